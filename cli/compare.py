@@ -1,48 +1,79 @@
-"""`rotorgram compare`: train several agents over the same seeds and steps, and report."""
+"""`rotorgram compare`: the paper's comparison over UDP, or rows of TOML files."""
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
+
+from tyro.conf import Positional, arg
 
 from ..agents import AlgorithmName
-from ..flights.executors import WorkersConfig
-from ..models.errors import expect, require
-from ..training.settings import CompareConfig
-from ._flags import refuse_settings
-from ._runs import RESUMED, RunsFlags, command_line, report_comparison, runs_folder
+from ..models.errors import InputError
+from ._flags import DEFAULT_ENV
+from ._study import StudyFlags
+
+if TYPE_CHECKING:
+    from ..training.settings import Row, Study
+
+_CONTROLLERS: Final = ("pid", "orca")
+"""Flown beside the agents where they can fly the env."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Compare(RunsFlags):
-    """Train VPG, A2C and SB3's A2C over the same seeds and steps, and report.
+class Compare(StudyFlags):
+    """Train several agents over the same seeds, and report: VPG, A2C and SB3's A2C, or your files.
 
-    Every run has a simulator process and a socket pair of its own. Writes one folder: results,
-    checkpoints, figures and report.html.
+    Without files it is the paper's comparison: each agent flies over its own pair of sockets.
     """
 
+    kinds: ClassVar[tuple[str, ...]] = ("paper", "compare")
+
+    files: Positional[Annotated[tuple[Path, ...], arg(metavar="FILE")]] = ()
+    """TOML files: of one row (agent, env, set, …), named by its file, or of [[row]] tables. They
+    train in process."""
     agents: tuple[AlgorithmName, ...] = ("vpg", "a2c", "sb3-a2c")
-    """Algorithms to train; the PID, or ORCA where a world has several drones, flies beside them."""
-    seeds: int = 5
-    """Number of seeds, the same for every agent. The paper's claims are decided from 30 on."""
-    snapshots: int = 10
-    """Policies kept during each training, for the learning curves."""
-    film: bool = True
-    """Whether the agents are filmed side by side for the report, where there is OpenGL."""
+    """Algorithms to train without files; the PID, or ORCA where a world has several drones, flies
+    beside them."""
 
-    def run(self) -> int:
-        """Compare, report, print the table."""
-        for module in ("matplotlib", "jinja2"):  # before hours of training
-            require(module, "report", "a comparison's report")
-        from ..training.compare import PARTS, compare, read_compare_config
+    def study(self) -> "Study":
+        """The study of the files, or of the agents."""
+        return self._of_files() if self.files else self._of_agents()
 
-        if self.resume:
-            refuse_settings(self, self.resume, free=("film", *RESUMED))
-            config = read_compare_config(self.resume)
-            config = replace(config, **self.settings(WorkersConfig))
-            advice = f"draw its report with: rotorgram report {self.resume}"
-            wanted = f"an interrupted comparison, {self.resume} is finished; {advice}"
-            expect((self.resume / PARTS).is_dir(), "resume", wanted)
-        else:
-            config = CompareConfig(**self.settings(CompareConfig))
-        with runs_folder("compare", self) as (folder, progress):
-            compare(config, folder, command_line(), progress)
-        report_comparison(folder, film=self.film)
-        return 0
+    def _of_files(self) -> "Study":
+        from ..training.settings import Study
+
+        studies = [Study.from_toml(path) for path in self.files]
+        rows = self.changed([row for study in studies for row in study.rows])
+        settings = {"kind": "compare", "episodes": 0, **self.given_of_study()}
+        return replace(studies[0], rows=rows, **settings)
+
+    def _of_agents(self) -> "Study":
+        from ..training.settings import Kind, Row, Study
+
+        env = self.env_config()
+        settings: dict[str, Any] = {"env_steps": 200_000, "num_envs": env.drones}
+        settings |= {"backend": "mujoco"} | self.given_of_rows()
+        if not self.agents:
+            raise InputError("agents: expected at least one, got none")
+        rows = [
+            Row(agent=agent, name=agent, env=env, set=self.changes(), **settings)
+            for agent in self.agents
+        ]
+        rows += [row for name in _CONTROLLERS for row in _controller(name, rows[0])]
+        paper = env.env_id == DEFAULT_ENV
+        kind: Kind = "paper" if paper else "compare"
+        return Study(
+            rows=tuple(rows), kind=kind, wire=True, keep_steps=paper, **self.given_of_study()
+        )
+
+
+def _controller(name: str, beside: "Row") -> list["Row"]:
+    """The row of a controller that can fly the same env as another row."""
+    from ..agents import CONTROLLERS
+    from ..envs.registry import env_spec
+    from ..training.settings import Row
+
+    with suppress(InputError):
+        CONTROLLERS[name](env_spec(beside.env.flown))
+        return [Row(agent=name, name=name, env=beside.env)]
+    return []

@@ -22,8 +22,7 @@ class Evaluate(AgentFlags, BackendFlags):
         import pandas as pd
 
         from ..flights.trajectories import fly_episodes
-        from ..training.metrics import Headline
-        from ..training.results import evaluation_row
+        from ..training.metrics import Headline, measure_episode
         from ._env import chosen_drones, chosen_env, load_checkpoint, policy_for, remote_env
 
         check_count("episodes", self.episodes)
@@ -36,7 +35,7 @@ class Evaluate(AgentFlags, BackendFlags):
             headline = Headline.of(env.env_spec)
             policy = policy_for(self, checkpoint, env.env_spec)
             trajectories = fly_episodes(env, policy, self.episodes, "final")
-        rows = pd.DataFrame([evaluation_row(trajectory, headline) for trajectory in trajectories])
+        rows = pd.DataFrame([measure_episode(trajectory, headline) for trajectory in trajectories])
         mean = rows.mean()
         measures = [f"{mean[name]:.4f}" for name in ("steady", "overshoot")]
         steady, overshoot = map(headline.amount, measures)

@@ -6,28 +6,21 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from ._flags import Command
+from ._study import report
 
 
 @dataclass(frozen=True, kw_only=True)
 class Report(Command):
-    """Draw a comparison's figures, table and report again, a sweep's table, or a board's page."""
+    """Draw figures, tables and page of a study again from its files."""
 
     folder: Positional[Path]
-    """Folder that `rotorgram compare`, `rotorgram sweep` or `rotorgram benchmark` wrote."""
+    """Folder that `rotorgram compare`, `sweep` or `benchmark` wrote."""
     page: Path | None = None
-    """Page of a board to write. Default: baselines.md in the folder."""
+    """Markdown page to write besides the report."""
     film: bool = True
-    """Whether a comparison's agents are filmed, if there is no film yet, where there is OpenGL."""
+    """Whether the agents are filmed, if there is no film yet, where there is OpenGL."""
 
     def run(self) -> int:
-        """Write figures and report from the files, and print the table."""
-        from ..training.results import content_of, read_config
-        from ._runs import report_board, report_comparison, report_sweep
-
-        if "board" in content_of(self.folder):
-            report_board(self.folder, self.page)
-        elif "sweep" in read_config(self.folder):
-            report_sweep(self.folder)
-        else:
-            report_comparison(self.folder, film=self.film)
+        """Write figures and report from the files, and print the tables."""
+        report(self.folder, page=self.page, film=self.film)
         return 0

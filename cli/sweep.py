@@ -1,78 +1,98 @@
-"""`rotorgram sweep`: train an algorithm over a grid of hyperparameters."""
+"""`rotorgram sweep`: train an algorithm over a grid of hyperparameters and task options."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Annotated, Any
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from itertools import product
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from tyro.conf import Positional, UseAppendAction, arg
 
 from ..agents import AlgorithmName
-from ..flights.executors import WorkersConfig
-from ..models.errors import expect
-from ..training.settings import SweepConfig
-from ._flags import parse_value, refuse_settings
-from ._runs import RESUMED, RunsFlags, command_line, report_sweep, runs_folder
+from ..models.errors import InputError
+from ._flags import parse_value
+from ._study import StudyFlags
+
+if TYPE_CHECKING:
+    from ..training.settings import Row, Study
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sweep(RunsFlags):
+class Sweep(StudyFlags):
     """Train an algorithm over a grid of hyperparameters, every point on the same seeds.
 
-    Every run has a simulator process and a socket pair of its own. Ctrl-C keeps the runs that are
-    done; --resume flies the others.
+    Ctrl-C keeps the runs that are done; --resume flies the others.
     """
 
+    kinds: ClassVar[tuple[str, ...]] = ("sweep",)
+
     algorithm: Positional[AlgorithmName]
+    """The algorithm."""
     grid: UseAppendAction[
         Annotated[tuple[tuple[str, ...], ...], arg(metavar="NAME=VALUE,... ...")]
     ] = ()
-    """Values to try, such as learning_rate=0.003,0.01 steps_per_update=64,256: every combination
-    is a point."""
-    seeds: int = 3
-    """Number of seeds, the same for every point; 30 or more before one is called the best."""
-    first_seed: int = 1000
-    """The first of them: by default none that a comparison uses."""
+    """Values to try, in JSON: learning_rate=0.003,0.01 hidden=[64,64],[32,32], and options of the
+    task as env.start_band=0.5,2. Every combination is a point."""
 
-    def run(self) -> int:
-        """Sweep, and print the table."""
-        from ..flights.executors import RunsFailed
-        from ..training.sweep import sweep
+    @property
+    def words(self) -> str:
+        return f"sweep {self.algorithm}"
 
-        if self.resume:
-            config = self._resumed(self.resume)
-        else:
-            grid = parse_grid(word for words in self.grid for word in words)
-            config = SweepConfig(**self.settings(SweepConfig) | {"grid": grid})
-        name = f"sweep {config.algorithm}"
-        try:
-            with runs_folder(name, self) as (folder, progress):
-                sweep(config, folder, command_line(), progress)
-        except RunsFailed:  # the other points are reported all the same
-            report_sweep(folder)
-            raise
-        report_sweep(folder)
-        return 0
+    def study(self) -> "Study":
+        """A row for each point, on seeds that no comparison uses by default."""
+        from ..training.settings import Study
 
-    def _resumed(self, folder: Path) -> SweepConfig:
-        from ..training.sweep import missing_runs, read_sweep_config, read_sweep_runs
+        grid = parse_grid(word for words in self.grid for word in words)
+        if not grid:
+            raise InputError("grid: expected at least one hyperparameter, got none")
+        rows = [
+            self._row(dict(zip(grid, values, strict=True))) for values in product(*grid.values())
+        ]
+        settings: dict[str, Any] = {"seeds": 3, "first_seed": 1000, "snapshots": 1}
+        settings |= self.given_of_study()
+        return Study(rows=tuple(rows), kind="sweep", evaluation="tuning", **settings)
 
-        config = replace(read_sweep_config(folder), **self.settings(WorkersConfig))
-        others = f"a sweep of {self.algorithm}, {folder} holds one of {config.algorithm}"
-        expect(config.algorithm == self.algorithm, "resume", others)
-        refuse_settings(self, folder, free=RESUMED)
-        advice = f"show it with: rotorgram report {folder}"
-        wanted = f"an interrupted sweep, {folder} is finished; {advice}"
-        expect(missing_runs(config, read_sweep_runs(folder, config)), "resume", wanted)
-        return config
+    def _row(self, point: Mapping[str, Any]) -> "Row":
+        from dataclasses import replace
+
+        from ..training.settings import Row
+
+        changes, options = self.changes(), dict(self.options)
+        for name, value in point.items():
+            if name.startswith("env."):
+                options[name.removeprefix("env.").replace("-", "_")] = value
+            else:
+                changes[name] = value
+        words = [f"{name}={json.dumps(value)}" for name, value in point.items()]
+        env = replace(self.env_config(), options=options)
+        settings: dict[str, Any] = {"env_steps": 200_000, "num_envs": env.drones}
+        settings |= {"backend": "mujoco"} | self.given_of_rows()
+        name = " ".join(words).replace('"', "").replace(", ", ",")
+        return Row(agent=self.algorithm, name=name, env=env, set=changes, **settings)
 
 
 def parse_grid(words: Iterable[str]) -> dict[str, tuple[Any, ...]]:
-    """Values by the name of their hyperparameter. Raises `InputError`."""
+    """Values by the name of their hyperparameter, each in JSON. Raises `InputError`."""
     grid: dict[str, tuple[Any, ...]] = {}
     for word in words:
-        name, equals, values = word.partition("=")
-        expect(equals, "grid", "NAME=VALUE,VALUE,…", repr(word))
-        expect(name not in grid, "grid", "each name once", f"{name} twice")
-        grid[name] = tuple(map(parse_value, values.split(",")))
+        name, equals, text = word.partition("=")
+        if not equals:
+            raise InputError(f"grid: expected NAME=VALUE,VALUE,…, got {word!r}")
+        if name in grid:
+            raise InputError(f"grid: expected each name once, got {name} twice")
+        values = _values(text)
+        for place, value in enumerate(values):
+            if value in values[:place]:
+                raise InputError(f"grid: expected each {name} once, got {value!r} twice")
+        grid[name] = values
     return grid
+
+
+def _values(text: str) -> tuple[Any, ...]:
+    """JSON values with commas between them; without brackets, words are texts."""
+    try:
+        return tuple(json.loads(f"[{text}]"))
+    except (ValueError, RecursionError):
+        if set(text) & set("[]{}"):
+            raise InputError(f"grid: expected values in JSON, got {text!r}") from None
+        return tuple(parse_value(value) for value in text.split(","))

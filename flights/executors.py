@@ -21,7 +21,6 @@ from multiprocessing.queues import SimpleQueue
 from threading import Thread
 from typing import Any, Final, Literal, NamedTuple, TypeVar
 
-from ..envs.registry import load
 from ..models.errors import InputError
 
 OnProgress = Callable[[str, int, int, str], None]
@@ -78,22 +77,19 @@ def run_jobs(
     jobs: Mapping[str, _Job],
     keep: Callable[[_Job, _Value], None],
     on_progress: OnProgress,
-    *,
-    task: str | None = None,
 ) -> None:
     """Do all jobs, given by name, and hand each with its result to `keep` as soon as it is there.
 
     Args:
         executor: Made by `open_executor`.
         function: Called in a worker with a job and a function that reports its progress.
-        task: `module:id` of the user's task, which a worker imports first.
 
     Raises:
         RunsFailed: At the end, if jobs failed; at once, if a worker was killed.
     """
     failures: list[str] = []
     on_progress("all runs", 0, len(jobs), "")
-    for number, result in enumerate(_results(executor, function, jobs, task), 1):
+    for number, result in enumerate(_results(executor, function, jobs), 1):
         if result.failure:
             failures.append(result.failure)
             on_progress(result.name, 0, 1, "failed")
@@ -109,7 +105,6 @@ def _results(
     executor: Executor,
     function: Callable[[_Job, Tell], _Value],
     jobs: Mapping[str, _Job],
-    task: str | None,
 ) -> Iterator[Result]:
     """Results in the order in which they come; at most `executor.workers` jobs are submitted."""
     waiting = iter(jobs.items())
@@ -117,7 +112,7 @@ def _results(
     submitted: set[Future[Result]] = set()
     while True:
         for name, job in islice(waiting, workers - len(submitted)):
-            submitted.add(executor.submit(_do, function, name, job, task))
+            submitted.add(executor.submit(_do, function, name, job))
         if not submitted:
             return
         done, submitted = wait(submitted, return_when=FIRST_COMPLETED)
@@ -231,12 +226,10 @@ def _end_with(ends: Connection) -> None:
     os._exit(1)
 
 
-def _do(function: Callable[[_Job, Tell], _Value], name: str, job: _Job, task: str | None) -> Result:
+def _do(function: Callable[[_Job, Tell], _Value], name: str, job: _Job) -> Result:
     """Do a job (in a worker)."""
     report = _worker.report
     try:
-        if task:
-            load(task)
         value = function(job, lambda done, total, words: report(name, done, total, words))
         return Result(name, "", value)
     except Exception as error:

@@ -37,9 +37,17 @@ Ending = Literal["terminated", "truncated", "cut off"]
 """`cut off`: the episode was given up, its simulator was lost, or the journal ends before it."""
 
 
-def evaluation_seed(episode: int, of: EpisodeSet = "curve") -> int:
-    """Seed of an evaluation episode: the same for every agent, and of no training."""
-    sequence = np.random.SeedSequence(_EVALUATION, spawn_key=(_SETS.index(of), episode))
+def evaluation_seed(
+    episode: int, of: EpisodeSet = "curve", training_seed: int | None = None
+) -> int:
+    """Seed of an evaluation episode: the same for every agent, and of no training.
+
+    Policies of different training seeds fly from different starts if their seed is given.
+    """
+    key = [_SETS.index(of), episode]
+    if training_seed is not None:
+        key.append(training_seed)
+    sequence = np.random.SeedSequence(_EVALUATION, spawn_key=key)
     return int(sequence.generate_state(1, np.uint64)[0])
 
 
@@ -162,7 +170,12 @@ def fly(env: gym.Env[Any, Any], policy: Policy | None, seed: int, episode: int =
 
 
 def fly_episodes(
-    env: Any, policy: Policy | None, episodes: int, of: EpisodeSet = "curve", first: int = 0
+    env: Any,
+    policy: Policy | None,
+    episodes: int,
+    of: EpisodeSet = "curve",
+    first: int = 0,
+    training_seed: int | None = None,
 ) -> list[Trajectory]:
     """Evaluation episodes of a set, from the number `first` on, in their order.
 
@@ -171,7 +184,8 @@ def fly_episodes(
     the other. Without a policy actions are random. An episode of several drones of one world gives
     a trajectory for each, in their order.
     """
-    seeds = {number: evaluation_seed(number, of) for number in range(first, first + episodes)}
+    numbers = range(first, first + episodes)
+    seeds = {number: evaluation_seed(number, of, training_seed) for number in numbers}
     if not isinstance(env, AdvancingVectorEnv):
         return [fly(env, policy, seed, episode) for episode, seed in seeds.items()]
     flown: dict[int, list[Trajectory]] = {}
@@ -280,6 +294,7 @@ def flown_trajectories(
     vehicle: str | Path | None = None,
     of: EpisodeSet = "curve",
     drones: int = 1,
+    training_seed: int | None = None,
 ) -> list[Trajectory]:
     """Evaluation episodes of a set by number, flown in process: see `fly` and, for several drones
     of one world, `fly_episodes`. The vehicle is a file or a name, None the paper's.
@@ -288,12 +303,13 @@ def flown_trajectories(
     if drones == 1:
         made = gym.make(name, disable_env_checker=True, vehicle=vehicle, **options)
         with closing(made.unwrapped) as env:
-            return [fly(env, policy, evaluation_seed(episode, of), episode) for episode in episodes]
+            seeds = {number: evaluation_seed(number, of, training_seed) for number in episodes}
+            return [fly(env, policy, seed, number) for number, seed in seeds.items()]
     from ..envs.vector import LocalVectorEnv  # which imports MuJoCo
 
     settings: dict[str, Any] = {"drones": drones, "vehicle": vehicle, **options}
     found: list[Trajectory] = []
     with closing(LocalVectorEnv(name, drones, autoreset_mode="Disabled", **settings)) as world:
         for episode in episodes:
-            found += fly_episodes(world, policy, 1, of, first=episode)
+            found += fly_episodes(world, policy, 1, of, episode, training_seed)
     return found

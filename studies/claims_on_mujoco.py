@@ -13,7 +13,8 @@ from typing import Any
 import pandas as pd
 from measuring import options
 from rotorgram.models.errors import expect
-from rotorgram.training import claims, metrics, results
+from rotorgram.training import claims, metrics
+from rotorgram.training.results import Results
 from rotorgram.training.statistics import bootstrap_difference, iqm
 
 MEASURES = {
@@ -25,13 +26,13 @@ MEASURES = {
 
 def values(folder: Path, seeds: set[int]) -> dict[tuple[str, str], list[float]]:
     """Of each agent and measure, one for each of these seeds, in their order."""
-    found = results.read_results(folder)
-    final = metrics.final_per_run(found.evaluations, found.headline)
+    found = Results.read(folder)
+    final = found.runs
     episodes = found.episodes[found.episodes["seed"].isin(seeds)]
     table: dict[tuple[str, str], list[float]] = {}
-    for agent in sorted(set(episodes["agent"])):
+    for agent in sorted(set(episodes["row"])):
         runs = metrics.training_runs(episodes, agent)
-        own = final[(final["agent"] == agent) & final["seed"].isin(seeds)]
+        own = final[(final["row"] == agent) & final["seed"].isin(seeds)]
         for name, measure in MEASURES.items():
             table[agent, name] = [measure(run) for run in runs]
         table[agent, "steady |E|, m"] = own["steady"].tolist()
@@ -40,7 +41,7 @@ def values(folder: Path, seeds: set[int]) -> dict[tuple[str, str], list[float]]:
 
 def compared(name: str, rigid: Path, mujoco: Path) -> list[dict[str, Any]]:
     """The rows of a pair of folders."""
-    seeds = [set(results.read_results(folder).runs["seed"]) for folder in (rigid, mujoco)]
+    seeds = [set(Results.read(folder).runs["seed"]) for folder in (rigid, mujoco)]
     both = seeds[0] & seeds[1]
     expect(len(both) > 1, name, "folders with two seeds or more in common", f"{len(both)}")
     ours, theirs = (values(folder, both) for folder in (rigid, mujoco))

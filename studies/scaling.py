@@ -21,7 +21,6 @@ import subprocess
 import sys
 import time
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -30,9 +29,10 @@ import gymnasium as gym
 import numpy as np
 import rotorgram.envs  # noqa: F401  # makes the envs known
 from measuring import RESULTS, medians, options, write
+from rotorgram.flights.executors import WorkersConfig
 from rotorgram.flights.folders import new_folder
-from rotorgram.training.compare import compare
-from rotorgram.training.settings import CompareConfig
+from rotorgram.training.settings import Row, Study
+from rotorgram.training.study import run_study
 from rotorgram.udp import RemoteVectorEnv
 
 ENV_ID = "rotorgram/Elevation-v0"
@@ -130,10 +130,9 @@ def extrapolate(alone, measured):
 
 
 def measure_runs(env_steps, rounds):
-    config = CompareConfig(
-        agents=("a2c",), seeds=4, env_steps=env_steps, snapshots=1, curve_episodes=1, episodes=1,
-    )  # fmt: skip
-    ways = {"one worker": replace(config, jobs=1), "two processes": replace(config, jobs=2)}
+    row = Row(agent="a2c", env_steps=env_steps)
+    study = Study(rows=(row,), seeds=4, snapshots=1, curve_episodes=1, episodes=1, wire=True)
+    ways = {"one worker": WorkersConfig(jobs=1), "two processes": WorkersConfig(jobs=2)}
     with ExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory()))
         if find_spec("ray"):
@@ -144,17 +143,17 @@ def measure_runs(env_steps, rounds):
             stack.callback(cluster.wait)
             stack.callback(cluster.stdin.close)
             address = next(x for x in cluster.stdout if x.startswith("at ")).split()[1]
-            ways["two, Ray"] = replace(config, jobs=2, runner="ray", address=address)
+            ways["two, Ray"] = WorkersConfig(jobs=2, runner="ray", address=address)
         seconds = {name: [] for name in ways}
         for number in range(rounds):
             for name, way in ways.items():
                 start = time.perf_counter()
-                compare(way, new_folder(folder / f"{number} {name}", ""), "", lambda *_: None)
+                run_study(study, new_folder(folder / f"{number} {name}", ""), workers=way)
                 seconds[name].append(round(time.perf_counter() - start, 2))
                 print(f"{name}: {seconds[name][-1]} s", flush=True)
     return {
         "env_steps": env_steps,
-        "trainings": config.seeds,
+        "trainings": study.seeds,
         "seconds": medians(seconds),
         "rounds": seconds,
     }

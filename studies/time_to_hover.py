@@ -23,9 +23,8 @@ import json, sys
 import numpy as np
 import rotorgram.envs
 from rotorgram.agents import preset
-from rotorgram.training.metrics import Headline
+from rotorgram.training.metrics import Headline, measure_episode
 from rotorgram.training.pairs import socket_pair
-from rotorgram.training.results import evaluation_row
 from rotorgram.training.settings import Run
 from rotorgram.training.training import Training
 from rotorgram.flights.trajectories import fly_episodes
@@ -38,7 +37,7 @@ with socket_pair(**run.env, num_envs=run.num_envs) as remote:
 spec = training.log.spec
 with socket_pair(**run.env, num_envs=20) as remote:
     flown = fly_episodes(remote, training.agent.policy(), 20, "final")
-rows = [evaluation_row(one, Headline.of(spec)) for one in flown]
+rows = [measure_episode(one, Headline.of(spec)) for one in flown]
 print(json.dumps({"training": training.log.seconds,
                   "error": float(np.mean([r["steady"] for r in rows]))}))
 """

@@ -1,22 +1,21 @@
-"""Folders of a comparison, made up: for the tests of figures, report and page."""
+"""Folders of a study, made up: for the tests of figures, tables and page."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
-import pyarrow.parquet as pq
 from rotorgram.envs.spec import ArraySpec, EnvSpec, Metric
-from rotorgram.training.metrics import Headline, overshoot, settling_time, steady_state
-from rotorgram.training.results import (
-    EPISODE_COLUMNS,
-    EVALUATION_COLUMNS,
-    RUN_COLUMNS,
-    step_schema,
+from rotorgram.training.metrics import (
+    Headline,
+    measure_run,
+    overshoot,
+    settling_time,
+    steady_state,
 )
+from rotorgram.training.results import COLUMNS, join_parts, write_config, write_part
+from rotorgram.training.settings import Row, Study
 
 PERIOD = 0.05
 ERROR = Metric(name="elevation_error", unit="m", symbol="E", settled=0.05, held=0.1, signed=True)
@@ -55,6 +54,12 @@ def flight(skill: float, agent: str, length: int, rng: np.random.Generator) -> n
     return damped + lost + noise
 
 
+def study_of(agents: Sequence[str], seeds: int = 3, **settings: Any) -> Study:
+    """The paper's comparison of some agents."""
+    rows = tuple(Row(agent=agent, name=agent, env_steps=2000) for agent in agents)
+    return Study(**{"rows": rows, "kind": "paper", "seeds": seeds, "keep_steps": True, **settings})
+
+
 def synthetic_folder(
     folder: Path,
     agents: Sequence[str] = ("vpg", "a2c", "sb3-a2c", "pid"),
@@ -62,29 +67,35 @@ def synthetic_folder(
     env_steps: int = 2000,
     length: int = 100,
     snapshots: int = 5,
+    study: Study | None = None,
 ) -> Path:
     """Write results with the shapes of learning: `env_steps` per run, all by chance."""
     rng = np.random.default_rng(1)
-    episodes: list[dict[str, Any]] = []
-    evaluations: list[dict[str, Any]] = []
-    steps: list[dict[str, Any]] = []
-    trained = [agent for agent in agents if agent != "pid"]
-    for agent in agents:
-        for seed in range(seeds):
-            rate = rng.uniform(0.8, 1.25)
-            if agent in trained:
-                _train(agent, seed, rate, env_steps, length, rng, episodes, steps)
-            marks = np.linspace(0, env_steps, snapshots) if agent in trained else [0]
-            for mark in marks:
-                final = mark == marks[-1]
-                skill = 1.0 if agent == "pid" else _skill(agent, rate * mark / env_steps)
-                _evaluate(agent, seed, int(mark), skill, length, rng, evaluations, steps, final)
-    runs = [
-        (agent, seed, env_steps, env_steps / 2500, 2500.0 + seed)
-        for agent in trained
-        for seed in range(seeds)
-    ]
-    _write(folder, agents, seeds, env_steps, length, episodes, evaluations, steps, runs)
+    study = study or study_of(agents, seeds)
+    folder.mkdir(parents=True, exist_ok=True)
+    specs = dict.fromkeys([row.name for row in study.rows], spec_of(length=length))
+    write_config(folder, "rotorgram compare --seeds 3 <folder>", study, specs)
+    for row, seed in study.runs().values():
+        rate = rng.uniform(0.8, 1.25)
+        marks = [0] if row.controller else np.linspace(0, env_steps, snapshots).astype(int)
+        evaluations, steps = [], []
+        for mark in marks:
+            progress = rate * mark / env_steps
+            skill = 1.0 if row.controller else _skill(row.agent, progress)
+            _evaluate(row.agent, int(mark), skill, length, rng, evaluations, steps)
+        flown = pd.concat(steps[-3:])
+        tables = {"evaluations": pd.DataFrame(evaluations), "steps": flown}
+        if not row.controller:
+            tables["episodes"], trained = _train(row.agent, rate, env_steps, length, rng)
+            tables["steps"] = pd.concat([trained, flown])
+        named = tables["evaluations"].assign(row=row.name, seed=seed)
+        last = int(marks[-1])
+        times = {"env_steps": last, "seconds": last / 2500, "steps_per_second": 2500.0 + seed}
+        if row.controller:
+            times["steps_per_second"] = np.nan
+        tables["runs"] = pd.DataFrame([times | measure_run(named, HEADLINE)])
+        write_part(folder, row, seed, tables)
+    join_parts(folder)
     return folder
 
 
@@ -92,77 +103,52 @@ def _skill(agent: str, progress: float) -> float:
     return float(1 / (1 + np.exp(-(progress - DELAYS.get(agent, 0.2)) * 25)))
 
 
-def _train(agent, seed, rate, env_steps, length, rng, episodes, steps):  # type: ignore[no-untyped-def]
+def _steps(phase: str, episode: int, first: int, errors: np.ndarray) -> pd.DataFrame:
+    return pd.DataFrame({
+        "phase": phase, "episode": episode, "step": np.arange(first, first + len(errors)) + 1,
+        "value": errors.astype(np.float32), "reward": np.float32(0), "thrust": np.float32(49),
+    })  # fmt: skip
+
+
+def _train(
+    agent: str, rate: float, env_steps: int, length: int, rng: np.random.Generator
+) -> tuple[pd.DataFrame, pd.DataFrame]:
     begin = number = 0
+    episodes: list[dict[str, Any]] = []
+    steps: list[pd.DataFrame] = []
     while begin < env_steps:
         skill = _skill(agent, rate * begin / env_steps)
         flown = min(length if rng.random() < 0.3 + skill else length // 3, env_steps - begin)
         errors = flight(skill, agent, max(2, flown), rng)[:flown]
-        steps.append(
-            {"agent": agent, "seed": seed, "phase": "train", "episode": number}
-            | {"step": np.arange(begin, begin + flown) + 1, "elevation_error": errors}
-        )
+        steps.append(_steps("train", number, begin, errors))
         begin += flown
         if flown < length and begin >= env_steps:
             break  # the end of training cut the episode: it is not recorded
-        episodes.append(
-            dict.fromkeys(EPISODE_COLUMNS, 0)
-            | {"agent": agent, "seed": seed, "episode": number, "first_step": begin - flown}
-            | {"last_step": begin}
-            | {"length": flown, "return": float(np.sum(1 - np.minimum(np.abs(errors), 3)))}
-            | {"elevation_error": float(np.abs(errors).mean()), "truncated": flown == length}
-            | {"terminated": flown < length, "seconds": begin / 2500}
-        )
+        episodes.append({
+            "episode": number, "first_step": begin - flown, "last_step": begin, "length": flown,
+            "return": float(np.sum(1 - np.minimum(np.abs(errors), 3))),
+            "mean_size": float(np.abs(errors).mean()), "truncated": flown == length,
+            "terminated": flown < length, "seconds": begin / 2500,
+        })  # fmt: skip
         number += 1
+    return pd.DataFrame(episodes, columns=list(COLUMNS["episodes"][2:])), pd.concat(steps)
 
 
-def _evaluate(agent, seed, mark, skill, length, rng, evaluations, steps, final):  # type: ignore[no-untyped-def]
+def _evaluate(
+    agent: str,
+    mark: int,
+    skill: float,
+    length: int,
+    rng: np.random.Generator,
+    evaluations: list[dict[str, Any]],
+    steps: list[pd.DataFrame],
+) -> None:
     for episode in range(3):
         errors = flight(skill, agent, length, rng)
-        evaluations.append(
-            {"agent": agent, "seed": seed, "env_steps": mark, "seconds": mark / 2500}
-            | {"episode": episode, "length": length, "return": float(np.sum(1 - np.abs(errors)))}
-            | {"start": float(errors[0]), "elevation_error": steady_state(np.abs(errors))}
-            | {"overshoot": overshoot(errors), "terminated": False}
-            | {"settling_time": settling_time(errors, PERIOD, 0.05)}
-        )
-        if final:
-            steps.append(
-                {"agent": agent, "seed": seed, "phase": "evaluation", "episode": episode}
-                | {"step": np.arange(1, length + 1), "elevation_error": errors}
-            )
-
-
-def _write(folder, agents, seeds, env_steps, length, episodes, evaluations, steps, runs):  # type: ignore[no-untyped-def]
-    folder.mkdir(parents=True, exist_ok=True)
-    settings = {"learning_rate": 1e-3, "anneal": True, "hidden": [64, 64]}
-    config = {
-        "created": "2025-01-02T03:04:05+00:00",
-        "command": "rotorgram compare --seeds 3 <folder>",
-        "preset": "tuned",
-        "seeds": list(range(seeds)),
-        "env_steps": env_steps,
-        "num_envs": 1,
-        "spec": json.loads(spec_of(length=length).to_json()),
-        "vehicle": None,
-        "bounds": {"time-optimal": 95.0},
-        "agents": dict.fromkeys(agents, settings),
-        "versions": {"rotorgram": "0.1.0", "mujoco": "4.0.0"},
-        "machine": {"platform": "Linux", "processor": "some <processor>", "cores": 2},
-    }
-    (folder / "config.json").write_text(json.dumps(config))
-    for name, rows, columns in (
-        ("episodes.csv", episodes, EPISODE_COLUMNS),
-        ("evaluations.csv", evaluations, EVALUATION_COLUMNS),
-    ):
-        own = [
-            "elevation_error" if column in ("mean_size", "steady") else column for column in columns
-        ]
-        pd.DataFrame(rows, columns=own).to_csv(folder / name, index=False)
-    pd.DataFrame(runs, columns=list(RUN_COLUMNS)).to_csv(folder / "runs.csv", index=False)
-    frame = pd.concat([pd.DataFrame(part) for part in steps])
-    schema = step_schema("elevation_error")
-    table = pa.Table.from_pandas(
-        frame.assign(reward=0.0, thrust=49.0)[schema.names], schema, preserve_index=False
-    )
-    pq.write_table(table, folder / "steps.parquet")
+        evaluations.append({
+            "env_steps": mark, "seconds": mark / 2500, "episode": episode, "length": length,
+            "return": float(np.sum(1 - np.abs(errors))), "start": float(errors[0]),
+            "steady": steady_state(np.abs(errors)), "overshoot": overshoot(errors),
+            "settling_time": settling_time(errors, PERIOD, 0.05), "terminated": False,
+        })  # fmt: skip
+        steps.append(_steps("evaluation", episode, 0, errors))

@@ -1,4 +1,4 @@
-"""The film of a comparison: one flight of each agent, side by side."""
+"""Films of a study: each row flies the same episode, side by side."""
 
 import logging
 from pathlib import Path
@@ -9,34 +9,43 @@ from ..agents.policies import Policy
 from ..flights.filming import Film, OnFrame, Shot, film
 from ..flights.palette import agent_color
 from ..flights.trajectories import flown_trajectories
+from ..models.errors import InputError
 from ..rendering import Camera, NoOpenGL
-from .metrics import run_label, shown_runs
-from .results import Results, read_results
+from .metrics import shown_runs
+from .results import Results, checkpoint_file
+from .settings import Row
+from .tables import row_label
 
 
-def film_comparison(
-    folder: Path, out: Path, on_frame: OnFrame = lambda *_: None, *, world: str = "airport"
+def film_study(
+    results: Results, out: Path, on_frame: OnFrame = lambda *_: None, *, world: str = "airport"
 ) -> bool:
-    """Film a comparison: each agent and the controller, the same episode side by side.
+    """Film the rows of a study of one task: the same episode, side by side.
 
-    `metrics.shown_runs` says which seeds and which episode.
-
-    The folder is one that `rotorgram compare` wrote; a film that exists is replaced. Returns
+    `metrics.shown_runs` says which seeds and which episode. A film that exists is replaced. Returns
     whether there is a film: without OpenGL there is none, and a line in the log says why.
 
     Raises:
-        InputError: The folder is not a comparison's.
+        InputError: Rows fly several tasks, or their policies were not kept.
         OSError: The film cannot be written.
     """
-    results = read_results(folder)
-    vehicle = results.config["vehicle"]
+    rows = results.study.rows
+    tasks = {row.task for row in rows}
+    if len(tasks) > 1:
+        raise InputError(f"film: expected rows of one task, got {', '.join(sorted(tasks))}")
+    env = rows[0].env
     # Small enough for a page that holds the film in itself.
-    camera: Camera = "top" if len(results.spec.agents) > 1 else "front"  # no craft hides another
-    config = Film(height=400, camera=camera, fast=True, quality=27, world=world, vehicle=vehicle)
+    camera: Camera = "top" if env.drones > 1 else "front"  # no craft hides another
+    config = Film(
+        height=400, camera=camera, fast=True, quality=27, world=world, vehicle=env.vehicle
+    )
     fresh = out.with_name(f".fresh-{out.name}")
     fresh.unlink(missing_ok=True)
+    headline = results.headline(rows[0])
+    seeds, episode = shown_runs(results.runs, results.evaluations, headline)
+    shots = [_shot(results, row, seeds[row.name], episode) for row in rows if row.name in seeds]
     try:
-        film(fresh, _comparison_shots(folder, results), config, on_frame)
+        film(fresh, shots, config, on_frame)
     except NoOpenGL as error:
         logging.getLogger(__name__).info("no film of the agents: %s", error)
         return False
@@ -44,19 +53,18 @@ def film_comparison(
     return True
 
 
-def _comparison_shots(folder: Path, results: Results) -> list[Shot]:
-    spec, vehicle = results.spec, results.config["vehicle"]
-    seeds, episode = shown_runs(results.evaluations, results.headline)
-    shots, drones = [], len(spec.agents)
-    for agent, seed in seeds.items():
-        name = run_label(results.evaluations, agent, seed)
-        file = folder / "checkpoints" / f"{agent}-seed{seed}.safetensors"
-        controller = CONTROLLERS.get(agent)
-        policy: Policy = controller(spec) if controller else load(file).policy()
-        flown = flown_trajectories(
-            policy, spec.env_id, spec.options, [episode],
-            vehicle=vehicle, of="final", drones=drones,
-        )  # fmt: skip
-        color = agent_color(agent, dark=True)
-        shots.append(Shot(name=name, color=color, trajectories=flown, drones=drones))
-    return shots
+def _shot(results: Results, row: Row, seed: int, episode: int) -> Shot:
+    spec = results.specs[row.name]
+    policy: Policy
+    if row.controller:
+        policy = CONTROLLERS[row.agent](spec)
+    else:
+        policy = load(checkpoint_file(results.folder, row, seed)).policy()
+    flown = flown_trajectories(
+        policy, spec.env_id, spec.options, [episode], vehicle=row.env.vehicle,
+        of=results.study.evaluation, drones=row.env.drones, training_seed=seed,
+    )  # fmt: skip
+    several = not row.controller and results.study.seeds > 1
+    name = row_label(row) + (f", seed {seed}" if several else "")
+    color = agent_color(row.agent if row.name == row.agent else row.name, dark=True)
+    return Shot(name=name, color=color, trajectories=flown, drones=row.env.drones)

@@ -1,31 +1,27 @@
-"""Measures of a trajectory and of a set of runs: pure functions of arrays and frames.
+"""Measures of a trajectory and of a run: pure functions of arrays and frames.
 
-Over an episode: `steady_state`, `settling_time`, `overshoot` of the headline metric. Over seeds:
-the interquartile mean with its interval (`statistics`), the share of seeds that hold their goal,
-and the worst seed. `results_table` puts them together.
+Over an episode: `steady_state`, `settling_time`, `overshoot` of the headline metric. Over the
+episodes of a run's evaluation: `measure_run`. Over seeds: `results.summarize`.
 
 How episodes that end early (a crash) enter: the steady state, the overshoot and the return are
-those of the flown part; the settling time is missing, and the table says how many episodes
-settled and how many crashed; a run with a crash in its evaluation does not hold its goal, unless
-the mean of its metric counts crashes already, as the share of landings does.
+those of the flown part; the settling time is missing, and the table says how many episodes settled
+and how many crashed; a run with a crash in its evaluation does not hold its goal, unless the mean
+of its metric counts crashes already, as the share of landings does.
 """
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
+from numpy.typing import NDArray
 
 from ..envs.spec import EnvSpec, Metric
-from ..flights.palette import agent_label, sort_agents
+from ..flights.trajectories import Trajectory
 from ..models.errors import InputError
-from .statistics import Floats, Values, bootstrap_interval, iqm, trimmed_mean
-
-_MEASURES: Final = ("steady", "settling_time", "overshoot", "return")
-_COUNTS: Final = ("seeds", "episodes", "settled", "crashed")
+from .statistics import Floats, Values, trimmed_mean
 
 
 class Curve(NamedTuple):
@@ -53,7 +49,8 @@ class Headline(Metric):
     @classmethod
     def of(cls, spec: EnvSpec) -> "Headline":
         """The headline metric of an env. Raises `InputError` where the env names none."""
-        if (metric := spec.headline) is None:
+        metric = spec.headline
+        if metric is None:
             raise InputError(f"env: expected one that names a metric, got {spec.env_id}")
         return cls(**(vars(metric) | {"symbol": metric.symbol or metric.name}))
 
@@ -90,9 +87,10 @@ class Headline(Metric):
 
     def size(self, values: Values) -> Floats:
         """Sizes of some values; same shape, float64."""
-        return np.asarray(values, float) if self.high else np.abs(np.asarray(values, float))
+        array = np.asarray(values, float)
+        return array if self.high else np.abs(array)
 
-    def holds(self, sizes: Values) -> npt.NDArray[np.bool_]:
+    def holds(self, sizes: Values) -> NDArray[np.bool_]:
         """Whether each mean size counts as holding the goal; false for nan, or without a bound."""
         array = np.asarray(sizes, float)
         bound = np.nan if self.held is None else self.held  # no number is above or below nan
@@ -109,12 +107,16 @@ class Headline(Metric):
         return ended & ~self.holds(evaluations["steady"]) if self.final else ended
 
 
+# ---- over an episode
+
+
 def steady_state(sizes: Values, *, final: bool = False) -> float:
     """Mean of the last quarter of an episode's sizes, (T,), at least of the last; nan if T = 0.
 
     Of a `final` metric only the last counts.
     """
-    last = np.asarray(sizes, float)[-1 if final else -max(1, len(sizes) // 4) :]
+    count = 1 if final else max(1, len(sizes) // 4)
+    last = np.asarray(sizes, float)[-count:]
     return float(last.mean()) if last.size else math.nan
 
 
@@ -127,7 +129,9 @@ def settling_time(errors: Values, control_period: float, tolerance: float) -> fl
     outside = ~(np.abs(np.asarray(errors, float)) < tolerance)
     if outside.size == 0 or outside[-1]:
         return math.nan
-    return float(outside.nonzero()[0][-1] + 1) * control_period if outside.any() else 0.0
+    if not outside.any():
+        return 0.0
+    return float(outside.nonzero()[0][-1] + 1) * control_period
 
 
 def overshoot(errors: Values) -> float:
@@ -142,9 +146,105 @@ def overshoot(errors: Values) -> float:
     return max(0.0, float(passed.max()))
 
 
-def training_runs(episodes: pd.DataFrame, agent: str) -> list[pd.DataFrame]:
-    """Split an agent's training episodes into one frame per seed, in the order of their ends."""
-    own = episodes[episodes["agent"] == agent].sort_values(["seed", "last_step"], kind="stable")
+def measure_episode(trajectory: Trajectory, headline: Headline) -> dict[str, float]:
+    """A trajectory as a row of the table `evaluations`, but for the columns that name the run.
+
+    What was drawn for the episode follows in columns of its own.
+    """
+    values = trajectory.headline
+    steady = steady_state(headline.size(values[1:]), final=headline.final)
+    reached = headline.final and bool(headline.holds([steady])[0])
+    settled = math.nan
+    if headline.settles and (reached or not trajectory.terminated):
+        settled = settling_time(values, trajectory.spec.control_period, headline.settled or 0.0)
+    return {
+        "episode": trajectory.episode,
+        "length": len(trajectory),
+        "return": float(trajectory.rewards.sum()),
+        "start": float(values[0]),
+        "steady": steady,
+        "settling_time": settled,
+        "overshoot": overshoot(values) if headline.signed else math.nan,
+        "terminated": trajectory.terminated,
+        **_drawn(trajectory),
+    }
+
+
+def _drawn(trajectory: Trajectory) -> dict[str, float]:
+    for array in trajectory.spec.telemetry:
+        if array.name == "drawn":
+            values = trajectory.telemetry[array.name][0].tolist()
+            return dict(zip(array.components, values, strict=True))
+    return {}
+
+
+# ---- over the episodes of a run's evaluation
+
+
+def measure_run(evaluations: pd.DataFrame, headline: Headline) -> dict[str, float]:
+    """Measures of one run from the evaluations of all its snapshots.
+
+    Returns:
+        Means over the episodes of the last snapshot: `steady`, `settling_time` (of those that
+        settled; nan if none did), `overshoot`, `return`. Counts: `episodes`, `settled`, `crashed`.
+        `held`: 1 if the mean steady state holds the goal, with a value in every episode and without
+        a crash that it does not count. `env_steps_to_hold`, `seconds_to_hold`: see
+        `first_lasting_snapshot`; nan for an agent that is not trained.
+    """
+    final = final_evaluations(evaluations)
+    crashed = headline.crashed(final)
+    settling = final["settling_time"].mask(crashed)
+    steady = float(final["steady"].mean())
+    safe = headline.counts_crashes or not crashed.any()
+    whole = bool(final["steady"].notna().all())
+    steps, seconds = math.nan, math.nan
+    if evaluations["env_steps"].max() > 0 and headline.held is not None:
+        steps, seconds = first_lasting_snapshot(evaluations, headline)
+    return {
+        "steady": steady,
+        "settling_time": float(settling.mean()),
+        "overshoot": float(final["overshoot"].mean()),
+        "return": float(final["return"].mean()),
+        "episodes": len(final),
+        "settled": int(settling.notna().sum()),
+        "crashed": int(crashed.sum()),
+        "held": int(safe and whole and bool(headline.holds([steady])[0])),
+        "env_steps_to_hold": steps,
+        "seconds_to_hold": seconds,
+    }
+
+
+def final_evaluations(evaluations: pd.DataFrame) -> pd.DataFrame:
+    """The evaluation episodes of each run's last snapshot (the largest `env_steps`)."""
+    last = evaluations.groupby(["row", "seed"])["env_steps"].transform("max")
+    return evaluations[evaluations["env_steps"] == last]
+
+
+def first_lasting_snapshot(evaluations: pd.DataFrame, headline: Headline) -> tuple[float, float]:
+    """Env steps and seconds of training after which one run holds its goal for good; nan if never.
+
+    They are those of the first snapshot from which on every snapshot holds its goal. Few
+    episodes judge a snapshot, and even an untrained network can pass them by luck.
+    """
+    # A crash, or a value that is missing, must not vanish in a mean that skips it.
+    never = -np.inf if headline.high else np.inf
+    crashed = headline.crashed(evaluations) & (not headline.counts_crashes)
+    steady = evaluations["steady"].fillna(never).mask(crashed, never)
+    snapshots = evaluations.assign(steady=steady).groupby("env_steps")
+    holds = headline.holds(snapshots["steady"].mean().to_numpy())
+    later = np.logical_and.accumulate(holds[::-1])[::-1]
+    lasting = snapshots["seconds"].max()[later]
+    if lasting.empty:
+        return math.nan, math.nan
+    return float(lasting.index[0]), float(lasting.iloc[0])
+
+
+# ---- curves
+
+
+def training_runs(episodes: pd.DataFrame, row: str) -> list[pd.DataFrame]:
+    """Training episodes of a row: one frame per seed, in the order of their ends."""
+    own = episodes[episodes["row"] == row].sort_values(["seed", "last_step"], kind="stable")
     return [run for _, run in own.groupby("seed")]
 
 
@@ -185,117 +285,22 @@ def extent(count: int) -> tuple[float, float]:
     return (0.25, 0.75) if count >= 4 else (0.0, 1.0)
 
 
-def first_lasting_snapshot(evaluations: pd.DataFrame, headline: Headline) -> tuple[float, float]:
-    """Env steps and seconds of training after which one run holds its goal for good; nan if never.
+# ---- what a film and a picture of paths show
 
-    They are those of the first snapshot from which on every snapshot holds its goal. Few
-    episodes judge a snapshot, and even an untrained network can pass them by luck.
+
+def shown_runs(
+    runs: pd.DataFrame, evaluations: pd.DataFrame, headline: Headline
+) -> tuple[Mapping[str, int], int]:
+    """A seed of each row, and an episode.
+
+    Of a row's seeds the middle one, by the steady state in the final evaluation (of an even number
+    the better of the two in the middle); of the episodes of that evaluation the one that starts
+    furthest from its goal.
     """
-    # A crash, or a value that is missing, must not vanish in a mean that skips it.
-    never = -np.inf if headline.high else np.inf
-    crashed = headline.crashed(evaluations) & (not headline.counts_crashes)
-    steady = evaluations["steady"].fillna(never).mask(crashed, never)
-    snapshots = evaluations.assign(steady=steady).groupby("env_steps")
-    misses = ~headline.holds(snapshots["steady"].mean().to_numpy())
-    lasting = snapshots["seconds"].max()[~np.logical_or.accumulate(misses[::-1])[::-1]]
-    return next(((float(s), float(t)) for s, t in lasting.items()), (math.nan, math.nan))
-
-
-def final_evaluations(evaluations: pd.DataFrame) -> pd.DataFrame:
-    """The evaluation episodes of each run's last snapshot (the largest `env_steps`)."""
-    last = evaluations.groupby(["agent", "seed"])["env_steps"].transform("max")
-    return evaluations[evaluations["env_steps"] == last]
-
-
-def final_per_run(evaluations: pd.DataFrame, headline: Headline) -> pd.DataFrame:
-    """One row per run (agent, seed): the means over the episodes of its final evaluation.
-
-    `settling_time` is the mean over the episodes that settled (nan if none did); `episodes`,
-    `settled` and `crashed` count them. `held`: whether its mean steady state holds the goal, with
-    a value in every episode and without a crash that this does not count.
-    """
-    final = final_evaluations(evaluations)
-    # Files leave a crash's settling time empty; a value there would be a mistake.
-    crashed = headline.crashed(final)
-    settling_time = final["settling_time"].mask(crashed)
-    missing = final["steady"].isna()
-    final = final.assign(settling_time=settling_time, missing=missing, crashed=crashed)
-    rows = final.groupby(["agent", "seed"], sort=True).agg(
-        **{name: (name, "mean") for name in _MEASURES},
-        episodes=("episode", "size"),
-        settled=("settling_time", "count"),
-        crashed=("crashed", "sum"),
-        missing=("missing", "sum"),
-    ).reset_index()  # fmt: skip
-    whole = ((rows["crashed"] == 0) | headline.counts_crashes) & (rows.pop("missing") == 0)
-    return rows.assign(held=headline.holds(rows["steady"].to_numpy()) & whole)
-
-
-def shown_runs(evaluations: pd.DataFrame, headline: Headline) -> tuple[dict[str, int], int]:
-    """What a film and a picture of paths show: a seed of each agent, and an episode.
-
-    Of an agent's seeds the middle one, by the steady state in the final evaluation (of an even
-    number the better of the two in the middle); of the episodes of that evaluation the one that
-    starts furthest from its goal.
-    """
-    final = final_per_run(evaluations, headline)
+    seeds: dict[str, int] = {}
+    for row, own in runs.groupby("row", sort=False):
+        order = own.sort_values("steady", ascending=not headline.high, kind="stable")
+        seeds[str(row)] = int(order["seed"].iloc[(len(order) - 1) // 2])
     shown = final_evaluations(evaluations)
     starts = headline.size(shown["start"].to_numpy())
-    seeds = {}
-    for agent in sort_agents(final["agent"]):
-        runs = final[final["agent"] == agent]
-        runs = runs.sort_values("steady", ascending=not headline.high, kind="stable")
-        seeds[agent] = int(runs["seed"].iloc[(len(runs) - 1) // 2])
     return seeds, int(shown["episode"].iloc[int(np.argmax(starts))])
-
-
-def run_label(evaluations: pd.DataFrame, agent: str, seed: int) -> str:
-    """Name of an agent's run: with its seed where there are others."""
-    several = evaluations.loc[evaluations["agent"] == agent, "seed"].nunique() > 1
-    return agent_label(agent) + (f", seed {seed}" if several else "")
-
-
-def results_table(
-    evaluations: pd.DataFrame,
-    runs: pd.DataFrame,
-    headline: Headline,
-    bounds: Mapping[str, float] | None = None,
-) -> pd.DataFrame:
-    """Tabulate the final evaluations and the training of all agents.
-
-    Args:
-        evaluations: As of `results.Results`, and so are `runs` and `headline`.
-        bounds: Mean returns that no agent reached but physics or idleness gives, by name.
-
-    Returns:
-        One row per agent, then one per bound, indexed by `agent`. For each of steady,
-        settling_time (s), overshoot and return: the interquartile mean over seeds, and `_low` and
-        `_high` of its 95 % interval. `held`: seeds that hold the goal; `worst`: the worst seed's
-        steady state. Counts: seeds, episodes, settled, crashed. For agents that were trained:
-        env_steps_to_reach and seconds_to_reach (interquartile mean over the `reached` of `seeds`
-        seeds that hold the goal for good) and steps_per_second. A bound has a return alone.
-    """
-    final = final_per_run(evaluations, headline)
-    rows: dict[str, dict[str, float]] = {}
-    for agent in sort_agents(evaluations["agent"]):
-        own = final[final["agent"] == agent]
-        row: dict[str, float] = {"seeds": len(own)}
-        for name in _MEASURES:
-            row[name] = iqm(own[name])
-            row[f"{name}_low"], row[f"{name}_high"] = bootstrap_interval(own[name])
-        row["held"] = math.nan if headline.held is None else own["held"].sum()
-        row["worst"] = own["steady"].agg("min" if headline.high else "max")
-        row |= own[["episodes", "settled", "crashed"]].sum().to_dict()
-        trained = runs[(runs["agent"] == agent) & (runs["env_steps"] > 0)]
-        row["reached"], steps, seconds = math.nan, np.empty(0), np.empty(0)
-        if len(trained) and headline.held is not None:
-            seeds = evaluations[evaluations["agent"] == agent].groupby("seed")
-            steps, seconds = np.array([first_lasting_snapshot(run, headline) for _, run in seeds]).T
-            row["reached"] = np.isfinite(steps).sum()
-        row |= {"env_steps_to_reach": iqm(steps), "seconds_to_reach": iqm(seconds)}
-        row["steps_per_second"] = iqm(trained["steps_per_second"])
-        rows[agent] = row
-    for name, value in (bounds or {}).items():
-        rows[name] = {**dict.fromkeys(_COUNTS, 0), "return": value}
-    table = pd.DataFrame.from_dict(rows, orient="index").rename_axis("agent")
-    return table.astype(dict.fromkeys(_COUNTS, "int64"))

@@ -1,375 +1,307 @@
-"""The files of a comparison: their names, their columns, writing and reading them.
+"""The files of a study: their names and columns, writing and reading them.
 
-`rotorgram compare` writes one folder. Everything that is drawn, tabulated or judged is read back
-from it, so these column tables are the contract between the side that trains and the side that
-reports.
+A study writes one folder. Everything that is drawn, tabulated or judged is read back from it.
 
 | file | one row per |
 |---|---|
-| `config.json` | (the comparison's configuration, the env's spec, versions and machine) |
-| `episodes.csv` | training episode |
-| `steps.parquet` | environment step of training and of the final evaluation |
-| `evaluations.csv` | deterministic evaluation episode of a policy snapshot |
-| `runs.csv` | training run (agent and seed) |
-| `positions.parquet` | drone and control step of the final evaluation, where a world has several |
+| `config.json` | (the study, the spec of each row's env, versions and machine) |
+| `runs.csv` | run, that is row and seed: `metrics.measure_run` and the times of its training |
+| `evaluations.parquet` | deterministic evaluation episode of a policy snapshot |
+| `episodes.parquet` | training episode |
+| `steps.parquet` | env step of training and of the final evaluation, if the study keeps steps |
+| `positions.parquet` | drone and control step of the final evaluation, if a world has several |
 
-The column of the headline metric has the metric's own name, such as `elevation_error`; its unit
-stands in `config.json`. In data frames its name says what it is: `steady`
-(mean size in the last quarter of an evaluation episode), `mean_size` (over a training episode) or
-`value` (after a step).
+An unfinished study has a folder `parts` with a folder for each run that is done. All tables begin
+with the columns `row` and `seed`. A size or value is that of the row's headline metric.
 """
 
 import json
 import os
 import platform
 import shutil
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import pandas as pd
 import pyarrow as pa
-import pyarrow.dataset as pads
 import pyarrow.parquet as pq
 
 from ..agents.checkpoints import software_versions, write_whole
-from ..agents.episodes import Episode
 from ..envs.spec import EnvSpec, SpecError
-from ..flights.trajectories import Trajectory
 from ..models.errors import InputError
-from .metrics import Headline, overshoot, settling_time, steady_state
-from .swarms import GOAL, POSITION
+from .metrics import Headline
+from .settings import Row, Study
 
 CONFIG_FILE: Final = "config.json"
-EPISODES_FILE: Final = "episodes.csv"
-STEPS_FILE: Final = "steps.parquet"
-EVALUATIONS_FILE: Final = "evaluations.csv"
-RUNS_FILE: Final = "runs.csv"
-POSITIONS_FILE: Final = "positions.parquet"
+PARTS: Final = "parts"
+CHECKPOINTS: Final = "checkpoints"
 
-CONFIG_KEYS: Final = ("created", "command", "preset", "seeds", "env_steps", "spec", "vehicle",
-                      "agents", "versions", "machine")  # fmt: skip
+COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
+    "runs": (
+        "row", "seed", "env_steps", "seconds", "steps_per_second",
+        "steady", "settling_time", "overshoot", "return", "episodes", "settled", "crashed", "held",
+        "env_steps_to_hold", "seconds_to_hold",
+    ),
+    "evaluations": (
+        "row", "seed",
+        "env_steps", "seconds",  # of training behind the snapshot; s of wall time
+        "episode", "length", "return",
+        "start",  # the metric before the first step
+        "steady",  # mean size in the last quarter
+        "settling_time",  # s; missing if the error never settled
+        "overshoot",  # missing if the metric has no sign
+        "terminated",
+    ),
+    "episodes": (
+        "row", "seed", "episode",
+        "first_step", "last_step",  # env steps of the run, of all drones, at start and end
+        "length", "return",
+        "mean_size",  # mean size of the metric
+        "terminated", "truncated",
+        "seconds",  # training wall time when the episode ended
+    ),
+    "steps": (
+        "row", "seed",
+        "phase",  # "train" or "evaluation"
+        "episode",  # within the run; -1: one that the end of training cut
+        "step",  # of the run for train, of the episode for evaluation; from 1
+        "value", "reward",
+        "thrust",  # mean over the rotors, N
+    ),
+    "positions": ("row", "seed", "episode", "drone", "step", "X", "Y", "Z",
+                  "goal_X", "goal_Y", "goal_Z"),
+}  # fmt: skip
+"""Columns of each table; `evaluations` and `episodes` may have more, of what was drawn."""
 
-EPISODE_COLUMNS: Final[Mapping[str, str]] = {
-    "agent": "str",
-    "seed": "int64",
-    "episode": "int64",
-    "first_step": "int64",  # env steps of the run, of all drones, before the episode began
-    "last_step": "int64",  # and when it ended
-    "length": "int64",  # control steps
-    "return": "float64",
-    "mean_size": "float64",  # in the file under the metric's name: mean size, metric's unit
-    "terminated": "bool",
-    "truncated": "bool",
-    "seconds": "float64",  # training wall time when the episode ended
-}
+_COUNTS: Final = ("seed", "env_steps", "episodes", "settled", "crashed", "held")
 
-EVALUATION_COLUMNS: Final[Mapping[str, str]] = {
-    "agent": "str",
-    "seed": "int64",
-    "env_steps": "int64",  # training behind the snapshot
-    "seconds": "float64",  # training wall time behind the snapshot
-    "episode": "int64",
-    "length": "int64",  # control steps
-    "return": "float64",
-    "start": "float64",  # the metric before the first step
-    "steady": "float64",  # in the file under the metric's name: mean size in the last quarter
-    "settling_time": "float64",  # s; empty if the error never settled
-    "overshoot": "float64",  # metric's unit; empty if the metric has no sign
-    "terminated": "bool",
-}
-
-RUN_COLUMNS: Final[Mapping[str, str]] = {
-    "agent": "str",
-    "seed": "int64",
-    "env_steps": "int64",
-    "seconds": "float64",
-    "steps_per_second": "float64",
-}
-
-POSITION_SCHEMA: Final = pa.schema(
-    {
-        "agent": pa.dictionary(pa.int32(), pa.string()),
-        "seed": pa.int32(),
-        "episode": pa.int32(),
-        "drone": pa.int32(),  # its place in the spec's `agents`
-        "step": pa.int32(),  # 0 is the start
-        **dict.fromkeys((*POSITION, *GOAL), pa.float32()),  # paper's frame, m
-    }
-)
-"""Columns of `positions.parquet`."""
-
-_TABLES: Final = {
-    EPISODES_FILE: EPISODE_COLUMNS,
-    EVALUATIONS_FILE: EVALUATION_COLUMNS,
-    RUNS_FILE: RUN_COLUMNS,
-}
+Tables = Mapping[str, pd.DataFrame]
+"""Tables by name."""
 
 
 class ResultsError(InputError):
     """A file of results is missing or is not what it should be."""
 
 
-def _in_file(column: str, metric: str) -> str:
-    return metric if column in ("mean_size", "steady", "value") else column
-
-
-def step_schema(metric: str) -> pa.Schema:
-    """Columns of `steps.parquet`, the headline metric by its name."""
-    columns = {
-        "agent": pa.dictionary(pa.int32(), pa.string()),
-        "seed": pa.int32(),
-        "phase": pa.dictionary(pa.int32(), pa.string()),  # "train" or "evaluation"
-        "episode": pa.int32(),  # within the run; -1: one that the end of training cut
-        "step": pa.int32(),  # of the run for train, of the episode for evaluation; from 1
-        metric: pa.float32(),
-        "reward": pa.float32(),
-        "thrust": pa.float32(),  # mean over the rotors, N
-    }
-    return pa.schema(columns)
-
-
-# ---- config.json
-
-
-def write_config(
-    folder: Path, command: str, spec: EnvSpec, vehicle: str | None, content: Mapping[str, Any]
-) -> None:
-    """Write `config.json`: the user's command, the env's spec, the path of its vehicle, and
-    the settings of the comparison or the sweep, with which all of `CONFIG_KEYS` are there.
-    """
-    about = {"spec": json.loads(spec.to_json()), "vehicle": vehicle}
-    write_settings(folder, command, {**content, **about})
-
-
-def write_settings(folder: Path, command: str, content: Mapping[str, Any]) -> None:
-    """Write `config.json`: the user's command, settings, versions and machine."""
-    whole = {
-        "created": datetime.now(UTC).isoformat(timespec="seconds"),
-        "command": command,
-        **content,
-        "versions": software_versions(),
-        "machine": machine(),
-    }
-    write_whole(folder / CONFIG_FILE, (json.dumps(whole, indent=2) + "\n").encode())
-
-
-def machine() -> dict[str, Any]:
-    """Machine and software on which times depend."""
-    cores = os.cpu_count()
-    return {"platform": platform.platform(), "processor": platform.machine(), "cores": cores}
-
-
-def read_config(folder: Path | str) -> dict[str, Any]:
-    """Read `config.json` and check that the keys of `CONFIG_KEYS` are there."""
-    config = content_of(folder)
-    _check_names(Path(folder) / CONFIG_FILE, "key", CONFIG_KEYS, config)
-    return config
-
-
-def content_of(folder: Path | str) -> dict[str, Any]:
-    """Content of any `config.json`. Raises `ResultsError` if there is none."""
-    path = _existing(folder, CONFIG_FILE)
-    try:
-        return dict(json.loads(path.read_text(encoding="utf-8")))
-    except (TypeError, ValueError) as error:
-        raise ResultsError(f"{path} is not JSON, or no object: {error}") from error
-
-
-def read_spec(folder: Path | str) -> EnvSpec:
-    """The env's spec from `config.json`. Raises `ResultsError`."""
-    try:
-        return EnvSpec.from_json(json.dumps(read_config(folder)["spec"]))
-    except SpecError as error:
-        raise ResultsError(f"{Path(folder) / CONFIG_FILE}: {error}") from None
-
-
 # ---- writing
 
 
-Rows = Mapping[str, list[dict[str, Any]]]
-"""Rows by the name of their file."""
+def write_config(folder: Path, command: str, study: Study, specs: Mapping[str, EnvSpec]) -> None:
+    """Write `config.json`: the user's command, the study, the spec of each row's env."""
+    content = {
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
+        "command": command,
+        "study": study.to_dict(),
+        "specs": {name: json.loads(spec.to_json()) for name, spec in specs.items()},
+        "versions": software_versions(),
+        "machine": machine(),
+    }
+    write_whole(folder / CONFIG_FILE, (json.dumps(content, indent=2) + "\n").encode())
 
 
-def write_part(
-    part: Path,
-    metric: str,
-    rows: Rows,
-    steps: list[pa.Table],
-    positions: pd.DataFrame | None = None,
-) -> None:
-    """Write what one run gave: a folder that is there whole or not at all."""
-    unfinished = part.with_name(f".{part.name}")
-    unfinished.mkdir(parents=True)
-    for name, columns in _TABLES.items():
-        given = rows.get(name, [])
-        drawn = [key for key in (given[0] if given else ()) if key.startswith("drawn_")]
-        table = pd.DataFrame(given, columns=[*columns, *drawn])
-        table.columns = [*(_in_file(column, metric) for column in columns), *drawn]
-        table.to_csv(unfinished / name, index=False)
-    pq.write_table(pa.concat_tables(steps), unfinished / STEPS_FILE, compression="zstd")
-    if positions is not None:
-        table = pa.Table.from_pandas(positions, POSITION_SCHEMA, preserve_index=False)
-        pq.write_table(table, unfinished / POSITIONS_FILE, compression="zstd")
-    unfinished.rename(part)
-
-
-def join_parts(parts: Path, folder: Path, metric: str) -> None:
-    """Make the tables of a comparison out of the parts of its runs, and remove these."""
-    names = sorted(p.name for p in parts.iterdir() if not p.name.startswith("."))
-    for table in _TABLES:
-        lines = [(parts / name / table).read_text().splitlines(keepends=True) for name in names]
-        body = [line for part in lines for line in part[1:]]
-        header = max((part[0] for part in lines), key=len)  # one without rows lacks what was drawn
-        (folder / table).write_text("".join([header, *body]))
-    for file, schema in ((STEPS_FILE, step_schema(metric)), (POSITIONS_FILE, POSITION_SCHEMA)):
-        if not (parts / names[0] / file).exists():  # one drone has no positions
-            continue
-        with pq.ParquetWriter(folder / file, schema, compression="zstd") as writer:
-            for name in names:
-                writer.write_table(pq.read_table(parts / name / file, schema=schema))
-    # Whole or not at all: a half-removed part would look like one to resume from.
-    shutil.rmtree(parts.rename(parts.with_name(f".{parts.name}")))
-
-
-def episode_row(episode: Episode, num_envs: int, env_steps: int) -> dict[str, Any]:
-    """A training episode as a row of `episodes.csv`, without agent and seed."""
-    # While one drone flies a step, each of the others does.
-    last = min(episode.first_step + episode.length * num_envs, env_steps)
-    return {**asdict(episode), "return": episode.total_reward, "last_step": last}
-
-
-def evaluation_row(trajectory: Trajectory, headline: Headline) -> dict[str, Any]:
-    """A trajectory as a row of `evaluations.csv`, but for the columns that name the run.
-
-    What was drawn for the episode follows in columns of its own.
-    """
-    values = trajectory.headline
-    steady = steady_state(headline.size(values[1:]), final=headline.final)
-    settled = np.nan
-    crashed = trajectory.terminated and not (headline.final and headline.holds([steady]))
-    if headline.settles and not crashed:
-        settled = settling_time(values, trajectory.spec.control_period, headline.settled or 0.0)
-    specs = [array for array in trajectory.spec.telemetry if array.name == "drawn"]
-    told = [trajectory.telemetry[array.name][0].tolist() for array in specs]
-    drawn = dict(zip(specs[0].components, told[0], strict=True)) if specs else {}
+def machine() -> dict[str, Any]:
+    """Machine on which times depend."""
     return {
-        "episode": trajectory.episode,
-        "length": len(trajectory),
-        "return": float(trajectory.rewards.sum()),
-        "start": float(values[0]),
-        "steady": steady,
-        "settling_time": settled,
-        "overshoot": overshoot(values) if headline.signed else np.nan,
-        "terminated": trajectory.terminated,
-        **drawn,
+        "platform": platform.platform(),
+        "processor": platform.machine(),
+        "cores": os.cpu_count(),
     }
 
 
-def step_table(metric: str, **columns: Any) -> pa.Table:
-    """Rows of `steps.parquet`: columns but `step`, the metric's as `value`; one value or (T,)."""
-    columns["step"] = np.arange(1, len(columns["reward"]) + 1)
-    frame = pd.DataFrame({_in_file(name, metric): column for name, column in columns.items()})
-    table = pa.Table.from_pandas(frame, step_schema(metric), preserve_index=False)
-    return table.replace_schema_metadata()
+def part_name(row: Row, seed: int) -> str:
+    """Name of the files of a run."""
+    letters = (letter if letter.isalnum() or letter in ".=+_" else "-" for letter in row.name)
+    words = "".join(letters).strip("-").lower()
+    return f"{words}-seed{seed}"
+
+
+def checkpoint_file(folder: Path, row: Row, seed: int) -> Path:
+    """The checkpoint of a run."""
+    return folder / CHECKPOINTS / f"{part_name(row, seed)}.safetensors"
+
+
+def write_part(folder: Path, row: Row, seed: int, tables: Tables) -> None:
+    """Write what one run gave: a folder that is there whole or not at all."""
+    part = folder / PARTS / part_name(row, seed)
+    unfinished = part.with_name(f".{part.name}")
+    unfinished.mkdir(parents=True)
+    for name, table in tables.items():
+        named = table.drop(columns=["row", "seed"], errors="ignore")
+        named.insert(0, "row", row.name)
+        named.insert(1, "seed", seed)
+        named.to_parquet(unfinished / f"{name}.parquet", index=False, compression="zstd")
+    unfinished.rename(part)
+
+
+def join_parts(folder: Path) -> None:
+    """Make the tables of a study out of the parts of its runs, and remove these."""
+    parts = folder / PARTS
+    for name in COLUMNS:
+        files = _parts_of(folder, name)
+        if not files:
+            continue
+        if name == "runs":
+            write_whole(folder / "runs.csv", _concatenated(files).to_csv(index=False).encode())
+            continue
+        schema = pa.unify_schemas([pq.read_schema(file).remove_metadata() for file in files])
+        with pq.ParquetWriter(folder / f"{name}.parquet", schema, compression="zstd") as writer:
+            for file in files:
+                writer.write_table(_with_schema(pq.read_table(file), schema))
+    # Whole or not at all: a half-removed part would look like one to resume from.
+    shutil.rmtree(parts.rename(parts.with_name(f".{PARTS}")))
+
+
+def _with_schema(table: pa.Table, schema: pa.Schema) -> pa.Table:
+    """The table with all columns of a schema; missing values in those that it lacks."""
+    columns = [
+        table[column.name].cast(column.type) if column.name in table.column_names
+        else pa.nulls(len(table), column.type)
+        for column in schema
+    ]  # fmt: skip
+    return pa.table(columns, schema=schema)
+
+
+def _parts_of(folder: Path, name: str) -> list[Path]:
+    return sorted((folder / PARTS).glob(f"[!.]*/{name}.parquet"))
+
+
+def _concatenated(files: list[Path]) -> pd.DataFrame:
+    return pd.concat([pd.read_parquet(file) for file in files], ignore_index=True)
 
 
 # ---- reading
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Results:
-    """Contents of a comparison's folder, without the step rows (see `read_steps`)."""
+    """The folder of a study; its tables are read when they are asked for.
 
-    config: dict[str, Any]
-    """`config.json`."""
-    spec: EnvSpec
-    headline: Headline
-    episodes: pd.DataFrame
-    """Training episodes, `EPISODE_COLUMNS`; one that the end of training cut is not there."""
-    evaluations: pd.DataFrame
-    """Evaluation episodes, `EVALUATION_COLUMNS`."""
-    runs: pd.DataFrame
-    """Training runs, `RUN_COLUMNS`."""
-    positions: pd.DataFrame | None = None
-    """Of several drones in the final evaluation, `POSITION_SCHEMA`."""
-
-
-def read_results(folder: Path | str) -> Results:
-    """Read all files of a comparison but the step rows. Raises `ResultsError`."""
-    spec = read_spec(folder)
-    headline = Headline.of(spec)
-    tables = {name.removesuffix(".csv"): _read_csv(folder, name, headline.name) for name in _TABLES}
-    positions = _read_positions(Path(folder) / POSITIONS_FILE)
-    return Results(config=read_config(folder), spec=spec, headline=headline, positions=positions,
-                   **tables)  # fmt: skip
-
-
-def _read_positions(path: Path) -> pd.DataFrame | None:
-    if not path.is_file():
-        return None
-    try:
-        table = pq.read_table(path)
-    except pa.ArrowInvalid as error:
-        raise ResultsError(f"{path} is not a Parquet file: {error}") from error
-    _check_names(path, "column", POSITION_SCHEMA.names, table.schema.names)
-    frame: pd.DataFrame = table.unify_dictionaries().to_pandas()
-    return frame
-
-
-def read_steps(
-    folder: Path | str,
-    metric: str,
-    phase: str,
-    columns: Iterable[str] = ("agent", "seed", "episode", "step", "value"),
-    max_rows: int | None = None,
-) -> pd.DataFrame:
-    """Read some columns of one phase of `steps.parquet`, "train" or "evaluation"; others are not
-    read from the disk. The column of the headline metric, which is given by name, becomes `value`.
-
-    Of more than `max_rows` rows about so many are kept, picked at random but always the same ones:
-    a stride that divides the episode length would show the same moments of every episode.
+    Raises `ResultsError` for a file that is missing or not what it should be.
     """
-    path = _existing(folder, STEPS_FILE)
+
+    folder: Path
+    config: Mapping[str, Any]
+    """`config.json`."""
+    study: Study
+    specs: Mapping[str, EnvSpec]
+    """Of each row's env, by the row's name."""
+
+    @classmethod
+    def read(cls, folder: Path | str) -> "Results":
+        """Raises `ResultsError`."""
+        path = Path(folder) / CONFIG_FILE
+        if not path.is_file():
+            raise ResultsError(
+                f"{folder}: expected the folder of a study, got one without {CONFIG_FILE}"
+            )
+        try:
+            config = json.loads(path.read_text(encoding="utf-8"))
+            study = Study.from_dict(f"{path}: study", config["study"])
+            specs = {
+                name: EnvSpec.from_json(json.dumps(spec)) for name, spec in config["specs"].items()
+            }
+        except (AttributeError, KeyError, TypeError, ValueError, SpecError) as error:
+            text = str(error) if isinstance(error, InputError) else repr(error)
+            raise ResultsError(f"{path}: expected the settings of a study, got: {text}") from None
+        return cls(folder=Path(folder), config=config, study=study, specs=specs)
+
+    def headline(self, row: Row) -> Headline:
+        """The metric that decides in the row's env."""
+        return Headline.of(self.specs[row.name])
+
+    @property
+    def finished(self) -> bool:
+        """Whether all runs are done."""
+        return not (self.folder / PARTS).exists() and (self.folder / "runs.csv").exists()
+
+    @cached_property
+    def runs(self) -> pd.DataFrame:
+        """Of the runs that are done, in the order of the rows and seeds."""
+        path = self.folder / "runs.csv"
+        if path.exists():
+            runs = _read_csv(path)
+        elif files := _parts_of(self.folder, "runs"):
+            runs = _concatenated(files)
+        else:
+            return pd.DataFrame(columns=list(COLUMNS["runs"]))
+        _check_columns(path, "runs", list(runs.columns))
+        wanted = {(row.name, seed) for row, seed in self.study.runs().values()}
+        found = list(zip(runs["row"], runs["seed"], strict=True))
+        if len(set(found)) < len(found) or not wanted.issuperset(found):
+            raise ResultsError(f"{path}: expected each run of the study once, got others")
+        order = {row.name: place for place, row in enumerate(self.study.rows)}
+        return runs.sort_values(
+            ["row", "seed"], key=lambda values: values.map(order).fillna(values), ignore_index=True
+        )
+
+    @cached_property
+    def evaluations(self) -> pd.DataFrame:
+        """Evaluation episodes."""
+        return self._table("evaluations")
+
+    @cached_property
+    def episodes(self) -> pd.DataFrame:
+        """Training episodes; one that the end of training cut is not there."""
+        return self._table("episodes")
+
+    @cached_property
+    def positions(self) -> pd.DataFrame:
+        """Of the drones of worlds of several in the final evaluation."""
+        return self._table("positions")
+
+    def steps(self, phase: str, max_rows: int | None = None) -> pd.DataFrame:
+        """Steps of one phase, "train" or "evaluation".
+
+        Of more than `max_rows` rows about so many are kept, picked at random but always the same
+        ones: a stride that divides the episode length would show the same moments of every episode.
+        """
+        files = self._files("steps")
+        if not files:
+            return pd.DataFrame(columns=list(COLUMNS["steps"]))
+        table = pa.concat_tables(
+            pq.read_table(file, filters=[("phase", "==", phase)]) for file in files
+        )
+        if max_rows is not None and max_rows < len(table):
+            kept = np.random.default_rng(0).random(len(table)) < max_rows / len(table)
+            table = table.filter(kept)
+        frame: pd.DataFrame = table.to_pandas()
+        return frame
+
+    def _files(self, name: str) -> list[Path]:
+        path = self.folder / f"{name}.parquet"
+        return [path] if path.exists() else _parts_of(self.folder, name)
+
+    def _table(self, name: str) -> pd.DataFrame:
+        files = self._files(name)
+        if not files:
+            return pd.DataFrame(columns=list(COLUMNS[name]))
+        try:
+            table = _concatenated(files)
+        except pa.ArrowInvalid as error:
+            raise ResultsError(f"{files[0]}: expected a Parquet file: {error}") from None
+        _check_columns(files[0], name, list(table.columns))
+        return table
+
+
+def _read_csv(path: Path) -> pd.DataFrame:
     try:
-        dataset = pads.dataset(path, format="parquet")
-    except pa.ArrowInvalid as error:
-        raise ResultsError(f"{path} is not a Parquet file: {error}") from error
-    whole = step_schema(metric)
-    _check_names(path, "column", whole.names, dataset.schema.names)
-    names = [_in_file(column, metric) for column in columns]
-    table = dataset.to_table(columns=names, filter=pads.field("phase") == phase)
-    if max_rows is not None and max_rows < (count := pq.read_metadata(path).num_rows):
-        table = table.filter(np.random.default_rng(0).random(len(table)) < max_rows / count)
-    table = table.cast(pa.schema([whole.field(name) for name in names]))
-    frame: pd.DataFrame = table.unify_dictionaries().to_pandas()
-    return frame.rename(columns={metric: "value"})
-
-
-def _existing(folder: Path | str, name: str) -> Path:
-    path = Path(folder) / name
-    if not path.is_file():
-        wanted = "the folder of a comparison, a sweep or a board"
-        raise ResultsError(f"{folder}: expected {wanted}, got one without {name}")
-    return path
-
-
-def _check_names(path: Path, kind: str, wanted: Iterable[str], present: Iterable[str]) -> None:
-    if missing := [name for name in wanted if name not in set(present)]:
-        lacks = f"{kind}{'s' * (len(missing) > 1)} {', '.join(missing)}"
-        has = ", ".join(present) or "none"
-        raise ResultsError(f"{path} lacks the {lacks}; it has {has}. Is it of a comparison?")
-
-
-def _read_csv(folder: Path | str, name: str, metric: str) -> pd.DataFrame:
-    path, columns = _existing(folder, name), _TABLES[name]
-    types = {_in_file(column, metric): kind for column, kind in columns.items()}
-    try:
-        frame = pd.read_csv(path, dtype=types)
+        text = pd.read_csv(path, dtype=str)
+        # By way of texts, so that every number keeps its bits.
+        types = {name: int if name in _COUNTS else float for name in text.columns[1:]}
+        return text.astype(types)
     except ValueError as error:  # an empty file, or a value that is not of the column's type
-        raise ResultsError(f"{path} cannot be read: {error}") from error
-    _check_names(path, "column", types, list(frame.columns))
-    return frame[list(types)].set_axis(list(columns), axis=1)
+        raise ResultsError(f"{path}: expected the runs of a study: {error}") from None
+
+
+def _check_columns(path: Path, name: str, present: list[str]) -> None:
+    missing = [column for column in COLUMNS[name] if column not in present]
+    if missing:
+        raise ResultsError(
+            f"{path}: expected the columns {', '.join(COLUMNS[name])}, got one without "
+            f"{', '.join(missing)}"
+        )

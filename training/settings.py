@@ -1,14 +1,15 @@
-"""Settings of a run, a comparison and a sweep: checked on construction, before anything flies.
+"""Settings of a run and of a study: checked on construction, before anything flies.
 
 Imports neither torch nor pandas.
 """
 
 import json
+import tomllib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from hashlib import blake2b
-from itertools import product
-from typing import Any, Final
+from pathlib import Path
+from typing import Any, Final, Literal
 
 from ..agents import CONTROLLERS
 from ..agents.presets import (
@@ -21,11 +22,15 @@ from ..agents.presets import (
     preset,
 )  # fmt: skip
 from ..envs import config as envs
-from ..envs.registry import env_spec, is_known, task_type
-from ..flights.executors import WorkersConfig
+from ..envs.registry import env_spec, is_known, load, task_type
+from ..flights.trajectories import EpisodeSet
 from ..models import BACKENDS, Backend
 from ..models.errors import InputError, expect
 
+MIN_FLIGHTS: Final = 200
+"""Evaluation flights of each row of a study, over all its seeds."""
+BOARD: Final = Path(__file__).parent / "assets" / "baselines.toml"
+"""The rows of our own board."""
 _LONGEST_WORD: Final = 60  # characters of an option's value in a name
 
 
@@ -108,106 +113,20 @@ class Run(EnvConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunsConfig(WorkersConfig):
-    """Settings that comparisons and sweeps share, besides the env; flags of their commands."""
-
-    preset: PresetName = "tuned"
-    """Hyperparameters: the paper's, or ours."""
-    env_steps: int = 200_000
-    """Env steps of each training, of all its drones together; a learning rate that falls, falls
-    over all of them."""
-    num_envs: int = 1
-    """Drones that fly at the same time, in lock-step, in each training; by default one, or those of
-    one world."""
-    episodes: int = 20
-    """Evaluation episodes of each final policy."""
-    seeds: int = 5
-    """Number of seeds, the same for every agent or point."""
-    first_seed: int = 0
-    """The first of them."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class _ManyRuns(RunsConfig, EnvConfig):
-    """Base of comparisons and sweeps."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        EnvConfig.__post_init__(self)
-        self._check_counts("seeds", "env_steps", "episodes")
-        expect(self.first_seed >= 0, "first_seed", "0 or more", str(self.first_seed))
-        expect(env_spec(self.flown).headline, "env", "one that names a metric", self.env_id)
-
-    def _check_counts(self, *names: str) -> None:
-        for name in names:
-            value = getattr(self, name)
-            expect(value >= 1, name, "at least 1", str(value))
-
-    @property
-    def all_seeds(self) -> range:
-        """The seeds."""
-        return range(self.first_seed, self.first_seed + self.seeds)
-
-    def content(self, *algorithms: str) -> dict[str, Any]:
-        """What `config.json` has of it, but for the env; `read_content` reads it."""
-        names = ("preset", "env_steps", "num_envs", "backend")
-        content = {name: getattr(self, name) for name in names}
-        agents = {name: asdict(preset(name, self.preset, self.env_id)) for name in algorithms}
-        return {**content, "seeds": list(self.all_seeds), "agents": agents}
-
-    @staticmethod
-    def read_content(content: Mapping[str, Any]) -> dict[str, Any]:
-        """The settings that all have, from the content of a `config.json`."""
-        seeds, spec = content["seeds"], content["spec"]
-        kept = {name: content[name] for name in ("preset", "env_steps", "num_envs", "vehicle")}
-        kept |= {name: spec[name] for name in ("env_id", "options")}
-        kept |= {"backend": content.get("backend", "mujoco"), "drones": len(spec["agents"])}
-        return kept | {"seeds": len(seeds), "first_seed": seeds[0]}
-
-    def _run(self, algorithm: str, seed: int, **changes: Any) -> Run:
-        shared = {"env_steps": self.env_steps, "num_envs": self.num_envs, **self.training_env}
-        config = preset(algorithm, self.preset, self.env_id, **changes)
-        return Run(algorithm=algorithm, config=config, seed=seed, **shared)
-
-
-@dataclass(frozen=True, kw_only=True)
-class CompareConfig(_ManyRuns):
-    """Settings of a comparison and its workers."""
-
-    agents: tuple[str, ...] = ("vpg", "a2c", "sb3-a2c")
-    """Agents to train. The PID, or ORCA, is evaluated beside them where it can fly the env."""
-    snapshots: int = 10
-    """Policies kept during each training, for the learning curves."""
-    curve_episodes: int = 10
-    """Evaluation episodes of each of them."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._check_counts("snapshots", "curve_episodes")
-        expect(self.agents, "agents", "at least one")
-        once = len(set(self.agents)) == len(self.agents)
-        expect(once, "agents", "each once", ", ".join(self.agents))
-        self.runs()  # wrong names and numbers are told before anything is trained
-
-    def runs(self) -> list[Run]:
-        """Every training, in the order in which they start: SB3's first, which take longest."""
-        return [
-            self._run(agent, seed)
-            for agent in sorted(self.agents, key=lambda agent: not agent.startswith("sb3-"))
-            for seed in self.all_seeds
-        ]
-
-
-@dataclass(frozen=True, kw_only=True)
-class BoardRow(EnvConfig):
-    """A row of the baselines board: an agent on a task with a vehicle."""
+class Row:
+    """A row of a study: an agent on an env. A row of an algorithm has a training for each seed."""
 
     agent: str
-    """An algorithm, or a controller, which needs no training and has no seeds."""
-    backend: Backend | None = None  # type: ignore[assignment]  # never None once made
-    """What steps it in training; None: what the preset says. Flown and evaluated on `mujoco`."""
+    """An algorithm, or a controller, which is not trained."""
+    name: str = ""
+    """Unique in the study. Default: agent, preset, changes and env in words."""
+    env: EnvConfig = field(default_factory=EnvConfig)
+    backend: Backend | None = None
+    """What steps the drones in training; None: as the preset says. Evaluated is on `mujoco`."""
     preset: PresetName = "tuned"
-    """Hyperparameters of an algorithm."""
+    """Hyperparameters: the paper's, or ours."""
+    set: Mapping[str, Any] = field(default_factory=dict)
+    """Hyperparameters that differ from the preset's."""
     env_steps: int = 0
     """Env steps of each training, of all its drones together; 0: those of the preset."""
     num_envs: int = 0
@@ -215,140 +134,251 @@ class BoardRow(EnvConfig):
 
     def __post_init__(self) -> None:
         known = (*CONTROLLERS, *PRESETS)
-        expect(self.agent in known, "agent", f"one of {', '.join(known)}", self.agent)
+        if self.agent not in known:
+            raise InputError(f"agent: expected one of {', '.join(known)}, got {self.agent}")
+        env = self.env
         if self.controller:
-            usual: Any = {"options": {**self.brought, **self.options}, "backend": "mujoco"}
-        else:
-            found = find_preset(self.agent, self.preset, self.env_id)
-            names = ("env_steps", "num_envs", "backend")
-            usual = {name: getattr(self, name) or getattr(found, name) for name in names}
-        for name, value in usual.items():
+            env = replace(env, options={**env.options, **self._brought_to(env)})
+        self._set(env=replace(env, backend="mujoco"), name=self.name or self._name_of(env))
+        if env_spec(env.flown).headline is None:
+            raise InputError(f"env_id: expected one that names a metric, got {env.env_id}")
+        if self.controller:
+            return
+        self._set_defaults()
+        try:
+            self.run(0)
+        except InputError as error:
+            raise InputError(f"{self.name}: {error}") from None
+
+    def _set(self, **values: Any) -> None:
+        for name, value in values.items():
             object.__setattr__(self, name, value)
-        super().__post_init__()
-        expect(is_known(self.env_id), "env_id", "a registered id", self.env_id)
-        expect(env_spec(self.flown).headline, "env_id", "one that names a metric", self.env_id)
+
+    def _brought_to(self, env: EnvConfig) -> dict[str, Any]:
+        """Options that the controller needs, where the env has the task's defaults."""
+        usual = EnvConfig(env_id=env.env_id).options
+        return {k: v for k, v in self.brought.items() if env.options.get(k) == usual.get(k)}
+
+    def _set_defaults(self) -> None:
+        found = find_preset(self.agent, self.preset, self.env.env_id)
+        drones = self.env.drones
+        usual = max(found.num_envs // drones, 1) * drones  # whole worlds
+        self._set(
+            env_steps=self.env_steps or found.env_steps,
+            num_envs=self.num_envs or usual,
+            backend=self.backend or found.backend,
+            set=json.loads(json.dumps(dict(self.set))),
+        )
+
+    def _name_of(self, env: EnvConfig) -> str:
+        words = [self.agent]
         if not self.controller:
-            try:  # wrong names and numbers are told before anything is trained
-                self.run(0)
-            except InputError as error:
-                raise InputError(f"{self.name}: {error}") from None
+            words.append(self.preset)
+        words += [f"{name}={_word(value)}" for name, value in self.set.items()]
+        return " ".join([*words, self._task_words(env)])
+
+    def _task_words(self, env: EnvConfig) -> str:
+        usual = {**EnvConfig(env_id=env.env_id).options, **self.brought}
+        words = [env.env_id.rpartition("/")[2]]
+        for name, value in env.options.items():
+            if value != usual.get(name):
+                words.append(f"{name}={_word(value)}")
+        if env.drones > 1:
+            words.append(f"of {env.drones}")
+        if env.vehicle:
+            words.append(f"with {env.vehicle}")
+        return " ".join(words)
+
+    @property
+    def default_name(self) -> str:
+        """Name of a row that is given none."""
+        return self._name_of(self.env)
+
+    @property
+    def task(self) -> str:
+        """The env in words: its name, options that are neither the task's defaults nor a
+        controller's, the vehicle.
+        """
+        return self._task_words(self.env)
 
     @property
     def controller(self) -> bool:
-        """Whether there is nothing to train."""
+        """Whether the agent is not trained."""
         return self.agent in CONTROLLERS
 
     @property
     def brought(self) -> Mapping[str, Any]:
-        """Options that a controller brings along."""
+        """Options of the env that a controller needs."""
         return CONTROLLERS[self.agent].options if self.controller else {}
 
     @property
-    def task(self) -> str:
-        """The env in words: its name, the options that are not the default nor a controller's, the
-        vehicle.
-        """
-        usual = envs.EnvConfig(env_id=self.env_id).flat_options()
-        usual |= self.brought
-        other = {name: value for name, value in self.options.items() if value != usual.get(name)}
-        words = [self.env_id.rpartition("/")[2]]
-        words += [f"{name}={_word(json.dumps(value))}" for name, value in other.items()]
-        words += [f"of {self.drones}"] if self.drones > 1 else []
-        words += [f"with {self.vehicle}"] if self.vehicle else []
-        return " ".join(words)
-
-    @property
-    def name(self) -> str:
-        """Of the row: agent, preset where there is one, and task."""
-        return " ".join([self.agent, *([] if self.controller else [self.preset]), self.task])
+    def config(self) -> Config:
+        """Hyperparameters of an algorithm."""
+        return preset(self.agent, self.preset, self.env.env_id, **self.set)
 
     def run(self, seed: int) -> Run:
         """The training of a seed."""
-        names = ("env_steps", "num_envs", "backend")
-        shared = {**{name: getattr(self, name) for name in names}, **self.env}
-        config = preset(self.agent, self.preset, self.env_id)
-        return Run(algorithm=self.agent, config=config, seed=seed, **shared)
+        settings = {**self.env.env, "backend": self.backend or "mujoco"}
+        return Run(
+            algorithm=self.agent, config=self.config, seed=seed, env_steps=self.env_steps,
+            num_envs=self.num_envs, **settings,
+        )  # fmt: skip
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON values that `from_dict` reads."""
+        content = {one.name: getattr(self, one.name) for one in fields(self)}
+        return {**content, "set": dict(self.set), "env": keywords_of(self.env)}
+
+    @classmethod
+    def from_dict(cls, where: str, table: Any, env: Mapping[str, Any] | None = None) -> "Row":
+        """A row from a table of TOML or JSON, whose `env` adds to the given keywords.
+
+        Raises `InputError`, whose sentence begins with `where`.
+        """
+        given = _checked(where, table, cls)
+        if "agent" not in given:
+            raise InputError(f"{where}: expected an agent, got none")
+        given["env"] = env_from({**(env or {}), **given.get("env", {})})
+        return cls(**given)
 
 
-def _word(text: str) -> str:
+def _word(value: Any) -> str:
     """A value for a name: without quotes, and of a long one, as a track, its digest."""
-    long = len(text) > _LONGEST_WORD
-    return blake2b(text.encode(), digest_size=4).hexdigest() if long else text.replace('"', "")
+    text = value if isinstance(value, str) else json.dumps(value)
+    if len(text) > _LONGEST_WORD:
+        return blake2b(text.encode(), digest_size=4).hexdigest()
+    return text.replace('"', "")
+
+
+def env_from(keywords: Mapping[str, Any]) -> EnvConfig:
+    """An env from flat keywords: `env_id`, `vehicle`, `drones`, and options. The module of an id
+    `module:Name-v0` is imported.
+    """
+    given = dict(keywords)
+    env_id = load(given.pop("env_id", EnvConfig().env_id))
+    named = {name: given.pop(name) for name in ("vehicle", "drones") if name in given}
+    return EnvConfig(env_id=env_id, options=given, **named)
+
+
+def keywords_of(env: EnvConfig) -> dict[str, Any]:
+    """The reverse of `env_from`."""
+    env_id = env.own_task or env.env_id
+    return {"env_id": env_id, "vehicle": env.vehicle, "drones": env.drones, **env.options}
+
+
+Kind = Literal["paper", "compare", "sweep", "benchmark"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class BenchmarkConfig(WorkersConfig):
-    """Settings of the baselines board and its workers."""
+class Study:
+    """Many runs: every row with every seed."""
 
-    rows: tuple[BoardRow, ...]
-    """What is trained and flown."""
-    seeds: int = 10
-    """Trainings of each row of an algorithm."""
-    first_seed: int = 5000
-    """The first of the seeds: by default none that a comparison or a sweep uses."""
-    snapshots: int = 20
-    """Policies kept during each training, for the steps and the time to the threshold."""
+    rows: tuple[Row, ...]
+    kind: Kind = "compare"
+    """paper: the paper's comparison, with its figures and verdicts. sweep: rows are ranked."""
+    seeds: int = 5
+    first_seed: int = 0
+    snapshots: int = 10
+    """Policies kept during each training, for the learning curves."""
     curve_episodes: int = 10
     """Evaluation episodes of each of them."""
-    episodes: int = 20
-    """Evaluation episodes of each final policy."""
+    episodes: int = 0
+    """Evaluation episodes of each final policy; 0: as many as make `MIN_FLIGHTS` of a row."""
+    evaluation: EpisodeSet = "final"
+    """Set of the episodes of the final evaluation."""
+    wire: bool = False
+    """Whether agents fly over UDP, each with a simulator process, or in process."""
+    keep_steps: bool = False
+    """Whether the results hold every step of training and final evaluation."""
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("seeds", "snapshots", "curve_episodes", "episodes"):
-            expect(getattr(self, name) >= 1, name, "at least 1", str(getattr(self, name)))
-        expect(self.first_seed >= 0, "first_seed", "0 or more", str(self.first_seed))
-        expect(self.rows, "row", "at least one", "none")
+        if not self.rows:
+            raise InputError("row: expected at least one, got none")
+        for name in ("seeds", "snapshots", "curve_episodes"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name}: expected at least 1, got {getattr(self, name)}")
+        for name in ("first_seed", "episodes"):
+            if getattr(self, name) < 0:
+                raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
         names = [row.name for row in self.rows]
-        twice = [name for name in names if names.count(name) > 1]
-        expect(not twice, "row", "each row once", f"{(twice or [''])[0]} twice")
+        for name in names:
+            if names.count(name) > 1:
+                raise InputError(f"row: expected each row once, got {name} twice")
+        if not self.episodes:
+            object.__setattr__(self, "episodes", max(20, -(-MIN_FLIGHTS // self.seeds)))
 
-    def runs(self) -> dict[str, tuple[BoardRow, int]]:
-        """Every run by name, a row and a seed: all rows with one seed, then with the next. A
-        controller flies once.
+    def runs(self) -> dict[str, tuple[Row, int]]:
+        """Every run by name, a row and a seed: all rows with one seed, then with the next.
+
+        So a study that is stopped has seen every row.
         """
         seeds = range(self.first_seed, self.first_seed + self.seeds)
-        return {
-            f"{row.name} seed {seed}": (row, seed)
-            for seed in seeds
-            for row in self.rows
-            if seed == self.first_seed or not row.controller
-        }
+        return {f"{row.name} seed {seed}": (row, seed) for seed in seeds for row in self.rows}
 
+    def to_dict(self) -> dict[str, Any]:
+        """JSON values that `from_dict` reads."""
+        content = {one.name: getattr(self, one.name) for one in fields(self)}
+        return {**content, "rows": [row.to_dict() for row in self.rows]}
 
-@dataclass(frozen=True, kw_only=True)
-class SweepConfig(_ManyRuns):
-    """Settings of a sweep and its workers. Its seeds are not those of a comparison."""
+    @classmethod
+    def from_dict(cls, where: str, content: Any) -> "Study":
+        """Raises `InputError`, whose sentence begins with `where`."""
+        given = _checked(where, content, cls)
+        rows = [
+            Row.from_dict(f"{where}: row {place}", table)
+            for place, table in enumerate(given.pop("rows", []), 1)
+        ]
+        return cls(rows=tuple(rows), **given)
 
-    algorithm: str
-    grid: Mapping[str, tuple[Any, ...]]
-    """Values of hyperparameters, by name: every combination is a point."""
-    seeds: int = 3
-    first_seed: int = 1000
+    @classmethod
+    def from_toml(cls, path: Path, defaults: Mapping[str, Any] | None = None) -> "Study":
+        """A study from a TOML file of settings and `[[row]]` tables; an `[env]` is of all rows.
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        expect(self.grid, "grid", "at least one hyperparameter", "none")
-        self.runs()  # wrong names and numbers are told before anything is trained
-        for name, values in self.grid.items():
-            expect(values, "grid", f"at least one value of {name}", "none")
-            for place, value in enumerate(values):
-                expect(value not in values[:place], "grid", f"each {name} once", f"{value!r} twice")
-
-    def points(self) -> list[dict[str, Any]]:
-        """Settings of every point; the value that is named last changes fastest."""
-        names, values = self.grid.keys(), product(*self.grid.values())
-        return [dict(zip(names, chosen, strict=True)) for chosen in values]
-
-    def runs(self) -> dict[str, tuple[int, Run]]:
-        """Every training by name, with its point: all points with one seed, then with the next.
-
-        So a sweep that is stopped has seen every point.
+        A file without `[[row]]` is one row, named as the file. Raises `InputError`.
         """
-        points = self.points()
-        words = [" ".join(f"{name}={value}" for name, value in one.items()) for one in points]
-        return {
-            f"{words[point]} seed {seed}": (point, self._run(self.algorithm, seed, **chosen))
-            for seed in self.all_seeds
-            for point, chosen in enumerate(points)
-        }
+        content = read_toml(path)
+        if "row" not in content:
+            content = {"row": [{"name": path.stem, **content}]}
+        env = content.pop("env", {})
+        tables = content.pop("row")
+        if type(tables) is not list:
+            raise InputError(f"{path}: row: expected [[row]] tables, got {tables!r:.80}")
+        given = _checked(f"{path}", content, cls)
+        rows = [
+            Row.from_dict(f"{path}: row {place}", table, env)
+            for place, table in enumerate(tables, 1)
+        ]
+        return cls(**{**(defaults or {}), "rows": tuple(rows), **given})
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Content of a TOML file. Raises `InputError`."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: expected a TOML file of rows: {error.strerror}") from None
+    except ValueError as error:
+        raise InputError(f"{path}: expected a TOML file of rows, got: {error}") from None
+
+
+_TYPES: Final = {
+    int: "a whole number", str: "a text", bool: "true or false", dict: "a table", list: "a list",
+}  # fmt: skip
+_TYPE_OF: Final = dict.fromkeys(
+    ("seeds", "first_seed", "snapshots", "curve_episodes", "episodes", "env_steps", "num_envs"), int
+) | {"wire": bool, "keep_steps": bool, "env": dict, "set": dict, "rows": list}
+
+
+def _checked(where: str, table: Any, kind: type[Row | Study]) -> dict[str, Any]:
+    """The table. Raises `InputError` unless each name is a field with a value of its type."""
+    if not isinstance(table, dict):
+        raise InputError(f"{where}: expected a table, got {table!r:.80}")
+    names = [one.name for one in fields(kind)]
+    for name, value in table.items():
+        if name not in names:
+            raise InputError(f"{where}: expected some of {', '.join(names)}, got {name!r}")
+        wanted = _TYPE_OF.get(name, str)
+        if type(value) is not wanted and not (name == "backend" and value is None):
+            expected = _TYPES[wanted]
+            raise InputError(f"{where}: {name}: expected {expected}, got {value!r:.80}")
+    return dict(table)

@@ -11,7 +11,6 @@ import pandas as pd
 
 from ..flights.distances import least
 from ..flights.trajectories import Trajectory
-from .metrics import Spread
 from .statistics import Floats, bootstrap_interval, iqm
 
 POSITION: Final = ("X", "Y", "Z")
@@ -47,50 +46,30 @@ def rows_of(flown: Sequence[Trajectory]) -> pd.DataFrame:
 
 
 def worlds(rows: pd.DataFrame) -> Iterator[tuple[tuple[str, int, int], World]]:
-    """The episodes in rows of `rows_of` with the columns `agent` and `seed`: agent, seed and number
+    """The episodes in rows of `rows_of` with the columns `row` and `seed`: row, seed and number
     of each, and its drones.
     """
-    for (agent, seed, episode), own in rows.groupby(["agent", "seed", "episode"], observed=True):
+    for (row, seed, episode), own in rows.groupby(["row", "seed", "episode"], observed=True):
         shape = int(own["step"].max()) + 1, int(own["drone"].max()) + 1, 6
         told = np.full(shape, np.nan)
         told[own["step"], own["drone"]] = own[[*POSITION, *GOAL]]
-        yield (str(agent), int(seed), int(episode)), World(told[..., :3], told[..., 3:])
-
-
-def distance_curves(rows: pd.DataFrame, control_period: float) -> dict[str, Spread]:
-    """Least distance between two drones over the time in an episode (s), by agent: interquartile
-    mean, lowest and highest of the episodes of all seeds that still have two.
-    """
-    found: dict[str, list[Floats]] = {}
-    for (agent, _, _), world in worlds(rows):
-        found.setdefault(agent, []).append(least(world.position))
-    curves = {}
-    for agent, ones in found.items():
-        table = np.full((len(ones), max(map(len, ones))), np.nan)
-        for row, one in zip(table, ones, strict=True):
-            row[: len(one)] = one
-        kept = np.flatnonzero(np.isfinite(table).any(axis=0))
-        if len(kept):
-            shown, x = table[:, kept], np.asarray(kept * control_period, float)
-            middle = np.array([iqm(column) for column in shown.T])
-            curves[agent] = Spread(x, middle, np.nanmin(shown, axis=0), np.nanmax(shown, axis=0))
-    return curves
+        yield (str(row), int(seed), int(episode)), World(told[..., :3], told[..., 3:])
 
 
 def least_distances(rows: pd.DataFrame) -> pd.DataFrame:
-    """Of each agent (the index) the least distance of a seed's evaluation, m: `least_distance`, the
+    """Of each row (the index) the least distance of a seed's evaluation, m: `least_distance`, the
     interquartile mean over seeds, and `_low` and `_high` of its 95 % interval.
     """
     found: dict[tuple[str, int], float] = {}
-    for (agent, seed, _), world in worlds(rows):
+    for (row, seed, _), world in worlds(rows):
         values = least(world.position)
         lowest = float(np.min(values[np.isfinite(values)], initial=np.inf))
-        found[agent, seed] = min(found.get((agent, seed), np.inf), lowest)
+        found[row, seed] = min(found.get((row, seed), np.inf), lowest)
     own = pd.Series(found).replace(np.inf, np.nan)
     table = {}
-    for agent, seeds in own.groupby(level=0):
+    for row, seeds in own.groupby(level=0):
         low, high = bootstrap_interval(seeds)
-        table[agent] = dict(zip(LEAST, (iqm(seeds), low, high), strict=True))
+        table[row] = dict(zip(LEAST, (iqm(seeds), low, high), strict=True))
     return pd.DataFrame.from_dict(table, orient="index")
 
 

@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 from rotorgram.agents import EpisodeLog, ResumeError, make_agent, preset
 from rotorgram.agents.rollouts import Collector, Rollout
-from rotorgram.cli._flags import parse
-from rotorgram.cli.compare import Compare
 from rotorgram.envs import LocalVectorEnv
-from rotorgram.training.settings import CompareConfig, Run
+from rotorgram.training.settings import Run
 from rotorgram.training.training import Training
 from swarms import RISE
 
@@ -181,10 +179,3 @@ def test_sb3_sees_zeros_of_one_that_is_out_until_its_world_ends() -> None:
         seen, rewards, *_ = log.step(np.array([[1.0], [0.0]]))
     assert (seen[0].tolist(), rewards[0]) == ([0.0, 0.0, 0.0], 0.0)
     assert seen[1, 2] == pytest.approx(10.0)
-
-
-def test_a_comparison_of_swarms_flies_one_world_unless_told() -> None:
-    words = ["--env", "rotorgram/Crossing-v0", "--drones", "4", "--agents", "ippo"]
-    for more, count in (([], 4), (["--num-envs", "8"], 8)):
-        command = parse(Compare, "rotorgram compare", [*words, *more])
-        assert CompareConfig(**command.settings(CompareConfig)).num_envs == count

@@ -6,6 +6,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from bounds import least_height_lost, recovery_bounds
 from pilot import Pilot, limited
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.loop import Loop, make_task
@@ -13,7 +14,6 @@ from rotorgram.envs.registry import env_spec
 from rotorgram.envs.tasks.recovery import RecoveryOptions
 from rotorgram.models import Vehicle
 from rotorgram.models.errors import InputError
-from rotorgram.training.bounds import least_height_lost, recovery_bounds
 from scipy.special import fresnel
 
 from flights import Shares, about, state_of

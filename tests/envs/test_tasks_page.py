@@ -6,6 +6,13 @@ from pathlib import Path
 import gymnasium as gym
 import pytest
 import rotorgram.envs  # noqa: F401
+from bounds import (
+    landing_time,
+    payload_time,
+    racing_time,
+    recovery_bounds,
+    waypoints_time,
+)
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec, task_type
 from rotorgram.envs.tasks.racing import RacingOptions
@@ -13,13 +20,6 @@ from rotorgram.envs.tasks.recovery import RecoveryOptions
 from rotorgram.envs.tasks.tracking import Tracking
 from rotorgram.envs.tasks.waypoints import WaypointsOptions
 from rotorgram.models import Vehicle
-from rotorgram.training.bounds import (
-    landing_time,
-    payload_time,
-    racing_time,
-    recovery_bounds,
-    waypoints_time,
-)
 
 PAGE = (Path(__file__).parents[2] / "docs" / "tasks.md").read_text(encoding="utf-8")
 ROWS = re.findall(r"^\| `([\w-]+)` \| .* \| `(\w+)` \| ([\dR+ ]+) \|", PAGE, re.MULTILINE)

@@ -21,9 +21,8 @@ from rotorgram.flights.trajectories import (
     fly,
     fly_episodes,
 )
-from rotorgram.training.metrics import Headline
+from rotorgram.training.metrics import Headline, measure_episode
 from rotorgram.training.pairs import socket_pair
-from rotorgram.training.results import evaluation_row
 from rotorgram.udp import RemoteVectorEnv, Simulator
 
 ELEVATION = "rotorgram/Elevation-v0"
@@ -90,7 +89,7 @@ def test_a_trajectory_is_what_the_env_tells() -> None:
     assert flown.rewards.tolist() == rewards
     assert flown.mean_thrust[0] == pytest.approx(49.0)
     assert [flown.step_at(s) for s in (-1.0, 0.0, 0.06, 0.07, 9.0)] == [0, 0, 3, 3, 25]
-    row = evaluation_row(flown, Headline.of(SPEC))
+    row = measure_episode(flown, Headline.of(SPEC))
     assert (row["episode"], row["length"], row["start"]) == (3, 25, errors[0])
     # A quarter of 25 steps is 6.
     assert row["steady"] == pytest.approx(np.mean(np.abs(errors[-6:])), rel=1e-12)

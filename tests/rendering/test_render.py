@@ -3,7 +3,6 @@
 import ctypes.util
 import json
 import logging
-import math
 import os
 import signal
 import subprocess
@@ -22,22 +21,14 @@ from PIL import Image
 from rotorgram.agents import PID
 from rotorgram.agents.checkpoints import load
 from rotorgram.cli import main
-from rotorgram.envs.config import EnvConfig
-from rotorgram.envs.registry import env_spec
 from rotorgram.flights import filming
 from rotorgram.flights.filming import Film, Shot, film
 from rotorgram.flights.recorded import recorded_trajectories
 from rotorgram.flights.trajectories import flown_trajectories
-from rotorgram.models import InputError
 from rotorgram.rendering import NoOpenGL
-from rotorgram.training.films import film_comparison
-from rotorgram.training.results import (
-    CONFIG_KEYS,
-    EPISODE_COLUMNS,
-    EVALUATION_COLUMNS,
-    RUN_COLUMNS,
-    write_config,
-)
+from rotorgram.training.films import film_study
+from rotorgram.training.results import COLUMNS, Results, write_config, write_part
+from rotorgram.training.settings import EnvConfig, Row, Study
 
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
@@ -302,65 +293,47 @@ def test_which_opengl_is_tried(
 
 
 @pytest.fixture
-def comparison(training: Path, tmp_path: Path) -> Path:
-    """A comparison's folder: the checkpoint of the middle seed alone."""
+def comparison(training: Path, tmp_path: Path) -> Results:
+    """A study of which one seed of A2C is done, beside a PID."""
     folder = tmp_path / "comparison"
     folder.mkdir()
     trained = load(training / "checkpoint.safetensors")
-    spec = env_spec(EnvConfig.from_keywords(trained.env_id, **trained.options))
-    content = dict.fromkeys(CONFIG_KEYS) | {"preset": "tuned", "seeds": [0, 1, 2], "agents": {}}
-    write_config(folder, "rotorgram compare", spec, None, content)
-    rows = [
-        dict.fromkeys(EVALUATION_COLUMNS, 0)
-        | {"agent": agent, "seed": seed, "env_steps": 200, "length": 25, "start": 0.5}
-        | {"steady": error, "settling_time": math.nan, "terminated": False}
-        for agent, seed, error in (("a2c", 0, 0.3), ("a2c", 1, 0.1), ("a2c", 2, 0.2),
-                                   ("pid", 0, 0.0))
-    ]  # fmt: skip
-    for name, columns, found in (("evaluations", EVALUATION_COLUMNS, rows),
-                                 ("episodes", EPISODE_COLUMNS, []),
-                                 ("runs", RUN_COLUMNS, [])):  # fmt: skip
-        table = pd.DataFrame(found, columns=list(columns))
-        named = table.rename(columns={"steady": spec.metrics[0].name,
-                                      "mean_size": spec.metrics[0].name})  # fmt: skip
-        named.to_csv(folder / f"{name}.csv", index=False)
+    env = EnvConfig(env_id=trained.env_id, options=trained.options)
+    rows = tuple(Row(agent=agent, name=agent, env=env) for agent in ("a2c", "pid"))
+    study = Study(rows=rows, seeds=1)
+    write_config(folder, "", study, dict.fromkeys(("a2c", "pid"), trained.spec))
+    for row in rows:
+        evaluations = pd.DataFrame(0.0, index=[0], columns=list(COLUMNS["evaluations"][2:]))
+        runs = pd.DataFrame(0.0, index=[0], columns=list(COLUMNS["runs"][2:]))
+        tables = {"evaluations": evaluations.assign(episode=0), "runs": runs}
+        write_part(folder, row, 0, tables)
     (folder / "checkpoints").mkdir()
     data = (training / "checkpoint.safetensors").read_bytes()
-    (folder / "checkpoints" / "a2c-seed2.safetensors").write_bytes(data)
-    return folder
+    (folder / "checkpoints" / "a2c-seed0.safetensors").write_bytes(data)
+    return Results.read(folder)
 
 
-def test_the_film_of_a_comparison_shows_its_agents(comparison: Path, opengl: None) -> None:
-    out = comparison / "video.mp4"
+def test_the_film_of_a_comparison_shows_its_agents(comparison: Results, opengl: None) -> None:
+    out = comparison.folder / "video.mp4"
     out.write_text("an old one")
-    assert film_comparison(comparison, out, world="plain")
+    assert film_study(comparison, out, world="plain")
     frames = decoded(out, 1280, 400)
     assert len(frames) == 13
     left, right = frames[0][:, :639].astype(int), frames[0][:, 641:].astype(int)
     assert abs(left[100:300] - right[100:300]).mean() < 8  # they start alike
-    assert sorted(path.name for path in comparison.iterdir()) == [
-        "checkpoints", "config.json", "episodes.csv", "evaluations.csv", "runs.csv",
-        "video.mp4",
-    ]  # fmt: skip
+    names = sorted(path.name for path in comparison.folder.iterdir())
+    assert names == ["checkpoints", "config.json", "parts", "video.mp4"]
 
 
 def test_a_comparison_without_opengl_has_no_film(
-    comparison: Path, no_egl: None, caplog: pytest.LogCaptureFixture
+    comparison: Results, no_egl: None, caplog: pytest.LogCaptureFixture
 ) -> None:
-    out = comparison / "video.mp4"
+    out = comparison.folder / "video.mp4"
     with caplog.at_level(logging.INFO, logger="rotorgram"):
-        assert not film_comparison(comparison, out)
+        assert not film_study(comparison, out)
     assert len(caplog.messages) == 1
     assert SENTENCE in caplog.messages[0]
     assert not out.exists()
-
-
-def test_what_is_no_comparison_is_one_sentence(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"got one without config\.json"):
-        film_comparison(tmp_path, tmp_path / "video.mp4")
-    (tmp_path / "config.json").write_text(json.dumps({}))
-    with pytest.raises(InputError, match=r"config\.json"):
-        film_comparison(tmp_path, tmp_path / "video.mp4")
 
 
 # ---- the page

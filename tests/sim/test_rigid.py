@@ -14,7 +14,6 @@ from rotorgram.models import QUAD_XML, Vehicle
 from rotorgram.models.errors import InputError
 from rotorgram.sim import InitialState, PhysicsError, World, make_world
 from rotorgram.sim.backends import kernel
-from rotorgram.training.settings import CompareConfig
 
 ELEVATION, HOVER = "rotorgram/Elevation-v0", "rotorgram/Hover-v0"
 DATA = Path(__file__).parents[1] / "data"
@@ -321,16 +320,6 @@ def test_over_udp_it_flies_as_in_process() -> None:
             here, there = pair.remote.step(actions[0]), local.step(actions)
             assert here[0].tobytes() == there[0].tobytes()
             assert here[1] == there[1][0]
-
-
-def test_runs_train_on_it_and_are_evaluated_on_mujoco() -> None:
-    config = CompareConfig(backend="rigid", seeds=1, agents=("a2c",))
-    (run,) = config.runs()
-    assert run.training_env["backend"] == "rigid"
-    assert "backend" not in config.env
-    assert config.content("a2c")["backend"] == "rigid"
-    with pytest.raises(InputError, match="backend: expected mujoco or rigid, got 'unity'"):
-        CompareConfig(backend="unity")  # type: ignore[arg-type]
 
 
 # --- what is refused ------------------------------------------------------------------------------

@@ -2,11 +2,7 @@
 
 import numpy as np
 import pytest
-from rotorgram.envs.config import EnvConfig
-from rotorgram.envs.tasks.racing import RacingOptions
-from rotorgram.envs.tasks.waypoints import WaypointsOptions
-from rotorgram.models.vehicle import Vehicle
-from rotorgram.training.bounds import (
+from bounds import (
     bang_bang,
     course_time,
     elevation_bounds,
@@ -16,6 +12,10 @@ from rotorgram.training.bounds import (
     racing_time,
     waypoints_time,
 )
+from rotorgram.envs.config import EnvConfig
+from rotorgram.envs.tasks.racing import RacingOptions
+from rotorgram.envs.tasks.waypoints import WaypointsOptions
+from rotorgram.models.vehicle import Vehicle
 from scipy import sparse
 from scipy.optimize import linprog
 

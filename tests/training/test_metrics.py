@@ -13,28 +13,28 @@ from rotorgram.training.metrics import (
     Headline,
     average_return,
     final_evaluations,
-    final_per_run,
     first_lasting_snapshot,
+    measure_run,
     overshoot,
-    results_table,
     settling_time,
     spread_over_seeds,
     steady_state,
 )
-from rotorgram.training.results import EVALUATION_COLUMNS, RUN_COLUMNS
+from rotorgram.training.results import COLUMNS
 
 
 def evaluations(*rows: tuple[object, ...]) -> pd.DataFrame:
-    """Rows of (agent, seed, env_steps, steady, settling_time, terminated)."""
-    names = ["agent", "seed", "env_steps", "steady", "settling_time", "terminated"]
+    """Rows of (row, seed, env_steps, steady, settling_time, terminated)."""
+    names = ["row", "seed", "env_steps", "steady", "settling_time", "terminated"]
     frame = pd.DataFrame(rows, columns=names)
-    frame["episode"] = frame.groupby(["agent", "seed", "env_steps"]).cumcount()
+    frame["episode"] = frame.groupby(["row", "seed", "env_steps"]).cumcount()
     frame = frame.assign(seconds=frame["env_steps"] / 100, length=10, start=1.0, overshoot=0.2)
-    return frame.assign(**{"return": 5.0})[list(EVALUATION_COLUMNS)]
+    return frame.assign(**{"return": 5.0})[list(COLUMNS["evaluations"])]
 
 
-def runs(*rows: tuple[object, ...]) -> pd.DataFrame:
-    return pd.DataFrame(rows, columns=list(RUN_COLUMNS))
+def per_seed(frame: pd.DataFrame, headline: Headline, name: str) -> list[float]:
+    """A measure of each seed."""
+    return [measure_run(run, headline)[name] for _, run in frame.groupby("seed")]
 
 
 def test_the_steady_state_is_the_mean_size_of_the_last_quarter():
@@ -50,13 +50,13 @@ def test_of_a_final_metric_an_end_that_holds_the_goal_is_no_crash():
     landed = Metric(name="landed", unit="", goal="high", held=0.75, final=True)
     rows = [("a", 0, 100, value, math.nan, True) for value in (1.0, 1.0, 1.0, 0.0)]
     frame = evaluations(*rows, *(("a", 1, 100, 1.0, math.nan, True) for _ in range(4)))
-    final = final_per_run(frame, Headline.of(spec_of(landed)))
-    assert final["crashed"].tolist() == [1, 0]
+    final = Headline.of(spec_of(landed))
+    assert per_seed(frame, final, "crashed") == [1, 0]
     # Three of four are the bound: the mean counts the crash, which is not held against it again.
-    assert final["held"].tolist() == [True, True]
+    assert per_seed(frame, final, "held") == [1, 1]
     once = Headline.of(spec_of(replace(landed, final=False)))
-    assert final_per_run(frame, once)["crashed"].tolist() == [4, 4]
-    assert final_per_run(frame, once)["held"].tolist() == [False, False]
+    assert per_seed(frame, once, "crashed") == [4, 4]
+    assert per_seed(frame, once, "held") == [0, 0]
     for held, expected in ((0.75, 100.0), (0.76, math.nan)):
         headline = Headline.of(spec_of(replace(landed, held=held)))
         steps, _ = first_lasting_snapshot(frame[frame["seed"] == 0], headline)
@@ -134,7 +134,7 @@ def test_a_run_holds_without_a_crash_and_without_a_gap():
         ("a2c", 2, 100, 0.01, 1.0, False), ("a2c", 2, 100, math.nan, math.nan, False),
         ("a2c", 3, 100, 0.2, 1.0, False),
     )  # fmt: skip
-    assert final_per_run(frame, HEADLINE)["held"].tolist() == [True, False, False, False]
+    assert per_seed(frame, HEADLINE, "held") == [1, 0, 0, 0]
 
 
 def test_the_final_evaluation_is_each_runs_own_last_snapshot():
@@ -146,39 +146,13 @@ def test_the_final_evaluation_is_each_runs_own_last_snapshot():
         ("pid", 0, 0, 0.0, 1.0, False),
     )
     assert final_evaluations(frame)["env_steps"].tolist() == [200, 200, 150, 0]
-    first = final_per_run(frame, HEADLINE).iloc[0]
+    first = measure_run(frame[(frame["row"] == "a2c") & (frame["seed"] == 0)], HEADLINE)
     assert first["steady"] == pytest.approx(0.2)
     assert first["settling_time"] == 2.0  # a crash has not settled, whatever its row says
     assert (first["episodes"], first["settled"], first["crashed"]) == (2, 1, 1)
-
-
-def test_results_table():
-    frame = evaluations(
-        *(("vpg", seed, 100, 0.5, math.nan, False) for seed in range(3)),
-        *(("vpg", seed, 200, 0.02 + 0.01 * seed, 1.0 + seed, False) for seed in range(2)),
-        ("vpg", 2, 200, 0.4, math.nan, True),
-        ("pid", 0, 0, 0.01, 3.0, False),
-    )
-    flown = runs(*(("vpg", s, 200, 2.0, 100.0 + s) for s in range(3)))
-    table = results_table(frame, flown, HEADLINE, {"time-optimal": 9.0})
-    assert table.index.tolist() == ["vpg", "pid", "time-optimal"]
-    bound = table.loc["time-optimal"]
-    assert (bound["return"], bound["seeds"], bound["crashed"]) == (9.0, 0, 0)
-    assert math.isnan(bound["steady"])
-    vpg, pid = table.loc["vpg"], table.loc["pid"]
-    assert vpg["steady"] == pytest.approx(0.15)  # (0.02 + 0.03 + 0.4) / 3
-    assert (vpg["steady_low"], vpg["steady_high"]) == pytest.approx((0.02, 0.4))
-    assert (vpg["seeds"], vpg["episodes"], vpg["settled"], vpg["crashed"]) == (3, 3, 2, 1)
-    assert (vpg["held"], vpg["worst"]) == (2, 0.4)
-    assert vpg["settling_time"] == 1.5
-    assert (vpg["reached"], vpg["env_steps_to_reach"], vpg["seconds_to_reach"]) == (2, 200, 2)
-    assert (vpg["steps_per_second"], vpg["return"]) == (101, 5)
-    assert vpg["overshoot"] == pytest.approx(0.2)
-    assert (pid["steady"], pid["settling_time"]) == (0.01, 3.0)
-    assert math.isnan(pid["steady_low"])
+    pid = measure_run(frame[frame["row"] == "pid"], HEADLINE)
     # An agent that is not trained has reached nothing by training.
-    assert math.isnan(pid["reached"])
-    assert math.isnan(pid["env_steps_to_reach"])
+    assert math.isnan(pid["env_steps_to_hold"])
 
 
 def test_average_return_is_a_mean_over_a_share_of_training():

@@ -1,4 +1,4 @@
-"""Comparison and sweep on a Ray cluster: two nodes of one core each, on this machine."""
+"""A study on a Ray cluster: two nodes of one core each, on this machine."""
 
 import os
 import secrets
@@ -8,7 +8,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
@@ -19,10 +18,9 @@ from rotorgram.flights.capture import capture
 from rotorgram.flights.executors import RunsFailed, WorkersConfig, open_executor, run_jobs
 from rotorgram.flights.folders import new_folder
 from rotorgram.flights.viewpoints import Plan
-from rotorgram.training.compare import compare
-from rotorgram.training.results import read_results, read_steps
-from rotorgram.training.settings import CompareConfig, SweepConfig
-from rotorgram.training.sweep import read_sweep_runs, sweep
+from rotorgram.training.results import Results
+from rotorgram.training.settings import EnvConfig, Row, Study
+from rotorgram.training.study import run_study
 
 # Ray listens beyond this machine. It reads these when it is imported.
 os.environ |= {
@@ -32,9 +30,13 @@ os.environ |= {
 }
 ray = pytest.importorskip("ray", reason="needs Ray: pip install 'rotorgram[ray]'")
 
-CONFIG = CompareConfig(
-    agents=("a2c",), seeds=1, env_steps=600, snapshots=1, curve_episodes=1, episodes=1,
-    options={"episode_length": 50},
+ENV = EnvConfig(options={"episode_length": 50})
+STUDY = Study(
+    rows=(
+        Row(agent="a2c", name="a2c", env=ENV, env_steps=600),
+        Row(agent="pid", name="pid", env=ENV),
+    ),
+    seeds=1, snapshots=1, curve_episodes=1, episodes=1, wire=True, keep_steps=True,
 )  # fmt: skip
 PLAN = """
 cameras = ["front@32x24", "front_depth@32x24"]
@@ -42,7 +44,7 @@ cameras = ["front@32x24", "front_depth@32x24"]
 from = "random"
 count = 20
 """
-TIMES = ["seconds", "steps_per_second"]
+TIMES = ["seconds", "steps_per_second", "seconds_to_hold"]
 
 
 def nothing(*_: object) -> None:
@@ -75,11 +77,11 @@ def address() -> Iterator[str]:
 def test_the_numbers_are_those_of_this_machine(tmp_path: Path, address: str) -> None:
     shown = []
     on_ray, here = (new_folder(tmp_path / name, "compare") for name in ("ray", "here"))
-    config = replace(CONFIG, runner="ray", address=address)
-    compare(config, on_ray, "", lambda name, done, total, words: shown.append((name, words)))
-    compare(CONFIG, here, "", nothing)
-    assert {("a2c seed 0", "done"), ("pid", "done")} <= {*shown}
-    a, b = read_results(on_ray), read_results(here)
+    workers = WorkersConfig(runner="ray", address=address)
+    run_study(STUDY, on_ray, "", lambda name, _, __, words: shown.append((name, words)), workers)
+    run_study(STUDY, here, workers=WorkersConfig(jobs=1))
+    assert {("a2c seed 0", "done"), ("pid seed 0", "done")} <= {*shown}
+    a, b = Results.read(on_ray), Results.read(here)
     assert len(a.episodes) > 5
     for table in ("episodes", "evaluations", "runs"):
         left, right = (
@@ -87,29 +89,10 @@ def test_the_numbers_are_those_of_this_machine(tmp_path: Path, address: str) -> 
         )
         pd.testing.assert_frame_equal(left, right, check_exact=True)
     for phase in ("train", "evaluation"):
-        pd.testing.assert_frame_equal(
-            read_steps(on_ray, "elevation_error", phase),
-            read_steps(here, "elevation_error", phase),
-            check_exact=True,
-        )
+        pd.testing.assert_frame_equal(a.steps(phase), b.steps(phase), check_exact=True)
     name = "checkpoints/a2c-seed0.safetensors"
     actor, other = load(on_ray / name).actor, load(here / name).actor
     assert {k: v.tobytes() for k, v in actor.items()} == {k: v.tobytes() for k, v in other.items()}
-
-
-def test_a_sweep_gives_the_rows_of_this_machine(tmp_path: Path, address: str) -> None:
-    config = SweepConfig(
-        algorithm="a2c", grid={"gamma": (0.9, 0.99)}, seeds=1, env_steps=300, episodes=1,
-        options={"episode_length": 50},
-    )  # fmt: skip
-    tables = []
-    for where in (config, replace(config, runner="ray", address=address)):
-        folder = new_folder(tmp_path / where.runner, "sweep")
-        sweep(where, folder, "", nothing)
-        rows = read_sweep_runs(folder, config).sort_values("point").reset_index(drop=True)
-        tables.append(rows.drop(columns=TIMES))
-    assert tables[0]["point"].tolist() == [0, 1]
-    pd.testing.assert_frame_equal(*tables, check_exact=True)
 
 
 def test_every_node_flies(address: str) -> None:
@@ -146,10 +129,10 @@ def test_a_worker_with_other_software_is_refused(
 ) -> None:
     here = software_versions()
     monkeypatch.setattr(module, "software_versions", lambda: {**here, "numpy": "0.1"})
-    config = replace(CONFIG, runner="ray", address=address)
+    workers = WorkersConfig(runner="ray", address=address)
     sentence = f"numpy: expected version 0.1 .*, got {here['numpy']} on {socket.gethostname()}"
     with pytest.raises(RunsFailed, match=f"2 of 2 runs failed: .*{sentence}"):
-        compare(config, tmp_path, "", nothing)
+        run_study(STUDY, tmp_path, workers=workers)
 
 
 def test_ctrl_c_ends_workers_and_simulators(tmp_path: Path, address: str) -> None:
@@ -199,17 +182,18 @@ def test_no_such_cluster(tmp_path: Path) -> None:
         sock.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{sock.getsockname()[1]}"
         sentence = f"address: expected a Ray cluster at {address}, got: Connection refused"
+        workers = WorkersConfig(runner="ray", address=address)
         with pytest.raises(ValueError, match=sentence):
-            compare(replace(CONFIG, runner="ray", address=address), tmp_path, "", nothing)
+            run_study(STUDY, tmp_path, workers=workers)
     assert not list(tmp_path.iterdir())
 
 
 def test_no_ray(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(ImportError, match=r"pip install 'rotorgram\[ray\]'"):
-        compare(replace(CONFIG, runner="ray"), tmp_path, "", nothing)
+        run_study(STUDY, tmp_path, workers=WorkersConfig(runner="ray"))
 
 
 def test_an_address_is_of_a_cluster() -> None:
     with pytest.raises(ValueError, match="address: expected it with runner ray"):
-        replace(CONFIG, address="auto")
+        WorkersConfig(address="auto")

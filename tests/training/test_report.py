@@ -1,303 +1,470 @@
-"""The files, the figures, the table and the report of a comparison, on small made-up folders."""
+"""Tables, figures, page and film of a study, on small made-up folders and by hand."""
 
+import base64
 import json
-import re
+from dataclasses import replace
+from html.parser import HTMLParser
 from io import StringIO
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
-from comparisons import GATES, HEADLINE, spec_of, synthetic_folder
+from comparisons import ERROR, GATES, HEADLINE, spec_of, study_of, synthetic_folder
 from rich.console import Console
+from rotorgram.envs.spec import EnvSpec
+from rotorgram.flights.distances import least, nearest
+from rotorgram.flights.filming import Film, Shot
 from rotorgram.flights.palette import agent_color, agent_label, sort_agents
-from rotorgram.training.figures import FIGURE_FILES, draw_figures, make_curves
-from rotorgram.training.metrics import Headline
-from rotorgram.training.report import (
-    VIDEO_FILE,
+from rotorgram.flights.trajectories import Trajectory
+from rotorgram.models.errors import InputError
+from rotorgram.training import films
+from rotorgram.training.figures import (
+    draw_figures,
+    learning_curves,
+    row_color,
+    trajectories,
+    value_fan,
+)
+from rotorgram.training.metrics import Headline, shown_runs
+from rotorgram.training.report import VIDEO_FILE, write_report
+from rotorgram.training.results import COLUMNS, Results, write_config
+from rotorgram.training.settings import EnvConfig, Row, Study
+from rotorgram.training.statistics import share_interval
+from rotorgram.training.swarms import GOAL, POSITION, least_distances, rows_of, worlds
+from rotorgram.training.tables import (
     headings,
-    result_rows,
-    table_note,
-    table_of,
-    terminal_table,
-    write_report,
-)
-from rotorgram.training.results import (
-    EVALUATION_COLUMNS,
-    ResultsError,
-    read_config,
-    read_results,
-    read_steps,
+    markdown,
+    number_text,
+    results_table,
+    row_label,
+    scores,
+    terminal_tables,
 )
 
-
-@pytest.fixture(scope="module")
-def comparison(tmp_path_factory):
-    folder = synthetic_folder(tmp_path_factory.mktemp("comparison") / "results")
-    write_report(folder)
-    return folder
+NAN = np.nan
 
 
-def test_results_are_read_with_their_types(comparison):
-    results = read_results(comparison)
-    assert list(results.evaluations.columns) == list(EVALUATION_COLUMNS)
-    assert results.evaluations["terminated"].dtype == bool
-    assert results.runs["env_steps"].tolist() == [2000] * 9
-    assert results.spec == spec_of()
-    assert results.headline == HEADLINE
+# ---- tables, by hand
+
+
+def runs_of(name: str, *steady: float, crashed: int = 0, env_steps: int = 2000) -> pd.DataFrame:
+    """The runs of a row: a steady size for each seed, which holds below 0.1."""
+    held = [int(one < 0.1) for one in steady]
+    return pd.DataFrame({
+        "row": name, "seed": range(len(steady)), "env_steps": env_steps, "seconds": 60.0,
+        "steps_per_second": 3000.0, "steady": steady, "settling_time": 1.5, "overshoot": 0.2,
+        "return": 200.0, "episodes": 20, "settled": 20, "crashed": crashed, "held": held,
+        "env_steps_to_hold": [1000.0 if one else NAN for one in held],
+        "seconds_to_hold": [2.5 if one else NAN for one in held],
+    })[list(COLUMNS["runs"])]  # fmt: skip
+
+
+def made_up(
+    folder: Path, study: Study, *runs: pd.DataFrame, spec: EnvSpec | None = None
+) -> Results:
+    """The folder of a study with these runs."""
+    specs = {row.name: spec or spec_of() for row in study.rows}
+    write_config(folder, "rotorgram compare", study, specs)
+    pd.concat(runs).to_csv(folder / "runs.csv", index=False)
+    return Results.read(folder)
+
+
+def test_measures_over_seeds(tmp_path: Path) -> None:
+    study = study_of(("vpg", "a2c", "pid"), 4)
+    results = made_up(
+        tmp_path, study,
+        runs_of("vpg", 0.025, 0.025, 0.025, 0.9), runs_of("a2c", 0.02, 0.03, 0.04, 0.05, crashed=1),
+        runs_of("pid", 0.01, env_steps=0),
+    )  # fmt: skip
+    table = results_table(results)
+    assert table.index.tolist() == ["vpg", "a2c", "pid"]
+    vpg, a2c, pid = (table.loc[name] for name in table.index)
+    # Without the lowest and the highest of four; in 5 % of the resamples three are 0.9, or four.
+    assert (vpg["steady"], vpg["steady_low"], vpg["steady_high"]) == (0.025, 0.025, 0.9)
+    assert (vpg["held"], vpg["worst"], vpg["reached"], vpg["env_steps_to_hold"]) == (
+        3,
+        0.9,
+        3,
+        1000,
+    )
+    assert (vpg["seeds"], vpg["episodes"], vpg["settled"], vpg["crashed"]) == (4, 80, 80, 0)
+    # Crashes per flight: 4 of 80, with Wilson's interval.
+    assert (a2c["crashed"], a2c["crash_rate"]) == (4, 0.05)
+    assert (a2c["crash_rate_low"], a2c["crash_rate_high"]) == share_interval(4, 80)
+    assert np.isnan(pid["steady_low"])  # one seed has no interval
+    assert np.isnan(pid["reached"])  # and no training, nothing to reach
+    page = markdown(results, table)
+    assert (
+        r"| VPG (4 seeds; 2,000 env steps) | 0.025 (0.025 to 0.90; worst 0.90) "
+        "| 3 of 4 (30 % to 95 %) | 0 % (0 to 4.58 %; 0 of 80) | 1.50 (1.50 to 1.50; "
+        "80 of 80 settled) | 0.20 (0.20 to 0.20) | 200 (200 to 200) | 1,000 (3 of 4 seeds; 2.50 s) "
+        "| 3,000 |" in page
+    )
+    assert "| 5.00 % (1.96 to 12.2 %; 4 of 80) |" in page
+    assert (
+        r"| Agent | Steady \|E\| (m) | Seeds that hold \|E\| < 0.1 m | Crashes per flight |" in page
+    )
+
+
+def test_a_share_of_all_flights_has_wilsons_interval(tmp_path: Path) -> None:  # fault 66
+    landed = replace(GATES, name="landed", held=0.75, final=True)
+    study = study_of(("a2c",), 3, kind="compare")
+    whole = runs_of("a2c", 1.0, 1.0, 1.0)
+    table = results_table(made_up(tmp_path, study, whole, spec=spec_of(landed)))
+    found = table.loc["a2c", "steady_low"], table.loc["a2c", "steady_high"]
+    assert found == share_interval(60, 60)
+    # A share of the time, which counts no crash, where all seeds have all of it.
+    other = spec_of(replace(landed, final=False))
+    table = results_table(made_up(tmp_path, study, whole, spec=other))
+    assert table.loc["a2c", "steady_low"] == share_interval(60, 60)[0]
+    some = runs_of("a2c", 1.0, 0.9, 0.8)
+    table = results_table(made_up(tmp_path, study, some, spec=other))
+    assert table.loc["a2c", "steady_low"] == pytest.approx(0.8)
+
+
+def test_points_of_a_sweep_are_ranked_by_their_worst_seed_and_its_crashes(tmp_path: Path) -> None:
+    rows = [Row(agent="a2c", name=f"p{i}", env_steps=400, set={"gamma": 0.9}) for i in range(4)]
+    study = Study(rows=tuple(rows), kind="sweep", seeds=3)
+    crashes = runs_of("p2", 0.02, 0.01, 0.04).assign(crashed=[2, 0, 0])
+    runs = (
+        runs_of("p0", 0.01, 0.01, 0.5), runs_of("p1", 0.1, 0.2, 0.3), crashes, runs_of("p3", 0.01)
+    )  # fmt: skip
+    table = results_table(made_up(tmp_path, study, *runs))
+    # Whole points first; of these the fewest crashes of a seed, then the worst seed's error.
+    assert table.index.tolist() == ["p1", "p0", "p2", "p3"]
+    assert table["most_crashed"].tolist() == [0, 0, 2, 0]
+    assert table["worst"].tolist() == [0.3, 0.5, 0.04, 0.01]
+    # Of a metric that is to be high, the lowest seed is the worst.
+    high = results_table(made_up(tmp_path, study, *runs, spec=spec_of(GATES)))
+    assert high["worst"].tolist() == [0.1, 0.01, 0.01, 0.01]
+
+
+def test_rows_of_several_tasks_have_a_table_each_and_scores(tmp_path: Path) -> None:
+    other = EnvConfig(options={"observation": "error", "action": "offset"})
+    rows = tuple(
+        Row(agent=agent, env=env, env_steps=2000)
+        for env in (EnvConfig(), other) for agent in ("vpg", "a2c")
+    )  # fmt: skip
+    study = Study(rows=rows, kind="benchmark", seeds=4)
+    names = [row.name for row in rows]
+    results = made_up(
+        tmp_path, study,
+        runs_of(names[0], 0.025, 0.025, 0.025, 0.9), runs_of(names[1], *[0.025] * 4),
+        runs_of(names[2], *[0.1] * 4, crashed=1), runs_of(names[3], *[0.1] * 4),
+    )  # fmt: skip
+    page = markdown(results, results_table(results))
+    assert "## Elevation-v0\n" in page
+    assert "## Elevation-v0 action=offset observation=error\n" in page
+    # Scores: 0.1 / (0.1 + 0.025) = 0.8, 0.1 for the fourth, 0 with a crash, 0.5 at the bound.
+    # A2C: the middle half of 0.8 four times and 0.5 four times.
+    assert "| A2C tuned | 2 | 0.650 (0.650 to 0.650) |" in page
+    # VPG: the middle half of 0.8 three times, 0.1 and four zeros is 0, 0, 0.1, 0.8.
+    assert "| VPG tuned | 2 | 0.225 (" in page
+    # VPG against A2C: 12 ties of 16 pairs and 4 losses give 0.375; all lost on the other task.
+    assert "| VPG tuned | – | 19% (" in page
+    assert "| A2C tuned | 81% (" in page
+
+
+def test_scores_of_what_is_to_be_high() -> None:
+    own = runs_of("x", 3.0, 9.0, 0.0, NAN)
+    # Held from 3 gates on: 3 / 6, 9 / 12, 0 / 3, and nothing without a value.
+    assert scores(own, Headline.of(spec_of(GATES))).tolist() == [0.5, 0.75, 0.0, 0.0]
+    climb = replace(GATES, name="climb", unit="m/s")
+    assert scores(runs_of("x", -9.0, 3.0), Headline.of(spec_of(climb))).tolist() == [0.0, 0.5]
+    recovered = replace(GATES, name="recovered", held=0.75)
+    # It lacks 0, 1/4 (the bound), 1/2 and 1: 1 / 1, 1/4 / 1/2, 1/4 / 3/4, 1/4 / 5/4.
+    own = runs_of("x", 1.0, 0.75, 0.5, 0.0)
+    expected = [1.0, 0.5, pytest.approx(1 / 3), 0.2]
+    assert scores(own, Headline.of(spec_of(recovered))).tolist() == expected
+    # The share of landings counts the crashes; that of the time after a recovery does not.
+    own = runs_of("x", 1.0, 0.75, 0.5, 0.0, crashed=1)
+    assert scores(own, Headline.of(spec_of(recovered))).tolist() == [0.0] * 4
+    landed = Headline.of(spec_of(replace(recovered, name="landed", final=True)))
+    assert scores(own, landed).tolist() == expected
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0.0, "0"), (NAN, "–"), (0.01234, "0.012"), (3.14159, "3.14"), (1234.5, "1,234"),
+     (-0.5, "-0.50"), (12.34, "12.3"), (0.00001234, "1e-05")],
+)  # fmt: skip
+def test_numbers_in_words(value: float, text: str) -> None:
+    assert number_text(value) == text
+
+
+def test_names_and_colours_of_rows() -> None:
+    a2c = Row(agent="a2c", name="a2c")
+    assert (row_label(a2c), row_color(a2c)) == ("A2C", "#0072B2")
+    assert row_label(Row(agent="sb3-ppo", preset="tuned")) == "SB3 PPO tuned"
+    assert row_label(Row(agent="a2c", name="wide")) == "wide"
+    assert agent_color("a2c", dark=True) != agent_color("a2c")
+    assert agent_label("zeta") == "zeta"
     assert sort_agents(["zeta", "pid", "a2c", "vpg", "a2c"]) == ["vpg", "a2c", "pid", "zeta"]
 
 
-def test_the_column_of_the_metric_has_its_name_in_every_file(comparison):
-    for name in ("episodes.csv", "evaluations.csv"):
-        assert "elevation_error" in pd.read_csv(comparison / name, nrows=0).columns
-    assert "elevation_error" in pq.read_schema(comparison / "steps.parquet").names
-    metric = json.loads((comparison / "config.json").read_text())["spec"]["metrics"][0]
-    assert (metric["name"], metric["unit"]) == ("elevation_error", "m")
+# ---- curves, by hand
 
 
-def test_steps_are_read_by_phase_and_column(comparison):
-    training = read_steps(comparison, "elevation_error", "train", ("agent", "step"))
-    assert list(training.columns) == ["agent", "step"]
-    assert len(training) == 9 * 2000
-    assert len(read_steps(comparison, "elevation_error", "evaluation")) == 12 * 3 * 100
-    assert read_steps(comparison, "elevation_error", "evaluation")["agent"].dtype == "category"
-    assert len(read_steps(comparison, "elevation_error", "nothing")) == 0
-    thinned = read_steps(comparison, "elevation_error", "train", max_rows=1000)
-    # A thousand of all 21,600 rows, hence 833 of the training's, by chance.
-    assert 700 < len(thinned) < 970
-    pd.testing.assert_frame_equal(
-        thinned, read_steps(comparison, "elevation_error", "train", max_rows=1000)
+def test_a_fan_is_of_the_quantiles_of_windows() -> None:
+    steps = pd.DataFrame({"step": range(1, 101), "value": [0.0] * 50 + [1.0] * 50})
+    fan = value_fan(steps)
+    assert len(fan.x) == 2
+    assert fan.middle.tolist() == [0.0, 1.0]
+    assert (fan.low[0], fan.high[1]) == (0.0, 1.0)
+
+
+def test_drones_of_an_episode_are_trajectories_of_their_own() -> None:
+    flights = [(0, 0, 3), (0, 0, 2), (0, 1, 2), (0, 1, 2)]  # seed, episode, steps
+    parts = [
+        pd.DataFrame({"seed": seed, "episode": episode, "step": range(1, steps + 1), "value": 1.0})
+        for seed, episode, steps in flights
+    ]
+    shown = trajectories(pd.concat(parts), 0.5)
+    assert sorted(time.tolist() for time, _ in shown) == [
+        [0.5, 1.0], [0.5, 1.0], [0.5, 1.0], [0.5, 1.0, 1.5],
+    ]  # fmt: skip
+
+
+def test_learning_curves_are_interquartile_means_of_seeds() -> None:
+    rows = [("a2c", seed, steps, float(seed)) for seed in range(3) for steps in (0, 100)]
+    rows += [("pid", 0, 0, 0.1)]
+    table = pd.DataFrame(rows, columns=["row", "seed", "env_steps", "steady"])
+    curves = learning_curves(table, ["a2c", "pid"])
+    assert list(curves) == ["a2c"]
+    assert curves["a2c"].x.tolist() == [0, 100]
+    assert curves["a2c"].middle.tolist() == [1.0, 1.0]
+    assert (curves["a2c"].low[0], curves["a2c"].high[0]) == (0.0, 2.0)
+
+
+# ---- the page
+
+
+@pytest.fixture(scope="module")
+def comparison(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = synthetic_folder(tmp_path_factory.mktemp("comparison") / "results")
+    (folder / VIDEO_FILE).write_bytes(b"a film")
+    write_report(Results.read(folder))
+    return folder
+
+
+class Page(HTMLParser):
+    """Elements and attributes of a page."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.found: list[tuple[str, dict[str, str | None]]] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.found.append((tag, dict(attrs)))
+
+    def of(self, tag: str) -> list[dict[str, str | None]]:
+        return [attributes for name, attributes in self.found if name == tag]
+
+
+def test_the_page_has_figures_tables_and_film_and_no_script(comparison: Path) -> None:
+    text = (comparison / "report.html").read_text(encoding="utf-8")
+    page = Page(text)
+    sources = [str(image["src"]) for image in page.of("img")]
+    assert [source[:26] for source in sources] == ["data:image/svg+xml;base64,"] * 4
+    pictures = [base64.b64decode(source.partition(",")[2]) for source in sources]
+    names = ("comparison", "fig6_reward", "fig7_cumulative_reward", "fig8_error")
+    for name, picture in zip(names, pictures, strict=True):
+        assert picture == (comparison / "figures" / f"{name}.svg").read_bytes()
+    assert (
+        page.of("video")[0]["src"]
+        == "data:video/mp4;base64," + base64.b64encode(b"a film").decode()
     )
+    assert page.of("script") == []
+    assert not any(name.startswith("on") for _, found in page.found for name in found)
+    # The command has signs of HTML in it.
+    assert "rotorgram compare --seeds 3 &lt;folder&gt;" in text
+    assert len(page.of("tr")) == 5  # a head and four agents
+    assert text.count("<details>") == 4 + 3  # rows; study, versions, machine
+    assert "It gives no numbers." in text
 
 
-@pytest.mark.parametrize(
-    "name", ["config.json", "episodes.csv", "steps.parquet", "evaluations.csv", "runs.csv"]
-)
-def test_a_missing_file_is_named(tmp_path, name):
-    folder = synthetic_folder(tmp_path, agents=("a2c",), seeds=1, env_steps=300)
-    (folder / name).unlink()
-    with pytest.raises(ResultsError, match=f"got one without {name}"):
-        write_report(folder)
+def test_figures_are_written_in_three_formats_and_always_the_same(comparison: Path) -> None:
+    results = Results.read(comparison)
+    names = draw_figures(results, results_table(results))
+    for name in names:
+        for kind, magic in (("png", b"\x89PNG"), ("pdf", b"%PDF"), ("svg", b"<?xml")):
+            content = (comparison / "figures" / f"{name}.{kind}").read_bytes()
+            assert content.startswith(magic)
+            assert len(content) < 1_000_000
 
 
-def test_what_is_wrong_in_a_file_is_named(tmp_path):
-    folder = synthetic_folder(tmp_path, agents=("a2c",), seeds=1, env_steps=300)
-    episodes = pd.read_csv(folder / "episodes.csv")
-    episodes.drop(columns=["return", "seed"]).to_csv(folder / "episodes.csv", index=False)
-    with pytest.raises(ResultsError, match=r"episodes\.csv lacks the columns seed, return"):
-        read_results(folder)
-    episodes.assign(length="long").to_csv(folder / "episodes.csv", index=False)
-    with pytest.raises(ResultsError, match="cannot be read"):
-        read_results(folder)
-    (folder / "episodes.csv").write_text("")
-    with pytest.raises(ResultsError, match="cannot be read"):
-        read_results(folder)
-    config = json.loads((folder / "config.json").read_text())
-    (folder / "config.json").write_text(json.dumps(config | {"spec": {"env_id": 1}}))
-    with pytest.raises(ResultsError, match=r"config\.json: spec: expected control_period"):
-        read_results(folder)
-    (folder / "config.json").write_text('{"preset": ')
-    with pytest.raises(ResultsError, match="not JSON"):
-        read_config(folder)
-    (folder / "config.json").write_text('{"preset": "tuned"}')
-    with pytest.raises(ResultsError, match="lacks the keys created, command, seeds"):
-        read_config(folder)
-    (folder / "steps.parquet").write_text("no steps")
-    with pytest.raises(ResultsError, match="not a Parquet file"):
-        read_steps(folder, "elevation_error", "train")
-    pq.write_table(pa.table({"agent": ["a2c"]}), folder / "steps.parquet")
-    with pytest.raises(ResultsError, match="lacks the columns seed, phase"):
-        read_steps(folder, "elevation_error", "train")
-
-
-def test_figures_are_pictures_of_modest_size(comparison):
-    paths = [comparison / "figures" / name for name in FIGURE_FILES]
-    written = [path.read_bytes() for path in paths]
-    results = read_results(comparison)
-    draw_figures(comparison, results, make_curves(comparison, results))
-    assert [path.read_bytes() for path in paths] == written
-    for path in paths:
-        assert path.read_bytes().startswith(b"\x89PNG")
-        assert 5_000 < path.stat().st_size < 200_000
-
-
-@pytest.mark.parametrize("dark", [False, True])
-def test_every_agent_keeps_its_colour(dark):
-    colors = {agent_color(agent, dark) for agent in ("vpg", "a2c", "sb3-a2c", "pid")}
-    assert len(colors) == 4
-    assert not colors & {agent_color(agent, not dark) for agent in ("vpg", "a2c", "sb3-a2c", "pid")}
-    assert agent_color("mine") == agent_color("mine")
-    assert agent_label("sb3-a2c") == "SB3 A2C"
-    assert agent_label("mine") == "mine"
-
-
-def test_the_table_and_the_verdicts_are_written_too(comparison):
-    table = table_of(read_results(comparison))
-    assert table.index.tolist() == ["vpg", "a2c", "sb3-a2c", "pid", "time-optimal"]
-    written = pd.read_csv(comparison / "results.csv", index_col="agent")
-    pd.testing.assert_frame_equal(written, table, check_dtype=False, check_index_type=False)
-    lines = (comparison / "results.md").read_text(encoding="utf-8").splitlines()
-    # Bars inside cells are escaped: every line of the table has the same number of columns.
-    assert [len(re.findall(r"(?<!\\)\|", line)) for line in lines[:7]] == [9] * 7
-    assert lines[6].startswith("| time-optimal (bound) | – |")
-    claims = json.loads((comparison / "claims.json").read_text(encoding="utf-8"))
+def test_verdicts_and_tables_are_files(comparison: Path) -> None:
+    claims = json.loads((comparison / "claims.json").read_text())
     assert len(claims) == 5
-    assert set(claims[0]) == {"claim", "source", "preset", "verdict", "definition", "evidence"}
-    assert [claim["preset"] for claim in claims] == ["tuned"] * 5
+    assert {claim["verdict"] for claim in claims} == {"undecided"}  # three seeds decide nothing
+    assert pd.read_csv(comparison / "results.csv")["row"].tolist() == [
+        "vpg",
+        "a2c",
+        "sb3-a2c",
+        "pid",
+    ]
+    text = (comparison / "results.md").read_text(encoding="utf-8")
+    assert text.startswith("# Results\n\n```sh\nrotorgram compare --seeds 3 <folder>\n```\n")
+    assert "Seeds 0 to 2; 67 evaluation episodes each;" in text
+    assert "Fewer than five seeds decide nothing." in text
 
 
-def test_a_report_from_results_at_hand_is_the_same(comparison):
-    page = comparison / "report.html"
-    before = page.read_bytes()
-    assert write_report(comparison, read_results(comparison)) == page
-    assert page.read_bytes() == before
+def test_the_terminal_shows_the_table_in_a_hundred_columns(comparison: Path) -> None:
+    results = Results.read(comparison)
+    (table,) = terminal_tables(results, results_table(results))
+    stream = StringIO()
+    Console(file=stream, width=100).print(table)
+    lines = stream.getvalue().splitlines()
+    assert max(map(len, lines)) <= 100
+    assert any(line.startswith("SB3 A2C ") for line in lines)
 
 
-def test_the_page_shows_the_film_where_there_is_one(tmp_path):
-    folder = synthetic_folder(tmp_path, agents=("a2c",), seeds=1, env_steps=300)
-    assert "<video" not in write_report(folder).read_text(encoding="utf-8")
-    (folder / VIDEO_FILE).write_bytes(b"film")
-    page = write_report(folder).read_text(encoding="utf-8")
-    assert 'src="data:video/mp4;base64,ZmlsbQ=="' in page
+def test_a_study_of_which_nothing_is_done_has_an_empty_report(tmp_path: Path) -> None:
+    study = study_of(("a2c",), 3)
+    write_config(tmp_path, "rotorgram compare", study, {"a2c": spec_of()})
+    assert write_report(Results.read(tmp_path)).empty
+    assert "3 of 3 runs are missing." in (tmp_path / "results.md").read_text()
 
 
-def test_a_task_of_another_kind_is_not_judged_by_the_papers_claims(tmp_path):
-    folder = synthetic_folder(tmp_path, agents=("vpg", "a2c"), seeds=2, env_steps=300)
-    config = json.loads((folder / "config.json").read_text())
-    spec = json.loads(spec_of(GATES).to_json()) | {"env_id": "mine/Race-v0"}
-    (folder / "config.json").write_text(json.dumps(config | {"spec": spec}))
-    for name in ("episodes.csv", "evaluations.csv"):
-        frame = pd.read_csv(folder / name).rename(columns={"elevation_error": "gates_passed"})
-        frame.to_csv(folder / name, index=False)
-    steps = pq.read_table(folder / "steps.parquet")
-    names = [n.replace("elevation_error", "gates_passed") for n in steps.column_names]
-    pq.write_table(steps.rename_columns(names), folder / "steps.parquet")
-    page = write_report(folder).read_text(encoding="utf-8")
-    claims = json.loads((folder / "claims.json").read_text(encoding="utf-8"))
-    assert [claim["source"] for claim in claims] == ["A claim of this software, not of the paper"]
-    assert "Agents on mine/Race-v0" in page
-    assert "Seeds that hold gates_passed ≥ 3" in page
-    assert "|E|" not in page
+# ---- several drones in a world
 
 
-@pytest.mark.parametrize(
-    ("annealed", "sentence"),
-    [
-        (("vpg", "a2c"), "the learning rate of VPG and A2C falls to 0 over the run"),
-        (("a2c",), "the learning rate of A2C falls to 0 over the run"),
-        ((), None),
-    ],
-)
-def test_the_report_names_the_preset_and_an_annealed_learning_rate(tmp_path, annealed, sentence):
-    folder = synthetic_folder(tmp_path, agents=("vpg", "a2c"), seeds=1, env_steps=300)
-    config = read_config(folder)
-    for name, settings in config["agents"].items():
-        settings["anneal"] = name in annealed
-    (folder / "config.json").write_text(json.dumps(config | {"preset": "mine"}))
-    text = write_report(folder).read_text(encoding="utf-8")
-    assert text.count("Judged with the preset “mine”.") == 5
-    if sentence is None:
-        assert "falls to 0" not in text
-    else:
-        assert sentence in text
+def line(*xs: float) -> np.ndarray:
+    """Positions of drones on a line along X, shape (1, A, 3)."""
+    return np.array([[(x, 10.0, 0.0) for x in xs]])
 
 
-def results_of(**changes: float) -> pd.DataFrame:
-    row = dict.fromkeys(("seeds", "episodes", "settled", "reached"), 10) | {"crashed": 0}
-    row |= {"held": 9, "worst": 0.43}
-    for name in ("steady", "settling_time", "overshoot", "return"):
-        row |= {name: 1.0, f"{name}_low": 0.5, f"{name}_high": 12.345}
-    row |= {"env_steps_to_reach": 1234567.0, "seconds_to_reach": 99.6, "steps_per_second": 2500.4}
-    table = pd.DataFrame([row | changes], index=["sb3-a2c"])
-    table.index.name = "agent"
-    return table
+def test_the_nearest_other_of_each_drone_that_flies() -> None:
+    assert nearest(line(0.0, 3.0, 4.0)).tolist() == [[3.0, 1.0, 1.0]]
+    assert least(line(0.0, 3.0, 4.0)).tolist() == [1.0]
+    assert nearest(np.array([[(0.0, 0.0, 0.0), (2.0, 3.0, 6.0)]])).tolist() == [[7.0, 7.0]]
+    np.testing.assert_array_equal(nearest(line(0.0, 3.0, NAN)), [[3.0, 3.0, NAN]])
+    np.testing.assert_array_equal(nearest(line(0.0, NAN, NAN)), [[NAN, NAN, NAN]])
+    np.testing.assert_array_equal(least(line(0.0, NAN)), [NAN])
 
 
-def test_cells_are_honest_about_what_is_missing():
-    (row,) = result_rows(results_of(reached=3, settled=7, crashed=2))
-    assert row[0] == ("SB3 A2C", ("10 seeds",))
-    assert row[1] == ("1.00", ("0.50 to 12.3", "2 of 10 crashed"))
-    assert row[2] == ("90 %", ("9 of 10 seeds", "worst 0.43"))
-    assert row[3].details == ("0.50 to 12.3", "7 of 10 settled")
-    assert row[6] == ("1,234,567", ("3 of 10 seeds", "99.6 s"))
-    assert row[7].value == "2,500"
-    nothing = dict.fromkeys(("settling_time", "settling_time_low", "settling_time_high"), np.nan)
-    (row,) = result_rows(results_of(seeds=1, reached=np.nan, settled=0, held=np.nan, **nothing))
-    assert row[2] == ("–", ("worst 0.43",))
-    assert row[3] == ("–", ("0 of 10 settled",))
-    assert row[6].details == ()
-    (bound,) = result_rows(results_of(seeds=0, **{"return": 234.4}))
-    assert [cell.value for cell in bound] == ["sb3-a2c", *"––––", "234", *"––"]
+def positions(*episodes: list[list[float]], row: str = "ippo", seed: int = 0) -> pd.DataFrame:
+    """Rows of episodes, of each drone its X after each step; the goals are at X = 5 m."""
+    rows = [
+        {"row": row, "seed": seed, "episode": episode, "drone": drone, "step": step}
+        | dict(zip((*POSITION, *GOAL), (x, 10.0, 0.0, 5.0, 10.0, 0.0), strict=True))
+        for episode, world in enumerate(episodes)
+        for drone, xs in enumerate(world)
+        for step, x in enumerate(xs)
+    ]
+    return pd.DataFrame(rows)
 
 
-def test_headings_and_note_name_the_metric_and_its_unit():
-    names = headings(HEADLINE)
-    assert names[1:4] == ("Steady |E| (m)", "Seeds that hold |E| < 0.1 m", "Settling to 0.05 m (s)")
-    assert "until |E| stays below 0.05 m" in table_note(HEADLINE)
-    gates = Headline.of(spec_of(GATES))
-    assert headings(gates)[1:3] == ("Steady gates_passed", "Seeds that hold gates_passed ≥ 3")
-    assert "Settling:" not in table_note(gates)
+def test_the_least_distance_is_that_of_all_episodes_of_a_seed() -> None:
+    rows = [positions([[0.0, 0.0], [4.0, 3.0]], [[0.0, 0.0], [2.0, 5.0]])]  # at the least 2 m
+    rows += [positions([[0.0], [4.0]], seed=1), positions([[0.0], [7.0]], row="orca")]
+    table = least_distances(pd.concat(rows))
+    assert table["least_distance"].to_dict() == {"ippo": 3.0, "orca": 7.0}
+    assert table.loc["ippo", "least_distance_low"] == 2.0
+    assert np.isnan(table.loc["orca", "least_distance_low"])  # one seed has no interval
 
 
-@pytest.mark.parametrize(
-    ("value", "expected"),
-    [
-        (0.0, "0"),
-        (0.00001234, "1e-05"),
-        (0.01234, "0.012"),
-        (0.5, "0.50"),
-        (3.14159, "3.14"),
-        (-27.18, "-27.2"),
-        (12345.6, "12,346"),
-    ],
-)
-def test_numbers_are_written_with_the_digits_that_count(value, expected):
-    (row,) = result_rows(results_of(overshoot=value))
-    assert row[4].value == expected
+def test_rows_of_trajectories_give_the_worlds_back() -> None:
+    spec = spec_of()
+    spec = type(spec)(**(vars(spec) | {"agents": ("drone_0", "drone_1")}))
+
+    def flown(*xs: float) -> Trajectory:
+        where = np.array([(x, 10.0, 1.0) for x in xs])
+        telemetry = {"position": where, "goal": where + 1.0}
+        steps = len(xs) - 1
+        return Trajectory(spec=spec, telemetry=telemetry, rewards=np.zeros(steps),
+                          actions=np.zeros((steps, 1)), ending="terminated", episode=7)  # fmt: skip
+
+    rows = rows_of([flown(0.0, 1.0, 2.0), flown(4.0, 5.0)]).assign(row="ippo", seed=3)
+    ((key, world),) = worlds(rows)
+    assert key == ("ippo", 3, 7)
+    np.testing.assert_array_equal(world.position[:, 0, 0], [0.0, 1.0, 2.0])
+    np.testing.assert_array_equal(world.position[:, 1, 0], [4.0, 5.0, NAN])
+    assert world.goal[1, 1].tolist() == [6.0, 11.0, 2.0]
 
 
-def test_the_terminal_table_fits_a_hundred_columns():
-    wide = {"return": -12345.0, "return_low": -12345.0, "return_high": -11234.0, "crashed": 10}
-    wide |= {"steady_low": 0.0123, "steady_high": 0.0456, "overshoot_low": 0.0123}
-    buffer = StringIO()
-    Console(file=buffer, width=100).print(terminal_table(results_of(**wide), HEADLINE))
-    lines = buffer.getvalue().splitlines()
-    assert max(len(line) for line in lines) <= 100
-    assert "…" not in buffer.getvalue()
-    assert any("1,234,567" in line for line in lines)
+def test_the_middle_seed_and_the_furthest_start_are_shown() -> None:
+    runs = pd.concat([runs_of("ippo", 0.3, 0.1, 0.2), runs_of("orca", 0.0)])
+    starts = [("ippo", 0, 0, episode, start) for episode, start in enumerate((1.0, -4.0, 2.0))]
+    table = pd.DataFrame(starts, columns=["row", "seed", "env_steps", "episode", "start"])
+    assert shown_runs(runs, table, HEADLINE) == ({"ippo": 2, "orca": 0}, 1)
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"agents": ("pid",), "seeds": 2},
-        {"agents": ("a2c",), "seeds": 1, "snapshots": 1},
-        {"agents": ("vpg", "a2c"), "seeds": 1, "env_steps": 60},
-        {"agents": ("vpg", "my [agent]", "pid"), "seeds": 2, "snapshots": 2},
-        {"agents": ("vpg", "a2c"), "seeds": 10, "env_steps": 1000},
-    ],
-    ids=lambda options: f"{len(options['agents'])}x{options['seeds']}",
-)
-def test_any_selection_gives_a_report(tmp_path, options):
-    folder = synthetic_folder(tmp_path, **options)
-    text = write_report(folder).read_text(encoding="utf-8")
-    assert text.count('<figure class="card chart"') == 6
-    # SB3's A2C, with which ours is compared, is in none of them.
-    both = {"vpg", "a2c"} <= set(options["agents"])
-    assert text.count('<span class="badge not-tested">') == (1 if both else 5)
+@pytest.fixture(scope="module")
+def swarm(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Results of two drones that fly past each other, with agents that were compared."""
+    env = EnvConfig(env_id="rotorgram/Formation-v0", drones=2, vehicle="crazyflie2")
+    rows = tuple(Row(agent=agent, name=agent, env=env) for agent in ("ippo", "mappo"))
+    study = Study(rows=rows, seeds=2)
+    folder = synthetic_folder(tmp_path_factory.mktemp("swarm") / "results", study=study)
+    content = json.loads((folder / "config.json").read_text())
+    for spec in content["specs"].values():
+        spec["agents"] = ["left", "right"]
+    (folder / "config.json").write_text(json.dumps(content))
+    there = np.linspace(0.0, 4.0, 21).tolist()
+    episode = [there, [5.0 - x for x in there]]  # at X = 2.4 and 2.6 m they are nearest
+    flown = [positions(*[episode] * 3, row=row.name, seed=seed) for row in rows for seed in (0, 1)]
+    pd.concat(flown).to_parquet(folder / "positions.parquet", index=False)
+    write_report(Results.read(folder))
+    return folder
 
 
-def test_missing_values_and_crashes_give_a_report(tmp_path):
-    folder = synthetic_folder(tmp_path, agents=("vpg", "a2c"), seeds=3)
-    evaluations = pd.read_csv(folder / "evaluations.csv")
-    evaluations.loc[evaluations["seed"] == 1, ["elevation_error", "overshoot"]] = np.nan
-    evaluations.loc[evaluations["agent"] == "a2c", "elevation_error"] = np.nan
-    evaluations.assign(settling_time=np.nan, terminated=True).to_csv(
-        folder / "evaluations.csv", index=False
-    )
-    text = write_report(folder).read_text(encoding="utf-8")
-    assert "0 of 9 settled" in text
-    assert "9 of 9 crashed" in text
-    assert "no value" in text
+def test_a_swarm_has_the_least_distance_in_place_of_the_overshoot(swarm: Path) -> None:
+    results = Results.read(swarm)
+    table = results_table(results)
+    assert table["least_distance"].to_dict() == pytest.approx({"ippo": 0.2, "mappo": 0.2})
+    assert headings(HEADLINE, swarm=True)[5] == "Least distance (m)"
+    text = (swarm / "results.md").read_text(encoding="utf-8")
+    assert "| Least distance (m) |" in text
+    assert "| 0.20 (0.20 to 0.20) |" in text
+    assert "Overshoot" not in text
+    assert not (swarm / "claims.json").exists()
+    names = {path.name for path in (swarm / "figures").glob("*.svg")}
+    assert names == {"comparison.svg", "swarm.svg"}
+
+
+def test_the_film_shows_the_middle_seed_of_each_row(
+    swarm: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    filmed: list[object] = []
+
+    def film(path: Path, shots: list[Shot], config: Film, _: object) -> None:
+        path.touch()
+        filmed.extend((shot.name, shot.drones) for shot in shots)
+        filmed.append(config.camera)
+
+    monkeypatch.setattr(films, "film", film)
+    monkeypatch.setattr(films, "load", lambda path: filmed.append(path.name) or FakePolicy)
+    monkeypatch.setattr(films, "flown_trajectories", lambda *_, **__: [])
+    results = Results.read(swarm)
+    seeds, _ = shown_runs(results.runs, results.evaluations, HEADLINE)
+    assert films.film_study(results, tmp_path / "film.mp4")
+    files = [f"{row}-seed{seed}.safetensors" for row, seed in seeds.items()]
+    labels = [(f"{row.upper()}, seed {seed}", 2) for row, seed in seeds.items()]
+    assert filmed == [*files, *labels, "top"]
+
+
+class FakePolicy:
+    """A checkpoint."""
+
+    @staticmethod
+    def policy() -> None:
+        return None
+
+
+def test_a_film_is_of_one_task(tmp_path: Path) -> None:
+    other = EnvConfig(options={"action": "offset"})
+    rows = (Row(agent="pid", name="a"), Row(agent="pid", name="b", env=other))
+    results = made_up(tmp_path, Study(rows=rows, seeds=1), runs_of("a", 0.1))
+    with pytest.raises(InputError, match="film: expected rows of one task"):
+        films.film_study(results, tmp_path / "film.mp4")
+
+
+def test_a_headline_without_a_bound_holds_nothing(tmp_path: Path) -> None:
+    spec = spec_of(replace(ERROR, held=None, settled=None))
+    results = made_up(tmp_path, study_of(("a2c",), 2), runs_of("a2c", 0.1, 0.2), spec=spec)
+    page = markdown(results, results_table(results))
+    assert "| Seeds that hold | " in page
+    assert "| – |" in page

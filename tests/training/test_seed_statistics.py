@@ -9,7 +9,6 @@ from rotorgram.training.statistics import (
     bootstrap_interval,
     improvement_interval,
     iqm,
-    performance_profile,
     probability_of_improvement,
     seeds_to_decide,
     seeds_to_decide_share,
@@ -32,11 +31,6 @@ def test_interquartile_means_and_stratified_intervals_are_those_of_rliable():
     assert bootstrap_interval(*SECOND) == pytest.approx((0.275, 0.5125), abs=0.015)
 
 
-def test_performance_profiles_are_those_of_rliable():
-    expected = [1.0, 0.85714286, 0.57142857, 0.35714286, 0.14285714]
-    assert performance_profile(FIRST, THRESHOLDS) == pytest.approx(expected, abs=1e-8)
-
-
 def test_the_probability_of_improvement_is_that_of_rliable():
     assert probability_of_improvement(FIRST, SECOND) == pytest.approx(0.7244897959, abs=1e-9)
     assert improvement_interval(FIRST, SECOND) == pytest.approx((0.5255, 0.9082), abs=0.02)
@@ -46,11 +40,6 @@ def test_strata_are_resampled_by_themselves():
     # Every run of a task has the task's score: no resample changes anything.
     assert bootstrap_interval([1.0] * 4, [3.0] * 4) == (2.0, 2.0)
     assert all(math.isnan(end) for end in bootstrap_interval([1.0, 2.0], [3.0]))
-
-
-def test_a_profile_counts_what_is_above_a_threshold():
-    # One of two runs is above 1, and both of the other task; a missing run does not count.
-    assert performance_profile([[1.0, 2.0], [3.0, 3.0, math.nan]], [1.0]).tolist() == [0.75]
 
 
 def test_ties_improve_by_halves():
@@ -88,19 +77,26 @@ def test_seeds_that_decide_a_difference():
     assert all(math.isnan(number) for number in seeds_to_decide([1.0], [2.0, 3.0]))
 
 
-def test_exact_intervals_of_shares():
-    # Of n out of n the lower end is the tail's n-th root, and of none the mirror image.
-    assert share_interval(50, 50) == (pytest.approx(0.025 ** (1 / 50)), 1.0)
-    assert share_interval(0, 50) == (0.0, pytest.approx(1 - 0.025 ** (1 / 50)))
-    # Clopper and Pearson's interval of 10 out of 20, as tables have it.
-    assert share_interval(10, 20) == pytest.approx((0.2720, 0.7280), abs=5e-5)
+def test_wilsons_intervals_of_shares():  # fault 66
+    # Of n out of n it begins at n / (n + z²), z = 1.96, and of none it is the mirror image.
+    assert share_interval(50, 50) == (pytest.approx(50 / 53.8415, rel=1e-5), 1.0)
+    assert share_interval(0, 50) == (0.0, pytest.approx(3.8415 / 53.8415, rel=1e-5))
+    # Newcombe, Statistics in Medicine 17, 1998, table I: 81 of 263 and 15 of 148.
+    assert share_interval(81, 263) == pytest.approx((0.2553, 0.3662), abs=5e-5)
+    assert share_interval(15, 148) == pytest.approx((0.0624, 0.1605), abs=5e-5)
+    assert all(math.isnan(end) for end in share_interval(0, 0))
+
+
+def test_an_improvement_at_the_boundary_has_wilsons_interval():  # fault 66
+    low, high = improvement_interval([[4.0, 5.0, 6.0]], [[1.0, 2.0, 3.0]])
+    assert (low, high) == (pytest.approx(3 / 6.8415, rel=1e-5), 1.0)
 
 
 def test_seeds_that_decide_a_share():
-    # All hold: 0.9^n < 0.00625 from n = 49 on, 0.9^n < 0.025 from 36 on.
-    assert seeds_to_decide_share(1.0, 0.9, 0.9875) == 49
-    assert seeds_to_decide_share(1.0, 0.9) == 36
-    assert seeds_to_decide_share(0.0, 0.9) == 2  # both fail: 0.1² < 0.025
+    # All hold: n / (n + z²) > 0.9 from n = 9 z² on, 56.2 at 98.75 % and 34.6 at 95 %.
+    assert seeds_to_decide_share(1.0, 0.9, 0.9875) == 57
+    assert seeds_to_decide_share(1.0, 0.9) == 35
+    assert seeds_to_decide_share(0.0, 0.9) == 1  # z² / (1 + z²) is 0.79
     assert seeds_to_decide_share(0.9, 0.9) == math.inf
     # A share between: the number decides with 80 % or more, by a count of flips of a coin.
     count = int(seeds_to_decide_share(0.8, 0.9))

@@ -16,18 +16,17 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-
-from ..agents.pid import SHARES
-from ..envs.config import EnvConfig as FlownConfig
-from ..envs.loop import Loop
-from ..envs.spec import canonical_id
-from ..envs.tasks.elevation import ERROR_SCALE
-from ..envs.tasks.racing import RacingOptions, read_track
-from ..envs.tasks.recovery import Recovery, RecoveryOptions
-from ..envs.tasks.waypoints import WaypointsOptions
-from ..flights.trajectories import evaluation_seed
-from ..models.vehicle import Vehicle
-from .settings import EnvConfig
+from rotorgram.agents.pid import SHARES
+from rotorgram.envs.config import EnvConfig as FlownConfig
+from rotorgram.envs.loop import Loop
+from rotorgram.envs.spec import canonical_id
+from rotorgram.envs.tasks.elevation import ERROR_SCALE
+from rotorgram.envs.tasks.racing import RacingOptions, read_track
+from rotorgram.envs.tasks.recovery import Recovery, RecoveryOptions
+from rotorgram.envs.tasks.waypoints import WaypointsOptions
+from rotorgram.flights.trajectories import evaluation_seed
+from rotorgram.models.vehicle import Vehicle
+from rotorgram.training.settings import EnvConfig
 
 _HALVINGS: Final = 24
 RECOVERY: Final = "rotorgram/Recovery-v0"

@@ -1,0 +1,498 @@
+"""A study: its runs, what it keeps when it is stopped, resuming, and wrong input."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from comparisons import study_of, synthetic_folder
+from rotorgram.agents import load, preset
+from rotorgram.cli import main
+from rotorgram.cli._flags import parse
+from rotorgram.cli.compare import Compare
+from rotorgram.cli.sweep import Sweep, parse_grid
+from rotorgram.envs import LocalVectorEnv
+from rotorgram.flights.executors import RunsFailed, WorkersConfig
+from rotorgram.flights.folders import locked
+from rotorgram.flights.trajectories import evaluation_seed, fly_episodes
+from rotorgram.models.errors import InputError
+from rotorgram.training.metrics import measure_episode
+from rotorgram.training.results import PARTS, Results, ResultsError, checkpoint_file
+from rotorgram.training.settings import BOARD, EnvConfig, Row, Study
+from rotorgram.training.study import open_env, run_study
+
+ENV = EnvConfig(options={"episode_length": 40, "flight_band": 1.2})
+A2C = Row(agent="a2c", name="a2c", env=ENV, env_steps=600, set={"steps_per_update": 64})
+STUDY = Study(
+    rows=(A2C, Row(agent="pid", name="pid", env=ENV)),
+    seeds=2, snapshots=2, curve_episodes=2, episodes=3, keep_steps=True,
+)  # fmt: skip
+ONE = WorkersConfig(jobs=1)
+COMMITTED = Path(__file__).parents[2] / "docs" / "results" / "baselines"
+TIMES = ["seconds", "steps_per_second", "seconds_to_hold"]
+FLAGS = ("--env-steps", "300", "--episodes", "1", "--episode-length", "40", "--no-film")
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
+    """Exit status, standard output and standard error of a command."""
+    status = main([str(a) for a in arguments])
+    captured = capsys.readouterr()
+    return status, captured.out, captured.err
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("study")
+    run_study(STUDY, path, "rotorgram compare", workers=ONE)
+    return path
+
+
+# ---- runs
+
+
+def test_a_run_is_what_its_checkpoint_flies_from_starts_of_its_seed(folder: Path) -> None:
+    results = Results.read(folder)
+    assert results.study == STUDY
+    runs = list(zip(results.runs["row"], results.runs["seed"], strict=True))
+    assert runs == [("a2c", 0), ("a2c", 1), ("pid", 0), ("pid", 1)]
+    policy = load(checkpoint_file(folder, A2C, 1)).policy()
+    headline = results.headline(A2C)
+    with closing(LocalVectorEnv(ENV.env_id, 3, autoreset_mode="Disabled", **ENV.options)) as env:
+        flown = fly_episodes(env, policy, 3, "final", training_seed=1)
+        others = fly_episodes(env, policy, 3, "final", training_seed=0)
+    rows = [measure_episode(one, headline) for one in flown]
+    found = results.runs.iloc[1]
+    assert found["steady"] == np.mean([row["steady"] for row in rows])
+    assert found["return"] == pytest.approx(np.mean([row["return"] for row in rows]), rel=1e-12)
+    assert (found["env_steps"], found["episodes"]) == (600, 3)
+    assert found["steps_per_second"] == pytest.approx(600 / found["seconds"])
+    # The other seed's starts are others.  # fault 41
+    assert all(a.headline[0] != b.headline[0] for a, b in zip(flown, others, strict=True))
+
+
+def test_evaluation_episodes_share_no_start() -> None:
+    sets: tuple[Any, ...] = ("final", "curve", "tuning")
+    seeds = {
+        evaluation_seed(episode, of, seed)
+        for episode in range(20) for of in sets for seed in (None, 0, 1, 2)
+    }  # fmt: skip
+    assert len(seeds) == 20 * 3 * 4
+
+
+def test_tables_flies_two_hundred_times_or_more() -> None:  # fault 41
+    for seeds, episodes in ((1, 200), (5, 40), (7, 29), (10, 20), (30, 20)):
+        assert Study(rows=(A2C,), seeds=seeds).episodes == episodes
+
+
+def test_files_hold_settings_software_and_every_step(folder: Path) -> None:
+    assert sorted(p.name for p in folder.iterdir()) == [
+        ".lock", "checkpoints", "config.json", "episodes.parquet", "evaluations.parquet",
+        "runs.csv", "steps.parquet",
+    ]  # fmt: skip
+    content = json.loads((folder / "config.json").read_text())
+    assert content["command"] == "rotorgram compare"
+    assert content["versions"]["mujoco"].startswith("4.")
+    assert len(content["specs"]["a2c"]["vehicle_hash"]) == 32
+    results = Results.read(folder)
+    training = results.steps("train")
+    for seed in (0, 1):
+        own = training[training["seed"] == seed]
+        assert own["step"].tolist() == list(range(1, 601))
+    # Two snapshots and the untrained policy on two episodes each, the last on three.
+    evaluations = results.evaluations[results.evaluations["row"] == "a2c"]
+    assert evaluations.groupby(["seed", "env_steps"]).size().iloc[-1] == 3
+    flown = results.evaluations[results.evaluations["row"] == "pid"]
+    steps = results.steps("evaluation")
+    assert (steps["row"] == "pid").sum() == flown["length"].sum()
+
+
+def test_over_the_wire_the_numbers_are_those_in_process(folder: Path, tmp_path: Path) -> None:
+    study = replace(STUDY, wire=True, seeds=1)
+    run_study(study, tmp_path, workers=ONE)
+    own, other = Results.read(tmp_path), Results.read(folder)
+    for name in ("runs", "evaluations", "episodes"):
+        table = getattr(other, name)
+        expected = table[table["seed"] == 0].reset_index(drop=True)
+        clocks = [name for name in table if "seconds" in name or name in TIMES]
+        pd.testing.assert_frame_equal(
+            getattr(own, name).drop(columns=clocks),
+            expected.drop(columns=clocks),
+            check_exact=True,
+        )
+
+
+def test_what_is_missing_is_flown_to_the_same_numbers(folder: Path, tmp_path: Path) -> None:
+    two = replace(STUDY, seeds=1)
+    run_study(two, tmp_path, workers=ONE)
+    parts = tmp_path / PARTS
+    shown: set[str] = set()
+    # As if the command had been stopped after the first seed.
+    for row in STUDY.rows:
+        tables = Results.read(tmp_path)
+        part = parts / f"{row.name}-seed0"
+        part.mkdir(parents=True)
+        for name in ("runs", "evaluations", "episodes", "steps"):
+            table = tables.steps("train") if name == "steps" else getattr(tables, name)
+            own = table[table["row"] == row.name]
+            if len(own):
+                own.to_parquet(part / f"{name}.parquet", index=False)
+    (tmp_path / "runs.csv").unlink()
+    content = json.loads((tmp_path / "config.json").read_text())
+    content["study"]["seeds"] = 2
+    (tmp_path / "config.json").write_text(json.dumps(content))
+    half = Results.read(tmp_path)
+    assert len(half.runs) == 2
+    assert not half.finished
+    run_study(half.study, tmp_path, "", lambda name, *_: shown.add(name), ONE)
+    assert shown == {"all runs", "a2c seed 1", "pid seed 1"}
+    whole, again = Results.read(folder).runs, Results.read(tmp_path).runs
+    assert Results.read(tmp_path).finished
+    pd.testing.assert_frame_equal(
+        again.drop(columns=TIMES), whole.drop(columns=TIMES), check_exact=True
+    )
+
+
+def test_all_rows_fly_with_a_seed_before_the_next() -> None:
+    names = ["a2c seed 0", "pid seed 0", "a2c seed 1", "pid seed 1"]
+    assert list(STUDY.runs()) == names
+
+
+@pytest.mark.parametrize("work", ["fresh", "resumed"])
+def test_a_folder_is_written_by_one_process(work: str, tmp_path: Path) -> None:
+    if work == "resumed":
+        synthetic_folder(tmp_path, ("a2c",), 1, 300)
+    before = {path.name for path in tmp_path.iterdir()}
+    busy = pytest.raises(InputError, match="expected a folder that no other process writes to")
+    with locked(tmp_path), busy:
+        run_study(STUDY, tmp_path, workers=ONE)
+    assert {path.name for path in tmp_path.iterdir()} == before | {".lock"}
+
+
+def test_a_run_that_fails_is_named_and_the_others_are_kept(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # Adam's step is as large as the learning rate: the second update overflows.
+    folder = tmp_path / "out"
+    flags = ("--grid", "learning_rate=0.01,1e29", "--seeds", 1, *FLAGS, "--jobs", 1)
+    status, out, err = run(capsys, "sweep", "a2c", *flags, "--out", folder)
+    assert status == 1
+    assert err.startswith("rotorgram: 1 of 2 runs failed: learning_rate=1e+29 seed 1000: ")
+    assert err.count("\n") == 1
+    assert f"go on with: rotorgram sweep a2c --resume {folder}" in out
+    assert "1 of 2 runs done" in out
+    assert pd.read_csv(folder / "results.csv")["row"].tolist() == ["learning_rate=0.01"]
+    study = Results.read(folder).study
+    with pytest.raises(RunsFailed, match=r"1 of 1 runs failed: learning_rate=1e\+29 seed 1000"):
+        run_study(study, folder, workers=ONE)
+    assert len(Results.read(folder).runs) == 1
+
+
+def test_ctrl_c_keeps_what_is_done(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "out"
+    flags = ["--grid", "gamma=0.9,0.99", "--seeds", "2", "--jobs", "1", *FLAGS]
+    flags[flags.index("--env-steps") + 1] = "4000"
+    process = subprocess.Popen(
+        [sys.executable, "-m", "rotorgram.cli", "sweep", "vpg", *flags, "--out", str(folder)],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+    )  # fmt: skip
+    try:
+        deadline = time.monotonic() + 60
+        while not list(folder.glob("parts/gamma*")):
+            assert process.poll() is None
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        os.killpg(process.pid, signal.SIGINT)
+        out, err = process.communicate(timeout=20)
+    finally:
+        process.kill()
+    assert (process.returncode, err) == (130, "rotorgram: interrupted\n")
+    assert f"go on with: rotorgram sweep vpg --resume {folder}\n" in out
+    kept = Results.read(folder).runs
+    assert 1 <= len(kept) < 4
+    assert run(capsys, "report", folder)[0] == 0
+    assert run(capsys, "sweep", "vpg", "--resume", folder, "--jobs", 1)[0] == 0
+    whole = Results.read(folder).runs
+    assert len(whole) == 4
+    merged = whole.merge(kept)  # the same bits, times too
+    assert len(merged) == len(kept)
+    status, _, err = run(capsys, "sweep", "vpg", "--resume", folder)
+    assert (status, "is finished; draw its report with: rotorgram report" in err) == (1, True)
+    status, _, err = run(capsys, "sweep", "vpg", "--resume", folder, "--seeds", 3)
+    assert (status, "got others by --seeds" in err) == (1, True)
+    status, _, err = run(capsys, "compare", "--resume", folder)
+    assert (status, "expected a folder of rotorgram compare" in err) == (1, True)
+
+
+# ---- rows and files
+
+
+def test_two_files_are_rows_of_their_names(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = 'agent = "a2c"\nenv_steps = 300\nset = {{ hidden = {} }}\n[env]\nepisode_length = 40\n'
+    for name, hidden in (("a", "[8]"), ("b", "[8, 8]")):
+        (tmp_path / f"{name}.toml").write_text(text.format(hidden))
+    files = [tmp_path / "a.toml", tmp_path / "b.toml"]
+    flags = ("--seeds", 2, "--episodes", 2, "--snapshots", 1, "--jobs", 1, "--no-film")
+    more = ("--set", "gamma=0.9", "--env.flight-band", "1.5", "--out", tmp_path / "out")
+    assert run(capsys, "compare", *files, *flags, *more)[0] == 0
+    results = Results.read(tmp_path / "out")
+    assert [row.name for row in results.study.rows] == ["a", "b"]
+    assert [row.config.hidden for row in results.study.rows] == [(8,), (8, 8)]
+    for row in results.study.rows:
+        assert (row.config.gamma, row.env.options["flight_band"]) == (0.9, 1.5)
+        assert row.env.options["episode_length"] == 40
+    assert not results.study.wire
+    figures = {path.name for path in (tmp_path / "out" / "figures").iterdir()}
+    assert figures == {"comparison.png", "comparison.pdf", "comparison.svg"}
+
+
+def test_a_study_is_read_back_from_its_json() -> None:
+    for study in (STUDY, Study.from_toml(BOARD), Study.from_toml(BOARD.with_name("swarms.toml"))):
+        content = json.loads(json.dumps(study.to_dict()))
+        assert Study.from_dict("here", content) == study
+
+
+OWN_TASK = """
+import rotorgram.envs
+from rotorgram.envs.tasks.hover import Hover
+
+class Near(Hover):
+    pass
+
+rotorgram.envs.register("Near-v0", Near)
+"""
+
+
+def test_a_board_takes_own_tasks_and_changes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:  # fault 60
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "near_task.py").write_text(OWN_TASK)
+    (tmp_path / "rows.toml").write_text(
+        '[[row]]\nagent = "ppo"\nenv_steps = 1024\nnum_envs = 4\n'
+        'env = { env_id = "near_task:Near-v0", episode_length = 20 }\n'
+        '[[row]]\nagent = "geometric"\n'
+        'env = { env_id = "near_task:Near-v0", episode_length = 20 }\n'
+    )
+    flags = ("--set", "steps_per_update=256", "--seeds", 2, "--episodes", 2, "--snapshots", 1)
+    status, out, err = run(
+        capsys, "benchmark", "rows.toml", *flags, "--jobs", 2, "--page", "page.md", "--out", "o"
+    )
+    assert status == 0, err
+    assert "4 of 4 runs done" in out
+    page = (tmp_path / "page.md").read_text()
+    assert "| PPO tuned steps_per_update=256 (2 seeds; 1,024 env steps) |" in page
+    assert "| Geometric (2 seeds) |" in page
+
+
+def test_a_controller_brings_its_options_and_stands_in_the_table_of_its_task() -> None:
+    hover = EnvConfig(env_id="rotorgram/Hover-v0", options={"episode_length": 9})
+    row = Row(agent="geometric", env=hover)
+    assert (row.env.options["action"], row.env.options["episode_length"]) == ("position", 9)
+    assert row.name == "geometric Hover-v0 episode_length=9"
+    assert row.task == Row(agent="ppo", env=hover, env_steps=41_000).task
+    velocity = replace(hover, options={"action": "velocity"})
+    assert Row(agent="geometric", env=velocity).task == "Hover-v0 action=velocity"
+
+
+def test_a_row_trains_on_the_backend_of_its_preset_or_its_own() -> None:
+    hover = EnvConfig(env_id="rotorgram/Hover-v0")
+    row = Row(agent="ppo", env=hover)
+    assert row.run(0).backend == "rigid"
+    assert "backend" not in row.env.env
+    assert Row(agent="ppo", env=hover, backend="mujoco").run(0).backend == "mujoco"
+    with pytest.raises(InputError, match=r"ppo tuned Hover-v0: env_steps: expected at least"):
+        Row(agent="ppo", env=hover, env_steps=100)
+
+
+def test_whole_worlds_train_a_swarm() -> None:
+    words = ["--env", "rotorgram/Crossing-v0", "--drones", "4", "--agents", "ippo"]
+    for more, count in (([], 4), (["--num-envs", "8"], 8)):
+        study = parse(Compare, "rotorgram compare", [*words, *more]).study()
+        assert study.rows[0].num_envs == count
+
+
+def test_without_files_it_is_the_papers_comparison_over_udp() -> None:
+    study = parse(Compare, "rotorgram compare", ["--set", "hidden=[32,32]"]).study()
+    assert [row.name for row in study.rows] == ["vpg", "a2c", "sb3-a2c", "pid"]
+    assert (study.kind, study.wire, study.keep_steps, study.seeds) == ("paper", True, True, 5)
+    assert {row.env_steps for row in study.rows[:3]} == {200_000}
+    assert study.rows[0].config == preset("vpg", "tuned", hidden=(32, 32))
+
+
+# ---- the grid
+
+
+def test_the_grid_is_read_by_name_in_json() -> None:  # fault 60
+    assert parse_grid(
+        ["learning_rate=0.01,1e-3", "anneal=true,False", "baseline=none,time",
+         "hidden=[64,64],[32]", "env.start_band=0.5,2"]
+    ) == {
+        "learning_rate": (0.01, 0.001),
+        "anneal": (True, False),
+        "baseline": ("none", "time"),
+        "hidden": ([64, 64], [32]),
+        "env.start_band": (0.5, 2),
+    }  # fmt: skip
+
+
+def test_points_are_all_combinations_of_settings_and_task_options() -> None:
+    words = ["ppo", "--env", "rotorgram/Hover-v0", "--set", "gamma=0.9"]
+    grid = ["--grid", "hidden=[64,64],[32]", "--grid", "env.start-band=0.5,1"]
+    study = parse(Sweep, "rotorgram sweep", [*words, *grid]).study()
+    found = [(row.config.hidden, row.env.options["start_band"]) for row in study.rows]
+    assert found == [((64, 64), 0.5), ((64, 64), 1), ((32,), 0.5), ((32,), 1)]
+    assert study.rows[0].name == "hidden=[64,64] env.start-band=0.5"
+    assert (study.first_seed, study.seeds, study.evaluation) == (1000, 3, "tuning")
+    assert study.rows[3].config.gamma == 0.9
+
+
+@pytest.mark.parametrize(
+    ("flags", "sentence"),
+    [
+        ([], "grid: expected at least one hyperparameter, got none"),
+        (["--grid", "gamma"], "grid: expected NAME=VALUE,VALUE,…, got 'gamma'"),
+        (["--grid", "hidden=[64,"], "grid: expected values in JSON, got '[64,'"),
+        (["--grid", "speed=1,2"], "hyperparameters: expected some of"),
+        (["--grid", "env.speed=1,2"], "speed"),
+        (["--grid", "gamma=0.9,1.1"], "gamma: expected a number from 0 to 1, got 1.1"),
+        (["--grid", "gamma=0.9,0.90"], "grid: expected each gamma once, got 0.9 twice"),
+        (["--grid", "gamma=0.9", "gamma=0.8"], "grid: expected each name once, got gamma twice"),
+        (["--grid", "gamma=0.9", "--grid", "gae_lambda=2"], "gae_lambda: expected a number"),
+        (["--grid", "gamma=0.9", "--set", "gamma"], "set: expected NAME=VALUE, got 'gamma'"),
+        (
+            ["--grid", "gamma=0.9", "--set", "hidden=64,64"],
+            "set: expected a list as hidden=[64,64], got 'hidden=64,64'",
+        ),
+        (["--grid", "gamma=0.9", "--seeds", "0"], "seeds: expected at least 1, got 0"),
+        (["--grid", "gamma=0.9", "--first-seed", "-1"], "first_seed: expected 0 or more, got -1"),
+        (["--grid", "gamma=0.9", "--env-steps", "9"], "env_steps: expected at least 256, got 9"),
+        (["--grid", "gamma=0.9", "--jobs", "0"], "jobs: expected at least 1, got 0"),
+        (["--grid", "gamma=0.9", "--address", "a:1"], "address: expected it with runner ray"),
+        (["--grid", "gamma=0.9", "--env.target", "1"], "target: expected"),
+        (["--grid", "gamma=0.9", "--out", "."], "exists already"),
+        (["--resume", "nowhere"], "got one without config.json"),
+    ],
+)
+def test_wrong_input_is_one_sentence(
+    flags: list[str],
+    sentence: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    status, out, err = run(capsys, "sweep", "a2c", *flags)
+    assert (status, out) == (1, "")
+    assert err.startswith("rotorgram: ")
+    assert sentence in err
+    assert err.count("\n") == 1
+    assert not list(tmp_path.iterdir()), "nothing has flown"
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("row = []", "row: expected at least one, got none"),
+        ('[[row]]\nagent = "lqg"', "agent: expected one of pid, "),
+        ('[[row]]\nagent = "a2c"\n[[row]]\nagent = "a2c"', "row: expected each row once, got a2c"),
+        ('[[row]]\nagent = "a2c"\nenv = {env_id = "x/Y-v0"}', "expected a registered id"),
+        ('[[row]]\nagent = "a2c"\ncolour = 1', "row 1: expected some of agent, name, env, backend"),
+        ("[[row]]\nnum_envs = 8", "row 1: expected an agent, got none"),
+        ('[[row]]\nagent = "a2c"\nenv_steps = "a"', "env_steps: expected a whole number, got 'a'"),
+        ('[[row]]\nagent = "a2c"\nenv = 3', "env: expected a table, got 3"),
+        ("row = [3]", "row 1: expected a table, got 3"),
+        ("row = 3", "row: expected [[row]] tables, got 3"),
+        ('[[rows]]\nagent = "pid"', "expected some of agent, name"),
+        ('seeds = 1.5\n[[row]]\nagent = "pid"', "seeds: expected a whole number, got 1.5"),
+        ('episodes = true\n[[row]]\nagent = "pid"', "episodes: expected a whole number, got True"),
+        ('[[row]]\nagent = "a2c"\nenv_steps = 100', "env_steps: expected at least 256, got 100"),
+        ('seeds = 0\n[[row]]\nagent = "pid"', "seeds: expected at least 1, got 0"),
+        ("[[row", "expected a TOML file of rows"),
+    ],
+)
+def test_wrong_files_are_one_sentence(text: str, sentence: str, tmp_path: Path) -> None:
+    path = tmp_path / "rows.toml"
+    path.write_text(text)
+    with pytest.raises(InputError) as error:
+        Study.from_toml(path)
+    assert sentence in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+# ---- files of results
+
+
+def test_results_that_are_wrong_are_one_sentence(tmp_path: Path) -> None:
+    with pytest.raises(ResultsError, match=r"expected the folder of a study, .*config\.json$"):
+        Results.read(tmp_path)
+    (tmp_path / "config.json").write_text("{}")
+    with pytest.raises(ResultsError, match="expected the settings of a study"):
+        Results.read(tmp_path)
+
+
+@pytest.mark.parametrize("change", ["twice", "foreign", "text", "empty", "column"])
+def test_runs_of_another_study_are_refused(tmp_path: Path, change: str) -> None:
+    folder = synthetic_folder(tmp_path, study=study_of(("a2c",), 2))
+    lines = (folder / "runs.csv").read_text().splitlines(keepends=True)
+    content = {
+        "twice": [*lines, lines[1]],
+        "foreign": [*lines, lines[1].replace("a2c,0,", "a2c,7,")],
+        "text": [*lines, lines[1].replace("a2c,0,", "a2c,x,")],
+        "empty": [],
+        "column": [line.replace("steady", "error") for line in lines],
+    }[change]
+    (folder / "runs.csv").write_text("".join(content))
+    with pytest.raises(ResultsError, match=r"runs\.csv: expected"):
+        _ = Results.read(folder).runs
+
+
+def test_a_table_that_is_no_table_is_one_sentence(tmp_path: Path) -> None:
+    folder = synthetic_folder(tmp_path, ("a2c",), 1, 300)
+    (folder / "evaluations.parquet").write_text("nothing")
+    with pytest.raises(ResultsError, match=r"evaluations\.parquet: expected a Parquet file"):
+        _ = Results.read(folder).evaluations
+    pd.DataFrame({"row": ["a2c"]}).to_parquet(folder / "evaluations.parquet")
+    with pytest.raises(ResultsError, match=r"evaluations\.parquet: expected the columns"):
+        _ = Results.read(folder).evaluations
+
+
+# ---- what is committed
+
+
+def test_our_own_rows_are_right() -> None:
+    study = Study.from_toml(BOARD)
+    assert {"vpg", "a2c", "sb3-a2c", "pid"} <= {row.agent for row in study.rows}
+    swarms = Study.from_toml(BOARD.with_name("swarms.toml"))
+    assert swarms.seeds == 5
+    assert {row.env.drones for row in swarms.rows} == {2, 4, 8}
+    assert {"ippo", "mappo", "sb3-ppo", "orca"} == {row.agent for row in swarms.rows}
+
+
+def test_the_committed_policies_fly_the_committed_numbers() -> None:
+    """From the starts of the commit that took them, which were those of all seeds."""
+    results = Results.read(COMMITTED)
+    trained = [row for row in results.study.rows if not row.controller]
+    files = {row.name: checkpoint_file(COMMITTED, row, results.study.first_seed) for row in trained}
+    assert {*files.values()} == set((COMMITTED / "checkpoints").iterdir())
+    runs = results.runs.set_index(["row", "seed"])
+    for row in trained:
+        first = runs.loc[row.name, results.study.first_seed]
+        policy, count = load(files[row.name]).policy(), results.study.episodes
+        with open_env(False, row.env.env, count) as env:
+            flown = fly_episodes(env, policy, count, "final")
+        measured = [measure_episode(one, results.headline(row)) for one in flown]
+        found = [np.mean([one[name] for one in measured]) for name in ("steady", "return")]
+        # Another processor may round otherwise.
+        expected = [first["steady"], first["return"]]
+        assert found == pytest.approx(expected, rel=0.02, abs=1e-3), row.name

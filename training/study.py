@@ -1,0 +1,215 @@
+"""A study: every row with every seed is trained and evaluated; what is done is kept."""
+
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from ..agents import CONTROLLERS
+from ..agents.checkpoints import Checkpoint, store
+from ..agents.policies import Policy
+from ..envs.registry import env_spec, load
+from ..envs.spec import EnvSpec
+from ..flights.executors import OnProgress, Tell, WorkersConfig, open_executor, run_jobs
+from ..flights.folders import locked
+from ..flights.trajectories import Trajectory, fly_episodes
+from . import results, swarms
+from .metrics import Headline, measure_episode, measure_run
+from .pairs import shared_pair
+from .results import CONFIG_FILE, PARTS
+from .settings import Row, Study
+from .training import Training, train_run
+
+MAX_BATCH: Final = 64
+"""Most evaluation episodes that are flown at a time."""
+
+Job = tuple[Row, int]
+"""A row and a seed."""
+
+
+class Stage(NamedTuple):
+    """A policy, and the training behind it."""
+
+    policy: Callable[[EnvSpec], Policy]
+    env_steps: int = 0
+    seconds: float = 0.0
+
+
+class Done(NamedTuple):
+    """What a run gives."""
+
+    tables: results.Tables
+    checkpoint: Checkpoint | None
+
+
+def run_study(
+    study: Study,
+    folder: Path,
+    command: str = "",
+    on_progress: OnProgress = lambda *_: None,
+    workers: WorkersConfig | None = None,
+) -> None:
+    """Train and evaluate everything, and write the results into `folder`.
+
+    Each run leaves a part behind when it is done, so that a study that was interrupted, or of which
+    a run failed, goes on where it was: call it again with the same folder and study. `report` draws
+    figures, table and verdicts.
+
+    Args:
+        study: Rows and seeds.
+        folder: It exists: see `folders.new_folder`.
+        command: The user's command, for `config.json`.
+        on_progress: Called with the progress of each run.
+        workers: Kind and number of workers; by default one for each core.
+
+    Raises:
+        RunsFailed: Some runs failed; the others are done, and their parts kept.
+        InputError: Another process writes to the folder, or there is no such Ray cluster; nothing
+            is written.
+    """
+    parts = folder / PARTS
+    jobs = {
+        name: job
+        for name, job in study.runs().items()
+        if not (parts / results.part_name(*job)).exists()
+    }
+    config = workers or WorkersConfig()
+    with open_executor(config, len(jobs), on_progress) as executor, locked(folder):
+        parts.mkdir(exist_ok=True)
+        if not (folder / CONFIG_FILE).exists():  # a resumed study keeps its settings
+            specs = {row.name: env_spec(row.env.flown) for row in study.rows}
+            results.write_config(folder, command, study, specs)
+        for unfinished in parts.glob(".*"):
+            shutil.rmtree(unfinished)
+        own_tasks = {row.env.own_task for row in study.rows if row.env.own_task}
+        fly = partial(_fly, study, own_tasks)
+        run_jobs(executor, fly, jobs, partial(_keep, study, folder), on_progress)
+        results.join_parts(folder)
+
+
+def _keep(study: Study, folder: Path, job: Job, done: Done) -> None:
+    """Write checkpoint and part; the part last, for with it the run is done."""
+    row, seed = job
+    checkpoint = done.checkpoint
+    if study.kind == "benchmark" and checkpoint:  # none is chosen: the first seed's policy
+        checkpoint = checkpoint.policy_alone() if seed == study.first_seed else None
+    if checkpoint and study.kind != "sweep":
+        store(checkpoint, results.checkpoint_file(folder, row, seed))
+    results.write_part(folder, row, seed, done.tables)
+
+
+# ---- in a worker
+
+
+def _fly(study: Study, own_tasks: set[str], job: Job, tell: Tell) -> Done:
+    row, seed = job
+    for task in own_tasks:
+        load(task)
+    if row.controller:
+        stages = [Stage(CONTROLLERS[row.agent])]
+        times = {"env_steps": 0, "seconds": 0.0, "steps_per_second": np.nan}
+        return Done(_evaluate(study, row, seed, stages, times), None)
+    run = row.run(seed)
+    with open_env(study.wire, run.training_env, run.num_envs) as env:
+        training, times = train_run(run, env, tell, study.snapshots, study.keep_steps)
+    stages = []
+    for taken in training.taken:
+        stages.append(Stage(_constant(taken.policy), taken.env_steps, taken.seconds))
+    tables = _evaluate(study, row, seed, stages, times)
+    tables["episodes"] = _episodes(training)
+    if study.keep_steps:
+        steps = _steps("train", **training.log.steps())
+        tables["steps"] = pd.concat([steps, tables["steps"]], ignore_index=True)
+    return Done(tables, training.checkpoint())
+
+
+def _constant(policy: Policy) -> Callable[[EnvSpec], Policy]:
+    return lambda spec: policy
+
+
+@contextmanager
+def open_env(wire: bool, settings: dict[str, Any], num_envs: int) -> Iterator[Any]:
+    """An env of so many drones without autoreset: over UDP with a simulator process that the next
+    run of this process uses again, or in process.
+    """
+    if wire:
+        with shared_pair(**settings, num_envs=num_envs) as env:
+            yield env
+        return
+    from ..envs.vector import LocalVectorEnv
+
+    keywords = {"autoreset_mode": "Disabled", **settings}
+    env_id, options = keywords.pop("env_id"), keywords.pop("options")
+    with closing(LocalVectorEnv(env_id, num_envs, **keywords, **options)) as local:
+        yield local
+
+
+def _evaluate(
+    study: Study, row: Row, seed: int, stages: Sequence[Stage], times: dict[str, Any]
+) -> dict[str, pd.DataFrame]:
+    """Tables of the evaluation of all stages: the last on `study.episodes` episodes of its own,
+    each before it on `study.curve_episodes` of the set `curve`.
+    """
+    rows: list[dict[str, Any]] = []
+    flown: list[Trajectory] = []
+    drones = row.env.drones
+    most = max(study.curve_episodes, study.episodes) if len(stages) > 1 else study.episodes
+    worlds = min(most, max(MAX_BATCH // drones, 1))
+    with open_env(study.wire, row.env.env, worlds * drones) as env:
+        headline = Headline.of(env.env_spec)
+        for stage in stages:
+            last = stage is stages[-1]
+            count = study.episodes if last else study.curve_episodes
+            episodes = study.evaluation if last else "curve"
+            policy = stage.policy(env.env_spec)
+            flown = fly_episodes(env, policy, count, episodes, training_seed=seed)
+            label = {"row": row.name, "seed": seed}
+            label |= {"env_steps": stage.env_steps, "seconds": stage.seconds}
+            rows += [label | measure_episode(one, headline) for one in flown]
+    evaluations = pd.DataFrame(rows)
+    measures = {**times, **measure_run(evaluations, headline)}
+    tables = {"runs": pd.DataFrame([measures]), "evaluations": evaluations}
+    if study.keep_steps:
+        tables["steps"] = pd.concat([_flown_steps(one) for one in flown], ignore_index=True)
+        if drones > 1:
+            tables["positions"] = swarms.rows_of(flown)
+    return tables
+
+
+def _episodes(training: Training) -> pd.DataFrame:
+    log, run = training.log, training.run
+    rows = []
+    for episode in log.episodes:
+        # While one drone flies a step, each of the others does.
+        last = min(episode.first_step + episode.length * run.num_envs, log.env_steps)
+        content = asdict(episode)
+        content |= {"return": content.pop("total_reward"), "last_step": last}
+        rows.append(content | log.drawn.get(episode.episode, {}))
+    names = list(results.COLUMNS["episodes"][2:])
+    drawn = [name for name in (rows[0] if rows else ()) if name not in names]
+    return pd.DataFrame(rows, columns=[*names, *drawn])
+
+
+def _flown_steps(one: Trajectory) -> pd.DataFrame:
+    return _steps(
+        "evaluation", episode=one.episode, value=one.headline[1:], reward=one.rewards,
+        thrust=one.mean_thrust[1:],
+    )  # fmt: skip
+
+
+def _steps(phase: str, **columns: Any) -> pd.DataFrame:
+    """Rows of the table `steps`: one value or shape (T,) for each column but `step`."""
+    count = len(columns["reward"])
+    floats = {name: np.asarray(columns[name], np.float32) for name in ("value", "reward", "thrust")}
+    return pd.DataFrame({
+        "phase": phase,
+        "episode": np.asarray(columns["episode"], np.int32),
+        "step": np.arange(1, count + 1, dtype=np.int32),
+        **floats,
+    })  # fmt: skip

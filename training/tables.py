@@ -1,0 +1,392 @@
+"""The table of a study: one line for each row, measures over its seeds, as text.
+
+Cells are made once; the terminal, Markdown and HTML show the same ones.
+"""
+
+import html
+import math
+import re
+from collections.abc import Mapping, Sequence
+from itertools import groupby
+from typing import Final, Literal, NamedTuple
+
+import numpy as np
+import pandas as pd
+from rich import box
+from rich.table import Table
+from rich.text import Text
+
+from ..flights.palette import agent_label
+from .metrics import Headline
+from .results import Results
+from .settings import Row
+from .statistics import (
+    Floats,
+    bootstrap_interval,
+    improvement_interval,
+    iqm,
+    probability_of_improvement,
+    share_interval,
+)
+from .swarms import least_distances
+
+_TERMINAL_COLUMNS: Final = (0, 1, 2, 3, 6, 7, 8)  # those that fit 100 columns
+NOTHING: Final = "–"
+"""Shown where there is no value."""
+_MEASURES: Final = ("steady", "settling_time", "overshoot", "return")
+_COUNTS: Final = ("episodes", "settled", "crashed")
+
+
+class Cell(NamedTuple):
+    """A cell of the table: its value, and the small print below it."""
+
+    value: str
+    details: tuple[str, ...] = ()
+
+
+class TaskTable(NamedTuple):
+    """The rows that fly one task."""
+
+    task: str
+    headline: Headline
+    headings: tuple[str, ...]
+    lines: list[tuple[Cell, ...]]
+
+
+# ---- numbers
+
+
+def results_table(results: Results) -> pd.DataFrame:
+    """Measures over seeds of each row of which a run is done, indexed by `row`.
+
+    For each of steady, settling_time (s), overshoot and return, and for the least_distance (m) of
+    drones of one world: the interquartile mean over seeds, and `_low` and `_high` of its 95 %
+    interval. `held`: seeds that hold the goal; `worst`: the worst seed's steady state;
+    `most_crashed`: crashes of the seed that crashed most. Counts: seeds, episodes, settled,
+    crashed; `crash_rate` of a flight, and `_low` and `_high` of Wilson's interval.
+    `env_steps_to_hold` and `seconds_to_hold`: interquartile means over the `reached` seeds.
+    `env_steps` of a training and `steps_per_second`; missing for controllers.
+
+    The rows of a sweep are ranked: whole rows first, then by the crashes of the worst seed, then by
+    its steady state. Other rows keep their order.
+    """
+    lines: dict[str, dict[str, float]] = {}
+    for row in results.study.rows:
+        own = results.runs[results.runs["row"] == row.name]
+        if len(own):
+            lines[row.name] = _measures(own, results.headline(row))
+    table = pd.DataFrame.from_dict(lines, orient="index").rename_axis("row")
+    if len(results.positions):
+        table = table.join(least_distances(results.positions))
+    if results.study.kind != "sweep" or table.empty:
+        return table
+    high = results.headline(results.study.rows[0]).high
+    order = {"seeds": False, "most_crashed": True, "worst": not high}
+    return table.sort_values(list(order), ascending=list(order.values()), kind="stable")
+
+
+def _measures(own: pd.DataFrame, headline: Headline) -> dict[str, float]:
+    trained = own["env_steps"].max() > 0
+    line: dict[str, float] = {"seeds": len(own)}
+    for name in _COUNTS:
+        line[name] = int(own[name].sum())
+    for name in _MEASURES:
+        values = own[name].to_numpy(float)
+        line[name] = iqm(values)
+        line[f"{name}_low"], line[f"{name}_high"] = bootstrap_interval(values)
+    line |= _share_interval(line, headline)
+    line["held"] = math.nan if headline.held is None else int(own["held"].sum())
+    line["worst"] = own["steady"].agg("min" if headline.high else "max")
+    line["most_crashed"] = int(own["crashed"].max())
+    low, high = share_interval(int(line["crashed"]), int(line["episodes"]))
+    line["crash_rate"] = line["crashed"] / line["episodes"]
+    line |= {"crash_rate_low": low, "crash_rate_high": high}
+    reached = own["env_steps_to_hold"].notna().sum() if trained else math.nan
+    line["reached"] = math.nan if headline.held is None else reached
+    for name in ("env_steps_to_hold", "seconds_to_hold", "steps_per_second"):
+        line[name] = iqm(own[name].to_numpy(float))
+    line["env_steps"] = own["env_steps"].max() if trained else math.nan
+    return line
+
+
+def _share_interval(line: Mapping[str, float], headline: Headline) -> dict[str, float]:
+    """Wilson's interval for a steady state that is a share of all flights, or is 0 or 1 in all
+    seeds: resampling shows no spread there.
+    """
+    total = int(line["episodes"])
+    degenerate = line["steady_low"] == line["steady_high"] and line["steady_low"] in (0.0, 1.0)
+    if headline.counts_crashes:
+        low, high = share_interval(total - int(line["crashed"]), total)
+    elif headline.high and not headline.unit and degenerate:
+        low, high = share_interval(round(line["steady"] * total), total)
+    else:
+        return {}
+    return {"steady_low": low, "steady_high": high}
+
+
+def scores(own: pd.DataFrame, headline: Headline) -> Floats:
+    """Scores from 0 to 1 of the seeds of a row, shape (n,); NaN without a bound of the goal.
+
+    With the steady size and the bound at which a goal counts as held: bound / (bound + size), or
+    for a metric that is to be high size / (bound + size). A share that is to be high, without a
+    unit and with a bound below 1, counts by what it lacks to 1. So 1/2 is the bound itself, and 1
+    the best. A run with a crash that the size does not count, or without a value, scores 0.
+    """
+    size, bound, high = own["steady"].to_numpy(float), headline.held, headline.high
+    if bound is None:
+        return np.full(len(own), np.nan)
+    if high and not headline.unit and bound < 1:
+        size, bound, high = 1 - size, 1 - bound, False
+    size = np.maximum(size, 0.0)
+    score = (size if high else bound) / (bound + size)
+    crashed = (own["crashed"] > 0) & (not headline.counts_crashes)
+    return np.where(crashed | np.isnan(size), 0.0, score)
+
+
+# ---- cells
+
+
+def task_tables(results: Results, table: pd.DataFrame) -> list[TaskTable]:
+    """A table of cells for each task, of `results_table`."""
+    rows = {row.name: row for row in results.study.rows}
+    ordered = [rows[str(name)] for name in table.index]
+    sweep = results.study.kind == "sweep"
+    found = []
+    for task, own in by_task(ordered, together=sweep):
+        headline = results.headline(own[0])
+        swarm = own[0].env.drones > 1 and "least_distance" in table
+        lines = [_line(row, table.loc[row.name].to_dict(), headline, swarm) for row in own]
+        found.append(TaskTable(task, headline, headings(headline, swarm), lines))
+    return found
+
+
+def by_task(rows: Sequence[Row], *, together: bool = False) -> list[tuple[str, list[Row]]]:
+    """Rows by their task; those of a sweep are kept together, whatever options it sweeps."""
+    if together:
+        return [(rows[0].env.env_id.rpartition("/")[2], list(rows))] if rows else []
+    ordered = sorted(rows, key=lambda row: row.task)
+    return [(task, list(group)) for task, group in groupby(ordered, key=lambda row: row.task)]
+
+
+def headings(headline: Headline, swarm: bool = False) -> tuple[str, ...]:
+    """Headings of the columns; of a swarm the least distance is in the place of the overshoot."""
+    settled = headline.settled
+    band = "" if settled is None else f" to {headline.amount(f'{settled:.2g}')}"
+    return (
+        "Agent",
+        headline.labelled(f"Steady {headline.size_symbol}"),
+        f"Seeds that hold {headline.held_text}".rstrip(),
+        "Crashes per flight",
+        f"Settling{band} (s)",
+        "Least distance (m)" if swarm else headline.labelled("Overshoot"),
+        "Return",
+        "Env steps to hold",
+        "Env steps per s",
+    )
+
+
+def _line(row: Row, line: Mapping[str, float], headline: Headline, swarm: bool) -> tuple[Cell, ...]:
+    seeds, episodes = int(line["seeds"]), int(line["episodes"])
+    reached: tuple[str, ...] = ()
+    if not math.isnan(line["reached"]):
+        reached = (_of(line["reached"], seeds, "seed"),)
+        if line["reached"]:
+            reached += (f"{number_text(line['seconds_to_hold'])} s",)
+    names = [_of(seeds, None, "seed")]
+    if not row.controller:
+        names.append(f"{count_text(line['env_steps'])} env steps")
+    return (
+        Cell(row_label(row), tuple(names)),
+        _measured(line, "steady", (f"worst {number_text(line['worst'])}",)),
+        _held(line, seeds),
+        _crashes(line),
+        _measured(line, "settling_time", (f"{int(line['settled'])} of {episodes} settled",))
+        if headline.settles
+        else Cell(NOTHING),
+        _measured(line, "least_distance" if swarm else "overshoot"),
+        _measured(line, "return"),
+        Cell(count_text(line["env_steps_to_hold"]), reached),
+        Cell(count_text(line["steps_per_second"])),
+    )
+
+
+def row_label(row: Row) -> str:
+    """Name of a row in tables and figures."""
+    if row.name == row.agent:
+        return agent_label(row.agent)
+    words = f" {row.task}"
+    if row.name.endswith(words):  # its table names the task
+        agent, *others = row.name.removesuffix(words).split()
+        return " ".join([agent_label(agent), *others])
+    return row.name
+
+
+def _held(line: Mapping[str, float], seeds: int) -> Cell:
+    if math.isnan(line["held"]):
+        return Cell(NOTHING)
+    held = int(line["held"])
+    low, high = share_interval(held, seeds)
+    return Cell(f"{held} of {seeds}", (f"{low:.0%} to {high:.0%}".replace("%", " %"),))
+
+
+def _crashes(line: Mapping[str, float]) -> Cell:
+    low, high = (100 * line[f"crash_rate_{end}"] for end in ("low", "high"))
+    rate = number_text(100 * line["crash_rate"])
+    interval = f"{number_text(low)} to {number_text(high)} %"
+    return Cell(f"{rate} %", (interval, f"{int(line['crashed'])} of {int(line['episodes'])}"))
+
+
+def _measured(line: Mapping[str, float], name: str, details: tuple[str, ...] = ()) -> Cell:
+    low, high = line[f"{name}_low"], line[f"{name}_high"]
+    interval = () if math.isnan(low) else (f"{number_text(low)} to {number_text(high)}",)
+    return Cell(number_text(line[name]), interval + details)
+
+
+def _of(count: float, total: int | None, word: str) -> str:
+    number = count if total is None else total
+    plural = "" if number == 1 else "s"
+    counted = f"{count:.0f}" if total is None else f"{count:.0f} of {total}"
+    return f"{counted} {word}{plural}"
+
+
+def number_text(value: float) -> str:
+    """Write a number with about three digits, and fewer below 1."""
+    if math.isnan(value):
+        return NOTHING
+    size = abs(value)
+    if size == 0.0:
+        return "0"
+    if size < 1e-4:
+        return f"{value:.0e}"
+    if size < 1.0:
+        return f"{value:.{1 - math.floor(math.log10(size))}f}"
+    return f"{value:,.{max(0, 2 - math.floor(math.log10(size)))}f}"
+
+
+def count_text(value: float) -> str:
+    """Write a number without decimals."""
+    return NOTHING if math.isnan(value) else f"{value:,.0f}"
+
+
+NOTE: Final = (
+    "Interquartile means over seeds with 95 % bootstrap intervals, from the deterministic "
+    "evaluation after training; each seed flies episodes of its own. Shares have Wilson's 95 % "
+    "interval. Steady: mean size of the metric in the last quarter of an episode, or at its end if "
+    "only the end counts. A seed holds if its mean steady state is on the right side of the bound "
+    "in every snapshot's flights without a crash; env steps to hold: to the first snapshot from "
+    "which on all hold. A crashed episode counts with what was flown of it and has not settled."
+)
+
+
+# ---- texts
+
+
+def markdown(results: Results, table: pd.DataFrame) -> str:
+    """All tables in Markdown, with a note; then scores over the tasks that rows share."""
+    tables = task_tables(results, table)
+    parts = []
+    for task in tables:
+        if len(tables) > 1:
+            parts.append(f"## {task.task}")
+        rows = [tuple(map(_markdown_cell, line)) for line in task.lines]
+        parts.append(_markdown_table(task.headings, rows))
+    parts.append(NOTE)
+    if len(tables) > 1:
+        parts += _scores(results)
+    return "\n\n".join(parts) + "\n"
+
+
+def _markdown_cell(cell: Cell) -> str:
+    return f"{cell.value} ({'; '.join(cell.details)})" if cell.details else cell.value
+
+
+def _markdown_table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [titles, ["---", *["---:"] * (len(titles) - 1)], *rows]
+    # |E| in a cell would end the cell.
+    escaped = [[cell.replace("|", r"\|") for cell in line] for line in lines]
+    return "\n".join(f"| {' | '.join(line)} |" for line in escaped)
+
+
+def _scores(results: Results) -> list[str]:
+    """Scores of trained agents over all of their tasks, and which agent is better."""
+    found: dict[str, dict[str, Floats]] = {}
+    for row in results.study.rows:
+        own = results.runs[results.runs["row"] == row.name]
+        headline = results.headline(row)
+        if not row.controller and len(own) and headline.held is not None:
+            found.setdefault(row_label(row), {})[row.task] = scores(own, headline)
+    if len(found) < 2:
+        return []
+    totals, pairs = [], []
+    for label, own in found.items():
+        strata = list(own.values())
+        low, high = bootstrap_interval(*strata)
+        totals.append([label, str(len(own)), f"{iqm(*strata):.3f} ({low:.3f} to {high:.3f})"])
+        pairs.append([label, *(_improvement(own, other) for other in found.values())])
+    return [
+        "## Over all tasks",
+        "Score: b / (b + e) for a steady size e and the bound b of holding (e / (b + e) of a "
+        "metric that is to be high; of a share that is, e and b are what it lacks to 1), 0 with a "
+        "crash. Below: the probability that a run of the agent of the row has a higher score than "
+        "one of the column, over the tasks that both fly. An interval with 50 % in it decides "
+        "nothing.",
+        _markdown_table(["Agent", "Tasks", "Score"], totals),
+        _markdown_table(["", *found], pairs),
+    ]
+
+
+def _improvement(own: Mapping[str, Floats], other: Mapping[str, Floats]) -> str:
+    tasks = [task for task in own if task in other]
+    if own is other or not tasks:
+        return NOTHING
+    first, second = [own[task] for task in tasks], [other[task] for task in tasks]
+    low, high = improvement_interval(first, second)
+    share = probability_of_improvement(first, second)
+    if math.isnan(low):
+        return f"{share:.0%}"
+    return f"{share:.0%} ({low:.0%} to {high:.0%})"
+
+
+def terminal_tables(results: Results, table: pd.DataFrame) -> list[Table]:
+    """The tables for a terminal of 100 columns."""
+    return [_terminal_table(task) for task in task_tables(results, table)]
+
+
+def _terminal_table(task: TaskTable) -> Table:
+    shown = Table(
+        title=task.task,
+        title_justify="left",
+        box=box.SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+        show_edge=False,
+        pad_edge=False,
+        caption="Below a value: its 95 % interval, and how many episodes (or seeds) got there.",
+        caption_justify="left",
+    )
+    for place in _TERMINAL_COLUMNS:
+        justify: Literal["left", "right"] = "right" if place else "left"
+        shown.add_column(task.headings[place], justify=justify, overflow="fold")
+    for line in task.lines:
+        cells = [_terminal_cell(line[place]) for place in _TERMINAL_COLUMNS]
+        shown.add_row(*cells, end_section=True)
+    return shown
+
+
+def _terminal_cell(cell: Cell) -> Text:
+    # Text, not markup: a name may hold brackets. The last words would cost the width.
+    details = [re.sub(r"( of \d+) (settled|seeds?)$", r"\1", text) for text in cell.details]
+    return Text("\n".join([cell.value, *details]))
+
+
+def html_table(task: TaskTable) -> str:
+    """A table in HTML."""
+    head = "".join(f"<th>{html.escape(heading)}</th>" for heading in task.headings)
+    lines = []
+    for line in task.lines:
+        lines.append(f"<tr>{''.join(map(_html_cell, line))}</tr>")
+    return f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(lines)}</tbody></table>"
+
+
+def _html_cell(cell: Cell) -> str:
+    details = "".join(f"<small>{html.escape(text)}</small>" for text in cell.details)
+    return f"<td>{html.escape(cell.value)}{details}</td>"
