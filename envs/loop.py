@@ -78,7 +78,7 @@ class Stages:
         judge = Judge(env_id, task)
         measure = Measure(world, task.control_period)
         self._observing = [measure, *sensing, Memory(task), judge, *readings]
-        pictures = [Pictures(task, shape)] if config.cameras else []
+        pictures = [Pictures(task, world.random, shape)] if config.cameras else []
         self._observing += pictures
         self.pictures = pictures[0].specs if pictures else ()
         if randomize is not None and "observation_delay" in drawn:

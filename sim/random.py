@@ -1,32 +1,188 @@
-"""Random numbers: one stream for each world, so that a batch of N equals N single worlds.
+"""Random numbers as functions of (seed, use, episode, step): Philox 4x32-10 in array code.
 
-A world's seed gives a `SeedSequence`. Every use has a child of it under a fixed number, so that a
-use that is switched on later does not move the numbers of another.
+J. K. Salmon, M. A. Moraes, R. O. Dror, D. E. Shaw, "Parallel random numbers: as easy as 1, 2, 3",
+SC 2011. The key is the 64-bit seed of a world. The counter has a block, the step, the episode and
+the number of a use, which is made of its name: a use that is switched on later does not move the
+numbers of another. A batch of W worlds has the numbers of W single ones.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from math import prod
-from typing import Any, Final, Protocol
+from secrets import randbits
+from typing import Any, Final
+from zlib import crc32
 
 import numpy as np
+from numpy.typing import NDArray
 
+from . import elementary
 from .state import Array
 
-START: Final = 0
-"""Child of a world's seed that draws how its episodes begin."""
-GUSTS: Final = 1
-"""Child that moves the air."""
-RANDOMIZATION: Final = 2
-"""Child that draws a vehicle's coefficients."""
-SENSORS: Final = 3
-"""Child of the sensors; each of them has a child of it."""
-CAMERAS: Final = 4
-"""Child of the noise of pictures."""
-SCENES: Final = 5
-"""Child that draws what surrounds an episode."""
+Words = NDArray[np.uint32]
+Numbers = NDArray[np.float64]
+Ids = Any
+"""Numbers of worlds, or `...` for all."""
 
-_ROWS: Final = 256  # Most rows of numbers that a stream gives at once
-_NUMBERS: Final = 1 << 23  # Most numbers that all streams of a `Noise` give at once: 64 MiB
+START: Final = "start"
+"""Use of the draws with which a task begins episodes."""
+GUSTS: Final = "gusts"
+RANDOMIZATION: Final = "randomization"
+CAMERAS: Final = "cameras"
+SCENES: Final = "scenes"
+
+_MULTIPLIERS: Final = np.array((0xD2511F53, 0xCD9E8D57), np.uint64)
+_WEYL: Final = (0x9E3779B9, 0xBB67AE85)
+_ROUNDS: Final = 10
+_UNIT: Final = 2.0**-32
+_TURN: Final = 6.283185307179586
+_AHEAD: Final = 256  # Most rows of numbers that are drawn ahead, over all worlds
+_BLOCKS: Final = 16  # Least blocks that a `Draw` computes at once for a world
+
+
+def philox(counter: Words, key: Words) -> Words:
+    """Four random words of a counter, shape (..., 4), and a key, shape (..., 2)."""
+    even = counter[..., 0::2].astype(np.uint64)
+    odd = counter[..., 1::2]
+    for number in range(_ROUNDS):
+        weyl = np.array([number * step % 2**32 for step in _WEYL], np.uint32)
+        product = even * _MULTIPLIERS
+        high = (product >> np.uint64(32)).astype(np.uint32)
+        mixed = high[..., ::-1] ^ odd ^ (key + weyl)
+        odd = product.astype(np.uint32)[..., ::-1]
+        even = mixed.astype(np.uint64)
+    words = np.empty((*np.broadcast_shapes(counter.shape[:-1], key.shape[:-1]), 4), np.uint32)
+    words[..., 0::2] = even
+    words[..., 1::2] = odd
+    return words
+
+
+def use_number(name: str) -> int:
+    """The number of a use."""
+    return crc32(name.encode())
+
+
+def words_of(
+    key: Words, use: int, episode: Array, step: Array, count: int, first: int = 0
+) -> Words:
+    """Random words of a use, shape (..., count), for keys (..., 2), episodes and steps (...).
+
+    They begin at the block `first`, of four words.
+    """
+    blocks = -(-count // 4)
+    counter = np.empty((*key.shape[:-1], blocks, 4), np.uint32)
+    counter[..., 0] = np.arange(first, first + blocks)
+    counter[..., 1] = np.asarray(step)[..., None]
+    counter[..., 2] = np.asarray(episode)[..., None]
+    counter[..., 3] = use
+    words = philox(counter, key[..., None, :])
+    return words.reshape(*key.shape[:-1], 4 * blocks)[..., :count]
+
+
+def uniform(words: Words) -> Numbers:
+    """Numbers from 0 up to 1, one of each word."""
+    return words * _UNIT
+
+
+def normal(words: Words) -> Numbers:
+    """Standard normal numbers of an even number of words, as many (Box and Muller, 1958)."""
+    half = words.shape[-1] // 2
+    distance: Any = uniform(words[..., :half])
+    angle = _TURN * uniform(words[..., half:])
+    radius = np.sqrt(-2.0 * elementary.log(1.0 - distance))
+    parts = (radius * elementary.cos(angle), radius * elementary.sin(angle))
+    return np.concatenate(parts, axis=-1, dtype=np.float64)
+
+
+def normals_of(key: Words, use: int, episode: Array, step: Array, count: int) -> Numbers:
+    """Standard normal numbers of a use, shape (..., count); arguments as of `words_of`."""
+    return normal(words_of(key, use, episode, step, count + count % 2))[..., :count]
+
+
+class Random:
+    """The counters of W worlds. Until a world is seeded its seed is unpredictable.
+
+    Attributes:
+        shape: (W, A), or () for a single drone.
+        keys: Of each world the low and the high word of its seed, shape (W, 2).
+        episode: Number of the world's episode since it was seeded, shape (W,).
+    """
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        self.shape = shape
+        worlds, drones = shape or (1, 1)
+        self.drones = drones
+        seeds = np.array([randbits(64) for _ in range(worlds)], np.uint64)
+        self.keys = _keys(seeds)
+        self.episode = np.zeros(worlds, np.uint32)
+        self._is_drawn = np.zeros(worlds, bool)  # whether the start of an episode was drawn
+        self._uses: dict[int, str] = {}
+        self._noises: dict[str, Noise] = {}
+
+    def seed(self, ids: Ids, seeds: Sequence[int | None]) -> None:
+        """Seed the worlds `ids`; where the seed is None their numbers go on."""
+        for world, seed in zip(ids, seeds, strict=True):
+            if seed is not None:
+                self.keys[world] = _keys(np.array(int(seed) % 2**64, np.uint64))
+                self.episode[world] = 0
+                self._is_drawn[world] = False
+        for noise in self._noises.values():
+            noise.forget(ids)
+
+    def use(self, name: str) -> int:
+        """The number of a new use. Raises `ValueError` if another has it."""
+        number = use_number(name)
+        if number in self._uses:
+            raise ValueError(f"random numbers: {name!r} has the number of {self._uses[number]!r}")
+        self._uses[number] = name
+        return number
+
+    def start(self, use: int, ids: Ids, chosen: Mapping[str, Array] | None = None) -> "Draw":
+        """Begin an episode of the worlds `ids` by drawing its start."""
+        self.episode[ids] += np.uint32(1)
+        self._is_drawn[ids] = True
+        return Draw(self, use, ids, chosen)
+
+    def begin(self, ids: Ids) -> None:
+        """Reset the worlds `ids`: an episode begins, unless its start was drawn before."""
+        self.episode[ids] += (~self._is_drawn[ids]).astype(np.uint32)
+        self._is_drawn[ids] = False
+        for noise in self._noises.values():
+            noise.begin(ids)
+
+    def noise(self, name: str, size: int) -> "Noise":
+        """So many normal numbers of each drone in every step."""
+        self._noises[name] = noise = Noise(self, self.use(name), size)
+        return noise
+
+    def shares(self, use: int, ids: Ids) -> Numbers:
+        """One number from 0 up to 1 for each of the worlds `ids` and their episode."""
+        words = words_of(self.keys[ids], use, self.episode[ids], np.zeros(len(ids)), 1)
+        return uniform(words[:, 0])
+
+    def generator(self, use: int, world: int, step: int) -> np.random.Generator:
+        """A generator for the many numbers that one step of a world takes, as a picture does."""
+        words = words_of(self.keys[world], use, self.episode[world], step, 4)
+        return np.random.Generator(np.random.Philox(key=words.view(np.uint64)))
+
+    def snapshot(self) -> dict[str, NDArray[Any]]:
+        """Copies of the counters by name."""
+        return {name: array.copy() for name, array in self._arrays().items()}
+
+    def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Put the counters of a snapshot back."""
+        for name, array in self._arrays().items():
+            array[...] = arrays[name]
+        for noise in self._noises.values():
+            noise.forget(...)
+
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        counters = {"keys": self.keys, "episode": self.episode, "is_drawn": self._is_drawn}
+        return counters | {f"step {name}": noise.step for name, noise in self._noises.items()}
+
+
+def _keys(seeds: NDArray[np.uint64]) -> Words:
+    words = (seeds & np.uint64(0xFFFFFFFF), seeds >> np.uint64(32))
+    return np.stack(words, axis=-1).astype(np.uint32)
 
 
 class Draw:
@@ -35,8 +191,13 @@ class Draw:
     `chosen` has by name what a reset's options give in place of draws, shape (W, A, *size).
     """
 
-    def __init__(self, chosen: Mapping[str, Any] | None) -> None:
+    def __init__(
+        self, random: Random, use: int, ids: Ids, chosen: Mapping[str, Array] | None = None
+    ) -> None:
+        self._random, self._use, self._ids = random, use, ids
         self._chosen = chosen or {}
+        self._words = np.empty((len(ids), 0), np.uint32)
+        self._first = 0  # block that comes next
 
     def uniform(
         self, low: float, high: float, size: tuple[int, ...] = (), *, name: str = ""
@@ -46,128 +207,117 @@ class Draw:
         Equal ends give that number, and a number is drawn all the same. Under `name` a reset's
         options may give values in place of the draw.
         """
-        return self._chosen.get(name, self._draw("uniform", (low, high), size))
+        drawn = low + (high - low) * uniform(self._next(size))
+        return self._chosen.get(name, self._spread(drawn, size))
 
     def normal(self, scale: float, size: tuple[int, ...] = (), *, name: str = "") -> Array:
         """Normal numbers with mean 0 and that standard deviation, shape (W, A, *size)."""
-        return self._chosen.get(name, self._draw("normal", (0.0, scale), size))
+        count = self._random.drones * prod(size)
+        drawn = scale * normal(self._next(size, count % 2))[:, :count]
+        return self._chosen.get(name, self._spread(drawn, size))
 
     def chosen(self, name: str) -> Array | None:
         """Values that a reset's options give under that name, shape (W, A); None if none."""
         return self._chosen.get(name)
 
-    def _draw(self, kind: str, parameters: tuple[float, float], size: tuple[int, ...]) -> Array:
-        raise NotImplementedError
+    def _next(self, size: tuple[int, ...], more: int = 0) -> Words:
+        """The next words of each world that begins, from a new block on."""
+        count = self._random.drones * prod(size) + more
+        if count > self._words.shape[1]:
+            random, ids = self._random, self._ids
+            blocks = max(_BLOCKS, -(-count // 4))
+            self._words = words_of(
+                random.keys[ids],
+                self._use,
+                random.episode[ids],
+                np.zeros(len(ids), np.uint32),
+                4 * blocks,
+                self._first,
+            )
+        words = self._words[:, :count]
+        used = -(-count // 4)
+        self._words = self._words[:, 4 * used :]
+        self._first += used
+        return words
 
-
-class Streams:
-    """A generator for each of W worlds, seeded by `seed`; unpredictable until it is.
-
-    `use` is the number of the child of a world's seed, or the path to a child of a child.
-    """
-
-    def __init__(self, num_worlds: int, use: int | tuple[int, ...] = START) -> None:
-        self._key = use if isinstance(use, tuple) else (use,)
-        self._generators: list[np.random.Generator | None] = [None] * num_worlds
-        self._seeds: list[int | None] = [None] * num_worlds  # of generators that were not asked yet
-
-    def seed(self, ids: Sequence[int], seeds: Sequence[int | None]) -> None:
-        """Seed the worlds `ids`; where the seed is None the stream goes on."""
-        for world, seed in zip(ids, seeds, strict=True):
-            if seed is not None:
-                self._generators[world], self._seeds[world] = None, int(seed)
-
-    def of(self, world: int) -> np.random.Generator:
-        """The generator of a world."""
-        generator = self._generators[world]
-        if generator is None:
-            seed = self._seeds[world]
-            sequence = None if seed is None else np.random.SeedSequence(seed, spawn_key=self._key)
-            generator = self._generators[world] = np.random.default_rng(sequence)
-        return generator
-
-
-class NumpyDraw(Draw):
-    """Draws from streams, for the worlds `ids` of (W, A), or of () for a single drone."""
-
-    def __init__(
-        self,
-        streams: Streams,
-        ids: Sequence[int],
-        shape: tuple[int, ...],
-        chosen: Mapping[str, Any] | None = None,
-    ) -> None:
-        super().__init__(chosen)
-        self._streams, self._ids, self._shape = streams, ids, shape
-
-    def _draw(self, kind: str, parameters: tuple[float, float], size: tuple[int, ...]) -> Array:
-        # A generator scales slowly, number by number, and to the same bits as this.
-        first, second = parameters
-        name, span = (
-            ("random", second - first) if kind == "uniform" else ("standard_normal", second)
-        )
-        one_world = (*self._shape[1:], *size)
-        numbers = np.zeros((*self._shape, *size))
-        if self._ids:
-            drawn = [getattr(self._streams.of(world), name)(one_world) for world in self._ids]
-            numbers[self._ids if self._shape else ...] = first + span * np.array(drawn)
+    def _spread(self, drawn: Numbers, size: tuple[int, ...]) -> Array:
+        shape = self._random.shape
+        numbers = np.zeros((*shape, *size))
+        ids = self._ids if shape else ...
+        numbers[ids] = drawn.reshape(-1, *shape[1:], *size) if shape else drawn.reshape(size)
         return numbers[()]
 
 
-class Noise(Protocol):
-    """Standard normal numbers in every step, from a use's streams: `World.noise` makes it."""
+class Noise:
+    """Standard normal numbers of each drone in every step: `Random.noise` makes it.
 
-    def seed(self, ids: Sequence[int], seeds: Sequence[int | None]) -> None:
-        """Seed the worlds `ids`; where the seed is None the stream goes on."""
+    Steps are drawn ahead: that is a cache and no state.
+
+    Attributes:
+        step: Number of each world's next step in its episode, shape (W,).
+    """
+
+    def __init__(self, random: Random, use: int, size: int) -> None:
+        worlds = len(random.keys)
+        self.step = np.zeros(worlds, np.uint32)
+        self._random, self._use, self._size = random, use, size
+        self._ahead = max(1, _AHEAD // worlds)
+        self._rows = np.zeros((worlds, self._ahead, random.drones, size))
+        self._left = np.zeros(worlds, int)  # rows that are drawn ahead
+        self._worlds = np.arange(worlds)
+
+    def begin(self, ids: Ids) -> None:
+        """An episode of some worlds begins."""
+        self.step[ids] = 0
+        self.forget(ids)
+
+    def forget(self, ids: Ids) -> None:
+        """Seed, episode or step of some worlds have changed."""
+        self._left[ids] = 0
 
     def normal(self, mask: Array | None = None) -> Array:
         """The next numbers of the worlds of a mask, bool, shape (W, A), None for all.
 
-        Shape (W, A, size). The other worlds get zeros, and their streams stay where they are.
+        Shape (W, A, size). The other worlds get zeros, and their steps do not advance.
         """
-
-
-class NumpyNoise:
-    """A `Noise` with a stream for each world.
-
-    A call of a generator takes longer than ten numbers, so that each gives many rows at once. How
-    many does not change the numbers.
-    """
-
-    def __init__(self, shape: tuple[int, ...], size: int, use: int | tuple[int, ...]) -> None:
-        self._shape, self._size, (worlds, drones) = shape, size, shape or (1, 1)
-        self._streams, self._worlds = Streams(worlds, use), np.arange(worlds)
-        row = (drones, size)
-        self._count = max(1, min(_ROWS, _NUMBERS // (worlds * prod(row))))
-        self._single = self._rows()
-        self._block = np.empty((worlds, self._count, *row) if shape else 0)
-        self._next = np.full(worlds, self._count)  # of the rows of each world; past the last: none
-
-    def seed(self, ids: Sequence[int], seeds: Sequence[int | None]) -> None:
-        """As `Noise.seed`."""
-        self._streams.seed(ids, seeds)
-        for world, seed in zip(ids, seeds, strict=True):
-            if seed is not None:
-                self._next[world] = self._count
-                self._single = self._rows()
-
-    def normal(self, mask: Array | None = None) -> Array:
-        """As `Noise.normal`."""
-        if not self._shape:
-            return np.zeros(self._size) if mask is not None and not mask else next(self._single)
-        ids = self._worlds if mask is None else np.flatnonzero(mask[:, 0])
-        for world in ids[self._next[ids] == self._count].tolist():
-            self._streams.of(world).standard_normal(out=self._block[world])
-            self._next[world] = 0
-        rows = self._block[ids, self._next[ids]]
-        self._next[ids] += 1
+        shape = self._random.shape
+        if not shape:
+            if mask is not None and not mask:
+                return np.zeros(self._size)
+            return self._single()
         if mask is None:
-            return rows
-        numbers = np.zeros((*self._shape, self._size))
-        numbers[ids] = rows
+            return self._take(self._worlds)
+        ids = np.flatnonzero(mask[:, 0])
+        numbers = np.zeros((*shape, self._size))
+        numbers[ids] = self._take(ids)
         return numbers
 
-    def _rows(self) -> Iterator[np.ndarray]:
-        """The rows of a single drone."""
-        while True:
-            yield from self._streams.of(0).standard_normal((self._count, self._size))
+    def _single(self) -> Numbers:
+        left = self._left.item()
+        if left == 0:
+            self._fill(self._worlds)
+            left = self._ahead
+        self._left[0] = left - 1
+        self.step[0] += 1
+        row: Numbers = self._rows[0, self._ahead - left, 0]
+        return row.copy()
+
+    def _take(self, ids: NDArray[np.int64]) -> Numbers:
+        missing = ids[self._left[ids] == 0]
+        if missing.size:
+            self._fill(missing)
+        left = self._left[ids]
+        self._left[ids] = left - 1
+        self.step[ids] += np.uint32(1)
+        rows: Numbers = self._rows[ids, self._ahead - left]
+        return rows
+
+    def _fill(self, ids: NDArray[np.int64]) -> None:
+        random, ahead = self._random, self._ahead
+        steps = self.step[ids, None] + np.arange(ahead, dtype=np.uint32)
+        keys = np.repeat(random.keys[ids][:, None], ahead, axis=1)
+        episodes = np.repeat(random.episode[ids][:, None], ahead, axis=1)
+        count = random.drones * self._size
+        drawn = normals_of(keys, self._use, episodes, steps, count)
+        self._rows[ids] = drawn.reshape(len(ids), ahead, random.drones, self._size)
+        self._left[ids] = ahead

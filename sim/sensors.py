@@ -2,7 +2,7 @@
 
 A sensor is sampled at the end of a control step, from the exact state there: one with a rate below
 the control rate holds its last reading in between. A reset gives a first reading, which a delay
-holds too. Each sensor draws from a stream of its own, so that none moves the numbers of another.
+holds too. Each sensor has random numbers of its own, so that none moves those of another.
 
 World frame: x east, y north, z up. Arrays have the leading axes of the world, none for one drone.
 """
@@ -18,7 +18,6 @@ import numpy as np
 from ..models.coefficients import COEFFICIENTS
 from ..models.errors import InputError, expect
 from ..models.fields import Limits, check, limits_of
-from .random import SENSORS
 from .rotations import advanced, between, cross, to_body, to_world, world_z
 from .state import Array, WorldState, clip, component, stack
 
@@ -439,7 +438,7 @@ class MotionCapture(Sensor):
 SENSOR_TYPES: Final[Mapping[str, type[Sensor]]] = {
     kind.name: kind for kind in (Imu, Magnetometer, Barometer, Rangefinder, Gps, MotionCapture)
 }
-"""In this order they are observed; the place is also the number of a sensor's stream."""
+"""In this order they are observed."""
 
 _ESTIMATE_READING: Final = Reading(
     _ESTIMATE,
@@ -469,8 +468,7 @@ class _Channel:
         self.sensor = SENSOR_TYPES[name](values, self.interval)
         self._world = world
         # One number more than the sensor takes decides whether a reading is lost.
-        use = SENSORS, list(SENSOR_TYPES).index(name)
-        self._noise = world.noise(self.sensor.columns + 1, use)
+        self._noise = world.random.noise(f"sensor {name}", self.sensor.columns + 1)
         dropout = values["dropout"]
         self._lost = NormalDist().inv_cdf(dropout) if dropout else -math.inf
         self.value: Array = 0.0

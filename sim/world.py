@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, Protocol
 from ..models import BACKENDS, MAX_DRONES, Backend
 from ..models.errors import InputError, expect
 from .effects import EffectOptions
-from .random import Draw, Noise
+from .random import Draw, Random
 from .randomize import CENTER, Randomization
 from .state import Array, InitialState, WorldState
 
@@ -36,6 +36,7 @@ class World(Protocol):
         vehicle: The vehicle of every drone.
         shape: (W, A), the leading axes of all arrays; () for a single drone.
         state: As the last step or reset left it.
+        random: The counters of all random numbers; `seed` seeds them.
         parameters: What was drawn for each drone's episode, by name, shape (W, A).
 
     Class attributes:
@@ -45,6 +46,7 @@ class World(Protocol):
     vehicle: "Vehicle"
     shape: tuple[int, ...]
     state: WorldState
+    random: Random
     parameters: dict[str, Array]
     settings: ClassVar[tuple[str, ...]]
 
@@ -65,10 +67,10 @@ class World(Protocol):
         """
 
     def seed(self, mask: Array, seeds: Sequence[int | None] | Array) -> None:
-        """Seed the streams of the worlds of a mask, seeds (W,); None leaves its stream."""
+        """Seed the worlds of a mask, seeds (W,); where it is None the random numbers go on."""
 
     def draw(self, mask: Array, chosen: Any = None) -> Draw:
-        """A `Draw` for the worlds of the mask; `chosen` as in `random.NumpyDraw`."""
+        """Begin an episode of the worlds of a mask; `chosen` as of `random.Draw`."""
 
     def acceleration(self) -> Array:
         """Of each body's origin at the present state and thrusts, world frame, m/s², (W, A, 3)."""
@@ -77,12 +79,6 @@ class World(Protocol):
         """Distance from each body's origin along its -z axis to the first surface, m, (W, A).
 
         Infinite where there is none. Geoms of the craft do not count; a payload is a surface.
-        """
-
-    def noise(self, size: int, use: int | tuple[int, ...]) -> Noise:
-        """So many normal numbers of each drone in every step; `seed` seeds their streams too.
-
-        `use` as of `random.Streams`.
         """
 
     def close(self) -> None:

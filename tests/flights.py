@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 from rotorgram.sim import Draw, WorldState
+from rotorgram.sim.random import Random
 
 
 def state_of(rotors: int = 4, **arrays: Any) -> WorldState:
@@ -31,7 +32,7 @@ class Shares(Draw):
     """Gives, one after another, these shares of the way from the low end of a draw to the high."""
 
     def __init__(self, *shares: Any) -> None:
-        super().__init__(None)
+        super().__init__(Random(()), 0, [0])
         self._shares = iter(shares)
 
     def uniform(

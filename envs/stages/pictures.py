@@ -13,10 +13,10 @@ from ...models.cameras import FARTHEST, View, cameras_of, chosen_views
 from ...models.errors import expect
 from ...models.fleet import members_of
 from ...scenes import scenes_of
-from ...sim.random import CAMERAS, SCENES, Streams
+from ...sim.random import CAMERAS, SCENES, Random
 from ..spec import ArraySpec
 from ..tasks.task import Task
-from .record import Mask, Record, Stage
+from .record import Record, Stage
 
 if TYPE_CHECKING:
     from ...rendering.cameras import Cameras
@@ -84,16 +84,18 @@ class Pictures(Stage):
 
     Args:
         task: Its options choose the cameras and the scene.
+        random: Of the world; noise and scenes draw from it.
         shape: (W, A).
     """
 
     arrays = ("scenes",)
 
-    def __init__(self, task: Task, shape: tuple[int, int]) -> None:
+    def __init__(self, task: Task, random: Random, shape: tuple[int, int]) -> None:
         from ...rendering.cameras import Cameras
 
         self._task, self._shape, self._rows = task, shape, shape[0] * shape[1]
-        self._noise, self._draws = Streams(shape[0], CAMERAS), Streams(shape[0], SCENES)
+        self._random = random
+        self._noise, self._scenes = random.use(CAMERAS), random.use(SCENES)
         self.views = views_of(task, shape[1])
         scenes = scenes_of(str(task.config.scene))
         self._count = len(scenes)
@@ -132,19 +134,13 @@ class Pictures(Stage):
         for painter in self._painters:
             painter.cameras.close()
 
-    def seed(self, mask: Mask, seeds: Sequence[int | None] | NDArray[Any]) -> None:
-        """Seed noise and scenes."""
-        ids = np.flatnonzero(self._per_drone(mask)[:: self._shape[1]]).tolist()
-        for streams in (self._noise, self._draws):
-            streams.seed(ids, [seeds[world] for world in ids])
-
     def begin(self, record: Record) -> None:
         """Draw the scene of each world."""
         begun = self._per_drone(record.begun).reshape(self._shape).any(axis=1)
         scenes = np.zeros(self._shape[0], int)
         if self._count > 1:
-            for world in np.flatnonzero(begun).tolist():
-                scenes[world] = self._draws.of(world).integers(self._count)
+            ids = np.flatnonzero(begun)
+            scenes[ids] = self._count * self._random.shares(self._scenes, ids)
         old = vars(record).get("scenes", scenes)
         record.scenes = np.where(begun, scenes, old)
 
@@ -171,7 +167,7 @@ class Pictures(Stage):
             rows["payload"] = self._per_drone(state.payload)
         if self._goal_moves:
             rows["goal"] = self._per_drone(self._task.goal(state))
-        pictures = self._taken(due, fresh, rows, record.scenes)
+        pictures = self._taken(due, fresh, rows, record.scenes, steps)
         for name, picture in pictures.items():
             record.observations[name] = picture.reshape(*record.shape, *picture.shape[1:])
 
@@ -181,14 +177,18 @@ class Pictures(Stage):
         fresh: NDArray[np.bool_],
         rows: dict[str, NDArray[Any]],
         scenes: NDArray[np.int64],
+        steps: NDArray[np.int64],
     ) -> dict[str, NDArray[Any]]:
         pictures: dict[str, NDArray[Any]] = {
             view.name: np.empty((self._rows, *view.shape), view.dtype) for view in self.views
         }
 
+        def noise(world: int) -> np.random.Generator:
+            return self._random.generator(self._noise, world, steps[world * self._shape[1]])
+
         def paint(painter: _Painter) -> None:
             worlds = painter.worlds & (scenes == painter.scene)
-            painter.cameras.take(due, fresh, rows, self._noise.of, worlds)
+            painter.cameras.take(due, fresh, rows, noise, worlds)
             drones = np.repeat(worlds, self._shape[1])
             for view in self.views:
                 picture = painter.cameras.pictures[view.name][drones]

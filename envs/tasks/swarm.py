@@ -8,6 +8,7 @@ import numpy as np
 from ...models.errors import expect
 from ...models.fields import Limits
 from ...sim import Array, Draw, WorldState
+from ...sim.random import uniform, use_number, words_of
 from ..delay import Delay
 from .flight import (
     AIR,
@@ -27,6 +28,7 @@ FORGOTTEN: Final = 1.0  # A drone that was not heard for so long is no neighbour
 APPROACH_WEIGHT: Final = 0.1  # Of a speed of 1 m/s towards the goal, in each step
 ROOM_WEIGHT: Final = 0.5  # Cost of spheres that touch; nothing from a diameter apart on
 TINY: Final = 1e-9  # m
+_RADIO: Final = use_number("radio")
 JITTER: Final = 0.2  # Of a start, in each axis, over the distance between starts
 
 
@@ -205,8 +207,8 @@ class Radio:
         self._said = Delay(options.radio_delay)  # position, velocity, silent
         self._heard = np.zeros((worlds, count, count, 6))  # of receiver and sender
         self._age = np.full((worlds, count, count), np.inf)  # control steps
-        self._keys = np.zeros((worlds, count), np.uint64)
-        self._steps = np.zeros(worlds, np.uint64)
+        self._keys = np.zeros((worlds, count), np.uint32)
+        self._steps = np.zeros(worlds, np.uint32)
         self._own = np.eye(count, dtype=bool)
 
     def begin(self, mask: np.ndarray, position: np.ndarray, lots: np.ndarray) -> None:
@@ -219,7 +221,7 @@ class Radio:
         near = self._in_range(position, position)
         self._age[mask] = np.where(near, 0.0, np.inf)[mask]
         self._heard[mask] = np.broadcast_to(rest[:, None, :, :6], self._heard.shape)[mask]
-        self._keys[mask] = (lots * 2.0**53).astype(np.uint64)[mask]
+        self._keys[mask] = (lots * 2.0**32).astype(np.uint32)[mask]
         self._steps[mask] = 0
 
     def step(
@@ -237,7 +239,7 @@ class Radio:
         self._heard = np.where(arrives[..., None], said[:, None, :, :6], self._heard)
         older = self._age + mask[:, None, None]
         self._age = np.where(arrives, float(delay), older)
-        self._steps += mask.astype(np.uint64)
+        self._steps += mask.astype(np.uint32)
 
     def nearest(self, position: np.ndarray, velocity: np.ndarray, count: int) -> np.ndarray:
         """Of the nearest that are known: relative position, relative velocity, and 1; else zeros.
@@ -264,16 +266,11 @@ class Radio:
         return np.asarray(apart <= self._options.radio_range)
 
     def _chances(self) -> np.ndarray:
-        """Numbers from 0 to 1 of each message of this step, (W, A, A): SplitMix64 of receiver's
-        key, step and sender.
-        """
-        count = self._own.shape[0]
-        senders = np.arange(count, dtype=np.uint64)
-        place = self._steps[:, None, None] * np.uint64(count) + senders
-        x = self._keys[..., None] + (place + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
-        x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-        x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-        return np.asarray(((x ^ (x >> np.uint64(31))) >> np.uint64(11)) * 2.0**-53)
+        """Numbers from 0 to 1 of each message of this step, (W, receiver, sender)."""
+        worlds, count = self._keys.shape
+        key = np.stack((self._keys, np.zeros_like(self._keys)), axis=-1)
+        steps = np.broadcast_to(self._steps[:, None], (worlds, count))
+        return uniform(words_of(key, _RADIO, np.zeros_like(steps), steps, count))
 
 
 def ring(count: int) -> np.ndarray:

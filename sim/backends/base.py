@@ -1,4 +1,4 @@
-"""What backends share: effects, and the streams of random numbers."""
+"""What backends share: effects and random numbers."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
@@ -7,7 +7,7 @@ import numpy as np
 
 from ...models.vehicle import Vehicle
 from ..effects import EffectOptions, Effects
-from ..random import RANDOMIZATION, START, Draw, Noise, NumpyDraw, NumpyNoise, Streams
+from ..random import RANDOMIZATION, START, Draw, Random
 from ..randomize import Randomization
 from ..state import Array, InitialState, WorldState, plain
 from ..world import contact_check
@@ -32,9 +32,10 @@ class BaseWorld:
         self.parameters: dict[str, Array] = {}
         self._options, self._randomize = effects or EffectOptions(), randomize
         self._drawn = () if randomize is None else randomize.names
-        self._noises: list[Noise] = []
-        self._starts, self._draws = self._source(START), self._source(RANDOMIZATION)
-        acting = Effects(vehicle, self._options, self.noise, self._drawn)
+        self.random = Random(shape)
+        self._start = self.random.use(START)
+        self._randomization = self.random.use(RANDOMIZATION)
+        acting = Effects(vehicle, self._options, self.random.noise, self._drawn)
         self.effects = acting if acting.works else None
         self._on_rotors = acting.on_rotors
         self._check = contact_check(vehicle.timestep)
@@ -42,25 +43,11 @@ class BaseWorld:
     def seed(self, mask: Array, seeds: Sequence[int | None] | Array) -> None:
         """As `World.seed`."""
         ids = self._ids(mask).tolist()
-        given = [seeds[i] for i in ids]
-        sources: list[Any] = [self._starts, self._draws, *self._noises]
-        for one in sources:
-            one.seed(ids, given)
+        self.random.seed(ids, [seeds[i] for i in ids])
 
     def draw(self, mask: Array, chosen: Mapping[str, Array] | None = None) -> Draw:
         """As `World.draw`."""
-        return self._drawing(self._starts, mask, chosen or {})
-
-    def noise(self, size: int, use: int | tuple[int, ...]) -> Noise:
-        """As `World.noise`."""
-        self._noises.append(NumpyNoise(self.shape, size, use))
-        return self._noises[-1]
-
-    def _source(self, use: int | tuple[int, ...]) -> Streams:
-        return Streams(self.shape[0] if self.shape else 1, use)
-
-    def _drawing(self, source: Any, mask: Array, chosen: Mapping[str, Array]) -> Draw:
-        return NumpyDraw(source, self._ids(mask).tolist(), self.shape, chosen)
+        return self.random.start(self._start, self._ids(mask), chosen)
 
     def _ids(self, mask: Array) -> np.ndarray:
         """The worlds of a mask; of a single one it is always true."""
@@ -69,7 +56,7 @@ class BaseWorld:
     def _draw_parameters(self, mask: Array) -> None:
         """Draw the parameters of the worlds of a mask."""
         if self._randomize is not None:
-            draw = self._drawing(self._draws, mask, {})
+            draw = Draw(self.random, self._randomization, self._ids(mask))
             for name, new in self._randomize.draw(draw).items():
                 old = self.parameters.get(name)
                 self.parameters[name] = plain(new if old is None else np.where(mask, new, old))

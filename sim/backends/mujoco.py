@@ -111,6 +111,7 @@ class MujocoWorld(BaseWorld):
         hung = self._hung(pose)
         if hung is not None and len(ids):
             check_hung(hung[ids, 2].min() + self._options.cable, self._least_height)
+        self.random.begin(ids)
         self._batch.state[ids] = self._initial
         self._warnings[ids] = 0
         state, here = self.state, () if self.shape == () else ids

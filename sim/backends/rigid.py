@@ -87,6 +87,7 @@ class RigidWorld(BaseWorld):
     def reset(self, mask: Array, pose: InitialState) -> None:
         """As `World.reset`."""
         state, rows = self.state, mask[..., None]
+        self.random.begin(self._ids(mask))
         begun = self._begun(mask, pose)
         turn = begun["quaternion"]
         unit = turn / np.sqrt(np.sum(turn * turn, axis=-1, keepdims=True))

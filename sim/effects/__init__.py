@@ -43,7 +43,7 @@ class Effects:
         self,
         vehicle: "Vehicle",
         options: EffectOptions,
-        noise: Callable[[int, int], Noise],
+        noise: Callable[[str, int], Noise],
         drawn: tuple[str, ...] = (),
     ) -> None:
         """`noise` is that of the world; `drawn` has the names of what `begin` gets."""
@@ -66,7 +66,7 @@ class Effects:
         self._gusts: Gusts | None = None
         if options.gusts:
             self._gusts = Gusts(options.gusts, options.wind, vehicle.timestep)
-            self._noise = noise(NUMBERS, GUSTS)
+            self._noise = noise(GUSTS, NUMBERS)
 
     def begin(self, mask: Array, state: WorldState, factors: dict[str, Array]) -> Array:
         """Begin episodes of the worlds of a mask, bool, (W, A), at their rows of `state`.

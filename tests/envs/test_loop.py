@@ -11,8 +11,7 @@ from gymnasium.utils.env_checker import check_env
 from rotorgram.envs import ArraySpec, Loop, Metric, Outcome, Task, TaskOptions, register, registry
 from rotorgram.envs.config import EnvConfig
 from rotorgram.models.errors import InputError
-from rotorgram.models.vehicle import Vehicle
-from rotorgram.sim import CollectiveThrust, InitialState, make_world, stack
+from rotorgram.sim import CollectiveThrust, InitialState, stack
 
 ID, HOVER = "rotorgram/Elevation-v0", "rotorgram/Hover-v0"
 HEXA = Path(__file__).parents[1] / "data" / "hexa.xml"
@@ -120,16 +119,6 @@ def test_seeds_of_a_wire() -> None:
     seeds = np.array([2**64 - 1, 5, 2**64 - 1], np.uint64)
     loop.advance(actions, np.array([True, False, True]), seeds, np.array([False, True, False]))
     assert shown(loop, 0) == shown(loop, 2) != shown(loop, 1) == before
-
-
-def test_another_use_of_randomness_does_not_move_the_starts() -> None:
-    """A world's seed gives a child to each use; the starts are those of the first child."""
-    world, every = make_world(Vehicle.load(), 2), np.ones((2, 1), bool)
-    world.seed(every, [11, 12])
-    drawn = world.draw(every).uniform(0.0, 1.0, (3,))[:, 0]
-    for seed, numbers in zip((11, 12), drawn, strict=True):
-        child = np.random.SeedSequence(seed).spawn(5)[0]  # however many there are
-        assert numbers.tolist() == np.random.default_rng(child).uniform(0.0, 1.0, 3).tolist()
 
 
 def test_a_draw_that_is_switched_off_moves_no_other() -> None:

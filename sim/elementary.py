@@ -1,0 +1,93 @@
+"""Elementary functions from + - * / rint floor frexp and where: the same bits on every processor.
+
+Each works in the precision of its argument, float32 or float64. Series are Taylor's where no source
+is named.
+"""
+
+from fractions import Fraction
+from math import factorial
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+Real = NDArray[np.floating]
+
+_PI: Final = Fraction(31415926535897932384626433832795028841971693993751, 10**49)
+_LOG2: Final = Fraction(69314718055994530941723212145817656807550013436026, 10**50)
+_SQRT_HALF: Final = 0.7071067811865476
+
+
+def _parts(value: Fraction, bits: int, count: int) -> tuple[float, ...]:
+    """A number as a sum of floats: each but the last has few bits, so that n · part is exact."""
+    found = []
+    rest = value
+    for _ in range(count - 1):
+        exponent = -(rest.denominator // rest.numerator).bit_length()
+        unit = Fraction(2) ** (exponent - bits + 1)
+        part = (rest // unit) * unit
+        found.append(float(part))
+        rest -= part
+    return (*found, float(rest))
+
+
+_SINGLE: Final = np.dtype(np.float32)
+_HALF_PI: Final = {True: _parts(_PI / 2, 10, 4), False: _parts(_PI / 2, 32, 3)}
+"""By whether the precision is single."""
+_LOG2_PARTS: Final = {True: _parts(_LOG2, 14, 2), False: _parts(_LOG2, 40, 2)}
+
+
+def polynomial(x: Real, coefficients: list[float]) -> Real:
+    """A polynomial by Horner's rule, the highest power first."""
+    result = 0.0 * x + coefficients[0]
+    for coefficient in coefficients[1:]:
+        result = result * x + coefficient
+    return result
+
+
+def sin(x: Real) -> Real:
+    """Sine of an angle, rad; right for |x| up to 1e4."""
+    return _wave(x, 0.0)
+
+
+def cos(x: Real) -> Real:
+    """Cosine of an angle, rad; right for |x| up to 1e4."""
+    return _wave(x, 1.0)
+
+
+def _wave(x: Real, quarters: float) -> Real:
+    """Sine of x plus so many quarter turns: reduction by Cody and Waite, then a series."""
+    is_single = x.dtype == _SINGLE
+    near = np.rint(x * float(2 / _PI))
+    rest = x
+    for part in _HALF_PI[is_single]:
+        rest = rest - near * part
+    quarter = near + quarters
+    quarter = quarter - 4.0 * np.floor(quarter * 0.25)
+    square = rest * rest
+    terms = 5 if is_single else 9
+    odd = [(-1) ** n / factorial(2 * n + 1) for n in range(1, terms)]
+    even = [(-1) ** n / factorial(2 * n) for n in range(2, terms + 1)]
+    sine = rest + rest * (square * polynomial(square, odd[::-1]))
+    cosine = 1.0 - (0.5 * square - square * (square * polynomial(square, even[::-1])))
+    is_cosine = (quarter == 1.0) | (quarter == 3.0)
+    value = np.where(is_cosine, cosine, sine)
+    return np.where(quarter >= 2.0, -value, value)
+
+
+def log(x: Real) -> Real:
+    """Natural logarithm of finite numbers above 0. As fdlibm's e_log.c."""
+    is_single = x.dtype == _SINGLE
+    fraction, exponent = np.frexp(x)
+    is_low = fraction < _SQRT_HALF
+    fraction = np.where(is_low, fraction + fraction, fraction)
+    power = exponent.astype(x.dtype) - is_low
+    f = fraction - 1.0
+    s = f / (2.0 + f)
+    z = s * s
+    terms = 6 if is_single else 13
+    series = [2.0 / (2 * n + 1) for n in range(1, terms)]
+    rest = z * polynomial(z, series[::-1])
+    half = 0.5 * f * f
+    upper, lower = _LOG2_PARTS[is_single]
+    return power * upper - ((half - (s * (half + rest) + power * lower)) - f)
