@@ -26,7 +26,7 @@ from .stages.judge import Judge, Memory, Starts
 from .stages.landing import Landed, Landing
 from .stages.measure import Measure
 from .stages.pictures import Pictures
-from .stages.record import Record, Stage
+from .stages.record import Mask, Record, Stage
 from .stages.sensing import Readings, Sensing
 from .tasks.task import Task
 from .telemetry import quantities_of
@@ -217,14 +217,13 @@ class Loop:
                 record.lose()
                 raise
         if record.begun is not None:
-            self._begin(seeds, chosen or {})
+            self._begin(record.begun, seeds, chosen or {})
         self._observe()
         self._take_results()
 
-    def _begin(self, seeds: Any, chosen: Mapping[str, np.ndarray]) -> None:
+    def _begin(self, begun: Mask, seeds: Any, chosen: Mapping[str, np.ndarray]) -> None:
         """Begin episodes: the task sets the start, and the other stages follow from it."""
         record, stages = self.record, self.stages
-        begun = record.begun
         everybody = bool(begun.all())
         record.chosen = {}
         if not (self._has_begun or everybody):  # the first time all of them

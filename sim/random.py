@@ -80,7 +80,7 @@ def words_of(
 
 def uniform(words: Words) -> Numbers:
     """Numbers from 0 up to 1, one of each word."""
-    return words * _UNIT
+    return words.astype(np.float64) * _UNIT
 
 
 def normal(words: Words) -> Numbers:

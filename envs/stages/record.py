@@ -51,6 +51,7 @@ class Record:
         leaving: Drones that leave the episode in this step; None: none.
     """
 
+    chosen: Mapping[str, Array]
     sent: NDArray[np.float64]
     action: NDArray[np.float64]
     received: NDArray[np.float64]
@@ -69,6 +70,7 @@ class Record:
     terminated: Mask
     truncated: Mask
     landing: Mask
+    scenes: NDArray[np.int64]
 
     def __init__(self, shape: tuple[int, ...]) -> None:
         self.shape = shape
