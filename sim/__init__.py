@@ -6,7 +6,7 @@ Knows nothing of tasks, rewards or Gymnasium.
 from ..models import BACKENDS, Backend
 from .control import LEVELS, CollectiveThrust, Controller, Gains, RotorThrust, make_controller
 from .effects import EffectOptions
-from .random import Draw
+from .random import Draw, numbers_of
 from .randomize import PARAMETERS, Randomization
 from .rotations import to_body, world_z
 from .sensors import checked_sensors
@@ -46,6 +46,7 @@ __all__ = [
     "each",
     "make_controller",
     "make_world",
+    "numbers_of",
     "plain",
     "square_root",
     "stack",

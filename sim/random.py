@@ -98,6 +98,12 @@ def normals_of(key: Words, use: int, episode: Array, step: Array, count: int) ->
     return normal(words_of(key, use, episode, step, count + count % 2))[..., :count]
 
 
+def numbers_of(use: str, keys: Words, step: Words, count: int) -> Numbers:
+    """Numbers from 0 up to 1, shape (..., count), for keys of one word, uint32, and steps (...)."""
+    both = np.stack((keys, np.zeros_like(keys)), axis=-1)
+    return uniform(words_of(both, use_number(use), np.zeros_like(step), step, count))
+
+
 class Random:
     """The counters of W worlds. Until a world is seeded its seed is unpredictable.
 

@@ -7,8 +7,7 @@ import numpy as np
 
 from ...models.errors import expect
 from ...models.fields import Limits
-from ...sim import Array, Draw, WorldState
-from ...sim.random import uniform, use_number, words_of
+from ...sim import Array, Draw, WorldState, numbers_of
 from ..delay import Delay
 from .flight import (
     AIR,
@@ -28,7 +27,6 @@ FORGOTTEN: Final = 1.0  # A drone that was not heard for so long is no neighbour
 APPROACH_WEIGHT: Final = 0.1  # Of a speed of 1 m/s towards the goal, in each step
 ROOM_WEIGHT: Final = 0.5  # Cost of spheres that touch; nothing from a diameter apart on
 TINY: Final = 1e-9  # m
-_RADIO: Final = use_number("radio")
 JITTER: Final = 0.2  # Of a start, in each axis, over the distance between starts
 
 
@@ -268,9 +266,8 @@ class Radio:
     def _chances(self) -> np.ndarray:
         """Numbers from 0 to 1 of each message of this step, (W, receiver, sender)."""
         worlds, count = self._keys.shape
-        key = np.stack((self._keys, np.zeros_like(self._keys)), axis=-1)
         steps = np.broadcast_to(self._steps[:, None], (worlds, count))
-        return uniform(words_of(key, _RADIO, np.zeros_like(steps), steps, count))
+        return numbers_of("radio", self._keys, steps, count)
 
 
 def ring(count: int) -> np.ndarray:
