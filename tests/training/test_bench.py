@@ -1,6 +1,9 @@
 """`rotorgram bench`: every layer is measured, and ratios are those of the same round."""
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -11,6 +14,7 @@ from rotorgram.training.bench import (
     Layer,
     Ratio,
     bench,
+    one_core,
     parts_of,
 )
 
@@ -33,6 +37,24 @@ def test_a_step_is_compared_with_its_physics_and_an_echo() -> None:
     rates = {"UDP, 1": 10_000.0, "mj_step": 50_000.0, "UDP echo": 1e6 / 30}
     assert RATIOS[0].of(rates) == pytest.approx(2.0)
     assert (RATIOS[0].target_text, RATIOS[0].reached(2.0)) == ("≤ 1.7", False)
+
+
+def test_a_step_is_compared_with_the_env_and_an_echo_on_one_core() -> None:  # fault 68
+    # 100 µs of a step, 25 µs of the env and 15 µs of echo.
+    ratio = next(r for r in RATIOS if r.name == "time of a step, UDP, 1 ÷ (env + UDP echo)")
+    assert ratio.of({"UDP, 1": 1e4, "env": 4e4, "UDP echo": 1e6 / 15}) == pytest.approx(2.5)
+    assert (ratio.target_text, ratio.reached(1.5)) == ("≤ 1.6", True)
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="no affinity of processes here")
+def test_the_echo_shares_the_core_of_its_client() -> None:  # fault 68
+    before = os.sched_getaffinity(0)
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
+        with one_core(process.pid):
+            assert os.sched_getaffinity(0) == os.sched_getaffinity(process.pid)
+            assert len(os.sched_getaffinity(0)) == 1
+        assert os.sched_getaffinity(0) == before
+        process.communicate(b"\n")
 
 
 def test_the_parts_of_a_step_and_what_is_left() -> None:

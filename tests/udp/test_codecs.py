@@ -3,6 +3,7 @@
 import math
 import struct
 import zlib
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -376,6 +377,29 @@ def test_lines_of_the_page() -> None:
 def test_layouts_that_text_cannot_tell(of: Any) -> None:
     with pytest.raises(InputError, match="text codec"):
         text.check_layout(of)
+
+
+def of_numbers(count: int) -> Layout:
+    """One drone whose line has so many numbers: the reward, three of observation, the telemetry."""
+    action = ArrayLayout(shape=(1,))
+    observation = (ArrayLayout(shape=(3,)),)
+    return Layout(drones=1, observation=observation, action=action, telemetry=((count - 4,),))
+
+
+def test_the_longest_line_is_known_at_the_start() -> None:  # fault 57
+    of = of_numbers(40)
+    text.check_layout(of)
+    longest = -2.2250738585072014e-308
+    state_ = replace(
+        state(1, of=of),
+        sequence=2**64 - 1,
+        rewards=np.array([longest]),
+        observations=(np.full((1, 3), -1.1754944e-38, np.float32),),
+        telemetry=(np.full((1, 36), longest),),
+    )
+    assert 1000 < len(text.encode(state_)) <= 1024
+    with pytest.raises(InputError, match="lines of at most 1024 bytes, got up to 1049 with 41 num"):
+        text.check_layout(of_numbers(41))
 
 
 def test_a_hello_of_nothing_but_extensions_is_not_read() -> None:

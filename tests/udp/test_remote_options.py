@@ -480,3 +480,13 @@ def test_a_world_of_two_drones_is_more_than_one_drone() -> None:
     layout = AgentConfig(drones=2).accept(hello)
     assert not isinstance(layout, str)
     assert layout.drones == 2
+
+
+def test_the_advice_for_text_names_no_key() -> None:  # fault 57
+    with pytest.raises(InputError) as caught:
+        Simulator(server=("192.0.2.1", 8001), bind=ANY, codec="text")
+    assert str(caught.value) == (
+        "192.0.2.1 is not a loopback address: expected 127.0.0.1, or the binary codec and a key, "
+        "or insecure=True (--insecure) where everybody who reaches this port may fly the drone: "
+        "text cannot be sealed"
+    )

@@ -22,6 +22,8 @@ from .messages import FLY, MAX_UINT64, RESET, Close, Command, State
 
 MAX_LINE: Final = 1024
 _FLOAT: Final = "float32"
+_LONGEST_NUMBER: Final = 24  # bytes: -2.2250738585072014e-308
+_FIXED: Final = 24  # bytes of the longest sequence number and two flags, with their commas
 _WHOLE: Final = re.compile(r"0|[1-9][0-9]{0,19}")
 _NUMBER: Final = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
@@ -41,6 +43,14 @@ def check_layout(layout: Layout) -> None:
     expect(flat == [True], what, expected, f"{got}: use binary")
     right = action is None or (len(action.shape) == 1 and action.dtype == _FLOAT)
     expect(right, what, "flat actions of float32", f"{action}: use binary")
+    shapes = [slot.shape for slot in (*layout.observation_slots, *layout.telemetry_slots)]
+    state = 1 + sum(map(prod, shapes))  # the reward is a number too
+    longest = _FIXED + (_LONGEST_NUMBER + 1) * max(state, prod(layout.actions.shape))
+    if longest > MAX_LINE:
+        raise InputError(
+            f"text codec: expected lines of at most {MAX_LINE} bytes, got up to {longest} with "
+            f"{state} numbers: use binary"
+        )
 
 
 def encode(message: State | Command | Close) -> bytes:

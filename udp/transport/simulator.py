@@ -18,7 +18,7 @@ from ..protocol.client import Address, Client, LinkConfig, largest_datagram, new
 from ..protocol.messages import POLICIES, Hello
 from ..protocol.party import Absence, AgentLink, OneAgent, SeveralAgents, SwarmWorld
 from .driver import Driver
-from .sockets import Port, resolve
+from .sockets import TEXT_WAY_OUT, WAY_OUT, Port, resolve
 from .stepped import make_stepped
 
 DEFAULT_AGENT: Final = ("127.0.0.1", 8001)
@@ -73,7 +73,8 @@ class Simulator(Driver):
             raise InputError(f"codec: expected 'binary' or 'text', got {codec!r}")
         key = Key(read_keys(key_file)[0], "simulator") if key_file else None
         insecure = insecure or key is not None
-        server = resolve(server, insecure=insecure)
+        way_out = TEXT_WAY_OUT if codec == "text" else WAY_OUT
+        server = resolve(server, insecure=insecure, way_out=way_out)
         if not server[1]:
             raise InputError("server: expected the port of the agent, 1 to 65535, got 0")
         count = drones if num_envs is None else num_envs

@@ -37,9 +37,13 @@ _MOST_ASLEEP: Final = 64  # waits at most that sleep at once before one looks ag
 _STRANGERS_EVERY: Final = 0.01  # time between two looks at strangers while no slot is free, s
 _BUFFER: Final = 1 << 22  # bytes of datagrams that a socket may hold until they are looked at
 _MAX_DATAGRAM: Final = 65507  # largest payload of a UDP datagram over IPv4, bytes
-_WAY_OUT: Final = (
+WAY_OUT: Final = (
     "a key that both sides share (key_file, --key-file), or insecure=True (--insecure) where "
     "everybody who reaches this port may fly the drone"
+)
+TEXT_WAY_OUT: Final = (
+    "the binary codec and a key, or insecure=True (--insecure) where everybody who reaches this "
+    "port may fly the drone: text cannot be sealed"
 )
 _SENTENCES: Final = {
     errno.EADDRINUSE: "the port is in use: choose another one, or end the program on it",
@@ -49,7 +53,7 @@ _SENTENCES: Final = {
 }
 
 
-def resolve(address: Address, *, insecure: bool, way_out: str = _WAY_OUT) -> Address:
+def resolve(address: Address, *, insecure: bool, way_out: str = WAY_OUT) -> Address:
     """The IPv4 address and port of a host name and port.
 
     Args:
