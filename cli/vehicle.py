@@ -116,7 +116,6 @@ class Vehicle(Command):
         print(f"vehicle: {path} (rotorgram vehicle check {path} examines it)")
 
     def _show(self) -> None:
-        from ..models.cameras import cameras_of
         from ..models.vehicle import Vehicle as Craft
         from ..models.vehicle_file import read_vehicle_file
 
@@ -132,7 +131,7 @@ class Vehicle(Command):
         for rotor in craft.rotors:
             print(f"{rotor.name:17} {_rotor_words(rotor)}")
         print("\ncameras: pictures, place")
-        for camera in cameras_of(craft):
+        for camera in craft.cameras:
             size = f"{camera.width} × {camera.height}"
             print(f"{camera.name:17} {', '.join(camera.kinds)} {size}, {camera.words}")
         if file:

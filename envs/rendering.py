@@ -96,8 +96,7 @@ def moments(loop: "Loop", episodes: Sequence[int]) -> "list[Moment]":
 
 def moment(spec: EnvSpec, telemetry: Mapping[str, Any], **rest: Any) -> "Moment":
     """The `Moment` of one drone, with `reward`, `step` and `episode` as `Moment` has them."""
-    from ..rendering import Mark, Moment
+    from ..rendering import Moment
 
-    marks = tuple(Mark(m.shape, m.size, m.position, m.heading, m.moves) for m in spec.marks)
     metrics = [(metric.name, metric.unit, metric.symbol) for metric in spec.metrics]
-    return Moment.of(telemetry, metrics, marks=marks, **rest)
+    return Moment.of(telemetry, metrics, marks=spec.marks, **rest)

@@ -14,6 +14,8 @@ from typing import Any, ClassVar, Final, Literal, Self
 import numpy as np
 
 from ..models.errors import InputError
+from ..models.fields import check_fields
+from ..scenes import marks
 
 MAX_ELEMENTS: Final = 1 << 22  # numbers of all observations of one drone
 MAX_TOLD: Final = 1 << 14  # numbers of all its telemetry: each has a name in `info`
@@ -207,31 +209,13 @@ class Metric(_Part):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Mark(_Part):
+class Mark(marks.Mark, _Part):
     """Something of a task that pictures show and physics does not know."""
 
     _optional = ("position", "heading", "moves")
 
-    shape: Literal["gate", "disc", "ball"]
-    """`gate`: an upright square frame; `disc`: level, as a landing pad; `ball`."""
-    size: float
-    """Width of a gate; radius of a disc or a ball, m."""
-    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Of its centre: x, y, z in MuJoCo's world frame (z up), m; from the goal where it moves."""
-    heading: float = 0.0
-    """Direction in which a gate is passed, degrees about z, anticlockwise from x."""
-    moves: bool = False
-    """Whether it moves along with the goal, which telemetry tells."""
-
     def __post_init__(self) -> None:
-        right = self.shape in ("gate", "disc", "ball")
-        _expect(right, "mark", "the shape 'gate', 'disc' or 'ball'", self.shape)
-        right = _is_number(self.size) and 0 < self.size <= _LARGEST
-        _expect(right, "mark", "a size > 0 m", self.size)
-        numbers = (*self.position, self.heading) if isinstance(self.position, tuple) else ()
-        right = len(numbers) == 4 and all(_is_number(n) and abs(n) <= _LARGEST for n in numbers)
-        _expect(right, "mark", "a position (x, y, z) and a heading", (self.position, self.heading))
-        _expect(type(self.moves) is bool, "mark", "moves to be true or false", self.moves)
+        check_fields(self, "mark: ", SpecError)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -80,7 +80,7 @@ def _pictures(task: Task) -> tuple[ArraySpec, ...]:
     views = views_of(task, config.drones)
     if not any(view.kind == "segmentation" for view in views):
         return arrays_of(views, ())
-    from ..rendering.seen import objects_of
+    from ..rendering.camera_model import objects_of
 
     payload = config.effects.payload > 0
     objects = []

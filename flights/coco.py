@@ -8,7 +8,7 @@ from typing import Any
 
 from ..agents.checkpoints import write_whole
 from ..models.vehicle import Vehicle
-from ..rendering.seen import NOTHING, objects_of
+from ..rendering.camera_model import NOTHING, objects_of
 from .viewpoints import Plan, PoseSequence
 
 Labels = Mapping[str, Any]

@@ -24,7 +24,7 @@ from ..envs.config import EnvConfig
 from ..envs.registry import env_spec
 from ..envs.registry import load as load_env
 from ..envs.spec import Mark
-from ..models.cameras import View, cameras_of, chosen_views
+from ..models.cameras import View, chosen_views
 from ..models.errors import InputError
 from ..models.fields import Limits, Text, check_fields, check_names, read_table
 from ..models.frames import pose_in_mujoco_frame
@@ -304,7 +304,7 @@ class Plan:
 
     def views(self) -> tuple[View, ...]:
         """The pictures of each pose. Raises `InputError`."""
-        return chosen_views(self.cameras, cameras_of(Vehicle.load(self.vehicle)))
+        return chosen_views(self.cameras, Vehicle.load(self.vehicle).cameras)
 
     def sequences(self) -> list[PoseSequence]:
         """All poses. Raises `InputError`."""

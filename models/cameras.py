@@ -8,7 +8,7 @@ file has a table `[[cameras]]` for each. A file without a `front` or a `down` ge
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, get_args
+from typing import Annotated, Any, Final, Literal, get_args
 
 import mujoco
 import numpy as np
@@ -17,9 +17,6 @@ from .coefficients import PREFIX
 from .errors import InputError, expect
 from .fields import Limits, read_table
 from .lens import Lens
-
-if TYPE_CHECKING:
-    from .vehicle import Vehicle
 
 Kind = Literal["rgb", "depth", "segmentation", "flow"]
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
@@ -54,8 +51,6 @@ class Optics:
     noise: Annotated[tuple[float, ...], Limits(0.0, 1.0, "1", count=2)] = (0.0, 0.0)
     """a and b in: standard deviation of a colour v, 0 to 1, is √(a² v + b²): the noise of photons
     and that of reading them, as of EMVA's standard 1288."""
-    readout: Annotated[float, Limits(0.0, 0.1, "s")] = 0.0
-    """From the first row to the last, which is read at the moment of the state."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,8 +157,6 @@ def chosen_views(words: Sequence[str], cameras: Iterable[Camera]) -> tuple[View,
             camera = replace(camera, width=width, height=height)
         for one in camera.kinds if alone else (kind,):
             view = View(camera=camera, kind=one)
-            right = one != "flow" or not camera.optics.readout
-            expect(right, "cameras", "flow of a camera that reads all rows at once", f"{word!r}")
             same = views.setdefault(view.name, view) == view
             expect(same, "cameras", "each picture in one size", f"{view.name!r} in two")
     return tuple(views.values())
@@ -284,31 +277,18 @@ def _vector(values: np.ndarray) -> _Vector:
 # ---- ours
 
 
-def cameras_of(vehicle: "Vehicle") -> tuple[Camera, ...]:
-    """All cameras: those of the file, and ours.
+def own_cameras(radius: float, rest_height: float) -> tuple[Camera, ...]:
+    """The cameras that every vehicle has unless its file has others of their names.
 
-    `front` looks ahead from the front of the sphere about the craft, `down` straight down from
-    a quarter of the height of its body above its landing gear.
+    `front` looks ahead from the front of the sphere about the craft, whose radius is in m, `down`
+    straight down from a quarter of the height of its body above its landing gear.
     """
-    ours = (
-        Camera(name="front", position=(vehicle.radius, 0.0, 0.0)),
-        Camera(
-            name="down",
-            position=(0.0, 0.0, -0.75 * vehicle.rest_height),
-            look=(0.0, 0.0, -1.0),
-            up=(1.0, 0.0, 0.0),
-        ),
+    down = (0.0, 0.0, -1.0)
+    place = (0.0, 0.0, -0.75 * rest_height)
+    return (
+        Camera(name="front", position=(radius, 0.0, 0.0)),
+        Camera(name="down", position=place, look=down, up=(1.0, 0.0, 0.0)),
     )
-    names = [camera.name for camera in vehicle.cameras]
-    return vehicle.cameras + tuple(camera for camera in ours if camera.name not in names)
-
-
-def add_cameras(spec: mujoco.MjSpec, body: mujoco.MjsBody, vehicle: "Vehicle", prefix: str) -> None:
-    """Add ours to the body of a vehicle in a spec, with a prefix before their names."""
-    own = [camera.name for camera in vehicle.cameras]
-    for camera in cameras_of(vehicle):
-        if camera.name not in own:
-            place_camera(spec, body, replace(camera, name=prefix + camera.name))
 
 
 def place_camera(spec: mujoco.MjSpec, body: mujoco.MjsBody, camera: Camera) -> None:

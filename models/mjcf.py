@@ -53,9 +53,13 @@ def has_ground(spec: mujoco.MjSpec) -> bool:
 
 def add_ground(spec: mujoco.MjSpec) -> None:
     """Add a plane at z = 0 to a spec without a plane or a height field."""
-    if not has_ground(spec):
-        plane = mujoco.mjtGeom.mjGEOM_PLANE
-        spec.worldbody.add_geom(name="rotorgram/ground", type=plane, size=(0.0, 0.0, 0.5))
+    if has_ground(spec):
+        return
+    ground = mujoco.MjSpec()  # of its own: the defaults of the vehicle's file are not the ground's
+    plane = mujoco.mjtGeom.mjGEOM_PLANE
+    ground.worldbody.add_geom(name="ground", type=plane, size=(0.0, 0.0, 0.5))
+    ground.visual, ground.stat = spec.visual, spec.stat  # MuJoCo warns if they differ
+    spec.attach(ground, prefix="rotorgram/", frame=spec.worldbody.add_frame())
 
 
 def swarm_spec(vehicles: Sequence[Path], names: Sequence[str]) -> mujoco.MjSpec:

@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 
 from . import MOST_DRAG
-from .cameras import Camera, read_cameras
+from .cameras import Camera, own_cameras, read_cameras
 from .coefficients import PREFIX, Coefficients
 from .errors import InputError, expect
 from .library import find_vehicle
@@ -87,8 +87,8 @@ class Vehicle:
     """Height of the body's origin when it touches level ground, m."""
     coefficients: Coefficients
     """What effects and sensors need."""
-    cameras: tuple[Camera, ...] = ()
-    """Those of the file; `cameras_of` has ours too."""
+    file_cameras: tuple[Camera, ...] = ()
+    """The cameras of the file."""
 
     @classmethod
     def load(cls, path: Path | str | None = None, *, linear_drag: float = 0.0) -> "Vehicle":
@@ -136,6 +136,13 @@ class Vehicle:
         solid &= np.isin(model.geom_bodyid, craft_bodies(model))
         reach = np.linalg.norm(data.geom_xpos, axis=1) + model.geom_rbound
         return float(reach[solid].max(initial=0.0))
+
+    @cached_property
+    def cameras(self) -> tuple[Camera, ...]:
+        """The cameras of the file, and ours where it has none of their names."""
+        names = {camera.name for camera in self.file_cameras}
+        ours = own_cameras(self.radius, self.rest_height)
+        return self.file_cameras + tuple(one for one in ours if one.name not in names)
 
     @property
     def timestep(self) -> float:
@@ -352,7 +359,7 @@ def _load(path: Path, drag: float, changed: tuple[int, ...]) -> Vehicle:
         hover_thrust=_hover(rotors, allocation, mass * gravity),
         rest_height=find_rest_height(model, data),
         coefficients=read_coefficients(model),
-        cameras=read_cameras(spec, model),
+        file_cameras=read_cameras(spec, model),
     )
 
 

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 from ..models.errors import NoOpenGL
 
 if TYPE_CHECKING:
-    from .stage import CAMERAS, Camera, Canvas, Mark, MetricValue, Moment, Stage
+    from .stage import CAMERAS, Camera, Canvas, MetricValue, Moment, Stage
 
 __all__ = [
-    "CAMERAS", "Camera", "Canvas", "Mark", "MetricValue", "Moment", "NoOpenGL", "Stage",
+    "CAMERAS", "Camera", "Canvas", "MetricValue", "Moment", "NoOpenGL", "Stage",
 ]  # fmt: skip
 
 

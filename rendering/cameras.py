@@ -9,25 +9,24 @@ A camera's frame here: x right, y down, z along its axis, as in computer vision.
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from itertools import pairwise
-from typing import Any, Final
+from typing import Final
 
 import mujoco
 import numpy as np
 
-from ..models.cameras import FARTHEST, MOST_PIXELS, Camera, Optics, View, cameras_of
+from ..models.cameras import FARTHEST, MOST_PIXELS, Camera, Optics, View
 from ..models.errors import expect
 from ..models.fleet import members_of
 from ..models.lens import Lens
 from ..models.swarm import drone_names
 from ..models.vehicle import Vehicle
+from ..scenes.marks import Mark
+from .camera_model import GOAL, PAYLOAD, drawn_model, objects_in, own_discs
 from .gl import Offscreen
-from .seen import GOAL, PAYLOAD, drawn_model, objects_in, own_discs
 
 _ROOM: Final = 1000  # geoms beyond those of the model
 _HIDDEN: Final = 5  # a group of geoms that is not drawn
 _FINER: Final = 2  # pixels of a pinhole's picture for one of a lens that distorts
-_STEADY: Final = 0.5  # pixels by which what is seen may move while a strip of rows is read
 _FLIP: Final = np.array((1.0, -1.0, -1.0))  # from MuJoCo's camera frame to that of vision
 
 
@@ -51,7 +50,7 @@ class Cameras:
         shape: tuple[int, int] = (1, 1),
         *,
         world: str = "plain",
-        marks: Sequence[Any] = (),
+        marks: Sequence[Mark] = (),
         payload: bool = False,
         fine: bool = False,
     ) -> None:
@@ -63,7 +62,7 @@ class Cameras:
         self._poses = _Poses(self.model, self._names)
         self.objects, self._object = objects_in(self.model, self._names)
         eyes: dict[tuple[int, tuple[int, int]], _Eye] = {}
-        crafts = [{one.name: one for one in cameras_of(x)} for x in members_of(vehicle, shape[1])]
+        crafts = [{one.name: one for one in x.cameras} for x in members_of(vehicle, shape[1])]
         self._eyes: dict[str, list[_Eye]] = {}
         for view in self.views:
             size = view.shape[:2]
@@ -116,10 +115,9 @@ class Cameras:
         just begun an episode, before which there was no other step, so that nothing flows.
 
         The state has `position` (N, 3) and `quaternion` (N, 4), and, where there are any, `goal`
-        and `payload` (N, 3): MuJoCo's world frame, m. Rows that are read earlier show where craft
-        were by their `velocity` (N, 3), m/s, and `body_rates` (N, 3), rad/s, if it has those.
-        `flow` is since the last call. `dice` gives the generator of a world's noise; without it
-        there is none. `of` has the worlds that are looked at, bool, shape (W,); None: all.
+        and `payload` (N, 3): MuJoCo's world frame, m. `flow` is since the last call. `dice` gives
+        the generator of a world's noise; without it there is none. `of` has the worlds that are
+        drawn, bool, shape (W,); None: all.
         """
         worlds, drones = self._shape
         of_world = {name: np.reshape(mask, (worlds, drones)) for name, mask in due.items()}
@@ -175,11 +173,11 @@ class Cameras:
         """A view's picture, from what was drawn of its eye for others."""
         if view.kind == "rgb":
             if shot.rgb is None:
-                colors, _ = self._read(eye, shot, objects=False)
+                colors, _ = self._render(eye, objects=False)
                 shot.rgb = colors if dice is None else _exposed(colors, eye.optics, dice)
             return shot.rgb
         if shot.depth is None:
-            shot.geoms, shot.depth = self._read(eye, shot, objects=True)
+            shot.geoms, shot.depth = self._render(eye, objects=True)
         if view.kind == "depth":
             return shot.depth[..., None]
         if view.kind == "segmentation":
@@ -189,34 +187,6 @@ class Cameras:
             return np.zeros(view.shape, np.float32)
         flow: np.ndarray = np.nan_to_num(self._flow(eye, shot.geoms, shot.depth, before))
         return flow
-
-    def _read(self, eye: "_Eye", shot: "_Shot", *, objects: bool) -> tuple[np.ndarray, np.ndarray]:
-        """As `_render`, each strip of rows at its own moment."""
-        shot.strips = shot.strips or self._strips(eye)
-        if not shot.strips[0][0]:
-            return self._render(eye, objects=objects)
-        now, parts = self._poses.now(self.data), []
-        for seconds, rows in shot.strips:
-            self._poses.restore(self.data, self._poses.ago(self.data, now, seconds))
-            parts.append([picture[rows] for picture in self._render(eye, objects=objects)])
-        self._poses.restore(self.data, now)
-        first, second = (np.concatenate(strips) for strips in zip(*parts, strict=True))
-        return first, second
-
-    def _strips(self, eye: "_Eye") -> list[tuple[float, slice]]:
-        """How long before the state the rows of a picture are read, s, in strips that are so thin
-        that while one is read nothing moves by more than `_STEADY`.
-        """
-        height, readout = eye.size[0], eye.optics.readout
-        if not (readout and self.data.qvel.any()):
-            return [(0.0, slice(height))]
-        geoms, depth = self._render(eye, objects=True)
-        past = self._poses.ago(self.data, self._poses.now(self.data), readout)
-        most = np.abs(self._flow(eye, geoms, depth, past)).max()
-        count = height if not most < _STEADY * height else max(int(np.ceil(most / _STEADY)), 1)
-        ends = np.linspace(0, height, count + 1).round().astype(int).tolist()
-        last = max(height - 1, 1)
-        return [(readout * (1 - (a + b - 1) / 2 / last), slice(a, b)) for a, b in pairwise(ends)]
 
     def _render(self, eye: "_Eye", *, objects: bool) -> tuple[np.ndarray, np.ndarray]:
         """Colours, uint8 (H, W, 3); or numbers of geoms from 1, 0 for none, int32 (H, W), and their
@@ -351,7 +321,6 @@ class _Shot:
     rgb: np.ndarray | None = None
     depth: np.ndarray | None = None
     geoms: np.ndarray = np.zeros((0, 0), np.int32)
-    strips: Sequence[tuple[float, slice]] = ()
 
 
 class _Eye:
@@ -446,7 +415,6 @@ class _Poses:
         self._model = model
         free = model.jnt_type == mujoco.mjtJoint.mjJNT_FREE
         self._at = model.jnt_qposadr[free][:, None] + np.arange(7)
-        self._speeds_at = model.jnt_dofadr[free][:, None] + np.arange(6)
         bodies = {GOAL: [f"{name}/{GOAL}" for name in names], PAYLOAD: [PAYLOAD]}
         self._mocap = {
             kind: [int(model.body(name).mocapid[0]) for name in own]
@@ -458,8 +426,6 @@ class _Poses:
         """Put them where a state has them."""
         data.qpos[self._at[:, :3]] = state["position"]
         data.qpos[self._at[:, 3:]] = state["quaternion"]
-        data.qvel[self._speeds_at[:, :3]] = state.get("velocity", 0.0)
-        data.qvel[self._speeds_at[:, 3:]] = state.get("body_rates", 0.0)
         for kind, bodies in self._mocap.items():
             if kind in state:
                 data.mocap_pos[bodies] = state[kind][: len(bodies)]
@@ -468,12 +434,6 @@ class _Poses:
     def now(self, data: mujoco.MjData) -> np.ndarray:
         """All numbers of the poses."""
         return np.concatenate((data.qpos, data.mocap_pos.ravel()))
-
-    def ago(self, data: mujoco.MjData, numbers: np.ndarray, seconds: float) -> np.ndarray:
-        """What `now` was so long before it told these numbers, at the speeds of the craft."""
-        then = numbers.copy()
-        mujoco.mj_integratePos(self._model, then[: len(data.qpos)], data.qvel, -seconds)
-        return then
 
     def restore(self, data: mujoco.MjData, numbers: np.ndarray) -> None:
         """Put them where `now` had them."""

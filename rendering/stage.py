@@ -18,6 +18,7 @@ from ..models.fleet import load_vehicles, members_of
 from ..models.frames import pose_in_mujoco_frame
 from ..models.mjcf import attach_craft, free_body
 from ..scenes.build import SCENE_PREFIX, build_scene
+from ..scenes.marks import Mark
 from .gl import Offscreen
 
 Camera = Literal["chase", "front", "side", "top", "onboard"]
@@ -31,7 +32,6 @@ _CABLE = (0.13, 0.14, 0.16, 1.0)
 _DISC = (0.13, 0.78, 0.52, 0.30)
 _DUE = (0.13, 0.78, 0.52, 0.9)  # The gate that is next, and a pad
 _GATE = (0.96, 0.42, 0.08, 0.9)
-_SQUARE = ((-1, -1), (1, -1), (1, 1), (-1, 1))
 _PATH = (1.0, 0.85, 0.25)
 DRONE_COLORS: Final = (
     _PATH, (0.34, 0.71, 0.91), (0.90, 0.62, 0.0), (0.0, 0.62, 0.45), (0.80, 0.47, 0.65),
@@ -85,21 +85,6 @@ class MetricValue(NamedTuple):
         whole = len(f"{abs(self.value):.0f}")
         number = f"{self.value:.{max(4 - whole, 0)}f}" if self.unit else f"{self.value:.4g}"
         return f"{number} {self.unit}".strip()
-
-
-class Mark(NamedTuple):
-    """Something of a task that is drawn."""
-
-    shape: str
-    """`gate`, an upright square frame; `disc`, level; or `ball`."""
-    size: float
-    """Width of a gate; radius of a disc or a ball, m."""
-    position: _Vector = (0.0, 0.0, 0.0)
-    """Of its centre, MuJoCo's frame, m; from the goal where it moves."""
-    heading: float = 0.0
-    """Direction in which a gate is passed, degrees about z, anticlockwise from x."""
-    moves: bool = False
-    """Whether it moves along with the goal."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -319,9 +304,7 @@ class Stage:
                 size = (0.12 * self.radius,) * 3
                 _decoration(scene, mujoco.mjtGeom.mjGEOM_SPHERE, size, payload, _PAYLOAD)
                 kind = mujoco.mjtGeom.mjGEOM_CAPSULE
-                cable = _decoration(scene, kind, (1.0, 1.0, 1.0), here, _CABLE)
-                if cable is not None:
-                    mujoco.mjv_connector(cable, kind, 0.012 * self.radius, here, payload)
+                _connect(scene, kind, 0.012 * self.radius, here, payload, _CABLE)
         marked = any(moment.marks for moment in self.moments)
         if 1 < len(self.names) <= MOST_NAMES:
             self._write_names(scene)
@@ -336,9 +319,7 @@ class Stage:
                 if np.array_equal(start, end):
                     continue
                 kind, rgba = mujoco.mjtGeom.mjGEOM_CAPSULE, (*color, 0.85 * number / len(path))
-                geom = _decoration(scene, kind, (1.0, 1.0, 1.0), start, rgba)
-                if geom is not None:
-                    mujoco.mjv_connector(geom, kind, 0.019 * self.radius, start, end)
+                _connect(scene, kind, 0.019 * self.radius, start, end, rgba)
 
     @property
     def least_distance(self) -> float | None:
@@ -452,24 +433,31 @@ def _draw_mark(
     if mark.moves and goal is None:
         return
     centre = (goal if mark.moves and goal is not None else offset) + mark.position
-    if mark.shape == "gate":
-        due = goal is not None and float(np.abs(goal - centre).max()) < 1e-3
-        turn, half = math.radians(mark.heading), mark.size / 2
-        aside = np.array((-math.sin(turn), math.cos(turn), 0.0))
-        up = np.array((0.0, 0.0, 1.0))
-        corners = [centre + half * (y * aside + z * up) for y, z in _SQUARE]
-        for start, end in zip(corners, [*corners[1:], corners[0]], strict=True):
-            kind, rgba = mujoco.mjtGeom.mjGEOM_CAPSULE, _DUE if due else _GATE
-            geom = _decoration(scene, kind, (1.0, 1.0, 1.0), start, rgba)
-            if geom is not None:
-                mujoco.mjv_connector(geom, kind, 0.025 * mark.size, start, end)
-    elif mark.shape == "disc":
-        thick = 0.02 * mark.size  # its lower side lies on the ground: both at one height flicker
-        size = (mark.size, thick, 0.0)
-        above = centre + np.array((0.0, 0.0, thick))
-        _decoration(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, size, above, _DUE)
-    else:
-        _decoration(scene, mujoco.mjtGeom.mjGEOM_SPHERE, (mark.size,) * 3, centre, _DISC)
+    rgba = {"gate": _GATE, "disc": _DUE, "ball": _DISC}[mark.shape]
+    if mark.shape == "gate" and goal is not None and np.abs(goal - centre).max() < 1e-3:
+        rgba = _DUE
+    for part in mark.parts(0.04 * mark.size):
+        start, end = centre + part.start, centre + part.end
+        if part.kind == "sphere":
+            _decoration(scene, mujoco.mjtGeom.mjGEOM_SPHERE, (part.radius,) * 3, start, rgba)
+        elif part.kind == "cylinder":
+            _connect(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, part.radius, start, end, rgba)
+        else:
+            _connect(scene, mujoco.mjtGeom.mjGEOM_CAPSULE, part.radius, start, end, rgba)
+
+
+def _connect(
+    scene: mujoco.MjvScene,
+    kind: mujoco.mjtGeom,
+    radius: float,
+    start: np.ndarray,
+    end: np.ndarray,
+    rgba: Sequence[float],
+) -> None:
+    """Add a cylinder or a capsule between two points."""
+    geom = _decoration(scene, kind, (1.0, 1.0, 1.0), start, rgba)
+    if geom is not None:
+        mujoco.mjv_connector(geom, kind, radius, start, end)
 
 
 def _decoration(

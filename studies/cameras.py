@@ -28,7 +28,7 @@ import mujoco
 import numpy as np
 from measuring import in_turns, medians, options, write
 from rotorgram.envs import LocalVectorEnv
-from rotorgram.models.cameras import KINDS, cameras_of, chosen_views
+from rotorgram.models.cameras import KINDS, chosen_views
 from rotorgram.models.vehicle import Vehicle
 from rotorgram.rendering.cameras import Cameras
 from rotorgram.scenes import SEEDED_SCENES
@@ -50,14 +50,13 @@ OPTICS = {
     "pinhole": "",
     "distortion": "distortion = [-0.25, 0.05, 0.001, -0.0005, 0.0]",
     "noise": "exposure = 0.3\nnoise = [0.05, 0.02]",
-    "readout": "readout = 0.03",
 }
 
 
 def optical(folder: str) -> Vehicle:
     """A Crazyflie with a camera for each of `OPTICS`, where its `front` is."""
     text = Vehicle.load(VEHICLE).path.read_text("utf-8")
-    front = next(one for one in cameras_of(Vehicle.load(VEHICLE)) if one.name == "front")
+    front = next(one for one in Vehicle.load(VEHICLE).cameras if one.name == "front")
     for name, words in OPTICS.items():
         place = [float(part) for part in front.position]
         text += f'\n[[cameras]]\nname = "{name}"\nposition = {place}\n{words}\n'
@@ -69,7 +68,7 @@ def optical(folder: str) -> Vehicle:
 def ours(word: str, world: str = "plain", vehicle: Vehicle | None = None) -> tuple[Step, Cameras]:
     """A picture of a craft that flies and yaws, a little further from one to the next."""
     vehicle = vehicle or Vehicle.load(VEHICLE)
-    views = chosen_views([word], cameras_of(vehicle))
+    views = chosen_views([word], vehicle.cameras)
     cameras, everybody = Cameras(vehicle, views, world=world), np.ones(1, bool)
     place, turn = np.array([[0.0, 0.0, 1.0]]), np.array([[1.0, 0.0, 0.0, 0.0]])
     speeds = {"velocity": np.array([[3.0, 0.0, 0.0]]), "body_rates": np.array([[0.0, 0.0, 2.0]])}
@@ -243,7 +242,7 @@ def optics(path: Path) -> None:
 
     with TemporaryDirectory() as folder:
         vehicle = optical(folder)
-        views = chosen_views([f"{name}@320x240" for name in OPTICS], cameras_of(vehicle))
+        views = chosen_views([f"{name}@320x240" for name in OPTICS], vehicle.cameras)
         cameras, everybody = Cameras(vehicle, views, world="gates:2"), np.ones(1, bool)
     state = {
         "position": np.array([[0.0, 0.0, 5.0]]),
@@ -262,7 +261,7 @@ def worlds(path: Path) -> None:
     from PIL import Image
 
     vehicle, rows = Vehicle.load(), []
-    views = chosen_views(["chase@320x240", "front@320x240"], cameras_of(vehicle))
+    views = chosen_views(["chase@320x240", "front@320x240"], vehicle.cameras)
     state = {"position": np.array([[0.0, 0.0, 5.0]]), "quaternion": np.array([[0.9, 0, 0, 0.436]])}
     everybody = np.ones(1, bool)
     for name in SEEDED_SCENES:

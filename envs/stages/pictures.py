@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...models.cameras import FARTHEST, View, cameras_of, chosen_views
+from ...models.cameras import FARTHEST, View, chosen_views
 from ...models.errors import expect
 from ...models.fleet import members_of
 from ...scenes import scenes_of
@@ -29,7 +29,7 @@ def views_of(task: Task, drones: int) -> tuple[View, ...]:
     """What the option `cameras` of a task chooses. Raises `InputError`."""
     words = task.config.cameras
     kinds = dict.fromkeys(members_of(task.vehicle, drones))
-    first, *others = (chosen_views(words, cameras_of(one)) for one in kinds)
+    first, *others = (chosen_views(words, one.cameras) for one in kinds)
     for views in others:
         names = [[view.name for view in some] for some in (first, views)]
         expect(

@@ -10,13 +10,13 @@ from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 from rotorgram.envs.rendering import moment
 from rotorgram.envs.spec import EnvSpec, Mark, SpecError
-from rotorgram.rendering import Mark as Drawn
 from rotorgram.rendering import Stage
 
 TRACK = (
     '{"gates":[{"position":[4,0,5],"heading":90,"size":2}],'
     '"start":{"position":[0,0,5],"heading":0}}'
 )
+GATE = Mark(shape="gate", size=2.0, position=(4.0, 0.0, 5.0), heading=90.0)
 CAPSULE, CYLINDER, SPHERE = (
     int(kind)
     for kind in (
@@ -39,8 +39,7 @@ def drawn(**fields: Any) -> list[tuple[int, list[float], list[float]]]:
 
 def test_tasks_have_their_marks_and_the_wire_keeps_them() -> None:
     racing = env_spec(EnvConfig.from_keywords("rotorgram/Racing-v0", track=TRACK))
-    gate = Mark(shape="gate", size=2.0, position=(4.0, 0.0, 5.0), heading=90.0)
-    assert racing.marks == (gate,)
+    assert racing.marks == (GATE,)
     assert EnvSpec.from_json(racing.to_json()) == racing
     waypoints = env_spec(EnvConfig.from_keywords("rotorgram/Waypoints-v0", radius=0.4))
     assert waypoints.marks == (Mark(shape="ball", size=0.4, moves=True),)
@@ -52,12 +51,12 @@ def test_tasks_have_their_marks_and_the_wire_keeps_them() -> None:
 def test_a_moment_has_the_marks_of_its_spec() -> None:
     spec = env_spec(EnvConfig.from_keywords("rotorgram/Racing-v0", track=TRACK))
     telemetry = {array.name: np.zeros(array.shape) for array in spec.telemetry}
-    assert moment(spec, telemetry).marks == (Drawn("gate", 2.0, (4.0, 0.0, 5.0), 90.0),)
+    assert moment(spec, telemetry).marks == (GATE,)
 
 
 def test_a_gate_is_a_square_across_its_heading() -> None:
     """Passed along y: its corners are 1 m from (4, 0, 5) along x and z."""
-    geoms = drawn(goal=None, marks=(Drawn("gate", 2.0, (4.0, 0.0, 5.0), 90.0),))
+    geoms = drawn(goal=None, marks=(GATE,))
     places = sorted(tuple(np.round(place, 6).tolist()) for kind, place, _ in geoms)
     assert [kind for kind, *_ in geoms] == [CAPSULE] * 4
     assert places == [(3.0, 0.0, 5.0), (4.0, 0.0, 4.0), (4.0, 0.0, 6.0), (5.0, 0.0, 5.0)]
@@ -65,11 +64,13 @@ def test_a_gate_is_a_square_across_its_heading() -> None:
 
 def test_what_moves_is_at_the_goal_in_place_of_its_disc() -> None:
     """The paper's (1, 0.3, 2) is (2, -1, 0.3) in MuJoCo's frame; the pad lies 0.3 m below."""
-    pad = Drawn("disc", 0.5, (0.0, 0.0, -0.3), moves=True)
+    pad = Mark(shape="disc", size=0.5, position=(0.0, 0.0, -0.3), moves=True)
     ((kind, place, size),) = drawn(goal=(1.0, 0.3, 2.0), marks=(pad,))
     assert (kind, place) == (CYLINDER, pytest.approx([2.0, -1.0, 0.01], abs=1e-6))
     assert size == pytest.approx([0.5, 0.5, 0.01], abs=1e-6)
-    ((kind, place, _),) = drawn(goal=(1.0, 5.0, 2.0), marks=(Drawn("ball", 0.3, moves=True),))
+    ((kind, place, _),) = drawn(
+        goal=(1.0, 5.0, 2.0), marks=(Mark(shape="ball", size=0.3, moves=True),)
+    )
     assert (kind, place) == (SPHERE, pytest.approx([2.0, -1.0, 5.0]))
     assert drawn(goal=None, marks=(pad,)) == []
 
@@ -77,10 +78,16 @@ def test_what_moves_is_at_the_goal_in_place_of_its_disc() -> None:
 @pytest.mark.parametrize(
     ("fields", "sentence"),
     [
-        ({"shape": "cube", "size": 1.0}, "mark: expected the shape 'gate', 'disc' or 'ball'"),
-        ({"shape": "ball", "size": 0.0}, "mark: expected a size > 0 m"),
-        ({"shape": "ball", "size": 1.0, "position": (0.0,)}, "mark: expected a position (x, y, z)"),
-        ({"shape": "ball", "size": 1.0, "moves": 1}, "mark: expected moves to be true or false"),
+        (
+            {"shape": "cube", "size": 1.0},
+            "mark: shape: expected 'gate' or 'disc' or 'ball'",
+        ),
+        ({"shape": "ball", "size": 0.0}, "mark: size: expected a number above 0 m, got 0.0"),
+        (
+            {"shape": "ball", "size": 1.0, "position": (0.0,)},
+            "mark: position: expected 3 numbers in m",
+        ),
+        ({"shape": "ball", "size": 1.0, "moves": 1}, "mark: moves: expected true or false, got 1"),
     ],
 )
 def test_wrong_marks(fields: dict[str, Any], sentence: str) -> None:

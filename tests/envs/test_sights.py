@@ -21,7 +21,7 @@ from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.parallel import LocalParallelEnv
 from rotorgram.envs.registry import env_spec
 from rotorgram.models import InputError
-from rotorgram.models.cameras import cameras_of, chosen_views
+from rotorgram.models.cameras import chosen_views
 from rotorgram.models.vehicle import Vehicle
 from rotorgram.rendering.cameras import Cameras
 from rotorgram.training.pairs import socket_pair
@@ -155,7 +155,7 @@ def test_pictures_of_the_backend_rigid(opengl: None) -> None:
         assert np.abs(pictures.astype(int) - first["down"]).max() <= 1
         craft = Vehicle.load()
         told = rigid.loop.world.state
-        views = chosen_views(["down"], cameras_of(craft))
+        views = chosen_views(["down"], craft.cameras)
         with closing(Cameras(craft, views, (2, 1))) as cameras:
             names = "position", "quaternion"
             state = {k: np.asarray(getattr(told, k)).reshape(2, -1) for k in names}

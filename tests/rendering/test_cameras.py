@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from rotorgram.envs.spec import Mark
 from rotorgram.models import InputError
-from rotorgram.models.cameras import FARTHEST, Camera, cameras_of, chosen_views
+from rotorgram.models.cameras import FARTHEST, Camera, chosen_views
 from rotorgram.models.errors import NoOpenGL
 from rotorgram.models.export import export_mjcf
 from rotorgram.models.fleet import load_vehicles
 from rotorgram.models.library import vehicle_names
 from rotorgram.models.vehicle import Vehicle
+from rotorgram.rendering.camera_model import objects_of
 from rotorgram.rendering.cameras import Cameras
 from rotorgram.rendering.gl import offscreen_context
-from rotorgram.rendering.seen import objects_of
 from rotorgram.sim.rotations import to_world
 
 BELLY = """
@@ -68,7 +68,7 @@ def made(opengl: None) -> Iterator[Any]:
 
     def make(words: str, vehicle: Any = None, shape: tuple[int, int] = (1, 1), **more: Any) -> Any:
         craft = vehicle if isinstance(vehicle, Vehicle) else Vehicle.load(vehicle)
-        views = chosen_views(words.split(), cameras_of(craft))
+        views = chosen_views(words.split(), craft.cameras)
         opened.append(Cameras(craft, views, shape, **more))
         return opened[-1]
 
@@ -82,7 +82,7 @@ def made(opengl: None) -> Iterator[Any]:
 
 def test_cameras_of_a_toml_file(tmp_path: Path) -> None:
     vehicle = vehicle_with(tmp_path, BELLY)
-    named = {camera.name: camera for camera in cameras_of(vehicle)}
+    named = {camera.name: camera for camera in vehicle.cameras}
     assert {*named} == {"belly", "tower", "front", "down"}
     belly, tower = named["belly"], named["tower"]
     assert (belly.width, belly.height, belly.every) == (48, 32, 2)
@@ -105,7 +105,7 @@ def test_cameras_of_an_mjcf_file(tmp_path: Path) -> None:
     text = text.replace("</mujoco>", f"{rate}</mujoco>")
     file = tmp_path / "own.xml"
     file.write_text(text, "utf-8")
-    named = {camera.name: camera for camera in Vehicle.load(file).cameras}
+    named = {camera.name: camera for camera in Vehicle.load(file).file_cameras}
     assert {*named} == {"eye", "chase", "portrait"}  # the others are those of quad.xml
     eye = named["eye"]
     assert (eye.width, eye.height, eye.every) == (40, 30, 4)
@@ -131,7 +131,7 @@ def test_cameras_that_are_left_out(made: Any, tmp_path: Path, words: str) -> Non
     start = text.index("<camera ")
     file = tmp_path / "own.xml"
     file.write_text(f"{text[:start]}<camera {words}/>{text[start:]}", "utf-8")
-    assert [one.name for one in Vehicle.load(file).cameras] == ["chase", "portrait"]
+    assert [one.name for one in Vehicle.load(file).file_cameras] == ["chase", "portrait"]
     seen = take(made("front", file, shape=(1, 2)), **state((0.0, 0.0, 3.0), (4.0, 0.0, 3.0)))
     assert seen["front"].std() > 1
 
@@ -164,7 +164,7 @@ def test_what_is_exported_has_its_cameras(made: Any, tmp_path: Path) -> None:
 
 
 def test_every_vehicle_has_two() -> None:
-    front, down = cameras_of(Vehicle.load("crazyflie2"))
+    front, down = Vehicle.load("crazyflie2").cameras
     assert (front.name, front.look) == ("front", (1.0, 0.0, 0.0))
     assert (down.name, down.look, down.up) == ("down", (0.0, 0.0, -1.0), (1.0, 0.0, 0.0))
 
@@ -198,7 +198,7 @@ def test_wrong_cameras_of_a_file(tmp_path: Path, change: str, sentence: str) -> 
 
 
 def test_words_choose_views(tmp_path: Path) -> None:
-    cameras = cameras_of(vehicle_with(tmp_path, BELLY))
+    cameras = vehicle_with(tmp_path, BELLY).cameras
     views = chosen_views(["belly", "front_flow@20x10", "down_segmentation"], cameras)
     assert [(view.name, view.shape, view.dtype) for view in views] == [
         ("belly", (32, 48, 3), "uint8"),

@@ -1,4 +1,4 @@
-"""What a camera does beyond a pinhole's sharp picture: lenses, noise, rows read one by one."""
+"""What a camera does beyond a pinhole's sharp picture: lenses and noise."""
 
 import math
 from contextlib import closing
@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 from rotorgram.envs import LocalVectorEnv
-from rotorgram.envs.spec import Mark
 from rotorgram.models import InputError
-from rotorgram.models.cameras import Optics, cameras_of, chosen_views
+from rotorgram.models.cameras import Optics, chosen_views
 from rotorgram.models.lens import Lens, distorted, undistorted
 from rotorgram.models.vehicle import Vehicle
 from rotorgram.rendering.cameras import Cameras
@@ -34,12 +33,6 @@ name = "noisy"
 resolution = [24, 18]
 exposure = 0.5
 noise = [0.04, 0.02]
-
-[[cameras]]
-name = "rolling"
-resolution = [96, 72]
-readout = 0.03
-kinds = ["rgb", "depth", "segmentation"]
 
 [[cameras]]
 name = "sharp"
@@ -159,41 +152,6 @@ def test_noise_is_that_of_the_seed(opengl: None, tmp_path: Path) -> None:
             assert (single["noisy"] != before).any()
 
 
-# ---- rows one by one
-
-
-def test_rows_see_the_moment_at_which_they_are_read(made: Any, tmp_path: Path) -> None:
-    """Balls before a craft that yaws, climbs and flies on, each by the middle of its pixels."""
-    craft = vehicle_with(tmp_path, OPTICS)
-    places = [(4.0, y, 3.0 + z) for y in (-1.5, 0.0, 1.5) for z in (-2.0, -1.0, 0.0, 1.0, 2.0)]
-    balls = [Mark(shape="ball", size=0.15, position=place) for place in places]
-    cameras = made("rolling sharp", craft, marks=balls)
-    speeds = {"velocity": np.array([[3.0, 1.0, 2.0]]), "body_rates": np.array([[0.0, 0.0, 6.0]])}
-    told = state((0.0, 0.0, 3.0), **speeds)
-    seen = take(cameras, **told)
-    numbers = seen["rolling_segmentation"][0, ..., 0]
-    apart = []
-    for i, place in enumerate(places):
-        rows, columns = np.nonzero(numbers == cameras.objects.index(f"task/ball_{i}"))
-        if len(rows) < 4 or {0, 71} & {*rows} or {0, 95} & {*columns}:
-            continue
-        found = np.array([columns.mean() + 0.5, rows.mean() + 0.5])
-        ago = 0.03 * (1 - rows.mean() / 71)
-        turned = -6.0 * ago / 2
-        then = state(
-            np.array([0.0, 0.0, 3.0]) - ago * speeds["velocity"][0],
-            quaternion=(math.cos(turned), 0.0, 0.0, math.sin(turned)),
-        )
-        point = np.array([place])
-        assert np.abs(cameras.lens("rolling", then).project(point)[0] - found).max() < 0.5
-        apart.append(np.abs(cameras.lens("rolling", told).project(point)[0] - found).max())
-    assert len(apart) > 8
-    assert max(apart) > 4  # where a picture of one moment would have it
-    still = take(cameras, **state((0.0, 0.0, 3.0)))
-    assert (still["rolling"] == still["sharp"]).all()
-    assert (seen["rolling"] != seen["sharp"]).any()
-
-
 # ---- files, and the wire
 
 
@@ -202,7 +160,6 @@ def test_rows_see_the_moment_at_which_they_are_read(made: Any, tmp_path: Path) -
     [
         (("-0.28, 0.07", "-3.0, 0.0"), "distortion: expected a lens that sees each direction"),
         (("0.0005, 0.01]", "0.0005]"), r"cameras\[1\].distortion: expected 5 numbers from"),
-        (("readout = 0.03", "readout = 3"), r"\[3\].readout: expected a number from 0 to 0.1 s"),
         (("noise = [0.04, 0.02]", "noise = 0.1"), r"cameras\[2\].noise: expected 2 numbers from"),
         (("exposure = 0.5", "exposure = -1"), r"exposure: expected a number from 0 to 10 stop"),
     ],
@@ -218,41 +175,34 @@ def test_what_a_file_says_is_what_mjcf_says_of_it(tmp_path: Path) -> None:
     told = {camera.name: camera.optics for camera in craft.cameras}
     assert told["wide"] == Optics(distortion=BARREL)
     assert told["noisy"] == Optics(exposure=0.5, noise=(0.04, 0.02))
-    assert told["rolling"] == Optics(readout=0.03)
     text = Vehicle.load().path.read_text("utf-8")
     start = text.index("<camera ")
     texts = "".join(
         f'<text name="rotorgram/cameras.eye.{key}" data="{data}"/>'
-        for key, data in (("distortion", "-0.28 0.07 0.001 -0.0005 0.01"), ("readout", "0.03"))
+        for key, data in (("distortion", "-0.28 0.07 0.001 -0.0005 0.01"), ("exposure", "0.3"))
     )
     file = tmp_path / "own.xml"
     eye = '<camera name="eye" pos="0.5 0 0"/>'
     whole = text[:start] + eye + text[start:]
     file.write_text(whole.replace("</mujoco>", f"<custom>{texts}</custom></mujoco>"), "utf-8")
     named = {camera.name: camera.optics for camera in Vehicle.load(file).cameras}
-    assert named["eye"] == Optics(distortion=BARREL, readout=0.03)
-    wrong = texts.replace('"0.03"', '"soon"')
+    assert named["eye"] == Optics(distortion=BARREL, exposure=0.3)
+    wrong = texts.replace('"0.3"', '"soon"')
     file.write_text(whole.replace("</mujoco>", f"<custom>{wrong}</custom></mujoco>"), "utf-8")
-    with pytest.raises(InputError, match=r"camera eye.readout: expected a number .* got 'soon'"):
+    with pytest.raises(InputError, match=r"camera eye.exposure: expected a number .* got 'soon'"):
         Vehicle.load(file)
-
-
-def test_flow_wants_rows_of_one_moment(tmp_path: Path) -> None:
-    cameras = cameras_of(vehicle_with(tmp_path, OPTICS))
-    with pytest.raises(InputError, match="expected flow of a camera that reads all rows at once"):
-        chosen_views(["rolling_flow"], cameras)
 
 
 def test_a_lens_that_needs_too_much(tmp_path: Path) -> None:
     text = OPTICS.replace("[-0.28, 0.07, 0.001, -0.0005, 0.01]", "[-0.05, 0.0, 0.0, 0.0, 0.0]")
     craft = vehicle_with(tmp_path, text.replace("[96, 72]\nfovy = 1.3", "[4000, 3000]\nfovy = 1.5"))
     with pytest.raises(InputError, match="distortion: expected a lens that needs at most 8192 pix"):
-        Cameras(craft, chosen_views(["wide"], cameras_of(craft)))
+        Cameras(craft, chosen_views(["wide"], craft.cameras))
 
 
 def test_all_of_them_over_udp(opengl: None, tmp_path: Path) -> None:
     vehicle = vehicle_with(tmp_path, OPTICS).path
-    options = {"cameras": "wide,noisy,rolling@24x18", "action": "velocity"}
+    options = {"cameras": "wide,noisy,sharp@24x18", "action": "velocity"}
     with (
         socket_pair(HOVER, options=options, vehicle=vehicle) as remote,
         closing(LocalVectorEnv(HOVER, 1, vehicle=vehicle, **options)) as local,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pictures import HEIGHT, WIDTH, at
 from rotorgram.models import QUAD_XML, InputError
-from rotorgram.models.cameras import cameras_of, chosen_views
+from rotorgram.models.cameras import chosen_views
 from rotorgram.models.library import find_vehicle, vehicle_names
 from rotorgram.models.mjcf import vehicle_spec
 from rotorgram.models.vehicle import Vehicle
@@ -141,7 +141,7 @@ def test_a_picture_has_many_colours(scene: str, opengl: None) -> None:
 @scenes
 def test_cameras_see_its_objects(opengl: None, scene: str) -> None:
     vehicle = Vehicle.load()
-    views = chosen_views(["front@96x72", "front_segmentation@96x72"], cameras_of(vehicle))
+    views = chosen_views(["front@96x72", "front_segmentation@96x72"], vehicle.cameras)
     with closing(Cameras(vehicle, views, world=f"{scene}:1")) as cameras:
         place, turn = np.array([[0.0, 0.0, 5.0]]), np.array([[1.0, 0.0, 0.0, 0.0]])
         due = {view.name: np.ones(1, bool) for view in views}

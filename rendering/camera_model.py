@@ -4,17 +4,19 @@ It is another than that of the physics, which never knows of it.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Final
 
 import mujoco
 import numpy as np
 
-from ..models.cameras import FARTHEST, add_cameras
+from ..models.cameras import FARTHEST, place_camera
 from ..models.fleet import members_of
 from ..models.mjcf import swarm_spec
 from ..models.swarm import drone_names
 from ..models.vehicle import Vehicle
 from ..scenes import add_scene
+from ..scenes.marks import Mark
 from .stage import scale_drawing
 
 NOTHING: Final = "nothing"
@@ -31,7 +33,7 @@ _COLOR: Final = {"gate": (0.96, 0.42, 0.08, 1.0), "disc": (0.13, 0.78, 0.52, 1.0
 
 
 def objects_of(
-    vehicle: Vehicle, drones: int, world: str, marks: Sequence[Any], *, payload: bool
+    vehicle: Vehicle, drones: int, world: str, marks: Sequence[Mark], *, payload: bool
 ) -> tuple[str, ...]:
     """`Cameras.objects` of such cameras, without an OpenGL."""
     names = drone_names(drones)
@@ -39,7 +41,7 @@ def objects_of(
 
 
 def drawn_model(
-    vehicle: Vehicle, names: Sequence[str], world: str, marks: Sequence[Any], *, payload: bool
+    vehicle: Vehicle, names: Sequence[str], world: str, marks: Sequence[Mark], *, payload: bool
 ) -> mujoco.MjModel:
     """What is drawn: craft with their cameras, what surrounds them, the task's marks."""
     crafts = members_of(vehicle, len(names))
@@ -47,7 +49,9 @@ def drawn_model(
     add_scene(spec, world)
     bodies = [body for body in spec.worldbody.bodies if body.name.partition("/")[0] in names]
     for name, body, craft in zip(names, bodies, crafts, strict=True):
-        add_cameras(spec, body, craft, f"{name}/")
+        for camera in craft.cameras:
+            if camera not in craft.file_cameras:
+                place_camera(spec, body, replace(camera, name=f"{name}/{camera.name}"))
     if payload:
         hung = spec.worldbody.add_body(name=PAYLOAD, mocap=True)
         _add(hung, PAYLOAD, mujoco.mjtGeom.mjGEOM_SPHERE, (0.12 * crafts[0].radius,) * 3)
@@ -85,27 +89,21 @@ def _add(body: Any, name: str, kind: Any, size: Sequence[float], **more: Any) ->
     geom.mass, geom.group = 0.0, 1
 
 
-def _add_mark(body: Any, name: str, mark: Any, thickness: float) -> None:
-    """A gate, a disc of a thickness or a ball of a task, as viewers show it."""
-    kinds, rgba = mujoco.mjtGeom, _COLOR.get(mark.shape, (0.13, 0.78, 0.52, 1.0))
-    centre = np.array(mark.position)
-    if mark.shape == "ball":
-        _add(body, name, kinds.mjGEOM_SPHERE, (mark.size,) * 3, pos=centre, rgba=rgba)
-    elif mark.shape == "disc":
-        half = thickness / 2  # its lower side lies on the ground: both at one height flicker
-        size, centre = (mark.size, half, 0.0), centre + np.array((0.0, 0.0, half))
-        _add(body, name, kinds.mjGEOM_CYLINDER, size, pos=centre, rgba=rgba)
-    else:
-        turn, half = np.radians(mark.heading), mark.size / 2
-        aside, up = np.array((-np.sin(turn), np.cos(turn), 0.0)), np.array((0.0, 0.0, 1.0))
-        corners = [centre + half * (y * aside + z * up) for y, z in _CORNERS]
-        for i, (start, end) in enumerate(zip(corners, corners[1:] + corners[:1], strict=True)):
-            ends = np.concatenate((start, end))
-            thick = (0.025 * mark.size, 0.0, 0.0)
-            _add(body, f"{name}/{i}", kinds.mjGEOM_CAPSULE, thick, fromto=ends, rgba=rgba)
-
-
-_CORNERS: Final = ((-1, -1), (1, -1), (1, 1), (-1, 1))
+def _add_mark(body: mujoco.MjsBody, name: str, mark: Mark, thickness: float) -> None:
+    """A mark of a task, as viewers show it; discs have a thickness, m."""
+    rgba = _COLOR.get(mark.shape, _COLOR["disc"])
+    parts = mark.parts(thickness)
+    for number, part in enumerate(parts):
+        own = f"{name}/{number}" if len(parts) > 1 else name
+        start, end = (np.add(mark.position, point) for point in (part.start, part.end))
+        size = (part.radius, 0.0, 0.0)
+        if part.kind == "sphere":
+            _add(body, own, mujoco.mjtGeom.mjGEOM_SPHERE, size, pos=start, rgba=rgba)
+            continue
+        kind = mujoco.mjtGeom.mjGEOM_CAPSULE
+        if part.kind == "cylinder":
+            kind = mujoco.mjtGeom.mjGEOM_CYLINDER
+        _add(body, own, kind, size, fromto=np.concatenate((start, end)), rgba=rgba)
 
 
 def objects_in(model: mujoco.MjModel, names: Sequence[str]) -> tuple[tuple[str, ...], np.ndarray]:
