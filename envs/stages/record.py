@@ -56,7 +56,6 @@ class Record:
     action: NDArray[np.float64]
     received: NDArray[np.float64]
     actions_sent: NDArray[np.float64]
-    scenes: NDArray[np.int64]
     thrust: Array
     start: InitialState
     state: State
