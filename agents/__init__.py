@@ -1,52 +1,42 @@
-"""Learning algorithms, their policies and files, and controllers: PID and geometric.
+"""Learning algorithms, their policies and files, and controllers: PID, geometric and ORCA.
 
-Policies, controllers and the reading of checkpoints import no algorithm: `make_agent` and
-`resume_agent` do. Only SB3's needs torch.
+Only SB3's algorithms need torch.
 """
 
-from typing import TYPE_CHECKING, Final
-
 from ..envs.spec import Discrete, EnvSpec, component_names
-from ..models.errors import InputError, expect
+from ..models.errors import InputError
+from .a2c import A2CConfig
 from .checkpoints import Checkpoint, CheckpointError, load, store
+from .config import NETWORK_FIELDS, Config
 from .episodes import Episode, EpisodeLog, ResumeError, episode_seed
 from .geometric import Geometric
 from .orca import Orca
 from .pid import PID
 from .policies import NetworkPolicy, Policy
-from .presets import (
-    NETWORKS,
-    PRESETS,
-    A2CConfig,
+from .ppo import PPOConfig
+from .presets import find_preset, preset
+from .registry import (
+    ALGORITHMS,
+    CONTROLLERS,
+    Agent,
     AlgorithmName,
-    Config,
-    PPOConfig,
-    SACConfig,
-    VPGConfig,
-    config_type,
-    preset,
+    Resumable,
+    find_algorithm,
 )
-
-if TYPE_CHECKING:
-    from .learner import Learner
-    from .sac import SAC
-    from .sb3 import SB3Agent
-
-    Agent = Learner | SAC | SB3Agent
-
-CONTROLLERS: Final[dict[str, type[PID] | type[Geometric] | type[Orca]]] = {
-    "pid": PID, "geometric": Geometric, "orca": Orca,
-}  # fmt: skip
-"""Agents that need no training, made of an env's spec."""
+from .sac import SACConfig
+from .vpg import VPGConfig
 
 __all__ = [
+    "ALGORITHMS",
     "CONTROLLERS",
+    "NETWORK_FIELDS",
     "PID",
-    "PRESETS",
     "A2CConfig",
+    "Agent",
     "AlgorithmName",
     "Checkpoint",
     "CheckpointError",
+    "Config",
     "Episode",
     "EpisodeLog",
     "Geometric",
@@ -57,8 +47,9 @@ __all__ = [
     "ResumeError",
     "SACConfig",
     "VPGConfig",
-    "can_resume",
     "episode_seed",
+    "find_algorithm",
+    "find_preset",
     "load",
     "make_agent",
     "preset",
@@ -67,83 +58,71 @@ __all__ = [
     "store",
 ]
 
+_ERRORS = (KeyError, TypeError, ValueError, RuntimeError, IndexError)
+"""What parts of a checkpoint that do not fit together raise."""
 
-def make_agent(algorithm: str, log: EpisodeLog, config: Config, seed: int) -> "Agent":
-    """A new agent of a name in `PRESETS`, for the env of a log.
+
+def make_agent(algorithm: str, log: EpisodeLog, config: Config, seed: int) -> Resumable:
+    """A new agent of a name in `ALGORITHMS`, for the env of a log; SB3's cannot `set_state`.
 
     Raises:
         InputError: No such algorithm, or a config of another one.
         MissingPackage: SB3 is not installed.
     """
-    match algorithm, config:
-        case "vpg", VPGConfig():
-            from .vpg import VPG
-
-            return VPG(log, config, seed)
-        case "ppo" | "ippo", PPOConfig():
-            from .ppo import PPO
-
-            return PPO(log, config, seed)
-        case "mappo", PPOConfig():
-            from .mappo import MAPPO
-
-            return MAPPO(log, config, seed)
-        case "a2c", A2CConfig() if not isinstance(config, PPOConfig):
-            from .a2c import A2C
-
-            return A2C(log, config, seed)
-        case "sac", SACConfig():
-            from .sac import SAC
-
-            return SAC(log, config, seed)
-        case "sb3-a2c" | "sb3-ppo" | "sb3-sac", A2CConfig() | SACConfig() if type(
-            config
-        ) is config_type(algorithm):
-            from .sb3 import SB3Agent
-
-            return SB3Agent(log, config, seed)
-    raise InputError(
-        f"algorithm: expected one of {sorted(PRESETS)} with its config, got {algorithm!r} "
-        f"with {type(config).__name__}"
-    )
-
-
-_ALIKE: Final = {"vpg", "a2c", "ppo", "ippo", "mappo"}
-"""Algorithms whose policies are the same network."""
+    row = find_algorithm(algorithm)
+    if type(config) is not row.config:
+        raise InputError(
+            f"algorithm: expected {algorithm} with its {row.config.__name__}, "
+            f"got {type(config).__name__}"
+        )
+    agent: Resumable = row.agent_class().create(log, config, seed)
+    return agent
 
 
 def start_agent(
     kept: Checkpoint, algorithm: str, log: EpisodeLog, config: Config, seed: int
-) -> "Agent":
+) -> Agent:
     """A new agent that begins with the networks of a checkpoint; all else of it is fresh.
 
-    The checkpoint is of the same algorithm; `vpg`, `a2c`, `ppo`, `ippo` and `mappo` take each
-    other's policy too, and `a2c`, `ppo` and `ippo` each other's critic. Its task, vehicle and
-    effects may be others, its observation and action may not.
+    The checkpoint is of the same algorithm; algorithms of one family take each other's policy, and
+    each other's critic where it has the same shape. Its task, vehicle and effects may be others,
+    its observation and action may not.
 
     Raises:
         InputError: The checkpoint has other networks, or is a policy alone.
         CheckpointError: The parts of the checkpoint do not fit together.
     """
-    names = ", ".join(sorted(_ALIKE)) if algorithm in _ALIKE else algorithm
-    right = kept.algorithm in (_ALIKE if algorithm in _ALIKE else {algorithm})
-    expect(right, "start-from", f"a training of {names}", kept.algorithm)
-    expect(kept.num_envs, "start-from", "the checkpoint of a training", "a policy alone")
-    for (what, wanted), (_, got) in zip(_parts(kept.spec), _parts(log.spec), strict=True):
-        fit = f"the {what} of {kept.env_id}"
-        expect(len(got) == len(wanted), "start-from", f"{fit}, {len(wanted)}", f"{len(got)}")
-        for one, other in zip(wanted, got, strict=True):
-            expect(one == other, "start-from", f"{fit} with {one!r}", repr(other))
-    begun_with = preset(kept.algorithm, "tuned", **kept.config)
-    for name in NETWORKS:
-        value, own = getattr(config, name), getattr(begun_with, name)
-        expect(value == own, name, f"{own} of the training to start from", f"{value}")
+    _check_start(kept, algorithm, log.spec, config)
     agent = make_agent(algorithm, log, config, seed)
     try:
         agent.start_from(kept)
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+    except _ERRORS as error:
         raise _unfit(error) from None
     return agent
+
+
+def _check_start(kept: Checkpoint, algorithm: str, spec: EnvSpec, config: Config) -> None:
+    family = find_algorithm(algorithm).family
+    alike = sorted(name for name, row in ALGORITHMS.items() if family and row.family == family)
+    names = alike or [algorithm]
+    if kept.algorithm not in names:
+        raise InputError(
+            f"start-from: expected a training of {', '.join(names)}, got {kept.algorithm}"
+        )
+    if not kept.num_envs:
+        raise InputError("start-from: expected the checkpoint of a training, got a policy alone")
+    for (kind, wanted), (_, got) in zip(_parts(kept.spec), _parts(spec), strict=True):
+        expected = f"start-from: expected the {kind} of {kept.env_id}"
+        if len(got) != len(wanted):
+            raise InputError(f"{expected}, {len(wanted)}, got {len(got)}")
+        for own, other in zip(wanted, got, strict=True):
+            if own != other:
+                raise InputError(f"{expected} with {own!r}, got {other!r}")
+    begun_with = preset(kept.algorithm, "tuned", **kept.config)
+    for name in NETWORK_FIELDS:
+        value, own = getattr(config, name), getattr(begun_with, name)
+        if value != own:
+            raise InputError(f"{name}: expected {own} of the training to start from, got {value}")
 
 
 def _parts(spec: EnvSpec) -> tuple[tuple[str, tuple[str, ...]], ...]:
@@ -159,12 +138,7 @@ def _unfit(error: Exception) -> CheckpointError:
     return CheckpointError(f"checkpoint: its parts do not fit together: {reason:.300}")
 
 
-def can_resume(algorithm: str) -> bool:
-    """Whether a training goes on where it stopped; SB3's keep no state, and start anew."""
-    return not algorithm.startswith("sb3-")
-
-
-def resume_agent(kept: Checkpoint, log: EpisodeLog) -> "Agent":
+def resume_agent(kept: Checkpoint, log: EpisodeLog) -> Agent:
     """The agent of a checkpoint; the log, a new one of as many drones, resumes where it was.
 
     An agent that cannot resume starts anew, and the log with it.
@@ -176,31 +150,35 @@ def resume_agent(kept: Checkpoint, log: EpisodeLog) -> "Agent":
         MissingPackage: SB3 is not installed.
     """
     kept.check_resumable()
-    for name in ("env_id", "options", "agents", "vehicle_hash", "observation", "action"):
-        expected, got = getattr(kept.spec, name), getattr(log.spec, name)
-        if expected == got or got == "0" * 32:  # the hash of a peer that tells none
-            continue
-        if name == "vehicle_hash":
-            then, now = (f"{s.vehicle} (model {s.vehicle_hash[:8]})" for s in (kept.spec, log.spec))
-            raise ResumeError(
-                f"resume: expected {then}, got {now}; name the vehicle with --vehicle"
-            )
-        if name == "options":  # those that differ
-            names = [one for one in {**expected, **got} if expected.get(one) != got.get(one)]
-            expected, got = ({one: o[one] for one in names if one in o} for o in (expected, got))
-        raise ResumeError(
-            f"resume: expected an env with {name} {expected!s:.300}, got {got!s:.300}"
-        )
+    _check_same_env(kept.spec, log.spec)
     try:
+        kept.policy()  # its networks are those of the config
         config = preset(kept.algorithm, "tuned", **kept.config)
-        layers = kept.policy().layers
-        if config.hidden != tuple(len(bias) for _, bias in layers[:-1]):
-            raise InputError(f"hidden: expected those of the policy, got {config.hidden}")
         agent = make_agent(kept.algorithm, log, config, kept.seed)
-        if not hasattr(agent, "set_state"):  # SB3's
+        if not find_algorithm(kept.algorithm).resumes:
             return agent
         agent.set_state(kept.state)
-    except (KeyError, TypeError, ValueError, RuntimeError, IndexError) as error:
+    except _ERRORS as error:
         raise _unfit(error) from None
     log.resume(kept.position)
     return agent
+
+
+def _check_same_env(then: EnvSpec, now: EnvSpec) -> None:
+    """Raises `ResumeError` unless a training can go on in this env."""
+    for name in ("env_id", "options", "agents", "vehicle_hash", "observation", "action"):
+        expected, got = getattr(then, name), getattr(now, name)
+        if expected == got or got == "0" * 32:  # the hash of a peer that gives none
+            continue
+        if name == "vehicle_hash":
+            before, found = (f"{s.vehicle} (model {s.vehicle_hash[:8]})" for s in (then, now))
+            raise ResumeError(
+                f"resume: expected {before}, got {found}; name the vehicle with --vehicle"
+            )
+        if name == "options":
+            different = [key for key in {**expected, **got} if expected.get(key) != got.get(key)]
+            expected = {key: expected[key] for key in different if key in expected}
+            got = {key: got[key] for key in different if key in got}
+        raise ResumeError(
+            f"resume: expected an env with {name} {expected!s:.300}, got {got!s:.300}"
+        )

@@ -1,11 +1,33 @@
 """Advantage Actor-Critic: the paper's Algorithm 2, Equation 3."""
 
-import numpy as np
+from dataclasses import dataclass
+from typing import Annotated
 
+import numpy as np
+from numpy.typing import NDArray
+
+from ..models.fields import Limits
+from .config import RolloutConfig
 from .learner import Learner
-from .policies import NetworkPolicy
-from .presets import A2CConfig
+from .networks import Floats
 from .rollouts import Collector, Rollout, advantages
+
+
+@dataclass(frozen=True, kw_only=True)
+class A2CConfig(RolloutConfig):
+    """Advantage Actor-Critic (paper, section 2.3, Algorithm 2). Defaults: the paper's setting.
+
+    Serves our A2C and Stable-Baselines3's.
+    """
+
+    gae_lambda: Annotated[float, Limits(0.0, 1.0)] = 0.0
+    """Lambda of generalised advantage estimation; 0 is the paper's Equation 3."""
+    normalize: bool = False
+    """Shift and scale the advantages of an update to mean 0 and standard deviation 1."""
+    vf_coef: Annotated[float, Limits(0.0)] = 0.5
+    """Weight of the squared error of the value."""
+    ent_coef: Annotated[float, Limits(0.0)] = 0.0
+    """Weight of the policy's entropy."""
 
 
 class A2C(Learner):
@@ -18,9 +40,9 @@ class A2C(Learner):
     config: A2CConfig
     has_critic = True
 
-    def collect(self, collector: Collector, policy: NetworkPolicy, most: int) -> Rollout:
+    def collect(self, collector: Collector, most: int) -> Rollout:
         """Fly a fixed number of steps, across episodes."""
-        return collector.steps(policy, min(self.config.steps_per_update, most))
+        return collector.steps(min(self.config.steps_per_update, most))
 
     def gradient(self, rollout: Rollout) -> None:
         """Of minus the mean of A · log P, plus the weighted squared error of the value."""
@@ -38,14 +60,18 @@ class A2C(Learner):
         self.terms = {"gain": gain, "entropy": entropy, "value_loss": value_loss}
         self.terms |= {"values": values, "targets": targets}
 
-    def advantages(self, rollout: Rollout) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """A_t and V(s_t) of every row, float64, shape (T, N), and what the critic saw of it."""
+    def advantages(
+        self, rollout: Rollout
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], Floats]:
+        """A_t and V(s_t) of every row, shape (T, N), and the inputs of the critic for them."""
         seen = self.seen(rollout.observations, rollout.kept)
         after = self.seen(rollout.next_observations, rollout.kept & ~rollout.terminated)
         values = self._values(seen)
-        following, new = np.empty_like(values), rollout.ends.copy()
-        following[:-1], new[-1] = values[1:], True
+        following = np.empty_like(values)
+        following[:-1] = values[1:]
         # The next row has the same observation, unless an episode ends between them.
+        new = rollout.ends.copy()
+        new[-1] = True
         following[new] = self._values(after[new])
         estimates = advantages(
             rollout.rewards,
@@ -58,14 +84,15 @@ class A2C(Learner):
         )
         return estimates, values, seen
 
-    def seen(self, observations: np.ndarray, flying: np.ndarray) -> np.ndarray:
+    def seen(self, observations: Floats, flying: NDArray[np.bool_]) -> Floats:
         """Inputs of the critic, shape (T, N, m), from observations (T, N, n): here the same.
 
         Of drones that are not `flying`, bool, shape (T, N), another drone may not learn.
         """
         return self.inputs(observations)
 
-    def _values(self, seen: np.ndarray) -> np.ndarray:
-        """V(s), float64, shape (...), of inputs of the critic, shape (..., m)."""
+    def _values(self, seen: Floats) -> NDArray[np.float64]:
+        """V(s), shape (...), of inputs of the critic, shape (..., m)."""
         *lead, size = seen.shape
-        return self._critic.forward(seen.reshape(-1, size)).reshape(lead).astype(np.float64)
+        values = self._critic.forward(seen.reshape(-1, size))
+        return values.reshape(lead).astype(np.float64)

@@ -27,7 +27,8 @@ from ..models import BACKENDS, Backend
 from ..models.errors import InputError, require
 from .episodes import Episode, Position, ResumeError
 from .policies import NetworkPolicy, flat_size
-from .presets import PRESETS, SQUASHED, preset
+from .presets import preset
+from .registry import ALGORITHMS
 
 FORMAT: Final = 3
 _GROUPS: Final = ("policy", "state", "position", "episodes")
@@ -95,8 +96,9 @@ class Checkpoint:
 
     def policy(self, spec: EnvSpec | None = None) -> NetworkPolicy:
         """The policy, ready to fly that env or its own. Raises `InputError` if it does not fit."""
-        spec, squash = spec or self.spec, self.algorithm in SQUASHED
-        return NetworkPolicy(self.actor, spec, self.config["activation"], squash=squash)
+        squash = ALGORITHMS[self.algorithm].squashed
+        config = preset(self.algorithm, "tuned", **self.config)
+        return NetworkPolicy.load(self.actor, spec or self.spec, config, squash=squash)
 
     def other_versions(self) -> dict[str, tuple[str, str]]:
         """Software whose version was another: its version then and now."""
@@ -177,7 +179,7 @@ def _read(data: bytes, parse: Any) -> Checkpoint:
         arrays[group][rest] = array
     meta.setdefault("backend", BACKENDS[0])
     _expect(meta["backend"] in BACKENDS, f"one of {BACKENDS}", meta["backend"])
-    _expect(meta["algorithm"] in PRESETS, f"one of {sorted(PRESETS)}", meta["algorithm"])
+    _expect(meta["algorithm"] in ALGORITHMS, f"one of {sorted(ALGORITHMS)}", meta["algorithm"])
     for name in ("config", "versions", "position"):
         _expect(isinstance(meta[name], dict), f"an object for {name}", meta[name])
     where, seconds = meta["position"], meta["position"]["seconds"]
@@ -195,6 +197,7 @@ def _read(data: bytes, parse: Any) -> Checkpoint:
         given: dict[str, Any] = {**arrays["position"]}
         position = replace(position, episodes=episodes, **given)
         _check_position(position, spec, meta["env_steps"])
+    meta["config"].setdefault("network", "mlp")
     config = vars(preset(meta["algorithm"], "tuned", **meta["config"]))
     config = json.loads(json.dumps(config))  # a tuple is a list there
     _expect(config == meta["config"], f"a config of all of {sorted(config)}", meta["config"])

@@ -34,6 +34,7 @@ class Geometric:
     Raises `InputError` for an env that lacks what it needs.
     """
 
+    label: ClassVar[str] = "Geometric"
     options: ClassVar[dict[str, Any]] = {"action": "position"}
     """Options of the env that it flies."""
 

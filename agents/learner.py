@@ -2,21 +2,53 @@
 
 import json
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar, TypeVar
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
-from .checkpoints import Checkpoint
+from ..envs.spec import EnvSpec
+from ..models.errors import InputError
+from .config import Config
 from .episodes import EpisodeLog
-from .networks import MLP, Actor, Adam, Weights, mlp_shapes
+from .networks import Floats, Network, Weights, make_network, named, part_of
 from .normalization import Moments
-from .policies import ActionMap, NetworkPolicy, flat_size
+from .optimizers import Adam
+from .policies import NetworkPolicy, flat_size
 from .rollouts import Collector, Diverged, Rollout
 
-Item = TypeVar("Item")
+if TYPE_CHECKING:
+    from .checkpoints import Checkpoint
 
 OnUpdate = Callable[[], bool]
 """Called after every rollout and its update; training stops where it returns False."""
+
+
+@dataclass(frozen=True)
+class Networks:
+    """What a learner moves."""
+
+    weights: Weights
+    """Of all networks: `actor.…`, and of a critic `critic.…`."""
+    actor: NetworkPolicy
+    critic: Network | None
+
+    @classmethod
+    def create(cls, spec: EnvSpec, config: Config, seed: int, critic_drones: int) -> Self:
+        """New networks; the critic sees so many drones of a world, with 0 there is none."""
+        actor, critic = NetworkPolicy(spec, config), None
+        shapes = named("actor.", actor.shapes)
+        if critic_drones:
+            critic = make_network(flat_size(spec) * critic_drones, 1, config)
+            shapes |= named("critic.", critic.shapes)
+        weights = Weights.zeros(shapes)
+        rng = np.random.default_rng(seed)
+        actor.bind(weights.part("actor."))
+        actor.initialise(rng, config.log_std)
+        if critic is not None:
+            critic.bind(weights.part("critic."))
+            critic.initialise(rng, 1.0)
+        return cls(weights, actor, critic)
 
 
 class Learner:
@@ -26,8 +58,9 @@ class Learner:
         weights: Of all networks: `actor.…`, and of a critic `critic.…`.
         optimizer: Adam of all weights.
         rate: Learning rate of the next update.
-        moments: Of the observations, where they are normalised; those of the next update have no
-            part in them yet.
+        moments: Of the observations, where they are normalised; the observations of the next update
+            have no part in them yet.
+        memory: What the policy remembers of each drone, shape (N, m).
         terms: Of the loss of the last update: `gain`, the mean of weight · log P, which the actor
             climbs; `entropy` of the policy, nats; and of a critic `value_loss`, the mean squared
             error of the values, with `values`, V(s_t) before the update, and their `targets`,
@@ -38,28 +71,34 @@ class Learner:
     central: ClassVar[bool] = False
     """Whether the critic sees the observations of all drones of a world."""
 
-    def __init__(self, log: EpisodeLog, config: Any, seed: int) -> None:
-        weights_seed, self._rng = seeds_of(seed)
-        self.spec, self.config = log.spec, config
-        actions, inputs = ActionMap(log.spec.action), flat_size(log.spec)
-        shapes = named("actor.", mlp_shapes((inputs, *config.hidden, actions.outputs)))
-        if not actions.discrete:
-            shapes["actor.log_std"] = (actions.outputs,)
-        if self.has_critic:
-            seen = inputs * (len(log.spec.agents) if self.central else 1)
-            shapes |= named("critic.", mlp_shapes((seen, *config.hidden, 1)))
-        self.weights = Weights.zeros(shapes)
-        dice = np.random.default_rng(weights_seed)
-        self._actor = Actor(self.weights.part("actor."), config.activation)
-        self._actor.initialise(dice, config.log_std)
-        if self.has_critic:
-            self._critic = MLP(self.weights.part("critic."), config.activation)
-            self._critic.initialise(dice, 1.0)
+    def __init__(
+        self,
+        networks: Networks,
+        config: Any,
+        rng: np.random.Generator,
+        memory: Floats,
+    ) -> None:
+        self.spec, self.config, self._rng = networks.actor.spec, config, rng
+        self.weights, self._actor, self.memory = networks.weights, networks.actor, memory
+        if networks.critic is not None:
+            self._critic = networks.critic
         self.optimizer, self.rate = Adam(self.weights), config.learning_rate
-        self.moments = Moments(inputs) if config.normalize_observations else None
+        normalised = config.normalize_observations
+        self.moments = Moments(flat_size(self.spec)) if normalised else None
         self.terms: dict[str, Any] = {}
 
-    def collect(self, collector: Collector, policy: NetworkPolicy, most: int) -> Rollout:
+    @classmethod
+    def create(cls, log: EpisodeLog, config: Config, seed: int) -> Self:
+        """A new agent, with networks of the kind that the config names, for the env of a log."""
+        weights_seed, rng = seeds_of(seed)
+        drones = len(log.spec.agents) if cls.central else int(cls.has_critic)
+        networks = Networks.create(log.spec, config, weights_seed, drones)
+        size = networks.actor.network.memory
+        if size and cls.central:
+            raise InputError("network: expected one without a memory for a central critic")
+        return cls(networks, config, rng, np.zeros((log.num_envs, size), np.float32))
+
+    def collect(self, collector: Collector, most: int) -> Rollout:
         """Fly for one update, at most so many env steps; an empty rollout makes none."""
         raise NotImplementedError
 
@@ -74,72 +113,86 @@ class Learner:
 
     def train(self, log: EpisodeLog, env_steps: int, on_update: OnUpdate) -> None:
         """Train until the log counts `env_steps`, from the current state on. Raises `Diverged`."""
-        collector = Collector(log, self._rng)
+        collector = Collector(log, self._rng, self._actor, self.memory)
         while log.env_steps < env_steps:
             before = log.env_steps
-            rollout = self.collect(collector, self.policy(), env_steps - before)
+            rollout = self.collect(collector, env_steps - before)
             if self.config.anneal:
                 self.rate = self.config.learning_rate * (1 - before / env_steps)
             if len(rollout):
-                with np.errstate(over="ignore", invalid="ignore"):  # told below
+                with np.errstate(over="ignore", invalid="ignore"):  # Diverged is raised below
                     self.update(rollout)
-                self._actor.clamp()
-                if self.moments is not None:
-                    self.moments.add(rollout.rows(rollout.observations))
-                if not np.isfinite(self.weights.values).all():
-                    raise diverged(self.optimizer.steps)
+                self._after_update(rollout)
             if not on_update():
                 return
 
-    def inputs(self, observations: np.ndarray) -> np.ndarray:
-        """Observations as the networks take them: normalised, if the config says so."""
-        if self.moments is None:
-            return observations
-        return (observations - self.moments.mean) * self.moments.scale
-
-    def actor(self) -> dict[str, np.ndarray]:
-        """Weights for `NetworkPolicy`: copies."""
-        arrays = {name: array.copy() for name, array in self._actor.weights.arrays.items()}
+    def _after_update(self, rollout: Rollout) -> None:
+        if self._actor.head is not None:
+            self._actor.head.clamp()
         if self.moments is not None:
-            moments = {"mean": self.moments.mean, "scale": self.moments.scale}
-            arrays |= named("observation.", moments)
-        return arrays
+            seen = rollout.rows(rollout.observations)
+            self.moments.add(seen[:, : flat_size(self.spec)])
+            self._take_moments()
+        if not np.isfinite(self.weights.values).all():
+            raise diverged(self.optimizer.steps)
+
+    def _take_moments(self) -> None:
+        if self.moments is not None and self._actor.normaliser is not None:
+            self._actor.normaliser.mean = self.moments.mean
+            self._actor.normaliser.scale = self.moments.scale
+
+    def inputs(self, observations: Floats) -> Floats:
+        """Observations as the networks take them: normalised, if the config says so."""
+        return self._actor.inputs(observations)
+
+    def actor(self) -> dict[str, Floats]:
+        """Weights of the policy, as a checkpoint has them: copies."""
+        return self._actor.arrays()
 
     def policy(self) -> NetworkPolicy:
         """The current policy: a copy."""
-        return NetworkPolicy(self.actor(), self.spec, self.config.activation)
+        return NetworkPolicy.load(self.actor(), self.spec, self.config)
 
     def state(self) -> dict[str, np.ndarray]:
         """All that the next update depends on: weights, Adam's moments and the generator."""
         arrays = {"weights": self.weights.values.copy(), "rng": generator_array(self._rng)}
+        if self.memory.size:
+            arrays["memory"] = self.memory.copy()
         if self.moments is not None:
             arrays |= named("observations.", self.moments.arrays())
         return arrays | named("optimizer.", self.optimizer.arrays())
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> None:
         """Take over a state. Raises `ValueError` or `KeyError` unless it is whole."""
-        values, weights = self.weights.values, state["weights"]
-        if weights.shape != values.shape:
-            raise ValueError(f"weights: expected {values.shape}, got {weights.shape}")
-        values[...] = weights
+        arrays = {"weights": self.weights.values}
+        if self.memory.size:
+            arrays["memory"] = self.memory
+        for name, values in arrays.items():
+            if state[name].shape != values.shape:
+                raise ValueError(f"{name}: expected {values.shape}, got {state[name].shape}")
+            values[...] = state[name]
         self.optimizer.load(part_of(state, "optimizer."))
         if self.moments is not None:
             self.moments.load(part_of(state, "observations."))
+            self._take_moments()
         set_generator(self._rng, state["rng"])
         self.terms = {}
 
-    def start_from(self, kept: Checkpoint) -> None:
+    def start_from(self, kept: "Checkpoint") -> None:
         """Take over the policy of another training with its normalisation, and a critic's weights.
 
         The noise begins anew, at `log_std`. Raises `ValueError` or `KeyError` unless they fit.
         """
-        self._actor.net.weights.load(part_of(kept.actor, "layers."))
+        own = self.weights.part("actor.").arrays
+        own |= {name: array for name, array in kept.actor.items() if name.startswith("layers.")}
+        self.weights.part("actor.").load(own)
         weights = kept.state["weights"]
         if self.has_critic and weights.shape == self.weights.values.shape:
-            critic = self._critic.weights.values
+            critic = self.weights.part("critic.").values
             critic[...] = weights[-critic.size :]
         if self.moments is not None:
             self.moments.load(part_of(kept.state, "observations."))
+            self._take_moments()
 
     def scalars(self) -> dict[str, float]:
         """Numbers of the last update, as in `docs/algorithms/README.md`; none before the first."""
@@ -158,25 +211,16 @@ class Learner:
             left = float(np.var(targets - terms.pop("values")))
             numbers["train/explained_variance"] = 1 - left / spread if spread else np.nan
         numbers |= {f"train/{name}": float(value) for name, value in terms.items()}
-        if self._actor.log_std is not None:
-            numbers["train/std"] = float(np.exp(self._actor.log_std).mean())
+        deviations = self.weights.arrays.get("actor.log_std")
+        if deviations is not None:
+            numbers["train/std"] = float(np.exp(deviations).mean())
         return numbers
 
 
 def diverged(updates: int) -> Diverged:
     """The error of weights that are not finite after so many updates."""
-    what = f"weights are not finite after update {updates}"
-    return Diverged(f"training diverged: {what}; try a lower learning_rate")
-
-
-def named(prefix: str, items: Mapping[str, Item]) -> dict[str, Item]:
-    """The same with a prefix to every name."""
-    return {prefix + name: item for name, item in items.items()}
-
-
-def part_of(arrays: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
-    """Those whose names begin so, without it."""
-    return {k.removeprefix(prefix): array for k, array in arrays.items() if k.startswith(prefix)}
+    reason = f"weights are not finite after update {updates}"
+    return Diverged(f"training diverged: {reason}; try a lower learning_rate")
 
 
 def seeds_of(seed: int) -> tuple[int, np.random.Generator]:

@@ -1,7 +1,9 @@
 """PPO with a central critic: Yu et al. 2022, arXiv 2103.01955, with parameters shared by drones."""
 
 import numpy as np
+from numpy.typing import NDArray
 
+from .networks import Floats
 from .ppo import PPO
 
 
@@ -15,7 +17,7 @@ class MAPPO(PPO):
 
     central = True
 
-    def seen(self, observations: np.ndarray, flying: np.ndarray) -> np.ndarray:
+    def seen(self, observations: Floats, flying: NDArray[np.bool_]) -> Floats:
         """Inputs of the critic, shape (T, N, A·n), as `A2C.seen`."""
         own = super().seen(observations, flying)
         count, (steps, rows, size) = len(self.spec.agents), own.shape

@@ -38,6 +38,7 @@ class Orca:
     `InputError` for an env that lacks what it needs.
     """
 
+    label: ClassVar[str] = "ORCA"
     options: ClassVar[dict[str, Any]] = {"action": "velocity"}
     """Options of the env that it flies."""
 

@@ -27,6 +27,7 @@ class PID:
     Raises `InputError` for another env, or where options or telemetry lack what it needs.
     """
 
+    label: ClassVar[str] = "PID"
     options: ClassVar[dict[str, Any]] = {}
     """Options of the env that it needs."""
 

@@ -1,14 +1,15 @@
 """Policies for flying, in plain NumPy: such small nets need no tensor library."""
 
 from collections.abc import Mapping
-from typing import Any, Final, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from ..envs.spec import ArraySpec, Discrete, EnvSpec
-from ..models.errors import expect
-
-_ZERO: Final = np.zeros((1, 1), np.float32)
+from ..models.errors import InputError
+from .config import Config
+from .heads import Categorical, Gaussian, Head
+from .networks import Floats, Layer, Normalise, Tanh, Weights, make_network
 
 
 class Policy(Protocol):
@@ -59,8 +60,10 @@ class ActionMap:
         if isinstance(action, Discrete):
             self.outputs, self.size = action.n, 1
             return
-        right = action.dtype.startswith("float")
-        expect(right, "action", "a choice or numbers of type float", action.dtype)
+        if not action.dtype.startswith("float"):
+            raise InputError(
+                f"action: expected a choice or numbers of type float, got {action.dtype}"
+            )
         self.outputs = self.size = action.size
         # Two axes here and below: NumPy is slow where it has to add one to a batch of one.
         low, high = (bound.reshape(1, -1) for bound in action.bounds())
@@ -81,114 +84,162 @@ class ActionMap:
         return clipped
 
 
-def _expected_shapes(
-    got: Mapping[str, tuple[int, ...]], inputs: int, actions: ActionMap, squash: bool
-) -> dict[str, tuple[int, ...]]:
-    """Of the weights of a policy with as many units in its layers as those have."""
-    expected: dict[str, tuple[int, ...]] = {}
-    last = max(sum(name.startswith("layers.") for name in got) // 2 - 1, 0)
-    before = inputs
-    for i in range(last + 1):
-        units = actions.outputs if i == last else (*got.get(f"layers.{i}.bias", ()), 0)[0]
-        expected |= {f"layers.{i}.weight": (units, before), f"layers.{i}.bias": (units,)}
-        before = units
-    if not actions.discrete and ("log_std" in got or not squash):
-        expected["log_std"] = (actions.outputs,)
-    if any(name.startswith("observation.") for name in got):
-        expected |= {"observation.mean": (inputs,), "observation.scale": (inputs,)}
-    return expected
-
-
 class NetworkPolicy:
-    """The actor of `networks.Actor`, from its weights, all float32.
+    """Normalised observations, a network and a head: what learns, draws actions and flies.
 
-    These are `layers.0.weight` (h, n), `layers.0.bias` (h,) and so on to the last layer, which
-    gives the mean of the action or the logits of the choices, k numbers; for continuous actions
-    `log_std` (k,); and where observations are normalised `observation.mean` (n,) and
-    `observation.scale` (n,): the input is (observation - mean) · scale. With `squash` the output is
-    tanh of the last layer's, and `log_std` may be left out: then the policy acts, but draws none.
-    Raises `InputError` if an array is missing, or the shapes are not those that the env needs.
+    Where the learner binds it to its weights, it is the policy that learns; a copy of it does not.
 
     Attributes:
-        layers: Weight (h, n) and bias (h,) of each layer.
-        activation: Of all layers but the last: `relu` or `tanh`.
-        squash: Whether the output is bounded by tanh.
-        mean: Of the observations: shape (n,), or None.
-        scale: Of the observations: shape (n,), or None.
+        network: From inputs to the mean of the action, or to the logits of the choices, k numbers.
+        head: Distribution of the actions; None for a policy that only flies.
+        normaliser: (observation - mean) · scale, if the config has it: 0 and 1 at the beginning.
         actions: Map from outputs to actions of the env.
+        shapes: Of its weights: those of the network and of the head.
     """
 
-    def __init__(
-        self,
-        weights: Mapping[str, np.ndarray],
+    head: Head | None
+
+    def __init__(self, spec: EnvSpec, config: Config, *, squash: bool = False) -> None:
+        self.spec, self.actions = spec, ActionMap(spec.action)
+        size, outputs = flat_size(spec), self.actions.outputs
+        self.network = make_network(size, outputs, config)
+        self.head = None
+        if self.actions.discrete:
+            self.head = Categorical(outputs)
+        elif not squash:
+            self.head = Gaussian(outputs)
+        self.shapes = dict(self.network.shapes)
+        if self.head is not None:
+            self.shapes |= self.head.shapes
+        self.normaliser: Normalise | None = None
+        if config.normalize_observations:
+            self.normaliser = Normalise(np.zeros(size, np.float32), np.ones(size, np.float32))
+        self._squash = [Tanh()] if squash else []
+        self.reset()
+
+    @classmethod
+    def load(
+        cls,
+        weights: Mapping[str, Floats],
         spec: EnvSpec,
-        activation: str = "relu",
+        config: Config,
         *,
         squash: bool = False,
-    ) -> None:
-        self.spec, self.actions = spec, ActionMap(spec.action)
-        self.activation, self.squash = activation, squash
-        self._relu = activation == "relu"
-        expect(activation in ("relu", "tanh"), "activation", "relu or tanh", activation)
+    ) -> "NetworkPolicy":
+        """The policy of some weights, as `arrays` gives them.
+
+        With `squash` the output is tanh of the network's, and `log_std` is left out: it flies the
+        most likely actions alone. Raises `InputError` unless the weights are those that the env and
+        the config need.
+        """
+        policy = cls(spec, config, squash=squash)
+        expected = dict(policy.shapes)
+        if policy.normaliser is not None:
+            expected |= {"observation.mean": (flat_size(spec),)}
+            expected |= {"observation.scale": (flat_size(spec),)}
         got = {name: array.shape for name, array in weights.items()}
-        expected = _expected_shapes(got, flat_size(spec), self.actions, squash)
-        reason = (
-            "it was trained for other observations or actions; give the --vehicle and the --env "
-            "options of its training"
-        )
-        right = got == expected and 0 not in sum(got.values(), ())
-        expect(right, "policy", f"weights of shapes {expected}", f"{got}: {reason}")
-        count = sum(name.startswith("layers.") for name in weights) // 2
-        self.layers = [(weights[f"layers.{i}.weight"], weights[f"layers.{i}.bias"])
-                       for i in range(count)]  # fmt: skip
-        self.mean, self.scale = weights.get("observation.mean"), weights.get("observation.scale")
-        self._sums = [(weight.T, bias[np.newaxis]) for weight, bias in self.layers]
-        self._std = np.exp(weights["log_std"]) if "log_std" in weights else None
+        if got != expected:
+            raise InputError(
+                f"policy: expected weights of shapes {expected}, got {got}: it was trained for "
+                "other observations or actions; give the --vehicle and the --env options of its "
+                "training"
+            )
+        bound = Weights.zeros(policy.shapes)
+        bound.load({name: weights[name] for name in policy.shapes})
+        policy.bind(bound)
+        if policy.normaliser is not None:
+            policy.normaliser.mean = weights["observation.mean"]
+            policy.normaliser.scale = weights["observation.scale"]
+        return policy
+
+    def bind(self, weights: Weights) -> None:
+        """Compute with these arrays from now on; they have the shapes of `shapes`."""
+        self.weights = weights
+        self.network.bind(weights)
+        if self.head is not None:
+            self.head.bind(weights)
+
+    def initialise(self, rng: np.random.Generator, log_std: float) -> None:
+        """Last layer near zero: the first policy gives the middle of the action space."""
+        self.network.initialise(rng, 0.01)
+        if self.head is not None:
+            self.head.initialise(log_std)
+
+    def arrays(self) -> dict[str, Floats]:
+        """Copies of all that `load` needs, by name."""
+        arrays = {name: array.copy() for name, array in self.weights.arrays.items()}
+        if self.normaliser is not None:
+            arrays["observation.mean"] = self.normaliser.mean
+            arrays["observation.scale"] = self.normaliser.scale
+        return arrays
+
+    @property
+    def inputs_size(self) -> int:
+        """Length of a flat observation."""
+        return flat_size(self.spec)
+
+    @property
+    def layers(self) -> list[Layer]:
+        """All that happens between an observation and the output, in its order."""
+        first = [] if self.normaliser is None else [self.normaliser]
+        return [*first, *self.network.layers, *self._squash]
 
     def reset(self) -> None:
-        """Nothing to forget."""
+        """Forget the last episode."""
+        self._memory = np.zeros((1, self.network.memory), np.float32)
 
-    def output(self, observations: np.ndarray) -> np.ndarray:
-        """Means, or logits, shape (N, k), of flat observations, shape (N, n)."""
-        values = observations
-        if self.mean is not None:
-            values = (values - self.mean) * self.scale
-        for i, (weight, bias) in enumerate(self._sums):
-            if i and self._relu:
-                np.maximum(values, _ZERO, out=values)
-            elif i:
-                np.tanh(values, out=values)
-            values = values.dot(weight)
-            values += bias
-        if self.squash:
-            np.tanh(values, out=values)
+    def inputs(self, observations: Floats) -> Floats:
+        """Observations (..., n), and the memory behind them, as the network takes them."""
+        if self.normaliser is None:
+            return observations
+        if not self.network.memory:
+            return self.normaliser.forward(observations)
+        size = len(self.normaliser.mean)
+        seen = self.normaliser.forward(observations[..., :size])
+        return np.concatenate([seen, observations[..., size:]], axis=-1)
+
+    def output(self, observations: Floats) -> Floats:
+        """Means, or logits, shape (N, k), of flat observations, shape (N, n), with the memory."""
+        values = self.network.forward(self.inputs(observations))
+        for layer in self._squash:
+            values = layer.forward(values)
         return values
 
     def act(self, observation: Any) -> Any:
         """The most likely action, inside the bounds of the env."""
-        output = self.output(flat(observation, self.spec, 1))
+        seen = flat(observation, self.spec, 1)
+        if self.network.memory:
+            seen = np.concatenate([seen, self._memory], axis=1)
+        output = self.output(seen)
+        if self.network.memory:
+            self._memory = self.network.remembered
         if isinstance(self.spec.action, Discrete):
             return int(output.argmax())
         return self.actions.to_envs(output).reshape(self.spec.action.shape)
 
-    def draw_noise(self, rng: np.random.Generator, steps: int) -> np.ndarray:
+    def draw_noise(self, rng: np.random.Generator, steps: int) -> Floats:
         """Randomness for so many rows of `sample`, drawn at once: shape (steps, k)."""
-        shape = steps, self.actions.outputs
-        if self._std is None:
-            # The Gumbel trick: the largest of logits plus Gumbel noise is a categorical draw.
-            return rng.gumbel(size=shape).astype(np.float32)
-        noise = rng.standard_normal(shape, dtype=np.float32)
-        noise *= self._std
-        return noise
+        assert self.head is not None
+        return self.head.noise(rng, steps)
 
-    def sample(self, observations: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    def sample(self, observations: Floats, noise: Floats) -> Floats:
         """Actions drawn from the policy, float32, shape (N, k), not clipped.
 
         Shape (N, 1), holding whole numbers, if they are discrete. Observations are flat, shape
-        (N, n); noise is N rows of `draw_noise`.
+        (N, n), with the memory; noise is N rows of `draw_noise`.
         """
-        output = self.output(observations)
-        output += noise
-        if self._std is None:
-            output = output.argmax(axis=1)[:, np.newaxis].astype(np.float32)
-        return output
+        assert self.head is not None
+        return self.head.sample(self.output(observations), noise)
+
+    def score(self, inputs: Floats, actions: Floats) -> tuple[Floats, float]:
+        """Log-probabilities, shape (B,), and mean entropy of actions (B, k), or (B, 1) if discrete.
+
+        Inputs are those of `inputs`, shape (B, n).
+        """
+        assert self.head is not None
+        return self.head.score(self.network.forward(inputs), actions)
+
+    def backward(self, by_log_probability: np.ndarray, by_entropy: float = 0.0) -> None:
+        """Set the gradients of a loss, from its derivatives by what `score` gave last."""
+        assert self.head is not None
+        self.network.backward(self.head.back(by_log_probability, by_entropy))

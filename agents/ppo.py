@@ -1,18 +1,47 @@
 """Proximal Policy Optimisation: Schulman et al. 2017, arXiv 1707.06347, Equations 7 and 9."""
 
 import math
+from dataclasses import dataclass
 from itertools import pairwise
+from typing import Annotated, Any, Final
 
 import numpy as np
 
-from .a2c import A2C
-from .episodes import EpisodeLog
+from ..models.fields import Limits
+from .a2c import A2C, A2CConfig
 from .learner import diverged
-from .networks import clip_norm
-from .presets import PPOConfig
+from .networks import Floats
+from .optimizers import clip_norm
 from .rollouts import Rollout
 
-_TERMS = ("gain", "entropy", "value_loss", "approx_kl", "clip_fraction")
+_TERMS: Final = ("gain", "entropy", "value_loss", "approx_kl", "clip_fraction")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PPOConfig(A2CConfig):
+    """Proximal Policy Optimisation (Schulman et al. 2017). Defaults: where it says so, the paper's.
+
+    Serves our PPO and Stable-Baselines3's.
+    """
+
+    learning_rate: float = 0.0003
+    """Of Adam (Schulman et al., table 3)."""
+    critic_learning_rate: Annotated[float | None, Limits(0.0, 1e30, above=True)] = None
+    """Of the critic's weights; null: the same."""
+    steps_per_update: int = 2048
+    """Env steps of a rollout, of all drones together (table 3)."""
+    gae_lambda: float = 0.95
+    """Lambda of generalised advantage estimation (table 3)."""
+    normalize: bool = True
+    """Shift and scale the advantages of a minibatch to mean 0 and standard deviation 1."""
+    epochs: Annotated[int, Limits(1, whole=True)] = 10
+    """Passes over a rollout (table 3)."""
+    minibatches: Annotated[int, Limits(1, whole=True)] = 32
+    """Parts of a rollout, each for one step of Adam (table 3: of 64 transitions)."""
+    clip: Annotated[float, Limits(0.0, above=True)] = 0.2
+    """Change of an action's probability that the objective rewards (table 3)."""
+    max_grad_norm: Annotated[float, Limits(0.0, above=True)] = 0.5
+    """The gradient, as one vector, is scaled down to this length."""
 
 
 class PPO(A2C):
@@ -24,15 +53,16 @@ class PPO(A2C):
 
     config: PPOConfig
 
-    def __init__(self, log: EpisodeLog, config: PPOConfig, seed: int) -> None:
-        super().__init__(log, config, seed)
-        critic = self.weights.part("critic.").values.size
+    def __init__(self, *parts: Any) -> None:
+        super().__init__(*parts)
         self._shares = np.ones_like(self.weights.values)
-        if config.critic_learning_rate is not None:
-            self._shares[-critic:] = config.critic_learning_rate / config.learning_rate
+        critic_rate = self.config.critic_learning_rate
+        if critic_rate is not None:
+            critic = self.weights.part("critic.").values.size
+            self._shares[-critic:] = critic_rate / self.config.learning_rate
 
     @property
-    def rates(self) -> np.ndarray:
+    def rates(self) -> Floats:
         """Learning rate of every weight in the next update, float32."""
         return np.float32(self.rate) * self._shares
 
@@ -56,12 +86,12 @@ class PPO(A2C):
 
     def minibatch(
         self,
-        observations: np.ndarray,
-        actions: np.ndarray,
-        before: np.ndarray,
-        advantage: np.ndarray,
-        targets: np.ndarray,
-        seen: np.ndarray | None = None,
+        observations: Floats,
+        actions: Floats,
+        before: Floats,
+        advantage: Floats,
+        targets: Floats,
+        seen: Floats | None = None,
     ) -> tuple[float, ...]:
         """Set the gradients of the loss of B transitions; its terms, by the names of `terms`.
 
@@ -89,7 +119,7 @@ class PPO(A2C):
         gain = float(np.minimum(gains, bounded).mean())
         return gain, entropy, float(errors.dot(errors)) / count, distance, clipped
 
-    def _columns(self, rollout: Rollout) -> tuple[np.ndarray, ...]:
+    def _columns(self, rollout: Rollout) -> tuple[Floats, ...]:
         """Arguments of `minibatch` for all transitions of a rollout."""
         observations = self.inputs(rollout.rows(rollout.observations))
         actions = rollout.rows(rollout.actions)

@@ -6,12 +6,17 @@ truncation and never over a termination; a recursion stops at either, and at the
 """
 
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..models.errors import InputError
 from .episodes import EpisodeLog
-from .policies import NetworkPolicy
+from .networks import Floats, Network
+
+Numbers = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 
 class Diverged(InputError):
@@ -25,24 +30,25 @@ class Rollout:
     Recursions over time may run through them, for an episode ends before each.
     """
 
-    observations: np.ndarray
-    """float32, shape (T, N, n)."""
-    actions: np.ndarray
-    """As drawn, not clipped: float32, shape (T, N, k); (T, N, 1) if discrete."""
-    rewards: np.ndarray
-    """float64, shape (T, N)."""
-    next_observations: np.ndarray
-    """Observations after each step, before any reset: float32, shape (T, N, n)."""
-    terminated: np.ndarray
-    """bool, shape (T, N), as the following."""
-    truncated: np.ndarray
-    kept: np.ndarray
+    observations: Floats
+    """Shape (T, N, n); of a policy with a memory (T, N, n + m), with the memory behind the
+    observation."""
+    actions: Floats
+    """As drawn, not clipped: shape (T, N, k); (T, N, 1) if discrete."""
+    rewards: Numbers
+    """Shape (T, N)."""
+    next_observations: Floats
+    """As `observations`, after each step and before any reset."""
+    terminated: Mask
+    """Shape (T, N), as the following."""
+    truncated: Mask
+    kept: Mask
 
     def __len__(self) -> int:
         return int(self.kept.sum())
 
     @property
-    def ends(self) -> np.ndarray:
+    def ends(self) -> Mask:
         """After which rows another episode begins, or may: bool, shape (T, N)."""
         return np.asarray(self.terminated | self.truncated | ~self.kept)
 
@@ -52,7 +58,7 @@ class Rollout:
             return array.reshape(-1, *array.shape[2:])
         return np.asarray(array[self.kept])
 
-    def without_steps(self, lost: np.ndarray) -> "Rollout":
+    def without_steps(self, lost: Mask) -> "Rollout":
         """Without the steps whose simulator was lost: their rewards and observations are made up.
 
         The episode stops one step earlier: a value is carried over that, as over a truncation.
@@ -63,27 +69,52 @@ class Rollout:
         truncated[:-1] |= lost[1:] & ~self.terminated[:-1]
         return replace(self, truncated=truncated, kept=self.kept & ~lost)
 
-    def without_episodes(self, lost: np.ndarray) -> "Rollout":
+    def without_episodes(self, lost: Mask) -> "Rollout":
         """Without the episodes that end with such a step: their returns are unknown."""
         return replace(self, kept=self.kept & (rewards_to_go(lost, self.ends, 1.0) == 0))
 
 
+class Explorer(Protocol):
+    """Draws actions for a collector, as `NetworkPolicy` does."""
+
+    network: Network
+
+    def draw_noise(self, rng: np.random.Generator, steps: int) -> Floats:
+        """Randomness for so many rows of `sample`."""
+
+    def sample(self, observations: Floats, noise: Floats) -> Floats:
+        """Actions, shape (N, k), of flat observations, shape (N, n), with the memory."""
+
+
 class Collector:
-    """Flies a policy, episode after episode, across calls; `rng` draws the actions."""
+    """Flies a policy, episode after episode, across calls; `rng` draws the actions.
 
-    def __init__(self, log: EpisodeLog, rng: np.random.Generator) -> None:
-        self._log, self._rng = log, rng
+    The policy's memory of each drone, shape (N, m), is kept in the array `memory`, and is 0 where
+    an episode begins.
+    """
 
-    def steps(self, policy: NetworkPolicy, count: int) -> Rollout:
+    def __init__(
+        self,
+        log: EpisodeLog,
+        rng: np.random.Generator,
+        policy: Explorer,
+        memory: Floats | None = None,
+    ) -> None:
+        self._log, self._rng, self._policy = log, rng, policy
+        if memory is None:
+            memory = np.zeros((log.num_envs, policy.network.memory), np.float32)
+        self._memory = memory
+
+    def steps(self, count: int) -> Rollout:
         """Whole steps of all drones, as many as so many transitions need, less those with a loss.
 
         Running episodes go on in the next call. After an episode ends, that drone's next step
         begins the next episode and is no transition; if all have ended, no step is spent.
         """
-        rollout, lost, _ = self._fly(policy, -(-count // self._log.num_envs), None)
+        rollout, lost, _ = self._fly(-(-count // self._log.num_envs), None)
         return rollout.without_steps(lost)
 
-    def episodes(self, policy: NetworkPolicy, count: int, most_steps: int) -> Rollout:
+    def episodes(self, count: int, most_steps: int) -> Rollout:
         """Whole episodes, as many as there are drones or a multiple: at least so many.
 
         A drone whose episode ends is frozen until all have ended. A round that `most_steps`
@@ -94,7 +125,7 @@ class Collector:
         rounds, last = -(-count // log.num_envs), log.env_steps + most_steps
         flown: list[Rollout] = []
         while rounds and log.env_steps < last:
-            rollout, lost, done = self._fly(policy, None, last - log.env_steps)
+            rollout, lost, done = self._fly(None, last - log.env_steps)
             rollout = rollout.without_episodes(lost)
             if not (done or log.num_envs == 1):
                 rollout = replace(rollout, kept=np.zeros_like(rollout.kept))
@@ -103,45 +134,71 @@ class Collector:
         columns = zip(*(vars(part).values() for part in flown), strict=True)
         return Rollout(*map(np.concatenate, columns))
 
-    def _fly(
-        self, policy: NetworkPolicy, length: int | None, most_steps: int | None
-    ) -> tuple[Rollout, np.ndarray, bool]:
+    def _fly(self, length: int | None, most_steps: int | None) -> tuple[Rollout, Mask, bool]:
         """So many steps of all drones; or an episode of each, if it takes at most so many steps.
 
         Returns the rollout; the steps in which a simulator was lost, bool, shape (T, N); and
-        whether all drones stand at the end of an episode.
+        whether all drones are at the end of an episode.
         """
         log, env, count = self._log, self._log.env, self._log.num_envs
         log.start()
         stop = None if most_steps is None else log.env_steps + most_steps
         block = length or max(256 // count, 1)
         rows: list[tuple[np.ndarray, ...]] = []
-        observations, waiting = log.observations, int(np.count_nonzero(log.done))
+        observations, waiting = self._seen(), int(np.count_nonzero(log.done))
         while len(rows) != length and (stop is None or log.env_steps < stop):
             if not len(rows) % block:
-                noise = policy.draw_noise(self._rng, block * count).reshape(block, count, -1)
-            actions = policy.sample(observations, noise[len(rows) % block])
+                drawn = self._policy.draw_noise(self._rng, block * count)
+                noise = drawn.reshape(block, count, -1)
+            actions = self._policy.sample(observations, noise[len(rows) % block])
             if not np.isfinite(actions).all():
                 hint = "try a lower learning_rate"
                 raise Diverged(f"training diverged: actions are not finite; {hint}")
-            flying, idle = ~log.out, log.done if waiting else None
-            log.fly(actions, idle) if stop is None else log.fly(actions, None, idle)
+            flying = ~log.out
+            idle = log.done if waiting else None
+            begins, frozen = (idle, None) if stop is None else (None, idle)
+            log.fly(actions, begins, frozen)
+            self._remember(begins, frozen)
+            after = self._seen()
             ends = (env.terminated, env.truncated, flying, env.lost)
-            rows.append((observations, actions, env.rewards, log.observations, *ends))
-            observations = rows[-1][3]
+            rows.append((observations, actions, env.rewards, after, *ends))
+            observations = after
             waiting = int(np.count_nonzero(log.done))  # of few drones faster than `any`
             if waiting == count:
                 if stop is not None:
                     break
-                log.begin(log.done)
-                observations, waiting = log.observations, 0
+                self._begin()
+                observations, waiting = self._seen(), 0
         if waiting and (stop is None or waiting == count):
-            log.begin(log.done)
+            self._begin()
         *columns, lost = (np.array(column) for column in zip(*rows, strict=True))
         return Rollout(*columns), lost, waiting == count
 
+    def _begin(self) -> None:
+        """Begin the next episodes where they have ended."""
+        done = self._log.done
+        broken = self._log.begin(done)
+        self._memory[done | broken] = 0.0
 
-def discounted_sums(values: np.ndarray, factors: np.ndarray) -> np.ndarray:
+    def _seen(self) -> Floats:
+        """What the policy takes now: the observations, and behind them its memory."""
+        if not self._memory.size:
+            return self._log.observations
+        return np.concatenate([self._log.observations, self._memory], axis=1)
+
+    def _remember(self, begins: Mask | None, frozen: Mask | None) -> None:
+        """Keep the policy's new memory, but of drones that did not fly."""
+        if not self._memory.size:
+            return
+        new = self._policy.network.remembered
+        if frozen is not None:
+            new = np.where(frozen[:, np.newaxis], self._memory, new)
+        if begins is not None:
+            new = np.where(begins[:, np.newaxis], np.float32(0.0), new)
+        self._memory[...] = new
+
+
+def discounted_sums(values: np.ndarray, factors: np.ndarray) -> Numbers:
     """S_t = v_t + f_t · S_t+1, where S is 0 after the last row: float64, shape of `values`.
 
     A factor is 0 where a sum stops. The rows are combined in pairs, pairs of pairs and so on:
@@ -158,7 +215,7 @@ def discounted_sums(values: np.ndarray, factors: np.ndarray) -> np.ndarray:
     return sums
 
 
-def rewards_to_go(rewards: np.ndarray, ends: np.ndarray, gamma: float) -> np.ndarray:
+def rewards_to_go(rewards: np.ndarray, ends: Mask, gamma: float) -> Numbers:
     """R_t = sum of gamma^(t' - t) · r_t' to the episode's end (paper, Algorithm 1, step 2).
 
     Arrays have shape (T, N), as the result; `ends` is bool.
@@ -167,31 +224,31 @@ def rewards_to_go(rewards: np.ndarray, ends: np.ndarray, gamma: float) -> np.nda
 
 
 def advantages(
-    rewards: np.ndarray,
-    values: np.ndarray,
-    next_values: np.ndarray,
-    terminated: np.ndarray,
-    truncated: np.ndarray,
+    rewards: Numbers,
+    values: Numbers,
+    next_values: Numbers,
+    terminated: Mask,
+    truncated: Mask,
     *,
     gamma: float,
     gae_lambda: float,
-) -> np.ndarray:
+) -> Numbers:
     """Generalised advantage estimates, float64; with `gae_lambda` = 0 the paper's Equation 3.
 
     A_t = r_t + gamma · V(s_t+1) - V(s_t), where V after a termination is 0, and s_t+1 is the state
     that the step led to, before any reset. `gae_lambda` is the decay of the sum over later errors.
     Arrays have shape (T, N), as the result; the last two are bool.
     """
-    errors: np.ndarray = rewards + gamma * np.where(terminated, 0.0, next_values) - values
+    errors: Numbers = rewards + gamma * np.where(terminated, 0.0, next_values) - values
     if gae_lambda == 0.0:
         return errors
     return discounted_sums(errors, gamma * gae_lambda * ~(terminated | truncated))
 
 
-def step_of_episode(ends: np.ndarray) -> np.ndarray:
+def step_of_episode(ends: Mask) -> NDArray[np.int64]:
     """Number of each step within its episode, where the first row begins at 0."""
     index = np.arange(len(ends)).reshape(-1, *(1,) * (ends.ndim - 1))
     starts = np.zeros(ends.shape, int)
     starts[1:] = np.where(ends[:-1], index[1:], 0)
-    result: np.ndarray = index - np.maximum.accumulate(starts)
+    result: NDArray[np.int64] = index - np.maximum.accumulate(starts)
     return result

@@ -2,26 +2,25 @@
 
 import math
 from collections.abc import Mapping
-from typing import Any, Final
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Final, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..models.errors import expect
-from .checkpoints import Checkpoint
+from ..envs.spec import EnvSpec
+from ..models.errors import InputError
+from ..models.fields import Limits
+from .config import RolloutConfig
 from .episodes import EpisodeLog
-from .learner import (
-    OnUpdate,
-    diverged,
-    generator_array,
-    named,
-    part_of,
-    seeds_of,
-    set_generator,
-)
-from .networks import MLP, Adam, Weights, mlp_shapes
+from .learner import OnUpdate, diverged, generator_array, seeds_of, set_generator
+from .networks import Floats, Network, Weights, make_network, named, part_of
+from .optimizers import Adam
 from .policies import ActionMap, NetworkPolicy, flat_size
-from .presets import SACConfig
 from .rollouts import Collector, Rollout
+
+if TYPE_CHECKING:
+    from .checkpoints import Checkpoint
 
 _LOG_STD: Final = np.array([-20.0, 2.0], np.float32)
 """Least and greatest logarithm of a standard deviation, as in the authors' code."""
@@ -29,12 +28,53 @@ _SMALL: Final = 1e-6  # keeps the logarithm of 1 - tanh² finite, as there
 _HALF_LOG_2_PI: Final = 0.5 * math.log(2 * math.pi)
 
 
+@dataclass(frozen=True, kw_only=True)
+class SACConfig(RolloutConfig):
+    """Soft Actor-Critic (Haarnoja et al. 2018, arXiv 1812.05905). Defaults: its Table 1.
+
+    Serves our SAC and Stable-Baselines3's.
+    """
+
+    hidden: tuple[int, ...] = (256, 256)
+    """Units of each hidden layer of each network."""
+    learning_rate: float = 0.0003
+    """Of Adam: actor, critics and temperature."""
+    gradient_steps: Annotated[int, Limits(1, whole=True)] = 1
+    """Updates after each `steps_per_update` env steps."""
+    batch_size: Annotated[int, Limits(1, whole=True)] = 256
+    """Transitions of an update, drawn from the buffer."""
+    buffer_size: Annotated[int, Limits(1, whole=True)] = 1_000_000
+    """Transitions that are kept; a checkpoint has them."""
+    learning_starts: Annotated[int, Limits(1, whole=True)] = 1_000
+    """Transitions of uniform actions before the first update. Table 1 has none."""
+    tau: Annotated[float, Limits(0.0, 1.0, above=True)] = 0.005
+    """Share of the critics that their targets take over in each update."""
+    alpha: Annotated[float, Limits(0.0, 1e30, above=True)] = 1.0
+    """Temperature at the beginning. Table 1 has none."""
+    target_entropy: float | None = None
+    """Entropy that the temperature aims at, nats; null: minus the number of actions."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.buffer_size < self.learning_starts:
+            raise InputError(
+                f"buffer_size: expected learning_starts ({self.learning_starts}) or more, "
+                f"got {self.buffer_size}"
+            )
+        if self.normalize_observations:
+            raise InputError("normalize_observations: expected false with SAC, got true")
+
+
 class SquashedActor:
     """Policy a = tanh(u), u Gaussian: its net gives mean and log σ of u, k numbers each."""
 
-    def __init__(self, weights: Weights, activation: str) -> None:
-        self.weights, self.net = weights, MLP(weights, activation)
-        self._kept: Any = None  # of `draw`, for `backward`
+    def __init__(self, net: Network) -> None:
+        self.net = net
+
+    def bind(self, weights: Weights) -> None:
+        """Compute with these arrays from now on."""
+        self.weights = weights
+        self.net.bind(weights)
 
     def initialise(self, rng: np.random.Generator, log_std: float) -> None:
         """Last layer near zero: the first policy has the mean 0 and the same σ everywhere."""
@@ -42,7 +82,7 @@ class SquashedActor:
         bias = list(self.weights.arrays.values())[-1]
         bias[len(bias) // 2 :] = log_std
 
-    def draw(self, observations: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def draw(self, observations: Floats, noise: Floats) -> tuple[Floats, Floats]:
         """Actions (B, k) of standard normal noise (B, k), and log π(a | s), shape (B,)."""
         output = self.net.forward(observations)
         size = output.shape[1] // 2
@@ -53,16 +93,16 @@ class SquashedActor:
         shifted = slope + np.float32(_SMALL)
         logs = -0.5 * noise * noise - log_std - np.float32(_HALF_LOG_2_PI) - np.log(shifted)
         free = log_std == output[:, size:]
-        self._kept = spread, actions, slope, shifted, free
+        self.kept = spread, actions, slope, shifted, free
         return actions, logs.sum(axis=1)
 
-    def backward(self, by_actions: np.ndarray, by_log_probability: float) -> None:
+    def backward(self, by_actions: Floats, by_log_probability: float) -> None:
         """Set the gradients of a loss, from its derivatives by what `draw` gave last.
 
         The noise is held still: u = mean + σ · noise. log π moves with u by tanh alone, for the
         density of the Gaussian part at u depends on σ only.
         """
-        spread, actions, slope, shifted, free = self._kept
+        spread, actions, slope, shifted, free = self.kept
         by_u = (by_actions + by_log_probability * 2 * actions / shifted) * slope
         by_log_std = (by_u * spread - by_log_probability) * free
         self.net.backward(np.concatenate([by_u, by_log_std], axis=1))
@@ -76,6 +116,7 @@ class ReplayBuffer:
 
     def __init__(self, capacity: int, observation: int, action: int) -> None:
         self.rows = np.zeros((capacity, 2 * observation + action + 2), np.float32)
+        self.action = action
         self.added = 0
         """Transitions since the beginning."""
         n, k = observation, action
@@ -93,10 +134,43 @@ class ReplayBuffer:
         self.rows[places] = rows
         self.added += len(rows)
 
-    def take(self, places: np.ndarray) -> tuple[np.ndarray, ...]:
+    def take(self, places: NDArray[np.int64]) -> tuple[Floats, ...]:
         """(s, a, s', r, ends) of some rows: shapes (B, n), (B, k), (B, n), (B,), (B,)."""
         rows = self.rows[places]
         return *(rows[:, part] for part in self._parts), rows[:, -2], rows[:, -1]
+
+
+@dataclass(frozen=True)
+class SACNetworks:
+    """What SAC moves, and the critics' targets."""
+
+    weights: Weights
+    targets: Weights
+    actor: SquashedActor
+    critics: list[Network]
+    target_critics: list[Network]
+
+    @classmethod
+    def create(cls, size: int, k: int, config: SACConfig, seed: int) -> Self:
+        """New networks for observations of n numbers and actions of k."""
+        actor = SquashedActor(make_network(size, 2 * k, config))
+        if actor.net.memory:
+            raise InputError(f"network: expected one without a memory, got {config.network}")
+        critics, targets = ([make_network(size + k, 1, config) for _ in "01"] for _ in "01")
+        twins = named("0.", critics[0].shapes) | named("1.", critics[1].shapes)
+        shapes = named("actor.", actor.net.shapes) | named("critic.", twins)
+        weights, held = Weights.zeros({**shapes, "log_alpha": (1,)}), Weights.zeros(twins)
+        rng = np.random.default_rng(seed)
+        actor.bind(weights.part("actor."))
+        actor.initialise(rng, config.log_std)
+        moved = weights.part("critic.")
+        for i in range(2):
+            critics[i].bind(moved.part(f"{i}."))
+            targets[i].bind(held.part(f"{i}."))
+            critics[i].initialise(rng, 1.0)
+        held.values[:] = moved.values
+        weights.arrays["log_alpha"][:] = math.log(config.alpha)
+        return cls(weights, held, actor, critics, targets)
 
 
 class SAC:
@@ -112,36 +186,43 @@ class SAC:
         updates: Updates so far.
     """
 
-    def __init__(self, log: EpisodeLog, config: SACConfig, seed: int) -> None:
-        weights_seed, self._rng = seeds_of(seed)
-        self.spec, self.config, self.updates = log.spec, config, 0
-        actions, n = ActionMap(log.spec.action), flat_size(log.spec)
-        expect(not actions.discrete, "sac", "an env of continuous actions", "one of choices")
-        k = actions.outputs
-        critic = mlp_shapes((n + k, *config.hidden, 1))
-        twins = named("0.", critic) | named("1.", critic)
-        shapes = named("actor.", mlp_shapes((n, *config.hidden, 2 * k)))
-        shapes |= {**named("critic.", twins), "log_alpha": (1,)}
-        self.weights, self.targets = Weights.zeros(shapes), Weights.zeros(twins)
-        self._of_actor, self._of_critics, self._of_alpha = parts = [
-            self.weights.part(prefix) for prefix in ("actor.", "critic.", "log_alpha")
-        ]
-        self._adams = dict(zip(("actor", "critic", "alpha"), map(Adam, parts), strict=True))
-        self._actor = SquashedActor(self._of_actor, config.activation)
-        self._critics, self._targets = (
-            [MLP(whole.part(f"{i}."), config.activation) for i in range(2)]
-            for whole in (self._of_critics, self.targets)
-        )
-        dice = np.random.default_rng(weights_seed)
-        self._actor.initialise(dice, config.log_std)
-        for net in self._critics:
-            net.initialise(dice, 1.0)
-        self.targets.values[:] = self._of_critics.values
-        self._of_alpha.values[:] = math.log(config.alpha)
-        self._aim = -float(k) if config.target_entropy is None else config.target_entropy
+    def __init__(
+        self,
+        spec: EnvSpec,
+        networks: SACNetworks,
+        buffer: ReplayBuffer,
+        config: SACConfig,
+        rng: np.random.Generator,
+    ) -> None:
+        self.spec, self.config, self._rng, self.updates = spec, config, rng, 0
+        self.weights, self.targets, self.buffer = networks.weights, networks.targets, buffer
+        self._actor, self._critics = networks.actor, networks.critics
+        self._targets = networks.target_critics
+        self._of_actor = self.weights.part("actor.")
+        self._of_critics = self.weights.part("critic.")
+        self._of_alpha = self.weights.part("log_alpha")
+        parts = {"actor": self._of_actor, "critic": self._of_critics, "alpha": self._of_alpha}
+        self._adams = {name: Adam(part) for name, part in parts.items()}
+        aim = config.target_entropy
+        self._aim = -float(self.k) if aim is None else aim
         self.rate = config.learning_rate
-        self.buffer = ReplayBuffer(config.buffer_size, n, k)
         self._numbers: dict[str, float] = {}
+
+    @classmethod
+    def create(cls, log: EpisodeLog, config: SACConfig, seed: int) -> Self:
+        """A new agent, with networks of the kind that the config names, for the env of a log."""
+        actions, size = ActionMap(log.spec.action), flat_size(log.spec)
+        if actions.discrete:
+            raise InputError("sac: expected an env of continuous actions, got one of choices")
+        weights_seed, rng = seeds_of(seed)
+        networks = SACNetworks.create(size, actions.outputs, config, weights_seed)
+        buffer = ReplayBuffer(config.buffer_size, size, actions.outputs)
+        return cls(log.spec, networks, buffer, config, rng)
+
+    @property
+    def k(self) -> int:
+        """Numbers of an action."""
+        return self.buffer.action
 
     def train(self, log: EpisodeLog, env_steps: int, on_update: OnUpdate) -> None:
         """Train until the log counts `env_steps`, from the current state on. Raises `Diverged`.
@@ -150,11 +231,10 @@ class SAC:
         `steps_per_update` env steps, rounded up to whole steps of all drones, are followed by
         `gradient_steps` updates.
         """
-        collector, config = Collector(log, self._rng), self.config
+        config = self.config
+        collector = Collector(log, self._rng, _Explorer(self))
         while (before := log.env_steps) < env_steps:
-            explorer = _Explorer(None if self.warming_up else self._actor, self._k)
-            most = min(config.steps_per_update, env_steps - before)
-            self.buffer.add(collector.steps(explorer, most))  # type: ignore[arg-type]
+            self.buffer.add(collector.steps(min(config.steps_per_update, env_steps - before)))
             if config.anneal:
                 self.rate = config.learning_rate * (1 - before / env_steps)
             if not self.warming_up:
@@ -166,7 +246,7 @@ class SAC:
         """Make `gradient_steps` updates, each from other transitions. Raises `Diverged`."""
         shape = self.config.gradient_steps, self.config.batch_size
         places = self._rng.integers(len(self.buffer), size=shape)
-        noise = self._rng.standard_normal((2, *shape, self._k), dtype=np.float32)
+        noise = self._rng.standard_normal((2, *shape, self.k), dtype=np.float32)
         for i, some in enumerate(places):
             self.update(self.buffer.take(some), noise[0, i], noise[1, i])
         if not np.isfinite(self.weights.values).all():
@@ -177,13 +257,7 @@ class SAC:
         """Whether there are too few transitions to learn from."""
         return self.buffer.added < self.config.learning_starts
 
-    @property
-    def _k(self) -> int:
-        return self.spec.action.size  # type: ignore[union-attr]  # never a choice
-
-    def update(
-        self, batch: tuple[np.ndarray, ...], noise: np.ndarray, next_noise: np.ndarray
-    ) -> None:
+    def update(self, batch: tuple[Floats, ...], noise: Floats, next_noise: Floats) -> None:
         """Learn from a batch of `ReplayBuffer.take`; noise is standard normal, shape (B, k)."""
         config, rate, size = self.config, self.rate, len(noise)
         states, done, next_states, rewards, ends = batch
@@ -207,7 +281,7 @@ class SAC:
         by_actions = np.zeros_like(actions)
         for net, chosen in zip(self._critics, (first, ~first), strict=True):
             slope = chosen[:, np.newaxis] * np.float32(-1 / size)
-            by_actions += net.backward(slope, by_inputs=True)[:, states.shape[1] :]
+            by_actions += net.by_inputs(slope)[:, states.shape[1] :]
         self._actor.backward(by_actions, alpha / size)
         self._adams["actor"].step(rate)
         self.targets.values[:] += config.tau * (self._of_critics.values - self.targets.values)
@@ -223,21 +297,21 @@ class SAC:
         }
 
     @staticmethod
-    def _values(nets: list[MLP], states: np.ndarray, actions: np.ndarray) -> list[np.ndarray]:
+    def _values(nets: list[Network], states: Floats, actions: Floats) -> list[Floats]:
         """Q of both critics, shape (B,) each."""
         inputs = np.concatenate([states, actions], axis=1)
         return [net.forward(inputs)[:, 0] for net in nets]
 
-    def actor(self) -> dict[str, np.ndarray]:
+    def actor(self) -> dict[str, Floats]:
         """Weights for `NetworkPolicy`, which squashes: the last layer gives the mean of u."""
         arrays = {name: array.copy() for name, array in self._of_actor.arrays.items()}
         for name in list(arrays)[-2:]:
-            arrays[name] = arrays[name][: self._k].copy()
+            arrays[name] = arrays[name][: self.k].copy()
         return arrays
 
     def policy(self) -> NetworkPolicy:
         """The current policy, without exploration: a copy."""
-        return NetworkPolicy(self.actor(), self.spec, self.config.activation, squash=True)
+        return NetworkPolicy.load(self.actor(), self.spec, self.config, squash=True)
 
     def state(self) -> dict[str, np.ndarray]:
         """All that the next update depends on, with the transitions that are kept."""
@@ -265,7 +339,7 @@ class SAC:
         set_generator(self._rng, state["rng"])
         self._numbers = {}
 
-    def start_from(self, kept: Checkpoint) -> None:
+    def start_from(self, kept: "Checkpoint") -> None:
         """Take over the weights of another training; the buffer begins empty.
 
         Raises `ValueError` or `KeyError` unless they fit.
@@ -282,18 +356,18 @@ class SAC:
 
 
 class _Explorer:
-    """Draws actions for a `Collector`: of the actor as it is now, or uniform without one."""
+    """Draws actions for a `Collector`: of the actor as it is now, or uniform while warming up."""
 
-    def __init__(self, actor: SquashedActor | None, size: int) -> None:
-        self._actor, self._size = actor, size
+    def __init__(self, agent: SAC) -> None:
+        self._agent, self.network = agent, agent._actor.net
 
-    def draw_noise(self, rng: np.random.Generator, steps: int) -> np.ndarray:
-        """For so many rows of `sample`: shape (steps, k)."""
-        shape = steps, self._size
-        if self._actor is None:
+    def draw_noise(self, rng: np.random.Generator, steps: int) -> Floats:
+        shape = steps, self._agent.k
+        if self._agent.warming_up:
             return rng.uniform(-1, 1, shape).astype(np.float32)
         return rng.standard_normal(shape, dtype=np.float32)
 
-    def sample(self, observations: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """Actions, shape (N, k), of flat observations, shape (N, n)."""
-        return noise if self._actor is None else self._actor.draw(observations, noise)[0]
+    def sample(self, observations: Floats, noise: Floats) -> Floats:
+        if self._agent.warming_up:
+            return noise
+        return self._agent._actor.draw(observations, noise)[0]

@@ -1,17 +1,20 @@
 """Stable-Baselines3: its A2C, PPO and SAC as references, and vector envs as it wants them."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 from ..models.errors import InputError, require
 from . import learner
+from .a2c import A2CConfig
 from .checkpoints import Checkpoint
 from .episodes import EpisodeLog
+from .networks import named, part_of
 from .policies import ActionMap, NetworkPolicy
-from .presets import A2CConfig, PPOConfig, SACConfig
+from .ppo import PPOConfig
+from .sac import SACConfig
 
 if TYPE_CHECKING:
     import stable_baselines3 as sb3
@@ -103,6 +106,8 @@ class SB3Agent:
     def __init__(self, log: EpisodeLog, config: A2CConfig | SACConfig, seed: int) -> None:
         if config.normalize_observations:
             raise InputError("normalize_observations: expected false with SB3, got true")
+        if config.network != "mlp":
+            raise InputError(f"network: expected mlp with SB3, got {config.network!r}")
         self.spec, self._config, self._ahead = log.spec, config, 0.0
         self._rollout = config.rollout_size(log.num_envs)
         torch.set_num_threads(1)  # such small nets lose by a second thread
@@ -126,6 +131,11 @@ class SB3Agent:
             self.model.set_rates(config)
         # It keeps the numbers of the last update for us; SB3's own makes a folder in /tmp.
         self.model.set_logger(sb3_logger.Logger(folder=None, output_formats=[]))
+
+    @classmethod
+    def create(cls, log: EpisodeLog, config: A2CConfig | SACConfig, seed: int) -> Self:
+        """A new agent for the env of a log."""
+        return cls(log, config, seed)
 
     def train(self, log: EpisodeLog, env_steps: int, on_update: learner.OnUpdate) -> None:
         """As `Learner.train`. SB3 flies whole rollouts only: a last part of one is not flown."""
@@ -176,11 +186,11 @@ class SB3Agent:
     def policy(self) -> NetworkPolicy:
         """The current policy, without exploration: a copy."""
         squash = isinstance(self._config, SACConfig)
-        return NetworkPolicy(self.actor(), self.spec, self._config.activation, squash=squash)
+        return NetworkPolicy.load(self.actor(), self.spec, self._config, squash=squash)
 
     def state(self) -> dict[str, np.ndarray]:
         """Weights of all networks, for `start_from`."""
-        return learner.named("policy.", self._weights())
+        return named("policy.", self._weights())
 
     def _weights(self) -> dict[str, np.ndarray]:
         parameters = self.model.policy.state_dict()
@@ -189,7 +199,7 @@ class SB3Agent:
     def start_from(self, kept: Checkpoint) -> None:
         """As `Learner.start_from`."""
         policy = self.model.policy
-        weights = learner.part_of(kept.state, "policy.")
+        weights = part_of(kept.state, "policy.")
         policy.load_state_dict({name: torch.from_numpy(w.copy()) for name, w in weights.items()})
         if "log_std" in weights:
             policy.log_std.data.fill_(self._config.log_std)

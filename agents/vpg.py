@@ -1,11 +1,39 @@
 """Vanilla Policy Gradient: the paper's Algorithm 1, Equations 1 and 2."""
 
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
 import numpy as np
 
+from ..models.errors import InputError
+from ..models.fields import Limits
+from .config import Config
 from .learner import Learner
-from .policies import NetworkPolicy
-from .presets import VPGConfig
+from .networks import Floats
 from .rollouts import Collector, Rollout, rewards_to_go, step_of_episode
+
+
+@dataclass(frozen=True, kw_only=True)
+class VPGConfig(Config):
+    """Vanilla Policy Gradient (paper, section 2.3, Algorithm 1). Defaults: the paper's setting."""
+
+    episodes_per_update: Annotated[int, Limits(1, whole=True)] = 1
+    """Episodes flown with one policy ("a set of drone data"; the paper gives no number)."""
+    baseline: Literal["none", "time"] = "none"
+    """Taken off the returns: nothing (paper), or their mean at the same step of the episode."""
+    normalize: bool = False
+    """Divide the returns of an update by their standard deviation."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.baseline == "time" and self.episodes_per_update == 1:
+            raise InputError(
+                "episodes_per_update: expected 2 or more with baseline 'time', where a single "
+                "episode is its own mean, got 1"
+            )
+
+    def least_steps(self, drones: int, episode_length: int) -> int:
+        return drones * episode_length if drones > 1 else 1
 
 
 class VPG(Learner):
@@ -17,26 +45,26 @@ class VPG(Learner):
 
     config: VPGConfig
 
-    def collect(self, collector: Collector, policy: NetworkPolicy, most: int) -> Rollout:
+    def collect(self, collector: Collector, most: int) -> Rollout:
         """Fly whole episodes with one policy."""
-        return collector.episodes(policy, self.config.episodes_per_update, most)
+        return collector.episodes(self.config.episodes_per_update, most)
 
     def gradient(self, rollout: Rollout) -> None:
         """Of minus the mean of R_t · log P(a_t | s_t)."""
         weights = self.returns(rollout)
-        log_probability, entropy = self._actor.score(
-            self.inputs(rollout.rows(rollout.observations)), rollout.rows(rollout.actions)
-        )
+        inputs = self.inputs(rollout.rows(rollout.observations))
+        log_probability, entropy = self._actor.score(inputs, rollout.rows(rollout.actions))
         self._actor.backward(-weights / len(weights))
         self.terms = {"gain": (log_probability * weights).mean(), "entropy": entropy}
 
-    def returns(self, rollout: Rollout) -> np.ndarray:
-        """R_t, less a baseline and scaled where the config says so: float32, shape (rows,)."""
+    def returns(self, rollout: Rollout) -> Floats:
+        """R_t, less a baseline and scaled where the config says so, shape (rows,)."""
         sums = rewards_to_go(rollout.rewards, rollout.ends, self.config.gamma)
         returns = rollout.rows(sums)
         if self.config.baseline == "time":
             step = rollout.rows(step_of_episode(rollout.ends))
-            returns = returns - (np.bincount(step, returns) / np.bincount(step))[step]
+            means = np.bincount(step, returns) / np.bincount(step)
+            returns = returns - means[step]
         if self.config.normalize:
             returns = returns / (returns.std() + 1e-8)
         return returns.astype(np.float32)

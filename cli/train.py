@@ -15,9 +15,21 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from ..agents import A2CConfig, AlgorithmName, Episode, can_resume, load, preset, store
+from ..agents import (
+    NETWORK_FIELDS,
+    A2CConfig,
+    AlgorithmName,
+    Episode,
+    PPOConfig,
+    VPGConfig,
+    find_algorithm,
+    find_preset,
+    load,
+    preset,
+    store,
+)
 from ..agents.checkpoints import Checkpoint, software_versions, write_whole
-from ..agents.presets import NETWORKS, PPOConfig, PresetName, VPGConfig, find_preset
+from ..agents.presets import PresetName
 from ..flights.folders import locked
 from ..models.errors import expect, require
 from ..training.settings import Run
@@ -55,6 +67,8 @@ class Train(AgentFlags, BackendFlags):
     """vpg, a2c, ppo, ippo, mappo, sac, sb3-a2c, sb3-ppo or sb3-sac."""
     preset: PresetName = "tuned"
     """Hyperparameters: the paper's (of vpg and a2c), or ours, which may depend on the task."""
+    preset_of: str | None = None
+    """Id of the task with the preset. Default: the one that is trained, or that it derives from."""
     set: UseAppendAction[Annotated[tuple[tuple[str, ...], ...], arg(metavar="NAME=VALUE …")]] = ()
     """Changes to the preset, such as gamma=0.99 steps_per_update=64."""
     seed: int = 0
@@ -90,10 +104,17 @@ class Train(AgentFlags, BackendFlags):
 
         check_count("drones", self.drones)
         start, told = self._start()
-        changes = {name: start.config[name] for name in NETWORKS} if start else {}
+        changes = {name: start.config[name] for name in NETWORK_FIELDS} if start else {}
         changes |= dict(_change(word) for words in self.set for word in words)
-        base = find_preset(self.algorithm, self.preset, self.env_id)
-        config = preset(self.algorithm, self.preset, self.env_id, **changes)
+        task = self.preset_of or self.env_id
+        base = find_preset(self.algorithm, self.preset, task)
+        config = preset(self.algorithm, self.preset, task, **changes)
+        if not base.fits:
+            print(
+                f"note: there is no preset of {self.algorithm} for {task}, nor for a task that it "
+                f"derives from: it gets that of {base.env_id}; --preset-of ID names another",
+                flush=True,
+            )
         named: dict[str, Any] = {"num_envs": self.num_envs, "env_steps": self.env_steps}
         named["backend"] = self.backend if "backend" in self.given else None
         chosen = {name: getattr(base, name) if n is None else n for name, n in named.items()}
@@ -160,7 +181,7 @@ class Train(AgentFlags, BackendFlags):
         from ._env import CHECKPOINT
         from ._progress import bars
 
-        if not can_resume(self.algorithm):
+        if not find_algorithm(self.algorithm).resumes:
             stopped = "it starts anew" if self.resume else "--resume starts it anew"
             print(f"note: {self.algorithm} keeps no state of a training: {stopped}", flush=True)
         flags = ("env", "vehicle", "listen", "num_simulators", "key_file", "insecure")

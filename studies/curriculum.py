@@ -14,7 +14,7 @@ from typing import Any, Final
 
 import numpy as np
 from measuring import RESULTS, add_row, options
-from rotorgram.agents.presets import find_preset
+from rotorgram.agents import find_preset
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.flights.trajectories import fly_episodes
 from rotorgram.training.settings import Run

@@ -18,6 +18,7 @@ from typing import Any, Final
 import numpy as np
 import onnxruntime
 from measuring import RESULTS, in_turns, options, write
+from rotorgram.agents import Config
 from rotorgram.agents.export import TARGETS, c, metadata, onnx
 from rotorgram.agents.policies import NetworkPolicy, flat_size
 from rotorgram.envs.config import EnvConfig
@@ -70,7 +71,8 @@ def policy_of(env: str, hidden: tuple[int, ...], activation: str, normalise: boo
         weights[f"layers.{i}.bias"] = np.zeros(units)
     if normalise:
         weights |= {"observation.mean": np.zeros(sizes[0]), "observation.scale": np.ones(sizes[0])}
-    return NetworkPolicy({n: w.astype(np.float32) for n, w in weights.items()}, spec, activation)
+    config = Config(hidden=hidden, activation=activation, normalize_observations=normalise)  # type: ignore[arg-type]
+    return NetworkPolicy.load({n: w.astype(np.float32) for n, w in weights.items()}, spec, config)
 
 
 def clock(act: Callable[[Any], Any], seen: list[Any]) -> float:
@@ -99,7 +101,7 @@ def clocks(policy: NetworkPolicy, folder: Path) -> tuple[dict[str, Clock], dict[
     rows = seen.astype(np.float32)
     (folder / "loop.c").write_text(C_LOOP)
     (folder / "call.c").write_text(C_CALL)
-    calls = int(COMPILED_WEIGHTS / sum(weight.size for weight, _ in policy.layers))
+    calls = int(COMPILED_WEIGHTS / policy.weights.values.size)
     sizes = [f"-DSEEN={SEEN}", f"-DCALLS={calls}"]
     compiled("gcc", "-std=c99", "-O2", *sizes, "-o", folder / "loop", folder / "loop.c")
     compiled("gcc", "-std=c99", "-Os", "-c", "-o", folder / "call.o", folder / "call.c")

@@ -384,7 +384,7 @@ def _policy(drones: int) -> Slice:
         "layers.1.bias": 1, "log_std": 1,
     }  # fmt: skip
     weights = {name: dice.normal(size=shape).astype(np.float32) for name, shape in shapes.items()}
-    policy = NetworkPolicy(weights, env_spec(EnvConfig(env_id=ENV_ID)))
+    policy = NetworkPolicy.load(weights, env_spec(EnvConfig(env_id=ENV_ID)), preset("vpg", "paper"))
     observations = dice.normal(size=(drones, 3)).astype(np.float32)
     noise = policy.draw_noise(dice, drones)
     return _again(lambda: policy.actions.to_envs(policy.sample(observations, noise)), drones)

@@ -11,16 +11,8 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from ..agents import CONTROLLERS
-from ..agents.presets import (
-    PRESETS,
-    A2CConfig,
-    Config,
-    PresetName,
-    SACConfig,
-    find_preset,
-    preset,
-)  # fmt: skip
+from ..agents import ALGORITHMS, CONTROLLERS, Config, find_preset, preset
+from ..agents.presets import PresetName
 from ..envs import config as envs
 from ..envs.registry import env_spec, is_known, load, task_type
 from ..flights.trajectories import EpisodeSet
@@ -104,11 +96,8 @@ class Run(EnvConfig):
         expect(self.num_envs >= 1, "num_envs", "1 or more", str(self.num_envs))
         whole = self.num_envs % self.drones == 0
         expect(whole, "num_envs", f"a multiple of drones = {self.drones}", str(self.num_envs))
-        least = 1
-        if isinstance(self.config, A2CConfig | SACConfig):
-            least = self.config.rollout_size(self.num_envs)
-        elif self.num_envs > 1:  # a whole episode of each
-            least = self.num_envs * int(self.options.get("episode_length", 1))
+        episode_length = int(self.options.get("episode_length", 1))
+        least = self.config.least_steps(self.num_envs, episode_length)
         expect(self.env_steps >= least, "env_steps", f"at least {least}", str(self.env_steps))
 
 
@@ -133,7 +122,7 @@ class Row:
     """Drones that fly at the same time in each training; 0: those of the preset."""
 
     def __post_init__(self) -> None:
-        known = (*CONTROLLERS, *PRESETS)
+        known = (*CONTROLLERS, *ALGORITHMS)
         if self.agent not in known:
             raise InputError(f"agent: expected one of {', '.join(known)}, got {self.agent}")
         env = self.env

@@ -39,7 +39,7 @@ def is_finished(kept: Checkpoint) -> bool:
 
 def _least_flown(algorithm: str, config: Any, num_envs: int) -> int:
     """Env steps that a training flies at least: SB3 flies whole rollouts only."""
-    return int(config.rollout_size(num_envs)) if algorithm.startswith("sb3-") else 1
+    return int(config.rollout_size(num_envs)) if not agents.find_algorithm(algorithm).resumes else 1
 
 
 @dataclass

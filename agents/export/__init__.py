@@ -39,15 +39,17 @@ def export(checkpoint: Checkpoint, target: str) -> bytes:
     if target == "onnx":
         require("onnx", "export", "--to onnx")
     module = import_module(f"{__name__}.{target}")
-    told = metadata(
+    facts = metadata(
         checkpoint.spec,
         algorithm=checkpoint.algorithm,
         seed=checkpoint.seed,
         env_steps=checkpoint.position.env_steps,
     )
     policy = checkpoint.policy()
+    if policy.network.memory:
+        raise InputError("export: expected a policy without a memory, got one with a memory")
     _check_finite(policy)
-    content: bytes = module.write(policy, told)
+    content: bytes = module.write(policy, facts)
     return content
 
 
@@ -70,7 +72,7 @@ def metadata(spec: EnvSpec, *, algorithm: str, seed: int, env_steps: int) -> dic
     A value that is not a text is JSON.
     """
     fields = json.loads(spec.to_json())
-    told = {
+    facts = {
         "format": FORMAT,
         "algorithm": algorithm,
         "seed": seed,
@@ -80,5 +82,5 @@ def metadata(spec: EnvSpec, *, algorithm: str, seed: int, env_steps: int) -> dic
     }
     return {
         name: value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
-        for name, value in told.items()
+        for name, value in facts.items()
     }

@@ -1,12 +1,21 @@
-"""C: one header of C99, and C++ too, without a library and without allocation."""
+"""C: one header of C99, and C++ too, without a library and without allocation.
 
-from collections.abc import Iterator, Mapping
-from typing import Final
+A spec comes from a file or a peer, so that none of its texts may be trusted.
+"""
 
-from ...envs.spec import Discrete
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from ...envs.spec import ArraySpec, Discrete, EnvSpec, component_names
+from ...models.errors import InputError
+from ..networks import Affine, Floats, Normalise, Relu, Tanh
 from ..policies import NetworkPolicy
-from ._source import about, body, lists, table, tables, uses_tanh
 
+_LARGEST: Final = float(np.finfo(np.float32).max)
+_PAIRS: Final = re.compile(r"(?<=\*)(?=/)|(?<=/)(?=\*)|(?<=\?)(?=\?)")
 _LAYER: Final = """
 /* out = weight . in + bias */
 static inline void rotorgram_layer(const float *weight, const float *bias, const float *in,
@@ -34,54 +43,235 @@ static inline float rotorgram_tanh(float x)
 }"""
 
 
-def write(policy: NetworkPolicy, told: Mapping[str, str]) -> bytes:
+def write(policy: NetworkPolicy, facts: Mapping[str, str]) -> bytes:
     """A header with `void rotorgram_policy(const float observation[n], float action[k])`.
 
     A discrete action is the number of the choice, in one element. An infinite bound is the largest
     float32: C has no infinity without a library.
     """
-    buffers, lines = body(policy, lambda name: f"rotorgram_{name}")
-    inputs = policy.layers[0][0].shape[1]
+    program = _Program(policy)
     parts = [
-        "/* " + "\n * ".join(about(policy.spec, told, "c")).replace(" * \n", " *\n") + "\n */",
+        "/* " + "\n * ".join(_about(policy.spec, facts)).replace(" * \n", " *\n") + "\n */",
         "#ifndef ROTORGRAM_POLICY_H\n#define ROTORGRAM_POLICY_H\n",
-        *_constants(policy, told),
+        *_constants(policy, facts),
         "",
     ]
-    for name, values in tables(policy).items():
-        numbers = table(values, "    ")
+    for name, values in program.tables.items():
+        numbers = _table(values)
         parts.append(f"static const float rotorgram_{name}[{values.size}] = {{\n{numbers}\n}};")
-    parts += [_LAYER, _TANH] if uses_tanh(policy) else [_LAYER]
+    parts += [_LAYER, _TANH] if program.uses_tanh else [_LAYER]
     parts += [
         "\n/* The action for an observation. */",
-        f"static inline void rotorgram_policy(const float observation[{inputs}],",
+        f"static inline void rotorgram_policy(const float observation[{facts['inputs']}],",
         f"                                    float action[{policy.actions.size}])",
         "{",
-        *(f"    float {name}[{length}];" for name, length in sorted(buffers.items())),
-        *(f"    {line}" for line in lines),
+        *(f"    float {name}[{length}];" for name, length in sorted(program.buffers.items())),
+        *(f"    {line}" for line in program.lines),
         "}\n",
         "#endif\n",
     ]
     return "\n".join(parts).encode()
 
 
-def _constants(policy: NetworkPolicy, told: Mapping[str, str]) -> Iterator[str]:
+class _Program:
+    """Statements, and the tables and buffers that they use, of the layers of a policy.
+
+    Attributes:
+        at: Name of the array with the numbers so far, `size` of them.
+    """
+
+    def __init__(self, policy: NetworkPolicy) -> None:
+        self.tables: dict[str, Floats] = {}
+        self.buffers: dict[str, int] = {}
+        self.lines: list[str] = []
+        self.at, self.size, self.uses_tanh = "observation", policy.inputs_size, False
+        for layer in policy.layers:
+            if isinstance(layer, Normalise):
+                self._normalise(layer)
+            elif isinstance(layer, Affine):
+                self._affine(layer)
+            elif isinstance(layer, Relu):
+                self._each(f"{self.at}[i] = {self.at}[i] < 0.0f ? 0.0f : {self.at}[i];")
+            elif isinstance(layer, Tanh):
+                self.uses_tanh = True
+                self._each(f"{self.at}[i] = rotorgram_tanh({self.at}[i]);")
+            else:
+                raise InputError(
+                    f"export: expected layers of normalise, affine, relu and tanh, "
+                    f"got {type(layer).__name__}"
+                )
+        if policy.actions.discrete:
+            self._choose()
+        else:
+            self._act(policy)
+
+    def _table(self, name: str, values: Floats) -> str:
+        self.tables[name] = values
+        return f"rotorgram_{name}"
+
+    def _buffer(self, size: int) -> str:
+        free = "b" if self.at == "a" else "a"
+        self.buffers[free] = max(size, self.buffers.get(free, 0))
+        return free
+
+    def _each(self, *statements: str) -> None:
+        """A loop over the numbers so far."""
+        start = f"for (int i = 0; i < {self.size}; i++)"
+        inner = [f"    {statement}" for statement in statements]
+        if len(inner) == 1:
+            self.lines += [start, *inner]
+        else:
+            self.lines += [f"{start} {{", *inner, "}"]
+
+    def _normalise(self, layer: Normalise) -> None:
+        mean, scale = self._table("mean", layer.mean), self._table("scale", layer.scale)
+        out = self._buffer(self.size)
+        self._each(f"{out}[i] = ({self.at}[i] - {mean}[i]) * {scale}[i];")
+        self.at = out
+
+    def _affine(self, layer: Affine) -> None:
+        outputs, inputs = layer.weight.shape
+        number = sum(name.startswith("weight_") for name in self.tables)
+        weight = self._table(f"weight_{number}", layer.weight)
+        bias = self._table(f"bias_{number}", layer.bias)
+        out = self._buffer(outputs)
+        self.lines.append(
+            f"rotorgram_layer({weight}, {bias}, {self.at}, {inputs}, {out}, {outputs});"
+        )
+        self.at, self.size = out, outputs
+
+    def _choose(self) -> None:
+        self.lines.append("action[0] = 0.0f;")
+        largest = f"{self.at}[(int)action[0]]"
+        self._each(f"action[0] = {self.at}[i] > {largest} ? (float)i : action[0];")
+
+    def _act(self, policy: NetworkPolicy) -> None:
+        """Map the outputs to the range of the action, and clip them to its bounds."""
+        actions = policy.actions
+        middle, half = (
+            self._table("action_middle", actions.middle),
+            self._table("action_half", actions.half),
+        )
+        low, high = self._table("action_low", actions.low), self._table("action_high", actions.high)
+        self._each(
+            f"float y = {middle}[i] + {half}[i] * {self.at}[i];",
+            f"y = y < {low}[i] ? {low}[i] : y;",
+            f"action[i] = y > {high}[i] ? {high}[i] : y;",
+        )
+
+
+def _comment(text: str) -> str:
+    """The text on one line of a comment: it neither ends nor begins one, and joins no lines.
+
+    A character that cannot be printed and a backslash become `_`. `*/`, `/*`, and `??`, which
+    begins a trigraph, get a space in between.
+    """
+    shown = "".join(c if c.isprintable() and c != "\\" else "_" for c in text)
+    return _PAIRS.sub(" ", shown)
+
+
+def _number(value: float) -> str:
+    """A float32 as a literal of C: nine digits give back every bit."""
+    digits = f"{value:.9g}"
+    return digits + ("f" if re.search("[.e]", digits) else ".0f")
+
+
+def _table(values: Floats) -> str:
+    """Numbers as lines of an initializer, six in a line.
+
+    Infinite ones are the largest float32: C has no infinity without a library.
+    """
+    finite = values.clip(-_LARGEST, _LARGEST)
+    words = [_number(value) for value in finite.ravel().tolist()]
+    lines = (", ".join(words[i : i + 6]) for i in range(0, len(words), 6))
+    return ",\n".join(f"    {line}" for line in lines)
+
+
+class _Element(NamedTuple):
+    """An element of an array of a spec."""
+
+    name: str
+    unit: str
+    frame: str
+    low: float
+    high: float
+
+
+def _elements(*arrays: ArraySpec) -> Iterator[_Element]:
+    """Every element of some arrays, one after the other, as a policy takes them."""
+    for array in arrays:
+        units = (array.unit,) * array.size if isinstance(array.unit, str) else array.unit
+        low, high = (bound.ravel().tolist() for bound in array.bounds())
+        for name, unit, *bounds in zip(component_names(array), units, low, high, strict=True):
+            yield _Element(name, unit, array.frame, *bounds)
+
+
+def _lists(spec: EnvSpec) -> dict[str, list[str]]:
+    """Names and units of all elements, by the name that they have in the file."""
+    observed, action = list(_elements(*spec.observation)), spec.action
+    listed = {
+        "observation_names": [one.name for one in observed],
+        "observation_units": [one.unit for one in observed],
+        "observation_frames": [one.frame for one in observed],
+    }
+    if isinstance(action, Discrete):
+        return listed | {"choice_names": _choices(action)}
+    acted = list(_elements(action))
+    return listed | {
+        "action_names": [one.name for one in acted],
+        "action_units": [one.unit for one in acted],
+    }
+
+
+def _choices(action: Discrete) -> list[str]:
+    return list(action.components) or [str(i) for i in range(action.n)]
+
+
+def _about(spec: EnvSpec, facts: Mapping[str, str]) -> list[str]:
+    """Lines of a comment: what the policy is, and what each number means."""
+    action = spec.action
+    lines = [
+        "A policy of rotorgram, written by `rotorgram export --to c`.",
+        "",
+        f"env: {spec.env_id}, one action every {spec.control_period:g} s",
+        f"options: {facts['options']}",
+        f"vehicle: {spec.vehicle} ({spec.vehicle_hash})",
+        f"trained: {facts['algorithm']}, seed {facts['seed']}, {facts['env_steps']} env steps",
+        "observation:",
+        *_described(_elements(*spec.observation)),
+    ]
+    if isinstance(action, Discrete):
+        lines.append("action, the number of a choice:")
+        lines += [f"  {i}: {name}" for i, name in enumerate(_choices(action))]
+    else:
+        lines += ["action:", *_described(_elements(action))]
+    return [_comment(line).rstrip() for line in lines]
+
+
+def _described(listed: Iterable[_Element]) -> Iterator[str]:
+    for i, one in enumerate(listed):
+        unit = "" if one.unit == "1" else one.unit
+        words = [f"{one.low:g} to {one.high:g} {unit}".rstrip(), one.frame]
+        yield f"  {i}: {one.name}: " + ", ".join(word for word in words if word)
+
+
+def _constants(policy: NetworkPolicy, facts: Mapping[str, str]) -> Iterator[str]:
     """Macros: they take no memory where they are not used."""
     spec, action = policy.spec, policy.spec.action
     numbers = {
-        "format": told["format"],
-        "observations": told["inputs"],
+        "format": facts["format"],
+        "observations": facts["inputs"],
         "actions": policy.actions.size,
         "telemetry": sum(array.size for array in spec.telemetry),
         "control_period": f"{spec.control_period!r}",
-        "seed": told["seed"],
-        "env_steps": told["env_steps"],
+        "seed": facts["seed"],
+        "env_steps": facts["env_steps"],
     } | ({"choices": action.n} if isinstance(action, Discrete) else {})
     for name, number in numbers.items():
         yield f"#define ROTORGRAM_{name.upper()} {number}"
     for name in ("algorithm", "env_id", "options", "vehicle", "vehicle_hash"):
-        yield f"#define ROTORGRAM_{name.upper()} {_text(told[name])}"
-    for name, texts in lists(spec).items():
+        yield f"#define ROTORGRAM_{name.upper()} {_text(facts[name])}"
+    for name, texts in _lists(spec).items():
         yield f"#define ROTORGRAM_{name.upper()} {{ {', '.join(map(_text, texts))} }}"
 
 

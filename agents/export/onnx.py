@@ -1,64 +1,82 @@
 """ONNX: a graph of Sub, Mul, Gemm, Relu or Tanh, Add, Max and Min, built node by node."""
 
 from collections.abc import Mapping
-from typing import Any, Final
+from typing import Final
 
+import numpy as np
 import onnx
 import onnx.checker
 from onnx import TensorProto, helper, numpy_helper
 
+from ...models.errors import InputError
+from ..networks import Affine, Normalise, Relu, Tanh
 from ..policies import NetworkPolicy
-from ._source import tables
 
 OPSET: Final = 13  # the first in which ArgMax, Max and Min are as they are today
 _IR: Final = 7  # the format of files that came with this opset
 
 
-def write(policy: NetworkPolicy, told: Mapping[str, str]) -> bytes:
+class _Graph:
+    """Nodes in a row, and the constants that they use."""
+
+    def __init__(self) -> None:
+        self.nodes: list[onnx.NodeProto] = []
+        self.constants: list[onnx.TensorProto] = []
+
+    def then(self, operator: str, *constants: np.ndarray, **attributes: int) -> None:
+        """Append a node on the last output and some constants."""
+        before = self.nodes[-1].output[0] if self.nodes else "observation"
+        output = f"x{len(self.nodes)}"
+        names = []
+        for constant in constants:
+            names.append(f"c{len(self.constants)}")
+            self.constants.append(numpy_helper.from_array(constant, names[-1]))
+        self.nodes.append(helper.make_node(operator, [before, *names], [output], **attributes))  # type: ignore[arg-type]
+
+
+def write(policy: NetworkPolicy, facts: Mapping[str, str]) -> bytes:
     """A model: `observation` (batch, n), float32, to `action`, (batch, k), float32.
 
     A discrete action is int64, (batch,).
     """
-    constants, actions = tables(policy), policy.actions
-    nodes: list[Any] = []
-
-    def then(operator: str, *names: str, **attributes: Any) -> None:
-        """Append a node on the last output and some constants."""
-        before = nodes[-1].output[0] if nodes else "observation"
-        output = f"x{len(nodes)}"
-        nodes.append(helper.make_node(operator, [before, *names], [output], **attributes))
-
-    if policy.mean is not None:
-        then("Sub", "mean")
-        then("Mul", "scale")
-    for i in range(len(policy.layers)):
-        if i:
-            then({"relu": "Relu", "tanh": "Tanh"}[policy.activation])
-        then("Gemm", f"weight_{i}", f"bias_{i}", transB=1)
+    graph, actions = _Graph(), policy.actions
+    for layer in policy.layers:
+        if isinstance(layer, Normalise):
+            graph.then("Sub", layer.mean)
+            graph.then("Mul", layer.scale)
+        elif isinstance(layer, Affine):
+            graph.then("Gemm", layer.weight, layer.bias[0], transB=1)
+        elif isinstance(layer, Relu | Tanh):
+            graph.then(type(layer).__name__)
+        else:
+            raise InputError(
+                f"export: expected layers of normalise, affine, relu and tanh, "
+                f"got {type(layer).__name__}"
+            )
+    kind: int = TensorProto.INT64
+    shape: list[str | int | None] = ["batch"]
     if actions.discrete:
-        then("ArgMax", axis=1, keepdims=0)
+        graph.then("ArgMax", axis=1, keepdims=0)
     else:
-        if policy.squash:
-            then("Tanh")
-        then("Mul", "action_half")
-        then("Add", "action_middle")
-        then("Max", "action_low")
-        then("Min", "action_high")
-    nodes[-1].output[0] = "action"
-    kind = TensorProto.INT64 if actions.discrete else TensorProto.FLOAT
-    shape: list[Any] = ["batch"] if actions.discrete else ["batch", actions.outputs]
-    inputs = policy.layers[0][0].shape[1]
-    graph = helper.make_graph(
-        nodes,
+        graph.then("Mul", actions.half)
+        graph.then("Add", actions.middle)
+        graph.then("Max", actions.low)
+        graph.then("Min", actions.high)
+        kind = TensorProto.FLOAT
+        shape.append(actions.outputs)
+    graph.nodes[-1].output[0] = "action"
+    sizes: list[str | int | None] = ["batch", policy.inputs_size]
+    made = helper.make_graph(
+        graph.nodes,
         "policy",
-        [helper.make_tensor_value_info("observation", TensorProto.FLOAT, ["batch", inputs])],
+        [helper.make_tensor_value_info("observation", TensorProto.FLOAT, sizes)],
         [helper.make_tensor_value_info("action", kind, shape)],
-        [numpy_helper.from_array(array, name) for name, array in constants.items()],
+        graph.constants,
     )
     opset = helper.make_opsetid("", OPSET)
-    model = helper.make_model(graph, producer_name="rotorgram", opset_imports=[opset])
+    model = helper.make_model(made, producer_name="rotorgram", opset_imports=[opset])
     model.ir_version = _IR
-    helper.set_model_props(model, dict(told))
+    helper.set_model_props(model, dict(facts))
     onnx.checker.check_model(model, full_check=True)
     content: bytes = model.SerializeToString(deterministic=True)
     return content

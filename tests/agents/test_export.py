@@ -14,6 +14,7 @@ import numpy as np
 import onnx
 import onnxruntime
 import pytest
+from nets import policy_of as loaded
 from peers import ANY, Running
 from rotorgram.agents import load, store
 from rotorgram.agents.export import TARGETS, export, metadata
@@ -64,9 +65,9 @@ def policy_of(
         weights["observation.mean"] = rng.normal(size=sizes[0])
         weights["observation.scale"] = np.exp(rng.normal(size=sizes[0]))
     single = {name: array.astype(np.float32) for name, array in weights.items()}
-    policy = NetworkPolicy(single, spec, activation)
-    policy.squash = squash
-    return policy
+    if squash:
+        single.pop("log_std", None)
+    return loaded(single, spec, activation, squash=squash)
 
 
 def told_of(spec: EnvSpec) -> dict[str, str]:
@@ -191,9 +192,7 @@ def test_tanh_is_exact_from_the_smallest_number_to_the_largest(runner: str, tmp_
     seen = numbers.astype(np.float32)[:, np.newaxis]
     spec = spec_of(ArraySpec(name="a", shape=(1,)), [ArraySpec(name="o", shape=(1,))])
     one, zero = np.ones((1, 1), np.float32), np.zeros(1, np.float32)
-    weights = {"layers.0.weight": one, "layers.0.bias": zero, "log_std": zero}
-    policy = NetworkPolicy(weights, spec)
-    policy.squash = True
+    policy = loaded({"layers.0.weight": one, "layers.0.bias": zero}, spec, squash=True)
     actions = RUNNERS[runner](policy, seen, tmp_path)
     expected = np.tanh(seen.astype(np.float64))
     assert (np.abs(actions - expected) <= 5e-7 * np.abs(expected)).all()
@@ -211,7 +210,7 @@ def test_weights_keep_every_bit(runner: str, tmp_path: Path) -> None:
         "layers.0.bias": bias,
         "log_std": np.zeros(count, np.float32),
     }
-    actions = RUNNERS[runner](NetworkPolicy(weights, spec), np.ones((1, 1), np.float32), tmp_path)
+    actions = RUNNERS[runner](loaded(weights, spec), np.ones((1, 1), np.float32), tmp_path)
     assert actions.tolist() == [bias.tolist()]
 
 
@@ -350,7 +349,7 @@ def test_a_policy_that_was_trained_with_normalised_observations(tmp_path: Path) 
     ]
     assert main([*words.split(), "--out", str(folder), "--set", *settings]) == 0
     policy = load(folder / "checkpoint.safetensors").policy()
-    assert policy.mean is not None
+    assert policy.normaliser is not None
     observations = observations_of(policy.spec, 1000)[:500]
     expected = by_policy(policy, observations)
     session = onnxruntime.InferenceSession(exported(folder, "onnx", tmp_path))
@@ -404,10 +403,7 @@ def test_no_text_of_a_spec_becomes_code(trained: Path, tmp_path: Path) -> None:
         action=ArraySpec(name="??/", shape=(2,), unit="*/", components=("\\", "/*")),
     )
     policy = policy_of(spec)
-    actor = {"log_std": np.zeros(2, np.float32)}
-    for i, (weight, bias) in enumerate(policy.layers):
-        actor |= {f"layers.{i}.weight": weight, f"layers.{i}.bias": bias}
-    crafted = replace(kept, spec=spec, actor=actor)
+    crafted = replace(kept, spec=spec, actor=policy.arrays())
     files = {target: tmp_path / TARGETS[target] for target in TARGETS}
     for target, path in files.items():
         path.write_bytes(export(crafted, target))

@@ -5,7 +5,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from rotorgram.agents.networks import MLP, Actor, Adam, Weights, clip_norm, mlp_shapes, orthogonal
+from nets import mlp_of, random_policy
+from rotorgram.agents.networks import MLP, Weights, orthogonal
+from rotorgram.agents.optimizers import Adam, clip_norm
+from rotorgram.agents.policies import NetworkPolicy
+from rotorgram.envs.spec import ArraySpec, Discrete
+from scripted import spec_of
 
 DICE = np.random.default_rng(0)
 INPUTS, BATCH = 5, 17
@@ -15,17 +20,15 @@ def normal(*shape: int) -> np.ndarray:
     return DICE.normal(size=shape).astype(np.float32)
 
 
-def mlp(hidden: tuple[int, ...], outputs: int, activation: str) -> MLP:
-    weights = Weights.zeros(mlp_shapes((INPUTS, *hidden, outputs)))
+def mlp(hidden: tuple[int, ...], outputs: int, activation: str) -> tuple[MLP, Weights]:
+    net, weights = mlp_of((INPUTS, *hidden, outputs), activation)
     weights.values[:] = 0.5 * normal(weights.values.size)
-    return MLP(weights, activation)
+    return net, weights
 
 
-def actor(hidden: tuple[int, ...], activation: str, *, discrete: bool) -> Actor:
-    shapes = mlp_shapes((INPUTS, *hidden, 3)) | ({} if discrete else {"log_std": (3,)})
-    weights = Weights.zeros(shapes)
-    weights.values[:] = 0.5 * normal(weights.values.size)
-    return Actor(weights, activation)
+def actor(*, discrete: bool) -> NetworkPolicy:
+    action = Discrete(n=3) if discrete else ArraySpec(name="action", shape=(3,))
+    return random_policy(spec_of(action, [ArraySpec(name="seen", shape=(INPUTS,))]), size=0.5)
 
 
 def tensors(weights: Weights) -> dict[str, torch.Tensor]:
@@ -62,51 +65,52 @@ def test_arrays_are_views_of_one() -> None:
 
 def test_forward_by_hand() -> None:
     """Two inputs, layers of two and one units, one output."""
-    weights = Weights.zeros(mlp_shapes((2, 2, 1, 1)))
-    weights.values[:] = [1, 2, -1, 1, 0.5, -0.5, 2, 1, 1, 3, 10]
+    values = np.array([1, 2, -1, 1, 0.5, -0.5, 2, 1, 1, 3, 10])
     inputs = np.array([[1, 1], [-1, 2]], np.float32)
     # hidden: (3.5, -0.5) -> (3.5, 0) -> 8; (3.5, 2.5) -> 10.5
-    assert MLP(weights).forward(inputs).tolist() == [[34.0], [41.5]]
+    assert mlp_of((2, 2, 1, 1), "relu", values)[0].forward(inputs).tolist() == [[34.0], [41.5]]
     first = np.tanh([3.5, -0.5])
     second = np.tanh(2 * first[0] + first[1] + 1)
-    got = MLP(weights, "tanh").forward(inputs)[0, 0]
+    got = mlp_of((2, 2, 1, 1), "tanh", values)[0].forward(inputs)[0, 0]
     assert got == pytest.approx(3 * second + 10, rel=1e-6)
 
 
 @pytest.mark.parametrize("activation", ["relu", "tanh"])
 @pytest.mark.parametrize("hidden", [(16,), (8, 9), (7, 6, 5)])
 def test_gradients_are_those_of_torch(hidden: tuple[int, ...], activation: str) -> None:
-    net, seen, slope = mlp(hidden, 2, activation), normal(BATCH, INPUTS), normal(BATCH, 2)
-    theirs, inputs = tensors(net.weights), torch.tensor(seen, requires_grad=True)
+    net, weights = mlp(hidden, 2, activation)
+    seen, slope = normal(BATCH, INPUTS), normal(BATCH, 2)
+    theirs, inputs = tensors(weights), torch.tensor(seen, requires_grad=True)
     output = torch_mlp(theirs, inputs, activation)
     (output * torch.from_numpy(slope)).sum().backward()
     np.testing.assert_allclose(net.forward(seen), output.detach(), rtol=1e-5, atol=1e-5)
     net.backward(slope)
-    before = net.weights.slopes.copy()
-    by_inputs = net.backward(2 * slope, by_inputs=True) / 2
-    np.testing.assert_array_equal(net.weights.slopes, before)
+    before = weights.slopes.copy()
+    by_inputs = net.by_inputs(2 * slope) / 2
+    np.testing.assert_array_equal(weights.slopes, before)
     assert inputs.grad is not None
     np.testing.assert_allclose(by_inputs, inputs.grad, rtol=2e-5, atol=2e-6)
-    agree(net.weights, theirs)
+    agree(weights, theirs)
 
 
 def test_gradients_are_finite_differences() -> None:
-    net, seen = mlp((8, 9), 1, "tanh"), normal(BATCH, INPUTS)
+    net, weights = mlp((8, 9), 1, "tanh")
+    seen = normal(BATCH, INPUTS)
     net.forward(seen)
     net.backward(np.full((BATCH, 1), 1 / BATCH, np.float32))
-    for i in range(0, net.weights.values.size, 7):
-        found, before = [], net.weights.values[i]
+    for i in range(0, weights.values.size, 7):
+        found, before = [], weights.values[i]
         for step in (0.02, -0.02):
-            net.weights.values[i] = before + step
+            weights.values[i] = before + step
             found.append(net.forward(seen).astype(float).mean())
-        net.weights.values[i] = before
+        weights.values[i] = before
         slope = (found[0] - found[1]) / 0.04
-        assert net.weights.slopes[i] == pytest.approx(slope, rel=5e-3, abs=2e-4)
+        assert weights.slopes[i] == pytest.approx(slope, rel=5e-3, abs=2e-4)
 
 
 @pytest.mark.parametrize("discrete", [False, True], ids=["continuous", "discrete"])
 def test_log_probability_entropy_and_their_gradients_are_those_of_torch(discrete: bool) -> None:
-    ours, seen = actor((16,), "relu", discrete=discrete), normal(BATCH, INPUTS)
+    ours, seen = actor(discrete=discrete), normal(BATCH, INPUTS)
     actions = DICE.integers(3, size=(BATCH, 1)).astype("f") if discrete else 2 * normal(BATCH, 3)
     theirs = tensors(ours.weights)
     output = torch_mlp(theirs, torch.from_numpy(seen), "relu")
@@ -128,15 +132,17 @@ def test_log_probability_entropy_and_their_gradients_are_those_of_torch(discrete
 
 def test_log_probability_of_a_gaussian_by_hand() -> None:
     """Mean 0; deviations 1, 1, e: log P = -(1 + 4 + 1) / 2 - 1 - 1.5 log 2 pi."""
-    ours = Actor(Weights.zeros(mlp_shapes((INPUTS, 2, 3)) | {"log_std": (3,)}))
-    assert ours.log_std is not None
-    ours.log_std[:] = 0, 0, 1
+    ours = actor(discrete=False)
+    ours.weights.values[:] = 0
+    log_std = ours.weights.arrays["log_std"]
+    log_std[:] = 0, 0, 1
     got, entropy = ours.score(np.zeros((1, INPUTS), np.float32), np.array([[1, 2, np.e]], "f"))
     assert got[0] == pytest.approx(-3 - 1 - 1.5 * 1.8378771, rel=1e-6)
     assert entropy == pytest.approx(1.5 * (1 + 1.8378771) + 1, rel=1e-6)
-    ours.log_std[:] = 9, 0, -9
-    ours.clamp()
-    assert ours.log_std.tolist() == [1, 0, -4]
+    log_std[:] = 9, 0, -9
+    assert ours.head is not None
+    ours.head.clamp()
+    assert log_std.tolist() == [1, 0, -4]
 
 
 def test_adam_is_torch_s() -> None:
@@ -185,7 +191,7 @@ def test_the_first_weights_are_orthogonal(shape: tuple[int, int]) -> None:
 
 
 def test_an_actor_begins_near_zero_and_a_net_with_gains() -> None:
-    ours = actor((16,), "relu", discrete=False)
+    ours = actor(discrete=False)
     ours.initialise(np.random.default_rng(0), -0.5)
     arrays = ours.weights.arrays
     np.testing.assert_allclose(np.linalg.norm(arrays["layers.0.weight"], axis=0), 2**0.5, rtol=1e-5)

@@ -39,10 +39,10 @@ def test_the_policy_has_the_moments_of_all_rollouts_before_it() -> None:
 
     def check() -> bool:
         rows = np.concatenate(seen).astype(float)
-        policy = agent.policy()
-        np.testing.assert_allclose(policy.mean, rows.mean(0), atol=1e-5)
+        arrays = agent.policy().arrays()
+        np.testing.assert_allclose(arrays["observation.mean"], rows.mean(0), atol=1e-5)
         expected = 1 / np.maximum(rows.std(0), 0.01)
-        np.testing.assert_allclose(policy.scale, expected, rtol=1e-4)
+        np.testing.assert_allclose(arrays["observation.scale"], expected, rtol=1e-4)
         return True
 
     agent.train(log, 200, check)

@@ -5,7 +5,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rotorgram.agents.networks import Actor, Weights, mlp_shapes
+from nets import policy_of, random_policy
+from rotorgram.agents.config import Config
+from rotorgram.agents.networks import Affine
 from rotorgram.agents.policies import ActionMap, NetworkPolicy, flat
 from rotorgram.agents.presets import preset
 from rotorgram.envs.spec import ArraySpec, Discrete
@@ -14,16 +16,6 @@ from scripted import spec_of
 
 BOX = spec_of()
 CHOICE = spec_of(Discrete(n=3))
-
-
-def actor(spec: Any, hidden: tuple[int, ...] = (16,), activation: str = "relu") -> Actor:
-    actions = ActionMap(spec.action)
-    shapes = mlp_shapes((3, *hidden, actions.outputs))
-    if not actions.discrete:
-        shapes["log_std"] = (actions.outputs,)
-    weights = Weights.zeros(shapes)
-    weights.values[:] = np.random.default_rng(3).normal(size=weights.values.size)
-    return Actor(weights, activation)
 
 
 def constant(spec: Any, *outputs: float) -> NetworkPolicy:
@@ -36,48 +28,49 @@ def constant(spec: Any, *outputs: float) -> NetworkPolicy:
     }
     if not isinstance(spec.action, Discrete):
         weights["log_std"] = np.zeros(len(outputs), np.float32)
-    return NetworkPolicy(weights, spec)
+    return policy_of(weights, spec)
 
 
 @pytest.mark.parametrize("spec", [BOX, CHOICE], ids=["box", "discrete"])
 @pytest.mark.parametrize(("hidden", "activation"), [((16,), "relu"), ((8, 4), "tanh")])
-def test_the_policy_gives_what_the_actor_gives(
+def test_a_loaded_policy_gives_what_the_learning_one_gives(
     spec: Any, hidden: tuple[int, ...], activation: str
 ) -> None:
-    network = actor(spec, hidden, activation)
-    policy = NetworkPolicy(network.weights.arrays, spec, activation)
+    learning = random_policy(spec, hidden, activation)
+    policy = policy_of(learning.arrays(), spec, activation)
     observations = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
-    expected = network.net.forward(observations)
-    np.testing.assert_allclose(policy.output(observations), expected, rtol=1e-5, atol=1e-5)
+    expected = learning.network.forward(observations)
+    np.testing.assert_array_equal(policy.output(observations), expected)
     each = np.array([policy.output(row[np.newaxis])[0] for row in observations])
     np.testing.assert_allclose(each, expected, rtol=1e-5, atol=1e-5)
-    assert [weight.shape for weight, _ in policy.layers] == [
-        (after, before) for before, after in pairwise((3, *hidden, policy.actions.outputs))
-    ]
+    sizes = [*pairwise((3, *hidden, policy.actions.outputs))]
+    affine = [layer for layer in policy.layers if isinstance(layer, Affine)]
+    assert [layer.weight.shape[::-1] for layer in affine] == sizes
 
 
 def test_observations_are_normalised_and_outputs_squashed() -> None:
     """Two layers of ones: 16 · sum of (o - mean) · scale, here 16 · (0.5 · 2 + 3 · 0.1)."""
-    weights = {name: np.ones(shape, np.float32) for name, shape in mlp_shapes((3, 16, 2)).items()}
+    weights = {
+        name: np.ones(shape, np.float32)
+        for name, shape in random_policy(BOX).network.shapes.items()
+    }
     weights |= {"layers.0.bias": np.zeros(16, "f"), "layers.1.bias": np.array([0, -20.3], "f")}
     weights |= {"log_std": np.zeros(2, "f"), "observation.mean": np.array([1, 2, 3], "f"),
                 "observation.scale": np.array([2, 0.1, 1], "f")}  # fmt: skip
     seen = np.array([[1.5, 5, 3]], np.float32)
-    policy = NetworkPolicy(weights, BOX)
+    policy = policy_of(weights, BOX)
     np.testing.assert_allclose(policy.output(seen), [[20.8, 0.5]], rtol=1e-5)
     assert seen.tolist() == [[1.5, 5, 3]]
-    squashed = NetworkPolicy(weights, BOX, squash=True)
+    squashed = policy_of({k: w for k, w in weights.items() if k != "log_std"}, BOX, squash=True)
     np.testing.assert_allclose(squashed.output(seen), [[1, np.tanh(0.5)]], rtol=1e-5)
 
 
 def test_gaussian_sampling_has_the_mean_and_deviation_of_the_policy() -> None:
-    network = actor(BOX)
-    policy = NetworkPolicy(network.weights.arrays, BOX)
+    policy = random_policy(BOX)
     observation = np.ones((1, 3), np.float32)
     noise = policy.draw_noise(np.random.default_rng(0), 40_000)
     drawn = policy.sample(np.repeat(observation, 40_000, axis=0), noise)
-    assert network.log_std is not None
-    std = np.exp(network.log_std)
+    std = np.exp(policy.arrays()["log_std"])
     mean = policy.output(observation)[0]
     np.testing.assert_allclose(drawn.mean(0), mean, atol=5 * std.max() / 200)
     np.testing.assert_allclose(drawn.std(0), std, rtol=0.02)
@@ -85,12 +78,11 @@ def test_gaussian_sampling_has_the_mean_and_deviation_of_the_policy() -> None:
 
 
 def test_categorical_sampling_has_the_probabilities_of_the_policy() -> None:
-    network = actor(CHOICE)
-    policy = NetworkPolicy(network.weights.arrays, CHOICE)
+    policy = random_policy(CHOICE)
     noise = policy.draw_noise(np.random.default_rng(0), 40_000)
     drawn = policy.sample(np.zeros((40_000, 3), np.float32), noise)
     counts = np.bincount(drawn[:, 0].astype(int), minlength=3)
-    shares = np.exp(network.net.forward(np.zeros((1, 3), np.float32))[0])
+    shares = np.exp(policy.output(np.zeros((1, 3), np.float32))[0])
     expected = shares / shares.sum()
     np.testing.assert_allclose(counts / 40_000, expected, atol=0.012)
     envs = policy.actions.to_envs(drawn)
@@ -129,7 +121,7 @@ def test_observations_of_many_arrays_are_joined_in_the_order_of_the_spec() -> No
 
 
 def test_weights_that_do_not_fit_are_refused() -> None:
-    weights = actor(BOX).weights.arrays
+    weights = random_policy(BOX).arrays()
     for wrong in (
         {k: v for k, v in weights.items() if k != "log_std"},
         {**weights, "log_std": np.zeros(3, np.float32)},
@@ -140,13 +132,12 @@ def test_weights_that_do_not_fit_are_refused() -> None:
         {},
     ):
         with pytest.raises(InputError, match="policy: expected weights of shapes"):
-            NetworkPolicy(wrong, BOX)
+            NetworkPolicy.load(wrong, BOX, Config())
 
 
 def test_the_first_policy_holds_the_thrust() -> None:
-    network = actor(BOX)
-    network.initialise(np.random.default_rng(0), -0.5)
-    policy = NetworkPolicy(network.weights.arrays, BOX)
+    policy = random_policy(BOX)
+    policy.initialise(np.random.default_rng(0), -0.5)
     assert np.abs(policy.act(np.array([3, 5, 1], np.float32))).max() < 0.1
 
 

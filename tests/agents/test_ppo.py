@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from rotorgram.agents import EpisodeLog, PPOConfig, load, make_agent
-from rotorgram.agents.networks import clip_norm
+from rotorgram.agents import EpisodeLog, PPOConfig, find_preset, load, make_agent
+from rotorgram.agents.optimizers import clip_norm
 from rotorgram.agents.ppo import PPO
-from rotorgram.agents.presets import find_preset
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.models.errors import InputError
 from test_learning import (
@@ -30,7 +29,7 @@ SMALL = PPOConfig(gamma=0.5, gae_lambda=0.5, steps_per_update=3, epochs=1, minib
 
 def filled(config: PPOConfig, actor: float = 0.0, critic: float = 0.0, seed: int = 0) -> PPO:
     """A linear critic V(s) = critic · s of one unit; an actor of constant weights."""
-    agent = PPO(log_of(), config, seed)
+    agent = PPO.create(log_of(), config, seed)
     for part, value in (("actor.", actor), ("critic.", critic)):
         for name, array in agent.weights.part(part).arrays.items():
             array[...] = value if name.endswith("weight") else 0.0
@@ -78,7 +77,7 @@ def columns(count: int) -> tuple[np.ndarray, ...]:
 
 
 def test_gradients_are_those_of_torch() -> None:
-    agent = PPO(log_of(), PPOConfig(ent_coef=0.03, vf_coef=0.7, clip=0.3), 0)
+    agent = PPO.create(log_of(), PPOConfig(ent_coef=0.03, vf_coef=0.7, clip=0.3), 0)
     agent.weights.values[:] += np.random.default_rng(0).normal(size=agent.weights.values.size) / 3
     seen, actions, before, advantage, targets = columns(40)
     before = before / 3 - 1.2  # near the log-probabilities
@@ -103,7 +102,7 @@ def test_gradients_are_those_of_torch() -> None:
 
 def test_rates_of_actor_and_critic() -> None:
     """Adam's first step is the rate, whatever the gradient."""
-    agent = PPO(log_of(), replace(SMALL, learning_rate=0.01, critic_learning_rate=0.03), 0)
+    agent = PPO.create(log_of(), replace(SMALL, learning_rate=0.01, critic_learning_rate=0.03), 0)
     before = {name: array.copy() for name, array in agent.weights.arrays.items()}
     agent.update(rollout())
     for name, array in agent.weights.arrays.items():
@@ -113,7 +112,7 @@ def test_rates_of_actor_and_critic() -> None:
 
 
 def test_every_epoch_takes_every_transition_once() -> None:
-    agent = PPO(log_of(), replace(SMALL, epochs=4, minibatches=3, normalize=False), 0)
+    agent = PPO.create(log_of(), replace(SMALL, epochs=4, minibatches=3, normalize=False), 0)
     taken: list[tuple[np.ndarray, ...]] = []
     minibatch = agent.minibatch
 
@@ -149,7 +148,7 @@ def test_sb3_and_ours_make_the_same_updates_of_the_same_experience() -> None:
     recorder = Recorder(elevation(episode_length=40, flight_band=1.1))
     log = EpisodeLog(recorder, seed=0)
     theirs: Any = make_agent("sb3-ppo", log, config, 0)
-    ours = PPO(log, config, seed=1)
+    ours = PPO.create(log, config, seed=1)
     for here, there in train_both(theirs, ours, recorder, log, 512):
         assert here["train/clip_fraction"] == pytest.approx(there["train/clip_fraction"], abs=0.02)
         assert here["train/value_loss"] == pytest.approx(there["train/value_loss"], rel=2e-3)
@@ -172,7 +171,7 @@ def test_sb3_and_ours_make_the_same_steps_of_the_same_minibatches() -> None:
     env: Any = LocalVectorEnv("rotorgram/Hover-v0", 4, autoreset_mode="Disabled")
     log = EpisodeLog(env, seed=0)
     theirs: Any = make_agent("sb3-ppo", log, config, 0)
-    ours = PPO(log, config, seed=1)
+    ours = PPO.create(log, config, seed=1)
     copy_weights(theirs, ours)
     get, parts = theirs.model.rollout_buffer.get, []
 
@@ -211,11 +210,12 @@ def test_the_tuned_preset_depends_on_the_task() -> None:
     assert find_preset("sb3-ppo", "tuned", "rotorgram/Hover-v0") == hover
     racing = find_preset("ppo", "tuned", "rotorgram/Racing-v0")
     assert (racing.num_envs, racing.backend, racing.config.hidden) == (512, "rigid", (64, 64))
-    assert find_preset("ppo", "tuned", "other/Task-v0") == ours
+    assert find_preset("ppo", "tuned", "other/Task-v0") == replace(ours, fits=False)
     swarm = find_preset("ippo", "tuned", "rotorgram/Formation-v0")
     assert swarm.config.rollout_size(swarm.num_envs) == swarm.num_envs * 512  # a whole episode
     for algorithm in ("ppo", "mappo", "sb3-ppo"):
-        assert find_preset(algorithm, "tuned", "rotorgram/Crossing-v0") == swarm
+        crossing = find_preset(algorithm, "tuned", "rotorgram/Crossing-v0")
+        assert crossing == replace(swarm, env_id="rotorgram/Crossing-v0")
     with pytest.raises(InputError, match="preset: expected tuned for ppo, got 'paper'"):
         find_preset("ppo", "paper")
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from nets import mlp_of
 from rotorgram.agents import (
     Checkpoint,
     EpisodeLog,
@@ -18,7 +19,6 @@ from rotorgram.agents import (
     resume_agent,
     store,
 )
-from rotorgram.agents.networks import Weights, mlp_shapes
 from rotorgram.agents.rollouts import Rollout
 from rotorgram.agents.sac import SAC, ReplayBuffer, SquashedActor
 from rotorgram.agents.sb3 import SB3Agent
@@ -37,9 +37,16 @@ def normal(*shape: int, seed: int = 0) -> np.ndarray:
 
 
 def squashed(activation: str = "tanh") -> SquashedActor:
-    weights = Weights.zeros(mlp_shapes((N, 8, 7, 2 * K)))
-    weights.values[:] = 0.4 * normal(weights.values.size)
-    return SquashedActor(weights, activation)
+    return actor_of((N, 8, 7, 2 * K), activation, 0.4)
+
+
+def actor_of(sizes: tuple[int, ...], activation: str = "relu", size: float = 0.0) -> SquashedActor:
+    """Of random weights of such a size."""
+    network, weights = mlp_of(sizes, activation)
+    weights.values[:] = size * normal(weights.values.size)
+    actor = SquashedActor(network)
+    actor.bind(weights)
+    return actor
 
 
 def agent_of(**changes: Any) -> SAC:
@@ -57,7 +64,7 @@ def batch_of(size: int = BATCH) -> tuple[np.ndarray, ...]:
 
 def test_log_probability_of_a_squashed_gaussian_by_hand() -> None:
     """Mean 0.5, σ 1, noise 0.3: u = 0.8, log N = -0.963939, log(1 - tanh² 0.8) = -0.581507."""
-    actor = SquashedActor(Weights.zeros(mlp_shapes((1, 1, 2))), "relu")
+    actor = actor_of((1, 1, 2))
     actor.weights.arrays["layers.1.bias"][:] = 0.5, 0.0
     actions, logs = actor.draw(np.ones((1, 1), np.float32), np.array([[0.3]], np.float32))
     assert actions[0, 0] == pytest.approx(0.6640368, rel=1e-6)
@@ -123,7 +130,7 @@ def test_gradients_of_the_actor_are_finite_differences() -> None:
 
 
 def test_a_deviation_at_its_limit_has_no_gradient() -> None:
-    actor = SquashedActor(Weights.zeros(mlp_shapes((1, 1, 2))), "relu")
+    actor = actor_of((1, 1, 2))
     bias = actor.weights.arrays["layers.1.bias"]
     for log_std, wanted in ((3.0, 2.0), (-25.0, -20.0)):
         bias[:] = 0.0, log_std
@@ -355,7 +362,7 @@ def test_a_checkpoint_of_another_buffer_is_refused() -> None:
 def test_the_policy_is_the_mean_of_the_actor() -> None:
     agent, seen = agent_of(), normal(5, N)
     agent.weights.values[:] = normal(agent.weights.values.size)
-    actor = SquashedActor(agent.weights.part("actor."), "relu")
+    actor = agent._actor
     expected, _ = actor.draw(seen, np.zeros((5, K), np.float32))
     np.testing.assert_allclose(agent.policy().output(seen), expected, atol=1e-6)
     assert abs(expected).max() <= 1
@@ -370,9 +377,9 @@ def test_choices_are_refused(algorithm: str) -> None:
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"tau": 0.0}, "tau: expected a number above 0, to 1, got 0.0"),
-        ({"gradient_steps": 0}, "gradient_steps: expected a whole number, 1 or more, got 0"),
-        ({"target_entropy": "auto"}, "target_entropy: expected a number, or null"),
+        ({"tau": 0.0}, "tau: expected a number above 0, at most 1, got 0.0"),
+        ({"gradient_steps": 0}, "gradient_steps: expected a whole number of at least 1, got 0"),
+        ({"target_entropy": "auto"}, "target_entropy: expected a number, or none"),
         ({"buffer_size": 50}, "buffer_size: expected learning_starts (1000) or more, got 50"),
     ],
 )

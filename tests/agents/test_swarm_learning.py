@@ -1,5 +1,6 @@
 """Learning with several drones in a world: who counts, what the critic sees, and resuming."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,8 @@ def log_of(worlds: int = 1, drones: int = 2, seed: int = 0, **options: Any) -> E
 class Climbers:
     """A policy of which every second drone, from the first on, climbs; the others hover."""
 
+    network = SimpleNamespace(memory=0)
+
     def draw_noise(self, rng: np.random.Generator, steps: int) -> np.ndarray:
         return np.zeros((steps, 1), np.float32)
 
@@ -33,7 +36,7 @@ class Climbers:
 
 def flown(log: EpisodeLog, count: int) -> Rollout:
     policy: Any = Climbers()
-    return Collector(log, np.random.default_rng(0)).steps(policy, count)
+    return Collector(log, np.random.default_rng(0), policy).steps(count)
 
 
 def test_one_that_is_out_flies_no_env_step() -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import rotorgram.envs
 import rotorgram.udp
+from nets import policy_of
 from rotorgram.agents import (
     EpisodeLog,
     NetworkPolicy,
@@ -46,12 +47,12 @@ def policy(log: EpisodeLog) -> NetworkPolicy:
               "layers.1.weight": (log.actions.outputs, 16)}  # fmt: skip
     weights = {k: 0.3 * dice.normal(size=s).astype(np.float32) for k, s in shapes.items()}
     zeros = np.zeros(log.actions.outputs, np.float32)
-    return NetworkPolicy({**weights, "layers.1.bias": zeros, "log_std": zeros}, log.spec)
+    return policy_of({**weights, "layers.1.bias": zeros, "log_std": zeros}, log.spec)
 
 
-def collector_of(drones: int, **options: Any) -> tuple[EpisodeLog, Collector, NetworkPolicy]:
+def collector_of(drones: int, **options: Any) -> tuple[EpisodeLog, Collector]:
     log = EpisodeLog(vector(drones, **options), 0)
-    return log, Collector(log, np.random.default_rng(0)), policy(log)
+    return log, Collector(log, np.random.default_rng(0), policy(log))
 
 
 def random_actions(dice: np.random.Generator, drones: int = N) -> np.ndarray:
@@ -209,8 +210,8 @@ def test_a_simulator_lost_while_others_begin() -> None:
 
 @pytest.mark.parametrize("drones", [1, N])
 def test_a_rollout_keeps_final_observations_and_goes_on(drones: int) -> None:
-    log, collector, flown_by = collector_of(drones)
-    rollouts = [collector.steps(flown_by, 20 * drones - drones // 2) for _ in range(3)]
+    log, collector = collector_of(drones)
+    rollouts = [collector.steps(20 * drones - drones // 2) for _ in range(3)]
     assert sum(map(len, rollouts)) == log.env_steps
     observations, after, ends, kept = (
         np.concatenate([getattr(rollout, name) for rollout in rollouts])
@@ -229,9 +230,9 @@ def test_a_rollout_keeps_final_observations_and_goes_on(drones: int) -> None:
 
 @pytest.mark.parametrize("drones", [1, N])
 def test_whole_episodes_of_every_drone(drones: int) -> None:
-    log, collector, flown_by = collector_of(drones)
+    log, collector = collector_of(drones)
     for number in range(1, 4):
-        rollout = collector.episodes(flown_by, drones + 1, 10**6)
+        rollout = collector.episodes(drones + 1, 10**6)
         assert ((rollout.terminated | rollout.truncated) & rollout.kept).sum() == 2 * drones
         assert len(log.episodes) == 2 * drones * number
         assert len(rollout) == sum(e.length for e in log.episodes[-2 * drones :])
@@ -241,8 +242,8 @@ def test_whole_episodes_of_every_drone(drones: int) -> None:
 def test_episodes_are_broken_off_where_the_training_ends() -> None:
     """A part of an episode is not learnt from, but it was flown; a single drone keeps its last."""
     for drones, learnt, flown in ((N, 0, 25), (1, 23, 23)):
-        log, collector, flown_by = collector_of(drones, flight_band=3.0)
-        rollout = collector.episodes(flown_by, 1, 23)
+        log, collector = collector_of(drones, flight_band=3.0)
+        rollout = collector.episodes(1, 23)
         assert (len(rollout), log.env_steps) == (learnt, flown)
 
 
@@ -252,7 +253,7 @@ def test_episodes_are_broken_off_where_the_training_ends() -> None:
 def test_many_numbers_to_see_and_to_act() -> None:
     """Hover-v0 has four actions; the log knows its metric by name."""
     log = EpisodeLog(gym.make("rotorgram/Hover-v0", episode_length=20), 0, keep_steps=True)
-    rollout = Collector(log, np.random.default_rng(0)).steps(policy(log), 50)
+    rollout = Collector(log, np.random.default_rng(0), policy(log)).steps(50)
     assert rollout.actions.shape == (50, 1, 4)
     assert log.episodes
     steps = log.steps()

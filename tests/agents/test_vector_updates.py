@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from rotorgram.agents import A2CConfig, VPGConfig, make_agent
 from rotorgram.agents.a2c import A2C
-from rotorgram.agents.policies import NetworkPolicy
 from rotorgram.agents.rollouts import Collector, Rollout
 from rotorgram.agents.vpg import VPG
 from scripted import CALM, LOSSES, Row, Script, Scripted, log_of
@@ -292,12 +291,11 @@ def test_updates_are_those_by_hand(
         assert abs(noise).max() > 2
 
 
-def collector_of(script: Script) -> tuple[Any, Collector, NetworkPolicy]:
+def collector_of(script: Script) -> tuple[Any, Collector]:
     """Reward 1 with every step, whatever is done."""
     log = log_of(Scripted(script, reward=1.0))
     agent: Any = make_agent("a2c", log, A2CConfig(), 0)
-    collector = Collector(log, np.random.default_rng(0))
-    return log, collector, agent.policy()
+    return log, Collector(log, np.random.default_rng(0), agent.policy())
 
 
 LOST_THIRD: Script = [[(20, "limit")], [(20, "limit")], [(3, "lost"), (20, "limit")]]
@@ -306,18 +304,18 @@ LOST_THIRD: Script = [[(20, "limit")], [(20, "limit")], [(3, "lost"), (20, "limi
 @pytest.mark.parametrize("script", [LOST_THIRD, LOST_THIRD[2:]], ids=["many", "one"])
 def test_a_lost_simulator_teaches_nothing(script: Script) -> None:
     """A reward of 1 for ever, gamma 0.98: V = 50, and no action is better than another."""
-    log, collector, policy = collector_of(script)
+    log, collector = collector_of(script)
     config: Any = VPGConfig(gamma=0.98, baseline="time", normalize=True, episodes_per_update=3)
-    rollout = collector.episodes(policy, len(script), 1000)
+    rollout = collector.episodes(len(script), 1000)
     assert len(rollout) == 20 * max(1, len(script) - 1)
     assert log.env_steps == len(rollout) + 3
-    np.testing.assert_allclose(VPG(log, config, 0).returns(rollout), 0, atol=1e-6)
+    np.testing.assert_allclose(VPG.create(log, config, 0).returns(rollout), 0, atol=1e-6)
 
-    log, collector, policy = collector_of(script)
-    agent: Any = A2C(log, A2CConfig(gamma=0.98, gae_lambda=0.98), 0)
+    log, collector = collector_of(script)
+    agent: Any = A2C.create(log, A2CConfig(gamma=0.98, gae_lambda=0.98), 0)
     agent.weights.arrays["critic.layers.1.weight"][:] = 0
     agent.weights.arrays["critic.layers.1.bias"][:] = 50
-    rollout = collector.steps(policy, 10 * len(script))
+    rollout = collector.steps(10 * len(script))
     left = rollout.rows(agent.advantages(rollout)[0])
     np.testing.assert_allclose(left, 0, atol=1e-4)
     assert log.env_steps == 10 * len(script) - (len(script) > 1)  # of many, one begins instead
@@ -327,24 +325,24 @@ def test_a_lost_simulator_teaches_nothing(script: Script) -> None:
 
 
 def test_an_end_before_a_loss_stays_what_it_was() -> None:
-    _, collector, policy = collector_of([[(2, "end"), (1, "lost"), (20, "limit")]])
-    rollout = collector.steps(policy, 6)
+    _, collector = collector_of([[(2, "end"), (1, "lost"), (20, "limit")]])
+    rollout = collector.steps(6)
     assert rollout.rows(rollout.terminated).tolist() == [False, True, False, False, False]
     assert not rollout.rows(rollout.truncated).any()
 
 
 def test_lost_steps_count_as_flown() -> None:
     """A round of 20, 20 and 3 steps, and the second breaks off after 6 more."""
-    log, collector, policy = collector_of(LOST_THIRD)
-    assert (len(collector.episodes(policy, 6, 49)), log.env_steps) == (40, 49)
+    log, collector = collector_of(LOST_THIRD)
+    assert (len(collector.episodes(6, 49)), log.env_steps) == (40, 49)
 
 
 def test_parts_of_episodes_teach_nothing() -> None:
     """Two drones, two rounds of 20 steps, and 42 left to fly: the second round breaks off."""
-    log, collector, policy = collector_of([[(20, "limit")]] * 2)
-    rollout = collector.episodes(policy, 4, 42)
+    log, collector = collector_of([[(20, "limit")]] * 2)
+    rollout = collector.episodes(4, 42)
     assert (len(rollout), log.env_steps) == (40, 42)
     config: Any = VPGConfig(gamma=0.98, baseline="time", normalize=True, episodes_per_update=4)
-    np.testing.assert_allclose(VPG(log, config, 0).returns(rollout), 0, atol=1e-6)
-    log, collector, policy = collector_of([[(20, "limit")]] * 2)
-    assert (len(collector.episodes(policy, 2, 38)), log.env_steps) == (0, 38)
+    np.testing.assert_allclose(VPG.create(log, config, 0).returns(rollout), 0, atol=1e-6)
+    log, collector = collector_of([[(20, "limit")]] * 2)
+    assert (len(collector.episodes(2, 38)), log.env_steps) == (0, 38)

@@ -1,0 +1,56 @@
+"""Hyperparameters that all algorithms have."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Final, Literal
+
+from ..models.fields import Limits, check_fields
+
+NETWORK_FIELDS: Final = ("network", "hidden", "activation", "normalize_observations")
+"""Hyperparameters that say what networks there are."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """Base of the hyperparameters of every algorithm. Raises `InputError` for a wrong one."""
+
+    network: str = "mlp"
+    """Kind of the networks: see `networks.NETWORKS`."""
+    hidden: Annotated[tuple[int, ...], Limits(1, whole=True, count=None)] = (16,)
+    """Units of each hidden layer of each network (paper: one of 16). A number is one layer."""
+    activation: Literal["relu", "tanh"] = "relu"
+    """Of the hidden units (paper: relu)."""
+    learning_rate: Annotated[float, Limits(0.0, 1e30, above=True)] = 0.001
+    """Of Adam (paper)."""
+    anneal: bool = False
+    """Lower the learning rate linearly to zero over the run."""
+    gamma: Annotated[float, Limits(0.0, 1.0)] = 0.99
+    """Discount. The paper names none."""
+    log_std: Annotated[float, Limits(-4.0, 1.0)] = -0.5
+    """Initial logarithm of the policy's standard deviation, in units of the action."""
+    normalize_observations: bool = False
+    """Shift and scale observations to mean 0 and standard deviation 1 of all rollouts before."""
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.hidden, Sequence):
+            object.__setattr__(self, "hidden", (self.hidden,))
+        check_fields(self)
+
+    def least_steps(self, drones: int, episode_length: int) -> int:
+        """Env steps that a training needs for one update, with all drones together."""
+        return 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class RolloutConfig(Config):
+    """Hyperparameters of an algorithm with rollouts of a fixed size."""
+
+    steps_per_update: Annotated[int, Limits(1, whole=True)] = 1
+    """Env steps between updates (paper: one), of all drones together."""
+
+    def rollout_size(self, drones: int) -> int:
+        """Env steps of a rollout: `steps_per_update`, rounded up to whole steps of all drones."""
+        return -(-self.steps_per_update // drones) * drones
+
+    def least_steps(self, drones: int, episode_length: int) -> int:
+        return self.rollout_size(drones)

@@ -1,0 +1,125 @@
+"""Heads: from the outputs of a network to distributions of actions, and their derivatives."""
+
+import math
+from typing import Final, Protocol
+
+import numpy as np
+
+from .networks import Floats, Shapes, Weights
+
+_LOG_STD: Final = np.array([-4.0, 1.0], np.float32)
+"""Least and greatest logarithm of a standard deviation."""
+
+
+class Head(Protocol):
+    """A distribution of actions (B, k), or (B, 1) of choices, by a network's outputs."""
+
+    shapes: Shapes
+    """Of its own weights, by name."""
+
+    def bind(self, weights: Weights) -> None:
+        """Compute with these arrays from now on."""
+
+    def initialise(self, log_std: float) -> None:
+        """Set the weights."""
+
+    def noise(self, rng: np.random.Generator, steps: int) -> Floats:
+        """Randomness for so many rows of `sample`, drawn at once: shape (steps, k)."""
+
+    def sample(self, output: Floats, noise: Floats) -> Floats:
+        """Actions, not clipped, from outputs and rows of `noise`; in the memory of the outputs."""
+
+    def score(self, output: Floats, actions: Floats) -> tuple[Floats, float]:
+        """Log-probabilities, shape (B,), and the mean entropy."""
+
+    def back(self, by_log_probability: Floats, by_entropy: float) -> Floats:
+        """Derivatives of a loss by the outputs, from those by what `score` gave last.
+
+        Sets the gradients of its own weights.
+        """
+
+    def clamp(self) -> None:
+        """Keep its weights where they are sensible."""
+
+
+class Gaussian:
+    """The outputs are means; the standard deviation is a weight, the same in every state."""
+
+    def __init__(self, size: int) -> None:
+        self.shapes: Shapes = {"log_std": (size,)}
+
+    def bind(self, weights: Weights) -> None:
+        self.log_std, self._by_log_std = weights.arrays["log_std"], weights.gradients["log_std"]
+
+    def initialise(self, log_std: float) -> None:
+        self.log_std[...] = log_std
+
+    def noise(self, rng: np.random.Generator, steps: int) -> Floats:
+        noise = rng.standard_normal((steps, self.log_std.size), dtype=np.float32)
+        noise *= np.exp(self.log_std)
+        return noise
+
+    def sample(self, output: Floats, noise: Floats) -> Floats:
+        output += noise
+        return output
+
+    def score(self, output: Floats, actions: Floats) -> tuple[Floats, float]:
+        self._inverse = np.exp(-self.log_std)
+        self._noise = (actions - output) * self._inverse
+        self._squares = self._noise * self._noise
+        size = self.log_std.size
+        constant = 0.5 * size * math.log(2 * math.pi) + float(self.log_std.sum())
+        halves = np.full(size, -0.5, np.float32)
+        return self._squares.dot(halves) - constant, constant + 0.5 * size
+
+    def back(self, by_log_probability: Floats, by_entropy: float) -> Floats:
+        self._by_log_std[...] = by_log_probability.dot(self._squares - 1) + by_entropy
+        slope: Floats = by_log_probability[:, np.newaxis] * (self._noise * self._inverse)
+        return slope
+
+    def clamp(self) -> None:
+        """Keep the standard deviation between e^-4 and e."""
+        np.clip(self.log_std, *_LOG_STD, out=self.log_std)
+
+
+class Categorical:
+    """The outputs are logits of choices."""
+
+    def __init__(self, size: int) -> None:
+        self.shapes: Shapes = {}
+        self._size = size
+
+    def bind(self, weights: Weights) -> None:
+        """It has no weights."""
+
+    def initialise(self, log_std: float) -> None:
+        """It has no weights."""
+
+    def noise(self, rng: np.random.Generator, steps: int) -> Floats:
+        # The Gumbel trick: the largest of logits plus Gumbel noise is a categorical draw.
+        return rng.gumbel(size=(steps, self._size)).astype(np.float32)
+
+    def sample(self, output: Floats, noise: Floats) -> Floats:
+        output += noise
+        chosen: Floats = output.argmax(axis=1)[:, np.newaxis].astype(np.float32)
+        return chosen
+
+    def score(self, output: Floats, actions: Floats) -> tuple[Floats, float]:
+        output -= output.max(axis=1, keepdims=True)
+        self._shares = np.exp(output)
+        total = self._shares.sum(axis=1, keepdims=True)
+        output -= np.log(total)
+        self._shares /= total
+        self._logs = output
+        self._entropy = -(self._shares * output).sum(axis=1, keepdims=True)
+        self._chosen = np.arange(len(output)), actions[:, 0].astype(int)
+        return output[self._chosen], float(self._entropy.mean())
+
+    def back(self, by_log_probability: Floats, by_entropy: float) -> Floats:
+        slope: Floats = -by_log_probability[:, np.newaxis] * self._shares
+        slope[self._chosen] += by_log_probability
+        slope -= by_entropy / len(slope) * self._shares * (self._logs + self._entropy)
+        return slope
+
+    def clamp(self) -> None:
+        """It has no weights."""

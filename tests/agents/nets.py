@@ -1,0 +1,58 @@
+"""Networks and policies of chosen numbers."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from rotorgram.agents.config import Config
+from rotorgram.agents.networks import MLP, Network, Weights
+from rotorgram.agents.policies import NetworkPolicy
+from rotorgram.envs.spec import EnvSpec
+
+
+def config_of(hidden: tuple[int, ...], activation: str, *, normalise: bool = False) -> Config:
+    """With any number of hidden layers, none too."""
+    config = Config(activation=activation, normalize_observations=normalise)  # type: ignore[arg-type]
+    object.__setattr__(config, "hidden", hidden)
+    return config
+
+
+def bound(network: Network, values: np.ndarray | float = 0.0) -> Weights:
+    """The weights of a network, all of these values."""
+    weights = Weights.zeros(network.shapes)
+    weights.values[:] = values
+    network.bind(weights)
+    return weights
+
+
+def mlp_of(
+    sizes: tuple[int, ...], activation: str = "relu", values: np.ndarray | float = 0.0
+) -> tuple[MLP, Weights]:
+    """An MLP of so many inputs, units and outputs."""
+    inputs, *hidden, outputs = sizes
+    network = MLP(inputs, outputs, config_of(tuple(hidden), activation))
+    return network, bound(network, values)
+
+
+def policy_of(
+    weights: Mapping[str, np.ndarray],
+    spec: EnvSpec,
+    activation: str = "relu",
+    *,
+    squash: bool = False,
+) -> NetworkPolicy:
+    """The policy of an MLP with as many layers and units as the weights have."""
+    last = sum(name.startswith("layers.") for name in weights) // 2 - 1
+    hidden = tuple(weights[f"layers.{i}.bias"].shape[0] for i in range(last))
+    config = config_of(hidden, activation, normalise="observation.mean" in weights)
+    return NetworkPolicy.load(weights, spec, config, squash=squash)
+
+
+def random_policy(
+    spec: EnvSpec, hidden: tuple[int, ...] = (16,), activation: str = "relu", size: float = 1.0
+) -> NetworkPolicy:
+    """A policy of random weights of such a size."""
+    policy = NetworkPolicy(spec, config_of(hidden, activation))
+    weights = Weights.zeros(policy.shapes)
+    weights.values[:] = size * np.random.default_rng(3).normal(size=weights.values.size)
+    policy.bind(weights)
+    return policy

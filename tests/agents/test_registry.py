@@ -1,0 +1,184 @@
+"""An algorithm is a module and a row; a network is a class and a row; a preset is inherited."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import pytest
+from rotorgram.agents import A2CConfig, Config, EpisodeLog, find_preset, load, make_agent, store
+from rotorgram.agents.a2c import A2C
+from rotorgram.agents.networks import NETWORKS, Affine, Floats, Layer, Network, Tanh
+from rotorgram.agents.registry import ALGORITHMS, Algorithm
+from rotorgram.agents.rollouts import Collector
+from rotorgram.cli import main
+from rotorgram.envs import LocalVectorEnv, register
+from rotorgram.envs.tasks.hover import Hover
+from rotorgram.flights.palette import agent_label
+from rotorgram.models.errors import InputError
+from rotorgram.models.fields import Limits
+from rotorgram.training.settings import Run
+from rotorgram.training.training import Training
+
+ENV = "rotorgram/Elevation-v0"
+OPTIONS: dict[str, Any] = {"episode_length": 12, "start_band": 0.3, "flight_band": 0.4}
+M = 5
+
+
+def vector(drones: int = 4) -> LocalVectorEnv:
+    return LocalVectorEnv(ENV, drones, autoreset_mode="Disabled", **OPTIONS)
+
+
+# ---- a row for an algorithm
+
+
+@dataclass(frozen=True, kw_only=True)
+class SlowConfig(A2CConfig):
+    slower: Annotated[float, Limits(0.0, 1.0)] = 0.5
+
+
+class Slow(A2C):
+    """A2C with smaller steps."""
+
+    config: SlowConfig
+
+    def update(self, rollout: Any) -> None:
+        self.rate = self.config.learning_rate * self.config.slower
+        super().update(rollout)
+
+
+def run_of(algorithm: str, config: Config) -> Run:
+    return Run(
+        algorithm=algorithm, config=config, seed=3, env_steps=240, num_envs=4, options=OPTIONS
+    )
+
+
+def stopped_and_resumed(run: Run, path: Path) -> tuple[Training, Training]:
+    """A training without a break, and one that was stored after two updates and went on."""
+    whole, part = Training(run, vector()), Training(run, vector())
+    assert whole.train()
+    updates = iter([True])
+    assert not part.train(lambda: next(updates, False))
+    store(part.checkpoint(), path)
+    resumed = Training.resume(load(path), vector())
+    assert 0 < resumed.log.env_steps < 240
+    assert resumed.train()
+    return whole, resumed
+
+
+def test_a_new_algorithm_is_one_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(ALGORITHMS, "slow", Algorithm("Slow A2C", SlowConfig, Slow))
+    assert agent_label("slow") == "Slow A2C"
+    preset = find_preset("slow", "tuned")
+    assert (preset.config, preset.fits) == (SlowConfig(), False)
+    run = run_of("slow", SlowConfig(steps_per_update=48))
+    whole, resumed = stopped_and_resumed(run, tmp_path / "c")
+    for name, array in whole.agent.state().items():
+        assert resumed.agent.state()[name].tobytes() == array.tobytes(), name
+
+
+# ---- a row for a network
+
+
+class Recurrent(Network):
+    """One layer of tanh units, which see what they gave a step before."""
+
+    memory = M
+
+    def build(self, inputs: int, outputs: int, config: Config) -> Sequence[Layer]:
+        return [Affine(inputs + M, M), Tanh(), Affine(M, outputs)]
+
+    def forward(self, inputs: Floats) -> Floats:
+        first, bend, last = self.layers
+        self.remembered = bend.forward(first.forward(inputs))
+        return last.forward(self.remembered)
+
+
+@pytest.mark.parametrize("algorithm", ["vpg", "a2c", "ppo"])
+def test_a_network_of_one_s_own_trains_resumes_and_loads(
+    algorithm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(NETWORKS, "recurrent", Recurrent)
+    sizes = {"episodes_per_update": 4} if algorithm == "vpg" else {"steps_per_update": 48}
+    config = ALGORITHMS[algorithm].config(
+        network="recurrent", normalize_observations=True, learning_rate=0.01, **sizes
+    )
+    whole, resumed = stopped_and_resumed(run_of(algorithm, config), tmp_path / "c")
+    for name, array in whole.agent.state().items():
+        assert resumed.agent.state()[name].tobytes() == array.tobytes(), name
+    begun = Training(whole.run, vector()).agent.actor()["layers.0.weight"]
+    assert (resumed.agent.actor()["layers.0.weight"] != begun).any()
+
+    policy, same = load(tmp_path / "c").policy(), load(tmp_path / "c").policy()
+    seen = np.array([0.3, -0.1, 0.0], np.float32)
+    first = policy.act(seen)
+    assert policy.act(seen) != first  # it remembers the first time
+    policy.reset()
+    assert policy.act(seen) == same.act(seen) == first
+    monkeypatch.delitem(NETWORKS, "recurrent")
+    with pytest.raises(InputError, match="network: expected one of mlp, got 'recurrent'; import"):
+        load(tmp_path / "c")
+
+
+def test_the_memory_begins_with_an_episode_and_is_kept_with_the_rollout(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(NETWORKS, "recurrent", Recurrent)
+    log = EpisodeLog(vector(3), 0)
+    agent: Any = make_agent("a2c", log, A2CConfig(network="recurrent"), 0)
+    collector = Collector(log, np.random.default_rng(0), agent.policy())
+    rollouts = [collector.steps(60), collector.steps(60)]
+    seen, after, ends, kept = (
+        np.concatenate([getattr(rollout, name) for rollout in rollouts])
+        for name in ("observations", "next_observations", "ends", "kept")
+    )
+    assert seen.shape == (40, 3, 3 + M)
+    began = np.zeros_like(kept)
+    began[0], began[1:] = True, ends[:-1] & kept[1:]
+    assert began[1:].any()
+    assert not seen[began][:, 3:].any()
+    goes_on = kept[1:] & ~began[1:]
+    np.testing.assert_array_equal(seen[1:][goes_on], after[:-1][goes_on])
+    assert (seen[1:][goes_on][:, 3:] != 0).all()
+
+
+@pytest.mark.parametrize("algorithm", ["mappo", "sac", "sb3-ppo"])
+def test_who_takes_no_memory_says_so(algorithm: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(NETWORKS, "recurrent", Recurrent)
+    config = ALGORITHMS[algorithm].config(network="recurrent")
+    with pytest.raises(InputError, match="network: expected "):
+        make_agent(algorithm, EpisodeLog(vector(), 0), config, 0)
+
+
+# ---- presets
+
+
+class Higher(Hover):
+    """Hover, by another name."""
+
+
+def test_a_task_has_the_preset_of_the_task_that_it_derives_from() -> None:
+    register("test/Higher-v0", Higher)
+    own, hover = (
+        find_preset("ppo", "tuned", f"{task}-v0") for task in ("test/Higher", "rotorgram/Hover")
+    )
+    assert own == hover
+    assert (own.env_id, own.fits, own.config.hidden) == ("rotorgram/Hover-v0", True, (64, 64))
+    other = find_preset("ippo", "tuned", "test/Higher-v0")
+    assert (other.env_id, other.fits) == (ENV, False)
+
+
+def test_train_says_where_no_preset_fits(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["train", "ippo", "--env", "rotorgram/Hover-v0", "--env-steps", "1024"]
+    assert main([*words, "--out", str(tmp_path / "a")]) == 0
+    out = capsys.readouterr().out
+    assert "there is no preset of ippo for rotorgram/Hover-v0" in out
+    assert f"it gets that of {ENV}; --preset-of ID names another\n" in out
+    words += ["--preset-of", "rotorgram/Crossing-v0", "--set", "steps_per_update=1024"]
+    assert main([*words, "--out", str(tmp_path / "b")]) == 0
+    assert "note: there is no preset" not in capsys.readouterr().out
+    kept = load(tmp_path / "b" / "checkpoint.safetensors")
+    assert (kept.config["hidden"], kept.num_envs) == ([64, 64], 32)
