@@ -6,7 +6,7 @@ from typing import Any, ClassVar, Final
 import numpy as np
 
 from ..envs.spec import EnvSpec
-from ..models.errors import expect
+from ..models.errors import InputError, expect
 
 ENV_ID: Final = "rotorgram/Elevation-v0"
 GRAVITY: Final = 9.8  # m/s²: the paper's
@@ -33,7 +33,10 @@ class PID:
 
     def __init__(self, spec: EnvSpec) -> None:
         options = spec.options
-        expect(spec.env_id == ENV_ID, "pid", f"the env {ENV_ID}", spec.env_id)
+        if spec.env_id != ENV_ID:
+            raise InputError(
+                f"pid: expected the env {ENV_ID}, got {spec.env_id}, which geometric flies"
+            )
         modes = f"{options['observation']!r} and {options['action_type']!r}"
         expected = "observation='full' and action_type='continuous'"
         expect(modes == "'full' and 'continuous'", "pid", expected, modes)
