@@ -61,7 +61,7 @@ class Render(EnvFlags):
 
     def run(self) -> int:
         """Fly or read, draw, and say where."""
-        from ..flights.filming import Film, Shot, film
+        from ..flights.filming import Film, FilmTrack, film
         from ..rendering.film import check_film
         from ..rendering.gl import offscreen_context
         from ._progress import frame_bar
@@ -74,15 +74,15 @@ class Render(EnvFlags):
         found = [self._find(what) for what in self.what]
         names = self.names or _told_apart([name for _, name, *_ in found], self.what)
         colors = _colors([agent for agent, *_ in found])
-        shots = [
-            Shot(name=name, color=color, trajectories=flown, drones=drones)
+        tracks = [
+            FilmTrack(name=name, color=color, trajectories=flown, drones=drones)
             for name, color, (_, _, flown, drones) in zip(names, colors, found, strict=True)
         ]
-        longest = max(shot.trajectories[0].seconds for shot in shots)
+        longest = max(track.trajectories[0].seconds for track in tracks)
         right, end = self.at is None or self.at <= longest, f"{longest:g} s, the flight's end"
         expect(right, "at", f"0 to {end}", f"{self.at or 0:g}")
         with frame_bar(self.out.name) as on_frame:
-            frames = film(self.out, shots, config, on_frame)
+            frames = film(self.out, tracks, config, on_frame)
         pictures = "1 picture" if frames == 1 else f"{frames} pictures"
         print(f"film: {self.out} ({pictures} of {width}x{height})")
         return 0

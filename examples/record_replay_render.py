@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 from rotorgram.agents import PID
-from rotorgram.flights.filming import Film, Shot, film
+from rotorgram.flights.filming import Film, FilmTrack, film
 from rotorgram.flights.recorded import recorded_trajectories
 from rotorgram.flights.trajectories import fly
 from rotorgram.training.pairs import socket_pair
@@ -28,6 +28,6 @@ print(f"return {trajectory.rewards.sum():.1f}: {journal}")
 print(Verification(journal))
 
 # A film needs OpenGL; flying and comparing do not.
-shot = Shot(name="PID", color="#E69F00", trajectories=recorded_trajectories(journal, [0]))
-film(folder / "flight.mp4", [shot], Film(width=640, height=360, camera="side", fast=True))
+track = FilmTrack(name="PID", color="#E69F00", trajectories=recorded_trajectories(journal, [0]))
+film(folder / "flight.mp4", [track], Film(width=640, height=360, camera="side", fast=True))
 print(f"film: {folder / 'flight.mp4'}")

@@ -9,20 +9,23 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..envs.rendering import moment
-from ..models.errors import InputError, expect
+from ..models.errors import InputError
 from ..rendering import Camera, Canvas, MetricValue, Moment, Stage
 from ..rendering.film import QUALITY, Overlay, check_film, graph_scale, write_film
 from ..scenes import parse_scene
 from .distances import least
 from .trajectories import Trajectory
 
+Floats = NDArray[np.float64]
+Picture = NDArray[np.uint8]
 OnFrame = Callable[[int, int], object]
 """Called with frames drawn, and frames in all."""
 
-MOST_FRAMES: Final = 1_000_000
-"""Of a film: 11 hours of it."""
+MAX_FRAMES: Final = 1_000_000
+"""Largest number of frames of a film: 11 hours of it."""
 _SPACE: Final = 2  # pixels between panes
 _DARK: Final = (13, 18, 26)
 _ASPECT: Final = 1.2  # of a pane that shows a craft and its graph well
@@ -31,31 +34,32 @@ _ASPECT: Final = 1.2  # of a pane that shows a craft and its graph well
 def moments(trajectory: Trajectory) -> list[Moment]:
     """The moments of a trajectory: its start, and after each control step.
 
-    Raises `InputError` if its telemetry does not tell where the craft is.
+    Raises `InputError` if its telemetry lacks position, attitude or thrust.
     """
-    told, spec = trajectory.telemetry, trajectory.spec
-    if missing := ", ".join(sorted({"position", "attitude", "thrust"} - set(told))):
-        raise InputError(f"pictures: expected telemetry of {missing}, {spec.env_id} tells none")
-    rewards = [0.0, *trajectory.rewards.tolist()]
-    return [
-        moment(spec, {name: array[step] for name, array in told.items()}, step=step,
-               reward=reward, episode=trajectory.episode)
-        for step, reward in enumerate(rewards)
-    ]  # fmt: skip
+    telemetry, spec = trajectory.telemetry, trajectory.spec
+    missing = {"position", "attitude", "thrust"} - set(telemetry)
+    if missing:
+        names = ", ".join(sorted(missing))
+        raise InputError(f"pictures: expected telemetry of {names}, {spec.env_id} has none")
+    found = []
+    for step, reward in enumerate([0.0, *trajectory.rewards.tolist()]):
+        row = {name: array[step] for name, array in telemetry.items()}
+        found.append(moment(spec, row, step=step, reward=reward, episode=trajectory.episode))
+    return found
 
 
 @dataclass(frozen=True, kw_only=True)
-class Shot:
-    """One pane: a name and its trajectories."""
+class FilmTrack:
+    """One pane of a film: a name and its trajectories."""
 
     name: str
     color: str
-    """Of name and curve, "#RRGGBB"."""
+    """Colour of name and curve, "#RRGGBB"."""
     trajectories: list[Trajectory]
-    """One after the other; with several drones those of each episode, in the order of the drones.
+    """Episode after episode; with several drones those of each episode in the order of the drones.
     """
     drones: int = 1
-    """Of the world of each episode."""
+    """Drones of the world of each episode."""
 
     @cached_property
     def episodes(self) -> list[list[Trajectory]]:
@@ -65,31 +69,32 @@ class Shot:
 
     @cached_property
     def moments(self) -> list[list[list[Moment]]]:
-        """Of each episode and drone."""
+        """The moments by episode and drone."""
         return [[moments(one) for one in world] for world in self.episodes]
 
     @cached_property
-    def distances(self) -> list[np.ndarray]:
-        """Of each episode the least distance between two drones after each control step, m, shape
-        (T + 1,). One that has ended stays where it is, as in the pictures.
+    def distances(self) -> list[Floats]:
+        """By episode the least distance between two drones after each control step, m, shape
+        (T + 1,). A drone whose episode has ended stays where it is, as in the pictures.
         """
         found = []
         for world in self.episodes:
-            told, long = [one.telemetry["position"] for one in world], max(map(len, world)) + 1
-            padded = [np.pad(one, ((0, long - len(one)), (0, 0)), "edge") for one in told]
+            longest = max(map(len, world)) + 1
+            positions = [one.pose[:, :3] for one in world]
+            padded = [np.pad(one, ((0, longest - len(one)), (0, 0)), "edge") for one in positions]
             found.append(least(np.stack(padded, axis=1)))
         return found
 
     def panel(self, episode: int, step: int) -> Moment:
-        """What the overlay tells: the first drone, and the least distance if there are others."""
-        told = self.moments[episode][0]
-        own = told[min(step, len(told) - 1)]
+        """Content of the overlay: the first drone, and the least distance if there are others."""
+        flown = self.moments[episode][0]
+        own = flown[min(step, len(flown) - 1)]
         if self.drones == 1:
             return own
         distance = MetricValue("least distance", float(self.distances[episode][step]), "m")
         return replace(own, metrics=(distance, *own.metrics))
 
-    def curve(self, episode: int) -> np.ndarray:
+    def curve(self, episode: int) -> Floats:
         """The overlay's graph: the headline metric; of several drones the least distance, m."""
         if self.drones == 1:
             return self.episodes[episode][0].headline
@@ -129,17 +134,18 @@ class Film:
 
     def __post_init__(self) -> None:
         parse_scene(self.world)
-        expect(0.001 <= self.speed <= 1000, "speed", "0.001 to 1000", f"{self.speed:g}")
-        right = self.at is None or 0 <= self.at < math.inf
-        expect(right, "at", "a time of 0 s or more", f"{self.at or 0:g}")
+        if not 0.001 <= self.speed <= 1000:
+            raise InputError(f"speed: expected 0.001 to 1000, got {self.speed:g}")
+        if self.at is not None and not 0 <= self.at < math.inf:
+            raise InputError(f"at: expected a time of 0 s or more, got {self.at:g}")
 
 
 def film(
-    path: Path, shots: Sequence[Shot], config: Film, on_frame: OnFrame = lambda *_: None
+    path: Path, tracks: Sequence[FilmTrack], config: Film, on_frame: OnFrame = lambda *_: None
 ) -> int:
     """Film trajectories side by side, into a path as of `write_film`; the number of frames written.
 
-    A `.png` is the picture at `config.at`, or the last. There are one or more shots, each with as
+    A `.png` is the picture at `config.at`, or the last. There are one or more tracks, each with as
     many trajectories. An episode lasts until its longest trajectory has ended; one that ended
     before stays on its last picture.
 
@@ -149,31 +155,36 @@ def film(
         OSError: It cannot be written.
     """
     check_film(path, config.width, config.height, config.fps)
-    times = _times(shots, config, still=path.suffix.lower() == ".png")
+    times = _times(tracks, config, still=path.suffix.lower() == ".png")
     # Whatever goes wrong, the OpenGL context is given back here.
-    with closing(_frames(shots, config, times, on_frame)) as frames:
+    with closing(_frames(tracks, config, times, on_frame)) as frames:
         return write_film(path, frames, config.fps, quality=config.quality)
 
 
-def _times(shots: Sequence[Shot], config: Film, *, still: bool) -> list[tuple[int, float]]:
+def _times(tracks: Sequence[FilmTrack], config: Film, *, still: bool) -> list[tuple[int, float]]:
     """Episode and time of flight of every frame, from its start to its end."""
-    counts = {(len(shot.episodes), shot.drones) for shot in shots}
-    right = len(counts) == 1 and min(counts)[0]
-    expect(right, "shots", "one or more, with as many episodes and drones each")
-    episodes = zip(*(shot.episodes for shot in shots), strict=True)
-    lengths = [max(one.seconds for world in flown for one in world) for flown in episodes]
+    counts = {(len(track.episodes), track.drones) for track in tracks}
+    if len(counts) != 1 or not tracks[0].episodes:
+        raise InputError("tracks: expected one or more, with as many episodes and drones each")
+    lengths = []
+    for episode in range(len(tracks[0].episodes)):
+        worlds = [track.episodes[episode] for track in tracks]
+        lengths.append(max(one.seconds for world in worlds for one in world))
     if config.at is not None:
         return [(0, config.at)]
     if still:
         return [(len(lengths) - 1, lengths[-1])]
     step, seconds = config.speed / config.fps, sum(lengths)
-    got = f"{seconds / step:,.0f} for {seconds:,.0f} s of flight; choose a higher speed"
-    expect(seconds / step <= MOST_FRAMES, "film", f"at most {MOST_FRAMES:,} frames", got)
-    return [
-        (episode, number * step)
-        for episode, length in enumerate(lengths)
-        for number in range(int(length / step + 1e-6) + 1)
-    ]
+    if seconds / step > MAX_FRAMES:
+        raise InputError(
+            f"film: expected at most {MAX_FRAMES:,} frames, got {seconds / step:,.0f} "
+            f"for {seconds:,.0f} s of flight; choose a higher speed"
+        )
+    times = []
+    for episode, length in enumerate(lengths):
+        frames = int(length / step + 1e-6) + 1
+        times += [(episode, number * step) for number in range(frames)]
+    return times
 
 
 def grid(count: int, width: int, height: int) -> tuple[int, int]:
@@ -188,65 +199,89 @@ def grid(count: int, width: int, height: int) -> tuple[int, int]:
 
 
 def _frames(
-    shots: Sequence[Shot], config: Film, times: Sequence[tuple[int, float]], on_frame: OnFrame
-) -> Generator[np.ndarray, None, None]:
-    """Frames of uint8, shape (height, width, 3). One canvas of a pane's size serves every pane."""
-    columns, rows = grid(len(shots), config.width, config.height)
+    tracks: Sequence[FilmTrack],
+    config: Film,
+    times: Sequence[tuple[int, float]],
+    on_frame: OnFrame,
+) -> Generator[Picture, None, None]:
+    """Frames, shape (height, width, 3). One canvas of a pane's size serves every pane."""
+    columns, rows = grid(len(tracks), config.width, config.height)
     width = (config.width - _SPACE * (columns - 1)) // columns
     height = (config.height - _SPACE * (rows - 1)) // rows
-    drones = shots[0].drones
-    names = shots[0].trajectories[0].spec.agents if drones > 1 else ()
+    drones = tracks[0].drones
+    names = tracks[0].trajectories[0].spec.agents if drones > 1 else ()
     stage = Stage(config.world, drones, vehicle=config.vehicle, names=names)
     with Canvas(stage, width, height, fast=config.fast) as canvas:
-        panes = [_pane(shot, config, canvas, stage.twin(), shots) for shot in shots]
-        for pane in panes:
-            next(pane)
-        for number, now in enumerate(times, 1):
+        panes = [_Pane(track, config, canvas, stage.twin(), tracks) for track in tracks]
+        for number, (episode, seconds) in enumerate(times, 1):
             frame = np.full((config.height, config.width, 3), _DARK, np.uint8)
             for place, pane in enumerate(panes):
-                x, y = (width + _SPACE) * (place % columns), (height + _SPACE) * (place // columns)
-                frame[y : y + height, x : x + width] = pane.send(now)
+                row, column = divmod(place, columns)
+                x, y = (width + _SPACE) * column, (height + _SPACE) * row
+                frame[y : y + height, x : x + width] = pane.draw(episode, seconds)
             yield frame
             on_frame(number, len(times))
 
 
-def _pane(
-    shot: Shot, config: Film, canvas: Canvas, stage: Stage, shots: Sequence[Shot]
-) -> Generator[np.ndarray, tuple[int, float], None]:
-    """Pictures of one flight, for each episode and time that are sent; drawn where they change."""
-    seconds = max(one.seconds for other in shots for one in other.trajectories)
-    of = stage.names[0] if stage.names else ""
-    scale, named = _scale(shots), len(shots) > 1
-    overlay = Overlay(
-        canvas.width, canvas.height, title=shot.name, color=shot.color, like=shot.panel(0, 0),
-        vehicle=stage.vehicle, period=shot.trajectories[0].spec.control_period, of=of,
-        seconds=seconds, scale=scale, numbers=config.overlay,
-    )  # fmt: skip
-    picture, shown = np.empty(0, np.uint8), (-1, -1)  # episode and step
-    while True:
-        episode, seconds = yield picture
-        world, told = shot.episodes[episode], shot.moments[episode]
-        trajectory = max(world, key=len)  # that of one that flew to the end
-        step = trajectory.step_at(seconds)
-        if (episode, step) == shown:
-            continue
-        begin = shown[1] + 1 if episode == shown[0] else 0
-        for now in range(begin, step + 1):  # paths have no gaps
-            stage.show(*(own[min(now, len(own) - 1)] for own in told))
-        shown = episode, step
-        picture = canvas.draw(config.camera, stage)
-        if config.overlay or named:
-            note = shot.note(episode, step) if config.overlay else ""
-            values = shot.curve(episode)[: step + 1].tolist()
-            picture = overlay.draw(picture, shot.panel(episode, step), values, note)
+class _Pane:
+    """Pictures of one track, drawn where they change."""
+
+    def __init__(
+        self,
+        track: FilmTrack,
+        config: Film,
+        canvas: Canvas,
+        stage: Stage,
+        tracks: Sequence[FilmTrack],
+    ) -> None:
+        self._track, self._config, self._canvas, self._stage = track, config, canvas, stage
+        self._is_named = len(tracks) > 1
+        self._overlay = Overlay(
+            canvas.width,
+            canvas.height,
+            title=track.name,
+            color=track.color,
+            like=track.panel(0, 0),
+            vehicle=stage.vehicle,
+            period=track.trajectories[0].spec.control_period,
+            of=stage.names[0] if stage.names else "",
+            seconds=max(one.seconds for other in tracks for one in other.trajectories),
+            scale=_scale(tracks),
+            numbers=config.overlay,
+        )
+        self._picture: Picture = np.empty(0, np.uint8)
+        self._shown = (-1, -1)  # episode and step
+
+    def draw(self, episode: int, seconds: float) -> Picture:
+        """The picture at a time of an episode."""
+        track, config = self._track, self._config
+        longest = max(track.episodes[episode], key=len)
+        step = longest.step_at(seconds)
+        if (episode, step) == self._shown:
+            return self._picture
+        flown = track.moments[episode]
+        first = self._shown[1] + 1 if episode == self._shown[0] else 0
+        for now in range(first, step + 1):  # paths have no gaps
+            self._stage.show(*(own[min(now, len(own) - 1)] for own in flown))
+        self._shown = episode, step
+        self._picture = self._canvas.draw(config.camera, self._stage)
+        if config.overlay or self._is_named:
+            note = track.note(episode, step) if config.overlay else ""
+            values = track.curve(episode)[: step + 1].tolist()
+            panel = track.panel(episode, step)
+            self._picture = self._overlay.draw(self._picture, panel, values, note)
+        return self._picture
 
 
-def _scale(shots: Sequence[Shot]) -> tuple[float, float]:
-    """Ends of the graph. Of the headline metric a crash has its start, unless all crashed."""
-    if shots[0].drones > 1:
-        return graph_scale(np.concatenate([x for shot in shots for x in shot.distances]).tolist())
-    flown = [one for shot in shots for one in shot.trajectories]
-    crashed = [one.terminated for one in flown]
-    ends = [1 if crash and not all(crashed) else None for crash in crashed]
-    shown = [one.headline[:end] for one, end in zip(flown, ends, strict=True)]
-    return graph_scale(np.concatenate(shown).tolist())
+def _scale(tracks: Sequence[FilmTrack]) -> tuple[float, float]:
+    """Ends of the graph. Of a crash the start of the headline metric counts, unless all crashed."""
+    if tracks[0].drones > 1:
+        distances = [values for track in tracks for values in track.distances]
+        return graph_scale(np.concatenate(distances).tolist())
+    flown = [one for track in tracks for one in track.trajectories]
+    all_crashed = all(one.terminated for one in flown)
+    values = []
+    for one in flown:
+        is_cut = one.terminated and not all_crashed
+        values.append(one.headline[:1] if is_cut else one.headline)
+    return graph_scale(np.concatenate(values).tolist())

@@ -19,7 +19,7 @@ from measuring import RESULTS, options, write
 from rotorgram.agents import PID
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
-from rotorgram.flights.filming import Film, Shot, film, moments
+from rotorgram.flights.filming import Film, FilmTrack, film, moments
 from rotorgram.flights.trajectories import Trajectory, flown_trajectories
 from rotorgram.models import Vehicle
 from rotorgram.rendering import Canvas, Moment, Stage
@@ -96,11 +96,11 @@ def overlays(flight: list[Moment], rounds: int, frames: int) -> dict[str, float]
 
 def whole_film(flown: Trajectory) -> dict[str, float]:
     """Five seconds at 1280x720 as MP4, once."""
-    shot = Shot(name="PID", color="#B4BCC4", trajectories=[flown])
+    track = FilmTrack(name="PID", color="#B4BCC4", trajectories=[flown])
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "film.mp4"
         start, spent = time.perf_counter(), time.process_time()
-        frames = film(path, [shot], Film())
+        frames = film(path, [track], Film())
         return {
             "frames": frames,
             "seconds": round(time.perf_counter() - start, 1),

@@ -6,7 +6,7 @@ from pathlib import Path
 from ..agents import CONTROLLERS
 from ..agents.checkpoints import load
 from ..agents.policies import Policy
-from ..flights.filming import Film, OnFrame, Shot, film
+from ..flights.filming import Film, OnFrame, FilmTrack, film
 from ..flights.palette import agent_color
 from ..flights.trajectories import flown_trajectories
 from ..models.errors import InputError
@@ -43,9 +43,9 @@ def film_study(
     fresh.unlink(missing_ok=True)
     headline = results.headline(rows[0])
     seeds, episode = shown_runs(results.runs, results.evaluations, headline)
-    shots = [_shot(results, row, seeds[row.name], episode) for row in rows if row.name in seeds]
+    tracks = [_track(results, row, seeds[row.name], episode) for row in rows if row.name in seeds]
     try:
-        film(fresh, shots, config, on_frame)
+        film(fresh, tracks, config, on_frame)
     except NoOpenGL as error:
         logging.getLogger(__name__).info("no film of the agents: %s", error)
         return False
@@ -53,7 +53,7 @@ def film_study(
     return True
 
 
-def _shot(results: Results, row: Row, seed: int, episode: int) -> Shot:
+def _track(results: Results, row: Row, seed: int, episode: int) -> FilmTrack:
     spec = results.specs[row.name]
     policy: Policy
     if row.controller:
@@ -67,4 +67,4 @@ def _shot(results: Results, row: Row, seed: int, episode: int) -> Shot:
     several = not row.controller and results.study.seeds > 1
     name = row_label(row) + (f", seed {seed}" if several else "")
     color = agent_color(row.agent if row.name == row.agent else row.name, dark=True)
-    return Shot(name=name, color=color, trajectories=flown, drones=row.env.drones)
+    return FilmTrack(name=name, color=color, trajectories=flown, drones=row.env.drones)

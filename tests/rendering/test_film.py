@@ -19,7 +19,7 @@ from pictures import HEIGHT, WIDTH, decoded, ffmpeg_facts, pixels, same
 from PIL import Image
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
-from rotorgram.flights.filming import Film, Shot, film, grid
+from rotorgram.flights.filming import Film, FilmTrack, film, grid
 from rotorgram.flights.trajectories import Trajectory
 from rotorgram.models import InputError, Vehicle
 from rotorgram.rendering import MetricValue
@@ -48,8 +48,8 @@ def trajectory(*elevations: float, ending: Any = "truncated") -> Trajectory:
     )
 
 
-def shot(*trajectories: Trajectory, name: str = "PID") -> Shot:
-    return Shot(name=name, color="#7CC8F2", trajectories=list(trajectories))
+def track(*trajectories: Trajectory, name: str = "PID") -> FilmTrack:
+    return FilmTrack(name=name, color="#7CC8F2", trajectories=list(trajectories))
 
 
 def greys(count: int, width: int = 64, height: int = 48) -> Iterator[np.ndarray]:
@@ -87,7 +87,7 @@ def test_a_poster_is_a_picture_from_within_the_film(tmp_path: Path) -> None:
 
 def test_the_first_frame_of_a_film_shows_the_flight(opengl: None, tmp_path: Path) -> None:
     path = tmp_path / "film.mp4"
-    film(path, [shot(trajectory(*[5.0] * 6))], FAST)
+    film(path, [track(trajectory(*[5.0] * 6))], FAST)
     first, *_ = decoded(path, WIDTH, HEIGHT)
     assert first.mean() > 100
     assert first.std() > 20
@@ -221,16 +221,16 @@ def frames_of(folder: Path) -> list[np.ndarray]:
     return [pixels(file) for file in sorted(folder.iterdir())]
 
 
-def filmed(folder: Path, *shots: Shot, **settings: Any) -> list[np.ndarray]:
+def filmed(folder: Path, *tracks: FilmTrack, **settings: Any) -> list[np.ndarray]:
     """The frames of a film."""
     out = folder / f"film{len(list(folder.iterdir()))}"
     config = Film(**{**asdict(FAST), **settings})
-    assert film(out, shots, config) == len(list(out.iterdir()))
+    assert film(out, tracks, config) == len(list(out.iterdir()))
     return frames_of(out)
 
 
 def test_a_frame_shows_the_step_of_its_time(opengl: None, tmp_path: Path) -> None:
-    flight = shot(trajectory(*(4.0 + step / 10 for step in range(11))))  # 0.2 s
+    flight = track(trajectory(*(4.0 + step / 10 for step in range(11))))  # 0.2 s
     assert [flight.trajectories[0].step_at(t) for t in (0, 0.019, 0.02, 0.06, 0.2, 9)] == [
         0, 0, 1, 3, 10, 10,
     ]  # fmt: skip
@@ -249,11 +249,11 @@ def test_a_frame_shows_the_step_of_its_time(opengl: None, tmp_path: Path) -> Non
 
 def test_panes_are_the_single_pictures_side_by_side(opengl: None, tmp_path: Path) -> None:
     one, other = trajectory(5.0, 5.1, 5.2), trajectory(4.0, 3.9, 3.8)
-    both = filmed(tmp_path, shot(one), shot(other), width=2 * WIDTH + 2)
+    both = filmed(tmp_path, track(one), track(other), width=2 * WIDTH + 2)
     for number, frame in enumerate(both):
         assert frame.shape == (HEIGHT, 2 * WIDTH + 2, 3)
         for flight, columns in ((one, slice(0, WIDTH)), (other, slice(WIDTH + 2, None))):
-            single, title = filmed(tmp_path, shot(flight))[number], slice(0, HEIGHT // 5)
+            single, title = filmed(tmp_path, track(flight))[number], slice(0, HEIGHT // 5)
             assert same(frame[HEIGHT // 5 :, columns], single[HEIGHT // 5 :])
             assert not same(frame[title, columns], single[title])  # of several the names are told
         assert (frame[:, WIDTH : WIDTH + 2] == (13, 18, 26)).all()
@@ -267,7 +267,7 @@ def alarms_in(picture: np.ndarray) -> int:
 def test_a_flight_that_ended_stays_on_its_last_picture(opengl: None, tmp_path: Path) -> None:
     crash = trajectory(5.0, 4.0, 3.0, ending="terminated")  # 0.04 s
     long = trajectory(*[5.0] * 11)  # 0.2 s
-    frames = filmed(tmp_path, shot(crash), shot(long), width=642, height=240, overlay=True)
+    frames = filmed(tmp_path, track(crash), track(long), width=642, height=240, overlay=True)
     panes = [frame[:, :320] for frame in frames]
     assert len(frames) == 6
     assert alarms_in(panes[0]) == 0
@@ -282,9 +282,9 @@ def test_the_scale_holds_crashes_if_there_is_nothing_else(opengl: None, tmp_path
     crash = trajectory(*(5.0 - 0.03 * step for step in range(101)), ending="terminated")  # E to 3 m
     hovers = trajectory(*[5.0] * 101)
     size = {"height": 240, "overlay": True, "fps": 0.5}
-    alone = filmed(tmp_path, shot(crash), width=320, **size)[-1]
-    beside = filmed(tmp_path, shot(crash), shot(hovers), width=642, **size)[-1][:, :320]
-    ((first, *_),), vehicle = shot(hovers).moments[0], Vehicle.load()
+    alone = filmed(tmp_path, track(crash), width=320, **size)[-1]
+    beside = filmed(tmp_path, track(crash), track(hovers), width=642, **size)[-1][:, :320]
+    ((first, *_),), vehicle = track(hovers).moments[0], Vehicle.load()
     strip = Overlay(320, 240, title="PID", like=first, vehicle=vehicle, period=0.02, seconds=2.0,
                     scale=(0.0, 3.0)).plot  # fmt: skip
     columns = [
@@ -297,17 +297,17 @@ def test_the_scale_holds_crashes_if_there_is_nothing_else(opengl: None, tmp_path
 
 def test_several_drones_tell_how_near_they_come() -> None:
     first, second = trajectory(5.0, 5.0, 5.0, ending="terminated"), trajectory(8.0, 7.0, 6.0, 6.5)
-    both = Shot(name="ORCA", color="#7CC8F2", trajectories=[first, second], drones=2)
+    both = FilmTrack(name="ORCA", color="#7CC8F2", trajectories=[first, second], drones=2)
     assert both.curve(0).tolist() == [3.0, 2.0, 1.0, 1.5]  # one that has ended stays there
     distance, headline = both.panel(0, 1).metrics
     assert distance == MetricValue("least distance", 2.0, "m")
     assert (headline.name, headline.value) == ("elevation_error", 0.0)
     assert both.panel(0, 3).metrics[0].value == 1.5
     assert [both.note(0, step) for step in range(4)] == ["", "", *["1 of 2 ended"] * 2]
-    alone = shot(second)
+    alone = track(second)
     assert alone.curve(0).tolist() == [-3.0, -2.0, -1.0, -1.5]
     assert [metric.name for metric in alone.panel(0, 0).metrics] == ["elevation_error"]
-    assert [shot(first).note(0, step) for step in (1, 2)] == ["", "terminated"]
+    assert [track(first).note(0, step) for step in (1, 2)] == ["", "terminated"]
 
 
 def test_a_film_of_several_drones(opengl: None, tmp_path: Path) -> None:
@@ -316,7 +316,7 @@ def test_a_film_of_several_drones(opengl: None, tmp_path: Path) -> None:
     for heights in ((8.0, 7.5, 7.0), (8.0, 7.5, 8.0)):
         flights = trajectory(5.0, 5.0, 5.0), trajectory(*heights)
         world = [replace(one, spec=spec) for one in flights]
-        both = Shot(name="ORCA", color="#7CC8F2", trajectories=world, drones=2)
+        both = FilmTrack(name="ORCA", color="#7CC8F2", trajectories=world, drones=2)
         pictures.append(filmed(tmp_path, both, overlay=True))
     assert [len(frames) for frames in pictures] == [2, 2]
     assert same(pictures[0][0], pictures[1][0])
@@ -326,7 +326,7 @@ def test_a_film_of_several_drones(opengl: None, tmp_path: Path) -> None:
 def test_episodes_follow_one_another_and_pictures_are_of_a_time(
     opengl: None, tmp_path: Path
 ) -> None:
-    flight = shot(trajectory(5.0, 5.1, 5.2), trajectory(4.0, 3.9, 3.8, 3.7, 3.6))
+    flight = track(trajectory(5.0, 5.1, 5.2), trajectory(4.0, 3.9, 3.8, 3.7, 3.6))
     frames = filmed(tmp_path, flight)
     assert len(frames) == 2 + 3
     for settings, expected in (({}, frames[-1]), ({"at": 0.04}, frames[1])):
@@ -343,9 +343,13 @@ def test_wrong_films_are_one_sentence(tmp_path: Path) -> None:
     ):
         with pytest.raises(InputError, match=sentence):
             Film(**settings)  # type: ignore[arg-type]
-    for shots in ([], [shot()], [shot(trajectory(5.0)), shot(trajectory(5.0), trajectory(5.0))]):
-        with pytest.raises(InputError, match="shots: expected one or more"):
-            film(tmp_path / "film.gif", shots, FAST)
+    for tracks in (
+        [],
+        [track()],
+        [track(trajectory(5.0)), track(trajectory(5.0), trajectory(5.0))],
+    ):
+        with pytest.raises(InputError, match="tracks: expected one or more"):
+            film(tmp_path / "film.gif", tracks, FAST)
 
 
 def test_a_film_without_end_is_refused(tmp_path: Path) -> None:
@@ -355,5 +359,5 @@ def test_a_film_without_end_is_refused(tmp_path: Path) -> None:
     with pytest.raises(
         InputError, match=r"film: expected at most 1,000,000 frames, got 1,22\d,\d+"
     ):
-        film(tmp_path / "film.gif", [shot(slow)], FAST)
+        film(tmp_path / "film.gif", [track(slow)], FAST)
     assert not list(tmp_path.iterdir())

@@ -22,7 +22,7 @@ from rotorgram.agents import PID
 from rotorgram.agents.checkpoints import load
 from rotorgram.cli import main
 from rotorgram.flights import filming
-from rotorgram.flights.filming import Film, Shot, film
+from rotorgram.flights.filming import Film, FilmTrack, film
 from rotorgram.flights.recorded import recorded_trajectories
 from rotorgram.flights.trajectories import flown_trajectories
 from rotorgram.rendering import NoOpenGL
@@ -85,9 +85,11 @@ def test_a_checkpoint_on_film_flies_as_it_does_over_the_wire(
     assert (status, err) == (0, "")
     assert f"film: {out} (13 pictures of 642x240)" in said  # 0.5 s, both ends
     last = decoded(out, 642, 240)[-1].astype(int)
-    shots = [Shot(name="it", color="#7CC8F2", trajectories=[one]) for one in (flown, recorded)]
+    tracks = [
+        FilmTrack(name="it", color="#7CC8F2", trajectories=[one]) for one in (flown, recorded)
+    ]
     config = Film(width=642, height=240, camera="front", world="plain", fast=True, overlay=False)
-    film(tmp_path / "plain.png", shots, config)
+    film(tmp_path / "plain.png", tracks, config)
     bare = pixels(tmp_path / "plain.png").astype(int)
     assert abs(bare[:, :320] - bare[:, 322:]).max() <= 3  # the same flight twice
     assert abs(last - bare).mean() > 10
@@ -117,12 +119,12 @@ def test_panes_of_the_same_have_names_of_their_own(
 ) -> None:
     """And show the episodes that `evaluate` flies."""
     shown: list[Any] = []
-    monkeypatch.setattr(filming, "film", lambda out, shots, *_: shown.extend(shots) or 1)
+    monkeypatch.setattr(filming, "film", lambda out, tracks, *_: shown.extend(tracks) or 1)
     monkeypatch.setattr(gl, "offscreen_context", lambda *_: SimpleNamespace(free=lambda: None))
     what = ("pid", "pid", "random", "pid", "random")
     settings = ("--episode-length", 10, "--episode", 1, "--out", tmp_path / "film.gif")
     assert run(capsys, "render", *what, *settings)[0] == 0
-    names = [shot.name for shot in shown]
+    names = [track.name for track in shown]
     assert names == ["PID 1", "PID 2", "random 1", "PID 3", "random 2"]
     evaluated = flown_trajectories(
         PID(shown[0].trajectories[0].spec), "rotorgram/Elevation-v0", {"episode_length": 10}, [1],
