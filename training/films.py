@@ -6,7 +6,7 @@ from pathlib import Path
 from ..agents import CONTROLLERS
 from ..agents.checkpoints import load
 from ..agents.policies import Policy
-from ..flights.filming import Film, OnFrame, FilmTrack, film
+from ..flights.filming import Film, FilmTrack, OnFrame, film
 from ..flights.palette import agent_color
 from ..flights.trajectories import flown_trajectories
 from ..models.errors import InputError
