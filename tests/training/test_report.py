@@ -14,7 +14,7 @@ from comparisons import ERROR, GATES, HEADLINE, spec_of, study_of, synthetic_fol
 from rich.console import Console
 from rotorgram.envs.spec import EnvSpec
 from rotorgram.flights.distances import least, nearest
-from rotorgram.flights.filming import Film, Shot
+from rotorgram.flights.filming import Film, FilmTrack
 from rotorgram.flights.palette import agent_color, agent_label, sort_agents
 from rotorgram.flights.trajectories import Trajectory
 from rotorgram.models.errors import InputError
@@ -430,9 +430,9 @@ def test_the_film_shows_the_middle_seed_of_each_row(
 ) -> None:
     filmed: list[object] = []
 
-    def film(path: Path, shots: list[Shot], config: Film, _: object) -> None:
+    def film(path: Path, tracks: list[FilmTrack], config: Film, _: object) -> None:
         path.touch()
-        filmed.extend((shot.name, shot.drones) for shot in shots)
+        filmed.extend((shot.name, shot.drones) for shot in tracks)
         filmed.append(config.camera)
 
     monkeypatch.setattr(films, "film", film)
