@@ -39,7 +39,6 @@ COMMANDS: Final = {
     "report": "Report",
     "render": "Render",
     "bench": "Bench",
-    "check-model": "CheckModel",
     "vehicle": "Vehicle",
     "identify": "Identify",
     "key": "Key",

@@ -1,19 +1,22 @@
 """`rotorgram vehicle`: a vehicle's file, from a first one to MJCF for others."""
 
-from collections.abc import Iterable, Iterator
+import json
+import math
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 from tyro.conf import Positional, arg
 
-from ..models.errors import expect
+from ..models.errors import InputError, expect
 from ..models.files import write_new
 from ._flags import Command
 
 if TYPE_CHECKING:
     from ..models import Rotor
     from ..models import Vehicle as Craft
+    from ..models.checks import Check
     from ..models.vehicle_file import VehicleFile
 
 _FRAME: Final = """\
@@ -69,7 +72,9 @@ class Vehicle(Command):
     """Write, show, examine or export the file of a vehicle.
 
     new: write a commented file that flies. show: print derived values, and each number with its
-    source. check: examine the model, as check-model. export: write MJCF for MuJoCo alone.
+    source. check: examine anyone's multirotor (mass, units, rotors, hover, integrator, flights,
+    floor); exit status 1 if a check fails, 2 if the file is no free body with actuators. export:
+    write MJCF for MuJoCo alone.
     """
 
     action: Positional[Literal["new", "show", "check", "export"]]
@@ -80,6 +85,8 @@ class Vehicle(Command):
     """MJCF file that `export` writes, a new one."""
     frame: Literal["plus", "cross", "hexa", "octo", "list"] = "cross"
     """Arrangement of the rotors of `new`."""
+    json: bool = False
+    """Print JSON in place of the table of `check`."""
 
     def run(self) -> int:
         """Do it."""
@@ -87,6 +94,8 @@ class Vehicle(Command):
         expect(other == (self.out is None), "vehicle", *_out_words(self.action, self.out))
         right = "frame" not in self.given or self.action == "new"
         expect(right, "frame", "no --frame but with new", self.frame)
+        if self.json and self.action != "check":
+            raise InputError(f"json: expected no --json but with check, got {self.action}")
         match self.action:
             case "new":
                 self._new()
@@ -95,10 +104,19 @@ class Vehicle(Command):
             case "export":
                 self._export()
             case "check":
-                from .check_model import CheckModel
-
-                return CheckModel(file=Path(self.file)).run()
+                return self._check()
         return 0
+
+    def _check(self) -> int:
+        from ..models.checks import examine
+
+        try:
+            checks = examine(self.file)
+        except InputError as error:
+            error.exit_status = 2  # type: ignore[attr-defined]
+            raise
+        print_checks(checks, as_json=self.json)
+        return 0 if all(check.passed for check in checks) else 1
 
     def _new(self) -> None:
         path = Path(self.file)
@@ -130,6 +148,8 @@ class Vehicle(Command):
         print("\nrotors: position, direction, torque besides that of the position per thrust")
         for rotor in craft.rotors:
             print(f"{rotor.name:17} {_rotor_words(rotor)}")
+        for upper, lower in _coaxial_pairs(craft):
+            print(f"{upper} is above {lower}: {lower} loses no thrust in its wake here")
         print("\ncameras: pictures, place")
         for camera in craft.cameras:
             size = f"{camera.width} × {camera.height}"
@@ -177,10 +197,20 @@ def _derived(craft: "Craft") -> Iterator[tuple[str, str]]:
     yield "gravity", f"{craft.gravity:.6g} m/s²"
     yield "rest height", f"{craft.rest_height:.6g} m"
     yield "physics step", f"{craft.timestep:.6g} s"
-    yield "hover thrust", f"{_listed(dict.fromkeys(craft.hover_thrust.round(9)))} N"
-    yield "hover throttle", f"{_listed(dict.fromkeys((100 * shares).round(2)))} %"
+    yield "hover thrust", f"{_listed(craft.hover_thrust.round(9))} N"
+    yield "hover throttle", f"{_listed((100 * shares).round(2))} %"
     yield "thrust to weight", f"{most / weight:.4g}"
     yield "hash", craft.hash
+
+
+def _coaxial_pairs(craft: "Craft") -> Iterator[tuple[str, str]]:
+    """Names of two rotors on one axis, the upper one first."""
+    near = 0.05 * max(math.hypot(*rotor.position[:2]) for rotor in craft.rotors)
+    for upper in craft.rotors:
+        for lower in craft.rotors:
+            apart = math.dist(upper.position[:2], lower.position[:2])
+            if apart <= near and upper.position[2] > lower.position[2]:
+                yield upper.name, lower.name
 
 
 def _rotor_words(rotor: "Rotor") -> str:
@@ -205,3 +235,45 @@ def _listed(values: float | Iterable[float]) -> str:
     numbers = list(values) if isinstance(values, Iterable) else [values]
     most = max(map(abs, numbers), default=0.0)
     return ", ".join(f"{0.0 if abs(one) <= 1e-12 * most else one:.6g}" for one in numbers)
+
+
+def print_checks(checks: Sequence["Check"], *, as_json: bool = False) -> None:
+    """Print an examination: a table and a sentence for each failed check, or JSON."""
+    failed = [check for check in checks if not check.passed]
+    if as_json:
+        report = {"passed": not failed, "checks": [check.report() for check in checks]}
+        print(json.dumps(report, indent=1, ensure_ascii=False, allow_nan=False))
+        return
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    console = Console()
+    wide = console.width >= 120
+    columns = ["", "check", "measured", "expected"] + ["source"] * wide
+    table = Table(*columns, box=SIMPLE_HEAD, pad_edge=False)
+    for check in checks:
+        note = f" ({check.note})" if check.note else ""
+        cells = (
+            "[green]ok" if check.passed else "[red]FAILED",
+            escape(check.name),
+            escape(f"{check.measured:.4g} {check.unit}".strip() + note),
+            escape(expectation(check)),
+            escape(check.source),
+        )
+        table.add_row(*cells[: len(columns)])
+    console.print(table)
+    for check in failed:
+        print(f"{check.name}: {check.meaning}")
+    print(f"{len(checks) - len(failed)} of {len(checks)} checks passed")
+
+
+def expectation(check: "Check") -> str:
+    """Expected value and tolerance of a check, or its range, without the unit."""
+    if check.expected is not None:
+        within = f" ± {check.tolerance:.2g}" if check.tolerance else ""
+        return f"{check.expected:.4g}{within}"
+    if check.high == math.inf:
+        return f"at least {check.low:.4g}"
+    return f"{check.low:.4g} to {check.high:.4g}"

@@ -28,6 +28,7 @@ _LEAST_TIMESTEP: Final = 1e-5  # s: a control step of 0.02 s then takes a hundre
 _MOST_TIMESTEP: Final = 1.0  # s: that of the longest control step
 _FIRST_HEIGHT: Final = 6.0  # m: where most craft touch nothing
 _MOST_HEIGHT: Final = 1e4  # m: above it no craft may touch anything
+_MAX_MASS: Final = 1e9  # kg: its squares overflow nowhere
 _RELATIVE: Final = 1e-9  # of a hover's torques and forces: what rounding leaves
 _ROUNDED: Final = 1e-5  # of the weight, sideways: what a file's six digits leave
 
@@ -312,6 +313,12 @@ def _check_structure(model: mujoco.MjModel) -> None:
         array = getattr(model, name)
         finite = getattr(array, "dtype", None) != np.float64 or np.isfinite(array).all()
         expect(finite, "vehicle", "finite numbers", f"others in {name}")
+    for name in ("timestep", "gravity", "wind", "density", "viscosity"):
+        if not np.isfinite(getattr(model.opt, name)).all():
+            raise InputError(f"vehicle: expected finite numbers, got others in {name}")
+    heaviest = float(model.body_mass.max())
+    if heaviest > _MAX_MASS:
+        raise InputError(f"vehicle: expected a mass of at most {_MAX_MASS:g} kg, got {heaviest:g}")
     free = int((model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).sum())
     got = f"{free} free of {model.njnt} joints"
     expect((free, model.njnt) == (1, 1), "vehicle", "one free body and no other joints", got)

@@ -424,6 +424,7 @@ class _Reader:
 
     def _rotor(self, table: Any, number: int, model: Path | None) -> PlacedRotor:
         name = f"rotors.list[{number}]"
+        _check_alike(name, table)
         given = self._read(table, "rotors.list", name)
         axis, turn = given.get("axis", _UP), table.get("turn")
         _check_axis(f"{name}.axis", axis)
@@ -496,6 +497,17 @@ def _number(name: str, limits: Limits, given: Any, source: str) -> Number:
         why=texts["why"],
         others=tuple(others),
     )
+
+
+def _check_alike(name: str, table: Any) -> None:
+    """Raise `InputError` for a rotor with a number that all rotors share."""
+    keys = table if isinstance(table, dict) else ()
+    for key in keys:
+        if f"rotors.{key}" in ENTRIES and f"rotors.list.{key}" not in ENTRIES:
+            raise InputError(
+                f"{name}: expected no {key}, which all rotors share in [rotors]; rotors of two "
+                f"sizes need an MJCF file with a motor for each, which [model] names, got {key}"
+            )
 
 
 def _check_keys(name: str, table: Any, known: Sequence[str], *silent: str) -> None:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Final
 
 from measuring import write_rows
-from rotorgram.cli.check_model import expectation
+from rotorgram.cli.vehicle import expectation
 from rotorgram.models import QUAD_XML
 from rotorgram.models.checks import Check, examine
 

@@ -233,7 +233,7 @@ def _examination(vehicle: Vehicle) -> str:
     checks = examine(vehicle)
     passed = sum(check.passed for check in checks)
     rows = [(check.name, "passed" if check.passed else "**failed**") for check in checks]
-    lead = f"`rotorgram check-model`: {passed} of {len(checks)} checks passed."
+    lead = f"`rotorgram vehicle check`: {passed} of {len(checks)} checks passed."
     return f"{lead}\n\n{table(('check', 'result'), rows)}"
 
 

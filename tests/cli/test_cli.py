@@ -281,7 +281,11 @@ def shell(command: str, **variables: str) -> subprocess.CompletedProcess[str]:
     [
         ("rotorgram --help >&-", 0, ""),
         ("rotorgram sim --help >&- 2>&-", 0, ""),
-        ("rotorgram check-model > /dev/full", 1, "rotorgram: standard output: No space left"),
+        (
+            "rotorgram vehicle check paper > /dev/full",
+            1,
+            "rotorgram: standard output: No space left",
+        ),
         ("(sleep 1; rotorgram --help) | true", 141, ""),
     ],
 )
@@ -301,7 +305,7 @@ def test_a_training_goes_on_without_standard_output(out: str, tmp_path: Path) ->
 
 
 def test_standard_output_in_ascii() -> None:
-    commands = ("rotorgram --help", "rotorgram render --help", "rotorgram check-model",
+    commands = ("rotorgram --help", "rotorgram render --help", "rotorgram vehicle check paper",
                 "rotorgram evaluate pid --episodes 1")  # fmt: skip
     for command in commands:
         done = shell(command, PYTHONIOENCODING="ascii")
@@ -310,7 +314,7 @@ def test_standard_output_in_ascii() -> None:
 
 def test_an_opengl_that_does_not_exist() -> None:
     """It is told to commands that draw; others go on."""
-    assert shell("rotorgram check-model", MUJOCO_GL="nonsense").returncode == 0
+    assert shell("rotorgram vehicle check paper", MUJOCO_GL="nonsense").returncode == 0
     done = shell("rotorgram render random --out /nowhere/a.mp4", MUJOCO_GL="nonsense")
     assert "Traceback" not in done.stderr
     assert done.returncode in (1, 2)
@@ -327,7 +331,7 @@ def test_a_folder_of_that_name_in_the_working_directory(tmp_path: Path) -> None:
 def test_a_model_with_a_tiny_time_step(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     model = QUAD_XML.read_text(encoding="utf-8").replace('timestep="0.01"', 'timestep="1e-8"')
     (tmp_path / "quad.xml").write_text(model)
-    status, out, _ = run(capsys, "check-model", tmp_path / "quad.xml")
+    status, out, _ = run(capsys, "vehicle", "check", tmp_path / "quad.xml")
     assert status == 1
     assert "expected a physics step of at least" in out
 
@@ -441,11 +445,11 @@ def test_a_course_that_is_flown_to_its_end_is_no_crash(capsys: pytest.CaptureFix
 
 
 def test_check_model(capsys: pytest.CaptureFixture[str]) -> None:
-    status, out, _ = run(capsys, "check-model")
+    status, out, _ = run(capsys, "vehicle", "check", "paper")
     assert status == 0
     passed, checks = re.search(r"(\d+) of (\d+) checks passed", out).groups()  # type: ignore[union-attr]
     assert passed == checks
-    assert run(capsys, "check-model", Path(__file__).parents[1] / "data" / "hexa.xml")[0] == 0
+    assert run(capsys, "vehicle", "check", Path(__file__).parents[1] / "data" / "hexa.xml")[0] == 0
 
 
 def test_check_model_prints_json_and_exits_with_1(
@@ -453,7 +457,7 @@ def test_check_model_prints_json_and_exits_with_1(
 ) -> None:
     text = QUAD_XML.read_text(encoding="utf-8").replace('ctrlrange="0 100"', 'ctrlrange="0 50"')
     (tmp_path / "weak.xml").write_text(text)
-    status, out, err = run(capsys, "check-model", tmp_path / "weak.xml", "--json")
+    status, out, err = run(capsys, "vehicle", "check", tmp_path / "weak.xml", "--json")
     report = json.loads(out)
     failed = {check["name"]: check for check in report["checks"] if not check["passed"]}
     assert (status, err, report["passed"]) == (1, "", False)
@@ -474,7 +478,7 @@ def test_check_model_of_what_is_no_vehicle(
 ) -> None:
     if text is not None:
         (tmp_path / "drone.xml").write_text(text)
-    status, out, err = run(capsys, "check-model", tmp_path / "drone.xml")
+    status, out, err = run(capsys, "vehicle", "check", tmp_path / "drone.xml")
     assert (status, out, err.count("\n")) == (2, "", 1)
     assert err.startswith(f"rotorgram: {sentence}")
 

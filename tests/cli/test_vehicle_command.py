@@ -10,10 +10,20 @@ import mujoco
 import pytest
 from rotorgram.cli import main
 from rotorgram.cli import vehicle as command
-from rotorgram.models import Vehicle
+from rotorgram.models import InputError, Vehicle
 from rotorgram.models.vehicle_file import FRAMES
 
 DATA = Path(__file__).parents[1] / "data"
+SHARED = """
+[body]
+mass = 1.6
+inertia = [0.02, 0.02, 0.035]
+
+[rotors]
+thrust = [0.0, 6.0]
+reaction = 0.016
+
+"""
 
 
 def run(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str, str]:
@@ -73,8 +83,8 @@ def test_show(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         "mass              2 kg",
         "centre of mass    0, 0, 0 m",
         "Ixx, Iyy, Izz     0.02, 0.021, 0.035 kg m²",
-        "hover thrust      4.905 N",  # 2 · 9.81 / 4
-        "hover throttle    49.05 %",
+        "hover thrust      4.905, 4.905, 4.905, 4.905 N",  # 2 · 9.81 / 4
+        "hover throttle    49.05, 49.05, 49.05, 49.05 %",
         "thrust to weight  2.039",  # 40 / 19.62
         "rotor2            0.212132, -0.212132, 0 m; 0, 0, 1; 0, 0, -0.016 N m/N; 0 to 10 N",
         "low               rgb, depth 160 × 120, at (0 0 0) m in the body, looks along (0 0 -1), "
@@ -182,3 +192,31 @@ def test_every_command_takes_the_file(tmp_path: Path, capsys: pytest.CaptureFixt
     capsys.readouterr()
     assert main(["replay", journal, "--verify"]) == 1  # the paper's has other rotors
     assert re.search("the vehicle was .*: --vehicle names its file", capsys.readouterr().out)
+
+
+def test_show_has_a_hover_thrust_for_each_rotor_and_names_coaxial_pairs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    corners = ((0.2, 0.2), (0.2, -0.2), (-0.2, -0.2), (-0.2, 0.2))
+    rotors = ""
+    for layer, height in (("top", 0.05), ("low", -0.05)):
+        for i, (x, y) in enumerate(corners):
+            turn = "cw" if (layer == "top") == (i % 2 == 0) else "ccw"
+            rotors += f'[[rotors.list]]\nname = "{layer}{i}"\nturn = "{turn}"\n'
+            rotors += f"position = [{x}, {y}, {height}]\n"
+    file = tmp_path / "x8.toml"
+    file.write_text(f"{SHARED}{rotors}")
+    status, out, _ = run(capsys, "show", file)
+    assert status == 0
+    (hover,) = (line for line in out.splitlines() if line.startswith("hover thrust"))
+    assert hover == "hover thrust      " + ", ".join(["1.962"] * 8) + " N"
+    assert "top0 is above low0: low0 loses no thrust in its wake here" in out
+    assert "low0 is above" not in out
+
+
+def test_rotors_of_two_sizes_are_told_the_way(tmp_path: Path) -> None:
+    file = tmp_path / "mixed.toml"
+    rotor = '[[rotors.list]]\nposition = [0.2, 0.2, 0.0]\nturn = "cw"\nradius = 0.1\n'
+    file.write_text(SHARED + rotor)
+    with pytest.raises(InputError, match=r"list\[1\]: expected no radius, which all rotors share"):
+        Vehicle.load(file)

@@ -221,7 +221,6 @@ OTHERS = {
 }
 RUN = {
     # commands that are run too, on the pages that have them, and what makes them short
-    "rotorgram check-model": [],
     "rotorgram key drone.key": [],
     "rotorgram train a2c --num-envs 32 --set steps_per_update=1024 learning_rate=0.02 "
     "--out runs/first": ["--env-steps", "2048"],

@@ -114,7 +114,7 @@ def test_a_missing_package_is_one_sentence(
 def test_the_base_alone_flies(tmp_path: Path) -> None:
     """What the base installs: a simulator and the PID meet; a key, a model's checks."""
     assert run_without(ALL, "key", tmp_path / "key").returncode == 0
-    assert run_without(ALL, "check-model").returncode == 0
+    assert run_without(ALL, "vehicle", "check", "paper").returncode == 0
     serve = ["serve", "pid", "--episodes", "1", "--listen", "127.0.0.1:0"]
     with subprocess.Popen(
         [sys.executable, "-c", WITHOUT.format(names=ALL), *serve], stdout=subprocess.PIPE, text=True
@@ -146,7 +146,7 @@ def imported(*arguments: str) -> set[str]:
 def test_flags_are_checked_before_anything_heavy_is_imported(command: str) -> None:
     heavy = {"mujoco", "torch", "pandas", "matplotlib", "stable_baselines3", "ray", "scipy"}
     assert not imported(command, "--wrong-flag") & heavy
-    if command in ("key", "replay", "check-model", "report", "bench"):
+    if command in ("key", "replay", "report", "bench"):
         assert not imported(command, "--wrong-flag") & {"gymnasium"}
 
 

@@ -24,7 +24,7 @@ from broken_vehicles import (
     rows,
 )
 from measuring import read_rows, write_rows
-from rotorgram.cli.check_model import print_checks
+from rotorgram.cli.vehicle import print_checks
 from rotorgram.models import QUAD_XML, InputError, Vehicle, checks
 from rotorgram.models.checks import (
     RANGES,
