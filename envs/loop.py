@@ -22,10 +22,11 @@ from .stages.delays import ObservationDelay
 from .stages.ends import Ends
 from .stages.flight import Control, Flight, StandStill
 from .stages.history import History
-from .stages.judge import Judge, Memory, Starts
+from .stages.judge import Judge, Remember, Starts
 from .stages.landing import Landed, Landing
 from .stages.measure import Measure
 from .stages.pictures import Pictures
+from .stages.radio import Radio
 from .stages.record import Mask, Record, Stage
 from .stages.sensing import Readings, Sensing
 from .tasks.task import Task
@@ -77,7 +78,10 @@ class Stages:
         self._flying += [self._flight, clock.Clock()]
         judge = Judge(env_id, task)
         measure = Measure(world, task.control_period)
-        self._observing = [measure, *sensing, Memory(task), judge, *readings]
+        radio: list[Stage] = []
+        if task.has_radio:
+            radio.append(Radio(task.options, task.control_period, shape[1], task.ended))
+        self._observing = [measure, *sensing, Remember(task), *radio, judge, *readings]
         pictures = [Pictures(task, world.random, shape)] if config.cameras else []
         self._observing += pictures
         self.pictures = pictures[0].specs if pictures else ()
@@ -174,7 +178,7 @@ class Loop:
         )
         self.stages = Stages(config.env_id, self.task, self.world, shape, randomize)
         self.spec = spec_of(config, self.task, self.stages.pictures)
-        self.record = Record(self.world.shape)
+        self.record = Record(self.world.shape, self.task.memory)
         self.record.kept = self.stages.kept
         self._quantities = quantities_of(self.task)
         self._arrays = [
@@ -196,9 +200,9 @@ class Loop:
     ) -> None:
         """Reset some drones, freeze some, and fly the others for one control period.
 
-        As `AdvancingVectorEnv.advance`; `chosen` has by the names of `Task.choices` what replaces
-        a draw, shape (N,). Where the task refuses such a start, the others have flown, those to be
-        reset are where they were, and their streams of random numbers have moved on.
+        As `AdvancingVectorEnv.advance`; `chosen` has what replaces a draw, by the names of
+        `Task.reset_options`, shape (N,). Where the task refuses such a start, the others have
+        flown, those to be reset are where they were, and their random numbers have moved on.
         """
         if self._closed:
             raise gym.error.ClosedEnvironmentError("expected an open env, got a closed one")

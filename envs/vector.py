@@ -78,8 +78,8 @@ class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
         Args:
             seed: Drone i gets seed + i, or the i-th of N seeds; None leaves its stream as it is.
             options: `reset_mask`: bool, shape (N,): which drones; the others stay where they are.
-                By the names of the task's `choices`: numbers, one or shape (N,), in place of those
-                that the seed gives.
+                By the names of the task's `reset_options`: numbers, one or shape (N,), in place of
+                those that the seed gives.
         """
         given = dict(options or {})
         mask = checked_mask(given.pop("reset_mask", None), self.num_envs)
@@ -126,8 +126,8 @@ class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
         return super()._info(mask) | terms | {f"_{name}": mask for name in terms}
 
     def _choice(self, name: str, value: Any) -> np.ndarray:
-        if name not in self._loop.task.choices:
-            expected = ", ".join(("reset_mask", *self._loop.task.choices))
+        if name not in self._loop.task.reset_options:
+            expected = ", ".join(("reset_mask", *self._loop.task.reset_options))
             raise InputError(f"options: expected some of {expected}, got {name!r}")
         try:
             values = np.asarray(value, np.float64)

@@ -21,6 +21,7 @@ from rotorgram.agents import Geometric
 from rotorgram.envs import register
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.loop import Loop
+from rotorgram.envs.state import State
 from rotorgram.envs.tasks.hover import Hover
 from rotorgram.models import QUAD_XML, Vehicle
 from rotorgram.sim import (
@@ -97,15 +98,9 @@ def response(name: str, level: str) -> dict[str, float]:
 class Circle(Hover):
     """A goal that goes round a circle of 1 m at 1 m/s, 5 m high."""
 
-    steps = 0
-
-    def remember(self, state: WorldState, mask: Any) -> None:
-        """Count the steps."""
-        self.steps += 1
-
-    def goal(self, state: WorldState) -> Any:
+    def goal(self, state: State) -> Any:
         """On the circle, at the time of the step."""
-        angle = SPEED * self.steps * self.control_period
+        angle = SPEED * state.time
         return np.array((math.cos(angle), math.sin(angle), 5.0))
 
 

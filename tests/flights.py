@@ -4,11 +4,12 @@ import math
 from typing import Any
 
 import numpy as np
-from rotorgram.sim import Draw, WorldState
+from rotorgram.envs.state import State
+from rotorgram.sim import Draw
 from rotorgram.sim.random import Random
 
 
-def state_of(rotors: int = 4, **arrays: Any) -> WorldState:
+def state_of(rotors: int = 4, time: float = 0.0, **arrays: Any) -> State:
     """A single level craft at rest at (0, 0, 5), but for the arrays that are given."""
     fields: dict[str, Any] = {
         "position": (0.0, 0.0, 5.0),
@@ -19,7 +20,8 @@ def state_of(rotors: int = 4, **arrays: Any) -> WorldState:
         "touching": False,
     }
     given = {name: np.array(value) for name, value in {**fields, **arrays}.items()}
-    return WorldState(**given, command=given["thrust"])
+    steps = round(time / 0.02)
+    return State(**given, command=given["thrust"], action=np.zeros(rotors), steps=steps, time=time)
 
 
 def about(axis: tuple[float, float, float], degrees: float) -> tuple[float, ...]:

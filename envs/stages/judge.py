@@ -24,8 +24,10 @@ class Starts(Stage):
 
     def begin(self, record: Record) -> None:
         """Other stages follow from the start."""
-        draw = self._world.draw(record.begun, record.chosen)
-        start = self._task.begin(record.begun, draw)
+        record.draw = self._world.draw(record.begun, record.chosen)
+        with self._task.memory.open("begin"):
+            start = self._task.begin(record.begun, record.draw)
+        self._task.memory.expand(record.shape)
         expected = (*record.shape, 3)
         got: Any = type(start).__name__
         if isinstance(start, InitialState):
@@ -38,7 +40,7 @@ class Starts(Stage):
         record.start = start
 
 
-class Memory(Stage):
+class Remember(Stage):
     """The task changes its memory of the drones that flew."""
 
     def __init__(self, task: Task) -> None:
@@ -46,10 +48,12 @@ class Memory(Stage):
 
     def step(self, record: Record) -> None:
         """Before it observes."""
-        flown = record.flown
-        mask = np.ones(record.shape, bool)[()] if flown is None else flown
-        if mask.any():
-            self._task.remember(record.state, mask)
+        if record.flown is None or record.flown.any():
+            record.run(record.flown, [self._update])
+
+    def _update(self, record: Record) -> None:
+        with self._task.memory.open("update"):
+            self._task.update_memory(record.state)
 
 
 class Judge(Stage):

@@ -7,8 +7,9 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ...sim import InitialState
+from ...sim import Draw, InitialState
 from ...sim.state import Array, WorldState
+from ..memory import Memory
 from ..state import State
 
 Mask = NDArray[np.bool_]
@@ -27,6 +28,7 @@ class Record:
 
     Attributes:
         shape: (W, A), or () for a single drone.
+        memory: Of the task.
         kept: Names of arrays that keep their values between steps.
         flown: Drones that fly in this step; None: all.
         begun: Drones that begin an episode in this step; None: none.
@@ -34,6 +36,8 @@ class Record:
         action: The last action that was flown, (W, A, k).
         received: The action that arrives at the controller.
         thrust: Of each rotor, N, (W, A, R).
+        chosen: What a reset's options give in place of draws, by name, (W, A).
+        draw: Draws the numbers of episodes that begin.
         start: Of the drones that begin.
         state: At the end of the step.
         measured: The same, as sensors have it.
@@ -57,6 +61,8 @@ class Record:
     received: NDArray[np.float64]
     actions_sent: NDArray[np.float64]
     thrust: Array
+    chosen: Mapping[str, Array]
+    draw: Draw
     start: InitialState
     state: State
     measured: State
@@ -71,9 +77,14 @@ class Record:
     truncated: Mask
     landing: Mask
     scenes: NDArray[np.int64]
+    said: NDArray[np.float64]
+    heard: NDArray[np.float64]
+    age: NDArray[np.float64]
+    keys: NDArray[np.uint32]
+    silent: Mask
 
-    def __init__(self, shape: tuple[int, ...]) -> None:
-        self.shape = shape
+    def __init__(self, shape: tuple[int, ...], memory: Memory) -> None:
+        self.shape, self.memory = shape, memory
         self.kept: tuple[str, ...] = ()
         nobody = np.zeros(shape, bool)[()]
         self.flown: Mask | None = None
@@ -88,20 +99,25 @@ class Record:
 
     def run(self, mask: Mask | None, stages: Sequence[Callable[["Record"], None]]) -> None:
         """Run a region for the drones of a mask, None for all. An error leaves all as it was."""
-        arrays = vars(self)
-        before = arrays.copy()
+        arrays, memory = vars(self), vars(self.memory)
+        before, remembered = arrays.copy(), memory.copy()
         try:
             for stage in stages:
                 stage(self)
         except BaseException:
             arrays.clear()
             arrays.update(before)
+            memory.clear()
+            memory.update(remembered)
             raise
         if mask is None:
             return
         for name in self.kept:
             if name in before and arrays[name] is not before[name]:
                 arrays[name] = merged(mask, arrays[name], before[name])
+        for name, old in remembered.items():
+            if memory[name] is not old:
+                memory[name] = where(mask, memory[name], old)
 
     def rest(self) -> None:
         """A drone that does not fly gets no reward and no end."""

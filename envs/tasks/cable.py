@@ -8,10 +8,11 @@ import numpy as np
 
 from ...models.errors import expect
 from ...models.fields import Limits
-from ...sim import Array, Draw, InitialState, WorldState, stack
+from ...sim import Array, Draw, InitialState, stack
 from ..config import EnvConfig
 from ..spec import Metric
-from .flight import (
+from ..state import State
+from .goal import (
     AIR,
     LEAST_TILT_COSINE,
     MOST_SPEED,
@@ -123,7 +124,6 @@ class Cable(Swarm):
         expected = f"a height of at least {least:.4g} m above the ground"
         expect(options.center[2] >= least, "center", expected, f"{options.center[2]:g}")
         self.reach = away * math.sqrt(3)
-        self._turn: Array = 0.0
         self.prepare(
             tuple(
                 (f"{quantity} {axis}", unit, size)
@@ -165,13 +165,12 @@ class Cable(Swarm):
         away = self.options.start_band * self.gap
         turn = draw.uniform(-math.pi, math.pi)[:, :1]  # one for all drones, as what follows
         offset = draw.uniform(-away, away, (3,))[:, :1]
-        self.keep(mask, _turn=turn + 0.0 * offset[..., 0] + np.zeros(self.shape))
+        self.memory.turn = turn + np.zeros(self.shape)
         ball = np.array(self.options.center) + offset + np.zeros((*self.shape, 3))
         azimuth = turn + self._azimuths
         half = self._tilt / 2
         sine, zero = math.sin(half), 0.0 * azimuth
         position = ball + self._around(turn)
-        self.hear(mask, draw, position)
         return InitialState(
             position=position,
             quaternion=stack(
@@ -187,20 +186,22 @@ class Cable(Swarm):
         x, y = self._ring * np.cos(azimuth), self._ring * np.sin(azimuth)
         return stack((x, y, 0.0 * x + self._height))
 
-    def goal(self, state: WorldState) -> Array:
+    def goal(self, state: State) -> Array:
         """The place of each drone where the payload hangs still at its goal."""
-        return np.array(self.options.center) + self._around(self._turn)
+        return np.array(self.options.center) + self._around(self.memory.turn)
 
-    def observe(self, state: WorldState) -> dict[str, Array]:
+    def observe(self, state: State) -> dict[str, Array]:
         """See the table of the class."""
         hung, moving = state.payload - state.position, state.payload_velocity - state.velocity
-        return self.seen(state, hung, moving, self._missing(state), *self.around(state))
+        return self.build_observation(
+            state, hung, moving, self._missing(state), *self.neighbour_observation(state)
+        )
 
-    def _missing(self, state: WorldState) -> Array:
+    def _missing(self, state: State) -> Array:
         """From the payload to its goal, world frame, m, (W, A, 3)."""
         return np.array(self.options.center) - state.payload
 
-    def ended(self, state: WorldState) -> Array:
+    def ended(self, state: State) -> Array:
         """Whether the flight of all drones of a world is over, bool, (W, A)."""
         outside = length(self._missing(state)) > self.band
         down = state.payload[..., 2] < self._radius
@@ -208,7 +209,7 @@ class Cable(Swarm):
         one = outside | down | flipped | state.touching
         return np.broadcast_to(one.any(axis=1, keepdims=True), one.shape)
 
-    def outcome(self, state: WorldState) -> Outcome:
+    def outcome(self, state: State) -> Outcome:
         """Nearness, approach and swing of the payload, and room; see the class."""
         missing = self._missing(state)
         distance, room, ended = length(missing), self.clearance(state), self.ended(state)
@@ -219,7 +220,7 @@ class Cable(Swarm):
                 "payload": (near - distance) / (near + distance),
                 "approach": APPROACH_WEIGHT * closing / (distance + TINY),
                 "swing": -SWING_WEIGHT * length(state.payload_velocity - state.velocity),
-                "room": self.narrowness(room),
+                "room": self.proximity_penalty(room),
                 "rates": -RATE_WEIGHT * length(state.body_rates),
                 "termination": ended * TERMINATION_REWARD + 0.0,
             },

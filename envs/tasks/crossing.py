@@ -4,8 +4,9 @@ import math
 
 import numpy as np
 
-from ...sim import Array, Draw, InitialState, WorldState, stack
+from ...sim import Array, Draw, InitialState, stack
 from ..spec import Metric
+from ..state import State
 from .swarm import JITTER, Swarm, SwarmOptions, ring
 
 
@@ -64,7 +65,6 @@ class Crossing(Swarm):
         angle = 2 * math.pi * np.arange(count) / count
         self._angles, self._radius = angle if self.shape else 0.0, radius * self.gap
         self.reach = 2 * self._radius + 2 * JITTER * self.gap
-        self._turn: Array = 0.0
         self.prepare()
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:
@@ -73,9 +73,8 @@ class Crossing(Swarm):
         jitter = draw.uniform(-JITTER, JITTER, (3,)) * self.gap
         if self.count > 1:
             turn = turn[:, :1]  # one for all
-        self.keep(mask, _turn=turn + 0.0 * jitter[..., 0])
+        self.memory.turn = turn + 0.0 * jitter[..., 0]
         position = self._opposite(turn + math.pi) + jitter
-        self.hear(mask, draw, position)
         return InitialState(position=position)
 
     def _opposite(self, turn: Array) -> Array:
@@ -85,10 +84,10 @@ class Crossing(Swarm):
         cx, cy, cz = self.options.center
         return stack((x + cx, y + cy, 0.0 * x + cz))
 
-    def observe(self, state: WorldState) -> dict[str, Array]:
+    def observe(self, state: State) -> dict[str, Array]:
         """See the table of the class."""
-        return self.seen(state, *self.around(state))
+        return self.build_observation(state, *self.neighbour_observation(state))
 
-    def goal(self, state: WorldState) -> Array:
+    def goal(self, state: State) -> Array:
         """The place opposite to the start of each drone."""
-        return self._opposite(self._turn)
+        return self._opposite(self.memory.turn)

@@ -14,13 +14,12 @@ from ...sim import (
     Draw,
     EffectOptions,
     InitialState,
-    WorldState,
     clip,
     component,
-    plain,
     stack,
 )  # fmt: skip
 from ..spec import ArraySpec, Metric
+from ..state import State
 from .task import Outcome, Task, TaskOptions
 
 ERROR_SCALE: Final = 0.5  # |E| at which the reward crosses zero, m
@@ -119,7 +118,7 @@ class Elevation(Task):
     metrics = (
         Metric(name="elevation_error", unit="m", settled=0.05, held=0.1, symbol="E", signed=True),
     )
-    choices = ("target", "start")
+    reset_options = ("target", "start")
 
     def setup(self) -> None:
         """See the class."""
@@ -143,7 +142,6 @@ class Elevation(Task):
         config = self.config
         ideal = config.effects == EffectOptions() and not config.randomize
         self._bounds = None if ideal else spec.bounds()
-        self.target: Array = 0.0
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """Level, at rest, near the target."""
@@ -153,13 +151,12 @@ class Elevation(Task):
         if (chosen := draw.chosen("start")) is not None:
             start = chosen
         self._check(target, start, mask)
-        self.target = plain(np.where(mask, target, self.target))
-        self._goal = stack((0.0, 0.0, self.target))
+        self.memory.target = target
         return InitialState(position=stack((0.0, 0.0, start)))
 
-    def observe(self, state: WorldState) -> dict[str, Array]:
+    def observe(self, state: State) -> dict[str, Array]:
         """E, its rate and the thrust; or E alone."""
-        error = self.target - component(state.position, 2)
+        error = self.memory.target - component(state.position, 2)
         if self.options.observation == "error":
             return {"observation": self._within(stack((error,)))}
         rate = 0.0 - component(state.velocity, 2)
@@ -172,12 +169,12 @@ class Elevation(Task):
             return values
         return clip(values, *self._bounds)
 
-    def outcome(self, state: WorldState) -> Outcome:
+    def outcome(self, state: State) -> Outcome:
         """Nearness to the target; the end at a crash, a flip-over, or outside the band."""
-        error = self.target - component(state.position, 2)
+        error = self.memory.target - component(state.position, 2)
         distance = abs(error)
         outside = distance > self.options.flight_band
-        terminated = outside | plain(state.touching) | (state.tilt_cosine < MAX_TILT_COSINE)
+        terminated = outside | state.touching | (state.tilt_cosine < MAX_TILT_COSINE)
         elevation = (ERROR_SCALE - distance) / (ERROR_SCALE + distance)
         termination = terminated * TERMINATION_REWARD + 0.0  # no negative zeros
         return Outcome(
@@ -186,9 +183,9 @@ class Elevation(Task):
             metrics={"elevation_error": error},
         )
 
-    def goal(self, state: WorldState) -> Array:
+    def goal(self, state: State) -> Array:
         """Above the start, at the target elevation."""
-        return self._goal
+        return stack((0.0, 0.0, self.memory.target))
 
     @property
     def rate_bound(self) -> float:

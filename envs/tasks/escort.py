@@ -7,9 +7,10 @@ from typing import Annotated
 import numpy as np
 
 from ...models.fields import Limits
-from ...sim import Array, Draw, InitialState, WorldState, stack
+from ...sim import Array, Draw, InitialState, stack
 from ..spec import Metric
-from .flight import FURTHEST, MOST_SPEED
+from ..state import State
+from .goal import FURTHEST, MOST_SPEED
 from .swarm import JITTER, Swarm, SwarmOptions, grid, ring
 
 
@@ -79,7 +80,6 @@ class Escort(Swarm):
         self._slots = ring(count) * self.gap
         starts = np.abs(grid(count)).max(axis=0) * self.gap + JITTER * self.gap
         self.reach = float(np.linalg.norm(np.abs(self._slots).max(axis=0) + starts))
-        self._time = self._ratio = self._alpha = self._beta = 0.0
         speeds = tuple((f"target velocity {axis}", "m/s", MOST_SPEED) for axis in "xyz")
         self.prepare(speeds)
 
@@ -89,34 +89,35 @@ class Escort(Swarm):
         alpha, beta = (draw.uniform(-math.pi, math.pi) for _ in range(2))
         if self.count > 1:  # one for all
             ratio, alpha, beta = (x[:, :1] + 0.0 * x for x in (ratio, alpha, beta))
-        self.keep(mask, _ratio=ratio, _alpha=alpha, _beta=beta, _time=0.0 * ratio)
+        memory = self.memory
+        memory.ratio, memory.alpha, memory.beta = ratio, alpha, beta
+        memory.time = 0.0
         position = self.cells(draw) + self.target()[0]
-        self.hear(mask, draw, position)
         return InitialState(position=position)
 
     def target(self) -> tuple[Array, Array]:
         """Position from the center and velocity of the target: world frame, m, m/s, (W, A, 3)."""
-        a = self.options.target_path
-        slow = self.options.target_speed / (a * np.sqrt(1.0 + self._ratio * self._ratio))
-        fast = self._ratio * slow
-        first, second = slow * self._time + self._alpha, fast * self._time + self._beta
+        memory, a = self.memory, self.options.target_path
+        slow = self.options.target_speed / (a * np.sqrt(1.0 + memory.ratio * memory.ratio))
+        fast = memory.ratio * slow
+        first = slow * memory.time + memory.alpha
+        second = fast * memory.time + memory.beta
         zero = 0.0 * first
         place = stack((a * np.sin(first), a * np.sin(second), zero))
         return place, stack((a * slow * np.cos(first), a * fast * np.cos(second), zero))
 
-    def remember(self, state: WorldState, mask: Array) -> None:
-        """Move the target; listen."""
-        self.keep(mask, _time=self._time + self.control_period)
-        super().remember(state, mask)
+    def update_memory(self, state: State) -> None:
+        """Move the target."""
+        self.memory.time = self.memory.time + self.control_period
 
-    def observe(self, state: WorldState) -> dict[str, Array]:
+    def observe(self, state: State) -> dict[str, Array]:
         """See the table of the class."""
-        return self.seen(state, self.target()[1], *self.around(state))
+        return self.build_observation(state, self.target()[1], *self.neighbour_observation(state))
 
     def goal_velocity(self) -> Array:
         """That of the target."""
         return self.target()[1]
 
-    def goal(self, state: WorldState) -> Array:
+    def goal(self, state: State) -> Array:
         """The place of each drone about the target."""
         return self.slots_at(self._slots, state) + self.target()[0]

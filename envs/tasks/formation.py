@@ -5,8 +5,9 @@ from typing import Final, Literal
 
 import numpy as np
 
-from ...sim import Array, Draw, InitialState, WorldState
+from ...sim import Array, Draw, InitialState
 from ..spec import Metric
+from ..state import State
 from .swarm import JITTER, Swarm, SwarmOptions, grid, line, ring
 
 Formed = Literal["ring", "line", "grid"]
@@ -77,13 +78,12 @@ class Formation(Swarm):
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """At rest, level, in the cells of a grid by lot."""
         position = self.cells(draw)
-        self.hear(mask, draw, position)
         return InitialState(position=position)
 
-    def observe(self, state: WorldState) -> dict[str, Array]:
+    def observe(self, state: State) -> dict[str, Array]:
         """See the table of the class."""
-        return self.seen(state, *self.around(state))
+        return self.build_observation(state, *self.neighbour_observation(state))
 
-    def goal(self, state: WorldState) -> Array:
+    def goal(self, state: State) -> Array:
         """The place of each drone."""
         return self.slots_at(self._slots, state)

@@ -8,16 +8,17 @@ import numpy as np
 
 from ...models.errors import expect
 from ...models.fields import Limits
-from ...sim import Array, Draw, InitialState, WorldState, component, stack
+from ...sim import Array, Draw, InitialState, component, stack
 from ..spec import Metric
-from .flight import (
+from ..state import State
+from .goal import (
     AIR,
     ERROR_SCALE,
     FURTHEST,
     LEAST_TILT_COSINE,
     RATE_WEIGHT,
     TERMINATION_REWARD,
-    Flight,
+    GoalTask,
     Point,
     at,
     axes,
@@ -52,7 +53,7 @@ class HoverOptions(TaskOptions):
         expect(self.flight_band > least, "flight_band", expected, f"{self.flight_band!r}")
 
 
-class Hover(Flight):
+class Hover(GoalTask):
     """Hold a position and a heading, each rotor on its own, from tilted starts.
 
     ## Observation, `float32`, shape (15 + R,)
@@ -99,7 +100,7 @@ class Hover(Flight):
         expected = f"a height of at least {least:g} m above the ground"
         expect(options.goal[2] >= least, "goal", expected, f"{options.goal[2]:g}")
         self.wanted = math.radians(options.heading)
-        self.describe(options.flight_band)
+        self.define_observation(options.flight_band)
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """At rest near the goal, tilted and turned."""
@@ -116,18 +117,18 @@ class Hover(Flight):
         goal = stack([0.0 * tilt + value for value in options.goal])
         return InitialState(position=goal + offset, quaternion=quaternion)
 
-    def observe(self, state: WorldState) -> dict[str, Array]:
+    def observe(self, state: State) -> dict[str, Array]:
         """See the table of the class."""
-        return self.seen(state)
+        return self.build_observation(state)
 
-    def outcome(self, state: WorldState) -> Outcome:
+    def outcome(self, state: State) -> Outcome:
         """Nearness to goal and heading; the end at a crash, a flip-over, or outside the band."""
         distance = length(self.goal(state) - state.position)
         nose, _ = axes(state.quaternion)
         off = np.atan2(component(nose, 1), component(nose, 0)) - self.wanted
         heading = np.atan2(np.sin(off), np.cos(off)) * (180 / math.pi)
         outside = distance > self.options.flight_band
-        terminated = outside | state.touching[()] | (state.tilt_cosine < LEAST_TILT_COSINE)
+        terminated = outside | state.touching | (state.tilt_cosine < LEAST_TILT_COSINE)
         return Outcome(
             reward={
                 "position": (ERROR_SCALE - distance) / (ERROR_SCALE + distance),
@@ -139,6 +140,6 @@ class Hover(Flight):
             metrics={"position_error": distance, "heading_error": heading},
         )
 
-    def goal(self, state: WorldState) -> Array:
+    def goal(self, state: State) -> Array:
         """The same for every drone."""
         return at(self.options.goal, state)

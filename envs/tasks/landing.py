@@ -8,9 +8,10 @@ import numpy as np
 
 from ...models.errors import expect
 from ...models.fields import Limits, NumberOrPair
-from ...sim import Array, Draw, InitialState, WorldState, component, each, plain, square_root, stack
+from ...sim import Array, Draw, InitialState, component, each, square_root, stack
 from ..spec import Mark, Metric
-from .flight import LEAST_TILT_COSINE, RATE_WEIGHT, Flight, length
+from ..state import State
+from .goal import LEAST_TILT_COSINE, RATE_WEIGHT, GoalTask, length
 from .task import Outcome, TaskOptions
 
 MATCHING_TIME: Final = 0.5  # Progress that 1 m/s less relative speed is worth, over 1 m less way, s
@@ -67,7 +68,7 @@ class LandingOptions(TaskOptions):
         return speed if isinstance(speed, tuple) else (speed, speed)
 
 
-class Landing(Flight):
+class Landing(GoalTask):
     """Touch down on a moving pad: inside it, slowly, and upright.
 
     The pad is a mark at height 0, no body of its own: what touches it touches the ground, and does
@@ -135,18 +136,13 @@ class Landing(Flight):
         """See the class."""
         options = self.options
         fastest = options.pad_speeds[1] + 0.001
-        self.describe(
+        self.define_observation(
             options.flight_band, [(f"velocity of the pad {axis}", "m/s", fastest) for axis in "xy"]
         )
         self._least_upright = math.cos(math.radians(options.tilt))
         self._height = self.vehicle.rest_height
         below = (0.0, 0.0, -self._height)
         self.marks = (Mark(shape="disc", size=options.pad_radius, position=below, moves=True),)
-        # The pad: phase (rad), its rate (rad/s), direction of the line, and the side of a circle.
-        self._phase = self._rate = self._cosine = self._sine = self._side = 0.0
-        # Of the last step: velocity, cosine of the tilt, potential; the first two before contact.
-        self._velocity = self._upright = self._potential = 0.0
-        self._arrival = self._arrival_upright = self._progress = 0.0
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """Level and at rest above the pad's path."""
@@ -157,40 +153,37 @@ class Landing(Flight):
         side = draw.uniform(-1.0, 1.0)
         zero = 0.0 * phase
         circle = options.motion == "circle"
-        self.keep(
-            mask,
-            _phase=phase,
-            _rate=speed / options.pad_path,
-            _cosine=np.cos(direction),
-            _sine=np.sin(direction),
-            _side=np.where(side < 0, zero - 1.0, zero + 1.0) if circle else zero,
-        )
+        memory = self.memory
+        memory.phase, memory.rate = phase, speed / options.pad_path  # rad, rad/s
+        memory.cosine, memory.sine = np.cos(direction), np.sin(direction)  # of the line
+        memory.side = np.where(side < 0, zero - 1.0, zero + 1.0) if circle else zero
         position = stack((zero, zero, zero + self._height + options.start_height)) + offset
-        rest, level = 0.0 * position, zero + 1.0
-        potential = self._potential_of(position, rest)
-        self.keep(mask, _velocity=rest, _upright=level, _potential=potential)
-        self.keep(mask, _arrival=rest, _arrival_upright=level, _progress=zero)
+        rest = 0.0 * position
+        # Velocity and cosine of the tilt after the last step, and before contact.
+        memory.velocity = memory.arrival = rest
+        memory.upright = memory.arrival_upright = 1.0
+        memory.potential, memory.progress = self._potential_of(position, rest), 0.0
         return InitialState(position=position)
 
-    def remember(self, state: WorldState, mask: Array) -> None:
+    def update_memory(self, state: State) -> None:
         """Move the pad; keep speed and tilt from before contact, and what was won on the way."""
-        touching = state.touching
-        self.keep(mask, _phase=self._phase + self._rate * self.control_period)
-        velocity = np.where(each(touching), self._velocity, state.velocity)
-        upright = np.where(touching, self._upright, state.tilt_cosine)
-        potential = self._potential_of(state.position, velocity)
-        self.keep(mask, _arrival=velocity, _arrival_upright=upright)
-        self.keep(mask, _progress=potential - self._potential, _potential=potential)
-        self.keep(mask, _velocity=state.velocity, _upright=state.tilt_cosine)
+        memory, touching = self.memory, state.touching
+        memory.phase = memory.phase + memory.rate * self.control_period
+        memory.arrival = np.where(each(touching), memory.velocity, state.velocity)
+        memory.arrival_upright = np.where(touching, memory.upright, state.tilt_cosine)
+        potential = self._potential_of(state.position, memory.arrival)
+        memory.progress = potential - memory.potential
+        memory.potential = potential
+        memory.velocity, memory.upright = state.velocity, state.tilt_cosine
 
-    def observe(self, state: WorldState) -> dict[str, Array]:
+    def observe(self, state: State) -> dict[str, Array]:
         """See the table of the class."""
-        return self.seen(state, *self._pad()[1])
+        return self.build_observation(state, *self._pad()[1])
 
-    def outcome(self, state: WorldState) -> Outcome:
+    def outcome(self, state: State) -> Outcome:
         """Progress and the end: a landing, a crash, a flip-over, or outside the band."""
-        options, touching = self.options, plain(state.touching)
-        speed = self._relative(self._arrival)
+        options, touching = self.options, state.touching
+        speed = self._relative(self.memory.arrival)
         away = self.goal(state) - state.position
         x, y = component(away, 0), component(away, 1)
         distance = square_root(x * x + y * y)
@@ -200,13 +193,13 @@ class Landing(Flight):
             & (distance <= options.pad_radius)
             & (-speed[2] <= options.sink)
             & (drift <= options.drift)
-            & (self._arrival_upright >= self._least_upright)
+            & (self.memory.arrival_upright >= self._least_upright)
         )
         outside = length(away) > options.flight_band
         terminated = touching | outside | (state.tilt_cosine < LEAST_TILT_COSINE)
         return Outcome(
             reward={
-                "progress": self._progress,
+                "progress": self.memory.progress,
                 "time": -TIME_COST,
                 "rates": -RATE_WEIGHT * length(state.body_rates),
                 "landing": landed * LANDING_REWARD,
@@ -220,7 +213,7 @@ class Landing(Flight):
             },
         )
 
-    def goal(self, state: WorldState) -> Array:
+    def goal(self, state: State) -> Array:
         """The pad's centre, at the height of a craft that stands on it."""
         return self._goal()
 
@@ -231,16 +224,16 @@ class Landing(Flight):
     def _pad(self) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         """Position, m, and velocity, m/s, of the pad's centre, x and y, world frame."""
         path = self.options.pad_path
-        c, s = path * np.cos(self._phase), path * np.sin(self._phase)
+        c, s = path * np.cos(self.memory.phase), path * np.sin(self.memory.phase)
 
         def turned(along: Array, across: Array) -> tuple[Array, Array]:
-            across = self._side * across
+            across = self.memory.side * across
             return (
-                self._cosine * along - self._sine * across,
-                self._sine * along + self._cosine * across,
+                self.memory.cosine * along - self.memory.sine * across,
+                self.memory.sine * along + self.memory.cosine * across,
             )
 
-        return turned(c, s), turned(-self._rate * s, self._rate * c)
+        return turned(c, s), turned(-self.memory.rate * s, self.memory.rate * c)
 
     def _relative(self, velocity: Array) -> tuple[Array, Array, Array]:
         """A velocity, (..., 3), as the pad sees it, m/s."""

@@ -12,16 +12,15 @@ from ...sim import (
     Array,
     Draw,
     InitialState,
-    WorldState,
     component,
     each,
-    plain,
     square_root,
     stack,
 )
 from ..config import EnvConfig
 from ..spec import Metric
-from .flight import (
+from ..state import State
+from .goal import (
     AIR,
     ERROR_SCALE,
     FURTHEST,
@@ -30,7 +29,7 @@ from .flight import (
     RATE_WEIGHT,
     SWING_WEIGHT,
     TERMINATION_REWARD,
-    Flight,
+    GoalTask,
     Point,
     at,
     length,
@@ -65,7 +64,7 @@ class PayloadHoverOptions(TaskOptions):
         expect(self.flight_band > least, "flight_band", expected, f"{self.flight_band!r}")
 
 
-class PayloadHover(Flight):
+class PayloadHover(GoalTask):
     """Hold a payload on a cable at a point, and damp its swing.
 
     The payload is the effect of that name, a ball on a tendon that is slack below its length. The
@@ -124,7 +123,7 @@ class PayloadHover(Flight):
         least = payload_radius(mass) + AIR + options.start_band
         expected = f"a height of at least {least:.4g} m above the ground"
         expect(options.goal[2] >= least, "goal", expected, f"{options.goal[2]:g}")
-        self.describe(
+        self.define_observation(
             options.flight_band,
             [
                 *((f"payload - position {axis}", "m", 2 * options.cable) for axis in "xyz"),
@@ -156,14 +155,14 @@ class PayloadHover(Flight):
             thrust=carrying + each(zero),
         )
 
-    def observe(self, state: WorldState) -> dict[str, Array]:
+    def observe(self, state: State) -> dict[str, Array]:
         """See the table of the class."""
         x, y, z = self.options.goal
         goal = at((x, y, z + self.options.cable), state)
         hung, moving = state.payload - state.position, state.payload_velocity - state.velocity
-        return self.seen(state, hung, moving, goal=goal)
+        return self.build_observation(state, hung, moving, goal=goal)
 
-    def outcome(self, state: WorldState) -> Outcome:
+    def outcome(self, state: State) -> Outcome:
         """Nearness of the payload, its swing; the end at contact, a flip-over, or too far away."""
         distance = length(self.goal(state) - state.payload)
         hung = state.position - state.payload
@@ -171,7 +170,7 @@ class PayloadHover(Flight):
         swing = np.atan2(square_root(x * x + y * y), z) * (180 / math.pi)
         outside = distance > self.options.flight_band
         flipped = state.tilt_cosine < LEAST_TILT_COSINE
-        terminated = outside | plain(state.touching) | flipped
+        terminated = outside | state.touching | flipped
         moving = length(state.payload_velocity - state.velocity)
         return Outcome(
             reward={
@@ -184,6 +183,6 @@ class PayloadHover(Flight):
             metrics={"payload_error": distance, "swing": swing},
         )
 
-    def goal(self, state: WorldState) -> Array:
+    def goal(self, state: State) -> Array:
         """Of the payload, the same for every drone."""
         return at(self.options.goal, state)

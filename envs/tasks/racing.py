@@ -16,7 +16,6 @@ from ...sim import (
     Array,
     Draw,
     InitialState,
-    WorldState,
     clip,
     component,
     each,
@@ -24,16 +23,18 @@ from ...sim import (
     stack,
 )
 from ..spec import Mark, Metric
-from .flight import (
+from ..state import State
+from .goal import (
     AIR,
     COURSE_RATE_WEIGHT,
     COURSE_TERMINATION_REWARD,
     FURTHEST,
     LEAST_TILT_COSINE,
     PASSING_REWARD,
-    Flight,
+    GoalTask,
     Point,
     length,
+    row_of,
 )
 from .task import Outcome, TaskOptions
 
@@ -86,7 +87,7 @@ class RacingOptions(TaskOptions):
         object.__setattr__(self, "track", json.dumps(content, separators=(",", ":")))
 
 
-class Racing(Flight):
+class Racing(GoalTask):
     """Pass the gates of a track in their order and direction, as fast as possible.
 
     Gates are not solid: they are lines in the air, and a craft that misses one has to come back.
@@ -167,7 +168,7 @@ class Racing(Flight):
         corners = np.vstack((centers, self._start.position))
         reach = float(np.linalg.norm(np.ptp(corners, axis=0))) + 2 * self.options.margin
         after = [(f"gate after - position {axis}", "m", reach) for axis in "xyz"]
-        self.describe(
+        self.define_observation(
             reach / 2,
             [
                 *((f"direction of the gate {axis}", "1", 1.001) for axis in "xy"),
@@ -176,10 +177,6 @@ class Racing(Flight):
                 ("half size of the gate", "m", float(halves.max()) + 0.001),
             ],
         )
-        self._passed = self._time = self._lap = self._lap_began = 0.0
-        self._progress = self._passing = self._off = 0.0
-        self._position: Array = 0.0  # before the last step
-        self._behind: Array = 0.0  # where the way to the next gate began
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """At rest near the start, the nose along the track."""
@@ -188,16 +185,19 @@ class Racing(Flight):
         zero = 0.0 * plain(offset[..., 0])
         position = stack([zero + x for x in self._start.position]) + offset
         half = math.radians(self._start.heading) / 2
-        self.keep(mask, _position=position, _behind=position)
-        names = ("_passed", "_time", "_lap", "_lap_began", "_progress", "_passing", "_off")
-        self.keep(mask, **dict.fromkeys(names, zero))
+        memory = self.memory
+        memory.position = position  # before the last step
+        memory.behind = position  # where the way to the next gate began
+        memory.passed = memory.passing = memory.progress = memory.off = 0.0
+        memory.lap = memory.lap_began = 0.0
         turn = stack((zero + math.cos(half), zero, zero, zero + math.sin(half)))
         return InitialState(position=position, quaternion=turn)
 
-    def remember(self, state: WorldState, mask: Array) -> None:
+    def update_memory(self, state: State) -> None:
         """Whether the gate was passed, how much nearer it came, and the times of rounds."""
-        now, before = state.position + 0.0, self._position
-        gate = self._gate(self._passed)
+        memory = self.memory
+        now, before = state.position, memory.position
+        gate = self._gate(memory.passed)
         center = gate[..., :3]
         x, y, half = (component(gate, i) for i in (3, 4, 5))
         a, b = before - center, now - center
@@ -207,26 +207,25 @@ class Racing(Flight):
         at = a + share * (b - a)
         aside = component(at, 1) * x - component(at, 0) * y
         inside = (abs(aside) <= half) & (abs(component(at, 2)) <= half)
-        left = self._passed < self._total
+        left = memory.passed < self._total
         passing = plain(through & inside & left) * 1.0
-        progress = plain(length(a) - length(b))
-        passed, time = self._passed + passing, self._time + self.control_period
+        passed = memory.passed + passing
         whole = (passing > 0.5) & (passed % self._count == 0.0)
-        way, come = center - self._behind, now - self._behind
+        way, come = center - memory.behind, now - memory.behind
         along = plain(np.sum(come * way, axis=-1)) / (plain(np.sum(way * way, axis=-1)) + 1e-12)
-        off = plain(length(come - each(clip(along, 0.0, 1.0)) * way))
-        behind_now = np.where(each(passing > 0.5), center, self._behind)
-        self.keep(
-            mask, _passed=passed, _time=time, _passing=passing, _progress=progress, _off=off,
-            _lap=plain(np.where(whole, time - self._lap_began, self._lap)),
-            _lap_began=plain(np.where(whole, time, self._lap_began)),
-            _position=now, _behind=behind_now,
-        )  # fmt: skip
+        behind_now = np.where(each(passing > 0.5), center, memory.behind)
+        memory.off = length(come - each(clip(along, 0.0, 1.0)) * way)
+        memory.progress = length(a) - length(b)
+        memory.passed, memory.passing = passed, passing
+        memory.lap = np.where(whole, state.time - memory.lap_began, memory.lap)
+        memory.lap_began = np.where(whole, state.time, memory.lap_began)
+        memory.position, memory.behind = now, behind_now
 
-    def observe(self, state: WorldState) -> dict[str, Array]:
+    def observe(self, state: State) -> dict[str, Array]:
         """See the table of the class."""
-        gate, after = self._gate(self._passed), self._gate(self._passed + 1.0)
-        return self.seen(
+        passed = self.memory.passed
+        gate, after = self._gate(passed), self._gate(passed + 1.0)
+        return self.build_observation(
             state,
             gate[..., 3:5],
             after[..., :3] - state.position,
@@ -234,35 +233,31 @@ class Racing(Flight):
             plain(gate[..., 5]),
         )
 
-    def outcome(self, state: WorldState) -> Outcome:
+    def outcome(self, state: State) -> Outcome:
         """Progress to the next gate; the end at the last one, or off the track."""
-        left = self._total - self._passed
+        memory = self.memory
+        left = self._total - memory.passed
         flipped = state.tilt_cosine < LEAST_TILT_COSINE
-        crashed = (self._off > self.options.margin) | plain(state.touching) | flipped
+        crashed = (memory.off > self.options.margin) | state.touching | flipped
         return Outcome(
             reward={
-                "progress": self._progress,
-                "passing": PASSING_REWARD * self._passing,
+                "progress": memory.progress,
+                "passing": PASSING_REWARD * memory.passing,
                 "rates": -COURSE_RATE_WEIGHT * length(state.body_rates),
                 "termination": (crashed & (left > 0.5)) * COURSE_TERMINATION_REWARD + 0.0,
             },
             terminated=crashed | (left < 0.5),
-            metrics={"gates_left": left, "flight_time": self._time, "lap_time": self._lap},
+            metrics={"gates_left": left, "flight_time": state.time, "lap_time": memory.lap},
         )
 
-    def goal(self, state: WorldState) -> Array:
+    def goal(self, state: State) -> Array:
         """The centre of the next gate."""
-        return self._gate(self._passed)[..., :3] + 0.0 * state.position
+        return self._gate(self.memory.passed)[..., :3] + 0.0 * state.position
 
     def _gate(self, passed: Array) -> Array:
         """The gate that is due after so many, shape (..., 6); after the last that one."""
-        number = np.where(passed < self._total, passed, 1.0 * self._total - 1.0)
-        number = plain(number) % self._count
-        rows = self._gates
-        chosen = rows[0]
-        for index in range(1, self._count):
-            chosen = np.where(each(number >= index), rows[index], chosen)
-        return chosen
+        number = np.minimum(passed, self._total - 1.0) % self._count
+        return row_of(self._gates, number)
 
 
 def read_track(given: Any) -> tuple[list[Gate], Start]:

@@ -12,14 +12,13 @@ from ...sim import (
     Array,
     Draw,
     InitialState,
-    WorldState,
     component,
-    plain,
     square_root,
     stack,
 )
 from ..spec import Metric
-from .flight import AIR, RATE_WEIGHT, Flight, Point, at, length
+from ..state import State
+from .goal import AIR, RATE_WEIGHT, GoalTask, Point, at, length
 from .task import Outcome, TaskOptions
 
 ERROR_SCALE: Final = 1.0  # Distance at which the reward for nearness crosses zero, m
@@ -58,7 +57,7 @@ class RecoveryOptions(TaskOptions):
         expect(self.flight_band > self.near, "flight_band", expected, f"{self.flight_band!r}")
 
 
-class Recovery(Flight):
+class Recovery(GoalTask):
     """Thrown at any attitude, moving and spinning: turn upright and come back to rest.
 
     ## Observation, `float32`, shape (12 + R,) or (15 + R,)
@@ -140,9 +139,8 @@ class Recovery(Flight):
         self.body = options.frame == "body"
         if options.frame is None:
             self.body = self.action in ("rotors", "rates")
-        self.describe(options.flight_band)
+        self.define_observation(options.flight_band)
         self._least_upright = math.cos(math.radians(options.upright))
-        self._time = self._missed = self._lowest = 0.0  # s, s, m
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """At the goal, thrown."""
@@ -160,7 +158,8 @@ class Recovery(Flight):
         velocity = stack((level * np.cos(azimuth), level * np.sin(azimuth), climb * speed))
         rates = draw.uniform(-1.0, 1.0, (3,))
         zero = 0.0 * share
-        self.keep(mask, _time=zero, _missed=zero, _lowest=zero + options.goal[2])
+        self.memory.missed = 0.0  # time of the last step that was not recovered, s
+        self.memory.lowest = options.goal[2]  # m
         return InitialState(
             position=stack([zero + value for value in options.goal]),
             quaternion=quaternion,
@@ -168,21 +167,20 @@ class Recovery(Flight):
             body_rates=rates * self.spin,
         )
 
-    def remember(self, state: WorldState, mask: Array) -> None:
-        """Time, the last step that was not recovered, and the lowest point."""
-        height = component(state.position, 2)
-        self.keep(mask, _time=self._time + self.control_period)
-        self.keep(mask, _missed=np.where(self._recovered(state), self._missed, self._time))
-        self.keep(mask, _lowest=np.where(height < self._lowest, height, self._lowest))
+    def update_memory(self, state: State) -> None:
+        """The last step that was not recovered, and the lowest point."""
+        memory, height = self.memory, component(state.position, 2)
+        memory.missed = np.where(self._recovered(state), memory.missed, state.time)
+        memory.lowest = np.minimum(height, memory.lowest)
 
-    def observe(self, state: WorldState) -> dict[str, Array]:
+    def observe(self, state: State) -> dict[str, Array]:
         """See the tables of the class."""
-        return self.seen(state)
+        return self.build_observation(state)
 
-    def outcome(self, state: WorldState) -> Outcome:
+    def outcome(self, state: State) -> Outcome:
         """Nearness to the goal, tilt and spin; the end at a crash or outside the band."""
         distance = length(self.goal(state) - state.position)
-        terminated = (distance > self.options.flight_band) | plain(state.touching)
+        terminated = (distance > self.options.flight_band) | state.touching
         return Outcome(
             reward={
                 "position": (ERROR_SCALE - distance) / (ERROR_SCALE + distance),
@@ -193,17 +191,17 @@ class Recovery(Flight):
             terminated=terminated,
             metrics={
                 "recovered": self._recovered(state) * 1.0,
-                "recovery_time": self._missed,
-                "height_lost": self.options.goal[2] - self._lowest,
+                "recovery_time": self.memory.missed,
+                "height_lost": self.options.goal[2] - self.memory.lowest,
                 "position_error": distance,
             },
         )
 
-    def goal(self, state: WorldState) -> Array:
+    def goal(self, state: State) -> Array:
         """The same for every drone."""
         return at(self.options.goal, state)
 
-    def _recovered(self, state: WorldState) -> Array:
+    def _recovered(self, state: State) -> Array:
         """Whether it is near, slow and upright, bool, shape (W, A)."""
         options = self.options
         near = length(self.goal(state) - state.position) < options.near

@@ -1,29 +1,28 @@
 """What tasks for several drones share: who hears whom by radio, and the room between drones."""
 
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 import numpy as np
 
 from ...models.errors import expect
 from ...models.fields import Limits
-from ...sim import Array, Draw, WorldState, numbers_of
-from ..delay import Delay
-from .flight import (
+from ...sim import Array, Draw
+from ..state import State
+from .goal import (
     AIR,
     FURTHEST,
     LEAST_TILT_COSINE,
     MOST_SPEED,
     RATE_WEIGHT,
     TERMINATION_REWARD,
-    Flight,
+    GoalTask,
     Point,
     length,
 )
 from .task import Outcome, TaskOptions
 
 MOST_DRONES: Final = 128
-FORGOTTEN: Final = 1.0  # A drone that was not heard for so long is no neighbour any more, s
 APPROACH_WEIGHT: Final = 0.1  # Of a speed of 1 m/s towards the goal, in each step
 ROOM_WEIGHT: Final = 0.5  # Cost of spheres that touch; nothing from a diameter apart on
 TINY: Final = 1e-9  # m
@@ -50,10 +49,10 @@ class SwarmOptions(TaskOptions):
     """Share of messages that are lost, each for itself: of one drone to another in one step."""
 
 
-class Swarm(Flight):
+class Swarm(GoalTask):
     """Base of tasks that several drones fly, each to a goal of its own, without touching.
 
-    The observation is that of `Flight`, further numbers of the task, and of each neighbour, the
+    The observation is that of `GoalTask`, further numbers of the task, and of each neighbour, the
     nearest first, seven numbers:
 
     | quantity | unit | frame |
@@ -62,7 +61,7 @@ class Swarm(Flight):
     | its velocity minus the own | m/s | world |
     | 1; 0, as all numbers before, where there is none | 1 | |
 
-    A derived class sets `reach` before `prepare`, calls `hear` in `begin`, and has `goal`.
+    A derived class sets `reach` before `prepare`, and has `goal`.
     """
 
     max_drones = MOST_DRONES
@@ -72,7 +71,7 @@ class Swarm(Flight):
     """Furthest distance of a start from its goal, m."""
 
     def prepare(self, more: tuple[tuple[str, str, float], ...] = ()) -> None:
-        """Set `observation`: that of `Flight`, further numbers, and the neighbours."""
+        """Set `observation`: that of `GoalTask`, further numbers, and the neighbours."""
         from ...models.fleet import members_of  # which imports MuJoCo
 
         options, vehicle = self.options, self.vehicle
@@ -88,13 +87,11 @@ class Swarm(Flight):
             told += [(f"{name} - position {axis}", "m", options.radio_range) for axis in "xyz"]
             told += [(f"{name} velocity - velocity {axis}", "m/s", MOST_SPEED) for axis in "xyz"]
             told.append((f"{name} is there", "1", 1.0))
-        self.describe(self.band, [*more, *told])
+        self.define_observation(self.band, [*more, *told])
         spheres = f"; drones with a radius of {vehicle.radius:.7g} m"
         self.observation = tuple(replace(a, frame=a.frame + spheres) for a in self.observation)
-        period = self.control_period
         self._radii = np.array([one.radius for one in members_of(vehicle, self.count)])
-        self.radio = Radio(options, period, self.shape) if self.count > 1 else None
-        self._down: Array = False
+        self.has_radio = self.count > 1
 
     @property
     def gap(self) -> float:
@@ -114,35 +111,22 @@ class Swarm(Flight):
         places = np.argsort(lots, axis=-1, kind="stable")
         return start + grid(self.count)[places] * self.gap
 
-    def hear(self, mask: Array, draw: Draw, position: Array) -> None:
-        """Begin episodes: each drone has heard where those in range start, at rest."""
-        lots = draw.uniform(0.0, 1.0)  # drawn with and without a loss: it moves no start
-        if self.radio is not None:
-            self.radio.begin(mask[..., 0], position, lots)
-            self._down = np.where(mask, False, self._down)
-
-    def remember(self, state: WorldState, mask: Array) -> None:
-        """Listen. One that has crashed is silent."""
-        if self.radio is not None:
-            self._down = np.where(mask, self._down | self.ended(state), self._down)
-            self.radio.step(mask[..., 0], state.position, state.velocity, self._down)
-
-    def around(self, state: WorldState) -> list[Array]:
+    def neighbour_observation(self, state: State) -> list[Array]:
         """The numbers of the neighbours, shape (W, A, 7 k) in all."""
         k = self.options.neighbours
         if not k:
             return []
-        if self.radio is None:
+        if state.neighbours is None:
             nothing = 0.0 * state.position[..., :1]
             return [np.concat([nothing] * (7 * k), axis=-1)]
-        return [self.radio.nearest(state.position, state.velocity, k)]
+        return [state.neighbours.reshape(*self.shape, 7 * k)]
 
-    def ended(self, state: WorldState) -> Array:
+    def ended(self, state: State) -> Array:
         """Whether a drone has touched anything, flipped over, or left for good, bool, (W, A)."""
         outside = length(self.goal(state) - state.position) > self.band
-        return outside | state.touching[()] | (state.tilt_cosine < LEAST_TILT_COSINE)
+        return outside | state.touching | (state.tilt_cosine < LEAST_TILT_COSINE)
 
-    def outcome(self, state: WorldState) -> Outcome:
+    def outcome(self, state: State) -> Outcome:
         """Nearness to the goal, approach and room; the end at a crash, a flip-over, or outside the
         band.
         """
@@ -155,7 +139,7 @@ class Swarm(Flight):
             reward={
                 "position": (near - distance) / (near + distance),
                 "approach": APPROACH_WEIGHT * closing / (distance + TINY),
-                "room": self.narrowness(room),
+                "room": self.proximity_penalty(room),
                 "rates": -RATE_WEIGHT * length(state.body_rates),
                 "termination": ended * TERMINATION_REWARD + 0.0,
             },
@@ -167,107 +151,27 @@ class Swarm(Flight):
         """Velocity of each drone's goal, world frame, m/s, shape (W, A, 3), or 0."""
         return 0.0
 
-    def clearance(self, state: WorldState) -> Array:
+    def clearance(self, state: State) -> Array:
         """Distance between a drone's sphere, of `Vehicle.radius`, and the nearest other, m, (W, A).
 
         Below 0 spheres overlap. A drone alone has the range of its radio.
         """
-        if self.radio is None:
+        if self.count == 1:
             return self.options.radio_range + 0.0 * length(state.velocity)
         apart = length(state.position[:, :, None] - state.position[:, None])
         apart[:, np.arange(self.count), np.arange(self.count)] = np.inf
         return (apart - (self._radii[:, None] + self._radii)).min(axis=-1)
 
-    def narrowness(self, room: Array) -> Array:
+    def proximity_penalty(self, room: Array) -> Array:
         """Reward for a clearance, (W, A): 0 from a diameter on, `-ROOM_WEIGHT` where it is 0."""
         radius = self._radii if self.shape else self.vehicle.radius
         narrow = 1.0 - room / (2 * radius)
         return -ROOM_WEIGHT * narrow * (narrow > 0)
 
-    def slots_at(self, slots: np.ndarray, state: WorldState) -> Array:
+    def slots_at(self, slots: np.ndarray, state: State) -> Array:
         """Offsets of each drone, shape (A, 3), from the center, in the world: (W, A, 3)."""
         places = np.array(self.options.center) + (slots if self.shape else slots[0])
         return places + 0.0 * state.position
-
-
-class Radio:
-    """What each drone of W worlds has heard last of each other.
-
-    Every drone says in every step where it is and how fast it flies. That arrives after
-    `radio_delay` steps, at those within `radio_range` then, unless it is lost. The receiver knows
-    how old it is, and takes it that the sender flew on straight; after `FORGOTTEN` seconds it knows
-    nothing.
-    """
-
-    def __init__(self, options: Any, period: float, shape: tuple[int, ...]) -> None:
-        worlds, count = shape
-        self._options, self._period = options, period
-        self._said = Delay(options.radio_delay)  # position, velocity, silent
-        self._heard = np.zeros((worlds, count, count, 6))  # of receiver and sender
-        self._age = np.full((worlds, count, count), np.inf)  # control steps
-        self._keys = np.zeros((worlds, count), np.uint32)
-        self._steps = np.zeros(worlds, np.uint32)
-        self._own = np.eye(count, dtype=bool)
-
-    def begin(self, mask: np.ndarray, position: np.ndarray, lots: np.ndarray) -> None:
-        """Begin episodes of the worlds of a mask, bool, shape (W,), at rest at these positions.
-
-        Lots, uniform from 0 to 1, shape (W, A), are the keys of what gets lost.
-        """
-        rest = np.concatenate((position, 0.0 * position, 0.0 * position[..., :1]), axis=-1)
-        self._said.begin(mask[:, None, None], rest)
-        near = self._in_range(position, position)
-        self._age[mask] = np.where(near, 0.0, np.inf)[mask]
-        self._heard[mask] = np.broadcast_to(rest[:, None, :, :6], self._heard.shape)[mask]
-        self._keys[mask] = (lots * 2.0**32).astype(np.uint32)[mask]
-        self._steps[mask] = 0
-
-    def step(
-        self, mask: np.ndarray, position: np.ndarray, velocity: np.ndarray, silent: np.ndarray
-    ) -> None:
-        """Let the drones of the worlds of a mask speak and listen."""
-        saying = np.concatenate((position, velocity, silent[..., None]), axis=-1)
-        self._said.push(None if mask.all() else mask[:, None, None], saying)
-        delay = self._options.radio_delay
-        said = self._said.get(np.full(1, delay))
-        arrives = self._in_range(position, said[..., :3]) & (said[:, None, :, 6] == 0)
-        if self._options.radio_loss:
-            arrives &= self._chances() >= self._options.radio_loss
-        arrives &= mask[:, None, None]
-        self._heard = np.where(arrives[..., None], said[:, None, :, :6], self._heard)
-        older = self._age + mask[:, None, None]
-        self._age = np.where(arrives, float(delay), older)
-        self._steps += mask.astype(np.uint32)
-
-    def nearest(self, position: np.ndarray, velocity: np.ndarray, count: int) -> np.ndarray:
-        """Of the nearest that are known: relative position, relative velocity, and 1; else zeros.
-
-        Shape (W, A, 7 count).
-        """
-        time = self._age[..., None] * self._period
-        known = (time[..., 0] <= FORGOTTEN) & ~self._own
-        passed = np.where(known[..., None], time, 0.0)
-        there = self._heard[..., :3] + self._heard[..., 3:] * passed - position[:, :, None]
-        moves = self._heard[..., 3:] - velocity[:, :, None]
-        distance = np.where(known, length(there), np.inf)
-        order = np.argsort(distance, axis=-1, kind="stable")[..., :count, None]
-        told = np.concatenate((there, moves, np.ones_like(there[..., :1])), axis=-1)
-        told = np.where(known[..., None], told, 0.0)
-        chosen = np.take_along_axis(told, order, axis=2)
-        worlds, drones, found, _ = chosen.shape
-        numbers = np.zeros((worlds, drones, count, 7))
-        numbers[:, :, :found] = chosen
-        return numbers.reshape(worlds, drones, 7 * count)
-
-    def _in_range(self, receivers: np.ndarray, senders: np.ndarray) -> np.ndarray:
-        apart = length(senders[:, None] - receivers[:, :, None])
-        return np.asarray(apart <= self._options.radio_range)
-
-    def _chances(self) -> np.ndarray:
-        """Numbers from 0 to 1 of each message of this step, (W, receiver, sender)."""
-        worlds, count = self._keys.shape
-        steps = np.broadcast_to(self._steps[:, None], (worlds, count))
-        return numbers_of("radio", self._keys, steps, count)
 
 
 def ring(count: int) -> np.ndarray:

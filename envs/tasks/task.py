@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from ...models.errors import InputError, UnknownOption
 from ...models.fields import check_fields
-from ...sim import LEVELS, Array, Controller, Draw, InitialState, WorldState, make_controller
+from ...sim import LEVELS, Array, Controller, Draw, InitialState, make_controller
+from ..memory import Memory
 from ..spec import ArraySpec, Mark, Metric
+from ..state import State
 
 if TYPE_CHECKING:
     from ...models.vehicle import Vehicle
@@ -70,10 +72,11 @@ class Task:
     Class attributes:
         Options: Dataclass of the task's options.
         metrics: Measures of how well it is done. The first is the headline.
-        choices: Names of draws that a reset's options may choose.
+        reset_options: Names of draws that a reset's options may choose.
         min_drones, max_drones: Drones of one world; the task separates their starts.
         actions: Action levels at which the task can be flown.
         action, control_period, episode_length: Defaults of an `EnvConfig`.
+        has_radio: Whether drones hear each other: see `stages/radio.py`.
 
     Attributes:
         config: The env's, with what `adjust` added.
@@ -81,6 +84,7 @@ class Task:
         action, control_period, episode_length: Those of the config.
         vehicle: The vehicle of all drones, or a `Fleet`.
         shape: (W, A), or () for a single drone.
+        memory: What lasts from step to step of an episode; nothing else does.
         controller: Turns actions into thrusts: that of the option `action`, unless `setup` sets
             another.
         observation: Specs of one drone's observation; set by `setup`.
@@ -89,10 +93,11 @@ class Task:
 
     Options: ClassVar[type[TaskOptions]] = TaskOptions
     metrics: ClassVar[tuple[Metric, ...]] = ()
-    choices: ClassVar[tuple[str, ...]] = ()
+    reset_options: ClassVar[tuple[str, ...]] = ()
     min_drones: ClassVar[int] = 1
     max_drones: ClassVar[int] = 1
     actions: ClassVar[tuple[str, ...]] = LEVELS
+    has_radio: bool = False
 
     action: str = "rotors"
     control_period: float = 0.02
@@ -113,9 +118,11 @@ class Task:
         assert config.episode_length
         self.action = config.action
         self.control_period, self.episode_length = config.control_period, config.episode_length
+        self.memory: Any = Memory()
         self.controller = of_level = self._of_level()
         self.setup()
         self.config = self.adjust(config)
+        vars(self)["_is_set_up"] = True
         task = type(self)
         ignored = self.controller is not of_level and task.actions is Task.actions
         if ignored and self.action != task.action:
@@ -123,6 +130,15 @@ class Task:
                 f"action: expected {task.action!r}, for the task has a controller, "
                 f"got {self.action!r}"
             )
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Raises `AttributeError` after `setup`: what changes belongs into `memory`."""
+        if "_is_set_up" in vars(self):
+            raise AttributeError(
+                f"{type(self).__name__}.{name}: expected self.memory.{name} = ..., "
+                f"got self.{name} = ... outside setup()"
+            )
+        super().__setattr__(name, value)
 
     def _of_level(self) -> Controller:
         """The controller of the action level."""
@@ -147,27 +163,26 @@ class Task:
     def setup(self) -> None:
         """Set `observation`, from `options` and `vehicle`.
 
-        Also set initial values of an episode's memory, as numbers: `self.target = 0.0`. Raise
-        `InputError` for an option that does not fit the vehicle.
+        Raise `InputError` for an option that does not fit the vehicle. Attributes that are set here
+        are constants.
         """
         raise NotImplementedError
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """Begin episodes: draw their numbers, shape (W, A, ...), and return the drones' starts.
 
-        The mask, bool, shape (W, A), has the worlds that begin one, in the first call all of them.
-        Keep the values of the others: `np.where(mask, new, self.old)`.
+        The mask, bool, shape (W, A), has the drones that begin one. Give numbers for all: starts
+        and memory of the others are kept.
         """
         raise NotImplementedError
 
-    def remember(self, state: WorldState, mask: Array) -> None:
+    def update_memory(self, state: State) -> None:
         """Change the memory of episodes, such as gates that were passed. Optional.
 
-        Called after a step, before `observe`. The mask, bool, shape (W, A), has the drones that
-        flew; keep the values of the others: `np.where(mask, new, self.old)`.
+        Called after a step, before `observe`. The memory of drones that did not fly is kept.
         """
 
-    def observe(self, state: WorldState) -> dict[str, Array]:
+    def observe(self, state: State) -> dict[str, Array]:
         """Observations: an array (W, A, *shape) for each of `observation`, by its name.
 
         Called after every step and reset, and for frozen drones too: change nothing here or in
@@ -176,13 +191,17 @@ class Task:
         """
         raise NotImplementedError
 
-    def outcome(self, state: WorldState) -> Outcome:
+    def outcome(self, state: State) -> Outcome:
         """Reward, end and metrics, after every step and reset.
 
         After a reset the metrics count; reward and end of a drone that did not fly are left out.
         """
         raise NotImplementedError
 
-    def goal(self, state: WorldState) -> Array:
+    def ended(self, state: State) -> Array:
+        """Which drones have crashed, bool, (W, A): their radio is silent. Only with a radio."""
+        raise NotImplementedError
+
+    def goal(self, state: State) -> Array:
         """Positions of the goals, for pictures: world frame, m, shape (W, A, 3). Optional."""
         raise NotImplementedError

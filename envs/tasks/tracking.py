@@ -3,7 +3,6 @@
 import csv
 import json
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final
@@ -15,32 +14,29 @@ from ...models.fields import Limits
 from ...sim import (
     Array,
     Draw,
-    Gains,
     InitialState,
-    WorldState,
     clip,
     component,
     each,
-    plain,
-    stack,
 )
 from ..spec import Metric
-from .flight import (
+from ..state import State
+from .goal import (
     AIR,
     ERROR_SCALE,
     FURTHEST,
     LEAST_TILT_COSINE,
     RATE_WEIGHT,
     TERMINATION_REWARD,
-    Flight,
+    GoalTask,
     Point,
     length,
+    row_of,
 )
 from .task import Outcome, TaskOptions
 
 MOST_SAMPLES: Final = 20_000  # Rows of a file
 MOST_POINTS: Final = 16  # That a minimum-snap trajectory goes through
-PER_PIECE: Final = 32  # Times of a piece of a minimum-snap trajectory at which it is checked
 _KINDS: Final = ("circle", "lemniscate", "snap")
 _EXPECTED: Final = "circle, lemniscate, snap, or a CSV file with columns t, x, y, z"
 
@@ -78,7 +74,7 @@ class TrackingOptions(TaskOptions):
             object.__setattr__(self, "trajectory", rows)
 
 
-class Tracking(Flight):
+class Tracking(GoalTask):
     """Be at the right place at the right time, along a trajectory that can be seen ahead.
 
     ## Observation, `float32`, shape (18 + R + 3 P,) with P = 3 later points (`preview`)
@@ -165,10 +161,7 @@ class Tracking(Flight):
         least = self.vehicle.rest_height + AIR + options.start_band
         expected = f"a height of at least {least:.4g} m above the ground"
         expect(low[2] >= least, "trajectory", expected, f"{low[2]:.4g}")
-        self._box = list(zip(middle.tolist(), box.tolist(), strict=True))
-        self._check_speed()
-        for shares, accelerations in self._asked():
-            self._check_rotors(shares, accelerations)
+        self._box = middle, box
         reach = float(np.linalg.norm(high - low)) + 2 * options.flight_band
         later = [
             (f"reference {number * options.preview_time:g} s later - position {axis}", "m", reach)
@@ -176,115 +169,42 @@ class Tracking(Flight):
             for axis in "xyz"
         ]
         speed = [(f"reference velocity {axis}", "m/s", 100.0) for axis in "xyz"]
-        self.describe(reach / 2, [*speed, *later])
+        self.define_observation(reach / 2, [*speed, *later])
         self._ahead = [
             float(round(number * options.preview_time / step))
             for number in range(1, options.preview + 1)
         ]
-        self._points: list[Array] = [0.0] * (options.points if self._drawn else 0)
-        self._index: Array = 0.0  # row of the table
-
-    def _check_speed(self) -> None:
-        """Raise `InputError` for a trajectory that asks for more thrust than the rotors have."""
-        ratio = self.quickest / self.options.period
-        if self._closed:
-            expected = f"at least {self.quickest:.4g} s, which the rotors' thrust needs"
-            expect(ratio <= 1.0, "period", expected, f"{self.options.period:g}")
-
-    @property
-    def quickest(self) -> float:
-        """Least time of a round that the rotors' thrust allows, s; 0 of a `snap` or a file.
-
-        The largest acceleration a, level, and gravity need a thrust of hypot(a, g) times the mass;
-        a falls with the square of the time. Of a circle a = r (2 π / T)².
-        """
-        if not self._closed:
-            return 0.0
-        times, accelerations = next(self._asked())
-        largest = float(np.linalg.norm(accelerations, axis=1).max())
-        vehicle = self.vehicle
-        lift = float(vehicle.allocation[0] @ vehicle.thrust_high) / vehicle.mass
-        free = math.sqrt(max(lift**2 - vehicle.gravity**2, 1e-12))
-        return float(len(times) * self.control_period * math.sqrt(largest / free))
-
-    def _asked(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Times, s, shape (L,), and accelerations, m/s², shape (L, 3), that may have to be flown.
-
-        Of a file these are the second differences of its rows. Of a `snap` the acceleration at any
-        time, and its change, are largest for points at corners of the box: those are tried.
-        """
-        options, step = self.options, self.control_period
-        if self._closed:
-            after, before = np.roll(self._table, -1, axis=0), np.roll(self._table, 1, axis=0)
-            yield np.arange(len(after)) * step, (after - 2 * self._table + before) / step**2
-        elif self._drawn:
-            times = np.linspace(0.0, 1.0, PER_PIECE * (options.points - 1) + 1)
-            shares, changes = (snap_basis(options.points, times, order) for order in (2, 3))
-            signs = np.sign(np.vstack((shares, changes)).round(6))
-            box = [half for _, half in self._box]
-            for corners in np.unique(np.vstack((signs, -signs)), axis=0):
-                accelerations = shares @ np.outer(corners, box) / options.period**2
-                yield times * options.period, accelerations
-        else:
-            rows = read_samples(options.trajectory)
-            times, places = rows[:, 0], rows[:, 1:]
-            velocities = np.diff(places, axis=0) / np.diff(times)[:, np.newaxis]
-            between = (times[2:] - times[:-2])[:, np.newaxis] / 2
-            yield times[1:-1], np.diff(velocities, axis=0) / between
-
-    def _check_rotors(self, times: np.ndarray, accelerations: np.ndarray) -> None:
-        """Raise `InputError` where the rotors cannot give an acceleration, or turn to it in time.
-
-        Position is a flat output (Mellinger and Kumar, ICRA 2011, section III): the acceleration a
-        needs the collective thrust m |a + g e₃| along a + g e₃, and the craft tilts as fast as that
-        direction turns. The largest rate is that of the level `rates`.
-        """
-        if not len(times):
-            return
-        vehicle = self.vehicle
-        lift = accelerations + np.array((0.0, 0.0, vehicle.gravity))
-        sizes = np.linalg.norm(lift, axis=1)
-        limits = (vehicle.thrust_low, vehicle.thrust_high)
-        low, high = (float(vehicle.allocation[0] @ limit) for limit in limits)
-        _check_within("N of thrust", times, vehicle.mass * sizes, low, high)
-        directions = lift / np.maximum(sizes, 1e-9)[:, np.newaxis]
-        chords = np.linalg.norm(np.diff(directions, axis=0), axis=1)
-        rates = 2 * np.arcsin(np.minimum(chords / 2, 1.0)) / np.diff(times)
-        fastest = min(Gains.of(vehicle, vehicle.timestep).most_rate[:2])
-        _check_within("rad/s of tilt rate", times, np.append(rates, 0.0), 0.0, fastest)
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """Near the beginning of the trajectory, or anywhere on a closed one, at its velocity."""
         band = self.options.start_band
         share = draw.uniform(0.0, 1.0)
         index = np.floor(share * len(self._table)) if self._closed else 0.0 * share
-        index = plain(index)
-        for number in range(len(self._points)):
-            place = draw.uniform(-1.0, 1.0, (3,))
-            new = stack([m + half * place[..., i] for i, (m, half) in enumerate(self._box)])
-            rows = each(mask) if new.ndim > 1 else mask
-            self._points[number] = np.where(rows, new, self._points[number])
-        self.keep(mask, _index=index)
+        if self._drawn:
+            middle, half = self._box
+            places = [draw.uniform(-1.0, 1.0, (3,)) for _ in range(self.options.points)]
+            self.memory.points = np.stack([middle + half * place for place in places], axis=-2)
+        self.memory.index = index  # row of the table
         offset = draw.uniform(-band, band, (3,))
         position, velocity = (self._at(table, 0.0) for table in (self._table, self._rates))
         return InitialState(position=position + offset, velocity=velocity + 0.0 * offset)
 
-    def remember(self, state: WorldState, mask: Array) -> None:
+    def update_memory(self, state: State) -> None:
         """Go on along the trajectory."""
-        self.keep(mask, _index=self._index + 1.0)
+        self.memory.index = self.memory.index + 1.0
 
-    def observe(self, state: WorldState) -> dict[str, Array]:
+    def observe(self, state: State) -> dict[str, Array]:
         """See the table of the class."""
         velocity = self._at(self._rates, 0.0) + 0.0 * state.position
         later = [self._at(self._table, ahead) - state.position for ahead in self._ahead]
-        return self.seen(state, velocity, *later)
+        return self.build_observation(state, velocity, *later)
 
-    def outcome(self, state: WorldState) -> Outcome:
+    def outcome(self, state: State) -> Outcome:
         """Nearness to where it should be; the end at contact, a flip-over, or too far away."""
         distance = length(self.goal(state) - state.position)
         outside = distance > self.options.flight_band
         flipped = state.tilt_cosine < LEAST_TILT_COSINE
-        terminated = outside | plain(state.touching) | flipped
+        terminated = outside | state.touching | flipped
         speed = length(self._at(self._rates, 0.0))
         return Outcome(
             reward={
@@ -296,35 +216,23 @@ class Tracking(Flight):
             metrics={"tracking_error": distance, "reference_speed": speed},
         )
 
-    def goal(self, state: WorldState) -> Array:
+    def goal(self, state: State) -> Array:
         """Where it should be."""
         return self._at(self._table, 0.0) + 0.0 * state.position
 
     def _at(self, table: np.ndarray, ahead: float) -> Array:
         """Row of a table so many steps ahead, of a `snap` times its points: shape (..., 3)."""
-        index = self._index + ahead
+        index = self.memory.index + ahead
         last = float(len(table))
         index = index % last if self._closed else clip(index, 0.0, last - 1.0)
-        rows = table
-        row = rows[int(index) if isinstance(index, float) else np.astype(index, np.int64)]
-        if not self._points:
+        row = row_of(table, index)
+        if not self._drawn:
             return row
-        parts = [each(component(row, k)) * point for k, point in enumerate(self._points)]
-        total = parts[0]
-        for part in parts[1:]:
-            total = total + part
+        total: Array = 0.0
+        for number in range(self.options.points):
+            point = self.memory.points[..., number, :]
+            total = total + each(component(row, number)) * point
         return total
-
-
-def _check_within(
-    what: str, times: np.ndarray, values: np.ndarray, low: float, high: float
-) -> None:
-    """Raise `InputError` with the time and the value that is furthest outside the limits."""
-    outside = np.maximum(values - high, low - values)
-    worst = int(outside.argmax())
-    expected = f"{low:.4g} to {high:.4g} {what}, which the vehicle has"
-    got = f"{values[worst]:.4g} at {times[worst]:.4g} s"
-    expect(outside[worst] <= 1e-6 * high, "trajectory", expected, got)
 
 
 def _circle(phase: np.ndarray, radius: float, rate: float) -> tuple[np.ndarray, np.ndarray]:

@@ -8,20 +8,22 @@ import numpy as np
 
 from ...models.errors import expect
 from ...models.fields import Limits
-from ...sim import Array, Draw, InitialState, WorldState, component, each, plain, stack
+from ...sim import Array, Draw, InitialState, component
 from ..spec import Mark, Metric
-from .flight import (
+from ..state import State
+from .goal import (
     AIR,
     COURSE_RATE_WEIGHT,
     COURSE_TERMINATION_REWARD,
     FURTHEST,
     LEAST_TILT_COSINE,
     PASSING_REWARD,
-    Flight,
+    GoalTask,
     Point,
     Sides,
     at,
     length,
+    row_of,
 )
 from .task import Outcome, TaskOptions
 
@@ -48,7 +50,7 @@ class WaypointsOptions(TaskOptions):
     """An episode terminates when the craft is further outside the box than this, m."""
 
 
-class Waypoints(Flight):
+class Waypoints(GoalTask):
     """Reach points one after the other, as soon as possible; with the last the episode ends.
 
     ## Observation, `float32`, shape (18 + R,)
@@ -107,73 +109,61 @@ class Waypoints(Flight):
         self._sides = tuple(side + options.margin for side in options.box)
         furthest = 2 * math.hypot(*self._sides)
         after = [(f"point after - position {axis}", "m", furthest) for axis in "xyz"]
-        self.describe(furthest / 2, after)
-        self._points: list[Array] = [0.0] * options.points
-        self._reached: Array = 0.0  # points that were
-        self._time: Array = 0.0
-        self._progress = self._passed = self._distance = 0.0
+        self.define_observation(furthest / 2, after)
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """At rest, level, somewhere in the box; the points are drawn alike."""
         options, count = self.options, self.options.points
-        sides = list(zip(options.center, options.box, strict=True))
-        start, *points = (
-            stack([middle + side * share[..., axis] for axis, (middle, side) in enumerate(sides)])
-            for share in [draw.uniform(-1.0, 1.0, (3,)) for _ in range(count + 1)]
-        )
-        rows = each(mask) if start.ndim > 1 else mask
-        both = zip(points, self._points, strict=True)
-        self._points = [np.where(rows, new, old) for new, old in both]
-        distance = plain(length(points[0] - start))
-        zero = 0.0 * distance
-        self.keep(mask, _reached=zero, _time=zero, _progress=zero, _passed=zero, _distance=distance)
+        center, box = np.array(options.center), np.array(options.box)
+        start, *points = [center + box * draw.uniform(-1.0, 1.0, (3,)) for _ in range(count + 1)]
+        memory = self.memory
+        memory.points = np.stack(points, axis=-2)
+        memory.distance = length(points[0] - start)
+        memory.reached = memory.progress = memory.passed = 0.0
         return InitialState(position=start)
 
-    def remember(self, state: WorldState, mask: Array) -> None:
+    def update_memory(self, state: State) -> None:
         """Count the point that was reached, and how much nearer the craft came."""
-        distance = plain(length(self.goal(state) - state.position))
-        left = self._reached < self.options.points
+        memory = self.memory
+        distance = length(self.goal(state) - state.position)
+        left = memory.reached < self.options.points
         passed = (distance < self.options.radius) & left
-        self.keep(
-            mask,
-            _progress=self._distance - distance,
-            _passed=passed * 1.0,
-            _reached=self._reached + passed,
-            _time=self._time + self.control_period,
-        )
-        self.keep(mask, _distance=plain(length(self.goal(state) - state.position)))
+        memory.progress = memory.distance - distance
+        memory.passed = passed * 1.0
+        memory.reached = memory.reached + passed
+        memory.distance = length(self.goal(state) - state.position)
 
-    def observe(self, state: WorldState) -> dict[str, Array]:
+    def observe(self, state: State) -> dict[str, Array]:
         """See the table of the class."""
-        return self.seen(state, self._point(self._reached + 1.0) - state.position)
+        return self.build_observation(
+            state, self._point(self.memory.reached + 1.0) - state.position
+        )
 
-    def outcome(self, state: WorldState) -> Outcome:
+    def outcome(self, state: State) -> Outcome:
         """Progress to the next point; the end at the last one, or far away."""
         options = self.options
-        left = options.points - self._reached
+        memory = self.memory
+        left = options.points - memory.reached
         off = abs(state.position - at(options.center, state))
-        crashed = plain(state.touching) | (state.tilt_cosine < LEAST_TILT_COSINE)
+        crashed = state.touching | (state.tilt_cosine < LEAST_TILT_COSINE)
         for axis, side in enumerate(self._sides):
             crashed = crashed | (component(off, axis) > side)
         finished = left < 0.5
         return Outcome(
             reward={
-                "progress": self._progress,
-                "passing": PASSING_REWARD * self._passed,
+                "progress": memory.progress,
+                "passing": PASSING_REWARD * memory.passed,
                 "rates": -COURSE_RATE_WEIGHT * length(state.body_rates),
                 "termination": (crashed & (left > 0.5)) * COURSE_TERMINATION_REWARD + 0.0,
             },
             terminated=crashed | finished,
-            metrics={"points_left": left, "flight_time": self._time},
+            metrics={"points_left": left, "flight_time": state.time},
         )
 
-    def goal(self, state: WorldState) -> Array:
+    def goal(self, state: State) -> Array:
         """The next point."""
-        return self._point(self._reached)
+        return self._point(self.memory.reached)
 
     def _point(self, index: Array) -> Array:
         """A point by its number from 0, the last for any larger one, shape (..., 3)."""
-        chosen = self._points[0]
-        for number, point in enumerate(self._points[1:], start=1):
-            chosen = np.where(each(index >= number), point, chosen)
-        return chosen
+        return row_of(self.memory.points, np.minimum(index, self.options.points - 1.0))

@@ -13,10 +13,11 @@ from rotorgram.agents import Geometric
 from rotorgram.agents.geometric import swing_gains
 from rotorgram.cli import main
 from rotorgram.envs import register
+from rotorgram.envs.state import State
 from rotorgram.envs.tasks.hover import Hover
 from rotorgram.models import QUAD_XML
 from rotorgram.models.errors import InputError
-from rotorgram.sim import Array, WorldState, component, stack
+from rotorgram.sim import Array, stack
 
 PAYLOAD = "rotorgram/PayloadHover-v0"
 HOVER, MOVING = "rotorgram/Hover-v0", "Moving-v0"
@@ -29,16 +30,8 @@ FILES |= {path.parent.name: path for path in sorted(QUAD_XML.parent.glob("*/*/ve
 class Moving(Hover):
     """A goal that turns on a circle of 1 m, at 1 m/s."""
 
-    def begin(self, mask: Any, draw: Any) -> Any:
-        self.time = 0.0
-        return super().begin(mask, draw)
-
-    def remember(self, state: WorldState, mask: Array) -> None:
-        self.time += 0.02
-
-    def goal(self, state: WorldState) -> Array:
-        zero = 0.0 * component(state.position, 0)
-        return stack((np.cos(self.time) + zero, np.sin(self.time), 5.0))
+    def goal(self, state: State) -> Array:
+        return stack((np.cos(state.time), np.sin(state.time), 5.0))
 
 
 if MOVING not in gym.registry:

@@ -30,7 +30,7 @@ def begun(direction: float = 0.5, phase: float = 0.5, side: float = 1.0, **optio
 
 def moved(task: Any, steps: int, **state: Any) -> Any:
     for _ in range(steps):
-        task.remember(state_of(**state), NOW)
+        task.update_memory(state_of(**state))
     return task
 
 
@@ -124,7 +124,7 @@ def test_drift_is_relative_to_the_pad() -> None:
             state_of(position=(2.0, 0.0, REST + 0.01), velocity=(0.0, speed, -0.2)),
             state_of(position=(2.0, 0.0, REST), velocity=(0.0, 0.0, 0.0), touching=True),
         ):
-            task.remember(state, NOW)
+            task.update_memory(state)
         outcome = task.outcome(state)
         assert outcome.metrics["landed"] == landed
         relative = math.hypot(1.0 - speed, 0.2)
@@ -136,10 +136,10 @@ def test_progress_by_hand() -> None:
     """From 5 m away at rest to 4.5 m away at 2 m/s: -(4.5 + 0.5 · 2) + 5; then 4 m at 1 m/s."""
     task = begun(**STILL, start_height=4.0)  # start at (0, 0, 4.4), the pad at (2, 0, 0.4)
     start = math.hypot(2.0, 4.0)
-    task.remember(state_of(position=(2.0, 4.5, REST), velocity=(2.0, 0.0, 0.0)), NOW)
+    task.update_memory(state_of(position=(2.0, 4.5, REST), velocity=(2.0, 0.0, 0.0)))
     state = state_of(position=(2.0, 4.0, REST), velocity=(0.0, 1.0, 0.0), body_rates=(3.0, 0, 4.0))
     assert task.outcome(state).reward["progress"] == pytest.approx(start - 5.5)
-    task.remember(state, NOW)
+    task.update_memory(state)
     reward = task.outcome(state).reward
     assert reward["progress"] == pytest.approx(5.5 - 4.5)
     assert reward["rates"] == pytest.approx(-0.1)

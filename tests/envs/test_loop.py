@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -160,18 +160,17 @@ class Careless(Task):
 class Counting(Careless):
     """Counts the steps of an episode, in its memory."""
 
-    count: Any = 0.0
-
     def begin(self, mask: Any, draw: Any) -> InitialState:
-        self.count = np.where(mask, 0.0, self.count)
+        self.memory.count = 0.0
         return super().begin(mask, draw)
 
-    def remember(self, state: Any, mask: Any) -> None:
-        self.count = self.count + np.where(mask, 1.0, 0.0)
+    def update_memory(self, state: Any) -> None:
+        self.memory.count = self.memory.count + 1.0
 
     def outcome(self, state: Any) -> Outcome:
         climb = 0.0 * state.velocity[..., 2]
-        return Outcome(reward={"none": climb}, terminated=False, metrics={"climb": self.count})
+        count = {"climb": self.memory.count}
+        return Outcome(reward={"none": climb}, terminated=False, metrics=count)
 
 
 @pytest.mark.parametrize("num_envs", [1, 3])
@@ -346,3 +345,84 @@ def test_a_start_that_is_none(num_envs: int, start: Any, got: str) -> None:
     )
     with pytest.raises(InputError, match=sentence):
         loop.advance(np.zeros((num_envs, 1), np.float32), np.ones(num_envs, bool))
+
+
+# --- what a task sees, and what it remembers ------------------------------------------------------
+
+
+class Watching(Careless):
+    """Keeps the states that it sees."""
+
+    seen: ClassVar[list[Any]] = []
+
+    def outcome(self, state: Any) -> Outcome:
+        self.seen.append(state)
+        return super().outcome(state)
+
+
+def looped(task: type[Task], num_envs: int) -> tuple[Loop, np.ndarray]:
+    register("looped-v0", task)
+    try:
+        loop = Loop("looped-v0", num_envs)
+    finally:
+        gym.registry.pop("looped-v0")
+    loop.advance(np.zeros((num_envs, 1), np.float32), np.ones(num_envs, bool), range(num_envs))
+    return loop, np.full((num_envs, 1), 0.5, np.float32)
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+def test_states_are_safe_to_keep(num_envs: int) -> None:
+    """A task that kept `state.thrust` once saw the simulator's memory (fault 43)."""
+    Watching.seen.clear()
+    loop, actions = looped(Watching, num_envs)
+    heights = [loop.record.state.position[..., 2].tolist()]
+    for _ in range(3):
+        loop.advance(actions)
+        heights.append(loop.record.state.position[..., 2].tolist())
+    assert [state.position[..., 2].tolist() for state in Watching.seen] == heights
+    assert len({str(row) for row in heights}) == 4
+    first, second = Watching.seen[:2]
+    assert np.ptp(second.thrust - first.thrust) == 0.0
+    assert (second.thrust - first.thrust).flat[0] == 5.0  # 10 N for an action of 1
+    with pytest.raises(ValueError, match="read-only"):
+        first.position[..., 2] = 0.0
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+def test_a_task_sees_action_and_time(num_envs: int) -> None:
+    Watching.seen.clear()
+    loop, actions = looped(Watching, num_envs)
+    loop.advance(actions)
+    loop.advance(actions)
+    drones = np.arange(num_envs)
+    loop.advance(actions, drones == 0, None, drones > 0)
+    assert [np.ravel(state.action)[0] for state in Watching.seen] == [0.0, 0.5, 0.5, 0.0]
+    assert [np.ravel(state.steps)[0] for state in Watching.seen] == [0, 1, 2, 0]
+    assert [np.ravel(state.time)[0] for state in Watching.seen] == [0.0, 0.02, 0.04, 0.0]
+    assert np.ravel(Watching.seen[-1].action)[1:].tolist() == [0.5] * (num_envs - 1)
+
+
+def test_a_task_remembers_in_its_memory_alone() -> None:
+    class Forgetful(Careless):
+        def outcome(self, state: Any) -> Outcome:
+            self.last = state.thrust
+            return super().outcome(state)
+
+    with pytest.raises(AttributeError, match=r"^Forgetful.last: expected self.memory.last = "):
+        looped(Forgetful, 2)
+
+    class Late(Careless):
+        def update_memory(self, state: Any) -> None:
+            self.memory.count = 1.0
+
+    loop, actions = looped(Late, 2)
+    with pytest.raises(AttributeError, match=r"^memory.count: expected a value from begin\(\)"):
+        loop.advance(actions)
+
+    class Writing(Counting):
+        def observe(self, state: Any) -> dict[str, Any]:
+            self.memory.count = 2.0
+            return super().observe(state)
+
+    with pytest.raises(AttributeError, match=r"^memory.count: expected to be set in begin\(\)"):
+        looped(Writing, 2)

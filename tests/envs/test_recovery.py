@@ -190,9 +190,9 @@ def test_time_and_height_lost_by_hand() -> None:
     task = begun()
     heights = [19.0, 16.5, 18.0, 19.8, 19.3, 19.7, 20.1, 20.0]
     told = []
-    for height in heights:
-        state = state_of(position=(0.0, 0.0, height))
-        task.remember(state, NOW)
+    for step, height in enumerate(heights, start=1):
+        state = state_of(position=(0.0, 0.0, height), time=0.02 * step)
+        task.update_memory(state)
         metrics = task.outcome(state).metrics
         told.append([metrics[name] for name in ("recovered", "recovery_time", "height_lost")])
     expected = [

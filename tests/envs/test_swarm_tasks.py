@@ -10,21 +10,60 @@ from rotorgram.agents import Orca
 from rotorgram.agents.orca import avoiding, nearest
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.envs.config import EnvConfig
+from rotorgram.envs.memory import Memory
 from rotorgram.envs.parallel import LocalParallelEnv
 from rotorgram.envs.registry import env_spec
-from rotorgram.envs.tasks.swarm import Radio, SwarmOptions, grid, line, ring
+from rotorgram.envs.stages.radio import Radio
+from rotorgram.envs.stages.record import Record
+from rotorgram.envs.state import State
+from rotorgram.envs.tasks.swarm import SwarmOptions, grid, line, ring
 from rotorgram.flights.trajectories import fly_episodes
 from rotorgram.models import InputError, Vehicle
+from rotorgram.sim import Draw, InitialState
 
 TASKS = ("rotorgram/Formation-v0", "rotorgram/Crossing-v0", "rotorgram/Escort-v0")
 ALL_TASKS = (*TASKS, "rotorgram/Cable-v0")
-ALL = np.ones(1, bool)
 PERIOD = 0.02
 
 
-def radio(**options: Any) -> Radio:
-    """Of one world with three drones."""
-    return Radio(SwarmOptions(**options), PERIOD, (1, 3))
+class Heard:
+    """The radio of one world with three drones, which hears what is written out."""
+
+    def __init__(self, **options: Any) -> None:
+        self.silent = SPEAKING
+        self.stage = Radio(SwarmOptions(**options), PERIOD, 3, lambda state: self.silent)
+        self.record: Any = Record((1, 3), Memory())
+
+    def begin(self, position: np.ndarray) -> None:
+        self.record.start = InitialState(position=position)
+        self.record.draw = Lots(None)
+        self.stage.begin(self.record)
+        self.record.flown = np.zeros((1, 3), bool)
+        self._observe(position, STILL)
+
+    def step(self, position: np.ndarray, velocity: np.ndarray) -> None:
+        self.record.flown = None
+        self.record.steps = self.record.steps + 1
+        self._observe(position, velocity)
+
+    def _observe(self, position: np.ndarray, velocity: np.ndarray) -> None:
+        none = np.zeros((1, 3, 4))
+        state = State(
+            position=position, velocity=velocity, quaternion=none, body_rates=none, command=none,
+            thrust=none, touching=SPEAKING, action=none, steps=0, time=0.0,
+        )  # fmt: skip
+        self.record.state = self.record.measured = state
+        self.stage.step(self.record)
+
+    @property
+    def neighbours(self) -> np.ndarray:
+        """Of each drone, shape (3, count, 7)."""
+        return self.record.measured.neighbours[0]
+
+
+class Lots(Draw):
+    def uniform(self, low: Any, high: Any, size: Any = (), *, name: str = "") -> Any:
+        return LOTS
 
 
 PLACES = np.array([[[0.0, 0.0, 5.0], [3.0, 0.0, 5.0], [0.0, 40.0, 5.0]]])
@@ -32,59 +71,55 @@ STILL, LOTS = np.zeros((1, 3, 3)), np.array([[0.1, 0.2, 0.3]])
 SPEAKING = np.zeros((1, 3), bool)
 
 
-def numbers(heard: Radio, position: np.ndarray, count: int = 2) -> np.ndarray:
-    """Of each drone the neighbours, shape (3, count, 7)."""
-    return heard.nearest(position, STILL, count).reshape(3, count, 7)
-
-
 def test_neighbours_are_the_nearest_in_range_by_hand() -> None:
-    heard = radio(radio_range=10.0)
-    heard.begin(ALL, PLACES, LOTS)
-    found = numbers(heard, PLACES)
+    heard = Heard(radio_range=10.0, neighbours=2)
+    heard.begin(PLACES)
+    found = heard.neighbours
     assert found[0].tolist() == [[3, 0, 0, 0, 0, 0, 1], [0] * 7]
     assert found[1].tolist() == [[-3, 0, 0, 0, 0, 0, 1], [0] * 7]
     assert found[2].tolist() == [[0] * 7, [0] * 7]  # out of range
-    wide = radio(radio_range=50.0)
-    wide.begin(ALL, PLACES, LOTS)
-    assert numbers(wide, PLACES, 1)[2, 0].tolist() == [0, -40, 0, 0, 0, 0, 1]  # not that 40.1 away
-    assert wide.nearest(PLACES, STILL, 4).reshape(3, 4, 7)[0, 2:].tolist() == [[0] * 7] * 2
+    wide = Heard(radio_range=50.0, neighbours=1)
+    wide.begin(PLACES)
+    assert wide.neighbours[2, 0].tolist() == [0, -40, 0, 0, 0, 0, 1]  # not that 40.1 away
+    more = Heard(radio_range=50.0, neighbours=4)
+    more.begin(PLACES)
+    assert more.neighbours[0, 2:].tolist() == [[0] * 7] * 2
 
 
 def test_what_is_heard_late_flies_on_straight() -> None:
-    heard = radio(radio_range=10.0, radio_delay=2)
-    heard.begin(ALL, PLACES, LOTS)
+    heard = Heard(radio_range=10.0, radio_delay=2)
+    heard.begin(PLACES)
     moves = STILL.copy()
     moves[0, 1] = 1.0, 0.0, 0.0
     now = PLACES.copy()
     for step in range(1, 5):
         now = now + PERIOD * moves
-        heard.step(ALL, now, moves, SPEAKING)
-        found = numbers(heard, now)[0, 0]
+        heard.step(now, moves)
+        found = heard.neighbours[0, 0]
         # Two steps late it hears of the start at rest, then of the flight.
         velocity = 0.0 if step < 3 else 1.0
-        assert found[:4] == pytest.approx(
-            [3.0 + (step * PERIOD if velocity else 0), 0, 0, velocity]
-        )
+        ahead = step * PERIOD if velocity else 0.0
+        assert found[:4] == pytest.approx([3.0 + ahead, 0, 0, velocity])
 
 
-def test_one_that_is_silent_or_lost_is_forgotten_after_a_second() -> None:
-    for loss, silent in ((1.0, False), (0.0, True)):
-        heard = radio(radio_range=10.0, radio_loss=loss)
-        heard.begin(ALL, PLACES, LOTS)
-        for step in range(52):
-            assert numbers(heard, PLACES)[0, 0, 6] == (step <= 50)
-            heard.step(ALL, PLACES, STILL, np.full((1, 3), silent))
+@pytest.mark.parametrize(("loss", "silent"), [(1.0, False), (0.0, True)])
+def test_one_that_is_silent_or_lost_is_forgotten_after_a_second(loss: float, silent: bool) -> None:
+    heard = Heard(radio_range=10.0, radio_loss=loss)
+    heard.begin(PLACES)
+    heard.silent = np.full((1, 3), silent)
+    for step in range(52):
+        assert heard.neighbours[0, 0, 6] == (step <= 50)
+        heard.step(PLACES, STILL)
 
 
 def test_so_many_messages_are_lost_and_each_for_itself() -> None:
-    heard = radio(radio_range=100.0, radio_loss=0.3)
-    heard.begin(ALL, PLACES, LOTS)
+    heard = Heard(radio_range=100.0, radio_loss=0.3, neighbours=2)
+    heard.begin(PLACES)
     arrived = np.zeros((3, 2, 2000))
     for step in range(2000):  # positions tell which step a message is of
         now = PLACES + np.array((0.0, 0.0, 0.01 * step))
-        heard.step(ALL, now, STILL, SPEAKING)
-        found = heard.nearest(now, STILL, 2).reshape(3, 2, 7)
-        arrived[..., step] = np.abs(found[..., 2]) < 1e-9
+        heard.step(now, STILL)
+        arrived[..., step] = np.abs(heard.neighbours[..., 2]) < 1e-9
     assert arrived.mean(axis=-1) == pytest.approx(0.7, abs=0.05)
     pairs = arrived.reshape(6, -1)
     assert np.abs(np.corrcoef(pairs) - np.eye(6)).max() < 0.1

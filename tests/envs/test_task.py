@@ -38,7 +38,7 @@ def state_of(n: int, **arrays: Any) -> WorldState:
 def task_of(n: int, target: float = 5.0, **options: Any) -> Any:
     config = EnvConfig.from_keywords(ID, **{"target": target, **options})
     task: Any = make_task(config, shape=(n, 1))
-    task.target = np.full((n, 1), target)
+    task.memory.target = np.full((n, 1), target)
     return task
 
 

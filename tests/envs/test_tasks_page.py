@@ -17,7 +17,6 @@ from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec, task_type
 from rotorgram.envs.tasks.racing import RacingOptions
 from rotorgram.envs.tasks.recovery import RecoveryOptions
-from rotorgram.envs.tasks.tracking import Tracking
 from rotorgram.envs.tasks.waypoints import WaypointsOptions
 from rotorgram.models import Vehicle
 
@@ -57,11 +56,6 @@ def test_the_bounds_are_those_that_are_computed() -> None:
     recovery = recovery_bounds(RecoveryOptions(), paper)
     for number, unit in (
         (waypoints_time(WaypointsOptions(), paper), "s"),
-        (Tracking(EnvConfig(env_id=TRACKING), paper).quickest, "s"),
-        (
-            Tracking(EnvConfig(env_id=TRACKING, task={"trajectory": "lemniscate"}), paper).quickest,
-            "s",
-        ),
         (racing_time(RacingOptions(), paper), "s"),
         (racing_time(RacingOptions(track="dive"), paper), "s"),
         (landing_time(4.0, 1.0, paper), "s"),

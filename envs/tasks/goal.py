@@ -11,17 +11,15 @@ from ...models.errors import InputError
 from ...models.fields import Limits
 from ...sim import (
     Array,
-    WorldState,
     clip,
     component,
-    each,
-    plain,
     stack,
     to_body,
     world_z,
 )
 from ..config import EnvConfig
 from ..spec import ArraySpec
+from ..state import State
 from .task import Task
 
 ERROR_SCALE: Final = 0.5  # Distance at which the reward for nearness crosses zero, m
@@ -61,7 +59,7 @@ def with_payload(config: EnvConfig, mass: float, cable: float) -> EnvConfig:
     return replace(config, effects=replace(config.effects, payload=mass, cable=cable))
 
 
-class Flight(Task):
+class GoalTask(Task):
     """Base of tasks that are flown to a goal, with an observation of 15 + R numbers and more.
 
     | index | quantity | unit | frame |
@@ -74,7 +72,8 @@ class Flight(Task):
     | 15... | thrust of each rotor over its hover thrust, minus 1 | 1 | |
 
     Numbers are clipped: positions at twice the flight band, speeds at 100 m/s, rates at 100 rad/s.
-    A derived class calls `describe` in `setup`, `seen` in `observe`, and has `goal`.
+    A derived class calls `define_observation` in `setup` and `build_observation` in `observe`, and
+    has `goal`.
 
     With `body` the first two vectors are in the body frame, and the direction of world z in the
     body frame takes the place of nose and thrust axis: 12 + R numbers that no heading changes.
@@ -85,7 +84,7 @@ class Flight(Task):
     body = False
     """Whether the observation is in the body frame."""
 
-    def describe(self, band: float, more: Sequence[Number] = ()) -> None:
+    def define_observation(self, band: float, more: Sequence[Number] = ()) -> None:
         """Set `observation`: positions up to twice the band, m, and further numbers after them."""
         vehicle = self.vehicle
         vectors = (
@@ -121,7 +120,7 @@ class Flight(Task):
         )
         self._bounds = tuple(np.array(bound) for bound in (low, high))
 
-    def seen(self, state: WorldState, *more: Array, goal: Array = None) -> dict[str, Array]:
+    def build_observation(self, state: State, *more: Array, goal: Array = None) -> dict[str, Array]:
         """The observation; `more` has vectors, shape (..., k), or numbers, in the order described.
 
         The goal, world frame, m, shape (..., 3), is by default that of `goal`.
@@ -147,17 +146,21 @@ class Flight(Task):
         x, y = vectors[..., 0], vectors[..., 1]
         return stack((c * x + s * y, c * y - s * x, vectors[..., 2]))
 
-    def keep(self, mask: Array, **values: Array) -> None:
-        """Set attributes for the drones of a mask, shape (W, A), and leave those of the others."""
-        for name, new in values.items():
-            rows = each(mask) if getattr(new, "ndim", 0) > getattr(mask, "ndim", 0) else mask
-            setattr(self, name, plain(np.where(rows, new, getattr(self, name))))
 
-
-def at(point: Sequence[float], state: WorldState) -> Array:
+def at(point: Sequence[float], state: State) -> Array:
     """A point for every drone, shape (W, A, 3)."""
     zero = 0.0 * component(state.position, 0)
     return stack([zero + value for value in point])
+
+
+def row_of(rows: Array, index: Array) -> Array:
+    """A row for each drone, (W, A, k): of its own, (W, A, rows, k), or of a table, (rows, k)."""
+    if not np.ndim(index):
+        return rows[int(index)]
+    number = index.astype(int)
+    if rows.ndim == 2:
+        return rows[number]
+    return np.take_along_axis(rows, number[..., None, None], axis=-2)[..., 0, :]
 
 
 def length(vectors: Array) -> Array:

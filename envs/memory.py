@@ -1,0 +1,61 @@
+"""The memory of a task."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+
+class Memory:
+    """What a task remembers of its episodes: arrays by name, shape (W, A, ...).
+
+    `Task.begin` makes the names, and `Task.update_memory` changes their values; elsewhere they are
+    read alone. A number stands for all drones. The loop keeps the values of drones that do not
+    fly. Of a single drone, (W, A) is () and numbers are Python's.
+    """
+
+    __slots__ = ("__dict__", "_phase")
+
+    def __init__(self) -> None:
+        object.__setattr__(self, "_phase", "begin")
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Raises `AttributeError` where a task may not change its memory."""
+        if self._phase == "closed":
+            raise AttributeError(
+                f"memory.{name}: expected to be set in begin() or update_memory(), "
+                "got an assignment elsewhere"
+            )
+        if self._phase == "update" and name not in vars(self):
+            raise AttributeError(f"memory.{name}: expected a value from begin() first, got none")
+        array = np.asarray(value)
+        if not array.ndim:
+            vars(self)[name] = array.item()
+            return
+        array = array.view()
+        array.flags.writeable = False
+        vars(self)[name] = array
+
+    def __getattr__(self, name: str) -> Any:
+        """Raises `AttributeError` for a name that is not known."""
+        known = ", ".join(vars(self)) or "none: begin() sets them"
+        raise AttributeError(f"memory.{name}: expected some of {known}")
+
+    def expand(self, shape: tuple[int, ...]) -> None:
+        """Make arrays of shape (W, A) of numbers that stand for all drones."""
+        if not shape:
+            return
+        arrays = vars(self)
+        for name, value in arrays.items():
+            if not np.ndim(value):
+                arrays[name] = np.full(shape, value)
+
+    @contextmanager
+    def open(self, phase: str) -> Iterator[None]:
+        """Let a task change its memory: in the phase `begin`, or `update`."""
+        object.__setattr__(self, "_phase", phase)
+        try:
+            yield
+        finally:
+            object.__setattr__(self, "_phase", "closed")
