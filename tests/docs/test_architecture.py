@@ -95,7 +95,8 @@ def test_a_task_knows_the_world_and_the_spec() -> None:
     assert packages(names) == {"envs", "models", "sim"}
     assert {name for name in ours if ".envs." in name} == {
         "rotorgram.envs.config",
-        "rotorgram.envs.delay",
+        "rotorgram.envs.memory",
+        "rotorgram.envs.state",
         "rotorgram.envs.spec",
         "rotorgram.envs.tasks.flight",
         "rotorgram.envs.tasks.swarm",
