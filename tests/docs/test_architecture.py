@@ -98,7 +98,7 @@ def test_a_task_knows_the_world_and_the_spec() -> None:
         "rotorgram.envs.memory",
         "rotorgram.envs.state",
         "rotorgram.envs.spec",
-        "rotorgram.envs.tasks.flight",
+        "rotorgram.envs.tasks.goal",
         "rotorgram.envs.tasks.swarm",
         "rotorgram.envs.tasks.task",
     }
