@@ -61,7 +61,6 @@ class Record:
     received: NDArray[np.float64]
     actions_sent: NDArray[np.float64]
     thrust: Array
-    chosen: Mapping[str, Array]
     draw: Draw
     start: InitialState
     state: State
