@@ -363,7 +363,7 @@ class Watching(Careless):
 def looped(task: type[Task], num_envs: int) -> tuple[Loop, np.ndarray]:
     register("looped-v0", task)
     try:
-        loop = Loop("looped-v0", num_envs)
+        loop = Loop(EnvConfig(env_id="looped-v0"), num_envs)
     finally:
         gym.registry.pop("looped-v0")
     loop.advance(np.zeros((num_envs, 1), np.float32), np.ones(num_envs, bool), range(num_envs))
