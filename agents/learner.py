@@ -67,6 +67,8 @@ class Learner:
             shape (T,). Other terms are logged under their names.
     """
 
+    epsilon: ClassVar[float] = 1e-8
+    """Added by Adam to the root of the squares."""
     has_critic: ClassVar[bool] = False
     central: ClassVar[bool] = False
     """Whether the critic sees the observations of all drones of a world."""
@@ -82,7 +84,7 @@ class Learner:
         self.weights, self._actor, self.memory = networks.weights, networks.actor, memory
         if networks.critic is not None:
             self._critic = networks.critic
-        self.optimizer, self.rate = Adam(self.weights), config.learning_rate
+        self.optimizer, self.rate = Adam(self.weights, self.epsilon), config.learning_rate
         normalised = config.normalize_observations
         self.moments = Moments(flat_size(self.spec)) if normalised else None
         self.terms: dict[str, Any] = {}

@@ -11,8 +11,8 @@ class MAPPO(PPO):
     """The critic sees all drones of a world, and is needed in training alone.
 
     To judge a drone it sees that drone's observation and then those of the others, from the next
-    one on by their names; zeros for one that is out (the paper's "death masking"). The actor sees
-    what its drone sees, as PPO's.
+    one on by their names; zeros for a drone that is out. The actor sees what its drone sees, as
+    PPO's.
     """
 
     central = True

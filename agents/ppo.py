@@ -52,6 +52,7 @@ class PPO(A2C):
     """
 
     config: PPOConfig
+    epsilon = 1e-5  # as in Stable-Baselines3 and in Schulman's code
 
     def __init__(self, *parts: Any) -> None:
         super().__init__(*parts)

@@ -8,12 +8,12 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 
 from ..models.errors import InputError, require
 from . import learner
-from .a2c import A2CConfig
+from .a2c import A2C, A2CConfig
 from .checkpoints import Checkpoint
 from .episodes import EpisodeLog
 from .networks import named, part_of
 from .policies import ActionMap, NetworkPolicy
-from .ppo import PPOConfig
+from .ppo import PPO, PPOConfig
 from .sac import SACConfig
 
 if TYPE_CHECKING:
@@ -260,6 +260,7 @@ _Made = tuple[type, dict[str, Any], dict[str, Any]]
 
 def _on_policy(config: A2CConfig, steps: int, log: EpisodeLog) -> _Made:
     rollout, hidden = steps * log.num_envs, list(config.hidden)
+    epsilon = (PPO if isinstance(config, PPOConfig) else A2C).epsilon
     settings: dict[str, Any] = {
         "n_steps": steps,
         "gae_lambda": config.gae_lambda,
@@ -270,7 +271,7 @@ def _on_policy(config: A2CConfig, steps: int, log: EpisodeLog) -> _Made:
     policy = {
         "net_arch": {"pi": hidden, "vf": hidden},
         "log_std_init": config.log_std,
-        "optimizer_kwargs": {"eps": 1e-8, "foreach": True},
+        "optimizer_kwargs": {"eps": epsilon, "foreach": True},
     }
     if not isinstance(config, PPOConfig):
         return sb3.A2C, {**settings, "max_grad_norm": float("inf"), "use_rms_prop": False}, policy

@@ -165,6 +165,10 @@ def test_adam_by_hand() -> None:
     weights.slopes[:] = 4, -0.5, 0
     adam.step(np.array([0.1, 0.2, 0.3], np.float32))
     np.testing.assert_allclose(weights.values, [-0.1, 0.2, 0], rtol=1e-6)
+    slow, slower = Adam(weights, 1e-5), weights.values.copy()
+    weights.slopes[:] = 1e-5, 0, 0  # as large as epsilon: half a step
+    slow.step(0.1)
+    np.testing.assert_allclose(weights.values - slower, [-0.05, 0, 0], atol=1e-6)
     kept = adam.arrays()
     np.testing.assert_allclose(kept["second"], [0.016, 0.00025, 0], rtol=1e-6)
     assert kept["steps"] == 1
