@@ -14,11 +14,13 @@ from statistics import NormalDist
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..models.coefficients import COEFFICIENTS
 from ..models.errors import InputError, expect
 from ..models.fields import Limits, check, limits_of
 from .rotations import advanced, between, cross, to_body, to_world, world_z
+from .snapshots import Arrays, Kept, joined, part_of
 from .state import Array, WorldState, clip, component, stack
 
 if TYPE_CHECKING:
@@ -221,7 +223,7 @@ def specific_force(world: "World") -> Array:
     return to_body(state.quaternion, world.acceleration() + gravity)
 
 
-class Sensor:
+class Sensor(Kept):
     """Base of sensors: a model of errors. `values` are all settings, `interval` is in s.
 
     Class attributes:
@@ -274,6 +276,7 @@ class Imu(Sensor):
     """
 
     name, prefix = "imu", ""
+    arrays = ("_bias", "_scale")
     needs = ("gyro_noise", "accelerometer_noise")
     defaults: ClassVar[Mapping[str, float]] = {
         "gyro_walk": 0.0, "gyro_bias": 0.0, "gyro_scale": 0.0, "gyro_range": GYRO_RANGE,
@@ -342,6 +345,7 @@ class Barometer(Sensor):
     """
 
     name, prefix, columns = "barometer", "barometer_", 2
+    arrays = ("_bias",)
     defaults: ClassVar[Mapping[str, float]] = {"walk": 0.0}
     settings = ("altitude",)
     frame = "above sea level"
@@ -454,13 +458,16 @@ _ESTIMATE_READING: Final = Reading(
 # ---- sampling
 
 
-class _Channel:
+class _Channel(Kept):
     """A sensor as it is sampled: rate, delay and dropout.
 
     Attributes:
         value: What is told now, shape (W, A, k).
         fresh: Whether it was not told before, bool, shape (W, A).
     """
+
+    arrays = ("value", "fresh", "_held")
+    lists = ("_late_values", "_late_fresh")
 
     def __init__(self, name: str, values: Mapping[str, Any], world: "World", period: float) -> None:
         self._every, self._lag = values["every"], values["lag"]
@@ -474,7 +481,8 @@ class _Channel:
         self.value: Array = 0.0
         self.fresh: Array = False
         self._held: Array = 0.0
-        self._queue: list[tuple[Array, Array]] = []
+        self._late_values: list[Array] = []  # those on their way, the oldest first
+        self._late_fresh: list[Array] = []
 
     def begin(self, mask: Array) -> None:
         """First reading of the drones of a mask."""
@@ -483,8 +491,10 @@ class _Channel:
         self.value = _chosen(mask, first, self.value)
         self._held = _chosen(mask, first, self._held)
         self.fresh = mask | (self.fresh & ~mask)
-        old = self._queue or [(self.value, self.fresh)] * self._lag
-        self._queue = [(_chosen(mask, first, value), fresh & ~mask) for value, fresh in old]
+        values = self._late_values or [self.value] * self._lag
+        fresh = self._late_fresh or [self.fresh] * self._lag
+        self._late_values = [_chosen(mask, first, value) for value in values]
+        self._late_fresh = [flag & ~mask for flag in fresh]
 
     def sample(self, mask: Array, steps: Array) -> None:
         """After a control step of the drones of a mask; so many steps are behind each drone."""
@@ -498,20 +508,25 @@ class _Channel:
         if not self._lag:
             self.value, self.fresh = self._held, _chosen(mask, fresh, self.fresh)
             return
-        value, told = self._queue[0]
-        self.value, self.fresh = _chosen(mask, value, self.value), _chosen(mask, told, self.fresh)
-        later = [*self._queue[1:], (self._held, fresh)]
-        self._queue = [
-            (_chosen(mask, new, old), _chosen(mask, flag, was))
-            for (new, flag), (old, was) in zip(later, self._queue, strict=True)
-        ]
+        self.value = _chosen(mask, self._late_values[0], self.value)
+        self.fresh = _chosen(mask, self._late_fresh[0], self.fresh)
+        self._late_values = _pushed(mask, self._held, self._late_values)
+        self._late_fresh = _pushed(mask, fresh, self._late_fresh)
 
 
-class Sensors:
+def _pushed(mask: Array, new: Array, late: list[Array]) -> list[Array]:
+    """What is on its way after a step of the drones of a mask, the oldest first."""
+    pairs = zip([*late[1:], new], late, strict=True)
+    return [_chosen(mask, value, old) for value, old in pairs]
+
+
+class Sensors(Kept):
     """The sensors of a world's drones, from `checked_sensors`, at so many s between two samples.
 
     Raises `InputError`.
     """
+
+    arrays = ("_steps",)
 
     def __init__(self, sensors: Mapping[str, Any], world: "World", period: float) -> None:
         self._world = world
@@ -550,6 +565,25 @@ class Sensors:
         if self._estimator is not None:
             self._estimator.update(mask, self._channels)
 
+    def snapshot(self) -> dict[str, NDArray[Any]]:
+        """Copies of all arrays that a later reading depends on, by name."""
+        parts = {name: part.snapshot() for name, part in self._parts().items()}
+        return joined(parts) | super().snapshot()
+
+    def restore(self, arrays: Arrays) -> None:
+        """Put a snapshot back, after that of the world."""
+        super().restore(arrays)
+        for name, part in self._parts().items():
+            part.restore(part_of(arrays, name))
+
+    def _parts(self) -> dict[str, Kept]:
+        parts: dict[str, Kept] = dict(self._channels)
+        for name, channel in self._channels.items():
+            parts[f"{name} errors"] = channel.sensor
+        if self._estimator is not None:
+            parts[_ESTIMATE] = self._estimator
+        return parts
+
     @property
     def readings(self) -> dict[str, Array]:
         """What the observation gets, by name, shapes (W, A, k)."""
@@ -569,7 +603,7 @@ class Sensors:
 # ---- the estimate
 
 
-class Estimator:
+class Estimator(Kept):
     """Complementary filter: what the IMU gives is integrated, and pulled to what measures it.
 
     Attitude: R. Mahony, T. Hamel, J.-M. Pflimlin, "Nonlinear Complementary Filters on the Special
@@ -586,6 +620,8 @@ class Estimator:
         altitude: Of the ground above sea level, m.
         field: Earth's, world frame, shape (3,).
     """
+
+    arrays = ("position", "velocity", "quaternion", "body_rates")
 
     def __init__(
         self,

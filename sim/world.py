@@ -4,6 +4,8 @@ from collections.abc import Mapping, Sequence
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Protocol
 
+from numpy.typing import NDArray
+
 from ..models import BACKENDS, MAX_DRONES, Backend
 from ..models.errors import InputError, expect
 from .effects import EffectOptions
@@ -80,6 +82,12 @@ class World(Protocol):
 
         Infinite where there is none. Geoms of the craft do not count; a payload is a surface.
         """
+
+    def snapshot(self) -> dict[str, NDArray[Any]]:
+        """Copies of all arrays that a later step depends on, by name."""
+
+    def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Put a snapshot back; no step runs. No later bit differs from those that followed it."""
 
     def close(self) -> None:
         """Release threads and memory. The state keeps its numbers; nothing else can be called."""

@@ -4,11 +4,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...models.vehicle import Vehicle
 from ..effects import EffectOptions, Effects
 from ..random import RANDOMIZATION, START, Draw, Random
 from ..randomize import Randomization
+from ..snapshots import Arrays, joined, part_of
 from ..state import Array, InitialState, WorldState, plain
 from ..world import contact_check
 
@@ -27,8 +29,15 @@ class BaseWorld:
         shape: tuple[int, ...],
         effects: EffectOptions | None,
         randomize: Randomization | None,
+        arguments: Mapping[str, Any],
     ) -> None:
         self.vehicle, self.shape = vehicle, shape
+        self._arguments = {
+            **arguments,
+            "vehicle": vehicle,
+            "effects": effects,
+            "randomize": randomize,
+        }
         self.parameters: dict[str, Array] = {}
         self._options, self._randomize = effects or EffectOptions(), randomize
         self._drawn = () if randomize is None else randomize.names
@@ -48,6 +57,37 @@ class BaseWorld:
     def draw(self, mask: Array, chosen: Mapping[str, Array] | None = None) -> Draw:
         """As `World.draw`."""
         return self.random.start(self._start, self._ids(mask), chosen)
+
+    def snapshot(self) -> dict[str, NDArray[Any]]:
+        """As `World.snapshot`."""
+        parts = {"random": self.random.snapshot(), "state": self._snapshot()}
+        parts["parameters"] = {name: np.array(x) for name, x in self.parameters.items()}
+        if self.effects is not None:
+            parts["effects"] = self.effects.snapshot()
+        return joined(parts)
+
+    def restore(self, arrays: Arrays) -> None:
+        """As `World.restore`."""
+        self.random.restore(part_of(arrays, "random"))
+        parameters = part_of(arrays, "parameters")
+        self.parameters = {name: plain(array.copy()) for name, array in parameters.items()}
+        self._restore(part_of(arrays, "state"))
+        if self.effects is not None:
+            self.effects.restore(part_of(arrays, "effects"), self.state, self.parameters)
+
+    def _snapshot(self) -> dict[str, NDArray[Any]]:
+        """Copies of the backend's own arrays."""
+        raise NotImplementedError
+
+    def _restore(self, arrays: Arrays) -> None:
+        """Put those back; the parameters are as they were."""
+        raise NotImplementedError
+
+    def __reduce__(self) -> Any:
+        return _made, (type(self), self._arguments), self.snapshot()
+
+    def __setstate__(self, arrays: Arrays) -> None:
+        self.restore(arrays)
 
     def _ids(self, mask: Array) -> np.ndarray:
         """The worlds of a mask; of a single one it is always true."""
@@ -74,3 +114,8 @@ class BaseWorld:
             given, old = getattr(pose, name), getattr(self.state, name)
             begun[name] = np.where(mask[..., None], default if given is None else given, old)
         return begun
+
+
+def _made(world_class: Any, arguments: Mapping[str, Any]) -> Any:
+    """A copy of a world, before it gets its state."""
+    return world_class(**arguments)

@@ -19,6 +19,7 @@ from ...models.vehicle import SURROUNDINGS, Vehicle, payload_radius
 from ..effects import EffectOptions, Effects
 from ..randomize import Randomization
 from ..rotations import body_z
+from ..snapshots import Arrays
 from ..state import Array, InitialState, WorldState
 from ..world import PhysicsError, check_hung, flown_model
 from .base import BaseWorld
@@ -54,7 +55,8 @@ class MujocoWorld(BaseWorld):
         if type(num_threads) is not int or num_threads < 0:
             raise InputError(f"num_threads: expected 0 or more, got {num_threads!r}")
         lead = (num_worlds, drones) if num_worlds * drones > 1 else ()
-        super().__init__(vehicle, lead, effects, randomize)
+        arguments = {"num_worlds": num_worlds, "drones": drones, "num_threads": num_threads}
+        super().__init__(vehicle, lead, effects, randomize, arguments)
         options, drawn = self._options, self._drawn
         threads = 1 if num_worlds == 1 else num_threads
         model = flown_model(vehicle, drones, options, drawn)
@@ -126,12 +128,7 @@ class MujocoWorld(BaseWorld):
             getattr(state, name)[here] = default if given is None else given[here]
         state.command[here] = state.thrust[here]
         self._draw_parameters(mask)
-        if self._varied.fields:
-            shape = self._touching.shape
-            values = {name: np.reshape(x, shape)[ids] for name, x in self.parameters.items()}
-            for field, rows in self._varied.values(values).items():
-                self._batch.expand(field)[ids] = rows
-            self._batch.set_const(ids)
+        self._vary(ids)
         if self.effects is not None:
             state.thrust[here] = self.effects.begin(mask, state, self.parameters)[here]
         if hung is not None:
@@ -173,6 +170,38 @@ class MujocoWorld(BaseWorld):
             substeps -= self._check
         if self._warnings.tobytes() != self._no_warnings:
             raise PhysicsError(self._describe_warnings())
+
+    def _vary(self, ids: np.ndarray) -> None:
+        """Give the models of some worlds their drawn parameters."""
+        if not self._varied.fields or not self.parameters:
+            return
+        shape = self._touching.shape
+        values = {name: np.reshape(x, shape)[ids] for name, x in self.parameters.items()}
+        for field, rows in self._varied.values(values).items():
+            self._batch.expand(field)[ids] = rows
+        self._batch.set_const(ids)
+
+    def _kept(self) -> dict[str, np.ndarray]:
+        """All that a later step depends on; `mjSTATE_INTEGRATION` has the warm start too."""
+        arrays = {
+            "integration": self._batch.state,
+            "command": self._command,
+            "thrust": self._thrust,
+            "touching": self._touching,
+        }
+        if self._colliding is not None:
+            arrays["colliding"] = self._colliding
+        return arrays
+
+    def _snapshot(self) -> dict[str, np.ndarray]:
+        return {name: array.copy() for name, array in self._kept().items()}
+
+    def _restore(self, arrays: Arrays) -> None:
+        self._check_process()
+        self._vary(np.arange(len(self._touching)))
+        for name, array in self._kept().items():
+            array[...] = arrays[name]
+        self._warnings.fill(0)
 
     def _act(self, effects: Effects, mask: Array | None, some: Any) -> None:
         """Let the effects act on some worlds before a physics step."""

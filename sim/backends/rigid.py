@@ -12,6 +12,7 @@ from ...models.errors import expect
 from ...models.vehicle import Vehicle
 from ..effects import EffectOptions
 from ..randomize import Randomization
+from ..snapshots import Arrays
 from ..state import Array, InitialState, WorldState, clip
 from ..world import PhysicsError
 from . import kernel
@@ -59,7 +60,8 @@ class RigidWorld(BaseWorld):
         expected = "none with the backend rigid, which has no cable: fly it with mujoco"
         expect(not payload, "effects: payload", expected, f"{payload:g} kg")
         shape = (num_worlds, drones)
-        super().__init__(vehicle, shape, effects, randomize)
+        arguments = {"num_worlds": num_worlds, "drones": drones, "dtype": dtype}
+        super().__init__(vehicle, shape, effects, randomize, arguments | {"compiled": compiled})
         _check_forces(vehicle)
         self.dtype = np.dtype(dtype)
         self._body, self._hull = RigidBody(vehicle), Hull(vehicle)
@@ -145,6 +147,30 @@ class RigidWorld(BaseWorld):
             old = 0.0 * wrench if self._wrench is None else self._wrench
             new = wrench if mask is None else np.where(mask.reshape(-1), wrench, old)
             self._wrench = new
+
+    def _snapshot(self) -> dict[str, np.ndarray]:
+        state = self.state
+        arrays = {
+            "rows": self._rows,
+            "acting": self._acting,
+            "wrench": self._wrench,
+            "command": state.command,
+            "thrust": state.thrust,
+            "touching": state.touching,
+            "colliding": state.colliding,
+        }
+        return {name: array.copy() for name, array in arrays.items() if array is not None}
+
+    def _restore(self, arrays: Arrays) -> None:
+        wrench = arrays.get("wrench")
+        self._rows, self._acting = arrays["rows"].copy(), arrays["acting"].copy()
+        self._wrench = None if wrench is None else wrench.copy()
+        for name in ("command", "thrust", "touching", "colliding"):
+            if name in arrays:
+                setattr(self.state, name, arrays[name].copy())
+        self._show()
+        if self.parameters:
+            self._vary({name: values.reshape(-1) for name, values in self.parameters.items()})
 
     def acceleration(self) -> Array:
         """As `World.acceleration`."""

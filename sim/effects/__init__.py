@@ -11,10 +11,13 @@ the same bits alone and in a batch.
 """
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
+
+from numpy.typing import NDArray
 
 from ...models.errors import expect
 from ..random import GUSTS, Noise
+from ..snapshots import Arrays, Kept, joined, part_of
 from ..state import Array, WorldState, component
 from .air import AirEffects
 from .downwash import Downwash
@@ -82,9 +85,32 @@ class Effects:
         if self._gusts is not None:
             height, normal = component(state.position, 2), self._noise.normal(mask)
             self._gusts.begin(mask, height, normal, factors.get("gusts", 1.0))
+        self._take_wind(factors)
+        return thrust
+
+    def _take_wind(self, factors: dict[str, Array]) -> None:
         both = zip(self._mean_wind, WINDS, strict=True)
         self._wind = [mean + factors.get(name, 0.0) for mean, name in both]
-        return thrust
+
+    def snapshot(self) -> dict[str, NDArray[Any]]:
+        """State of all effects by name."""
+        return joined({name: part.snapshot() for name, part in self._parts().items()})
+
+    def restore(self, arrays: Arrays, state: WorldState, factors: dict[str, Array]) -> None:
+        """Put a snapshot back, after the state and the factors of drawn parameters."""
+        for name, part in self._parts().items():
+            part.restore(part_of(arrays, name))
+        if self.on_rotors:
+            self._rotors.take(state.thrust, factors)
+        if self.on_body:
+            self._air.take(state.position, factors)
+        self._take_wind(factors)
+
+    def _parts(self) -> dict[str, Kept]:
+        parts: dict[str, Kept] = {"rotors": self._rotors, "air": self._air}
+        if self._gusts is not None:
+            parts["gusts"] = self._gusts
+        return parts
 
     def step(self, state: WorldState, mask: Array | None) -> tuple[Array, Array, Array | None]:
         """Advance the worlds of a mask, None for all, by a physics step, from `state` on.

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from ...models.errors import expect
+from ..snapshots import Kept
 from ..state import Array, WorldState, clip, component, each, kept, square_root, stack
 from .options import EffectOptions
 from .rotors import split, total
@@ -21,7 +22,7 @@ choice, since the formula has a pole at a quarter of a radius."""
 Vector = tuple[Array, Array, Array]
 
 
-class AirEffects:
+class AirEffects(Kept):
     """The air around W worlds; the ground effect needs level ground at z = 0.
 
     Forces, in body axes, with v the velocity of a point through the air:
@@ -34,6 +35,8 @@ class AirEffects:
     * each rotor at height z over the ground, with radius R: thrust / (1 - (R / 4z)²) in place of
       its thrust (Cheeseman and Bennett, ARC R&M 3021, 1955).
     """
+
+    lists = ("_before",)
 
     def __init__(self, vehicle: "Vehicle", options: EffectOptions) -> None:
         self._options, self._half = options, 0.5 * vehicle.timestep
@@ -91,10 +94,14 @@ class AirEffects:
 
     def begin(self, mask: Array, state: WorldState, factors: dict[str, Array]) -> None:
         """Begin at the motion of a state; factors (W, A) by parameter."""
-        self._factors = factors
         self._before = kept(mask, _motion(state), self._before)
+        self.take(state.position, factors)
+
+    def take(self, position: Array, factors: dict[str, Array]) -> None:
+        """Take the factors of drawn parameters, for positions of this shape."""
+        self._factors = factors
         rows = self._geometry.tolist()
-        if state.position.ndim > 1:
+        if position.ndim > 1:
             rows = [list(self._geometry.T)]
         self._rotors = [(row[:3], row[3:]) for row in rows]
 

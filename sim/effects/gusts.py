@@ -15,6 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from ..snapshots import Kept
 from ..state import Array, kept
 
 FOOT: Final = 0.3048  # m
@@ -27,7 +28,7 @@ NUMBERS: Final = 5  # Normal numbers that a step takes
 Vector = tuple[Array, Array, Array]
 
 
-class Gusts:
+class Gusts(Kept):
     """Gusts of W worlds. A drone keeps the scales of the height at which its episode began.
 
     Args:
@@ -35,6 +36,8 @@ class Gusts:
         mean_wind: Velocity of the mean wind, world frame, m/s, three numbers.
         timestep: Physics step, s.
     """
+
+    lists = ("_filters", "_state")
 
     def __init__(self, wind_speed: float, mean_wind: tuple[float, ...], timestep: float) -> None:
         self._sigma = 0.1 * wind_speed

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...models.errors import expect
+from ..snapshots import Kept
 from ..state import Array, clip, component, each, kept, square_root, stack
 from .options import EffectOptions
 
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 Parts = list[Any]
 
 
-class RotorEffects:
+class RotorEffects(Kept):
     """Rotors of W worlds.
 
     The chain, once in every physics step: a command in newtons is a throttle u, as if thrust were
@@ -34,6 +35,9 @@ class RotorEffects:
         charge: Of the battery, share, shape (W, A).
         voltage: At its terminals, V, shape (W, A).
     """
+
+    arrays = ("charge", "voltage")
+    lists = ("_roots",)
 
     def __init__(self, vehicle: "Vehicle", options: EffectOptions) -> None:
         self._options, self._step = options, vehicle.timestep
@@ -77,6 +81,18 @@ class RotorEffects:
         Gives the thrusts that they do give, (W, A, R), N.
         """
         options = self._options
+        self.take(thrust, factors)
+        roots = [square_root(part) for part in split(thrust)]
+        self._roots = kept(mask[..., None], roots, self._roots)
+        if options.battery:
+            charge = factors.get("battery_charge", 1.0) + 0.0 * component(thrust, 0)
+            (self.charge,) = kept(mask, [charge], [self.charge])
+            self.voltage = self._terminal()
+        return _join(self._scaled(split(thrust)))
+
+    def take(self, thrust: Array, factors: dict[str, Array]) -> None:
+        """Take the factors of drawn parameters, (W, A), for thrusts of this shape."""
+        options = self._options
         self._low, self._high = (_of_rotors(x, thrust) for x in self._limits)
         self._scales = []
         if options.efficiency:
@@ -89,13 +105,6 @@ class RotorEffects:
         if options.motor_lag:
             scale = each(factors["time_constant"]) if "time_constant" in factors else 1.0
             self._answers = [self._answer(time * scale) for time in self._times]
-        roots = [square_root(part) for part in split(thrust)]
-        self._roots = kept(mask[..., None], roots, self._roots)
-        if options.battery:
-            charge = factors.get("battery_charge", 1.0) + 0.0 * component(thrust, 0)
-            (self.charge,) = kept(mask, [charge], [self.charge])
-            self.voltage = self._terminal()
-        return _join(self._scaled(split(thrust)))
 
     def step(self, command: Array, mask: Array | None) -> tuple[Array, Array, Array | None]:
         """Advance by a physics step: mean thrusts over it, and those at its end, (W, A, R), N.

@@ -1,0 +1,55 @@
+"""State as named arrays, so that it can be copied, put back, and stored."""
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+Arrays = Mapping[str, NDArray[Any]]
+
+
+class Kept:
+    """Base of what keeps a state between steps.
+
+    Class attributes:
+        arrays: Names of attributes that are arrays, or a single drone's numbers.
+        lists: Names of attributes that are lists of those.
+    """
+
+    arrays: ClassVar[tuple[str, ...]] = ()
+    lists: ClassVar[tuple[str, ...]] = ()
+
+    def snapshot(self) -> dict[str, NDArray[Any]]:
+        """Copies by name; what has no value yet is left out."""
+        values = {name: getattr(self, name) for name in (*self.arrays, *self.lists)}
+        return {name: np.array(value) for name, value in values.items() if value is not None}
+
+    def restore(self, arrays: Arrays) -> None:
+        """Put a snapshot back."""
+        for name in self.arrays:
+            array = arrays.get(name)
+            setattr(self, name, None if array is None else array.copy()[()])
+        for name in self.lists:
+            array = arrays.get(name)
+            if array is None:
+                setattr(self, name, None)
+            else:
+                setattr(self, name, array.tolist() if array.ndim == 1 else list(array.copy()))
+
+
+def joined(parts: Mapping[str, Arrays]) -> dict[str, NDArray[Any]]:
+    """Arrays of several parts under the name of the part and their own."""
+    joint = {}
+    for part, arrays in parts.items():
+        for name, array in arrays.items():
+            joint[f"{part}/{name}"] = array
+    return joint
+
+
+def part_of(arrays: Arrays, part: str) -> dict[str, NDArray[Any]]:
+    """The arrays of one part of `joined`."""
+    start = f"{part}/"
+    return {
+        name.removeprefix(start): array for name, array in arrays.items() if name.startswith(start)
+    }
