@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from ..models.errors import InputError
 from ..udp.journal.reader import Recording, Session
-from ..udp.protocol.messages import MAX_UINT64, Command, State
+from ..udp.journal.walker import Transition, Walker
+from ..udp.protocol.messages import State
 from .trajectories import Ending, Trajectory
 
 
@@ -96,49 +97,39 @@ class SessionReader:
         self._drones = len(session.spec.agents)
         count = session.num_envs
         self._chosen = np.ones(count, bool) if drone is None else np.arange(count) == drone
-        self._command: Command | None = None
-        self._sequence: int | None = None
+        self._walker = Walker(session)
         self._rows: list[list[_Row]] = [[] for _ in range(count)]
         self._seeds: list[int | None] = [None] * count
         self._episodes = [0] * count
 
     def take(self, message: Any) -> Iterator[Trajectory]:
         """The next message of the session: the episodes that it ends, one after the other."""
-        if isinstance(message, Command):
-            self._command = message
-        elif isinstance(message, State):
-            before, self._sequence = self._sequence, message.sequence
-            yield from self._follow(message, before)
+        transition = self._walker.take(message)
+        if transition is not None:
+            yield from self._follow(transition)
 
     def finish(self) -> Iterator[Trajectory]:
         """The episodes that the journal's end cuts off."""
         for drone in range(len(self._rows)):
             yield from self._end(drone, "cut off")
 
-    def _follow(self, state: State, before: int | None) -> Iterator[Trajectory]:
-        command = self._command
-        count = self.session.num_envs
-        if before is None:
-            seed = self.session.seed  # drone i takes seed + i: rule 6 of the protocol
-            seeds = None if seed is None else [(seed + i) & MAX_UINT64 for i in range(count)]
-            yield from self._begin(state, np.ones(count, bool), seeds)
-            return
-        if command is None or not before == command.sequence == state.sequence - 1:
+    def _follow(self, transition: Transition) -> Iterator[Trajectory]:
+        state, command = transition.state, transition.command
+        if transition.is_gap:
             yield from self.finish()
             return
-        flown = ~(command.resets | command.frozen)
-        self.has_steps |= bool(flown.any())
-        for drone in np.flatnonzero(flown & self._chosen).tolist():
-            if not self._rows[drone]:
+        self.has_steps |= bool(transition.flown.any())
+        for drone in np.flatnonzero(transition.flown & self._chosen).tolist():
+            if command is None or not self._rows[drone]:
                 continue  # its episode has ended
             self._rows[drone].append(self._row(state, drone, command.actions[drone]))
             if state.terminated[drone]:
                 yield from self._end(drone, "terminated")
             elif state.truncated[drone]:
                 yield from self._end(drone, "truncated")
-        if command.resets.any():
-            seeds = None if command.seeds is None else command.seeds.tolist()
-            yield from self._begin(state, command.resets, seeds)
+        if transition.resets.any():
+            seeds = None if transition.seeds is None else transition.seeds.tolist()
+            yield from self._begin(state, transition.resets, seeds)
 
     def _begin(
         self, state: State, drones: NDArray[np.bool_], seeds: list[int] | None

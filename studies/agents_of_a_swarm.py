@@ -33,7 +33,7 @@ from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.loop import Loop
 from rotorgram.sim import InitialState
 from rotorgram.udp import LinkConfig, RemoteVectorEnv, SharedSimulator, Simulator
-from rotorgram.udp.protocol.messages import Command, Message, State
+from rotorgram.udp.protocol.messages import Command, State
 
 ENV_ID = "benchmark/Row-v0"
 FAULTS = {"drop": 0.3, "duplicate": 0.1, "reorder": 0.1}
@@ -103,7 +103,7 @@ class Twin:
         self.counts = Counter({f"absent_{kind}": 0 for kind in kinds})
         self.shown = np.zeros((AGENTS, 3), np.float32)
 
-    def __call__(self, cause: Message | None, state: State) -> None:
+    def __call__(self, cause: Command | None, state: State) -> None:
         loop, simulator, everybody = self.loop, self.simulator, np.ones(AGENTS, bool)
         nothing = np.zeros((AGENTS, 1), np.float32)
         if cause is None:
@@ -117,7 +117,7 @@ class Twin:
             mask = np.arange(AGENTS) == absence.agent
             if policy != "hold":
                 (loop.land if policy == "land" else loop.retire)(mask)
-            self.counts[f"absent_{absence.presence.value}"] += 1
+            self.counts[f"absent_{absence.participation.value}"] += 1
         self.taken = len(simulator.absences)
         if isinstance(cause, Command):
             flying = ~(self.absent | loop.out)

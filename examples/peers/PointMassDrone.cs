@@ -18,7 +18,7 @@ namespace Rotorgram
         const string Json = @"{
             'env_id': 'rotorgram/Elevation-v0',
             'options': {
-                'episode_length': 250, 'history': 1, 'control_period': 0.02, 'linear_drag': 0.0, 'target': 5.0,
+                'episode_length': 250, 'history': 1, 'control_period': 0.02, 'target': 5.0,
                 'start_band': 1.0, 'flight_band': 3.0, 'action': 'increment',
                 'action_type': 'continuous', 'observation': 'full', 'thrust_scale': null},
             'control_period': 0.02,

@@ -22,7 +22,8 @@ from ..layouts import layout_of
 from ..protocol import binary
 from ..protocol.errors import DecodeError
 from ..protocol.layout import MAX_MESSAGE, Layout
-from ..protocol.messages import FLY, Close, Command, Hello, Message, Refuse, State, Unknown, Welcome
+from ..protocol.messages import Close, Hello, Message, Refuse, Unknown, Welcome
+from .walker import Transition, Walker
 from .writer import ABOUT, FORMAT
 
 MAX_CHUNK: Final = 2 * MAX_MESSAGE
@@ -235,9 +236,9 @@ class SessionSummary:
     """Sum of their returns."""
     ending: str = "not closed"
     """Reason of its Close or Refuse."""
-    _command: Command | None = None
 
     def __post_init__(self) -> None:
+        self._walker = Walker(self.session)
         self._returns = np.zeros(self.session.num_envs)
         self._out = np.zeros(self.session.num_envs, bool)  # ended, while its world flies on
 
@@ -255,11 +256,10 @@ class SessionSummary:
     def take(self, item: Item) -> None:
         """Count a message of the session."""
         self.last = item.time
+        transition = self._walker.take(item.message)
+        if transition:
+            self._count(transition)
         match item.message:
-            case Command() as command:
-                self._command = command
-            case State() as state:
-                self._take_state(state)
             case Close(reason=reason) if reason:
                 self.ending = f"closed: {reason}"
             case Close() if not self.ending.startswith("closed"):
@@ -269,11 +269,10 @@ class SessionSummary:
             case Unknown():
                 self.ending = "the agent does not know this session"
 
-    def _take_state(self, state: State) -> None:
-        command = self._command
+    def _count(self, transition: Transition) -> None:
+        state, resets = transition.state, transition.resets
         self.states += 1
-        resets = np.ones(len(state.rewards), bool) if command is None else command.resets
-        stepped = ~resets if command is None else (command.orders == FLY) & ~self._out
+        stepped = transition.flown & ~self._out
         self._returns[resets] = 0.0
         self._returns += np.where(stepped, state.rewards, 0.0)
         self.steps += int(stepped.sum())

@@ -12,10 +12,10 @@ from ...envs.spec import component_names
 from ...models import Backend
 from ...models.errors import InputError
 from ...models.fleet import load_vehicles
-from ..protocol.messages import Command, State
-from ..protocol.party import first_seeds
+from ..protocol.messages import State
 from ..transport.stepped import Steppable, make_stepped
 from .reader import Item, Recording, Session, count_of, printable
+from .walker import Transition, Walker
 from .writer import software
 
 
@@ -57,9 +57,10 @@ class SessionVerdict:
     notes: list[str] = field(default_factory=list)
     """Other things that have changed."""
     _loop: "Steppable | None" = None
-    _sequence: int | None = None
-    _command: Command | None = None
     _known: bool = False  # whether the simulated drones are where the recorded ones were
+
+    def __post_init__(self) -> None:
+        self._walker = Walker(self.session)
 
     @property
     def identical(self) -> bool:
@@ -77,42 +78,40 @@ class SessionVerdict:
 
     def take(self, item: Item) -> None:
         """Repeat a message."""
-        if self.problem:
+        transition = self._walker.take(item.message)
+        if self.problem or transition is None:
             return
-        if isinstance(item.message, Command):
-            self._command = item.message
-        elif isinstance(item.message, State):
-            try:
-                self._repeat(item.message.sequence)
-            except Exception as error:  # the env's: the recorded run ended with it too
-                what = str(error) or type(error).__name__
-                self.problem = f"State {item.message.sequence} cannot be repeated: {what}"
-            else:
-                self._compare(item.message)
+        state = transition.state
+        try:
+            self._repeat(transition)
+        except Exception as error:  # the env's: the recorded run ended with it too
+            what = str(error) or type(error).__name__
+            self.problem = f"State {state.sequence} cannot be repeated: {what}"
+        else:
+            self._compare(state)
 
     def close(self) -> None:
         """Release the drones."""
         if self._loop:
             self._loop.close()
 
-    def _repeat(self, sequence: int) -> None:
+    def _repeat(self, transition: Transition) -> None:
         """Bring the drones to that State."""
-        command, seed = self._command, self.session.seed
+        command, resets, seeds = transition.command, transition.resets, transition.seeds
         if self._loop is None:
             self._loop = self._make()
-            if seed is not None:
-                actions, drones = self.session.layout.actions, self.session.num_envs
-                nothing = np.zeros(actions.shape, actions.dtype)
-                everyone = np.ones(drones, bool)
-                self._loop.advance(nothing, everyone, first_seeds(seed, drones), None)
-                self._known = True
-        elif command is None or not self._sequence == command.sequence == sequence - 1:
-            number = command.sequence if command else "none"
-            raise InputError(f"expected Command {sequence - 1} before it, got {number}")
-        elif self._known or (command.seeds is not None and command.resets.all()):
-            self._loop.advance(command.actions, command.resets, command.seeds, command.frozen)
-            self._known = True
-        self._sequence = sequence
+        if transition.is_gap:
+            number = transition.state.sequence - 1
+            raise InputError(f"expected Command {number} before it, got none of that number")
+        if not self._known and (seeds is None or not resets.all()):
+            return
+        self._known = True
+        if command is None:
+            actions = self.session.layout.actions
+            nothing = np.zeros(actions.shape, actions.dtype)
+            self._loop.advance(nothing, resets, seeds, None)
+        else:
+            self._loop.advance(command.actions, resets, seeds, command.frozen)
 
     def _make(self) -> Steppable:
         """The drones. Raises `InputError` unless their arrays are those of the recorded spec."""

@@ -1,0 +1,63 @@
+"""Joins the Commands and States of a session: what each State followed from."""
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..protocol.messages import FLY, Command, State
+from ..protocol.party import first_seeds
+
+if TYPE_CHECKING:
+    from .reader import Session
+
+Mask = NDArray[np.bool_]
+
+
+class Transition(NamedTuple):
+    """A State, and what led to it."""
+
+    state: State
+    command: Command | None
+    """None: the first State of its session, or one whose Command is missing in the journal."""
+    is_first: bool
+    flown: Mask
+    """Drones that took a step, shape (N,)."""
+    resets: Mask
+    """Drones that were reset, shape (N,)."""
+    seeds: NDArray[np.uint64] | None
+    """Of the drones that were reset, shape (N,). None: their generators went on, or it is unknown
+    how the session began."""
+
+    @property
+    def is_gap(self) -> bool:
+        """Whether nobody knows what was flown."""
+        return self.command is None and not self.is_first
+
+
+class Walker:
+    """Takes the messages of one session, and gives its transitions."""
+
+    def __init__(self, session: "Session") -> None:
+        self.session = session
+        self._command: Command | None = None
+        self._sequence: int | None = None
+
+    def take(self, message: Any) -> Transition | None:
+        """The transition that a State completes; None for any other message."""
+        if isinstance(message, Command):
+            self._command = message
+        if not isinstance(message, State):
+            return None
+        before, self._sequence = self._sequence, message.sequence
+        drones = self.session.num_envs
+        nobody = np.zeros(drones, bool)
+        if before is None:
+            seed = self.session.seed  # drone i takes seed + i: rule 6 of the protocol
+            seeds = None if seed is None else first_seeds(seed, drones)
+            return Transition(message, None, True, nobody, ~nobody, seeds)
+        command = self._command
+        if command is None or not before == command.sequence == message.sequence - 1:
+            return Transition(message, None, False, nobody, nobody, None)
+        flown = np.asarray(command.orders == FLY)
+        return Transition(message, command, False, flown, command.resets, command.seeds)
