@@ -2,8 +2,8 @@
 
 Nothing is compared with a vehicle that we know. A check holds a measured value to a closed form, or
 to a plausible range whose source it names. `examine` runs them all; each `check_...` is one group
-of them and takes a `Vehicle`, the path of a vehicle's file, or a `Craft`, which is a file read
-once. A file that flying refuses is examined all the same, as long as it is a free body with
+of them and takes a `Vehicle`, the path of a vehicle's file, or an `ExaminedModel`, which is a file
+read once. A file that flying refuses is examined all the same, as long as it is a free body with
 actuators: a fault becomes a check that fails, and every reason is told at once.
 
 World frame: z up. Body frame: x forward, y left, z up. SI units and radians throughout.
@@ -157,7 +157,7 @@ def failed(checks: Iterable[Check]) -> list[Check]:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Craft:
+class ExaminedModel:
     """A vehicle's file, read for the examination; flying may refuse it."""
 
     path: Path
@@ -191,12 +191,12 @@ class Craft:
     """As `Vehicle.rest_height`; NaN if it touches something at any height."""
 
     @classmethod
-    def read(cls, vehicle: "Subject" = None) -> "Craft":
+    def read(cls, vehicle: "ModelLike" = None) -> "ExaminedModel":
         """Read a vehicle's file, None for the paper's; a vehicle does not change.
 
         Raises `InputError` for a file that is no free body with actuators.
         """
-        if isinstance(vehicle, Craft):
+        if isinstance(vehicle, ExaminedModel):
             return vehicle
         drag = vehicle.linear_drag if isinstance(vehicle, Vehicle) else 0.0
         given = vehicle.path if isinstance(vehicle, Vehicle) else vehicle
@@ -311,7 +311,7 @@ class Craft:
         return np.array(data.qacc)
 
 
-Subject = Vehicle | Craft | Path | str | None
+ModelLike = Vehicle | ExaminedModel | Path | str | None
 """A vehicle, a file read once, what `Vehicle.load` takes, or None for the paper's vehicle."""
 
 
@@ -361,20 +361,20 @@ def _expect_no_warning(data: Any) -> None:
         raise _Warned(", ".join(told))
 
 
-CHECKS: Final[list[Callable[[Subject], list[Check]]]] = []
+CHECKS: Final[list[Callable[[ModelLike], list[Check]]]] = []
 """Every group of checks, in the order of the table."""
 
 
-def _group(part: Callable[[Craft], Iterator[Check]]) -> Callable[[Subject], list[Check]]:
+def _group(part: Callable[[ExaminedModel], Iterator[Check]]) -> Callable[[ModelLike], list[Check]]:
     """A public group of checks. A warning of MuJoCo in its flights ends it, as a failed check."""
 
     @wraps(part)
-    def group(vehicle: Subject = None) -> list[Check]:
+    def group(vehicle: ModelLike = None) -> list[Check]:
         checks, config, quiet = [], mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
         quiet.logto_console = False  # a warning becomes a check
         quiet.set()
         try:
-            for check in part(Craft.read(vehicle)):
+            for check in part(ExaminedModel.read(vehicle)):
                 checks.append(check)
         except _Warned as warning:
             name = part.__name__.removeprefix("check_").replace("_", " ")
@@ -384,18 +384,18 @@ def _group(part: Callable[[Craft], Iterator[Check]]) -> Callable[[Subject], list
             config.set()
         return checks
 
-    group.__annotations__ = {"vehicle": Subject, "return": list[Check]}
+    group.__annotations__ = {"vehicle": ModelLike, "return": list[Check]}
     CHECKS.append(group)
     return group
 
 
-def examine(vehicle: Subject = None) -> list[Check]:
+def examine(vehicle: ModelLike = None) -> list[Check]:
     """Run every check on a vehicle or the path of its file; nothing changes.
 
     Checks that need rotors are left out if an actuator is no rotor, and those of drag if the file
     has none. Raises `InputError` for a file that is no free body with actuators.
     """
-    craft = Craft.read(vehicle)
+    craft = ExaminedModel.read(vehicle)
     return [check for group in CHECKS for check in group(craft)]
 
 
@@ -403,7 +403,7 @@ def examine(vehicle: Subject = None) -> list[Check]:
 
 
 @_group
-def check_accepted(craft: Craft) -> Iterator[Check]:
+def check_accepted(craft: ExaminedModel) -> Iterator[Check]:
     """Whether `--vehicle` takes the file, and its coefficients can be read."""
     name, source = "accepted by --vehicle", "rotorgram.models.Vehicle.load"
     yield _near(name, not craft.refusal, 1, "", source,
@@ -414,7 +414,7 @@ def check_accepted(craft: Craft) -> Iterator[Check]:
 
 
 @_group
-def check_actuators(craft: Craft) -> Iterator[Check]:
+def check_actuators(craft: ExaminedModel) -> Iterator[Check]:
     """Every actuator is a rotor: a limited thrust at a site of the body, gain times control."""
     for index in range(craft.model.nu):
         name = rotor_name(craft.model, index)
@@ -424,7 +424,7 @@ def check_actuators(craft: Craft) -> Iterator[Check]:
 
 
 @_group
-def check_gravity(craft: Craft) -> Iterator[Check]:
+def check_gravity(craft: ExaminedModel) -> Iterator[Check]:
     """Gravity points down and has the size of a world with an atmosphere."""
     down = -float(craft.model.opt.gravity[2]) / craft.gravity
     yield _near("gravity: part along -z", down, 1, "", "world frame: z up",
@@ -434,7 +434,7 @@ def check_gravity(craft: Craft) -> Iterator[Check]:
 
 
 @_group
-def check_inertia(craft: Craft) -> Iterator[Check]:
+def check_inertia(craft: ExaminedModel) -> Iterator[Check]:
     """Inertia of a body that can exist, and mass and inertia as forces and torques meet them."""
     bodies = [*craft.written, ("the whole craft", craft.moments)]
     name, moments = min(bodies, key=lambda one: one[1][0] / max(abs(one[1][2]), 1e-300))
@@ -473,7 +473,7 @@ _MEANINGS: Final = {
 
 
 @_group
-def check_units(craft: Craft) -> Iterator[Check]:
+def check_units(craft: ExaminedModel) -> Iterator[Check]:
     """Ratios that no multirotor has unless a unit is wrong."""
     if not craft.rotors:
         return
@@ -503,7 +503,7 @@ def check_units(craft: Craft) -> Iterator[Check]:
 
 
 @_group
-def check_rotors(craft: Craft) -> Iterator[Check]:
+def check_rotors(craft: ExaminedModel) -> Iterator[Check]:
     """Each rotor pushes where its site and gear say, and upwards."""
     if not craft.rotors:
         return
@@ -524,7 +524,7 @@ def check_rotors(craft: Craft) -> Iterator[Check]:
 
 
 @_group
-def check_allocation(craft: Craft) -> Iterator[Check]:
+def check_allocation(craft: ExaminedModel) -> Iterator[Check]:
     """Thrust and the torques about x, y and z can be commanded, each without the others."""
     if not craft.rotors:
         return
@@ -557,7 +557,7 @@ def check_allocation(craft: Craft) -> Iterator[Check]:
 
 
 @_group
-def check_turns(craft: Craft) -> Iterator[Check]:
+def check_turns(craft: ExaminedModel) -> Iterator[Check]:
     """Reactions cancel at equal thrusts; a rotor that turns like both its neighbours is named."""
     if not craft.rotors:
         return
@@ -588,7 +588,7 @@ def check_turns(craft: Craft) -> Iterator[Check]:
 
 
 @_group
-def check_hover(craft: Craft) -> Iterator[Check]:
+def check_hover(craft: ExaminedModel) -> Iterator[Check]:
     """The rotors can carry the level craft, with a margin, each within its limits."""
     if not craft.rotors:
         return
@@ -610,7 +610,7 @@ def check_hover(craft: Craft) -> Iterator[Check]:
 
 
 @_group
-def check_trim(craft: Craft) -> Iterator[Check]:
+def check_trim(craft: ExaminedModel) -> Iterator[Check]:
     """With the thrusts of the hover, within limits, the craft neither accelerates nor turns."""
     if not craft.rotors:
         return
@@ -639,7 +639,7 @@ def _turned(data: Any, vector: Array) -> Array:
 
 
 @_group
-def check_free_fall(craft: Craft) -> Iterator[Check]:
+def check_free_fall(craft: ExaminedModel) -> Iterator[Check]:
     """Depth of a fall of two seconds without thrust: g t² / 2."""
     model = craft.falling()
     data = craft.ready(model=model)
@@ -652,7 +652,7 @@ def check_free_fall(craft: Craft) -> Iterator[Check]:
 
 
 @_group
-def check_momentum(craft: Craft) -> Iterator[Check]:
+def check_momentum(craft: ExaminedModel) -> Iterator[Check]:
     """Five seconds of tumbling without forces: momenta and energy are conserved."""
     model = craft.falling(gravity=np.zeros(3))
     before, after = craft.ready(model=model), craft.ready(model=model)
@@ -696,7 +696,7 @@ class Convergence:
         return _COARSE / self.turn * float((error / self.error) ** (1 / max(self.order, 0.1)))
 
 
-def _converge(craft: Craft) -> Convergence:
+def _converge(craft: ExaminedModel) -> Convergence:
     """Fly one tumbling turn at a step, at its half and at its quarter."""
     turn = float(np.linalg.norm(_SPIN))
     if craft.rotors:
@@ -731,7 +731,7 @@ def _converge(craft: Craft) -> Convergence:
 
 
 @_group
-def check_integrator(craft: Craft) -> Iterator[Check]:
+def check_integrator(craft: ExaminedModel) -> Iterator[Check]:
     """Observed order of the integrator: how fast its error falls with the step."""
     found = craft.convergence
     yield _within("integrator: observed order", found.order,
@@ -741,7 +741,7 @@ def check_integrator(craft: Craft) -> Iterator[Check]:
                   .removeprefix("mjINT_"))  # fmt: skip
 
 
-def recommended_step(vehicle: Subject = None) -> tuple[float, str]:
+def recommended_step(vehicle: ModelLike = None) -> tuple[float, str]:
     """Physics step, s, and what bounds it.
 
     The cost of a second falls with the step, so it is the largest of 1, 2 and 5 times a power of
@@ -750,7 +750,7 @@ def recommended_step(vehicle: Subject = None) -> tuple[float, str]:
     most 2000 °/s); the step at which a free fall of a second is 1 mm off; half the time constant
     of its contacts; the time constant of its motors.
     """
-    craft = Craft.read(vehicle)
+    craft = ExaminedModel.read(vehicle)
     bounds = {"error of attitude of 0.01° a second": craft.convergence.step(_ATTITUDE)}
     if craft.convergence.fall > _TRUNCATION:
         bounds["error of a free fall of 1 mm a second"] = _DEPTH / craft.convergence.fall
@@ -770,7 +770,7 @@ def recommended_step(vehicle: Subject = None) -> tuple[float, str]:
 
 
 @_group
-def check_physics_step(craft: Craft) -> Iterator[Check]:
+def check_physics_step(craft: ExaminedModel) -> Iterator[Check]:
     """The physics step is at most the recommended one, and long enough to be flown."""
     step, why = recommended_step(craft)
     error = math.degrees(craft.convergence.at(min(craft.timestep, _MOST_STEP)))
@@ -781,7 +781,7 @@ def check_physics_step(craft: Craft) -> Iterator[Check]:
 
 
 @_group
-def check_terminal_velocity(craft: Craft) -> Iterator[Check]:
+def check_terminal_velocity(craft: ExaminedModel) -> Iterator[Check]:
     """A level fall with the drag of the file, against its closed form; nothing without drag.
 
     m v' = m g - c₁ v - c₂ v² ends at the v where the right side is 0.
@@ -825,7 +825,7 @@ def check_terminal_velocity(craft: Craft) -> Iterator[Check]:
 
 
 @_group
-def check_floor(craft: Craft) -> Iterator[Check]:
+def check_floor(craft: ExaminedModel) -> Iterator[Check]:
     """In the air it touches nothing; dropped by 5 cm it comes to rest on the floor."""
     data = craft.ready()
     mujoco.mj_forward(craft.model, data)
@@ -850,7 +850,7 @@ def check_floor(craft: Craft) -> Iterator[Check]:
 
 
 @_group
-def check_random_control(craft: Craft) -> Iterator[Check]:
+def check_random_control(craft: ExaminedModel) -> Iterator[Check]:
     """Two seconds of random thrusts within the limits, from 1 m above the floor: no warning."""
     if not craft.rotors:
         return

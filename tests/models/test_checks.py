@@ -30,7 +30,7 @@ from rotorgram.models.checks import (
     RANGES,
     THRUST_TO_WEIGHT,
     Check,
-    Craft,
+    ExaminedModel,
     check_allocation,
     check_hover,
     check_integrator,
@@ -249,7 +249,7 @@ def test_a_file_that_is_no_craft_is_one_sentence(
 def test_groups_take_a_path_a_vehicle_or_a_craft() -> None:
     path = DATA / "hexa.xml"
     expected = [check.report() for check in check_hover(path)]
-    for subject in (str(path), Vehicle.load(path), Craft.read(path)):
+    for subject in (str(path), Vehicle.load(path), ExaminedModel.read(path)):
         assert [check.report() for check in check_hover(subject)] == expected
     assert [check.report() for check in check_hover()] == [
         check.report() for check in check_hover(QUAD_XML)
@@ -301,13 +301,13 @@ def test_the_recommended_step_by_its_rule(tmp_path: Path) -> None:
 
 def test_euler_misses_a_free_fall_in_proportion_to_the_step(tmp_path: Path) -> None:
     # Of g t² / 2 it misses g h t / 2: 4.9 m in a second for each second of step.
-    euler = Craft.read(broken(tmp_path, ('integrator="RK4"', "")))
+    euler = ExaminedModel.read(broken(tmp_path, ('integrator="RK4"', "")))
     assert euler.convergence.fall == pytest.approx(4.9, rel=1e-6)
-    assert Craft.read().convergence.fall < 1e-9
+    assert ExaminedModel.read().convergence.fall < 1e-9
 
 
 def test_the_error_is_as_large_as_predicted() -> None:
-    craft = Craft.read(DATA / "tiny.xml")
+    craft = ExaminedModel.read(DATA / "tiny.xml")
     found, reached = craft.convergence, []
     for steps in (40, 3200):  # of a flight in which it turns by 8 rad
         model = craft.falling(gravity=np.zeros(3), timestep=8 / found.turn / steps)
@@ -322,7 +322,7 @@ def test_the_error_is_as_large_as_predicted() -> None:
 
 def test_a_light_craft_needs_a_shorter_step() -> None:
     # Full torque turns it faster, and the error of RK4 has the fourth power of the step.
-    heavy, light = Craft.read(), Craft.read(DATA / "tiny.xml")
+    heavy, light = ExaminedModel.read(), ExaminedModel.read(DATA / "tiny.xml")
     assert light.convergence.turn > 5 * heavy.convergence.turn
     assert light.convergence.at(0.01) == pytest.approx(16 * light.convergence.at(0.005), rel=0.2)
     assert light.convergence.at(0.01) > 1000 * heavy.convergence.at(0.01)
