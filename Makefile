@@ -51,6 +51,7 @@ types: .venv/.dev links
 # names, and pyproject.toml names that folder.
 links:
 	@mkdir -p .venv/types/rotorgram
+	@ln -sfn ../../../rotorgram/__init__.py .venv/types/rotorgram/__init__.py
 	@for p in $(PACKAGES); do ln -sfn ../../../$$p .venv/types/rotorgram/$$p; done
 
 # The pages as a site, in build/site: python -m http.server -d build/site. A warning fails it.

@@ -77,6 +77,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     _show_log()
     # A terminated command says Close to the other side before it ends.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    # Nor in a process that this one starts.
+    os.environ.setdefault("PYTHONSAFEPATH", "1")
     # A second thread of NumPy's products loses on small networks, and takes the simulator's core.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # At exit Python collects garbage: with torch half a second for nothing.

@@ -12,8 +12,8 @@ from ..envs.spec import EnvSpec
 from ..flights.trajectories import Trajectory
 from ..models import Backend
 from ..models.errors import expect
-from ..training.pairs import socket_pair
 from ..udp import RemoteEnv, RemoteVectorEnv
+from ..udp.spawn import spawn_simulator
 from ._flags import AgentFlags, EnvFlags, check_count, parse_address
 
 CHECKPOINT: Final = "checkpoint.safetensors"
@@ -159,10 +159,10 @@ def remote_env(
         expect(local, "key-file, insecure", "them with --listen", own)
         reason = "the task is not known here without the module that registers it"
         expect(is_known(env_id), "env", f"--env MODULE:{env_id}, for {reason}")
-        opened = socket_pair(
-            env_id, options, num_envs=num_envs or drones, drones=drones, vehicle=command.vehicle,
-            backend=backend, record=command.record,
-        )  # fmt: skip
+        config = EnvConfig.from_keywords(
+            env_id, drones=drones, vehicle=command.vehicle, backend=backend, **options
+        )
+        opened = spawn_simulator(config, num_envs=num_envs, record=command.record)
     with opened as env:
         try:
             yield env

@@ -192,7 +192,9 @@ def _with_file(
 
 def _world_options(command: Any, given: frozenset[str]) -> dict[str, Any]:
     """Options by name of the flags whose words are NAME or NAME=VALUE. Raises `InputError`."""
-    options = {name: getattr(command, name) for name in _PLAIN_FLAGS if name in given}
+    options: dict[str, Any] = {}
+    for name in given.intersection(_PLAIN_FLAGS):
+        options[name] = getattr(command, name)
     for flag in given.intersection(_WORLD_FLAGS):
         words = getattr(command, flag)
         values: dict[str, Any] = {}

@@ -174,13 +174,18 @@ class EnvConfig:
     # ---- other forms
 
     @classmethod
-    def from_keywords(cls, env_id: str = DEFAULT_ENV, **keywords: Any) -> Self:
-        """A config from the flat keyword arguments of `gym.make`.
+    def from_keywords(cls, env_id: "str | EnvConfig" = DEFAULT_ENV, **keywords: Any) -> "EnvConfig":
+        """A config from the flat keyword arguments of `gym.make`; or a config itself.
 
         A keyword that is a field, or a setting of the backend, is that; any other is an option of
         the task. `task={...}` holds options of the task whatever their names are. Raises
         `InputError`, which is a `TypeError` too for a name that is not known.
         """
+        if isinstance(env_id, EnvConfig):
+            if keywords:
+                got = ", ".join(keywords)
+                raise InputError(f"env: expected a config without keywords, got {got}")
+            return env_id
         options = {name: value for name, value in keywords.items() if name not in KEYWORDS}
         nested = options.pop("task", {})
         given = {name: value for name, value in keywords.items() if name not in options}
@@ -209,7 +214,7 @@ class EnvConfig:
         return json_values({**values, **shown, **({"task": hidden} if hidden else {})})
 
     @classmethod
-    def from_toml(cls, path: Path | str, **keywords: Any) -> Self:
+    def from_toml(cls, path: Path | str, **keywords: Any) -> "EnvConfig":
         """A config from a TOML file of keywords, `env_id` among them; keyword arguments win.
 
         A relative path of a vehicle is looked for beside the file first. Raises `InputError`.

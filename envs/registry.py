@@ -1,8 +1,11 @@
 """Tasks by env id. An id from a file or a peer is looked up here; its module is never imported."""
 
+import os
 import re
 import sys
 from importlib import import_module
+from importlib.machinery import PathFinder
+from importlib.util import module_from_spec
 from typing import TYPE_CHECKING, Final
 
 import gymnasium
@@ -48,19 +51,36 @@ def load(env_id: str) -> str:
     """
     module, colon, name = env_id.rpartition(":")
     if colon:
-        if "" not in sys.path:
-            sys.path.append("")  # last: no file there takes the place of an installed package
-        right = module and not module.startswith(".")
-        expect(right, "env", "MODULE:NAME with the name of a module", repr(env_id))
-        try:
-            import_module(module)
-        except ModuleNotFoundError as error:
-            if not module.startswith(error.name or "?"):
-                raise
-            raise InputError(f"env: expected a module {module} here, got none") from None
+        if not module or module.startswith("."):
+            raise InputError(f"env: expected MODULE:NAME with the name of a module, got {env_id!r}")
+        _import_here(module)
         if not is_known(name):
             raise InputError(f"env: expected {module} to register {name}, it does not")
     return name
+
+
+def _import_here(module: str) -> None:
+    """Import a module that is installed, or that one alone of the working folder.
+
+    Nothing else of that folder is imported: `queue.py` there does not take the place of Python's.
+    """
+    top = module.partition(".")[0]
+    try:
+        if top not in sys.modules and PathFinder.find_spec(top) is None:
+            spec = PathFinder.find_spec(top, [os.getcwd()])
+            if spec is None or spec.loader is None:
+                raise ModuleNotFoundError(name=module)
+            sys.modules[top] = loaded = module_from_spec(spec)
+            try:
+                spec.loader.exec_module(loaded)
+            except BaseException:
+                del sys.modules[top]
+                raise
+        import_module(module)
+    except ModuleNotFoundError as error:
+        if not module.startswith(error.name or "?"):
+            raise
+        raise InputError(f"env: expected a module {module} here, got none") from None
 
 
 def is_known(env_id: str) -> bool:

@@ -41,7 +41,7 @@ class SingleEnv(NotCopied, gym.Env[Any, Any]):
 
     def __init__(
         self,
-        env_id: str,
+        env_id: str | EnvConfig,
         render_mode: str | None = None,
         **keywords: Any,
     ) -> None:

@@ -29,7 +29,7 @@ class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
     `final_obs` and `final_info` where one ended. With DISABLED a reset with a mask begins the next.
 
     Args:
-        env_id: Of a registered task.
+        env_id: Of a registered task, or the config of an env.
         num_envs: N.
         render_mode: None, `rgb_array` (N pictures) or `human` (a window shows sixteen of them).
         autoreset_mode: `AutoresetMode`, or its value.
@@ -45,7 +45,7 @@ class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
 
     def __init__(
         self,
-        env_id: str,
+        env_id: str | EnvConfig,
         num_envs: int = 1,
         render_mode: str | None = None,
         *,

@@ -10,18 +10,19 @@ import sys
 from pathlib import Path
 
 from rotorgram.agents import PID
+from rotorgram.envs import EnvConfig
 from rotorgram.flights.filming import Film, FilmTrack, film
 from rotorgram.flights.recorded import recorded_trajectories
 from rotorgram.flights.trajectories import fly
-from rotorgram.training.pairs import socket_pair
 from rotorgram.udp.journal.replay import Verification
+from rotorgram.udp.spawn import spawn_simulator
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else ".")
 journal = folder / "flight.mcap"
 if journal.exists():
     sys.exit(f"{journal} is there already: name another folder")
 
-with socket_pair("rotorgram/Elevation-v0", record=journal) as env:
+with spawn_simulator(EnvConfig(), record=journal) as env:
     trajectory = fly(env, PID(env.env_spec), seed=7)
 print(f"return {trajectory.rewards.sum():.1f}: {journal}")
 

@@ -15,9 +15,9 @@ import numpy as np
 from rotorgram.agents import preset, store
 from rotorgram.flights.trajectories import fly_episodes
 from rotorgram.training.metrics import steady_state
-from rotorgram.training.pairs import socket_pair
 from rotorgram.training.settings import Run
 from rotorgram.training.training import Training
+from rotorgram.udp.spawn import spawn_simulator
 
 parser = argparse.ArgumentParser()
 parser.add_argument("--env-steps", type=int, default=100_000)
@@ -34,13 +34,13 @@ run = Run(
     env_steps=args.env_steps,
     num_envs=args.num_envs,
 )
-with socket_pair(**run.env, num_envs=run.num_envs) as drones:  # agent here, simulator beside it
+with spawn_simulator(run.flown, num_envs=run.num_envs) as drones:  # agent here, simulator beside it
     training = Training(run, drones)
     training.train()
 store(training.checkpoint(), args.out)
 print(f"{training.log.env_steps:,} env steps in {training.log.seconds:.1f} s: {args.out}")
 
-with socket_pair(**run.env) as drone:
+with spawn_simulator(run.flown) as drone:
     policy = training.agent.policy()
     trajectories = fly_episodes(drone, policy, episodes=5)
 errors = [abs(one.headline[1:]) for one in trajectories]

@@ -11,10 +11,7 @@ has no optical flow: there ours is beside its depth. Cases take turns within a r
 told.
 """
 
-import json
 import os
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
@@ -28,12 +25,13 @@ import mujoco
 import numpy as np
 from measuring import in_turns, medians, options, write
 from rotorgram.envs import LocalVectorEnv
+from rotorgram.envs.config import EnvConfig
 from rotorgram.models.cameras import KINDS, chosen_views
 from rotorgram.models.vehicle import Vehicle
 from rotorgram.rendering.cameras import Cameras
 from rotorgram.scenes import SEEDED_SCENES
-from rotorgram.training.pairs import socket_pair
 from rotorgram.udp import RemoteVectorEnv
+from rotorgram.udp.spawn import spawn_simulator, start_simulator
 from swarm import advanced, timed
 
 ENV = "rotorgram/Hover-v0"
@@ -175,7 +173,9 @@ def steps(drones: int, seconds: float, repeats: int) -> dict[str, float]:
         for name, more in flown.items():
             local = LocalVectorEnv(ENV, drones, vehicle=VEHICLE, **more)
             opened.callback(local.close)
-            pair = socket_pair(ENV, more, num_envs=drones, vehicle=VEHICLE)
+            pair = spawn_simulator(
+                EnvConfig.from_keywords(ENV, vehicle=VEHICLE, **more), num_envs=drones
+            )
             cases[name] = advanced(local, drones)
             cases[f"{name} over UDP"] = advanced(opened.enter_context(pair), drones)
         if drones > 1:
@@ -193,12 +193,11 @@ def two_simulators(drones: int, settings: dict[str, Any]) -> Iterator[RemoteVect
         here, env_id=ENV, options=settings, num_simulators=2, num_envs=drones,
         autoreset_mode="Disabled", connect=False,
     )  # fmt: skip
-    told = {"server": env.address, "bind": here, "num_envs": drones // 2, "env": ENV}
-    words = json.dumps(told | {"vehicle": VEHICLE, "options": settings})
-    command = [sys.executable, "-P", "-m", "rotorgram.udp", words]
+    config = EnvConfig.from_keywords(ENV, vehicle=VEHICLE, **settings)
     with ExitStack() as opened:
         for _ in range(2):
-            opened.enter_context(subprocess.Popen(command))
+            process = start_simulator(config, env.address, num_envs=drones // 2)
+            opened.enter_context(process)
         opened.callback(env.close)
         yield env
 

@@ -17,9 +17,9 @@ from typing import Any
 
 from measuring import RESULTS, options, write
 from rotorgram.agents import preset
-from rotorgram.training.pairs import socket_pair
 from rotorgram.training.settings import Run
 from rotorgram.training.training import Training
+from rotorgram.udp.spawn import spawn_simulator
 
 FLOOD = """
 import json, random, socket, sys, time
@@ -71,7 +71,7 @@ print(json.dumps({"sent": sent, "datagrams_per_second": round(sent / seconds)}))
 
 
 def train(run: Run, flood_seconds: float) -> dict[str, Any]:
-    with socket_pair(run.env_id, run.options) as env:
+    with spawn_simulator(run.flown) as env:
         training = Training(run, env)
         flood, marks = None, []
 

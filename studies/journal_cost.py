@@ -11,10 +11,7 @@ Beside it, less disturbed by others: the processor time of a step on the side th
 that of the same side without a journal, and the journal alone, chunks and writing included.
 """
 
-import json
 import statistics
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -24,10 +21,12 @@ from typing import NamedTuple
 
 import numpy as np
 from measuring import RESULTS, medians, options, write
+from rotorgram.envs.config import EnvConfig
 from rotorgram.udp import RemoteEnv
 from rotorgram.udp.journal import Journal, Recording, Summary
 from rotorgram.udp.protocol.messages import Command, Hello, State
 from rotorgram.udp.protocol.statistics import Statistics
+from rotorgram.udp.spawn import start_simulator
 
 SIDES: dict[str, tuple[str, ...]] = {
     "none": (),
@@ -82,11 +81,10 @@ def processor_time(process: int) -> float:
 def flight(name: str, folder: Path) -> Iterator[Flight]:
     record = folder / f"{name}-agent.mcap" if "agent" in SIDES[name] else None
     with RemoteEnv(("127.0.0.1", 0), connect=False, record=record) as env:
-        arguments = {"server": env.address, "bind": ("127.0.0.1", 0)}
+        settings = {}
         if "simulator" in SIDES[name]:
-            arguments["record"] = str(folder / f"{name}-simulator.mcap")
-        words = [sys.executable, "-m", "rotorgram.udp", json.dumps(arguments)]
-        with subprocess.Popen(words) as process:
+            settings["record"] = str(folder / f"{name}-simulator.mcap")
+        with start_simulator(EnvConfig(), env.address, **settings) as process:
             yield Flight(env, process.pid)
             env.close()
             process.wait()

@@ -15,7 +15,6 @@
   there is no Ray.
 """
 
-import json
 import statistics
 import subprocess
 import sys
@@ -29,11 +28,13 @@ import gymnasium as gym
 import numpy as np
 import rotorgram.envs  # noqa: F401  # makes the envs known
 from measuring import RESULTS, medians, options, write
+from rotorgram.envs.config import EnvConfig
 from rotorgram.flights.executors import WorkersConfig
 from rotorgram.flights.folders import new_folder
 from rotorgram.training.settings import Row, Study
 from rotorgram.training.study import run_study
 from rotorgram.udp import RemoteVectorEnv
+from rotorgram.udp.spawn import start_simulator
 
 ENV_ID = "rotorgram/Elevation-v0"
 DRONES = 1024
@@ -70,17 +71,14 @@ def simulators(count):
             here, num_envs=count * DRONES, num_simulators=count, connect=False,
             autoreset_mode="Disabled", connect_timeout=60.0,
         )
-    ) as env:  # fmt: skip
-        settings = {"server": env.address, "bind": here, "num_envs": DRONES, "env": ENV_ID}
-        words = [sys.executable, "-m", "rotorgram.udp", json.dumps(settings)]
-        with ExitStack() as stack:
-            for _ in range(count):
-                process = subprocess.Popen([*words, "--until-stdin-closes"], stdin=subprocess.PIPE)
-                stack.callback(process.wait)
-                stack.callback(process.stdin.close)
-            env.connect()
-            env.reset(seed=0)
-            yield env
+    ) as env, ExitStack() as stack:  # fmt: skip
+        for _ in range(count):
+            process = start_simulator(EnvConfig(env_id=ENV_ID), env.address, num_envs=DRONES)
+            stack.callback(process.wait)
+            stack.callback(process.stdin.close)
+        env.connect()
+        env.reset(seed=0)
+        yield env
 
 
 def in_turns(envs, rounds, seconds):

@@ -12,8 +12,9 @@ import statistics
 import time
 from contextlib import ExitStack
 
+from rotorgram.envs.config import EnvConfig
 from rotorgram.training.bench import _echo, _env, _local
-from rotorgram.training.pairs import socket_pair
+from rotorgram.udp.spawn import spawn_simulator
 
 ENV_ID = "rotorgram/Elevation-v0"
 TURN = 0.2  # s
@@ -27,7 +28,7 @@ def main() -> None:
         runs = {
             "env": _local(stack, 1),
             "echo": _echo(stack),
-            "step": _env(stack.enter_context(socket_pair(ENV_ID))),
+            "step": _env(stack.enter_context(spawn_simulator(EnvConfig(env_id=ENV_ID)))),
         }
         times: dict[str, list[float]] = {name: [] for name in runs}
         for _ in range(rounds):

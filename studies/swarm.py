@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 from measuring import in_turns, medians, options, write
 from rotorgram.envs import LocalVectorEnv
-from rotorgram.training.pairs import socket_pair
+from rotorgram.envs.config import EnvConfig
+from rotorgram.udp.spawn import spawn_simulator
 
 ENV = "rotorgram/Formation-v0"
 EPISODE = 100_000  # control steps: none ends while it is measured
@@ -59,7 +60,7 @@ def measure(counts: list[int], seconds: float, repeats: int) -> dict[str, dict[s
         for drones in counts:
             options: dict[str, Any] = {"episode_length": EPISODE}
             local = LocalVectorEnv(ENV, drones, drones=drones, autoreset_mode="Disabled", **options)
-            pair = socket_pair(ENV, options, num_envs=drones, drones=drones)
+            pair = spawn_simulator(EnvConfig.from_keywords(ENV, drones=drones, **options))
             cases["apart", drones] = physics(drones, together=False)
             cases["one world", drones] = physics(drones, together=True)
             cases["with the task", drones] = advanced(local, drones)

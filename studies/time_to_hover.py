@@ -24,18 +24,18 @@ import numpy as np
 import rotorgram.envs
 from rotorgram.agents import preset
 from rotorgram.training.metrics import Headline, measure_episode
-from rotorgram.training.pairs import socket_pair
+from rotorgram.udp.spawn import spawn_simulator
 from rotorgram.training.settings import Run
 from rotorgram.training.training import Training
 from rotorgram.flights.trajectories import fly_episodes
 s = json.loads(sys.argv[1])
 run = Run(algorithm=s["agent"], config=preset(s["agent"], "tuned", **s["changes"]),
           seed=s["seed"], env_steps=s["env_steps"], num_envs=s["drones"])
-with socket_pair(**run.env, num_envs=run.num_envs) as remote:
+with spawn_simulator(run.flown, num_envs=run.num_envs) as remote:
     training = Training(run, remote)
     training.train()
 spec = training.log.spec
-with socket_pair(**run.env, num_envs=20) as remote:
+with spawn_simulator(run.flown, num_envs=20) as remote:
     flown = fly_episodes(remote, training.agent.policy(), 20, "final")
 rows = [measure_episode(one, Headline.of(spec)) for one in flown]
 print(json.dumps({"training": training.log.seconds,

@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 from measuring import RESULTS, medians, options, write
 from rotorgram.agents import preset
-from rotorgram.training.pairs import socket_pair
 from rotorgram.training.settings import Run
 from rotorgram.training.training import Training
+from rotorgram.udp.spawn import spawn_simulator
 
 
 def processor_seconds() -> float:
@@ -41,7 +41,7 @@ def steps_per_second(
     """By the clock, and per second of a processor."""
     config = preset(algorithm, "tuned", **changes)
     run = Run(algorithm=algorithm, config=config, seed=seed, **settings)
-    with socket_pair(**run.training_env, num_envs=run.num_envs) as env:
+    with spawn_simulator(run.trained, num_envs=run.num_envs) as env:
         training = Training(run, env)
         before = processor_seconds()
         training.train()

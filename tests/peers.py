@@ -41,10 +41,11 @@ class Running:
         assert isinstance(self.join(), OSError)
 
 
-def launch(code: str, *arguments: object) -> subprocess.Popen[str]:
+def launch(code: str, *arguments: object, stdin: int | None = None) -> subprocess.Popen[str]:
     """A Python program in a process of its own."""
     command = [sys.executable, "-c", textwrap.dedent(code), *map(str, arguments)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    pipe = subprocess.PIPE
+    return subprocess.Popen(command, stdin=stdin, stdout=pipe, stderr=pipe, text=True)
 
 
 @contextmanager

@@ -40,7 +40,7 @@ from ..models.vehicle import Vehicle
 from ..udp.layouts import layout_of
 from ..udp.protocol import binary
 from ..udp.protocol.messages import Command, State
-from .pairs import socket_pair
+from ..udp.spawn import spawn_simulator
 from .results import machine
 from .settings import Run
 from .training import Training
@@ -396,7 +396,7 @@ def _training(stack: ExitStack, algorithm: str, drones: int) -> Slice:
     changes: dict[str, Any] = {} if drones == 1 else batch
     config = preset(algorithm, "tuned", **changes)
     run = Run(algorithm=algorithm, config=config, seed=0, env_steps=10**9, num_envs=drones)
-    env = stack.enter_context(socket_pair(**run.env, num_envs=drones))
+    env = stack.enter_context(spawn_simulator(run.flown, num_envs=drones))
     training = Training(run, env)
 
     def fly(seconds: float) -> int:
@@ -418,7 +418,8 @@ _LAYERS: Final[list[tuple[str, str, int, Callable[[ExitStack], Slice]]]] = [
     *((f"vector env, {n}", "the vector env", n, lambda s, n=n: _local(s, n)) for n in _MANY),
     ("UDP echo", "blocking sockets in Python on one core, datagrams of the same sizes", 1, _echo),
     *((f"UDP, {n}", f"Remote{'Vector' * (n > 1)}Env and a simulator", n,
-       lambda s, n=n: _env(s.enter_context(socket_pair(ENV_ID, num_envs=n)))) for n in (1, *_MANY)),
+       lambda s, n=n: _env(s.enter_context(spawn_simulator(EnvConfig(), num_envs=n))))
+      for n in (1, *_MANY)),
     ("simulate", "physics, task and telemetry of one drone", 1, _simulate),
     *((name, "of one drone, binary", 1, lambda _, name=name: _codec(name)) for name in _CODEC),
     ("decide", "16 units, sampled", 1, lambda _: _policy(1)),

@@ -51,7 +51,7 @@ class EnvConfig:
 
     @property
     def env(self) -> dict[str, Any]:
-        """Keyword arguments of `EnvConfig` and `pairs.socket_pair`, on `mujoco`."""
+        """Its fields by name, but for the backend."""
         env = {"env_id": self.env_id, "options": self.options, "vehicle": self.vehicle}
         return {**env, "drones": self.drones}
 
@@ -62,9 +62,9 @@ class EnvConfig:
         return envs.EnvConfig.from_keywords(self.env_id, **keywords)
 
     @property
-    def training_env(self) -> dict[str, Any]:
+    def trained(self) -> envs.EnvConfig:
         """The same on the backend of the training."""
-        return self.env | {"backend": self.backend}
+        return replace(self.flown, backend=envs.BackendConfig(name=self.backend))
 
     @property
     def module(self) -> str | None:

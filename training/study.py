@@ -14,14 +14,15 @@ import pandas as pd
 from ..agents import CONTROLLERS
 from ..agents.checkpoints import Checkpoint, store
 from ..agents.policies import Policy
+from ..envs.config import EnvConfig
 from ..envs.registry import env_spec, load
 from ..envs.spec import EnvSpec
 from ..flights.executors import OnProgress, Tell, WorkersConfig, open_executor, run_jobs
 from ..flights.folders import locked
 from ..flights.trajectories import Trajectory, fly_episodes
+from ..udp.spawn import cached_simulator
 from . import results, swarms
 from .metrics import Headline, measure_episode, measure_run
-from .pairs import shared_pair
 from .results import CONFIG_FILE, PARTS
 from .settings import Row, Study
 from .training import Training, train_run
@@ -116,7 +117,7 @@ def _fly(study: Study, own_tasks: set[str], job: Job, tell: Tell) -> Done:
         times = {"env_steps": 0, "seconds": 0.0, "steps_per_second": np.nan}
         return Done(_evaluate(study, row, seed, stages, times), None)
     run = row.run(seed)
-    with open_env(study.wire, run.training_env, run.num_envs) as env:
+    with open_env(study.wire, run.trained, run.num_envs) as env:
         training, times = train_run(run, env, tell, study.snapshots, study.keep_steps)
     stages = []
     for taken in training.taken:
@@ -134,19 +135,17 @@ def _constant(policy: Policy) -> Callable[[EnvSpec], Policy]:
 
 
 @contextmanager
-def open_env(wire: bool, settings: dict[str, Any], num_envs: int) -> Iterator[Any]:
+def open_env(wire: bool, config: EnvConfig, num_envs: int) -> Iterator[Any]:
     """An env of so many drones without autoreset: over UDP with a simulator process that the next
     run of this process uses again, or in process.
     """
     if wire:
-        with shared_pair(**settings, num_envs=num_envs) as env:
+        with cached_simulator(config, num_envs=num_envs) as env:
             yield env
         return
     from ..envs.vector import LocalVectorEnv
 
-    keywords = {"autoreset_mode": "Disabled", **settings}
-    env_id, options = keywords.pop("env_id"), keywords.pop("options")
-    with closing(LocalVectorEnv(env_id, num_envs, **keywords, **options)) as local:
+    with closing(LocalVectorEnv(config, num_envs, autoreset_mode="Disabled")) as local:
         yield local
 
 
@@ -161,7 +160,7 @@ def _evaluate(
     drones = row.env.drones
     most = max(study.curve_episodes, study.episodes) if len(stages) > 1 else study.episodes
     worlds = min(most, max(MAX_BATCH // drones, 1))
-    with open_env(study.wire, row.env.env, worlds * drones) as env:
+    with open_env(study.wire, row.env.flown, worlds * drones) as env:
         headline = Headline.of(env.env_spec)
         for stage in stages:
             last = stage is stages[-1]

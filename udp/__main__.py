@@ -1,9 +1,9 @@
-"""A simulator process for programs: `python -m rotorgram.udp JSON [--until-stdin-closes]`.
+"""A simulator process for programs: `python -P -m rotorgram.udp`; people use `rotorgram sim`.
 
-The JSON object holds the keyword arguments of `Simulator`, but for `config`: the options of the env
-as `options`. `module`, which only our own command line gives, is imported first: it registers the
-env of a user. An id is never imported: it may be one of a file. With the flag the process ends with
-the program that holds its standard input, however that ends. People use `rotorgram sim`.
+Its first line of standard input is a JSON object: `config` as `EnvConfig.to_dict` gives it, and
+keyword arguments of `Simulator`. `module`, which only our own command line gives, is imported
+first: it registers the env of a user. An id is never imported: it may be one of a file. The process
+ends with the program that holds its standard input, however that ends.
 """
 
 import json
@@ -14,75 +14,78 @@ from threading import Thread
 from typing import Any, Final
 
 from ..envs import registry
-from ..envs.spec import canonical_id
-from ..models.errors import InputError, MissingPackage, NoOpenGL, expect
+from ..envs.config import EnvConfig
+from ..models.errors import InputError, MissingPackage, NoOpenGL
+from ..models.fields import check_names
 from .protocol.client import LinkConfig
 from .protocol.errors import LinkError
+from .transport.driver import Driver
 from .transport.simulator import Simulator
 
-_FOR_EVER: Final = 30 * 86_400.0  # s
-_KINDS: Final[dict[str, tuple[Any, str]]] = {
-    "env": (str, "an id"),
-    "module": (str, "the name of a module"),
-    "options": (dict, "an object"),
-    **dict.fromkeys(("num_envs", "drones"), (int, "a number")),
-    **dict.fromkeys(("backend", "codec"), (str, "a name")),
-    **dict.fromkeys(("server", "bind"), (list, "[host, port]")),
-    **dict.fromkeys(("vehicle", "key_file", "record"), (str | None, "a path")),
-    "insecure": (bool, "true or false"),
-}
+_KEYS: Final = ("config", "module", "num_envs", "server", "bind", "codec", "key_file", "insecure",
+                "record")  # fmt: skip
+_FOR_EVER: Final = 30 * 86_400.0
+"""Seconds that an agent may be silent while it holds standard input."""
 
 
 def main() -> int:
     """Fly until the agent closes. Exit status 1 and one sentence if it fell silent."""
     # The agent closes the exchange; Ctrl-C in a terminal is meant for it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    words = sys.argv[1:]
-    ends_with_stdin = words[1:] == ["--until-stdin-closes"]
     try:
-        arguments = parse_arguments(words[:1] if ends_with_stdin else words)
-        if ends_with_stdin:  # an agent that is busy for long still holds it
-            arguments["config"] = LinkConfig(timeout=_FOR_EVER)
-        with Simulator(**arguments) as simulator:
-            ended: list[int] = []
-
-            def end(number: int, _: object) -> None:
-                ended.append(number)
-                simulator.stop()
-
-            signal.signal(signal.SIGTERM, end)
-
-            def stop_with_stdin() -> None:
-                while os.read(0, 1024):
-                    pass
-                simulator.stop()
-
-            if ends_with_stdin:
-                Thread(target=stop_with_stdin, daemon=True).start()
-            simulator.run()
-            return 128 + ended[0] if ended else 0
+        env, settings = read_arguments(_first_line())
+        with Simulator(env, config=LinkConfig(timeout=_FOR_EVER), **settings) as simulator:
+            return _fly(simulator)
     except (LinkError, OSError, InputError, MissingPackage, NoOpenGL) as error:
         print(f"rotorgram simulator: {error}", file=sys.stderr)
         return 1
 
 
-def parse_arguments(words: list[str]) -> dict[str, Any]:
-    """Keyword arguments of `Simulator` from those of the program. Raises `InputError`."""
-    if len(words) != 1:
-        raise InputError(f"expected one argument, a JSON object, got {len(words)}")
+def _fly(simulator: Driver) -> int:
+    ended: list[int] = []
+
+    def end(number: int, _: object) -> None:
+        ended.append(number)
+        simulator.stop()
+
+    def stop_with_stdin() -> None:
+        while os.read(0, 1024):
+            pass
+        simulator.stop()
+
+    signal.signal(signal.SIGTERM, end)
+    Thread(target=stop_with_stdin, daemon=True).start()
+    simulator.run()
+    return 128 + ended[0] if ended else 0
+
+
+def _first_line() -> bytes:
+    """Up to the first end of a line, and no byte more: the thread reads the rest."""
+    line = b""
+    while not line.endswith(b"\n"):
+        byte = os.read(0, 1 << 16)
+        if not byte:
+            break
+        line += byte
+    return line
+
+
+def read_arguments(line: bytes) -> tuple[EnvConfig, dict[str, Any]]:
+    """The config, and keyword arguments of `Simulator`. Raises `InputError`."""
     try:
-        arguments = json.loads(words[0])
+        arguments = json.loads(line)
     except (ValueError, RecursionError) as error:
-        raise InputError(f"expected a JSON object: {error}") from None
+        raise InputError(f"standard input: expected a JSON object: {error}") from None
     if not isinstance(arguments, dict):
-        raise InputError(f"expected a JSON object, got {words[0][:80]}")
-    for name, value in arguments.items():
-        expect(name in _KINDS, name, f"one of {', '.join(_KINDS)}")
-        kind, expected = _KINDS[name]
-        expect(isinstance(value, kind), name, expected, f"{value!r}")
+        raise InputError(f"standard input: expected a JSON object, got {arguments!r:.80}")
+    check_names(arguments, _KEYS, "standard input")
+    content = arguments.pop("config", None)
     if module := arguments.pop("module", None):
-        registry.load(f"{module}:{canonical_id(arguments.get('env', ''))}")
-    return {**arguments.pop("options", {}), **arguments}
+        registry.load(f"{module}:{dict(content or {}).get('env_id', '')}")
+    for name in ("server", "bind"):
+        if name in arguments:
+            arguments[name] = tuple(arguments[name])
+    return EnvConfig.from_dict(content), arguments
 
 
 if __name__ == "__main__":

@@ -93,7 +93,10 @@ def test_help(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
         (["evaluate", "nowhere.safetensors"], "there is no file nowhere.safetensors"),
         (["evaluate", "pid", "--episodes", "0"], "episodes: expected at least 1, got 0"),
         (["evaluate", "pid", "--env.observation", "error"], "pid: expected observation='full'"),
-        (["evaluate", "pid", "--env", "rotorgram/Hover-v0"], "pid: expected the env rotorgram/El"),
+        (
+            ["evaluate", "pid", "--env", "rotorgram/Hover-v0"],
+            "pid: expected the env rotorgram/El",
+        ),
         (["train", "a2c", "--set", "gamma"], "set: expected NAME=VALUE, got 'gamma'"),
         (["train", "a2c", "--set", "speed=1"], "hyperparameters: expected some of"),
         (["train", "a2c", "--set", "gamma=[[["], "gamma: expected a number from 0 to 1, got '[[['"),

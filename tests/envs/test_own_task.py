@@ -170,3 +170,18 @@ def test_a_task_that_nobody_knows_is_one_sentence(elsewhere: Path) -> None:
     told = rotorgram(elsewhere, "sim", "--env", ID, status=1)
     assert "expected a module landing here, got none" in told
     assert "Traceback" not in told
+
+
+def test_files_of_the_working_folder_are_not_executed(tmp_path: Path) -> None:
+    """But the module that `--env` names, in this process and in the simulator's."""
+    for name in ("queue", "json", "random", "numpy"):
+        (tmp_path / f"{name}.py").write_text("raise SystemExit('executed')\n")
+    source = Path(__file__).parents[2] / "examples" / "landing.py"
+    (tmp_path / "landing.py").write_text(source.read_text())
+    words = ["train", "ppo", "--env", "landing:Landing-v0", "--env-steps", "2000", "--out", "run"]
+    for program in ("rotorgram", "rotorgram.cli"):
+        done = subprocess.run(
+            [sys.executable, "-m", program, *words], cwd=tmp_path, capture_output=True, text=True
+        )
+        assert done.returncode == 0, done.stderr
+        shutil.rmtree(tmp_path / "run")

@@ -24,9 +24,9 @@ from rotorgram.models import InputError
 from rotorgram.models.cameras import chosen_views
 from rotorgram.models.vehicle import Vehicle
 from rotorgram.rendering.cameras import Cameras
-from rotorgram.training.pairs import socket_pair
 from rotorgram.udp import LinkConfig, Simulator
 from rotorgram.udp.remote_parallel import RemoteParallelEnv
+from rotorgram.udp.spawn import spawn_simulator
 from test_cameras import BELLY, vehicle_with
 
 LANDING = "rotorgram/Landing-v0"
@@ -195,7 +195,7 @@ def test_each_episode_has_a_world_of_its_own(opengl: None) -> None:
     assert np.sum(found, axis=0).tolist() == [1, 1, 1, 1]
     assert len({*np.argmax(found, axis=0)}) > 1
     assert (again["front"] != first["front"]).any(axis=(1, 2, 3)).all()  # other starts, at least
-    with socket_pair(HOVER, options) as env:
+    with spawn_simulator(EnvConfig.from_keywords(HOVER, **options)) as env:
         told = env.reset(seed=5)[0]
         for name, picture in told.items():
             assert (np.asarray(picture) == first[name][2]).all()
@@ -299,7 +299,7 @@ def test_sb3_learns_from_pictures(opengl: None, over_udp: bool) -> None:
     options = {"cameras": ["down@40x40"], "action": "velocity"}
     with ExitStack() as opened:
         if over_udp:
-            env = opened.enter_context(socket_pair(HOVER, options))
+            env = opened.enter_context(spawn_simulator(EnvConfig.from_keywords(HOVER, **options)))
         else:
             env = opened.enter_context(closing(gym.make(HOVER, **options)))
         settings = {"n_steps": 16, "batch_size": 16, "n_epochs": 1, "device": "cpu"}

@@ -14,7 +14,7 @@ from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.delay import Delay
 from rotorgram.envs.registry import env_spec
 from rotorgram.models.errors import InputError
-from rotorgram.training.pairs import socket_pair
+from rotorgram.udp.spawn import spawn_simulator
 
 RACER = Path(__file__).parents[1] / "data" / "racer.xml"
 ELEVATION, HOVER = "rotorgram/Elevation-v0", "rotorgram/Hover-v0"
@@ -111,7 +111,7 @@ def test_a_batch_equals_single_envs(env_id: str) -> None:
 
 def test_over_udp_the_same_bits_and_what_was_drawn() -> None:
     here = gym.make(HOVER, vehicle=str(RACER), **WORLD)
-    with socket_pair(HOVER, WORLD, vehicle=str(RACER)) as remote:
+    with spawn_simulator(EnvConfig.from_keywords(HOVER, vehicle=RACER, **WORLD)) as remote:
         ours, theirs = here.reset(seed=4), remote.reset(seed=4)
         assert (ours[0] == theirs[0]).all()
         for name in ("drawn_mass", "drawn_wind_y", "drawn_action_delay"):

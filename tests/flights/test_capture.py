@@ -12,13 +12,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rotorgram.envs.config import EnvConfig
 from rotorgram.flights import capture as capturing
 from rotorgram.flights.capture import capture, label_file, objects_in, read_labels
 from rotorgram.flights.coco import category
 from rotorgram.flights.executors import WorkersConfig
 from rotorgram.flights.viewpoints import Plan
 from rotorgram.models import InputError
-from rotorgram.training.pairs import socket_pair
+from rotorgram.udp.spawn import spawn_simulator
 from test_cameras import BELLY, vehicle_with
 
 Image = pytest.importorskip("PIL.Image")
@@ -360,7 +361,7 @@ def test_several_drones_and_a_camera_that_stands(opengl: None, tmp_path: Path) -
 
 def test_a_journal_of_another_vehicle(tmp_path: Path) -> None:
     journal = tmp_path / "flight.mcap"
-    with socket_pair("rotorgram/Hover-v0", record=journal) as env:
+    with spawn_simulator(EnvConfig(env_id="rotorgram/Hover-v0"), record=journal) as env:
         env.reset(seed=1)
         for _ in range(4):
             env.step(env.action_space.sample())

@@ -14,7 +14,7 @@ from rotorgram.flights.plots import panels_of, roll_pitch_yaw
 from rotorgram.flights.recorded import recorded_trajectories
 from rotorgram.flights.signals import Signal, columns_of
 from rotorgram.flights.trajectories import Trajectory
-from rotorgram.training.pairs import socket_pair
+from rotorgram.udp.spawn import spawn_simulator
 
 pytest.importorskip("mcap")
 HEAD = [
@@ -28,7 +28,7 @@ HEAD = [
 def journal(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three steps of a first episode, which is given up, and two of a second one."""
     path = tmp_path_factory.mktemp("journals") / "hover.mcap"
-    with socket_pair("rotorgram/Hover-v0", record=path) as env:
+    with spawn_simulator(EnvConfig(env_id="rotorgram/Hover-v0"), record=path) as env:
         for steps in (3, 2):
             env.reset(seed=steps)
             for _ in range(steps):
@@ -221,7 +221,9 @@ def test_wrong_words_of_plot(
 
 def test_all_drones_of_a_journal(tmp_path: Path) -> None:
     path = tmp_path / "two.mcap"
-    with socket_pair("rotorgram/Elevation-v0", num_envs=2, record=path) as env:
+    with spawn_simulator(
+        EnvConfig(env_id="rotorgram/Elevation-v0"), num_envs=2, record=path
+    ) as env:
         env.reset(seed=[1, 2])
         for _ in range(2):
             env.step(np.zeros((2, 1), np.float32))

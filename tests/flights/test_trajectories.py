@@ -22,8 +22,8 @@ from rotorgram.flights.trajectories import (
     fly_episodes,
 )
 from rotorgram.training.metrics import Headline, measure_episode
-from rotorgram.training.pairs import socket_pair
 from rotorgram.udp import RemoteVectorEnv, Simulator
+from rotorgram.udp.spawn import spawn_simulator
 
 ELEVATION = "rotorgram/Elevation-v0"
 SHORT: dict[str, Any] = {"episode_length": 25}  # half a second
@@ -68,7 +68,7 @@ def test_a_batch_is_bit_for_bit_as_one_after_the_other(drones: int) -> None:
 
 def test_a_batch_over_udp_is_bit_for_bit_as_in_process() -> None:
     flown = flown_trajectories(PID(SPEC), ELEVATION, SHORT, range(3))
-    with socket_pair(ELEVATION, SHORT, num_envs=2) as env:
+    with spawn_simulator(EnvConfig.from_keywords(ELEVATION, **SHORT), num_envs=2) as env:
         assert all(map(same, flown, fly_episodes(env, PID(SPEC), 3)))
 
 
@@ -104,7 +104,7 @@ def test_sets_of_evaluation_episodes_share_no_seed() -> None:
 
 def test_a_recorded_trajectory_is_the_one_that_was_flown(tmp_path: Path) -> None:
     journal = tmp_path / "pid.mcap"
-    with socket_pair(ELEVATION, SHORT, record=journal) as env:
+    with spawn_simulator(EnvConfig.from_keywords(ELEVATION, **SHORT), record=journal) as env:
         for episode in range(2):
             fly(env, PID(SPEC), evaluation_seed(episode))
         env.reset(seed=3)  # given up at once: no episode
@@ -156,7 +156,7 @@ def test_any_drone_of_any_session(tmp_path: Path) -> None:
 
 def test_a_journal_without_a_step_is_one_sentence(tmp_path: Path) -> None:
     journal = tmp_path / "nothing.mcap"
-    with socket_pair(ELEVATION, SHORT, record=journal) as env:
+    with spawn_simulator(EnvConfig.from_keywords(ELEVATION, **SHORT), record=journal) as env:
         env.reset(seed=0)
     with pytest.raises(ValueError, match="expected an episode with a step in it"):
         recorded_trajectories(journal, [0])

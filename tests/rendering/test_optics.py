@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 from rotorgram.envs import LocalVectorEnv
+from rotorgram.envs.config import EnvConfig
 from rotorgram.models import InputError
 from rotorgram.models.cameras import Optics, chosen_views
 from rotorgram.models.lens import Lens, distorted, undistorted
 from rotorgram.models.vehicle import Vehicle
 from rotorgram.rendering.cameras import Cameras
-from rotorgram.training.pairs import socket_pair
+from rotorgram.udp.spawn import spawn_simulator
 from test_cameras import made, state, take, vehicle_with
 
 __all__ = ["made"]  # a fixture
@@ -204,7 +205,7 @@ def test_all_of_them_over_udp(opengl: None, tmp_path: Path) -> None:
     vehicle = vehicle_with(tmp_path, OPTICS).path
     options = {"cameras": "wide,noisy,sharp@24x18", "action": "velocity"}
     with (
-        socket_pair(HOVER, options=options, vehicle=vehicle) as remote,
+        spawn_simulator(EnvConfig.from_keywords(HOVER, vehicle=vehicle, **options)) as remote,
         closing(LocalVectorEnv(HOVER, 1, vehicle=vehicle, **options)) as local,
     ):
         told, own = remote.reset(seed=4)[0], local.reset(seed=[4])[0]

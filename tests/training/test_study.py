@@ -490,7 +490,7 @@ def test_the_committed_policies_fly_the_committed_numbers() -> None:
     assert flown_before.keys() == files.keys()
     for row in trained:
         policy, count = load(files[row.name]).policy(), results.study.episodes
-        with open_env(False, row.env.env, count) as env:
+        with open_env(False, row.env.flown, count) as env:
             flown = fly_episodes(env, policy, count, "final")
         measured = [measure_episode(one, results.headline(row)) for one in flown]
         found = {

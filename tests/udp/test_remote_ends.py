@@ -7,7 +7,6 @@ import os
 import re
 import signal
 import socket
-import subprocess
 import sys
 import threading
 import time
@@ -20,6 +19,7 @@ import pytest
 import rotorgram.envs  # noqa: F401
 from peers import ANY, ENV_ID, Running, launch, plain_socket
 from remotes import QUICK, Broken, assert_parity, flying
+from rotorgram.envs.config import EnvConfig
 from rotorgram.udp import (
     LinkConfig,
     PeerClosed,
@@ -31,6 +31,7 @@ from rotorgram.udp import (
 from rotorgram.udp import __main__ as udp_main
 from rotorgram.udp.protocol import binary
 from rotorgram.udp.protocol.messages import Close, Hello, Welcome
+from rotorgram.udp.spawn import start_simulator
 from rotorgram.udp.transport import driver, sockets
 
 # ---- silence and ends
@@ -294,8 +295,7 @@ def test_a_second_simulator_waits_until_the_first_has_left(
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 def test_the_simulator_program_ends_on_sigterm_and_tells_the_agent() -> None:
     with RemoteEnv(ANY, connect=False, connect_timeout=20, timeout=10) as remote:
-        arguments = json.dumps({"server": remote.address, "bind": ANY})
-        process = subprocess.Popen([sys.executable, "-m", "rotorgram.udp", arguments])
+        process = start_simulator(EnvConfig(), remote.address)
         remote.reset(seed=0)
         process.send_signal(signal.SIGINT)  # Ctrl-C is for the agent
         remote.step(np.zeros(1))
@@ -303,6 +303,8 @@ def test_the_simulator_program_ends_on_sigterm_and_tells_the_agent() -> None:
         with pytest.raises(PeerClosed, match="closed: the simulator was stopped"):
             remote.reset()
         assert process.wait(10) == 128 + signal.SIGTERM
+        assert process.stdin is not None
+        process.stdin.close()
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
@@ -383,13 +385,11 @@ def test_a_simulator_of_our_own_waits_as_long_as_its_agent_lives(
 
     monkeypatch.setattr(udp_main, "Simulator", Made)
     monkeypatch.setattr(signal, "signal", lambda *_: None)
-    monkeypatch.setattr(os, "read", lambda *_: b"")
-    arguments = json.dumps({"server": ["127.0.0.1", 9], "bind": ["127.0.0.1", 0]})
-    for words in ([arguments], [arguments, "--until-stdin-closes"]):
-        monkeypatch.setattr(sys, "argv", ["simulator", *words])
-        assert udp_main.main() == 0
-    assert made[0] == LinkConfig().timeout
-    assert made[1] >= 86_400
+    words = {"config": EnvConfig().to_dict(), "server": ["127.0.0.1", 9], "bind": ANY}
+    parts = [json.dumps(words).encode() + b"\n"]
+    monkeypatch.setattr(os, "read", lambda *_: parts.pop() if parts else b"")
+    assert udp_main.main() == 0
+    assert made[0] >= 86_400
 
 
 def test_a_pause_of_its_own_does_not_end_a_simulator(  # fault 25

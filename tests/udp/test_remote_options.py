@@ -23,7 +23,7 @@ from rotorgram.envs.registry import env_spec
 from rotorgram.models import QUAD_XML
 from rotorgram.models.errors import InputError
 from rotorgram.udp import LinkError, PeerClosed, Refused, RemoteEnv, RemoteVectorEnv, Simulator
-from rotorgram.udp.__main__ import parse_arguments
+from rotorgram.udp.__main__ import read_arguments
 from rotorgram.udp.protocol import binary
 from rotorgram.udp.protocol.messages import Hello, Refuse
 from rotorgram.udp.transport.agent import AgentConfig
@@ -42,7 +42,10 @@ posix = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals and fo
         (lambda: Simulator("rotorgram/No-v0"), "env: expected a registered id"),
         (lambda: Simulator("CartPole-v1", wind=1), "options of CartPole-v1: .*'wind'"),
         (lambda: Simulator(wind=1), "wind"),
-        (lambda: Simulator(Broken(None), target=1), r"options \['target'\]: expected none"),
+        (
+            lambda: Simulator(Broken(None), target=1),
+            "env: expected one env without keywords",
+        ),
         (lambda: Simulator(num_envs=10**9), "num_envs: expected 1 to 65536"),
         (lambda: Simulator(num_envs=2, codec="text"), "text codec: expected one drone"),
         (lambda: RemoteEnv(ANY, env_id=ENV_ID, options={"wind": 1}), "wind"),
@@ -65,31 +68,27 @@ def test_wrong_arguments(make: Any, sentence: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "sentence"),
+    ("line", "sentence"),
     [
-        ([], "expected one argument, a JSON object, got 0"),
-        (["server"], "expected a JSON object: Expecting value"),
-        (["[" * 100_000], "expected a JSON object: maximum recursion depth"),
-        (["[1]"], r"expected a JSON object, got \[1\]"),
-        (['{"server": 5}'], r"server: expected \[host, port\], got 5"),
-        (['{"env": 5}'], "env: expected an id, got 5"),
-        (['{"insecure": "false"}'], "insecure: expected true or false, got 'false'"),
-        (['{"config": {"timeout": 1}}'], "config: expected one of"),
-        (['{"module": "no.such"}'], "env: expected a module no.such here, got none"),
+        ("", "expected a JSON object: Expecting value"),
+        ("[" * 100_000, "expected a JSON object: maximum recursion depth"),
+        ("[1]", r"expected a JSON object, got \[1\]"),
+        ('{"server": ["127.0.0.1", 5]}', "config: expected an object, got None"),
+        ('{"config": {"version": 7}}', "config: expected version 1, got 7"),
+        ('{"timeout": 1}', "standard input: expected some of config, .*, got 'timeout'"),
+        ('{"module": "no.such"}', "env: expected a module no.such here, got none"),
     ],
 )
-def test_wrong_arguments_of_the_simulator_program(words: list[str], sentence: str) -> None:
+def test_wrong_arguments_of_the_simulator_program(line: str, sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
-        parse_arguments(words)
+        read_arguments(line.encode())
 
 
 def test_arguments_of_the_simulator_program() -> None:
-    words = {"env": ENV_ID, "options": {"target": 3.0}, "server": ["127.0.0.1", 5]}
-    assert parse_arguments([json.dumps(words)]) == {
-        "env": ENV_ID,
-        "target": 3.0,
-        "server": ["127.0.0.1", 5],
-    }
+    config = EnvConfig(task={"target": 3.0})
+    words = {"config": config.to_dict(), "server": ["127.0.0.1", 5]}
+    arguments = read_arguments(json.dumps(words).encode() + b"\n")
+    assert arguments == (config, {"server": ("127.0.0.1", 5)})
 
 
 def test_the_simulator_program_says_which_package_is_missing(tmp_path: Path) -> None:
@@ -98,8 +97,9 @@ def test_the_simulator_program_says_which_package_is_missing(tmp_path: Path) -> 
         sys.modules["mcap"] = None
         runpy.run_module("rotorgram.udp", run_name="__main__")
     """
-    process = launch(code, json.dumps({"record": str(tmp_path / "j")}))
-    out, err = process.communicate(timeout=60)
+    process = launch(code, stdin=subprocess.PIPE)
+    words = {"config": EnvConfig().to_dict(), "record": str(tmp_path / "j")}
+    out, err = process.communicate(json.dumps(words) + "\n", timeout=60)
     sentence = "the journal of a flight needs the package mcap: pip install 'rotorgram[record]'"
     assert (process.returncode, out, err) == (1, "", f"rotorgram simulator: {sentence}\n")
 

@@ -20,6 +20,7 @@ import pytest
 import rotorgram.envs  # noqa: F401
 from peers import ANY, ENV_ID, Running, launch, plain_socket
 from relay import FaultConfig, relaying
+from rotorgram.envs.config import EnvConfig
 from rotorgram.udp import (
     LinkConfig,
     PeerClosed,
@@ -31,6 +32,7 @@ from rotorgram.udp import (
 )
 from rotorgram.udp.protocol import binary
 from rotorgram.udp.protocol.auth import message_of, write_key
+from rotorgram.udp.spawn import start_simulator
 
 LOSSY = FaultConfig(drop=0.3, duplicate=0.1, reorder=0.2, seed=2)
 QUICK = LinkConfig(timeout=10)
@@ -363,9 +365,7 @@ def test_a_simulator_ends_with_its_standard_input() -> None:
     """That of a program which was killed: before the first Welcome and in mid-flight."""
     with RemoteEnv(ANY, connect=False) as remote, plain_socket() as nobody:
         for server in (nobody.getsockname(), remote.address):
-            arguments = json.dumps({"server": server, "bind": ANY})
-            command = [sys.executable, "-m", "rotorgram.udp", arguments, "--until-stdin-closes"]
-            with subprocess.Popen(command, stdin=subprocess.PIPE) as process:
+            with start_simulator(EnvConfig(), server) as process:
                 assert process.stdin is not None
                 if server == remote.address:
                     remote.reset()

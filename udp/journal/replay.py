@@ -7,6 +7,7 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
+from ...envs.config import EnvConfig
 from ...envs.registry import is_known
 from ...envs.spec import component_names
 from ...models import Backend
@@ -128,10 +129,9 @@ class SessionVerdict:
         other = bool(was.strip("0")) and was != now
         hint = f"the vehicle was {was}, and is {now} here: --vehicle names its file" * other
         try:
-            loop = make_stepped(
-                spec.env_id, count, drones=len(spec.agents), vehicle=self.vehicle,
-                backend=self.backend, options=spec.options,
-            )  # fmt: skip
+            keywords = {"vehicle": self.vehicle, "backend": self.backend, **spec.options}
+            config = EnvConfig.from_keywords(spec.env_id, drones=len(spec.agents), **keywords)
+            loop = make_stepped(config, count, {})
         except InputError as error:
             raise InputError(hint or str(error)) from None
         for name in ("agents", "observation", "action", "telemetry", "control_period"):

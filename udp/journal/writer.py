@@ -224,7 +224,10 @@ def models_of(stepped: Any) -> tuple[dict[str, str], dict[str, str]]:
             name = f"model{len(names) or ''}.xml"
             names[vehicle.hash] = name
             models[name] = str(vehicle_spec(vehicle.path).to_xml())
-    return {"models": " ".join(names[vehicle.hash] for vehicle in members)}, models
+    about = {"models": " ".join(names[vehicle.hash] for vehicle in members)}
+    about["config"] = json.dumps(stepped.config.to_dict())
+    about["backend"] = stepped.config.backend.name
+    return about, models
 
 
 def _words(message: Message, datagram: bytes) -> dict[str, Any]:

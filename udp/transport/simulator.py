@@ -10,6 +10,7 @@ from typing import Any, Final, Literal, cast
 import gymnasium as gym
 import numpy as np
 
+from ...envs.config import DEFAULT_ENV, EnvConfig
 from ...envs.spec import EnvSpec
 from ...models.errors import InputError
 from ..layouts import layout_of
@@ -29,18 +30,15 @@ class Simulator(Driver):
     """Simulated drones that an agent flies over UDP.
 
     Args:
-        env: Id of a registered env, or one Gymnasium env itself: observations are a Box or a Dict
-            of Box, actions a Box or `Discrete`.
+        env: `EnvConfig`, id of a registered env, or one Gymnasium env itself: observations are a
+            Box or a Dict of Box, actions a Box or `Discrete`.
         server: Address (host, port) of the agent.
         num_envs: Drones in all; None: those of one world.
-        drones: Of each world.
         bind: Address of this side; port 0 takes a free port.
         codec: `binary`, or the paper's `text`.
-        vehicle: As `make_stepped`.
-        backend: As `make_stepped`.
         config: Times of the exchange.
         key_file: As `AgentSettings`, and so are `insecure` and `record`.
-        options: Options of the env, by name.
+        keywords: As of `EnvConfig.from_keywords`, with an id: `drones` of each world, `vehicle` …
 
     Attributes:
         link: The exchange with the agent, with its statistics.
@@ -54,20 +52,17 @@ class Simulator(Driver):
 
     def __init__(
         self,
-        env: str | gym.Env[Any, Any] = "rotorgram/Elevation-v0",
+        env: str | EnvConfig | gym.Env[Any, Any] = DEFAULT_ENV,
         *,
         server: Address = DEFAULT_AGENT,
         num_envs: int | None = None,
-        drones: int = 1,
         bind: Address = DEFAULT_SIMULATOR,
         codec: Literal["binary", "text"] = "binary",
-        vehicle: Path | str | None = None,
-        backend: str = "mujoco",
         config: LinkConfig | None = None,
         key_file: Path | str | None = None,
         insecure: bool = False,
         record: Path | str | None = None,
-        **options: Any,
+        **keywords: Any,
     ) -> None:
         if codec not in ("binary", "text"):
             raise InputError(f"codec: expected 'binary' or 'text', got {codec!r}")
@@ -77,13 +72,10 @@ class Simulator(Driver):
         server = resolve(server, insecure=insecure, way_out=way_out)
         if not server[1]:
             raise InputError("server: expected the port of the agent, 1 to 65535, got 0")
-        count = drones if num_envs is None else num_envs
         with ExitStack() as failing:  # closes what is open if a later step fails
-            stepped = make_stepped(
-                env, count, drones=drones, vehicle=vehicle, backend=backend, options=options
-            )
+            stepped = make_stepped(env, num_envs, keywords)
             failing.callback(stepped.close)
-            worlds = stepped.num_envs // drones
+            worlds = stepped.num_envs // len(stepped.spec.agents)
             layout = layout_of(stepped.spec, worlds)
             hello = Hello(session=new_session(), spec=stepped.spec.to_json(), worlds=worlds)
             config = config or LinkConfig()
@@ -98,16 +90,14 @@ class Simulator(Driver):
             rules = OneAgent(stepped, layout, stepped.spec.control_period, [link])
             super().__init__(stepped, rules, port)
             if record:
-                self._record(record, hello, backend)
+                self._record(record, hello)
             failing.pop_all()
 
-    def _record(self, path: Path | str, hello: Hello, backend: str) -> None:
+    def _record(self, path: Path | str, hello: Hello) -> None:
         from ..journal import Journal
         from ..journal.writer import models_of
 
         about, models = models_of(self.stepped)
-        if about:
-            about["backend"] = backend
         self._journal = Journal(
             path,
             self.link.statistics,
@@ -128,10 +118,9 @@ class SharedSimulator(Driver):
     those of `SeveralAgents`.
 
     Args:
-        env: Id of a registered task for several drones.
+        env: `EnvConfig`, or id of a registered task for several drones.
         agents: Their addresses (host, port), which share the drones evenly in their order; or, by
             address, the names of the drones of each.
-        drones: Of the world: `drone_0` and so on.
         when_lost: Policy of agents that state none: `hold` (the action that changes nothing),
             `land` (`Loop.land`) or `end` (rotors stand still).
         patience: Longest wait for a Command, s.
@@ -151,19 +140,16 @@ class SharedSimulator(Driver):
 
     def __init__(
         self,
-        env: str,
+        env: str | EnvConfig,
         agents: Sequence[Address] | Mapping[Address, Sequence[str]],
         *,
-        drones: int,
         when_lost: str = "hold",
         patience: float = 10.0,
         bind: Address = DEFAULT_SIMULATOR,
-        vehicle: Path | str | None = None,
-        backend: str = "mujoco",
         config: LinkConfig | None = None,
         key_file: Path | str | None = None,
         insecure: bool = False,
-        **options: Any,
+        **keywords: Any,
     ) -> None:
         if not (isinstance(patience, int | float) and 0 < patience < inf):
             raise InputError(f"patience: expected seconds > 0, got {patience!r}")
@@ -173,9 +159,7 @@ class SharedSimulator(Driver):
         insecure = insecure or key is not None
         config = config or LinkConfig()
         with ExitStack() as failing:
-            stepped = make_stepped(
-                env, drones, drones=drones, vehicle=vehicle, backend=backend, options=options
-            )
+            stepped = make_stepped(env, None, keywords)
             failing.callback(stepped.close)
             if not hasattr(stepped, "retire"):
                 raise InputError(f"env: expected a registered task for several drones, got {env!r}")

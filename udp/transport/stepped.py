@@ -1,7 +1,6 @@
 """Envs of a simulator: the loop of a registered task, or Gymnasium envs one after the other."""
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any, Protocol
 
 import gymnasium as gym
@@ -9,9 +8,10 @@ import numpy as np
 from gymnasium import spaces
 
 from ...envs import registry
+from ...envs.config import EnvConfig
 from ...envs.spaces import action_space, observation_space
 from ...envs.spec import ArraySpec, Discrete, EnvSpec, canonical_id, component_names
-from ...models.errors import InputError, expect
+from ...models.errors import InputError
 from ..protocol.layout import MAX_DRONES
 from ..protocol.party import World
 
@@ -26,50 +26,45 @@ class Steppable(World, Protocol):
 
 
 def make_stepped(
-    env: str | gym.Env[Any, Any],
-    num_envs: int,
-    *,
-    drones: int = 1,
-    vehicle: Path | str | None = None,
-    backend: str = "mujoco",
-    options: Mapping[str, Any],
+    env: str | EnvConfig | gym.Env[Any, Any],
+    num_envs: int | None,
+    keywords: Mapping[str, Any],
 ) -> Steppable:
     """N drones of an env. Raises `InputError` if its spaces or an argument are not right.
 
     Args:
-        env: Id of a registered task, of an env of Gymnasium, or one env itself.
-        num_envs: N, a multiple of `drones`.
-        drones: Of each world, for a registered task.
-        vehicle: File or name, for a registered task; None is the paper's.
-        backend: One of `sim.BACKENDS`, for a registered task.
-        options: Of the env, by name.
+        env: Config, id of a registered task or of an env of Gymnasium, or one env itself.
+        num_envs: N, a multiple of the drones of a world; None: one world.
+        keywords: As of `EnvConfig.from_keywords`, with an id.
     """
-    expect(type(drones) is int and drones >= 1, "drones", "1 or more", f"{drones!r}")
-    right = type(num_envs) is int and 1 <= num_envs <= MAX_DRONES
-    expect(right, "num_envs", f"1 to {MAX_DRONES}", f"{num_envs!r}")
-    expect(num_envs % drones == 0, "drones", f"a divisor of num_envs = {num_envs}", f"{drones}")
-    if isinstance(env, str):
-        if registry.is_known(env):
-            from ...envs.config import EnvConfig
-            from ...envs.loop import Loop
+    if isinstance(env, gym.Env):
+        if keywords or num_envs not in (None, 1):
+            got = ", ".join(keywords) or f"num_envs = {num_envs}"
+            raise InputError(f"env: expected one env without keywords, got {got}")
+        return GymnasiumBatch([env], {})
+    env = EnvConfig.from_keywords(env, **keywords)
+    count, drones = num_envs, env.drones
+    if count is None:
+        count = drones
+    if type(count) is not int or not 1 <= count <= MAX_DRONES:
+        raise InputError(f"num_envs: expected 1 to {MAX_DRONES}, got {count!r}")
+    if count % drones:
+        raise InputError(f"drones: expected a divisor of num_envs = {count}, got {drones}")
+    if registry.is_known(env.env_id):
+        from ...envs.loop import Loop
 
-            config = EnvConfig.from_keywords(
-                env, drones=drones, vehicle=vehicle, backend=backend, **options
-            )
-            return Loop(config, num_envs // drones)
-        try:
-            envs = [gym.make(env, disable_env_checker=True, **options) for _ in range(num_envs)]
-        except (gym.error.Error, ImportError) as error:
-            raise InputError(f"env: expected a registered id, got {env!r}: {error}") from None
-        except TypeError as error:
-            raise InputError(f"options of {env}: {error}") from None
-    else:
-        expect(not options, f"options {sorted(options)}", "none with an env already made")
-        expect(num_envs == 1, "num_envs", "1 with an env already made", f"{num_envs}")
-        envs = [env]
-    ours = vehicle is not None or backend != "mujoco" or drones > 1
-    expect(not ours, "vehicle, backend, drones", f"none for {env!r}, which is no task of ours")
-    return GymnasiumBatch(envs, options)
+        return Loop(env, count // drones)
+    if env != EnvConfig(env_id=env.env_id, task=env.task):
+        raise InputError(
+            f"vehicle, backend, drones: expected none for {env.env_id!r}, which is no task of ours"
+        )
+    try:
+        envs = [gym.make(env.env_id, disable_env_checker=True, **env.task) for _ in range(count)]
+    except (gym.error.Error, ImportError) as error:
+        raise InputError(f"env: expected a registered id, got {env.env_id!r}: {error}") from None
+    except TypeError as error:
+        raise InputError(f"options of {env.env_id}: {error}") from None
+    return GymnasiumBatch(envs, env.task)
 
 
 class GymnasiumBatch:

@@ -1,0 +1,218 @@
+"""The config of an env: its forms, defaults, checks, files and digest."""
+
+import pickle
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import pytest
+from rotorgram.envs import ArraySpec, EnvConfig, Loop, Outcome, Task, register
+from rotorgram.envs.config import BackendConfig, SceneConfig, source_hash
+from rotorgram.envs.tasks import Hover
+from rotorgram.models.errors import InputError
+from rotorgram.sim import EffectOptions, InitialState, stack
+
+HOVER = "rotorgram/Hover-v0"
+FULL = {
+    "vehicle": "crazyflie2,crazyflie2", "drones": 2, "scene": "forest:2-4", "action": "rates",
+    "control_period": 0.04, "episode_length": 9, "history": 3, "effects": {"motor_lag": True},
+    "randomize": {"mass": "uniform(0.9,1.1)"}, "sensors": {"imu": True}, "cameras": "front,down",
+    "backend": "rigid", "dtype": "float64", "compiled": False, "spacing": 4,
+}  # fmt: skip
+
+
+class Hold(Task):
+    """A task of one's own with an option that is named like a field of the config."""
+
+    action = "offset"
+    control_period = 0.05
+    episode_length = 7
+
+    def setup(self) -> None:
+        self.observation = (ArraySpec(name="observation", shape=(1,)),)
+
+    def begin(self, mask: Any, draw: Any) -> InitialState:
+        return InitialState(position=stack((0.0, 0.0, 5.0 + 0.0 * draw.uniform(0.0, 1.0))))
+
+    def observe(self, state: Any) -> dict[str, Any]:
+        return {"observation": state.position[..., 2:]}
+
+    def outcome(self, state: Any) -> Outcome:
+        height = state.position[..., 2]
+        return Outcome(reward={"height": height}, terminated=height > 9.0, metrics={})
+
+
+register("config/Hold-v0", Hold)
+
+
+def test_flat_keywords_reach_their_fields_and_the_task() -> None:
+    config = EnvConfig.from_keywords("rotorgram/Formation-v0", **FULL)
+    assert config.vehicle == ("crazyflie2", "crazyflie2")
+    assert config.scene == SceneConfig(name="forest", seeds=(2, 3, 4))
+    assert config.backend == BackendConfig(name="rigid", dtype="float64", compiled=False)
+    assert config.effects == EffectOptions(motor_lag=True)
+    assert config.cameras == ("front", "down")
+    assert (config.drones, config.action, config.history) == (2, "rates", 3)
+    assert (config.control_period, config.episode_length) == (0.04, 9)
+    assert config.task["spacing"] == 4.0
+    assert config.task["margin"] == 10.0  # a default of the task
+    nested = {name: value for name, value in FULL.items() if name != "spacing"}
+    assert EnvConfig.from_keywords(config.env_id, task={"spacing": 4}, **nested) == config
+
+
+def test_defaults_come_from_the_task() -> None:
+    config = EnvConfig(env_id="config/Hold-v0")
+    assert (config.action, config.control_period, config.episode_length) == ("offset", 0.05, 7)
+    formation = EnvConfig(env_id="rotorgram/Formation-v0")
+    assert (formation.action, formation.episode_length) == ("velocity", 500)
+
+
+def test_the_record_as_json_and_as_a_pickle() -> None:
+    config = EnvConfig.from_keywords("rotorgram/Formation-v0", **FULL)
+    content = config.to_dict()
+    assert content["version"] == 1
+    assert content["scene"] == {"name": "forest", "seeds": [2, 3, 4]}
+    assert EnvConfig.from_dict(content) == config
+    assert pickle.loads(pickle.dumps(config)) == config
+    with pytest.raises(InputError, match=r"^config: expected version 1, got 2$"):
+        EnvConfig.from_dict(content | {"version": 2})
+    with pytest.raises(InputError, match=r"^config: expected some of env_id, .*, got 'colour'$"):
+        EnvConfig.from_dict(content | {"colour": "red"})
+
+
+def test_flat_options_make_the_same_env() -> None:
+    config = EnvConfig.from_keywords("rotorgram/Formation-v0", **FULL)
+    again = EnvConfig.from_keywords(
+        config.env_id, vehicle="crazyflie2,crazyflie2", drones=2, backend=config.backend,
+        **config.flat_options(),
+    )  # fmt: skip
+    assert again == config
+
+
+def test_a_file_and_keywords_that_win(tmp_path: Path) -> None:
+    (tmp_path / "own.xml").write_text("<mujoco/>")
+    file = tmp_path / "drone.toml"
+    file.write_text(
+        f'env_id = "{HOVER}"\nvehicle = "own.xml"\nstart_tilt = 5\nhistory = 2\n'
+        '[backend]\nname = "rigid"\n[effects]\ngusts = 2\n'
+    )
+    config = EnvConfig.from_toml(file, history=4)
+    assert config.vehicle == (str(tmp_path / "own.xml"),)  # beside the file
+    assert (config.task["start_tilt"], config.history) == (5.0, 4)
+    assert (config.backend.name, config.effects.gusts) == ("rigid", 2.0)
+    file.write_text("env_id = ")
+    with pytest.raises(InputError, match=r"^config: expected a TOML file, got "):
+        EnvConfig.from_toml(file)
+    with pytest.raises(InputError, match=r"^config: cannot read .*nowhere.toml: "):
+        EnvConfig.from_toml(tmp_path / "nowhere.toml")
+
+
+@pytest.mark.parametrize(
+    ("keywords", "sentence"),
+    [
+        ({"frameskip": 4}, "options: expected some of goal, .*compiled, got 'frameskip'"),
+        ({"task": 3}, "task: expected options by name, got 3"),
+        ({"vehicle": 3}, "vehicle: expected names or files, got 3"),
+        ({"cameras": 3}, "cameras: expected names, with commas between them, got 3"),
+        ({"scene": {"nam": "plain"}}, "scene: expected some of name, seeds, got 'nam'"),
+        ({"backend": "bullet"}, "backend: expected mujoco or rigid, got 'bullet'"),
+        ({"backend": {"name": "rigid", "x": 1}}, "backend: expected some of name, .*, got 'x'"),
+        ({"action": "thrusts"}, "action: expected 'rotors' or .*, got 'thrusts'"),
+        ({"drones": 0}, "drones: expected a whole number from 1 to 1024, got 0"),
+    ],
+)
+def test_a_wrong_field_is_one_sentence(keywords: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(InputError, match=f"^{sentence}$"):
+        EnvConfig.from_keywords(HOVER, **keywords)
+
+
+@pytest.mark.parametrize(
+    ("keywords", "sentence"),
+    [
+        ({"drones": 2}, "drones: expected 1 with rotorgram/Hover-v0, got 2"),
+        ({"backend": "rigid", "num_threads": 2}, "num_threads: expected dtype or compiled, "),
+        ({"dtype": "float64"}, "dtype: expected num_threads, the setting of the backend mujoco"),
+        ({"control_period": 0.015}, "control_period: expected a positive multiple of .*timestep"),
+    ],
+)
+def test_what_does_not_go_together_is_refused_by_name(
+    keywords: dict[str, Any], sentence: str
+) -> None:
+    config = EnvConfig.from_keywords(HOVER, **keywords)
+    with pytest.raises(InputError, match=f"^{sentence}"):
+        config.resolve()
+
+
+def test_the_digest_is_of_what_changes_numbers() -> None:
+    config = EnvConfig(env_id=HOVER)
+    same = replace(config, backend=BackendConfig(num_threads=2))
+    assert config.digest == same.digest == config.resolve().digest
+    others = [
+        replace(config, history=2),
+        replace(config, effects=EffectOptions(linear_drag=0.5)),
+        replace(config, vehicle=("crazyflie2",)),
+        replace(config, backend=BackendConfig(name="rigid")),
+        EnvConfig(env_id=HOVER, task={"start_tilt": 3.0}),
+    ]
+    assert len({config.digest, *(other.digest for other in others)}) == 6
+
+
+def test_a_resolved_config_holds_its_vehicle_to_its_hash(tmp_path: Path) -> None:
+    from rotorgram.models import QUAD_XML
+
+    file = tmp_path / "own.xml"
+    file.write_text(QUAD_XML.read_text())
+    resolved = EnvConfig(env_id=HOVER, vehicle=(str(file),)).resolve()
+    assert resolved.resolve() == resolved
+    file.write_text(QUAD_XML.read_text().replace('ctrlrange="0 100"', 'ctrlrange="0 90"'))
+    with pytest.raises(InputError, match=r"^vehicle_hash: expected [0-9a-f]{32}, got "):
+        resolved.resolve()
+
+
+def test_the_source_of_an_own_task_belongs_to_the_digest() -> None:
+    assert source_hash(Hover) == ""
+    assert len(source_hash(Hold)) == 32
+    assert EnvConfig(env_id="config/Hold-v0").resolve().task_hash == source_hash(Hold)
+
+
+def test_a_task_may_add_to_a_config_and_its_users_may_not_contradict_it() -> None:
+    loop = Loop(EnvConfig(env_id="rotorgram/PayloadHover-v0"))
+    assert loop.task.config.effects.payload == pytest.approx(2.0)  # a tenth of 20 kg
+    assert loop.config.effects.payload == 0.0
+    with pytest.raises(InputError, match=r"^effects: expected a payload that the options of"):
+        Loop(EnvConfig.from_keywords("rotorgram/PayloadHover-v0", effects={"payload": 1.0}))
+
+
+def test_setup_runs_once_in_a_loop() -> None:
+    class Counted(Hold):
+        """Counts its setups."""
+
+        count = 0
+
+        def setup(self) -> None:
+            super().setup()
+            Counted.count += 1
+
+    register("config/Counted-v0", Counted)
+    Loop(EnvConfig(env_id="config/Counted-v0"), 3)
+    assert Counted.count == 1
+
+
+def test_an_unknown_keyword_is_a_type_error_too() -> None:
+    """As TorchRL expects, which tries frameskip."""
+    for make in (gym.make, lambda env_id, **rest: gym.make_vec(env_id, num_envs=2, **rest)):
+        with pytest.raises(TypeError, match="got 'frameskip'"):
+            make(HOVER, frameskip=4)
+
+
+def test_the_dozen_names_are_lazy() -> None:
+    code = (
+        "import sys, rotorgram\n"
+        "assert not {'numpy', 'gymnasium', 'rotorgram.envs'} & set(sys.modules)\n"
+        "assert rotorgram.make('rotorgram/Hover-v0').unwrapped.config.env_id\n"
+        "for name in rotorgram.__all__: getattr(rotorgram, name)\n"
+    )
+    subprocess.run([sys.executable, "-P", "-W", "error", "-c", code], check=True)

@@ -1,0 +1,153 @@
+"""A remote env here, and its simulator in a process of its own."""
+
+import atexit
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from tempfile import TemporaryFile
+from typing import IO, Any, Final
+
+from ..envs.config import EnvConfig
+from .protocol.client import Address
+from .protocol.errors import PeerClosed, PeerSilent
+from .remote import RemoteEnv, RemoteVectorEnv
+
+__all__ = [
+    "cached_simulator",
+    "close_cached_simulators",
+    "spawn_simulator",
+    "start_simulator",
+]
+
+Remote = RemoteEnv | RemoteVectorEnv
+_START_TIMEOUT: Final = 60.0
+_ANSWER_TIMEOUT: Final = 10.0
+_STOP_TIMEOUT: Final = 5.0
+_POLL: Final = 0.5
+# -P: no file of the working directory takes the place of a package.
+_COMMAND: Final = (sys.executable, "-P", "-m", "rotorgram.udp")
+
+
+@contextmanager
+def spawn_simulator(
+    config: EnvConfig, *, num_envs: int | None = None, record: Path | None = None
+) -> Iterator[Any]:
+    """A connected remote env, on free ports of the loopback interface.
+
+    One drone makes a `RemoteEnv`, more make a `RemoteVectorEnv` without autoreset. The simulator
+    ends with this process, however this one ends.
+
+    Args:
+        config: What is flown.
+        num_envs: Drones in all; None: those of one world.
+        record: MCAP file of the agent's journal.
+
+    Raises:
+        PeerClosed: The simulator did not start, or ended: its own sentence, or its last words.
+        PeerSilent: The simulator runs and does not answer.
+    """
+    count = config.drones if num_envs is None else num_envs
+    settings: dict[str, Any] = {
+        "env_id": config.env_id,
+        "options": config.flat_options(),
+        "connect": False,
+        "connect_timeout": _POLL,
+        "timeout": _ANSWER_TIMEOUT,
+        "record": record,
+    }
+    here = ("127.0.0.1", 0)
+    env: Remote
+    if count == 1:
+        env = RemoteEnv(here, **settings)
+    else:
+        env = RemoteVectorEnv(here, num_envs=count, autoreset_mode="Disabled", **settings)
+    with TemporaryFile("w+") as said:
+        process = start_simulator(config, env.address, num_envs=count, stderr=said)
+        try:
+            _connect(env, process)
+            yield env
+        except PeerSilent as error:
+            if process.poll() is None:
+                raise
+            raise PeerClosed(_last_words(said, process.returncode)) from error
+        finally:
+            env.close()
+            try:
+                process.communicate(timeout=_STOP_TIMEOUT)  # closes its standard input
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+
+def start_simulator(
+    config: EnvConfig, server: Address, *, stderr: IO[str] | None = None, **settings: Any
+) -> subprocess.Popen[bytes]:
+    """A simulator in a process of its own, on a free port; it ends when its stdin is closed.
+
+    `settings` are keyword arguments of `Simulator`.
+    """
+    arguments = {"config": config.to_dict(), "module": config.module, "server": server}
+    arguments |= {"bind": ("127.0.0.1", 0), **settings}
+    # A second thread of torch makes small tensors slower, and takes the agent's core.
+    around = {"OMP_NUM_THREADS": "1", **os.environ, "PYTHONSAFEPATH": "1"}
+    process = subprocess.Popen(_COMMAND, stdin=subprocess.PIPE, stderr=stderr, env=around)
+    assert process.stdin is not None
+    with suppress(BrokenPipeError):  # it has ended: its exit status says so
+        process.stdin.write(json.dumps(arguments).encode() + b"\n")
+        process.stdin.flush()
+    return process
+
+
+def _connect(env: Remote, process: subprocess.Popen[bytes]) -> None:
+    """Wait for the simulator, as long as its process runs."""
+    deadline = time.monotonic() + _START_TIMEOUT
+    while True:
+        try:
+            return env.connect()
+        except PeerSilent as error:
+            if process.poll() is not None:
+                raise
+            if time.monotonic() > deadline:
+                said = f"the simulator runs, and did not connect in {_START_TIMEOUT:g} s"
+                raise PeerSilent(said) from error
+
+
+def _last_words(said: IO[str], status: int) -> str:
+    said.seek(0)
+    words = said.read().strip() or "it said nothing"
+    _, own, sentence = words.rpartition("rotorgram simulator: ")
+    return sentence if own else f"the simulator ended with status {status}: {words}"
+
+
+_cached: dict[str, tuple[Any, ExitStack]] = {}
+
+
+@contextmanager
+def cached_simulator(config: EnvConfig, *, num_envs: int | None = None) -> Iterator[Any]:
+    """As `spawn_simulator`, but the simulator stays open for the next use in this process.
+
+    To start one takes as long as a short training. One whose block fails is closed, the others by
+    `close_cached_simulators`, or with the process.
+    """
+    key = json.dumps([config.to_dict(), num_envs], sort_keys=True)
+    if key not in _cached:
+        stack = ExitStack()
+        _cached[key] = stack.enter_context(spawn_simulator(config, num_envs=num_envs)), stack
+    env, stack = _cached[key]
+    try:
+        yield env
+    except BaseException:
+        _cached.pop(key)[1].close()
+        raise
+
+
+@atexit.register
+def close_cached_simulators() -> None:
+    """Close what `cached_simulator` left open."""
+    while _cached:
+        _cached.popitem()[1][1].close()
