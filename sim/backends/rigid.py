@@ -8,8 +8,8 @@ from typing import Final
 import mujoco
 import numpy as np
 
-from ...models.errors import expect
-from ...models.vehicle import Vehicle
+from ...models.errors import InputError, expect
+from ...models.vehicle import Vehicle, craft_bodies
 from ..effects import EffectOptions
 from ..randomize import Randomization
 from ..snapshots import Arrays
@@ -62,6 +62,7 @@ class RigidWorld(BaseWorld):
         shape = (num_worlds, drones)
         arguments = {"num_worlds": num_worlds, "drones": drones, "dtype": dtype}
         super().__init__(vehicle, shape, effects, randomize, arguments | {"compiled": compiled})
+        _check_obstacles(vehicle)
         _check_forces(vehicle)
         self.dtype = np.dtype(dtype)
         self._body, self._hull = RigidBody(vehicle), Hull(vehicle)
@@ -244,6 +245,20 @@ class RigidWorld(BaseWorld):
         worlds = np.any(bad.reshape(self.shape), axis=1)
         ids = worlds.nonzero()[0].flatten().tolist()
         raise PhysicsError(f"the rigid body has bad states in envs {ids[:5]}: reset the env")
+
+
+def _check_obstacles(vehicle: Vehicle) -> None:
+    """Refuse obstacles of the vehicle's file, through which drones would fly."""
+    model = vehicle.model
+    ours = np.isin(model.geom_bodyid, craft_bodies(model))
+    types, affinities = model.geom_contype, model.geom_conaffinity
+    for i in np.flatnonzero(~ours & (model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)).tolist():
+        if ((types[i] & affinities[ours]) | (affinities[i] & types[ours])).any():
+            name = model.geom(i).name or f"geom {i}"
+            raise InputError(
+                f"vehicle: expected no obstacles with the backend rigid, which has none (the "
+                f"backend mujoco has), got {name} in {vehicle.name}"
+            )
 
 
 def _check_forces(vehicle: Vehicle) -> None:

@@ -351,6 +351,19 @@ def test_what_mujoco_moves_in_another_way_is_refused(change: str, tmp_path: Path
         arrays(vehicle)
 
 
+def test_obstacles_of_a_file_are_refused_by_name(tmp_path: Path) -> None:
+    text = (DATA / "racer.xml").read_text()
+    tree = '<geom name="tree" type="cylinder" size="0.1 2" pos="1 0 2"/></worldbody>'
+    (tmp_path / "wood.xml").write_text(text.replace("</worldbody>", tree, 1))
+    vehicle = Vehicle.load(tmp_path / "wood.xml")
+    make_world(vehicle, 1)
+    with pytest.raises(InputError, match=r"^vehicle: expected no obstacles .* got tree in racer"):
+        arrays(vehicle)
+    seen = tree.replace("/>", ' contype="0" conaffinity="0"/>')  # which nothing touches
+    (tmp_path / "wood.xml").write_text(text.replace("</worldbody>", seen, 1))
+    arrays(Vehicle.load(tmp_path / "wood.xml"))
+
+
 def test_a_bad_state_raises_and_a_reset_mends_it() -> None:
     loop = Loop(EnvConfig.from_keywords(ELEVATION, backend="rigid"), 2)
     every, still = np.ones(2, bool), np.zeros((2, 1))
