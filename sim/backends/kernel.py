@@ -8,6 +8,7 @@ processor.
 import copy
 import ctypes
 import os
+import shlex
 import shutil
 import subprocess
 import tempfile
@@ -55,10 +56,13 @@ Fly = Callable[[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray | None, in
 """New rows (13, W) from rows, thrusts (R, W), a wrench (6, W), what varies, and physics steps."""
 
 
-def compiler() -> str | None:
-    """The C compiler: that of the variable CC, or `cc` or `gcc`; None if there is none."""
-    words = (os.environ.get("CC"), "cc", "gcc", "clang")
-    return next((found for word in words if word and (found := shutil.which(word))), None)
+def compiler() -> list[str] | None:
+    """Path and flags of the C compiler: of the variable CC, or `cc`, `gcc` or `clang`; or None."""
+    for words in (os.environ.get("CC", ""), "cc", "gcc", "clang"):
+        tool, *flags = shlex.split(words) or [""]
+        if path := shutil.which(tool):
+            return [path, *flags]
+    return None
 
 
 def compiled(body: RigidBody, rotors: int, dtype: Any, *, wrench: bool) -> Fly:
@@ -202,16 +206,18 @@ def _source(body: RigidBody, rotors: int, kind: str, wrench: bool) -> str:
 @lru_cache
 def _library(source: str) -> Any:
     """The compiled source. Raises `InputError` if it cannot be compiled or loaded."""
-    tool = str(compiler())
+    command = compiler() or ["cc"]
+    tool = command[0]
     try:
         with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
             given, made = Path(folder) / "fly.c", Path(folder) / "fly.so"
             given.write_text(source)
-            words = [tool, *_FLAGS, "-shared", "-fPIC", "-o", str(made), str(given), "-lm"]
+            words = [*command, *_FLAGS, "-shared", "-fPIC", "-o", str(made), str(given), "-lm"]
             done = subprocess.run(
                 words, capture_output=True, check=False, errors="replace", timeout=COMPILE_SECONDS
             )
-            said = (done.stderr.strip().splitlines() or ["nothing"])[0]
+            first, *_ = done.stderr.strip().splitlines() or ["nothing"]
+            said = "".join(letter for letter in first if letter.isprintable())
             expect(done.returncode == 0, "compiled", f"{tool} to compile the equations", said)
             return ctypes.CDLL(str(made))
     except (OSError, subprocess.TimeoutExpired) as error:

@@ -3,6 +3,7 @@
 It flies as `mujoco` does until a part touches the ground, or another drone, of which it tells.
 """
 
+import logging
 from typing import Final
 
 import mujoco
@@ -83,9 +84,14 @@ class RigidWorld(BaseWorld):
             ones = np.ones(num_worlds * drones)
             self._vary(dict.fromkeys(self._drawn, ones))
             pushed = self.effects is not None and self.effects.on_body
-            self._function = kernel.compiled(
-                self._body, vehicle.num_rotors, self.dtype, wrench=pushed
-            )
+            try:
+                self._function = kernel.compiled(
+                    self._body, vehicle.num_rotors, self.dtype, wrench=pushed
+                )
+            except InputError as error:
+                if compiled:
+                    raise
+                logging.getLogger(__name__).warning("rigid flies by NumPy: %s", error)
 
     def reset(self, mask: Array, pose: InitialState) -> None:
         """As `World.reset`."""

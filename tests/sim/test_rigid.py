@@ -128,25 +128,34 @@ def test_arrays_have_the_same_bits_alone_and_in_a_batch() -> None:
         (b"#!/bin/sh\nfor f; do case $f in *.so) echo > $f;; esac; done", "file too short"),
         (b"#!/no/interpreter", "No such file"),
         (b"#!/bin/sh\nprintf '\\377 no' >&2; exit 1", "\ufffd no"),
+        (b"#!/bin/sh\nprintf '\\033[31mred' >&2; exit 1", r"\[31mred"),
     ],
 )
 def test_a_compiler_that_misbehaves_is_told_in_one_sentence(
-    script: bytes, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    script: bytes,
+    reason: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     tool = tmp_path / "cc"
     tool.write_bytes(script)
     tool.chmod(0o755)
-    monkeypatch.setenv("CC", str(tool))
+    monkeypatch.setenv("CC", f"'{tool}' -O1")
     monkeypatch.setattr(kernel, "COMPILE_SECONDS", 0.2 if b"sleep" in script else 60.0)
     with pytest.raises(InputError, match=rf"^compiled: expected [^\n]*{reason}"):
-        arrays(Vehicle.load(linear_drag=0.124))
+        arrays(Vehicle.load(linear_drag=0.124), compiled=True)
+    assert arrays(Vehicle.load(linear_drag=0.124)).shape == (N, 1)  # by NumPy
+    assert len(caplog.messages) == 1
+    assert caplog.messages[0].startswith("rigid flies by NumPy: compiled: expected ")
+    assert caplog.messages[0].isprintable()
 
 
 def test_without_a_compiler_numpy_flies(monkeypatch: pytest.MonkeyPatch) -> None:
     vehicle = Vehicle.load(linear_drag=0.123)
     monkeypatch.setenv("CC", str(shutil.which("false")))
     with pytest.raises(InputError, match=r"^compiled: expected .*false to compile the equations"):
-        arrays(vehicle)
+        arrays(vehicle, compiled=True)
     monkeypatch.setattr(shutil, "which", lambda _: None)
     with pytest.raises(InputError, match=r"^compiled: expected false where no C compiler is found"):
         arrays(vehicle, compiled=True)
