@@ -55,7 +55,7 @@ EXTRAS: Final = {
               "pyarrow", "scipy"),
     "record": ("mcap",),
     "render": ("PIL", "imageio_ffmpeg"),
-    "report": ("matplotlib", "jinja2"),
+    "report": ("matplotlib",),
     "ray": ("ray",),
     "dataset": ("mcap", "pyarrow", "minari", "h5py", "PIL"),
     "identify": ("pyulog", "pandas", "pyarrow", "scipy"),

@@ -238,6 +238,16 @@ def parse_value(text: str) -> Any:
         return text
 
 
+def named_value(flag: str, word: str) -> tuple[str, Any]:
+    """NAME=VALUE, a value in JSON or a text. Raises `InputError`."""
+    name, equals, value = word.partition("=")
+    if not equals:
+        raise InputError(f"{flag}: expected NAME=VALUE, got {word!r}")
+    if name == "hidden" and "," in value and not value.startswith("["):
+        raise InputError(f"{flag}: expected a list as hidden=[{value}], got {word!r}")
+    return name, parse_value(value)
+
+
 def _given(words: Sequence[str]) -> frozenset[str]:
     """Names of the flags among the words, as fields are named."""
     flags = (word[2:].partition("=")[0].replace("-", "_") for word in words if word[:2] == "--")

@@ -14,7 +14,7 @@ from ..agents.presets import PresetName
 from ..flights.executors import RunsFailed, WorkersConfig
 from ..flights.folders import FolderBusy
 from ..models.errors import InputError
-from ._flags import BackendFlags, folder_to_write, go_on_with, parse_value, refuse_settings
+from ._flags import BackendFlags, folder_to_write, go_on_with, named_value, refuse_settings
 
 if TYPE_CHECKING:
     from ..training.results import Results
@@ -155,16 +155,6 @@ class StudyFlags(BackendFlags, WorkersConfig):
         if row.controller:
             return replace(row, name=name, env=env)
         return replace(row, name=name, env=env, set={**row.set, **self.changes()}, **settings)
-
-
-def named_value(flag: str, word: str) -> tuple[str, Any]:
-    """NAME=VALUE, a value in JSON or a text. Raises `InputError`."""
-    name, equals, value = word.partition("=")
-    if not equals:
-        raise InputError(f"{flag}: expected NAME=VALUE, got {word!r}")
-    if name == "hidden" and "," in value and not value.startswith("["):
-        raise InputError(f"{flag}: expected a list as hidden=[{value}], got {word!r}")
-    return name, parse_value(value)
 
 
 def report(folder: Path, *, page: Path | None = None, film: bool = True) -> None:

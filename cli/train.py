@@ -31,7 +31,7 @@ from ..agents import (
 from ..agents.checkpoints import Checkpoint, software_versions, write_whole
 from ..agents.presets import PresetName
 from ..flights.folders import locked
-from ..models.errors import expect, require
+from ..models.errors import InputError, expect, require
 from ..training.settings import Run
 from ._flags import (
     AgentFlags,
@@ -39,7 +39,7 @@ from ._flags import (
     check_count,
     folder_to_write,
     go_on_with,
-    parse_value,
+    named_value,
     refuse_settings,
 )
 
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
 EPISODES: Final = "episodes.csv"
 _FREE: Final = ("resume", "listen", "num_simulators", "key_file", "insecure", "record",
-                "store_every", "env", "vehicle")  # fmt: skip
+                "store_every", "env", "vehicle", "env_steps")  # fmt: skip
 """Flags that a resumed training may be given."""
 _UPDATE_WITHIN: Final = 2.0  # s
 _LEAST_STEPS: Final = 16  # of each drone for an update of A2C
@@ -74,7 +74,8 @@ class Train(AgentFlags, BackendFlags):
     seed: int = 0
     """Seed of weights, actions and episodes."""
     env_steps: int | None = None
-    """Env steps to train for. Default: those of the preset."""
+    """Env steps to train for. Default: those of the preset. With --resume, more of them extend a
+    training; a learning rate that falls, falls over all of them."""
     num_envs: int | None = None
     """Drones that fly at the same time, in lock-step. Env steps count all of them. Default: those
     of the preset."""
@@ -105,7 +106,7 @@ class Train(AgentFlags, BackendFlags):
         check_count("drones", self.drones)
         start, told = self._start()
         changes = {name: start.config[name] for name in NETWORK_FIELDS} if start else {}
-        changes |= dict(_change(word) for words in self.set for word in words)
+        changes |= dict(named_value("set", word) for words in self.set for word in words)
         task = self.preset_of or self.env_id
         base = find_preset(self.algorithm, self.preset, task)
         config = preset(self.algorithm, self.preset, task, **changes)
@@ -160,6 +161,8 @@ class Train(AgentFlags, BackendFlags):
             refuse_settings(self, folder, free=("algorithm", *_FREE))
             right = "env" not in self.given or self.env_id == kept.env_id
             expect(right, "resume", f"--env {kept.env_id}", self.env)
+            if self.env_steps is not None:
+                kept = self._extended(kept, folder)
             if is_finished(kept):
                 flown = kept.position.env_steps
                 print(f"already trained {flown:,} of {kept.env_steps:,} env steps")
@@ -170,6 +173,19 @@ class Train(AgentFlags, BackendFlags):
             with self._env(kept.env_id, kept.options, required=True, num_envs=kept.num_envs,
                            drones=len(kept.spec.agents), backend=kept.backend) as env:  # fmt: skip
                 return self._train(Training.resume(kept, env), folder)
+
+    def _extended(self, kept: Checkpoint, folder: Path) -> Checkpoint:
+        """The checkpoint with more env steps to fly, which `config.json` gets too."""
+        env_steps = self.env_steps or 0
+        if env_steps < kept.env_steps:
+            raise InputError(
+                f"env_steps: expected {kept.env_steps} or more, to which {folder} is to be "
+                f"trained, got {env_steps}"
+            )
+        file = folder / "config.json"
+        content = {**json.loads(file.read_text(encoding="utf-8")), "env_steps": env_steps}
+        write_whole(file, (json.dumps(content, indent=2) + "\n").encode())
+        return replace(kept, env_steps=env_steps)
 
     def _env(self, env_id: str, options: dict[str, Any], **settings: Any) -> Any:
         """The env of the training, over the wire."""
@@ -212,13 +228,6 @@ class Train(AgentFlags, BackendFlags):
         print(f"{flown / training.log.seconds:,.0f} env steps per second")
         print(f"checkpoint: {folder / CHECKPOINT}" if finished else go_on)
         return 0 if finished else 128 + signal.SIGINT
-
-
-def _change(word: str) -> tuple[str, Any]:
-    """NAME=VALUE of a hyperparameter. Raises `InputError`."""
-    name, equals, value = word.partition("=")
-    expect(equals, "set", "NAME=VALUE", repr(word))
-    return name, parse_value(value)
 
 
 def _advice(run: Run) -> str:
