@@ -1,4 +1,4 @@
-"""`rotorgram bench`: the speed of each layer of a training on this machine."""
+"""`rotorgram bench`: env steps per second on this machine."""
 
 import logging
 from collections.abc import Iterable
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Bench(Command):
-    """Measure the layers of a training on this machine, from raw physics to an update."""
+    """Measure env steps per second on this machine, from raw physics to a simulator over UDP."""
 
     rounds: int = 7
     """Turns of every layer, besides one to warm up; medians count."""
@@ -31,7 +31,7 @@ class Bench(Command):
         """Measure, print and draw."""
         from rich.console import Console
 
-        from ..training.bench import RATIOS, bench, parts_of
+        from ..training.bench import RATIOS, bench
         from ._progress import bars
 
         require("matplotlib", "report", "drawing")  # before anything is measured
@@ -46,9 +46,6 @@ class Bench(Command):
         show = Console().print
         show(_table("layer", "what", "env steps/s", "µs per env step", rows=[
             (one.name, one.about, f"{one.rate:,.0f}", f"{1e6 / one.rate:.2f}") for one in layers
-        ]))  # fmt: skip
-        show(_table("part of a lock-step step of one drone", "µs", rows=[
-            (name, f"{1e6 * seconds:.1f}") for name, seconds in parts_of(layers)
         ]))  # fmt: skip
         values = [(ratio, ratio.value(layers)) for ratio in RATIOS]
         show(_table("ratio", "median", "target", rows=[

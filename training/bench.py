@@ -1,15 +1,10 @@
-"""The speed of each layer of a training on this machine, from raw physics to an update.
+"""Env steps per second on this machine, from raw physics to a simulator over UDP.
 
-Layers of one drone, of many drones and of training are open at the same time, each group by
-itself, and take turns to run for a moment, in an order that changes from round to round. Ratios are
-made within a round, and their medians count, so that a machine that slows down for a while slows
-all alike.
-
-The parts of a lock-step exchange are layers too, each measured by itself; the links take the rest
-of the time of a step.
+Layers that are compared with each other are open at the same time and take turns to run for a
+moment, in an order that changes from round to round. Ratios are made within a round, and their
+medians count, so that a machine that slows down for a while slows all alike.
 """
 
-import copy
 import json
 import os
 import socket
@@ -28,30 +23,25 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 from mujoco.batch import Batch
+from numpy.typing import NDArray
 
-from ..agents import preset
 from ..agents.checkpoints import software_versions, write_whole
-from ..agents.policies import NetworkPolicy
 from ..envs.config import EnvConfig
 from ..envs.loop import Loop
-from ..envs.registry import env_spec
-from ..models.errors import expect
+from ..models.errors import InputError
 from ..models.vehicle import Vehicle
 from ..udp.layouts import layout_of
 from ..udp.protocol import binary
 from ..udp.protocol.messages import Command, State
 from ..udp.spawn import spawn_simulator
 from .results import machine
-from .settings import Run
-from .training import Training
 
 ENV_ID: Final = "rotorgram/Elevation-v0"
 _PERIOD: Final = 0.02  # s, of a control step
-_FINER_TIMESTEP: Final = 0.005  # s, for comparison
+_STEPS_AT_ONCE: Final = 64  # between two looks at the clock
 
 Slice = Callable[[float], int]
-"""Runs for about so many seconds; how many env steps it made."""
-
+"""Runs for about so many seconds; the number of env steps that it made."""
 Rates = Mapping[str, float]
 """Env steps per second, by layer."""
 
@@ -62,7 +52,7 @@ class Ratio:
 
     name: str
     of: Callable[[Rates], float]
-    target: float | None = None
+    target: float
     at_most: bool = False  # whether less is better
 
     def value(self, layers: Sequence["Layer"]) -> float:
@@ -73,46 +63,30 @@ class Ratio:
 
     @property
     def target_text(self) -> str:
-        """The target, with its sign; empty without one."""
-        sign = "≤" if self.at_most else "≥"
-        return f"{sign} {self.target:g}" if self.target is not None else ""
+        """The target, with its sign."""
+        return f"{'≤' if self.at_most else '≥'} {self.target:g}"
 
     def reached(self, value: float) -> bool:
         """Whether a value is on the right side of the target."""
-        target = value if self.target is None else self.target
-        return value <= target if self.at_most else value >= target
+        return value <= self.target if self.at_most else value >= self.target
 
 
-def _over(above: str, below: str, target: float | None = None) -> Ratio:
+def _over(above: str, below: str, target: float) -> Ratio:
     return Ratio(name=f"{above} ÷ {below}", of=lambda r: r[above] / r[below], target=target)
 
 
 RATIOS: Final = (
-    Ratio(
-        name="time of a step, UDP, 1 ÷ (mj_step + UDP echo)",
-        of=lambda r: (1 / r["UDP, 1"]) / (1 / r["mj_step"] + 1 / r["UDP echo"]),
-        target=1.7,
-        at_most=True,
-    ),
     Ratio(
         name="time of a step, UDP, 1 ÷ (env + UDP echo)",
         of=lambda r: (1 / r["UDP, 1"]) / (1 / r["env"] + 1 / r["UDP echo"]),
         target=1.6,
         at_most=True,
     ),
-    _over("Batch.step, 1024", "Batch.step at 5 ms, 1024", 1.9),
-    _over("vector env, 1024", "Batch.step, 1024", 0.95),
-    _over("env", "mj_step", 0.6),
-    _over("UDP, 1024", "vector env, 1024", 0.92),
-    _over("a2c, 64", "sb3-a2c, 64"),
-    _over("a2c, 1", "sb3-a2c, 1"),
-    _over("vector env, 4096", "vector env, 64"),
+    _over("env", "mj_step", 0.2),
+    _over("vector env, 1024", "Batch.step, 1024", 0.85),
+    _over("UDP, 1024", "vector env, 1024", 0.8),
 )
 """Figures of rates, with their targets."""
-
-PARTS: Final = ("simulate", "encode State", "decode State", "decide", "encode Command",
-                "decode Command", "UDP echo")  # fmt: skip
-"""Layers of which a lock-step step of one drone consists: once each."""
 
 _ECHO: Final = """
 import socket, sys
@@ -126,7 +100,6 @@ while True:
         break
     sock.sendto(answer, address)
 """
-_STEPS_AT_ONCE: Final = 64  # between two looks at the clock
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,13 +123,17 @@ def bench(
 ) -> list[Layer]:
     """Measure every layer in turns of so many seconds, and write `bench.json` into `folder`.
 
-    Told before each turn: name of the layer, turns done, turns in all. Raises `InputError`.
+    `on_layer` is called before each turn: name of the layer, turns done, turns in all. Raises
+    `InputError`.
     """
-    expect(rounds >= 1, "rounds", "at least 1", str(rounds))
-    expect(0 < seconds <= 60, "seconds", "more than 0 and at most 60", str(seconds))
+    if rounds < 1:
+        raise InputError(f"rounds: expected at least 1, got {rounds}")
+    if not 0 < seconds <= 60:
+        raise InputError(f"seconds: expected more than 0 and at most 60, got {seconds}")
     rates: dict[str, list[float]] = {name: [] for name, *_ in _LAYERS}
     turns, done = (rounds + 1) * len(_LAYERS), 0
-    for group in _GROUPS:
+    for many in (False, True):
+        group = [layer for layer in _LAYERS if (layer[2] > 1) == many]
         with ExitStack() as stack:
             opened: list[tuple[str, Slice]] = []
             for name, _, _, open_ in group:
@@ -175,6 +152,11 @@ def bench(
         Layer(name=name, about=about, drones=drones, rates=tuple(rates[name]))
         for name, about, drones, _ in _LAYERS
     ]
+    _write(layers, rounds, seconds, folder)
+    return layers
+
+
+def _write(layers: Sequence[Layer], rounds: int, seconds: float, folder: Path) -> None:
     values = {
         ratio.name: {"value": round(ratio.value(layers), 3), "target": ratio.target_text}
         for ratio in RATIOS
@@ -185,21 +167,10 @@ def bench(
         "layers": [asdict(layer) for layer in layers],
         "medians": {layer.name: layer.rate for layer in layers},
         "ratios": values,
-        "microseconds": {name: round(1e6 * seconds, 2) for name, seconds in parts_of(layers)},
         "machine": machine(),
         "versions": software_versions(),
     }
     write_whole(folder / "bench.json", (json.dumps(content, indent=2) + "\n").encode())
-    return layers
-
-
-def parts_of(layers: Sequence[Layer]) -> list[tuple[str, float]]:
-    """Median time of each part of a lock-step step of one drone, of the rest and of all, s."""
-    of = {layer.name: layer for layer in layers}
-    whole = statistics.median(1 / rate for rate in of["UDP, 1"].rates)
-    whole += 1 / of["decide"].rate  # the layer flies without a policy
-    parts = [(name, 1 / of[name].rate) for name in PARTS]
-    return [*parts, ("links", whole - sum(seconds for _, seconds in parts)), ("step", whole)]
 
 
 # ---- the layers: each is opened for as long as the stack is, and gives a `Slice`
@@ -242,11 +213,9 @@ def _mj_step(_: ExitStack) -> Slice:
     return _again(lambda: mujoco.mj_step(model, data, substeps), prepare=prepare)
 
 
-def _batch_step(drones: int, timestep: float | None = None) -> Slice:
+def _batch_step(drones: int) -> Slice:
     vehicle = Vehicle.load()
-    model = copy.deepcopy(vehicle.model)
-    model.opt.timestep = timestep or model.opt.timestep
-    batch, substeps = Batch(model, drones), round(_PERIOD / model.opt.timestep)
+    batch, substeps = Batch(vehicle.model, drones), vehicle.substeps(_PERIOD)
 
     def prepare() -> None:
         batch.reset()
@@ -259,7 +228,7 @@ def _batch_step(drones: int, timestep: float | None = None) -> Slice:
     return _for_a_while(fly, prepare)
 
 
-def _actions(*shape: int) -> Iterator[Any]:
+def _actions(*shape: int) -> Iterator[NDArray[np.float32]]:
     """Random actions near hover, the same ones again and again."""
     return cycle(np.random.default_rng(0).uniform(-0.1, 0.1, shape).astype(np.float32))
 
@@ -292,21 +261,8 @@ def _env(env: Any) -> Slice:
     return _again(step)
 
 
-def _simulate(stack: ExitStack) -> Slice:
-    """The simulator's part between a Command and a State."""
-    actions, everyone = _actions(_STEPS_AT_ONCE, 1, 1), np.ones(1, bool)
-    loop = stack.enter_context(closing(Loop(EnvConfig(env_id=ENV_ID))))
-    loop.advance(next(actions), everyone)
-
-    def step() -> None:
-        loop.advance(next(actions), everyone if loop.done[0] else None)
-        loop.telemetry  # noqa: B018  # made when it is asked for
-
-    return _again(step)
-
-
-def _messages() -> tuple[Any, dict[str, State | Command]]:
-    """The layout of one drone, and a State and a Command of it by name."""
+def _sizes() -> dict[str, int]:
+    """Bytes of a State and a Command of one drone."""
     action = np.zeros((1, 1), np.float32)
     with closing(Loop(EnvConfig(env_id=ENV_ID))) as loop:
         loop.advance(action, np.ones(1, bool))
@@ -319,24 +275,16 @@ def _messages() -> tuple[Any, dict[str, State | Command]]:
             **{name: getattr(loop, name) for name in ("rewards", "terminated", "truncated")},
         )
         command = Command(session=1, sequence=2, actions=action, orders=np.zeros(1, np.uint8))
-        return layout_of(loop.spec, 1), {"State": state, "Command": command}
-
-
-def _codec(name: str) -> Slice:
-    layout, messages = _messages()
-    what, kind = name.split()
-    message = messages[kind]
-    datagram = binary.encode(message, layout)
-    if what == "encode":
-        return _again(lambda: binary.encode(message, layout))
-    return _again(lambda: binary.decode(datagram, layout))
+        layout = layout_of(loop.spec, 1)
+    messages: dict[str, State | Command] = {"State": state, "Command": command}
+    return {kind: len(binary.encode(message, layout)) for kind, message in messages.items()}
 
 
 def _echo(stack: ExitStack) -> Slice:
-    """A blocking Python client and server on one core, which is the fastest way; datagrams of the
-    sizes of a State and a Command."""
-    layout, messages = _messages()
-    sizes = {kind: len(binary.encode(one, layout)) for kind, one in messages.items()}
+    """A raw exchange of datagrams of the sizes of a State and a Command: two Python processes with
+    blocking sockets, on one core, where a wake-up costs least.
+    """
+    sizes = _sizes()
     words = [sys.executable, "-c", _ECHO, str(sizes["Command"])]
     process = stack.enter_context(subprocess.Popen(words, stdout=subprocess.PIPE))
     assert process.stdout is not None
@@ -377,60 +325,24 @@ def one_core(pid: int) -> Iterator[None]:
         os.sched_setaffinity(0, cores)
 
 
-def _policy(drones: int) -> Slice:
-    dice = np.random.default_rng(0)
-    shapes: dict[str, Any] = {
-        "layers.0.weight": (16, 3), "layers.0.bias": 16, "layers.1.weight": (1, 16),
-        "layers.1.bias": 1, "log_std": 1,
-    }  # fmt: skip
-    weights = {name: dice.normal(size=shape).astype(np.float32) for name, shape in shapes.items()}
-    policy = NetworkPolicy.load(weights, env_spec(EnvConfig(env_id=ENV_ID)), preset("vpg", "paper"))
-    observations = dice.normal(size=(drones, 3)).astype(np.float32)
-    noise = policy.draw_noise(dice, drones)
-    return _again(lambda: policy.actions.to_envs(policy.sample(observations, noise)), drones)
-
-
-def _training(stack: ExitStack, algorithm: str, drones: int) -> Slice:
-    # With 64 drones: five steps of each for an update, as SB3's default has it; VPG an episode.
-    batch = {"episodes_per_update": 64} if algorithm == "vpg" else {"steps_per_update": 64 * 5}
-    changes: dict[str, Any] = {} if drones == 1 else batch
-    config = preset(algorithm, "tuned", **changes)
-    run = Run(algorithm=algorithm, config=config, seed=0, env_steps=10**9, num_envs=drones)
-    env = stack.enter_context(spawn_simulator(run.flown, num_envs=drones))
-    training = Training(run, env)
-
-    def fly(seconds: float) -> int:
-        until, before = time.perf_counter() + seconds, training.log.env_steps
-        training.train(lambda: time.perf_counter() < until)
-        return training.log.env_steps - before
-
-    return fly
+def _udp(stack: ExitStack, drones: int) -> Slice:
+    return _env(stack.enter_context(spawn_simulator(EnvConfig(env_id=ENV_ID), num_envs=drones)))
 
 
 _MANY: Final = (64, 1024, 4096)
-_CODEC: Final = ("encode State", "decode State", "encode Command", "decode Command")
 _LAYERS: Final[list[tuple[str, str, int, Callable[[ExitStack], Slice]]]] = [
     ("mj_step", "a loop over mj_step, substeps of one control step", 1, _mj_step),
-    ("env", "the single env's step", 1, lambda s: _local(s, 1)),
+    ("env", "the single env's step", 1, lambda stack: _local(stack, 1)),
+    ("UDP echo", "blocking sockets of two processes on one core", 1, _echo),
+    ("UDP, 1", "RemoteEnv and a simulator", 1, lambda stack: _udp(stack, 1)),
     ("Batch.step, 1024", "mujoco.batch, the same substeps", 1024, lambda _: _batch_step(1024)),
-    ("Batch.step at 5 ms, 1024", "the same with physics steps of 5 ms", 1024,
-     lambda _: _batch_step(1024, _FINER_TIMESTEP)),
-    *((f"vector env, {n}", "the vector env", n, lambda s, n=n: _local(s, n)) for n in _MANY),
-    ("UDP echo", "blocking sockets in Python on one core, datagrams of the same sizes", 1, _echo),
-    *((f"UDP, {n}", f"Remote{'Vector' * (n > 1)}Env and a simulator", n,
-       lambda s, n=n: _env(s.enter_context(spawn_simulator(EnvConfig(), num_envs=n))))
-      for n in (1, *_MANY)),
-    ("simulate", "physics, task and telemetry of one drone", 1, _simulate),
-    *((name, "of one drone, binary", 1, lambda _, name=name: _codec(name)) for name in _CODEC),
-    ("decide", "16 units, sampled", 1, lambda _: _policy(1)),
-    ("policy, 1024", "16 units, sampled", 1024, lambda _: _policy(1024)),
-    *((f"{a}, {n}", "training over UDP", n, lambda s, a=a, n=n: _training(s, a, n))
-      for n in (1, 64) for a in ("vpg", "a2c", "sb3-a2c")),
-]  # fmt: skip
+    *(
+        (f"vector env, {n}", "the vector env", n, lambda stack, n=n: _local(stack, n))
+        for n in _MANY
+    ),
+    *(
+        (f"UDP, {n}", "RemoteVectorEnv and a simulator", n, lambda stack, n=n: _udp(stack, n))
+        for n in _MANY
+    ),
+]
 """Name, what it is, drones, and how it is opened."""
-_GROUPS: Final = (
-    [layer for layer in _LAYERS if layer[2] == 1 and "training" not in layer[1]],
-    [layer for layer in _LAYERS if layer[2] > 1 and "training" not in layer[1]],
-    [layer for layer in _LAYERS if "training" in layer[1]],
-)
-"""Those that are compared with each other are open together, and no others."""
