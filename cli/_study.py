@@ -136,6 +136,10 @@ class StudyFlags(BackendFlags, WorkersConfig):
 
     def given_of_rows(self) -> dict[str, Any]:
         """Settings of rows that were given, but for the env and the changes."""
+        for name in ("env_steps", "num_envs"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise InputError(f"{name}: expected 1 or more, got {value}")
         return {name: getattr(self, name) for name in _OF_ROWS if name in self.given}
 
     def changed(self, rows: Sequence["Row"]) -> tuple["Row", ...]:

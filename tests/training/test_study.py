@@ -379,6 +379,7 @@ def test_points_are_all_combinations_of_settings_and_task_options() -> None:
         (["--grid", "gamma=0.9", "--first-seed", "-1"], "first_seed: expected 0 or more, got -1"),
         (["--grid", "gamma=0.9", "--env-steps", "9"], "env_steps: expected at least 256, got 9"),
         (["--grid", "gamma=0.9", "--jobs", "0"], "jobs: expected at least 1, got 0"),
+        (["--grid", "gamma=0.9", "--num-envs", "0"], "num_envs: expected 1 or more, got 0"),
         (["--grid", "gamma=0.9", "--address", "a:1"], "address: expected it with runner ray"),
         (["--grid", "gamma=0.9", "--env.target", "1"], "target: expected"),
         (["--grid", "gamma=0.9", "--out", "."], "exists already"),
