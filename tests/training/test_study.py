@@ -280,7 +280,7 @@ def test_a_board_takes_own_tasks_and_changes(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "near_task.py").write_text(OWN_TASK)
     (tmp_path / "rows.toml").write_text(
-        '[[row]]\nagent = "ppo"\nenv_steps = 1024\nnum_envs = 4\n'
+        '[[row]]\nagent = "ppo"\nenv_steps = 4096\nnum_envs = 4\n'
         'env = { env_id = "near_task:Near-v0", episode_length = 20 }\n'
         '[[row]]\nagent = "geometric"\n'
         'env = { env_id = "near_task:Near-v0", episode_length = 20 }\n'
@@ -292,7 +292,7 @@ def test_a_board_takes_own_tasks_and_changes(
     assert status == 0, err
     assert "4 of 4 runs done" in out
     page = (tmp_path / "page.md").read_text()
-    assert "| PPO tuned steps_per_update=256 (2 seeds; 1,024 env steps) |" in page
+    assert "| PPO tuned steps_per_update=256 (2 seeds; 4,096 env steps) |" in page
     assert "| Geometric (2 seeds) |" in page
 
 
