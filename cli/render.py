@@ -4,17 +4,17 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 
 from tyro.conf import Positional
 
 from ..flights.palette import DARK_COLORS, agent_color, agent_label
 from ..flights.recorded import recorded_trajectories
 from ..flights.trajectories import Trajectory, flown_trajectories
-from ..models.errors import expect
+from ..models.errors import InputError
 from ._flags import EnvFlags, check_count
 
-_ALIKE: Final = ("pid", "geometric", "orca", "random")  # their words tell no two of them apart
+_ALIKE: Final = ("pid", "geometric", "orca", "random")  # words that are no names of files
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,15 +72,15 @@ class Render(EnvFlags):
         self._check()
         offscreen_context(16, 16).free()  # flying takes longer than finding no OpenGL
         found = [self._find(what) for what in self.what]
-        names = self.names or _told_apart([name for _, name, *_ in found], self.what)
-        colors = _colors([agent for agent, *_ in found])
+        names = self.names or _distinct([flown.name for flown in found], self.what)
+        colors = _colors([flown.agent for flown in found])
         tracks = [
-            FilmTrack(name=name, color=color, trajectories=flown, drones=drones)
-            for name, color, (_, _, flown, drones) in zip(names, colors, found, strict=True)
+            FilmTrack(name=name, color=color, trajectories=flown.trajectories, drones=flown.drones)
+            for name, color, flown in zip(names, colors, found, strict=True)
         ]
         longest = max(track.trajectories[0].seconds for track in tracks)
-        right, end = self.at is None or self.at <= longest, f"{longest:g} s, the flight's end"
-        expect(right, "at", f"0 to {end}", f"{self.at or 0:g}")
+        if self.at is not None and self.at > longest:
+            raise InputError(f"at: expected 0 to {longest:g} s, the flight's end, got {self.at:g}")
         with frame_bar(self.out.name) as on_frame:
             frames = film(self.out, tracks, config, on_frame)
         pictures = "1 picture" if frames == 1 else f"{frames} pictures"
@@ -88,56 +88,74 @@ class Render(EnvFlags):
         return 0
 
     def _check(self) -> None:
-        right, flights = self.at is None or self.out.suffix.lower() == ".png", len(self.what)
-        expect(right, "at", "it with a picture, --out NAME.png", str(self.out))
-        expect(self.what, "what", "a checkpoint, pid, geometric, random or a journal", "nothing")
-        right = len(self.names) in (0, flights)
-        expect(right, "names", f"one for each of {flights} flights", str(len(self.names)))
-        expect(self.episode >= 0, "episode", "0 or more", str(self.episode))
+        """Refuse flags that contradict each other."""
+        if self.at is not None and self.out.suffix.lower() != ".png":
+            raise InputError(f"at: expected it with a picture, --out NAME.png, got {self.out}")
+        if not self.what:
+            raise InputError(
+                "what: expected a checkpoint, pid, geometric, random or a journal, got nothing"
+            )
+        if self.names and len(self.names) != len(self.what):
+            raise InputError(
+                f"names: expected one for each of {len(self.what)} flights, got {len(self.names)}"
+            )
+        if self.episode < 0:
+            raise InputError(f"episode: expected 0 or more, got {self.episode}")
         check_count("episodes", self.episodes)
         journals = [Path(words).suffix == ".mcap" for words in self.what]
-        right = any(journals) or (self.session is None and not self.drone)
-        expect(right, "session, drone", "them with a journal (.mcap)", "none")
-        right = not (self.options and all(journals))
-        expect(right, "env", "no options with a journal, which has its own")
+        if not any(journals) and (self.session is not None or self.drone):
+            raise InputError("session, drone: expected them with a journal (.mcap), got none")
+        if self.options and all(journals):
+            raise InputError("env: expected no options with a journal, which has its own")
 
-    def _find(self, what: str) -> tuple[str, str, list[Trajectory], int]:
-        """Agent, name, trajectories and drones of a world, of a policy or journal."""
+    def _find(self, what: str) -> "_Flown":
+        """Flights of a policy or a journal."""
         from ._env import chosen_drones, pilot_of
 
         episodes = range(self.episode, self.episode + self.episodes)
         path = Path(what)
         if path.suffix == ".mcap":
             recorded = recorded_trajectories(path, episodes, session=self.session, drone=self.drone)
-            return path.stem, path.stem, recorded, 1
+            return _Flown(path.stem, path.stem, recorded, 1)
         checkpoint, policy, env = pilot_of(self, what)
         drones = chosen_drones(self, checkpoint)
         agent = checkpoint.algorithm if checkpoint else what
+        name = what if what == "random" else agent_label(agent)
         flown = flown_trajectories(
             policy, *env, episodes, vehicle=self.vehicle, of="final", drones=drones
         )
-        return agent, what if what == "random" else agent_label(agent), flown, drones
+        return _Flown(agent, name, flown, drones)
+
+
+class _Flown(NamedTuple):
+    """Flights of one pane."""
+
+    agent: str
+    name: str
+    trajectories: list[Trajectory]
+    drones: int
 
 
 def parse_size(text: str) -> tuple[int, int]:
     """WIDTHxHEIGHT as a pair. Raises `InputError`."""
     match = re.fullmatch(r"([0-9]{2,4})x([0-9]{2,4})", text)
     width, height = map(int, match.groups()) if match else (0, 0)
-    right = min(width, height) >= 16 and max(width, height) <= 8192
-    expect(right, "size", "WIDTHxHEIGHT of 16 to 8192 pixels each", repr(text))
+    if min(width, height) < 16 or max(width, height) > 8192:
+        raise InputError(f"size: expected WIDTHxHEIGHT of 16 to 8192 pixels each, got {text!r}")
     return width, height
 
 
-def _told_apart(names: Sequence[str], what: Sequence[str]) -> list[str]:
-    """The names; of those that are the same, what the user typed besides, then a number."""
-    longer = [
-        f"{name}, {Path(words).stem}" if names.count(name) > 1 and words not in _ALIKE else name
-        for name, words in zip(names, what, strict=True)
-    ]
-    return [
-        name if longer.count(name) == 1 else f"{name} {longer[: place + 1].count(name)}"
-        for place, name in enumerate(longer)
-    ]
+def _distinct(names: Sequence[str], what: Sequence[str]) -> list[str]:
+    """The names; equal ones get the words that the user typed, then a number."""
+    longer = []
+    for name, words in zip(names, what, strict=True):
+        is_repeated = names.count(name) > 1 and words not in _ALIKE
+        longer.append(f"{name}, {Path(words).stem}" if is_repeated else name)
+    distinct = []
+    for place, name in enumerate(longer):
+        number = longer[: place + 1].count(name)
+        distinct.append(name if longer.count(name) == 1 else f"{name} {number}")
+    return distinct
 
 
 def _colors(agents: Sequence[str]) -> list[str]:

@@ -10,7 +10,7 @@ from tyro.conf import Positional
 
 from ..flights.recorded import recorded_trajectories
 from ..flights.trajectories import Trajectory, flown_trajectories
-from ..models.errors import expect
+from ..models.errors import InputError
 from ..scenes import parse_scene
 from ._flags import EnvFlags, check_count
 
@@ -74,7 +74,8 @@ class View(EnvFlags):
         from ._env import chosen_drones, pilot_of
 
         if (path := Path(self.what)).suffix == ".mcap":
-            expect(not self.options, "env", "no options with a journal, which has its own")
+            if self.options:
+                raise InputError("env: expected no options with a journal, which has its own")
             yield from ([one] for one in recorded_trajectories(path))
             return
         checkpoint, policy, env = pilot_of(self, self.what)

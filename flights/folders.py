@@ -8,7 +8,7 @@ from itertools import count
 from pathlib import Path
 from typing import Final
 
-from ..models.errors import InputError, expect
+from ..models.errors import InputError
 
 LOCK: Final = ".lock"
 """File in a folder that its writer holds locked."""
@@ -53,8 +53,8 @@ def locked(folder: Path) -> Iterator[None]:
     except OSError as error:
         raise InputError(f"{folder}: cannot be written: {error.strerror}") from None
     try:
-        wanted = "a folder that no other process writes to"
-        expect(_try_lock(file), str(folder), wanted, kind=FolderBusy)
+        if not _try_lock(file):
+            raise FolderBusy(f"{folder}: expected a folder that no other process writes to")
         yield
     finally:
         os.close(file)
