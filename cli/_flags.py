@@ -14,7 +14,6 @@ from typing import Annotated, Any, Final, TypeVar, Union, cast, get_args, get_or
 import tyro
 from tyro.conf import Fixed, Suppress, arg
 
-from ..envs.spec import canonical_id
 from ..flights.folders import LOCK, new_folder
 from ..models import Backend
 from ..models.errors import InputError, expect
@@ -125,6 +124,7 @@ def parse(kind: type[C], prog: str, words: Sequence[str]) -> C:
         return cast(C, replace(tyro.cli(plain, prog=prog, args=words), given=given))
     from ..envs import registry
     from ..envs.config import KEYWORDS, EnvConfig
+    from ..envs.spec import canonical_id
 
     parser = ArgumentParser(prog, add_help=False, allow_abbrev=False)
     parser.add_argument("--env")

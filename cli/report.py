@@ -6,7 +6,6 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from ._flags import Command
-from ._study import report
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,5 +21,7 @@ class Report(Command):
 
     def run(self) -> int:
         """Write figures and report from the files, and print the tables."""
+        from ._study import report
+
         report(self.folder, page=self.page, film=self.film)
         return 0

@@ -139,7 +139,7 @@ def test_help(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
         ),
         (["sim", "--patience", "3"], "--patience: expected it with --agents, got 3.0"),
         (["sim", "--when-lost", "land"], "--when-lost: expected it with --agents, got land"),
-        (["sim", "--drones", "0"], "drones: expected 1 or more, got 0"),
+        (["sim", "--drones", "0"], "drones: expected a whole number from 1 to 1024, got 0"),
         (["serve", "pid", "--drones", "0"], "drones: expected at least 1, got 0"),
         (["train", "mappo", "--drones", "0"], "drones: expected at least 1, got 0"),
         (["train", "a2c", "--key-file", "nowhere"], "key-file, insecure: expected them with"),
@@ -195,7 +195,7 @@ def test_a_bug_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_flags_that_are_set_to_their_default_are_set() -> None:
     words = ["--env.target", "5", "--num-envs=1", "--no-realtime", "--action", "offset"]
     command = parse(Sim, "rotorgram sim", words)
-    assert command.given == {"env.target", "num_envs", "realtime", "env.action"}
+    assert command.given == {"env.target", "num_envs", "realtime", "action"}
     assert command.options == {"target": 5.0, "action": "offset"}
     assert parse(Sim, "rotorgram sim", []).options == {}
 
@@ -566,7 +566,7 @@ def test_train_evaluate_and_resume(tmp_path: Path, capsys: pytest.CaptureFixture
     assert reference == ("rotorgram/Elevation-v0", kept.options)
     words = ["x", "--episode-length", "1000", "--effects", "linear_drag=0"]  # the defaults
     assert chosen_env(parse(Serve, "serve", words), kept)[1] == {
-        **kept.options, "episode_length": 1000
+        **kept.options, "episode_length": 1000, "effects": {"linear_drag": 0}
     }  # fmt: skip
     (folder / "episodes.csv").unlink()  # a result: the checkpoint has the episodes
     assert run(capsys, "train", "a2c", "--resume", folder)[0] == 0

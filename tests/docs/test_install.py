@@ -67,7 +67,7 @@ def test_the_table_of_extras_is_that_of_pyproject() -> None:
 
 
 def test_every_package_is_listed() -> None:
-    found = {
+    found = {"rotorgram"} | {
         "rotorgram." + ".".join(path.parent.relative_to(ROOT).parts)
         for folder in FOLDERS
         for path in (ROOT / folder).rglob("*.py")
@@ -174,7 +174,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The wheel, built from a copy: setuptools leaves folders beside what it builds."""
     pytest.importorskip("setuptools")
     source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
-    for folder in FOLDERS:
+    for folder in ("rotorgram", *FOLDERS):
         shutil.copytree(
             ROOT / folder, source / folder, ignore=shutil.ignore_patterns("__pycache__")
         )
@@ -193,6 +193,7 @@ def test_the_wheel_has_every_file(wheel: Path) -> None:
         for path in (ROOT / folder).rglob("*")
         if path.is_file() and "__pycache__" not in path.parts
     }
+    expected |= {"rotorgram/__init__.py", "rotorgram/__main__.py"}
     packed = set(zipfile.ZipFile(wheel).namelist())
     assert {name for name in packed if not name.startswith("rotorgram-")} == expected
 
@@ -213,7 +214,7 @@ def test_the_wheel_runs_the_demo(wheel: Path, tmp_path: Path) -> None:
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     (report,) = (tmp_path / "here" / "runs").glob("*/report.html")
-    assert "uPlot" in report.read_text(encoding="utf-8")
+    assert "data:image/svg+xml" in report.read_text(encoding="utf-8")
     where = subprocess.run(
         [sys.executable, "-P", "-c", "import rotorgram.cli as c; print(c.__file__)"],
         env={**os.environ, "PYTHONPATH": str(installed)},
