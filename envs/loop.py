@@ -11,8 +11,10 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from ..models.errors import InputError
 from ..sim import Array, PhysicsError, Randomization, World, make_world
 from ..sim.sensors import Sensors
+from ..sim.snapshots import Arrays, joined, part_of
 from .autoreset import Seeds, checked_seeds
 from .config import EnvConfig
 from .specification import make_task, observed, spec_of
@@ -46,7 +48,9 @@ class Stages:
         begin: What all of them do when an episode begins.
         observe: Steps from `Measure` on.
         kept: Names of the record that keep their values between steps.
+        measure: The first of those.
         pictures: Their specs.
+        cameras, sensors: None where there are none.
     """
 
     def __init__(
@@ -61,6 +65,7 @@ class Stages:
         config, controller, vehicle = task.config, task.controller, task.vehicle
         self._task, self._world = task, world
         self._look = lambda: world.state
+        self.sensors: Sensors | None = None
         sensing, readings = self._sensors()
         self.actions = Actions(world.shape, len(controller.low), controller.choices)
         self._flying: list[Stage] = [Receive(self.actions.neutral())]
@@ -77,13 +82,14 @@ class Stages:
         self._flight = Flight(world, parts, substeps, self._held)
         self._flying += [self._flight, clock.Clock()]
         judge = Judge(env_id, task)
-        measure = Measure(world, task.control_period)
+        self.measure = measure = Measure(world, task.control_period)
         radio: list[Stage] = []
         if task.has_radio:
             radio.append(Radio(task.options, task.control_period, shape[1], task.ended))
         self._observing = [measure, *sensing, Remember(task), *radio, judge, *readings]
         pictures = [Pictures(task, world.random, shape)] if config.cameras else []
         self._observing += pictures
+        self.cameras = pictures[0] if pictures else None
         self.pictures = pictures[0].specs if pictures else ()
         if randomize is not None and "observation_delay" in drawn:
             longest = randomize.most_steps("observation_delay")
@@ -101,7 +107,7 @@ class Stages:
         config = self._task.config
         if not config.sensors:
             return [], []
-        sensors = Sensors(config.sensors, self._world, self._task.control_period)
+        self.sensors = sensors = Sensors(config.sensors, self._world, self._task.control_period)
         estimated = config.estimated
         if estimated:
             self._look = sensors.seen
@@ -204,8 +210,7 @@ class Loop:
         `Task.reset_options`, shape (N,). Where the task refuses such a start, the others have
         flown, those to be reset are where they were, and their random numbers have moved on.
         """
-        if self._closed:
-            raise gym.error.ClosedEnvironmentError("expected an open env, got a closed one")
+        self._check_open()
         record, stages = self.record, self.stages
         clock.take(record, resets, frozen)
         flies = record.flown is None or bool(record.flown.any())
@@ -240,8 +245,7 @@ class Loop:
         lead = record.shape
         record.chosen = {name: values.reshape(lead)[()] for name, values in chosen.items()}
         record.run(None if everybody else begun, stages.begin)
-        record.anyone_waits = bool(record.waiting.any())
-        record.anyone_out = bool(record.out.any())
+        record.count()
         self._has_begun = True
 
     def _observe(self) -> None:
@@ -326,14 +330,74 @@ class Loop:
         """The telemetry of a single drone in a row."""
         row: list[float] = []
         for quantity in self._quantities:
-            row += quantity.read(self).tolist()
+            row += quantity.read(self).ravel().tolist()
         return row
+
+    def snapshot(self) -> dict[str, NDArray[Any]]:
+        """Copies of all arrays that a later step depends on, by name.
+
+        Raises `gymnasium.error.ClosedEnvironmentError` after `close`.
+        """
+        self._check_open()
+        stages = self.stages
+        parts: dict[str, Arrays] = {
+            "world": self.world.snapshot(),
+            "record": self.record.snapshot(),
+            "loop": {"has_begun": np.array(self._has_begun)},
+        }
+        if stages.sensors is not None:
+            parts["sensors"] = stages.sensors.snapshot()
+        if stages.cameras is not None:
+            parts["cameras"] = stages.cameras.snapshot(self.record)
+        return joined(parts)
+
+    def restore(self, snapshot: Arrays) -> None:
+        """Put back a snapshot of a loop of the same config and size; no step runs.
+
+        No later bit differs from those that followed it.
+
+        Raises:
+            InputError: It is of another number of drones; nothing has changed.
+            gymnasium.error.ClosedEnvironmentError: The loop is closed.
+        """
+        self._check_open()
+        record, stages = self.record, self.stages
+        kept = part_of(snapshot, "record")
+        shape = getattr(kept.get("kept/steps"), "shape", None)
+        if shape != record.shape:
+            raise InputError(f"snapshot: expected one of drones {record.shape}, got {shape}")
+        if "kept/landing" in kept:
+            stages.land()
+            record.kept = stages.kept
+        self.world.restore(part_of(snapshot, "world"))
+        if stages.sensors is not None:
+            stages.sensors.restore(part_of(snapshot, "sensors"))
+        record.restore(kept)
+        if "landing" in record.kept and "kept/landing" not in kept:
+            record.landing = np.zeros(record.shape, bool)[()]
+        if stages.cameras is not None:
+            stages.cameras.restore(part_of(snapshot, "cameras"))
+        self._has_begun = bool(snapshot["loop/has_begun"])
+        if self._has_begun:
+            stages.measure.step(record)
+        self._take_results()
+
+    def __reduce__(self) -> Any:
+        worlds = self.num_envs // self.config.drones
+        return type(self), (self.config, worlds), self.snapshot()
+
+    def __setstate__(self, snapshot: Arrays) -> None:
+        self.restore(snapshot)
 
     def close(self) -> None:
         """Release threads and memory; what the last step gave can be read on."""
         for stage in self.stages.all:
             stage.close()
         self._closed = True
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise gym.error.ClosedEnvironmentError("expected an open env, got a closed one")
 
     def _per_drone(self, values: Array) -> NDArray[np.float64]:
         if not np.ndim(values):  # one number for all drones

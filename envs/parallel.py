@@ -3,8 +3,10 @@
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..models.errors import NotCopied, expect, require
+from ..models.errors import expect, require
+from ..sim.snapshots import Arrays
 from .autoreset import AdvancingVectorEnv
 from .rendering import RENDER_MODES
 from .spaces import action_space, observation_space
@@ -18,7 +20,7 @@ Told = dict[str, Any]
 """By the names of agents."""
 
 
-class AdvancingParallelEnv(NotCopied, ParallelEnv[str, Any, Any]):  # type: ignore[misc]
+class AdvancingParallelEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc]
     """Base of local and remote parallel envs: one world of an `AdvancingVectorEnv`.
 
     One whose episode ends leaves `agents`: its rotors stand still, and the others fly on. Spaces,
@@ -141,5 +143,17 @@ class LocalParallelEnv(AdvancingParallelEnv):
             env_id, drones, render_mode, autoreset_mode="Disabled", drones=drones, **keywords
         )
         super().__init__(world)
+        self._local = world
         self.render_mode = render_mode
         self.metadata["render_modes"] = RENDER_MODES
+
+    def snapshot(self) -> dict[str, NDArray[Any]]:
+        """Copies of all arrays that a later step depends on, by name."""
+        flying = [agent in self.agents for agent in self.possible_agents]
+        return self._local.snapshot() | {"agents": np.array(flying)}
+
+    def restore(self, snapshot: Arrays) -> None:
+        """Put back a snapshot of an env of the same config. No later bit differs."""
+        self._local.restore(snapshot)
+        flying = zip(self.possible_agents, snapshot["agents"].tolist(), strict=True)
+        self.agents = [agent for agent, flies in flying if flies]

@@ -28,6 +28,10 @@ class Renderer:
         self._view: LiveView | None = None
         self._shown: list[Moment] = []
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what is open."""
+        return vars(self) | {"_canvas": None, "_view": None, "_shown": []}
+
     def render(self, episodes: Sequence[int]) -> tuple[np.ndarray, ...] | None:
         """Pictures, uint8, shape (height, width, 3); None in other modes than `rgb_array`.
 

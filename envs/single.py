@@ -4,15 +4,17 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from numpy.typing import NDArray
 
-from ..models.errors import InputError, NotCopied
+from ..models.errors import InputError
+from ..sim.snapshots import Arrays
 from .config import EnvConfig
 from .loop import Loop
 from .rendering import RENDER_MODES, Renderer
 from .spaces import action_space, observation_space, telemetry_names
 
 
-class SingleEnv(NotCopied, gym.Env[Any, Any]):
+class SingleEnv(gym.Env[Any, Any]):
     """A drone that flies a task, in process.
 
     `info` has every component of the telemetry by its name (positions and attitude in the paper's
@@ -23,7 +25,8 @@ class SingleEnv(NotCopied, gym.Env[Any, Any]):
     Render modes: with `rgb_array`, `render()` gives a picture, uint8, shape (360, 480, 3); with
     `human` a window shows the flight in real time. The physics is the same with either.
 
-    Keywords are those of `EnvConfig.from_keywords`.
+    Keywords are those of `EnvConfig.from_keywords`. An env can be copied by `copy.deepcopy` and
+    pickled; the copy opens a window of its own.
 
     Attributes:
         config: The env's `EnvConfig`.
@@ -95,6 +98,15 @@ class SingleEnv(NotCopied, gym.Env[Any, Any]):
         pictures = self._renderer.render([self._episodes])
         return pictures[0] if pictures else None
 
+    def snapshot(self) -> dict[str, NDArray[Any]]:
+        """Copies of all arrays that a later step depends on, by name."""
+        return self._loop.snapshot() | {"episodes": np.array(self._episodes)}
+
+    def restore(self, snapshot: Arrays) -> None:
+        """Put back a snapshot of an env of the same config. No later bit differs."""
+        self._loop.restore(snapshot)
+        self._episodes = int(snapshot["episodes"])
+
     def close(self) -> None:
         """Close the window, if there is one; release memory."""
         self._renderer.close()
@@ -132,5 +144,5 @@ class SingleEnv(NotCopied, gym.Env[Any, Any]):
         info = self._blank.copy()  # faster than to insert one name after the other
         info |= zip(self._blank, loop.row(), strict=False)
         for name, term in loop.terms.items():
-            info["reward_" + name] = float(term)
+            info["reward_" + name] = term.item() if isinstance(term, np.ndarray) else float(term)
         return info

@@ -5,8 +5,10 @@ from typing import Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
 
-from ..models.errors import InputError, NotCopied
+from ..models.errors import InputError
+from ..sim.snapshots import Arrays
 from .autoreset import AdvancingVectorEnv, Seeds, checked_mask, checked_seeds
 from .config import EnvConfig
 from .loop import Loop
@@ -14,7 +16,7 @@ from .rendering import RENDER_MODES, Renderer
 from .spaces import joined
 
 
-class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
+class LocalVectorEnv(AdvancingVectorEnv):
     """N drones that fly a task in process, bit for bit as N single ones do.
 
     With several `drones` to a world, N is a multiple of them. One whose episode ends is `out`, with
@@ -108,13 +110,21 @@ class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
         """As `AdvancingVectorEnv.advance`; `chosen` as of `Loop.advance`."""
         loop = self._loop
         loop.advance(actions, resets, seeds, frozen, chosen)
-        self.observations = joined(loop.spec, loop.observations)
-        self.rewards, self.terminated = loop.rewards, loop.terminated
-        self.truncated, self.done, self.out = loop.truncated, loop.done, loop.out
+        self._take_results()
         if self.render_mode is not None:
             self._episodes = self._episodes + (0 if resets is None else resets)
             if self.render_mode == "human":
                 self.render()
+
+    def snapshot(self) -> dict[str, NDArray[Any]]:
+        """Copies of all arrays that a later step depends on, by name."""
+        return self._loop.snapshot() | {"episodes": self._episodes.copy()}
+
+    def restore(self, snapshot: Arrays) -> None:
+        """Put back a snapshot of an env of the same config and size. No later bit differs."""
+        self._loop.restore(snapshot)
+        self._episodes = snapshot["episodes"].copy()
+        self._take_results()
 
     @property
     def telemetry(self) -> Any:  # type: ignore[override]  # made when it is asked for
@@ -124,6 +134,12 @@ class LocalVectorEnv(NotCopied, AdvancingVectorEnv):
     def _info(self, mask: Any) -> dict[str, Any]:
         terms = {f"reward_{name}": term for name, term in self._loop.reward_terms.items()}
         return super()._info(mask) | terms | {f"_{name}": mask for name in terms}
+
+    def _take_results(self) -> None:
+        loop = self._loop
+        self.observations = joined(loop.spec, loop.observations)
+        self.rewards, self.terminated = loop.rewards, loop.terminated
+        self.truncated, self.done, self.out = loop.truncated, loop.done, loop.out
 
     def _choice(self, name: str, value: Any) -> np.ndarray:
         if name not in self._loop.task.reset_options:

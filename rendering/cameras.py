@@ -137,6 +137,22 @@ class Cameras:
                 if flows:
                     self._before[world] = self._poses.now(self.data)
 
+    def snapshot(self) -> dict[str, np.ndarray]:
+        """What each drone took last, and where each world was then, by name."""
+        arrays = {name: pictures.copy() for name, pictures in self.pictures.items()}
+        like = next((one for one in self._before if one is not None), None)
+        if like is not None:
+            none = np.full_like(like, np.nan)
+            arrays["before"] = np.stack([none if one is None else one for one in self._before])
+        return arrays
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Put a snapshot back."""
+        for name, pictures in self.pictures.items():
+            pictures[:] = arrays[name]
+        if "before" in arrays:
+            self._before = list(arrays["before"].copy())
+
     def lens(
         self, name: str, state: Mapping[str, np.ndarray], drone: int = 0, world: int = 0
     ) -> Lens:

@@ -14,6 +14,7 @@ from ...models.errors import expect
 from ...models.fleet import members_of
 from ...scenes import scenes_of
 from ...sim.random import CAMERAS, SCENES, Random
+from ...sim.snapshots import Arrays
 from ..spec import ArraySpec
 from ..tasks.task import Task
 from .record import Record, Stage
@@ -133,6 +134,24 @@ class Pictures(Stage):
             self._pool.shutdown()
         for painter in self._painters:
             painter.cameras.close()
+
+    def snapshot(self, record: Record) -> dict[str, NDArray[Any]]:
+        """What each drone's cameras took last, and from where."""
+        taken: dict[str, NDArray[Any]] = {}
+        if "scenes" not in vars(record):
+            return taken
+        for painter in self._painters:
+            worlds = painter.worlds & (record.scenes == painter.scene)
+            for name, array in painter.cameras.snapshot().items():
+                mask = np.repeat(worlds, len(array) // len(worlds))
+                taken.setdefault(name, np.zeros_like(array))[mask] = array[mask]
+        return taken
+
+    def restore(self, arrays: Arrays) -> None:
+        """Put a snapshot back."""
+        if arrays:
+            for painter in self._painters:
+                painter.cameras.restore(arrays)
 
     def begin(self, record: Record) -> None:
         """Draw the scene of each world."""

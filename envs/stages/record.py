@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...sim import Draw, InitialState
+from ...sim.snapshots import Arrays, joined, part_of
 from ...sim.state import Array, WorldState
 from ..memory import Memory
 from ..state import State
@@ -16,6 +17,7 @@ Mask = NDArray[np.bool_]
 Look = Callable[[], WorldState]
 """Gives the state that a controller sees: the exact one, or the estimate."""
 
+_MAPPINGS = ("observations", "terms", "metrics", "past_observations", "history")
 _SMALL = 64  # Up to this many numbers Python's loop is faster than NumPy's call
 
 
@@ -117,6 +119,43 @@ class Record:
         for name, old in remembered.items():
             if memory[name] is not old:
                 memory[name] = where(mask, memory[name], old)
+
+    def snapshot(self) -> dict[str, NDArray[Any]]:
+        """Copies of what is kept and of the memory, by name."""
+        known = vars(self)
+        parts: dict[str, dict[str, Any]] = {"memory": vars(self.memory), "kept": {}}
+        for name in self.kept:
+            if name in known:
+                values = known[name]
+                if name in _MAPPINGS:
+                    parts[name] = values
+                else:
+                    parts["kept"][name] = values
+        return {name: np.array(values) for name, values in joined(parts).items()}
+
+    def restore(self, arrays: Arrays) -> None:
+        """Put a snapshot back."""
+        values: dict[str, Any] = {}
+        for name, array in part_of(arrays, "kept").items():
+            values[name] = array.copy()[()]
+        for name in _MAPPINGS:
+            mapping = {key: array.copy()[()] for key, array in part_of(arrays, name).items()}
+            if mapping or name == "metrics":
+                values[name] = mapping
+        for name in self.kept:
+            vars(self).pop(name, None)
+        vars(self).update(values)
+        vars(self.memory).clear()
+        with self.memory.open("begin"):
+            for name, array in part_of(arrays, "memory").items():
+                setattr(self.memory, name, array.copy())
+        self.flown = self.begun = self.leaving = None
+        self.count()
+
+    def count(self) -> None:
+        """See again whether any drone waits or is out."""
+        self.anyone_waits = bool(self.waiting.any())
+        self.anyone_out = bool(self.out.any())
 
     def rest(self) -> None:
         """A drone that does not fly gets no reward and no end."""

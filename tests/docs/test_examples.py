@@ -12,6 +12,7 @@ import pytest
 EXAMPLES = Path(__file__).parents[2] / "examples"
 SHORT = {
     "fly_pid.py": ([], r"return 2\d\d\.\d, elevation 6\.000 m of 6\.0 m"),
+    "mpc.py": (["--steps", "75"], r"step 75: 0\.[0-2]\d\d m from the goal"),
     "ppo_loop.py": (["--updates", "2"], r"update 2: 4,096 steps, return -?\d+\.\d"),
     "record_replay_render.py": ([], r"identical: \d+ States[^|]*film: flight\.mp4"),
     "sb3_ppo.py": (["--env-steps", "2048"], r"return -?\d+\.\d ± \d+\.\d of at most 250"),

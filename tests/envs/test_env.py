@@ -1,10 +1,8 @@
 """Single envs: the contract of every task, the closed forms of the elevation task, its ends."""
 
-import copy
 import inspect
 import itertools
 import math
-import pickle
 import re
 import subprocess
 import sys
@@ -152,15 +150,6 @@ def test_options_through_make() -> None:
 def test_frames_per_second_follow_the_control_period() -> None:
     assert _env().metadata["render_fps"] == 50
     assert _env(control_period=0.1).metadata["render_fps"] == 10
-
-
-@pytest.mark.parametrize("copies", [copy.copy, copy.deepcopy, pickle.dumps])
-@pytest.mark.parametrize("make", [_env, lambda: gym.make_vec(ID, num_envs=2)])
-def test_a_running_env_is_not_copied(make: Any, copies: Any) -> None:
-    """A copy's arrays would no longer be those of its simulator."""
-    env = make()
-    with pytest.raises(TypeError, match="cannot be copied or pickled: make another one"):
-        copies(env)
 
 
 def _table(heading: str) -> list[list[str]]:

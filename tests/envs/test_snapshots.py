@@ -1,0 +1,217 @@
+"""After `restore(snapshot())` no later bit differs, and copies of an env fly as it does."""
+
+import copy
+import pickle
+from collections.abc import Callable
+from typing import Any
+
+import cloudpickle
+import gymnasium as gym
+import numpy as np
+import pytest
+from rotorgram.envs.registry import task_type
+from rotorgram.models.errors import InputError
+
+HOVER = "rotorgram/Hover-v0"
+TASKS = [name for name in gym.registry if name.startswith("rotorgram/")]
+RICH: dict[str, Any] = {
+    "vehicle": "crazyflie2",
+    "effects": {
+        "motor_lag": True, "battery": True, "body_drag": True, "rotor_drag": True,
+        "ground_effect": True, "wind": (1.0, 0.0, 0.0), "gusts": 1.0,
+    },
+    "sensors": {
+        "imu": True, "motion_capture": {"noise": 0.001, "angle_noise": 0.01, "delay": 0.04},
+    },
+    "history": 3,
+    "randomize": {
+        "mass": "uniform(0.9, 1.1)", "action_delay": "choice(0, 1, 2)",
+        "observation_delay": "choice(0, 1, 2)",
+    },
+}  # fmt: skip
+LOSSY = {"drones": 3, "radio_loss": 0.3, "radio_delay": 2}
+CASES: dict[str, tuple[str, dict[str, Any]]] = {
+    **{name: (name, {}) for name in TASKS},
+    "rigid": (HOVER, {"backend": "rigid"}),
+    "rich": (HOVER, RICH),
+    "rich, rigid": (HOVER, {**RICH, "backend": "rigid"}),
+    "lossy radio": ("rotorgram/Formation-v0", LOSSY),
+    "short episodes": (HOVER, {"episode_length": 9}),
+}
+COPIES: dict[str, Callable[[Any], Any]] = {
+    "deepcopy": copy.deepcopy,
+    "pickle": lambda env: pickle.loads(pickle.dumps(env)),
+    "cloudpickle": lambda env: pickle.loads(cloudpickle.dumps(env)),
+}
+
+
+def bits(value: Any) -> Any:
+    """A value in which each bit counts."""
+    if isinstance(value, dict):
+        return {name: bits(part) for name, part in value.items()}
+    if isinstance(value, tuple):
+        return [bits(part) for part in value]
+    array = np.asarray(value)
+    return array.shape, array.dtype.str, array.tobytes()
+
+
+def flight(env: Any, steps: int) -> list[Any]:
+    """All that the steps return. A single env is reset after an episode, a vector env by itself."""
+    rng = np.random.default_rng(7)
+    shape = env.action_space.shape
+    seen = []
+    for _ in range(steps):
+        result = env.step((0.3 * rng.normal(size=shape)).clip(-1.0, 1.0).astype(np.float32))
+        seen.append(bits(result))
+        if not isinstance(env, gym.vector.VectorEnv) and (result[2] or result[3]):
+            seen.append(bits(env.reset()))
+    return seen
+
+
+def vector_of(case: str) -> Any:
+    env_id, options = CASES[case]
+    drones = options.get("drones", task_type(env_id).min_drones)
+    return gym.make_vec(env_id, num_envs=2 * drones, **(options | {"drones": drones}))
+
+
+def single_of(case: str) -> Any:
+    env_id, options = CASES[case]
+    return gym.make(env_id, **options)
+
+
+ALONE = [
+    case
+    for case, (name, options) in CASES.items()
+    if task_type(name).min_drones == 1 and "drones" not in options
+]
+
+
+def check_restored(make: Callable[[], Any]) -> None:
+    env = make()
+    env.reset(seed=3)
+    flight(env, 6)
+    snapshot = env.unwrapped.snapshot()
+    kept = copy.deepcopy(snapshot)
+    first = flight(env, 12)
+    env.unwrapped.restore(snapshot)
+    assert flight(env, 12) == first
+    other = make()
+    other.reset(seed=4)
+    flight(other, 2)
+    other.unwrapped.restore(snapshot)
+    assert flight(other, 12) == first
+    assert bits(snapshot) == bits(kept)
+
+
+@pytest.mark.parametrize("case", ALONE)
+def test_a_single_env_is_restored(case: str) -> None:
+    check_restored(lambda: single_of(case))
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_vector_env_is_restored(case: str) -> None:
+    check_restored(lambda: vector_of(case))
+
+
+@pytest.mark.parametrize("copied", COPIES)
+@pytest.mark.parametrize("case", [HOVER, "rich", "rigid"])
+def test_single_envs_are_copied(case: str, copied: str) -> None:
+    env = single_of(case)
+    env.reset(seed=3)
+    flight(env, 6)
+    twin = COPIES[copied](env)
+    assert flight(twin, 12) == flight(env, 12)
+
+
+@pytest.mark.parametrize("copied", COPIES)
+@pytest.mark.parametrize("case", [HOVER, "rich", "lossy radio"])
+def test_vector_envs_are_copied(case: str, copied: str) -> None:
+    env = vector_of(case)
+    fresh = COPIES[copied](env)
+    assert bits(fresh.reset(seed=3)) == bits(env.reset(seed=3))
+    flight(env, 6)
+    twin = COPIES[copied](env)
+    assert flight(twin, 12) == flight(env, 12)
+
+
+def test_results_of_the_snapshot_are_back() -> None:
+    env: Any = gym.make_vec(HOVER, num_envs=3).unwrapped
+    env.reset(seed=1)
+    results = env.step(env.action_space.sample())
+    telemetry = bits(dict(env.telemetry))
+    snapshot = env.snapshot()
+    flight(env, 3)
+    env.restore(snapshot)
+    assert bits((env.observations, env.rewards)) == bits(results[:2])
+    assert bits(dict(env.telemetry)) == telemetry
+
+
+def test_drones_that_land_go_on_landing() -> None:
+    env: Any = gym.make_vec(HOVER, num_envs=2).unwrapped
+    env.reset(seed=1)
+    env.loop.land(np.array([True, False]))
+    flight(env, 3)
+    snapshot = env.snapshot()
+    first = flight(env, 5)
+    other: Any = gym.make_vec(HOVER, num_envs=2).unwrapped
+    before = other.snapshot()
+    other.restore(snapshot)
+    assert flight(other, 5) == first
+    other.restore(before)
+    env.reset(seed=2)
+    other.reset(seed=2)
+    assert flight(other, 5) == flight(env, 5)
+
+
+def test_another_number_of_drones_is_refused() -> None:
+    two: Any = gym.make_vec(HOVER, num_envs=2).unwrapped
+    three: Any = gym.make_vec(HOVER, num_envs=3).unwrapped
+    with pytest.raises(InputError, match=r"expected one of drones \(3, 1\), got \(2, 1\)"):
+        three.restore(two.snapshot())
+
+
+def test_a_closed_env_has_no_snapshot() -> None:
+    env: Any = gym.make(HOVER)
+    env.close()
+    with pytest.raises(gym.error.ClosedEnvironmentError):
+        env.unwrapped.snapshot()
+
+
+def test_a_single_env_flies_on_rigid() -> None:
+    env = gym.make(HOVER, backend="rigid")
+    _, info = env.reset(seed=1)
+    assert isinstance(info["X"], float)
+    assert isinstance(info["reward_position"], float)
+    alone = gym.make(HOVER)
+    _, exact = alone.reset(seed=1)
+    assert list(info) == list(exact)
+    assert [info[name] for name in "XYZ"] == pytest.approx([exact[name] for name in "XYZ"])
+
+
+def test_pictures_are_restored(opengl: None) -> None:
+    env: Any = gym.make(HOVER, cameras=("front@16x16", "front_flow@16x16"), render_mode="rgb_array")
+    env.reset(seed=1)
+    env.render()
+    flight(env, 3)
+    twin = copy.deepcopy(env)
+    snapshot = env.unwrapped.snapshot()
+    first = flight(env, 6)
+    env.unwrapped.restore(snapshot)
+    assert flight(env, 6) == first
+    assert flight(twin, 6) == first
+    env.close()
+    twin.close()
+
+
+def test_parallel_envs_are_restored_and_copied() -> None:
+    from rotorgram.envs.parallel import LocalParallelEnv
+
+    env = LocalParallelEnv("rotorgram/Formation-v0", drones=3)
+    env.reset(seed=1)
+    snapshot = env.snapshot()
+    twin = pickle.loads(pickle.dumps(env))
+    actions = {agent: env.action_space(agent).sample() for agent in env.agents}
+    first = bits(env.step(actions))
+    env.restore(snapshot)
+    assert bits(env.step(actions)) == first
+    assert bits(twin.step(actions)) == first
