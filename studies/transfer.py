@@ -24,7 +24,6 @@ import pandas as pd
 from matplotlib import style
 from matplotlib.figure import Figure
 from measuring import RESULTS, options, write
-from rotorgram import training
 from rotorgram.agents import Geometric, load, preset, store
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.flights.trajectories import fly_episodes
@@ -32,6 +31,8 @@ from rotorgram.training.metrics import steady_state
 from rotorgram.training.settings import Run
 from rotorgram.training.statistics import bootstrap_interval, iqm
 from rotorgram.training.training import Training
+
+from rotorgram import training
 
 ENV: Final = "rotorgram/Hover-v0"
 VEHICLE: Final = "crazyflie_brushless"
