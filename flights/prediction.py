@@ -9,6 +9,7 @@ with z up; body x forward, y left, z up; quaternions scalar first; SI.
 """
 
 import copy
+import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Self
@@ -17,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..models.coefficients import Drag
+from ..models.errors import InputError
 from ..models.vehicle import Vehicle
 from ..sim.backends import kernel
 from ..sim.backends.body import RigidBody
@@ -168,10 +170,18 @@ def predict(
 def _flight(
     body: RigidBody, rotors: int, *, pushed: bool
 ) -> Callable[[Floats, Floats, Floats | None], Floats]:
-    """New rows (13, N) after a physics step; compiled where there is a C compiler."""
+    """New rows (13, N) after a physics step; compiled where a C compiler can, else by NumPy."""
+
+    def by_numpy(rows: Floats, thrust: Floats, wrench: Floats | None) -> Floats:
+        return np.array(body.fly(rows, thrust, wrench))
+
     if kernel.compiler() is None:
-        return lambda rows, thrust, wrench: np.array(body.fly(rows, thrust, wrench))
-    step = kernel.compiled(body, rotors, np.float64, wrench=pushed)
+        return by_numpy
+    try:
+        step = kernel.compiled(body, rotors, np.float64, wrench=pushed)
+    except InputError as error:
+        logging.getLogger(__name__).warning("predictions by NumPy: %s", error)
+        return by_numpy
     varying = kernel.packed(body, np.float64)
     return lambda rows, thrust, wrench: step(rows, thrust, wrench, varying, 1)
 

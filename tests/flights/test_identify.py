@@ -1,5 +1,6 @@
 """System identification: known values come back, and what a log does not tell is named."""
 
+import shutil
 import struct
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from rotorgram.flights.identify import identify
 from rotorgram.flights.prediction import Windows, differences, numbers_of, predict
 from rotorgram.models.errors import InputError
 from rotorgram.models.vehicle import Vehicle
+from rotorgram.sim.backends import kernel
 from rotorgram.sim.effects import EffectOptions
 from rotorgram.sim.state import InitialState
 from rotorgram.sim.world import make_world
@@ -205,7 +207,15 @@ def test_a_prediction_is_the_simulator_s(log: Path) -> None:
     world.close()
 
 
-def test_free_fall_with_linear_drag_falls_as_the_closed_form() -> None:
+@pytest.mark.parametrize("compiler", ["works", "fails", "missing"])
+def test_free_fall_with_linear_drag_falls_as_the_closed_form(
+    compiler: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    if compiler == "fails":
+        kernel._library.cache_clear()
+        monkeypatch.setenv("CC", str(shutil.which("false")))
+    if compiler == "missing":
+        monkeypatch.setattr(kernel, "compiler", lambda: None)
     vehicle = Vehicle.load(LIVELY)
     numbers = numbers_of(vehicle) | {"drag.linear.z": 0.5}
     still = np.zeros((501, 3))
@@ -219,6 +229,8 @@ def test_free_fall_with_linear_drag_falls_as_the_closed_form() -> None:
     # m dv/dt = -m g - c v with m = 0.5, c = 0.5: v = -g (1 - e^-t), z = -g (t - 1 + e^-t).
     assert velocity[2, 0] == pytest.approx(-9.81 * (1 - np.exp(-1)), abs=1e-5)
     assert position[2, 0] == pytest.approx(-9.81 * np.exp(-1), abs=1e-5)
+    warnings = [line.startswith("predictions by NumPy: compiled: ") for line in caplog.messages]
+    assert warnings == ([True] if compiler == "fails" else [])
 
 
 def test_lag_is_the_closed_form(short: Path) -> None:

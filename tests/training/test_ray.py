@@ -174,7 +174,7 @@ def _simulators() -> list[int]:
     def is_ours(pid: int) -> bool:
         return pid == os.getpid() or (pid in parents and is_ours(parents[pid]))
 
-    return [int(p) for p, _, words in rows if "until-stdin-closes" in words and is_ours(int(p))]
+    return [int(p) for p, _, words in rows if "-m rotorgram.udp" in words and is_ours(int(p))]
 
 
 def test_no_such_cluster(tmp_path: Path) -> None:
