@@ -545,12 +545,17 @@ def test_a_policy_that_does_not_exist_is_told() -> None:
         RemoteEnv(ANY, connect=False, when_lost="fall")
 
 
-def test_a_landing_drone_comes_down_at_its_speed_and_is_then_out() -> None:
+def test_a_landing_drone_comes_down_at_its_speed_and_is_then_out(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     loop = Loop(EnvConfig.from_keywords(RISE, drones=2, episode_length=2000))
     nothing = np.zeros((2, 1), np.float32)
     loop.advance(nothing, np.ones(2, bool), [1, 1])
     start = loop.world.state.position.copy()
-    loop.task.outcome = lambda state, told=loop.task.outcome: flying_on(told(state))
+    outcome = type(loop.task).outcome
+    monkeypatch.setattr(
+        type(loop.task), "outcome", lambda task, state: flying_on(outcome(task, state))
+    )
     loop.land(np.array([False, True]))
     speeds = []
     while not loop.out[1]:
