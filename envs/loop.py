@@ -169,7 +169,7 @@ class Loop:
         self.config = config = config.resolve()
         backend, shape = config.backend, (num_worlds, config.drones)
         alone = shape == (1, 1) and backend.name == "mujoco"
-        self.task = make_task(config, () if alone else shape)
+        self.task: Task = make_task(config, () if alone else shape)
         self.num_envs, self.vehicle = num_worlds * config.drones, self.task.vehicle
         flown = self.task.config
         randomize = Randomization(flown.randomize, flown.effects) if flown.randomize else None
@@ -184,7 +184,7 @@ class Loop:
         )
         self.stages = Stages(config.env_id, self.task, self.world, shape, randomize)
         self.spec = spec_of(config, self.task, self.stages.pictures)
-        self.record = Record(self.world.shape, self.task.memory)
+        self.record: Record = Record(self.world.shape, self.task.memory)
         self.record.kept = self.stages.kept
         self._quantities = quantities_of(self.task)
         self._arrays = [

@@ -34,8 +34,8 @@ class Actions:
         if actions.dtype.kind not in "iuf":
             raise InputError(f"actions: expected real numbers, got {actions.dtype}")
         if actions.size != self._count * self._width:
-            expected = (self._count, self._width)
-            raise InputError(f"actions: expected shape {expected}, got {actions.shape}")
+            shape = (self._count, self._width)
+            raise InputError(f"actions: expected shape {shape}, got {actions.shape}")
         values = actions.reshape(self._shape)
         if self._choices:
             right = (values >= 0) & (values < self._choices) & (values % 1 == 0)

@@ -1,6 +1,6 @@
 """Drones of a lost agent land by themselves."""
 
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -28,8 +28,9 @@ class Landing(Stage):
 
     def __init__(self, world: World, look: Look, period: float, lag: float) -> None:
         self._look = look
-        self._controller = make_controller("velocity", world.vehicle, period, lag=lag)
-        fastest, _ = self._controller.ranges()[2]
+        controller: Any = make_controller("velocity", world.vehicle, period, lag=lag)
+        self._controller = controller
+        fastest, _ = controller.ranges()[2]
         down = (0.0, 0.0, -min(1.0, DESCENT / fastest), 0.0)
         self._action = np.broadcast_to(down, (*world.shape, len(down)))
 

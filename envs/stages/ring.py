@@ -29,13 +29,16 @@ def later(past: Values | None, values: Values, steps: int, record: Record) -> Va
     new = pushed(past, values, axis)
     if record.begun is None:
         return new
-    return where(record.begun, filled(values, steps, axis), new)
+    merged: Values = where(record.begun, filled(values, steps, axis), new)
+    return merged
 
 
 def taken(past: Values, age: Any, axis: int) -> Values:
     """Values of so many steps ago; the age has the shape (W, A), whole numbers."""
     index = past.shape[axis] - 1 - np.asarray(age).astype(int)
     if not axis:
-        return past[int(index)]
+        present: Values = past[int(index)]
+        return present
     index = index.reshape(index.shape + (1,) * (past.ndim - axis))
-    return np.take_along_axis(past, index, axis).squeeze(axis)
+    chosen: Values = np.take_along_axis(past, index, axis).squeeze(axis)
+    return chosen

@@ -188,7 +188,7 @@ def test_what_cannot_fly_is_one_sentence(
 
 def test_a_period_that_does_not_fit_the_files_step(files: dict[str, Path]) -> None:
     gym.make(ELEVATION, vehicle=files["unequal"], control_period=0.005)
-    with pytest.raises(InputError, match=r"^control_period: .* physics step of 0.01 s, got 0.005"):
+    with pytest.raises(InputError, match=r"^control_period: .* 0.01 s, .* timestep .* got 0.005"):
         gym.make(ELEVATION, vehicle=files["included"], control_period=0.005)
 
 
