@@ -205,10 +205,12 @@ def test_every_file_is_there(captured: Path) -> None:
             assert all((captured / file).is_file() for file in one["files"])
 
 
-def test_depth_in_millimetres_is_depth_in_metres(captured: Path) -> None:
+def test_depth_in_millimetres_is_depth_in_metres(opengl: None, tmp_path: Path) -> None:
+    tilted = plan_of(tmp_path, PLAN.replace("tilt = 0.5", "tilt = 1.4"))  # some see the horizon
+    assert capture(tilted, tmp_path, ONE) == 8
     seen: set[bool] = set()
-    for frame in read_labels(captured, 8):
-        depth, coded = (captured / file for file in frame["pictures"][1]["files"])
+    for frame in read_labels(tmp_path, 8):
+        depth, coded = (tmp_path / file for file in frame["pictures"][1]["files"])
         meters = np.load(depth)
         with Image.open(coded) as image:
             millimetres = np.asarray(image).astype(float)
