@@ -147,6 +147,7 @@ def _measure(given: Namespace, vehicle: Vehicle) -> int:
     result = {
         "vehicle": vehicle.name,
         "vehicle_hash": vehicle.hash,
+        "numbers": moving_numbers(vehicle),
         "starts": len(windows.index),
         "measures": MEASURES,
         "errors": row["errors"],
@@ -156,6 +157,22 @@ def _measure(given: Namespace, vehicle: Vehicle) -> int:
     (given.out / f"{Path(given.vehicle).stem}.json").write_text(text + "\n", encoding="utf-8")
     print(text)
     return 0
+
+
+def moving_numbers(vehicle: Vehicle) -> dict[str, object]:
+    """Numbers of a vehicle that its motion in this study depends on, SI.
+
+    Its hash changes with others too, such as those of sensors; as long as these are the same, the
+    errors are those of the vehicle.
+    """
+    return {
+        "mass": vehicle.mass,
+        "gravity": vehicle.gravity,
+        "center_of_mass": vehicle.center_of_mass.tolist(),
+        "inertia": vehicle.inertia.tolist(),
+        "allocation": vehicle.allocation.tolist(),
+        **numbers_of(vehicle),
+    }
 
 
 def simulated(
