@@ -45,8 +45,10 @@ def main() -> None:
     API.mkdir(parents=True)
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     for name, folder in project["tool"]["setuptools"]["package-dir"].items():
-        link = API / name.removeprefix("rotorgram.")
-        link.symlink_to(ROOT / folder, target_is_directory=True)
+        _, _, subpackage = name.partition(".")
+        if subpackage:
+            (API / subpackage).symlink_to(ROOT / folder, target_is_directory=True)
+    (API / "__init__.py").symlink_to(ROOT / "rotorgram" / "__init__.py")
 
 
 def _places() -> dict[str, str]:
