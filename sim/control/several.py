@@ -23,7 +23,12 @@ class Several:
         self.components, self.choices = first.components, first.choices
         self.every_step = getattr(first, "every_step", False)
         self.units, self.frame = getattr(first, "units", ""), getattr(first, "frame", "")
-        self._controllers = controllers
+        self._controllers, self._first = controllers, first
+
+    def ranges(self) -> list[tuple[float, str]]:
+        """As `Rates.ranges`, of a level that has them; all drones share them."""
+        ranges: list[tuple[float, str]] = self._first.ranges()
+        return ranges
 
     def thrust(self, action: Array, state: WorldState) -> Array:
         """As `Controller.thrust`."""

@@ -237,7 +237,7 @@ def test_a_storm_clips_the_observations_of_the_elevation_task(up: float) -> None
     effects = {"body_drag": True, "wind": (0.0, 0.0, 60.0 * up)}
     env = gym.make(ELEVATION, vehicle=DATA / "racer.xml", effects=effects, flight_band=1.5)
     low, high = env.observation_space.low, env.observation_space.high
-    observation, _ = env.reset(seed=0)
+    observation, _ = env.reset(seed=4)  # a start far from the goal
     seen, terminated = [observation], False
     while not terminated:
         observation, _, terminated, _, info = env.step(np.array((up,), np.float32))

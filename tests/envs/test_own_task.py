@@ -16,6 +16,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import pandas as pd
 import pytest
 from gymnasium.utils.env_checker import check_env
 from rotorgram.envs import registry
@@ -162,8 +163,10 @@ def test_agents_are_compared_on_it(here: Path) -> None:
     words += ["--episodes", "1", "--snapshots", "1", "--no-film", "--out", "comparison"]
     rotorgram(here, "compare", *words)
     assert (here / "comparison" / "report.html").is_file()
-    header = (here / "comparison" / "evaluations.csv").read_text().splitlines()[0]
-    assert "height" in header
+    evaluations = pd.read_parquet(here / "comparison" / "evaluations.parquet")
+    assert set(evaluations["env_steps"]) == {0, 2048}
+    assert evaluations["steady"].notna().all()
+    assert "| Steady h (m) |" in (here / "comparison" / "results.md").read_text()
 
 
 def test_a_task_that_nobody_knows_is_one_sentence(elsewhere: Path) -> None:

@@ -36,7 +36,7 @@ class Heard:
 
     def begin(self, position: np.ndarray) -> None:
         self.record.start = InitialState(position=position)
-        self.record.draw = Lots(None)
+        self.record.draw = Lots()
         self.stage.begin(self.record)
         self.record.flown = np.zeros((1, 3), bool)
         self._observe(position, STILL)
@@ -62,6 +62,9 @@ class Heard:
 
 
 class Lots(Draw):
+    def __init__(self) -> None:
+        """It draws the same numbers for every world."""
+
     def uniform(self, low: Any, high: Any, size: Any = (), *, name: str = "") -> Any:
         return LOTS
 

@@ -88,7 +88,10 @@ def test_defaults() -> None:
             {"control_period": 0.0},
             "control_period: expected a number from 1e-06 to 1 s, .*, got 0.0",
         ),
-        ({"control_period": 0.005}, "control_period: expected a positive multiple .* 0.01 s, got"),
+        (
+            {"control_period": 0.005},
+            "control_period: expected a positive multiple .* 0.01 s, .*, got",
+        ),
         ({"control_period": 0.025}, "control_period: expected a positive multiple .*, got 0.025"),
         ({"control_period": 1.01}, "control_period: expected a number .* to 1 s, .*, got 1.01"),
         ({"action": "delta"}, "action: expected 'increment' or 'offset', got 'delta'"),

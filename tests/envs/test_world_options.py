@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -11,8 +12,10 @@ import pytest
 import rotorgram.envs  # noqa: F401
 from rotorgram.cli import main
 from rotorgram.envs.config import EnvConfig
-from rotorgram.envs.delay import Delay
+from rotorgram.envs.memory import Memory
 from rotorgram.envs.registry import env_spec
+from rotorgram.envs.stages.actions import ActionDelay
+from rotorgram.envs.stages.record import Record
 from rotorgram.models.errors import InputError
 from rotorgram.udp.spawn import spawn_simulator
 
@@ -41,17 +44,25 @@ def flight(env: Any, seed: int, steps: int = 30) -> list[np.ndarray]:
     return seen
 
 
-def test_a_delay_gives_what_was_pushed_so_many_steps_ago() -> None:
-    delay, everybody = Delay(2), np.ones((3, 1), bool)
-    delay.begin(everybody, np.full((3, 1), -1.0))
-    age = np.array([[0], [1], [2]])
-    given = []
-    for step in range(4):
-        delay.push(None, np.full((3, 1), float(step)))
-        given.append(delay.get(age)[:, 0].tolist())
+def test_a_delay_gives_what_was_sent_so_many_steps_ago() -> None:
+    neutral, age = np.full((3, 1, 1), -1.0), np.array([[0], [1], [2]])
+    world: Any = SimpleNamespace(parameters={"action_delay": age})
+    delay = ActionDelay(world, 2, neutral)
+    record = Record((3, 1), Memory())
+    record.kept = delay.arrays
+    delay.begin(record)
+
+    def arrived(action: float, mask: np.ndarray | None) -> list[float]:
+        record.received = np.full((3, 1, 1), action)
+        record.run(mask, [delay.step])
+        received: list[float] = record.received[:, 0, 0].tolist()
+        return received
+
+    given = [arrived(float(step), None) for step in range(4)]
     assert given == [[0, -1, -1], [1, 0, -1], [2, 1, 0], [3, 2, 1]]
-    delay.push(np.array([[True], [False], [False]]), np.full((3, 1), 9.0))
-    assert delay.get(age)[:, 0].tolist() == [9, 2, 1]  # a frozen drone's past does not move
+    arrived(9.0, np.array([[True], [False], [False]]))
+    # the past of a frozen drone does not move
+    assert record.actions_sent[:, 0, :, 0].tolist() == [[2, 3, 9], [1, 2, 3], [1, 2, 3]]
 
 
 @pytest.mark.parametrize("late", [1, 3])
@@ -189,8 +200,8 @@ def test_files_of_a_comparison_tell_what_was_drawn(tmp_path: Path) -> None:
     words += ["--jobs", "1", "--episode-length", "50", "--no-film"]
     words += ["--randomize", "mass=uniform(0.9,1.1)", "--out", str(tmp_path / "c")]
     assert main(["compare", *words]) == 0
-    for name in ("episodes.csv", "evaluations.csv"):
-        drawn = pd.read_csv(tmp_path / "c" / name)["drawn_mass"]
+    for name in ("episodes.parquet", "evaluations.parquet"):
+        drawn = pd.read_parquet(tmp_path / "c" / name)["drawn_mass"]
         assert len(drawn) > 3
         assert drawn.between(0.9, 1.1).all()
         assert drawn.nunique() > 1
