@@ -256,6 +256,7 @@ def test_an_error_of_the_physics_leaves_no_warnings(monkeypatch: pytest.MonkeyPa
     loop.advance(still)
 
 
+@pytest.mark.quiet
 def test_tilted_drones_cost_what_level_ones_do() -> None:
     """1,024 drones, telemetry and all: nothing is computed drone by drone."""
     envs = {
