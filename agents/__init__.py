@@ -120,7 +120,8 @@ def _check_start(kept: Checkpoint, algorithm: str, spec: EnvSpec, config: Config
                 raise InputError(f"{expected} with {own!r}, got {other!r}")
     begun_with = preset(kept.algorithm, "tuned", **kept.config)
     for name in NETWORK_FIELDS:
-        value, own = getattr(config, name), getattr(begun_with, name)
+        value = getattr(config, name)
+        own = getattr(begun_with, name)
         if value != own:
             raise InputError(f"{name}: expected {own} of the training to start from, got {value}")
 
@@ -167,7 +168,8 @@ def resume_agent(kept: Checkpoint, log: EpisodeLog) -> Agent:
 def _check_same_env(then: EnvSpec, now: EnvSpec) -> None:
     """Raises `ResumeError` unless a training can go on in this env."""
     for name in ("env_id", "options", "agents", "vehicle_hash", "observation", "action"):
-        expected, got = getattr(then, name), getattr(now, name)
+        expected = getattr(then, name)
+        got = getattr(now, name)
         if expected == got or got == "0" * 32:  # the hash of a peer that gives none
             continue
         if name == "vehicle_hash":

@@ -46,7 +46,8 @@ class A2C(Learner):
 
     def gradient(self, rollout: Rollout) -> None:
         """Of minus the mean of A · log P, plus the weighted squared error of the value."""
-        config, observations = self.config, self.inputs(rollout.rows(rollout.observations))
+        config = self.config
+        observations = self.inputs(rollout.rows(rollout.observations))
         advantage = rollout.rows(self.advantages(rollout)[0]).astype(np.float32)
         values = self._critic.forward(observations)[:, 0]
         targets = values + advantage
@@ -56,7 +57,8 @@ class A2C(Learner):
         self._actor.backward(-advantage / len(advantage), -config.ent_coef)
         errors = values - targets
         self._critic.backward((2 * config.vf_coef / len(errors) * errors)[:, np.newaxis])
-        gain, value_loss = (log_probability * advantage).mean(), (errors * errors).mean()
+        gain = (log_probability * advantage).mean()
+        value_loss = (errors * errors).mean()
         self.terms = {"gain": gain, "entropy": entropy, "value_loss": value_loss}
         self.terms |= {"values": values, "targets": targets}
 

@@ -122,7 +122,8 @@ def store(checkpoint: Checkpoint, path: Path) -> None:
 
     Raises `CheckpointError` where a number is not finite: training diverged. The old file stays.
     """
-    where, rows = checkpoint.position, checkpoint.position.episodes
+    where = checkpoint.position
+    rows = checkpoint.position.episodes
     parts: dict[str, Mapping[str, Any]] = {
         "policy": checkpoint.actor,
         "state": checkpoint.state,
@@ -182,7 +183,8 @@ def _read(data: bytes, parse: Any) -> Checkpoint:
     _expect(meta["algorithm"] in ALGORITHMS, f"one of {sorted(ALGORITHMS)}", meta["algorithm"])
     for name in ("config", "versions", "position"):
         _expect(isinstance(meta[name], dict), f"an object for {name}", meta[name])
-    where, seconds = meta["position"], meta["position"]["seconds"]
+    where = meta["position"]
+    seconds = meta["position"]["seconds"]
     for count in (meta["seed"], meta["env_steps"], where["env_steps"]):
         _expect(type(count) is int and 0 <= count < 2**62, "a whole number, 0 or more", count)
     _expect(type(seconds) is float and 0 <= seconds < float("inf"), "seconds", seconds)
@@ -202,7 +204,8 @@ def _read(data: bytes, parse: Any) -> Checkpoint:
     config = json.loads(json.dumps(config))  # a tuple is a list there
     _expect(config == meta["config"], f"a config of all of {sorted(config)}", meta["config"])
     plain = {name: meta[name] for name in _PLAIN}
-    actor, state = arrays["policy"], arrays["state"]
+    actor = arrays["policy"]
+    state = arrays["state"]
     checkpoint = Checkpoint(**plain, spec=spec, actor=actor, state=state, position=position)
     checkpoint.policy()  # raises if it does not fit
     return checkpoint
@@ -226,14 +229,17 @@ def _is_finite(name: str, array: np.ndarray) -> bool:
 
 def _check_position(position: Position, spec: EnvSpec, total: int) -> None:
     """Shapes fit the env; env steps are those of the episodes."""
-    count, longest, action = len(position.numbers), len(position.actions), spec.action
+    count = len(position.numbers)
+    longest = len(position.actions)
+    action = spec.action
     drawn, kind = ((), "i") if isinstance(action, Discrete) else ((action.size,), "f")
     expected: dict[str, Any] = dict.fromkeys(_POSITION, ((count,), "i"))
     expected["actions"] = (longest, count, *drawn), kind
     expected["observations"] = (count, flat_size(spec)), "f"
     got = {n: (vars(position)[n].shape, vars(position)[n].dtype.kind) for n in _POSITION}
     _expect(got == expected and count > 0, f"a position of shapes {expected}", got)
-    lengths, steps = position.lengths, position.env_steps
+    lengths = position.lengths
+    steps = position.env_steps
     _expect(lengths.max() == longest, f"an episode of {longest} steps", lengths)
     ended = {episode.episode: episode.length for episode in position.episodes}
     running = zip(position.numbers.tolist(), lengths.tolist(), strict=True)

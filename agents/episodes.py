@@ -113,14 +113,18 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.single_observation_space = spaces.Box(low, high)
         box = spaces.Box(-1, 1, (actions.size,))
         self.single_action_space = spaces.Discrete(actions.outputs) if actions.discrete else box
-        self.run_seed, self.env_steps = seed, 0
+        self.run_seed = seed
+        self.env_steps = 0
         self.episodes: list[Episode] = []
         self._began: float | None = None
         self._numbers = np.arange(-count, 0)  # of the running episodes
-        self._lengths, self._first_steps = np.zeros(count, int), np.zeros(count, int)
-        self._rewards, self._sizes = np.zeros(count), np.zeros(count)
+        self._lengths = np.zeros(count, int)
+        self._first_steps = np.zeros(count, int)
+        self._rewards = np.zeros(count)
+        self._sizes = np.zeros(count)
         self._seeds = np.zeros(count, np.uint64)
-        self._all, self._nothing = np.ones(count, bool), np.full(count, np.nan)
+        self._all = np.ones(count, bool)
+        self._nothing = np.full(count, np.nan)
         self._together = len(self.spec.agents)
         self.out = self.done = ~self._all
         self._flown: list[np.ndarray] = []  # actions; at least those of the running episodes
@@ -164,10 +168,13 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self, sent: Any, begins: np.ndarray | None = None, frozen: np.ndarray | None = None
     ) -> None:
         """The same with actions of the env, shape (N, k), or (N,) if discrete."""
-        env, seeds, idle = self.env, None, self._idle(frozen)
+        env = self.env
+        seeds = None
+        idle = self._idle(frozen)
         if begins is not None:
             self._number(begins)
-            seeds, idle = self._seeds, begins if idle is None else begins | idle
+            seeds = self._seeds
+            idle = begins if idle is None else begins | idle
         env.advance(sent, begins, seeds, frozen)
         self._flown.append(sent)
         self._keep_step(idle)
@@ -211,10 +218,13 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
         One that is out observes zeros, with no reward, and terminates once more with its world.
         """
-        env, info = self.env, {}
+        env = self.env
+        info = {}
         self.fly(np.asarray(actions, np.float32).reshape(self.num_envs, -1))
-        last, rewards = self.observations, env.rewards
-        terminated, truncated = env.terminated, env.truncated
+        last = self.observations
+        rewards = env.rewards
+        terminated = env.terminated
+        truncated = env.truncated
         if self.done.any():
             begun = self.done
             truncated = truncated | self.begin(begun)
@@ -255,11 +265,13 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         if position.numbers[0] < 0:  # it had not begun
             return
         self.episodes = list(position.episodes)
-        self._numbers[:], self._first_steps[:] = position.numbers, position.first_steps
+        self._numbers[:] = position.numbers
+        self._first_steps[:] = position.first_steps
         self._draw_seeds(self._all)
         while self._repeat(position):  # a simulator was lost: once more, with the next
             pass
-        expected, got = position.observations, self.observations
+        expected = position.observations
+        got = self.observations
         if (self._lengths != position.lengths).any() or got.tobytes() != expected.tobytes():
             raise ResumeError(
                 "resume: the simulator does not repeat the episodes that were interrupted: "
@@ -271,7 +283,8 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def _repeat(self, position: Position) -> bool:
         """Fly the actions of a position; whether a simulator was lost."""
         self._forget(self._all)
-        self._flown, self._steps = [], None if self._steps is None else []
+        self._flown = []
+        self._steps = None if self._steps is None else []
         self.env.reset(seed=self._seeds.tolist())
         lengths = position.lengths.reshape(-1, self._together).max(1).repeat(self._together)
         for step, actions in enumerate(position.actions):
@@ -309,7 +322,8 @@ class EpisodeLog(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def _forget(self, drones: np.ndarray) -> None:
         self._lengths[drones] = self._rewards[drones] = self._sizes[drones] = 0
-        self.out, self.done = self.out & ~drones, self.done & ~drones
+        self.out = self.out & ~drones
+        self.done = self.done & ~drones
 
     def _take_out(self, ended: np.ndarray) -> None:
         self.out = self.out | ended
@@ -396,8 +410,10 @@ class _OneDrone:
             action = int(actions[0]) if self._shape is None else actions[0].reshape(self._shape)
             observation, reward, terminated, truncated, info = self._env.step(action)
             self._take(observation, info)
-            self.rewards, self.lost = np.array((float(reward),)), _FLAGS[LOST in info]
-            self.terminated, self.truncated = _FLAGS[terminated], _FLAGS[truncated]
+            self.rewards = np.array((float(reward),))
+            self.lost = _FLAGS[LOST in info]
+            self.terminated = _FLAGS[terminated]
+            self.truncated = _FLAGS[truncated]
 
     def _take(self, observation: Any, info: dict[str, Any]) -> None:
         if isinstance(observation, dict):

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Final
 import numpy as np
 
 from ..envs.spec import ArraySpec, EnvSpec
-from ..models.errors import expect
+from ..models.errors import InputError
 from .policies import flat
 
 DAMPING: Final = 0.5  # Damping ratio of a payload's swing
@@ -42,18 +42,25 @@ class Geometric:
         action = spec.action
         names = action.components
         level = "actions of the level position (--action position)"
-        expect(names == _ACTION, "geometric", level, f"{', '.join(names) or 'others'}")
+        if names != _ACTION:
+            raise InputError(f"geometric: expected {level}, got {', '.join(names) or 'others'}")
         assert isinstance(action, ArraySpec)
         found = re.search(r"approached at (\S+) /s, gravity (\S+) m/s²", action.frame)
-        expect(found, "geometric", "gain and gravity in the action's frame", repr(action.frame))
+        if not found:
+            raise InputError(
+                "geometric: expected gain and gravity in the action's frame, "
+                f"got {action.frame!r:.300}"
+            )
         assert found is not None
-        self._gain, self._gravity = float(found[1]), float(found[2])
+        self._gain = float(found[1])
+        self._gravity = float(found[2])
         self._units = np.array([float(unit.split()[0]) for unit in action.unit])
         seen = [name for one in spec.observation for name in one.components or [""] * one.size]
         wanted = [f"{vector} {axis}" for vector in (*_VECTORS, "nose") for axis in "xyz"]
         missing = [name for name in wanted if name not in seen]
         expected = f"the observation {missing[0]!r}" if missing else ""
-        expect(not missing, "geometric", expected, f"{spec.env_id} without it")
+        if missing:
+            raise InputError(f"geometric: expected {expected}, got {spec.env_id} without it")
         self._at = {v: [seen.index(f"{v} {axis}") for axis in "xyz"] for v in (*_VECTORS, "nose")}
         rotors = [i for i, name in enumerate(seen) if re.fullmatch(r"thrust \d+ over hover", name)]
         self._rotors = rotors
@@ -64,14 +71,16 @@ class Geometric:
             self._at |= {v: [seen.index(f"{v} {axis}") for axis in "xyz"] for v in _PAYLOAD}
             self._swing = swing_gains(self._gain, self._gravity / cable, share)
             self._pull = share * self._gravity / cable
-        self._spec, self._period = spec, spec.control_period
+        self._spec = spec
+        self._period = spec.control_period
         self._share = -math.expm1(-FILTER * self._gain * self._period)
         self.reset()
 
     def reset(self) -> None:
         """Forget the last episode."""
         self._before: dict[str, np.ndarray] | None = None
-        self._moving, self._pushed = np.zeros(3), np.zeros(3)
+        self._moving = np.zeros(3)
+        self._pushed = np.zeros(3)
 
     def act(self, observation: Any) -> Any:
         """Offset and heading as the env's action, float32, shape (4,)."""
@@ -79,7 +88,8 @@ class Geometric:
         now = {name: numbers[at] for name, at in self._at.items()}
         lift = self._gravity * (1.0 + (numbers[self._rotors].mean() if self._rotors else 0.0))
         now["force"] = lift * now["thrust axis"] - (0.0, 0.0, self._gravity)
-        before, goes = self._before or now, self._follow(now)
+        before = self._before or now
+        goes = self._follow(now)
         self._before = now
         k = self._gain
         offset = now["goal - position"] + self._moving / k + (goes - self._pushed) / (OVER * k * k)
@@ -98,7 +108,8 @@ class Geometric:
         """The offset at which the loops ask for the acceleration of `swing_gains`, m."""
         assert self._swing is not None
         faster = (now["force"] - before["force"]) / self._period
-        from_goal, moves = -now["goal - position"], now["velocity"] - self._moving
+        from_goal = -now["goal - position"]
+        moves = now["velocity"] - self._moving
         seen = (from_goal, moves, *(now[name] for name in _PAYLOAD), now["force"], faster)
         wanted = goes - self._pushed - self._swing @ np.array(seen)
         k = self._gain
@@ -106,7 +117,8 @@ class Geometric:
 
     def _follow(self, now: dict[str, np.ndarray]) -> Any:
         """Filter the goal's velocity and what pushes; return the goal's acceleration, m/s²."""
-        before, period = self._before, self._period
+        before = self._before
+        period = self._period
         if before is None:
             return np.zeros(3)
         moved, faster = (now[name] - before[name] for name in ("goal - position", "velocity"))
@@ -142,13 +154,17 @@ def swing_gains(position: float, frequency: float, share: float) -> np.ndarray:
         frequency: ω² = gravity over the cable's length, 1/s².
         share: Mass of the payload over that of the vehicle.
     """
-    p, swing = 5 * position, (1 + share) * frequency
+    p = 5 * position
+    swing = (1 + share) * frequency
     plant = np.zeros((6, 6))
     plant[(0, 1, 2, 4), (1, 4, 3, 5)] = 1.0
-    plant[1, 2], plant[3, 2], plant[3, 4] = share * frequency, -swing, -1.0
+    plant[1, 2] = share * frequency
+    plant[3, 2] = -swing
+    plant[3, 4] = -1.0
     plant[5, 4:] = -2 * p * p, -2 * p
     powers = [np.linalg.matrix_power(plant, n) for n in range(7)]
-    craft, thrust = (1.0, p / 2, p * p / 10), (1.0, 2 * p, 2 * p * p)
+    craft = (1.0, p / 2, p * p / 10)
+    thrust = (1.0, 2 * p, 2 * p * p)
     damped = (1.0, 2 * DAMPING * math.sqrt(swing), swing)
     polynomial = np.polymul(np.polymul(craft, thrust), damped)
     reached = 2 * p * p * np.column_stack([power[:, 5] for power in powers[:6]])

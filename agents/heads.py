@@ -49,7 +49,8 @@ class Gaussian:
         self.shapes: Shapes = {"log_std": (size,)}
 
     def bind(self, weights: Weights) -> None:
-        self.log_std, self._by_log_std = weights.arrays["log_std"], weights.gradients["log_std"]
+        self.log_std = weights.arrays["log_std"]
+        self._by_log_std = weights.gradients["log_std"]
 
     def initialise(self, log_std: float) -> None:
         self.log_std[...] = log_std

@@ -36,7 +36,8 @@ class Networks:
     @classmethod
     def create(cls, spec: EnvSpec, config: Config, seed: int, critic_drones: int) -> Self:
         """New networks; the critic sees so many drones of a world, with 0 there is none."""
-        actor, critic = NetworkPolicy(spec, config), None
+        actor = NetworkPolicy(spec, config)
+        critic = None
         shapes = named("actor.", actor.shapes)
         if critic_drones:
             critic = make_network(flat_size(spec) * critic_drones, 1, config)
@@ -80,11 +81,16 @@ class Learner:
         rng: np.random.Generator,
         memory: Floats,
     ) -> None:
-        self.spec, self.config, self._rng = networks.actor.spec, config, rng
-        self.weights, self._actor, self.memory = networks.weights, networks.actor, memory
+        self.spec = networks.actor.spec
+        self.config = config
+        self._rng = rng
+        self.weights = networks.weights
+        self._actor = networks.actor
+        self.memory = memory
         if networks.critic is not None:
             self._critic = networks.critic
-        self.optimizer, self.rate = Adam(self.weights, self.epsilon), config.learning_rate
+        self.optimizer = Adam(self.weights, self.epsilon)
+        self.rate = config.learning_rate
         normalised = config.normalize_observations
         self.moments = Moments(flat_size(self.spec)) if normalised else None
         self.terms: dict[str, Any] = {}

@@ -20,7 +20,8 @@ class MAPPO(PPO):
     def seen(self, observations: Floats, flying: NDArray[np.bool_]) -> Floats:
         """Inputs of the critic, shape (T, N, A·n), as `A2C.seen`."""
         own = super().seen(observations, flying)
-        count, (steps, rows, size) = len(self.spec.agents), own.shape
+        count = len(self.spec.agents)
+        (steps, rows, size) = own.shape
         worlds = own.reshape(steps, -1, count, size)
         there = worlds * flying.reshape(steps, -1, count, 1)
         others = [np.roll(there, -next_one, axis=2) for next_one in range(1, count)]

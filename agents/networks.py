@@ -125,10 +125,13 @@ class Affine(Layer):
         self._ones = np.ones(0, np.float32)
 
     def bind(self, weights: Weights) -> None:
-        arrays, slopes = weights.arrays, weights.gradients
-        self.weight, self.bias = arrays["weight"], arrays["bias"][np.newaxis]
+        arrays = weights.arrays
+        slopes = weights.gradients
+        self.weight = arrays["weight"]
+        self.bias = arrays["bias"][np.newaxis]
         self._columns = self.weight.T
-        self._by_weight, self._by_bias = slopes["weight"], slopes["bias"]
+        self._by_weight = slopes["weight"]
+        self._by_bias = slopes["bias"]
 
     def initialise(self, rng: np.random.Generator, gain: float) -> None:
         self.weight[...] = orthogonal(rng, self.weight.shape, gain)
@@ -179,7 +182,8 @@ class Normalise(Layer):
     """(x - mean) · scale, with numbers that no loss moves; shape (n,) each."""
 
     def __init__(self, mean: Floats, scale: Floats) -> None:
-        self.mean, self.scale = mean, scale
+        self.mean = mean
+        self.scale = scale
 
     def forward(self, inputs: Floats) -> Floats:
         return (inputs - self.mean) * self.scale

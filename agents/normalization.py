@@ -17,13 +17,16 @@ class Moments:
     """
 
     def __init__(self, size: int) -> None:
-        self._count, self._mean, self._squares = np.zeros(()), np.zeros(size), np.zeros(size)
+        self._count = np.zeros(())
+        self._mean = np.zeros(size)
+        self._squares = np.zeros(size)
         self._set()
 
     def add(self, rows: np.ndarray) -> None:
         """Take rows into account, shape (B, n)."""
         rows = rows.astype(np.float64)
-        mean, count = rows.mean(axis=0), self._count + len(rows)
+        mean = rows.mean(axis=0)
+        count = self._count + len(rows)
         step = mean - self._mean
         self._squares += ((rows - mean) ** 2).sum(0) + step**2 * self._count * len(rows) / count
         self._mean += step * len(rows) / count
@@ -47,4 +50,5 @@ class Moments:
     def _set(self) -> None:
         deviation = np.sqrt(self._squares / max(float(self._count), 1.0))
         scale = 1 / np.maximum(deviation, _LEAST) if self._count else np.ones_like(deviation)
-        self.mean, self.scale = self._mean.astype(np.float32), scale.astype(np.float32)
+        self.mean = self._mean.astype(np.float32)
+        self.scale = scale.astype(np.float32)

@@ -12,8 +12,10 @@ class Adam:
     """Kingma and Ba 2015, Algorithm 1, with their constants and torch's order of operations."""
 
     def __init__(self, weights: Weights, epsilon: float = 1e-8) -> None:
-        self._weights, self._epsilon = weights, epsilon
-        self.first, self.second = np.zeros_like(weights.values), np.zeros_like(weights.values)
+        self._weights = weights
+        self._epsilon = epsilon
+        self.first = np.zeros_like(weights.values)
+        self.second = np.zeros_like(weights.values)
         self.steps = 0
 
     def step(self, rate: float | Floats) -> None:
@@ -47,7 +49,8 @@ class Adam:
         steps = int(arrays["steps"])
         if steps < 0 or arrays["second"].min(initial=0.0) < 0:
             raise ValueError(f"optimizer: expected no negative steps or squares, got {steps} steps")
-        self.first[...], self.second[...] = arrays["first"], arrays["second"]
+        self.first[...] = arrays["first"]
+        self.second[...] = arrays["second"]
         self.steps = steps
 
 

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Final
 import numpy as np
 
 from ..envs.spec import ArraySpec, EnvSpec
-from ..models.errors import expect
+from ..models.errors import InputError, expect
 from .policies import flat
 
 HORIZON: Final = 3.0  # Time ahead for which nothing may touch, s
@@ -43,13 +43,15 @@ class Orca:
     """Options of the env that it flies."""
 
     def __init__(self, spec: EnvSpec) -> None:
-        action, seen = spec.action, spec.observation[0]
+        action = spec.action
+        seen = spec.observation[0]
         right = isinstance(action, ArraySpec) and action.components[:1] == ("velocity x",)
         level = "actions of the level velocity (--action velocity)"
         expect(right, "orca", level, ", ".join(action.components) or "others")
         assert isinstance(action, ArraySpec)
         found = re.search(r"drones with a radius of (\S+) m", seen.frame)
-        expect(found, "orca", "a task for several drones", spec.env_id)
+        if not found:
+            raise InputError(f"orca: expected a task for several drones, got {spec.env_id}")
         assert found is not None
         self._radius = 2 * ROOM * float(found[1])
         self._units = [float(unit.split()[0]) for unit in action.unit]
@@ -73,7 +75,8 @@ class Orca:
         def vector(first: int) -> Vector:
             return numbers[first], numbers[first + 1], numbers[first + 2]
 
-        own, goal = vector(self._velocity), vector(self._goal)
+        own = vector(self._velocity)
+        goal = vector(self._goal)
         moves = (0.0, 0.0, 0.0) if self._ahead is None else vector(self._ahead)
         most = SPEED * self._units[0]
         wanted = _within(_sum(moves, goal, APPROACH), most)
@@ -85,7 +88,8 @@ class Orca:
         x, y, z = nearest(wanted, planes, most)
         c, s, _ = vector(self._nose)
         size = math.hypot(c, s) or 1.0
-        c, s = c / size, s / size
+        c = c / size
+        s = s / size
         action = np.array((c * x + s * y, c * y - s * x, z, 0.0)) / self._units
         return np.clip(action, -1.0, 1.0).astype(np.float32)
 
@@ -106,9 +110,11 @@ def avoiding(there: Vector, moves: Vector, own: Vector, radius: float, period: f
     horizon = HORIZON if apart else period
     # The obstacle is a cone along `there`, cut off by a sphere about `there` / horizon.
     to_cap = _sum(approach, there, -1.0 / horizon)
-    size, along = math.sqrt(_dot(to_cap, to_cap)), _dot(to_cap, there)
+    size = math.sqrt(_dot(to_cap, to_cap))
+    along = _dot(to_cap, there)
     if not apart or (along < 0.0 and along * along > radius * radius * size * size):
-        away, change = to_cap, radius / horizon - size
+        away = to_cap
+        change = radius / horizon - size
     else:
         # The point t · `there` of the axis whose sphere, of radius t R, is nearest on its side.
         leg = square - radius * radius

@@ -6,7 +6,7 @@ from typing import Any, ClassVar, Final
 import numpy as np
 
 from ..envs.spec import EnvSpec
-from ..models.errors import InputError, expect
+from ..models.errors import InputError
 
 ENV_ID: Final = "rotorgram/Elevation-v0"
 GRAVITY: Final = 9.8  # m/s²: the paper's
@@ -39,16 +39,19 @@ class PID:
             )
         modes = f"{options['observation']!r} and {options['action_type']!r}"
         expected = "observation='full' and action_type='continuous'"
-        expect(modes == "'full' and 'continuous'", "pid", expected, modes)
+        if modes != "'full' and 'continuous'":
+            raise InputError(f"pid: expected {expected}, got {modes}")
         telemetry = {array.name: array for array in spec.telemetry}
-        expect("thrust" in telemetry, "pid", "the telemetry thrust", f"{sorted(telemetry)}")
+        if "thrust" not in telemetry:
+            raise InputError(f"pid: expected the telemetry thrust, got {sorted(telemetry)}")
         highest = telemetry["thrust"].bounds()[1]
         self._hover = float(highest[0]) / (1 + float(spec.observation[0].bounds()[1][2]))
         self._increment = options["action"] == "increment"
         share = SHARES[options["action"]]
         self._scale = options["thrust_scale"] or share * float(highest.max())
         self._period = spec.control_period
-        self._name, self._integral = spec.observation[0].name, 0.0
+        self._name = spec.observation[0].name
+        self._integral = 0.0
 
     def reset(self) -> None:
         """Forget the integral."""

@@ -58,7 +58,8 @@ class ActionMap:
     def __init__(self, action: ArraySpec | Discrete) -> None:
         self.discrete = isinstance(action, Discrete)
         if isinstance(action, Discrete):
-            self.outputs, self.size = action.n, 1
+            self.outputs = action.n
+            self.size = 1
             return
         if not action.dtype.startswith("float"):
             raise InputError(
@@ -71,7 +72,8 @@ class ActionMap:
         with np.errstate(invalid="ignore"):
             self.middle = np.where(bounded, (low + high) / 2, 0.0).astype(np.float32)
             self.half = np.where(bounded, (high - low) / 2, 1.0).astype(np.float32)
-        self.low, self.high = low.astype(np.float32), high.astype(np.float32)
+        self.low = low.astype(np.float32)
+        self.high = high.astype(np.float32)
         self._plain = bool((self.middle == 0).all() and (self.half == 1).all())
 
     def to_envs(self, actions: np.ndarray) -> np.ndarray:
@@ -100,8 +102,10 @@ class NetworkPolicy:
     head: Head | None
 
     def __init__(self, spec: EnvSpec, config: Config, *, squash: bool = False) -> None:
-        self.spec, self.actions = spec, ActionMap(spec.action)
-        size, outputs = flat_size(spec), self.actions.outputs
+        self.spec = spec
+        self.actions = ActionMap(spec.action)
+        size = flat_size(spec)
+        outputs = self.actions.outputs
         self.network = make_network(size, outputs, config)
         self.head = None
         if self.actions.discrete:

@@ -69,8 +69,10 @@ class PPO(A2C):
 
     def update(self, rollout: Rollout) -> None:
         """Learn from a rollout: by `epochs` times `minibatches` steps of Adam."""
-        config, columns = self.config, self._columns(rollout)
-        rates, count = self.rates, len(rollout)
+        config = self.config
+        columns = self._columns(rollout)
+        rates = self.rates
+        count = len(rollout)
         cuts = np.linspace(0, count, min(config.minibatches, count) + 1).astype(int).tolist()
         terms: list[tuple[float, ...]] = []
         for _ in range(config.epochs):
@@ -102,7 +104,8 @@ class PPO(A2C):
         and `targets` of V(s). The objective is the mean of min(r A, clip(r, 1 - c, 1 + c) A) for
         the ratio r of the probabilities. Its derivative by log P is r A, or 0 where it is clipped.
         """
-        config, count = self.config, len(before)
+        config = self.config
+        count = len(before)
         if config.normalize and count > 1:
             advantage = advantage - advantage.mean()
             advantage /= np.sqrt(advantage.dot(advantage) / (count - 1)) + 1e-8

@@ -43,7 +43,8 @@ def _tables() -> dict[tuple[str, str, str], dict[str, Any]]:
     content = tomllib.loads(_FILE.read_text(encoding="utf-8"))
     found: dict[tuple[str, str, str], dict[str, Any]] = {}
     for table in content["preset"]:
-        algorithms, tasks = table.pop("algorithms"), table.pop("tasks")
+        algorithms = table.pop("algorithms")
+        tasks = table.pop("tasks")
         name = table.pop("name", "tuned")
         base = content["settings"][table.pop("settings")] if "settings" in table else {}
         for algorithm in algorithms:

@@ -100,7 +100,9 @@ class Collector:
         policy: Explorer,
         memory: Floats | None = None,
     ) -> None:
-        self._log, self._rng, self._policy = log, rng, policy
+        self._log = log
+        self._rng = rng
+        self._policy = policy
         if memory is None:
             memory = np.zeros((log.num_envs, policy.network.memory), np.float32)
         self._memory = memory
@@ -122,7 +124,8 @@ class Collector:
         are left out, and a round of nothing else does not count.
         """
         log = self._log
-        rounds, last = -(-count // log.num_envs), log.env_steps + most_steps
+        rounds = -(-count // log.num_envs)
+        last = log.env_steps + most_steps
         flown: list[Rollout] = []
         while rounds and log.env_steps < last:
             rollout, lost, done = self._fly(None, last - log.env_steps)
@@ -145,7 +148,8 @@ class Collector:
         stop = None if most_steps is None else log.env_steps + most_steps
         block = length or max(256 // count, 1)
         rows: list[tuple[np.ndarray, ...]] = []
-        observations, waiting = self._seen(), int(np.count_nonzero(log.done))
+        observations = self._seen()
+        waiting = int(np.count_nonzero(log.done))
         while len(rows) != length and (stop is None or log.env_steps < stop):
             if not len(rows) % block:
                 drawn = self._policy.draw_noise(self._rng, block * count)
@@ -168,7 +172,8 @@ class Collector:
                 if stop is not None:
                     break
                 self._begin()
-                observations, waiting = self._seen(), 0
+                observations = self._seen()
+                waiting = 0
         if waiting and (stop is None or waiting == count):
             self._begin()
         *columns, lost = (np.array(column) for column in zip(*rows, strict=True))

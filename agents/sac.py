@@ -159,7 +159,8 @@ class SACNetworks:
         critics, targets = ([make_network(size + k, 1, config) for _ in "01"] for _ in "01")
         twins = named("0.", critics[0].shapes) | named("1.", critics[1].shapes)
         shapes = named("actor.", actor.net.shapes) | named("critic.", twins)
-        weights, held = Weights.zeros({**shapes, "log_alpha": (1,)}), Weights.zeros(twins)
+        weights = Weights.zeros({**shapes, "log_alpha": (1,)})
+        held = Weights.zeros(twins)
         rng = np.random.default_rng(seed)
         actor.bind(weights.part("actor."))
         actor.initialise(rng, config.log_std)
@@ -194,9 +195,15 @@ class SAC:
         config: SACConfig,
         rng: np.random.Generator,
     ) -> None:
-        self.spec, self.config, self._rng, self.updates = spec, config, rng, 0
-        self.weights, self.targets, self.buffer = networks.weights, networks.targets, buffer
-        self._actor, self._critics = networks.actor, networks.critics
+        self.spec = spec
+        self.config = config
+        self._rng = rng
+        self.updates = 0
+        self.weights = networks.weights
+        self.targets = networks.targets
+        self.buffer = buffer
+        self._actor = networks.actor
+        self._critics = networks.critics
         self._targets = networks.target_critics
         self._of_actor = self.weights.part("actor.")
         self._of_critics = self.weights.part("critic.")
@@ -211,7 +218,8 @@ class SAC:
     @classmethod
     def create(cls, log: EpisodeLog, config: SACConfig, seed: int) -> Self:
         """A new agent, with networks of the kind that the config names, for the env of a log."""
-        actions, size = ActionMap(log.spec.action), flat_size(log.spec)
+        actions = ActionMap(log.spec.action)
+        size = flat_size(log.spec)
         if actions.discrete:
             raise InputError("sac: expected an env of continuous actions, got one of choices")
         weights_seed, rng = seeds_of(seed)
@@ -259,7 +267,9 @@ class SAC:
 
     def update(self, batch: tuple[Floats, ...], noise: Floats, next_noise: Floats) -> None:
         """Learn from a batch of `ReplayBuffer.take`; noise is standard normal, shape (B, k)."""
-        config, rate, size = self.config, self.rate, len(noise)
+        config = self.config
+        rate = self.rate
+        size = len(noise)
         states, done, next_states, rewards, ends = batch
         alpha = math.exp(self._of_alpha.values[0])
         next_actions, next_logs = self._actor.draw(next_states, next_noise)
@@ -333,7 +343,8 @@ class SAC:
                 raise ValueError(f"{name}: expected {values.shape}, got {state[name].shape}")
         for name, values in pairs.items():
             values[...] = state[name]
-        self.buffer.added, self.updates = added, int(state["updates"])
+        self.buffer.added = added
+        self.updates = int(state["updates"])
         for name, adam in self._adams.items():
             adam.load(part_of(state, f"optimizer.{name}."))
         set_generator(self._rng, state["rng"])
@@ -359,7 +370,8 @@ class _Explorer:
     """Draws actions for a `Collector`: of the actor as it is now, or uniform while warming up."""
 
     def __init__(self, agent: SAC) -> None:
-        self._agent, self.network = agent, agent._actor.net
+        self._agent = agent
+        self.network = agent._actor.net
 
     def draw_noise(self, rng: np.random.Generator, steps: int) -> Floats:
         shape = steps, self._agent.k

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 else:
     sb3 = require("stable_baselines3", "train", "sb3-a2c")
     torch = require("torch", "train", "sb3-a2c")
-    sb3_logger, sb3_vec = sb3.common.logger, sb3.common.vec_env
+    sb3_logger = sb3.common.logger
+    sb3_vec = sb3.common.vec_env
     sb3_callbacks = sb3.common.callbacks
 
 
@@ -108,7 +109,9 @@ class SB3Agent:
             raise InputError("normalize_observations: expected false with SB3, got true")
         if config.network != "mlp":
             raise InputError(f"network: expected mlp with SB3, got {config.network!r}")
-        self.spec, self._config, self._ahead = log.spec, config, 0.0
+        self.spec = log.spec
+        self._config = config
+        self._ahead = 0.0
         self._rollout = config.rollout_size(log.num_envs)
         torch.set_num_threads(1)  # such small nets lose by a second thread
         steps = self._rollout // log.num_envs
@@ -170,9 +173,11 @@ class SB3Agent:
     def actor(self) -> dict[str, np.ndarray]:
         """Weights of the policy, under our names."""
         weights = self._weights()
-        hidden, output = "mlp_extractor.policy_net", "action_net"
+        hidden = "mlp_extractor.policy_net"
+        output = "action_net"
         if isinstance(self._config, SACConfig):
-            hidden, output = "actor.latent_pi", "actor.mu"
+            hidden = "actor.latent_pi"
+            output = "actor.mu"
         layers = [f"{hidden}.{2 * i}" for i in range(len(self._config.hidden))]
         actor = {
             f"layers.{i}.{kind}": weights[f"{name}.{kind}"]
@@ -259,7 +264,8 @@ _Made = tuple[type, dict[str, Any], dict[str, Any]]
 
 
 def _on_policy(config: A2CConfig, steps: int, log: EpisodeLog) -> _Made:
-    rollout, hidden = steps * log.num_envs, list(config.hidden)
+    rollout = steps * log.num_envs
+    hidden = list(config.hidden)
     epsilon = (PPO if isinstance(config, PPOConfig) else A2C).epsilon
     settings: dict[str, Any] = {
         "n_steps": steps,

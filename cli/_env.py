@@ -11,7 +11,7 @@ from ..envs.registry import env_spec, is_known, task_type
 from ..envs.spec import EnvSpec
 from ..flights.trajectories import Trajectory
 from ..models import Backend
-from ..models.errors import expect
+from ..models.errors import InputError
 from ..udp import RemoteEnv, RemoteVectorEnv
 from ..udp.spawn import spawn_simulator
 from ._flags import AgentFlags, EnvFlags, check_count, parse_address
@@ -31,11 +31,13 @@ def trained(name: str, *others: str) -> Checkpoint:
     the others that are right.
     """
     path = Path(name)
-    file, several = path / CHECKPOINT if path.is_dir() else path, path / "checkpoints"
+    file = path / CHECKPOINT if path.is_dir() else path
+    several = path / "checkpoints"
     got = f"{name}, where there is no file {file}"
     got += f": look into {several}" if several.is_dir() else ""
     expected = ", ".join([*others, "a checkpoint or the folder of a training"])
-    expect(file.is_file(), "policy", expected, got)
+    if not file.is_file():
+        raise InputError(f"policy: expected {expected}, got {got}")
     return load(file)
 
 
@@ -48,18 +50,24 @@ def chosen_env(
     options that the user set win. Raises `InputError` if they are of another task than the
     checkpoint's.
     """
-    env_id, options = command.env_id, command.options
+    env_id = command.env_id
+    options = command.options
     if isinstance(checkpoint, type):
         level = checkpoint.options.get("action")
         if level and "action" not in options and is_known(env_id):
-            right, expected = level in task_type(env_id).actions, f"a task flown by {level}"
-            expect(right, checkpoint.__name__.lower(), expected, f"{env_id}; name one with --env")
+            right = level in task_type(env_id).actions
+            expected = f"a task flown by {level}"
+            if not right:
+                raise InputError(
+                    f"{checkpoint.__name__.lower()}: expected {expected}, "
+                    f"got {env_id}; name one with --env"
+                )
         return env_id, {**checkpoint.options, **options}
     if checkpoint is None or ("env" in command.given and env_id != checkpoint.env_id):
         return env_id, options
     wanted = f"--env {checkpoint.env_id} with options of the task that the policy was trained on"
-    right = not options or env_id == checkpoint.env_id
-    expect(right, "env", wanted, f"options of {env_id}")
+    if not (not options or env_id == checkpoint.env_id):
+        raise InputError(f"env: expected {wanted}, got options of {env_id}")
     env = checkpoint.env_id, {**checkpoint.options, **options}
     own = getattr(command, "listen", None) is None  # a simulator of our own flies it
     if own and is_known(env[0]):
@@ -102,7 +110,8 @@ def _check_vehicle(command: EnvFlags, checkpoint: Checkpoint, spec: EnvSpec) -> 
     right = not other or "vehicle" in command.given
     then, now = (f"{one.vehicle} (model {one.vehicle_hash[:8]})" for one in (trained, spec))
     wanted = f"{then}, on which the policy was trained"
-    expect(right, "vehicle", wanted, f"{now}; name one with --vehicle")
+    if not right:
+        raise InputError(f"vehicle: expected {wanted}, got {now}; name one with --vehicle")
 
 
 def pilot_of(
@@ -149,16 +158,21 @@ def remote_env(
     """
     if command.listen is not None:
         theirs = "it of the simulator that comes: rotorgram sim --backend"
-        expect("backend" not in command.given, "backend", theirs)
+        if "backend" in command.given:
+            raise InputError(f"backend: expected {theirs}")
         settings = {"env_id": env_id, "options": options or None} if required else {}
         opened = _waiting(command, command.listen, num_envs, num_simulators, **settings)
     else:
-        alone, local = num_simulators == 1, not (command.key_file or command.insecure)
-        expect(alone, "num-simulators", "1 without --listen", str(num_simulators))
+        alone = num_simulators == 1
+        local = not (command.key_file or command.insecure)
+        if not alone:
+            raise InputError(f"num-simulators: expected 1 without --listen, got {num_simulators}")
         own = "them for a simulator of our own on this machine"
-        expect(local, "key-file, insecure", "them with --listen", own)
+        if not local:
+            raise InputError(f"key-file, insecure: expected them with --listen, got {own}")
         reason = "the task is not known here without the module that registers it"
-        expect(is_known(env_id), "env", f"--env MODULE:{env_id}, for {reason}")
+        if not is_known(env_id):
+            raise InputError(f"env: expected --env MODULE:{env_id}, for {reason}")
         config = EnvConfig.from_keywords(
             env_id, drones=drones, vehicle=command.vehicle, backend=backend, **options
         )
@@ -198,6 +212,8 @@ def _waiting(
         print(f"waiting for {waited} at {here} (Ctrl-C ends)", flush=True)
         remote.connect()
         came = len(remote.env_spec.agents)
-        right = "drones" not in command.given or came == command.drones
-        expect(right, "drones", f"a simulator of {command.drones} in each world", f"one of {came}")
+        if not ("drones" not in command.given or came == command.drones):
+            raise InputError(
+                f"drones: expected a simulator of {command.drones} in each world, got one of {came}"
+            )
         yield remote

@@ -16,7 +16,7 @@ from tyro.conf import Fixed, Suppress, arg
 
 from ..flights.folders import LOCK, new_folder
 from ..models import Backend
-from ..models.errors import InputError, expect
+from ..models.errors import InputError
 
 DEFAULT_ENV: Final = "rotorgram/Elevation-v0"
 _PLAIN_FLAGS: Final = ("action", "control_period", "episode_length", "history", "scene", "cameras")
@@ -119,7 +119,8 @@ def parse(kind: type[C], prog: str, words: Sequence[str]) -> C:
 
     Raises `InputError` if the task or one of its options is not what it should be.
     """
-    given, plain = _given(words), _for_tyro(kind)
+    given = _given(words)
+    plain = _for_tyro(kind)
     if not issubclass(kind, EnvFlags):
         return cast(C, replace(tyro.cli(plain, prog=prog, args=words), given=given))
     from ..envs import registry
@@ -203,7 +204,8 @@ def _world_options(command: Any, given: frozenset[str]) -> dict[str, Any]:
             several = re.fullmatch(r"[-+.\deE]+(,[-+.\deE]+)+", text)
             value = parse_value(f"[{text}]" if several else text)
             key = name.replace("-", "_")
-            expect(key not in values, flag, "each name once", f"{key!r} twice")
+            if key in values:
+                raise InputError(f"{flag}: expected each name once, got {key!r} twice")
             values[key] = value if equals else True
         options[flag] = values
     return options
@@ -280,14 +282,15 @@ def _without_requirements(words: Sequence[str]) -> tuple[list[str], dict[str, An
 def parse_address(text: str) -> tuple[str, int]:
     """HOST:PORT as a pair. Raises `InputError`."""
     host, _, port = text.rpartition(":")
-    right = host and port.isascii() and port.isdecimal() and int(port) <= 65535
-    expect(right, "address", "HOST:PORT with a port up to 65535", repr(text))
+    if not (host and port.isascii() and port.isdecimal() and int(port) <= 65535):
+        raise InputError(f"address: expected HOST:PORT with a port up to 65535, got {text!r:.300}")
     return host, int(port)
 
 
 def check_count(name: str, value: int | None) -> None:
     """Raises `InputError` for a number that is given and less than 1."""
-    expect(value is None or value >= 1, name, "at least 1", str(value))
+    if not (value is None or value >= 1):
+        raise InputError(f"{name}: expected at least 1, got {value}")
 
 
 @contextmanager
@@ -307,7 +310,10 @@ def folder_to_write(out: Path | None, name: str) -> Iterator[Path]:
 def refuse_settings(command: Command, folder: Path, *, free: tuple[str, ...]) -> None:
     """Raises `InputError` if a setting but the free ones was given: a resumed run keeps its own."""
     flags = ["--" + name.replace("_", "-") for name in sorted(command.given.difference(free))]
-    expect(not flags, "resume", f"the settings of {folder}", f"others by {', '.join(flags)}")
+    if flags:
+        raise InputError(
+            f"resume: expected the settings of {folder}, got others by {', '.join(flags)}"
+        )
 
 
 def go_on_with(command: Command, words: str, folder: Path, *flags: str) -> str:

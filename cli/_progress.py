@@ -85,7 +85,8 @@ class Lines(Bars):
 
     def __call__(self, name: str, done: int, total: int, words: str) -> None:
         """Print it, unless that was done a moment ago."""
-        task, now = self._update(name, done, total, words), self.progress.get_time()
+        task = self._update(name, done, total, words)
+        now = self.progress.get_time()
         if words == "done" or now - self._last.get(name, now - _LINE_EVERY) >= _LINE_EVERY:
             self._last[name] = now
             figures = (_count(task), _rate(task), _times(task), words)
@@ -111,7 +112,8 @@ def _count(task: Task) -> str:
 def _per_second(task: Task) -> float:
     """0 where it is not known."""
     points = task.fields["points"]
-    (began, before), (now, done) = points[0], points[-1]
+    (began, before) = points[0]
+    (now, done) = points[-1]
     return max(done - before, 0) / (now - began) if now > began else 0.0
 
 
@@ -122,7 +124,8 @@ def _rate(task: Task) -> str:
 
 def _times(task: Task) -> str:
     elapsed = task.finished_time if task.finished else task.elapsed
-    rate, remaining = _per_second(task), task.remaining
+    rate = _per_second(task)
+    remaining = task.remaining
     left = f", {_duration(math.ceil(remaining / rate))} left" if rate and remaining else ""
     return f"{_duration(elapsed or 0.0)}{left}"
 

@@ -40,7 +40,8 @@ class ScalarWriter:
     def due(self, env_steps: int, *, last: bool = False) -> bool:
         """Asked at every update: whether to write at it; at the last, if it is not written yet."""
         due = self._begins or env_steps // self._every > self._last // self._every
-        self._begins, self._last = False, env_steps
+        self._begins = False
+        self._last = env_steps
         return due or (last and self._written != env_steps)
 
     def write(self, env_steps: int, numbers: dict[str, float]) -> None:
@@ -58,7 +59,8 @@ class ScalarWriter:
         self._file.close()
 
     def _add(self, event: Event, step: int) -> None:
-        event.step, event.wall_time = step, time.time()
+        event.step = step
+        event.wall_time = time.time()
         self._records.write(event.SerializeToString())
 
 

@@ -35,7 +35,8 @@ class Watcher:
 
     def __call__(self, cause: Command | None, state: State) -> None:
         """See one State, and what led to it; episodes count in which something was flown."""
-        count, live = len(self._steps), self._live
+        count = len(self._steps)
+        live = self._live
         resets = True if cause is None else cause.resets[:count]
         self._episodes += resets & (self._steps > 0)
         self._steps = self._loop.steps[:count]
@@ -75,7 +76,8 @@ def watched(simulator: Driver, command: "Sim") -> Iterator[None]:
     observers: list[Observer] = []
     with ExitStack() as opened:
         if command.view is not None:
-            pace, drones = Pace(0.0), simulator.stepped.num_envs
+            pace = Pace(0.0)
+            drones = simulator.stepped.num_envs
             names = simulator.spec.agents if len(simulator.spec.agents) > 1 else ()
             shown = len(names) or min(drones, MOST_DRONES)  # of the first world
             stage = Stage(command.world, shown, vehicle=command.vehicle, names=names)

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from ..models.errors import expect
+from ..models.errors import InputError
 from ._flags import Command
 
 
@@ -29,7 +29,8 @@ class Export(Command):
         from ._env import trained
 
         out = self.out or Path(TARGETS[self.to])
-        expect(not out.exists(), "out", "the name of a new file", f"{out}, which is there")
+        if out.exists():
+            raise InputError(f"out: expected the name of a new file, got {out}, which is there")
         content = export(trained(self.policy), self.to)
         write_whole(out, content)
         print(f"policy: {out} ({len(content):,} bytes)")

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from ..models.errors import expect
+from ..models.errors import InputError, expect
 from ._flags import BackendFlags, parse_address
 
 if TYPE_CHECKING:
@@ -69,7 +69,8 @@ class Sim(BackendFlags):
             return self._run_shared()
         for name in ("when_lost", "patience"):
             flag = f"--{name.replace('_', '-')}"
-            expect(name not in self.given, flag, "it with --agents", f"{getattr(self, name)}")
+            if name in self.given:
+                raise InputError(f"{flag}: expected it with --agents, got {getattr(self, name)}")
         from ..udp import Simulator
 
         simulator = Simulator(
@@ -97,8 +98,10 @@ class Sim(BackendFlags):
 
         for name in ("server", "num_envs", "codec", "record"):
             flag = f"--{name.replace('_', '-')}"
-            expect(name not in self.given, flag, "none with --agents", f"{getattr(self, name)}")
-        expect(self.agents, "--agents", "HOST:PORT of each agent", "none")
+            if name in self.given:
+                raise InputError(f"{flag}: expected none with --agents, got {getattr(self, name)}")
+        if not self.agents:
+            raise InputError("--agents: expected HOST:PORT of each agent, got none")
         named = {address: names.split(",") for address, _, names in
                  (agent.partition("=") for agent in self.agents) if names}  # fmt: skip
         right = len(named) in (0, len(self.agents))

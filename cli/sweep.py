@@ -57,7 +57,8 @@ class Sweep(StudyFlags):
 
         from ..training.settings import Row
 
-        changes, options = self.changes(), dict(self.options)
+        changes = self.changes()
+        options = dict(self.options)
         for name, value in point.items():
             if name.startswith("env."):
                 options[name.removeprefix("env.").replace("-", "_")] = value

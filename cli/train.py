@@ -31,7 +31,7 @@ from ..agents import (
 from ..agents.checkpoints import Checkpoint, software_versions, write_whole
 from ..agents.presets import PresetName
 from ..flights.folders import locked
-from ..models.errors import InputError, expect, require
+from ..models.errors import InputError, require
 from ..training.settings import Run
 from ._flags import (
     AgentFlags,
@@ -96,8 +96,8 @@ class Train(AgentFlags, BackendFlags):
         require("tensorboard", "train", "training")
         if self.algorithm.startswith("sb3-"):
             require("torch", "train", self.algorithm)
-        right = 0 < self.store_every < math.inf
-        expect(right, "store-every", "seconds > 0", str(self.store_every))
+        if not 0 < self.store_every < math.inf:
+            raise InputError(f"store-every: expected seconds > 0, got {self.store_every}")
         return self._resume(self.resume) if self.resume else self._begin()
 
     def _begin(self) -> int:
@@ -157,10 +157,11 @@ class Train(AgentFlags, BackendFlags):
         with locked(folder):
             kept = load(folder / CHECKPOINT)
             others = f"a training of {self.algorithm}, {folder} holds one of {kept.algorithm}"
-            expect(kept.algorithm == self.algorithm, "resume", others)
+            if kept.algorithm != self.algorithm:
+                raise InputError(f"resume: expected {others}")
             refuse_settings(self, folder, free=("algorithm", *_FREE))
-            right = "env" not in self.given or self.env_id == kept.env_id
-            expect(right, "resume", f"--env {kept.env_id}", self.env)
+            if not ("env" not in self.given or self.env_id == kept.env_id):
+                raise InputError(f"resume: expected --env {kept.env_id}, got {self.env}")
             if self.env_steps is not None:
                 kept = self._extended(kept, folder)
             if is_finished(kept):
@@ -223,7 +224,8 @@ class Train(AgentFlags, BackendFlags):
                 print(go_on)
             raise
         keeper.close()
-        flown, what = training.log.env_steps, "trained" if finished else "stopped after"
+        flown = training.log.env_steps
+        what = "trained" if finished else "stopped after"
         print(f"{what} {flown:,} of {training.run.env_steps:,} env steps")
         print(f"{flown / training.log.seconds:,.0f} env steps per second")
         print(f"checkpoint: {folder / CHECKPOINT}" if finished else go_on)
@@ -232,7 +234,8 @@ class Train(AgentFlags, BackendFlags):
 
 def _advice(run: Run) -> str:
     """Advice if an update has too little data of so many drones; empty if not."""
-    drones, config = run.num_envs, run.config
+    drones = run.num_envs
+    config = run.config
     if drones == 1 or "episode_length" not in run.options:
         return ""
     if isinstance(config, PPOConfig):  # many updates with each transition
@@ -270,9 +273,12 @@ class _Keeper:
     def __init__(self, training: "Training", folder: Path, every: float) -> None:
         from ._scalars import ScalarWriter
 
-        self._training, self._folder, self._every = training, folder, every
+        self._training = training
+        self._folder = folder
+        self._every = every
         self._due = 0.0
-        total, behind = training.run.env_steps, training.log.env_steps
+        total = training.run.env_steps
+        behind = training.log.env_steps
         self._scalars = ScalarWriter(folder / "tensorboard", total, behind=behind)
 
     def keep(self, *, now: bool, last: bool = False) -> None:
@@ -308,7 +314,8 @@ def _stop_at_update() -> Iterator[Callable[[], bool]]:
 
     Asked again, or if no update comes soon (no simulator answers), it stops at once.
     """
-    asked, timers = False, hasattr(signal, "setitimer")
+    asked = False
+    timers = hasattr(signal, "setitimer")
 
     def set_timer(seconds: float) -> None:
         if timers:

@@ -92,8 +92,8 @@ class Vehicle(Command):
         """Do it."""
         other = self.action != "export"
         expect(other == (self.out is None), "vehicle", *_out_words(self.action, self.out))
-        right = "frame" not in self.given or self.action == "new"
-        expect(right, "frame", "no --frame but with new", self.frame)
+        if not ("frame" not in self.given or self.action == "new"):
+            raise InputError(f"frame: expected no --frame but with new, got {self.frame}")
         if self.json and self.action != "check":
             raise InputError(f"json: expected no --json but with check, got {self.action}")
         match self.action:
@@ -120,11 +120,13 @@ class Vehicle(Command):
 
     def _new(self) -> None:
         path = Path(self.file)
-        right = path.suffix.lower() == ".toml"
-        expect(right, "file", "a name that ends in .toml", self.file)
-        expect(not path.exists(), "file", "the name of a new file", f"{path}, which is there")
+        if path.suffix.lower() != ".toml":
+            raise InputError(f"file: expected a name that ends in .toml, got {self.file}")
+        if path.exists():
+            raise InputError(f"file: expected the name of a new file, got {path}, which is there")
         count = {"hexa": 6, "octo": 8}.get(self.frame, 4)
-        listed, space = self.frame == "list", " " * (24 - len(self.frame))
+        listed = self.frame == "list"
+        space = " " * (24 - len(self.frame))
         text = _NEW.format(
             frame="" if listed else _FRAME.format(frame=self.frame, space=space),
             thrust=f"[0.0, {30.0 / count}]",  # twice the weight

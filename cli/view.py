@@ -47,7 +47,8 @@ class View(EnvFlags):
         parse_scene(self.world)
         flights = islice(self._flights(), self.episodes)
         first = next(flights)
-        spec, drones = first[0].spec, len(first)
+        spec = first[0].spec
+        drones = len(first)
         pace = Pace(spec.control_period, self.speed)
         names = spec.agents if drones > 1 else ()
         stage = Stage(self.world, drones, vehicle=self.vehicle, names=names)

@@ -74,7 +74,9 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
         mode = self.metadata["autoreset_mode"]
         resets = self.done if mode == AutoresetMode.NEXT_STEP and self.done.any() else None
         self.advance(self._shaped(actions), resets)
-        rewards, terminated, truncated = self.rewards, self.terminated, self.truncated
+        rewards = self.rewards
+        terminated = self.terminated
+        truncated = self.truncated
         info = self._info(~self._nobody)
         if mode == AutoresetMode.SAME_STEP and self.done.any():
             truncated, info = self._begin_next(truncated, info)
@@ -91,14 +93,16 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
             self.single_action_space = action_space(spec)
             self.observation_space = batch_space(self.single_observation_space, num_envs)
             self.action_space = batch_space(self.single_action_space, num_envs)
-        self.env_spec, self.num_envs = spec, num_envs
+        self.env_spec = spec
+        self.num_envs = num_envs
         self._nobody = np.zeros(num_envs, bool)
         self.control_period = spec.control_period
         fps = max(1, round(1 / spec.control_period))
         self.metadata = {"render_modes": [], "render_fps": fps, "autoreset_mode": mode}
 
     def _shaped(self, actions: Any) -> Any:
-        array, expected = np.asarray(actions), self.action_space.shape
+        array = np.asarray(actions)
+        expected = self.action_space.shape
         if array.shape != expected:
             got = f"got shape {array.shape}"
             raise InputError(f"actions: expected an array of shape {expected}, {got}")
@@ -113,7 +117,8 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
         A simulator that is lost meanwhile truncates the episodes of its frozen drones: they begin
         their next as well.
         """
-        last, ended = self.observations, self._nobody
+        last = self.observations
+        ended = self._nobody
         while self.done.any():
             truncated = truncated | self.lost
             ended = ended | self.done

@@ -52,7 +52,8 @@ class SceneConfig:
         """The text that `parse` reads: `forest`, `forest:3` or `forest:0-7`."""
         if not self.seeds:
             return self.name
-        first, last = self.seeds[0], self.seeds[-1]
+        first = self.seeds[0]
+        last = self.seeds[-1]
         return f"{self.name}:{first}" if first == last else f"{self.name}:{first}-{last}"
 
     @classmethod
@@ -288,7 +289,8 @@ class EnvConfig:
         check_world(vehicle, self.backend.name, self.drones, self.effects, randomize, settings)
         resolved = replace(self, vehicle_hash=vehicle.hash, task_hash=source_hash(task))
         for name in ("vehicle_hash", "task_hash"):
-            was, now = getattr(self, name), getattr(resolved, name)
+            was = getattr(self, name)
+            now = getattr(resolved, name)
             if was and was != now:
                 raise InputError(f"{name}: expected {was}, got {now}")
         return resolved

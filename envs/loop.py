@@ -62,8 +62,11 @@ class Stages:
         randomize: Randomization | None,
     ) -> None:
         drawn = () if randomize is None else randomize.names
-        config, controller, vehicle = task.config, task.controller, task.vehicle
-        self._task, self._world = task, world
+        config = task.config
+        controller = task.controller
+        vehicle = task.vehicle
+        self._task = task
+        self._world = world
         self._look = lambda: world.state
         self.sensors: Sensors | None = None
         sensing, readings = self._sensors()
@@ -167,10 +170,12 @@ class Loop:
 
     def __init__(self, config: EnvConfig, num_worlds: int = 1) -> None:
         self.config = config = config.resolve()
-        backend, shape = config.backend, (num_worlds, config.drones)
+        backend = config.backend
+        shape = (num_worlds, config.drones)
         alone = shape == (1, 1) and backend.name == "mujoco"
         self.task: Task = make_task(config, () if alone else shape)
-        self.num_envs, self.vehicle = num_worlds * config.drones, self.task.vehicle
+        self.num_envs = num_worlds * config.drones
+        self.vehicle = self.task.vehicle
         flown = self.task.config
         randomize = Randomization(flown.randomize, flown.effects) if flown.randomize else None
         self.world: World = make_world(
@@ -211,7 +216,8 @@ class Loop:
         flown, those to be reset are where they were, and their random numbers have moved on.
         """
         self._check_open()
-        record, stages = self.record, self.stages
+        record = self.record
+        stages = self.stages
         clock.take(record, resets, frozen)
         flies = record.flown is None or bool(record.flown.any())
         if record.begun is not None:
@@ -232,13 +238,15 @@ class Loop:
 
     def _begin(self, begun: Mask, seeds: Any, chosen: Mapping[str, np.ndarray]) -> None:
         """Begin episodes: the task sets the start, and the other stages follow from it."""
-        record, stages = self.record, self.stages
+        record = self.record
+        stages = self.stages
         everybody = bool(begun.all())
         record.chosen = {}
         if not (self._has_begun or everybody):  # the first time all of them
             record.begun = begun | True
             record.run(None, stages.begin)
-            record.begun, record.waiting = begun, begun | True
+            record.begun = begun
+            record.waiting = begun | True
         if seeds is not None:
             for stage in stages.all:
                 stage.seed(begun, seeds[:: len(self.spec.agents)])
@@ -261,7 +269,8 @@ class Loop:
 
     def _take_results(self) -> None:
         """New arrays of N drones, of the declared dtypes."""
-        record, count = self.record, (self.num_envs,)
+        record = self.record
+        count = (self.num_envs,)
         self._telemetry = None
         observations = vars(record).get("observations")
         self.observations = {}
@@ -361,7 +370,8 @@ class Loop:
             gymnasium.error.ClosedEnvironmentError: The loop is closed.
         """
         self._check_open()
-        record, stages = self.record, self.stages
+        record = self.record
+        stages = self.stages
         kept = part_of(snapshot, "record")
         shape = getattr(kept.get("kept/steps"), "shape", None)
         if shape != record.shape:

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..models.errors import expect, require
+from ..models.errors import InputError, require
 from ..sim.snapshots import Arrays
 from .autoreset import AdvancingVectorEnv
 from .rendering import RENDER_MODES
@@ -31,10 +31,12 @@ class AdvancingParallelEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc]
     """
 
     def __init__(self, world: AdvancingVectorEnv) -> None:
-        self._world, self.env_spec = world, world.env_spec
-        names, self.control_period = self.env_spec.agents, world.control_period
-        same = world.num_envs == len(names)
-        expect(same, "worlds", "one", f"{world.num_envs // len(names)}")
+        self._world = world
+        self.env_spec = world.env_spec
+        names = self.env_spec.agents
+        self.control_period = world.control_period
+        if world.num_envs != len(names):
+            raise InputError(f"worlds: expected one, got {world.num_envs // len(names)}")
         fps = world.metadata["render_fps"]
         self.metadata = {"render_modes": [], "render_fps": fps, "name": self.env_spec.env_id,
                          "is_parallelizable": True}  # fmt: skip
@@ -66,10 +68,12 @@ class AdvancingParallelEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc]
         Gives observations, rewards, terminated, truncated and infos of those agents; one that ends
         is not among `agents` any more. Actions of others are ignored.
         """
-        flown, world = self.agents, self._world
+        flown = self.agents
+        world = self._world
         right = isinstance(actions, dict) and actions.keys() >= set(flown)
         got = sorted(actions) if isinstance(actions, dict) else type(actions).__name__
-        expect(right, "actions", f"a dict with {', '.join(flown)}", f"{got}")
+        if not right:
+            raise InputError(f"actions: expected a dict with {', '.join(flown)}, got {got}")
         space = world.action_space
         given = np.zeros(space.shape or (), space.dtype)
         with np.errstate(over="ignore"):  # an overflow is infinite, and refused as such
@@ -101,13 +105,15 @@ class AdvancingParallelEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc]
         shape = self.action_spaces[agent].shape
         right = array.dtype.kind in "iuf" and array.shape == shape
         expected = f"an array of real numbers of shape {shape} for {agent}"
-        expect(right, "actions", expected, f"{action!r:.80}")
+        if not right:
+            raise InputError(f"actions: expected {expected}, got {action!r:.80}")
         return array
 
     def _told(self, seen: Any, info: dict[str, Any], agents: list[str]) -> tuple[Told, Told]:
         """Observations and infos of some agents."""
         names = [name for name in info if not name.startswith("_")]
-        observations, infos = {}, {}
+        observations = {}
+        infos = {}
         for agent in agents:
             row = self._rows[agent]
             several = isinstance(seen, dict)

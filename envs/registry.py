@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 import gymnasium
 
-from ..models.errors import InputError, expect
+from ..models.errors import InputError
 from .spec import EnvSpec, canonical_id
 
 if TYPE_CHECKING:
@@ -28,10 +28,10 @@ def register(env_id: str, task: "str | type[Task]") -> None:
     Raises `InputError` if the id is not as `name-v0` or `namespace/name-v0`, or belongs to another
     package's env.
     """
-    right = isinstance(env_id, str) and _ID.fullmatch(env_id)
-    expect(right, "env id", "name-v0 or namespace/name-v0", f"{env_id!r}")
-    free = env_id in _tasks or env_id not in gymnasium.registry
-    expect(free, "env id", "one that is free", f"{env_id!r}")
+    if not (isinstance(env_id, str) and _ID.fullmatch(env_id)):
+        raise InputError(f"env id: expected name-v0 or namespace/name-v0, got {env_id!r:.300}")
+    if not (env_id in _tasks or env_id not in gymnasium.registry):
+        raise InputError(f"env id: expected one that is free, got {env_id!r:.300}")
     gymnasium.registry.pop(env_id, None)
     _tasks[env_id] = task
     # No max_episode_steps: the env truncates by itself, since over UDP no wrapper would.

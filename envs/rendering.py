@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Final
 import gymnasium as gym
 import numpy as np
 
-from ..models.errors import expect
+from ..models.errors import InputError
 from .spec import EnvSpec
 
 if TYPE_CHECKING:
@@ -21,9 +21,12 @@ class Renderer:
     """`render` of an env: a picture of each world, or a window that shows them in real time."""
 
     def __init__(self, mode: str | None, loop: "Loop") -> None:
-        right = mode is None or mode in RENDER_MODES
-        expect(right, "render_mode", "None, 'human' or 'rgb_array'", f"{mode!r}")
-        self._mode, self._loop = mode, loop
+        if not (mode is None or mode in RENDER_MODES):
+            raise InputError(
+                f"render_mode: expected None, 'human' or 'rgb_array', got {mode!r:.300}"
+            )
+        self._mode = mode
+        self._loop = loop
         self._canvas: Canvas | None = None
         self._view: LiveView | None = None
         self._shown: list[Moment] = []
@@ -54,7 +57,8 @@ class Renderer:
             one = len(now) == drones
             stage = Stage(drones=drones, vehicle=self._loop.vehicle.path, trail=one, names=names)
             self._canvas = Canvas(stage, *((480, 360) if one else (240, 180)))
-        canvas, pictures = self._canvas, []
+        canvas = self._canvas
+        pictures = []
         for first in range(0, len(now), drones):
             canvas.stage.show(*now[first : first + drones])
             pictures.append(canvas.draw())
@@ -85,7 +89,9 @@ class Renderer:
 
 def moments(loop: "Loop", episodes: Sequence[int]) -> "list[Moment]":
     """The current `Moment` of every drone; `episodes` are the numbers of their episodes."""
-    telemetry, steps, rewards = loop.telemetry, loop.steps, loop.rewards
+    telemetry = loop.telemetry
+    steps = loop.steps
+    rewards = loop.rewards
     return [
         moment(
             loop.spec,

@@ -52,7 +52,8 @@ class SingleEnv(gym.Env[Any, Any]):
         if self.config.drones > 1:
             raise InputError(f"drones: expected 1 in a single env, got {self.config.drones}")
         self._loop = loop = Loop(self.config)
-        self.render_mode, self._renderer = render_mode, Renderer(render_mode, loop)
+        self.render_mode = render_mode
+        self._renderer = Renderer(render_mode, loop)
         self.env_spec = loop.spec
         self.control_period = loop.spec.control_period
         self.metadata = self.metadata | {"render_fps": max(1, round(1 / self.control_period))}

@@ -14,8 +14,10 @@ def box(array: ArraySpec) -> spaces.Box:
     low, high = array.bounds()
     dtype: Any = np.dtype(array.dtype)
     if dtype.kind in "iu":
-        least, most = np.iinfo(dtype).min, np.iinfo(dtype).max
-        low, high = np.clip(low, least, most), np.clip(high, least, most)
+        least = np.iinfo(dtype).min
+        most = np.iinfo(dtype).max
+        low = np.clip(low, least, most)
+        high = np.clip(high, least, most)
     return spaces.Box(low.astype(dtype), high.astype(dtype), dtype=dtype)
 
 

@@ -95,7 +95,10 @@ class ArraySpec(_Part):
     def __post_init__(self) -> None:
         _check_text("name", self.name)
         _check_words(f"{self.name}: categories", self.categories)
-        name, shape, units, names = self.name, self.shape, self.unit, self.components
+        name = self.name
+        shape = self.shape
+        units = self.unit
+        names = self.components
         _expect(name, "name", "a name for an array", name)
         is_shape = isinstance(shape, tuple) and all(type(n) is int and n >= 1 for n in shape)
         _expect(is_shape, name, "a shape of whole numbers >= 1", shape)
@@ -246,7 +249,9 @@ class EnvSpec(_Part):
     def __post_init__(self) -> None:
         _check_text("env_id", self.env_id)
         object.__setattr__(self, "options", json_values(self.options))
-        period, digits, agents = self.control_period, self.vehicle_hash, self.agents
+        period = self.control_period
+        digits = self.vehicle_hash
+        agents = self.agents
         right = _is_number(period) and 1e-6 <= period <= 1e3
         _expect(right, "control_period", "1e-6 to 1e3 s", period)
         _check_text("vehicle", self.vehicle)

@@ -60,7 +60,8 @@ class LocalVectorEnv(AdvancingVectorEnv):
             expected = f"a multiple of drones = {config.drones}"
             raise InputError(f"num_envs: expected {expected}, got {num_envs!r}")
         self._loop = loop = Loop(config, num_envs // config.drones)
-        self.render_mode, self._renderer = render_mode, Renderer(render_mode, loop)
+        self.render_mode = render_mode
+        self._renderer = Renderer(render_mode, loop)
         self._take_spec(loop.spec, num_envs, autoreset_mode)
         self.metadata["render_modes"] = RENDER_MODES
         self._nobody = self.lost = self.done = self.out = loop.done
@@ -138,8 +139,11 @@ class LocalVectorEnv(AdvancingVectorEnv):
     def _take_results(self) -> None:
         loop = self._loop
         self.observations = joined(loop.spec, loop.observations)
-        self.rewards, self.terminated = loop.rewards, loop.terminated
-        self.truncated, self.done, self.out = loop.truncated, loop.done, loop.out
+        self.rewards = loop.rewards
+        self.terminated = loop.terminated
+        self.truncated = loop.truncated
+        self.done = loop.done
+        self.out = loop.out
 
     def _choice(self, name: str, value: Any) -> np.ndarray:
         if name not in self._loop.task.reset_options:

@@ -23,7 +23,9 @@ env.connect()  # the simulator's Hello brings the spec
 pid = PID(env.env_spec)
 observation, info = env.reset(seed=1)
 pid.reset()
-total, terminated, truncated = 0.0, False, False
+total = 0.0
+terminated = False
+truncated = False
 while not (terminated or truncated):
     observation, reward, terminated, truncated, info = env.step(pid.act(observation))
     total += reward

@@ -45,12 +45,14 @@ class Landing(Task):
         return InitialState(position=stack((0.0, 0.0, self.vehicle.rest_height + height)))
 
     def observe(self, state):
-        height, climb = self.height(state), state.velocity[..., 2]
+        height = self.height(state)
+        climb = state.velocity[..., 2]
         seen = stack((clip(height, -1.0, self.highest + 20.0), clip(climb, -20.0, 20.0)))
         return {"observation": seen}
 
     def outcome(self, state):
-        height, climb = self.height(state), state.velocity[..., 2]
+        height = self.height(state)
+        climb = state.velocity[..., 2]
         hard = (height < 0.3) & (climb < -1.5)
         ended = hard | (height > self.highest) | (state.tilt_cosine < 0.5)
         nearness = (0.5 - abs(height)) / (0.5 + abs(height))

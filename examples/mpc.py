@@ -40,14 +40,16 @@ def total_reward(snapshot, action):
 def best_action(last):
     """The best of random changes of the last action."""
     snapshot = env.unwrapped.snapshot()
-    best, most = last, total_reward(snapshot, last)
+    best = last
+    most = total_reward(snapshot, last)
     for number in range(PLANS):
         spread = SPREAD * SHRINK ** (number // 5)
         action = best + spread * rng.normal(size=last.shape)
         action = action.clip(-1.0, 1.0).astype(np.float32)
         total = total_reward(snapshot, action)
         if total > most:
-            best, most = action, total
+            best = action
+            most = total
     return best
 
 

@@ -30,7 +30,9 @@ def read(folder: Path) -> tuple[torch.Tensor, torch.Tensor, np.ndarray]:
     boxes = {
         one["image_id"]: one["bbox"] for one in coco["annotations"] if one["category_id"] == pad
     }
-    pictures, targets, flights = [], [], []
+    pictures = []
+    targets = []
+    flights = []
     for image in coco["images"]:
         with Image.open(folder / image["file_name"]) as file:
             pictures.append(np.asarray(file).transpose(2, 0, 1))
@@ -62,7 +64,9 @@ def trained_and_tested(
 ) -> dict[str, float]:
     """Train on the pictures that are not held back, test on those that are."""
     torch.manual_seed(seed)
-    rest, net, begun = torch.nonzero(~held).ravel(), network(), time.perf_counter()
+    rest = torch.nonzero(~held).ravel()
+    net = network()
+    begun = time.perf_counter()
     net(pictures[:1])
     optimizer = torch.optim.Adam(net.parameters(), 1e-3)
     for _ in range(epochs):
@@ -73,7 +77,8 @@ def trained_and_tested(
     seconds = time.perf_counter() - begun
     with torch.no_grad():
         out = torch.cat([net(part) for part in pictures[held].split(256)])
-    told, there = targets[held], targets[held][:, 0] > 0
+    told = targets[held]
+    there = targets[held][:, 0] > 0
     error = pixels_off(out[there, 1:], told[there, 1:], pictures.shape[-1])
     return {
         "right about whether": round(float(((out[:, 0] > 0) == there).float().mean()), 4),
@@ -98,7 +103,8 @@ def main() -> None:
     args = parser.parse_args()
     pictures, targets, flights = read(args.folder)
     held = torch.from_numpy(flights % 5 == 4)
-    seen, true = targets[~held & (targets[:, 0] > 0), 1:], targets[held & (targets[:, 0] > 0), 1:]
+    seen = targets[~held & (targets[:, 0] > 0), 1:]
+    true = targets[held & (targets[:, 0] > 0), 1:]
     mean = pixels_off(seen.mean(dim=0), true, pictures.shape[-1])
     result = {
         "pictures": {"trained": int((~held).sum()), "tested": int(held.sum())},

@@ -20,7 +20,11 @@ parser.add_argument("--updates", type=int, default=50)
 parser.add_argument("--seed", type=int, default=0)
 args = parser.parse_args()
 
-DRONES, STEPS, GAMMA, LAMBDA, CLIP = 16, 128, 0.98, 0.95, 0.2
+DRONES = 16
+STEPS = 128
+GAMMA = 0.98
+LAMBDA = 0.95
+CLIP = 0.2
 torch.manual_seed(args.seed)
 torch.set_num_threads(1)
 envs = gym.make_vec("rotorgram/Elevation-v0", num_envs=DRONES)
@@ -30,13 +34,16 @@ def network(outputs: int) -> nn.Sequential:
     return nn.Sequential(nn.Linear(3, 64), nn.Tanh(), nn.Linear(64, outputs))
 
 
-actor, critic, log_std = network(1), network(1), nn.Parameter(torch.tensor(-0.5))
+actor = network(1)
+critic = network(1)
+log_std = nn.Parameter(torch.tensor(-0.5))
 with torch.no_grad():
     actor[2].weight *= 0.01  # the first policy holds the thrust
 optimizer = torch.optim.Adam([*actor.parameters(), *critic.parameters(), log_std], lr=3e-3)
 observation, _ = envs.reset(seed=args.seed)
 fresh = np.zeros(DRONES, bool)  # whose next step is a reset, no transition
-total, returns = np.zeros(DRONES), []
+total = np.zeros(DRONES)
+returns = []
 
 for update in range(args.updates):
     rows = []
@@ -44,7 +51,8 @@ for update in range(args.updates):
         seen = torch.as_tensor(observation)
         with torch.no_grad():
             policy = torch.distributions.Normal(actor(seen), log_std.exp())
-            action, value = policy.sample(), critic(seen).squeeze(1)
+            action = policy.sample()
+            value = critic(seen).squeeze(1)
             log_prob = policy.log_prob(action).sum(1)
         following, reward, terminated, truncated, _ = envs.step(action.clamp(-1, 1).numpy())
         with torch.no_grad():  # a truncated flight would have gone on; a terminated one would not
@@ -60,13 +68,17 @@ for update in range(args.updates):
         torch.stack, zip(*rows, strict=True)
     )
 
-    advantage, ahead = torch.zeros_like(reward), torch.zeros(DRONES)
+    advantage = torch.zeros_like(reward)
+    ahead = torch.zeros(DRONES)
     for t in reversed(range(STEPS)):
         delta = reward[t] + GAMMA * after[t] - value[t]
         ahead = delta + GAMMA * LAMBDA * ahead * ~ended[t] * flown[t]
         advantage[t] = ahead
-    target, old = (advantage + value)[flown], log_prob[flown]
-    seen, action, advantage = seen[flown], action[flown], advantage[flown]
+    target = (advantage + value)[flown]
+    old = log_prob[flown]
+    seen = seen[flown]
+    action = action[flown]
+    advantage = advantage[flown]
     advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
 
     for _ in range(10):

@@ -12,7 +12,11 @@ import sys
 
 agent = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 agent.bind(("127.0.0.1", int(sys.argv[1]) if len(sys.argv) > 1 else 8001))
-episodes, steps, total, last, reply = 0, 0, 0.0, "", b""
+episodes = 0
+steps = 0
+total = 0.0
+last = ""
+reply = b""
 while not reply.endswith(b"close"):
     line, simulator = agent.recvfrom(1024)
     sequence, *fields = line.decode().split(",")
@@ -20,10 +24,14 @@ while not reply.endswith(b"close"):
         break
     if sequence != last:  # a repeat gets the answer that it did not hear
         reward, terminated, truncated, error, rate, thrust = map(float, fields[:6])
-        last, steps, total = sequence, steps + 1, total + reward
+        last = sequence
+        steps = steps + 1
+        total = total + reward
         if terminated or truncated:
             print(f"episode {episodes}: {steps - 1} steps, return {total:.1f}", flush=True)
-            episodes, steps, total = episodes + 1, 0, 0.0
+            episodes = episodes + 1
+            steps = 0
+            total = 0.0
             reply = f"{sequence},{'reset' if episodes < 3 else 'close'}".encode()
         else:
             action = 9 * error + 6 * rate - 9.8 * thrust  # here goes what you have learnt

@@ -86,7 +86,8 @@ def capture(
         RunsFailed: Workers fail.
     """
     with locked(folder):
-        sequences, views = plan.sequences(), plan.views()
+        sequences = plan.sequences()
+        views = plan.views()
         _claim(folder / "plan.toml", plan.text, "plan")
         _claim(
             folder / "made_of.json",
@@ -178,7 +179,8 @@ def _is_whole(folder: Path, number: int, views: Sequence[View], drones: int) -> 
         same_sizes = all((folder / file).stat().st_size == size for file, size in sizes.items())
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
         return False
-    expected, files = [], set()
+    expected = []
+    files = set()
     for view in views:
         height, width = view.shape[:2]
         for drone in range(pictures_of(view, drones)):
@@ -211,7 +213,8 @@ def _take(job: _Job, tell: Tell) -> list[Frame]:
     """The frames of a job."""
     from ..rendering.cameras import Cameras
 
-    plan, poses = job.plan, job.poses
+    plan = job.plan
+    poses = job.poses
     drones = poses.drones
     everybody = np.ones(drones, bool)
     frames = []
@@ -333,7 +336,8 @@ def objects_in(numbers: NDArray[np.int32], names: Sequence[str]) -> Iterator[dic
         flat = np.concatenate(([False], mask.ravel(order="F")))
         edges = np.flatnonzero(flat[1:] != flat[:-1])
         runs = np.diff(np.concatenate(([0], edges, [mask.size])))
-        width, height = int(np.ptp(columns)) + 1, int(np.ptp(rows)) + 1
+        width = int(np.ptp(columns)) + 1
+        height = int(np.ptp(rows)) + 1
         yield {
             "number": number,
             "name": names[number],

@@ -98,7 +98,8 @@ class RecordedEpisodes:
         """Refuse another spec than that of the first session, and a session that was read."""
         first = self.__dict__.setdefault("spec", spec)
         for one in fields(EnvSpec):
-            ours, theirs = getattr(first, one.name), getattr(spec, one.name)
+            ours = getattr(first, one.name)
+            theirs = getattr(spec, one.name)
             if ours != theirs:
                 raise InputError(
                     f"{path}: expected journals of one env, all with the {one.name} "
@@ -159,7 +160,8 @@ def write_parquet(episodes: RecordedEpisodes, out: Path) -> tuple[int, int]:
             waiting += len(batch)
             if waiting > _ROW_GROUP:
                 writer.write_table(pa.concat_tables(batches))
-                batches, waiting = [], 0
+                batches = []
+                waiting = 0
         if batches:
             writer.write_table(pa.concat_tables(batches))
         writer.close()
@@ -268,7 +270,8 @@ def write_minari(
         batch: list[Any] = []
         for episode in episodes:
             batch.append(_buffer(spec, episode))
-            count, steps = count + 1, steps + len(episode)
+            count = count + 1
+            steps = steps + len(episode)
             if len(batch) == _BATCH:
                 data.update_dataset_from_buffer(batch)
                 batch = []

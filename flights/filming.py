@@ -36,7 +36,8 @@ def moments(trajectory: Trajectory) -> list[Moment]:
 
     Raises `InputError` if its telemetry lacks position, attitude or thrust.
     """
-    telemetry, spec = trajectory.telemetry, trajectory.spec
+    telemetry = trajectory.telemetry
+    spec = trajectory.spec
     missing = {"position", "attitude", "thrust"} - set(telemetry)
     if missing:
         names = ", ".join(sorted(missing))
@@ -64,7 +65,8 @@ class FilmTrack:
     @cached_property
     def episodes(self) -> list[list[Trajectory]]:
         """The trajectories of each episode, one of each drone."""
-        flown, drones = self.trajectories, self.drones
+        flown = self.trajectories
+        drones = self.drones
         return [flown[first : first + drones] for first in range(0, len(flown), drones)]
 
     @cached_property
@@ -174,7 +176,8 @@ def _times(tracks: Sequence[FilmTrack], config: Film, *, still: bool) -> list[tu
         return [(0, config.at)]
     if still:
         return [(len(lengths) - 1, lengths[-1])]
-    step, seconds = config.speed / config.fps, sum(lengths)
+    step = config.speed / config.fps
+    seconds = sum(lengths)
     if seconds / step > MAX_FRAMES:
         raise InputError(
             f"film: expected at most {MAX_FRAMES:,} frames, got {seconds / step:,.0f} "
@@ -217,7 +220,8 @@ def _frames(
             frame = np.full((config.height, config.width, 3), _DARK, np.uint8)
             for place, pane in enumerate(panes):
                 row, column = divmod(place, columns)
-                x, y = (width + _SPACE) * column, (height + _SPACE) * row
+                x = (width + _SPACE) * column
+                y = (height + _SPACE) * row
                 frame[y : y + height, x : x + width] = pane.draw(episode, seconds)
             yield frame
             on_frame(number, len(times))
@@ -234,7 +238,10 @@ class _Pane:
         stage: Stage,
         tracks: Sequence[FilmTrack],
     ) -> None:
-        self._track, self._config, self._canvas, self._stage = track, config, canvas, stage
+        self._track = track
+        self._config = config
+        self._canvas = canvas
+        self._stage = stage
         self._is_named = len(tracks) > 1
         self._overlay = Overlay(
             canvas.width,
@@ -254,7 +261,8 @@ class _Pane:
 
     def draw(self, episode: int, seconds: float) -> Picture:
         """The picture at a time of an episode."""
-        track, config = self._track, self._config
+        track = self._track
+        config = self._config
         longest = max(track.episodes[episode], key=len)
         step = longest.step_at(seconds)
         if (episode, step) == self._shown:

@@ -19,7 +19,9 @@ MOTION: Final = ("t", *"xyz", *(f"q{a}" for a in "wxyz"), *(f"v{a}" for a in "xy
                  *(f"w{a}" for a in "xyz"))  # fmt: skip
 """Columns that a log must have: time, s; position, m, and velocity, m/s, world frame with z up;
 quaternion from body to world; body rates, rad/s, in a body frame x forward, y left, z up."""
-SPEED, SPEED_COMMAND, THROTTLE = "m{}_rads", "m{}_command_rads", "m{}_throttle"
+SPEED = "m{}_rads"
+SPEED_COMMAND = "m{}_command_rads"
+THROTTLE = "m{}_throttle"
 """Columns of rotor 1, 2...: measured speed and commanded speed, rad/s, and throttle, 0 to 1, which
 is the share of the largest thrust. A log has measured speeds, or one of the commands, or both."""
 _KINDS: Final = (SPEED, SPEED_COMMAND, THROTTLE)
@@ -289,7 +291,8 @@ def _table(path: Path) -> Columns:
 
 def _column(table: Columns, text: str, path: Path) -> Floats | None:
     """A column, times a factor that may follow its name; None: there is none."""
-    name, factor = text, "1"
+    name = text
+    factor = "1"
     if text not in table and "*" in text:
         name, _, factor = text.rpartition("*")
         name = name.strip()
@@ -305,7 +308,8 @@ def _column(table: Columns, text: str, path: Path) -> Floats | None:
 
 def _commanded_speeds(throttle: Floats, vehicle: Vehicle, path: Path) -> Floats:
     """Speeds at which the vehicle as it is gives the commanded share of its largest thrust."""
-    low, high = float(throttle.min()), float(throttle.max())
+    low = float(throttle.min())
+    high = float(throttle.max())
     if low <= -0.01 or high >= 1.01:
         _refuse(path, "throttle from 0 to 1", f"{low:.3g} to {high:.3g}")
     (coefficient,) = vehicle.coefficients.need("rotors.thrust_coefficient", "a log of commands")

@@ -178,7 +178,8 @@ def regressed(
             slope = -float((speed[:, i] * rest[:, i]).sum() / (speed[:, i] ** 2).sum())
             values[name] = max(slope, 0.0)
         name = f"body.inertia.{axis}"
-        x, y = coefficient * torque[:, i], turning[:, i]
+        x = coefficient * torque[:, i]
+        y = turning[:, i]
         inverse = float((x * y).sum() / max((x * x).sum(), 1e-300))
         if name in names and inverse > 0 and 0.1 < 1 / (inverse * own[name]) < 10:
             values[name] = 1 / inverse
@@ -190,10 +191,12 @@ def _accelerations(vehicle: Vehicle, own: Numbers, flight: FlightLog) -> tuple[F
     axes; thrust per thrust coefficient; velocity, body axes; torque per thrust coefficient; and
     acceleration of the rates plus its gyroscopic part, with the inertia as it is."""
     inner = slice(2, -2)
-    quaternion, rates = flight.quaternion[inner], flight.body_rates[inner]
+    quaternion = flight.quaternion[inner]
+    rates = flight.body_rates[inner]
 
     def slope(array: Floats) -> Floats:
-        near, far = array[3:-1] - array[1:-3], array[4:] - array[:-4]
+        near = array[3:-1] - array[1:-3]
+        far = array[4:] - array[:-4]
         slopes: Floats = (8 * near - far) / (12 * flight.period)
         return slopes
 
@@ -253,7 +256,9 @@ class _Problem:
     """
 
     def __init__(self, vehicle: Vehicle, logs: Sequence[FlightLog], steps: int) -> None:
-        self._vehicle, self._logs, self._steps = vehicle, logs, steps
+        self._vehicle = vehicle
+        self._logs = logs
+        self._steps = steps
         self._measured = logs[0].measured
         shares = (0.2, 0.4, 0.6, 0.8, 1.0)
         horizons = sorted({1, *(max(1, round(steps * share)) for share in shares)})
@@ -343,7 +348,8 @@ class _Problem:
     def _prepare(self, point: Numbers) -> None:
         """Set the spreads at a point, and the basis: the effects of errors of the starts."""
         self._basis = None
-        vehicle, windows = self._vehicle, self._windows
+        vehicle = self._vehicle
+        windows = self._windows
         speeds = None if self._measured else self._speeds(point)
         self._spreads = _spreads(vehicle, point, windows, speeds)
         if self._measured and LAG in point:
@@ -387,7 +393,8 @@ class _Problem:
         np.add.at(sums, self.cluster, scores)
         size = np.sqrt(np.diag(bread))
         felt = size > 1e-9 * max(float(size.max()), 1e-300)
-        half, self.correlation = np.full(len(x), np.inf), np.eye(len(x))
+        half = np.full(len(x), np.inf)
+        self.correlation = np.eye(len(x))
         chosen = np.ix_(felt, felt)
         scaled = bread[chosen] / np.outer(size[felt], size[felt])
         inverse = np.linalg.pinv(scaled, rcond=1e-13, hermitian=True)
@@ -484,7 +491,8 @@ def _shifted(start: States, index: int, size: float) -> States:
     arrays = list(start)
     if kind == 1:
         turn = np.zeros(4)
-        turn[0], turn[1 + axis] = np.cos(size / 2), np.sin(size / 2)
+        turn[0] = np.cos(size / 2)
+        turn[1 + axis] = np.sin(size / 2)
         arrays[1] = multiplied(start[1].T, np.broadcast_to(turn, start[1].T.shape)).T
     else:
         arrays[kind] = start[kind].copy()
@@ -525,7 +533,8 @@ def _flattened(vehicle: Vehicle, numbers: Numbers) -> dict[str, float]:
 
 def _scale(vehicle: Vehicle, numbers: Numbers, name: str) -> float:
     """A typical size of a number: its own, or one that gives a lively vehicle's forces."""
-    inertia, weight = float(np.trace(vehicle.inertia)) / 3, vehicle.mass * vehicle.gravity
+    inertia = float(np.trace(vehicle.inertia)) / 3
+    weight = vehicle.mass * vehicle.gravity
     lift = weight / vehicle.num_rotors
     speed = np.sqrt(lift / numbers["rotors.thrust_coefficient"])
     typical = {

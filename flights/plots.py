@@ -147,10 +147,12 @@ def _drawn(
 def _places(panels: Sequence[Panel]) -> list[tuple[int, int]]:
     """Row and column of each panel, side by side; a wide one has a row of its own."""
     places = []
-    row, column = 0, 0
+    row = 0
+    column = 0
     for panel in panels:
         if column and (panel.wide or column == _COLUMNS):
-            row, column = row + 1, 0
+            row = row + 1
+            column = 0
         places.append((row, column))
         column += _COLUMNS if panel.wide else 1
     return places

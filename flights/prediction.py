@@ -105,7 +105,8 @@ class Windows:
                 parts = [getattr(one, name)[at + shift].T for one, at in pairs]
                 return np.concatenate(parts, axis=-1)
 
-            position, quaternion = joined("position"), joined("quaternion")
+            position = joined("position")
+            quaternion = joined("quaternion")
             return position, quaternion, joined("velocity"), joined("body_rates")
 
         spans = [at[:, None] + np.arange(steps) for at in starts]
@@ -223,7 +224,8 @@ class _Air:
         """
         if self._effects is None:
             return None
-        columns, force = rows.T[:, None], thrust.T[:, None]
+        columns = rows.T[:, None]
+        force = thrust.T[:, None]
         state = WorldState(
             position=columns[..., :3],
             quaternion=columns[..., 3:7],

@@ -114,7 +114,8 @@ class SessionReader:
             yield from self._end(drone, "cut off")
 
     def _follow(self, transition: Transition) -> Iterator[Trajectory]:
-        state, command = transition.state, transition.command
+        state = transition.state
+        command = transition.command
         if transition.is_gap:
             yield from self.finish()
             return
@@ -151,7 +152,8 @@ class SessionReader:
 
     def _end(self, drone: int, ending: Ending) -> Iterator[Trajectory]:
         """The episode of a drone, if it has a step; a new one has not begun."""
-        rows, self._rows[drone] = self._rows[drone], []
+        rows = self._rows[drone]
+        self._rows[drone] = []
         if len(rows) < 2:
             return
         spec = self.session.spec

@@ -144,7 +144,9 @@ def fly(env: gym.Env[Any, Any], policy: Policy | None, seed: int, episode: int =
             env.action_space.seed(seed)
         else:
             policy.reset()
-        infos, rewards, actions = [info], [], []
+        infos = [info]
+        rewards = []
+        actions = []
         terminated = truncated = lost = False
         while not (terminated or truncated or lost):
             action = env.action_space.sample() if policy is None else policy.act(observation)
@@ -202,7 +204,8 @@ class _Batch:
     def __init__(
         self, env: AdvancingVectorEnv, policy: Policy | None, seeds: Mapping[int, int]
     ) -> None:
-        self._env, self._seeds = env, seeds
+        self._env = env
+        self._seeds = seeds
         self._drones = len(env.env_spec.agents)
         self._used = len(seeds) * self._drones
         self._policies = [copy.deepcopy(policy) for _ in range(self._used)]
@@ -256,7 +259,8 @@ class _Batch:
 
     def _trajectories(self, lost: NDArray[np.bool_]) -> dict[int, list[Trajectory]]:
         telemetry = stacked(self._telemetry)
-        rewards, actions = np.array(self._rewards, np.float64), np.array(self._actions)
+        rewards = np.array(self._rewards, np.float64)
+        actions = np.array(self._actions)
         flown: dict[int, list[Trajectory]] = {}
         for world, (episode, seed) in enumerate(self._seeds.items()):
             first = world * self._drones

@@ -241,7 +241,8 @@ class JournalPoses(_FlightPoses):
         """Read from the journal."""
         path = Path(self.file)
         flown = recorded_trajectories(path, session=self.session, drone=self.drone)
-        recorded, own = flown[0].spec.vehicle, Vehicle.load(vehicle).name
+        recorded = flown[0].spec.vehicle
+        own = Vehicle.load(vehicle).name
         if recorded != own:
             raise InputError(
                 f"plan: vehicle: expected {recorded}, which flies in {path}, got {own}"
@@ -293,7 +294,8 @@ class Plan:
         except RecursionError:
             raise InputError("plan: expected a TOML file, got tables nested too deeply") from None
         check_names(table, [name for name in cls.__dataclass_fields__ if name != "text"], "plan")
-        cameras, poses = table.get("cameras", list(cls.cameras)), table.get("poses", [])
+        cameras = table.get("cameras", list(cls.cameras))
+        poses = table.get("poses", [])
         if not _is_list_of(str, cameras):
             raise InputError(f"plan: cameras: expected a list of names, got {cameras!r:.80}")
         if not _is_list_of(dict, poses):
@@ -381,7 +383,8 @@ def _poses_after(one: Trajectory, steps: NDArray[np.int_]) -> dict[str, Floats]:
     """Poses of one drone after so many steps; after its end it stays where it is."""
     arrays = one.telemetry
     rows = np.minimum(steps, len(one))
-    now, before = one.pose[rows], one.pose[np.maximum(rows - 1, 0)]
+    now = one.pose[rows]
+    before = one.pose[np.maximum(rows - 1, 0)]
     turned = np.zeros((len(rows), 3))
     for turn, new, old in zip(turned, now[:, 3:], before[:, 3:], strict=True):
         mujoco.mju_subQuat(turn, new, old)

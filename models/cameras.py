@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from .coefficients import PREFIX
-from .errors import InputError, expect
+from .errors import InputError
 from .fields import Limits, read_table
 from .lens import Lens
 
@@ -150,15 +150,18 @@ def chosen_views(words: Sequence[str], cameras: Iterable[Camera]) -> tuple[View,
         alone = text in known
         right = alone or (name in known and kind in KINDS)
         expected = f"some of {', '.join(known)}, each with _{', _'.join(KINDS)} behind it or not"
-        expect(right, "cameras", expected, f"{word!r}")
+        if not right:
+            raise InputError(f"cameras: expected {expected}, got {word!r:.300}")
         camera = known[text if alone else name]
         if at:
             width, height = _size(word, size)
             camera = replace(camera, width=width, height=height)
         for one in camera.kinds if alone else (kind,):
             view = View(camera=camera, kind=one)
-            same = views.setdefault(view.name, view) == view
-            expect(same, "cameras", "each picture in one size", f"{view.name!r} in two")
+            if views.setdefault(view.name, view) != view:
+                raise InputError(
+                    f"cameras: expected each picture in one size, got {view.name!r} in two"
+                )
     return tuple(views.values())
 
 
@@ -167,7 +170,8 @@ def _size(word: str, text: str) -> tuple[int, int]:
     right = all(side.isascii() and side.isdecimal() and len(side) < 9 for side in (width, height))
     right = right and all(1 <= int(side) <= MOST_PIXELS for side in (width, height))
     expected = f"NAME@WIDTHxHEIGHT of 1 to {MOST_PIXELS} pixels each"
-    expect(right, "cameras", expected, f"{word!r}")
+    if not right:
+        raise InputError(f"cameras: expected {expected}, got {word!r:.300}")
     return int(width), int(height)
 
 
@@ -188,7 +192,8 @@ def read_cameras(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[Camera, ..
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
     mujoco.mj_camlight(model, data)
-    modes, perspective = mujoco.mjtCamLight, mujoco.mjtProjection.mjPROJ_PERSPECTIVE
+    modes = mujoco.mjtCamLight
+    perspective = mujoco.mjtProjection.mjPROJ_PERSPECTIVE
     targets = modes.mjCAMLIGHT_TARGETBODY.value, modes.mjCAMLIGHT_TARGETBODYCOM.value
     for number in range(model.ncam):
         one = model.camera(number)
@@ -201,7 +206,8 @@ def read_cameras(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[Camera, ..
             width = height = _SIDE
         for side in (width, height):
             expected = f"1 to {MOST_PIXELS} pixels a side"
-            expect(1 <= side <= MOST_PIXELS, f"camera {one.name}", expected, f"{side}")
+            if not 1 <= side <= MOST_PIXELS:
+                raise InputError(f"camera {one.name}: expected {expected}, got {side}")
         told = {
             key: texts.pop(f"{_TEXTS}{one.name}.{key}")
             for key in ("rate", *(each.name for each in fields(Optics)))
@@ -209,7 +215,8 @@ def read_cameras(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[Camera, ..
         }
         rate = told.pop("rate", "1")
         optics = {key: _read(text) for key, text in told.items()}
-        output, axes = int(model.cam_output[number]), data.cam_xmat[number].reshape(3, 3)
+        output = int(model.cam_output[number])
+        axes = data.cam_xmat[number].reshape(3, 3)
         mine = model.body_rootid[model.cam_bodyid[number]] == model.jnt_bodyid[0]
         found.append(
             Camera(
@@ -239,13 +246,20 @@ def is_name(name: object) -> bool:
 def _check_numbers(name: str, model: mujoco.MjModel, number: int) -> None:
     """Raise `InputError` unless a camera of a model can see something."""
     low, high = (math.degrees(end) for end in FOVY)
-    fovy, focal = float(model.cam_fovy[number]), model.cam_intrinsic[number, :2].tolist()
-    if model.cam_sensorsize[number].any():
-        right = min(*focal, *model.cam_sensorsize[number]) > 0
-        expect(right, name, "a focal length above 0 with its sensorsize", f"{focal}")
-    expect(low <= fovy <= high, name, f"fovy from {low:.3g} to {high:.4g} degrees", f"{fovy:g}")
+    fovy = float(model.cam_fovy[number])
+    focal = model.cam_intrinsic[number, :2].tolist()
+    sensor = model.cam_sensorsize[number]
+    if sensor.any() and not min(*focal, *sensor) > 0:
+        raise InputError(
+            f"{name}: expected a focal length above 0 with its sensorsize, got {focal}"
+        )
+    if not low <= fovy <= high:
+        raise InputError(
+            f"{name}: expected fovy from {low:.3g} to {high:.4g} degrees, got {fovy:g}"
+        )
     place = model.cam_pos[number].tolist()
-    expect(max(map(abs, place)) <= 1e4, name, "a position within 1e4 m", f"{place}")
+    if not max(map(abs, place)) <= 1e4:
+        raise InputError(f"{name}: expected a position within 1e4 m, got {place}")
 
 
 def _read(text: str) -> Any:
@@ -265,7 +279,8 @@ def steps_of(name: str, rate: str | float) -> int:
         steps = math.nan
     right = 1 <= steps <= MOST_STEPS and abs(steps - round(steps)) < 1e-6 * steps
     expected = f"1 over a whole number of control steps up to {MOST_STEPS}"
-    expect(right, f"{name}.rate", expected, f"{rate}")
+    if not right:
+        raise InputError(f"{name}.rate: expected {expected}, got {rate}")
     return round(steps)
 
 
@@ -296,7 +311,8 @@ def place_camera(spec: mujoco.MjSpec, body: mujoco.MjsBody, camera: Camera) -> N
     added = body.add_camera(name=camera.name, pos=camera.position)
     added.alt.type = mujoco.mjtOrientation.mjORIENTATION_XYAXES
     added.alt.xyaxes = axes_of(camera)
-    added.fovy, added.resolution = math.degrees(camera.fovy), (camera.width, camera.height)
+    added.fovy = math.degrees(camera.fovy)
+    added.resolution = (camera.width, camera.height)
     added.output = sum(int(OUTPUTS[kind]) for kind in camera.kinds)
     for name, data in texts_of(camera).items():
         spec.add_text(name=name, data=data)

@@ -136,7 +136,8 @@ def _near(
     tolerance: float = _EXACT, **more: Any,
 ) -> Check:  # fmt: skip
     """A check that compares."""
-    low, high = float(expected - tolerance), float(expected + tolerance)
+    low = float(expected - tolerance)
+    high = float(expected + tolerance)
     return Check(name=name, measured=float(measured), low=low, high=high, unit=unit,
                  source=source, meaning=meaning, expected=float(expected), **more)  # fmt: skip
 
@@ -200,7 +201,8 @@ class ExaminedModel:
             return vehicle
         drag = vehicle.linear_drag if isinstance(vehicle, Vehicle) else 0.0
         given = vehicle.path if isinstance(vehicle, Vehicle) else vehicle
-        path, refusal = find_vehicle(given), ""
+        path = find_vehicle(given)
+        refusal = ""
         try:
             Vehicle.load(given)
         except InputError as error:
@@ -245,7 +247,8 @@ class ExaminedModel:
     def mass_matrix(self) -> Array:
         """Of the free joint, at rest and level, from its answers to forces and torques, (6, 6)."""
         data = self.ready()
-        rest, answers = self.acceleration(data), []
+        rest = self.acceleration(data)
+        answers = []
         for wrench in np.eye(6):
             data.qfrc_applied[:] = wrench
             answers.append(self.acceleration(data) - rest)
@@ -370,7 +373,9 @@ def _group(part: Callable[[ExaminedModel], Iterator[Check]]) -> Callable[[ModelL
 
     @wraps(part)
     def group(vehicle: ModelLike = None) -> list[Check]:
-        checks, config, quiet = [], mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
+        checks = []
+        config = mujoco.MjLogConfig.get()
+        quiet = mujoco.MjLogConfig.get()
         quiet.logto_console = False  # a warning becomes a check
         quiet.set()
         try:
@@ -405,7 +410,8 @@ def examine(vehicle: ModelLike = None) -> list[Check]:
 @_group
 def check_accepted(craft: ExaminedModel) -> Iterator[Check]:
     """Whether `--vehicle` takes the file, and its coefficients can be read."""
-    name, source = "accepted by --vehicle", "rotorgram.models.Vehicle.load"
+    name = "accepted by --vehicle"
+    source = "rotorgram.models.Vehicle.load"
     yield _near(name, not craft.refusal, 1, "", source,
                 craft.refusal or "it cannot fly here", 0)  # fmt: skip
     wrong = craft.coefficients if isinstance(craft.coefficients, str) else ""
@@ -448,7 +454,9 @@ def check_inertia(craft: ExaminedModel) -> Iterator[Check]:
                   Range(1 - _TRUNCATION, math.inf, "", "two moments sum up to the third or more"),
                   f"the moments of {name} belong to no body: the largest exceeds the sum of the "
                   "others")  # fmt: skip
-    matrix, mass, center = craft.mass_matrix, craft.mass, craft.center
+    matrix = craft.mass_matrix
+    mass = craft.mass
+    center = craft.center
     answer = float(np.trace(matrix[:3, :3])) / 3
     yield _near("mass against a force of 1 N", answer, mass, "kg", _MODEL,
                 "a force moves it like another mass: armature of the free joint",
@@ -562,7 +570,8 @@ def check_turns(craft: ExaminedModel) -> Iterator[Check]:
     if not craft.rotors:
         return
     reactions = np.array([np.dot(rotor.reaction, rotor.axis) for rotor in craft.rotors])
-    number, total = len(reactions), float(np.abs(reactions).sum())
+    number = len(reactions)
+    total = float(np.abs(reactions).sum())
     share = float(reactions.sum()) / total if total > 0 else math.nan
     most = 1.5 / number if number % 2 else 1 / number  # a wrong sign of R rotors gives 2 / R more
     yield _near("turns: yaw of equal thrusts", share, 0, "", "half of what one wrong sign gives",
@@ -655,11 +664,14 @@ def check_free_fall(craft: ExaminedModel) -> Iterator[Check]:
 def check_momentum(craft: ExaminedModel) -> Iterator[Check]:
     """Five seconds of tumbling without forces: momenta and energy are conserved."""
     model = craft.falling(gravity=np.zeros(3))
-    before, after = craft.ready(model=model), craft.ready(model=model)
+    before = craft.ready(model=model)
+    after = craft.ready(model=model)
     for data in (before, after):
         data.qvel[:] = (*_SPEED, *_SPIN)
     _fly(model, after, 5.0)
-    velocity, spin, energy = [], [], []
+    velocity = []
+    spin = []
+    energy = []
     for data in (before, after):
         rates = np.array(data.qvel[3:])
         velocity.append(data.qvel[:3] + _turned(data, np.cross(rates, craft.center)))
@@ -808,7 +820,8 @@ def check_terminal_velocity(craft: ExaminedModel) -> Iterator[Check]:
     # Closed form from half the final speed on: u = v + a / 2b, u' = r² / 4b - b u².
     seconds = float(data.time)
     if square > 0:
-        shift, scale = linear / (2 * square), root / (2 * square)
+        shift = linear / (2 * square)
+        scale = root / (2 * square)
         phase = math.atanh((final / 2 + shift) / scale)
         expected = scale * math.tanh(root * seconds / 2 + phase) - shift
     else:
@@ -831,7 +844,8 @@ def check_floor(craft: ExaminedModel) -> Iterator[Check]:
     mujoco.mj_forward(craft.model, data)
     yield _near("contacts in free flight", data.ncon, 0, "", "level, 1000 m above the floor",
                 "it touches itself or something that reaches up there", 0)  # fmt: skip
-    rest, model = craft.rest_height, craft.falling(contact=True)
+    rest = craft.rest_height
+    model = craft.falling(contact=True)
     if math.isnan(rest):
         yield _near("floor: height at rest", rest, 0, "m", _MODEL,
                     "it touches something at any height: itself, or a wall")  # fmt: skip

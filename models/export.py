@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 from xml.etree import ElementTree
 
-from .errors import InputError, expect
+from .errors import InputError
 from .files import write_new
 from .library import find_vehicle
 from .mjcf import read_spec
@@ -18,8 +18,10 @@ def export_mjcf(vehicle: Path | str, out: Path) -> str:
     What a TOML file tells by itself is written with all its digits, and moves bit for bit as the
     vehicle. Other models are written by MuJoCo, with six digits. Raises `InputError`.
     """
-    expect(out.suffix.lower() == ".xml", "out", "a name that ends in .xml", str(out))
-    expect(not out.exists(), "out", "the name of a new file", f"{out}, which is there")
+    if out.suffix.lower() != ".xml":
+        raise InputError(f"out: expected a name that ends in .xml, got {out}")
+    if out.exists():
+        raise InputError(f"out: expected the name of a new file, got {out}, which is there")
     path = find_vehicle(vehicle)
     Vehicle.load(path)  # refuses what cannot fly
     if path.suffix.lower() == ".toml":

@@ -74,7 +74,8 @@ class Limits:
         return not (math.isinf(self.low) and math.isinf(self.high))
 
     def _range(self) -> str:
-        low, high = _digits(self.low), _digits(self.high)
+        low = _digits(self.low)
+        high = _digits(self.high)
         if not self._is_bounded:
             return ""
         if math.isinf(self.low):

@@ -10,7 +10,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from .errors import expect
+from .errors import InputError
 from .vehicle import Vehicle
 
 
@@ -35,12 +35,10 @@ class Fleet(Vehicle):
         first = vehicles[0]
         for one in vehicles:
             expected = f"{first.num_rotors} rotors as of {first.name}"
-            expect(
-                one.num_rotors == first.num_rotors,
-                "vehicle",
-                expected,
-                f"{one.num_rotors} of {one.name}",
-            )
+            if one.num_rotors != first.num_rotors:
+                raise InputError(
+                    f"vehicle: expected {expected}, got {one.num_rotors} of {one.name}"
+                )
         step = min(one.timestep for one in vehicles)
         kinds = {one: _under(one, step, first.gravity) for one in vehicles}
         members = tuple(kinds[one] for one in vehicles)
@@ -92,7 +90,8 @@ def load_vehicles(vehicle: Path | str | None, drones: int, *, linear_drag: float
     several = isinstance(vehicle, str) and "," in vehicle and not Path(vehicle).exists()
     names = [name.strip() for name in str(vehicle).split(",")] if several else [vehicle]
     expected = f"at most one vehicle for each of {drones} drones"
-    expect(len(names) <= drones, "vehicle", expected, f"{len(names)}: {vehicle}")
+    if not len(names) <= drones:
+        raise InputError(f"vehicle: expected {expected}, got {len(names)}: {vehicle}")
     found = [Vehicle.load(name, linear_drag=linear_drag) for name in names]
     if len(set(found)) == 1:
         return found[0]
@@ -109,6 +108,7 @@ def _under(vehicle: Vehicle, timestep: float, gravity: float) -> Vehicle:
     if (timestep, gravity) == (vehicle.timestep, vehicle.gravity):
         return vehicle
     model = copy.copy(vehicle.model)
-    model.opt.timestep, model.opt.gravity[2] = timestep, -gravity
+    model.opt.timestep = timestep
+    model.opt.gravity[2] = -gravity
     hover = vehicle.hover_thrust * (gravity / vehicle.gravity)
     return replace(vehicle, model=model, gravity=gravity, hover_thrust=hover)

@@ -68,8 +68,11 @@ def pose_in_mujoco_frame(positions: ArrayLike, attitudes: ArrayLike) -> Array:
     """(X, Y, Z), m, and (phi, theta, psi), degrees, -> `qpos` of a free joint, (..., 7)."""
     right, up, forward = np.moveaxis(np.asarray(positions, np.float64), -1, 0)
     halves = np.radians(np.moveaxis(np.asarray(attitudes, np.float64), -1, 0)) / 2
-    (a, b, c), (d, e, f) = np.cos(halves), np.sin(halves)
+    (a, b, c) = np.cos(halves)
+    (d, e, f) = np.sin(halves)
     # Ry(theta) · Rx(phi) · Rz(psi) as a quaternion about X, Y and Z.
-    w, x = b * a * c + e * d * f, b * d * c + e * a * f
-    y, z = e * a * c - b * d * f, b * a * f - e * d * c
+    w = b * a * c + e * d * f
+    x = b * d * c + e * a * f
+    y = e * a * c - b * d * f
+    z = b * a * f - e * d * c
     return np.stack((forward, -right, up, w, -z, x, -y), axis=-1) + 0.0

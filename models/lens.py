@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from .errors import expect
+from .errors import InputError
 
 WIDEST: Final = math.radians(80.0)
 """Largest angle from its axis that a lens with distortion may see, rad."""
@@ -41,7 +41,8 @@ class Lens(NamedTuple):
     def pixels(self, seen: np.ndarray) -> np.ndarray:
         """The same of points of the camera's frame."""
         ahead = np.where(seen[..., 2:] > 0, seen[..., 2:], np.nan)
-        flat, k = distorted(seen[..., :2] / ahead, self.distortion), self.matrix
+        flat = distorted(seen[..., :2] / ahead, self.distortion)
+        k = self.matrix
         pixels: np.ndarray = flat * np.diagonal(k)[:2] + k[:2, 2]
         return pixels
 
@@ -77,7 +78,8 @@ def distorted(flat: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
     if not any(coefficients):
         return flat
     k1, k2, p1, p2, k3 = coefficients
-    x, y = flat[..., 0], flat[..., 1]
+    x = flat[..., 0]
+    y = flat[..., 1]
     square = x * x + y * y
     scale = 1 + square * (k1 + square * (k2 + square * k3))
     return np.stack(
@@ -106,13 +108,15 @@ def undistorted(flat: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray
                 across, both, down = _slope(found, coefficients)
                 if np.abs(missing).max() < _EXACT:
                     break
-                x, y = missing[..., 0], missing[..., 1]
+                x = missing[..., 0]
+                y = missing[..., 1]
                 steps = np.stack((down * x - both * y, across * y - both * x), axis=-1)
                 found = found + steps / (across * down - both * both)[..., None]
             right = (across * down > both * both) & (across > 0)
             right &= np.linalg.norm(found, axis=-1) < math.tan(WIDEST)
             right &= np.abs(missing).max(axis=-1) < 1e3 * _EXACT
-            expect(bool(right.all()), "distortion", wanted, got)
+            if not right.all():
+                raise InputError(f"distortion: expected {wanted}, got {got}")
     return found
 
 
@@ -121,7 +125,8 @@ def _slope(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Derivatives of `distorted`: of x by x, of x by y (which is that of y by x), of y by y."""
     k1, k2, p1, p2, k3 = coefficients
-    x, y = flat[..., 0], flat[..., 1]
+    x = flat[..., 0]
+    y = flat[..., 1]
     square = x * x + y * y
     scale = 1 + square * (k1 + square * (k2 + square * k3))
     more = 2 * (k1 + square * (2 * k2 + square * 3 * k3))  # of the scale, over x or y

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Final
 
 from . import QUAD_XML
-from .errors import InputError, expect
+from .errors import InputError
 
 __all__ = ["LIBRARY", "find_vehicle", "vehicle_names"]
 
@@ -21,17 +21,24 @@ def find_vehicle(vehicle: Path | str | None) -> Path:
     """The absolute path of a vehicle's file; None is the paper's. Raises `InputError`."""
     if vehicle is None:
         return QUAD_XML.resolve()
-    right = isinstance(vehicle, str | Path) and 0 < len(str(vehicle)) <= 1000
-    expect(right, "vehicle", "the path of a file, of 1 to 1000 characters", repr(vehicle))
-    path, word = Path(vehicle), str(vehicle)
+    if not (isinstance(vehicle, str | Path) and 0 < len(str(vehicle)) <= 1000):
+        raise InputError(
+            f"vehicle: expected the path of a file, of 1 to 1000 characters, got {vehicle!r:.300}"
+        )
+    path = Path(vehicle)
+    word = str(vehicle)
     if word in vehicle_names() and not path.is_file():
         return (LIBRARY / word / "vehicle.toml").resolve()
     if path.suffix == "" and path.name == word and not path.exists():
         known = ", ".join(vehicle_names())
         raise InputError(f"vehicle: expected a file, or one of {known}, got {word!r}")
-    right = path.is_file() or not (path.exists() or path.is_symlink())
-    expect(right, "vehicle", "a file", f"{word}, which is a folder, a device or a link to nothing")
+    if not (path.is_file() or not (path.exists() or path.is_symlink())):
+        raise InputError(
+            "vehicle: expected a file, "
+            f"got {word}, which is a folder, a device or a link to nothing"
+        )
     urdf = path.suffix.lower() == ".urdf"
     wanted = f"a TOML file that names the rotors, with [model] and file = {path.name!r}"
-    expect(not urdf, "vehicle", wanted, "the URDF file itself")
+    if urdf:
+        raise InputError(f"vehicle: expected {wanted}, got the URDF file itself")
     return path.resolve()

@@ -115,7 +115,9 @@ def _check_sizes(path: Path) -> None:
 
     MuJoCo allocates their memory while it reads, and aborts the process if there is too little.
     """
-    seen, total, waiting = {path}, 0, [(_root(path), 1)]
+    seen = {path}
+    total = 0
+    waiting = [(_root(path), 1)]
     while waiting:
         element, times = waiting.pop()
         _check_element(element)

@@ -6,13 +6,14 @@ from typing import Final
 import mujoco
 import numpy as np
 
-from .errors import expect
+from .errors import InputError
 from .mjcf import add_ground, swarm_spec
 from .vehicle import Vehicle, hang_payload, owners
 
 SHARED: Final = ("timestep", "gravity", "integrator", "density", "viscosity", "wind", "magnetic")
 """Options that a world has once, so that its vehicles have to agree."""
-CONTACTS, GROUNDED = "rotorgram/contacts", "rotorgram/grounded"
+CONTACTS = "rotorgram/contacts"
+GROUNDED = "rotorgram/grounded"
 """Sensors of a craft: how many contacts it has, and how many of them with the world."""
 
 
@@ -31,12 +32,17 @@ def swarm_model(
     craft: its free joint comes last, and centers of mass may be moved too. Raises `InputError`
     where vehicles do not agree in `SHARED`.
     """
-    first, names = vehicles[0], drone_names(len(vehicles))
+    first = vehicles[0]
+    names = drone_names(len(vehicles))
     for vehicle in vehicles:
         for name in SHARED:
             ours, its = (getattr(one.model.opt, name) for one in (first, vehicle))
-            same, got = np.array_equal(ours, its), f"{its} of {vehicle.name}"
-            expect(same, "vehicle", f"a {name} of {ours} as of {first.name}", got)
+            same = np.array_equal(ours, its)
+            got = f"{its} of {vehicle.name}"
+            if not same:
+                raise InputError(
+                    f"vehicle: expected a {name} of {ours} as of {first.name}, got {got}"
+                )
     spec = swarm_spec([vehicle.path for vehicle in vehicles], names)
     add_ground(spec)
     spec.compiler.discardvisual = True
@@ -62,7 +68,8 @@ def swarm_model(
 
 def _count_contacts(spec: mujoco.MjSpec, name: str, craft: str, other: str = "") -> None:
     """A sensor of how many contacts a craft has, with anything or with one other body."""
-    kinds, count = mujoco.mjtObj, 1 << mujoco.mjtConDataField.mjCONDATA_FOUND.value
+    kinds = mujoco.mjtObj
+    count = 1 << mujoco.mjtConDataField.mjCONDATA_FOUND.value
     spec.add_sensor(
         name=name, type=mujoco.mjtSensor.mjSENS_CONTACT, objtype=kinds.mjOBJ_XBODY, objname=craft,
         reftype=kinds.mjOBJ_BODY if other else kinds.mjOBJ_UNKNOWN, refname=other,

@@ -19,7 +19,7 @@ import numpy as np
 from . import MOST_DRAG
 from .cameras import Camera, own_cameras, read_cameras
 from .coefficients import PREFIX, Coefficients
-from .errors import InputError, expect
+from .errors import InputError
 from .library import find_vehicle
 from .mjcf import free_body, vehicle_spec
 from .vehicle_file import read_vehicle_file
@@ -105,7 +105,11 @@ class Vehicle:
         """
         file = find_vehicle(path)
         right = isinstance(linear_drag, int | float | np.floating) and 0 <= linear_drag <= MOST_DRAG
-        expect(right, "linear_drag", f"a number from 0 to {MOST_DRAG:g} /s", f"{linear_drag!r}")
+        if not right:
+            raise InputError(
+                f"linear_drag: expected a number from 0 to {MOST_DRAG:g} /s, "
+                f"got {linear_drag!r:.300}"
+            )
         try:
             changed = tuple(one.stat().st_mtime_ns for one in _files(file))
         except OSError as error:
@@ -154,7 +158,8 @@ class Vehicle:
     def max_acceleration(self) -> float:
         """Largest vertical acceleration of the level craft, up or down, m/s²."""
         ends = self.allocation[0] * (self.thrust_low, self.thrust_high)
-        most, least = ends.max(axis=0).sum(), ends.min(axis=0).sum()
+        most = ends.max(axis=0).sum()
+        least = ends.min(axis=0).sum()
         return float(max(most / self.mass - self.gravity, self.gravity - least / self.mass))
 
     def turning(self, axis: Sequence[float] | np.ndarray) -> float:
@@ -194,7 +199,8 @@ class Vehicle:
         data.qpos[7:10] = (0.0, 0.0, high - cable)
         clear = not _touches(model, data, high)
         expected = f"a length at which a payload with a radius of {radius:.3g} m hangs clear"
-        expect(clear, "effects: cable", expected, f"{cable:g} m")
+        if not clear:
+            raise InputError(f"effects: cable: expected {expected}, got {cable:g} m")
         return model
 
     def with_movable_center(self) -> mujoco.MjModel:
@@ -315,7 +321,8 @@ def _check_structure(model: mujoco.MjModel) -> None:
     for name in dir(model):
         array = getattr(model, name)
         finite = getattr(array, "dtype", None) != np.float64 or np.isfinite(array).all()
-        expect(finite, "vehicle", "finite numbers", f"others in {name}")
+        if not finite:
+            raise InputError(f"vehicle: expected finite numbers, got others in {name}")
     for name in ("timestep", "gravity", "wind", "density", "viscosity"):
         if not np.isfinite(getattr(model.opt, name)).all():
             raise InputError(f"vehicle: expected finite numbers, got others in {name}")
@@ -324,20 +331,24 @@ def _check_structure(model: mujoco.MjModel) -> None:
         raise InputError(f"vehicle: expected a mass of at most {_MAX_MASS:g} kg, got {heaviest:g}")
     free = int((model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).sum())
     got = f"{free} free of {model.njnt} joints"
-    expect((free, model.njnt) == (1, 1), "vehicle", "one free body and no other joints", got)
-    expect(model.nu, "vehicle", "at least one rotor, an actuator at a site", "none")
+    if (free, model.njnt) != (1, 1):
+        raise InputError(f"vehicle: expected one free body and no other joints, got {got}")
+    if not model.nu:
+        raise InputError("vehicle: expected at least one rotor, an actuator at a site, got none")
 
 
 def _check_flyable(model: mujoco.MjModel) -> None:
     """Raise `InputError` for a vehicle's model that does not fall, or that cannot be stepped."""
-    mass, gravity = float(model.body_subtreemass[model.jnt_bodyid[0]]), model.opt.gravity
+    mass = float(model.body_subtreemass[model.jnt_bodyid[0]])
+    gravity = model.opt.gravity
     right = mass > 0 and gravity[2] < 0 and not gravity[:2].any()
     got = f"{mass:g} kg and {gravity.tolist()} m/s²"
-    expect(right, "vehicle", "a mass > 0 and gravity along -z", got)
+    if not right:
+        raise InputError(f"vehicle: expected a mass > 0 and gravity along -z, got {got}")
     step = model.opt.timestep
     limits = f"at least {_LEAST_TIMESTEP:g} s and at most {_MOST_TIMESTEP:g} s"
-    right = _LEAST_TIMESTEP <= step <= _MOST_TIMESTEP
-    expect(right, "vehicle", f"a physics step of {limits}", f"{step:g}")
+    if not _LEAST_TIMESTEP <= step <= _MOST_TIMESTEP:
+        raise InputError(f"vehicle: expected a physics step of {limits}, got {step:g}")
 
 
 @lru_cache(maxsize=32)
@@ -349,7 +360,7 @@ def _load(path: Path, drag: float, changed: tuple[int, ...]) -> Vehicle:
     mass, center, inertia = mass_properties(model, data)
     for index in range(model.nu):
         for expected, got in rotor_faults(model, index):
-            expect(False, "vehicle", expected, got)
+            raise InputError(f"vehicle: expected {expected}, got {got}") from None
     rotors = tuple(read_rotor(model, data, index) for index in range(model.nu))
     allocation = allocate(rotors, center)
     model.dof_damping[0:3] = drag * mass
@@ -409,7 +420,8 @@ def rotor_name(model: mujoco.MjModel, index: int) -> str:
 
 def rotor_faults(model: mujoco.MjModel, index: int) -> Iterator[tuple[str, str]]:
     """(What is expected, what came) of an actuator that is no rotor."""
-    body, rotor = int(model.jnt_bodyid[0]), f"rotor {rotor_name(model, index)}"
+    body = int(model.jnt_bodyid[0])
+    rotor = f"rotor {rotor_name(model, index)}"
     site, reference = model.actuator_trnid[index].tolist()
     at_site = model.actuator_trntype[index] == mujoco.mjtTrn.mjTRN_SITE
     if not at_site or model.body_rootid[model.site_bodyid[site]] != body:
@@ -432,7 +444,8 @@ def rotor_faults(model: mujoco.MjModel, index: int) -> Iterator[tuple[str, str]]
 def read_rotor(model: mujoco.MjModel, data: Any, index: int) -> Rotor:
     """The rotor of an actuator without faults; `data` is at the origin and level."""
     site = int(model.actuator_trnid[index, 0])
-    force, torque = model.actuator_gear[index, :3], model.actuator_gear[index, 3:]
+    force = model.actuator_gear[index, :3]
+    torque = model.actuator_gear[index, 3:]
     size = math.hypot(*force)
     newtons = size * float(model.actuator_gainprm[index, 0])
     turn = data.site_xmat[site].reshape(3, 3)
@@ -481,14 +494,17 @@ def _hover(rotors: tuple[Rotor, ...], allocation: np.ndarray, weight: float) -> 
     hovers = left <= 1e-6 * _torque_scale(allocation, weight)
     hovers = hovers and np.abs(sideways).max() <= _ROUNDED * weight
     able = "rotors that can carry the level craft without a torque or a sideways force"
-    expect(hovers, "vehicle", able, "ones that cannot")
+    if not hovers:
+        raise InputError(f"vehicle: expected {able}, got ones that cannot")
     for rotor, newtons in zip(rotors, thrust.tolist(), strict=True):
         carries = f"rotor {rotor.name} to carry"
         part = f"{carries} a part of the weight of the level craft"
-        expect(newtons > _RELATIVE * weight, "vehicle", part, f"{newtons:.4g} N")
+        if not newtons > _RELATIVE * weight:
+            raise InputError(f"vehicle: expected {part}, got {newtons:.4g} N")
         share = f"{carries} its share of the weight, {newtons:.4g} N, within its limits"
         got = f"{rotor.low:g} to {rotor.high:g} N"
-        expect(rotor.low <= newtons < rotor.high, "vehicle", share, got)
+        if not rotor.low <= newtons < rotor.high:
+            raise InputError(f"vehicle: expected {share}, got {got}")
     return thrust
 
 
@@ -497,13 +513,15 @@ def find_rest_height(model: mujoco.MjModel, data: Any) -> float:
 
     Raises `InputError` if it touches something at any height, like a wall.
     """
-    low, high = 0.0, _FIRST_HEIGHT
+    low = 0.0
+    high = _FIRST_HEIGHT
     if not _touches(model, data, low):
         return 0.0
     while _touches(model, data, high):
         high *= 2
         got = f"one that touches something at {high:.0f} m"
-        expect(high <= _MOST_HEIGHT, "vehicle", "a craft that is free above the ground", got)
+        if not high <= _MOST_HEIGHT:
+            raise InputError(f"vehicle: expected a craft that is free above the ground, got {got}")
     while high - low > 1e-10 * high:
         middle = (low + high) / 2
         low, high = (middle, high) if _touches(model, data, middle) else (low, middle)

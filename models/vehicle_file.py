@@ -229,7 +229,10 @@ def read_vehicle_file(path: Path) -> VehicleFile:
     `OSError` if the file cannot be read.
     """
     size = path.stat().st_size
-    expect(size <= _MOST_BYTES, "vehicle", f"a TOML file of at most {_MOST_BYTES} bytes", f"{size}")
+    if not size <= _MOST_BYTES:
+        raise InputError(
+            f"vehicle: expected a TOML file of at most {_MOST_BYTES} bytes, got {size}"
+        )
     try:
         return _Reader(path, tomllib.loads(path.read_text(encoding="utf-8"))).result
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
@@ -254,7 +257,10 @@ class _Reader:
         cameras = tuple(self._camera(one, f"cameras[{i}]") for i, one in tables)
         twice = [one.name for one in cameras]
         twice = [name for name in twice if twice.count(name) > 1]
-        expect(not twice, "cameras", "a name of its own for each", f"{''.join(twice[:1])!r} twice")
+        if twice:
+            raise InputError(
+                f"cameras: expected a name of its own for each, got {''.join(twice[:1])!r} twice"
+            )
         for group in ("drag", "battery", "sensors", "real_flights"):
             self._read(tree.get(group, {}), group)
         physical = {key: value for key, value in tree.items() if key != "real_flights"}
@@ -279,7 +285,8 @@ class _Reader:
         }
         _check_keys(name, table, [*_WORDS.get(kind, ()), *entries], "source")
         source = table.get("source", "")
-        expect(isinstance(source, str), f"{name}.source", "a text", repr(source))
+        if not isinstance(source, str):
+            raise InputError(f"{name}.source: expected a text, got {source!r:.300}")
         values = {}
         for key, one in entries.items():
             if key in table:
@@ -294,39 +301,55 @@ class _Reader:
         self._read(table, "model")
         file = table.get("file")
         right = isinstance(file, str) and Path(file).suffix.lower() in (".urdf", ".xml")
-        expect(right, "model.file", "a URDF file (.urdf) or an MJCF file (.xml)", repr(file))
+        if not right:
+            raise InputError(
+                "model.file: expected a URDF file (.urdf) or an MJCF file (.xml), "
+                f"got {file!r:.300}"
+            )
         model = path.parent / str(file)
-        expect(model.is_file(), "model.file", "a file that is there", repr(file))
+        if not model.is_file():
+            raise InputError(f"model.file: expected a file that is there, got {file!r:.300}")
         return model
 
     def _body(self, table: Any, model: Path | None) -> tuple[Part, ...]:
         if model is not None:
-            expect(table is None, "body", "none beside a model's file, which has it", "a table")
+            if table is not None:
+                raise InputError(
+                    "body: expected none beside a model's file, which has it, got a table"
+                )
             return ()
-        expect(table is not None, "vehicle", "a table [body], or [model] with a file", "neither")
+        if table is None:
+            raise InputError(
+                "vehicle: expected a table [body], or [model] with a file, got neither"
+            )
         given = self._read(table, "body")
         own = [key for key in ("mass", "inertia", "center_of_mass") if key in given]
         if "parts" in table:
             got = f"{', '.join(own)} too"
-            expect(not own, "body", "parts, or mass and inertia", got)
+            if own:
+                raise InputError(f"body: expected parts, or mass and inertia, got {got}")
             listed = _tables("body.parts", table["parts"])
             return tuple(self._part(one, f"body.parts[{i}]") for i, one in enumerate(listed, 1))
         for key in ("mass", "inertia"):
-            expect(key in given, "body", "mass and inertia, or parts", f"no {key}")
+            if key not in given:
+                raise InputError(f"body: expected mass and inertia, or parts, got no {key}")
         _check_inertia(given["inertia"])
         return ()
 
     def _part(self, table: Any, name: str) -> Part:
         given = self._read(table, "body.parts", name)
         shape = table.get("shape")
-        right = isinstance(shape, str) and shape in _SHAPES
-        expect(right, f"{name}.shape", "'box' or 'cylinder'", repr(shape))
+        if not (isinstance(shape, str) and shape in _SHAPES):
+            raise InputError(f"{name}.shape: expected 'box' or 'cylinder', got {shape!r:.300}")
         turn, other = ("yaw", "axis") if shape == "box" else ("axis", "yaw")
         for key in ("mass", *_SHAPES[shape]):
-            expect(key in given, name, f"{key} of a {shape}", "none")
+            if key not in given:
+                raise InputError(f"{name}: expected {key} of a {shape}, got none")
         foreign = ({"size", "radius", "length", other} - set(_SHAPES[shape])) & set(given)
         for key in sorted(foreign):
-            expect(False, name, f"no {key} for a {shape}", repr(given[key]))
+            raise InputError(
+                f"{name}: expected no {key} for a {shape}, got {given[key]!r:.300}"
+            ) from None
         if "axis" in given:
             _check_axis(f"{name}.axis", given["axis"])
         size = (value for key in _SHAPES[shape] for value in _floats(given[key]))
@@ -339,27 +362,40 @@ class _Reader:
 
     def _camera(self, table: Any, name: str) -> Camera:
         given = self._read(table, "cameras", name)
-        own, kinds, stands = table.get("name"), table.get("kinds", ["rgb"]), table.get("stands")
-        expect(
-            is_name(own), f"{name}.name", f"up to {MOST_LETTERS} letters, digits and _", repr(own)
-        )
+        own = table.get("name")
+        kinds = table.get("kinds", ["rgb"])
+        stands = table.get("stands")
+        if not is_name(own):
+            raise InputError(
+                f"{name}.name: expected up to {MOST_LETTERS} letters, digits and _, "
+                f"got {own!r:.300}"
+            )
         right = isinstance(kinds, list) and bool(kinds)
         right = right and all(isinstance(kind, str) and kind in OUTPUTS for kind in kinds)
-        expect(right, f"{name}.kinds", f"some of {', '.join(OUTPUTS)}", repr(kinds))
-        right = stands is None or isinstance(stands, bool)
-        expect(right, f"{name}.stands", "true, for one that no drone carries", repr(stands))
+        if not right:
+            raise InputError(
+                f"{name}.kinds: expected some of {', '.join(OUTPUTS)}, got {kinds!r:.300}"
+            )
+        if not (stands is None or isinstance(stands, bool)):
+            raise InputError(
+                f"{name}.stands: expected true, for one that no drone carries, got {stands!r:.300}"
+            )
         look = given.get("look", _AHEAD)
         _check_axis(f"{name}.look", look)
         upright = math.hypot(*look[:2]) > 1e-6 * math.hypot(*look)
         up = given.get("up", _UP if upright else _AHEAD)
         across = math.hypot(*_crossed(look, up))
-        right = across > 1e-6 * math.hypot(*look) * math.hypot(*up)
-        expect(right, f"{name}.up", "another direction than look", f"{list(up)}")
+        if not across > 1e-6 * math.hypot(*look) * math.hypot(*up):
+            raise InputError(f"{name}.up: expected another direction than look, got {list(up)}")
         width, height = (round(side) for side in given.get("resolution", (64.0, 64.0)))
-        right = (width, height) == given.get("resolution", (width, height))
-        expect(right, f"{name}.resolution", "whole numbers", f"{given.get('resolution')}")
-        right = (width, height) != (1, 1)
-        expect(right, f"{name}.resolution", "more than one pixel", f"{width} by {height}")
+        if (width, height) != given.get("resolution", (width, height)):
+            raise InputError(
+                f"{name}.resolution: expected whole numbers, got {given.get('resolution')}"
+            )
+        if (width, height) == (1, 1):
+            raise InputError(
+                f"{name}.resolution: expected more than one pixel, got {width} by {height}"
+            )
         return Camera(
             name=str(own),
             width=width,
@@ -377,9 +413,11 @@ class _Reader:
     def _rotors(self, table: Any, model: Path | None) -> tuple[PlacedRotor, ...]:
         if table is None and model is not None and model.suffix.lower() == ".xml":
             return ()  # those of the file
-        expect(table is not None, "vehicle", "a table [rotors]", "none")
+        if table is None:
+            raise InputError("vehicle: expected a table [rotors], got none")
         given = self._read(table, "rotors")
-        frame, listed = table.get("frame"), table.get("list")
+        frame = table.get("frame")
+        listed = table.get("list")
         mjcf = model is not None and model.suffix.lower() == ".xml"
         if listed is None and frame is None and mjcf:
             self._only_coefficients(given)
@@ -391,59 +429,82 @@ class _Reader:
         self._check_thrust(given)
         if frame is None:
             for key in ("arm", "height"):
-                expect(key not in given, "rotors", f"no {key} with a list", repr(given.get(key)))
+                if key in given:
+                    raise InputError(
+                        f"rotors: expected no {key} with a list, got {given.get(key)!r:.300}"
+                    )
             tables = enumerate(_tables("rotors.list", listed), 1)
             rotors = [self._rotor(one, i, model) for i, one in tables]
             names = [rotor.name for rotor in rotors]
             twice = next((name for name in names if names.count(name) > 1), None)
-            expect(twice is None, "rotors.list", "a name of its own for each", f"{twice!r} twice")
+            if twice is not None:
+                raise InputError(
+                    f"rotors.list: expected a name of its own for each, got {twice!r} twice"
+                )
             return tuple(rotors)
         right = isinstance(frame, str) and frame in FRAMES
         expect(right, "rotors.frame", " or ".join(map(repr, FRAMES)), repr(frame))
-        expect("arm" in given, "rotors", f"arm of the frame {frame!r}", "none")
+        if "arm" not in given:
+            raise InputError(f"rotors: expected arm of the frame {frame!r}, got none")
         return frame_rotors(frame, given["arm"], given.get("height", 0.0))
 
     def _only_coefficients(self, given: Mapping[str, Any]) -> None:
         for key in given:
             wanted = f"no {key} for rotors of the model's file"
-            expect(f"rotors.{key}" in COEFFICIENTS, "rotors", wanted, repr(given[key]))
+            if f"rotors.{key}" not in COEFFICIENTS:
+                raise InputError(f"rotors: expected {wanted}, got {given[key]!r:.300}")
 
     def _check_thrust(self, given: Mapping[str, Any]) -> None:
         """Thrust and reaction are told once each."""
         two = [key for key in ("thrust", "speed") if key in given]
         got = " and ".join(two) or "neither"
-        expect(len(two) == 1, "rotors", "thrust, or speed with thrust_coefficient", got)
+        if len(two) != 1:
+            raise InputError(
+                f"rotors: expected thrust, or speed with thrust_coefficient, got {got}"
+            )
         low, high = given[two[0]]
-        expect(low < high, f"rotors.{two[0]}", "a lower and a higher number", f"{low:g}, {high:g}")
+        if not low < high:
+            raise InputError(
+                f"rotors.{two[0]}: expected a lower and a higher number, got {low:g}, {high:g}"
+            )
         two = [key for key in ("reaction", "torque_coefficient") if key in given]
         wanted = "reaction, or torque_coefficient with thrust_coefficient"
         expect(len(two) == 1, "rotors", wanted, " and ".join(two) or "neither")
         for key in ("speed", "torque_coefficient"):
-            right = key not in given or "thrust_coefficient" in given
-            expect(right, "rotors", f"thrust_coefficient with {key}", "none")
+            if not (key not in given or "thrust_coefficient" in given):
+                raise InputError(f"rotors: expected thrust_coefficient with {key}, got none")
 
     def _rotor(self, table: Any, number: int, model: Path | None) -> PlacedRotor:
         name = f"rotors.list[{number}]"
         _check_alike(name, table)
         given = self._read(table, "rotors.list", name)
-        axis, turn = given.get("axis", _UP), table.get("turn")
+        axis = given.get("axis", _UP)
+        turn = table.get("turn")
         _check_axis(f"{name}.axis", axis)
-        expect(turn in ("cw", "ccw"), f"{name}.turn", "'cw' or 'ccw'", repr(turn))
+        if turn not in ("cw", "ccw"):
+            raise InputError(f"{name}.turn: expected 'cw' or 'ccw', got {turn!r:.300}")
         own = table.get("name", f"rotor{number}")
         _check_name(f"{name}.name", own)
         places = [key for key in ("link", "body", "site") if key in table]
         if model is None:
             expect(not places, name, "a position", "".join(places[:1]))
-            expect("position" in given, name, "a position", "none")
+            if "position" not in given:
+                raise InputError(f"{name}: expected a position, got none")
             on = None
         else:
             got = " and ".join(places) or "none"
-            expect(len(places) == 1, name, "one of link, body and site of the model's file", got)
+            if len(places) != 1:
+                raise InputError(
+                    f"{name}: expected one of link, body and site of the model's file, got {got}"
+                )
             place = table[places[0]]
-            expect(isinstance(place, str), f"{name}.{places[0]}", "a name", repr(place))
+            if not isinstance(place, str):
+                raise InputError(f"{name}.{places[0]}: expected a name, got {place!r:.300}")
             at_site = places == ["site"]
-            right = not (at_site and "position" in given)
-            expect(right, name, "no position besides a site, which has it", "both")
+            if at_site and "position" in given:
+                raise InputError(
+                    f"{name}: expected no position besides a site, which has it, got both"
+                )
             on = ("site" if at_site else "body", place)
         return PlacedRotor(
             name=own,
@@ -478,16 +539,20 @@ def _number(name: str, limits: Limits, given: Any, source: str) -> Number:
     """A number that is given plainly or with its provenance. Raises `InputError`."""
     told = given if isinstance(given, dict) else {"value": given}
     _check_keys(name, told, ("value", "source", "why", "others"))
-    expect("value" in told, name, "a value", "none")
+    if "value" not in told:
+        raise InputError(f"{name}: expected a value, got none")
     texts = {key: told.get(key, "") for key in ("source", "why")}
     for key, text in texts.items():
-        expect(isinstance(text, str), f"{name}.{key}", "a text", repr(text))
+        if not isinstance(text, str):
+            raise InputError(f"{name}.{key}: expected a text, got {text!r:.300}")
     others = []
     for i, other in enumerate(_tables(f"{name}.others", told.get("others", []), least=0), 1):
         _check_keys(f"{name}.others[{i}]", other, ("value", "source"))
-        expect("value" in other, f"{name}.others[{i}]", "a value", "none")
+        if "value" not in other:
+            raise InputError(f"{name}.others[{i}]: expected a value, got none")
         where = other.get("source", "")
-        expect(isinstance(where, str), f"{name}.others[{i}].source", "a text", repr(where))
+        if not isinstance(where, str):
+            raise InputError(f"{name}.others[{i}].source: expected a text, got {where!r:.300}")
         others.append((check(f"{name}.others[{i}]", limits, other["value"]), where))
     return Number(
         name=name,
@@ -511,27 +576,32 @@ def _check_alike(name: str, table: Any) -> None:
 
 
 def _check_keys(name: str, table: Any, known: Sequence[str], *silent: str) -> None:
-    expect(isinstance(table, dict), name, "a table", f"{table!r:.80}")
+    if not isinstance(table, dict):
+        raise InputError(f"{name}: expected a table, got {table!r:.80}")
     for key in table:
-        right = key in known or key in silent
-        expect(right, name, f"some of {', '.join(known)}", repr(key))
+        if not (key in known or key in silent):
+            raise InputError(f"{name}: expected some of {', '.join(known)}, got {key!r:.300}")
 
 
 def _check_name(name: str, given: Any) -> None:
-    right = isinstance(given, str) and 0 < len(given) <= 100 and given.isprintable()
-    expect(right, name, "a text of 1 to 100 printable characters", repr(given))
+    if not (isinstance(given, str) and 0 < len(given) <= 100 and given.isprintable()):
+        raise InputError(
+            f"{name}: expected a text of 1 to 100 printable characters, got {given!r:.300}"
+        )
 
 
 def _tables(name: str, given: Any, least: int = 1) -> list[Any]:
     right = isinstance(given, list) and len(given) >= least
     wanted = "a list of tables" + ", at least one" * least
-    expect(right, name, wanted, f"{given!r:.80}")
+    if not right:
+        raise InputError(f"{name}: expected {wanted}, got {given!r:.80}")
     return list(given)
 
 
 def _check_axis(name: str, axis: Sequence[float]) -> None:
     got = ", ".join(f"{one:g}" for one in axis)
-    expect(math.hypot(*axis) > 1e-6, name, "a direction: three numbers, not all 0", got)
+    if not math.hypot(*axis) > 1e-6:
+        raise InputError(f"{name}: expected a direction: three numbers, not all 0, got {got}")
 
 
 def _check_inertia(values: tuple[float, ...]) -> None:
@@ -540,14 +610,18 @@ def _check_inertia(values: tuple[float, ...]) -> None:
 
     got = ", ".join(f"{one:g}" for one in values)
     counts = "3 numbers: Ixx, Iyy, Izz, or 6: Ixx, Iyy, Izz, Ixy, Ixz, Iyz"
-    expect(len(values) in (3, 6), "body.inertia", counts, got)
+    if len(values) not in (3, 6):
+        raise InputError(f"body.inertia: expected {counts}, got {got}")
     xx, yy, zz, xy, xz, yz = (*values, 0.0, 0.0, 0.0)[:6]
     low, middle, high = np.linalg.eigvalsh(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))).tolist()
     wanted = f"principal moments above {_LEAST_MOMENT:g} kg m²"
-    expect(low > _LEAST_MOMENT, "body.inertia", wanted, got)
+    if not low > _LEAST_MOMENT:
+        raise InputError(f"body.inertia: expected {wanted}, got {got}")
     wanted = "principal moments of which none is larger than the sum of the others"
-    right = high <= (low + middle) * (1 + 1e-9)
-    expect(right, "body.inertia", wanted, f"{low:.4g}, {middle:.4g} and {high:.4g} kg m²")
+    if not high <= (low + middle) * (1 + 1e-9):
+        raise InputError(
+            f"body.inertia: expected {wanted}, got {low:.4g}, {middle:.4g} and {high:.4g} kg m²"
+        )
 
 
 def _floats(value: float | Iterable[float]) -> tuple[float, ...]:
@@ -590,7 +664,8 @@ class _Mjcf:
     """
 
     def __init__(self, file: VehicleFile) -> None:
-        self.file, self.rotors = file, file.rotors
+        self.file = file
+        self.rotors = file.rotors
         reach = max(math.hypot(*rotor.position) for rotor in self.rotors)
         self.reach = max(reach, file.value("rotors.radius", 0.0), 1e-2)
         self.unit = self.reach / math.sqrt(2)  # 1 m of quad.xml
@@ -655,7 +730,8 @@ class _Mjcf:
         lowest = max(self.half[2], *(motor - rotor.position[2] for rotor in self.rotors))
         given: float = self.file.value("body.ground_clearance", lowest + 0.33 * self.unit)
         wanted = f"more than {lowest:.4g} m, which hub and rotors need"
-        expect(given > lowest, "body.ground_clearance", wanted, f"{given:g}")
+        if not given > lowest:
+            raise InputError(f"body.ground_clearance: expected {wanted}, got {given:g}")
         return given
 
     def _geom(self, name: str, kind: str, material: str, **more: str) -> None:
@@ -701,7 +777,8 @@ class _Mjcf:
             where = {"pos": _text(*rotor.position), "size": motor} | _turned(rotor)
             self._geom(f"motor {rotor.name}", "cylinder", "silver", **where, **seen)
         thick = min(0.03 * self.unit, (clearance - self.half[2]) / 2)
-        long, wide = 0.5 * self.unit, 0.45 * self.unit
+        long = 0.5 * self.unit
+        wide = 0.45 * self.unit
         for side, y in (("left", wide), ("right", -wide)):
             ends = _text(-long, y, thick - clearance, long, y, thick - clearance)
             self._geom(f"skid {side}", "capsule", "silver", size=_text(thick), fromto=ends)
@@ -716,7 +793,8 @@ class _Mjcf:
 
     def _looks(self) -> None:
         x, y, z = self.half
-        shell, mark = _text(1.2 * x, 0.9 * y, 1.7 * z), _text(0.6 * x, 0.55 * y, 1.1 * z)
+        shell = _text(1.2 * x, 0.9 * y, 1.7 * z)
+        mark = _text(0.6 * x, 0.55 * y, 1.1 * z)
         self._ghost("canopy", "ellipsoid", "shell", pos=_text(0, 0, 0.7 * z), size=shell)
         self._ghost("front mark", "ellipsoid", "front", pos=_text(0.9 * x, 0, 0.6 * z), size=mark)
         radius = self.file.value("rotors.radius") or 0.4 * _nearest(self.rotors, self.reach)
@@ -738,7 +816,8 @@ class _Mjcf:
             self._ghost("", "ellipsoid", "carbon", size=_text(*blade), **pos, **turned)
 
     def _actuators(self) -> None:
-        motors, reaction = ElementTree.SubElement(self.root, "actuator"), self.file.reaction
+        motors = ElementTree.SubElement(self.root, "actuator")
+        reaction = self.file.reaction
         for rotor in self.rotors:
             place = {"name": rotor.name, "pos": _text(*rotor.position)} | _turned(rotor)
             looks = {"group": "4", "size": _text(0.02 * self.unit)}
@@ -786,24 +865,25 @@ def _complete(spec: mujoco.MjSpec, file: VehicleFile) -> None:
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
         spec.compiler.fusestatic = False  # it would fuse the root with the world
         root = spec.worldbody.first_body()
-        expect(root is not None, "model.file", "a URDF file with links", "none")
+        if root is None:
+            raise InputError("model.file: expected a URDF file with links, got none")
         if not list(root.joints):
             root.add_freejoint()
     if urdf or file.value("timestep"):
         spec.option.timestep = file.value("timestep", DEFAULT_TIMESTEP)
     if urdf or file.value("gravity"):
         spec.option.gravity = (0.0, 0.0, -file.value("gravity", DEFAULT_GRAVITY))
-    expect(
-        not file.rotors or not list(spec.actuators),
-        "rotors.list",
-        "none for a model's file with actuators, which are its rotors",
-        f"{len(file.rotors)} of them",
-    )
+    if not (not file.rotors or not list(spec.actuators)):
+        raise InputError(
+            "rotors.list: expected none for a model's file with actuators, which are its rotors, "
+            f"got {len(file.rotors)} of them"
+        )
     for number, rotor in enumerate(file.rotors, 1):
         _add_rotor(spec, file, rotor, number)
     for name, values in file.coefficients.items():
         numeric = spec.numeric(PREFIX + name) or spec.add_numeric(name=PREFIX + name)
-        numeric.size, numeric.data = len(values), values
+        numeric.size = len(values)
+        numeric.data = values
 
 
 def _find_meshes(spec: mujoco.MjSpec, folder: Path) -> None:
@@ -816,7 +896,10 @@ def _find_meshes(spec: mujoco.MjSpec, folder: Path) -> None:
         places = (up / way for up in (folder, *folder.parents) for way in ways)
         found = next((place for place in places if place.is_file()), None)
         got = f"no file for {mesh.file}"
-        expect(found, "model.file", "its meshes in its folder or one above", got)
+        if not found:
+            raise InputError(
+                f"model.file: expected its meshes in its folder or one above, got {got}"
+            )
         mesh.file = os.path.relpath(str(found), folder)
 
 
@@ -826,7 +909,8 @@ def _add_rotor(spec: mujoco.MjSpec, file: VehicleFile, rotor: PlacedRotor, numbe
     known = [one.name for one in (spec.sites if kind == "site" else spec.bodies)]
     found = getattr(spec, kind)(name)
     wanted = f"a {kind} of the model's file: {', '.join(one for one in known if one != 'world')}"
-    expect(found is not None and name != "world", f"rotors.list[{number}]", wanted, repr(name))
+    if not (found is not None and name != "world"):
+        raise InputError(f"rotors.list[{number}]: expected {wanted}, got {name!r:.300}")
     if kind == "body":
         for joint in list(found.joints):  # a propeller that turns is welded on
             if joint.type != mujoco.mjtJoint.mjJNT_FREE:
@@ -850,7 +934,11 @@ def _add_disc(body: Any, file: VehicleFile, rotor: PlacedRotor) -> None:
     if (radius := file.value("rotors.radius")) is None:
         return
     disc = body.add_geom(type=mujoco.mjtGeom.mjGEOM_CYLINDER, pos=rotor.position, group=2)
-    disc.size, disc.rgba = (radius, 0.01 * radius, 0), (0.20, 0.46, 0.78, 0.42)
-    disc.mass, disc.contype, disc.conaffinity = 0, 0, 0
+    disc.size = (radius, 0.01 * radius, 0)
+    disc.rgba = (0.20, 0.46, 0.78, 0.42)
+    disc.mass = 0
+    disc.contype = 0
+    disc.conaffinity = 0
     if rotor.axis != _UP:
-        disc.alt.type, disc.alt.zaxis = mujoco.mjtOrientation.mjORIENTATION_ZAXIS, rotor.axis
+        disc.alt.type = mujoco.mjtOrientation.mjORIENTATION_ZAXIS
+        disc.alt.zaxis = rotor.axis

@@ -68,7 +68,8 @@ def drawn_model(
     scale_drawing(model, vehicle.radius, 0.0)
     extent = model.stat.extent
     nearest = _NEAREST * min(craft.radius for craft in crafts)
-    model.vis.map.znear, model.vis.map.zfar = nearest / extent, FARTHEST / extent
+    model.vis.map.znear = nearest / extent
+    model.vis.map.zfar = FARTHEST / extent
     return model
 
 
@@ -86,7 +87,8 @@ def _add(body: Any, name: str, kind: Any, size: Sequence[float], **more: Any) ->
     """A geom that is only drawn."""
     geom = body.add_geom(name=name, type=kind, size=size, **more)
     geom.contype = geom.conaffinity = 0
-    geom.mass, geom.group = 0.0, 1
+    geom.mass = 0.0
+    geom.group = 1
 
 
 def _add_mark(body: mujoco.MjsBody, name: str, mark: Mark, thickness: float) -> None:
@@ -113,7 +115,8 @@ def objects_in(model: mujoco.MjModel, names: Sequence[str]) -> tuple[tuple[str, 
     last slash, if they have two or more. Geoms of the world without a name are told apart by their
     material.
     """
-    known, numbers = {NOTHING: 0}, [0]
+    known = {NOTHING: 0}
+    numbers = [0]
     roots = {int(model.body(one).rootid[0]): one.partition("/")[0] for one in _bodies(model, names)}
     for number in range(model.ngeom):
         geom = model.geom(number)

@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 
 from ..models.cameras import FARTHEST, MOST_PIXELS, Camera, Optics, View
-from ..models.errors import expect
+from ..models.errors import InputError
 from ..models.fleet import members_of
 from ..models.lens import Lens
 from ..models.swarm import drone_names
@@ -54,8 +54,10 @@ class Cameras:
         payload: bool = False,
         fine: bool = False,
     ) -> None:
-        expect(views, "cameras", "one picture or more", "none")
-        self.views, self._shape = tuple(views), shape
+        if not views:
+            raise InputError("cameras: expected one picture or more, got none")
+        self.views = tuple(views)
+        self._shape = shape
         self._names = drone_names(shape[1])
         self.model = drawn_model(vehicle, self._names, world, marks, payload=payload)
         self.data = mujoco.MjData(self.model)
@@ -78,7 +80,8 @@ class Cameras:
         self.model.vis.quality.offsamples = 4 if fine else 0
         self._scene = mujoco.MjvScene(self.model, self.model.ngeom + _ROOM)
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW.value] = fine
-        self._option, self._camera = mujoco.MjvOption(), mujoco.MjvCamera()
+        self._option = mujoco.MjvOption()
+        self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
 
     def _camera_ids(self, view: View) -> list[int]:
@@ -208,7 +211,9 @@ class Cameras:
         """Colours, uint8 (H, W, 3); or numbers of geoms from 1, 0 for none, int32 (H, W), and their
         depth, float32 (H, W), m. The first row is on top.
         """
-        scene, view_of, every = self._scene, self._camera, mujoco.mjtCatBit.mjCAT_ALL.value
+        scene = self._scene
+        view_of = self._camera
+        every = mujoco.mjtCatBit.mjCAT_ALL.value
         view_of.fixedcamid = eye.camera
         # The scene lays an endless floor around the camera that it had: without this the last one.
         mujoco.mjv_updateCamera(self.model, self.data, view_of, scene)
@@ -224,11 +229,13 @@ class Cameras:
         if eye.source is not None:
             eye.source.aim(scene)
         self._drawing.draw(scene, colors, depth if objects else None)
-        colors, depth = colors[::-1], depth[::-1]
+        colors = colors[::-1]
+        depth = depth[::-1]
         if not objects:
             return colors if eye.source is None else eye.source.blended(colors), depth
         if eye.source is not None:
-            colors, depth = eye.source.nearest(colors), eye.source.nearest(depth)
+            colors = eye.source.nearest(colors)
+            depth = eye.source.nearest(depth)
         return self._number(eye, colors), self._meters(depth)
 
     def _number(self, eye: "_Eye", colors: np.ndarray) -> np.ndarray:
@@ -246,7 +253,8 @@ class Cameras:
 
     def _meters(self, depth: np.ndarray) -> np.ndarray:
         """Depth along the camera's axis, float32, m, of OpenGL's: 1 near, 0 far."""
-        extent, clip = self.model.stat.extent, self.model.vis.map
+        extent = self.model.stat.extent
+        clip = self.model.vis.map
         near, far = (float(np.float32(end * extent)) for end in (clip.znear, clip.zfar))
         meters = near * far / (near + depth.astype(np.float64) * (far - near))
         told: np.ndarray = np.minimum(meters, FARTHEST).astype(np.float32)
@@ -259,13 +267,17 @@ class Cameras:
 
         What the camera could not see then, since it was beside or behind it: nan.
         """
-        now, lens = self._poses.frames(self.data), eye.lens(self.data)
+        now = self._poses.frames(self.data)
+        lens = eye.lens(self.data)
         state = self._poses.now(self.data)
         self._poses.restore(self.data, before)
-        past, old = self._poses.frames(self.data), eye.lens(self.data)
+        past = self._poses.frames(self.data)
+        old = eye.lens(self.data)
         self._poses.restore(self.data, state)
-        bodies, depth = np.append(0, self.model.geom_bodyid)[geoms.ravel()], depth.ravel()
-        rays, middles = eye.rays, eye.middles
+        bodies = np.append(0, self.model.geom_bodyid)[geoms.ravel()]
+        depth = depth.ravel()
+        rays = eye.rays
+        middles = eye.middles
         flow = np.empty(middles.shape, np.float32)
         stands = np.array_equal(lens.rotation, old.rotation)
         stands &= np.array_equal(lens.translation, old.translation)
@@ -277,7 +289,8 @@ class Cameras:
             if stands and all(map(np.array_equal, now[body], past[body])):
                 flow[which] = 0.0
                 continue
-            (place, axes), (old_place, old_axes) = now[body], past[body]
+            (place, axes) = now[body]
+            (old_place, old_axes) = past[body]
             turn = old.rotation @ old_axes @ axes.T
             start = turn @ (-lens.rotation.T @ lens.translation - place)
             start += old.rotation @ old_place + old.translation
@@ -322,7 +335,8 @@ def _hues(hue: np.ndarray, value: np.ndarray) -> np.ndarray:
 
 def _exposed(colors: np.ndarray, optics: Optics, dice: np.random.Generator) -> np.ndarray:
     """Colours as a sensor reads them: see `Optics`."""
-    (photons, reading), spread = optics.noise, optics.exposure
+    (photons, reading) = optics.noise
+    spread = optics.exposure
     if not (photons or reading or spread):
         return colors
     light = colors / 255 * np.exp2(spread * dice.standard_normal())
@@ -345,7 +359,9 @@ class _Eye:
     def __init__(
         self, model: mujoco.MjModel, number: int, size: tuple[int, int], camera: Camera
     ) -> None:
-        self.camera, self.size, self.optics = number, size, camera.optics
+        self.camera = number
+        self.size = size
+        self.optics = camera.optics
         self._matrix = _matrix(model, number, size)
         self.numbers = np.zeros(0, np.int32)
         """Of the geoms from 1, by their colours in pictures of objects."""
@@ -380,31 +396,37 @@ class _Source:
     """A pinhole's picture, finer, from which a lens that distorts takes its own (H, W)."""
 
     def __init__(self, lens: Lens, size: tuple[int, int]) -> None:
-        (height, width), pitch = size, 1 / _FINER / np.diagonal(lens.matrix)[:2]
-        along, down = np.arange(width + 1.0), np.arange(height + 1.0)
+        (height, width) = size
+        pitch = 1 / _FINER / np.diagonal(lens.matrix)[:2]
+        along = np.arange(width + 1.0)
+        down = np.arange(height + 1.0)
         edges = [(x, y) for x in along for y in (0, height)] + [
             (x, y) for y in down for x in (0, width)
         ]
         seen = lens.rays_of(np.array(edges))[:, :2]
-        low, high = seen.min(axis=0), seen.max(axis=0)
+        low = seen.min(axis=0)
+        high = seen.max(axis=0)
         width, height = (int(side) for side in np.ceil((high - low) / pitch))
         expected = f"a lens that needs at most {_FINER * MOST_PIXELS} pixels of a pinhole a side"
         most = max(width, height)
-        expect(most <= _FINER * MOST_PIXELS, "distortion", expected, f"{most}")
+        if not most <= _FINER * MOST_PIXELS:
+            raise InputError(f"distortion: expected {expected}, got {most}")
         self.size = height, width
-        self._low, self._high = low, low + pitch * (width, height)
+        self._low = low
+        self._high = low + pitch * (width, height)
         # Columns and rows, from the first pixel's middle.
         self._at = (lens.rays(*size)[..., :2] - low) / pitch - 0.5
 
     def aim(self, scene: mujoco.MjvScene) -> None:
         """Let the scene's camera see as much."""
-        (left, top), (right, bottom) = self._low, self._high
+        (left, top) = self._low
+        (right, bottom) = self._high
         for camera in scene.camera:
             near = camera.frustum_near
-            camera.frustum_center, camera.frustum_width = (
-                near * (left + right) / 2, near * (right - left) / 2
-            )  # fmt: skip
-            camera.frustum_bottom, camera.frustum_top = -near * bottom, -near * top
+            camera.frustum_center = near * (left + right) / 2
+            camera.frustum_width = near * (right - left) / 2
+            camera.frustum_bottom = -near * bottom
+            camera.frustum_top = -near * top
 
     def nearest(self, picture: np.ndarray) -> np.ndarray:
         """What the lens has, of the nearest pixels: numbers that must not be mixed."""
@@ -475,8 +497,10 @@ def _matrix(model: mujoco.MjModel, camera: int, size: tuple[int, int]) -> np.nda
         focal = model.cam_intrinsic[camera]
         scale = np.array((width, height)) / model.cam_sensorsize[camera]
         fx, fy = focal[:2] * scale
-        cx, cy = width / 2 - focal[2] * scale[0], height / 2 - focal[3] * scale[1]
+        cx = width / 2 - focal[2] * scale[0]
+        cy = height / 2 - focal[3] * scale[1]
     else:
         fx = fy = 0.5 * height / np.tan(np.radians(model.cam_fovy[camera]) / 2)
-        cx, cy = width / 2, height / 2
+        cx = width / 2
+        cy = height / 2
     return np.array(((fx, 0.0, cx), (0.0, fy, cy), (0.0, 0.0, 1.0)))

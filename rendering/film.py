@@ -19,7 +19,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from ..models.errors import InputError, expect, require
+from ..models.errors import InputError, require
 from ..models.fleet import members_of
 from ..models.vehicle import Vehicle
 from .stage import Moment
@@ -33,10 +33,13 @@ QUALITY: Final = 20
 
 _GROUND: Final = (13, 18, 26, 150)  # Of panels: dark, and some of the picture shows through
 _EDGE: Final = (255, 255, 255, 36)
-_NAMES, _VALUES = (164, 176, 190), (238, 242, 246)
-_ZERO, _LIMIT = (150, 162, 176), (84, 96, 110)
+_NAMES = (164, 176, 190)
+_VALUES = (238, 242, 246)
+_ZERO = (150, 162, 176)
+_LIMIT = (84, 96, 110)
 _ALARM: Final = (255, 107, 96)
-_BAR, _BAR_GROUND = (120, 190, 255), (70, 82, 98)
+_BAR = (120, 190, 255)
+_BAR_GROUND = (70, 82, 98)
 _STEPS: Final = (1.0, 1.5, 2.0, 3.0, 5.0, 10.0)  # Round numbers for the ends of a graph
 _LEAST: Final = 0.1  # Smallest end of a graph, in the metric's unit
 _STRIP_SIZE: Final = 160, 240  # Width and height of the smallest picture with a graph, pixels
@@ -47,17 +50,23 @@ _TIMES: Final = 2  # Everything is drawn so much larger, and reduced: smooth lin
 
 def check_film(path: Path, width: int, height: int, fps: float) -> None:
     """Check the arguments of `write_film` before anything is drawn. Raises `InputError`."""
-    kind, hundredths = path.suffix.lower(), 100 / max(fps, 0.01)
+    kind = path.suffix.lower()
+    hundredths = 100 / max(fps, 0.01)
     expected = "a name that ends in .mp4, .gif or .png, or a folder's name without a dot"
-    expect(kind in (".mp4", ".gif", ".png", ""), "film", expected, str(path))
+    if kind not in (".mp4", ".gif", ".png", ""):
+        raise InputError(f"film: expected {expected}, got {path}")
     if path.exists():
         raise InputError(f"film: {path} is there already; choose another name")
-    expect(0.01 <= fps <= 1000, "fps", "0.01 to 1000 pictures per second", f"{fps:g}")
-    even = kind != ".mp4" or not (width % 2 or height % 2)
-    expect(even, "film", "an even width and an even height for MP4", f"{width}x{height}")
+    if not 0.01 <= fps <= 1000:
+        raise InputError(f"fps: expected 0.01 to 1000 pictures per second, got {fps:g}")
+    if not (kind != ".mp4" or not (width % 2 or height % 2)):
+        raise InputError(
+            f"film: expected an even width and an even height for MP4, got {width}x{height}"
+        )
     whole = kind != ".gif" or abs(hundredths - round(hundredths)) <= 1e-6
     expected = "100 divided by a whole number (50, 25, 20, 10) for GIF, which counts hundredths"
-    expect(whole, "fps", f"{expected} of a second", f"{fps:g}")
+    if not whole:
+        raise InputError(f"fps: expected {expected} of a second, got {fps:g}")
 
 
 def write_film(
@@ -83,7 +92,8 @@ def write_film(
     if (first := next(taken, None)) is None:
         raise InputError("film: expected at least one frame, got none")
     check_film(path, first.shape[1], first.shape[0], fps)
-    shape, count = (*first.shape[:2], 3), 0
+    shape = (*first.shape[:2], 3)
+    count = 0
 
     def counted() -> Iterator[np.ndarray]:
         nonlocal count
@@ -121,7 +131,8 @@ def write_film(
 def _write_gif(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
     # Without dithering: parts that stand still do not change, and cost nothing.
     pictures = (Image.fromarray(f).quantize(256, dither=Image.Dither.NONE) for f in frames)
-    first, settings = next(pictures), {"duration": round(100 / fps) * 10, "loop": 0}
+    first = next(pictures)
+    settings = {"duration": round(100 / fps) * 10, "loop": 0}
     with path.open("wb") as file:  # Pillow's own stays open when it is interrupted
         first.save(file, "GIF", save_all=True, append_images=pictures, **settings)
 
@@ -130,7 +141,8 @@ def _write_mp4(
     path: Path, frames: Iterator[np.ndarray], shape: tuple[int, ...], fps: float, quality: int
 ) -> None:
     """Through FFmpeg. Raises `OSError` with its words if it fails."""
-    size, rate = f"{shape[1]}x{shape[0]}", str(Fraction(fps).limit_denominator(1001))
+    size = f"{shape[1]}x{shape[0]}"
+    rate = str(Fraction(fps).limit_denominator(1001))
     words = [
         *(_ffmpeg(), "-y", "-v", "error"),
         *("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", rate, "-i", "-"),
@@ -248,8 +260,11 @@ class Overlay:
         of: str = "",
     ) -> None:
         self._size = width, height
-        self._title, self._color = title, ImageColor.getrgb(color)[:3]
-        self._period, self._seconds, self._scale = period, max(seconds, period), scale
+        self._title = title
+        self._color = ImageColor.getrgb(color)[:3]
+        self._period = period
+        self._seconds = max(seconds, period)
+        self._scale = scale
         self._vehicle = members_of(vehicle, 1)[0]  # the overlay is of the first drone
         self._high = float(self._vehicle.thrust_high.max())
         self._of = [("numbers of", of)] if of else []
@@ -266,7 +281,8 @@ class Overlay:
         self._widest = self._lines(widest)
         self._metric = like.metrics[0] if like.metrics else None
         unit = max(7.0, min(height / 30, width / 34))
-        self._unit, self._gap = unit, max(2, round(0.55 * unit))
+        self._unit = unit
+        self._gap = max(2, round(0.55 * unit))
         self._line = round(1.28 * unit)
         self._small, self._font, self._large = (_font(unit * share) for share in (0.85, 1, 1.25))
         self.has_numbers = numbers and self._have_room()
@@ -288,7 +304,8 @@ class Overlay:
         period; `note` is an event, such as "terminated".
         """
         image = Image.fromarray(picture)
-        expect(image.size == self._size, "picture", f"{self._size} pixels", str(image.size))
+        if image.size != self._size:
+            raise InputError(f"picture: expected {self._size} pixels, got {image.size}")
         for box, ground in self._grounds:
             image.paste(ground, box[:2], ground)
         _enlarged(image, self.panel, lambda draw: self._write_panel(draw, moment))
@@ -297,7 +314,8 @@ class Overlay:
             _enlarged(image, self._curve, lambda draw: self._draw_curve(draw, values))
         if note:  # below the panel, away from the craft
             wide = self._large.getlength(note) / _TIMES + 3 * self._gap
-            left, upper = self.panel.left, self.panel.lower + self._gap
+            left = self.panel.left
+            upper = self.panel.lower + self._gap
             box = Box(left, upper, round(left + wide), round(upper + 1.9 * self._unit))
             _enlarged(image, box, lambda draw: self._write_note(draw, box, note))
         return np.asarray(image)
@@ -314,25 +332,32 @@ class Overlay:
 
     def _have_room(self) -> bool:
         """Whether numbers fit, and leave the middle free."""
-        wide, high = self._gap + self._numbers_width(), self._panel_box(True).lower
+        wide = self._gap + self._numbers_width()
+        high = self._panel_box(True).lower
         width, height = self._size
         fits = height >= _NUMBERS_HEIGHT and width >= wide + self._gap
         return fits and (wide <= _NUMBERS_SHARE * width or high <= _NUMBERS_SHARE * height)
 
     def _panel_box(self, numbers: bool) -> Box:
-        gap, (width, height) = self._gap, self._size
+        gap = self._gap
+        (width, height) = self._size
         title = math.ceil(self._large.getlength(self._title) / _TIMES + 1.2 * self._unit) + 1
-        lower, right = 3 * gap + round(1.6 * self._unit), 5 * gap + title
+        lower = 3 * gap + round(1.6 * self._unit)
+        right = 5 * gap + title
         if numbers:
             lower += len(self._widest) * self._line + 3 * gap
             right = max(right, gap + self._numbers_width())
         return Box(gap, gap, min(right, width - gap), min(lower, height - gap))
 
     def _write_panel(self, draw: ImageDraw.ImageDraw, moment: Moment) -> None:
-        unit, gap, line = self._unit * _TIMES, self._gap * _TIMES, self._line * _TIMES
-        left, y = 2 * gap, gap
+        unit = self._unit * _TIMES
+        gap = self._gap * _TIMES
+        line = self._line * _TIMES
+        left = 2 * gap
+        y = gap
         right = self.panel.size[0] - 2 * gap
-        middle, radius = y + 0.8 * unit, 0.36 * unit
+        middle = y + 0.8 * unit
+        radius = 0.36 * unit
         draw.ellipse((left, middle - radius, left + 2 * radius, middle + radius), self._color)
         title = _fitted(self._title, self._large, right - left - 1.2 * unit)
         draw.text((left + 1.2 * unit, middle), title, self._color, self._large, anchor="lm")
@@ -365,12 +390,15 @@ class Overlay:
             draw.line((mark, box.upper - _TIMES, mark, box.lower + _TIMES), _VALUES, thick)
 
     def _strip_boxes(self) -> tuple[Box, Box]:
-        gap, (width, height) = self._gap, self._size
+        gap = self._gap
+        (width, height) = self._size
         upper = max(height - gap - round(6.6 * self._unit), 0)
         strip = Box(gap, upper, width - gap, height - gap)
         label = max(self._small.getlength(name) for name, _ in self._levels()) / _TIMES
-        left, upper = strip.left + round(label) + 3 * gap, upper + gap + round(1.75 * self._unit)
-        right, lower = strip.right - 2 * gap, strip.lower - round(1.5 * gap)
+        left = strip.left + round(label) + 3 * gap
+        upper = upper + gap + round(1.75 * self._unit)
+        right = strip.right - 2 * gap
+        lower = strip.lower - round(1.5 * gap)
         return strip, Box(left, upper, max(left, right), max(upper, lower))
 
     def _levels(self) -> tuple[tuple[str, float], ...]:
@@ -379,7 +407,8 @@ class Overlay:
         return (f"{high:g}", 1.0), (f"{(low + high) / 2:g}", 0.0), (f"{low:g}", -1.0)
 
     def _write_strip(self, draw: ImageDraw.ImageDraw, values: Sequence[float]) -> None:
-        unit, gap = self._unit * _TIMES, self._gap * _TIMES
+        unit = self._unit * _TIMES
+        gap = self._gap * _TIMES
         assert self._metric is not None
         words = [f"{self._metric.label} over time", *filter(None, [self._metric.unit])]
         draw.text((2 * gap, gap), ", ".join(words), _NAMES, self._font)

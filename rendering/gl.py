@@ -34,12 +34,14 @@ def hidden_gl_setting() -> Iterator[None]:
 
     Otherwise MuJoCo imports one, which takes a tenth of a second, and raises where that fails.
     """
-    before, wanted = dict(os.environ), _wanted()
+    before = dict(os.environ)
+    wanted = _wanted()
     library = _LIBRARIES.get(wanted, "")
     if wanted in (*_OFF, *_ON) or (library and ctypes.util.find_library(library)):
         yield
         return
-    os.environ[_HIDDEN], os.environ["MUJOCO_GL"] = wanted, "disable"
+    os.environ[_HIDDEN] = wanted
+    os.environ["MUJOCO_GL"] = "disable"
     try:
         yield
     finally:
@@ -90,8 +92,10 @@ class Offscreen:
     def __init__(self, model: Any, width: int, height: int) -> None:
         import mujoco
 
-        model.vis.global_.offwidth, model.vis.global_.offheight = width, height
-        font, buffer = mujoco.mjtFontScale.mjFONTSCALE_100, mujoco.mjtFramebuffer.mjFB_OFFSCREEN
+        model.vis.global_.offwidth = width
+        model.vis.global_.offheight = height
+        font = mujoco.mjtFontScale.mjFONTSCALE_100
+        buffer = mujoco.mjtFramebuffer.mjFB_OFFSCREEN
         self._gl: Any = offscreen_context(width, height)
         try:
             with self.current():

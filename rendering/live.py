@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final, Literal, TypeAlias
 import mujoco
 import numpy as np
 
-from ..models.errors import expect
+from ..models.errors import InputError
 from .stage import Moment, Stage
 
 if TYPE_CHECKING:
@@ -45,9 +45,13 @@ class Pace:
     """
 
     def __init__(self, period: float, speed: float = 1.0) -> None:
-        low, high = SPEEDS[0], SPEEDS[-1]
-        expect(low <= speed <= high, "speed", f"{low:g} to {high:g}", f"{speed:g}")
-        self.period, self.speed, self.paused = period, speed, False
+        low = SPEEDS[0]
+        high = SPEEDS[-1]
+        if not low <= speed <= high:
+            raise InputError(f"speed: expected {low:g} to {high:g}, got {speed:g}")
+        self.period = period
+        self.speed = speed
+        self.paused = False
         self._presses: SimpleQueue[Press] = SimpleQueue()
         self._asked = 0  # steps that a pause lets pass
         self._since: float | None = None  # when the last step was due
@@ -85,7 +89,9 @@ class Pace:
 
     def _obey(self, press: Press) -> None:
         if press == "pause":
-            self.paused, self._asked, self._since = not self.paused, 0, None
+            self.paused = not self.paused
+            self._asked = 0
+            self._since = None
         elif press == "step":
             self._asked = self._asked + 1 if self.paused else 1
             self.paused = True
@@ -118,10 +124,14 @@ class LiveView(AbstractContextManager["LiveView"]):
     """Draws the latest moments in a thread of its own; `of` drones, if more than are shown."""
 
     def __init__(self, stage: Stage, surface: "Surface", pace: Pace, of: int | None = None) -> None:
-        self.stage, self.surface, self.pace = stage, surface, pace
-        self._of, self._said = of or stage.drones, ""
+        self.stage = stage
+        self.surface = surface
+        self.pace = pace
+        self._of = of or stage.drones
+        self._said = ""
         self._latest: tuple[Moment, ...] = ()
-        self._fresh, self._closing = Event(), Event()
+        self._fresh = Event()
+        self._closing = Event()
         self._error: Exception | None = None
         self._thread = Thread(target=self._paint, name="live view", daemon=True)
         self._thread.start()
@@ -130,7 +140,8 @@ class LiveView(AbstractContextManager["LiveView"]):
     def is_running(self) -> bool:
         """Whether the surface is open. Raises the error with which drawing ended."""
         if self._error is not None:
-            error, self._error = self._error, None
+            error = self._error
+            self._error = None
             raise error
         return self._thread.is_alive() and not self._closing.is_set()
 
@@ -142,7 +153,8 @@ class LiveView(AbstractContextManager["LiveView"]):
     def draw(self, *moments: Moment) -> None:
         """Leave moments to be drawn, one of each craft. Older ones that wait are dropped."""
         drones = self.stage.drones
-        expect(len(moments) == drones, "moments", f"{drones}", f"{len(moments)}")
+        if len(moments) != drones:
+            raise InputError(f"moments: expected {drones}, got {len(moments)}")
         self._latest = moments
         self._fresh.set()
 

@@ -13,7 +13,7 @@ from typing import Any, Final, Literal, NamedTuple, Self, get_args
 import mujoco
 import numpy as np
 
-from ..models.errors import InputError, expect
+from ..models.errors import InputError
 from ..models.fleet import load_vehicles, members_of
 from ..models.frames import pose_in_mujoco_frame
 from ..models.mjcf import attach_craft, free_body
@@ -147,10 +147,12 @@ class Moment:
         lines += [(name, f"{point[1]:.2f} m") for name, point in heights.items() if point]
         unit, scale = ("N", 1.0) if thrust_high >= 1 else ("mN", 1e3)
         decimals = max(0, 2 - math.floor(math.log10(thrust_high * scale)))
-        shown, rotors = self.thrusts, len(self.thrusts)
+        shown = self.thrusts
+        rotors = len(self.thrusts)
         name = f"F1 to F{rotors}" if rotors > 1 else "F1"
         if rotors > _MOST_THRUSTS:
-            name, shown = f"{name}, mean", (float(np.mean(shown)),)
+            name = f"{name}, mean"
+            shown = (float(np.mean(shown)),)
         thrusts = " ".join(f"{scale * thrust:.{decimals}f}" for thrust in shown)
         lines += [(name, f"{thrusts} {unit}"), ("reward", f"{self.reward:+.3f}")]
         return [*lines, ("step", str(self.step)), ("episode", str(self.episode))]
@@ -180,20 +182,25 @@ class Stage:
         trail: bool = True,
         names: Sequence[str] = (),
     ) -> None:
-        expect(drones >= 1, "drones", "1 or more", f"{drones}")
-        expect(len(names) in (0, drones), "names", f"one for each of {drones} drones", f"{names}")
-        self.drones, self.names = drones, tuple(names)
+        if not drones >= 1:
+            raise InputError(f"drones: expected 1 or more, got {drones}")
+        if len(names) not in (0, drones):
+            raise InputError(f"names: expected one for each of {drones} drones, got {names}")
+        self.drones = drones
+        self.names = tuple(names)
         self.vehicle = load_vehicles(vehicle, drones)
         crafts = members_of(self.vehicle, drones)
         try:
             scenes = [build_scene(path, world) for path in dict.fromkeys(c.path for c in crafts)]
-            spec, sizes = scenes[0], [_size(scene.compile()) for scene in scenes]
+            spec = scenes[0]
+            sizes = [_size(scene.compile()) for scene in scenes]
         except InputError:
             raise
         except ValueError as error:  # a texture is missing, which the physics does not need
             reason = " ".join(str(error).split())
             raise InputError(f"vehicle: expected a file that can be drawn, got: {reason}") from None
-        self.radius, top = max(radius for radius, _ in sizes), sizes[0][1]
+        self.radius = max(radius for radius, _ in sizes)
+        top = sizes[0][1]
         grid = _grid(drones, _SPACING * self.radius)
         self._offsets = 0.0 * grid if names else grid
         free_body(spec).add_camera(  # sees nose, front rotors and horizon
@@ -228,15 +235,21 @@ class Stage:
 
     def show(self, *moments: Moment) -> None:
         """Put every craft where its moment has it, and extend its path. Raises `InputError`."""
-        expect(len(moments) == self.drones, "moments", f"{self.drones}", f"{len(moments)}")
-        craft, rotors = self.vehicle, len(moments[0].thrusts)
+        if len(moments) != self.drones:
+            raise InputError(f"moments: expected {self.drones}, got {len(moments)}")
+        craft = self.vehicle
+        rotors = len(moments[0].thrusts)
         expected = f"a file with {rotors} rotors, as in the flight"
         got = f"{craft.path.name} with {craft.num_rotors}"
-        expect(rotors == craft.num_rotors, "vehicle", expected, got)
-        before, self.moments = self.moments or moments, moments
+        if rotors != craft.num_rotors:
+            raise InputError(f"vehicle: expected {expected}, got {got}")
+        before = self.moments or moments
+        self.moments = moments
         poses = self.data.qpos.reshape(self.drones, 7)
         for i, (moment, last) in enumerate(zip(moments, before, strict=True)):
-            pose, path, goal = poses[i], self._paths[i], None
+            pose = poses[i]
+            path = self._paths[i]
+            goal = None
             pose[:] = pose_in_mujoco_frame(moment.position, moment.attitude)
             pose[:3] += self._offsets[i]
             if moment.goal is not None:
@@ -269,12 +282,15 @@ class Stage:
             camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
             camera.fixedcamid = self.model.camera(_ONBOARD).id
             return camera
-        expect(name in _VIEWS, "camera", f"one of {', '.join(CAMERAS)}", f"{name!r}")
+        if name not in _VIEWS:
+            raise InputError(f"camera: expected one of {', '.join(CAMERAS)}, got {name!r:.300}")
         camera.azimuth, camera.elevation, distance, holds = _VIEWS[name]
-        places, reach = self._offsets, float(self._reach.max())
+        places = self._offsets
+        reach = float(self._reach.max())
         if len(self.names) > 1:  # the goals of one world lie apart, often far from their craft
             goals = (goal for goal in self._goals if goal is not None)
-            places, reach = np.array([*self._points(), *goals]), 0.0
+            places = np.array([*self._points(), *goals])
+            reach = 0.0
         camera.distance = distance * self.radius + float(np.ptp(places, axis=0).max())
         if holds == math.inf:
             camera.lookat[:] = self._points().mean(axis=0)
@@ -318,7 +334,8 @@ class Stage:
             for number, (start, end) in enumerate(pairwise([*path, here]), 1):
                 if np.array_equal(start, end):
                     continue
-                kind, rgba = mujoco.mjtGeom.mjGEOM_CAPSULE, (*color, 0.85 * number / len(path))
+                kind = mujoco.mjtGeom.mjGEOM_CAPSULE
+                rgba = (*color, 0.85 * number / len(path))
                 _connect(scene, kind, 0.019 * self.radius, start, end, rgba)
 
     @property
@@ -349,8 +366,11 @@ class Canvas(AbstractContextManager["Canvas"]):
         self, stage: Stage, width: int = 640, height: int = 480, *, fast: bool = False
     ) -> None:
         for name, pixels in (("width", width), ("height", height)):
-            expect(16 <= pixels <= 8192, name, "16 to 8192 pixels", f"{pixels}")
-        self.stage, self.width, self.height = stage, width, height
+            if not 16 <= pixels <= 8192:
+                raise InputError(f"{name}: expected 16 to 8192 pixels, got {pixels}")
+        self.stage = stage
+        self.width = width
+        self.height = height
         model = stage.model
         model.vis.quality.offsamples = 0 if fast else _SAMPLES
         self._drawing = Offscreen(model, width, height)
@@ -363,8 +383,11 @@ class Canvas(AbstractContextManager["Canvas"]):
         stage = stage or self.stage
         if stage.model is not self.stage.model:
             raise ValueError("stage: expected the canvas's own or a twin of it, got another")
-        model, data, scene = stage.model, stage.data, self._scene
-        view, every = stage.camera(camera), mujoco.mjtCatBit.mjCAT_ALL.value
+        model = stage.model
+        data = stage.data
+        scene = self._scene
+        view = stage.camera(camera)
+        every = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(model, data, self._option, None, view, every, scene)
         for light in scene.lights[: scene.nlight]:
             if light.headlight and camera == "top":  # it would add itself to the sun
@@ -399,7 +422,8 @@ def _size(model: mujoco.MjModel) -> tuple[float, float]:
     chosen = drawn if drawn.any() else craft
     if not chosen.any():
         return 1.0, 0.0
-    centres, bounds = data.geom_xpos[chosen], model.geom_rbound[chosen]
+    centres = data.geom_xpos[chosen]
+    bounds = model.geom_rbound[chosen]
     boxes, rows = model.geom_aabb[chosen], data.geom_xmat[chosen, 6:]  # of z in body axes
     tops = centres[:, 2] + (rows * boxes[:, :3] + abs(rows) * boxes[:, 3:]).sum(axis=1)
     radius = float((np.linalg.norm(centres, axis=1) + bounds).max())
@@ -408,7 +432,8 @@ def _size(model: mujoco.MjModel) -> tuple[float, float]:
 
 def scale_drawing(model: mujoco.MjModel, radius: float, spread: float) -> None:
     """Set the near end of drawing, the shadow's fineness and our floor's squares for the craft."""
-    visual, extent = model.vis, model.stat.extent
+    visual = model.vis
+    extent = model.stat.extent
     visual.global_.fovy = _FOVY
     visual.map.znear = min(visual.map.znear * extent, _NEAR * radius) / extent
     # Software draws shadows too: finer ones cost more than they show.
@@ -437,7 +462,8 @@ def _draw_mark(
     if mark.shape == "gate" and goal is not None and np.abs(goal - centre).max() < 1e-3:
         rgba = _DUE
     for part in mark.parts(0.04 * mark.size):
-        start, end = centre + part.start, centre + part.end
+        start = centre + part.start
+        end = centre + part.end
         if part.kind == "sphere":
             _decoration(scene, mujoco.mjtGeom.mjGEOM_SPHERE, (part.radius,) * 3, start, rgba)
         elif part.kind == "cylinder":
@@ -470,7 +496,8 @@ def _decoration(
     """A new geom that casts no shadow; None if the scene is full."""
     if scene.ngeom == scene.maxgeom:
         return None
-    geom, color = scene.geoms[scene.ngeom], np.array(rgba, np.float32)
+    geom = scene.geoms[scene.ngeom]
+    color = np.array(rgba, np.float32)
     scene.ngeom += 1
     mujoco.mjv_initGeom(geom, kind, np.array(size), centre, np.eye(3).ravel(), color)
     geom.category = mujoco.mjtCatBit.mjCAT_DECOR

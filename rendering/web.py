@@ -75,7 +75,8 @@ class WebPage:
     def __init__(self, stage: Stage, pace: Pace, port: int) -> None:
         if not 0 <= port <= 65535:
             raise InputError(f"port: expected 0 to 65535, got {port}")
-        self._stage, self._panel = stage, _Panel(pace, Aim(stage))
+        self._stage = stage
+        self._panel = _Panel(pace, Aim(stage))
         self._scene = mujoco.MjvScene(stage.model, MAX_EXTRA_GEOMS)
         config = viewer_protocol.ViewerConfig(title="rotorgram", gfx="web", http_port=port)
 
@@ -84,7 +85,8 @@ class WebPage:
             viewer_protocol.run_viewer_loop(viewer)
 
         self._handle = launch_thread.launch_thread(serve)
-        self._handle.model, self._handle.data = stage.model, stage.data
+        self._handle.model = stage.model
+        self._handle.data = stage.data
         try:
             while not self._panel.started.wait(0.05):
                 self._handle.is_running()  # raises what the other thread has raised
@@ -149,9 +151,11 @@ class _Panel(plugin.ViewerPlugin):  # type: ignore[misc]
     """The overlay, with buttons. Lives in the viewer's thread."""
 
     def __init__(self, pace: Pace, aim: Aim) -> None:
-        self._pace, self._aim = pace, aim
+        self._pace = pace
+        self._aim = aim
         self._lines: Lines = []
-        self.started, self.watched = threading.Event(), threading.Event()
+        self.started = threading.Event()
+        self.watched = threading.Event()
 
     @messages.handler  # type: ignore[untyped-decorator]
     def _on_viewer_init(self, _: plugin.ViewerInitEvent) -> None:

@@ -44,7 +44,9 @@ class Window:
     def __init__(self, stage: Stage, pace: Pace) -> None:
         before = _tasks()
         viewer = _viewer()
-        self._stage, self._pace, self._aim = stage, pace, Aim(stage)
+        self._stage = stage
+        self._pace = pace
+        self._aim = Aim(stage)
         others = set(threading.enumerate())
         try:
             self._handle = viewer.launch_passive(
@@ -75,7 +77,8 @@ class Window:
             handle.user_scn.ngeom = 0
             self._stage.decorate(handle.user_scn)
         keys = _HELP if self._pace.period else _HELP[:2]
-        top, bottom = mujoco.mjtGridPos.mjGRID_TOPLEFT, mujoco.mjtGridPos.mjGRID_BOTTOMLEFT
+        top = mujoco.mjtGridPos.mjGRID_TOPLEFT
+        bottom = mujoco.mjtGridPos.mjGRID_BOTTOMLEFT
         handle.set_texts([_text(top, lines), _text(bottom, keys)])
         handle.sync()
 

@@ -54,7 +54,8 @@ def scenes_of(text: str) -> tuple[str, ...]:
     try:
         low, high = (parse_scene(f"{name}:{end}")[1] for end in (first, last))
     except InputError:
-        low, high = 0, -1
+        low = 0
+        high = -1
     if not 0 <= high - low < MAX_SEEDS:
         names = ", ".join(map(repr, SEEDED_SCENES))
         raise InputError(

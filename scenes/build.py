@@ -57,7 +57,8 @@ def _add_plain(spec: mujoco.MjSpec) -> None:
         scene.delete(scene.geom("floor"))
         scene.visual, scene.stat = spec.visual, spec.stat  # MuJoCo warns if they differ
     else:
-        spec.visual, spec.stat = scene.visual, scene.stat
+        spec.visual = scene.visual
+        spec.stat = scene.stat
     if any(texture.type == SKY for texture in spec.textures):
         scene.delete(scene.texture("sky"))
     if spec.worldbody.lights:

@@ -91,7 +91,8 @@ class _Builder:
 
     def sun(self) -> tuple[Colour, Colour]:
         """Add a sun from a side of its own; returns the colours of its sky."""
-        azimuth, down = self.uniform(0.0, 2 * math.pi), self.uniform(1.0, 2.5)
+        azimuth = self.uniform(0.0, 2 * math.pi)
+        down = self.uniform(1.0, 2.5)
         bright = self.uniform(0.6, 0.8)
         light = Light(
             name="sun",
@@ -127,7 +128,8 @@ def forest(seed: int) -> Scene:
         wide = wood.uniform(0.4, 1.2)
         x, y = wood.around(wide, _FOREST)
         leaf = wood.choose(leaves)
-        size, position = (wide, wide, 0.7 * wide), (x, y, 0.4 * wide)
+        size = (wide, wide, 0.7 * wide)
+        position = (x, y, 0.4 * wide)
         wood.add(f"shrub_{i}/crown", "ellipsoid", size, position, leaf)
     for i in range(40):
         sides = wood.rng.uniform(0.3, 1.0, 3)
@@ -139,7 +141,8 @@ def forest(seed: int) -> Scene:
 
 def _add_tree(wood: _Builder, name: str, bark: Sequence[str], leaves: Sequence[str]) -> None:
     x, y = wood.around(3.2, _FOREST)
-    tall, wide = wood.uniform(6.0, 15.0), wood.uniform(1.4, 3.0)
+    tall = wood.uniform(6.0, 15.0)
+    wide = wood.uniform(1.4, 3.0)
     kind = int(wood.rng.integers(3))
     leaf = wood.choose(leaves)
     trunk = (0.13 + 0.012 * tall, 0.3 * tall, 0)
@@ -193,13 +196,16 @@ def warehouse(seed: int) -> Scene:
 
 def _add_hall(hall: _Builder, wall: str, roof: str, steel: str, glass: str) -> None:
     """Walls with windows, and a roof with lamps."""
-    middle, right = _HEIGHT / 2, math.pi / 2
+    middle = _HEIGHT / 2
+    right = math.pi / 2
     hall.add("roof/sheet", "plane", (_LENGTH, _WIDTH, 1), (0, 0, _HEIGHT), roof, (math.pi, 0, 0))
     for name, sign in (("west", -1), ("east", 1)):
-        position, turn = (sign * _LENGTH, 0, middle), (0.0, -sign * right, 0.0)
+        position = (sign * _LENGTH, 0, middle)
+        turn = (0.0, -sign * right, 0.0)
         hall.add(f"wall_{name}/sheet", "plane", (middle, _WIDTH, 1), position, wall, turn)
     for name, sign in (("south", -1), ("north", 1)):
-        place, turn = (0, sign * _WIDTH, middle), (sign * right, 0.0, 0.0)
+        place = (0, sign * _WIDTH, middle)
+        turn = (sign * right, 0.0, 0.0)
         hall.add(f"wall_{name}/sheet", "plane", (_LENGTH, middle, 1), place, wall, turn)
         for i, x in enumerate(np.linspace(-24.0, 24.0, 7)):
             window = (x, sign * (_WIDTH - 0.05), 19.0)
@@ -263,29 +269,39 @@ def gates(seed: int) -> Scene:
         else:
             track.add(f"cone_{i}/body", "ellipsoid", (0.3, 0.3, 0.8), (x, y, 0.1), tint)
     for i in range(4):
-        away, angle = track.uniform(34.0, 44.0), math.pi * (i / 2 + 0.25)
+        away = track.uniform(34.0, 44.0)
+        angle = math.pi * (i / 2 + 0.25)
         for row in range(4):
-            distance, height = away + 1.5 * row, 0.4 * (row + 1)
+            distance = away + 1.5 * row
+            height = 0.4 * (row + 1)
             position = (distance * math.cos(angle), distance * math.sin(angle), height)
-            size, turn = (0.75, 9.0, height), (0.0, 0.0, angle)
+            size = (0.75, 9.0, height)
+            turn = (0.0, 0.0, angle)
             track.add(f"stand_{i}/row_{row}", "box", size, position, stand, turn)
     return track.scene("gates", sky)
 
 
 def _add_gate(track: _Builder, number: int, paint: Sequence[str], steel: str) -> None:
-    half, bar = _OPENING / 2, 0.25
+    half = _OPENING / 2
+    bar = 0.25
     angle = 2 * math.pi * number / _GATES + track.uniform(-0.15, 0.15)
-    radius, height = track.uniform(15.0, 20.0), track.uniform(5.0, 12.0)
+    radius = track.uniform(15.0, 20.0)
+    height = track.uniform(5.0, 12.0)
     heading = angle + math.pi / 2 + track.uniform(-0.3, 0.3)  # anticlockwise round the ring
-    tint, turn = track.choose(paint), (0.0, 0.0, heading)
-    x, y = radius * math.cos(angle), radius * math.sin(angle)
+    tint = track.choose(paint)
+    turn = (0.0, 0.0, heading)
+    x = radius * math.cos(angle)
+    y = radius * math.sin(angle)
     foot = (height - half - 2 * bar) / 2
     for part, sign in (("left", 1), ("right", -1)):
         aside = sign * (half + bar)
-        side_x, side_y = x - aside * math.sin(heading), y + aside * math.cos(heading)
-        name, size = f"gate_{number}/frame_{part}", (0.15, bar, half + 2 * bar)
+        side_x = x - aside * math.sin(heading)
+        side_y = y + aside * math.cos(heading)
+        name = f"gate_{number}/frame_{part}"
+        size = (0.15, bar, half + 2 * bar)
         track.add(name, "box", size, (side_x, side_y, height), tint, turn)
-        name, size = f"gate_{number}/post_{part}", (0.1, foot, 0)
+        name = f"gate_{number}/post_{part}"
+        size = (0.1, foot, 0)
         track.add(name, "cylinder", size, (side_x, side_y, foot), steel)
     for part, sign in (("top", 1), ("bottom", -1)):
         position = (x, y, height + sign * (half + bar))

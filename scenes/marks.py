@@ -36,7 +36,8 @@ class Mark:
             return [MarkPart("sphere", self.size, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))]
         if self.shape == "disc":  # its lower side lies on the ground: both at one height flicker
             return [MarkPart("cylinder", self.size, (0.0, 0.0, 0.0), (0.0, 0.0, thickness))]
-        turn, half = math.radians(self.heading), self.size / 2
+        turn = math.radians(self.heading)
+        half = self.size / 2
         corners = [
             (-half * y * math.sin(turn), half * y * math.cos(turn), half * z) for y, z in _CORNERS
         ]

@@ -150,7 +150,8 @@ def clear(spec: mujoco.MjSpec, near: float, far: float, slices: int) -> None:
     for texture in list(spec.textures):
         if texture.type == SKY:
             spec.delete(texture)
-    stat, visual = spec.stat, spec.visual
+    stat = spec.stat
+    visual = spec.visual
     stat.extent = model.stat.extent
     stat.center = model.stat.center
     stat.meansize = model.stat.meansize

@@ -200,7 +200,9 @@ class Draw:
     def __init__(
         self, random: Random, use: int, ids: Ids, chosen: Mapping[str, Array] | None = None
     ) -> None:
-        self._random, self._use, self._ids = random, use, ids
+        self._random = random
+        self._use = use
+        self._ids = ids
         self._chosen = chosen or {}
         self._words = np.empty((len(ids), 0), np.uint32)
         self._first = 0  # block that comes next
@@ -230,7 +232,8 @@ class Draw:
         """The next words of each world that begins, from a new block on."""
         count = self._random.drones * prod(size) + more
         if count > self._words.shape[1]:
-            random, ids = self._random, self._ids
+            random = self._random
+            ids = self._ids
             blocks = max(_BLOCKS, -(-count // 4))
             self._words = words_of(
                 random.keys[ids],
@@ -266,7 +269,9 @@ class Noise:
     def __init__(self, random: Random, use: int, size: int) -> None:
         worlds = len(random.keys)
         self.step = np.zeros(worlds, np.uint32)
-        self._random, self._use, self._size = random, use, size
+        self._random = random
+        self._use = use
+        self._size = size
         self._ahead = max(1, _AHEAD // worlds)
         self._rows = np.zeros((worlds, self._ahead, random.drones, size))
         self._left = np.zeros(worlds, int)  # rows that are drawn ahead
@@ -319,7 +324,8 @@ class Noise:
         return rows
 
     def _fill(self, ids: NDArray[np.int64]) -> None:
-        random, ahead = self._random, self._ahead
+        random = self._random
+        ahead = self._ahead
         steps = self.step[ids, None] + np.arange(ahead, dtype=np.uint32)
         keys = np.repeat(random.keys[ids][:, None], ahead, axis=1)
         episodes = np.repeat(random.episode[ids][:, None], ahead, axis=1)

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from ..models.errors import expect
+from ..models.errors import InputError
 from .effects import EffectOptions
 from .random import Draw
 from .state import Array, clip
@@ -73,15 +73,22 @@ class Randomization:
     """
 
     def __init__(self, texts: Any, effects: EffectOptions | None) -> None:
-        right = isinstance(texts, Mapping)
-        expect(right, "randomize", "a mapping from names to distributions", f"{texts!r:.80}")
+        if not isinstance(texts, Mapping):
+            raise InputError(
+                f"randomize: expected a mapping from names to distributions, got {texts!r:.80}"
+            )
         self._kinds: dict[str, tuple[str, tuple[float, ...]]] = {}
         for name, text in texts.items():
             known = ", ".join(PARAMETERS)
-            expect(name in PARAMETERS, "randomize", f"some of {known}", repr(name))
+            if name not in PARAMETERS:
+                raise InputError(f"randomize: expected some of {known}, got {name!r:.300}")
             needs = PARAMETERS[name].needs
             on = not needs or effects is None or any(getattr(effects, name) for name in needs)
-            expect(on, f"randomize: {name}", f"the effect {' or '.join(needs)}", "it switched off")
+            if not on:
+                raise InputError(
+                    f"randomize: {name}: expected the effect {' or '.join(needs)}, "
+                    "got it switched off"
+                )
             self._kinds[name] = _distribution(name, text)
 
     @property
@@ -146,5 +153,6 @@ def _distribution(name: str, text: Any) -> tuple[str, tuple[float, ...]]:
         right = numbers[0] <= numbers[1] and (kind == "uniform" or numbers[0] > 0)
     if right and kind == "normal":
         right = 0 <= numbers[1] < float("inf")
-    expect(right, f"randomize: {name}", expected, f"{text!r:.80}")
+    if not right:
+        raise InputError(f"randomize: {name}: expected {expected}, got {text!r:.80}")
     return kind, numbers

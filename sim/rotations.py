@@ -65,7 +65,9 @@ def _turned(quaternion: Array, vector: Array, sign: float) -> Array:
     w, x, y, z = (component(quaternion, i) for i in range(4))
     a, b, c = (component(vector, i) for i in range(3))
     w = w * sign
-    p, q, r = 2 * (y * c - z * b), 2 * (z * a - x * c), 2 * (x * b - y * a)
+    p = 2 * (y * c - z * b)
+    q = 2 * (z * a - x * c)
+    r = 2 * (x * b - y * a)
     return stack((
         a + w * p + y * r - z * q,
         b + w * q + z * p - x * r,

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..models.coefficients import COEFFICIENTS
-from ..models.errors import InputError, expect
+from ..models.errors import InputError
 from ..models.fields import Limits, check, limits_of
 from .rotations import advanced, between, cross, to_body, to_world, world_z
 from .snapshots import Arrays, Kept, joined, part_of
@@ -109,25 +109,30 @@ def checked_sensors(given: Any) -> dict[str, Any]:
     "estimate".
     """
     known = [*SENSOR_TYPES, _ESTIMATE, "observe"]
-    expect(isinstance(given, Mapping), "sensors", "settings by sensor", f"{given!r:.80}")
+    if not isinstance(given, Mapping):
+        raise InputError(f"sensors: expected settings by sensor, got {given!r:.80}")
     for name in given:
-        expect(name in known, "sensors", f"some of {', '.join(known)}", f"{name!r}")
+        if name not in known:
+            raise InputError(f"sensors: expected some of {', '.join(known)}, got {name!r:.300}")
     sensors: dict[str, Any] = {}
     for name in known[:-1]:
         settings = given.get(name)
         if settings is None or settings is False:
             continue
-        right = settings is True or isinstance(settings, Mapping)
-        expect(right, f"sensors.{name}", "true, or settings by name", f"{settings!r:.80}")
+        if not (settings is True or isinstance(settings, Mapping)):
+            raise InputError(
+                f"sensors.{name}: expected true, or settings by name, got {settings!r:.80}"
+            )
         sensors[name] = {} if settings is True else _checked_settings(name, settings)
     observe = given.get("observe", "added")
-    right = observe in ("added", _ESTIMATE)
-    expect(right, "sensors.observe", "'added' or 'estimate'", f"{observe!r}")
+    if observe not in ("added", _ESTIMATE):
+        raise InputError(f"sensors.observe: expected 'added' or 'estimate', got {observe!r:.300}")
     if observe == _ESTIMATE:
-        expect(_ESTIMATE in sensors, "sensors", "estimate, which is to be observed", "none")
+        if _ESTIMATE not in sensors:
+            raise InputError("sensors: expected estimate, which is to be observed, got none")
         sensors["observe"] = observe
-    right = _ESTIMATE not in sensors or "imu" in sensors
-    expect(right, "sensors", "imu, which estimate needs", "none")
+    if not (_ESTIMATE not in sensors or "imu" in sensors):
+        raise InputError("sensors: expected imu, which estimate needs, got none")
     return sensors
 
 
@@ -144,9 +149,13 @@ def _limits(name: str) -> dict[str, Limits]:
 
 
 def _checked_settings(name: str, given: Mapping[str, Any]) -> dict[str, Any]:
-    known, settings = _limits(name), {}
+    known = _limits(name)
+    settings = {}
     for key, value in given.items():
-        expect(key in known, f"sensors.{name}", f"some of {', '.join(known)}", f"{key!r}")
+        if key not in known:
+            raise InputError(
+                f"sensors.{name}: expected some of {', '.join(known)}, got {key!r:.300}"
+            )
         number = check(f"sensors.{name}.{key}", known[key], value)
         settings[key] = list(number) if isinstance(number, tuple) else number
     return settings
@@ -188,7 +197,10 @@ def _steps(name: str, value: float, period: float) -> int:
     what = f"the control rate of {1 / period:g} Hz over a whole number"
     late = f"a whole number of control periods of {period:g} s, at most {MOST_DELAY}"
     what = what if is_rate else late
-    expect(right, f"sensors.{name}", what, f"{value:g} {'Hz' if is_rate else 's'}")
+    if not right:
+        raise InputError(
+            f"sensors.{name}: expected {what}, got {value:g} {'Hz' if is_rate else 's'}"
+        )
     return round(steps)
 
 
@@ -247,7 +259,8 @@ class Sensor(Kept):
     units: ClassVar[tuple[str, ...]]
 
     def __init__(self, values: Mapping[str, Any], interval: float) -> None:
-        self.values, self.interval = values, interval
+        self.values = values
+        self.interval = interval
 
     def bounds(self) -> tuple[list[float], list[float]]:
         """(low, high) of each component."""
@@ -275,7 +288,8 @@ class Imu(Sensor):
     every T has σ = N / √T; the bias walks by K √T between readings. (IEEE Std 952-1997, annex C.)
     """
 
-    name, prefix = "imu", ""
+    name = "imu"
+    prefix = ""
     arrays = ("_bias", "_scale")
     needs = ("gyro_noise", "accelerometer_noise")
     defaults: ClassVar[Mapping[str, float]] = {
@@ -305,7 +319,8 @@ class Imu(Sensor):
 
     def begin(self, mask: Array, normal: Array) -> None:
         """Bias and error of scale."""
-        bias, scale = self._both("bias"), self._both("scale")
+        bias = self._both("bias")
+        scale = self._both("scale")
         self._bias = _chosen(mask, bias * normal[..., :6], self._bias)
         self._scale = _chosen(mask, scale * normal[..., 6:], self._scale)
 
@@ -321,10 +336,13 @@ class Imu(Sensor):
 class Magnetometer(Sensor):
     """Earth's field in the body frame; white noise."""
 
-    name, prefix, columns = "magnetometer", "magnetometer_", 3
+    name = "magnetometer"
+    prefix = "magnetometer_"
+    columns = 3
     settings = ("field",)
     frame = "body"
-    components, units = ("field x", "field y", "field z"), ("µT",) * 3
+    components = ("field x", "field y", "field z")
+    units = ("µT",) * 3
 
     def bounds(self) -> tuple[list[float], list[float]]:
         """Plus and minus 1 mT, far from any reading but for a wrong noise."""
@@ -344,12 +362,15 @@ class Barometer(Sensor):
     body's origin.
     """
 
-    name, prefix, columns = "barometer", "barometer_", 2
+    name = "barometer"
+    prefix = "barometer_"
+    columns = 2
     arrays = ("_bias",)
     defaults: ClassVar[Mapping[str, float]] = {"walk": 0.0}
     settings = ("altitude",)
     frame = "above sea level"
-    components, units = ("pressure altitude",), ("m",)
+    components = ("pressure altitude",)
+    units = ("m",)
 
     def __init__(self, values: Mapping[str, Any], interval: float) -> None:
         super().__init__(values, interval)
@@ -378,10 +399,13 @@ class Barometer(Sensor):
 class Rangefinder(Sensor):
     """Distance from the body's origin along its -z axis, by a ray; white noise."""
 
-    name, prefix, columns = "rangefinder", "range_", 1
+    name = "rangefinder"
+    prefix = "range_"
+    columns = 1
     needs = ("noise", "limit")
     frame = "body, along -z"
-    components, units = ("distance",), ("m",)
+    components = ("distance",)
+    units = ("m",)
 
     def bounds(self) -> tuple[list[float], list[float]]:
         """0 to the limit, which it reads where there is nothing."""
@@ -396,7 +420,9 @@ class Rangefinder(Sensor):
 class Gps(Sensor):
     """Position and velocity; white noise."""
 
-    name, prefix, columns = "gps", "gps_", 6
+    name = "gps"
+    prefix = "gps_"
+    columns = 6
     needs = ("noise", "vertical_noise", "velocity_noise")
     frame = "world"
     components = ("x", "y", "z", "vx", "vy", "vz")
@@ -419,7 +445,9 @@ class Gps(Sensor):
 class MotionCapture(Sensor):
     """Position and attitude; white noise, of the attitude about the body's axes."""
 
-    name, prefix, columns = "motion_capture", "mocap_", 6
+    name = "motion_capture"
+    prefix = "mocap_"
+    columns = 6
     needs = ("noise", "angle_noise")
     frame = "world; quaternion: body to world"
     components = ("x", "y", "z", "qw", "qx", "qy", "qz")
@@ -470,7 +498,8 @@ class _Channel(Kept):
     lists = ("_late_values", "_late_fresh")
 
     def __init__(self, name: str, values: Mapping[str, Any], world: "World", period: float) -> None:
-        self._every, self._lag = values["every"], values["lag"]
+        self._every = values["every"]
+        self._lag = values["lag"]
         self.interval = self._every * period
         self.sensor = SENSOR_TYPES[name](values, self.interval)
         self._world = world
@@ -506,7 +535,8 @@ class _Channel(Kept):
             fresh = due & (component(normal, -1) >= self._lost)
             self._held = _chosen(fresh, reading, self._held)
         if not self._lag:
-            self.value, self.fresh = self._held, _chosen(mask, fresh, self.fresh)
+            self.value = self._held
+            self.fresh = _chosen(mask, fresh, self.fresh)
             return
         self.value = _chosen(mask, self._late_values[0], self.value)
         self.fresh = _chosen(mask, self._late_fresh[0], self.fresh)
@@ -631,8 +661,11 @@ class Estimator(Kept):
         altitude: float,
         field: Any,
     ) -> None:
-        self._times, self._period, self._gravity = times, period, gravity
-        self._altitude, self._north = altitude, math.atan2(field[1], field[0])
+        self._times = times
+        self._period = period
+        self._gravity = gravity
+        self._altitude = altitude
+        self._north = math.atan2(field[1], field[0])
         self.position: Array = 0.0
         self.velocity: Array = 0.0
         self.quaternion: Array = 0.0
@@ -647,8 +680,10 @@ class Estimator(Kept):
 
     def update(self, mask: Array, channels: Mapping[str, _Channel]) -> None:
         """A control step of the drones of a mask."""
-        imu, period = channels["imu"].value, self._period
-        rates, force = imu[..., :3], imu[..., 3:]
+        imu = channels["imu"].value
+        period = self._period
+        rates = imu[..., :3]
+        force = imu[..., 3:]
         turned = advanced(self.quaternion, rates * period + self._correction(force, channels))
         gravity = np.array((0.0, 0.0, self._gravity))
         acceleration = to_world(turned, force) - gravity
@@ -662,7 +697,8 @@ class Estimator(Kept):
 
     def _correction(self, force: Array, channels: Mapping[str, _Channel]) -> Array:
         """Rotation vector in the body frame that pulls the attitude to what measures it, rad."""
-        up, time = world_z(self.quaternion), self._times["attitude_time"]
+        up = world_z(self.quaternion)
+        time = self._times["attitude_time"]
         angle = (1 - math.exp(-self._period / time)) / self._gravity * cross(force, up)
         if channel := channels.get("magnetometer"):
             field = to_world(self.quaternion, channel.value)
@@ -688,7 +724,8 @@ class Estimator(Kept):
         if channel := channels.get("motion_capture"):
             g, h = self._gains(channel, "position_time")
             off = channel.value[..., :3] - position
-            position, velocity = position + stack((g,)) * off, velocity + stack((h,)) * off
+            position = position + stack((g,)) * off
+            velocity = velocity + stack((h,)) * off
         if channel := channels.get("gps"):
             gain = stack((self._gain(channel, "position_time"),))
             position = position + gain * (channel.value[..., :3] - position)

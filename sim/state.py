@@ -58,7 +58,8 @@ class WorldState:
     @property
     def tilt_cosine(self) -> Array:
         """Cosine of the angle between each body's z axis and the vertical, shape (W, A)."""
-        x, y = component(self.quaternion, 1), component(self.quaternion, 2)
+        x = component(self.quaternion, 1)
+        y = component(self.quaternion, 2)
         return 1 - 2 * (x * x + y * y)
 
 

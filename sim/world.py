@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, Protocol
 from numpy.typing import NDArray
 
 from ..models import BACKENDS, MAX_DRONES, Backend
-from ..models.errors import InputError, expect
+from ..models.errors import InputError
 from .effects import EffectOptions
 from .random import Draw, Random
 from .randomize import CENTER, Randomization
@@ -120,7 +120,8 @@ def flown_model(
 def check_hung(height: float, least: float) -> None:
     """Refuse a start at which the payload would hang in the ground. Raises `InputError`."""
     expected = f"a height over {least:.4g} m, for the payload on its cable"
-    expect(height > least, "start", expected, f"{height:.4g} m")
+    if not height > least:
+        raise InputError(f"start: expected {expected}, got {height:.4g} m")
 
 
 def _class_of(backend: Backend) -> Any:

@@ -92,7 +92,8 @@ def markdown(rows: Sequence[Accuracy]) -> str:
 def _start(vehicle: Vehicle, integrator: str, step: float, height: float) -> tuple[Any, Any]:
     """(model, data) of a level craft at rest."""
     model = copy.copy(vehicle.model)
-    model.opt.integrator, model.opt.timestep = INTEGRATORS[integrator], step
+    model.opt.integrator = INTEGRATORS[integrator]
+    model.opt.timestep = step
     data = mujoco.MjData(model)
     data.qpos[:] = (0.0, 0.0, height, 1.0, 0.0, 0.0, 0.0)
     return model, data
@@ -102,7 +103,8 @@ def _tumble(
     vehicle: Vehicle, integrator: str, step: float, repeats: int = 1
 ) -> tuple[NDArray[np.float64], float]:
     """(`qpos` after the flight, least µs for a simulated second)."""
-    control_steps, substeps = round(_SECONDS / _CONTROL), round(_CONTROL / step)
+    control_steps = round(_SECONDS / _CONTROL)
+    substeps = round(_CONTROL / step)
     phases = np.arange(control_steps)[:, None] * (0.11, 0.13, 0.17, 0.19)
     thrusts = vehicle.hover_thrust * (1 + 0.3 * np.sin(phases))
     cost = float("inf")

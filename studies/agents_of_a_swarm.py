@@ -96,7 +96,8 @@ class Twin:
     """A world in process that repeats what the simulator does, and compares every bit."""
 
     def __init__(self, simulator: SharedSimulator) -> None:
-        self.simulator, self.loop = simulator, Loop(EnvConfig(env_id=ENV_ID, drones=AGENTS))
+        self.simulator = simulator
+        self.loop = Loop(EnvConfig(env_id=ENV_ID, drones=AGENTS))
         self.taken = 0  # absences that were repeated
         self.absent = np.zeros(AGENTS, bool)
         kinds = ("silent", "coming", "late", "waiting", "left")
@@ -104,7 +105,9 @@ class Twin:
         self.shown = np.zeros((AGENTS, 3), np.float32)
 
     def __call__(self, cause: Command | None, state: State) -> None:
-        loop, simulator, everybody = self.loop, self.simulator, np.ones(AGENTS, bool)
+        loop = self.loop
+        simulator = self.simulator
+        everybody = np.ones(AGENTS, bool)
         nothing = np.zeros((AGENTS, 1), np.float32)
         if cause is None:
             seed = simulator.seed
@@ -156,7 +159,8 @@ def fly_eight(kills: int, dice: random.Random) -> dict[str, Any]:
                 assert thread.is_alive(), "the simulator failed"
                 time.sleep(0.01)
             time.sleep(dice.uniform(0.0, 1.5))
-            victim, killed = dice.randrange(AGENTS), dice.random() < 0.6
+            victim = dice.randrange(AGENTS)
+            killed = dice.random() < 0.6
             if killed:
                 agents[victim].kill()
                 agents[victim].wait()
@@ -200,12 +204,17 @@ def fly_hundred(steps: int) -> dict[str, Any]:
     simulator = Simulator(ENV_ID, server=server, bind=ANY, drones=100)
     thread = threading.Thread(target=simulator.run)
     thread.start()
-    remote, local = RemoteVectorEnv(("127.0.0.1", port)), LocalVectorEnv(ENV_ID, 100, drones=100)
-    here, there = local.reset(seed=0), remote.reset(seed=0)
-    dice, different, episodes = np.random.default_rng(0), 0, 0
+    remote = RemoteVectorEnv(("127.0.0.1", port))
+    local = LocalVectorEnv(ENV_ID, 100, drones=100)
+    here = local.reset(seed=0)
+    there = remote.reset(seed=0)
+    dice = np.random.default_rng(0)
+    different = 0
+    episodes = 0
     for _ in range(steps):
         actions = dice.uniform(-0.1, 0.1, (100, 1)).astype(np.float32)
-        here, there = local.step(actions), remote.step(actions)
+        here = local.step(actions)
+        there = remote.step(actions)
         told = (name for name in here[4] if not name.startswith(("_", "reward")))
         pairs = [*zip(here[:4], there[:4], strict=True),
                  *((here[4][name], there[4][name]) for name in told)]  # fmt: skip
@@ -232,7 +241,8 @@ def main() -> None:
     }
     write(args.out, result)
     print(json.dumps(result, indent=2))
-    eight, hundred = result["agent_processes"], result["hundred_drones"]
+    eight = result["agent_processes"]
+    hundred = result["hundred_drones"]
     differ = eight["states_that_differ"] + eight["actions_that_differ"]
     if differ or hundred["steps_that_differ"]:
         sys.exit(1)

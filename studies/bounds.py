@@ -52,16 +52,20 @@ def known_bounds(config: EnvConfig, episodes: int) -> dict[str, float]:
 def elevation_bounds(config: FlownConfig, vehicle: Vehicle, starts: Floats) -> dict[str, float]:
     """Mean returns of the two flights by name, over episodes that start at E in m, shape (n,)."""
     options: Any = config.task_options
-    steps, period = config.episode_length or 0, config.control_period or 0.0
+    steps = config.episode_length or 0
+    period = config.control_period or 0.0
     # Largest accelerations up and down, m/s², and the largest change of one in a control step.
     up = float(vehicle.thrust_high.sum()) / vehicle.mass - vehicle.gravity
     down = vehicle.gravity - float(vehicle.thrust_low.sum()) / vehicle.mass
     newtons = options.thrust_scale or SHARES[config.action or ""] * float(vehicle.thrust_high.max())
     change = vehicle.num_rotors * newtons / vehicle.mass
     if config.action == "offset":
-        up, down, change = min(up, change), min(down, change), np.inf
+        up = min(up, change)
+        down = min(down, change)
+        change = np.inf
     rising = starts > 0
-    towards, against = np.where(rising, up, down), np.where(rising, down, up)
+    towards = np.where(rising, up, down)
+    against = np.where(rising, down, up)
     drag = config.effects.linear_drag
     left = bang_bang(np.abs(starts), steps, period, towards, against, change, drag)
     return {
@@ -108,7 +112,8 @@ def bang_bang(
 
 
 def _bisected(too_low: Any, low: Floats, high: Floats) -> Floats:
-    low, high = low.copy(), high.copy()
+    low = low.copy()
+    high = high.copy()
     for _ in range(_HALVINGS):
         middle = (low + high) / 2
         below = too_low(middle)
@@ -176,7 +181,8 @@ def least_height_lost(
     torques are left out. Integrated in steps of so many seconds.
     """
     low, high = lift
-    speed, height = np.array(climb, float), np.zeros(len(tilt))
+    speed = np.array(climb, float)
+    height = np.zeros(len(tilt))
     lowest = height
     for count in range(round(60.0 / step)):
         # The vertical thrust of the best tilt within the step: that of its end.
@@ -200,7 +206,8 @@ def recovery_bounds(
     one axis with the largest angular acceleration a, 2 sqrt(tilt / a), s. `height_lost`: see
     `least_height_lost`, m.
     """
-    dice, angles = np.random.default_rng(0), np.radians(np.arange(360.0))
+    dice = np.random.default_rng(0)
+    angles = np.radians(np.arange(360.0))
     axes = np.stack((np.cos(angles), np.sin(angles), 0.0 * angles), axis=1)
     turn = max(map(vehicle.turning, axes)) / float(np.cos(np.radians(0.5)))  # between the axes
     most = Recovery(FlownConfig.from_keywords(RECOVERY, **options.to_options()), vehicle).spin

@@ -16,7 +16,8 @@ from rotorgram.envs import LocalVectorEnv
 from rotorgram.flights.trajectories import fly_episodes
 from rotorgram.models.library import vehicle_names
 
-CABLE, DRONES = "rotorgram/Cable-v0", (2, 3, 4, 8)
+CABLE = "rotorgram/Cable-v0"
+DRONES = (2, 3, 4, 8)
 
 
 def flown(vehicle: str, drones: int, episodes: int) -> dict[str, Any]:

@@ -67,10 +67,13 @@ def ours(word: str, world: str = "plain", vehicle: Vehicle | None = None) -> tup
     """A picture of a craft that flies and yaws, a little further from one to the next."""
     vehicle = vehicle or Vehicle.load(VEHICLE)
     views = chosen_views([word], vehicle.cameras)
-    cameras, everybody = Cameras(vehicle, views, world=world), np.ones(1, bool)
-    place, turn = np.array([[0.0, 0.0, 1.0]]), np.array([[1.0, 0.0, 0.0, 0.0]])
+    cameras = Cameras(vehicle, views, world=world)
+    everybody = np.ones(1, bool)
+    place = np.array([[0.0, 0.0, 1.0]])
+    turn = np.array([[1.0, 0.0, 0.0, 0.0]])
     speeds = {"velocity": np.array([[3.0, 0.0, 0.0]]), "body_rates": np.array([[0.0, 0.0, 2.0]])}
-    due, dice = {views[0].name: everybody}, {0: np.random.default_rng(0)}
+    due = {views[0].name: everybody}
+    dice = {0: np.random.default_rng(0)}
 
     def step() -> None:
         place[0, 0] += 1e-3
@@ -242,7 +245,8 @@ def optics(path: Path) -> None:
     with TemporaryDirectory() as folder:
         vehicle = optical(folder)
         views = chosen_views([f"{name}@320x240" for name in OPTICS], vehicle.cameras)
-        cameras, everybody = Cameras(vehicle, views, world="gates:2"), np.ones(1, bool)
+        cameras = Cameras(vehicle, views, world="gates:2")
+        everybody = np.ones(1, bool)
     state = {
         "position": np.array([[0.0, 0.0, 5.0]]),
         "quaternion": np.array([[1.0, 0.0, 0.0, 0.0]]),
@@ -259,7 +263,8 @@ def worlds(path: Path) -> None:
     """Two seeds of each world that is made from one: from behind the paper's craft, and ahead."""
     from PIL import Image
 
-    vehicle, rows = Vehicle.load(), []
+    vehicle = Vehicle.load()
+    rows = []
     views = chosen_views(["chase@320x240", "front@320x240"], vehicle.cameras)
     state = {"position": np.array([[0.0, 0.0, 5.0]]), "quaternion": np.array([[0.9, 0, 0, 0.436]])}
     everybody = np.ones(1, bool)
@@ -288,7 +293,8 @@ def main() -> None:
     print("| kind | pixels | pictures/s | of `mujoco.Renderer` | ratio |")
     print("|---|---|---:|---:|---:|")
     for row in rows:
-        size, names = f"{row['width']} × {row['height']}", ("per_second", "renderer_per_second")
+        size = f"{row['width']} × {row['height']}"
+        names = ("per_second", "renderer_per_second")
         told = " | ".join(f"{row[name]:,.0f}" for name in names)
         print(f"| {row['kind']} | {size} | {told} | {row['ratio']:.2f} |")
     taken = {str(drones): steps(drones, args.seconds, args.repeats) for drones in (1, 16)}

@@ -12,7 +12,7 @@ from typing import Any
 
 import pandas as pd
 from measuring import options
-from rotorgram.models.errors import expect
+from rotorgram.models.errors import InputError
 from rotorgram.training import claims, metrics
 from rotorgram.training.results import Results
 from rotorgram.training.statistics import bootstrap_difference, iqm
@@ -43,7 +43,10 @@ def compared(name: str, rigid: Path, mujoco: Path) -> list[dict[str, Any]]:
     """The rows of a pair of folders."""
     seeds = [set(Results.read(folder).runs["seed"]) for folder in (rigid, mujoco)]
     both = seeds[0] & seeds[1]
-    expect(len(both) > 1, name, "folders with two seeds or more in common", f"{len(both)}")
+    if not len(both) > 1:
+        raise InputError(
+            f"{name}: expected folders with two seeds or more in common, got {len(both)}"
+        )
     ours, theirs = (values(folder, both) for folder in (rigid, mujoco))
     rows = []
     for (agent, measure), numbers in ours.items():

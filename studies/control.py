@@ -34,7 +34,8 @@ from rotorgram.sim import (
     make_world,
 )
 
-HOVER, CIRCLE = "rotorgram/Hover-v0", "Circle-v0"
+HOVER = "rotorgram/Hover-v0"
+CIRCLE = "Circle-v0"
 FLOWN = ("paper", "crazyflie2", "heavy_hexa")
 PERIOD, SPEED = 2 * math.pi, 1.0  # of a circle with a radius of 1 m: s, m/s
 
@@ -73,19 +74,22 @@ STEPS: dict[str, tuple[int, float, str, float, Callable[[WorldState], float]]] =
 
 def response(name: str, level: str) -> dict[str, float]:
     """Rise time, overshoot and settling time of a step from hover."""
-    vehicle, (index, size, _, time, read) = Vehicle.load(name), STEPS[level]
+    vehicle = Vehicle.load(name)
+    (index, size, _, time, read) = STEPS[level]
     lag = lag_of(vehicle)
     world = make_world(vehicle, 1, effects=EffectOptions(motor_lag=lag > 0))
     controller: Any = make_controller(level, vehicle, vehicle.timestep, lag=lag)
     world.reset(np.True_, InitialState(position=np.array((0.0, 0.0, 1000.0))))
-    unit, action = controller.ranges()[index][0], np.zeros(4)
+    unit = controller.ranges()[index][0]
+    action = np.zeros(4)
     seen = []
     for _ in range(round(time / vehicle.timestep)):
         now = read(world.state)
         seen.append(now)
         action[index] = (size - now if level == "position" else size) / unit
         world.step(controller.thrust(action, world.state), 1)
-    values, step = np.array(seen) / size, vehicle.timestep
+    values = np.array(seen) / size
+    step = vehicle.timestep
     low, high = (int((values >= share).argmax()) for share in (0.1, 0.9))
     outside = np.flatnonzero(np.abs(values - 1) > 0.05)
     return {
@@ -109,7 +113,8 @@ def tracking(name: str) -> float:
     lags = {"motor_lag": True} if lag_of(Vehicle.load(name)) else {}
     options = {"action": "position", "episode_length": 1000, "effects": lags}
     loop = Loop(EnvConfig.from_keywords(CIRCLE, vehicle=name, **options))
-    policy, errors = Geometric(loop.spec), []
+    policy = Geometric(loop.spec)
+    errors = []
     loop.advance(np.zeros(4), np.ones(1, bool), [0])
     for _ in range(round(3 * PERIOD / 0.02)):
         loop.advance(policy.act(loop.observations["observation"][0]))
@@ -123,10 +128,13 @@ def cost(num_drones: int, seconds: float, repeats: int) -> dict[str, Any]:
         level: Loop(EnvConfig(env_id=HOVER, action=level, episode_length=10**6), num_drones)
         for level in LEVELS
     }
-    every, rates = np.ones(num_drones, bool), {level: list[float]() for level in LEVELS}
+    every = np.ones(num_drones, bool)
+    rates = {level: list[float]() for level in LEVELS}
     for repeat in range(repeats):
         for level in LEVELS if repeat % 2 else LEVELS[::-1]:
-            loop, taken, steps = loops[level], 0.0, 0
+            loop = loops[level]
+            taken = 0.0
+            steps = 0
             actions = np.zeros((num_drones, len(loop.task.controller.low)), np.float32)
             while taken < seconds:
                 loop.advance(actions, every, list(range(num_drones)))

@@ -36,7 +36,9 @@ def made(count: int, track: str, backend: Any) -> Any:
 
 def measure(row: str, seed: int) -> dict[str, Any]:
     """Train through the stages of a row, and fly the track of the last one."""
-    preset, began, kept = find_preset("ppo", "tuned", RACING), time.process_time(), None
+    preset = find_preset("ppo", "tuned", RACING)
+    began = time.process_time()
+    kept = None
     for track, env_steps in ROWS[row]:
         run = Run(
             algorithm="ppo", config=preset.config, seed=seed, env_steps=env_steps,

@@ -13,7 +13,8 @@ from rotorgram.flights.trajectories import flown_trajectories
 from rotorgram.rendering import CAMERAS, Canvas, Stage
 
 WIDTH, HEIGHT = 480, 270  # of each picture
-COLUMNS, SPACE = 2, 4
+COLUMNS = 2
+SPACE = 4
 TIMES = 2  # drawn larger and reduced: smooth edges
 ENV = "rotorgram/Elevation-v0"
 EPISODE, STEP = 1, 20  # on its way to the goal
@@ -40,7 +41,8 @@ def draw() -> Image.Image:
         around = (box[0] - 5, box[1] - 4, box[2] + 5, box[3] + 4)
         write.rounded_rectangle(around, 4, (13, 18, 26))
         write.text((10, 8), name, "white", font)
-        column, row = number % COLUMNS, number // COLUMNS
+        column = number % COLUMNS
+        row = number // COLUMNS
         sheet.paste(picture, (column * (WIDTH + SPACE), row * (HEIGHT + SPACE)))
     return sheet
 

@@ -11,7 +11,8 @@ from measuring import IMAGES, options
 from PIL import Image
 from rotorgram.scenes import build_scene
 
-WIDTH, HEIGHT = 1200, 675
+WIDTH = 1200
+HEIGHT = 675
 OVERSAMPLING = 1.5  # drawn larger and reduced: smooth edges of thin arms and discs
 ALTITUDE = 1.2  # m: low enough for craft and shadow to share the picture
 
@@ -23,7 +24,9 @@ def draw() -> Image.Image:
     data.qpos[2] = ALTITUDE
     mujoco.mj_forward(model, data)
     camera = mujoco.MjvCamera()
-    camera.azimuth, camera.elevation, camera.distance = 164.0, -20.0, 4.25
+    camera.azimuth = 164.0
+    camera.elevation = -20.0
+    camera.distance = 4.25
     camera.lookat[:] = (0.0, 0.0, ALTITUDE - 0.38)
     size = int(HEIGHT * OVERSAMPLING), int(WIDTH * OVERSAMPLING)
     with mujoco.Renderer(model, *size) as renderer:

@@ -15,7 +15,8 @@ from rotorgram.flights.filming import moments
 from rotorgram.flights.trajectories import flown_trajectories
 from rotorgram.rendering import Camera, Canvas, Stage
 
-WIDTH, HEIGHT = 480, 270
+WIDTH = 480
+HEIGHT = 270
 TIMES = 2  # drawn larger and reduced: smooth edges
 COLORS = 128  # of a picture: a quarter of the bytes
 
@@ -42,7 +43,8 @@ SCENES = {
 
 def draw(name: str, scene: Scene) -> Image.Image:
     """A picture of the task by its name without ending."""
-    env_id, agent = f"rotorgram/{name}-v0", CONTROLLERS[scene.agent]
+    env_id = f"rotorgram/{name}-v0"
+    agent = CONTROLLERS[scene.agent]
     options: dict[str, Any] = agent.options
     policy = agent(env_spec(EnvConfig.from_keywords(env_id, **options)))
     (flown,) = flown_trajectories(policy, env_id, options, [0])

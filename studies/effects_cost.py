@@ -39,7 +39,9 @@ def steps_per_second(world: World, commands: np.ndarray, seconds: float) -> floa
     """Control steps of all drones per second, resets not counted."""
     every = np.ones(world.shape, bool)[()]
     pose = InitialState(position=np.broadcast_to((0.0, 0.0, 30.0), (*world.shape, 3)))
-    substeps, taken, steps = world.vehicle.substeps(0.02), 0.0, 0
+    substeps = world.vehicle.substeps(0.02)
+    taken = 0.0
+    steps = 0
     while taken < seconds:
         world.reset(every, pose)
         begun = perf_counter()

@@ -63,9 +63,11 @@ Clock = Callable[[], float]
 
 def policy_of(env: str, hidden: tuple[int, ...], activation: str, normalise: bool) -> NetworkPolicy:
     """With random weights: time and size do not depend on them."""
-    spec, rng = env_spec(EnvConfig(env_id=env)), np.random.default_rng(0)
+    spec = env_spec(EnvConfig(env_id=env))
+    rng = np.random.default_rng(0)
     k = spec.action.size  # type: ignore[union-attr]
-    sizes, weights = [flat_size(spec), *hidden, k], {"log_std": np.zeros(k)}
+    sizes = [flat_size(spec), *hidden, k]
+    weights = {"log_std": np.zeros(k)}
     for i, (inputs, units) in enumerate(pairwise(sizes)):
         weights[f"layers.{i}.weight"] = rng.normal(size=(units, inputs)) / np.sqrt(inputs)
         weights[f"layers.{i}.bias"] = np.zeros(units)

@@ -73,7 +73,8 @@ print(json.dumps({"sent": sent, "datagrams_per_second": round(sent / seconds)}))
 def train(run: Run, flood_seconds: float) -> dict[str, Any]:
     with spawn_simulator(run.flown) as env:
         training = Training(run, env)
-        flood, marks = None, []
+        flood = None
+        marks = []
 
         def on_update() -> bool:
             nonlocal flood
@@ -103,7 +104,8 @@ def train(run: Run, flood_seconds: float) -> dict[str, Any]:
             "agent": env.statistics.numbers(),
         }
     if len(marks) > 1:
-        (began, first), (ended, last) = marks[0], marks[-1]
+        (began, first) = marks[0]
+        (ended, last) = marks[-1]
         result["flooded_seconds"] = round(ended - began, 1)
         result["flooded_steps_per_second"] = round((last - first) / (ended - began))
     return result
@@ -120,7 +122,8 @@ def main() -> None:
         seed=0,
         env_steps=args.env_steps,
     )
-    calm, flooded = train(run, 0), train(run, args.seconds)
+    calm = train(run, 0)
+    flooded = train(run, args.seconds)
     same = calm["episodes"] == flooded["episodes"] and all(
         calm["state"][name].tobytes() == flooded["state"][name].tobytes() for name in calm["state"]
     )

@@ -45,7 +45,8 @@ EFFECTS: Final[dict[str, dict[str, Any]]] = {
     "all": {"motor_lag": True, "body_drag": True, "rotor_drag": True, "wind": WIND},
 }
 """Those whose equations are smooth; a vehicle flies with the ones that it has coefficients for."""
-MOST_M, MOST_DEG = 1e-3, 0.01
+MOST_M = 1e-3
+MOST_DEG = 0.01
 """The targets: largest distance and angle between both flights."""
 
 CONTROL: Final = 0.02  # s
@@ -128,8 +129,10 @@ def at_step(vehicle: Vehicle, step: float) -> Vehicle:
 
 def thrusts(vehicle: Vehicle, seconds: float = SECONDS, seed: int = _SEED) -> Floats:
     """Thrust of each rotor in each control period, N, shape (T, R)."""
-    periods, dice = round(seconds / CONTROL), np.random.default_rng(seed)
-    hover, torques = vehicle.hover_thrust, vehicle.allocation[1:]
+    periods = round(seconds / CONTROL)
+    dice = np.random.default_rng(seed)
+    hover = vehicle.hover_thrust
+    torques = vehicle.allocation[1:]
     spins = np.linalg.norm(np.linalg.solve(vehicle.inertia, torques * hover), axis=1)
     own = min(_VARIED, math.sqrt(3) * _AGILE / float(spins.max()))
     varied = dice.uniform(-_VARIED, _VARIED, (periods, 1))
@@ -140,11 +143,12 @@ def thrusts(vehicle: Vehicle, seconds: float = SECONDS, seed: int = _SEED) -> Fl
 def ours(vehicle: Vehicle, commands: Floats, effects: dict[str, Any]) -> Flight:
     """The flight of the backend `mujoco` at the vehicle's physics step."""
     world = make_world(vehicle, 1, effects=EffectOptions(**effects))
-    state, start = world.state, InitialState(
+    state = world.state
+    start = InitialState(
         position=np.array((0.0, 0.0, _HEIGHT)),
         velocity=np.array(VELOCITY),
         body_rates=np.array(SPIN),
-    )  # fmt: skip
+    )
     world.reset(np.True_, start)
     flown = [[x.copy() for x in (state.position, state.quaternion, state.body_rates)]]
     for command in commands:
@@ -172,7 +176,8 @@ def independent(
             np.sqrt(vehicle.hover_thrust),
         )
     )
-    at, flown = np.array((0.0, 0.0, _HEIGHT)) + center, []
+    at = np.array((0.0, 0.0, _HEIGHT)) + center
+    flown = []
     for command in (None, *commands):
         if command is not None:
             end = solve_ivp(
@@ -181,7 +186,8 @@ def independent(
             )  # fmt: skip
             assert end.success, end.message
             y = end.y[:, -1].copy()
-            at, y[:3] = at + y[:3], 0.0
+            at = at + y[:3]
+            y[:3] = 0.0
             y[6:10] /= np.linalg.norm(y[6:10])
         flown.append((at - rotation(y[6:10]) @ center, y[6:10].copy(), y[10:13].copy()))
     return Flight(*(np.array(part) for part in zip(*flown, strict=True)))
@@ -191,9 +197,12 @@ class Equations:
     """The Newton-Euler equations of a vehicle about its center of mass, with some effects."""
 
     def __init__(self, vehicle: Vehicle, effects: dict[str, Any]) -> None:
-        told, rotors = vehicle.coefficients, vehicle.rotors
-        self.effects, self.mass = effects, vehicle.mass
-        self.inertia, self.inverse = vehicle.inertia, np.linalg.inv(vehicle.inertia)
+        told = vehicle.coefficients
+        rotors = vehicle.rotors
+        self.effects = effects
+        self.mass = vehicle.mass
+        self.inertia = vehicle.inertia
+        self.inverse = np.linalg.inv(vehicle.inertia)
         self.weight = np.array((0.0, 0.0, -vehicle.mass * vehicle.gravity))
         self.axis = np.array([r.axis for r in rotors])
         self.arm = np.array([r.position for r in rotors]) - vehicle.center_of_mass
@@ -208,13 +217,18 @@ class Equations:
         if "rotor_drag" in effects:
             self.k = told.rotors.thrust_coefficient
             self.drag = told.rotors.drag or 0.0
-            self.inflow, self.lift = told.rotors.inflow or 0.0, told.rotors.lift or 0.0
+            self.inflow = told.rotors.inflow or 0.0
+            self.lift = told.rotors.lift or 0.0
 
     def derivative(self, _: float, y: Floats, command: Floats) -> Floats:
         """Of the position and velocity of the center of mass, quaternion, body rates, and roots."""
-        velocity, q, rates, root = y[3:6], y[6:10], y[10:13], y[13:]
+        velocity = y[3:6]
+        q = y[6:10]
+        rates = y[10:13]
+        root = y[13:]
         turn = rotation(q)
-        thrust, change = command, np.zeros_like(root)
+        thrust = command
+        change = np.zeros_like(root)
         if "motor_lag" in self.effects:
             wanted = np.sqrt(command)
             thrust = root * root
@@ -235,7 +249,9 @@ class Equations:
         torque = torque + cross(self.arm, force).sum(axis=0)
         acceleration = (turn @ (force.sum(axis=0) + body) + self.weight) / self.mass
         spin = self.inverse @ (torque - cross(rates, self.inertia @ rates))
-        w, (x, y_, z), (a, b, c) = q[0], q[1:], 0.5 * rates
+        w = q[0]
+        (x, y_, z) = q[1:]
+        (a, b, c) = 0.5 * rates
         turning = (
             -x * a - y_ * b - z * c,
             w * a + y_ * c - z * b,
@@ -272,9 +288,11 @@ def compare(
     seconds: float = SECONDS,
 ) -> list[Row]:
     """Fly a vehicle both ways, with each of the effects that it has coefficients for."""
-    rows, commands = [], thrusts(vehicle, seconds)
+    rows = []
+    commands = thrusts(vehicle, seconds)
     for words in effects:
-        chosen, truth = EFFECTS[words], None
+        chosen = EFFECTS[words]
+        truth = None
         for step in sorted({*steps, vehicle.timestep}, reverse=True):
             try:
                 flown = ours(at_step(vehicle, step), commands, chosen)

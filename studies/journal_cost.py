@@ -58,8 +58,10 @@ class Flight:
         env.reset(seed=0)
 
     def fly(self, seconds: float) -> Slice:
-        start, before = time.perf_counter(), self.steps
-        here, there = time.process_time(), processor_time(self.simulator)
+        start = time.perf_counter()
+        before = self.steps
+        here = time.process_time()
+        there = processor_time(self.simulator)
         while time.perf_counter() - start < seconds:
             _, _, terminated, truncated, _ = self.env.step(self.actions[self.steps % 4096])
             self.steps += 1

@@ -128,7 +128,8 @@ def kill_often(
     pair = Pair(folder, env_steps)
     pair.start_simulator()
     pair.start_agent()
-    back, counts = [], dict.fromkeys(sides, 0)
+    back = []
+    counts = dict.fromkeys(sides, 0)
     for number in range(1, kills + 1):
         before = pair.done()
         pair.wait_for_progress(before)
@@ -181,7 +182,8 @@ def main() -> None:
     args = options(__doc__, **defaults, out=RESULTS / "reliability" / "kills.json").parse_args()
     # In a shell's background it is ignored, by the children too.
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    dice, root = random.Random(args.seed), Path(tempfile.mkdtemp())
+    dice = random.Random(args.seed)
+    root = Path(tempfile.mkdtemp())
     half = args.kills // 2
     agent = kill_often(root / "agent", args.env_steps, half, ["a"], dice)
     unbroken(root / "unbroken", args.env_steps)

@@ -134,7 +134,8 @@ CASES = (
 def main(page: Path) -> int:
     """Fly all cases and write the page; the exit status."""
     warnings.simplefilter("ignore")
-    rows, failed = [], 0
+    rows = []
+    failed = 0
     for case in CASES:
         result = "flies"
         try:

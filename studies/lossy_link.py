@@ -29,7 +29,8 @@ from typing import Any
 from measuring import RESULTS, launch, options, write
 from rotorgram.udp.protocol.auth import write_key
 
-AGENT_ADDRESS, SIMULATOR_ADDRESS = "10.77.0.1", "10.77.0.2"
+AGENT_ADDRESS = "10.77.0.1"
+SIMULATOR_ADDRESS = "10.77.0.2"
 PORT = 8001
 
 AGENT = """
@@ -95,7 +96,9 @@ class Wire:
 
     def __init__(self, ends: tuple[int, int], loss: float, delay: float) -> None:
         self.packets = self.lost = 0
-        self._ends, self._loss, self._delay = ends, loss, delay
+        self._ends = ends
+        self._loss = loss
+        self._delay = delay
         self._dice = random.Random(0).random
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._carry)
@@ -110,7 +113,8 @@ class Wire:
         while not self._closed.is_set():
             wait = min(max(held[0][0] - time.perf_counter(), 0), 0.05) if held else 0.05
             for end in select.select(self._ends, [], [], wait)[0]:
-                packet, other = os.read(end, 65_536), self._ends[end == self._ends[0]]
+                packet = os.read(end, 65_536)
+                other = self._ends[end == self._ends[0]]
                 self.packets += 1
                 if self._dice() < self._loss:
                     self.lost += 1
@@ -126,7 +130,8 @@ def run(*words: object) -> None:
 
 
 def open_tun(name: str) -> int:
-    tunsetiff, tun_without_header = 0x400454CA, 0x1001
+    tunsetiff = 0x400454CA
+    tun_without_header = 0x1001
     end = os.open("/dev/net/tun", os.O_RDWR)
     fcntl.ioctl(end, tunsetiff, struct.pack("16sH22x", name.encode(), tun_without_header))
     return end
@@ -163,7 +168,8 @@ def fly(drones: int, mtu: int, delay: float, loss: float, seconds: float) -> dic
         wire = Wire((here[1], there[1]), loss, delay)
         settings = [drones, seconds, key, AGENT_ADDRESS, PORT]
         agent = launch(AGENT, settings, "ip", "netns", "exec", here[0])
-        server, bind = (AGENT_ADDRESS, PORT), (SIMULATOR_ADDRESS, 0)
+        server = (AGENT_ADDRESS, PORT)
+        bind = (SIMULATOR_ADDRESS, 0)
         simulator = launch(SIMULATE, [drones, key, server, bind], "ip", "netns", "exec", there[0])
         try:
             out, _ = agent.communicate(timeout=seconds + 300)

@@ -15,7 +15,9 @@ from typing import Any, Final, TypeVar, get_type_hints
 
 RESULTS: Final = Path("docs/results")
 IMAGES: Final = Path(__file__).parents[1] / "docs" / "images"
-Name, Way, Value = TypeVar("Name"), TypeVar("Way"), TypeVar("Value")
+Name = TypeVar("Name")
+Way = TypeVar("Way")
+Value = TypeVar("Value")
 
 
 def options(doc: str, **defaults: Any) -> argparse.ArgumentParser:

@@ -15,18 +15,24 @@ from measuring import RESULTS, options, write
 from rotorgram.agents import Geometric
 from rotorgram.envs import SingleEnv
 
-PAYLOAD, FLOWN, FIRST = "rotorgram/PayloadHover-v0", ("paper", "crazyflie2", "heavy_hexa"), 100
+PAYLOAD = "rotorgram/PayloadHover-v0"
+FLOWN = ("paper", "crazyflie2", "heavy_hexa")
+FIRST = 100
 
 
 def flown(name: str, episodes: int, damped: bool) -> dict[str, Any]:
     """Error, m, swing, degrees, and episodes that terminated."""
     env = SingleEnv(PAYLOAD, vehicle=name, action="position")
     spec = env.env_spec if damped else replace(env.env_spec, options={})
-    policy, ends, crashes = Geometric(spec), [], 0
+    policy = Geometric(spec)
+    ends = []
+    crashes = 0
     for seed in range(FIRST, FIRST + episodes):
         observation, _ = env.reset(seed=seed)
         policy.reset()
-        told, terminated, truncated = [], False, False
+        told = []
+        terminated = False
+        truncated = False
         while not (terminated or truncated):
             observation, _, terminated, truncated, info = env.step(policy.act(observation))
             told.append((info["payload_error"], info["swing"]))

@@ -22,7 +22,10 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
-ENV, DRONES, UPDATES, RETURNS = "rotorgram/Elevation-v0", 16, 50, (150, 200)
+ENV = "rotorgram/Elevation-v0"
+DRONES = 16
+UPDATES = 50
+RETURNS = (150, 200)
 EXAMPLE = Path(__file__).parents[1] / "examples" / "ppo_loop.py"
 assert rotorgram.envs  # importing it registers the env
 

@@ -72,7 +72,8 @@ def driver() -> str:
 
 def overlays(flight: list[Moment], rounds: int, frames: int) -> dict[str, float]:
     """Milliseconds for panel and graph of a picture."""
-    times, values = {}, [moment.metrics[0].value for moment in flight]
+    times = {}
+    values = [moment.metrics[0].value for moment in flight]
     for width, height in SIZES:
         overlay = Overlay(
             width,
@@ -99,7 +100,8 @@ def whole_film(flown: Trajectory) -> dict[str, float]:
     track = FilmTrack(name="PID", color="#B4BCC4", trajectories=[flown])
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "film.mp4"
-        start, spent = time.perf_counter(), time.process_time()
+        start = time.perf_counter()
+        spent = time.process_time()
         frames = film(path, [track], Film())
         return {
             "frames": frames,

@@ -38,7 +38,8 @@ OUT = RESULTS / "rigid"
 HERE = Path(__file__).parent
 FILES = [*sorted(Path("tests/data").glob("*.xml")), *sorted(Path("tests/data").glob("*.toml"))]
 FILES += sorted(QUAD_XML.parent.glob("vehicles/*/vehicle.toml"))
-PERIOD, HOVER = 0.02, "rotorgram/Hover-v0"
+PERIOD = 0.02
+HOVER = "rotorgram/Hover-v0"
 
 
 def accuracy() -> None:
@@ -54,7 +55,8 @@ def accuracy() -> None:
 
 
 def distances(file: Path, dtype: str, drones: int = 32) -> dict[str, float]:
-    vehicle, dice = Vehicle.load(file), np.random.default_rng(0)
+    vehicle = Vehicle.load(file)
+    dice = np.random.default_rng(0)
     ours = make_world(vehicle, drones, "rigid", dtype=dtype)
     theirs = make_world(vehicle, drones, num_threads=1)
     turned = dice.normal(size=(drones, 1, 4))
@@ -85,7 +87,9 @@ def distances(file: Path, dtype: str, drones: int = 32) -> dict[str, float]:
 
 def rate(fly: Callable[[], None], drones: int, seconds: float) -> tuple[float, float]:
     """Control steps of all drones per second, and per second of a processor."""
-    times, start, used = 0, time.perf_counter(), time.process_time()
+    times = 0
+    start = time.perf_counter()
+    used = time.process_time()
     while times < 3 or time.perf_counter() - start < seconds:
         fly()
         times += 1
@@ -95,7 +99,8 @@ def rate(fly: Callable[[], None], drones: int, seconds: float) -> tuple[float, f
 
 def world(backend: Any, drones: int, steps: int = 2, **settings: Any) -> Callable[[], None]:
     """A control step of the world of the paper's vehicle, by default two physics steps."""
-    vehicle, dice = Vehicle.load(), np.random.default_rng(0)
+    vehicle = Vehicle.load()
+    dice = np.random.default_rng(0)
     made = make_world(vehicle, drones, backend, **settings)
     thrust = vehicle.hover_thrust * dice.uniform(0.999, 1.001, (drones, 1, vehicle.num_rotors))
     place = np.broadcast_to((0.0, 0.0, 2000.0), (drones, 1, 3))

@@ -19,7 +19,8 @@ from crazyflow.control import Control
 from crazyflow.dynamics import Dynamics
 from crazyflow.sim import Sim
 
-DRONES, SECONDS = int(sys.argv[1]), float(sys.argv[2])
+DRONES = int(sys.argv[1])
+SECONDS = float(sys.argv[2])
 
 
 def measured(freq: int, steps: int) -> tuple[float, float]:
@@ -36,7 +37,9 @@ def measured(freq: int, steps: int) -> tuple[float, float]:
 
     for _ in range(5):  # compiles
         fly()
-    times, start, used = 0, time.perf_counter(), time.process_time()
+    times = 0
+    start = time.perf_counter()
+    used = time.process_time()
     while time.perf_counter() - start < SECONDS:
         fly()
         times += 1

@@ -45,7 +45,8 @@ _EVERY: Final = 5  # control steps between two points of the figure
 
 def mjcf(params: dict[str, Any]) -> str:
     """RotorPy's parameters as an MJCF file with our coefficients."""
-    ratio, most = params["k_m"] / params["k_eta"], params["k_eta"] * params["rotor_speed_max"] ** 2
+    ratio = params["k_m"] / params["k_eta"]
+    most = params["k_eta"] * params["rotor_speed_max"] ** 2
     moments = " ".join(repr(params[f"I{axes}"]) for axes in ("xx", "yy", "zz", "xy", "xz", "yz"))
     numbers = {
         "rotors.thrust_coefficient": (params["k_eta"],),
@@ -59,7 +60,8 @@ def mjcf(params: dict[str, Any]) -> str:
         f'<numeric name="rotorgram/{name}" data="{" ".join(map(repr, values))}"/>'
         for name, values in numbers.items()
     )
-    places, turns = params["rotor_pos"], params["rotor_directions"]
+    places = params["rotor_pos"]
+    turns = params["rotor_directions"]
     sites = "".join(
         f'<site name="r{i}" pos="{" ".join(map(repr, place))}"/>' for i, place in enumerate(places)
     )
@@ -89,7 +91,8 @@ def compare(python: str) -> dict[str, Any]:
         vehicle = Vehicle.load(file)
     commands = thrusts(vehicle)
     told = _theirs(python, EFFECTS, (commands / vehicle.hover_thrust).tolist())
-    rows, curves = [], {}
+    rows = []
+    curves = {}
     for name, effects in EFFECTS.items():
         tight, usual = (_flight(told["flights"][name][kind]) for kind in ("tight", "default"))
         row = {"effects": name, "metres": {}, "degrees": {}}

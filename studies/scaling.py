@@ -54,8 +54,10 @@ cluster.shutdown()
 
 def fly(env, seconds):
     """Control steps per second, and the processor time of this process for each, s."""
-    count, actions = 0, np.zeros((env.num_envs, 1), np.float32)
-    wall, cpu = time.perf_counter(), time.process_time()
+    count = 0
+    actions = np.zeros((env.num_envs, 1), np.float32)
+    wall = time.perf_counter()
+    cpu = time.process_time()
     while time.perf_counter() - wall < seconds:
         env.advance(actions, env.done if env.done.any() else None)
         count += 1

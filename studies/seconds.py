@@ -33,7 +33,8 @@ from rotorgram.training.metrics import Headline, steady_state
 def train(words: list[str], seed: int, folder: Path) -> dict[str, float]:
     """Wall time and processor time of a training, s."""
     command = [sys.executable, "-m", "rotorgram.cli", "train", *words]
-    began, used = time.perf_counter(), processor_seconds()
+    began = time.perf_counter()
+    used = processor_seconds()
     subprocess.run([*command, "--seed", str(seed), "--out", str(folder)],
                    check=True, stdout=subprocess.DEVNULL)  # fmt: skip
     return {"seconds": round(time.perf_counter() - began, 2),

@@ -43,14 +43,17 @@ COSTS: Final = {
     },
 }  # fmt: skip
 DRONES: Final = (1, 1024)
-_PERIOD, _SAMPLES, _WORLDS = 0.02, 50_000, 32
+_PERIOD = 0.02
+_SAMPLES = 50_000
+_WORLDS = 32
 _ROUNDS: Final = 7
 _ENV: Final = "rotorgram/Hover-v0"
 
 
 def gyroscope() -> np.ndarray:
     """Readings at rest, less the bias that each drone has when it is switched on, (samples, n)."""
-    world, every = make_world(Vehicle.load(), _WORLDS, num_threads=1), np.ones((_WORLDS, 1), bool)
+    world = make_world(Vehicle.load(), _WORLDS, num_threads=1)
+    every = np.ones((_WORLDS, 1), bool)
     sensors = Sensors(checked_sensors({"imu": IRIS | {"gyro_bias": 0.0}}), world, _PERIOD)
     world.seed(every, range(_WORLDS))
     world.reset(every, InitialState(position=np.tile((0.0, 0.0, 5.0), (_WORLDS, 1, 1))))

@@ -67,10 +67,8 @@ class Agent:
         log = EpisodeLog(env, 0)
         self.spent = {"env": 0.0, "learn": 0.0}
         self.agent: Any = make_agent("ppo", log, config, 0)
-        env.advance, self.agent.update = (
-            self.timed("env", env.advance),
-            self.timed("learn", self.agent.update),
-        )
+        env.advance = self.timed("env", env.advance)
+        self.agent.update = self.timed("learn", self.agent.update)
         self.log = log
 
     def timed(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
@@ -94,7 +92,8 @@ class Agent:
 def main() -> None:
     args = options(__doc__, drones=128, rounds=15).parse_args()
     ways = {f"simulate {name}": simulate(name, args.drones) for name in ("mujoco", "rigid")}
-    agent, both = Agent(args.drones), exchange(args.drones)
+    agent = Agent(args.drones)
+    both = exchange(args.drones)
     rows: dict[str, list[float]] = {}
     for _ in range(args.rounds):
         times = {name: microseconds(fly, 20) for name, fly in ways.items()}

@@ -73,7 +73,9 @@ def soak(job: int, steps: int, drones: int, keyed: bool) -> dict[str, Any]:
     local = gym.make_vec("rotorgram/Elevation-v0", num_envs=drones, **options)
     dice = np.random.default_rng(job)
     assert numbers(remote.reset(seed=job)) == numbers(local.reset(seed=job))
-    began, different, ended = time.perf_counter(), None, 0
+    began = time.perf_counter()
+    different = None
+    ended = 0
     for step in range(1, steps + 1):
         actions = dice.uniform(-1.2, 1.2, (drones, 1)).astype(np.float32)
         answer = remote.step(actions)

@@ -31,7 +31,8 @@ def physics(drones: int, *, together: bool) -> Step:
     kind = {"drones": drones} if together else {}
     env = LocalVectorEnv(ENV, drones, episode_length=EPISODE, **kind)
     env.reset(seed=0)
-    world, substeps = env.loop.world, env.loop.vehicle.substeps(env.control_period)
+    world = env.loop.world
+    substeps = env.loop.vehicle.substeps(env.control_period)
     thrust = np.broadcast_to(env.loop.vehicle.hover_thrust, world.state.thrust.shape)
     return lambda: world.step(thrust, substeps)
 
@@ -46,7 +47,8 @@ def advanced(env: Any, drones: int) -> Step:
 
 def timed(step: Step, seconds: float) -> float:
     """Seconds of a step: the mean over as many as take about so long."""
-    steps, begun = 0, perf_counter()
+    steps = 0
+    begun = perf_counter()
     while perf_counter() - begun < seconds:
         step()
         steps += 1

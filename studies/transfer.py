@@ -66,7 +66,9 @@ class Shift:
     def __init__(
         self, by: str, at: float | str, wind: float = 0.0, vehicle: str = VEHICLE, **factors: Any
     ) -> None:
-        self.by, self.at, self.vehicle = by, at, vehicle
+        self.by = by
+        self.at = at
+        self.vehicle = vehicle
         self.options: dict[str, Any] = {
             "effects": EFFECTS | ({"wind": (wind, 0.0, 0.0)} if wind else {}),
             "randomize": factors,
@@ -99,7 +101,8 @@ def train(row: str, seed: int, env_steps: int, path: Path) -> None:
         num_envs=128, env_id=ENV, options=options, vehicle=VEHICLE,
     )  # fmt: skip
     env: Any = made(run.num_envs, VEHICLE, options)
-    training, began = Training(run, env), time.process_time()
+    training = Training(run, env)
+    began = time.process_time()
     training.train()
     path.parent.mkdir(parents=True, exist_ok=True)
     store(training.checkpoint().policy_alone(), path)

@@ -118,8 +118,10 @@ def decide(flown: Trajectory, headline: Headline) -> float:
 def measure(algorithm: str, task: str, settings: dict[str, Any], seed: int) -> dict[str, Any]:
     """Train with the settings on a seed; the columns of the result."""
     config = dict(settings)
-    drones, env_steps = config.pop("drones"), config.pop("env_steps")
-    options, backend = {"action": config.pop("action")}, config.pop("backend", "mujoco")
+    drones = config.pop("drones")
+    env_steps = config.pop("env_steps")
+    options = {"action": config.pop("action")}
+    backend = config.pop("backend", "mujoco")
     options |= dict(word.split("=") for word in config.pop("options", "").split())
 
     def make(count: int, backend: str = "mujoco") -> Any:

@@ -59,7 +59,8 @@ class Updates:
     def seconds(self) -> tuple[float, float]:
         """Wall time and processor time of an update, s: on a busy machine compare the second."""
         self.agent.set_state(self.state)
-        wall, processor = time.perf_counter(), time.process_time()
+        wall = time.perf_counter()
+        processor = time.process_time()
         self.update()
         return time.perf_counter() - wall, time.process_time() - processor
 

@@ -28,7 +28,8 @@ PAGE: Final = ROOT / "docs" / "library.md"
 LIBRARY: Final = tomllib.loads((FOLDER / "library.toml").read_text(encoding="utf-8"))
 """Tables `vehicles` and `works`; see the file."""
 
-WIDTH, HEIGHT = 960, 540
+WIDTH = 960
+HEIGHT = 540
 OVERSAMPLING = 2  # drawn larger and reduced: smooth edges
 SWITCHES: Final = (
     "motor_lag",
@@ -38,7 +39,8 @@ SWITCHES: Final = (
     "rotor_drag",
     "ground_effect",
 )
-BEGIN, END = "<!-- written by studies/vehicle_pages.py -->", "<!-- end -->"
+BEGIN = "<!-- written by studies/vehicle_pages.py -->"
+END = "<!-- end -->"
 
 
 def path_of(name: str) -> Path:
@@ -48,7 +50,8 @@ def path_of(name: str) -> Path:
 
 def readme(name: str) -> str:
     """The page of a vehicle."""
-    about, path = LIBRARY["vehicles"][name], path_of(name)
+    about = LIBRARY["vehicles"][name]
+    path = path_of(name)
     vehicle, numbers = Vehicle.load(path), read_vehicle_file(path).numbers
     works = sorted({work for one in numbers for text in sources(one) for work in works_of(text)})
     parts = [
@@ -170,7 +173,8 @@ def shown(value: float | Sequence[float]) -> str:
 def _derived(vehicle: Vehicle) -> str:
     share = vehicle.hover_thrust / vehicle.thrust_high
     flights = read_vehicle_file(vehicle.path).real_flights
-    inertia, center = vehicle.inertia, vehicle.center_of_mass
+    inertia = vehicle.inertia
+    center = vehicle.center_of_mass
     products = [f"{inertia[i, j] + 0.0:.4g}" for i, j in ((0, 1), (0, 2), (1, 2))]
     rows = [
         ("mass", f"{vehicle.mass:.5g}", "kg"),
@@ -213,7 +217,8 @@ def _sourced(numbers: Iterable[Number]) -> list[tuple[str, ...]]:
 
 def _disagreements(numbers: Iterable[Number]) -> list[str]:
     """Sections on what sources say besides the values used, on why, and on single sources."""
-    parts, remarks = [], []
+    parts = []
+    remarks = []
     for one in numbers:
         if one.others:
             rows = [(f"**{shown(one.value)}**", f"**{one.source}**")]
@@ -259,11 +264,14 @@ def draw(name: str) -> Image.Image:
     data.qpos[2] = height
     mujoco.mj_forward(model, data)
     camera = mujoco.MjvCamera()
-    camera.azimuth, camera.elevation, camera.distance = 158.0, -33.0, 2.5 * reach
+    camera.azimuth = 158.0
+    camera.elevation = -33.0
+    camera.distance = 2.5 * reach
     camera.lookat[:] = (0.0, 0.0, height - 0.2 * reach)
     pixels = np.empty((HEIGHT * OVERSAMPLING, WIDTH * OVERSAMPLING, 3), np.uint8)
     frame = mujoco.MjrRect(0, 0, WIDTH * OVERSAMPLING, HEIGHT * OVERSAMPLING)
-    scene, everything = mujoco.MjvScene(model, 1000), mujoco.mjtCatBit.mjCAT_ALL
+    scene = mujoco.MjvScene(model, 1000)
+    everything = mujoco.mjtCatBit.mjCAT_ALL
     mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), None, camera, everything, scene)
     with offscreen_context(frame.width, frame.height).as_current():
         context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)

@@ -69,7 +69,8 @@ def simulator(drones: int, kind: str, address: tuple[str, int]) -> Iterator[list
     )
     server = "{}:{}".format(*address)
     words = ["--server", server, "--bind", "127.0.0.1:0", "--num-envs", str(drones), *view]
-    command, shown = [sys.executable, "-c", SIM, "sim", *words], list[float]()
+    command = [sys.executable, "-c", SIM, "sim", *words]
+    shown = list[float]()
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         yield shown
         told, _ = process.communicate()
@@ -94,7 +95,8 @@ def browser() -> Iterator[None]:
 def fly(env: Any, drones: int, seconds: float) -> float:
     """Control steps per second."""
     actions = np.random.default_rng(0).uniform(-0.1, 0.1, (256, drones, 1)).astype(np.float32)
-    steps, start = 0, time.perf_counter()
+    steps = 0
+    start = time.perf_counter()
     while time.perf_counter() - start < seconds:
         if drones > 1:
             env.step(actions[steps % 256])

@@ -53,7 +53,8 @@ def busy(count):
 
 
 def microseconds(env, actions):
-    steps, begin = 0, time.perf_counter()
+    steps = 0
+    begin = time.perf_counter()
     while time.perf_counter() < begin + SECONDS:
         for action in actions:
             _, _, terminated, truncated, _ = env.step(action)

@@ -78,7 +78,8 @@ def synthetic_folder(
     for row, seed in study.runs().values():
         rate = rng.uniform(0.8, 1.25)
         marks = [0] if row.controller else np.linspace(0, env_steps, snapshots).astype(int)
-        evaluations, steps = [], []
+        evaluations = []
+        steps = []
         for mark in marks:
             progress = rate * mark / env_steps
             skill = 1.0 if row.controller else _skill(row.agent, progress)

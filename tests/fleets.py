@@ -60,7 +60,8 @@ def assert_same(here: tuple, there: tuple, drones: slice = slice(None)) -> None:
         assert ours.dtype == theirs.dtype
         assert ours[drones].tobytes() == theirs[drones].tobytes()
     for name in (name for name in there[-1] if name.lstrip("_") in NAMES):
-        ours, theirs = here[-1][name], there[-1][name]
+        ours = here[-1][name]
+        theirs = there[-1][name]
         assert ours.dtype == theirs.dtype
         assert ours[drones].tobytes() == theirs[drones].tobytes()
 
@@ -78,7 +79,8 @@ def assert_parity(remote: VectorEnv, local: VectorEnv, steps: int) -> int:
     ends = 0
     for _ in range(steps):
         actions = random_actions(local, dice)
-        here, there = remote.step(actions), local.step(actions)
+        here = remote.step(actions)
+        there = local.step(actions)
         assert_same(here, there)
         assert set(here[-1]) == {*NAMES, *(f"_{name}" for name in NAMES)}
         ends += int((here[2] | here[3]).sum())

@@ -225,13 +225,18 @@ def changed(datagram: bytes, at: int, new: bytes) -> bytes:
 
 def malformed(right: dict[str, bytes]) -> list[tuple[str, str, bytes]]:
     """Name, name of the spec, bytes. Each is dropped, whatever else it says."""
-    hello, welcome, close = right["hello"], right["welcome"], right["close"]
+    hello = right["hello"]
+    welcome = right["welcome"]
+    close = right["close"]
     state, picture = right["state, truncated"], right["state of two drones with a picture"]
-    choice, freeze = right["command to fly choice 2"], right["command: fly, freeze"]
-    nan, infinity = b"\x00\x00\xc0\x7f", b"\x00\x00\x80\x7f"
+    choice = right["command to fly choice 2"]
+    freeze = right["command: fly, freeze"]
+    nan = b"\x00\x00\xc0\x7f"
+    infinity = b"\x00\x00\x80\x7f"
     flags = LAYOUTS["one"].flags[0].at
     missing = right["missing: 0, 2 and 9 of 10"]
-    one, two = "one", "two"
+    one = "one"
+    two = "two"
     return [
         ("nothing", one, b""),
         ("a header cut short", one, right["wait"][:23]),
@@ -326,7 +331,8 @@ def sealed(right: dict[str, bytes]) -> list[dict[str, Any]]:
 
 def forged(right: dict[str, bytes]) -> list[dict[str, Any]]:
     """Datagrams that a side with the key drops, as it would take `of` from the other."""
-    hello, command = right["hello"], right["command to fly choice 2"]
+    hello = right["hello"]
+    command = right["command to fly choice 2"]
     theirs = Key(SECRET, "agent")
     session, other = theirs.for_session(SESSION, NONCE), theirs.for_session(SESSION, NONCE + 1)
     good = session.seal(command)

@@ -27,8 +27,11 @@ from rotorgram.udp.protocol.messages import (
 from rotorgram.udp.protocol.server import Event, Server
 from rotorgram.udp.protocol.transitions import AgentState
 
-SESSION, OTHER, NONCE = 77, 78, 99
-HERE, STRANGER = ("127.0.0.1", 8000), ("127.0.0.1", 9999)
+SESSION = 77
+OTHER = 78
+NONCE = 99
+HERE = ("127.0.0.1", 8000)
+STRANGER = ("127.0.0.1", 9999)
 CONFIG = LinkConfig(timeout=10)
 SECRET = bytes(range(32))
 CAUSES = {"malformed", "forged", "foreign", "refused", "duplicate", "stale"}
@@ -147,7 +150,10 @@ class Pair:
     """
 
     def __init__(self, client: Client, server: Server, fate: Fate, peer: Address = HERE) -> None:
-        self.client, self.server, self.fate, self.peer = client, server, fate, peer
+        self.client = client
+        self.server = server
+        self.fate = fate
+        self.peer = peer
         self.now = 0.0
         self.steps: list[float] = []
         """Actions in the order in which the simulator stepped them."""
@@ -200,7 +206,9 @@ class Fleet:
     """Simulators, one for each slot of an agent that answers all of their States at once."""
 
     def __init__(self, clients: list[Client], server: Server, fate: Fate) -> None:
-        self.clients, self.server, self.fate = clients, server, fate
+        self.clients = clients
+        self.server = server
+        self.fate = fate
         self.now = 0.0
         self.steps = self._order = 0
         self._flying: list[tuple[float, int, str, int, bytes]] = []

@@ -1,6 +1,7 @@
 """Moments, films and pixels for the tests of what is drawn."""
 
 import subprocess
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -11,7 +12,8 @@ from imageio_ffmpeg import (  # type: ignore[import-untyped]
 from PIL import Image
 from rotorgram.rendering import MetricValue, Moment
 
-WIDTH, HEIGHT = 160, 120
+WIDTH = 160
+HEIGHT = 120
 DATA: Final = Path(__file__).parent / "data"
 HEXA: Final = DATA / "meadow_hexa.xml"
 """Six rotors of up to 30 N, 0.62 m from centre to tip, with a ground of its own."""
@@ -43,13 +45,25 @@ def decoded(path: Path, width: int, height: int) -> np.ndarray:
     return np.frombuffer(data, np.uint8).reshape(-1, height, width, 3)
 
 
+def nearest(picture: np.ndarray, others: Sequence[np.ndarray]) -> int:
+    """The number of the picture that differs least; it differs by less than 1 of 255 in the mean.
+
+    MuJoCo sorts what is transparent by distance. What is as far away is drawn in either order, so that
+    discs that overlap change their colour a little from time to time.
+    """
+    apart = [abs(picture.astype(int) - other).mean() for other in others]
+    number = int(np.argmin(apart))
+    assert apart[number] < 1.0
+    return number
+
+
 def same(one: np.ndarray, other: np.ndarray) -> bool:
-    """Whether two pictures show the same: drivers round differently from time to time, and now and
-    then a pixel at an edge falls to the other side.
+    """Whether two pictures show the same: one pixel in 500 may be off, at an edge, and colours may
+    differ a little (see `nearest`).
     """
     if one.shape != other.shape:
         return False
-    off = abs(one.astype(int) - other).max(axis=-1) > 3
+    off = abs(one.astype(int) - other).max(axis=-1) > 40
     return bool(off.mean() <= 0.002)
 
 

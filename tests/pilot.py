@@ -14,7 +14,9 @@ class Pilot:
     """Actions of the level `rotors` from observations of shape (N, 15 + R or more)."""
 
     def __init__(self, vehicle: Vehicle, stiffness: float = 49.0, damping: float = 14.0) -> None:
-        self.vehicle, self.stiffness, self.damping = vehicle, stiffness, damping
+        self.vehicle = vehicle
+        self.stiffness = stiffness
+        self.damping = damping
         self._mix = np.linalg.pinv(vehicle.allocation)
         turns = [vehicle.turning(axis) for axis in np.eye(3)]
         self._most = np.array((turns[0], turns[1], 0.5 * turns[2]))
@@ -25,8 +27,11 @@ class Pilot:
 
     def act(self, observation: np.ndarray, acceleration: np.ndarray) -> np.ndarray:
         """Actions, float32, (N, R), for accelerations in the frame of the observation, (N, 3)."""
-        vehicle, seen = self.vehicle, observation.astype(np.float64)
-        nose, axis, rates = seen[:, 6:9], seen[:, 9:12], seen[:, 12:15]
+        vehicle = self.vehicle
+        seen = observation.astype(np.float64)
+        nose = seen[:, 6:9]
+        axis = seen[:, 9:12]
+        rates = seen[:, 12:15]
         to_world = np.stack((nose, np.cross(axis, nose), axis), axis=2)
         wanted = acceleration + np.array((0.0, 0.0, vehicle.gravity))
         size = np.linalg.norm(wanted, axis=1, keepdims=True)

@@ -92,7 +92,8 @@ class Relay:
     """
 
     def __init__(self, server: Address, config: FaultConfig) -> None:
-        self.server, self.config = server, config
+        self.server = server
+        self.config = config
         self.counters: Counter[str] = Counter()
         self._clients: dict[Address, Any] = {}  # its socket to the server, faults down and up
         self._held: list[tuple[float, int, bytes, Address, bool]] = []
@@ -132,7 +133,8 @@ class Relay:
             heappush(self._held, (now + delay, next(self._numbers), copy, client, upward))
 
     def _add(self, client: Address) -> None:
-        upstream, number = udp_socket(peer=self.server), len(self._clients) + 1
+        upstream = udp_socket(peer=self.server)
+        number = len(self._clients) + 1
         down, up = (Faults(self.config, f"{d}/{number}", self.counters) for d in ("down", "up"))
         self._clients[client] = upstream, down, up
         self._selector.register(upstream, selectors.EVENT_READ, client)

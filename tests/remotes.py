@@ -56,7 +56,8 @@ def assert_parity(remote: gym.Env, local: gym.Env, steps: int, seeds: list[int])
             action: Any = int(dice.integers(3))
         else:
             action = dice.uniform(-1.2, 1.2, 1).astype(np.float32)
-        here, there = remote.step(action), local.step(action)
+        here = remote.step(action)
+        there = local.step(action)
         same(here, there)
         if here[2] or here[3]:
             ends += 1
@@ -73,7 +74,8 @@ class Broken(gym.Env[np.ndarray, np.ndarray]):
     spec = SimpleNamespace(id=ENV_ID)  # type: ignore[assignment]
 
     def __init__(self, value: float | None) -> None:
-        self.value, self.steps = value, 0
+        self.value = value
+        self.steps = 0
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
         return np.zeros(1, np.float32), {}

@@ -64,12 +64,16 @@ class Scripted(AdvancingVectorEnv):
     """Flies a script; a lost simulator as `RemoteVectorEnv` reports it."""
 
     def __init__(self, script: Script, *, discrete: bool = False, reward: float | None = None):
-        self.closed, self.num_envs, self._script, self._reward = False, 0, script, reward
+        self.closed = False
+        self.num_envs = 0
+        self._script = script
+        self._reward = reward
         self._take_spec(
             spec_of(Discrete(n=3) if discrete else None), len(script), AutoresetMode.DISABLED
         )
         self.flown: list[list[Row]] = [[] for _ in script]
-        self._episodes, self._steps = [-1] * len(script), [0] * len(script)
+        self._episodes = [-1] * len(script)
+        self._steps = [0] * len(script)
         self._dice = np.random.default_rng(42)
         self.observations = np.zeros((len(script), 3), np.float32)
         self._clear()
@@ -97,7 +101,8 @@ class Scripted(AdvancingVectorEnv):
         self.terminated, self.truncated, self.lost = np.zeros((3, self.num_envs), bool)
 
     def _fly(self, drone: int, action: np.ndarray) -> None:
-        episodes, self._steps[drone] = self._script[drone], self._steps[drone] + 1
+        episodes = self._script[drone]
+        self._steps[drone] = self._steps[drone] + 1
         length, end = episodes[self._episodes[drone] % len(episodes)]
         assert self._steps[drone] <= length, "flown after its end"
         if self._steps[drone] < length:
@@ -128,7 +133,8 @@ class OneDrone(gym.Env[np.ndarray, Any]):
     """The first drone of a scripted env, as `RemoteEnv` would fly it."""
 
     def __init__(self, env: Scripted) -> None:
-        self.env, self.env_spec = env, env.env_spec
+        self.env = env
+        self.env_spec = env.env_spec
         self.observation_space = observation_space(env.env_spec)
         self.action_space = action_space(env.env_spec)
 

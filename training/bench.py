@@ -131,7 +131,8 @@ def bench(
     if not 0 < seconds <= 60:
         raise InputError(f"seconds: expected more than 0 and at most 60, got {seconds}")
     rates: dict[str, list[float]] = {name: [] for name, *_ in _LAYERS}
-    turns, done = (rounds + 1) * len(_LAYERS), 0
+    turns = (rounds + 1) * len(_LAYERS)
+    done = 0
     for many in (False, True):
         group = [layer for layer in _LAYERS if (layer[2] > 1) == many]
         with ExitStack() as stack:
@@ -179,7 +180,8 @@ def _write(layers: Sequence[Layer], rounds: int, seconds: float, folder: Path) -
 def _for_a_while(fly: Callable[[], int], prepare: Callable[[], object] = lambda: None) -> Slice:
     def run(seconds: float) -> int:
         prepare()
-        until, steps = time.perf_counter() + seconds, 0
+        until = time.perf_counter() + seconds
+        steps = 0
         while time.perf_counter() < until:
             steps += fly()
         return steps
@@ -202,24 +204,28 @@ def _again(
 
 def _mj_step(_: ExitStack) -> Slice:
     vehicle = Vehicle.load()
-    model, substeps = vehicle.model, vehicle.substeps(_PERIOD)
+    model = vehicle.model
+    substeps = vehicle.substeps(_PERIOD)
     data = mujoco.MjData(model)
 
     def prepare() -> None:
         # Every turn begins in the air: how long it lasts must not matter.
         mujoco.mj_resetData(model, data)
-        data.qpos[2], data.ctrl[:] = 5.0, vehicle.hover_thrust
+        data.qpos[2] = 5.0
+        data.ctrl[:] = vehicle.hover_thrust
 
     return _again(lambda: mujoco.mj_step(model, data, substeps), prepare=prepare)
 
 
 def _batch_step(drones: int) -> Slice:
     vehicle = Vehicle.load()
-    batch, substeps = Batch(vehicle.model, drones), vehicle.substeps(_PERIOD)
+    batch = Batch(vehicle.model, drones)
+    substeps = vehicle.substeps(_PERIOD)
 
     def prepare() -> None:
         batch.reset()
-        batch.qpos[:, 2], batch.ctrl[:] = 5.0, vehicle.hover_thrust
+        batch.qpos[:, 2] = 5.0
+        batch.ctrl[:] = vehicle.hover_thrust
 
     def fly() -> int:
         batch.step(nstep=substeps)
@@ -288,7 +294,8 @@ def _echo(stack: ExitStack) -> Slice:
     words = [sys.executable, "-c", _ECHO, str(sizes["Command"])]
     process = stack.enter_context(subprocess.Popen(words, stdout=subprocess.PIPE))
     assert process.stdout is not None
-    address, message = ("127.0.0.1", int(process.stdout.readline())), bytes(sizes["State"])
+    address = ("127.0.0.1", int(process.stdout.readline()))
+    message = bytes(sizes["State"])
     sock = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
     sock.settimeout(1.0)
     stack.callback(sock.sendto, b"", address)

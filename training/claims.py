@@ -262,8 +262,10 @@ def _holds(runs: pd.DataFrame, headline: Headline) -> tuple[Outcome, str]:
     """Whether one agent holds its goal in its final evaluations, and the numbers."""
     if runs.empty:
         return "not tested", "not trained"
-    count, held = len(runs), int(runs["held"].sum())
-    crashed, episodes = int(runs["crashed"].sum()), int(runs["episodes"].sum())
+    count = len(runs)
+    held = int(runs["held"].sum())
+    crashed = int(runs["crashed"].sum())
+    episodes = int(runs["episodes"].sum())
     low, high = share_interval(held, count, LEVEL)
     steady = headline.amount(_number(iqm(runs["steady"].to_numpy())))
     text = f"{steady}, holds in {held} of {_seeds(count, count)}"

@@ -300,7 +300,8 @@ def draw_swarm(results: Results, rows: Sequence[Row]) -> Figure:
     positions = results.positions[results.positions["episode"] == episode]
     found: Mapping[tuple[str, int, int], World] = dict(worlds(positions))
     for (above, below), row in zip(axes.T, shown, strict=True):
-        world, spec = found[row.name, seeds[row.name], episode], results.specs[row.name]
+        world = found[row.name, seeds[row.name], episode]
+        spec = results.specs[row.name]
         _draw_paths(above, world, spec.agents)
         _draw_distances(below, world, spec.control_period, _touching(row))
         above.set_title(row_label(row))

@@ -197,7 +197,8 @@ def measure_run(evaluations: pd.DataFrame, headline: Headline) -> dict[str, floa
     steady = float(final["steady"].mean())
     safe = headline.counts_crashes or not crashed.any()
     whole = bool(final["steady"].notna().all())
-    steps, seconds = math.nan, math.nan
+    steps = math.nan
+    seconds = math.nan
     if evaluations["env_steps"].max() > 0 and headline.held is not None:
         steps, seconds = first_lasting_snapshot(evaluations, headline)
     return {

@@ -52,16 +52,19 @@ def judge(results: Results) -> list[Verdict]:
     if results.study.kind != "paper" or results.runs.empty:
         return []
     row = results.study.rows[0]
-    headline, preset = results.headline(row), row.preset
+    headline = results.headline(row)
+    preset = row.preset
     verdicts = judge_claims(results.episodes, results.runs, preset, headline)
     return [*verdicts, judge_no_worse(results.runs, preset, headline)]
 
 
 def _head(results: Results) -> str:
     """Title, command and origin of the numbers, in Markdown."""
-    study, config = results.study, results.config
+    study = results.study
+    config = results.config
     last = study.first_seed + study.seeds - 1
-    machine, versions = config["machine"], config["versions"]
+    machine = config["machine"]
+    versions = config["versions"]
     lines = [
         "# Results",
         "",

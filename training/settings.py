@@ -43,7 +43,8 @@ class EnvConfig:
 
     def __post_init__(self) -> None:
         expect(self.backend in BACKENDS, "backend", " or ".join(BACKENDS), repr(self.backend))
-        expect(self.drones >= 1, "drones", "1 or more", str(self.drones))
+        if not self.drones >= 1:
+            raise InputError(f"drones: expected 1 or more, got {self.drones}")
         options: dict[str, Any] = dict(self.options)
         if is_known(self.env_id):
             options = envs.EnvConfig.from_keywords(self.env_id, **options).flat_options()
@@ -92,13 +93,18 @@ class Run(EnvConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        expect(self.seed >= 0, "seed", "0 or more", str(self.seed))
-        expect(self.num_envs >= 1, "num_envs", "1 or more", str(self.num_envs))
-        whole = self.num_envs % self.drones == 0
-        expect(whole, "num_envs", f"a multiple of drones = {self.drones}", str(self.num_envs))
+        if not self.seed >= 0:
+            raise InputError(f"seed: expected 0 or more, got {self.seed}")
+        if not self.num_envs >= 1:
+            raise InputError(f"num_envs: expected 1 or more, got {self.num_envs}")
+        if self.num_envs % self.drones != 0:
+            raise InputError(
+                f"num_envs: expected a multiple of drones = {self.drones}, got {self.num_envs}"
+            )
         episode_length = int(self.options.get("episode_length", 1))
         least = self.config.least_steps(self.num_envs, episode_length)
-        expect(self.env_steps >= least, "env_steps", f"at least {least}", str(self.env_steps))
+        if not self.env_steps >= least:
+            raise InputError(f"env_steps: expected at least {least}, got {self.env_steps}")
 
 
 @dataclass(frozen=True, kw_only=True)

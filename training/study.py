@@ -182,7 +182,8 @@ def _evaluate(
 
 
 def _episodes(training: Training) -> pd.DataFrame:
-    log, run = training.log, training.run
+    log = training.log
+    run = training.run
     rows = []
     for episode in log.episodes:
         # While one drone flies a step, each of the others does.

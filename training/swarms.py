@@ -38,7 +38,8 @@ def rows_of(flown: Sequence[Trajectory]) -> pd.DataFrame:
     for place, one in enumerate(flown):
         where = np.asarray(one.telemetry["position"], float)
         goal = np.asarray(one.telemetry.get("goal", np.full(where.shape, np.nan)), float)
-        drone, steps = place % len(one.spec.agents), np.arange(len(where))
+        drone = place % len(one.spec.agents)
+        steps = np.arange(len(where))
         label = {"episode": one.episode, "drone": drone, "step": steps}
         columns = zip((*POSITION, *GOAL), np.hstack((where, goal)).T, strict=True)
         parts.append(pd.DataFrame({**label, **dict(columns)}))

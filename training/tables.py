@@ -132,11 +132,15 @@ def scores(own: pd.DataFrame, headline: Headline) -> Floats:
     unit and with a bound below 1, counts by what it lacks to 1. So 1/2 is the bound itself, and 1
     the best. A run with a crash that the size does not count, or without a value, scores 0.
     """
-    size, bound, high = own["steady"].to_numpy(float), headline.held, headline.high
+    size = own["steady"].to_numpy(float)
+    bound = headline.held
+    high = headline.high
     if bound is None:
         return np.full(len(own), np.nan)
     if high and not headline.unit and bound < 1:
-        size, bound, high = 1 - size, 1 - bound, False
+        size = 1 - size
+        bound = 1 - bound
+        high = False
     size = np.maximum(size, 0.0)
     score = (size if high else bound) / (bound + size)
     crashed = (own["crashed"] > 0) & (not headline.counts_crashes)
@@ -186,7 +190,8 @@ def headings(headline: Headline, swarm: bool = False) -> tuple[str, ...]:
 
 
 def _line(row: Row, line: Mapping[str, float], headline: Headline, swarm: bool) -> tuple[Cell, ...]:
-    seeds, episodes = int(line["seeds"]), int(line["episodes"])
+    seeds = int(line["seeds"])
+    episodes = int(line["episodes"])
     reached: tuple[str, ...] = ()
     if not math.isnan(line["reached"]):
         reached = (_of(line["reached"], seeds, "seed"),)
@@ -237,7 +242,8 @@ def _crashes(line: Mapping[str, float]) -> Cell:
 
 
 def _measured(line: Mapping[str, float], name: str, details: tuple[str, ...] = ()) -> Cell:
-    low, high = line[f"{name}_low"], line[f"{name}_high"]
+    low = line[f"{name}_low"]
+    high = line[f"{name}_high"]
     interval = () if math.isnan(low) else (f"{number_text(low)} to {number_text(high)}",)
     return Cell(number_text(line[name]), interval + details)
 
@@ -317,7 +323,8 @@ def _scores(results: Results) -> list[str]:
             found.setdefault(row_label(row), {})[row.task] = scores(own, headline)
     if len(found) < 2:
         return []
-    totals, pairs = [], []
+    totals = []
+    pairs = []
     for label, own in found.items():
         strata = list(own.values())
         low, high = bootstrap_interval(*strata)
@@ -339,7 +346,8 @@ def _improvement(own: Mapping[str, Floats], other: Mapping[str, Floats]) -> str:
     tasks = [task for task in own if task in other]
     if own is other or not tasks:
         return NOTHING
-    first, second = [own[task] for task in tasks], [other[task] for task in tasks]
+    first = [own[task] for task in tasks]
+    second = [other[task] for task in tasks]
     low, high = improvement_interval(first, second)
     share = probability_of_improvement(first, second)
     if math.isnan(low):

@@ -12,7 +12,7 @@ from .. import agents
 from ..agents import Checkpoint, CheckpointError
 from ..envs.autoreset import AdvancingVectorEnv
 from ..flights.executors import Tell
-from ..models.errors import InputError, expect
+from ..models.errors import InputError
 from .settings import Run
 
 AnyEnv = gym.Env[Any, Any] | AdvancingVectorEnv
@@ -62,8 +62,10 @@ class Training:
     taken: list[Snapshot] = field(default_factory=list, init=False)
 
     def __post_init__(self) -> None:
-        drones, wanted = getattr(self.env, "num_envs", 1), self.run.num_envs
-        expect(drones == wanted, "env", f"one of {wanted} drones", str(drones))
+        drones = getattr(self.env, "num_envs", 1)
+        wanted = self.run.num_envs
+        if drones != wanted:
+            raise InputError(f"env: expected one of {wanted} drones, got {drones}")
         self.log = agents.EpisodeLog(self.env, self.run.seed, keep_steps=self.keep_steps)
         run = self.run
         new = run.algorithm, self.log, run.config, run.seed
@@ -95,7 +97,9 @@ class Training:
 
         Progress is told at updates, five times a second at most, and at the end.
         """
-        log, total, told = self.log, self.run.env_steps, 0.0
+        log = self.log
+        total = self.run.env_steps
+        told = 0.0
         log.start_clock()
 
         def after_update() -> bool:
@@ -119,7 +123,8 @@ class Training:
         """Recent return and size of the headline metric, for a progress bar."""
         if not (recent := self._recent_means(20)):
             return ""
-        text, headline = f"return {recent['rew']:.0f}", self.log.spec.headline
+        text = f"return {recent['rew']:.0f}"
+        headline = self.log.spec.headline
         if headline is None:
             return text
         symbol = headline.symbol or headline.name
@@ -170,7 +175,8 @@ class Training:
     def _take(self) -> None:
         log = self.log
         if self.snapshots:
-            seconds, policy = log.seconds, self.agent.policy()
+            seconds = log.seconds
+            policy = self.agent.policy()
             self.taken.append(Snapshot(env_steps=log.env_steps, seconds=seconds, policy=policy))
 
 
@@ -180,7 +186,8 @@ def train_run(
     """Train to the end: the training, and its `env_steps`, `seconds` and `steps_per_second`."""
     training = Training(run, env, snapshots=snapshots, keep_steps=keep_steps)
     training.train(tell=tell)
-    steps, seconds = training.log.env_steps, training.log.seconds
+    steps = training.log.env_steps
+    seconds = training.log.seconds
     tell(run.env_steps, run.env_steps, "evaluating")
     times = {"env_steps": steps, "seconds": seconds, "steps_per_second": steps / seconds}
     return training, times

@@ -17,7 +17,7 @@ from ..envs.autoreset import (
 )
 from ..envs.spaces import action_space, joined, observation_space, telemetry_names
 from ..envs.spec import Discrete, EnvSpec
-from ..models.errors import InputError, NotCopied, expect
+from ..models.errors import InputError, NotCopied
 from .protocol.client import Address
 from .protocol.layout import MAX_DRONES
 from .protocol.messages import FLY, FREEZE, MAX_UINT64, RESET, State
@@ -125,8 +125,10 @@ class RemoteEnv(_Remote, gym.Env[Any, Any]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Start an episode in the simulator, with its generator seeded where a seed is given."""
-        expect(seed is None or 0 <= seed <= MAX_UINT64, "seed", "0 to 2^64 - 1", f"{seed}")
-        expect(not options, "options", "none over UDP", f"{options}")
+        if not (seed is None or 0 <= seed <= MAX_UINT64):
+            raise InputError(f"seed: expected 0 to 2^64 - 1, got {seed}")
+        if options:
+            raise InputError(f"options: expected none over UDP, got {options}")
         super().reset(seed=seed)
         self._flying = False
         self.connect()
@@ -156,7 +158,8 @@ class RemoteEnv(_Remote, gym.Env[Any, Any]):
             info = {**self._info(self._state), LOST: reason}
             return self._observation(self._state), 0.0, False, True, info
         self._state = state = self._agent.states[0]
-        terminated, truncated = state.terminated.item(), state.truncated.item()
+        terminated = state.terminated.item()
+        truncated = state.truncated.item()
         self._flying = not (terminated or truncated)
         observation = self._observation(state)
         return observation, state.rewards.item(), terminated, truncated, self._info(state)
@@ -236,14 +239,18 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
         **settings: Unpack[AgentSettings],
     ) -> None:
         self.closed = True  # nothing is open yet
-        right = type(num_simulators) is int and 1 <= num_simulators <= MAX_DRONES
-        expect(right, "num_simulators", f"1 to {MAX_DRONES}", f"{num_simulators!r}")
+        if not (type(num_simulators) is int and 1 <= num_simulators <= MAX_DRONES):
+            raise InputError(
+                f"num_simulators: expected 1 to {MAX_DRONES}, got {num_simulators!r:.300}"
+            )
         most = num_simulators * MAX_DRONES
         if num_envs is not None:
             right = type(num_envs) is int and 1 <= num_envs <= most
             expected = f"a multiple of num_simulators = {num_simulators}, at most {most}"
-            expect(right and not num_envs % num_simulators, "num_envs", expected, f"{num_envs!r}")
-        self.num_simulators, self.num_envs = num_simulators, num_envs or 0
+            if not (right and not num_envs % num_simulators):
+                raise InputError(f"num_envs: expected {expected}, got {num_envs!r:.300}")
+        self.num_simulators = num_simulators
+        self.num_envs = num_envs or 0
         self._broken: tuple[np.ndarray, np.ndarray] | None = None
         self._flying = False
         self.metadata = {"render_modes": [], "autoreset_mode": checked_mode(autoreset_mode)}
@@ -282,14 +289,16 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
         in_flight = "reset_mask" in options and self._flying
         if not in_flight:
             self.connect()
-        mask, seeds = checked_mask(options.get("reset_mask"), self.num_envs), self._seeds(seed)
+        mask = checked_mask(options.get("reset_mask"), self.num_envs)
+        seeds = self._seeds(seed)
         self._broken = None
         if in_flight:
             self.advance(self._nothing, mask, seeds, ~mask)
         else:
             self._flying = False
             self._reset_until_done(mask, seeds)
-            self.done, self._idle = np.zeros(self.num_envs, bool), ~mask
+            self.done = np.zeros(self.num_envs, bool)
+            self._idle = ~mask
             self.out = self.done
             self._flying = True
             self._take_states(np.ones(self.num_envs, bool))
@@ -330,7 +339,8 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
         lost = self._agent.lost
         if any(lost) and numbers is not None:  # a simulator in place of a lost one knows none
             lost = self._reset_until_done(resets, numbers, lost)
-        before, telemetry = self._arrays, self.telemetry
+        before = self._arrays
+        telemetry = self.telemetry
         self._take_states(resets | frozen)
         reasons = np.repeat(np.array(lost, object), self._shape[1])
         broken = (reasons != "") & ~(resets | grounded | self.out)
@@ -414,7 +424,8 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
 
     def _sent(self, actions: np.ndarray, idle: np.ndarray) -> np.ndarray:
         """Actions as they cross the wire; those of drones that do not fly are 0."""
-        shape, action = (self.num_envs, *self._row), self.env_spec.action
+        shape = (self.num_envs, *self._row)
+        action = self.env_spec.action
         array = np.array(actions)
         if isinstance(action, Discrete) and array.shape == (*shape, 1):
             array = array[:, 0]

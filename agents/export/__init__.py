@@ -22,7 +22,8 @@ FORMAT: Final = 1
 TARGETS: Final = {"onnx": "policy.onnx", "c": "rotorgram_policy.h"}
 """Name of the file of each target, by default."""
 
-_TRIED, _FAR = 256, 100.0
+_TRIED = 256
+_FAR = 100.0
 """Observations that a policy is tried with, and their largest numbers where they have no bound."""
 
 _SPEC: Final = (

@@ -84,7 +84,9 @@ class _Program:
         self.tables: dict[str, Floats] = {}
         self.buffers: dict[str, int] = {}
         self.lines: list[str] = []
-        self.at, self.size, self.uses_tanh = "observation", policy.inputs_size, False
+        self.at = "observation"
+        self.size = policy.inputs_size
+        self.uses_tanh = False
         for layer in policy.layers:
             if isinstance(layer, Normalise):
                 self._normalise(layer)
@@ -124,7 +126,8 @@ class _Program:
             self.lines += [f"{start} {{", *inner, "}"]
 
     def _normalise(self, layer: Normalise) -> None:
-        mean, scale = self._table("mean", layer.mean), self._table("scale", layer.scale)
+        mean = self._table("mean", layer.mean)
+        scale = self._table("scale", layer.scale)
         out = self._buffer(self.size)
         self._each(f"{out}[i] = ({self.at}[i] - {mean}[i]) * {scale}[i];")
         self.at = out
@@ -138,7 +141,8 @@ class _Program:
         self.lines.append(
             f"rotorgram_layer({weight}, {bias}, {self.at}, {inputs}, {out}, {outputs});"
         )
-        self.at, self.size = out, outputs
+        self.at = out
+        self.size = outputs
 
     def _choose(self) -> None:
         self.lines.append("action[0] = 0.0f;")
@@ -148,11 +152,10 @@ class _Program:
     def _act(self, policy: NetworkPolicy) -> None:
         """Map the outputs to the range of the action, and clip them to its bounds."""
         actions = policy.actions
-        middle, half = (
-            self._table("action_middle", actions.middle),
-            self._table("action_half", actions.half),
-        )
-        low, high = self._table("action_low", actions.low), self._table("action_high", actions.high)
+        middle = self._table("action_middle", actions.middle)
+        half = self._table("action_half", actions.half)
+        low = self._table("action_low", actions.low)
+        high = self._table("action_high", actions.high)
         self._each(
             f"float y = {middle}[i] + {half}[i] * {self.at}[i];",
             f"y = y < {low}[i] ? {low}[i] : y;",
@@ -208,7 +211,8 @@ def _elements(*arrays: ArraySpec) -> Iterator[_Element]:
 
 def _lists(spec: EnvSpec) -> dict[str, list[str]]:
     """Names and units of all elements, by the name that they have in the file."""
-    observed, action = list(_elements(*spec.observation)), spec.action
+    observed = list(_elements(*spec.observation))
+    action = spec.action
     listed = {
         "observation_names": [one.name for one in observed],
         "observation_units": [one.unit for one in observed],

@@ -39,7 +39,8 @@ def write(policy: NetworkPolicy, facts: Mapping[str, str]) -> bytes:
 
     A discrete action is int64, (batch,).
     """
-    graph, actions = _Graph(), policy.actions
+    graph = _Graph()
+    actions = policy.actions
     for layer in policy.layers:
         if isinstance(layer, Normalise):
             graph.then("Sub", layer.mean)

@@ -22,7 +22,9 @@ class Actions:
     """
 
     def __init__(self, shape: tuple[int, ...], width: int, choices: int) -> None:
-        self._shape, self._width, self._choices = (*shape, width), width, choices
+        self._shape = (*shape, width)
+        self._width = width
+        self._choices = choices
         self._count = math.prod(shape)
 
     def checked(self, given: Any, flown: Mask | None) -> NDArray[np.float64]:

@@ -65,7 +65,8 @@ def mask_of(record: Record, given: Any) -> Mask:
 def drones_of(record: Record, given: Any) -> Mask:
     """A mask of shape (N,) as one of shape (W, A). Raises `InputError`."""
     expected = (record.out.size,)
-    dtype, shape = getattr(given, "dtype", None), getattr(given, "shape", None)
+    dtype = getattr(given, "dtype", None)
+    shape = getattr(given, "shape", None)
     if dtype != np.bool_ or shape != expected:
         raise InputError(f"resets, frozen: expected bool of shape {expected}, got {given!r:.80}")
     mask: Mask = given.reshape(record.shape)[()]

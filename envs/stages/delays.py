@@ -26,7 +26,8 @@ class ObservationDelay(Stage):
         """A drone that begins fills its past with the present."""
         past = vars(record).get("past_observations", {})
         age = self._world.parameters["observation_delay"]
-        sent, arrived = {}, {}
+        sent = {}
+        arrived = {}
         for name, values in record.observations.items():
             sent[name] = later(past.get(name), values, self._steps, record)
             arrived[name] = taken(sent[name], age, self._axis)

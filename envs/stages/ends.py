@@ -43,8 +43,11 @@ class Ends(Stage):
             flying = ~record.out if flying is None else flying & ~record.out
         if flying is not None:
             reward = np.where(flying, reward, 0.0)[()]
-            terminated, truncated = terminated & flying, truncated & flying
-        record.reward, record.terminated, record.truncated = reward, terminated, truncated
+            terminated = terminated & flying
+            truncated = truncated & flying
+        record.reward = reward
+        record.terminated = terminated
+        record.truncated = truncated
         ends = terminated | truncated
         if ends.any():
             record.end(ends)

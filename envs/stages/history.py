@@ -23,12 +23,15 @@ class History(Stage):
     arrays = ("history",)
 
     def __init__(self, steps: int, names: tuple[str, ...], axis: int) -> None:
-        self._steps, self._names, self._axis = steps, names, axis
+        self._steps = steps
+        self._names = names
+        self._axis = axis
 
     def step(self, record: Record) -> None:
         """A drone that begins fills its history with the present."""
         past = vars(record).get("history", {})
-        history, rows = {}, {}
+        history = {}
+        rows = {}
         for name in self._names:
             values = record.observations[name]
             if values.ndim == self._axis:  # a number
@@ -39,7 +42,8 @@ class History(Stage):
         record.observations = {**record.observations, **rows}
 
     def _side_by_side(self, history: Values) -> Values:
-        lead, rest = history.shape[: self._axis], history.shape[self._axis + 2 :]
+        lead = history.shape[: self._axis]
+        rest = history.shape[self._axis + 2 :]
         return history.reshape(*lead, -1, *rest)
 
 

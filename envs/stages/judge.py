@@ -20,7 +20,9 @@ class Starts(Stage):
     """
 
     def __init__(self, env_id: str, task: Task, world: World) -> None:
-        self._env_id, self._task, self._world = env_id, task, world
+        self._env_id = env_id
+        self._task = task
+        self._world = world
 
     def begin(self, record: Record) -> None:
         """Other stages follow from the start."""
@@ -62,7 +64,8 @@ class Judge(Stage):
     arrays = ("observations", "terms", "metrics")
 
     def __init__(self, env_id: str, task: Task) -> None:
-        self._env_id, self._task = env_id, task
+        self._env_id = env_id
+        self._task = task
         self._checked = False
 
     def step(self, record: Record) -> None:
@@ -76,7 +79,8 @@ class Judge(Stage):
             array.name: np.asarray(observations[array.name]).reshape(*record.shape, *array.shape)
             for array in self._task.observation
         }
-        record.terms, record.metrics = outcome.reward, outcome.metrics
+        record.terms = outcome.reward
+        record.metrics = outcome.metrics
         record.ended = outcome.terminated
 
     def _check(self, observations: Any, outcome: Any, record: Record) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...models.cameras import FARTHEST, View, chosen_views
-from ...models.errors import expect
+from ...models.errors import InputError
 from ...models.fleet import members_of
 from ...scenes import scenes_of
 from ...sim.random import CAMERAS, SCENES, Random
@@ -33,15 +33,17 @@ def views_of(task: Task, drones: int) -> tuple[View, ...]:
     first, *others = (chosen_views(words, one.cameras) for one in kinds)
     for views in others:
         names = [[view.name for view in some] for some in (first, views)]
-        expect(
-            names[0] == names[1], "cameras", f"{', '.join(names[0])} of all vehicles", f"{names[1]}"
-        )
+        if names[0] != names[1]:
+            raise InputError(
+                f"cameras: expected {', '.join(names[0])} of all vehicles, got {names[1]}"
+            )
         for ours, its in zip(first, views, strict=True):
             a, b = ours.camera, its.camera
             same = (ours.shape, a.every, a.carried) == (its.shape, b.every, b.carried)
             same &= a.carried or a == b  # of a world there is one alone
             expected = "one of the same size and rate on all vehicles, or the same in their world"
-            expect(same, f"camera {ours.name}", expected, "others")
+            if not same:
+                raise InputError(f"camera {ours.name}: expected {expected}, got others")
     return first
 
 
@@ -94,9 +96,12 @@ class Pictures(Stage):
     def __init__(self, task: Task, random: Random, shape: tuple[int, int]) -> None:
         from ...rendering.cameras import Cameras
 
-        self._task, self._shape, self._rows = task, shape, shape[0] * shape[1]
+        self._task = task
+        self._shape = shape
+        self._rows = shape[0] * shape[1]
         self._random = random
-        self._noise, self._scenes = random.use(CAMERAS), random.use(SCENES)
+        self._noise = random.use(CAMERAS)
+        self._scenes = random.use(SCENES)
         self.views = views_of(task, shape[1])
         scenes = scenes_of(str(task.config.scene))
         self._count = len(scenes)
@@ -169,8 +174,10 @@ class Pictures(Stage):
         A drone takes one with the first state of an episode, and with every so many control steps
         of it.
         """
-        count, state = self._rows, record.state
-        fresh, flown = np.zeros(count, bool), np.ones(count, bool)
+        count = self._rows
+        state = record.state
+        fresh = np.zeros(count, bool)
+        flown = np.ones(count, bool)
         if record.begun is not None:
             fresh = self._per_drone(record.begun)
         if record.flown is not None:

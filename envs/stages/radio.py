@@ -54,7 +54,9 @@ class Radio(Stage):
         drones: int,
         ended: Callable[[State], Mask],
     ) -> None:
-        self._options, self._period, self._ended = options, period, ended
+        self._options = options
+        self._period = period
+        self._ended = ended
         self._own = np.eye(drones, dtype=bool)
 
     def begin(self, record: Record) -> None:
@@ -79,7 +81,8 @@ class Radio(Stage):
         measured.neighbours = self._nearest(record, measured.position, measured.velocity)
 
     def _exchange(self, record: Record) -> None:
-        state, delay = record.state, self._options.radio_delay
+        state = record.state
+        delay = self._options.radio_delay
         record.silent = record.silent | self._ended(state)
         message = np.concatenate(
             (state.position, state.velocity, record.silent[..., None]), axis=-1

@@ -85,7 +85,8 @@ class Record:
     silent: Mask
 
     def __init__(self, shape: tuple[int, ...], memory: Memory) -> None:
-        self.shape, self.memory = shape, memory
+        self.shape = shape
+        self.memory = memory
         self.kept: tuple[str, ...] = ()
         nobody = np.zeros(shape, bool)[()]
         self.flown: Mask | None = None
@@ -95,13 +96,17 @@ class Record:
         self.out = self.done = self.terminated = self.truncated = nobody
         self.waiting = ~nobody
         self.reward = np.zeros(shape)[()]
-        self._nothing, self._nobody = self.reward, nobody
-        self.anyone_waits, self.anyone_out = True, False
+        self._nothing = self.reward
+        self._nobody = nobody
+        self.anyone_waits = True
+        self.anyone_out = False
 
     def run(self, mask: Mask | None, stages: Sequence[Callable[["Record"], None]]) -> None:
         """Run a region for the drones of a mask, None for all. An error leaves all as it was."""
-        arrays, memory = vars(self), vars(self.memory)
-        before, remembered = arrays.copy(), memory.copy()
+        arrays = vars(self)
+        memory = vars(self.memory)
+        before = arrays.copy()
+        remembered = memory.copy()
         try:
             for stage in stages:
                 stage(self)

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import numpy as np
 
-from ...models.errors import expect
+from ...models.errors import InputError
 from ...models.fields import Limits
 from ...sim import Array, Draw, InitialState, stack
 from ..config import EnvConfig
@@ -92,23 +92,26 @@ class Cable(Swarm):
         Metric(name="payload_error", unit="m", settled=0.1, held=0.1, symbol="e"),
         Metric(name="clearance", unit="m", goal="high"),
     )
-    min_drones, max_drones = 2, 32
+    min_drones = 2
+    max_drones = 32
 
     def setup(self) -> None:
         """See the class."""
         from ...models.fleet import Fleet
         from ...models.vehicle import payload_radius
 
-        options, vehicle, count = self.options, self.vehicle, self.shape[1]
-        alike = not isinstance(vehicle, Fleet)
-        expect(alike, "vehicle", "one for all drones that carry a payload", vehicle.name)
+        options = self.options
+        vehicle = self.vehicle
+        count = self.shape[1]
+        if isinstance(vehicle, Fleet):
+            raise InputError(
+                f"vehicle: expected one for all drones that carry a payload, got {vehicle.name}"
+            )
         self._slant = math.radians(options.angle)
         self._ring = float(np.linalg.norm(ring(count)[0])) * self.gap
         self._azimuths = 2 * math.pi * np.arange(count) / count
-        self._height, self._cable = (
-            self._ring / math.tan(self._slant),
-            self._ring / math.sin(self._slant),
-        )
+        self._height = self._ring / math.tan(self._slant)
+        self._cable = self._ring / math.sin(self._slant)
         self._load = options.payload_share * vehicle.mass * vehicle.gravity
         lift = vehicle.mass * vehicle.gravity + self._load
         self._tilt = math.atan2(self._load * math.tan(self._slant), lift)
@@ -117,12 +120,14 @@ class Cable(Swarm):
         expected = (
             f"a load that the rotors of {vehicle.name} carry at an angle of {options.angle:g}°"
         )
-        expect(bool(able), "payload_share", expected, f"{options.payload_share:g}")
+        if not able:
+            raise InputError(f"payload_share: expected {expected}, got {options.payload_share:g}")
         self._radius = payload_radius(options.payload_share * vehicle.mass * count)
         away = options.start_band * self.gap
         least = self._radius + AIR + away
         expected = f"a height of at least {least:.4g} m above the ground"
-        expect(options.center[2] >= least, "center", expected, f"{options.center[2]:g}")
+        if not options.center[2] >= least:
+            raise InputError(f"center: expected {expected}, got {options.center[2]:g}")
         self.reach = away * math.sqrt(3)
         self.prepare(
             tuple(
@@ -146,11 +151,14 @@ class Cable(Swarm):
         Each cable pulls at the body's origin, which may be off the center of mass: the rotors turn
         against that.
         """
-        vehicle, load = self.vehicle, self._load
+        vehicle = self.vehicle
+        load = self._load
         # The pull in the frame of a drone that is tilted outwards; its height and its way inwards.
         inwards = load * math.tan(self._slant)
-        c, s = math.cos(self._tilt), math.sin(self._tilt)
-        along, down = s * load - c * inwards, -s * inwards - c * load
+        c = math.cos(self._tilt)
+        s = math.sin(self._tilt)
+        along = s * load - c * inwards
+        down = -s * inwards - c * load
         pull = stack((along * np.cos(azimuth), along * np.sin(azimuth), down))
         force = np.full(azimuth.shape, math.hypot(inwards, load + vehicle.mass * vehicle.gravity))
         torque = np.cross(vehicle.center_of_mass, pull)
@@ -169,7 +177,8 @@ class Cable(Swarm):
         ball = np.array(self.options.center) + offset + np.zeros((*self.shape, 3))
         azimuth = turn + self._azimuths
         half = self._tilt / 2
-        sine, zero = math.sin(half), 0.0 * azimuth
+        sine = math.sin(half)
+        zero = 0.0 * azimuth
         position = ball + self._around(turn)
         return InitialState(
             position=position,
@@ -183,7 +192,8 @@ class Cable(Swarm):
     def _around(self, turn: Array) -> Array:
         """Places of the drones from the payload, on the ring turned by an angle, (W, A, 3), m."""
         azimuth = turn + self._azimuths
-        x, y = self._ring * np.cos(azimuth), self._ring * np.sin(azimuth)
+        x = self._ring * np.cos(azimuth)
+        y = self._ring * np.sin(azimuth)
         return stack((x, y, 0.0 * x + self._height))
 
     def goal(self, state: State) -> Array:
@@ -192,7 +202,8 @@ class Cable(Swarm):
 
     def observe(self, state: State) -> dict[str, Array]:
         """See the table of the class."""
-        hung, moving = state.payload - state.position, state.payload_velocity - state.velocity
+        hung = state.payload - state.position
+        moving = state.payload_velocity - state.velocity
         return self.build_observation(
             state, hung, moving, self._missing(state), *self.neighbour_observation(state)
         )
@@ -212,7 +223,9 @@ class Cable(Swarm):
     def outcome(self, state: State) -> Outcome:
         """Nearness, approach and swing of the payload, and room; see the class."""
         missing = self._missing(state)
-        distance, room, ended = length(missing), self.clearance(state), self.ended(state)
+        distance = length(missing)
+        room = self.clearance(state)
+        ended = self.ended(state)
         near = self.gap / 2
         closing = np.sum(missing * state.payload_velocity, axis=-1)
         return Outcome(

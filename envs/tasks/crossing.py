@@ -63,7 +63,8 @@ class Crossing(Swarm):
         places = ring(count)
         radius = max(float(np.linalg.norm(places[0])), 1.0)  # of six
         angle = 2 * math.pi * np.arange(count) / count
-        self._angles, self._radius = angle if self.shape else 0.0, radius * self.gap
+        self._angles = angle if self.shape else 0.0
+        self._radius = radius * self.gap
         self.reach = 2 * self._radius + 2 * JITTER * self.gap
         self.prepare()
 
@@ -80,7 +81,8 @@ class Crossing(Swarm):
     def _opposite(self, turn: Array) -> Array:
         """Where drones fly to from a ring turned by an angle, rad: world frame, m, (W, A, 3)."""
         angle = turn + self._angles + math.pi
-        x, y = self._radius * np.cos(angle), self._radius * np.sin(angle)
+        x = self._radius * np.cos(angle)
+        y = self._radius * np.sin(angle)
         cx, cy, cz = self.options.center
         return stack((x + cx, y + cy, 0.0 * x + cz))
 

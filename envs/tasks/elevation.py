@@ -6,7 +6,7 @@ from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 
-from ...models.errors import InputError, expect
+from ...models.errors import InputError
 from ...models.fields import Limits, NumberOrPair
 from ...sim import (
     Array,
@@ -56,7 +56,8 @@ class ElevationOptions(TaskOptions):
         """Check the options of this task. Raises `InputError`."""
         wider = self.flight_band > self.start_band
         least = f"more than start_band = {self.start_band:g} m"
-        expect(wider, "flight_band", least, f"{self.flight_band!r}")
+        if not wider:
+            raise InputError(f"flight_band: expected {least}, got {self.flight_band!r:.300}")
 
     @property
     def target_range(self) -> tuple[float, float]:
@@ -122,18 +123,24 @@ class Elevation(Task):
 
     def setup(self) -> None:
         """See the class."""
-        options, vehicle = self.options, self.vehicle
+        options = self.options
+        vehicle = self.vehicle
         room = vehicle.rest_height + AIR
         self.least_target = least = room + options.start_band
         low, high = options.target_range
         reasons = f"(start_band = {options.start_band:g} m, and {room:g} m of room)"
         expected = f"{least:g} m {reasons} to {FURTHEST:g} m"
-        expect(least <= low and high <= FURTHEST, "target", expected, f"{options.target!r}")
-        increment, most = self.action == "increment", float(vehicle.thrust_high.max())
+        if not (least <= low and high <= FURTHEST):
+            raise InputError(f"target: expected {expected}, got {options.target!r:.300}")
+        increment = self.action == "increment"
+        most = float(vehicle.thrust_high.max())
         usual: Any = self.controller
         scale = options.thrust_scale or usual.newtons
         expected = f"at most {most:g} N, the largest thrust of a rotor"
-        expect(scale <= most, "thrust_scale", expected, f"{options.thrust_scale!r}")
+        if not scale <= most:
+            raise InputError(
+                f"thrust_scale: expected {expected}, got {options.thrust_scale!r:.300}"
+            )
         self.controller = CollectiveThrust(
             vehicle, scale, increment=increment, discrete=options.action_type == "discrete"
         )
@@ -195,7 +202,8 @@ class Elevation(Task):
         of a control period T. So the craft may turn back outside it within one period, fly through
         it, and fly on for one period: sqrt((a T / 2)² + 2 a · 2 flight_band) + a T.
         """
-        a, period = self.vehicle.max_acceleration, self.control_period
+        a = self.vehicle.max_acceleration
+        period = self.control_period
         out = math.sqrt(4 * a * self.options.flight_band)
         return float(math.hypot(a * period / 2, out) + a * period)
 

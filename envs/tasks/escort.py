@@ -90,14 +90,17 @@ class Escort(Swarm):
         if self.count > 1:  # one for all
             ratio, alpha, beta = (x[:, :1] + 0.0 * x for x in (ratio, alpha, beta))
         memory = self.memory
-        memory.ratio, memory.alpha, memory.beta = ratio, alpha, beta
+        memory.ratio = ratio
+        memory.alpha = alpha
+        memory.beta = beta
         memory.time = 0.0
         position = self.cells(draw) + self.target()[0]
         return InitialState(position=position)
 
     def target(self) -> tuple[Array, Array]:
         """Position from the center and velocity of the target: world frame, m, m/s, (W, A, 3)."""
-        memory, a = self.memory, self.options.target_path
+        memory = self.memory
+        a = self.options.target_path
         slow = self.options.target_speed / (a * np.sqrt(1.0 + memory.ratio * memory.ratio))
         fast = memory.ratio * slow
         first = slow * memory.time + memory.alpha

@@ -126,7 +126,8 @@ class GoalTask(Task):
         The goal, world frame, m, shape (..., 3), is by default that of `goal`.
         """
         goal = self.goal(state) if goal is None else goal
-        to_goal, quaternion = goal - state.position, state.quaternion
+        to_goal = goal - state.position
+        quaternion = state.quaternion
         if self.body:
             turned = [to_body(quaternion, v) for v in (to_goal, state.velocity)]
             vectors = (*turned, world_z(quaternion))
@@ -142,8 +143,10 @@ class GoalTask(Task):
         """World vectors in the world frame turned by the wanted heading, shape (..., 3)."""
         if self.wanted == 0.0:
             return vectors
-        c, s = math.cos(self.wanted), math.sin(self.wanted)
-        x, y = vectors[..., 0], vectors[..., 1]
+        c = math.cos(self.wanted)
+        s = math.sin(self.wanted)
+        x = vectors[..., 0]
+        y = vectors[..., 1]
         return stack((c * x + s * y, c * y - s * x, vectors[..., 2]))
 
 

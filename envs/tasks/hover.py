@@ -6,7 +6,7 @@ from typing import Annotated, Final
 
 import numpy as np
 
-from ...models.errors import expect
+from ...models.errors import InputError
 from ...models.fields import Limits
 from ...sim import Array, Draw, InitialState, component, stack
 from ..spec import Metric
@@ -50,7 +50,8 @@ class HoverOptions(TaskOptions):
         """Check the options of this task. Raises `InputError`."""
         least = self.start_band * math.sqrt(3)
         expected = f"more than sqrt(3) · start_band = {least:.4g} m"
-        expect(self.flight_band > least, "flight_band", expected, f"{self.flight_band!r}")
+        if not self.flight_band > least:
+            raise InputError(f"flight_band: expected {expected}, got {self.flight_band!r:.300}")
 
 
 class Hover(GoalTask):
@@ -95,10 +96,12 @@ class Hover(GoalTask):
 
     def setup(self) -> None:
         """See the class."""
-        options, vehicle = self.options, self.vehicle
+        options = self.options
+        vehicle = self.vehicle
         least = vehicle.rest_height + AIR + options.start_band
         expected = f"a height of at least {least:g} m above the ground"
-        expect(options.goal[2] >= least, "goal", expected, f"{options.goal[2]:g}")
+        if not options.goal[2] >= least:
+            raise InputError(f"goal: expected {expected}, got {options.goal[2]:g}")
         self.wanted = math.radians(options.heading)
         self.define_observation(options.flight_band)
 
@@ -111,8 +114,11 @@ class Hover(GoalTask):
         off = math.radians(options.start_heading)
         heading = (self.wanted + draw.uniform(-off, off)) / 2
         # First tilted about a horizontal axis, then turned about the vertical.
-        w, x, y = np.cos(tilt), np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth)
-        c, s = np.cos(heading), np.sin(heading)
+        w = np.cos(tilt)
+        x = np.sin(tilt) * np.cos(azimuth)
+        y = np.sin(tilt) * np.sin(azimuth)
+        c = np.cos(heading)
+        s = np.sin(heading)
         quaternion = stack((c * w, c * x - s * y, c * y + s * x, s * w))
         goal = stack([0.0 * tilt + value for value in options.goal])
         return InitialState(position=goal + offset, quaternion=quaternion)

@@ -6,7 +6,7 @@ from typing import Annotated, Final, Literal
 
 import numpy as np
 
-from ...models.errors import expect
+from ...models.errors import InputError
 from ...models.fields import Limits, NumberOrPair
 from ...sim import Array, Draw, InitialState, component, each, square_root, stack
 from ..spec import Mark, Metric
@@ -55,11 +55,15 @@ class LandingOptions(TaskOptions):
     def check(self) -> None:
         """Check the options of this task. Raises `InputError`."""
         lowest = self.start_height - self.start_band
-        expect(lowest >= 0.5, "start_band", "at most start_height - 0.5 m", f"{self.start_band!r}")
+        if not lowest >= 0.5:
+            raise InputError(
+                f"start_band: expected at most start_height - 0.5 m, got {self.start_band!r:.300}"
+            )
         reach = self.pad_path + math.sqrt(2) * self.start_band
         furthest = math.hypot(reach, self.start_height + self.start_band)
         expected = f"more than the {furthest:.4g} m of the furthest start"
-        expect(self.flight_band > furthest, "flight_band", expected, f"{self.flight_band!r}")
+        if not self.flight_band > furthest:
+            raise InputError(f"flight_band: expected {expected}, got {self.flight_band!r:.300}")
 
     @property
     def pad_speeds(self) -> tuple[float, float]:
@@ -149,7 +153,8 @@ class Landing(GoalTask):
         options = self.options
         offset = draw.uniform(-options.start_band, options.start_band, (3,))
         speed = draw.uniform(*options.pad_speeds)
-        direction, phase = draw.uniform(-math.pi, math.pi), draw.uniform(-math.pi, math.pi)
+        direction = draw.uniform(-math.pi, math.pi)
+        phase = draw.uniform(-math.pi, math.pi)
         side = draw.uniform(-1.0, 1.0)
         zero = 0.0 * phase
         circle = options.motion == "circle"
@@ -162,19 +167,22 @@ class Landing(GoalTask):
         # Velocity and cosine of the tilt after the last step, and before contact.
         memory.velocity = memory.arrival = rest
         memory.upright = memory.arrival_upright = 1.0
-        memory.potential, memory.progress = self._potential_of(position, rest), 0.0
+        memory.potential = self._potential_of(position, rest)
+        memory.progress = 0.0
         return InitialState(position=position)
 
     def update_memory(self, state: State) -> None:
         """Move the pad; keep speed and tilt from before contact, and what was won on the way."""
-        memory, touching = self.memory, state.touching
+        memory = self.memory
+        touching = state.touching
         memory.phase = memory.phase + memory.rate * self.control_period
         memory.arrival = np.where(each(touching), memory.velocity, state.velocity)
         memory.arrival_upright = np.where(touching, memory.upright, state.tilt_cosine)
         potential = self._potential_of(state.position, memory.arrival)
         memory.progress = potential - memory.potential
         memory.potential = potential
-        memory.velocity, memory.upright = state.velocity, state.tilt_cosine
+        memory.velocity = state.velocity
+        memory.upright = state.tilt_cosine
 
     def observe(self, state: State) -> dict[str, Array]:
         """See the table of the class."""
@@ -182,10 +190,12 @@ class Landing(GoalTask):
 
     def outcome(self, state: State) -> Outcome:
         """Progress and the end: a landing, a crash, a flip-over, or outside the band."""
-        options, touching = self.options, state.touching
+        options = self.options
+        touching = state.touching
         speed = self._relative(self.memory.arrival)
         away = self.goal(state) - state.position
-        x, y = component(away, 0), component(away, 1)
+        x = component(away, 0)
+        y = component(away, 1)
         distance = square_root(x * x + y * y)
         drift = square_root(speed[0] * speed[0] + speed[1] * speed[1])
         landed = (
@@ -224,7 +234,8 @@ class Landing(GoalTask):
     def _pad(self) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         """Position, m, and velocity, m/s, of the pad's centre, x and y, world frame."""
         path = self.options.pad_path
-        c, s = path * np.cos(self.memory.phase), path * np.sin(self.memory.phase)
+        c = path * np.cos(self.memory.phase)
+        s = path * np.sin(self.memory.phase)
 
         def turned(along: Array, across: Array) -> tuple[Array, Array]:
             across = self.memory.side * across

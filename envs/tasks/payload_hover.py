@@ -6,7 +6,7 @@ from typing import Annotated
 
 import numpy as np
 
-from ...models.errors import expect
+from ...models.errors import InputError
 from ...models.fields import Limits
 from ...sim import (
     Array,
@@ -61,7 +61,8 @@ class PayloadHoverOptions(TaskOptions):
         """Check the options of this task. Raises `InputError`."""
         least = self.start_band * math.sqrt(3)
         expected = f"more than sqrt(3) · start_band = {least:.4g} m"
-        expect(self.flight_band > least, "flight_band", expected, f"{self.flight_band!r}")
+        if not self.flight_band > least:
+            raise InputError(f"flight_band: expected {expected}, got {self.flight_band!r:.300}")
 
 
 class PayloadHover(GoalTask):
@@ -118,11 +119,13 @@ class PayloadHover(GoalTask):
         """See the class."""
         from ...models.vehicle import payload_radius
 
-        options, vehicle = self.options, self.vehicle
+        options = self.options
+        vehicle = self.vehicle
         mass = options.payload_share * vehicle.mass
         least = payload_radius(mass) + AIR + options.start_band
         expected = f"a height of at least {least:.4g} m above the ground"
-        expect(options.goal[2] >= least, "goal", expected, f"{options.goal[2]:g}")
+        if not options.goal[2] >= least:
+            raise InputError(f"goal: expected {expected}, got {options.goal[2]:g}")
         self.define_observation(
             options.flight_band,
             [
@@ -139,12 +142,15 @@ class PayloadHover(GoalTask):
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """The payload near its goal, hanging still below a craft that moves and tilts."""
         options = self.options
-        band, fastest = options.start_band, options.start_speed
+        band = options.start_band
+        fastest = options.start_speed
         offset = draw.uniform(-band, band, (3,))
         tilt = draw.uniform(0.0, math.radians(options.start_tilt)) / 2
         azimuth = draw.uniform(-math.pi, math.pi)
-        along, across = draw.uniform(-fastest, fastest), draw.uniform(-fastest, fastest)
-        sine, zero = np.sin(tilt), 0.0 * tilt
+        along = draw.uniform(-fastest, fastest)
+        across = draw.uniform(-fastest, fastest)
+        sine = np.sin(tilt)
+        zero = 0.0 * tilt
         x, y, z = options.goal
         above = stack((zero + x, zero + y, zero + z + options.cable))
         carrying = (1.0 + options.payload_share) * self.vehicle.hover_thrust
@@ -159,7 +165,8 @@ class PayloadHover(GoalTask):
         """See the table of the class."""
         x, y, z = self.options.goal
         goal = at((x, y, z + self.options.cable), state)
-        hung, moving = state.payload - state.position, state.payload_velocity - state.velocity
+        hung = state.payload - state.position
+        moving = state.payload_velocity - state.velocity
         return self.build_observation(state, hung, moving, goal=goal)
 
     def outcome(self, state: State) -> Outcome:

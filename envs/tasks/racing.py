@@ -10,7 +10,7 @@ from typing import Annotated, Any, Final
 
 import numpy as np
 
-from ...models.errors import InputError, expect
+from ...models.errors import InputError
 from ...models.fields import Limits, read_table
 from ...sim import (
     Array,
@@ -151,9 +151,10 @@ class Racing(GoalTask):
         gates, self._start = read_track(self.options.track)
         least = self.vehicle.rest_height + AIR + self.options.start_band
         got = self._start.position[2]
-        expect(
-            got >= least, "track", f"a start at least {least:.4g} m above the ground", f"{got:g}"
-        )
+        if not got >= least:
+            raise InputError(
+                f"track: expected a start at least {least:.4g} m above the ground, got {got:g}"
+            )
         self._total = len(gates) * self.options.laps
         self._count = len(gates)
         self.marks = tuple(
@@ -196,11 +197,13 @@ class Racing(GoalTask):
     def update_memory(self, state: State) -> None:
         """Whether the gate was passed, how much nearer it came, and the times of rounds."""
         memory = self.memory
-        now, before = state.position, memory.position
+        now = state.position
+        before = memory.position
         gate = self._gate(memory.passed)
         center = gate[..., :3]
         x, y, half = (component(gate, i) for i in (3, 4, 5))
-        a, b = before - center, now - center
+        a = before - center
+        b = now - center
         ahead, behind = (component(p, 0) * x + component(p, 1) * y for p in (b, a))
         through = (behind < 0.0) & (ahead >= 0.0)
         share = each(plain(behind / np.where(through, behind - ahead, -1.0)))
@@ -211,15 +214,18 @@ class Racing(GoalTask):
         passing = plain(through & inside & left) * 1.0
         passed = memory.passed + passing
         whole = (passing > 0.5) & (passed % self._count == 0.0)
-        way, come = center - memory.behind, now - memory.behind
+        way = center - memory.behind
+        come = now - memory.behind
         along = plain(np.sum(come * way, axis=-1)) / (plain(np.sum(way * way, axis=-1)) + 1e-12)
         behind_now = np.where(each(passing > 0.5), center, memory.behind)
         memory.off = length(come - each(clip(along, 0.0, 1.0)) * way)
         memory.progress = length(a) - length(b)
-        memory.passed, memory.passing = passed, passing
+        memory.passed = passed
+        memory.passing = passing
         memory.lap = np.where(whole, state.time - memory.lap_began, memory.lap)
         memory.lap_began = np.where(whole, state.time, memory.lap_began)
-        memory.position, memory.behind = now, behind_now
+        memory.position = now
+        memory.behind = behind_now
 
     def observe(self, state: State) -> dict[str, Array]:
         """See the table of the class."""
@@ -262,7 +268,8 @@ class Racing(GoalTask):
 
 def read_track(given: Any) -> tuple[list[Gate], Start]:
     """Gates of a track, and its start, a gate of size 0. Raises `InputError`."""
-    expect(isinstance(given, str), "track", _WAY, f"{given!r:.80}")
+    if not isinstance(given, str):
+        raise InputError(f"track: expected {_WAY}, got {given!r:.80}")
     try:
         if given.lstrip().startswith("{"):
             content = json.loads(given)
@@ -276,11 +283,13 @@ def read_track(given: Any) -> tuple[list[Gate], Start]:
         raise InputError(
             f"track: expected {_WAY} ({names}), got {given!r:.80}: {reason:.120}"
         ) from None
-    right = isinstance(content, Mapping) and isinstance(content.get("gates"), list)
-    expect(right, "track", "a list of gates", f"{content!r:.80}")
+    if not (isinstance(content, Mapping) and isinstance(content.get("gates"), list)):
+        raise InputError(f"track: expected a list of gates, got {content!r:.80}")
     unknown = sorted({*content} - {"gates", "start"})
-    expect(not unknown, "track", "gates and start", f"{unknown}")
+    if unknown:
+        raise InputError(f"track: expected gates and start, got {unknown}")
     rows = content["gates"]
-    expect(1 <= len(rows) <= MOST_GATES, "track", f"1 to {MOST_GATES} gates", f"{len(rows)}")
+    if not 1 <= len(rows) <= MOST_GATES:
+        raise InputError(f"track: expected 1 to {MOST_GATES} gates, got {len(rows)}")
     gates = [read_table(Gate, row, f"track: gate {i}") for i, row in enumerate(rows, start=1)]
     return gates, read_table(Start, content.get("start"), "track: start")

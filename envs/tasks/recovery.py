@@ -6,7 +6,7 @@ from typing import Annotated, Final, Literal
 
 import numpy as np
 
-from ...models.errors import expect
+from ...models.errors import InputError
 from ...models.fields import Limits
 from ...sim import (
     Array,
@@ -54,7 +54,8 @@ class RecoveryOptions(TaskOptions):
     def check(self) -> None:
         """Check the options of this task. Raises `InputError`."""
         expected = f"more than near = {self.near:g} m"
-        expect(self.flight_band > self.near, "flight_band", expected, f"{self.flight_band!r}")
+        if not self.flight_band > self.near:
+            raise InputError(f"flight_band: expected {expected}, got {self.flight_band!r:.300}")
 
 
 class Recovery(GoalTask):
@@ -130,10 +131,12 @@ class Recovery(GoalTask):
 
     def setup(self) -> None:
         """See the class."""
-        options, vehicle = self.options, self.vehicle
+        options = self.options
+        vehicle = self.vehicle
         least = vehicle.rest_height + AIR
         expected = f"a height of at least {least:g} m above the ground"
-        expect(options.goal[2] >= least, "goal", expected, f"{options.goal[2]:g}")
+        if not options.goal[2] >= least:
+            raise InputError(f"goal: expected {expected}, got {options.goal[2]:g}")
         turning = [min(vehicle.turning(axis), vehicle.turning(-axis)) for axis in np.eye(3)]
         self.spin = np.minimum(options.spin, STOP_TIME * np.array(turning))
         self.body = options.frame == "body"
@@ -144,16 +147,19 @@ class Recovery(GoalTask):
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """At the goal, thrown."""
-        options, turn = self.options, math.pi
+        options = self.options
+        turn = math.pi
         share, a, b = (
             draw.uniform(low, high) for low, high in ((0, 1), (-turn, turn), (-turn, turn))
         )
-        long, short = np.sqrt(share), np.sqrt(1.0 - share)
+        long = np.sqrt(share)
+        short = np.sqrt(1.0 - share)
         quaternion = stack((
             long * np.cos(b), short * np.sin(a), short * np.cos(a), long * np.sin(b)
         ))  # fmt: skip
         speed = draw.uniform(0.0, options.start_speed)
-        climb, azimuth = draw.uniform(-1.0, 1.0), draw.uniform(-turn, turn)
+        climb = draw.uniform(-1.0, 1.0)
+        azimuth = draw.uniform(-turn, turn)
         level = square_root(1.0 - climb * climb) * speed
         velocity = stack((level * np.cos(azimuth), level * np.sin(azimuth), climb * speed))
         rates = draw.uniform(-1.0, 1.0, (3,))
@@ -169,7 +175,8 @@ class Recovery(GoalTask):
 
     def update_memory(self, state: State) -> None:
         """The last step that was not recovered, and the lowest point."""
-        memory, height = self.memory, component(state.position, 2)
+        memory = self.memory
+        height = component(state.position, 2)
         memory.missed = np.where(self._recovered(state), memory.missed, state.time)
         memory.lowest = np.minimum(height, memory.lowest)
 

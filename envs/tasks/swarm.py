@@ -5,7 +5,7 @@ from typing import Annotated, Final
 
 import numpy as np
 
-from ...models.errors import expect
+from ...models.errors import InputError
 from ...models.fields import Limits
 from ...sim import Array, Draw
 from ..state import State
@@ -74,12 +74,14 @@ class Swarm(GoalTask):
         """Set `observation`: that of `GoalTask`, further numbers, and the neighbours."""
         from ...models.fleet import members_of  # which imports MuJoCo
 
-        options, vehicle = self.options, self.vehicle
+        options = self.options
+        vehicle = self.vehicle
         self.count = self.shape[1] if self.shape else 1
         lowest = options.center[2] - JITTER * self.gap
         least = vehicle.rest_height + AIR
         expected = f"a height of at least {least + JITTER * self.gap:.4g} m above the ground"
-        expect(lowest >= least, "center", expected, f"{options.center[2]:g}")
+        if not lowest >= least:
+            raise InputError(f"center: expected {expected}, got {options.center[2]:g}")
         self.band = self.reach + options.margin
         names = [f"neighbour {n}" for n in range(1, options.neighbours + 1)]
         told: list[tuple[str, str, float]] = []
@@ -134,7 +136,9 @@ class Swarm(GoalTask):
         distance = length(to_goal)
         along = to_goal * (state.velocity - self.goal_velocity())
         closing = along[..., 0] + along[..., 1] + along[..., 2]
-        room, ended, near = self.clearance(state), self.ended(state), self.gap / 2
+        room = self.clearance(state)
+        ended = self.ended(state)
+        near = self.gap / 2
         return Outcome(
             reward={
                 "position": (near - distance) / (near + distance),

@@ -111,13 +111,16 @@ class Task:
     def __init__(
         self, config: "EnvConfig", vehicle: "Vehicle", shape: tuple[int, ...] = ()
     ) -> None:
-        self.config, self.vehicle, self.shape = config, vehicle, shape
+        self.config = config
+        self.vehicle = vehicle
+        self.shape = shape
         self.options: Any = config.task_options
         assert config.action
         assert config.control_period
         assert config.episode_length
         self.action = config.action
-        self.control_period, self.episode_length = config.control_period, config.episode_length
+        self.control_period = config.control_period
+        self.episode_length = config.episode_length
         self.memory: Any = Memory()
         self.controller = of_level = self._of_level()
         self.setup()

@@ -9,7 +9,7 @@ from typing import Annotated, Final
 
 import numpy as np
 
-from ...models.errors import InputError, expect
+from ...models.errors import InputError
 from ...models.fields import Limits
 from ...sim import (
     Array,
@@ -128,7 +128,8 @@ class Tracking(GoalTask):
 
     def setup(self) -> None:
         """See the class."""
-        options, step = self.options, self.control_period
+        options = self.options
+        step = self.control_period
         middle = np.array(options.center)
         self._closed = options.trajectory in ("circle", "lemniscate")
         self._drawn = options.trajectory == "snap"
@@ -160,7 +161,8 @@ class Tracking(GoalTask):
         )
         least = self.vehicle.rest_height + AIR + options.start_band
         expected = f"a height of at least {least:.4g} m above the ground"
-        expect(low[2] >= least, "trajectory", expected, f"{low[2]:.4g}")
+        if not low[2] >= least:
+            raise InputError(f"trajectory: expected {expected}, got {low[2]:.4g}")
         self._box = middle, box
         reach = float(np.linalg.norm(high - low)) + 2 * options.flight_band
         later = [
@@ -268,7 +270,8 @@ def snap_basis(points: int, times: np.ndarray, derivative: int = 0) -> np.ndarra
             values[8 * piece + n] = math.factorial(n) / math.factorial(n - order) * power
         return values
 
-    rows, given = [], []
+    rows = []
+    given = []
     for piece in range(pieces):
         for end in (0, 1):
             rows.append(row(piece, float(end), 0))
@@ -295,7 +298,8 @@ def read_samples(given: str) -> np.ndarray:
 
     Raises `InputError`.
     """
-    expect(isinstance(given, str), "trajectory", _EXPECTED, f"{given!r:.80}")
+    if not isinstance(given, str):
+        raise InputError(f"trajectory: expected {_EXPECTED}, got {given!r:.80}")
     try:
         if given.lstrip().startswith("["):
             rows = json.loads(given)
@@ -311,9 +315,15 @@ def read_samples(given: str) -> np.ndarray:
         raise InputError(f"trajectory: expected {_EXPECTED}, got {got}") from None
     shape = samples.shape
     right = samples.ndim == 2 and shape[1:] == (4,) and 2 <= len(samples) <= MOST_SAMPLES
-    expect(right, "trajectory", f"2 to {MOST_SAMPLES} rows of t, x, y, z", f"shape {shape}")
-    expect(bool(np.isfinite(samples).all()), "trajectory", "finite numbers", "others")
+    if not right:
+        raise InputError(
+            f"trajectory: expected 2 to {MOST_SAMPLES} rows of t, x, y, z, got shape {shape}"
+        )
+    if not np.isfinite(samples).all():
+        raise InputError("trajectory: expected finite numbers, got others")
     far = float(np.abs(samples[:, 1:]).max())
-    expect(far <= FURTHEST, "trajectory", f"coordinates up to {FURTHEST:g} m", f"{far:g}")
-    expect(bool((np.diff(samples[:, 0]) > 0).all()), "trajectory", "times that rise", "others")
+    if not far <= FURTHEST:
+        raise InputError(f"trajectory: expected coordinates up to {FURTHEST:g} m, got {far:g}")
+    if not (np.diff(samples[:, 0]) > 0).all():
+        raise InputError("trajectory: expected times that rise, got others")
     return samples

@@ -6,7 +6,7 @@ from typing import Annotated, Final
 
 import numpy as np
 
-from ...models.errors import expect
+from ...models.errors import InputError
 from ...models.fields import Limits
 from ...sim import Array, Draw, InitialState, component
 from ..spec import Mark, Metric
@@ -104,7 +104,8 @@ class Waypoints(GoalTask):
         options = self.options
         least = self.vehicle.rest_height + AIR + options.box[2]
         expected = f"a height of at least {least:g} m above the ground"
-        expect(options.center[2] >= least, "center", expected, f"{options.center[2]:g}")
+        if not options.center[2] >= least:
+            raise InputError(f"center: expected {expected}, got {options.center[2]:g}")
         self.marks = (Mark(shape="ball", size=options.radius, moves=True),)
         self._sides = tuple(side + options.margin for side in options.box)
         furthest = 2 * math.hypot(*self._sides)
@@ -114,7 +115,8 @@ class Waypoints(GoalTask):
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """At rest, level, somewhere in the box; the points are drawn alike."""
         options, count = self.options, self.options.points
-        center, box = np.array(options.center), np.array(options.box)
+        center = np.array(options.center)
+        box = np.array(options.box)
         start, *points = [center + box * draw.uniform(-1.0, 1.0, (3,)) for _ in range(count + 1)]
         memory = self.memory
         memory.points = np.stack(points, axis=-2)

@@ -31,7 +31,8 @@ class BaseWorld:
         randomize: Randomization | None,
         arguments: Mapping[str, Any],
     ) -> None:
-        self.vehicle, self.shape = vehicle, shape
+        self.vehicle = vehicle
+        self.shape = shape
         self._arguments = {
             **arguments,
             "vehicle": vehicle,
@@ -39,7 +40,8 @@ class BaseWorld:
             "randomize": randomize,
         }
         self.parameters: dict[str, Array] = {}
-        self._options, self._randomize = effects or EffectOptions(), randomize
+        self._options = effects or EffectOptions()
+        self._randomize = randomize
         self._drawn = () if randomize is None else randomize.names
         self.random = Random(shape)
         self._start = self.random.use(START)
@@ -111,7 +113,8 @@ class BaseWorld:
         }
         begun = {}
         for name, default in (usual | {"thrust": self.vehicle.hover_thrust}).items():
-            given, old = getattr(pose, name), getattr(self.state, name)
+            given = getattr(pose, name)
+            old = getattr(self.state, name)
             begun[name] = np.where(mask[..., None], default if given is None else given, old)
         return begun
 

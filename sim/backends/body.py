@@ -124,10 +124,11 @@ class RigidBody:
     varying: Varying
 
     def __init__(self, vehicle: Vehicle) -> None:
-        model, rotors = vehicle.model, vehicle.rotors
-        self._step, self._gravity, self._drag = (
-            vehicle.timestep, vehicle.gravity, vehicle.linear_drag
-        )  # fmt: skip
+        model = vehicle.model
+        rotors = vehicle.rotors
+        self._step = vehicle.timestep
+        self._gravity = vehicle.gravity
+        self._drag = vehicle.linear_drag
         self._least = (vehicle.mass, vehicle.center_of_mass.tolist())
         axes, reactions, places = (
             np.array([getattr(rotor, name) for rotor in rotors]).T
@@ -135,8 +136,10 @@ class RigidBody:
         )
         levers = np.cross(places - vehicle.center_of_mass[:, None], axes, axis=0)
         size = abs(levers + reactions).max()
-        self._axes, self._levers = _sparse(axes), _sparse(levers, size)
-        self._reactions, self._torques = _sparse(reactions, size), _sparse(levers + reactions)
+        self._axes = _sparse(axes)
+        self._levers = _sparse(levers, size)
+        self._reactions = _sparse(reactions, size)
+        self._torques = _sparse(levers + reactions)
         boxes = _boxes(model)
         self._inertias = _own_and_far(vehicle, boxes)
         fluid = model.opt.density or model.opt.viscosity
@@ -146,12 +149,15 @@ class RigidBody:
 
     def vary(self, parameters: Mapping[str, Array]) -> None:
         """Take drawn parameters by their names, each of shape (W,)."""
-        (mass, center), (own, far) = self._least, self._inertias
+        (mass, center) = self._least
+        (own, far) = self._inertias
         inertia: Any
-        factor, more = parameters.get("mass", 1.0), parameters.get("inertia", 1.0)
+        factor = parameters.get("mass", 1.0)
+        more = parameters.get("inertia", 1.0)
         easier = 1.0 / factor
         if isinstance(more, float) or not far.any():
-            easier, inertia = easier / more, own + far
+            easier = easier / more
+            inertia = own + far
         else:
             parts = (own, more), (far, 1.0 + 0.0 * more)
             inertia = sum(part * share[:, None, None] for part, share in parts)
@@ -182,14 +188,16 @@ class RigidBody:
 
         With thrusts (R, W), N, and None, or a force and a torque as of `Effects.step`, (6, W).
         """
-        push, now = self.push(thrust, wrench), motion(rows)
+        push = self.push(thrust, wrench)
+        now = motion(rows)
         for _ in range(steps):
             now = self.advance(now, push)
         return [*now.position, *now.quaternion, *now.velocity, *now.rates]
 
     def push(self, thrust: Any, wrench: Any = None) -> Push:
         """Of thrusts, and a force and a torque, as of `fly`."""
-        rotors, varying = [_lanes(row) for row in thrust], self.varying
+        rotors = [_lanes(row) for row in thrust]
+        varying = self.varying
         force = _times(self._axes, rotors)
         if varying.reaction is None:
             torque = _times(self._torques, rotors)
@@ -235,7 +243,8 @@ class RigidBody:
 
     def advance(self, now: Motion, push: Push) -> Motion:
         """The motion after a physics step."""
-        h, (position, quaternion, velocity, rates) = self._step, now
+        h = self._step
+        (position, quaternion, velocity, rates) = now
         moves = self._drag or self._fluid is not None  # the acceleration depends on the velocity
         stages = [(*self.acceleration(now, push), rates)]
         for part in (0.5 * h, 0.5 * h, h):
@@ -248,8 +257,10 @@ class RigidBody:
             stages.append((*self.acceleration(now, push), follows))
         (a, u, p), (b, v, q), (c, w, r), (d, x, s) = stages
         # The stages' velocities are V, V + h/2 a, V + h/2 b and V + h c.
-        early, late = _plus(_plus(a, b), c), _plus(_plus(b, c), d)
-        turns, middle = _plus(_plus(u, x), _plus(v, w), 2.0), _plus(q, r)
+        early = _plus(_plus(a, b), c)
+        late = _plus(_plus(b, c), d)
+        turns = _plus(_plus(u, x), _plus(v, w), 2.0)
+        middle = _plus(q, r)
         spin = _plus(_plus(p, s), middle, 2.0)
         return Motion(
             _plus(_plus(position, velocity, h), early, h * h / 6),
@@ -267,8 +278,10 @@ class _Fluid:
     """Forces on the inertia boxes of MuJoCo's bodies in a fluid: its "inertia box model"."""
 
     def __init__(self, model: mujoco.MjModel, boxes: list[Any]) -> None:
-        self._density, self._viscosity = float(model.opt.density), float(model.opt.viscosity)
-        self._wind, self._boxes = (-model.opt.wind).tolist(), []
+        self._density = float(model.opt.density)
+        self._viscosity = float(model.opt.viscosity)
+        self._wind = (-model.opt.wind).tolist()
+        self._boxes = []
         for mass, (x, y, z), axes, place in boxes:
             sides = np.sqrt(6 / mass * np.maximum((y + z - x, x + z - y, x + y - z), 1e-15))
             self._boxes.append((sides.tolist(), axes.tolist(), place.tolist()))
@@ -281,15 +294,21 @@ class _Fluid:
         A box's sides grow with the square root of its inertia over its mass.
         """
         air = _back(matrix, _plus(velocity, self._wind))
-        scale, force, torque = varying.scale, _ZERO, _ZERO
-        area, volume = scale * scale, scale * scale * scale
+        scale = varying.scale
+        force = _ZERO
+        torque = _ZERO
+        area = scale * scale
+        volume = scale * scale * scale
         for sides, axes, place in self._boxes:
             center = _plus(varying.shift, place)
             through = _back(axes, _plus(air, _cross(rates, center)))
-            spin, mean = _back(axes, rates), sum(sides) / 3
-            pushes, twists = [], []
+            spin = _back(axes, rates)
+            mean = sum(sides) / 3
+            pushes = []
+            twists = []
             for i, (v, w) in enumerate(zip(through, spin, strict=True)):
-                a, b = sides[i - 2], sides[i - 1]
+                a = sides[i - 2]
+                b = sides[i - 1]
                 slow = -3 * math.pi * mean * self._viscosity
                 fast = -0.5 * self._density * a * b
                 pushes.append(_sum(0.0, (slow, v, scale), (fast, v, abs(v), area)))
@@ -349,7 +368,8 @@ def _euler(inertia: np.ndarray) -> tuple[Any, Any]:
     """
     inverse = np.linalg.inv(inertia)
     terms = -np.einsum("il,ljm,mk->ijk", inverse, _CROSS, inertia)
-    least, found = _NOTHING * abs(terms).max(), []
+    least = _NOTHING * abs(terms).max()
+    found = []
     for axis in terms:
         folded = np.triu(axis + axis.T) - np.diag(np.diag(axis))
         places = np.argwhere(abs(folded) > least).tolist()
@@ -376,7 +396,8 @@ def _sparse(matrix: np.ndarray, size: float | None = None) -> list[list[float]]:
 def _sum(total: Any, *products: tuple[Any, ...]) -> Any:
     """The total and the products of some vectors and numbers, in the fewest operations."""
     for product in products:
-        share, vectors = 1.0, []
+        share = 1.0
+        vectors = []
         for one in product:
             if isinstance(one, float):
                 share *= one
@@ -421,7 +442,8 @@ def _scaled(vector: Any, share: Any) -> Vector:
 
 
 def _cross(a: Any, b: Any) -> Vector:
-    (p, q, r), (x, y, z) = a, b
+    (p, q, r) = a
+    (x, y, z) = b
     return (
         _sum(0.0, (q, z), (-1.0, r, y)),
         _sum(0.0, (r, x), (-1.0, p, z)),
@@ -442,9 +464,18 @@ def _back(matrix: Any, vector: Any) -> Vector:
 def _matrix(quaternion: Any) -> Any:
     """Rotation matrix, three rows."""
     w, x, y, z = quaternion
-    a, b, c = x + x, y + y, z + z
-    wx, wy, wz, xx, xy, xz = w * a, w * b, w * c, x * a, x * b, x * c
-    yy, yz, zz = y * b, y * c, z * c
+    a = x + x
+    b = y + y
+    c = z + z
+    wx = w * a
+    wy = w * b
+    wz = w * c
+    xx = x * a
+    xy = x * b
+    xz = x * c
+    yy = y * b
+    yz = y * c
+    zz = z * c
     return (
         (1.0 - (yy + zz), xy - wz, xz + wy),
         (xy + wz, 1.0 - (xx + zz), yz - wx),

@@ -24,7 +24,8 @@ class Hull:
 
     def __init__(self, vehicle: Vehicle) -> None:
         shapes = _shapes(vehicle.model)
-        self._reach, self.ground = -np.inf, 0.0
+        self._reach = -np.inf
+        self.ground = 0.0
         self._apart = 2 * vehicle.radius
         if not shapes:
             return
@@ -63,7 +64,8 @@ class Hull:
         """How far the craft reaches along unit vectors, body frame, (3, W): m, (W,)."""
         centers, radii, axes, flat, rounded = self._shapes
         along = (axes @ down).reshape(-1, 3, down.shape[1])
-        straight, round_ = flat * abs(along), rounded * along
+        straight = flat * abs(along)
+        round_ = rounded * along
         sizes = np.sum(straight, axis=1) + np.sqrt(np.sum(round_ * round_, axis=1))
         return np.max(centers @ down + radii + sizes, axis=0)
 
@@ -74,18 +76,22 @@ def _shapes(model: mujoco.MjModel) -> list[tuple[Any, ...]]:
     data.qpos[:7] = (0, 0, 0, 1, 0, 0, 0)
     mujoco.mj_kinematics(model, data)
     ours = np.isin(model.geom_bodyid, craft_bodies(model))
-    types, affinities = model.geom_contype, model.geom_conaffinity
+    types = model.geom_contype
+    affinities = model.geom_conaffinity
     shapes: list[tuple[Any, ...]] = []
-    none, kinds = (0.0, 0.0, 0.0), mujoco.mjtGeom
+    none = (0.0, 0.0, 0.0)
+    kinds = mujoco.mjtGeom
     for i in np.flatnonzero(ours).tolist():
         if not ((types[i] & affinities[~ours]) | (affinities[i] & types[~ours])).any():
             continue
-        place, axes = data.geom_xpos[i].copy(), data.geom_xmat[i].reshape(3, 3).copy()
+        place = data.geom_xpos[i].copy()
+        axes = data.geom_xmat[i].reshape(3, 3).copy()
         a, b, c = model.geom_size[i].tolist()
         kind = kinds(model.geom_type[i])
         if kind == kinds.mjGEOM_MESH:
             mesh = model.geom_dataid[i]
-            first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+            first = model.mesh_vertadr[mesh]
+            count = model.mesh_vertnum[mesh]
             for vertex in model.mesh_vert[first : first + count].astype(np.float64):
                 shapes.append((place + axes @ vertex, 0.0, axes, none, none))
             continue

@@ -21,7 +21,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from ...models.errors import InputError, expect
+from ...models.errors import InputError
 from .body import RigidBody, mapped
 
 ROWS: Final = 13
@@ -96,7 +96,8 @@ class _Lines:
     """The lines of a function; the same operation on the same variables is one line."""
 
     def __init__(self, terms: int) -> None:
-        self.terms, self._names = terms, dict[str, Variable]()
+        self.terms = terms
+        self._names = dict[str, Variable]()
 
     def text(self) -> list[str]:
         """The lines of C."""
@@ -116,7 +117,8 @@ class Variable:
     __array_ufunc__ = None  # NumPy's numbers leave operators to it
 
     def __init__(self, lines: _Lines, name: str) -> None:
-        self._lines, self.name = lines, name
+        self._lines = lines
+        self.name = name
 
     def _made(self, text: str, *others: Any) -> "Variable":
         names = (x.name if isinstance(x, Variable) else f"(T){float(x)!r}" for x in others)
@@ -193,7 +195,9 @@ def _source(body: RigidBody, rotors: int, kind: str, wrench: bool) -> str:
     def read(array: str, count: int) -> list[Variable]:
         return [lines.new(f"{array}[{k} * count + i]") for k in range(count)]
 
-    rows, thrust, numbers = read("rows", ROWS), read("thrust", rotors), count()
+    rows = read("rows", ROWS)
+    thrust = read("thrust", rotors)
+    numbers = count()
     traced = copy.copy(body)
     traced.varying = mapped(
         body.varying, lambda _: lines.new(f"varying[{next(numbers)} * count + i]")
@@ -210,7 +214,8 @@ def _library(source: str) -> Any:
     tool = command[0]
     try:
         with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-            given, made = Path(folder) / "fly.c", Path(folder) / "fly.so"
+            given = Path(folder) / "fly.c"
+            made = Path(folder) / "fly.so"
             given.write_text(source)
             words = [*command, *_FLAGS, "-shared", "-fPIC", "-o", str(made), str(given), "-lm"]
             done = subprocess.run(
@@ -218,7 +223,8 @@ def _library(source: str) -> Any:
             )
             first, *_ = done.stderr.strip().splitlines() or ["nothing"]
             said = "".join(letter for letter in first if letter.isprintable())
-            expect(done.returncode == 0, "compiled", f"{tool} to compile the equations", said)
+            if done.returncode != 0:
+                raise InputError(f"compiled: expected {tool} to compile the equations, got {said}")
             return ctypes.CDLL(str(made))
     except (OSError, subprocess.TimeoutExpired) as error:
         expected = f"{tool} to make a library that loads from the folder for temporary files"

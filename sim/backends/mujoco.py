@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch, SimulationError
 
-from ...models.errors import InputError, expect
+from ...models.errors import InputError
 from ...models.fleet import members_of
 from ...models.swarm import CONTACTS, GROUNDED, contact_columns
 from ...models.vehicle import SURROUNDINGS, Vehicle, payload_radius
@@ -57,7 +57,8 @@ class MujocoWorld(BaseWorld):
         lead = (num_worlds, drones) if num_worlds * drones > 1 else ()
         arguments = {"num_worlds": num_worlds, "drones": drones, "num_threads": num_threads}
         super().__init__(vehicle, lead, effects, randomize, arguments)
-        options, drawn = self._options, self._drawn
+        options = self._options
+        drawn = self._drawn
         threads = 1 if num_worlds == 1 else num_threads
         model = flown_model(vehicle, drones, options, drawn)
         if self._on_rotors:  # commands are within their limits; thrusts need not be
@@ -78,7 +79,8 @@ class MujocoWorld(BaseWorld):
         self._ctrl: np.ndarray = batch.bind("ctrl")
         self._contacts: np.ndarray = batch.bind("ncon")
         self._warnings = batch.warning  # of each kind the last info, and how many
-        self._no_warnings, self._no_contacts = self._warnings.tobytes(), self._contacts.tobytes()
+        self._no_warnings = self._warnings.tobytes()
+        self._no_contacts = self._contacts.tobytes()
         crafts = members_of(vehicle, drones)
         newtons = np.array([rotor.newtons for craft in crafts for rotor in craft.rotors])
         self._newtons = None if (newtons == 1.0).all() else newtons
@@ -89,7 +91,8 @@ class MujocoWorld(BaseWorld):
         self._touching = np.zeros((num_worlds, drones), bool)
         self._colliding: np.ndarray | None = None
         if drones > 1:
-            self._colliding, self._counts = self._touching.copy(), batch.bind("sensordata")
+            self._colliding = self._touching.copy()
+            self._counts = batch.bind("sensordata")
             self._columns = [contact_columns(model, name) for name in (CONTACTS, GROUNDED)]
         self._qacc: np.ndarray | None = None  # bound by what first asks for it
         self.state = WorldState(
@@ -116,7 +119,8 @@ class MujocoWorld(BaseWorld):
         self.random.begin(ids)
         self._batch.state[ids] = self._initial
         self._warnings[ids] = 0
-        state, here = self.state, () if self.shape == () else ids
+        state = self.state
+        here = () if self.shape == () else ids
         state.position[here] = pose.position[here]
         for name, default in (
             ("quaternion", (1, 0, 0, 0)),
@@ -276,15 +280,19 @@ class MujocoWorld(BaseWorld):
         drones = self._touching.shape[1]
         if pose.payload is None:
             expected = "one drone in a world, or a task whose start places it"
-            expect(drones == 1, "effects: payload", expected, f"{drones} drones")
+            if drones != 1:
+                raise InputError(f"effects: payload: expected {expected}, got {drones} drones")
         hung = pose.position - (0.0, 0.0, self._cable) if pose.payload is None else pose.payload
         return np.reshape(hung, (-1, drones, 3))[:, 0]
 
     def _place_payload(self, ids: np.ndarray, hung: np.ndarray) -> None:
         """Put payloads there, moving along with the first craft."""
-        qpos, qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
-        qpos[ids, -7:-4], qpos[ids, -4:] = hung[ids], (1.0, 0.0, 0.0, 0.0)
-        qvel[ids, -6:-3], qvel[ids, -3:] = qvel[ids, :3], 0.0
+        qpos = self._batch.bind("qpos")
+        qvel = self._batch.bind("qvel")
+        qpos[ids, -7:-4] = hung[ids]
+        qpos[ids, -4:] = (1.0, 0.0, 0.0, 0.0)
+        qvel[ids, -6:-3] = qvel[ids, :3]
+        qvel[ids, -3:] = 0.0
 
     def _apply_thrust(self, thrust: np.ndarray, some: Any = ...) -> None:
         if self._newtons is not None:

@@ -50,23 +50,25 @@ class RigidWorld(BaseWorld):
         dtype: str = "float32",
         compiled: bool | None = None,
     ) -> None:
-        expect(
-            compiled is None or type(compiled) is bool, "compiled", "true or false", repr(compiled)
-        )
+        if not (compiled is None or type(compiled) is bool):
+            raise InputError(f"compiled: expected true or false, got {compiled!r:.300}")
         expect(dtype in DTYPES, "dtype", " or ".join(DTYPES), repr(dtype))
         found = kernel.compiler()
         expected = "false where no C compiler is found (cc, gcc, clang or the variable CC)"
-        expect(found or not compiled, "compiled", expected, "true")
+        if not (found or not compiled):
+            raise InputError(f"compiled: expected {expected}, got true")
         payload = 0.0 if effects is None else effects.payload
         expected = "none with the backend rigid, which has no cable: fly it with mujoco"
-        expect(not payload, "effects: payload", expected, f"{payload:g} kg")
+        if payload:
+            raise InputError(f"effects: payload: expected {expected}, got {payload:g} kg")
         shape = (num_worlds, drones)
         arguments = {"num_worlds": num_worlds, "drones": drones, "dtype": dtype}
         super().__init__(vehicle, shape, effects, randomize, arguments | {"compiled": compiled})
         _check_obstacles(vehicle)
         _check_forces(vehicle)
         self.dtype = np.dtype(dtype)
-        self._body, self._hull = RigidBody(vehicle), Hull(vehicle)
+        self._body = RigidBody(vehicle)
+        self._hull = Hull(vehicle)
         self._at_once = None if self.effects is None else 1  # physics steps of a call
         thrust = np.zeros((*shape, vehicle.num_rotors), self.dtype)
         self._nothing = self._acting = thrust  # mean over the last physics step
@@ -95,7 +97,8 @@ class RigidWorld(BaseWorld):
 
     def reset(self, mask: Array, pose: InitialState) -> None:
         """As `World.reset`."""
-        state, rows = self.state, mask[..., None]
+        state = self.state
+        rows = mask[..., None]
         self.random.begin(self._ids(mask))
         begun = self._begun(mask, pose)
         turn = begun["quaternion"]
@@ -170,7 +173,8 @@ class RigidWorld(BaseWorld):
 
     def _restore(self, arrays: Arrays) -> None:
         wrench = arrays.get("wrench")
-        self._rows, self._acting = arrays["rows"].copy(), arrays["acting"].copy()
+        self._rows = arrays["rows"].copy()
+        self._acting = arrays["acting"].copy()
         self._wrench = None if wrench is None else wrench.copy()
         for name in ("command", "thrust", "touching", "colliding"):
             if name in arrays:
@@ -231,7 +235,8 @@ class RigidWorld(BaseWorld):
 
     def _contacts(self) -> list[Array]:
         """Which crafts touch anything and, of several, which another, bool, (W, A)."""
-        rows, shape = self._rows, self.shape
+        rows = self._rows
+        shape = self.shape
         touching = self._hull.touches(rows[2], rows[3:7]).reshape(shape)
         if shape[1] == 1:
             return [touching]
@@ -257,7 +262,8 @@ def _check_obstacles(vehicle: Vehicle) -> None:
     """Refuse obstacles of the vehicle's file, through which drones would fly."""
     model = vehicle.model
     ours = np.isin(model.geom_bodyid, craft_bodies(model))
-    types, affinities = model.geom_contype, model.geom_conaffinity
+    types = model.geom_contype
+    affinities = model.geom_conaffinity
     for i in np.flatnonzero(~ours & (model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)).tolist():
         if ((types[i] & affinities[ours]) | (affinities[i] & types[ours])).any():
             name = model.geom(i).name or f"geom {i}"
@@ -282,4 +288,7 @@ def _check_forces(vehicle: Vehicle) -> None:
     theirs = np.concatenate((data.qpos, data.qvel)) - rows
     right = np.abs(ours - theirs).max() <= 1e-9 * max(1.0, np.abs(theirs).max())
     expected = "RK4, and no forces but gravity, rotors, linear_drag and a fluid's on inertia boxes"
-    expect(bool(right), "vehicle", f"{expected} (the backend rigid)", f"others in {vehicle.name}")
+    if not right:
+        raise InputError(
+            f"vehicle: expected {expected} (the backend rigid), got others in {vehicle.name}"
+        )

@@ -31,7 +31,8 @@ class Varied:
         self.fields = tuple(dict.fromkeys(f for name in self._names for f in _FIELDS[name]))
         self._base = {name: getattr(model, name).copy() for name in self.fields}
         owner = owners(model)
-        self._craft, self._hung = owner >= 0, np.zeros(model.nbody, bool)
+        self._craft = owner >= 0
+        self._hung = np.zeros(model.nbody, bool)
         if "payload" in self._names:
             self._hung[payload_body(model)] = True
         # Of each craft the first of six degrees of freedom are those of its translation.

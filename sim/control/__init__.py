@@ -7,7 +7,7 @@ within bounds, or is one of some choices.
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
-from ...models.errors import expect
+from ...models.errors import InputError
 from ..state import Array, WorldState
 from .cascade import Attitude, Position, Rates, Velocity
 from .gains import Gains, shared_ranges
@@ -67,7 +67,8 @@ def make_controller(
     where the state is an estimate. `lag` is the rotors' time constant, s; 0 where they follow at
     once. Raises `InputError` if the level is none of them, or the vehicle cannot be flown at it.
     """
-    expect(level in LEVELS, "action", f"one of {', '.join(LEVELS)}", repr(level))
+    if level not in LEVELS:
+        raise InputError(f"action: expected one of {', '.join(LEVELS)}, got {level!r:.300}")
     if members := getattr(vehicle, "members", ()):
         return _of_several(level, members, period, lag)
     if level == "rotors":

@@ -52,12 +52,15 @@ class Rates:
 
     def __init__(self, vehicle: "Vehicle", gains: "Gains") -> None:
         self.gains = gains
-        self.low, self.high = (-1.0,) * len(self.components), (1.0,) * len(self.components)
+        self.low = (-1.0,) * len(self.components)
+        self.high = (1.0,) * len(self.components)
         self.units = tuple(f"{size:.7g} {unit}" if unit else "1" for size, unit in self.ranges())
         self._sizes = [size for size, _ in self.ranges()]
-        self._mass, self._gravity = vehicle.mass, vehicle.gravity
+        self._mass = vehicle.mass
+        self._gravity = vehicle.gravity
         self._hover = vehicle.mass * vehicle.gravity
-        self._up, self._down = gains.highest - self._hover, self._hover - gains.lowest
+        self._up = gains.highest - self._hover
+        self._down = self._hover - gains.lowest
         self._inertia = vehicle.inertia.tolist()
         limits = vehicle.thrust_low.tolist(), vehicle.thrust_high.tolist()
         self._limits = list(zip(*limits, strict=True))
@@ -83,12 +86,16 @@ class Rates:
 
     def mixed(self, collective: Any, torque: Parts) -> list[Any]:
         """Thrust of each rotor, N, for a collective thrust, N, and a torque, N·m."""
-        gains, (roll, pitch, yaw) = self.gains, torque
-        low, high = gains.lowest, gains.highest
+        gains = self.gains
+        (roll, pitch, yaw) = torque
+        low = gains.lowest
+        high = gains.highest
         added = [a * roll + b * pitch for a, b, _ in gains.mix]
-        lower, upper = _least(added), _most(added)
+        lower = _least(added)
+        upper = _most(added)
         scale = clip((high - low) / clip(upper - lower, 1e-9 * high, math.inf), 0.0, 1.0)
-        least, most = low - scale * lower, high - scale * upper
+        least = low - scale * lower
+        most = high - scale * upper
         middle = _smaller(_larger(collective + 0.0 * least, least), most)
         parts = [middle + scale * part for part in added]
         yaws = [(part, c) for part, (*_, c) in zip(parts, gains.mix, strict=True) if c]
@@ -185,15 +192,18 @@ class Velocity(Attitude):
         self, velocity: Parts, yaw_rate: Any, axes: Sequence[Parts], state: WorldState
     ) -> Array:
         """As `point`, for a velocity in the world frame, m/s."""
-        gains, gravity = self.gains, self._gravity
+        gains = self.gains
+        gravity = self._gravity
         level, up = gains.most_acceleration
         u, v, w = _parts(state.velocity)
         k = gains.velocity
-        x, y = k * (velocity[0] - u), k * (velocity[1] - v)
+        x = k * (velocity[0] - u)
+        y = k * (velocity[1] - v)
         z = gravity + clip(k * (velocity[2] - w), -up, up)
         # Sideways no more than what the largest tilt gives at this lift.
         share = clip(level / gravity * z / _length(x, y), 0.0, 1.0)
-        x, y = share * x, share * y
+        x = share * x
+        y = share * y
         size = _root(x * x + y * y + z * z)
         collective = self._mass * _dot((x, y, z), axes[2])
         return self.point(collective, (x / size, y / size, z / size), yaw_rate, axes, state)
@@ -221,8 +231,10 @@ class Position(Velocity):
     def thrust(self, action: Array, state: WorldState) -> Array:
         """As `Controller.thrust`."""
         x, y, z, heading = self._scaled(action)
-        axes, gains = _axes(state.quaternion), self.gains
-        (level, up), (fast, climb) = gains.most_acceleration, gains.most_velocity
+        axes = _axes(state.quaternion)
+        gains = self.gains
+        (level, up) = gains.most_acceleration
+        (fast, climb) = gains.most_velocity
         along = self._gain(_length(x, y), level, fast)
         x, y = _turned(axes[0], along * x, along * y)
         z = self._gain(_length(z), up, climb) * z
@@ -251,7 +263,8 @@ def _turned(nose: Parts, x: Any, y: Any) -> tuple[Any, Any]:
     The heading is the direction of the nose on the ground; 0 where the nose is vertical.
     """
     length = _length(nose[0], nose[1])
-    c, s = nose[0] / length, nose[1] / length
+    c = nose[0] / length
+    s = nose[1] / length
     return c * x - s * y, s * x + c * y
 
 
@@ -303,4 +316,5 @@ def _by_name(name: str, angle: Any) -> Any:
     return float(found) if isinstance(angle, float) else found
 
 
-_sin, _cos = partial(_by_name, "sin"), partial(_by_name, "cos")
+_sin = partial(_by_name, "sin")
+_cos = partial(_by_name, "cos")

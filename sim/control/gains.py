@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 
 import numpy as np
 
-from ...models.errors import expect
+from ...models.errors import InputError
 
 if TYPE_CHECKING:
     from ...models.vehicle import Vehicle
@@ -88,7 +88,10 @@ class Gains:
         """
         able = "a vehicle whose rotors roll, pitch and yaw it, for this action"
         rank = int(np.linalg.matrix_rank(vehicle.allocation / _rows(vehicle.allocation)))
-        expect(rank == 4, "vehicle", able, f"{vehicle.name}, an allocation of rank {rank}")
+        if rank != 4:
+            raise InputError(
+                f"vehicle: expected {able}, got {vehicle.name}, an allocation of rank {rank}"
+            )
         gravity, weight = vehicle.gravity, vehicle.mass * vehicle.gravity
         share = vehicle.hover_thrust / weight
         mix = np.linalg.pinv(vehicle.allocation)[:, 1:] / share[:, np.newaxis]

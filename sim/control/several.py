@@ -19,11 +19,15 @@ class Several:
 
     def __init__(self, controllers: Sequence[tuple["Controller", Sequence[int]]]) -> None:
         first: Any = controllers[0][0]
-        self.low, self.high = first.low, first.high
-        self.components, self.choices = first.components, first.choices
+        self.low = first.low
+        self.high = first.high
+        self.components = first.components
+        self.choices = first.choices
         self.every_step = getattr(first, "every_step", False)
-        self.units, self.frame = getattr(first, "units", ""), getattr(first, "frame", "")
-        self._controllers, self._first = controllers, first
+        self.units = getattr(first, "units", "")
+        self.frame = getattr(first, "frame", "")
+        self._controllers = controllers
+        self._first = first
 
     def ranges(self) -> list[tuple[float, str]]:
         """As `Rates.ranges`, of a level that has them; all drones share them."""

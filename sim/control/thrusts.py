@@ -28,10 +28,13 @@ class CollectiveThrust:
         )
         self.choices = 3 if discrete else 0
         self.newtons = newtons
-        hover, low, high = vehicle.hover_thrust, vehicle.thrust_low, vehicle.thrust_high
+        hover = vehicle.hover_thrust
+        low = vehicle.thrust_low
+        high = vehicle.thrust_high
         alike = all((values == values[0]).all() for values in (hover, low, high))
         # Rotors that are alike need one number for all of them.
-        self._alike, self._increment = alike, increment
+        self._alike = alike
+        self._increment = increment
         self._hover, self._per_action, self._low, self._high = (
             values.item(0) if alike else values
             for values in (hover, newtons * (hover / hover.mean()), low, high)
@@ -53,7 +56,8 @@ class RotorThrust:
     """One number for each rotor: 0 is its thrust at hover, -1 its least and 1 its largest."""
 
     def __init__(self, vehicle: "Vehicle") -> None:
-        self.low, self.high = (-1.0,) * vehicle.num_rotors, (1.0,) * vehicle.num_rotors
+        self.low = (-1.0,) * vehicle.num_rotors
+        self.high = (1.0,) * vehicle.num_rotors
         self.components = tuple(f"F{i + 1}" for i in range(vehicle.num_rotors))
         self.choices = 0
         self._hover: Final = vehicle.hover_thrust
@@ -62,5 +66,6 @@ class RotorThrust:
 
     def thrust(self, action: Array, state: WorldState) -> Array:
         """As `Controller.thrust`."""
-        above, below = clip(action, 0.0, 1.0), clip(action, -1.0, 0.0)
+        above = clip(action, 0.0, 1.0)
+        below = clip(action, -1.0, 0.0)
         return self._hover + self._up * above + self._down * below

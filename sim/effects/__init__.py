@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from numpy.typing import NDArray
 
-from ...models.errors import expect
+from ...models.errors import InputError
 from ..random import GUSTS, Noise
 from ..snapshots import Arrays, Kept, joined, part_of
 from ..state import Array, WorldState, component
@@ -54,7 +54,8 @@ class Effects:
         scaled = [name for name in drawn if name.startswith("thrust")]
         rotor = max((int(name.partition("_")[2] or 0) for name in scaled), default=0)
         count = vehicle.num_rotors
-        expect(rotor <= count, "randomize", f"one of the {count} rotors", f"thrust_{rotor}")
+        if not rotor <= count:
+            raise InputError(f"randomize: expected one of the {count} rotors, got thrust_{rotor}")
         self.on_rotors = bool(rotors or options.efficiency or scaled)
         moved = options.body_drag or options.rotor_drag
         self.on_body = moved or options.ground_effect
@@ -63,8 +64,10 @@ class Effects:
         self._air = AirEffects(vehicle, options)
         self._mean_wind = options.wind
         self._wind: list[Array] = [0.0, 0.0, 0.0]
-        needed = not options.wind_blows or moved
-        expect(needed, "effects", "body_drag or rotor_drag, on which wind acts", "neither")
+        if not (not options.wind_blows or moved):
+            raise InputError(
+                "effects: expected body_drag or rotor_drag, on which wind acts, got neither"
+            )
         self._downwash = Downwash(vehicle) if options.downwash else None
         self._gusts: Gusts | None = None
         if options.gusts:
@@ -83,7 +86,8 @@ class Effects:
         if self.on_body:
             self._air.begin(mask, state, factors)
         if self._gusts is not None:
-            height, normal = component(state.position, 2), self._noise.normal(mask)
+            height = component(state.position, 2)
+            normal = self._noise.normal(mask)
             self._gusts.begin(mask, height, normal, factors.get("gusts", 1.0))
         self._take_wind(factors)
         return thrust

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from ...models.errors import expect
+from ...models.errors import InputError
 from ..snapshots import Kept
 from ..state import Array, WorldState, clip, component, each, kept, square_root, stack
 from .options import EffectOptions
@@ -39,19 +39,25 @@ class AirEffects(Kept):
     lists = ("_before",)
 
     def __init__(self, vehicle: "Vehicle", options: EffectOptions) -> None:
-        self._options, self._half = options, 0.5 * vehicle.timestep
-        told, rotors = vehicle.coefficients, vehicle.rotors
+        self._options = options
+        self._half = 0.5 * vehicle.timestep
+        told = vehicle.coefficients
+        rotors = vehicle.rotors
         self._center: Vector = tuple(vehicle.center_of_mass.tolist())
         self._geometry = np.array([(*rotor.position, *rotor.axis) for rotor in rotors])
         if options.body_drag:
-            linear, quadratic = told.drag.linear, told.drag.quadratic
-            self._angular, self._moment = told.drag.angular, told.drag.moment
+            linear = told.drag.linear
+            quadratic = told.drag.quadratic
+            self._angular = told.drag.angular
+            self._moment = told.drag.moment
             known = (linear, quadratic, self._angular, self._moment)
             given = any(value is not None for value in known)
             expected = "drag.linear or drag.quadratic in the vehicle's file, which body_drag needs"
-            expect(given, "vehicle", expected, "none")
+            if not given:
+                raise InputError(f"vehicle: expected {expected}, got none")
             none = (0.0, 0.0, 0.0)
-            self._linear, self._quadratic = linear or none, quadratic or none
+            self._linear = linear or none
+            self._quadratic = quadratic or none
             # Of a fall at its terminal velocity, sqrt(weight / quadratic), the slope of the drag.
             weight = vehicle.mass * vehicle.gravity
             slope = max(self._linear) + 2 * math.sqrt(max(self._quadratic) * weight)
@@ -59,14 +65,16 @@ class AirEffects(Kept):
             most = 0.5 * float(np.linalg.eigvalsh(vehicle.inertia)[0]) / vehicle.timestep
             stiffest = max(self._angular or none)
             expected = f"at most {most:.4g} N m s, half the least inertia over the physics step"
-            expect(stiffest <= most, "drag.angular", expected, f"{stiffest:.4g}")
+            if not stiffest <= most:
+                raise InputError(f"drag.angular: expected {expected}, got {stiffest:.4g}")
         if options.rotor_drag:
             (coefficient,) = told.need("rotors.thrust_coefficient", "rotor_drag")
             self._slope = math.sqrt(coefficient)  # of the square root of a thrust over the speed
             three = (told.rotors.drag, told.rotors.inflow, told.rotors.lift)
             some = any(value is not None for value in three)
             expected = "rotors.drag, inflow or lift in the vehicle's file, which rotor_drag needs"
-            expect(some, "vehicle", expected, "none")
+            if not some:
+                raise InputError(f"vehicle: expected {expected}, got none")
             self._drag, self._inflow, self._lift = (value or 0.0 for value in three)
             speeds = np.sqrt(np.maximum(vehicle.thrust_high, 0.0)) / self._slope
             slope = max(self._drag, self._inflow) * float(speeds.sum())
@@ -170,7 +178,9 @@ class AirEffects(Kept):
         the body's origin.
         """
         place, axis = rotor
-        thrust, up, push = clip(thrust, 0.0, math.inf), 0.0, (0.0, 0.0, 0.0)
+        thrust = clip(thrust, 0.0, math.inf)
+        up = 0.0
+        push = (0.0, 0.0, 0.0)
         if self._options.rotor_drag:
             x, y, z = _add(around, _cross(around[3:6], place))
             along = x * axis[0] + y * axis[1] + z * axis[2]
@@ -196,7 +206,8 @@ def _check_stiffness(vehicle: "Vehicle", slope: float, what: str) -> None:
     """Refuse drag that the extrapolation over a physics step cannot follow."""
     most = 0.5 * vehicle.mass / vehicle.timestep
     expected = f"{what} of at most {most:.4g} N s/m, half its mass over the physics step"
-    expect(slope <= most, "vehicle", expected, f"{slope:.4g}")
+    if not slope <= most:
+        raise InputError(f"vehicle: expected {expected}, got {slope:.4g}")
 
 
 def _motion(state: WorldState) -> list[Array]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from ...models.errors import expect
+from ...models.errors import InputError
 from ..rotations import body_z
 from ..state import Array, WorldState
 
@@ -50,7 +50,8 @@ class Downwash:
         (radius,) = vehicle.coefficients.need("rotors.radius", "downwash")
         places = np.array([rotor.position for rotor in vehicle.rotors])
         self.length = float(np.linalg.norm(places[:, None] - places, axis=-1).max())
-        expect(self.length > 0, "vehicle", "two rotors or more, for downwash", "one")
+        if not self.length > 0:
+            raise InputError("vehicle: expected two rotors or more, for downwash, got one")
         self._area = vehicle.num_rotors * math.pi * radius**2
 
     def velocity(self, thrust: Array, below: Array, beside: Array) -> Array:

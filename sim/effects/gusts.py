@@ -65,7 +65,8 @@ class Gusts(Kept):
         # The noise of a step has the covariance ((q11, q12), (q12, q22)).
         for sigma, length in zip(sigmas, lengths, strict=True):
             r = self._step * self._speed / length
-            e, half = np.exp(-r), 0.5 * sigma * sigma
+            e = np.exp(-r)
+            half = 0.5 * sigma * sigma
             q11 = -half * np.expm1(-2 * r)
             q12 = half / 2 * (1 - e * e * (1 + 2 * r))
             q22 = half / 2 * (1 - e * e * (1 + 2 * r + 2 * r * r))
@@ -77,7 +78,8 @@ class Gusts(Kept):
         n = _parts(normal)
         start = [along * n[0]]
         for index, sigma in ((1, along), (3, up)):
-            z1, z2 = n[index], n[index + 1]
+            z1 = n[index]
+            z2 = n[index + 1]
             start += [math.sqrt(0.5) * sigma * z1, math.sqrt(0.125) * sigma * (z1 + z2)]
         self._state = kept(mask, start, self._state)
 
@@ -94,7 +96,9 @@ class Gusts(Kept):
                 e * (z[i + 1] + r * z[i]) + b * n[i] + c * n[i + 1],
             ]
         self._state = z = kept(mask, new, z)
-        (x, y), root, u = self._along, math.sqrt(3), z[0]
+        (x, y) = self._along
+        root = math.sqrt(3)
+        u = z[0]
         v, w = (root * z[i] + (1 - root) * z[i + 1] for i in (1, 3))
         return x * u - y * v, y * u + x * v, w
 

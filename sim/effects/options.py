@@ -6,7 +6,7 @@ from numbers import Real
 from typing import Any, Final, Self
 
 from ...models import MOST_DRAG
-from ...models.errors import expect
+from ...models.errors import InputError
 
 MOST_WIND: Final = 100.0  # m/s
 
@@ -72,16 +72,22 @@ class EffectOptions:
         object.__setattr__(self, name, numbers[0] if count == 1 else numbers)
 
     def _check(self, name: str, expected: str, right: bool) -> None:
-        expect(right, f"effects: {name}", expected, f"{getattr(self, name)!r:.80}")
+        if not right:
+            raise InputError(
+                f"effects: {name}: expected {expected}, got {getattr(self, name)!r:.80}"
+            )
 
     @classmethod
     def from_options(cls, options: Any) -> Self:
         """Options by name. An unknown name raises `InputError`, which names those there are."""
         known = ", ".join(one.name for one in fields(cls))
-        right = isinstance(options, Mapping)
-        expect(right, "effects", "a mapping from names to values", f"{options!r:.80}")
+        if not isinstance(options, Mapping):
+            raise InputError(
+                f"effects: expected a mapping from names to values, got {options!r:.80}"
+            )
         for name in options:
-            expect(name in known.split(", "), "effects", f"some of {known}", repr(name))
+            if name not in known.split(", "):
+                raise InputError(f"effects: expected some of {known}, got {name!r:.300}")
         return cls(**options)
 
     def to_options(self) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...models.errors import expect
+from ...models.errors import InputError
 from ..snapshots import Kept
 from ..state import Array, clip, component, each, kept, square_root, stack
 from .options import EffectOptions
@@ -40,7 +40,8 @@ class RotorEffects(Kept):
     lists = ("_roots",)
 
     def __init__(self, vehicle: "Vehicle", options: EffectOptions) -> None:
-        self._options, self._step = options, vehicle.timestep
+        self._options = options
+        self._step = vehicle.timestep
         told = vehicle.coefficients
         self._limits = vehicle.thrust_low, vehicle.thrust_high
         if options.motor_lag:
@@ -54,22 +55,32 @@ class RotorEffects(Kept):
                 "a curve that ends at the largest thrust, c₀ + c₁ + ... = 1, and is no higher"
             )
             ends = sum(self._curve)
-            right = abs(ends - 1) < 1e-3 and most < 1 + 1e-3
-            expect(right, "rotors.curve", expected, f"an end of {ends:.4g}, and up to {most:.4g}")
+            if not (abs(ends - 1) < 1e-3 and most < 1 + 1e-3):
+                raise InputError(
+                    f"rotors.curve: expected {expected}, "
+                    f"got an end of {ends:.4g}, and up to {most:.4g}"
+                )
         if options.battery:
             names = "battery.full battery.empty battery.capacity battery.resistance rotors.power"
             full, empty, capacity, self._resistance, self._watts = told.need(names, "battery")
-            expected, got = f"at most battery.full, {full:g} V", f"{empty:g} V"
-            expect(empty <= full, "battery.empty", expected, got)
-            self._full, self._empty = full, empty
+            expected = f"at most battery.full, {full:g} V"
+            got = f"{empty:g} V"
+            if not empty <= full:
+                raise InputError(f"battery.empty: expected {expected}, got {got}")
+            self._full = full
+            self._empty = empty
             self._coulombs = 3600 * capacity
         if options.motor_lag or options.thrust_curve or options.battery:
             pushes = bool((vehicle.thrust_low >= 0).all())
             expected = "rotors that push one way only, for motor_lag, thrust_curve and battery"
-            expect(pushes, "vehicle", expected, "a thrust below 0")
-        share, count = options.efficiency, vehicle.num_rotors
-        right = len(share) in (0, count)
-        expect(right, "effects: efficiency", f"{count} numbers, one for each rotor", f"{share}")
+            if not pushes:
+                raise InputError(f"vehicle: expected {expected}, got a thrust below 0")
+        share = options.efficiency
+        count = vehicle.num_rotors
+        if len(share) not in (0, count):
+            raise InputError(
+                f"effects: efficiency: expected {count} numbers, one for each rotor, got {share}"
+            )
         self._scales: list[Parts] = []
         self._roots: Any = None  # of the thrusts, proportional to the rotors' speeds
         self.charge: Array = None

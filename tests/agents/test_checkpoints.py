@@ -77,7 +77,9 @@ def test_a_training_that_was_stopped_ends_as_if_it_had_not(
     stopped = trained(algorithm, half, updates=3)
     store(checkpoint_of(algorithm, half, stopped), tmp_path / "c")
     kept = load(tmp_path / "c")
-    assert (kept.num_envs, kept.env_id, kept.options["episode_length"]) == (drones, ENV, 30)
+    assert kept.num_envs == drones
+    assert kept.env_id == ENV
+    assert kept.options["episode_length"] == 30
     assert kept.position.episodes == tuple(half.episodes)
     torch.manual_seed(99)  # nothing may depend on what the process did before
     log = log_of(drones, action_type=kind)
@@ -102,7 +104,9 @@ def kept(tmp_path_factory: pytest.TempPathFactory) -> Checkpoint:
 
 
 def test_a_checkpoint_tells_where_it_comes_from(kept: Checkpoint) -> None:
-    assert (kept.algorithm, kept.config["gae_lambda"], kept.seed) == ("a2c", 0.98, 5)
+    assert kept.algorithm == "a2c"
+    assert kept.config["gae_lambda"] == 0.98
+    assert kept.seed == 5
     assert kept.spec.vehicle_hash != "0" * 32
     assert kept.versions == software_versions()
     assert kept.other_versions() == {}
@@ -211,8 +215,11 @@ def test_crafted_metadata_is_refused(
 def test_parts_that_do_not_fit_are_refused(algorithm: str) -> None:
     log = log_of(2)
     kept = checkpoint_of(algorithm, log, trained(algorithm, log, updates=3))
-    network, rng = "weights", "rng"
-    first, second, steps = "optimizer.first", "optimizer.second", "optimizer.steps"
+    network = "weights"
+    rng = "rng"
+    first = "optimizer.first"
+    second = "optimizer.second"
+    steps = "optimizer.steps"
     changes: list[dict[str, Any]] = [
         {first: None},
         {steps: np.zeros(3, np.float32)},
@@ -243,7 +250,8 @@ def test_parts_that_do_not_fit_are_refused(algorithm: str) -> None:
 def test_parts_that_cannot_be_of_a_training_are_not_loaded(algorithm: str, tmp_path: Path) -> None:
     """The checksum is right, and resuming would fail later, or fly other numbers."""
     log = log_of(2)
-    kept, path = checkpoint_of(algorithm, log, trained(algorithm, log, updates=3)), tmp_path / "c"
+    kept = checkpoint_of(algorithm, log, trained(algorithm, log, updates=3))
+    path = tmp_path / "c"
     store(kept, path)
     assert load(path).position.env_steps == kept.position.env_steps == log.env_steps
     position = kept.position
@@ -299,7 +307,8 @@ def test_a_policy_alone_is_small_flies_the_same_and_resumes_nothing(
     alone, size = ((tmp_path / name).stat().st_size for name in ("alone", "whole"))
     assert alone < min(6000, size / 2)
     kept = load(tmp_path / "alone")
-    assert (kept.num_envs, kept.position.env_steps) == (0, whole.position.env_steps)
+    assert kept.num_envs == 0
+    assert kept.position.env_steps == whole.position.env_steps
     observation = np.array([0.5, -0.2, 0.1], np.float32)
     assert kept.policy().act(observation) == whole.policy().act(observation)
     words = "resume: expected the checkpoint of a training, got a policy alone"

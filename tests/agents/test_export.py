@@ -117,7 +117,8 @@ int main(void)
 def fed(observations: np.ndarray, *command: object) -> np.ndarray:
     words = [str(word) for word in command]
     done = subprocess.run(words, input=observations.tobytes(), capture_output=True, timeout=60)
-    assert (done.returncode, done.stderr) == (0, b"")
+    assert done.returncode == 0
+    assert done.stderr == b""
     return np.frombuffer(done.stdout, np.float32).reshape(len(observations), -1)
 
 
@@ -187,11 +188,13 @@ def test_every_vehicle_has_its_actions(vehicle: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("runner", RUNNERS)
 def test_tanh_is_exact_from_the_smallest_number_to_the_largest(runner: str, tmp_path: Path) -> None:
-    near, small = np.linspace(-12, 12, 20_001), np.geomspace(1e-30, 10, 10_001)
+    near = np.linspace(-12, 12, 20_001)
+    small = np.geomspace(1e-30, 10, 10_001)
     numbers = np.concatenate([near, small, -small, [0.0, 9.1, -9.1, 1e30, -1e30, np.inf, -np.inf]])
     seen = numbers.astype(np.float32)[:, np.newaxis]
     spec = spec_of(ArraySpec(name="a", shape=(1,)), [ArraySpec(name="o", shape=(1,))])
-    one, zero = np.ones((1, 1), np.float32), np.zeros(1, np.float32)
+    one = np.ones((1, 1), np.float32)
+    zero = np.zeros(1, np.float32)
     policy = loaded({"layers.0.weight": one, "layers.0.bias": zero}, spec, squash=True)
     actions = RUNNERS[runner](policy, seen, tmp_path)
     expected = np.tanh(seen.astype(np.float64))
@@ -203,7 +206,8 @@ def test_tanh_is_exact_from_the_smallest_number_to_the_largest(runner: str, tmp_
 def test_weights_keep_every_bit(runner: str, tmp_path: Path) -> None:
     """Of the smallest number, of the largest, and of some that no short decimal gives."""
     numbers = [1e-45, 1.1754944e-38, 3.4028235e38, 1 / 3, -0.1, 16777217.0, 1e-5, 123456.79, 2.0]
-    bias, count = np.array(numbers, np.float32), len(numbers)
+    bias = np.array(numbers, np.float32)
+    count = len(numbers)
     spec = spec_of(ArraySpec(name="a", shape=(count,)), [ArraySpec(name="o", shape=(1,))])
     weights = {
         "layers.0.weight": np.zeros((count, 1), np.float32),
@@ -222,7 +226,8 @@ def test_what_is_no_number_is_not_made_one(tmp_path: Path) -> None:
 
 
 def test_the_header_needs_nothing_but_a_compiler(tmp_path: Path) -> None:
-    header, program = tmp_path / "rotorgram_policy.h", tmp_path / "policy.c"
+    header = tmp_path / "rotorgram_policy.h"
+    program = tmp_path / "policy.c"
     policy = policy_of(
         env_spec(EnvConfig(env_id="rotorgram/Hover-v0")), (64, 64), "tanh", squash=True
     )
@@ -305,19 +310,27 @@ def test_every_file_tells_what_it_is(trained: Path, tmp_path: Path) -> None:
     told = {entry.key: entry.value for entry in model.metadata_props}
     assert [(one.domain, one.version) for one in model.opset_import] == [("", 13)]
     assert told["format"] == "1"
-    assert (told["algorithm"], told["seed"], told["inputs"]) == ("a2c", "3", "3")
+    assert told["algorithm"] == "a2c"
+    assert told["seed"] == "3"
+    assert told["inputs"] == "3"
     assert int(told["env_steps"]) == kept.position.env_steps >= 512
-    assert (told["env_id"], told["control_period"]) == ("rotorgram/Elevation-v0", "0.02")
-    assert (told["vehicle"], told["vehicle_hash"]) == (kept.spec.vehicle, kept.spec.vehicle_hash)
+    assert told["env_id"] == "rotorgram/Elevation-v0"
+    assert told["control_period"] == "0.02"
+    assert told["vehicle"] == kept.spec.vehicle
+    assert told["vehicle_hash"] == kept.spec.vehicle_hash
     assert json.loads(told["options"]) == kept.options
-    (observation,), action = json.loads(told["observation"]), json.loads(told["action"])
+    (observation,) = json.loads(told["observation"])
+    action = json.loads(told["action"])
     assert observation["components"] == [
         "elevation error",
         "rate of the error",
         "thrust over hover",
     ]
-    assert (observation["unit"], observation["frame"]) == (["m", "m/s", "1"], "world, up")
-    assert (action["components"], action["low"], action["high"]) == (["collective"], -1.0, 1.0)
+    assert observation["unit"] == ["m", "m/s", "1"]
+    assert observation["frame"] == "world, up"
+    assert action["components"] == ["collective"]
+    assert action["low"] == -1.0
+    assert action["high"] == 1.0
     expected = [
         "a2c", "rotorgram/Elevation-v0", told["options"], kept.spec.vehicle, told["vehicle_hash"],
         *observation["components"], "m", "m/s", "1", *["world, up"] * 3, "collective",
@@ -461,7 +474,8 @@ def test_a_policy_that_diverged_is_refused(target: str, trained: Path) -> None:
     """Its weights are finite numbers, its actions are not."""
     kept = load(trained / "checkpoint.safetensors")
     actor = {name: array.copy() for name, array in kept.actor.items()}
-    actor["layers.0.weight"][0], actor["layers.1.weight"][0] = 3e38, -3e38
+    actor["layers.0.weight"][0] = 3e38
+    actor["layers.1.weight"][0] = -3e38
     with pytest.raises(InputError, match=r"^policy: expected finite actions, got NaN or infinity"):
         export(replace(kept, actor=actor), target)
 
@@ -474,7 +488,8 @@ def test_only_onnx_needs_onnx(trained: Path, tmp_path: Path) -> None:
 
     assert run("c") == (0, "")
     status, error = run("onnx")
-    assert (status, error.count("\n")) == (1, 1)
+    assert status == 1
+    assert error.count("\n") == 1
     assert "pip install 'rotorgram[export]'" in error
     assert not (tmp_path / "onnx").exists()
 
@@ -504,7 +519,8 @@ def flown_by_c(
             simulator.observer = observe
             flight = Running(simulator)
             status, out, err = ended(agent)
-            assert (status, err) == (0, "")
+            assert status == 0
+            assert err == ""
             assert f"episode 1: {len(actions)} steps" in out
             flight.join()
         flights.append(np.array(actions))
@@ -544,7 +560,8 @@ def test_the_c_peer_flies_other_actions(name: str, tmp_path: Path) -> None:
     (theirs,) = flown_by_c(header, [7], env, vehicle, **options)
     made: Any = gym.make(env, vehicle=vehicle, **options).unwrapped
     observation, _ = made.reset(seed=7)
-    ours, done = [], False
+    ours = []
+    done = False
     while not done:
         ours.append(np.atleast_1d(policy.act(observation)).astype(np.float64))
         observation, _, terminated, truncated, _ = made.step(policy.act(observation))
@@ -576,7 +593,8 @@ def test_the_program_of_the_page_runs(trained: Path, tmp_path: Path) -> None:
 def test_the_page_shows_what_the_benchmark_wrote() -> None:
     content = json.loads((ROOT / "docs" / "results" / "export.json").read_text())
     for name, one in content["policies"].items():
-        times, sizes = one["microseconds"], one["bytes"]
+        times = one["microseconds"]
+        sizes = one["bytes"]
         row = " | ".join(f"{times[target]:.3g}" for target in ("NumPy", *TARGETS))
         assert f"| {name}: µs a call | {row} |" in PAGE
         row = " | ".join(f"{sizes[target]:,}" for target in TARGETS)

@@ -20,7 +20,8 @@ from rotorgram.models.errors import InputError
 from rotorgram.sim import Array, stack
 
 PAYLOAD = "rotorgram/PayloadHover-v0"
-HOVER, MOVING = "rotorgram/Hover-v0", "Moving-v0"
+HOVER = "rotorgram/Hover-v0"
+MOVING = "Moving-v0"
 DATA = Path(__file__).parents[1] / "data"
 MOCAP = {"noise": 0.001, "angle_noise": 0.002}
 FILES = {"quad": QUAD_XML, "tiny": DATA / "tiny.xml", "hexa": DATA / "hexa.xml"}
@@ -42,7 +43,8 @@ def errors_of(env: Any, seed: int = 0) -> list[tuple[float, float]]:
     """Distance to the goal, m, and error of the heading, degrees, after each step."""
     policy = Geometric(env.get_wrapper_attr("env_spec"))
     observation, _ = env.reset(seed=seed)
-    errors, truncated = [], False
+    errors = []
+    truncated = False
     while not truncated:
         observation, _, terminated, truncated, info = env.step(policy.act(observation))
         errors.append((info["position_error"], info["heading_error"]))
@@ -81,7 +83,9 @@ def test_gravity_is_the_vehicles(tmp_path: Path) -> None:
     file.write_text(f"gravity = 1.62\n{text}", encoding="utf-8")
     policy = Geometric(gym.make(HOVER, action="position", vehicle=file).unwrapped.env_spec)
     for time in (0.0, 0.02):
-        below, nose, up = -1.62 * time**2 / 2, (1, 0, 0), (0, 0, 1)
+        below = -1.62 * time**2 / 2
+        nose = (1, 0, 0)
+        up = (0, 0, 1)
         seen = [0, 0, below, 0, 0, 1.62 * time, *nose, *up, 0, 0, 0, 1, 1, 1, 1]
         assert policy.act(np.array(seen)) == pytest.approx([0, 0, below / 4, 0], abs=1e-6)
 
@@ -112,7 +116,9 @@ def test_a_payload_swings_no_more(vehicle: str | None) -> None:
     env = gym.make(PAYLOAD, action="position", **options)
     policy = Geometric(env.get_wrapper_attr("env_spec"))
     observation, _ = env.reset(seed=100)
-    swings, errors, truncated = [], [], False
+    swings = []
+    errors = []
+    truncated = False
     while not truncated:
         observation, _, terminated, truncated, info = env.step(policy.act(observation))
         swings.append(info["swing"])

@@ -40,7 +40,9 @@ class Constant(gym.Env[np.ndarray, Any]):
     action_space = spaces.Box(-1, 1, (1,), np.float32)
 
     def __init__(self, ending: str = "end", spec: EnvSpec = LINE) -> None:
-        self.env_spec, self._ending, self._steps = spec, ending, 0
+        self.env_spec = spec
+        self._ending = ending
+        self._steps = 0
         self.flown: list[float] = []
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
@@ -51,7 +53,8 @@ class Constant(gym.Env[np.ndarray, Any]):
         self._steps += 1
         self.flown.append(float(action[0]))
         over = self._steps == 8
-        terminated, truncated = over and self._ending == "end", over and self._ending == "limit"
+        terminated = over and self._ending == "end"
+        truncated = over and self._ending == "limit"
         return np.zeros(1, np.float32), 1.0, terminated, truncated, {"distance": 0.5}
 
 
@@ -242,7 +245,9 @@ def train_both(
 ) -> list[tuple[dict[str, float], dict[str, float]]]:
     """SB3 flies; ours, from the same weights, is given what it flew: scalars of both by update."""
     copy_weights(theirs, ours)
-    buffer, seen, told = theirs.model.rollout_buffer, [], []
+    buffer = theirs.model.rollout_buffer
+    seen = []
+    told = []
     prepare = buffer.compute_returns_and_advantage
 
     def keep_buffer(*args: Any, **kwargs: Any) -> None:
@@ -374,7 +379,8 @@ def overwrite(agent: Any, fill: Callable[[np.ndarray], None]) -> None:
         optimizer: Any = agent.model.policy.optimizer
         arrays = [p.detach().numpy() for p in agent.model.policy.parameters()]
     else:
-        optimizer, arrays = agent.optimizer, list(agent.weights.arrays.values())
+        optimizer = agent.optimizer
+        arrays = list(agent.weights.arrays.values())
     step = optimizer.step
 
     def then_fill(*arguments: Any) -> None:
@@ -416,7 +422,8 @@ def test_every_agent_trains_with_every_preset_and_kind_of_action(
     log = EpisodeLog(elevation(action_type=action_type, episode_length=60), seed=0)
     agent = make_agent(algorithm, log, preset(algorithm, name), 0)
     rollouts = 1024 if "ppo" in algorithm else 512
-    before, steps = agent.actor(), 150 if name == "paper" else rollouts
+    before = agent.actor()
+    steps = 150 if name == "paper" else rollouts
     agent.train(log, steps, lambda: True)
     assert log.env_steps == steps
     assert any(not np.array_equal(before[k], array) for k, array in agent.actor().items())
@@ -446,7 +453,8 @@ def test_learns_to_hold_the_target(
         flown = fly_episodes(vector(5), policy, 5)
         return float(np.mean([np.abs(one.headline[-60:]).mean() for one in flown]))
 
-    before, after = [], []
+    before = []
+    after = []
     for seed in (0, 1):
         log = EpisodeLog(vector(drones), seed)
         agent = make_agent(algorithm, log, preset(algorithm, "tuned", **changes), seed)

@@ -151,7 +151,8 @@ def test_what_is_not_defined_is_not_written() -> None:
     logged = training.scalars()
     assert "train/explained_variance" not in logged
     assert not any(name.startswith("rollout/") for name in logged), "no episode has ended"
-    assert (logged["train/n_updates"], logged["time/total_timesteps"]) == (1, 1)
+    assert logged["train/n_updates"] == 1
+    assert logged["time/total_timesteps"] == 1
 
 
 # ---- values
@@ -223,7 +224,8 @@ def test_the_terms_of_a2c_by_hand() -> None:
     assert logged["train/value_loss"] == pytest.approx((0.0 + 0.25) / 2)
     assert logged["train/entropy_loss"] == pytest.approx(-ENTROPY_OF_ONE)
     assert logged["train/explained_variance"] == pytest.approx(1 - 0.0625 / 0.25)
-    assert (logged["train/std"], logged["train/n_updates"]) == (1.0, 0)
+    assert logged["train/std"] == 1.0
+    assert logged["train/n_updates"] == 0
 
 
 def test_the_terms_of_vpg_by_hand() -> None:
@@ -264,7 +266,8 @@ def test_the_curves_of_a_killed_training_go_on_as_if_it_had_not_been(
     algorithm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Killed where it hurts most: the curves are written, the checkpoint is the one before."""
-    folder, broken = tmp_path / "whole", tmp_path / "broken"
+    folder = tmp_path / "whole"
+    broken = tmp_path / "broken"
 
     def copy_before(checkpoint: Checkpoint, path: Path) -> None:
         if path.exists() and checkpoint.position.env_steps >= 800 and not broken.exists():
@@ -379,7 +382,8 @@ def test_no_bar_is_wider_than_its_terminal(width: int) -> None:
 
 def test_bars_are_drawn_on_a_terminal_while_they_are_told() -> None:
     """As `bars` does it: started, so that rich draws whenever it likes."""
-    clock, terminal = Clock(), io.StringIO()
+    clock = Clock()
+    terminal = io.StringIO()
     bars = Bars(Console(width=80, file=terminal, force_terminal=True), clock)
     with bars.progress:
         fly(bars, clock, "vpg seed 3", 12)

@@ -13,7 +13,8 @@ from rotorgram.envs.spec import ArraySpec, Discrete
 from scripted import spec_of
 
 DICE = np.random.default_rng(0)
-INPUTS, BATCH = 5, 17
+INPUTS = 5
+BATCH = 17
 
 
 def normal(*shape: int) -> np.ndarray:
@@ -79,8 +80,10 @@ def test_forward_by_hand() -> None:
 @pytest.mark.parametrize("hidden", [(16,), (8, 9), (7, 6, 5)])
 def test_gradients_are_those_of_torch(hidden: tuple[int, ...], activation: str) -> None:
     net, weights = mlp(hidden, 2, activation)
-    seen, slope = normal(BATCH, INPUTS), normal(BATCH, 2)
-    theirs, inputs = tensors(weights), torch.tensor(seen, requires_grad=True)
+    seen = normal(BATCH, INPUTS)
+    slope = normal(BATCH, 2)
+    theirs = tensors(weights)
+    inputs = torch.tensor(seen, requires_grad=True)
     output = torch_mlp(theirs, inputs, activation)
     (output * torch.from_numpy(slope)).sum().backward()
     np.testing.assert_allclose(net.forward(seen), output.detach(), rtol=1e-5, atol=1e-5)
@@ -99,7 +102,8 @@ def test_gradients_are_finite_differences() -> None:
     net.forward(seen)
     net.backward(np.full((BATCH, 1), 1 / BATCH, np.float32))
     for i in range(0, weights.values.size, 7):
-        found, before = [], weights.values[i]
+        found = []
+        before = weights.values[i]
         for step in (0.02, -0.02):
             weights.values[i] = before + step
             found.append(net.forward(seen).astype(float).mean())
@@ -110,17 +114,20 @@ def test_gradients_are_finite_differences() -> None:
 
 @pytest.mark.parametrize("discrete", [False, True], ids=["continuous", "discrete"])
 def test_log_probability_entropy_and_their_gradients_are_those_of_torch(discrete: bool) -> None:
-    ours, seen = actor(discrete=discrete), normal(BATCH, INPUTS)
+    ours = actor(discrete=discrete)
+    seen = normal(BATCH, INPUTS)
     actions = DICE.integers(3, size=(BATCH, 1)).astype("f") if discrete else 2 * normal(BATCH, 3)
     theirs = tensors(ours.weights)
     output = torch_mlp(theirs, torch.from_numpy(seen), "relu")
     given = torch.from_numpy(actions)
     if discrete:
         choices: Any = torch.distributions.Categorical(logits=output)
-        expected, entropy = choices.log_prob(given[:, 0]), choices.entropy().mean()
+        expected = choices.log_prob(given[:, 0])
+        entropy = choices.entropy().mean()
     else:
         choices = torch.distributions.Normal(output, theirs["log_std"].exp())
-        expected, entropy = choices.log_prob(given).sum(1), choices.entropy().sum(1).mean()
+        expected = choices.log_prob(given).sum(1)
+        entropy = choices.entropy().sum(1).mean()
     got, mean = ours.score(seen, actions)
     np.testing.assert_allclose(got, expected.detach(), rtol=1e-5, atol=1e-5)
     assert mean == pytest.approx(entropy.item(), rel=1e-5)
@@ -149,7 +156,8 @@ def test_adam_is_torch_s() -> None:
     weights = Weights.zeros({"w": (40,)})
     weights.values[:] = normal(40)
     theirs = torch.tensor(weights.values.copy(), requires_grad=True)
-    reference, ours = torch.optim.Adam([theirs], lr=0.01), Adam(weights)
+    reference = torch.optim.Adam([theirs], lr=0.01)
+    ours = Adam(weights)
     for step in range(50):
         weights.slopes[:] = normal(40) * 10.0 ** (step % 5 - 3)
         theirs.grad = torch.from_numpy(weights.slopes.copy())
@@ -165,7 +173,8 @@ def test_adam_by_hand() -> None:
     weights.slopes[:] = 4, -0.5, 0
     adam.step(np.array([0.1, 0.2, 0.3], np.float32))
     np.testing.assert_allclose(weights.values, [-0.1, 0.2, 0], rtol=1e-6)
-    slow, slower = Adam(weights, 1e-5), weights.values.copy()
+    slow = Adam(weights, 1e-5)
+    slower = weights.values.copy()
     weights.slopes[:] = 1e-5, 0, 0  # as large as epsilon: half a step
     slow.step(0.1)
     np.testing.assert_allclose(weights.values - slower, [-0.05, 0, 0], atol=1e-6)

@@ -12,7 +12,8 @@ from rotorgram.envs import LocalVectorEnv
 def test_moments_of_parts_are_those_of_the_whole() -> None:
     rows = np.random.default_rng(0).normal([1e6, -2, 0], [3, 0.5, 1e-4], (1000, 3))
     moments = Moments(3)
-    assert (moments.mean.tolist(), moments.scale.tolist()) == ([0, 0, 0], [1, 1, 1])
+    assert moments.mean.tolist() == [0, 0, 0]
+    assert moments.scale.tolist() == [1, 1, 1]
     for part in np.split(rows, [1, 7, 500]):
         moments.add(part)
     np.testing.assert_allclose(moments.mean, rows.mean(0), rtol=1e-6)
@@ -33,7 +34,8 @@ def test_the_policy_has_the_moments_of_all_rollouts_before_it() -> None:
     log = EpisodeLog(env, 0)
     agent: Any = make_agent("a2c", log, A2CConfig(normalize_observations=True,
                                                   steps_per_update=40), 0)  # fmt: skip
-    update, seen = agent.update, []
+    update = agent.update
+    seen = []
     agent.update = lambda rollout: (seen.append(rollout.rows(rollout.observations)),
                                     update(rollout))[1]  # fmt: skip
 

@@ -22,7 +22,8 @@ def test_pid_holds_the_target(mode: str, drag: float) -> None:
     for seed in range(3):
         policy.reset()
         observation, _ = env.reset(seed=seed)
-        errors, truncated = [], False
+        errors = []
+        truncated = False
         while not truncated:
             observation, _, terminated, truncated, info = env.step(policy.act(observation))
             errors.append(abs(info["elevation_error"]))

@@ -86,7 +86,8 @@ def test_categorical_sampling_has_the_probabilities_of_the_policy() -> None:
     expected = shares / shares.sum()
     np.testing.assert_allclose(counts / 40_000, expected, atol=0.012)
     envs = policy.actions.to_envs(drawn)
-    assert (envs.dtype, envs.shape) == (np.int64, (40_000,))
+    assert envs.dtype == np.int64
+    assert envs.shape == (40_000,)
 
 
 def test_only_the_env_gets_clipped_actions() -> None:
@@ -143,4 +144,5 @@ def test_the_first_policy_holds_the_thrust() -> None:
 
 def test_the_paper_s_networks_have_one_hidden_layer_of_16_relu_units() -> None:
     config = preset("a2c", "paper")
-    assert (config.hidden, config.activation) == ((16,), "relu")
+    assert config.hidden == (16,)
+    assert config.activation == "relu"

@@ -50,9 +50,11 @@ def test_the_clipped_objective_by_hand() -> None:
     config = PPOConfig(hidden=1, log_std=0.0, normalize=False, clip=0.2)
     agent = filled(config)
     actions = np.array([0.5, 1.0, -2.0, 1.5, 0.3], np.float32)
-    ratio, advantage = np.array([1.1, 1.5, 0.5, 1.5, 0.5]), np.array([2, 2, 2, -1, -1], "f")
+    ratio = np.array([1.1, 1.5, 0.5, 1.5, 0.5])
+    advantage = np.array([2, 2, 2, -1, -1], "f")
     before = (-(actions**2) / 2 - 0.9189385 - np.log(ratio)).astype(np.float32)
-    seen, targets = np.ones((5, 1), np.float32), np.array([1, 2, 3, 4, 5], np.float32)
+    seen = np.ones((5, 1), np.float32)
+    targets = np.array([1, 2, 3, 4, 5], np.float32)
     gain, entropy, value_loss, distance, clipped = agent.minibatch(
         seen, actions[:, np.newaxis], before, advantage, targets
     )
@@ -174,7 +176,8 @@ def test_sb3_and_ours_make_the_same_steps_of_the_same_minibatches() -> None:
     ours = PPO.create(log, config, seed=1)
     assert {group["eps"] for group in theirs.model.policy.optimizer.param_groups} == {1e-5}
     copy_weights(theirs, ours)
-    get, parts = theirs.model.rollout_buffer.get, []
+    get = theirs.model.rollout_buffer.get
+    parts = []
 
     def keep(size: int) -> Any:
         for part in get(size):
@@ -205,12 +208,17 @@ def test_sb3_and_ours_make_the_same_steps_of_the_same_minibatches() -> None:
 
 def test_the_tuned_preset_depends_on_the_task() -> None:
     ours = find_preset("ppo", "tuned", "rotorgram/Elevation-v0")
-    assert (ours.num_envs, ours.env_steps, ours.config.hidden) == (32, 41_000, (16,))
+    assert ours.num_envs == 32
+    assert ours.env_steps == 41_000
+    assert ours.config.hidden == (16,)
     hover = find_preset("ppo", "tuned", "rotorgram/Hover-v0")
-    assert (hover.num_envs, hover.config.hidden) == (128, (64, 64))
+    assert hover.num_envs == 128
+    assert hover.config.hidden == (64, 64)
     assert find_preset("sb3-ppo", "tuned", "rotorgram/Hover-v0") == hover
     racing = find_preset("ppo", "tuned", "rotorgram/Racing-v0")
-    assert (racing.num_envs, racing.backend, racing.config.hidden) == (512, "rigid", (64, 64))
+    assert racing.num_envs == 512
+    assert racing.backend == "rigid"
+    assert racing.config.hidden == (64, 64)
     assert find_preset("ppo", "tuned", "other/Task-v0") == replace(ours, fits=False)
     swarm = find_preset("ippo", "tuned", "rotorgram/Formation-v0")
     assert swarm.config.rollout_size(swarm.num_envs) == swarm.num_envs * 512  # a whole episode
@@ -235,8 +243,11 @@ def test_presets_of_flights_are_variations_of_hover_s(
     found = find_preset("ppo", "tuned", f"rotorgram/{task}-v0")
     config = found.config
     assert isinstance(config, PPOConfig)
-    assert (found.backend, found.num_envs) == (backend, drones)
-    assert (config.gamma, config.gae_lambda, config.log_std) == (gamma, gae_lambda, log_std)
+    assert found.backend == backend
+    assert found.num_envs == drones
+    assert config.gamma == gamma
+    assert config.gae_lambda == gae_lambda
+    assert config.log_std == log_std
     assert config.rollout_size(drones) == 32 * drones
 
 
@@ -251,5 +262,6 @@ def test_training_by_the_command_takes_the_preset_s_drones_and_loads_no_torch(
     told = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     assert told.stdout.splitlines()[-1] == "[]"
     kept = load(folder / "checkpoint.safetensors")
-    assert (kept.num_envs, kept.algorithm) == (32, "ppo")
+    assert kept.num_envs == 32
+    assert kept.algorithm == "ppo"
     assert 2100 <= kept.position.env_steps < 2132

@@ -56,7 +56,8 @@ def run_of(algorithm: str, config: Config) -> Run:
 
 def stopped_and_resumed(run: Run, path: Path) -> tuple[Training, Training]:
     """A training without a break, and one that was stored after two updates and went on."""
-    whole, part = Training(run, vector()), Training(run, vector())
+    whole = Training(run, vector())
+    part = Training(run, vector())
     assert whole.train()
     updates = iter([True])
     assert not part.train(lambda: next(updates, False))
@@ -135,7 +136,8 @@ def test_the_memory_begins_with_an_episode_and_is_kept_with_the_rollout(
     )
     assert seen.shape == (40, 3, 3 + M)
     began = np.zeros_like(kept)
-    began[0], began[1:] = True, ends[:-1] & kept[1:]
+    began[0] = True
+    began[1:] = ends[:-1] & kept[1:]
     assert began[1:].any()
     assert not seen[began][:, 3:].any()
     goes_on = kept[1:] & ~began[1:]
@@ -181,4 +183,5 @@ def test_train_says_where_no_preset_fits(
     assert main([*words, "--out", str(tmp_path / "b")]) == 0
     assert "note: there is no preset" not in capsys.readouterr().out
     kept = load(tmp_path / "b" / "checkpoint.safetensors")
-    assert (kept.config["hidden"], kept.num_envs) == ([64, 64], 32)
+    assert kept.config["hidden"] == [64, 64]
+    assert kept.num_envs == 32

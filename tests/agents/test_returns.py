@@ -100,7 +100,8 @@ def test_drones_beside_each_other_are_summed_each_for_itself() -> None:
 def test_sums_of_any_length_are_those_of_the_recursion() -> None:
     dice = np.random.default_rng(0)
     for length in (1, 2, 3, 7, 64, 100):
-        values, factors = dice.normal(size=length), dice.uniform(size=length)
+        values = dice.normal(size=length)
+        factors = dice.uniform(size=length)
         expected = [values[t] + sum(np.prod(factors[t:u]) * values[u] for u in range(t + 1, length))
                     for t in range(length)]  # fmt: skip
         np.testing.assert_allclose(discounted_sums(values, factors), expected, rtol=1e-12)
@@ -108,7 +109,8 @@ def test_sums_of_any_length_are_those_of_the_recursion() -> None:
 
 def test_drones_are_not_summed_one_by_one() -> None:  # fault 8
     def seconds(drones: int) -> float:
-        values, factors = np.ones((64, drones)), np.full((64, drones), 0.9)
+        values = np.ones((64, drones))
+        factors = np.full((64, drones), 0.9)
         return min(timeit.repeat(lambda: discounted_sums(values, factors), number=10, repeat=20))
 
     assert seconds(1024) < 200 * seconds(1)

@@ -78,7 +78,8 @@ def torch_draw(actor: SquashedActor, states: np.ndarray, noise: np.ndarray) -> A
     for i in range(3):
         hidden = hidden @ leaves[f"layers.{i}.weight"].T + leaves[f"layers.{i}.bias"]
         hidden = torch.tanh(hidden) if i < 2 else hidden
-    mean, log_std = hidden[:, :K], hidden[:, K:].clamp(-20, 2)
+    mean = hidden[:, :K]
+    log_std = hidden[:, K:].clamp(-20, 2)
     base: Any = torch.distributions.Normal(mean, log_std.exp())
     squash: Any = torch.distributions.TransformedDistribution(
         base, [torch.distributions.TanhTransform(cache_size=1)]
@@ -89,7 +90,9 @@ def torch_draw(actor: SquashedActor, states: np.ndarray, noise: np.ndarray) -> A
 
 
 def test_gradients_of_the_actor_are_those_of_torch() -> None:
-    actor, states, noise = squashed(), normal(BATCH, N, seed=5), normal(BATCH, K, seed=6)
+    actor = squashed()
+    states = normal(BATCH, N, seed=5)
+    noise = normal(BATCH, K, seed=6)
     leaves, actions, logs = torch_draw(actor, states, noise)
     ours, our_logs = actor.draw(states, noise)
     np.testing.assert_allclose(ours, actions.detach(), atol=1e-6)
@@ -109,7 +112,9 @@ def test_gradients_of_the_actor_are_those_of_torch() -> None:
 
 
 def test_gradients_of_the_actor_are_finite_differences() -> None:
-    actor, states, noise = squashed(), normal(BATCH, N, seed=5), 0.3 * normal(BATCH, K, seed=6)
+    actor = squashed()
+    states = normal(BATCH, N, seed=5)
+    noise = 0.3 * normal(BATCH, K, seed=6)
     actor.weights.values[:] *= 0.5  # where tanh is steep, float32 has digits enough
     slope = normal(BATCH, K, seed=7) / BATCH
 
@@ -120,7 +125,8 @@ def test_gradients_of_the_actor_are_finite_differences() -> None:
     loss()
     actor.backward(slope, 0.3 / BATCH)
     for i in range(0, actor.weights.values.size, 11):
-        found, before = [], actor.weights.values[i]
+        found = []
+        before = actor.weights.values[i]
         for step in (0.01, -0.01):
             actor.weights.values[i] = before + step
             found.append(loss())
@@ -151,7 +157,8 @@ def test_critics_and_temperature_by_hand() -> None:
     for i, (own, target) in enumerate(((1.0, 2.0), (3.0, 5.0))):
         agent.weights.arrays[f"critic.{i}.layers.2.bias"][:] = own
         agent.targets.arrays[f"{i}.layers.2.bias"][:] = target
-    states, actions = np.zeros((2, N), np.float32), np.zeros((2, K), np.float32)
+    states = np.zeros((2, N), np.float32)
+    actions = np.zeros((2, K), np.float32)
     batch = states, actions, states, np.full(2, 4, np.float32), np.array([0, 1], np.float32)
     agent.update(batch, actions, actions)
     # Errors 1 - 6.627 and 1 - 4, mean -4.3135; 3 - 6.627 and 3 - 4, mean -2.3135: Adam's first
@@ -181,7 +188,8 @@ def sb3_like(agent: SAC, config: SACConfig) -> SB3Agent:
         for i in range(last):
             state[f"actor.latent_pi.{2 * i}.{kind}"] = weights[f"actor.layers.{i}.{kind}"]
         both = weights[f"actor.layers.{last}.{kind}"]
-        state[f"actor.mu.{kind}"], state[f"actor.log_std.{kind}"] = both[:K], both[K:]
+        state[f"actor.mu.{kind}"] = both[:K]
+        state[f"actor.log_std.{kind}"] = both[K:]
         for net in range(2):
             for i in range(last + 1):
                 own = weights[f"critic.{net}.layers.{i}.{kind}"]
@@ -207,7 +215,8 @@ def test_updates_are_those_of_sb3(activation: str, monkeypatch: pytest.MonkeyPat
         states, actions, next_states, rewards, ends = batch = tuple(
             np.roll(part, step, axis=0) for part in batch_of()
         )
-        noise, ahead = normal(BATCH, K, seed=50 + step), normal(BATCH, K, seed=90 + step)
+        noise = normal(BATCH, K, seed=50 + step)
+        ahead = normal(BATCH, K, seed=90 + step)
         noises += [noise, ahead]  # SB3 draws at the states first
         columns = (states, actions, next_states, ends[:, None], rewards[:, None], None)
         samples = _samples(*columns)
@@ -230,7 +239,8 @@ def test_updates_are_those_of_sb3(activation: str, monkeypatch: pytest.MonkeyPat
             log_alpha = agent.weights.arrays["log_alpha"]
             theirs_alpha = theirs.model.log_ent_coef.detach().numpy()
             np.testing.assert_allclose(log_alpha, theirs_alpha, rtol=1e-4)
-            told, ours_told = theirs.scalars(), agent.scalars()
+            told = theirs.scalars()
+            ours_told = agent.scalars()
             for name in ("actor_loss", "critic_loss", "ent_coef", "ent_coef_loss"):
                 got = ours_told[f"train/{name}"]
                 assert got == pytest.approx(told[f"train/{name}"], rel=2e-3, abs=1e-4), name
@@ -271,7 +281,8 @@ def test_the_buffer_keeps_the_last_transitions() -> None:
     assert ends.tolist() == [1, 0]
     # A truncation is no end; the row that is not kept is no transition.
     buffer.add(rollout([4, 5, 6], truncated=[True, False, False], kept=[True, False, True]))
-    assert (len(buffer), buffer.added) == (4, 5)
+    assert len(buffer) == 4
+    assert buffer.added == 5
     states, *_, ends = buffer.take(np.arange(4))
     assert states[:, 0].tolist() == [6, 2, 3, 4]
     assert ends.tolist() == [0, 0, 1, 0]
@@ -341,7 +352,8 @@ def test_a_training_goes_on_to_the_same_bits(drones: int, tmp_path: Path) -> Non
     resumed: Any = resume_agent(kept, again)
     resumed.train(again, total, lambda: True)
     assert again.env_steps == whole.env_steps >= total
-    expected, got = unbroken.state(), resumed.state()
+    expected = unbroken.state()
+    got = resumed.state()
     assert expected.keys() == got.keys()
     for name, array in expected.items():
         assert got[name].tobytes() == array.tobytes(), name
@@ -360,7 +372,8 @@ def test_a_checkpoint_of_another_buffer_is_refused() -> None:
 
 
 def test_the_policy_is_the_mean_of_the_actor() -> None:
-    agent, seen = agent_of(), normal(5, N)
+    agent = agent_of()
+    seen = normal(5, N)
     agent.weights.values[:] = normal(agent.weights.values.size)
     actor = agent._actor
     expected, _ = actor.draw(seen, np.zeros((5, K), np.float32))

@@ -92,13 +92,15 @@ def test_the_normalisation_goes_on_where_it_was() -> None:
     assert np.abs(kept.actor["observation.mean"]).max() > 0
     training.train()
     counts = kept.state["observations.count"], training.agent.state()["observations.count"]
-    first, second = kept.position.env_steps, training.log.env_steps
+    first = kept.position.env_steps
+    second = training.log.env_steps
     assert counts == (first, first + second)
 
 
 def test_a_second_stage_that_was_stopped_ends_as_if_it_had_not(tmp_path: Path) -> None:
     kept = trained("ppo")
-    unbroken, stopped = training_of("ppo", start=kept), training_of("ppo", start=kept)
+    unbroken = training_of("ppo", start=kept)
+    stopped = training_of("ppo", start=kept)
     unbroken.train()
     assert not stopped.train(lambda: False)
     store(stopped.checkpoint(), tmp_path / "stage")
@@ -133,7 +135,8 @@ def test_what_does_not_fit_is_one_sentence() -> None:
 def test_a_curriculum_is_a_chain_of_trainings(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    first, second = str(tmp_path / "first"), str(tmp_path / "second")
+    first = str(tmp_path / "first")
+    second = str(tmp_path / "second")
     words = ["train", "a2c", "--env-steps", "300", "--set", "steps_per_update=100"]
     assert main([*words, "hidden=[8]", "--out", first]) == 0
     harder = ["--effects", "linear_drag=0.5", "--start-from", first, "--out", second]

@@ -123,18 +123,22 @@ def test_a_training_that_stops_anywhere_ends_with_the_same_bits(algorithm: str) 
     whole = Training(run, env())
     assert whole.train()
     assert any(e.terminated for e in whole.log.episodes)
-    kept, stopped, outs = None, 0, 0
+    kept = None
+    stopped = 0
+    outs = 0
     while True:
         training = Training.resume(kept, env()) if kept else Training(run, env())
         updates = iter([True, False])
         ended = training.train(lambda updates=updates: next(updates, False))
-        kept, stopped = training.checkpoint(), stopped + 1
+        kept = training.checkpoint()
+        stopped = stopped + 1
         outs += int(training.log.out.any())
         if ended:
             break
     assert stopped > (1 if algorithm == "vpg" else 4)
     assert outs or algorithm == "vpg"  # VPG updates between worlds alone
-    ours, theirs = training.agent.state(), whole.agent.state()
+    ours = training.agent.state()
+    theirs = whole.agent.state()
     assert all(ours[name].tobytes() == theirs[name].tobytes() for name in theirs)
     lengths = [[e.length for e in one.log.episodes] for one in (training, whole)]
     assert lengths[0] == lengths[1]
@@ -180,5 +184,6 @@ def test_sb3_sees_zeros_of_one_that_is_out_until_its_world_ends() -> None:
     log.reset()
     for _ in range(first + 1):
         seen, rewards, *_ = log.step(np.array([[1.0], [0.0]]))
-    assert (seen[0].tolist(), rewards[0]) == ([0.0, 0.0, 0.0], 0.0)
+    assert seen[0].tolist() == [0.0, 0.0, 0.0]
+    assert rewards[0] == 0.0
     assert seen[1, 2] == pytest.approx(10.0)

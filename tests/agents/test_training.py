@@ -117,7 +117,8 @@ def test_a_run_that_was_stopped_ends_as_if_it_had_not(
     algorithm: str, drones: int, tmp_path: Path
 ) -> None:
     """SB3's keeps no state, and flies everything again."""
-    run, path = run_of(algorithm, drones), tmp_path / "checkpoint.safetensors"
+    run = run_of(algorithm, drones)
+    path = tmp_path / "checkpoint.safetensors"
     unbroken = Training(run, env_of(run))
     assert unbroken.train()
     stopped = Training(run, env_of(run))
@@ -198,7 +199,8 @@ def test_train_says_where_the_drones_are_too_many(
 def test_a_stopped_run_of_sb3_starts_anew_and_says_so(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder, words = tmp_path / "run", ["train", "sb3-a2c"]
+    folder = tmp_path / "run"
+    words = ["train", "sb3-a2c"]
     assert main([*words, "--env-steps", "300", "--num-envs", "4", "--out", str(folder)]) == 0
     path = folder / "checkpoint.safetensors"
     store(replace(load(path), env_steps=600), path)

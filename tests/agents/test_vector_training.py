@@ -70,7 +70,8 @@ def test_episode_seeds_differ_between_runs_and_episodes() -> None:
 def test_every_episode_has_the_seed_of_its_number() -> None:
     log = EpisodeLog(vector(), seed=3)
     log.reset()
-    dice, flown = np.random.default_rng(0), []
+    dice = np.random.default_rng(0)
+    flown = []
     for _ in range(100):
         flown.append(random_actions(dice))
         log.step(flown[-1])
@@ -81,10 +82,12 @@ def test_every_episode_has_the_seed_of_its_number() -> None:
     env = single(**OPTIONS)
     for episode in log.episodes:
         # Which drone flew it? The one whose actions repeat it, from the step where it began.
-        first, matches = episode.first_step // N, []
+        first = episode.first_step // N
+        matches = []
         for drone in range(N):
             env.reset(seed=episode_seed(3, episode.episode))
-            rewards, sizes = [], []
+            rewards = []
+            sizes = []
             for actions in flown[first : first + episode.length]:
                 _, reward, terminated, truncated, info = env.step(actions[drone])
                 rewards.append(reward)
@@ -113,7 +116,8 @@ def test_the_log_of_one_drone_and_of_many_keep_the_same() -> None:
         assert column.tobytes() == other[name].tobytes()
     assert one["value"].shape == (70,)
     first = logs[0].episodes[0]
-    assert (first.episode, first.first_step) == (0, 0)
+    assert first.episode == 0
+    assert first.first_step == 0
     assert one["episode"].tolist().count(0) == first.length
     own = one["episode"] == 0
     assert first.total_reward == pytest.approx(one["reward"][own].sum(), rel=1e-5)
@@ -124,7 +128,8 @@ def test_the_log_of_one_drone_and_of_many_keep_the_same() -> None:
 def test_a_step_is_gymnasiums_same_step() -> None:
     log = EpisodeLog(vector(), seed=0)
     log.reset()
-    dice, ended = np.random.default_rng(0), 0
+    dice = np.random.default_rng(0)
+    ended = 0
     for _ in range(60):
         observations, rewards, terminated, truncated, info = log.step(random_actions(dice))
         if (terminated | truncated).any():
@@ -146,7 +151,8 @@ def test_resuming_brings_every_drone_to_where_it_was(drones: int) -> None:
         return single(**OPTIONS) if drones == 1 else vector(drones)
 
     for steps in (0, 1, 37):
-        first, second = EpisodeLog(env(), 1), EpisodeLog(env(), 1)
+        first = EpisodeLog(env(), 1)
+        second = EpisodeLog(env(), 1)
         dice = np.random.default_rng(7)
         first.reset()
         for _ in range(steps):
@@ -192,7 +198,8 @@ def test_a_simulator_lost_while_others_begin() -> None:
     # With this seed the first drone's episode ends alone, while both drones of the second half fly.
     log = EpisodeLog(env, 3)
     log.reset()
-    dice, seen = np.random.default_rng(0), False
+    dice = np.random.default_rng(0)
+    seen = False
     for step in range(80):
         env.armed = step > 5 and not seen
         observations, _, terminated, truncated, info = log.step(random_actions(dice, 4))
@@ -246,7 +253,8 @@ def test_episodes_are_broken_off_where_the_training_ends() -> None:
     for drones, learnt, flown in ((N, 0, 25), (1, 23, 23)):
         log, collector = collector_of(drones, flight_band=3.0)
         rollout = collector.episodes(1, 23)
-        assert (len(rollout), log.env_steps) == (learnt, flown)
+        assert len(rollout) == learnt
+        assert log.env_steps == flown
 
 
 # ---- other tasks
@@ -273,7 +281,8 @@ def test_sb3_sees_final_observations_and_truncations() -> None:
     first = env.reset()
     other = vector(mode="SameStep")
     assert first.tobytes() == other.reset(seed=3)[0].tobytes()
-    dice, kinds = np.random.default_rng(0), set()
+    dice = np.random.default_rng(0)
+    kinds = set()
     for _ in range(80):
         actions = random_actions(dice)
         observations, rewards, dones, infos = env.step(actions)

@@ -16,7 +16,9 @@ from rotorgram.agents.rollouts import Collector, Rollout
 from rotorgram.agents.vpg import VPG
 from scripted import CALM, LOSSES, Row, Script, Scripted, log_of
 
-GAMMA, RATE, VF_COEF = 0.9, 0.01, 0.7
+GAMMA = 0.9
+RATE = 0.01
+VF_COEF = 0.7
 
 
 # ---- arithmetic
@@ -49,7 +51,8 @@ class Net:
     def adam(self, gradient: dict[str, np.ndarray], rate: float) -> None:
         self._updates += 1
         for name, slope in gradient.items():
-            first, second = self._first[name], self._second[name]
+            first = self._first[name]
+            second = self._second[name]
             first += 0.1 * (slope - first)
             second += 0.001 * (slope**2 - second)
             scale = np.sqrt(second / (1 - 0.999**self._updates)) + 1e-8
@@ -65,7 +68,8 @@ def policy_gradient(
     actor: Net, seen: np.ndarray, actions: np.ndarray, weights: np.ndarray, entropy: float
 ) -> dict[str, np.ndarray]:
     """Of minus the mean of weight · log P, and of minus the weighted mean entropy."""
-    output, column = actor(seen), weights[:, np.newaxis]
+    output = actor(seen)
+    column = weights[:, np.newaxis]
     if "log_std" not in actor.weights:
         shares = np.exp(output) / np.exp(output).sum(1, keepdims=True)
         chosen = np.eye(3)[actions[:, 0].astype(int)]
@@ -83,7 +87,8 @@ def a2c_rows(
     flown: list[list[Row]], value: Callable[[np.ndarray], float], gae_lambda: float
 ) -> Any:
     """Rows to learn from and their advantages. A lost step is none; the one before bootstraps."""
-    kept, advantages = [], []
+    kept = []
+    advantages = []
     for rows in flown:
         sums: list[float] = []
         for row, following in reversed(list(zip_longest(rows, rows[1:]))):
@@ -141,9 +146,13 @@ class Followed:
     """An agent in training, and beside it the same by hand."""
 
     def __init__(self, algorithm: str, config: Any, env: Scripted, total: int) -> None:
-        self.env, self.log, self.total, self.config = env, log_of(env), total, config
+        self.env = env
+        self.log = log_of(env)
+        self.total = total
+        self.config = config
         self.agent: Any = make_agent(algorithm, self.log, config, 3)
-        self.actor, self.critic = Net(self.agent.actor()), Net(self._critic())
+        self.actor = Net(self.agent.actor())
+        self.critic = Net(self._critic())
         self.updates = self.left_out = 0
         self.noise: list[np.ndarray] = []
         self._seen: list[tuple[np.ndarray, np.ndarray]] = []
@@ -238,7 +247,8 @@ class Followed:
         self._seen.clear()
         self.updates += 1
         assert seen.tobytes() == np.array([row.observation for row in kept]).tobytes()
-        done, seen = np.array([row.action for row in kept]), seen.astype(float)
+        done = np.array([row.action for row in kept])
+        seen = seen.astype(float)
         if "log_std" in self.actor.weights:
             self.noise.append((actions - self.actor(seen)) / np.exp(self.actor.weights["log_std"]))
         low, high = (-1, 1) if "log_std" in self.actor.weights else (0, 2)
@@ -273,7 +283,8 @@ CASES = [
 def test_updates_are_those_by_hand(
     algorithm: str, changes: dict[str, Any], script: Script, discrete: bool
 ) -> None:
-    losses, many = script[0] is LOSSES[0], len(script) > 1
+    losses = script[0] is LOSSES[0]
+    many = len(script) > 1
     settings = {**changes, "gamma": GAMMA, "learning_rate": RATE, "anneal": True, "log_std": 0.0}
     config: Any = (
         VPGConfig(**settings) if algorithm == "vpg" else A2CConfig(vf_coef=VF_COEF, **settings)
@@ -334,15 +345,18 @@ def test_an_end_before_a_loss_stays_what_it_was() -> None:
 def test_lost_steps_count_as_flown() -> None:
     """A round of 20, 20 and 3 steps, and the second breaks off after 6 more."""
     log, collector = collector_of(LOST_THIRD)
-    assert (len(collector.episodes(6, 49)), log.env_steps) == (40, 49)
+    assert len(collector.episodes(6, 49)) == 40
+    assert log.env_steps == 49
 
 
 def test_parts_of_episodes_teach_nothing() -> None:
     """Two drones, two rounds of 20 steps, and 42 left to fly: the second round breaks off."""
     log, collector = collector_of([[(20, "limit")]] * 2)
     rollout = collector.episodes(4, 42)
-    assert (len(rollout), log.env_steps) == (40, 42)
+    assert len(rollout) == 40
+    assert log.env_steps == 42
     config: Any = VPGConfig(gamma=0.98, baseline="time", normalize=True, episodes_per_update=4)
     np.testing.assert_allclose(VPG.create(log, config, 0).returns(rollout), 0, atol=1e-6)
     log, collector = collector_of([[(20, "limit")]] * 2)
-    assert (len(collector.episodes(2, 38)), log.env_steps) == (0, 38)
+    assert len(collector.episodes(2, 38)) == 0
+    assert log.env_steps == 38

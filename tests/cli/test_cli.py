@@ -174,7 +174,8 @@ def test_wrong_flags_name_what_was_expected(
 def test_no_command_and_an_unknown_one(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(capsys)[0] == 2
     status, _, err = run(capsys, "fly")
-    assert (status, err.count("\n")) == (2, 1)
+    assert status == 2
+    assert err.count("\n") == 1
     assert "expected a command of sim, train, " in err
     status, out, _ = run(capsys, "--version")
     assert status == 0
@@ -211,7 +212,8 @@ def test_options_are_those_of_the_task(capsys: pytest.CaptureFixture[str]) -> No
 def test_requirements_of_a_task_that_is_not_known_here() -> None:
     words = ["pid", "--env", "other/Race-v3", "--env.num-gates=3", "--env.wind", "[0.5, 1]"]
     command = parse(Serve, "rotorgram serve", [*words, "--env.track", "long", "--episodes", "2"])
-    assert (command.env, command.episodes) == ("other/Race-v3", 2)
+    assert command.env == "other/Race-v3"
+    assert command.episodes == 2
     assert command.options == {"num_gates": 3, "wind": [0.5, 1], "track": "long"}
 
 
@@ -235,9 +237,11 @@ def test_a_task_of_the_working_directory(tmp_path: Path) -> None:
     done = shell(f"cd {tmp_path} && rotorgram train a2c {env} --env-steps 300 --out run")
     assert done.returncode == 0, done.stderr
     kept = load(tmp_path / "run" / "checkpoint.safetensors")
-    assert (kept.env_id, kept.options["target"]) == ("Low-v0", 4.0)
+    assert kept.env_id == "Low-v0"
+    assert kept.options["target"] == 4.0
     done = shell(f"rotorgram evaluate {tmp_path}/run --episodes 1")
-    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
     assert "expected --env MODULE:Low-v0" in done.stderr
     agent = start("serve", tmp_path / "run", "--listen", "127.0.0.1:0", "--episodes", 1)
     assert agent.stdout is not None
@@ -351,7 +355,8 @@ def test_a_file_that_cannot_be_written_is_named_and_leaves_its_name_free(
     command: str, file: str, tmp_path: Path
 ) -> None:
     done = shell(f"cd {tmp_path} && ulimit -f 0 && rotorgram {command}")
-    assert (done.returncode, done.stderr) == (1, f"rotorgram: {file}: File too large\n")
+    assert done.returncode == 1
+    assert done.stderr == f"rotorgram: {file}: File too large\n"
     assert list(tmp_path.iterdir()) == []
 
 
@@ -363,13 +368,15 @@ def test_a_training_that_writes_nothing_leaves_the_name_of_its_folder_free(
 
     monkeypatch.setattr(train, "write_whole", full)
     status, _, err = run(capsys, "train", "a2c", "--out", tmp_path / "run")
-    assert (status, err) == (1, f"rotorgram: {tmp_path}/run/config.json: No space left on device\n")
+    assert status == 1
+    assert err == f"rotorgram: {tmp_path}/run/config.json: No space left on device\n"
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_key_on_a_full_disk(capsys: pytest.CaptureFixture[str]) -> None:
     status, _, err = run(capsys, "key", "/dev/full")
-    assert (status, err.count("\n")) == (1, 1)
+    assert status == 1
+    assert err.count("\n") == 1
 
 
 def test_curves_go_on_after_the_clock_went_back(
@@ -482,7 +489,9 @@ def test_check_model_of_what_is_no_vehicle(
     if text is not None:
         (tmp_path / "drone.xml").write_text(text)
     status, out, err = run(capsys, "vehicle", "check", tmp_path / "drone.xml")
-    assert (status, out, err.count("\n")) == (2, "", 1)
+    assert status == 2
+    assert out == ""
+    assert err.count("\n") == 1
     assert err.startswith(f"rotorgram: {sentence}")
 
 
@@ -494,9 +503,8 @@ def test_worlds_of_the_simulator_that_comes(
     flags = ("--env", "rotorgram/Formation-v0", "--listen", here)
     simulator = start(*swarm)
     status, _, err = run(capsys, "evaluate", "orca", *flags, "--drones", 4, "--episodes", 1)
-    assert (status, err) == (
-        1, "rotorgram: drones: expected a simulator of 4 in each world, got one of 2\n"
-    )  # fmt: skip
+    assert status == 1
+    assert err == "rotorgram: drones: expected a simulator of 4 in each world, got one of 2\n"
     assert "the agent closed" in simulator.communicate(timeout=10)[0]
     simulator = start(*swarm)
     settings = ("--num-envs", 4, "--env-steps", 64, "--set", "steps_per_update=32", "hidden=8")
@@ -504,11 +512,13 @@ def test_worlds_of_the_simulator_that_comes(
     simulator.communicate(timeout=10)
     assert status == 0
     config = json.loads((tmp_path / "run" / "config.json").read_text())
-    assert (config["num_envs"], config["drones"]) == (4, 2)
+    assert config["num_envs"] == 4
+    assert config["drones"] == 2
 
 
 def test_train_with_many_drones(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder, port = tmp_path / "run", free_port()
+    folder = tmp_path / "run"
+    port = free_port()
     settings = ("--env-steps", 1200, "--num-envs", 4, "--set", "steps_per_update=100")
     listen = ("--listen", f"127.0.0.1:{port}", "--num-simulators", 2)
     sims = [
@@ -542,7 +552,8 @@ def test_train_evaluate_and_resume(tmp_path: Path, capsys: pytest.CaptureFixture
     assert status == 0
     assert "trained 1,200 of 1,200 env steps" in out
     kept = load(folder / "checkpoint.safetensors")
-    assert (kept.algorithm, kept.config["steps_per_update"]) == ("a2c", 100)
+    assert kept.algorithm == "a2c"
+    assert kept.config["steps_per_update"] == 100
     assert kept.options["episode_length"] == 60
     assert len(kept.spec.vehicle_hash) == 32
     assert json.loads((folder / "config.json").read_text())["seed"] == 0
@@ -576,7 +587,8 @@ def test_nothing_that_a_checkpoint_names_is_imported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Fault 28: not in the processes of its simulators either."""
-    imported, folder = tmp_path / "imported", tmp_path / "run"
+    imported = tmp_path / "imported"
+    folder = tmp_path / "run"
     (tmp_path / "evil.py").write_text(f"open({str(imported)!r}, 'w')")
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
@@ -605,7 +617,8 @@ def test_of_two_trainings_with_one_folder_one_is_refused(tmp_path: Path) -> None
         (_, out, err), (status, _, refused) = sorted(ended, key=lambda one: one[0])
         assert "3,000 env steps" in out, err
         if words[0] == "--out" or status:  # of a finished one both may say that it is finished
-            assert (status, refused.count("\n")) == (1, 1)
+            assert status == 1
+            assert refused.count("\n") == 1
             assert "expected a " in refused
         kept = load(tmp_path / "run" / "checkpoint.safetensors")
         assert kept.position.env_steps == 3000
@@ -646,10 +659,8 @@ def test_text_of_others_holds_no_terminal_escapes(
 
     monkeypatch.setattr(Sim, "run", fail)
     status, _, err = run(capsys, "sim")
-    assert (status, err) == (
-        1,
-        "rotorgram: said \ufffd[2J\nrotorgram: refused: \ufffd]0;title\ufffd\n",
-    )
+    assert status == 1
+    assert err == "rotorgram: said \ufffd[2J\nrotorgram: refused: \ufffd]0;title\ufffd\n"
 
 
 def test_ctrl_c_stops_a_training_that_resumes_to_the_numbers_of_an_unbroken_one(
@@ -684,10 +695,12 @@ def test_sim_and_serve_meet(tmp_path: Path) -> None:
     address = agent.stdout.readline().split()[5]
     simulator = start("sim", "--server", address, "--bind", "127.0.0.1:0", "--codec", "text")
     out, err = agent.communicate(timeout=30)
-    assert (agent.returncode, err) == (0, "")
+    assert agent.returncode == 0
+    assert err == ""
     assert "episode 1: return" in out
     out, err = simulator.communicate(timeout=10)
-    assert (simulator.returncode, err) == (0, "")
+    assert simulator.returncode == 0
+    assert err == ""
     assert "the agent closed" in out
 
 
@@ -698,10 +711,8 @@ class Terse(gym.Env[Any, Any]):
         self.env: Any = gym.make("rotorgram/Elevation-v0", episode_length=50).unwrapped
         some = [a for a in self.env.env_spec.telemetry if a.name in ("thrust", "metrics")]
         self.env_spec = replace(self.env.env_spec, telemetry=tuple(some))
-        self.observation_space, self.action_space = (
-            self.env.observation_space,
-            self.env.action_space,
-        )
+        self.observation_space = self.env.observation_space
+        self.action_space = self.env.action_space
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
         return self.env.reset(seed=seed)
@@ -716,7 +727,8 @@ def test_a_simulator_of_other_telemetry_is_served() -> None:  # fault 12
     with Simulator(Terse(), server=("127.0.0.1", port), bind=("127.0.0.1", 0)) as simulator:
         assert simulator.run() == "the agent closed"
     out, err = agent.communicate(timeout=30)
-    assert (agent.returncode, err) == (0, "")
+    assert agent.returncode == 0
+    assert err == ""
     assert "episode 0: return" in out
 
 
@@ -737,7 +749,8 @@ def test_serve_flies_as_many_drones_as_the_simulator_has(
         )  # fmt: skip
         assert (status, "the agent closed" in out) == (0, True)
         out, err = agent.communicate(timeout=30)
-        assert (agent.returncode, err) == (0, "")
+        assert agent.returncode == 0
+        assert err == ""
         told.append(re.findall("episode .*", out))
     assert len(told[0]) == 5
     assert told[0] == told[1]
@@ -745,7 +758,8 @@ def test_serve_flies_as_many_drones_as_the_simulator_has(
 
 def test_a_key_loss_and_a_journal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """What a user does who flies over a bad network that others share."""
-    key, journal = tmp_path / "key", tmp_path / "flight.mcap"
+    key = tmp_path / "key"
+    journal = tmp_path / "flight.mcap"
     assert run(capsys, "key", key)[0] == 0
     assert key.stat().st_mode & 0o777 == 0o600
     assert run(capsys, "key", key)[0] == 1, "a key is never replaced"

@@ -13,7 +13,8 @@ SETTINGS = ["--preset", "paper", "--set", "steps_per_update=64", "--episode-leng
 def test_an_extended_training_is_one_of_as_many_env_steps(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    first, whole = tmp_path / "first", tmp_path / "whole"
+    first = tmp_path / "first"
+    whole = tmp_path / "whole"
     assert main(["train", "a2c", *SETTINGS, "--env-steps", "640", "--out", str(first)]) == 0
     assert main(["train", "a2c", *SETTINGS, "--env-steps", "1280", "--out", str(whole)]) == 0
     assert main(["train", "a2c", "--resume", str(first), "--env-steps", "500"]) == 1

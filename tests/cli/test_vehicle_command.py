@@ -38,7 +38,8 @@ def test_a_new_file_flies_as_it_is(
 ) -> None:
     file = tmp_path / "mine.toml"
     status, out, _ = run(capsys, "new", file, "--frame", frame)
-    assert (status, out) == (0, f"vehicle: {file} (rotorgram vehicle check {file} examines it)\n")
+    assert status == 0
+    assert out == f"vehicle: {file} (rotorgram vehicle check {file} examines it)\n"
     vehicle = Vehicle.load(file)
     assert vehicle.num_rotors == {"hexa": 6, "octo": 8}.get(frame, 4)
     assert vehicle.thrust_high.sum() == pytest.approx(30.0)
@@ -116,10 +117,12 @@ def test_show_has_what_a_models_file_tells(
 
 
 def test_export(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    file, out = tmp_path / "mine.toml", tmp_path / "mine.xml"
+    file = tmp_path / "mine.toml"
+    out = tmp_path / "mine.xml"
     run(capsys, "new", file)
     status, words, _ = run(capsys, "export", file, out)
-    assert (status, words) == (0, f"vehicle: {out} (every number with all its digits)\n")
+    assert status == 0
+    assert words == f"vehicle: {out} (every number with all its digits)\n"
     model = mujoco.MjModel.from_xml_path(str(out))
     assert model.body_mass[1] == 1.5
     status, words, _ = run(capsys, "export", DATA / "hexa.xml", tmp_path / "hexa.xml")
@@ -158,7 +161,8 @@ def test_wrong_words_are_one_sentence(
     Path("there.toml").touch()
     Path("there.xml").touch()
     status, out, err = run(capsys, *words)
-    assert (status, out) == (2 if words[0] == "check" else 1, "")
+    assert status == 2 if words[0] == "check" else 1
+    assert out == ""
     assert re.match(rf"rotorgram: {sentence}.*\n$", err)
 
 
@@ -181,7 +185,8 @@ def test_a_wrong_flag_loads_nothing_heavy() -> None:
 
 
 def test_every_command_takes_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    file, folder = tmp_path / "mine.toml", tmp_path / "run"
+    file = tmp_path / "mine.toml"
+    folder = tmp_path / "run"
     run(capsys, "new", file, "--frame", "hexa")
     task = ["--env", "rotorgram/Hover-v0", "--vehicle", str(file)]
     assert main(["train", "a2c", *task, "--env-steps", "256", "--out", str(folder)]) == 0

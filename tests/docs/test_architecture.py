@@ -119,7 +119,8 @@ def test_an_agent_loads_neither_mujoco_nor_torch() -> None:
         "print(sorted({'mujoco', 'torch', 'pandas', 'matplotlib'} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert (done.stdout, done.stderr) == ("[]\n", "")
+    assert done.stdout == "[]\n"
+    assert done.stderr == ""
 
 
 @pytest.mark.parametrize("package", PACKAGES)

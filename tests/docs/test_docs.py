@@ -132,12 +132,11 @@ def test_the_reliability_page_tells_what_the_benchmarks_wrote() -> None:
     assert flood["identical"]
     assert soak["control_steps"] >= 1_000_000
     swarm = json.loads((RESULTS / "reliability" / "swarm.json").read_text())
-    eight, hundred = swarm["agent_processes"], swarm["hundred_drones"]
+    eight = swarm["agent_processes"]
+    hundred = swarm["hundred_drones"]
     kinds = ("silent", "coming", "late")
-    network, absences = (
-        hundred["network"],
-        ", ".join(str(eight.get(f"absent_{k}", 0)) for k in kinds),
-    )
+    network = hundred["network"]
+    absences = ", ".join(str(eight.get(f"absent_{k}", 0)) for k in kinds)
     for sentence in (
         f"{eight['killed']} kills and {eight['stopped']} stops of {eight['agents']} agent "
         f"processes: {eight['states_that_differ']} of {eight['control_steps']:,} control steps "
@@ -192,7 +191,8 @@ def test_the_performance_page_tells_what_the_benchmarks_wrote() -> None:
 def test_the_scaling_page_tells_what_the_benchmark_wrote() -> None:
     page = (ROOT / "docs" / "scaling.md").read_text()
     scaling = json.loads((RESULTS / "performance" / "scaling.json").read_text())
-    extrapolated, drones = scaling["extrapolated"], scaling["drones"]
+    extrapolated = scaling["extrapolated"]
+    drones = scaling["drones"]
     told = [f"| {threads} | {rate:,} |" for threads, rate in scaling["threads"].items()]
     told += [
         f"| {count} | {int(count) * drones:,} | {one['rate']:,} "
@@ -242,8 +242,10 @@ def test_the_limits_are_those_that_were_measured() -> None:
 def test_the_seeds_of_ppo_are_those_that_were_flown(task: str) -> None:
     name = {"PayloadHover": "payload"}.get(task, task.lower())
     found = json.loads((RESULTS / f"seconds_{name}.json").read_text())
-    sizes, count = [row["steady"] for row in found["seeds"]], len(found["seeds"])
-    crashes, beside = sum(row["crashes"] for row in found["seeds"]), found["beside"]["geometric"]
+    sizes = [row["steady"] for row in found["seeds"]]
+    count = len(found["seeds"])
+    crashes = sum(row["crashes"] for row in found["seeds"])
+    beside = found["beside"]["geometric"]
     row = (
         f"| {found['hold']} of {count} | {min(sizes):.3g} to {max(sizes):.3g} "
         f"| {crashes} of {20 * count} | {beside['steady']:.3g}, {beside['crashes']} of 20 "

@@ -99,7 +99,8 @@ def test_a_missing_package_is_one_sentence(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    file, checkpoint = tmp_path / "file", tmp_path / "checkpoint"
+    file = tmp_path / "file"
+    checkpoint = tmp_path / "checkpoint"
     file.touch()
     checkpoint.touch()
     words = [str(file) if word == "FILE" else word for word in arguments]
@@ -173,7 +174,8 @@ def test_a_command_starts_in_time(arguments: list[str]) -> None:
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The wheel, built from a copy: setuptools leaves folders beside what it builds."""
     pytest.importorskip("setuptools")
-    source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
+    source = tmp_path_factory.mktemp("source")
+    out = tmp_path_factory.mktemp("wheel")
     for folder in ("rotorgram", *FOLDERS):
         shutil.copytree(
             ROOT / folder, source / folder, ignore=shutil.ignore_patterns("__pycache__")

@@ -31,7 +31,8 @@ def test_the_start_is_an_equilibrium(vehicle: str | None, drones: int) -> None:
     """
     env = started(drones, vehicle)
     world, state = env.loop.world, env.loop.world.state
-    crafts, ball = state.position.copy(), state.payload.copy()
+    crafts = state.position.copy()
+    ball = state.payload.copy()
     length = np.linalg.norm(crafts - ball, axis=-1)
     assert length == pytest.approx(length[0, 0])
     slant = np.degrees(np.arccos((crafts - ball)[..., 2] / length))
@@ -46,7 +47,8 @@ def test_the_start_is_an_equilibrium(vehicle: str | None, drones: int) -> None:
 def test_the_tensions_carry_the_payload(drones: int) -> None:
     """T = m g / (A cos(angle)) in each cable: together the weight."""
     env = started(drones, payload_share=0.3, angle=40.0)
-    state, vehicle = env.loop.world.state, env.loop.world.vehicle
+    state = env.loop.world.state
+    vehicle = env.loop.world.vehicle
     mass = 0.3 * drones * vehicle.mass
     cable = float(np.linalg.norm((state.position - state.payload)[0, 0]))
     model = swarm_model([vehicle] * drones, payload=mass, cable=cable)

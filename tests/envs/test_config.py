@@ -55,8 +55,11 @@ def test_flat_keywords_reach_their_fields_and_the_task() -> None:
     assert config.backend == BackendConfig(name="rigid", dtype="float64", compiled=False)
     assert config.effects == EffectOptions(motor_lag=True)
     assert config.cameras == ("front", "down")
-    assert (config.drones, config.action, config.history) == (2, "rates", 3)
-    assert (config.control_period, config.episode_length) == (0.04, 9)
+    assert config.drones == 2
+    assert config.action == "rates"
+    assert config.history == 3
+    assert config.control_period == 0.04
+    assert config.episode_length == 9
     assert config.task["spacing"] == 4.0
     assert config.task["margin"] == 10.0  # a default of the task
     nested = {name: value for name, value in FULL.items() if name != "spacing"}
@@ -65,9 +68,12 @@ def test_flat_keywords_reach_their_fields_and_the_task() -> None:
 
 def test_defaults_come_from_the_task() -> None:
     config = EnvConfig(env_id="config/Hold-v0")
-    assert (config.action, config.control_period, config.episode_length) == ("offset", 0.05, 7)
+    assert config.action == "offset"
+    assert config.control_period == 0.05
+    assert config.episode_length == 7
     formation = EnvConfig(env_id="rotorgram/Formation-v0")
-    assert (formation.action, formation.episode_length) == ("velocity", 500)
+    assert formation.action == "velocity"
+    assert formation.episode_length == 500
 
 
 def test_the_record_as_json_and_as_a_pickle() -> None:
@@ -101,8 +107,10 @@ def test_a_file_and_keywords_that_win(tmp_path: Path) -> None:
     )
     config = EnvConfig.from_toml(file, history=4)
     assert config.vehicle == (str(tmp_path / "own.xml"),)  # beside the file
-    assert (config.task["start_tilt"], config.history) == (5.0, 4)
-    assert (config.backend.name, config.effects.gusts) == ("rigid", 2.0)
+    assert config.task["start_tilt"] == 5.0
+    assert config.history == 4
+    assert config.backend.name == "rigid"
+    assert config.effects.gusts == 2.0
     file.write_text("env_id = ")
     with pytest.raises(InputError, match=r"^config: expected a TOML file, got "):
         EnvConfig.from_toml(file)

@@ -22,7 +22,8 @@ from rotorgram.envs.spec import component_names
 from rotorgram.models import QUAD_XML, Vehicle
 
 DATA = Path(__file__).parents[1] / "data"
-ELEVATION, HOVER = "rotorgram/Elevation-v0", "rotorgram/Hover-v0"
+ELEVATION = "rotorgram/Elevation-v0"
+HOVER = "rotorgram/Hover-v0"
 TASKS = sorted(  # that one drone can fly
     name
     for name in gym.registry
@@ -31,7 +32,8 @@ TASKS = sorted(  # that one drone can fly
 FILES = {"quad": QUAD_XML}
 FILES |= {path.stem: path for path in sorted(DATA.glob("*.xml"))}
 FILES |= {path.parent.name: path for path in sorted(QUAD_XML.parent.glob("*/*/vehicle.toml"))}
-N, STEPS = 3, 40
+N = 3
+STEPS = 40
 STORM = {"wind": (4.0, -3.0, 6.0), "gusts": 8.0}
 
 
@@ -50,7 +52,8 @@ def pairs(every: int) -> Any:
     )
 
 
-everything, some = pairs(1), pairs(3)
+everything = pairs(1)
+some = pairs(3)
 
 
 @cache
@@ -58,7 +61,9 @@ def effects_of(file: Path) -> dict[str, Any]:
     """All effects that a vehicle has coefficients for; in a storm, if it feels air."""
     vehicle = Vehicle.load(file)
     told = vehicle.coefficients
-    rotors, drag, battery = told.rotors, told.drag, told.battery
+    rotors = told.rotors
+    drag = told.drag
+    battery = told.battery
     felt = (rotors.drag, rotors.inflow, rotors.lift)
     given = {
         "motor_lag": rotors.time_constant,
@@ -86,7 +91,8 @@ def options_of(env_id: str, file: Path, windy: bool = True) -> dict[str, Any]:
 
 def actions_of(space: gym.Space, seed: int) -> Iterator[np.ndarray]:
     """Random, then all at one bound, then at the other: what drives a craft to its limits."""
-    dice, box = np.random.default_rng(seed), space
+    dice = np.random.default_rng(seed)
+    box = space
     assert isinstance(box, gym.spaces.Box)
     for step in range(STEPS):
         limit = (None, box.high, box.low)[3 * step // STEPS]
@@ -121,12 +127,15 @@ def check_alone(env_id: str, file: Path, windy: bool) -> None:
     env = gym.make(env_id, disable_env_checker=True, **options_of(env_id, file, windy)).unwrapped
     assert isinstance(env, SingleEnv)
     check_env(env, skip_render_check=True)
-    first, again = list(flown(env, 3)), list(flown(env, 3))
+    first = list(flown(env, 3))
+    again = list(flown(env, 3))
     telemetry = names_of(env)
     for observation, reward, terminated, truncated, info in first:
         assert env.observation_space.contains(observation)  # shape, dtype, bounds
         assert np.isfinite(observation).all()
-        assert (type(reward), type(terminated), type(truncated)) == (float, bool, bool)
+        assert type(reward) is float
+        assert type(terminated) is bool
+        assert type(truncated) is bool
         assert not (terminated and truncated)
         assert list(info)[: len(telemetry)] == telemetry
         assert set(map(type, info.values())) == {float}
@@ -157,7 +166,9 @@ def test_in_a_batch(env_id: str, file: Path) -> None:
         told.append(batch.step(np.stack([given[step] for given in actions])))
     for step, (seen, rewards, terminated, truncated, info) in enumerate(told):
         assert batch.observation_space.contains(seen)
-        assert (rewards.dtype, terminated.dtype, truncated.dtype) == (np.float64, bool, bool)
+        assert rewards.dtype == np.float64
+        assert terminated.dtype == bool
+        assert truncated.dtype == bool
         for i, single in enumerate(singles):
             observation, *rest, single_info = single[step]
             assert seen[i].tobytes() == observation.tobytes()
@@ -209,10 +220,12 @@ def test_the_pid_of_the_paper_holds_every_vehicle(file: Path) -> None:
 def test_one_cascade_with_the_same_gains_hovers_with_every_vehicle(file: Path) -> None:
     """From 30° of tilt and metres off, within 5 s: the tasks' bands suit 27 g and 20 kg alike."""
     vehicle, env = Vehicle.load(file), gym.make(HOVER, vehicle=file)
-    up, down = vehicle.thrust_high - vehicle.hover_thrust, vehicle.hover_thrust - vehicle.thrust_low
+    up = vehicle.thrust_high - vehicle.hover_thrust
+    down = vehicle.hover_thrust - vehicle.thrust_low
     mix = np.linalg.pinv(vehicle.allocation)
     observation, _ = env.reset(seed=1)
-    errors, truncated = [], False
+    errors = []
+    truncated = False
     while not truncated:
         offset, velocity, nose, axis, rates = observation[:15].astype(np.float64).reshape(5, 3)
         to_world = np.stack((nose, np.cross(axis, nose), axis), axis=1)
@@ -236,9 +249,11 @@ def test_a_storm_clips_the_observations_of_the_elevation_task(up: float) -> None
     """Wind of 60 m/s accelerates beyond what rotors and gravity can: the bounds are clipped at."""
     effects = {"body_drag": True, "wind": (0.0, 0.0, 60.0 * up)}
     env = gym.make(ELEVATION, vehicle=DATA / "racer.xml", effects=effects, flight_band=1.5)
-    low, high = env.observation_space.low, env.observation_space.high
+    low = env.observation_space.low
+    high = env.observation_space.high
     observation, _ = env.reset(seed=4)  # a start far from the goal
-    seen, terminated = [observation], False
+    seen = [observation]
+    terminated = False
     while not terminated:
         observation, _, terminated, _, info = env.step(np.array((up,), np.float32))
         assert env.observation_space.contains(observation)

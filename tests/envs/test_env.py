@@ -24,7 +24,8 @@ from rotorgram.envs.tasks.elevation import Elevation
 from rotorgram.models.errors import InputError
 from rotorgram.sim import PhysicsError
 
-ID, HOVER = "rotorgram/Elevation-v0", "rotorgram/Hover-v0"
+ID = "rotorgram/Elevation-v0"
+HOVER = "rotorgram/Hover-v0"
 HEXA = str(Path(__file__).parents[1] / "data" / "hexa.xml")
 DRAG = {"linear_drag": 2.0}
 COMBINATIONS: list[tuple[str, dict[str, Any]]] = [
@@ -187,7 +188,8 @@ def test_discrete_actions_fly_as_the_continuous_ones(mode: str, newtons: float) 
         few, many = (_env(action=mode, action_type=k) for k in ("discrete", "continuous"))
         few.reset(seed=3)
         many.reset(seed=3)
-        one, other = few.step(np.int64(index)), many.step(_a(action))
+        one = few.step(np.int64(index))
+        other = many.step(_a(action))
         assert one[0].tobytes() == other[0].tobytes()
         assert one[1:] == other[1:]
         assert one[4]["F1"] == one[4]["F4"] == 49.0 + newtons * action
@@ -245,7 +247,9 @@ def test_number_types_of_an_action_do_not_matter() -> None:
 def test_flight_follows_the_formula_of_constant_acceleration(mode: str, period: float) -> None:
     env = _env(action=mode, control_period=period, flight_band=50.0, target=60.0)
     _, info = env.reset(seed=2)
-    height, speed, thrust = info["Y"], 0.0, 49.0
+    height = info["Y"]
+    speed = 0.0
+    thrust = 49.0
     for n in range(60):
         action = (1.0, -0.25, 0.5, -1.0)[n // 3 % 4]  # exact in float32
         thrust = min(100.0, max(0.0, thrust + 5 * action if mode == "increment" else
@@ -257,7 +261,9 @@ def test_flight_follows_the_formula_of_constant_acceleration(mode: str, period: 
         assert info["Y"] == pytest.approx(height, abs=1e-9)
         assert info["elevation_error"] == pytest.approx(60 - height, abs=1e-9)
         assert (info["X"], info["Z"]) == pytest.approx((0.0, 0.0), abs=1e-9)
-        assert (info["X_goal"], info["Y_goal"], info["Z_goal"]) == (0.0, 60.0, 0.0)
+        assert info["X_goal"] == 0.0
+        assert info["Y_goal"] == 60.0
+        assert info["Z_goal"] == 0.0
         assert observation == pytest.approx([60 - height, -speed, thrust / 49 - 1], abs=1e-5)
 
 
@@ -284,7 +290,8 @@ def test_reward_and_observation_of_a_step_by_hand() -> None:
 
 
 def test_telemetry_is_in_the_papers_frame() -> None:
-    flight, half = Flight(5.0), math.radians(20) / 2
+    flight = Flight(5.0)
+    half = math.radians(20) / 2
     flight.state.position[:] = 1.0, 2.0, 5.0
     flight.state.quaternion[:] = math.cos(half), 0.0, 0.0, math.sin(half)  # to the left
     flight.step(0.0)
@@ -333,7 +340,8 @@ def test_fastest_crossing_stays_within_the_bounds(side: float, period: float) ->
     space: Any = env.observation_space
     for turn in np.linspace(0.3, 2.99, 8).tolist():
         env.reset(seed=0)
-        over, push = False, side * 0.5
+        over = False
+        push = side * 0.5
         while not over:
             observation, _, over, *_ = env.step(_a(push))
             assert observation in space
@@ -389,7 +397,8 @@ def test_a_bounce_within_a_long_control_period_is_a_crash() -> None:
 @pytest.mark.parametrize(("degrees", "over"), [(59.0, False), (61.0, True), (180.0, True)])
 @pytest.mark.parametrize("axis", [1, 2])
 def test_terminated_by_tilt(degrees: float, over: bool, axis: int) -> None:
-    flight, half = Flight(5.0), math.radians(degrees) / 2
+    flight = Flight(5.0)
+    half = math.radians(degrees) / 2
     flight.state.quaternion[0] = math.cos(half)
     flight.state.quaternion[axis] = math.sin(half)
     flight.step(0.0)
@@ -402,7 +411,8 @@ def test_a_bad_state_raises_and_leaves_no_log(
     field: str, warning: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    flight, twin = Flight(5.0), Flight(5.0)
+    flight = Flight(5.0)
+    twin = Flight(5.0)
     getattr(flight.state, field)[2] = math.nan
     with pytest.raises(PhysicsError, match=f"MuJoCo warned of mjWARN_BAD{warning} .*reset"):
         flight.step(0.0)
@@ -416,8 +426,10 @@ def test_a_bad_state_raises_and_leaves_no_log(
 
 
 def test_a_log_file_that_the_user_named_stays_on(tmp_path: Path) -> None:
-    old, mine = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
-    mine.logto_file, mine.logfile = True, str(tmp_path / "mine.txt")
+    old = mujoco.MjLogConfig.get()
+    mine = mujoco.MjLogConfig.get()
+    mine.logto_file = True
+    mine.logfile = str(tmp_path / "mine.txt")
     try:
         mine.set()
         flight = Flight(5.0)
@@ -442,7 +454,8 @@ def test_a_step_before_a_reset(env_id: str) -> None:
 
 @pytest.mark.parametrize("env_id", [ID, HOVER])
 def test_seeds(env_id: str) -> None:
-    one, other = _env(env_id), _env(env_id)
+    one = _env(env_id)
+    other = _env(env_id)
     starts = [one.reset(seed=seed)[0].tobytes() for seed in range(10)]
     starts += [one.reset()[0].tobytes() for _ in range(5)]  # goes on with the stream
     again = [other.reset(seed=seed)[0].tobytes() for seed in range(10)]

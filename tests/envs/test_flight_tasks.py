@@ -14,7 +14,8 @@ def test_a_frozen_drone_keeps_its_numbers(name: str) -> None:
     """Of two drones with the same seed and actions one rests for ten steps in between."""
     env: Any = gym.make_vec(f"rotorgram/{name}-v0", num_envs=2, autoreset_mode="Disabled")
     env.reset(seed=[3, 3])
-    actions, seen = np.full(env.action_space.shape, 0.05, np.float32), [[], []]
+    actions = np.full(env.action_space.shape, 0.05, np.float32)
+    seen = [[], []]
     for step in range(60):
         rests = np.array((False, 20 <= step < 30))
         env.advance(actions, None, None, rests)

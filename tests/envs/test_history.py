@@ -11,7 +11,8 @@ from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 from rotorgram.models.errors import InputError
 
-HOVER, ELEVATION = "rotorgram/Hover-v0", "rotorgram/Elevation-v0"
+HOVER = "rotorgram/Hover-v0"
+ELEVATION = "rotorgram/Elevation-v0"
 LATE = {"randomize": {"observation_delay": "uniform(0, 0.07)"}}
 IMU = {"imu": True, "estimate": True}
 MEASURED = {"vehicle": "crazyflie2", "sensors": {**IMU, "observe": "estimate"}}
@@ -27,7 +28,8 @@ def sides(rows: list[np.ndarray], count: int) -> list[np.ndarray]:
 def flight(env: Any, steps: int = 12) -> list[Any]:
     """Observations of an episode with random actions."""
     observation, _ = env.reset(seed=4)
-    seen, dice = [observation], np.random.default_rng(0)
+    seen = [observation]
+    dice = np.random.default_rng(0)
     for _ in range(steps):
         action = dice.uniform(-0.3, 0.3, env.action_space.shape).astype(np.float32)
         observation, _, terminated, *_ = env.step(action)
@@ -68,7 +70,8 @@ def test_a_batch_with_resets_and_drones_that_rest() -> None:
     actions = np.full(envs[0].action_space.shape, 0.1, np.float32)
     for step in range(10):
         resets, frozen = np.zeros((2, 3), bool)
-        resets[1], frozen[2] = step == 5, step in (3, 4, 8)
+        resets[1] = step == 5
+        frozen[2] = step in (3, 4, 8)
         for env in envs:
             env.advance(actions, resets, None, frozen)
         for drone in range(3):
@@ -90,11 +93,10 @@ def test_over_udp() -> None:
 
 
 def test_the_spec_names_every_number() -> None:
-    usual, long = (
-        env_spec(EnvConfig(env_id=ELEVATION)),
-        env_spec(EnvConfig.from_keywords(ELEVATION, history=3)),
-    )
-    (one,), (three,) = usual.observation, long.observation
+    usual = env_spec(EnvConfig(env_id=ELEVATION))
+    long = env_spec(EnvConfig.from_keywords(ELEVATION, history=3))
+    (one,) = usual.observation
+    (three,) = long.observation
     assert three.shape == (9,)
     assert three.components[3:] == (
         "elevation error, 1 step ago", "rate of the error, 1 step ago",

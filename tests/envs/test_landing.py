@@ -70,7 +70,8 @@ def test_observation_by_hand() -> None:
         quaternion=about((1, 0, 0), 30.0), thrust=(49.0, 98.0, 0.0, 24.5),
     )  # fmt: skip
     seen = task.observe(state)["observation"]
-    half, root = 0.5, math.sqrt(3) / 2
+    half = 0.5
+    root = math.sqrt(3) / 2
     expected = [1, 1, -3, 1, 2, -3, 1, 0, 0, 0, -half, root, 0.1, 0.2, 0.3, 0, 1, -1, -0.5, 0, 1]
     assert seen == pytest.approx(expected, abs=1e-12)
     (spec,) = task.observation
@@ -173,13 +174,15 @@ def test_a_pilot_lands_and_a_stone_does_not() -> None:
         ("paper", "circle", {}),
         ("crazyflie2", "line", {"body_drag": True, "rotor_drag": True, "wind": [1.2, -0.8, 0.0]}),
     ):
-        craft, n = Vehicle.load(vehicle), 16
+        craft = Vehicle.load(vehicle)
+        n = 16
         env: Any = gym.make_vec(
             ID, num_envs=n, autoreset_mode="Disabled", vehicle=vehicle, motion=motion,
             effects=effects,
         )  # fmt: skip
         env.reset(seed=0)
-        pilot, landed = Pilot(craft), np.zeros(n)
+        pilot = Pilot(craft)
+        landed = np.zeros(n)
         while not env.done.all():
             flown = ~env.done
             actions = pilot.act(env.observations, wanted(env.observations, craft.num_rotors))
@@ -194,7 +197,8 @@ def test_a_pilot_lands_and_a_stone_does_not() -> None:
 
 def wanted(seen: np.ndarray, rotors: int) -> np.ndarray:
     """Follow the pad; come down to 1 m above it, and on it only when right above it."""
-    offset, pad = seen[:, :3].astype(float), seen[:, 15 + rotors :].astype(float)
+    offset = seen[:, :3].astype(float)
+    pad = seen[:, 15 + rotors :].astype(float)
     speed = seen[:, 3:6] - np.pad(pad, ((0, 0), (0, 1)))
     acceleration = 5 * offset - 4 * speed
     above = np.hypot(*offset.T[:2]) < 0.8

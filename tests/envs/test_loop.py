@@ -13,7 +13,8 @@ from rotorgram.envs.config import EnvConfig
 from rotorgram.models.errors import InputError
 from rotorgram.sim import CollectiveThrust, InitialState, stack
 
-ID, HOVER = "rotorgram/Elevation-v0", "rotorgram/Hover-v0"
+ID = "rotorgram/Elevation-v0"
+HOVER = "rotorgram/Hover-v0"
 HEXA = Path(__file__).parents[1] / "data" / "hexa.xml"
 
 
@@ -34,7 +35,8 @@ def shown(loop: Loop, drone: int) -> bytes:
 @pytest.mark.parametrize("env_id", [ID, HOVER])
 def test_a_frozen_drone_is_as_before(env_id: str) -> None:
     (held, actions), (free, _) = (started(env_id, episode_length=5) for _ in range(2))
-    first, second = np.array([True, False]), np.array([False, True])
+    first = np.array([True, False])
+    second = np.array([False, True])
     for loop in (held, free):
         loop.advance(actions)
     before = shown(held, 0)
@@ -68,7 +70,8 @@ def test_flags_of_those_that_do_not_fly() -> None:
 @pytest.mark.parametrize("num_envs", [1, 2])
 def test_masks_and_seeds_of_another_shape_are_refused(num_envs: int) -> None:
     loop, actions = started(num_envs=num_envs)
-    before, every = shown(loop, 0), np.ones(num_envs, bool)
+    before = shown(loop, 0)
+    every = np.ones(num_envs, bool)
     for wrong in (np.ones(3, bool), np.ones(num_envs), np.bool_(True), [True] * num_envs):
         for name in ("resets", "frozen"):
             with pytest.raises(InputError, match=r"^resets, frozen: expected bool of shape"):
@@ -87,11 +90,9 @@ def test_wrong_seeds_are_refused_before_the_others_fly() -> None:
 
 
 def test_a_first_reset_that_is_refused_begins_nothing() -> None:
-    loop, still, some = (
-        Loop(EnvConfig(env_id=ID), 2),
-        np.zeros((2, 1), np.float32),
-        np.array([True, False]),
-    )
+    loop = Loop(EnvConfig(env_id=ID), 2)
+    still = np.zeros((2, 1), np.float32)
+    some = np.array([True, False])
     with pytest.raises(InputError, match=r"^start: expected at least"):
         loop.advance(still, np.ones(2, bool), chosen={"start": np.full(2, 1e5)})
     loop.advance(still, some, frozen=~some)
@@ -99,8 +100,10 @@ def test_a_first_reset_that_is_refused_begins_nothing() -> None:
 
 
 def test_the_first_reset_may_be_of_some() -> None:
-    loop, every = Loop(EnvConfig(env_id=ID), 3), np.ones(3, bool)
-    still, some = np.zeros((3, 1), np.float32), np.array([False, True, False])
+    loop = Loop(EnvConfig(env_id=ID), 3)
+    every = np.ones(3, bool)
+    still = np.zeros((3, 1), np.float32)
+    some = np.array([False, True, False])
     loop.advance(still, some, [7, 7, 7], frozen=~some)
     alone = Loop(EnvConfig(env_id=ID))
     alone.advance(still[:1], every[:1], [7])
@@ -180,7 +183,8 @@ def test_a_tasks_memory_is_that_of_the_drones_that_flew(num_envs: int) -> None:
         loop = Loop(EnvConfig(env_id="counting-v0"), num_envs)
     finally:
         gym.registry.pop("counting-v0")
-    actions, everyone = np.zeros((num_envs, 1), np.float32), np.ones(num_envs, bool)
+    actions = np.zeros((num_envs, 1), np.float32)
+    everyone = np.ones(num_envs, bool)
     first = np.arange(num_envs) == 0
     loop.advance(actions, everyone, range(num_envs))
     assert loop.metrics["climb"].tolist() == [0.0] * num_envs
@@ -240,7 +244,8 @@ def test_a_task_may_give_constants_and_float32(num_envs: int) -> None:
             return outcome
 
     register("Plain-v0", Plain)
-    loop, still = Loop(EnvConfig(env_id="Plain-v0"), num_envs), np.zeros((num_envs, 1), np.float32)
+    loop = Loop(EnvConfig(env_id="Plain-v0"), num_envs)
+    still = np.zeros((num_envs, 1), np.float32)
     loop.advance(still, np.ones(num_envs, bool), chosen={"start": np.full(num_envs, 4.5)})
     loop.advance(still)
     assert loop.rewards.dtype == np.float64

@@ -82,7 +82,8 @@ def trained(here: Path, elsewhere: Path) -> Path:
 @pytest.fixture(scope="module")
 def recorded(here: Path, elsewhere: Path, trained: Path) -> Path:
     """A journal of an evaluation by an agent that lacks the file."""
-    port, journal = free_port(), elsewhere / "flight.mcap"
+    port = free_port()
+    journal = elsewhere / "flight.mcap"
     with simulator(here, port):
         words = ["--listen", f"127.0.0.1:{port}", "--episodes", "1", "--record", journal]
         told = rotorgram(elsewhere, "evaluate", trained, *words)

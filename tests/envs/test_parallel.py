@@ -30,10 +30,8 @@ def test_an_agent_leaves_where_its_episode_ends() -> None:
         _, rewards, terminated, truncated, infos = env.step(actions)
         assert set(rewards) == set(infos) == {"drone_0", "drone_1"}
     assert env.agents == ["drone_1"]
-    assert (terminated, truncated) == (
-        {"drone_0": True, "drone_1": False},
-        {"drone_0": False, "drone_1": False},
-    )
+    assert terminated == {"drone_0": True, "drone_1": False}
+    assert truncated == {"drone_0": False, "drone_1": False}
     assert abs(infos["drone_0"]["risen"]) > 0.5
     seen, *_ = env.step(actions)  # an action of one that left is ignored
     assert list(seen) == ["drone_1"]

@@ -54,7 +54,8 @@ def test_observation_by_hand() -> None:
         payload=(0.1, 2.3, 5.2), payload_velocity=(1.5, 1.0, -3.0),
     )  # fmt: skip
     seen = task.observe(state)["observation"]
-    half, root = 0.5, math.sqrt(3) / 2
+    half = 0.5
+    root = math.sqrt(3) / 2
     craft = [0.5, 0, 1, 1, 2, -3, 1, 0, 0, 0, -half, root, 0.1, 0.2, 0.3, 0, 1, -1, -0.5]
     assert seen == pytest.approx([*craft, -0.4, 0.3, -0.8, 0.5, -1, 0], abs=1e-12)
     assert task.goal(state).tolist() == [1.0, 2.0, 6.0]
@@ -111,10 +112,12 @@ def swinging_pilot(seen: np.ndarray, rotors: int) -> np.ndarray:
 @pytest.mark.parametrize("vehicle", ["paper", "crazyflie2", "heavy_hexa"])
 def test_a_pilot_damps_the_swing(vehicle: str) -> None:
     """From all of 16 starts: below 5 cm and 1° for the last second."""
-    craft, n = Vehicle.load(vehicle), 16
+    craft = Vehicle.load(vehicle)
+    n = 16
     env: Any = gym.make_vec(ID, num_envs=n, autoreset_mode="Disabled", vehicle=vehicle)
     env.reset(seed=0)
-    pilot, errors = Pilot(craft, 100.0, 20.0), []
+    pilot = Pilot(craft, 100.0, 20.0)
+    errors = []
     while not env.done.any():
         seen = env.observations
         wanted = 1.1 * swinging_pilot(seen, craft.num_rotors) + (0, 0, 0.1 * craft.gravity)

@@ -172,7 +172,8 @@ def test_wrong_tracks(content: Any, sentence: str) -> None:
 def test_a_pilot_flies_it(track: str, name: str | None) -> None:
     vehicle = Vehicle.load(name)
     env = gym.make_vec(ID, 4, vehicle=name, autoreset_mode="Disabled", track=track, laps=1)
-    pilot, done = Pilot(vehicle), np.zeros(4, bool)
+    pilot = Pilot(vehicle)
+    done = np.zeros(4, bool)
     first = 15 + vehicle.num_rotors
     seen, _ = env.reset(seed=3)
     for _ in range(1499):

@@ -48,7 +48,8 @@ def test_a_spec_tells_of_pictures() -> None:
     spec = env_spec(EnvConfig.from_keywords(LANDING, cameras=[EYES]))
     down, depth, objects = spec.observation[1:]
     assert objects.categories == ("nothing", "scene/floor", "drone_0", "task/disc_0 of drone_0")
-    assert (down.categories, depth.unit) == ((), "m")
+    assert down.categories == ()
+    assert depth.unit == "m"
     assert down.frame.endswith("m in the body, looks along (0 0 -1), 90 degrees high")
     assert spec.options["cameras"] == EYES.split(",")
     assert type(spec).from_json(spec.to_json()) == spec
@@ -61,14 +62,16 @@ def test_the_flight_is_that_without_cameras(opengl: None) -> None:
         closing(gym.make(HOVER, **more)) as blind,
         closing(gym.make(HOVER, cameras="front@8x8", scene="airport", **more)) as seeing,
     ):
-        first, second = blind.reset(seed=3)[0], seeing.reset(seed=3)[0]
+        first = blind.reset(seed=3)[0]
+        second = seeing.reset(seed=3)[0]
         seeing.action_space.seed(4)
         for _ in range(60):
             assert first.tobytes() == second["observation"].tobytes()
             action = seeing.action_space.sample()
             first, *rest, info = blind.step(action)
             second, *others, told = seeing.step(action)
-            assert (rest, info) == (others, told)
+            assert rest == others
+            assert info == told
             if rest[1] or rest[2]:
                 break
 
@@ -96,7 +99,8 @@ def test_pictures_cross_the_wire(opengl: None) -> None:
         flying(1, 2, LANDING, cameras=EYES.split(",")) as (remote, _),
         closing(LocalVectorEnv(LANDING, 2, cameras=EYES)) as local,
     ):
-        here, there = remote.reset(seed=8)[0], local.reset(seed=8)[0]
+        here = remote.reset(seed=8)[0]
+        there = local.reset(seed=8)[0]
         assert remote.observation_space == local.observation_space
         dice = np.random.default_rng(2)
         for _ in range(12):
@@ -104,7 +108,8 @@ def test_pictures_cross_the_wire(opengl: None) -> None:
             for name, values in here.items():
                 assert values.tobytes() == there[name].tobytes()
             actions = dice.uniform(-1, 1, local.action_space.shape).astype(np.float32)
-            here, there = remote.step(actions)[0], local.step(actions)[0]
+            here = remote.step(actions)[0]
+            there = local.step(actions)[0]
 
 
 def test_a_slow_camera_holds_its_picture(opengl: None, tmp_path: Path) -> None:
@@ -149,9 +154,11 @@ def test_pictures_of_the_backend_rigid(opengl: None) -> None:
         closing(LocalVectorEnv(HOVER, 2, cameras="down", backend="mujoco")) as usual,
         closing(LocalVectorEnv(HOVER, 2, cameras="down", backend="rigid")) as rigid,
     ):
-        first, second = usual.reset(seed=5)[0], rigid.reset(seed=5)[0]
+        first = usual.reset(seed=5)[0]
+        second = rigid.reset(seed=5)[0]
         pictures = np.asarray(second["down"])
-        assert (pictures.dtype, pictures.shape) == (np.uint8, (2, 64, 64, 3))
+        assert pictures.dtype == np.uint8
+        assert pictures.shape == (2, 64, 64, 3)
         assert np.abs(pictures.astype(int) - first["down"]).max() <= 1
         craft = Vehicle.load()
         told = rigid.loop.world.state
@@ -170,7 +177,8 @@ def test_each_episode_has_a_world_of_its_own(opengl: None) -> None:
         "cameras": "front@32x24,front_segmentation@32x24", "scene": "warehouse:0-2",
         "action": "velocity", "episode_length": 2,
     }  # fmt: skip
-    seeds, still = [3, 4, 5, 6], np.zeros((4, 4), np.float32)
+    seeds = [3, 4, 5, 6]
+    still = np.zeros((4, 4), np.float32)
     with closing(LocalVectorEnv(HOVER, 4, autoreset_mode="Disabled", **options)) as env:
         assert (
             env.env_spec.observation
@@ -184,7 +192,8 @@ def test_each_episode_has_a_world_of_its_own(opengl: None) -> None:
     for number in range(3):
         alone = options | {"scene": f"warehouse:{number}"}
         with closing(LocalVectorEnv(HOVER, 4, autoreset_mode="Disabled", **alone)) as env:
-            own, stepped = env.reset(seed=seeds)[0], env.step(still)[0]
+            own = env.reset(seed=seeds)[0]
+            stepped = env.step(still)[0]
             objects = np.array(env.env_spec.observation[2].categories)
         same = (own["front"] == first["front"]).all(axis=(1, 2, 3))
         for row in np.flatnonzero(same):
@@ -267,7 +276,8 @@ def test_a_simulator_without_opengl_says_so_in_a_sentence() -> None:
 
 def test_pictures_of_a_swarm_cross_a_lossy_wire(opengl: None) -> None:
     """One State for the world, 30 % of the datagrams lost: every bit of every drone's picture."""
-    words, name = "front_segmentation@24x16,down@8x8", "rotorgram/Formation-v0"
+    words = "front_segmentation@24x16,down@8x8"
+    name = "rotorgram/Formation-v0"
     local = LocalParallelEnv(name, 3, cameras=words)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(ANY)
@@ -280,7 +290,8 @@ def test_pictures_of_a_swarm_cross_a_lossy_wire(opengl: None) -> None:
         running = Running(simulator)
         with closing(RemoteParallelEnv(agent)) as remote, closing(local):
             assert remote.observation_spaces == local.observation_spaces
-            here, there = remote.reset(seed=4)[0], local.reset(seed=4)[0]
+            here = remote.reset(seed=4)[0]
+            there = local.reset(seed=4)[0]
             dice = np.random.default_rng(6)
             for _ in range(8):
                 assert here.keys() == there.keys() == {*local.agents}
@@ -289,7 +300,8 @@ def test_pictures_of_a_swarm_cross_a_lossy_wire(opengl: None) -> None:
                         assert here[drone][part].tobytes() == values.tobytes()
                 shape = local.action_space("drone_0").shape
                 actions = {one: dice.uniform(-1, 1, shape).astype("f4") for one in local.agents}
-                here, there = remote.step(actions)[0], local.step(actions)[0]
+                here = remote.step(actions)[0]
+                there = local.step(actions)[0]
         running.join()
 
 

@@ -23,7 +23,8 @@ from rotorgram.envs.spec import (
 )
 from rotorgram.models.errors import InputError
 
-ID, HOVER = "rotorgram/Elevation-v0", "rotorgram/Hover-v0"
+ID = "rotorgram/Elevation-v0"
+HOVER = "rotorgram/Hover-v0"
 PICTURE = ArraySpec(name="picture", shape=(4, 5, 3), dtype="uint8", low=0, high=255)
 WORDS = st.text(st.characters(exclude_categories=["Cc", "Cs"]), min_size=1, max_size=20)
 NUMBERS = st.floats(-1e6, 1e6)
@@ -44,7 +45,9 @@ def spec_of(**rest: Any) -> EnvSpec:
 
 def test_the_elevation_env_by_hand() -> None:
     spec = env_spec(EnvConfig.from_keywords(ID, target=(4, 8)))
-    assert (spec.env_id, spec.control_period, spec.agents) == (ID, 0.02, ("drone_0",))
+    assert spec.env_id == ID
+    assert spec.control_period == 0.02
+    assert spec.agents == ("drone_0",)
     assert spec.options["target"] == [4.0, 8.0]  # as JSON gives it back
     assert [array.name for array in spec.telemetry] == [
         "position", "attitude", "thrust", "goal", "metrics",
@@ -133,7 +136,8 @@ def test_any_spec_survives_json(spec: EnvSpec) -> None:
 def test_bounds_of_the_same_value_are_one_number() -> None:
     one = ArraySpec(name="a", shape=(2, 3), low=(-1.0,) * 6, high=np.full((2, 3), 2.0))  # type: ignore[arg-type]
     assert one == ArraySpec(name="a", shape=(2, 3), low=-1.0, high=2.0)
-    assert (one.low, one.high) == (-1.0, 2.0)
+    assert one.low == -1.0
+    assert one.high == 2.0
     assert one.bounds()[1].tolist() == [[2.0] * 3] * 2
     assert '"low":-1.0' in spec_of(observation=(one,)).to_json()
 

@@ -20,7 +20,8 @@ def begun(worlds: int = 1, drones: int = 2, **options: int) -> Loop:
 def test_a_world_tells_its_drones_by_name_and_row() -> None:
     loop = begun(2, 3)
     assert loop.spec.agents == ("drone_0", "drone_1", "drone_2")
-    assert (loop.num_envs, loop.observations["observation"].shape) == (6, (6, 3))
+    assert loop.num_envs == 6
+    assert loop.observations["observation"].shape == (6, 3)
     rows = loop.observations["observation"][:, 0].reshape(2, 3)
     assert rows == pytest.approx(np.tile(5.0 * np.arange(3), (2, 1)), abs=0.1)
     assert len(np.unique(rows - 5.0 * np.arange(3))) == 6
@@ -34,7 +35,9 @@ def test_one_that_ends_is_out_and_the_others_fly_on() -> None:
     for step in range(30):
         loop.advance(up)
         if loop.terminated[0]:
-            ends, out_at, climb = ends + 1, step, loop.world.state.velocity[0, 0, 2]
+            ends = ends + 1
+            out_at = step
+            climb = loop.world.state.velocity[0, 0, 2]
             assert (loop.rewards[0], loop.done.any()) == (1.0, False)
             assert loop.out.tolist() == [True, False]
         rewards += loop.rewards[0]
@@ -53,7 +56,8 @@ def test_one_that_ends_is_out_and_the_others_fly_on() -> None:
 
 
 def test_a_world_begins_anew_while_another_flies_on() -> None:
-    loop, alone = begun(2), begun(2)
+    loop = begun(2)
+    alone = begun(2)
     up = np.array([[1.0], [1.0], [0.0], [0.0]], np.float32)
     while not loop.done.any():
         loop.advance(up)

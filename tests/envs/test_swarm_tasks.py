@@ -70,7 +70,8 @@ class Lots(Draw):
 
 
 PLACES = np.array([[[0.0, 0.0, 5.0], [3.0, 0.0, 5.0], [0.0, 40.0, 5.0]]])
-STILL, LOTS = np.zeros((1, 3, 3)), np.array([[0.1, 0.2, 0.3]])
+STILL = np.zeros((1, 3, 3))
+LOTS = np.array([[0.1, 0.2, 0.3]])
 SPEAKING = np.zeros((1, 3), bool)
 
 
@@ -207,7 +208,8 @@ def test_the_target_moves_no_faster_than_it_may_and_its_velocity_is_told() -> No
     env = LocalVectorEnv(TASKS[2], 2, drones=2, target_speed=3.0, target_path=4.0)
     env.reset(seed=1)
     task: Any = env.loop.task
-    before, speeds = task.target()[0], []
+    before = task.target()[0]
+    speeds = []
     for _ in range(400):
         seen, *_ = env.step(np.zeros((2, 4), np.float32))
         now, velocity = task.target()

@@ -47,7 +47,8 @@ def test_a_lemniscate_by_hand() -> None:
     """At 45° of φ: (cos φ, sin φ cos φ) / (1 + sin² φ) = (√2 / 3, 1 / 3)."""
     task = begun(0.125, trajectory="lemniscate", radius=3.0, period=20.0)
     assert task.goal(state_of()) == pytest.approx([math.sqrt(2), 1.0, 5.0])
-    table, step = task._table, 0.02
+    table = task._table
+    step = 0.02
     assert task._rates[1:-1] == pytest.approx((table[2:] - table[:-2]) / (2 * step), abs=1e-4)
 
 
@@ -104,7 +105,8 @@ def test_minimum_snap_through_points(points: int) -> None:
     for order in (1, 2, 3):
         assert np.abs(snap_basis(points, ends, order)).max() < 1e-4 * points**order
     # Six derivatives are continuous, and points on a line of any place add up to 1.
-    inner, little = knots[1:-1], 1e-9
+    inner = knots[1:-1]
+    little = 1e-9
     for order in range(7):
         before, after = (snap_basis(points, inner + side, order) for side in (-little, little))
         assert before == pytest.approx(after, abs=1e-4 * points ** (order + 1))
@@ -186,7 +188,8 @@ def test_wrong_options(options: dict[str, Any], sentence: str) -> None:
 def test_a_pilot_flies_it(trajectory: str, name: str | None) -> None:
     vehicle = Vehicle.load(name)
     env = gym.make_vec(ID, 4, vehicle=name, autoreset_mode="Disabled", trajectory=trajectory)
-    pilot, first = Pilot(vehicle), 15 + vehicle.num_rotors
+    pilot = Pilot(vehicle)
+    first = 15 + vehicle.num_rotors
     seen, _ = env.reset(seed=3)
     errors = []
     for _ in range(599):

@@ -16,7 +16,8 @@ from rotorgram.envs.config import EnvConfig
 from rotorgram.models.errors import InputError
 from rotorgram.sim import PhysicsError
 
-ID, HOVER = "rotorgram/Elevation-v0", "rotorgram/Hover-v0"
+ID = "rotorgram/Elevation-v0"
+HOVER = "rotorgram/Hover-v0"
 HEXA = Path(__file__).parents[1] / "data" / "hexa.xml"
 N = 7
 FLOWN: list[tuple[str, dict[str, Any]]] = [
@@ -137,7 +138,8 @@ def test_a_mask_resets_some_and_leaves_the_others(env_id: str) -> None:
 
 def test_targets_and_starts_of_ones_own() -> None:
     env = LocalVectorEnv(ID, 3)
-    targets, starts = np.array([3.0, 5.0, 400.0]), np.array([2.5, 7.0, 399.0])
+    targets = np.array([3.0, 5.0, 400.0])
+    starts = np.array([2.5, 7.0, 399.0])
     observations, info = env.reset(options={"target": targets, "start": starts})
     assert info["Y"].tolist() == starts.tolist()
     assert info["Y_goal"].tolist() == targets.tolist()
@@ -222,7 +224,8 @@ def test_a_step_before_a_reset() -> None:
 
 def test_a_bad_state_raises_and_a_reset_mends_it() -> None:
     loop = Loop(EnvConfig(env_id=ID), 3)
-    still, every = np.zeros((3, 1), np.float32), np.ones(3, bool)
+    still = np.zeros((3, 1), np.float32)
+    every = np.ones(3, bool)
     loop.advance(still, every, [0, 1, 2])
     before = loop.observations["observation"].copy()
     loop.world.state.velocity[1, 0, 2] = 1e12
@@ -237,13 +240,15 @@ def test_a_bad_state_raises_and_a_reset_mends_it() -> None:
 
 def test_an_error_of_the_physics_leaves_no_warnings(monkeypatch: pytest.MonkeyPatch) -> None:
     """Env 1 goes bad in the call in which MuJoCo fails in env 0."""
-    loop, step = Loop(EnvConfig(env_id=ID), 2), Batch.step
+    loop = Loop(EnvConfig(env_id=ID), 2)
+    step = Batch.step
 
     def failing(batch: Any, *arguments: Any, **named: Any) -> None:
         step(batch, *arguments, **named)
         raise SimulationError(np.array([0]), "out of memory")
 
-    still, first = np.zeros((2, 1), np.float32), np.array([True, False])
+    still = np.zeros((2, 1), np.float32)
+    first = np.array([True, False])
     loop.advance(still, first | True, [0, 1])
     loop.world.state.velocity[1, 0, 2] = 1e12
     with monkeypatch.context() as patch:

@@ -31,7 +31,9 @@ def moved(task: Any, *position: float, **rest: Any) -> Any:
     return task.outcome(state)
 
 
-MIDDLE, EAST, ABOVE = (0.5, 0.5, 0.5), (1.0, 0.5, 0.5), (1.0, 0.5, 1.0)
+MIDDLE = (0.5, 0.5, 0.5)
+EAST = (1.0, 0.5, 0.5)
+ABOVE = (1.0, 0.5, 1.0)
 
 
 def test_starts_and_points_by_hand() -> None:
@@ -121,7 +123,8 @@ def test_wrong_options(options: dict[str, Any], sentence: str) -> None:
 def test_a_pilot_flies_it(name: str | None) -> None:
     vehicle = Vehicle.load(name)
     env = gym.make_vec(ID, 8, vehicle=name, autoreset_mode="Disabled")
-    pilot, done = Pilot(vehicle), np.zeros(8, bool)
+    pilot = Pilot(vehicle)
+    done = np.zeros(8, bool)
     seen, _ = env.reset(seed=3)
     for _ in range(749):
         wanted = limited(2.0 * seen[:, :3].astype(float), 2.0) - seen[:, 3:6]

@@ -20,7 +20,8 @@ from rotorgram.models.errors import InputError
 from rotorgram.udp.spawn import spawn_simulator
 
 RACER = Path(__file__).parents[1] / "data" / "racer.xml"
-ELEVATION, HOVER = "rotorgram/Elevation-v0", "rotorgram/Hover-v0"
+ELEVATION = "rotorgram/Elevation-v0"
+HOVER = "rotorgram/Hover-v0"
 WORLD: dict[str, Any] = {
     "effects": {"motor_lag": True, "body_drag": True, "wind": [0.5, 0.0, 0.0], "gusts": 2.0},
     "randomize": {
@@ -45,7 +46,8 @@ def flight(env: Any, seed: int, steps: int = 30) -> list[np.ndarray]:
 
 
 def test_a_delay_gives_what_was_sent_so_many_steps_ago() -> None:
-    neutral, age = np.full((3, 1, 1), -1.0), np.array([[0], [1], [2]])
+    neutral = np.full((3, 1, 1), -1.0)
+    age = np.array([[0], [1], [2]])
     world: Any = SimpleNamespace(parameters={"action_delay": age})
     delay = ActionDelay(world, 2, neutral)
     record = Record((3, 1), Memory())
@@ -74,7 +76,8 @@ def test_a_late_action_acts_as_one_that_was_given_later(late: int) -> None:
     delayed.reset(seed=2)
     waited = [np.zeros(4, np.float32)] * late + list(given)
     for now, then in zip(given, waited, strict=False):
-        ours, theirs = delayed.step(now), plain.step(then)
+        ours = delayed.step(now)
+        theirs = plain.step(then)
         assert (ours[0] == theirs[0]).all()
         assert ours[1] == theirs[1]
 
@@ -123,7 +126,8 @@ def test_a_batch_equals_single_envs(env_id: str) -> None:
 def test_over_udp_the_same_bits_and_what_was_drawn() -> None:
     here = gym.make(HOVER, vehicle=str(RACER), **WORLD)
     with spawn_simulator(EnvConfig.from_keywords(HOVER, vehicle=RACER, **WORLD)) as remote:
-        ours, theirs = here.reset(seed=4), remote.reset(seed=4)
+        ours = here.reset(seed=4)
+        theirs = remote.reset(seed=4)
         assert (ours[0] == theirs[0]).all()
         for name in ("drawn_mass", "drawn_wind_y", "drawn_action_delay"):
             assert ours[1][name] == theirs[1][name]

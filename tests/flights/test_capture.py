@@ -65,7 +65,8 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 def test_random_places_fill_the_box(tmp_path: Path) -> None:
     poses, _ = plan_of(tmp_path, PLAN.replace("count = 5", "count = 400")).sequences()
-    position, quaternion = poses.position[:, 0], poses.quaternion[:, 0]
+    position = poses.position[:, 0]
+    quaternion = poses.quaternion[:, 0]
     assert position.min(axis=0) == pytest.approx([-2, -2, 1], abs=0.1)
     assert position.max(axis=0) == pytest.approx([2, 2, 3], abs=0.1)
     assert np.linalg.norm(quaternion, axis=1) == pytest.approx(1.0)
@@ -82,7 +83,8 @@ def test_random_places_fill_the_box(tmp_path: Path) -> None:
 
 def test_places_and_flights_share_worlds(tmp_path: Path) -> None:
     """Places as evenly as they can be, flights in turn."""
-    path, flight = tmp_path / "plan.toml", 'env = "rotorgram/Hover-v0"\nepisodes = 3\nevery = 500'
+    path = tmp_path / "plan.toml"
+    flight = 'env = "rotorgram/Hover-v0"\nepisodes = 3\nevery = 500'
     sources = f'[[poses]]\nfrom = "random"\ncount = 8\n[[poses]]\nfrom = "flight"\n{flight}'
     path.write_text(f'world = "gates:1-3"\n{sources}')
     sequences = Plan.read(path).sequences()
@@ -164,8 +166,12 @@ def test_boxes_and_runs_are_those_of_the_mask() -> None:
     numbers[1:4, 2:5] = 2
     numbers[2, 3] = 1
     one, two = objects_in(numbers, ["nothing", "inner", "outer"])
-    assert (one["name"], one["box"], one["area"]) == ("inner", [3, 2, 1, 1], 1)
-    assert (two["name"], two["box"], two["area"]) == ("outer", [2, 1, 3, 3], 8)
+    assert one["name"] == "inner"
+    assert one["box"] == [3, 2, 1, 1]
+    assert one["area"] == 1
+    assert two["name"] == "outer"
+    assert two["box"] == [2, 1, 3, 3]
+    assert two["area"] == 8
     # Down the columns: 10 of the first two, the third's first; then 3; and so on.
     assert two["runs"] == [11, 3, 2, 1, 1, 1, 2, 3, 6]
     full = next(objects_in(np.ones((2, 2), np.int32), ["nothing", "all"]))
@@ -238,8 +244,10 @@ def test_boxes_are_those_of_the_pictures(captured: Path) -> None:
         assert ((numbers == value) == mask).all()
         rows, columns = np.nonzero(mask)
         left, top, width, height = one["bbox"]
-        assert (columns.min(), rows.min()) == (left, top)
-        assert (columns.max() + 1, rows.max() + 1) == (left + width, top + height)
+        assert columns.min() == left
+        assert rows.min() == top
+        assert columns.max() + 1 == left + width
+        assert rows.max() + 1 == top + height
         assert one["area"] == mask.sum()
 
 
@@ -278,7 +286,8 @@ def test_it_is_the_same_again_and_goes_on(captured: Path, tmp_path: Path) -> Non
     whole = contents(captured)
     whole.pop("plan.toml")
     assert {k: v for k, v in contents(folder).items() if k != "plan.toml"} == whole
-    kept, other = folder / "rgb" / "down" / "000001.png", bytearray(whole["rgb/down/000001.png"])
+    kept = folder / "rgb" / "down" / "000001.png"
+    other = bytearray(whole["rgb/down/000001.png"])
     other[other.index(b"IEND") + 5] ^= 1  # of the same size, and a picture
     kept.write_bytes(other)
     for number in (2, 7):
@@ -413,7 +422,8 @@ def test_a_task_of_a_module_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 def test_a_full_disk_loses_nothing(
     opengl: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder, written = tmp_path / "full", []
+    folder = tmp_path / "full"
+    written = []
     folder.mkdir()
     whole = capturing.write_whole
 
@@ -482,6 +492,7 @@ def test_a_run_that_is_killed_goes_on(captured: Path, tmp_path: Path) -> None:
     done = subprocess.run([*line, "--jobs", "1"], cwd=tmp_path, stdout=subprocess.PIPE, text=True)
     assert done.returncode == 0
     assert "out: 8 frames" in done.stdout
-    whole, told = contents(captured), contents(tmp_path / "out")
+    whole = contents(captured)
+    told = contents(tmp_path / "out")
     left = {name for name in told if name.endswith(".part")}
     assert {name: told[name] for name in told.keys() - left} == whole

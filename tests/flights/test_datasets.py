@@ -26,7 +26,8 @@ from rotorgram.udp import LinkConfig, RemoteEnv, RemoteVectorEnv, Simulator
 pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")
 LOSSY = FaultConfig(drop=0.1, duplicate=0.1, reorder=0.1, seed=3)
-ELEVATION, HOVER = "rotorgram/Elevation-v0", "rotorgram/Hover-v0"
+ELEVATION = "rotorgram/Elevation-v0"
+HOVER = "rotorgram/Hover-v0"
 
 
 @contextmanager
@@ -61,7 +62,8 @@ def fly_one(remote: RemoteEnv, seeds: list[int | None], most: int = 10**6) -> li
     episodes = []
     for seed in seeds:
         observation, _ = remote.reset(seed=seed)
-        seen, done = [(observation, None)], False
+        seen = [(observation, None)]
+        done = False
         while not done and len(seen) <= most:
             observation, reward, terminated, truncated, _ = remote.step(
                 remote.action_space.sample()
@@ -89,7 +91,8 @@ def same(a: Any, b: Any) -> bool:
 def flown_again(env: gym.Env[Any, Any], seed: int, actions: Any) -> tuple[list[Any], list[Any]]:
     """Observations and (reward, terminated, truncated) of these actions from this seed."""
     observation, _ = env.reset(seed=seed)
-    observations, outcomes = [observation], []
+    observations = [observation]
+    outcomes = []
     for action in actions:
         observation, reward, terminated, truncated, _ = env.step(action)
         observations.append(observation)
@@ -203,12 +206,12 @@ def test_a_frozen_drone_makes_no_steps(tmp_path: Path) -> None:
             frozen = np.array([step >= 4, step in (1, 2)])
             remote.advance(np.full((2, 1), step / 8, np.float32), None, None, frozen)
     first, second = RecordedEpisodes([path])
-    assert (first.drone, first.seed, first.actions.ravel().tolist()) == (
-        0, 20, [0.0, 0.125, 0.25, 0.375]
-    )  # fmt: skip
-    assert (second.drone, second.seed, second.actions.ravel().tolist()) == (
-        1, 21, [0.0, 0.375, 0.5, 0.625]
-    )  # fmt: skip
+    assert first.drone == 0
+    assert first.seed == 20
+    assert first.actions.ravel().tolist() == [0.0, 0.125, 0.25, 0.375]
+    assert second.drone == 1
+    assert second.seed == 21
+    assert second.actions.ravel().tolist() == [0.0, 0.375, 0.5, 0.625]
 
 
 def test_several_journals_are_one_data_set(tmp_path: Path) -> None:
@@ -270,7 +273,8 @@ def test_a_write_that_fails_names_the_file_and_leaves_none(tmp_path: Path) -> No
     journal = tmp_path / "flight.mcap"
     with recording(journal, episode_length=5) as remote:
         fly_one(remote, [1])
-    out, limits = tmp_path / "flight.parquet", resource.getrlimit(resource.RLIMIT_FSIZE)
+    out = tmp_path / "flight.parquet"
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     episodes = RecordedEpisodes([journal])
     resource.setrlimit(resource.RLIMIT_FSIZE, (100, limits[1]))  # bytes, of any file
     try:

@@ -75,7 +75,8 @@ def test_positions_of_a_log_have_z_up(journal: Path, tmp_path: Path) -> None:
 
 def test_parquet_has_the_same_numbers_and_units_in_metadata(journal: Path, tmp_path: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet")
-    out, text = tmp_path / "log.parquet", tmp_path / "log.csv"
+    out = tmp_path / "log.parquet"
+    text = tmp_path / "log.csv"
     assert main(["log", str(journal), "--parquet", "--out", str(out)]) == 0
     assert main(["log", str(journal), "--csv", "--out", str(text)]) == 0
     read = parquet.read_table(out)
@@ -132,7 +133,9 @@ def test_columns_of_a_flight_by_hand() -> None:
     columns = {column.name: column.values.tolist() for column in columns_of(flight)}
     assert columns["time"] == [0.0, 0.02]
     assert columns["episode"] == [7, 7]
-    assert (columns["x"], columns["y"], columns["z"]) == ([3.0, 3.0], [-1.0, -1.0], [2.0, 2.5])
+    assert columns["x"] == [3.0, 3.0]
+    assert columns["y"] == [-1.0, -1.0]
+    assert columns["z"] == [2.0, 2.5]
     assert columns["qw"] == pytest.approx([1.0, math.sqrt(0.5)])
     assert columns["qz"] == pytest.approx([0.0, -math.sqrt(0.5)])
     assert columns["reward"][1] == 0.5

@@ -77,20 +77,27 @@ def test_a_trajectory_is_what_the_env_tells() -> None:
         flown = fly(env, PID(SPEC), 7, episode=3)
         observation, info = env.reset(seed=7)
         policy = PID(SPEC)
-        heights, errors, rewards = [info["Y"]], [info["elevation_error"]], []
+        heights = [info["Y"]]
+        errors = [info["elevation_error"]]
+        rewards = []
         for _ in range(25):
             observation, reward, *_, info = env.step(policy.act(observation))
             heights.append(info["Y"])
             errors.append(info["elevation_error"])
             rewards.append(reward)
-    assert (len(flown), flown.ending, flown.seconds, flown.episode) == (25, "truncated", 0.5, 3)
+    assert len(flown) == 25
+    assert flown.ending == "truncated"
+    assert flown.seconds == 0.5
+    assert flown.episode == 3
     assert flown.telemetry["position"][:, 1].tolist() == heights
     assert flown.headline.tolist() == errors
     assert flown.rewards.tolist() == rewards
     assert flown.mean_thrust[0] == pytest.approx(49.0)
     assert [flown.step_at(s) for s in (-1.0, 0.0, 0.06, 0.07, 9.0)] == [0, 0, 3, 3, 25]
     row = measure_episode(flown, Headline.of(SPEC))
-    assert (row["episode"], row["length"], row["start"]) == (3, 25, errors[0])
+    assert row["episode"] == 3
+    assert row["length"] == 25
+    assert row["start"] == errors[0]
     # A quarter of 25 steps is 6.
     assert row["steady"] == pytest.approx(np.mean(np.abs(errors[-6:])), rel=1e-12)
     assert row["return"] == pytest.approx(sum(rewards), rel=1e-12)
@@ -114,7 +121,9 @@ def test_a_recorded_trajectory_is_the_one_that_was_flown(tmp_path: Path) -> None
     recorded = recorded_trajectories(journal, [0, 1, 2])
     assert all(map(same, flown, recorded))
     last = recorded[2]
-    assert (len(last), last.ending, last.episode) == (1, "cut off", 2)
+    assert len(last) == 1
+    assert last.ending == "cut off"
+    assert last.episode == 2
     with pytest.raises(ValueError, match=r"episode: expected 0 to 2 in .*, got 3"):
         recorded_trajectories(journal, [3])
 
@@ -143,7 +152,8 @@ def test_any_drone_of_any_session(tmp_path: Path) -> None:
             assert found.telemetry["position"][:, 1].tolist() == heights
             assert found.ending == "cut off"
     (second,) = recorded_trajectories(journal, [1], drone=1, session=1)
-    assert (len(second), second.episode) == (3, 1)
+    assert len(second) == 3
+    assert second.episode == 1
     for choice, sentence in (
         ({"drone": 2}, "drone: expected 0 to 1 in .*, got 2"),
         ({"drone": -1}, "drone: expected 0 to 1"),

@@ -146,7 +146,8 @@ def fuzz_text(data: bytes) -> None:
 
 
 def fuzz_keys(data: bytes) -> None:
-    ours, theirs = Key(SECRET, "simulator"), Key(SECRET, "agent")
+    ours = Key(SECRET, "simulator")
+    theirs = Key(SECRET, "agent")
     expect(theirs.open(ours.seal(data)) == data, "not opened")
     expect(theirs.open(ours.seal(data, data), data) == data, "not opened")
     for hostile in (data, b"\xa7S" + data, ours.seal(data)[:-1] + b"x" + data, theirs.seal(data)):
@@ -157,11 +158,14 @@ def fuzz_keys(data: bytes) -> None:
 
 def fuzz_fragments(data: bytes) -> None:
     """Fragments in any order, of messages that are a few bytes long."""
-    program, largest = Program(data), 100
+    program = Program(data)
+    largest = 100
     assembler = Assembler(largest)
     came: dict[tuple[int, int, int], set[bytes]] = {}
     while program:
-        sequence, number, count = program.byte() % 3, program.byte() % 5, program.byte() % 5
+        sequence = program.byte() % 3
+        number = program.byte() % 5
+        count = program.byte() % 5
         head = b"" if number else binary.frame(binary.STATE, SESSION, sequence, b"")
         piece = head + program.piece()
         fragment = fragment_of(binary.STATE, SESSION, sequence, number, count, piece)
@@ -199,7 +203,8 @@ class Program:
     """Bytes as numbers and pieces; zeros behind the end."""
 
     def __init__(self, data: bytes) -> None:
-        self._data, self._at = data, 0
+        self._data = data
+        self._at = 0
 
     def __bool__(self) -> bool:
         return self._at < len(self._data)
@@ -318,7 +323,8 @@ class Flight:
 
     def give_simulator(self, datagram: bytes, address: Address) -> None:
         link = self.simulators[address]
-        sequence, session = link.sequence, link.hello.session
+        sequence = link.sequence
+        session = link.hello.session
         message = link.receive(datagram, self.now)
         if isinstance(message, Command):
             check_numbers(message)
@@ -349,10 +355,12 @@ class Flight:
 
     def make(self, program: Program) -> bytes:
         """A datagram of its own, or of what it has seen; changed, made right, sealed."""
-        source, flags = program.byte(), program.byte()
+        source = program.byte()
+        flags = program.byte()
         datagram = self.seen[source % len(self.seen)] if source and self.seen else program.piece()
         if flags & 1:
-            at, new = program.byte(), program.piece()
+            at = program.byte()
+            new = program.piece()
             datagram = datagram[:at] + new + datagram[at + len(new) :]
         if flags & 2:
             datagram = datagram[: program.byte()]

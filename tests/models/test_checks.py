@@ -272,7 +272,8 @@ def test_every_group_has_a_name_of_its_own_and_examine_runs_it() -> None:
 def test_passing_is_within_limits_and_never_nan(measured: float, passed: bool) -> None:
     check = Check(name="x", measured=measured, low=0.75, high=1.25, unit="m", source="hand",
                   meaning="it is wrong", expected=1.0)  # fmt: skip
-    assert (check.passed, check.tolerance) == (passed, 0.25)
+    assert check.passed == passed
+    assert check.tolerance == 0.25
     assert [one.name for one in failed([check])] == ([] if passed else ["x"])
     assert check.report()["measured"] == (None if math.isnan(measured) else measured)
 
@@ -308,7 +309,8 @@ def test_euler_misses_a_free_fall_in_proportion_to_the_step(tmp_path: Path) -> N
 
 def test_the_error_is_as_large_as_predicted() -> None:
     craft = ExaminedModel.read(DATA / "tiny.xml")
-    found, reached = craft.convergence, []
+    found = craft.convergence
+    reached = []
     for steps in (40, 3200):  # of a flight in which it turns by 8 rad
         model = craft.falling(gravity=np.zeros(3), timestep=8 / found.turn / steps)
         data = craft.ready(model=model)
@@ -322,7 +324,8 @@ def test_the_error_is_as_large_as_predicted() -> None:
 
 def test_a_light_craft_needs_a_shorter_step() -> None:
     # Full torque turns it faster, and the error of RK4 has the fourth power of the step.
-    heavy, light = ExaminedModel.read(), ExaminedModel.read(DATA / "tiny.xml")
+    heavy = ExaminedModel.read()
+    light = ExaminedModel.read(DATA / "tiny.xml")
     assert light.convergence.turn > 5 * heavy.convergence.turn
     assert light.convergence.at(0.01) == pytest.approx(16 * light.convergence.at(0.005), rel=0.2)
     assert light.convergence.at(0.01) > 1000 * heavy.convergence.at(0.01)
@@ -399,7 +402,8 @@ def test_published_vehicles_are_in_the_ranges_and_wrong_units_are_not(name: str)
     if radius:
         values |= {"reaction / rotor radius": reaction / radius, "rotor radius / arm": radius / arm}
     for key, value in values.items():
-        low, high = RANGES[key].low, RANGES[key].high
+        low = RANGES[key].low
+        high = RANGES[key].high
         assert low < value < high, key
         if key != "arm":
             assert value / 1000 < low < high < value * 1000, key
@@ -428,12 +432,16 @@ def test_units_of_coefficients(tmp_path: Path) -> None:
 
 
 def test_the_committed_table_is_true_and_on_the_page(tmp_path: Path) -> None:
-    committed, again = read_rows(COMMITTED, Row), rows()
+    committed = read_rows(COMMITTED, Row)
+    again = rows()
     assert markdown(committed) in PAGE
     assert all(row.found for row in committed)
     for old, new in zip(committed, again, strict=True):
-        assert (old.fault, old.found_by, old.failed, old.checks, old.flies) == (
-            new.fault, new.found_by, new.failed, new.checks, new.flies)  # fmt: skip
+        assert old.fault == new.fault
+        assert old.found_by == new.found_by
+        assert old.failed == new.failed
+        assert old.checks == new.checks
+        assert old.flies == new.flies
     write_rows(tmp_path / "new" / "table.csv", again)
     assert read_rows(tmp_path / "new" / "table.csv", Row) == again
 
@@ -444,7 +452,9 @@ def test_the_committed_examination_is_on_the_page() -> None:
     assert examination(committed) in PAGE
     assert not failed(committed)
     for old, new in zip(committed, examine(), strict=True):
-        assert (old.name, old.source, old.meaning) == (new.name, new.source, new.meaning)
+        assert old.name == new.name
+        assert old.source == new.source
+        assert old.meaning == new.meaning
 
 
 def test_json_has_stable_keys(capsys: pytest.CaptureFixture[str]) -> None:

@@ -17,13 +17,15 @@ from rotorgram.sim.control import Gains
 from rotorgram.udp import LinkConfig, RemoteVectorEnv, Simulator
 
 MIX = "crazyflie2,hummingbird,paper"
-FORMATION, CROSSING = "rotorgram/Formation-v0", "rotorgram/Crossing-v0"
+FORMATION = "rotorgram/Formation-v0"
+CROSSING = "rotorgram/Crossing-v0"
 
 
 def test_vehicles_go_to_the_drones_in_turn() -> None:
     fleet = load_vehicles("crazyflie2, paper", 5)
     assert isinstance(fleet, Fleet)
-    one, other = Vehicle.load("crazyflie2"), Vehicle.load("paper")
+    one = Vehicle.load("crazyflie2")
+    other = Vehicle.load("paper")
     assert [craft.hash for craft in fleet.members] == [one.hash, other.hash] * 2 + [one.hash]
     assert load_vehicles("paper", 3) is other
     assert load_vehicles("paper,paper", 2) is other  # alike: one for all
@@ -36,13 +38,16 @@ def test_vehicles_go_to_the_drones_in_turn() -> None:
 
 def test_a_fleet_has_the_numbers_of_its_vehicles_under_one_step_and_gravity() -> None:
     fleet = load_vehicles("paper,crazyflie2", 2)
-    paper, nano = Vehicle.load("paper"), Vehicle.load("crazyflie2")
+    paper = Vehicle.load("paper")
+    nano = Vehicle.load("crazyflie2")
     assert paper.gravity != nano.gravity
-    assert (fleet.timestep, fleet.gravity) == (nano.timestep, paper.gravity)
+    assert fleet.timestep == nano.timestep
+    assert fleet.gravity == paper.gravity
     assert fleet.mass.tolist() == [paper.mass, nano.mass]
     assert fleet.hover_thrust.sum(axis=1) == pytest.approx(paper.gravity * fleet.mass)
     assert fleet.thrust_high.tolist() == [paper.thrust_high.tolist(), nano.thrust_high.tolist()]
-    assert (fleet.radius, fleet.rest_height) == (paper.radius, paper.rest_height)
+    assert fleet.radius == paper.radius
+    assert fleet.rest_height == paper.rest_height
     assert len(fleet.hash) == 32
     assert fleet.hash != load_vehicles("crazyflie2,paper", 2).hash
     assert pickle.loads(pickle.dumps(fleet)).hash == fleet.hash
@@ -110,7 +115,8 @@ def test_an_asked_velocity_is_reached_by_all() -> None:
 def test_the_clearance_is_between_the_spheres_of_each() -> None:
     env = LocalVectorEnv(FORMATION, 3, drones=3, vehicle=MIX)
     env.reset(seed=0)
-    place, fleet = env.loop.world.state.position[0], load_vehicles(MIX, 3)
+    place = env.loop.world.state.position[0]
+    fleet = load_vehicles(MIX, 3)
     radii = [craft.radius for craft in members_of(fleet, 3)]
     room = [
         min(np.linalg.norm(place[i] - place[j]) - radii[i] - radii[j] for j in range(3) if j != i)
@@ -131,12 +137,14 @@ def test_over_udp_it_is_the_same_to_the_bit() -> None:
     )  # fmt: skip
     running = Running(simulator)
     remote = RemoteVectorEnv(agent)
-    ours, theirs = local.reset(seed=5)[0], remote.reset(seed=5)[0]
+    ours = local.reset(seed=5)[0]
+    theirs = remote.reset(seed=5)[0]
     assert remote.env_spec == local.env_spec
     for _ in range(40):
         assert theirs.tobytes() == ours.tobytes()
         actions = dice.uniform(-1, 1, (3, 4)).astype(np.float32)
-        (ours, *rest), (theirs, *others) = local.step(actions), remote.step(actions)
+        (ours, *rest) = local.step(actions)
+        (theirs, *others) = remote.step(actions)
         for mine, its in zip(rest[:3], others[:3], strict=True):
             assert mine.tolist() == its.tolist()
     remote.close()

@@ -78,7 +78,8 @@ def test_its_picture_is_small(name: str) -> None:
 
 
 def test_the_paper_quadcopter_is_that_of_quad_xml() -> None:
-    ours, default = Vehicle.load(FOLDER / "paper" / "vehicle.toml"), Vehicle.load()
+    ours = Vehicle.load(FOLDER / "paper" / "vehicle.toml")
+    default = Vehicle.load()
     assert ours.mass == pytest.approx(20.0, rel=1e-12)
     assert np.diag(ours.inertia) == pytest.approx(np.diag(default.inertia), rel=1e-9)
     assert ours.allocation == pytest.approx(default.allocation, abs=1e-9)
@@ -118,7 +119,8 @@ def test_the_skydio_x2_has_the_inertia_of_the_menagerie_s_ellipsoids() -> None:
 
 def test_the_heavy_hexacopter_follows_from_its_derivations() -> None:
     told = numbers("heavy_hexa")
-    density, radius = 1.225, 0.2794
+    density = 1.225
+    radius = 0.2794
     area = np.pi * radius**2
     k = 45.0 / (120.0 / radius) ** 2
     assert told["rotors.thrust_coefficient"].value == pytest.approx(k, rel=1e-3)

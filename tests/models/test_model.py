@@ -46,11 +46,15 @@ def test_options(model: mujoco.MjModel) -> None:
     assert model.opt.gravity.tolist() == [0.0, 0.0, -9.8]
     assert (model.opt.density, model.opt.viscosity) == (0.0, 0.0)  # no air, so no aerodynamics
     assert model.opt.wind.tolist() == [0.0, 0.0, 0.0]
-    assert (model.opt.disableflags, model.opt.enableflags) == (0, 0)
+    assert model.opt.disableflags == 0
+    assert model.opt.enableflags == 0
 
 
 def test_one_free_body_and_four_thrusts(model: mujoco.MjModel) -> None:
-    assert (model.nq, model.nv, model.nu, model.na) == (7, 6, 4, 0)
+    assert model.nq == 7
+    assert model.nv == 6
+    assert model.nu == 4
+    assert model.na == 0
     assert model.actuator_ctrlrange.tolist() == [[0.0, 100.0]] * 4
     for rotor, place, reaction in zip(ROTORS, PLACES, REACTIONS, strict=True):
         assert tuple(model.site(rotor).pos) == place
@@ -159,7 +163,8 @@ def test_a_file_keeps_its_ground_sun_and_sky_and_gets_those_it_lacks(
 def test_without_what_is_only_looked_at_the_physics_is_the_same() -> None:
     models = [spec.compile() for spec in (build_scene(), vehicle_spec(QUAD_XML))]
     assert models[0].ngeom > models[1].ngeom
-    dice, contacts = np.random.default_rng(0), 0
+    dice = np.random.default_rng(0)
+    contacts = 0
     data = [mujoco.MjData(model) for model in models]
     for one in data:
         one.qpos[:] = [0, 0, 3, 0.99, 0.1, 0.05, 0.02]
@@ -182,7 +187,9 @@ def test_without_what_is_only_looked_at_the_physics_is_the_same() -> None:
 def test_the_papers_vehicle() -> None:
     vehicle = Vehicle.load()
     assert vehicle is Vehicle.load(QUAD_XML)
-    assert (vehicle.mass, vehicle.gravity, vehicle.timestep) == (pytest.approx(20.0), 9.8, 0.01)
+    assert vehicle.mass == pytest.approx(20.0)
+    assert vehicle.gravity == 9.8
+    assert vehicle.timestep == 0.01
     assert vehicle.center_of_mass == pytest.approx(0.0, abs=1e-15)
     assert vehicle.rest_height == 0.4
     assert [rotor.name for rotor in vehicle.rotors] == list(ROTORS)
@@ -194,7 +201,8 @@ def test_the_papers_vehicle() -> None:
     np.testing.assert_allclose(vehicle.allocation, expected, atol=1e-15)
     assert vehicle.hover_thrust == pytest.approx([49.0] * 4, abs=1e-12)
     assert vehicle.max_acceleration == pytest.approx(10.2)
-    assert (vehicle.substeps(0.02), vehicle.substeps(0.01)) == (2, 1)
+    assert vehicle.substeps(0.02) == 2
+    assert vehicle.substeps(0.01) == 1
     with pytest.raises(InputError, match=r"multiple of the physics step of 0\.01 s, .* got 0\.015"):
         vehicle.substeps(0.015)
 
@@ -207,7 +215,8 @@ def test_a_hexacopter_with_throttles_and_a_camera_in_front() -> None:
     assert vehicle.num_rotors == 6
     assert {(rotor.low, rotor.high, rotor.newtons) for rotor in vehicle.rotors} == {(0, 12, 12)}
     assert [rotor.reaction[2] * 12 for rotor in vehicle.rotors] == pytest.approx([0.19, -0.19] * 3)
-    front, rear = vehicle.hover_thrust[0], vehicle.hover_thrust[3]
+    front = vehicle.hover_thrust[0]
+    rear = vehicle.hover_thrust[3]
     assert front > 3.03 * 9.81 / 6 > rear
     wanted = [3.03 * 9.81, 0.0, 0.0, 0.0]
     np.testing.assert_allclose(vehicle.allocation @ vehicle.hover_thrust, wanted, atol=1e-12)
@@ -289,7 +298,8 @@ def test_a_file_that_was_written_anew_is_loaded_anew(tmp_path: Path) -> None:
     before = Vehicle.load(path)
     _moved(tmp_path, 'mass="12"', 'mass="13"')
     os.utime(path, ns=(0, path.stat().st_mtime_ns + 1))
-    assert (before.mass, Vehicle.load(path).mass) == (pytest.approx(20), pytest.approx(21))
+    assert before.mass == pytest.approx(20)
+    assert Vehicle.load(path).mass == pytest.approx(21)
 
 
 # --- what is no vehicle ---------------------------------------------------------------------------

@@ -15,7 +15,8 @@ from rotorgram.envs.config import EnvConfig
 from rotorgram.models.errors import InputError
 from rotorgram.models.vehicle import Vehicle
 
-ELEVATION, HOVER = "rotorgram/Elevation-v0", "rotorgram/Hover-v0"
+ELEVATION = "rotorgram/Elevation-v0"
+HOVER = "rotorgram/Hover-v0"
 DATA = Path(__file__).parents[1] / "data"
 
 UNEQUAL = """<mujoco model="unequal">
@@ -78,7 +79,8 @@ def tetrahedron(path: Path, size: float) -> None:
 
 @pytest.fixture
 def files(tmp_path: Path) -> dict[str, Path]:
-    unequal, included = tmp_path / "unequal.xml", tmp_path / "included.xml"
+    unequal = tmp_path / "unequal.xml"
+    included = tmp_path / "included.xml"
     unequal.write_text(UNEQUAL)
     included.write_text(INCLUDING)
     (tmp_path / "craft.xml").write_text(f"<mujoco>{BODY}</mujoco>")
@@ -195,7 +197,8 @@ def test_a_period_that_does_not_fit_the_files_step(files: dict[str, Path]) -> No
 def test_a_policy_flies_another_vehicle_only_if_the_user_names_one(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    small, run = ("--vehicle", str(DATA / "small.xml")), str(tmp_path / "run")
+    small = ("--vehicle", str(DATA / "small.xml"))
+    run = str(tmp_path / "run")
     task = ("--env", HOVER, "--num-envs", "4", "--env-steps", "256")
     assert main(["train", "a2c", *task, *small, "--out", run]) == 0
     assert main(["evaluate", run, "--episodes", "1", *small]) == 0

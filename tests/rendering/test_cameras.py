@@ -84,8 +84,11 @@ def test_cameras_of_a_toml_file(tmp_path: Path) -> None:
     vehicle = vehicle_with(tmp_path, BELLY)
     named = {camera.name: camera for camera in vehicle.cameras}
     assert {*named} == {"belly", "tower", "front", "down"}
-    belly, tower = named["belly"], named["tower"]
-    assert (belly.width, belly.height, belly.every) == (48, 32, 2)
+    belly = named["belly"]
+    tower = named["tower"]
+    assert belly.width == 48
+    assert belly.height == 32
+    assert belly.every == 2
     assert belly.kinds == ("rgb", "depth")
     assert belly.fovy == pytest.approx(1.0, rel=1e-6)
     assert belly.position == (0.0, 0.0, -0.02)
@@ -108,7 +111,9 @@ def test_cameras_of_an_mjcf_file(tmp_path: Path) -> None:
     named = {camera.name: camera for camera in Vehicle.load(file).file_cameras}
     assert {*named} == {"eye", "chase", "portrait"}  # the others are those of quad.xml
     eye = named["eye"]
-    assert (eye.width, eye.height, eye.every) == (40, 30, 4)
+    assert eye.width == 40
+    assert eye.height == 30
+    assert eye.every == 4
     assert eye.kinds == ("rgb", "segmentation")
     assert (eye.look, eye.up) == ((0.0, 0.0, -1.0), (0.0, 1.0, 0.0))  # MuJoCo's: along -z
     file.write_text(text.replace("cameras.eye", "cameras.ear"), "utf-8")
@@ -165,8 +170,11 @@ def test_what_is_exported_has_its_cameras(made: Any, tmp_path: Path) -> None:
 
 def test_every_vehicle_has_two() -> None:
     front, down = Vehicle.load("crazyflie2").cameras
-    assert (front.name, front.look) == ("front", (1.0, 0.0, 0.0))
-    assert (down.name, down.look, down.up) == ("down", (0.0, 0.0, -1.0), (1.0, 0.0, 0.0))
+    assert front.name == "front"
+    assert front.look == (1.0, 0.0, 0.0)
+    assert down.name == "down"
+    assert down.look == (0.0, 0.0, -1.0)
+    assert down.up == (1.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -230,10 +238,15 @@ def test_depth_is_that_of_rays(made: Any) -> None:
     depth = take(cameras, **told)["chase_depth"][0, ..., 0]
     lens = cameras.lens("chase_depth", told)
     dice = np.random.default_rng(3)
-    rows, columns = dice.integers(120, size=1000), dice.integers(160, size=1000)
-    model, data = cameras.model, cameras.data
-    eye, groups = -lens.rotation.T @ lens.translation, np.array([1, 1, 1, 0, 0, 0], np.uint8)
-    errors, seen, hit = [], [], np.zeros(1, np.int32)
+    rows = dice.integers(120, size=1000)
+    columns = dice.integers(160, size=1000)
+    model = cameras.model
+    data = cameras.data
+    eye = -lens.rotation.T @ lens.translation
+    groups = np.array([1, 1, 1, 0, 0, 0], np.uint8)
+    errors = []
+    seen = []
+    hit = np.zeros(1, np.int32)
     for row, column in zip(rows.tolist(), columns.tolist(), strict=True):
         ray = np.linalg.solve(lens.matrix, (column + 0.5, row + 0.5, 1.0))  # 1 m of depth
         way = lens.rotation.T @ ray
@@ -334,13 +347,15 @@ def test_flow_of_a_camera_that_turns(made: Any) -> None:
     """About its axis by a small angle: each pixel by that angle about the middle. About another by
     half a turn: all was behind it, so that there is no flow."""
     cameras = made("down_flow@64x64 front_flow@64x64", "crazyflie2")
-    place, angle = (0.0, 0.0, 2.0), 0.1
+    place = (0.0, 0.0, 2.0)
+    angle = 0.1
     take(cameras, **state(place))
     turned = np.array([math.cos(angle / 2), 0.0, 0.0, math.sin(angle / 2)])
     flow = take(cameras, fresh=False, **state(place, quaternion=turned))["down_flow"][0]
     rows, columns = np.indices((64, 64)) - 31.5
     # The camera turns to the left, so that the ground turns to the right in its picture.
-    cosine, sine = math.cos(angle), math.sin(angle)
+    cosine = math.cos(angle)
+    sine = math.sin(angle)
     before = np.stack((cosine * columns + sine * rows, cosine * rows - sine * columns), axis=-1)
     assert flow == pytest.approx(np.stack((columns, rows), axis=-1) - before, abs=1e-3)
     back = np.array([math.cos((angle + math.pi) / 2), 0.0, 0.0, math.sin((angle + math.pi) / 2)])
@@ -381,12 +396,14 @@ def test_colours_are_what_mujoco_draws_of_each_camera_alone(made: Any) -> None:
     pictures = take(cameras, **told)
     model, scene = cameras.model, mujoco.MjvScene(cameras.model, 10_000)
     scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW.value] = False
-    gl, rect = offscreen_context(80, 60), mujoco.MjrRect(0, 0, 80, 60)
+    gl = offscreen_context(80, 60)
+    rect = mujoco.MjrRect(0, 0, 80, 60)
     with gl.as_current():
         context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)
         for name, drone in (("front", 0), ("down", 0), ("front", 1)):
-            view, every = mujoco.MjvCamera(), mujoco.mjtCatBit.mjCAT_ALL
+            view = mujoco.MjvCamera()
+            every = mujoco.mjtCatBit.mjCAT_ALL
             view.type = mujoco.mjtCamera.mjCAMERA_FIXED
             view.fixedcamid = model.camera(f"drone_{drone}/{name}").id
             option = mujoco.MjvOption()
@@ -425,7 +442,8 @@ def test_different_vehicles_in_one_world(made: Any, tmp_path: Path) -> None:
     """Each draws from as near as the smallest needs; `down` of each is its own."""
     fleet = load_vehicles("crazyflie2,paper", 2)
     cameras = made("down_depth down_segmentation", fleet, shape=(1, 2))
-    small, large = Vehicle.load("crazyflie2"), Vehicle.load()
+    small = Vehicle.load("crazyflie2")
+    large = Vehicle.load()
     told = state((0.0, 0.0, small.rest_height), (3.0, 0.0, large.rest_height))
     seen = take(cameras, **told)
     for number, craft in enumerate((small, large)):

@@ -140,7 +140,8 @@ def test_noise_is_that_of_the_seed(opengl: None, tmp_path: Path) -> None:
         closing(LocalVectorEnv(HOVER, 1, **options)) as alone,
         closing(LocalVectorEnv(HOVER, 1, **(options | {"cameras": "sharp@24x18"}))) as clean,
     ):
-        first, single = both.reset(seed=[5, 6])[0], alone.reset(seed=[6])[0]
+        first = both.reset(seed=[5, 6])[0]
+        single = alone.reset(seed=[6])[0]
         sharp = clean.reset(seed=[6])[0]
         for _ in range(3):
             assert (first["noisy"][1] == single["noisy"][0]).all()
@@ -148,7 +149,8 @@ def test_noise_is_that_of_the_seed(opengl: None, tmp_path: Path) -> None:
             assert (single["noisy"] != sharp["sharp"]).any()
             assert (single["observation"] == sharp["observation"]).all()  # it flies the same
             before = single["noisy"]
-            first, single = both.step(actions)[0], alone.step(actions[:1])[0]
+            first = both.step(actions)[0]
+            single = alone.step(actions[:1])[0]
             sharp = clean.step(actions[:1])[0]
             assert (single["noisy"] != before).any()
 
@@ -208,9 +210,11 @@ def test_all_of_them_over_udp(opengl: None, tmp_path: Path) -> None:
         spawn_simulator(EnvConfig.from_keywords(HOVER, vehicle=vehicle, **options)) as remote,
         closing(LocalVectorEnv(HOVER, 1, vehicle=vehicle, **options)) as local,
     ):
-        told, own = remote.reset(seed=4)[0], local.reset(seed=[4])[0]
+        told = remote.reset(seed=4)[0]
+        own = local.reset(seed=[4])[0]
         for _ in range(3):
             for name, picture in told.items():
                 assert (np.asarray(picture) == own[name][0]).all(), name
             action = np.array([0.3, -0.2, 0.1, 0.5], np.float32)
-            told, own = remote.step(action)[0], local.step(action[None])[0]
+            told = remote.step(action)[0]
+            own = local.step(action[None])[0]

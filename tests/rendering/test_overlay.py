@@ -30,10 +30,12 @@ def test_the_curve_has_the_colour_of_the_flight_and_the_place_of_its_errors() ->
     strip[int(360 * 0.75) :] = True
     curve = (drawn[..., 1] > 200) & (drawn[..., 0] < 60) & strip
     rows, columns = np.nonzero(curve)
-    left, right = overlay.plot[0], overlay.plot[2]
+    left = overlay.plot[0]
+    right = overlay.plot[2]
     assert columns.min() == pytest.approx(left, abs=3)
     assert columns.max() == pytest.approx((left + right) / 2, abs=5)
-    upper, lower = overlay.plot[1], overlay.plot[3]
+    upper = overlay.plot[1]
+    lower = overlay.plot[3]
     assert rows.mean() == pytest.approx(upper + (lower - upper) / 4, abs=2)  # halfway to +1 m
     assert not picture.any()
 
@@ -52,7 +54,8 @@ def test_a_curve_that_leaves_its_scale_has_no_plateau(side: float) -> None:
     overlay = overlay_of(640, 360, seconds=2.0, scale=(-0.5, 0.5))
     rising = [side * step / 50 for step in range(101)]  # reaches the edge after 0.5 s of 2 s
     green = lit(overlay, rising, 360, 640)
-    columns, middle = np.nonzero(green)[1], green.shape[0] // 2
+    columns = np.nonzero(green)[1]
+    middle = green.shape[0] // 2
     edge = green.shape[1] / 4
     assert columns.max() == pytest.approx(edge, abs=6)  # half a triangle
     triangle = green[:, round(edge) - 6 : round(edge) + 7]
@@ -91,7 +94,8 @@ def test_full_thrusts_do_not_lie_on_their_name(size: tuple[int, int]) -> None:
         moment = at(5.0, thrusts=(thrust,) * 4)
         return overlay.draw(np.zeros((*size[::-1], 3), np.uint8), moment, [0.0]).astype(int)
 
-    nothing, full = drawn(0.0), drawn(100.0)
+    nothing = drawn(0.0)
+    full = drawn(100.0)
     bars = np.nonzero((np.abs(full - (120, 190, 255)).max(axis=2) < 4).any(axis=1))[0].min()
     values = (nothing != full).any(axis=2)[: bars - 3]
     rows, columns = np.nonzero(values)
@@ -131,7 +135,8 @@ def test_what_is_too_small_to_be_read_is_left_out(
     size: tuple[int, int], numbers: bool, strip: bool
 ) -> None:
     overlay = overlay_of(*size, title="PID")
-    assert (overlay.has_numbers, overlay.has_strip) == (numbers, strip)
+    assert overlay.has_numbers == numbers
+    assert overlay.has_strip == strip
     drawn = overlay.draw(np.zeros((*size[::-1], 3), np.uint8), at(5.0), [0.0, 0.5, 0.0])
     green = (drawn[..., 1] > 150) & (drawn[..., 0] < 80)
     assert green[: overlay.panel.lower].any()  # the title
@@ -218,7 +223,8 @@ def test_there_is_a_bar_for_each_rotor_with_its_own_limits(file: Path, rotors: i
 
 
 def test_it_names_the_craft_of_which_the_numbers_are() -> None:
-    without, named = overlay_of(640, 360), overlay_of(640, 360, of="drone_3")
+    without = overlay_of(640, 360)
+    named = overlay_of(640, 360, of="drone_3")
     assert named.has_numbers
     assert named.panel.lower - without.panel.lower == 15  # a line: 1.28 of a thirtieth of 360
     black = np.zeros((360, 640, 3), np.uint8)

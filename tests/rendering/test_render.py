@@ -82,7 +82,8 @@ def test_a_checkpoint_on_film_flies_as_it_does_over_the_wire(
     out = tmp_path / "film.mp4"
     what = (training, journal, "--out", out, "--size", "642x240", *SMALL[2:])
     status, said, err = run(capsys, "render", *what, "--episode", 1, "--camera", "front")
-    assert (status, err) == (0, "")
+    assert status == 0
+    assert err == ""
     assert f"film: {out} (13 pictures of 642x240)" in said  # 0.5 s, both ends
     last = decoded(out, 642, 240)[-1].astype(int)
     tracks = [
@@ -185,7 +186,8 @@ def test_ctrl_c_leaves_no_half_film(opengl: None, tmp_path: Path) -> None:
     time.sleep(0.2)
     os.killpg(process.pid, signal.SIGINT)
     _, err = process.communicate(timeout=30)
-    assert (process.returncode, err) == (130, "rotorgram: interrupted\n")
+    assert process.returncode == 130
+    assert err == "rotorgram: interrupted\n"
     assert list(tmp_path.iterdir()) == []
 
 
@@ -234,7 +236,8 @@ def test_a_wrong_mujoco_gl_is_one_sentence_of_what_draws(setting: str, tmp_path:
     assert expected[setting] in draws.stderr
     assert draws.stderr.count("\n") == 1
     flies = done("evaluate", "pid", "--episodes", 1, "--episode-length", 5)
-    assert (flies.returncode, flies.stderr.count("Traceback")) == (0, 0)
+    assert flies.returncode == 0
+    assert flies.stderr.count("Traceback") == 0
 
 
 @pytest.fixture
@@ -321,7 +324,8 @@ def test_the_film_of_a_comparison_shows_its_agents(comparison: Results, opengl: 
     assert film_study(comparison, out, world="plain")
     frames = decoded(out, 1280, 400)
     assert len(frames) == 13
-    left, right = frames[0][:, :639].astype(int), frames[0][:, 641:].astype(int)
+    left = frames[0][:, :639].astype(int)
+    right = frames[0][:, 641:].astype(int)
     assert abs(left[100:300] - right[100:300]).mean() < 8  # they start alike
     names = sorted(path.name for path in comparison.folder.iterdir())
     assert names == ["checkpoints", "config.json", "parts", "video.mp4"]
@@ -345,7 +349,8 @@ def test_the_page_tells_what_the_benchmark_wrote() -> None:
     docs = Path(__file__).parents[2] / "docs"
     page = (docs / "rendering.md").read_text()
     told = json.loads((docs / "results" / "performance" / "rendering.json").read_text())
-    rates, overlay = told["pictures_per_second"], told["overlay_milliseconds"]
+    rates = told["pictures_per_second"]
+    overlay = told["overlay_milliseconds"]
     for size in ("640x360", "1280x720"):
         assert f"| {size} | {rates[size]} | {rates[f'{size}, fast']} | {overlay[size]} |" in page
     assert (docs / "images" / "cameras.jpg").stat().st_size < 200_000

@@ -38,7 +38,8 @@ def test_a_picture_of_one_drone_and_the_same_bits(env_id: str, vehicle: Any) -> 
     before = env.render()
     full = env.action_space.high
     for _ in range(40):
-        one, two = env.step(full), plain.step(full)
+        one = env.step(full)
+        two = plain.step(full)
         assert one[0].tobytes() == two[0].tobytes()
         assert one[1:4] == two[1:4]
         if one[2]:
@@ -49,7 +50,8 @@ def test_a_picture_of_one_drone_and_the_same_bits(env_id: str, vehicle: Any) -> 
     for picture in (before, after):
         assert picture.shape == (360, 480, 3)
         assert picture.dtype == np.uint8
-        top, bottom = picture[:30].mean(axis=(0, 1)), picture[-30:].mean(axis=(0, 1))
+        top = picture[:30].mean(axis=(0, 1))
+        bottom = picture[-30:].mean(axis=(0, 1))
         assert top[2] > top[0] + 20, "the sky is blue"
         assert abs(bottom[2] - bottom[0]) < 40, "the ground is not"
     assert (before != after).mean() > 0.05, "it climbed, and the camera with it"
@@ -81,7 +83,8 @@ def _green(picture: np.ndarray) -> np.ndarray:
 def test_any_thread_may_ask_for_a_picture() -> None:
     env = gym.make(ENV_ID, render_mode="rgb_array")
     env.reset(seed=0)
-    here, there = env.render(), []
+    here = env.render()
+    there = []
     thread = Thread(target=lambda: there.append(env.render()))
     thread.start()
     thread.join()
@@ -173,7 +176,8 @@ def test_drones_of_one_world_are_in_one_picture_where_they_are() -> None:
     env = LocalParallelEnv(RISE, 3, "rgb_array")
     env.reset(seed=1)
     picture = env.render()
-    assert (picture.shape, picture.dtype) == ((360, 480, 3), np.uint8)
+    assert picture.shape == (360, 480, 3)
+    assert picture.dtype == np.uint8
     env.close()
     stage = Stage("plain", 2, names=("a", "b"))
     still: Any = {"attitude": (0.0,) * 3, "thrusts": (49.0,) * 4}

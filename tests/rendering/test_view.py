@@ -134,11 +134,13 @@ def test_speeds_end_at_a_sixteenth_and_at_eight() -> None:
     for _ in range(9):
         pace.press("slower")
     pace.wait(0.0)
-    assert (pace.speed, pace.words) == (1 / 16, "1/16 x")
+    assert pace.speed == 1 / 16
+    assert pace.words == "1/16 x"
     for _ in range(9):
         pace.press("faster")
     pace.wait(0.0)
-    assert (pace.speed, pace.words) == (8.0, "8 x")
+    assert pace.speed == 8.0
+    assert pace.words == "8 x"
     odd = Pace(0.25, 3.0)  # between two of them
     odd.press("slower")
     odd.wait(0.0)
@@ -217,7 +219,8 @@ def test_lines_over_drones_of_one_world_tell_how_near_they_are() -> None:
 
 
 def test_the_camera_goes_with_the_goal_and_leaves_the_mouse_its_turn(stage: Stage) -> None:
-    aim, camera = Aim(stage), mujoco.MjvCamera()
+    aim = Aim(stage)
+    camera = mujoco.MjvCamera()
     stage.show(moment(height=4.5, error=0.5))
     aim.apply(camera)
     assert camera.lookat.tolist() == [0.0, 0.0, 5.0]
@@ -229,11 +232,13 @@ def test_the_camera_goes_with_the_goal_and_leaves_the_mouse_its_turn(stage: Stag
         assert camera.lookat.tolist() == [2.0, 0.0, 5.0]
     stage.show(moment(2, height=8.0, error=0.0))
     aim.apply(camera)
-    assert (camera.lookat.tolist(), camera.azimuth) == ([2.0, 0.0, 8.0], 45.0)
+    assert camera.lookat.tolist() == [2.0, 0.0, 8.0]
+    assert camera.azimuth == 45.0
 
 
 def test_without_a_goal_the_camera_goes_with_the_craft(stage: Stage) -> None:
-    aim, camera = Aim(stage), mujoco.MjvCamera()
+    aim = Aim(stage)
+    camera = mujoco.MjvCamera()
     for height in (5.0, 6.0):
         stage.show(at(height, goal=None))
         aim.apply(camera)
@@ -280,7 +285,8 @@ def test_what_drawing_raises_because_it_was_closed_is_no_error(stage: Stage) -> 
     with fake_view(stage, busy=True) as (live, surface):
         live.draw(moment())
         wait_until(lambda: surface.shown)
-        surface.error, surface.open = RuntimeError("there is no window"), False
+        surface.error = RuntimeError("there is no window")
+        surface.open = False
         surface.gate.set()
         wait_until(lambda: not live.is_running)
         assert not live.draw_in_time(moment())
@@ -334,8 +340,10 @@ def simulator_of(*heights: float, rotors: int = 4) -> Any:
     `advance` flies what led to a State, before the watcher sees it.
     """
     drones = len(heights)
-    position, goal = np.zeros((drones, 3)), np.zeros((drones, 3))
-    position[:, 1], goal[:, 1] = heights, np.add(heights, 0.5)
+    position = np.zeros((drones, 3))
+    goal = np.zeros((drones, 3))
+    position[:, 1] = heights
+    goal[:, 1] = np.add(heights, 0.5)
     telemetry = {
         "position": position,
         "attitude": np.zeros((drones, 3)),
@@ -387,7 +395,8 @@ class RecordingView:
     is_running = wants = True
 
     def __init__(self, stage: Stage) -> None:
-        self.stage, self.pace = stage, Pace(0.0)
+        self.stage = stage
+        self.pace = Pace(0.0)
         self.drawn: list[tuple[Moment, ...]] = []
 
     def draw(self, *moments: Moment) -> None:
@@ -418,7 +427,8 @@ def test_a_watcher_counts_steps_and_episodes_of_each_drone() -> None:
         [(1, 1), (0, 1)],
     ]
     first, second = view.drawn[-1]
-    assert (first.position, first.goal) == ((0.0, 4.0, 0.0), (0.0, 4.5, 0.0))
+    assert first.position == (0.0, 4.0, 0.0)
+    assert first.goal == (0.0, 4.5, 0.0)
     assert first.metrics == (("elevation_error", 0.5, "m", "E"),)
     assert (first.reward, second.reward) == (0.25, 0.0)  # no step led to a start
 
@@ -451,7 +461,8 @@ def test_a_view_that_fails_or_closes_stops_no_simulator(
         def is_running(self) -> bool:  # type: ignore[override]
             raise RuntimeError("the driver is gone")
 
-    failing, closed = FailingView(stage), RecordingView(stage)
+    failing = FailingView(stage)
+    closed = RecordingView(stage)
     closed.is_running = False
     for view in (failing, closed):
         watcher = Watcher(view, simulator_of(5.0))  # type: ignore[arg-type]
@@ -463,7 +474,8 @@ def test_a_view_that_fails_or_closes_stops_no_simulator(
 
 
 def test_realtime_sleeps_from_step_to_step() -> None:
-    hold, began = Realtime(0.05), time.monotonic()
+    hold = Realtime(0.05)
+    began = time.monotonic()
     for _ in range(5):  # the first at once, the others 0.05 s apart
         hold(None, state())
     assert time.monotonic() - began >= 0.2
@@ -508,7 +520,8 @@ def test_wrong_flags(
     words: tuple[str, ...], expected: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     status, error = status_and_error(capsys, "view", "pid", "--world", "plain", *words)
-    assert (status, error) == (1, f"rotorgram: {expected}")
+    assert status == 1
+    assert error == f"rotorgram: {expected}"
 
 
 def open_fakes(monkeypatch: pytest.MonkeyPatch) -> list[FakeSurface]:
@@ -527,7 +540,8 @@ def open_fakes(monkeypatch: pytest.MonkeyPatch) -> list[FakeSurface]:
 def test_view_shows_a_journal_to_its_end(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    journal, anywhere = tmp_path / "flight.mcap", ("127.0.0.1", 0)
+    journal = tmp_path / "flight.mcap"
+    anywhere = ("127.0.0.1", 0)
     with RemoteEnv(anywhere, connect=False, record=journal) as env:
         simulator = Simulator(server=env.address, bind=anywhere, episode_length=30)
         running = Running(simulator)
@@ -570,7 +584,8 @@ def test_the_page_of_the_docs_tells_what_the_benchmark_wrote() -> None:
     docs = Path(__file__).parents[2] / "docs"
     page = (docs / "viewing.md").read_text()
     result = json.loads((docs / "results" / "performance" / "viewing.json").read_text())
-    rates, ratios = result["control_steps_per_second"], result["of_that_without"]
+    rates = result["control_steps_per_second"]
+    ratios = result["of_that_without"]
     pictures = result["pictures_per_second"]
     for kind in rates["1"]:
         one, many = (

@@ -58,7 +58,8 @@ def fly(model: mujoco.MjModel) -> tuple[bytes, set[int]]:
     """State after every step of a flight with hops and landings, and the numbers of contacts."""
     data = mujoco.MjData(model)
     rng = np.random.default_rng(5)
-    states, contacts = [], set()
+    states = []
+    contacts = set()
     for step in range(STEPS):
         if step % 40 == 0 and model.nu:
             data.ctrl[:] = rng.uniform(30.0, 68.0) + rng.uniform(-1.0, 1.0, model.nu)
@@ -84,7 +85,10 @@ def test_nothing_is_added_but_geoms(model: mujoco.MjModel, airport: np.ndarray) 
     alone = build_scene().compile()
     for count in ("nbody", "njnt", "nq", "nv", "nu", "nsensor", "nsite", "nmocap", "neq", "npair"):
         assert getattr(model, count) == getattr(alone, count), count
-    assert (model.nmesh, model.nhfield, model.nflex, model.nskin) == (0, 0, 0, 0)
+    assert model.nmesh == 0
+    assert model.nhfield == 0
+    assert model.nflex == 0
+    assert model.nskin == 0
     assert model.body_mass.tolist() == alone.body_mass.tolist()
     assert model.body_inertia.tolist() == alone.body_inertia.tolist()
     assert 250 < len(airport) <= 400  # drawn in software too
@@ -105,8 +109,11 @@ def test_the_airport_stands_still_and_touches_nothing(
 def test_discardvisual_drops_all_of_it() -> None:
     spec = build_scene()
     spec.compiler.discardvisual = True
-    alone, model = spec.compile(), with_airport(build_scene, discard=True)
-    assert (model.ngeom, model.nmat, model.ntex) == (alone.ngeom, alone.nmat, alone.ntex)
+    alone = spec.compile()
+    model = with_airport(build_scene, discard=True)
+    assert model.ngeom == alone.ngeom
+    assert model.nmat == alone.nmat
+    assert model.ntex == alone.ntex
 
 
 @pytest.mark.parametrize("visual", [True, False])
@@ -126,7 +133,8 @@ def test_only_the_floor_is_hidden() -> None:
 
 @pytest.mark.parametrize("make", [build_scene, other])
 def test_the_scenes_own_scale_stays(make: Callable[[], mujoco.MjSpec]) -> None:
-    alone, model = make().compile(), with_airport(make)
+    alone = make().compile()
+    model = with_airport(make)
     assert model.stat.extent == alone.stat.extent
     assert model.stat.center.tolist() == alone.stat.center.tolist()
     assert model.vis.map.znear * model.stat.extent == pytest.approx(0.25)

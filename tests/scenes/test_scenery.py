@@ -62,7 +62,8 @@ def test_the_flying_room_is_free(scene: str, seed: int) -> None:
         rotation = data.geom_xmat[geom].reshape(3, 3)
         centre = data.geom_xpos[geom] + rotation @ model.geom_aabb[geom, :3]
         half = abs(rotation) @ model.geom_aabb[geom, 3:]
-        low, high = centre - half, centre + half
+        low = centre - half
+        high = centre + half
         inside = (low[:2] < 8.0).all() and (high[:2] > -8.0).all() and low[2] < 20.0
         assert not inside, name
 
@@ -87,8 +88,10 @@ def test_the_craft_of_the_paper_fits_through_every_gate(seed: int) -> None:
 def fly(spec: mujoco.MjSpec) -> tuple[bytes, set[int]]:
     """Every bit of 1,000 steps of hops and landings, and the numbers of contacts met."""
     model = spec.compile()
-    data, rng = mujoco.MjData(model), np.random.default_rng(1)
-    states, contacts = [], set()
+    data = mujoco.MjData(model)
+    rng = np.random.default_rng(1)
+    states = []
+    contacts = set()
     for step in range(1000):
         if step % 40 == 0:
             data.ctrl[:] = rng.uniform(30.0, 68.0) + rng.uniform(-1.0, 1.0, model.nu)
@@ -111,7 +114,8 @@ def test_motion_is_the_same_to_the_last_bit(scene: str, discard: bool) -> None:
 
 @scenes
 def test_it_touches_nothing_and_is_dropped_with_what_is_visual(scene: str) -> None:
-    alone, spec = vehicle_spec(QUAD_XML).compile(), build_scene(scene=scene)
+    alone = vehicle_spec(QUAD_XML).compile()
+    spec = build_scene(scene=scene)
     model = spec.compile()
     geoms = [model.geom(name).id for name in ours(model, scene)]
     assert not model.geom_contype[geoms].any()
@@ -120,7 +124,8 @@ def test_it_touches_nothing_and_is_dropped_with_what_is_visual(scene: str) -> No
     assert model.body_mass.tolist() == alone.body_mass.tolist()
     spec.compiler.discardvisual = True
     dropped = spec.compile()
-    assert (dropped.ngeom, dropped.nmat) == (alone.ngeom, alone.nmat)
+    assert dropped.ngeom == alone.ngeom
+    assert dropped.nmat == alone.nmat
 
 
 @scenes
@@ -143,7 +148,8 @@ def test_cameras_see_its_objects(opengl: None, scene: str) -> None:
     vehicle = Vehicle.load()
     views = chosen_views(["front@96x72", "front_segmentation@96x72"], vehicle.cameras)
     with closing(Cameras(vehicle, views, world=f"{scene}:1")) as cameras:
-        place, turn = np.array([[0.0, 0.0, 5.0]]), np.array([[1.0, 0.0, 0.0, 0.0]])
+        place = np.array([[0.0, 0.0, 5.0]])
+        turn = np.array([[1.0, 0.0, 0.0, 0.0]])
         due = {view.name: np.ones(1, bool) for view in views}
         cameras.take(due, np.ones(1, bool), {"position": place, "quaternion": turn})
         seen = np.unique(cameras.pictures["front_segmentation"])

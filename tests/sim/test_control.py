@@ -61,7 +61,9 @@ def test_gains_of_the_papers_craft() -> None:
     20 N. So α = 196 / 5.0257 = 38.9993 rad/s² and 196 / 200.03 = 0.97984 rad/s², p = sqrt(α / 2).
     """
     gains = Gains.of(Vehicle.load(), 0.01)
-    assert (gains.lowest, gains.highest, gains.lead) == (0.0, pytest.approx(400.0), 1.0)
+    assert gains.lowest == 0.0
+    assert gains.highest == pytest.approx(400.0)
+    assert gains.lead == 1.0
     assert gains.attitude == pytest.approx(4.41584, abs=1e-4)
     assert gains.rate == pytest.approx((8.83168, 8.83168, 1.39987), abs=1e-4)
     assert gains.heading == pytest.approx(0.69994, abs=1e-4)
@@ -92,9 +94,11 @@ def test_a_lag_slows_the_loops_and_is_led() -> None:
 
 def test_five_equal_poles() -> None:
     """Rotors with the lag L = 1 / 5p, and the four loops: (s + p)⁵."""
-    vehicle, lag = Vehicle.load("crazyflie2"), 0.072
+    vehicle = Vehicle.load("crazyflie2")
+    lag = 0.072
     gains = Gains.of(vehicle, 0.005, lag)
-    rate, p = gains.rate[0], gains.attitude
+    rate = gains.rate[0]
+    p = gains.attitude
     ends = rate * np.array((1, p, p * gains.velocity, p * gains.velocity * gains.position))
     roots = np.roots((lag / 3 + 0.005, 1.0, *ends))
     assert np.abs(roots + p).max() < 0.01 * p
@@ -235,13 +239,16 @@ def flown(vehicle: Vehicle, level: str, lag: float, quaternion: Any, time: float
     goal = np.array((0.0, 0.0, 50.0))
     start = np.array((0.8, -0.6, 0.5)) if level == "position" else np.zeros(3)
     world.reset(np.True_, InitialState(position=goal + start, quaternion=np.array(quaternion)))
-    seen, state = [], world.state
+    seen = []
+    state = world.state
     for _ in range(round(time / vehicle.timestep)):
         w, x, y, z = state.quaternion
         heading = math.atan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))
         action = np.zeros(4)
         if level == "position":
-            offset, c, s = goal - state.position, math.cos(heading), math.sin(heading)
+            offset = goal - state.position
+            c = math.cos(heading)
+            s = math.sin(heading)
             turned = c * offset[0] + s * offset[1], c * offset[1] - s * offset[0], offset[2]
             action = np.array((*turned, -heading)) / [size for size, _ in controller.ranges()]
         world.step(controller.thrust(action, state), 1)
@@ -288,7 +295,9 @@ def test_the_spec_tells_names_units_and_frames() -> None:
     assert action.frame == expected
     action = env_of("rates").env_spec.action
     assert action.unit[:2] == ("1", "11.06888 rad/s")
-    assert (action.low, action.high, action.shape) == (-1.0, 1.0, (4,))
+    assert action.low == -1.0
+    assert action.high == 1.0
+    assert action.shape == (4,)
     assert env_of("rotors").env_spec.action.unit == ""
 
 
@@ -315,7 +324,8 @@ def test_loops_run_in_every_physics_step_unless_they_see_an_estimate(
     loop = Loop(
         EnvConfig.from_keywords(HOVER, action="attitude", sensors=sensors, vehicle="crazyflie2")
     )
-    controller, looked = loop.task.controller, []
+    controller = loop.task.controller
+    looked = []
     thrust = controller.thrust
     controller.thrust = lambda action, state: looked.append(1) or thrust(action, state)
     loop.advance(np.zeros(4), np.ones(1, bool))
@@ -371,7 +381,8 @@ def test_the_page_tells_what_the_benchmark_wrote_and_the_code_gives() -> None:
         gains = Gains.of(Vehicle.load(name), given["timestep"], given["lag"])
         for field in given.keys() - {"timestep", "lag"}:
             assert getattr(gains, field) == pytest.approx(given[field], abs=1e-4)
-        tilt, (level, up) = math.degrees(gains.most_tilt), gains.most_offset
+        tilt = math.degrees(gains.most_tilt)
+        (level, up) = gains.most_offset
         assert f"| {tilt:.0f} | {given['most_velocity'][0]:.2f}, " in page
         assert f"{given['most_velocity'][1]:.2f} | {level:.2f}, {up:.2f} |" in page
         assert f"| {gains.velocity:.2f} | {given['position']:.3f} | {given['lead']:.2f} |" in page

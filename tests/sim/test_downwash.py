@@ -14,7 +14,9 @@ from rotorgram.sim.effects.downwash import Downwash
 ROOT = Path(__file__).parents[2]
 BIRD = "hummingbird"
 # Of its file, typed here again: four rotors at 0.17 m, their radius, and its drag along z.
-LENGTH, RADIUS, DRAG = 0.34, 0.1, 0.01
+LENGTH = 0.34
+RADIUS = 0.1
+DRAG = 0.01
 MASS = Vehicle.load(BIRD).mass
 WEIGHT = MASS * Vehicle.load(BIRD).gravity
 SPEED = math.sqrt(WEIGHT / (2 * 1.225 * 4 * math.pi * RADIUS**2))  # at the rotors, in hover
@@ -46,7 +48,8 @@ def test_the_momentum_of_a_jet_is_the_thrust_but_for_a_third(name: str) -> None:
     vehicle = Vehicle.load(name)
     if vehicle.coefficients.rotors.radius is None:
         pytest.skip("no rotors.radius")
-    downwash, weight = Downwash(vehicle), vehicle.mass * vehicle.gravity
+    downwash = Downwash(vehicle)
+    weight = vehicle.mass * vehicle.gravity
     for depth in (3.0, 30.0):
         radius = np.linspace(0.0, 60 * depth / 3 * downwash.length, 300_001)
         far = np.full_like(radius, depth * downwash.length)
@@ -108,7 +111,8 @@ def test_a_tilted_craft_blows_along_its_own_axis() -> None:
     world = birds([(0, 0, 20.0), there, (0, 0, 20.0 - away)], quaternion)
     air = np.stack(Downwash(world.vehicle).air(world.state), axis=-1)[0]
     assert air[0] == pytest.approx([0.0, 0.0, 0.0], abs=1e-3)
-    own, side = jet(8.0), jet(8.0 * math.cos(tilt), 8.0 * math.sin(tilt))
+    own = jet(8.0)
+    side = jet(8.0 * math.cos(tilt), 8.0 * math.sin(tilt))
     assert np.linalg.norm(air[1]) == pytest.approx(own, rel=0.02)  # the third one's edge besides
     assert air[1] / np.linalg.norm(air[1]) == pytest.approx([-0.5, 0.0, -math.sqrt(0.75)], abs=1e-6)
     assert np.linalg.norm(air[2]) == pytest.approx(side, rel=0.02)

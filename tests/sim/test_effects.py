@@ -29,7 +29,9 @@ from rotorgram.sim.effects.rotors import RotorEffects
 ROOT = Path(__file__).parents[2]
 RACER = ROOT / "tests" / "data" / "racer.xml"
 # Of that file, typed here again.
-M, G, H = 0.6, 9.81, 0.005
+M = 0.6
+G = 9.81
+H = 0.005
 HOVER = M * G / 4
 K = 5e-6  # thrust = K speed²
 OMEGA = math.sqrt(HOVER / K)
@@ -66,7 +68,8 @@ def racer(
 ) -> Vehicle:
     """The racer with other coefficients, `group_name="1 2"`, or without one, None."""
     tree = ET.parse(RACER)
-    custom, option = tree.find("custom"), tree.find("option")
+    custom = tree.find("custom")
+    option = tree.find("option")
     assert custom is not None
     assert option is not None
     option.set("timestep", str(timestep))
@@ -126,7 +129,8 @@ def fly_hovering(world: World) -> World:
 
 def pushed(world: World, thrust: Any = HOVER) -> tuple[np.ndarray, np.ndarray]:
     """Acceleration of the body's origin, and its angular one, over one physics step."""
-    state, step = world.state, world.vehicle.timestep
+    state = world.state
+    step = world.vehicle.timestep
     before = state.velocity.copy(), state.body_rates.copy()
     fly(world, thrust, 1)
     return (state.velocity - before[0]) / step, (state.body_rates - before[1]) / step
@@ -196,7 +200,8 @@ def test_battery_charge_by_integration(tmp_path: Path) -> None:
     # Without resistance the power 80 · 4 F^1.5 (V / 12.6)³ draws I = 80 · 4 F^1.5 V² / 12.6³, and
     # V = 9.9 + 2.7 q falls by dV/dt = -2.7 I / (3600 · 0.5): 1/V = 1/12.6 + b t.
     vehicle = racer(tmp_path, battery_resistance="0")
-    seconds, b = 30.0, 2.7 / 1800 * 80 * 4 * HOVER**1.5 / 12.6**3
+    seconds = 30.0
+    b = 2.7 / 1800 * 80 * 4 * HOVER**1.5 / 12.6**3
     voltage = 1 / (1 / 12.6 + b * seconds)
     rotors = RotorEffects(vehicle, EffectOptions(battery=True))
     thrust = np.full(4, HOVER)
@@ -295,7 +300,9 @@ def test_body_drag_in_body_axes(tmp_path: Path) -> None:
     )
     # Body axes: x forward 12, y 4, z: the world's x, 3. |v| = 13.
     acceleration, _ = pushed(world, 0.0)
-    x, y, z = (-(0.1 + 0.02 * 13) * 3, -(0.06 + 0.012 * 13) * 4, (0.05 + 0.01 * 13) * 12)
+    x = -(0.1 + 0.02 * 13) * 3
+    y = -(0.06 + 0.012 * 13) * 4
+    z = (0.05 + 0.01 * 13) * 12
     np.testing.assert_allclose(acceleration, (x / M, y / M, z / M - G), rtol=1e-3)
 
 
@@ -303,7 +310,8 @@ def test_rotors_in_sideways_and_vertical_motion(tmp_path: Path) -> None:
     vehicle = racer(tmp_path, timestep=1e-4)
     world = begin(world_of(vehicle, rotor_drag=True), velocity=[3.0, 0.0, 0.0])
     acceleration, turn = pushed(world)
-    drag, lift = -4 * 1e-4 * OMEGA * 3, 4 * 3e-3 * 9
+    drag = -4 * 1e-4 * OMEGA * 3
+    lift = 4 * 3e-3 * 9
     # The rotors are 1 cm over the center of mass, and the origin 1 cm under it.
     pitch = 0.01 * drag / 5e-3
     np.testing.assert_allclose(turn, (0, pitch, 0), rtol=1e-3, atol=1e-9)
@@ -342,9 +350,12 @@ def test_rotors_with_tilted_axes(tmp_path: Path) -> None:
     thrust = vehicle.hover_thrust[0]
     assert thrust == pytest.approx(HOVER / math.cos(0.3), rel=1e-6)
     world = world_of(vehicle, rotor_drag=True, ground_effect=True)
-    velocity, height = np.array((3.0, 2.0, 1.0)), 0.2
+    velocity = np.array((3.0, 2.0, 1.0))
+    height = 0.2
     acceleration, turn = pushed(begin(world, height, velocity=velocity), vehicle.hover_thrust)
-    force, torque, speed = np.zeros(3), np.zeros(3), math.sqrt(thrust / K)
+    force = np.zeros(3)
+    torque = np.zeros(3)
+    speed = math.sqrt(thrust / K)
     more = thrust * (1 / (1 - (0.1 / (4 * (height + 0.02))) ** 2) - 1)
     for x, y in ((0.14, -0.12), (-0.14, -0.12), (-0.14, 0.12), (0.14, 0.12)):
         axis = np.array((0, lean[1 if y > 0 else -1], math.cos(0.3)))
@@ -451,10 +462,14 @@ def test_the_order_of_the_air_forces_is_two(
 
 # --- gusts ----------------------------------------------------------------------------------------
 
-SPEED, HEIGHT, W20 = 6.0, 20.0, 8.0
+SPEED = 6.0
+HEIGHT = 20.0
+W20 = 8.0
 FEET = 20.0 / 0.3048
-L_U, L_W = 20.0 / (0.177 + 0.000823 * FEET) ** 1.2, 20.0
-SIGMA_U, SIGMA_W = 0.8 / (0.177 + 0.000823 * FEET) ** 0.4, 0.8
+L_U = 20.0 / (0.177 + 0.000823 * FEET) ** 1.2
+L_W = 20.0
+SIGMA_U = 0.8 / (0.177 + 0.000823 * FEET) ** 0.4
+SIGMA_W = 0.8
 
 
 def gusts(
@@ -465,7 +480,8 @@ def gusts(
     height: float = HEIGHT,
 ) -> np.ndarray:
     """Gusts of so many worlds, shape (steps, num, 3)."""
-    air, dice = Gusts(W20, wind, step), np.random.default_rng(0)
+    air = Gusts(W20, wind, step)
+    dice = np.random.default_rng(0)
     mask = np.ones((num, 1), bool)
     air.begin(mask, np.full((num, 1), height), dice.standard_normal((num, 1, 5)))
     rows = [air.step(None, dice.standard_normal((num, 1, 5))) for _ in range(steps)]
@@ -484,26 +500,31 @@ def test_gusts_are_stationary_from_the_first_step() -> None:
 
 def test_correlation_of_gusts_over_time() -> None:
     """Along the wind exp(-r / L); across it (1 - r / 2L) exp(-r / L), with r = V t."""
-    num, step = 20_000, 0.5
+    num = 20_000
+    step = 0.5
     blown = gusts(num, 80, step, wind=(0.0, 6.0, 0.0))  # along y
     for count in (1, 5, 20, 60):
         seen = (blown[0] * blown[count]).mean(axis=0) / np.square((SIGMA_U, SIGMA_U, SIGMA_W))
         r = SPEED * step * count
-        along, across = math.exp(-r / L_U), (1 - r / (2 * L_U)) * math.exp(-r / L_U)
+        along = math.exp(-r / L_U)
+        across = (1 - r / (2 * L_U)) * math.exp(-r / L_U)
         up = (1 - r / (2 * L_W)) * math.exp(-r / L_W)
         np.testing.assert_allclose(seen, (across, along, up), atol=5 * math.sqrt(2 / num))
 
 
 def test_spectra_of_gusts() -> None:
     """Welch's estimate, with a Hann window, over worlds, averaged in bands of frequency."""
-    num, steps, step = 300, 4096, 0.02
+    num = 300
+    steps = 4096
+    step = 0.02
     blown = gusts(num, steps, step)
     window = np.hanning(steps)[:, None, None]
     power = abs(np.fft.rfft(blown * window, axis=0)) ** 2
     # One-sided over the angular frequency: 2 · step / (2π · Σ window²).
     density = power.mean(axis=1) * step / (math.pi * np.square(window).sum())
     omega = 2 * math.pi * np.fft.rfftfreq(steps, step)
-    x, y = omega * L_U / SPEED, omega * L_W / SPEED
+    x = omega * L_U / SPEED
+    y = omega * L_W / SPEED
     expected = (
         SIGMA_U**2 * 2 * L_U / (math.pi * SPEED) / (1 + x**2),
         SIGMA_U**2 * L_U / (math.pi * SPEED) * (1 + 3 * x**2) / (1 + x**2) ** 2,
@@ -578,7 +599,8 @@ def test_the_period_of_a_pendulum() -> None:
     # Under the paper's 20 kg, held against the weight of both: 2π √(L/g) √(M / (M + m)).
     model, data = pendulum(Vehicle.load(), 0.2, 2.0, 0.05)
     data.ctrl[:] = 20.2 * 9.8 / 4
-    crossings, last = [], 1.0
+    crossings = []
+    last = 1.0
     while len(crossings) < 5:
         mujoco.mj_step(model, data)
         offset = data.qpos[7] - data.qpos[0]
@@ -662,7 +684,8 @@ GUSTY = {**EVERYTHING, "gusts": 4.0, "payload": 0.05, "cable": 0.4}
     "effects", [GUSTY, {"motor_lag": True, "battery": True}, {"battery": True}]
 )
 def test_a_batch_is_single_worlds_bit_for_bit(effects: dict[str, Any]) -> None:
-    num, dice = 5, np.random.default_rng(0)
+    num = 5
+    dice = np.random.default_rng(0)
     drawn = DRAWN if effects is GUSTY else {"battery_charge": "uniform(0, 1)", "thrust": 0.9}
     batch = world_of(None, num, randomize=drawn, **effects)
     batch.seed(np.ones((num, 1), bool), list(range(num)))
@@ -687,7 +710,8 @@ def test_a_batch_is_single_worlds_bit_for_bit(effects: dict[str, Any]) -> None:
 def test_frozen_drones_and_their_streams_stay() -> None:
     """A drone that was frozen flies on as one that never was."""
     worlds = [world_of(None, 2, randomize=DRAWN, **GUSTY) for _ in range(2)]
-    every, first = np.ones((2, 1), bool), np.array([[True], [False]])
+    every = np.ones((2, 1), bool)
+    first = np.array([[True], [False]])
     for world in worlds:
         world.seed(every, [3, 4])
         begin(world)
@@ -779,7 +803,8 @@ def test_drawn_mass_inertia_and_center_are_those_of_a_compiled_model(tmp_path: P
 def test_a_drawn_center_turns_every_vehicle(name: str | None) -> None:
     vehicle = Vehicle.load(name)
     weight = vehicle.mass * vehicle.gravity
-    x, y = 0.02 * vehicle.inertia[0, 0] / weight, -0.03 * vehicle.inertia[1, 1] / weight
+    x = 0.02 * vehicle.inertia[0, 0] / weight
+    y = -0.03 * vehicle.inertia[1, 1] / weight
     world = begin(world_of(vehicle, randomize={"center_x": x, "center_y": y}))
     rates = fly_hovering(world).state.body_rates / vehicle.timestep
     # The thrust m g acts at (-x, -y) from the center: the torque is (-y m g, x m g, 0).

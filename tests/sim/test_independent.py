@@ -66,7 +66,9 @@ def test_linear_drag_alike_in_all_directions_gives_an_exponential() -> None:
     drag = Drag(linear=(0.3, 0.3, 0.3))
     craft = replace(RACER, coefficients=Coefficients(drag=drag))
     flight = independent(craft, np.zeros((50, 4)), {"body_drag": True, "wind": (2.0, 0.0, 0.0)})
-    center, rate, t = craft.center_of_mass, 0.3 / 0.6, 1.0
+    center = craft.center_of_mass
+    rate = 0.3 / 0.6
+    t = 1.0
     end = np.array((2.0, 0.0, 0.0)) + DOWN / rate
     start = VELOCITY + np.cross(SPIN, center)
     moved = end * t + (start - end) * (1 - math.exp(-rate * t)) / rate
@@ -92,7 +94,8 @@ def test_a_rotor_lags_and_drags_as_worked_out_by_hand() -> None:
     assert change[3] == pytest.approx(-sum(drags) / 0.6)
     assert change[5] == pytest.approx(sum(pushes) / 0.6 - 9.81)
     # Rotors at (±0.14, ±0.12), 0.01 m above the center of mass; reactions ±0.02 · T.
-    sides, fronts = (-0.12, -0.12, 0.12, 0.12), (0.14, -0.14, -0.14, 0.14)
+    sides = (-0.12, -0.12, 0.12, 0.12)
+    fronts = (0.14, -0.14, -0.14, 0.14)
     turns = (0.02, -0.02, 0.02, -0.02)
     roll = sum(y * f for y, f in zip(sides, pushes, strict=True)) / 4e-3
     pitch = -sum(x * f for x, f in zip(fronts, pushes, strict=True)) - 0.01 * sum(drags)
@@ -146,7 +149,8 @@ def test_rotors_that_lag_drag_with_their_mean_speed() -> None:
     told = RACER.coefficients
     quick = replace(told.rotors, time_constant=0.005, time_constant_down=None)
     craft = replace(RACER, coefficients=replace(told, rotors=quick))
-    effects, commands = {"motor_lag": True, "rotor_drag": True}, thrusts(craft, 2.0)
+    effects = {"motor_lag": True, "rotor_drag": True}
+    commands = thrusts(craft, 2.0)
     flown = ours(at_step(craft, 0.005), commands, effects)
     _, degrees = flown.apart(independent(craft, commands, effects))
     assert degrees < 0.012
@@ -214,7 +218,8 @@ def test_rotorpys_parameters_become_our_vehicle(tmp_path: Path) -> None:
     file.write_text(rotorpy.mjcf(params))
     vehicle = Vehicle.load(file)
     told = vehicle.coefficients
-    assert (vehicle.mass, vehicle.gravity) == (0.4, 9.81)
+    assert vehicle.mass == 0.4
+    assert vehicle.gravity == 9.81
     assert vehicle.inertia == pytest.approx(
         np.array(((1e-3, 0, 1e-4), (0, 2e-3, 0), (1e-4, 0, 2.5e-3))), abs=1e-9
     )
@@ -223,6 +228,9 @@ def test_rotorpys_parameters_become_our_vehicle(tmp_path: Path) -> None:
     assert vehicle.allocation == pytest.approx(
         np.array((*signs, (0.02, -0.02, 0.02, -0.02))), abs=1e-12
     )
-    assert (told.rotors.thrust_coefficient, told.rotors.time_constant) == (2e-6, 0.01)
-    assert (told.rotors.drag, told.rotors.inflow, told.rotors.lift) == (1e-4, 2e-4, 3e-3)
+    assert told.rotors.thrust_coefficient == 2e-6
+    assert told.rotors.time_constant == 0.01
+    assert told.rotors.drag == 1e-4
+    assert told.rotors.inflow == 2e-4
+    assert told.rotors.lift == 3e-3
     assert told.drag.quadratic == (0.01, 0.02, 0.03)

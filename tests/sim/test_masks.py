@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from rotorgram.envs import LocalVectorEnv
 
-N, STEPS, LENGTH = 4, 30, 11
+N = 4
+STEPS = 30
+LENGTH = 11
 EFFECTS = {
     "motor_lag": True, "battery": True, "body_drag": True, "rotor_drag": True,
     "ground_effect": True, "wind": (2.0, -1.0, 0.5), "gusts": 3.0,
@@ -61,7 +63,8 @@ def test_a_batch_equals_its_drones_alone(task: str, backend: str, feature: str) 
     batch = LocalVectorEnv(f"rotorgram/{task}-v0", N, **options)
     singles = [LocalVectorEnv(f"rotorgram/{task}-v0", 1, **options) for _ in range(N)]
     dice = np.random.default_rng(2)
-    resets, frozen = np.ones(N, bool), np.zeros(N, bool)
+    resets = np.ones(N, bool)
+    frozen = np.zeros(N, bool)
     ends = 0
     for step in range(STEPS):
         actions = dice.uniform(-0.6, 0.6, batch.action_space.shape).astype(np.float32)

@@ -156,7 +156,8 @@ def test_draws_follow_each_other_in_blocks() -> None:
     random = random_of(2, 3)
     use = random.use("start")
     draw = Draw(random, use, [1])
-    first, second = draw.uniform(2.0, 4.0), draw.normal(3.0, (2,))
+    first = draw.uniform(2.0, 4.0)
+    second = draw.normal(3.0, (2,))
     assert first[0].tolist() == [0.0] * 3
     assert second[0].tolist() == [[0.0] * 2] * 3
     words = words_of(np.array((6, 0), np.uint32), use, 1, 0, 12)

@@ -15,11 +15,13 @@ from rotorgram.models.errors import InputError
 from rotorgram.sim import InitialState, PhysicsError, World, make_world
 from rotorgram.sim.backends import kernel
 
-ELEVATION, HOVER = "rotorgram/Elevation-v0", "rotorgram/Hover-v0"
+ELEVATION = "rotorgram/Elevation-v0"
+HOVER = "rotorgram/Hover-v0"
 DATA = Path(__file__).parents[1] / "data"
 FILES = {path.stem: path for path in sorted((*DATA.glob("*.xml"), *DATA.glob("*.toml")))}
 FILES |= {path.parent.name: path for path in sorted(QUAD_XML.parent.glob("*/*/vehicle.toml"))}
-RACER, HEXA = DATA / "racer.xml", DATA / "hexa.xml"
+RACER = DATA / "racer.xml"
+HEXA = DATA / "hexa.xml"
 N = 4
 EVERY = np.ones((N, 1), bool)
 
@@ -45,7 +47,8 @@ def begin(world: World, **pose: np.ndarray) -> None:
 
 def angle(ours: Any, theirs: np.ndarray) -> float:
     """Largest angle between attitudes, rad."""
-    q, p = np.asarray(ours, np.float64), theirs
+    q = np.asarray(ours, np.float64)
+    p = theirs
     apart = np.minimum(abs(q - p).max(axis=-1), abs(q + p).max(axis=-1))
     return 4 * float(apart.max())
 
@@ -58,9 +61,11 @@ def angle(ours: Any, theirs: np.ndarray) -> float:
 )
 def test_flies_as_mujoco_for_five_seconds(name: str, drag: float) -> None:
     """1e-6 m and 1e-6 rad, from any attitude, tumbling, at random thrusts; measured: 1e-9."""
-    vehicle, dice = Vehicle.load(FILES[name], linear_drag=drag), np.random.default_rng(0)
+    vehicle = Vehicle.load(FILES[name], linear_drag=drag)
+    dice = np.random.default_rng(0)
     pose = tumbling(dice)
-    ours, theirs = arrays(vehicle), make_world(vehicle, N, num_threads=1)
+    ours = arrays(vehicle)
+    theirs = make_world(vehicle, N, num_threads=1)
     substeps = vehicle.substeps(0.02)
     for world in (ours, theirs):
         world.reset(EVERY, InitialState(**pose))
@@ -78,7 +83,8 @@ def test_flies_as_mujoco_for_five_seconds(name: str, drag: float) -> None:
 @pytest.mark.parametrize("name", FILES)
 def test_compiled_and_numpy_fly_the_same(name: str) -> None:
     """A C function, if there is a compiler, and NumPy: but for rounding."""
-    vehicle, dice = Vehicle.load(FILES[name]), np.random.default_rng(0)
+    vehicle = Vehicle.load(FILES[name])
+    dice = np.random.default_rng(0)
     pose = tumbling(dice)
     worlds = [arrays(vehicle, compiled=choice) for choice in (None, False)]
     for world in worlds:
@@ -105,7 +111,8 @@ def test_compiled_a_fast_spin_is_exact(dtype: str) -> None:
 
 
 def test_arrays_have_the_same_bits_alone_and_in_a_batch() -> None:
-    vehicle, dice = Vehicle.load(FILES["hexa"]), np.random.default_rng(0)
+    vehicle = Vehicle.load(FILES["hexa"])
+    dice = np.random.default_rng(0)
     many = 19  # no multiple of what a processor computes at once
     pose = tumbling(dice, many)
     thrust = vehicle.hover_thrust * dice.uniform(0.9, 1.1, (many, 1, 6))
@@ -117,7 +124,8 @@ def test_arrays_have_the_same_bits_alone_and_in_a_batch() -> None:
         alone.reset(EVERY[:1], InitialState(**{name: x[i : i + 1] for name, x in pose.items()}))
         alone.step(thrust[i : i + 1], 2)
         for name in ("position", "quaternion", "velocity", "body_rates"):
-            one, all_ = getattr(alone.state, name), getattr(batch.state, name)
+            one = getattr(alone.state, name)
+            all_ = getattr(batch.state, name)
             assert one[0].tobytes() == all_[i].tobytes()
 
 
@@ -260,18 +268,23 @@ def test_acceleration_and_below() -> None:
 @pytest.mark.parametrize("file", FILES.values(), ids=FILES)
 def test_touches_the_ground_where_mujoco_does(file: Path) -> None:
     """Attitudes at random, just above and below the contact."""
-    vehicle, dice, count = Vehicle.load(file), np.random.default_rng(3), 24
+    vehicle = Vehicle.load(file)
+    dice = np.random.default_rng(3)
+    count = 24
     turned = dice.normal(size=(count, 1, 4))
     turned /= np.linalg.norm(turned, axis=-1, keepdims=True)
     turned[0] = (1.0, 0.0, 0.0, 0.0)
-    ours, theirs = arrays(vehicle, count), make_world(vehicle, count, num_threads=1)
-    low, high = np.zeros(count), np.full(count, float(vehicle.model.stat.extent) * 2)
+    ours = arrays(vehicle, count)
+    theirs = make_world(vehicle, count, num_threads=1)
+    low = np.zeros(count)
+    high = np.full(count, float(vehicle.model.stat.extent) * 2)
     for _ in range(40):
         middle = (low + high) / 2
         place = np.stack((0 * middle, 0 * middle, middle), axis=-1)[:, None]
         theirs.reset(np.ones((count, 1), bool), InitialState(position=place, quaternion=turned))
         touching = theirs.state.touching[:, 0]
-        low, high = np.where(touching, middle, low), np.where(touching, high, middle)
+        low = np.where(touching, middle, low)
+        high = np.where(touching, high, middle)
     small = 1e-4 * vehicle.rest_height
     for offset in (small, -small):
         place = np.stack((0 * high, 0 * high, high + offset), axis=-1)[:, None]
@@ -292,9 +305,11 @@ def test_whole_episodes_agree_with_mujoco(env_id: str, size: float, file: Any) -
     ours = LocalVectorEnv(
         env_id, N, vehicle=file, autoreset_mode="Disabled", backend="rigid", dtype="float64",
     )  # fmt: skip
-    first, expected = ours.reset(seed=5)[0], theirs.reset(seed=5)[0]
+    first = ours.reset(seed=5)[0]
+    expected = theirs.reset(seed=5)[0]
     np.testing.assert_array_equal(first, expected)
-    dice, shape = np.random.default_rng(2), theirs.action_space.shape
+    dice = np.random.default_rng(2)
+    shape = theirs.action_space.shape
     alive = np.ones(N, bool)
     for _ in range(250):
         actions = dice.uniform(-size, size, shape).astype(np.float32)
@@ -326,7 +341,8 @@ def test_over_udp_it_flies_as_in_process() -> None:
         assert seen[0].tobytes() == seen[1].tobytes()
         for _ in range(5):
             actions = np.full((1, 4), 0.1, np.float32)
-            here, there = pair.remote.step(actions[0]), local.step(actions)
+            here = pair.remote.step(actions[0])
+            there = local.step(actions)
             assert here[0].tobytes() == there[0].tobytes()
             assert here[1] == there[1][0]
 
@@ -375,7 +391,8 @@ def test_obstacles_of_a_file_are_refused_by_name(tmp_path: Path) -> None:
 
 def test_a_bad_state_raises_and_a_reset_mends_it() -> None:
     loop = Loop(EnvConfig.from_keywords(ELEVATION, backend="rigid"), 2)
-    every, still = np.ones(2, bool), np.zeros((2, 1))
+    every = np.ones(2, bool)
+    still = np.zeros((2, 1))
     loop.advance(still, every, [0, 1])
     begin(
         loop.world, position=np.full((2, 1, 3), 9.0), velocity=np.array([[[0.0] * 3], [[1e30] * 3]])

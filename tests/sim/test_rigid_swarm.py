@@ -21,7 +21,8 @@ from rotorgram.sim import (
 )
 from rotorgram.udp import RemoteVectorEnv
 
-FORMATION, CROSSING = "rotorgram/Formation-v0", "rotorgram/Crossing-v0"
+FORMATION = "rotorgram/Formation-v0"
+CROSSING = "rotorgram/Crossing-v0"
 MOVED = ("position", "quaternion", "velocity", "body_rates", "thrust")
 EFFECTS = {"motor_lag": True, "rotor_drag": True, "wind": (3.0, 1.0, 0.0)}
 DRAWN = {
@@ -37,7 +38,8 @@ def arrays(vehicle: Vehicle, worlds: int, drones: int, dtype: str = "float64", *
 
 def tumbling(worlds: int, drones: int) -> dict[str, np.ndarray]:
     """Starts high up, 50 m apart, at any attitude."""
-    dice, shape = np.random.default_rng(0), (worlds, drones)
+    dice = np.random.default_rng(0)
+    shape = (worlds, drones)
     turned = dice.normal(size=(*shape, 4))
     position = dice.uniform(1000.0, 1001.0, (*shape, 3))
     position[..., 0] += 50.0 * np.arange(drones)
@@ -69,7 +71,8 @@ def begin(world: World, mask: Any = None, **pose: np.ndarray) -> None:
 def test_drones_that_keep_apart_fly_bit_for_bit_as_alone(
     name: str | None, effects: dict[str, Any], compiled: bool | None
 ) -> None:
-    vehicle, shape = Vehicle.load(name), (2, 3)
+    vehicle = Vehicle.load(name)
+    shape = (2, 3)
     given: Any = {"effects": EffectOptions.from_options(effects), "compiled": compiled}
     together = arrays(vehicle, *shape, "float32", **given)
     alone = arrays(vehicle, 6, 1, "float32", **given)
@@ -81,7 +84,8 @@ def test_drones_that_keep_apart_fly_bit_for_bit_as_alone(
         together.step(thrust, 2, some)
         alone.step(thrust.reshape(6, 1, -1), 2, some.reshape(6, 1))
     for field in MOVED:
-        ours, theirs = getattr(together.state, field), getattr(alone.state, field)
+        ours = getattr(together.state, field)
+        theirs = getattr(alone.state, field)
         assert ours.tobytes() == theirs.tobytes(), field
     assert together.acceleration().tobytes() == alone.acceleration().tobytes()
     assert not together.state.touching.any()
@@ -91,8 +95,10 @@ def test_drones_that_keep_apart_fly_bit_for_bit_as_alone(
 @pytest.mark.parametrize("name", ["paper", "crazyflie2"])
 def test_flies_as_mujoco_for_five_seconds(name: str) -> None:
     """1e-6 m and 1e-6 rad from any attitude, tumbling, at random thrusts."""
-    vehicle, shape = Vehicle.load(name), (2, 3)
-    ours, theirs = arrays(vehicle, *shape), make_world(vehicle, 2, drones=3, num_threads=1)
+    vehicle = Vehicle.load(name)
+    shape = (2, 3)
+    ours = arrays(vehicle, *shape)
+    theirs = make_world(vehicle, 2, drones=3, num_threads=1)
     substeps = vehicle.substeps(0.02)
     for world in (ours, theirs):
         begin(world, **tumbling(*shape))
@@ -110,7 +116,8 @@ def test_flies_as_mujoco_for_five_seconds(name: str) -> None:
 
 def test_every_drone_has_the_draws_that_it_has_on_mujoco() -> None:
     """Of mass and the like, and of gusts; float64."""
-    vehicle, shape = Vehicle.load("crazyflie2"), (2, 3)
+    vehicle = Vehicle.load("crazyflie2")
+    shape = (2, 3)
     effects = EffectOptions.from_options({**EFFECTS, "gusts": 6.0})
     given: Any = {"drones": 3, "effects": effects, "randomize": Randomization(DRAWN, effects)}
     ours = make_world(vehicle, 2, "rigid", dtype="float64", **given)
@@ -168,9 +175,11 @@ def test_spheres_touch_at_two_radii_and_fly_on(name: str | None) -> None:
     third, and until 4 radii have passed twice. A third drone, and another world, keep apart.
     """
     vehicle = Vehicle.load(name, linear_drag=0.0)
-    radius, looks = vehicle.radius, round(0.02 / vehicle.timestep)
+    radius = vehicle.radius
+    looks = round(0.02 / vehicle.timestep)
     world = make_world(vehicle, 2, "rigid", drones=3, dtype="float64")
-    position, velocity = np.zeros((2, 3, 3)), np.zeros((2, 3, 3))
+    position = np.zeros((2, 3, 3))
+    velocity = np.zeros((2, 3, 3))
     position[..., 2] = 1000.0
     position[0, :, 0] = np.array((-1.5, 1.5, 20.0)) * radius
     position[1, :, 0] = np.array((-1.5, 1.5, 20.0)) * radius
@@ -179,7 +188,8 @@ def test_spheres_touch_at_two_radii_and_fly_on(name: str | None) -> None:
 
     pose = {"position": position, "velocity": velocity, "thrust": none}
     begin(world, np.ones((2, 3), bool), **pose)
-    state, seen = world.state, []
+    state = world.state
+    seen = []
     assert not state.touching.any()
     for _ in range(14):
         world.step(none, looks)
@@ -215,9 +225,11 @@ def test_a_touch_is_told_of_all_looks_of_a_control_step() -> None:
 
 def test_of_128_drones_those_that_overlap_are_told() -> None:
     vehicle = Vehicle.load("crazyflie2")
-    world, radius = arrays(vehicle, 2, 128, "float32"), vehicle.radius
+    world = arrays(vehicle, 2, 128, "float32")
+    radius = vehicle.radius
     position = np.zeros((2, 128, 3))
-    position[..., 0], position[..., 2] = 2.001 * radius * np.arange(128), 100.0
+    position[..., 0] = 2.001 * radius * np.arange(128)
+    position[..., 2] = 100.0
     position[0, 127, :2] = position[0, 40, 0], 1.999 * radius  # beside the 41st, and near two more
     position[1, 0, 2] = position[1, 1, 2] = 0.0  # on the ground, no drone among them
     begin(world, position=position)
@@ -238,14 +250,16 @@ def test_it_tells_a_touch_earlier_than_mujoco() -> None:
 
 
 def test_a_mask_moves_and_tells_of_its_worlds_alone() -> None:
-    vehicle, shape = Vehicle.load(), (2, 2)
+    vehicle = Vehicle.load()
+    shape = (2, 2)
     world = arrays(vehicle, *shape)
     place = np.zeros((2, 2, 3))
     place[..., 2] = 20.0  # both in one place
     begin(world, position=place)
     assert world.state.colliding.all()
     apart = place + np.array((0.0, 50.0, 0.0)) * np.arange(2)[:, None]
-    first, second = np.array([[True] * 2, [False] * 2]), np.array([[False] * 2, [True] * 2])
+    first = np.array([[True] * 2, [False] * 2])
+    second = np.array([[False] * 2, [True] * 2])
     begin(world, second, position=apart)
     assert world.state.touching.tolist() == [[True, True], [False, False]]
     thrust = np.broadcast_to(1.1 * vehicle.hover_thrust, (2, 2, 4))
@@ -293,7 +307,8 @@ def test_whole_episodes_agree_with_mujoco_until_a_touch(
     ours = LocalVectorEnv(env_id, 8, radio_loss=0.2, backend="rigid", dtype="float64", **options)
     seen = [env.reset(seed=5)[0] for env in (ours, theirs)]
     np.testing.assert_array_equal(*seen)
-    met, flown = False, 0
+    met = False
+    flown = 0
     for _ in range(500):
         actions = np.zeros((8, 4), np.float32)
         actions[:, :3] = np.clip(seen[1][:, :3], -fastest, fastest)
@@ -341,12 +356,14 @@ def test_over_udp_it_flies_as_in_process() -> None:
     running = simulate(remote, env=CROSSING, num_envs=4, **given)
     try:
         remote.connect()
-        here, there = local.reset(seed=4), remote.reset(seed=4)
+        here = local.reset(seed=4)
+        there = remote.reset(seed=4)
         assert_same(here, there)
         for _ in range(60):
             actions = np.zeros((4, 4), np.float32)
             actions[:, :3] = np.clip(here[0][:, :3], -0.1, 0.1)
-            here, there = local.step(actions), remote.step(actions)
+            here = local.step(actions)
+            there = remote.step(actions)
             assert_same(here, there)
             assert remote.out.tolist() == local.out.tolist()
             if local.done.any():

@@ -22,9 +22,11 @@ from rotorgram.models.vehicle import Vehicle
 from rotorgram.sim import EffectOptions, InitialState, World, checked_sensors, make_world
 from rotorgram.sim.sensors import Estimator, Sensors, isa_height, isa_pressure
 
-ELEVATION, HOVER = "rotorgram/Elevation-v0", "rotorgram/Hover-v0"
+ELEVATION = "rotorgram/Elevation-v0"
+HOVER = "rotorgram/Hover-v0"
 PERIOD = 0.02
-LEVEL, LEFT = (1.0, 0.0, 0.0, 0.0), (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))
+LEVEL = (1.0, 0.0, 0.0, 0.0)
+LEFT = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))
 IMU = {"gyro_noise": 0.0, "accelerometer_noise": 0.0}
 GPS = {"noise": 0.0, "vertical_noise": 0.0, "velocity_noise": 0.0}
 NOISY = {
@@ -122,7 +124,8 @@ def test_imu_feels_the_air(tmp_path: Path) -> None:
     file = tmp_path / "draggy.xml"
     text = Vehicle.load().path.read_text()
     file.write_text(text.replace("<worldbody>", f"{drag}<worldbody>"))
-    vehicle, every = Vehicle.load(file), np.True_
+    vehicle = Vehicle.load(file)
+    every = np.True_
     world = make_world(vehicle, 1, effects=EffectOptions(body_drag=True, wind=(5.0, 0.0, 0.0)))
     sensors = Sensors(checked_sensors({"imu": IMU}), world, PERIOD)
     world.reset(every, InitialState(position=np.array((0.0, 0.0, 5.0))))
@@ -280,10 +283,14 @@ def freedom(n: int, m: int) -> float:
 @pytest.mark.parametrize("rate", [50.0, 25.0])
 def test_allan_deviation_of_the_gyroscope(rate: float) -> None:
     """N / √τ at short, K √(τ / 3) at long times: the numbers that the datasheet gives."""
-    density, walk, samples, worlds = 1e-3, 3e-3, 6000, 16
+    density = 1e-3
+    walk = 3e-3
+    samples = 6000
+    worlds = 16
     settings = IMU | {"gyro_noise": density, "gyro_walk": walk, "rate": rate}
     _, sensors, every = sensing({"imu": settings}, worlds)
-    interval, series = 1 / rate, []
+    interval = 1 / rate
+    series = []
     for _ in range(samples):
         for _ in range(round(interval / PERIOD)):
             sensors.sample(every)
@@ -309,7 +316,8 @@ def test_a_delay_is_exact_and_a_rate_holds(worlds: int) -> None:
     """Read every 5th step and told 3 steps later; the first reading until then."""
     settings = GPS | {"rate": 10.0, "delay": 0.06}
     world, sensors, every = sensing({"gps": settings}, worlds, velocity=(1.0, 2.0, 3.0))
-    flown, told = [world.state.position.copy()], [sensors.readings["gps"][..., :3]]
+    flown = [world.state.position.copy()]
+    told = [sensors.readings["gps"][..., :3]]
     for _ in range(20):
         world.step(np.full((*world.shape, 4), 60.0), 2)
         sensors.sample(every)
@@ -324,13 +332,15 @@ def test_dropouts() -> None:
     """A lost reading leaves the one before: 30 % of 100,000."""
     settings = {"noise": 1.0, "vertical_noise": 1.0, "velocity_noise": 1.0, "dropout": 0.3}
     _, sensors, every = sensing({"gps": settings}, 2000)
-    lost, before = 0, sensors.readings["gps"]
+    lost = 0
+    before = sensors.readings["gps"]
     for _ in range(50):
         sensors.sample(every)
         now = sensors.readings["gps"]
         same = (now == before).all(axis=-1)
         assert (same == (now == before).any(axis=-1)).all()
-        lost, before = lost + int(same.sum()), now
+        lost = lost + int(same.sum())
+        before = now
     assert lost / 1e5 == pytest.approx(0.3, abs=4 * math.sqrt(0.3 * 0.7 / 1e5))
 
 
@@ -435,7 +445,8 @@ def test_a_batch_is_so_many_single_envs(observe: str) -> None:
         seen, _, terminated, truncated, _ = many.step(actions)
         for i, env in enumerate(singles):
             if ended[i]:
-                alone[i], ended[i] = env.reset()[0], False
+                alone[i] = env.reset()[0]
+                ended[i] = False
             else:
                 alone[i], _, *ends, _ = env.step(actions[i])
                 ended[i] = any(ends)
@@ -445,7 +456,9 @@ def test_a_batch_is_so_many_single_envs(observe: str) -> None:
 
 def test_a_frozen_drone_stays_as_it_is() -> None:
     held, free = (Loop(EnvConfig.from_keywords(HOVER, sensors=NOISY), 2) for _ in range(2))
-    every, mask, actions = np.ones(2, bool), np.array([True, False]), actions_of(2, 12)
+    every = np.ones(2, bool)
+    mask = np.array([True, False])
+    actions = actions_of(2, 12)
     for loop in (held, free):
         loop.advance(actions[0], every, [1, 2])
         loop.advance(actions[0])
@@ -472,7 +485,8 @@ def test_sensors_move_nothing_else(worlds: int) -> None:
         Loop(EnvConfig.from_keywords(HOVER, sensors=sensors, flight_band=100.0), worlds)
         for sensors in ({}, two, NOISY)
     )
-    every, down = np.ones(worlds, bool), np.full((worlds, 4), -0.5, np.float32)
+    every = np.ones(worlds, bool)
+    down = np.full((worlds, 4), -0.5, np.float32)
     for seeds in (range(worlds), None):  # two episodes
         for loop in (none, some, all_of_them):
             loop.advance(down, every, seeds)
@@ -509,7 +523,8 @@ def test_over_the_wire_as_in_process() -> None:
         assert pair.remote.observation_space == local.observation_space
         for _ in range(20):
             action = dice.uniform(-0.2, 0.2, 4).astype(np.float32)
-            here, there = pair.remote.step(action), local.step(action)
+            here = pair.remote.step(action)
+            there = local.step(action)
             assert bits(here[0]) == bits(there[0])
             assert here[1:4] == there[1:4]
 
@@ -631,7 +646,8 @@ def test_a_reading_counts_once() -> None:
 
 def test_a_gyroscopes_bias_tilts_the_estimate_by_so_much() -> None:
     """What the bias adds in a step is what the accelerometer takes away: b T = sin(tilt) / 2."""
-    made, bias = estimator(), 0.5
+    made = estimator()
+    bias = 0.5
     for _ in range(100):
         made.update(np.True_, {"imu": channel(bias, 0, 0, 0, 0, 10)})
     assert math.sin(angles_of(made.quaternion)[0]) == pytest.approx(2 * bias * PERIOD)
@@ -639,7 +655,9 @@ def test_a_gyroscopes_bias_tilts_the_estimate_by_so_much() -> None:
 
 def test_errors_of_a_long_hover_are_those_of_the_biases() -> None:
     """With a time constant of τ steps: tilt by b τ and a / g, height by a τ²."""
-    gyro, force, drones = 0.01, 0.1, 400
+    gyro = 0.01
+    force = 0.1
+    drones = 400
     biases = IMU | {"gyro_bias": gyro, "accelerometer_bias": force}
     sensors = {"imu": biases, "barometer": {"noise": 0.0}, "estimate": True}
     _, made, every = sensing(sensors, drones)
@@ -681,7 +699,8 @@ def test_a_controller_flies_on_the_estimate() -> None:
     pilot = PID(env.unwrapped.env_spec)  # type: ignore[attr-defined]
     pilot.reset()
     seen, _ = env.reset(seed=5)
-    errors, differences = [], []
+    errors = []
+    differences = []
     for _ in range(250):
         seen, _, terminated, _, info = env.step(pilot.act(seen))
         assert not terminated
@@ -696,7 +715,8 @@ def test_a_controller_flies_on_the_estimate() -> None:
 
 def test_the_page_tells_what_the_benchmark_wrote() -> None:
     docs = Path(__file__).parents[2] / "docs"
-    page, results = (docs / "sensors.md").read_text(), docs / "results" / "sensors"
+    page = (docs / "sensors.md").read_text()
+    results = docs / "results" / "sensors"
     one, many = json.loads((results / "cost.json").read_text()).values()
     for name, time in one.items():
         assert f"| {name} | {time:.0f} | {many[name]:,.0f} |" in page

@@ -14,7 +14,8 @@ def begun(world: World, apart: float = 5.0) -> np.ndarray:
     """Positions from which all drones of a world start, each drone the same in all worlds."""
     worlds, drones = world.shape
     position = np.zeros((worlds, drones, 3))
-    position[..., 0], position[..., 2] = apart * np.arange(drones), 20.0
+    position[..., 0] = apart * np.arange(drones)
+    position[..., 2] = 20.0
     everybody = np.ones(world.shape, bool)
     world.reset(everybody, InitialState(position=position))
     return position
@@ -28,7 +29,8 @@ def thrusts(vehicle: Vehicle, steps: int, count: int) -> np.ndarray:
 
 @pytest.mark.parametrize("name", [None, "crazyflie2", "heavy_hexa"])
 def test_drones_that_keep_apart_fly_bit_for_bit_as_alone(name: str | None) -> None:
-    vehicle, drones = Vehicle.load(name), 4
+    vehicle = Vehicle.load(name)
+    drones = 4
     together = make_world(vehicle, 1, drones=drones)
     alone = make_world(vehicle, drones)
     begun(together)
@@ -40,13 +42,16 @@ def test_drones_that_keep_apart_fly_bit_for_bit_as_alone(name: str | None) -> No
         together.step(thrust[None], 2)
         alone.step(thrust[:, None], 2)
     for field in ("position", "quaternion", "velocity", "body_rates", "thrust"):
-        ours, theirs = getattr(together.state, field)[0], getattr(alone.state, field)[:, 0]
+        ours = getattr(together.state, field)[0]
+        theirs = getattr(alone.state, field)[:, 0]
         assert ours.tobytes() == theirs.tobytes(), field
     assert not together.state.touching.any()
 
 
 def test_a_batch_of_swarms_is_that_many_swarms() -> None:
-    vehicle, worlds, drones = Vehicle.load("crazyflie2"), 3, 2
+    vehicle = Vehicle.load("crazyflie2")
+    worlds = 3
+    drones = 2
     effects = EffectOptions.from_options(EFFECTS)
     drawn = Randomization(DRAWN, effects)
     settings = {"drones": drones, "effects": effects, "randomize": drawn}
@@ -75,7 +80,9 @@ def test_a_collision_keeps_momentum_and_gains_no_energy() -> None:
     world.reset(
         np.ones((1, 2), bool), InitialState(position=position, velocity=velocity, thrust=none)
     )
-    state, met, time = world.state, False, 0.0
+    state = world.state
+    met = False
+    time = 0.0
 
     def momentum() -> np.ndarray:
         return vehicle.mass * state.velocity[0].sum(axis=0)
@@ -85,7 +92,8 @@ def test_a_collision_keeps_momentum_and_gains_no_energy() -> None:
         turning = np.einsum("ai,ij,aj->", rates, vehicle.inertia, rates)
         return 0.5 * (vehicle.mass * (state.velocity[0] ** 2).sum() + turning)
 
-    before, start = momentum(), kinetic()
+    before = momentum()
+    start = kinetic()
     for _ in range(100):
         world.step(none, 1)
         time += vehicle.timestep
@@ -140,7 +148,8 @@ def test_what_a_swarm_cannot_have_is_one_sentence() -> None:
     with pytest.raises(InputError, match=r"^drones: expected 1 to 1024, got 0$"):
         make_world(vehicle, 1, drones=0)
     payload = EffectOptions.from_options({"payload": 1.0, "cable": 1.0})
-    world, above = make_world(vehicle, 1, drones=2, effects=payload), np.full((1, 2, 3), 5.0)
+    world = make_world(vehicle, 1, drones=2, effects=payload)
+    above = np.full((1, 2, 3), 5.0)
     with pytest.raises(InputError, match=r"payload: expected one drone in a world, or a task .* 2"):
         world.reset(np.ones((1, 2), bool), InitialState(position=above))
     with pytest.raises(InputError, match=r"expected a timestep of 0.01 as of"):

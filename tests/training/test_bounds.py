@@ -90,16 +90,19 @@ def test_the_largest_return_is_nearly_that_of_the_time_optimal_flight(start: flo
     # Accelerations of 90 steps, m/s², which change by 1 at most, and the sizes |E| after each.
     # (s - x) / (s + x) is convex, so the tangent at a flight's sizes lies below it: a linear
     # program that lowers the sizes weighted by the slopes never lowers the return.
-    steps, period = 90, 0.02
+    steps = 90
+    period = 0.02
     late = np.subtract.outer(np.arange(steps), np.arange(steps))
     way = np.where(late >= 0, (late + 0.5) * period**2, 0.0)
     change = sparse.diags([1.0, -1.0], [0, -1], (steps, steps))
-    size, none = -sparse.identity(steps), sparse.csr_matrix((steps, steps))
+    size = -sparse.identity(steps)
+    none = sparse.csr_matrix((steps, steps))
     limits = sparse.bmat([[change, none], [-change, none], [-way, size], [way, size]])
     most = np.repeat([1.0, 1.0, -start, start], steps)
     # It starts too low: towards the target it climbs, with 10.2 m/s² at most, and falls with 9.8.
     box = [(-9.8, 10.2)] * steps + [(0, None)] * steps
-    slopes, returns = np.ones(steps), [-np.inf]
+    slopes = np.ones(steps)
+    returns = [-np.inf]
     while len(returns) < 4 or returns[-1] > returns[-2] + 1e-3:
         weights = np.concatenate([np.zeros(steps), slopes])
         sizes = linprog(weights, limits, most, bounds=box).x[steps:]
@@ -111,7 +114,9 @@ def test_the_largest_return_is_nearly_that_of_the_time_optimal_flight(start: flo
 
 
 def test_least_time_of_a_course_by_hand() -> None:
-    start, east, none = (0.0, 0.0, 0.0), (2.0, 0.0, 0.0), np.zeros(2)
+    start = (0.0, 0.0, 0.0)
+    east = (2.0, 0.0, 0.0)
+    none = np.zeros(2)
     # 1 m/s² without gravity: 2 m take sqrt(2 · 2) s, and there and back 2 sqrt(2) + sqrt(2 · 2) s.
     assert course_time(np.array((start, east)), none[:1], 1.0, 0.0) == pytest.approx(2.0)
     back = np.array((start, east, start))

@@ -304,4 +304,5 @@ def test_no_worse_of_what_is_to_be_high_and_of_what_was_not_trained():
     worse = evaluated(a2c=[4.0] * 30, **{"sb3-a2c": [5.0] * 30})
     assert judge_no_worse(worse, "tuned", high).verdict == "not borne out"
     verdict = judge_no_worse(evaluated(a2c=[4.5] * 30), "tuned", high)
-    assert (verdict.verdict, verdict.evidence) == ("not tested", "sb3-a2c was not trained.")
+    assert verdict.verdict == "not tested"
+    assert verdict.evidence == "sb3-a2c was not trained."

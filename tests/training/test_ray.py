@@ -111,7 +111,8 @@ def test_every_node_flies(address: str) -> None:
 
 def test_pictures_are_taken_on_a_cluster(opengl: None, tmp_path: Path, address: str) -> None:
     (tmp_path / "plan.toml").write_text(PLAN, "utf-8")
-    plan, found = Plan.read(tmp_path / "plan.toml"), []
+    plan = Plan.read(tmp_path / "plan.toml")
+    found = []
     for name, config in {
         "here": WorkersConfig(jobs=1),
         "there": WorkersConfig(runner="ray", address=address),

@@ -74,7 +74,8 @@ def test_a_run_is_what_its_checkpoint_flies_from_starts_of_its_seed(folder: Path
     found = results.runs.iloc[1]
     assert found["steady"] == np.mean([row["steady"] for row in rows])
     assert found["return"] == pytest.approx(np.mean([row["return"] for row in rows]), rel=1e-12)
-    assert (found["env_steps"], found["episodes"]) == (600, 3)
+    assert found["env_steps"] == 600
+    assert found["episodes"] == 3
     assert found["steps_per_second"] == pytest.approx(600 / found["seconds"])
     # The other seed's starts are others.  # fault 41
     assert all(a.headline[0] != b.headline[0] for a, b in zip(flown, others, strict=True))
@@ -119,7 +120,8 @@ def test_files_hold_settings_software_and_every_step(folder: Path) -> None:
 def test_over_the_wire_the_numbers_are_those_in_process(folder: Path, tmp_path: Path) -> None:
     study = replace(STUDY, wire=True, seeds=1)
     run_study(study, tmp_path, workers=ONE)
-    own, other = Results.read(tmp_path), Results.read(folder)
+    own = Results.read(tmp_path)
+    other = Results.read(folder)
     for name in ("runs", "evaluations", "episodes"):
         table = getattr(other, name)
         expected = table[table["seed"] == 0].reset_index(drop=True)
@@ -155,7 +157,8 @@ def test_what_is_missing_is_flown_to_the_same_numbers(folder: Path, tmp_path: Pa
     assert not half.finished
     run_study(half.study, tmp_path, "", lambda name, *_: shown.add(name), ONE)
     assert shown == {"all runs", "a2c seed 1", "pid seed 1"}
-    whole, again = Results.read(folder).runs, Results.read(tmp_path).runs
+    whole = Results.read(folder).runs
+    again = Results.read(tmp_path).runs
     assert Results.read(tmp_path).finished
     pd.testing.assert_frame_equal(
         again.drop(columns=TIMES), whole.drop(columns=TIMES), check_exact=True
@@ -215,7 +218,8 @@ def test_ctrl_c_keeps_what_is_done(tmp_path: Path, capsys: pytest.CaptureFixture
         out, err = process.communicate(timeout=20)
     finally:
         process.kill()
-    assert (process.returncode, err) == (130, "rotorgram: interrupted\n")
+    assert process.returncode == 130
+    assert err == "rotorgram: interrupted\n"
     assert f"go on with: rotorgram sweep vpg --resume {folder}\n" in out
     kept = Results.read(folder).runs
     assert 1 <= len(kept) < 4
@@ -250,7 +254,8 @@ def test_two_files_are_rows_of_their_names(
     assert [row.name for row in results.study.rows] == ["a", "b"]
     assert [row.config.hidden for row in results.study.rows] == [(8,), (8, 8)]
     for row in results.study.rows:
-        assert (row.config.gamma, row.env.options["flight_band"]) == (0.9, 1.5)
+        assert row.config.gamma == 0.9
+        assert row.env.options["flight_band"] == 1.5
         assert row.env.options["episode_length"] == 40
     assert not results.study.wire
     figures = {path.name for path in (tmp_path / "out" / "figures").iterdir()}
@@ -299,7 +304,8 @@ def test_a_board_takes_own_tasks_and_changes(
 def test_a_controller_brings_its_options_and_stands_in_the_table_of_its_task() -> None:
     hover = EnvConfig(env_id="rotorgram/Hover-v0", options={"episode_length": 9})
     row = Row(agent="geometric", env=hover)
-    assert (row.env.options["action"], row.env.options["episode_length"]) == ("position", 9)
+    assert row.env.options["action"] == "position"
+    assert row.env.options["episode_length"] == 9
     assert row.name == "geometric Hover-v0 episode_length=9"
     assert row.task == Row(agent="ppo", env=hover, env_steps=41_000).task
     velocity = replace(hover, options={"action": "velocity"})
@@ -354,7 +360,9 @@ def test_points_are_all_combinations_of_settings_and_task_options() -> None:
     found = [(row.config.hidden, row.env.options["start_band"]) for row in study.rows]
     assert found == [((64, 64), 0.5), ((64, 64), 1), ((32,), 0.5), ((32,), 1)]
     assert study.rows[0].name == "hidden=[64,64] env.start-band=0.5"
-    assert (study.first_seed, study.seeds, study.evaluation) == (1000, 3, "tuning")
+    assert study.first_seed == 1000
+    assert study.seeds == 3
+    assert study.evaluation == "tuning"
     assert study.rows[3].config.gamma == 0.9
 
 
@@ -395,7 +403,8 @@ def test_wrong_input_is_one_sentence(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     status, out, err = run(capsys, "sweep", "a2c", *flags)
-    assert (status, out) == (1, "")
+    assert status == 1
+    assert out == ""
     assert err.startswith("rotorgram: ")
     assert sentence in err
     assert err.count("\n") == 1
@@ -490,7 +499,8 @@ def test_the_committed_policies_fly_the_committed_numbers() -> None:
     flown_before = json.loads((DATA / "committed_policies.json").read_text())
     assert flown_before.keys() == files.keys()
     for row in trained:
-        policy, count = load(files[row.name]).policy(), results.study.episodes
+        policy = load(files[row.name]).policy()
+        count = results.study.episodes
         with open_env(False, row.env.flown, count) as env:
             flown = fly_episodes(env, policy, count, "final")
         measured = [measure_episode(one, results.headline(row)) for one in flown]

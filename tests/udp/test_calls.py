@@ -14,7 +14,8 @@ from peers import ANY, Running
 from rotorgram.udp import RemoteEnv, Simulator, protocol
 
 UDP = str(Path(protocol.__file__).parents[1])
-STEPS, MOST = 41, 40
+STEPS = 41
+MOST = 40
 
 
 def test_a_step_of_one_drone_takes_few_calls() -> None:

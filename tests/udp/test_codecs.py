@@ -89,14 +89,18 @@ def test_any_state_and_command_comes_back(of: Layout, seed: int) -> None:
     got = binary.decode(data, of)
     assert isinstance(got, State)
     assert len(data) == of.state_size
-    assert (got.session, got.sequence, got.time, got.nonce) == (3, 9, 0.25, 0)
+    assert got.session == 3
+    assert got.sequence == 9
+    assert got.time == 0.25
+    assert got.nonce == 0
     pairs = [*zip(sent.observations, got.observations, strict=True),
              *zip(sent.telemetry, got.telemetry, strict=True),
              (sent.rewards, got.rewards), (sent.terminated, got.terminated),
              (sent.truncated, got.truncated)]  # fmt: skip
     for there, here in pairs:
-        assert (there.dtype, there.shape, there.tobytes()) == (here.dtype, here.shape,
-                                                               here.tobytes())  # fmt: skip
+        assert there.dtype == here.dtype
+        assert there.shape == here.shape
+        assert there.tobytes() == here.tobytes()
         assert not here.flags.writeable
     for seeds in (None, dice.integers(0, 2**64, n, np.uint64)):
         actions = of.actions
@@ -128,10 +132,15 @@ def test_arrays_lie_at_multiples_of_eight() -> None:
         telemetry=((3,),),
     )
     assert [slot.at for slot in of.observation_slots] == [40, 56]
-    assert (of.rewards.at, of.flags[0].at, of.flags[1].at) == (72, 96, 99)
+    assert of.rewards.at == 72
+    assert of.flags[0].at == 96
+    assert of.flags[1].at == 99
     assert of.telemetry_slots[0].at == 104
     assert of.state_size == 104 + 72
-    assert (of.actions.at, of.orders.at, of.seeds.at, of.command_size) == (32, 48, 56, 80)
+    assert of.actions.at == 32
+    assert of.orders.at == 48
+    assert of.seeds.at == 56
+    assert of.command_size == 80
 
 
 @pytest.mark.parametrize("message", SHORT, ids=lambda m: type(m).__name__)

@@ -75,7 +75,8 @@ def its_end(process: subprocess.Popen[str]) -> tuple[int, Counter[str]]:
 
 def assert_bad(relay: Relay, agent: Counter[str], simulator: Counter[str]) -> None:
     """The faults did happen, and both sides saw them."""
-    got, config = relay.counters, relay.config
+    got = relay.counters
+    config = relay.config
     total = got["received"]
     for name, share in (
         ("dropped", config.drop),
@@ -111,7 +112,8 @@ def assert_same_flight(remote: gym.Env, steps: int) -> int:
     states = 2  # its own reset, and ours
     for _ in range(steps):
         action = dice.uniform(-1.1, 1.1, 1).astype(np.float32)
-        here, there = remote.step(action), local.step(action)
+        here = remote.step(action)
+        there = local.step(action)
         same(here, there)
         states += 1
         if here[2] or here[3]:
@@ -238,7 +240,8 @@ def flying_locally(seeds: list[int], steps: int) -> Iterator[Any]:
 
 
 def test_64_drones() -> None:
-    steps, seeds = 500, list(range(1000, 1064))
+    steps = 500
+    seeds = list(range(1000, 1064))
     env = RemoteVectorEnv(ANY, num_envs=64, connect=False)
     with (
         flying_locally(seeds, steps) as local,
@@ -255,7 +258,8 @@ def test_64_drones() -> None:
 
 
 def test_three_simulators_of_two_drones() -> None:
-    steps, seeds = 200, list(range(2000, 2006))
+    steps = 200
+    seeds = list(range(2000, 2006))
     env = RemoteVectorEnv(ANY, num_simulators=3, num_envs=6, connect=False)
     with (
         flying_locally(seeds, steps) as local,

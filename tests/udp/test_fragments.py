@@ -46,7 +46,8 @@ def test_what_fits_is_not_cut() -> None:
 def test_any_message_comes_through(size: int, largest: int, seed: int, loss: float) -> None:
     data = message(size)
     dice = random.Random(seed)
-    transfer, assembler = Transfer(data, largest, Window()), Assembler(len(data))
+    transfer = Transfer(data, largest, Window())
+    assembler = Assembler(len(data))
     out = transfer.start()
     for _ in range(100):
         assert all(len(datagram) <= largest for datagram in out)
@@ -82,7 +83,8 @@ def test_messages_of_too_many_fragments_are_not_begun() -> None:
 
 def test_only_what_is_missing_is_sent_again() -> None:
     data = message(5000)
-    transfer, assembler = Transfer(data, FAR, Window()), Assembler(len(data))
+    transfer = Transfer(data, FAR, Window())
+    assembler = Assembler(len(data))
     first = transfer.start()
     assert len(first) == transfer.count == 18
     for number, datagram in enumerate(first):

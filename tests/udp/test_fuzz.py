@@ -28,7 +28,8 @@ def changed(data: bytes, dice: Random) -> bytes:
     """A few bytes changed, cut out, doubled or taken from another input."""
     buffer = bytearray(data)
     for _ in range(dice.randint(1, 4)):
-        at, size = dice.randrange(len(buffer) + 1), dice.randrange(1, 9)
+        at = dice.randrange(len(buffer) + 1)
+        size = dice.randrange(1, 9)
         match dice.randrange(5):
             case 0 if at < len(buffer):
                 buffer[at] ^= 1 << dice.randrange(8)
@@ -72,7 +73,8 @@ def test_what_is_honest_is_taken() -> None:
         again = binary.decode(binary.encode(message, LAYOUT), LAYOUT)
         assert content(again) == content(message)
     assert text.decode_state(b"1,0.5,0,1,0.25,-0.0,1.5", LAYOUT).rewards.tolist() == [0.5]
-    whole, assembler = binary.frame(binary.STATE, SESSION, 1, b"ab"), Assembler(100)
+    whole = binary.frame(binary.STATE, SESSION, 1, b"ab")
+    assembler = Assembler(100)
     parts = [(1, whole[20:]), (0, whole[:20])]
     pieces = [fragment_of(binary.STATE, SESSION, 1, number, 2, part) for number, part in parts]
     assert [assembler.take(piece) for piece in pieces] == [None, whole]

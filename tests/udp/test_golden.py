@@ -27,7 +27,8 @@ def bytes_of(name: str) -> bytes:
 
 
 def by_hand(kind: int, sequence: int, body: bytes) -> bytes:
-    head, rest = bytes([0xA7, 0x52, 2, kind]), struct.pack("<QQ", 0x0123456789ABCDEF, sequence)
+    head = bytes([0xA7, 0x52, 2, kind])
+    rest = struct.pack("<QQ", 0x0123456789ABCDEF, sequence)
     return head + struct.pack("<I", zlib.crc32(head + rest + body)) + rest + body
 
 
@@ -108,7 +109,8 @@ def test_the_bytes_are_those_of_the_page() -> None:
 
 @pytest.mark.parametrize("name", MESSAGES)
 def test_a_right_message_is_read(name: str) -> None:
-    case, layout = MESSAGES[name], golden.LAYOUTS[MESSAGES[name]["env"]]
+    case = MESSAGES[name]
+    layout = golden.LAYOUTS[MESSAGES[name]["env"]]
     message = binary.decode(bytes_of(name), layout)
     assert type(message).__name__ == case["type"]
     assert json.loads(json.dumps(golden.described(message))) == case["fields"]
@@ -130,14 +132,16 @@ def test_a_wrong_message_is_not_read(case: dict[str, str]) -> None:
 @pytest.mark.parametrize("case", GOLDEN["fragments"], ids=lambda case: case["of"])
 @pytest.mark.parametrize("order", [1, -1])
 def test_fragments_are_the_message(case: dict[str, Any], order: int) -> None:
-    message, datagrams = bytes_of(case["of"]), list(map(bytes.fromhex, case["datagrams"]))
+    message = bytes_of(case["of"])
+    datagrams = list(map(bytes.fromhex, case["datagrams"]))
     assert max(map(len, datagrams)) <= 60
     # By hand: header with 128 added to the type, number, count, asks, slice.
     slices = [datagram[32:] for datagram in datagrams]
     assert b"".join(slices) == message
     assert len({len(piece) for piece in slices[:-1]}) <= 1
     for number, datagram in enumerate(datagrams):
-        kind, (session, sequence) = message[3], struct.unpack_from("<QQ", message, 8)
+        kind = message[3]
+        (session, sequence) = struct.unpack_from("<QQ", message, 8)
         assert datagram[3] == kind + 128
         assert struct.unpack_from("<QQ", datagram, 8) == (session, sequence)
         asks = number == len(datagrams) - 1
@@ -167,8 +171,10 @@ def test_the_key_of_a_session() -> None:
 
 @pytest.mark.parametrize("case", GOLDEN["sealed"], ids=lambda c: f"{c['of']} by the {c['from']}")
 def test_seals(case: dict[str, str]) -> None:
-    told, message = GOLDEN["key"], bytes_of(case["of"])
-    datagram, answers = bytes.fromhex(case["datagram"]), bytes.fromhex(case.get("answers", ""))
+    told = GOLDEN["key"]
+    message = bytes_of(case["of"])
+    datagram = bytes.fromhex(case["datagram"])
+    answers = bytes.fromhex(case.get("answers", ""))
     secret = bytes.fromhex(told["shared" if case["key"] == "shared" else "of the session"])
     person = case["from"].encode()
     tag = blake2b(message + answers, key=secret, digest_size=16, person=person).digest()
@@ -189,7 +195,8 @@ def test_forged_datagrams_are_not_opened(case: dict[str, str]) -> None:
 
 
 def test_text_lines() -> None:
-    lines, layout = GOLDEN["text of env one"], golden.LAYOUTS["one"]
+    lines = GOLDEN["text of env one"]
+    layout = golden.LAYOUTS["one"]
     states = [text.decode_state(line.encode(), layout) for line in lines["states"]]
     commands = [text.decode_command(line.encode(), layout, 0) for line in lines["commands"]]
     first = states[0]

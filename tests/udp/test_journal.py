@@ -67,7 +67,10 @@ def fly(remote: Any, steps: int, seed: int | None = 7) -> SimpleNamespace:
     remote.reset(seed=seed)
     remote.action_space.seed(steps)
     drones = getattr(remote, "num_envs", 1)
-    flown, episodes, total, running = 0, 0, 0.0, np.zeros(drones)
+    flown = 0
+    episodes = 0
+    total = 0.0
+    running = np.zeros(drones)
     ended = np.zeros(drones, bool)
     for _ in range(steps):
         _, reward, terminated, truncated, _ = remote.step(remote.action_space.sample())
@@ -78,7 +81,8 @@ def fly(remote: Any, steps: int, seed: int | None = 7) -> SimpleNamespace:
         total += float(running[ended].sum())
         if drones == 1 and ended[0]:
             remote.reset()
-            running, ended = np.zeros(1), np.zeros(1, bool)
+            running = np.zeros(1)
+            ended = np.zeros(1, bool)
     return SimpleNamespace(steps=flown, episodes=episodes, returns=total)
 
 
@@ -130,7 +134,8 @@ def datagrams(path: Path, *kinds: type) -> list[bytes]:
 def rewrite(source: Path, target: Path, change: Callable[[Message], Message]) -> None:
     """Write a journal again, by other means, with changed messages."""
     with source.open("rb") as old, target.open("wb") as new:
-        reader, writer = make_reader(old), Writer(new)
+        reader = make_reader(old)
+        writer = Writer(new)
         writer.start()
         for metadata in reader.iter_metadata():
             writer.add_metadata(metadata.name, metadata.metadata)
@@ -190,9 +195,11 @@ def test_both_sides_can_be_repeated_bit_for_bit(
     assert seen.episodes > 1
     for side in ("agent", "simulator"):
         path = getattr(both, side)
-        summary, verdict = Summary(path), Verification(path)
+        summary = Summary(path)
+        verdict = Verification(path)
         assert (summary.about["side"], summary.complete, summary.ending) == (side, True, "complete")
-        assert (summary.steps, summary.episodes) == (seen.steps, seen.episodes)
+        assert summary.steps == seen.steps
+        assert summary.episodes == seen.episodes
         (session,) = summary.sessions
         assert session.returns == pytest.approx(seen.returns, rel=1e-12)
         assert session.session.num_envs == arrangement.get("drones", 1)
@@ -201,7 +208,8 @@ def test_both_sides_can_be_repeated_bit_for_bit(
         assert 0 < session.last - session.first < 60e9
         (compared,) = verdict.sessions
         blind = int(side == "agent" and session.session.codec == "text")
-        assert (compared.same, compared.unchecked) == (session.states - blind, blind)
+        assert compared.same == session.states - blind
+        assert compared.unchecked == blind
         assert compared.notes == verdict.notes == []
         assert verdict.identical
         assert str(verdict).endswith(f"identical: {compared.same} States in 1 session")
@@ -274,7 +282,8 @@ def test_a_journal_has_the_model_of_each_vehicle_of_a_mix(tmp_path: Path) -> Non
 
 def test_both_sides_write_the_same_datagrams(flight: SimpleNamespace) -> None:
     everything = State, Command, Hello, Welcome
-    ours, theirs = datagrams(flight.agent, *everything), datagrams(flight.simulator, *everything)
+    ours = datagrams(flight.agent, *everything)
+    theirs = datagrams(flight.simulator, *everything)
     assert ours == theirs
     assert len(ours) == 2 * 602 + 1  # Hello, Welcome, State 1 and its reset; the last has no answer
 
@@ -330,7 +339,8 @@ def test_a_flight_that_never_began(tmp_path: Path) -> None:
         with pytest.raises(PeerSilent):
             simulator.run()
         (session,) = Summary(path).sessions  # finished by the end of `run`
-    assert (session.ending, session.steps) == ("not closed", 0)
+    assert session.ending == "not closed"
+    assert session.steps == 0
     assert str(Verification(path)).endswith("nothing to compare")
     assert not Verification(path).identical
 
@@ -376,8 +386,11 @@ def test_one_flipped_bit_is_found(field: str, flight: SimpleNamespace, tmp_path:
     (session,) = verdict.sessions
     found = session.difference
     assert found is not None
-    assert (found.sequence, found.drone, found.field) == (123, 2, field)
-    assert (session.differing, session.same) == (1, 601)
+    assert found.sequence == 123
+    assert found.drone == 2
+    assert found.field == field
+    assert session.differing == 1
+    assert session.same == 601
     assert found.recorded != found.replayed
     if field == "reward":
         was, now = (float.fromhex(text.split()[0]) for text in (found.recorded, found.replayed))
@@ -487,7 +500,8 @@ def test_a_binary_session_may_have_the_number_0(tmp_path: Path) -> None:
         fly(remote, 20)
     assert running.join() == "the agent closed"
     (session,) = Summary(path).sessions
-    assert (session.session.codec, session.steps) == ("binary", 20)
+    assert session.session.codec == "binary"
+    assert session.steps == 20
     assert Verification(path).identical
 
 
@@ -504,7 +518,8 @@ def test_several_simulators_at_once(tmp_path: Path) -> None:
         one.join()
     summary = Summary(path)
     assert [s.session.slot for s in summary.sessions] == [0, 1]
-    assert (summary.steps, summary.episodes) == (seen.steps, seen.episodes)
+    assert summary.steps == seen.steps
+    assert summary.episodes == seen.episodes
     assert Verification(path).identical
     with path.open("rb") as file:
         topics = {c.topic for c in make_reader(file).get_summary().channels.values()}
@@ -537,7 +552,8 @@ def test_an_agent_that_was_started_anew(tmp_path: Path) -> None:
 
 
 def test_loss_and_repetition_do_not_enter(tmp_path: Path) -> None:
-    ours, theirs = tmp_path / "agent.mcap", tmp_path / "simulator.mcap"
+    ours = tmp_path / "agent.mcap"
+    theirs = tmp_path / "simulator.mcap"
     faults = FaultConfig(drop=0.1, duplicate=0.1, reorder=0.1, corrupt=0.05, seed=3)
     remote = RemoteEnv(ANY, connect=False, record=ours, **TIMES)
     with relaying(remote.address, faults) as relay:
@@ -594,7 +610,8 @@ def crc_of_the_summary(path: Path) -> bool:
 
     data = path.read_bytes()
     opcode, size, start, offsets, crc = struct.unpack("<BQQQI", data[-37:-8])
-    assert (opcode, size) == (2, 20)
+    assert opcode == 2
+    assert size == 20
     assert 0 < start < len(data)
     assert offsets == 0  # readers take the whole summary
     return crc == zlib.crc32(data[start:-12])
@@ -614,13 +631,16 @@ def test_message_indexes_point_at_the_messages(flight: SimpleNamespace) -> None:
             elif isinstance(record, MessageIndex):
                 for when, offset in record.records:
                     opcode, _, channel, _, log_time = struct.unpack_from("<BQHIQ", raw, offset)
-                    assert (opcode, channel, log_time) == (5, record.channel_id, when)
+                    assert opcode == 5
+                    assert channel == record.channel_id
+                    assert log_time == when
                     checked += 1
     assert checked == sum(1 for _ in Recording(flight.agent)) + 1  # and the statistics
 
 
 def test_what_else_is_in_it(flight: SimpleNamespace) -> None:
-    ours, theirs = Recording(flight.agent), Recording(flight.simulator)
+    ours = Recording(flight.agent)
+    theirs = Recording(flight.simulator)
     assert ours.attachments == {}
     hello = next(iter(theirs)).session.hello
     assert list(theirs.attachments) == ["model.xml"]
@@ -754,7 +774,8 @@ def test_an_event_that_is_nested_too_deep(tmp_path: Path) -> None:
 def test_terminal_escapes_are_not_printed(flight: SimpleNamespace, tmp_path: Path) -> None:
     path = tmp_path / "escape.mcap"
     with flight.simulator.open("rb") as old, path.open("wb") as new:
-        reader, writer = make_reader(old), Writer(new)
+        reader = make_reader(old)
+        writer = Writer(new)
         writer.start()
         for metadata in reader.iter_metadata():
             changed = {
@@ -778,7 +799,8 @@ def test_a_file_that_was_cut_is_read_up_to_the_cut(
     with pair(tmp_path) as both:
         fly(both.remote, 500)
     for path in (both.agent, both.simulator):
-        whole, data = datagrams(path, object), path.read_bytes()
+        whole = datagrams(path, object)
+        data = path.read_bytes()
         cut = tmp_path / "cut.mcap"
         sizes = []
         for tenth in range(10):
@@ -786,7 +808,8 @@ def test_a_file_that_was_cut_is_read_up_to_the_cut(
                 cut.write_bytes(data[:size])
                 part = datagrams(cut, object)
                 assert part == whole[: len(part)]
-                summary, verdict = Summary(cut), Verification(cut)
+                summary = Summary(cut)
+                verdict = Verification(cut)
                 assert not summary.complete
                 assert summary.ending.startswith("cut off")
                 assert all(session.identical for session in verdict.sessions)
@@ -898,7 +921,8 @@ for _ in range(50):
 
 
 def test_garbage_finishes_the_file(tmp_path: Path) -> None:
-    ours, theirs = tmp_path / "agent.mcap", tmp_path / "simulator.mcap"
+    ours = tmp_path / "agent.mcap"
+    theirs = tmp_path / "simulator.mcap"
     remote = RemoteEnv(ANY, connect=False, record=ours, **TIMES)
     running = Running(Simulator(server=remote.address, bind=ANY, config=QUICK, record=theirs))
     fly(remote, 10)
@@ -994,10 +1018,13 @@ def test_interrupts_at_any_moment(
 ) -> None:
     monkeypatch.setattr(journal_module, "_CHUNK", 10_000)
     items = list(Recording(flight.agent))
-    hello, state = items[0], next(i for i in items if isinstance(i.message, State)).message
+    hello = items[0]
+    state = next(i for i in items if isinstance(i.message, State)).message
     journal = Journal(tmp_path / "j", Statistics(), side="agent")
     journal.tap(0, hello.message, hello.datagram)
-    armed, returned, interrupts = False, [], 0
+    armed = False
+    returned = []
+    interrupts = 0
 
     def interrupt(*_: Any) -> None:
         if armed:

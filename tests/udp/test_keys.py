@@ -23,8 +23,10 @@ from rotorgram.udp.protocol.auth import (
 from rotorgram.udp.protocol.messages import Unknown
 
 SECRET = bytes(range(32))
-SESSION, NONCE = 0x0123456789ABCDEF, 0xFEDCBA9876543210
-SIMULATOR, AGENT = Key(SECRET, "simulator"), Key(SECRET, "agent")
+SESSION = 0x0123456789ABCDEF
+NONCE = 0xFEDCBA9876543210
+SIMULATOR = Key(SECRET, "simulator")
+AGENT = Key(SECRET, "agent")
 
 GOLDEN = {
     "Hello": binary.encode(hello(SESSION)),
@@ -154,7 +156,8 @@ def test_a_key_has_32_bytes(size: int) -> None:
 
 
 def test_a_key_is_written_and_read(tmp_path: Path) -> None:
-    first, second = tmp_path / "first", tmp_path / "second"
+    first = tmp_path / "first"
+    second = tmp_path / "second"
     write_key(first)
     write_key(second)
     (secret,) = read_keys(first)

@@ -185,7 +185,8 @@ def test_only_what_the_table_says_can_be_sent() -> None:
 
 @BOTH
 def test_a_repeat_is_the_same_bytes_and_gets_the_same_answer(sealed: bool) -> None:
-    client, server = simulator(sealed=sealed), agent(sealed=sealed)
+    client = simulator(sealed=sealed)
+    server = agent(sealed=sealed)
     Pair(client, server, lossy(0)).run(3)
     first = client.take_outgoing()
     assert client.handle_timer(client.next_timer() or 0.0)
@@ -299,7 +300,8 @@ def test_an_agent_that_waits_for_long_is_asked_before_the_timeout(
     wire = Wire("agent", False)
     link = to(simulator(config=LinkConfig(timeout=timeout)), SimulatorState.WAITING, wire)
     alive = wire(Alive(session=link.hello.session, sequence=link.sequence))
-    now, asked = 0.0, 0
+    now = 0.0
+    asked = 0
     while now < 50_000.0:
         now, before = link.next_timer() or 0.0, now
         assert link.handle_timer(now)
@@ -337,7 +339,8 @@ def test_a_simulator_that_was_never_welcomed_closes_without_a_word() -> None:  #
 
 
 def test_while_wait_comes_there_is_no_silence() -> None:
-    link, wire = simulator(), Wire("agent", False)
+    link = simulator()
+    wire = Wire("agent", False)
     link.connect(0.0)
     for now in range(0, 100, 9):
         assert link.receive(wire(Wait(session=SESSION)), float(now)) is None
@@ -358,14 +361,16 @@ def test_wrong_numbers_of_the_config() -> None:
 
 def test_a_second_simulator_waits_until_the_first_has_left() -> None:
     server = agent()
-    first, second = Wire("simulator", False), hello(session=OTHER)
+    first = Wire("simulator", False)
+    second = hello(session=OTHER)
     server.receive(first(hello()), HERE, 0.0)
     server.receive(first(state(1)), HERE, 0.0)
     server.take_outgoing()
     datagram = binary.encode(second)
     server.receive(datagram, STRANGER, 0.0)
     ((reply, to_),) = server.take_outgoing()
-    assert (plain(reply), to_) == (Wait(session=OTHER), STRANGER)
+    assert plain(reply) == Wait(session=OTHER)
+    assert to_ == STRANGER
     server.receive(binary.encode(close(1)), HERE, 0.0)
     server.take_outgoing()
     server.receive(datagram, STRANGER, 0.0)
@@ -433,7 +438,8 @@ def test_one_session_number_from_two_addresses(slots: int) -> None:  # fault 18
     for address, nonce in nonces.items():
         server.receive(binary.encode(hello()), address, 0.0)
         ((reply, to_),) = server.take_outgoing()
-        assert (plain(reply), to_) == (Welcome(session=SESSION, nonce=nonce), address)
+        assert plain(reply) == Welcome(session=SESSION, nonce=nonce)
+        assert to_ == address
     event = server.receive(binary.encode(state(1, nonce=NONCE + 1), ONE), STRANGER, 0.0)
     assert event is not None
     assert event.joined
@@ -482,7 +488,8 @@ def test_the_longest_hello_comes_in_fragments() -> None:
     extensions = (Extension(number=1, value=bytes(512)),) * 64
     longest = hello(spec="x" * (1 << 22), extensions=extensions)
     transfer = Transfer(binary.encode(longest), 65_483, Window())
-    fragments, answer = transfer.start(), None
+    fragments = transfer.start()
+    answer = None
     while fragments:
         for fragment in fragments:
             server.receive(fragment, HERE, 0.0)
@@ -559,7 +566,8 @@ def test_an_agent_takes_any_of_its_keys() -> None:  # fault 18: keys change whil
 
 @BOTH
 def test_a_simulator_that_computes_says_that_it_lives(sealed: bool) -> None:  # fault 33
-    client, server = simulator(sealed=sealed), agent(sealed=sealed)
+    client = simulator(sealed=sealed)
+    server = agent(sealed=sealed)
     Pair(client, server, lossy(0)).run(3)
     (datagram,) = client.take_outgoing()
     server.receive(datagram, HERE, 1.0)
@@ -654,7 +662,8 @@ def test_recorded_messages_of_another_session_are_forged() -> None:
 
 def test_every_message_is_shown_once() -> None:
     seen: dict[str, list[Any]] = {"simulator": [], "agent": []}
-    client, server = simulator(), agent()
+    client = simulator()
+    server = agent()
     client.tap = lambda slot, m, data: seen["simulator"].append((slot, data))
     server.tap = lambda slot, m, data: seen["agent"].append((slot, data))
     pair = Pair(client, server, lossy(0.3))

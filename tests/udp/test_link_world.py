@@ -323,7 +323,8 @@ def test_a_simulator_that_is_started_again_has_its_place_back(seed: int, codec: 
     for _ in range(4):
         world.run_steps(dice.randrange(12))
         again = dice.choice(world.physics)
-        begun, others = world.now, [p for p in world.physics if p is not again]
+        begun = world.now
+        others = [p for p in world.physics if p is not again]
         sessions = [p.session for p in others]
         physics = world.start_simulator(again.address)
         world.run_steps(10, most=200)
@@ -361,7 +362,8 @@ def test_a_simulator_at_another_address_waits_until_the_place_is_free(
     world = World(fate, codec=codec)
     world.run_steps(10)
     world.physics.clear()
-    physics, begun = world.start_simulator(("10.0.0.2", 5)), world.now
+    physics = world.start_simulator(("10.0.0.2", 5))
+    begun = world.now
     world.run(lambda: bool(world.joined[1:]), most=60)
     assert world.now - begun > SILENCE - 5
     assert "every slot" in physics.link.statistics.take_notices()[0]
@@ -391,7 +393,8 @@ def test_more_simulators_than_slots_take_turns(seed: int, codec: str) -> None:
 @pytest.mark.parametrize("seed", range(4))
 def test_after_any_trouble_all_fly_again(seed: int, codec: str) -> None:
     """Whatever was lost, late or restarted: once the network is good, nobody hangs."""
-    world, dice = World(bad(seed), codec=codec, simulators=3), random.Random(seed)
+    world = World(bad(seed), codec=codec, simulators=3)
+    dice = random.Random(seed)
     for _ in range(12):
         end = world.now + dice.choice([0.005, 0.3, 1.0, 4.0])
         world.run(lambda end=end: world.now >= end)  # type: ignore[misc]

@@ -20,7 +20,8 @@ from rotorgram.udp.protocol.messages import (
 from rotorgram.udp.protocol.party import AgentLink, Participation, SeveralAgents
 from rotorgram.udp.protocol.server import Server
 
-PATIENCE, TIMEOUT = 10.0, 60.0
+PATIENCE = 10.0
+TIMEOUT = 60.0
 
 
 class World:
@@ -100,7 +101,8 @@ class Swarm:
 
     def say(self, number: int, order: int, value: float = 0.0, seed: int | None = None) -> None:
         seeds = None if seed is None else np.array([seed], np.uint64)
-        actions, orders = np.full((1, 1), value, np.float32), np.array([order], np.uint8)
+        actions = np.full((1, 1), value, np.float32)
+        orders = np.array([order], np.uint8)
         self.agents[number].send_command(0, actions, orders, seeds, self.now)
 
     def wait(self, seconds: float) -> None:
@@ -181,7 +183,8 @@ def test_the_policy_flies_the_drones_of_a_silent_agent(policy: str) -> None:
     swarm.say(1, FLY, 7.0)  # it comes back, and is told that its episode was truncated
     swarm.pump()
     last = swarm.states[1][-1]
-    assert (last.truncated.tolist(), last.rewards.tolist()) == ([True], [0.0])
+    assert last.truncated.tolist() == [True]
+    assert last.rewards.tolist() == [0.0]
     assert last.observations[0].item() == 2.0  # of its last State
     swarm.say(1, RESET)
     swarm.say(0, RESET, seed=3)
@@ -234,7 +237,8 @@ def test_before_the_world_begins_a_refusal_and_silence_end_it() -> None:
 
 def test_an_agent_that_closes_before_the_world_begins_ends_it() -> None:
     swarm = Swarm()
-    link, server = swarm.rules.links[0], swarm.agents[0]
+    link = swarm.rules.links[0]
+    server = swarm.agents[0]
     for datagram in link.client.take_outgoing():
         server.receive(datagram, HERE, 0.0)
     for datagram, _ in server.take_outgoing():

@@ -46,7 +46,9 @@ def tool(name: str) -> str:
 
 def compiled(*command: object) -> None:
     done = subprocess.run([str(c) for c in command], capture_output=True, text=True, timeout=60)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    assert done.returncode == 0
+    assert done.stdout == ""
+    assert done.stderr == ""
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +61,8 @@ def agent(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
 
 @pytest.fixture(scope="module")
 def simulator(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
-    mono, program = tool("mono"), tmp_path_factory.mktemp("simulator") / "simulator.exe"
+    mono = tool("mono")
+    program = tmp_path_factory.mktemp("simulator") / "simulator.exe"
     compiled(tool("mcs"), "-warnaserror", f"-out:{program}", *sorted(PEERS.glob("*.cs")))
     return [mono, str(program), "--bind", "127.0.0.1:0", "--timeout", "20", "--server"]
 
@@ -134,7 +137,8 @@ def flown(agent: list[str], config: FaultConfig | None, steps: int = 250) -> lis
         running([sys.executable, "-c", TEXT_SIMULATOR], address[1], steps) as simulator,
     ):
         status, out, err = ended(process)
-        assert (status, err) == (0, "")
+        assert status == 0
+        assert err == ""
         assert ended(simulator)[0] == 0
     return out.splitlines()
 
@@ -222,7 +226,8 @@ def test_agent_answers_by_the_rules(agent: list[str]) -> None:
         assert sock.recv(2048) == b"44,close"  # repeated, until it is answered
         sock.send(b"44,close")
         status, out, err = ended(process)
-    assert (status, err) == (0, "")
+    assert status == 0
+    assert err == ""
     assert out == "episode 1: 2 steps, return 0.125, last |E| 0.250000 m, truncated\n"
 
 
@@ -288,7 +293,8 @@ def test_simulator_writes_and_reads_the_golden_datagrams(simulator: list[str]) -
     spec = json.dumps(GOLDEN["envs"]["one"]["spec"], separators=(",", ":"))
     with running(simulator[:2], "--self-test", spec, *given, *wrong) as test:
         status, out, err = ended(test)
-    assert (status, err) == (0, "")
+    assert status == 0
+    assert err == ""
     written = ["hello", "state 1 echoes the nonce", "state, truncated", "close"]
     assert out.splitlines() == [
         *(f"{name} {golden(name)}" for name in written),
@@ -304,7 +310,8 @@ def law(observation: np.ndarray) -> float:
 
 def flights(simulator: list[str], config: FaultConfig | None, steps: int) -> list[object]:
     """All that the agent sees of two seeded flights with noise in their actions."""
-    noise, seen = Random(5), []
+    noise = Random(5)
+    seen = []
     with (
         RemoteEnv(("127.0.0.1", 0), connect=False) as env,
         relayed(env.address, config) as address,
@@ -319,7 +326,8 @@ def flights(simulator: list[str], config: FaultConfig | None, steps: int) -> lis
                 seen.append((float(action), observation.tolist(), reward, *ends, info))
         env.close()
         status, out, err = ended(process)
-    assert (status, err) == (0, "")
+    assert status == 0
+    assert err == ""
     assert " 1 sessions;" in out
     return seen
 
@@ -329,12 +337,15 @@ def fly(loop: Loop, action: float, *, reset: bool = False) -> None:
 
 
 def test_simulator_flies_the_closed_form_and_our_drone(simulator: list[str]) -> None:
-    seen, ours = flights(simulator, None, 250), Loop(EnvConfig(env_id=ENV_ID))
+    seen = flights(simulator, None, 250)
+    ours = Loop(EnvConfig(env_id=ENV_ID))
     assert len(seen) == 2 * 251
     for i, (action, observation, reward, *ends, info) in enumerate(seen):
         step = i % 251
         if step == 0:
-            y, v, thrust = info["Y"], 0.0, 49.0
+            y = info["Y"]
+            v = 0.0
+            thrust = 49.0
             assert abs(5 - y) <= 1
             # Ours starts elsewhere, which moves the whole flight by as much.
             fly(ours, 0.0, reset=True)
@@ -342,7 +353,8 @@ def test_simulator_flies_the_closed_form_and_our_drone(simulator: list[str]) -> 
         else:
             thrust = min(100.0, max(0.0, thrust + 5 * min(1.0, max(-1.0, action))))
             u = 4 * thrust / 20 - 9.8
-            y, v = y + v * 0.02 + u * 0.02**2 / 2, v + u * 0.02
+            y = y + v * 0.02 + u * 0.02**2 / 2
+            v = v + u * 0.02
             fly(ours, action)
             height = ours.telemetry["position"][0, 1]
             assert info["Y"] == pytest.approx(height + moved, abs=1e-9)
@@ -408,7 +420,8 @@ os.kill(os.getpid(), signal.SIGKILL)
                 assert not terminated
             assert "simulator_lost" not in info
         status, out, err = ended(process)
-    assert (status, err) == (0, "")
+    assert status == 0
+    assert err == ""
     assert " 2 sessions;" in out
     assert abs(observation[0]) < 0.05
 
@@ -419,7 +432,8 @@ NONCE = 0xFEDCBA9876543210
 
 
 def datagram(kind: int, session: int, sequence: int, body: bytes = b"", version: int = 2) -> bytes:
-    head, rest = bytes([0xA7, 0x52, version, kind]), struct.pack("<QQ", session, sequence) + body
+    head = bytes([0xA7, 0x52, version, kind])
+    rest = struct.pack("<QQ", session, sequence) + body
     return head + struct.pack("<I", zlib.crc32(head + rest)) + rest
 
 
@@ -444,7 +458,9 @@ class Hand:
     """An agent by hand: `next` is the simulator's next datagram that is not a repeat."""
 
     def __init__(self, sock: socket.socket) -> None:
-        self.sock, self.last, self.session = sock, b"", 0
+        self.sock = sock
+        self.last = b""
+        self.session = 0
         self.simulator: tuple[str, int] | None = None
 
     def receive(self) -> bytes:
@@ -477,7 +493,10 @@ class Hand:
         assert (session not in (0, self.session), sequence) == (True, 0)
         self.session = session
         low, high, worlds, size = struct.unpack_from("<BB2xII", got, 24)
-        assert (low, high, worlds, len(got)) == (2, 2, 1, 40 + size)
+        assert low == 2
+        assert high == 2
+        assert worlds == 1
+        assert len(got) == 40 + size
         assert EnvSpec.from_json(got[40:].decode()) == replace(
             env_spec(EnvConfig(env_id=ENV_ID)), vehicle="point mass", vehicle_hash="0" * 32
         )
@@ -490,10 +509,8 @@ class Hand:
         time, nonce = struct.unpack_from("<dQ", got, 24)
         assert time == pytest.approx(0.02 * (sequence - 1))
         assert nonce == (NONCE if sequence == 1 else 0)
-        observation, (reward,) = (
-            struct.unpack_from("<3f", got, 40),
-            struct.unpack_from("<d", got, 56),
-        )
+        observation = struct.unpack_from("<3f", got, 40)
+        (reward,) = struct.unpack_from("<d", got, 56)
         return reward, struct.unpack_from("<14d", got, 72), observation, got[64], got[65]
 
     def closed(self, sequence: int, reason: str = "") -> None:
@@ -502,7 +519,8 @@ class Hand:
 
 def junk(hand: Hand, sequence: int) -> list[bytes]:
     """What must change nothing where a simulator waits for this Command."""
-    session, random = hand.session, Random(0)
+    session = hand.session
+    random = Random(0)
     good = command(session, sequence, 0.5)
     reason = text_field("no")
     return [
@@ -556,7 +574,8 @@ def test_simulator_obeys_the_rules(simulator: list[str]) -> None:
         hand.send(welcome(hand.session, 7))
         first = hand.state(1)
         reward, telemetry, observation, *ends = first
-        assert (reward, ends) == (0, [0, 0])
+        assert reward == 0
+        assert ends == [0, 0]
         y, error = telemetry[1], telemetry[13]
         assert telemetry == (0, y, 0, 0, 0, 0, 49, 49, 49, 49, 0, 5, 0, error)
         assert error == 5 - y
@@ -580,7 +599,8 @@ def test_simulator_obeys_the_rules(simulator: list[str]) -> None:
         before = hand.last
         hand.send(command(hand.session, 4, 1.0, 2))
         frozen = hand.state(5)
-        assert (frozen[0], hand.last[72:]) == (0, before[72:])
+        assert frozen[0] == 0
+        assert hand.last[72:] == before[72:]
         # An agent that knows nothing of it: a new session.
         old = hand.session
         hand.send(datagram(8, hand.session, 5))
@@ -594,7 +614,8 @@ def test_simulator_obeys_the_rules(simulator: list[str]) -> None:
         hand.send(datagram(6, hand.session, 1, text_field("enough")))
         hand.closed(2)
         status, out, err = ended(process)
-    assert (status, err) == (0, "")
+    assert status == 0
+    assert err == ""
     assert out.startswith("enough\n7 states, 2 sessions;")
 
 
@@ -604,31 +625,36 @@ def test_simulator_ends_as_the_rules_say(simulator: list[str]) -> None:
         hand.hello()
         hand.send(datagram(3, hand.session, 0, text_field("too old"), version=3))
         status, out, _ = ended(process)
-        assert (status, out.splitlines()[0]) == (1, "refused by the agent: too old")
+        assert status == 1
+        assert out.splitlines()[0] == "refused by the agent: too old"
     with udp() as sock, running(simulator, place(sock.getsockname())) as process:
         hand = Hand(sock)
         hand.hello()
         hand.send(welcome(hand.session))
-        terminated, sequence = 0, 0
+        terminated = 0
+        sequence = 0
         while not terminated:
             sequence += 1
             reward, telemetry, _, terminated, truncated = hand.state(sequence)
             hand.send(command(hand.session, sequence, 1e30))
         error = abs(5 - telemetry[1])
         assert error > 3
-        assert (reward, truncated) == (pytest.approx((0.5 - error) / (0.5 + error) - 20), 0)
+        assert reward == pytest.approx((0.5 - error) / (0.5 + error) - 20)
+        assert truncated == 0
         reason = "drone 0 was flown on after its episode's end: send a reset"
         hand.closed(sequence, reason)
         hand.repeat()  # until it is answered
         hand.send(datagram(6, hand.session, sequence, text_field("")))
         status, out, _ = ended(process)
-        assert (status, out.splitlines()[0]) == (1, reason)
+        assert status == 1
+        assert out.splitlines()[0] == reason
     with (
         udp() as sock,
         running(simulator, place(sock.getsockname()), "--timeout", "0.3") as process,
     ):
         status, out, _ = ended(process)
-        assert (status, out.splitlines()[0]) == (1, "no answer from the agent for 0.3 s")
+        assert status == 1
+        assert out.splitlines()[0] == "no answer from the agent for 0.3 s"
     with (
         udp() as sock,
         running(simulator, place(sock.getsockname()), "--timeout", "1.5") as process,
@@ -672,6 +698,7 @@ def test_unity_script_compiles(tmp_path: Path) -> None:
     """Against a stub of what it uses: Unity itself is not here."""
     stub = tmp_path / "Unity.cs"
     stub.write_text(UNITY)
-    out, sources = f"-out:{tmp_path / 'unity.dll'}", sorted(PEERS.glob("*.cs"))
+    out = f"-out:{tmp_path / 'unity.dll'}"
+    sources = sorted(PEERS.glob("*.cs"))
     compiled(tool("mcs"), "-t:library", "-d:UNITY_5_3_OR_NEWER", out, *sources, stub)
     assert (tmp_path / "unity.dll").is_file()

@@ -48,7 +48,8 @@ def test_a_remote_parallel_env_is_that_in_process(faults: FaultConfig | None) ->
         assert remote.possible_agents == ["drone_0", "drone_1", "drone_2"]
         assert remote.observation_spaces == local.observation_spaces
         for seed in (1, 2):
-            ours, theirs = local.reset(seed=seed), remote.reset(seed=seed)
+            ours = local.reset(seed=seed)
+            theirs = remote.reset(seed=seed)
             left = []
             while local.agents:
                 assert remote.agents == local.agents
@@ -59,7 +60,8 @@ def test_a_remote_parallel_env_is_that_in_process(faults: FaultConfig | None) ->
                     agent: share * dice.uniform(0.95, 1.0, 1).astype(np.float32)
                     for agent, share in zip(remote.possible_agents, (0.1, 0.8, 1.0), strict=True)
                 }
-                ours, theirs = local.step(actions), remote.step(actions)
+                ours = local.step(actions)
+                theirs = remote.step(actions)
                 assert theirs[1:4] == ours[1:4]
                 left.append(len(local.agents))
             assert remote.agents == []
@@ -73,12 +75,14 @@ def test_a_vector_env_of_worlds_is_that_in_process() -> None:
     with flying(4, 2, LOSSY) as address:
         remote = RemoteVectorEnv(address)
         assert remote.num_envs == 4
-        ours, theirs = local.reset(seed=5), remote.reset(seed=5)
+        ours = local.reset(seed=5)
+        theirs = remote.reset(seed=5)
         ends = 0
         for _ in range(100):
             assert theirs[0].tobytes() == ours[0].tobytes()
             actions = dice.uniform(-0.4, 1, (4, 1)).astype(np.float32)
-            ours, theirs = local.step(actions), remote.step(actions)
+            ours = local.step(actions)
+            theirs = remote.step(actions)
             for here, there in zip(ours[1:4], theirs[1:4], strict=True):
                 assert here.tolist() == there.tolist()
             assert (remote.done == local.done).all()
@@ -113,7 +117,8 @@ def test_recorded_episodes_of_a_swarm_have_the_seed_of_their_world(tmp_path: Pat
 
 
 def test_a_summary_counts_no_steps_of_drones_that_are_out(tmp_path: Path) -> None:
-    journal, flown = tmp_path / "swarm.mcap", 0
+    journal = tmp_path / "swarm.mcap"
+    flown = 0
     with flying(3, 3) as address:
         remote = RemoteParallelEnv(address, record=journal)
         for seed in (1, 2):
@@ -124,7 +129,8 @@ def test_a_summary_counts_no_steps_of_drones_that_are_out(tmp_path: Path) -> Non
                 remote.step(climb)
         remote.close()
     (session,) = Summary(journal).sessions
-    assert (session.steps, session.episodes) == (flown, 6)
+    assert session.steps == flown
+    assert session.episodes == 6
     assert flown < 3 * (session.states - 2)
 
 

@@ -67,7 +67,8 @@ def test_another_env_of_gymnasium_flies_too() -> None:
         dice = np.random.default_rng(0)
         for _ in range(100):
             actions = dice.integers(2, size=4)
-            here, there = remote.step(actions), local.step(actions)
+            here = remote.step(actions)
+            there = local.step(actions)
             assert_same((*here[:1], *here[2:]), (*there[:1], *there[2:]))
             # Gymnasium's own are float64 as well; CartPole's are whole.
             assert here[1].tolist() == there[1].tolist()
@@ -104,7 +105,8 @@ def test_what_a_step_gives() -> None:
             assert observations in remote.observation_space
             assert observations.dtype == np.float32
             for name in NAMES:
-                assert (info[name].dtype, info[name].shape) == (np.float64, (4,))
+                assert info[name].dtype == np.float64
+                assert info[name].shape == (4,)
                 assert (info[f"_{name}"].dtype, info[f"_{name}"].all()) == (bool, True)
             observations, *arrays, info = remote.step(remote.action_space.sample())
             assert [a.dtype for a in arrays] == [np.float64, bool, bool]
@@ -115,7 +117,8 @@ def test_what_a_step_gives_is_the_callers() -> None:
     with flying(1, 2) as (remote, _), sync(2) as local:
         assert_same(remote.reset(seed=0), local.reset(seed=0))
         for _ in range(5):
-            here, there = remote.step(np.ones((2, 1))), local.step(np.ones((2, 1), np.float32))
+            here = remote.step(np.ones((2, 1)))
+            there = local.step(np.ones((2, 1), np.float32))
             assert_same(here, there)
             for array in (*here[:4], *here[4].values()):
                 array[...] = 1  # changes nothing of the next step, nor of another array
@@ -129,7 +132,8 @@ def test_the_first_simulator_says_how_many_drones_there_are() -> None:
         Running(Simulator(server=address, bind=ANY, num_envs=3, config=QUICK)) for _ in range(2)
     ]
     with closing(RemoteVectorEnv(address, num_simulators=2)) as remote:
-        assert (remote.num_envs, remote.num_simulators) == (6, 2)
+        assert remote.num_envs == 6
+        assert remote.num_simulators == 2
         assert remote.observation_space.shape == (6, 3)
         assert remote.statistics.counters["sessions"] == 2
         sentence = f"127.0.0.1:{address[1]} refused: expected a simulator of 3 drones, got one of 2"
@@ -268,10 +272,12 @@ def test_autoreset_is_that_of_the_local_env(mode: str, drones: int) -> None:
     with flying(2, drones, autoreset=mode, **options) as (remote, _):
         assert remote.metadata["autoreset_mode"] == local.metadata["autoreset_mode"]
         assert_same(remote.reset(seed=4), local.reset(seed=4))
-        dice, ended = np.random.default_rng(2), 0
+        dice = np.random.default_rng(2)
+        ended = 0
         for _ in range(80):
             actions = dice.uniform(-1, 1, (2 * drones, 1)).astype(np.float32)
-            here, there = remote.step(actions), local.step(actions)
+            here = remote.step(actions)
+            there = local.step(actions)
             assert_same(here, there)
             assert ("final_obs" in here[4]) == ("final_obs" in there[4])
             if "final_obs" in here[4]:
@@ -307,7 +313,8 @@ def test_a_mask_resets_some_and_the_others_hold() -> None:
 
 def test_a_drone_of_both_masks_is_reset() -> None:
     local = LocalVectorEnv(ENV_ID, 2, autoreset_mode="Disabled")
-    resets, frozen = np.array([True, False]), np.array([True, True])
+    resets = np.array([True, False])
+    frozen = np.array([True, True])
     with flying(1, 2, autoreset="Disabled") as (remote, _):
         for env in (remote, local):
             env.reset(seed=1)

@@ -262,9 +262,11 @@ def test_a_killed_simulator_takes_only_its_own_drones_along(how: str) -> None:
         victim.wait()
         if how != "another waits":
             processes.append(start(("127.0.0.1", port) if same else ANY))
-        drones, others = slice(2, 4), np.array([0, 1, 4, 5])
+        drones = slice(2, 4)
+        others = np.array([0, 1, 4, 5])
         actions = np.full((6, 1), 0.3, np.float32)
-        here, there = remote.step(actions), local.step(actions)
+        here = remote.step(actions)
+        there = local.step(actions)
         assert_same(here, there, others)
         assert_same((here[0], here[-1]), (before[0], before[-1]), drones)
         assert here[1][drones].tolist() == [0.0, 0.0]
@@ -281,7 +283,8 @@ def test_a_killed_simulator_takes_only_its_own_drones_along(how: str) -> None:
             assert reasons[2].startswith(sentence)
         # The others fly on as if nothing had been; the new ones begin with a reset.
         actions = np.full((6, 1), -0.2, np.float32)
-        here, there = remote.step(actions), local.step(actions)
+        here = remote.step(actions)
+        there = local.step(actions)
         assert_same(here, there, others)
         assert here[1][drones].tolist() == [0.0, 0.0]
         assert (here[0][drones, 1:] == 0).all()
@@ -338,7 +341,8 @@ def test_a_simulator_lost_in_the_second_round_trip_of_a_step_is_told(
         remote.step(np.zeros((2, 1)))
         remote.reset(options={"reset_mask": np.array([False, True])})
         remote.step(np.zeros((2, 1)))
-        advance, here = remote.advance, running[0].simulator.address
+        advance = remote.advance
+        here = running[0].simulator.address
         calls: list[Any] = []
 
         def lose_it(*arguments: Any) -> None:

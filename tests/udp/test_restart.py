@@ -119,7 +119,8 @@ def assert_flies(remote: gym.Env, seed: int, steps: int = 100) -> None:
     assert remote.reset(seed=seed)[0].tobytes() == local.reset(seed=seed)[0].tobytes()
     for _ in range(steps):
         action = dice.uniform(-1, 1, 1).astype(np.float32)
-        here, there = remote.step(action), local.step(action)
+        here = remote.step(action)
+        there = local.step(action)
         assert here[0].tobytes() == there[0].tobytes()
         assert here[1:4] == there[1:4]
         if here[2] or here[3]:
@@ -204,9 +205,11 @@ def test_a_simulator_that_is_killed_at_any_time(network: Any) -> None:
         lost = steps = 0
         # Whoever is killed while an episode begins is replaced without a word: it begins again.
         while remote.statistics.counters["sessions"] < 4:
-            here, there = remote.reset(seed=steps), local.reset(seed=steps)
+            here = remote.reset(seed=steps)
+            there = local.reset(seed=steps)
             while here[0].tobytes() == there[0].tobytes():
-                before, here = here, remote.step(np.zeros(1))
+                before = here
+                here = remote.step(np.zeros(1))
                 steps += 1
                 if "simulator_lost" in here[-1]:
                     assert here[0].tobytes() == before[0].tobytes()
@@ -271,7 +274,8 @@ def test_a_killed_agent_is_replaced(network: Any, options: dict[str, str], key_f
             assert_flies(remote, 4)
             assert time.monotonic() - start < 8
         out, err = simulator.communicate(timeout=10)
-    assert (simulator.returncode, out) == (0, "the agent closed\n")
+    assert simulator.returncode == 0
+    assert out == "the agent closed\n"
     anew = err.count("the agent does not know this session (any more); beginning a new one")
     assert anew == (0 if "codec" in options else 2)
 
@@ -543,7 +547,8 @@ def test_a_recorded_flight_sent_again_changes_nothing(secret: bool, key_file: st
         with pytest.raises(PeerClosed, match="TypeError: 'NoneType' object is not callable"):
             remote.step(np.zeros(1))
         assert isinstance(first.join(), TypeError)
-        upward, downward = list(tap.upward), list(tap.downward)
+        upward = list(tap.upward)
+        downward = list(tap.downward)
         assert min(len(upward), len(downward)) > 30
         second = simulate()
         local = gym.make(ENV_ID)
@@ -552,7 +557,8 @@ def test_a_recorded_flight_sent_again_changes_nothing(secret: bool, key_file: st
         for step in range(60):
             tap.again(upward[step % 20 :], downward[step % 20 :])
             action = dice.uniform(-1, 1, 1).astype(np.float32)
-            here, there = remote.step(action), local.step(action)
+            here = remote.step(action)
+            there = local.step(action)
             assert here[0].tobytes() == there[0].tobytes()
             assert here[1:4] == there[1:4]
         counters = remote.statistics.counters

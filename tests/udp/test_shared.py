@@ -163,7 +163,8 @@ def in_process(
         flights = [[(rows[i].tobytes(), 0.0, False, False)] for i in range(drones)]
         step = 0
         while not loop.done.all():
-            flown, actions = ~loop.out, nothing.copy()
+            flown = ~loop.out
+            actions = nothing.copy()
             for i in range(drones):
                 actions[i] = act(i, episode, step)
             if lost and episode == 0 and step >= lost[1]:
@@ -172,7 +173,8 @@ def in_process(
                 if step == lost[1] and lost[2] != "hold":
                     (loop.land if lost[2] == "land" else loop.retire)(victim)
             loop.advance(actions)
-            rows, step = loop.observations["observation"], step + 1
+            rows = loop.observations["observation"]
+            step = step + 1
             for i in np.flatnonzero(flown):
                 told = loop.rewards[i].item(), loop.terminated[i].item(), loop.truncated[i].item()
                 flights[i].append((rows[i].tobytes(), *told))
@@ -184,7 +186,8 @@ def in_process(
 
 @pytest.mark.parametrize("faults", [None, LOSSY], ids=["clean", "30 % loss"])
 def test_an_agent_for_each_drone_is_the_world_in_process(faults: FaultConfig | None) -> None:
-    agents, seen = free_ports(8), {}
+    agents = free_ports(8)
+    seen = {}
     with shared(agents, 8, faults, episode_length=60) as running:
         in_threads([lambda a=a, i=i: fly_one(a, i, 2, seen) for i, a in enumerate(agents)])
         assert running.join() == "the agent closed"
@@ -195,7 +198,8 @@ def test_an_agent_for_each_drone_is_the_world_in_process(faults: FaultConfig | N
 
 
 def test_two_agents_of_four_drones_each_are_the_world_in_process() -> None:
-    agents, seen = free_ports(2), {}
+    agents = free_ports(2)
+    seen = {}
     names = [f"drone_{i}" for i in range(8)]
     with shared(agents, 8, LOSSY, episode_length=60):
         in_threads([
@@ -215,7 +219,8 @@ def heard(process: subprocess.Popen[str], word: str) -> None:
 
 @pytest.mark.parametrize("policy", ["hold", "land", "end"])
 def test_one_that_is_killed_follows_its_policy_and_comes_back(policy: str) -> None:
-    agents, seen = free_ports(3), {}
+    agents = free_ports(3)
+    seen = {}
     others = [threading.Thread(target=fly_one, args=(agents[i], i, 3, seen, calm)) for i in (0, 2)]
     victim = launch(VICTIM, agents[1][1], policy)
     with shared(agents, 3, episode_length=LONG, patience=1.0) as running:
@@ -231,7 +236,8 @@ def test_one_that_is_killed_follows_its_policy_and_comes_back(policy: str) -> No
         process.kill()
         process.communicate()
     loss, *later = running.simulator.absences
-    assert (loss.agent, loss.episode) == (1, 1)
+    assert loss.agent == 1
+    assert loss.episode == 1
     assert 20 <= loss.step < LONG - 1
     assert loss.participation in (Participation.SILENT, Participation.COMING)
     expected = in_process(3, 3, calm, (1, loss.step, policy), episode_length=LONG)
@@ -242,7 +248,9 @@ def test_one_that_is_killed_follows_its_policy_and_comes_back(policy: str) -> No
 def test_an_agent_that_comes_back_to_land_where_the_vehicle_cannot_ends_nobodys_flight(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    model, agents, seen = tmp_path / "no_yaw.xml", free_ports(2), {}
+    model = tmp_path / "no_yaw.xml"
+    agents = free_ports(2)
+    seen = {}
     text = QUAD_XML.read_text(encoding="utf-8")
     for rotor, reaction in (("2", "0.05"), ("3", "-0.05")):  # a yaw is always a roll, too
         at = rf'(site="rotor{rotor}" gear="0 0 1 0 0) +[-.0-9]+'
@@ -269,7 +277,8 @@ def test_an_agent_that_comes_back_to_land_where_the_vehicle_cannot_ends_nobodys_
 
 
 def test_one_that_is_started_anew_before_the_others_come_flies_the_first_episode() -> None:
-    agents, seen = free_ports(2), {}
+    agents = free_ports(2)
+    seen = {}
     with shared(agents, 2, episode_length=60) as running:
         first = launch(VICTIM, agents[0][1], "end")
         while running.simulator.links[0].participation is not Participation.READY:
@@ -291,7 +300,8 @@ def test_one_that_is_started_anew_before_the_others_come_flies_the_first_episode
 
 
 def test_one_that_is_stopped_and_goes_on_takes_part_again() -> None:
-    agents, seen = free_ports(2), {}
+    agents = free_ports(2)
+    seen = {}
     other = threading.Thread(target=fly_one, args=(agents[0], 0, 3, seen, calm))
     victim = launch(VICTIM, agents[1][1], "hold")
     with shared(agents, 2, episode_length=LONG, patience=0.5) as running:
@@ -308,13 +318,17 @@ def test_one_that_is_stopped_and_goes_on_takes_part_again() -> None:
         victim.kill()
         victim.communicate()
     loss = running.simulator.absences[0]
-    assert (loss.agent, loss.episode, loss.participation) == (1, 1, Participation.SILENT)
+    assert loss.agent == 1
+    assert loss.episode == 1
+    assert loss.participation == Participation.SILENT
     expected = in_process(2, 3, calm, (1, loss.step, "hold"), episode_length=LONG)
     assert seen[0][0] == expected[0][0]
 
 
 def test_with_a_key_they_are_the_world_in_process(tmp_path: Path) -> None:
-    agents, seen, key = free_ports(2), {}, tmp_path / "key"
+    agents = free_ports(2)
+    seen = {}
+    key = tmp_path / "key"
     write_key(key)
     with shared(agents, 2, LOSSY, key_file=key):
         in_threads([
@@ -324,7 +338,9 @@ def test_with_a_key_they_are_the_world_in_process(tmp_path: Path) -> None:
 
 
 def test_one_that_asks_for_a_reset_before_the_others_waits_for_them() -> None:
-    agents, seen, starts = free_ports(2), {}, []
+    agents = free_ports(2)
+    seen = {}
+    starts = []
 
     def impatient() -> None:
         env = RemoteEnv(agents[0], connect_timeout=60)
@@ -348,7 +364,8 @@ def test_one_that_asks_for_a_reset_before_the_others_waits_for_them() -> None:
 
 
 def test_one_that_resets_a_start_gets_it_again() -> None:
-    agents, starts = free_ports(2), []
+    agents = free_ports(2)
+    starts = []
     done = threading.Event()
 
     def twice() -> None:
@@ -370,12 +387,14 @@ def test_one_that_resets_a_start_gets_it_again() -> None:
     with shared(agents, 2) as running:
         in_threads([twice, once])
         running.join()
-        assert (running.simulator.seed, running.simulator.episodes) == (1, 1)
+        assert running.simulator.seed == 1
+        assert running.simulator.episodes == 1
     assert starts[0] == starts[1]
 
 
 def test_orders_that_the_world_cannot_follow_end_the_session_of_that_agent_alone() -> None:
-    agents, seen = free_ports(2), {}
+    agents = free_ports(2)
+    seen = {}
 
     def wrong() -> None:
         env = RemoteVectorEnv(agents[0], connect_timeout=60)
@@ -392,7 +411,9 @@ def test_orders_that_the_world_cannot_follow_end_the_session_of_that_agent_alone
 
 
 def test_a_late_agent_is_told_the_end_of_the_drones_that_were_in_flight() -> None:
-    agents, seen, ends = free_ports(2), {}, []
+    agents = free_ports(2)
+    seen = {}
+    ends = []
     done = threading.Event()
 
     def late() -> None:
@@ -421,15 +442,18 @@ def test_a_late_agent_is_told_the_end_of_the_drones_that_were_in_flight() -> Non
 
 
 def test_the_command_flies_the_world_of_several_agents() -> None:
-    agents, seen = free_ports(2), {}
+    agents = free_ports(2)
+    seen = {}
     where = [f"127.0.0.1:{port}" for _, port in agents]
     command = [sys.executable, "-m", "rotorgram.cli", "sim", "--env", "swarms:swarm/Rise-v0",
                "--drones", "2", "--bind", "127.0.0.1:0", "--agents", *where]  # fmt: skip
-    pipe, here = subprocess.PIPE, Path(__file__).parents[1]
+    pipe = subprocess.PIPE
+    here = Path(__file__).parents[1]
     with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, cwd=here) as simulator:
         in_threads([lambda a=a, i=i: fly_one(a, i, 1, seen) for i, a in enumerate(agents)])
         out, err = simulator.communicate(timeout=30)
-    assert (simulator.returncode, err) == (0, "")
+    assert simulator.returncode == 0
+    assert err == ""
     first, closed, *wires = out.splitlines()
     assert first.startswith("simulating at 127.0.0.1:")
     assert first.endswith(" for 2 agents (Ctrl-C ends)")
@@ -441,7 +465,8 @@ def test_the_command_flies_the_world_of_several_agents() -> None:
 def test_a_journal_of_a_part_of_a_world_cannot_be_simulated_and_says_so_briefly(
     tmp_path: Path,
 ) -> None:
-    agents, journal = free_ports(2), tmp_path / "part.mcap"
+    agents = free_ports(2)
+    journal = tmp_path / "part.mcap"
 
     def begin(address: tuple[str, int], **settings: Any) -> None:
         with closing(RemoteVectorEnv(address, connect_timeout=60, **settings)) as env:
@@ -459,7 +484,8 @@ def test_a_journal_of_a_part_of_a_world_cannot_be_simulated_and_says_so_briefly(
 
 
 def test_an_agent_of_each_own_names() -> None:
-    agents, seen = free_ports(2), {}
+    agents = free_ports(2)
+    seen = {}
     shares = {agents[0]: ["drone_2", "drone_0"], agents[1]: ["drone_1"]}
     with shared(shares, 3):
         in_threads([

@@ -115,7 +115,9 @@ def test_the_port_cannot_be_taken_while_a_simulator_joins(
 class Quiet(sockets.Socket):
     """Nothing ever comes; it has a clock of its own, and counts how often one looks."""
 
-    looks, now, pace = 0, 0.0, 2e-6
+    looks = 0
+    now = 0.0
+    pace = 2e-6
 
     def recvfrom(self, *_: object) -> Any:
         self.looks += 1

@@ -92,7 +92,8 @@ def test_what_every_bad_network_does_is_counted_and_not_said() -> None:
 
 def test_notices_are_bounded_whatever_comes() -> None:
     dice = random.Random(4)
-    statistics, now = Statistics(), 0.0
+    statistics = Statistics()
+    now = 0.0
     causes = ["forged", "foreign", "malformed", "refused", "duplicate", "stale"]
     for _ in range(20_000):
         now += dice.expovariate(100)

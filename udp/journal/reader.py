@@ -154,7 +154,8 @@ class Recording:
         try:
             if topic == "events":
                 words = json.loads(data)
-                data, codec = bytes.fromhex(words["datagram"]), str(words.get("codec", ""))
+                data = bytes.fromhex(words["datagram"])
+                codec = str(words.get("codec", ""))
             message = binary.decode(data, session.layout if session else None)
             if isinstance(message, Hello):
                 layout_of(EnvSpec.from_json(message.spec), message.worlds)
@@ -270,7 +271,8 @@ class SessionSummary:
                 self.ending = "the agent does not know this session"
 
     def _count(self, transition: Transition) -> None:
-        state, resets = transition.state, transition.resets
+        state = transition.state
+        resets = transition.resets
         self.states += 1
         stepped = transition.flown & ~self._out
         self._returns[resets] = 0.0

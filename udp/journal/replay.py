@@ -98,7 +98,9 @@ class SessionVerdict:
 
     def _repeat(self, transition: Transition) -> None:
         """Bring the drones to that State."""
-        command, resets, seeds = transition.command, transition.resets, transition.seeds
+        command = transition.command
+        resets = transition.resets
+        seeds = transition.seeds
         if self._loop is None:
             self._loop = self._make()
         if transition.is_gap:
@@ -125,7 +127,8 @@ class SessionVerdict:
         count = self.session.num_envs
         drag = spec.options.get("effects", {}).get("linear_drag", 0.0)
         craft = load_vehicles(self.vehicle, len(spec.agents), linear_drag=drag)
-        was, now = spec.vehicle_hash, craft.hash
+        was = spec.vehicle_hash
+        now = craft.hash
         other = bool(was.strip("0")) and was != now
         hint = f"the vehicle was {was}, and is {now} here: --vehicle names its file" * other
         try:
@@ -135,7 +138,8 @@ class SessionVerdict:
         except InputError as error:
             raise InputError(hint or str(error)) from None
         for name in ("agents", "observation", "action", "telemetry", "control_period"):
-            was, now = getattr(spec, name), getattr(loop.spec, name)
+            was = getattr(spec, name)
+            now = getattr(loop.spec, name)
             if was != now:
                 loop.close()
                 words = f"expected an env of the {name} {was!s:.200}, got one of {now!s:.200}"

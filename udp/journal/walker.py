@@ -49,7 +49,8 @@ class Walker:
             self._command = message
         if not isinstance(message, State):
             return None
-        before, self._sequence = self._sequence, message.sequence
+        before = self._sequence
+        self._sequence = message.sequence
         drones = self.session.num_envs
         nobody = np.zeros(drones, bool)
         if before is None:

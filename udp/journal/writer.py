@@ -77,7 +77,9 @@ class Journal:
         about: Mapping[str, str] | None = None,
         models: Mapping[str, str] | None = None,
     ) -> None:
-        self._statistics, self._slots, self._text_hello = statistics, slots, text_hello
+        self._statistics = statistics
+        self._slots = slots
+        self._text_hello = text_hello
         self._holders: dict[int, object] = {}  # by slot: number of a binary session, or a text one
         self._channels: dict[tuple[int, int], int] = {}  # by slot and kind of message
         self._size = self._sessions = 0
@@ -100,7 +102,8 @@ class Journal:
             if isinstance(error, OSError):
                 raise OSError(error.errno, error.strerror, str(path)) from None
             raise
-        self._file, self._pending = file, file.pending
+        self._file = file
+        self._pending = file.pending
         weakref.finalize(self, file.close)
 
     def tap(self, slot: int, message: Message, datagram: bytes) -> None:
@@ -151,7 +154,8 @@ class Journal:
         if not 0 <= now - self._counted < _STATISTICS:
             self._count(now)
         self._file.flush()
-        self._size, self._flushed = 0, now
+        self._size = 0
+        self._flushed = now
 
     # ---- sessions
 
@@ -258,7 +262,8 @@ class McapFile:
         """Messages of the next chunk: channel, nanoseconds since 1970, sequence number, data.
         Append to it; `flush` takes them."""
         self.size = 0  # bytes of the whole records in the file
-        self._path, self._pid = path, os.getpid()
+        self._path = path
+        self._pid = os.getpid()
         self._schemas: dict[tuple[str, str], int] = {}  # ids by name and text
         self._channels: dict[str, int] = {}  # ids by topic
         self._file: Any = path.open("xb", buffering=_BUFFER)

@@ -57,7 +57,8 @@ class Slots:
 
     def free(self, slot: int) -> None:
         """Give a slot to the next simulator that comes."""
-        session, self.sessions[slot] = self.sessions[slot], None
+        session = self.sessions[slot]
+        self.sessions[slot] = None
         if session:
             session.state = AgentState.CLOSED
             del self.of[session.peer]
@@ -91,8 +92,12 @@ class Admission:
     ) -> None:
         self.closed = False
         self.openings: OrderedDict[tuple[Address, int], Session] = OrderedDict()  # WELCOMED
-        self._slots, self._outbox, self._accept = slots, outbox, accept
-        self._keys, self._extensions, self._draw_nonce = keys, extensions, draw_nonce
+        self._slots = slots
+        self._outbox = outbox
+        self._accept = accept
+        self._keys = keys
+        self._extensions = extensions
+        self._draw_nonce = draw_nonce
         self._queue: OrderedDict[Address, Session] = OrderedDict()  # QUEUED
         self._assembling: OrderedDict[tuple[Address, int], Assembler] = OrderedDict()
         self._ended_text: OrderedDict[Address, tuple[bytes, int, float]] = OrderedDict()
@@ -108,7 +113,8 @@ class Admission:
 
     def receive_hello(self, hello: m.Hello, arrival: Arrival, key: Key | None) -> None:
         """Welcome a simulator, refuse it, or let it wait."""
-        address, size = arrival.address, len(arrival.datagram)
+        address = arrival.address
+        size = len(arrival.datagram)
         opening = self.openings.get((address, hello.session))
         if self._slots.had(hello.session):
             self.drop("stale", "", arrival)
@@ -184,7 +190,8 @@ class Admission:
             if sequence < 1:
                 self.drop("stale", "", arrival)
                 return None
-            largest, key = opening.layout.state_size, opening.session_key()
+            largest = opening.layout.state_size
+            key = opening.session_key()
         place = arrival.address, number
         assembler = self._assembling.get(place) or Assembler(largest)
         most = max(_LEAST_ASSEMBLING, len(self._slots.sessions))

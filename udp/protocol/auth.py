@@ -18,7 +18,7 @@ from hmac import compare_digest
 from pathlib import Path
 from typing import Final, Literal
 
-from ...models.errors import InputError, expect
+from ...models.errors import InputError
 from .errors import Forged
 
 KEY_SIZE: Final = 32  # bytes of a shared key
@@ -41,7 +41,8 @@ class Key:
     """
 
     def __init__(self, secret: bytes, side: Side, *, id_: bytes = b"") -> None:
-        expect(len(secret) == KEY_SIZE, "key", f"{KEY_SIZE} bytes", f"{len(secret)}")
+        if len(secret) != KEY_SIZE:
+            raise InputError(f"key: expected {KEY_SIZE} bytes, got {len(secret)}")
         self._secret = secret
         self.id = id_ or blake2b(key=secret, digest_size=_ID_SIZE, person=b"key id").digest()
         self._envelope = _MAGIC + self.id
@@ -68,7 +69,8 @@ class Key:
         message = message_of(datagram)
         tag = self._theirs.copy()
         tag.update(message + asked)
-        envelope, theirs = datagram[:_TAG_AT], datagram[_TAG_AT:OVERHEAD]
+        envelope = datagram[:_TAG_AT]
+        theirs = datagram[_TAG_AT:OVERHEAD]
         if not (envelope == self._envelope and compare_digest(tag.digest(), theirs)):
             raise Forged("key: the tag is not of this key and session")
         return message
@@ -107,13 +109,14 @@ def read_keys(path: Path | str) -> tuple[bytes, ...]:
         raise InputError(f"key file: cannot read {path}: {error.strerror}") from None
     private = os.name != "posix" or not stat.S_ISREG(mode) or not mode & 0o077
     expected = f"{path} to be readable by its owner alone (chmod 600)"
-    expect(private, "key file", expected, f"mode {mode & 0o777:o}")
+    if not private:
+        raise InputError(f"key file: expected {expected}, got mode {mode & 0o777:o}")
     try:
         keys = tuple(bytes.fromhex(line) for line in text.decode("ascii").split())
     except ValueError:
         keys = ()
-    right = keys and all(len(key) == KEY_SIZE for key in keys)
-    expect(right, "key file", f"{2 * KEY_SIZE} hexadecimal digits in {path}")
+    if not (keys and all(len(key) == KEY_SIZE for key in keys)):
+        raise InputError(f"key file: expected {2 * KEY_SIZE} hexadecimal digits in {path}")
     return keys
 
 

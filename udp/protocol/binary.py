@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from ...models.errors import InputError, expect
+from ...models.errors import InputError
 from . import messages
 from .errors import DecodeError, VersionMismatch
 from .layout import COMMAND_ARRAYS_AT, MAX_MESSAGE, Layout, Slot
@@ -79,7 +79,8 @@ def encode(message: Message, layout: Layout | None = None) -> bytes:
 
 def frame(kind: int, session: int, sequence: int, body: bytes) -> bytes:
     """A datagram: header and body."""
-    start, rest = MAGIC + bytes((VERSION, kind)), _NUMBERS.pack(session, sequence) + body
+    start = MAGIC + bytes((VERSION, kind))
+    rest = _NUMBERS.pack(session, sequence) + body
     return start + zlib.crc32(rest, zlib.crc32(start)).to_bytes(4, "little") + rest
 
 
@@ -272,7 +273,8 @@ def _misfit(what: str, shape: tuple[int, ...], dtype: np.dtype, array: np.ndarra
 
 
 def _expect_finite_state(data: bytes, time: float, layout: Layout) -> None:
-    expect(isfinite(time), "time", "a finite number", f"{time}")
+    if not isfinite(time):
+        raise InputError(f"time: expected a finite number, got {time}")
     _expect_finite("observation, reward, telemetry", data, layout.state_floats)
 
 
@@ -311,8 +313,10 @@ def _decode_hello(body: bytes) -> dict[str, Any]:
     low, high, worlds, size = _HELLO_BODY.unpack_from(body)
     at = _HELLO_BODY.size
     most = min(MAX_SPEC, len(body) - at)
-    expect(size <= most, "spec", f"at most {most} bytes", f"{size}")
-    spec, extensions = body[at : at + size].decode(), _take_extensions(body, at + size)
+    if not size <= most:
+        raise InputError(f"spec: expected at most {most} bytes, got {size}")
+    spec = body[at : at + size].decode()
+    extensions = _take_extensions(body, at + size)
     return {"spec": spec, "worlds": worlds, "versions": (low, high), "extensions": extensions}
 
 
@@ -323,7 +327,8 @@ def _encode_welcome(m: messages.Welcome) -> bytes:
 
 def _decode_welcome(body: bytes) -> dict[str, Any]:
     nonce, seed, has_seed, version = _WELCOME_BODY.unpack_from(body)
-    expect(has_seed <= 1, "has seed", "0 or 1", f"{has_seed}")
+    if not has_seed <= 1:
+        raise InputError(f"has seed: expected 0 or 1, got {has_seed}")
     extensions = _take_extensions(body, _WELCOME_BODY.size)
     seed = seed if has_seed else None
     return {"nonce": nonce, "version": version, "seed": seed, "extensions": extensions}
@@ -356,7 +361,8 @@ def _encode_reason(m: messages.Refuse | messages.Close) -> bytes:
 
 def _decode_reason(body: bytes) -> dict[str, Any]:
     (size,) = _LENGTH.unpack_from(body)
-    expect(size <= MAX_TEXT, "reason", f"at most {MAX_TEXT} bytes", f"{size}")
+    if not size <= MAX_TEXT:
+        raise InputError(f"reason: expected at most {MAX_TEXT} bytes, got {size}")
     if len(body) != _LENGTH.size + size:
         raise _wrong_size(body, _LENGTH.size + size)
     return {"reason": body[_LENGTH.size :].decode()}
@@ -372,11 +378,12 @@ def _extensions(extensions: tuple[Extension, ...]) -> bytes:
 def _take_extensions(data: bytes, at: int) -> tuple[Extension, ...]:
     extensions: list[Extension] = []
     while at < len(data):
-        few = len(extensions) < _MOST_EXTENSIONS
-        expect(few, "extensions", f"at most {_MOST_EXTENSIONS}", "more")
+        if not len(extensions) < _MOST_EXTENSIONS:
+            raise InputError(f"extensions: expected at most {_MOST_EXTENSIONS}, got more")
         number, size = _EXTENSION.unpack_from(data, at)
         at += _EXTENSION.size
-        expect(size <= len(data) - at, "extension", f"{size} bytes", f"{len(data) - at}")
+        if not size <= len(data) - at:
+            raise InputError(f"extension: expected {size} bytes, got {len(data) - at}")
         critical = bool(number & _CRITICAL)
         value = data[at : at + size]
         extensions.append(Extension(number=number & ~_CRITICAL, value=value, critical=critical))

@@ -15,7 +15,7 @@ from typing import Final
 
 import numpy as np
 
-from ...models.errors import InputError, expect
+from ...models.errors import InputError
 from . import binary, text
 from . import messages as m
 from .auth import Key, is_sealed, message_of
@@ -125,7 +125,8 @@ class RoundTrips:
             if not self._came_twice:
                 self._in_a_row = 0
             self._came_twice = False
-        self._sent_at, self._is_repeat = now, not first
+        self._sent_at = now
+        self._is_repeat = not first
 
     def answered(self, now: float, *, alive: bool = False) -> None:
         """The answer came, or only Alive.
@@ -136,7 +137,8 @@ class RoundTrips:
         self._says_alive |= alive
         smoothed = self._smoothed
         if smoothed is None:
-            self._smoothed, self._variation = seconds, seconds / 2
+            self._smoothed = seconds
+            self._variation = seconds / 2
         else:
             waited = self._says_alive and not alive and seconds > smoothed
             too_soon = self._is_repeat and seconds < smoothed / 2
@@ -205,7 +207,8 @@ class Client:
         draw_session: Callable[[], int] = new_session,
     ) -> None:
         if by_text:
-            expect(not key, "text codec", "no key", "one: only binary can be sealed")
+            if key:
+                raise InputError("text codec: expected no key, got one: only binary can be sealed")
             text.check_layout(layout)
         check_size(max(layout.state_size, len(binary.encode(hello))), largest)
         self.hello = hello
@@ -286,7 +289,8 @@ class Client:
     def close(self, reason: str, now: float) -> None:
         """End the exchange. An agent that has welcomed this simulator is told, until it answers."""
         if (self.state, Way.SENT, m.Close) in SIMULATOR:
-            session, number = self.hello.session, self.sequence
+            session = self.hello.session
+            number = self.sequence
             self._send(m.Close(session=session, sequence=number, reason=one_line(reason)), now)
         elif self.state is not SimulatorState.CLOSING:
             self._end()  # a Hello that was not answered is not repeated
@@ -297,7 +301,8 @@ class Client:
             return None
         self.statistics.counters["received"] += 1
         if self.state is SimulatorState.WAITING and self._is_plain:
-            session, sequence = self.hello.session, self.sequence
+            session = self.hello.session
+            sequence = self.sequence
             message = binary.decode_due(binary.COMMAND, datagram, session, sequence, self.layout)
             if isinstance(message, Command):
                 self._take_command(message, datagram, now)
@@ -318,7 +323,8 @@ class Client:
                     plain = whole
                 message = binary.decode(plain, self.layout)
         except DecodeError as error:
-            cause, reason = "forged" if isinstance(error, Forged) else "malformed", str(error)
+            cause = "forged" if isinstance(error, Forged) else "malformed"
+            reason = str(error)
             if self._key is None and is_sealed(datagram):
                 cause = "forged"
                 reason = "key: the agent has one, this simulator has none (--key-file)"
@@ -371,7 +377,8 @@ class Client:
 
     def take_outgoing(self) -> list[bytes]:
         """Datagrams to send to the agent, each once."""
-        outgoing, self.outgoing = self.outgoing, []
+        outgoing = self.outgoing
+        self.outgoing = []
         return outgoing
 
     # ---- what came
@@ -421,7 +428,8 @@ class Client:
         return message
 
     def _take_command(self, command: Command, plain: bytes, now: float) -> None:
-        self.state, self._transfer = _AFTER_COMMAND, None
+        self.state = _AFTER_COMMAND
+        self._transfer = None
         self.resend_at = self.deadline = inf
         self._answered_at = now
         if self.tap:
@@ -492,7 +500,9 @@ class Client:
             "the agent does not know this session (any more); beginning a new one"
         )
         self.hello = replace(self.hello, session=self._draw_session())
-        self.sequence, self._session_key, self._is_queued = 0, None, False
+        self.sequence = 0
+        self._session_key = None
+        self._is_queued = False
         self._assembler = Assembler(self.layout.command_size)
         self._send(self.hello, now)
 
@@ -520,7 +530,8 @@ class Client:
             self._put(transfer.start(), self._transfer_key)
         self.asked_at = now
         if kind is m.Close:
-            self.resend_at, self.deadline = now + CLOSE_INTERVAL, now + CLOSE_LINGER
+            self.resend_at = now + CLOSE_INTERVAL
+            self.deadline = now + CLOSE_LINGER
         else:
             self.resend_at = now + self._round_trips.interval
             self.deadline = now + self.config.timeout

@@ -15,7 +15,7 @@ from zlib import crc32
 
 import numpy as np
 
-from ...models.errors import expect
+from ...models.errors import InputError
 from . import binary
 from .binary import HEADER_SIZE
 from .errors import DecodeError
@@ -40,15 +40,16 @@ _LARGEST_BITMAP: Final = 128  # bytes of the bitmap of a Missing: it tells of 1,
 
 def check_largest(largest: int | None) -> None:
     """Raise `InputError` for a largest datagram, bytes, that is too small."""
-    right = largest is None or largest >= _LEAST
-    expect(right, "max_datagram", f"at least {_LEAST}", f"{largest}")
+    if not (largest is None or largest >= _LEAST):
+        raise InputError(f"max_datagram: expected at least {_LEAST}, got {largest}")
 
 
 def check_size(size: int, largest: int) -> None:
     """Raise `InputError` if a message of so many bytes takes too many datagrams of the largest."""
     least = ceil(size / MAX_FRAGMENTS) + _OVERHEAD
     expected = f"at least {least} for messages of {size} bytes"
-    expect(largest >= least, "max_datagram", expected, f"{largest}")
+    if not largest >= least:
+        raise InputError(f"max_datagram: expected {expected}, got {largest}")
 
 
 class Window:
@@ -195,6 +196,7 @@ class Assembler:
         return Missing(**numbers, first=first, bitmap=bitmap)
 
     def _begin(self, header: tuple[int, int, int], count: int) -> None:
-        self._header, self._count = header, count
+        self._header = header
+        self._count = count
         self._slices: dict[int, bytes] = {}
         self._size = 0

@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from ...models.errors import InputError, expect
+from ...models.errors import InputError
 
 MAX_DRONES: Final = 1 << 16  # most drones of one simulator
 MAX_MESSAGE: Final = 1 << 24  # largest message in all its fragments, bytes
@@ -84,16 +84,23 @@ class Layout:
         choices: int = 0,
         telemetry: tuple[tuple[int, ...], ...] = (),
     ) -> None:
-        expect(1 <= drones <= MAX_DRONES, "drones", f"1 to {MAX_DRONES}", f"{drones}")
-        self.drones, self.observation, self.action = drones, observation, action
-        self.choices, self.telemetry = choices, telemetry
+        if not 1 <= drones <= MAX_DRONES:
+            raise InputError(f"drones: expected 1 to {MAX_DRONES}, got {drones}")
+        self.drones = drones
+        self.observation = observation
+        self.action = action
+        self.choices = choices
+        self.telemetry = telemetry
 
         reward = ArrayLayout((), "float64")
         *slots, self.rewards = _slots(STATE_ARRAYS_AT, drones, [*observation, reward])
-        at, end, flag = self.rewards.end, self.rewards.end + drones, np.dtype(bool)
+        at = self.rewards.end
+        end = self.rewards.end + drones
+        flag = np.dtype(bool)
         self.flags = Slot(at, end, (drones,), flag), Slot(end, end + drones, (drones,), flag)
         told = _slots(end + drones, drones, [ArrayLayout(shape, "float64") for shape in telemetry])
-        self.observation_slots, self.telemetry_slots = tuple(slots), tuple(told)
+        self.observation_slots = tuple(slots)
+        self.telemetry_slots = tuple(told)
         slots += [self.rewards, *self.flags, *told]
         ends = [STATE_ARRAYS_AT, *(slot.end for slot in slots)]
         self.state_slots = tuple(
@@ -105,7 +112,8 @@ class Layout:
             slot for slot in slots[: len(observation) + 1] if slot.dtype.kind == "f"
         ]
         if told:  # float64 side by side: one array, for one look at it
-            at, end = told[0].at, told[-1].end
+            at = told[0].at
+            end = told[-1].end
             self.state_floats.append(Slot(at, end, ((end - at) // 8,), told[0].dtype))
         self.state_numbers = _numbers("d8x", STATE_ARRAYS_AT, self.state_floats)
 
@@ -138,5 +146,6 @@ def _numbers(fixed: str, at: int, slots: list[Slot]) -> struct.Struct | None:
         if slot.dtype.kind == "f":
             size = math.prod(slot.shape)
             form += f"{slot.at - at}x{size}{_LETTERS[slot.dtype.name]}"
-            at, count = slot.end, count + size
+            at = slot.end
+            count = count + size
     return struct.Struct(form) if count <= _SMALL else None

@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from ...models.errors import InputError, expect
+from ...models.errors import InputError
 from .layout import MAX_DRONES
 
 MAX_UINT64: Final = (1 << 64) - 1  # largest session, sequence number, nonce and seed
@@ -39,8 +39,10 @@ def one_line(text: str) -> str:
 
 def _check_text(name: str, text: str) -> None:
     size = len(text.encode())
-    expect(size <= MAX_TEXT, name, f"at most {MAX_TEXT} bytes of UTF-8", f"{size}")
-    expect(not _CONTROL.search(text), name, "no control characters", f"{text!r}")
+    if not size <= MAX_TEXT:
+        raise InputError(f"{name}: expected at most {MAX_TEXT} bytes of UTF-8, got {size}")
+    if _CONTROL.search(text):
+        raise InputError(f"{name}: expected no control characters, got {text!r:.300}")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -53,9 +55,12 @@ class Extension:
     """Whether a side that does not know it must not go on."""
 
     def __post_init__(self) -> None:
-        number, size = self.number, len(self.value)
-        expect(0 <= number < 1 << 15, "extension", "a number 0 to 32767", f"{number}")
-        expect(size <= MAX_TEXT, "extension", f"at most {MAX_TEXT} bytes", f"{size}")
+        number = self.number
+        size = len(self.value)
+        if not 0 <= number < 1 << 15:
+            raise InputError(f"extension: expected a number 0 to 32767, got {number}")
+        if not size <= MAX_TEXT:
+            raise InputError(f"extension: expected at most {MAX_TEXT} bytes, got {size}")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -73,11 +78,15 @@ class Hello:
     extensions: tuple[Extension, ...] = ()
 
     def __post_init__(self) -> None:
-        worlds, (low, high), size = self.worlds, self.versions, len(self.spec.encode())
-        expect(1 <= worlds <= MAX_DRONES, "worlds", f"1 to {MAX_DRONES}", f"{worlds}")
-        right = 1 <= low <= high <= 255
-        expect(right, "versions", "1 <= lowest <= highest", f"{self.versions}")
-        expect(2 <= size <= MAX_SPEC, "spec", f"2 to {MAX_SPEC} bytes of UTF-8", f"{size}")
+        worlds = self.worlds
+        (low, high) = self.versions
+        size = len(self.spec.encode())
+        if not 1 <= worlds <= MAX_DRONES:
+            raise InputError(f"worlds: expected 1 to {MAX_DRONES}, got {worlds}")
+        if not 1 <= low <= high <= 255:
+            raise InputError(f"versions: expected 1 <= lowest <= highest, got {self.versions}")
+        if not 2 <= size <= MAX_SPEC:
+            raise InputError(f"spec: expected 2 to {MAX_SPEC} bytes of UTF-8, got {size}")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -96,7 +105,8 @@ class Welcome:
 
     def __post_init__(self) -> None:
         for name, number in (("nonce", self.nonce), ("seed", self.seed or 0)):
-            expect(0 <= number <= MAX_UINT64, name, "0 to 2^64 - 1", f"{number}")
+            if not 0 <= number <= MAX_UINT64:
+                raise InputError(f"{name}: expected 0 to 2^64 - 1, got {number}")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -154,7 +164,8 @@ class Missing:
     def __post_init__(self) -> None:
         if self.kind not in (1, 4, 5):
             raise InputError(f"expected a Hello, State or Command, got type {self.kind}")
-        size, count = len(self.bitmap), self.count
+        size = len(self.bitmap)
+        count = self.count
         if not size or self.first >= count or self.first + 8 * (size - 1) >= count:
             raise InputError(f"expected a bitmap of {count} fragments, got {size} bytes")
         if (numbers := self.numbers()) and numbers[-1] >= count:

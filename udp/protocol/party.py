@@ -176,7 +176,9 @@ class WorldRules:
         self.reason: str | None = None
         self.cause: Command | None = None
         self.moved = False
-        self._world, self._layout, self._period = world, layout, period
+        self._world = world
+        self._layout = layout
+        self._period = period
 
     def start(self, now: float) -> None:
         """Say Hello to every agent."""
@@ -243,7 +245,8 @@ class WorldRules:
         actions = self._layout.actions
         nothing = np.zeros(actions.shape, actions.dtype)
         self._world.advance(nothing, np.ones(self._layout.drones, bool), seeds, None)
-        self.cause, self.moved = None, True
+        self.cause = None
+        self.moved = True
 
     def _lose_silent(self, link: AgentLink, why: str) -> None:
         raise NotImplementedError
@@ -313,7 +316,8 @@ class OneAgent(WorldRules):
             self._world.advance(message.actions, None, None, None)
         else:
             self._world.advance(message.actions, message.resets, message.seeds, message.frozen)
-        self.cause, self.moved = message, True
+        self.cause = message
+        self.moved = True
         return False
 
     def answer(self, now: float) -> None:
@@ -321,7 +325,8 @@ class OneAgent(WorldRules):
         if not self._answers:
             return
         self._answers = False
-        world, client = self._world, self._client
+        world = self._world
+        client = self._client
         client.send_state(
             client.sequence * self._period,
             tuple(world.observations.values()),
@@ -377,7 +382,8 @@ class SeveralAgents(WorldRules):
         self.episodes = self.steps = 0
         self.seed: int | None = None
         self._swarm = world
-        self._when_lost, self._patience = when_lost, patience
+        self._when_lost = when_lost
+        self._patience = patience
         self._due: list[tuple[AgentLink, bool, bool]] = []  # States: to whom, again, cut
         self._last_reason = ""
 
@@ -476,7 +482,8 @@ class SeveralAgents(WorldRules):
 
     def _fly(self, flying: list[AgentLink]) -> None:
         """Fly the world for one control period, if any agent flies in it."""
-        layout, flown = self._layout, False
+        layout = self._layout
+        flown = False
         actions = np.zeros(layout.actions.shape, layout.actions.dtype)
         if layout.choices:
             actions += (layout.choices - 1) // 2  # hold
@@ -500,7 +507,8 @@ class SeveralAgents(WorldRules):
 
     def _close_wrong(self, link: AgentLink, flying: list[AgentLink], now: float) -> bool:
         """Close the link to an agent whose Command the world cannot follow; whether it did."""
-        out, wrong = self._out(link), ""
+        out = self._out(link)
+        wrong = ""
         nobody_flies = all(other.order in (FREEZE, RESET) for other in flying)
         if link.order is None:
             wrong = f"orders: expected the same for all {len(link.rows)} drones, got different ones"
@@ -518,7 +526,8 @@ class SeveralAgents(WorldRules):
 
     def _lose(self, link: AgentLink, participation: Participation, why: str = "") -> None:
         """The policy of an agent flies its drones for the rest of the episode."""
-        was, link.participation = link.participation, participation
+        was = link.participation
+        link.participation = participation
         if participation is not Participation.WAITING:
             link.command = None
         flew = False
@@ -565,12 +574,15 @@ class SeveralAgents(WorldRules):
 
     def answer(self, now: float) -> None:
         """Send the States that are due."""
-        due, self._due = self._due, []
+        due = self._due
+        self._due = []
         for link, again, cut in due:
             self._send(link, again, cut, now)
 
     def _send(self, link: AgentLink, again: bool, cut: bool, now: float) -> None:
-        world, rows, client = self._world, link.rows, link.client
+        world = self._world
+        rows = link.rows
+        client = link.client
         nothing = np.zeros(len(rows), bool)
         rewards: Array = np.zeros(len(rows))
         terminated = truncated = nothing
@@ -578,7 +590,8 @@ class SeveralAgents(WorldRules):
             truncated = link.in_flight
         elif not again:
             rewards = world.rewards[rows]
-            terminated, truncated = world.terminated[rows], world.truncated[rows]
+            terminated = world.terminated[rows]
+            truncated = world.truncated[rows]
             link.shown = (
                 tuple(array[rows] for array in world.observations.values()),
                 tuple(array[rows] for array in world.telemetry.values()),
@@ -629,7 +642,8 @@ class SeveralAgents(WorldRules):
             if link.participation in (Participation.SILENT, Participation.LATE):
                 self._take_late(link, now)
         elif isinstance(message, Welcome):
-            link.participation, link.seed = Participation.READY, message.seed
+            link.participation = Participation.READY
+            link.seed = message.seed
             self._take_policy(link, message)
         elif isinstance(message, Refuse | Close):
             if self.episodes:

@@ -98,7 +98,8 @@ class Server:
         self.outbox.statistics.counters["received"] += 1
         session = self._slots.of.get(address)
         if session and session.is_plain and session.state is AgentState.EXPECTING:
-            number, sequence = session.number, session.sequence + 1
+            number = session.number
+            sequence = session.sequence + 1
             state = binary.decode_due(binary.STATE, datagram, number, sequence, session.layout)
             if isinstance(state, State):
                 return session.take_state(state, datagram, now)
@@ -133,7 +134,8 @@ class Server:
             if session:
                 session.send_close(reason)
         self._admission.close(reason)
-        self._resend_at, self._deadline = now + CLOSE_INTERVAL, now + CLOSE_LINGER
+        self._resend_at = now + CLOSE_INTERVAL
+        self._deadline = now + CLOSE_LINGER
 
     def next_timer(self) -> float | None:
         """When `handle_timer` wants to be called; None if never."""
@@ -152,7 +154,8 @@ class Server:
 
     def take_outgoing(self) -> list[tuple[bytes, Address]]:
         """Datagrams to send and where to, each once."""
-        taken, self.outbox.datagrams = self.outbox.datagrams, []
+        taken = self.outbox.datagrams
+        self.outbox.datagrams = []
         return taken
 
     # ---- from a datagram to its session
@@ -168,7 +171,8 @@ class Server:
             return None
 
     def _receive_binary(self, session: Session | None, arrival: Arrival) -> Event | None:
-        address, admission = arrival.address, self._admission
+        address = arrival.address
+        admission = self._admission
         plain, key = self._open(arrival, session)
         kind, number, _ = binary.peek(plain)
         seated = session if session and session.number == number and not session.is_text else None
@@ -225,9 +229,11 @@ class Server:
         layout = None if self._keys else self._text_layout()
         if layout is None:
             sequence, fields = text.split(datagram)
-            cause, reason = "refused", "text is not flown here"
+            cause = "refused"
+            reason = "text is not flown here"
             if self._keys:
-                cause, reason = "forged", "key: this agent has one (--key-file), text has none"
+                cause = "forged"
+                reason = "key: this agent has one (--key-file), text has none"
             if fields == ["close"]:  # two agents would answer each other's Closes for ever
                 self._admission.drop(cause, reason, arrival)
             else:
@@ -272,7 +278,8 @@ class Server:
     def _refuse_undecoded(self, error: DecodeError, arrival: Arrival) -> None:
         """Count it, and answer a Hello if its sender must change its configuration."""
         datagram, address, _ = arrival
-        under_seal, size = is_sealed(datagram), len(datagram)
+        under_seal = is_sealed(datagram)
+        size = len(datagram)
         plain = message_of(datagram) if under_seal else datagram
         kind, number, _ = binary.peek(plain)
         if isinstance(error, NoSuchSession):

@@ -85,12 +85,17 @@ class Session:
         key: Key | None = None,
         line: bytes = b"",
     ) -> None:
-        self.peer, self.number, self.layout, self.hello = peer, number, layout, hello
-        self.key, self.line = key, line
+        self.peer = peer
+        self.number = number
+        self.layout = layout
+        self.hello = hello
+        self.key = key
+        self.line = line
         self.is_text = hello is None
         self.state = AgentState.NEW
         self.welcome: m.Welcome | None = None
-        self.slot, self.sequence = -1, 0
+        self.slot = -1
+        self.sequence = 0
         self.reply: Transfer | None = None
         self.room = 0
         self.asked_at = self.heard_at = 0.0
@@ -193,7 +198,8 @@ class Session:
 
     def join(self, slot: int, state: State, plain: bytes) -> Event:
         """Take a slot with the first State."""
-        self.key, self.slot = self.session_key(), slot
+        self.key = self.session_key()
+        self.slot = slot
         self.move(Way.RECEIVED, State)
         self.sequence = state.sequence
         self.is_plain = self.key is None and not self.is_text
@@ -206,7 +212,8 @@ class Session:
 
     def take_state(self, state: State, plain: bytes, now: float) -> Event:
         """The next State, which is expected."""
-        self.sequence, self.state = state.sequence, _AFTER_STATE
+        self.sequence = state.sequence
+        self.state = _AFTER_STATE
         self._outbox.statistics.round_trips.add(now - self.asked_at)
         if self._outbox.tap:
             self.record(state, plain)

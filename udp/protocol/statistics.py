@@ -75,12 +75,14 @@ class Statistics:
 
     def take_notices(self) -> list[str]:
         """Sentences for the log, each once."""
-        notices, self.notices = self.notices, []
+        notices = self.notices
+        self.notices = []
         return notices
 
     def report_due(self, now: float) -> bool:
         """Whether a minute has passed since the last report, or since the first call."""
-        is_first, is_due = not self.report_at, now >= self.report_at
+        is_first = not self.report_at
+        is_due = now >= self.report_at
         if is_first or is_due:
             self.report_at = now + REPORT_INTERVAL
         return is_due and not is_first

@@ -15,7 +15,7 @@ from typing import Final
 
 import numpy as np
 
-from ...models.errors import InputError, expect
+from ...models.errors import InputError
 from .errors import DecodeError
 from .layout import Layout
 from .messages import FLY, MAX_UINT64, RESET, Close, Command, State
@@ -35,14 +35,18 @@ def is_text(datagram: bytes) -> bool:
 
 def check_layout(layout: Layout) -> None:
     """Raise `InputError` if the messages of a layout cannot be written as text."""
-    what, arrays, action = "text codec", layout.observation, layout.action
-    expect(layout.drones == 1, what, "one drone", f"{layout.drones}: use binary")
+    what = "text codec"
+    arrays = layout.observation
+    action = layout.action
+    if layout.drones != 1:
+        raise InputError(f"{what}: expected one drone, got {layout.drones}: use binary")
     flat = [len(array.shape) == 1 and array.dtype == _FLOAT for array in arrays]
     got = ", ".join(f"{array.dtype} of shape {array.shape}" for array in arrays)
     expected = "one flat array of float32 as observation"
-    expect(flat == [True], what, expected, f"{got}: use binary")
-    right = action is None or (len(action.shape) == 1 and action.dtype == _FLOAT)
-    expect(right, what, "flat actions of float32", f"{action}: use binary")
+    if flat != [True]:
+        raise InputError(f"{what}: expected {expected}, got {got}: use binary")
+    if not (action is None or (len(action.shape) == 1 and action.dtype == _FLOAT)):
+        raise InputError(f"{what}: expected flat actions of float32, got {action}: use binary")
     shapes = [slot.shape for slot in (*layout.observation_slots, *layout.telemetry_slots)]
     state = 1 + sum(map(prod, shapes))  # the reward is a number too
     longest = _FIXED + (_LONGEST_NUMBER + 1) * max(state, prod(layout.actions.shape))
@@ -64,8 +68,8 @@ def encode(message: State | Command | Close) -> bytes:
         case Command() if message.orders.item() == RESET:
             fields = ["reset"] if message.seeds is None else ["reset", str(message.seeds.item())]
         case Command():
-            flies = message.orders.item() == FLY
-            expect(flies, "text codec", "an action or a reset", "a frozen drone")
+            if message.orders.item() != FLY:
+                raise InputError("text codec: expected an action or a reset, got a frozen drone")
             fields = _numbers([message.actions])
         case Close():
             fields = ["close"]
@@ -87,7 +91,8 @@ def decode_state(datagram: bytes, layout: Layout) -> State | Close:
     sequence, fields = split(datagram)
     if fields == ["close"]:
         return Close(session=0, sequence=sequence, reason="the simulator closed")
-    observation, telemetry = layout.observation_slots[0], layout.telemetry_slots
+    observation = layout.observation_slots[0]
+    telemetry = layout.telemetry_slots
     size = observation.shape[1]
     sizes = [prod(slot.shape) for slot in telemetry]
     expected = 3 + size + sum(sizes)

@@ -44,7 +44,10 @@ class AgentState(_Enum):
     CLOSED = "closed"
 
 
-_S, _A, _SENT, _RECEIVED = SimulatorState, AgentState, Way.SENT, Way.RECEIVED
+_S = SimulatorState
+_A = AgentState
+_SENT = Way.SENT
+_RECEIVED = Way.RECEIVED
 
 SIMULATOR: Final[dict[tuple[SimulatorState, Way, type[m.Message]], SimulatorState]] = {
     (_S.IDLE, _SENT, m.Hello): _S.HELLO,

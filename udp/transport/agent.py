@@ -18,7 +18,7 @@ import numpy as np
 from ...envs import registry
 from ...envs.config import EnvConfig
 from ...envs.spec import EnvSpec, canonical_id, json_values
-from ...models.errors import InputError, expect
+from ...models.errors import InputError
 from ..layouts import layout_of
 from ..protocol import text
 from ..protocol.auth import Key, read_keys
@@ -79,10 +79,13 @@ class AgentConfig:
     def __post_init__(self) -> None:
         for name in ("connect_timeout", "timeout"):
             seconds = getattr(self, name)
-            expect(math.isfinite(seconds) and seconds > 0, name, "seconds > 0", f"{seconds}")
+            if not (math.isfinite(seconds) and seconds > 0):
+                raise InputError(f"{name}: expected seconds > 0, got {seconds}")
         check_largest(self.max_datagram)
-        right = self.when_lost is None or self.when_lost in POLICIES
-        expect(right, "when_lost", f"one of {', '.join(POLICIES)}", f"{self.when_lost!r}")
+        if not (self.when_lost is None or self.when_lost in POLICIES):
+            raise InputError(
+                f"when_lost: expected one of {', '.join(POLICIES)}, got {self.when_lost!r:.300}"
+            )
         if self.env_id is not None:
             self.env_id = canonical_id(self.env_id)
             self._expected_options(self.env_id)
@@ -219,7 +222,8 @@ class Agent:
     def _record(self, path: Path | str) -> Any:
         from ..journal import Journal
 
-        server, spec = self.server, self.config.text_spec
+        server = self.server
+        spec = self.config.text_spec
         hello = Hello(session=0, spec=spec.to_json()) if spec else None
         return Journal(path, server.statistics, side="agent", slots=server.slots, text_hello=hello)
 
@@ -239,7 +243,8 @@ class Agent:
             left = min(map(deadlines.__getitem__, pending)) - now
             if left <= 0:
                 self._give_up(pending, now)
-                now, pending = time.monotonic(), self._pending()
+                now = time.monotonic()
+                pending = self._pending()
                 continue
             before = now
             try:
@@ -279,7 +284,8 @@ class Agent:
         return pending
 
     def _handle(self, event: Event, address: Address) -> None:
-        slot, message = event.slot, event.message
+        slot = event.slot
+        message = event.message
         if isinstance(message, Close):
             self._lose(slot, f"the simulator at {address_text(address)} closed: {message.reason}")
             if not any(self.server.slots):
@@ -293,14 +299,17 @@ class Agent:
 
     def _welcome(self, slot: int, address: Address) -> None:
         """Another simulator has this slot now."""
-        session, config = self.server.slots[slot], self.config
+        session = self.server.slots[slot]
+        config = self.config
         assert session is not None
         self._keep_sockets()
         if session.hello:
             self.server.takes_text = False
-            config.spec, config.drones = _spec(session.hello.spec), session.layout.drones
+            config.spec = _spec(session.hello.spec)
+            config.drones = session.layout.drones
         else:
-            config.spec, config.drones = config.text_spec, 1
+            config.spec = config.text_spec
+            config.drones = 1
         if slot in self.states and not self.lost[slot]:
             self._lose(slot, f"the simulator at {address_text(address)} was started anew")
             _log.warning("%s", self.lost[slot])
@@ -312,7 +321,8 @@ class Agent:
                 continue
             session = self.server.slots[slot]
             if session is None:
-                lost, dropped = self.lost[slot], self._last_dropped()
+                lost = self.lost[slot]
+                dropped = self._last_dropped()
                 raise PeerSilent(
                     f"{f'{lost}; no other' if lost else 'no simulator'} came to "
                     f"{address_text(self.address)} for {self.config.connect_timeout:g} s"
@@ -321,7 +331,8 @@ class Agent:
             if now < session.heard_at + self.config.timeout:  # it lives, and computes
                 self._deadlines[slot] = session.heard_at + self.config.timeout
                 continue
-            here, there = address_text(self.address), address_text(session.peer)
+            here = address_text(self.address)
+            there = address_text(session.peer)
             reason = (
                 f"no datagram from the simulator at {there} for {self.config.timeout:g} s, "
                 f"waiting at {here} for State {session.sequence + 1}{self._last_dropped()}"
@@ -339,7 +350,8 @@ class Agent:
         self._keep_sockets()
 
     def _say_waiting(self, slot: int) -> None:
-        here, wait = address_text(self.address), self.config.connect_timeout
+        here = address_text(self.address)
+        wait = self.config.connect_timeout
         long = f"{wait:g} s " if wait < 86_400 else ""  # commands wait without limit
         _log.warning("%s; waiting %sfor another at %s", self.lost[slot], long, here)
 
@@ -374,7 +386,8 @@ def _spec_difference(ours: EnvSpec, theirs: EnvSpec) -> str:
     """Difference between a simulator and earlier ones, in a sentence; "" if there is none."""
     for name in ("env_id", "options", "vehicle_hash", "control_period", "agents", "observation",
                  "action", "telemetry", "metrics"):  # fmt: skip
-        expected, got = getattr(ours, name), getattr(theirs, name)
+        expected = getattr(ours, name)
+        got = getattr(theirs, name)
         if expected != got and name == "options":
             return _options_difference(expected, got, both_ways=True)
         if expected != got:
@@ -402,12 +415,14 @@ def _leave(pid: int, server: Server, port: Port, journal: Any) -> None:
 
 def _flush(server: Server, port: Port) -> None:
     outbox = server.outbox
-    datagrams, outbox.datagrams = outbox.datagrams, []
+    datagrams = outbox.datagrams
+    outbox.datagrams = []
     for datagram, address in datagrams:
         try:
             port.send(datagram, address)
         except OSError:  # as good as lost: the simulator asks again, or the wait ends in time
             outbox.statistics.counters["unsent"] += 1
-    statistics, now = outbox.statistics, time.monotonic()
+    statistics = outbox.statistics
+    now = time.monotonic()
     if statistics.notices or now >= statistics.report_at:
         log_notices(statistics, now)

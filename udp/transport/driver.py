@@ -36,10 +36,13 @@ class Driver(NotCopied):
     """
 
     def __init__(self, stepped: Steppable, rules: WorldRules, port: Port) -> None:
-        self.stepped, self.spec = stepped, stepped.spec
+        self.stepped = stepped
+        self.spec = stepped.spec
         self.address: Address = port.address
         self.observer: Observer | None = None
-        self._rules, self._port, self._receive = rules, port, port.receiver()
+        self._rules = rules
+        self._port = port
+        self._receive = port.receiver()
         self._by_address = {link.address: link for link in rules.links}
         self._stopped = self._ran = False
         self._journal: Any = None
@@ -71,7 +74,8 @@ class Driver(NotCopied):
             name = type(self).__name__
             raise ValueError(f"run: expected one call for each {name}, got another")
         self._ran = True
-        reason, finished = "the simulator was stopped", threading.Event()
+        reason = "the simulator was stopped"
+        finished = threading.Event()
         heart = threading.Thread(target=self._say_alive, args=(finished,), daemon=True)
         with _deferred_interrupt(self.stop) as interrupted:
             heart.start()
@@ -171,13 +175,15 @@ class Driver(NotCopied):
         """Send what is due, before any wait."""
         for link in self._rules.links:
             client = link.client
-            outgoing, client.outgoing = client.outgoing, []
+            outgoing = client.outgoing
+            client.outgoing = []
             for datagram in outgoing:
                 try:
                     self._port.send(datagram, link.address)
                 except OSError as error:  # as good as lost
                     self._note_unsent(link, error)
-            statistics, now = client.statistics, time.monotonic()
+            statistics = client.statistics
+            now = time.monotonic()
             if statistics.notices or now >= statistics.report_at:
                 log_notices(statistics, now)
 

@@ -241,7 +241,8 @@ def _shares(
             got = ", ".join(given) or "none"
             raise InputError(f"agents: expected each of {', '.join(names)} once, got {got}")
         return shares
-    count, drones = len(agents), len(names)
+    count = len(agents)
+    drones = len(names)
     if not count or drones % count:
         raise InputError(f"agents: expected a divisor of {drones} drones, got {count} agents")
     size = drones // count

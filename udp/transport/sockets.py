@@ -112,7 +112,8 @@ class Socket(socket.socket):
                 try:
                     came = self.recvfrom(_MAX_DATAGRAM)
                 except BlockingIOError:
-                    before, now = now, time.monotonic()
+                    before = now
+                    now = time.monotonic()
                     if now - before > _LOST:
                         self._row = _MOST_ASLEEP
                         break

@@ -43,7 +43,8 @@ def make_stepped(
             raise InputError(f"env: expected one env without keywords, got {got}")
         return GymnasiumBatch([env], {})
     env = EnvConfig.from_keywords(env, **keywords)
-    count, drones = num_envs, env.drones
+    count = num_envs
+    drones = env.drones
     if count is None:
         count = drones
     if type(count) is not int or not 1 <= count <= MAX_DRONES:
@@ -71,18 +72,22 @@ class GymnasiumBatch:
     """Gymnasium envs, one after the other."""
 
     def __init__(self, envs: Sequence[gym.Env[Any, Any]], options: Mapping[str, Any]) -> None:
-        self.envs, self.num_envs = envs, len(envs)
+        self.envs = envs
+        self.num_envs = len(envs)
         self.spec = spec_of_gymnasium(envs[0], options)
-        n, spec = self.num_envs, self.spec
+        n = self.num_envs
+        spec = self.spec
         self.observations = {a.name: np.zeros((n, *a.shape), a.dtype) for a in spec.observation}
         self.telemetry = {a.name: np.zeros((n, *a.shape)) for a in spec.telemetry}
         self.rewards = np.zeros(n)
-        self.terminated, self.truncated = np.zeros(n, bool), np.zeros(n, bool)
+        self.terminated = np.zeros(n, bool)
+        self.truncated = np.zeros(n, bool)
         self._waiting = np.ones(n, bool)  # for a reset
 
     def advance(self, actions: np.ndarray, resets: Any, seeds: Any, frozen: Any) -> None:
         none = np.zeros(self.num_envs, bool)
-        resets, frozen = none if resets is None else resets, none if frozen is None else frozen
+        resets = none if resets is None else resets
+        frozen = none if frozen is None else frozen
         waiting = self._waiting & ~resets & ~frozen
         if waiting.any():
             raise gym.error.ResetNeeded(f"step: expected a reset of env {waiting.argmax()} first")
@@ -96,7 +101,9 @@ class GymnasiumBatch:
                 action = int(actions[i]) if isinstance(self.spec.action, Discrete) else actions[i]
                 observation, reward, terminated, truncated, info = env.step(action)
                 self._keep(i, observation, info)
-            self.rewards[i], self.terminated[i], self.truncated[i] = reward, terminated, truncated
+            self.rewards[i] = reward
+            self.terminated[i] = terminated
+            self.truncated[i] = truncated
             self._waiting[i] = terminated or truncated or (frozen[i] and self._waiting[i])
 
     def close(self) -> None:
@@ -128,7 +135,8 @@ def spec_of_gymnasium(env: gym.Env[Any, Any], options: Mapping[str, Any]) -> Env
         action = Discrete(n=int(env.action_space.n))
     else:
         action = _array("action", env.action_space)
-    spec, ours = getattr(base, "env_spec", None), (env.observation_space, env.action_space)
+    spec = getattr(base, "env_spec", None)
+    ours = (env.observation_space, env.action_space)
     if isinstance(spec, EnvSpec) and ours == (observation_space(spec), action_space(spec)):
         return spec
     fps = env.metadata.get("render_fps") or 50
