@@ -65,7 +65,8 @@ class EnvFlags(Command):
     """Number of the last observations that are observed side by side."""
     scene: str = "plain"
     """Ground and obstacles: plain, airport, forest, warehouse or gates; the last three from a
-    seed, as forest:3, or from one of several for each episode, as forest:0-7."""
+    seed, as forest:3, or from one of several for each episode, as forest:0-7. Films and views
+    show one scene; their default is the airport."""
     cameras: tuple[str, ...] = ()
     """Pictures that are observed: cameras of the vehicle, each NAME, NAME_KIND or
     NAME@WIDTHxHEIGHT."""
@@ -87,6 +88,11 @@ class EnvFlags(Command):
     def env_id(self) -> str:
         """The task without its module."""
         return self.env.rpartition(":")[2]
+
+    @property
+    def shown_scene(self) -> str:
+        """The scene of films and views."""
+        return str(self.options.get("scene", "airport"))
 
 
 @dataclass(frozen=True, kw_only=True)

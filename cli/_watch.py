@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..envs.rendering import moments
-from ..rendering.live import MOST_DRONES, LiveView, Pace, open_surface
+from ..rendering.live import MAX_SHOWN, LiveView, Pace, open_surface
 from ..rendering.stage import Stage
 from ..udp.protocol.messages import Command, State
 from ..udp.transport.driver import Driver, Observer
@@ -79,8 +79,8 @@ def watched(simulator: Driver, command: "Sim") -> Iterator[None]:
             pace = Pace(0.0)
             drones = simulator.stepped.num_envs
             names = simulator.spec.agents if len(simulator.spec.agents) > 1 else ()
-            shown = len(names) or min(drones, MOST_DRONES)  # of the first world
-            stage = Stage(command.world, shown, vehicle=command.vehicle, names=names)
+            shown = len(names) or min(drones, MAX_SHOWN)  # of the first world
+            stage = Stage(command.shown_scene, shown, vehicle=command.vehicle, names=names)
             surface = open_surface(command.view, stage, pace, command.view_port)
             live = opened.enter_context(LiveView(stage, surface, pace, of=drones))
             print(f"shown {surface.where}", flush=True)

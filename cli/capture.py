@@ -18,7 +18,7 @@ class Capture(Command):
     """
 
     plan: Positional[Path]
-    """TOML file: cameras, world, where to take pictures from. docs/capture.md has its fields."""
+    """TOML file: cameras, scene, where to take pictures from. docs/capture.md has its fields."""
     out: Path
     """Folder to write to: a new one, or one of the same plan to go on with."""
     jobs: int | None = None

@@ -44,9 +44,6 @@ class Render(EnvFlags):
     """Seconds of flight per second of film: 0.25 is slow motion."""
     at: float | None = None
     """With a .png: the time of the picture in the first episode, s. Default: its end."""
-    world: str = "airport"
-    """Surroundings of the drones in the picture; they change no flight:
-    plain, airport, forest, warehouse or gates; the last three from a seed, as forest:3."""
     overlay: bool = True
     """Whether numbers and curves are on the picture. Of several flights the names always are."""
     fast: bool = False
@@ -67,7 +64,8 @@ class Render(EnvFlags):
         from ._progress import frame_bar
 
         width, height = parse_size(self.size)
-        config = Film(width=width, height=height, **self.settings(Film))
+        settings = self.settings(Film) | {"scene": self.shown_scene}
+        config = Film(width=width, height=height, **settings)
         check_film(self.out, width, height, self.fps)
         self._check()
         offscreen_context(16, 16).free()  # flying takes longer than finding no OpenGL
@@ -105,7 +103,7 @@ class Render(EnvFlags):
         journals = [Path(words).suffix == ".mcap" for words in self.what]
         if not any(journals) and (self.session is not None or self.drone):
             raise InputError("session, drone: expected them with a journal (.mcap), got none")
-        if self.options and all(journals):
+        if self.options.keys() - {"scene"} and all(journals):
             raise InputError("env: expected no options with a journal, which has its own")
 
     def _find(self, what: str) -> "_Flown":

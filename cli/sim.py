@@ -53,9 +53,6 @@ class Sim(BackendFlags):
     not wait for it. Keys: docs/viewing.md."""
     view_port: int = 8080
     """TCP port of the page, on this machine's loopback; 0 takes the first free one."""
-    world: str = "airport"
-    """Surroundings of the drones in the view:
-    plain, airport, forest, warehouse or gates; the last three from a seed, as forest:3."""
     realtime: bool = False
     """Fly no faster than real time, for viewers."""
 

@@ -28,9 +28,6 @@ class View(EnvFlags):
     """Serve a page for browsers, for a machine without a display."""
     port: int = 8080
     """TCP port of the page, on this machine's loopback; 0 takes the first free one."""
-    world: str = "airport"
-    """Surroundings of the drone:
-    plain, airport, forest, warehouse or gates; the last three from a seed, as forest:3."""
     speed: float = 1.0
     """1 is real time, from 1/16 to 8."""
     episodes: int | None = None
@@ -44,14 +41,14 @@ class View(EnvFlags):
         from ._env import words_of
 
         check_count("episodes", self.episodes)
-        parse_scene(self.world)
+        parse_scene(self.shown_scene)
         flights = islice(self._flights(), self.episodes)
         first = next(flights)
         spec = first[0].spec
         drones = len(first)
         pace = Pace(spec.control_period, self.speed)
         names = spec.agents if drones > 1 else ()
-        stage = Stage(self.world, drones, vehicle=self.vehicle, names=names)
+        stage = Stage(self.shown_scene, drones, vehicle=self.vehicle, names=names)
         surface = open_surface("web" if self.web else "window", stage, pace, self.port)
         with LiveView(stage, surface, pace) as live:
             print(f"showing {self.what} {surface.where} (Ctrl-C ends)", flush=True)
@@ -75,7 +72,7 @@ class View(EnvFlags):
         from ._env import chosen_drones, pilot_of
 
         if (path := Path(self.what)).suffix == ".mcap":
-            if self.options:
+            if self.options.keys() - {"scene"}:
                 raise InputError("env: expected no options with a journal, which has its own")
             yield from ([one] for one in recorded_trajectories(path))
             return

@@ -68,7 +68,7 @@ class Renderer:
         from ..rendering import Stage, live
 
         names = self._loop.spec.agents if len(self._loop.spec.agents) > 1 else ()
-        shown = now[: len(names) or live.MOST_DRONES]  # of the first world
+        shown = now[: len(names) or live.MAX_SHOWN]  # of the first world
         if self._view is None:
             path = self._loop.vehicle.path
             stage = Stage(drones=len(shown), vehicle=path, names=names)

@@ -222,7 +222,7 @@ def _take(job: _Job, tell: Tell) -> list[Frame]:
         Vehicle.load(plan.vehicle),
         plan.views(),
         (1, drones),
-        world=poses.world,
+        scene=poses.scene,
         marks=poses.marks,
         payload=poses.payload is not None,
         fine=plan.fine,
@@ -242,7 +242,7 @@ def _take(job: _Job, tell: Tell) -> list[Frame]:
                 "frame": number,
                 "sequence": job.sequence,
                 "source": poses.name,
-                "world": poses.world,
+                "scene": poses.scene,
                 "time": float(poses.times[row]),
             }
             frames.append(_frame(number, cameras, drones, state, labels, plan.least_area))

@@ -122,7 +122,7 @@ class Film:
     fps: float = 25.0
     speed: float = 1.0
     """Seconds of flight per second of film."""
-    world: str = "airport"
+    scene: str = "airport"
     vehicle: str | None = None
     """File or name of the vehicle; None: the paper's."""
     overlay: bool = True
@@ -135,7 +135,7 @@ class Film:
     """As of `write_film`."""
 
     def __post_init__(self) -> None:
-        parse_scene(self.world)
+        parse_scene(self.scene)
         if not 0.001 <= self.speed <= 1000:
             raise InputError(f"speed: expected 0.001 to 1000, got {self.speed:g}")
         if self.at is not None and not 0 <= self.at < math.inf:
@@ -213,7 +213,7 @@ def _frames(
     height = (config.height - _SPACE * (rows - 1)) // rows
     drones = tracks[0].drones
     names = tracks[0].trajectories[0].spec.agents if drones > 1 else ()
-    stage = Stage(config.world, drones, vehicle=config.vehicle, names=names)
+    stage = Stage(config.scene, drones, vehicle=config.vehicle, names=names)
     with Canvas(stage, width, height, fast=config.fast) as canvas:
         panes = [_Pane(track, config, canvas, stage.twin(), tracks) for track in tracks]
         for number, (episode, seconds) in enumerate(times, 1):

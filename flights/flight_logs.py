@@ -28,7 +28,7 @@ _KINDS: Final = (SPEED, SPEED_COMMAND, THROTTLE)
 _LONGEST_GAP: Final = 0.1  # s: longer gaps are not interpolated
 _POSITION_ERROR: Final = 0.5  # m: between two samples, besides the distance by the velocity
 _ATTITUDE_ERROR: Final = 0.5  # rad: the same for the attitude
-_MOST_LEFT_OUT: Final = 0.01  # share of the samples
+_MAX_LEFT_OUT: Final = 0.01  # share of the samples
 _FASTEST: Final = 5.0  # rotor speed, as a multiple of that at the largest thrust
 
 
@@ -195,7 +195,7 @@ class _Raw:
         for name in MOTION:
             if not np.isfinite(self.motion([name])[0][rows]).all():
                 _refuse(self.path, f"finite numbers in {name}", "others")
-        most = max(1, int(_MOST_LEFT_OUT * len(rows)))
+        most = max(1, int(_MAX_LEFT_OUT * len(rows)))
         while len(bad := np.flatnonzero(~self._agree(rows[:-1], rows[1:]))):
             rows = self._without_one(rows, int(bad[0]))
             self.left_out += 1
@@ -328,7 +328,7 @@ _ROTOR_TOPICS: Final = (
 """Topic, its field of a rotor from 0, our column, and the factor."""
 _AXES: Final = (("x", 1.0), ("y", -1.0), ("z", -1.0))
 """Signs of our axes: theirs are north east down and forward right down."""
-_MOST_ROTORS: Final = 12
+_MAX_ROTORS: Final = 12
 
 
 def _ulog(path: Path) -> Columns:
@@ -366,7 +366,7 @@ def _ulog(path: Path) -> Columns:
     for axis, sign in (("w", 1.0), *_AXES):
         columns[f"q{axis}"] = at(smooth, axis, sign)
     for topic, field, ours, factor in _ROTOR_TOPICS:
-        for i in range(_MOST_ROTORS):
+        for i in range(_MAX_ROTORS):
             name = field.format(i)
             if name in topics.get(topic, {}):
                 columns[ours.format(i + 1)] = at(topics[topic], name, factor)

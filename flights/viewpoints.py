@@ -49,7 +49,7 @@ class Stage(NamedTuple):
     """What pictures of a sequence show besides the pose."""
 
     drones: int
-    world: str
+    scene: str
     marks: tuple[Mark, ...]
     payload: bool
 
@@ -78,7 +78,7 @@ class PoseSequence:
     payload: Floats | None = None
     """Shape (T, A, 3)."""
     marks: tuple[Mark, ...] = ()
-    world: str = "plain"
+    scene: str = "plain"
     """Surroundings of the drones."""
 
     def __len__(self) -> int:
@@ -92,7 +92,7 @@ class PoseSequence:
     @property
     def stage(self) -> Stage:
         """What its pictures show besides the pose."""
-        return Stage(self.drones, self.world, self.marks, self.payload is not None)
+        return Stage(self.drones, self.scene, self.marks, self.payload is not None)
 
     def part(self, first: int, end: int) -> "PoseSequence":
         """The poses from `first` to before `end`."""
@@ -114,7 +114,7 @@ class PoseSequence:
 class PoseSource:
     """A table `[[poses]]` of a plan."""
 
-    world: str = ""
+    scene: str = ""
     """Surroundings; empty: those of the plan."""
 
     @abstractmethod
@@ -267,7 +267,7 @@ class Plan:
     """Words as of the option `cameras` of a task."""
     poses: tuple[PoseSource, ...]
     vehicle: str | None = None
-    world: str = "plain"
+    scene: str = "plain"
     """Flights and places are shared among the scenes of `scenes_of`."""
     seed: Annotated[int, Limits(0, (1 << 63) - 1, whole=True)] = 0
     fine: bool = True
@@ -277,7 +277,7 @@ class Plan:
 
     def __post_init__(self) -> None:
         check_fields(self, "plan: ")
-        scenes_of(self.world)
+        scenes_of(self.scene)
         self.views()
 
     @classmethod
@@ -315,10 +315,10 @@ class Plan:
         for number, source in enumerate(self.poses, 1):
             name = f"{number} {kinds[type(source)]}"
             rng = np.random.default_rng([self.seed, number])
-            scenes = scenes_of(source.world or self.world)
+            scenes = scenes_of(source.scene or self.scene)
             sequences = source.sequences(name, self.vehicle, rng, len(scenes))
             for sequence, scene in zip(sequences, cycle(scenes), strict=False):
-                found.append(replace(sequence, world=scene))
+                found.append(replace(sequence, scene=scene))
         count = sum(map(len, found))
         if count > MAX_FRAMES:
             raise InputError(f"plan: expected at most {MAX_FRAMES} poses, got {count}")
@@ -338,8 +338,8 @@ def _source(table: dict[str, Any], number: int) -> PoseSource:
         words = " or ".join(map(repr, _SOURCES))
         raise InputError(f"{name}.from: expected {words}, got {word!r:.80}")
     source = read_table(_SOURCES[word], table, name)
-    if source.world:
-        scenes_of(source.world)
+    if source.scene:
+        scenes_of(source.scene)
     if isinstance(source, RandomPoses):
         lowest = source.center[2] - source.size[2] / 2
         if lowest < 0:

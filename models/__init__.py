@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from .vehicle import Rotor, Vehicle
 
 __all__ = [
-    "BACKENDS", "MAX_DRONES", "MOST_DRAG", "QUAD_XML", "Backend", "InputError", "MissingPackage",
+    "BACKENDS", "MAX_DRONES", "MAX_DRAG", "QUAD_XML", "Backend", "InputError", "MissingPackage",
     "Rotor", "Vehicle",
 ]  # fmt: skip
 
@@ -25,7 +25,7 @@ no contact, in NumPy or in compiled C."""
 BACKENDS: Final[tuple[Backend, ...]] = get_args(Backend)
 MAX_DRONES: Final = 1024
 """Most drones of a world."""
-MOST_DRAG: Final = 100.0
+MAX_DRAG: Final = 100.0
 """Largest linear drag, 1/s. RK4 at 10 ms is within 0.1 % there, and unstable above 278 /s."""
 
 

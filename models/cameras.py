@@ -24,7 +24,7 @@ KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 number for each object. `flow`: float32, pixels to the right and down since the step before."""
 FARTHEST: Final = 1000.0
 """Where drawing ends, and the depth where nothing is seen, m."""
-MOST_PIXELS: Final = 4096  # of a side
+MAX_PIXELS: Final = 4096  # of a side
 OUTPUTS: Final = {
     "rgb": mujoco.mjtCamOutBit.mjCAMOUT_RGB,
     "depth": mujoco.mjtCamOutBit.mjCAMOUT_DEPTH,
@@ -34,9 +34,9 @@ OUTPUTS: Final = {
 _TEXTS: Final = PREFIX + "cameras."
 _CHECKED: Final = 16  # places along a side at which a lens is tried
 _SIDE: Final = 64  # Pixels of a side, where the file tells none
-MOST_LETTERS: Final = 64  # of a name
+MAX_LETTERS: Final = 64  # of a name
 FOVY: Final = (1e-3, 3.0)  # rad
-MOST_STEPS: Final = 1000  # from picture to picture
+MAX_STEPS: Final = 1000  # from picture to picture
 _Vector = tuple[float, float, float]
 
 
@@ -168,8 +168,8 @@ def chosen_views(words: Sequence[str], cameras: Iterable[Camera]) -> tuple[View,
 def _size(word: str, text: str) -> tuple[int, int]:
     width, _, height = text.partition("x")
     right = all(side.isascii() and side.isdecimal() and len(side) < 9 for side in (width, height))
-    right = right and all(1 <= int(side) <= MOST_PIXELS for side in (width, height))
-    expected = f"NAME@WIDTHxHEIGHT of 1 to {MOST_PIXELS} pixels each"
+    right = right and all(1 <= int(side) <= MAX_PIXELS for side in (width, height))
+    expected = f"NAME@WIDTHxHEIGHT of 1 to {MAX_PIXELS} pixels each"
     if not right:
         raise InputError(f"cameras: expected {expected}, got {word!r:.300}")
     return int(width), int(height)
@@ -205,8 +205,8 @@ def read_cameras(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[Camera, ..
         if (width, height) == (1, 1):  # MJCF's default
             width = height = _SIDE
         for side in (width, height):
-            expected = f"1 to {MOST_PIXELS} pixels a side"
-            if not 1 <= side <= MOST_PIXELS:
+            expected = f"1 to {MAX_PIXELS} pixels a side"
+            if not 1 <= side <= MAX_PIXELS:
                 raise InputError(f"camera {one.name}: expected {expected}, got {side}")
         told = {
             key: texts.pop(f"{_TEXTS}{one.name}.{key}")
@@ -240,7 +240,7 @@ def read_cameras(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[Camera, ..
 
 def is_name(name: object) -> bool:
     """Whether a camera can be called so: also in an option with commas, and in a file's name."""
-    return isinstance(name, str) and name.isidentifier() and len(name) <= MOST_LETTERS
+    return isinstance(name, str) and name.isidentifier() and len(name) <= MAX_LETTERS
 
 
 def _check_numbers(name: str, model: mujoco.MjModel, number: int) -> None:
@@ -277,8 +277,8 @@ def steps_of(name: str, rate: str | float) -> int:
         steps = 1 / float(rate)
     except (ValueError, ZeroDivisionError):
         steps = math.nan
-    right = 1 <= steps <= MOST_STEPS and abs(steps - round(steps)) < 1e-6 * steps
-    expected = f"1 over a whole number of control steps up to {MOST_STEPS}"
+    right = 1 <= steps <= MAX_STEPS and abs(steps - round(steps)) < 1e-6 * steps
+    expected = f"1 over a whole number of control steps up to {MAX_STEPS}"
     if not right:
         raise InputError(f"{name}.rate: expected {expected}, got {rate}")
     return round(steps)

@@ -40,8 +40,8 @@ from .vehicle import (
 
 Array = NDArray[np.float64]
 
-_MOST_STEPS: Final = 4000  # of a flight: tiny physics steps shorten it
-_MOST_STEP: Final = 10.0  # s: every flight diverges there, but no number overflows
+_MAX_STEPS: Final = 4000  # of a flight: tiny physics steps shorten it
+_MAX_STEP: Final = 10.0  # s: every flight diverges there, but no number overflows
 _STEPS_AT_ONCE: Final = 1000  # Ctrl-C waits for no more
 _HEIGHT: Final = 1000.0  # m: flights begin here, and none reaches the floor
 _CONTROL: Final = 0.02  # s: period of the random thrusts
@@ -235,7 +235,7 @@ class ExaminedModel:
         model.opt.density = model.opt.viscosity = 0.0
         model.opt.wind = 0.0
         timestep = float(model.opt.timestep)
-        model.opt.timestep = min(timestep, _MOST_STEP)
+        model.opt.timestep = min(timestep, _MAX_STEP)
         return cls(
             path=path, refusal=refusal, model=model, mass=mass, center=center, inertia=inertia,
             written=tuple(written), gravity=gravity, rotors=rotors, faults=tuple(faults),
@@ -345,11 +345,11 @@ class _Warned(Exception):
 
 
 def _fly(model: mujoco.MjModel, data: Any, seconds: float) -> float:
-    """Step for `seconds`, a whole number of steps, `_MOST_STEPS` at most; the time flown, s.
+    """Step for `seconds`, a whole number of steps, `_MAX_STEPS` at most; the time flown, s.
 
     Raises `_Warned`: MuJoCo resets bad states silently otherwise.
     """
-    steps = left = round(min(max(seconds / model.opt.timestep, 1), _MOST_STEPS))
+    steps = left = round(min(max(seconds / model.opt.timestep, 1), _MAX_STEPS))
     while left > 0:
         mujoco.mj_step(model, data, nstep=min(left, _STEPS_AT_ONCE))
         left -= _STEPS_AT_ONCE
@@ -785,7 +785,7 @@ def recommended_step(vehicle: ModelLike = None) -> tuple[float, str]:
 def check_physics_step(craft: ExaminedModel) -> Iterator[Check]:
     """The physics step is at most the recommended one, and long enough to be flown."""
     step, why = recommended_step(craft)
-    error = math.degrees(craft.convergence.at(min(craft.timestep, _MOST_STEP)))
+    error = math.degrees(craft.convergence.at(min(craft.timestep, _MAX_STEP)))
     yield _within("physics step", craft.timestep,
                   Range(1e-5, step * (1 + _EXACT), "s", f"recommended: {why}"),
                   f"too long for this craft, or shorter than any flight needs: {step:g} s is the "
@@ -811,7 +811,7 @@ def check_terminal_velocity(craft: ExaminedModel) -> Iterator[Check]:
     data = craft.ready(model=model)
     data.qvel[2] = -final / 2
     step = float(model.opt.timestep)
-    for _ in range(round(min(10 * final / craft.gravity / step, _MOST_STEPS))):
+    for _ in range(round(min(10 * final / craft.gravity / step, _MAX_STEPS))):
         speed = -float(data.qvel[2])
         force = craft.mass * (linear + square * abs(speed)) * speed
         data.qfrc_applied[2] = force
@@ -872,7 +872,7 @@ def check_random_control(craft: ExaminedModel) -> Iterator[Check]:
     data = craft.ready()
     data.qpos[2] = 1.0 + (0.0 if math.isnan(craft.rest_height) else craft.rest_height)
     step = float(craft.model.opt.timestep)
-    substeps = max(1, min(round(_CONTROL / step), _MOST_STEPS // 100))
+    substeps = max(1, min(round(_CONTROL / step), _MAX_STEPS // 100))
     newtons = np.array([rotor.newtons for rotor in craft.rotors])
     told = ""
     try:

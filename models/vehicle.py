@@ -16,7 +16,7 @@ from typing import Any, Final, Self
 import mujoco
 import numpy as np
 
-from . import MOST_DRAG
+from . import MAX_DRAG
 from .cameras import Camera, own_cameras, read_cameras
 from .coefficients import PREFIX, Coefficients
 from .errors import InputError
@@ -25,9 +25,9 @@ from .mjcf import free_body, vehicle_spec
 from .vehicle_file import read_vehicle_file
 
 _LEAST_TIMESTEP: Final = 1e-5  # s: a control step of 0.02 s then takes a hundredth of a second
-_MOST_TIMESTEP: Final = 1.0  # s: that of the longest control step
+_MAX_TIMESTEP: Final = 1.0  # s: that of the longest control step
 _FIRST_HEIGHT: Final = 6.0  # m: where most craft touch nothing
-_MOST_HEIGHT: Final = 1e4  # m: above it no craft may touch anything
+_MAX_HEIGHT: Final = 1e4  # m: above it no craft may touch anything
 _MAX_MASS: Final = 1e9  # kg: its squares overflow nowhere
 _RELATIVE: Final = 1e-9  # of a hover's torques and forces: what rounding leaves
 _ROUNDED: Final = 1e-5  # of the weight, sideways: what a file's six digits leave
@@ -104,10 +104,10 @@ class Vehicle:
         enter; numbers do, those of TOML with all digits, others to the six that MuJoCo writes.
         """
         file = find_vehicle(path)
-        right = isinstance(linear_drag, int | float | np.floating) and 0 <= linear_drag <= MOST_DRAG
+        right = isinstance(linear_drag, int | float | np.floating) and 0 <= linear_drag <= MAX_DRAG
         if not right:
             raise InputError(
-                f"linear_drag: expected a number from 0 to {MOST_DRAG:g} /s, "
+                f"linear_drag: expected a number from 0 to {MAX_DRAG:g} /s, "
                 f"got {linear_drag!r:.300}"
             )
         try:
@@ -346,8 +346,8 @@ def _check_flyable(model: mujoco.MjModel) -> None:
     if not right:
         raise InputError(f"vehicle: expected a mass > 0 and gravity along -z, got {got}")
     step = model.opt.timestep
-    limits = f"at least {_LEAST_TIMESTEP:g} s and at most {_MOST_TIMESTEP:g} s"
-    if not _LEAST_TIMESTEP <= step <= _MOST_TIMESTEP:
+    limits = f"at least {_LEAST_TIMESTEP:g} s and at most {_MAX_TIMESTEP:g} s"
+    if not _LEAST_TIMESTEP <= step <= _MAX_TIMESTEP:
         raise InputError(f"vehicle: expected a physics step of {limits}, got {step:g}")
 
 
@@ -520,7 +520,7 @@ def find_rest_height(model: mujoco.MjModel, data: Any) -> float:
     while _touches(model, data, high):
         high *= 2
         got = f"one that touches something at {high:.0f} m"
-        if not high <= _MOST_HEIGHT:
+        if not high <= _MAX_HEIGHT:
             raise InputError(f"vehicle: expected a craft that is free above the ground, got {got}")
     while high - low > 1e-10 * high:
         middle = (low + high) / 2

@@ -17,7 +17,7 @@ import mujoco
 
 from .cameras import (
     FOVY,
-    MOST_LETTERS,
+    MAX_LETTERS,
     OUTPUTS,
     Camera,
     Optics,
@@ -103,7 +103,7 @@ _WORDS: Final[Mapping[str, tuple[str, ...]]] = {
 _SHAPES: Final[Mapping[str, tuple[str, ...]]] = {"box": ("size",), "cylinder": ("radius", "length")}
 _AHEAD: Final = (1.0, 0.0, 0.0)
 _UP: Final = (0.0, 0.0, 1.0)
-_MOST_BYTES: Final = 1_000_000  # it is read within a few seconds
+_MAX_BYTES: Final = 1_000_000  # it is read within a few seconds
 _LEAST_MOMENT: Final = 1e-15  # kg m²: MuJoCo's mjMINVAL
 DEFAULT_TIMESTEP: Final = 0.01
 """Physics step of a file that tells none, s."""
@@ -229,10 +229,8 @@ def read_vehicle_file(path: Path) -> VehicleFile:
     `OSError` if the file cannot be read.
     """
     size = path.stat().st_size
-    if not size <= _MOST_BYTES:
-        raise InputError(
-            f"vehicle: expected a TOML file of at most {_MOST_BYTES} bytes, got {size}"
-        )
+    if not size <= _MAX_BYTES:
+        raise InputError(f"vehicle: expected a TOML file of at most {_MAX_BYTES} bytes, got {size}")
     try:
         return _Reader(path, tomllib.loads(path.read_text(encoding="utf-8"))).result
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
@@ -367,8 +365,7 @@ class _Reader:
         stands = table.get("stands")
         if not is_name(own):
             raise InputError(
-                f"{name}.name: expected up to {MOST_LETTERS} letters, digits and _, "
-                f"got {own!r:.300}"
+                f"{name}.name: expected up to {MAX_LETTERS} letters, digits and _, got {own!r:.300}"
             )
         right = isinstance(kinds, list) and bool(kinds)
         right = right and all(isinstance(kind, str) and kind in OUTPUTS for kind in kinds)

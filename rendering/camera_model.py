@@ -33,20 +33,20 @@ _COLOR: Final = {"gate": (0.96, 0.42, 0.08, 1.0), "disc": (0.13, 0.78, 0.52, 1.0
 
 
 def objects_of(
-    vehicle: Vehicle, drones: int, world: str, marks: Sequence[Mark], *, payload: bool
+    vehicle: Vehicle, drones: int, scene: str, marks: Sequence[Mark], *, payload: bool
 ) -> tuple[str, ...]:
     """`Cameras.objects` of such cameras, without an OpenGL."""
     names = drone_names(drones)
-    return objects_in(drawn_model(vehicle, names, world, marks, payload=payload), names)[0]
+    return objects_in(drawn_model(vehicle, names, scene, marks, payload=payload), names)[0]
 
 
 def drawn_model(
-    vehicle: Vehicle, names: Sequence[str], world: str, marks: Sequence[Mark], *, payload: bool
+    vehicle: Vehicle, names: Sequence[str], scene: str, marks: Sequence[Mark], *, payload: bool
 ) -> mujoco.MjModel:
     """What is drawn: craft with their cameras, what surrounds them, the task's marks."""
     crafts = members_of(vehicle, len(names))
     spec = swarm_spec([craft.path for craft in crafts], names)
-    add_scene(spec, world)
+    add_scene(spec, scene)
     bodies = [body for body in spec.worldbody.bodies if body.name.partition("/")[0] in names]
     for name, body, craft in zip(names, bodies, crafts, strict=True):
         for camera in craft.cameras:

@@ -14,7 +14,7 @@ from typing import Final
 import mujoco
 import numpy as np
 
-from ..models.cameras import FARTHEST, MOST_PIXELS, Camera, Optics, View
+from ..models.cameras import FARTHEST, MAX_PIXELS, Camera, Optics, View
 from ..models.errors import InputError
 from ..models.fleet import members_of
 from ..models.lens import Lens
@@ -49,7 +49,7 @@ class Cameras:
         views: Sequence[View],
         shape: tuple[int, int] = (1, 1),
         *,
-        world: str = "plain",
+        scene: str = "plain",
         marks: Sequence[Mark] = (),
         payload: bool = False,
         fine: bool = False,
@@ -59,7 +59,7 @@ class Cameras:
         self.views = tuple(views)
         self._shape = shape
         self._names = drone_names(shape[1])
-        self.model = drawn_model(vehicle, self._names, world, marks, payload=payload)
+        self.model = drawn_model(vehicle, self._names, scene, marks, payload=payload)
         self.data = mujoco.MjData(self.model)
         self._poses = _Poses(self.model, self._names)
         self.objects, self._object = objects_in(self.model, self._names)
@@ -407,9 +407,9 @@ class _Source:
         low = seen.min(axis=0)
         high = seen.max(axis=0)
         width, height = (int(side) for side in np.ceil((high - low) / pitch))
-        expected = f"a lens that needs at most {_FINER * MOST_PIXELS} pixels of a pinhole a side"
+        expected = f"a lens that needs at most {_FINER * MAX_PIXELS} pixels of a pinhole a side"
         most = max(width, height)
-        if not most <= _FINER * MOST_PIXELS:
+        if not most <= _FINER * MAX_PIXELS:
             raise InputError(f"distortion: expected {expected}, got {most}")
         self.size = height, width
         self._low = low

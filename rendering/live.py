@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     Surface: TypeAlias = Window | WebPage
 
-MOST_DRONES: Final = 16
+MAX_SHOWN: Final = 16
 """Most craft side by side; of more, the first ones are shown."""
 _PICTURES: Final = 30.0  # a second, at most
 _NAP: Final = 0.02  # s, at most, before keys are looked at again

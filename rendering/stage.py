@@ -24,8 +24,8 @@ from .gl import Offscreen
 Camera = Literal["chase", "front", "side", "top", "onboard"]
 CAMERAS: Final[tuple[Camera, ...]] = get_args(Camera)
 
-_MOST_METRICS = 4  # with a line of their own
-_MOST_THRUSTS = 4  # rotors with a number of their own
+_MAX_METRICS = 4  # with a line of their own
+_MAX_THRUSTS = 4  # rotors with a number of their own
 _TRAIL, _EVERY = 150, 3  # control steps of a path, and of one piece of it
 _PAYLOAD = (0.96, 0.42, 0.08, 1.0)
 _CABLE = (0.13, 0.14, 0.16, 1.0)
@@ -39,7 +39,7 @@ DRONE_COLORS: Final = (
 )  # fmt: skip
 """Red, green and blue, 0 to 1, of the drones of one world, their paths and goals, again from the
 first: Okabe and Ito's, told apart with colour-blindness."""
-MOST_NAMES: Final = 16
+MAX_NAMES: Final = 16
 """Drones of one world whose names are shown; more would hide them."""
 _ONBOARD: Final = "stage/onboard"
 _ROOM = 10_000  # geoms
@@ -142,7 +142,7 @@ class Moment:
 
     def lines(self, thrust_high: float) -> list[tuple[str, str]]:
         """Names and values for an overlay; a rotor's largest thrust, N, sets the digits."""
-        lines = [(metric.label, metric.text) for metric in self.metrics[:_MOST_METRICS]]
+        lines = [(metric.label, metric.text) for metric in self.metrics[:_MAX_METRICS]]
         heights = {"elevation": self.position, "goal": self.goal}
         lines += [(name, f"{point[1]:.2f} m") for name, point in heights.items() if point]
         unit, scale = ("N", 1.0) if thrust_high >= 1 else ("mN", 1e3)
@@ -150,7 +150,7 @@ class Moment:
         shown = self.thrusts
         rotors = len(self.thrusts)
         name = f"F1 to F{rotors}" if rotors > 1 else "F1"
-        if rotors > _MOST_THRUSTS:
+        if rotors > _MAX_THRUSTS:
             name = f"{name}, mean"
             shown = (float(np.mean(shown)),)
         thrusts = " ".join(f"{scale * thrust:.{decimals}f}" for thrust in shown)
@@ -175,7 +175,7 @@ class Stage:
 
     def __init__(
         self,
-        world: str = "airport",
+        scene: str = "airport",
         drones: int = 1,
         *,
         vehicle: Path | str | None = None,
@@ -191,7 +191,7 @@ class Stage:
         self.vehicle = load_vehicles(vehicle, drones)
         crafts = members_of(self.vehicle, drones)
         try:
-            scenes = [build_scene(path, world) for path in dict.fromkeys(c.path for c in crafts)]
+            scenes = [build_scene(path, scene) for path in dict.fromkeys(c.path for c in crafts)]
             spec = scenes[0]
             sizes = [_size(scene.compile()) for scene in scenes]
         except InputError:
@@ -322,7 +322,7 @@ class Stage:
                 kind = mujoco.mjtGeom.mjGEOM_CAPSULE
                 _connect(scene, kind, 0.012 * self.radius, here, payload, _CABLE)
         marked = any(moment.marks for moment in self.moments)
-        if 1 < len(self.names) <= MOST_NAMES:
+        if 1 < len(self.names) <= MAX_NAMES:
             self._write_names(scene)
         lines = zip(self._paths, self._goals, self._points(), strict=True)
         for drone, (path, goal, here) in enumerate(lines):

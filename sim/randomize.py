@@ -31,7 +31,7 @@ class Parameter:
     """Effects of which one has to be on."""
 
 
-MOST_ROTORS: Final = 8  # Rotors whose thrust can be drawn on its own
+MAX_ROTORS: Final = 8  # Rotors whose thrust can be drawn on its own
 _AIR: Final = ("body_drag", "rotor_drag")
 PARAMETERS: Final = {
     "mass": Parameter(0.1, 10.0, "", "mass of the vehicle; its inertia goes with it"),
@@ -44,7 +44,7 @@ PARAMETERS: Final = {
     "thrust": Parameter(0.0, 10.0, "", "thrust of every rotor at the same command"),
     **{
         f"thrust_{n}": Parameter(0.0, 10.0, "", f"thrust of rotor {n} at the same command")
-        for n in range(1, MOST_ROTORS + 1)
+        for n in range(1, MAX_ROTORS + 1)
     },
     "time_constant": Parameter(0.01, 100.0, "", "time constant of the rotors", ("motor_lag",)),
     "battery_charge": Parameter(0.0, 1.0, "1", "charge at the start", ("battery",)),

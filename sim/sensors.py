@@ -38,8 +38,8 @@ _EXPONENT: Final = 9.80665 / (287.052_87 * LAPSE_RATE)
 LOWEST, HIGHEST = -5_000.0, 11_000.0  # Heights that the barometer tells, m
 
 FURTHEST: Final = 1e5  # Largest coordinate of a reading, m
-MOST_SPEED: Final = 1e3  # Largest speed of a reading along an axis, m/s
-MOST_DELAY: Final = 1000  # Longest delay, control steps
+MAX_SPEED: Final = 1e3  # Largest speed of a reading along an axis, m/s
+MAX_DELAY: Final = 1000  # Longest delay, control steps
 GYRO_RANGE: Final = math.radians(2000.0)  # rad/s: the largest setting of the BMI088
 ACCELEROMETER_RANGE: Final = 24 * 9.80665  # m/s²: the same
 
@@ -193,9 +193,9 @@ def _steps(name: str, value: float, period: float) -> int:
     is_rate = name.endswith("rate")
     steps = 1 / (value * period) if is_rate else value / period
     right = abs(steps - round(steps)) < 1e-6 * max(steps, 1.0) and round(steps) >= is_rate
-    right = right and (is_rate or steps < MOST_DELAY + 0.5)
+    right = right and (is_rate or steps < MAX_DELAY + 0.5)
     what = f"the control rate of {1 / period:g} Hz over a whole number"
-    late = f"a whole number of control periods of {period:g} s, at most {MOST_DELAY}"
+    late = f"a whole number of control periods of {period:g} s, at most {MAX_DELAY}"
     what = what if is_rate else late
     if not right:
         raise InputError(
@@ -430,7 +430,7 @@ class Gps(Sensor):
 
     def bounds(self) -> tuple[list[float], list[float]]:
         """Far beyond any flight."""
-        high = [FURTHEST] * 3 + [MOST_SPEED] * 3
+        high = [FURTHEST] * 3 + [MAX_SPEED] * 3
         return [-x for x in high], high
 
     def read(self, world: "World", normal: Array) -> Array:
@@ -475,8 +475,8 @@ SENSOR_TYPES: Final[Mapping[str, type[Sensor]]] = {
 _ESTIMATE_READING: Final = Reading(
     _ESTIMATE,
     (13,),
-    (-FURTHEST,) * 3 + (-MOST_SPEED,) * 3 + (-_UNIT,) * 4 + (-2 * MOST_SPEED,) * 3,
-    (FURTHEST,) * 3 + (MOST_SPEED,) * 3 + (_UNIT,) * 4 + (2 * MOST_SPEED,) * 3,
+    (-FURTHEST,) * 3 + (-MAX_SPEED,) * 3 + (-_UNIT,) * 4 + (-2 * MAX_SPEED,) * 3,
+    (FURTHEST,) * 3 + (MAX_SPEED,) * 3 + (_UNIT,) * 4 + (2 * MAX_SPEED,) * 3,
     ("m",) * 3 + ("m/s",) * 3 + ("1",) * 4 + ("rad/s",) * 3,
     "world; body rates: body",
     ("x", "y", "z", "vx", "vy", "vz", "qw", "qx", "qy", "qz", "wx", "wy", "wz"),
@@ -692,7 +692,7 @@ class Estimator(Kept):
         position, velocity = self._followed(position, velocity, channels)
         self.quaternion = _chosen(mask, turned, self.quaternion)
         self.position = _chosen(mask, clip(position, -FURTHEST, FURTHEST), self.position)
-        self.velocity = _chosen(mask, clip(velocity, -MOST_SPEED, MOST_SPEED), self.velocity)
+        self.velocity = _chosen(mask, clip(velocity, -MAX_SPEED, MAX_SPEED), self.velocity)
         self.body_rates = _chosen(mask, rates, self.body_rates)
 
     def _correction(self, force: Array, channels: Mapping[str, _Channel]) -> Array:

@@ -2,7 +2,7 @@
 
     python studies/cameras.py [--seconds 1] [--repeats 7] [--out FILE.json]
     python studies/cameras.py --sheet FILE.png    pictures of every kind, to look at
-    python studies/cameras.py --worlds FILE.png   worlds of two seeds each
+    python studies/cameras.py --scenes FILE.png   scenes of two seeds each
     python studies/cameras.py --optics FILE.png   what a camera does beyond a pinhole's
 
 Unless told otherwise a case draws the plain world with a Crazyflie from its camera `front`.
@@ -63,11 +63,11 @@ def optical(folder: str) -> Vehicle:
     return Vehicle.load(file)
 
 
-def ours(word: str, world: str = "plain", vehicle: Vehicle | None = None) -> tuple[Step, Cameras]:
+def ours(word: str, scene: str = "plain", vehicle: Vehicle | None = None) -> tuple[Step, Cameras]:
     """A picture of a craft that flies and yaws, a little further from one to the next."""
     vehicle = vehicle or Vehicle.load(VEHICLE)
     views = chosen_views([word], vehicle.cameras)
-    cameras = Cameras(vehicle, views, world=world)
+    cameras = Cameras(vehicle, views, scene=scene)
     everybody = np.ones(1, bool)
     place = np.array([[0.0, 0.0, 1.0]])
     turn = np.array([[1.0, 0.0, 0.0, 0.0]])
@@ -209,13 +209,13 @@ def sheet(path: Path) -> None:
     """A step of flights: a row for each, of every kind and of `down`."""
     from matplotlib import colormaps, image
 
-    scenes: list[tuple[str, str | None, str, dict[str, Any], int]] = [
+    cases: list[tuple[str, str | None, str, dict[str, Any], int]] = [
         ("rotorgram/Landing-v0", "crazyflie2", "front", {"scene": "airport"}, 1),
         ("rotorgram/Racing-v0", "skydio_x2", "front", {}, 1),
         ("rotorgram/Formation-v0", None, "chase", {}, 6),
     ]
     rows = []
-    for env_id, vehicle, eye, more, drones in scenes:
+    for env_id, vehicle, eye, more, drones in cases:
         kinds = ("down", eye, *(f"{eye}_{kind}" for kind in KINDS[1:]))
         words = [f"{name}@160x120" for name in kinds]
         env = LocalVectorEnv(
@@ -245,7 +245,7 @@ def optics(path: Path) -> None:
     with TemporaryDirectory() as folder:
         vehicle = optical(folder)
         views = chosen_views([f"{name}@320x240" for name in OPTICS], vehicle.cameras)
-        cameras = Cameras(vehicle, views, world="gates:2")
+        cameras = Cameras(vehicle, views, scene="gates:2")
         everybody = np.ones(1, bool)
     state = {
         "position": np.array([[0.0, 0.0, 5.0]]),
@@ -259,7 +259,7 @@ def optics(path: Path) -> None:
     cameras.close()
 
 
-def worlds(path: Path) -> None:
+def scenes(path: Path) -> None:
     """Two seeds of each world that is made from one: from behind the paper's craft, and ahead."""
     from PIL import Image
 
@@ -271,7 +271,7 @@ def worlds(path: Path) -> None:
     for name in SEEDED_SCENES:
         row = []
         for seed in range(2):
-            cameras = Cameras(vehicle, views, world=f"{name}:{seed}", fine=True)
+            cameras = Cameras(vehicle, views, scene=f"{name}:{seed}", fine=True)
             cameras.take({view.name: everybody for view in views}, everybody, state)
             row += [cameras.pictures[view.name][0] for view in views]
             cameras.close()
@@ -282,7 +282,7 @@ def worlds(path: Path) -> None:
 
 def main() -> None:
     """Measure, print and write."""
-    drawings = {"sheet": sheet, "worlds": worlds, "optics": optics}
+    drawings = {"sheet": sheet, "scenes": scenes, "optics": optics}
     files = dict.fromkeys(drawings, Path)
     args = options(__doc__, seconds=1.0, repeats=7, out=Path, **files).parse_args()
     for name, draw in drawings.items():

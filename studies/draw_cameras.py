@@ -35,7 +35,7 @@ def draw() -> Image.Image:
                 stage.show(moment)
             picture = Image.fromarray(canvas.draw(camera)).reduce(TIMES)
         write = ImageDraw.Draw(picture)
-        name = camera if world == "airport" else f"{camera}, --world {world}"
+        name = camera if world == "airport" else f"{camera}, --scene {world}"
         font = ImageFont.load_default(15)
         box = write.textbbox((10, 8), name, font)
         around = (box[0] - 5, box[1] - 4, box[2] + 5, box[3] + 4)

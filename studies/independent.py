@@ -45,8 +45,8 @@ EFFECTS: Final[dict[str, dict[str, Any]]] = {
     "all": {"motor_lag": True, "body_drag": True, "rotor_drag": True, "wind": WIND},
 }
 """Those whose equations are smooth; a vehicle flies with the ones that it has coefficients for."""
-MOST_M = 1e-3
-MOST_DEG = 0.01
+MAX_M = 1e-3
+MAX_DEG = 0.01
 """The targets: largest distance and angle between both flights."""
 
 CONTROL: Final = 0.02  # s
@@ -83,7 +83,7 @@ class Row:
     @property
     def within(self) -> bool:
         """Whether both targets are met."""
-        return self.position_m <= MOST_M and self.attitude_deg <= MOST_DEG
+        return self.position_m <= MAX_M and self.attitude_deg <= MAX_DEG
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from matplotlib.ticker import EngFormatter
 from ..flights.distances import nearest
 from ..flights.palette import agent_color
 from ..models.vehicle import Vehicle
-from ..rendering.stage import DRONE_COLORS, MOST_NAMES
+from ..rendering.stage import DRONE_COLORS, MAX_NAMES
 from . import metrics
 from .metrics import Curve, Headline, Spread
 from .results import Results
@@ -330,7 +330,7 @@ def _draw_paths(axis: Axes, world: World, names: Sequence[str]) -> None:
     for drone, name in enumerate(names):
         x, _, z = world.position[:, drone].T
         style = _drone_style(drone)
-        axis.plot(x, z, label=name if drone < MOST_NAMES else None, **style)
+        axis.plot(x, z, label=name if drone < MAX_NAMES else None, **style)
         axis.plot(x[:1], z[:1], "o", markersize=5, **style)
         goal = world.goal[np.isfinite(world.position[:, drone, 0]), drone][-1]
         axis.plot(goal[0], goal[2], "x", markersize=6, mew=1.4, **style)

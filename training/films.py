@@ -18,7 +18,7 @@ from .tables import row_label
 
 
 def film_study(
-    results: Results, out: Path, on_frame: OnFrame = lambda *_: None, *, world: str = "airport"
+    results: Results, out: Path, on_frame: OnFrame = lambda *_: None, *, scene: str = "airport"
 ) -> bool:
     """Film the rows of a study of one task: the same episode, side by side.
 
@@ -37,7 +37,7 @@ def film_study(
     # Small enough for a page that holds the film in itself.
     camera: Camera = "top" if env.drones > 1 else "front"  # no craft hides another
     config = Film(
-        height=400, camera=camera, fast=True, quality=27, world=world, vehicle=env.vehicle
+        height=400, camera=camera, fast=True, quality=27, scene=scene, vehicle=env.vehicle
     )
     fresh = out.with_name(f".fresh-{out.name}")
     fresh.unlink(missing_ok=True)

@@ -22,7 +22,7 @@ from .record import Record, Stage
 if TYPE_CHECKING:
     from ...rendering.cameras import Cameras
 
-_MOST_THREADS: Final = 16
+_MAX_THREADS: Final = 16
 _BOUNDS: Final = {"rgb": (0.0, 255.0), "depth": (0.0, FARTHEST), "flow": (-np.inf, np.inf)}
 
 
@@ -105,7 +105,7 @@ class Pictures(Stage):
         self.views = views_of(task, shape[1])
         scenes = scenes_of(str(task.config.scene))
         self._count = len(scenes)
-        self._threads = min(os.cpu_count() or 1, shape[0], _MOST_THREADS)
+        self._threads = min(os.cpu_count() or 1, shape[0], _MAX_THREADS)
         parts = np.arange(shape[0]) % -(-self._threads // len(scenes))
         cameras = []
         for number, scene in enumerate(scenes):
@@ -115,7 +115,7 @@ class Pictures(Stage):
                     task.vehicle,
                     self.views,
                     shape,
-                    world=scene,
+                    scene=scene,
                     marks=task.marks,
                     payload=payload,
                 )

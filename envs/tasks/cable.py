@@ -15,7 +15,7 @@ from ..state import State
 from .goal import (
     AIR,
     LEAST_TILT_COSINE,
-    MOST_SPEED,
+    MAX_SPEED,
     RATE_WEIGHT,
     SWING_WEIGHT,
     TERMINATION_REWARD,
@@ -134,7 +134,7 @@ class Cable(Swarm):
                 (f"{quantity} {axis}", unit, size)
                 for quantity, unit, size in (
                     ("payload - position", "m", 2 * self._cable),
-                    ("payload velocity - velocity", "m/s", MOST_SPEED),
+                    ("payload velocity - velocity", "m/s", MAX_SPEED),
                     ("payload goal - payload", "m", 2 * (self.reach + options.margin)),
                 )
                 for axis in "xyz"

@@ -10,7 +10,7 @@ from ...models.fields import Limits
 from ...sim import Array, Draw, InitialState, stack
 from ..spec import Metric
 from ..state import State
-from .goal import FURTHEST, MOST_SPEED
+from .goal import FURTHEST, MAX_SPEED
 from .swarm import JITTER, Swarm, SwarmOptions, grid, ring
 
 
@@ -18,7 +18,7 @@ from .swarm import JITTER, Swarm, SwarmOptions, grid, ring
 class EscortOptions(SwarmOptions):
     """Options of `rotorgram/Escort-v0`."""
 
-    target_speed: Annotated[float, Limits(0.0, MOST_SPEED, "m/s")] = 1.0
+    target_speed: Annotated[float, Limits(0.0, MAX_SPEED, "m/s")] = 1.0
     """Largest speed of the target, m/s."""
     target_path: Annotated[float, Limits(0.01, FURTHEST, "m")] = 5.0
     """Furthest distance of the target from the center along x and y, m."""
@@ -80,7 +80,7 @@ class Escort(Swarm):
         self._slots = ring(count) * self.gap
         starts = np.abs(grid(count)).max(axis=0) * self.gap + JITTER * self.gap
         self.reach = float(np.linalg.norm(np.abs(self._slots).max(axis=0) + starts))
-        speeds = tuple((f"target velocity {axis}", "m/s", MOST_SPEED) for axis in "xyz")
+        speeds = tuple((f"target velocity {axis}", "m/s", MAX_SPEED) for axis in "xyz")
         self.prepare(speeds)
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:

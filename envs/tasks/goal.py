@@ -33,8 +33,8 @@ LEAST_TILT_COSINE: Final = 0.0
 """Cosine of the tilt (90°) past which the craft counts as flipped over."""
 AIR: Final = 0.6  # Least room under a craft that starts, m
 FURTHEST: Final = 1e4  # Furthest goal, m
-MOST_SPEED: Final = 100.0  # Speed past which an observation is clipped, m/s
-MOST_RATE: Final = 100.0  # Body rate past which an observation is clipped, rad/s
+MAX_SPEED: Final = 100.0  # Speed past which an observation is clipped, m/s
+MAX_RATE: Final = 100.0  # Body rate past which an observation is clipped, rad/s
 
 Number = tuple[str, str, float]
 """Name, unit and largest size of a number of an observation."""
@@ -89,9 +89,9 @@ class GoalTask(Task):
         vehicle = self.vehicle
         vectors = (
             ("goal - position", "m", 2 * band),
-            ("velocity", "m/s", MOST_SPEED),
+            ("velocity", "m/s", MAX_SPEED),
             *((name, "1", 1.001) for name in (("up",) if self.body else ("nose", "thrust axis"))),
-            ("body rate", "rad/s", MOST_RATE),
+            ("body rate", "rad/s", MAX_RATE),
         )
         first: list[Number] = [
             (f"{v} {axis}", unit, most) for v, unit, most in vectors for axis in "xyz"

@@ -25,7 +25,7 @@ from .goal import (
     ERROR_SCALE,
     FURTHEST,
     LEAST_TILT_COSINE,
-    MOST_SPEED,
+    MAX_SPEED,
     RATE_WEIGHT,
     SWING_WEIGHT,
     TERMINATION_REWARD,
@@ -130,7 +130,7 @@ class PayloadHover(GoalTask):
             options.flight_band,
             [
                 *((f"payload - position {axis}", "m", 2 * options.cable) for axis in "xyz"),
-                *((f"payload velocity - velocity {axis}", "m/s", MOST_SPEED) for axis in "xyz"),
+                *((f"payload velocity - velocity {axis}", "m/s", MAX_SPEED) for axis in "xyz"),
             ],
         )
 

@@ -39,8 +39,8 @@ from .goal import (
 from .task import Outcome, TaskOptions
 
 TRACKS: Final = Path(__file__).parent.parent / "tracks"
-MOST_GATES: Final = 64
-MOST_LAPS: Final = 1000
+MAX_GATES: Final = 64
+MAX_LAPS: Final = 1000
 _WAY: Final = "a track of ours, a TOML file of gates, or its content as JSON"
 
 
@@ -72,7 +72,7 @@ class RacingOptions(TaskOptions):
     track: str = "oval"
     """A track of ours (`oval`, `dive`), or a TOML file with its gates and its start. It is kept as
     JSON, so that it crosses the wire."""
-    laps: Annotated[int, Limits(1, MOST_LAPS, whole=True)] = 1
+    laps: Annotated[int, Limits(1, MAX_LAPS, whole=True)] = 1
     """Rounds of all gates."""
     start_band: Annotated[float, Limits(0.0, FURTHEST, "m")] = 0.5
     """Largest distance of the start from that of the track along each axis, m."""
@@ -289,7 +289,7 @@ def read_track(given: Any) -> tuple[list[Gate], Start]:
     if unknown:
         raise InputError(f"track: expected gates and start, got {unknown}")
     rows = content["gates"]
-    if not 1 <= len(rows) <= MOST_GATES:
-        raise InputError(f"track: expected 1 to {MOST_GATES} gates, got {len(rows)}")
+    if not 1 <= len(rows) <= MAX_GATES:
+        raise InputError(f"track: expected 1 to {MAX_GATES} gates, got {len(rows)}")
     gates = [read_table(Gate, row, f"track: gate {i}") for i, row in enumerate(rows, start=1)]
     return gates, read_table(Start, content.get("start"), "track: start")

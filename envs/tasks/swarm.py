@@ -13,7 +13,7 @@ from .goal import (
     AIR,
     FURTHEST,
     LEAST_TILT_COSINE,
-    MOST_SPEED,
+    MAX_SPEED,
     RATE_WEIGHT,
     TERMINATION_REWARD,
     GoalTask,
@@ -22,7 +22,7 @@ from .goal import (
 )
 from .task import Outcome, TaskOptions
 
-MOST_DRONES: Final = 128
+MAX_DRONES: Final = 128
 APPROACH_WEIGHT: Final = 0.1  # Of a speed of 1 m/s towards the goal, in each step
 ROOM_WEIGHT: Final = 0.5  # Cost of spheres that touch; nothing from a diameter apart on
 TINY: Final = 1e-9  # m
@@ -64,7 +64,7 @@ class Swarm(GoalTask):
     A derived class sets `reach` before `prepare`, and has `goal`.
     """
 
-    max_drones = MOST_DRONES
+    max_drones = MAX_DRONES
     action = "velocity"
     episode_length = 500
     reach = 0.0
@@ -87,7 +87,7 @@ class Swarm(GoalTask):
         told: list[tuple[str, str, float]] = []
         for name in names:
             told += [(f"{name} - position {axis}", "m", options.radio_range) for axis in "xyz"]
-            told += [(f"{name} velocity - velocity {axis}", "m/s", MOST_SPEED) for axis in "xyz"]
+            told += [(f"{name} velocity - velocity {axis}", "m/s", MAX_SPEED) for axis in "xyz"]
             told.append((f"{name} is there", "1", 1.0))
         self.define_observation(self.band, [*more, *told])
         spheres = f"; drones with a radius of {vehicle.radius:.7g} m"

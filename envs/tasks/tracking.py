@@ -35,8 +35,8 @@ from .goal import (
 )
 from .task import Outcome, TaskOptions
 
-MOST_SAMPLES: Final = 20_000  # Rows of a file
-MOST_POINTS: Final = 16  # That a minimum-snap trajectory goes through
+MAX_SAMPLES: Final = 20_000  # Rows of a file
+MAX_POINTS: Final = 16  # That a minimum-snap trajectory goes through
 _KINDS: Final = ("circle", "lemniscate", "snap")
 _EXPECTED: Final = "circle, lemniscate, snap, or a CSV file with columns t, x, y, z"
 
@@ -56,7 +56,7 @@ class TrackingOptions(TaskOptions):
     as high, m."""
     period: Annotated[float, Limits(0.1, 1e4, "s")] = 10.0
     """Time of a round, or of all of a `snap`, s."""
-    points: Annotated[int, Limits(2, MOST_POINTS, whole=True)] = 5
+    points: Annotated[int, Limits(2, MAX_POINTS, whole=True)] = 5
     """Points of a `snap`, 2 to 16, which are drawn in the box for each episode."""
     preview: Annotated[int, Limits(0, 20, whole=True)] = 3
     """Later points of the trajectory in the observation, 0 to 20."""
@@ -314,10 +314,10 @@ def read_samples(given: str) -> np.ndarray:
         got = f"{str(Path(given[:80]))!r}: {' '.join(reason.split()):.120}"
         raise InputError(f"trajectory: expected {_EXPECTED}, got {got}") from None
     shape = samples.shape
-    right = samples.ndim == 2 and shape[1:] == (4,) and 2 <= len(samples) <= MOST_SAMPLES
+    right = samples.ndim == 2 and shape[1:] == (4,) and 2 <= len(samples) <= MAX_SAMPLES
     if not right:
         raise InputError(
-            f"trajectory: expected 2 to {MOST_SAMPLES} rows of t, x, y, z, got shape {shape}"
+            f"trajectory: expected 2 to {MAX_SAMPLES} rows of t, x, y, z, got shape {shape}"
         )
     if not np.isfinite(samples).all():
         raise InputError("trajectory: expected finite numbers, got others")

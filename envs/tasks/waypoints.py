@@ -27,14 +27,14 @@ from .goal import (
 )
 from .task import Outcome, TaskOptions
 
-MOST_POINTS: Final = 64
+MAX_POINTS: Final = 64
 
 
 @dataclass(frozen=True, kw_only=True)
 class WaypointsOptions(TaskOptions):
     """Options of `rotorgram/Waypoints-v0`."""
 
-    points: Annotated[int, Limits(1, MOST_POINTS, whole=True)] = 4
+    points: Annotated[int, Limits(1, MAX_POINTS, whole=True)] = 4
     """Points of an episode, 1 to 64."""
     center: Point = (0.0, 0.0, 5.0)
     """Middle of the box in which points and start are drawn: x, y, z in MuJoCo's world frame, m."""

@@ -27,7 +27,7 @@
 #include <time.h>
 #include <unistd.h>
 
-enum { MOST_BYTES = 1024 };
+enum { MAX_BYTES = 1024 };
 
 #ifdef POLICY
 #include POLICY
@@ -69,7 +69,7 @@ typedef struct {
 
 static int udp;
 static struct sockaddr_in simulator; /* the one that this agent is pinned to, once `begun` */
-static char answer[MOST_BYTES];      /* the last one, which every repeat gets again */
+static char answer[MAX_BYTES];      /* the last one, which every repeat gets again */
 
 /* Parsing. Each function reads one piece of the grammar at *at and goes behind it, if it is there. */
 
@@ -127,7 +127,7 @@ static bool flag(const char **at, bool *out)
 static bool parse(char *line, ssize_t length, Message *m)
 {
     const char *at = line;
-    if (length > MOST_BYTES)
+    if (length > MAX_BYTES)
         return false;
     length -= length > 0 && line[length - 1] == '\n';
     length -= length > 0 && line[length - 1] == '\r';
@@ -163,7 +163,7 @@ static ssize_t receive(char *line, struct sockaddr_in *from, double deadline)
         socklen_t size = sizeof *from;
         ssize_t length = -1;
         if (poll(&wanted, 1, (int)ceil(1e3 * left)) > 0)
-            length = recvfrom(udp, line, MOST_BYTES + 1, 0, (struct sockaddr *)from, &size);
+            length = recvfrom(udp, line, MAX_BYTES + 1, 0, (struct sockaddr *)from, &size);
         if (length >= 0)
             return length;
     }
@@ -184,7 +184,7 @@ static bool from_simulator(const struct sockaddr_in *from)
 /* The flight: all episodes, then the Close that is sent. Returns the exit status. */
 static int fly(uint64_t episodes, uint64_t seed, double patience)
 {
-    char line[MOST_BYTES + 2];
+    char line[MAX_BYTES + 2];
     Message m = {0};
     struct sockaddr_in from;
     bool begun = false, fresh = false, binary = false; /* fresh: the last answer was a reset */
@@ -246,7 +246,7 @@ static int fly(uint64_t episodes, uint64_t seed, double patience)
             double action[ACTIONS];
             int end = snprintf(answer, sizeof answer, "%" PRIu64, m.sequence);
             act(m.values, action);
-            for (int i = 0; i < ACTIONS && end < MOST_BYTES; i++)
+            for (int i = 0; i < ACTIONS && end < MAX_BYTES; i++)
                 end += snprintf(answer + end, sizeof answer - (size_t)end, ",%.17g", action[i]);
         }
         simulator = from;

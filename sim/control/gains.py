@@ -35,7 +35,7 @@ LEAD: Final = 3.0
 """Rotors are driven to follow so many times faster than their own lag."""
 SURPLUS: Final = 0.75
 """Share of the thrust beyond the weight that holds the height at the largest tilt."""
-MOST_TILT: Final = math.radians(60.0)
+MAX_TILT: Final = math.radians(60.0)
 BRAKING: Final = 2.0
 """Distance in which half the largest acceleration stops the craft from its largest speed, m."""
 LEAST_ROOM: Final = 0.05
@@ -106,7 +106,7 @@ class Gains:
         p = min(fastest, math.sqrt(min(alpha[0], alpha[1]) / 2))
         yaw = min(fastest, math.sqrt(alpha[2] / 2))
         surplus = highest - weight
-        tilt = min(math.acos(weight / (weight + SURPLUS * surplus)), MOST_TILT)
+        tilt = min(math.acos(weight / (weight + SURPLUS * surplus)), MAX_TILT)
         most = gravity * math.tan(tilt), min(SURPLUS * surplus / vehicle.mass, gravity / 2)
         speeds = tuple(math.sqrt(a * BRAKING) for a in most)
         offsets = tuple(max(v / (p / 5), 2 * BRAKING) for v in speeds)

@@ -5,10 +5,10 @@ from dataclasses import dataclass, fields
 from numbers import Real
 from typing import Any, Final, Self
 
-from ...models import MOST_DRAG
+from ...models import MAX_DRAG
 from ...models.errors import InputError
 
-MOST_WIND: Final = 100.0  # m/s
+MAX_WIND: Final = 100.0  # m/s
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,10 +52,10 @@ class EffectOptions:
             self._check(name, "true or false", type(getattr(self, name)) is bool)
         for name in ("ground_effect", "downwash"):
             self._check(name, "true or false", type(getattr(self, name)) is bool)
-        self._keep("linear_drag", 0.0, MOST_DRAG, "/s", 1)
-        self._keep("wind", -MOST_WIND, MOST_WIND, "m/s", 3)
+        self._keep("linear_drag", 0.0, MAX_DRAG, "/s", 1)
+        self._keep("wind", -MAX_WIND, MAX_WIND, "m/s", 3)
         self._keep("efficiency", 0.0, 1.0, "for each rotor")
-        self._keep("gusts", 0.0, MOST_WIND, "m/s", 1)
+        self._keep("gusts", 0.0, MAX_WIND, "m/s", 1)
         self._keep("payload", 0.0, 1e4, "kg", 1)
         self._keep("cable", 0.05, 100.0, "m", 1)
 

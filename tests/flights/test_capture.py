@@ -86,10 +86,10 @@ def test_places_and_flights_share_worlds(tmp_path: Path) -> None:
     path = tmp_path / "plan.toml"
     flight = 'env = "rotorgram/Hover-v0"\nepisodes = 3\nevery = 500'
     sources = f'[[poses]]\nfrom = "random"\ncount = 8\n[[poses]]\nfrom = "flight"\n{flight}'
-    path.write_text(f'world = "gates:1-3"\n{sources}')
+    path.write_text(f'scene = "gates:1-3"\n{sources}')
     sequences = Plan.read(path).sequences()
     names = ["gates:1", "gates:2", "gates:3"]
-    assert [poses.world for poses in sequences] == names * 2
+    assert [poses.scene for poses in sequences] == names * 2
     assert [len(poses) for poses in sequences[:3]] == [2, 3, 3]
     path.write_text(sources)
     alone = Plan.read(path).sequences()[0]
@@ -114,7 +114,7 @@ def test_a_flight_gives_every_so_many_steps(tmp_path: Path) -> None:
             "plan: seed: expected a whole number from 0 to .*, got -1",
         ),
         (("seed = 7", "sed = 7"), "plan: expected some of cameras, poses, vehicle, .* got 'sed'"),
-        (("seed = 7", 'world = "moon"'), "scene: expected 'plain' or 'airport' .* got 'moon'"),
+        (("seed = 7", 'scene = "moon"'), "scene: expected 'plain' or 'airport' .* got 'moon'"),
         (
             ("count = 5", "count = 0"),
             r"poses\[1\].count: expected a whole number from 1 to 1000000",
@@ -126,7 +126,7 @@ def test_a_flight_gives_every_so_many_steps(tmp_path: Path) -> None:
         ),
         (
             ("tilt = 0.5", "tip = 4"),
-            r"\[1\]: expected some of world, count, center, size, tilt",
+            r"\[1\]: expected some of scene, count, center, size, tilt",
         ),
         (('from = "random"', 'from = "air"'), r"poses\[1\].from: expected 'random' or 'flight'"),
         (
@@ -139,7 +139,7 @@ def test_a_flight_gives_every_so_many_steps(tmp_path: Path) -> None:
         ),
         (("every = 40", "agent = 5"), r"\[2\].agent: expected a text, got 5"),
         (("{ episode_length = 100 }", "1"), r"\[2\].options: expected options by name, got 1"),
-        (("count = 5", "count = 5\nworld = 3"), "world: expected a text, got 3"),
+        (("count = 5", "count = 5\nscene = 3"), "scene: expected a text, got 3"),
         (("[0.0, 0.0, 2.0]", "[0.0, 0.0, 0.5]"), r"\[1\]: expected a box above the ground, got"),
         (("[0.0, 0.0, 2.0]", "[1e308, 0.0, 2.0]"), r"\[1\].center: expected 3 numbers from -10000"),
         (("[4.0, 4.0, 2.0]", "[-4.0, 4.0, 2.0]"), r"\[1\].size: expected 3 numbers from 0 to"),

@@ -25,7 +25,7 @@ from rotorgram.models import InputError, Vehicle
 from rotorgram.rendering import MetricValue
 from rotorgram.rendering.film import Overlay, check_film, poster, write_film
 
-FAST = Film(width=WIDTH, height=HEIGHT, world="plain", fast=True, overlay=False)
+FAST = Film(width=WIDTH, height=HEIGHT, scene="plain", fast=True, overlay=False)
 
 
 def trajectory(*elevations: float, ending: Any = "truncated") -> Trajectory:

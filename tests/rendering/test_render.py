@@ -40,7 +40,7 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, st
     return status, captured.out, captured.err
 
 
-SMALL = ("--size", f"{WIDTH}x{HEIGHT}", "--world", "plain", "--fast")
+SMALL = ("--size", f"{WIDTH}x{HEIGHT}", "--scene", "plain", "--fast")
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +89,7 @@ def test_a_checkpoint_on_film_flies_as_it_does_over_the_wire(
     tracks = [
         FilmTrack(name="it", color="#7CC8F2", trajectories=[one]) for one in (flown, recorded)
     ]
-    config = Film(width=642, height=240, camera="front", world="plain", fast=True, overlay=False)
+    config = Film(width=642, height=240, camera="front", scene="plain", fast=True, overlay=False)
     film(tmp_path / "plain.png", tracks, config)
     bare = pixels(tmp_path / "plain.png").astype(int)
     assert abs(bare[:, :320] - bare[:, 322:]).max() <= 3  # the same flight twice
@@ -321,7 +321,7 @@ def comparison(training: Path, tmp_path: Path) -> Results:
 def test_the_film_of_a_comparison_shows_its_agents(comparison: Results, opengl: None) -> None:
     out = comparison.folder / "video.mp4"
     out.write_text("an old one")
-    assert film_study(comparison, out, world="plain")
+    assert film_study(comparison, out, scene="plain")
     frames = decoded(out, 1280, 400)
     assert len(frames) == 13
     left = frames[0][:, :639].astype(int)

@@ -500,7 +500,7 @@ def test_no_display(
 ) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    status, error = status_and_error(capsys, *words, "--world", "plain")
+    status, error = status_and_error(capsys, *words, "--scene", "plain")
     assert status == 2
     assert error.startswith("rotorgram: window: expected a display, got none")
     assert "--web" in error
@@ -519,7 +519,7 @@ def test_no_display(
 def test_wrong_flags(
     words: tuple[str, ...], expected: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    status, error = status_and_error(capsys, "view", "pid", "--world", "plain", *words)
+    status, error = status_and_error(capsys, "view", "pid", "--scene", "plain", *words)
     assert status == 1
     assert error == f"rotorgram: {expected}"
 
@@ -548,7 +548,7 @@ def test_view_shows_a_journal_to_its_end(
         seen = flown(env, 70)  # 30 steps, a reset, 30 steps, a reset, 8 steps
     running.join()
     surfaces = open_fakes(monkeypatch)
-    assert main(["view", str(journal), "--world", "plain", "--speed", "8"]) == 0
+    assert main(["view", str(journal), "--scene", "plain", "--speed", "8"]) == 0
     out = capsys.readouterr().out.splitlines()
     assert [line.split(":")[0] for line in out[1:]] == [f"episode {k}" for k in range(3)]
     total = sum(reward for _, reward, *_ in seen[1:31])
@@ -565,7 +565,7 @@ def test_view_shows_episodes_at_the_speed_that_was_asked_for(
     surfaces = open_fakes(monkeypatch)
     words = ["--episodes", "2", "--speed", "8", "--episode-length", "80"]
     began = time.monotonic()
-    assert main(["view", who, "--world", "plain", *words]) == 0
+    assert main(["view", who, "--scene", "plain", *words]) == 0
     # 81 pictures an episode, 0.02 s / 8 between two; at most 0.1 s are made up for.
     assert time.monotonic() - began >= 161 * 0.02 / 8 - 0.1
     out = capsys.readouterr().out.splitlines()

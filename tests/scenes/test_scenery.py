@@ -147,7 +147,7 @@ def test_a_picture_has_many_colours(scene: str, opengl: None) -> None:
 def test_cameras_see_its_objects(opengl: None, scene: str) -> None:
     vehicle = Vehicle.load()
     views = chosen_views(["front@96x72", "front_segmentation@96x72"], vehicle.cameras)
-    with closing(Cameras(vehicle, views, world=f"{scene}:1")) as cameras:
+    with closing(Cameras(vehicle, views, scene=f"{scene}:1")) as cameras:
         place = np.array([[0.0, 0.0, 5.0]])
         turn = np.array([[1.0, 0.0, 0.0, 0.0]])
         due = {view.name: np.ones(1, bool) for view in views}

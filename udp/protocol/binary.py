@@ -51,9 +51,9 @@ _MISSING_BODY: Final = struct.Struct("<BxHH")
 _EXTENSION: Final = struct.Struct("<HH")
 _LENGTH: Final = struct.Struct("<H")
 _CRITICAL: Final = 1 << 15
-_MOST_EXTENSIONS: Final = 64
+_MAX_EXTENSIONS: Final = 64
 LONGEST_HELLO: Final = (
-    HEADER_SIZE + _HELLO_BODY.size + MAX_SPEC + _MOST_EXTENSIONS * (_EXTENSION.size + MAX_TEXT)
+    HEADER_SIZE + _HELLO_BODY.size + MAX_SPEC + _MAX_EXTENSIONS * (_EXTENSION.size + MAX_TEXT)
 )  # bytes
 
 
@@ -378,8 +378,8 @@ def _extensions(extensions: tuple[Extension, ...]) -> bytes:
 def _take_extensions(data: bytes, at: int) -> tuple[Extension, ...]:
     extensions: list[Extension] = []
     while at < len(data):
-        if not len(extensions) < _MOST_EXTENSIONS:
-            raise InputError(f"extensions: expected at most {_MOST_EXTENSIONS}, got more")
+        if not len(extensions) < _MAX_EXTENSIONS:
+            raise InputError(f"extensions: expected at most {_MAX_EXTENSIONS}, got more")
         number, size = _EXTENSION.unpack_from(data, at)
         at += _EXTENSION.size
         if not size <= len(data) - at:

@@ -34,7 +34,7 @@ _OVERHEAD: Final = HEADER_SIZE + _FRAGMENT.size
 _ASKS_AT: Final = 28
 _FIRST_BURST: Final = 3 << 16  # bytes: what the smallest buffer that systems give a socket holds
 _LARGEST_BURST: Final = 1 << 20
-_MOST_LOST: Final = 0.25  # A burst of which more was lost was too large for a buffer on its way
+_MAX_LOST: Final = 0.25  # A burst of which more was lost was too large for a buffer on its way
 _LARGEST_BITMAP: Final = 128  # bytes of the bitmap of a Missing: it tells of 1,024 fragments
 
 
@@ -60,7 +60,7 @@ class Window:
 
     def report(self, sent: int, lost: int) -> None:
         """Take into account that so many fragments of a burst were lost."""
-        if lost > max(_MOST_LOST * sent, 1):
+        if lost > max(_MAX_LOST * sent, 1):
             self.size = max(self.size // 2, _FIRST_BURST // 8)
         elif lost == 0:
             self.size = min(2 * self.size, _LARGEST_BURST)

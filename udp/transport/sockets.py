@@ -33,7 +33,7 @@ PAUSE: Final = 1.0
 _log: Final = logging.getLogger("rotorgram.udp")
 _LOOK: Final = 200e-6  # look of a wait before it sleeps, s: a step of one drone takes less
 _LOST: Final = 60e-6  # time between two looks if another process had the core, s; else 2e-6
-_MOST_ASLEEP: Final = 64  # waits at most that sleep at once before one looks again
+_MAX_ASLEEP: Final = 64  # waits at most that sleep at once before one looks again
 _STRANGERS_EVERY: Final = 0.01  # time between two looks at strangers while no slot is free, s
 _BUFFER: Final = 1 << 22  # bytes of datagrams that a socket may hold until they are looked at
 _MAX_DATAGRAM: Final = 65507  # largest payload of a UDP datagram over IPv4, bytes
@@ -115,12 +115,12 @@ class Socket(socket.socket):
                     before = now
                     now = time.monotonic()
                     if now - before > _LOST:
-                        self._row = _MOST_ASLEEP
+                        self._row = _MAX_ASLEEP
                         break
                 else:
                     self._row = max(1, self._row // 2)
                     return came
-            self._asleep = self._row = min(4 * self._row, _MOST_ASLEEP)
+            self._asleep = self._row = min(4 * self._row, _MAX_ASLEEP)
         timeout = min(timeout, LONGEST_WAIT)
         if self._poll:
             self._poll.poll(ceil(1e3 * timeout))
