@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from .vehicle import Rotor, Vehicle
 
 __all__ = [
-    "BACKENDS", "MAX_DRONES", "MAX_DRAG", "QUAD_XML", "Backend", "InputError", "MissingPackage",
+    "BACKENDS", "MAX_DRAG", "MAX_DRONES", "QUAD_XML", "Backend", "InputError", "MissingPackage",
     "Rotor", "Vehicle",
 ]  # fmt: skip
 

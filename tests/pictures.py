@@ -48,8 +48,8 @@ def decoded(path: Path, width: int, height: int) -> np.ndarray:
 def nearest(picture: np.ndarray, others: Sequence[np.ndarray]) -> int:
     """The number of the picture that differs least; it differs by less than 1 of 255 in the mean.
 
-    MuJoCo sorts what is transparent by distance. What is as far away is drawn in either order, so that
-    discs that overlap change their colour a little from time to time.
+    MuJoCo sorts what is transparent by distance. What is as far away is drawn in either order, so
+    that discs that overlap change their colour a little from time to time.
     """
     apart = [abs(picture.astype(int) - other).mean() for other in others]
     number = int(np.argmin(apart))
