@@ -65,11 +65,13 @@ def readme(name: str) -> str:
         _rotors(vehicle),
         "## Every number and its source",
         table(("number", "value", "unit", "source"), _sourced(numbers)),
-        *_disagreements(numbers),
+        "## Where sources differ, and why these are used",
+        "All published values that we found. Bold: the one that is used.",
+        _choices(numbers),
         "## Examination",
         _examination(vehicle),
         "## Works and licences",
-        "Numbers only: no code or text of these works is here. The licence is that of the work.",
+        "Numbers only: no code or text of these works is here.",
         table(("work", "version", "licence"), map(_work, works)),
     ]
     return "\n\n".join(parts) + "\n"
@@ -215,23 +217,17 @@ def _sourced(numbers: Iterable[Number]) -> list[tuple[str, ...]]:
     return [(f"`{one.name}`", shown(one.value), one.unit, one.source) for one in numbers]
 
 
-def _disagreements(numbers: Iterable[Number]) -> list[str]:
-    """Sections on what sources say besides the values used, on why, and on single sources."""
-    parts = []
-    remarks = []
-    for one in numbers:
-        if one.others:
-            rows = [(f"**{shown(one.value)}**", f"**{one.source}**")]
-            rows += [(shown(value), source) for value, source in one.others]
-            why = f"{one.why}\n\n" if one.why else ""
-            unit = f", {one.unit}" if one.unit != "1" else ""
-            parts.append(f"### `{one.name}`\n\n{why}{table((f'value{unit}', 'source'), rows)}")
-        elif one.why:
-            remarks.append(f"* `{one.name}`: {one.why}")
-    if parts:
-        lead = "All published values that we found. Bold: the one that is used."
-        parts = ["## Where sources differ, and why these are used", lead, *parts]
-    return parts + (["## Remarks", "\n".join(remarks)] if remarks else [])
+def _choices(numbers: Iterable[Number]) -> str:
+    """Table of the numbers that have other published values, or a reason."""
+    rows = []
+    for number in numbers:
+        if not number.others and not number.why:
+            continue
+        unit = f", {number.unit}" if number.unit != "1" else ""
+        name = f"`{number.name}`{unit}"
+        rows.append((name, f"**{shown(number.value)}**", number.source, number.why))
+        rows += [("", shown(value), source, "") for value, source in number.others]
+    return table(("number", "value", "source", "remark"), rows)
 
 
 def _examination(vehicle: Vehicle) -> str:
