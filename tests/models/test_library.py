@@ -137,8 +137,8 @@ def test_the_heavy_hexacopter_follows_from_its_derivations() -> None:
 
 def test_the_page_shows_all_published_inertias_of_the_crazyflie_brushless() -> None:
     page = (FOLDER / "crazyflie_brushless" / "README.md").read_text(encoding="utf-8")
-    inertia = page.split("### `body.inertia`")[1].split("###")[0]
-    assert re.findall(r"^\| (?!value|---)(.*?) \|", inertia, re.MULTILINE) == [
+    rows = page.split("| `body.inertia`, kg m² |")[1].split("\n| `")[0]
+    assert re.findall(r"(?:^|\n\|  \|) (.*?) \|", rows) == [
         "**3.3e-05, 3.6e-05, 5.9e-05**",
         "3.3e-05, 3.6e-05, 5.9e-05",
         "2.5e-05, 2.8e-05, 4.9e-05",
