@@ -24,6 +24,7 @@ class Landing(Task):
     Options = LandingOptions
     action = "offset"
     episode_length = 400
+    worst_step = -1.0
     metrics = (Metric(name="height", unit="m", settled=0.05, held=0.1, symbol="h"),)
 
     def setup(self):
@@ -57,7 +58,7 @@ class Landing(Task):
         ended = hard | (height > self.highest) | (state.tilt_cosine < 0.5)
         nearness = (0.5 - abs(height)) / (0.5 + abs(height))
         return Outcome(
-            reward={"nearness": nearness, "end": -20.0 * ended},
+            reward={"nearness": nearness, "end": self.crash(ended)},
             terminated=ended,
             metrics={"height": height},
         )

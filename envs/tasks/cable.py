@@ -16,10 +16,10 @@ from .goal import (
     AIR,
     LEAST_TILT_COSINE,
     MAX_SPEED,
-    RATE_WEIGHT,
-    SWING_WEIGHT,
-    TERMINATION_REWARD,
+    WORST_SWING,
     length,
+    rates_cost,
+    swing_cost,
     with_payload,
 )
 from .swarm import APPROACH_WEIGHT, TINY, Swarm, SwarmOptions, ring
@@ -88,6 +88,7 @@ class Cable(Swarm):
     """
 
     Options = CableOptions
+    worst_step = Swarm.worst_step + WORST_SWING
     metrics = (
         Metric(name="payload_error", unit="m", settled=0.1, held=0.1, symbol="e"),
         Metric(name="clearance", unit="m", goal="high"),
@@ -232,10 +233,10 @@ class Cable(Swarm):
             reward={
                 "payload": (near - distance) / (near + distance),
                 "approach": APPROACH_WEIGHT * closing / (distance + TINY),
-                "swing": -SWING_WEIGHT * length(state.payload_velocity - state.velocity),
+                "swing": swing_cost(state),
                 "room": self.proximity_penalty(room),
-                "rates": -RATE_WEIGHT * length(state.body_rates),
-                "termination": ended * TERMINATION_REWARD + 0.0,
+                "rates": rates_cost(state),
+                "termination": self.crash(ended),
             },
             terminated=ended,
             metrics={"payload_error": distance, "clearance": room},

@@ -25,10 +25,13 @@ from .task import Task
 ERROR_SCALE: Final = 0.5  # Distance at which the reward for nearness crosses zero, m
 RATE_WEIGHT: Final = 0.02  # Cost of a body rate of 1 rad/s
 SWING_WEIGHT: Final = 0.1  # Cost of a payload that moves at 1 m/s relative to the craft
-TERMINATION_REWARD: Final = -20.0  # Added to the reward of the step that terminates an episode
 PASSING_REWARD: Final = 1.0  # Of a course: added in a step in which a point or gate is passed
-COURSE_RATE_WEIGHT: Final = 0.002  # Of a course: cost of a body rate of 1 rad/s in a step
-COURSE_TERMINATION_REWARD: Final = -5.0  # Of a course: for an end before its own
+COURSE_RATE_WEIGHT: Final = 0.002  # Of a course: cost of a body rate of 1 rad/s
+FASTEST_COUNTED: Final = 20.0  # A faster body rate costs no more, rad/s
+WORST_RATES: Final = -RATE_WEIGHT * FASTEST_COUNTED
+WORST_SWING: Final = -0.4
+COURSE_WORST_RATES: Final = -COURSE_RATE_WEIGHT * FASTEST_COUNTED
+COURSE_WORST_STEP: Final = -0.05
 LEAST_TILT_COSINE: Final = 0.0
 """Cosine of the tilt (90°) past which the craft counts as flipped over."""
 AIR: Final = 0.6  # Least room under a craft that starts, m
@@ -169,6 +172,17 @@ def row_of(rows: Array, index: Array) -> Array:
 def length(vectors: Array) -> Array:
     """Sizes of vectors, shape (..., 3)."""
     return np.sqrt(np.sum(vectors * vectors, axis=-1))
+
+
+def rates_cost(state: State, weight: float = RATE_WEIGHT) -> Array:
+    """Reward for body rates, (W, A): minus the weight times their size, rad/s."""
+    return -weight * np.minimum(length(state.body_rates), FASTEST_COUNTED)
+
+
+def swing_cost(state: State) -> Array:
+    """Reward for the speed of a payload relative to the craft, (W, A)."""
+    speed = length(state.payload_velocity - state.velocity)
+    return np.maximum(-SWING_WEIGHT * speed, WORST_SWING)
 
 
 def axes(quaternion: Array) -> tuple[Array, Array]:

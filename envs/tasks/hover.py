@@ -16,13 +16,13 @@ from .goal import (
     ERROR_SCALE,
     FURTHEST,
     LEAST_TILT_COSINE,
-    RATE_WEIGHT,
-    TERMINATION_REWARD,
+    WORST_RATES,
     GoalTask,
     Point,
     at,
     axes,
     length,
+    rates_cost,
 )
 from .task import Outcome, TaskOptions
 
@@ -89,6 +89,7 @@ class Hover(GoalTask):
     """
 
     Options = HoverOptions
+    worst_step = -1.0 - HEADING_WEIGHT + WORST_RATES
     metrics = (
         Metric(name="position_error", unit="m", settled=0.1, held=0.1, symbol="e"),
         Metric(name="heading_error", unit="deg", settled=5.0, signed=True),
@@ -139,8 +140,8 @@ class Hover(GoalTask):
             reward={
                 "position": (ERROR_SCALE - distance) / (ERROR_SCALE + distance),
                 "heading": -HEADING_WEIGHT / 180 * abs(heading),
-                "rates": -RATE_WEIGHT * length(state.body_rates),
-                "termination": terminated * TERMINATION_REWARD + 0.0,
+                "rates": rates_cost(state),
+                "termination": self.crash(terminated),
             },
             terminated=terminated,
             metrics={"position_error": distance, "heading_error": heading},

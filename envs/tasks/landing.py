@@ -11,13 +11,19 @@ from ...models.fields import Limits, NumberOrPair
 from ...sim import Array, Draw, InitialState, component, each, square_root, stack
 from ..spec import Mark, Metric
 from ..state import State
-from .goal import LEAST_TILT_COSINE, RATE_WEIGHT, GoalTask, length
+from .goal import (
+    COURSE_RATE_WEIGHT,
+    COURSE_WORST_RATES,
+    LEAST_TILT_COSINE,
+    GoalTask,
+    length,
+    rates_cost,
+)
 from .task import Outcome, TaskOptions
 
 MATCHING_TIME: Final = 0.5  # Progress that 1 m/s less relative speed is worth, over 1 m less way, s
 LANDING_REWARD: Final = 20.0  # Added to the reward of a step that ends with a landing
 TIME_COST: Final = 0.1  # Of each step
-CRASH_REWARD: Final = -10.0  # Added to the reward of a step that terminates in another way
 FASTEST_PAD: Final = 20.0  # m/s
 FURTHEST: Final = 1e3  # m
 
@@ -129,6 +135,7 @@ class Landing(GoalTask):
     """
 
     Options = LandingOptions
+    worst_step = -TIME_COST + COURSE_WORST_RATES
     episode_length = 400
     metrics = (
         Metric(name="landed", unit="", goal="high", held=0.9, final=True),
@@ -211,9 +218,9 @@ class Landing(GoalTask):
             reward={
                 "progress": self.memory.progress,
                 "time": -TIME_COST,
-                "rates": -RATE_WEIGHT * length(state.body_rates),
+                "rates": rates_cost(state, COURSE_RATE_WEIGHT),
                 "landing": landed * LANDING_REWARD,
-                "termination": (terminated > landed) * CRASH_REWARD + 0.0,
+                "termination": self.crash(terminated > landed),
             },
             terminated=terminated,
             metrics={

@@ -26,13 +26,14 @@ from .goal import (
     FURTHEST,
     LEAST_TILT_COSINE,
     MAX_SPEED,
-    RATE_WEIGHT,
-    SWING_WEIGHT,
-    TERMINATION_REWARD,
+    WORST_RATES,
+    WORST_SWING,
     GoalTask,
     Point,
     at,
     length,
+    rates_cost,
+    swing_cost,
     with_payload,
 )
 from .task import Outcome, TaskOptions
@@ -110,6 +111,7 @@ class PayloadHover(GoalTask):
     """
 
     Options = PayloadHoverOptions
+    worst_step = -1.0 + WORST_SWING + WORST_RATES
     metrics = (
         Metric(name="payload_error", unit="m", settled=0.1, held=0.1, symbol="e"),
         Metric(name="swing", unit="deg", settled=5.0),
@@ -178,13 +180,12 @@ class PayloadHover(GoalTask):
         outside = distance > self.options.flight_band
         flipped = state.tilt_cosine < LEAST_TILT_COSINE
         terminated = outside | state.touching | flipped
-        moving = length(state.payload_velocity - state.velocity)
         return Outcome(
             reward={
                 "payload": (ERROR_SCALE - distance) / (ERROR_SCALE + distance),
-                "swing": -SWING_WEIGHT * moving,
-                "rates": -RATE_WEIGHT * length(state.body_rates),
-                "termination": terminated * TERMINATION_REWARD + 0.0,
+                "swing": swing_cost(state),
+                "rates": rates_cost(state),
+                "termination": self.crash(terminated),
             },
             terminated=terminated,
             metrics={"payload_error": distance, "swing": swing},

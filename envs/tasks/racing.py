@@ -27,13 +27,14 @@ from ..state import State
 from .goal import (
     AIR,
     COURSE_RATE_WEIGHT,
-    COURSE_TERMINATION_REWARD,
+    COURSE_WORST_STEP,
     FURTHEST,
     LEAST_TILT_COSINE,
     PASSING_REWARD,
     GoalTask,
     Point,
     length,
+    rates_cost,
     row_of,
 )
 from .task import Outcome, TaskOptions
@@ -139,6 +140,7 @@ class Racing(GoalTask):
     """
 
     Options = RacingOptions
+    worst_step = COURSE_WORST_STEP
     episode_length = 1500
     metrics = (
         Metric(name="gates_left", unit="", settled=0.5, held=0.5, final=True),
@@ -249,8 +251,8 @@ class Racing(GoalTask):
             reward={
                 "progress": memory.progress,
                 "passing": PASSING_REWARD * memory.passing,
-                "rates": -COURSE_RATE_WEIGHT * length(state.body_rates),
-                "termination": (crashed & (left > 0.5)) * COURSE_TERMINATION_REWARD + 0.0,
+                "rates": rates_cost(state, COURSE_RATE_WEIGHT),
+                "termination": self.crash(crashed & (left > 0.5)),
             },
             terminated=crashed | (left < 0.5),
             metrics={"gates_left": left, "flight_time": state.time, "lap_time": memory.lap},

@@ -18,12 +18,11 @@ from ...sim import (
 )
 from ..spec import Metric
 from ..state import State
-from .goal import AIR, RATE_WEIGHT, GoalTask, Point, at, length
+from .goal import AIR, WORST_RATES, GoalTask, Point, at, length, rates_cost
 from .task import Outcome, TaskOptions
 
 ERROR_SCALE: Final = 1.0  # Distance at which the reward for nearness crosses zero, m
 TILT_WEIGHT: Final = 0.25  # Cost of a tilt of 90°; upside down it is twice as much
-TERMINATION_REWARD: Final = -100.0  # Added to the reward of the step that terminates an episode
 STOP_TIME: Final = 0.5  # Longest time to stop the spin about an axis by all torque about it, s
 Frame = Literal["body", "world"]
 
@@ -121,6 +120,7 @@ class Recovery(GoalTask):
     """
 
     Options = RecoveryOptions
+    worst_step = -1.0 - 2 * TILT_WEIGHT + WORST_RATES
     episode_length = 400
     metrics = (
         Metric(name="recovered", unit="", goal="high", held=0.9),
@@ -192,8 +192,8 @@ class Recovery(GoalTask):
             reward={
                 "position": (ERROR_SCALE - distance) / (ERROR_SCALE + distance),
                 "tilt": TILT_WEIGHT * (state.tilt_cosine - 1.0),
-                "rates": -RATE_WEIGHT * length(state.body_rates),
-                "termination": terminated * TERMINATION_REWARD + 0.0,
+                "rates": rates_cost(state),
+                "termination": self.crash(terminated),
             },
             terminated=terminated,
             metrics={

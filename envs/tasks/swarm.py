@@ -7,18 +7,18 @@ import numpy as np
 
 from ...models.errors import InputError
 from ...models.fields import Limits
-from ...sim import Array, Draw
+from ...sim import Array, Draw, clip
 from ..state import State
 from .goal import (
     AIR,
     FURTHEST,
     LEAST_TILT_COSINE,
     MAX_SPEED,
-    RATE_WEIGHT,
-    TERMINATION_REWARD,
+    WORST_RATES,
     GoalTask,
     Point,
     length,
+    rates_cost,
 )
 from .task import Outcome, TaskOptions
 
@@ -67,6 +67,7 @@ class Swarm(GoalTask):
     max_drones = MAX_DRONES
     action = "velocity"
     episode_length = 500
+    worst_step = -1.0 - 2 * ROOM_WEIGHT + WORST_RATES
     reach = 0.0
     """Furthest distance of a start from its goal, m."""
 
@@ -144,8 +145,8 @@ class Swarm(GoalTask):
                 "position": (near - distance) / (near + distance),
                 "approach": APPROACH_WEIGHT * closing / (distance + TINY),
                 "room": self.proximity_penalty(room),
-                "rates": -RATE_WEIGHT * length(state.body_rates),
-                "termination": ended * TERMINATION_REWARD + 0.0,
+                "rates": rates_cost(state),
+                "termination": self.crash(ended),
             },
             terminated=ended,
             metrics={"position_error": distance, "clearance": room},
@@ -169,8 +170,8 @@ class Swarm(GoalTask):
     def proximity_penalty(self, room: Array) -> Array:
         """Reward for a clearance, (W, A): 0 from a diameter on, `-ROOM_WEIGHT` where it is 0."""
         radius = self._radii if self.shape else self.vehicle.radius
-        narrow = 1.0 - room / (2 * radius)
-        return -ROOM_WEIGHT * narrow * (narrow > 0)
+        narrow = clip(1.0 - room / (2 * radius), 0.0, 2.0)
+        return -ROOM_WEIGHT * narrow
 
     def slots_at(self, slots: np.ndarray, state: State) -> Array:
         """Offsets of each drone, shape (A, 3), from the center, in the world: (W, A, 3)."""

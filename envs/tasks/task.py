@@ -7,7 +7,7 @@ functions, and never changes an array in place.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Self
 
 from ...models.errors import InputError, UnknownOption
 from ...models.fields import check_fields
@@ -19,6 +19,8 @@ from ..state import State
 if TYPE_CHECKING:
     from ...models.vehicle import Vehicle
     from ..config import EnvConfig
+
+HORIZON: Final = 100  # 1 / (1 - γ) of the largest discount, γ = 0.99: see `Task.crash`
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,6 +79,8 @@ class Task:
         actions: Action levels at which the task can be flown.
         action, control_period, episode_length: Defaults of an `EnvConfig`.
         has_radio: Whether drones hear each other: see `stages/radio.py`.
+        worst_step: No step's reward is lower, but for terms that add up to a difference, as
+            progress does.
 
     Attributes:
         config: The env's, with what `adjust` added.
@@ -98,6 +102,7 @@ class Task:
     max_drones: ClassVar[int] = 1
     actions: ClassVar[tuple[str, ...]] = LEVELS
     has_radio: bool = False
+    worst_step: ClassVar[float] = 0.0
 
     action: str = "rotors"
     control_period: float = 0.02
@@ -200,6 +205,13 @@ class Task:
         After a reset the metrics count; reward and end of a drone that did not fly are left out.
         """
         raise NotImplementedError
+
+    def crash(self, crashed: Array) -> Array:
+        """Reward of drones that crash, (W, A), and 0 of others: what the worst step would cost for
+        ever, at discounts up to 0.99. If a crash cost less, a learner that cannot do the task yet
+        would learn to crash soon.
+        """
+        return crashed * (HORIZON * self.worst_step) + 0.0  # no negative zeros
 
     def ended(self, state: State) -> Array:
         """Which drones have crashed, bool, (W, A): their radio is silent. Only with a radio."""

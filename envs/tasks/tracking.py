@@ -26,11 +26,11 @@ from .goal import (
     ERROR_SCALE,
     FURTHEST,
     LEAST_TILT_COSINE,
-    RATE_WEIGHT,
-    TERMINATION_REWARD,
+    WORST_RATES,
     GoalTask,
     Point,
     length,
+    rates_cost,
     row_of,
 )
 from .task import Outcome, TaskOptions
@@ -120,6 +120,7 @@ class Tracking(GoalTask):
     """
 
     Options = TrackingOptions
+    worst_step = -1.0 + WORST_RATES
     episode_length = 600
     metrics = (
         Metric(name="tracking_error", unit="m", settled=0.2, held=0.2, symbol="e"),
@@ -211,8 +212,8 @@ class Tracking(GoalTask):
         return Outcome(
             reward={
                 "position": (ERROR_SCALE - distance) / (ERROR_SCALE + distance),
-                "rates": -RATE_WEIGHT * length(state.body_rates),
-                "termination": terminated * TERMINATION_REWARD + 0.0,
+                "rates": rates_cost(state),
+                "termination": self.crash(terminated),
             },
             terminated=terminated,
             metrics={"tracking_error": distance, "reference_speed": speed},

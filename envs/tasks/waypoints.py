@@ -14,7 +14,7 @@ from ..state import State
 from .goal import (
     AIR,
     COURSE_RATE_WEIGHT,
-    COURSE_TERMINATION_REWARD,
+    COURSE_WORST_STEP,
     FURTHEST,
     LEAST_TILT_COSINE,
     PASSING_REWARD,
@@ -23,6 +23,7 @@ from .goal import (
     Sides,
     at,
     length,
+    rates_cost,
     row_of,
 )
 from .task import Outcome, TaskOptions
@@ -93,6 +94,7 @@ class Waypoints(GoalTask):
     """
 
     Options = WaypointsOptions
+    worst_step = COURSE_WORST_STEP
     episode_length = 750
     metrics = (
         Metric(name="points_left", unit="", settled=0.5, held=0.5, final=True),
@@ -155,8 +157,8 @@ class Waypoints(GoalTask):
             reward={
                 "progress": memory.progress,
                 "passing": PASSING_REWARD * memory.passed,
-                "rates": -COURSE_RATE_WEIGHT * length(state.body_rates),
-                "termination": (crashed & (left > 0.5)) * COURSE_TERMINATION_REWARD + 0.0,
+                "rates": rates_cost(state, COURSE_RATE_WEIGHT),
+                "termination": self.crash(crashed & (left > 0.5)),
             },
             terminated=crashed | finished,
             metrics={"points_left": left, "flight_time": state.time},

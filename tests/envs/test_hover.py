@@ -55,10 +55,10 @@ def test_observations_are_clipped_to_their_bounds() -> None:
         ({"quaternion": about((0, 0, 1), 90.0)}, {"heading": -0.1}, False),
         ({"quaternion": about((0, 0, 1), -179.9)}, {"heading": -0.2 * 179.9 / 180}, False),
         ({"body_rates": (3.0, 0.0, 4.0)}, {"rates": -0.1}, False),
-        ({"position": (3.01, 0.0, 5.0)}, {"termination": -20.0}, True),
+        ({"position": (3.01, 0.0, 5.0)}, {"termination": -160.0}, True),
         ({"quaternion": about((0, 1, 0), 89.0)}, {"termination": 0.0}, False),
-        ({"quaternion": about((0, 1, 0), 91.0)}, {"termination": -20.0}, True),
-        ({"touching": True}, {"termination": -20.0}, True),
+        ({"quaternion": about((0, 1, 0), 91.0)}, {"termination": -160.0}, True),
+        ({"touching": True}, {"termination": -160.0}, True),
     ],
     ids=str,
 )

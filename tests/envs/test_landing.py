@@ -114,7 +114,7 @@ def test_what_is_a_landing(before: dict[str, Any], at: dict[str, Any], landed: b
     assert bool(outcome.terminated)
     assert outcome.metrics["landed"] == landed
     assert outcome.reward["landing"] == 20.0 * landed
-    assert outcome.reward["termination"] == -10.0 * (not landed)
+    assert outcome.reward["termination"] == pytest.approx(-14.0 * (not landed))
 
 
 def test_drift_is_relative_to_the_pad() -> None:
@@ -143,7 +143,7 @@ def test_progress_by_hand() -> None:
     task.update_memory(state)
     reward = task.outcome(state).reward
     assert reward["progress"] == pytest.approx(5.5 - 4.5)
-    assert reward["rates"] == pytest.approx(-0.1)
+    assert reward["rates"] == pytest.approx(-0.01)
     assert reward["time"] == -0.1
     assert reward["termination"] == reward["landing"] == 0.0
 
@@ -164,7 +164,7 @@ def test_ends(change: dict[str, Any], terminated: bool) -> None:
     task = begun(**STILL)
     outcome = task.outcome(state_of(**{"position": (2.0, 3.0, 3.0), **change}))
     assert outcome.terminated == terminated
-    assert outcome.reward["termination"] == -10.0 * terminated
+    assert outcome.reward["termination"] == pytest.approx(-14.0 * terminated)
     assert outcome.metrics["landed"] == 0.0
 
 

@@ -127,7 +127,7 @@ def test_it_is_a_gymnasium_env(monkeypatch: pytest.MonkeyPatch) -> None:
         if terminated.any():
             break
     assert terminated.any()
-    assert (info["reward_end"][terminated] == -20.0).all()
+    assert (info["reward_end"][terminated] == -100.0).all()
 
 
 def test_an_agent_without_the_file_trains(trained: Path) -> None:

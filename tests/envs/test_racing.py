@@ -119,7 +119,7 @@ def test_a_lap_by_hand() -> None:
 def test_ends(place: Any, rest: dict[str, Any], ends: bool) -> None:
     outcome = moved(begun(), *place, **rest)
     assert bool(outcome.terminated) == ends
-    assert outcome.reward["termination"] == (-5.0 if ends else 0.0)
+    assert outcome.reward["termination"] == pytest.approx(-5.0 if ends else 0.0)
 
 
 def test_a_track_of_a_file_crosses_the_wire(tmp_path: Path) -> None:

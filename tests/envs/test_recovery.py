@@ -155,8 +155,8 @@ PLACE = {"position": (0.0, 0.0, 20.0)}
         ({"quaternion": about((1, 0, 0), 180.0)}, {"tilt": -0.5, "termination": 0.0}, False),
         ({"body_rates": (3.0, 0.0, 4.0)}, {"rates": -0.1}, False),
         ({"position": (0.0, 0.0, 5.1)}, {"termination": 0.0}, False),
-        ({"position": (0.0, 0.0, 4.9)}, {"termination": -100.0}, True),
-        ({"touching": True}, {"termination": -100.0}, True),
+        ({"position": (0.0, 0.0, 4.9)}, {"termination": -190.0}, True),
+        ({"touching": True}, {"termination": -190.0}, True),
     ],
     ids=str,
 )

@@ -197,7 +197,7 @@ def test_a_crash_ends_the_episode_of_those_that_touch_and_they_fall_silent() -> 
     env.advance(np.zeros((3, 4), np.float32))
     assert env.terminated.tolist() == [True, True, False]
     assert env.done.tolist() == [False] * 3
-    assert env.loop.reward_terms["termination"].tolist() == [-20, -20, 0]
+    assert env.loop.reward_terms["termination"] == pytest.approx([-240, -240, 0])
     for _ in range(60):  # longer than a second
         env.advance(np.zeros((3, 4), np.float32))
     there = env.observations.reshape(3, -1)[2, 19:].reshape(7, 7)[:, 6]

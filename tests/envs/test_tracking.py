@@ -85,7 +85,7 @@ def test_reward_and_metrics_by_hand() -> None:
 def test_ends(state: dict[str, Any], ends: bool) -> None:
     outcome = begun().outcome(state_of(**{"position": (2.0, 0.0, 5.0), **state}))
     assert bool(outcome.terminated) == ends
-    assert outcome.reward["termination"] == (-20.0 if ends else 0.0)
+    assert outcome.reward["termination"] == pytest.approx(-140.0 if ends else 0.0)
 
 
 def test_minimum_snap_from_rest_to_rest() -> None:

@@ -100,7 +100,7 @@ def test_ends(place: tuple[float, float, float], rest: dict[str, Any], ends: boo
     task = begun(MIDDLE, (0.0, 0.0, 0.0), ABOVE)
     outcome = moved(task, *place, **rest)
     assert bool(outcome.terminated) == ends
-    assert outcome.reward["termination"] == (-5.0 if ends else 0.0)
+    assert outcome.reward["termination"] == pytest.approx(-5.0 if ends else 0.0)
 
 
 @pytest.mark.parametrize(
