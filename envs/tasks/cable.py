@@ -73,7 +73,7 @@ class Cable(Swarm):
     between neighbouring drones; 0.1 s/m times the speed of the payload towards it; -0.1 s/m times
     the speed of the payload relative to the drone; -0.02 s/rad times the size of the body rates;
     with less than a diameter between the drone's sphere and another, down to -0.5 where they touch
-    and further below; and -20 on the step that terminates.
+    and -1 where their middles do; and -280 on the step that terminates.
 
     ## Start, termination, truncation
 

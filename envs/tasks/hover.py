@@ -77,7 +77,8 @@ class Hover(GoalTask):
     ## Reward
 
     (s - d) / (s + d) for the distance d to the goal with s = 0.5 m; -0.2 |heading error| / 180°;
-    -0.02 s/rad times the size of the body rates; and -20 on the step that terminates.
+    -0.02 s/rad times the size of the body rates, up to 20 rad/s; and -160 on the step that
+    terminates.
 
     ## Start, termination, truncation
 

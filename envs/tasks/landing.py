@@ -121,9 +121,10 @@ class Landing(GoalTask):
 
     Progress P' - P of the potential P = -(d + 0.5 s · w) / 1 m, for the distance d to the goal and
     the speed w relative to the pad (potential-based shaping: Ng, Harada and Russell 1999);
-    -0.02 s/rad times the size of the body rates; -0.1 for each step; 20 for a landing, and -10 on
-    a step that terminates otherwise. With γ = 0.99 to stay in the air for ever costs 10 too: a
-    touch-down that may fail is no worse. If time costs nothing a policy hovers above the pad.
+    -0.002 s/rad times the size of the body rates, up to 20 rad/s; -0.1 for each step; 20 for a
+    landing, and -14 on a step that terminates otherwise. With γ = 0.99 to stay in the air for ever
+    costs 10: a touch-down that may fail is hardly worse. If time costs nothing a policy hovers
+    above the pad.
 
     ## Start, termination, truncation
 

@@ -96,8 +96,8 @@ class PayloadHover(GoalTask):
     ## Reward
 
     (s - d) / (s + d) for the distance d of the payload to its goal with s = 0.5 m; -0.1 s/m times
-    the speed of the payload relative to the craft; -0.02 s/rad times the size of the body rates;
-    and -20 on the step that terminates.
+    the speed of the payload relative to the craft, up to 4 m/s; -0.02 s/rad times the size of the
+    body rates, up to 20 rad/s; and -180 on the step that terminates.
 
     ## Start, termination, truncation
 

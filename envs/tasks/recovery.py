@@ -94,8 +94,8 @@ class Recovery(GoalTask):
     ## Reward
 
     (s - d) / (s + d) for the distance d to the goal with s = 1 m; -0.25 (1 - cosine of the tilt);
-    -0.02 s/rad times the size of the body rates; and -100 on the step that terminates: a fall costs
-    more than a slow recovery.
+    -0.02 s/rad times the size of the body rates, up to 20 rad/s; and -190 on the step that
+    terminates: a fall costs more than a slow recovery.
 
     ## Metrics
 

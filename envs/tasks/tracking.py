@@ -101,7 +101,7 @@ class Tracking(GoalTask):
     ## Reward
 
     (s - d) / (s + d) for the distance d from where it should be with s = 0.5 m; -0.02 s/rad times
-    the size of the body rates; and -20 on the step that terminates.
+    the size of the body rates, up to 20 rad/s; and -140 on the step that terminates.
 
     ## Trajectories
 

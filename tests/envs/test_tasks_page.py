@@ -51,6 +51,14 @@ def test_the_docstring_is_a_specification(env_id: str) -> None:
     assert "Truncated" in text
 
 
+def test_the_table_of_crashes() -> None:
+    rows = re.findall(r"^\| (`[^|]*) \| −(\d+) \|$", PAGE, re.MULTILINE)
+    costs = {name: int(cost) for names, cost in rows for name in re.findall(r"[\w-]+-v0", names)}
+    assert set(costs) == {name.split("/")[1] for name in TASKS} - {"Elevation-v0"}
+    for name, cost in costs.items():
+        assert -100 * task_type(f"rotorgram/{name}").worst_step == pytest.approx(cost)
+
+
 def test_the_bounds_are_those_that_are_computed() -> None:
     paper = Vehicle.load()
     recovery = recovery_bounds(RecoveryOptions(), paper)
