@@ -12,13 +12,9 @@ from ..models.vehicle_file import read_vehicle_file
 from .identify import LAG, Estimate, Identified
 from .prediction import Numbers, inertia_of
 
-_VECTORS: Final = {
-    "body.inertia": "xyz", "drag.linear": "xyz", "drag.angular": "xyz", "drag.moment": "xy",
-}  # fmt: skip
-_SINGLE: Final = (
-    "rotors.thrust_coefficient", "rotors.reaction", "rotors.drag", "rotors.inflow", "rotors.lift",
-    LAG,
-)  # fmt: skip
+_AXES: Final = ("x", "y", "z")
+_OF_FILE: Final = ("body.size", "body.ground_clearance", "rotors.speed")
+"""Entries of a file that the vehicle itself no longer has."""
 
 
 class Origin(NamedTuple):
@@ -34,46 +30,39 @@ def identified_toml(vehicle: Vehicle, found: Identified) -> str:
     All else is the vehicle's own, with the sources of its file where that is TOML.
     """
     source = f"identified from {', '.join(found.logs)}"
-    groups: dict[str, list[Estimate]] = {}
-    for one in found.estimates:
-        group = one.name.rpartition(".")[0]
-        groups.setdefault(group if group in _VECTORS else one.name, []).append(one)
-    origins = {}
-    for name, estimates in groups.items():
-        fitted = any(not one.kept for one in estimates)
-        why = "; ".join(map(_sentence, estimates))
-        origins[name] = Origin(source if fitted else "", why)
+    origins: dict[str, Origin] = {}
+    for estimate in found.estimates:
+        entry, axis = _entry(estimate.name)
+        before = origins.get(entry, Origin(""))
+        sentence = f"{axis}: {_sentence(estimate)}" if axis else _sentence(estimate)
+        why = "; ".join(filter(None, (before.why, sentence)))
+        origins[entry] = Origin(before.source if estimate.kept else source, why)
     return vehicle_toml(vehicle, found.numbers, origins)
 
 
-def vehicle_toml(
-    vehicle: Vehicle, numbers: Numbers, origins: Mapping[str, Origin] | None = None
-) -> str:
-    """A TOML file of a vehicle with other numbers; sources by their dotted names.
+def vehicle_toml(vehicle: Vehicle, numbers: Numbers, origins: Mapping[str, Origin]) -> str:
+    """A TOML file of a vehicle with other numbers; origins by their dotted names.
 
     The time constant is the vehicle's own unless it is among the numbers.
     """
-    origins = origins or {}
     given = {}
     if vehicle.path.suffix.lower() == ".toml":
-        given = {one.name: one for one in read_vehicle_file(vehicle.path).numbers}
+        given = {number.name: number for number in read_vehicle_file(vehicle.path).numbers}
     own = vehicle.path.parent.name if vehicle.path.stem == "vehicle" else vehicle.path.stem
-    groups: dict[str, dict[str, ArrayLike]] = {"body": {}, "rotors": {}}
-    for name in ("body.size", "body.ground_clearance"):
-        if name in given:
-            groups["body"][name] = given[name].value
-    if "rotors.speed" in given:
-        groups["rotors"]["rotors.speed"] = given["rotors.speed"].value
-    for name, value in _values(vehicle, numbers, "rotors.speed" not in given):
-        groups.setdefault(name.partition(".")[0], {})[name] = value
+    values = _values(vehicle, numbers)
+    values |= {name: given[name].value for name in _OF_FILE if name in given}
+    if "rotors.speed" in values:  # the file has it in place of the thrust
+        del values["rotors.thrust"]
     lines = [
         f"name = {_quoted(vehicle.name)}",
         f"timestep = {vehicle.timestep!r}",
         f"gravity = {vehicle.gravity!r}",
     ]
-    for group, values in groups.items():
+    for group in dict.fromkeys(name.partition(".")[0] for name in values):
         lines += ["", f"[{group}]"]
         for name, value in values.items():
+            if not name.startswith(f"{group}."):
+                continue
             origin = origins.get(name, Origin(""))
             known = given[name].source if name in given else f"as in {own}"
             text = f"value = {_plain(value)}, source = {_quoted(origin.source or known)}"
@@ -85,29 +74,38 @@ def vehicle_toml(
     return "\n".join([*lines, ""])
 
 
-def _values(vehicle: Vehicle, numbers: Numbers, limits: bool) -> Iterator[tuple[str, ArrayLike]]:
-    """Names and values of the file, but for those that a model lacks."""
+def _entry(name: str) -> tuple[str, str]:
+    """Entry of the file, and the axis of a number in it: drag.linear and x of drag.linear.x."""
+    entry, _, axis = name.rpartition(".")
+    return (entry, axis) if axis in _AXES else (name, "")
+
+
+def _values(vehicle: Vehicle, numbers: Numbers) -> dict[str, ArrayLike]:
+    """Values of the file's entries, but for those that a model lacks."""
     inertia = inertia_of(vehicle, numbers)
     products = [inertia[0, 1], inertia[0, 2], inertia[1, 2]]
-    yield "body.mass", vehicle.mass
-    yield "body.inertia", [*np.diag(inertia), *(products if np.any(products) else ())]
+    values: dict[str, ArrayLike] = {
+        "body.mass": vehicle.mass,
+        "body.inertia": [*np.diag(inertia), *(products if np.any(products) else ())],
+        "rotors.thrust": [vehicle.thrust_low.min(), vehicle.thrust_high.max()],
+    }
     if vehicle.center_of_mass.any():
-        yield "body.center_of_mass", vehicle.center_of_mass
-    if limits:
-        yield "rotors.thrust", [vehicle.thrust_low.min(), vehicle.thrust_high.max()]
-    values: dict[str, ArrayLike] = {}
+        values["body.center_of_mass"] = vehicle.center_of_mass
     for name, own in vehicle.coefficients.numbers().items():
         values[name] = own[0] if len(own) == 1 and name != "rotors.curve" else own
-    for name in _SINGLE:
-        if name in numbers and (numbers[name] or name in values):
-            values[name] = numbers[name]
-    for name, axes in _VECTORS.items():
-        vector = [numbers[f"{name}.{axis}"] for axis in axes]
-        if name != "body.inertia" and (any(vector) or name in values):
-            values[name] = vector
+    vectors: dict[str, list[float]] = {}
+    for name, number in numbers.items():
+        entry, axis = _entry(name)
+        if axis:
+            vectors.setdefault(entry, []).append(number)
+        elif number or name in values:
+            values[name] = number
+    for entry, vector in vectors.items():
+        if entry != "body.inertia" and (any(vector) or entry in values):
+            values[entry] = vector
     if LAG in numbers:
         values.pop("rotors.time_constant_down", None)
-    yield from values.items()
+    return values
 
 
 def _rotors(vehicle: Vehicle) -> Iterator[str]:
@@ -123,12 +121,10 @@ def _rotors(vehicle: Vehicle) -> Iterator[str]:
         )
 
 
-def _sentence(one: Estimate) -> str:
-    group, _, axis = one.name.rpartition(".")
-    start = f"{axis}: " if group in _VECTORS else ""
-    if one.kept:
-        return f"{start}the vehicle's own value, {one.kept}"
-    return f"{start}95 % interval {one.low:.4g} to {one.high:.4g}"
+def _sentence(estimate: Estimate) -> str:
+    if estimate.kept:
+        return f"the vehicle's own value, {estimate.kept}"
+    return f"95 % interval {estimate.low:.4g} to {estimate.high:.4g}"
 
 
 def _plain(value: ArrayLike) -> str:

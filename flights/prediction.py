@@ -1,16 +1,15 @@
-"""Open-loop prediction of recorded flights: thousands of starts at once, with `sim`'s body.
+"""Open-loop prediction of recorded flights: thousands of starts at once, by the backend `rigid`.
 
-A start is a measured state of a flight. From there the rotor speeds that were measured, and nothing
-else, move the vehicle; after each horizon the result is compared with what was measured. System
-identification fits numbers of the vehicle to that.
+A window begins at a measured state. From there the measured rotor speeds, and nothing else, move
+the vehicle; after each horizon its state is compared with the measured one.
 
-Vectors have their component as the first axis and the start as the last, as (3, M). World x, y, z
-with z up; body x forward, y left, z up; quaternions scalar first; SI.
+A state has 13 numbers: position, quaternion (scalar first), velocity, in the world frame with z up,
+and body rates, body frame; SI.
 """
 
 import copy
-import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Final, Self
 
@@ -18,21 +17,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..models.coefficients import Drag
-from ..models.errors import InputError
 from ..models.vehicle import Vehicle
-from ..sim.backends import kernel
-from ..sim.backends.body import RigidBody
+from ..sim.backends.rigid import RigidWorld
 from ..sim.effects import EffectOptions
-from ..sim.effects.air import AirEffects
 from ..sim.rotations import between
-from ..sim.state import WorldState
+from ..sim.state import InitialState
+from ..sim.world import PhysicsError
 from .flight_logs import FlightLog
 
 Floats = NDArray[np.float64]
 Numbers = Mapping[str, float]
 """Numbers of a vehicle by the names of `NAMES`, in the units of `models/coefficients.py`."""
-States = tuple[Floats, Floats, Floats, Floats]
-"""Position, quaternion, velocity and body rates, (3, M) or (4, M)."""
 
 NAMES: Final = (
     "rotors.thrust_coefficient", "rotors.reaction", "rotors.drag", "rotors.inflow", "rotors.lift",
@@ -41,8 +36,9 @@ NAMES: Final = (
     "drag.angular.x", "drag.angular.y", "drag.angular.z", "drag.moment.x", "drag.moment.y",
 )  # fmt: skip
 """Numbers that move a vehicle and can be fitted."""
-_ON_ROTORS: Final = NAMES[2:5]
-_AIR: Final = _ON_ROTORS + NAMES[8:]
+_ON_ROTORS: Final = ("rotors.drag", "rotors.inflow", "rotors.lift")
+_MORE_THRUST: Final = 100.0  # times the vehicle's limit: predictions never reach it
+_LOST: Final = 1e6  # every number of a state after a prediction that diverged
 
 
 def numbers_of(vehicle: Vehicle) -> dict[str, float]:
@@ -50,19 +46,16 @@ def numbers_of(vehicle: Vehicle) -> dict[str, float]:
 
     Raises `InputError` if it has no thrust coefficient.
     """
-    coefficients = vehicle.coefficients
-    coefficients.need("rotors.thrust_coefficient", "a prediction from rotor speeds")
+    vehicle.coefficients.need("rotors.thrust_coefficient", "a prediction from rotor speeds")
     reactions = [np.linalg.norm(rotor.reaction) for rotor in vehicle.rotors]
+    vectors = {"body.inertia": np.diag(vehicle.inertia), "rotors.reaction": [np.mean(reactions)]}
     numbers = dict.fromkeys(NAMES, 0.0)
-    numbers["rotors.reaction"] = float(np.mean(reactions))
-    for i, axis in enumerate("xyz"):
-        numbers[f"body.inertia.{axis}"] = float(vehicle.inertia[i, i])
-    for name, values in coefficients.numbers().items():
+    for name, values in (vehicle.coefficients.numbers() | vectors).items():
         if name in numbers:
-            numbers[name] = values[0]
+            numbers[name] = float(values[0])
         for axis, value in zip("xyz", values, strict=False):
             if f"{name}.{axis}" in numbers:
-                numbers[f"{name}.{axis}"] = value
+                numbers[f"{name}.{axis}"] = float(value)
     return numbers
 
 
@@ -75,183 +68,141 @@ def inertia_of(vehicle: Vehicle, numbers: Numbers) -> Floats:
 
 @dataclass(frozen=True, kw_only=True)
 class Windows:
-    """M starts of flights, the rotor speeds from there on, and the measured motion.
-
-    `speeds` has shape (H, R, M) for H steps of `period`.
-    """
+    """M starts of flights, the rotor speeds from there on, and the measured motion."""
 
     period: float
+    """Of the samples, s."""
     horizons: tuple[int, ...]
-    """Steps after which predictions are compared."""
+    """H numbers of steps, after which predictions are compared."""
+    start: Floats
+    """States, shape (M, 13)."""
+    truth: Floats
+    """Measured states at the horizons, shape (M, H, 13)."""
     speeds: Floats
-    start: States
-    truth: Mapping[int, States]
-    """The measured states by horizon."""
+    """Of the rotors at each step, rad/s, shape (M, steps, R)."""
     flight: NDArray[np.int_]
     """Index of the flight of each start, shape (M,)."""
     index: NDArray[np.int_]
     """Sample of the flight at which it starts, shape (M,)."""
 
+    def repeated(self, times: int) -> Self:
+        """The same windows several times, one lot after the other."""
+        return replace(
+            self,
+            start=np.tile(self.start, (times, 1)),
+            truth=np.tile(self.truth, (times, 1, 1)),
+            speeds=np.tile(self.speeds, (times, 1, 1)),
+        )
+
     @classmethod
     def cut(
         cls, flights: Sequence[FlightLog], steps: int, stride: int, horizons: Sequence[int] = ()
     ) -> Self:
-        """Starts at every `stride`-th sample after which the flight has `steps` more."""
-        starts = [np.arange(0, len(one.position) - steps, stride) for one in flights]
+        """Starts at every `stride`-th sample after which the flight has `steps` more.
 
-        def states(shift: int) -> States:
-            def joined(name: str) -> Floats:
-                pairs = zip(flights, starts, strict=True)
-                parts = [getattr(one, name)[at + shift].T for one, at in pairs]
-                return np.concatenate(parts, axis=-1)
-
-            position = joined("position")
-            quaternion = joined("quaternion")
-            return position, quaternion, joined("velocity"), joined("body_rates")
-
-        spans = [at[:, None] + np.arange(steps) for at in starts]
-        speeds = np.concatenate([f.speeds[s] for f, s in zip(flights, spans, strict=True)])
-        flight = [np.full(len(at), number) for number, at in enumerate(starts)]
-        horizons = tuple(horizons) or (steps,)
+        The only horizon is the last step, unless others are given.
+        """
+        chosen = np.array(horizons or [steps])
+        starts = [np.arange(0, len(flight.position) - steps, stride) for flight in flights]
+        states = []
+        truth = []
+        speeds = []
+        for flight, first in zip(flights, starts, strict=True):
+            motion = (flight.position, flight.quaternion, flight.velocity, flight.body_rates)
+            samples = np.concatenate(motion, axis=1)
+            states.append(samples[first])
+            truth.append(samples[first[:, None] + chosen])
+            speeds.append(flight.speeds[first[:, None] + np.arange(steps)])
+        counts = [len(first) for first in starts]
         return cls(
             period=flights[0].period,
-            horizons=horizons,
-            speeds=np.ascontiguousarray(speeds.transpose(1, 2, 0)),
-            start=states(0),
-            truth={horizon: states(horizon) for horizon in horizons},
-            flight=np.concatenate(flight),
+            horizons=tuple(chosen.tolist()),
+            start=np.concatenate(states),
+            truth=np.concatenate(truth),
+            speeds=np.concatenate(speeds),
+            flight=np.repeat(np.arange(len(flights)), counts),
             index=np.concatenate(starts),
         )
 
 
 def mean_speeds(speeds: Floats, step: int) -> Floats:
-    """Rotor speeds between a sample and the next, (R, M): the mean of both.
+    """Rotor speeds between a sample and the next, the mean of both, of speeds (M, steps, R).
 
-    After the last sample that a prediction may know, those of that one. `speeds`: (H, R, M).
+    After the last sample that a prediction may know, those of that one.
     """
-    after = speeds[min(step + 1, len(speeds) - 1)]
-    between_both: Floats = 0.5 * (speeds[step] + after)
-    return between_both
+    following = min(step + 1, speeds.shape[1] - 1)
+    mean: Floats = 0.5 * (speeds[:, step] + speeds[:, following])
+    return mean
 
 
-def predict(
-    vehicle: Vehicle,
-    candidates: Numbers | Sequence[Numbers],
-    windows: Windows,
-    speeds: Floats | None = None,
-) -> Iterator[tuple[int, States]]:
-    """Each horizon, and the states there, of the vehicle with other numbers.
+def predict(vehicle: Vehicle, candidates: Sequence[Numbers], windows: Windows) -> Floats:
+    """States at the horizons, (M, H, 13), of the vehicle with other numbers.
 
-    P candidates are flown at once, much faster than one after the other; arrays then have P M
-    starts, those of the first candidate first. `speeds`, (H, R, P M), replaces those of the
-    windows. A physics step is the period of the samples.
+    Each candidate flies its share of the windows, the first one the first share; all at once, much
+    faster than one after the other. A physics step is the period of the samples.
     """
-    several = [candidates] if isinstance(candidates, Mapping) else list(candidates)
-    starts = windows.start[0].shape[-1]
-    numbers = {name: np.repeat([one[name] for one in several], starts) for name in NAMES}
-    flown = _with_step(vehicle, windows.period)
-    body = RigidBody(flown)
-    own = numbers_of(vehicle)["rotors.reaction"]
-    if own:
-        body.vary({"reaction": numbers["rotors.reaction"] / own})
-    inertias = np.stack([inertia_of(vehicle, one) for one in several])
-    body.set_inertia(np.repeat(inertias, starts, axis=0))
-    air = _Air(flown, numbers)
-    fly = _flight(body, vehicle.num_rotors, pushed=air.acts)
-    rows = np.ascontiguousarray(np.tile(np.concatenate(windows.start), len(several)))
-    given = np.tile(windows.speeds, len(several)) if speeds is None else speeds
-    given = np.ascontiguousarray(given)
-    for step in range(len(windows.speeds)):
-        thrust = numbers["rotors.thrust_coefficient"] * mean_speeds(given, step) ** 2
-        rows = fly(rows, thrust, air.wrench(rows, thrust))
-        if step + 1 in windows.horizons:
-            yield step + 1, (rows[:3], rows[3:7], rows[7:10], rows[10:])
+    starts = len(windows.start)
+    share = starts // len(candidates)
+    numbers = {name: np.repeat([one[name] for one in candidates], share) for name in NAMES}
+    world = _world(vehicle, numbers, windows.period)
+    inertias = np.stack([inertia_of(vehicle, one) for one in candidates])
+    own = numbers_of(vehicle)["rotors.reaction"] or 1.0
+    world.vary(
+        inertia=np.repeat(inertias, share, axis=0),
+        reaction=numbers["rotors.reaction"] / own,
+        air={name: values[:, None] for name, values in numbers.items()},
+    )
+    position, quaternion, velocity, rates = np.split(windows.start[:, None], (3, 7, 10), axis=-1)
+    start = InitialState(
+        position=position, quaternion=quaternion, velocity=velocity, body_rates=rates
+    )
+    world.reset(np.ones((starts, 1), bool), start)
+    states = np.full((starts, len(windows.horizons), 13), _LOST)
+    coefficient = numbers["rotors.thrust_coefficient"][:, None]
+    state = world.state
+    with suppress(PhysicsError):  # of numbers far off, which a fit tries
+        for step in range(windows.speeds.shape[1]):
+            thrust = coefficient * mean_speeds(windows.speeds, step) ** 2
+            world.step(thrust[:, None], 1)
+            if step + 1 in windows.horizons:
+                motion = (state.position, state.quaternion, state.velocity, state.body_rates)
+                horizon = windows.horizons.index(step + 1)
+                states[:, horizon] = np.concatenate(motion, axis=-1)[:, 0]
+    return states
 
 
-def _flight(
-    body: RigidBody, rotors: int, *, pushed: bool
-) -> Callable[[Floats, Floats, Floats | None], Floats]:
-    """New rows (13, N) after a physics step; compiled where a C compiler can, else by NumPy."""
-
-    def by_numpy(rows: Floats, thrust: Floats, wrench: Floats | None) -> Floats:
-        return np.array(body.fly(rows, thrust, wrench))
-
-    if kernel.compiler() is None:
-        return by_numpy
-    try:
-        step = kernel.compiled(body, rotors, np.float64, wrench=pushed)
-    except InputError as error:
-        logging.getLogger(__name__).warning("predictions by NumPy: %s", error)
-        return by_numpy
-    varying = kernel.packed(body, np.float64)
-    return lambda rows, thrust, wrench: step(rows, thrust, wrench, varying, 1)
-
-
-def _with_step(vehicle: Vehicle, period: float) -> Vehicle:
-    """The vehicle with another physics step, s."""
+def _world(vehicle: Vehicle, numbers: Mapping[str, Floats], period: float) -> RigidWorld:
+    """A world for each number, of a vehicle without limits of thrust; the air acts on it."""
     model = copy.copy(vehicle.model)
     model.opt.timestep = period
-    return replace(vehicle, model=model)
-
-
-class _Air:
-    """Force and torque of the air on N bodies with numbers of their own, each of shape (N,)."""
-
-    def __init__(self, vehicle: Vehicle, numbers: Mapping[str, Floats]) -> None:
-        self._effects: AirEffects | None = None
-        quadratic = vehicle.coefficients.drag.quadratic
-        if quadratic is None and not any(numbers[name].any() for name in _AIR):
-            return
-        on_rotors = any(numbers[name].any() for name in _ON_ROTORS)
-        none = Drag(linear=(0.0, 0.0, 0.0), quadratic=quadratic)
-        rotors = replace(vehicle.coefficients.rotors, drag=0.0)
-        coefficients = replace(vehicle.coefficients, drag=none, rotors=rotors)
-        still = replace(vehicle, coefficients=coefficients)  # the numbers take their place
-        options = EffectOptions(body_drag=True, rotor_drag=on_rotors)
-        self._effects = AirEffects(still, options)
-        self._effects.vary({name: values[:, None] for name, values in numbers.items()})
-        self._begun = False
-
-    @property
-    def acts(self) -> bool:
-        """Whether there is air."""
-        return self._effects is not None
-
-    def wrench(self, rows: Floats, thrust: Floats) -> Floats | None:
-        """Of states (13, N) and thrusts (R, N): force, world frame, and torque, body frame, (6, N).
-
-        None where there is no air.
-        """
-        if self._effects is None:
-            return None
-        columns = rows.T[:, None]
-        force = thrust.T[:, None]
-        state = WorldState(
-            position=columns[..., :3],
-            quaternion=columns[..., 3:7],
-            velocity=columns[..., 7:10],
-            body_rates=columns[..., 10:],
-            command=force,
-            thrust=force,
-            touching=np.False_,
-        )
-        if not self._begun:
-            self._effects.begin(np.True_, state, {})
-            self._begun = True
-        push: Floats = self._effects.step(state, force, None, [0.0, 0.0, 0.0], None)
-        return np.ascontiguousarray(push.reshape(-1, 6).T)
-
-
-def differences(predicted: States, truth: States) -> States:
-    """Predicted less measured: position, rotation vector, velocity and body rates, (3, M) each."""
-    turn = between(truth[1].T, predicted[1].T).T
-    turn = turn * np.where(turn[0] < 0, -1.0, 1.0)
-    size = np.sqrt((turn[1:] ** 2).sum(axis=0))
-    angle = 2 * np.arctan2(size, turn[0])
-    share = np.divide(angle, size, out=np.full_like(size, 2.0), where=size > 1e-12)
-    return (
-        predicted[0] - truth[0],
-        turn[1:] * share,
-        predicted[2] - truth[2],
-        predicted[3] - truth[3],
+    model.actuator_ctrlrange *= _MORE_THRUST
+    rotors = [replace(rotor, high=_MORE_THRUST * rotor.high) for rotor in vehicle.rotors]
+    own = vehicle.coefficients
+    # The numbers take the place of these.
+    drag = Drag(linear=(0.0, 0.0, 0.0), quadratic=own.drag.quadratic)
+    of_rotors = replace(own.rotors, drag=0.0, inflow=None, lift=None)
+    free = replace(
+        vehicle,
+        model=model,
+        rotors=tuple(rotors),
+        coefficients=replace(own, drag=drag, rotors=of_rotors),
     )
+    has_rotor_drag = any(numbers[name].any() for name in _ON_ROTORS)
+    effects = EffectOptions(body_drag=True, rotor_drag=has_rotor_drag)
+    count = len(numbers["rotors.drag"])
+    return RigidWorld(free, count, effects=effects, dtype="float64")
+
+
+def differences(predicted: Floats, truth: Floats) -> Floats:
+    """Predicted less measured, of states (..., 13): shape (..., 4, 3).
+
+    Position, rotation vector, velocity and body rates.
+    """
+    turn = between(truth[..., 3:7], predicted[..., 3:7])
+    turn = turn * np.where(turn[..., :1] < 0, -1.0, 1.0)
+    size = np.linalg.norm(turn[..., 1:], axis=-1, keepdims=True)
+    angle = 2 * np.arctan2(size, turn[..., :1])
+    share = np.divide(angle, size, out=np.full_like(size, 2.0), where=size > 1e-12)
+    rest = predicted - truth
+    parts = (rest[..., :3], turn[..., 1:] * share, rest[..., 7:10], rest[..., 10:])
+    return np.stack(parts, axis=-2)

@@ -25,7 +25,7 @@ import numpy as np
 from measuring import RESULTS, options
 from rotorgram.flights.flight_logs import FlightLog, read_log
 from rotorgram.flights.identified_vehicle import Origin, vehicle_toml
-from rotorgram.flights.identify import Group, fit, regressed
+from rotorgram.flights.identify import Fit, Group
 from rotorgram.flights.prediction import (
     Floats,
     Numbers,
@@ -37,6 +37,7 @@ from rotorgram.flights.prediction import (
 )
 from rotorgram.models.vehicle import Vehicle
 from rotorgram.sim.effects import EffectOptions
+from rotorgram.sim.rotations import to_body
 from rotorgram.sim.state import InitialState
 from rotorgram.sim.world import make_world
 
@@ -110,8 +111,7 @@ def main() -> int:
     windows = Windows.cut(test, HORIZONS[-1], given.stride, HORIZONS)
     print(f"{len(train)} training flights; {len(test)} test flights, {len(windows.index)} starts")
     held = numbers_of(base)
-    naive = dict.fromkeys(HORIZONS, windows.start)
-    rows = [_row("state held", naive, windows, test)]
+    rows = [_row("state held", _held(windows), windows, test)]
     _show(rows[-1], "ours")
     cut = Windows.cut(train, HORIZONS[-1], _STRIDE, (10, 25, 50))
     for variant in VARIANTS:
@@ -119,8 +119,8 @@ def main() -> int:
         numbers = _fitted(variant, base, held, cut, train)
         text, vehicle = _vehicle(base, numbers, variant)
         row = _row(variant.name, simulated(vehicle, windows), windows, test)
-        numpy = dict(predict(base, _flown(variant, numbers), windows))
-        ours = _row(variant.name, numpy, windows, test)
+        predicted = predict(base, [_flown(variant, numbers)], windows)
+        ours = _row(variant.name, predicted, windows, test)
         row["numpy"] = ours["errors"][HORIZONS[-1]]
         row["unseen_kinds"] = _unseen(variant, base, held, train)
         reference = rows[1] if len(rows) > 1 else row
@@ -175,44 +175,60 @@ def moving_numbers(vehicle: Vehicle) -> dict[str, object]:
     }
 
 
-def simulated(
-    vehicle: Vehicle, windows: Windows, *, rotors: bool = True
-) -> dict[int, tuple[Floats, ...]]:
-    """Position, quaternion, velocity and body rates at each horizon, flown by the simulator."""
+def simulated(vehicle: Vehicle, windows: Windows, *, rotors: bool = True) -> Floats:
+    """States at each horizon, (M, H, 13), flown by the simulator."""
     told = vehicle.coefficients
     body = any(x is not None for x in (told.drag.linear, told.drag.angular, told.drag.moment))
     rotor = any(x is not None for x in (told.rotors.drag, told.rotors.inflow))
     effects = EffectOptions(body_drag=body, rotor_drag=rotor and rotors)
     (coefficient,) = told.need("rotors.thrust_coefficient", "a flight from rotor speeds")
-    parts: dict[int, list[tuple[Floats, ...]]] = {h: [] for h in HORIZONS}
-    for first in range(0, len(windows.index), _WORLDS):
+    lift = np.array((0.0, 0.0, _UP))
+    substeps = vehicle.substeps(windows.period)
+    states = np.empty((len(windows.start), len(HORIZONS), 13))
+    for first in range(0, len(states), _WORLDS):
         some = slice(first, first + _WORLDS)
-        position, quaternion, velocity, rates = (array[:, some].T for array in windows.start)
-        count = len(position)
-        world = make_world(vehicle, count, effects=effects, num_threads=1)
-        lift = np.array((0.0, 0.0, _UP))
-        thrust = [
-            coefficient * mean_speeds(windows.speeds, i)[:, some].T ** 2
-            for i in range(HORIZONS[-1])
-        ]
-        start = [position + lift, quaternion, velocity, rates, thrust[0]]
-        world.reset(np.ones((count, 1), bool), InitialState(**dict(zip(
-            ("position", "quaternion", "velocity", "body_rates", "thrust"),
-            (array[:, None] for array in start), strict=True))))  # fmt: skip
-        substeps = vehicle.substeps(windows.period)
+        speeds = windows.speeds[some]
+        thrust = [coefficient * mean_speeds(speeds, step) ** 2 for step in range(HORIZONS[-1])]
+        start = windows.start[some, None]
+        world = make_world(vehicle, len(start), effects=effects, num_threads=1)
+        initial = InitialState(
+            position=start[..., :3] + lift,
+            quaternion=start[..., 3:7],
+            velocity=start[..., 7:10],
+            body_rates=start[..., 10:],
+            thrust=thrust[0][:, None],
+        )
+        world.reset(np.ones((len(start), 1), bool), initial)
         for step in range(HORIZONS[-1]):
             world.step(thrust[step][:, None], substeps)
             if step + 1 in HORIZONS:
                 s = world.state
-                parts[step + 1].append((
-                    (s.position[:, 0] - lift).T, s.quaternion[:, 0].T.copy(),
-                    s.velocity[:, 0].T.copy(), s.body_rates[:, 0].T.copy(),
-                ))  # fmt: skip
+                motion = (s.position - lift, s.quaternion, s.velocity, s.body_rates)
+                here = np.concatenate(motion, axis=-1)[:, 0]
+                states[some, HORIZONS.index(step + 1)] = here
         world.close()
-    return {
-        h: tuple(np.concatenate(arrays, axis=-1) for arrays in zip(*chunks, strict=True))
-        for h, chunks in parts.items()
-    }
+    return states
+
+
+def regressed(vehicle: Vehicle, flights: Sequence[FlightLog]) -> dict[str, float]:
+    """Thrust coefficient and linear drag by a regression of accelerations, in body axes."""
+    axes = np.array([rotor.axis for rotor in vehicle.rotors])
+    forces, axials, velocities = [], [], []
+    for flight in flights:
+        inner = slice(2, -2)
+        velocity = flight.velocity
+        near = velocity[3:-1] - velocity[1:-3]
+        far = velocity[4:] - velocity[:-4]
+        slope = (8 * near - far) / (12 * flight.period)
+        up = np.array([0.0, 0.0, vehicle.gravity])
+        forces.append(to_body(flight.quaternion[inner], slope + up))
+        velocities.append(to_body(flight.quaternion[inner], velocity[inner]))
+        axials.append(flight.speeds[inner] ** 2 @ axes)
+    force, axial, velocity = (np.concatenate(parts) for parts in (forces, axials, velocities))
+    coefficient = vehicle.mass * float((axial * force).sum() / (axial * axial).sum())
+    rest = vehicle.mass * force - coefficient * axial
+    drag = -(velocity * rest).sum(axis=0) / (velocity**2).sum(axis=0)
+    return dict(zip(FORCES, (coefficient, *np.maximum(drag, 0.0).tolist()), strict=True))
 
 
 def _flights(folder: Path, vehicle: Vehicle) -> list[FlightLog]:
@@ -230,11 +246,11 @@ def _fitted(
     flights: Sequence[FlightLog],
 ) -> Numbers:
     """The numbers of a variant; where rates are constant, forces are fitted with them constant."""
-    begun = regressed(base, flights, FORCES) if variant.regressed else {}
+    begun = regressed(base, flights) if variant.regressed else {}
     start = _flown(variant, {**held, **begun})
     if not variant.groups:
         return held
-    found = fit(base, start, windows, variant.groups)
+    found = Fit(base, windows, start, variant.groups).solve()
     if variant.turns:
         return found
     return found | {name: held[name] for name in held if name.startswith("body.inertia")}
@@ -260,40 +276,37 @@ def _vehicle(base: Vehicle, numbers: Numbers, variant: Variant) -> tuple[str, Ve
         return text, Vehicle.load(file)
 
 
-def _sizes(predicted: Sequence[Floats], truth: Sequence[Floats]) -> list[Floats]:
-    return [np.linalg.norm(error, axis=0) for error in differences(predicted, truth)]
+def _held(windows: Windows) -> Floats:
+    """Predictions of a craft that stays as it is."""
+    return np.repeat(windows.start[:, None], len(windows.horizons), axis=1)
 
 
-def _row(
-    name: str,
-    predicted: Mapping[int, Sequence[Floats]],
-    windows: Windows,
-    flights: Sequence[FlightLog],
-) -> dict:
+def _sizes(predicted: Floats, truth: Floats) -> Floats:
+    return np.linalg.norm(differences(predicted, truth), axis=-1)
+
+
+def _row(name: str, predicted: Floats, windows: Windows, flights: Sequence[FlightLog]) -> dict:
     """Mean errors: over all starts, by the formula of the published rows, and of each flight."""
     row: dict = {"name": name, "errors": {}, "published_formula": {}, "flights": {}}
-    for h in HORIZONS:
-        sizes = _sizes(predicted[h], windows.truth[h])
-        row["errors"][h] = [float(size.mean()) for size in sizes]
-        row["published_formula"][h] = published_formula(predicted[h], windows, h)
+    for index, h in enumerate(HORIZONS):
+        sizes = _sizes(predicted[:, index], windows.truth[:, index])
+        row["errors"][h] = sizes.mean(axis=0).tolist()
+        row["published_formula"][h] = published_formula(predicted[:, index], windows, h)
         for i, flight in enumerate(flights):
-            mine = [float(size[windows.flight == i].mean()) for size in sizes]
+            mine = sizes[windows.flight == i].mean(axis=0).tolist()
             row["flights"].setdefault(flight.name, {})[h] = mine
     return row
 
 
-def published_formula(predicted: Sequence[Floats], windows: Windows, h: int) -> list[float]:
+def published_formula(predicted: Floats, windows: Windows, h: int) -> list[float]:
     """The means as the benchmark computes them (its utils/metrics_utils.py).
 
     It joins the flights into one table with the measured state of the step after each start, and
     takes the measured state h - 1 rows further for that at the horizon. For the last h - 1 starts
     of a flight these rows are of the next flight.
     """
-    rows = windows.truth[1]
-    count = rows[0].shape[-1] - h + 1
-    truth = [array[:, h - 1 :] for array in rows]
-    sizes = _sizes([array[:, :count] for array in predicted], truth)
-    return [float(size.mean()) for size in sizes]
+    truth = windows.truth[h - 1 :, 0]
+    return _sizes(predicted[: len(truth)], truth).mean(axis=0).tolist()
 
 
 def _unseen(
@@ -308,8 +321,8 @@ def _unseen(
         windows = Windows.cut(rest, HORIZONS[-1], 2 * _STRIDE, (10, 25, 50))
         numbers = _flown(variant, _fitted(variant, base, held, windows, rest))
         cut = Windows.cut(left, HORIZONS[-1], _STRIDE // 2)
-        for horizon, predicted in predict(base, numbers, cut):
-            errors.append([float(s.mean()) for s in _sizes(predicted, cut.truth[horizon])])
+        sizes = _sizes(predict(base, [numbers], cut), cut.truth)
+        errors.append(sizes.mean(axis=(0, 1)))
     return [float(x) for x in np.mean(errors, axis=0)]
 
 

@@ -4,6 +4,7 @@ It flies as `mujoco` does until a part touches the ground, or another drone, of 
 """
 
 import logging
+from collections.abc import Mapping
 from typing import Final
 
 import mujoco
@@ -82,18 +83,36 @@ class RigidWorld(BaseWorld):
 
         self._varying: np.ndarray | None = None
         self._function: kernel.Fly | None = None
+        self._compiled = compiled
         if found and compiled is not False:
             ones = np.ones(num_worlds * drones)
             self._vary(dict.fromkeys(self._drawn, ones))
-            pushed = self.effects is not None and self.effects.on_body
-            try:
-                self._function = kernel.compiled(
-                    self._body, vehicle.num_rotors, self.dtype, wrench=pushed
-                )
-            except InputError as error:
-                if compiled:
-                    raise
-                logging.getLogger(__name__).warning("rigid flies by NumPy: %s", error)
+            self._compile()
+
+    def _compile(self) -> None:
+        """Compile the body as it varies now."""
+        pushed = self.effects is not None and self.effects.on_body
+        rotors = self.vehicle.num_rotors
+        try:
+            self._function = kernel.compiled(self._body, rotors, self.dtype, wrench=pushed)
+        except InputError as error:
+            if self._compiled:
+                raise
+            logging.getLogger(__name__).warning("rigid flies by NumPy: %s", error)
+
+    def vary(self, inertia: Array, reaction: Array, air: Mapping[str, Array]) -> None:
+        """Give every drone numbers of its own, before the first reset; for `body_drag`.
+
+        Inertia, kg·m², (W A, 3, 3); a factor of the rotors' reactions, (W A,); and coefficients of
+        the air by their names in a vehicle's file, (W, A) each.
+        """
+        self._body.vary({"reaction": reaction})
+        self._body.set_inertia(inertia)
+        self._varying = kernel.packed(self._body, self.dtype)
+        if self.effects is not None:
+            self.effects.vary(air)
+        if self._function is not None:
+            self._compile()
 
     def reset(self, mask: Array, pose: InitialState) -> None:
         """As `World.reset`."""

@@ -10,7 +10,7 @@ is of second order in the step. Sums over rotors and axes are written out, since
 the same bits alone and in a batch.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Final
 
 from numpy.typing import NDArray
@@ -73,6 +73,10 @@ class Effects:
         if options.gusts:
             self._gusts = Gusts(options.gusts, options.wind, vehicle.timestep)
             self._noise = noise(GUSTS, NUMBERS)
+
+    def vary(self, air: Mapping[str, Array]) -> None:
+        """As `AirEffects.vary`."""
+        self._air.vary(air)
 
     def begin(self, mask: Array, state: WorldState, factors: dict[str, Array]) -> Array:
         """Begin episodes of the worlds of a mask, bool, (W, A), at their rows of `state`.

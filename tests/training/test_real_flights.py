@@ -40,7 +40,7 @@ def flight(count: int, velocity: float, start: float = 0.0) -> FlightLog:
 def test_the_published_formula_compares_the_end_of_a_flight_with_the_next() -> None:
     """Two flights of 12 samples, horizon 10: two starts each, in a table of four rows."""
     windows = Windows.cut([flight(12, 1.0), flight(12, 2.0, 50.0)], 10, 1, (1, 10))
-    held = windows.start
+    held = windows.start  # no step changes it
     position, _, velocity, _ = real_flights.published_formula(held, windows, 1)
     assert position == pytest.approx((0.01 + 0.01 + 0.02 + 0.02) / 4)
     assert velocity == pytest.approx(0.0)
@@ -55,13 +55,13 @@ def test_the_simulator_falls_from_each_start() -> None:
     vehicle = Vehicle.load(ROOT / "studies" / "nanodrone.toml")
     windows = Windows.cut([flight(60, 1.5)], 50, 5, (1, 10, 50))
     flown = real_flights.simulated(vehicle, windows)
-    position, quaternion, velocity, rates = flown[50]
-    assert position.shape == (3, 2)
-    np.testing.assert_allclose(position[0], windows.start[0][0] + 1.5 * 0.5, atol=1e-9)
-    np.testing.assert_allclose(position[2], -0.5 * 9.81 * 0.25, atol=1e-9)
-    np.testing.assert_allclose(velocity[2], -9.81 * 0.5, atol=1e-9)
-    np.testing.assert_allclose(quaternion[0], 1.0)
-    np.testing.assert_allclose(rates, 0.0, atol=1e-12)
+    assert flown.shape == (2, 3, 13)
+    end = flown[:, 2]
+    np.testing.assert_allclose(end[:, 0], windows.start[:, 0] + 1.5 * 0.5, atol=1e-9)
+    np.testing.assert_allclose(end[:, 2], -0.5 * 9.81 * 0.25, atol=1e-9)
+    np.testing.assert_allclose(end[:, 3], 1.0)
+    np.testing.assert_allclose(end[:, 9], -9.81 * 0.5, atol=1e-9)
+    np.testing.assert_allclose(end[:, 10:], 0.0, atol=1e-12)
 
 
 def test_the_page_has_the_figures_of_the_benchmark() -> None:

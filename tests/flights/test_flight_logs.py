@@ -1,0 +1,163 @@
+"""Logs of real flights: columns, units, times; and impossible samples that are left out."""
+
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rotorgram.flights.flight_logs import MOTION, FlightLog, read_log, with_lag
+from rotorgram.models.errors import InputError
+from rotorgram.models.vehicle import Vehicle
+
+pandas = pytest.importorskip("pandas")
+
+LIVELY = Vehicle.load(Path(__file__).parents[1] / "data" / "lively.toml")
+SPEEDS = [f"m{i}_rads" for i in range(1, 5)]
+COMMANDS = [f"m{i}_command_rads" for i in range(1, 5)]
+FRAME = pandas.DataFrame
+
+
+@pytest.fixture
+def table() -> FRAME:
+    """2 s along x at 1 m/s, rolling by 0.5 rad/s; a command that steps after 0.1 s."""
+    time = 0.01 * np.arange(200)
+    frame = pandas.DataFrame(0.0, index=range(200), columns=[*MOTION, *SPEEDS, *COMMANDS])
+    frame["t"] = time
+    frame["x"] = time
+    frame["vx"] = 1.0
+    frame["wx"] = 0.5
+    frame["qw"] = np.cos(0.25 * time)
+    frame["qx"] = np.sin(0.25 * time)
+    frame[SPEEDS] = 600.0
+    for name in COMMANDS:
+        frame[name] = np.where(time < 0.095, 500.0, 600.0)
+    return frame
+
+
+@pytest.fixture
+def read(tmp_path: Path) -> Callable[..., FlightLog]:
+    def reading(table: FRAME, columns: dict[str, str] | None = None, **more: float) -> FlightLog:
+        file = tmp_path / "log.csv"
+        table.to_csv(file, index=False)
+        return read_log(file, LIVELY, columns, **more)
+
+    return reading
+
+
+Read = Callable[..., FlightLog]
+
+
+def test_lag_is_the_closed_form(table: FRAME, read: Read) -> None:
+    speeds = with_lag(read(table), 0.05).speeds
+    assert speeds[10, 0] == pytest.approx(500.0)
+    assert speeds[15, 2] == pytest.approx(600 - 100 * np.exp(-0.05 / 0.05))
+
+
+def test_columns_may_have_other_names_units_and_times(table: FRAME, read: Read) -> None:
+    table["rpm"] = table.pop("m1_rads") * 60 / (2 * np.pi)
+    table = table.rename(columns={"x": "pos_x"})
+    table[["qw", "qx", "qy", "qz"]] *= np.where(np.arange(200) % 3, 1, -1)[:, None]
+    log = read(table, {"x": "pos_x", "m1_rads": "rpm*0.10471975511965977"}, period=0.005)
+    time = 0.005 * np.arange(399)
+    np.testing.assert_allclose(log.position[:, 0], time, atol=1e-12)
+    np.testing.assert_allclose(log.speeds, 600.0)
+    np.testing.assert_allclose(np.abs(log.quaternion[:, 0]), np.cos(0.25 * time), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda t: t.drop(columns="vy"), "expected a column vy"),
+        (lambda t: t.drop(columns=SPEEDS + COMMANDS), r"m1...4_rads"),
+        (lambda t: t.drop(index=range(50, 70)), r"no gap of more than 0\.1 s, got 0\.21 s"),
+        (lambda t: t.assign(x=np.nan), "finite numbers"),
+        (lambda t: t.assign(x="here"), "numbers in x"),
+        (lambda t: t.head(0), r"^log\.csv: expected two or more samples, got 0$"),  # fault 54
+        (lambda t: t.assign(x=t.x + 5.0 * (t.index >= 100)),
+         r"agree with velocities and rates, got a jump at 1 s"),
+        (lambda t: t.assign(m1_rads=np.where(t.index == 60, 1e6, t.m1_rads)),
+         r"rotor speeds of at most 5000 rad/s, got 1e\+06"),
+    ],
+)  # fmt: skip
+def test_a_wrong_log_is_refused(
+    table: FRAME, read: Read, change: Callable[[FRAME], FRAME], sentence: str
+) -> None:
+    with pytest.raises(InputError, match=sentence):
+        read(change(table))
+
+
+@pytest.mark.parametrize("impossible", [1e6, 1e308, -50.0])
+@pytest.mark.parametrize("row", [0, 60, 199])
+@pytest.mark.parametrize("column", ["x", "vz"])
+def test_an_impossible_sample_is_left_out(
+    table: FRAME, read: Read, impossible: float, row: int, column: str
+) -> None:
+    """Fault 45: the velocity contradicts a position, or both positions contradict a velocity."""
+    if column == "vz" and impossible < 1e308:
+        impossible *= 10  # -500 m/s moves by 5 m in a sample
+    table.loc[row, column] = impossible
+    log = read(table)
+    assert log.left_out == 1
+    assert len(log.position) == (200 if row == 60 else 199)
+    start = 0.01 if row == 0 else 0.0
+    time = start + 0.01 * np.arange(len(log.position))
+    np.testing.assert_allclose(log.position[:, 0], time, atol=1e-9)
+
+
+def test_a_jump_of_the_attitude_is_left_out(table: FRAME, read: Read) -> None:
+    assert read(table).left_out == 0
+    table.loc[60, ["qw", "qx", "qy", "qz"]] = (0.0, 0.0, 1.0, 0.0)  # on its head
+    assert read(table).left_out == 1
+
+
+def ulog(path: Path) -> Path:
+    """A PX4 log of 2 s: a climb at 1 m/s past 3 m north and 2 m east, rolled by 0.2 rad."""
+    topics = {
+        "vehicle_local_position": (["x", "y", "z", "vx", "vy", "vz"], "float"),
+        "vehicle_attitude": (["q[4]"], "float"),
+        "vehicle_angular_velocity": (["xyz[3]"], "float"),
+        "actuator_motors": (["control[12]"], "float"),
+    }
+
+    def message(kind: str, content: bytes) -> bytes:
+        return struct.pack("<HB", len(content), ord(kind)) + content
+
+    parts = [b"\x55\x4c\x6f\x67\x01\x12\x35\x01" + struct.pack("<Q", 0)]
+    parts.append(message("B", bytes(40)))
+    for topic, (names, kind) in topics.items():
+        fields = ["uint64_t timestamp"]
+        for name in names:
+            word, bracket, size = name.partition("[")
+            fields.append(f"{kind}{bracket}{size} {word}")
+        parts.append(message("F", f"{topic}:{';'.join(fields)};".encode()))
+    for index, topic in enumerate(topics):
+        parts.append(message("A", struct.pack("<BH", 0, index) + topic.encode()))
+    for step in range(201):
+        time = step * 0.01
+        rows = (
+            (3.0, 2.0, -5.0 - time, 0.0, 0.0, -1.0),
+            (np.cos(0.1), np.sin(0.1), 0.0, 0.0),
+            (0.1, 0.2, 0.3),
+            (0.25, 0.5, 0.75, 1.0, *[np.nan] * 8),
+        )
+        for index, row in enumerate(rows):
+            head = struct.pack("<HQ", index, 1_000_000 + step * 10_000)
+            parts.append(message("D", head + struct.pack(f"<{len(row)}f", *row)))
+    path.write_bytes(b"".join(parts))
+    return path
+
+
+def test_a_ulog_file_comes_in_our_frames(tmp_path: Path) -> None:
+    pytest.importorskip("pyulog")
+    log = read_log(ulog(tmp_path / "flight.ulg"), LIVELY)
+    assert not log.measured
+    # North east down becomes north, west, up; forward right down becomes forward, left, up.
+    np.testing.assert_allclose(log.position[100], (3.0, -2.0, 6.0), atol=1e-6)
+    np.testing.assert_allclose(log.velocity[50], (0.0, 0.0, 1.0), atol=1e-6)
+    expected = (np.cos(0.1), np.sin(0.1), 0.0, 0.0)
+    np.testing.assert_allclose(log.quaternion[7], expected, atol=1e-6)
+    np.testing.assert_allclose(log.body_rates[7], (0.1, -0.2, -0.3), atol=1e-6)
+    # A quarter of the largest thrust, 3 N, at 3e-6 N s²/rad², is 500 rad/s.
+    assert log.speeds[7, 0] == pytest.approx(500.0)
+    assert log.speeds[7, 3] == pytest.approx(1000.0)
