@@ -176,7 +176,7 @@ def _undetermined(estimates: Sequence[Estimate], correlation: Floats) -> dict[st
     """
     pairs = np.triu(np.abs(correlation), 1)
     if pairs.max(initial=0.0) > ALIKE:
-        i, j = np.unravel_index(pairs.argmax(), pairs.shape)
+        i, j = divmod(int(pairs.argmax()), len(pairs))
         reason = f"not told apart from {estimates[i].name} (correlation {pairs[i, j]:.3f})"
         return {estimates[j].name: reason}
     ratios = {}

@@ -48,14 +48,16 @@ def numbers_of(vehicle: Vehicle) -> dict[str, float]:
     """
     vehicle.coefficients.need("rotors.thrust_coefficient", "a prediction from rotor speeds")
     reactions = [np.linalg.norm(rotor.reaction) for rotor in vehicle.rotors]
-    vectors = {"body.inertia": np.diag(vehicle.inertia), "rotors.reaction": [np.mean(reactions)]}
+    own: dict[str, Sequence[float]] = dict(vehicle.coefficients.numbers())
+    own["body.inertia"] = np.diag(vehicle.inertia).tolist()
+    own["rotors.reaction"] = [float(np.mean(reactions))]
     numbers = dict.fromkeys(NAMES, 0.0)
-    for name, values in (vehicle.coefficients.numbers() | vectors).items():
+    for name, values in own.items():
         if name in numbers:
-            numbers[name] = float(values[0])
+            numbers[name] = values[0]
         for axis, value in zip("xyz", values, strict=False):
             if f"{name}.{axis}" in numbers:
-                numbers[f"{name}.{axis}"] = float(value)
+                numbers[f"{name}.{axis}"] = value
     return numbers
 
 
