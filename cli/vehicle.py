@@ -253,7 +253,7 @@ def print_checks(checks: Sequence["Check"], *, as_json: bool = False) -> None:
 
     console = Console()
     wide = console.width >= 120
-    columns = ["", "check", "measured", "expected"] + ["source"] * wide
+    columns = ["", "check", "measured", "expected"] + ["equation", "source"] * wide
     table = Table(*columns, box=SIMPLE_HEAD, pad_edge=False)
     for check in checks:
         note = f" ({check.note})" if check.note else ""
@@ -262,6 +262,7 @@ def print_checks(checks: Sequence["Check"], *, as_json: bool = False) -> None:
             escape(check.name),
             escape(f"{check.measured:.4g} {check.unit}".strip() + note),
             escape(expectation(check)),
+            escape(check.equation),
             escape(check.source),
         )
         table.add_row(*cells[: len(columns)])
