@@ -229,7 +229,9 @@ def test_a_path_and_a_vehicle_have_the_same_checks() -> None:
 
 
 def test_a_group_of_no_name_names_those_there_are() -> None:
-    with pytest.raises(InputError, match="^groups: expected some of file, .*, floor, got 'hoover'"):
+    with pytest.raises(
+        InputError, match=r"^groups: expected some of file, .*, floor, got 'hoover'"
+    ):
         examine(QUAD_XML, "hoover")
 
 
