@@ -376,7 +376,7 @@ def _mend(spec: mujoco.MjSpec) -> Iterator[tuple[str, Array]]:
         if np.isfinite(body.fullinertia[0]):
             xx, yy, zz, xy, xz, yz = body.fullinertia
             full = np.array(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))
-            moments = np.linalg.eigvalsh(full)
+            moments[:] = np.linalg.eigvalsh(full)
         yield body.name or "a body without a name", moments
         if not (moments[0] > 0 and moments[0] + moments[1] >= moments[2] * (1 - _RELATIVE)):
             body.fullinertia = [math.nan, 0, 0, 0, 0, 0]
