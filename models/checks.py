@@ -353,8 +353,7 @@ class _Craft:
         for wrench in np.eye(6):
             data.qfrc_applied[:] = wrench
             answers.append(self.acceleration(data) - rest)
-        matrix: Array = np.linalg.pinv(np.array(answers).T)
-        return matrix
+        return np.asarray(np.linalg.pinv(np.array(answers).T), np.float64)
 
     @cached_property
     def convergence(self) -> "_Convergence":
