@@ -103,6 +103,10 @@ class BackendFlags(EnvFlags):
     """What steps the drones: mujoco, or rigid (without contact, fast)."""
 
 
+BackendOfPreset = Annotated[Backend, arg(help_behavior_hint="(default: the preset's)")]
+"""Type of the flag where a preset names the default."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class AgentFlags(EnvFlags):
     """A command that flies over the wire: the UDP server."""

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from tyro.conf import Positional, arg
 
+from ._flags import BackendOfPreset
 from ._study import StudyFlags
 
 if TYPE_CHECKING:
@@ -23,6 +24,8 @@ class Benchmark(StudyFlags):
 
     rows: Positional[Annotated[Path | None, arg(metavar="FILE")]] = None
     """TOML file of rows. Default: those of docs/baselines.md."""
+    backend: BackendOfPreset = "mujoco"
+    """What steps the drones in training: mujoco, or rigid (without contact, fast)."""
 
     def study(self) -> "Study":
         """The rows of the file, by default on seeds that no other command uses."""

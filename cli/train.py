@@ -36,6 +36,7 @@ from ..training.settings import Run
 from ._flags import (
     AgentFlags,
     BackendFlags,
+    BackendOfPreset,
     check_count,
     folder_to_write,
     go_on_with,
@@ -67,6 +68,8 @@ class Train(AgentFlags, BackendFlags):
     """vpg, a2c, ppo, ippo, mappo, sac, sb3-a2c, sb3-ppo or sb3-sac."""
     preset: PresetName = "tuned"
     """Hyperparameters: the paper's (of vpg and a2c), or ours, which may depend on the task."""
+    backend: BackendOfPreset = "mujoco"
+    """What steps the drones: mujoco, or rigid (without contact, fast)."""
     preset_of: str | None = None
     """Id of the task with the preset. Default: the one that is trained, or that it derives from."""
     set: UseAppendAction[Annotated[tuple[tuple[str, ...], ...], arg(metavar="NAME=VALUE …")]] = ()

@@ -45,6 +45,12 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
     lost: np.ndarray
     telemetry: Mapping[str, np.ndarray]
 
+    @property
+    def autoreset_mode(self) -> AutoresetMode:
+        """What follows the end of an episode."""
+        mode: AutoresetMode = self.metadata["autoreset_mode"]
+        return mode
+
     @abstractmethod
     def reset(
         self, *, seed: int | Seeds | None = None, options: dict[str, Any] | None = None
@@ -71,7 +77,7 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
 
     def step(self, actions: Any) -> Step:
         """Fly every drone for one control period; after an episode the autoreset mode decides."""
-        mode = self.metadata["autoreset_mode"]
+        mode = self.autoreset_mode
         resets = self.done if mode == AutoresetMode.NEXT_STEP and self.done.any() else None
         self.advance(self._shaped(actions), resets)
         rewards = self.rewards

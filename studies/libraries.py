@@ -54,10 +54,11 @@ def torchrl_single() -> None:
 
 
 def torchrl_vector() -> None:
-    """GymWrapper takes a vector env."""
+    """GymWrapper takes a vector env of SAME_STEP or DISABLED."""
     from torchrl.envs.libs.gym import GymWrapper
 
-    flown = GymWrapper(gym.make_vec(ENV, num_envs=4)).rollout(STEPS, break_when_any_done=False)
+    made = gym.make_vec(ENV, num_envs=4, autoreset_mode="SameStep")
+    flown = GymWrapper(made).rollout(STEPS, break_when_any_done=False)
     assert flown["observation"].shape[:2] == (4, STEPS)
 
 

@@ -59,6 +59,7 @@ PUBLISHED: Final = {
 """Rows of the benchmark's table: position, attitude, velocity, rates at each horizon."""
 _WORLDS: Final = 2048
 _UP: Final = 100.0  # m: far from the ground, which no effect here feels
+_UNTURNED: Final = 1e3  # kg m²: an inertia that no rotor turns
 _STRIDE: Final = 50  # samples between two starts of a fit: windows do not overlap
 
 K: Final = ("rotors.thrust_coefficient",)
@@ -85,6 +86,7 @@ VARIANTS: Final = (
     Variant("+ thrust coefficient fitted", (K,), False),
     Variant("+ drag of the body", (K, *DRAG), False),
     Variant("or drag and inflow of the rotors instead", (K, *ROTOR_DRAG), False),
+    Variant("rates decay, no torques", (K, *DRAG, *DAMPING), False),
     Variant("rotors turn the craft, published inertia", (K, *DRAG)),
     Variant("+ inertia fitted", (K, *DRAG, *INERTIA)),
     Variant("+ moment of the air", (K, *DRAG, *INERTIA, *MOMENT)),
@@ -250,6 +252,9 @@ def _fitted(
     start = _flown(variant, {**held, **begun})
     if not variant.groups:
         return held
+    if not variant.turns:
+        decaying = [name for group in DAMPING if group in variant.groups for name in group]
+        start = {**start, **dict.fromkeys(decaying, _UNTURNED / 0.5)}  # time constant: 0.5 s
     found = Fit(base, windows, start, variant.groups).solve()
     if variant.turns:
         return found
@@ -257,10 +262,10 @@ def _fitted(
 
 
 def _flown(variant: Variant, numbers: Numbers) -> Numbers:
-    """With an inertia that nothing turns, where the rates stay constant."""
+    """Without torques of the rotors: an inertia that they cannot turn, and damping in its ratio."""
     if variant.turns:
         return numbers
-    return {**numbers, **{f"body.inertia.{axis}": 1e3 for axis in "xyz"}}
+    return {**numbers, **{f"body.inertia.{axis}": _UNTURNED for axis in "xyz"}}
 
 
 def _vehicle(base: Vehicle, numbers: Numbers, variant: Variant) -> tuple[str, Vehicle]:

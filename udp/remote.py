@@ -5,7 +5,7 @@ from typing import Any, Final, Unpack
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.vector import AutoresetMode
+from gymnasium.vector import AutoresetMode, VectorEnv
 
 from ..envs.autoreset import (
     AdvancingVectorEnv,
@@ -197,7 +197,7 @@ class RemoteEnv(_Remote, gym.Env[Any, Any]):
         return dict(zip(self._names, numbers, strict=True))
 
 
-class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
+class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
     """The M · N drones of M simulators with N drones each, in lock-step over one socket.
 
     The simulators may be on any machines, and come in any order: each takes the first slot that is
@@ -264,7 +264,7 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv):
         """Wait until every slot is taken."""
         spec = self._agent.connect()
         num_envs = self.num_simulators * (self._agent.config.drones or 1)
-        self._take_spec(spec, num_envs, self.metadata["autoreset_mode"])
+        self._take_spec(spec, num_envs, self.autoreset_mode)
         self._take_actions(spec.action, num_envs)
         self._shape = self.num_simulators, num_envs // self.num_simulators
         if not self._flying:

@@ -51,7 +51,9 @@ class TaskOptions:
         for name in options:
             if name not in known:
                 names = ", ".join([*known, *others])
-                raise UnknownOption(f"options: expected some of {names}, got {name!r}")
+                # TorchRL looks for Python's own words, and tries again without the keyword.
+                got = f"an unexpected keyword argument {name!r}"
+                raise UnknownOption(f"options: expected some of {names}, got {got}")
         return cls(**options)
 
 

@@ -88,6 +88,18 @@ def test_help(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize(
+    ("command", "default"),
+    [("train", "the preset's"), ("benchmark", "the preset's"), ("compare", "mujoco")],
+)
+def test_help_names_the_default_backend(
+    command: str, default: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = " ".join(run(capsys, command, "--help")[1].replace("│", " ").split())
+    flag = words.partition("--backend ")[2].partition(" --")[0]
+    assert f"(default: {default})" in flag
+
+
+@pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
         (["evaluate", "nowhere.safetensors"], "there is no file nowhere.safetensors"),

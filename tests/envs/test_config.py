@@ -121,7 +121,7 @@ def test_a_file_and_keywords_that_win(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("keywords", "sentence"),
     [
-        ({"frameskip": 4}, "options: expected some of goal, .*compiled, got 'frameskip'"),
+        ({"frameskip": 4}, "options: expected some of goal, .*compiled, got an unex.* 'frameskip'"),
         ({"task": 3}, "task: expected options by name, got 3"),
         ({"vehicle": 3}, "vehicle: expected names or files, got 3"),
         ({"cameras": 3}, "cameras: expected names, with commas between them, got 3"),
@@ -212,7 +212,7 @@ def test_setup_runs_once_in_a_loop() -> None:
 def test_an_unknown_keyword_is_a_type_error_too() -> None:
     """As TorchRL expects, which tries frameskip."""
     for make in (gym.make, lambda env_id, **rest: gym.make_vec(env_id, num_envs=2, **rest)):
-        with pytest.raises(TypeError, match="got 'frameskip'"):
+        with pytest.raises(TypeError, match="unexpected keyword argument 'frameskip'"):
             make(HOVER, frameskip=4)
 
 

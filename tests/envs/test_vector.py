@@ -3,18 +3,20 @@
 import os
 import signal
 import time
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from mujoco.batch import Batch, SimulationError
 from rotorgram.envs import LocalVectorEnv, Loop
 from rotorgram.envs.config import EnvConfig
 from rotorgram.models.errors import InputError
 from rotorgram.sim import PhysicsError
+from rotorgram.udp import RemoteVectorEnv
 
 ID = "rotorgram/Elevation-v0"
 HOVER = "rotorgram/Hover-v0"
@@ -182,7 +184,7 @@ def test_wrong_seeds(seed: Any) -> None:
         ({"num_envs": 0}, "num_envs: expected 1 to 65536, got 0"),
         ({"num_envs": 10**9}, "num_envs: expected 1 to 65536, got 1000000000"),
         ({"num_threads": -1}, "num_threads: expected 0 or more, got -1"),
-        ({"device": "cuda"}, "options: expected some of target, .*, got .device"),
+        ({"device": "cuda"}, "options: expected some of target, .*, got an .* .device"),
         ({"backend": "bullet"}, "backend: expected mujoco or rigid, got 'bullet'"),
         ({"autoreset_mode": "never"}, "autoreset_mode: expected 'NextStep' or 'SameStep'"),
         ({"render_mode": "ansi"}, "render_mode: expected None, 'human' or 'rgb_array', got 'ansi'"),
@@ -333,3 +335,13 @@ def test_threads_do_not_follow_into_a_fork() -> None:
     assert os.waitpid(child, 0)[1] == 0
     vector.step(action)
     vector.close()
+
+
+@pytest.mark.parametrize("mode", AutoresetMode)
+def test_other_libraries_find_the_autoreset_and_the_kind_of_env(mode: AutoresetMode) -> None:
+    """TorchRL reads the attribute; skrl looks for Gymnasium among the direct bases."""
+    with closing(gym.make_vec("rotorgram/Hover-v0", num_envs=2, autoreset_mode=mode)) as env:
+        assert env.autoreset_mode == mode
+        assert env.metadata["autoreset_mode"] == mode
+    for kind in (LocalVectorEnv, RemoteVectorEnv):
+        assert VectorEnv in kind.__bases__
