@@ -138,7 +138,9 @@ def test_options_through_make() -> None:
     assert env.observation_space.shape == (1,)
     assert env.env_spec.options["target"] == 6.0
     assert [env.step(_a(0))[3] for _ in range(3)] == [False, False, True]
-    with pytest.raises(InputError, match=r"^options: expected some of .*target.*, got an .* 'targt'"):
+    with pytest.raises(
+        InputError, match=r"^options: expected some of .*target.*, got an .* 'targt'"
+    ):
         gym.make(ID, targt=6)
     with pytest.raises(InputError, match=r"^render_mode: expected None, .*, got 'ansi'$"):
         SingleEnv(ID, render_mode="ansi")

@@ -159,7 +159,10 @@ def test_bounds_are_never_left_and_ends_are_never_both() -> None:
         ({"start_tilt": 81.0}, "start_tilt: expected a number from 0 to 80 degrees"),
         ({"start_heading": -1.0}, "start_heading: expected a number from 0 to 180 degrees"),
         ({"flight_band": 1.7}, "flight_band: expected more than .* = 1.732 m, got 1.7"),
-        ({"target": 5.0}, "options: expected some of goal, .*episode_length, .*, got an .* 'target'"),
+        (
+            {"target": 5.0},
+            "options: expected some of goal, .*episode_length, .*, got an .* 'target'",
+        ),
     ],
 )
 def test_a_wrong_option_gives_one_sentence(options: dict[str, Any], sentence: str) -> None:
