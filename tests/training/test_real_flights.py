@@ -82,11 +82,10 @@ def test_the_baseline_lets_the_rates_decay_whatever_the_rotors_do() -> None:
     windows = Windows.cut(flights, 50, 10, (10, 25, 50))
     damping = replace(baseline, groups=real_flights.DAMPING)
     numbers = real_flights._fitted(damping, vehicle, numbers_of(vehicle), windows, flights)
-    predicted = dict(predict(vehicle, real_flights._flown(damping, numbers), windows))
-    for horizon in (25, 50):
-        rates = predicted[horizon][3]
-        start = windows.start[3]
-        np.testing.assert_allclose(rates, start * np.exp(-horizon / 25), atol=0.02)
+    predicted = predict(vehicle, [real_flights._flown(damping, numbers)], windows)
+    for place, horizon in ((1, 25), (2, 50)):
+        expected = windows.start[:, 10:] * np.exp(-horizon / 25)
+        np.testing.assert_allclose(predicted[:, place, 10:], expected, atol=0.02)
 
 
 def test_the_page_has_the_figures_of_the_benchmark() -> None:
