@@ -227,7 +227,7 @@ def fly_hundred(steps: int) -> dict[str, Any]:
     return {
         "drones": 100, "faults": FAULTS, "control_steps": steps, "drone_steps": 100 * steps,
         "episodes": episodes, "steps_that_differ": different,
-        "bytes_of_a_state": simulator.link.layout.state_size,
+        "bytes_of_a_state": simulator.link.layout.state.size,
         "network": json.loads(relays.stdout.readline())[0],
     }  # fmt: skip
 

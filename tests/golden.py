@@ -233,7 +233,7 @@ def malformed(right: dict[str, bytes]) -> list[tuple[str, str, bytes]]:
     freeze = right["command: fly, freeze"]
     nan = b"\x00\x00\xc0\x7f"
     infinity = b"\x00\x00\x80\x7f"
-    flags = LAYOUTS["one"].flags[0].at
+    flags = LAYOUTS["one"].state.flags.start
     missing = right["missing: 0, 2 and 9 of 10"]
     one = "one"
     two = "two"
@@ -265,7 +265,7 @@ def malformed(right: dict[str, bytes]) -> list[tuple[str, str, bytes]]:
         ("a Command that resets, with choice 3", one,
          changed(changed(choice, 32, b"\x03"), 40, b"\x01")),
         ("a Command with an action that is NaN for a frozen drone", two, changed(freeze, 36, nan)),
-        ("a Command with order 3", two, changed(freeze, LAYOUTS["two"].orders.at, b"\x03")),
+        ("a Command with order 3", two, changed(freeze, LAYOUTS["two"].command.flags.start, b"\x03")),
         ("a Command with one seed for two drones", two, changed(freeze, 24, b"\x01")),
         ("a Close with a longer reason than it has", one, changed(close, 24, b"\x05")),
         ("a Close with a line feed", one, changed(close, 26, b"\n")),
@@ -391,9 +391,9 @@ def golden() -> dict[str, Any]:
             name: {
                 "worlds": WORLDS[name],
                 "spec": json.loads(spec.to_json()),
-                "state bytes": LAYOUTS[name].state_size,
+                "state bytes": LAYOUTS[name].state.size,
                 "command bytes without and with seeds": [
-                    LAYOUTS[name].orders.end, LAYOUTS[name].command_size
+                    LAYOUTS[name].command.size, LAYOUTS[name].seeded_command.size
                 ],
             }
             for name, spec in SPECS.items()

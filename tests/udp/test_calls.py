@@ -44,6 +44,6 @@ def test_a_step_of_one_drone_takes_few_calls() -> None:
             sys.setprofile(None)
     running.join()
     assert counts["RemoteEnv.step"] == STEPS
-    assert counts["encode_state"] >= STEPS  # the other side is counted too
+    assert counts["encode_step"] >= STEPS  # the other side is counted too
     # The median: a busy machine sends some messages again.
     assert 20 < median(after - before for before, after in pairwise(totals)) <= MOST, counts

@@ -88,7 +88,7 @@ def test_any_state_and_command_comes_back(of: Layout, seed: int) -> None:
     data = binary.encode(sent, of)
     got = binary.decode(data, of)
     assert isinstance(got, State)
-    assert len(data) == of.state_size
+    assert len(data) == of.state.size
     assert got.session == 3
     assert got.sequence == 9
     assert got.time == 0.25
@@ -116,7 +116,8 @@ def test_any_state_and_command_comes_back(of: Layout, seed: int) -> None:
         data = binary.encode(order, of)
         back = binary.decode(data, of)
         assert isinstance(back, Command)
-        assert len(data) == (of.seeds.end if seeds is not None else of.orders.end)
+        record = of.command if seeds is None else of.seeded_command
+        assert len(data) == record.size
         assert back.actions.tobytes() == order.actions.tobytes()
         assert (back.orders == order.orders).all()
         assert (back.resets == (order.orders == RESET)).all()
@@ -132,15 +133,15 @@ def test_arrays_lie_at_multiples_of_eight() -> None:
         telemetry=((3,),),
     )
     assert [slot.at for slot in of.observation_slots] == [40, 56]
-    assert of.rewards.at == 72
-    assert of.flags[0].at == 96
-    assert of.flags[1].at == 99
+    assert of.state.slots[2].at == 72
+    assert of.state.flags.start == 96
+    assert of.state.slots[4].at == 99
     assert of.telemetry_slots[0].at == 104
-    assert of.state_size == 104 + 72
+    assert of.state.size == 104 + 72
     assert of.actions.at == 32
-    assert of.orders.at == 48
-    assert of.seeds.at == 56
-    assert of.command_size == 80
+    assert of.command.slots[1].at == 48
+    assert of.seeded_command.slots[2].at == 56
+    assert of.seeded_command.size == 80
 
 
 @pytest.mark.parametrize("message", SHORT, ids=lambda m: type(m).__name__)
@@ -226,7 +227,7 @@ def test_what_is_not_finite_does_not_travel(value: float, drones: int) -> None:
     with pytest.raises(InputError, match="finite"):
         binary.encode(action, of)
     data = binary.encode(state(1, of=of), of)
-    at = of.rewards.at
+    at = of.state.slots[1].at
     forged = data[24:at] + struct.pack("<d", value) + data[at + 8 :]
     with pytest.raises(DecodeError, match="finite"):
         binary.decode(binary.frame(4, 1, 1, forged), of)

@@ -156,7 +156,7 @@ class Admission:
             return layout
         try:
             largest = largest_datagram(address, self._outbox.max_datagram)
-            check_size(layout.command_size, largest)
+            check_size(layout.seeded_command.size, largest)
         except InputError as error:
             return str(error)
         return layout
@@ -190,7 +190,7 @@ class Admission:
             if sequence < 1:
                 self.drop("stale", "", arrival)
                 return None
-            largest = opening.layout.state_size
+            largest = opening.layout.state.size
             key = opening.session_key()
         place = arrival.address, number
         assembler = self._assembling.get(place) or Assembler(largest)

@@ -6,32 +6,56 @@ constants and structs below follow it, and `tests/golden.py` writes the bytes th
 
 import struct
 import zlib
-from collections.abc import Callable, Iterable
 from math import isfinite
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from ...models.errors import InputError
-from . import messages
 from .errors import DecodeError, VersionMismatch
-from .layout import COMMAND_ARRAYS_AT, MAX_MESSAGE, Layout, Slot
-from .messages import MAX_SPEC, MAX_TEXT, Command, Extension, Message, State
+from .layout import Layout, Record
+from .messages import (
+    MAX_SPEC,
+    MAX_TEXT,
+    Alive,
+    Close,
+    Command,
+    Extension,
+    Hello,
+    Message,
+    Missing,
+    Refuse,
+    State,
+    Unknown,
+    Wait,
+    Welcome,
+)
 
 MAGIC: Final = b"\xa7R"  # not UTF-8, so that no text datagram begins with it
 VERSION: Final = 2
 HEADER_SIZE: Final = 24
 
 HELLO: Final = 1
-_WELCOME: Final = 2
 REFUSE: Final = 3
 STATE: Final = 4
 COMMAND: Final = 5
 CLOSE: Final = 6
-_WAIT: Final = 7
 UNKNOWN: Final = 8
 ALIVE: Final = 9
 MISSING: Final = 10
+_MESSAGES: Final = (
+    Hello,
+    Welcome,
+    Refuse,
+    State,
+    Command,
+    Close,
+    Wait,
+    Unknown,
+    Alive,
+    Missing,
+)
+"""In the order of their types, from 1 on."""
 
 FRAGMENT: Final = 0x80  # set in the type of a fragment of a message
 OF_SESSION: Final = frozenset({STATE, COMMAND, CLOSE, ALIVE})
@@ -43,12 +67,15 @@ _HEADER: Final = struct.Struct("<2sBBIQQ")
 _NUMBERS: Final = struct.Struct("<QQ")  # session, sequence: the end of the header
 _HELLO_BODY: Final = struct.Struct("<BB2xII4x")
 _WELCOME_BODY: Final = struct.Struct("<QQBB6x")
+_REST_AT: Final = 8  # first byte after the checksum
 _STATE_BODY: Final = struct.Struct("<dQ")
 _STATE_HEAD: Final = struct.Struct("<QQdQ")  # numbers and body
 _COMMAND_BODY: Final = struct.Struct("<I4x")
 _COMMAND_HEAD: Final = struct.Struct("<QQI4x")  # numbers and body
 _MISSING_BODY: Final = struct.Struct("<BxHH")
 _EXTENSION: Final = struct.Struct("<HH")
+_START: Final = {kind: MAGIC + bytes((VERSION, kind)) for kind in (STATE, COMMAND)}
+_START_CRC: Final = {kind: zlib.crc32(start) for kind, start in _START.items()}
 _LENGTH: Final = struct.Struct("<H")
 _CRITICAL: Final = 1 << 15
 _MAX_EXTENSIONS: Final = 64
@@ -62,19 +89,14 @@ def encode(message: Message, layout: Layout | None = None) -> bytes:
 
     Raises `InputError` if a number, an array or the whole does not fit.
     """
-    if isinstance(message, State):
-        return encode_state(message, _expect(layout))
-    if isinstance(message, Command):
-        return encode_command(message, _expect(layout))
-    name = type(message).__name__
-    kind, encoder = _ENCODERS[type(message)]
+    if isinstance(message, State | Command):
+        return encode_step(message, _expect(layout))
+    kind = _MESSAGES.index(type(message)) + 1
+    sequence = getattr(message, "sequence", 0)
     try:
-        data = frame(kind, message.session, getattr(message, "sequence", 0), encoder(message))
+        return frame(kind, message.session, sequence, _encode_body(message))
     except struct.error as error:
-        raise InputError(f"{name}: {error}") from None
-    if len(data) > MAX_MESSAGE:
-        raise InputError(f"{name}: expected at most {MAX_MESSAGE} bytes, got {len(data)}")
-    return data
+        raise InputError(f"{type(message).__name__}: {error}") from None
 
 
 def frame(kind: int, session: int, sequence: int, body: bytes) -> bytes:
@@ -106,16 +128,14 @@ def decode(datagram: bytes, layout: Layout | None = None) -> Message:
     Raises `DecodeError`, and nothing else, for any other bytes.
     """
     kind, session, sequence = check(datagram)
-    if kind not in _MESSAGES:
+    if not 1 <= kind <= len(_MESSAGES):
         raise DecodeError(f"type: expected 1 to {len(_MESSAGES)}, got {kind}")
-    message, _, decoder = _MESSAGES[kind]
     try:
-        if kind in _DUE:
-            return _DUE[kind][2](datagram, session, sequence, _expect(layout))
-        numbers: dict[str, Any] = {"sequence": sequence} if kind in _NUMBERED else {}
-        return message(session=session, **numbers, **decoder(datagram[HEADER_SIZE:]))
+        if kind in (STATE, COMMAND):
+            return _decode_step(kind, datagram, session, sequence, _expect(layout))
+        return _decode_body(kind, session, sequence, datagram[HEADER_SIZE:])
     except (ValueError, struct.error) as error:
-        raise DecodeError(f"{message.__name__.lower()}: {error}") from None
+        raise DecodeError(f"{_MESSAGES[kind - 1].__name__.lower()}: {error}") from None
 
 
 def decode_due(
@@ -126,13 +146,12 @@ def decode_due(
     The short way of a lock-step: only one header can come, so it is compared, not read. None sends
     any other datagram, and one that is wrong, the way of `decode`, which tells why.
     """
-    start, crc, decoder = _DUE[kind]
-    if datagram[:4] != start or datagram[8:24] != _NUMBERS.pack(session, sequence):
+    if datagram[:4] != _START[kind] or datagram[8:24] != _NUMBERS.pack(session, sequence):
         return None
-    if zlib.crc32(datagram[8:], crc) != int.from_bytes(datagram[4:8], "little"):
+    if zlib.crc32(datagram[8:], _START_CRC[kind]) != int.from_bytes(datagram[4:8], "little"):
         return None
     try:
-        return decoder(datagram, session, sequence, layout)
+        return _decode_step(kind, datagram, session, sequence, layout)
     except (ValueError, struct.error):
         return None
 
@@ -148,42 +167,83 @@ def peek(datagram: bytes) -> tuple[int, int, int]:
 # ---- State and Command
 
 
-def encode_state(m: State, layout: Layout) -> bytes:
-    """The bytes of a State, whole. Raises `InputError` as `encode`."""
-    slots = layout.state_slots
-    arrays = (*m.observations, m.rewards, m.terminated, m.truncated, *m.telemetry)
-    if len(arrays) != len(slots):
-        raise InputError(f"State: expected {len(slots)} arrays, got {len(arrays)}")
+def encode_step(m: State | Command, layout: Layout) -> bytes:
+    """The bytes of a State or a Command, whole. Raises `InputError` as `encode`."""
     try:
-        pieces = [_STATE_HEAD.pack(m.session, m.sequence, m.time, m.nonce)]
+        if isinstance(m, State):
+            record = layout.state
+            start = _START[STATE]
+            crc = _START_CRC[STATE]
+            time = m.time
+            pieces = [_STATE_HEAD.pack(m.session, m.sequence, time, m.nonce)]
+            arrays = (*m.observations, m.rewards, m.terminated, m.truncated, *m.telemetry)
+        else:
+            record = layout.command if m.seeds is None else layout.seeded_command
+            start = _START[COMMAND]
+            crc = _START_CRC[COMMAND]
+            time = 0.0
+            count = 0 if m.seeds is None else layout.drones
+            pieces = [_COMMAND_HEAD.pack(m.session, m.sequence, count)]
+            arrays = (m.actions, m.orders)
+            if m.seeds is not None:
+                arrays = (m.actions, m.orders, m.seeds)
     except struct.error as error:
-        raise InputError(f"State: {error}") from None
-    for (shape, dtype, _, pad), array in zip(slots, arrays, strict=True):
-        if array.shape != shape or (array.dtype is not dtype and array.dtype != dtype):
-            raise _misfit("State", shape, dtype, array)
-        pieces += (pad, array.tobytes())
+        raise InputError(f"{type(m).__name__}: {error}") from None
+    if len(arrays) != len(record.slots):
+        raise InputError(f"State: expected {len(record.slots)} arrays, got {len(arrays)}")
+    for slot, array in zip(record.slots, arrays, strict=True):
+        if array.shape != slot.shape or array.dtype != slot.dtype:  # numbers are never converted
+            raise InputError(
+                f"{type(m).__name__}: expected {slot.dtype.name} of shape {slot.shape}, "
+                f"got {array.dtype.name} of shape {array.shape}"
+            )
+        pieces += (slot.pad, array.tobytes())
     rest = b"".join(pieces)
-    numbers = layout.state_numbers
+    numbers = record.numbers
     # NaN and infinity stay in a sum. Huge numbers may overflow, so a second look decides.
-    if numbers is None or not isfinite(sum(numbers.unpack_from(rest, _BODY_AT))):
-        _expect_finite_state(_START + rest, m.time, layout)
-    crc = zlib.crc32(rest, _STATE_CRC)
-    return _STATE_START + crc.to_bytes(4, "little") + rest
+    at = record.slots[0].at - _REST_AT
+    if numbers is None or not isfinite(sum(numbers.unpack_from(rest, at), time)):
+        _check_numbers(bytes(_REST_AT) + rest, time, record, layout)
+    flags = record.flags
+    wrong = rest[flags.start - _REST_AT : flags.stop - _REST_AT].translate(None, record.legal)
+    if wrong:
+        raise _wrong_flags(wrong, record)
+    return start + zlib.crc32(rest, crc).to_bytes(4, "little") + rest
 
 
-def _decode_state(data: bytes, session: int, sequence: int, layout: Layout) -> State:
-    if len(data) != layout.state_size:
-        raise _wrong_size(data, layout.state_size)
-    time, nonce = _STATE_BODY.unpack_from(data, HEADER_SIZE)
-    numbers = layout.state_numbers
-    if numbers is None or not isfinite(sum(numbers.unpack_from(data, HEADER_SIZE))):
-        _expect_finite_state(data, time, layout)
-    terminated, truncated = layout.flags
-    if wrong := data[terminated.at : truncated.end].translate(None, b"\0\1"):
-        raise _wrong_flags(wrong, 1)
+def _decode_step(
+    kind: int, data: bytes, session: int, sequence: int, layout: Layout
+) -> State | Command:
+    time = 0.0
+    count = nonce = 0
+    if kind == STATE:
+        record = layout.state
+        time, nonce = _STATE_BODY.unpack_from(data, HEADER_SIZE)
+    else:
+        (count,) = _COMMAND_BODY.unpack_from(data, HEADER_SIZE)
+        if count not in (0, layout.drones):
+            raise InputError(f"seeds: expected 0 or {layout.drones}, got {count}")
+        record = layout.seeded_command if count else layout.command
+    if len(data) != record.size:
+        raise _wrong_size(data, record.size)
+    if wrong := data[record.flags].translate(None, record.legal):
+        raise _wrong_flags(wrong, record)
+    numbers = record.numbers
+    at = record.slots[0].at
+    if numbers is None or not isfinite(sum(numbers.unpack_from(data, at), time)):
+        _check_numbers(data, time, record, layout)
     arrays = []
-    for shape, dtype, at, _ in layout.state_slots:
-        arrays.append(np.ndarray(shape, dtype, data, at))
+    for slot in record.slots:
+        arrays.append(np.ndarray(slot.shape, slot.dtype, data, slot.at))
+    if kind == COMMAND:
+        actions, orders, *seeds = arrays
+        return Command(
+            session=session,
+            sequence=sequence,
+            actions=actions,
+            orders=orders,
+            seeds=seeds[0] if seeds else None,
+        )
     first = len(layout.observation)
     return State(
         session=session,
@@ -198,93 +258,24 @@ def _decode_state(data: bytes, session: int, sequence: int, layout: Layout) -> S
     )
 
 
-def encode_command(m: Command, layout: Layout) -> bytes:
-    """The bytes of a Command, whole. Raises `InputError` as `encode`."""
-    arrays = [(layout.actions, m.actions), (layout.orders, m.orders)]
-    count = 0
-    if m.seeds is not None:
-        arrays.append((layout.seeds, m.seeds))
-        count = layout.drones
-    try:
-        pieces = [_COMMAND_HEAD.pack(m.session, m.sequence, count)]
-    except struct.error as error:
-        raise InputError(f"Command: {error}") from None
-    end = COMMAND_ARRAYS_AT
-    for slot, array in arrays:
-        if array.shape != slot.shape or array.dtype != slot.dtype:  # numbers are never converted
-            raise _misfit("Command", slot.shape, slot.dtype, array)
-        pieces += (bytes(slot.at - end), array.tobytes())
-        end = slot.end
-    rest = b"".join(pieces)
-    flags = m.orders.tobytes().translate(None, b"\0\1\2")
-    if flags:
-        raise _wrong_flags(flags, 2)
-    quick = layout.command_numbers
-    if quick is None or not isfinite(sum(quick.unpack_from(rest, _ACTIONS_AT))):
-        _check_actions(_START + rest, layout)
-    crc = zlib.crc32(rest, _COMMAND_CRC)
-    return _COMMAND_START + crc.to_bytes(4, "little") + rest
-
-
-def _decode_command(data: bytes, session: int, sequence: int, layout: Layout) -> Command:
-    (count,) = _COMMAND_BODY.unpack_from(data, HEADER_SIZE)
-    if count not in (0, layout.drones):
-        raise InputError(f"seeds: expected 0 or {layout.drones}, got {count}")
-    slots = [layout.actions, layout.orders, layout.seeds][: 3 if count else 2]
-    if len(data) != slots[-1].end:
-        raise _wrong_size(data, slots[-1].end)
-    orders = layout.orders
-    flags = data[orders.at : orders.end].translate(None, b"\0\1\2")
-    if flags:
-        raise _wrong_flags(flags, 2)
-    quick = layout.command_numbers
-    if quick is None or not isfinite(sum(quick.unpack_from(data, COMMAND_ARRAYS_AT))):
-        _check_actions(data, layout)
-    arrays = []
-    for slot in slots:
-        arrays.append(np.ndarray(slot.shape, slot.dtype, data, slot.at))
-    return Command(
-        session=session,
-        sequence=sequence,
-        actions=arrays[0],
-        orders=arrays[1],
-        seeds=arrays[2] if count else None,
-    )
-
-
-def _check_actions(data: bytes, layout: Layout) -> None:
-    """Raises `InputError` for a choice that does not exist, or numbers that are not finite."""
-    actions = layout.actions
-    if not layout.choices:
-        _expect_finite("action", data, (actions,))
-        return
-    numbers = actions.view(data)
-    beyond = (numbers < 0) | (numbers >= layout.choices)
-    if beyond.any():
-        most = layout.choices - 1
-        raise InputError(f"action: expected a choice 0 to {most}, got {numbers[beyond][0]}")
-
-
-def _misfit(what: str, shape: tuple[int, ...], dtype: np.dtype, array: np.ndarray) -> InputError:
-    return InputError(
-        f"{what}: expected {dtype.name} of shape {shape}, "
-        f"got {array.dtype.name} of shape {array.shape}"
-    )
-
-
-def _expect_finite_state(data: bytes, time: float, layout: Layout) -> None:
+def _check_numbers(data: bytes, time: float, record: Record, layout: Layout) -> None:
+    """Raises `InputError` for numbers that are not finite, or a choice that does not exist."""
     if not isfinite(time):
         raise InputError(f"time: expected a finite number, got {time}")
-    _expect_finite("observation, reward, telemetry", data, layout.state_floats)
-
-
-def _expect_finite(what: str, data: bytes, slots: Iterable[Slot]) -> None:
-    for slot in slots:
+    for slot in record.slots:
+        if slot.dtype.kind != "f":
+            continue
         array = slot.view(data)
         finite = np.isfinite(array)
         if not finite.all():
             first = np.argwhere(~finite)[0].tolist()
-            raise InputError(f"{what}: expected finite numbers, got {array[*first]} at {first}")
+            raise InputError(f"expected finite numbers, got {array[*first]} at {first}")
+    if layout.choices and record is not layout.state:
+        actions = layout.actions.view(data)
+        beyond = (actions < 0) | (actions >= layout.choices)
+        if beyond.any():
+            most = layout.choices - 1
+            raise InputError(f"action: expected a choice 0 to {most}, got {actions[beyond][0]}")
 
 
 def _expect(layout: Layout | None) -> Layout:
@@ -297,125 +288,111 @@ def _wrong_size(data: bytes, size: int) -> InputError:
     return InputError(f"expected {size} bytes, got {len(data)}")
 
 
-def _wrong_flags(wrong: bytes, most: int) -> InputError:
-    return InputError(f"flags: expected 0 to {most}, got {wrong[0]}")
+def _wrong_flags(wrong: bytes, record: Record) -> InputError:
+    return InputError(f"flags: expected 0 to {record.legal[-1]}, got {wrong[0]}")
 
 
-# ---- all others: the body of a message, and its fields
+# ---- the bodies of all others
 
 
-def _encode_hello(m: messages.Hello) -> bytes:
-    spec = m.spec.encode()
-    return _HELLO_BODY.pack(*m.versions, m.worlds, len(spec)) + spec + _extensions(m.extensions)
-
-
-def _decode_hello(body: bytes) -> dict[str, Any]:
-    low, high, worlds, size = _HELLO_BODY.unpack_from(body)
-    at = _HELLO_BODY.size
-    most = min(MAX_SPEC, len(body) - at)
-    if not size <= most:
-        raise InputError(f"spec: expected at most {most} bytes, got {size}")
-    spec = body[at : at + size].decode()
-    extensions = _take_extensions(body, at + size)
-    return {"spec": spec, "worlds": worlds, "versions": (low, high), "extensions": extensions}
-
-
-def _encode_welcome(m: messages.Welcome) -> bytes:
-    body = _WELCOME_BODY.pack(m.nonce, m.seed or 0, m.seed is not None, m.version)
-    return body + _extensions(m.extensions)
-
-
-def _decode_welcome(body: bytes) -> dict[str, Any]:
-    nonce, seed, has_seed, version = _WELCOME_BODY.unpack_from(body)
-    if not has_seed <= 1:
-        raise InputError(f"has seed: expected 0 or 1, got {has_seed}")
-    extensions = _take_extensions(body, _WELCOME_BODY.size)
-    seed = seed if has_seed else None
-    return {"nonce": nonce, "version": version, "seed": seed, "extensions": extensions}
-
-
-def _encode_nothing(m: messages.Wait | messages.Unknown | messages.Alive) -> bytes:
+def _encode_body(m: Message) -> bytes:
+    match m:
+        case Hello():
+            spec = m.spec.encode()
+            head = _HELLO_BODY.pack(*m.versions, m.worlds, len(spec))
+            return head + spec + _extensions(m.extensions)
+        case Welcome():
+            head = _WELCOME_BODY.pack(m.nonce, m.seed or 0, m.seed is not None, m.version)
+            return head + _extensions(m.extensions)
+        case Refuse() | Close():
+            reason = m.reason.encode()
+            return _LENGTH.pack(len(reason)) + reason
+        case Missing():
+            return _MISSING_BODY.pack(m.kind, m.count, m.first) + m.bitmap
     return b""
 
 
-def _decode_nothing(body: bytes) -> dict[str, Any]:
+def _decode_body(kind: int, session: int, sequence: int, body: bytes) -> Message:
+    match kind:
+        case 1:
+            return _decode_hello(session, body)
+        case 2:
+            return _decode_welcome(session, body)
+        case 3:
+            return Refuse(session=session, reason=_decode_reason(body))
+        case 6:
+            return Close(session=session, sequence=sequence, reason=_decode_reason(body))
+        case 10:
+            of, count, first = _MISSING_BODY.unpack_from(body)
+            bitmap = body[_MISSING_BODY.size :]
+            return Missing(
+                session=session, sequence=sequence, kind=of, count=count, first=first, bitmap=bitmap
+            )
     if body:
         raise _wrong_size(body, 0)
-    return {}
+    match kind:
+        case 7:
+            return Wait(session=session)
+        case 8:
+            return Unknown(session=session, sequence=sequence)
+    return Alive(session=session, sequence=sequence)
 
 
-def _encode_missing(m: messages.Missing) -> bytes:
-    return _MISSING_BODY.pack(m.kind, m.count, m.first) + m.bitmap
+def _decode_hello(session: int, body: bytes) -> Hello:
+    low, high, worlds, size = _HELLO_BODY.unpack_from(body)
+    at = _HELLO_BODY.size
+    most = min(MAX_SPEC, len(body) - at)
+    if size > most:
+        raise InputError(f"spec: expected at most {most} bytes, got {size}")
+    return Hello(
+        session=session,
+        spec=body[at : at + size].decode(),
+        worlds=worlds,
+        versions=(low, high),
+        extensions=_take_extensions(body, at + size),
+    )
 
 
-def _decode_missing(body: bytes) -> dict[str, Any]:
-    kind, count, first = _MISSING_BODY.unpack_from(body)
-    bitmap = body[_MISSING_BODY.size :]
-    return {"kind": kind, "count": count, "first": first, "bitmap": bitmap}
+def _decode_welcome(session: int, body: bytes) -> Welcome:
+    nonce, seed, has_seed, version = _WELCOME_BODY.unpack_from(body)
+    if has_seed > 1:
+        raise InputError(f"has seed: expected 0 or 1, got {has_seed}")
+    extensions = _take_extensions(body, _WELCOME_BODY.size)
+    return Welcome(
+        session=session,
+        nonce=nonce,
+        version=version,
+        seed=seed if has_seed else None,
+        extensions=extensions,
+    )
 
 
-def _encode_reason(m: messages.Refuse | messages.Close) -> bytes:
-    raw = m.reason.encode()
-    return _LENGTH.pack(len(raw)) + raw
-
-
-def _decode_reason(body: bytes) -> dict[str, Any]:
+def _decode_reason(body: bytes) -> str:
     (size,) = _LENGTH.unpack_from(body)
-    if not size <= MAX_TEXT:
-        raise InputError(f"reason: expected at most {MAX_TEXT} bytes, got {size}")
     if len(body) != _LENGTH.size + size:
         raise _wrong_size(body, _LENGTH.size + size)
-    return {"reason": body[_LENGTH.size :].decode()}
+    return body[_LENGTH.size :].decode()
 
 
 def _extensions(extensions: tuple[Extension, ...]) -> bytes:
-    return b"".join(
-        _EXTENSION.pack(e.number | (_CRITICAL if e.critical else 0), len(e.value)) + e.value
-        for e in extensions
-    )
+    pieces = []
+    for each in extensions:
+        number = each.number | (_CRITICAL if each.critical else 0)
+        pieces += (_EXTENSION.pack(number, len(each.value)), each.value)
+    return b"".join(pieces)
 
 
 def _take_extensions(data: bytes, at: int) -> tuple[Extension, ...]:
     extensions: list[Extension] = []
     while at < len(data):
-        if not len(extensions) < _MAX_EXTENSIONS:
+        if len(extensions) == _MAX_EXTENSIONS:
             raise InputError(f"extensions: expected at most {_MAX_EXTENSIONS}, got more")
         number, size = _EXTENSION.unpack_from(data, at)
         at += _EXTENSION.size
-        if not size <= len(data) - at:
-            raise InputError(f"extension: expected {size} bytes, got {len(data) - at}")
-        critical = bool(number & _CRITICAL)
         value = data[at : at + size]
+        if len(value) < size:
+            raise InputError(f"extension: expected {size} bytes, got {len(value)}")
+        critical = bool(number & _CRITICAL)
         extensions.append(Extension(number=number & ~_CRITICAL, value=value, critical=critical))
         at += size
     return tuple(extensions)
-
-
-_MESSAGES: Final[dict[int, tuple[type[Message], Callable[..., bytes], Callable[..., Any]]]] = {
-    HELLO: (messages.Hello, _encode_hello, _decode_hello),
-    _WELCOME: (messages.Welcome, _encode_welcome, _decode_welcome),
-    REFUSE: (messages.Refuse, _encode_reason, _decode_reason),
-    STATE: (State, encode_state, _decode_state),
-    COMMAND: (Command, encode_command, _decode_command),
-    CLOSE: (messages.Close, _encode_reason, _decode_reason),
-    _WAIT: (messages.Wait, _encode_nothing, _decode_nothing),
-    UNKNOWN: (messages.Unknown, _encode_nothing, _decode_nothing),
-    ALIVE: (messages.Alive, _encode_nothing, _decode_nothing),
-    MISSING: (messages.Missing, _encode_missing, _decode_missing),
-}
-
-_ENCODERS: Final = {message: (kind, encoder) for kind, (message, encoder, _) in _MESSAGES.items()}
-
-# The start and body position of the two messages of a step; the CRC-32 goes on from the start's.
-_STATE_START: Final = MAGIC + bytes((VERSION, STATE))
-_COMMAND_START: Final = MAGIC + bytes((VERSION, COMMAND))
-_STATE_CRC: Final = zlib.crc32(_STATE_START)
-_COMMAND_CRC: Final = zlib.crc32(_COMMAND_START)
-_START: Final = bytes(8)  # in the place of a start, for a look at arrays by their offset
-_BODY_AT: Final = HEADER_SIZE - len(_START)
-_ACTIONS_AT: Final = COMMAND_ARRAYS_AT - len(_START)
-
-_DUE: Final[dict[int, tuple[bytes, int, Callable[..., State | Command]]]] = {
-    STATE: (_STATE_START, _STATE_CRC, _decode_state),
-    COMMAND: (_COMMAND_START, _COMMAND_CRC, _decode_command),
-}

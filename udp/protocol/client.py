@@ -210,7 +210,7 @@ class Client:
             if key:
                 raise InputError("text codec: expected no key, got one: only binary can be sealed")
             text.check_layout(layout)
-        check_size(max(layout.state_size, len(binary.encode(hello))), largest)
+        check_size(max(layout.state.size, len(binary.encode(hello))), largest)
         self.hello = hello
         self.layout = layout
         self.state = SimulatorState.READY if by_text else SimulatorState.IDLE
@@ -230,7 +230,7 @@ class Client:
         self._draw_session = draw_session
         self._dice = Random(config.drop_seed).random if config.drop else None
         self._is_queued = False
-        self._assembler = Assembler(layout.command_size)
+        self._assembler = Assembler(layout.seeded_command.size)
         self._window = Window()
         self._transfer: Transfer | None = None  # of the outstanding message
         self._transfer_key: Key | None = None
@@ -503,7 +503,7 @@ class Client:
         self.sequence = 0
         self._session_key = None
         self._is_queued = False
-        self._assembler = Assembler(self.layout.command_size)
+        self._assembler = Assembler(self.layout.seeded_command.size)
         self._send(self.hello, now)
 
     # ---- what is sent
@@ -512,7 +512,7 @@ class Client:
         """Send a message and repeat it until it is answered."""
         kind = type(message)
         if isinstance(message, State) and not self.by_text:
-            data = binary.encode_state(message, self.layout)
+            data = binary.encode_step(message, self.layout)
         else:
             data = self._encode(message)
         if self.tap:

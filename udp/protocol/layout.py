@@ -18,8 +18,7 @@ MAX_MESSAGE: Final = 1 << 24  # largest message in all its fragments, bytes
 STATE_ARRAYS_AT: Final = 40
 COMMAND_ARRAYS_AT: Final = 32
 
-_LETTERS: Final = {"float32": "f", "float64": "d", "uint8": "B", "int32": "i", "int64": "q"}
-"""The dtypes that may cross the wire, and how `struct` calls them."""
+_LETTERS: Final = {"float32": "f", "float64": "d"}  # names of `struct`
 _SMALL: Final = 256  # up to this many numbers Python's loop is faster than NumPy's calls
 
 
@@ -38,10 +37,22 @@ class Slot(NamedTuple):
     end: int  # first byte after it
     shape: tuple[int, ...]  # (N, *shape)
     dtype: np.dtype  # little-endian
+    pad: bytes  # the zeros before it
 
     def view(self, data: bytes) -> np.ndarray:
         """The array in a message, not copied, read-only."""
         return np.ndarray(self.shape, self.dtype, data, self.at)
+
+
+class Record(NamedTuple):
+    """The arrays of a State or a Command."""
+
+    slots: tuple[Slot, ...]
+    size: int  # bytes of the message
+    flags: slice  # bytes that are flags or orders
+    legal: bytes  # values of these bytes
+    numbers: struct.Struct | None
+    """Reads the floats from the first array on, for a quick check; None if NumPy is faster."""
 
 
 class Layout:
@@ -49,27 +60,15 @@ class Layout:
 
     Args:
         drones: N, of all worlds together.
-        observation: Of one drone.
+        observation: Arrays of one drone.
         action: None if actions are discrete.
         choices: Discrete actions are 0 ... choices - 1; 0 if actions are an array.
         telemetry: Shape of each telemetry array of one drone.
 
     Attributes:
-        observation_slots: Of each observation array in a State.
-        rewards: float64, shape (N,).
-        flags: terminated and truncated, bool, shape (N,).
-        telemetry_slots: Of each telemetry array in a State, float64.
-        state_slots: Every array of a State in its order: shape, dtype, first byte, and the zeros
-            before. Plain tuples, for they are looked at in each message.
-        state_floats: Where its numbers lie that have to be finite: of the telemetry all together.
-        state_numbers: Reads every float of a State after its header, for a quick look at whether
-            all are finite. None where there are so many that NumPy is faster.
-        actions: Of the actions in a Command: (N, *shape), or int64 of shape (N,) if discrete.
-        orders: uint8, shape (N,).
-        seeds: uint64, shape (N,), in a Command that has any; others end before.
-        command_numbers: Reads every float of a Command, as `state_numbers`; None too if discrete.
-        state_size: Bytes of a State.
-        command_size: Bytes of a Command with seeds.
+        state: Observations, rewards (float64), terminated, truncated (bool), telemetry (float64).
+        command: Actions (N, *shape), or int64 of shape (N,) if discrete; orders (uint8).
+        seeded_command: The same with seeds (uint64).
 
     Raises:
         InputError: The drones are too many, or a message would be larger than `MAX_MESSAGE`.
@@ -93,59 +92,52 @@ class Layout:
         self.telemetry = telemetry
 
         reward = ArrayLayout((), "float64")
-        *slots, self.rewards = _slots(STATE_ARRAYS_AT, drones, [*observation, reward])
-        at = self.rewards.end
-        end = self.rewards.end + drones
-        flag = np.dtype(bool)
-        self.flags = Slot(at, end, (drones,), flag), Slot(end, end + drones, (drones,), flag)
-        told = _slots(end + drones, drones, [ArrayLayout(shape, "float64") for shape in telemetry])
-        self.observation_slots = tuple(slots)
-        self.telemetry_slots = tuple(told)
-        slots += [self.rewards, *self.flags, *told]
-        ends = [STATE_ARRAYS_AT, *(slot.end for slot in slots)]
-        self.state_slots = tuple(
-            (slot.shape, slot.dtype, slot.at, bytes(slot.at - end))
-            for slot, end in zip(slots, ends, strict=False)
-        )
-        self.state_size = ends[-1]
-        self.state_floats = [
-            slot for slot in slots[: len(observation) + 1] if slot.dtype.kind == "f"
-        ]
-        if told:  # float64 side by side: one array, for one look at it
-            at = told[0].at
-            end = told[-1].end
-            self.state_floats.append(Slot(at, end, ((end - at) // 8,), told[0].dtype))
-        self.state_numbers = _numbers("d8x", STATE_ARRAYS_AT, self.state_floats)
+        flag = ArrayLayout((), "bool")
+        told = [ArrayLayout(shape, "float64") for shape in telemetry]
+        arrays = [*observation, reward, flag, flag, *told]
+        slots = _slots(STATE_ARRAYS_AT, drones, arrays)
+        first = len(observation)
+        flags = slice(slots[first + 1].at, slots[first + 2].end)
+        self.state = Record(slots, slots[-1].end, flags, b"\0\1", _numbers(slots))
+        self.observation_slots = slots[:first]
+        self.telemetry_slots = slots[first + 3 :]
 
         actions = action or ArrayLayout((), "int64")
         arrays = [actions, ArrayLayout((), "uint8"), ArrayLayout((), "uint64")]
-        self.actions, self.orders, self.seeds = _slots(COMMAND_ARRAYS_AT, drones, arrays)
-        self.command_size = self.seeds.end
-        self.command_numbers = _numbers("", COMMAND_ARRAYS_AT, [self.actions]) if action else None
-        if (size := max(self.state_size, self.command_size)) > MAX_MESSAGE:
+        slots = _slots(COMMAND_ARRAYS_AT, drones, arrays)
+        self.actions, orders, _ = slots
+        flags = slice(orders.at, orders.end)
+        numbers = _numbers(slots[:1]) if action else None
+        self.command = Record(slots[:2], orders.end, flags, b"\0\1\2", numbers)
+        self.seeded_command = self.command._replace(slots=slots, size=slots[-1].end)
+        size = max(self.state.size, self.seeded_command.size)
+        if size > MAX_MESSAGE:
             most = f"States and Commands of at most {MAX_MESSAGE} bytes"
             raise InputError(f"expected {most}, got {size}")
 
 
-def _slots(at: int, drones: int, arrays: Sequence[ArrayLayout]) -> list[Slot]:
-    slots = []
+def _slots(at: int, drones: int, arrays: Sequence[ArrayLayout]) -> tuple[Slot, ...]:
+    slots: list[Slot] = []
     for shape, name in arrays:
-        at = -(-at // 8) * 8
+        begin = at
+        if not (name == "bool" and slots[-1].dtype == bool):  # the second flag follows the first
+            begin = -(-at // 8) * 8
         dtype = np.dtype("<" + np.dtype(name).str[1:])  # NumPy's own object: quick to compare
-        end = at + drones * math.prod(shape) * dtype.itemsize
-        slots.append(Slot(at, end, (drones, *shape), dtype))
+        end = begin + drones * math.prod(shape) * dtype.itemsize
+        slots.append(Slot(begin, end, (drones, *shape), dtype, bytes(begin - at)))
         at = end
-    return slots
+    return tuple(slots)
 
 
-def _numbers(fixed: str, at: int, slots: list[Slot]) -> struct.Struct | None:
-    """Reads the floats of all slots behind `fixed`, which ends at that byte; None if many."""
-    form = "<" + fixed
+def _numbers(slots: Sequence[Slot]) -> struct.Struct | None:
+    """Reads the floats of all slots from the first byte of the first slot on."""
+    form = "<"
     count = 0
+    at = slots[0].at
     for slot in slots:
         if slot.dtype.kind == "f":
             size = math.prod(slot.shape)
             form += f"{slot.at - at}x{size}{_LETTERS[slot.dtype.name]}"
             at = slot.end
-            count = count + size
+            count += size
     return struct.Struct(form) if count <= _SMALL else None

@@ -143,7 +143,7 @@ class Session:
             seeds=seeds,
         )
         layout = self.layout
-        data = text.encode(command) if self.is_text else binary.encode_command(command, layout)
+        data = text.encode(command) if self.is_text else binary.encode_step(command, layout)
         self.state = AGENT[self.state, Way.SENT, Command]
         self.asked_at = self.heard_at = now
         self.reply = reply = Transfer(data, self._largest, self._window)
@@ -267,7 +267,7 @@ class Session:
                 self.answer_again()
             self._drop("duplicate" if is_repeat else "stale", now)
             return None
-        self._assembler = self._assembler or Assembler(self.layout.state_size)
+        self._assembler = self._assembler or Assembler(self.layout.state.size)
         self.heard_at = now
         whole = self._assembler.take(fragment)
         if whole is None and asks(fragment) and (missing := self._assembler.missing()):
