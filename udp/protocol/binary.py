@@ -375,7 +375,7 @@ def _decode_reason(body: bytes) -> str:
 
 
 def _extensions(extensions: tuple[Extension, ...]) -> bytes:
-    pieces = []
+    pieces: list[bytes] = []
     for each in extensions:
         number = each.number | (_CRITICAL if each.critical else 0)
         pieces += (_EXTENSION.pack(number, len(each.value)), each.value)
