@@ -25,7 +25,6 @@ from rotorgram.envs.config import EnvConfig
 from rotorgram.udp import RemoteEnv
 from rotorgram.udp.journal import Journal, Recording, Summary
 from rotorgram.udp.protocol.messages import Command, Hello, State
-from rotorgram.udp.protocol.statistics import Statistics
 from rotorgram.udp.spawn import start_simulator
 
 SIDES: dict[str, tuple[str, ...]] = {
@@ -130,7 +129,7 @@ def journal_alone(source: Path, target: Path, repeats: int = 9) -> float:
     flown = flown[:40_000]
     times = []
     for number in range(repeats):
-        journal = Journal(target / f"{number}.mcap", Statistics(), side="agent")
+        journal = Journal(target / f"{number}.mcap", side="agent")
         journal.tap(0, hello.message, hello.datagram)
         start = time.perf_counter()
         for message, datagram in flown:

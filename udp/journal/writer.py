@@ -13,35 +13,26 @@ import time
 import weakref
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from errno import EFBIG, EINTR
+from errno import EINTR
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from threading import RLock
-from typing import Any, Final
+from typing import Final
 
 from mcap.writer import Writer
 
-from ...envs.spec import EnvSpec
-from ..layouts import layout_of
 from ..protocol import binary
 from ..protocol.messages import Command, Hello, Message, State
-from ..protocol.statistics import Statistics
+from ..transport.stepped import Steppable
 
 ABOUT: Final = "rotorgram"  # name of the metadata about the whole file
 FORMAT: Final = "3"  # version of the file's content, beside the protocol's in each datagram
 
 _CHUNK: Final = 1 << 16  # bytes; 2 ms to write
 _SECOND: Final = 10**9
-_STATISTICS: Final = 10 * _SECOND
-_MAX_CHANNELS: Final = 0xFFFF
 _BUFFER: Final = 1 << 20  # bytes; more than a chunk, so that its records reach the file at once
 _PACKAGES: Final = ("rotorgram", "mujoco", "gymnasium", "numpy", "mcap")
 
 _log: Final = logging.getLogger("rotorgram.udp")
-
-_EVENT: Final = "rotorgram.Event", '{"type": "object"}'
-_NUMBER: Final = '{"type": "object", "additionalProperties": {"type": "number"}}'
-_NUMBERS: Final = "rotorgram.Statistics", _NUMBER
 
 
 class Journal:
@@ -52,7 +43,6 @@ class Journal:
 
     Args:
         path: The file; it must not exist.
-        statistics: Those of the link. They are written every 10 s, and at the end.
         side: `simulator` or `agent`.
         slots: Sessions in the slots of an agent; another one in a slot is another session. Only the
             text codec needs them: there all sessions have the same number.
@@ -69,7 +59,6 @@ class Journal:
     def __init__(
         self,
         path: Path | str,
-        statistics: Statistics,
         *,
         side: str,
         slots: Sequence[object] = ("the only agent",),
@@ -77,13 +66,11 @@ class Journal:
         about: Mapping[str, str] | None = None,
         models: Mapping[str, str] | None = None,
     ) -> None:
-        self._statistics = statistics
         self._slots = slots
         self._text_hello = text_hello
         self._holders: dict[int, object] = {}  # by slot: number of a binary session, or a text one
-        self._channels: dict[tuple[int, int], int] = {}  # by slot and kind of message
-        self._size = self._sessions = 0
-        now = self._flushed = self._counted = time.time_ns()
+        self._size = 0  # bytes that are not written yet
+        now = self._flushed = time.time_ns()
         versions = software()
         head = {f"version of {name}": number for name, number in versions.items()}
         head |= {"format": FORMAT, "side": side, **(about or {})}
@@ -93,9 +80,7 @@ class Journal:
             sentence = f"record: expected a file that does not exist yet, got {path}"
             raise FileExistsError(sentence) from None
         try:
-            file.add_metadata(ABOUT, head)
-            for name, model in (models or {}).items():
-                file.add_attachment(name, "application/xml", model.encode(), now)
+            file.write_head(head, models or {}, now)
         except BaseException as error:
             file.abandon()
             Path(path).unlink()
@@ -103,25 +88,26 @@ class Journal:
                 raise OSError(error.errno, error.strerror, str(path)) from None
             raise
         self._file = file
-        self._pending = file.pending
         weakref.finalize(self, file.close)
 
     def tap(self, slot: int, message: Message, datagram: bytes) -> None:
         """Take note of a message: a `Tap`. `write` pays for writing it."""
-        now = time.time_ns()
         if self._file.closed:
             return
+        now = time.time_ns()
         try:
             if isinstance(message, Hello):
-                self._begin(slot, message, datagram, "binary", now)
                 self._holders[slot] = message.session
-            elif message.session != self._holders.get(slot):  # no Hello: by text
+                self._add_event(slot, message, datagram, now, codec="binary")
+                return
+            if message.session != self._holders.get(slot):  # no Hello: by text
                 self._begin_by_text(slot, now)
             if isinstance(message, State | Command):
-                channel = self._channels[slot, datagram[3]]
-                self._pending.append((channel, now, message.sequence, datagram))
-            elif not isinstance(message, Hello):
-                self._add_json(f"/slot{slot}/events", _EVENT, _words(message, datagram), now)
+                topic = "state" if isinstance(message, State) else "command"
+                channel = self._file.channel(f"/slot{slot}/{topic}", "rotorgram")
+                self._file.pending.append((channel, now, message.sequence, datagram))
+            else:
+                self._add_event(slot, message, datagram, now)
             self._size += len(datagram)
             if self._size > 4 * _CHUNK:  # nobody calls `write`
                 self._flush(now)
@@ -142,22 +128,12 @@ class Journal:
 
     def close(self) -> None:
         """Write all, and finish the file. May be called again."""
-        if self._file.closed:
-            return
-        try:
-            self._count(time.time_ns())
-        except OSError as error:
-            self._file.give_up(error)
         self._file.close()
 
     def _flush(self, now: int) -> None:
-        if not 0 <= now - self._counted < _STATISTICS:
-            self._count(now)
         self._file.flush()
         self._size = 0
         self._flushed = now
-
-    # ---- sessions
 
     def _begin_by_text(self, slot: int, now: int) -> None:
         """Begin a session if this is the first message of a new text simulator."""
@@ -166,37 +142,19 @@ class Journal:
         holder = self._slots[slot]
         if holder is not self._holders.get(slot):
             self._holders[slot] = holder
-            self._begin(slot, hello, binary.encode(hello), "text", now)
+            self._add_event(slot, hello, binary.encode(hello), now, codec="text")
 
-    def _begin(self, slot: int, hello: Hello, datagram: bytes, codec: str, now: int) -> None:
-        """Take note of a new session, whose messages may have another layout."""
-        self._flush(now)
-        self._sessions += 1
-        layout = layout_of(EnvSpec.from_json(hello.spec), hello.worlds)
-        words = {
-            "index": str(self._sessions),
-            "slot": str(slot),
-            "session": f"{hello.session:016x}",
-            "codec": codec,
-            "drones": str(layout.drones),
-            "spec": hello.spec,
-        }
-        self._file.add_metadata("session", words)
-        for kind, topic in ((binary.STATE, "state"), (binary.COMMAND, "command")):
-            channel = self._file.channel(f"/slot{slot}/{topic}", "rotorgram")
-            self._channels[slot, kind] = channel
-        words = _words(hello, datagram) | {"codec": codec}
-        self._add_json(f"/slot{slot}/events", _EVENT, words, now)
-
-    def _count(self, now: int) -> None:
-        self._counted = now
-        self._add_json("/statistics", _NUMBERS, self._statistics.numbers(), now)
-
-    def _add_json(
-        self, topic: str, schema: tuple[str, str], words: Mapping[str, Any], now: int
+    def _add_event(
+        self, slot: int, message: Message, datagram: bytes, now: int, **more: str
     ) -> None:
-        channel = self._file.channel(topic, "json", schema)
-        self._pending.append((channel, now, 0, json.dumps(words).encode()))
+        """Add a message for readers, with its datagram for programs."""
+        words = {"type": type(message).__name__, "session": f"{message.session:016x}", **more}
+        for name in ("worlds", "spec", "seed", "sequence", "reason"):
+            if hasattr(message, name):
+                words[name] = getattr(message, name)
+        words["datagram"] = datagram.hex()
+        channel = self._file.channel(f"/slot{slot}/events", "json")
+        self._file.pending.append((channel, now, 0, json.dumps(words).encode()))
 
 
 def software() -> dict[str, str]:
@@ -208,19 +166,19 @@ def software() -> dict[str, str]:
     return versions
 
 
-def models_of(stepped: Any) -> tuple[dict[str, str], dict[str, str]]:
+def models_of(stepped: Steppable) -> tuple[dict[str, str], dict[str, str]]:
     """Metadata and attachments that describe the vehicles of a registered task; else empty.
 
     The attachments are the whole MJCF of each different vehicle, its includes resolved. The
     metadata `models` names the attachment of each drone of a world, in their order.
     """
-    task = getattr(stepped, "task", None)
-    if task is None:
-        return {}, {}
-
+    from ...envs.loop import Loop
     from ...models.mjcf import vehicle_spec
 
-    members = getattr(task.vehicle, "members", (task.vehicle,))
+    if not isinstance(stepped, Loop):
+        return {}, {}
+    vehicle = stepped.task.vehicle
+    members = getattr(vehicle, "members", (vehicle,))
     names: dict[str, str] = {}  # by hash
     models: dict[str, str] = {}
     for vehicle in members:
@@ -234,135 +192,90 @@ def models_of(stepped: Any) -> tuple[dict[str, str], dict[str, str]]:
     return about, models
 
 
-def _words(message: Message, datagram: bytes) -> dict[str, Any]:
-    """A message for readers, and its datagram for programs."""
-    words = {"type": type(message).__name__, "session": f"{message.session:016x}"}
-    names = ("worlds", "spec", "seed", "sequence", "reason")
-    told = {name: getattr(message, name) for name in names if hasattr(message, name)}
-    return {**words, **told, "datagram": datagram.hex()}
-
-
 # ---- the file
 
 
 class McapFile:
-    """Appends whole records to a new file, so that a killed program leaves a readable one.
+    """Appends whole chunks to a new file, so that a killed program leaves a readable one.
 
     Messages wait in a list, which costs the exchange next to nothing, until `flush` makes a chunk
-    of them. Nothing is written before the first flush. `library` is name and version of the
-    program. Every method but `close` and `give_up` raises `OSError` where it fails.
+    of them. `library` is name and version of the program. Every method but `close` and `give_up`
+    raises `OSError` where it fails.
 
     A write that an exception interrupts (a full device, Ctrl-C) may leave half a record. Then
-    nothing more can be written, and `abandon` closes the file after the last whole record.
+    nothing more can be written.
     """
 
     def __init__(self, path: Path, library: str) -> None:
         self.closed = False
         self.pending: list[tuple[int, int, int, bytes]] = []
-        """Messages of the next chunk: channel, nanoseconds since 1970, sequence number, data.
-        Append to it; `flush` takes them."""
-        self.size = 0  # bytes of the whole records in the file
+        """Messages of the next chunk: channel, nanoseconds since 1970, sequence number, data."""
         self._path = path
         self._pid = os.getpid()
-        self._schemas: dict[tuple[str, str], int] = {}  # ids by name and text
         self._channels: dict[str, int] = {}  # ids by topic
-        self._file: Any = path.open("xb", buffering=_BUFFER)
-        self._writer: Any = Writer(self._file, chunk_size=sys.maxsize, use_summary_offsets=False)
-        self._lock = RLock()
-        self._broken = self._busy = False
+        self._file = path.open("xb", buffering=_BUFFER)
+        self._writer = Writer(self._file, chunk_size=sys.maxsize, use_summary_offsets=False)
+        self._broken = False
         self._writer.start("", library)
+        self._event = self._writer.register_schema(
+            "rotorgram.Event", "jsonschema", b'{"type": "object"}'
+        )
 
-    def channel(self, topic: str, encoding: str, schema: tuple[str, str] | None = None) -> int:
-        """Id of the channel with this JSON schema (name, text). A file has at most 65,535."""
-        with self._lock:
-            if schema and schema not in self._schemas:
-                name, text = schema
-                number = self._writer.register_schema(name, "jsonschema", text.encode())
-                self._schemas[schema] = number
-            if topic not in self._channels:
-                if len(self._channels) == _MAX_CHANNELS:
-                    raise OSError(EFBIG, f"more than {_MAX_CHANNELS} channels")
-                number = self._schemas[schema] if schema else 0  # 0: none
-                self._channels[topic] = self._writer.register_channel(topic, encoding, number)
-            return self._channels[topic]
+    def channel(self, topic: str, encoding: str) -> int:
+        """Id of the channel of a topic."""
+        if topic not in self._channels:
+            schema = self._event if encoding == "json" else 0
+            self._channels[topic] = self._writer.register_channel(topic, encoding, schema)
+        return self._channels[topic]
 
-    def add_metadata(self, name: str, words: Mapping[str, str]) -> None:
-        """Write names and values, after all messages before."""
-        self.flush()
+    def write_head(self, about: Mapping[str, str], models: Mapping[str, str], time: int) -> None:
+        """Write the metadata, and the models as attachments."""
         with self._whole():
-            self._writer.add_metadata(name, dict(words))
-
-    def add_attachment(self, name: str, media_type: str, data: bytes, time: int) -> None:
-        """Write a whole file, after all messages before."""
-        self.flush()
-        with self._whole():
-            self._writer.add_attachment(0, time, name, media_type, data)
+            self._writer.add_metadata(ABOUT, dict(about))
+            for name, model in models.items():
+                self._writer.add_attachment(0, time, name, "application/xml", model.encode())
 
     def flush(self) -> None:
         """Write all messages as one chunk."""
-        with self._lock:
-            # Busy: called by a signal handler that interrupted us.
-            if self._busy or self.closed or not self.pending:
-                return
-            self._busy = True
-            try:
-                count = len(self.pending)  # another thread may append meanwhile
-                with self._whole():
-                    for channel, time, sequence, data in self.pending[:count]:
-                        self._writer.add_message(channel, time, data, time, sequence & 0xFFFFFFFF)
-                    del self.pending[:count]
-                    self._writer.flush()
-            finally:
-                self._busy = False
+        if self.closed or not self.pending:
+            return
+        with self._whole():
+            for channel, time, sequence, data in self.pending:
+                self._writer.add_message(channel, time, data, time, sequence & 0xFFFFFFFF)
+            self.pending.clear()
+            self._writer.flush()
 
-    def finish(self) -> None:
-        """Write pending messages and the summary, and close the file. May be called again."""
-        with self._lock:
-            if self._busy or self.closed:
-                return
+    def close(self) -> None:
+        """Finish the file, or give it up where that fails. A fork leaves it to its parent."""
+        if self.closed or os.getpid() != self._pid:
+            return
+        try:
             self.flush()
             with self._whole():
                 self._writer.finish()
             self.closed = True
             self._file.close()
-
-    def close(self) -> None:
-        """Finish the file, or give it up where that fails. A fork leaves it to its parent."""
-        if os.getpid() == self._pid:
-            try:
-                self.finish()
-            except OSError as error:
-                self.give_up(error)
+        except OSError as error:
+            self.give_up(error)
 
     def give_up(self, error: OSError) -> None:
         """Log why the journal ends here, and abandon the file: what was written can be read."""
         sentence = "record: writing %s failed (%s): the flight goes on, its journal ends here"
         _log.warning(sentence, self._path, error.strerror or error)
-        with suppress(OSError):
-            self.abandon()
+        self.abandon()
 
     def abandon(self) -> None:
-        """Close the file after its last whole record. Pending messages are lost."""
-        with self._lock:
-            if self.closed:
-                return
-            raw = self._file.raw  # its buffer still holds the bytes that a full device refused
-            try:
-                raw.truncate(self.size)
-            except (OSError, ValueError):  # ValueError: a second interrupt found it closed
-                pass
-            finally:
-                raw.close()
-                self.closed = True
+        """Close the file as it is. Pending messages are lost."""
+        self.closed = True
+        with suppress(OSError):
+            self._file.raw.close()  # its buffer still holds the bytes that a full device refused
 
     @contextmanager
     def _whole(self) -> Iterator[None]:
         """Write what is added here, up to the device. If that is interrupted, it is the last."""
-        with self._lock:
-            if self._broken:
-                raise OSError(EINTR, "a write was interrupted")
-            self._broken = True
-            yield
-            self._file.flush()
-            self.size = self._file.tell()
-            self._broken = False
+        if self._broken:
+            raise OSError(EINTR, "a write was interrupted")
+        self._broken = True
+        yield
+        self._file.flush()
+        self._broken = False

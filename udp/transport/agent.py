@@ -225,7 +225,7 @@ class Agent:
         server = self.server
         spec = self.config.text_spec
         hello = Hello(session=0, spec=spec.to_json()) if spec else None
-        return Journal(path, server.statistics, side="agent", slots=server.slots, text_hello=hello)
+        return Journal(path, side="agent", slots=server.slots, text_hello=hello)
 
     # ---- the exchange
 

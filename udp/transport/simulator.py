@@ -99,12 +99,7 @@ class Simulator(Driver):
 
         about, models = models_of(self.stepped)
         self._journal = Journal(
-            path,
-            self.link.statistics,
-            side="simulator",
-            text_hello=hello,
-            about=about,
-            models=models,
+            path, side="simulator", text_hello=hello, about=about, models=models
         )
         self.link.tap = self._journal.tap
 
