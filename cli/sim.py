@@ -3,13 +3,14 @@
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
-from ..models.errors import InputError, expect
+from ..models.errors import InputError
 from ._flags import BackendFlags, parse_address
 
 if TYPE_CHECKING:
-    from ..udp import LinkConfig, SharedSimulator, Simulator
+    from ..udp import Simulator
+    from ..udp.transport.simulator import Agents
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,81 +63,62 @@ class Sim(BackendFlags):
             from ..rendering.gl import offscreen_context
 
             offscreen_context(16, 16).free()
-        if "agents" in self.given:
-            return self._run_shared()
-        for name in ("when_lost", "patience"):
-            flag = f"--{name.replace('_', '-')}"
-            if name in self.given:
-                raise InputError(f"{flag}: expected it with --agents, got {getattr(self, name)}")
-        from ..udp import Simulator
+        from ..udp import LinkConfig, Simulator
 
+        several = "agents" in self.given
+        wrong = "with" if several else "without"
+        for name in (
+            ("server", "num_envs", "codec", "record") if several else ("when_lost", "patience")
+        ):
+            if name in self.given:
+                flag = f"--{name.replace('_', '-')}"
+                raise InputError(f"{flag}: cannot be used {wrong} --agents")
         simulator = Simulator(
             self.env_id,
             server=parse_address(self.server),
+            agents=self._agents() if several else None,
             num_envs=self.num_envs,
-            drones=self.drones,
+            bind=parse_address(self.bind),
             codec=self.codec,
-            config=self._link(),
+            config=LinkConfig(timeout=self.timeout, drop=self.drop, drop_seed=self.drop_seed),
+            key_file=self.key_file,
+            insecure=self.insecure,
             record=self.record,
-            **self._common(),
-        )
-        with simulator, self._shown(simulator):
-            here = "{}:{}".format(*simulator.address)
-            print(f"simulating at {here} for the agent at {self.server} (Ctrl-C ends)", flush=True)
-            try:
-                print(simulator.run())
-            finally:
-                print(f"wire: {simulator.link.statistics}", flush=True)
-        return 0
-
-    def _run_shared(self) -> int:
-        """Simulate one world until all its agents have closed."""
-        from ..udp import SharedSimulator
-
-        for name in ("server", "num_envs", "codec", "record"):
-            flag = f"--{name.replace('_', '-')}"
-            if name in self.given:
-                raise InputError(f"{flag}: expected none with --agents, got {getattr(self, name)}")
-        if not self.agents:
-            raise InputError("--agents: expected HOST:PORT of each agent, got none")
-        named = {address: names.split(",") for address, _, names in
-                 (agent.partition("=") for agent in self.agents) if names}  # fmt: skip
-        right = len(named) in (0, len(self.agents))
-        expect(right, "--agents", "drones of each agent or of none", " ".join(self.agents))
-        shares = {parse_address(address): names for address, names in named.items()}
-        simulator = SharedSimulator(
-            self.env_id,
-            shares or [parse_address(agent) for agent in self.agents],
-            drones=self.drones,
             when_lost=self.when_lost,
             patience=self.patience,
-            config=self._link(),
-            **self._common(),
+            drones=self.drones,
+            vehicle=self.vehicle,
+            backend=self.backend,
+            **self.options,
         )
+        links = simulator.rules.links
+        there = f"{len(links)} agents" if several else f"the agent at {self.server}"
         with simulator, self._shown(simulator):
             here = "{}:{}".format(*simulator.address)
-            print(f"simulating at {here} for {len(self.agents)} agents (Ctrl-C ends)", flush=True)
+            print(f"simulating at {here} for {there} (Ctrl-C ends)", flush=True)
             try:
                 print(simulator.run())
             finally:
-                for link in simulator.links:
-                    where = "{}:{}".format(*link.address)
-                    print(f"wire to {where}: {link.client.statistics}", flush=True)
+                for link in links:
+                    where = " to {}:{}".format(*link.address) if several else ""
+                    print(f"wire{where}: {link.client.statistics}", flush=True)
         return 0
 
-    def _link(self) -> "LinkConfig":
-        from ..udp import LinkConfig
+    def _agents(self) -> "Agents":
+        """Addresses of the agents, with their drones if they are named."""
+        if not self.agents:
+            raise InputError("--agents: expected HOST:PORT of each agent, got none")
+        named = {}
+        for agent in self.agents:
+            address, _, names = agent.partition("=")
+            if names:
+                named[parse_address(address)] = names.split(",")
+        if len(named) not in (0, len(self.agents)):
+            got = " ".join(self.agents)
+            raise InputError(f"--agents: expected drones of each agent or of none, got {got}")
+        return named or [parse_address(agent) for agent in self.agents]
 
-        return LinkConfig(timeout=self.timeout, drop=self.drop, drop_seed=self.drop_seed)
-
-    def _common(self) -> dict[str, Any]:
-        """Settings of both simulators."""
-        return {
-            "bind": parse_address(self.bind), "vehicle": self.vehicle, "backend": self.backend,
-            "key_file": self.key_file, "insecure": self.insecure, **self.options,
-        }  # fmt: skip
-
-    def _shown(self, simulator: "Simulator | SharedSimulator") -> AbstractContextManager[None]:
+    def _shown(self, simulator: "Simulator") -> AbstractContextManager[None]:
         if self.view is None and not self.realtime:  # nothing that draws is imported
             return nullcontext()
         from ._watch import watched

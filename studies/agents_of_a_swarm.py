@@ -32,7 +32,7 @@ from rotorgram.envs import ArraySpec, LocalVectorEnv, Outcome, Task, register
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.loop import Loop
 from rotorgram.sim import InitialState
-from rotorgram.udp import LinkConfig, RemoteVectorEnv, SharedSimulator, Simulator
+from rotorgram.udp import LinkConfig, RemoteVectorEnv, Simulator
 from rotorgram.udp.protocol.messages import Command, State
 
 ENV_ID = "benchmark/Row-v0"
@@ -95,7 +95,7 @@ def action_of(observation: np.ndarray) -> np.float32:
 class Twin:
     """A world in process that repeats what the simulator does, and compares every bit."""
 
-    def __init__(self, simulator: SharedSimulator) -> None:
+    def __init__(self, simulator: Simulator) -> None:
         self.simulator = simulator
         self.loop = Loop(EnvConfig(env_id=ENV_ID, drones=AGENTS))
         self.taken = 0  # absences that were repeated
@@ -106,22 +106,22 @@ class Twin:
 
     def __call__(self, cause: Command | None, state: State) -> None:
         loop = self.loop
-        simulator = self.simulator
+        rules = self.simulator.rules
         everybody = np.ones(AGENTS, bool)
         nothing = np.zeros((AGENTS, 1), np.float32)
         if cause is None:
-            seed = simulator.seed
+            seed = rules.seed
             loop.advance(nothing, everybody, None if seed is None else [seed] * AGENTS)
             self.absent = ~everybody
-            self.taken = sum(one.episode < simulator.episodes for one in simulator.absences)
-        for absence in simulator.absences[self.taken :]:
+            self.taken = sum(one.episode < rules.episodes for one in rules.absences)
+        for absence in rules.absences[self.taken :]:
             self.absent = self.absent | (np.arange(AGENTS) == absence.agent)
             policy = POLICIES[absence.agent % 3]
             mask = np.arange(AGENTS) == absence.agent
             if policy != "hold":
                 (loop.land if policy == "land" else loop.retire)(mask)
             self.counts[f"absent_{absence.participation.value}"] += 1
-        self.taken = len(simulator.absences)
+        self.taken = len(rules.absences)
         if isinstance(cause, Command):
             flying = ~(self.absent | loop.out)
             for drone in range(AGENTS):
@@ -145,17 +145,19 @@ def fly_eight(kills: int, dice: random.Random) -> dict[str, Any]:
     settings = [[port, POLICIES[i % 3]] for i, port in enumerate(ports)]
     agents = [launch(AGENT, each) for each in settings]
     relays = launch(RELAYS, [[("127.0.0.1", port) for port in ports], FAULTS])
-    simulator = SharedSimulator(
-        ENV_ID, [tuple(a) for a in json.loads(relays.stdout.readline())], drones=AGENTS, bind=ANY,
-        patience=PATIENCE, config=LinkConfig(timeout=600),
+    addresses = [tuple(address) for address in json.loads(relays.stdout.readline())]
+    simulator = Simulator(
+        ENV_ID, agents=addresses, drones=AGENTS, bind=ANY, patience=PATIENCE,
+        config=LinkConfig(timeout=600),
     )  # fmt: skip
+    rules = simulator.rules
     simulator.observer = twin = Twin(simulator)
     thread = threading.Thread(target=simulator.run)
     thread.start()
     done: Counter[str] = Counter()
     try:
         for number in range(kills):
-            while simulator.steps < 5 or not simulator.episodes:
+            while rules.steps < 5 or not rules.episodes:
                 assert thread.is_alive(), "the simulator failed"
                 time.sleep(0.01)
             time.sleep(dice.uniform(0.0, 1.5))
@@ -172,12 +174,12 @@ def fly_eight(kills: int, dice: random.Random) -> dict[str, Any]:
                 agents[victim].send_signal(signal.SIGCONT)
             done["killed" if killed else "stopped"] += 1
             print(f"{number + 1} of {kills}: agent {victim} {'killed' if killed else 'stopped'}, "
-                  f"episode {simulator.episodes}, {dict(twin.counts)}", flush=True)  # fmt: skip
-        wanted = simulator.episodes + 3  # all take part again
-        while simulator.episodes < wanted:
+                  f"episode {rules.episodes}, {dict(twin.counts)}", flush=True)  # fmt: skip
+        wanted = rules.episodes + 3  # all take part again
+        while rules.episodes < wanted:
             assert thread.is_alive(), "the simulator failed"
             time.sleep(0.01)
-        present = [link.participation.value for link in simulator.links]
+        present = [link.participation.value for link in rules.links]
     finally:
         simulator.stop()
         thread.join(60)
@@ -192,7 +194,7 @@ def fly_eight(kills: int, dice: random.Random) -> dict[str, Any]:
             agent.wait()
     return {
         "agents": AGENTS, "faults": FAULTS, "patience": PATIENCE, **done,
-        "episodes": simulator.episodes, **twin.counts,
+        "episodes": rules.episodes, **twin.counts,
         "agents_lost_for_good": present.count("left"), "network": dict(network),
     }  # fmt: skip
 

@@ -12,7 +12,7 @@ from .protocol.errors import DecodeError, LinkError, PeerClosed, PeerSilent, Ref
 
 if TYPE_CHECKING:
     from .remote import LOST, RemoteEnv, RemoteVectorEnv
-    from .transport.simulator import DEFAULT_AGENT, DEFAULT_SIMULATOR, SharedSimulator, Simulator
+    from .transport.simulator import DEFAULT_AGENT, DEFAULT_SIMULATOR, Simulator
 
 __all__ = [
     "DEFAULT_AGENT",
@@ -27,7 +27,6 @@ __all__ = [
     "Refused",
     "RemoteEnv",
     "RemoteVectorEnv",
-    "SharedSimulator",
     "Simulator",
 ]
 

@@ -138,7 +138,7 @@ def test_help_names_the_default_backend(
         (["sim", "--key-file", "nowhere"], "key file: cannot read nowhere"),
         (
             ["sim", "--agents", "here:1", "--server", "here:2"],
-            "--server: expected none with --agents, got here:2",
+            "--server: cannot be used with --agents",
         ),
         (
             ["sim", "--agents", "here:1=drone_0", "here:2"],
@@ -147,10 +147,10 @@ def test_help_names_the_default_backend(
         (["sim", "--agents"], "--agents: expected HOST:PORT of each agent, got none"),
         (
             ["sim", *SWARM, "--bind", "127.0.0.1:0", "--agents", "127.0.0.1:0"],
-            "agents: expected the port of each agent, 1 to 65535, got 0",
+            "server: expected the port of the agent, 1 to 65535, got 0",
         ),
-        (["sim", "--patience", "3"], "--patience: expected it with --agents, got 3.0"),
-        (["sim", "--when-lost", "land"], "--when-lost: expected it with --agents, got land"),
+        (["sim", "--patience", "3"], "--patience: cannot be used without --agents"),
+        (["sim", "--when-lost", "land"], "--when-lost: cannot be used without --agents"),
         (["sim", "--drones", "0"], "drones: expected a whole number from 1 to 1024, got 0"),
         (["serve", "pid", "--drones", "0"], "drones: expected at least 1, got 0"),
         (["train", "mappo", "--drones", "0"], "drones: expected at least 1, got 0"),

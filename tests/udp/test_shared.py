@@ -25,7 +25,6 @@ from rotorgram.udp import (
     Refused,
     RemoteEnv,
     RemoteVectorEnv,
-    SharedSimulator,
     Simulator,
 )
 from rotorgram.udp.journal.replay import Verification
@@ -76,7 +75,7 @@ def shared(
         if faults:
             agents = [stack.enter_context(relaying(a, faults)).address for a in agents]
         rest = {"patience": 20.0, "config": LinkConfig(timeout=60), **rest}
-        running = Running(SharedSimulator(RISE, agents, drones=drones, bind=ANY, **rest))
+        running = Running(Simulator(RISE, agents=agents, drones=drones, bind=ANY, **rest))
         try:
             yield running
         finally:
@@ -191,7 +190,7 @@ def test_an_agent_for_each_drone_is_the_world_in_process(faults: FaultConfig | N
     with shared(agents, 8, faults, episode_length=60) as running:
         in_threads([lambda a=a, i=i: fly_one(a, i, 2, seen) for i, a in enumerate(agents)])
         assert running.join() == "the agent closed"
-        assert running.simulator.episodes == 2
+        assert running.simulator.rules.episodes == 2
     expected = in_process(8, 2, episode_length=60)
     assert len({len(flights[0]) for flights in expected.values()}) > 6  # one after the other
     assert seen == expected
@@ -235,7 +234,7 @@ def test_one_that_is_killed_follows_its_policy_and_comes_back(policy: str) -> No
     for process in (victim, again):
         process.kill()
         process.communicate()
-    loss, *later = running.simulator.absences
+    loss, *later = running.simulator.rules.absences
     assert loss.agent == 1
     assert loss.episode == 1
     assert 20 <= loss.step < LONG - 1
@@ -281,7 +280,7 @@ def test_one_that_is_started_anew_before_the_others_come_flies_the_first_episode
     seen = {}
     with shared(agents, 2, episode_length=60) as running:
         first = launch(VICTIM, agents[0][1], "end")
-        while running.simulator.links[0].participation is not Participation.READY:
+        while running.simulator.rules.links[0].participation is not Participation.READY:
             assert running.thread.is_alive()
         first.kill()
         again = launch(VICTIM, agents[0][1], "end")
@@ -290,8 +289,8 @@ def test_one_that_is_started_anew_before_the_others_come_flies_the_first_episode
         again.kill()
     for process in (first, again):
         process.communicate()
-    assert [absence.episode for absence in running.simulator.absences] == [2] * len(
-        running.simulator.absences
+    assert [absence.episode for absence in running.simulator.rules.absences] == [2] * len(
+        running.simulator.rules.absences
     )
     expected = in_process(
         2, 1, lambda i, *at: calm(i, *at) if i else np.zeros(1, np.float32), episode_length=60
@@ -308,7 +307,7 @@ def test_one_that_is_stopped_and_goes_on_takes_part_again() -> None:
         other.start()
         heard(victim, "20")
         victim.send_signal(signal.SIGSTOP)
-        while not running.simulator.absences:
+        while not running.simulator.rules.absences:
             assert running.thread.is_alive()
         victim.send_signal(signal.SIGCONT)
         heard(victim, "cut")
@@ -317,7 +316,7 @@ def test_one_that_is_stopped_and_goes_on_takes_part_again() -> None:
         other.join(60)
         victim.kill()
         victim.communicate()
-    loss = running.simulator.absences[0]
+    loss = running.simulator.rules.absences[0]
     assert loss.agent == 1
     assert loss.episode == 1
     assert loss.participation == Participation.SILENT
@@ -354,7 +353,7 @@ def test_one_that_asks_for_a_reset_before_the_others_waits_for_them() -> None:
     with shared(agents, 2, episode_length=LONG) as running:
         in_threads([impatient, lambda: fly_one(agents[1], 1, 2, seen, calm)])
         running.join()
-        waits, closes = running.simulator.absences
+        waits, closes = running.simulator.rules.absences
         assert waits == (0, 1, 5, Participation.WAITING)
         assert closes == (0, 2, 1, Participation.LEFT)
     expected = in_process(2, 2, calm, (0, 5, "hold"), episode_length=LONG)
@@ -387,8 +386,8 @@ def test_one_that_resets_a_start_gets_it_again() -> None:
     with shared(agents, 2) as running:
         in_threads([twice, once])
         running.join()
-        assert running.simulator.seed == 1
-        assert running.simulator.episodes == 1
+        assert running.simulator.rules.seed == 1
+        assert running.simulator.rules.episodes == 1
     assert starts[0] == starts[1]
 
 
@@ -472,7 +471,7 @@ def test_a_journal_of_a_part_of_a_world_cannot_be_simulated_and_says_so_briefly(
         with closing(RemoteVectorEnv(address, connect_timeout=60, **settings)) as env:
             env.reset(seed=0)
 
-    formation = SharedSimulator("rotorgram/Formation-v0", agents, drones=4, bind=ANY)
+    formation = Simulator("rotorgram/Formation-v0", agents=agents, drones=4, bind=ANY)
     running = Running(formation)
     in_threads([lambda: begin(agents[0], record=journal), lambda: begin(agents[1])])
     assert running.join() == "the agent closed"
@@ -554,16 +553,15 @@ def test_an_agent_that_refuses_is_named() -> None:
 def test_wrong_arguments_are_told(changes: dict[str, Any], sentence: str) -> None:
     given = {"env": RISE, "agents": [("127.0.0.1", 1)], "drones": 3, "bind": ANY, **changes}
     with pytest.raises(InputError) as told:
-        SharedSimulator(given.pop("env"), given.pop("agents"), **given)
+        Simulator(given.pop("env"), **given)
     assert str(told.value).startswith(sentence)
 
 
 def test_this_side_is_no_agent() -> None:
     (here,) = free_ports(1)
-    with pytest.raises(InputError, match="agents: expected addresses of agents, got that of this"):
-        SharedSimulator(RISE, [here], drones=1, bind=here)
-    with pytest.raises(InputError, match="server: expected the address of the agent, got that of"):
-        Simulator(server=here, bind=here)
+    for several in ({"agents": [here]}, {"server": here}):
+        with pytest.raises(InputError, match="server: expected the address of an agent, got that"):
+            Simulator(RISE, bind=here, **several)
 
 
 def test_a_policy_that_does_not_exist_is_told() -> None:

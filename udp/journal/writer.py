@@ -16,7 +16,7 @@ from contextlib import contextmanager, suppress
 from errno import EINTR
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from mcap.writer import Writer
 
@@ -213,8 +213,8 @@ class McapFile:
         self._path = path
         self._pid = os.getpid()
         self._channels: dict[str, int] = {}  # ids by topic
-        self._file = path.open("xb", buffering=_BUFFER)
-        self._writer = Writer(self._file, chunk_size=sys.maxsize, use_summary_offsets=False)
+        self._file: Any = path.open("xb", buffering=_BUFFER)
+        self._writer: Any = Writer(self._file, chunk_size=sys.maxsize, use_summary_offsets=False)
         self._broken = False
         self._writer.start("", library)
         self._event = self._writer.register_schema(

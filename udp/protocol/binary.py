@@ -269,7 +269,8 @@ def _check_numbers(data: bytes, time: float, record: Record, layout: Layout) -> 
         finite = np.isfinite(array)
         if not finite.all():
             first = np.argwhere(~finite)[0].tolist()
-            raise InputError(f"expected finite numbers, got {array[*first]} at {first}")
+            what = "observation, reward, telemetry" if record is layout.state else "action"
+            raise InputError(f"{what}: expected finite numbers, got {array[*first]} at {first}")
     if layout.choices and record is not layout.state:
         actions = layout.actions.view(data)
         beyond = (actions < 0) | (actions >= layout.choices)

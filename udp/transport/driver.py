@@ -31,7 +31,7 @@ class Driver(NotCopied):
         address: Address of this side.
         spec: Spec of the env.
         stepped: The loop or the envs.
-        links: The agents.
+        rules: What the world does with the messages of its agents.
         observer: Called for every State of the world once the agents have it; None at first.
     """
 
@@ -40,7 +40,7 @@ class Driver(NotCopied):
         self.spec = stepped.spec
         self.address: Address = port.address
         self.observer: Observer | None = None
-        self._rules = rules
+        self.rules = rules
         self._port = port
         self._receive = port.receiver()
         self._by_address = {link.address: link for link in rules.links}
@@ -48,14 +48,9 @@ class Driver(NotCopied):
         self._journal: Any = None
 
     @property
-    def links(self) -> list[AgentLink]:
-        """The agents."""
-        return self._rules.links
-
-    @property
     def link(self) -> Client:
         """The exchange with the first agent."""
-        return self._rules.links[0].client
+        return self.rules.links[0].client
 
     def run(self) -> str:
         """Fly until every agent has closed; the reason that the last one gave. Runs once.
@@ -112,7 +107,7 @@ class Driver(NotCopied):
 
     def _fly(self) -> str:
         """Until all agents have closed: why the last one did. Empty if this side was stopped."""
-        rules = self._rules
+        rules = self.rules
         rules.start(time.monotonic())
         while not self._stopped:
             try:
@@ -151,7 +146,7 @@ class Driver(NotCopied):
 
     def _end(self, reason: str) -> None:
         """Tell the agents, until they have answered or will not."""
-        rules = self._rules
+        rules = self.rules
         rules.close(reason, time.monotonic())
         self._flush()
         while any(link.client.next_timer() < float("inf") for link in rules.links):
@@ -173,7 +168,7 @@ class Driver(NotCopied):
 
     def _flush(self) -> None:
         """Send what is due, before any wait."""
-        for link in self._rules.links:
+        for link in self.rules.links:
             client = link.client
             outgoing = client.outgoing
             client.outgoing = []
@@ -197,14 +192,14 @@ class Driver(NotCopied):
         if self._port.closed:
             raise error
         if pause > PAUSE:  # this process was stopped
-            self._rules.pardon(pause)
-        if len(self.links) == 1 and not isinstance(error, TimeoutError):
-            self.links[0].trouble = _words(error, "receiving")
+            self.rules.pardon(pause)
+        if len(self.rules.links) == 1 and not isinstance(error, TimeoutError):
+            self.rules.links[0].trouble = _words(error, "receiving")
 
     def _say_alive(self, finished: threading.Event) -> None:
         """In a thread: tell agents that wait for a State that it will come."""
         while not finished.wait(_ALIVE_EVERY):
-            for link in self._rules.links:
+            for link in self.rules.links:
                 for datagram in link.client.alive(time.monotonic()):
                     with suppress(OSError):  # as good as lost
                         self._port.send(datagram, link.address)

@@ -15,7 +15,7 @@ import selectors
 import socket
 import sys
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from functools import partial
 from math import ceil
@@ -161,14 +161,15 @@ class Port:
     """The agent's port: a socket for all senders and, if the system can, one for each simulator.
 
     Those are connected, so that the system sorts the datagrams, each socket has a buffer of its
-    own, and no other sender can fill the one of a simulator. `address` is listened on. With `only`
-    there is one socket for this only peer, resolved.
+    own, and no other sender can fill the one of a simulator. `address` is listened on. `peers`,
+    resolved, are known from the start; if there is one, it has the only socket.
 
     Raises:
         InputError, OSError: As `open_socket`.
     """
 
-    def __init__(self, address: Address, *, insecure: bool, only: Address | None = None) -> None:
+    def __init__(self, address: Address, *, insecure: bool, peers: Sequence[Address] = ()) -> None:
+        only = peers[0] if len(peers) == 1 else None
         self._everybody = open_socket(address, insecure=insecure, peer=only)
         self.address: Address = self._everybody.getsockname()
         self._only = only
@@ -178,6 +179,8 @@ class Port:
         self._all.register(self._everybody, selectors.EVENT_READ)
         self._missing = False  # whether a simulator's datagrams come to the socket for all senders
         self._next_look = 0.0
+        if only is None:
+            self.keep(peers)
 
     def keep(self, peers: Collection[Address]) -> None:
         """Have a socket for each of these, and no others."""
