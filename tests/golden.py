@@ -265,7 +265,7 @@ def malformed(right: dict[str, bytes]) -> list[tuple[str, str, bytes]]:
         ("a Command that resets, with choice 3", one,
          changed(changed(choice, 32, b"\x03"), 40, b"\x01")),
         ("a Command with an action that is NaN for a frozen drone", two, changed(freeze, 36, nan)),
-        ("a Command with order 3", two, changed(freeze, LAYOUTS["two"].command.flags.start, b"\x03")),
+        ("a Command with order 3", two, changed(freeze, 40, b"\x03")),
         ("a Command with one seed for two drones", two, changed(freeze, 24, b"\x01")),
         ("a Close with a longer reason than it has", one, changed(close, 24, b"\x05")),
         ("a Close with a line feed", one, changed(close, 26, b"\n")),
