@@ -40,7 +40,7 @@ class Actions:
             raise InputError(f"actions: expected shape {shape}, got {actions.shape}")
         values = actions.reshape(self._shape)
         if self._choices:
-            right = (values >= 0) & (values < self._choices) & (values % 1 == 0)
+            right = (values >= 0) & (values < self._choices) & (np.floor(values) == values)
             expected = f"a whole number 0 to {self._choices - 1}"
             return self._refused(values, right, expected, flown)
         if values.dtype != np.float32:

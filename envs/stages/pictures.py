@@ -146,7 +146,7 @@ class Pictures(Stage):
         if "scenes" not in vars(record):
             return taken
         for painter in self._painters:
-            worlds = painter.worlds & (record.scenes == painter.scene)
+            worlds = painter.worlds & (self._scenes_of(record) == painter.scene)
             for name, array in painter.cameras.snapshot().items():
                 mask = np.repeat(worlds, len(array) // len(worlds))
                 taken.setdefault(name, np.zeros_like(array))[mask] = array[mask]
@@ -161,12 +161,12 @@ class Pictures(Stage):
     def begin(self, record: Record) -> None:
         """Draw the scene of each world."""
         begun = self._per_drone(record.begun).reshape(self._shape).any(axis=1)
-        scenes = np.zeros(self._shape[0], int)
+        scenes = np.zeros(self._shape, int)
         if self._count > 1:
             ids = np.flatnonzero(begun)
-            scenes[ids] = self._count * self._random.shares(self._scenes, ids)
-        old = vars(record).get("scenes", scenes)
-        record.scenes = np.where(begun, scenes, old)
+            shares = self._random.shares(self._scenes, ids)
+            scenes[ids] = (self._count * shares).astype(int)[:, None]
+        record.scenes = scenes.reshape(record.shape)[()]
 
     def step(self, record: Record) -> None:
         """Add all pictures to the observations, shape (W, A, height, width, channels).
@@ -193,7 +193,7 @@ class Pictures(Stage):
             rows["payload"] = self._per_drone(state.payload)
         if self._goal_moves:
             rows["goal"] = self._per_drone(self._task.goal(state))
-        pictures = self._taken(due, fresh, rows, record.scenes, steps)
+        pictures = self._taken(due, fresh, rows, self._scenes_of(record), steps)
         for name, picture in pictures.items():
             record.observations[name] = picture.reshape(*record.shape, *picture.shape[1:])
 
@@ -232,6 +232,10 @@ class Pictures(Stage):
         else:
             paint(painters[0])
         return pictures
+
+    def _scenes_of(self, record: Record) -> NDArray[np.int64]:
+        """Number of each world's scene, (W,)."""
+        return np.reshape(record.scenes, self._shape)[:, 0]
 
     def _per_drone(self, values: Any) -> NDArray[Any]:
         """A row for each drone."""

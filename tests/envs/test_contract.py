@@ -1,200 +1,208 @@
-"""The contract of every vehicle in every task: alone, in a batch, over UDP, on every backend.
+"""The contract of every task: levels, backends, features and vehicles are those of contracts.py.
 
-What a task or a backend promises beyond this has tests of its own: test_env.py, test_vector.py,
-test_remote.py, test_rigid.py. Here the vehicles vary: those of the tests, and those
-of the library.
+What a task or a backend promises beyond this has tests of its own.
 """
 
+import json
 from collections.abc import Iterator
-from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import contracts
 import gymnasium as gym
 import numpy as np
 import pytest
-import rotorgram.envs  # noqa: F401
+from contracts import (
+    CASES,
+    ELEVATION,
+    FEATURES,
+    FILES,
+    HOVER,
+    LENGTH,
+    STEPS,
+    VEHICLES,
+    WORLDS,
+    Case,
+    bits,
+    results,
+)
 from gymnasium.utils.env_checker import check_env
 from remotes import flying
 from rotorgram.agents import PID
-from rotorgram.envs import LocalVectorEnv, SingleEnv, registry
-from rotorgram.envs.spec import component_names
-from rotorgram.models import QUAD_XML, Vehicle
+from rotorgram.envs import Loop, SingleEnv
+from rotorgram.models import InputError, Vehicle
 
-DATA = Path(__file__).parents[1] / "data"
-ELEVATION = "rotorgram/Elevation-v0"
-HOVER = "rotorgram/Hover-v0"
-TASKS = sorted(  # that one drone can fly
-    name
-    for name in gym.registry
-    if name.startswith("rotorgram/") and registry.task_type(name).min_drones == 1
-)
-FILES = {"quad": QUAD_XML}
-FILES |= {path.stem: path for path in sorted(DATA.glob("*.xml"))}
-FILES |= {path.parent.name: path for path in sorted(QUAD_XML.parent.glob("*/*/vehicle.toml"))}
-N = 3
-STEPS = 40
-STORM = {"wind": (4.0, -3.0, 6.0), "gusts": 8.0}
+RESET = {(7, 1), (8, 2), (16, 0)}
+"""Steps at which a world is reset in mid-flight."""
+FROZEN = {(3, 2), (4, 2), (8, 0), (12, 1)}
+"""Steps at which a world rests."""
 
 
-def pairs(every: int) -> Any:
-    """Tasks and vehicles: each task with one vehicle in so many, each vehicle with some tasks."""
-    chosen = [
-        (env_id, name)
-        for row, env_id in enumerate(TASKS)
-        for column, name in enumerate(FILES)
-        if (row + column) % every == 0
+every_case = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+
+
+class Step(NamedTuple):
+    """What a step got and what it gave, a row for each drone."""
+
+    actions: Any
+    resets: Any
+    seeds: Any
+    frozen: Any
+    results: dict[str, Any]
+    done: Any
+    steps: Any
+
+
+def flight(loop: Loop, steps: range) -> list[Step]:
+    """Worlds whose episode has ended begin the next; others are reset in mid-flight, or rest."""
+    rows = loop.num_envs // WORLDS
+    actions = contracts.actions_of(loop)
+    sent = [next(actions) for _ in range(STEPS)]
+    flown = []
+    for step in steps:
+        begins = [step == 0 or (step, world) in RESET for world in range(WORLDS)]
+        rests = [(step, world) in FROZEN for world in range(WORLDS)]
+        resets = loop.done | np.repeat(begins, rows)
+        frozen = ~resets & np.repeat(rests, rows)
+        seeds = np.arange(loop.num_envs) + 100 * step
+        loop.advance(sent[step], resets, seeds, frozen)
+        flown.append(Step(sent[step], resets, seeds, frozen, results(loop), loop.done, loop.steps))
+    return flown
+
+
+@every_case
+def test_a_batch_has_the_bits_of_single_worlds(case: Case) -> None:
+    """Also when some worlds are reset or rest while others fly (fault 38)."""
+    steps = flight(Loop(case.config(), WORLDS), range(STEPS))
+    for world in range(WORLDS):
+        single = Loop(case.config())
+        rows = slice(world * case.drones, (world + 1) * case.drones)
+        for step in steps:
+            single.advance(*(array[rows] for array in step[:4]))
+            assert bits(results(single)) == bits({k: x[rows] for k, x in step.results.items()})
+            assert single.done.tolist() == step.done[rows].tolist()
+            assert single.steps.tolist() == step.steps[rows].tolist()
+
+
+@every_case
+def test_results_keep_to_the_spec(case: Case) -> None:
+    """Types, bounds, ends, and arrays that are nobody else's memory."""
+    loop = Loop(case.config(), WORLDS)
+    kept = []
+    for step in flight(loop, range(STEPS)):
+        result = step.results
+        rewards = result["0 rewards"]
+        ends = result["0 terminated"] | result["0 truncated"]
+        rests = step.resets | step.frozen
+        assert rewards.dtype == np.float64
+        assert not (result["0 terminated"] & result["0 truncated"]).any()
+        assert not rewards[rests].any()
+        assert not ends[rests].any()
+        assert (result["0 truncated"] <= (step.steps == LENGTH)).all()
+        assert (step.done | (step.steps < LENGTH)).all()
+        for array in loop.spec.observation:
+            values = result[f"1 {array.name}"]
+            low, high = (bound.astype(array.dtype) for bound in array.bounds())
+            assert values.shape == (loop.num_envs, *array.shape)
+            assert values.dtype == array.dtype
+            assert (np.isfinite(values) & (values >= low) & (values <= high)).all()
+        kept.append((result, bits(result)))
+    for result, before in kept:
+        assert bits(result) == before
+    for name in ("position", "velocity", "thrust"):
+        with pytest.raises(ValueError, match="read-only"):
+            getattr(loop.record.state, name)[...] = 0.0
+
+
+@every_case
+def test_no_later_bit_differs_after_a_restore(case: Case) -> None:
+    loop = Loop(case.config(), WORLDS)
+    flight(loop, range(10))
+    snapshot = loop.snapshot()
+    kept = bits(snapshot)
+    later = [bits(step.results) for step in flight(loop, range(10, STEPS))]
+    fresh = Loop(case.config(), WORLDS)
+    for other in (loop, fresh):
+        other.restore(snapshot)
+        assert [bits(step.results) for step in flight(other, range(10, STEPS))] == later
+    assert bits(snapshot) == kept
+
+
+@every_case
+def test_what_is_refused_changes_nothing(case: Case) -> None:
+    loop = Loop(case.config(), WORLDS)
+    flight(loop, range(3))
+    before = bits(loop.snapshot())
+    rows = loop.num_envs
+    good = next(contracts.actions_of(loop))
+    wrong = [
+        ((np.full_like(good, np.nan),), "actions: expected"),
+        ((np.full_like(good, np.inf),), "actions: expected"),
+        ((good[:-1],), "actions: expected shape"),
+        ((good.astype(complex),), "actions: expected real numbers"),
+        ((good, np.ones(rows + 1, bool)), "resets, frozen: expected bool of shape"),
+        ((good, None, None, np.ones(rows)), "resets, frozen: expected bool of shape"),
+        ((good, np.ones(rows, bool), [-1] * rows), "seed: expected"),
+        ((good, np.ones(rows, bool), [1] * (rows + 1)), "seed: expected"),
     ]
-    return pytest.mark.parametrize(
-        ("env_id", "file"),
-        [(env_id, FILES[name]) for env_id, name in chosen],
-        ids=[f"{env_id[10:-3]}-{name}" for env_id, name in chosen],
-    )
+    for arguments, sentence in wrong:
+        with pytest.raises(InputError, match=f"^{sentence}"):
+            loop.advance(*arguments)
+    assert bits(loop.snapshot()) == before
 
 
-everything = pairs(1)
-some = pairs(3)
+@every_case
+def test_numbers_change_on_purpose_alone(case: Case, request: pytest.FixtureRequest) -> None:
+    """`python tests/contracts.py` writes the numbers anew."""
+    name = request.node.callspec.id
+    expected = json.loads(contracts.ORACLE.read_text())[name]
+    assert contracts.measured(case) == pytest.approx(expected, rel=2e-3, abs=1e-3)
 
 
-@cache
-def effects_of(file: Path) -> dict[str, Any]:
-    """All effects that a vehicle has coefficients for; in a storm, if it feels air."""
-    vehicle = Vehicle.load(file)
-    told = vehicle.coefficients
-    rotors = told.rotors
-    drag = told.drag
-    battery = told.battery
-    felt = (rotors.drag, rotors.inflow, rotors.lift)
-    given = {
-        "motor_lag": rotors.time_constant,
-        "thrust_curve": rotors.curve,
-        "battery": battery.full and battery.capacity and rotors.power,
-        "body_drag": drag.linear or drag.quadratic,
-        "rotor_drag": rotors.thrust_coefficient and any(felt),
-        "ground_effect": rotors.radius,
-    }
-    effects: dict[str, Any] = {name: True for name, value in given.items() if value}
-    if effects.keys() & {"body_drag", "rotor_drag"}:
-        effects |= STORM
-    share = (0.9, *(1.0 for _ in vehicle.rotors[1:]))
-    return {**effects, "efficiency": share, "payload": 0.1 * vehicle.mass, "cable": 0.5}
+ALONE = {name: case for name, case in (FEATURES | VEHICLES).items() if case.drones == 1}
 
 
-def options_of(env_id: str, file: Path, windy: bool = True) -> dict[str, Any]:
-    effects = effects_of(file)
-    if "Payload" in env_id:  # it hangs one itself
-        effects = {name: x for name, x in effects.items() if name not in ("payload", "cable")}
-    return {"vehicle": file, "episode_length": STEPS} | (
-        {"effects": effects, "randomize": {"mass": "uniform(0.9, 1.1)"}} if windy else {}
-    )
+@pytest.mark.parametrize("case", ALONE.values(), ids=ALONE)
+@pytest.mark.filterwarnings("ignore:.*infinity")  # of flow
+def test_gymnasium_accepts_single_envs(case: Case) -> None:
+    env = gym.make(case.env_id, disable_env_checker=True, **case.options).unwrapped
+    assert isinstance(env, SingleEnv)
+    check_env(env, skip_render_check=True)
+    names = [name for array in env.env_spec.telemetry for name in array.components]
+    for observation, reward, terminated, truncated, info in flown(env, 3):
+        assert env.observation_space.contains(observation)
+        assert list(map(type, (reward, terminated, truncated))) == [float, bool, bool]
+        assert list(info)[: len(names)] == names
+        assert set(map(type, info.values())) == {float}
+        terms = [value for name, value in info.items() if name.startswith("reward_")]
+        assert reward in (0.0, pytest.approx(sum(terms), abs=1e-7))
+    env.close()
 
 
-def actions_of(space: gym.Space, seed: int) -> Iterator[np.ndarray]:
-    """Random, then all at one bound, then at the other: what drives a craft to its limits."""
-    dice = np.random.default_rng(seed)
-    box = space
-    assert isinstance(box, gym.spaces.Box)
-    for step in range(STEPS):
-        limit = (None, box.high, box.low)[3 * step // STEPS]
-        yield dice.uniform(box.low, box.high).astype(np.float32) if limit is None else limit
-
-
-def names_of(env: Any) -> list[str]:
-    return [name for array in env.env_spec.telemetry for name in component_names(array)]
-
-
-def flown(env: gym.Env, seed: int, steps: int = STEPS) -> Iterator[tuple[Any, ...]]:
-    """What a reset and the steps of an episode give, as (observation, reward, ends, info)."""
+def flown(env: Any, seed: int, steps: int = STEPS) -> Iterator[tuple[Any, ...]]:
+    """What a reset and the steps of an episode give."""
     observation, info = env.reset(seed=seed)
     yield observation, 0.0, False, False, info
-    for _, action in zip(range(steps), actions_of(env.action_space, seed), strict=False):
-        yield (result := env.step(action))
+    env.action_space.seed(seed)
+    for _ in range(steps):
+        result = env.step(env.action_space.sample())
+        yield result
         if result[2] or result[3]:
             return
 
 
-@some
-def test_alone_without_effects(env_id: str, file: Path) -> None:
-    check_alone(env_id, file, windy=False)
-
-
-@everything
-def test_alone(env_id: str, file: Path) -> None:
-    check_alone(env_id, file, windy=True)
-
-
-def check_alone(env_id: str, file: Path, windy: bool) -> None:
-    env = gym.make(env_id, disable_env_checker=True, **options_of(env_id, file, windy)).unwrapped
-    assert isinstance(env, SingleEnv)
-    check_env(env, skip_render_check=True)
-    first = list(flown(env, 3))
-    again = list(flown(env, 3))
-    telemetry = names_of(env)
-    for observation, reward, terminated, truncated, info in first:
-        assert env.observation_space.contains(observation)  # shape, dtype, bounds
-        assert np.isfinite(observation).all()
-        assert type(reward) is float
-        assert type(terminated) is bool
-        assert type(truncated) is bool
-        assert not (terminated and truncated)
-        assert list(info)[: len(telemetry)] == telemetry
-        assert set(map(type, info.values())) == {float}
-        assert np.isfinite(list(info.values())).all()
-    terms = [name for name in first[1][4] if name.startswith("reward_")]
-    for _, reward, _, _, info in first[1:]:
-        assert reward == pytest.approx(sum(info[name] for name in terms), abs=1e-12)
-    assert first[-1][2] or len(first) == STEPS + 1
-    assert first[-1][2] or first[-1][3]
-    for one, other in zip(first, again, strict=True):
-        assert one[0].tobytes() == other[0].tobytes()  # and no view: the second flight is later
-        assert one[1:] == other[1:]
-    assert len({one[0].tobytes() for one in first}) == len(first)
-    env.close()
-
-
-@some
-def test_in_a_batch(env_id: str, file: Path) -> None:
-    """Each drone of a batch gets the bits of a single env with its seed."""
-    options = options_of(env_id, file)
-    batch = gym.make_vec(env_id, num_envs=N, autoreset_mode="Disabled", **options)
-    assert isinstance(batch, LocalVectorEnv)
-    singles = [list(flown(gym.make(env_id, **options), 5 + i)) for i in range(N)]
-    actions = [list(actions_of(batch.single_action_space, 5 + i)) for i in range(N)]
-    observations, info = batch.reset(seed=5)
-    told = [(observations, np.zeros(N), np.zeros(N, bool), np.zeros(N, bool), info)]
-    for step in range(min(map(len, singles)) - 1):
-        told.append(batch.step(np.stack([given[step] for given in actions])))
-    for step, (seen, rewards, terminated, truncated, info) in enumerate(told):
-        assert batch.observation_space.contains(seen)
-        assert rewards.dtype == np.float64
-        assert terminated.dtype == bool
-        assert truncated.dtype == bool
-        for i, single in enumerate(singles):
-            observation, *rest, single_info = single[step]
-            assert seen[i].tobytes() == observation.tobytes()
-            assert [rewards[i], terminated[i], truncated[i]] == rest
-            assert {name: info[name][i] for name in names_of(batch)}.items() <= single_info.items()
-    batch.close()
-
-
-@some
-def test_over_udp(env_id: str, file: Path) -> None:
-    options = options_of(env_id, file)
-    local = gym.make(env_id, **options)
-    with flying(env_id, **options) as pair:
-        remote = list(flown(_connected(pair.remote), 11))
+@pytest.mark.parametrize("case", ALONE.values(), ids=ALONE)
+def test_over_udp(case: Case) -> None:
+    local = gym.make(case.env_id, **case.options)
+    names = [name for array in local.unwrapped.env_spec.telemetry for name in array.components]
+    with flying(case.env_id, **case.options) as pair:
+        pair.remote.connect()
         assert pair.remote.observation_space == local.observation_space
         assert pair.remote.action_space == local.action_space
-        names = names_of(local.unwrapped)
-        for here, there in zip(remote, flown(local, 11), strict=True):
-            assert here[0].tobytes() == there[0].tobytes()
+        for here, there in zip(flown(pair.remote, 11), flown(local, 11), strict=True):
+            assert bits(here[0]) == bits(there[0])
             assert here[1:4] == there[1:4]
             assert here[4] == {name: there[4][name] for name in names}
-
-
-def _connected(remote: Any) -> Any:
-    remote.connect()
-    return remote
 
 
 # --- do the tasks suit vehicles of any size? ------------------------------------------------------
@@ -248,7 +256,7 @@ def test_one_cascade_with_the_same_gains_hovers_with_every_vehicle(file: Path) -
 def test_a_storm_clips_the_observations_of_the_elevation_task(up: float) -> None:
     """Wind of 60 m/s accelerates beyond what rotors and gravity can: the bounds are clipped at."""
     effects = {"body_drag": True, "wind": (0.0, 0.0, 60.0 * up)}
-    env = gym.make(ELEVATION, vehicle=DATA / "racer.xml", effects=effects, flight_band=1.5)
+    env = gym.make(ELEVATION, vehicle=FILES["racer"], effects=effects, flight_band=1.5)
     low = env.observation_space.low
     high = env.observation_space.high
     observation, _ = env.reset(seed=4)  # a start far from the goal

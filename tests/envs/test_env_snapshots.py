@@ -9,50 +9,14 @@ import cloudpickle
 import gymnasium as gym
 import numpy as np
 import pytest
-from rotorgram.envs.registry import task_type
+from contracts import CASES, HOVER, bits
 from rotorgram.models.errors import InputError
 
-HOVER = "rotorgram/Hover-v0"
-TASKS = [name for name in gym.registry if name.startswith("rotorgram/")]
-RICH: dict[str, Any] = {
-    "vehicle": "crazyflie2",
-    "effects": {
-        "motor_lag": True, "battery": True, "body_drag": True, "rotor_drag": True,
-        "ground_effect": True, "wind": (1.0, 0.0, 0.0), "gusts": 1.0,
-    },
-    "sensors": {
-        "imu": True, "motion_capture": {"noise": 0.001, "angle_noise": 0.01, "delay": 0.04},
-    },
-    "history": 3,
-    "randomize": {
-        "mass": "uniform(0.9, 1.1)", "action_delay": "choice(0, 1, 2)",
-        "observation_delay": "choice(0, 1, 2)",
-    },
-}  # fmt: skip
-LOSSY = {"drones": 3, "radio_loss": 0.3, "radio_delay": 2}
-CASES: dict[str, tuple[str, dict[str, Any]]] = {
-    **{name: (name, {}) for name in TASKS},
-    "rigid": (HOVER, {"backend": "rigid"}),
-    "rich": (HOVER, RICH),
-    "rich, rigid": (HOVER, {**RICH, "backend": "rigid"}),
-    "lossy radio": ("rotorgram/Formation-v0", LOSSY),
-    "short episodes": (HOVER, {"episode_length": 9}),
-}
 COPIES: dict[str, Callable[[Any], Any]] = {
     "deepcopy": copy.deepcopy,
     "pickle": lambda env: pickle.loads(pickle.dumps(env)),
     "cloudpickle": lambda env: pickle.loads(cloudpickle.dumps(env)),
 }
-
-
-def bits(value: Any) -> Any:
-    """A value in which each bit counts."""
-    if isinstance(value, dict):
-        return {name: bits(part) for name, part in value.items()}
-    if isinstance(value, tuple):
-        return [bits(part) for part in value]
-    array = np.asarray(value)
-    return array.shape, array.dtype.str, array.tobytes()
 
 
 def flight(env: Any, steps: int) -> list[Any]:
@@ -68,53 +32,29 @@ def flight(env: Any, steps: int) -> list[Any]:
     return seen
 
 
-def vector_of(case: str) -> Any:
-    env_id, options = CASES[case]
-    drones = options.get("drones", task_type(env_id).min_drones)
-    return gym.make_vec(env_id, num_envs=2 * drones, **(options | {"drones": drones}))
+def vector_of(name: str) -> Any:
+    case = CASES[name]
+    options = {**case.options, "drones": case.drones}
+    return gym.make_vec(case.env_id, num_envs=2 * case.drones, **options)
 
 
-def single_of(case: str) -> Any:
-    env_id, options = CASES[case]
-    return gym.make(env_id, **options)
+def single_of(name: str) -> Any:
+    return gym.make(CASES[name].env_id, **CASES[name].options)
 
 
-ALONE = [
-    case
-    for case, (name, options) in CASES.items()
-    if task_type(name).min_drones == 1 and "drones" not in options
-]
-
-
-def check_restored(make: Callable[[], Any]) -> None:
-    env = make()
+@pytest.mark.parametrize("make", [single_of, vector_of])
+def test_envs_are_restored(make: Callable[[str], Any]) -> None:
+    env = make("rich").unwrapped
     env.reset(seed=3)
     flight(env, 6)
-    snapshot = env.unwrapped.snapshot()
-    kept = copy.deepcopy(snapshot)
+    snapshot = env.snapshot()
     first = flight(env, 12)
-    env.unwrapped.restore(snapshot)
+    env.restore(snapshot)
     assert flight(env, 12) == first
-    other = make()
-    other.reset(seed=4)
-    flight(other, 2)
-    other.unwrapped.restore(snapshot)
-    assert flight(other, 12) == first
-    assert bits(snapshot) == bits(kept)
-
-
-@pytest.mark.parametrize("case", ALONE)
-def test_a_single_env_is_restored(case: str) -> None:
-    check_restored(lambda: single_of(case))
-
-
-@pytest.mark.parametrize("case", CASES)
-def test_a_vector_env_is_restored(case: str) -> None:
-    check_restored(lambda: vector_of(case))
 
 
 @pytest.mark.parametrize("copied", COPIES)
-@pytest.mark.parametrize("case", [HOVER, "rich", "rigid"])
+@pytest.mark.parametrize("case", ["Hover, rotors", "rich", "rich, rigid", "pictures"])
 def test_single_envs_are_copied(case: str, copied: str) -> None:
     env = single_of(case)
     env.reset(seed=3)
@@ -124,7 +64,7 @@ def test_single_envs_are_copied(case: str, copied: str) -> None:
 
 
 @pytest.mark.parametrize("copied", COPIES)
-@pytest.mark.parametrize("case", [HOVER, "rich", "lossy radio"])
+@pytest.mark.parametrize("case", ["Hover, rotors", "rich", "lossy radio"])
 def test_vector_envs_are_copied(case: str, copied: str) -> None:
     env = vector_of(case)
     fresh = COPIES[copied](env)
@@ -186,21 +126,6 @@ def test_a_single_env_flies_on_rigid() -> None:
     _, exact = alone.reset(seed=1)
     assert list(info) == list(exact)
     assert [info[name] for name in "XYZ"] == pytest.approx([exact[name] for name in "XYZ"])
-
-
-def test_pictures_are_restored(opengl: None) -> None:
-    env: Any = gym.make(HOVER, cameras=("front@16x16", "front_flow@16x16"), render_mode="rgb_array")
-    env.reset(seed=1)
-    env.render()
-    flight(env, 3)
-    twin = copy.deepcopy(env)
-    snapshot = env.unwrapped.snapshot()
-    first = flight(env, 6)
-    env.unwrapped.restore(snapshot)
-    assert flight(env, 6) == first
-    assert flight(twin, 6) == first
-    env.close()
-    twin.close()
 
 
 def test_parallel_envs_are_restored_and_copied() -> None:

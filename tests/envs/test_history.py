@@ -5,7 +5,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from remotes import flying
 from rotorgram.agents import PID
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
@@ -54,42 +53,6 @@ def test_readings_of_sensors_have_a_history_of_their_own() -> None:
     for name in usual[0]:
         for one, other in zip(sides([seen[name] for seen in usual], 3), long, strict=True):
             assert other[name].tobytes() == one.tobytes()
-
-
-def test_a_batch_with_resets_and_drones_that_rest() -> None:
-    """A reset fills the past with the first observation; a frozen drone keeps its past."""
-    envs = [
-        gym.make_vec(HOVER, num_envs=3, autoreset_mode="Disabled", history=count)
-        for count in (1, 3)
-    ]
-    rows: list[list[np.ndarray]] = [[], [], []]
-    for env in envs:
-        env.reset(seed=0)
-    for drone in range(3):
-        rows[drone] = [envs[0].observations[drone].copy()]
-    actions = np.full(envs[0].action_space.shape, 0.1, np.float32)
-    for step in range(10):
-        resets, frozen = np.zeros((2, 3), bool)
-        resets[1] = step == 5
-        frozen[2] = step in (3, 4, 8)
-        for env in envs:
-            env.advance(actions, resets, None, frozen)
-        for drone in range(3):
-            if resets[drone]:
-                rows[drone] = []
-            if not frozen[drone]:
-                rows[drone].append(envs[0].observations[drone].copy())
-            expected = sides(rows[drone], 3)[-1]
-            assert envs[1].observations[drone].tobytes() == expected.tobytes()
-            assert envs[1].rewards[drone] == envs[0].rewards[drone]
-
-
-def test_over_udp() -> None:
-    local = flight(gym.make(HOVER, history=4))
-    with flying(HOVER, history=4) as pair:
-        pair.remote.connect()
-        for here, there in zip(flight(pair.remote), local, strict=True):
-            assert here.tobytes() == there.tobytes()
 
 
 def test_the_spec_names_every_number() -> None:

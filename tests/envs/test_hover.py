@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 from rotorgram.envs import Loop
 from rotorgram.envs.config import EnvConfig
-from rotorgram.envs.registry import env_spec
 from rotorgram.envs.specification import make_task
-from rotorgram.models.errors import InputError
 from rotorgram.models.vehicle import Vehicle
 
 from flights import about, state_of
@@ -132,46 +130,3 @@ def test_starts_fill_their_bands() -> None:
     assert 30.0 - 0.1 < tilt.max() <= 30.0 + 1e-9
     assert abs(info["heading_error"]).max() < 36.0  # 30, and what the tilt adds
     assert abs(info["heading_error"].mean()) < 1.5
-
-
-def test_bounds_are_never_left_and_ends_are_never_both() -> None:
-    env: Any = gym.make_vec(ID, num_envs=32, episode_length=60, start_tilt=80.0, vehicle=HEXA)
-    env.reset(seed=0)
-    dice = np.random.default_rng(0)
-    ends = np.zeros(2, int)
-    for _ in range(120):
-        actions = dice.choice([-1.0, 0.0, 1.0], env.action_space.shape).astype(np.float32)
-        observations, _, terminated, truncated, _ = env.step(actions)
-        assert observations in env.observation_space
-        assert not (terminated & truncated).any()
-        ends += terminated.sum(), truncated.sum()
-    assert ends[0] > 32
-
-
-@pytest.mark.parametrize(
-    ("options", "sentence"),
-    [
-        ({"goal": 5.0}, "goal: expected 3 numbers"),
-        ({"goal": (0.0, 0.0)}, "goal: expected 3 numbers"),
-        ({"goal": (0.0, math.nan, 5.0)}, "goal: expected 3 numbers"),
-        ({"goal": (0.0, 0.0, 1.9)}, "goal: expected a height of at least 2 m above the ground"),
-        ({"heading": "north"}, "heading: expected a number from -360 to 360 degrees, got 'north'"),
-        ({"start_tilt": 81.0}, "start_tilt: expected a number from 0 to 80 degrees"),
-        ({"start_heading": -1.0}, "start_heading: expected a number from 0 to 180 degrees"),
-        ({"flight_band": 1.7}, "flight_band: expected more than .* = 1.732 m, got 1.7"),
-        (
-            {"target": 5.0},
-            "options: expected some of goal, .*episode_length, .*, got an .* 'target'",
-        ),
-    ],
-)
-def test_a_wrong_option_gives_one_sentence(options: dict[str, Any], sentence: str) -> None:
-    with pytest.raises(InputError, match=f"^{sentence}") as caught:
-        env_spec(EnvConfig.from_keywords(ID, **options))
-    assert "\n" not in str(caught.value)
-
-
-def test_a_goal_read_from_json_is_a_tuple() -> None:
-    options = env_spec(EnvConfig.from_keywords(ID, goal=[1, 2, 3])).options
-    assert options["goal"] == [1.0, 2.0, 3.0]
-    assert make_task(EnvConfig.from_keywords(ID, **options)).options.goal == (1.0, 2.0, 3.0)

@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 from pilot import Pilot, limited
 from rotorgram.envs.config import EnvConfig
-from rotorgram.envs.registry import env_spec
 from rotorgram.envs.specification import make_task
 from rotorgram.models import Vehicle
-from rotorgram.models.errors import InputError
 
 from flights import Shares, about, state_of
 
@@ -205,30 +203,3 @@ def wanted(seen: np.ndarray, rotors: int) -> np.ndarray:
     climb = np.where(above, -0.8, np.clip(offset[:, 2] + 1, -1, 1))
     acceleration[:, 2] = 3 * (climb - speed[:, 2])
     return limited(acceleration, 4.0)
-
-
-@pytest.mark.parametrize(
-    ("options", "sentence"),
-    [
-        ({"motion": "spiral"}, "motion: expected 'circle' or 'line', got 'spiral'"),
-        ({"pad_speed": (1.0, 0.5)}, "pad_speed: expected a number from 0 to 20 m/s, or a pair"),
-        ({"pad_speed": -1.0}, "pad_speed: expected a number from 0 to 20 m/s"),
-        ({"pad_path": 0.0}, "pad_path: expected a number from 0.01 to 1000 m, got 0"),
-        ({"pad_radius": "wide"}, "pad_radius: expected a number from 0.01 to 1000 m, got 'wide'"),
-        ({"sink": 0.0}, "sink: expected a number from 0.01 to 100 m/s"),
-        ({"drift": -1.0}, "drift: expected a number from 0.01 to 100 m/s"),
-        ({"tilt": 91.0}, "tilt: expected a number from 0.1 to 90 degrees"),
-        ({"start_height": 1.0}, "start_band: expected at most start_height - 0.5 m, got 1.0"),
-        ({"flight_band": 6.0}, "flight_band: expected more than the 6.054 m of the furthest start"),
-    ],
-)
-def test_a_wrong_option_gives_one_sentence(options: dict[str, Any], sentence: str) -> None:
-    with pytest.raises(InputError, match=f"^{sentence}") as caught:
-        env_spec(EnvConfig.from_keywords(ID, **options))
-    assert "\n" not in str(caught.value)
-
-
-def test_a_speed_read_from_json_is_a_tuple() -> None:
-    options = env_spec(EnvConfig.from_keywords(ID, pad_speed=[0.5, 2])).options
-    assert options["pad_speed"] == [0.5, 2.0]
-    assert make_task(EnvConfig.from_keywords(ID, **options)).options.pad_speed == (0.5, 2.0)

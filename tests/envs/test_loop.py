@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from rotorgram.envs import ArraySpec, Loop, Metric, Outcome, Task, TaskOptions, register, registry
+from rotorgram.envs import ArraySpec, Loop, Metric, Outcome, Task, register, registry
 from rotorgram.envs.config import EnvConfig
 from rotorgram.models.errors import InputError
 from rotorgram.sim import CollectiveThrust, InitialState, stack
@@ -65,21 +65,6 @@ def test_flags_of_those_that_do_not_fly() -> None:
     assert loop.rewards.tolist() == [0.0, 0.0]
     assert loop.done.tolist() == [False, True]
     assert loop.steps.tolist() == [0, 1]
-
-
-@pytest.mark.parametrize("num_envs", [1, 2])
-def test_masks_and_seeds_of_another_shape_are_refused(num_envs: int) -> None:
-    loop, actions = started(num_envs=num_envs)
-    before = shown(loop, 0)
-    every = np.ones(num_envs, bool)
-    for wrong in (np.ones(3, bool), np.ones(num_envs), np.bool_(True), [True] * num_envs):
-        for name in ("resets", "frozen"):
-            with pytest.raises(InputError, match=r"^resets, frozen: expected bool of shape"):
-                loop.advance(actions, **{name: wrong})  # type: ignore[arg-type]
-    for seeds in ([1, 2, 3], [-1] * num_envs):
-        with pytest.raises(InputError, match=rf"^seed: expected .* from 0 on, or {num_envs} of"):
-            loop.advance(actions, every, seeds)
-    assert shown(loop, 0) == before
 
 
 def test_wrong_seeds_are_refused_before_the_others_fly() -> None:
@@ -300,11 +285,6 @@ def test_what_a_user_typed_is_imported_and_nothing_else(
     with pytest.raises(InputError, match=r"^env: expected a module nowhere here, got none"):
         registry.load("nowhere:Typed-v0")
     gym.registry.pop("Typed-v0")
-
-
-def test_options_are_a_plain_dataclass() -> None:
-    assert registry.task_type(HOVER).Options.from_options({"heading": 3}).heading == 3.0  # type: ignore[attr-defined]
-    assert issubclass(registry.task_type(ID).Options, TaskOptions)
 
 
 @pytest.mark.parametrize("num_envs", [1, 3])

@@ -12,7 +12,6 @@ from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 from rotorgram.envs.specification import make_task
 from rotorgram.models import Vehicle
-from rotorgram.models.errors import InputError
 
 from flights import Shares, about, state_of
 
@@ -142,26 +141,3 @@ def test_hovering_without_the_payload_drops_it(share: float, factor: float) -> N
         assert not terminated
     assert info["payload_error"] == pytest.approx(9.8 / 11 * 2.0, rel=0.01)
     assert info["swing"] == pytest.approx(0.0, abs=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("options", "sentence"),
-    [
-        ({"goal": (0.0, 0.0)}, "goal: expected 3 numbers"),
-        ({"goal": (0.0, 0.0, 1.5)}, "goal: expected a height of at least 1.678 m above the ground"),
-        (
-            {"effects": {"payload": 2.0}},
-            "effects: expected a payload that the options of the task describe, got payload",
-        ),
-        ({"randomize": {"gusts": "uniform(1, 2)"}}, "randomize: gusts: expected .*"),
-        ({"payload_share": 0.0}, "payload_share: expected a number from 0.001 to 10, got 0"),
-        ({"cable": "long"}, "cable: expected a number from 0.05 to 100 m, got 'long'"),
-        ({"start_speed": -1.0}, "start_speed: expected a number from 0 to 100 m/s"),
-        ({"start_tilt": 81.0}, "start_tilt: expected a number from 0 to 80 degrees"),
-        ({"flight_band": 1.7}, "flight_band: expected more than .* = 1.732 m, got 1.7"),
-    ],
-)
-def test_a_wrong_option_gives_one_sentence(options: dict[str, Any], sentence: str) -> None:
-    with pytest.raises(InputError, match=f"^{sentence}") as caught:
-        env_spec(EnvConfig.from_keywords(ID, **options))
-    assert "\n" not in str(caught.value)

@@ -11,7 +11,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from fleets import flying
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 from peers import ANY, Running
@@ -74,42 +73,6 @@ def test_the_flight_is_that_without_cameras(opengl: None) -> None:
             assert info == told
             if rest[1] or rest[2]:
                 break
-
-
-def test_a_vector_has_the_pictures_of_single_envs(opengl: None) -> None:
-    with closing(LocalVectorEnv(LANDING, 3, cameras=EYES)) as several:
-        seen = several.reset(seed=[4, 5, 6])[0]
-        pictures = [{name: array[0] for name, array in seen.items()}]
-        ones = [gym.make(LANDING, cameras=EYES) for _ in range(3)]
-        firsts = [one.reset(seed=seed)[0] for one, seed in zip(ones, (4, 5, 6), strict=True)]
-        assert (pictures[0]["down"] == firsts[0]["down"]).all()
-        for _ in range(5):
-            actions = several.action_space.sample()
-            seen = several.step(actions)[0]
-            for i, one in enumerate(ones):
-                alone = one.step(actions[i])[0]
-                for name, picture in alone.items():
-                    assert picture.tobytes() == seen[name][i].tobytes()
-        for one in ones:
-            one.close()
-
-
-def test_pictures_cross_the_wire(opengl: None) -> None:
-    with (
-        flying(1, 2, LANDING, cameras=EYES.split(",")) as (remote, _),
-        closing(LocalVectorEnv(LANDING, 2, cameras=EYES)) as local,
-    ):
-        here = remote.reset(seed=8)[0]
-        there = local.reset(seed=8)[0]
-        assert remote.observation_space == local.observation_space
-        dice = np.random.default_rng(2)
-        for _ in range(12):
-            assert {*here} == {*there} == {"observation", "down", "down_depth", "down_segmentation"}
-            for name, values in here.items():
-                assert values.tobytes() == there[name].tobytes()
-            actions = dice.uniform(-1, 1, local.action_space.shape).astype(np.float32)
-            here = remote.step(actions)[0]
-            there = local.step(actions)[0]
 
 
 def test_a_slow_camera_holds_its_picture(opengl: None, tmp_path: Path) -> None:

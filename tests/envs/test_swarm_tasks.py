@@ -156,23 +156,6 @@ def test_the_radius_holds_all_that_collides(vehicle: str | None) -> None:
     assert env.loop.metrics["clearance"] == pytest.approx([distance - 2 * radius] * 2)
 
 
-@pytest.mark.parametrize("env_id", ALL_TASKS)
-def test_worlds_of_a_batch_fly_as_single_ones(env_id: str) -> None:
-    lossy = {"radio_loss": 0.4, "radio_delay": 2, "radio_range": 30.0, "neighbours": 2}
-    dice = np.random.default_rng(0)
-    actions = dice.uniform(-1, 1, (40, 9, 4)).astype(np.float32)
-    batch = LocalVectorEnv(env_id, 9, drones=3, **lossy)
-    seen, _ = batch.reset(seed=[1, 0, 0, 2, 0, 0, 3, 0, 0])
-    alone = [LocalVectorEnv(env_id, 3, drones=3, **lossy) for _ in range(3)]
-    firsts = [env.reset(seed=[seed, 0, 0])[0] for seed, env in enumerate(alone, 1)]
-    assert np.concatenate(firsts).tobytes() == seen.tobytes()
-    for row in actions:
-        seen, rewards, *_ = batch.step(row)
-        results = [env.step(row[3 * i : 3 * i + 3]) for i, env in enumerate(alone)]
-        assert np.concatenate([result[0] for result in results]).tobytes() == seen.tobytes()
-        assert np.concatenate([result[1] for result in results]).tobytes() == rewards.tobytes()
-
-
 def test_a_lossy_radio_moves_no_start() -> None:
     starts = []
     for loss in (0.0, 0.9):
@@ -277,21 +260,6 @@ def test_what_orca_cannot_fly_is_one_sentence() -> None:
         Orca(env_spec(EnvConfig.from_keywords("rotorgram/Hover-v0", action="velocity")))
     with pytest.raises(InputError, match=r"orca: expected actions of the level velocity"):
         Orca(env_spec(EnvConfig.from_keywords(TASKS[0], action="position")))
-
-
-@pytest.mark.parametrize(
-    ("options", "expected"),
-    [
-        ({"spacing": 1.0}, "spacing: expected a number from 2 to 1000 diameters, got 1.0"),
-        ({"radio_loss": 1.5}, "radio_loss: expected a number from 0 to 1, got 1.5"),
-        ({"neighbours": 17}, "neighbours: expected a whole number from 0 to 16 drones, got 17"),
-        ({"center": (0, 0, 1)}, "center: expected a height of at least"),
-        ({"formation": "star"}, "formation: expected 'ring' or 'line' or 'grid', got 'star'"),
-    ],
-)
-def test_wrong_options(options: dict[str, Any], expected: str) -> None:
-    with pytest.raises(InputError, match=f"^{expected}"):
-        LocalVectorEnv(TASKS[0], 2, drones=2, **options)
 
 
 @pytest.mark.parametrize("height", [4.0, -4.0])

@@ -162,26 +162,6 @@ def test_a_file_crosses_the_wire(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "sentence"),
-    [
-        ({"trajectory": "spiral"}, "trajectory: expected circle, lemniscate, snap, or a CSV file"),
-        ({"trajectory": "[[0,1,2]]"}, "trajectory: expected 2 to 20000 rows of t, x, y, z, got"),
-        ({"trajectory": "[[0,0,0,5],[0,1,0,5]]"}, "trajectory: expected times that rise"),
-        ({"trajectory": "[[0,0,0,5],[1,1e9,0,5]]"}, "trajectory: expected coordinates up to"),
-        ({"trajectory": '[["a"]]'}, "trajectory: expected circle, lemniscate, snap"),
-        ({"center": (0.0, 0.0, 1.2)}, "trajectory: expected a height of at least 1.3 m above"),
-        ({"points": 1}, "points: expected a whole number from 2 to 16, got 1"),
-        ({"preview": -1}, "preview: expected a whole number from 0 to 20, got -1"),
-        ({"period": 0.0}, "period: expected a number from 0.1 to 10000 s, got 0.0"),
-    ],
-)
-def test_wrong_options(options: dict[str, Any], sentence: str) -> None:
-    with pytest.raises(InputError) as error:
-        make_task(EnvConfig.from_keywords(ID, **options))
-    assert str(error.value).startswith(sentence)
-
-
-@pytest.mark.parametrize(
     ("trajectory", "name"),
     [("circle", None), ("lemniscate", None), ("snap", None), ("lemniscate", "crazyflie2")],
 )

@@ -106,23 +106,6 @@ def test_reward_and_end_are_never_late() -> None:
         assert plain.step(np.ones(1, np.float32))[1:4] == late.step(np.ones(1, np.float32))[1:4]
 
 
-@pytest.mark.parametrize("env_id", [ELEVATION, HOVER])
-def test_a_batch_equals_single_envs(env_id: str) -> None:
-    batch = gym.make_vec(env_id, num_envs=3, vehicle=str(RACER), **WORLD)
-    width = batch.single_action_space.shape[0]
-    given = actions(40, width)
-    seen, info = batch.reset(seed=7)
-    rows = [batch.step(np.tile(action, (3, 1)))[0] for action in given]
-    for index in range(3):
-        env = gym.make(env_id, vehicle=str(RACER), **WORLD)
-        alone, told = env.reset(seed=7 + index)
-        assert (alone == seen[index]).all()
-        assert told["drawn_mass"] == info["drawn_mass"][index]
-        for row, action in zip(rows, given, strict=True):
-            assert (env.step(action)[0] == row[index]).all()
-    batch.close()
-
-
 def test_over_udp_the_same_bits_and_what_was_drawn() -> None:
     here = gym.make(HOVER, vehicle=str(RACER), **WORLD)
     with spawn_simulator(EnvConfig.from_keywords(HOVER, vehicle=RACER, **WORLD)) as remote:

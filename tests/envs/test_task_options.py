@@ -1,0 +1,133 @@
+"""Options of all tasks: each is checked by its rule, in one sentence, and crosses the wire."""
+
+import json
+import math
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+from contracts import TASKS
+from rotorgram.envs import registry
+from rotorgram.envs.config import EnvConfig
+from rotorgram.envs.registry import env_spec
+from rotorgram.models.errors import InputError
+from rotorgram.models.fields import Choice, Limits, NumberOrPair, OrNone, Rule, rules_of
+
+OPTIONS = {env_id: registry.task_type(env_id).Options for env_id in TASKS}
+
+
+def wrong_values(rule: Rule) -> list[Any]:
+    if isinstance(rule, OrNone):
+        return [value for value in wrong_values(rule.rule) if value is not None]
+    if isinstance(rule, NumberOrPair):
+        low, high = 4.0, 6.0
+        pairs: list[Any] = [(high, low), (low,), (), (low, low, high), (low, "x")]
+        return pairs + wrong_values(rule.limits)
+    if isinstance(rule, Choice):
+        return ["neither", 3, ["full"]]
+    if not isinstance(rule, Limits):
+        return [3]
+    values = ["57", True, None, math.nan, math.inf, 10**400, [[3.0]]]
+    values += [edge for edge in (rule.low - 1, 2 * rule.high + 1) if math.isfinite(edge)]
+    values += [2.5] * rule.whole
+    if rule.count == 1:
+        return values
+    count = rule.count or 3
+    return [5.0, (0.0,) * (count - 1), *((0.0,) * (count - 1) + (x,) for x in values)]
+
+
+@pytest.mark.parametrize("env_id", TASKS)
+def test_every_option_has_its_rule(env_id: str) -> None:
+    options = OPTIONS[env_id]
+    rules = rules_of(options)
+    assert rules.keys() == options().to_options().keys()
+    for name, rule in rules.items():
+        for wrong in wrong_values(rule):
+            expected = re.escape(f"{name}: expected {rule.expected}" if wrong != 3 else name)
+            with pytest.raises(InputError, match=f"^{expected}") as caught:
+                options(**{name: wrong})
+            assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("env_id", TASKS)
+def test_options_cross_the_wire(env_id: str) -> None:
+    options = OPTIONS[env_id]()
+    told = json.loads(json.dumps(options.to_options()))
+    again = OPTIONS[env_id].from_options(told)
+    assert again == options
+    assert hash(again) == hash(options)
+    with pytest.raises(InputError, match=r"^options: expected some of .*, got 'drag'"):
+        OPTIONS[env_id].from_options({"drag": 1.0})
+    with pytest.raises(AttributeError):
+        options.drag = 1.0  # type: ignore[attr-defined]
+
+
+def test_numpy_numbers_become_python_numbers() -> None:
+    options = OPTIONS["rotorgram/Hover-v0"](start_tilt=np.float32(0.5), goal=np.array([1, 2, 6]))
+    assert options.to_options()["start_tilt"] == 0.5
+    assert options.to_options()["goal"] == (1.0, 2.0, 6.0)
+    kinds = {type(value) for value in options.to_options()["goal"]}
+    assert kinds == {type(options.to_options()["start_tilt"])} == {float}
+
+
+@pytest.mark.parametrize(
+    ("task", "options", "sentence"),
+    [
+        ("Elevation", {"target": 1.9}, r"target: expected 2 m \(start_band = 1 m, .* got 1.9"),
+        ("Elevation", {"target": 2e6}, r"target: expected 2 m .* to 1e\+06 m, got 2000000.0"),
+        ("Elevation", {"flight_band": 1.0}, "flight_band: expected more than start_band = 1 m"),
+        ("Elevation", {"thrust_scale": 101.0}, "thrust_scale: expected at most 100 N, .*, got 101"),
+        ("Elevation", {"episode_length": 0}, "episode_length: expected a whole number .*, got 0"),
+        ("Elevation", {"control_period": 0.0}, "control_period: expected a number from 1e-06 to 1"),
+        (
+            "Elevation",
+            {"control_period": 0.025},
+            "control_period: expected a positive multiple .* 0.01 s, .*, got 0.025",
+        ),
+        ("Elevation", {"action": "delta"}, "action: expected 'increment' or 'offset', got 'delta'"),
+        ("Hover", {"goal": (0.0, 0.0, 1.9)}, "goal: expected a height of at least 2 m above"),
+        ("Hover", {"flight_band": 1.7}, "flight_band: expected more than .* = 1.732 m, got 1.7"),
+        ("Landing", {"start_height": 1.0}, "start_band: expected at most start_height - 0.5 m"),
+        ("Landing", {"flight_band": 6.0}, "flight_band: expected more than the 6.054 m of the"),
+        ("PayloadHover", {"goal": (0, 0, 1.5)}, "goal: expected a height of at least 1.678 m"),
+        ("PayloadHover", {"flight_band": 1.7}, "flight_band: expected more than .* = 1.732 m"),
+        (
+            "PayloadHover",
+            {"effects": {"payload": 2.0}},
+            "effects: expected a payload that the options of the task describe, got payload",
+        ),
+        ("PayloadHover", {"randomize": {"gusts": "uniform(1, 2)"}}, "randomize: gusts: expected"),
+        ("Recovery", {"goal": (0.0, 0.0, 0.9)}, "goal: expected a height of at least 1 m above"),
+        ("Recovery", {"flight_band": 0.5}, "flight_band: expected more than near = 0.5 m, got 0.5"),
+        ("Waypoints", {"center": (0, 0, 2)}, "center: expected a height of at least 2.5 m above"),
+        ("Formation", {"center": (0, 0, 1)}, "center: expected a height of at least"),
+        ("Tracking", {"trajectory": "spiral"}, "trajectory: expected circle, lemniscate, snap, or"),
+        ("Tracking", {"trajectory": "[[0,1,2]]"}, "trajectory: expected 2 to 20000 rows of t, x,"),
+        ("Tracking", {"trajectory": "[[0,0,0,5],[0,1,0,5]]"}, "trajectory: expected times that"),
+        ("Tracking", {"trajectory": "[[0,0,0,5],[1,1e9,0,5]]"}, "trajectory: expected coordinates"),
+        ("Tracking", {"trajectory": '[["a"]]'}, "trajectory: expected circle, lemniscate, snap"),
+        ("Tracking", {"center": (0, 0, 1.2)}, "trajectory: expected a height of at least 1.3 m"),
+    ],
+)
+def test_options_that_do_not_go_together(task: str, options: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(InputError, match=f"^{sentence}") as caught:
+        env_spec(EnvConfig.from_keywords(f"rotorgram/{task}-v0", **options))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"target": 2.0},
+        {"start_band": 0.0, "target": 1.0},
+        {"control_period": 0.01},
+        {"control_period": 1},
+        {"episode_length": 250.0},
+        {"thrust_scale": 100},
+        {"target": 1e6},
+    ],
+    ids=str,
+)
+def test_extremes_are_allowed(options: dict[str, Any]) -> None:
+    env_spec(EnvConfig.from_keywords("rotorgram/Elevation-v0", **options))
