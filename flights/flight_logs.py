@@ -1,9 +1,9 @@
 """Logs of real flights: CSV, Parquet and ULog files on a uniform grid of times."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, NoReturn
+from typing import Final, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,41 +12,36 @@ from ..models.errors import InputError, require
 from ..models.vehicle import Vehicle
 
 Floats = NDArray[np.float64]
-Columns = Mapping[str, NDArray[Any]]
+Rows = NDArray[np.int_]
+Columns = Mapping[str, NDArray[np.generic]]
 """Columns of a file by name, each of shape (N,)."""
 
-MOTION: Final = ("t", *"xyz", *(f"q{a}" for a in "wxyz"), *(f"v{a}" for a in "xyz"),
-                 *(f"w{a}" for a in "xyz"))  # fmt: skip
-"""Columns that a log must have: time, s; position, m, and velocity, m/s, world frame with z up;
-quaternion from body to world; body rates, rad/s, in a body frame x forward, y left, z up."""
-SPEED = "m{}_rads"
-SPEED_COMMAND = "m{}_command_rads"
-THROTTLE = "m{}_throttle"
+MOTION: Final = ("x", "y", "z", "qw", "qx", "qy", "qz", "vx", "vy", "vz", "wx", "wy", "wz")
+"""Columns that a log must have besides the time t, s: position, m, and velocity, m/s, world frame
+with z up; quaternion from body to world; body rates, rad/s, in a body frame x forward, y left,
+z up."""
+SPEED: Final = "m{}_rads"
+SPEED_COMMAND: Final = "m{}_command_rads"
+THROTTLE: Final = "m{}_throttle"
 """Columns of rotor 1, 2...: measured speed and commanded speed, rad/s, and throttle, 0 to 1, which
 is the share of the largest thrust. A log has measured speeds, or one of the commands, or both."""
 _KINDS: Final = (SPEED, SPEED_COMMAND, THROTTLE)
 _LONGEST_GAP: Final = 0.1  # s: longer gaps are not interpolated
 _POSITION_ERROR: Final = 0.5  # m: between two samples, besides the distance by the velocity
 _ATTITUDE_ERROR: Final = 0.5  # rad: the same for the attitude
-_MAX_LEFT_OUT: Final = 0.01  # share of the samples
+_MOST_LEFT_OUT: Final = 0.01  # share of the samples
 _FASTEST: Final = 5.0  # rotor speed, as a multiple of that at the largest thrust
 
 
 @dataclass(frozen=True, kw_only=True)
 class FlightLog:
-    """A recorded flight on a uniform grid of N times. Arrays have the time as their first axis."""
+    """A recorded flight on a uniform grid of N times."""
 
     name: str
     period: float
     """Time between two samples, s."""
-    position: Floats
-    """Of the body's origin, world frame, m, shape (N, 3)."""
-    quaternion: Floats
-    """From body to world, scalar first, shape (N, 4)."""
-    velocity: Floats
-    """Of the body's origin, world frame, m/s, shape (N, 3)."""
-    body_rates: Floats
-    """Body frame, rad/s, shape (N, 3)."""
+    states: Floats
+    """The columns of `MOTION`, shape (N, 13)."""
     speeds: Floats
     """Of the rotors in the vehicle's order, rad/s, shape (N, R): measured, or else commanded."""
     measured: bool = True
@@ -72,33 +67,42 @@ def read_log(
     finite.
     """
     path = Path(path)
-    raw = _Raw.read(path, vehicle, columns or {})
-    raw.check_speeds(vehicle)
-    row = raw.consistent_rows()
-    grid = raw.grid(row, period)
-    quaternion = raw.resampled(raw.quaternions.T, row, grid)
-    length = np.linalg.norm(quaternion, axis=1, keepdims=True)
+    table = _our_columns(path, columns or {}, vehicle.num_rotors)
+    states = np.stack([table[name] for name in MOTION], axis=1)
+    states[:, 3:7] = _without_flips(states[:, 3:7])
+    speeds = _of_rotors(table, SPEED, vehicle)
+    commands = _of_rotors(table, SPEED_COMMAND, vehicle)
+    throttle = _of_rotors(table, THROTTLE, vehicle)
+    if commands is None and throttle is not None:
+        commands = _commanded_speeds(path, throttle, vehicle)
+    speeds_or_commands = commands if speeds is None else speeds
+    if speeds_or_commands is None:
+        names = " or ".join(kind.format(f"1...{vehicle.num_rotors}") for kind in _KINDS)
+        _refuse(path, f"columns {names}", "none")
+    _check_speeds(path, vehicle, speeds_or_commands)
+    samples = np.concatenate((states, speeds_or_commands), axis=1)
+    if commands is not None:
+        _check_speeds(path, vehicle, commands)
+        samples = np.concatenate((samples, commands), axis=1)
+    rows = _consistent_rows(path, table["t"], samples)
+    times = table["t"][rows]
+    grid = _grid(path, times, period)
+    uniform = np.stack([np.interp(grid, times, column) for column in samples[rows].T], axis=1)
+    states, speeds_or_commands, commands_after = np.split(
+        uniform, (len(MOTION), len(MOTION) + vehicle.num_rotors), axis=1
+    )
+    length = np.linalg.norm(states[:, 3:7], axis=1, keepdims=True)
     if not (length > 0.5).all():
         _refuse(path, "quaternions of length 1", f"{length.min():.3g}")
-    commands = None
-    if raw.commands is not None:
-        commands = raw.resampled(raw.commands, row, grid)
-    elif raw.throttle is not None:
-        throttle = raw.resampled(raw.throttle, row, grid)
-        commands = _commanded_speeds(throttle, vehicle, path)
-    speeds = commands if raw.speeds is None else raw.resampled(raw.speeds, row, grid)
-    assert speeds is not None  # `_Raw.read` refuses a log without any
+    states[:, 3:7] /= length
     return FlightLog(
         name=path.stem,
         period=period,
-        position=raw.resampled(raw.motion("xyz"), row, grid),
-        quaternion=quaternion / length,
-        velocity=raw.resampled(raw.motion(["vx", "vy", "vz"]), row, grid),
-        body_rates=raw.resampled(raw.motion(["wx", "wy", "wz"]), row, grid),
-        speeds=speeds,
-        measured=raw.speeds is not None,
-        commands=commands,
-        left_out=raw.left_out,
+        states=states,
+        speeds=speeds_or_commands,
+        measured=speeds is not None,
+        commands=None if commands is None else commands_after,
+        left_out=_later(table["t"]).size - rows.size,
     )
 
 
@@ -121,155 +125,27 @@ def _refuse(path: Path, expected: str, got: str) -> NoReturn:
     raise InputError(f"{path.name}: expected {expected}, got {got}")
 
 
-class _Raw:
-    """The columns of a log at its own times.
-
-    Attributes:
-        speeds, commands, throttle: One array for each rotor, or None where the log lacks them.
-        quaternions: Without changes of sign, shape (N, 4).
-        left_out: Samples that `consistent_rows` has left out.
-    """
-
-    def __init__(self, path: Path, columns: Mapping[str, Floats | None], rotors: int) -> None:
-        self.path = path
-        self.left_out = 0
-        self._columns = columns
-        self.speeds, self.commands, self.throttle = (
-            self._of_rotors(kind, rotors) for kind in _KINDS
-        )
-        quaternions = np.stack(self.motion(["qw", "qx", "qy", "qz"]), axis=1)
-        self.quaternions = _without_flips(quaternions)
-
-    @classmethod
-    def read(cls, path: Path, vehicle: Vehicle, given: Mapping[str, str]) -> "_Raw":
-        """Read a file. Raises `InputError`."""
-        rotors = vehicle.num_rotors
-        known = list(MOTION)
-        for kind in _KINDS:
-            known += [kind.format(number) for number in range(1, rotors + 1)]
-        for name in given:
-            if name not in known:
-                raise InputError(f"columns: expected some of {', '.join(known)}, got {name!r}")
-        table = _table(path)
-        columns = {name: _column(table, given.get(name, name), path) for name in known}
-        for name in MOTION:
-            if columns[name] is None:
-                _refuse(path, f"a column {given.get(name, name)}", ", ".join(map(str, table)))
-        raw = cls(path, columns, rotors)
-        if raw.speeds is None and raw.commands is None and raw.throttle is None:
-            names = " or ".join(kind.format(f"1...{rotors}") for kind in _KINDS)
-            _refuse(path, f"columns {names}", "none")
-        return raw
-
-    def motion(self, names: Sequence[str]) -> list[Floats]:
-        """Columns of the motion."""
-        columns = [self._columns[name] for name in names]
-        return [column for column in columns if column is not None]
-
-    def _of_rotors(self, kind: str, rotors: int) -> list[Floats] | None:
-        columns = self.motion([kind.format(number) for number in range(1, rotors + 1)])
-        return columns if len(columns) == rotors else None
-
-    def check_speeds(self, vehicle: Vehicle) -> None:
-        """Refuse speeds that no such rotor reaches."""
-        coefficient = vehicle.coefficients.rotors.thrust_coefficient
-        if coefficient is None:
-            return
-        most = _FASTEST * float(np.sqrt(vehicle.thrust_high.max() / coefficient))
-        for columns in (self.speeds, self.commands):
-            if columns is None:
-                continue
-            fastest = float(np.abs(columns).max(initial=0.0))
-            if fastest > most:
-                _refuse(self.path, f"rotor speeds of at most {most:.4g} rad/s", f"{fastest:.4g}")
-
-    def consistent_rows(self) -> NDArray[np.int_]:
-        """Samples with a later time than those before, without single impossible ones."""
-        (times,) = self.motion("t")
-        if len(times) < 2:
-            _refuse(self.path, "two or more samples", str(len(times)))
-        if not np.isfinite(times).all():
-            _refuse(self.path, "finite times", "others")
-        later = times[1:] > np.maximum.accumulate(times)[:-1]
-        rows = np.flatnonzero(np.concatenate(([True], later)))
-        for name in MOTION:
-            if not np.isfinite(self.motion([name])[0][rows]).all():
-                _refuse(self.path, f"finite numbers in {name}", "others")
-        most = max(1, int(_MAX_LEFT_OUT * len(rows)))
-        while len(bad := np.flatnonzero(~self._agree(rows[:-1], rows[1:]))):
-            rows = self._without_one(rows, int(bad[0]))
-            self.left_out += 1
-            if self.left_out > most:
-                _refuse(
-                    self.path,
-                    "positions and attitudes that agree with velocities and rates",
-                    f"more than {most} samples that do not",
-                )
-        return rows
-
-    def _without_one(self, rows: NDArray[np.int_], step: int) -> NDArray[np.int_]:
-        """Without the one of two samples that do not agree which also contradicts the others."""
-        for place in (step + 1, step):
-            rest = np.delete(rows, place)
-            around = rest[max(place - 1, 0) : place + 1]
-            if len(around) < 2 or self._agree(around[:1], around[1:])[0]:
-                return rest
-        seconds = self.motion("t")[0][rows[step + 1]]
-        _refuse(
-            self.path,
-            "positions and attitudes that agree with velocities and rates",
-            f"a jump at {seconds:.6g} s",
-        )
-
-    def _agree(self, first: NDArray[np.int_], second: NDArray[np.int_]) -> NDArray[np.bool_]:
-        """Whether the second of two samples follows from the first by the mean rates of both."""
-        (times,) = self.motion("t")
-        seconds = times[second] - times[first]
-        with np.errstate(all="ignore"):
-            squares = np.zeros(len(seconds))
-            for axis in "xyz":
-                place, speed = self.motion([axis, f"v{axis}"])
-                moved = 0.5 * (speed[first] + speed[second]) * seconds
-                squares += (place[second] - place[first] - moved) ** 2
-            rates = np.stack(self.motion(["wx", "wy", "wz"]), axis=1)
-            turned = 0.5 * np.linalg.norm(rates[first] + rates[second], axis=1) * seconds
-            cosine = np.abs((self.quaternions[first] * self.quaternions[second]).sum(axis=1))
-            angle = 2 * np.arccos(np.clip(cosine, 0.0, 1.0))
-            near = np.sqrt(squares) <= _POSITION_ERROR
-            level = np.abs(angle - turned) <= _ATTITUDE_ERROR
-        agree: NDArray[np.bool_] = near & level
-        return agree
-
-    def grid(self, rows: NDArray[np.int_], period: float) -> Floats:
-        """Uniform times from the first sample on. Raises `InputError` for a gap."""
-        times = self.motion("t")[0][rows]
-        if len(times) < 2:
-            _refuse(self.path, "two or more samples", str(len(times)))
-        gap = float(np.diff(times).max())
-        if gap > _LONGEST_GAP:
-            _refuse(self.path, f"no gap of more than {_LONGEST_GAP:g} s", f"{gap:.3g} s")
-        steps = int(np.floor((times[-1] - times[0]) / period + 1e-6))
-        uniform: Floats = times[0] + period * np.arange(steps + 1)
-        return uniform
-
-    def resampled(
-        self, columns: Sequence[Floats] | Floats, rows: NDArray[np.int_], grid: Floats
-    ) -> Floats:
-        """Columns at other times, shape (N, k)."""
-        times = self.motion("t")[0][rows]
-        chosen = [column[rows] for column in columns]
-        if not all(np.isfinite(column).all() for column in chosen):
-            _refuse(self.path, "finite numbers", "others")
-        return np.stack([np.interp(grid, times, column) for column in chosen], axis=1)
+# ---- columns
 
 
-def _without_flips(quaternions: Floats) -> Floats:
-    """The same attitudes, shape (N, 4), each quaternion on the side of the one before."""
-    cosine = (quaternions[1:] * quaternions[:-1]).sum(axis=1)
-    signs = np.cumprod(np.where(cosine < 0, -1.0, 1.0))
-    flipped = quaternions.copy()
-    flipped[1:] *= signs[:, None]
-    return flipped
+def _our_columns(path: Path, given: Mapping[str, str], rotors: int) -> dict[str, Floats]:
+    """The columns of a file that we know, by our names. Raises `InputError`."""
+    known = ["t", *MOTION]
+    for kind in _KINDS:
+        known += [kind.format(number) for number in range(1, rotors + 1)]
+    for name in given:
+        if name not in known:
+            raise InputError(f"columns: expected some of {', '.join(known)}, got {name!r}")
+    table = _table(path)
+    columns = {}
+    for name in known:
+        theirs = given.get(name, name)
+        column = _column(path, table, theirs)
+        if column is not None:
+            columns[name] = column
+        elif name in ("t", *MOTION):
+            _refuse(path, f"a column {theirs}", ", ".join(table))
+    return columns
 
 
 def _table(path: Path) -> Columns:
@@ -289,7 +165,7 @@ def _table(path: Path) -> Columns:
     return {str(name): frame[name].to_numpy() for name in frame}
 
 
-def _column(table: Columns, text: str, path: Path) -> Floats | None:
+def _column(path: Path, table: Columns, text: str) -> Floats | None:
     """A column, times a factor that may follow its name; None: there is none."""
     name = text
     factor = "1"
@@ -306,10 +182,18 @@ def _column(table: Columns, text: str, path: Path) -> Floats | None:
         ) from None
 
 
-def _commanded_speeds(throttle: Floats, vehicle: Vehicle, path: Path) -> Floats:
+def _of_rotors(table: Mapping[str, Floats], kind: str, vehicle: Vehicle) -> Floats | None:
+    """Columns of all rotors, shape (N, R); None: some are missing."""
+    names = [kind.format(number) for number in range(1, vehicle.num_rotors + 1)]
+    if not all(name in table for name in names):
+        return None
+    return np.stack([table[name] for name in names], axis=1)
+
+
+def _commanded_speeds(path: Path, throttle: Floats, vehicle: Vehicle) -> Floats:
     """Speeds at which the vehicle as it is gives the commanded share of its largest thrust."""
-    low = float(throttle.min())
-    high = float(throttle.max())
+    low = float(throttle.min(initial=0.0))
+    high = float(throttle.max(initial=0.0))
     if low <= -0.01 or high >= 1.01:
         _refuse(path, "throttle from 0 to 1", f"{low:.3g} to {high:.3g}")
     (coefficient,) = vehicle.coefficients.need("rotors.thrust_coefficient", "a log of commands")
@@ -318,17 +202,94 @@ def _commanded_speeds(throttle: Floats, vehicle: Vehicle, path: Path) -> Floats:
     return speeds
 
 
+def _check_speeds(path: Path, vehicle: Vehicle, speeds: Floats) -> None:
+    """Refuse speeds that no such rotor reaches."""
+    coefficient = vehicle.coefficients.rotors.thrust_coefficient
+    if coefficient is None:
+        return
+    most = _FASTEST * float(np.sqrt(vehicle.thrust_high.max() / coefficient))
+    fastest = float(np.abs(speeds).max(initial=0.0))
+    if fastest > most:
+        _refuse(path, f"rotor speeds of at most {most:.4g} rad/s", f"{fastest:.4g}")
+
+
+def _without_flips(quaternions: Floats) -> Floats:
+    """The same attitudes, shape (N, 4), each quaternion on the side of the one before."""
+    cosine = (quaternions[1:] * quaternions[:-1]).sum(axis=1)
+    signs = np.cumprod(np.where(cosine < 0, -1.0, 1.0))
+    return np.concatenate((quaternions[:1], quaternions[1:] * signs[:, None]))
+
+
+# ---- samples
+
+
+def _later(times: Floats) -> Rows:
+    """Samples with a later time than all before."""
+    later = times[1:] > np.maximum.accumulate(times)[:-1]
+    return np.flatnonzero(np.concatenate(([True], later)))
+
+
+def _consistent_rows(path: Path, times: Floats, samples: Floats) -> Rows:
+    """Samples with a later time than those before, without single impossible ones."""
+    if len(times) < 2:
+        _refuse(path, "two or more samples", str(len(times)))
+    if not np.isfinite(times).all():
+        _refuse(path, "finite times", "others")
+    rows = _later(times)
+    if not np.isfinite(samples[rows]).all():
+        _refuse(path, "finite numbers", "others")
+    least = len(rows) - max(1, int(_MOST_LEFT_OUT * len(rows)))
+    rule = "positions and attitudes that agree with velocities and rates"
+    while len(bad := np.flatnonzero(~_agree(times, samples, rows))):
+        step = int(bad[0])
+        for sample in (step + 1, step):
+            rest = np.delete(rows, sample)
+            around = rest[max(sample - 1, 0) : sample + 1]
+            if _agree(times, samples, around).all():
+                break
+        else:
+            _refuse(path, rule, f"a jump at {times[rows[step + 1]]:.6g} s")
+        rows = rest
+        if len(rows) < least:
+            _refuse(path, rule, f"more than {len(_later(times)) - least} samples that do not")
+    return rows
+
+
+def _agree(times: Floats, states: Floats, rows: Rows) -> NDArray[np.bool_]:
+    """Whether each sample follows from the one before by the mean rates of both."""
+    first = states[rows[:-1]]
+    second = states[rows[1:]]
+    seconds = np.diff(times[rows])[:, None]
+    with np.errstate(all="ignore"):
+        moved = 0.5 * (first[:, 7:10] + second[:, 7:10]) * seconds
+        distance = np.linalg.norm(second[:, :3] - first[:, :3] - moved, axis=1)
+        turned = np.linalg.norm(0.5 * (first[:, 10:13] + second[:, 10:13]) * seconds, axis=1)
+        cosine = np.abs((first[:, 3:7] * second[:, 3:7]).sum(axis=1))
+        angle = 2 * np.arccos(np.clip(cosine, 0.0, 1.0))
+        agree: NDArray[np.bool_] = distance <= _POSITION_ERROR
+        return agree & (np.abs(angle - turned) <= _ATTITUDE_ERROR)
+
+
+def _grid(path: Path, times: Floats, period: float) -> Floats:
+    """Uniform times from the first sample on. Raises `InputError` for a gap."""
+    if len(times) < 2:
+        _refuse(path, "two or more samples", str(len(times)))
+    gap = float(np.diff(times).max())
+    if gap > _LONGEST_GAP:
+        _refuse(path, f"no gap of more than {_LONGEST_GAP:g} s", f"{gap:.3g} s")
+    steps = int(np.floor((times[-1] - times[0]) / period + 1e-6))
+    uniform: Floats = times[0] + period * np.arange(steps + 1)
+    return uniform
+
+
 # ---- PX4
 
-_TOPICS: Final = ("vehicle_local_position", "vehicle_attitude", "vehicle_angular_velocity")
-_ROTOR_TOPICS: Final = (
-    ("esc_status", "esc[{}].esc_rpm", SPEED, 2 * np.pi / 60),
-    ("actuator_motors", "control[{}]", THROTTLE, 1.0),
-)
-"""Topic, its field of a rotor from 0, our column, and the factor."""
-_AXES: Final = (("x", 1.0), ("y", -1.0), ("z", -1.0))
-"""Signs of our axes: theirs are north east down and forward right down."""
-_MAX_ROTORS: Final = 12
+_POSITION: Final = "vehicle_local_position"
+_ATTITUDE: Final = "vehicle_attitude"
+_RATES: Final = "vehicle_angular_velocity"
+_ESC: Final = "esc_status"
+_MOTORS: Final = "actuator_motors"
+_MOST_ROTORS: Final = 12
 
 
 def _ulog(path: Path) -> Columns:
@@ -341,42 +302,33 @@ def _ulog(path: Path) -> Columns:
         log = pyulog.ULog(str(path))
     except (TypeError, ValueError, IndexError, KeyError) as error:
         raise InputError(f"log: expected a ULog file, got {path.name}: {error}") from None
-    topics = {one.name: one.data for one in reversed(log.data_list)}
-    for topic in _TOPICS:
+    topics = {topic.name: topic.data for topic in reversed(log.data_list)}
+    for topic in (_POSITION, _ATTITUDE, _RATES):
         if topic not in topics:
             _refuse(path, f"the topic {topic}", ", ".join(sorted(topics)))
-    place, turn, rates = (topics[name] for name in _TOPICS)
-    rotor_topics = [topics[name] for name, *_ in _ROTOR_TOPICS if name in topics]
-    base = _common_times(rates, [place, turn, *rotor_topics])
-
-    def at(topic: Columns, name: str, factor: float = 1.0) -> Floats:
-        times = topic["timestamp"].astype(np.float64)
-        values = np.interp(base, times, topic[name].astype(np.float64))
-        return np.asarray(factor * values)
-
+    used = topics.keys() & {_POSITION, _ATTITUDE, _RATES, _ESC, _MOTORS}
+    times = {topic: topics[topic]["timestamp"].astype(np.float64) for topic in used}
+    first = max(own[0] for own in times.values())
+    last = min(own[-1] for own in times.values())
+    base = times[_RATES][(times[_RATES] >= first) & (times[_RATES] <= last)]
+    attitude = topics[_ATTITUDE]
+    smooth = _without_flips(np.stack([attitude[f"q[{i}]"] for i in range(4)], axis=1))
+    attitude |= {f"q[{i}]": smooth[:, i] for i in range(4)}
     columns = {"t": (base - base[:1]) * 1e-6}
-    for i, (axis, sign) in enumerate(_AXES):
-        columns[axis] = at(place, axis, sign)
-        columns[f"v{axis}"] = at(place, f"v{axis}", sign)
-        columns[f"w{axis}"] = at(rates, f"xyz[{i}]", sign)
-    quaternions = np.stack([turn[f"q[{i}]"].astype(np.float64) for i in range(4)], axis=1)
-    smooth = {"timestamp": turn["timestamp"]}
-    for axis, values in zip("wxyz", _without_flips(quaternions).T, strict=True):
-        smooth[axis] = values
-    for axis, sign in (("w", 1.0), *_AXES):
-        columns[f"q{axis}"] = at(smooth, axis, sign)
-    for topic, field, ours, factor in _ROTOR_TOPICS:
-        for i in range(_MAX_ROTORS):
-            name = field.format(i)
-            if name in topics.get(topic, {}):
-                columns[ours.format(i + 1)] = at(topics[topic], name, factor)
+
+    def take(ours: str, topic: str, field: str, factor: float = 1.0) -> None:
+        if topic in used and field in topics[topic]:
+            values = topics[topic][field].astype(np.float64)
+            columns[ours] = factor * np.interp(base, times[topic], values)
+
+    take("qw", _ATTITUDE, "q[0]")
+    # Theirs are north east down and forward right down.
+    for i, (axis, sign) in enumerate((("x", 1.0), ("y", -1.0), ("z", -1.0))):
+        take(axis, _POSITION, axis, sign)
+        take(f"v{axis}", _POSITION, f"v{axis}", sign)
+        take(f"w{axis}", _RATES, f"xyz[{i}]", sign)
+        take(f"q{axis}", _ATTITUDE, f"q[{i + 1}]", sign)
+    for i in range(_MOST_ROTORS):
+        take(SPEED.format(i + 1), _ESC, f"esc[{i}].esc_rpm", 2 * np.pi / 60)
+        take(THROTTLE.format(i + 1), _MOTORS, f"control[{i}]")
     return columns
-
-
-def _common_times(base: Columns, others: Sequence[Columns]) -> Floats:
-    """Times of a topic, µs, at which all others have samples around them."""
-    times = base["timestamp"].astype(np.float64)
-    first = max(float(topic["timestamp"][0]) for topic in others)
-    last = min(float(topic["timestamp"][-1]) for topic in others)
-    inside: Floats = times[(times >= first) & (times <= last)]
-    return inside

@@ -105,15 +105,13 @@ class Windows:
         The only horizon is the last step, unless others are given.
         """
         chosen = np.array(horizons or [steps])
-        starts = [np.arange(0, len(flight.position) - steps, stride) for flight in flights]
+        starts = [np.arange(0, len(flight.states) - steps, stride) for flight in flights]
         states = []
         truth = []
         speeds = []
         for flight, first in zip(flights, starts, strict=True):
-            motion = (flight.position, flight.quaternion, flight.velocity, flight.body_rates)
-            samples = np.concatenate(motion, axis=1)
-            states.append(samples[first])
-            truth.append(samples[first[:, None] + chosen])
+            states.append(flight.states[first])
+            truth.append(flight.states[first[:, None] + chosen])
             speeds.append(flight.speeds[first[:, None] + np.arange(steps)])
         counts = [len(first) for first in starts]
         return cls(

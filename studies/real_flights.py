@@ -218,13 +218,14 @@ def regressed(vehicle: Vehicle, flights: Sequence[FlightLog]) -> dict[str, float
     forces, axials, velocities = [], [], []
     for flight in flights:
         inner = slice(2, -2)
-        velocity = flight.velocity
+        quaternion = flight.states[inner, 3:7]
+        velocity = flight.states[:, 7:10]
         near = velocity[3:-1] - velocity[1:-3]
         far = velocity[4:] - velocity[:-4]
         slope = (8 * near - far) / (12 * flight.period)
         up = np.array([0.0, 0.0, vehicle.gravity])
-        forces.append(to_body(flight.quaternion[inner], slope + up))
-        velocities.append(to_body(flight.quaternion[inner], velocity[inner]))
+        forces.append(to_body(quaternion, slope + up))
+        velocities.append(to_body(quaternion, velocity[inner]))
         axials.append(flight.speeds[inner] ** 2 @ axes)
     force, axial, velocity = (np.concatenate(parts) for parts in (forces, axials, velocities))
     coefficient = vehicle.mass * float((axial * force).sum() / (axial * axial).sum())

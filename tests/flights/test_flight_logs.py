@@ -22,7 +22,7 @@ FRAME = pandas.DataFrame
 def table() -> FRAME:
     """2 s along x at 1 m/s, rolling by 0.5 rad/s; a command that steps after 0.1 s."""
     time = 0.01 * np.arange(200)
-    frame = pandas.DataFrame(0.0, index=range(200), columns=[*MOTION, *SPEEDS, *COMMANDS])
+    frame = pandas.DataFrame(0.0, index=range(200), columns=["t", *MOTION, *SPEEDS, *COMMANDS])
     frame["t"] = time
     frame["x"] = time
     frame["vx"] = 1.0
@@ -60,9 +60,9 @@ def test_columns_may_have_other_names_units_and_times(table: FRAME, read: Read) 
     table[["qw", "qx", "qy", "qz"]] *= np.where(np.arange(200) % 3, 1, -1)[:, None]
     log = read(table, {"x": "pos_x", "m1_rads": "rpm*0.10471975511965977"}, period=0.005)
     time = 0.005 * np.arange(399)
-    np.testing.assert_allclose(log.position[:, 0], time, atol=1e-12)
+    np.testing.assert_allclose(log.states[:, 0], time, atol=1e-12)
     np.testing.assert_allclose(log.speeds, 600.0)
-    np.testing.assert_allclose(np.abs(log.quaternion[:, 0]), np.cos(0.25 * time), atol=1e-5)
+    np.testing.assert_allclose(np.abs(log.states[:, 3]), np.cos(0.25 * time), atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -99,10 +99,10 @@ def test_an_impossible_sample_is_left_out(
     table.loc[row, column] = impossible
     log = read(table)
     assert log.left_out == 1
-    assert len(log.position) == (200 if row == 60 else 199)
+    assert len(log.states) == (200 if row == 60 else 199)
     start = 0.01 if row == 0 else 0.0
-    time = start + 0.01 * np.arange(len(log.position))
-    np.testing.assert_allclose(log.position[:, 0], time, atol=1e-9)
+    time = start + 0.01 * np.arange(len(log.states))
+    np.testing.assert_allclose(log.states[:, 0], time, atol=1e-9)
 
 
 def test_a_jump_of_the_attitude_is_left_out(table: FRAME, read: Read) -> None:
@@ -153,11 +153,11 @@ def test_a_ulog_file_comes_in_our_frames(tmp_path: Path) -> None:
     log = read_log(ulog(tmp_path / "flight.ulg"), LIVELY)
     assert not log.measured
     # North east down becomes north, west, up; forward right down becomes forward, left, up.
-    np.testing.assert_allclose(log.position[100], (3.0, -2.0, 6.0), atol=1e-6)
-    np.testing.assert_allclose(log.velocity[50], (0.0, 0.0, 1.0), atol=1e-6)
+    np.testing.assert_allclose(log.states[100, :3], (3.0, -2.0, 6.0), atol=1e-6)
+    np.testing.assert_allclose(log.states[50, 7:10], (0.0, 0.0, 1.0), atol=1e-6)
     expected = (np.cos(0.1), np.sin(0.1), 0.0, 0.0)
-    np.testing.assert_allclose(log.quaternion[7], expected, atol=1e-6)
-    np.testing.assert_allclose(log.body_rates[7], (0.1, -0.2, -0.3), atol=1e-6)
+    np.testing.assert_allclose(log.states[7, 3:7], expected, atol=1e-6)
+    np.testing.assert_allclose(log.states[7, 10:], (0.1, -0.2, -0.3), atol=1e-6)
     # A quarter of the largest thrust, 3 N, at 3e-6 N s²/rad², is 500 rad/s.
     assert log.speeds[7, 0] == pytest.approx(500.0)
     assert log.speeds[7, 3] == pytest.approx(1000.0)

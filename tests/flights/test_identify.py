@@ -76,7 +76,7 @@ def flown(
     assert state.position[2] > 10.0
     world.close()
     commanded = [f"m{i}_command_rads" for i in range(1, 5)]
-    pandas.DataFrame(rows, columns=[*MOTION, *SPEEDS, *commanded]).to_csv(path, index=False)
+    pandas.DataFrame(rows, columns=["t", *MOTION, *SPEEDS, *commanded]).to_csv(path, index=False)
     return path
 
 
@@ -187,8 +187,8 @@ def test_a_prediction_is_the_simulator_s(tmp_path: Path) -> None:
     world = make_world(vehicle, 1, effects=EffectOptions(body_drag=True, rotor_drag=True))
     world.reset(np.True_, InitialState(thrust=thrust, **start))
     world.step(thrust, 100)
-    held = {name: np.tile(array, (101, 1)) for name, array in start.items()}
-    flight = FlightLog(name="", period=0.005, speeds=np.tile(speeds, (101, 1)), **held)
+    states = np.tile(np.concatenate(list(start.values())), (101, 1))
+    flight = FlightLog(name="", period=0.005, speeds=np.tile(speeds, (101, 1)), states=states)
     windows = Windows.cut([flight], 100, 200)
     predicted = predict(vehicle, [numbers_of(vehicle)], windows)[0, 0]
     state = world.state
@@ -201,16 +201,9 @@ def test_a_prediction_is_the_simulator_s(tmp_path: Path) -> None:
 
 def test_free_fall_with_linear_drag_falls_as_the_closed_form() -> None:
     vehicle = Vehicle.load(LIVELY)
-    still = np.zeros((501, 3))
-    flight = FlightLog(
-        name="",
-        period=0.002,
-        position=still,
-        quaternion=np.tile((1.0, 0.0, 0.0, 0.0), (501, 1)),
-        velocity=still,
-        body_rates=still,
-        speeds=np.zeros((501, 4)),
-    )
+    states = np.zeros((501, 13))
+    states[:, 3] = 1.0
+    flight = FlightLog(name="", period=0.002, states=states, speeds=np.zeros((501, 4)))
     candidates = [numbers_of(vehicle) | {"drag.linear.z": drag} for drag in (0.5, 0.0)]
     windows = Windows.cut([flight], 500, 600).repeated(2)
     draggy, free = predict(vehicle, candidates, windows)[:, 0]

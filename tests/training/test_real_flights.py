@@ -23,18 +23,12 @@ RESULTS = ROOT / "docs" / "results" / "real_flights"
 
 def flight(count: int, velocity: float, start: float = 0.0) -> FlightLog:
     """Along x at a constant velocity, level, with rotors at rest."""
-    still = np.zeros((count, 3))
-    time = 0.01 * np.arange(count)
-    position = still.copy()
-    position[:, 0] = start + velocity * time
+    states = np.zeros((count, 13))
+    states[:, 0] = start + velocity * 0.01 * np.arange(count)
+    states[:, 3] = 1.0
+    states[:, 7] = velocity
     return FlightLog(
-        name=f"flight{velocity:g}",
-        period=0.01,
-        position=position,
-        quaternion=np.tile((1.0, 0.0, 0.0, 0.0), (count, 1)),
-        velocity=np.tile((velocity, 0.0, 0.0), (count, 1)),
-        body_rates=still,
-        speeds=np.zeros((count, 4)),
+        name=f"flight{velocity:g}", period=0.01, states=states, speeds=np.zeros((count, 4))
     )
 
 
