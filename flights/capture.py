@@ -9,11 +9,11 @@ import hashlib
 import io
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 import mujoco
 import numpy as np
@@ -24,7 +24,7 @@ from ..models.cameras import View
 from ..models.errors import InputError
 from ..models.swarm import drone_names
 from ..models.vehicle import Vehicle
-from .coco import write_coco
+from .coco import Labels, write_coco
 from .executors import OnProgress, Tell, WorkersConfig, open_executor, run_jobs
 from .folders import locked
 from .viewpoints import Plan, PoseSequence
@@ -32,45 +32,34 @@ from .viewpoints import Plan, PoseSequence
 if TYPE_CHECKING:
     from ..rendering.cameras import Cameras
 
-LABELS: Final = "labels"
-_CHUNK: Final = 64  # frames of a job, at most
-_ENDINGS: Final = {
-    "rgb": ("png",),
-    "depth": ("npy", "png"),
-    "segmentation": ("png",),
-    "flow": ("npy",),
-}
-"""File name extensions of each kind of picture."""
+_MOST_FRAMES: Final = 64  # of a job
 _FARTHEST: Final = 65.535  # m: the largest number of millimetres in 16 bits
+Picture = NDArray[np.generic]
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Job:
-    """Some consecutive frames of a sequence, and the pose before them, if there is one."""
+    """Some frames of a sequence."""
 
     plan: Plan
     poses: PoseSequence
-    """These poses alone."""
+    """From the pose before the first frame to the last frame."""
     sequence: int
     """Number of the whole sequence."""
     first: int
-    """Number of the first frame."""
-    before: int
-    """1 if `poses` begins with the pose before the first frame, else 0."""
-
-    @property
-    def name(self) -> str:
-        last = self.first + len(self.poses) - self.before - 1
-        return f"frames {self.first} to {last}"
+    """Number of the frame of the first pose."""
+    missing: frozenset[int]
+    """Numbers of the frames to take."""
 
 
-class Frame(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class Frame:
     """The pictures and labels of a pose."""
 
     number: int
     files: dict[str, bytes]
     """By their paths in the folder."""
-    labels: dict[str, Any]
+    labels: Labels
 
 
 def capture(
@@ -87,28 +76,39 @@ def capture(
     """
     with locked(folder):
         sequences = plan.sequences()
-        views = plan.views()
         _claim(folder / "plan.toml", plan.text, "plan")
-        _claim(
-            folder / "made_of.json",
-            _made_of(plan, sequences, views),
-            "vehicle, flights and MuJoCo",
-        )
+        _claim(folder / "made_of.json", _made_of(plan, sequences), "vehicle, flights and MuJoCo")
         for unfinished in folder.rglob(".*.tmp"):  # by a run that was killed
             unfinished.unlink()
+        count = sum(map(len, sequences))
         workers = config.jobs or os.cpu_count() or 1
-        found = _jobs(plan, sequences, views, folder, workers)
-        jobs = {job.name: job for job in found}
+        longest = min(_MOST_FRAMES, -(-count // (2 * workers)))
+        jobs = {}
+        for job in _jobs(plan, sequences, folder, longest):
+            jobs[f"frames {min(job.missing)} to {max(job.missing)}"] = job
+
+        def keep(_: _Job, frames: list[Frame]) -> None:
+            for frame in frames:
+                for name, data in frame.files.items():
+                    write_whole(folder / name, data)
+                labels = json.dumps(frame.labels, separators=(",", ":"))
+                write_whole(label_file(folder, frame.number), labels.encode())
+
         if jobs:
-
-            def keep(_: _Job, frames: list[Frame]) -> None:
-                _write(folder, frames)
-
             with open_executor(config, len(jobs), on_progress) as executor:
                 run_jobs(executor, _take, jobs, keep, on_progress)
-        count = sum(map(len, sequences))
         write_coco(plan, sequences, read_labels(folder, count), folder / "coco.json")
     return count
+
+
+def label_file(folder: Path, number: int) -> Path:
+    """Path of a frame's labels."""
+    return folder / "labels" / f"{number:06}.json"
+
+
+def read_labels(folder: Path, count: int) -> list[Labels]:
+    """Labels of the first `count` frames; all of them have to be whole."""
+    return [json.loads(label_file(folder, number).read_bytes()) for number in range(count)]
 
 
 def _claim(file: Path, text: str, what: str) -> None:
@@ -119,7 +119,7 @@ def _claim(file: Path, text: str, what: str) -> None:
         raise InputError(f"{file.parent}: expected a folder of the same {what}, got one of others")
 
 
-def _made_of(plan: Plan, sequences: Sequence[PoseSequence], views: Sequence[View]) -> str:
+def _made_of(plan: Plan, sequences: Sequence[PoseSequence]) -> str:
     """Hashes of what decides the pictures besides the plan, in JSON."""
     digest = hashlib.blake2b(digest_size=16)
     for sequence in sequences:
@@ -129,7 +129,7 @@ def _made_of(plan: Plan, sequences: Sequence[PoseSequence], views: Sequence[View
             digest.update(content)
     made = {
         "vehicle": Vehicle.load(plan.vehicle).hash,
-        "cameras": hashlib.blake2b(repr(views).encode(), digest_size=16).hexdigest(),
+        "cameras": hashlib.blake2b(repr(plan.views()).encode(), digest_size=16).hexdigest(),
         "poses": digest.hexdigest(),
         "mujoco": mujoco.__version__,
     }
@@ -137,73 +137,36 @@ def _made_of(plan: Plan, sequences: Sequence[PoseSequence], views: Sequence[View
 
 
 def _jobs(
-    plan: Plan,
-    sequences: Sequence[PoseSequence],
-    views: Sequence[View],
-    folder: Path,
-    workers: int,
+    plan: Plan, sequences: Sequence[PoseSequence], folder: Path, longest: int
 ) -> Iterator[_Job]:
-    """Runs of consecutive frames that are not whole."""
-    first = 0
-    share = -(-sum(map(len, sequences)) // (2 * workers))
-    longest = min(share, _CHUNK)
-    for number, poses in enumerate(sequences):
-        missing = [
-            row
-            for row in range(len(poses))
-            if not _is_whole(folder, first + row, views, poses.drones)
-        ]
-        while missing:
-            start = missing[0]
-            count = 1
-            while count < min(longest, len(missing)) and missing[count] == start + count:
-                count += 1
-            before = min(start, 1)
-            yield _Job(
-                plan=plan,
-                poses=poses.part(start - before, start + count),
-                sequence=number,
-                first=first + start,
-                before=before,
-            )
-            missing = missing[count:]
-        first += len(poses)
+    """Jobs of at most so many frames, for those that are not whole."""
+    start = 0  # number of the first frame of the sequence
+    for index, poses in enumerate(sequences):
+        for first in range(0, len(poses), longest):
+            end = min(first + longest, len(poses))
+            numbers = range(start + first, start + end)
+            missing = frozenset(number for number in numbers if not _is_whole(folder, number))
+            if missing:
+                before = max(min(missing) - 1 - start, 0)
+                yield _Job(
+                    plan=plan,
+                    poses=poses.part(before, end),
+                    sequence=index,
+                    first=start + before,
+                    missing=missing,
+                )
+        start += len(poses)
 
 
-def _is_whole(folder: Path, number: int, views: Sequence[View], drones: int) -> bool:
+def _is_whole(folder: Path, number: int) -> bool:
     """Whether a frame's labels are there, and all its files in their sizes."""
     try:
-        pictures = json.loads(label_file(folder, number).read_bytes())["pictures"]
-        labelled = [(p["camera"], p["kind"], p["width"], p["height"]) for p in pictures]
-        sizes = {file: size for p in pictures for file, size in p["files"].items()}
-        same_sizes = all((folder / file).stat().st_size == size for file, size in sizes.items())
+        labels = json.loads(label_file(folder, number).read_bytes())
+        sizes = [item for picture in labels["pictures"] for item in picture["files"].items()]
+        same = all((folder / file).stat().st_size == size for file, size in sizes)
+        return same and labels["frame"] == number and bool(labels["pose"])
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
         return False
-    expected = []
-    files = set()
-    for view in views:
-        height, width = view.shape[:2]
-        for drone in range(pictures_of(view, drones)):
-            expected.append((view.camera.name, view.kind, width, height))
-            for ending in _ENDINGS[view.kind]:
-                files.add(picture_name(view, number, drone, drones, ending))
-    return same_sizes and labelled == expected and files == sizes.keys()
-
-
-def label_file(folder: Path, number: int) -> Path:
-    """Path of a frame's labels."""
-    return folder / LABELS / f"{number:06}.json"
-
-
-def pictures_of(view: View, drones: int) -> int:
-    """Pictures of a view in each frame: one of each drone, or one of a camera that stands."""
-    return drones if view.camera.carried else 1
-
-
-def picture_name(view: View, number: int, drone: int, drones: int, ending: str) -> str:
-    """Path of a picture in the folder."""
-    suffix = f"_{drone}" if pictures_of(view, drones) > 1 else ""
-    return f"{view.kind}/{view.camera.name}/{number:06}{suffix}.{ending}"
 
 
 # ---- in workers
@@ -213,68 +176,55 @@ def _take(job: _Job, tell: Tell) -> list[Frame]:
     """The frames of a job."""
     from ..rendering.cameras import Cameras
 
-    plan = job.plan
     poses = job.poses
-    drones = poses.drones
-    everybody = np.ones(drones, bool)
+    everybody = np.ones(poses.drones, bool)
     frames = []
     opened = Cameras(
-        Vehicle.load(plan.vehicle),
-        plan.views(),
-        (1, drones),
+        Vehicle.load(job.plan.vehicle),
+        job.plan.views(),
+        (1, poses.drones),
         scene=poses.scene,
         marks=poses.marks,
         payload=poses.payload is not None,
-        fine=plan.fine,
+        fine=job.plan.fine,
     )
     with closing(opened) as cameras:
         for row in range(len(poses)):
-            is_frame = row >= job.before  # the pose before serves optical flow alone
-            number = job.first + row - job.before
-            state = poses.state(row)
-            due = dict.fromkeys(cameras.pictures, everybody & is_frame)
+            number = job.first + row
+            is_missing = number in job.missing  # others serve optical flow alone
+            due = dict.fromkeys(cameras.pictures, everybody & is_missing)
             begun = everybody & (row == 0)
-            rng = {0: np.random.default_rng([plan.seed, 0, number])}  # sources count from 1
-            cameras.take(due, begun, state, rng.__getitem__)
-            if not is_frame:
-                continue
-            labels = {
-                "frame": number,
-                "sequence": job.sequence,
-                "source": poses.name,
-                "scene": poses.scene,
-                "time": float(poses.times[row]),
-            }
-            frames.append(_frame(number, cameras, drones, state, labels, plan.least_area))
-            tell(len(frames), len(poses) - job.before, "frames")
+            rng = {0: np.random.default_rng([job.plan.seed, 0, number])}  # sources count from 1
+            cameras.take(due, begun, poses.state(row), rng.__getitem__)
+            if is_missing:
+                frames.append(_frame(job, row, cameras))
+                tell(len(frames), len(job.missing), "frames")
     return frames
 
 
-def _frame(
-    number: int,
-    cameras: "Cameras",
-    drones: int,
-    state: Mapping[str, NDArray[np.float64]],
-    labels: Mapping[str, Any],
-    least_area: int,
-) -> Frame:
+def _frame(job: _Job, row: int, cameras: "Cameras") -> Frame:
     """Files and labels of the pictures that the cameras have just taken."""
+    poses = job.poses
+    number = job.first + row
+    state = poses.state(row)
+    names = drone_names(poses.drones)
     files: dict[str, bytes] = {}
     pictures = []
     for view in cameras.views:
-        for drone in range(pictures_of(view, drones)):
+        # A camera that stands takes one picture for all drones.
+        drones = range(poses.drones if view.camera.carried else 1)
+        for drone in drones:
+            suffix = f"_{drone}" if len(drones) > 1 else ""
+            stem = f"{view.kind}/{view.camera.name}/{number:06}{suffix}"
             image = cameras.pictures[view.name][drone]
-            encoded = {
-                picture_name(view, number, drone, drones, ending): data
-                for ending, data in _encoded(view.kind, image)
-            }
-            files.update(encoded)
+            encoded = {f"{stem}.{ending}": data for ending, data in _encoded(view, image)}
+            files |= encoded
             lens = cameras.lens(view.name, state, drone)
             height, width = view.shape[:2]
-            picture: dict[str, Any] = {
+            picture: Labels = {
                 "camera": view.camera.name,
                 "kind": view.kind,
-                "drone": drone_names(drones)[drone],
+                "drone": names[drone],
                 "width": width,
                 "height": height,
                 "matrix": lens.matrix.tolist(),
@@ -285,35 +235,38 @@ def _frame(
             }
             if view.kind == "segmentation":
                 found = objects_in(image[..., 0], cameras.objects)
-                picture["objects"] = [thing for thing in found if thing["area"] >= least_area]
+                least = job.plan.least_area
+                picture["objects"] = [thing for thing in found if thing["area"] >= least]
             pictures.append(picture)
-    pose = {name: values.tolist() for name, values in state.items()}
-    return Frame(number, files, {**labels, "pose": pose, "pictures": pictures})
+    labels = {
+        "frame": number,
+        "sequence": job.sequence,
+        "source": poses.name,
+        "scene": poses.scene,
+        "time": float(poses.times[row]),
+        "pose": {name: values.tolist() for name, values in state.items()},
+        "pictures": pictures,
+    }
+    return Frame(number=number, files=files, labels=labels)
 
 
-def _encoded(kind: str, image: NDArray[Any]) -> Iterator[tuple[str, bytes]]:
+def _encoded(view: View, image: Picture) -> Iterator[tuple[str, bytes]]:
     """Ending and bytes of the files of a picture."""
-    if kind == "rgb":
+    if view.kind in ("depth", "flow"):
+        data = io.BytesIO()
+        np.save(data, image[..., 0] if view.kind == "depth" else image)
+        yield "npy", data.getvalue()
+    if view.kind == "rgb":
         yield "png", _png(image)
-    elif kind == "segmentation":
+    elif view.kind == "segmentation":
         yield "png", _png(image[..., 0].astype(np.uint16))
-    elif kind == "flow":
-        yield "npy", _npy(image)
-    else:
-        depth = image[..., 0]
-        yield "npy", _npy(depth)
-        millimetres = np.rint(1000 * depth.astype(np.float64))
-        near = np.where(depth <= _FARTHEST, millimetres, 0)
+    elif view.kind == "depth":
+        depth = image[..., 0].astype(np.float64)
+        near = np.where(image[..., 0] <= _FARTHEST, np.rint(1000 * depth), 0)
         yield "png", _png(near.astype(np.uint16))
 
 
-def _npy(array: NDArray[Any]) -> bytes:
-    data = io.BytesIO()
-    np.save(data, array)
-    return data.getvalue()
-
-
-def _png(array: NDArray[Any]) -> bytes:
+def _png(array: Picture) -> bytes:
     from PIL import Image
 
     data = io.BytesIO()
@@ -321,45 +274,24 @@ def _png(array: NDArray[Any]) -> bytes:
     return data.getvalue()
 
 
-def objects_in(numbers: NDArray[np.int32], names: Sequence[str]) -> Iterator[dict[str, Any]]:
+def objects_in(numbers: Picture, names: Sequence[str]) -> Iterator[Labels]:
     """Objects of a segmentation picture (H, W): name, box from its mask, area, run lengths.
 
     The box is [left, top, width, height], pixels. Run lengths are COCO's: down each column, those
     outside first.
     """
-    for number in np.unique(numbers).tolist():
-        if number == 0:
-            continue
+    for number in np.unique(numbers[numbers != 0]).tolist():
         mask = numbers == number
-        rows = np.flatnonzero(mask.any(axis=1))
-        columns = np.flatnonzero(mask.any(axis=0))
+        rows, columns = np.nonzero(mask)
         flat = np.concatenate(([False], mask.ravel(order="F")))
         edges = np.flatnonzero(flat[1:] != flat[:-1])
         runs = np.diff(np.concatenate(([0], edges, [mask.size])))
-        width = int(np.ptp(columns)) + 1
-        height = int(np.ptp(rows)) + 1
+        left = int(columns.min())
+        top = int(rows.min())
         yield {
             "number": number,
             "name": names[number],
-            "box": [int(columns[0]), int(rows[0]), width, height],
-            "area": int(mask.sum()),
+            "box": [left, top, int(columns.max()) + 1 - left, int(rows.max()) + 1 - top],
+            "area": len(rows),
             "runs": runs.tolist(),
         }
-
-
-# ---- files
-
-
-def _write(folder: Path, frames: Iterable[Frame]) -> None:
-    """Write frames, the labels of each last."""
-    for frame in frames:
-        for name, data in frame.files.items():
-            write_whole(folder / name, data)
-        labels = json.dumps(frame.labels, separators=(",", ":"))
-        write_whole(label_file(folder, frame.number), labels.encode())
-
-
-def read_labels(folder: Path, count: int) -> list[dict[str, Any]]:
-    """Labels of the first `count` frames; all of them have to be whole."""
-    files = (label_file(folder, number) for number in range(count))
-    return [json.loads(file.read_bytes()) for file in files]

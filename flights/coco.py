@@ -2,26 +2,58 @@
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from ..agents.checkpoints import write_whole
 from ..models.vehicle import Vehicle
 from ..rendering.camera_model import NOTHING, objects_of
 from .viewpoints import Plan, PoseSequence
 
-Labels = Mapping[str, Any]
-"""The labels of one frame: the content of its JSON file."""
+Labels = dict[str, Any]
+"""The labels of one frame or picture: an object of JSON."""
+_SAME_VIEW: Final = ("camera", "drone", "width", "height")
 
 
 def write_coco(
-    plan: Plan, sequences: Sequence[PoseSequence], labels: Sequence[Labels], file: Path
+    plan: Plan, sequences: Sequence[PoseSequence], frames: Sequence[Labels], file: Path
 ) -> None:
-    """Write the objects of all segmentation pictures. Raises `OSError`."""
-    content = coco(labels, _categories(plan, sequences))
-    text = json.dumps(content, separators=(",", ":")) + "\n"
-    write_whole(file, text.encode())
+    """Write the objects of all segmentation pictures, with the labels of all frames.
+
+    The categories are the kinds of all objects of the scenes, seen or not. Raises `OSError`.
+    """
+    vehicle = Vehicle.load(plan.vehicle)
+    kinds = set[str]()
+    for drones, scene, marks, payload in {sequence.stage for sequence in sequences}:
+        names = objects_of(vehicle, drones, scene, marks, payload=payload)
+        kinds.update(map(category, names))
+    categories = {kind: number for number, kind in enumerate(sorted(kinds - {NOTHING}), 1)}
+    images = []
+    annotations = []
+    for image, picture in _segmented(frames):
+        images.append(image)
+        for thing in picture["objects"]:
+            annotation = {
+                "id": len(annotations) + 1,
+                "image_id": image["id"],
+                "category_id": categories[category(thing["name"])],
+                "bbox": thing["box"],
+                "area": thing["area"],
+                "iscrowd": 0,
+                "segmentation": {
+                    "size": [image["height"], image["width"]],
+                    "counts": thing["runs"],
+                },
+                "object": thing["name"],
+            }
+            annotations.append(annotation)
+    content = {
+        "images": images,
+        "annotations": annotations,
+        "categories": [{"id": number, "name": name} for name, number in categories.items()],
+    }
+    write_whole(file, json.dumps(content, separators=(",", ":")).encode() + b"\n")
 
 
 def category(name: str) -> str:
@@ -29,62 +61,32 @@ def category(name: str) -> str:
     return re.sub(r"_\d+\b", "", name)
 
 
-def _categories(plan: Plan, sequences: Sequence[PoseSequence]) -> list[str]:
-    """Sorted kinds of all objects of the scenes, seen or not."""
-    vehicle = Vehicle.load(plan.vehicle)
-    kinds = set[str]()
-    for drones, world, marks, payload in {sequence.stage for sequence in sequences}:
-        names = objects_of(vehicle, drones, world, marks, payload=payload)
-        kinds.update(map(category, names))
-    return sorted(kinds - {NOTHING})
-
-
-def coco(labels: Sequence[Labels], categories: Sequence[str]) -> dict[str, Any]:
-    """COCO's tables: images with their time and sequence, annotations and categories.
+def _segmented(frames: Sequence[Labels]) -> Iterator[tuple[Labels, Labels]]:
+    """COCO's image and our labels of each segmentation picture.
 
     An image is named by the colours of its camera in the same size, or else by its segmentation.
     """
-    numbers = {kind: number for number, kind in enumerate(categories, 1)}
-    images: list[dict[str, Any]] = []
-    annotations: list[dict[str, Any]] = []
-    for frame in labels:
-        colours = {
-            _identity(picture): next(iter(picture["files"]))
-            for picture in frame["pictures"]
-            if picture["kind"] == "rgb"
-        }
+    count = 0
+    for frame in frames:
+        files: dict[tuple[object, ...], str] = {}
         for picture in frame["pictures"]:
-            if picture["kind"] != "segmentation":
-                continue
-            (file,) = picture["files"]
-            image = {
-                "id": len(images) + 1,
-                "file_name": colours.get(_identity(picture), file),
-                "width": picture["width"],
-                "height": picture["height"],
-                "sequence": frame["sequence"],
-                "time": frame["time"],
-            }
-            images.append(image)
-            for thing in picture["objects"]:
-                annotation = {
-                    "id": len(annotations) + 1,
-                    "image_id": image["id"],
-                    "category_id": numbers[category(thing["name"])],
-                    "bbox": thing["box"],
-                    "area": thing["area"],
-                    "iscrowd": 0,
-                    "segmentation": {
-                        "size": [picture["height"], picture["width"]],
-                        "counts": thing["runs"],
-                    },
-                    "object": thing["name"],
+            if picture["kind"] == "rgb":
+                (files[_view(picture)],) = picture["files"]
+        for picture in frame["pictures"]:
+            if picture["kind"] == "segmentation":
+                count += 1
+                (own,) = picture["files"]
+                image = {
+                    "id": count,
+                    "file_name": files.get(_view(picture), own),
+                    "width": picture["width"],
+                    "height": picture["height"],
+                    "sequence": frame["sequence"],
+                    "time": frame["time"],
                 }
-                annotations.append(annotation)
-    kinds = [{"id": number, "name": name} for name, number in numbers.items()]
-    return {"images": images, "annotations": annotations, "categories": kinds}
+                yield image, picture
 
 
-def _identity(picture: Labels) -> tuple[Any, ...]:
+def _view(picture: Labels) -> tuple[object, ...]:
     """Camera, drone and size, which the pictures of one view share."""
-    return tuple(picture[key] for key in ("camera", "drone", "width", "height"))
+    return tuple(picture[key] for key in _SAME_VIEW)
