@@ -262,8 +262,8 @@ def _encoded(view: View, image: Picture) -> Iterator[tuple[str, bytes]]:
         yield "png", _png(image[..., 0].astype(np.uint16))
     elif view.kind == "depth":
         depth = image[..., 0].astype(np.float64)
-        near = np.where(image[..., 0] <= _FARTHEST, np.rint(1000 * depth), 0)
-        yield "png", _png(near.astype(np.uint16))
+        millimetres = np.where(depth <= _FARTHEST, np.rint(1000 * depth), 0)
+        yield "png", _png(millimetres.astype(np.uint16))
 
 
 def _png(array: Picture) -> bytes:

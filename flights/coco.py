@@ -29,8 +29,8 @@ def write_coco(
         names = objects_of(vehicle, drones, scene, marks, payload=payload)
         kinds.update(map(category, names))
     categories = {kind: number for number, kind in enumerate(sorted(kinds - {NOTHING}), 1)}
-    images = []
-    annotations = []
+    images: list[Labels] = []
+    annotations: list[Labels] = []
     for image, picture in _segmented(frames):
         images.append(image)
         for thing in picture["objects"]:

@@ -266,8 +266,10 @@ def _agree(times: Floats, states: Floats, rows: Rows) -> NDArray[np.bool_]:
         turned = np.linalg.norm(0.5 * (first[:, 10:13] + second[:, 10:13]) * seconds, axis=1)
         cosine = np.abs((first[:, 3:7] * second[:, 3:7]).sum(axis=1))
         angle = 2 * np.arccos(np.clip(cosine, 0.0, 1.0))
-        agree: NDArray[np.bool_] = distance <= _POSITION_ERROR
-        return agree & (np.abs(angle - turned) <= _ATTITUDE_ERROR)
+        near = distance <= _POSITION_ERROR
+        level = np.abs(angle - turned) <= _ATTITUDE_ERROR
+    agree: NDArray[np.bool_] = near & level
+    return agree
 
 
 def _grid(path: Path, times: Floats, period: float) -> Floats:
