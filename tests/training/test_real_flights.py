@@ -67,9 +67,9 @@ def test_the_baseline_lets_the_rates_decay_whatever_the_rotors_do() -> None:
     for rate in (1.0, -2.0):
         angle = 0.25 * rate * (1 - np.exp(-time / 0.25))
         log = flight(120, 0.0)
-        log.body_rates[:, 0] = rate * np.exp(-time / 0.25)
-        log.quaternion[:, 0] = np.cos(angle / 2)
-        log.quaternion[:, 1] = np.sin(angle / 2)
+        log.states[:, 10] = rate * np.exp(-time / 0.25)
+        log.states[:, 3] = np.cos(angle / 2)
+        log.states[:, 4] = np.sin(angle / 2)
         log.speeds[:] = (1750.0, 1720.0, 1720.0, 1690.0)
         flights.append(log)
     vehicle = Vehicle.load(ROOT / "studies" / "nanodrone.toml")
