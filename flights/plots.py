@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..models.errors import InputError, require
+from ..sim.rotations import euler
 from .palette import FLIGHT_COLORS
 from .signals import QUATERNION, Signal, signals_of
 from .trajectories import Trajectory
@@ -104,11 +105,8 @@ def roll_pitch_yaw(quaternion: Floats) -> Floats:
 
     Roll and yaw have no jumps by a whole turn. Quaternions have shape (T, 4), scalar first.
     """
-    w, x, y, z = quaternion.T
-    roll = np.unwrap(np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)))
-    pitch = np.arcsin(np.clip(2 * (w * y - x * z), -1.0, 1.0))
-    yaw = np.unwrap(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
-    return np.stack((roll, pitch, yaw), axis=-1)
+    roll, pitch, yaw = euler(quaternion)
+    return np.stack((np.unwrap(roll), pitch, np.unwrap(yaw)), axis=-1)
 
 
 def _label(name: str, unit: str) -> str:

@@ -8,7 +8,7 @@ from .control import LEVELS, CollectiveThrust, Controller, Gains, RotorThrust, m
 from .effects import EffectOptions
 from .random import Draw, numbers_of
 from .randomize import PARAMETERS, Randomization
-from .rotations import to_body, world_z
+from .rotations import body_x, body_z, to_body, world_z
 from .sensors import checked_sensors
 from .state import (
     Array,
@@ -40,6 +40,8 @@ __all__ = [
     "RotorThrust",
     "World",
     "WorldState",
+    "body_x",
+    "body_z",
     "checked_sensors",
     "clip",
     "component",

@@ -38,9 +38,10 @@ _LOG2_PARTS: Final = {True: _parts(_LOG2, 14, 2), False: _parts(_LOG2, 40, 2)}
 
 
 def polynomial(x: Real, coefficients: list[float]) -> Real:
-    """A polynomial by Horner's rule, the highest power first."""
-    result = 0.0 * x + coefficients[0]
-    for coefficient in coefficients[1:]:
+    """A polynomial by Horner's rule, the highest power of at least one first."""
+    highest, *rest = coefficients
+    result = x * highest + rest[0]
+    for coefficient in rest[1:]:
         result = result * x + coefficient
     return result
 

@@ -1,8 +1,76 @@
-"""Vectors turned by unit quaternions, scalar first, for any leading axes."""
+"""Rotations by unit quaternions, scalar first: the one algebra of the project.
+
+Functions of `Parts` take and give the components of vectors: each a number, or an array. The others
+take arrays with the components on their last axis, and any leading axes.
+"""
+
+from collections.abc import Sequence
 
 import numpy as np
 
-from .state import Array, component, stack
+from .state import Array, stack
+
+Parts = Sequence[Array]
+Rows = tuple[Parts, Parts, Parts]
+
+
+def parts_of(array: Array) -> list[Array]:
+    """Components of the last axis; of a single drone Python's numbers."""
+    if array.ndim == 1:
+        numbers: list[Array] = array.tolist()
+        return numbers
+    return [array[..., index] for index in range(array.shape[-1])]
+
+
+# ---- of components
+
+
+def dot(a: Parts, b: Parts) -> Array:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def add(a: Parts, b: Parts) -> Parts:
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+def cross(a: Parts, b: Parts) -> Parts:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+def times(rows: Sequence[Parts], vector: Parts) -> Parts:
+    """A matrix of three rows, and a vector."""
+    return dot(rows[0], vector), dot(rows[1], vector), dot(rows[2], vector)
+
+
+def transposed(rows: Rows) -> Rows:
+    """The three columns of a matrix."""
+    x, y, z = zip(*rows, strict=True)
+    return x, y, z
+
+
+def product(a: Parts, b: Parts) -> Parts:
+    """Product of quaternions: b in the frame that a turns."""
+    w, x, y, z = a
+    d, e, f, g = b
+    return (
+        w * d - x * e - y * f - z * g,
+        x * d + w * e + y * g - z * f,
+        y * d + w * f + z * e - x * g,
+        z * d + w * g + x * f - y * e,
+    )
+
+
+def matrix(quaternion: Parts, twice: Array = 2.0) -> Rows:
+    """Rotation matrix from body to world, three rows; `twice` is 2 over the squared length."""
+    w, x, y, z = quaternion
+    return (
+        (1.0 - twice * (y * y + z * z), twice * (x * y - w * z), twice * (x * z + w * y)),
+        (twice * (x * y + w * z), 1.0 - twice * (x * x + z * z), twice * (y * z - w * x)),
+        (twice * (x * z - w * y), twice * (y * z + w * x), 1.0 - twice * (x * x + y * y)),
+    )
+
+
+# ---- of arrays
 
 
 def to_world(quaternion: Array, vector: Array) -> Array:
@@ -15,61 +83,65 @@ def to_body(quaternion: Array, vector: Array) -> Array:
     return _turned(quaternion, vector, -1.0)
 
 
+def _turned(quaternion: Array, vector: Array, sign: float) -> Array:
+    # v + w t + u x t with t = 2 u x v, for the axis u; the other way with w's sign changed.
+    w, *axis = parts_of(quaternion)
+    w = w * sign
+    v = parts_of(vector)
+    t = [2 * part for part in cross(axis, v)]
+    (x, y, z) = axis
+    (p, q, r) = t
+    return stack((
+        v[0] + w * p + y * r - z * q,
+        v[1] + w * q + z * p - x * r,
+        v[2] + w * r + x * q - y * p,
+    ))  # fmt: skip
+
+
+def body_x(quaternion: Array) -> Array:
+    """Direction of body x in the world frame, shape (..., 3)."""
+    w, x, y, z = parts_of(quaternion)
+    return stack((1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)))
+
+
 def body_z(quaternion: Array) -> Array:
     """Direction of body z in the world frame, shape (..., 3)."""
-    w, x, y, z = (component(quaternion, i) for i in range(4))
+    w, x, y, z = parts_of(quaternion)
     return stack((2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)))
 
 
 def world_z(quaternion: Array) -> Array:
     """Direction of world z in the body frame, shape (..., 3)."""
-    w, x, y, z = (component(quaternion, i) for i in range(4))
+    w, x, y, z = parts_of(quaternion)
     return stack((2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)))
 
 
-def cross(a: Array, b: Array) -> Array:
-    """Cross product of vectors, shape (..., 3)."""
-    (ax, ay, az), (bx, by, bz) = ([component(v, i) for i in range(3)] for v in (a, b))
-    return stack((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx))
+def euler(quaternion: Array) -> tuple[Array, Array, Array]:
+    """Angles about x, y and z of R = Rz(yaw) Ry(pitch) Rx(roll), rad, shape (...)."""
+    w, x, y, z = parts_of(quaternion)
+    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = np.arcsin(np.clip(2 * (w * y - x * z), -1.0, 1.0))
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return roll, pitch, yaw
 
 
 def multiplied(a: Array, b: Array) -> Array:
     """Product of quaternions, shape (..., 4): b in the frame that a turns."""
-    (aw, ax, ay, az), (bw, bx, by, bz) = ([component(q, i) for i in range(4)] for q in (a, b))
-    return stack((
-        aw * bw - ax * bx - ay * by - az * bz,
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-    ))  # fmt: skip
+    return stack(product(parts_of(a), parts_of(b)))
 
 
 def between(a: Array, b: Array) -> Array:
     """Quaternion that turns a into b, seen from a, shape (..., 4): a's conjugate times b."""
-    w, x, y, z = (component(a, i) for i in range(4))
-    return multiplied(stack((w, -x, -y, -z)), b)
+    w, x, y, z = parts_of(a)
+    return stack(product((w, -x, -y, -z), parts_of(b)))
 
 
 def advanced(quaternion: Array, angle: Array) -> Array:
     """Attitudes turned by rotation vectors in the body frame, rad, shape (..., 3); normalised."""
-    x, y, z = (0.5 * component(angle, i) for i in range(3))
+    x, y, z = (0.5 * part for part in parts_of(angle))
     half = np.sqrt(x * x + y * y + z * z)
     share = np.sin(half) / (half + 1e-30)  # 1 or 0 where nothing turns: x, y, z are 0 then
-    turned = multiplied(quaternion, stack((np.cos(half), share * x, share * y, share * z)))
-    w, x, y, z = (component(turned, i) for i in range(4))
-    return turned / stack((np.sqrt(w * w + x * x + y * y + z * z),))
-
-
-def _turned(quaternion: Array, vector: Array, sign: float) -> Array:
-    # v + w t + u x t with t = 2 u x v, for the axis u; the other way with w's sign changed.
-    w, x, y, z = (component(quaternion, i) for i in range(4))
-    a, b, c = (component(vector, i) for i in range(3))
-    w = w * sign
-    p = 2 * (y * c - z * b)
-    q = 2 * (z * a - x * c)
-    r = 2 * (x * b - y * a)
-    return stack((
-        a + w * p + y * r - z * q,
-        b + w * q + z * p - x * r,
-        c + w * r + x * q - y * p,
-    ))  # fmt: skip
+    turn = (np.cos(half), share * x, share * y, share * z)
+    w, x, y, z = product(parts_of(quaternion), turn)
+    size = np.sqrt(w * w + x * x + y * y + z * z)
+    return stack((w / size, x / size, y / size, z / size))

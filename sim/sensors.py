@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ..models.coefficients import COEFFICIENTS
 from ..models.errors import InputError
 from ..models.fields import Limits, check, limits_of
-from .rotations import advanced, between, cross, to_body, to_world, world_z
+from .rotations import advanced, between, cross, parts_of, to_body, to_world, world_z
 from .snapshots import Arrays, Kept, joined, part_of
 from .state import Array, WorldState, clip, component, stack
 
@@ -699,7 +699,11 @@ class Estimator(Kept):
         """Rotation vector in the body frame that pulls the attitude to what measures it, rad."""
         up = world_z(self.quaternion)
         time = self._times["attitude_time"]
-        angle = (1 - math.exp(-self._period / time)) / self._gravity * cross(force, up)
+        angle = (
+            (1 - math.exp(-self._period / time))
+            / self._gravity
+            * stack(cross(parts_of(force), parts_of(up)))
+        )
         if channel := channels.get("magnetometer"):
             field = to_world(self.quaternion, channel.value)
             off = self._north - np.atan2(component(field, 1), component(field, 0))

@@ -11,6 +11,8 @@ from ...models.errors import InputError
 from ...models.fields import Limits
 from ...sim import (
     Array,
+    body_x,
+    body_z,
     clip,
     component,
     stack,
@@ -135,7 +137,8 @@ class GoalTask(Task):
             turned = [to_body(quaternion, v) for v in (to_goal, state.velocity)]
             vectors = (*turned, world_z(quaternion))
         else:
-            vectors = tuple(map(self.turned, (to_goal, state.velocity, *axes(quaternion))))
+            seen = (to_goal, state.velocity, body_x(quaternion), body_z(quaternion))
+            vectors = tuple(map(self.turned, seen))
         thrust = state.thrust / self.vehicle.hover_thrust - 1.0
         rest = [x if getattr(x, "ndim", 0) == state.position.ndim else stack((x,)) for x in more]
         parts = (*vectors, state.body_rates, thrust, *rest)
@@ -183,11 +186,3 @@ def swing_cost(state: State) -> Array:
     """Reward for the speed of a payload relative to the craft, (W, A)."""
     speed = length(state.payload_velocity - state.velocity)
     return np.maximum(-SWING_WEIGHT * speed, WORST_SWING)
-
-
-def axes(quaternion: Array) -> tuple[Array, Array]:
-    """Directions of body x and body z in the world frame, shape (..., 3) each."""
-    w, x, y, z = (component(quaternion, i) for i in range(4))
-    nose = (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y))
-    up = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
-    return stack(nose), stack(up)

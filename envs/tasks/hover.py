@@ -8,7 +8,7 @@ import numpy as np
 
 from ...models.errors import InputError
 from ...models.fields import Limits
-from ...sim import Array, Draw, InitialState, component, stack
+from ...sim import Array, Draw, InitialState, body_x, component, stack
 from ..spec import Metric
 from ..state import State
 from .goal import (
@@ -20,7 +20,6 @@ from .goal import (
     GoalTask,
     Point,
     at,
-    axes,
     length,
     rates_cost,
 )
@@ -132,7 +131,7 @@ class Hover(GoalTask):
     def outcome(self, state: State) -> Outcome:
         """Nearness to goal and heading; the end at a crash, a flip-over, or outside the band."""
         distance = length(self.goal(state) - state.position)
-        nose, _ = axes(state.quaternion)
+        nose = body_x(state.quaternion)
         off = np.atan2(component(nose, 1), component(nose, 0)) - self.wanted
         heading = np.atan2(np.sin(off), np.cos(off)) * (180 / math.pi)
         outside = distance > self.options.flight_band

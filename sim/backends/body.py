@@ -16,7 +16,9 @@ import mujoco
 import numpy as np
 
 from ...models.vehicle import Vehicle, craft_bodies
+from .. import elementary
 from ..randomize import CENTER
+from ..rotations import Rows, matrix, product
 from ..state import Array
 
 Vector = tuple[Any, Any, Any]
@@ -79,30 +81,6 @@ class Varying(NamedTuple):
     """The center of mass, body frame, m."""
     scale: Any
     """Factor of the sides of the inertia boxes."""
-
-
-class Lanes(np.ndarray):
-    """Numbers of W worlds, with the methods that a motion needs."""
-
-    def add(self, other: Any, *, alpha: float) -> Any:
-        """Itself and `alpha` times another."""
-        return self + other * alpha
-
-    def addcmul(self, a: Any, b: Any, *, value: float = 1.0) -> Any:
-        """Itself and `value` times a product."""
-        return self + a * b * value
-
-    def sqrt(self) -> Any:
-        """Square roots."""
-        return np.sqrt(self)
-
-    def sin(self) -> Any:
-        """Sines."""
-        return np.sin(self)
-
-    def cos(self) -> Any:
-        """Cosines."""
-        return np.cos(self)
 
 
 class RigidBody:
@@ -175,13 +153,13 @@ class RigidBody:
         if not isinstance(inertia, np.ndarray) or inertia.ndim == 3:
             turn, gyroscopic = _euler_of_each(inertia)
             varying = varying._replace(turn=turn, gyroscopic=gyroscopic)
-        self.varying = mapped(varying, _lanes)
+        self.varying = varying
 
     def set_inertia(self, inertia: np.ndarray) -> None:
         """Take another inertia about the center of mass for each world, kg·m², (W, 3, 3)."""
         turn, gyroscopic = _euler_of_each(inertia)
         varying = self.varying._replace(easier=1.0, turn=turn, gyroscopic=gyroscopic)
-        self.varying = mapped(varying, lambda x: _lanes(x) if x.any() else 0.0)
+        self.varying = mapped(varying, lambda x: x if x.any() else 0.0)
 
     def fly(self, rows: Any, thrust: Any, wrench: Any = None, steps: int = 1) -> list[Any]:
         """The 13 rows of a state after physics steps, (W,) each, from those of `motion`.
@@ -196,7 +174,7 @@ class RigidBody:
 
     def push(self, thrust: Any, wrench: Any = None) -> Push:
         """Of thrusts, and a force and a torque, as of `fly`."""
-        rotors = [_lanes(row) for row in thrust]
+        rotors = list(thrust)
         varying = self.varying
         force = _times(self._axes, rotors)
         if varying.reaction is None:
@@ -207,7 +185,7 @@ class RigidBody:
         torque = _plus(torque, _cross(force, varying.shift))
         outer = _ZERO
         if wrench is not None:
-            parts = [_lanes(row) for row in wrench]
+            parts = list(wrench)
             outer = _scaled(parts[:3], 1.0 / varying.mass)
             torque = _plus(torque, parts[3:])
         return Push(_scaled(force, 1.0 / varying.mass), self._turned(torque), outer)
@@ -218,18 +196,18 @@ class RigidBody:
         inner, turning, outer = push
         varying = self.varying
         center, off = varying.center, _is_there(varying.center)
-        matrix: Any = None
+        turn: Rows | None = None
         if self._drag:
             outer = _plus(outer, velocity, -self._drag)
         if self._fluid is not None:
-            matrix = _matrix(quaternion)
-            force, torque = self._fluid.push(matrix, velocity, rates, varying)
+            turn = matrix(quaternion)
+            force, torque = self._fluid.push(turn, velocity, rates, varying)
             inner = _plus(inner, _scaled(force, 1.0 / varying.mass))
             turning = _plus(turning, self._turned(_plus(torque, _cross(force, center))))
         if off and _is_there(outer):
-            matrix = matrix or _matrix(quaternion)
+            turn = turn or matrix(quaternion)
             # The force at the origin has the torque -c × F about the center of mass.
-            lever = _cross(_scaled(_back(matrix, outer), varying.mass), center)
+            lever = _cross(_scaled(_back(turn, outer), varying.mass), center)
             turning = _plus(turning, self._turned(lever))
         turning = tuple(
             _sum(start, *((k, rates[i], rates[j]) for i, j, k in terms))
@@ -238,7 +216,7 @@ class RigidBody:
         if off:
             inner = _plus(inner, _cross(center, turning))
             inner = _plus(inner, _cross(_cross(rates, center), rates))
-        x, y, z = _plus(_to_world(quaternion, matrix, inner), outer)
+        x, y, z = _plus(_to_world(quaternion, turn, inner), outer)
         return (x, y, _sum(z, (-self._gravity,))), turning
 
     def advance(self, now: Motion, push: Push) -> Motion:
@@ -287,13 +265,13 @@ class _Fluid:
             self._boxes.append((sides.tolist(), axes.tolist(), place.tolist()))
 
     def push(
-        self, matrix: Any, velocity: Vector, rates: Vector, varying: Varying
+        self, turn: Rows, velocity: Vector, rates: Vector, varying: Varying
     ) -> tuple[Vector, Vector]:
         """Force, N, and torque about the body's origin, N·m; both in the body frame.
 
         A box's sides grow with the square root of its inertia over its mass.
         """
-        air = _back(matrix, _plus(velocity, self._wind))
+        air = _back(turn, _plus(velocity, self._wind))
         scale = varying.scale
         force = _ZERO
         torque = _ZERO
@@ -323,7 +301,7 @@ class _Fluid:
 
 def motion(rows: Any) -> Motion:
     """The motion of states (13, W)."""
-    x = [_lanes(row) for row in rows]
+    x = list(rows)
     return Motion(x[:3], x[3:7], x[7:10], x[10:])
 
 
@@ -333,10 +311,6 @@ def mapped(tree: Any, change: Callable[[Any], Any]) -> Any:
         parts = [mapped(one, change) for one in tree]
         return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
     return change(tree) if hasattr(tree, "shape") else tree
-
-
-def _lanes(vector: Any) -> Any:
-    return vector.view(Lanes) if isinstance(vector, np.ndarray) else vector
 
 
 def _boxes(model: mujoco.MjModel) -> list[Any]:
@@ -395,32 +369,19 @@ def _sparse(matrix: np.ndarray, size: float | None = None) -> list[list[float]]:
 
 def _sum(total: Any, *products: tuple[Any, ...]) -> Any:
     """The total and the products of some vectors and numbers, in the fewest operations."""
-    for product in products:
-        share = 1.0
-        vectors = []
-        for one in product:
-            if isinstance(one, float):
-                share *= one
-            else:
-                vectors.append(one)
+    for factors in products:
+        share = math.prod(one for one in factors if isinstance(one, float))
         if share == 0.0:
             continue
+        vectors = [one for one in factors if not isinstance(one, float)]
         if not vectors:
             total = total + share
             continue
-        *rest, last = vectors
-        if isinstance(total, float):
-            for one in rest:
-                last = last * one
-            last = last if share == 1.0 else last * share
-            total = last if total == 0.0 else last + total
-        elif not rest:
-            total = total.add(last, alpha=share)
-        else:
-            first = rest[0]
-            for one in rest[1:]:
-                first = first * one
-            total = total.addcmul(first, last, value=share)
+        value = math.prod(vectors[1:], start=vectors[0])
+        if share != 1.0:
+            value = value * share
+        is_nothing = isinstance(total, float) and total == 0.0
+        total = value if is_nothing else total + value
     return total
 
 
@@ -461,57 +422,24 @@ def _back(matrix: Any, vector: Any) -> Vector:
     return _forth(tuple(zip(*matrix, strict=True)), vector)
 
 
-def _matrix(quaternion: Any) -> Any:
-    """Rotation matrix, three rows."""
-    w, x, y, z = quaternion
-    a = x + x
-    b = y + y
-    c = z + z
-    wx = w * a
-    wy = w * b
-    wz = w * c
-    xx = x * a
-    xy = x * b
-    xz = x * c
-    yy = y * b
-    yz = y * c
-    zz = z * c
-    return (
-        (1.0 - (yy + zz), xy - wz, xz + wy),
-        (xy + wz, 1.0 - (xx + zz), yz - wx),
-        (xz - wy, yz + wx, 1.0 - (xx + yy)),
-    )
-
-
-def _to_world(quaternion: Any, matrix: Any, vector: Vector) -> Vector:
-    """A body vector in the world frame; the matrix of the quaternion is None if nobody made it."""
-    if matrix is not None or _is_there(vector[:2]):
-        return _forth(matrix or _matrix(quaternion), vector)
+def _to_world(quaternion: Any, turn: Rows | None, vector: Vector) -> Vector:
+    """A body vector in the world frame; `turn` is the quaternion's matrix where it is known."""
+    if turn is not None or _is_there(vector[:2]):
+        return _forth(turn or matrix(quaternion), vector)
     w, x, y, z = quaternion
     up = vector[2]
     twice = up + up
-    return (
-        (x * z).addcmul(w, y) * twice,
-        (y * z).addcmul(w, x, value=-1.0) * twice,
-        _sum(up, (-1.0, (x * x).addcmul(y, y), twice)),
-    )
+    return (x * z + w * y) * twice, (y * z - w * x) * twice, up - (x * x + y * y) * twice
 
 
 def _rotated(quaternion: Any, rates: Vector, time: float) -> tuple[Any, Any]:
     """A quaternion turned for a time at body rates, and the square of the angle."""
-    w, x, y, z = quaternion
-    a, b, c = rates
-    square = (a * a).addcmul(b, b).addcmul(c, c) * (time * time)
-    half = _sum(_TINY, (0.25, square)).sqrt()
-    share = half.sin() / half * (0.5 * time)
-    a, b, c, d = half.cos(), a * share, b * share, c * share
-    turned = (
-        _sum(w * a, (-1.0, x, b), (-1.0, y, c), (-1.0, z, d)),
-        _sum(x * a, (w, b), (y, d), (-1.0, z, c)),
-        _sum(y * a, (w, c), (z, b), (-1.0, x, d)),
-        _sum(z * a, (w, d), (x, c), (-1.0, y, b)),
-    )
-    return turned, square
+    x, y, z = rates
+    square = (x * x + y * y + z * z) * (time * time)
+    half = np.sqrt(0.25 * square + _TINY)
+    share = elementary.sin(half) / half * (0.5 * time)
+    turn = (elementary.cos(half), x * share, y * share, z * share)
+    return product(quaternion, turn), square
 
 
 def _of_rotation_vector(spin: Vector, time: float, square: Any, rates: Vector) -> Vector:
@@ -520,7 +448,7 @@ def _of_rotation_vector(spin: Vector, time: float, square: Any, rates: Vector) -
     rates + r × rates / 2 + k r × (r × rates), k = (1 - |r| / 2 · cot(|r| / 2)) / |r|² (Bortz,
     IEEE Trans. AES-7, 1971): the sum of 2 / ((2 π n)² - |r|²) over n > 0. Here up to |r| = π.
     """
-    square = square.clip(max=math.pi**2)
+    square = np.minimum(square, math.pi**2)
     series = square * _BORTZ[-1]
     for one in _BORTZ[-2:0:-1]:
         series = (series + one) * square
@@ -535,6 +463,5 @@ def _of_rotation_vector(spin: Vector, time: float, square: Any, rates: Vector) -
 def _normalized(quaternion: Any) -> Any:
     """A quaternion whose size is nearly 1: Newton's step towards 1."""
     w, x, y, z = quaternion
-    square = (w * w).addcmul(x, x).addcmul(y, y).addcmul(z, z)
-    share = _sum(1.5, (-0.5, square))
+    share = 1.5 - 0.5 * (w * w + x * x + y * y + z * z)
     return w * share, x * share, y * share, z * share

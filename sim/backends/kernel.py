@@ -15,11 +15,11 @@ import tempfile
 from collections.abc import Callable
 from functools import lru_cache
 from itertools import count
-from math import factorial, pi
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.lib.mixins import NDArrayOperatorsMixin
 
 from ...models.errors import InputError
 from .body import RigidBody, mapped
@@ -36,7 +36,23 @@ _FLAGS: Final = (
     "-fopenmp-simd",
     "-ffp-contract=off",
 )
-_TERMS: Final = {"float": 7, "double": 12}  # of the series of a sine, up to a quarter turn
+_EXPRESSIONS: Final = {
+    np.add: "{} + {}",
+    np.subtract: "{} - {}",
+    np.multiply: "{} * {}",
+    np.true_divide: "{} / {}",
+    np.negative: "-{}",
+    np.absolute: "fabs({})",
+    np.sqrt: "sqrt({})",
+    np.rint: "rint({})",
+    np.floor: "floor({})",
+    np.equal: "{} == {}",
+    np.greater_equal: "{} >= {}",
+    np.bitwise_or: "{} | {}",
+    np.minimum: "{0} > {1} ? {1} : {0}",  # NaN stays NaN
+    np.where: "{} ? {} : {}",
+}
+"""NumPy's functions in C. Together with `-ffp-contract=off` they give the same bits."""
 _SOURCE: Final = """#include <math.h>
 #include <tgmath.h>
 typedef {kind} T;
@@ -71,7 +87,7 @@ def compiled(body: RigidBody, rotors: int, dtype: Any, *, wrench: bool) -> Fly:
     Takes half a second. Raises `InputError` if the compiler fails.
     """
     dtype = np.dtype(dtype)
-    found = _library(_source(body, rotors, "float" if dtype.itemsize == 4 else "double", wrench))
+    found = _library(_source(body, rotors, dtype, wrench))
     pointer = ctypes.c_void_p
     found.fly.argtypes = [ctypes.c_long, ctypes.c_long, *[pointer] * 5]
 
@@ -95,115 +111,58 @@ def packed(body: RigidBody, dtype: Any) -> np.ndarray | None:
 class _Lines:
     """The lines of a function; the same operation on the same variables is one line."""
 
-    def __init__(self, terms: int) -> None:
-        self.terms = terms
-        self._names = dict[str, Variable]()
+    def __init__(self, dtype: np.dtype[Any]) -> None:
+        self.dtype = dtype
+        self._names = dict[str, TracedArray]()
 
     def text(self) -> list[str]:
         """The lines of C."""
-        return [f"      const T {x.name} = {text};" for text, x in self._names.items()]
+        return [f"      const __auto_type {x.name} = {text};" for text, x in self._names.items()]
 
-    def new(self, text: str) -> "Variable":
-        """The variable of an expression."""
+    def of(self, expression: str, *inputs: Any) -> "TracedArray":
+        """The variable of an expression of variables and numbers."""
+        names = (x.name if isinstance(x, TracedArray) else f"(T){float(x)!r}" for x in inputs)
+        text = expression.format(*names)
         if text not in self._names:
-            self._names[text] = Variable(self, f"x{len(self._names)}")
+            self._names[text] = TracedArray(self, f"x{len(self._names)}")
         return self._names[text]
 
 
-class Variable:
-    """A number of the C function. Its methods are those of `body.Lanes`."""
+class TracedArray(NDArrayOperatorsMixin):
+    """A number of the C function: NumPy's functions of it write lines."""
 
     shape = ()
-    __array_ufunc__ = None  # NumPy's numbers leave operators to it
 
     def __init__(self, lines: _Lines, name: str) -> None:
         self._lines = lines
         self.name = name
+        self.dtype = lines.dtype
 
-    def _made(self, text: str, *others: Any) -> "Variable":
-        names = (x.name if isinstance(x, Variable) else f"(T){float(x)!r}" for x in others)
-        return self._lines.new(text.format(self.name, *names))
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any) -> "TracedArray":
+        return self._lines.of(_EXPRESSIONS[ufunc], *inputs)
 
-    def __add__(self, other: Any) -> "Variable":
-        return self._made("{} + {}", other)
-
-    __radd__ = __add__
-
-    def __mul__(self, other: Any) -> "Variable":
-        return self._made("{} * {}", other)
-
-    __rmul__ = __mul__
-
-    def __sub__(self, other: Any) -> "Variable":
-        return self._made("{} - {}", other)
-
-    def __rsub__(self, other: Any) -> "Variable":
-        return self._made("{1} - {0}", other)
-
-    def __truediv__(self, other: Any) -> "Variable":
-        return self._made("{} / {}", other)
-
-    def __rtruediv__(self, other: Any) -> "Variable":
-        return self._made("{1} / {0}", other)
-
-    def __abs__(self) -> "Variable":
-        return self._made("fabs({})")
-
-    def add(self, other: Any, *, alpha: float) -> Any:
-        """Itself and `alpha` times another."""
-        return self + other * alpha
-
-    def addcmul(self, a: Any, b: Any, *, value: float = 1.0) -> Any:
-        """Itself and `value` times a product."""
-        return self + (a * b if value == 1.0 else a * b * value)
-
-    def clip(self, *, max: float) -> "Variable":
-        """The lesser of itself and a number."""
-        return self._made("{0} > {1} ? {1} : {0}", max)  # NaN stays NaN
-
-    def sqrt(self) -> "Variable":
-        """Square root."""
-        return self._made("sqrt({})")
-
-    def sin(self) -> Any:
-        """Sine."""
-        return self._wave(1)
-
-    def cos(self) -> Any:
-        """Cosine."""
-        return self._wave(0)
-
-    def _wave(self, first: int) -> Any:
-        """A sine (1) or cosine (0) by its series within a quarter turn of whole half turns.
-
-        With a library's functions the compiler would use no vectors.
-        """
-        turns = self._made("rint({} * {})", 1 / pi)
-        near = float(np.float32(pi))  # the two parts of pi make the rest exact
-        rest = self - turns * near - turns * (pi - near)
-        square = rest * rest
-        series: Any = 0.0
-        for n in reversed(range(1, self._lines.terms)):
-            series = (series + (-1) ** n / factorial(2 * n + first)) * square
-        odd = turns - self._lines.new(f"floor({turns.name} * (T)0.5)") * 2.0
-        return (series * rest + rest if first else series + 1.0) * (1.0 - odd * 2.0)
+    def __array_function__(
+        self, function: Any, types: Any, inputs: Any, options: Any
+    ) -> "TracedArray":
+        return self._lines.of(_EXPRESSIONS[function], *inputs)
 
 
-def _source(body: RigidBody, rotors: int, kind: str, wrench: bool) -> str:
-    lines = _Lines(_TERMS[kind])
+def _source(body: RigidBody, rotors: int, dtype: np.dtype[Any], wrench: bool) -> str:
+    lines = _Lines(dtype)
 
-    def read(array: str, count: int) -> list[Variable]:
-        return [lines.new(f"{array}[{k} * count + i]") for k in range(count)]
+    def read(array: str, count: int) -> list[TracedArray]:
+        return [lines.of(f"{array}[{k} * count + i]") for k in range(count)]
 
     rows = read("rows", ROWS)
     thrust = read("thrust", rotors)
     numbers = count()
     traced = copy.copy(body)
     traced.varying = mapped(
-        body.varying, lambda _: lines.new(f"varying[{next(numbers)} * count + i]")
+        body.varying, lambda _: lines.of(f"varying[{next(numbers)} * count + i]")
     )
     flown = traced.fly(rows, thrust, read("wrench", 6) if wrench else None)
     out = [f"      out[{k} * count + i] = {x.name};" for k, x in enumerate(flown)]
+    kind = "float" if dtype.itemsize == 4 else "double"
     return _SOURCE.format(kind=kind, lines="\n".join([*lines.text(), *out]))
 
 

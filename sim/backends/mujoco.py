@@ -23,7 +23,7 @@ from ..snapshots import Arrays
 from ..state import Array, InitialState, WorldState
 from ..world import PhysicsError, check_hung, flown_model
 from .base import BaseWorld
-from .varied import Varied
+from .world_parameters import WorldParameters
 
 _FEW: Final = 8
 _SEEN: Final = np.array(SURROUNDINGS, np.uint8)
@@ -67,7 +67,7 @@ class MujocoWorld(BaseWorld):
         self._batch = batch = Batch(model, num_worlds, threads)
         self._cable = options.cable if options.payload else None
         self._least_height = options.cable + payload_radius(options.payload)
-        self._varied = Varied(batch.model, drawn)
+        self._varied = WorldParameters(batch.model, drawn)
         self._owner = None if threads == 1 else os.getpid()
         self._initial = batch.state[0].copy()
         # Live views of simulator memory, made once.

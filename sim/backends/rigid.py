@@ -19,7 +19,7 @@ from ..state import Array, InitialState, WorldState, clip
 from ..world import PhysicsError
 from . import kernel
 from .base import BaseWorld
-from .body import RigidBody, motion
+from .body import RigidBody, mapped, motion
 from .hull import Hull
 
 DTYPES: Final = ("float32", "float64")
@@ -219,7 +219,9 @@ class RigidWorld(BaseWorld):
         """Nothing is to be released."""
 
     def _vary(self, parameters: dict[str, Array]) -> None:
-        self._body.vary(parameters)
+        body = self._body
+        body.vary(parameters)
+        body.varying = mapped(body.varying, lambda numbers: numbers.astype(self.dtype))
         self._varying = kernel.packed(self._body, self.dtype)
 
     def _flown(self, rows: Array, thrust: Array, wrench: Array, steps: int) -> np.ndarray:

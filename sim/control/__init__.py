@@ -11,7 +11,7 @@ from ...models.errors import InputError
 from ..state import Array, WorldState
 from .cascade import Attitude, Position, Rates, Velocity
 from .gains import Gains, shared_ranges
-from .several import Several
+from .mixed import MixedController
 from .thrusts import CollectiveThrust, RotorThrust
 
 if TYPE_CHECKING:
@@ -90,4 +90,4 @@ def _of_several(level: str, vehicles: Sequence["Vehicle"], period: float, lag: f
     else:
         controllers = [make_controller(level, vehicle, period, lag=lag) for vehicle in kinds]
     drones = [[i for i, own in enumerate(vehicles) if own is kind] for kind in kinds]
-    return Several(list(zip(controllers, drones, strict=True)))
+    return MixedController(list(zip(controllers, drones, strict=True)))

@@ -17,20 +17,17 @@ Array code with any leading axes; of a single drone the numbers are Python's.
 """
 
 import math
-from collections.abc import Sequence
 from functools import partial, reduce
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from ..rotations import Parts, Rows, dot, matrix, parts_of, times, transposed
 from ..state import Array, WorldState, clip, stack
 
 if TYPE_CHECKING:
     from ...models.vehicle import Vehicle
     from .gains import Gains
-
-Parts = Sequence[Any]
-"""Numbers of a vector, or of the rotors: each a number, or an array of shape (W, A)."""
 
 _ASIDE: Final = 1e-3  # Upside down every way to turn is as short: it is about x
 _TINY: Final = 1e-12  # Added to squares under a root, whose slope at 0 is infinite
@@ -76,11 +73,11 @@ class Rates:
 
     def turn(self, collective: Any, rates: Parts, state: WorldState) -> Array:
         """Thrusts, N, shape (..., R), for a collective thrust, N, and body rates, rad/s."""
-        p, q, r = _parts(state.body_rates)
+        p, q, r = parts_of(state.body_rates)
         about_x, about_y, about_z = self.gains.rate
         wanted = about_x * (rates[0] - p), about_y * (rates[1] - q), about_z * (rates[2] - r)
-        roll, pitch, yaw = self._with_inertia(*wanted)
-        u, v, w = self._with_inertia(p, q, r)
+        roll, pitch, yaw = times(self._inertia, wanted)
+        u, v, w = times(self._inertia, (p, q, r))
         torque = roll + (q * w - r * v), pitch + (r * u - p * w), yaw + (p * v - q * u)
         return self._driven(self.mixed(collective, torque), state)
 
@@ -109,21 +106,18 @@ class Rates:
         """Commands that make rotors with a lag give these thrusts."""
         lead = self.gains.lead
         if lead != 1.0:
-            now = _parts(state.thrust)
+            now = parts_of(state.thrust)
             wanted = [old + lead * (new - old) for old, new in zip(now, wanted, strict=True)]
         limited = zip(wanted, self._limits, strict=True)
         return stack([clip(part, low, high) for part, (low, high) in limited])
 
     def _scaled(self, action: Array) -> list[Any]:
-        pairs = zip(_parts(action), self._sizes, strict=True)
+        pairs = zip(parts_of(action), self._sizes, strict=True)
         return [size * clip(part, -1.0, 1.0) for part, size in pairs]
 
     def _collective(self, share: Any) -> Any:
         """N, of a number in [-1, 1]."""
         return self._hover + self._up * clip(share, 0.0, 1.0) + self._down * clip(share, -1.0, 0.0)
-
-    def _with_inertia(self, x: Any, y: Any, z: Any) -> list[Any]:
-        return [a * x + b * y + c * z for a, b, c in self._inertia]
 
 
 class Attitude(Rates):
@@ -153,13 +147,13 @@ class Attitude(Rates):
         return self.point(self._collective(share), axis, yaw_rate, axes, state)
 
     def point(
-        self, collective: Any, axis: Parts, yaw_rate: Any, axes: Sequence[Parts], state: WorldState
+        self, collective: Any, axis: Parts, yaw_rate: Any, axes: Rows, state: WorldState
     ) -> Array:
         """As `turn`, for a collective thrust, N, and a thrust axis, a unit vector of the world.
 
         `axes` are the body's axes in the world frame; the yaw rate is about the vertical, rad/s.
         """
-        x, y, z = (_dot(own, axis) for own in axes)
+        x, y, z = times(axes, axis)
         aside = _ASIDE * (z < 0.0)
         # Of the turn by θ about (-y, x, 0) / sin θ: over cos(θ / 2), which is sqrt((1 + z) / 2).
         size = self.gains.attitude / _root(0.5 * (1.0 + z) + 0.25 * (aside * aside))
@@ -188,14 +182,12 @@ class Velocity(Attitude):
         axes = _axes(state.quaternion)
         return self.fly((*_turned(axes[0], x, y), z), yaw_rate, axes, state)
 
-    def fly(
-        self, velocity: Parts, yaw_rate: Any, axes: Sequence[Parts], state: WorldState
-    ) -> Array:
+    def fly(self, velocity: Parts, yaw_rate: Any, axes: Rows, state: WorldState) -> Array:
         """As `point`, for a velocity in the world frame, m/s."""
         gains = self.gains
         gravity = self._gravity
         level, up = gains.most_acceleration
-        u, v, w = _parts(state.velocity)
+        u, v, w = parts_of(state.velocity)
         k = gains.velocity
         x = k * (velocity[0] - u)
         y = k * (velocity[1] - v)
@@ -205,7 +197,7 @@ class Velocity(Attitude):
         x = share * x
         y = share * y
         size = _root(x * x + y * y + z * z)
-        collective = self._mass * _dot((x, y, z), axes[2])
+        collective = self._mass * dot((x, y, z), axes[2])
         return self.point(collective, (x / size, y / size, z / size), yaw_rate, axes, state)
 
 
@@ -247,14 +239,9 @@ class Position(Velocity):
         return clip(_smaller(braked, speed / distance), 0.0, self.gains.position)
 
 
-def _axes(quaternion: Array) -> tuple[Parts, Parts, Parts]:
+def _axes(quaternion: Array) -> Rows:
     """Body x, y and z in the world frame."""
-    w, x, y, z = _parts(quaternion)
-    return (
-        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
-        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
-        (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
-    )
+    return transposed(matrix(parts_of(quaternion)))
 
 
 def _turned(nose: Parts, x: Any, y: Any) -> tuple[Any, Any]:
@@ -268,20 +255,8 @@ def _turned(nose: Parts, x: Any, y: Any) -> tuple[Any, Any]:
     return c * x - s * y, s * x + c * y
 
 
-def _dot(a: Parts, b: Parts) -> Any:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
 def _length(x: Any, y: Any = 0.0) -> Any:
     return _root(x * x + y * y + _TINY)
-
-
-def _parts(array: Array) -> list[Any]:
-    """Components of the last axis; of a single drone Python's numbers."""
-    if array.ndim == 1:
-        numbers: list[Any] = array.tolist()
-        return numbers
-    return [array[..., i] for i in range(array.shape[-1])]
 
 
 def _most(parts: list[Any]) -> Any:

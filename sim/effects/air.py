@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from ...models.errors import InputError
+from ..rotations import Parts, Rows, add, cross, matrix, parts_of, product, times, transposed
 from ..snapshots import Kept
 from ..state import Array, WorldState, clip, component, each, kept, square_root, stack
 from .options import EffectOptions
@@ -19,7 +20,7 @@ LEAST_HEIGHT: Final = 0.5
 """Height of a rotor over the ground, in radii, below which the ground effect grows no further: our
 choice, since the formula has a pole at a quarter of a radius."""
 
-Vector = tuple[Array, Array, Array]
+_NOTHING: Final = (0.0, 0.0, 0.0)
 
 
 class AirEffects(Kept):
@@ -43,7 +44,7 @@ class AirEffects(Kept):
         self._half = 0.5 * vehicle.timestep
         told = vehicle.coefficients
         rotors = vehicle.rotors
-        self._center: Vector = tuple(vehicle.center_of_mass.tolist())
+        self._center: Parts = tuple(vehicle.center_of_mass.tolist())
         self._geometry = np.array([(*rotor.position, *rotor.axis) for rotor in rotors])
         if options.body_drag:
             linear = told.drag.linear
@@ -131,37 +132,37 @@ class AirEffects(Kept):
         # The middle of the step: half of the last step's change further.
         ahead = [1.5 * new - 0.5 * old for new, old in zip(now, self._before, strict=True)]
         self._before = kept(mask, now, self._before)
-        w: Vector = (ahead[3], ahead[4], ahead[5])
+        w: Parts = (ahead[3], ahead[4], ahead[5])
         turn = _turned(state.quaternion, w, self._half)
         through = (ahead[0] - wind[0], ahead[1] - wind[1], ahead[2] - wind[2])
-        v = _to_body(turn, through)
-        force = torque = (0.0, 0.0, 0.0)
+        v = times(transposed(turn), through)
+        force: Parts = _NOTHING
+        torque: Parts = _NOTHING
         if self._options.body_drag:
             force, torque = self._body(v, w)
         if self._options.rotor_drag or self._options.ground_effect:
             height = component(state.position, 2) + self._half * ahead[2]
-            around = [each(number) for number in (*v, *w, *turn[6:], height)]
-            push: Any = None
-            twist: Any = None
+            around = [each(number) for number in (*v, *w, *turn[2], height)]
+            push: Parts = _NOTHING
+            twist: Parts = _NOTHING
             parts = split(thrust)
             roots = [None] * len(parts) if root is None else split(root)
             for rotor, part, mean_root in zip(self._rotors, parts, roots, strict=True):
                 one = self._push(rotor, part, mean_root, around)
-                turned = _cross(rotor[0], one)
-                push = one if push is None else _add(push, one)
-                twist = turned if twist is None else _add(twist, turned)
-            force = _add(force, [total([x]) for x in push])
-            torque = _add(torque, [total([x]) for x in twist])
-        return stack((*_to_world(turn, force), *torque))
+                push = add(push, one)
+                twist = add(twist, cross(rotor[0], one))
+            force = add(force, [total([x]) for x in push])
+            torque = add(torque, [total([x]) for x in twist])
+        return stack((*times(turn, force), *torque))
 
-    def _body(self, v: Vector, w: Vector) -> tuple[Vector, Vector]:
+    def _body(self, v: Parts, w: Parts) -> tuple[Parts, Parts]:
         """Drag of the body, body axes: force, and torque about the body's origin."""
-        v = _add(v, _cross(w, self._center))
+        v = add(v, cross(w, self._center))
         speed = square_root(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
         factor = self._factors.get("body_drag", 1.0)
         both = zip(self._linear, self._quadratic, v, strict=True)
         x, y, z = (-factor * (linear + quadratic * speed) * u for linear, quadratic, u in both)
-        torque = _cross(self._center, (x, y, z))
+        torque = cross(self._center, (x, y, z))
         if self._angular is not None:
             pairs = zip(torque, self._angular, w, strict=True)
             roll, pitch, yaw = (t - factor * k * rate for t, k, rate in pairs)
@@ -171,7 +172,7 @@ class AirEffects(Kept):
             torque = torque[0] + roll * v[1], torque[1] - pitch * v[0], torque[2]
         return (x, y, z), torque
 
-    def _push(self, rotor: Any, thrust: Array, root: Array | None, around: list[Array]) -> Vector:
+    def _push(self, rotor: Any, thrust: Array, root: Array | None, around: list[Array]) -> Parts:
         """Force of a part of the rotors besides their thrust, body axes; the root as of `step`.
 
         `around` has velocity and body rates, of each body axis its part upwards, and the height of
@@ -180,9 +181,9 @@ class AirEffects(Kept):
         place, axis = rotor
         thrust = clip(thrust, 0.0, math.inf)
         up = 0.0
-        push = (0.0, 0.0, 0.0)
+        push: Parts = _NOTHING
         if self._options.rotor_drag:
-            x, y, z = _add(around, _cross(around[3:6], place))
+            x, y, z = add(around, cross(around[3:6], place))
             along = x * axis[0] + y * axis[1] + z * axis[2]
             plane = (x - along * axis[0], y - along * axis[1], z - along * axis[2])
             root = square_root(thrust) if root is None else root
@@ -218,43 +219,10 @@ def _motion(state: WorldState) -> list[Array]:
     return [array[..., axis] + 0.0 for array in both for axis in range(3)]
 
 
-def _add(a: Any, b: Any) -> Any:
-    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
-
-
-def _cross(a: Any, b: Any) -> Vector:
-    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
-
-
-def _turned(quaternion: Array, rates: Vector, time: float) -> tuple[Array, ...]:
-    """Rotation matrix, row by row, after such a time of turning at these body rates."""
-    w, x, y, z = (component(quaternion, i) for i in range(4))
-    a, b, c = (0.5 * time * rate for rate in rates)
-    w, x, y, z = (
-        w - a * x - b * y - c * z,
-        x + a * w + c * y - b * z,
-        y + b * w + a * z - c * x,
-        z + c * w + b * x - a * y,
-    )
-    s = 2 / (w * w + x * x + y * y + z * z)
-    return (
-        1 - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y),
-        s * (x * y + w * z), 1 - s * (x * x + z * z), s * (y * z - w * x),
-        s * (x * z - w * y), s * (y * z + w * x), 1 - s * (x * x + y * y),
-    )  # fmt: skip
-
-
-def _to_world(m: tuple[Array, ...], v: Any) -> Vector:
-    return (
-        m[0] * v[0] + m[1] * v[1] + m[2] * v[2],
-        m[3] * v[0] + m[4] * v[1] + m[5] * v[2],
-        m[6] * v[0] + m[7] * v[1] + m[8] * v[2],
-    )
-
-
-def _to_body(m: tuple[Array, ...], v: Any) -> Vector:
-    return (
-        m[0] * v[0] + m[3] * v[1] + m[6] * v[2],
-        m[1] * v[0] + m[4] * v[1] + m[7] * v[2],
-        m[2] * v[0] + m[5] * v[1] + m[8] * v[2],
-    )
+def _turned(quaternion: Array, rates: Parts, time: float) -> Rows:
+    """Rotation matrix from body to world after such a time of turning at these body rates."""
+    half = 0.5 * time
+    spin = (1.0, half * rates[0], half * rates[1], half * rates[2])
+    turned = product(parts_of(quaternion), spin)
+    w, x, y, z = turned
+    return matrix(turned, 2 / (w * w + x * x + y * y + z * z))

@@ -27,7 +27,7 @@ def both(*arrays: np.ndarray) -> list[list[Any]]:
         (rotations.to_body, (ROLLED, V), (1.0, 3.0, -2.0)),
         (rotations.body_z, (ROLLED,), (0.0, -1.0, 0.0)),
         (rotations.world_z, (ROLLED,), (0.0, 1.0, 0.0)),
-        (rotations.cross, (V, np.array((4.0, 5.0, 6.0))), (-3.0, 6.0, -3.0)),
+        (rotations.body_x, (LEFT,), (0.0, 1.0, 0.0)),
         # First to the left, then rolled about the new nose: body z points along world x.
         (rotations.multiplied, (LEFT, ROLLED), (0.5, 0.5, 0.5, 0.5)),
         (rotations.between, (LEFT, np.array((0.5, 0.5, 0.5, 0.5))), (HALF, HALF, 0.0, 0.0)),
@@ -49,3 +49,15 @@ def test_a_rotation_vector_turns_the_body() -> None:
     for _ in range(90):
         many = rotations.advanced(many, np.radians((0.0, 0.0, 1.0)))
     np.testing.assert_allclose(many, LEFT, atol=1e-13)
+
+
+def test_vectors_by_their_components() -> None:
+    assert rotations.cross(V, (4.0, 5.0, 6.0)) == (-3.0, 6.0, -3.0)
+    turn = rotations.matrix(LEFT)
+    assert rotations.times(turn, V) == pytest.approx((-2.0, 1.0, 3.0))
+    assert rotations.times(rotations.transposed(turn), V) == pytest.approx((2.0, -1.0, 3.0))
+
+
+def test_euler_angles() -> None:
+    """Yaw by 90°, then a roll by 90° about the new nose."""
+    assert rotations.euler(np.full(4, 0.5)) == pytest.approx((math.pi / 2, 0.0, math.pi / 2))

@@ -19,7 +19,7 @@ _FIELDS: Final = {
 }
 
 
-class Varied:
+class WorldParameters:
     """Fields of a model that differ between worlds.
 
     Attributes:

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from . import Controller
 
 
-class Several:
+class MixedController:
     """As `Controller`: each flies the drones with its numbers. Actions mean the same to all.
 
     Arrays are NumPy's, of shape (W, A, ...).
