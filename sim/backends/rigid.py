@@ -108,7 +108,7 @@ class RigidWorld(BaseWorld):
         """
         self._body.vary({"reaction": reaction})
         self._body.set_inertia(inertia)
-        self._varying = kernel.packed(self._body, self.dtype)
+        self._pack()
         if self.effects is not None:
             self.effects.vary(air)
         if self._function is not None:
@@ -219,10 +219,14 @@ class RigidWorld(BaseWorld):
         """Nothing is to be released."""
 
     def _vary(self, parameters: dict[str, Array]) -> None:
+        self._body.vary(parameters)
+        self._pack()
+
+    def _pack(self) -> None:
+        """NumPy and compiled code take the same numbers of what varies."""
         body = self._body
-        body.vary(parameters)
         body.varying = mapped(body.varying, lambda numbers: numbers.astype(self.dtype))
-        self._varying = kernel.packed(self._body, self.dtype)
+        self._varying = kernel.packed(body, self.dtype)
 
     def _flown(self, rows: Array, thrust: Array, wrench: Array, steps: int) -> np.ndarray:
         """New rows after physics steps: see `RigidBody.fly`."""
