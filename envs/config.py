@@ -138,7 +138,7 @@ class EnvConfig:
     randomize: Mapping[str, Any] = field(default_factory=dict, hash=False)
     """Distributions of what is drawn for each episode: names of `sim.PARAMETERS` to texts."""
     sensors: Mapping[str, Any] = field(default_factory=dict, hash=False)
-    """Settings by sensor, or true; see `sim/sensors.py`."""
+    """Settings by sensor, or true; see `sim/sensors`."""
     cameras: tuple[str, ...] = ()
     """Pictures that are observed: cameras of the vehicle as NAME, NAME_KIND or
     NAME@WIDTHxHEIGHT."""

@@ -1,4 +1,4 @@
-"""Sensors and the onboard estimate of `sim/sensors.py`."""
+"""Sensors and the onboard estimate of `sim/sensors`."""
 
 from dataclasses import replace
 

@@ -20,7 +20,8 @@ from rotorgram.envs.registry import env_spec
 from rotorgram.models.errors import InputError
 from rotorgram.models.vehicle import Vehicle
 from rotorgram.sim import EffectOptions, InitialState, World, checked_sensors, make_world
-from rotorgram.sim.sensors import Estimator, Sensors, isa_height, isa_pressure
+from rotorgram.sim.sensors import Estimator, Sensors
+from rotorgram.sim.sensors.barometer import isa_height, isa_pressure
 
 ELEVATION = "rotorgram/Elevation-v0"
 HOVER = "rotorgram/Hover-v0"

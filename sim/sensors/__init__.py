@@ -1,0 +1,167 @@
+"""Sensors and an onboard estimate, as options of every task; `docs/sensors.md` is their page.
+
+A sensor is sampled at the end of a control step, from the exact state there: one with a rate below
+the control rate holds its last reading in between. A reset gives a first reading, which a delay
+holds too. Each sensor has random numbers of its own, so that none moves those of another.
+
+World frame: x east, y north, z up. Arrays have the leading axes of the world, none for one drone.
+"""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Final
+
+from numpy.typing import NDArray
+
+from ...models.errors import InputError
+from ...models.fields import check_names
+from ..snapshots import Arrays, Kept, joined, part_of
+from ..state import Array, WorldState
+from .barometer import Barometer
+from .base import Reading, Sensor, Source, Values, chosen
+from .channel import Channel
+from .estimator import Estimator
+from .gps import Gps
+from .imu import Imu
+from .magnetometer import FIELD, Magnetometer
+from .motion_capture import MotionCapture
+from .rangefinder import Rangefinder
+
+if TYPE_CHECKING:
+    from ...models.vehicle import Vehicle
+    from ..world import World
+
+__all__ = ["SENSOR_TYPES", "Estimator", "Reading", "Sensors", "checked_sensors", "readings_of"]
+
+SENSOR_TYPES: Final[Mapping[str, type[Sensor]]] = {
+    kind.name: kind for kind in (Imu, Magnetometer, Barometer, Rangefinder, Gps, MotionCapture)
+}
+"""In this order they are observed."""
+
+_ESTIMATE: Final = Estimator.name
+_SOURCES: Final[Mapping[str, type[Source]]] = {**SENSOR_TYPES, _ESTIMATE: Estimator}
+
+
+def checked_sensors(given: Any) -> dict[str, Any]:
+    """The option `sensors` of a task as plain values in one order. Raises `InputError`.
+
+    By sensor its settings by name, or True for none; False leaves it out. `observe` is "added" or
+    "estimate".
+    """
+    if not isinstance(given, Mapping):
+        raise InputError(f"sensors: expected settings by sensor, got {given!r:.80}")
+    check_names(given, [*_SOURCES, "observe"], "sensors")
+    sensors: dict[str, Any] = {}
+    for name, kind in _SOURCES.items():
+        settings = given.get(name)
+        if settings is None or settings is False:
+            continue
+        if settings is True:
+            settings = {}
+        if not isinstance(settings, Mapping):
+            raise InputError(
+                f"sensors.{name}: expected true, or settings by name, got {settings!r:.80}"
+            )
+        sensors[name] = kind.checked(settings)
+    observe = given.get("observe", "added")
+    if observe not in ("added", _ESTIMATE):
+        raise InputError(f"sensors.observe: expected 'added' or 'estimate', got {observe!r:.300}")
+    if observe == _ESTIMATE:
+        if _ESTIMATE not in sensors:
+            raise InputError("sensors: expected estimate, which is to be observed, got none")
+        sensors["observe"] = observe
+    if _ESTIMATE in sensors and "imu" not in sensors:
+        raise InputError("sensors: expected imu, which estimate needs, got none")
+    return sensors
+
+
+def _resolved(sensors: Values, vehicle: "Vehicle", period: float) -> dict[str, dict[str, Any]]:
+    """All settings by sensor."""
+    return {
+        name: _SOURCES[name].resolved(given, vehicle, period)
+        for name, given in sensors.items()
+        if name != "observe"
+    }
+
+
+def readings_of(sensors: Values, vehicle: "Vehicle", period: float) -> tuple[Reading, ...]:
+    """What sensors add to an observation, from `checked_sensors`. Raises `InputError`."""
+    settings = _resolved(sensors, vehicle, period)
+    if "observe" in sensors:
+        return ()
+    return tuple(_SOURCES[name](values, 1.0).reading for name, values in settings.items())
+
+
+class Sensors(Kept):
+    """The sensors of a world's drones, from `checked_sensors`, at so many s between two samples.
+
+    Raises `InputError`.
+    """
+
+    arrays = ("_steps",)
+
+    def __init__(self, sensors: Values, world: "World", period: float) -> None:
+        self._world = world
+        settings = _resolved(sensors, world.vehicle, period)
+        estimate = settings.pop(_ESTIMATE, None)
+        self._channels = {
+            name: Channel(SENSOR_TYPES[name], values, world, period)
+            for name, values in settings.items()
+        }
+        self._estimator = None
+        if estimate is not None:
+            altitude = settings.get("barometer", {}).get("altitude", 0.0)
+            field = settings.get("magnetometer", {}).get("field", FIELD)
+            gravity = world.vehicle.gravity
+            self._estimator = Estimator(estimate, period, gravity, altitude, field)
+        self._replaces = "observe" in sensors
+        self._steps: Array = 0
+
+    def begin(self, mask: Array) -> None:
+        """Begin episodes of the drones of a mask, bool, shape (W, A), after a reset of theirs."""
+        self._steps = chosen(mask, 0 * mask, self._steps)
+        for channel in self._channels.values():
+            channel.begin(mask)
+        if self._estimator is not None:
+            self._estimator.begin(mask, self._world.state, self._channels["imu"].value)
+
+    def sample(self, mask: Array) -> None:
+        """After a control step of the drones of a mask; the others keep their readings."""
+        self._steps = self._steps + mask
+        for channel in self._channels.values():
+            channel.sample(mask, self._steps)
+        if self._estimator is not None:
+            self._estimator.update(mask, self._channels)
+
+    def snapshot(self) -> dict[str, NDArray[Any]]:
+        """Copies of all arrays that a later reading depends on, by name."""
+        parts = {name: part.snapshot() for name, part in self._parts().items()}
+        return joined(parts) | super().snapshot()
+
+    def restore(self, arrays: Arrays) -> None:
+        """Put a snapshot back, after that of the world."""
+        super().restore(arrays)
+        for name, part in self._parts().items():
+            part.restore(part_of(arrays, name))
+
+    def _parts(self) -> dict[str, Kept]:
+        parts: dict[str, Kept] = dict(self._channels)
+        for name, channel in self._channels.items():
+            parts[f"{name} errors"] = channel.sensor
+        if self._estimator is not None:
+            parts[_ESTIMATE] = self._estimator
+        return parts
+
+    @property
+    def readings(self) -> dict[str, Array]:
+        """What the observation gets, by name, shapes (W, A, k)."""
+        if self._replaces:
+            return {}
+        readings = {name: channel.value for name, channel in self._channels.items()}
+        if self._estimator is not None:
+            readings[_ESTIMATE] = self._estimator.estimate()
+        return readings
+
+    def seen(self) -> WorldState:
+        """The state that task and controller see: the exact one, or the estimate."""
+        state = self._world.state
+        return self._estimator.seen(state) if self._estimator and self._replaces else state

@@ -1,0 +1,76 @@
+"""Barometer."""
+
+import math
+from typing import TYPE_CHECKING, ClassVar, Final
+
+from ...models.fields import Limits
+from ..state import Array, clip
+from .base import Sensor, Setting, Values, chosen
+
+if TYPE_CHECKING:
+    from ..world import World
+
+SEA_LEVEL_PRESSURE: Final = 101_325.0  # Pa. These are those of ISO 2533:1975
+SEA_LEVEL_TEMPERATURE: Final = 288.15  # K
+LAPSE_RATE: Final = 0.0065  # K/m, up to 11 km
+LOWEST: Final = -5_000.0  # m
+HIGHEST: Final = 11_000.0
+_EXPONENT: Final = 9.80665 / (287.052_87 * LAPSE_RATE)
+
+
+def isa_pressure(height: Array) -> Array:
+    """Pressure of the International Standard Atmosphere, Pa, at a geopotential height in m.
+
+    p = p₀ (1 - L h / T₀)^(g₀ / R L), ISO 2533:1975, in the troposphere: up to 11 km.
+    """
+    return SEA_LEVEL_PRESSURE * (1 - LAPSE_RATE / SEA_LEVEL_TEMPERATURE * height) ** _EXPONENT
+
+
+def isa_height(pressure: Array) -> Array:
+    """The reverse of `isa_pressure`: the pressure altitude, m."""
+    share = (pressure / SEA_LEVEL_PRESSURE) ** (1 / _EXPONENT)
+    return SEA_LEVEL_TEMPERATURE / LAPSE_RATE * (1 - share)
+
+
+_PRESSURES: Final = (isa_pressure(HIGHEST), isa_pressure(LOWEST))
+
+
+class Barometer(Sensor):
+    """Pressure altitude: the height at which the standard atmosphere has the pressure it reads.
+
+    White noise and a walk from 0 on act on the pressure, that of the standard atmosphere at the
+    body's origin. Setting: the height of the ground above sea level.
+    """
+
+    name = "barometer"
+    prefix = "barometer_"
+    columns = 2
+    arrays = ("_bias",)
+    defaults: ClassVar = {"walk": 0.0}
+    settings: ClassVar = {"altitude": Setting(0.0, Limits(-1e3, 9e3, "m"))}
+    frame = "above sea level"
+    components = ("pressure altitude",)
+    units = ("m",)
+
+    def __init__(self, values: Values, interval: float) -> None:
+        super().__init__(values, interval)
+        self._step = values["walk"] * math.sqrt(interval)
+        self._bias: Array = 0.0
+
+    def high(self) -> list[float]:
+        return [HIGHEST + 1]
+
+    def low(self) -> list[float]:
+        return [LOWEST - 1]
+
+    def begin(self, mask: Array, normal: Array) -> None:
+        """No walk yet."""
+        self._bias = chosen(mask, 0.0 * normal[..., :1], self._bias)
+
+    def measure(self, world: "World", normal: Array) -> Array:
+        # An array of a single drone too: a power of Python's numbers may differ by a bit.
+        height = world.state.position[..., 2:] + self.values["altitude"]
+        exact = isa_pressure(clip(height, LOWEST, HIGHEST))
+        pressure = exact + self._bias + self.values["noise"] * normal[..., :1]
+        self._bias = self._bias + self._step * normal[..., 1:]
+        return isa_height(clip(pressure, *_PRESSURES))

@@ -1,0 +1,79 @@
+"""A sensor as it is sampled: rate, delay and dropout."""
+
+import math
+from statistics import NormalDist
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..snapshots import Kept
+from ..state import Array, component
+from .base import Sensor, Values, chosen
+
+if TYPE_CHECKING:
+    from ..world import World
+
+
+class Channel(Kept):
+    """Samples a sensor, given as its class and all its settings, every `period` s.
+
+    A reading is kept with a last number, 1 where it is new and 0 where the one before was held.
+    """
+
+    arrays = ("_now", "_held")
+    lists = ("_late",)
+
+    def __init__(self, kind: type[Sensor], values: Values, world: "World", period: float) -> None:
+        self._every = values["every"]
+        self._lag = values["lag"]
+        self.interval = self._every * period
+        self.sensor = kind(values, self.interval)
+        self._world = world
+        # One number more than the sensor takes decides whether a reading is lost.
+        self._noise = world.random.noise(f"sensor {kind.name}", kind.columns + 1)
+        dropout = values["dropout"]
+        self._lost = NormalDist().inv_cdf(dropout) if dropout else -math.inf
+        self._now: Array = 0.0
+        self._held: Array = 0.0
+        self._late: list[Array] = []  # those on their way, the oldest first
+
+    @property
+    def value(self) -> Array:
+        """What is observed now, shape (W, A, k)."""
+        return self._now[..., :-1]
+
+    @property
+    def fresh(self) -> Array:
+        """1 where it was not observed before, and 0 elsewhere, shape (W, A)."""
+        return component(self._now, -1)
+
+    def begin(self, mask: Array) -> None:
+        """First reading of the drones of a mask."""
+        self.sensor.begin(mask, self._noise.normal(mask)[..., :-1])
+        first = self.sensor.read(self._world, self._noise.normal(mask)[..., :-1])
+        self._held = chosen(mask, first, self._held)
+        self._now = chosen(mask, _with(first, 1.0), self._now)
+        old = _with(first, 0.0)
+        self._late = [chosen(mask, old, late) for late in self._late or [old] * self._lag]
+
+    def sample(self, mask: Array, steps: Array) -> None:
+        """After a control step of the drones of a mask; so many steps are behind each drone."""
+        due = mask if self._every == 1 else mask & (steps % self._every == 0)
+        fresh = due
+        if np.any(due):
+            normal = self._noise.normal(due)
+            reading = self.sensor.read(self._world, normal[..., :-1])
+            fresh = due & (component(normal, -1) >= self._lost)
+            self._held = chosen(fresh, reading, self._held)
+        first, *rest = [*self._late, _with(self._held, fresh)]
+        self._now = chosen(mask, first, self._now)
+        self._late = [chosen(mask, new, old) for new, old in zip(rest, self._late, strict=True)]
+
+
+def _with(reading: Array, fresh: Array) -> Array:
+    """A reading with one more number for each drone."""
+    *lead, size = reading.shape
+    both = np.empty((*lead, size + 1))
+    both[..., :-1] = reading
+    both[..., -1] = fresh
+    return both

@@ -1,0 +1,149 @@
+"""The onboard estimate of position, velocity, attitude and body rates."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import ClassVar, Final
+
+import numpy as np
+
+from ...models.fields import Limits
+from ..rotations import advanced, between, cross, parts_of, to_world, world_z
+from ..state import Array, WorldState, clip, component, stack
+from .base import FURTHEST, MAX_SPEED, UNIT, Setting, Source, Values, chosen
+from .channel import Channel
+from .magnetometer import FIELD
+
+_TIME: Final = Setting(1.0, Limits(1e-3, 1e4, "s"))
+_PARTS: Final = ("position", "velocity", "quaternion", "body_rates")
+
+
+class Estimator(Source):
+    """Complementary filter: what the IMU gives is integrated, and pulled to what measures it.
+
+    Attitude: R. Mahony, T. Hamel, J.-M. Pflimlin, "Nonlinear Complementary Filters on the Special
+    Orthogonal Group", IEEE TAC 53(5), 2008, equation 32, without its bias; the accelerometer's
+    direction counts in proportion to its size over g, the magnetometer turns about the vertical
+    alone. Position and velocity: a g-h filter with two equal poles (E. Brookner, "Tracking and
+    Kalman Filtering Made Easy", 1998, section 1.2). The filter begins at the exact state, and
+    takes a late reading for one of now.
+
+    Settings are time constants: of the attitude; of height and climb rate, which follow the
+    barometer; of position and velocity, which follow motion capture and GPS.
+
+    Args:
+        values: All settings.
+        interval: Time of a step, s.
+        gravity: m/s².
+        altitude: Of the ground above sea level, m.
+        field: Earth's, world frame, shape (3,).
+    """
+
+    name = "estimate"
+    arrays = _PARTS
+    settings: ClassVar = {
+        "attitude_time": _TIME,
+        "height_time": _TIME,
+        "position_time": _TIME,
+    }
+    frame = "world; body rates: body"
+    components = ("x", "y", "z", "vx", "vy", "vz", "qw", "qx", "qy", "qz", "wx", "wy", "wz")
+    units = ("m",) * 3 + ("m/s",) * 3 + ("1",) * 4 + ("rad/s",) * 3
+
+    def __init__(
+        self,
+        values: Values,
+        interval: float,
+        gravity: float = 0.0,
+        altitude: float = 0.0,
+        field: tuple[float, ...] = FIELD,
+    ) -> None:
+        super().__init__(values, interval)
+        self._gravity = gravity
+        self._altitude = altitude
+        self._north = math.atan2(field[1], field[0])
+        self.position: Array = 0.0
+        self.velocity: Array = 0.0
+        self.quaternion: Array = 0.0
+        self.body_rates: Array = 0.0
+
+    def high(self) -> list[float]:
+        return [FURTHEST] * 3 + [MAX_SPEED] * 3 + [UNIT] * 4 + [2 * MAX_SPEED] * 3
+
+    def begin(self, mask: Array, state: WorldState, imu: Array) -> None:
+        """Take over the exact state of the drones of a mask."""
+        for name in ("position", "velocity", "quaternion"):
+            exact = getattr(state, name) + 0.0  # its own memory
+            setattr(self, name, chosen(mask, exact, getattr(self, name)))
+        self.body_rates = imu[..., :3]
+
+    def update(self, mask: Array, channels: Mapping[str, Channel]) -> None:
+        """A control step of the drones of a mask."""
+        imu = channels["imu"].value
+        period = self.interval
+        rates = imu[..., :3]
+        force = imu[..., 3:]
+        turned = advanced(self.quaternion, rates * period + self._correction(force, channels))
+        gravity = np.array((0.0, 0.0, self._gravity))
+        acceleration = to_world(turned, force) - gravity
+        position = self.position + period * self.velocity + 0.5 * period**2 * acceleration
+        velocity = self.velocity + period * acceleration
+        position, velocity = self._followed(position, velocity, channels)
+        self.quaternion = chosen(mask, turned, self.quaternion)
+        self.position = chosen(mask, clip(position, -FURTHEST, FURTHEST), self.position)
+        self.velocity = chosen(mask, clip(velocity, -MAX_SPEED, MAX_SPEED), self.velocity)
+        self.body_rates = chosen(mask, rates, self.body_rates)
+
+    def _correction(self, force: Array, channels: Mapping[str, Channel]) -> Array:
+        """Rotation vector in the body frame that pulls the attitude to what measures it, rad."""
+        up = world_z(self.quaternion)
+        share = 1 - math.exp(-self.interval / self.values["attitude_time"])
+        angle = share / self._gravity * stack(cross(parts_of(force), parts_of(up)))
+        if channel := channels.get("magnetometer"):
+            field = to_world(self.quaternion, channel.value)
+            off = self._north - np.atan2(component(field, 1), component(field, 0))
+            off = np.atan2(np.sin(off), np.cos(off)) * self._gain(channel, "attitude_time")
+            angle = angle + stack((off,)) * up
+        if channel := channels.get("motion_capture"):
+            error = between(self.quaternion, channel.value[..., 3:])
+            sign = 2.0 * self._gain(channel, "attitude_time") * np.sign(component(error, 0))
+            angle = angle + stack((sign,)) * error[..., 1:]
+        return angle
+
+    def _followed(
+        self, position: Array, velocity: Array, channels: Mapping[str, Channel]
+    ) -> tuple[Array, Array]:
+        """Position and velocity, pulled to what measures them."""
+        if channel := channels.get("barometer"):
+            zero = 0.0 * component(position, 2)
+            off = component(channel.value, 0) - self._altitude - component(position, 2)
+            g, h = self._gains(channel, "height_time")
+            position = position + stack((zero, zero, g * off))
+            velocity = velocity + stack((zero, zero, h * off))
+        if channel := channels.get("motion_capture"):
+            g, h = self._gains(channel, "position_time")
+            off = channel.value[..., :3] - position
+            position = position + stack((g,)) * off
+            velocity = velocity + stack((h,)) * off
+        if channel := channels.get("gps"):
+            gain = stack((self._gain(channel, "position_time"),))
+            position = position + gain * (channel.value[..., :3] - position)
+            velocity = velocity + gain * (channel.value[..., 3:] - velocity)
+        return position, velocity
+
+    def _gain(self, channel: Channel, time: str) -> Array:
+        """Share of an error that a fresh reading takes away; 0 where there is none."""
+        return (1 - math.exp(-channel.interval / self.values[time])) * channel.fresh
+
+    def _gains(self, channel: Channel, time: str) -> tuple[Array, Array]:
+        """g, and h over the interval: 1 - ξ² and (1 - ξ)² for two poles at ξ."""
+        pole = math.exp(-channel.interval / self.values[time])
+        return (1 - pole**2) * channel.fresh, (1 - pole) ** 2 / channel.interval * channel.fresh
+
+    def estimate(self) -> Array:
+        """Position, velocity, quaternion and rates, shape (W, A, 13)."""
+        return np.concat([getattr(self, name) for name in _PARTS], axis=-1)
+
+    def seen(self, state: WorldState) -> WorldState:
+        """A state with the estimate in place of what is estimated."""
+        return replace(state, **{name: getattr(self, name) for name in _PARTS})

@@ -1,0 +1,32 @@
+"""Position and velocity by satellites."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..state import Array
+from .base import FURTHEST, MAX_SPEED, Sensor
+
+if TYPE_CHECKING:
+    from ..world import World
+
+
+class Gps(Sensor):
+    """Position and velocity of the body's origin; white noise."""
+
+    name = "gps"
+    prefix = "gps_"
+    columns = 6
+    needs = ("noise", "vertical_noise", "velocity_noise")
+    frame = "world"
+    components = ("x", "y", "z", "vx", "vy", "vz")
+    units = ("m",) * 3 + ("m/s",) * 3
+
+    def high(self) -> list[float]:
+        return [FURTHEST] * 3 + [MAX_SPEED] * 3
+
+    def measure(self, world: "World", normal: Array) -> Array:
+        level, vertical, speed = (self.values[name] for name in self.needs)
+        sigma = np.array((level, level, vertical, speed, speed, speed))
+        exact = np.concat((world.state.position, world.state.velocity), axis=-1)
+        return exact + sigma * normal

@@ -1,0 +1,79 @@
+"""Gyroscope and accelerometer."""
+
+import math
+from typing import TYPE_CHECKING, ClassVar, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..rotations import to_body
+from ..state import Array
+from .base import Sensor, Values, chosen
+
+if TYPE_CHECKING:
+    from ..world import World
+
+GYRO_RANGE: Final = math.radians(2000.0)  # rad/s: the largest setting of the BMI088
+ACCELEROMETER_RANGE: Final = 24 * 9.80665  # m/s²: the same
+
+
+def specific_force(world: "World") -> Array:
+    """Acceleration less that of gravity at the body's origin, body frame, m/s², shape (W, A, 3).
+
+    R^T (a - g), with the attitude R and the acceleration a at the end of the control step, under
+    the thrusts and the forces of the air of its last physics step.
+    """
+    gravity = np.array((0.0, 0.0, world.vehicle.gravity))
+    return to_body(world.state.quaternion, world.acceleration() + gravity)
+
+
+class Imu(Sensor):
+    """Gyroscope and accelerometer at the body's origin.
+
+    reading = (1 + scale) · exact + bias + white noise, for each axis. White noise of density N read
+    every T has σ = N / √T; the bias walks by K √T between readings. (IEEE Std 952-1997, annex C.)
+    """
+
+    name = "imu"
+    prefix = ""
+    arrays = ("_bias", "_scale")
+    needs = ("gyro_noise", "accelerometer_noise")
+    defaults: ClassVar = {
+        "gyro_walk": 0.0,
+        "gyro_bias": 0.0,
+        "gyro_scale": 0.0,
+        "gyro_range": GYRO_RANGE,
+        "accelerometer_walk": 0.0,
+        "accelerometer_bias": 0.0,
+        "accelerometer_scale": 0.0,
+        "accelerometer_range": ACCELEROMETER_RANGE,
+    }
+    columns = 12
+    frame = "body"
+    components = tuple(f"{what} {axis}" for what in ("gyro", "accelerometer") for axis in "xyz")
+    units = ("rad/s",) * 3 + ("m/s²",) * 3
+
+    def __init__(self, values: Values, interval: float) -> None:
+        super().__init__(values, interval)
+        self._white = self._both("noise") / math.sqrt(interval)
+        self._step = self._both("walk") * math.sqrt(interval)
+        self._bias: Array = 0.0
+        self._scale: Array = 0.0
+
+    def _both(self, what: str) -> NDArray[np.float64]:
+        return np.repeat([self.values[f"gyro_{what}"], self.values[f"accelerometer_{what}"]], 3)
+
+    def high(self) -> list[float]:
+        high: list[float] = self._both("range").tolist()
+        return high
+
+    def begin(self, mask: Array, normal: Array) -> None:
+        """Bias and error of scale."""
+        self._bias = chosen(mask, self._both("bias") * normal[..., :6], self._bias)
+        self._scale = chosen(mask, self._both("scale") * normal[..., 6:], self._scale)
+
+    def measure(self, world: "World", normal: Array) -> Array:
+        exact = np.concat((world.state.body_rates, specific_force(world)), axis=-1)
+        reading = (1 + self._scale) * exact + self._bias + self._white * normal[..., :6]
+        self._bias = self._bias + self._step * normal[..., 6:]
+        return reading

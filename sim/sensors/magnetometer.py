@@ -1,0 +1,37 @@
+"""Magnetometer."""
+
+from typing import TYPE_CHECKING, ClassVar, Final
+
+import numpy as np
+
+from ...models.fields import Limits
+from ..rotations import to_body
+from ..state import Array
+from .base import Sensor, Setting
+
+if TYPE_CHECKING:
+    from ..world import World
+
+FIELD: Final = (1.287, 21.532, -43.231)
+"""Earth's magnetic field at Zurich (47.377° N, 8.542° E, 408 m) on 2025-01-01: east, north and up,
+µT. World Magnetic Model WMM2025, NOAA NCEI and British Geological Survey."""
+
+
+class Magnetometer(Sensor):
+    """Earth's field in the body frame; white noise. Setting: the field in the world frame."""
+
+    name = "magnetometer"
+    prefix = "magnetometer_"
+    columns = 3
+    settings: ClassVar = {"field": Setting(FIELD, Limits(-100.0, 100.0, "µT", count=3))}
+    frame = "body"
+    components = ("field x", "field y", "field z")
+    units = ("µT",) * 3
+
+    def high(self) -> list[float]:
+        """1 mT, far from any reading but for a wrong noise."""
+        return [1e3] * 3
+
+    def measure(self, world: "World", normal: Array) -> Array:
+        field = np.array(self.values["field"]) + 0.0 * normal
+        return to_body(world.state.quaternion, field) + self.values["noise"] * normal

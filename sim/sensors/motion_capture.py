@@ -1,0 +1,33 @@
+"""Motion capture."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..rotations import advanced
+from ..state import Array
+from .base import FURTHEST, UNIT, Sensor
+
+if TYPE_CHECKING:
+    from ..world import World
+
+
+class MotionCapture(Sensor):
+    """Position and attitude; white noise, of the attitude about the body's axes."""
+
+    name = "motion_capture"
+    prefix = "mocap_"
+    columns = 6
+    needs = ("noise", "angle_noise")
+    frame = "world; quaternion: body to world"
+    components = ("x", "y", "z", "qw", "qx", "qy", "qz")
+    units = ("m",) * 3 + ("1",) * 4
+
+    def high(self) -> list[float]:
+        return [FURTHEST] * 3 + [UNIT] * 4
+
+    def measure(self, world: "World", normal: Array) -> Array:
+        state = world.state
+        position = state.position + self.values["noise"] * normal[..., :3]
+        turned = advanced(state.quaternion, self.values["angle_noise"] * normal[..., 3:])
+        return np.concat((position, turned), axis=-1)

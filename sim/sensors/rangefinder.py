@@ -1,0 +1,34 @@
+"""Rangefinder."""
+
+from typing import TYPE_CHECKING
+
+from ..state import Array, clip, stack
+from .base import Sensor
+
+if TYPE_CHECKING:
+    from ..world import World
+
+
+class Rangefinder(Sensor):
+    """Distance from the body's origin along its -z axis, by a ray; white noise.
+
+    It reads its limit where there is nothing.
+    """
+
+    name = "rangefinder"
+    prefix = "range_"
+    columns = 1
+    needs = ("noise", "limit")
+    frame = "body, along -z"
+    components = ("distance",)
+    units = ("m",)
+
+    def high(self) -> list[float]:
+        return [self.values["limit"]]
+
+    def low(self) -> list[float]:
+        return [0.0]
+
+    def measure(self, world: "World", normal: Array) -> Array:
+        distance = clip(world.below(), 0.0, self.values["limit"])
+        return stack((distance,)) + self.values["noise"] * normal
