@@ -130,7 +130,7 @@ class Stages:
             if isinstance(stage, Landed):
                 return stage
         period = self._held * self._world.vehicle.timestep
-        landing = Landing(self._world, self._look, period, self._task.lag)
+        landing = Landing(self._world, self._look, period, self._task.config.effects)
         self._flight.parts.insert(1, landing)
         landed = Landed()
         self._observing.insert(self._observing.index(self._ends), landed)

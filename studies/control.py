@@ -76,9 +76,9 @@ def response(name: str, level: str) -> dict[str, float]:
     """Rise time, overshoot and settling time of a step from hover."""
     vehicle = Vehicle.load(name)
     (index, size, _, time, read) = STEPS[level]
-    lag = lag_of(vehicle)
-    world = make_world(vehicle, 1, effects=EffectOptions(motor_lag=lag > 0))
-    controller: Any = make_controller(level, vehicle, vehicle.timestep, lag=lag)
+    effects = EffectOptions(motor_lag=lag_of(vehicle) > 0)
+    world = make_world(vehicle, 1, effects=effects)
+    controller: Any = make_controller(level, vehicle, vehicle.timestep, effects)
     world.reset(np.True_, InitialState(position=np.array((0.0, 0.0, 1000.0))))
     unit = controller.ranges()[index][0]
     action = np.zeros(4)

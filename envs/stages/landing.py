@@ -4,7 +4,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from ...sim import World, make_controller
+from ...sim import EffectOptions, World, make_controller
 from .record import Look, Mask, Record, Stage, where
 
 DESCENT: Final = 0.7  # m/s: PX4's default of MPC_LAND_SPEED
@@ -20,15 +20,15 @@ class Landing(Stage):
         world: What flies.
         look: Gives the state that a controller sees.
         period: Time between two controls, s.
-        lag: Time constant of the rotors, s.
+        effects: Lag and thrust curve of the rotors among them.
 
     Raises:
         InputError: The vehicle cannot be flown at that level.
     """
 
-    def __init__(self, world: World, look: Look, period: float, lag: float) -> None:
+    def __init__(self, world: World, look: Look, period: float, effects: EffectOptions) -> None:
         self._look = look
-        controller: Any = make_controller("velocity", world.vehicle, period, lag=lag)
+        controller: Any = make_controller("velocity", world.vehicle, period, effects)
         self._controller = controller
         fastest, _ = controller.ranges()[2]
         down = (0.0, 0.0, -min(1.0, DESCENT / fastest), 0.0)

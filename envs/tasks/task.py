@@ -153,7 +153,7 @@ class Task:
     def _of_level(self) -> Controller:
         """The controller of the action level."""
         period = self.control_period if self.config.estimated else self.vehicle.timestep
-        return make_controller(self.action, self.vehicle, period, lag=self.lag)
+        return make_controller(self.action, self.vehicle, period, self.config.effects)
 
     def adjust(self, config: "EnvConfig") -> "EnvConfig":
         """The config with what the task adds to it, such as a payload; called after `setup`.
@@ -161,14 +161,6 @@ class Task:
         It may add, and never drop. Raises `InputError` for what contradicts the task.
         """
         return config
-
-    @property
-    def lag(self) -> float:
-        """Longest time constant of the rotors, s; 0 without the effect `motor_lag`."""
-        rotors = self.vehicle.coefficients.rotors
-        lags = self.config.effects.motor_lag
-        times = (rotors.time_constant, rotors.time_constant_down) if lags else ()
-        return max((time for time in times if time), default=0.0)
 
     def setup(self) -> None:
         """Set `observation`, from `options` and `vehicle`.

@@ -4,10 +4,10 @@ A controller has no memory: what it needs of the past is in the state. An action
 within bounds, or is one of some choices.
 """
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from ...models.errors import InputError
+from ..effects import EffectOptions
 from ..state import Array, WorldState
 from .cascade import Attitude, Position, Rates, Velocity
 from .gains import Gains, shared_ranges
@@ -59,35 +59,41 @@ class Controller(Protocol):
 
 
 def make_controller(
-    level: str, vehicle: "Vehicle", period: float, *, lag: float = 0.0
+    level: str, vehicle: "Vehicle", period: float, effects: EffectOptions | None = None
 ) -> Controller:
     """The controller of one of `LEVELS`.
 
     `period` is the time between two looks at the state, s: the physics step, or the control period
-    where the state is an estimate. `lag` is the rotors' time constant, s; 0 where they follow at
-    once. Raises `InputError` if the level is none of them, or the vehicle cannot be flown at it.
+    where the state is an estimate. Loops know the rotors' lag and thrust curve where these effects
+    are on. Raises `InputError` if the level is none of them, or the vehicle cannot be flown at it.
     """
     if level not in LEVELS:
         raise InputError(f"action: expected one of {', '.join(LEVELS)}, got {level!r:.300}")
-    if members := getattr(vehicle, "members", ()):
-        return _of_several(level, members, period, lag)
-    if level == "rotors":
-        return RotorThrust(vehicle)
-    if level in _CASCADE:
-        controller: Controller = _CASCADE[level](vehicle, Gains.of(vehicle, period, lag))
-        return controller
-    newtons = SHARES[level] * float(vehicle.thrust_high.max())
-    return CollectiveThrust(vehicle, newtons, increment=level == "increment")
-
-
-def _of_several(level: str, vehicles: Sequence["Vehicle"], period: float, lag: float) -> Controller:
-    """One of a level for each vehicle; an action stands for the same with all."""
-    kinds = list(dict.fromkeys(vehicles))
+    effects = effects or EffectOptions()
+    members = getattr(vehicle, "members", (vehicle,))
+    kinds = list(dict.fromkeys(members))
     controllers: list[Controller]
     if level in _CASCADE:
-        gains = shared_ranges([Gains.of(vehicle, period, lag) for vehicle in kinds])
-        controllers = [_CASCADE[level](*both) for both in zip(kinds, gains, strict=True)]
+        gains = [Gains.of(kind, period, _lag(kind, effects)) for kind in kinds]
+        pairs = zip(kinds, shared_ranges(gains), strict=True)
+        controllers = [_CASCADE[level](kind, own, effects) for kind, own in pairs]
     else:
-        controllers = [make_controller(level, vehicle, period, lag=lag) for vehicle in kinds]
-    drones = [[i for i, own in enumerate(vehicles) if own is kind] for kind in kinds]
+        controllers = [_of_thrusts(level, kind) for kind in kinds]
+    if len(members) == 1:
+        return controllers[0]
+    drones = [[i for i, own in enumerate(members) if own is kind] for kind in kinds]
     return MixedController(list(zip(controllers, drones, strict=True)))
+
+
+def _lag(vehicle: "Vehicle", effects: EffectOptions) -> float:
+    """Longest time constant of the rotors, s; 0 where they follow at once."""
+    rotors = vehicle.coefficients.rotors
+    times = (rotors.time_constant or 0.0, rotors.time_constant_down or 0.0)
+    return max(times) if effects.motor_lag else 0.0
+
+
+def _of_thrusts(level: str, vehicle: "Vehicle") -> Controller:
+    if level == "rotors":
+        return RotorThrust(vehicle)
+    newtons = SHARES[level] * float(vehicle.thrust_high.max())
+    return CollectiveThrust(vehicle, newtons, increment=level == "increment")

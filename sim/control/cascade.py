@@ -22,6 +22,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from ..effects import EffectOptions
+from ..effects.rotors import polynomial
 from ..rotations import Parts, Rows, dot, matrix, parts_of, times, transposed
 from ..state import Array, WorldState, clip, stack
 
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
 
 _ASIDE: Final = 1e-3  # Upside down every way to turn is as short: it is about x
 _TINY: Final = 1e-12  # Added to squares under a root, whose slope at 0 is infinite
+_POINTS: Final = 1025  # of the table that inverts a thrust curve: right to 1e-6
 _HEADING: Final = "world turned by the heading"
 
 
@@ -47,7 +50,7 @@ class Rates:
     components: tuple[str, ...] = ("collective thrust", "roll rate", "pitch rate", "yaw rate")
     frame = "body"
 
-    def __init__(self, vehicle: "Vehicle", gains: "Gains") -> None:
+    def __init__(self, vehicle: "Vehicle", gains: "Gains", effects: EffectOptions) -> None:
         self.gains = gains
         self.low = (-1.0,) * len(self.components)
         self.high = (1.0,) * len(self.components)
@@ -61,6 +64,12 @@ class Rates:
         self._inertia = vehicle.inertia.tolist()
         limits = vehicle.thrust_low.tolist(), vehicle.thrust_high.tolist()
         self._limits = list(zip(*limits, strict=True))
+        self._throttle: tuple[Array, Array] | None = None
+        if effects.thrust_curve:
+            (curve,) = vehicle.coefficients.need("rotors.curve", "thrust_curve")
+            throttle = np.linspace(0.0, 1.0, _POINTS)
+            thrust = np.maximum.accumulate(polynomial(curve, throttle))
+            self._throttle = thrust, throttle
 
     def ranges(self) -> list[tuple[float, str]]:
         """What an action of 1 stands for, and the unit; of a collective thrust it is its limit."""
@@ -103,13 +112,17 @@ class Rates:
         return [share * (part + c * yaw) for share, part, (*_, c) in rotors]
 
     def _driven(self, wanted: list[Any], state: WorldState) -> Array:
-        """Commands that make rotors with a lag give these thrusts."""
+        """Commands that make rotors with a lag and a thrust curve give these thrusts."""
         lead = self.gains.lead
         if lead != 1.0:
             now = parts_of(state.thrust)
             wanted = [old + lead * (new - old) for old, new in zip(now, wanted, strict=True)]
         limited = zip(wanted, self._limits, strict=True)
-        return stack([clip(part, low, high) for part, (low, high) in limited])
+        commands = [clip(part, low, high) for part, (low, high) in limited]
+        if self._throttle is not None:
+            both = zip(commands, self._limits, strict=True)
+            commands = [high * np.interp(part / high, *self._throttle) for part, (_, high) in both]
+        return stack(commands)
 
     def _scaled(self, action: Array) -> list[Any]:
         pairs = zip(parts_of(action), self._sizes, strict=True)
@@ -164,8 +177,9 @@ class Attitude(Rates):
 class Velocity(Attitude):
     """Velocity in the world frame turned by the heading, and yaw rate.
 
-    Wanted acceleration = kᵥ (wanted velocity - velocity), within `Gains.most_acceleration`. With
-    gravity it gives the thrust axis, and along the present one the collective thrust.
+    Wanted acceleration = kᵥ (wanted velocity - velocity), within `Gains.most_acceleration`, upwards
+    within `most_lift`, which a craft needs that is heavier than its file says. With gravity it
+    gives the thrust axis, and along the present one the collective thrust.
     """
 
     components = ("velocity x", "velocity y", "velocity z", "yaw rate")
@@ -191,7 +205,7 @@ class Velocity(Attitude):
         k = gains.velocity
         x = k * (velocity[0] - u)
         y = k * (velocity[1] - v)
-        z = gravity + clip(k * (velocity[2] - w), -up, up)
+        z = gravity + clip(k * (velocity[2] - w), -up, gains.most_lift)
         # Sideways no more than what the largest tilt gives at this lift.
         share = clip(level / gravity * z / _length(x, y), 0.0, 1.0)
         x = share * x
@@ -210,8 +224,8 @@ class Position(Velocity):
 
     components = ("offset x", "offset y", "offset z", "offset of the heading")
 
-    def __init__(self, vehicle: "Vehicle", gains: "Gains") -> None:
-        super().__init__(vehicle, gains)
+    def __init__(self, vehicle: "Vehicle", gains: "Gains", effects: EffectOptions) -> None:
+        super().__init__(vehicle, gains, effects)
         approach = f"approached at {gains.position:.7g} /s, gravity {vehicle.gravity:.7g} m/s²"
         self.frame = f"{_HEADING}, {approach}"
 

@@ -64,7 +64,9 @@ class Gains:
     most_tilt: float
     """Largest tilt that a level asks for, rad."""
     most_acceleration: tuple[float, float]
-    """Largest acceleration that the velocity loop asks for, horizontal and vertical, m/s²."""
+    """Largest acceleration that the velocity loop asks for, horizontal and downwards, m/s²."""
+    most_lift: float
+    """The same upwards, m/s²: all the thrust beyond the weight."""
     most_velocity: tuple[float, float]
     """Range of the velocity, horizontal and vertical, m/s."""
     most_offset: tuple[float, float]
@@ -120,6 +122,7 @@ class Gains:
             most_rate=tuple(np.sqrt(math.pi * alpha).tolist()),
             most_tilt=tilt,
             most_acceleration=most,
+            most_lift=surplus / vehicle.mass,
             most_velocity=(speeds[0], speeds[1]),
             most_offset=(offsets[0], offsets[1]),
             lowest=lowest,

@@ -50,7 +50,7 @@ class RotorEffects(Kept):
             self._times = [rise] if fall in (None, rise) else [rise, fall]
         if options.thrust_curve:
             (self._curve,) = told.need("rotors.curve", "thrust_curve")
-            most = max(_polynomial(self._curve, i / 100) for i in range(101))
+            most = max(polynomial(self._curve, i / 100) for i in range(101))
             expected = (
                 "a curve that ends at the largest thrust, c₀ + c₁ + ... = 1, and is no higher"
             )
@@ -128,7 +128,7 @@ class RotorEffects(Kept):
         target = [clip(part, low, high) for part, low, high in limits]
         if options.thrust_curve:
             both = zip(target, self._high, strict=True)
-            target = [h * clip(_polynomial(self._curve, part / h), 0.0, 1.0) for part, h in both]
+            target = [h * clip(polynomial(self._curve, part / h), 0.0, 1.0) for part, h in both]
         if options.battery:
             if not options.motor_lag:
                 (self.voltage,) = kept(mask, [self._loaded(target)], [self.voltage])
@@ -237,7 +237,7 @@ def _of_rotors(values: np.ndarray, like: Array) -> Parts:
     return values.tolist() if like.ndim == 1 else [values]
 
 
-def _polynomial(coefficients: tuple[float, ...], x: Any) -> Any:
+def polynomial(coefficients: tuple[float, ...], x: Any) -> Any:
     result = coefficients[-1] + 0.0 * x
     for c in coefficients[-2::-1]:
         result = result * x + c

@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from rotorgram.agents import Geometric
 from rotorgram.cli import main
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.loop import Loop
@@ -28,6 +29,7 @@ DOCS = Path(__file__).parents[2] / "docs"
 HOVER = "rotorgram/Hover-v0"
 MOCAP = {"noise": 0.001, "angle_noise": 0.002}
 ESTIMATE = {"imu": True, "motion_capture": MOCAP, "estimate": True, "observe": "estimate"}
+LAG = EffectOptions(motor_lag=True)
 CASCADE = ("rates", "attitude", "velocity", "position")
 FILES: dict[str, Any] = {"quad": QUAD_XML}
 FILES |= {path.stem: path for path in sorted(DATA.glob("*.xml"))} | {"lively": DATA / "lively.toml"}
@@ -87,7 +89,7 @@ def test_a_lag_slows_the_loops_and_is_led() -> None:
     assert gains.lead == pytest.approx(2.8032, abs=1e-3)
     assert Gains.of(vehicle, 0.005).attitude > 15.0
     state = state_of(vehicle, thrust=vehicle.hover_thrust - 0.001)
-    controller = make_controller("rates", vehicle, 0.005, lag=0.072)
+    controller = make_controller("rates", vehicle, 0.005, LAG)
     found = controller.thrust(np.zeros(4), state)
     assert found == pytest.approx(vehicle.hover_thrust - 0.001 + 0.0028032, abs=1e-6)
 
@@ -164,8 +166,10 @@ def test_velocity_by_hand() -> None:
 def test_position_by_hand() -> None:
     # 0.4 m · 0.883168 /s · 2.20792 /s = 0.779998 m/s².
     assert thrusts("position", (0, 0, 0.1, 0)) == [52.89999] * 4
-    # 4 m: half of 4.9 m/s² stops from 3.1305 m/s, within 2 m; 3.1305 · 2.20792 is more than 4.9.
-    assert thrusts("position", (0, 0, 1, 0)) == [73.5] * 4
+    # 4 m: half of 4.9 m/s² stops from 3.1305 m/s, within 2 m; 3.1305 · 2.20792 is 6.91190 m/s², up
+    # as it is, and down no more than 4.9.
+    assert thrusts("position", (0, 0, 1, 0)) == [83.5595] * 4
+    assert thrusts("position", (0, 0, -1, 0)) == [24.5] * 4
     # 0.0314159 rad · 0.69994 /s · 1.39987 /s · 10.00163 kg m² = 0.307878 N m.
     assert thrusts("position", (0, 0, 0, 0.01)) == [50.53939, 47.46061, 50.53939, 47.46061]
 
@@ -207,11 +211,14 @@ def random_states(vehicle: Vehicle, n: int) -> tuple[dict[str, np.ndarray], np.n
 
 
 @pytest.mark.parametrize("level", CASCADE)
-@pytest.mark.parametrize("name", ["quad", "hexa", "crazyflie2"])
+@pytest.mark.parametrize("name", ["quad", "racer", "crazyflie2"])
 def test_a_batch_has_the_bits_of_single_drones(name: str, level: str) -> None:
     vehicle = Vehicle.load(FILES[name])
-    lag = vehicle.coefficients.rotors.time_constant or 0.0
-    controller = make_controller(level, vehicle, vehicle.timestep, lag=lag)
+    effects = EffectOptions(
+        motor_lag=vehicle.coefficients.rotors.time_constant is not None,
+        thrust_curve=vehicle.coefficients.rotors.curve is not None,
+    )
+    controller = make_controller(level, vehicle, vehicle.timestep, effects)
     given, actions = random_states(vehicle, 50)
     batch = controller.thrust(actions, WorldState(**given))
     assert batch.shape == (50, 1, vehicle.num_rotors)
@@ -225,17 +232,12 @@ def test_a_batch_has_the_bits_of_single_drones(name: str, level: str) -> None:
 # --- every vehicle flies --------------------------------------------------------------------------
 
 
-def lags(vehicle: Vehicle) -> list[float]:
-    """Without motor lag and, where the file has a time constant, with it."""
-    told = vehicle.coefficients.rotors
-    times = [time for time in (told.time_constant, told.time_constant_down) if time]
-    return [0.0, max(times)] if times else [0.0]
-
-
-def flown(vehicle: Vehicle, level: str, lag: float, quaternion: Any, time: float) -> list[Any]:
+def flown(
+    vehicle: Vehicle, level: str, effects: EffectOptions, quaternion: Any, time: float
+) -> list[Any]:
     """Distance, tilt cosine and heading after each physics step of a flight to (0, 0, 50) m."""
-    world = make_world(vehicle, 1, effects=EffectOptions(motor_lag=lag > 0))
-    controller: Any = make_controller(level, vehicle, vehicle.timestep, lag=lag)
+    world = make_world(vehicle, 1, effects=effects)
+    controller: Any = make_controller(level, vehicle, vehicle.timestep, effects)
     goal = np.array((0.0, 0.0, 50.0))
     start = np.array((0.8, -0.6, 0.5)) if level == "position" else np.zeros(3)
     world.reset(np.True_, InitialState(position=goal + start, quaternion=np.array(quaternion)))
@@ -257,14 +259,15 @@ def flown(vehicle: Vehicle, level: str, lag: float, quaternion: Any, time: float
 
 
 def check_flights(vehicle: Vehicle) -> None:
-    for lag in lags(vehicle):
+    has_lag = vehicle.coefficients.rotors.time_constant is not None
+    for effects in [EffectOptions(), LAG][: 1 + has_lag]:
         tilted = (math.cos(0.2618), 0.6 * math.sin(0.2618), 0.8 * math.sin(0.2618), 0.0)  # by 30°
-        seen = np.array(flown(vehicle, "position", lag, tilted, 4.0))
+        seen = np.array(flown(vehicle, "position", effects, tilted, 4.0))
         assert seen[:, 0].max() < 1.5
         settled = seen[round(3.0 / vehicle.timestep) :]
         assert settled[:, 0].max() < 0.05
         assert abs(settled[-1, 2]) < math.radians(10)
-        over = np.array(flown(vehicle, "attitude", lag, (0.0, 1.0, 0.0, 0.0), 2.0))
+        over = np.array(flown(vehicle, "attitude", effects, (0.0, 1.0, 0.0, 0.0), 2.0))
         assert over[-1, 1] > math.cos(math.radians(3))
 
 
@@ -278,6 +281,37 @@ def test_a_new_vehicle_flies_without_tuning(frame: str, tmp_path: Path) -> None:
     file = tmp_path / "mine.toml"
     assert main(["vehicle", "new", str(file), "--frame", frame]) == 0
     check_flights(Vehicle.load(file))
+
+
+def hover_error(**options: Any) -> float:
+    """Distance from the goal after 6 s of the geometric controller, m."""
+    env = env_of("position", flight_band=8.0, episode_length=300, **options)
+    agent = Geometric(env.env_spec)
+    observation, _ = env.reset(seed=0)
+    for _ in range(300):
+        observation, _, terminated, _, info = env.step(agent.act(observation))
+        assert not terminated
+    return info["position_error"]  # type: ignore[no-any-return]
+
+
+@pytest.mark.parametrize("mass", [1.4, 1.5, 1.6])
+def test_a_heavier_craft_holds_its_height(mass: float) -> None:
+    """The paper's craft lifts 2.04 times its mass."""
+    assert hover_error(randomize={"mass": mass}) < 0.05
+
+
+def test_loops_invert_the_thrust_curve() -> None:
+    """Rotors of 4 N give 0.4 u + 0.6 u² of it: hover, 1.4715 N, is a throttle of 0.5177."""
+    vehicle = Vehicle.load(FILES["racer"])
+    effects = EffectOptions(thrust_curve=True)
+    controller = make_controller("rates", vehicle, vehicle.timestep, effects)
+    command = controller.thrust(np.zeros(4), state_of(vehicle))
+    assert command == pytest.approx([4 * 0.517687] * 4, abs=1e-5)
+    world = make_world(vehicle, 1, effects=effects)
+    world.reset(np.True_, InitialState(position=np.array((0.0, 0.0, 50.0))))
+    world.step(command, 1)
+    assert world.state.thrust == pytest.approx(vehicle.hover_thrust, abs=1e-5)
+    assert hover_error(vehicle=FILES["racer"], effects={"thrust_curve": True}) < 0.01
 
 
 # --- in an env ------------------------------------------------------------------------------------
