@@ -1,5 +1,6 @@
 """Drones in remote simulators as Gymnasium envs of the agent: one drone, or many."""
 
+from abc import abstractmethod
 from collections.abc import Collection
 from typing import Any, Final, Unpack
 
@@ -16,7 +17,7 @@ from ..envs.autoreset import (
     worlds_done,
 )
 from ..envs.spaces import action_space, joined, observation_space, telemetry_names
-from ..envs.spec import Discrete, EnvSpec
+from ..envs.spec import ArraySpec, Discrete, EnvSpec
 from ..models.errors import InputError, NotCopied
 from .protocol.client import Address
 from .protocol.layout import MAX_DRONES
@@ -28,6 +29,7 @@ from .transport.simulator import DEFAULT_AGENT
 LOST: Final = "simulator_lost"
 """Key of `info`: why the simulator was lost whose episode ends here as truncated."""
 
+Arrays = dict[str, np.ndarray]
 _FLY: Final = np.array([FLY], np.uint8)
 _RESET: Final = np.array([RESET], np.uint8)
 
@@ -36,6 +38,21 @@ class _Remote(NotCopied):
     """Base of both envs: the `Agent` behind them, and actions as they cross the wire."""
 
     _agent: Agent
+    _flying = False
+
+    def _open(self, address: Address, config: AgentConfig, connect: bool) -> None:
+        """Listen, and wait for simulators; without success nothing stays open."""
+        self._agent = Agent(address, config)
+        if connect:
+            try:
+                self.connect()
+            except BaseException:
+                self._agent.close()
+                raise
+
+    @abstractmethod
+    def connect(self) -> None:
+        """Wait until it is the agent's turn: for the simulators' first States, if none has come."""
 
     @property
     def address(self) -> Address:
@@ -47,11 +64,13 @@ class _Remote(NotCopied):
         """Counts and round trips of the wire, over all simulators."""
         return self._agent.server.statistics
 
-    def _take_actions(self, action: Any, count: int) -> None:
+    def _take_actions(self, action: ArraySpec | Discrete, count: int) -> None:
         """Take dtype and shape of the actions of so many drones as they cross the wire."""
-        is_discrete = isinstance(action, Discrete)
-        self._row: tuple[int, ...] = () if is_discrete else action.shape
-        self._dtype = np.dtype(np.int64 if is_discrete else action.dtype)
+        self._row: tuple[int, ...] = ()
+        self._dtype = np.dtype(np.int64)
+        if isinstance(action, ArraySpec):
+            self._row = action.shape
+            self._dtype = np.dtype(action.dtype)
         self._nothing: np.ndarray = np.zeros((count, *self._row), self._dtype)
 
 
@@ -112,13 +131,9 @@ class RemoteEnv(_Remote, gym.Env[Any, Any]):
         **settings: Unpack[AgentSettings],
     ) -> None:
         self.render_mode = None
-        self._flying = False
-        self._agent = Agent(address, AgentConfig(drones=1, slots=1, **settings))
-        if connect:
-            _connect(self)
+        self._open(address, AgentConfig(drones=1, slots=1, **settings), connect)
 
     def connect(self) -> None:
-        """Wait until it is the agent's turn: for the simulator's first State, if none has come."""
         self._take_spec(self._agent.connect())
 
     def reset(
@@ -133,9 +148,10 @@ class RemoteEnv(_Remote, gym.Env[Any, Any]):
         self._flying = False
         self.connect()
         seeds = None if seed is None else np.array([seed], np.uint64)
-        self._agent.exchange({0: (self._nothing, _RESET, seeds)})
-        while self._agent.lost[0]:  # the simulator that has come instead was not reset
+        was_reset = False
+        while not was_reset:  # a simulator that has come instead was not
             self._agent.exchange({0: (self._nothing, _RESET, seeds)})
+            was_reset = not self._agent.lost[0]
         self._flying = True
         self._state = self._agent.states[0]
         return self._observation(self._state), self._info(self._state)
@@ -239,37 +255,37 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
         **settings: Unpack[AgentSettings],
     ) -> None:
         self.closed = True  # nothing is open yet
+        self.num_envs = 0
+        self._arrays: Arrays = {}
+        self.telemetry: Arrays = {}
+        self.num_simulators = num_simulators
+        self._reasons: np.ndarray | None = None  # of simulators that were lost in this step
+        self.metadata = {"render_modes": [], "autoreset_mode": checked_mode(autoreset_mode)}
         if not (type(num_simulators) is int and 1 <= num_simulators <= MAX_DRONES):
             raise InputError(
                 f"num_simulators: expected 1 to {MAX_DRONES}, got {num_simulators!r:.300}"
             )
-        most = num_simulators * MAX_DRONES
+        drones = None
         if num_envs is not None:
+            most = num_simulators * MAX_DRONES
             right = type(num_envs) is int and 1 <= num_envs <= most
-            expected = f"a multiple of num_simulators = {num_simulators}, at most {most}"
-            if not (right and not num_envs % num_simulators):
-                raise InputError(f"num_envs: expected {expected}, got {num_envs!r:.300}")
-        self.num_simulators = num_simulators
-        self.num_envs = num_envs or 0
-        self._broken: tuple[np.ndarray, np.ndarray] | None = None
-        self._flying = False
-        self.metadata = {"render_modes": [], "autoreset_mode": checked_mode(autoreset_mode)}
-        drones = num_envs // num_simulators if num_envs else None
-        self._agent = Agent(address, AgentConfig(drones=drones, slots=num_simulators, **settings))
+            if not right or num_envs % num_simulators:
+                raise InputError(
+                    f"num_envs: expected a multiple of num_simulators = {num_simulators}, at most "
+                    f"{most}, got {num_envs!r:.300}"
+                )
+            self.num_envs = num_envs
+            drones = num_envs // num_simulators
+        config = AgentConfig(drones=drones, slots=num_simulators, **settings)
+        self._open(address, config, connect)
         self.closed = False
-        if connect:
-            _connect(self)
 
     def connect(self) -> None:
-        """Wait until every slot is taken."""
         spec = self._agent.connect()
         num_envs = self.num_simulators * (self._agent.config.drones or 1)
-        self._take_spec(spec, num_envs, self.autoreset_mode)
+        self._take_spec(spec, num_envs, self.metadata["autoreset_mode"])
         self._take_actions(spec.action, num_envs)
         self._shape = self.num_simulators, num_envs // self.num_simulators
-        if not self._flying:
-            self.done = self.out = np.zeros(num_envs, bool)
-            self._idle = np.ones(num_envs, bool)  # those that no reset has begun
 
     def reset(
         self, *, seed: int | Seeds | None = None, options: dict[str, Any] | None = None
@@ -291,24 +307,19 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
             self.connect()
         mask = checked_mask(options.get("reset_mask"), self.num_envs)
         seeds = self._seeds(seed)
-        self._broken = None
-        if in_flight:
-            self.advance(self._nothing, mask, seeds, ~mask)
-        else:
-            self._flying = False
-            self._reset_until_done(mask, seeds)
-            self.done = np.zeros(self.num_envs, bool)
-            self._idle = ~mask
-            self.out = self.done
+        self._reasons = None
+        if not in_flight:
+            self.done = self.out = np.zeros(self.num_envs, bool)
+            self._idle = np.ones(self.num_envs, bool)  # those that no reset has begun
             self._flying = True
-            self._take_states(np.ones(self.num_envs, bool))
+        self.advance(self._nothing, mask, seeds, ~mask)
         return self.observations, self._info(mask)
 
     def step(self, actions: Any) -> Any:
         """Fly every drone for one control period; what follows an episode, the autoreset says."""
         if not self._flying:
             raise gym.error.ResetNeeded("step: expected a call of reset() first")
-        self._broken = None
+        self._reasons = None
         return super().step(actions)
 
     def advance(
@@ -330,62 +341,66 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
         if (waiting := grounded & ~(resets | frozen)).any():
             first = int(waiting.argmax())
             raise gym.error.ResetNeeded(f"step: expected a call of reset() for env {first} first")
-        sent = self._sent(actions, resets | frozen)
-        numbers = self._seeds(seeds)
-        rows: np.ndarray = np.all(frozen.reshape(self._shape), axis=1)
-        slots = [slot for slot in range(self.num_simulators) if not rows[slot]]
-        self._flying = False  # until the answers are there
-        self._agent.exchange(self._orders(slots, sent, resets, numbers, frozen))
-        lost = self._agent.lost
-        if any(lost) and numbers is not None:  # a simulator in place of a lost one knows none
-            lost = self._reset_until_done(resets, numbers, lost)
-        before = self._arrays
-        telemetry = self.telemetry
-        self._take_states(resets | frozen)
-        reasons = np.repeat(np.array(lost, object), self._shape[1])
-        broken = (reasons != "") & ~(resets | grounded | self.out)
-        if broken.any():  # these States are the start of the next episodes
-            for now, then in ((self._arrays, before), (self.telemetry, telemetry)):
-                for name, array in now.items():
-                    array[broken] = then[name][broken]
-            self.rewards[broken] = 0.0
-            self.terminated[broken] = False
-            self.truncated[broken] = True
-            earlier, told = self._broken or (np.array(None), self._nobody)  # earlier in this step
-            self._broken = np.where(broken, reasons, earlier), broken | told
-            self.lost = broken
+        still = resets | frozen
+        sent = self._sent(actions, still)
+        before = self._arrays, self.telemetry
+        reasons = self._exchange(sent, resets, self._seeds(seeds), frozen)
+        self._take_states(still)
+        self.lost = (reasons != "") & ~(resets | grounded | self.out)
+        if self.lost.any():
+            self._break_off(before, reasons)
         self.out = self.terminated | self.truncated | (self.out & ~resets)
         self.done = worlds_done(self.out, len(self.env_spec.agents))
         self._idle = self._idle & ~resets
         self._flying = True
+
+    def _exchange(
+        self,
+        actions: np.ndarray,
+        resets: np.ndarray,
+        seeds: np.ndarray | None,
+        frozen: np.ndarray,
+    ) -> np.ndarray:
+        """One exchange with each simulator; why that of each drone was lost, or "", shape (N,)."""
+        slots = range(self.num_simulators)
+        awake: np.ndarray = ~np.all(frozen.reshape(self._shape), axis=1)
+        starting: np.ndarray = np.any(resets.reshape(self._shape), axis=1)
+        pending = [slot for slot in slots if awake[slot]]
+        reasons = [""] * self.num_simulators
+        self._flying = False  # until the answers are there
+        while pending:
+            self._agent.exchange(self._orders(pending, actions, resets, seeds, frozen))
+            lost = self._agent.lost
+            reasons = [new or old for new, old in zip(lost, reasons, strict=True)]
+            # A simulator in place of a lost one knows no seeds.
+            pending = [s for s in slots if lost[s] and starting[s] and seeds is not None]
+            actions = self._nothing
+            frozen = ~resets
+        return np.repeat(np.array(reasons, object), self._shape[1])
+
+    def _break_off(self, before: tuple[Arrays, Arrays], reasons: np.ndarray) -> None:
+        """Truncate the episodes of lost drones: these States are the start of the next ones."""
+        for now, then in zip((self._arrays, self.telemetry), before, strict=True):
+            for name, array in now.items():
+                array[self.lost] = then[name][self.lost]
+        self.rewards[self.lost] = 0.0
+        self.terminated[self.lost] = False
+        self.truncated[self.lost] = True
+        earlier = np.full(self.num_envs, None) if self._reasons is None else self._reasons
+        self._reasons = np.where(self.lost, reasons, earlier)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Tell the simulators and close the socket."""
         self._agent.close()
         self._flying = False
 
-    def _seeds(self, seed: Any) -> np.ndarray | None:
+    def _seeds(self, seed: int | Seeds | None) -> np.ndarray | None:
         """Seeds as they cross the wire. Raises `InputError`."""
-        if getattr(seed, "dtype", None) == np.uint64 and seed.shape == (self.num_envs,):
+        is_array = isinstance(seed, np.ndarray) and seed.dtype == np.uint64
+        if is_array and np.shape(seed) == (self.num_envs,):
             return np.asarray(seed)
         seeds = checked_seeds(seed, self.num_envs, MAX_UINT64)
         return None if seeds is None else np.array(seeds, np.uint64)
-
-    def _reset_until_done(
-        self, resets: np.ndarray, seeds: np.ndarray | None, lost: list[str] | None = None
-    ) -> list[str]:
-        """Reset drones, again where another simulator comes meanwhile; which were lost, and why.
-
-        `lost` says for each slot why its simulator was lost before; None: all are to be reset.
-        """
-        wanted: np.ndarray = np.any(resets.reshape(self._shape), axis=1)
-        reasons = lost or [""] * self.num_simulators
-        anew = [not lost or bool(reason) for reason in reasons]
-        while slots := [s for s in range(self.num_simulators) if anew[s] and wanted[s]]:
-            self._agent.exchange(self._orders(slots, self._nothing, resets, seeds, ~resets))
-            reasons = [new or old for new, old in zip(self._agent.lost, reasons, strict=True)]
-            anew = [bool(reason) for reason in self._agent.lost]
-        return reasons
 
     def _orders(
         self,
@@ -431,8 +446,6 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
             array = array[:, 0]
         if array.shape == shape:
             array[idle] = 0
-        if isinstance(action, Discrete) and array.dtype.kind == "f" and not (array % 1).any():
-            array = array.astype(np.int64)
         sent = _checked_actions(array, self._dtype, shape)
         if self._dtype.kind == "f" and not (finite := np.isfinite(sent)).all():
             first = np.argwhere(~finite)[0].tolist()
@@ -441,17 +454,12 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
             raise InputError(f"action: expected 0 to {action.n - 1}, got {sent[wrong][0]}")
         return sent
 
+    def _no_actions(self) -> np.ndarray:
+        return self._nothing
+
     def _losses(self) -> dict[str, Any]:
-        return dict(zip((LOST, f"_{LOST}"), self._broken, strict=True)) if self._broken else {}
-
-
-def _connect(env: RemoteEnv | RemoteVectorEnv) -> None:
-    """Connect; without success nothing stays open."""
-    try:
-        env.connect()
-    except BaseException:
-        env.close()
-        raise
+        reasons = self._reasons
+        return {} if reasons is None else {LOST: reasons, f"_{LOST}": reasons != None}  # noqa: E711
 
 
 def _checked_actions(action: Any, dtype: np.dtype, shape: tuple[int, ...]) -> np.ndarray:

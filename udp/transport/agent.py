@@ -7,7 +7,7 @@ import time
 import weakref
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, Final, TypedDict
@@ -117,8 +117,10 @@ class AgentConfig:
             return f"expected a vehicle of hash {self.vehicle_hash}, got {got}"
         if self.options is not None:
             expected = self._expected_options(env_id)
-            both_ways = registry.is_known(env_id)
-            if reason := _options_difference(expected, spec.options, both_ways=both_ways):
+            got_options = dict(spec.options)
+            if not registry.is_known(env_id):  # others have any value
+                got_options = {n: v for n, v in got_options.items() if n in expected}
+            if reason := _options_difference(expected, got_options):
                 return reason
         return _spec_difference(self.spec, spec) if self.spec else ""
 
@@ -366,31 +368,26 @@ def _spec(text: str) -> EnvSpec:
     return EnvSpec.from_json(text)
 
 
-def _options_difference(
-    ours: Mapping[str, Any], theirs: Mapping[str, Any], *, both_ways: bool
-) -> str:
+def _options_difference(ours: Mapping[str, object], theirs: Mapping[str, object]) -> str:
     """In which options two envs differ, in a sentence; "" if in none."""
-
-    def told(options: Mapping[str, Any], name: str) -> str:
-        return repr(options[name]) if name in options else "not to be there"
-
-    differing = [
-        f"{name} {told(ours, name)}, got {told(theirs, name)}"
-        for name in ({**ours, **theirs} if both_ways else ours)
-        if (name in ours, ours.get(name)) != (name in theirs, theirs.get(name))
-    ]
-    return f"options: expected {'; expected '.join(differing)}" if differing else ""
+    differing = []
+    for name in {**ours, **theirs}:
+        pair = []
+        for options in (ours, theirs):
+            pair.append(repr(options[name]) if name in options else "not to be there")
+        if ours.get(name, pair) != theirs.get(name, pair):
+            differing.append(f"expected {name} {pair[0]}, got {pair[1]}")
+    return f"options: {'; '.join(differing)}" if differing else ""
 
 
 def _spec_difference(ours: EnvSpec, theirs: EnvSpec) -> str:
     """Difference between a simulator and earlier ones, in a sentence; "" if there is none."""
-    for name in ("env_id", "options", "vehicle_hash", "control_period", "agents", "observation",
-                 "action", "telemetry", "metrics"):  # fmt: skip
+    if ours.options != theirs.options:
+        return _options_difference(ours.options, theirs.options)
+    for name in (field.name for field in fields(EnvSpec)):
         expected = getattr(ours, name)
         got = getattr(theirs, name)
-        if expected != got and name == "options":
-            return _options_difference(expected, got, both_ways=True)
-        if expected != got:
+        if expected != got and name not in ("vehicle", "marks"):
             return f"{name}: expected {expected!r:.200} as before, got {got!r:.200}"
     return ""
 
