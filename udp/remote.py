@@ -396,9 +396,9 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
 
     def _seeds(self, seed: int | Seeds | None) -> np.ndarray | None:
         """Seeds as they cross the wire. Raises `InputError`."""
-        is_array = isinstance(seed, np.ndarray) and seed.dtype == np.uint64
-        if is_array and np.shape(seed) == (self.num_envs,):
-            return np.asarray(seed)
+        shape = (self.num_envs,)
+        if isinstance(seed, np.ndarray) and seed.dtype == np.uint64 and seed.shape == shape:
+            return seed
         seeds = checked_seeds(seed, self.num_envs, MAX_UINT64)
         return None if seeds is None else np.array(seeds, np.uint64)
 

@@ -665,7 +665,7 @@ def test_every_message_is_shown_once() -> None:
     client = simulator()
     server = agent()
     client.tap = lambda slot, m, data: seen["simulator"].append((slot, data))
-    server.tap = lambda slot, m, data: seen["agent"].append((slot, data))
+    server.outbox.tap = lambda slot, m, data: seen["agent"].append((slot, data))
     pair = Pair(client, server, lossy(0.3))
     pair.run(30)
     client.close("done", pair.now)

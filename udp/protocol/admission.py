@@ -18,7 +18,7 @@ from .fragments import Assembler, asks, check_size, is_fragment
 from .layout import Layout
 from .messages import State, one_line
 from .session import Event, Outbox, Session
-from .transitions import AgentState, Way
+from .transitions import Way
 
 _MOST: Final = 1024  # simulators remembered between Hello and State 1, in the queue, and after
 _LEAST_ASSEMBLING: Final = 16
@@ -60,7 +60,7 @@ class Slots:
         session = self.sessions[slot]
         self.sessions[slot] = None
         if session:
-            session.state = AgentState.CLOSED
+            session.move(Way.UNSAID, m.Close)
             del self.of[session.peer]
             if not session.is_text:
                 keep(self._ended, session.number, None)

@@ -293,7 +293,7 @@ class Client:
             number = self.sequence
             self._send(m.Close(session=session, sequence=number, reason=one_line(reason)), now)
         elif self.state is not SimulatorState.CLOSING:
-            self._end()  # a Hello that was not answered is not repeated
+            self._give_up()  # a Hello that was not answered is not repeated
 
     def receive(self, datagram: bytes, now: float) -> Message | None:
         """Take a datagram from the agent; the message, if it moves the exchange on."""
@@ -353,7 +353,7 @@ class Client:
             return True
         if now >= self.deadline:
             if self.state is SimulatorState.CLOSING:
-                self._end()
+                self._give_up()
                 return True
             self._forget_transfer()
             self.close(f"no answer from the agent for {self.config.timeout:g} s", now)
@@ -434,7 +434,7 @@ class Client:
         self._answered_at = now
         if self.tap:
             self._record(command, plain)
-        self.statistics.round_trips.add(now - self.asked_at)
+        self.statistics.round_trips.append(now - self.asked_at)
         self._round_trips.answered(now)
 
     def _open(self, datagram: bytes) -> bytes:
@@ -560,8 +560,8 @@ class Client:
         if self.tap:
             self.tap(0, message, binary.encode(message, self.layout) if self.by_text else data)
 
-    def _end(self) -> None:
-        self.state = SimulatorState.CLOSED
+    def _give_up(self) -> None:
+        self.state = SIMULATOR[self.state, Way.UNSAID, m.Close]
         self._forget_transfer()
 
     def _forget_transfer(self) -> None:

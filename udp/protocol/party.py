@@ -294,7 +294,7 @@ class OneAgent(WorldRules):
         elif isinstance(message, Refuse):
             raise Refused(f"{link.name} refused: {message.reason}")
         elif isinstance(message, Close):
-            if self._client.by_text and not self._client.statistics.round_trips.count:
+            if self._client.by_text and not self._client.statistics.round_trips:
                 raise Refused(
                     f"{link.name} closed before its first command: it has no free slot, has a key, "
                     "or flies no text"

@@ -8,21 +8,19 @@ answer.
 import secrets
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import Any
 
-from numpy.typing import NDArray
+import numpy as np
 
 from . import binary, text
 from . import messages as m
 from .admission import Admission, Arrival, Slots
 from .auth import Key, is_sealed, key_id, message_of
-from .client import CLOSE_INTERVAL, CLOSE_LINGER, Address, Tap
+from .client import CLOSE_INTERVAL, CLOSE_LINGER, Address
 from .errors import DecodeError, Forged, VersionMismatch
 from .fragments import is_fragment
 from .layout import Layout
 from .messages import State
 from .session import Event, NoSuchSession, Outbox, Session
-from .statistics import Statistics
 from .transitions import AgentState
 
 __all__ = ["Event", "Server", "Session"]
@@ -47,7 +45,8 @@ class Server:
     Attributes:
         slots: Session of each slot, None where it is free.
         takes_text: Whether a text simulator may take a free slot.
-        outbox: Datagrams to send, statistics and the tap.
+        outbox: Datagrams to send, and the tap.
+        statistics: Counts and times, over all simulators.
     """
 
     def __init__(
@@ -62,6 +61,7 @@ class Server:
         draw_nonce: Callable[[], int] = lambda: secrets.randbits(64),
     ) -> None:
         self.outbox = Outbox(max_datagram)
+        self.statistics = self.outbox.statistics
         self.takes_text = text_layout is not None
         self._text_layout = text_layout or (lambda: None)
         self._keys = {key.id: key for key in keys}
@@ -71,25 +71,6 @@ class Server:
             self._slots, self.outbox, accept, self._keys, extensions, draw_nonce
         )
         self._resend_at = self._deadline = 0.0
-
-    @property
-    def statistics(self) -> Statistics:
-        """Counts and times, over all simulators."""
-        return self.outbox.statistics
-
-    @property
-    def closed(self) -> bool:
-        """Whether the agent has closed."""
-        return self._admission.closed
-
-    @property
-    def tap(self) -> Tap | None:
-        """Sees every message once; None at first."""
-        return self.outbox.tap
-
-    @tap.setter
-    def tap(self, tap: Tap | None) -> None:
-        self.outbox.tap = tap
 
     # ---- what the caller does
 
@@ -108,9 +89,9 @@ class Server:
     def send_command(
         self,
         slot: int,
-        actions: NDArray[Any],
-        orders: NDArray[Any],
-        seeds: NDArray[Any] | None,
+        actions: np.ndarray,
+        orders: np.ndarray,
+        seeds: np.ndarray | None,
         now: float,
     ) -> None:
         """Answer the last State of a slot: see `messages.Command`.
@@ -128,7 +109,7 @@ class Server:
 
     def close(self, reason: str, now: float) -> None:
         """End every exchange and tell the simulators, until they answer."""
-        if self.closed:
+        if self._admission.closed:
             return
         for session in self.slots:
             if session:
@@ -139,7 +120,11 @@ class Server:
 
     def next_timer(self) -> float | None:
         """When `handle_timer` wants to be called; None if never."""
-        return min(self._resend_at, self._deadline) if self.closed and any(self.slots) else None
+        return (
+            min(self._resend_at, self._deadline)
+            if self._admission.closed and any(self.slots)
+            else None
+        )
 
     def handle_timer(self, now: float) -> None:
         """Repeat what is due: a Close that nobody has answered, until nobody will."""

@@ -4,9 +4,9 @@ Every change of state goes through the table `AGENT`. `server` opens sessions an
 of a datagram; `Outbox` takes what they send.
 """
 
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
-from numpy.typing import NDArray
+import numpy as np
 
 from . import binary, text
 from . import messages as m
@@ -126,9 +126,9 @@ class Session:
 
     def send_command(
         self,
-        actions: NDArray[Any],
-        orders: NDArray[Any],
-        seeds: NDArray[Any] | None,
+        actions: np.ndarray,
+        orders: np.ndarray,
+        seeds: np.ndarray | None,
         now: float,
     ) -> None:
         """Answer the last State. Raises `InputError` if it cannot be encoded: nothing was sent."""
@@ -214,7 +214,7 @@ class Session:
         """The next State, which is expected."""
         self.sequence = state.sequence
         self.state = _AFTER_STATE
-        self._outbox.statistics.round_trips.add(now - self.asked_at)
+        self._outbox.statistics.round_trips.append(now - self.asked_at)
         if self._outbox.tap:
             self.record(state, plain)
         return Event(self.slot, state)

@@ -1,8 +1,9 @@
 """Statistics of one side of the wire: counts, round trips, and notices at a bounded rate."""
 
 from collections import Counter, deque
-from math import ceil
 from typing import Final
+
+import numpy as np
 
 from .messages import one_line
 
@@ -14,31 +15,6 @@ _QUIET: Final = frozenset({"duplicate", "stale"})
 """Events of every network that loses datagrams: counted, without a notice."""
 
 
-class Durations:
-    """The last 16,384 durations, s."""
-
-    def __init__(self) -> None:
-        self._last: deque[float] = deque(maxlen=_REMEMBERED)
-        self.add = self._last.append  # called in every step
-
-    @property
-    def count(self) -> int:
-        """Number of durations."""
-        return len(self._last)
-
-    @property
-    def longest(self) -> float:
-        """Longest duration, s; 0 while there is none."""
-        return max(self._last, default=0.0)
-
-    def quantile(self, share: float) -> float:
-        """Duration that the given share does not exceed, s; 0 if there is none."""
-        ordered = sorted(self._last)
-        if not ordered:
-            return 0.0
-        return ordered[max(ceil(share * len(ordered)) - 1, 0)]
-
-
 class Statistics:
     """Counts and times of one side. Everything else about dropped datagrams is forgotten."""
 
@@ -46,8 +22,8 @@ class Statistics:
         self.counters: Counter[str] = Counter()
         """`sent`, `received`, `resent`, `unsent`, `sessions`, and what was dropped, by cause:
         `malformed`, `forged`, `foreign`, `refused`, `duplicate`, `stale`."""
-        self.round_trips = Durations()
-        """From the first sending of a message to the answer that counts."""
+        self.round_trips: deque[float] = deque(maxlen=_REMEMBERED)
+        """The last ones, s: from the first sending of a message to the answer that counts."""
         self.last_error = ""  # why the last unexpected datagram was dropped; "" if none was
         self.notices: list[str] = []
         """Sentences for the log, until `take_notices`."""
@@ -89,20 +65,16 @@ class Statistics:
 
     def numbers(self) -> dict[str, float]:
         """All of it as numbers by name, round trips in milliseconds: for logs of training."""
-        trips = self.round_trips
-        return {
-            **self.counters,
-            "round_trip_p50_ms": 1e3 * trips.quantile(0.5),
-            "round_trip_p99_ms": 1e3 * trips.quantile(0.99),
-            "round_trip_max_ms": 1e3 * trips.longest,
-        }
+        shares = (0.5, 0.99, 1.0)
+        trips = 1e3 * np.quantile(self.round_trips or [0.0], shares, method="inverted_cdf")
+        names = ("round_trip_p50_ms", "round_trip_p99_ms", "round_trip_max_ms")
+        return {**self.counters, **dict(zip(names, trips.tolist(), strict=True))}
 
     def __str__(self) -> str:
         if not self.counters:
             return "no datagrams"
         counts = ", ".join(f"{count} {name}" for name, count in sorted(self.counters.items()))
-        if not self.round_trips.count:
+        if not self.round_trips:
             return counts
-        numbers = self.numbers()
-        p50, p99, most = (numbers[f"round_trip_{name}_ms"] for name in ("p50", "p99", "max"))
+        p50, p99, most = list(self.numbers().values())[-3:]
         return f"{counts}; round trip p50 {p50:.3f} ms, p99 {p99:.3f} ms, max {most:.3f} ms"

@@ -19,6 +19,7 @@ class Way(_Enum):
 
     SENT = "sent"
     RECEIVED = "received"
+    UNSAID = "unsaid"  # this side gives up, or another takes the slot: nothing is sent
 
 
 class SimulatorState(_Enum):
@@ -48,6 +49,7 @@ _S = SimulatorState
 _A = AgentState
 _SENT = Way.SENT
 _RECEIVED = Way.RECEIVED
+_UNSAID = Way.UNSAID
 
 SIMULATOR: Final[dict[tuple[SimulatorState, Way, type[m.Message]], SimulatorState]] = {
     (_S.IDLE, _SENT, m.Hello): _S.HELLO,
@@ -67,8 +69,11 @@ SIMULATOR: Final[dict[tuple[SimulatorState, Way, type[m.Message]], SimulatorStat
     (_S.WAITING, _RECEIVED, m.Close): _S.CLOSED,
     (_S.WAITING, _SENT, m.Close): _S.CLOSING,
     (_S.CLOSING, _RECEIVED, m.Close): _S.CLOSED,
+    (_S.IDLE, _UNSAID, m.Close): _S.CLOSED,
+    (_S.HELLO, _UNSAID, m.Close): _S.CLOSED,
+    (_S.CLOSING, _UNSAID, m.Close): _S.CLOSED,
+    (_S.CLOSED, _UNSAID, m.Close): _S.CLOSED,
 }
-"""A simulator closes without a word at IDLE and HELLO, and at CLOSING after a while."""
 
 AGENT: Final[dict[tuple[AgentState, Way, type[m.Message]], AgentState]] = {
     (_A.NEW, _SENT, m.Refuse): _A.CLOSED,
@@ -95,5 +100,8 @@ AGENT: Final[dict[tuple[AgentState, Way, type[m.Message]], AgentState]] = {
     (_A.EXPECTING, _RECEIVED, m.Close): _A.CLOSED,
     (_A.EXPECTING, _SENT, m.Close): _A.CLOSING,
     (_A.CLOSING, _RECEIVED, m.Close): _A.CLOSED,
+    (_A.DECIDING, _UNSAID, m.Close): _A.CLOSED,
+    (_A.EXPECTING, _UNSAID, m.Close): _A.CLOSED,
+    (_A.CLOSING, _UNSAID, m.Close): _A.CLOSED,
+    (_A.CLOSED, _UNSAID, m.Close): _A.CLOSED,
 }
-"""A slot is freed without a word when its simulator is silent, or another takes it over."""

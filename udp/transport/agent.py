@@ -186,7 +186,7 @@ class Agent:
         if config.record:
             try:
                 self._journal = self._record(config.record)
-                server.tap = self._journal.tap
+                server.outbox.tap = self._journal.tap
             except BaseException:
                 self._port.close()
                 raise
