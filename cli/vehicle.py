@@ -175,8 +175,8 @@ class Vehicle(Command):
         from ..models.export import export_mjcf
 
         assert self.out is not None
-        digits = export_mjcf(self.file, self.out)
-        print(f"vehicle: {self.out} ({digits})")
+        export_mjcf(self.file, self.out)
+        print(f"vehicle: {self.out}")
 
 
 def _out_words(action: str, out: Path | None) -> tuple[str, str]:

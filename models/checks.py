@@ -277,11 +277,12 @@ class _Craft:
     """A vehicle's file. Raises `InputError` if it is no free body with actuators."""
 
     def __init__(self, vehicle: Vehicle | Path | str | None) -> None:
-        path = find_vehicle(vehicle.path if isinstance(vehicle, Vehicle) else vehicle)
+        given = vehicle.path if isinstance(vehicle, Vehicle) else vehicle
+        path = find_vehicle(given)
         self.refusal = ""
         """Why `Vehicle.load` refuses it; empty if it does not."""
         try:
-            Vehicle.load(path)
+            Vehicle.load(given)
         except InputError as error:
             self.refusal = str(error)
         if not path.is_file():

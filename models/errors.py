@@ -35,6 +35,12 @@ class NotCopied:
         raise TypeError("a running env cannot be copied or pickled: make another one")
 
 
+def shortened(value: object) -> str:
+    """The value's `repr` for an error, of at most 80 characters."""
+    text = repr(value)
+    return text if len(text) <= 80 else text[:79] + "…"
+
+
 def expect(
     right: object, name: str, expected: str, got: str = "", kind: type[InputError] = InputError
 ) -> None:

@@ -12,12 +12,8 @@ from .vehicle import Vehicle
 from .vehicle_file import read_vehicle_file
 
 
-def export_mjcf(vehicle: Path | str, out: Path) -> str:
-    """Write a vehicle's MJCF to a new file; returns how exact its numbers are, in words.
-
-    What a TOML file tells by itself is written with all its digits, and moves bit for bit as the
-    vehicle. Other models are written by MuJoCo, with six digits. Raises `InputError`.
-    """
+def export_mjcf(vehicle: Path | str, out: Path) -> None:
+    """Write a vehicle's MJCF to a new file, with the six digits of MuJoCo. Raises `InputError`."""
     if out.suffix.lower() != ".xml":
         raise InputError(f"out: expected a name that ends in .xml, got {out}")
     if out.exists():
@@ -25,11 +21,7 @@ def export_mjcf(vehicle: Path | str, out: Path) -> str:
     path = find_vehicle(vehicle)
     Vehicle.load(path)  # refuses what cannot fly
     if path.suffix.lower() == ".toml":
-        file = read_vehicle_file(path)
-        if file.model is None:
-            write_new(out, file.mjcf())
-            return "every number with all its digits"
-        path = file.model
+        path = read_vehicle_file(path).model or path
     try:
         root = ElementTree.fromstring(read_spec(find_vehicle(vehicle)).to_xml())
     except (ValueError, RuntimeError) as error:
@@ -40,4 +32,3 @@ def export_mjcf(vehicle: Path | str, out: Path) -> str:
             compiler.set(key, os.path.relpath(folder, out.resolve().parent))
     text = ElementTree.tostring(root, encoding="unicode") + "\n"
     write_new(out, text)
-    return "numbers with the six digits that MuJoCo writes"

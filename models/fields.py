@@ -23,7 +23,7 @@ from numbers import Real
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Protocol, TypeVar, Union, get_args, get_origin
 
-from .errors import InputError
+from .errors import InputError, shortened
 
 T = TypeVar("T")
 
@@ -203,7 +203,7 @@ def check(name: str, rule: Rule, value: Any, error: type[InputError] = InputErro
     try:
         return rule.read(value)
     except (TypeError, ValueError, OverflowError):
-        raise error(f"{name}: expected {rule.expected}, got {_shortened(value)}") from None
+        raise error(f"{name}: expected {rule.expected}, got {shortened(value)}") from None
 
 
 def check_fields(instance: Any, where: str = "", error: type[InputError] = InputError) -> None:
@@ -224,7 +224,7 @@ def read_table(kind: type[T], table: Any, where: str, error: type[InputError] = 
     known = {one.name: one for one in fields(kind) if one.init}  # type: ignore[arg-type]
     if not isinstance(table, Mapping):
         names = ", ".join(known)
-        raise error(f"{where}: expected values by name ({names}), got {_shortened(table)}")
+        raise error(f"{where}: expected values by name ({names}), got {shortened(table)}")
     check_names(table, known, where, error)
     rules = rules_of(kind)
     values = {}
@@ -246,7 +246,7 @@ def check_names(
     names = list(known)
     for name in table:
         if name not in names:
-            raise error(f"{where}: expected some of {', '.join(names)}, got {_shortened(name)}")
+            raise error(f"{where}: expected some of {', '.join(names)}, got {shortened(name)}")
 
 
 def rules_of(kind: Any) -> Mapping[str, Rule]:
@@ -308,8 +308,3 @@ def _rule_of(hint: Any) -> Rule | None:
 def _digits(value: float) -> str:
     """Six digits; whole numbers have all of them."""
     return f"{value:d}" if isinstance(value, int) else f"{value:g}"
-
-
-def _shortened(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 80 else text[:79] + "…"

@@ -8,6 +8,7 @@ from xml.etree import ElementTree
 
 import mujoco
 
+from .craft import craft_spec
 from .errors import InputError
 from .vehicle_file import read_vehicle_file
 
@@ -33,7 +34,7 @@ def read_spec(path: Path) -> mujoco.MjSpec:
     """The spec of a vehicle's file alone. Raises `InputError`, or `ValueError` if it is no MJCF."""
     if path.suffix.lower() == ".toml":
         file = read_vehicle_file(path)
-        return file.build(None if file.model is None else read_spec(file.model))
+        return craft_spec(file, None if file.model is None else read_spec(file.model))
     _check_sizes(path)
     switch_off_log_file()
     return mujoco.MjSpec.from_file(str(path))

@@ -1,0 +1,300 @@
+"""The MuJoCo spec of a vehicle's TOML file: built from its tables, or completed from its model."""
+
+import math
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import mujoco
+
+from .cameras import place_camera
+from .coefficients import PREFIX
+from .errors import InputError
+from .vehicle_file import UP, Box, Cylinder, PlacedRotor, VehicleFile
+
+Vector = Sequence[float]
+Colour = tuple[float, float, float, float]
+
+DEFAULT_TIMESTEP: Final = 0.01
+"""Physics step of a file without one, s."""
+DEFAULT_GRAVITY: Final = 9.81
+"""Downward acceleration of a file without one, m/s²."""
+_CARBON: Final = (0.13, 0.14, 0.16, 1.0)
+_SHELL: Final = (0.93, 0.94, 0.95, 1.0)
+_SILVER: Final = (0.62, 0.65, 0.69, 1.0)
+_ORANGE: Final = (0.96, 0.42, 0.08, 1.0)
+_FRONT_DISC: Final = (0.98, 0.50, 0.12, 0.42)
+_DISC: Final = (0.20, 0.46, 0.78, 0.42)
+_BOX: Final = mujoco.mjtGeom.mjGEOM_BOX
+_CAPSULE: Final = mujoco.mjtGeom.mjGEOM_CAPSULE
+_CYLINDER: Final = mujoco.mjtGeom.mjGEOM_CYLINDER
+_ELLIPSOID: Final = mujoco.mjtGeom.mjGEOM_ELLIPSOID
+
+
+def craft_spec(file: VehicleFile, base: mujoco.MjSpec | None = None) -> mujoco.MjSpec:
+    """The vehicle alone, without ground; `base` is the spec of its model, changed in place."""
+    spec = base or mujoco.MjSpec()
+    spec.modelname = file.name
+    if file.model is None:
+        _build(spec, file)
+    else:
+        _complete(spec, file, file.model)
+    for name, values in file.coefficients.items():
+        numeric = spec.numeric(PREFIX + name) or spec.add_numeric(name=PREFIX + name)
+        numeric.size = len(values)
+        numeric.data = values
+    free = mujoco.mjtJoint.mjJNT_FREE
+    crafts = [body for body in spec.bodies if any(j.type == free for j in body.joints)]
+    for camera in file.cameras if crafts else ():
+        place_camera(spec, crafts[0] if camera.carried else spec.worldbody, camera)
+    return spec
+
+
+def _set_options(spec: mujoco.MjSpec, file: VehicleFile) -> None:
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
+    spec.option.timestep = file.timestep or DEFAULT_TIMESTEP
+    spec.option.gravity = (0.0, 0.0, -(file.gravity or DEFAULT_GRAVITY))
+
+
+def _add_actuator(
+    spec: mujoco.MjSpec, file: VehicleFile, rotor: PlacedRotor, site: mujoco.MjsSite
+) -> None:
+    """A motor at a site: thrust along the rotor's axis, and a reaction about it."""
+    axis = _scaled(rotor.axis, 1 / math.hypot(*rotor.axis))
+    torque = file.rotors.torque
+    spec.add_actuator(
+        name=rotor.name,
+        target=site.name,
+        trntype=mujoco.mjtTrn.mjTRN_SITE,
+        gear=(*axis, *_scaled(axis, torque if rotor.turn == "cw" else -torque)),
+        ctrllimited=True,
+        ctrlrange=file.rotors.limits,
+    )
+
+
+def _add_geom(
+    body: mujoco.MjsBody,
+    name: str,
+    kind: mujoco.mjtGeom,
+    rgba: Colour,
+    size: Vector,
+    pos: Vector = (0.0, 0.0, 0.0),
+    *,
+    ends: Vector = (),
+    axis: Vector = UP,
+    yaw: float = 0.0,
+    mass: float = 0.0,
+    group: int = 2,
+    solid: bool = False,
+) -> None:
+    """A geom at a place, or between two `ends`, that is drawn; a solid one collides."""
+    geom = body.add_geom(name=name, type=kind, rgba=rgba, pos=pos, mass=mass, group=group)
+    geom.size[: len(size)] = size
+    geom.contype = geom.conaffinity = int(solid)
+    if ends:
+        geom.fromto = ends
+    if tuple(axis) != UP:
+        geom.alt.type = mujoco.mjtOrientation.mjORIENTATION_ZAXIS
+        geom.alt.zaxis = axis
+    if yaw:
+        geom.alt.type = mujoco.mjtOrientation.mjORIENTATION_EULER
+        geom.alt.euler = (0.0, 0.0, yaw)
+
+
+def _scaled(vector: Vector, factor: float) -> tuple[float, ...]:
+    return tuple(factor * one for one in vector)
+
+
+# ---- from the tables
+
+
+def _build(spec: mujoco.MjSpec, file: VehicleFile) -> None:
+    """What weighs, what collides, what is drawn, and the rotors.
+
+    Lengths that the file does not say are those of quad.xml, in the proportion of the spans.
+    """
+    _set_options(spec, file)
+    spec.compiler.degree = False
+    rotors = [(rotor, rotor.position or (0.0, 0.0, 0.0)) for rotor in file.rotors.list]
+    reach = max(math.hypot(*place) for _, place in rotors)
+    reach = max(reach, file.rotors.radius or 0.0, 1e-2)
+    unit = reach / math.sqrt(2)  # 1 m of quad.xml
+    half = _scaled(file.body.size or _sides(file.body.parts, unit), 0.5)
+    motor = 0.06 * unit
+    lowest = max(half[2], *(motor - place[2] for _, place in rotors))
+    clearance = file.body.ground_clearance or lowest + 0.33 * unit
+    if clearance <= lowest:
+        raise InputError(
+            f"body.ground_clearance: expected more than {lowest:.4g} m, which hub and rotors need, "
+            f"got {clearance:g}"
+        )
+    body = spec.worldbody.add_body(name="craft", pos=(0.0, 0.0, clearance))
+    body.add_freejoint(name="free")
+    _add_mass(body, file)
+    seen = 3 if file.body.parts else 1  # if parts are drawn, hub and motors are not
+    _add_geom(body, "hub", _BOX, _CARBON, half, group=seen, solid=True)
+    for rotor, place in rotors:
+        size = (0.09 * unit, motor)
+        name = f"motor {rotor.name}"
+        _add_geom(
+            body, name, _CYLINDER, _SILVER, size, place, axis=rotor.axis, group=seen, solid=True
+        )
+    _add_skids(body, half, unit, clearance)
+    _add_looks(body, half)
+    radius = file.rotors.radius or 0.4 * _nearest([place for _, place in rotors], reach)
+    for number, (rotor, place) in enumerate(rotors, 1):
+        if not file.body.parts and math.hypot(*place[:2]) > half[0]:
+            ends = (0.0, 0.0, 0.0, *place)
+            _add_geom(body, f"arm{number}", _CYLINDER, _CARBON, (0.035 * unit,), ends=ends)
+        up = _scaled(rotor.axis, 0.09 * unit / math.hypot(*rotor.axis))
+        above = (place[0] + up[0], place[1] + up[1], place[2] + up[2])
+        rgba = _FRONT_DISC if place[0] > 1e-6 * reach else _DISC
+        _add_disc(body, f"disc{number}", rotor, radius, above, rgba)
+        blade = _scaled((0.97, 0.09, 0.018), radius)
+        yaw = 0.4 + 1.5 * number if rotor.axis == UP else 0.0
+        _add_geom(body, "", _ELLIPSOID, _CARBON, blade, above, axis=rotor.axis, yaw=yaw)
+        site = body.add_site(name=rotor.name, pos=place, group=4)
+        site.size[0] = 0.02 * unit
+        _add_actuator(spec, file, rotor, site)
+
+
+def _add_disc(
+    body: mujoco.MjsBody, name: str, rotor: PlacedRotor, radius: float, place: Vector, rgba: Colour
+) -> None:
+    _add_geom(body, name, _CYLINDER, rgba, (radius, 0.01 * radius), place, axis=rotor.axis)
+
+
+def _sides(parts: Sequence[Box | Cylinder], unit: float) -> Vector:
+    """Of the hub of a file without its size: of the heaviest box, if there are any."""
+    boxes = [part for part in parts if isinstance(part, Box)]
+    if not boxes:
+        return _scaled((0.44, 0.44, 0.14), unit)
+    return max(boxes, key=lambda box: box.mass).size
+
+
+def _add_mass(body: mujoco.MjsBody, file: VehicleFile) -> None:
+    """Mass and inertia as given, or parts that have them."""
+    table = file.body
+    for number, part in enumerate(table.parts, 1):
+        name = f"part{number}"
+        place = part.position
+        if isinstance(part, Box):
+            size = _scaled(part.size, 0.5)
+            _add_geom(body, name, _BOX, _CARBON, size, place, yaw=part.yaw, mass=part.mass, group=1)
+        else:
+            size = (part.radius, part.length / 2)
+            axis = part.axis
+            _add_geom(
+                body, name, _CYLINDER, _CARBON, size, place, axis=axis, mass=part.mass, group=1
+            )
+    if table.parts:
+        return
+    assert table.mass is not None
+    assert table.inertia is not None
+    body.explicitinertial = True
+    body.mass = table.mass
+    body.ipos = table.center_of_mass
+    if len(table.inertia) == 3:
+        body.inertia = table.inertia
+    else:
+        body.fullinertia = table.inertia
+
+
+def _add_skids(body: mujoco.MjsBody, half: Vector, unit: float, clearance: float) -> None:
+    """Two skids that collide, each on two struts."""
+    thick = min(0.03 * unit, (clearance - half[2]) / 2)
+    low = thick - clearance
+    long = 0.5 * unit
+    for side, y in (("left", 0.45 * unit), ("right", -0.45 * unit)):
+        ends = (-long, y, low, long, y, low)
+        name = f"skid {side}"
+        _add_geom(body, name, _CAPSULE, _SILVER, (thick,), ends=ends, group=1, solid=True)
+        for x in (-0.6 * long, 0.6 * long):
+            top = (math.copysign(0.7 * half[0], x), math.copysign(0.8 * half[1], y), -half[2] / 2)
+            _add_geom(body, "", _CAPSULE, _SILVER, (0.7 * thick,), ends=(*top, x, y, low))
+
+
+def _add_looks(body: mujoco.MjsBody, half: Vector) -> None:
+    x, y, z = half
+    shell = (1.2 * x, 0.9 * y, 1.7 * z)
+    mark = (0.6 * x, 0.55 * y, 1.1 * z)
+    _add_geom(body, "canopy", _ELLIPSOID, _SHELL, shell, (0.0, 0.0, 0.7 * z))
+    _add_geom(body, "front mark", _ELLIPSOID, _ORANGE, mark, (0.9 * x, 0.0, 0.6 * z))
+
+
+def _nearest(places: Sequence[Vector], reach: float) -> float:
+    """Shortest distance between two rotors that are not above each other, m."""
+    distances = [math.dist(a[:2], b[:2]) for i, a in enumerate(places) for b in places[:i]]
+    return min((one for one in distances if one > 0.1 * reach), default=reach)
+
+
+# ---- from a model's file
+
+
+def _complete(spec: mujoco.MjSpec, file: VehicleFile, model: Path) -> None:
+    """Add to the spec of a model's file what the TOML file says."""
+    urdf = model.suffix.lower() == ".urdf"
+    if urdf:
+        _find_meshes(spec, model.parent)
+        spec.compiler.fusestatic = False  # it would fuse the root with the world
+        root = spec.worldbody.first_body()
+        if root is None:
+            raise InputError("model.file: expected a URDF file with links, got none")
+        if not list(root.joints):
+            root.add_freejoint()
+        _set_options(spec, file)
+    if file.timestep:
+        spec.option.timestep = file.timestep
+    if file.gravity:
+        spec.option.gravity = (0.0, 0.0, -file.gravity)
+    rotors = file.rotors.list
+    if rotors and list(spec.actuators):
+        raise InputError(
+            "rotors.list: expected none for a model's file with actuators, which are its rotors, "
+            f"got {len(rotors)} of them"
+        )
+    for number, rotor in enumerate(rotors, 1):
+        site = _rotor_site(spec, file, rotor, f"rotors.list[{number}]")
+        _add_actuator(spec, file, rotor, site)
+
+
+def _find_meshes(spec: mujoco.MjSpec, folder: Path) -> None:
+    """Meshes of a package are looked for in the folder of a URDF file, and in those above it."""
+    for mesh in spec.meshes:
+        if not mesh.file.startswith("package:"):
+            continue
+        inside = Path(mesh.file.removeprefix("package:").lstrip("/"))
+        ways = inside, Path(*inside.parts[1:])  # with the package's name, or without
+        places = (up / way for up in (folder, *folder.parents) for way in ways)
+        found = next((place for place in places if place.is_file()), None)
+        if found is None:
+            raise InputError(
+                "model.file: expected its meshes in its folder or one above, "
+                f"got no file for {mesh.file}"
+            )
+        mesh.file = os.path.relpath(str(found), folder)
+
+
+def _rotor_site(
+    spec: mujoco.MjSpec, file: VehicleFile, rotor: PlacedRotor, where: str
+) -> mujoco.MjsSite:
+    """The site of a rotor: one of the model, or a new one on one of its bodies."""
+    kind = "site" if rotor.site is not None else "body"
+    name = rotor.site or rotor.link or rotor.body
+    known = [one.name for one in (spec.sites if kind == "site" else spec.bodies)]
+    known = [one for one in known if one != "world"]
+    if name not in known:
+        raise InputError(
+            f"{where}: expected a {kind} of the model's file: {', '.join(known)}, got {name!r}"
+        )
+    if kind == "site":
+        return spec.site(name)
+    body = spec.body(name)
+    for joint in list(body.joints):  # a propeller that turns is welded on
+        if joint.type != mujoco.mjtJoint.mjJNT_FREE:
+            spec.delete(joint)
+    place = rotor.position or (0.0, 0.0, 0.0)
+    if file.rotors.radius is not None:
+        _add_disc(body, "", rotor, file.rotors.radius, place, _DISC)
+    return body.add_site(name=f"rotor/{rotor.name}", pos=place, group=4)
