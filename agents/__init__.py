@@ -8,7 +8,7 @@ from ..models.errors import InputError
 from .a2c import A2CConfig
 from .checkpoints import Checkpoint, CheckpointError, load, store
 from .config import NETWORK_FIELDS, Config
-from .episodes import Episode, EpisodeLog, ResumeError, episode_seed
+from .episodes import Episode, EpisodeRecorder, ResumeError, episode_seed
 from .geometric import Geometric
 from .orca import Orca
 from .pid import PID
@@ -38,7 +38,7 @@ __all__ = [
     "CheckpointError",
     "Config",
     "Episode",
-    "EpisodeLog",
+    "EpisodeRecorder",
     "Geometric",
     "NetworkPolicy",
     "Orca",
@@ -62,7 +62,7 @@ _ERRORS = (KeyError, TypeError, ValueError, RuntimeError, IndexError)
 """What parts of a checkpoint that do not fit together raise."""
 
 
-def make_agent(algorithm: str, log: EpisodeLog, config: Config, seed: int) -> Resumable:
+def make_agent(algorithm: str, log: EpisodeRecorder, config: Config, seed: int) -> Resumable:
     """A new agent of a name in `ALGORITHMS`, for the env of a log; SB3's cannot `set_state`.
 
     Raises:
@@ -80,7 +80,7 @@ def make_agent(algorithm: str, log: EpisodeLog, config: Config, seed: int) -> Re
 
 
 def start_agent(
-    kept: Checkpoint, algorithm: str, log: EpisodeLog, config: Config, seed: int
+    kept: Checkpoint, algorithm: str, log: EpisodeRecorder, config: Config, seed: int
 ) -> Agent:
     """A new agent that begins with the networks of a checkpoint; all else of it is fresh.
 
@@ -139,7 +139,7 @@ def _unfit(error: Exception) -> CheckpointError:
     return CheckpointError(f"checkpoint: its parts do not fit together: {reason:.300}")
 
 
-def resume_agent(kept: Checkpoint, log: EpisodeLog) -> Agent:
+def resume_agent(kept: Checkpoint, log: EpisodeRecorder) -> Agent:
     """The agent of a checkpoint; the log, a new one of as many drones, resumes where it was.
 
     An agent that cannot resume starts anew, and the log with it.

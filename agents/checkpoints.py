@@ -13,25 +13,27 @@ import os
 import platform
 import re
 import secrets
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..envs.spec import Discrete, EnvSpec
-from ..models import BACKENDS, Backend
+from ..models import Backend
 from ..models.errors import InputError, require
+from ..models.fields import Limits, read_table
 from .episodes import Episode, Position, ResumeError
+from .networks import Floats, named, part_of
 from .policies import NetworkPolicy, flat_size
 from .presets import preset
 from .registry import ALGORITHMS
 
 FORMAT: Final = 3
-_GROUPS: Final = ("policy", "state", "position", "episodes")
 _PLAIN: Final = ("algorithm", "config", "backend", "seed", "env_steps", "versions")
 _POSITION: Final = ("actions", "observations", "numbers", "lengths", "first_steps")
 _COLUMNS: Final[dict[str, type[np.generic]]] = {
@@ -61,9 +63,9 @@ class Checkpoint:
     seed: int
     env_steps: int
     """Env steps that the whole training is to have."""
-    actor: Mapping[str, np.ndarray]
+    actor: Mapping[str, Floats]
     """Weights for `NetworkPolicy`."""
-    state: Mapping[str, np.ndarray]
+    state: Mapping[str, NDArray[Any]]
     """State of the agent."""
     position: Position
     versions: dict[str, str] = field(default_factory=lambda: software_versions())
@@ -123,30 +125,25 @@ def store(checkpoint: Checkpoint, path: Path) -> None:
     Raises `CheckpointError` where a number is not finite: training diverged. The old file stays.
     """
     where = checkpoint.position
-    rows = checkpoint.position.episodes
-    parts: dict[str, Mapping[str, Any]] = {
-        "policy": checkpoint.actor,
-        "state": checkpoint.state,
-        "position": {name: getattr(where, name) for name in _POSITION},
-        "episodes": {n: np.array([vars(row)[n] for row in rows], k) for n, k in _COLUMNS.items()},
-    }
-    groups = _GROUPS if checkpoint.num_envs else ("policy",)
-    arrays = {
-        f"{group}/{name}": np.array(value, order="C")
-        for group in groups
-        for name, value in parts[group].items()
-    }
+    arrays = named("policy/", dict(checkpoint.actor))
+    if checkpoint.num_envs:
+        arrays |= named("state/", checkpoint.state)
+        arrays |= named("position/", {name: getattr(where, name) for name in _POSITION})
+        for name, dtype in _COLUMNS.items():
+            column = [getattr(episode, name) for episode in where.episodes]
+            arrays[f"episodes/{name}"] = np.array(column, dtype)
     for name, array in arrays.items():
         if not _is_finite(name, array):
             raise CheckpointError(f"checkpoint: training diverged, {name} is not finite")
-    meta = {
-        "format": FORMAT,
+        arrays[name] = np.array(array, order="C")
+    meta = _Meta(
+        format=FORMAT,
+        spec=checkpoint.spec.to_json(),
+        position={"env_steps": where.env_steps, "seconds": where.seconds},
         **{name: getattr(checkpoint, name) for name in _PLAIN},
-        "spec": checkpoint.spec.to_json(),
-        "position": {"env_steps": where.env_steps, "seconds": where.seconds},
-    }
+    )
     numpy = require("safetensors.numpy", "train", "writing checkpoints")
-    text = {"rotorgram": json.dumps(meta), "sha256": "0" * 64}
+    text = {"rotorgram": json.dumps(vars(meta)), "sha256": "0" * 64}
     data: bytes = numpy.save(arrays, metadata=text)
     write_whole(path, _with_checksum(data, hashlib.sha256(data).hexdigest().encode()))
 
@@ -165,50 +162,82 @@ def load(path: Path) -> Checkpoint:
         raise CheckpointError(f"{path}: expected a rotorgram checkpoint: {reason:.200}") from None
 
 
-def _read(data: bytes, parse: Any) -> Checkpoint:
-    told = _CHECKSUM.findall(data)[:1]
-    _expect(bool(told), "a checksum", "none")
-    found = hashlib.sha256(_with_checksum(data, b"0" * 64)).hexdigest().encode()
-    _expect(told == [found], "a file without damage", "another checksum than it holds")
+def _read(data: bytes, parse: Callable[[bytes], dict[str, NDArray[Any]]]) -> Checkpoint:
+    found = _CHECKSUM.search(data)
+    checksum = hashlib.sha256(_with_checksum(data, b"0" * 64)).hexdigest().encode()
+    if found is None or found[1] != checksum:
+        raise ValueError("expected a file without damage, got another checksum than it holds")
     header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
-    meta = json.loads(header["__metadata__"]["rotorgram"])
-    _expect(meta["format"] == FORMAT, f"format {FORMAT}", meta["format"])
-    arrays: dict[str, dict[str, np.ndarray]] = {group: {} for group in _GROUPS}
-    for name, array in parse(data).items():
-        _expect(_is_finite(name, array), f"finite numbers in {name}", "NaN or infinity")
-        group, _, rest = name.partition("/")
-        arrays[group][rest] = array
-    meta.setdefault("backend", BACKENDS[0])
-    _expect(meta["backend"] in BACKENDS, f"one of {BACKENDS}", meta["backend"])
-    _expect(meta["algorithm"] in ALGORITHMS, f"one of {sorted(ALGORITHMS)}", meta["algorithm"])
-    for name in ("config", "versions", "position"):
-        _expect(isinstance(meta[name], dict), f"an object for {name}", meta[name])
-    where = meta["position"]
-    seconds = meta["position"]["seconds"]
-    for count in (meta["seed"], meta["env_steps"], where["env_steps"]):
-        _expect(type(count) is int and 0 <= count < 2**62, "a whole number, 0 or more", count)
-    _expect(type(seconds) is float and 0 <= seconds < float("inf"), "seconds", seconds)
-    spec = EnvSpec.from_json(meta["spec"])
-    position = _no_position(where["env_steps"], seconds)
-    if arrays["position"] or arrays["state"] or arrays["episodes"]:
-        columns = arrays["episodes"]
-        kinds = {name: column.dtype.type for name, column in columns.items()}
-        _expect(kinds == _COLUMNS, f"columns {sorted(_COLUMNS)} of episodes", sorted(kinds))
-        rows = zip(*(columns[name].tolist() for name in _COLUMNS), strict=True)
-        episodes = tuple(Episode(**dict(zip(_COLUMNS, row, strict=True))) for row in rows)
-        given: dict[str, Any] = {**arrays["position"]}
-        position = replace(position, episodes=episodes, **given)
-        _check_position(position, spec, meta["env_steps"])
-    meta["config"].setdefault("network", "mlp")
-    config = vars(preset(meta["algorithm"], "tuned", **meta["config"]))
-    config = json.loads(json.dumps(config))  # a tuple is a list there
-    _expect(config == meta["config"], f"a config of all of {sorted(config)}", meta["config"])
-    plain = {name: meta[name] for name in _PLAIN}
-    actor = arrays["policy"]
-    state = arrays["state"]
-    checkpoint = Checkpoint(**plain, spec=spec, actor=actor, state=state, position=position)
+    content = json.loads(header["__metadata__"]["rotorgram"])
+    if content["format"] != FORMAT:
+        raise ValueError(f"expected format {FORMAT}, got {content['format']!r:.80}")
+    meta = read_table(_Meta, content, "metadata")
+    spec = EnvSpec.from_json(meta.spec)
+    arrays = parse(data)
+    for name, array in arrays.items():
+        if not _is_finite(name, array):
+            raise ValueError(f"expected finite numbers in {name}, got NaN or infinity")
+    checkpoint = Checkpoint(
+        spec=spec,
+        actor=part_of(arrays, "policy/"),
+        state=part_of(arrays, "state/"),
+        position=_position(meta, arrays, spec),
+        **{name: getattr(meta, name) for name in _PLAIN},
+    )
     checkpoint.policy()  # raises if it does not fit
     return checkpoint
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Progress:
+    """What a training has flown."""
+
+    env_steps: Annotated[int, Limits(0, 2**62, whole=True)]
+    seconds: Annotated[float, Limits(0.0)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Meta:
+    """What a file holds besides arrays, as JSON."""
+
+    format: int
+    algorithm: str
+    config: dict[str, Any]
+    spec: str
+    backend: Backend = "mujoco"
+    seed: Annotated[int, Limits(0, 2**62, whole=True)]
+    env_steps: Annotated[int, Limits(0, 2**62, whole=True)]
+    position: dict[str, Any]
+    """As `_Progress`."""
+    versions: dict[str, str]
+
+    def __post_init__(self) -> None:
+        """Complete the config, and raise `InputError` for a wrong one."""
+        self.config.setdefault("network", "mlp")
+        config = vars(preset(self.algorithm, "tuned", **self.config))
+        complete = json.loads(json.dumps(config))  # a tuple is a list there
+        if complete != json.loads(json.dumps(self.config)):
+            raise InputError(f"config: expected all of {sorted(complete)}, got {self.config!r:.80}")
+        if not isinstance(self.versions, dict):
+            raise InputError(f"versions: expected values by name, got {self.versions!r:.80}")
+
+
+def _position(meta: _Meta, arrays: Mapping[str, NDArray[Any]], spec: EnvSpec) -> Position:
+    """The position of a training, or of a policy alone."""
+    progress = read_table(_Progress, meta.position, "position")
+    position = _no_position(progress.env_steps, progress.seconds)
+    if all(name.startswith("policy/") for name in arrays):
+        return position
+    columns = part_of(arrays, "episodes/")
+    kinds = {name: column.dtype.type for name, column in columns.items()}
+    if kinds != _COLUMNS:
+        raise ValueError(f"expected columns {sorted(_COLUMNS)} of episodes, got {sorted(kinds)}")
+    rows = zip(*(columns[name].tolist() for name in _COLUMNS), strict=True)
+    episodes = [Episode(**dict(zip(_COLUMNS, row, strict=True))) for row in rows]
+    flown: dict[str, Any] = part_of(arrays, "position/")
+    position = replace(position, episodes=tuple(episodes), **flown)
+    _check_position(position, spec, meta.env_steps)
+    return position
 
 
 def _no_position(env_steps: int, seconds: float) -> Position:
@@ -221,14 +250,14 @@ def _with_checksum(data: bytes, checksum: bytes) -> bytes:
     return _CHECKSUM.sub(b'"sha256":"%s"' % checksum, data, count=1)
 
 
-def _is_finite(name: str, array: np.ndarray) -> bool:
+def _is_finite(name: str, array: NDArray[Any]) -> bool:
     # Without metrics the error of an episode is NaN, which is no divergence.
     allowed = name == "episodes/mean_size"
     return allowed or array.dtype.kind != "f" or bool(np.isfinite(array).all())
 
 
 def _check_position(position: Position, spec: EnvSpec, total: int) -> None:
-    """Shapes fit the env; env steps are those of the episodes."""
+    """Raises `ValueError` unless shapes fit the env, and env steps those of the episodes."""
     count = len(position.numbers)
     longest = len(position.actions)
     action = spec.action
@@ -236,24 +265,19 @@ def _check_position(position: Position, spec: EnvSpec, total: int) -> None:
     expected: dict[str, Any] = dict.fromkeys(_POSITION, ((count,), "i"))
     expected["actions"] = (longest, count, *drawn), kind
     expected["observations"] = (count, flat_size(spec)), "f"
-    got = {n: (vars(position)[n].shape, vars(position)[n].dtype.kind) for n in _POSITION}
-    _expect(got == expected and count > 0, f"a position of shapes {expected}", got)
-    lengths = position.lengths
-    steps = position.env_steps
-    _expect(lengths.max() == longest, f"an episode of {longest} steps", lengths)
+    arrays = {name: getattr(position, name) for name in _POSITION}
+    got = {name: (array.shape, array.dtype.kind) for name, array in arrays.items()}
+    if got != expected or position.lengths.max() != longest:
+        raise ValueError(f"expected a position of shapes {expected}, got {got}")
     ended = {episode.episode: episode.length for episode in position.episodes}
-    running = zip(position.numbers.tolist(), lengths.tolist(), strict=True)
-    flown = sum(ended.values()) + sum(length for number, length in running if number not in ended)
-    _expect(flown == steps, f"env_steps of the episodes, {flown}", steps)
-    _expect(steps < total + count, f"env_steps of {total} at most", steps)
-    for name in ("numbers", "lengths", "first_steps"):
-        least = vars(position)[name].min()
-        _expect(least >= 0 or (not steps and least == -1), f"{name} of 0 or more", int(least))
-
-
-def _expect(ok: bool, expected: str, got: object) -> None:
-    if not ok:
-        raise ValueError(f"expected {expected}, got {got!r:.80}")
+    running = dict(zip(position.numbers.tolist(), position.lengths.tolist(), strict=True))
+    flown = sum({**running, **ended}.values())
+    steps = position.env_steps
+    if steps != flown or steps >= total + count:
+        raise ValueError(f"expected env_steps of {flown}, at most {total}, got {steps}")
+    least = min(int(arrays[name].min()) for name in ("numbers", "lengths", "first_steps"))
+    if least < (0 if steps else -count):
+        raise ValueError(f"expected numbers of 0 or more, got {least}")
 
 
 def write_whole(path: Path, data: bytes) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from ..envs.spec import EnvSpec
 from ..models.errors import InputError
 from .config import Config
-from .episodes import EpisodeLog
+from .episodes import EpisodeRecorder
 from .networks import Floats, Network, Weights, make_network, named, part_of
 from .normalization import Moments
 from .optimizers import Adam
@@ -96,7 +96,7 @@ class Learner:
         self.terms: dict[str, Any] = {}
 
     @classmethod
-    def create(cls, log: EpisodeLog, config: Config, seed: int) -> Self:
+    def create(cls, log: EpisodeRecorder, config: Config, seed: int) -> Self:
         """A new agent, with networks of the kind that the config names, for the env of a log."""
         weights_seed, rng = seeds_of(seed)
         drones = len(log.spec.agents) if cls.central else int(cls.has_critic)
@@ -119,7 +119,7 @@ class Learner:
         self.gradient(rollout)
         self.optimizer.step(self.rate)
 
-    def train(self, log: EpisodeLog, env_steps: int, on_update: OnUpdate) -> None:
+    def train(self, log: EpisodeRecorder, env_steps: int, on_update: OnUpdate) -> None:
         """Train until the log counts `env_steps`, from the current state on. Raises `Diverged`."""
         collector = Collector(log, self._rng, self._actor, self.memory)
         while log.env_steps < env_steps:

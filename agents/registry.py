@@ -14,7 +14,7 @@ import numpy as np
 from ..models.errors import InputError
 from .a2c import A2C, A2CConfig
 from .config import Config
-from .episodes import EpisodeLog
+from .episodes import EpisodeRecorder
 from .geometric import Geometric
 from .learner import OnUpdate
 from .mappo import MAPPO
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 class Agent(Protocol):
     """What learns. Its class has `create(log, config, seed)`."""
 
-    def train(self, log: EpisodeLog, env_steps: int, on_update: OnUpdate) -> None:
+    def train(self, log: EpisodeRecorder, env_steps: int, on_update: OnUpdate) -> None:
         """Train until the log counts `env_steps`, from the current state on. Raises `Diverged`."""
 
     def actor(self) -> dict[str, np.ndarray]:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..models.errors import InputError
-from .episodes import EpisodeLog
+from .episodes import EpisodeRecorder
 from .networks import Floats, Network
 
 Numbers = NDArray[np.float64]
@@ -95,7 +95,7 @@ class Collector:
 
     def __init__(
         self,
-        log: EpisodeLog,
+        log: EpisodeRecorder,
         rng: np.random.Generator,
         policy: Explorer,
         memory: Floats | None = None,

@@ -12,7 +12,7 @@ from ..envs.spec import EnvSpec
 from ..models.errors import InputError
 from ..models.fields import Limits
 from .config import RolloutConfig
-from .episodes import EpisodeLog
+from .episodes import EpisodeRecorder
 from .learner import OnUpdate, diverged, generator_array, seeds_of, set_generator
 from .networks import Floats, Network, Weights, make_network, named, part_of
 from .optimizers import Adam
@@ -216,7 +216,7 @@ class SAC:
         self._numbers: dict[str, float] = {}
 
     @classmethod
-    def create(cls, log: EpisodeLog, config: SACConfig, seed: int) -> Self:
+    def create(cls, log: EpisodeRecorder, config: SACConfig, seed: int) -> Self:
         """A new agent, with networks of the kind that the config names, for the env of a log."""
         actions = ActionMap(log.spec.action)
         size = flat_size(log.spec)
@@ -232,7 +232,7 @@ class SAC:
         """Numbers of an action."""
         return self.buffer.action
 
-    def train(self, log: EpisodeLog, env_steps: int, on_update: OnUpdate) -> None:
+    def train(self, log: EpisodeRecorder, env_steps: int, on_update: OnUpdate) -> None:
         """Train until the log counts `env_steps`, from the current state on. Raises `Diverged`.
 
         Actions are uniform until `learning_starts` transitions are kept. From then on each

@@ -4,14 +4,16 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
+from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
+from numpy.typing import NDArray
 
 from ..models.errors import InputError, require
 from . import learner
 from .a2c import A2C, A2CConfig
 from .checkpoints import Checkpoint
-from .episodes import EpisodeLog
-from .networks import named, part_of
+from .episodes import EpisodeRecorder
+from .networks import Floats, named, part_of
 from .policies import ActionMap, NetworkPolicy
 from .ppo import PPO, PPOConfig
 from .sac import SACConfig
@@ -90,6 +92,51 @@ class SB3VecEnv(sb3_vec.VecEnv):
         return [False] * len(list(self._get_indices(indices)))
 
 
+class RecordedEnv(VectorEnv[Floats, Floats, NDArray[Any]]):
+    """A recorder as a vector env of SAME_STEP, whatever the autoreset of its env.
+
+    Observations are flat, continuous actions in the units of `ActionMap`, and every episode has the
+    seed that the recorder gives. A drone that is out observes zeros, with no reward, and terminates
+    once more with its world.
+    """
+
+    def __init__(self, recorder: EpisodeRecorder) -> None:
+        self.recorder = recorder
+        self.num_envs = recorder.num_envs
+        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
+        bounds = [array.bounds() for array in recorder.spec.observation]
+        low = np.concatenate([pair[0].ravel() for pair in bounds])
+        high = np.concatenate([pair[1].ravel() for pair in bounds])
+        actions = recorder.actions
+        box = spaces.Box(-1, 1, (actions.size,))
+        self.single_observation_space = spaces.Box(low.astype("f"), high.astype("f"))
+        self.single_action_space = spaces.Discrete(actions.outputs) if actions.discrete else box
+
+    def reset(self, **_: Any) -> tuple[Floats, dict[str, Any]]:
+        """Begin an episode of every drone; arguments are not used."""
+        self.recorder.reset()
+        return self.recorder.observations, {}
+
+    def step(self, actions: Floats) -> Any:
+        """Fly one step. `info` has `final_obs` where an episode ended."""
+        recorder = self.recorder
+        env = recorder.env
+        recorder.fly(np.asarray(actions, np.float32).reshape(self.num_envs, -1))
+        last = recorder.observations
+        rewards = env.rewards
+        terminated = env.terminated
+        truncated = env.truncated
+        if recorder.done.any():
+            begun = recorder.done
+            truncated = truncated | recorder.begin(begun)
+            terminated = terminated | (begun & ~truncated)
+        ended = terminated | truncated
+        info = {"final_obs": last, "_final_obs": ended} if ended.any() else {}
+        observations = recorder.observations
+        observations[recorder.out] = 0.0
+        return observations, rewards, terminated, truncated, info
+
+
 class SB3Agent:
     """SB3's A2C, PPO or SAC, by the class of its config, behind the interface of ours.
 
@@ -104,7 +151,7 @@ class SB3Agent:
         InputError: Observations are to be normalised; or SAC is to make choices.
     """
 
-    def __init__(self, log: EpisodeLog, config: A2CConfig | SACConfig, seed: int) -> None:
+    def __init__(self, log: EpisodeRecorder, config: A2CConfig | SACConfig, seed: int) -> None:
         if config.normalize_observations:
             raise InputError("normalize_observations: expected false with SB3, got true")
         if config.network != "mlp":
@@ -122,7 +169,7 @@ class SB3Agent:
         activation = {"relu": torch.nn.ReLU, "tanh": torch.nn.Tanh}[config.activation]
         self.model = kind(
             "MlpPolicy",
-            SB3VecEnv(log),
+            SB3VecEnv(RecordedEnv(log)),
             learning_rate=self._learning_rate,
             gamma=config.gamma,
             policy_kwargs={"activation_fn": activation, **policy_settings},
@@ -136,11 +183,11 @@ class SB3Agent:
         self.model.set_logger(sb3_logger.Logger(folder=None, output_formats=[]))
 
     @classmethod
-    def create(cls, log: EpisodeLog, config: A2CConfig | SACConfig, seed: int) -> Self:
+    def create(cls, log: EpisodeRecorder, config: A2CConfig | SACConfig, seed: int) -> Self:
         """A new agent for the env of a log."""
         return cls(log, config, seed)
 
-    def train(self, log: EpisodeLog, env_steps: int, on_update: learner.OnUpdate) -> None:
+    def train(self, log: EpisodeRecorder, env_steps: int, on_update: learner.OnUpdate) -> None:
         """As `Learner.train`. SB3 flies whole rollouts only: a last part of one is not flown."""
         whole = env_steps // self._rollout * self._rollout
         if not whole:
@@ -263,7 +310,7 @@ _Made = tuple[type, dict[str, Any], dict[str, Any]]
 """A class of SB3, its settings, and those of its policy."""
 
 
-def _on_policy(config: A2CConfig, steps: int, log: EpisodeLog) -> _Made:
+def _on_policy(config: A2CConfig, steps: int, log: EpisodeRecorder) -> _Made:
     rollout = steps * log.num_envs
     hidden = list(config.hidden)
     epsilon = (PPO if isinstance(config, PPOConfig) else A2C).epsilon
@@ -290,7 +337,7 @@ def _on_policy(config: A2CConfig, steps: int, log: EpisodeLog) -> _Made:
     return _PPO, settings, policy
 
 
-def _sac(config: SACConfig, steps: int, log: EpisodeLog) -> _Made:
+def _sac(config: SACConfig, steps: int, log: EpisodeRecorder) -> _Made:
     if ActionMap(log.spec.action).discrete:
         raise InputError("sb3-sac: expected an env of continuous actions, got one of choices")
     aim = config.target_entropy

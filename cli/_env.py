@@ -12,7 +12,7 @@ from ..envs.spec import EnvSpec
 from ..flights.trajectories import Trajectory
 from ..models import Backend
 from ..models.errors import InputError
-from ..udp import RemoteEnv, RemoteVectorEnv
+from ..udp import RemoteVectorEnv
 from ..udp.spawn import spawn_simulator
 from ._flags import AgentFlags, EnvFlags, check_count, parse_address
 
@@ -147,14 +147,14 @@ def remote_env(
     num_simulators: int = 1,
     drones: int = 1,
     backend: Backend = "mujoco",
-) -> Iterator[Any]:
+) -> Iterator[RemoteVectorEnv]:
     """A remote env with a simulator of its own, on a backend, or those that come to
     `command.listen`; at the end the counters of the wire are printed.
 
-    One drone is a `RemoteEnv`, more are a `RemoteVectorEnv` without autoreset; None are as many as
-    the first simulator has, in a `RemoteVectorEnv`. Where it is `required`, simulators that come
-    must fly this task, with these options (not the default ones) if there are any; otherwise the
-    first that comes decides. Raises `InputError` for flags that contradict each other.
+    It is a vector env without autoreset; None are as many drones as the first simulator has. Where
+    it is `required`, simulators that come must fly this task, with these options (not the default
+    ones) if there are any; otherwise the first that comes decides. Raises `InputError` for flags
+    that contradict each other.
     """
     if command.listen is not None:
         theirs = "it of the simulator that comes: rotorgram sim --backend"
@@ -176,7 +176,7 @@ def remote_env(
         config = EnvConfig.from_keywords(
             env_id, drones=drones, vehicle=command.vehicle, backend=backend, **options
         )
-        opened = spawn_simulator(config, num_envs=num_envs, record=command.record)
+        opened = spawn_simulator(config, num_envs=num_envs or drones, record=command.record)
     with opened as env:
         try:
             yield env
@@ -187,7 +187,7 @@ def remote_env(
 @contextmanager
 def _waiting(
     command: AgentFlags, listen: str, num_envs: int | None, num_simulators: int, **settings: Any
-) -> Iterator[RemoteEnv | RemoteVectorEnv]:
+) -> Iterator[RemoteVectorEnv]:
     check_count("drones", command.drones)
     if command.vehicle is not None:
         from ..models.fleet import load_vehicles  # an agent needs no MuJoCo otherwise
@@ -196,14 +196,9 @@ def _waiting(
     settings |= {
         "connect": False, "connect_timeout": _CONNECT_TIMEOUT, "key_file": command.key_file,
         "insecure": command.insecure, "record": command.record,
+        "num_simulators": num_simulators, "autoreset_mode": "Disabled",
     }  # fmt: skip
-    address = parse_address(listen)
-    remote: RemoteEnv | RemoteVectorEnv
-    if num_envs == num_simulators == 1:
-        remote = RemoteEnv(address, **settings)
-    else:
-        settings |= {"num_simulators": num_simulators, "autoreset_mode": "Disabled"}
-        remote = RemoteVectorEnv(address, num_envs=num_envs, **settings)
+    remote = RemoteVectorEnv(parse_address(listen), num_envs=num_envs, **settings)
     with closing(remote):
         waited = "a simulator" if num_simulators == 1 else f"{num_simulators} simulators"
         share = (num_envs or 0) // num_simulators

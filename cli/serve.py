@@ -35,7 +35,7 @@ class Serve(AgentFlags):
         with remote_env(self, *chosen_env(self, checkpoint), num_envs=None) as env:
             policy = policy_for(self, checkpoint, env.env_spec)
             names = env.env_spec.agents
-            worlds = getattr(env, "num_envs", 1) // len(names)
+            worlds = env.num_envs // len(names)
             while self.episodes is None or episode < self.episodes:
                 count = int(min(worlds, (self.episodes or math.inf) - episode))
                 try:

@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
@@ -11,6 +11,9 @@ from gymnasium.vector.utils import batch_space
 from ..models.errors import InputError
 from .spaces import action_space, info_columns, observation_space
 from .spec import EnvSpec
+
+LOST: Final = "simulator_lost"
+"""Key of the `info` of a step: why the simulator was lost whose episode ends here as truncated."""
 
 Step = tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]
 Seeds = Sequence[int | None] | np.ndarray

@@ -16,9 +16,8 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from ..agents.episodes import LOST
 from ..agents.policies import Policy
-from ..envs.autoreset import AdvancingVectorEnv, worlds_done
+from ..envs.autoreset import LOST, AdvancingVectorEnv, worlds_done
 from ..envs.spec import Discrete, EnvSpec, canonical_id, component_names
 from ..models.errors import InputError
 from ..models.frames import pose_in_mujoco_frame

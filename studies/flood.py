@@ -71,7 +71,7 @@ print(json.dumps({"sent": sent, "datagrams_per_second": round(sent / seconds)}))
 
 
 def train(run: Run, flood_seconds: float) -> dict[str, Any]:
-    with spawn_simulator(run.flown) as env:
+    with spawn_simulator(run.flown, num_envs=1) as env:
         training = Training(run, env)
         flood = None
         marks = []

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 from measuring import RESULTS, medians, options, write
-from rotorgram.agents import EpisodeLog, make_agent, preset
+from rotorgram.agents import EpisodeRecorder, make_agent, preset
 from rotorgram.envs import EnvConfig, LocalVectorEnv, Loop
 from rotorgram.udp import RemoteVectorEnv, Simulator
 from rotorgram.udp.transport import sockets
@@ -64,7 +64,7 @@ class Agent:
         config: Any = preset("ppo", "tuned", HOVER)
         self.steps = config.rollout_size(drones) // drones
         env: Any = LocalVectorEnv(HOVER, drones, autoreset_mode="Disabled", backend="rigid")
-        log = EpisodeLog(env, 0)
+        log = EpisodeRecorder(env, 0)
         self.spent = {"env": 0.0, "learn": 0.0}
         self.agent: Any = make_agent("ppo", log, config, 0)
         env.advance = self.timed("env", env.advance)

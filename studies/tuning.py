@@ -17,7 +17,7 @@ from typing import Any, Final
 
 import numpy as np
 from measuring import RESULTS, add_row, options
-from rotorgram.agents import EpisodeLog, find_algorithm, make_agent
+from rotorgram.agents import EpisodeRecorder, find_algorithm, make_agent
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.flights.trajectories import Trajectory, fly_episodes
 from rotorgram.training.metrics import Headline, steady_state
@@ -129,7 +129,7 @@ def measure(algorithm: str, task: str, settings: dict[str, Any], seed: int) -> d
         settings |= options
         return LocalVectorEnv(f"rotorgram/{task}", count, autoreset_mode="Disabled", **settings)
 
-    log = EpisodeLog(make(drones, backend), seed)
+    log = EpisodeRecorder(make(drones, backend), seed)
     agent = make_agent(algorithm, log, find_algorithm(algorithm).config(**config), seed)
     began = time.process_time()
     agent.train(log, env_steps, lambda: True)

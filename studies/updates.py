@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 from measuring import RESULTS, options, write
-from rotorgram.agents import EpisodeLog, make_agent, preset
+from rotorgram.agents import EpisodeRecorder, make_agent, preset
 from rotorgram.agents.rollouts import Rollout
 from rotorgram.envs import LocalVectorEnv
 
@@ -37,7 +37,7 @@ class Updates:
 
     def __init__(self, algorithm: str, env_id: str, drones: int, config: Any) -> None:
         env: Any = LocalVectorEnv(env_id, drones, autoreset_mode="Disabled", num_threads=1)
-        log = EpisodeLog(env, 0)
+        log = EpisodeRecorder(env, 0)
         self.agent: Any = make_agent(algorithm, log, config, 0)
         self.rollouts: list[Rollout] = []
         total = 2 * config.rollout_size(drones) + getattr(config, "learning_starts", 0)

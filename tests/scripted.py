@@ -4,12 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
-from rotorgram.agents.episodes import LOST, EpisodeLog
+from rotorgram.agents.episodes import EpisodeRecorder
 from rotorgram.envs.autoreset import AdvancingVectorEnv
-from rotorgram.envs.spaces import action_space, observation_space
 from rotorgram.envs.spec import ArraySpec, Discrete, EnvSpec, Metric
 
 Script = Sequence[Sequence[tuple[int, str]]]
@@ -129,27 +127,5 @@ class Scripted(AdvancingVectorEnv):
         self.flown[drone].append(row)
 
 
-class OneDrone(gym.Env[np.ndarray, Any]):
-    """The first drone of a scripted env, as `RemoteEnv` would fly it."""
-
-    def __init__(self, env: Scripted) -> None:
-        self.env = env
-        self.env_spec = env.env_spec
-        self.observation_space = observation_space(env.env_spec)
-        self.action_space = action_space(env.env_spec)
-
-    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[np.ndarray, dict[str, Any]]:
-        observation = self.env.reset()[0][0]
-        return observation, {"distance": float(observation[0])}
-
-    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        env = self.env
-        env.advance(np.reshape(action, (1, -1)))
-        info = {"distance": float(env.observations[0, 0])}
-        info |= {LOST: "killed"} if env.lost[0] else {}
-        ends = bool(env.terminated[0]), bool(env.truncated[0])
-        return env.observations[0].copy(), float(env.rewards[0]), *ends, info
-
-
-def log_of(env: Scripted) -> EpisodeLog:
-    return EpisodeLog(env if env.num_envs > 1 else OneDrone(env), 7)
+def log_of(env: Scripted) -> EpisodeRecorder:
+    return EpisodeRecorder(env, 7)

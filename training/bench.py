@@ -333,7 +333,11 @@ def one_core(pid: int) -> Iterator[None]:
 
 
 def _udp(stack: ExitStack, drones: int) -> Slice:
-    return _env(stack.enter_context(spawn_simulator(EnvConfig(env_id=ENV_ID), num_envs=drones)))
+    return _env(
+        stack.enter_context(
+            spawn_simulator(EnvConfig(env_id=ENV_ID), num_envs=None if drones == 1 else drones)
+        )
+    )
 
 
 _MANY: Final = (64, 1024, 4096)

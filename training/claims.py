@@ -8,8 +8,6 @@ every verdict states its own, and with which preset the agents were trained.
 The paper's claims are four, and three comparisons judge them (presets `tuned` and `paper`, and the
 task that observes the error alone). Each is judged by an interval of 1 - 0.05 / 12 = 99.58 %
 (Bonferroni), so the chance of a wrong verdict among the twelve is 5 % at most.
-A claim that stays undecided tells how many seeds would decide it: see
-`statistics.seeds_to_decide` and `statistics.seeds_to_decide_share`.
 
 Overlapping intervals do not show that two agents are alike. Our own claim, that our A2C is no worse
 than SB3's, is shown by a margin of non-inferiority: the whole interval of the difference has to lie
@@ -25,15 +23,7 @@ import pandas as pd
 
 from . import metrics
 from .metrics import Headline
-from .statistics import (
-    POWER,
-    Floats,
-    bootstrap_difference,
-    iqm,
-    seeds_to_decide,
-    seeds_to_decide_share,
-    share_interval,
-)
+from .statistics import Floats, bootstrap_difference, iqm, share_interval
 
 MIN_SEEDS: Final = 30
 """Seeds with a value that each agent needs before a claim is decided.
@@ -226,12 +216,7 @@ def _compare(
     difference, low, high = bootstrap_difference(*pair, level=LEVEL)
     evidence += f"difference {_number(difference)}, {_INTERVAL} {_range(low, high)}"
     if low <= 0.0 <= high:
-        found, fewest = seeds_to_decide(*pair, level=LEVEL)
-        return "undecided", (
-            f"{evidence}; to decide it with a probability of {POWER:.0%} takes {_count(found)} "
-            "seeds of each if this is the difference, and at least "
-            f"{_count(fewest)} if it is the far end of the interval."
-        )
+        return "undecided", f"{evidence}."
     return ("borne out" if (low > 0.0) == larger else "not borne out"), f"{evidence}."
 
 
@@ -272,15 +257,11 @@ def _holds(runs: pd.DataFrame, headline: Headline) -> tuple[Outcome, str]:
     text += f", {_INTERVAL} of the share {low:.1%} to {high:.1%}"
     if crashed:
         text += f", {crashed} of {episodes} episodes crashed"
-    if count < MIN_SEEDS:
-        return "undecided", text
-    if low > HOLDING_SHARE:
+    if count >= MIN_SEEDS and low > HOLDING_SHARE:
         return "borne out", text
-    if high < HOLDING_SHARE:
+    if count >= MIN_SEEDS and high < HOLDING_SHARE:
         return "not borne out", text
-    share = held / count
-    wanted = _count(seeds_to_decide_share(share, HOLDING_SHARE, LEVEL))
-    return "undecided", f"{text}, {wanted} seeds would decide it if the share is {share:.1%}"
+    return "undecided", text
 
 
 def judge_no_worse(runs: pd.DataFrame, preset: str, headline: Headline) -> Verdict:
@@ -329,10 +310,6 @@ def _number(value: float) -> str:
     if not np.isfinite(value):
         return "no value"
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
-
-
-def _count(seeds: float) -> str:
-    return f"{seeds:,.0f}" if np.isfinite(seeds) else "more than any number of"
 
 
 def _range(low: float, high: float) -> str:

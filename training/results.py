@@ -9,7 +9,6 @@ A study writes one folder. Everything that is drawn, tabulated or judged is read
 | `evaluations.parquet` | deterministic evaluation episode of a policy snapshot |
 | `episodes.parquet` | training episode |
 | `steps.parquet` | env step of training and of the final evaluation, if the study keeps steps |
-| `positions.parquet` | drone and control step of the final evaluation, if a world has several |
 
 An unfinished study has a folder `parts` with a folder for each run that is done. All tables begin
 with the columns `row` and `seed`. A size or value is that of the row's headline metric.
@@ -73,10 +72,12 @@ COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
         "value", "reward",
         "thrust",  # mean over the rotors, N
     ),
-    "positions": ("row", "seed", "episode", "drone", "step", "X", "Y", "Z",
-                  "goal_X", "goal_Y", "goal_Z"),
 }  # fmt: skip
-"""Columns of each table; `evaluations` and `episodes` may have more, of what was drawn."""
+"""Columns of each table.
+
+`evaluations` and `episodes` may have more, of what was drawn, and `runs` has `least_distance`, m,
+where a world has several drones.
+"""
 
 _COUNTS: Final = ("seed", "env_steps", "episodes", "settled", "crashed", "held")
 
@@ -248,11 +249,6 @@ class Results:
     def episodes(self) -> pd.DataFrame:
         """Training episodes; one that the end of training cut is not there."""
         return self._table("episodes")
-
-    @cached_property
-    def positions(self) -> pd.DataFrame:
-        """Of the drones of worlds of several in the final evaluation."""
-        return self._table("positions")
 
     def steps(self, phase: str, max_rows: int | None = None) -> pd.DataFrame:
         """Steps of one phase, "train" or "evaluation".

@@ -1,4 +1,4 @@
-"""Statistics over seeds: interquartile means, intervals, and how many seeds decide.
+"""Statistics over seeds: interquartile means and intervals.
 
 The definitions are those of Agarwal et al., "Deep Reinforcement Learning at the Edge of the
 Statistical Precipice" (NeurIPS 2021, arXiv 2108.13264), computed by SciPy. The scores of an agent
@@ -8,7 +8,6 @@ each task by themselves, always in the same way. Missing values (nan) are left o
 
 import math
 from collections.abc import Callable, Sequence
-from statistics import NormalDist
 from typing import Any, Final
 
 import numpy as np
@@ -16,9 +15,6 @@ from numpy.typing import NDArray
 from scipy import stats
 
 _RESAMPLES: Final = 2000
-POWER: Final = 0.8
-"""Probability with which a number of seeds is to decide: the usual one."""
-_MAX_SEEDS: Final = 20_000
 
 Floats = NDArray[np.float64]
 Values = Sequence[float] | NDArray[np.floating[Any]]
@@ -54,7 +50,7 @@ def bootstrap_interval(*strata: Values, level: float = 0.95) -> tuple[float, flo
     def statistic(*samples: Floats, axis: int = -1) -> Floats:
         return trimmed_mean(np.concatenate(samples, axis=axis), axis=axis)
 
-    return _bootstrap(strata, statistic, level)[:2]
+    return _bootstrap(strata, statistic, level)
 
 
 def bootstrap_difference(
@@ -65,7 +61,7 @@ def bootstrap_difference(
     The runs of the two agents are resampled independently. Runs of one seed share their starting
     states; as far as this makes them alike, the interval is wider than it need be.
     """
-    low, high, _ = _bootstrap([first, second], _difference, level)
+    low, high = _bootstrap([first, second], _difference, level)
     return iqm(first) - iqm(second), low, high
 
 
@@ -95,59 +91,11 @@ def improvement_interval(first: Strata, second: Strata, level: float = 0.95) -> 
         pairs = zip(samples[:tasks], samples[tasks:], strict=True)
         return np.asarray(np.mean([_beaten(x, y, axis) for x, y in pairs], axis=0))
 
-    low, high, _ = _bootstrap([*first, *second], statistic, level)
+    low, high = _bootstrap([*first, *second], statistic, level)
     if low == high and low in (0.0, 1.0):
         runs = min(sum(finite(values).size for values in agent) for agent in (first, second))
         return share_interval(round(low * runs), runs, level)
     return low, high
-
-
-# ---- how many seeds decide
-
-
-def seeds_to_decide(first: Values, second: Values, level: float = 0.95) -> tuple[float, float]:
-    """Seeds of each agent after which `bootstrap_difference` leaves 0 out, with probability
-    `POWER`: if the true difference is the one that was found, and if it is the end of its interval
-    that is further from 0. The second is the fewest that may be hoped for.
-
-    The variance of an interquartile mean falls with the number of seeds n: n times that of the
-    bootstrap's is v, of either agent. So for a difference d the number is (v + v') ((z + z') / d)²;
-    z and z' are the normal quantiles of the level and of the power (Cohen, Statistical Power
-    Analysis for the Behavioral Sciences, 1988, section 2.4, with a measured variance). inf where d
-    is 0; nan where there is no interval.
-    """
-    found, low, high = bootstrap_difference(first, second, level)
-    if math.isnan(low):
-        return math.nan, math.nan
-    variance = 0.0
-    for values in (first, second):
-        deviation = _bootstrap([values], trimmed_mean, level)[2]
-        variance += finite(values).size * deviation**2
-    normal = NormalDist()
-    factor = normal.inv_cdf((1 + level) / 2) + normal.inv_cdf(POWER)
-
-    def number(difference: float) -> float:
-        if difference == 0:
-            return math.inf
-        return float(math.ceil(factor**2 * variance / difference**2))
-
-    return number(found), number(max(abs(low), abs(high)))
-
-
-def seeds_to_decide_share(share: float, bound: float, level: float = 0.95) -> float:
-    """The fewest seeds whose `share_interval` leaves the bound out with probability `POWER`, if the
-    true share is the one given; inf beyond 20,000.
-
-    Wilson's interval leaves the bound b out where |k - nb| > z √(nb(1 - b)), k of n seeds.
-    """
-    totals = np.arange(1, _MAX_SEEDS + 1)
-    half = NormalDist().inv_cdf((1 + level) / 2) * np.sqrt(totals * bound * (1 - bound))
-    above = np.floor(totals * bound + half) + 1
-    below = np.ceil(totals * bound - half) - 1
-    binomial = stats.binom(totals, share)
-    decided = binomial.sf(above - 1) + binomial.cdf(below)
-    enough = np.flatnonzero(decided >= POWER)
-    return float(totals[enough[0]]) if enough.size else math.inf
 
 
 # ---- parts
@@ -155,11 +103,11 @@ def seeds_to_decide_share(share: float, bound: float, level: float = 0.95) -> fl
 
 def _bootstrap(
     strata: Strata, statistic: Callable[..., Floats], level: float
-) -> tuple[float, float, float]:
-    """Ends of the interval, and the standard error; nan if a task has fewer than two runs."""
+) -> tuple[float, float]:
+    """Ends of the interval; nan if a task has fewer than two runs."""
     scores = [finite(values) for values in strata]
     if min(values.size for values in scores) < 2:
-        return math.nan, math.nan, math.nan
+        return math.nan, math.nan
     found = stats.bootstrap(
         scores,
         statistic,
@@ -170,7 +118,7 @@ def _bootstrap(
         random_state=np.random.default_rng(0),
     )
     interval = found.confidence_interval
-    return float(interval.low), float(interval.high), float(found.standard_error)
+    return float(interval.low), float(interval.high)
 
 
 def _difference(first: Floats, second: Floats, axis: int = -1) -> Floats:

@@ -1,5 +1,6 @@
 """A study: every row with every seed is trained and evaluated; what is done is kept."""
 
+import math
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
@@ -17,11 +18,12 @@ from ..agents.policies import Policy
 from ..envs.config import EnvConfig
 from ..envs.registry import env_spec, load
 from ..envs.spec import EnvSpec
+from ..flights.distances import least
 from ..flights.executors import OnProgress, Tell, WorkersConfig, open_executor, run_jobs
 from ..flights.folders import locked
 from ..flights.trajectories import Trajectory, fly_episodes
 from ..udp.spawn import cached_simulator
-from . import results, swarms
+from . import results
 from .metrics import Headline, measure_episode, measure_run
 from .results import CONFIG_FILE, PARTS
 from .settings import Row, Study
@@ -173,12 +175,28 @@ def _evaluate(
             rows += [label | measure_episode(one, headline) for one in flown]
     evaluations = pd.DataFrame(rows)
     measures = {**times, **measure_run(evaluations, headline)}
+    if drones > 1:
+        measures["least_distance"] = least_distance(flown)
     tables = {"runs": pd.DataFrame([measures]), "evaluations": evaluations}
     if study.keep_steps:
         tables["steps"] = pd.concat([_flown_steps(one) for one in flown], ignore_index=True)
-        if drones > 1:
-            tables["positions"] = swarms.rows_of(flown)
     return tables
+
+
+def least_distance(flown: Sequence[Trajectory]) -> float:
+    """Least distance between the origins of two drones that fly in a world, m.
+
+    The trajectories of an episode follow each other in the order of its drones.
+    """
+    drones = len(flown[0].spec.agents)
+    found = math.inf
+    for first in range(0, len(flown), drones):
+        world = flown[first : first + drones]
+        position = np.full((max(map(len, world)) + 1, drones, 3), np.nan)
+        for drone, one in enumerate(world):
+            position[: len(one) + 1, drone] = one.telemetry["position"]
+        found = min(found, float(np.nanmin(least(position))))
+    return found
 
 
 def _episodes(training: Training) -> pd.DataFrame:

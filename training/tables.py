@@ -28,12 +28,11 @@ from .statistics import (
     probability_of_improvement,
     share_interval,
 )
-from .swarms import least_distances
 
 _TERMINAL_COLUMNS: Final = (0, 1, 2, 3, 6, 7, 8)  # those that fit 100 columns
 NOTHING: Final = "–"
 """Shown where there is no value."""
-_MEASURES: Final = ("steady", "settling_time", "overshoot", "return")
+_MEASURES: Final = ("steady", "settling_time", "overshoot", "return", "least_distance")
 _COUNTS: Final = ("episodes", "settled", "crashed")
 
 
@@ -76,8 +75,6 @@ def results_table(results: Results) -> pd.DataFrame:
         if len(own):
             lines[row.name] = _measures(own, results.headline(row))
     table = pd.DataFrame.from_dict(lines, orient="index").rename_axis("row")
-    if len(results.positions):
-        table = table.join(least_distances(results.positions))
     if results.study.kind != "sweep" or table.empty:
         return table
     high = results.headline(results.study.rows[0]).high
@@ -90,7 +87,7 @@ def _measures(own: pd.DataFrame, headline: Headline) -> dict[str, float]:
     line: dict[str, float] = {"seeds": len(own)}
     for name in _COUNTS:
         line[name] = int(own[name].sum())
-    for name in _MEASURES:
+    for name in own.columns.intersection(_MEASURES):
         values = own[name].to_numpy(float)
         line[name] = iqm(values)
         line[f"{name}_low"], line[f"{name}_high"] = bootstrap_interval(values)

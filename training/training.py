@@ -5,7 +5,6 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from typing import Any, Final
 
-import gymnasium as gym
 import numpy as np
 
 from .. import agents
@@ -14,8 +13,6 @@ from ..envs.autoreset import AdvancingVectorEnv
 from ..flights.executors import Tell
 from ..models.errors import InputError
 from .settings import Run
-
-AnyEnv = gym.Env[Any, Any] | AdvancingVectorEnv
 
 _TELL_EVERY: Final = 0.2  # s
 
@@ -46,7 +43,7 @@ def _least_flown(algorithm: str, config: Any, num_envs: int) -> int:
 class Training:
     """A run on an env, to be started, stopped and resumed at update boundaries.
 
-    The env is local or remote, a vector env where the run has many drones, and not closed here.
+    The env is a local or remote vector env, and not closed here.
     Besides the untrained policy, so many `snapshots` are kept in `taken` for later evaluation,
     evenly spread. With `keep_steps` every step is kept, for `log.steps()`. A run that goes on does
     so from the checkpoint `kept`; a new one may begin with the networks of another training, those
@@ -54,7 +51,7 @@ class Training:
     """
 
     run: Run
-    env: AnyEnv
+    env: AdvancingVectorEnv
     snapshots: int = 0
     keep_steps: bool = False
     kept: Checkpoint | None = None
@@ -62,11 +59,10 @@ class Training:
     taken: list[Snapshot] = field(default_factory=list, init=False)
 
     def __post_init__(self) -> None:
-        drones = getattr(self.env, "num_envs", 1)
         wanted = self.run.num_envs
-        if drones != wanted:
-            raise InputError(f"env: expected one of {wanted} drones, got {drones}")
-        self.log = agents.EpisodeLog(self.env, self.run.seed, keep_steps=self.keep_steps)
+        if self.env.num_envs != wanted:
+            raise InputError(f"env: expected one of {wanted} drones, got {self.env.num_envs}")
+        self.log = agents.EpisodeRecorder(self.env, self.run.seed, keep_steps=self.keep_steps)
         run = self.run
         new = run.algorithm, self.log, run.config, run.seed
         self.agent: agents.Agent
@@ -78,7 +74,7 @@ class Training:
             self.agent = agents.make_agent(*new)
 
     @classmethod
-    def resume(cls, kept: Checkpoint, env: AnyEnv) -> "Training":
+    def resume(cls, kept: Checkpoint, env: AdvancingVectorEnv) -> "Training":
         """Go on from a checkpoint. Raises what `agents.resume_agent` raises."""
         kept.check_resumable()
         try:
@@ -181,7 +177,7 @@ class Training:
 
 
 def train_run(
-    run: Run, env: AnyEnv, tell: Tell, snapshots: int = 0, keep_steps: bool = False
+    run: Run, env: AdvancingVectorEnv, tell: Tell, snapshots: int = 0, keep_steps: bool = False
 ) -> tuple[Training, dict[str, Any]]:
     """Train to the end: the training, and its `env_steps`, `seconds` and `steps_per_second`."""
     training = Training(run, env, snapshots=snapshots, keep_steps=keep_steps)

@@ -11,7 +11,8 @@ from .protocol.client import Address, LinkConfig
 from .protocol.errors import DecodeError, LinkError, PeerClosed, PeerSilent, Refused
 
 if TYPE_CHECKING:
-    from .remote import LOST, RemoteEnv, RemoteVectorEnv
+    from ..envs.autoreset import LOST
+    from .remote import RemoteEnv, RemoteVectorEnv
     from .transport.simulator import DEFAULT_AGENT, DEFAULT_SIMULATOR, Simulator
 
 __all__ = [

@@ -9,6 +9,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 from ..envs.autoreset import (
+    LOST,
     AdvancingVectorEnv,
     Seeds,
     checked_mask,
@@ -25,9 +26,6 @@ from .protocol.messages import FLY, FREEZE, MAX_UINT64, RESET, State
 from .protocol.statistics import Statistics
 from .transport.agent import Agent, AgentConfig, AgentSettings, Order
 from .transport.simulator import DEFAULT_AGENT
-
-LOST: Final = "simulator_lost"
-"""Key of `info`: why the simulator was lost whose episode ends here as truncated."""
 
 Arrays = dict[str, np.ndarray]
 _FLY: Final = np.array([FLY], np.uint8)

@@ -39,12 +39,12 @@ def spawn_simulator(
 ) -> Iterator[Any]:
     """A connected remote env, on free ports of the loopback interface.
 
-    One drone makes a `RemoteEnv`, more make a `RemoteVectorEnv` without autoreset. The simulator
-    ends with this process, however this one ends.
+    The simulator ends with this process, however this one ends.
 
     Args:
         config: What is flown.
-        num_envs: Drones in all; None: those of one world.
+        num_envs: Drones of a `RemoteVectorEnv` without autoreset. None: those of one world, and a
+            `RemoteEnv` for a single drone.
         record: MCAP file of the agent's journal.
 
     Raises:
@@ -62,7 +62,7 @@ def spawn_simulator(
     }
     here = ("127.0.0.1", 0)
     env: Remote
-    if count == 1:
+    if num_envs is None and count == 1:
         env = RemoteEnv(here, **settings)
     else:
         env = RemoteVectorEnv(here, num_envs=count, autoreset_mode="Disabled", **settings)

@@ -8,15 +8,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
-import rotorgram.envs  # noqa: F401
 import torch
+from drones import ENV, OPTIONS, vector
 from rotorgram.agents import (
     Checkpoint,
     CheckpointError,
-    EpisodeLog,
+    EpisodeRecorder,
     ResumeError,
     load,
     make_agent,
@@ -26,26 +25,21 @@ from rotorgram.agents import (
 )
 from rotorgram.agents.checkpoints import software_versions, write_whole
 from rotorgram.agents.learner import Learner
-from rotorgram.envs import LocalVectorEnv
 from rotorgram.models.errors import InputError
 
-ENV = "rotorgram/Elevation-v0"
 SMALL: dict[str, dict[str, Any]] = {
     "vpg": {"episodes_per_update": 3},
     "a2c": {"steps_per_update": 64},
     "ppo": {"steps_per_update": 64, "epochs": 2, "minibatches": 3, "normalize_observations": True},
 }
-OPTIONS: dict[str, Any] = {"episode_length": 30, "start_band": 0.3, "flight_band": 0.4}
 TOTAL = 768
 
 
-def log_of(drones: int, seed: int = 5, **options: Any) -> EpisodeLog:
-    settings = {**OPTIONS, **options}
-    env: Any = LocalVectorEnv(ENV, drones, autoreset_mode="Disabled", **settings)
-    return EpisodeLog(gym.make(ENV, **settings) if drones == 1 else env, seed)
+def log_of(drones: int, seed: int = 5, **options: Any) -> EpisodeRecorder:
+    return EpisodeRecorder(vector(drones, **{**OPTIONS, **options}), seed)
 
 
-def checkpoint_of(algorithm: str, log: EpisodeLog, agent: Learner) -> Checkpoint:
+def checkpoint_of(algorithm: str, log: EpisodeRecorder, agent: Learner) -> Checkpoint:
     return Checkpoint(
         algorithm=algorithm,
         config=vars(preset(algorithm, "tuned", **SMALL[algorithm])),
@@ -58,7 +52,7 @@ def checkpoint_of(algorithm: str, log: EpisodeLog, agent: Learner) -> Checkpoint
     )
 
 
-def trained(algorithm: str, log: EpisodeLog, updates: int = 10**9) -> Learner:
+def trained(algorithm: str, log: EpisodeRecorder, updates: int = 10**9) -> Learner:
     agent = make_agent(algorithm, log, preset(algorithm, "tuned", **SMALL[algorithm]), 5)
     calls = iter(range(updates - 1))
     agent.train(log, TOTAL, lambda: next(calls, None) is not None)

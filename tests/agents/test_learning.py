@@ -4,14 +4,13 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from gymnasium import spaces
+from drones import LINE, ONE, Constant, Kept, log_of, vector
 from rotorgram.agents import (
     A2CConfig,
-    EpisodeLog,
+    EpisodeRecorder,
     PPOConfig,
     VPGConfig,
     make_agent,
@@ -22,48 +21,8 @@ from rotorgram.agents.presets import preset_names
 from rotorgram.agents.rollouts import Collector, Diverged, Rollout
 from rotorgram.agents.sb3 import SB3Agent
 from rotorgram.agents.vpg import VPG
-from rotorgram.envs import LocalVectorEnv
-from rotorgram.envs.spec import ArraySpec, EnvSpec
 from rotorgram.flights.trajectories import fly_episodes
 from rotorgram.models.errors import InputError
-from scripted import spec_of
-
-ENV = "rotorgram/Elevation-v0"
-ONE = ArraySpec(name="action", shape=(1,), low=-1.0, high=1.0)
-LINE = spec_of(ONE, [ArraySpec(name="observation", shape=(1,), low=-1.0, high=1.0)])
-
-
-class Constant(gym.Env[np.ndarray, Any]):
-    """Reward 1 at every step, whatever is done; episodes are cut after 8 steps."""
-
-    observation_space = spaces.Box(-1, 1, (1,), np.float32)
-    action_space = spaces.Box(-1, 1, (1,), np.float32)
-
-    def __init__(self, ending: str = "end", spec: EnvSpec = LINE) -> None:
-        self.env_spec = spec
-        self._ending = ending
-        self._steps = 0
-        self.flown: list[float] = []
-
-    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        self._steps = 0
-        return np.zeros(1, np.float32), {"distance": 0.5}
-
-    def step(self, action: Any) -> Any:
-        self._steps += 1
-        self.flown.append(float(action[0]))
-        over = self._steps == 8
-        terminated = over and self._ending == "end"
-        truncated = over and self._ending == "limit"
-        return np.zeros(1, np.float32), 1.0, terminated, truncated, {"distance": 0.5}
-
-
-def log_of(ending: str = "end") -> EpisodeLog:
-    return EpisodeLog(Constant(ending), seed=0)
-
-
-def elevation(**options: Any) -> Any:
-    return gym.make(ENV, disable_env_checker=True, **options).unwrapped
 
 
 def rollout(**changes: Any) -> Rollout:
@@ -215,19 +174,6 @@ def test_learning_rate_falls_from_its_full_value_linearly(algorithm: str, anneal
     assert rates == pytest.approx(expected)
 
 
-class Recorder(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
-    """Keeps what every step returned."""
-
-    def __init__(self, env: gym.Env[np.ndarray, Any]) -> None:
-        super().__init__(env)
-        self.results: list[Any] = []
-
-    def step(self, action: Any) -> Any:
-        result = self.env.step(action)
-        self.results.append(result)
-        return result
-
-
 def copy_weights(theirs: Any, ours: A2C) -> None:
     """Of SB3's agent to ours."""
     weights = theirs.state()
@@ -241,7 +187,7 @@ def copy_weights(theirs: Any, ours: A2C) -> None:
 
 
 def train_both(
-    theirs: Any, ours: A2C, recorder: Recorder, log: EpisodeLog, env_steps: int
+    theirs: Any, ours: A2C, env: Kept, log: EpisodeRecorder, env_steps: int
 ) -> list[tuple[dict[str, float], dict[str, float]]]:
     """SB3 flies; ours, from the same weights, is given what it flew: scalars of both by update."""
     copy_weights(theirs, ours)
@@ -257,8 +203,8 @@ def train_both(
     buffer.compute_returns_and_advantage = keep_buffer
 
     def follow() -> bool:
-        after, rewards, terminated, truncated, _ = zip(*recorder.results, strict=True)
-        recorder.results.clear()
+        after, rewards, terminated, truncated = zip(*env.results, strict=True)
+        env.results.clear()
         data = rollout(
             observations=seen[0], actions=seen[1], rewards=np.array(rewards),
             next_observations=np.array(after), terminated=np.array(terminated),
@@ -278,11 +224,11 @@ def test_sb3_and_ours_make_the_same_updates_of_the_same_experience() -> None:
         steps_per_update=64, gamma=0.98, gae_lambda=0.95, learning_rate=0.01, ent_coef=0.01,
         normalize=True,
     )  # fmt: skip
-    recorder = Recorder(elevation(episode_length=40, flight_band=1.1))
-    log = EpisodeLog(recorder, seed=0)
+    env = Kept(episode_length=40, flight_band=1.1)
+    log = EpisodeRecorder(env, seed=0)
     theirs: Any = make_agent("sb3-a2c", log, config, 0)
     ours = A2C.create(log, config, seed=1)
-    assert len(train_both(theirs, ours, recorder, log, 640)) == 10
+    assert len(train_both(theirs, ours, env, log, 640)) == 10
     assert any(e.truncated for e in log.episodes)
     assert any(e.terminated for e in log.episodes)
     for name, expected in theirs.actor().items():
@@ -364,7 +310,7 @@ def test_what_is_stored_is_not_clipped_and_what_is_flown_is_in_the_units_of_the_
     """Of an action from 10 to 14, 12 is the middle and 2 the unit."""
     action = replace(ONE, low=10.0, high=14.0)
     env = Constant("limit", replace(LINE, action=action))
-    log = EpisodeLog(env, seed=0)
+    log = EpisodeRecorder(env, seed=0)
     agent = make_agent("a2c", log, A2CConfig(log_std=1.0), 0)
     collector = Collector(log, np.random.default_rng(0), agent.policy())
     data = collector.steps(200)
@@ -419,7 +365,7 @@ def test_huge_weights_of_a_training_that_diverges_are_no_error_of_the_env(algori
 def test_every_agent_trains_with_every_preset_and_kind_of_action(
     algorithm: str, name: str, action_type: str
 ) -> None:
-    log = EpisodeLog(elevation(action_type=action_type, episode_length=60), seed=0)
+    log = EpisodeRecorder(vector(action_type=action_type, episode_length=60), seed=0)
     agent = make_agent(algorithm, log, preset(algorithm, name), 0)
     rollouts = 1024 if "ppo" in algorithm else 512
     before = agent.actor()
@@ -445,9 +391,6 @@ def test_learns_to_hold_the_target(
     Rounding differs between processors, and with it a single training's fate.
     """
 
-    def vector(count: int) -> LocalVectorEnv:
-        return LocalVectorEnv(ENV, count, autoreset_mode="Disabled")
-
     def late_error(agent: Any) -> float:
         policy = agent.policy()
         flown = fly_episodes(vector(5), policy, 5)
@@ -456,7 +399,7 @@ def test_learns_to_hold_the_target(
     before = []
     after = []
     for seed in (0, 1):
-        log = EpisodeLog(vector(drones), seed)
+        log = EpisodeRecorder(vector(drones), seed)
         agent = make_agent(algorithm, log, preset(algorithm, "tuned", **changes), seed)
         before.append(late_error(agent))
         agent.train(log, 41_000 if algorithm == "ppo" else 60_000, lambda: True)

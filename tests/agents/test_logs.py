@@ -9,17 +9,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pandas as pd
 import pytest
+from drones import Kept, log_of, vector
 from rich.console import Console
 from rotorgram.agents import A2CConfig, VPGConfig, make_agent, preset
 from rotorgram.agents.a2c import A2C
 from rotorgram.agents.checkpoints import Checkpoint, load, store
-from rotorgram.agents.episodes import EpisodeLog
+from rotorgram.agents.episodes import EpisodeRecorder
 from rotorgram.agents.networks import Weights
-from rotorgram.agents.sb3 import SB3VecEnv
+from rotorgram.agents.sb3 import RecordedEnv, SB3VecEnv
 from rotorgram.agents.vpg import VPG
 from rotorgram.cli import main
 from rotorgram.cli._progress import Bars, Lines
@@ -31,17 +31,13 @@ from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.vec_env import VecMonitor
 from tensorboard.backend.event_processing import plugin_event_accumulator
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from test_learning import Recorder, log_of, rollout, train_both
+from test_learning import rollout, train_both
 
 DOCS = Path(__file__).parents[2] / "docs" / "algorithms"
 AGENTS = ["vpg", "a2c", "sb3-a2c"]
 ENTROPY_OF_ONE = 0.5 * math.log(2 * math.pi * math.e)  # nats, of a Gaussian with deviation 1
 
 Curves = dict[str, list[tuple[int, float]]]
-
-
-def elevation(**options: Any) -> Any:
-    return gym.make("rotorgram/Elevation-v0", **options).unwrapped
 
 
 def curves(folder: Path) -> Curves:
@@ -107,8 +103,10 @@ def test_sb3_logs_the_same_under_the_same_names() -> None:
         algorithm="sb3-a2c", config=preset("a2c", "tuned"), seed=0,
         env_steps=2400,
     )  # fmt: skip
-    training = Training(run, elevation(episode_length=12))
-    model = PlainA2C("MlpPolicy", VecMonitor(SB3VecEnv(training.log)), n_steps=40, device="cpu")
+    training = Training(run, vector(episode_length=12))
+    model = PlainA2C(
+        "MlpPolicy", VecMonitor(SB3VecEnv(RecordedEnv(training.log))), n_steps=40, device="cpu"
+    )
     capture = Capture(training)
     model.set_logger(Logger(folder=None, output_formats=[capture]))
     training.log.start_clock()
@@ -127,7 +125,7 @@ def test_sb3_logs_the_same_under_the_same_names() -> None:
 
 @pytest.mark.parametrize("algorithm", AGENTS)
 def test_discrete_actions_have_no_deviation(algorithm: str) -> None:
-    env = elevation(action_type="discrete", episode_length=10)
+    env = vector(action_type="discrete", episode_length=10)
     size = {"episodes_per_update": 2} if algorithm == "vpg" else {"steps_per_update": 20}
     run = Run(
         algorithm=algorithm, config=preset(algorithm, "tuned", **size),
@@ -146,7 +144,7 @@ def test_discrete_actions_have_no_deviation(algorithm: str) -> None:
 def test_what_is_not_defined_is_not_written() -> None:
     """One step has no variance to explain."""
     run = Run(algorithm="a2c", config=preset("a2c", "paper"), seed=0, env_steps=1)
-    training = Training(run, elevation())
+    training = Training(run, vector())
     training.train()
     logged = training.scalars()
     assert "train/explained_variance" not in logged
@@ -239,10 +237,10 @@ def test_the_terms_of_vpg_by_hand() -> None:
 
 def test_ours_logs_what_sb3_logs_of_the_same_updates() -> None:
     config = A2CConfig(steps_per_update=64, gae_lambda=0.95, learning_rate=0.01, normalize=True)
-    recorder = Recorder(elevation(episode_length=40))
-    log = EpisodeLog(recorder, seed=0)
+    env = Kept(episode_length=40)
+    log = EpisodeRecorder(env, seed=0)
     theirs: Any = make_agent("sb3-a2c", log, config, 0)
-    for here, there in train_both(theirs, A2C.create(log, config, seed=1), recorder, log, 320):
+    for here, there in train_both(theirs, A2C.create(log, config, seed=1), env, log, 320):
         assert here.keys() == there.keys()
         for name, value in there.items():
             assert here[name] == pytest.approx(value, rel=2e-3, abs=2e-4), name

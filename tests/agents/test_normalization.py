@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rotorgram.agents import A2CConfig, EpisodeLog, make_agent
+from rotorgram.agents import A2CConfig, EpisodeRecorder, make_agent
 from rotorgram.agents.normalization import Moments
 from rotorgram.envs import LocalVectorEnv
 
@@ -31,7 +31,7 @@ def test_moments_of_parts_are_those_of_the_whole() -> None:
 def test_the_policy_has_the_moments_of_all_rollouts_before_it() -> None:
     """Reward and weights apart, what is seen decides: mean and deviation of the rollouts."""
     env: Any = LocalVectorEnv("rotorgram/Elevation-v0", 4, autoreset_mode="Disabled")
-    log = EpisodeLog(env, 0)
+    log = EpisodeRecorder(env, 0)
     agent: Any = make_agent("a2c", log, A2CConfig(normalize_observations=True,
                                                   steps_per_update=40), 0)  # fmt: skip
     update = agent.update

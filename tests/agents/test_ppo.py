@@ -9,20 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from rotorgram.agents import EpisodeLog, PPOConfig, find_preset, load, make_agent
+from drones import Kept, log_of
+from rotorgram.agents import EpisodeRecorder, PPOConfig, find_preset, load, make_agent
 from rotorgram.agents.optimizers import clip_norm
 from rotorgram.agents.ppo import PPO
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.models.errors import InputError
-from test_learning import (
-    Recorder,
-    copy_weights,
-    elevation,
-    log_of,
-    rollout,
-    torch_net,
-    train_both,
-)
+from test_learning import copy_weights, rollout, torch_net, train_both
 
 SMALL = PPOConfig(gamma=0.5, gae_lambda=0.5, steps_per_update=3, epochs=1, minibatches=1)
 
@@ -147,11 +140,11 @@ def test_sb3_and_ours_make_the_same_updates_of_the_same_experience() -> None:
         steps_per_update=64, gamma=0.98, gae_lambda=0.95, learning_rate=0.003, ent_coef=0.01,
         critic_learning_rate=0.01, epochs=5, minibatches=1, clip=0.1, max_grad_norm=0.5,
     )  # fmt: skip
-    recorder = Recorder(elevation(episode_length=40, flight_band=1.1))
-    log = EpisodeLog(recorder, seed=0)
+    env = Kept(episode_length=40, flight_band=1.1)
+    log = EpisodeRecorder(env, seed=0)
     theirs: Any = make_agent("sb3-ppo", log, config, 0)
     ours = PPO.create(log, config, seed=1)
-    for here, there in train_both(theirs, ours, recorder, log, 512):
+    for here, there in train_both(theirs, ours, env, log, 512):
         assert here["train/clip_fraction"] == pytest.approx(there["train/clip_fraction"], abs=0.02)
         assert here["train/value_loss"] == pytest.approx(there["train/value_loss"], rel=2e-3)
         assert here["train/approx_kl"] == pytest.approx(
@@ -171,7 +164,7 @@ def test_sb3_and_ours_make_the_same_steps_of_the_same_minibatches() -> None:
         minibatches=4, ent_coef=0.01,
     )  # fmt: skip
     env: Any = LocalVectorEnv("rotorgram/Hover-v0", 4, autoreset_mode="Disabled")
-    log = EpisodeLog(env, seed=0)
+    log = EpisodeRecorder(env, seed=0)
     theirs: Any = make_agent("sb3-ppo", log, config, 0)
     ours = PPO.create(log, config, seed=1)
     assert {group["eps"] for group in theirs.model.policy.optimizer.param_groups} == {1e-5}

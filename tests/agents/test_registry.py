@@ -7,7 +7,15 @@ from typing import Annotated, Any
 
 import numpy as np
 import pytest
-from rotorgram.agents import A2CConfig, Config, EpisodeLog, find_preset, load, make_agent, store
+from rotorgram.agents import (
+    A2CConfig,
+    Config,
+    EpisodeRecorder,
+    find_preset,
+    load,
+    make_agent,
+    store,
+)
 from rotorgram.agents.a2c import A2C
 from rotorgram.agents.networks import NETWORKS, Affine, Floats, Layer, Network, Tanh
 from rotorgram.agents.registry import ALGORITHMS, Algorithm
@@ -126,7 +134,7 @@ def test_the_memory_begins_with_an_episode_and_is_kept_with_the_rollout(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setitem(NETWORKS, "recurrent", Recurrent)
-    log = EpisodeLog(vector(3), 0)
+    log = EpisodeRecorder(vector(3), 0)
     agent: Any = make_agent("a2c", log, A2CConfig(network="recurrent"), 0)
     collector = Collector(log, np.random.default_rng(0), agent.policy())
     rollouts = [collector.steps(60), collector.steps(60)]
@@ -150,7 +158,7 @@ def test_who_takes_no_memory_says_so(algorithm: str, monkeypatch: pytest.MonkeyP
     monkeypatch.setitem(NETWORKS, "recurrent", Recurrent)
     config = ALGORITHMS[algorithm].config(network="recurrent")
     with pytest.raises(InputError, match="network: expected "):
-        make_agent(algorithm, EpisodeLog(vector(), 0), config, 0)
+        make_agent(algorithm, EpisodeRecorder(vector(), 0), config, 0)
 
 
 # ---- presets

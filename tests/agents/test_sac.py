@@ -11,7 +11,7 @@ import torch
 from nets import mlp_of
 from rotorgram.agents import (
     Checkpoint,
-    EpisodeLog,
+    EpisodeRecorder,
     SACConfig,
     load,
     make_agent,
@@ -321,9 +321,9 @@ def test_the_beginning_is_uniform() -> None:
 # ---- trainings
 
 
-def elevation(drones: int, seed: int = 5) -> EpisodeLog:
+def elevation(drones: int, seed: int = 5) -> EpisodeRecorder:
     options: dict[str, Any] = {"episode_length": 30, "start_band": 0.3, "flight_band": 0.4}
-    return EpisodeLog(LocalVectorEnv(ENV, drones, autoreset_mode="Disabled", **options), seed)
+    return EpisodeRecorder(LocalVectorEnv(ENV, drones, autoreset_mode="Disabled", **options), seed)
 
 
 @pytest.mark.parametrize("drones", [1, 3])
@@ -406,7 +406,7 @@ def test_learns_to_hold_the_target() -> None:
     """A third of the preset's length: the better of two seeds comes close."""
     late = []
     for seed in (0, 1):
-        log = EpisodeLog(LocalVectorEnv(ENV, 8, autoreset_mode="Disabled"), seed)
+        log = EpisodeRecorder(LocalVectorEnv(ENV, 8, autoreset_mode="Disabled"), seed)
         agent = make_agent("sac", log, preset("sac", "tuned"), seed)
         agent.train(log, 10_000, lambda: True)
         evaluation = LocalVectorEnv(ENV, 5, autoreset_mode="Disabled")

@@ -5,8 +5,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rotorgram.agents import EpisodeLog, ResumeError, make_agent, preset
+from rotorgram.agents import EpisodeRecorder, ResumeError, make_agent, preset
 from rotorgram.agents.rollouts import Collector, Rollout
+from rotorgram.agents.sb3 import RecordedEnv
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.training.settings import Run
 from rotorgram.training.training import Training
@@ -15,9 +16,9 @@ from swarms import RISE
 SMALL = {"steps_per_update": 48, "epochs": 2, "minibatches": 2}
 
 
-def log_of(worlds: int = 1, drones: int = 2, seed: int = 0, **options: Any) -> EpisodeLog:
+def log_of(worlds: int = 1, drones: int = 2, seed: int = 0, **options: Any) -> EpisodeRecorder:
     env = LocalVectorEnv(RISE, worlds * drones, drones=drones, autoreset_mode="Disabled", **options)
-    return EpisodeLog(env, seed, keep_steps=True)
+    return EpisodeRecorder(env, seed, keep_steps=True)
 
 
 class Climbers:
@@ -34,7 +35,7 @@ class Climbers:
         return actions
 
 
-def flown(log: EpisodeLog, count: int) -> Rollout:
+def flown(log: EpisodeRecorder, count: int) -> Rollout:
     policy: Any = Climbers()
     return Collector(log, np.random.default_rng(0), policy).steps(count)
 
@@ -169,10 +170,11 @@ def test_a_training_of_other_worlds_is_not_resumed() -> None:
 
 def test_sb3_sees_zeros_of_one_that_is_out_until_its_world_ends() -> None:
     log = log_of()
-    log.reset()
+    env = RecordedEnv(log)
+    env.reset()
     ends = []
     for _ in range(30):
-        seen, rewards, terminated, truncated, info = log.step(np.array([[1.0], [0.0]]))
+        seen, rewards, terminated, truncated, info = env.step(np.array([[1.0], [0.0]]))
         ends.append((terminated | truncated).tolist())
     first = log.episodes[0].length
     assert [row[0] for row in ends] == [step + 1 in (first, 30) for step in range(30)]
@@ -181,9 +183,9 @@ def test_sb3_sees_zeros_of_one_that_is_out_until_its_world_ends() -> None:
     assert info["_final_obs"].tolist() == [True, True]
     assert seen[:, 2] == pytest.approx(10.0)  # both have begun again
 
-    log.reset()
+    env.reset()
     for _ in range(first + 1):
-        seen, rewards, *_ = log.step(np.array([[1.0], [0.0]]))
+        seen, rewards, *_ = env.step(np.array([[1.0], [0.0]]))
     assert seen[0].tolist() == [0.0, 0.0, 0.0]
     assert rewards[0] == 0.0
     assert seen[1, 2] == pytest.approx(10.0)

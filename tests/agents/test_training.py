@@ -4,10 +4,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from drones import OPTIONS, vector
 from rotorgram.agents import (
     CheckpointError,
     ResumeError,
@@ -17,16 +17,13 @@ from rotorgram.agents import (
     preset,
     store,
 )
-from rotorgram.agents.episodes import EpisodeLog
+from rotorgram.agents.episodes import EpisodeRecorder
 from rotorgram.cli import main
-from rotorgram.envs import LocalVectorEnv
 from rotorgram.flights.trajectories import evaluation_seed, fly_episodes
 from rotorgram.models.errors import InputError
 from rotorgram.training.settings import Run
 from rotorgram.training.training import Training, is_finished
 
-ENV = "rotorgram/Elevation-v0"
-OPTIONS: dict[str, Any] = {"episode_length": 30, "start_band": 0.3, "flight_band": 0.4}
 SMALL: dict[str, dict[str, int]] = {
     "vpg": {"episodes_per_update": 4},
     "a2c": {"steps_per_update": 70},
@@ -47,10 +44,7 @@ def run_of(algorithm: str, drones: int = 4, **changes: Any) -> Run:
 
 
 def env_of(run: Run, **changes: Any) -> Any:
-    options = {**run.options, **changes}
-    if run.num_envs == 1:
-        return gym.make(ENV, disable_env_checker=True, **options)
-    return LocalVectorEnv(ENV, run.num_envs, autoreset_mode="Disabled", **options)
+    return vector(run.num_envs, **{**run.options, **changes})
 
 
 def test_wrong_runs_are_one_sentence() -> None:
@@ -77,8 +71,8 @@ def test_training_and_evaluation_share_no_seed() -> None:
 
 
 def test_evaluation_flies_without_noise() -> None:
-    env = gym.make(ENV, disable_env_checker=True)
-    log = EpisodeLog(env, 0)
+    env = vector()
+    log = EpisodeRecorder(env, 0)
     policy = make_agent("a2c", log, preset("a2c", "paper"), 0).policy()
     first, second = (fly_episodes(env, policy, 2) for _ in range(2))
     for one, other in zip(first, second, strict=True):

@@ -9,50 +9,27 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-import rotorgram.envs
-import rotorgram.udp
-from nets import policy_of
-from rotorgram.agents import (
-    EpisodeLog,
-    NetworkPolicy,
-    ResumeError,
-    episode_seed,
-    make_agent,
-    preset,
-)
-from rotorgram.agents.episodes import LOST
+from drones import ENV, OPTIONS
+from drones import vector as drones_of
+from nets import random_policy
+from rotorgram.agents import EpisodeRecorder, ResumeError, episode_seed, make_agent, preset
 from rotorgram.agents.rollouts import Collector
-from rotorgram.agents.sb3 import SB3VecEnv
+from rotorgram.agents.sb3 import RecordedEnv, SB3VecEnv
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.models.errors import InputError
-from rotorgram.udp import RemoteEnv, RemoteVectorEnv, Simulator
+from rotorgram.udp import RemoteVectorEnv, Simulator
 
-ENV = "rotorgram/Elevation-v0"
 N = 5
-OPTIONS: dict[str, Any] = {"episode_length": 30, "start_band": 0.3, "flight_band": 0.4}
 
 
 def vector(drones: int = N, mode: str = "Disabled", **options: Any) -> LocalVectorEnv:
-    return LocalVectorEnv(ENV, drones, autoreset_mode=mode, **{**OPTIONS, **options})
+    return drones_of(drones, mode, **{**OPTIONS, **options})
 
 
-def single(**options: Any) -> Any:
-    return gym.make(ENV, disable_env_checker=True, **options)
-
-
-def policy(log: EpisodeLog) -> NetworkPolicy:
-    dice = np.random.default_rng(0)
-    size = log.single_observation_space.shape[0]  # type: ignore[index]
-    shapes = {"layers.0.weight": (16, size), "layers.0.bias": (16,),
-              "layers.1.weight": (log.actions.outputs, 16)}  # fmt: skip
-    weights = {k: 0.3 * dice.normal(size=s).astype(np.float32) for k, s in shapes.items()}
-    zeros = np.zeros(log.actions.outputs, np.float32)
-    return policy_of({**weights, "layers.1.bias": zeros, "log_std": zeros}, log.spec)
-
-
-def collector_of(drones: int, **options: Any) -> tuple[EpisodeLog, Collector]:
-    log = EpisodeLog(vector(drones, **options), 0)
-    return log, Collector(log, np.random.default_rng(0), policy(log))
+def collector_of(drones: int, **options: Any) -> tuple[EpisodeRecorder, Collector]:
+    log = EpisodeRecorder(vector(drones, **options), 0)
+    policy = random_policy(log.spec, size=0.3)
+    return log, Collector(log, np.random.default_rng(0), policy)
 
 
 def random_actions(dice: np.random.Generator, drones: int = N) -> np.ndarray:
@@ -68,70 +45,70 @@ def test_episode_seeds_differ_between_runs_and_episodes() -> None:
 
 
 def test_every_episode_has_the_seed_of_its_number() -> None:
-    log = EpisodeLog(vector(), seed=3)
-    log.reset()
+    log = EpisodeRecorder(vector(), seed=3)
+    env = RecordedEnv(log)
+    env.reset()
     dice = np.random.default_rng(0)
-    flown = []
-    for _ in range(100):
-        flown.append(random_actions(dice))
-        log.step(flown[-1])
+    flown = [random_actions(dice) for _ in range(100)]
+    for actions in flown:
+        env.step(actions)
     assert log.env_steps == 100 * N
     assert len(log.episodes) >= 3 * N
     numbers = [episode.episode for episode in log.episodes]
     assert sorted(numbers)[: 2 * N] == list(range(2 * N))
-    env = single(**OPTIONS)
+    again = gym.make(ENV, disable_env_checker=True, **OPTIONS)
     for episode in log.episodes:
         # Which drone flew it? The one whose actions repeat it, from the step where it began.
         first = episode.first_step // N
         matches = []
         for drone in range(N):
-            env.reset(seed=episode_seed(3, episode.episode))
+            again.reset(seed=episode_seed(3, episode.episode))
             rewards = []
             sizes = []
-            for actions in flown[first : first + episode.length]:
-                _, reward, terminated, truncated, info = env.step(actions[drone])
+            ended = False
+            while not ended and len(rewards) < episode.length:
+                action = flown[first + len(rewards)][drone]
+                _, reward, terminated, truncated, info = again.step(action)
                 rewards.append(reward)
                 sizes.append(abs(info["elevation_error"]))
-                if terminated or truncated:
-                    break
-            if len(rewards) == episode.length and terminated == episode.terminated:
+                ended = terminated or truncated
+            if ended and len(rewards) == episode.length:
                 matches.append((sum(rewards), np.mean(sizes)))
         got = episode.total_reward, episode.mean_size
         assert any(got == pytest.approx(match, rel=1e-9) for match in matches)
         assert episode.truncated != episode.terminated
 
 
-def test_the_log_of_one_drone_and_of_many_keep_the_same() -> None:
-    logs = [EpisodeLog(env, seed=5, keep_steps=True) for env in (single(**OPTIONS), vector(1))]
+def test_kept_steps_are_those_of_the_episodes() -> None:
+    log = EpisodeRecorder(vector(1), seed=5, keep_steps=True)
     dice = np.random.default_rng(1)
-    actions = [random_actions(dice, 1) for _ in range(70)]
-    for log in logs:
-        log.start()
-        for action in actions:
-            log.fly(action)
-            if log.env.terminated[0] or log.env.truncated[0]:
-                log.begin(np.ones(1, bool))
-    one, other = (log.steps() for log in logs)
-    for name, column in one.items():
-        assert column.tobytes() == other[name].tobytes()
-    assert one["value"].shape == (70,)
-    first = logs[0].episodes[0]
+    first_action = random_actions(dice, 1)
+    log.start()
+    log.fly(first_action)
+    for _ in range(69):
+        if log.done[0]:
+            log.begin(log.done)
+        log.fly(random_actions(dice, 1))
+    steps = log.steps()
+    assert steps["value"].shape == (70,)
+    first = log.episodes[0]
     assert first.episode == 0
     assert first.first_step == 0
-    assert one["episode"].tolist().count(0) == first.length
-    own = one["episode"] == 0
-    assert first.total_reward == pytest.approx(one["reward"][own].sum(), rel=1e-5)
-    assert first.mean_size == pytest.approx(np.abs(one["value"][own]).mean(), rel=1e-5)
-    assert one["thrust"][0] == pytest.approx(49 + 5 * actions[0][0, 0], rel=1e-6)
+    own = steps["episode"] == 0
+    assert own.sum() == first.length
+    assert first.total_reward == pytest.approx(steps["reward"][own].sum(), rel=1e-5)
+    assert first.mean_size == pytest.approx(np.abs(steps["value"][own]).mean(), rel=1e-5)
+    assert steps["thrust"][0] == pytest.approx(49 + 5 * first_action[0, 0], rel=1e-6)
 
 
-def test_a_step_is_gymnasiums_same_step() -> None:
-    log = EpisodeLog(vector(), seed=0)
-    log.reset()
+def test_a_step_for_sb3_is_gymnasiums_same_step() -> None:
+    log = EpisodeRecorder(vector(), seed=0)
+    env = RecordedEnv(log)
+    env.reset()
     dice = np.random.default_rng(0)
     ended = 0
     for _ in range(60):
-        observations, rewards, terminated, truncated, info = log.step(random_actions(dice))
+        observations, rewards, terminated, truncated, info = env.step(random_actions(dice))
         if (terminated | truncated).any():
             ends = info["_final_obs"]
             ended += int(ends.sum())
@@ -145,35 +122,32 @@ def test_a_step_is_gymnasiums_same_step() -> None:
     assert ended > N
 
 
+@pytest.mark.parametrize("steps", [0, 1, 37])
 @pytest.mark.parametrize("drones", [1, 4])
-def test_resuming_brings_every_drone_to_where_it_was(drones: int) -> None:
-    def env() -> Any:
-        return single(**OPTIONS) if drones == 1 else vector(drones)
-
-    for steps in (0, 1, 37):
-        first = EpisodeLog(env(), 1)
-        second = EpisodeLog(env(), 1)
-        dice = np.random.default_rng(7)
-        first.reset()
-        for _ in range(steps):
-            first.step(random_actions(dice, drones))
-        second.resume(first.position())
-        for _ in range(45):
-            actions = random_actions(dice, drones)
-            for ours, theirs in zip(first.step(actions)[:4], second.step(actions)[:4], strict=True):
-                assert ours.tobytes() == theirs.tobytes()
-        kept = [[replace(e, seconds=0.0) for e in log.episodes] for log in (first, second)]
-        assert kept[0] == kept[1]
-
-
-def test_resuming_elsewhere_is_refused() -> None:
-    first = EpisodeLog(vector(2), 1)
+def test_resuming_brings_every_drone_to_where_it_was(drones: int, steps: int) -> None:
+    logs = [EpisodeRecorder(vector(drones), 1) for _ in range(2)]
+    first, second = map(RecordedEnv, logs)
+    dice = np.random.default_rng(7)
     first.reset()
+    for _ in range(steps):
+        first.step(random_actions(dice, drones))
+    logs[1].resume(logs[0].position())
+    for _ in range(45):
+        actions = random_actions(dice, drones)
+        for ours, theirs in zip(first.step(actions)[:4], second.step(actions)[:4], strict=True):
+            assert ours.tobytes() == theirs.tobytes()
+    kept = [[replace(e, seconds=0.0) for e in log.episodes] for log in logs]
+    assert kept[0] == kept[1]
+
+
+@pytest.mark.parametrize("changes", [{"effects": {"linear_drag": 0.1}}, {"episode_length": 5}])
+def test_resuming_elsewhere_is_refused(changes: dict[str, Any]) -> None:
+    log = EpisodeRecorder(vector(2), 1)
+    log.start()
     for _ in range(10):
-        first.step(np.full((2, 1), 0.1))
-    for changes in ({"effects": {"linear_drag": 0.1}}, {"episode_length": 5}):
-        with pytest.raises(ResumeError, match="does not repeat the episodes"):
-            EpisodeLog(vector(2, **changes), 1).resume(first.position())
+        log.fly(np.full((2, 1), 0.1, np.float32))
+    with pytest.raises(ResumeError, match="does not repeat the episodes"):
+        EpisodeRecorder(vector(2, **changes), 1).resume(log.position())
 
 
 class Losing(LocalVectorEnv):
@@ -196,13 +170,14 @@ class Losing(LocalVectorEnv):
 def test_a_simulator_lost_while_others_begin() -> None:
     env = Losing(ENV, 4, autoreset_mode="Disabled", **OPTIONS)
     # With this seed the first drone's episode ends alone, while both drones of the second half fly.
-    log = EpisodeLog(env, 3)
-    log.reset()
+    log = EpisodeRecorder(env, 3)
+    same_step = RecordedEnv(log)
+    same_step.reset()
     dice = np.random.default_rng(0)
     seen = False
     for step in range(80):
         env.armed = step > 5 and not seen
-        observations, _, terminated, truncated, info = log.step(random_actions(dice, 4))
+        observations, _, terminated, truncated, info = same_step.step(random_actions(dice, 4))
         if step > 5 and not seen and not env.armed:
             seen = True
             # The frozen drones are truncated too, and begin anew.
@@ -257,21 +232,6 @@ def test_episodes_are_broken_off_where_the_training_ends() -> None:
         assert log.env_steps == flown
 
 
-# ---- other tasks
-
-
-def test_many_numbers_to_see_and_to_act() -> None:
-    """Hover-v0 has four actions; the log knows its metric by name."""
-    log = EpisodeLog(gym.make("rotorgram/Hover-v0", episode_length=20), 0, keep_steps=True)
-    rollout = Collector(log, np.random.default_rng(0), policy(log)).steps(50)
-    assert rollout.actions.shape == (50, 1, 4)
-    assert log.episodes
-    steps = log.steps()
-    own = steps["value"][steps["episode"] == 0]
-    assert log.episodes[0].mean_size == pytest.approx(own.mean(), rel=1e-5)
-    assert (own >= 0).all()
-
-
 # ---- Stable-Baselines3
 
 
@@ -309,26 +269,17 @@ def test_sb3_wants_same_step() -> None:
 
 
 @contextmanager
-def remote(simulators: int, drones: int) -> Iterator[Any]:
-    """A vector env whose drones are flown by simulators in threads; one drone is a `RemoteEnv`."""
-    options: dict[str, Any] = {"connect": False, "connect_timeout": 20, "timeout": 20}
+def remote(simulators: int, drones: int) -> Iterator[RemoteVectorEnv]:
+    """A vector env whose drones are flown by simulators in threads."""
+    here = ("127.0.0.1", 0)
+    env = RemoteVectorEnv(
+        here, num_simulators=simulators, num_envs=simulators * drones, autoreset_mode="Disabled",
+        connect=False, connect_timeout=20, timeout=20,
+    )  # fmt: skip
     with ExitStack() as stack:
-        env: Any
-        if simulators * drones == 1:
-            env = RemoteEnv(("127.0.0.1", 0), **options)
-        else:
-            env = RemoteVectorEnv(
-                ("127.0.0.1", 0),
-                num_simulators=simulators,
-                num_envs=simulators * drones,
-                autoreset_mode="Disabled",
-                **options,
-            )
         stack.callback(env.close)
         for _ in range(simulators):
-            simulator = Simulator(
-                ENV, server=env.address, bind=("127.0.0.1", 0), num_envs=drones, **OPTIONS
-            )
+            simulator = Simulator(ENV, server=env.address, bind=here, num_envs=drones, **OPTIONS)
             thread = Thread(target=simulator.run)
             thread.start()
             stack.callback(simulator.close)
@@ -340,21 +291,16 @@ def remote(simulators: int, drones: int) -> Iterator[Any]:
 
 @pytest.mark.parametrize(("simulators", "drones"), [(1, 1), (2, 2)])
 def test_over_udp_the_training_is_the_same_and_goes_on(simulators: int, drones: int) -> None:
-    config: Any = preset("a2c", "tuned", steps_per_update=64)
-    count = simulators * drones
-    here = EpisodeLog(single(**OPTIONS) if count == 1 else vector(count), 1)
+    config = preset("a2c", "tuned", steps_per_update=64)
+    here = EpisodeRecorder(vector(simulators * drones), 1)
     agent = make_agent("a2c", here, config, 1)
     agent.train(here, 512, lambda: True)
     with remote(simulators, drones) as env:
-        there = EpisodeLog(env, 1)
+        there = EpisodeRecorder(env, 1)
         other = make_agent("a2c", there, config, 1)
         other.train(there, 512, lambda: True)
         for name, weight in agent.actor().items():
             assert weight.tobytes() == other.actor()[name].tobytes()
-        again = EpisodeLog(env, 1)
+        again = EpisodeRecorder(env, 1)
         again.resume(here.position())
         assert again.position().observations.tobytes() == here.observations.tobytes()
-
-
-def test_the_name_of_a_loss_is_that_of_the_wire() -> None:
-    assert LOST == rotorgram.udp.LOST

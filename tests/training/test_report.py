@@ -31,7 +31,7 @@ from rotorgram.training.report import VIDEO_FILE, write_report
 from rotorgram.training.results import COLUMNS, Results, write_config
 from rotorgram.training.settings import EnvConfig, Row, Study
 from rotorgram.training.statistics import share_interval
-from rotorgram.training.swarms import GOAL, POSITION, least_distances, rows_of, worlds
+from rotorgram.training.study import least_distance
 from rotorgram.training.tables import (
     headings,
     markdown,
@@ -213,22 +213,20 @@ def test_names_and_colours_of_rows() -> None:
 def test_a_fan_is_of_the_quantiles_of_windows() -> None:
     steps = pd.DataFrame({"step": range(1, 101), "value": [0.0] * 50 + [1.0] * 50})
     fan = value_fan(steps)
-    assert len(fan.x) == 2
-    assert fan.middle.tolist() == [0.0, 1.0]
-    assert fan.low[0] == 0.0
-    assert fan.high[1] == 1.0
+    assert fan.index.tolist() == [25.25, 75.75]
+    assert fan[0.5].tolist() == [0.0, 1.0]
+    assert fan[0.05].iloc[0] == 0.0
+    assert fan[0.95].iloc[1] == 1.0
 
 
-def test_drones_of_an_episode_are_trajectories_of_their_own() -> None:
-    flights = [(0, 0, 3), (0, 0, 2), (0, 1, 2), (0, 1, 2)]  # seed, episode, steps
-    parts = [
-        pd.DataFrame({"seed": seed, "episode": episode, "step": range(1, steps + 1), "value": 1.0})
-        for seed, episode, steps in flights
-    ]
+def test_a_trajectory_is_an_episode_of_a_seed() -> None:
+    parts = []
+    for seed, episode, steps in ((0, 0, 3), (0, 1, 2), (1, 0, 2)):
+        one = {"seed": seed, "episode": episode, "step": range(1, steps + 1), "value": 1.0}
+        parts.append(pd.DataFrame(one))
     shown = trajectories(pd.concat(parts), 0.5)
-    assert sorted(time.tolist() for time, _ in shown) == [
-        [0.5, 1.0], [0.5, 1.0], [0.5, 1.0], [0.5, 1.0, 1.5],
-    ]  # fmt: skip
+    times = sorted(time.tolist() for time, _ in shown)
+    assert times == [[0.5, 1.0], [0.5, 1.0], [0.5, 1.0, 1.5]]
 
 
 def test_learning_curves_are_interquartile_means_of_seeds() -> None:
@@ -351,44 +349,22 @@ def test_the_nearest_other_of_each_drone_that_flies() -> None:
     np.testing.assert_array_equal(least(line(0.0, NAN)), [NAN])
 
 
-def positions(*episodes: list[list[float]], row: str = "ippo", seed: int = 0) -> pd.DataFrame:
-    """Rows of episodes, of each drone its X after each step; the goals are at X = 5 m."""
-    rows = [
-        {"row": row, "seed": seed, "episode": episode, "drone": drone, "step": step}
-        | dict(zip((*POSITION, *GOAL), (x, 10.0, 0.0, 5.0, 10.0, 0.0), strict=True))
-        for episode, world in enumerate(episodes)
-        for drone, xs in enumerate(world)
-        for step, x in enumerate(xs)
-    ]
-    return pd.DataFrame(rows)
+def flown(episode: int, *xs: float) -> Trajectory:
+    """A drone of a world of two, at these X after each step."""
+    spec = replace(spec_of(), agents=("left", "right"))
+    where = np.array([(x, 10.0, 1.0) for x in xs])
+    steps = len(xs) - 1
+    return Trajectory(
+        spec=spec, telemetry={"position": where}, rewards=np.zeros(steps),
+        actions=np.zeros((steps, 1)), ending="terminated", episode=episode,
+    )  # fmt: skip
 
 
-def test_the_least_distance_is_that_of_all_episodes_of_a_seed() -> None:
-    rows = [positions([[0.0, 0.0], [4.0, 3.0]], [[0.0, 0.0], [2.0, 5.0]])]  # at the least 2 m
-    rows += [positions([[0.0], [4.0]], seed=1), positions([[0.0], [7.0]], row="orca")]
-    table = least_distances(pd.concat(rows))
-    assert table["least_distance"].to_dict() == {"ippo": 3.0, "orca": 7.0}
-    assert table.loc["ippo", "least_distance_low"] == 2.0
-    assert np.isnan(table.loc["orca", "least_distance_low"])  # one seed has no interval
-
-
-def test_rows_of_trajectories_give_the_worlds_back() -> None:
-    spec = spec_of()
-    spec = type(spec)(**(vars(spec) | {"agents": ("drone_0", "drone_1")}))
-
-    def flown(*xs: float) -> Trajectory:
-        where = np.array([(x, 10.0, 1.0) for x in xs])
-        telemetry = {"position": where, "goal": where + 1.0}
-        steps = len(xs) - 1
-        return Trajectory(spec=spec, telemetry=telemetry, rewards=np.zeros(steps),
-                          actions=np.zeros((steps, 1)), ending="terminated", episode=7)  # fmt: skip
-
-    rows = rows_of([flown(0.0, 1.0, 2.0), flown(4.0, 5.0)]).assign(row="ippo", seed=3)
-    ((key, world),) = worlds(rows)
-    assert key == ("ippo", 3, 7)
-    np.testing.assert_array_equal(world.position[:, 0, 0], [0.0, 1.0, 2.0])
-    np.testing.assert_array_equal(world.position[:, 1, 0], [4.0, 5.0, NAN])
-    assert world.goal[1, 1].tolist() == [6.0, 11.0, 2.0]
+def test_the_least_distance_is_that_of_all_episodes_while_both_fly() -> None:
+    apart = [flown(0, 0.0, 0.0, 0.0), flown(0, 4.0, 3.0, 3.5)]
+    near = [flown(1, 0.0, 0.0, 5.0), flown(1, 2.0, 5.0)]  # the second has ended where both are at 5
+    assert least_distance(apart) == 3.0
+    assert least_distance([*apart, *near]) == 2.0
 
 
 def test_the_middle_seed_and_the_furthest_start_are_shown() -> None:
@@ -400,35 +376,28 @@ def test_the_middle_seed_and_the_furthest_start_are_shown() -> None:
 
 @pytest.fixture(scope="module")
 def swarm(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Results of two drones that fly past each other, with agents that were compared."""
+    """Results of worlds of two drones, with agents that were compared."""
     env = EnvConfig(env_id="rotorgram/Formation-v0", drones=2, vehicle="crazyflie2")
     rows = tuple(Row(agent=agent, name=agent, env=env) for agent in ("ippo", "mappo"))
     study = Study(rows=rows, seeds=2)
     folder = synthetic_folder(tmp_path_factory.mktemp("swarm") / "results", study=study)
-    content = json.loads((folder / "config.json").read_text())
-    for spec in content["specs"].values():
-        spec["agents"] = ["left", "right"]
-    (folder / "config.json").write_text(json.dumps(content))
-    there = np.linspace(0.0, 4.0, 21).tolist()
-    episode = [there, [5.0 - x for x in there]]  # at X = 2.4 and 2.6 m they are nearest
-    flown = [positions(*[episode] * 3, row=row.name, seed=seed) for row in rows for seed in (0, 1)]
-    pd.concat(flown).to_parquet(folder / "positions.parquet", index=False)
+    runs = pd.read_csv(folder / "runs.csv")
+    runs.assign(least_distance=[0.1, 0.3, 0.2, 0.2]).to_csv(folder / "runs.csv", index=False)
     write_report(Results.read(folder))
     return folder
 
 
 def test_a_swarm_has_the_least_distance_in_place_of_the_overshoot(swarm: Path) -> None:
-    results = Results.read(swarm)
-    table = results_table(results)
+    table = results_table(Results.read(swarm))
     assert table["least_distance"].to_dict() == pytest.approx({"ippo": 0.2, "mappo": 0.2})
+    assert table.loc["ippo", "least_distance_low"] == 0.1
     assert headings(HEADLINE, swarm=True)[5] == "Least distance (m)"
     text = (swarm / "results.md").read_text(encoding="utf-8")
     assert "| Least distance (m) |" in text
     assert "| 0.20 (0.20 to 0.20) |" in text
     assert "Overshoot" not in text
     assert not (swarm / "claims.json").exists()
-    names = {path.name for path in (swarm / "figures").glob("*.svg")}
-    assert names == {"comparison.svg", "swarm.svg"}
+    assert [path.name for path in (swarm / "figures").glob("*.svg")] == ["comparison.svg"]
 
 
 def test_the_film_shows_the_middle_seed_of_each_row(

@@ -10,10 +10,7 @@ from rotorgram.training.statistics import (
     improvement_interval,
     iqm,
     probability_of_improvement,
-    seeds_to_decide,
-    seeds_to_decide_share,
     share_interval,
-    trimmed_mean,
 )
 
 # Scores of seven runs on two tasks of two agents, and what rliable 1.2.0 (with arch 7.2.0) gives
@@ -21,7 +18,6 @@ from rotorgram.training.statistics import (
 # `create_performance_profile`, `probability_of_improvement`.
 FIRST = [[0.9, 0.7, 0.8, 0.3, 0.6, 0.85, 0.65], [0.2, 0.4, 0.1, 0.5, 0.6, 0.35, 0.45]]
 SECOND = [[0.5, 0.55, 0.8, 0.2, 0.4, 0.45, 0.6], [0.3, 0.4, 0.2, 0.15, 0.25, 0.05, 0.7]]
-THRESHOLDS = [0.0, 0.2, 0.45, 0.6, 0.8]
 
 
 def test_interquartile_means_and_stratified_intervals_are_those_of_rliable():
@@ -54,31 +50,6 @@ def test_a_level_of_its_own_widens_an_interval():
     assert lowest < low < high < highest
 
 
-def test_seeds_that_decide_a_difference():
-    # Normal samples of standard deviation 1 around 0 and 0.5, forty of each. The interquartile
-    # mean of a normal sample has about 1.19 times the variance of its mean, so the textbook's
-    # number is (1.960 + 0.842)² · 2 · 1.19 / 0.5² = 74.7 of each.
-    dice = np.random.default_rng(0)
-    found = []
-    for _ in range(40):
-        first = dice.normal(0.0, 1.0, 40)
-        second = dice.normal(0.0, 1.0, 40)
-        second += iqm(first) - iqm(second) - 0.5  # the very difference
-        number, fewest = seeds_to_decide(first, second)
-        assert 1 <= fewest < number
-        found.append(number)
-    assert np.median(found) == pytest.approx(74.7, rel=0.1)
-    assert seeds_to_decide([1.0, 2.0] * 5, [1.0, 2.0] * 5)[0] == math.inf
-    # Four times the seeds of one agent tell the same variance of its seeds, and the same number.
-    first = dice.normal(0.0, 1.0, 40)
-    second = dice.normal(0.5, 1.0, 40)
-    many = np.tile(second, 4)
-    assert seeds_to_decide(first, many)[0] == pytest.approx(
-        seeds_to_decide(first, second)[0], rel=0.1
-    )
-    assert all(math.isnan(number) for number in seeds_to_decide([1.0], [2.0, 3.0]))
-
-
 def test_wilsons_intervals_of_shares():  # fault 66
     # Of n out of n it begins at n / (n + z²), z = 1.96, and of none it is the mirror image.
     assert share_interval(50, 50) == (pytest.approx(50 / 53.8415, rel=1e-5), 1.0)
@@ -93,20 +64,6 @@ def test_an_improvement_at_the_boundary_has_wilsons_interval():  # fault 66
     low, high = improvement_interval([[4.0, 5.0, 6.0]], [[1.0, 2.0, 3.0]])
     assert low == pytest.approx(3 / 6.8415, rel=1e-5)
     assert high == 1.0
-
-
-def test_seeds_that_decide_a_share():
-    # All hold: n / (n + z²) > 0.9 from n = 9 z² on, 56.2 at 98.75 % and 34.6 at 95 %.
-    assert seeds_to_decide_share(1.0, 0.9, 0.9875) == 57
-    assert seeds_to_decide_share(1.0, 0.9) == 35
-    assert seeds_to_decide_share(0.0, 0.9) == 1  # z² / (1 + z²) is 0.79
-    assert seeds_to_decide_share(0.9, 0.9) == math.inf
-    # A share between: the number decides with 80 % or more, by a count of flips of a coin.
-    count = int(seeds_to_decide_share(0.8, 0.9))
-    coins = np.random.default_rng(1).binomial(count, 0.8, 4000)
-    intervals = {coin: share_interval(coin, count) for coin in np.unique(coins).tolist()}
-    decided = [not intervals[coin][0] <= 0.9 <= intervals[coin][1] for coin in coins.tolist()]
-    assert 0.78 < np.mean(decided) < 0.86
 
 
 def test_iqm_cuts_a_quarter_from_each_end():
@@ -141,9 +98,3 @@ def test_bootstrap_difference():
     assert difference == -1.0
     assert math.isnan(low)
     assert math.isnan(high)
-
-
-def test_the_trimmed_mean_leaves_a_quarter_out_at_each_end():
-    assert trimmed_mean(np.array([1.0, 2.0, 6.0])) == 3.0
-    assert trimmed_mean(np.array([100.0, 2.0, 4.0, -100.0])) == 3.0
-    assert trimmed_mean(np.array([[0.0, 8.0], [2.0, 4.0]]), axis=0).tolist() == [1.0, 6.0]

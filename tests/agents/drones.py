@@ -1,0 +1,71 @@
+"""Vector envs that the agents' tests train in."""
+
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from rotorgram.agents import EpisodeRecorder
+from rotorgram.envs import LocalVectorEnv
+from rotorgram.envs.autoreset import AdvancingVectorEnv
+from rotorgram.envs.spec import ArraySpec, EnvSpec
+from scripted import spec_of
+
+ENV = "rotorgram/Elevation-v0"
+OPTIONS: dict[str, Any] = {"episode_length": 30, "start_band": 0.3, "flight_band": 0.4}
+"""Short episodes, some of which crash."""
+ONE = ArraySpec(name="action", shape=(1,), low=-1.0, high=1.0)
+LINE = spec_of(ONE, [ArraySpec(name="observation", shape=(1,), low=-1.0, high=1.0)])
+
+
+def vector(drones: int = 1, mode: str = "Disabled", **options: Any) -> LocalVectorEnv:
+    return LocalVectorEnv(ENV, drones, autoreset_mode=mode, **options)
+
+
+class Constant(AdvancingVectorEnv):
+    """One drone with reward 1 at every step, whatever is done; its episodes have 8 steps."""
+
+    def __init__(self, ending: str = "end", spec: EnvSpec = LINE) -> None:
+        self.closed = False
+        self._take_spec(spec, 1, AutoresetMode.DISABLED)
+        self._ending = ending
+        self._steps = 0
+        self.flown: list[float] = []
+        self.observations = np.zeros((1, 1), np.float32)
+        self.telemetry = {"metrics": np.full((1, 1), 0.5)}
+        self.lost = np.zeros(1, bool)
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        self.advance(None, np.ones(1, bool))
+        return self.observations, {}
+
+    def advance(
+        self, actions: Any, resets: Any = None, seeds: Any = None, frozen: Any = None
+    ) -> None:
+        begins = resets is not None and resets[0]
+        if begins:
+            self._steps = 0
+        else:
+            self._steps += 1
+            self.flown.append(float(actions[0, 0]))
+        over = self._steps == 8
+        self.rewards = np.array([0.0 if begins else 1.0])
+        self.terminated = np.array([over and self._ending == "end"])
+        self.truncated = np.array([over and self._ending == "limit"])
+
+
+class Kept(LocalVectorEnv):
+    """One drone that keeps what every step returned."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(ENV, autoreset_mode="Disabled", **options)
+        self.results: list[Any] = []
+
+    def advance(self, actions: Any, resets: Any = None, *rest: Any) -> None:
+        super().advance(actions, resets, *rest)
+        if resets is None:
+            numbers = self.rewards[0], self.terminated[0], self.truncated[0]
+            self.results.append((self.observations[0], *numbers))
+
+
+def log_of(ending: str = "end") -> EpisodeRecorder:
+    return EpisodeRecorder(Constant(ending), seed=0)
