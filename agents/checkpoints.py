@@ -136,14 +136,14 @@ def store(checkpoint: Checkpoint, path: Path) -> None:
         if not _is_finite(name, array):
             raise CheckpointError(f"checkpoint: training diverged, {name} is not finite")
         arrays[name] = np.array(array, order="C")
-    meta = _Meta(
-        format=FORMAT,
-        spec=checkpoint.spec.to_json(),
-        position={"env_steps": where.env_steps, "seconds": where.seconds},
+    meta = {
+        "format": FORMAT,
         **{name: getattr(checkpoint, name) for name in _PLAIN},
-    )
+        "spec": checkpoint.spec.to_json(),
+        "position": {"env_steps": where.env_steps, "seconds": where.seconds},
+    }
     numpy = require("safetensors.numpy", "train", "writing checkpoints")
-    text = {"rotorgram": json.dumps(vars(meta)), "sha256": "0" * 64}
+    text = {"rotorgram": json.dumps(meta), "sha256": "0" * 64}
     data: bytes = numpy.save(arrays, metadata=text)
     write_whole(path, _with_checksum(data, hashlib.sha256(data).hexdigest().encode()))
 
