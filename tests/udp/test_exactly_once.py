@@ -18,6 +18,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import pytest
 from peers import ANY, ENV_ID, launch
 from relay import FaultConfig, Relay, relaying
 from rotorgram.envs.config import EnvConfig
@@ -124,46 +125,32 @@ def assert_same_flight(remote: gym.Env, steps: int) -> int:
     return states
 
 
-def test_one_drone() -> None:
-    with RemoteEnv(ANY, connect=False) as remote:
-        with relaying(remote.address, BAD) as relay, simulating(relay.address) as process:
-            states = assert_same_flight(remote, 1000)
-            remote.close()
-            last, counters = its_end(process)
-        assert last == states
-        assert_bad(relay, remote.statistics.counters, counters)
-        assert remote.statistics.counters["sessions"] == 1
-
-
-def test_one_drone_by_text() -> None:
-    # A changed text is another text: against that there is UDP's own checksum, and nothing more.
-    lossy = FaultConfig(drop=0.3, duplicate=0.1, reorder=0.2, reorder_by=0.001)
-    with RemoteEnv(ANY, env_id=ENV_ID, connect=False, options=OPTIONS) as remote:
-        with (
-            relaying(remote.address, lossy) as relay,
-            simulating(relay.address, codec="text") as process,
-        ):
-            states = assert_same_flight(remote, 300)
-            remote.close()
-            last, counters = its_end(process)
-        assert last == states
-        assert_bad(relay, remote.statistics.counters, counters)
-
-
-def test_one_drone_with_a_key(tmp_path: Path) -> None:
-    key = tmp_path / "key"
-    write_key(key)
-    with RemoteEnv(ANY, connect=False, key_file=key) as remote:
-        with (
-            relaying(remote.address, BAD) as relay,
-            simulating(relay.address, key_file=str(key)) as process,
-        ):
-            states = assert_same_flight(remote, 300)
-            remote.close()
-            last, counters = its_end(process)
-        assert last == states
-        assert_bad(relay, remote.statistics.counters, counters)
-        assert min(counters["forged"], remote.statistics.counters["forged"]) > 0
+@pytest.mark.parametrize(("kind", "steps"), [("binary", 1000), ("text", 300), ("key", 300)])
+def test_one_drone(kind: str, steps: int, tmp_path: Path) -> None:
+    faults = BAD
+    settings: dict[str, Any] = {}
+    arguments: dict[str, str] = {}
+    if kind == "text":
+        # A changed text is another text: against that there is UDP's own checksum, and no more.
+        faults = FaultConfig(drop=0.3, duplicate=0.1, reorder=0.2, reorder_by=0.001)
+        settings = {"env_id": ENV_ID, "options": OPTIONS}
+        arguments = {"codec": "text"}
+    if kind == "key":
+        write_key(tmp_path / "key")
+        arguments = settings = {"key_file": str(tmp_path / "key")}
+    with (
+        RemoteEnv(ANY, connect=False, **settings) as remote,
+        relaying(remote.address, faults) as relay,
+        simulating(relay.address, **arguments) as process,
+    ):
+        states = assert_same_flight(remote, steps)
+        remote.close()
+        last, counters = its_end(process)
+    assert last == states
+    assert_bad(relay, remote.statistics.counters, counters)
+    assert remote.statistics.counters["sessions"] == 1
+    forged = min(counters["forged"], remote.statistics.counters["forged"])
+    assert (forged > 0) == (kind == "key")
 
 
 # ---- many

@@ -35,7 +35,6 @@ from rotorgram.envs.spec import EnvSpec
 from rotorgram.models.errors import InputError
 from rotorgram.udp import (
     LinkConfig,
-    PeerClosed,
     PeerSilent,
     Refused,
     RemoteEnv,
@@ -442,28 +441,6 @@ def test_a_missing_command_is_noticed(flight: SimpleNamespace, tmp_path: Path) -
 
 
 # ---- sessions
-
-
-def test_simulators_that_come_and_go(tmp_path: Path) -> None:
-    path = tmp_path / "agent.mcap"
-    remote = RemoteEnv(ANY, connect=False, record=path, **TIMES)
-    own = []
-    for number in range(3):
-        own.append(tmp_path / f"{number}.mcap")
-        simulator = Simulator(server=remote.address, bind=ANY, config=QUICK, record=own[-1])
-        running = Running(simulator)
-        fly(remote, 30, seed=number)
-        simulator.link.close("enough", time.monotonic())
-        with pytest.raises(PeerClosed):
-            fly(remote, 1)
-        running.join()
-    remote.close()
-    summary = Summary(path)
-    assert [s.steps for s in summary.sessions] == [30, 30, 30]
-    assert len({s.session.hello.session for s in summary.sessions}) == 3
-    assert all(s.ending.startswith("closed") for s in summary.sessions)
-    assert Verification(path).identical
-    assert all(Verification(file).identical for file in own)
 
 
 def test_text_simulators_one_after_another_are_sessions_of_their_own(tmp_path: Path) -> None:

@@ -201,27 +201,6 @@ def test_a_repeat_is_the_same_bytes_and_gets_the_same_answer(sealed: bool) -> No
     assert server.statistics.counters["duplicate"] == 3
 
 
-@pytest.mark.parametrize("seed", range(4))
-@BOTH
-def test_each_command_is_stepped_once_on_a_bad_wire(seed: int, sealed: bool) -> None:
-    import random
-
-    dice = random.Random(seed)
-
-    def fate(datagram: bytes) -> list[tuple[float, bytes]]:
-        raw = bytearray(datagram)
-        if dice.random() < 0.1:
-            raw[dice.randrange(len(raw))] ^= 1 << dice.randrange(8)
-        copies = dice.choices([0, 1, 2], [0.3, 0.5, 0.2])[0]
-        return [(dice.choice([0.001, 0.004, 0.3]), bytes(raw)) for _ in range(copies)]
-
-    patient = LinkConfig(timeout=1000)
-    pair = Pair(simulator(sealed=sealed, config=patient), agent(sealed=sealed), fate)
-    pair.run(150)
-    assert pair.steps == [float(i + 1) for i in range(150)]
-    assert pair.seen == [float(i) for i in range(len(pair.seen))]
-
-
 def test_no_resend_on_a_clean_wire_and_few_on_one_that_slows_down() -> None:  # fault 16
     delay = [1e-4]
     pair = Pair(simulator(), agent(), lambda datagram: [(delay[0], datagram)])

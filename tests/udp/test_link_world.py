@@ -278,26 +278,6 @@ def test_a_clean_network_repeats_nothing() -> None:
 # ---- restarts
 
 
-@pytest.mark.parametrize("codec", ["binary", "sealed"])
-@pytest.mark.parametrize("seed", range(4))
-def test_an_agent_that_is_started_again_goes_on(seed: int, codec: str) -> None:
-    world = World(bad(seed), codec=codec, simulators=3)
-    dice = random.Random(seed)
-    for _ in range(4):
-        world.run_steps(dice.randrange(12))
-        before = {p.address: p.session for p in world.physics}
-        told = [p.link.statistics.take_notices() for p in world.physics]
-        world.start_agent()
-        world.run_steps(10, most=200)
-        world.check()
-        told = [p.link.statistics.take_notices() for p in world.physics]
-        for physics, notices in zip(world.physics, told, strict=True):
-            if physics.session != before[physics.address]:
-                assert any("the agent does not know this session" in notice for notice in notices)
-    assert all(len(p.steps) > 1 for p in world.physics)
-    assert not any(p.ended for p in world.physics)
-
-
 def test_a_clean_restart_of_the_agent_costs_one_message_more() -> None:
     world = World(clean, codec="sealed")
     world.run_steps(10)
@@ -334,42 +314,6 @@ def test_a_simulator_that_is_started_again_has_its_place_back(seed: int, codec: 
         assert [p.session for p in others] == sessions  # it is nobody else's business
         assert begun < world.now
     assert not any(p.ended for p in world.physics)
-
-
-def test_a_clean_restart_of_the_simulator_takes_its_place_at_state_1() -> None:
-    world = World(clean, codec="sealed")
-    world.run_steps(10)
-    (old,) = world.joined
-    world.start_simulator(world.physics[0].address)
-
-    def superseded() -> bool:
-        session = world.agent.slots[0]
-        assert session is not None
-        return session.number != old
-
-    begun = world.now
-    world.run(superseded, most=1.0)
-    assert world.now - begun == pytest.approx(0.003)  # Hello, Welcome, State 1
-    assert len(world.joined) == 2
-    world.run_steps(10)
-    world.check()
-
-
-@pytest.mark.parametrize("fate", [clean, bad(1)], ids=["clean", "bad"])
-@pytest.mark.parametrize("codec", ["binary", "sealed"])
-def test_a_simulator_at_another_address_waits_until_the_place_is_free(
-    codec: str, fate: Fate
-) -> None:
-    world = World(fate, codec=codec)
-    world.run_steps(10)
-    world.physics.clear()
-    physics = world.start_simulator(("10.0.0.2", 5))
-    begun = world.now
-    world.run(lambda: bool(world.joined[1:]), most=60)
-    assert world.now - begun > SILENCE - 5
-    assert "every slot" in physics.link.statistics.take_notices()[0]
-    world.run_steps(10, most=200)
-    world.check()
 
 
 @pytest.mark.parametrize("codec", ["binary", "sealed"])

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 from links import HERE, NONCE, hello, layout
+from rotorgram.models.errors import InputError
 from rotorgram.udp.protocol import binary
 from rotorgram.udp.protocol.client import Client, LinkConfig
 from rotorgram.udp.protocol.errors import LinkError, PeerSilent, Refused
@@ -34,6 +35,7 @@ class World:
         self.telemetry: dict[str, Any] = {}
         self.flown: list[list[float]] = []
         self.seeds: list[list[int] | None] = []
+        self.can_land = True
         self.landed = self.retired = np.zeros(2, bool)
 
     @property
@@ -51,6 +53,8 @@ class World:
         self.height = self.height + actions
 
     def land(self, drones: Any) -> None:
+        if not self.can_land:
+            raise InputError("no rotors")
         self.landed = self.landed | drones
 
     def retire(self, drones: Any) -> None:
@@ -60,26 +64,29 @@ class World:
 class Swarm:
     """Both sides of a world of two drones, each flown by an agent of its own."""
 
-    def __init__(self, *policies: str) -> None:
+    def __init__(self, *policies: str, shares: tuple[list[int], ...] = ([0], [1])) -> None:
         self.now = 0.0
         self.world = World()
         self.policies = policies or ("hold", "hold")
+        self.layout = layout(len(shares[0]))
         config = LinkConfig(timeout=TIMEOUT)
         links = []
-        for i in range(2):
-            client = Client(hello(70 + i), layout(), config, draw_session=lambda i=i: 80 + i)
-            links.append(AgentLink(i, ("127.0.0.1", 1000 + i), client, np.array([i])))
+        for i, rows in enumerate(shares):
+            client = Client(hello(70 + i), self.layout, config, draw_session=lambda i=i: 80 + i)
+            links.append(AgentLink(i, ("127.0.0.1", 1000 + i), client, np.array(rows)))
         self.rules = SeveralAgents(
             self.world, layout(2), 0.1, links, when_lost="hold", patience=PATIENCE
         )
-        self.agents = [self.agent(i) for i in range(2)]
+        self.agents = [self.agent(i) for i in range(len(shares))]
         self.states: list[list[State]] = [[], []]
         self.closed = ["", ""]
         self.rules.start(0.0)
 
     def agent(self, number: int, refusal: str = "") -> Server:
         policy = Extension(number=WHEN_LOST, value=self.policies[number].encode())
-        return Server(lambda _: refusal or layout(), draw_nonce=lambda: NONCE, extensions=(policy,))
+        return Server(
+            lambda _: refusal or self.layout, draw_nonce=lambda: NONCE, extensions=(policy,)
+        )
 
     def pump(self) -> None:
         """Carry datagrams until nothing moves."""
@@ -203,6 +210,33 @@ def test_an_agent_that_came_back_does_not_hide_the_seeds_of_the_others() -> None
     assert swarm.world.seeds[1:] == [[9, 9]]
     assert swarm.rules.seed == 9
     assert swarm.participations == [Participation.FLYING] * 2
+
+
+def test_an_agent_that_comes_back_to_land_where_the_vehicle_cannot_ends_nobodys_flight() -> None:
+    swarm = begun()
+    swarm.policies = ("hold", "land")
+    swarm.restart(1)
+    swarm.world.can_land = False
+    swarm.wait(1.0)
+    assert swarm.rules.links[1].when_lost == "hold"
+    notice = swarm.rules.links[1].client.statistics.take_notices()[-1]
+    assert notice == "the agent at 127.0.0.1:1001 cannot have land (no rotors): hold"
+    swarm = Swarm("land")
+    swarm.world.can_land = False
+    with pytest.raises(InputError, match="no rotors"):
+        swarm.pump()
+
+
+def test_different_orders_of_one_agent_close_its_link() -> None:
+    swarm = Swarm("hold", shares=([0, 1],))
+    swarm.pump()
+    orders = np.array([FLY, FREEZE], np.uint8)
+    swarm.agents[0].send_command(0, np.zeros((2, 1), np.float32), orders, None, swarm.now)
+    swarm.pump()
+    reason = "orders: expected the same for all 2 drones, got different ones"
+    assert swarm.closed[0] == reason
+    assert swarm.participations == [Participation.LEFT]
+    assert swarm.world.flown == []
 
 
 @pytest.mark.parametrize(

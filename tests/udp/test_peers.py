@@ -5,7 +5,6 @@ import math
 import os
 import re
 import shutil
-import signal
 import socket
 import struct
 import subprocess
@@ -395,35 +394,6 @@ def test_simulator_is_held_by_our_pid(
     errors = re.findall(r"last E (\S+) m", out)
     assert len(errors) == episodes
     assert max(abs(float(error)) for error in errors) < 0.05
-
-
-def test_simulator_goes_on_with_an_agent_that_was_started_again(simulator: list[str]) -> None:
-    with udp() as sock:
-        address = sock.getsockname()
-    killed = f"""
-import os, signal
-from rotorgram.udp import RemoteEnv
-env = RemoteEnv({address})
-env.reset(seed=1)
-for _ in range(50):
-    env.step([0.0])
-os.kill(os.getpid(), signal.SIGKILL)
-"""
-    with running(simulator, place(address)) as process:
-        with running([sys.executable, "-c", killed]) as first:
-            assert ended(first) == (-signal.SIGKILL, "", "")
-        with RemoteEnv(address) as env:
-            observation, _ = env.reset(seed=1)
-            truncated = False
-            while not truncated:
-                observation, _, terminated, truncated, info = env.step([law(observation)])
-                assert not terminated
-            assert "simulator_lost" not in info
-        status, out, err = ended(process)
-    assert status == 0
-    assert err == ""
-    assert " 2 sessions;" in out
-    assert abs(observation[0]) < 0.05
 
 
 # By hand: the agent's datagrams as the page has them.

@@ -58,31 +58,6 @@ def test_parity(codec: str, options: dict[str, Any]) -> None:
         assert pair.running.join() == "the agent closed"
 
 
-@pytest.mark.parametrize("codec", ["binary", "text"])
-def test_parity_with_a_simulator_in_another_process(codec: str) -> None:
-    with RemoteEnv(ANY, env_id=ENV_ID, connect=False, connect_timeout=20) as remote:
-        process = launch(SIMULATE, remote.address[1], codec)
-        assert_parity(remote, gym.make(ENV_ID), 1000, [0, 2**64 - 1])
-    out, err = process.communicate(timeout=10)
-    assert process.returncode == 0
-    assert err == ""
-    assert out == "over: the agent closed\n"
-
-
-def test_another_env_of_gymnasium_flies_too() -> None:
-    remote = RemoteEnv(ANY, env_id="CartPole-v1", connect=False)
-    running = Running(Simulator("CartPole-v1", server=remote.address, bind=ANY))
-    with remote, gym.make("CartPole-v1") as local:
-        assert remote.reset(seed=3)[0].tobytes() == local.reset(seed=3)[0].tobytes()
-        assert remote.action_space == local.action_space
-        assert remote.metadata["render_fps"] == 50
-        here = remote.step(1)
-        there = local.step(1)
-        assert here[0].tobytes() == there[0].tobytes()
-        assert here[1:4] == there[1:4]
-    assert running.join() == "the agent closed"
-
-
 # ---- the env
 
 

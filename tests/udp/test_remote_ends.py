@@ -17,20 +17,19 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import rotorgram.envs  # noqa: F401
-from peers import ANY, ENV_ID, Running, launch, plain_socket
-from remotes import QUICK, Broken, assert_parity, flying
+from peers import ANY, ENV_ID, Running, plain_socket
+from remotes import QUICK, Broken
 from rotorgram.envs.config import EnvConfig
 from rotorgram.udp import (
     LinkConfig,
     PeerClosed,
     PeerSilent,
-    Refused,
     RemoteEnv,
     Simulator,
 )
 from rotorgram.udp import __main__ as udp_main
 from rotorgram.udp.protocol import binary
-from rotorgram.udp.protocol.messages import Close, Hello, Welcome
+from rotorgram.udp.protocol.messages import Hello
 from rotorgram.udp.spawn import start_simulator
 from rotorgram.udp.transport import driver, sockets
 
@@ -75,24 +74,6 @@ def test_an_agent_that_hears_but_never_answers() -> None:
             sock.recv(65507)
     assert len(set(datagrams)) == 1
     assert isinstance(binary.decode(datagrams[0]), Hello)
-
-
-def test_an_agent_that_falls_silent_is_told() -> None:
-    with plain_socket() as sock:
-        simulator = Simulator(server=sock.getsockname(), bind=ANY, config=LinkConfig(timeout=0.3))
-        running = Running(simulator)
-        hello, address = sock.recvfrom(65507)
-        welcome = Welcome(session=binary.decode(hello).session, nonce=1)
-        sock.sendto(binary.encode(welcome), address)
-        error = running.join()
-        assert isinstance(error, PeerSilent)
-        sends = int(re.findall(r"for 0.3 s, State 1 sent (\d+) times", str(error))[0])
-        states = [sock.recv(65507) for _ in range(sends)]
-        goodbyes = [sock.recv(65507) for _ in range(5)]  # of ten: nobody answers
-    assert len(set(states)) == len(set(goodbyes)) == 1
-    goodbye = binary.decode(goodbyes[0])
-    assert isinstance(goodbye, Close)
-    assert goodbye.reason == "no answer from the agent for 0.3 s"
 
 
 @pytest.mark.quiet
@@ -243,55 +224,6 @@ def test_a_reset_after_a_close_waits_for_another_simulator() -> None:
             remote.reset()
 
 
-def test_a_simulator_that_is_started_anew_at_the_same_address() -> None:
-    with RemoteEnv(ANY, connect=False, timeout=10) as remote:
-        running = Running(Simulator(server=remote.address, bind=ANY, config=QUICK))
-        remote.reset(seed=0)
-        before = remote.step(np.ones(1))
-        here = running.simulator.address
-        running.cut()
-        running = Running(Simulator(server=remote.address, bind=here, config=QUICK))
-        after = remote.step(np.ones(1))
-        assert after[0].tobytes() == before[0].tobytes()
-        assert after[1:4] == (0.0, False, True)
-        reason = f"the simulator at 127.0.0.1:{here[1]} was started anew"
-        assert after[4] == {**before[4], "simulator_lost": reason}
-        with pytest.raises(gym.error.ResetNeeded):
-            remote.step(np.ones(1))
-        local = gym.make(ENV_ID)
-        assert_parity(remote, local, 300, [5])
-        running.cut()  # the next reset meets the new one
-        running = Running(Simulator(server=remote.address, bind=here, config=QUICK))
-        assert_parity(remote, local, 300, [6])
-        assert remote.statistics.counters["sessions"] == 3
-    assert running.join() == "the agent closed"
-
-
-def test_a_second_simulator_waits_until_the_first_has_left(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    with RemoteEnv(ANY, connect=False, timeout=5) as remote:
-        first = Running(Simulator(Broken(None), server=remote.address, bind=ANY, config=QUICK))
-        remote.reset()
-        # Its timeout is shorter than the wait: it does not run while the agent says Wait.
-        config = LinkConfig(timeout=0.6)
-        second = Running(Simulator(Broken(0.0), server=remote.address, bind=ANY, config=config))
-        until = time.monotonic() + 1.2
-        while time.monotonic() < until:
-            remote.reset()
-            time.sleep(0.02)
-        remote.step(np.zeros(1))
-        remote.step(np.zeros(1))
-        with pytest.raises(PeerClosed, match="bad state"):
-            remote.step(np.zeros(1))
-        remote.reset()
-        remote.step(np.zeros(1))
-        assert remote.statistics.counters["refused"] == 0
-        first.join()
-    assert second.join() == "the agent closed"
-    assert "every slot of the agent is taken; waiting for a free one" in caplog.text
-
-
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 def test_the_simulator_program_ends_on_sigterm_and_tells_the_agent() -> None:
     with RemoteEnv(ANY, connect=False, connect_timeout=20, timeout=10) as remote:
@@ -307,29 +239,6 @@ def test_the_simulator_program_ends_on_sigterm_and_tells_the_agent() -> None:
         process.stdin.close()
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
-def test_ctrl_c_at_the_agent_tells_the_simulator() -> None:
-    agent = launch(
-        """
-        import time
-        from rotorgram.udp import RemoteEnv
-        env = RemoteEnv(("127.0.0.1", 0), connect=False)
-        print(env.address[1], flush=True)
-        env.reset()
-        print("flying", flush=True)
-        time.sleep(60)
-        """
-    )
-    assert agent.stdout is not None
-    port = int(agent.stdout.readline())
-    running = Running(Simulator(server=("127.0.0.1", port), bind=ANY, config=QUICK))
-    assert agent.stdout.readline() == "flying\n"
-    agent.send_signal(signal.SIGINT)
-    _, err = agent.communicate(timeout=10)
-    assert "KeyboardInterrupt" in err
-    assert running.join() == "the agent closed"
-
-
 def test_a_forgotten_env_tells_the_simulator() -> None:
     remote = RemoteEnv(ANY, connect=False)
     running = Running(Simulator(server=remote.address, bind=ANY, config=QUICK))
@@ -337,20 +246,6 @@ def test_a_forgotten_env_tells_the_simulator() -> None:
     del remote
     gc.collect()
     assert running.join() == "the agent closed"
-
-
-def test_a_simulator_that_waits_is_told_when_the_agent_closes() -> None:
-    with flying() as pair:
-        pair.remote.reset()
-        waiting = Running(Simulator(server=pair.remote.address, bind=ANY, config=QUICK))
-        until = time.monotonic() + 5
-        while not waiting.simulator.link.statistics.counters["received"]:
-            assert time.monotonic() < until
-            pair.remote.reset()
-        pair.remote.close()
-        error = waiting.join()
-        assert isinstance(error, Refused)
-        assert str(error).endswith(" refused: the agent closed")
 
 
 @pytest.mark.parametrize(

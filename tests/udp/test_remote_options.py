@@ -6,7 +6,6 @@ import re
 import signal
 import subprocess
 import sys
-import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -247,23 +246,6 @@ def test_the_agent_trusts_hello() -> None:
 # ---- actions
 
 
-@pytest.mark.parametrize(
-    "action",
-    [
-        np.zeros(2, np.float32), np.zeros((1, 1)), np.zeros(1, complex), np.array(["a"]), [None],
-        np.array([np.nan]), np.array([np.inf]), np.array([1e39]), np.zeros(1, bool),
-    ],
-)  # fmt: skip
-def test_wrong_actions_send_nothing(action: Any) -> None:  # fault 37
-    with flying() as pair:
-        pair.remote.reset(seed=1)
-        before = pair.remote.statistics.counters["sent"]
-        with pytest.raises(InputError, match="expected"):
-            pair.remote.step(action)
-        assert pair.remote.statistics.counters["sent"] == before
-        pair.remote.step(np.zeros(1))
-
-
 def test_actions_are_neither_clipped_nor_scaled() -> None:  # fault 6
     seen = []
 
@@ -302,25 +284,6 @@ def test_stop_from_another_thread() -> None:  # fault 7
             reset_for_ever(remote)
         assert time.monotonic() - begun < 2
         assert running.join() == "the simulator was stopped"
-
-
-@posix
-def test_ctrl_c_at_a_simulator_in_the_main_thread() -> None:  # fault 7
-    with RemoteEnv(ANY, connect=False, connect_timeout=20) as remote:
-        code = (
-            "import sys; from rotorgram.udp import Simulator\n"
-            "with Simulator(server=('127.0.0.1', int(sys.argv[1])), bind=('127.0.0.1', 0)) as s:\n"
-            "    s.run()"
-        )
-        process = subprocess.Popen(
-            [sys.executable, "-c", code, str(remote.address[1])], stderr=subprocess.PIPE
-        )
-        remote.reset()
-        process.send_signal(signal.SIGINT)
-        with pytest.raises(PeerClosed, match="the simulator was stopped"):
-            reset_for_ever(remote)
-        _, errors = process.communicate(timeout=10)
-        assert b"KeyboardInterrupt" in errors
 
 
 def test_a_long_step_is_no_silence() -> None:  # fault 33
@@ -466,14 +429,6 @@ def test_text_needs_an_env_that_is_known_here() -> None:
             remote.connect()
         running.simulator.stop()
         running.join()
-
-
-def test_the_spec_over_the_wire_is_that_of_the_env(tmp_path: Path) -> None:
-    with flying(target=3.0) as pair:
-        pair.remote.reset()
-        assert pair.remote.env_spec == env_spec(EnvConfig.from_keywords(ENV_ID, target=3.0))
-        assert pair.remote.control_period == 0.02
-        assert threading.active_count() < 20
 
 
 def test_a_world_of_two_drones_is_more_than_one_drone() -> None:

@@ -22,13 +22,10 @@ from fleets import (
 from peers import ANY, ENV_ID, launch, plain_socket
 from rotorgram.udp import (
     LinkConfig,
-    PeerClosed,
     PeerSilent,
     Refused,
     RemoteVectorEnv,
 )
-from rotorgram.udp.protocol import binary
-from rotorgram.udp.protocol.messages import Hello, Wait
 
 SIMULATE = """
     import json, sys
@@ -83,26 +80,6 @@ def test_a_late_simulator_waits_until_another_leaves(caplog: pytest.LogCaptureFi
         assert reason.startswith("no datagram from the simulator at 127.0.0.1:")
         remote.step(np.zeros((4, 1)))
     assert late.join() == "the agent closed"
-
-
-def test_a_stranger_is_told_to_wait_with_no_more_bytes_than_he_sent() -> None:
-    with flying(1, 2) as (remote, _), plain_socket() as stranger:
-        remote.reset()
-        hello = Hello(session=9, spec=remote.env_spec.to_json(), worlds=2)
-        stranger.sendto(binary.encode(hello), remote.address)
-        answer = b""
-        stranger.setblocking(False)
-        until = time.monotonic() + 5
-        while not answer and time.monotonic() < until:
-            remote.step(np.zeros((2, 1)))
-            try:
-                answer = stranger.recv(65507)
-            except BlockingIOError:
-                time.sleep(0.01)
-        message = binary.decode(answer)
-        assert isinstance(message, Wait)
-        assert message.session == hello.session
-        assert len(answer) <= len(binary.encode(hello))
 
 
 class Slow(gym.Wrapper):
@@ -179,29 +156,6 @@ def test_text_simulators_fly_as_well() -> None:
 
 
 # ---- lost simulators
-
-
-def test_all_simulators_close() -> None:
-    envs = [Failing(gym.make(ENV_ID, disable_env_checker=True)) for _ in range(2)]
-    remote = RemoteVectorEnv(ANY, num_simulators=2, num_envs=2, connect=False, connect_timeout=5)
-    running = [simulate(remote, env=env) for env in envs]
-    actions = np.zeros((2, 1))
-    remote.reset(seed=0)
-    remote.step(actions)
-    for env in envs:
-        env.fails = True
-    sentence = r"the simulator at 127.0.0.1:\d+ closed: RuntimeError: out of fuel"
-    with pytest.raises(PeerClosed, match=sentence):
-        remote.step(actions)
-    with pytest.raises(gym.error.ResetNeeded):
-        remote.step(actions)
-    assert [str(one.join()) for one in running] == ["out of fuel"] * 2
-    running = [simulate(remote) for _ in envs]  # a reset waits for others
-    with sync(2) as local:
-        assert_same(remote.reset(seed=0), local.reset(seed=0))
-        assert_parity(remote, local, 10)
-    remote.close()
-    assert [one.join() for one in running] == ["the agent closed"] * 2
 
 
 def test_one_simulator_closes_and_no_other_comes() -> None:

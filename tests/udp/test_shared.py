@@ -17,12 +17,10 @@ from peers import ANY, Running, launch
 from relay import FaultConfig, relaying
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.loop import Loop
-from rotorgram.models import QUAD_XML, InputError
+from rotorgram.models import InputError
 from rotorgram.udp import (
     LinkConfig,
-    PeerClosed,
     PeerSilent,
-    Refused,
     RemoteEnv,
     RemoteVectorEnv,
     Simulator,
@@ -183,29 +181,23 @@ def in_process(
     return seen
 
 
-@pytest.mark.parametrize("faults", [None, LOSSY], ids=["clean", "30 % loss"])
-def test_an_agent_for_each_drone_is_the_world_in_process(faults: FaultConfig | None) -> None:
+@pytest.mark.parametrize("faults", [None, LOSSY], ids=["clean", "30 % loss and a key"])
+def test_an_agent_for_each_drone_is_the_world_in_process(
+    faults: FaultConfig | None, tmp_path: Path
+) -> None:
     agents = free_ports(8)
     seen = {}
-    with shared(agents, 8, faults, episode_length=60) as running:
-        in_threads([lambda a=a, i=i: fly_one(a, i, 2, seen) for i, a in enumerate(agents)])
+    key: dict[str, Any] = {}
+    if faults:
+        key = {"key_file": tmp_path / "key"}
+        write_key(key["key_file"])
+    with shared(agents, 8, faults, episode_length=60, **key) as running:
+        in_threads([lambda a=a, i=i: fly_one(a, i, 2, seen, **key) for i, a in enumerate(agents)])
         assert running.join() == "the agent closed"
         assert running.simulator.rules.episodes == 2
     expected = in_process(8, 2, episode_length=60)
     assert len({len(flights[0]) for flights in expected.values()}) > 6  # one after the other
     assert seen == expected
-
-
-def test_two_agents_of_four_drones_each_are_the_world_in_process() -> None:
-    agents = free_ports(2)
-    seen = {}
-    names = [f"drone_{i}" for i in range(8)]
-    with shared(agents, 8, LOSSY, episode_length=60):
-        in_threads([
-            lambda: fly_several(agents[0], names[:4], 2, seen),
-            lambda: fly_several(agents[1], names[4:], 2, seen),
-        ])  # fmt: skip
-    assert seen == in_process(8, 2, episode_length=60)
 
 
 def heard(process: subprocess.Popen[str], word: str) -> None:
@@ -244,37 +236,6 @@ def test_one_that_is_killed_follows_its_policy_and_comes_back(policy: str) -> No
     assert all(loss.agent != 1 or loss.participation is not Participation.LEFT for loss in later)
 
 
-def test_an_agent_that_comes_back_to_land_where_the_vehicle_cannot_ends_nobodys_flight(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    model = tmp_path / "no_yaw.xml"
-    agents = free_ports(2)
-    seen = {}
-    text = QUAD_XML.read_text(encoding="utf-8")
-    for rotor, reaction in (("2", "0.05"), ("3", "-0.05")):  # a yaw is always a roll, too
-        at = rf'(site="rotor{rotor}" gear="0 0 1 0 0) +[-.0-9]+'
-        text = re.sub(at, rf"\1 {reaction}", text)
-    model.write_text(text)
-    other = threading.Thread(target=fly_one, args=(agents[0], 0, 3, seen, calm))
-    victim = launch(VICTIM, agents[1][1], "hold")
-    with shared(agents, 2, episode_length=LONG, patience=4.0, vehicle=model):
-        other.start()
-        heard(victim, "20")
-        victim.kill()
-        again = launch(VICTIM, agents[1][1], "land")
-        heard(again, "20")  # of a later episode
-        again.kill()
-        other.join(60)
-    for process in (victim, again):
-        process.communicate()
-    assert [len(flight) for flight in seen[0]] == [LONG + 1] * 3
-    assert (
-        f"the agent at 127.0.0.1:{agents[1][1]} cannot have land (vehicle: expected a vehicle "
-        "whose rotors roll, pitch and yaw it, for this action, got rotorgram "
-        "quadcopter, an allocation of rank 3): hold"
-    ) in caplog.messages
-
-
 def test_one_that_is_started_anew_before_the_others_come_flies_the_first_episode() -> None:
     agents = free_ports(2)
     seen = {}
@@ -296,44 +257,6 @@ def test_one_that_is_started_anew_before_the_others_come_flies_the_first_episode
         2, 1, lambda i, *at: calm(i, *at) if i else np.zeros(1, np.float32), episode_length=60
     )
     assert seen[1] == expected[1]
-
-
-def test_one_that_is_stopped_and_goes_on_takes_part_again() -> None:
-    agents = free_ports(2)
-    seen = {}
-    other = threading.Thread(target=fly_one, args=(agents[0], 0, 3, seen, calm))
-    victim = launch(VICTIM, agents[1][1], "hold")
-    with shared(agents, 2, episode_length=LONG, patience=0.5) as running:
-        other.start()
-        heard(victim, "20")
-        victim.send_signal(signal.SIGSTOP)
-        while not running.simulator.rules.absences:
-            assert running.thread.is_alive()
-        victim.send_signal(signal.SIGCONT)
-        heard(victim, "cut")
-        heard(victim, "begun")
-        heard(victim, "20")  # of a later episode
-        other.join(60)
-        victim.kill()
-        victim.communicate()
-    loss = running.simulator.rules.absences[0]
-    assert loss.agent == 1
-    assert loss.episode == 1
-    assert loss.participation == Participation.SILENT
-    expected = in_process(2, 3, calm, (1, loss.step, "hold"), episode_length=LONG)
-    assert seen[0][0] == expected[0][0]
-
-
-def test_with_a_key_they_are_the_world_in_process(tmp_path: Path) -> None:
-    agents = free_ports(2)
-    seen = {}
-    key = tmp_path / "key"
-    write_key(key)
-    with shared(agents, 2, LOSSY, key_file=key):
-        in_threads([
-            lambda a=a, i=i: fly_one(a, i, 1, seen, key_file=key) for i, a in enumerate(agents)
-        ])  # fmt: skip
-    assert seen == in_process(2, 1)
 
 
 def test_one_that_asks_for_a_reset_before_the_others_waits_for_them() -> None:
@@ -389,24 +312,6 @@ def test_one_that_resets_a_start_gets_it_again() -> None:
         assert running.simulator.rules.seed == 1
         assert running.simulator.rules.episodes == 1
     assert starts[0] == starts[1]
-
-
-def test_orders_that_the_world_cannot_follow_end_the_session_of_that_agent_alone() -> None:
-    agents = free_ports(2)
-    seen = {}
-
-    def wrong() -> None:
-        env = RemoteVectorEnv(agents[0], connect_timeout=60)
-        env.reset(seed=0)
-        with pytest.raises(PeerClosed, match="orders: expected the same for all 2 drones"):
-            env.advance(np.zeros((2, 1), np.float32), None, None, np.array([True, False]))
-        env.close()
-
-    with shared({agents[0]: ["drone_0", "drone_1"], agents[1]: ["drone_2"]}, 3):
-        in_threads([wrong, lambda: fly_one(agents[1], 2, 1, seen)])
-    nothing = np.zeros(1, np.float32)
-    others = in_process(3, 1, lambda i, *at: action_of(i, *at) if i == 2 else nothing)
-    assert seen == {2: others[2]}
 
 
 def test_a_late_agent_is_told_the_end_of_the_drones_that_were_in_flight() -> None:
@@ -522,18 +427,6 @@ def test_who_is_waited_for_is_told_soon(caplog: pytest.LogCaptureFixture) -> Non
         rf"no answer from the agent at {where} for 1 s, Hello sent \d+ times; asking for 60 s"
     )
     assert re.match(expected, caplog.messages[0])
-
-
-def test_an_agent_that_refuses_is_named() -> None:
-    agents = free_ports(2)
-    with shared(agents, 2) as running:
-        env = RemoteEnv(agents[0], connect=False, env_id="rotorgram/Hover-v0", connect_timeout=2)
-        with pytest.raises(PeerSilent, match="no simulator came"):
-            env.reset()
-        result = running.join()
-        env.close()
-    assert isinstance(result, Refused)
-    assert f"the agent at 127.0.0.1:{agents[0][1]} refused: expected a simulator of" in str(result)
 
 
 @pytest.mark.parametrize(
