@@ -221,7 +221,7 @@ def test_an_agent_that_comes_back_to_land_where_the_vehicle_cannot_ends_nobodys_
     assert swarm.rules.links[1].when_lost == "hold"
     notice = swarm.rules.links[1].client.statistics.take_notices()[-1]
     assert notice == "the agent at 127.0.0.1:1001 cannot have land (no rotors): hold"
-    swarm = Swarm("land")
+    swarm = Swarm("land", "land")
     swarm.world.can_land = False
     with pytest.raises(InputError, match="no rotors"):
         swarm.pump()
