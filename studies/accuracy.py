@@ -1,6 +1,8 @@
 """Accuracy and cost of integrators and physics steps.
 
-`python studies/accuracy.py FILE.csv` writes the table that `docs/physics.md` shows.
+    python studies/accuracy.py [--out FILE.csv]
+
+writes the table that `docs/physics.md` shows, within a minute.
 
 Two flights of the paper's vehicle. Tumbling: 5 s that begin with a spin about no axis of symmetry,
 with four thrusts that change every 20 ms; compared with RK4 at 0.25 ms. Drop: 1.5 s that begin at
@@ -8,16 +10,14 @@ rest, 1 m above the floor, without thrust; contacts are soft, so that the craft 
 """
 
 import copy
-import sys
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Final
 
 import mujoco
 import numpy as np
-from measuring import write_rows
+from measuring import RESULTS, options, table, write_rows
 from numpy.typing import NDArray
 from rotorgram.models import Vehicle
 
@@ -76,17 +76,26 @@ def accuracy(
 
 def markdown(rows: Sequence[Accuracy]) -> str:
     """The table, in Markdown."""
-    lines = [
-        "| integrator | step, ms | off the path, m | off the attitude, ° | drop sinks, mm "
-        "| cost of a second, µs |",
-        "|---|---|---|---|---|---|",
-    ]
-    for row in rows:
-        lines.append(
-            f"| {row.integrator} | {row.step_ms:g} | {row.position_m:.1e} | {row.attitude_deg:.1e} "
-            f"| {row.sinks_mm:.1f} | {row.cost_us:,.0f} |"
+    head = (
+        "integrator",
+        "step, ms",
+        "off the path, m",
+        "off the attitude, °",
+        "drop sinks, mm",
+        "cost of a second, µs",
+    )
+    cells = (
+        (
+            row.integrator,
+            f"{row.step_ms:g}",
+            f"{row.position_m:.1e}",
+            f"{row.attitude_deg:.1e}",
+            f"{row.sinks_mm:.1f}",
+            f"{row.cost_us:,.0f}",
         )
-    return "\n".join(lines)
+        for row in rows
+    )
+    return table(head, cells)
 
 
 def _start(vehicle: Vehicle, integrator: str, step: float, height: float) -> tuple[Any, Any]:
@@ -130,10 +139,11 @@ def _sinks(vehicle: Vehicle, integrator: str, step: float) -> float:
 
 
 def _main() -> None:
+    out = RESULTS / "physics" / "accuracy.csv"
+    args = options(__doc__, out=out).parse_args()
     rows = accuracy(Vehicle.load())
     print(markdown(rows))
-    if len(sys.argv) > 1:
-        write_rows(Path(sys.argv[1]), rows)
+    write_rows(args.out, rows)
 
 
 if __name__ == "__main__":

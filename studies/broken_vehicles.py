@@ -1,14 +1,14 @@
 """Broken vehicles and what the examination says of each: every fault, found by its own check.
 
-`python studies/broken_vehicles.py FILE.csv` writes the table that `docs/physics.md` shows, and
-beside it `FILE.json`, the examination of the paper's vehicle. Each broken vehicle is the paper's
-with one thing wrong.
+    python studies/broken_vehicles.py [--out FILE.csv]
+
+writes the table that `docs/physics.md` shows, and beside it `FILE.json`, the examination of the
+paper's vehicle, within a minute. Each broken vehicle is the paper's with one thing wrong.
 """
 
 import json
 import math
 import re
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from measuring import write_rows
+from measuring import RESULTS, options, table, write_rows
 from rotorgram.cli.vehicle import expectation
 from rotorgram.models import QUAD_XML
 from rotorgram.models.checks import Check, examine
@@ -213,26 +213,31 @@ def _row(fault: str, name: str, checks: Sequence[Check]) -> Row:
 
 def markdown(told: Sequence[Row]) -> str:
     """The table, in Markdown."""
-    lines = ["| what is wrong | found by | measured (expected) | flies | failed checks |",
-             "|---|---|---|---|---|"]  # fmt: skip
+    rows = []
     for row in told:
         flies = "yes" if row.flies else "no"
-        lines.append(f"| {row.fault} | {row.found_by} | {row.measured} | {flies} "
-                     f"| {row.failed} of {row.checks} |")  # fmt: skip
-    return "\n".join(lines)
+        failed = f"{row.failed} of {row.checks}"
+        rows.append((row.fault, row.found_by, row.measured, flies, failed))
+    return table(
+        ("what is wrong", "found by", "measured (expected)", "flies", "failed checks"), rows
+    )
 
 
 def examination(checks: Sequence[Check]) -> str:
     """Every check of a vehicle, in Markdown."""
-    columns = ["check", "measured", "expected", "unit", "equation", "source"]
-    lines = [f"| {' | '.join(columns)} |", "|---" * len(columns) + "|"]
-    for check in checks:
-        cells = [
-            check.name, f"{check.measured:.4g}", expectation(check), check.unit,
-            check.equation.replace("|", "\\|"), check.source,
-        ]  # fmt: skip
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+    head = ("check", "measured", "expected", "unit", "equation", "source")
+    rows = (
+        (
+            check.name,
+            f"{check.measured:.4g}",
+            expectation(check),
+            check.unit,
+            check.equation,
+            check.source,
+        )
+        for check in checks
+    )
+    return table(head, rows)
 
 
 def read_report(path: Path) -> tuple[float, list[Check]]:
@@ -245,17 +250,17 @@ def read_report(path: Path) -> tuple[float, list[Check]]:
 
 
 def _main() -> None:
+    out = RESULTS / "physics" / "broken_vehicles.csv"
+    path = options(__doc__, out=out).parse_args().out
     told = rows()
-    print(markdown(told), examination(examine()), sep="\n\n")
-    if len(sys.argv) > 1:
-        path = Path(sys.argv[1])
-        write_rows(path, told)
-        begun = time.perf_counter()
-        checks = examine()
-        seconds = round(time.perf_counter() - begun, 3)
-        report = {"seconds": seconds, "checks": [check.report() for check in checks]}
-        text = json.dumps(report, indent=1, ensure_ascii=False, allow_nan=False)
-        path.with_suffix(".json").write_text(text + "\n", "utf-8")
+    write_rows(path, told)
+    begun = time.perf_counter()
+    checks = examine()
+    seconds = round(time.perf_counter() - begun, 3)
+    print(markdown(told), examination(checks), sep="\n\n")
+    report = {"seconds": seconds, "checks": [check.report() for check in checks]}
+    text = json.dumps(report, indent=1, ensure_ascii=False, allow_nan=False)
+    path.with_suffix(".json").write_text(text + "\n", "utf-8")
 
 
 if __name__ == "__main__":

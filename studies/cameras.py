@@ -23,7 +23,7 @@ os.environ.setdefault("MUJOCO_GL", "egl")  # which MuJoCo's renderer needs befor
 
 import mujoco
 import numpy as np
-from measuring import in_turns, medians, options, write
+from measuring import in_turns, medians, options, table, timed, write
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.envs.config import EnvConfig
 from rotorgram.models.cameras import KINDS, chosen_views
@@ -32,7 +32,7 @@ from rotorgram.rendering.cameras import Cameras
 from rotorgram.scenes import SEEDED_SCENES
 from rotorgram.udp import RemoteVectorEnv
 from rotorgram.udp.spawn import spawn_simulator, start_simulator
-from swarm import advanced, timed
+from swarm import advanced
 
 ENV = "rotorgram/Hover-v0"
 VEHICLE = "crazyflie2"
@@ -111,7 +111,7 @@ def pictures(seconds: float, repeats: int) -> list[dict[str, Any]]:
         for kind in KINDS:
             here, cameras = ours(f"front_{kind}@{width}x{height}")
             cases = {"ours": here, "theirs": theirs(kind, width, height, cameras)}
-            taken = medians(in_turns(cases, repeats, lambda step: timed(step, seconds)))
+            taken = medians(in_turns(cases, repeats, lambda step: timed(step, seconds)[0]))
             cameras.close()
             rows.append(
                 {
@@ -129,7 +129,7 @@ def pictures(seconds: float, repeats: int) -> list[dict[str, Any]]:
 def milliseconds(cases: dict[str, tuple[Step, Cameras]], seconds: float, repeats: int) -> Times:
     """Of a picture of each case, in turns."""
     steps = {name: step for name, (step, _) in cases.items()}
-    taken = medians(in_turns(steps, repeats, lambda step: timed(step, seconds)))
+    taken = medians(in_turns(steps, repeats, lambda step: timed(step, seconds)[0]))
     for _, cameras in cases.values():
         cameras.close()
     return {name: round(1e3 * time, 2) for name, time in taken.items()}
@@ -161,7 +161,7 @@ def threads(seconds: float, repeats: int) -> dict[str, float]:
             "one thread": lambda: [step() for step, _ in each],
             "two threads": lambda: [*pool.map(lambda one: one[0](), each)],
         }
-        taken = medians(in_turns(cases, repeats, lambda step: timed(step, seconds)))
+        taken = medians(in_turns(cases, repeats, lambda step: timed(step, seconds)[0]))
     for _, cameras in each:
         cameras.close()
     return {name: round(2 / time, 1) for name, time in taken.items()}
@@ -184,7 +184,7 @@ def steps(drones: int, seconds: float, repeats: int) -> dict[str, float]:
         if drones > 1:
             several = opened.enter_context(two_simulators(drones, flown["seeing"]))
             cases["seeing over UDP, two simulators"] = advanced(several, drones)
-        taken = medians(in_turns(cases, repeats, lambda step: timed(step, seconds)))
+        taken = medians(in_turns(cases, repeats, lambda step: timed(step, seconds)[0]))
     return {name: round(time * 1e3, 3) for name, time in taken.items()}
 
 
@@ -280,6 +280,13 @@ def scenes(path: Path) -> None:
     pictures.save(path, optimize=True)
 
 
+def shown(row: dict[str, Any]) -> list[str]:
+    """A row of the table of pictures."""
+    size = f"{row['width']} × {row['height']}"
+    rates = [f"{row[name]:,.0f}" for name in ("per_second", "renderer_per_second")]
+    return [row["kind"], size, *rates, f"{row['ratio']:.2f}"]
+
+
 def main() -> None:
     """Measure, print and write."""
     drawings = {"sheet": sheet, "scenes": scenes, "optics": optics}
@@ -290,30 +297,13 @@ def main() -> None:
             draw(file)
             return
     rows = pictures(args.seconds, args.repeats)
-    print("| kind | pixels | pictures/s | of `mujoco.Renderer` | ratio |")
-    print("|---|---|---:|---:|---:|")
-    for row in rows:
-        size = f"{row['width']} × {row['height']}"
-        names = ("per_second", "renderer_per_second")
-        told = " | ".join(f"{row[name]:,.0f}" for name in names)
-        print(f"| {row['kind']} | {size} | {told} | {row['ratio']:.2f} |")
+    head = ("kind", "pixels", "pictures/s", "of `mujoco.Renderer`", "ratio")
+    print(table(head, map(shown, rows)))
     taken = {str(drones): steps(drones, args.seconds, args.repeats) for drones in (1, 16)}
-    print("| ms of a step | " + " | ".join(f"{drones} drones" for drones in taken) + " |")
-    print("|---|" + "---:|" * len(taken))
-    for name in taken["16"]:
-        told = (f"{one[name]:.2f}" if name in one else "–" for one in taken.values())
-        print(f"| {name} | " + " | ".join(told) + " |")
     around = surroundings(args.seconds, args.repeats)
-    print("| ms of a picture of 64 × 64 | " + " | ".join(WORLDS) + " |")
-    print("|---|" + "---:|" * len(WORLDS))
-    for kind, told in around.items():
-        print(f"| {kind} | " + " | ".join(f"{told[world]:.1f}" for world in WORLDS) + " |")
     beyond = lenses(args.seconds, args.repeats)
-    print("| ms of colours of 128 × 128 | " + " | ".join(beyond) + " |")
-    print("|---|" + "---:|" * len(beyond))
-    print("| | " + " | ".join(f"{time:.1f}" for time in beyond.values()) + " |")
     side_by_side = threads(args.seconds, args.repeats)
-    print(f"pictures per second of two cameras: {side_by_side}")
+    print(taken, around, beyond, side_by_side, sep="\n")
     if args.out:
         write(
             args.out,

@@ -12,11 +12,10 @@ import json
 import math
 import statistics
 from collections.abc import Callable
-from time import perf_counter
 from typing import Any
 
 import numpy as np
-from measuring import RESULTS, medians, options, write
+from measuring import RESULTS, in_turns, medians, options, timed, write
 from rotorgram.agents import Geometric
 from rotorgram.envs import register
 from rotorgram.envs.config import EnvConfig
@@ -128,22 +127,14 @@ def cost(num_drones: int, seconds: float, repeats: int) -> dict[str, Any]:
         level: Loop(EnvConfig(env_id=HOVER, action=level, episode_length=10**6), num_drones)
         for level in LEVELS
     }
-    every = np.ones(num_drones, bool)
-    rates = {level: list[float]() for level in LEVELS}
-    for repeat in range(repeats):
-        for level in LEVELS if repeat % 2 else LEVELS[::-1]:
-            loop = loops[level]
-            taken = 0.0
-            steps = 0
-            actions = np.zeros((num_drones, len(loop.task.controller.low)), np.float32)
-            while taken < seconds:
-                loop.advance(actions, every, list(range(num_drones)))
-                begun = perf_counter()
-                for _ in range(4):
-                    loop.advance(actions)
-                taken += perf_counter() - begun
-                steps += 4
-            rates[level].append(steps * num_drones / taken)
+
+    def rate(loop: Loop) -> float:
+        actions = np.zeros((num_drones, len(loop.task.controller.low)), np.float32)
+        loop.advance(actions, np.ones(num_drones, bool), list(range(num_drones)))
+        wall, _ = timed(lambda: loop.advance(actions, loop.done), seconds)
+        return num_drones / wall
+
+    rates = in_turns(loops, repeats, rate)
     for loop in loops.values():
         loop.close()
     ratios = {

@@ -1,6 +1,8 @@
 """The flight at the top of the README, in few colours so that the file stays small.
 
-Run `python studies/draw_flight.py docs/images/flight.gif`; it needs no display.
+    python studies/draw_flight.py [--out FILE.gif]
+
+It needs no display, and takes a minute.
 """
 
 import subprocess
@@ -8,6 +10,7 @@ import sys
 import tempfile
 from pathlib import Path
 
+from measuring import IMAGES, options
 from PIL import Image
 
 FRAMES = 70
@@ -18,8 +21,9 @@ FILM = (
 )
 
 
-def main(out: Path) -> None:
+def main() -> None:
     """Render the film, and write its first frames in the colours of one of them."""
+    out = options(__doc__, out=IMAGES / "flight.gif").parse_args().out
     with tempfile.TemporaryDirectory() as folder:
         film = Path(folder) / "flight.gif"
         command = [sys.executable, "-P", "-m", "rotorgram.cli", *FILM.split(), str(film)]
@@ -35,4 +39,4 @@ def main(out: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main()

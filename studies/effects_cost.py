@@ -3,16 +3,16 @@
     python studies/effects_cost.py [--seconds 0.1] [--repeats 25] [--out FILE.json]
 
 A control step is 0.02 s of the vehicle in `tests/data/racer.xml`, which has every coefficient: four
-physics steps, without a task. The cases take turns within a repeat, in an order that changes, so
-that a machine that slows down slows all of them; the medians over the repeats are compared.
+physics steps, without a task; a reset every 50 steps counts too. The cases take turns within a
+repeat; the medians over the repeats are compared. It takes two minutes.
 """
 
+import itertools
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
 import numpy as np
-from measuring import RESULTS, medians, options, write
+from measuring import RESULTS, in_turns, medians, options, timed, write
 from rotorgram.models import Vehicle
 from rotorgram.sim import EffectOptions, InitialState, Randomization, World, make_world
 
@@ -32,24 +32,24 @@ CASES: dict[str, dict[str, Any]] = {
 }
 CASES["all"] = {name: value for case in CASES.values() for name, value in case.items()}
 DRAWN = {"mass": "uniform(0.9, 1.1)", "thrust": "uniform(0.9, 1.1)"}
-EPISODE = 2  # control steps between two resets: short, so that the cases take turns often
+EPISODE = 50  # control steps between two resets
 
 
-def steps_per_second(world: World, commands: np.ndarray, seconds: float) -> float:
-    """Control steps of all drones per second, resets not counted."""
+def steps_per_second(world: World, seconds: float) -> float:
+    """Control steps of all drones per second."""
     every = np.ones(world.shape, bool)[()]
     pose = InitialState(position=np.broadcast_to((0.0, 0.0, 30.0), (*world.shape, 3)))
+    commands = np.broadcast_to(world.vehicle.hover_thrust, (*world.shape, world.vehicle.num_rotors))
     substeps = world.vehicle.substeps(0.02)
-    taken = 0.0
-    steps = 0
-    while taken < seconds:
-        world.reset(every, pose)
-        begun = perf_counter()
-        for _ in range(EPISODE):
-            world.step(commands, substeps)
-        taken += perf_counter() - begun
-        steps += EPISODE
-    return steps * max(1, every.size) / taken
+    step = itertools.count()
+
+    def advance() -> None:
+        if next(step) % EPISODE == 0:
+            world.reset(every, pose)
+        world.step(commands, substeps)
+
+    wall, _ = timed(advance, seconds)
+    return round(every.size / wall, 1)
 
 
 def measure(num_drones: int, seconds: float, repeats: int) -> dict[str, Any]:
@@ -59,13 +59,7 @@ def measure(num_drones: int, seconds: float, repeats: int) -> dict[str, Any]:
         effects = EffectOptions(**case)
         drawn = Randomization(DRAWN, effects) if name == "randomize" else None
         worlds[name] = make_world(vehicle, num_drones, effects=effects, randomize=drawn)
-    rates: dict[str, list[float]] = {name: [] for name in worlds}
-    dice = np.random.default_rng(0)
-    for _ in range(repeats):
-        for name in dice.permutation(list(worlds)).tolist():
-            world = worlds[name]
-            commands = np.broadcast_to(vehicle.hover_thrust, (*world.shape, vehicle.num_rotors))
-            rates[name].append(round(steps_per_second(world, commands, seconds), 1))
+    rates = in_turns(worlds, repeats, lambda world: steps_per_second(world, seconds))
     middle = medians(rates)
     ratios = {name: round(median / middle["none"], 3) for name, median in middle.items()}
     for name, median in middle.items():

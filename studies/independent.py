@@ -1,7 +1,9 @@
 """Our flights beside an independent solution of the same equations.
 
-`python studies/independent.py [FOLDER]` flies every vehicle for 10 s at physics steps from 10 to
-1 ms and writes `flights.csv`, which `docs/independent.md` shows, into the folder.
+    python studies/independent.py [--out FILE.csv]
+
+flies every vehicle for 10 s at physics steps from 10 to 1 ms and writes the table that
+`docs/independent.md` shows, in some minutes.
 
 Ours: the backend `mujoco`. Theirs: the Newton-Euler equations about the center of mass, written
 here from the numbers that `Vehicle` derives, with quaternions; scipy's `solve_ivp` integrates them
@@ -16,14 +18,13 @@ can measure, or 30 % where that is less.
 
 import copy
 import math
-import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from measuring import write_rows
+from measuring import options, table, write_rows
 from numpy.typing import NDArray
 from rotorgram.models import QUAD_XML, InputError, Vehicle
 from rotorgram.sim import EffectOptions, InitialState, make_world
@@ -314,22 +315,29 @@ def order(rows: Sequence[Row]) -> float:
 
 def markdown(rows: Sequence[Row]) -> str:
     """The table, in Markdown: each vehicle with each effect at the step of its file."""
-    lines = [
-        "| vehicle | effects | turns, rad/s | flies, m/s | step, ms | off the path, m "
-        "| off the attitude, ° | order | within 1 mm and 0.01° at |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
+    head = (
+        "vehicle",
+        "effects",
+        "turns, rad/s",
+        "flies, m/s",
+        "step, ms",
+        "off the path, m",
+        "off the attitude, °",
+        "order",
+        "within 1 mm and 0.01° at",
+    )
+    lines = []
     for row in rows:
         if not row.of_file:
             continue
         alike = [r for r in rows if (r.vehicle, r.effects) == (row.vehicle, row.effects)]
-        enough = max((r.step_ms for r in alike if r.within), default=None)
-        lines.append(
-            f"| {row.vehicle} | {row.effects} | {row.fastest_rad_s:.1f} | {row.fastest_m_s:.0f} "
-            f"| {row.step_ms:g} | {row.position_m:.1e} | {row.attitude_deg:.1e} "
-            f"| {order(alike):.1f} | {'less than 1' if enough is None else f'{enough:g}'} ms |"
-        )
-    return "\n".join(lines)
+        enough = [r.step_ms for r in alike if r.within]
+        most = f"{max(enough):g}" if enough else "less than 1"
+        errors = (f"{row.position_m:.1e}", f"{row.attitude_deg:.1e}")
+        speeds = (f"{row.fastest_rad_s:.1f}", f"{row.fastest_m_s:.0f}", f"{row.step_ms:g}")
+        order_seen = f"{order(alike):.1f}"
+        lines.append((row.vehicle, row.effects, *speeds, *errors, order_seen, f"{most} ms"))
+    return table(head, lines)
 
 
 def _airless(vehicle: Vehicle) -> Vehicle:
@@ -340,11 +348,11 @@ def _airless(vehicle: Vehicle) -> Vehicle:
 
 
 def _main() -> None:
-    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else RESULTS
+    args = options(__doc__, out=RESULTS / "flights.csv").parse_args()
     rows = []
     for name, vehicle in vehicles().items():
         rows += compare(name, vehicle)
-    write_rows(folder / "flights.csv", rows)
+    write_rows(args.out, rows)
     print(markdown(rows))
 
 

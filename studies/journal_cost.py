@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from measuring import RESULTS, medians, options, write
+from measuring import RESULTS, medians, options, table, write
 from rotorgram.envs.config import EnvConfig
 from rotorgram.udp import RemoteEnv
 from rotorgram.udp.journal import Journal, Recording, Summary
@@ -33,6 +33,9 @@ SIDES: dict[str, tuple[str, ...]] = {
     "agent": ("agent",),
     "both": ("simulator", "agent"),
 }
+
+
+COLUMNS = ("ratio", "quartiles", "microseconds", "processor_microseconds")
 
 
 class Slice(NamedTuple):
@@ -161,15 +164,11 @@ def main() -> None:
     }
     write(args.out, result)
     print(f"without a journal: {statistics.median(rates['none']):,.0f} steps/s (median)")
-    print("| journal on | rate, of that without | quartiles | µs more per step | processor, µs |")
-    print("|---|---|---|---|---|")
-    for name, numbers in result["journal_on"].items():
-        low, high = numbers["quartiles"]
-        spent = ", ".join(
-            f"{side} {n:.1f}" for side, n in numbers["processor_microseconds"].items()
-        )
-        print(f"| {name} | {numbers['ratio']:.3f} | {low:.3f} … {high:.3f} | "
-              f"{numbers['microseconds']:.1f} | {spent} |")  # fmt: skip
+    rows = [
+        [name, *(str(numbers[key]) for key in COLUMNS)]
+        for name, numbers in result["journal_on"].items()
+    ]
+    print(table(("journal on", *COLUMNS), rows))
     print(f"the journal alone: {alone:.2f} µs per step")
     print(f"bytes per step: {sizes}")
 

@@ -196,14 +196,12 @@ def main() -> None:
     out = RESULTS / "reliability" / "link.json"
     args = options(__doc__, drones=(1, 64, 1024), **links, seconds=10.0, out=out).parse_args()
     flights = []
-    print("| drones | MTU | loss | steps/s | in process |\n|---:|---:|---:|---:|---:|")
     for drones in args.drones:
         for mtu in args.mtu:
             for loss in args.loss:
                 one = fly(drones, mtu, args.delay, loss, args.seconds)
                 flights.append(one)
-                rates = f"{one['steps_per_second']} | {one['in_process_steps_per_second']}"
-                print(f"| {drones} | {mtu} | {loss:.0%} | {rates} |", flush=True)
+                print(one, flush=True)
     write(args.out, {"flights": flights})
 
 

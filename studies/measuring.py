@@ -7,7 +7,8 @@ import socket
 import statistics
 import subprocess
 import sys
-from collections.abc import Callable, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
@@ -41,7 +42,7 @@ def options(doc: str, **defaults: Any) -> argparse.ArgumentParser:
     return parser
 
 
-def launch(code: str, settings: Any, *before: str) -> subprocess.Popen[str]:
+def launch(code: str, settings: object, *before: str) -> subprocess.Popen[str]:
     """Run code in a process of its own, with its settings as JSON in `sys.argv[1]`.
 
     `before` are the words of a command that runs it.
@@ -72,9 +73,28 @@ def in_turns(
     return measured
 
 
+def timed(step: Callable[[], object], seconds: float) -> tuple[float, float]:
+    """Seconds of a step, by the clock and of a processor: means over as many as take so long."""
+    count = 0
+    began = time.perf_counter()
+    used = time.process_time()
+    while count < 3 or time.perf_counter() - began < seconds:
+        step()
+        count += 1
+    return (time.perf_counter() - began) / count, (time.process_time() - used) / count
+
+
 def medians(measured: Mapping[Name, list[float]]) -> dict[Name, float]:
     """Median of what was measured of each way."""
     return {name: statistics.median(values) for name, values in measured.items()}
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table of Markdown."""
+    escaped = ([cell.replace("|", "\\|") for cell in cells] for cells in (head, *rows))
+    lines = [f"| {' | '.join(cells)} |" for cells in escaped]
+    rule = "|---" * len(head) + "|"
+    return "\n".join((lines[0], rule, *lines[1:]))
 
 
 def add_row(path: Path, row: Mapping[str, Any]) -> None:

@@ -14,7 +14,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from measuring import RESULTS, medians, options, write
+from measuring import RESULTS, in_turns, medians, options, write
 
 ONE = """
 import gymnasium, numpy as np
@@ -76,13 +76,18 @@ def main() -> None:
         "PyFlyt QuadX-Hover-v4": (args.pyflyt, PYFLYT, (1,)),
         "Crazyflow DroneReachPos-v0": (args.crazyflow, CRAZYFLOW, (1, 64, 1024, 4096)),
     }
-    rates: dict[str, list[float]] = {}
-    for _ in range(args.rounds):
-        for name, (python, script, counts) in peers.items():
-            for n in counts if python else ():
-                words = [str(python), "-c", ONE + script + CLOCK, str(n), str(args.seconds)]
-                said = subprocess.run(words, check=True, capture_output=True, text=True).stdout
-                rates.setdefault(f"{name}, {n}", []).append(round(float(said.split()[-1]), 1))
+    ways = {
+        f"{name}, {n}": [str(python), "-c", ONE + script + CLOCK, str(n), str(args.seconds)]
+        for name, (python, script, counts) in peers.items()
+        for n in counts
+        if python
+    }
+
+    def rate(words: list[str]) -> float:
+        said = subprocess.run(words, check=True, capture_output=True, text=True).stdout
+        return round(float(said.split()[-1]), 1)
+
+    rates = in_turns(ways, args.rounds, rate)
     middle = medians(rates)
     write(args.out, {"env_steps_per_second": middle, "rates": rates, "seconds": args.seconds})
     for name, rate in middle.items():

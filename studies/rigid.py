@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measuring import RESULTS, in_turns, medians, options, write
+from measuring import RESULTS, in_turns, medians, options, timed, write
 from rotorgram.envs import EnvConfig, Loop
 from rotorgram.models import QUAD_XML, Vehicle
 from rotorgram.sim import InitialState, make_world
@@ -87,14 +87,8 @@ def distances(file: Path, dtype: str, drones: int = 32) -> dict[str, float]:
 
 def rate(fly: Callable[[], None], drones: int, seconds: float) -> tuple[float, float]:
     """Control steps of all drones per second, and per second of a processor."""
-    times = 0
-    start = time.perf_counter()
-    used = time.process_time()
-    while times < 3 or time.perf_counter() - start < seconds:
-        fly()
-        times += 1
-    flown = times * drones
-    return flown / (time.perf_counter() - start), flown / (time.process_time() - used)
+    wall, used = timed(fly, seconds)
+    return drones / wall, drones / used
 
 
 def world(backend: Any, drones: int, steps: int = 2, **settings: Any) -> Callable[[], None]:

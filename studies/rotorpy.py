@@ -1,16 +1,16 @@
 """Flights of the AscTec Hummingbird, ours beside RotorPy's.
 
-`python studies/rotorpy.py [FOLDER] [--python FILE]` writes `hummingbird.json`, which
-`docs/independent.md` shows, into the folder, and draws `docs/images/rotorpy.png`. RotorPy comes
-from PyPI into an environment that the script makes and removes; or FILE is the Python of one that
-has it.
+    python studies/rotorpy.py [--out FOLDER] [--python FILE]
+
+writes `hummingbird.json`, which `docs/independent.md` shows, and draws `docs/images/rotorpy.png`,
+in some minutes. RotorPy comes from PyPI into an environment that the script makes and removes; or
+FILE is the Python of one that has it.
 
 Both fly the parameters of RotorPy's own `hummingbird_params`, read when this runs: for ours they
 become an MJCF file. The motor speeds commanded, the starts and the flights are those of
 `independent.py`, whose solution stands beside both.
 """
 
-import argparse
 import json
 import subprocess
 import sys
@@ -32,6 +32,7 @@ from independent import (
     ours,
     thrusts,
 )
+from measuring import options, table
 from rotorgram.models import Vehicle
 
 HERE: Final = Path(__file__).parent
@@ -145,11 +146,11 @@ def markdown(result: dict[str, Any]) -> str:
     """The table, in Markdown."""
     kinds = ["independent", "RotorPy", *(f"{step * 1e3:g} ms" for step in reversed(STEPS))]
     heads = ["independent solution", "RotorPy as it is", *(f"ours, {kind}" for kind in kinds[2:])]
-    lines = [f"| effects | {' | '.join(heads)} |", "|---" * (1 + len(kinds)) + "|"]
+    rows = []
     for row in result["rows"]:
-        cells = [f"{row['metres'][k]:.1e} m, {row['degrees'][k]:.1e}°" for k in kinds]
-        lines.append(f"| {row['effects']} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+        cells = (f"{row['metres'][k]:.1e} m, {row['degrees'][k]:.1e}°" for k in kinds)
+        rows.append((row["effects"], *cells))
+    return table(("effects", *heads), rows)
 
 
 def draw(result: dict[str, Any], path: Path) -> None:
@@ -186,17 +187,14 @@ def _made(folder: str) -> str:
 
 
 def _main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("folder", nargs="?", type=Path, default=RESULTS)
-    parser.add_argument("--python", help="of an environment that has RotorPy")
-    given = parser.parse_args()
+    args = options(__doc__, out=RESULTS, python=str).parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        result = compare(given.python or _made(folder))
-    given.folder.mkdir(parents=True, exist_ok=True)
+        result = compare(args.python or _made(folder))
+    args.out.mkdir(parents=True, exist_ok=True)
     text = json.dumps(result, separators=(",", ":")).replace('{"effects"', '\n{"effects"')
-    (given.folder / "hummingbird.json").write_text(text + "\n", encoding="utf-8")
+    (args.out / "hummingbird.json").write_text(text + "\n", encoding="utf-8")
     print(markdown(result))
-    draw(result, PICTURE if given.folder == RESULTS else given.folder / PICTURE.name)
+    draw(result, PICTURE if args.out == RESULTS else args.out / PICTURE.name)
 
 
 if __name__ == "__main__":

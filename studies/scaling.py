@@ -15,19 +15,20 @@
   there is no Ray.
 """
 
+import itertools
 import statistics
-import subprocess
-import sys
 import time
+from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import rotorgram.envs  # noqa: F401  # makes the envs known
-from measuring import RESULTS, medians, options, write
+from measuring import RESULTS, in_turns, launch, medians, options, timed, write
 from rotorgram.envs.config import EnvConfig
 from rotorgram.flights.executors import WorkersConfig
 from rotorgram.flights.folders import new_folder
@@ -52,20 +53,14 @@ cluster.shutdown()
 """
 
 
-def fly(env, seconds):
-    """Control steps per second, and the processor time of this process for each, s."""
-    count = 0
+def fly(env: Any, seconds: float) -> tuple[float, float]:
+    """Wall time of a control step, and processor time of this process for it, s."""
     actions = np.zeros((env.num_envs, 1), np.float32)
-    wall = time.perf_counter()
-    cpu = time.process_time()
-    while time.perf_counter() - wall < seconds:
-        env.advance(actions, env.done if env.done.any() else None)
-        count += 1
-    return count / (time.perf_counter() - wall), (time.process_time() - cpu) / count
+    return timed(lambda: env.advance(actions, env.done if env.done.any() else None), seconds)
 
 
 @contextmanager
-def simulators(count):
+def simulators(count: int) -> Iterator[RemoteVectorEnv]:
     """An agent's env and its simulators, each a process."""
     here = "127.0.0.1", 0
     with closing(
@@ -83,24 +78,17 @@ def simulators(count):
         yield env
 
 
-def in_turns(envs, rounds, seconds):
+def measure(envs: dict[int, Any], rounds: int, seconds: float) -> dict[int, dict[str, float]]:
     """Median rate in env steps/s and processor time per control step, s, of each."""
-    measured = {name: [] for name in envs}
-    for number in range(rounds + 1):
-        for name, env in envs.items():
-            rate, cpu = fly(env, seconds)
-            if number:  # the first round warms up
-                measured[name].append((rate * env.num_envs, cpu))
-    return {
-        name: {
-            "rate": round(statistics.median(rate for rate, _ in pairs)),
-            "agent_seconds": round(statistics.median(cpu for _, cpu in pairs), 6),
-        }
-        for name, pairs in measured.items()
-    }
+    found = {}
+    for name, pairs in in_turns(envs, rounds, lambda env: fly(env, seconds)).items():
+        wall, processor = np.median(pairs, axis=0)
+        rate = round(envs[name].num_envs / wall)
+        found[name] = {"rate": rate, "agent_seconds": round(processor, 6)}
+    return found
 
 
-def measure_threads(rounds, seconds):
+def measure_threads(rounds: int, seconds: float) -> dict[int, float]:
     with ExitStack() as stack:
         envs = {}
         for threads in (1, 2):
@@ -108,16 +96,16 @@ def measure_threads(rounds, seconds):
             env = stack.enter_context(closing(made))
             env.reset(seed=0)
             envs[threads] = env
-        return {name: value["rate"] for name, value in in_turns(envs, rounds, seconds).items()}
+        return {name: value["rate"] for name, value in measure(envs, rounds, seconds).items()}
 
 
-def measure_simulators(rounds, seconds):
+def measure_simulators(rounds: int, seconds: float) -> dict[int, dict[str, float]]:
     with ExitStack() as stack:
         envs = {count: stack.enter_context(simulators(count)) for count in (1, 2, 4)}
-        return in_turns(envs, rounds, seconds)
+        return measure(envs, rounds, seconds)
 
 
-def extrapolate(alone, measured):
+def extrapolate(alone: float, measured: dict[int, dict[str, float]]) -> dict[str, object]:
     """Env steps/s with M machines like this one: one simulator on each, the agent apart."""
     physics = DRONES / alone
     agent = statistics.median(value["agent_seconds"] / n for n, value in measured.items())
@@ -129,28 +117,26 @@ def extrapolate(alone, measured):
     }
 
 
-def measure_runs(env_steps, rounds):
+def measure_runs(env_steps: int, rounds: int) -> dict[str, object]:
     row = Row(agent="a2c", env_steps=env_steps)
     study = Study(rows=(row,), seeds=4, snapshots=1, curve_episodes=1, episodes=1, wire=True)
     ways = {"one worker": WorkersConfig(jobs=1), "two processes": WorkersConfig(jobs=2)}
     with ExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory()))
         if find_spec("ray"):
-            pipe = subprocess.PIPE
-            cluster = subprocess.Popen(
-                [sys.executable, "-c", CLUSTER], stdin=pipe, stdout=pipe, text=True
-            )
+            cluster = launch(CLUSTER, None)
             stack.callback(cluster.wait)
             stack.callback(cluster.stdin.close)
             address = next(x for x in cluster.stdout if x.startswith("at ")).split()[1]
             ways["two, Ray"] = WorkersConfig(jobs=2, runner="ray", address=address)
-        seconds = {name: [] for name in ways}
-        for number in range(rounds):
-            for name, way in ways.items():
-                start = time.perf_counter()
-                run_study(study, new_folder(folder / f"{number} {name}", ""), workers=way)
-                seconds[name].append(round(time.perf_counter() - start, 2))
-                print(f"{name}: {seconds[name][-1]} s", flush=True)
+        numbers = itertools.count()
+
+        def compared(workers: WorkersConfig) -> float:
+            start = time.perf_counter()
+            run_study(study, new_folder(folder / str(next(numbers)), ""), workers=workers)
+            return round(time.perf_counter() - start, 2)
+
+        seconds = in_turns(ways, rounds, compared)
     return {
         "env_steps": env_steps,
         "trainings": study.seeds,

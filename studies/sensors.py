@@ -1,15 +1,16 @@
 """Allan deviation of the simulated gyroscope, and what each sensor costs.
 
-`python studies/sensors.py FOLDER` writes `allan.csv`, `allan.png` and `cost.json`, which
-`docs/sensors.md` shows. Gyroscope: 32 drones at rest for 1,000 s, read at 50 Hz, the three axes of
+    python studies/sensors.py [--out FOLDER]
+
+writes `allan.csv`, `allan.png` and `cost.json`, which `docs/sensors.md` shows, in some minutes.
+Gyroscope: 32 drones at rest for 1,000 s, read at 50 Hz, the three axes of
 all together. Cost: processor time of a control step of 0.02 s, the least of several rounds.
 """
 
-import csv
 import json
 import math
-import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,6 +18,7 @@ import gymnasium as gym
 import numpy as np
 import rotorgram.envs  # noqa: F401
 from matplotlib.figure import Figure
+from measuring import RESULTS, options, write_rows
 from rotorgram.models import Vehicle
 from rotorgram.sim import InitialState, checked_sensors, make_world
 from rotorgram.sim.sensors import Sensors
@@ -65,8 +67,18 @@ def gyroscope() -> np.ndarray:
     return readings
 
 
-def allan(rates: np.ndarray) -> list[tuple[float, float, float, float]]:
-    """(τ in s, overlapping Allan deviation, its closed form, both in rad/s, and their ratio)."""
+@dataclass(frozen=True)
+class Deviation:
+    """Overlapping Allan deviation at an averaging time, beside its closed form."""
+
+    tau_s: float
+    simulated_rad_s: float
+    closed_form_rad_s: float
+    ratio: float
+
+
+def allan(rates: np.ndarray) -> list[Deviation]:
+    """Deviations at averaging times that double, for rates of shape (samples, n)."""
     angle = np.concatenate((np.zeros((1, rates.shape[1])), rates.cumsum(axis=0)))
     rows = []
     for power in range(int(math.log2(_SAMPLES / 4)) + 1):
@@ -74,7 +86,7 @@ def allan(rates: np.ndarray) -> list[tuple[float, float, float, float]]:
         second = (angle[2 * m :] - 2 * angle[m:-m] + angle[: -2 * m]) / m
         found = math.sqrt(0.5 * float(np.mean(second**2)))
         expected = math.hypot(*lines(m * _PERIOD))
-        rows.append((m * _PERIOD, found, expected, found / expected))
+        rows.append(Deviation(m * _PERIOD, found, expected, found / expected))
     return rows
 
 
@@ -83,16 +95,18 @@ def lines(time: float) -> tuple[float, float]:
     return IRIS["gyro_noise"] / math.sqrt(time), IRIS["gyro_walk"] * math.sqrt(time / 3)
 
 
-def draw(rows: list[tuple[float, float, float, float]], path: Path) -> None:
+def draw(rows: list[Deviation], path: Path) -> None:
     """The figure."""
     figure = Figure(figsize=(6.4, 4.0), layout="constrained")
     axes = figure.subplots()
-    times = np.array([row[0] for row in rows])
+    times = np.array([row.tau_s for row in rows])
     white, walk = np.array([lines(time) for time in times]).T
     axes.loglog(times, white, "--", color="#56B4E9", label="white noise, N / √τ")
     axes.loglog(times, walk, "--", color="#E69F00", label="walk of the bias, K √(τ / 3)")
     axes.loglog(times, np.hypot(white, walk), color="#555555", label="both")
-    axes.loglog(times, [row[1] for row in rows], "o", color="#D55E00", label="simulated")
+    axes.loglog(
+        times, [row.simulated_rad_s for row in rows], "o", color="#D55E00", label="simulated"
+    )
     axes.set_ylim(0.5 * np.hypot(white, walk).min(), 2 * white.max())
     axes.set(xlabel="averaging time τ, s", ylabel="Allan deviation, rad/s")
     axes.grid(alpha=0.3)
@@ -134,15 +148,11 @@ def _time(env: Any, steps: int) -> float:
 
 
 def main() -> None:
-    folder = Path(sys.argv[1])
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "cost.json").write_text(json.dumps(costs(), indent=1) + "\n")
+    folder = options(__doc__, out=RESULTS / "sensors").parse_args().out
     rows = allan(gyroscope())
-    with (folder / "allan.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(("tau_s", "simulated_rad_s", "closed_form_rad_s", "ratio"))
-        writer.writerows([f"{value:.6g}" for value in row] for row in rows)
+    write_rows(folder / "allan.csv", rows)
     draw(rows, folder / "allan.png")
+    (folder / "cost.json").write_text(json.dumps(costs(), indent=1) + "\n")
 
 
 if __name__ == "__main__":

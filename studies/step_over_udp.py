@@ -7,11 +7,11 @@ its simulator take turns of a moment; medians over the rounds count. Prints micr
 step as a multiple of env and echo together.
 """
 
-import argparse
-import statistics
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 
+from measuring import in_turns, medians, options
 from rotorgram.envs.config import EnvConfig
 from rotorgram.training.bench import _echo, _env, _local
 from rotorgram.udp.spawn import spawn_simulator
@@ -20,25 +20,24 @@ ENV_ID = "rotorgram/Elevation-v0"
 TURN = 0.2  # s
 
 
+def microseconds(run: Callable[[float], int]) -> float:
+    """Of a step, the mean over a moment."""
+    began = time.perf_counter()
+    count = run(TURN)
+    return 1e6 * (time.perf_counter() - began) / count
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rounds", type=int, default=20)
-    rounds = parser.parse_args().rounds
+    rounds = options(__doc__, rounds=20).parse_args().rounds
     with ExitStack() as stack:
         runs = {
             "env": _local(stack, 1),
             "echo": _echo(stack),
             "step": _env(stack.enter_context(spawn_simulator(EnvConfig(env_id=ENV_ID)))),
         }
-        times: dict[str, list[float]] = {name: [] for name in runs}
-        for _ in range(rounds):
-            for name, run in runs.items():
-                begin = time.perf_counter()
-                count = run(TURN)
-                times[name].append((time.perf_counter() - begin) / count)
-    median = {name: 1e6 * statistics.median(seconds) for name, seconds in times.items()}
-    for name, microseconds in median.items():
-        print(f"{name}: {microseconds:.1f} µs")
+        median = medians(in_turns(runs, rounds, microseconds))
+    for name, time_of_step in median.items():
+        print(f"{name}: {time_of_step:.1f} µs")
     print(f"step ÷ (env + echo): {median['step'] / (median['env'] + median['echo']):.2f}")
 
 

@@ -11,11 +11,10 @@ Over UDP the simulator is a process of its own, and the agent asks for a standst
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
 import numpy as np
-from measuring import in_turns, medians, options, write
+from measuring import in_turns, medians, options, table, timed, write
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.envs.config import EnvConfig
 from rotorgram.udp.spawn import spawn_simulator
@@ -45,16 +44,6 @@ def advanced(env: Any, drones: int) -> Step:
     return (lambda: env.advance(actions)) if vector else (lambda: env.step(actions))
 
 
-def timed(step: Step, seconds: float) -> float:
-    """Seconds of a step: the mean over as many as take about so long."""
-    steps = 0
-    begun = perf_counter()
-    while perf_counter() - begun < seconds:
-        step()
-        steps += 1
-    return (perf_counter() - begun) / steps
-
-
 def measure(counts: list[int], seconds: float, repeats: int) -> dict[str, dict[str, float]]:
     """Microseconds for each drone and step, by case and number of drones."""
     with ExitStack() as opened:
@@ -67,7 +56,7 @@ def measure(counts: list[int], seconds: float, repeats: int) -> dict[str, dict[s
             cases["one world", drones] = physics(drones, together=True)
             cases["with the task", drones] = advanced(local, drones)
             cases["over UDP", drones] = advanced(opened.enter_context(pair), drones)
-        taken = medians(in_turns(cases, repeats, lambda step: timed(step, seconds)))
+        taken = medians(in_turns(cases, repeats, lambda step: timed(step, seconds)[0]))
     found: dict[str, dict[str, float]] = {}
     for (name, drones), time in taken.items():
         found.setdefault(name, {})[str(drones)] = round(time / drones * 1e6, 2)
@@ -79,10 +68,8 @@ def main() -> None:
     drones = (1, 8, 32, 100)
     args = options(__doc__, drones=drones, seconds=0.5, repeats=9, out=Path).parse_args()
     found = measure(args.drones, args.seconds, args.repeats)
-    print("| µs for each drone and step | " + " | ".join(map(str, args.drones)) + " |")
-    print("|---|" + "---:|" * len(args.drones))
-    for name, row in found.items():
-        print(f"| {name} | " + " | ".join(f"{x:,.1f}" for x in row.values()) + " |")
+    rows = [(name, *(f"{time:,.1f}" for time in row.values())) for name, row in found.items()]
+    print(table(("µs for each drone and step", *map(str, args.drones)), rows))
     if args.out:
         write(args.out, {"microseconds": found})
 

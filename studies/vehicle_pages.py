@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import mujoco
 import numpy as np
-from measuring import options
+from measuring import options, table
 from PIL import Image
 from rotorgram.models import InputError, Vehicle
 from rotorgram.models.checks import examine
@@ -158,12 +158,6 @@ def works_of(source: str) -> list[str]:
         raise ValueError(f"expected a source that begins with a work of library.toml: {source!r}")
     cited = [work for work in LIBRARY["works"] if work in source and work[-4:].isdecimal()]
     return [max(first, key=len), *cited]
-
-
-def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table of Markdown."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join(f"| {' | '.join(cell.replace('|', '¦') for cell in line)} |" for line in lines)
 
 
 def shown(value: float | Sequence[float]) -> str:

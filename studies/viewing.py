@@ -9,6 +9,7 @@ page is also watched by one, without a screen: it draws on the same processors, 
 would.
 """
 
+import itertools
 import json
 import shutil
 import statistics
@@ -21,7 +22,7 @@ from contextlib import contextmanager, nullcontext
 from typing import Any
 
 import numpy as np
-from measuring import RESULTS, medians, options, write
+from measuring import RESULTS, in_turns, medians, options, timed, write
 from rotorgram.udp import RemoteEnv, RemoteVectorEnv
 
 PORT = 8181
@@ -94,18 +95,16 @@ def browser() -> Iterator[None]:
 
 def fly(env: Any, drones: int, seconds: float) -> float:
     """Control steps per second."""
-    actions = np.random.default_rng(0).uniform(-0.1, 0.1, (256, drones, 1)).astype(np.float32)
-    steps = 0
-    start = time.perf_counter()
-    while time.perf_counter() - start < seconds:
-        if drones > 1:
-            env.step(actions[steps % 256])
-        else:
-            _, _, terminated, truncated, _ = env.step(actions[steps % 256, 0])
-            if terminated or truncated:
-                env.reset()
-        steps += 1
-    return steps / (time.perf_counter() - start)
+    drawn = np.random.default_rng(0).uniform(-0.1, 0.1, (256, drones, 1)).astype(np.float32)
+    actions = itertools.cycle(drawn if drones > 1 else drawn[:, 0])
+
+    def step() -> None:
+        _, _, terminated, truncated, _ = env.step(next(actions))
+        if drones == 1 and (terminated or truncated):
+            env.reset()
+
+    wall, _ = timed(step, seconds)
+    return 1 / wall
 
 
 def turn(drones: int, kind: str, seconds: float) -> tuple[float, float]:
@@ -143,21 +142,13 @@ def main() -> None:
     renderer = subprocess.run(
         [sys.executable, "-c", RENDERER], capture_output=True, text=True, check=True
     ).stdout.strip()
-    rates: dict[str, dict[str, list[float]]] = {
-        str(drones): {kind: [] for kind in kinds} for drones in (1, 64)
-    }
-    pictures: dict[str, dict[str, list[float]]] = {
-        drones: {kind: [] for kind in kinds} for drones in rates
-    }
-    for number in range(args.rounds):
-        order = kinds[number % len(kinds) :] + kinds[: number % len(kinds)]
-        for drones in (1, 64):
-            for kind in order:
-                rate, drawn = turn(drones, kind, args.seconds)
-                rates[str(drones)][kind].append(round(rate, 1))
-                pictures[str(drones)][kind].append(round(drawn, 1))
-                told = f"{rate:,.0f} control steps/s, {drawn:.1f} pictures/s"
-                print(f"{drones:3} drones, {kind}: {told}", flush=True)
+    ways = {(drones, kind): (drones, kind) for drones in (1, 64) for kind in kinds}
+    turns = in_turns(ways, args.rounds, lambda way: turn(*way, args.seconds))
+    rates: dict[str, dict[str, list[float]]] = {"1": {}, "64": {}}
+    pictures: dict[str, dict[str, list[float]]] = {"1": {}, "64": {}}
+    for (drones, kind), pairs in turns.items():
+        rates[str(drones)][kind] = [round(rate, 1) for rate, _ in pairs]
+        pictures[str(drones)][kind] = [round(drawn, 1) for _, drawn in pairs]
     result = {
         "rounds": args.rounds,
         "seconds": args.seconds,
@@ -169,7 +160,7 @@ def main() -> None:
         },
         "rates": rates,
         "opengl": renderer,
-        "world": "airport",
+        "scene": "airport",
     }
     write(args.out, result)
     print(json.dumps(result["control_steps_per_second"], indent=2))

@@ -282,15 +282,12 @@ def test_the_curriculum_is_the_one_that_was_measured() -> None:
 
 def test_the_page_of_rigid_tells_what_the_benchmarks_wrote() -> None:
     page = (ROOT / "docs" / "rigid.md").read_text()
-    sizes, shares, a2c = (
-        json.loads((RESULTS / "rigid" / f"{name}.json").read_text())
-        for name in ("sizes", "shares", "a2c")
+    sizes, a2c = (
+        json.loads((RESULTS / "rigid" / f"{name}.json").read_text()) for name in ("sizes", "a2c")
     )
     for drones, row in sizes["processor_microseconds"].items():
         numbers = [f"{number:,}" for name, number in row.items() if "tensors" not in name]
         assert f"| {int(drones):,} | {' | '.join(numbers)} |" in page
-    for number in shares["microseconds_per_step"].values():
-        assert f" | {number:,} |" in page
     assert f"{a2c['ratio_to_sb3']['a2c']:.2f} times as many env steps per second" in page
 
 
