@@ -13,6 +13,8 @@ the same, and every action the one that follows from it.
 
 Then one agent flies a hundred drones of one world through such a relay, beside the same env in
 process: again every bit has to be the same.
+
+It takes about three minutes on two cores.
 """
 
 import json

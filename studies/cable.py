@@ -5,6 +5,8 @@
 Of each vehicle of the library and each number of drones, over the evaluation episodes of Cable-v0:
 median and largest of the means of the payload's error over the last quarter of an episode, and
 worlds whose episode terminated.
+
+It takes about five minutes on two cores.
 """
 
 from typing import Any

@@ -5,6 +5,8 @@
 RIGID and MUJOCO are folders of `rotorgram compare` with the same settings but for the backend and
 the number of seeds. Of the seeds that both have, the file has a row for each agent and measure: the
 interquartile means, the difference `mujoco` - `rigid`, and its 95 % bootstrap interval.
+
+It takes about a few seconds on two cores.
 """
 
 from pathlib import Path

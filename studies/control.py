@@ -6,6 +6,8 @@ Steps begin at hover, and are flown by the level itself. Rise: from 10 % to 90 %
 overshoot: share of the step; settled: the last time at which it is 5 % of the step away. The circle
 is flown by the agent `geometric`: the root mean square of its distance from the goal in the third
 lap. Costs: env steps per second of Hover-v0 over those of `rotors`; the levels take turns.
+
+It takes about two minutes on two cores.
 """
 
 import json

@@ -1,6 +1,8 @@
 """Draw `docs/images/cameras.jpg`: the same moment of a flight from every camera.
 
 Run `python studies/draw_cameras.py`; it needs no display.
+
+It takes about a few seconds on two cores.
 """
 
 from measuring import IMAGES, options

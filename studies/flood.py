@@ -5,6 +5,8 @@
 The garbage: random bytes, with a valid magic and without, Hellos of an env that is not flown and of
 the one that is, States of sessions that do not exist, lines of text. The training has to end with
 the very weights, optimizer's state and episodes of one that nobody disturbs.
+
+It takes about two minutes on two cores.
 """
 
 import json

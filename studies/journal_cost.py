@@ -9,6 +9,8 @@ count, so that a machine that slows down for a while slows all alike.
 
 Beside it, less disturbed by others: the processor time of a step on the side that writes, against
 that of the same side without a journal, and the journal alone, chunks and writing included.
+
+It takes about two minutes on two cores.
 """
 
 import statistics

@@ -12,6 +12,8 @@ its own, are killed at random moments and started again by the same command, the
 
 After every kill the checkpoint has to load, the episodes before it have to be there, unchanged, and
 the training has to advance within a minute. Then Ctrl-C: both sides have to end within a second.
+
+It takes about ten minutes on two cores.
 """
 
 import json

@@ -5,6 +5,8 @@
     python studies/libraries.py docs/libraries.md
 
 The exit status is 1 if a library does not fly an env. The page has the versions.
+
+It takes about two minutes on two cores.
 """
 
 import subprocess

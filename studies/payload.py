@@ -5,6 +5,8 @@
 Of each vehicle, over episodes of PayloadHover-v0 from seeds 100 on: medians of the means over the
 last quarter of an episode, and episodes that terminated. Without: the agent is not told the options
 of the env, and cannot know cable and mass.
+
+It takes about two minutes on two cores.
 """
 
 from dataclasses import replace

@@ -8,6 +8,8 @@ Each runs in a Python of its own, for their requirements exclude each other. The
 medians count. Hover tasks, a control step of 0.02 s where it can be chosen, PyFlyt's own otherwise.
 They do not compute the same: PyFlyt simulates propellers, motors and a body with contacts in
 Bullet, Crazyflow an analytic model of a Crazyflie in JAX, without contacts.
+
+It takes about three minutes on two cores.
 """
 
 import subprocess

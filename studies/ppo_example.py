@@ -4,6 +4,8 @@
 
 For each seed: after how many steps the mean return of the last 32 episodes is 150 and 200 of at
 most 250. Both train with 16 drones in process and look after each update of 2,048 steps.
+
+It takes about six minutes on two cores.
 """
 
 import json

@@ -4,6 +4,8 @@
 
 Every size and quality is drawn in turns; the fastest round of each counts, since other work on the
 machine only slows it down. The craft flies: every picture differs from the one before.
+
+It takes about two minutes on two cores.
 """
 
 import json

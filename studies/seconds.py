@@ -9,6 +9,8 @@ written. Processor seconds are of all its processes: on a busy machine compare t
 then flies 20 `--episodes` on `mujoco`, of starts that no training has seen. A seed holds if the
 mean of the steady headline metric over the episodes is on the good side of `--within`, and none of
 them crashes; for a metric whose last value counts, as `landed`, the mean alone decides.
+
+It takes about two minutes on two cores.
 """
 
 import os

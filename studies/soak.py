@@ -6,6 +6,8 @@ Every job is an agent, a relay that loses 30 % of the datagrams, doubles 10 %, r
 7 %, and a simulator, each a process of its own. The agent flies the same seeds and random actions
 on a local env beside it and compares every bit of every answer. The last job flies 64 drones, the
 one before it with a key. One bit that differs ends the soak with the step's number.
+
+It takes about an hour and a half on two cores.
 """
 
 import json

@@ -5,6 +5,8 @@
 The env, a blocking echo of the same sizes whose two processes share a core, and a `RemoteEnv` with
 its simulator take turns of a moment; medians over the rounds count. Prints microseconds, and the
 step as a multiple of env and echo together.
+
+It takes about a few seconds on two cores.
 """
 
 import time

@@ -6,6 +6,8 @@ A step is one of 0.02 s of `rotorgram/Formation-v0` with the vehicle of the pape
 steps, at hover. `apart` are as many worlds of one drone in one batch. Cases take turns within a
 repeat, and the medians over the repeats are told, in microseconds for each drone and control step.
 Over UDP the simulator is a process of its own, and the agent asks for a standstill.
+
+It takes about two minutes on two cores.
 """
 
 from collections.abc import Callable

@@ -5,6 +5,8 @@
 A lock-step of one drone over UDP, agent and simulator in a process each. `looks` is the wait of
 `rotorgram.udp.transport.sockets`; `sleeps` is the same with no time to look. Both pairs stay open
 and take turns; medians count. Neighbours are endless loops in Python.
+
+It takes about a minute on two cores.
 """
 
 import itertools

@@ -143,114 +143,117 @@ Fate = Callable[[bytes], list[tuple[float, bytes]]]
 """What becomes of a datagram: delays, s, and bytes."""
 
 
-class Pair:
-    """A simulator and an agent joined by a network, with a clock of its own.
+class Network:
+    """Simulators and an agent, joined by a network with a clock of its own."""
 
-    The simulator counts its steps in its observation, the agent its choices in its action.
-    """
-
-    def __init__(self, client: Client, server: Server, fate: Fate, peer: Address = HERE) -> None:
-        self.client = client
-        self.server = server
-        self.fate = fate
-        self.peer = peer
-        self.now = 0.0
-        self.steps: list[float] = []
-        """Actions in the order in which the simulator stepped them."""
-        self.seen: list[float] = []
-        """Observations in the order in which the agent took them."""
-        self.sent = 0
-        self._order = 0
-        self._flying: list[tuple[float, int, str, bytes]] = []
-
-    def run(self, steps: int) -> None:
-        self.client.connect(self.now)
-        while len(self.steps) < steps:
-            self._send()
-            timer = self.client.next_timer()
-            assert timer < inf or self._flying, "nothing will ever happen"
-            if self._flying and self._flying[0][0] <= timer:
-                self._arrive()
-            else:
-                self.now = max(self.now, timer)
-                assert self.client.handle_timer(self.now), "silent"
-
-    def _send(self) -> None:
-        for datagram in self.client.take_outgoing():
-            self._put("agent", datagram)
-        for datagram, _ in self.server.take_outgoing():
-            self._put("simulator", datagram)
-
-    def _put(self, to: str, datagram: bytes) -> None:
-        self.sent += 1
-        for delay, bytes_ in self.fate(datagram):
-            self._order += 1
-            heappush(self._flying, (self.now + delay, self._order, to, bytes_))
-
-    def _arrive(self) -> None:
-        self.now, _, to, datagram = heappop(self._flying)
-        if to == "agent":
-            event = self.server.receive(datagram, self.peer, self.now)
-            if isinstance(event, Event) and isinstance(event.message, State):
-                self.seen.append(float(event.message.observations[0].flat[0]))
-                send_command(self.server, event.slot, len(self.seen), self.now)
-            return
-        message = self.client.receive(datagram, self.now)
-        if isinstance(message, Command):
-            self.steps.append(float(message.actions.flat[0]))
-        if isinstance(message, Command | Welcome):
-            send_state(self.client, len(self.steps), self.now)
-
-
-class Fleet:
-    """Simulators, one for each slot of an agent that answers all of their States at once."""
-
-    def __init__(self, clients: list[Client], server: Server, fate: Fate) -> None:
+    def __init__(
+        self, clients: list[Client], server: Server, fate: Fate, addresses: list[Address]
+    ) -> None:
         self.clients = clients
         self.server = server
         self.fate = fate
+        self.addresses = addresses
         self.now = 0.0
-        self.steps = self._order = 0
+        self.sent = 0
+        self._copies = 0
         self._flying: list[tuple[float, int, str, int, bytes]] = []
+
+    def count(self) -> int:
+        """Steps so far."""
+        raise NotImplementedError
+
+    def agent_received(self, event: Any) -> None:
+        """The agent took a datagram: what its server made of it."""
+        raise NotImplementedError
+
+    def simulator_received(self, client: Client, message: Message | None) -> None:
+        """A simulator took a datagram."""
+        raise NotImplementedError
 
     def run(self, steps: int) -> None:
         for client in self.clients:
             client.connect(self.now)
-        while self.steps < steps:
+        while self.count() < steps:
             self._send()
             timers = [client.next_timer() or inf for client in self.clients]
             due = min(timers)
+            assert due < inf or self._flying, "nothing will ever happen"
             if self._flying and self._flying[0][0] <= due:
                 self._arrive()
-            else:
-                self.now = max(self.now, due)
-                assert self.clients[timers.index(due)].handle_timer(self.now), "silent"
+                continue
+            self.now = max(self.now, due)
+            assert self.clients[timers.index(due)].handle_timer(self.now), "silent"
 
     def _send(self) -> None:
         for number, client in enumerate(self.clients):
             for datagram in client.take_outgoing():
                 self._put("agent", number, datagram)
-        for datagram, (_, number) in self.server.take_outgoing():
-            self._put("simulator", number, datagram)
+        for datagram, address in self.server.take_outgoing():
+            self._put("simulator", self.addresses.index(address), datagram)
 
     def _put(self, to: str, number: int, datagram: bytes) -> None:
-        for delay, bytes_ in self.fate(datagram):
-            self._order += 1
-            heappush(self._flying, (self.now + delay, self._order, to, number, bytes_))
+        self.sent += 1
+        for delay, copy in self.fate(datagram):
+            self._copies += 1
+            heappush(self._flying, (self.now + delay, self._copies, to, number, copy))
 
     def _arrive(self) -> None:
         self.now, _, to, number, datagram = heappop(self._flying)
-        if to == "simulator":
+        if to == "agent":
+            event = self.server.receive(datagram, self.addresses[number], self.now)
+            self.agent_received(event)
+        else:
             client = self.clients[number]
-            if isinstance(client.receive(datagram, self.now), Command | Welcome):
-                send_state(client, 0.0, self.now)
-            return
-        self.server.receive(datagram, (HERE[0], number), self.now)
+            self.simulator_received(client, client.receive(datagram, self.now))
+
+
+class Pair(Network):
+    """One simulator counts its steps in its observation, the agent its choices in its action."""
+
+    def __init__(self, client: Client, server: Server, fate: Fate, peer: Address = HERE) -> None:
+        super().__init__([client], server, fate, [peer])
+        self.client = client
+        self.steps: list[float] = []
+        """Actions in the order in which the simulator stepped them."""
+        self.seen: list[float] = []
+        """Observations in the order in which the agent took them."""
+
+    def count(self) -> int:
+        return len(self.steps)
+
+    def agent_received(self, event: Any) -> None:
+        if isinstance(event, Event) and isinstance(event.message, State):
+            self.seen.append(float(event.message.observations[0].flat[0]))
+            send_command(self.server, event.slot, len(self.seen), self.now)
+
+    def simulator_received(self, client: Client, message: Message | None) -> None:
+        if isinstance(message, Command):
+            self.steps.append(float(message.actions.flat[0]))
+        if isinstance(message, Command | Welcome):
+            send_state(client, len(self.steps), self.now)
+
+
+class Fleet(Network):
+    """Simulators, one for each slot of an agent that answers all of their States at once."""
+
+    def __init__(self, clients: list[Client], server: Server, fate: Fate) -> None:
+        addresses = [(HERE[0], number) for number in range(len(clients))]
+        super().__init__(clients, server, fate, addresses)
+        self.steps = 0
+
+    def count(self) -> int:
+        return self.steps
+
+    def agent_received(self, event: Any) -> None:
         slots = self.server.slots
         if all(session and session.state is AgentState.DECIDING for session in slots):
             self.steps += 1
             for slot in range(len(slots)):
                 send_command(self.server, slot, 0.0, self.now)
+
+    def simulator_received(self, client: Client, message: Message | None) -> None:
+        if isinstance(message, Command | Welcome):
+            send_state(client, 0.0, self.now)
 
 
 def lossy(share: float, delay: float = 1e-3, seed: int = 1) -> Fate:

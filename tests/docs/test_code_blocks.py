@@ -6,31 +6,28 @@ comment of its own is run first. What else is not as on the page stands in `INST
 reason.
 """
 
-import atexit
 import io
 import re
 import shlex
-import shutil
-import socket
 import subprocess
 import sys
-import tempfile
 import tomllib
 from contextlib import redirect_stdout
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import pytest
+from programs import EXAMPLES, ROOT, free_port, rotorgram, run
 from rotorgram.cli import COMMANDS
 from rotorgram.cli._flags import parse
+from rotorgram.training.settings import Study
 
-ROOT = Path(__file__).parents[2]
 PAGES = [
     ROOT / "README.md",
     *sorted(path for path in (ROOT / "docs").rglob("*.md") if "results" not in path.parts),
-    *sorted((ROOT / "examples").rglob("*.md")),
+    *sorted(EXAMPLES.rglob("*.md")),
     ROOT / "models" / "README.md",
 ]
 FENCE = re.compile(r"^```(.*?)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -91,29 +88,12 @@ simulator.close()
 """
 
 
-def rotorgram(*arguments: str) -> list[str]:
-    return [sys.executable, "-m", "rotorgram.cli", *arguments]
-
-
-def run(command: list[str], folder: Path) -> str:
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=90)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        sock.bind(("127.0.0.1", 0))
-        return int(sock.getsockname()[1])
-
-
-@cache
-def short_training() -> str:
-    """The folder of one, for pages that fly a policy."""
-    folder = tempfile.mkdtemp()
-    atexit.register(shutil.rmtree, folder)
-    run(rotorgram("train", "a2c", "--env-steps", "256", "--out", f"{folder}/run"), Path(folder))
-    return f"{folder}/run"
+@pytest.fixture(scope="session")
+def training(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a short training, for pages that fly a policy."""
+    folder = tmp_path_factory.mktemp("training") / "run"
+    run(rotorgram("train", "a2c", "--env-steps", "256", "--out", folder), folder.parent)
+    return folder
 
 
 def simulators_for(code: str, port: int, folder: Path) -> list[subprocess.Popen[bytes]]:
@@ -132,7 +112,7 @@ def simulators_for(code: str, port: int, folder: Path) -> list[subprocess.Popen[
     ("page", "code"), PROGRAMS, ids=[f"{page}-{i}" for i, (page, _) in enumerate(PROGRAMS)]
 )
 def test_python_runs_as_pasted(
-    page: str, code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    page: str, code: str, training: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if "import minari" in code:
         pytest.importorskip("minari")
@@ -145,7 +125,7 @@ def test_python_runs_as_pasted(
     for words in re.findall(r"^# rotorgram (.+)$", code, re.MULTILINE):
         run(rotorgram(*words.split()), tmp_path)
     if "policy.onnx" in code:
-        run(rotorgram("export", short_training(), "--to", "onnx"), tmp_path)
+        run(rotorgram("export", training, "--to", "onnx"), tmp_path)
     if "8001" in code:
         port = free_port()
         code = code.replace("8001", str(port))
@@ -171,21 +151,27 @@ def test_every_fence_says_what_it_is() -> None:
     assert len(PROGRAMS) >= 16
 
 
+@pytest.mark.parametrize("block", [b for b in ALL if "\nagent = " in b.code], ids=str)
+def test_rows_of_a_study_are_ones_that_there_are(block: Block, tmp_path: Path) -> None:
+    (tmp_path / "rows.toml").write_text(block.code)
+    assert Study.from_toml(tmp_path / "rows.toml").rows
+
+
 # Commands
 
 
-def parsed(arguments: list[str]) -> Any:
-    """The command, as the real parser makes it. SystemExit: it cannot."""
+def parse_command(arguments: list[str]) -> None:
+    """By the real parser. Raises `SystemExit` for what it does not know."""
     name, *flags = arguments
     kind = getattr(import_module(f"rotorgram.cli.{name.replace('-', '_')}"), COMMANDS[name])
-    return parse(kind, f"rotorgram {name}", flags)
+    parse(kind, f"rotorgram {name}", flags)
 
 
 @cache
 def flags_of(*command: str) -> frozenset[str]:
     page = io.StringIO()
     with redirect_stdout(page), pytest.raises(SystemExit):
-        parsed([*command, "--help"])
+        parse_command([*command, "--help"])
     return frozenset(re.findall(r"--[a-z][a-z0-9.-]*", page.getvalue()))
 
 
@@ -236,11 +222,11 @@ RUN = {
 def test_commands_are_ones_that_there_are(
     page: str, command: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.syspath_prepend(ROOT / "examples")  # where landing.py is
+    monkeypatch.syspath_prepend(EXAMPLES)  # where landing.py is
     program, *arguments = command
     match program:
         case "rotorgram":
-            parsed(arguments)
+            parse_command(arguments)
         case "make":
             assert re.search(rf"^{arguments[0]}:", (ROOT / "Makefile").read_text(), re.MULTILINE)
         case "pip":
@@ -269,7 +255,7 @@ def test_short_commands_run(tmp_path: Path) -> None:
 def test_commands_and_flags_in_the_text_are_ones_that_there_are(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.syspath_prepend(ROOT / "examples")
+    monkeypatch.syspath_prepend(EXAMPLES)
     own = flags_of("sim", "--env", "landing:Landing-v0")
     flags = own.union(*(flags_of(command) for command in COMMANDS))
     for page in PAGES:

@@ -2,14 +2,13 @@
 
 import json
 import re
-import socket
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from programs import EXAMPLES, free_port, rotorgram, run
 
-EXAMPLES = Path(__file__).parents[2] / "examples"
 SHORT = {
     "fly_pid.py": ([], r"return 2\d\d\.\d, elevation 6\.000 m of 6\.0 m"),
     "mpc.py": (["--steps", "75"], r"step 75: 0\.[0-2]\d\d m from the goal"),
@@ -20,26 +19,21 @@ SHORT = {
 }
 
 
-def run(script: str, *arguments: str, cwd: Path) -> str:
-    command = [sys.executable, str(EXAMPLES / script), *arguments]
-    done = subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=110)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+def run_script(script: str, folder: Path, *arguments: str) -> str:
+    return run([sys.executable, str(EXAMPLES / script), *arguments], folder)
 
 
 @pytest.mark.parametrize("script", SHORT)
 def test_it_runs(script: str, tmp_path: Path) -> None:
     arguments, expected = SHORT[script]
-    assert re.search(expected, run(script, *arguments, cwd=tmp_path))
+    assert re.search(expected, run_script(script, tmp_path, *arguments))
 
 
 def test_the_text_agent_flies_a_simulator(tmp_path: Path) -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        sock.bind(("127.0.0.1", 0))
-        port = sock.getsockname()[1]
-    sim = [sys.executable, "-m", "rotorgram.cli", "sim", "--codec", "text", "--bind", "127.0.0.1:0"]
-    with subprocess.Popen([*sim, "--server", f"127.0.0.1:{port}"]) as simulator:
-        lines = run("text_agent.py", str(port), cwd=tmp_path).splitlines()
+    port = free_port()
+    addresses = ("--bind", "127.0.0.1:0", "--server", f"127.0.0.1:{port}")
+    with subprocess.Popen(rotorgram("sim", "--codec", "text", *addresses)) as simulator:
+        lines = run_script("text_agent.py", tmp_path, str(port)).splitlines()
         assert simulator.wait(20) == 0
     assert [line.split(":")[0] for line in lines] == [f"episode {i}" for i in range(3)]
     assert all(float(line.split()[-1]) > 150 for line in lines)
@@ -50,10 +44,10 @@ def test_the_detector_learns_from_pictures(opengl: None, tmp_path: Path) -> None
     plan = plan.replace('"down", "down_segm', '"down@32x32", "down_segm')
     plan = plan.replace("every = 5", "every = 9")
     (tmp_path / "pad.toml").write_text(plan.replace('tation"]', 'tation@32x32"]'), "utf-8")
-    command = [sys.executable, "-m", "rotorgram.cli", "capture", "pad.toml", "--out", "pad"]
-    subprocess.run([*command, "--jobs", "1"], cwd=tmp_path, check=True, timeout=110)
-    told = run("pad_detector.py", "pad", "--epochs", "2", "--out", "told.json", cwd=tmp_path)
-    assert json.loads(told) == json.loads((tmp_path / "told.json").read_text())
+    run(rotorgram("capture", "pad.toml", "--out", "pad", "--jobs", "1"), tmp_path)
+    words = ("pad", "--epochs", "2", "--out", "result.json")
+    told = run_script("pad_detector.py", tmp_path, *words)
+    assert json.loads(told) == json.loads((tmp_path / "result.json").read_text())
     (one,) = json.loads(told)["seeds"]
     assert 0.0 < one["median error"] < 32
 

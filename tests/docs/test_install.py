@@ -1,6 +1,5 @@
 """What is installed: layers of packages, the wheel, and how little a command imports."""
 
-import os
 import re
 import shutil
 import subprocess
@@ -16,18 +15,7 @@ from rotorgram.cli import COMMANDS, EXTRAS
 
 ROOT = Path(__file__).parents[2]
 PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-FOLDERS = (
-    "models",
-    "scenes",
-    "sim",
-    "envs",
-    "udp",
-    "agents",
-    "rendering",
-    "flights",
-    "training",
-    "cli",
-)
+FOLDERS = sorted({name.split(".")[1] for name in PROJECT["tool"]["setuptools"]["packages"][1:]})
 IMPORT_NAMES = {"pillow": "PIL"}
 
 WITHOUT = """
@@ -64,15 +52,6 @@ def test_the_table_of_extras_is_that_of_pyproject() -> None:
     for extra, modules in EXTRAS.items():
         names = [re.split(r"[>=\[]", line)[0] for line in declared[extra]]
         assert [IMPORT_NAMES.get(n, n.replace("-", "_")) for n in names] == list(modules), extra
-
-
-def test_every_package_is_listed() -> None:
-    found = {"rotorgram"} | {
-        "rotorgram." + ".".join(path.parent.relative_to(ROOT).parts)
-        for folder in FOLDERS
-        for path in (ROOT / folder).rglob("*.py")
-    }
-    assert sorted(PROJECT["tool"]["setuptools"]["packages"]) == sorted(found)
 
 
 @pytest.mark.parametrize(
@@ -198,29 +177,3 @@ def test_the_wheel_has_every_file(wheel: Path) -> None:
     expected |= {"rotorgram/__init__.py", "rotorgram/__main__.py"}
     packed = set(zipfile.ZipFile(wheel).namelist())
     assert {name for name in packed if not name.startswith("rotorgram-")} == expected
-
-
-def test_the_wheel_runs_the_demo(wheel: Path, tmp_path: Path) -> None:
-    """Not editable: what is imported are the wheel's files."""
-    installed = tmp_path / "installed"
-    zipfile.ZipFile(wheel).extractall(installed)
-    (tmp_path / "here").mkdir()
-    done = subprocess.run(
-        [sys.executable, "-P", "-m", "rotorgram.cli", "compare", "--agents", "a2c", "--seeds", "1",
-         "--env-steps", "1024", "--episodes", "1", "--snapshots", "1", "--no-film"],
-        cwd=tmp_path / "here",
-        env={**os.environ, "PYTHONPATH": str(installed)},
-        capture_output=True,
-        text=True,
-        timeout=100,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    (report,) = (tmp_path / "here" / "runs").glob("*/report.html")
-    assert "data:image/svg+xml" in report.read_text(encoding="utf-8")
-    where = subprocess.run(
-        [sys.executable, "-P", "-c", "import rotorgram.cli as c; print(c.__file__)"],
-        env={**os.environ, "PYTHONPATH": str(installed)},
-        capture_output=True,
-        text=True,
-    )
-    assert where.stdout.startswith(str(installed))

@@ -1,30 +1,21 @@
 """docs/troubleshooting.md quotes what is really printed: each sentence is provoked."""
 
-import socket
 import sys
 from contextlib import suppress
 from pathlib import Path
 from threading import Thread
 
 import pytest
+from peers import plain_socket
+from programs import ROOT, free_port
 from rotorgram.cli import main
 from rotorgram.udp import PeerSilent, RemoteEnv
 
-PAGE = (Path(__file__).parents[2] / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
+CODE = " ".join(PAGE.split()).split("`")[1::2]
+"""What the page quotes between backquotes."""
 QUIET = ["sim", "--bind", "127.0.0.1:0", "--timeout", "0.3", "--server"]
 """A simulator that gives up soon."""
-
-
-def quoted(part: str) -> bool:
-    """Whether the page has it as code, between backquotes."""
-    return any(part in code for code in " ".join(PAGE.split()).split("`")[1::2])
-
-
-@pytest.fixture
-def port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        sock.bind(("127.0.0.1", 0))
-        return int(sock.getsockname()[1])
 
 
 @pytest.fixture
@@ -42,21 +33,21 @@ def check(arguments: list[str], parts: list[str], capsys: pytest.CaptureFixture[
     assert all(line.startswith("rotorgram: dropped a datagram") for line in logged)
     for part in parts:
         assert part in sentence
-        assert quoted(part), part
+        assert any(part in code for code in CODE), part
 
 
-def test_no_agent(port: int, key: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_agent(key: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    alone = [*QUIET, f"127.0.0.1:{free_port()}"]
     parts = ["no answer from the agent at", "Hello sent", "nothing listens on that port"]
-    check([*QUIET, f"127.0.0.1:{port}"], parts, capsys)
-    keyed = [*QUIET, f"127.0.0.1:{port}", "--key-file", str(key)]
+    check(alone, parts, capsys)
+    keyed = [*alone, "--key-file", str(key)]
     check(keyed, ["; an agent with another key does not answer"], capsys)
 
 
-def test_an_agent_that_drops_everything(port: int, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_agent_that_drops_everything(capsys: pytest.CaptureFixture[str]) -> None:
     """As behind a firewall: there is a socket, and no answer."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        sock.bind(("127.0.0.1", port))
-        assert main([*QUIET, f"127.0.0.1:{port}"]) == 1
+    with plain_socket() as sock:
+        assert main([*QUIET, "{}:{}".format(*sock.getsockname())]) == 1
     sentence = capsys.readouterr().err
     assert "no answer from the agent at" in sentence
     assert "nothing listens" not in sentence
@@ -92,11 +83,11 @@ def test_an_address_that_others_reach(capsys: pytest.CaptureFixture[str]) -> Non
     check(["serve", "pid", "--listen", "0.0.0.0:8001"], [part], capsys)
 
 
-def test_a_port_in_use(port: int, capsys: pytest.CaptureFixture[str]) -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        sock.bind(("127.0.0.1", port))
+def test_a_port_in_use(capsys: pytest.CaptureFixture[str]) -> None:
+    with plain_socket() as sock:
+        address = "{}:{}".format(*sock.getsockname())
         parts = ["cannot bind", ": the port is in use"]
-        check(["serve", "pid", "--listen", f"127.0.0.1:{port}"], parts, capsys)
+        check(["serve", "pid", "--listen", address], parts, capsys)
 
 
 def test_a_bad_key_file(key: Path, capsys: pytest.CaptureFixture[str]) -> None:
