@@ -126,15 +126,6 @@ def test_a_large_message_goes_in_bursts_that_grow_and_shrink() -> None:
     assert window.size == before // 2
 
 
-@pytest.mark.parametrize(
-    ("number", "count", "flag"), [(3, 3, 0), (0, 0, 0), (0, 16_385, 0), (0, 2, 2)]
-)
-def test_numbers_that_make_no_sense(number: int, count: int, flag: int) -> None:
-    body = b"".join(n.to_bytes(2, "little") for n in (number, count)) + bytes((flag, 0, 0, 0))
-    with pytest.raises(DecodeError, match="fragment"):
-        Assembler(1000).take(binary.frame(132, 1, 1, body + b"x"))
-
-
 def test_more_than_can_come_is_not_kept() -> None:
     data = message(1000)
     assembler = Assembler(600)

@@ -200,6 +200,48 @@ def test_the_policy_flies_the_drones_of_a_silent_agent(policy: str) -> None:
     assert swarm.participations == [Participation.FLYING] * 2
 
 
+def test_an_agent_that_asks_for_a_reset_before_the_others_waits_for_them() -> None:
+    swarm = begun("hold", "end")
+    swarm.say(1, RESET)
+    swarm.say(0, FLY, 3.0)
+    swarm.pump()
+    assert swarm.world.flown[1:] == [[3.0, 0.0]]
+    assert swarm.world.retired.tolist() == [False, True]
+    assert swarm.participations == [Participation.FLYING, Participation.WAITING]
+    assert swarm.rules.absences == [(1, 1, 1, Participation.WAITING)]
+    swarm.say(0, RESET, seed=4)
+    swarm.pump()
+    assert swarm.world.seeds[1:] == [[4, 4]]
+    assert swarm.participations == [Participation.FLYING] * 2
+
+
+def test_an_agent_that_resets_a_start_gets_it_again() -> None:
+    swarm = Swarm()
+    swarm.pump()
+    swarm.say(0, RESET, seed=4)
+    swarm.say(1, FLY, 1.0)
+    swarm.pump()
+    assert swarm.world.seeds == [[70, 71]]
+    assert swarm.world.flown == []
+    swarm.say(0, FLY, 2.0)
+    swarm.pump()
+    assert swarm.rules.episodes == 1
+    assert len(swarm.states[0]) - len(swarm.states[1]) == 1
+
+
+def test_a_late_agent_is_told_the_end_of_the_drones_that_were_in_flight() -> None:
+    swarm = Swarm("end", shares=([0, 1],))
+    swarm.pump()
+    fly = np.zeros((2, 1), np.float32), np.full(2, FLY, np.uint8), None
+    swarm.world.out = np.array([True, False])
+    swarm.wait(PATIENCE + 0.1)
+    assert swarm.participations == [Participation.SILENT]
+    swarm.agents[0].send_command(0, *fly, swarm.now)
+    swarm.pump()
+    assert swarm.states[0][-1].truncated.tolist() == [False, True]
+    assert swarm.participations == [Participation.LATE]
+
+
 def test_an_agent_that_came_back_does_not_hide_the_seeds_of_the_others() -> None:  # fault 50
     swarm = begun()
     swarm.restart(0)
@@ -265,7 +307,8 @@ def test_before_the_world_begins_a_refusal_and_silence_end_it() -> None:
     with pytest.raises(Refused, match=r"^the agent at 127.0.0.1:1001 refused: another vehicle$"):
         swarm.pump()
     silent = Swarm()
-    with pytest.raises(PeerSilent, match="and the world begins when all have come"):
+    sentence = "^no answer from the agent at .* for 60 s, Hello sent .*, and the world begins when"
+    with pytest.raises(PeerSilent, match=sentence):
         silent.never_answered()
 
 

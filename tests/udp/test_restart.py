@@ -2,9 +2,7 @@
 
 import json
 import re
-import select
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -23,7 +21,6 @@ from relay import FaultConfig, relaying
 from rotorgram.envs.config import EnvConfig
 from rotorgram.udp import (
     LinkConfig,
-    PeerClosed,
     PeerSilent,
     Refused,
     RemoteEnv,
@@ -397,96 +394,3 @@ def test_a_key_allows_every_address(key_file: str) -> None:
 
 
 # ---- what was recorded
-
-
-class Wiretap:
-    """Carries datagrams between a simulator and an agent, keeps them, and can send its own.
-
-    To the agent it is the simulator, at one address for all its life.
-    """
-
-    def __init__(self, agent: tuple[str, int]) -> None:
-        self.down, self.up = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in "du")
-        self.down.bind(ANY)
-        self.up.bind(ANY)
-        self.up.connect(agent)
-        self.simulator: Any = None
-        self.upward: list[bytes] = []
-        self.downward: list[bytes] = []
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
-
-    def __enter__(self) -> "Wiretap":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._over.set()
-        self._thread.join()
-        self.down.close()
-        self.up.close()
-
-    @property
-    def address(self) -> Any:
-        return self.down.getsockname()
-
-    def again(self, upward: list[bytes], downward: list[bytes]) -> None:
-        for datagram in upward:
-            self.up.send(datagram)
-        for datagram in downward:
-            self.down.sendto(datagram, self.simulator)
-
-    def _run(self) -> None:
-        while not self._over.is_set():
-            for sock in select.select([self.down, self.up], [], [], 0.02)[0]:
-                try:
-                    datagram, address = sock.recvfrom(65507)
-                except ConnectionError:
-                    continue
-                if sock is self.down:
-                    self.simulator = address
-                    self.upward.append(datagram)
-                    self.up.send(datagram)
-                else:
-                    self.downward.append(datagram)
-                    self.down.sendto(datagram, self.simulator)
-
-
-@pytest.mark.parametrize("secret", [False, True], ids=["no key", "key"])
-def test_a_recorded_flight_sent_again_changes_nothing(secret: bool, key_file: str) -> None:
-    """All of an earlier session, from the same address, again and again during the next one."""
-    keys: Any = {"key_file": key_file} if secret else {}
-    remote = RemoteEnv(ANY, connect=False, timeout=5, connect_timeout=5, **keys)
-    with remote, Wiretap(remote.address) as tap:
-
-        def simulate() -> Running:
-            return Running(Simulator(server=tap.address, bind=ANY, config=QUICK, **keys))
-
-        first = simulate()
-        assert_flies(remote, 1, 30)
-        first.simulator.stepped.advance = None  # type: ignore[assignment]
-        with pytest.raises(PeerClosed, match="TypeError: 'NoneType' object is not callable"):
-            remote.step(np.zeros(1))
-        assert isinstance(first.join(), TypeError)
-        upward = list(tap.upward)
-        downward = list(tap.downward)
-        assert min(len(upward), len(downward)) > 30
-        second = simulate()
-        local = gym.make(ENV_ID)
-        assert remote.reset(seed=1)[0].tobytes() == local.reset(seed=1)[0].tobytes()
-        dice = np.random.default_rng(0)
-        for step in range(60):
-            tap.again(upward[step % 20 :], downward[step % 20 :])
-            action = dice.uniform(-1, 1, 1).astype(np.float32)
-            here = remote.step(action)
-            there = local.step(action)
-            assert here[0].tobytes() == there[0].tobytes()
-            assert here[1:4] == there[1:4]
-        counters = remote.statistics.counters
-        assert counters["sessions"] == 2
-        assert second.simulator.link.sequence == 62
-        cause = "forged" if secret else "foreign"
-        assert second.simulator.link.statistics.counters[cause] > 100
-        assert counters["foreign"] + counters["forged"] + counters["stale"] > 100
-        remote.close()
-        assert second.join() == "the agent closed"

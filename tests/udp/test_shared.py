@@ -20,7 +20,6 @@ from rotorgram.envs.loop import Loop
 from rotorgram.models import InputError
 from rotorgram.udp import (
     LinkConfig,
-    PeerSilent,
     RemoteEnv,
     RemoteVectorEnv,
     Simulator,
@@ -259,92 +258,6 @@ def test_one_that_is_started_anew_before_the_others_come_flies_the_first_episode
     assert seen[1] == expected[1]
 
 
-def test_one_that_asks_for_a_reset_before_the_others_waits_for_them() -> None:
-    agents = free_ports(2)
-    seen = {}
-    starts = []
-
-    def impatient() -> None:
-        env = RemoteEnv(agents[0], connect_timeout=60)
-        starts.append(env.reset(seed=0)[0].tobytes())
-        for step in range(5):
-            env.step(calm(0, 0, step))
-        starts.append(env.reset(seed=1)[0].tobytes())
-        env.step(calm(0, 1, 0))
-        env.close()
-
-    with shared(agents, 2, episode_length=LONG) as running:
-        in_threads([impatient, lambda: fly_one(agents[1], 1, 2, seen, calm)])
-        running.join()
-        waits, closes = running.simulator.rules.absences
-        assert waits == (0, 1, 5, Participation.WAITING)
-        assert closes == (0, 2, 1, Participation.LEFT)
-    expected = in_process(2, 2, calm, (0, 5, "hold"), episode_length=LONG)
-    assert seen[1][0] == expected[1][0]
-    assert starts == [expected[0][0][0][0], expected[0][1][0][0]]
-    assert seen[1][1][0] == expected[1][1][0]
-
-
-def test_one_that_resets_a_start_gets_it_again() -> None:
-    agents = free_ports(2)
-    starts = []
-    done = threading.Event()
-
-    def twice() -> None:
-        env = RemoteEnv(agents[0], connect_timeout=60)
-        for seed in (1, 2):
-            observation, info = env.reset(seed=seed)
-            starts.append((observation.tobytes(), info))
-        env.step(calm(0, 0, 0))
-        done.wait(60)
-        env.close()
-
-    def once() -> None:
-        env = RemoteEnv(agents[1], connect_timeout=60)
-        env.reset(seed=3)
-        env.step(calm(1, 0, 0))
-        done.set()
-        env.close()
-
-    with shared(agents, 2) as running:
-        in_threads([twice, once])
-        running.join()
-        assert running.simulator.rules.seed == 1
-        assert running.simulator.rules.episodes == 1
-    assert starts[0] == starts[1]
-
-
-def test_a_late_agent_is_told_the_end_of_the_drones_that_were_in_flight() -> None:
-    agents = free_ports(2)
-    seen = {}
-    ends = []
-    done = threading.Event()
-
-    def late() -> None:
-        env = RemoteVectorEnv(agents[0], connect_timeout=60, autoreset_mode="Disabled")
-        env.reset(seed=0)
-        while not env.out.any():
-            observations, *_, info = env.step(np.array([[1.0], [0.0]], np.float32))
-            last = observations.tobytes(), info["risen"].tolist()
-        assert env.terminated.tolist() == [True, False]
-        done.wait(60)
-        observations, rewards, *flags, info = env.step(np.zeros((2, 1), np.float32))
-        # Its own last moment: the world may be in another episode.
-        assert (observations.tobytes(), info["risen"].tolist()) == last
-        ends.append((rewards.tolist(), *(flag.tolist() for flag in flags)))
-        env.close()
-
-    def other() -> None:
-        fly_one(agents[1], 2, 1, seen, calm)
-        done.set()
-
-    shares = {agents[0]: ["drone_0", "drone_1"], agents[1]: ["drone_2"]}
-    with shared(shares, 3, episode_length=LONG, patience=0.5):
-        in_threads([late, other])
-    assert ends == [([0.0, 0.0], [False, False], [False, True])]
-    assert len(seen[2][0]) == LONG + 1
-
-
 def test_the_command_flies_the_world_of_several_agents() -> None:
     agents = free_ports(2)
     seen = {}
@@ -397,19 +310,6 @@ def test_an_agent_of_each_own_names() -> None:
             lambda: fly_one(agents[1], 1, 1, seen),
         ])  # fmt: skip
     assert seen == in_process(3, 1, first=201)  # the seed of drone_0
-
-
-def test_an_agent_that_does_not_come_is_named() -> None:
-    there, nowhere = free_ports(2)
-    with shared([there, nowhere], 2, config=LinkConfig(timeout=1.0)) as running:
-        env = RemoteEnv(there, connect=False, connect_timeout=2)
-        with pytest.raises(PeerSilent, match="no simulator came"):
-            env.reset()
-        result = running.join()
-        env.close()
-    assert isinstance(result, PeerSilent)
-    expected = f"no answer from the agent at 127.0.0.1:{nowhere[1]} for 1 s, Hello sent "
-    assert str(result).startswith(expected)
 
 
 def test_who_is_waited_for_is_told_soon(caplog: pytest.LogCaptureFixture) -> None:
