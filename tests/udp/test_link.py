@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from math import inf
-from typing import Any
 
 import pytest
 from links import (
@@ -32,7 +31,7 @@ from links import (
 )
 from rotorgram.models.errors import InputError
 from rotorgram.udp import LinkConfig
-from rotorgram.udp.protocol import binary, text
+from rotorgram.udp.protocol import binary
 from rotorgram.udp.protocol.auth import Key
 from rotorgram.udp.protocol.client import Client, RoundTrips
 from rotorgram.udp.protocol.fragments import Transfer, Window
@@ -41,7 +40,6 @@ from rotorgram.udp.protocol.messages import (
     Close,
     Command,
     Extension,
-    Hello,
     Message,
     Missing,
     Refuse,
@@ -640,22 +638,16 @@ def test_recorded_messages_of_another_session_are_forged() -> None:
 
 
 def test_every_message_is_shown_once() -> None:
-    seen: dict[str, list[Any]] = {"simulator": [], "agent": []}
+    here: list[bytes] = []
+    there: list[bytes] = []
     client = simulator()
     server = agent()
-    client.tap = lambda slot, m, data: seen["simulator"].append((slot, data))
-    server.outbox.tap = lambda slot, m, data: seen["agent"].append((slot, data))
-    pair = Pair(client, server, lossy(0.3))
-    pair.run(30)
-    client.close("done", pair.now)
-    pair._send()
-    hellos = [data for _, data in seen["simulator"] if data[3] == binary.HELLO]
-    assert len(hellos) == 1
-    numbers = [binary.peek(data)[::2] for _, data in seen["agent"]]
-    assert len(set(numbers)) == len(numbers)
-    assert [d for _, d in seen["simulator"][:60]] == [d for _, d in seen["agent"][:60]]
-    assert text.is_text(b"1,close")
-    assert isinstance(hello(), Hello)
+    client.tap = lambda slot, message, data: here.append(data)
+    server.outbox.tap = lambda slot, message, data: there.append(data)
+    Pair(client, server, lossy(0.3)).run(30)
+    assert len(here) > 60
+    assert len(set(here)) == len(here)
+    assert here[:60] == there[:60]
 
 
 @pytest.mark.parametrize("drop", [-0.1, 1.1, float("nan")])
@@ -665,25 +657,20 @@ def test_a_wrong_probability_of_loss(drop: float) -> None:
 
 
 def test_a_simulator_loses_datagrams_on_purpose_the_same_for_a_seed() -> None:
-    def lost(seed: int) -> list[bool]:
+    def arrived(seed: int) -> list[bool]:
         link = simulator(config=LinkConfig(timeout=1e6, drop=0.3, drop_seed=seed))
         link.connect(0.0)
         sent = []
-        for _ in range(1000):
-            sent.append(bool(link.take_outgoing()))
-            timer = link.next_timer()
-            link.handle_timer(timer)
         for number in range(1000):
+            sent.append(bool(link.take_outgoing()))
+            link.handle_timer(link.next_timer())
             link.receive(b"", 1e4 + number)
-        counters = link.statistics.counters
-        assert abs(counters["malformed"] - 700) < 75  # five standard deviations
-        assert counters["received"] == counters["malformed"]
-        assert (
-            counters["dropped"]
-            == 1001 - sum(sent) - bool(link.take_outgoing()) + 1000 - (counters["malformed"])
-        )
-        return [not came for came in sent]
+        received = link.statistics.counters["received"]
+        assert abs(received - 700) < 75  # five standard deviations
+        lost = 2001 - sum(sent) - bool(link.take_outgoing()) - received
+        assert link.statistics.counters["dropped"] == lost
+        return sent
 
-    assert abs(sum(lost(1)) - 300) < 75
-    assert lost(1) == lost(1)
-    assert lost(1) != lost(2)
+    assert abs(sum(arrived(1)) - 700) < 75
+    assert arrived(1) == arrived(1)
+    assert arrived(1) != arrived(2)
