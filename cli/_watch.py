@@ -11,7 +11,7 @@ import numpy as np
 from ..envs.rendering import moments
 from ..rendering.live import MAX_SHOWN, LiveView, Pace, open_surface
 from ..rendering.stage import Stage
-from ..udp.protocol.messages import Command, State
+from ..udp.protocol.messages import Command
 from ..udp.transport.driver import Driver, Observer
 
 if TYPE_CHECKING:
@@ -33,8 +33,8 @@ class Watcher:
         self._steps = np.zeros(live.stage.drones, np.int64)
         self._episodes = np.zeros(live.stage.drones, np.int64)
 
-    def __call__(self, cause: Command | None, state: State) -> None:
-        """See one State, and what led to it; episodes count in which something was flown."""
+    def __call__(self, cause: Command | None) -> None:
+        """See what moved the drones; episodes count in which something was flown."""
         count = len(self._steps)
         live = self._live
         resets = True if cause is None else cause.resets[:count]
@@ -64,7 +64,7 @@ class Realtime:
     def __init__(self, control_period: float) -> None:
         self._pace = Pace(control_period)
 
-    def __call__(self, cause: Command | None, state: State) -> None:
+    def __call__(self, cause: Command | None) -> None:
         """Wait until the next step may be taken."""
         time.sleep(self._pace.wait(time.monotonic()) or 0.0)
         self._pace.stepped(time.monotonic())
@@ -88,9 +88,9 @@ def watched(simulator: Driver, command: "Sim") -> Iterator[None]:
         if command.realtime:
             observers.append(Realtime(simulator.spec.control_period))
 
-        def observe(cause: Command | None, state: State) -> None:
+        def observe(cause: Command | None) -> None:
             for observer in observers:
-                observer(cause, state)
+                observer(cause)
 
         simulator.observer = observe
         yield

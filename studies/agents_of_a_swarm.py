@@ -35,7 +35,7 @@ from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.loop import Loop
 from rotorgram.sim import InitialState
 from rotorgram.udp import LinkConfig, RemoteVectorEnv, Simulator
-from rotorgram.udp.protocol.messages import Command, State
+from rotorgram.udp.protocol.messages import Command
 
 ENV_ID = "benchmark/Row-v0"
 FAULTS = {"drop": 0.3, "duplicate": 0.1, "reorder": 0.1}
@@ -106,7 +106,7 @@ class Twin:
         self.counts = Counter({f"absent_{kind}": 0 for kind in kinds})
         self.shown = np.zeros((AGENTS, 3), np.float32)
 
-    def __call__(self, cause: Command | None, state: State) -> None:
+    def __call__(self, cause: Command | None) -> None:
         loop = self.loop
         rules = self.simulator.rules
         everybody = np.ones(AGENTS, bool)
@@ -133,13 +133,14 @@ class Twin:
                 self.counts["drone_steps_by_commands"] += int(flying[drone])
             loop.advance(cause.actions)
             self.counts["control_steps"] += 1
-        here = (loop.observations["observation"], loop.rewards, loop.terminated, loop.truncated,
-                *loop.telemetry.values())  # fmt: skip
-        there = (state.observations[0], state.rewards, state.terminated, state.truncated,
-                 *state.telemetry)  # fmt: skip
+        here, there = (
+            (world.observations["observation"], world.rewards, world.terminated, world.truncated,
+             *world.telemetry.values())
+            for world in (loop, self.simulator.stepped)
+        )  # fmt: skip
         same = all(a.tobytes() == b.tobytes() for a, b in zip(here, there, strict=True))
         self.counts["states_that_differ"] += not same
-        self.shown = state.observations[0].copy()
+        self.shown = loop.observations["observation"].copy()
 
 
 def fly_eight(kills: int, dice: random.Random) -> dict[str, Any]:

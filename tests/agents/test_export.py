@@ -509,7 +509,7 @@ def flown_by_c(
     for seed in seeds:
         actions: list[np.ndarray] = []
 
-        def observe(message: Any, state: Any, actions: list[np.ndarray] = actions) -> None:
+        def observe(message: Any, actions: list[np.ndarray] = actions) -> None:
             if isinstance(message, Command) and message.orders[0] == FLY:
                 actions.append(np.atleast_1d(message.actions[0]).astype(np.float64))
 

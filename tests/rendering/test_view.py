@@ -25,7 +25,7 @@ from rotorgram.models import InputError
 from rotorgram.rendering import Moment, Stage, live
 from rotorgram.rendering.live import Aim, Lines, LiveView, Pace, lines_over
 from rotorgram.udp import RemoteEnv, Simulator
-from rotorgram.udp.protocol.messages import Command, State
+from rotorgram.udp.protocol.messages import Command
 
 ELEVATION = "rotorgram/Elevation-v0"
 
@@ -367,18 +367,6 @@ def simulator_of(*heights: float, rotors: int = 4) -> Any:
     return SimpleNamespace(spec=spec, stepped=loop, advance=advance)
 
 
-def state(drones: int = 1) -> State:
-    return State(
-        session=1,
-        sequence=1,
-        time=0.0,
-        observations=(np.full((drones, 1), 0.5, np.float32),),
-        rewards=np.full(drones, 0.25),
-        terminated=np.zeros(drones, bool),
-        truncated=np.zeros(drones, bool),
-    )
-
-
 def command(*orders: str) -> Command:
     """r resets, f freezes, s steps."""
     return Command(
@@ -416,7 +404,7 @@ def test_a_watcher_counts_steps_and_episodes_of_each_drone() -> None:
         command("s", "r", "s"),
     ]
     for cause in causes:
-        watcher(simulator.advance(cause), state(3))
+        watcher(simulator.advance(cause))
     counted = [[(m.step, m.episode) for m in moments] for moments in view.drawn]
     assert counted == [
         [(0, 0), (0, 0)],
@@ -435,7 +423,7 @@ def test_a_watcher_counts_steps_and_episodes_of_each_drone() -> None:
 
 def test_a_watcher_shows_the_rotors_that_there_are() -> None:
     view = RecordingView(Stage("plain", vehicle=HEXA))
-    Watcher(view, simulator_of(4.0, rotors=6))(None, state())  # type: ignore[arg-type]
+    Watcher(view, simulator_of(4.0, rotors=6))(None)  # type: ignore[arg-type]
     assert view.drawn[0][0].thrusts == (9.0,) * 6
 
 
@@ -443,13 +431,13 @@ def test_a_pause_freezes_the_picture_alone() -> None:
     view = RecordingView(Stage("plain"))
     simulator = simulator_of(5.0)
     watcher = Watcher(view, simulator)  # type: ignore[arg-type]
-    watcher(None, state())
+    watcher(None)
     view.pace.press("pause")
     for _ in range(3):
-        watcher(simulator.advance(command("s")), state())  # returns: lock-step goes on
+        watcher(simulator.advance(command("s")))  # returns: lock-step goes on
     view.pace.press("step")
     for _ in range(3):
-        watcher(simulator.advance(command("s")), state())
+        watcher(simulator.advance(command("s")))
     assert [moments[0].step for moments in view.drawn] == [0, 4]
 
 
@@ -467,7 +455,7 @@ def test_a_view_that_fails_or_closes_stops_no_simulator(
     for view in (failing, closed):
         watcher = Watcher(view, simulator_of(5.0))  # type: ignore[arg-type]
         for _ in range(2):
-            watcher(command("s"), state())
+            watcher(command("s"))
         assert not view.drawn
     assert "the simulator goes on: the driver is gone" in caplog.text
     assert len(caplog.records) == 1 or "was closed" in caplog.text
@@ -477,7 +465,7 @@ def test_realtime_sleeps_from_step_to_step() -> None:
     hold = Realtime(0.05)
     began = time.monotonic()
     for _ in range(5):  # the first at once, the others 0.05 s apart
-        hold(None, state())
+        hold(None)
     assert time.monotonic() - began >= 0.2
 
 

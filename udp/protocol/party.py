@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from math import inf
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,6 @@ from .layout import Layout
 from .messages import (
     FLY,
     FREEZE,
-    MAX_UINT64,
     POLICIES,
     RESET,
     WHEN_LOST,
@@ -28,11 +27,10 @@ from .messages import (
     Command,
     Message,
     Refuse,
-    State,
     Welcome,
 )
 
-Array = NDArray[Any]
+Array = np.ndarray
 Mask = NDArray[np.bool_]
 
 COMPLAIN_AFTER: Final = 1.0  # silence of an agent before the log says so, once a message, s
@@ -123,7 +121,7 @@ class AgentLink:
     """Of its Welcome."""
     trouble: str = ""
     """Why datagrams do not reach it, as far as the transport knows."""
-    shown: tuple[Any, ...] = ()
+    shown: tuple[tuple[Array, ...], tuple[Array, ...]] = ((), ())
     """Observations and telemetry of its last State."""
     in_flight: Mask = field(init=False)
     """Its drones that were flying when it was lost."""
@@ -224,23 +222,6 @@ class WorldRules:
         for link in self.links:
             link.client.close(reason, now)
 
-    def state(self) -> State:
-        """The State of the whole world, for observers."""
-        raise NotImplementedError
-
-    def _world_state(self, sequence: int, steps: int) -> State:
-        world = self._world
-        return State(
-            session=0,
-            sequence=sequence,
-            time=steps * self._period,
-            observations=tuple(world.observations.values()),
-            rewards=world.rewards,
-            terminated=world.terminated,
-            truncated=world.truncated,
-            telemetry=tuple(world.telemetry.values()),
-        )
-
     def _reset_all(self, seeds: NDArray[np.uint64] | None) -> None:
         actions = self._layout.actions
         nothing = np.zeros(actions.shape, actions.dtype)
@@ -261,7 +242,7 @@ class WorldRules:
 
 def first_seeds(seed: int, drones: int) -> NDArray[np.uint64]:
     """Seeds of a simulator's own first reset: drone i takes seed + i, modulo 2^64."""
-    return np.array([(seed + i) & MAX_UINT64 for i in range(drones)], np.uint64)
+    return np.uint64(seed) + np.arange(drones, dtype=np.uint64)
 
 
 class OneAgent(WorldRules):
@@ -342,11 +323,6 @@ class OneAgent(WorldRules):
         client = self._client
         return min(client.resend_at, client.deadline)
 
-    def state(self) -> State:
-        """The State that was sent last."""
-        sequence = self._client.sequence
-        return self._world_state(sequence, sequence - 1)
-
     def _lose_silent(self, link: AgentLink, why: str) -> None:
         raise PeerSilent(why)
 
@@ -386,10 +362,6 @@ class SeveralAgents(WorldRules):
         self._patience = patience
         self._due: list[tuple[AgentLink, bool, bool]] = []  # States: to whom, again, cut
         self._last_reason = ""
-
-    def state(self) -> State:
-        """The State of the world after the last step or reset, counted from 1 in an episode."""
-        return self._world_state(self.steps + 1, self.steps)
 
     # ---- episodes and steps
 

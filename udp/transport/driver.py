@@ -12,16 +12,16 @@ import gymnasium as gym
 from ...models.errors import NotCopied
 from ..protocol.client import Address, Client
 from ..protocol.errors import LinkError
-from ..protocol.messages import Command, State
+from ..protocol.messages import Command
 from ..protocol.party import AgentLink, WorldRules
 from .sockets import LONGEST_WAIT, PAUSE, Port, log_notices
 from .stepped import Steppable
 
 _ALIVE_EVERY: Final = 0.5  # period of the message Alive while an agent waits for a State, s
 
-Observer = Callable[[Command | None, State], None]
-"""Called with the Command that moved the drones, or None where all of them were reset, and the
-State after it: valid during the call only."""
+Observer = Callable[[Command | None], None]
+"""Called with the Command that moved the drones, or None where all of them were reset, once the
+world has moved: see `Driver.stepped`."""
 
 
 class Driver(NotCopied):
@@ -32,7 +32,7 @@ class Driver(NotCopied):
         spec: Spec of the env.
         stepped: The loop or the envs.
         rules: What the world does with the messages of its agents.
-        observer: Called for every State of the world once the agents have it; None at first.
+        observer: Called after every step of the world, once the agents have its State.
     """
 
     def __init__(self, stepped: Steppable, rules: WorldRules, port: Port) -> None:
@@ -121,7 +121,7 @@ class Driver(NotCopied):
             if rules.moved:
                 rules.moved = False
                 if self.observer is not None:
-                    self.observer(rules.cause, rules.state())
+                    self.observer(rules.cause)
                 if self._journal:
                     self._journal.write()
             if rules.reason is not None:
