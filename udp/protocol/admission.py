@@ -170,39 +170,23 @@ class Admission:
             refuse = m.Refuse(session=number, reason=_cut(reason, room))
             self._outbox.put([binary.encode(refuse)], address, key)
 
-    # ---- a simulator that was welcomed
-
     def assemble(
         self, fragment: bytes, opening: Session | None, arrival: Arrival, key: Key | None
     ) -> bytes | None:
-        """The Hello or State 1 of a simulator without a slot, once all its fragments are there."""
-        kind, number, sequence = binary.peek(fragment)
-        if kind == binary.HELLO and opening:
+        """The Hello of a simulator without a slot, once all its fragments are there."""
+        if opening:
             if asks(fragment):
                 opening.repeat()
             self.drop("duplicate", "", arrival)
             return None
-        largest = binary.LONGEST_HELLO
-        if kind != binary.HELLO:
-            if opening is None or sequence > 1:
-                self.disown(fragment, arrival)
-                return None
-            if sequence < 1:
-                self.drop("stale", "", arrival)
-                return None
-            largest = opening.layout.state.size
-            key = opening.session_key()
-        place = arrival.address, number
-        assembler = self._assembling.get(place) or Assembler(largest)
-        most = max(_LEAST_ASSEMBLING, len(self._slots.sessions))
-        keep(self._assembling, place, assembler, most)
+        place = arrival.address, binary.peek(fragment)[1]
+        assembler = self._assembling.get(place) or Assembler(binary.LONGEST_HELLO)
+        keep(self._assembling, place, assembler, max(_LEAST_ASSEMBLING, len(self._slots.sessions)))
         whole = assembler.take(fragment)
         if whole is not None:
-            self._assembling.pop(place, None)
-        elif asks(fragment) and (missing := assembler.missing()):
-            body = binary.encode(missing)[binary.HEADER_SIZE : len(fragment)]  # no more than came
-            reply = binary.frame(binary.MISSING, number, sequence, body)
-            self._outbox.put([reply], arrival.address, key)
+            del self._assembling[place]
+        elif answer := assembler.ask(fragment):
+            self._outbox.put(answer, arrival.address, key)
         return whole
 
     def receive(
@@ -254,7 +238,6 @@ class Admission:
     def forget(self, opening: Session) -> None:
         """Forget a session that was welcomed."""
         del self.openings[opening.peer, opening.number]
-        self._assembling.pop((opening.peer, opening.number), None)
 
     def disown(self, plain: bytes, arrival: Arrival) -> None:
         """Tell the simulator of an unknown session to begin another one.

@@ -26,7 +26,6 @@ from .fragments import (
     Assembler,
     Transfer,
     Window,
-    asks,
     check_largest,
     check_size,
     is_fragment,
@@ -466,9 +465,9 @@ class Client:
             return None
         whole = self._assembler.take(fragment)
         self._progress(now)
-        if whole is None and asks(fragment) and (missing := self._assembler.missing()):
+        if whole is None and (answer := self._assembler.ask(fragment)):
             self._round_trips.sent(now)
-            self._put([binary.encode(missing)], self._session_key)
+            self._put(answer, self._session_key)
         return whole
 
     def _progress(self, now: float) -> None:

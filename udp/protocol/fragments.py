@@ -192,8 +192,22 @@ class Assembler:
         lacking = np.array([first + i not in self._slices for i in range(span)])
         kind, session, sequence = self._header
         bitmap = np.packbits(lacking, bitorder="little").tobytes()
-        numbers = {"session": session, "sequence": sequence, "kind": kind, "count": self._count}
-        return Missing(**numbers, first=first, bitmap=bitmap)
+        return Missing(
+            session=session,
+            sequence=sequence,
+            kind=kind,
+            count=self._count,
+            first=first,
+            bitmap=bitmap,
+        )
+
+    def ask(self, fragment: bytes) -> list[bytes]:
+        """The answer to a fragment whose sender waits for one, in no more bytes than it has."""
+        missing = self.missing() if asks(fragment) else None
+        if missing is None:
+            return []
+        body = binary.encode(missing)[HEADER_SIZE : len(fragment)]
+        return [binary.frame(binary.MISSING, missing.session, missing.sequence, body)]
 
     def _begin(self, header: tuple[int, int, int], count: int) -> None:
         self._header = header

@@ -162,16 +162,24 @@ class Server:
         kind, number, _ = binary.peek(plain)
         seated = session if session and session.number == number and not session.is_text else None
         opening = None if seated else admission.openings.get((address, number))
+        holder = seated or opening
         if is_fragment(plain):
-            whole = self._assemble(plain, seated, opening, arrival, key)
+            kind = binary.check(plain)[0] & ~binary.FRAGMENT
+            if kind == binary.HELLO and not seated:
+                whole = admission.assemble(plain, opening, arrival, key)
+            elif kind == binary.STATE and holder:
+                whole = holder.assemble(plain, arrival.now)
+            elif kind == binary.STATE:
+                raise NoSuchSession(f"session {number:016x}")
+            else:
+                whole = None
+                admission.drop("foreign", f"a fragment of type {kind}", arrival)
             if whole is None:
                 return None
             plain = whole
-        holder = seated or opening
         if holder is None and kind != binary.HELLO:
             binary.check(plain)
-            self._receive_stranger(kind, plain, arrival)
-            return None
+            raise NoSuchSession(f"session {number:016x}")
         message = binary.decode(plain, holder.layout if holder else None)
         if isinstance(message, m.Hello):
             admission.receive_hello(message, arrival, key)
@@ -180,24 +188,6 @@ class Server:
             return self._receive_seated(seated, message, plain, arrival)
         assert opening is not None
         return admission.receive(opening, message, plain, arrival)
-
-    def _assemble(
-        self,
-        fragment: bytes,
-        seated: Session | None,
-        opening: Session | None,
-        arrival: Arrival,
-        key: Key | None,
-    ) -> bytes | None:
-        """The message of an accepted sender, once all its fragments are there."""
-        kind = binary.check(fragment)[0] & ~binary.FRAGMENT
-        allowed = (binary.STATE,) if seated else (binary.HELLO, binary.STATE)
-        if kind not in allowed:
-            self._admission.drop("foreign", f"a fragment of type {kind}", arrival)
-            return None
-        if seated:
-            return seated.assemble(fragment, arrival.now)
-        return self._admission.assemble(fragment, opening, arrival, key)
 
     def _receive_seated(
         self, session: Session, message: m.Message, plain: bytes, arrival: Arrival
@@ -264,22 +254,17 @@ class Server:
         """Count it, and answer a Hello if its sender must change its configuration."""
         datagram, address, _ = arrival
         under_seal = is_sealed(datagram)
-        size = len(datagram)
         plain = message_of(datagram) if under_seal else datagram
         kind, number, _ = binary.peek(plain)
         if isinstance(error, NoSuchSession):
-            self._receive_stranger(kind, plain, arrival)
+            if kind in (binary.STATE, binary.MISSING):
+                self._admission.disown(plain, arrival)
+            else:  # the answer to a Close of ours, mostly: not counted
+                self.statistics.counters["foreign"] += 1
             return
         if isinstance(error, _KeyMismatch | VersionMismatch) and kind == binary.HELLO:
             trusted = under_seal and not isinstance(error, _KeyMismatch)
             key = self._keys.get(key_id(datagram)) if trusted else None
-            self._admission.refuse(number, str(error), address, size, key)
+            self._admission.refuse(number, str(error), address, len(datagram), key)
         cause = "forged" if isinstance(error, Forged) else "malformed"
         self._admission.drop(cause, str(error), arrival)
-
-    def _receive_stranger(self, kind: int, plain: bytes, arrival: Arrival) -> None:
-        """A message of an unknown session."""
-        if kind in (binary.STATE, binary.MISSING):
-            self._admission.disown(plain, arrival)
-        else:  # the answer to a Close of ours, mostly: not counted
-            self.statistics.counters["foreign"] += 1

@@ -181,7 +181,6 @@ class Session:
             alive = m.Alive(session=self.number, sequence=self.sequence)
             self.move(Way.SENT, m.Alive)
             self._outbox.put([binary.encode(alive)], self.peer, self.key)
-            self._outbox.statistics.counters["sent"] += 1
 
     def record(self, message: Message, data: bytes) -> None:
         """Show a message to the tap."""
@@ -257,12 +256,12 @@ class Session:
         return None
 
     def assemble(self, fragment: bytes, now: float) -> bytes | None:
-        """The State that is due, once all its fragments are there; with a slot."""
+        """The State that is due, once all its fragments are there."""
         _, _, sequence = binary.peek(fragment)
         if sequence > self.sequence + 1:
             raise NoSuchSession(f"State {sequence}")
         if sequence <= self.sequence:
-            is_repeat = sequence == self.sequence
+            is_repeat = sequence == self.sequence and self.slot >= 0
             if is_repeat and asks(fragment):
                 self.answer_again()
             self._drop("duplicate" if is_repeat else "stale", now)
@@ -270,8 +269,8 @@ class Session:
         self._assembler = self._assembler or Assembler(self.layout.state.size)
         self.heard_at = now
         whole = self._assembler.take(fragment)
-        if whole is None and asks(fragment) and (missing := self._assembler.missing()):
-            self._outbox.put([binary.encode(missing)], self.peer, self.key)
+        if whole is None and (answer := self._assembler.ask(fragment)):
+            self._outbox.put(answer, self.peer, self.session_key())
         return whole
 
     def _drop(self, cause: str, now: float) -> None:
