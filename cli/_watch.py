@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..envs.rendering import moments
-from ..rendering.live import MAX_SHOWN, LiveView, Pace, open_surface
+from ..rendering import window
+from ..rendering.live import MAX_SHOWN, LiveView, Pace
 from ..rendering.stage import Stage
 from ..udp.protocol.messages import Command
 from ..udp.transport.driver import Driver, Observer
@@ -75,15 +76,15 @@ def watched(simulator: Driver, command: "Sim") -> Iterator[None]:
     """Show a simulator, or hold it to real time, during the block, as the command says."""
     observers: list[Observer] = []
     with ExitStack() as opened:
-        if command.view is not None:
+        if command.view:
             pace = Pace(0.0)
             drones = simulator.stepped.num_envs
             names = simulator.spec.agents if len(simulator.spec.agents) > 1 else ()
             shown = len(names) or min(drones, MAX_SHOWN)  # of the first world
             stage = Stage(command.shown_scene, shown, vehicle=command.vehicle, names=names)
-            surface = open_surface(command.view, stage, pace, command.view_port)
+            surface = window.Window(stage, pace)
             live = opened.enter_context(LiveView(stage, surface, pace, of=drones))
-            print(f"shown {surface.where}", flush=True)
+            print("shown in the window", flush=True)
             observers.append(Watcher(live, simulator))
         if command.realtime:
             observers.append(Realtime(simulator.spec.control_period))

@@ -49,11 +49,8 @@ class Sim(BackendFlags):
     """Allow addresses beyond this machine without a key: anyone who reaches them may take part."""
     record: Path | None = None
     """MCAP file to write every message to."""
-    view: Literal["window", "web"] | None = None
-    """Show up to 16 drones: in a window, or on a page for browsers. Lock-step does
-    not wait for it. Keys: docs/viewing.md."""
-    view_port: int = 8080
-    """TCP port of the page, on this machine's loopback; 0 takes the first free one."""
+    view: bool = False
+    """Show up to 16 drones in a window. Lock-step does not wait for it. Keys: docs/viewing.md."""
     realtime: bool = False
     """Fly no faster than real time, for viewers."""
 
@@ -119,7 +116,7 @@ class Sim(BackendFlags):
         return named or [parse_address(agent) for agent in self.agents]
 
     def _shown(self, simulator: "Simulator") -> AbstractContextManager[None]:
-        if self.view is None and not self.realtime:  # nothing that draws is imported
+        if not (self.view or self.realtime):  # nothing that draws is imported
             return nullcontext()
         from ._watch import watched
 

@@ -17,17 +17,13 @@ from ._flags import EnvFlags, check_count
 
 @dataclass(frozen=True, kw_only=True)
 class View(EnvFlags):
-    """Show flights, in real time or slower, in a window or in a browser.
+    """Show flights, in real time or slower, in a window.
 
     Keys: space pauses, the arrow to the right takes one step, - and + change the speed.
     """
 
     what: Positional[str]
     """Checkpoint, folder of a training, pid, geometric, orca, random, or a journal (.mcap)."""
-    web: bool = False
-    """Serve a page for browsers, for a machine without a display."""
-    port: int = 8080
-    """TCP port of the page, on this machine's loopback; 0 takes the first free one."""
     speed: float = 1.0
     """1 is real time, from 1/16 to 8."""
     episodes: int | None = None
@@ -36,7 +32,8 @@ class View(EnvFlags):
     def run(self) -> int:
         """Fly and show, episode after episode."""
         from ..flights.filming import moments
-        from ..rendering.live import LiveView, Pace, open_surface
+        from ..rendering import window
+        from ..rendering.live import LiveView, Pace
         from ..rendering.stage import Stage
         from ._env import words_of
 
@@ -49,11 +46,8 @@ class View(EnvFlags):
         pace = Pace(spec.control_period, self.speed)
         names = spec.agents if drones > 1 else ()
         stage = Stage(self.shown_scene, drones, vehicle=self.vehicle, names=names)
-        surface = open_surface("web" if self.web else "window", stage, pace, self.port)
-        with LiveView(stage, surface, pace) as live:
-            print(f"showing {self.what} {surface.where} (Ctrl-C ends)", flush=True)
-            while live.is_running and not live.surface.is_watched():
-                time.sleep(0.02)
+        with LiveView(stage, window.Window(stage, pace), pace) as live:
+            print(f"showing {self.what} in the window (Ctrl-C ends)", flush=True)
             for flight in chain((first,), flights):
                 told = [moments(one) for one in flight]
                 longest = max(map(len, told))

@@ -65,7 +65,7 @@ class Renderer:
         return tuple(pictures)
 
     def _show(self, now: "list[Moment]") -> None:
-        from ..rendering import Stage, live
+        from ..rendering import Stage, live, window
 
         names = self._loop.spec.agents if len(self._loop.spec.agents) > 1 else ()
         shown = now[: len(names) or live.MAX_SHOWN]  # of the first world
@@ -73,7 +73,7 @@ class Renderer:
             path = self._loop.vehicle.path
             stage = Stage(drones=len(shown), vehicle=path, names=names)
             pace = live.Pace(self._loop.spec.control_period)
-            surface = live.open_surface("window", stage, pace)
+            surface = window.Window(stage, pace)
             self._view = live.LiveView(stage, surface, pace, of=len(now))
         if shown != self._shown:  # `step` shows by itself, and a script may ask once more
             self._shown = shown

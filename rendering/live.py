@@ -1,4 +1,4 @@
-"""Live views: the latest moment in a window or a browser, and the speed of what is shown.
+"""Live views: the latest moment in a window, and the speed of what is shown.
 
 A slow machine draws fewer pictures; the simulation goes on, slowed only by the processor that both
 share.
@@ -8,19 +8,13 @@ import time
 from contextlib import AbstractContextManager
 from queue import SimpleQueue
 from threading import Event, Thread
-from typing import TYPE_CHECKING, Final, Literal, TypeAlias
+from typing import Final, Literal, Protocol
 
 import mujoco
 import numpy as np
 
 from ..models.errors import InputError
 from .stage import Moment, Stage
-
-if TYPE_CHECKING:
-    from .web import WebPage
-    from .window import Window
-
-    Surface: TypeAlias = Window | WebPage
 
 MAX_SHOWN: Final = 16
 """Most craft side by side; of more, the first ones are shown."""
@@ -30,7 +24,7 @@ _NAP: Final = 0.02  # s, at most, before keys are looked at again
 Lines = list[tuple[str, str]]
 """Names and values."""
 Press = Literal["pause", "step", "slower", "faster"]
-"""Effect of a key or a button."""
+"""Effect of a key."""
 SPEEDS: Final = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0, 4.0, 8.0)
 """Steps of `slower` and `faster`; 1 is real time."""
 _CATCH_UP: Final = 0.1  # Longest delay that later steps make up for, s
@@ -120,10 +114,23 @@ class Aim:
         self._focus = focus
 
 
+class Surface(Protocol):
+    """Where a stage is drawn, as `Window`."""
+
+    def show(self, lines: Lines) -> None:
+        """Draw the stage as it is now, with these lines over it."""
+
+    def is_running(self) -> bool:
+        """Whether it is open."""
+
+    def close(self) -> None:
+        """Close it."""
+
+
 class LiveView(AbstractContextManager["LiveView"]):
     """Draws the latest moments in a thread of its own; `of` drones, if more than are shown."""
 
-    def __init__(self, stage: Stage, surface: "Surface", pace: Pace, of: int | None = None) -> None:
+    def __init__(self, stage: Stage, surface: Surface, pace: Pace, of: int | None = None) -> None:
         self.stage = stage
         self.surface = surface
         self.pace = pace
@@ -226,16 +233,3 @@ def lines_over(
         shown = f"{len(moments)} of {drones}" if drones > len(moments) else str(drones)
         lines.insert(0, ("drones", f"{shown} shown, numbers of the first"))
     return lines
-
-
-def open_surface(
-    kind: Literal["window", "web"], stage: Stage, pace: Pace, port: int = 8080
-) -> "Surface":
-    """A window on the display, or a page for browsers. Raises `NoDisplay` or `InputError`."""
-    if kind == "window":
-        from .window import Window
-
-        return Window(stage, pace)
-    from .web import WebPage
-
-    return WebPage(stage, pace, port)

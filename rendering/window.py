@@ -25,10 +25,7 @@ KEYS: Final[dict[int, Press]] = {
 }
 """GLFW's keys. MuJoCo's passive viewer uses none of them."""
 _HELP: Final = [("space", "pause"), ("right arrow", "one step"), ("- and +", "slower, faster")]
-_INSTEAD: Final = (
-    "look from a browser instead (--web, or --view web with rotorgram sim) or make a film "
-    "(rotorgram render)"
-)
+_INSTEAD: Final = "make a film instead (rotorgram render)"
 _NICENESS: Final = 10  # of the threads that draw: the simulation comes first
 
 
@@ -38,8 +35,6 @@ class NoDisplay(NoOpenGL):
 
 class Window:
     """A stage in a window, whose keys change the pace: `Surface`. Raises `NoDisplay`."""
-
-    where = "in the window"
 
     def __init__(self, stage: Stage, pace: Pace) -> None:
         before = _tasks()
@@ -85,10 +80,6 @@ class Window:
     def is_running(self) -> bool:
         """Whether it is open."""
         return bool(self._handle.is_running())
-
-    def is_watched(self) -> bool:
-        """True: a window has a viewer from its start."""
-        return True
 
     def close(self) -> None:
         """Close it, and wait for the thread that draws it: Python must not end before."""

@@ -12,7 +12,7 @@ from pictures import HEXA, at
 from rotorgram.envs import LocalVectorEnv, SingleEnv
 from rotorgram.envs.parallel import LocalParallelEnv
 from rotorgram.models import InputError
-from rotorgram.rendering import Moment, NoOpenGL, live
+from rotorgram.rendering import Moment, NoOpenGL, live, window
 from rotorgram.rendering.gl import offscreen_context
 from rotorgram.rendering.stage import Stage
 from swarms import RISE
@@ -108,7 +108,7 @@ def test_a_window_shows_a_moment_once(monkeypatch: pytest.MonkeyPatch) -> None:
             drawn.append(None)
 
     monkeypatch.setattr(live, "LiveView", View)
-    monkeypatch.setattr(live, "open_surface", lambda *_: None)
+    monkeypatch.setattr(window, "Window", lambda *_: None)
     env = gym.make(ENV_ID, render_mode="human")
     env.reset(seed=0)
     for _ in range(3):
@@ -162,7 +162,7 @@ def test_many_stand_side_by_side() -> None:
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        ({"world": "moon"}, "scene: expected 'plain' or 'airport' .* got 'moon'"),
+        ({"scene": "moon"}, "scene: expected 'plain' or 'airport' .* got 'moon'"),
         ({"drones": 0}, "drones: expected 1 or more, got 0"),
         ({"vehicle": "nowhere.xml"}, "vehicle: cannot read nowhere.xml"),
     ],

@@ -22,7 +22,7 @@ from rotorgram.envs import SingleEnv
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 from rotorgram.models import InputError
-from rotorgram.rendering import Moment, Stage, live
+from rotorgram.rendering import Moment, Stage, window
 from rotorgram.rendering.live import Aim, Lines, LiveView, Pace, lines_over
 from rotorgram.udp import RemoteEnv, Simulator
 from rotorgram.udp.protocol.messages import Command
@@ -40,7 +40,6 @@ class FakeSurface:
 
     stage: Stage
     gate: threading.Event = field(default_factory=threading.Event)
-    where: str = "nowhere"
     shown: list[tuple[Moment, ...]] = field(default_factory=list)
     lines: list[Lines] = field(default_factory=list)
     error: Exception | None = None
@@ -55,9 +54,6 @@ class FakeSurface:
 
     def is_running(self) -> bool:
         return self.open
-
-    def is_watched(self) -> bool:
-        return True
 
     def close(self) -> None:
         self.open = False
@@ -477,9 +473,7 @@ def status_and_error(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[i
     return status, capsys.readouterr().err.strip()
 
 
-@pytest.mark.parametrize(
-    "words", [("view", "pid"), ("sim", "--view", "window", "--bind", "127.0.0.1:0")]
-)
+@pytest.mark.parametrize("words", [("view", "pid"), ("sim", "--view", "--bind", "127.0.0.1:0")])
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems always have a display")
 def test_no_display(
     words: tuple[str, ...],
@@ -491,7 +485,6 @@ def test_no_display(
     status, error = status_and_error(capsys, *words, "--scene", "plain")
     assert status == 2
     assert error.startswith("rotorgram: window: expected a display, got none")
-    assert "--web" in error
     assert "rotorgram render" in error
     assert "\n" not in error
 
@@ -500,7 +493,6 @@ def test_no_display(
     ("words", "expected"),
     [
         (("--speed", "9"), "speed: expected 0.0625 to 8, got 9"),
-        (("--web", "--port", "70000"), "port: expected 0 to 65535, got 70000"),
         (("--episodes", "0"), "episodes: expected at least 1, got 0"),
     ],
 )
@@ -516,12 +508,12 @@ def open_fakes(monkeypatch: pytest.MonkeyPatch) -> list[FakeSurface]:
     """What `rotorgram view` opens in place of windows."""
     surfaces: list[FakeSurface] = []
 
-    def open_fake(kind: str, stage: Stage, pace: Pace, port: int) -> FakeSurface:
+    def open_fake(stage: Stage, pace: Pace) -> FakeSurface:
         surfaces.append(FakeSurface(stage))
         surfaces[-1].gate.set()
         return surfaces[-1]
 
-    monkeypatch.setattr(live, "open_surface", open_fake)
+    monkeypatch.setattr(window, "Window", open_fake)
     return surfaces
 
 
@@ -558,7 +550,7 @@ def test_view_shows_episodes_at_the_speed_that_was_asked_for(
     assert time.monotonic() - began >= 161 * 0.02 / 8 - 0.1
     out = capsys.readouterr().out.splitlines()
     assert [line.split(":")[0] for line in out] == [
-        f"showing {who} nowhere (Ctrl-C ends)",
+        f"showing {who} in the window (Ctrl-C ends)",
         "episode 0",
         "episode 1",
     ]

@@ -1,4 +1,4 @@
-"""The window on a screen in memory, and the page without a browser."""
+"""The window on a screen in memory."""
 
 import os
 import shutil
@@ -12,11 +12,12 @@ WINDOW = """
 import os, sys, threading, time
 import mujoco
 from rotorgram.rendering import Moment, Stage
-from rotorgram.rendering.live import LiveView, Pace, open_surface
+from rotorgram.rendering.live import LiveView, Pace
+from rotorgram.rendering.window import Window
 
 niceness = os.getpriority(os.PRIO_PROCESS, 0)
 stage, pace = Stage("plain", 2), Pace(0.02)
-surface = open_surface("window", stage, pace)
+surface = Window(stage, pace)
 live = LiveView(stage, surface, pace)
 for step in range(20):
     height = 5.0 + step / 20
@@ -28,7 +29,7 @@ for step in range(20):
 end = time.monotonic() + 60
 while not live.wants and time.monotonic() < end:
     time.sleep(0.05)
-assert live.is_running and live.surface.is_watched()
+assert live.is_running
 handle = surface._handle
 assert abs(stage.data.qpos[2] - 5.95) < 1e-9, stage.data.qpos
 assert handle.cam.lookat[2] == 5.0
@@ -129,108 +130,3 @@ def on_a_screen(script: str, folder: Path) -> str:
         pytest.skip("Xvfb has no OpenGL (on Debian and Ubuntu: libgl1-mesa-dri)")
     assert done.returncode == 0, done.stderr
     return done.stdout
-
-
-PAGE = """
-import socket
-import time
-from urllib.request import urlopen
-import mujoco
-from rotorgram.rendering import Moment, Stage
-from rotorgram.rendering import web
-from rotorgram.rendering.live import LiveView, Pace, open_surface
-
-def wait_until(condition):
-    end = time.monotonic() + 30
-    while not condition():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.01)
-
-def answers(url):
-    try:
-        urlopen(url, timeout=20).close()
-    except OSError:  # the server is about to listen
-        return False
-    return True
-
-SAME, EVIL = "http://127.0.0.1:{port}", "http://evil.example"
-HERE = "Host: 127.0.0.1:{port}"
-REQUESTS = [
-    ("/state", [HERE], 101),  # a program that is no browser
-    ("/state", [HERE, "Origin: " + SAME], 101),
-    ("/ui", [HERE, "Origin: " + SAME], 101),
-    ("/state", ["Host: localhost:9000", "Origin: http://localhost:9000"], 101),  # ssh -L 9000:
-    ("/state", [HERE, "Origin: " + EVIL], 403),
-    ("/ui", [HERE, "Origin: " + EVIL], 403),
-    ("/drop", [HERE, "Origin: null"], 403),
-    ("/ui", [HERE, "Origin: http://127.0.0.1:3000"], 403),  # another page of this machine
-    ("/state", ["Host: evil.example:{port}", "Origin: http://evil.example:{port}"], 403),
-    ("/model", ["Host: evil.example:{port}"], 403),  # its name server names this machine
-    ("/model", [HERE, "Origin: " + EVIL], 403),
-    ("/model", [HERE], 200),
-    ("/", ["Host: evil.example"], 403),
-]
-
-def upgrade(port, path, headers):
-    lines = [f"GET {path} HTTP/1.1", *(h.format(port=port) for h in headers)]
-    if path in ("/state", "/ui", "/drop"):
-        lines += ["Connection: Upgrade", "Upgrade: websocket", "Sec-WebSocket-Version: 13",
-                  "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ=="]
-    with socket.create_connection(("127.0.0.1", port), timeout=20) as connection:
-        connection.sendall("\\r\\n".join([*lines, "", ""]).encode())
-        return int(connection.makefile("rb").readline().split()[1])
-
-def look(stage, pace, page, live):
-    live.draw(Moment(position=(0.0, 5.0, 0.0), attitude=(0.0, 0.0, 0.0), thrusts=(49.0,) * 4,
-                     goal=(0.0, 5.5, 0.0), step=3))
-    url = f"http://127.0.0.1:{page.port}/"
-    assert url in page.where
-    wait_until(lambda: answers(url))
-    assert b"<canvas" in urlopen(url, timeout=20).read()
-    assert len(urlopen(url + "model", timeout=20).read()) >= mujoco.mj_sizeModel(stage.model)
-    viewer = page._panel.viewer
-    wait_until(lambda: page._panel._lines)
-    assert ("step", "3") in page._panel._lines
-    for path, headers, status in REQUESTS:
-        answer = upgrade(page.port, path, headers)
-        assert answer == status, (path, headers, answer)
-    assert viewer.address == ("127.0.0.1", page.port)
-    assert viewer.extra_geoms[0].type == mujoco.mjtGeom.mjGEOM_CYLINDER
-    assert viewer.extra_geoms[0].pos.tolist() == [0.0, 0.0, 5.5]
-    assert viewer.camera.lookat[2] == 5.5
-    wait_until(lambda: viewer.data.qpos[2] == 5.0)
-    time.sleep(0.2)  # a few frames
-    assert live.is_running
-    assert not live.surface.is_watched()  # no browser has come
-    try:
-        web.WebPage(stage, pace, page.port)
-    except ValueError as error:
-        assert str(error).startswith(f"port: expected a free one, got {page.port}"), error
-    else:
-        raise AssertionError("two pages at one port")
-
-stage, pace = Stage("plain"), Pace(0.02)
-page = open_surface("web", stage, pace, 0)
-with LiveView(stage, page, pace) as live:
-    look(stage, pace, page, live)
-assert not page.is_running()
-
-web._HOST = "0.0.0.0"  # as another version of MuJoCo might: it binds what it likes
-try:
-    web.WebPage(stage, pace, 0)
-except OSError as error:
-    assert "would serve 0.0.0.0 port" in str(error), error
-else:
-    raise AssertionError("a page for everybody")
-print("looked at")
-"""
-
-
-def test_the_page(tmp_path: Path) -> None:
-    pytest.importorskip("mujoco.studio.web_viewer", reason="no mujoco-studio")
-    # In a process of its own: MuJoCo's server leaves connections to Python's end.
-    done = subprocess.run(
-        [sys.executable, "-c", PAGE], cwd=tmp_path, capture_output=True, text=True, timeout=100
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.endswith("looked at\n")
