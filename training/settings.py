@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 from ..agents import ALGORITHMS, CONTROLLERS, Config, find_preset, preset
 from ..agents.presets import PresetName
@@ -17,7 +17,8 @@ from ..envs import config as envs
 from ..envs.registry import env_spec, is_known, load, task_type
 from ..flights.trajectories import EpisodeSet
 from ..models import BACKENDS, Backend
-from ..models.errors import InputError, expect
+from ..models.errors import InputError
+from ..models.fields import Limits, check_fields, check_names
 
 MIN_FLIGHTS: Final = 200
 """Evaluation flights of each row of a study, over all its seeds."""
@@ -42,7 +43,8 @@ class EnvConfig:
     """Drones of each world, for a task of several."""
 
     def __post_init__(self) -> None:
-        expect(self.backend in BACKENDS, "backend", " or ".join(BACKENDS), repr(self.backend))
+        if self.backend not in BACKENDS:
+            raise InputError(f"backend: expected {' or '.join(BACKENDS)}, got {self.backend!r}")
         if not self.drones >= 1:
             raise InputError(f"drones: expected 1 or more, got {self.drones}")
         options: dict[str, Any] = dict(self.options)
@@ -122,15 +124,16 @@ class Row:
     """Hyperparameters: the paper's, or ours."""
     set: Mapping[str, Any] = field(default_factory=dict)
     """Hyperparameters that differ from the preset's."""
-    env_steps: int = 0
+    env_steps: Annotated[int, Limits(0, whole=True)] = 0
     """Env steps of each training, of all its drones together; 0: those of the preset."""
-    num_envs: int = 0
+    num_envs: Annotated[int, Limits(0, whole=True)] = 0
     """Drones that fly at the same time in each training; 0: those of the preset."""
 
     def __post_init__(self) -> None:
         known = (*CONTROLLERS, *ALGORITHMS)
         if self.agent not in known:
             raise InputError(f"agent: expected one of {', '.join(known)}, got {self.agent}")
+        check_fields(self)
         env = self.env
         if self.controller:
             env = replace(env, options={**env.options, **self._brought_to(env)})
@@ -230,11 +233,15 @@ class Row:
 
         Raises `InputError`, whose sentence begins with `where`.
         """
-        given = _checked(where, table, cls)
+        given = _fields(where, table, cls)
         if "agent" not in given:
             raise InputError(f"{where}: expected an agent, got none")
-        given["env"] = env_from({**(env or {}), **given.get("env", {})})
-        return cls(**given)
+        _table(f"{where}: set", given.get("set", {}))
+        own = _table(f"{where}: env", given.get("env", {}))
+        try:
+            return cls(**{**given, "env": env_from({**(env or {}), **own})})
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from None
 
 
 def _word(value: Any) -> str:
@@ -271,13 +278,13 @@ class Study:
     rows: tuple[Row, ...]
     kind: Kind = "compare"
     """paper: the paper's comparison, with its figures and verdicts. sweep: rows are ranked."""
-    seeds: int = 5
-    first_seed: int = 0
-    snapshots: int = 10
+    seeds: Annotated[int, Limits(1, whole=True)] = 5
+    first_seed: Annotated[int, Limits(0, whole=True)] = 0
+    snapshots: Annotated[int, Limits(1, whole=True)] = 10
     """Policies kept during each training, for the learning curves."""
-    curve_episodes: int = 10
+    curve_episodes: Annotated[int, Limits(1, whole=True)] = 10
     """Evaluation episodes of each of them."""
-    episodes: int = 0
+    episodes: Annotated[int, Limits(0, whole=True)] = 0
     """Evaluation episodes of each final policy; 0: as many as make `MIN_FLIGHTS` of a row."""
     evaluation: EpisodeSet = "final"
     """Set of the episodes of the final evaluation."""
@@ -289,12 +296,7 @@ class Study:
     def __post_init__(self) -> None:
         if not self.rows:
             raise InputError("row: expected at least one, got none")
-        for name in ("seeds", "snapshots", "curve_episodes"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name}: expected at least 1, got {getattr(self, name)}")
-        for name in ("first_seed", "episodes"):
-            if getattr(self, name) < 0:
-                raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
+        check_fields(self)
         names = [row.name for row in self.rows]
         for name in names:
             if names.count(name) > 1:
@@ -318,7 +320,7 @@ class Study:
     @classmethod
     def from_dict(cls, where: str, content: Any) -> "Study":
         """Raises `InputError`, whose sentence begins with `where`."""
-        given = _checked(where, content, cls)
+        given = _fields(where, content, cls)
         rows = [
             Row.from_dict(f"{where}: row {place}", table)
             for place, table in enumerate(given.pop("rows", []), 1)
@@ -338,7 +340,7 @@ class Study:
         tables = content.pop("row")
         if type(tables) is not list:
             raise InputError(f"{path}: row: expected [[row]] tables, got {tables!r:.80}")
-        given = _checked(f"{path}", content, cls)
+        given = _fields(f"{path}", content, cls)
         rows = [
             Row.from_dict(f"{path}: row {place}", table, env)
             for place, table in enumerate(tables, 1)
@@ -356,24 +358,14 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: expected a TOML file of rows, got: {error}") from None
 
 
-_TYPES: Final = {
-    int: "a whole number", str: "a text", bool: "true or false", dict: "a table", list: "a list",
-}  # fmt: skip
-_TYPE_OF: Final = dict.fromkeys(
-    ("seeds", "first_seed", "snapshots", "curve_episodes", "episodes", "env_steps", "num_envs"), int
-) | {"wire": bool, "keep_steps": bool, "env": dict, "set": dict, "rows": list}
-
-
-def _checked(where: str, table: Any, kind: type[Row | Study]) -> dict[str, Any]:
-    """The table. Raises `InputError` unless each name is a field with a value of its type."""
+def _table(where: str, table: Any) -> dict[str, Any]:
     if not isinstance(table, dict):
         raise InputError(f"{where}: expected a table, got {table!r:.80}")
-    names = [one.name for one in fields(kind)]
-    for name, value in table.items():
-        if name not in names:
-            raise InputError(f"{where}: expected some of {', '.join(names)}, got {name!r}")
-        wanted = _TYPE_OF.get(name, str)
-        if type(value) is not wanted and not (name == "backend" and value is None):
-            expected = _TYPES[wanted]
-            raise InputError(f"{where}: {name}: expected {expected}, got {value!r:.80}")
     return dict(table)
+
+
+def _fields(where: str, table: Any, kind: type[Row | Study]) -> dict[str, Any]:
+    """The table. Raises `InputError` unless each name is a field."""
+    given = _table(where, table)
+    check_names(given, [one.name for one in fields(kind)], where)
+    return given

@@ -5,7 +5,7 @@ A spec comes from a file or a peer, so that none of its texts may be trusted.
 
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
@@ -190,43 +190,6 @@ def _table(values: Floats) -> str:
     return ",\n".join(f"    {line}" for line in lines)
 
 
-class _Element(NamedTuple):
-    """An element of an array of a spec."""
-
-    name: str
-    unit: str
-    frame: str
-    low: float
-    high: float
-
-
-def _elements(*arrays: ArraySpec) -> Iterator[_Element]:
-    """Every element of some arrays, one after the other, as a policy takes them."""
-    for array in arrays:
-        units = (array.unit,) * array.size if isinstance(array.unit, str) else array.unit
-        low, high = (bound.ravel().tolist() for bound in array.bounds())
-        for name, unit, *bounds in zip(component_names(array), units, low, high, strict=True):
-            yield _Element(name, unit, array.frame, *bounds)
-
-
-def _lists(spec: EnvSpec) -> dict[str, list[str]]:
-    """Names and units of all elements, by the name that they have in the file."""
-    observed = list(_elements(*spec.observation))
-    action = spec.action
-    listed = {
-        "observation_names": [one.name for one in observed],
-        "observation_units": [one.unit for one in observed],
-        "observation_frames": [one.frame for one in observed],
-    }
-    if isinstance(action, Discrete):
-        return listed | {"choice_names": _choices(action)}
-    acted = list(_elements(action))
-    return listed | {
-        "action_names": [one.name for one in acted],
-        "action_units": [one.unit for one in acted],
-    }
-
-
 def _choices(action: Discrete) -> list[str]:
     return list(action.components) or [str(i) for i in range(action.n)]
 
@@ -242,21 +205,28 @@ def _about(spec: EnvSpec, facts: Mapping[str, str]) -> list[str]:
         f"vehicle: {spec.vehicle} ({spec.vehicle_hash})",
         f"trained: {facts['algorithm']}, seed {facts['seed']}, {facts['env_steps']} env steps",
         "observation:",
-        *_described(_elements(*spec.observation)),
+        *_described(spec.observation),
     ]
     if isinstance(action, Discrete):
         lines.append("action, the number of a choice:")
         lines += [f"  {i}: {name}" for i, name in enumerate(_choices(action))]
     else:
-        lines += ["action:", *_described(_elements(action))]
+        lines += ["action:", *_described([action])]
     return [_comment(line).rstrip() for line in lines]
 
 
-def _described(listed: Iterable[_Element]) -> Iterator[str]:
-    for i, one in enumerate(listed):
-        unit = "" if one.unit == "1" else one.unit
-        words = [f"{one.low:g} to {one.high:g} {unit}".rstrip(), one.frame]
-        yield f"  {i}: {one.name}: " + ", ".join(word for word in words if word)
+def _described(arrays: Iterable[ArraySpec]) -> Iterator[str]:
+    """A line for every element of some arrays, one after the other, as a policy takes them."""
+    number = 0
+    for array in arrays:
+        units = (array.unit,) * array.size if isinstance(array.unit, str) else array.unit
+        low, high = (bound.ravel().tolist() for bound in array.bounds())
+        for place, name in enumerate(component_names(array)):
+            unit = "" if units[place] == "1" else units[place]
+            bounds = f"{low[place]:g} to {high[place]:g} {unit}".rstrip()
+            words = f"{bounds}, {array.frame}" if array.frame else bounds
+            yield f"  {number}: {name}: {words}"
+            number += 1
 
 
 def _constants(policy: NetworkPolicy, facts: Mapping[str, str]) -> Iterator[str]:
@@ -275,8 +245,6 @@ def _constants(policy: NetworkPolicy, facts: Mapping[str, str]) -> Iterator[str]
         yield f"#define ROTORGRAM_{name.upper()} {number}"
     for name in ("algorithm", "env_id", "options", "vehicle", "vehicle_hash"):
         yield f"#define ROTORGRAM_{name.upper()} {_text(facts[name])}"
-    for name, texts in _lists(spec).items():
-        yield f"#define ROTORGRAM_{name.upper()} {{ {', '.join(map(_text, texts))} }}"
 
 
 def _text(text: str) -> str:

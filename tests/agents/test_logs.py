@@ -19,16 +19,12 @@ from rotorgram.agents.a2c import A2C
 from rotorgram.agents.checkpoints import Checkpoint, load, store
 from rotorgram.agents.episodes import EpisodeRecorder
 from rotorgram.agents.networks import Weights
-from rotorgram.agents.sb3 import RecordedEnv, SB3VecEnv
 from rotorgram.agents.vpg import VPG
 from rotorgram.cli import main
 from rotorgram.cli._progress import Bars, Lines
 from rotorgram.cli._scalars import ScalarWriter
 from rotorgram.training.settings import Run
 from rotorgram.training.training import Training
-from stable_baselines3 import A2C as PlainA2C
-from stable_baselines3.common.logger import KVWriter, Logger
-from stable_baselines3.common.vec_env import VecMonitor
 from tensorboard.backend.event_processing import plugin_event_accumulator
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from test_learning import rollout, train_both
@@ -81,46 +77,6 @@ def test_the_names_are_those_of_the_pages(algorithm: str, drones: int, tmp_path:
     steps = {tuple(step for step, _ in points) for points in logged.values()}
     assert max(steps)[-1] >= 400
     assert all(a < b for a, b in zip(max(steps), max(steps)[1:], strict=False))
-
-
-class Capture(KVWriter):
-    """Asks, whenever SB3 writes its log, what we would write."""
-
-    def __init__(self, training: Training) -> None:
-        self.training = training
-        self.rows: list[tuple[dict[str, Any], dict[str, float]]] = []
-
-    def write(self, key_values: dict[str, Any], key_excluded: Any, step: int = 0) -> None:
-        self.rows.append((dict(key_values), self.training.scalars()))
-
-    def close(self) -> None:
-        """Nothing to close."""
-
-
-def test_sb3_logs_the_same_under_the_same_names() -> None:
-    """A plain SB3 with its own Monitor and log, beside what we say of the same episodes."""
-    run = Run(
-        algorithm="sb3-a2c", config=preset("a2c", "tuned"), seed=0,
-        env_steps=2400,
-    )  # fmt: skip
-    training = Training(run, vector(episode_length=12))
-    model = PlainA2C(
-        "MlpPolicy", VecMonitor(SB3VecEnv(RecordedEnv(training.log))), n_steps=40, device="cpu"
-    )
-    capture = Capture(training)
-    model.set_logger(Logger(folder=None, output_formats=[capture]))
-    training.log.start_clock()
-    model.learn(2400, log_interval=1)
-    assert len(training.log.episodes) > 190, "more than a window"
-    assert len(capture.rows) == 60
-    for theirs, ours in capture.rows[1:]:
-        for name in ("rollout/ep_rew_mean", "rollout/ep_len_mean", "time/total_timesteps"):
-            assert ours[name] == pytest.approx(theirs[name], abs=1e-4)
-    theirs, ours = capture.rows[-1]
-    assert documented("sb3-a2c.md") == {name for name in theirs if name.startswith("train/")}
-    own = {"rollout/ep_error_mean"}
-    assert documented("README.md") - own <= set(theirs)
-    assert ours["time/fps"] == pytest.approx(theirs["time/fps"], rel=0.5)
 
 
 @pytest.mark.parametrize("algorithm", AGENTS)
@@ -181,17 +137,6 @@ def test_the_values_by_hand(
     for step, value in logged["train/learning_rate"]:
         assert value == pytest.approx(0.01 * (1 - (step - size) / 800), rel=1e-5)
     assert logged["train/n_updates"] == [(s, s / size) for s, _ in logged["train/n_updates"]]
-
-
-@pytest.mark.parametrize("algorithm", ["a2c", "sb3-a2c"])
-def test_the_entropy_is_that_of_the_deviation_before_the_update(
-    algorithm: str, tmp_path: Path
-) -> None:
-    logged = train(algorithm, tmp_path / "run", "--env-steps", 600, *sized(algorithm))
-    before = [math.exp(-0.5), *(value for _, value in logged["train/std"])]
-    assert len(before) == 7
-    for (_, loss), deviation in zip(logged["train/entropy_loss"], before, strict=False):
-        assert loss == pytest.approx(-(ENTROPY_OF_ONE + math.log(deviation)), rel=1e-5)
 
 
 TWO_STEPS = rollout(
@@ -376,19 +321,6 @@ def test_no_bar_is_wider_than_its_terminal(width: int) -> None:
     assert len(lines) == 3, "none is wrapped"
     assert max(map(len, lines)) <= width
     assert [line.split()[0][:2] for line in lines] == ["sb", "vp", "a2"]
-
-
-def test_bars_are_drawn_on_a_terminal_while_they_are_told() -> None:
-    """As `bars` does it: started, so that rich draws whenever it likes."""
-    clock = Clock()
-    terminal = io.StringIO()
-    bars = Bars(Console(width=80, file=terminal, force_terminal=True), clock)
-    with bars.progress:
-        fly(bars, clock, "vpg seed 3", 12)
-        bars.progress.refresh()
-        assert "61,440/200k 5,120/s 0:12, 0:28 left return 224" in terminal.getvalue()
-        bars("vpg seed 3", 200_000, 200_000, "done")
-    assert "vpg seed 3     done" in terminal.getvalue()
 
 
 def test_lines_come_every_ten_seconds_with_the_same_figures(

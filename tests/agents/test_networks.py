@@ -96,22 +96,6 @@ def test_gradients_are_those_of_torch(hidden: tuple[int, ...], activation: str) 
     agree(weights, theirs)
 
 
-def test_gradients_are_finite_differences() -> None:
-    net, weights = mlp((8, 9), 1, "tanh")
-    seen = normal(BATCH, INPUTS)
-    net.forward(seen)
-    net.backward(np.full((BATCH, 1), 1 / BATCH, np.float32))
-    for i in range(0, weights.values.size, 7):
-        found = []
-        before = weights.values[i]
-        for step in (0.02, -0.02):
-            weights.values[i] = before + step
-            found.append(net.forward(seen).astype(float).mean())
-        weights.values[i] = before
-        slope = (found[0] - found[1]) / 0.04
-        assert weights.slopes[i] == pytest.approx(slope, rel=5e-3, abs=2e-4)
-
-
 @pytest.mark.parametrize("discrete", [False, True], ids=["continuous", "discrete"])
 def test_log_probability_entropy_and_their_gradients_are_those_of_torch(discrete: bool) -> None:
     ours = actor(discrete=discrete)
@@ -137,21 +121,6 @@ def test_log_probability_entropy_and_their_gradients_are_those_of_torch(discrete
     agree(ours.weights, theirs)
 
 
-def test_log_probability_of_a_gaussian_by_hand() -> None:
-    """Mean 0; deviations 1, 1, e: log P = -(1 + 4 + 1) / 2 - 1 - 1.5 log 2 pi."""
-    ours = actor(discrete=False)
-    ours.weights.values[:] = 0
-    log_std = ours.weights.arrays["log_std"]
-    log_std[:] = 0, 0, 1
-    got, entropy = ours.score(np.zeros((1, INPUTS), np.float32), np.array([[1, 2, np.e]], "f"))
-    assert got[0] == pytest.approx(-3 - 1 - 1.5 * 1.8378771, rel=1e-6)
-    assert entropy == pytest.approx(1.5 * (1 + 1.8378771) + 1, rel=1e-6)
-    log_std[:] = 9, 0, -9
-    assert ours.head is not None
-    ours.head.clamp()
-    assert log_std.tolist() == [1, 0, -4]
-
-
 def test_adam_is_torch_s() -> None:
     weights = Weights.zeros({"w": (40,)})
     weights.values[:] = normal(40)
@@ -164,26 +133,6 @@ def test_adam_is_torch_s() -> None:
         reference.step()
         ours.step(0.01)
         np.testing.assert_allclose(weights.values, theirs.detach(), rtol=1e-6, atol=2e-7)
-
-
-def test_adam_by_hand() -> None:
-    """First step: moments 0.1 g and 0.001 g^2, unbiased g and g^2: a step of the rate against g."""
-    weights = Weights.zeros({"w": (3,)})
-    adam = Adam(weights)
-    weights.slopes[:] = 4, -0.5, 0
-    adam.step(np.array([0.1, 0.2, 0.3], np.float32))
-    np.testing.assert_allclose(weights.values, [-0.1, 0.2, 0], rtol=1e-6)
-    slow = Adam(weights, 1e-5)
-    slower = weights.values.copy()
-    weights.slopes[:] = 1e-5, 0, 0  # as large as epsilon: half a step
-    slow.step(0.1)
-    np.testing.assert_allclose(weights.values - slower, [-0.05, 0, 0], atol=1e-6)
-    kept = adam.arrays()
-    np.testing.assert_allclose(kept["second"], [0.016, 0.00025, 0], rtol=1e-6)
-    assert kept["steps"] == 1
-    for wrong in ({**kept, "first": np.zeros(2)}, {**kept, "steps": np.array(-1)}, {}):
-        with pytest.raises(ValueError, match="optimizer: expected"):
-            adam.load(wrong)
 
 
 def test_a_norm_is_clipped_as_in_torch() -> None:

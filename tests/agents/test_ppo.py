@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from drones import Kept, log_of
 from rotorgram.agents import EpisodeRecorder, PPOConfig, find_preset, load, make_agent
 from rotorgram.agents.optimizers import clip_norm
 from rotorgram.agents.ppo import PPO
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.models.errors import InputError
-from test_learning import copy_weights, rollout, torch_net, train_both
+from test_learning import copy_weights, rollout, train_both
 
 SMALL = PPOConfig(gamma=0.5, gae_lambda=0.5, steps_per_update=3, epochs=1, minibatches=1)
 
@@ -69,30 +68,6 @@ def columns(count: int) -> tuple[np.ndarray, ...]:
     dice = np.random.default_rng(1)
     shapes = [(count, 1), (count, 1), (count,), (count,), (count,)]
     return tuple(dice.normal(size=shape).astype(np.float32) for shape in shapes)
-
-
-def test_gradients_are_those_of_torch() -> None:
-    agent = PPO.create(log_of(), PPOConfig(ent_coef=0.03, vf_coef=0.7, clip=0.3), 0)
-    agent.weights.values[:] += np.random.default_rng(0).normal(size=agent.weights.values.size) / 3
-    seen, actions, before, advantage, targets = columns(40)
-    before = before / 3 - 1.2  # near the log-probabilities
-    agent.minibatch(seen, actions, before, advantage, targets)
-    arrays = {k: torch.tensor(a, requires_grad=True) for k, a in agent.weights.arrays.items()}
-    actor, critic = ({k.removeprefix(p): a for k, a in arrays.items() if k.startswith(p)}
-                     for p in ("actor.", "critic."))  # fmt: skip
-    inputs, old, gains, goals = map(torch.from_numpy, (seen, before, advantage, targets))
-    normal: Any = torch.distributions.Normal(torch_net(actor, inputs), actor["log_std"].exp())
-    ratio = (normal.log_prob(torch.from_numpy(actions)).sum(1) - old).exp()
-    gains = (gains - gains.mean()) / (gains.std() + 1e-8)
-    objective = torch.min(ratio * gains, ratio.clamp(0.7, 1.3) * gains).mean()
-    value_loss = (torch_net(critic, inputs)[:, 0] - goals).square().mean()
-    (0.7 * value_loss - objective - 0.03 * normal.entropy().sum(1).mean()).backward()
-    share = ((ratio - 1).abs() > 0.3).float().mean()
-    assert 0.1 < share < 0.9, "some are clipped, some are not"
-    for name, gradient in agent.weights.gradients.items():
-        theirs = arrays[name].grad
-        assert theirs is not None
-        np.testing.assert_allclose(gradient, theirs, rtol=1e-4, atol=1e-6, err_msg=name)
 
 
 def test_rates_of_actor_and_critic() -> None:

@@ -111,30 +111,6 @@ def test_gradients_of_the_actor_are_those_of_torch() -> None:
         np.testing.assert_allclose(gradient, leaves[name].grad, rtol=1e-3, atol=2e-5, err_msg=name)
 
 
-def test_gradients_of_the_actor_are_finite_differences() -> None:
-    actor = squashed()
-    states = normal(BATCH, N, seed=5)
-    noise = 0.3 * normal(BATCH, K, seed=6)
-    actor.weights.values[:] *= 0.5  # where tanh is steep, float32 has digits enough
-    slope = normal(BATCH, K, seed=7) / BATCH
-
-    def loss() -> float:
-        actions, logs = actor.draw(states, noise)
-        return float((slope * actions).sum(dtype=float) + 0.3 * logs.mean(dtype=float))
-
-    loss()
-    actor.backward(slope, 0.3 / BATCH)
-    for i in range(0, actor.weights.values.size, 11):
-        found = []
-        before = actor.weights.values[i]
-        for step in (0.01, -0.01):
-            actor.weights.values[i] = before + step
-            found.append(loss())
-        actor.weights.values[i] = before
-        difference = (found[0] - found[1]) / 0.02
-        assert actor.weights.slopes[i] == pytest.approx(difference, rel=2e-2, abs=3e-4)
-
-
 def test_a_deviation_at_its_limit_has_no_gradient() -> None:
     actor = actor_of((1, 1, 2))
     bias = actor.weights.arrays["layers.1.bias"]

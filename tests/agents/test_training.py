@@ -6,23 +6,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from drones import OPTIONS, vector
 from rotorgram.agents import (
     CheckpointError,
     ResumeError,
     episode_seed,
     load,
-    make_agent,
     preset,
     store,
 )
-from rotorgram.agents.episodes import EpisodeRecorder
 from rotorgram.cli import main
-from rotorgram.flights.trajectories import evaluation_seed, fly_episodes
+from rotorgram.flights.trajectories import evaluation_seed
 from rotorgram.models.errors import InputError
 from rotorgram.training.settings import Run
-from rotorgram.training.training import Training, is_finished
+from rotorgram.training.training import Training
 
 SMALL: dict[str, dict[str, int]] = {
     "vpg": {"episodes_per_update": 4},
@@ -70,15 +67,6 @@ def test_training_and_evaluation_share_no_seed() -> None:
     assert training.isdisjoint(evaluation)
 
 
-def test_evaluation_flies_without_noise() -> None:
-    env = vector()
-    log = EpisodeRecorder(env, 0)
-    policy = make_agent("a2c", log, preset("a2c", "paper"), 0).policy()
-    first, second = (fly_episodes(env, policy, 2) for _ in range(2))
-    for one, other in zip(first, second, strict=True):
-        assert one.headline.tobytes() == other.headline.tobytes()
-
-
 def test_same_seed_same_numbers_and_other_seed_other_numbers() -> None:
     def weights(seed: int) -> bytes:
         run = replace(run_of("a2c", 1), seed=seed, env_steps=300)
@@ -103,35 +91,6 @@ def test_progress_tells_of_every_drone() -> None:
     assert training.words().startswith(f"return {mean:.0f}, |E| 0.")
     assert training.scalars()["rollout/ep_rew_mean"] == pytest.approx(mean)
     assert training.scalars()["rollout/ep_len_mean"] == pytest.approx(np.mean(lengths))
-
-
-@pytest.mark.parametrize("drones", [1, 4])
-@pytest.mark.parametrize("algorithm", SMALL)
-def test_a_run_that_was_stopped_ends_as_if_it_had_not(
-    algorithm: str, drones: int, tmp_path: Path
-) -> None:
-    """SB3's keeps no state, and flies everything again."""
-    run = run_of(algorithm, drones)
-    path = tmp_path / "checkpoint.safetensors"
-    unbroken = Training(run, env_of(run))
-    assert unbroken.train()
-    stopped = Training(run, env_of(run))
-    updates = iter(range(3))
-    assert not stopped.train(lambda: next(updates, None) != 2)
-    store(stopped.checkpoint(), path)
-    kept = load(path)
-    assert kept.num_envs == drones
-    assert not is_finished(kept)
-    torch.manual_seed(99)  # nothing may depend on what the process did before
-    resumed = Training.resume(kept, env_of(run))
-    expected_steps = 0 if algorithm == "sb3-a2c" else stopped.log.env_steps
-    assert resumed.log.env_steps == expected_steps < 1400
-    assert resumed.train()
-    assert is_finished(resumed.checkpoint())
-    for name, expected in unbroken.agent.state().items():
-        assert resumed.agent.state()[name].tobytes() == expected.tobytes(), name
-    episodes = [[replace(e, seconds=0.0) for e in t.log.episodes] for t in (resumed, unbroken)]
-    assert episodes[0] == episodes[1]
 
 
 def test_what_cannot_be_resumed_is_refused() -> None:

@@ -1,7 +1,7 @@
-"""Updates with many drones, worked out again in plain NumPy: own gradients, own Adam.
+"""What many drones learn from: the rows that they flew, and returns and advantages by hand.
 
-Scripted drones keep what they flew: the numbers come from there, and the first weights from the
-agent. Nothing of the rollouts, the returns or the networks is used.
+Scripted drones keep what they flew: the numbers come from there. Nothing of the rollouts or the
+returns is used.
 """
 
 from collections.abc import Callable
@@ -17,70 +17,7 @@ from rotorgram.agents.vpg import VPG
 from scripted import CALM, LOSSES, Row, Script, Scripted, log_of
 
 GAMMA = 0.9
-RATE = 0.01
-VF_COEF = 0.7
-
-
-# ---- arithmetic
-
-
-class Net:
-    """One hidden layer of ReLU units in float64, with its gradient and its Adam."""
-
-    def __init__(self, weights: dict[str, np.ndarray]) -> None:
-        self.weights = {name: array.astype(np.float64) for name, array in weights.items()}
-        self._first = {name: np.zeros_like(array) for name, array in self.weights.items()}
-        self._second = {name: np.zeros_like(array) for name, array in self.weights.items()}
-        self._updates = 0
-
-    def __call__(self, inputs: np.ndarray) -> np.ndarray:
-        output: np.ndarray = self._hidden(inputs) @ self.weights["layers.1.weight"].T
-        return output + self.weights["layers.1.bias"]
-
-    def gradient(self, inputs: np.ndarray, slope: np.ndarray) -> dict[str, np.ndarray]:
-        """Of a loss whose derivative by the outputs is `slope`, shape (T, k)."""
-        hidden = self._hidden(inputs)
-        inner = slope @ self.weights["layers.1.weight"] * (hidden > 0)
-        return {
-            "layers.1.weight": slope.T @ hidden,
-            "layers.1.bias": slope.sum(0),
-            "layers.0.weight": inner.T @ inputs,
-            "layers.0.bias": inner.sum(0),
-        }
-
-    def adam(self, gradient: dict[str, np.ndarray], rate: float) -> None:
-        self._updates += 1
-        for name, slope in gradient.items():
-            first = self._first[name]
-            second = self._second[name]
-            first += 0.1 * (slope - first)
-            second += 0.001 * (slope**2 - second)
-            scale = np.sqrt(second / (1 - 0.999**self._updates)) + 1e-8
-            self.weights[name] -= rate * first / (1 - 0.9**self._updates) / scale
-
-    def _hidden(self, inputs: np.ndarray) -> np.ndarray:
-        weights = self.weights
-        hidden: np.ndarray = inputs @ weights["layers.0.weight"].T + weights["layers.0.bias"]
-        return np.maximum(hidden, 0)
-
-
-def policy_gradient(
-    actor: Net, seen: np.ndarray, actions: np.ndarray, weights: np.ndarray, entropy: float
-) -> dict[str, np.ndarray]:
-    """Of minus the mean of weight · log P, and of minus the weighted mean entropy."""
-    output = actor(seen)
-    column = weights[:, np.newaxis]
-    if "log_std" not in actor.weights:
-        shares = np.exp(output) / np.exp(output).sum(1, keepdims=True)
-        chosen = np.eye(3)[actions[:, 0].astype(int)]
-        surprise = -(shares * np.log(shares)).sum(1, keepdims=True)
-        slope = column * (chosen - shares) - entropy * shares * (np.log(shares) + surprise)
-        return actor.gradient(seen, -slope / len(seen))
-    std = np.exp(actor.weights["log_std"])
-    noise = (actions - output) / std
-    gradient = actor.gradient(seen, -column * noise / std / len(seen))
-    gradient["log_std"] = -(column * (noise**2 - 1)).mean(0) - entropy
-    return gradient
+SCRIPTS = [CALM, CALM[:1], LOSSES, LOSSES[:1]]
 
 
 def a2c_rows(
@@ -103,8 +40,8 @@ def a2c_rows(
     return kept, np.array(advantages)
 
 
-def vpg_rows(flown: list[list[Row]]) -> tuple[list[Row], np.ndarray, np.ndarray]:
-    """Rows to learn from, their returns, and the number of each within its episode.
+def vpg_rows(flown: list[list[Row]]) -> tuple[list[Row], np.ndarray]:
+    """Rows to learn from, and their returns.
 
     With many drones only rounds count that every drone has flown to an end, and of them only
     episodes without a loss; with one drone all that are without a loss.
@@ -114,192 +51,115 @@ def vpg_rows(flown: list[list[Row]]) -> tuple[list[Row], np.ndarray, np.ndarray]
          for number in sorted({row.episode for row in rows})]
         for rows in flown
     ]  # fmt: skip
-    found: list[list[tuple[Row, float, int]]] = [[] for _ in flown]
+    kept: list[list[Row]] = [[] for _ in flown]
+    returns: list[list[float]] = [[] for _ in flown]
     for round_ in zip_longest(*parts, fillvalue=[]):
         if len(flown) > 1 and not all(rows and rows[-1].ends for rows in round_):
             continue
         for drone, rows in enumerate(round_):
             if not rows[-1].lost:
-                found[drone] += [
-                    (rows[t], sum(GAMMA**k * row.reward for k, row in enumerate(rows[t:])), t)
-                    for t in range(len(rows))
-                ]
-    kept = [entry for entries in found for entry in entries]
-    return (
-        [r for r, _, _ in kept],
-        np.array([x for _, x, _ in kept]),
-        np.array([t for *_, t in kept]),
-    )
+                kept[drone] += rows
+                for t in range(len(rows)):
+                    discounted = [GAMMA**k * row.reward for k, row in enumerate(rows[t:])]
+                    returns[drone].append(sum(discounted))
+    return [row for own in kept for row in own], np.concatenate(returns)
 
 
 # ---- updates
 
 
-def by_drone(rollout: Rollout) -> tuple[np.ndarray, np.ndarray]:
-    """What is kept of a rollout: observations and actions, one drone after the other."""
-    kept = rollout.kept.T
-    seen, done = (array.swapaxes(0, 1)[kept] for array in (rollout.observations, rollout.actions))
-    return seen, done
+def by_drone(rollout: Rollout, array: np.ndarray) -> np.ndarray:
+    """The kept rows of an array (T, N, ...), one drone after the other."""
+    return array.swapaxes(0, 1)[rollout.kept.T]
 
 
 class Followed:
-    """An agent in training, and beside it the same by hand."""
+    """An agent in training; after each update `check` gets the rows flown for it and a rollout."""
 
-    def __init__(self, algorithm: str, config: Any, env: Scripted, total: int) -> None:
+    def __init__(
+        self, agent: Any, env: Scripted, log: Any, weights: Callable[[Rollout], np.ndarray]
+    ) -> None:
+        self.agent = agent
         self.env = env
-        self.log = log_of(env)
-        self.total = total
-        self.config = config
-        self.agent: Any = make_agent(algorithm, self.log, config, 3)
-        self.actor = Net(self.agent.actor())
-        self.critic = Net(self._critic())
-        self.updates = self.left_out = 0
-        self.noise: list[np.ndarray] = []
-        self._seen: list[tuple[np.ndarray, np.ndarray]] = []
+        self.log = log
+        self.updates = 0
+        self._weights = weights
+        self._learn = agent.update
+        self._taken: list[tuple[Rollout, np.ndarray]] = []
         self._known = [0] * env.num_envs
-        self._catch()
+        agent.update = self._update
 
-    def train(self) -> None:
-        self.agent.train(self.log, self.total, self._follow)
+    def train(self, total: int, expected: Callable[[list[list[Row]]], Any]) -> None:
+        def check() -> bool:
+            flown = [rows[n:] for rows, n in zip(self.env.flown, self._known, strict=True)]
+            self._known = [len(rows) for rows in self.env.flown]
+            assert self.log.env_steps == sum(self._known)
+            kept, wanted = expected(flown)
+            if self._taken:
+                ((rollout, weights),) = self._taken
+                self._check(rollout, weights, kept, wanted)
+                self._taken.clear()
+                self.updates += 1
+            else:
+                assert kept == []
+            return True
 
-    def _critic(self) -> dict[str, np.ndarray]:
-        if isinstance(self.agent, VPG):
-            return {}
-        if isinstance(self.agent, A2C):
-            return self.agent.weights.part("critic.").arrays
-        weights = self.agent.state()
-        names = {"layers.0": "mlp_extractor.value_net.0", "layers.1": "value_net"}
-        return {f"{ours}.{kind}": weights[f"policy.{theirs}.{kind}"]
-                for ours, theirs in names.items() for kind in ("weight", "bias")}  # fmt: skip
+        self.agent.train(self.log, total, check)
 
-    def _catch(self) -> None:
-        """Keep what the agent learns from, drone by drone: what was seen, and done unclipped."""
-        if isinstance(self.agent, VPG | A2C):
-            update = self.agent.update
-            self.agent.update = lambda rollout: (  # type: ignore[method-assign]
-                self._seen.append(by_drone(rollout)),
-                update(rollout),
-            )[1]
-            return
-        buffer = self.agent.model.rollout_buffer
-        prepare = buffer.compute_returns_and_advantage
+    def _update(self, rollout: Rollout) -> None:
+        self._taken.append((rollout, self._weights(rollout)))
+        self._learn(rollout)
 
-        def prepare_and_keep(*args: Any, **kwargs: Any) -> None:
-            columns = (np.swapaxes(c, 0, 1) for c in (buffer.observations, buffer.actions))
-            seen, done = (c.reshape(-1, c.shape[-1]).copy() for c in columns)
-            self._seen.append((seen, done))
-            prepare(*args, **kwargs)
-
-        buffer.compute_returns_and_advantage = prepare_and_keep
-
-    def _follow(self) -> bool:
-        before = sum(self._known)
-        flown = [rows[known:] for rows, known in zip(self.env.flown, self._known, strict=True)]
-        self._known = [len(rows) for rows in self.env.flown]
-        assert self.log.env_steps == sum(self._known)
-        whole = self.total
-        if not isinstance(self.agent, VPG | A2C):  # SB3 flies whole rollouts only
-            whole -= whole % (self.agent.model.n_steps * self.agent.model.n_envs)
-        update = self._vpg if isinstance(self.agent, VPG) else self._a2c
-        update(flown, RATE * (1 - before / whole))
-        pairs = [(self.actor, self.agent.actor()), (self.critic, self._critic())]
-        # Where a gradient cancels to 1e-9, it is rounding, and Adam divides it by its own size.
-        for net, weights in pairs:
-            for name, array in weights.items():
-                np.testing.assert_allclose(array, net.weights[name], atol=5e-5, err_msg=name)
-        return True
-
-    def _a2c(self, flown: list[list[Row]], rate: float) -> None:
-        config = self.config
-        value = lambda seen: float(self.critic(seen[np.newaxis].astype(float))[0, 0])  # noqa: E731
-        kept, advantages = a2c_rows(flown, value, config.gae_lambda)
-        self.left_out += sum(map(len, flown)) - len(kept)
-        if not kept:
-            assert not self._seen
-            return
-        seen, actions = self._taken(kept)
-        targets = advantages + self.critic(seen)[:, 0]
-        if config.normalize and len(kept) > 1:
-            advantages = (advantages - advantages.mean()) / (advantages.std(ddof=1) + 1e-8)
-        gradient = policy_gradient(self.actor, seen, actions, advantages, config.ent_coef)
-        self.actor.adam(gradient, rate)
-        errors = self.critic(seen) - targets[:, np.newaxis]
-        slope = 2 * VF_COEF * errors / len(seen)
-        self.critic.adam(self.critic.gradient(seen, slope), rate)
-
-    def _vpg(self, flown: list[list[Row]], rate: float) -> None:
-        kept, weights, steps = vpg_rows(flown)
-        self.left_out += sum(map(len, flown)) - len(kept)
-        if not kept:
-            assert not self._seen
-            return
-        if self.config.baseline == "time":
-            means = [weights[steps == step].mean() for step in range(steps.max() + 1)]
-            weights -= np.take(means, steps)
-        if self.config.normalize:
-            weights /= weights.std() + 1e-8
-        seen, actions = self._taken(kept)
-        self.actor.adam(policy_gradient(self.actor, seen, actions, weights, 0.0), rate)
-
-    def _taken(self, kept: list[Row]) -> tuple[np.ndarray, np.ndarray]:
-        """What the agent has learnt from, which has to be these rows."""
-        ((seen, actions),) = self._seen
-        self._seen.clear()
-        self.updates += 1
+    def _check(
+        self, rollout: Rollout, weights: np.ndarray, kept: list[Row], wanted: np.ndarray
+    ) -> None:
+        seen = by_drone(rollout, rollout.observations)
         assert seen.tobytes() == np.array([row.observation for row in kept]).tobytes()
         done = np.array([row.action for row in kept])
-        seen = seen.astype(float)
-        if "log_std" in self.actor.weights:
-            self.noise.append((actions - self.actor(seen)) / np.exp(self.actor.weights["log_std"]))
-        low, high = (-1, 1) if "log_std" in self.actor.weights else (0, 2)
+        actions = by_drone(rollout, rollout.actions)
+        low, high = (0, 2) if self.log.actions.discrete else (-1, 1)
         np.testing.assert_array_equal(np.clip(actions, low, high), done.reshape(actions.shape))
-        return seen, actions.astype(float)
-
-
-A2C_SETTINGS = [
-    {"steps_per_update": 15},
-    {"steps_per_update": 14, "gae_lambda": 0.95, "normalize": True, "ent_coef": 0.01},
-    {"steps_per_update": 1, "gae_lambda": 1.0, "ent_coef": 0.1},
-]
-VPG_SETTINGS = [
-    {"episodes_per_update": 1},
-    {"episodes_per_update": 4, "baseline": "time", "normalize": True},
-    {"episodes_per_update": 7, "baseline": "time"},
-]
-
-
-# SB3 learns from lost steps too; tests/agents/test_learning.py compares it with ours for one drone.
-CASES = [
-    *(("a2c", changes, script)
-      for changes in A2C_SETTINGS for script in (CALM, CALM[:1], LOSSES, LOSSES[:1])),
-    *(("vpg", changes, script)
-      for changes in VPG_SETTINGS for script in (CALM, CALM[:1], LOSSES, LOSSES[:1])),
-    *(("sb3-a2c", changes, CALM) for changes in A2C_SETTINGS),
-]  # fmt: skip
+        np.testing.assert_allclose(by_drone(rollout, weights), wanted, atol=1e-5)
 
 
 @pytest.mark.parametrize("discrete", [False, True], ids=["continuous", "discrete"])
-@pytest.mark.parametrize(("algorithm", "changes", "script"), CASES)
-def test_updates_are_those_by_hand(
-    algorithm: str, changes: dict[str, Any], script: Script, discrete: bool
+@pytest.mark.parametrize("script", SCRIPTS)
+@pytest.mark.parametrize(("steps", "gae_lambda"), [(15, 0.0), (14, 0.95), (1, 1.0)])
+def test_a2c_learns_from_what_each_drone_flew(
+    steps: int, gae_lambda: float, script: Script, discrete: bool
 ) -> None:
-    losses = script[0] is LOSSES[0]
-    many = len(script) > 1
-    settings = {**changes, "gamma": GAMMA, "learning_rate": RATE, "anneal": True, "log_std": 0.0}
-    config: Any = (
-        VPGConfig(**settings) if algorithm == "vpg" else A2CConfig(vf_coef=VF_COEF, **settings)
-    )
-    total = 130 if many else 60
-    followed = Followed(algorithm, config, Scripted(script, discrete=discrete), total)
-    followed.train()
-    assert total - 15 < followed.log.env_steps < total + len(script)
+    env = Scripted(script, discrete=discrete)
+    log = log_of(env)
+    config = A2CConfig(steps_per_update=steps, gae_lambda=gae_lambda, gamma=GAMMA)
+    agent = A2C.create(log, config, 3)
+    values: dict[bytes, float] = {}
+
+    def estimates(rollout: Rollout) -> np.ndarray:
+        for array in (rollout.observations, rollout.next_observations):
+            for seen in array.reshape(-1, 3):
+                values[seen.tobytes()] = float(agent._critic.forward(seen[np.newaxis])[0, 0])
+        return agent.advantages(rollout)[0]
+
+    followed = Followed(agent, env, log, estimates)
+    followed.train(130, lambda flown: a2c_rows(flown, lambda s: values[s.tobytes()], gae_lambda))
     assert followed.updates >= 3
-    cut = algorithm == "vpg" and many
-    assert (followed.left_out > 0) == (losses or cut)
-    if not discrete:
-        noise = np.concatenate(followed.noise)
-        assert len(np.unique(noise.round(4))) > 0.98 * noise.size, "each drone has its own"
-        assert abs(noise).max() > 2
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+@pytest.mark.parametrize("episodes", [1, 4, 7])
+def test_vpg_learns_from_the_episodes_that_each_drone_flew(episodes: int, script: Script) -> None:
+    env = Scripted(script)
+    log = log_of(env)
+    agent = VPG.create(log, VPGConfig(episodes_per_update=episodes, gamma=GAMMA), 3)
+
+    def returns(rollout: Rollout) -> np.ndarray:
+        found = np.zeros(rollout.kept.shape)
+        found[rollout.kept] = agent.returns(rollout)
+        return found
+
+    followed = Followed(agent, env, log, returns)
+    followed.train(130, vpg_rows)
+    assert followed.updates >= 3
 
 
 def collector_of(script: Script) -> tuple[Any, Collector]:

@@ -26,7 +26,7 @@ from rotorgram.flights.folders import locked
 from rotorgram.flights.trajectories import evaluation_seed, fly_episodes
 from rotorgram.models.errors import InputError
 from rotorgram.training.metrics import measure_episode
-from rotorgram.training.results import PARTS, Results, ResultsError, checkpoint_file
+from rotorgram.training.results import Results, ResultsError, checkpoint_file
 from rotorgram.training.settings import BOARD, EnvConfig, Row, Study
 from rotorgram.training.study import open_env, run_study
 
@@ -131,38 +131,6 @@ def test_over_the_wire_the_numbers_are_those_in_process(folder: Path, tmp_path: 
             expected.drop(columns=clocks),
             check_exact=True,
         )
-
-
-def test_what_is_missing_is_flown_to_the_same_numbers(folder: Path, tmp_path: Path) -> None:
-    two = replace(STUDY, seeds=1)
-    run_study(two, tmp_path, workers=ONE)
-    parts = tmp_path / PARTS
-    shown: set[str] = set()
-    # As if the command had been stopped after the first seed.
-    for row in STUDY.rows:
-        tables = Results.read(tmp_path)
-        part = parts / f"{row.name}-seed0"
-        part.mkdir(parents=True)
-        for name in ("runs", "evaluations", "episodes", "steps"):
-            table = tables.steps("train") if name == "steps" else getattr(tables, name)
-            own = table[table["row"] == row.name]
-            if len(own):
-                own.to_parquet(part / f"{name}.parquet", index=False)
-    (tmp_path / "runs.csv").unlink()
-    content = json.loads((tmp_path / "config.json").read_text())
-    content["study"]["seeds"] = 2
-    (tmp_path / "config.json").write_text(json.dumps(content))
-    half = Results.read(tmp_path)
-    assert len(half.runs) == 2
-    assert not half.finished
-    run_study(half.study, tmp_path, "", lambda name, *_: shown.add(name), ONE)
-    assert shown == {"all runs", "a2c seed 1", "pid seed 1"}
-    whole = Results.read(folder).runs
-    again = Results.read(tmp_path).runs
-    assert Results.read(tmp_path).finished
-    pd.testing.assert_frame_equal(
-        again.drop(columns=TIMES), whole.drop(columns=TIMES), check_exact=True
-    )
 
 
 def test_all_rows_fly_with_a_seed_before_the_next() -> None:
@@ -383,8 +351,11 @@ def test_points_are_all_combinations_of_settings_and_task_options() -> None:
             ["--grid", "gamma=0.9", "--set", "hidden=64,64"],
             "set: expected a list as hidden=[64,64], got 'hidden=64,64'",
         ),
-        (["--grid", "gamma=0.9", "--seeds", "0"], "seeds: expected at least 1, got 0"),
-        (["--grid", "gamma=0.9", "--first-seed", "-1"], "first_seed: expected 0 or more, got -1"),
+        (["--grid", "gamma=0.9", "--seeds", "0"], "seeds: expected a whole number of at least 1"),
+        (
+            ["--grid", "gamma=0.9", "--first-seed", "-1"],
+            "first_seed: expected a whole number of at least 0",
+        ),
         (["--grid", "gamma=0.9", "--env-steps", "9"], "env_steps: expected at least 256, got 9"),
         (["--grid", "gamma=0.9", "--jobs", "0"], "jobs: expected at least 1, got 0"),
         (["--grid", "gamma=0.9", "--num-envs", "0"], "num_envs: expected 1 or more, got 0"),
@@ -420,15 +391,24 @@ def test_wrong_input_is_one_sentence(
         ('[[row]]\nagent = "a2c"\nenv = {env_id = "x/Y-v0"}', "expected a registered id"),
         ('[[row]]\nagent = "a2c"\ncolour = 1', "row 1: expected some of agent, name, env, backend"),
         ("[[row]]\nnum_envs = 8", "row 1: expected an agent, got none"),
-        ('[[row]]\nagent = "a2c"\nenv_steps = "a"', "env_steps: expected a whole number, got 'a'"),
+        (
+            '[[row]]\nagent = "a2c"\nenv_steps = "a"',
+            "env_steps: expected a whole number of at least 0",
+        ),
         ('[[row]]\nagent = "a2c"\nenv = 3', "env: expected a table, got 3"),
         ("row = [3]", "row 1: expected a table, got 3"),
         ("row = 3", "row: expected [[row]] tables, got 3"),
         ('[[rows]]\nagent = "pid"', "expected some of agent, name"),
-        ('seeds = 1.5\n[[row]]\nagent = "pid"', "seeds: expected a whole number, got 1.5"),
-        ('episodes = true\n[[row]]\nagent = "pid"', "episodes: expected a whole number, got True"),
+        (
+            'seeds = 1.5\n[[row]]\nagent = "pid"',
+            "seeds: expected a whole number of at least 1, got 1.5",
+        ),
+        (
+            'episodes = true\n[[row]]\nagent = "pid"',
+            "episodes: expected a whole number of at least 0, got True",
+        ),
         ('[[row]]\nagent = "a2c"\nenv_steps = 100', "env_steps: expected at least 256, got 100"),
-        ('seeds = 0\n[[row]]\nagent = "pid"', "seeds: expected at least 1, got 0"),
+        ('seeds = 0\n[[row]]\nagent = "pid"', "seeds: expected a whole number of at least 1"),
         ("[[row", "expected a TOML file of rows"),
     ],
 )
