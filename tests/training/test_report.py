@@ -3,7 +3,6 @@
 import base64
 import json
 from dataclasses import replace
-from html.parser import HTMLParser
 from io import StringIO
 from pathlib import Path
 
@@ -252,39 +251,16 @@ def comparison(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-class Page(HTMLParser):
-    """Elements and attributes of a page."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.found: list[tuple[str, dict[str, str | None]]] = []
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.found.append((tag, dict(attrs)))
-
-    def of(self, tag: str) -> list[dict[str, str | None]]:
-        return [attributes for name, attributes in self.found if name == tag]
-
-
 def test_the_page_has_figures_tables_and_film_and_no_script(comparison: Path) -> None:
     text = (comparison / "report.html").read_text(encoding="utf-8")
-    page = Page(text)
-    sources = [str(image["src"]) for image in page.of("img")]
-    assert [source[:26] for source in sources] == ["data:image/svg+xml;base64,"] * 4
-    pictures = [base64.b64decode(source.partition(",")[2]) for source in sources]
-    names = ("comparison", "fig6_reward", "fig7_cumulative_reward", "fig8_error")
-    for name, picture in zip(names, pictures, strict=True):
-        assert picture == (comparison / "figures" / f"{name}.svg").read_bytes()
-    assert (
-        page.of("video")[0]["src"]
-        == "data:video/mp4;base64," + base64.b64encode(b"a film").decode()
-    )
-    assert page.of("script") == []
-    assert not any(name.startswith("on") for _, found in page.found for name in found)
+    for name in ("comparison", "fig6_reward", "fig7_cumulative_reward", "fig8_error"):
+        picture = (comparison / "figures" / f"{name}.svg").read_bytes()
+        assert f"data:image/svg+xml;base64,{base64.b64encode(picture).decode()}" in text
+    assert f"data:video/mp4;base64,{base64.b64encode(b'a film').decode()}" in text
+    assert "<script" not in text
     # The command has signs of HTML in it.
     assert "rotorgram compare --seeds 3 &lt;folder&gt;" in text
-    assert len(page.of("tr")) == 5  # a head and four agents
+    assert text.count("<tr>") == 5  # a head and four agents
     assert text.count("<details>") == 4 + 3  # rows; study, versions, machine
     assert "It gives no numbers." in text
 
