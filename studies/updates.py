@@ -56,11 +56,9 @@ class Updates:
             self.agent.update = lambda rollout: (self.rollouts.append(rollout), update(rollout))
             self.agent.train(log, total, lambda: True)
             self.update = lambda: update(self.rollouts[-1])
-        self.state = self.agent.state()
 
     def seconds(self) -> tuple[float, float]:
         """Wall time and processor time of an update, s: on a busy machine compare the second."""
-        self.agent.set_state(self.state)
         wall = time.perf_counter()
         processor = time.process_time()
         self.update()

@@ -3,6 +3,7 @@
 import re
 import runpy
 import tomllib
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,12 @@ def test_links_lead_somewhere() -> None:
     for page in PAGES:
         for target in LINK.findall(page.read_text(encoding="utf-8")):
             assert (page.parent / target).exists(), f"{page.name} links to {target}"
+
+
+def test_the_pages_of_the_api_name_modules_that_there_are() -> None:
+    for page in (ROOT / "docs" / "api").glob("*.md"):
+        for module in re.findall(r"^::: (\S+)", page.read_text(encoding="utf-8"), re.MULTILINE):
+            assert find_spec(module), module
 
 
 def test_the_navigation_has_every_page_once(stage: dict[str, Any]) -> None:
