@@ -13,11 +13,12 @@ from ..config import EnvConfig
 from ..spec import Metric
 from ..state import State
 from .goal import (
-    AIR,
-    LEAST_TILT_COSINE,
     MAX_SPEED,
     WORST_SWING,
+    along,
+    check_height,
     length,
+    nearness,
     rates_cost,
     swing_cost,
     with_payload,
@@ -103,7 +104,7 @@ class Cable(Swarm):
 
         options = self.options
         vehicle = self.vehicle
-        count = self.shape[1]
+        count = self.count
         if isinstance(vehicle, Fleet):
             raise InputError(
                 f"vehicle: expected one for all drones that carry a payload, got {vehicle.name}"
@@ -118,29 +119,19 @@ class Cable(Swarm):
         self._tilt = math.atan2(self._load * math.tan(self._slant), lift)
         thrust = self.carrying(np.linspace(0.0, 2 * math.pi, 36))
         able = (vehicle.thrust_low <= thrust).all() and (thrust <= vehicle.thrust_high).all()
-        expected = (
-            f"a load that the rotors of {vehicle.name} carry at an angle of {options.angle:g}°"
-        )
         if not able:
-            raise InputError(f"payload_share: expected {expected}, got {options.payload_share:g}")
+            raise InputError(
+                f"payload_share: expected a load that the rotors of {vehicle.name} carry at an "
+                f"angle of {options.angle:g}°, got {options.payload_share:g}"
+            )
         self._radius = payload_radius(options.payload_share * vehicle.mass * count)
         away = options.start_band * self.gap
-        least = self._radius + AIR + away
-        expected = f"a height of at least {least:.4g} m above the ground"
-        if not options.center[2] >= least:
-            raise InputError(f"center: expected {expected}, got {options.center[2]:g}")
+        check_height("center", options.center[2], self._radius + away)
         self.reach = away * math.sqrt(3)
-        self.prepare(
-            tuple(
-                (f"{quantity} {axis}", unit, size)
-                for quantity, unit, size in (
-                    ("payload - position", "m", 2 * self._cable),
-                    ("payload velocity - velocity", "m/s", MAX_SPEED),
-                    ("payload goal - payload", "m", 2 * (self.reach + options.margin)),
-                )
-                for axis in "xyz"
-            )
-        )
+        numbers = along("payload - position", "m", 2 * self._cable)
+        numbers += along("payload velocity - velocity", "m/s", MAX_SPEED)
+        numbers += along("payload goal - payload", "m", 2 * (self.reach + options.margin))
+        self.prepare(numbers)
 
     def adjust(self, config: EnvConfig) -> EnvConfig:
         """The payload's share of each drone, on its cable."""
@@ -201,13 +192,11 @@ class Cable(Swarm):
         """The place of each drone where the payload hangs still at its goal."""
         return np.array(self.options.center) + self._around(self.memory.turn)
 
-    def observe(self, state: State) -> dict[str, Array]:
-        """See the table of the class."""
+    def further(self, state: State) -> list[Array]:
+        """The payload from the drone, its way to its goal, and the neighbours."""
         hung = state.payload - state.position
         moving = state.payload_velocity - state.velocity
-        return self.build_observation(
-            state, hung, moving, self._missing(state), *self.neighbour_observation(state)
-        )
+        return [hung, moving, self._missing(state), *super().further(state)]
 
     def _missing(self, state: State) -> Array:
         """From the payload to its goal, world frame, m, (W, A, 3)."""
@@ -217,8 +206,7 @@ class Cable(Swarm):
         """Whether the flight of all drones of a world is over, bool, (W, A)."""
         outside = length(self._missing(state)) > self.band
         down = state.payload[..., 2] < self._radius
-        flipped = state.tilt_cosine < LEAST_TILT_COSINE
-        one = outside | down | flipped | state.touching
+        one = self.crashed(state, outside | down)
         return np.broadcast_to(one.any(axis=1, keepdims=True), one.shape)
 
     def outcome(self, state: State) -> Outcome:
@@ -227,11 +215,10 @@ class Cable(Swarm):
         distance = length(missing)
         room = self.clearance(state)
         ended = self.ended(state)
-        near = self.gap / 2
         closing = np.sum(missing * state.payload_velocity, axis=-1)
         return Outcome(
             reward={
-                "payload": (near - distance) / (near + distance),
+                "payload": nearness(distance, self.gap / 2),
                 "approach": APPROACH_WEIGHT * closing / (distance + TINY),
                 "swing": swing_cost(state),
                 "room": self.proximity_penalty(room),

@@ -59,10 +59,8 @@ class Crossing(Swarm):
 
     def setup(self) -> None:
         """See the class."""
-        count = self.shape[1] if self.shape else 1
-        places = ring(count)
-        radius = max(float(np.linalg.norm(places[0])), 1.0)  # of six
-        angle = 2 * math.pi * np.arange(count) / count
+        radius = max(float(np.linalg.norm(ring(self.count)[0])), 1.0)  # of six
+        angle = 2 * math.pi * np.arange(self.count) / self.count
         self._angles = angle if self.shape else 0.0
         self._radius = radius * self.gap
         self.reach = 2 * self._radius + 2 * JITTER * self.gap
@@ -85,10 +83,6 @@ class Crossing(Swarm):
         y = self._radius * np.sin(angle)
         cx, cy, cz = self.options.center
         return stack((x + cx, y + cy, 0.0 * x + cz))
-
-    def observe(self, state: State) -> dict[str, Array]:
-        """See the table of the class."""
-        return self.build_observation(state, *self.neighbour_observation(state))
 
     def goal(self, state: State) -> Array:
         """The place opposite to the start of each drone."""

@@ -10,8 +10,8 @@ from ...models.fields import Limits
 from ...sim import Array, Draw, InitialState, stack
 from ..spec import Metric
 from ..state import State
-from .goal import FURTHEST, MAX_SPEED
-from .swarm import JITTER, Swarm, SwarmOptions, grid, ring
+from .goal import FURTHEST, MAX_SPEED, along
+from .swarm import Swarm, SwarmOptions, ring
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,17 +76,14 @@ class Escort(Swarm):
 
     def setup(self) -> None:
         """See the class."""
-        count = self.shape[1] if self.shape else 1
-        self._slots = ring(count) * self.gap
-        starts = np.abs(grid(count)).max(axis=0) * self.gap + JITTER * self.gap
-        self.reach = float(np.linalg.norm(np.abs(self._slots).max(axis=0) + starts))
-        speeds = tuple((f"target velocity {axis}", "m/s", MAX_SPEED) for axis in "xyz")
-        self.prepare(speeds)
+        velocity = along("target velocity", "m/s", MAX_SPEED)
+        self.prepare_slots(ring(self.count), velocity)
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """At rest, level, in the cells of a grid about the target, by lot."""
         ratio = draw.uniform(0.5, 2.0)
-        alpha, beta = (draw.uniform(-math.pi, math.pi) for _ in range(2))
+        alpha = draw.uniform(-math.pi, math.pi)
+        beta = draw.uniform(-math.pi, math.pi)
         if self.count > 1:  # one for all
             ratio, alpha, beta = (x[:, :1] + 0.0 * x for x in (ratio, alpha, beta))
         memory = self.memory
@@ -113,9 +110,9 @@ class Escort(Swarm):
         """Move the target."""
         self.memory.time = self.memory.time + self.control_period
 
-    def observe(self, state: State) -> dict[str, Array]:
-        """See the table of the class."""
-        return self.build_observation(state, self.target()[1], *self.neighbour_observation(state))
+    def further(self, state: State) -> list[Array]:
+        """The velocity of the target, and the neighbours."""
+        return [self.target()[1], *super().further(state)]
 
     def goal_velocity(self) -> Array:
         """That of the target."""
@@ -123,4 +120,4 @@ class Escort(Swarm):
 
     def goal(self, state: State) -> Array:
         """The place of each drone about the target."""
-        return self.slots_at(self._slots, state) + self.target()[0]
+        return super().goal(state) + self.target()[0]

@@ -3,12 +3,9 @@
 from dataclasses import dataclass
 from typing import Final, Literal
 
-import numpy as np
-
 from ...sim import Array, Draw, InitialState
 from ..spec import Metric
-from ..state import State
-from .swarm import JITTER, Swarm, SwarmOptions, grid, line, ring
+from .swarm import Swarm, SwarmOptions, grid, line, ring
 
 Formed = Literal["ring", "line", "grid"]
 _PLACES: Final = {"ring": ring, "line": line, "grid": grid}
@@ -69,21 +66,8 @@ class Formation(Swarm):
 
     def setup(self) -> None:
         """See the class."""
-        count = self.shape[1] if self.shape else 1
-        self._slots = _PLACES[self.options.formation](count) * self.gap
-        starts = np.abs(grid(count)).max(axis=0) * self.gap + JITTER * self.gap
-        self.reach = float(np.linalg.norm(np.abs(self._slots).max(axis=0) + starts))
-        self.prepare()
+        self.prepare_slots(_PLACES[self.options.formation](self.count))
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """At rest, level, in the cells of a grid by lot."""
-        position = self.cells(draw)
-        return InitialState(position=position)
-
-    def observe(self, state: State) -> dict[str, Array]:
-        """See the table of the class."""
-        return self.build_observation(state, *self.neighbour_observation(state))
-
-    def goal(self, state: State) -> Array:
-        """The place of each drone."""
-        return self.slots_at(self._slots, state)
+        return InitialState(position=self.cells(draw))

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Annotated, Final
+from typing import Annotated, Final, NamedTuple
 
 import numpy as np
 
@@ -41,8 +41,14 @@ FURTHEST: Final = 1e4  # Furthest goal, m
 MAX_SPEED: Final = 100.0  # Speed past which an observation is clipped, m/s
 MAX_RATE: Final = 100.0  # Body rate past which an observation is clipped, rad/s
 
-Number = tuple[str, str, float]
-"""Name, unit and largest size of a number of an observation."""
+
+class Number(NamedTuple):
+    """A number of an observation."""
+
+    name: str
+    unit: str
+    low: float
+    high: float
 
 
 Point = Annotated[tuple[float, float, float], Limits(-FURTHEST, FURTHEST, "m", count=3)]
@@ -77,8 +83,8 @@ class GoalTask(Task):
     | 15... | thrust of each rotor over its hover thrust, minus 1 | 1 | |
 
     Numbers are clipped: positions at twice the flight band, speeds at 100 m/s, rates at 100 rad/s.
-    A derived class calls `define_observation` in `setup` and `build_observation` in `observe`, and
-    has `goal`.
+    A derived class calls `define_observation` in `setup`, and has `further` for further numbers.
+    It has an option `goal`, or a method.
 
     With `body` the first two vectors are in the body frame, and the direction of world z in the
     body frame takes the place of nose and thrust axis: 12 + R numbers that no heading changes.
@@ -89,61 +95,68 @@ class GoalTask(Task):
     body = False
     """Whether the observation is in the body frame."""
 
-    def define_observation(self, band: float, more: Sequence[Number] = ()) -> None:
+    def define_observation(self, band: float, further: Sequence[Number] = ()) -> None:
         """Set `observation`: positions up to twice the band, m, and further numbers after them."""
         vehicle = self.vehicle
-        vectors = (
-            ("goal - position", "m", 2 * band),
-            ("velocity", "m/s", MAX_SPEED),
-            *((name, "1", 1.001) for name in (("up",) if self.body else ("nose", "thrust axis"))),
-            ("body rate", "rad/s", MAX_RATE),
-        )
-        first: list[Number] = [
-            (f"{v} {axis}", unit, most) for v, unit, most in vectors for axis in "xyz"
-        ]
-        rotors = range(1, vehicle.num_rotors + 1)
-        weakest, strongest = (  # of any vehicle, where there are several
-            pick(np.atleast_2d(limit / vehicle.hover_thrust - 1), axis=0)
-            for pick, limit in ((np.min, vehicle.thrust_low), (np.max, vehicle.thrust_high))
-        )
-        outer, inner = ([most for *_, most in numbers] for numbers in (first, more))
-        low = (*(-x for x in outer), *(weakest - 0.001).tolist(), *(-x for x in inner))
-        high = (*outer, *(strongest + 0.001).tolist(), *inner)
-        named = [*first, *((f"thrust {i} over hover", "1", 0.0) for i in rotors), *more]
+        numbers = along("goal - position", "m", 2 * band) + along("velocity", "m/s", MAX_SPEED)
+        for name in ("up",) if self.body else ("nose", "thrust axis"):
+            numbers += along(name, "1", 1.001)
+        numbers += along("body rate", "rad/s", MAX_RATE)
+        # Of any vehicle, where there are several.
+        weakest = np.atleast_2d(vehicle.thrust_low / vehicle.hover_thrust - 1).min(axis=0)
+        strongest = np.atleast_2d(vehicle.thrust_high / vehicle.hover_thrust - 1).max(axis=0)
+        limits = zip((weakest - 0.001).tolist(), (strongest + 0.001).tolist(), strict=True)
+        for rotor, (low, high) in enumerate(limits, 1):
+            numbers.append(Number(f"thrust {rotor} over hover", "1", low, high))
+        numbers += further
+        names, units, lows, highs = zip(*numbers, strict=True)
+        frame = "body" if self.body else "world turned by the wanted heading; body rates: body"
         self.observation = (
             ArraySpec(
                 name="observation",
-                shape=(len(named),),
-                low=low,
-                high=high,
-                unit=tuple(unit for _, unit, _ in named),
-                frame=(
-                    "body" if self.body else "world turned by the wanted heading; body rates: body"
-                ),
-                components=tuple(name for name, *_ in named),
+                shape=(len(numbers),),
+                low=lows,
+                high=highs,
+                unit=units,
+                frame=frame,
+                components=names,
             ),
         )
-        self._bounds = tuple(np.array(bound) for bound in (low, high))
+        self._bounds = np.array(lows), np.array(highs)
 
-    def build_observation(self, state: State, *more: Array, goal: Array = None) -> dict[str, Array]:
-        """The observation; `more` has vectors, shape (..., k), or numbers, in the order described.
-
-        The goal, world frame, m, shape (..., 3), is by default that of `goal`.
-        """
-        goal = self.goal(state) if goal is None else goal
-        to_goal = goal - state.position
+    def observe(self, state: State) -> dict[str, Array]:
+        """See the table of the class; further numbers are those of `further`."""
+        position = state.position
         quaternion = state.quaternion
+        to_place = self.place(state) - position
         if self.body:
-            turned = [to_body(quaternion, v) for v in (to_goal, state.velocity)]
-            vectors = (*turned, world_z(quaternion))
+            vectors = [to_body(quaternion, v) for v in (to_place, state.velocity)]
+            vectors.append(world_z(quaternion))
         else:
-            seen = (to_goal, state.velocity, body_x(quaternion), body_z(quaternion))
-            vectors = tuple(map(self.turned, seen))
+            seen = (to_place, state.velocity, body_x(quaternion), body_z(quaternion))
+            vectors = [self.turned(vector) for vector in seen]
         thrust = state.thrust / self.vehicle.hover_thrust - 1.0
-        rest = [x if getattr(x, "ndim", 0) == state.position.ndim else stack((x,)) for x in more]
-        parts = (*vectors, state.body_rates, thrust, *rest)
-        low, high = self._bounds
-        return {"observation": clip(np.concat(parts, axis=-1), low, high)}
+        parts = [*vectors, state.body_rates, thrust]
+        for values in self.further(state):
+            is_number = np.ndim(values) < position.ndim
+            parts.append(stack((values,)) if is_number else values)
+        return {"observation": clip(np.concat(parts, axis=-1), *self._bounds)}
+
+    def further(self, state: State) -> Sequence[Array]:
+        """Numbers, (W, A), and vectors, (W, A, k), of the observation, as they were defined."""
+        return ()
+
+    def goal(self, state: State) -> Array:
+        """The option `goal`, the same for every drone."""
+        return at(self.options.goal, component(state.position, 0))
+
+    def place(self, state: State) -> Array:
+        """Where each drone should be, world frame, m, shape (W, A, 3)."""
+        return self.goal(state)
+
+    def crashed(self, state: State, outside: Array) -> Array:
+        """Whether drones are outside of their band, touch anything, or flipped over, (W, A)."""
+        return outside | state.touching | (state.tilt_cosine < LEAST_TILT_COSINE)
 
     def turned(self, vectors: Array) -> Array:
         """World vectors in the world frame turned by the wanted heading, shape (..., 3)."""
@@ -156,10 +169,39 @@ class GoalTask(Task):
         return stack((c * x + s * y, c * y - s * x, vectors[..., 2]))
 
 
-def at(point: Sequence[float], state: State) -> Array:
-    """A point for every drone, shape (W, A, 3)."""
-    zero = 0.0 * component(state.position, 0)
-    return stack([zero + value for value in point])
+def at(point: Sequence[float], like: Array) -> Array:
+    """A point for every drone, (W, A, 3); `like` has a number for each."""
+    return stack([0.0 * like + value for value in point])
+
+
+def along(name: str, unit: str, size: float, axes: str = "xyz") -> list[Number]:
+    """A vector of an observation, none of whose numbers is larger than `size`."""
+    return [Number(f"{name} {axis}", unit, -size, size) for axis in axes]
+
+
+def nearness(distance: Array, scale: float = ERROR_SCALE) -> Array:
+    """Reward for a distance, m, (W, A): 1 at the goal, 0 at `scale`, and -1 far away."""
+    return (scale - distance) / (scale + distance)
+
+
+def check_height(name: str, height: float, room: float) -> None:
+    """Refuse an option whose point is too low, m, for `room` and air. Raises `InputError`."""
+    least = room + AIR
+    if not height >= least:
+        raise InputError(
+            f"{name}: expected a height of at least {least:.4g} m above the ground, "
+            f"got {height:.4g}"
+        )
+
+
+def check_band(flight_band: float, start_band: float) -> None:
+    """Refuse a band that a start within a cube leaves. Raises `InputError`."""
+    furthest = start_band * math.sqrt(3)
+    if not flight_band > furthest:
+        raise InputError(
+            f"flight_band: expected more than sqrt(3) · start_band = {furthest:.4g} m, "
+            f"got {flight_band!r}"
+        )
 
 
 def row_of(rows: Array, index: Array) -> Array:

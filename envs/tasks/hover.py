@@ -6,21 +6,20 @@ from typing import Annotated, Final
 
 import numpy as np
 
-from ...models.errors import InputError
 from ...models.fields import Limits
 from ...sim import Array, Draw, InitialState, body_x, component, stack
 from ..spec import Metric
 from ..state import State
 from .goal import (
-    AIR,
-    ERROR_SCALE,
     FURTHEST,
-    LEAST_TILT_COSINE,
     WORST_RATES,
     GoalTask,
     Point,
     at,
+    check_band,
+    check_height,
     length,
+    nearness,
     rates_cost,
 )
 from .task import Outcome, TaskOptions
@@ -47,10 +46,7 @@ class HoverOptions(TaskOptions):
 
     def check(self) -> None:
         """Check the options of this task. Raises `InputError`."""
-        least = self.start_band * math.sqrt(3)
-        expected = f"more than sqrt(3) · start_band = {least:.4g} m"
-        if not self.flight_band > least:
-            raise InputError(f"flight_band: expected {expected}, got {self.flight_band!r:.300}")
+        check_band(self.flight_band, self.start_band)
 
 
 class Hover(GoalTask):
@@ -98,11 +94,7 @@ class Hover(GoalTask):
     def setup(self) -> None:
         """See the class."""
         options = self.options
-        vehicle = self.vehicle
-        least = vehicle.rest_height + AIR + options.start_band
-        expected = f"a height of at least {least:g} m above the ground"
-        if not options.goal[2] >= least:
-            raise InputError(f"goal: expected {expected}, got {options.goal[2]:g}")
+        check_height("goal", options.goal[2], self.vehicle.rest_height + options.start_band)
         self.wanted = math.radians(options.heading)
         self.define_observation(options.flight_band)
 
@@ -121,12 +113,7 @@ class Hover(GoalTask):
         c = np.cos(heading)
         s = np.sin(heading)
         quaternion = stack((c * w, c * x - s * y, c * y + s * x, s * w))
-        goal = stack([0.0 * tilt + value for value in options.goal])
-        return InitialState(position=goal + offset, quaternion=quaternion)
-
-    def observe(self, state: State) -> dict[str, Array]:
-        """See the table of the class."""
-        return self.build_observation(state)
+        return InitialState(position=at(options.goal, tilt) + offset, quaternion=quaternion)
 
     def outcome(self, state: State) -> Outcome:
         """Nearness to goal and heading; the end at a crash, a flip-over, or outside the band."""
@@ -134,19 +121,14 @@ class Hover(GoalTask):
         nose = body_x(state.quaternion)
         off = np.atan2(component(nose, 1), component(nose, 0)) - self.wanted
         heading = np.atan2(np.sin(off), np.cos(off)) * (180 / math.pi)
-        outside = distance > self.options.flight_band
-        terminated = outside | state.touching | (state.tilt_cosine < LEAST_TILT_COSINE)
+        crashed = self.crashed(state, distance > self.options.flight_band)
         return Outcome(
             reward={
-                "position": (ERROR_SCALE - distance) / (ERROR_SCALE + distance),
+                "position": nearness(distance),
                 "heading": -HEADING_WEIGHT / 180 * abs(heading),
                 "rates": rates_cost(state),
-                "termination": self.crash(terminated),
+                "termination": self.crash(crashed),
             },
-            terminated=terminated,
+            terminated=crashed,
             metrics={"position_error": distance, "heading_error": heading},
         )
-
-    def goal(self, state: State) -> Array:
-        """The same for every drone."""
-        return at(self.options.goal, state)

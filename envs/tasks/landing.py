@@ -14,8 +14,8 @@ from ..state import State
 from .goal import (
     COURSE_RATE_WEIGHT,
     COURSE_WORST_RATES,
-    LEAST_TILT_COSINE,
     GoalTask,
+    along,
     length,
     rates_cost,
 )
@@ -148,9 +148,8 @@ class Landing(GoalTask):
         """See the class."""
         options = self.options
         fastest = options.pad_speeds[1] + 0.001
-        self.define_observation(
-            options.flight_band, [(f"velocity of the pad {axis}", "m/s", fastest) for axis in "xy"]
-        )
+        pad = along("velocity of the pad", "m/s", fastest, "xy")
+        self.define_observation(options.flight_band, pad)
         self._least_upright = math.cos(math.radians(options.tilt))
         self._height = self.vehicle.rest_height
         below = (0.0, 0.0, -self._height)
@@ -192,9 +191,9 @@ class Landing(GoalTask):
         memory.velocity = state.velocity
         memory.upright = state.tilt_cosine
 
-    def observe(self, state: State) -> dict[str, Array]:
-        """See the table of the class."""
-        return self.build_observation(state, *self._pad()[1])
+    def further(self, state: State) -> tuple[Array, Array]:
+        """The velocity of the pad."""
+        return self._pad()[1]
 
     def outcome(self, state: State) -> Outcome:
         """Progress and the end: a landing, a crash, a flip-over, or outside the band."""
@@ -213,8 +212,7 @@ class Landing(GoalTask):
             & (drift <= options.drift)
             & (self.memory.arrival_upright >= self._least_upright)
         )
-        outside = length(away) > options.flight_band
-        terminated = touching | outside | (state.tilt_cosine < LEAST_TILT_COSINE)
+        terminated = self.crashed(state, length(away) > options.flight_band)
         return Outcome(
             reward={
                 "progress": self.memory.progress,

@@ -6,7 +6,6 @@ from typing import Annotated
 
 import numpy as np
 
-from ...models.errors import InputError
 from ...models.fields import Limits
 from ...sim import (
     Array,
@@ -21,17 +20,18 @@ from ..config import EnvConfig
 from ..spec import Metric
 from ..state import State
 from .goal import (
-    AIR,
-    ERROR_SCALE,
     FURTHEST,
-    LEAST_TILT_COSINE,
     MAX_SPEED,
     WORST_RATES,
     WORST_SWING,
     GoalTask,
     Point,
+    along,
     at,
+    check_band,
+    check_height,
     length,
+    nearness,
     rates_cost,
     swing_cost,
     with_payload,
@@ -60,10 +60,7 @@ class PayloadHoverOptions(TaskOptions):
 
     def check(self) -> None:
         """Check the options of this task. Raises `InputError`."""
-        least = self.start_band * math.sqrt(3)
-        expected = f"more than sqrt(3) · start_band = {least:.4g} m"
-        if not self.flight_band > least:
-            raise InputError(f"flight_band: expected {expected}, got {self.flight_band!r:.300}")
+        check_band(self.flight_band, self.start_band)
 
 
 class PayloadHover(GoalTask):
@@ -122,19 +119,11 @@ class PayloadHover(GoalTask):
         from ...models.vehicle import payload_radius
 
         options = self.options
-        vehicle = self.vehicle
-        mass = options.payload_share * vehicle.mass
-        least = payload_radius(mass) + AIR + options.start_band
-        expected = f"a height of at least {least:.4g} m above the ground"
-        if not options.goal[2] >= least:
-            raise InputError(f"goal: expected {expected}, got {options.goal[2]:g}")
-        self.define_observation(
-            options.flight_band,
-            [
-                *((f"payload - position {axis}", "m", 2 * options.cable) for axis in "xyz"),
-                *((f"payload velocity - velocity {axis}", "m/s", MAX_SPEED) for axis in "xyz"),
-            ],
-        )
+        radius = payload_radius(options.payload_share * self.vehicle.mass)
+        check_height("goal", options.goal[2], radius + options.start_band)
+        hung = along("payload - position", "m", 2 * options.cable)
+        moving = along("payload velocity - velocity", "m/s", MAX_SPEED)
+        self.define_observation(options.flight_band, hung + moving)
 
     def adjust(self, config: EnvConfig) -> EnvConfig:
         """The payload on its cable."""
@@ -153,23 +142,26 @@ class PayloadHover(GoalTask):
         across = draw.uniform(-fastest, fastest)
         sine = np.sin(tilt)
         zero = 0.0 * tilt
-        x, y, z = options.goal
-        above = stack((zero + x, zero + y, zero + z + options.cable))
         carrying = (1.0 + options.payload_share) * self.vehicle.hover_thrust
         return InitialState(
-            position=above + offset,
+            position=self._above(zero) + offset,
             quaternion=stack((np.cos(tilt), sine * np.cos(azimuth), sine * np.sin(azimuth), zero)),
             velocity=stack((along, across, zero)),
             thrust=carrying + each(zero),
         )
 
-    def observe(self, state: State) -> dict[str, Array]:
-        """See the table of the class."""
+    def _above(self, like: Array) -> Array:
+        """Above the payload's goal by the cable, (W, A, 3), m."""
         x, y, z = self.options.goal
-        goal = at((x, y, z + self.options.cable), state)
-        hung = state.payload - state.position
-        moving = state.payload_velocity - state.velocity
-        return self.build_observation(state, hung, moving, goal=goal)
+        return at((x, y, z + self.options.cable), like)
+
+    def place(self, state: State) -> Array:
+        """Where the craft holds the payload at its goal."""
+        return self._above(component(state.position, 0))
+
+    def further(self, state: State) -> tuple[Array, Array]:
+        """Position and velocity of the payload relative to the craft."""
+        return state.payload - state.position, state.payload_velocity - state.velocity
 
     def outcome(self, state: State) -> Outcome:
         """Nearness of the payload, its swing; the end at contact, a flip-over, or too far away."""
@@ -177,20 +169,14 @@ class PayloadHover(GoalTask):
         hung = state.position - state.payload
         x, y, z = (component(hung, i) for i in range(3))
         swing = np.atan2(square_root(x * x + y * y), z) * (180 / math.pi)
-        outside = distance > self.options.flight_band
-        flipped = state.tilt_cosine < LEAST_TILT_COSINE
-        terminated = outside | state.touching | flipped
+        crashed = self.crashed(state, distance > self.options.flight_band)
         return Outcome(
             reward={
-                "payload": (ERROR_SCALE - distance) / (ERROR_SCALE + distance),
+                "payload": nearness(distance),
                 "swing": swing_cost(state),
                 "rates": rates_cost(state),
-                "termination": self.crash(terminated),
+                "termination": self.crash(crashed),
             },
-            terminated=terminated,
+            terminated=crashed,
             metrics={"payload_error": distance, "swing": swing},
         )
-
-    def goal(self, state: State) -> Array:
-        """Of the payload, the same for every drone."""
-        return at(self.options.goal, state)

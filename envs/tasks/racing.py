@@ -29,10 +29,12 @@ from .goal import (
     COURSE_RATE_WEIGHT,
     COURSE_WORST_STEP,
     FURTHEST,
-    LEAST_TILT_COSINE,
     PASSING_REWARD,
     GoalTask,
+    Number,
     Point,
+    along,
+    at,
     length,
     rates_cost,
     row_of,
@@ -170,23 +172,19 @@ class Racing(GoalTask):
         self._gates = np.column_stack((centers, np.cos(turns), np.sin(turns), halves))
         corners = np.vstack((centers, self._start.position))
         reach = float(np.linalg.norm(np.ptp(corners, axis=0))) + 2 * self.options.margin
-        after = [(f"gate after - position {axis}", "m", reach) for axis in "xyz"]
-        self.define_observation(
-            reach / 2,
-            [
-                *((f"direction of the gate {axis}", "1", 1.001) for axis in "xy"),
-                *after,
-                *((f"direction of the gate after {axis}", "1", 1.001) for axis in "xy"),
-                ("half size of the gate", "m", float(halves.max()) + 0.001),
-            ],
-        )
+        numbers = along("direction of the gate", "1", 1.001, "xy")
+        numbers += along("gate after - position", "m", reach)
+        numbers += along("direction of the gate after", "1", 1.001, "xy")
+        half = float(halves.max()) + 0.001
+        numbers.append(Number("half size of the gate", "m", -half, half))
+        self.define_observation(reach / 2, numbers)
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """At rest near the start, the nose along the track."""
         band = self.options.start_band
         offset = draw.uniform(-band, band, (3,))
         zero = 0.0 * plain(offset[..., 0])
-        position = stack([zero + x for x in self._start.position]) + offset
+        position = at(self._start.position, zero) + offset
         half = math.radians(self._start.heading) / 2
         memory = self.memory
         memory.position = position  # before the last step
@@ -209,9 +207,9 @@ class Racing(GoalTask):
         ahead, behind = (component(p, 0) * x + component(p, 1) * y for p in (b, a))
         through = (behind < 0.0) & (ahead >= 0.0)
         share = each(plain(behind / np.where(through, behind - ahead, -1.0)))
-        at = a + share * (b - a)
-        aside = component(at, 1) * x - component(at, 0) * y
-        inside = (abs(aside) <= half) & (abs(component(at, 2)) <= half)
+        crossing = a + share * (b - a)
+        aside = component(crossing, 1) * x - component(crossing, 0) * y
+        inside = (abs(aside) <= half) & (abs(component(crossing, 2)) <= half)
         left = memory.passed < self._total
         passing = plain(through & inside & left) * 1.0
         passed = memory.passed + passing
@@ -229,24 +227,18 @@ class Racing(GoalTask):
         memory.position = now
         memory.behind = behind_now
 
-    def observe(self, state: State) -> dict[str, Array]:
-        """See the table of the class."""
-        passed = self.memory.passed
-        gate, after = self._gate(passed), self._gate(passed + 1.0)
-        return self.build_observation(
-            state,
-            gate[..., 3:5],
-            after[..., :3] - state.position,
-            after[..., 3:5],
-            plain(gate[..., 5]),
-        )
+    def further(self, state: State) -> tuple[Array, ...]:
+        """The direction of the next gate, the gate after it, and the size of the next."""
+        gate = self._gate(self.memory.passed)
+        after = self._gate(self.memory.passed + 1.0)
+        way = after[..., :3] - state.position
+        return gate[..., 3:5], way, after[..., 3:5], plain(gate[..., 5])
 
     def outcome(self, state: State) -> Outcome:
         """Progress to the next gate; the end at the last one, or off the track."""
         memory = self.memory
         left = self._total - memory.passed
-        flipped = state.tilt_cosine < LEAST_TILT_COSINE
-        crashed = (memory.off > self.options.margin) | state.touching | flipped
+        crashed = self.crashed(state, memory.off > self.options.margin)
         return Outcome(
             reward={
                 "progress": memory.progress,

@@ -18,7 +18,7 @@ from ...sim import (
 )
 from ..spec import Metric
 from ..state import State
-from .goal import AIR, WORST_RATES, GoalTask, Point, at, length, rates_cost
+from .goal import WORST_RATES, GoalTask, Point, at, check_height, length, nearness, rates_cost
 from .task import Outcome, TaskOptions
 
 ERROR_SCALE: Final = 1.0  # Distance at which the reward for nearness crosses zero, m
@@ -133,10 +133,7 @@ class Recovery(GoalTask):
         """See the class."""
         options = self.options
         vehicle = self.vehicle
-        least = vehicle.rest_height + AIR
-        expected = f"a height of at least {least:g} m above the ground"
-        if not options.goal[2] >= least:
-            raise InputError(f"goal: expected {expected}, got {options.goal[2]:g}")
+        check_height("goal", options.goal[2], vehicle.rest_height)
         turning = [min(vehicle.turning(axis), vehicle.turning(-axis)) for axis in np.eye(3)]
         self.spin = np.minimum(options.spin, STOP_TIME * np.array(turning))
         self.body = options.frame == "body"
@@ -163,11 +160,10 @@ class Recovery(GoalTask):
         level = square_root(1.0 - climb * climb) * speed
         velocity = stack((level * np.cos(azimuth), level * np.sin(azimuth), climb * speed))
         rates = draw.uniform(-1.0, 1.0, (3,))
-        zero = 0.0 * share
         self.memory.missed = 0.0  # time of the last step that was not recovered, s
         self.memory.lowest = options.goal[2]  # m
         return InitialState(
-            position=stack([zero + value for value in options.goal]),
+            position=at(options.goal, share),
             quaternion=quaternion,
             velocity=velocity,
             body_rates=rates * self.spin,
@@ -180,17 +176,13 @@ class Recovery(GoalTask):
         memory.missed = np.where(self._recovered(state), memory.missed, state.time)
         memory.lowest = np.minimum(height, memory.lowest)
 
-    def observe(self, state: State) -> dict[str, Array]:
-        """See the tables of the class."""
-        return self.build_observation(state)
-
     def outcome(self, state: State) -> Outcome:
         """Nearness to the goal, tilt and spin; the end at a crash or outside the band."""
         distance = length(self.goal(state) - state.position)
         terminated = (distance > self.options.flight_band) | state.touching
         return Outcome(
             reward={
-                "position": (ERROR_SCALE - distance) / (ERROR_SCALE + distance),
+                "position": nearness(distance, ERROR_SCALE),
                 "tilt": TILT_WEIGHT * (state.tilt_cosine - 1.0),
                 "rates": rates_cost(state),
                 "termination": self.crash(terminated),
@@ -203,10 +195,6 @@ class Recovery(GoalTask):
                 "position_error": distance,
             },
         )
-
-    def goal(self, state: State) -> Array:
-        """The same for every drone."""
-        return at(self.options.goal, state)
 
     def _recovered(self, state: State) -> Array:
         """Whether it is near, slow and upright, bool, shape (W, A)."""

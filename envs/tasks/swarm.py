@@ -1,23 +1,25 @@
 """What tasks for several drones share: who hears whom by radio, and the room between drones."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Final
 
 import numpy as np
 
-from ...models.errors import InputError
 from ...models.fields import Limits
 from ...sim import Array, Draw, clip
 from ..state import State
 from .goal import (
-    AIR,
     FURTHEST,
-    LEAST_TILT_COSINE,
     MAX_SPEED,
     WORST_RATES,
     GoalTask,
+    Number,
     Point,
+    along,
+    check_height,
     length,
+    nearness,
     rates_cost,
 )
 from .task import Outcome, TaskOptions
@@ -61,7 +63,8 @@ class Swarm(GoalTask):
     | its velocity minus the own | m/s | world |
     | 1; 0, as all numbers before, where there is none | 1 | |
 
-    A derived class sets `reach` before `prepare`, and has `goal`.
+    A derived class calls `prepare_slots` in `setup`; or it sets `reach` before `prepare`, and has
+    `goal`.
     """
 
     max_drones = MAX_DRONES
@@ -71,30 +74,39 @@ class Swarm(GoalTask):
     reach = 0.0
     """Furthest distance of a start from its goal, m."""
 
-    def prepare(self, more: tuple[tuple[str, str, float], ...] = ()) -> None:
+    def prepare(self, further: Sequence[Number] = ()) -> None:
         """Set `observation`: that of `GoalTask`, further numbers, and the neighbours."""
         from ...models.fleet import members_of  # which imports MuJoCo
 
         options = self.options
         vehicle = self.vehicle
-        self.count = self.shape[1] if self.shape else 1
-        lowest = options.center[2] - JITTER * self.gap
-        least = vehicle.rest_height + AIR
-        expected = f"a height of at least {least + JITTER * self.gap:.4g} m above the ground"
-        if not lowest >= least:
-            raise InputError(f"center: expected {expected}, got {options.center[2]:g}")
+        check_height("center", options.center[2], vehicle.rest_height + JITTER * self.gap)
         self.band = self.reach + options.margin
-        names = [f"neighbour {n}" for n in range(1, options.neighbours + 1)]
-        told: list[tuple[str, str, float]] = []
-        for name in names:
-            told += [(f"{name} - position {axis}", "m", options.radio_range) for axis in "xyz"]
-            told += [(f"{name} velocity - velocity {axis}", "m/s", MAX_SPEED) for axis in "xyz"]
-            told.append((f"{name} is there", "1", 1.0))
-        self.define_observation(self.band, [*more, *told])
+        numbers = [*further]
+        for number in range(1, options.neighbours + 1):
+            name = f"neighbour {number}"
+            numbers += along(f"{name} - position", "m", options.radio_range)
+            numbers += along(f"{name} velocity - velocity", "m/s", MAX_SPEED)
+            numbers.append(Number(f"{name} is there", "1", -1.0, 1.0))
+        self.define_observation(self.band, numbers)
         spheres = f"; drones with a radius of {vehicle.radius:.7g} m"
         self.observation = tuple(replace(a, frame=a.frame + spheres) for a in self.observation)
         self._radii = np.array([one.radius for one in members_of(vehicle, self.count)])
         self.has_radio = self.count > 1
+
+    def prepare_slots(self, slots: np.ndarray, further: Sequence[Number] = ()) -> None:
+        """Prepare for goals at such offsets from the center, (A, 3), over the gap between them, and
+        for starts in `cells`.
+        """
+        self._slots = slots * self.gap
+        starts = np.abs(grid(self.count)).max(axis=0) * self.gap + JITTER * self.gap
+        self.reach = float(np.linalg.norm(np.abs(self._slots).max(axis=0) + starts))
+        self.prepare(further)
+
+    @property
+    def count(self) -> int:
+        """A."""
+        return self.shape[1] if self.shape else 1
 
     @property
     def gap(self) -> float:
@@ -114,7 +126,7 @@ class Swarm(GoalTask):
         places = np.argsort(lots, axis=-1, kind="stable")
         return start + grid(self.count)[places] * self.gap
 
-    def neighbour_observation(self, state: State) -> list[Array]:
+    def further(self, state: State) -> list[Array]:
         """The numbers of the neighbours, shape (W, A, 7 k) in all."""
         k = self.options.neighbours
         if not k:
@@ -126,8 +138,7 @@ class Swarm(GoalTask):
 
     def ended(self, state: State) -> Array:
         """Whether a drone has touched anything, flipped over, or left for good, bool, (W, A)."""
-        outside = length(self.goal(state) - state.position) > self.band
-        return outside | state.touching | (state.tilt_cosine < LEAST_TILT_COSINE)
+        return self.crashed(state, length(self.goal(state) - state.position) > self.band)
 
     def outcome(self, state: State) -> Outcome:
         """Nearness to the goal, approach and room; the end at a crash, a flip-over, or outside the
@@ -135,14 +146,13 @@ class Swarm(GoalTask):
         """
         to_goal = self.goal(state) - state.position
         distance = length(to_goal)
-        along = to_goal * (state.velocity - self.goal_velocity())
-        closing = along[..., 0] + along[..., 1] + along[..., 2]
+        towards = to_goal * (state.velocity - self.goal_velocity())
+        closing = towards[..., 0] + towards[..., 1] + towards[..., 2]
         room = self.clearance(state)
         ended = self.ended(state)
-        near = self.gap / 2
         return Outcome(
             reward={
-                "position": (near - distance) / (near + distance),
+                "position": nearness(distance, self.gap / 2),
                 "approach": APPROACH_WEIGHT * closing / (distance + TINY),
                 "room": self.proximity_penalty(room),
                 "rates": rates_cost(state),
@@ -173,10 +183,10 @@ class Swarm(GoalTask):
         narrow = clip(1.0 - room / (2 * radius), 0.0, 2.0)
         return -ROOM_WEIGHT * narrow
 
-    def slots_at(self, slots: np.ndarray, state: State) -> Array:
-        """Offsets of each drone, shape (A, 3), from the center, in the world: (W, A, 3)."""
-        places = np.array(self.options.center) + (slots if self.shape else slots[0])
-        return places + 0.0 * state.position
+    def goal(self, state: State) -> Array:
+        """The slot of each drone."""
+        slots = self._slots if self.shape else self._slots[0]
+        return np.array(self.options.center) + slots + 0.0 * state.position
 
 
 def ring(count: int) -> np.ndarray:

@@ -22,14 +22,14 @@ from ...sim import (
 from ..spec import Metric
 from ..state import State
 from .goal import (
-    AIR,
-    ERROR_SCALE,
     FURTHEST,
-    LEAST_TILT_COSINE,
     WORST_RATES,
     GoalTask,
     Point,
+    along,
+    check_height,
     length,
+    nearness,
     rates_cost,
     row_of,
 )
@@ -160,23 +160,16 @@ class Tracking(GoalTask):
             if self._drawn
             else (self._table.min(axis=0), self._table.max(axis=0))
         )
-        least = self.vehicle.rest_height + AIR + options.start_band
-        expected = f"a height of at least {least:.4g} m above the ground"
-        if not low[2] >= least:
-            raise InputError(f"trajectory: expected {expected}, got {low[2]:.4g}")
+        check_height("trajectory", low[2], self.vehicle.rest_height + options.start_band)
         self._box = middle, box
         reach = float(np.linalg.norm(high - low)) + 2 * options.flight_band
-        later = [
-            (f"reference {number * options.preview_time:g} s later - position {axis}", "m", reach)
-            for number in range(1, options.preview + 1)
-            for axis in "xyz"
-        ]
-        speed = [(f"reference velocity {axis}", "m/s", 100.0) for axis in "xyz"]
-        self.define_observation(reach / 2, [*speed, *later])
-        self._ahead = [
-            float(round(number * options.preview_time / step))
-            for number in range(1, options.preview + 1)
-        ]
+        numbers = along("reference velocity", "m/s", 100.0)
+        self._ahead = []
+        for number in range(1, options.preview + 1):
+            ahead = number * options.preview_time
+            numbers += along(f"reference {ahead:g} s later - position", "m", reach)
+            self._ahead.append(float(round(ahead / step)))
+        self.define_observation(reach / 2, numbers)
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """Near the beginning of the trajectory, or anywhere on a closed one, at its velocity."""
@@ -196,26 +189,24 @@ class Tracking(GoalTask):
         """Go on along the trajectory."""
         self.memory.index = self.memory.index + 1.0
 
-    def observe(self, state: State) -> dict[str, Array]:
-        """See the table of the class."""
+    def further(self, state: State) -> list[Array]:
+        """The velocity of the trajectory, and where it is later."""
         velocity = self._at(self._rates, 0.0) + 0.0 * state.position
         later = [self._at(self._table, ahead) - state.position for ahead in self._ahead]
-        return self.build_observation(state, velocity, *later)
+        return [velocity, *later]
 
     def outcome(self, state: State) -> Outcome:
         """Nearness to where it should be; the end at contact, a flip-over, or too far away."""
         distance = length(self.goal(state) - state.position)
-        outside = distance > self.options.flight_band
-        flipped = state.tilt_cosine < LEAST_TILT_COSINE
-        terminated = outside | state.touching | flipped
+        crashed = self.crashed(state, distance > self.options.flight_band)
         speed = length(self._at(self._rates, 0.0))
         return Outcome(
             reward={
-                "position": (ERROR_SCALE - distance) / (ERROR_SCALE + distance),
+                "position": nearness(distance),
                 "rates": rates_cost(state),
-                "termination": self.crash(terminated),
+                "termination": self.crash(crashed),
             },
-            terminated=terminated,
+            terminated=crashed,
             metrics={"tracking_error": distance, "reference_speed": speed},
         )
 

@@ -6,22 +6,20 @@ from typing import Annotated, Final
 
 import numpy as np
 
-from ...models.errors import InputError
 from ...models.fields import Limits
-from ...sim import Array, Draw, InitialState, component
+from ...sim import Array, Draw, InitialState, plain
 from ..spec import Mark, Metric
 from ..state import State
 from .goal import (
-    AIR,
     COURSE_RATE_WEIGHT,
     COURSE_WORST_STEP,
     FURTHEST,
-    LEAST_TILT_COSINE,
     PASSING_REWARD,
     GoalTask,
     Point,
     Sides,
-    at,
+    along,
+    check_height,
     length,
     rates_cost,
     row_of,
@@ -104,15 +102,11 @@ class Waypoints(GoalTask):
     def setup(self) -> None:
         """See the class."""
         options = self.options
-        least = self.vehicle.rest_height + AIR + options.box[2]
-        expected = f"a height of at least {least:g} m above the ground"
-        if not options.center[2] >= least:
-            raise InputError(f"center: expected {expected}, got {options.center[2]:g}")
+        check_height("center", options.center[2], self.vehicle.rest_height + options.box[2])
         self.marks = (Mark(shape="ball", size=options.radius, moves=True),)
         self._sides = tuple(side + options.margin for side in options.box)
         furthest = 2 * math.hypot(*self._sides)
-        after = [(f"point after - position {axis}", "m", furthest) for axis in "xyz"]
-        self.define_observation(furthest / 2, after)
+        self.define_observation(furthest / 2, along("point after - position", "m", furthest))
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """At rest, level, somewhere in the box; the points are drawn alike."""
@@ -137,21 +131,17 @@ class Waypoints(GoalTask):
         memory.reached = memory.reached + passed
         memory.distance = length(self.goal(state) - state.position)
 
-    def observe(self, state: State) -> dict[str, Array]:
-        """See the table of the class."""
-        return self.build_observation(
-            state, self._point(self.memory.reached + 1.0) - state.position
-        )
+    def further(self, state: State) -> tuple[Array]:
+        """The way to the point after the next."""
+        return (self._point(self.memory.reached + 1.0) - state.position,)
 
     def outcome(self, state: State) -> Outcome:
         """Progress to the next point; the end at the last one, or far away."""
         options = self.options
         memory = self.memory
         left = options.points - memory.reached
-        off = abs(state.position - at(options.center, state))
-        crashed = state.touching | (state.tilt_cosine < LEAST_TILT_COSINE)
-        for axis, side in enumerate(self._sides):
-            crashed = crashed | (component(off, axis) > side)
+        off = abs(state.position - np.array(options.center))
+        crashed = self.crashed(state, plain((off > self._sides).any(axis=-1)))
         finished = left < 0.5
         return Outcome(
             reward={
