@@ -7,6 +7,7 @@ from typing import Any, Final, Unpack
 import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
+from numpy.typing import ArrayLike
 
 from ..envs.autoreset import (
     LOST,
@@ -28,6 +29,8 @@ from .transport.agent import Agent, AgentConfig, AgentSettings, Order
 from .transport.simulator import DEFAULT_AGENT
 
 Arrays = dict[str, np.ndarray]
+Info = dict[str, Any]
+Observation = Any  # an array, or a dict of arrays
 _FLY: Final = np.array([FLY], np.uint8)
 _RESET: Final = np.array([RESET], np.uint8)
 
@@ -135,8 +138,8 @@ class RemoteEnv(_Remote, gym.Env[Any, Any]):
         self._take_spec(self._agent.connect())
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+        self, *, seed: int | None = None, options: Info | None = None
+    ) -> tuple[Observation, Info]:
         """Start an episode in the simulator, with its generator seeded where a seed is given."""
         if not (seed is None or 0 <= seed <= MAX_UINT64):
             raise InputError(f"seed: expected 0 to 2^64 - 1, got {seed}")
@@ -154,14 +157,14 @@ class RemoteEnv(_Remote, gym.Env[Any, Any]):
         self._state = self._agent.states[0]
         return self._observation(self._state), self._info(self._state)
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, Info]:
         """Fly for one control period. The action is sent in the dtype of its space."""
         if not self._flying:
             raise gym.error.ResetNeeded("step: expected a call of reset() first")
-        fits = type(action) is np.ndarray and action.dtype == self._dtype
-        if not fits or action.shape != self._row:
-            action = _checked_actions(action, self._dtype, self._row)
-        actions = action[np.newaxis]
+        actions = action if isinstance(action, np.ndarray) else np.asarray(action)
+        if actions.dtype != self._dtype or actions.shape != self._row:
+            actions = _checked_actions(actions, self._dtype, self._row)
+        actions = actions[np.newaxis]
         self._flying = False  # until the answer is there
         try:
             self._agent.exchange({0: (actions, _FLY, None)})
@@ -197,14 +200,14 @@ class RemoteEnv(_Remote, gym.Env[Any, Any]):
         self._names = telemetry_names(spec)
         self._take_actions(spec.action, 1)
 
-    def _observation(self, state: State) -> Any:
+    def _observation(self, state: State) -> Observation:
         """As the space has it, a copy."""
         arrays = state.observations
         if len(arrays) == 1:
             return np.array(arrays[0][0])
         return {name: np.array(a[0]) for name, a in zip(self._arrays, arrays, strict=True)}
 
-    def _info(self, state: State) -> dict[str, Any]:
+    def _info(self, state: State) -> Info:
         numbers: list[float] = []
         for array in state.telemetry:
             numbers += array.tolist()[0] if array.ndim == 2 else array.ravel().tolist()
@@ -286,8 +289,8 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
         self._shape = self.num_simulators, num_envs // self.num_simulators
 
     def reset(
-        self, *, seed: int | Seeds | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+        self, *, seed: int | Seeds | None = None, options: Info | None = None
+    ) -> tuple[Observation, Info]:
         """Begin an episode, for all drones or some.
 
         Where none is under way, before the first reset or after an error, a step wants a reset of
@@ -455,12 +458,12 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
     def _no_actions(self) -> np.ndarray:
         return self._nothing
 
-    def _losses(self) -> dict[str, Any]:
+    def _losses(self) -> Info:
         reasons = self._reasons
         return {} if reasons is None else {LOST: reasons, f"_{LOST}": reasons != None}  # noqa: E711
 
 
-def _checked_actions(action: Any, dtype: np.dtype, shape: tuple[int, ...]) -> np.ndarray:
+def _checked_actions(action: ArrayLike, dtype: np.dtype, shape: tuple[int, ...]) -> np.ndarray:
     """Actions as they cross the wire; the env checks bounds.
 
     Raises `InputError` for another shape, and what is not real or cannot be of that dtype.

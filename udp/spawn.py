@@ -124,7 +124,7 @@ def _last_words(said: IO[str], status: int) -> str:
     return sentence if own else f"the simulator ended with status {status}: {words}"
 
 
-_cached: dict[str, tuple[Any, ExitStack]] = {}
+_cached: dict[str, tuple[Remote, ExitStack]] = {}
 
 
 @contextmanager

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -224,16 +224,17 @@ class Verification(Recording):
 
 
 def _difference(recorded: State, loop: Steppable) -> Difference | None:
-    """The first number of the first drone that differs in any bit; None if none does."""
-    pairs = [pair for pair in _arrays(recorded, loop) if pair[1].tobytes() != pair[2].tobytes()]
-    differences = (
-        Difference(recorded.sequence, drone, name, _digits(old), _digits(new))
-        for drone in range(loop.num_envs)
-        for names, was, now in pairs
-        for name, old, new in zip(names, was[drone].flat, now[drone].flat, strict=True)
-        if old.tobytes() != new.tobytes()
-    )
-    return next(differences, None)
+    """The first number that differs in any bit; None if none does."""
+    for names, was, now in _arrays(recorded, loop):
+        if was.tobytes() == now.tobytes():
+            continue
+        for at, old in enumerate(was.flat):
+            new = now.flat[at]
+            if old.tobytes() != new.tobytes():
+                drone, component = divmod(at, len(names))
+                name = names[component]
+                return Difference(recorded.sequence, drone, name, _digits(old), _digits(new))
+    return None
 
 
 def _arrays(recorded: State, loop: Steppable) -> Iterator[tuple[list[str], np.ndarray, np.ndarray]]:
@@ -250,8 +251,8 @@ def _arrays(recorded: State, loop: Steppable) -> Iterator[tuple[list[str], np.nd
             yield names, was, np.ascontiguousarray(here[spec.name], was.dtype)
 
 
-def _digits(number: Any) -> str:
-    value = number.item()
+def _digits(number: np.generic) -> str:
+    value: object = number.item()
     return f"{value.hex()} ({number!s})" if isinstance(value, float) else str(value)
 
 

@@ -1,6 +1,6 @@
 """Joins the Commands and States of a session: what each State followed from."""
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +43,7 @@ class Walker:
         self._command: Command | None = None
         self._sequence: int | None = None
 
-    def take(self, message: Any) -> Transition | None:
+    def take(self, message: object) -> Transition | None:
         """The transition that a State completes; None for any other message."""
         if isinstance(message, Command):
             self._command = message

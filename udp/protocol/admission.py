@@ -7,7 +7,7 @@ read. Memory for simulators without a slot is bounded.
 
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple, TypeVar
 
 from ...models.errors import InputError
 from . import binary, text
@@ -26,6 +26,10 @@ _LEAST_ASSEMBLING: Final = 16
 may come at the same moment."""
 _TEXT_REMEMBERED: Final = 2.0  # for so long the last line of a closed text simulator is known, s
 _REASON_AT: Final = binary.HEADER_SIZE + 2  # bytes of a Refuse or a Close before its reason
+
+
+K = TypeVar("K")
+V = TypeVar("V")
 
 
 class Arrival(NamedTuple):
@@ -306,7 +310,7 @@ class Admission:
         self._outbox.drop(cause, reason, arrival.address, arrival.now)
 
 
-def keep(table: "OrderedDict[Any, Any]", key: Any, value: Any, most: int = _MOST) -> None:
+def keep(table: OrderedDict[K, V], key: K, value: V, most: int = _MOST) -> None:
     """Put into a table that forgets its oldest entries."""
     table[key] = value
     table.move_to_end(key)

@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass, fields
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any, Final, TypedDict
+from typing import TYPE_CHECKING, Final, TypedDict
 
 import gymnasium as gym
 import numpy as np
@@ -31,6 +31,9 @@ from ..protocol.server import Event, Server
 from ..protocol.transitions import AgentState
 from .sockets import LONGEST_WAIT, PAUSE, Port, log_notices
 
+if TYPE_CHECKING:
+    from ..journal import Journal
+
 _log: Final = logging.getLogger("rotorgram.udp")
 
 Order = tuple[np.ndarray, np.ndarray, np.ndarray | None]
@@ -41,7 +44,7 @@ class AgentSettings(TypedDict, total=False):
     """Settings of an env over UDP: see `RemoteEnv`."""
 
     env_id: str | None
-    options: Mapping[str, Any] | None
+    options: Mapping[str, object] | None
     vehicle_hash: str | None
     connect_timeout: float
     timeout: float
@@ -60,7 +63,7 @@ class AgentConfig:
     """
 
     env_id: str | None = None
-    options: Mapping[str, Any] | None = None
+    options: Mapping[str, object] | None = None
     vehicle_hash: str | None = None
     connect_timeout: float = 60.0
     timeout: float = 30.0
@@ -124,7 +127,7 @@ class AgentConfig:
                 return reason
         return _spec_difference(self.spec, spec) if self.spec else ""
 
-    def _expected_options(self, env_id: str) -> dict[str, Any]:
+    def _expected_options(self, env_id: str) -> dict[str, object]:
         """The options that a simulator of this env must have, as JSON values.
 
         Raises `InputError` if they are none, or the env is known here and has no such options.
@@ -182,7 +185,7 @@ class Agent:
         self._deadlines = [0.0] * config.slots
         self._port = Port(address, insecure=config.insecure or bool(keys))
         self.address = self._port.address
-        self._journal: Any = None
+        self._journal: Journal | None = None
         if config.record:
             try:
                 self._journal = self._record(config.record)
@@ -221,7 +224,7 @@ class Agent:
         self.lost = [""] * len(self.lost)
         self._gather(self._pending() if None in self.server.slots else list(orders))
 
-    def _record(self, path: Path | str) -> Any:
+    def _record(self, path: Path | str) -> "Journal":
         from ..journal import Journal
 
         server = self.server
@@ -392,7 +395,7 @@ def _spec_difference(ours: EnvSpec, theirs: EnvSpec) -> str:
     return ""
 
 
-def _leave(pid: int, server: Server, port: Port, journal: Any) -> None:
+def _leave(pid: int, server: Server, port: Port, journal: "Journal | None") -> None:
     """Tell every simulator, until it has answered or will not."""
     if os.getpid() != pid:  # a fork of the process that owns the agent
         return

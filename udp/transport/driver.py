@@ -5,7 +5,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import Any, Final
+from typing import TYPE_CHECKING, Final
 
 import gymnasium as gym
 
@@ -16,6 +16,9 @@ from ..protocol.messages import Command
 from ..protocol.party import AgentLink, WorldRules
 from .sockets import LONGEST_WAIT, PAUSE, Port, log_notices
 from .stepped import Steppable
+
+if TYPE_CHECKING:
+    from ..journal import Journal
 
 _ALIVE_EVERY: Final = 0.5  # period of the message Alive while an agent waits for a State, s
 
@@ -45,7 +48,7 @@ class Driver(NotCopied):
         self._receive = port.receiver()
         self._by_address = {link.address: link for link in rules.links}
         self._stopped = self._ran = False
-        self._journal: Any = None
+        self._journal: Journal | None = None
 
     @property
     def link(self) -> Client:

@@ -7,7 +7,6 @@ from math import inf
 from pathlib import Path
 from typing import Any, Final, Literal, cast
 
-import gymnasium as gym
 import numpy as np
 
 from ...envs.config import DEFAULT_ENV, EnvConfig
@@ -20,7 +19,7 @@ from ..protocol.messages import POLICIES, Hello
 from ..protocol.party import AgentLink, OneAgent, SeveralAgents, SwarmWorld, WorldRules
 from .driver import Driver
 from .sockets import TEXT_WAY_OUT, WAY_OUT, Port, resolve
-from .stepped import make_stepped
+from .stepped import GymEnv, make_stepped
 
 DEFAULT_AGENT: Final = ("127.0.0.1", 8001)
 DEFAULT_SIMULATOR: Final = ("127.0.0.1", 8000)
@@ -62,7 +61,7 @@ class Simulator(Driver):
 
     def __init__(
         self,
-        env: str | EnvConfig | gym.Env[Any, Any] = DEFAULT_ENV,
+        env: str | EnvConfig | GymEnv = DEFAULT_ENV,
         *,
         server: Address = DEFAULT_AGENT,
         agents: Agents | None = None,

@@ -19,7 +19,7 @@ from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from functools import partial
 from math import ceil
-from typing import Any, Final
+from typing import Final
 
 from ...models.errors import InputError
 from ..protocol.client import Address, address_text
@@ -88,9 +88,8 @@ class Socket(socket.socket):
         self.setblocking(False)
         with suppress(OSError):  # room for the fragments of a large message, if the system has it
             self.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
-        self._poll: Any = None
-        if hasattr(select, "poll"):
-            self._poll = select.poll()
+        self._poll = select.poll() if hasattr(select, "poll") else None
+        if self._poll:
             self._poll.register(self.fileno(), select.POLLIN)
         self._asleep = 0  # of the next waits so many sleep at once
         self._row = 1  # and so many after the next wait in which nothing came
@@ -273,8 +272,8 @@ class Port:
 def _receive_any(selector: selectors.BaseSelector, timeout: float) -> tuple[bytes, Address]:
     """As `Socket.receive`, from any of several sockets, without looking first."""
     for key, _ in selector.select(min(timeout, LONGEST_WAIT)):
-        sock: Any = key.fileobj
-        datagram, address = sock.recvfrom(_MAX_DATAGRAM)
+        assert isinstance(key.fileobj, socket.socket)
+        datagram, address = key.fileobj.recvfrom(_MAX_DATAGRAM)
         return datagram, address
     raise TimeoutError
 

@@ -1,11 +1,12 @@
 """Envs of a simulator: the loop of a registered task, or Gymnasium envs one after the other."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from numpy.typing import NDArray
 
 from ...envs import registry
 from ...envs.config import EnvConfig
@@ -13,7 +14,9 @@ from ...envs.spaces import action_space, observation_space
 from ...envs.spec import ArraySpec, Discrete, EnvSpec, canonical_id, component_names
 from ...models.errors import InputError
 from ..protocol.layout import MAX_DRONES
-from ..protocol.party import World
+from ..protocol.party import Mask, World
+
+GymEnv = gym.Env[Any, Any]
 
 
 class Steppable(World, Protocol):
@@ -26,9 +29,9 @@ class Steppable(World, Protocol):
 
 
 def make_stepped(
-    env: str | EnvConfig | gym.Env[Any, Any],
+    env: str | EnvConfig | GymEnv,
     num_envs: int | None,
-    keywords: Mapping[str, Any],
+    keywords: Mapping[str, object],
 ) -> Steppable:
     """N drones of an env. Raises `InputError` if its spaces or an argument are not right.
 
@@ -71,7 +74,7 @@ def make_stepped(
 class GymnasiumBatch:
     """Gymnasium envs, one after the other."""
 
-    def __init__(self, envs: Sequence[gym.Env[Any, Any]], options: Mapping[str, Any]) -> None:
+    def __init__(self, envs: Sequence[GymEnv], options: Mapping[str, object]) -> None:
         self.envs = envs
         self.num_envs = len(envs)
         self.spec = spec_of_gymnasium(envs[0], options)
@@ -84,7 +87,13 @@ class GymnasiumBatch:
         self.truncated = np.zeros(n, bool)
         self._waiting = np.ones(n, bool)  # for a reset
 
-    def advance(self, actions: np.ndarray, resets: Any, seeds: Any, frozen: Any) -> None:
+    def advance(
+        self,
+        actions: np.ndarray,
+        resets: Mask | None,
+        seeds: NDArray[np.uint64] | None,
+        frozen: Mask | None,
+    ) -> None:
         none = np.zeros(self.num_envs, bool)
         resets = none if resets is None else resets
         frozen = none if frozen is None else frozen
@@ -92,7 +101,7 @@ class GymnasiumBatch:
         if waiting.any():
             raise gym.error.ResetNeeded(f"step: expected a reset of env {waiting.argmax()} first")
         for i, env in enumerate(self.envs):
-            reward: Any = 0.0
+            reward: SupportsFloat = 0.0
             terminated = truncated = False
             if resets[i]:
                 observation, info = env.reset(seed=None if seeds is None else int(seeds[i]))
@@ -101,7 +110,7 @@ class GymnasiumBatch:
                 action = int(actions[i]) if isinstance(self.spec.action, Discrete) else actions[i]
                 observation, reward, terminated, truncated, info = env.step(action)
                 self._keep(i, observation, info)
-            self.rewards[i] = reward
+            self.rewards[i] = float(reward)
             self.terminated[i] = terminated
             self.truncated[i] = truncated
             self._waiting[i] = terminated or truncated or (frozen[i] and self._waiting[i])
@@ -110,10 +119,11 @@ class GymnasiumBatch:
         for env in self.envs:
             env.close()
 
-    def _keep(self, i: int, observation: Any, info: Mapping[str, Any]) -> None:
-        named = isinstance(observation, dict)
+    def _keep(self, i: int, observation: object, info: Mapping[str, Any]) -> None:
         for array in self.spec.observation:
-            value = np.asarray(observation[array.name] if named else observation)
+            value = np.asarray(
+                observation[array.name] if isinstance(observation, dict) else observation
+            )
             if value.shape != array.shape or value.dtype != array.dtype:
                 expected = f"{array.dtype} of shape {array.shape}"
                 got = f"{value.dtype} of shape {value.shape}"
@@ -124,9 +134,9 @@ class GymnasiumBatch:
             self.telemetry[array.name][i] = np.reshape(numbers, array.shape)
 
 
-def spec_of_gymnasium(env: gym.Env[Any, Any], options: Mapping[str, Any]) -> EnvSpec:
+def spec_of_gymnasium(env: GymEnv, options: Mapping[str, object]) -> EnvSpec:
     """The env's own spec, or one from its spaces. `InputError`: one cannot cross the wire."""
-    base: Any = env.unwrapped
+    base = env.unwrapped
     observation = env.observation_space
     boxes = observation.spaces if isinstance(observation, spaces.Dict) else {"": observation}
     arrays = tuple(_array(name or "observation", box) for name, box in boxes.items())
@@ -149,7 +159,7 @@ def spec_of_gymnasium(env: gym.Env[Any, Any], options: Mapping[str, Any]) -> Env
     )
 
 
-def _array(name: str, space: Any) -> ArraySpec:
+def _array(name: str, space: spaces.Space[Any]) -> ArraySpec:
     if not isinstance(space, spaces.Box):
         raise InputError(f"{name} space: expected Box, a Dict of Box, or Discrete, got {space}")
     low, high = (tuple(b.astype(np.float64).ravel().tolist()) for b in (space.low, space.high))
