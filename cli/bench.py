@@ -4,16 +4,11 @@ import logging
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from rich import box
 from rich.table import Table
 
-from ..models.errors import require
 from ._flags import Command, folder_to_write
-
-if TYPE_CHECKING:
-    from ..training.bench import Layer
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,13 +23,12 @@ class Bench(Command):
     """Folder to write to. Default: runs/bench-TIME."""
 
     def run(self) -> int:
-        """Measure, print and draw."""
+        """Measure and print."""
         from rich.console import Console
 
         from ..training.bench import RATIOS, bench
         from ._progress import bars
 
-        require("matplotlib", "report", "drawing")  # before anything is measured
         logging.getLogger("rotorgram").setLevel(logging.WARNING)  # no counters of every wire
         with folder_to_write(self.out, "bench") as folder, bars() as progress:
 
@@ -52,8 +46,7 @@ class Bench(Command):
             (ratio.name, f"{'' if ratio.reached(value) else '[red]'}{value:.2f}", ratio.target_text)
             for ratio, value in values
         ]))  # fmt: skip
-        _draw(layers, folder / "bench.png")
-        print(f"written: {folder / 'bench.json'}, {folder / 'bench.png'}")
+        print(f"written: {folder / 'bench.json'}")
         return 0
 
 
@@ -65,18 +58,3 @@ def _table(*headings: str, rows: Iterable[tuple[str, ...]]) -> Table:
     for row in rows:
         table.add_row(*row)
     return table
-
-
-def _draw(layers: "list[Layer]", path: Path) -> None:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7, 0.28 * len(layers) + 1), layout="constrained")
-    axes = figure.subplots()
-    shown = layers[::-1]
-    axes.barh([layer.name for layer in shown], [layer.rate for layer in shown], color="#2b6cb0")
-    for place, layer in enumerate(shown):
-        axes.text(layer.rate, place, f" {layer.rate:,.0f}", va="center", fontsize=8)
-    axes.set(xscale="log", xlabel="env steps per second")
-    axes.margins(x=0.12)
-    axes.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path, dpi=150)

@@ -9,33 +9,29 @@ step as a multiple of env and echo together.
 It takes about a few seconds on two cores.
 """
 
-import time
-from collections.abc import Callable
 from contextlib import ExitStack
 
 from measuring import in_turns, medians, options
 from rotorgram.envs.config import EnvConfig
-from rotorgram.training.bench import _echo, _env, _local
+from rotorgram.training.bench import Step, local_env, rate_of, single_step, udp_echo
 from rotorgram.udp.spawn import spawn_simulator
 
 ENV_ID = "rotorgram/Elevation-v0"
 TURN = 0.2  # s
 
 
-def microseconds(run: Callable[[float], int]) -> float:
+def microseconds(step: Step) -> float:
     """Of a step, the mean over a moment."""
-    began = time.perf_counter()
-    count = run(TURN)
-    return 1e6 * (time.perf_counter() - began) / count
+    return 1e6 / rate_of(step, TURN)
 
 
 def main() -> None:
     rounds = options(__doc__, rounds=20).parse_args().rounds
     with ExitStack() as stack:
         runs = {
-            "env": _local(stack, 1),
-            "echo": _echo(stack),
-            "step": _env(stack.enter_context(spawn_simulator(EnvConfig(env_id=ENV_ID)))),
+            "env": local_env(stack),
+            "echo": udp_echo(stack),
+            "step": single_step(stack.enter_context(spawn_simulator(EnvConfig(env_id=ENV_ID)))),
         }
         median = medians(in_turns(runs, rounds, microseconds))
     for name, time_of_step in median.items():

@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict, dataclass
+from functools import partial
 from itertools import cycle
 from pathlib import Path
 from typing import Any, Final
@@ -26,9 +27,11 @@ from mujoco.batch import Batch
 from numpy.typing import NDArray
 
 from ..agents.checkpoints import software_versions, write_whole
+from ..envs.autoreset import AdvancingVectorEnv
 from ..envs.config import EnvConfig
 from ..envs.loop import Loop
-from ..models.errors import InputError
+from ..envs.vector import LocalVectorEnv
+from ..models.fields import Limits, check
 from ..models.vehicle import Vehicle
 from ..udp.layouts import layout_of
 from ..udp.protocol import binary
@@ -38,10 +41,10 @@ from .results import machine
 
 ENV_ID: Final = "rotorgram/Elevation-v0"
 _PERIOD: Final = 0.02  # s, of a control step
-_STEPS_AT_ONCE: Final = 64  # between two looks at the clock
+_STEPS_AT_ONCE: Final = 64  # of one drone between two looks at the clock
 
-Slice = Callable[[float], int]
-"""Runs for about so many seconds; the number of env steps that it made."""
+Step = Callable[[], int]
+"""Flies a step of all drones; the number of env steps that it made."""
 Rates = Mapping[str, float]
 """Env steps per second, by layer."""
 
@@ -53,12 +56,13 @@ class Ratio:
     name: str
     of: Callable[[Rates], float]
     target: float
-    at_most: bool = False  # whether less is better
+    at_most: bool = False
+    """Whether less is better."""
 
     def value(self, layers: Sequence["Layer"]) -> float:
         """Median over the rounds."""
-        rounds = zip(*(layer.rates for layer in layers), strict=True)
         names = [layer.name for layer in layers]
+        rounds = zip(*(layer.rates for layer in layers), strict=True)
         return statistics.median(self.of(dict(zip(names, rates, strict=True))) for rates in rounds)
 
     @property
@@ -126,35 +130,43 @@ def bench(
     `on_layer` is called before each turn: name of the layer, turns done, turns in all. Raises
     `InputError`.
     """
-    if rounds < 1:
-        raise InputError(f"rounds: expected at least 1, got {rounds}")
-    if not 0 < seconds <= 60:
-        raise InputError(f"seconds: expected more than 0 and at most 60, got {seconds}")
-    rates: dict[str, list[float]] = {name: [] for name, *_ in _LAYERS}
+    check("rounds", Limits(1, whole=True), rounds)
+    check("seconds", Limits(0, 60, "s", above=True), seconds)
     turns = (rounds + 1) * len(_LAYERS)
     done = 0
-    for many in (False, True):
-        group = [layer for layer in _LAYERS if (layer[2] > 1) == many]
+    layers = []
+    for single in (True, False):
+        group = [layer for layer in _LAYERS if (layer[2] == 1) == single]
+        rates: dict[str, list[float]] = {name: [] for name, *_ in group}
         with ExitStack() as stack:
-            opened: list[tuple[str, Slice]] = []
-            for name, _, _, open_ in group:
+            opened = []
+            for name, _, drones, open_ in group:
                 on_layer(f"opening {name}", done, turns)
-                opened.append((name, open_(stack)))
+                opened.append((name, drones, open_(stack)))
             for number in range(rounds + 1):
                 first = number % len(opened)
-                for name, run in opened[first:] + opened[:first]:
+                for name, drones, step in opened[first:] + opened[:first]:
                     on_layer(name, done, turns)
-                    start = time.perf_counter()
-                    rate = run(seconds) / (time.perf_counter() - start)
                     done += 1
+                    rate = rate_of(step, seconds, _STEPS_AT_ONCE if drones == 1 else 1)
                     if number:  # the first round warms up
                         rates[name].append(round(rate, 1))
-    layers = [
-        Layer(name=name, about=about, drones=drones, rates=tuple(rates[name]))
-        for name, about, drones, _ in _LAYERS
-    ]
+        for name, about, drones, _ in group:
+            layers.append(Layer(name=name, about=about, drones=drones, rates=tuple(rates[name])))
     _write(layers, rounds, seconds, folder)
     return layers
+
+
+def rate_of(step: Step, seconds: float, at_once: int = _STEPS_AT_ONCE) -> float:
+    """Env steps per second over so many seconds, with as many steps between looks at the clock."""
+    start = time.perf_counter()
+    now = start
+    steps = 0
+    while now < start + seconds:
+        for _ in range(at_once):
+            steps += step()
+        now = time.perf_counter()
+    return steps / (now - start)
 
 
 def _write(layers: Sequence[Layer], rounds: int, seconds: float, folder: Path) -> None:
@@ -174,64 +186,36 @@ def _write(layers: Sequence[Layer], rounds: int, seconds: float, folder: Path) -
     write_whole(folder / "bench.json", (json.dumps(content, indent=2) + "\n").encode())
 
 
-# ---- the layers: each is opened for as long as the stack is, and gives a `Slice`
+# ---- the layers: each is opened for as long as the stack is
 
 
-def _for_a_while(fly: Callable[[], int], prepare: Callable[[], object] = lambda: None) -> Slice:
-    def run(seconds: float) -> int:
-        prepare()
-        until = time.perf_counter() + seconds
-        steps = 0
-        while time.perf_counter() < until:
-            steps += fly()
-        return steps
-
-    return run
-
-
-def _again(
-    call: Callable[[], Any], drones: int = 1, prepare: Callable[[], object] = lambda: None
-) -> Slice:
-    """Calls it, a step of so many drones, `_STEPS_AT_ONCE` times between two looks at the clock."""
-
-    def fly() -> int:
-        for _ in range(_STEPS_AT_ONCE):
-            call()
-        return drones * _STEPS_AT_ONCE
-
-    return _for_a_while(fly, prepare)
-
-
-def _mj_step(_: ExitStack) -> Slice:
+def _mj_step(_: ExitStack) -> Step:
     vehicle = Vehicle.load()
     model = vehicle.model
     substeps = vehicle.substeps(_PERIOD)
     data = mujoco.MjData(model)
+    data.qpos[2] = 5.0
+    data.ctrl[:] = vehicle.hover_thrust
 
-    def prepare() -> None:
-        # Every turn begins in the air: how long it lasts must not matter.
-        mujoco.mj_resetData(model, data)
-        data.qpos[2] = 5.0
-        data.ctrl[:] = vehicle.hover_thrust
+    def step() -> int:
+        mujoco.mj_step(model, data, substeps)
+        return 1
 
-    return _again(lambda: mujoco.mj_step(model, data, substeps), prepare=prepare)
+    return step
 
 
-def _batch_step(drones: int) -> Slice:
+def _batch_step(_: ExitStack) -> Step:
     vehicle = Vehicle.load()
-    batch = Batch(vehicle.model, drones)
+    batch = Batch(vehicle.model, 1024)
     substeps = vehicle.substeps(_PERIOD)
+    batch.qpos[:, 2] = 5.0
+    batch.ctrl[:] = vehicle.hover_thrust
 
-    def prepare() -> None:
-        batch.reset()
-        batch.qpos[:, 2] = 5.0
-        batch.ctrl[:] = vehicle.hover_thrust
-
-    def fly() -> int:
+    def step() -> int:
         batch.step(nstep=substeps)
-        return drones
+        return 1024
 
-    return _for_a_while(fly, prepare)
+    return step
 
 
 def _actions(*shape: int) -> Iterator[NDArray[np.float32]]:
@@ -239,35 +223,40 @@ def _actions(*shape: int) -> Iterator[NDArray[np.float32]]:
     return cycle(np.random.default_rng(0).uniform(-0.1, 0.1, shape).astype(np.float32))
 
 
-def _local(stack: ExitStack, drones: int) -> Slice:
-    one = drones == 1
-    made: Any = gym.make(ENV_ID, disable_env_checker=True) if one else gym.make_vec(ENV_ID, drones)
-    return _env(stack.enter_context(closing(made.unwrapped)))
+def local_env(stack: ExitStack) -> Step:
+    """The single env in process."""
+    env = stack.enter_context(closing(gym.make(ENV_ID, disable_env_checker=True).unwrapped))
+    return single_step(env)
 
 
-def _env(env: Any) -> Slice:
-    """Of a vector env, drones whose episode ended are reset by the next step, as in NEXT_STEP."""
+def single_step(env: gym.Env[Any, Any]) -> Step:
+    """Steps of a single env with random actions; after an episode it is reset."""
+    actions = _actions(4096, 1)
     env.reset(seed=0)
-    if hasattr(env, "num_envs"):
-        actions = _actions(16, env.num_envs, 1)
 
-        def fly() -> int:
-            resets = env.done
-            env.advance(next(actions), resets if resets.any() else None)
-            return int((~resets).sum())
-
-        return _for_a_while(fly)
-    single = _actions(4096, 1)
-
-    def step() -> None:
-        _, _, terminated, truncated, _ = env.step(next(single))
+    def step() -> int:
+        _, _, terminated, truncated, _ = env.step(next(actions))
         if terminated or truncated:
             env.reset()
+        return 1
 
-    return _again(step)
+    return step
 
 
-def _sizes() -> dict[str, int]:
+def _vector_step(env: AdvancingVectorEnv) -> Step:
+    """Drones whose episode ended are reset by the next step, as in NEXT_STEP."""
+    actions = _actions(16, env.num_envs, 1)
+    env.reset(seed=0)
+
+    def step() -> int:
+        resets = env.done
+        env.advance(next(actions), resets if resets.any() else None)
+        return int((~resets).sum())
+
+    return step
+
+
+def _sizes() -> tuple[int, int]:
     """Bytes of a State and a Command of one drone."""
     action = np.zeros((1, 1), np.float32)
     with closing(Loop(EnvConfig(env_id=ENV_ID))) as loop:
@@ -280,37 +269,33 @@ def _sizes() -> dict[str, int]:
             telemetry=tuple(loop.telemetry.values()),
             **{name: getattr(loop, name) for name in ("rewards", "terminated", "truncated")},
         )
-        command = Command(session=1, sequence=2, actions=action, orders=np.zeros(1, np.uint8))
         layout = layout_of(loop.spec, 1)
-    messages: dict[str, State | Command] = {"State": state, "Command": command}
-    return {kind: len(binary.encode(message, layout)) for kind, message in messages.items()}
+    command = Command(session=1, sequence=2, actions=action, orders=np.zeros(1, np.uint8))
+    return len(binary.encode(state, layout)), len(binary.encode(command, layout))
 
 
-def _echo(stack: ExitStack) -> Slice:
+def udp_echo(stack: ExitStack) -> Step:
     """A raw exchange of datagrams of the sizes of a State and a Command: two Python processes with
     blocking sockets, on one core, where a wake-up costs least.
     """
-    sizes = _sizes()
-    words = [sys.executable, "-c", _ECHO, str(sizes["Command"])]
+    state_size, command_size = _sizes()
+    words = [sys.executable, "-c", _ECHO, str(command_size)]
     process = stack.enter_context(subprocess.Popen(words, stdout=subprocess.PIPE))
     assert process.stdout is not None
     address = ("127.0.0.1", int(process.stdout.readline()))
-    message = bytes(sizes["State"])
+    message = bytes(state_size)
     sock = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
     sock.settimeout(1.0)
     stack.callback(sock.sendto, b"", address)
 
-    def exchange() -> None:
-        sock.sendto(message, address)
-        sock.recvfrom(65536)
-
-    exchange_for = _again(exchange)
-
-    def run(seconds: float) -> int:
+    def step() -> int:
         with one_core(process.pid):
-            return exchange_for(seconds)
+            for _ in range(_STEPS_AT_ONCE):
+                sock.sendto(message, address)
+                sock.recvfrom(65536)
+        return _STEPS_AT_ONCE
 
-    return run
+    return step
 
 
 @contextmanager
@@ -332,28 +317,30 @@ def one_core(pid: int) -> Iterator[None]:
         os.sched_setaffinity(0, cores)
 
 
-def _udp(stack: ExitStack, drones: int) -> Slice:
-    return _env(
-        stack.enter_context(
-            spawn_simulator(EnvConfig(env_id=ENV_ID), num_envs=None if drones == 1 else drones)
-        )
-    )
+def _remote(stack: ExitStack) -> Step:
+    return single_step(stack.enter_context(spawn_simulator(EnvConfig(env_id=ENV_ID))))
+
+
+def _remote_vector(stack: ExitStack, drones: int) -> Step:
+    opened = spawn_simulator(EnvConfig(env_id=ENV_ID), num_envs=drones)
+    return _vector_step(stack.enter_context(opened))
+
+
+def _vector(stack: ExitStack, drones: int) -> Step:
+    env = stack.enter_context(closing(LocalVectorEnv(ENV_ID, drones)))
+    return _vector_step(env)
 
 
 _MANY: Final = (64, 1024, 4096)
-_LAYERS: Final[list[tuple[str, str, int, Callable[[ExitStack], Slice]]]] = [
-    ("mj_step", "a loop over mj_step, substeps of one control step", 1, _mj_step),
-    ("env", "the single env's step", 1, lambda stack: _local(stack, 1)),
-    ("UDP echo", "blocking sockets of two processes on one core", 1, _echo),
-    ("UDP, 1", "RemoteEnv and a simulator", 1, lambda stack: _udp(stack, 1)),
-    ("Batch.step, 1024", "mujoco.batch, the same substeps", 1024, lambda _: _batch_step(1024)),
-    *(
-        (f"vector env, {n}", "the vector env", n, lambda stack, n=n: _local(stack, n))
-        for n in _MANY
-    ),
-    *(
-        (f"UDP, {n}", "RemoteVectorEnv and a simulator", n, lambda stack, n=n: _udp(stack, n))
-        for n in _MANY
-    ),
+_LAYERS: Final[list[tuple[str, str, int, Callable[[ExitStack], Step]]]] = [
+    ("mj_step", "mj_step with the substeps of one control step", 1, _mj_step),
+    ("env", "the single env's step", 1, local_env),
+    ("UDP echo", "blocking sockets of two processes on one core", 1, udp_echo),
+    ("UDP, 1", "RemoteEnv and a simulator", 1, _remote),
+    ("Batch.step, 1024", "mujoco.batch, the same substeps", 1024, _batch_step),
 ]
 """Name, what it is, drones, and how it is opened."""
+
+for _n in _MANY:
+    _LAYERS.append((f"vector env, {_n}", "the vector env", _n, partial(_vector, drones=_n)))
+    _LAYERS.append((f"UDP, {_n}", "RemoteVectorEnv", _n, partial(_remote_vector, drones=_n)))
