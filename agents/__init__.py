@@ -20,7 +20,6 @@ from .registry import (
     CONTROLLERS,
     Agent,
     AlgorithmName,
-    Resumable,
     find_algorithm,
 )
 from .sac import SACConfig
@@ -62,7 +61,7 @@ _ERRORS = (KeyError, TypeError, ValueError, RuntimeError, IndexError)
 """What parts of a checkpoint that do not fit together raise."""
 
 
-def make_agent(algorithm: str, log: EpisodeRecorder, config: Config, seed: int) -> Resumable:
+def make_agent(algorithm: str, log: EpisodeRecorder, config: Config, seed: int) -> Agent:
     """A new agent of a name in `ALGORITHMS`, for the env of a log; SB3's cannot `set_state`.
 
     Raises:
@@ -75,7 +74,7 @@ def make_agent(algorithm: str, log: EpisodeRecorder, config: Config, seed: int) 
             f"algorithm: expected {algorithm} with its {row.config.__name__}, "
             f"got {type(config).__name__}"
         )
-    agent: Resumable = row.agent_class().create(log, config, seed)
+    agent: Agent = row.agent_class().create(log, config, seed)
     return agent
 
 
@@ -118,7 +117,7 @@ def _check_start(kept: Checkpoint, algorithm: str, spec: EnvSpec, config: Config
         for own, other in zip(wanted, got, strict=True):
             if own != other:
                 raise InputError(f"{expected} with {own!r}, got {other!r}")
-    begun_with = preset(kept.algorithm, "tuned", **kept.config)
+    begun_with = kept.hyperparameters
     for name in NETWORK_FIELDS:
         value = getattr(config, name)
         own = getattr(begun_with, name)
@@ -154,8 +153,7 @@ def resume_agent(kept: Checkpoint, log: EpisodeRecorder) -> Agent:
     _check_same_env(kept.spec, log.spec)
     try:
         kept.policy()  # its networks are those of the config
-        config = preset(kept.algorithm, "tuned", **kept.config)
-        agent = make_agent(kept.algorithm, log, config, kept.seed)
+        agent = make_agent(kept.algorithm, log, kept.hyperparameters, kept.seed)
         if not find_algorithm(kept.algorithm).resumes:
             return agent
         agent.set_state(kept.state)

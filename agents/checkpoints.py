@@ -21,12 +21,12 @@ from pathlib import Path
 from typing import Annotated, Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..envs.spec import Discrete, EnvSpec
 from ..models import Backend
 from ..models.errors import InputError, require
 from ..models.fields import Limits, read_table
+from .config import Config
 from .episodes import Episode, Position, ResumeError
 from .networks import Floats, named, part_of
 from .policies import NetworkPolicy, flat_size
@@ -65,7 +65,7 @@ class Checkpoint:
     """Env steps that the whole training is to have."""
     actor: Mapping[str, Floats]
     """Weights for `NetworkPolicy`."""
-    state: Mapping[str, NDArray[Any]]
+    state: Mapping[str, np.ndarray]
     """State of the agent."""
     position: Position
     versions: dict[str, str] = field(default_factory=lambda: software_versions())
@@ -76,7 +76,7 @@ class Checkpoint:
         return self.spec.env_id
 
     @property
-    def options(self) -> dict[str, Any]:
+    def options(self) -> dict[str, object]:
         """Every option of the env."""
         return dict(self.spec.options)
 
@@ -84,6 +84,11 @@ class Checkpoint:
     def num_envs(self) -> int:
         """Drones that it trains with; 0 of a policy alone."""
         return len(self.position.numbers)
+
+    @property
+    def hyperparameters(self) -> Config:
+        """Those of `config`. Raises `InputError` for wrong ones."""
+        return preset(self.algorithm, "tuned", **self.config)
 
     def policy_alone(self) -> "Checkpoint":
         """Without the state and the position, which only a training needs."""
@@ -99,7 +104,7 @@ class Checkpoint:
     def policy(self, spec: EnvSpec | None = None) -> NetworkPolicy:
         """The policy, ready to fly that env or its own. Raises `InputError` if it does not fit."""
         squash = ALGORITHMS[self.algorithm].squashed
-        config = preset(self.algorithm, "tuned", **self.config)
+        config = self.hyperparameters
         return NetworkPolicy.load(self.actor, spec or self.spec, config, squash=squash)
 
     def other_versions(self) -> dict[str, tuple[str, str]]:
@@ -162,7 +167,7 @@ def load(path: Path) -> Checkpoint:
         raise CheckpointError(f"{path}: expected a rotorgram checkpoint: {reason:.200}") from None
 
 
-def _read(data: bytes, parse: Callable[[bytes], dict[str, NDArray[Any]]]) -> Checkpoint:
+def _read(data: bytes, parse: Callable[[bytes], dict[str, np.ndarray]]) -> Checkpoint:
     found = _CHECKSUM.search(data)
     checksum = hashlib.sha256(_with_checksum(data, b"0" * 64)).hexdigest().encode()
     if found is None or found[1] != checksum:
@@ -207,7 +212,7 @@ class _Meta:
     backend: Backend = "mujoco"
     seed: Annotated[int, Limits(0, 2**62, whole=True)]
     env_steps: Annotated[int, Limits(0, 2**62, whole=True)]
-    position: dict[str, Any]
+    position: dict[str, object]
     """As `_Progress`."""
     versions: dict[str, str]
 
@@ -222,7 +227,7 @@ class _Meta:
             raise InputError(f"versions: expected values by name, got {self.versions!r:.80}")
 
 
-def _position(meta: _Meta, arrays: Mapping[str, NDArray[Any]], spec: EnvSpec) -> Position:
+def _position(meta: _Meta, arrays: Mapping[str, np.ndarray], spec: EnvSpec) -> Position:
     """The position of a training, or of a policy alone."""
     progress = read_table(_Progress, meta.position, "position")
     position = _no_position(progress.env_steps, progress.seconds)
@@ -250,7 +255,7 @@ def _with_checksum(data: bytes, checksum: bytes) -> bytes:
     return _CHECKSUM.sub(b'"sha256":"%s"' % checksum, data, count=1)
 
 
-def _is_finite(name: str, array: NDArray[Any]) -> bool:
+def _is_finite(name: str, array: np.ndarray) -> bool:
     # Without metrics the error of an episode is NaN, which is no divergence.
     allowed = name == "episodes/mean_size"
     return allowed or array.dtype.kind != "f" or bool(np.isfinite(array).all())

@@ -6,7 +6,6 @@ keeps no simulator's state: it resets to the same seed and repeats the same acti
 
 import time
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,7 +58,7 @@ class Position:
     env_steps: int
     seconds: float
     """Wall time since training began, s."""
-    actions: NDArray[Any]
+    actions: np.ndarray
     """Actions of the env: float32, shape (t, N, k), or int64, shape (t, N), for the t steps of the
     longest running episode."""
     observations: Floats
@@ -116,7 +115,7 @@ class EpisodeRecorder:
         self._seeds = np.zeros(count, np.uint64)
         self._all = np.ones(count, bool)
         self._nothing = np.full(count, np.nan)
-        self._flown: list[NDArray[Any]] = []  # actions; at least those of the running episodes
+        self._flown: list[np.ndarray] = []  # actions; at least those of the running episodes
         self._steps: list[NDArray[np.float64]] | None = [] if keep_steps else None
         self._still = self.actions.to_envs(np.zeros((count, self.actions.size), np.float32))
 
@@ -154,7 +153,7 @@ class EpisodeRecorder:
         self.advance(self.actions.to_envs(actions), begins, frozen)
 
     def advance(
-        self, sent: NDArray[Any], begins: Mask | None = None, frozen: Mask | None = None
+        self, sent: np.ndarray, begins: Mask | None = None, frozen: Mask | None = None
     ) -> None:
         """The same with actions of the env, shape (N, k), or (N,) if discrete."""
         env = self.env
@@ -233,7 +232,7 @@ class EpisodeRecorder:
         self.env_steps = position.env_steps
         self._began = time.perf_counter() - position.seconds
 
-    def steps(self) -> dict[str, NDArray[Any]]:
+    def steps(self) -> dict[str, np.ndarray]:
         """Every step that was flown, in the order of flight, those of one moment drone by drone.
 
         `episode` (int64), and float32 of the shape (T,): `value` of the headline metric, `reward`,
@@ -242,7 +241,7 @@ class EpisodeRecorder:
         if self._steps is None:
             raise ValueError("steps: expected a recorder with keep_steps")
         table = np.concatenate([np.zeros((0, 4)), *self._steps])
-        columns: dict[str, NDArray[Any]] = {"episode": table[:, 0].astype(np.int64)}
+        columns: dict[str, np.ndarray] = {"episode": table[:, 0].astype(np.int64)}
         for place, name in enumerate(("value", "reward", "thrust"), 1):
             columns[name] = table[:, place].astype(np.float32)
         return columns

@@ -2,13 +2,14 @@
 
 import math
 import re
-from typing import Any, ClassVar, Final
+from typing import ClassVar, Final
 
 import numpy as np
 
 from ..envs.spec import ArraySpec, EnvSpec
 from ..models.errors import InputError
-from .policies import flat
+from .networks import Floats
+from .policies import Observation, flat
 
 DAMPING: Final = 0.5  # Damping ratio of a payload's swing
 FILTER: Final = 20.0  # Filters forget so many times faster than the position loop answers
@@ -35,7 +36,7 @@ class Geometric:
     """
 
     label: ClassVar[str] = "Geometric"
-    options: ClassVar[dict[str, Any]] = {"action": "position"}
+    options: ClassVar[dict[str, str]] = {"action": "position"}
     """Options of the env that it flies."""
 
     def __init__(self, spec: EnvSpec) -> None:
@@ -82,7 +83,7 @@ class Geometric:
         self._moving = np.zeros(3)
         self._pushed = np.zeros(3)
 
-    def act(self, observation: Any) -> Any:
+    def act(self, observation: Observation) -> Floats:
         """Offset and heading as the env's action, float32, shape (4,)."""
         numbers = flat(observation, self._spec).astype(np.float64)
         now = {name: numbers[at] for name, at in self._at.items()}
@@ -100,11 +101,12 @@ class Geometric:
         turn = -math.atan2(s, c)
         action = np.array((c * x + s * y, c * y - s * x, z, turn)) / self._units
         action[:2] /= max(1.0, math.hypot(*action[:2]))
-        return np.clip(action, -1.0, 1.0).astype(np.float32)
+        clipped: Floats = np.clip(action, -1.0, 1.0).astype(np.float32)
+        return clipped
 
     def _steadied(
-        self, now: dict[str, np.ndarray], before: dict[str, np.ndarray], goes: Any
-    ) -> Any:
+        self, now: dict[str, np.ndarray], before: dict[str, np.ndarray], goes: np.ndarray
+    ) -> np.ndarray:
         """The offset at which the loops ask for the acceleration of `swing_gains`, m."""
         assert self._swing is not None
         faster = (now["force"] - before["force"]) / self._period
@@ -113,9 +115,10 @@ class Geometric:
         seen = (from_goal, moves, *(now[name] for name in _PAYLOAD), now["force"], faster)
         wanted = goes - self._pushed - self._swing @ np.array(seen)
         k = self._gain
-        return wanted / (OVER * k * k) + now["velocity"] / k
+        offset: np.ndarray = wanted / (OVER * k * k) + now["velocity"] / k
+        return offset
 
-    def _follow(self, now: dict[str, np.ndarray]) -> Any:
+    def _follow(self, now: dict[str, np.ndarray]) -> np.ndarray:
         """Filter the goal's velocity and what pushes; return the goal's acceleration, m/s²."""
         before = self._before
         period = self._period
@@ -130,7 +133,7 @@ class Geometric:
         if np.abs(moving).max() > JUMP * self._units[0] * self._gain:
             self._moving = np.zeros(3)
             return np.zeros(3)
-        change = self._share * (moving - self._moving)
+        change: np.ndarray = self._share * (moving - self._moving)
         self._moving = self._moving + change
         return change / period
 

@@ -77,7 +77,7 @@ class Learner:
     def __init__(
         self,
         networks: Networks,
-        config: Any,
+        config: Config,
         rng: np.random.Generator,
         memory: Floats,
     ) -> None:

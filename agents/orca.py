@@ -6,13 +6,14 @@ Robotics Research, STAR 70, Springer 2011, in three dimensions.
 
 import math
 import re
-from typing import Any, ClassVar, Final
+from typing import ClassVar, Final
 
 import numpy as np
 
 from ..envs.spec import ArraySpec, EnvSpec
 from ..models.errors import InputError, expect
-from .policies import flat
+from .networks import Floats
+from .policies import Observation, flat
 
 HORIZON: Final = 3.0  # Time ahead for which nothing may touch, s
 ROOM: Final = 1.15  # Spheres are taken for larger, since a velocity is not reached at once
@@ -39,7 +40,7 @@ class Orca:
     """
 
     label: ClassVar[str] = "ORCA"
-    options: ClassVar[dict[str, Any]] = {"action": "velocity"}
+    options: ClassVar[dict[str, str]] = {"action": "velocity"}
     """Options of the env that it flies."""
 
     def __init__(self, spec: EnvSpec) -> None:
@@ -68,7 +69,7 @@ class Orca:
     def reset(self) -> None:
         """Nothing of an episode is kept."""
 
-    def act(self, observation: Any) -> Any:
+    def act(self, observation: Observation) -> Floats:
         """Velocity and yaw rate as the env's action, float32, shape (4,)."""
         numbers = flat(observation, self._spec).astype(np.float64).tolist()
 

@@ -1,12 +1,14 @@
 """A hand-tuned PID controller: the classical baseline of `Elevation-v0`."""
 
 from collections.abc import Mapping
-from typing import Any, ClassVar, Final
+from typing import ClassVar, Final
 
 import numpy as np
 
 from ..envs.spec import EnvSpec
 from ..models.errors import InputError
+from .networks import Floats
+from .policies import Observation
 
 ENV_ID: Final = "rotorgram/Elevation-v0"
 GRAVITY: Final = 9.8  # m/s²: the paper's
@@ -28,7 +30,7 @@ class PID:
     """
 
     label: ClassVar[str] = "PID"
-    options: ClassVar[dict[str, Any]] = {}
+    options: ClassVar[dict[str, str]] = {}
     """Options of the env that it needs."""
 
     def __init__(self, spec: EnvSpec) -> None:
@@ -57,7 +59,7 @@ class PID:
         """Forget the integral."""
         self._integral = 0.0
 
-    def act(self, observation: Any) -> Any:
+    def act(self, observation: Observation) -> Floats:
         """Change of thrust, or thrust over hover, as the env's action, float32, shape (1,)."""
         own = observation[self._name] if isinstance(observation, Mapping) else observation
         error, rate, thrust = own.tolist()[-3:]  # the newest of a history

@@ -1,7 +1,7 @@
 """Policies for flying, in plain NumPy: such small nets need no tensor library."""
 
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -11,6 +11,11 @@ from .config import Config
 from .heads import Categorical, Gaussian, Head
 from .networks import Floats, Layer, Normalise, Tanh, Weights, make_network
 
+Observation = np.ndarray | Mapping[str, np.ndarray]
+"""As an env gives it."""
+Action = np.ndarray | int
+"""As an env takes it."""
+
 
 class Policy(Protocol):
     """Chooses actions: called once for each control step."""
@@ -18,11 +23,11 @@ class Policy(Protocol):
     def reset(self) -> None:
         """Forget the last episode."""
 
-    def act(self, observation: Any) -> Any:
+    def act(self, observation: Observation) -> Action:
         """The action for an observation, both as the env has them."""
 
 
-def flat(observations: Any, spec: EnvSpec, *lead: int) -> np.ndarray:
+def flat(observations: Observation, spec: EnvSpec, *lead: int) -> np.ndarray:
     """Observations as networks take them: float32, shape (*lead, n).
 
     Given is an array of shape (*lead, ...), or a mapping with one for each array of the spec.
@@ -209,7 +214,7 @@ class NetworkPolicy:
             values = layer.forward(values)
         return values
 
-    def act(self, observation: Any) -> Any:
+    def act(self, observation: Observation) -> Action:
         """The most likely action, inside the bounds of the env."""
         seen = flat(observation, self.spec, 1)
         if self.network.memory:

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 import numpy as np
 
@@ -54,18 +54,15 @@ class PPO(A2C):
     config: PPOConfig
     epsilon = 1e-5  # as in Stable-Baselines3 and in Schulman's code
 
-    def __init__(self, *parts: Any) -> None:
-        super().__init__(*parts)
-        self._shares = np.ones_like(self.weights.values)
-        critic_rate = self.config.critic_learning_rate
-        if critic_rate is not None:
-            critic = self.weights.part("critic.").values.size
-            self._shares[-critic:] = critic_rate / self.config.learning_rate
-
     @property
     def rates(self) -> Floats:
         """Learning rate of every weight in the next update, float32."""
-        return np.float32(self.rate) * self._shares
+        rates = np.full_like(self.weights.values, self.rate)
+        critic_rate = self.config.critic_learning_rate
+        if critic_rate is not None:
+            critic = self.weights.part("critic.").values.size
+            rates[-critic:] *= critic_rate / self.config.learning_rate
+        return rates
 
     def update(self, rollout: Rollout) -> None:
         """Learn from a rollout: by `epochs` times `minibatches` steps of Adam."""

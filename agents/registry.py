@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 class Agent(Protocol):
-    """What learns. Its class has `create(log, config, seed)`."""
+    """What learns. Its class has `create(log, config, seed)`; SB3's has no `set_state`."""
 
     def train(self, log: EpisodeRecorder, env_steps: int, on_update: OnUpdate) -> None:
         """Train until the log counts `env_steps`, from the current state on. Raises `Diverged`."""
@@ -44,18 +44,14 @@ class Agent(Protocol):
     def state(self) -> dict[str, np.ndarray]:
         """All that the next update depends on, if it resumes; at least all weights."""
 
+    def set_state(self, state: Mapping[str, np.ndarray]) -> None:
+        """Take over a state. Raises `ValueError` or `KeyError` unless it is whole."""
+
     def start_from(self, kept: "Checkpoint") -> None:
         """Take over networks. Raises `ValueError` or `KeyError` unless they fit."""
 
     def scalars(self) -> dict[str, float]:
         """Numbers of the last update by SB3's names; none before the first."""
-
-
-class Resumable(Agent, Protocol):
-    """An agent that goes on where it stopped."""
-
-    def set_state(self, state: Mapping[str, np.ndarray]) -> None:
-        """Take over a state. Raises `ValueError` or `KeyError` unless it is whole."""
 
 
 Colors = tuple[str, str]

@@ -17,11 +17,8 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from ..agents import (
     NETWORK_FIELDS,
-    A2CConfig,
     AlgorithmName,
     Episode,
-    PPOConfig,
-    VPGConfig,
     find_algorithm,
     find_preset,
     load,
@@ -52,8 +49,6 @@ _FREE: Final = ("resume", "listen", "num_simulators", "key_file", "insecure", "r
                 "store_every", "env", "vehicle", "env_steps")  # fmt: skip
 """Flags that a resumed training may be given."""
 _UPDATE_WITHIN: Final = 2.0  # s
-_LEAST_STEPS: Final = 16  # of each drone for an update of A2C
-_LEAST_UPDATES: Final = 30  # of VPG
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,8 +120,6 @@ class Train(AgentFlags, BackendFlags):
         if self.num_envs is None:  # whole worlds
             chosen["num_envs"] = max(base.num_envs // self.drones, 1) * self.drones
         run = Run(config=config, **{**self.settings(Run), **chosen})
-        if advice := _advice(run):
-            print(f"note: {advice}", flush=True)
         required = bool(self.options) or "env" in self.given
         with (
             folder_to_write(self.out, f"{run.algorithm}-seed{run.seed}") as folder,
@@ -233,37 +226,6 @@ class Train(AgentFlags, BackendFlags):
         print(f"{flown / training.log.seconds:,.0f} env steps per second")
         print(f"checkpoint: {folder / CHECKPOINT}" if finished else go_on)
         return 0 if finished else 128 + signal.SIGINT
-
-
-def _advice(run: Run) -> str:
-    """Advice if an update has too little data of so many drones; empty if not."""
-    drones = run.num_envs
-    config = run.config
-    if drones == 1 or "episode_length" not in run.options:
-        return ""
-    if isinstance(config, PPOConfig):  # many updates with each transition
-        return ""
-    if isinstance(config, A2CConfig):
-        steps = config.rollout_size(drones) // drones
-        if steps >= _LEAST_STEPS:
-            return ""
-        better = 2 * _LEAST_STEPS * drones
-        return (
-            f"an update has {steps} steps of each of {drones} drones, and {run.algorithm} learns "
-            f"little from fewer than {_LEAST_STEPS}: try --set steps_per_update={better}, a higher "
-            f"learning_rate, and --env-steps {100 * better} or more"
-        )
-    if not isinstance(config, VPGConfig):
-        return ""
-    whole = -(-config.episodes_per_update // drones) * drones * run.options["episode_length"]
-    updates = run.env_steps // whole
-    if updates >= _LEAST_UPDATES:
-        return ""
-    return (
-        f"{run.env_steps:,} env steps of {drones} drones may be as few as {updates} updates, and "
-        f"vpg learns little from fewer than {_LEAST_UPDATES}: try --env-steps "
-        f"{_LEAST_UPDATES * whole} or more, or fewer drones"
-    )
 
 
 class _Keeper:

@@ -10,7 +10,7 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import pandas as pd
 
@@ -133,7 +133,7 @@ def _verdict(verdict: Verdict) -> str:
     )
 
 
-def _settings(results: Results) -> dict[str, dict[str, Any]]:
+def _settings(results: Results) -> dict[str, dict[str, object]]:
     """Settings by the title of their list."""
     study = results.study.to_dict()
     rows = study.pop("rows")
@@ -144,7 +144,7 @@ def _settings(results: Results) -> dict[str, dict[str, Any]]:
     return {**found, "versions": results.config["versions"], "machine": results.config["machine"]}
 
 
-def _listing(title: str, values: dict[str, Any]) -> str:
+def _listing(title: str, values: dict[str, object]) -> str:
     items = []
     for name, value in values.items():
         text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)

@@ -105,7 +105,7 @@ def write_config(folder: Path, command: str, study: Study, specs: Mapping[str, E
     write_whole(folder / CONFIG_FILE, (json.dumps(content, indent=2) + "\n").encode())
 
 
-def machine() -> dict[str, Any]:
+def machine() -> dict[str, object]:
     """Machine on which times depend."""
     return {
         "platform": platform.platform(),
@@ -152,19 +152,10 @@ def join_parts(folder: Path) -> None:
         schema = pa.unify_schemas([pq.read_schema(file).remove_metadata() for file in files])
         with pq.ParquetWriter(folder / f"{name}.parquet", schema, compression="zstd") as writer:
             for file in files:
-                writer.write_table(_with_schema(pq.read_table(file), schema))
+                parted = [schema.empty_table(), pq.read_table(file)]  # it may lack columns
+                writer.write_table(pa.concat_tables(parted, promote_options="permissive"))
     # Whole or not at all: a half-removed part would look like one to resume from.
     shutil.rmtree(parts.rename(parts.with_name(f".{PARTS}")))
-
-
-def _with_schema(table: pa.Table, schema: pa.Schema) -> pa.Table:
-    """The table with all columns of a schema; missing values in those that it lacks."""
-    columns = [
-        table[column.name].cast(column.type) if column.name in table.column_names
-        else pa.nulls(len(table), column.type)
-        for column in schema
-    ]  # fmt: skip
-    return pa.table(columns, schema=schema)
 
 
 def _parts_of(folder: Path, name: str) -> list[Path]:

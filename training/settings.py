@@ -148,7 +148,7 @@ class Row:
         except InputError as error:
             raise InputError(f"{self.name}: {error}") from None
 
-    def _set(self, **values: Any) -> None:
+    def _set(self, **values: object) -> None:
         for name, value in values.items():
             object.__setattr__(self, name, value)
 
@@ -228,7 +228,7 @@ class Row:
         return {**content, "set": dict(self.set), "env": keywords_of(self.env)}
 
     @classmethod
-    def from_dict(cls, where: str, table: Any, env: Mapping[str, Any] | None = None) -> "Row":
+    def from_dict(cls, where: str, table: object, env: Mapping[str, Any] | None = None) -> "Row":
         """A row from a table of TOML or JSON, whose `env` adds to the given keywords.
 
         Raises `InputError`, whose sentence begins with `where`.
@@ -244,7 +244,7 @@ class Row:
             raise InputError(f"{where}: {error}") from None
 
 
-def _word(value: Any) -> str:
+def _word(value: object) -> str:
     """A value for a name: without quotes, and of a long one, as a track, its digest."""
     text = value if isinstance(value, str) else json.dumps(value)
     if len(text) > _LONGEST_WORD:
@@ -318,7 +318,7 @@ class Study:
         return {**content, "rows": [row.to_dict() for row in self.rows]}
 
     @classmethod
-    def from_dict(cls, where: str, content: Any) -> "Study":
+    def from_dict(cls, where: str, content: object) -> "Study":
         """Raises `InputError`, whose sentence begins with `where`."""
         given = _fields(where, content, cls)
         rows = [
@@ -358,13 +358,13 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: expected a TOML file of rows, got: {error}") from None
 
 
-def _table(where: str, table: Any) -> dict[str, Any]:
+def _table(where: str, table: object) -> dict[str, Any]:
     if not isinstance(table, dict):
         raise InputError(f"{where}: expected a table, got {table!r:.80}")
     return dict(table)
 
 
-def _fields(where: str, table: Any, kind: type[Row | Study]) -> dict[str, Any]:
+def _fields(where: str, table: object, kind: type[Row | Study]) -> dict[str, Any]:
     """The table. Raises `InputError` unless each name is a field."""
     given = _table(where, table)
     check_names(given, [one.name for one in fields(kind)], where)

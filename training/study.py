@@ -15,6 +15,7 @@ import pandas as pd
 from ..agents import CONTROLLERS
 from ..agents.checkpoints import Checkpoint, store
 from ..agents.policies import Policy
+from ..envs.autoreset import AdvancingVectorEnv
 from ..envs.config import EnvConfig
 from ..envs.registry import env_spec, load
 from ..envs.spec import EnvSpec
@@ -137,7 +138,7 @@ def _constant(policy: Policy) -> Callable[[EnvSpec], Policy]:
 
 
 @contextmanager
-def open_env(wire: bool, config: EnvConfig, num_envs: int) -> Iterator[Any]:
+def open_env(wire: bool, config: EnvConfig, num_envs: int) -> Iterator[AdvancingVectorEnv]:
     """An env of so many drones without autoreset: over UDP with a simulator process that the next
     run of this process uses again, or in process.
     """
@@ -152,7 +153,7 @@ def open_env(wire: bool, config: EnvConfig, num_envs: int) -> Iterator[Any]:
 
 
 def _evaluate(
-    study: Study, row: Row, seed: int, stages: Sequence[Stage], times: dict[str, Any]
+    study: Study, row: Row, seed: int, stages: Sequence[Stage], times: dict[str, float]
 ) -> dict[str, pd.DataFrame]:
     """Tables of the evaluation of all stages: the last on `study.episodes` episodes of its own,
     each before it on `study.curve_episodes` of the set `curve`.

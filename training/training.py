@@ -3,12 +3,13 @@
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from .. import agents
 from ..agents import Checkpoint, CheckpointError
+from ..agents.config import RolloutConfig
 from ..envs.autoreset import AdvancingVectorEnv
 from ..flights.executors import Tell
 from ..models.errors import InputError
@@ -29,14 +30,15 @@ class Snapshot:
 def is_finished(kept: Checkpoint) -> bool:
     """Whether a training has flown all its env steps. Raises `ResumeError` for a policy alone."""
     kept.check_resumable()
-    config = agents.preset(kept.algorithm, "tuned", **kept.config)
     left = kept.env_steps - kept.position.env_steps
-    return left < _least_flown(kept.algorithm, config, kept.num_envs)
+    return left < _least_flown(kept.algorithm, kept.hyperparameters, kept.num_envs)
 
 
-def _least_flown(algorithm: str, config: Any, num_envs: int) -> int:
+def _least_flown(algorithm: str, config: agents.Config, num_envs: int) -> int:
     """Env steps that a training flies at least: SB3 flies whole rollouts only."""
-    return int(config.rollout_size(num_envs)) if not agents.find_algorithm(algorithm).resumes else 1
+    if agents.find_algorithm(algorithm).resumes or not isinstance(config, RolloutConfig):
+        return 1
+    return config.rollout_size(num_envs)
 
 
 @dataclass
@@ -79,9 +81,9 @@ class Training:
         kept.check_resumable()
         try:
             names = ("algorithm", "env_id", "options", "backend", "seed", "env_steps", "num_envs")
-            config = agents.preset(kept.algorithm, "tuned", **kept.config)
             kept_settings = {name: getattr(kept, name) for name in names}
-            run = Run(config=config, drones=len(kept.spec.agents), **kept_settings)
+            drones = len(kept.spec.agents)
+            run = Run(config=kept.hyperparameters, drones=drones, **kept_settings)
         except (InputError, TypeError, ValueError) as error:
             raise CheckpointError(f"checkpoint: its parts do not fit together: {error}") from None
         return cls(run, env, kept=kept)
@@ -178,7 +180,7 @@ class Training:
 
 def train_run(
     run: Run, env: AdvancingVectorEnv, tell: Tell, snapshots: int = 0, keep_steps: bool = False
-) -> tuple[Training, dict[str, Any]]:
+) -> tuple[Training, dict[str, float]]:
     """Train to the end: the training, and its `env_steps`, `seconds` and `steps_per_second`."""
     training = Training(run, env, snapshots=snapshots, keep_steps=keep_steps)
     training.train(tell=tell)

@@ -10,11 +10,9 @@ import numpy as np
 import pytest
 from drones import Kept, log_of
 from rotorgram.agents import EpisodeRecorder, PPOConfig, find_preset, load, make_agent
-from rotorgram.agents.optimizers import clip_norm
 from rotorgram.agents.ppo import PPO
-from rotorgram.envs import LocalVectorEnv
 from rotorgram.models.errors import InputError
-from test_learning import copy_weights, rollout, train_both
+from test_learning import rollout, train_both
 
 SMALL = PPOConfig(gamma=0.5, gae_lambda=0.5, steps_per_update=3, epochs=1, minibatches=1)
 
@@ -119,6 +117,8 @@ def test_sb3_and_ours_make_the_same_updates_of_the_same_experience() -> None:
     log = EpisodeRecorder(env, seed=0)
     theirs: Any = make_agent("sb3-ppo", log, config, 0)
     ours = PPO.create(log, config, seed=1)
+    epsilons = {group["eps"] for group in theirs.model.policy.optimizer.param_groups}
+    assert epsilons == {PPO.epsilon} == {1e-5}  # fault 67
     for here, there in train_both(theirs, ours, env, log, 512):
         assert here["train/clip_fraction"] == pytest.approx(there["train/clip_fraction"], abs=0.02)
         assert here["train/value_loss"] == pytest.approx(there["train/value_loss"], rel=2e-3)
@@ -130,48 +130,6 @@ def test_sb3_and_ours_make_the_same_updates_of_the_same_experience() -> None:
     assert ours.optimizer.steps == 40
     for name, expected in theirs.actor().items():
         np.testing.assert_allclose(ours.actor()[name], expected, atol=2e-4, err_msg=name)
-
-
-def test_sb3_and_ours_make_the_same_steps_of_the_same_minibatches() -> None:
-    """Four drones; SB3 draws the minibatches."""
-    config = PPOConfig(
-        steps_per_update=128, gamma=0.98, learning_rate=0.003, critic_learning_rate=0.01, epochs=3,
-        minibatches=4, ent_coef=0.01,
-    )  # fmt: skip
-    env: Any = LocalVectorEnv("rotorgram/Hover-v0", 4, autoreset_mode="Disabled")
-    log = EpisodeRecorder(env, seed=0)
-    theirs: Any = make_agent("sb3-ppo", log, config, 0)
-    ours = PPO.create(log, config, seed=1)
-    assert {group["eps"] for group in theirs.model.policy.optimizer.param_groups} == {1e-5}
-    copy_weights(theirs, ours)
-    get = theirs.model.rollout_buffer.get
-    parts = []
-
-    def keep(size: int) -> Any:
-        for part in get(size):
-            parts.append(part)
-            yield part
-
-    theirs.model.rollout_buffer.get = keep
-    clipped: list[float] = []
-
-    def follow() -> bool:
-        for part in parts:
-            terms = ours.minibatch(
-                *(tensor.numpy() for tensor in (part.observations, part.actions, part.old_log_prob,
-                                                part.advantages, part.returns))
-            )  # fmt: skip
-            clip_norm(ours.weights.slopes, config.max_grad_norm)
-            ours.optimizer.step(ours.rates)
-            clipped.append(terms[4])
-        parts.clear()
-        return True
-
-    theirs.train(log, 4 * 128, follow)
-    assert len(clipped) == 4 * 3 * 4
-    assert max(clipped) > 0
-    for name, expected in theirs.actor().items():
-        np.testing.assert_allclose(ours.actor()[name], expected, atol=5e-5, err_msg=name)
 
 
 def test_the_tuned_preset_depends_on_the_task() -> None:
@@ -195,28 +153,6 @@ def test_the_tuned_preset_depends_on_the_task() -> None:
         assert crossing == replace(swarm, env_id="rotorgram/Crossing-v0")
     with pytest.raises(InputError, match="preset: expected tuned for ppo, got 'paper'"):
         find_preset("ppo", "paper")
-
-
-@pytest.mark.parametrize(
-    ("task", "backend", "drones", "gamma", "gae_lambda", "log_std"),
-    [
-        ("PayloadHover", "mujoco", 128, 0.98, 0.95, -1.0),  # `rigid` has no payload
-        ("Landing", "rigid", 512, 0.99, 0.95, -1.0),
-        ("Recovery", "rigid", 512, 0.98, 0.97, -0.5),
-    ],
-)
-def test_presets_of_flights_are_variations_of_hover_s(
-    task: str, backend: str, drones: int, gamma: float, gae_lambda: float, log_std: float
-) -> None:
-    found = find_preset("ppo", "tuned", f"rotorgram/{task}-v0")
-    config = found.config
-    assert isinstance(config, PPOConfig)
-    assert found.backend == backend
-    assert found.num_envs == drones
-    assert config.gamma == gamma
-    assert config.gae_lambda == gae_lambda
-    assert config.log_std == log_std
-    assert config.rollout_size(drones) == 32 * drones
 
 
 def test_training_by_the_command_takes_the_preset_s_drones_and_loads_no_torch(

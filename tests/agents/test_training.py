@@ -1,4 +1,4 @@
-"""Trainings: wrong ones are refused, progress, resuming, and the advice of `rotorgram train`."""
+"""Trainings: wrong ones are refused, progress and resuming."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -109,44 +109,6 @@ def test_what_cannot_be_resumed_is_refused() -> None:
         Training.resume(replace(kept, config={**kept.config, "hidden": 8}), env_of(run))
     with pytest.raises(CheckpointError, match="its parts do not fit together: seed: expected"):
         Training.resume(replace(kept, seed=-1), env_of(run))
-
-
-@pytest.mark.parametrize(
-    ("algorithm", "settings", "note"),
-    [
-        ("a2c", ("--num-envs", 16), ""),
-        (
-            "sb3-a2c",
-            ("--num-envs", 18),
-            "note: an update has 15 steps of each of 18 drones, and sb3-a2c learns little from "
-            "fewer than 16: try --set steps_per_update=576, a higher learning_rate, and "
-            "--env-steps 57600 or more\n",
-        ),
-        # Rounds of 4 episodes of 5 steps: 30 updates, and one less.
-        ("vpg", ("--num-envs", 4, "--env-steps", 600), ""),
-        (
-            "vpg",
-            ("--num-envs", 4, "--env-steps", 599),
-            "note: 599 env steps of 4 drones may be as few as 29 updates, and vpg learns little "
-            "from fewer than 30: try --env-steps 600 or more, or fewer drones\n",
-        ),
-    ],
-)
-def test_train_says_where_the_drones_are_too_many(
-    algorithm: str,
-    settings: tuple[object, ...],
-    note: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    arguments = ["train", algorithm, "--env-steps", 600, "--episode-length", 5]
-    folder = tmp_path / "run"
-    assert main([str(a) for a in (*arguments, *settings, "--out", folder)]) == 0
-    out = capsys.readouterr().out
-    assert out.startswith(note)
-    anew = f"note: {algorithm} keeps no state of a training: --resume starts it anew\n"
-    assert (anew in out) == algorithm.startswith("sb3-")
-    assert out.replace(anew, "").count("note: ") == bool(note)
 
 
 def test_a_stopped_run_of_sb3_starts_anew_and_says_so(
