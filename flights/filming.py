@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from ..envs.rendering import moment
 from ..models.errors import InputError
 from ..rendering import Camera, Canvas, MetricValue, Moment, Stage
-from ..rendering.film import QUALITY, Overlay, check_film, graph_scale, write_film
+from ..rendering.film import QUALITY, check_film, write_film
+from ..rendering.overlay import Overlay, graph_scale
 from ..scenes import parse_scene
 from .distances import least
 from .trajectories import Trajectory

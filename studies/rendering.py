@@ -25,8 +25,8 @@ from rotorgram.flights.filming import Film, FilmTrack, film, moments
 from rotorgram.flights.trajectories import Trajectory, flown_trajectories
 from rotorgram.models import Vehicle
 from rotorgram.rendering import Canvas, Moment, Stage
-from rotorgram.rendering.film import Overlay
 from rotorgram.rendering.gl import offscreen_context
+from rotorgram.rendering.overlay import Overlay
 
 SIZES = ((640, 360), (1280, 720))
 ENV = "rotorgram/Elevation-v0"

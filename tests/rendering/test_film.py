@@ -23,7 +23,8 @@ from rotorgram.flights.filming import Film, FilmTrack, film, grid
 from rotorgram.flights.trajectories import Trajectory
 from rotorgram.models import InputError, Vehicle
 from rotorgram.rendering import MetricValue
-from rotorgram.rendering.film import Overlay, check_film, poster, write_film
+from rotorgram.rendering.film import check_film, poster, write_film
+from rotorgram.rendering.overlay import Overlay
 
 FAST = Film(width=WIDTH, height=HEIGHT, scene="plain", fast=True, overlay=False)
 

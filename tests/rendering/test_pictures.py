@@ -13,7 +13,7 @@ import pytest
 from pictures import HEIGHT, HEXA, TINY, WIDTH, at, same
 from rotorgram.models import InputError
 from rotorgram.rendering import CAMERAS, Camera, Canvas, Stage
-from rotorgram.rendering.film import Overlay
+from rotorgram.rendering.overlay import Overlay
 
 
 @pytest.fixture(scope="module")
