@@ -5,13 +5,10 @@ once: every observation, reward, flag and telemetry value is that of the env wit
 """
 
 import json
-import multiprocessing
 import subprocess
 from collections import Counter
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
-from hashlib import blake2b
+from contextlib import ExitStack, contextmanager
 from math import sqrt
 from pathlib import Path
 from typing import Any
@@ -19,6 +16,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from fleets import assert_parity, assert_same, sync
 from peers import ANY, ENV_ID, launch
 from relay import FaultConfig, Relay, relaying
 from rotorgram.envs.config import EnvConfig
@@ -156,109 +154,23 @@ def test_one_drone(kind: str, steps: int, tmp_path: Path) -> None:
 # ---- many
 
 
-def actions(drones: int) -> Iterator[np.ndarray]:
-    """float32, shape (drones, 1): the same ones in every process."""
-    dice = np.random.default_rng(9)
-    while True:
-        yield dice.uniform(-1.1, 1.1, (drones, 1)).astype(np.float32)
-
-
-def digest(*arrays: np.ndarray) -> bytes:
-    fingerprint = blake2b(digest_size=16)
-    for array in arrays:
-        fingerprint.update(np.ascontiguousarray(array))
-    return fingerprint.digest()
-
-
-def local_flight(seeds: list[int], steps: int) -> list[bytes]:
-    """Digests of each step of so many envs, stepped and reset by hand."""
-    envs = [gym.make(ENV_ID, disable_env_checker=True, **OPTIONS).unwrapped for _ in seeds]
-    dice = actions(len(envs))
-    rows: list[Any] = [
-        (observation, 0.0, False, False, info)
-        for observation, info in (env.reset(seed=s) for env, s in zip(envs, seeds, strict=True))
-    ]
-    digests = []
-    for _ in range(steps):
-        digests.append(digest_of(rows))
-        for i, action in enumerate(next(dice)):
-            if rows[i][2] or rows[i][3]:
-                observation, info = envs[i].reset()
-                rows[i] = (observation, 0.0, False, False, info)
-            else:
-                rows[i] = envs[i].step(action)
-    return [*digests, digest_of(rows)]
-
-
-def digest_of(rows: list[Any]) -> bytes:
-    observations, rewards, terminated, truncated, infos = zip(*rows, strict=True)
-    telemetry = np.array([[info[name] for name in NAMES] for info in infos])
-    return digest(
-        np.array(observations), np.array(rewards), np.array(terminated), np.array(truncated),
-        telemetry,
-    )  # fmt: skip
-
-
-def remote_flight(env: RemoteVectorEnv, seeds: list[int], steps: int) -> list[bytes]:
-    """The same of a RemoteVectorEnv."""
-    dice = actions(env.num_envs)
-    observations, info = env.reset(seed=seeds)
-    none = np.zeros(env.num_envs)
-    flags = np.zeros(env.num_envs, bool)
-    telemetry = np.column_stack([info[name] for name in NAMES])
-    digests = [digest(observations, none, flags, flags, telemetry)]
-    for _ in range(steps):
-        *arrays, info = env.step(next(dice))
-        digests.append(digest(*arrays, np.column_stack([info[name] for name in NAMES])))
-    return digests
-
-
-def assert_same_digests(remote: list[bytes], local: list[bytes]) -> None:
-    differing = [step for step, (a, b) in enumerate(zip(remote, local, strict=True)) if a != b]
-    assert not differing, f"{len(differing)} steps differ, the first is {differing[0]}"
-
-
-@contextmanager
-def flying_locally(seeds: list[int], steps: int) -> Iterator[Any]:
-    """`local_flight` in another process at the same time."""
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(1, mp_context=context) as pool:
-        yield pool.submit(local_flight, seeds, steps)
-
-
-def test_64_drones() -> None:
-    steps = 500
-    seeds = list(range(1000, 1064))
-    env = RemoteVectorEnv(ANY, num_envs=64, connect=False)
-    with (
-        flying_locally(seeds, steps) as local,
-        relaying(env.address, BAD) as relay,
-        simulating(relay.address, num_envs=64) as process,
-    ):
-        remote = remote_flight(env, seeds, steps)
-        env.close()
-        last, counters = its_end(process)
-        assert_same_digests(remote, local.result())
-    assert last == steps + 2
-    assert_bad(relay, env.statistics.counters, counters)
-    assert env.statistics.counters["sessions"] == 1
-
-
-def test_three_simulators_of_two_drones() -> None:
-    steps = 200
-    seeds = list(range(2000, 2006))
-    env = RemoteVectorEnv(ANY, num_simulators=3, num_envs=6, connect=False)
-    with (
-        flying_locally(seeds, steps) as local,
-        relaying(env.address, BAD) as relay,
-        simulating(relay.address, num_envs=2) as one,
-        simulating(relay.address, num_envs=2) as two,
-        simulating(relay.address, num_envs=2) as three,
-    ):
-        remote = remote_flight(env, seeds, steps)
-        env.close()
-        ends = [its_end(process) for process in (one, two, three)]
-        assert_same_digests(remote, local.result())
-    assert [last for last, _ in ends] == [steps + 2] * 3
-    assert_bad(relay, env.statistics.counters, sum((counters for _, counters in ends), Counter()))
-    assert env.statistics.counters["sessions"] == 3
+@pytest.mark.parametrize(("simulators", "drones", "steps"), [(1, 64, 500), (3, 2, 200)])
+def test_many_drones(simulators: int, drones: int, steps: int) -> None:
+    count = simulators * drones
+    seeds = list(range(1000, 1000 + count))
+    remote = RemoteVectorEnv(ANY, num_simulators=simulators, num_envs=count, connect=False)
+    with ExitStack() as stack:
+        local = stack.enter_context(sync(count, **OPTIONS))
+        relay = stack.enter_context(relaying(remote.address, BAD))
+        processes = []
+        for _ in range(simulators):
+            flying = simulating(relay.address, num_envs=drones)
+            processes.append(stack.enter_context(flying))
+        assert_same(remote.reset(seed=seeds), local.reset(seed=seeds))
+        assert assert_parity(remote, local, steps) > 0
+        remote.close()
+        ends = [its_end(process) for process in processes]
+    assert [last for last, _ in ends] == [steps + 2] * simulators
+    counters = sum((counters for _, counters in ends), Counter())
+    assert_bad(relay, remote.statistics.counters, counters)
+    assert remote.statistics.counters["sessions"] == simulators

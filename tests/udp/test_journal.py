@@ -7,7 +7,6 @@ import logging
 import os
 import re
 import struct
-import subprocess
 import sys
 import textwrap
 import time
@@ -24,12 +23,11 @@ import pytest
 import zstandard
 from mcap.reader import make_reader
 from mcap.writer import Writer
-from peers import ANY, ENV_ID, Running
+from peers import ANY, ENV_ID, Running, launch
 from relay import FaultConfig, relaying
 from rotorgram.cli.replay import Replay
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.loop import Loop
-from rotorgram.envs.spec import EnvSpec
 from rotorgram.models.errors import InputError
 from rotorgram.udp import (
     LinkConfig,
@@ -43,10 +41,8 @@ from rotorgram.udp.journal import Journal, Recording, Summary
 from rotorgram.udp.journal import writer as journal_module
 from rotorgram.udp.journal.reader import MAX_CHUNK
 from rotorgram.udp.journal.replay import Verification
-from rotorgram.udp.layouts import layout_of
 from rotorgram.udp.protocol import binary
 from rotorgram.udp.protocol.auth import write_key
-from rotorgram.udp.protocol.layout import Layout
 from rotorgram.udp.protocol.messages import Close, Command, Hello, Message, State, Welcome
 
 PAGE = Path(__file__).parents[2] / "docs" / "journal.md"
@@ -124,35 +120,15 @@ def datagrams(path: Path, *kinds: type) -> list[bytes]:
 
 
 def rewrite(source: Path, target: Path, change: Callable[[Message], Message]) -> None:
-    """Write a journal again, by other means, with changed messages."""
-    with source.open("rb") as old, target.open("wb") as new:
-        reader = make_reader(old)
-        writer = Writer(new)
-        writer.start()
-        for metadata in reader.iter_metadata():
-            writer.add_metadata(metadata.name, metadata.metadata)
-        channels: dict[int, int] = {}
-        layout: Layout | None = None
-        for schema, channel, message in reader.iter_messages(log_time_order=False):
-            if channel.id not in channels:
-                number = 0
-                if schema:
-                    number = writer.register_schema(schema.name, schema.encoding, schema.data)
-                channels[channel.id] = writer.register_channel(
-                    channel.topic, channel.message_encoding, number
-                )
-            data = message.data
-            if channel.topic.endswith("events"):
-                words = json.loads(data)
-                message_ = binary.decode(bytes.fromhex(words["datagram"]))
-                if isinstance(message_, Hello):
-                    layout = layout_of(EnvSpec.from_json(message_.spec), message_.worlds)
-                changed = change(message_)
-                data = json.dumps(words | {"datagram": binary.encode(changed).hex()}).encode()
-            elif channel.message_encoding == "rotorgram":
-                data = binary.encode(change(binary.decode(data, layout)), layout)
-            writer.add_message(channels[channel.id], message.log_time, data, message.publish_time)
-        writer.finish()
+    """Write a journal again with changed messages."""
+    recording = Recording(source)
+    target.unlink(missing_ok=True)
+    journal = Journal(target, side=recording.about["side"], about=recording.about)
+    for item in recording:
+        message = change(item.message)
+        data = binary.encode(message, item.session.layout)
+        journal.tap(item.session.slot, message, data)
+    journal.close()
 
 
 def flip(array: np.ndarray, *index: int) -> np.ndarray:
@@ -686,19 +662,10 @@ def test_an_event_that_is_nested_too_deep(tmp_path: Path) -> None:
         Summary(path)
 
 
-def test_terminal_escapes_are_not_printed(flight: SimpleNamespace, tmp_path: Path) -> None:
+def test_terminal_escapes_are_not_printed(tmp_path: Path) -> None:
     path = tmp_path / "escape.mcap"
-    with flight.simulator.open("rb") as old, path.open("wb") as new:
-        reader = make_reader(old)
-        writer = Writer(new)
-        writer.start()
-        for metadata in reader.iter_metadata():
-            changed = {
-                name: "\x1b[2J\x9b31m\u202e" if name in ("side", "version of numpy") else text
-                for name, text in metadata.metadata.items()
-            }
-            writer.add_metadata(metadata.name, changed)
-        writer.finish()
+    escapes = dict.fromkeys(("side", "version of numpy"), "\x1b[2J\x9b31m\u202e")
+    Journal(path, side="", about=escapes).close()
     out = str(Summary(path)) + str(Verification(path))
     assert "[2J" in out
     assert all(character.isprintable() or character == "\n" for character in out)
@@ -764,11 +731,6 @@ RECORD = """
     if sys.argv[4:]:
         time.sleep(60)
 """
-
-
-def launch(code: str, *arguments: object) -> subprocess.Popen[str]:
-    command = [sys.executable, "-c", textwrap.dedent(code), *map(str, arguments)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def test_sigkill_costs_at_most_a_second(tmp_path: Path) -> None:

@@ -157,33 +157,19 @@ def test_agent_flies_the_same_whatever_the_network_does(agent: list[str]) -> Non
 
 
 TELEMETRY = ",0,5,0,0,0,0,49,49,49,49,0,5,0,0.5"
+GOLDEN = json.loads((ROOT / "docs" / "golden.json").read_text("utf-8"))
 JUNK_LINES = [
-    b"",
-    b"\n",
+    *[line.encode() for line in GOLDEN["text of env one"]["malformed states"]],
     b"\xff\x00\xa7",
     bytes.fromhex("a7520201"),
-    b"42",
-    b"42,",
-    b"42,close,",
     b"42,close\x00",
     b"42,1,0,0,1,0,0",  # no telemetry
     b"42,1,0,0,1,0,0" + TELEMETRY.encode() + b",1",
-    b"42,nan,0,0,1,0,0" + TELEMETRY.encode(),
-    b"42,1,0,0,inf,0,0" + TELEMETRY.encode(),
-    b"42,1,0,0,1e999,0,0" + TELEMETRY.encode(),
-    b"42,1,0,0,0x1,0,0" + TELEMETRY.encode(),
-    b"42,1,0,2,1,0,0" + TELEMETRY.encode(),
-    b"42,1,0,00,1,0,0" + TELEMETRY.encode(),
-    b"42, 1,0,0,1,0,0" + TELEMETRY.encode(),
     b"42,1,0,0,1,0,." + TELEMETRY.encode(),
     b"42,1,0,0,1,0,1e" + TELEMETRY.encode(),
-    b"-42,1,0,0,1,0,0" + TELEMETRY.encode(),
     b"18446744073709551658,1,0,0,1,0,0" + TELEMETRY.encode(),  # 42 modulo 2^64
-    b"000000000000000000042,1,0,0,1,0,0" + TELEMETRY.encode(),  # 21 digits
     b"042,1,0,0,1,0,0" + TELEMETRY.encode(),
-    b"42,1,0,0,1,0,0" + TELEMETRY.encode() + b"\n\n",
     b"42,1,0,0,1,0,0" + TELEMETRY.encode() + b"\x00",
-    b"42,1,0,0,1,0,0." + b"0" * 1024 + TELEMETRY.encode(),
 ]
 
 
@@ -255,9 +241,6 @@ def test_agent_says_why_it_gives_up(agent: list[str]) -> None:
 
 
 # The simulator in C#.
-
-
-GOLDEN = json.loads((ROOT / "docs" / "golden.json").read_text("utf-8"))
 
 
 def golden(name: str) -> str:

@@ -1,10 +1,9 @@
 """Many drones of one or several simulators: places, and simulators that are lost."""
 
-import json
 import logging
 import re
 import time
-from contextlib import ExitStack, closing
+from contextlib import closing
 from typing import Any
 
 import gymnasium as gym
@@ -19,26 +18,13 @@ from fleets import (
     simulate,
     sync,
 )
-from peers import ANY, ENV_ID, launch, plain_socket
+from peers import ANY, ENV_ID, plain_socket
 from rotorgram.udp import (
     LinkConfig,
     PeerSilent,
     Refused,
     RemoteVectorEnv,
 )
-
-SIMULATE = """
-    import json, sys
-    from rotorgram.udp import LinkConfig, Simulator
-    arguments = json.loads(sys.argv[1])
-    for name in ("server", "bind"):
-        arguments[name] = tuple(arguments[name])
-    config = LinkConfig(timeout=20)
-    with Simulator(config=config, **arguments) as simulator:
-        print(simulator.address[1], flush=True)
-        print(simulator.run())
-"""
-
 
 # ---- places
 
@@ -184,40 +170,25 @@ def test_a_killed_simulator_takes_only_its_own_drones_along(how: str) -> None:
     """Three simulators of two drones; the others' numbers are those of a flight without it."""
     options = {"episode_length": 40}
     same = how == "same address"
-    remote = RemoteVectorEnv(
-        ANY, num_simulators=3, num_envs=6, connect=False, timeout=10 if same else 0.5
-    )
-    with ExitStack() as stack:
-        stack.callback(remote.close)
-
-        def start(bind: tuple[str, int] = ANY) -> Any:
-            arguments = {"server": remote.address, "bind": bind, "num_envs": 2, **options}
-            process = launch(SIMULATE, json.dumps(arguments))
-            stack.callback(process.communicate)
-            stack.callback(process.kill)
-            return process
-
-        processes = [start() for _ in range(3)]
-        ports = [int(process.stdout.readline()) for process in processes]
-        local = stack.enter_context(sync(6, **options))
+    drones = slice(2, 4)
+    others = np.array([0, 1, 4, 5])
+    with flying(3, 2, **options) as (remote, running), sync(6, **options) as local:
+        remote._agent.config.timeout = 10 if same else 0.5
         assert_same(remote.reset(seed=6), local.reset(seed=6))
         assert assert_parity(remote, local, 65) == 6
-        place = 1
-        session = remote._agent.server.slots[place]
+        session = remote._agent.server.slots[1]
         assert session is not None
-        port = session.peer[1]
+        address = session.peer
+        victim = next(one for one in running if one.simulator.address == address)
+        running.remove(victim)
         if how == "another waits":
-            processes.append(start())
-            assert processes[3].stdout.readline()
-        victim = processes.pop(ports.index(port))
+            running.append(simulate(remote, num_envs=2, **options))
         before = local.step(np.zeros((6, 1), np.float32))
         assert_same(remote.step(np.zeros((6, 1))), before)
-        victim.kill()
-        victim.wait()
+        victim.cut()
         if how != "another waits":
-            processes.append(start(("127.0.0.1", port) if same else ANY))
-        drones = slice(2, 4)
-        others = np.array([0, 1, 4, 5])
+            bind = address if same else ANY
+            running.append(simulate(remote, bind=bind, num_envs=2, **options))
         actions = np.full((6, 1), 0.3, np.float32)
         here = remote.step(actions)
         there = local.step(actions)
@@ -230,16 +201,13 @@ def test_a_killed_simulator_takes_only_its_own_drones_along(how: str) -> None:
         reasons = here[4]["simulator_lost"].tolist()
         assert reasons[2] == reasons[3]
         assert reasons[:2] == reasons[4:] == [None, None]
+        sentence = f"no datagram from the simulator at 127.0.0.1:{address[1]} for 0.5 s, waiting at"
         if same:
-            assert reasons[2] == f"the simulator at 127.0.0.1:{port} was started anew"
-        else:
-            sentence = f"no datagram from the simulator at 127.0.0.1:{port} for 0.5 s, waiting at "
-            assert reasons[2].startswith(sentence)
+            sentence = f"the simulator at 127.0.0.1:{address[1]} was started anew"
+        assert reasons[2].startswith(sentence)
         # The others fly on as if nothing had been; the new ones begin with a reset.
-        actions = np.full((6, 1), -0.2, np.float32)
-        here = remote.step(actions)
-        there = local.step(actions)
-        assert_same(here, there, others)
+        here = remote.step(-actions)
+        assert_same(here, local.step(-actions), others)
         assert here[1][drones].tolist() == [0.0, 0.0]
         assert (here[0][drones, 1:] == 0).all()
         assert "simulator_lost" not in here[4]
@@ -251,11 +219,6 @@ def test_a_killed_simulator_takes_only_its_own_drones_along(how: str) -> None:
         assert_same(remote.reset(seed=1), local.reset(seed=1))
         assert_parity(remote, local, 50)
         assert remote.statistics.counters["sessions"] == 4
-        remote.close()
-        for process in processes:
-            out, err = process.communicate(timeout=10)
-            assert process.returncode == 0, err
-            assert out.endswith("the agent closed\n")
 
 
 def test_a_simulator_lost_between_an_episode_and_the_next() -> None:
