@@ -25,6 +25,8 @@ from typing import Final
 import atheris
 import numpy as np
 
+sys.path.append(str(Path(__file__).parent.parent))
+
 with atheris.instrument_imports(include=["rotorgram.udp", "rotorgram.envs.spec"]):
     from targets import fuzz_one, seeds
 

@@ -8,15 +8,15 @@ exception but `DecodeError` from a codec, any from a link, and any promise of do
 """
 
 import struct
-import zlib
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from itertools import count, product
 from typing import Any, Final
 
 import numpy as np
-from rotorgram.envs.spec import ArraySpec, Discrete, EnvSpec, SpecError
-from rotorgram.udp.layouts import layout_of
+from golden import LAYOUTS, SECRET, SESSION, fixed, messages, text_lines
+from golden import ONE as SPEC
+from rotorgram.envs.spec import EnvSpec, SpecError
 from rotorgram.udp.protocol import binary, text
 from rotorgram.udp.protocol.auth import OVERHEAD, Key, is_sealed
 from rotorgram.udp.protocol.client import Address, Client, LinkConfig
@@ -24,23 +24,16 @@ from rotorgram.udp.protocol.errors import DecodeError
 from rotorgram.udp.protocol.fragments import Assembler, is_fragment
 from rotorgram.udp.protocol.layout import Layout
 from rotorgram.udp.protocol.messages import (
-    Alive,
     Close,
     Command,
     Hello,
     Message,
-    Missing,
-    Refuse,
     State,
-    Unknown,
-    Wait,
     Welcome,
 )
 from rotorgram.udp.protocol.server import Server
 from rotorgram.udp.protocol.transitions import AgentState
 
-SECRET: Final = bytes(range(32))
-SESSION: Final = 0x0123456789ABCDEF
 ADDRESSES: Final = [("10.0.0.1", 0), ("10.0.0.1", 1), ("10.6.6.6", 666)]
 """Of two simulators, and of an attacker."""
 
@@ -57,27 +50,7 @@ def expect(promise: bool, *got: object) -> None:
 # ---- codecs
 
 
-SPEC: Final = EnvSpec(
-    env_id="a/B-v0",
-    options={"a": 1},
-    control_period=0.02,
-    observation=(ArraySpec(name="observation", shape=(1,), low=-1, high=1),),
-    action=Discrete(n=3),
-    telemetry=(ArraySpec(name="position", shape=(2,)),),
-)
-LAYOUT: Final = layout_of(SPEC)
-MANY: Final = layout_of(
-    EnvSpec(
-        env_id="a/C-v0",
-        control_period=0.1,
-        observation=(
-            ArraySpec(name="picture", shape=(3,), dtype="uint8"),
-            ArraySpec(name="rest", shape=(2,), dtype="float64"),
-        ),
-        action=ArraySpec(name="action", shape=(1,)),
-    ),
-    2,
-)
+LAYOUT: Final = LAYOUTS["one"]
 
 
 def content(message: Message) -> list[object]:
@@ -105,18 +78,17 @@ def check_numbers(message: Message) -> None:
         expect(bool(np.isfinite(array).all()), "not finite", message)
 
 
-def fixed(datagram: bytes) -> bytes:
+def righted(datagram: bytes) -> bytes:
     """With its checksum made right, behind whatever seal it has."""
     at = OVERHEAD if is_sealed(datagram) else 0
     if len(datagram) < at + 24:
         return datagram
-    crc = zlib.crc32(datagram[at + 8 :], zlib.crc32(datagram[at : at + 4]))
-    return datagram[: at + 4] + crc.to_bytes(4, "little") + datagram[at + 8 :]
+    return datagram[:at] + fixed(datagram[at:])
 
 
 def fuzz_binary(data: bytes) -> None:
-    for datagram in (data, fixed(data), fixed(b"\xa7R\x02" + data)):
-        for layout in (LAYOUT, MANY, None):
+    for datagram in (data, righted(data), righted(b"\xa7R\x02" + data)):
+        for layout in (*LAYOUTS.values(), None):
             with suppress(DecodeError):
                 message = binary.decode(datagram, layout)
                 check_numbers(message)
@@ -230,8 +202,9 @@ def accept(hello: Hello) -> Layout | str:
 
 def send_state(link: Client, now: float) -> None:
     flag = np.zeros(1, bool)
-    observations = (np.array([[link.sequence]], np.float32),)
-    link.send_state(0.0, observations, np.zeros(1), flag, flag, (np.zeros((1, 2)),), now)
+    observations = (np.full((1, 3), link.sequence, np.float32),)
+    telemetry = (np.zeros((1, 3)), np.zeros((1, 1)))
+    link.send_state(0.0, observations, np.zeros(1), flag, flag, telemetry, now)
 
 
 class Flight:
@@ -369,7 +342,7 @@ class Flight:
             piece = datagram[numbers[0] * len(datagram) // numbers[1] :]
             datagram = fragment_of(*binary.peek(datagram), *numbers, piece[: program.byte()])
         if flags & 4:
-            datagram = fixed(datagram)
+            datagram = righted(datagram)
         if flags & 8 and is_sealed(datagram):
             datagram = datagram[OVERHEAD:]
         if flags & 16:  # with a key of its own
@@ -427,40 +400,10 @@ def fuzz_one(data: bytes) -> None:
         TARGETS[data[0] % len(TARGETS)](data[1:])
 
 
-def messages() -> list[Message]:
-    return [
-        greeting(),
-        Welcome(session=SESSION, nonce=5, seed=7),
-        Refuse(session=SESSION, reason="busy"),
-        State(
-            session=SESSION,
-            sequence=1,
-            time=0.0,
-            nonce=5,
-            observations=(np.zeros((1, 1), np.float32),),
-            rewards=np.zeros(1),
-            terminated=np.zeros(1, bool),
-            truncated=np.zeros(1, bool),
-            telemetry=(np.zeros((1, 2)),),
-        ),
-        Command(
-            session=SESSION,
-            sequence=1,
-            actions=np.array([2]),
-            orders=np.array([1], np.uint8),
-            seeds=np.array([2**64 - 1], np.uint64),
-        ),
-        Close(session=SESSION, sequence=1, reason="done"),
-        Wait(session=SESSION),
-        Unknown(session=SESSION, sequence=1),
-        Alive(session=SESSION, sequence=1),
-        Missing(session=SESSION, sequence=1, kind=4, count=3, first=0, bitmap=b"\x05"),
-    ]
-
-
 def seeds() -> Iterator[bytes]:
     """The first inputs: every message, every line, and some flights."""
-    for message in messages():
+    lines = text_lines()
+    for message in [message for _, env, message in messages() if env == "one"]:
         datagram = binary.encode(message, LAYOUT)
         yield b"\0" + datagram
         yield b"\2" + datagram
@@ -476,8 +419,7 @@ def seeds() -> Iterator[bytes]:
     for order in ((0, 1, 2), (2, 0, 0, 1), (1, 2, 0, 1, 2, 0)):
         yield b"\x08" + b"".join(bytes([1, number, 3, 2, number, 7]) for number in order)
     yield b"\3" + SPEC.to_json().encode()
-    for line in (b"1,0.5,0,1,0.25,-0.0,1.5,1.0,-2.0", b"1,0,0,0,.5,1,2", b"1,0.5", b"1,reset",
-                 b"1,reset,7\r\n", b"1,close", b"3,-1e-300,+2.,3E4"):  # fmt: skip
+    for line in [line.encode() for line in (*lines["states"], *lines["commands"])]:
         yield b"\1" + line
         yield bytes([4, 0x22, 0, 0, 0, len(line)]) + line + b"\x07"
     for mode in range(0x30, 0x33):

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from golden import changed
+from golden import LAYOUTS, changed, messages
 from hypothesis import given
 from hypothesis import strategies as st
 from links import ONE, command, hello, layout, state
@@ -17,36 +17,17 @@ from rotorgram.udp.protocol import binary, text
 from rotorgram.udp.protocol.errors import DecodeError, VersionMismatch
 from rotorgram.udp.protocol.layout import MAX_DRONES, ArrayLayout, Layout
 from rotorgram.udp.protocol.messages import (
-    Alive,
     Close,
     Command,
     Extension,
     Hello,
     Message,
-    Missing,
     Refuse,
     State,
-    Unknown,
     Wait,
     Welcome,
 )
 
-SHORT: list[Message] = [
-    hello(),
-    hello(
-        worlds=MAX_DRONES,
-        versions=(2, 7),
-        extensions=(Extension(number=5, value=b"x", critical=True), Extension(number=0, value=b"")),
-    ),
-    Welcome(session=1, nonce=2**64 - 1),
-    Welcome(session=1, nonce=0, seed=2**64 - 1, extensions=(Extension(number=1, value=b"ab"),)),
-    Refuse(session=1, reason="höher"),
-    Wait(session=1),
-    Unknown(session=1, sequence=7),
-    Alive(session=2**64 - 1, sequence=2**64 - 1),
-    Missing(session=1, sequence=0, kind=1, count=20, first=8, bitmap=b"\1\x80"[:1]),
-    Close(session=1, sequence=5, reason=""),
-]
 DTYPES = ("float32", "float64", "uint8", "int32", "int64")
 
 
@@ -110,42 +91,10 @@ def assert_comes_back(message: State | Command, of: Layout, size: int) -> None:
     assert binary.encode(back, of) == data
 
 
-def test_arrays_lie_at_multiples_of_eight() -> None:
-    of = Layout(
-        drones=3,
-        observation=(ArrayLayout(shape=(1,)), ArrayLayout(shape=(2, 2), dtype="uint8")),
-        action=ArrayLayout(shape=(1,)),
-        telemetry=((3,),),
-    )
-    assert [slot.at for slot in of.observation_slots] == [40, 56]
-    assert of.state.slots[2].at == 72
-    assert of.state.flags.start == 96
-    assert of.state.slots[4].at == 99
-    assert of.telemetry_slots[0].at == 104
-    assert of.state.size == 104 + 72
-    assert of.actions.at == 32
-    assert of.command.slots[1].at == 48
-    assert of.seeded_command.slots[2].at == 56
-    assert of.seeded_command.size == 80
-
-
-@pytest.mark.parametrize("message", SHORT, ids=lambda m: type(m).__name__)
-def test_every_other_message_comes_back(message: Message) -> None:
-    assert binary.decode(binary.encode(message)) == message
-
-
-def samples() -> list[bytes]:
-    of = layout(2, 2, ((3,),))
-    return [
-        *(binary.encode(message) for message in SHORT),
-        binary.encode(state(1, of=of), of),
-        binary.encode(command(1, of=of), of),
-    ]
-
-
 def test_any_flipped_bit_and_any_cut_is_seen() -> None:
-    of = layout(2, 2, ((3,),))
-    for data in samples():
+    for _, env, message in messages():
+        of = LAYOUTS[env]
+        data = binary.encode(message, of)
         for bit in range(8 * len(data)):
             raw = bytearray(data)
             raw[bit // 8] ^= 1 << bit % 8
