@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ..agents.policies import Policy
 from ..envs.autoreset import LOST, AdvancingVectorEnv, worlds_done
-from ..envs.spec import Discrete, EnvSpec, canonical_id, component_names
+from ..envs.spec import EnvSpec, canonical_id, component_names
 from ..models.errors import InputError
 from ..models.frames import pose_in_mujoco_frame
 
@@ -193,99 +193,81 @@ def fly_episodes(
     worlds = env.num_envs // len(env.env_spec.agents)
     while missing := [episode for episode in seeds if episode not in flown]:
         batch = {episode: seeds[episode] for episode in missing[:worlds]}
-        flown |= _Batch(env, policy, batch).fly()  # without episodes whose simulator was lost
+        flown |= _fly_batch(env, policy, batch)  # without episodes whose simulator was lost
     return [trajectory for episode in seeds for trajectory in flown[episode]]
 
 
-class _Batch:
-    """At most W episodes, one in each world of a vector env."""
+def _fly_batch(
+    env: AdvancingVectorEnv, policy: Policy | None, seeds: Mapping[int, int]
+) -> dict[int, list[Trajectory]]:
+    """At most W episodes, one in each world, by number; those of a lost simulator are missing."""
+    drones = len(env.env_spec.agents)
+    used = len(seeds) * drones
+    policies = [copy.deepcopy(policy) for _ in range(used)]
+    for own in policies:
+        if own is not None:
+            own.reset()
+    of_drones = [seed for seed in seeds.values() for _ in range(drones)]
+    env.single_action_space.seed(of_drones[0])
+    env.reset(seed=[*of_drones, *[0] * (env.num_envs - used)])
+    nobody = np.zeros(env.num_envs, bool)
+    telemetry = [env.telemetry]
+    rewards: list[Floats] = []
+    actions: list[NDArray[Any]] = []
+    lengths = np.zeros(env.num_envs, int)
+    terminated = nobody
+    lost = env.lost.copy()
+    done = lost | (np.arange(env.num_envs) >= used)
+    while not done.all():
+        chosen = _act(env, policies, done)
+        env.advance(chosen, nobody, None, worlds_done(done, drones))
+        telemetry.append(env.telemetry)
+        rewards.append(env.rewards)
+        actions.append(chosen.astype(np.float64))
+        lengths += ~done
+        terminated = terminated | (env.terminated & ~done)
+        lost |= env.lost & ~done
+        done = done | env.terminated | env.truncated
+    arrays = {name: np.array([row[name] for row in telemetry]) for name in telemetry[0]}
+    flown: dict[int, list[Trajectory]] = {}
+    for world, (episode, seed) in enumerate(seeds.items()):
+        first = world * drones
+        if lost[first]:
+            continue
+        flown[episode] = []
+        for drone in range(first, first + drones):
+            steps = int(lengths[drone])
+            trajectory = Trajectory(
+                spec=env.env_spec,
+                telemetry={name: rows[: steps + 1, drone] for name, rows in arrays.items()},
+                rewards=np.array([row[drone] for row in rewards[:steps]], np.float64),
+                actions=np.array([row[drone] for row in actions[:steps]]),
+                ending="terminated" if terminated[drone] else "truncated",
+                episode=episode,
+                drone=drone - first,
+                seed=seed,
+            )
+            flown[episode].append(trajectory)
+    return flown
 
-    def __init__(
-        self, env: AdvancingVectorEnv, policy: Policy | None, seeds: Mapping[int, int]
-    ) -> None:
-        self._env = env
-        self._seeds = seeds
-        self._drones = len(env.env_spec.agents)
-        self._used = len(seeds) * self._drones
-        self._policies = [copy.deepcopy(policy) for _ in range(self._used)]
-        self._telemetry: list[Mapping[str, Floats]] = []
-        self._rewards: list[Floats] = []
-        self._actions: list[NDArray[Any]] = []
-        self._lengths = np.zeros(env.num_envs, int)
-        self._terminated = np.zeros(env.num_envs, bool)
 
-    def fly(self) -> dict[int, list[Trajectory]]:
-        """Trajectories of the drones by episode; those of a lost simulator are missing."""
-        env, count = self._env, self._env.num_envs
-        for policy in self._policies:
-            if policy is not None:
-                policy.reset()
-        given = [seed for seed in self._seeds.values() for _ in range(self._drones)]
-        env.reset(seed=[*given, *[0] * (count - len(given))])
-        self._telemetry.append(env.telemetry)
-        lost = env.lost.copy()
-        done = lost | (np.arange(count) >= self._used)
-        while not done.all():
-            actions = self._act(done)
-            env.advance(actions, np.zeros(count, bool), None, worlds_done(done, self._drones))
-            self._telemetry.append(env.telemetry)
-            self._rewards.append(env.rewards)
-            self._actions.append(actions.astype(np.float64))
-            self._lengths += ~done
-            self._terminated |= env.terminated & ~done
-            lost |= env.lost & ~done
-            done = done | env.terminated | env.truncated
-        return self._trajectories(lost)
-
-    def _act(self, done: NDArray[np.bool_]) -> NDArray[Any]:
-        """Actions of the drones that fly; 0 for the others."""
-        env, action = self._env, self._env.env_spec.action
-        if isinstance(action, Discrete):
-            actions: NDArray[Any] = np.zeros(env.num_envs, np.int64)
+def _act(
+    env: AdvancingVectorEnv, policies: Sequence[Policy | None], done: NDArray[np.bool_]
+) -> NDArray[Any]:
+    """Actions of the drones that fly; 0 for the others."""
+    space = env.single_action_space
+    actions = np.zeros((env.num_envs, *(space.shape or ())), space.dtype)
+    observations: Any = env.observations
+    for drone in np.flatnonzero(~done).tolist():
+        policy = policies[drone]
+        if policy is None:
+            actions[drone] = space.sample()
+        elif isinstance(observations, dict):
+            own = {name: values[drone] for name, values in observations.items()}
+            actions[drone] = policy.act(own)
         else:
-            actions = np.zeros((env.num_envs, *action.shape), np.float32)
-        observations: Any = env.observations
-        for drone in np.flatnonzero(~done).tolist():
-            policy = self._policies[drone]
-            if policy is None:
-                actions[drone] = env.single_action_space.sample()
-            elif isinstance(observations, dict):
-                own = {name: values[drone] for name, values in observations.items()}
-                actions[drone] = policy.act(own)
-            else:
-                actions[drone] = policy.act(observations[drone])
-        return actions
-
-    def _trajectories(self, lost: NDArray[np.bool_]) -> dict[int, list[Trajectory]]:
-        telemetry = stacked(self._telemetry)
-        rewards = np.array(self._rewards, np.float64)
-        actions = np.array(self._actions)
-        flown: dict[int, list[Trajectory]] = {}
-        for world, (episode, seed) in enumerate(self._seeds.items()):
-            first = world * self._drones
-            if lost[first]:
-                continue
-            flown[episode] = []
-            for drone in range(first, first + self._drones):
-                steps = self._lengths[drone]
-                own = {name: values[: steps + 1, drone] for name, values in telemetry.items()}
-                trajectory = Trajectory(
-                    spec=self._env.env_spec,
-                    telemetry=own,
-                    rewards=rewards[:steps, drone],
-                    actions=actions[:steps, drone],
-                    ending="terminated" if self._terminated[drone] else "truncated",
-                    episode=episode,
-                    drone=drone - first,
-                    seed=seed,
-                )
-                flown[episode].append(trajectory)
-        return flown
-
-
-def stacked(rows: Sequence[Mapping[str, Floats]]) -> dict[str, Floats]:
-    """Arrays by name of several moments, with a first axis for these."""
-    return {name: np.array([row[name] for row in rows], np.float64) for name in rows[0]}
+            actions[drone] = policy.act(observations[drone])
+    return actions
 
 
 def flown_trajectories(
@@ -302,14 +284,9 @@ def flown_trajectories(
     """Evaluation episodes of a set by number, flown in process: see `fly` and, for several drones
     of one world, `fly_episodes`. The vehicle is a file or a name, None the paper's.
     """
-    name = canonical_id(env_id)  # a checkpoint may name a module, which is not to be imported
-    if drones == 1:
-        made = gym.make(name, disable_env_checker=True, vehicle=vehicle, **options)
-        with closing(made.unwrapped) as env:
-            seeds = {number: evaluation_seed(number, of, training_seed) for number in episodes}
-            return [fly(env, policy, seed, number) for number, seed in seeds.items()]
     from ..envs.vector import LocalVectorEnv  # which imports MuJoCo
 
+    name = canonical_id(env_id)  # a checkpoint may name a module, which is not to be imported
     settings: dict[str, Any] = {"drones": drones, "vehicle": vehicle, **options}
     found: list[Trajectory] = []
     with closing(LocalVectorEnv(name, drones, autoreset_mode="Disabled", **settings)) as world:
