@@ -17,11 +17,12 @@ MAX_ELEMENTS: Final = 10_000  # of a file, each as often as it is repeated: seco
 MAX_SIZES: Final = {
     "nuser_body": 100, "nuser_jnt": 100, "nuser_geom": 100, "nuser_site": 100, "nuser_cam": 100,
     "nuser_tendon": 100, "nuser_actuator": 100, "nuser_sensor": 100, "nuserdata": 1_000_000,
-    "nkey": 1000, "nconmax": 100_000, "njmax": 100_000, "nstack": 10_000_000,
+    "nkey": 100, "nconmax": 100_000, "njmax": 4000, "nstack": 10_000_000,
 }  # fmt: skip
 """Largest attributes of MJCF's element `size`."""
 MAX_MEMORY: Final = 1 << 30  # bytes of MJCF's attribute `memory`
 MAX_LENGTH: Final = 10_000  # numbers of a custom numeric or of a sensor
+MAX_NUMBERS: Final = 1 << 26  # of all height fields, textures, numerics and sensors: 0.5 GB
 _SIDES: Final = ("nrow", "ncol", "width", "height")
 _LENGTHS: Final = ("size", "dim", "num", "nsample", "actdim")
 _LENGTHS_OF: Final = ("numeric", "user", "contact", "general", "plugin")
@@ -118,6 +119,7 @@ def _check_sizes(path: Path) -> None:
     """
     seen = {path}
     total = 0
+    numbers = 0
     waiting = [(_root(path), 1)]
     while waiting:
         element, times = waiting.pop()
@@ -131,6 +133,9 @@ def _check_sizes(path: Path) -> None:
                 seen.add(inner)
                 waiting.append((_root(inner), times))
         total += times
+        numbers += times * _numbers(element)
+        if numbers > MAX_NUMBERS:
+            _refuse(f"at most {MAX_NUMBERS} numbers of assets and sensors", f"{numbers} or more")
         if total > MAX_ELEMENTS:
             _refuse(f"at most {MAX_ELEMENTS} elements", f"{total} or more")
         waiting += [(child, times) for child in element]
@@ -153,6 +158,14 @@ def _check_element(element: ElementTree.Element) -> None:
     elif element.tag in _LENGTHS_OF:
         for name in _LENGTHS:
             _check_size(element, name, MAX_LENGTH)
+
+
+def _numbers(element: ElementTree.Element) -> int:
+    """How many numbers MuJoCo allocates for an asset, a custom numeric or a sensor."""
+    names = _SIDES if element.tag in ("hfield", "texture") else _LENGTHS
+    if element.tag not in ("hfield", "texture", *_LENGTHS_OF):
+        return 0
+    return math.prod(max(1, _whole(element.get(name, "1"))) for name in names)
 
 
 def _check_size(element: ElementTree.Element, name: str, largest: int) -> None:

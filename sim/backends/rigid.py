@@ -303,7 +303,10 @@ def _check_forces(vehicle: Vehicle) -> None:
     model, data = vehicle.model, mujoco.MjData(vehicle.model)
     data.qpos[2:7] = (vehicle.rest_height + 1e3, 0.8, 0.36, -0.36, 0.3168596)
     data.qvel[:] = (1.0, -2.0, 0.5, 0.4, 0.7, -0.6)
-    thrust = 0.6 * vehicle.hover_thrust + 0.4 * vehicle.thrust_high
+    # With thrusts far beyond those of a hover, rounding would hide what differs.
+    moderate = vehicle.hover_thrust + abs(vehicle.hover_thrust).mean()
+    most = np.minimum(vehicle.thrust_high, moderate)
+    thrust = 0.6 * vehicle.hover_thrust + 0.4 * most
     thrust[0] = 0.5 * (vehicle.thrust_low[0] + vehicle.hover_thrust[0])
     data.ctrl[:] = thrust / [rotor.newtons for rotor in vehicle.rotors]
     data.qpos[3:7] /= np.linalg.norm(data.qpos[3:7])

@@ -22,7 +22,8 @@ def changed(folder: Path, old: str, new: str) -> Path:
         ('nuser_body="1000000000"', "a nuser_body of at most 100 in <size>, got 1000000000"),
         ('nuser_geom="101"', "a nuser_geom of at most 100 in <size>, got 101"),
         ('nstack="2000000000"', "a nstack of at most 10000000 in <size>, got 2000000000"),
-        ('nkey="1000000"', "a nkey of at most 1000 in <size>, got 1000000"),
+        ('nkey="1000000"', "a nkey of at most 100 in <size>, got 1000000"),
+        ('njmax="100000"', "a njmax of at most 4000 in <size>, got 100000"),
         ('memory="2G"', "a memory of at most 1G, got 2G"),
     ],
 )
@@ -41,6 +42,20 @@ def test_sizes_of_other_files_are_bounded_too(tmp_path: Path, tag: str) -> None:
     other = f'<{tag} name="other" file="other.xml"/>'
     path = changed(tmp_path, "<asset>", f"<asset>{other}")
     with pytest.raises(InputError, match="a nuserdata of at most 1000000 in <size>, got 9999999"):
+        read_spec(path)
+
+
+@pytest.mark.parametrize(
+    ("parent", "parts"),
+    [
+        ("asset", '<hfield nrow="4096" ncol="4096" size="1 1 1 1"/>' * 5),
+        ("custom", '<numeric name="a" size="9000" data="0"/>' * 8000),
+    ],
+)
+def test_all_parts_together_are_bounded(tmp_path: Path, parent: str, parts: str) -> None:
+    """Each is small enough; together they take more than 0.5 GB."""
+    path = changed(tmp_path, "</mujoco>", f"<{parent}>{parts}</{parent}></mujoco>")
+    with pytest.raises(InputError, match="at most 67108864 numbers of assets and sensors, got"):
         read_spec(path)
 
 

@@ -1,5 +1,6 @@
 """The backend rigid: MuJoCo's flights without contact, and the tasks on it."""
 
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -99,6 +100,20 @@ def test_compiled_and_numpy_fly_the_same_bits(name: str, dtype: str) -> None:
             world.step(thrust, 2)
     for name in ("position", "quaternion", "velocity", "body_rates"):
         assert getattr(compiled.state, name).tobytes() == getattr(plain.state, name).tobytes()
+
+
+@pytest.mark.parametrize(("share", "most"), [(1.0, "1e6"), (5e-8, "100"), (5e-8, "1e6")])
+def test_strong_rotors_and_a_light_craft_fly(share: float, most: str, tmp_path: Path) -> None:
+    """20 kg and 1e-6 kg: two control steps at hover, at rest."""
+    text = QUAD_XML.read_text(encoding="utf-8").replace('"0 100"', f'"0 {most}"')
+    text = re.sub(r'mass="([0-9.]+)"', lambda found: f'mass="{float(found[1]) * share}"', text)
+    file = tmp_path / "extreme.xml"
+    file.write_text(text, encoding="utf-8")
+    vehicle = Vehicle.load(file)
+    world = arrays(vehicle, 1)
+    begin(world, position=np.full((1, 1, 3), 9.0))
+    world.step(np.tile(vehicle.hover_thrust, (1, 1, 1)), 4)
+    assert world.state.position == pytest.approx(np.full((1, 1, 3), 9.0), abs=1e-9)
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
