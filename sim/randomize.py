@@ -3,6 +3,7 @@
 A parameter is a factor of the vehicle's own value, 1 being that value, or a number in its unit.
 """
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ from typing import Any, Final
 import numpy as np
 
 from ..models.errors import InputError
+from ..models.fields import check_names
 from .effects import EffectOptions
 from .random import Draw
 from .state import Array, clip
@@ -60,7 +62,7 @@ PARAMETERS: Final = {
 CENTER: Final = ("center_x", "center_y", "center_z")
 WHOLE: Final = ("action_delay", "observation_delay")
 """Parameters that are whole numbers: of a uniform draw each has the same chance."""
-_KINDS: Final = {"uniform": 2, "loguniform": 2, "normal": 2, "choice": 0}
+_FORMS: Final = "uniform(low,high), loguniform(low,high), normal(mean,deviation), choice(a,b,...)"
 _TEXT: Final = re.compile(r"\s*([a-z]+)\s*\(([^()]*)\)\s*")
 
 
@@ -78,13 +80,10 @@ class Randomization:
                 f"randomize: expected a mapping from names to distributions, got {texts!r:.80}"
             )
         self._kinds: dict[str, tuple[str, tuple[float, ...]]] = {}
+        check_names(texts, PARAMETERS, "randomize")
         for name, text in texts.items():
-            known = ", ".join(PARAMETERS)
-            if name not in PARAMETERS:
-                raise InputError(f"randomize: expected some of {known}, got {name!r:.300}")
             needs = PARAMETERS[name].needs
-            on = not needs or effects is None or any(getattr(effects, name) for name in needs)
-            if not on:
+            if needs and effects and not any(getattr(effects, effect) for effect in needs):
                 raise InputError(
                     f"randomize: {name}: expected the effect {' or '.join(needs)}, "
                     "got it switched off"
@@ -136,23 +135,31 @@ class Randomization:
 
 def _distribution(name: str, text: Any) -> tuple[str, tuple[float, ...]]:
     limits = PARAMETERS[name]
-    within = f"numbers from {limits.low:g} to {limits.high:g} {limits.unit}".rstrip()
-    kinds = "uniform(low,high), loguniform(low,high), normal(mean,deviation), choice(a,b,...)"
-    expected = f"{kinds} or a number, with low <= high and {within}"
     match = _TEXT.fullmatch(text) if isinstance(text, str) else None
     kind, inside = match.groups() if match else ("choice", str(text))
     try:
         numbers = tuple(float(word) for word in inside.split(","))
     except ValueError:
         numbers = ()
-    most = max(1, len(numbers)) if match else 1
-    right = kind in _KINDS and len(numbers) == (_KINDS.get(kind) or most)
-    bounded = numbers[:1] if kind == "normal" else numbers
-    right = right and all(limits.low <= number <= limits.high for number in bounded)
-    if right and kind in ("uniform", "loguniform"):
-        right = numbers[0] <= numbers[1] and (kind == "uniform" or numbers[0] > 0)
-    if right and kind == "normal":
-        right = 0 <= numbers[1] < float("inf")
-    if not right:
-        raise InputError(f"randomize: {name}: expected {expected}, got {text!r:.80}")
+    is_one = match is not None or len(numbers) == 1
+    if not (is_one and _is_right(kind, numbers, limits)):
+        within = f"numbers from {limits.low:g} to {limits.high:g} {limits.unit}".rstrip()
+        raise InputError(
+            f"randomize: {name}: expected {_FORMS} or a number, with low <= high and {within}, "
+            f"got {text!r:.80}"
+        )
     return kind, numbers
+
+
+def _is_right(kind: str, numbers: tuple[float, ...], limits: Parameter) -> bool:
+    low = limits.low
+    high = limits.high
+    if kind == "choice":
+        return bool(numbers) and all(low <= number <= high for number in numbers)
+    if len(numbers) != 2:
+        return False
+    first, second = numbers
+    if kind == "normal":
+        return low <= first <= high and 0 <= second < math.inf
+    is_ordered = low <= first <= second <= high
+    return is_ordered and (kind == "uniform" or (kind == "loguniform" and first > 0))
