@@ -23,6 +23,9 @@ from rotorgram.sim import (
     make_controller,
     make_world,
 )
+from rotorgram.sim.control.cascade import Position
+from rotorgram.sim.control.gains import shared_ranges
+from rotorgram.sim.control.mixed import MixedController
 
 DATA = Path(__file__).parents[1] / "data"
 DOCS = Path(__file__).parents[2] / "docs"
@@ -335,21 +338,6 @@ def test_the_spec_tells_names_units_and_frames() -> None:
     assert env_of("rotors").env_spec.action.unit == ""
 
 
-@pytest.mark.parametrize("level", LEVELS)
-def test_a_batch_of_every_level_flies_as_single_envs(level: str) -> None:
-    batch = gym.make_vec(HOVER, num_envs=3, autoreset_mode="Disabled", action=level)
-    singles = [env_of(level) for _ in range(3)]
-    first, _ = batch.reset(seed=4)
-    for i, env in enumerate(singles):
-        assert env.reset(seed=4 + i)[0].tobytes() == first[i].tobytes()
-    dice = np.random.default_rng(0)
-    for _ in range(8):
-        actions = dice.uniform(-0.3, 0.3, batch.action_space.shape).astype(np.float32)
-        seen, *_ = batch.step(actions)
-        for i, env in enumerate(singles):
-            assert env.step(actions[i])[0].tobytes() == seen[i].tobytes()
-
-
 @pytest.mark.parametrize(("estimate", "calls"), [(False, 4), (True, 1)], ids=["exact", "estimate"])
 def test_loops_run_in_every_physics_step_unless_they_see_an_estimate(
     estimate: bool, calls: int
@@ -400,6 +388,23 @@ def test_a_craft_that_cannot_yaw_is_refused(tmp_path: Path) -> None:
     vehicle = Vehicle.load(file)
     with pytest.raises(InputError, match=r"vehicle: expected .* yaw it.* got .* of rank 3"):
         make_controller("rates", vehicle, 0.01)
+
+
+def test_controllers_of_different_vehicles_share_their_ranges() -> None:
+    """Of a Crazyflie and a heavy hexacopter: an action stands for what the least able can."""
+    crafts = [Vehicle.load(name) for name in ("crazyflie2", "heavy_hexa")]
+    gains = [Gains.of(craft, craft.timestep) for craft in crafts]
+    shared = shared_ranges(gains)
+    pairs = [
+        (Position(craft, own, EffectOptions()), [drone])
+        for drone, (craft, own) in enumerate(zip(crafts, shared, strict=True))
+    ]
+    mixed = MixedController(pairs)
+    level = min(one.most_offset[0] for one in gains)
+    up = min(one.most_offset[1] for one in gains)
+    assert mixed.ranges() == [(level, "m"), (level, "m"), (up, "m"), (math.pi, "rad")]
+    assert mixed.ranges() == pairs[1][0].ranges()
+    assert mixed.units[0] == f"{level:.7g} m"
 
 
 # --- the page -------------------------------------------------------------------------------------

@@ -134,22 +134,6 @@ def test_alone_and_side_by_side_it_changes_no_bit(places: Any) -> None:
     assert flown[0] == flown[1]
 
 
-def test_a_batch_of_swarms_is_that_many_swarms() -> None:
-    dice = np.random.default_rng(0)
-    places = dice.uniform(-0.5, 0.5, (3, 4, 3)) + (0.0, 0.0, 1.0) * np.arange(5, 9)[:, None]
-    options = EffectOptions(body_drag=True, downwash=True, motor_lag=True)
-    batch = make_world(Vehicle.load(BIRD), 3, drones=4, effects=options)
-    batch.reset(np.ones((3, 4), bool), InitialState(position=places))
-    alone = [birds(row, body_drag=True, downwash=True, motor_lag=True) for row in places]
-    thrust = np.broadcast_to(batch.vehicle.hover_thrust, (3, 4, 4)) * 0.9
-    for _ in range(20):
-        batch.step(thrust, 2)
-        for world, row in zip(alone, thrust, strict=True):
-            world.step(row[None], 2)
-    singles = np.concatenate([world.state.position for world in alone])
-    assert singles.tobytes() == np.ascontiguousarray(batch.state.position).tobytes()
-
-
 def test_what_lacks_is_one_sentence() -> None:
     with pytest.raises(InputError, match="effects: expected body_drag or rotor_drag, on which"):
         birds([(0, 0, 9), (0, 0, 5)], downwash=True)

@@ -707,63 +707,6 @@ def test_a_batch_is_single_worlds_bit_for_bit(effects: dict[str, Any]) -> None:
     assert len({position.tobytes() for position in batch.state.position}) == num
 
 
-def test_frozen_drones_and_their_streams_stay() -> None:
-    """A drone that was frozen flies on as one that never was."""
-    worlds = [world_of(None, 2, randomize=DRAWN, **GUSTY) for _ in range(2)]
-    every = np.ones((2, 1), bool)
-    first = np.array([[True], [False]])
-    for world in worlds:
-        world.seed(every, [3, 4])
-        begin(world)
-        fly(world, 2.0, 5)
-    kept = [array[1].copy() for array in states(worlds[0])]
-    for _ in range(7):
-        worlds[0].step(np.full((2, 1, 4), 3.0), 2, first)
-    for now, before in zip(states(worlds[0]), kept, strict=True):
-        assert now[1].tobytes() == before.tobytes()
-    for world in worlds:
-        fly(world, 2.5, 20)
-    assert worlds[0].state.position[1].tobytes() == worlds[1].state.position[1].tobytes()
-    assert worlds[0].state.thrust[1].tobytes() == worlds[1].state.thrust[1].tobytes()
-    assert worlds[0].state.position[0].tobytes() != worlds[1].state.position[0].tobytes()
-
-
-def test_a_reset_of_some_leaves_the_others() -> None:
-    worlds = [world_of(None, 3, randomize=DRAWN, **GUSTY) for _ in range(2)]
-    for world in worlds:
-        world.seed(np.ones((3, 1), bool), [5, 6, 7])
-        begin(world)
-        fly(world, 2.0, 10)
-    begin(worlds[0], mask=np.array([[False], [True], [False]]))
-    for world in worlds:
-        fly(world, 2.0, 20)
-    for index in (0, 2):
-        for one, other in zip(states(worlds[0]), states(worlds[1]), strict=True):
-            assert one[index].tobytes() == other[index].tobytes()
-        for name in DRAWN:
-            values = [world.parameters[name][index] for world in worlds]
-            assert values[0] == values[1]
-    assert worlds[0].parameters["mass"][1] != worlds[1].parameters["mass"][1]
-
-
-@pytest.mark.parametrize("num_worlds", [1, 3])
-def test_a_seed_gives_the_same_flight_whatever_came_before(num_worlds: int) -> None:
-    flown = []
-    world = world_of(None, num_worlds, randomize=DRAWN, **GUSTY)
-    for _ in range(2):
-        world.seed(np.ones((num_worlds, 1), bool), [11 + i for i in range(num_worlds)])
-        begin(world, 0.6, velocity=[0, 0, -1])
-        fly(world, 1.0, 40, 4)
-        assert world.state.touching.any()
-        flown.append(states(world))
-        fly(world, 3.0, 33)
-    for one, other in zip(*flown, strict=True):
-        assert one.tobytes() == other.tobytes()
-    other_seed = begin(world, 0.6, velocity=[0, 0, -1])
-    fly(other_seed, 1.0, 40, 4)
-    assert other_seed.state.position.tobytes() != flown[0][0].tobytes()
-
-
 def test_a_closed_world_keeps_its_state_and_no_memory_of_the_simulator() -> None:
     world = fly(begin(world_of(None, 2, randomize=DRAWN, **GUSTY)), 2.0, 5)
     before = world.state.position.copy()

@@ -8,7 +8,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from remotes import flying
 from rotorgram.envs import LocalVectorEnv, Loop
 from rotorgram.envs.config import EnvConfig
 from rotorgram.models import QUAD_XML, Vehicle
@@ -196,15 +195,6 @@ def test_without_a_compiler_numpy_flies(monkeypatch: pytest.MonkeyPatch) -> None
     np.testing.assert_allclose(world.state.velocity[0, 0], expected, rtol=1e-9)
 
 
-def test_a_seed_gives_arrays_the_draws_of_mujoco() -> None:
-    ours, theirs = (
-        Loop(EnvConfig.from_keywords(HOVER, backend=name), N) for name in ("rigid", "mujoco")
-    )
-    for loop in (ours, theirs):
-        loop.advance(np.zeros((N, 4), np.float32), EVERY[:, 0], range(N))
-    np.testing.assert_allclose(ours.world.state.position, theirs.world.state.position, rtol=1e-6)
-
-
 def test_a_free_fall_is_exact() -> None:
     vehicle = Vehicle.load(linear_drag=0.0)
     world = arrays(vehicle, 1, "float32")
@@ -341,28 +331,6 @@ def test_whole_episodes_agree_with_mujoco(env_id: str, size: float, file: Any) -
         if not alive.any():
             break
     assert theirs.terminated.any() or theirs.truncated.any()
-
-
-def test_seeds_repeat_starts_in_float32() -> None:
-    env = LocalVectorEnv(HOVER, 50, backend="rigid")
-    first, again, other = (env.reset(seed=seed)[0] for seed in (3, 3, 4))
-    assert first.tobytes() == again.tobytes()
-    assert first.tobytes() != other.tobytes()
-    assert len({row.tobytes() for row in first}) == 50
-
-
-def test_over_udp_it_flies_as_in_process() -> None:
-    with flying(HOVER, backend="rigid") as pair:
-        pair.remote.connect()
-        local = LocalVectorEnv(HOVER, 1, backend="rigid", autoreset_mode="Disabled")
-        seen = pair.remote.reset(seed=4)[0], local.reset(seed=[4])[0]
-        assert seen[0].tobytes() == seen[1].tobytes()
-        for _ in range(5):
-            actions = np.full((1, 4), 0.1, np.float32)
-            here = pair.remote.step(actions[0])
-            there = local.step(actions)
-            assert here[0].tobytes() == there[0].tobytes()
-            assert here[1] == there[1][0]
 
 
 # --- what is refused ------------------------------------------------------------------------------

@@ -427,57 +427,6 @@ def bits(observation: Any, drone: Any = ...) -> bytes:
     return b"".join(np.ascontiguousarray(array[drone]).tobytes() for array in arrays)
 
 
-def actions_of(num_envs: int, steps: int) -> np.ndarray:
-    dice = np.random.default_rng(3)
-    return dice.uniform(-0.3, 0.3, (steps, num_envs, 4)).astype(np.float32)
-
-
-@pytest.mark.parametrize("observe", ["added", "estimate"])
-def test_a_batch_is_so_many_single_envs(observe: str) -> None:
-    """With an episode's end on the way, and a second one from the streams as they are."""
-    options: dict[str, Any] = {"sensors": {**NOISY, "observe": observe}, "episode_length": 30}
-    many = gym.make_vec(HOVER, num_envs=3, autoreset_mode="NextStep", **options)
-    singles = [gym.make(HOVER, disable_env_checker=True, **options) for _ in range(3)]
-    seen, _ = many.reset(seed=7)
-    alone = [env.reset(seed=7 + i)[0] for i, env in enumerate(singles)]
-    ended = [False] * 3
-    for actions in actions_of(3, 75):
-        assert [bits(seen, i) for i in range(3)] == [bits(one) for one in alone]
-        seen, _, terminated, truncated, _ = many.step(actions)
-        for i, env in enumerate(singles):
-            if ended[i]:
-                alone[i] = env.reset()[0]
-                ended[i] = False
-            else:
-                alone[i], _, *ends, _ = env.step(actions[i])
-                ended[i] = any(ends)
-        assert (terminated | truncated).tolist() == ended
-    many.close()
-
-
-def test_a_frozen_drone_stays_as_it_is() -> None:
-    held, free = (Loop(EnvConfig.from_keywords(HOVER, sensors=NOISY), 2) for _ in range(2))
-    every = np.ones(2, bool)
-    mask = np.array([True, False])
-    actions = actions_of(2, 12)
-    for loop in (held, free):
-        loop.advance(actions[0], every, [1, 2])
-        loop.advance(actions[0])
-    before = bits(held.observations, 0)
-    for action in actions[1:4]:
-        held.advance(action, frozen=mask)
-        free.advance(action)
-        assert bits(held.observations, 0) == before
-        assert bits(held.observations, 1) == bits(free.observations, 1)
-    after = Loop(EnvConfig.from_keywords(HOVER, sensors=NOISY), 2)
-    after.advance(actions[0], every, [1, 2])
-    after.advance(actions[0])
-    for action in actions[4:]:
-        held.advance(action)
-        after.advance(action)
-        assert bits(held.observations, 0) == bits(after.observations, 0)
-
-
 @pytest.mark.parametrize("worlds", [1, 3])
 def test_sensors_move_nothing_else(worlds: int) -> None:
     """Physics with contact, starts, and the readings of the other sensors keep their bits."""
@@ -540,13 +489,6 @@ def test_gymnasium_takes_it(env_id: str, observe: str) -> None:
     if is_dict:
         sensors = [name for name in NOISY if name != "observe"]
         assert set(env.observation_space) == {"observation", *sensors}  # type: ignore[call-overload]
-
-
-def test_sb3_takes_it() -> None:
-    sb3 = pytest.importorskip("stable_baselines3")
-    env = gym.make(HOVER, sensors=NOISY)
-    model = sb3.A2C("MultiInputPolicy", env, n_steps=8, device="cpu", seed=0).learn(16)
-    assert env.action_space.contains(model.predict(env.reset(seed=0)[0])[0])
 
 
 def test_an_estimate_stays_within_the_bounds_of_a_task() -> None:
