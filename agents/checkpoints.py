@@ -24,7 +24,7 @@ import numpy as np
 
 from ..envs.spec import Discrete, EnvSpec
 from ..models import Backend
-from ..models.errors import InputError, require
+from ..models.errors import InputError, require, shortened
 from ..models.fields import Limits, read_table
 from .config import Config
 from .episodes import Episode, Position, ResumeError
@@ -175,7 +175,7 @@ def _read(data: bytes, parse: Callable[[bytes], dict[str, np.ndarray]]) -> Check
     header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
     content = json.loads(header["__metadata__"]["rotorgram"])
     if content["format"] != FORMAT:
-        raise ValueError(f"expected format {FORMAT}, got {content['format']!r:.80}")
+        raise ValueError(f"expected format {FORMAT}, got {shortened(content['format'])}")
     meta = read_table(_Meta, content, "metadata")
     spec = EnvSpec.from_json(meta.spec)
     arrays = parse(data)
@@ -222,9 +222,11 @@ class _Meta:
         config = vars(preset(self.algorithm, "tuned", **self.config))
         complete = json.loads(json.dumps(config))  # a tuple is a list there
         if complete != json.loads(json.dumps(self.config)):
-            raise InputError(f"config: expected all of {sorted(complete)}, got {self.config!r:.80}")
+            raise InputError(
+                f"config: expected all of {sorted(complete)}, got {shortened(self.config)}"
+            )
         if not isinstance(self.versions, dict):
-            raise InputError(f"versions: expected values by name, got {self.versions!r:.80}")
+            raise InputError(f"versions: expected values by name, got {shortened(self.versions)}")
 
 
 def _position(meta: _Meta, arrays: Mapping[str, np.ndarray], spec: EnvSpec) -> Position:

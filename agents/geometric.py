@@ -7,7 +7,7 @@ from typing import ClassVar, Final
 import numpy as np
 
 from ..envs.spec import ArraySpec, EnvSpec
-from ..models.errors import InputError
+from ..models.errors import InputError, shortened
 from .networks import Floats
 from .policies import Observation, flat
 
@@ -50,7 +50,7 @@ class Geometric:
         if not found:
             raise InputError(
                 "geometric: expected gain and gravity in the action's frame, "
-                f"got {action.frame!r:.300}"
+                f"got {shortened(action.frame)}"
             )
         assert found is not None
         self._gain = float(found[1])

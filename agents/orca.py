@@ -11,7 +11,7 @@ from typing import ClassVar, Final
 import numpy as np
 
 from ..envs.spec import ArraySpec, EnvSpec
-from ..models.errors import InputError, expect
+from ..models.errors import InputError
 from .networks import Floats
 from .policies import Observation, flat
 
@@ -46,10 +46,11 @@ class Orca:
     def __init__(self, spec: EnvSpec) -> None:
         action = spec.action
         seen = spec.observation[0]
-        right = isinstance(action, ArraySpec) and action.components[:1] == ("velocity x",)
-        level = "actions of the level velocity (--action velocity)"
-        expect(right, "orca", level, ", ".join(action.components) or "others")
-        assert isinstance(action, ArraySpec)
+        if not isinstance(action, ArraySpec) or action.components[:1] != ("velocity x",):
+            got = ", ".join(action.components) or "others"
+            raise InputError(
+                f"orca: expected actions of the level velocity (--action velocity), got {got}"
+            )
         found = re.search(r"drones with a radius of (\S+) m", seen.frame)
         if not found:
             raise InputError(f"orca: expected a task for several drones, got {spec.env_id}")

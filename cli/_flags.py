@@ -16,7 +16,7 @@ from tyro.conf import Fixed, Suppress, arg
 
 from ..flights.folders import LOCK, new_folder
 from ..models import Backend
-from ..models.errors import InputError
+from ..models.errors import InputError, shortened
 
 DEFAULT_ENV: Final = "rotorgram/Elevation-v0"
 _PLAIN_FLAGS: Final = ("action", "control_period", "episode_length", "history", "scene", "cameras")
@@ -293,7 +293,9 @@ def parse_address(text: str) -> tuple[str, int]:
     """HOST:PORT as a pair. Raises `InputError`."""
     host, _, port = text.rpartition(":")
     if not (host and port.isascii() and port.isdecimal() and int(port) <= 65535):
-        raise InputError(f"address: expected HOST:PORT with a port up to 65535, got {text!r:.300}")
+        raise InputError(
+            f"address: expected HOST:PORT with a port up to 65535, got {shortened(text)}"
+        )
     return host, int(port)
 
 

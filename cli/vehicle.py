@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 from tyro.conf import Positional, arg
 
-from ..models.errors import InputError, expect
+from ..models.errors import InputError
 from ..models.files import write_new
 from ._flags import Command
 
@@ -90,9 +90,13 @@ class Vehicle(Command):
 
     def run(self) -> int:
         """Do it."""
-        other = self.action != "export"
-        expect(other == (self.out is None), "vehicle", *_out_words(self.action, self.out))
-        if not ("frame" not in self.given or self.action == "new"):
+        if self.action == "export" and self.out is None:
+            raise InputError(
+                "vehicle: expected two files, that of the vehicle and that to write, got one"
+            )
+        if self.action != "export" and self.out is not None:
+            raise InputError(f"vehicle: expected one file for {self.action}, got {self.out} too")
+        if "frame" in self.given and self.action != "new":
             raise InputError(f"frame: expected no --frame but with new, got {self.frame}")
         if self.json and self.action != "check":
             raise InputError(f"json: expected no --json but with check, got {self.action}")
@@ -177,13 +181,6 @@ class Vehicle(Command):
         assert self.out is not None
         export_mjcf(self.file, self.out)
         print(f"vehicle: {self.out}")
-
-
-def _out_words(action: str, out: Path | None) -> tuple[str, str]:
-    """Expected and got of a wrong number of files."""
-    if action == "export":
-        return "two files, that of the vehicle and that to write", "one"
-    return f"one file for {action}", f"{out} too"
 
 
 def _derived(craft: "Craft") -> Iterator[tuple[str, str]]:

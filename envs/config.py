@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Self
 
 from ..models import BACKENDS, MAX_DRONES, Backend
-from ..models.errors import InputError, UnknownOption
+from ..models.errors import InputError, UnknownOption, shortened
 from ..models.fields import Choice, Limits, check, check_fields
 from ..scenes import scenes_of
 from ..sim import EffectOptions, Randomization, checked_sensors
@@ -158,7 +158,7 @@ class EnvConfig:
             self._set(effects=EffectOptions.from_options(self.effects))
         self._set(randomize=Randomization(self.randomize, None).to_options())
         if not isinstance(self.task, Mapping):
-            raise InputError(f"task: expected options by name, got {self.task!r:.80}")
+            raise InputError(f"task: expected options by name, got {shortened(self.task)}")
         options: Mapping[str, Any] = self.task
         if registry.is_known(self.env_id):
             task = registry.task_type(self.env_id)
@@ -197,7 +197,7 @@ class EnvConfig:
             base = BackendConfig.parse(given.get("backend", BackendConfig()))
             given["backend"] = replace(base, **settings)
         if not isinstance(nested, Mapping):
-            raise InputError(f"task: expected options by name, got {nested!r:.80}")
+            raise InputError(f"task: expected options by name, got {shortened(nested)}")
         return cls(env_id=env_id, task={**options, **nested}, **given)
 
     def flat_options(self) -> dict[str, Any]:
@@ -233,11 +233,11 @@ class EnvConfig:
     def from_dict(cls, content: Any) -> Self:
         """The reverse of `to_dict`. Raises `InputError`."""
         if not isinstance(content, Mapping):
-            raise InputError(f"config: expected an object, got {content!r:.80}")
+            raise InputError(f"config: expected an object, got {shortened(content)}")
         given = dict(content)
         version = given.pop("version", None)
         if version != VERSION:
-            raise InputError(f"config: expected version {VERSION}, got {version!r:.80}")
+            raise InputError(f"config: expected version {VERSION}, got {shortened(version)}")
         return cls(**known_only("config", given, _names(cls)))
 
     # ---- checks that need more than one field, and the files
@@ -373,10 +373,10 @@ def _vehicles(given: Any) -> tuple[str, ...]:
         several = isinstance(given, str) and "," in text and not Path(text).exists()
         return tuple(word.strip() for word in text.split(",")) if several else (text,)
     if not isinstance(given, list | tuple):
-        raise InputError(f"vehicle: expected names or files, got {given!r:.80}")
+        raise InputError(f"vehicle: expected names or files, got {shortened(given)}")
     for word in given:
         if not isinstance(word, str | Path):
-            raise InputError(f"vehicle: expected names or files, got {given!r:.80}")
+            raise InputError(f"vehicle: expected names or files, got {shortened(given)}")
     return tuple(str(word) for word in given)
 
 
@@ -384,5 +384,7 @@ def _words(name: str, given: Any) -> tuple[str, ...]:
     """Words of a text with commas, or of several texts. Raises `InputError`."""
     texts = [given] if isinstance(given, str) else given
     if not isinstance(texts, list | tuple) or not all(isinstance(one, str) for one in texts):
-        raise InputError(f"{name}: expected names, with commas between them, got {given!r:.80}")
+        raise InputError(
+            f"{name}: expected names, with commas between them, got {shortened(given)}"
+        )
     return tuple(word for text in texts for word in text.replace(",", " ").split())

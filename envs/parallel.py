@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..models.errors import InputError, require
+from ..models.errors import InputError, require, shortened
 from ..sim.snapshots import Arrays
 from .autoreset import AdvancingVectorEnv
 from .rendering import RENDER_MODES
@@ -106,7 +106,7 @@ class AdvancingParallelEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc]
         right = array.dtype.kind in "iuf" and array.shape == shape
         expected = f"an array of real numbers of shape {shape} for {agent}"
         if not right:
-            raise InputError(f"actions: expected {expected}, got {action!r:.80}")
+            raise InputError(f"actions: expected {expected}, got {shortened(action)}")
         return array
 
     def _told(self, seen: Any, info: dict[str, Any], agents: list[str]) -> tuple[Told, Told]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 import gymnasium
 
-from ..models.errors import InputError
+from ..models.errors import InputError, shortened
 from .spec import EnvSpec, canonical_id
 
 if TYPE_CHECKING:
@@ -29,9 +29,9 @@ def register(env_id: str, task: "str | type[Task]") -> None:
     package's env.
     """
     if not (isinstance(env_id, str) and _ID.fullmatch(env_id)):
-        raise InputError(f"env id: expected name-v0 or namespace/name-v0, got {env_id!r:.300}")
+        raise InputError(f"env id: expected name-v0 or namespace/name-v0, got {shortened(env_id)}")
     if not (env_id in _tasks or env_id not in gymnasium.registry):
-        raise InputError(f"env id: expected one that is free, got {env_id!r:.300}")
+        raise InputError(f"env id: expected one that is free, got {shortened(env_id)}")
     gymnasium.registry.pop(env_id, None)
     _tasks[env_id] = task
     # No max_episode_steps: the env truncates by itself, since over UDP no wrapper would.

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Final
 import gymnasium as gym
 import numpy as np
 
-from ..models.errors import InputError
+from ..models.errors import InputError, shortened
 from .spec import EnvSpec
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ class Renderer:
     def __init__(self, mode: str | None, loop: "Loop") -> None:
         if not (mode is None or mode in RENDER_MODES):
             raise InputError(
-                f"render_mode: expected None, 'human' or 'rgb_array', got {mode!r:.300}"
+                f"render_mode: expected None, 'human' or 'rgb_array', got {shortened(mode)}"
             )
         self._mode = mode
         self._loop = loop

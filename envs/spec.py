@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Final, Literal, Self
 
 import numpy as np
 
-from ..models.errors import InputError
+from ..models.errors import InputError, shortened
 from ..models.fields import check_fields
 from ..scenes import marks
 
@@ -271,7 +271,7 @@ class EnvSpec(_Part):
             _expect(size <= most, what, f"at most {most} elements in all", size)
         names = tuple(metric.name for metric in self.metrics)
         told = next((a.components for a in self.telemetry if a.name == "metrics"), ())
-        expected = f"the components of the telemetry 'metrics' to be {names!r:.80}"
+        expected = f"the components of the telemetry 'metrics' to be {shortened(names)}"
         _expect(told == names, "metrics", expected, told)
         listed = [name for array in self.telemetry for name in component_names(array)]
         right = len({*listed}) == len(listed)
@@ -328,7 +328,7 @@ def component_names(array: ArraySpec) -> tuple[str, ...]:
 
 def _expect(right: object, name: str, expected: str, got: object) -> None:
     if not right:
-        raise SpecError(f"{name}: expected {expected}, got {got!r:.80}")
+        raise SpecError(f"{name}: expected {expected}, got {shortened(got)}")
 
 
 def _check_text(name: str, text: Any) -> None:
@@ -380,7 +380,9 @@ def json_values(options: Any) -> dict[str, Any]:
         text.encode()  # half a surrogate pair cannot be sent
         plain: dict[str, Any] = json.loads(text)
     except (TypeError, ValueError, RecursionError) as error:
-        raise SpecError(f"options: expected JSON values, got {options!r:.80}: {error}") from None
+        raise SpecError(
+            f"options: expected JSON values, got {shortened(options)}: {error}"
+        ) from None
     for name in plain:
         _check_text("options", name)
     return plain

@@ -25,7 +25,7 @@ from ..envs.registry import env_spec
 from ..envs.registry import load as load_env
 from ..envs.spec import Mark
 from ..models.cameras import View, chosen_views
-from ..models.errors import InputError
+from ..models.errors import InputError, shortened
 from ..models.fields import Limits, Text, check_fields, check_names, read_table
 from ..models.frames import pose_in_mujoco_frame
 from ..models.vehicle import Vehicle
@@ -297,9 +297,9 @@ class Plan:
         cameras = table.get("cameras", list(cls.cameras))
         poses = table.get("poses", [])
         if not _is_list_of(str, cameras):
-            raise InputError(f"plan: cameras: expected a list of names, got {cameras!r:.80}")
+            raise InputError(f"plan: cameras: expected a list of names, got {shortened(cameras)}")
         if not _is_list_of(dict, poses):
-            raise InputError(f"plan: expected a table [[poses]] or more, got {poses!r:.80}")
+            raise InputError(f"plan: expected a table [[poses]] or more, got {shortened(poses)}")
         table["cameras"] = tuple(cameras)
         table["poses"] = tuple(_source(one, number) for number, one in enumerate(poses, 1))
         return cls(text=text, **table)
@@ -336,7 +336,7 @@ def _source(table: dict[str, Any], number: int) -> PoseSource:
     word = table.pop("from", None)
     if not isinstance(word, str) or word not in _SOURCES:
         words = " or ".join(map(repr, _SOURCES))
-        raise InputError(f"{name}.from: expected {words}, got {word!r:.80}")
+        raise InputError(f"{name}.from: expected {words}, got {shortened(word)}")
     source = read_table(_SOURCES[word], table, name)
     if source.scene:
         scenes_of(source.scene)
@@ -345,7 +345,9 @@ def _source(table: dict[str, Any], number: int) -> PoseSource:
         if lowest < 0:
             raise InputError(f"{name}: expected a box above the ground, got one from {lowest:g} m")
     if not isinstance(getattr(source, "options", {}), Mapping):
-        raise InputError(f"{name}.options: expected options by name, got {table['options']!r:.80}")
+        raise InputError(
+            f"{name}.options: expected options by name, got {shortened(table['options'])}"
+        )
     return source
 
 

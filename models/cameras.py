@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from .coefficients import PREFIX
-from .errors import InputError
+from .errors import InputError, shortened
 from .fields import Limits, read_table
 from .lens import Lens
 
@@ -151,7 +151,7 @@ def chosen_views(words: Sequence[str], cameras: Iterable[Camera]) -> tuple[View,
         right = alone or (name in known and kind in KINDS)
         expected = f"some of {', '.join(known)}, each with _{', _'.join(KINDS)} behind it or not"
         if not right:
-            raise InputError(f"cameras: expected {expected}, got {word!r:.300}")
+            raise InputError(f"cameras: expected {expected}, got {shortened(word)}")
         camera = known[text if alone else name]
         if at:
             width, height = _size(word, size)
@@ -171,7 +171,7 @@ def _size(word: str, text: str) -> tuple[int, int]:
     right = right and all(1 <= int(side) <= MAX_PIXELS for side in (width, height))
     expected = f"NAME@WIDTHxHEIGHT of 1 to {MAX_PIXELS} pixels each"
     if not right:
-        raise InputError(f"cameras: expected {expected}, got {word!r:.300}")
+        raise InputError(f"cameras: expected {expected}, got {shortened(word)}")
     return int(width), int(height)
 
 

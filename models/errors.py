@@ -41,18 +41,6 @@ def shortened(value: object) -> str:
     return text if len(text) <= 80 else text[:79] + "…"
 
 
-def expect(
-    right: object, name: str, expected: str, got: str = "", kind: type[InputError] = InputError
-) -> None:
-    """Raise an error with the sentence "name: expected this, got that", unless it is right.
-
-    What was got is cut to 300 characters.
-    """
-    if not right:
-        got = got if len(got) <= 300 else got[:299] + "…"
-        raise kind(f"{name}: expected {expected}" + (f", got {got}" if got else ""))
-
-
 def require(module: str, extra: str, purpose: str) -> ModuleType:
     """Import an optional package, which an extra of rotorgram installs. Raises `MissingPackage`.
 

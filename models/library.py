@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Final
 
 from . import QUAD_XML
-from .errors import InputError
+from .errors import InputError, shortened
 
 __all__ = ["LIBRARY", "find_vehicle", "vehicle_names"]
 
@@ -23,7 +23,8 @@ def find_vehicle(vehicle: Path | str | None) -> Path:
         return QUAD_XML.resolve()
     if not (isinstance(vehicle, str | Path) and 0 < len(str(vehicle)) <= 1000):
         raise InputError(
-            f"vehicle: expected the path of a file, of 1 to 1000 characters, got {vehicle!r:.300}"
+            "vehicle: expected the path of a file, of 1 to 1000 characters, "
+            f"got {shortened(vehicle)}"
         )
     path = Path(vehicle)
     word = str(vehicle)

@@ -19,7 +19,7 @@ import numpy as np
 from . import MAX_DRAG
 from .cameras import Camera, own_cameras, read_cameras
 from .coefficients import PREFIX, Coefficients
-from .errors import InputError
+from .errors import InputError, shortened
 from .library import find_vehicle
 from .mjcf import free_body, vehicle_spec
 from .vehicle_file import read_vehicle_file
@@ -108,7 +108,7 @@ class Vehicle:
         if not right:
             raise InputError(
                 f"linear_drag: expected a number from 0 to {MAX_DRAG:g} /s, "
-                f"got {linear_drag!r:.300}"
+                f"got {shortened(linear_drag)}"
             )
         try:
             changed = tuple(one.stat().st_mtime_ns for one in _files(file))

@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager, contextmanager
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
-from ..models.errors import NoOpenGL
+from ..models.errors import NoOpenGL, shortened
 
 if TYPE_CHECKING:
     import numpy as np
@@ -150,7 +150,7 @@ def _candidates() -> tuple[str, ...]:
     if wanted in _ON:
         return ("glfw",)
     if wanted:
-        raise NoOpenGL(f"MUJOCO_GL: expected egl, osmesa, glfw or disable, got {wanted!r:.80}")
+        raise NoOpenGL(f"MUJOCO_GL: expected egl, osmesa, glfw or disable, got {shortened(wanted)}")
     if sys.platform != "linux":
         return ("cgl", "glfw") if sys.platform == "darwin" else ("glfw",)
     # Without a display GLFW writes warnings of its own; it has nothing to offer there.

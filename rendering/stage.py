@@ -13,7 +13,7 @@ from typing import Any, Final, Literal, NamedTuple, Self, get_args
 import mujoco
 import numpy as np
 
-from ..models.errors import InputError
+from ..models.errors import InputError, shortened
 from ..models.fleet import load_vehicles, members_of
 from ..models.frames import pose_in_mujoco_frame
 from ..models.mjcf import attach_craft, free_body
@@ -283,7 +283,7 @@ class Stage:
             camera.fixedcamid = self.model.camera(_ONBOARD).id
             return camera
         if name not in _VIEWS:
-            raise InputError(f"camera: expected one of {', '.join(CAMERAS)}, got {name!r:.300}")
+            raise InputError(f"camera: expected one of {', '.join(CAMERAS)}, got {shortened(name)}")
         camera.azimuth, camera.elevation, distance, holds = _VIEWS[name]
         places = self._offsets
         reach = float(self._reach.max())

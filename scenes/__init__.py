@@ -7,7 +7,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from ..models.errors import InputError
+from ..models.errors import InputError, shortened
 
 if TYPE_CHECKING:
     from .build import add_airport, add_scene, build_scene
@@ -36,7 +36,7 @@ def parse_scene(text: str) -> tuple[str, int]:
         names = " or ".join(map(repr, SCENES))
         raise InputError(
             f"scene: expected {names}, the last three with a seed or not, as 'forest:3', "
-            f"got {text!r:.80}"
+            f"got {shortened(text)}"
         )
     return name, int(number or 0)
 
@@ -60,7 +60,7 @@ def scenes_of(text: str) -> tuple[str, ...]:
         names = ", ".join(map(repr, SEEDED_SCENES))
         raise InputError(
             f"scene: expected one of {names} with up to {MAX_SEEDS} seeds, as 'forest:0-7', "
-            f"got {text!r:.80}"
+            f"got {shortened(text)}"
         )
     return tuple(f"{name}:{seed}" for seed in range(low, high + 1))
 

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from ..models.errors import InputError
+from ..models.errors import InputError, shortened
 from ..models.fields import check_names
 from .effects import EffectOptions
 from .random import Draw
@@ -77,7 +77,7 @@ class Randomization:
     def __init__(self, texts: Any, effects: EffectOptions | None) -> None:
         if not isinstance(texts, Mapping):
             raise InputError(
-                f"randomize: expected a mapping from names to distributions, got {texts!r:.80}"
+                f"randomize: expected a mapping from names to distributions, got {shortened(texts)}"
             )
         self._kinds: dict[str, tuple[str, tuple[float, ...]]] = {}
         check_names(texts, PARAMETERS, "randomize")
@@ -146,7 +146,7 @@ def _distribution(name: str, text: Any) -> tuple[str, tuple[float, ...]]:
         within = f"numbers from {limits.low:g} to {limits.high:g} {limits.unit}".rstrip()
         raise InputError(
             f"randomize: {name}: expected {_FORMS} or a number, with low <= high and {within}, "
-            f"got {text!r:.80}"
+            f"got {shortened(text)}"
         )
     return kind, numbers
 

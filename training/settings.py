@@ -17,7 +17,7 @@ from ..envs import config as envs
 from ..envs.registry import env_spec, is_known, load, task_type
 from ..flights.trajectories import EpisodeSet
 from ..models import BACKENDS, Backend
-from ..models.errors import InputError
+from ..models.errors import InputError, shortened
 from ..models.fields import Limits, check_fields, check_names
 
 MIN_FLIGHTS: Final = 200
@@ -339,7 +339,7 @@ class Study:
         env = content.pop("env", {})
         tables = content.pop("row")
         if type(tables) is not list:
-            raise InputError(f"{path}: row: expected [[row]] tables, got {tables!r:.80}")
+            raise InputError(f"{path}: row: expected [[row]] tables, got {shortened(tables)}")
         given = _fields(f"{path}", content, cls)
         rows = [
             Row.from_dict(f"{path}: row {place}", table, env)
@@ -360,7 +360,7 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 def _table(where: str, table: object) -> dict[str, Any]:
     if not isinstance(table, dict):
-        raise InputError(f"{where}: expected a table, got {table!r:.80}")
+        raise InputError(f"{where}: expected a table, got {shortened(table)}")
     return dict(table)
 
 

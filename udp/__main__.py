@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from ..envs import registry
 from ..envs.config import EnvConfig
-from ..models.errors import InputError, MissingPackage, NoOpenGL
+from ..models.errors import InputError, MissingPackage, NoOpenGL, shortened
 from ..models.fields import check_names
 from .protocol.client import LinkConfig
 from .protocol.errors import LinkError
@@ -77,7 +77,7 @@ def read_arguments(line: bytes) -> tuple[EnvConfig, dict[str, Any]]:
     except (ValueError, RecursionError) as error:
         raise InputError(f"standard input: expected a JSON object: {error}") from None
     if not isinstance(arguments, dict):
-        raise InputError(f"standard input: expected a JSON object, got {arguments!r:.80}")
+        raise InputError(f"standard input: expected a JSON object, got {shortened(arguments)}")
     check_names(arguments, _KEYS, "standard input")
     content = arguments.pop("config", None)
     if module := arguments.pop("module", None):

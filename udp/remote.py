@@ -20,7 +20,7 @@ from ..envs.autoreset import (
 )
 from ..envs.spaces import action_space, joined, observation_space, telemetry_names
 from ..envs.spec import ArraySpec, Discrete, EnvSpec
-from ..models.errors import InputError, NotCopied
+from ..models.errors import InputError, NotCopied, shortened
 from .protocol.client import Address
 from .protocol.layout import MAX_DRONES
 from .protocol.messages import FLY, FREEZE, MAX_UINT64, RESET, State
@@ -264,7 +264,7 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
         self.metadata = {"render_modes": [], "autoreset_mode": checked_mode(autoreset_mode)}
         if not (type(num_simulators) is int and 1 <= num_simulators <= MAX_DRONES):
             raise InputError(
-                f"num_simulators: expected 1 to {MAX_DRONES}, got {num_simulators!r:.300}"
+                f"num_simulators: expected 1 to {MAX_DRONES}, got {shortened(num_simulators)}"
             )
         drones = None
         if num_envs is not None:
@@ -273,7 +273,7 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
             if not right or num_envs % num_simulators:
                 raise InputError(
                     f"num_envs: expected a multiple of num_simulators = {num_simulators}, at most "
-                    f"{most}, got {num_envs!r:.300}"
+                    f"{most}, got {shortened(num_envs)}"
                 )
             self.num_envs = num_envs
             drones = num_envs // num_simulators

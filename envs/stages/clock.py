@@ -5,7 +5,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from ...models.errors import InputError
+from ...models.errors import InputError, shortened
 from .record import Mask, Record, Stage
 
 
@@ -68,6 +68,8 @@ def drones_of(record: Record, given: Any) -> Mask:
     dtype = getattr(given, "dtype", None)
     shape = getattr(given, "shape", None)
     if dtype != np.bool_ or shape != expected:
-        raise InputError(f"resets, frozen: expected bool of shape {expected}, got {given!r:.80}")
+        raise InputError(
+            f"resets, frozen: expected bool of shape {expected}, got {shortened(given)}"
+        )
     mask: Mask = given.reshape(record.shape)[()]
     return mask

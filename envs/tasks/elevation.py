@@ -6,7 +6,7 @@ from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 
-from ...models.errors import InputError
+from ...models.errors import InputError, shortened
 from ...models.fields import Limits, NumberOrPair
 from ...sim import (
     Array,
@@ -57,7 +57,7 @@ class ElevationOptions(TaskOptions):
         wider = self.flight_band > self.start_band
         least = f"more than start_band = {self.start_band:g} m"
         if not wider:
-            raise InputError(f"flight_band: expected {least}, got {self.flight_band!r:.300}")
+            raise InputError(f"flight_band: expected {least}, got {shortened(self.flight_band)}")
 
     @property
     def target_range(self) -> tuple[float, float]:
@@ -131,7 +131,7 @@ class Elevation(Task):
         reasons = f"(start_band = {options.start_band:g} m, and {room:g} m of room)"
         expected = f"{least:g} m {reasons} to {FURTHEST:g} m"
         if not (least <= low and high <= FURTHEST):
-            raise InputError(f"target: expected {expected}, got {options.target!r:.300}")
+            raise InputError(f"target: expected {expected}, got {shortened(options.target)}")
         increment = self.action == "increment"
         most = float(vehicle.thrust_high.max())
         usual: Any = self.controller
@@ -139,7 +139,7 @@ class Elevation(Task):
         expected = f"at most {most:g} N, the largest thrust of a rotor"
         if not scale <= most:
             raise InputError(
-                f"thrust_scale: expected {expected}, got {options.thrust_scale!r:.300}"
+                f"thrust_scale: expected {expected}, got {shortened(options.thrust_scale)}"
             )
         self.controller = CollectiveThrust(
             vehicle, scale, increment=increment, discrete=options.action_type == "discrete"

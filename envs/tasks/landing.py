@@ -6,7 +6,7 @@ from typing import Annotated, Final, Literal
 
 import numpy as np
 
-from ...models.errors import InputError
+from ...models.errors import InputError, shortened
 from ...models.fields import Limits, NumberOrPair
 from ...sim import Array, Draw, InitialState, component, each, square_root, stack
 from ..spec import Mark, Metric
@@ -63,13 +63,14 @@ class LandingOptions(TaskOptions):
         lowest = self.start_height - self.start_band
         if not lowest >= 0.5:
             raise InputError(
-                f"start_band: expected at most start_height - 0.5 m, got {self.start_band!r:.300}"
+                "start_band: expected at most start_height - 0.5 m, "
+                f"got {shortened(self.start_band)}"
             )
         reach = self.pad_path + math.sqrt(2) * self.start_band
         furthest = math.hypot(reach, self.start_height + self.start_band)
         expected = f"more than the {furthest:.4g} m of the furthest start"
         if not self.flight_band > furthest:
-            raise InputError(f"flight_band: expected {expected}, got {self.flight_band!r:.300}")
+            raise InputError(f"flight_band: expected {expected}, got {shortened(self.flight_band)}")
 
     @property
     def pad_speeds(self) -> tuple[float, float]:

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Final
 
 import numpy as np
 
-from ...models.errors import InputError
+from ...models.errors import InputError, shortened
 from ...models.fields import Limits, read_table
 from ...sim import (
     Array,
@@ -263,7 +263,7 @@ class Racing(GoalTask):
 def read_track(given: Any) -> tuple[list[Gate], Start]:
     """Gates of a track, and its start, a gate of size 0. Raises `InputError`."""
     if not isinstance(given, str):
-        raise InputError(f"track: expected {_WAY}, got {given!r:.80}")
+        raise InputError(f"track: expected {_WAY}, got {shortened(given)}")
     try:
         if given.lstrip().startswith("{"):
             content = json.loads(given)
@@ -275,10 +275,10 @@ def read_track(given: Any) -> tuple[list[Gate], Start]:
         names = ", ".join(sorted(path.stem for path in TRACKS.glob("*.toml")))
         reason = " ".join((getattr(error, "strerror", None) or str(error)).split())
         raise InputError(
-            f"track: expected {_WAY} ({names}), got {given!r:.80}: {reason:.120}"
+            f"track: expected {_WAY} ({names}), got {shortened(given)}: {reason:.120}"
         ) from None
     if not (isinstance(content, Mapping) and isinstance(content.get("gates"), list)):
-        raise InputError(f"track: expected a list of gates, got {content!r:.80}")
+        raise InputError(f"track: expected a list of gates, got {shortened(content)}")
     unknown = sorted({*content} - {"gates", "start"})
     if unknown:
         raise InputError(f"track: expected gates and start, got {unknown}")

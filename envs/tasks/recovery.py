@@ -6,7 +6,7 @@ from typing import Annotated, Final, Literal
 
 import numpy as np
 
-from ...models.errors import InputError
+from ...models.errors import InputError, shortened
 from ...models.fields import Limits
 from ...sim import (
     Array,
@@ -54,7 +54,7 @@ class RecoveryOptions(TaskOptions):
         """Check the options of this task. Raises `InputError`."""
         expected = f"more than near = {self.near:g} m"
         if not self.flight_band > self.near:
-            raise InputError(f"flight_band: expected {expected}, got {self.flight_band!r:.300}")
+            raise InputError(f"flight_band: expected {expected}, got {shortened(self.flight_band)}")
 
 
 class Recovery(GoalTask):

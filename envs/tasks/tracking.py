@@ -9,7 +9,7 @@ from typing import Annotated, Final
 
 import numpy as np
 
-from ...models.errors import InputError
+from ...models.errors import InputError, shortened
 from ...models.fields import Limits
 from ...sim import (
     Array,
@@ -291,7 +291,7 @@ def read_samples(given: str) -> np.ndarray:
     Raises `InputError`.
     """
     if not isinstance(given, str):
-        raise InputError(f"trajectory: expected {_EXPECTED}, got {given!r:.80}")
+        raise InputError(f"trajectory: expected {_EXPECTED}, got {shortened(given)}")
     try:
         if given.lstrip().startswith("["):
             rows = json.loads(given)

@@ -10,7 +10,7 @@ from typing import Final
 import mujoco
 import numpy as np
 
-from ...models.errors import InputError, expect
+from ...models.errors import InputError, shortened
 from ...models.vehicle import Vehicle, craft_bodies
 from ..effects import EffectOptions
 from ..randomize import Randomization
@@ -52,8 +52,9 @@ class RigidWorld(BaseWorld):
         compiled: bool | None = None,
     ) -> None:
         if not (compiled is None or type(compiled) is bool):
-            raise InputError(f"compiled: expected true or false, got {compiled!r:.300}")
-        expect(dtype in DTYPES, "dtype", " or ".join(DTYPES), repr(dtype))
+            raise InputError(f"compiled: expected true or false, got {shortened(compiled)}")
+        if dtype not in DTYPES:
+            raise InputError(f"dtype: expected {' or '.join(DTYPES)}, got {dtype!r}")
         found = kernel.compiler()
         expected = "false where no C compiler is found (cc, gcc, clang or the variable CC)"
         if not (found or not compiled):

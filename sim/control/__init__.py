@@ -6,7 +6,7 @@ within bounds, or is one of some choices.
 
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
-from ...models.errors import InputError
+from ...models.errors import InputError, shortened
 from ..effects import EffectOptions
 from ..state import Array, WorldState
 from .cascade import Attitude, Position, Rates, Velocity
@@ -68,7 +68,7 @@ def make_controller(
     are on. Raises `InputError` if the level is none of them, or the vehicle cannot be flown at it.
     """
     if level not in LEVELS:
-        raise InputError(f"action: expected one of {', '.join(LEVELS)}, got {level!r:.300}")
+        raise InputError(f"action: expected one of {', '.join(LEVELS)}, got {shortened(level)}")
     effects = effects or EffectOptions()
     members = getattr(vehicle, "members", (vehicle,))
     kinds = list(dict.fromkeys(members))

@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields
 from typing import Annotated, Any, Final, Self
 
 from ...models import MAX_DRAG
-from ...models.errors import InputError
+from ...models.errors import InputError, shortened
 from ...models.fields import Limits, check_fields, check_names
 
 MAX_WIND: Final = 100.0  # m/s
@@ -61,7 +61,7 @@ class EffectOptions:
         """Options by name. An unknown name raises `InputError`, which names those there are."""
         if not isinstance(options, Mapping):
             raise InputError(
-                f"effects: expected a mapping from names to values, got {options!r:.80}"
+                f"effects: expected a mapping from names to values, got {shortened(options)}"
             )
         check_names(options, [one.name for one in fields(cls)], "effects")
         return cls(**options)

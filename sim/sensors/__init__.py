@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from numpy.typing import NDArray
 
-from ...models.errors import InputError
+from ...models.errors import InputError, shortened
 from ...models.fields import check_names
 from ..snapshots import Arrays, Kept, joined, part_of
 from ..state import Array, WorldState
@@ -48,7 +48,7 @@ def checked_sensors(given: Any) -> dict[str, Any]:
     "estimate".
     """
     if not isinstance(given, Mapping):
-        raise InputError(f"sensors: expected settings by sensor, got {given!r:.80}")
+        raise InputError(f"sensors: expected settings by sensor, got {shortened(given)}")
     check_names(given, [*_SOURCES, "observe"], "sensors")
     sensors: dict[str, Any] = {}
     for name, kind in _SOURCES.items():
@@ -59,12 +59,14 @@ def checked_sensors(given: Any) -> dict[str, Any]:
             settings = {}
         if not isinstance(settings, Mapping):
             raise InputError(
-                f"sensors.{name}: expected true, or settings by name, got {settings!r:.80}"
+                f"sensors.{name}: expected true, or settings by name, got {shortened(settings)}"
             )
         sensors[name] = kind.checked(settings)
     observe = given.get("observe", "added")
     if observe not in ("added", _ESTIMATE):
-        raise InputError(f"sensors.observe: expected 'added' or 'estimate', got {observe!r:.300}")
+        raise InputError(
+            f"sensors.observe: expected 'added' or 'estimate', got {shortened(observe)}"
+        )
     if observe == _ESTIMATE:
         if _ESTIMATE not in sensors:
             raise InputError("sensors: expected estimate, which is to be observed, got none")

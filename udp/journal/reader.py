@@ -16,7 +16,7 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 
 from ...envs.spec import EnvSpec
-from ...models.errors import InputError
+from ...models.errors import InputError, shortened
 from ..layouts import layout_of
 from ..protocol import binary
 from ..protocol.errors import DecodeError
@@ -120,7 +120,9 @@ class Recording:
                 break
         if self.about.get("format", FORMAT) != FORMAT or (self.complete and not self.about):
             got = self.about.get("format", "another MCAP file")
-            raise InputError(f"{self.path}: expected a journal of format {FORMAT}, got {got!r:.80}")
+            raise InputError(
+                f"{self.path}: expected a journal of format {FORMAT}, got {shortened(got)}"
+            )
 
     def __iter__(self) -> Iterator[Item]:
         topics: dict[int, tuple[int, str]] = {}

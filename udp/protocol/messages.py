@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from ...models.errors import InputError
+from ...models.errors import InputError, shortened
 from .layout import MAX_DRONES
 
 MAX_UINT64: Final = (1 << 64) - 1  # largest session, sequence number, nonce and seed
@@ -42,7 +42,7 @@ def _check_text(name: str, text: str) -> None:
     if not size <= MAX_TEXT:
         raise InputError(f"{name}: expected at most {MAX_TEXT} bytes of UTF-8, got {size}")
     if _CONTROL.search(text):
-        raise InputError(f"{name}: expected no control characters, got {text!r:.300}")
+        raise InputError(f"{name}: expected no control characters, got {shortened(text)}")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

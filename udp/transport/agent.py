@@ -18,7 +18,7 @@ import numpy as np
 from ...envs import registry
 from ...envs.config import EnvConfig
 from ...envs.spec import EnvSpec, canonical_id, json_values
-from ...models.errors import InputError
+from ...models.errors import InputError, shortened
 from ..layouts import layout_of
 from ..protocol import text
 from ..protocol.auth import Key, read_keys
@@ -87,7 +87,7 @@ class AgentConfig:
         check_largest(self.max_datagram)
         if not (self.when_lost is None or self.when_lost in POLICIES):
             raise InputError(
-                f"when_lost: expected one of {', '.join(POLICIES)}, got {self.when_lost!r:.300}"
+                f"when_lost: expected one of {', '.join(POLICIES)}, got {shortened(self.when_lost)}"
             )
         if self.env_id is not None:
             self.env_id = canonical_id(self.env_id)
@@ -391,7 +391,7 @@ def _spec_difference(ours: EnvSpec, theirs: EnvSpec) -> str:
         expected = getattr(ours, name)
         got = getattr(theirs, name)
         if expected != got and name not in ("vehicle", "marks"):
-            return f"{name}: expected {expected!r:.200} as before, got {got!r:.200}"
+            return f"{name}: expected {shortened(expected)} as before, got {shortened(got)}"
     return ""
 
 
