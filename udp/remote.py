@@ -364,17 +364,21 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
     ) -> np.ndarray:
         """One exchange with each simulator; why that of each drone was lost, or "", shape (N,)."""
         slots = range(self.num_simulators)
-        awake: np.ndarray = ~np.all(frozen.reshape(self._shape), axis=1)
-        starting: np.ndarray = np.any(resets.reshape(self._shape), axis=1)
-        pending = [slot for slot in slots if awake[slot]]
+        pending = list(slots)
+        if frozen is not self._nobody:
+            asleep = frozen.reshape(self._shape).all(axis=1)
+            pending = [slot for slot in slots if not asleep[slot]]
         reasons = [""] * self.num_simulators
         self._flying = False  # until the answers are there
         while pending:
             self._agent.exchange(self._orders(pending, actions, resets, seeds, frozen))
             lost = self._agent.lost
             reasons = [new or old for new, old in zip(lost, reasons, strict=True)]
+            if seeds is None or not any(lost):
+                break
             # A simulator in place of a lost one knows no seeds.
-            pending = [s for s in slots if lost[s] and starting[s] and seeds is not None]
+            starting = resets.reshape(self._shape).any(axis=1)
+            pending = [slot for slot in slots if lost[slot] and starting[slot]]
             actions = self._nothing
             frozen = ~resets
         return np.repeat(np.array(reasons, object), self._shape[1])
