@@ -5,7 +5,6 @@ Cells are made once; the terminal, Markdown and HTML show the same ones.
 
 import html
 import math
-import re
 from collections.abc import Mapping, Sequence
 from itertools import groupby
 from typing import Final, Literal, NamedTuple
@@ -188,26 +187,27 @@ def headings(headline: Headline, swarm: bool = False) -> tuple[str, ...]:
 
 def _line(row: Row, line: Mapping[str, float], headline: Headline, swarm: bool) -> tuple[Cell, ...]:
     seeds = int(line["seeds"])
-    episodes = int(line["episodes"])
-    reached: tuple[str, ...] = ()
-    if not math.isnan(line["reached"]):
-        reached = (_of(line["reached"], seeds, "seed"),)
-        if line["reached"]:
-            reached += (f"{number_text(line['seconds_to_hold'])} s",)
-    names = [_of(seeds, None, "seed")]
+    names = [f"{seeds} seed{'s' * (seeds != 1)}"]
     if not row.controller:
         names.append(f"{count_text(line['env_steps'])} env steps")
+    settling = Cell(NOTHING)
+    if headline.settles:
+        settled = f"{int(line['settled'])} of {int(line['episodes'])}"
+        settling = _measured(line, "settling_time", settled)
+    reached = []
+    if not math.isnan(line["reached"]):
+        reached.append(f"{int(line['reached'])} of {seeds}")
+    if line["reached"] > 0:
+        reached.append(f"{number_text(line['seconds_to_hold'])} s")
     return (
         Cell(row_label(row), tuple(names)),
-        _measured(line, "steady", (f"worst {number_text(line['worst'])}",)),
+        _measured(line, "steady", f"worst {number_text(line['worst'])}"),
         _held(line, seeds),
         _crashes(line),
-        _measured(line, "settling_time", (f"{int(line['settled'])} of {episodes} settled",))
-        if headline.settles
-        else Cell(NOTHING),
+        settling,
         _measured(line, "least_distance" if swarm else "overshoot"),
         _measured(line, "return"),
-        Cell(count_text(line["env_steps_to_hold"]), reached),
+        Cell(count_text(line["env_steps_to_hold"]), tuple(reached)),
         Cell(count_text(line["steps_per_second"])),
     )
 
@@ -238,18 +238,11 @@ def _crashes(line: Mapping[str, float]) -> Cell:
     return Cell(f"{rate} %", (interval, f"{int(line['crashed'])} of {int(line['episodes'])}"))
 
 
-def _measured(line: Mapping[str, float], name: str, details: tuple[str, ...] = ()) -> Cell:
+def _measured(line: Mapping[str, float], name: str, *details: str) -> Cell:
     low = line[f"{name}_low"]
     high = line[f"{name}_high"]
     interval = () if math.isnan(low) else (f"{number_text(low)} to {number_text(high)}",)
     return Cell(number_text(line[name]), interval + details)
-
-
-def _of(count: float, total: int | None, word: str) -> str:
-    number = count if total is None else total
-    plural = "" if number == 1 else "s"
-    counted = f"{count:.0f}" if total is None else f"{count:.0f} of {total}"
-    return f"{counted} {word}{plural}"
 
 
 def number_text(value: float) -> str:
@@ -372,15 +365,11 @@ def _terminal_table(task: TaskTable) -> Table:
         justify: Literal["left", "right"] = "right" if place else "left"
         shown.add_column(task.headings[place], justify=justify, overflow="fold")
     for line in task.lines:
-        cells = [_terminal_cell(line[place]) for place in _TERMINAL_COLUMNS]
-        shown.add_row(*cells, end_section=True)
+        shown_cells = [line[place] for place in _TERMINAL_COLUMNS]
+        # Text, not markup: a name may hold brackets.
+        texts = [Text("\n".join([cell.value, *cell.details])) for cell in shown_cells]
+        shown.add_row(*texts, end_section=True)
     return shown
-
-
-def _terminal_cell(cell: Cell) -> Text:
-    # Text, not markup: a name may hold brackets. The last words would cost the width.
-    details = [re.sub(r"( of \d+) (settled|seeds?)$", r"\1", text) for text in cell.details]
-    return Text("\n".join([cell.value, *details]))
 
 
 def html_table(task: TaskTable) -> str:

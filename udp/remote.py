@@ -366,7 +366,7 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
         slots = range(self.num_simulators)
         pending = list(slots)
         if frozen is not self._nobody:
-            asleep = frozen.reshape(self._shape).all(axis=1)
+            asleep: np.ndarray = np.all(frozen.reshape(self._shape), axis=1)
             pending = [slot for slot in slots if not asleep[slot]]
         reasons = [""] * self.num_simulators
         self._flying = False  # until the answers are there
@@ -377,7 +377,7 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
             if seeds is None or not any(lost):
                 break
             # A simulator in place of a lost one knows no seeds.
-            starting = resets.reshape(self._shape).any(axis=1)
+            starting: np.ndarray = np.any(resets.reshape(self._shape), axis=1)
             pending = [slot for slot in slots if lost[slot] and starting[slot]]
             actions = self._nothing
             frozen = ~resets

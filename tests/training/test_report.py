@@ -101,7 +101,7 @@ def test_measures_over_seeds(tmp_path: Path) -> None:
     assert (
         r"| VPG (4 seeds; 2,000 env steps) | 0.025 (0.025 to 0.90; worst 0.90) "
         "| 3 of 4 (30 % to 95 %) | 0 % (0 to 4.58 %; 0 of 80) | 1.50 (1.50 to 1.50; "
-        "80 of 80 settled) | 0.20 (0.20 to 0.20) | 200 (200 to 200) | 1,000 (3 of 4 seeds; 2.50 s) "
+        "80 of 80) | 0.20 (0.20 to 0.20) | 200 (200 to 200) | 1,000 (3 of 4; 2.50 s) "
         "| 3,000 |" in page
     )
     assert "| 5.00 % (1.96 to 12.2 %; 4 of 80) |" in page
