@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...sim import Controller, World
+from ...sim.snapshots import Arrays
 from .record import Look, Mask, Record, Stage
 
 
@@ -43,6 +44,14 @@ class Flight(Stage):
             for part in self.parts:
                 part.step(record)
             self._world.step(record.thrust, self._held, record.flown, again=first > 0)
+
+    def snapshot(self, record: Record) -> Arrays:
+        """State of the world."""
+        return self._world.snapshot()
+
+    def restore(self, record: Record, arrays: Arrays) -> None:
+        """Put the world back."""
+        self._world.restore(arrays)
 
     def close(self) -> None:
         """Close the world."""

@@ -19,8 +19,7 @@ class Starts(Stage):
     Raises `InputError` if it gives another thing.
     """
 
-    def __init__(self, env_id: str, task: Task, world: World) -> None:
-        self._env_id = env_id
+    def __init__(self, task: Task, world: World) -> None:
         self._task = task
         self._world = world
 
@@ -35,9 +34,10 @@ class Starts(Stage):
         if isinstance(start, InitialState):
             got = tuple(getattr(start.position, "shape", ()))
         if got != expected:
+            env_id = self._task.config.env_id
             raise InputError(
-                f"{self._env_id}: expected begin() to return an InitialState with a position of "
-                f"shape {expected}, got {got}"
+                f"{env_id}: expected begin() to return an InitialState with a position of shape "
+                f"{expected}, got {got}"
             )
         record.start = start
 
@@ -63,8 +63,7 @@ class Judge(Stage):
 
     arrays = ("observations", "terms", "metrics")
 
-    def __init__(self, env_id: str, task: Task) -> None:
-        self._env_id = env_id
+    def __init__(self, task: Task) -> None:
         self._task = task
         self._checked = False
 
@@ -118,4 +117,4 @@ class Judge(Stage):
             )
 
     def _refuse(self, expected: str, got: Any) -> None:
-        raise InputError(f"{self._env_id}: expected {expected}, got {got}")
+        raise InputError(f"{self._task.config.env_id}: expected {expected}, got {got}")

@@ -1,8 +1,10 @@
 """Drones of a lost agent land by themselves."""
 
+from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...sim import EffectOptions, World, make_controller
 from .record import Look, Mask, Record, Stage, where
@@ -21,22 +23,34 @@ class Landing(Stage):
         look: Gives the state that a controller sees.
         period: Time between two controls, s.
         effects: Lag and thrust curve of the rotors among them.
-
-    Raises:
-        InputError: The vehicle cannot be flown at that level.
     """
 
     def __init__(self, world: World, look: Look, period: float, effects: EffectOptions) -> None:
+        self._world = world
         self._look = look
-        controller: Any = make_controller("velocity", world.vehicle, period, effects)
-        self._controller = controller
+        self._period = period
+        self._effects = effects
+
+    @cached_property
+    def _descent(self) -> tuple[Any, NDArray[np.float64]]:
+        """The controller and its action, made when the first drone lands."""
+        vehicle = self._world.vehicle
+        controller: Any = make_controller("velocity", vehicle, self._period, self._effects)
         fastest, _ = controller.ranges()[2]
         down = (0.0, 0.0, -min(1.0, DESCENT / fastest), 0.0)
-        self._action = np.broadcast_to(down, (*world.shape, len(down)))
+        return controller, np.broadcast_to(down, (*self._world.shape, len(down)))
+
+    def prepare(self, record: Record, drones: Mask) -> None:
+        """These drones land too. Raises `InputError` if the vehicle has no level `velocity`."""
+        assert self._descent
+        record.landing = vars(record).get("landing", False) | drones
 
     def step(self, record: Record) -> None:
         """Replace the thrust of the drones that land."""
-        down = self._controller.thrust(self._action, self._look())
+        if "landing" not in vars(record):
+            return
+        controller, action = self._descent
+        down = controller.thrust(action, self._look())
         record.thrust = where(record.landing, down, record.thrust)
 
 
@@ -45,15 +59,12 @@ class Landed(Stage):
 
     arrays = ("landing",)
 
-    def prepare(self, record: Record, drones: Mask) -> None:
-        """These drones land too."""
-        landing = vars(record).get("landing", False)
-        record.landing = landing | drones
-
     def begin(self, record: Record) -> None:
         """A drone whose episode begins has an agent again."""
-        record.landing = np.zeros(record.shape, bool)[()]
+        if "landing" in vars(record):
+            record.landing = np.zeros(record.shape, bool)[()]
 
     def step(self, record: Record) -> None:
         """Take them out."""
-        record.leaving = record.landing & record.state.touching
+        if "landing" in vars(record):
+            record.leaving = record.landing & record.state.touching

@@ -1,6 +1,7 @@
 """What is measured of the state: the state itself, or what sensors say of it."""
 
 from ...sim import World
+from ...sim.snapshots import Arrays
 from ..state import kept_state
 from .record import Record, Stage
 
@@ -16,6 +17,11 @@ class Measure(Stage):
     def __init__(self, world: World, period: float) -> None:
         self._world = world
         self._period = period
+
+    def restore(self, record: Record, arrays: Arrays) -> None:
+        """Measure the state that was put back."""
+        if record.has_begun:
+            self.step(record)
 
     def step(self, record: Record) -> None:
         """Measures without errors; sensors change it."""

@@ -152,7 +152,7 @@ class Pictures(Stage):
                 taken.setdefault(name, np.zeros_like(array))[mask] = array[mask]
         return taken
 
-    def restore(self, arrays: Arrays) -> None:
+    def restore(self, record: Record, arrays: Arrays) -> None:
         """Put a snapshot back."""
         if arrays:
             for painter in self._painters:

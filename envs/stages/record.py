@@ -84,10 +84,10 @@ class Record:
     keys: NDArray[np.uint32]
     silent: Mask
 
-    def __init__(self, shape: tuple[int, ...], memory: Memory) -> None:
+    def __init__(self, shape: tuple[int, ...], memory: Memory, kept: tuple[str, ...] = ()) -> None:
         self.shape = shape
         self.memory = memory
-        self.kept: tuple[str, ...] = ()
+        self.kept = kept
         nobody = np.zeros(shape, bool)[()]
         self.flown: Mask | None = None
         self.begun: Mask | None = None
@@ -157,6 +157,11 @@ class Record:
         self.flown = self.begun = self.leaving = None
         self.count()
 
+    @property
+    def has_begun(self) -> bool:
+        """Whether there was an episode."""
+        return "action" in vars(self)
+
     def count(self) -> None:
         """See again whether any drone waits or is out."""
         self.anyone_waits = bool(self.waiting.any())
@@ -207,6 +212,13 @@ class Stage:
 
         Stages from `Measure` on run for drones that fly and for drones that begin.
         """
+
+    def snapshot(self, record: Record) -> Arrays:
+        """What a later step depends on besides the record."""
+        return {}
+
+    def restore(self, record: Record, arrays: Arrays) -> None:
+        """Put a snapshot back; the record has been restored, and so have stages before this."""
 
     def close(self) -> None:
         """Release threads and memory."""

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...sim.sensors import Sensors
+from ...sim.snapshots import Arrays
 from ..spec import ArraySpec
 from ..state import read_only
 from .record import Record, Stage
@@ -27,6 +28,14 @@ class Sensing(Stage):
     def begin(self, record: Record) -> None:
         """First readings."""
         self._sensors.begin(record.begun)
+
+    def snapshot(self, record: Record) -> Arrays:
+        """State of the sensors."""
+        return self._sensors.snapshot()
+
+    def restore(self, record: Record, arrays: Arrays) -> None:
+        """Put them back."""
+        self._sensors.restore(arrays)
 
     def step(self, record: Record) -> None:
         """Readings of the drones that flew; the others keep theirs."""

@@ -1,0 +1,93 @@
+"""The list of a loop's stages, in its order; a feature that is off is not in it."""
+
+from ..sim import Randomization, World
+from ..sim.sensors import Sensors
+from .specification import observed
+from .stages.actions import ActionDelay, Actions, Receive
+from .stages.clock import Clock
+from .stages.delays import ObservationDelay
+from .stages.ends import Ends
+from .stages.flight import Control, Flight, StandStill
+from .stages.history import History
+from .stages.judge import Judge, Remember, Starts
+from .stages.landing import Landed, Landing
+from .stages.measure import Measure
+from .stages.pictures import Pictures
+from .stages.radio import Radio
+from .stages.record import Stage
+from .stages.sensing import Readings, Sensing
+from .tasks.task import Task
+
+
+class Pipeline:
+    """Stages by region.
+
+    A step has four regions: the clock, for all drones; flight, for those that fly; begin, for those
+    whose episode begins; and from `Measure` on for both, together.
+
+    Attributes:
+        actions: Checks what an agent sends.
+        stages: In the order in which an episode begins.
+        fly: Steps of the drones that fly.
+        begin: What all of them do when an episode begins.
+        observe: Steps from `Measure` on.
+        pictures: Specs of pictures.
+        landing: The part of flight that brings drones down.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        world: World,
+        shape: tuple[int, int],
+        randomize: Randomization | None,
+    ) -> None:
+        config = task.config
+        controller = task.controller
+        period = task.control_period
+        drawn = () if randomize is None else randomize.names
+        look = lambda: world.state  # noqa: E731
+        sensors = Sensors(config.sensors, world, period) if config.sensors else None
+        if sensors is not None and config.estimated:
+            look = sensors.seen
+        self.actions = Actions(world.shape, len(controller.low), controller.choices)
+        neutral = self.actions.neutral()
+        substeps = task.vehicle.substeps(period)
+        # An estimate is computed once in a control step, and so is a thrust that follows from it.
+        often = getattr(controller, "every_step", False) and not config.estimated
+        held = 1 if often else substeps
+        self.landing = Landing(world, look, held * task.vehicle.timestep, config.effects)
+        parts: list[Stage] = [Control(controller, look), self.landing]
+        if shape[1] > 1:
+            parts.append(StandStill(world))
+
+        flying: list[Stage] = [Receive(neutral)]
+        if randomize is not None and "action_delay" in drawn:
+            flying.append(ActionDelay(world, randomize.most_steps("action_delay"), neutral))
+        flying += [Flight(world, parts, substeps, held), Clock()]
+
+        observing: list[Stage] = [Measure(world, period)]
+        if sensors is not None:
+            observing.append(Sensing(sensors, replaces=config.estimated))
+        observing.append(Remember(task))
+        if task.has_radio:
+            observing.append(Radio(task.options, period, shape[1], task.ended))
+        observing.append(Judge(task))
+        if sensors is not None:
+            observing.append(Readings(sensors, observed(task) if config.estimated else ()))
+        self.pictures = ()
+        if config.cameras:
+            pictures = Pictures(task, world.random, shape)
+            self.pictures = pictures.specs
+            observing.append(pictures)
+        if randomize is not None and "observation_delay" in drawn:
+            observing.append(ObservationDelay(world, randomize.most_steps("observation_delay")))
+        if config.history > 1:
+            names = tuple(array.name for array in observed(task))
+            observing.append(History(config.history, names, len(world.shape)))
+        observing += [Landed(), Ends(config.env_id, world.shape, task.episode_length)]
+
+        self.stages = [Starts(task, world), *flying, *observing]
+        self.fly = [stage.step for stage in flying]
+        self.begin = [stage.begin for stage in self.stages]
+        self.observe = [stage.step for stage in observing]
