@@ -2,6 +2,7 @@
 
 from ..sim import Randomization, World
 from ..sim.sensors import Sensors
+from .spec import ArraySpec
 from .specification import observed
 from .stages.actions import ActionDelay, Actions, Receive
 from .stages.clock import Clock
@@ -75,7 +76,7 @@ class Pipeline:
         observing.append(Judge(task))
         if sensors is not None:
             observing.append(Readings(sensors, observed(task) if config.estimated else ()))
-        self.pictures = ()
+        self.pictures: tuple[ArraySpec, ...] = ()
         if config.cameras:
             pictures = Pictures(task, world.random, shape)
             self.pictures = pictures.specs

@@ -14,7 +14,7 @@ from .spec import ArraySpec
 from .tasks.task import Task
 
 if TYPE_CHECKING:
-    from .loop import Loop
+    from .results import Results
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,10 +22,10 @@ class Quantity:
     """A number or a vector of the telemetry: its spec, and how it is read of a loop."""
 
     spec: ArraySpec
-    read: Callable[["Loop"], Array]
+    read: Callable[["Results"], Array]
     """Gives an array of shape (W, A, *shape), or () for a number of a single drone."""
 
-    def values(self, loop: "Loop") -> NDArray[np.float64]:
+    def values(self, loop: "Results") -> NDArray[np.float64]:
         """float64, shape (N, *shape)."""
         values = np.asarray(self.read(loop), np.float64)
         return values.reshape(loop.num_envs, *self.spec.shape)
@@ -46,7 +46,7 @@ def quantities_of(task: Task) -> tuple[Quantity, ...]:
 
 
 def _quantity(
-    name: str, components: tuple[str, ...], read: Callable[["Loop"], Array], **rest: Any
+    name: str, components: tuple[str, ...], read: Callable[["Results"], Array], **rest: Any
 ) -> Quantity:
     spec = ArraySpec(
         name=name, shape=(len(components),), dtype="float64", components=components, **rest
@@ -98,7 +98,7 @@ def _thrust(task: Task) -> Quantity:
 
 
 def _drawn(names: tuple[str, ...]) -> Quantity:
-    def read(loop: "Loop") -> Array:
+    def read(loop: "Results") -> Array:
         return np.stack([loop.world.parameters[name] for name in names], axis=-1)
 
     units = tuple(PARAMETERS[name].unit for name in names)
@@ -108,7 +108,7 @@ def _drawn(names: tuple[str, ...]) -> Quantity:
 def _metrics(task: Task) -> Quantity:
     names = tuple(metric.name for metric in task.metrics)
 
-    def read(loop: "Loop") -> Array:
+    def read(loop: "Results") -> Array:
         metrics = loop.record.metrics
         zero = np.zeros(loop.record.shape)
         return np.stack([metrics[name] + zero for name in names], axis=-1)
