@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..models.errors import InputError
-from ..sim import Array, PhysicsError, Randomization, World, make_world
+from ..sim import Array, PhysicsError, Randomization, make_world
 from ..sim.snapshots import Arrays, joined, part_of
 from .autoreset import Seeds, checked_seeds
 from .config import EnvConfig
@@ -21,7 +21,6 @@ from .results import Results
 from .specification import make_task, spec_of
 from .stages import clock
 from .stages.record import Mask, Record
-from .tasks.task import Task
 
 
 class Loop(Results):
@@ -54,11 +53,11 @@ class Loop(Results):
         backend = config.backend
         shape = (num_worlds, config.drones)
         alone = shape == (1, 1) and backend.name == "mujoco"
-        self.task: Task = make_task(config, () if alone else shape)
-        self.vehicle = self.task.vehicle
-        flown = self.task.config
+        task = make_task(config, () if alone else shape)
+        self.vehicle = task.vehicle
+        flown = task.config
         randomize = Randomization(flown.randomize, flown.effects) if flown.randomize else None
-        self.world: World = make_world(
+        world = make_world(
             self.vehicle,
             num_worlds,
             backend.name,
@@ -67,12 +66,12 @@ class Loop(Results):
             randomize=randomize,
             **backend.settings,
         )
-        self._pipeline = pipeline = Pipeline(self.task, self.world, shape, randomize)
-        self.spec = spec_of(config, self.task, pipeline.pictures)
+        self._pipeline = pipeline = Pipeline(task, world, shape, randomize)
+        self.spec = spec_of(config, task, pipeline.pictures)
         kept = tuple(name for stage in pipeline.stages for name in stage.arrays)
-        self.record = Record(self.world.shape, self.task.memory, kept)
+        record = Record(world.shape, task.memory, kept)
         self._closed = False
-        super().__init__(self.task, self.spec, self.record)
+        super().__init__(task, world, self.spec, record)
 
     def advance(
         self,

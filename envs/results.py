@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from ..sim import Array
+from ..sim import Array, World
 from .spec import EnvSpec
 from .stages.record import Record
 from .tasks.task import Task
@@ -24,8 +24,10 @@ class Results:
         out: bool, shape (N,): its own has ended.
     """
 
-    def __init__(self, task: Task, spec: EnvSpec, record: Record) -> None:
-        self.record = record
+    def __init__(self, task: Task, world: World, spec: EnvSpec, record: Record) -> None:
+        self.task = task
+        self.world = world
+        self.record: Record = record
         self.num_envs = record.out.size
         self._quantities = quantities_of(task)
         self._arrays = {
