@@ -25,8 +25,8 @@ class Results:
     """
 
     def __init__(self, task: Task, world: World, spec: EnvSpec, record: Record) -> None:
-        self.task = task
-        self.world = world
+        self.task: Task = task
+        self.world: World = world
         self.record: Record = record
         self.num_envs = record.out.size
         self._quantities = quantities_of(task)
