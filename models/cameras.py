@@ -8,7 +8,7 @@ file has a table `[[cameras]]` for each. A file without a `front` or a `down` ge
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Annotated, Any, Final, Literal, get_args
+from typing import Annotated, Final, Literal, get_args
 
 import mujoco
 import numpy as np
@@ -262,7 +262,7 @@ def _check_numbers(name: str, model: mujoco.MjModel, number: int) -> None:
         raise InputError(f"{name}: expected a position within 1e4 m, got {place}")
 
 
-def _read(text: str) -> Any:
+def _read(text: str) -> str | float | list[float]:
     """Numbers of a text; itself where it has others."""
     try:
         numbers = [float(word) for word in text.split()]

@@ -129,12 +129,13 @@ class Coefficients:
             values.append(value)
         return tuple(values)
 
-    def _value(self, name: str) -> Any:
+    def _value(self, name: str) -> float | tuple[float, ...] | None:
         group, _, key = name.partition(".")
-        return getattr(getattr(self, group), key)
+        value: float | tuple[float, ...] | None = getattr(getattr(self, group), key)
+        return value
 
     @classmethod
-    def read(cls, numbers: Mapping[str, Any]) -> "Coefficients":
+    def read(cls, numbers: Mapping[str, object]) -> "Coefficients":
         """From numbers and lists of numbers by "group.name". Raises `InputError`."""
         groups: dict[str, dict[str, Any]] = {one.name: {} for one in fields(cls)}
         for name, value in numbers.items():

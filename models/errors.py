@@ -2,7 +2,6 @@
 
 from importlib import import_module
 from types import ModuleType
-from typing import Any
 
 
 class InputError(ValueError):
@@ -30,7 +29,7 @@ class NoOpenGL(RuntimeError):
 class NotCopied:
     """Base of what holds memory of a simulator, or a socket: a copy would fly wrong numbers."""
 
-    def __reduce__(self) -> Any:
+    def __reduce__(self) -> str:
         """Raise `TypeError`."""
         raise TypeError("a running env cannot be copied or pickled: make another one")
 

@@ -35,7 +35,7 @@ class Rule(Protocol):
     def expected(self) -> str:
         """The rule in words, as they stand after "expected"."""
 
-    def read(self, value: Any) -> Any:
+    def read(self, value: object) -> Any:
         """The value as it is kept. Raises `ValueError` or `TypeError` for a wrong one."""
 
 
@@ -135,7 +135,7 @@ class Choice:
     def expected(self) -> str:
         return " or ".join(map(repr, self.words))
 
-    def read(self, value: Any) -> str:
+    def read(self, value: object) -> str:
         if not isinstance(value, str) or value not in self.words:
             raise ValueError
         return value
@@ -160,7 +160,7 @@ class Text:
             return f"up to {self.longest} letters, digits and _"
         return f"a text of {int(not self.empty)} to {self.longest} printable characters"
 
-    def read(self, value: Any) -> str:
+    def read(self, value: object) -> str:
         if not isinstance(value, str) or not (value or self.empty):
             raise ValueError
         if self.longest is None:
@@ -178,7 +178,7 @@ class Flag:
 
     expected = "true or false"
 
-    def read(self, value: Any) -> bool:
+    def read(self, value: object) -> bool:
         if type(value) is not bool:
             raise TypeError
         return value
@@ -194,11 +194,11 @@ class OrNone:
     def expected(self) -> str:
         return f"{self.rule.expected}, or none"
 
-    def read(self, value: Any) -> Any:
+    def read(self, value: object) -> Any:
         return None if value is None else self.rule.read(value)
 
 
-def check(name: str, rule: Rule, value: Any, error: type[InputError] = InputError) -> Any:
+def check(name: str, rule: Rule, value: object, error: type[InputError] = InputError) -> Any:
     """A value as its rule keeps it. Raises the error with the sentence "name: expected…, got…"."""
     try:
         return rule.read(value)
@@ -206,7 +206,7 @@ def check(name: str, rule: Rule, value: Any, error: type[InputError] = InputErro
         raise error(f"{name}: expected {rule.expected}, got {shortened(value)}") from None
 
 
-def check_fields(instance: Any, where: str = "", error: type[InputError] = InputError) -> None:
+def check_fields(instance: object, where: str = "", error: type[InputError] = InputError) -> None:
     """Check the fields of a dataclass that have rules; keep numbers as floats, ints and tuples.
 
     For `__post_init__`, also of a frozen class. `where` stands before the field's name.
@@ -216,7 +216,7 @@ def check_fields(instance: Any, where: str = "", error: type[InputError] = Input
         object.__setattr__(instance, name, value)
 
 
-def read_table(kind: type[T], table: Any, where: str, error: type[InputError] = InputError) -> T:
+def read_table(kind: type[T], table: object, where: str, error: type[InputError] = InputError) -> T:
     """An instance of a dataclass from its fields by name, as TOML and JSON have them.
 
     Names of fields stand behind `where` and a dot. Unknown, missing and wrong fields raise.
@@ -249,7 +249,7 @@ def check_names(
             raise error(f"{where}: expected some of {', '.join(names)}, got {shortened(name)}")
 
 
-def rules_of(kind: Any) -> Mapping[str, Rule]:
+def rules_of(kind: type) -> Mapping[str, Rule]:
     """The rules of a dataclass's fields, by name.
 
     They are those of annotations: `Annotated` with a rule, `Literal`, and the types bool, int,
@@ -268,11 +268,11 @@ def rules_of(kind: Any) -> Mapping[str, Rule]:
     return rules
 
 
-_RULES: dict[Any, Mapping[str, Rule]] = {}
+_RULES: dict[type, Mapping[str, Rule]] = {}
 """What `rules_of` has found."""
 
 
-def limits_of(kind: Any, prefix: str = "") -> dict[str, Limits]:
+def limits_of(kind: type, prefix: str = "") -> dict[str, Limits]:
     """The limits of a dataclass's numbers, by the prefix and the name; None is no number."""
     found = {}
     for name, rule in rules_of(kind).items():
@@ -282,7 +282,7 @@ def limits_of(kind: Any, prefix: str = "") -> dict[str, Limits]:
     return found
 
 
-_PLAIN: Mapping[Any, Rule] = {
+_PLAIN: Mapping[object, Rule] = {
     bool: Flag(),
     int: Limits(whole=True),
     float: Limits(),
@@ -290,7 +290,7 @@ _PLAIN: Mapping[Any, Rule] = {
 }
 
 
-def _rule_of(hint: Any) -> Rule | None:
+def _rule_of(hint: object) -> Rule | None:
     arguments = get_args(hint)
     if get_origin(hint) in (Union, UnionType) and NoneType in arguments:
         others = [one for one in arguments if one is not NoneType]

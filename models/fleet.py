@@ -75,7 +75,7 @@ class Fleet(Vehicle):
         """Of the least able, rad/s²."""
         return min(one.turning(axis) for one in self.members)
 
-    def __reduce__(self) -> Any:
+    def __reduce__(self) -> tuple[object, ...]:
         """Loaded again from its files."""
         paths = ",".join(str(one.path) for one in self.members)
         return partial(load_vehicles, linear_drag=self.linear_drag), (paths, len(self.members))

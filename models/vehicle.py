@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Final, Self
 
 import mujoco
 import numpy as np
@@ -222,11 +222,11 @@ class Vehicle:
         _group(model)
         return model
 
-    def __deepcopy__(self, memo: Any) -> Self:
+    def __deepcopy__(self, memo: object) -> Self:
         """Itself: it never changes."""
         return self
 
-    def __reduce__(self) -> Any:
+    def __reduce__(self) -> tuple[object, ...]:
         """Loaded again from its file."""
         return partial(Vehicle.load, linear_drag=self.linear_drag), (str(self.path),)
 
@@ -384,7 +384,9 @@ def _load(path: Path, drag: float, changed: tuple[int, ...]) -> Vehicle:
     )
 
 
-def mass_properties(model: mujoco.MjModel, data: Any) -> tuple[float, np.ndarray, np.ndarray]:
+def mass_properties(
+    model: mujoco.MjModel, data: mujoco.MjData
+) -> tuple[float, np.ndarray, np.ndarray]:
     """Mass, center of mass and inertia about it of the free body and what is welded to it.
 
     `data` is at the origin and level. Units and shapes as of `Vehicle`.
@@ -441,7 +443,7 @@ def rotor_faults(model: mujoco.MjModel, index: int) -> Iterator[tuple[str, str]]
         yield f"{rotor} to have a thrust with limits (ctrlrange)", ""
 
 
-def read_rotor(model: mujoco.MjModel, data: Any, index: int) -> Rotor:
+def read_rotor(model: mujoco.MjModel, data: mujoco.MjData, index: int) -> Rotor:
     """The rotor of an actuator without faults; `data` is at the origin and level."""
     site = int(model.actuator_trnid[index, 0])
     force = model.actuator_gear[index, :3]
@@ -508,7 +510,7 @@ def _hover(rotors: tuple[Rotor, ...], allocation: np.ndarray, weight: float) -> 
     return thrust
 
 
-def find_rest_height(model: mujoco.MjModel, data: Any) -> float:
+def find_rest_height(model: mujoco.MjModel, data: mujoco.MjData) -> float:
     """Height at which the level body first touches anything, by bisection; 0 if it never does.
 
     Raises `InputError` if it touches something at any height, like a wall.
@@ -528,7 +530,7 @@ def find_rest_height(model: mujoco.MjModel, data: Any) -> float:
     return round(high, 9)
 
 
-def _touches(model: mujoco.MjModel, data: Any, height: float) -> bool:
+def _touches(model: mujoco.MjModel, data: mujoco.MjData, height: float) -> bool:
     data.qpos[2] = height
     mujoco.mj_fwdPosition(model, data)
     return bool(data.ncon > 0)

@@ -9,7 +9,7 @@ import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, TypeVar
+from typing import Annotated, Final, Literal, TypeVar
 
 import numpy as np
 
@@ -260,7 +260,7 @@ def read_vehicle_file(path: Path) -> VehicleFile:
         ) from None
 
 
-def _read(path: Path, tree: dict[str, Any]) -> VehicleFile:
+def _read(path: Path, tree: dict[str, object]) -> VehicleFile:
     numbers: list[Number] = []
     name = path.parent.name if path.stem == "vehicle" else path.stem
     file = _table(numbers, _File, {"name": name, **tree}, "vehicle")
@@ -287,7 +287,7 @@ def _read(path: Path, tree: dict[str, Any]) -> VehicleFile:
     )
 
 
-_GROUPS: Final[Mapping[str, type[Any]]] = {
+_GROUPS: Final[Mapping[str, type]] = {
     "drag": Drag,
     "battery": Battery,
     "sensors": Sensors,
@@ -330,13 +330,13 @@ def _number(name: str, limits: Limits, given: object, source: str) -> Number:
     )
 
 
-def _mapping(given: object, where: str) -> Mapping[str, Any]:
+def _mapping(given: object, where: str) -> Mapping[str, object]:
     if not isinstance(given, Mapping):
         raise InputError(f"{where}: expected a table, got {shortened(given)}")
     return given
 
 
-def _text(table: Mapping[str, Any], key: str, where: str) -> str:
+def _text(table: Mapping[str, object], key: str, where: str) -> str:
     return str(check(f"{where}.{key}", Text(empty=True), table.get(key, "")))
 
 
@@ -567,7 +567,7 @@ def _check_inertia(values: _Numbers) -> None:
         )
 
 
-def _plain(tree: Any) -> Any:
+def _plain(tree: object) -> object:
     """What a tree says without provenance, with every number as a float."""
     if isinstance(tree, dict):
         if "value" in tree:

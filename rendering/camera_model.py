@@ -5,7 +5,7 @@ It is another than that of the physics, which never knows of it.
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Final
+from typing import Final
 
 import mujoco
 import numpy as np
@@ -83,7 +83,9 @@ def own_discs(model: mujoco.MjModel, camera: int) -> np.ndarray:
     return discs
 
 
-def _add(body: Any, name: str, kind: Any, size: Sequence[float], **more: Any) -> None:
+def _add(
+    body: mujoco.MjsBody, name: str, kind: mujoco.mjtGeom, size: Sequence[float], **more: object
+) -> None:
     """A geom that is only drawn."""
     geom = body.add_geom(name=name, type=kind, size=size, **more)
     geom.contype = geom.conaffinity = 0

@@ -8,7 +8,8 @@ from collections.abc import Iterable, Iterator
 from fractions import Fraction
 from itertools import chain
 from pathlib import Path
-from typing import Any, Final
+from types import ModuleType
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -164,7 +165,7 @@ def poster(path: Path, share: float = 0.3) -> bytes:
     return jpeg.getvalue()
 
 
-def _ffmpeg() -> Any:
+def _ffmpeg() -> ModuleType:
     """The module. Raises `OSError` if it finds no program."""
     module = require("imageio_ffmpeg", "render", "an MP4 film")
     try:

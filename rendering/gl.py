@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 from ..models.errors import NoOpenGL, shortened
 
 if TYPE_CHECKING:
+    import mujoco
     import numpy as np
 
 _OFF: Final = ("disable", "disabled", "off", "false", "0")
@@ -89,7 +90,7 @@ class Offscreen:
     Raises `NoOpenGL`.
     """
 
-    def __init__(self, model: Any, width: int, height: int) -> None:
+    def __init__(self, model: "mujoco.MjModel", width: int, height: int) -> None:
         import mujoco
 
         model.vis.global_.offwidth = width
@@ -106,15 +107,17 @@ class Offscreen:
             raise NoOpenGL(f"OpenGL: expected one that MuJoCo can draw with, got {error}") from None
         self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR.value
 
-    def current(self) -> AbstractContextManager[Any]:
+    def current(self) -> AbstractContextManager[object]:
         """Keep OpenGL with this thread for a block: `draw` in it is faster."""
         if self._gl is None:
             raise NoOpenGL("OpenGL: expected cameras that are open, got closed ones")
         _refuse_forked()
-        block: AbstractContextManager[Any] = self._gl.as_current()
+        block: AbstractContextManager[object] = self._gl.as_current()
         return block
 
-    def draw(self, scene: Any, pixels: "np.ndarray", depth: "np.ndarray | None" = None) -> None:
+    def draw(
+        self, scene: "mujoco.MjvScene", pixels: "np.ndarray", depth: "np.ndarray | None" = None
+    ) -> None:
         """Draw a scene into arrays of one size, the lowest row first: colours, uint8 (H, W, 3), and
         OpenGL's depth, float32 (H, W), 1 near and 0 far.
         """

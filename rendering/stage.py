@@ -12,6 +12,7 @@ from typing import Any, Final, Literal, NamedTuple, Self, get_args
 
 import mujoco
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..models.errors import InputError, shortened
 from ..models.fleet import load_vehicles, members_of
@@ -114,7 +115,10 @@ class Moment:
 
     @classmethod
     def of(
-        cls, telemetry: Mapping[str, Any], metrics: Sequence[tuple[str, str, str]], **rest: Any
+        cls,
+        telemetry: Mapping[str, ArrayLike],
+        metrics: Sequence[tuple[str, str, str]],
+        **rest: Any,
     ) -> Self:
         """From a drone's telemetry, and `reward`, `step` and `episode`, which it does not have.
 

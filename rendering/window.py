@@ -7,7 +7,8 @@ import threading
 import warnings
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Final
+from types import ModuleType
+from typing import Final
 
 import mujoco
 
@@ -93,7 +94,7 @@ class Window:
             self._pace.press(KEYS[key])
 
 
-def _text(place: mujoco.mjtGridPos, lines: Lines) -> tuple[Any, ...]:
+def _text(place: mujoco.mjtGridPos, lines: Lines) -> tuple[object, ...]:
     names, values = ("\n".join(column) for column in zip(*lines, strict=True))
     return mujoco.mjtFontScale.mjFONTSCALE_100, place, names, values
 
@@ -103,7 +104,7 @@ def _tasks() -> set[int]:
     return {int(task.name) for task in Path("/proc/self/task").glob("*")}
 
 
-def _viewer() -> Any:
+def _viewer() -> ModuleType:
     """MuJoCo's module. Raises `NoDisplay` first: without a display MuJoCo would wait forever."""
     on_x = sys.platform == "linux"
     if on_x and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
@@ -125,4 +126,5 @@ def _viewer() -> Any:
                 glfw.destroy_window(window)
     except (ImportError, RuntimeError) as error:
         raise NoDisplay(f"window: expected a display, got {error}: {_INSTEAD}") from None
-    return viewer
+    module: ModuleType = viewer
+    return module

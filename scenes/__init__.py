@@ -5,7 +5,7 @@ Pictures show them; physics does not know them. Importing this package does not 
 
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 from ..models.errors import InputError, shortened
 
@@ -65,7 +65,7 @@ def scenes_of(text: str) -> tuple[str, ...]:
     return tuple(f"{name}:{seed}" for seed in range(low, high + 1))
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     """Import on first use the names that need MuJoCo (PEP 562)."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
