@@ -90,14 +90,6 @@ def test_categorical_sampling_has_the_probabilities_of_the_policy() -> None:
     assert envs.shape == (40_000,)
 
 
-def test_only_the_env_gets_clipped_actions() -> None:
-    policy = constant(BOX, 5.0, 0.25)
-    drawn = policy.sample(np.zeros((1, 3), np.float32), np.array([[2.0, 0.0]], np.float32))
-    assert drawn.tolist() == [[7.0, 0.25]]
-    assert policy.actions.to_envs(drawn).tolist() == [[1.0, 0.25]]
-    assert policy.act(np.zeros(3, np.float32)).tolist() == [1.0, 0.25]
-
-
 def test_zero_is_the_middle_of_the_space_and_one_its_bound() -> None:
     action = ArraySpec(name="a", shape=(2, 2), low=(0.0, -2.0, 10.0, -np.inf),
                        high=(100.0, 2.0, 20.0, 3.0))  # fmt: skip
