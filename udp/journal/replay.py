@@ -12,7 +12,6 @@ from ...envs.registry import is_known
 from ...envs.spec import component_names
 from ...models import Backend
 from ...models.errors import InputError
-from ...models.fleet import load_vehicles
 from ..protocol.messages import State
 from ..transport.stepped import Steppable, make_stepped
 from .reader import Item, Recording, Session, count_of, printable
@@ -124,28 +123,21 @@ class SessionVerdict:
                 f"expected a registered env id, got {spec.env_id!r}: "
                 "--env MODULE:NAME names the module that registers it"
             )
-        count = self.session.num_envs
-        drag = spec.options.get("effects", {}).get("linear_drag", 0.0)
-        craft = load_vehicles(self.vehicle, len(spec.agents), linear_drag=drag)
-        was = spec.vehicle_hash
-        now = craft.hash
-        other = bool(was.strip("0")) and was != now
-        hint = f"the vehicle was {was}, and is {now} here: --vehicle names its file" * other
-        try:
-            keywords = {"vehicle": self.vehicle, "backend": self.backend, **spec.options}
-            config = EnvConfig.from_keywords(spec.env_id, drones=len(spec.agents), **keywords)
-            loop = make_stepped(config, count, {})
-        except InputError as error:
-            raise InputError(hint or str(error)) from None
+        keywords = {"vehicle": self.vehicle, "backend": self.backend, **spec.options}
+        config = EnvConfig.from_keywords(spec.env_id, drones=len(spec.agents), **keywords)
+        loop = make_stepped(config, self.session.num_envs, {})
+        recorded = spec.vehicle_hash
+        here = loop.spec.vehicle_hash
+        if recorded.strip("0") and recorded != here:
+            hint = "--vehicle names its file"
+            self.notes.append(f"the vehicle was {recorded}, and is {here} here: {hint}")
         for name in ("agents", "observation", "action", "telemetry", "control_period"):
             was = getattr(spec, name)
             now = getattr(loop.spec, name)
             if was != now:
                 loop.close()
                 words = f"expected an env of the {name} {was!s:.200}, got one of {now!s:.200}"
-                raise InputError(hint or words)
-        if other:
-            self.notes.append(hint)
+                raise InputError(words)
         return loop
 
     def _compare(self, recorded: State) -> None:

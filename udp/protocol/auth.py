@@ -28,7 +28,6 @@ _MAGIC: Final = b"\xa7S"
 _ID_SIZE: Final = 6
 _TAG_AT: Final = 2 + _ID_SIZE
 _TAG_SIZE: Final = 16
-_LONGEST_FILE: Final = 1 << 12  # bytes
 
 Side = Literal["simulator", "agent"]
 
@@ -100,22 +99,19 @@ def read_keys(path: Path | str) -> tuple[bytes, ...]:
     Raises `InputError` if the file cannot be read, holds something else, or others can read it.
     """
     try:
-        # A FIFO would block for ever.
-        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
-        with open(descriptor, "rb") as file:
-            mode = os.fstat(file.fileno()).st_mode
-            text = file.read(_LONGEST_FILE) if stat.S_ISREG(mode) else b""
+        mode = os.stat(path).st_mode
+        is_file = stat.S_ISREG(mode)  # a FIFO would block for ever
+        text = Path(path).read_bytes() if is_file else b""
     except OSError as error:
         raise InputError(f"key file: cannot read {path}: {error.strerror}") from None
-    private = os.name != "posix" or not stat.S_ISREG(mode) or not mode & 0o077
-    expected = f"{path} to be readable by its owner alone (chmod 600)"
-    if not private:
+    if os.name == "posix" and is_file and mode & 0o077:
+        expected = f"{path} to be readable by its owner alone (chmod 600)"
         raise InputError(f"key file: expected {expected}, got mode {mode & 0o777:o}")
     try:
         keys = tuple(bytes.fromhex(line) for line in text.decode("ascii").split())
     except ValueError:
         keys = ()
-    if not (keys and all(len(key) == KEY_SIZE for key in keys)):
+    if {len(key) for key in keys} != {KEY_SIZE}:
         raise InputError(f"key file: expected {2 * KEY_SIZE} hexadecimal digits in {path}")
     return keys
 

@@ -236,7 +236,9 @@ class Agent:
 
     def _gather(self, pending: list[int]) -> None:
         """Send what is due and answer what comes, until it is the agent's turn everywhere."""
-        server, config, slots = self.server, self.config, self.server.slots
+        server = self.server
+        config = self.config
+        slots = server.slots
         _flush(server, self._port)  # before anything else: a simulator waits
         now = time.monotonic()
         deadlines = self._deadlines
@@ -252,18 +254,19 @@ class Agent:
                 pending = self._pending()
                 continue
             before = now
+            datagram = None
             try:
                 datagram, address = self._port.receive(left, strangers=None in slots)
-            except (OSError, ValueError):
+            except (OSError, ValueError):  # nothing came; or (Windows) one came back
                 if not self.close.alive:  # another thread has closed the env
                     raise gym.error.ClosedEnvironmentError("the env was closed") from None
-                # Nothing came; or (Windows) an earlier datagram found nobody.
-                now = time.monotonic()
-                self._pardon(now - before - min(left, LONGEST_WAIT))
-                continue
             now = time.monotonic()
-            if now - before > PAUSE:
-                self._pardon(now - before - min(left, LONGEST_WAIT))
+            pause = now - before - min(left, LONGEST_WAIT)
+            if pause > PAUSE:  # of this process: what the simulators sent meanwhile was not read
+                for slot in range(len(slots)):
+                    deadlines[slot] += pause
+            if datagram is None:
+                continue
             event = server.receive(datagram, address, now)
             if event and not event.joined and isinstance(event.message, State):
                 self.states[event.slot] = event.message
@@ -273,12 +276,6 @@ class Agent:
                 pending = self._pending()
             if pending:
                 _flush(server, self._port)
-
-    def _pardon(self, pause: float) -> None:
-        """After a pause of this process: what the simulators sent meanwhile was not read."""
-        if pause > PAUSE:
-            for slot in range(len(self._deadlines)):
-                self._deadlines[slot] += pause
 
     def _pending(self) -> list[int]:
         """Slots at which it is not the agent's turn."""

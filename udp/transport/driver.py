@@ -5,6 +5,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from math import inf
 from typing import TYPE_CHECKING, Final
 
 import gymnasium as gym
@@ -152,11 +153,11 @@ class Driver(NotCopied):
         rules = self.rules
         rules.close(reason, time.monotonic())
         self._flush()
-        while any(link.client.next_timer() < float("inf") for link in rules.links):
-            if self._port.closed:
+        while not self._port.closed:
+            timer = min([link.client.next_timer() for link in rules.links])
+            if timer == inf:
                 break
-            before = time.monotonic()
-            left = min(link.client.next_timer() for link in rules.links) - before
+            left = timer - time.monotonic()
             try:
                 datagram, address = self._receive(max(left, 0.0))
                 if link := self._by_address.get(address):
