@@ -36,11 +36,15 @@ def flying(env: Any = ENV_ID, codec: Any = "binary", **options: Any) -> Iterator
         running.join()
 
 
-def assert_parity(remote: gym.Env, local: gym.Env, steps: int, seeds: list[int]) -> None:
-    """The same seeds and actions give the same bits."""
+def assert_parity(
+    remote: gym.Env, steps: int, seeds: tuple[int, ...] = (1,), **options: Any
+) -> int:
+    """The same seeds and actions give the same bits as in process; how many States it took."""
+    local = gym.make(ENV_ID, **options)
     dice = np.random.default_rng(5)
     spec = local.unwrapped.env_spec
     names = [name for array in spec.telemetry for name in component_names(array)]
+    left = list(seeds)
 
     def same(here: tuple, there: tuple) -> None:
         assert here[0].tobytes() == there[0].tobytes()
@@ -49,21 +53,24 @@ def assert_parity(remote: gym.Env, local: gym.Env, steps: int, seeds: list[int])
         assert [type(v) for v in here[1:-1]] == [type(v) for v in there[1:-1]]
         assert {name: there[-1][name] for name in names} == here[-1]
 
-    same(remote.reset(seed=seeds[0]), local.reset(seed=seeds[0]))
-    ends = 0
+    def begin() -> None:
+        seed = left.pop(0) if left else None
+        same(remote.reset(seed=seed), local.reset(seed=seed))
+
+    begin()
+    states = 2  # its own reset, and ours
     for _ in range(steps):
+        action: Any = dice.uniform(-1.2, 1.2, 1).astype(np.float32)
         if isinstance(local.action_space, spaces.Discrete):
-            action: Any = int(dice.integers(3))
-        else:
-            action = dice.uniform(-1.2, 1.2, 1).astype(np.float32)
+            action = int(dice.integers(3))
         here = remote.step(action)
-        there = local.step(action)
-        same(here, there)
+        same(here, local.step(action))
+        states += 1
         if here[2] or here[3]:
-            ends += 1
-            seed = seeds[ends] if ends < len(seeds) else None
-            same(remote.reset(seed=seed), local.reset(seed=seed))
-    assert ends >= len(seeds)
+            begin()
+            states += 1
+    assert not left
+    return states
 
 
 class Broken(gym.Env[np.ndarray, np.ndarray]):

@@ -13,15 +13,11 @@ from math import sqrt
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
-import numpy as np
 import pytest
 from fleets import assert_parity, assert_same, sync
 from peers import ANY, ENV_ID, launch
 from relay import FaultConfig, Relay, relaying
-from rotorgram.envs.config import EnvConfig
-from rotorgram.envs.registry import env_spec
-from rotorgram.envs.spec import component_names
+from remotes import assert_parity as assert_remote_parity
 from rotorgram.udp import RemoteEnv, RemoteVectorEnv
 from rotorgram.udp.protocol.auth import write_key
 
@@ -29,12 +25,6 @@ BAD = FaultConfig(
     drop=0.3, duplicate=0.1, reorder=0.2, corrupt=0.05, truncate=0.02, reorder_by=0.0006, seed=1
 )
 OPTIONS = {"control_period": 0.01, "target": (4.0, 6.0)}
-NAMES = [
-    n
-    for array in env_spec(EnvConfig.from_keywords(ENV_ID, **OPTIONS)).telemetry
-    for n in component_names(array)
-]
-
 SIMULATE = """
     import json, sys
     from rotorgram.udp import LinkConfig, Simulator
@@ -97,32 +87,6 @@ def assert_bad(relay: Relay, agent: Counter[str], simulator: Counter[str]) -> No
 # ---- one drone
 
 
-def assert_same_flight(remote: gym.Env, steps: int) -> int:
-    """Fly a RemoteEnv and the env itself; the number of States that this takes."""
-    local = gym.make(ENV_ID, **OPTIONS)
-    dice = np.random.default_rng(8)
-
-    def same(here: tuple, there: tuple) -> None:
-        assert here[0].tobytes() == there[0].tobytes()
-        assert here[1:-1] == there[1:-1]
-        assert here[-1] == {name: there[-1][name] for name in NAMES}
-
-    same(remote.reset(seed=1), local.reset(seed=1))
-    states = 2  # its own reset, and ours
-    for _ in range(steps):
-        action = dice.uniform(-1.1, 1.1, 1).astype(np.float32)
-        here = remote.step(action)
-        there = local.step(action)
-        same(here, there)
-        states += 1
-        if here[2] or here[3]:
-            seed = int(dice.integers(2**63)) if states % 2 else None
-            same(remote.reset(seed=seed), local.reset(seed=seed))
-            states += 1
-    assert states > steps + 2
-    return states
-
-
 @pytest.mark.parametrize(("kind", "steps"), [("binary", 1000), ("text", 300), ("key", 300)])
 def test_one_drone(kind: str, steps: int, tmp_path: Path) -> None:
     faults = BAD
@@ -141,7 +105,7 @@ def test_one_drone(kind: str, steps: int, tmp_path: Path) -> None:
         relaying(remote.address, faults) as relay,
         simulating(relay.address, **arguments) as process,
     ):
-        states = assert_same_flight(remote, steps)
+        states = assert_remote_parity(remote, steps, (1, 2**63), **OPTIONS)
         remote.close()
         last, counters = its_end(process)
     assert last == states

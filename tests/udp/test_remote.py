@@ -51,7 +51,7 @@ SIMULATE = """
 def test_parity(codec: str, options: dict[str, Any]) -> None:
     with flying(codec=codec, **options) as pair:
         local = gym.make(ENV_ID, **options)
-        assert_parity(pair.remote, local, 1000, [0, 2**64 - 1, 7, 0])
+        assert_parity(pair.remote, 1000, (0, 2**64 - 1, 7, 0), **options)
         assert pair.remote.observation_space == local.observation_space
         assert pair.remote.action_space == local.action_space
         pair.remote.close()

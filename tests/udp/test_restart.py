@@ -12,12 +12,12 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import rotorgram.envs  # noqa: F401
 from peers import ANY, ENV_ID, Running, launch, plain_socket
 from relay import FaultConfig, relaying
+from remotes import assert_parity
 from rotorgram.envs.config import EnvConfig
 from rotorgram.udp import (
     LinkConfig,
@@ -108,21 +108,6 @@ def key_file(tmp_path: Path) -> str:
     return str(tmp_path / "key")
 
 
-def assert_flies(remote: gym.Env, seed: int, steps: int = 100) -> None:
-    """As the env itself does."""
-    local = gym.make(ENV_ID)
-    dice = np.random.default_rng(seed)
-    assert remote.reset(seed=seed)[0].tobytes() == local.reset(seed=seed)[0].tobytes()
-    for _ in range(steps):
-        action = dice.uniform(-1, 1, 1).astype(np.float32)
-        here = remote.step(action)
-        there = local.step(action)
-        assert here[0].tobytes() == there[0].tobytes()
-        assert here[1:4] == there[1:4]
-        if here[2] or here[3]:
-            assert remote.reset()[0].tobytes() == local.reset()[0].tobytes()
-
-
 def ends(process: subprocess.Popen[str]) -> str:
     """What a simulator that ended in order says at last; its log is empty or on `stderr`."""
     out, err = process.communicate(timeout=10)
@@ -174,7 +159,7 @@ def test_a_killed_simulator_is_replaced(network: Any, kind: str, same: bool, key
             else:
                 sentence = r"no datagram from the simulator at .* for 0.7 s, waiting at .*"
                 assert re.fullmatch(sentence, reason)
-            assert_flies(remote, 3)
+            assert_parity(remote, 100, (3,))
             assert remote.statistics.counters["sessions"] == 2
             remote.close()
             assert ends(second) == "the agent closed"
@@ -195,7 +180,7 @@ def test_a_simulator_that_was_frozen_begins_anew() -> None:
             assert after[0].tobytes() == before[0].tobytes()
             assert after[3]
             assert "for 0.5 s" in after[4]["simulator_lost"]
-            assert_flies(remote, 2)
+            assert_parity(remote, 100, (2,))
             remote.close()
             assert ends(process) == "the agent closed"
         assert remote.statistics.counters["sessions"] == 2
@@ -222,7 +207,7 @@ def test_a_killed_agent_is_replaced(network: Any, options: dict[str, str], key_f
                 assert simulator.poll() is None
         with RemoteEnv(address, env_id=ENV_ID, connect=False, **keys) as remote:
             start = time.monotonic()
-            assert_flies(remote, 4)
+            assert_parity(remote, 100, (4,))
             assert time.monotonic() - start < 8
         out, err = simulator.communicate(timeout=10)
     assert simulator.returncode == 0
@@ -318,7 +303,7 @@ def keyed(
 
 def test_both_have_the_key(key_file: str) -> None:
     with keyed(key_file, key_file) as (remote, running):
-        assert_flies(remote, 6)
+        assert_parity(remote, 100, (6,))
         remote.close()
         assert running.join() == "the agent closed"
         for statistics in (remote.statistics, running.simulator.link.statistics):
@@ -388,7 +373,7 @@ def test_a_key_allows_every_address(key_file: str) -> None:
             key_file=key_file,
         )
         running = Running(simulator)
-        assert_flies(remote, 1)
+        assert_parity(remote, 100, (1,))
         remote.close()
         assert running.join() == "the agent closed"
 
