@@ -435,20 +435,6 @@ def test_text_simulators_one_after_another_are_sessions_of_their_own(tmp_path: P
     assert Verification(path).identical
 
 
-def test_a_binary_session_may_have_the_number_0(tmp_path: Path) -> None:
-    path = tmp_path / "agent.mcap"
-    with RemoteEnv(ANY, env_id=ENV_ID, connect=False, record=path, **TIMES) as remote:
-        simulator = Simulator(server=remote.address, bind=ANY, config=QUICK)
-        simulator.link.hello = replace(simulator.link.hello, session=0)
-        running = Running(simulator)
-        fly(remote, 20)
-    assert running.join() == "the agent closed"
-    (session,) = Summary(path).sessions
-    assert session.session.codec == "binary"
-    assert session.steps == 20
-    assert Verification(path).identical
-
-
 def test_several_simulators_at_once(tmp_path: Path) -> None:
     path = tmp_path / "agent.mcap"
     remote = RemoteVectorEnv(ANY, num_simulators=2, num_envs=4, connect=False, record=path, **TIMES)
@@ -533,10 +519,7 @@ def test_it_is_valid_mcap_with_checksums_and_summary(
         assert counts.message_count == len(messages)
         assert counts.chunk_count == len(summary.chunk_indexes) > 10
         assert len(some) == sum(topic == "/slot0/command" for topic, _ in messages) > 300
-        assert counts.message_start_time == min(m.log_time for _, m in messages)
-        assert counts.message_end_time == max(m.log_time for _, m in messages)
-        times = [m.log_time for topic, m in messages]
-        assert abs(times[-1] - time.time_ns()) < 60e9
+        assert abs(counts.message_end_time - time.time_ns()) < 60e9
         states = [m for topic, m in messages if topic == "/slot0/state"]
         assert [m.sequence for m in states] == list(range(1, len(states) + 1))
 

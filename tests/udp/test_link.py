@@ -614,22 +614,6 @@ def test_a_key_and_text_do_not_go_together() -> None:
 # ---- keys that only one side has
 
 
-def test_what_a_side_without_the_key_is_told() -> None:
-    server = agent(sealed=True)
-    server.receive(binary.encode(hello(spec="{" + " " * 99 + "}")), HERE, 0.0)
-    ((reply, _),) = server.take_outgoing()
-    refuse = plain(reply)
-    assert isinstance(refuse, Refuse)
-    assert "this agent has one" in refuse.reason
-    link = to(simulator(sealed=True), SimulatorState.HELLO, Wire("agent", True))
-    assert link.receive(binary.encode(Refuse(session=SESSION, reason="no key")), 0.0) is None
-    assert "no key" in link.statistics.last_error
-    link = to(simulator(), SimulatorState.HELLO, Wire("agent", False))
-    link.receive(Wire("agent", True)(WELCOME), 0.0)
-    assert "the agent has one" in link.statistics.last_error
-    assert dropped(link) == {"forged": 1}
-
-
 def test_recorded_messages_of_another_session_are_forged() -> None:
     old = Key(SECRET, "agent").for_session(SESSION, 1)
     link = to(simulator(sealed=True), SimulatorState.WAITING, Wire("agent", True))

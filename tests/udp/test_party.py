@@ -199,6 +199,20 @@ def test_the_policy_flies_the_drones_of_a_silent_agent(policy: str) -> None:
     assert swarm.participations == [Participation.FLYING] * 2
 
 
+def test_an_agent_that_is_started_anew_before_the_first_step_flies_the_first_episode() -> None:
+    swarm = Swarm()
+    swarm.pump()
+    swarm.restart(0)
+    swarm.wait(1.0)  # its State is answered with Unknown; the first step waits for it
+    assert swarm.participations == [Participation.FLYING] * 2
+    assert swarm.rules.absences == []
+    swarm.say(0, FLY, 1.0)
+    swarm.say(1, FLY, 2.0)
+    swarm.pump()
+    assert swarm.world.flown == [[1.0, 2.0]]
+    assert swarm.rules.episodes == 1
+
+
 def test_an_agent_that_asks_for_a_reset_before_the_others_waits_for_them() -> None:
     swarm = begun("hold", "end")
     swarm.say(1, RESET)

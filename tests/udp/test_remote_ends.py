@@ -207,23 +207,6 @@ def test_a_simulator_that_falls_silent() -> None:
     assert running.join() == "the agent closed"
 
 
-def test_a_reset_after_a_close_waits_for_another_simulator() -> None:
-    with RemoteEnv(ANY, connect=False, connect_timeout=0.5) as remote:
-        for _ in range(2):
-            running = Running(Simulator(Broken(None), server=remote.address, bind=ANY))
-            remote.reset()
-            remote.step(np.zeros(1))
-            remote.step(np.zeros(1))
-            with pytest.raises(PeerClosed, match="RuntimeError: bad state"):
-                remote.step(np.zeros(1))
-            with pytest.raises(gym.error.ResetNeeded):
-                remote.step(np.zeros(1))
-            running.join()
-        sentence = r"closed: RuntimeError: bad state x+; no other came to 127.0.0.1:\d+ for 0.5 s$"
-        with pytest.raises(PeerSilent, match=sentence):
-            remote.reset()
-
-
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 def test_the_simulator_program_ends_on_sigterm_and_tells_the_agent() -> None:
     with RemoteEnv(ANY, connect=False, connect_timeout=20, timeout=10) as remote:

@@ -23,8 +23,7 @@ from rotorgram.models import QUAD_XML
 from rotorgram.models.errors import InputError
 from rotorgram.udp import LinkError, PeerClosed, Refused, RemoteEnv, RemoteVectorEnv, Simulator
 from rotorgram.udp.__main__ import read_arguments
-from rotorgram.udp.protocol import binary
-from rotorgram.udp.protocol.messages import Hello, Refuse
+from rotorgram.udp.protocol.messages import Hello
 from rotorgram.udp.transport.agent import AgentConfig
 
 posix = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals and forks")
@@ -172,22 +171,6 @@ def test_spaces_in_a_distribution_do_not_differ() -> None:
         remote.connect()
         assert remote.env_spec.options["randomize"] == {"mass": "uniform(0.9, 1.1)"}
     running.join()
-
-
-def test_an_option_that_the_agent_does_not_know_is_refused() -> None:
-    """A later version of the env may have more of them."""
-    spec = env_spec(EnvConfig(env_id=ENV_ID))
-    spec = replace(spec, options={**spec.options, "gusts": 1.0})
-    with (
-        RemoteEnv(ANY, env_id=ENV_ID, options={}, connect=False, connect_timeout=0.2) as remote,
-        plain_socket() as sock,
-    ):
-        sock.sendto(binary.encode(Hello(session=1, spec=spec.to_json())), remote.address)
-        with pytest.raises(ConnectionError):
-            remote.connect()
-        refuse = binary.decode(sock.recv(65507))
-    assert isinstance(refuse, Refuse)
-    assert refuse.reason == "options: expected gusts not to be there, got 1.0"
 
 
 @pytest.mark.parametrize(

@@ -235,29 +235,6 @@ def test_one_that_is_killed_follows_its_policy_and_comes_back(policy: str) -> No
     assert all(loss.agent != 1 or loss.participation is not Participation.LEFT for loss in later)
 
 
-def test_one_that_is_started_anew_before_the_others_come_flies_the_first_episode() -> None:
-    agents = free_ports(2)
-    seen = {}
-    with shared(agents, 2, episode_length=60) as running:
-        first = launch(VICTIM, agents[0][1], "end")
-        while running.simulator.rules.links[0].participation is not Participation.READY:
-            assert running.thread.is_alive()
-        first.kill()
-        again = launch(VICTIM, agents[0][1], "end")
-        fly_one(agents[1], 1, 1, seen, calm)
-        heard(again, "60")
-        again.kill()
-    for process in (first, again):
-        process.communicate()
-    assert [absence.episode for absence in running.simulator.rules.absences] == [2] * len(
-        running.simulator.rules.absences
-    )
-    expected = in_process(
-        2, 1, lambda i, *at: calm(i, *at) if i else np.zeros(1, np.float32), episode_length=60
-    )
-    assert seen[1] == expected[1]
-
-
 def test_the_command_flies_the_world_of_several_agents() -> None:
     agents = free_ports(2)
     seen = {}
