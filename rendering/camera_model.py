@@ -17,7 +17,7 @@ from ..models.swarm import drone_names
 from ..models.vehicle import Vehicle
 from ..scenes import add_scene
 from ..scenes.marks import Mark
-from .stage import scale_drawing
+from .stage import MARK_GEOMS, scale_drawing
 
 NOTHING: Final = "nothing"
 """Name of what a segmentation picture has where it sees no object: number 0."""
@@ -100,14 +100,11 @@ def _add_mark(body: mujoco.MjsBody, name: str, mark: Mark, thickness: float) -> 
     for number, part in enumerate(parts):
         own = f"{name}/{number}" if len(parts) > 1 else name
         start, end = (np.add(mark.position, point) for point in (part.start, part.end))
+        place = {"pos": start}
+        if part.kind != "sphere":
+            place = {"fromto": np.concatenate((start, end))}
         size = (part.radius, 0.0, 0.0)
-        if part.kind == "sphere":
-            _add(body, own, mujoco.mjtGeom.mjGEOM_SPHERE, size, pos=start, rgba=rgba)
-            continue
-        kind = mujoco.mjtGeom.mjGEOM_CAPSULE
-        if part.kind == "cylinder":
-            kind = mujoco.mjtGeom.mjGEOM_CYLINDER
-        _add(body, own, kind, size, fromto=np.concatenate((start, end)), rgba=rgba)
+        _add(body, own, MARK_GEOMS[part.kind], size, rgba=rgba, **place)
 
 
 def objects_in(model: mujoco.MjModel, names: Sequence[str]) -> tuple[tuple[str, ...], np.ndarray]:

@@ -304,35 +304,6 @@ class Cameras:
             self._drawing.close()
 
 
-def shown(kind: str, picture: np.ndarray) -> np.ndarray:
-    """A picture (H, W, channels) of a kind in colours to look at, uint8, (H, W, 3).
-
-    Depth: near is bright. Objects: a colour for each number. Flow: the hue is its direction, and
-    the brightest is what moves faster than nine tenths of the picture.
-    """
-    if kind == "rgb":
-        return picture
-    if kind == "depth":
-        near = np.log(np.maximum(picture, 1e-3))
-        share = 1.0 - (near - near.min()) / max(float(np.ptp(near)), 1e-9)
-        return np.repeat((255 * share).astype(np.uint8), 3, axis=-1)
-    if kind == "segmentation":
-        hue = picture[..., 0] * 0.618034 % 1.0
-        return _hues(hue, np.where(picture[..., 0] > 0, 1.0, 0.0))
-    size = np.linalg.norm(picture, axis=-1)
-    hue = np.arctan2(picture[..., 1], picture[..., 0]) / (2 * np.pi) % 1.0
-    return _hues(hue, np.clip(size / max(float(np.quantile(size, 0.9)), 1e-9), 0.0, 1.0))
-
-
-def _hues(hue: np.ndarray, value: np.ndarray) -> np.ndarray:
-    """Colours of hues from 0 to 1 and values from 0 to 1, uint8, with three channels."""
-    from PIL import Image
-
-    parts = (255 * hue, np.full_like(value, 200), 255 * value)
-    colors = Image.fromarray(np.stack(parts, axis=-1).astype(np.uint8), "HSV").convert("RGB")
-    return np.asarray(colors)
-
-
 def _exposed(colors: np.ndarray, optics: Optics, dice: np.random.Generator) -> np.ndarray:
     """Colours as a sensor reads them: see `Optics`."""
     (photons, reading) = optics.noise

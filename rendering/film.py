@@ -1,7 +1,5 @@
 """Films of pictures: MP4, GIF or PNGs. A film is there whole or not at all."""
 
-import io
-import subprocess
 import tempfile
 from collections import deque
 from collections.abc import Iterable, Iterator
@@ -144,25 +142,6 @@ def _write_mp4(
         writer.close()
     if written != sent:
         raise OSError("ffmpeg: the film could not be written: is the disk full?")
-
-
-def poster(path: Path, share: float = 0.3) -> bytes:
-    """A JPEG of an MP4, from this share of its length. Raises `OSError` or `MissingPackage`."""
-    ffmpeg = _ffmpeg()
-    try:
-        count, seconds = ffmpeg.count_frames_and_secs(str(path))
-    except RuntimeError as error:
-        raise OSError(f"{path}: expected a film, got none that ffmpeg reads") from error
-    start = share * seconds * (count - 1) / max(count, 1)
-    words = f"-v error -ss {start:.6f} -i - -frames:v 1 -f image2pipe -c:v png -".split()
-    with path.open("rb") as film:
-        command = [ffmpeg.get_ffmpeg_exe(), *words]
-        done = subprocess.run(command, stdin=film, capture_output=True, check=False)
-    if not done.stdout:
-        raise OSError(f"{path}: expected a picture of the film, got none from ffmpeg")
-    jpeg = io.BytesIO()
-    Image.open(io.BytesIO(done.stdout)).convert("RGB").save(jpeg, "JPEG", quality=80)
-    return jpeg.getvalue()
 
 
 def _ffmpeg() -> ModuleType:

@@ -42,6 +42,12 @@ DRONE_COLORS: Final = (
 first: Okabe and Ito's, told apart with colour-blindness."""
 MAX_NAMES: Final = 16
 """Drones of one world whose names are shown; more would hide them."""
+MARK_GEOMS: Final = {
+    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
+    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
+}
+"""How parts of marks are drawn."""
 _ONBOARD: Final = "stage/onboard"
 _ROOM = 10_000  # geoms
 _SAMPLES = 4  # of every pixel, for smooth edges; software has no more
@@ -468,12 +474,11 @@ def _draw_mark(
     for part in mark.parts(0.04 * mark.size):
         start = centre + part.start
         end = centre + part.end
+        kind = MARK_GEOMS[part.kind]
         if part.kind == "sphere":
-            _decoration(scene, mujoco.mjtGeom.mjGEOM_SPHERE, (part.radius,) * 3, start, rgba)
-        elif part.kind == "cylinder":
-            _connect(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, part.radius, start, end, rgba)
+            _decoration(scene, kind, (part.radius,) * 3, start, rgba)
         else:
-            _connect(scene, mujoco.mjtGeom.mjGEOM_CAPSULE, part.radius, start, end, rgba)
+            _connect(scene, kind, part.radius, start, end, rgba)
 
 
 def _connect(

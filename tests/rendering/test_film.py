@@ -1,6 +1,5 @@
 """Films: every frame at its time, whole or not at all, panes side by side."""
 
-import io
 import math
 import subprocess
 import sys
@@ -23,7 +22,7 @@ from rotorgram.flights.filming import Film, FilmTrack, film, grid
 from rotorgram.flights.trajectories import Trajectory
 from rotorgram.models import InputError, Vehicle
 from rotorgram.rendering import MetricValue
-from rotorgram.rendering.film import check_film, poster, write_film
+from rotorgram.rendering.film import check_film, write_film
 from rotorgram.rendering.overlay import Overlay
 
 FAST = Film(width=WIDTH, height=HEIGHT, scene="plain", fast=True, overlay=False)
@@ -73,20 +72,6 @@ def test_mp4_has_every_frame_at_its_time(tmp_path: Path) -> None:
     assert seconds == pytest.approx(1.2, abs=0.01)
     data = path.read_bytes()
     assert data.index(b"moov") < data.index(b"mdat")  # plays before it is loaded whole
-
-
-def test_a_poster_is_a_picture_from_within_the_film(tmp_path: Path) -> None:
-    path = tmp_path / "grey.mp4"
-    write_film(path, greys(31), 25.0)  # from 20 to 140
-    for share, brightness in ((0.0, 20), (0.3, 56), (1.0, 140)):
-        with Image.open(io.BytesIO(poster(path, share))) as picture:
-            assert picture.format == "JPEG"
-            assert picture.size == (64, 48)
-            assert np.asarray(picture).mean() == pytest.approx(brightness, abs=8)
-    (tmp_path / "no.mp4").write_bytes(b"no film")
-    for name in ("no.mp4", "nowhere.mp4"):
-        with pytest.raises(OSError, match=f"{name}: expected a film"):
-            poster(tmp_path / name)
 
 
 def test_the_first_frame_of_a_film_shows_the_flight(opengl: None, tmp_path: Path) -> None:
