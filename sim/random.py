@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import elementary
+from .snapshots import Arrays, Snapshot
 from .state import Array
 
 Words = NDArray[np.uint32]
@@ -86,7 +87,7 @@ def uniform(words: Words) -> Numbers:
 def normal(words: Words) -> Numbers:
     """Standard normal numbers of an even number of words, as many (Box and Muller, 1958)."""
     half = words.shape[-1] // 2
-    distance: Any = uniform(words[..., :half])
+    distance = uniform(words[..., :half])
     angle = _TURN * uniform(words[..., half:])
     radius = np.sqrt(-2.0 * elementary.log(1.0 - distance))
     parts = (radius * elementary.cos(angle), radius * elementary.sin(angle))
@@ -170,18 +171,18 @@ class Random:
         words = words_of(self.keys[world], use, self.episode[world], step, 4)
         return np.random.Generator(np.random.Philox(key=words.view(np.uint64)))
 
-    def snapshot(self) -> dict[str, NDArray[Any]]:
+    def snapshot(self) -> Snapshot:
         """Copies of the counters by name."""
         return {name: array.copy() for name, array in self._arrays().items()}
 
-    def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+    def restore(self, arrays: Arrays) -> None:
         """Put the counters of a snapshot back."""
         for name, array in self._arrays().items():
             array[...] = arrays[name]
         for noise in self._noises.values():
             noise.forget(...)
 
-    def _arrays(self) -> dict[str, NDArray[Any]]:
+    def _arrays(self) -> Snapshot:
         counters = {"keys": self.keys, "episode": self.episode, "is_drawn": self._is_drawn}
         return counters | {f"step {name}": noise.step for name, noise in self._noises.items()}
 

@@ -7,7 +7,7 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -74,7 +74,7 @@ class Randomization:
     a parameter whose effect is off; with None for the effects nothing is said of them.
     """
 
-    def __init__(self, texts: Any, effects: EffectOptions | None) -> None:
+    def __init__(self, texts: object, effects: EffectOptions | None) -> None:
         if not isinstance(texts, Mapping):
             raise InputError(
                 f"randomize: expected a mapping from names to distributions, got {shortened(texts)}"
@@ -95,9 +95,9 @@ class Randomization:
         """Names of what is drawn, in the order of `PARAMETERS`."""
         return tuple(name for name in PARAMETERS if name in self._kinds)
 
-    def to_options(self) -> dict[str, Any]:
+    def to_options(self) -> dict[str, float | str]:
         """The distributions by name, each in one way of writing: a number, or a text."""
-        told: dict[str, Any] = {}
+        told: dict[str, float | str] = {}
         for name, (kind, numbers) in self._kinds.items():
             inside = ", ".join(repr(number).removesuffix(".0") for number in numbers)
             alone = kind == "choice" and len(numbers) == 1
@@ -133,7 +133,7 @@ class Randomization:
         return drawn
 
 
-def _distribution(name: str, text: Any) -> tuple[str, tuple[float, ...]]:
+def _distribution(name: str, text: object) -> tuple[str, tuple[float, ...]]:
     limits = PARAMETERS[name]
     match = _TEXT.fullmatch(text) if isinstance(text, str) else None
     kind, inside = match.groups() if match else ("choice", str(text))

@@ -6,6 +6,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+Snapshot = dict[str, NDArray[Any]]
 Arrays = Mapping[str, NDArray[Any]]
 
 
@@ -20,7 +21,7 @@ class Kept:
     arrays: ClassVar[tuple[str, ...]] = ()
     lists: ClassVar[tuple[str, ...]] = ()
 
-    def snapshot(self) -> dict[str, NDArray[Any]]:
+    def snapshot(self) -> Snapshot:
         """Copies by name; what has no value yet is left out."""
         values = {name: getattr(self, name) for name in (*self.arrays, *self.lists)}
         return {name: np.array(value) for name, value in values.items() if value is not None}
@@ -38,7 +39,7 @@ class Kept:
                 setattr(self, name, array.tolist() if array.ndim == 1 else list(array.copy()))
 
 
-def joined(parts: Mapping[str, Arrays]) -> dict[str, NDArray[Any]]:
+def joined(parts: Mapping[str, Arrays]) -> Snapshot:
     """Arrays of several parts under the name of the part and their own."""
     joint = {}
     for part, arrays in parts.items():
@@ -47,7 +48,7 @@ def joined(parts: Mapping[str, Arrays]) -> dict[str, NDArray[Any]]:
     return joint
 
 
-def part_of(arrays: Arrays, part: str) -> dict[str, NDArray[Any]]:
+def part_of(arrays: Arrays, part: str) -> Snapshot:
     """The arrays of one part of `joined`."""
     start = f"{part}/"
     return {

@@ -82,7 +82,7 @@ class InitialState:
     straight below the drone, which has to be alone."""
 
 
-def clip(array: Array, low: Any, high: Any) -> Array:
+def clip(array: Array, low: Array, high: Array) -> Array:
     """The nearest numbers within bounds: numbers, or arrays of the same kind."""
     if isinstance(array, float):  # a single drone's number, NumPy's among them
         return low if array < low else high if array > high else array
@@ -99,7 +99,7 @@ def each(values: Array) -> Array:
     return values if isinstance(values, _NUMBERS) else values[..., None]
 
 
-def kept(mask: Array, new: Any, old: Any) -> Any:
+def kept(mask: Array, new: Sequence[Array], old: Sequence[Array] | None) -> Sequence[Array]:
     """Lists of arrays: the new for the worlds of a mask, None for all, and the old for the others.
 
     Of a single drone, whose numbers are Python's, all are new; so they are where there is no old.
@@ -121,7 +121,7 @@ def square_root(array: Array) -> Array:
     return np.sqrt(np.maximum(array, 0.0))
 
 
-def stack(parts: Sequence[Any]) -> Array:
+def stack(parts: Sequence[Array]) -> Array:
     """Arrays along a new last axis; a number among them counts for all drones.
 
     Of a single drone they are numbers.

@@ -4,13 +4,12 @@ from collections.abc import Mapping, Sequence
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Protocol
 
-from numpy.typing import NDArray
-
 from ..models import BACKENDS, MAX_DRONES, Backend
 from ..models.errors import InputError
 from .effects import EffectOptions
 from .random import Draw, Random
 from .randomize import CENTER, Randomization
+from .snapshots import Arrays, Snapshot
 from .state import Array, InitialState, WorldState
 
 if TYPE_CHECKING:
@@ -71,7 +70,7 @@ class World(Protocol):
     def seed(self, mask: Array, seeds: Sequence[int | None] | Array) -> None:
         """Seed the worlds of a mask, seeds (W,); where it is None the random numbers go on."""
 
-    def draw(self, mask: Array, chosen: Any = None) -> Draw:
+    def draw(self, mask: Array, chosen: Mapping[str, Array] | None = None) -> Draw:
         """Begin an episode of the worlds of a mask; `chosen` as of `random.Draw`."""
 
     def acceleration(self) -> Array:
@@ -83,10 +82,10 @@ class World(Protocol):
         Infinite where there is none. Geoms of the craft do not count; a payload is a surface.
         """
 
-    def snapshot(self) -> dict[str, NDArray[Any]]:
+    def snapshot(self) -> Snapshot:
         """Copies of all arrays that a later step depends on, by name."""
 
-    def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+    def restore(self, arrays: Arrays) -> None:
         """Put a snapshot back; no step runs. No later bit differs from those that followed it."""
 
     def close(self) -> None:

@@ -4,13 +4,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...models.vehicle import Vehicle
 from ..effects import EffectOptions, Effects
 from ..random import RANDOMIZATION, START, Draw, Random
 from ..randomize import Randomization
-from ..snapshots import Arrays, joined, part_of
+from ..snapshots import Arrays, Snapshot, joined, part_of
 from ..state import Array, InitialState, WorldState, plain
 from ..world import contact_check
 
@@ -60,7 +59,7 @@ class BaseWorld:
         """As `World.draw`."""
         return self.random.start(self._start, self._ids(mask), chosen)
 
-    def snapshot(self) -> dict[str, NDArray[Any]]:
+    def snapshot(self) -> Snapshot:
         """As `World.snapshot`."""
         parts = {"random": self.random.snapshot(), "state": self._snapshot()}
         parts["parameters"] = {name: np.array(x) for name, x in self.parameters.items()}
@@ -77,7 +76,7 @@ class BaseWorld:
         if self.effects is not None:
             self.effects.restore(part_of(arrays, "effects"), self.state, self.parameters)
 
-    def _snapshot(self) -> dict[str, NDArray[Any]]:
+    def _snapshot(self) -> Snapshot:
         """Copies of the backend's own arrays."""
         raise NotImplementedError
 
@@ -85,7 +84,7 @@ class BaseWorld:
         """Put those back; the parameters are as they were."""
         raise NotImplementedError
 
-    def __reduce__(self) -> Any:
+    def __reduce__(self) -> tuple[object, ...]:
         return _made, (type(self), self._arguments), self.snapshot()
 
     def __setstate__(self, arrays: Arrays) -> None:
@@ -105,7 +104,7 @@ class BaseWorld:
 
     def _begun(self, mask: Array, pose: InitialState) -> dict[str, Array]:
         """The pose's arrays by their names; those of the state for worlds out of the mask."""
-        usual: dict[str, Any] = {
+        usual: dict[str, Array] = {
             "position": 0.0,
             "quaternion": _LEVEL,
             "velocity": 0.0,
@@ -119,6 +118,6 @@ class BaseWorld:
         return begun
 
 
-def _made(world_class: Any, arguments: Mapping[str, Any]) -> Any:
+def _made(world_class: type, arguments: Mapping[str, object]) -> object:
     """A copy of a world, before it gets its state."""
     return world_class(**arguments)

@@ -10,7 +10,7 @@ Frames: world, z up, and the body's. Position and velocity are those of the body
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import mujoco
 import numpy as np
@@ -21,7 +21,7 @@ from ..randomize import CENTER
 from ..rotations import Rows, matrix, product
 from ..state import Array
 
-Vector = tuple[Any, Any, Any]
+Vector = tuple[Array, Array, Array]
 
 _NOTHING: Final = 1e-12  # of the largest number of its kind: what rounding leaves
 _TINY: Final = 1e-30  # keeps the slope of a square root finite where nothing turns
@@ -41,13 +41,13 @@ _CROSS: Final = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(2, 0, 1)
 class Motion(NamedTuple):
     """State of W bodies, each component a vector, SI units."""
 
-    position: Any
+    position: Array
     """World frame, three."""
-    quaternion: Any
+    quaternion: Array
     """From body to world, four."""
-    velocity: Any
+    velocity: Array
     """World frame, three."""
-    rates: Any
+    rates: Array
     """Angular velocity, body frame, three."""
 
 
@@ -65,21 +65,21 @@ class Push(NamedTuple):
 class Varying(NamedTuple):
     """What may differ between worlds: numbers for all of them, or vectors where it is drawn."""
 
-    mass: Any
+    mass: Array
     """kg."""
-    easier: Any
+    easier: Array
     """One over the factor of the inertia that all its parts have."""
-    turn: Any
+    turn: Array
     """Inverse of the inertia without that factor, three rows."""
-    gyroscopic: Any
+    gyroscopic: Array
     """Terms of `_euler`."""
-    reaction: Any
+    reaction: Array
     """Factor of the rotors' torque about their axes, or None."""
     shift: Vector
     """Of the center of mass, body frame, m."""
     center: Vector
     """The center of mass, body frame, m."""
-    scale: Any
+    scale: Array
     """Factor of the sides of the inertia boxes."""
 
 
@@ -129,7 +129,7 @@ class RigidBody:
         """Take drawn parameters by their names, each of shape (W,)."""
         (mass, center) = self._least
         (own, far) = self._inertias
-        inertia: Any
+        inertia: Array
         factor = parameters.get("mass", 1.0)
         more = parameters.get("inertia", 1.0)
         easier = 1.0 / factor
@@ -161,7 +161,7 @@ class RigidBody:
         varying = self.varying._replace(easier=1.0, turn=turn, gyroscopic=gyroscopic)
         self.varying = mapped(varying, lambda x: x if x.any() else 0.0)
 
-    def fly(self, rows: Any, thrust: Any, wrench: Any = None, steps: int = 1) -> list[Any]:
+    def fly(self, rows: Array, thrust: Array, wrench: Array = None, steps: int = 1) -> list[Array]:
         """The 13 rows of a state after physics steps, (W,) each, from those of `motion`.
 
         With thrusts (R, W), N, and None, or a force and a torque as of `Effects.step`, (6, W).
@@ -172,7 +172,7 @@ class RigidBody:
             now = self.advance(now, push)
         return [*now.position, *now.quaternion, *now.velocity, *now.rates]
 
-    def push(self, thrust: Any, wrench: Any = None) -> Push:
+    def push(self, thrust: Array, wrench: Array = None) -> Push:
         """Of thrusts, and a force and a torque, as of `fly`."""
         rotors = list(thrust)
         varying = self.varying
@@ -255,7 +255,7 @@ class RigidBody:
 class _Fluid:
     """Forces on the inertia boxes of MuJoCo's bodies in a fluid: its "inertia box model"."""
 
-    def __init__(self, model: mujoco.MjModel, boxes: list[Any]) -> None:
+    def __init__(self, model: mujoco.MjModel, boxes: list[Array]) -> None:
         self._density = float(model.opt.density)
         self._viscosity = float(model.opt.viscosity)
         self._wind = (-model.opt.wind).tolist()
@@ -299,13 +299,13 @@ class _Fluid:
         return force, torque
 
 
-def motion(rows: Any) -> Motion:
+def motion(rows: Array) -> Motion:
     """The motion of states (13, W)."""
     x = list(rows)
     return Motion(x[:3], x[3:7], x[7:10], x[10:])
 
 
-def mapped(tree: Any, change: Callable[[Any], Any]) -> Any:
+def mapped(tree: Array, change: Callable[[Array], Array]) -> Array:
     """Tuples and lists in each other with every vector changed, in a fixed order."""
     if isinstance(tree, tuple | list):
         parts = [mapped(one, change) for one in tree]
@@ -313,7 +313,7 @@ def mapped(tree: Any, change: Callable[[Any], Any]) -> Any:
     return change(tree) if hasattr(tree, "shape") else tree
 
 
-def _boxes(model: mujoco.MjModel) -> list[Any]:
+def _boxes(model: mujoco.MjModel) -> list[Array]:
     """Mass, principal inertia, their axes and center of each body with a mass, body frame."""
     data = mujoco.MjData(model)
     data.qpos[:7] = (0, 0, 0, 1, 0, 0, 0)
@@ -325,7 +325,7 @@ def _boxes(model: mujoco.MjModel) -> list[Any]:
     ]
 
 
-def _own_and_far(vehicle: Vehicle, boxes: list[Any]) -> tuple[np.ndarray, np.ndarray]:
+def _own_and_far(vehicle: Vehicle, boxes: list[Array]) -> tuple[np.ndarray, np.ndarray]:
     """The inertia as the sum of that of the bodies, and of their masses about the center."""
     own = np.zeros((3, 3))
     for _, inertia, axes, _ in boxes:
@@ -335,7 +335,7 @@ def _own_and_far(vehicle: Vehicle, boxes: list[Any]) -> tuple[np.ndarray, np.nda
     return vehicle.inertia - far, far
 
 
-def _euler(inertia: np.ndarray) -> tuple[Any, Any]:
+def _euler(inertia: np.ndarray) -> tuple[Array, Array]:
     """Of an inertia: its inverse, and -I⁻¹ (ω × I ω) as terms (i, j, k).
 
     Each axis has its list of terms: k times component i times component j of the rates.
@@ -351,7 +351,7 @@ def _euler(inertia: np.ndarray) -> tuple[Any, Any]:
     return _sparse(inverse), found
 
 
-def _euler_of_each(inertia: Any) -> tuple[Any, Any]:
+def _euler_of_each(inertia: Array) -> tuple[Array, Array]:
     """The same of inertias (W, 3, 3): vectors."""
     turn = np.linalg.inv(inertia)
     products = -np.einsum("wil,ljm,wmk->ijkw", turn, _CROSS, inertia)
@@ -367,7 +367,7 @@ def _sparse(matrix: np.ndarray, size: float | None = None) -> list[list[float]]:
     return rows
 
 
-def _sum(total: Any, *products: tuple[Any, ...]) -> Any:
+def _sum(total: Array, *products: tuple[Array, ...]) -> Array:
     """The total and the products of some vectors and numbers, in the fewest operations."""
     for factors in products:
         share = math.prod(one for one in factors if isinstance(one, float))
@@ -385,24 +385,24 @@ def _sum(total: Any, *products: tuple[Any, ...]) -> Any:
     return total
 
 
-def _times(matrix: list[list[float]], rotors: list[Any]) -> Vector:
+def _times(matrix: list[list[float]], rotors: list[Array]) -> Vector:
     """A matrix (3, R) and thrusts of R rotors: three vectors."""
     return tuple(_sum(0.0, *zip(row, rotors, strict=True)) for row in matrix)
 
 
-def _is_there(vector: Any) -> bool:
+def _is_there(vector: Array) -> bool:
     return any(not isinstance(x, float) or x != 0.0 for x in vector)
 
 
-def _plus(a: Any, b: Any, share: float = 1.0) -> Vector:
+def _plus(a: Array, b: Array, share: float = 1.0) -> Vector:
     return tuple(_sum(x, (share, y)) for x, y in zip(a, b, strict=True))
 
 
-def _scaled(vector: Any, share: Any) -> Vector:
+def _scaled(vector: Array, share: Array) -> Vector:
     return tuple(_sum(0.0, (share, x)) for x in vector)
 
 
-def _cross(a: Any, b: Any) -> Vector:
+def _cross(a: Array, b: Array) -> Vector:
     (p, q, r) = a
     (x, y, z) = b
     return (
@@ -412,17 +412,17 @@ def _cross(a: Any, b: Any) -> Vector:
     )
 
 
-def _forth(matrix: Any, vector: Any) -> Vector:
+def _forth(matrix: Array, vector: Array) -> Vector:
     """A matrix, three rows, and a vector."""
     return tuple(_sum(0.0, *zip(row, vector, strict=True)) for row in matrix)
 
 
-def _back(matrix: Any, vector: Any) -> Vector:
+def _back(matrix: Array, vector: Array) -> Vector:
     """The transposed matrix and a vector."""
     return _forth(tuple(zip(*matrix, strict=True)), vector)
 
 
-def _to_world(quaternion: Any, turn: Rows | None, vector: Vector) -> Vector:
+def _to_world(quaternion: Array, turn: Rows | None, vector: Vector) -> Vector:
     """A body vector in the world frame; `turn` is the quaternion's matrix where it is known."""
     if turn is not None or _is_there(vector[:2]):
         return _forth(turn or matrix(quaternion), vector)
@@ -432,7 +432,7 @@ def _to_world(quaternion: Any, turn: Rows | None, vector: Vector) -> Vector:
     return (x * z + w * y) * twice, (y * z - w * x) * twice, up - (x * x + y * y) * twice
 
 
-def _rotated(quaternion: Any, rates: Vector, time: float) -> tuple[Any, Any]:
+def _rotated(quaternion: Array, rates: Vector, time: float) -> tuple[Array, Array]:
     """A quaternion turned for a time at body rates, and the square of the angle."""
     x, y, z = rates
     square = (x * x + y * y + z * z) * (time * time)
@@ -442,7 +442,7 @@ def _rotated(quaternion: Any, rates: Vector, time: float) -> tuple[Any, Any]:
     return product(quaternion, turn), square
 
 
-def _of_rotation_vector(spin: Vector, time: float, square: Any, rates: Vector) -> Vector:
+def _of_rotation_vector(spin: Vector, time: float, square: Array, rates: Vector) -> Vector:
     """How fast the rotation vector r = spin · time changes at body rates in the turned frame.
 
     rates + r × rates / 2 + k r × (r × rates), k = (1 - |r| / 2 · cot(|r| / 2)) / |r|² (Bortz,
@@ -460,7 +460,7 @@ def _of_rotation_vector(spin: Vector, time: float, square: Any, rates: Vector) -
     )
 
 
-def _normalized(quaternion: Any) -> Any:
+def _normalized(quaternion: Array) -> Array:
     """A quaternion whose size is nearly 1: Newton's step towards 1."""
     w, x, y, z = quaternion
     share = 1.5 - 0.5 * (w * w + x * x + y * y + z * z)

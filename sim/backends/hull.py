@@ -1,6 +1,6 @@
 """Which crafts of W worlds reach level ground, by their solid geoms, or each other, by spheres."""
 
-from typing import Any, Final
+from typing import Final
 
 import mujoco
 import numpy as np
@@ -37,7 +37,7 @@ class Hull:
         margin = vehicle.rest_height - float(self._depth(np.array([[0.0], [0.0], [-1.0]]))[0])
         self.ground = margin if abs(margin) > _ROUNDED else 0.0
 
-    def touches(self, height: Array, quaternion: Any) -> Array:
+    def touches(self, height: Array, quaternion: Array) -> Array:
         """Whether crafts at such heights and attitudes (four vectors) touch the ground, (W,)."""
         height = height - self.ground
         near = height < self._reach
@@ -53,7 +53,7 @@ class Hull:
 
         Of `Vehicle.radius` about the body's origin, at positions (3, W, A), m.
         """
-        square: Any = 0.0
+        square: Array = 0.0
         for x in clip(position, -mujoco.mjMAXVAL, mujoco.mjMAXVAL):  # a bad state overflows
             apart = x[:, :, None] - x[:, None]
             square = square + apart * apart
@@ -70,7 +70,7 @@ class Hull:
         return np.max(centers @ down + radii + sizes, axis=0)
 
 
-def _shapes(model: mujoco.MjModel) -> list[tuple[Any, ...]]:
+def _shapes(model: mujoco.MjModel) -> list[tuple[Array, ...]]:
     """Center, radius, axes as columns, s and t of each geom that meets the ground."""
     data = mujoco.MjData(model)
     data.qpos[:7] = (0, 0, 0, 1, 0, 0, 0)
@@ -78,7 +78,7 @@ def _shapes(model: mujoco.MjModel) -> list[tuple[Any, ...]]:
     ours = np.isin(model.geom_bodyid, craft_bodies(model))
     types = model.geom_contype
     affinities = model.geom_conaffinity
-    shapes: list[tuple[Any, ...]] = []
+    shapes: list[tuple[Array, ...]] = []
     none = (0.0, 0.0, 0.0)
     kinds = mujoco.mjtGeom
     for i in np.flatnonzero(ours).tolist():

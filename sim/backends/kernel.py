@@ -16,14 +16,17 @@ from collections.abc import Callable
 from functools import lru_cache
 from itertools import count
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
+from numpy.typing import DTypeLike
 
 from ...models.errors import InputError
+from ..state import Array
 from .body import RigidBody, mapped
 
+Precision = np.dtype[np.floating]
 ROWS: Final = 13
 COMPILE_SECONDS: Final = 60.0
 """Time limit of the compiler, s."""
@@ -81,17 +84,16 @@ def compiler() -> list[str] | None:
     return None
 
 
-def compiled(body: RigidBody, rotors: int, dtype: Any, *, wrench: bool) -> Fly:
+def compiled(body: RigidBody, rotors: int, dtype: Precision, *, wrench: bool) -> Fly:
     """The flight of a body whose `varying` has the vectors that it will have.
 
     Takes half a second. Raises `InputError` if the compiler fails.
     """
-    dtype = np.dtype(dtype)
     found = _library(_source(body, rotors, dtype, wrench))
     pointer = ctypes.c_void_p
     found.fly.argtypes = [ctypes.c_long, ctypes.c_long, *[pointer] * 5]
 
-    def fly(rows: Any, thrust: Any, wrench: Any, varying: Any, steps: int) -> np.ndarray:
+    def fly(rows: Array, thrust: Array, wrench: Array, varying: Array, steps: int) -> np.ndarray:
         out = np.empty(rows.shape, dtype)
         given = (rows, thrust, wrench, varying)
         places = [None if x is None else x.ctypes.data for x in given]
@@ -101,7 +103,7 @@ def compiled(body: RigidBody, rotors: int, dtype: Any, *, wrench: bool) -> Fly:
     return fly
 
 
-def packed(body: RigidBody, dtype: Any) -> np.ndarray | None:
+def packed(body: RigidBody, dtype: DTypeLike) -> np.ndarray | None:
     """The vectors of `varying` as the compiled function takes them, (L, W); None if none vary."""
     found: list[np.ndarray] = []
     mapped(body.varying, found.append)
@@ -111,7 +113,7 @@ def packed(body: RigidBody, dtype: Any) -> np.ndarray | None:
 class _Lines:
     """The lines of a function; the same operation on the same variables is one line."""
 
-    def __init__(self, dtype: np.dtype[Any]) -> None:
+    def __init__(self, dtype: Precision) -> None:
         self.dtype = dtype
         self._names = dict[str, TracedArray]()
 
@@ -119,7 +121,7 @@ class _Lines:
         """The lines of C."""
         return [f"      const __auto_type {x.name} = {text};" for text, x in self._names.items()]
 
-    def of(self, expression: str, *inputs: Any) -> "TracedArray":
+    def of(self, expression: str, *inputs: Array) -> "TracedArray":
         """The variable of an expression of variables and numbers."""
         names = (x.name if isinstance(x, TracedArray) else f"(T){float(x)!r}" for x in inputs)
         text = expression.format(*names)
@@ -138,16 +140,16 @@ class TracedArray(NDArrayOperatorsMixin):
         self.name = name
         self.dtype = lines.dtype
 
-    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any) -> "TracedArray":
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Array) -> "TracedArray":
         return self._lines.of(_EXPRESSIONS[ufunc], *inputs)
 
     def __array_function__(
-        self, function: Any, types: Any, inputs: Any, options: Any
+        self, function: object, types: object, inputs: Array, options: object
     ) -> "TracedArray":
         return self._lines.of(_EXPRESSIONS[function], *inputs)
 
 
-def _source(body: RigidBody, rotors: int, dtype: np.dtype[Any], wrench: bool) -> str:
+def _source(body: RigidBody, rotors: int, dtype: Precision, wrench: bool) -> str:
     lines = _Lines(dtype)
 
     def read(array: str, count: int) -> list[TracedArray]:
@@ -167,7 +169,7 @@ def _source(body: RigidBody, rotors: int, dtype: np.dtype[Any], wrench: bool) ->
 
 
 @lru_cache
-def _library(source: str) -> Any:
+def _library(source: str) -> ctypes.CDLL:
     """The compiled source. Raises `InputError` if it cannot be compiled or loaded."""
     command = compiler() or ["cc"]
     tool = command[0]

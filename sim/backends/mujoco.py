@@ -6,7 +6,7 @@ of threads.
 
 import copy
 import os
-from typing import Any, Final
+from typing import Final
 
 import mujoco
 import numpy as np
@@ -207,7 +207,7 @@ class MujocoWorld(BaseWorld):
             array[...] = arrays[name]
         self._warnings.fill(0)
 
-    def _act(self, effects: Effects, mask: Array | None, some: Any) -> None:
+    def _act(self, effects: Effects, mask: Array | None, some: Array) -> None:
         """Let the effects act on some worlds before a physics step."""
         mean, end, wrench = effects.step(self.state, mask)
         if self._thrust is not self._command:
@@ -219,13 +219,13 @@ class MujocoWorld(BaseWorld):
             here = some if self.shape else ...
             self._applied[here] = wrench[here]
 
-    def _clear_contacts(self, some: Any) -> None:
+    def _clear_contacts(self, some: Array) -> None:
         """No contact of some worlds yet."""
         self._touching[some] = False
         if self._colliding is not None:
             self._colliding[some] = False
 
-    def _add_contacts(self, some: Any) -> None:
+    def _add_contacts(self, some: Array) -> None:
         """Add the contacts of some worlds to those that they had."""
         if self._colliding is None:
             self._touching[some] |= self._contacts[some, None] > 0
@@ -294,7 +294,7 @@ class MujocoWorld(BaseWorld):
         qvel[ids, -6:-3] = qvel[ids, :3]
         qvel[ids, -3:] = 0.0
 
-    def _apply_thrust(self, thrust: np.ndarray, some: Any = ...) -> None:
+    def _apply_thrust(self, thrust: np.ndarray, some: Array = ...) -> None:
         if self._newtons is not None:
             self._ctrl[some] = thrust[some] / self._newtons
         elif thrust is not self._ctrl:

@@ -4,7 +4,7 @@ A controller has no memory: what it needs of the past is in the state. An action
 within bounds, or is one of some choices.
 """
 
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 
 from ...models.errors import InputError, shortened
 from ..effects import EffectOptions
@@ -21,7 +21,7 @@ __all__ = [
     "LEVELS", "SHARES", "CollectiveThrust", "Controller", "Gains", "RotorThrust", "make_controller",
 ]  # fmt: skip
 
-_CASCADE: Final[dict[str, Any]] = {
+_CASCADE: Final[dict[str, type[Rates]]] = {
     "rates": Rates,
     "attitude": Attitude,
     "velocity": Velocity,

@@ -18,7 +18,7 @@ Array code with any leading axes; of a single drone the numbers are Python's.
 
 import math
 from functools import partial, reduce
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -45,8 +45,8 @@ class Rates:
     the collective thrust moves as little as makes room for them; yaw gets the room that is left.
     """
 
-    every_step: Final = True
-    choices: Final = 0
+    every_step = True
+    choices = 0
     components: tuple[str, ...] = ("collective thrust", "roll rate", "pitch rate", "yaw rate")
     frame = "body"
 
@@ -80,7 +80,7 @@ class Rates:
         share, *rates = self._scaled(action)
         return self.turn(self._collective(share), rates, state)
 
-    def turn(self, collective: Any, rates: Parts, state: WorldState) -> Array:
+    def turn(self, collective: Array, rates: Parts, state: WorldState) -> Array:
         """Thrusts, N, shape (..., R), for a collective thrust, N, and body rates, rad/s."""
         p, q, r = parts_of(state.body_rates)
         about_x, about_y, about_z = self.gains.rate
@@ -90,7 +90,7 @@ class Rates:
         torque = roll + (q * w - r * v), pitch + (r * u - p * w), yaw + (p * v - q * u)
         return self._driven(self.mixed(collective, torque), state)
 
-    def mixed(self, collective: Any, torque: Parts) -> list[Any]:
+    def mixed(self, collective: Array, torque: Parts) -> list[Array]:
         """Thrust of each rotor, N, for a collective thrust, N, and a torque, N·m."""
         gains = self.gains
         (roll, pitch, yaw) = torque
@@ -111,7 +111,7 @@ class Rates:
         rotors = zip(gains.share, parts, gains.mix, strict=True)
         return [share * (part + c * yaw) for share, part, (*_, c) in rotors]
 
-    def _driven(self, wanted: list[Any], state: WorldState) -> Array:
+    def _driven(self, wanted: list[Array], state: WorldState) -> Array:
         """Commands that make rotors with a lag and a thrust curve give these thrusts."""
         lead = self.gains.lead
         if lead != 1.0:
@@ -124,11 +124,11 @@ class Rates:
             commands = [high * np.interp(part / high, *self._throttle) for part, (_, high) in both]
         return stack(commands)
 
-    def _scaled(self, action: Array) -> list[Any]:
+    def _scaled(self, action: Array) -> list[Array]:
         pairs = zip(parts_of(action), self._sizes, strict=True)
         return [size * clip(part, -1.0, 1.0) for part, size in pairs]
 
-    def _collective(self, share: Any) -> Any:
+    def _collective(self, share: Array) -> Array:
         """N, of a number in [-1, 1]."""
         return self._hover + self._up * clip(share, 0.0, 1.0) + self._down * clip(share, -1.0, 0.0)
 
@@ -160,7 +160,7 @@ class Attitude(Rates):
         return self.point(self._collective(share), axis, yaw_rate, axes, state)
 
     def point(
-        self, collective: Any, axis: Parts, yaw_rate: Any, axes: Rows, state: WorldState
+        self, collective: Array, axis: Parts, yaw_rate: Array, axes: Rows, state: WorldState
     ) -> Array:
         """As `turn`, for a collective thrust, N, and a thrust axis, a unit vector of the world.
 
@@ -196,7 +196,7 @@ class Velocity(Attitude):
         axes = _axes(state.quaternion)
         return self.fly((*_turned(axes[0], x, y), z), yaw_rate, axes, state)
 
-    def fly(self, velocity: Parts, yaw_rate: Any, axes: Rows, state: WorldState) -> Array:
+    def fly(self, velocity: Parts, yaw_rate: Array, axes: Rows, state: WorldState) -> Array:
         """As `point`, for a velocity in the world frame, m/s."""
         gains = self.gains
         gravity = self._gravity
@@ -247,7 +247,7 @@ class Position(Velocity):
         most = gains.most_rate[2]
         return self.fly((x, y, z), clip(gains.heading * heading, -most, most), axes, state)
 
-    def _gain(self, distance: Any, acceleration: float, speed: float) -> Any:
+    def _gain(self, distance: Array, acceleration: float, speed: float) -> Array:
         """Velocity over offset, 1/s."""
         braked = _root(0.5 * acceleration / distance)
         return clip(_smaller(braked, speed / distance), 0.0, self.gains.position)
@@ -258,7 +258,7 @@ def _axes(quaternion: Array) -> Rows:
     return transposed(matrix(parts_of(quaternion)))
 
 
-def _turned(nose: Parts, x: Any, y: Any) -> tuple[Any, Any]:
+def _turned(nose: Parts, x: Array, y: Array) -> tuple[Array, Array]:
     """A horizontal vector of the frame turned by the heading, in the world frame.
 
     The heading is the direction of the nose on the ground; 0 where the nose is vertical.
@@ -269,37 +269,37 @@ def _turned(nose: Parts, x: Any, y: Any) -> tuple[Any, Any]:
     return c * x - s * y, s * x + c * y
 
 
-def _length(x: Any, y: Any = 0.0) -> Any:
+def _length(x: Array, y: Array = 0.0) -> Array:
     return _root(x * x + y * y + _TINY)
 
 
-def _most(parts: list[Any]) -> Any:
+def _most(parts: list[Array]) -> Array:
     return max(parts) if isinstance(parts[0], float) else reduce(_larger, parts)
 
 
-def _least(parts: list[Any]) -> Any:
+def _least(parts: list[Array]) -> Array:
     return min(parts) if isinstance(parts[0], float) else reduce(_smaller, parts)
 
 
-def _root(square: Any) -> Any:
+def _root(square: Array) -> Array:
     if isinstance(square, float):
         return math.sqrt(square)
     return np.sqrt(square)
 
 
-def _larger(a: Any, b: Any) -> Any:
+def _larger(a: Array, b: Array) -> Array:
     if isinstance(a, float):
         return max(a, b)
     return np.maximum(a, b)
 
 
-def _smaller(a: Any, b: Any) -> Any:
+def _smaller(a: Array, b: Array) -> Array:
     if isinstance(a, float):
         return min(a, b)
     return np.minimum(a, b)
 
 
-def _by_name(name: str, angle: Any) -> Any:
+def _by_name(name: str, angle: Array) -> Array:
     """Of numbers too by NumPy: a batch gets the bits of a single drone."""
     found = getattr(np, name)(angle)
     return float(found) if isinstance(angle, float) else found

@@ -25,6 +25,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...models.errors import InputError
 
@@ -146,6 +147,7 @@ def shared_ranges(several: Sequence[Gains]) -> list[Gains]:
     return [replace(one, **least) for one in several]
 
 
-def _rows(allocation: np.ndarray) -> Any:
+def _rows(allocation: np.ndarray) -> NDArray[np.float64]:
     """Largest number of each row, so that the rank does not depend on the craft's size."""
-    return np.maximum(np.abs(allocation).max(axis=1, keepdims=True), 1e-12)
+    largest: NDArray[np.float64] = np.abs(allocation).max(axis=1, keepdims=True)
+    return np.maximum(largest, 1e-12)

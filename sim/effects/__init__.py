@@ -11,13 +11,11 @@ the same bits alone and in a batch.
 """
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, Final
-
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, Final
 
 from ...models.errors import InputError
 from ..random import GUSTS, Noise
-from ..snapshots import Arrays, Kept, joined, part_of
+from ..snapshots import Arrays, Kept, Snapshot, joined, part_of
 from ..state import Array, WorldState, component
 from .air import AirEffects
 from .downwash import Downwash
@@ -100,7 +98,7 @@ class Effects:
         both = zip(self._mean_wind, WINDS, strict=True)
         self._wind = [mean + factors.get(name, 0.0) for mean, name in both]
 
-    def snapshot(self) -> dict[str, NDArray[Any]]:
+    def snapshot(self) -> Snapshot:
         """State of all effects by name."""
         return joined({name: part.snapshot() for name, part in self._parts().items()})
 

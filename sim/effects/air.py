@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -86,8 +86,8 @@ class AirEffects(Kept):
         if options.ground_effect:
             (self._radius,) = told.need("rotors.radius", "ground_effect")
         self._factors: dict[str, Array] = {}
-        self._rotors: list[Any] = []
-        self._before: Any = None
+        self._rotors: list[Array] = []
+        self._before: Array = None
 
     def vary(self, numbers: Mapping[str, Array]) -> None:
         """Take other coefficients for each drone, (W, A), by their names in a vehicle's file.
@@ -172,7 +172,7 @@ class AirEffects(Kept):
             torque = torque[0] + roll * v[1], torque[1] - pitch * v[0], torque[2]
         return (x, y, z), torque
 
-    def _push(self, rotor: Any, thrust: Array, root: Array | None, around: list[Array]) -> Parts:
+    def _push(self, rotor: Array, thrust: Array, root: Array | None, around: list[Array]) -> Parts:
         """Force of a part of the rotors besides their thrust, body axes; the root as of `step`.
 
         `around` has velocity and body rates, of each body axis its part upwards, and the height of

@@ -6,7 +6,7 @@ Automation Letters 2025, arXiv 2403.13321, measured below hovering drones of sev
 """
 
 import math
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -77,5 +77,5 @@ class Downwash:
         square = (offset * offset).sum(-1) - below * below
         thrust = state.thrust.sum(-1)[:, None] + 0.0 * below
         speed = self.velocity(thrust, below, square.clip(0.0) ** 0.5)
-        air: Any = (speed[..., None] * down[:, None]).sum(2)  # a drone's own has the depth 0
+        air: Array = (speed[..., None] * down[:, None]).sum(2)  # a drone's own has the depth 0
         return [air[..., axis] for axis in range(3)]

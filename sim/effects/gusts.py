@@ -11,7 +11,7 @@ h / (0.177 + 0.000823 h)^1.2, σ_w = 0.1 W20 and σ_u = σ_v = σ_w / (0.177 + 0
 """
 
 import math
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -45,8 +45,8 @@ class Gusts(Kept):
         self._along = (1.0, 0.0) if across == 0 else (mean_wind[0] / across, mean_wind[1] / across)
         self._speed = max(LEAST_SPEED, math.hypot(*mean_wind))
         self._step = timestep
-        self._filters: Any = None
-        self._state: Any = None
+        self._filters: Array = None
+        self._state: Array = None
 
     def begin(self, mask: Array, height: Array, normal: Array, factor: Array = 1.0) -> None:
         """Begin in the stationary state; height in m, shape (W, A), normal (W, A, 5).

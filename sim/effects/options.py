@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Annotated, Any, Final, Self
+from typing import Annotated, Final, Self
 
 from ...models import MAX_DRAG
 from ...models.errors import InputError, shortened
@@ -57,7 +57,7 @@ class EffectOptions:
         check_fields(self, "effects: ")
 
     @classmethod
-    def from_options(cls, options: Any) -> Self:
+    def from_options(cls, options: object) -> Self:
         """Options by name. An unknown name raises `InputError`, which names those there are."""
         if not isinstance(options, Mapping):
             raise InputError(
@@ -66,7 +66,7 @@ class EffectOptions:
         check_names(options, [one.name for one in fields(cls)], "effects")
         return cls(**options)
 
-    def to_options(self) -> dict[str, Any]:
+    def to_options(self) -> dict[str, object]:
         """The reverse of `from_options`: those that differ from their default."""
         values = {one.name: getattr(self, one.name) for one in fields(self)}
         return {

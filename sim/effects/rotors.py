@@ -3,7 +3,7 @@
 Rotors are a list of parts: of a single drone a number for each, of a batch one array (W, A, R).
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from .options import EffectOptions
 if TYPE_CHECKING:
     from ...models.vehicle import Vehicle
 
-Parts = list[Any]
+Parts = list[Array]
 
 
 class RotorEffects(Kept):
@@ -82,7 +82,7 @@ class RotorEffects(Kept):
                 f"effects: efficiency: expected {count} numbers, one for each rotor, got {share}"
             )
         self._scales: list[Parts] = []
-        self._roots: Any = None  # of the thrusts, proportional to the rotors' speeds
+        self._roots: Array = None  # of the thrusts, proportional to the rotors' speeds
         self.charge: Array = None
         self.voltage: Array = None
 
@@ -174,7 +174,7 @@ class RotorEffects(Kept):
         gone = -(float(np.expm1(-ratio)) if number else np.expm1(-ratio))
         return gone, gone / ratio, gone * (2 - gone) / (2 * ratio)
 
-    def _follow(self, root: Any, wanted: Any) -> tuple[Any, Any, Any]:
+    def _follow(self, root: Array, wanted: Array) -> tuple[Array, Array, Array]:
         """Of what begins at `root` and follows `wanted` over a step: mean square, end and mean."""
         off = root - wanted
         answer = self._answers[0]
@@ -237,7 +237,7 @@ def _of_rotors(values: np.ndarray, like: Array) -> Parts:
     return values.tolist() if like.ndim == 1 else [values]
 
 
-def polynomial(coefficients: tuple[float, ...], x: Any) -> Any:
+def polynomial(coefficients: tuple[float, ...], x: Array) -> Array:
     result = coefficients[-1] + 0.0 * x
     for c in coefficients[-2::-1]:
         result = result * x + c

@@ -10,11 +10,9 @@ World frame: x east, y north, z up. Arrays have the leading axes of the world, n
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Final
 
-from numpy.typing import NDArray
-
 from ...models.errors import InputError, shortened
 from ...models.fields import check_names
-from ..snapshots import Arrays, Kept, joined, part_of
+from ..snapshots import Arrays, Kept, Snapshot, joined, part_of
 from ..state import Array, WorldState
 from .barometer import Barometer
 from .base import Reading, Sensor, Source, Values, chosen
@@ -41,7 +39,7 @@ _ESTIMATE: Final = Estimator.name
 _SOURCES: Final[Mapping[str, type[Source]]] = {**SENSOR_TYPES, _ESTIMATE: Estimator}
 
 
-def checked_sensors(given: Any) -> dict[str, Any]:
+def checked_sensors(given: object) -> dict[str, Any]:
     """The option `sensors` of a task as plain values in one order. Raises `InputError`.
 
     By sensor its settings by name, or True for none; False leaves it out. `observe` is "added" or
@@ -134,7 +132,7 @@ class Sensors(Kept):
         if self._estimator is not None:
             self._estimator.update(mask, self._channels)
 
-    def snapshot(self) -> dict[str, NDArray[Any]]:
+    def snapshot(self) -> Snapshot:
         """Copies of all arrays that a later reading depends on, by name."""
         parts = {name: part.snapshot() for name, part in self._parts().items()}
         return joined(parts) | super().snapshot()
