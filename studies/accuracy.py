@@ -13,7 +13,7 @@ import copy
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import mujoco
 import numpy as np
@@ -98,7 +98,9 @@ def markdown(rows: Sequence[Accuracy]) -> str:
     return table(head, cells)
 
 
-def _start(vehicle: Vehicle, integrator: str, step: float, height: float) -> tuple[Any, Any]:
+def _start(
+    vehicle: Vehicle, integrator: str, step: float, height: float
+) -> tuple[mujoco.MjModel, mujoco.MjData]:
     """(model, data) of a level craft at rest."""
     model = copy.copy(vehicle.model)
     model.opt.integrator = INTEGRATORS[integrator]

@@ -26,14 +26,14 @@ import time
 import zlib
 from collections import Counter
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from measuring import RESULTS, free_ports, launch, options, write
 from rotorgram.envs import ArraySpec, LocalVectorEnv, Outcome, Task, register
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.loop import Loop
-from rotorgram.sim import InitialState
+from rotorgram.envs.state import State as TaskState
+from rotorgram.sim import Draw, InitialState
 from rotorgram.udp import LinkConfig, RemoteVectorEnv, Simulator
 from rotorgram.udp.protocol.messages import Command
 
@@ -74,14 +74,14 @@ class Row(Task):
     def setup(self) -> None:
         self.observation = (ArraySpec(name="observation", shape=(3,)),)
 
-    def begin(self, mask: Any, draw: Any) -> InitialState:
+    def begin(self, mask: np.ndarray, draw: Draw) -> InitialState:
         row = 5.0 * np.arange(self.shape[1]) + draw.uniform(-0.1, 0.1)
         return InitialState(position=np.stack((row, 0.0 * row, 2.0 + 0.0 * row), axis=-1))
 
-    def observe(self, state: Any) -> dict[str, Any]:
+    def observe(self, state: TaskState) -> dict[str, np.ndarray]:
         return {"observation": state.position}
 
-    def outcome(self, state: Any) -> Outcome:
+    def outcome(self, state: TaskState) -> Outcome:
         risen = state.position[..., 2] - 2.0
         return Outcome(reward={"risen": risen}, terminated=risen > 0.05, metrics={})
 
@@ -143,7 +143,7 @@ class Twin:
         self.shown = loop.observations["observation"].copy()
 
 
-def fly_eight(kills: int, dice: random.Random) -> dict[str, Any]:
+def fly_eight(kills: int, dice: random.Random) -> dict[str, object]:
     ports = free_ports(AGENTS)
     settings = [[port, POLICIES[i % 3]] for i, port in enumerate(ports)]
     agents = [launch(AGENT, each) for each in settings]
@@ -202,7 +202,7 @@ def fly_eight(kills: int, dice: random.Random) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def fly_hundred(steps: int) -> dict[str, Any]:
+def fly_hundred(steps: int) -> dict[str, object]:
     port = free_ports(1)[0]
     relays = launch(RELAYS, [[("127.0.0.1", port)], FAULTS])
     server = tuple(json.loads(relays.stdout.readline())[0])

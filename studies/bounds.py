@@ -12,7 +12,8 @@ agent comes near this return and does not exceed it by more than what one contro
 **Hover.** The thrust stays at hover: E stays what it was at the start.
 """
 
-from typing import Any, Final
+from collections.abc import Callable
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -51,7 +52,7 @@ def known_bounds(config: EnvConfig, episodes: int) -> dict[str, float]:
 
 def elevation_bounds(config: FlownConfig, vehicle: Vehicle, starts: Floats) -> dict[str, float]:
     """Mean returns of the two flights by name, over episodes that start at E in m, shape (n,)."""
-    options: Any = config.task_options
+    options = config.task_options
     steps = config.episode_length or 0
     period = config.control_period or 0.0
     # Largest accelerations up and down, m/s², and the largest change of one in a control step.
@@ -111,7 +112,9 @@ def bang_bang(
     return np.asarray(distance[:, None] - way[:, :steps])
 
 
-def _bisected(too_low: Any, low: Floats, high: Floats) -> Floats:
+def _bisected(
+    too_low: Callable[[Floats], npt.NDArray[np.bool_]], low: Floats, high: Floats
+) -> Floats:
     low = low.copy()
     high = high.copy()
     for _ in range(_HALVINGS):

@@ -9,8 +9,6 @@ worlds whose episode terminated.
 It takes about five minutes on two cores.
 """
 
-from typing import Any
-
 import numpy as np
 from measuring import RESULTS, options, write
 from rotorgram.agents import Geometric
@@ -22,7 +20,7 @@ CABLE = "rotorgram/Cable-v0"
 DRONES = (2, 3, 4, 8)
 
 
-def flown(vehicle: str, drones: int, episodes: int) -> dict[str, Any]:
+def flown(vehicle: str, drones: int, episodes: int) -> dict[str, object]:
     """Errors, m, and worlds that terminated."""
     env = LocalVectorEnv(
         CABLE, episodes * drones, drones=drones, vehicle=vehicle, action="position",
@@ -40,7 +38,7 @@ def flown(vehicle: str, drones: int, episodes: int) -> dict[str, Any]:
 
 def main() -> None:
     args = options(__doc__, episodes=10, out=RESULTS / "control" / "cable.json").parse_args()
-    told: dict[str, Any] = {"episodes": args.episodes}
+    told = {"episodes": args.episodes}
     for name in vehicle_names():
         told[name] = {str(count): flown(name, count, args.episodes) for count in DRONES}
         print(name, told[name], flush=True)

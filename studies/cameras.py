@@ -171,7 +171,7 @@ def threads(seconds: float, repeats: int) -> dict[str, float]:
 
 def steps(drones: int, seconds: float, repeats: int) -> dict[str, float]:
     """Milliseconds of a step of so many drones: without pictures, with one each, and over UDP."""
-    blind: dict[str, Any] = {"episode_length": EPISODE, "action": "velocity"}
+    blind = {"episode_length": EPISODE, "action": "velocity"}
     flown = {"blind": blind, "seeing": {**blind, "cameras": ["front"]}}
     with ExitStack() as opened:
         cases: dict[str, Step] = {}

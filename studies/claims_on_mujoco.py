@@ -10,7 +10,6 @@ It takes about a few seconds on two cores.
 """
 
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 from measuring import options
@@ -41,7 +40,7 @@ def values(folder: Path, seeds: set[int]) -> dict[tuple[str, str], list[float]]:
     return table
 
 
-def compared(name: str, rigid: Path, mujoco: Path) -> list[dict[str, Any]]:
+def compared(name: str, rigid: Path, mujoco: Path) -> list[dict[str, object]]:
     """The rows of a pair of folders."""
     seeds = [set(Results.read(folder).runs["seed"]) for folder in (rigid, mujoco)]
     both = seeds[0] & seeds[1]

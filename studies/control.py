@@ -14,7 +14,6 @@ import json
 import math
 import statistics
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from measuring import RESULTS, in_turns, medians, options, timed, write
@@ -47,7 +46,7 @@ def lag_of(vehicle: Vehicle) -> float:
     return max((t for t in (told.time_constant, told.time_constant_down) if t), default=0.0)
 
 
-def gains_of(name: str) -> dict[str, Any]:
+def gains_of(name: str) -> dict[str, object]:
     """Gains and ranges of a vehicle, with its motor lag if it has one."""
     vehicle = Vehicle.load(name)
     gains = Gains.of(vehicle, vehicle.timestep, lag_of(vehicle))
@@ -79,7 +78,7 @@ def response(name: str, level: str) -> dict[str, float]:
     (index, size, _, time, read) = STEPS[level]
     effects = EffectOptions(motor_lag=lag_of(vehicle) > 0)
     world = make_world(vehicle, 1, effects=effects)
-    controller: Any = make_controller(level, vehicle, vehicle.timestep, effects)
+    controller = make_controller(level, vehicle, vehicle.timestep, effects)
     world.reset(np.True_, InitialState(position=np.array((0.0, 0.0, 1000.0))))
     unit = controller.ranges()[index][0]
     action = np.zeros(4)
@@ -103,7 +102,7 @@ def response(name: str, level: str) -> dict[str, float]:
 class Circle(Hover):
     """A goal that goes round a circle of 1 m at 1 m/s, 5 m high."""
 
-    def goal(self, state: State) -> Any:
+    def goal(self, state: State) -> np.ndarray:
         """On the circle, at the time of the step."""
         angle = SPEED * state.time
         return np.array((math.cos(angle), math.sin(angle), 5.0))
@@ -123,7 +122,7 @@ def tracking(name: str) -> float:
     return round(math.sqrt(statistics.fmean(e * e for e in errors[round(2 * PERIOD / 0.02) :])), 4)
 
 
-def cost(num_drones: int, seconds: float, repeats: int) -> dict[str, Any]:
+def cost(num_drones: int, seconds: float, repeats: int) -> dict[str, object]:
     """Env steps per second of each level, medians, and their ratios to `rotors`."""
     loops = {
         level: Loop(EnvConfig(env_id=HOVER, action=level, episode_length=10**6), num_drones)

@@ -12,7 +12,7 @@ It takes about twenty minutes on two cores.
 """
 
 import time
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from measuring import RESULTS, add_row, options
@@ -31,12 +31,12 @@ ROWS: Final = {
 EPISODES: Final = 50
 
 
-def made(count: int, track: str, backend: Any) -> Any:
+def made(count: int, track: str, backend: str) -> LocalVectorEnv:
     """So many drones in this process."""
     return LocalVectorEnv(RACING, count, autoreset_mode="Disabled", backend=backend, track=track)
 
 
-def measure(row: str, seed: int) -> dict[str, Any]:
+def measure(row: str, seed: int) -> dict[str, object]:
     """Train through the stages of a row, and fly the track of the last one."""
     preset = find_preset("ppo", "tuned", RACING)
     began = time.process_time()

@@ -6,7 +6,7 @@ PID flies the task of the paper, `geometric` the others.
 It takes about half a minute on two cores.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from measuring import IMAGES, options
 from PIL import Image
@@ -47,7 +47,7 @@ def draw(name: str, scene: Scene) -> Image.Image:
     """A picture of the task by its name without ending."""
     env_id = f"rotorgram/{name}-v0"
     agent = CONTROLLERS[scene.agent]
-    options: dict[str, Any] = agent.options
+    options = agent.options
     policy = agent(env_spec(EnvConfig.from_keywords(env_id, **options)))
     (flown,) = flown_trajectories(policy, env_id, options, [0])
     stage = Stage()

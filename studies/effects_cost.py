@@ -9,7 +9,6 @@ repeat; the medians over the repeats are compared. It takes two minutes.
 
 import itertools
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from measuring import RESULTS, in_turns, medians, options, timed, write
@@ -17,7 +16,7 @@ from rotorgram.models import Vehicle
 from rotorgram.sim import EffectOptions, InitialState, Randomization, World, make_world
 
 ROOT = Path(__file__).parent.parent
-CASES: dict[str, dict[str, Any]] = {
+CASES: dict[str, dict[str, object]] = {
     "none": {},
     "motor_lag": {"motor_lag": True},
     "thrust_curve": {"thrust_curve": True},
@@ -52,7 +51,7 @@ def steps_per_second(world: World, seconds: float) -> float:
     return round(every.size / wall, 1)
 
 
-def measure(num_drones: int, seconds: float, repeats: int) -> dict[str, Any]:
+def measure(num_drones: int, seconds: float, repeats: int) -> dict[str, object]:
     vehicle = Vehicle.load(ROOT / "tests" / "data" / "racer.xml")
     worlds = {}
     for name, case in [*CASES.items(), ("randomize", {})]:

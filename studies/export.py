@@ -12,10 +12,10 @@ import json
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import onnxruntime
@@ -79,7 +79,7 @@ def policy_of(env: str, hidden: tuple[int, ...], activation: str, normalise: boo
     return NetworkPolicy.load({n: w.astype(np.float32) for n, w in weights.items()}, spec, config)
 
 
-def clock(act: Callable[[Any], Any], seen: list[Any]) -> float:
+def clock(act: Callable[[object], object], seen: Sequence[object]) -> float:
     start = time.process_time()
     for i in range(PYTHON_CALLS):
         act(seen[i % SEEN])

@@ -18,10 +18,10 @@ can measure, or 30 % where that is less.
 
 import copy
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from measuring import options, table, write_rows
@@ -37,7 +37,7 @@ RESULTS: Final = ROOT / "docs" / "results" / "independent"
 STEPS: Final = (0.01, 0.005, 0.002, 0.001)
 """Physics steps compared, s; each divides the control period."""
 WIND: Final = (3.0, -2.0, 1.0)  # m/s
-EFFECTS: Final[dict[str, dict[str, Any]]] = {
+EFFECTS: Final[dict[str, dict[str, object]]] = {
     "none": {},
     "motor lag": {"motor_lag": True},
     "body drag": {"body_drag": True},
@@ -141,7 +141,7 @@ def thrusts(vehicle: Vehicle, seconds: float = SECONDS, seed: int = _SEED) -> Fl
     return np.clip(hover * (1 + varied), vehicle.thrust_low, vehicle.thrust_high)
 
 
-def ours(vehicle: Vehicle, commands: Floats, effects: dict[str, Any]) -> Flight:
+def ours(vehicle: Vehicle, commands: Floats, effects: Mapping[str, object]) -> Flight:
     """The flight of the backend `mujoco` at the vehicle's physics step."""
     world = make_world(vehicle, 1, effects=EffectOptions(**effects))
     state = world.state
@@ -161,7 +161,7 @@ def ours(vehicle: Vehicle, commands: Floats, effects: dict[str, Any]) -> Flight:
 
 
 def independent(
-    vehicle: Vehicle, commands: Floats, effects: dict[str, Any], tolerance: float = 1e-12
+    vehicle: Vehicle, commands: Floats, effects: Mapping[str, object], tolerance: float = 1e-12
 ) -> Flight:
     """The flight by `solve_ivp` of `Equations`."""
     equations = Equations(vehicle, effects)
@@ -197,7 +197,7 @@ def independent(
 class Equations:
     """The Newton-Euler equations of a vehicle about its center of mass, with some effects."""
 
-    def __init__(self, vehicle: Vehicle, effects: dict[str, Any]) -> None:
+    def __init__(self, vehicle: Vehicle, effects: Mapping[str, object]) -> None:
         told = vehicle.coefficients
         rotors = vehicle.rotors
         self.effects = effects

@@ -26,7 +26,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import pandas as pd
 from measuring import RESULTS, free_ports, options, write
@@ -126,7 +126,7 @@ def identical(one: Path, other: Path) -> bool:
 
 def kill_often(
     folder: Path, env_steps: int, kills: int, sides: list[str], dice: random.Random
-) -> dict[str, Any]:
+) -> dict[str, object]:
     pair = Pair(folder, env_steps)
     pair.start_simulator()
     pair.start_agent()

@@ -16,7 +16,7 @@ import warnings
 from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import gymnasium as gym
 import rotorgram.envs  # noqa: F401  registers the envs
@@ -44,7 +44,7 @@ class Case(NamedTuple):
     package: str
     """Name of the distribution."""
     what: str
-    fly: Callable[[], Any]
+    fly: Callable[[], None]
 
 
 def torchrl_single() -> None:

@@ -26,7 +26,6 @@ from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from measuring import RESULTS, launch, options, write
 from rotorgram.udp.protocol.auth import write_key
@@ -162,7 +161,7 @@ def two_machines(mtu: int) -> Iterator[tuple[tuple[str, int], tuple[str, int]]]:
             run("ip", "netns", "del", name)
 
 
-def fly(drones: int, mtu: int, delay: float, loss: float, seconds: float) -> dict[str, Any]:
+def fly(drones: int, mtu: int, delay: float, loss: float, seconds: float) -> dict[str, object]:
     """The rate and counts of one flight. Raises `CalledProcessError` if it fails."""
     with tempfile.TemporaryDirectory() as folder, two_machines(mtu) as (here, there):
         key = str(Path(folder) / "key")

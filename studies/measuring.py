@@ -21,7 +21,7 @@ Way = TypeVar("Way")
 Value = TypeVar("Value")
 
 
-def options(doc: str, **defaults: Any) -> argparse.ArgumentParser:
+def options(doc: str, **defaults: object) -> argparse.ArgumentParser:
     """A parser with an option for each name; `doc` is the script's.
 
     An option takes what its default is, a sequence one value or more. A type stands for an option
@@ -97,7 +97,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return "\n".join((lines[0], rule, *lines[1:]))
 
 
-def add_row(path: Path, row: Mapping[str, Any]) -> None:
+def add_row(path: Path, row: Mapping[str, object]) -> None:
     """Add a row to a CSV file, which begins with the names of the first one."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a", newline="") as file:
@@ -124,7 +124,7 @@ def read_rows(path: Path, kind: type[Value]) -> list[Value]:
     return [kind(**{name: types[name](text) for name, text in row.items()}) for row in rows]
 
 
-def write(path: Path, result: Mapping[str, Any]) -> None:
+def write(path: Path, result: Mapping[str, object]) -> None:
     """Write a result as JSON, with the software and the machine on which it depends."""
     from rotorgram.agents.checkpoints import software_versions
     from rotorgram.training.results import machine

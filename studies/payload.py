@@ -10,7 +10,6 @@ It takes about two minutes on two cores.
 """
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from measuring import RESULTS, options, write
@@ -22,7 +21,7 @@ FLOWN = ("paper", "crazyflie2", "heavy_hexa")
 FIRST = 100
 
 
-def flown(name: str, episodes: int, damped: bool) -> dict[str, Any]:
+def flown(name: str, episodes: int, damped: bool) -> dict[str, object]:
     """Error, m, swing, degrees, and episodes that terminated."""
     env = SingleEnv(PAYLOAD, vehicle=name, action="position")
     spec = env.env_spec if damped else replace(env.env_spec, options={})
@@ -46,7 +45,7 @@ def flown(name: str, episodes: int, damped: bool) -> dict[str, Any]:
 
 def main() -> None:
     args = options(__doc__, episodes=20, out=RESULTS / "control" / "payload.json").parse_args()
-    told: dict[str, Any] = {"episodes": args.episodes}
+    told = {"episodes": args.episodes}
     for name in FLOWN:
         told[name] = {
             case: flown(name, args.episodes, damped=case == "damped")

@@ -13,7 +13,6 @@ import re
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -52,7 +51,7 @@ class Curve(BaseCallback):
 def sb3(seed: int) -> list[tuple[int, float]]:
     """Env steps and mean returns of SB3's PPO with the example's settings."""
     envs = VecMonitor(DummyVecEnv([lambda: gym.make(ENV)] * DRONES))
-    policy: dict[str, Any] = {"net_arch": [64], "log_std_init": -0.5}
+    policy = {"net_arch": [64], "log_std_init": -0.5}
     model = PPO("MlpPolicy", envs, n_steps=128, batch_size=512, gamma=0.98, learning_rate=3e-3,
                 seed=seed, policy_kwargs=policy, device="cpu")  # fmt: skip
     curve = Curve()
@@ -72,10 +71,10 @@ def main() -> None:
     """Train both with each seed, and write after how many steps they were there."""
     args = options(__doc__, seeds=3, out=Path).parse_args()
     torch.set_num_threads(1)
-    found: dict[str, list[dict[str, Any]]] = {"ppo_loop.py": [], "SB3's PPO": []}
+    found: dict[str, list[dict[str, object]]] = {"ppo_loop.py": [], "SB3's PPO": []}
     for seed in range(args.seeds):
         for (name, rows), curve in zip(found.items(), (example(seed), sb3(seed)), strict=True):
-            row: dict[str, Any] = {"seed": seed}
+            row = {"seed": seed}
             for least in RETURNS:
                 there = (steps for steps, mean in curve if mean >= least)
                 row[f"return_{least}"] = next(there, None)  # null: not within the steps

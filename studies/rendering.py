@@ -14,7 +14,6 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from measuring import RESULTS, options, write
@@ -89,7 +88,7 @@ def overlays(flight: list[Moment], rounds: int, frames: int) -> dict[str, float]
         )
         picture = np.zeros((height, width, 3), np.uint8)
 
-        def draw(number: int, overlay: Overlay = overlay, picture: Any = picture) -> None:
+        def draw(number: int, overlay: Overlay = overlay, picture: np.ndarray = picture) -> None:
             overlay.draw(picture, flight[number], values[: number + 1])
 
         best = max(rate(draw, frames) for _ in range(rounds))

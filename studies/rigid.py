@@ -28,12 +28,11 @@ import time
 from argparse import Namespace
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from measuring import RESULTS, in_turns, medians, options, timed, write
 from rotorgram.envs import EnvConfig, Loop
-from rotorgram.models import QUAD_XML, Vehicle
+from rotorgram.models import QUAD_XML, Backend, Vehicle
 from rotorgram.sim import InitialState, make_world
 
 OUT = RESULTS / "rigid"
@@ -48,7 +47,7 @@ def accuracy() -> None:
     rows = []
     for file in FILES:
         name = file.parent.name if file.stem == "vehicle" else file.stem
-        row: dict[str, Any] = {"vehicle": name}
+        row = {"vehicle": name}
         for dtype in ("float64", "float32"):
             row[dtype] = distances(file, dtype)
         print(row, flush=True)
@@ -93,7 +92,7 @@ def rate(fly: Callable[[], None], drones: int, seconds: float) -> tuple[float, f
     return drones / wall, drones / used
 
 
-def world(backend: Any, drones: int, steps: int = 2, **settings: Any) -> Callable[[], None]:
+def world(backend: Backend, drones: int, steps: int = 2, **settings: object) -> Callable[[], None]:
     """A control step of the world of the paper's vehicle, by default two physics steps."""
     vehicle = Vehicle.load()
     dice = np.random.default_rng(0)
@@ -104,10 +103,10 @@ def world(backend: Any, drones: int, steps: int = 2, **settings: Any) -> Callabl
     return lambda: made.step(thrust, steps)
 
 
-def env(backend: Any, drones: int, **settings: Any) -> Callable[[], None]:
+def env(backend: Backend, drones: int, **settings: object) -> Callable[[], None]:
     """A step of Hover: controller, world, observation, reward, ends and resets."""
     loop = Loop(EnvConfig.from_keywords(HOVER, backend=backend, **settings), drones)
-    actions: Any = np.random.default_rng(0).uniform(-0.1, 0.1, (drones, 4)).astype(np.float32)
+    actions = np.random.default_rng(0).uniform(-0.1, 0.1, (drones, 4)).astype(np.float32)
     loop.advance(actions, np.ones(drones, bool), range(drones))
 
     def fly() -> None:
@@ -118,7 +117,7 @@ def env(backend: Any, drones: int, **settings: Any) -> Callable[[], None]:
 
 def sizes(args: Namespace) -> None:
     """Processor microseconds of `Loop.advance` of Hover, by the number of drones."""
-    ways: dict[str, tuple[Any, dict[str, Any]]] = {
+    ways: dict[str, tuple[Backend, dict[str, object]]] = {
         "mujoco": ("mujoco", {}),
         "rigid, arrays": ("rigid", {}),
         "rigid, arrays without a compiler": ("rigid", {"compiled": False}),
@@ -148,7 +147,7 @@ def speed(args: Namespace) -> None:
         ways[name]()
         firsts[name] = round(time.perf_counter() - start, 2)
     rates: dict[str, list[tuple[float, float]]] = {name: [] for name in ways}
-    told: dict[str, Any] = {}
+    told = {}
     for _ in range(args.repeats):
         for name, fly in ways.items():
             rates[name].append(rate(fly, args.drones, args.seconds))

@@ -109,7 +109,7 @@ def compare(python: str) -> dict[str, Any]:
     return {"rotorpy": told["version"], "rows": rows, "curves": curves}
 
 
-def _theirs(python: str, cases: dict[str, Any], shares: list[Any]) -> dict[str, Any]:
+def _theirs(python: str, cases: dict[str, Any], shares: list[object]) -> dict[str, Any]:
     given = {
         "cases": cases,
         "kinds": ("tight", "default"),
@@ -123,21 +123,20 @@ def _theirs(python: str, cases: dict[str, Any], shares: list[Any]) -> dict[str, 
     done = subprocess.run(
         command, input=json.dumps(given), stdout=subprocess.PIPE, text=True, check=True
     )
-    told: dict[str, Any] = json.loads(done.stdout)
-    return told
+    return json.loads(done.stdout)
 
 
-def _flight(told: list[Any]) -> Any:
+def _flight(told: list[object]) -> Flight:
     position, quaternion = (np.array(part) for part in told)
     return Flight(position, quaternion, np.zeros((len(position), 3)))
 
 
-def _level(flight: Any) -> Any:
+def _level(flight: Flight) -> Flight:
     """The flight counted from its first position: theirs begin at the origin."""
     return Flight(flight.position - flight.position[0], flight.quaternion, flight.rates)
 
 
-def _distances(flight: Any, other: Any) -> list[float]:
+def _distances(flight: Flight, other: Flight) -> list[float]:
     apart = np.linalg.norm(flight.position - other.position, axis=1)[::_EVERY]
     return [float(f"{x:.3g}") for x in apart]
 

@@ -20,17 +20,17 @@ It takes about eight minutes on two cores.
 import itertools
 import statistics
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import rotorgram.envs  # noqa: F401  # makes the envs known
 from measuring import RESULTS, in_turns, launch, medians, options, timed, write
+from rotorgram.envs import LocalVectorEnv
 from rotorgram.envs.config import EnvConfig
 from rotorgram.flights.executors import WorkersConfig
 from rotorgram.flights.folders import new_folder
@@ -55,7 +55,7 @@ cluster.shutdown()
 """
 
 
-def fly(env: Any, seconds: float) -> tuple[float, float]:
+def fly(env: LocalVectorEnv | RemoteVectorEnv, seconds: float) -> tuple[float, float]:
     """Wall time of a control step, and processor time of this process for it, s."""
     actions = np.zeros((env.num_envs, 1), np.float32)
     return timed(lambda: env.advance(actions, env.done if env.done.any() else None), seconds)
@@ -80,7 +80,9 @@ def simulators(count: int) -> Iterator[RemoteVectorEnv]:
         yield env
 
 
-def measure(envs: dict[int, Any], rounds: int, seconds: float) -> dict[int, dict[str, float]]:
+def measure(
+    envs: Mapping[int, LocalVectorEnv | RemoteVectorEnv], rounds: int, seconds: float
+) -> dict[int, dict[str, float]]:
     """Median rate in env steps/s and processor time per control step, s, of each."""
     found = {}
     for name, pairs in in_turns(envs, rounds, lambda env: fly(env, seconds)).items():

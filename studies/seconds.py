@@ -51,12 +51,12 @@ def processor_seconds() -> float:
 
 def evaluate(
     agent: Any, env_id: str, within: float, vehicle: str | None, episodes: int
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Of a `Checkpoint`, or of a controller by its name: steady size of the headline metric and
     return, means over episodes; crashes; the verdict.
     """
     options = CONTROLLERS[agent].options if isinstance(agent, str) else agent.options
-    env: Any = LocalVectorEnv(env_id, episodes, autoreset_mode="Disabled", vehicle=vehicle,
+    env = LocalVectorEnv(env_id, episodes, autoreset_mode="Disabled", vehicle=vehicle,
                               **options)  # fmt: skip
     spec = env.env_spec
     policy = CONTROLLERS[agent](spec) if isinstance(agent, str) else agent.policy(spec)
@@ -83,8 +83,8 @@ def main() -> None:
     parser.add_argument("words", nargs="*", default=["ppo"])
     args = parser.parse_args()
     words = args.words + (["--vehicle", args.vehicle] if args.vehicle else [])
-    rows: list[dict[str, Any]] = []
-    beside: dict[str, Any] = {}
+    rows = []
+    beside = {}
     for seed in range(args.first_seed, args.first_seed + args.seeds):
         with tempfile.TemporaryDirectory() as folder:
             row = {"seed": seed, **train(words, seed, Path(folder) / "run")}
@@ -103,7 +103,11 @@ def main() -> None:
 
 
 def note(
-    path: Path, words: list[str], within: float, rows: list[Any], beside: dict[str, Any]
+    path: Path,
+    words: list[str],
+    within: float,
+    rows: list[dict[str, object]],
+    beside: dict[str, object],
 ) -> None:
     """After every seed, so that an interrupted measurement has those that were flown."""
     result = {

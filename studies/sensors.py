@@ -132,7 +132,7 @@ def _env(drones: int, sensors: dict[str, Any]) -> Any:
     options = {"sensors": sensors, "episode_length": 1 << 30, "flight_band": 1e4}
     options |= {"start_tilt": 0.0, "start_heading": 0.0}
     if drones == 1:
-        env: Any = gym.make(_ENV, disable_env_checker=True, **options).unwrapped
+        env = gym.make(_ENV, disable_env_checker=True, **options).unwrapped
     else:
         env = gym.make_vec(_ENV, num_envs=drones, num_threads=1, **options)
     env.reset(seed=0)

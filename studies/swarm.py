@@ -51,7 +51,7 @@ def measure(counts: list[int], seconds: float, repeats: int) -> dict[str, dict[s
     with ExitStack() as opened:
         cases: dict[tuple[str, int], Step] = {}
         for drones in counts:
-            options: dict[str, Any] = {"episode_length": EPISODE}
+            options = {"episode_length": EPISODE}
             local = LocalVectorEnv(ENV, drones, drones=drones, autoreset_mode="Disabled", **options)
             pair = spawn_simulator(EnvConfig.from_keywords(ENV, drones=drones, **options))
             cases["apart", drones] = physics(drones, together=False)

@@ -17,7 +17,6 @@ import os
 import statistics
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from measuring import RESULTS, medians, options, write
@@ -38,7 +37,7 @@ def processor_seconds() -> float:
 
 
 def steps_per_second(
-    algorithm: str, changes: dict[str, int], seed: int, **settings: Any
+    algorithm: str, changes: dict[str, int], seed: int, **settings: object
 ) -> tuple[float, float]:
     """By the clock, and per second of a processor."""
     config = preset(algorithm, "tuned", **changes)

@@ -19,7 +19,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import pandas as pd
@@ -40,13 +40,13 @@ ENV: Final = "rotorgram/Hover-v0"
 VEHICLE: Final = "crazyflie_brushless"
 LAG: Final = 50.0
 """Time constant of its rotors, ms: `models/vehicles/crazyflie_brushless`."""
-EFFECTS: Final[dict[str, Any]] = {"motor_lag": True, "body_drag": True}
+EFFECTS: Final[dict[str, object]] = {"motor_lag": True, "body_drag": True}
 DRAWN: Final = {
     "mass": "uniform(0.7, 1.4)", "inertia": "loguniform(0.5, 2)",
     "time_constant": "uniform(0.01, 1.6)",
     "wind_x": "uniform(-6, 6)", "wind_y": "uniform(-6, 6)",
 }  # fmt: skip
-ROWS: Final[dict[str, dict[str, Any]]] = {
+ROWS: Final[dict[str, dict[str, object]]] = {
     "plain": {},
     "randomised": {"randomize": DRAWN},
     "randomised, history": {"randomize": DRAWN, "history": 4},
@@ -66,12 +66,12 @@ class Shift:
     """A vehicle that is not the one of the file: `by` is the axis, `at` the place on it."""
 
     def __init__(
-        self, by: str, at: float | str, wind: float = 0.0, vehicle: str = VEHICLE, **factors: Any
+        self, by: str, at: float | str, wind: float = 0.0, vehicle: str = VEHICLE, **factors: float
     ) -> None:
         self.by = by
         self.at = at
         self.vehicle = vehicle
-        self.options: dict[str, Any] = {
+        self.options: dict[str, object] = {
             "effects": EFFECTS | ({"wind": (wind, 0.0, 0.0)} if wind else {}),
             "randomize": factors,
         }
@@ -102,7 +102,7 @@ def train(row: str, seed: int, env_steps: int, path: Path) -> None:
         algorithm="ppo", config=preset("ppo", "tuned", ENV), seed=seed, env_steps=env_steps,
         num_envs=128, env_id=ENV, options=options, vehicle=VEHICLE,
     )  # fmt: skip
-    env: Any = made(run.num_envs, VEHICLE, options)
+    env = made(run.num_envs, VEHICLE, options)
     training = Training(run, env)
     began = time.process_time()
     training.train()
@@ -112,7 +112,7 @@ def train(row: str, seed: int, env_steps: int, path: Path) -> None:
     print(f"{path.name}: {time.process_time() - began:.0f} s of processor time", flush=True)
 
 
-def made(count: int, vehicle: str, options: Mapping[str, Any]) -> Any:
+def made(count: int, vehicle: str, options: Mapping[str, object]) -> LocalVectorEnv:
     """So many drones in this process."""
     return LocalVectorEnv(ENV, count, autoreset_mode="Disabled", num_threads=1,
                           vehicle=vehicle, **options)  # fmt: skip

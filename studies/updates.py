@@ -22,7 +22,7 @@ from rotorgram.agents import EpisodeRecorder, make_agent, preset
 from rotorgram.agents.rollouts import Rollout
 from rotorgram.envs import LocalVectorEnv
 
-CASES: dict[str, tuple[str, str, int, dict[str, Any]]] = {
+CASES: dict[str, tuple[str, str, int, dict[str, int]]] = {
     "ppo, Elevation-v0": ("ppo", "rotorgram/Elevation-v0", 32, {}),
     "ppo, Hover-v0": ("ppo", "rotorgram/Hover-v0", 64, {}),
     "a2c, 256 steps of 1 drone": ("a2c", "rotorgram/Elevation-v0", 1, {}),
@@ -38,7 +38,7 @@ class Updates:
     """An agent that has flown a rollout, to update from it again and again."""
 
     def __init__(self, algorithm: str, env_id: str, drones: int, config: Any) -> None:
-        env: Any = LocalVectorEnv(env_id, drones, autoreset_mode="Disabled", num_threads=1)
+        env = LocalVectorEnv(env_id, drones, autoreset_mode="Disabled", num_threads=1)
         log = EpisodeRecorder(env, 0)
         self.agent: Any = make_agent(algorithm, log, config, 0)
         self.rollouts: list[Rollout] = []
@@ -65,9 +65,9 @@ class Updates:
         return time.perf_counter() - wall, time.process_time() - processor
 
 
-def measure(case: tuple[str, str, int, dict[str, Any]], seconds: float) -> dict[str, Any]:
+def measure(case: tuple[str, str, int, dict[str, int]], seconds: float) -> dict[str, object]:
     algorithm, env_id, drones, changes = case
-    config: Any = preset(algorithm, "tuned", env_id, **changes)
+    config = preset(algorithm, "tuned", env_id, **changes)
     updates = {name: Updates(name, env_id, drones, config)
                for name in (algorithm, f"sb3-{algorithm}")}  # fmt: skip
     times: dict[str, list[tuple[float, float]]] = {name: [] for name in updates}

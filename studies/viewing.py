@@ -88,7 +88,7 @@ def fly(env: Any, drones: int, seconds: float) -> float:
 def turn(drones: int, kind: str, seconds: float) -> tuple[float, float]:
     """Control steps and pictures per second."""
     here = ("127.0.0.1", 0)
-    env: Any = (
+    env = (
         RemoteEnv(here, connect=False)
         if drones == 1
         else RemoteVectorEnv(here, num_envs=drones, connect=False)
