@@ -8,7 +8,6 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -24,6 +23,7 @@ from test_cameras import BELLY, vehicle_with
 
 Image = pytest.importorskip("PIL.Image")
 ONE = WorkersConfig(jobs=1)
+LINE = [sys.executable, "-m", "rotorgram.cli", "capture", "plan.toml", "--out", "out"]
 PLAN = """
 vehicle = "crazyflie2"
 cameras = ["down@32x24", "down_depth@32x24", "down_segmentation@32x24", "front_flow@16x16"]
@@ -107,55 +107,27 @@ def test_a_flight_gives_every_so_many_steps(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "sentence"),
+    ("old", "new", "sentence"),
     [
-        (
-            ("seed = 7", "seed = -1"),
-            "plan: seed: expected a whole number from 0 to .*, got -1",
-        ),
-        (("seed = 7", "sed = 7"), "plan: expected some of cameras, poses, vehicle, .* got 'sed'"),
-        (("seed = 7", 'scene = "moon"'), "scene: expected 'plain' or 'airport' .* got 'moon'"),
-        (
-            ("count = 5", "count = 0"),
-            r"poses\[1\].count: expected a whole number from 1 to 1000000",
-        ),
-        (("count = 5", ""), r"plan: poses\[1\]: expected count, got none"),
-        (
-            ("tilt = 0.5", "tilt = 4"),
-            r"\[1\].tilt: expected a number from 0 to 3.14159 rad, got 4",
-        ),
-        (
-            ("tilt = 0.5", "tip = 4"),
-            r"\[1\]: expected some of scene, count, center, size, tilt",
-        ),
-        (('from = "random"', 'from = "air"'), r"poses\[1\].from: expected 'random' or 'flight'"),
-        (
-            ("[4.0, 4.0, 2.0]", "[4.0]"),
-            r"\[1\].size: expected 3 numbers from 0 to 10000 m, got",
-        ),
-        (
-            ('env = "rotorgram/Landing-v0"', "env = 3"),
-            r"\[2\].env: expected a text, or none",
-        ),
-        (("every = 40", "agent = 5"), r"\[2\].agent: expected a text, got 5"),
-        (("{ episode_length = 100 }", "1"), r"\[2\].options: expected options by name, got 1"),
-        (("count = 5", "count = 5\nscene = 3"), "scene: expected a text, got 3"),
-        (("[0.0, 0.0, 2.0]", "[0.0, 0.0, 0.5]"), r"\[1\]: expected a box above the ground, got"),
-        (("[0.0, 0.0, 2.0]", "[1e308, 0.0, 2.0]"), r"\[1\].center: expected 3 numbers from -10000"),
-        (("[4.0, 4.0, 2.0]", "[-4.0, 4.0, 2.0]"), r"\[1\].size: expected 3 numbers from 0 to"),
-        (('from = "random"', 'from = ["random"]'), r"\[1\].from: expected 'random' or 'flight'"),
-        (
-            ("seed = 7", "seed = 7\nleast_area = 0"),
-            "plan: least_area: expected a whole number of",
-        ),
-        (("seed = 7", "seed = " + "[" * 5000), "plan: expected a TOML file"),
-        (("down@32x24", "rear"), "cameras: expected some of front, down"),
-        (("seed = 7", "seed ="), "plan: expected a TOML file, got plan.toml"),
+        ("seed = 7", "seed = -1", "plan: seed: expected a whole number from 0 to .*, got -1"),
+        ("seed = 7", "sed = 7", "plan: expected some of cameras, poses, vehicle, .* got 'sed'"),
+        ("seed = 7", 'scene = "moon"', "scene: expected 'plain' or 'airport' .* got 'moon'"),
+        ("seed = 7", "seed = " + "[" * 5000, "plan: expected a TOML file"),
+        ("seed = 7", "seed =", "plan: expected a TOML file, got plan.toml"),
+        ("down@32x24", "rear", "cameras: expected some of front, down"),
+        ("count = 5", "", r"plan: poses\[1\]: expected count, got none"),
+        ("tilt = 0.5", "tip = 4", r"\[1\]: expected some of scene, count, center, size, tilt"),
+        ("[4.0, 4.0, 2.0]", "[4.0]", r"\[1\].size: expected 3 numbers from 0 to 10000 m, got"),
+        ("[0.0, 0.0, 2.0]", "[0.0, 0.0, 0.5]", r"\[1\]: expected a box above the ground, got"),
+        ('from = "random"', 'from = "air"', r"poses\[1\].from: expected 'random' or 'flight'"),
+        ('from = "random"', 'from = ["random"]', r"\[1\].from: expected 'random' or 'flight'"),
+        ('env = "rotorgram/Landing-v0"', "env = 3", r"\[2\].env: expected a text, or none"),
+        ("{ episode_length = 100 }", "1", r"\[2\].options: expected options by name, got 1"),
     ],
 )
-def test_wrong_plans(tmp_path: Path, change: tuple[str, str], sentence: str) -> None:
+def test_wrong_plans(tmp_path: Path, old: str, new: str, sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
-        plan_of(tmp_path, PLAN.replace(*change))
+        plan_of(tmp_path, PLAN.replace(old, new))
 
 
 # ---- labels
@@ -303,11 +275,7 @@ def test_it_is_the_same_again_and_goes_on(captured: Path, tmp_path: Path) -> Non
     assert told == whole
 
 
-@pytest.mark.parametrize(
-    "text",
-    ['{"frame"', "[]", '{"frame": 1}', '{"pictures": 3}', '{"pictures": [{}]}', "[" * 9000,
-     '{"pictures": []}'],
-)  # fmt: skip
+@pytest.mark.parametrize("text", ['{"frame"', "[" * 9000, '{"pictures": []}'])
 def test_labels_that_were_altered_are_made_again(captured: Path, tmp_path: Path, text: str) -> None:
     folder = tmp_path / "altered"
     shutil.copytree(captured, folder)
@@ -384,12 +352,7 @@ def test_a_journal_of_another_vehicle(tmp_path: Path) -> None:
     every = 2
     """
     (poses,) = plan_of(tmp_path, text).sequences()
-    assert (
-        len(
-            poses,
-        )
-        == 3
-    )
+    assert len(poses) == 3
     assert poses.times.tolist() == [0.0, 0.04, 0.08]
     with pytest.raises(InputError, match=r"plan: vehicle: expected .*, which flies in "):
         plan_of(tmp_path, 'vehicle = "crazyflie2"\n' + text).sequences()
@@ -457,11 +420,10 @@ def test_one_ctrl_c_ends_it(opengl: None, tmp_path: Path) -> None:
     """With workers that have much left to do; what they made is kept, each file whole."""
     plan = PLAN.replace("count = 5", "count = 3000").replace("tilt = 0.5", "tilt = 0.5\n")
     (tmp_path / "plan.toml").write_text(plan, "utf-8")
-    line = [sys.executable, "-m", "rotorgram.cli", "capture", "plan.toml", "--out", "out"]
-    told: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
     with subprocess.Popen(
-        [*line, "--jobs", "2"], cwd=tmp_path, start_new_session=True, **told
-    ) as process:
+        [*LINE, "--jobs", "2"], cwd=tmp_path, start_new_session=True, stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE, text=True,
+    ) as process:  # fmt: skip
         deadline = time.monotonic() + 90
         while len(list((tmp_path / "out" / "labels").glob("*.json"))) < 5:
             assert process.poll() is None
@@ -480,16 +442,15 @@ def test_one_ctrl_c_ends_it(opengl: None, tmp_path: Path) -> None:
 def test_a_run_that_is_killed_goes_on(captured: Path, tmp_path: Path) -> None:
     """SIGKILL in the middle of it; the same line again makes the folder whole."""
     (tmp_path / "plan.toml").write_text(PLAN, "utf-8")
-    line = [sys.executable, "-m", "rotorgram.cli", "capture", "plan.toml", "--out", "out"]
     pipe = subprocess.DEVNULL
-    with subprocess.Popen([*line, "--jobs", "1"], cwd=tmp_path, stdout=pipe) as process:
+    with subprocess.Popen([*LINE, "--jobs", "1"], cwd=tmp_path, stdout=pipe) as process:
         deadline = time.monotonic() + 60
         while not label_file(tmp_path / "out", 1).exists():
             assert process.poll() is None
             assert time.monotonic() < deadline
             time.sleep(0.001)
         process.kill()
-    done = subprocess.run([*line, "--jobs", "1"], cwd=tmp_path, stdout=subprocess.PIPE, text=True)
+    done = subprocess.run([*LINE, "--jobs", "1"], cwd=tmp_path, stdout=subprocess.PIPE, text=True)
     assert done.returncode == 0
     assert "out: 8 frames" in done.stdout
     whole = contents(captured)
