@@ -1,4 +1,4 @@
-"""`rotorgram sim --view`: shows the drones while an agent flies them."""
+"""Windows of `rotorgram view`, and of `rotorgram sim --view` while an agent flies."""
 
 import logging
 import time
@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..envs.rendering import moments
+from ..envs.spec import EnvSpec
 from ..rendering import window
 from ..rendering.live import MAX_SHOWN, LiveView, Pace
 from ..rendering.stage import Stage
 from ..udp.protocol.messages import Command
 from ..udp.transport.driver import Driver, Observer
+from ._flags import EnvFlags
 
 if TYPE_CHECKING:
     from .sim import Sim
@@ -71,21 +73,27 @@ class Realtime:
         self._pace.stepped(time.monotonic())
 
 
+def open_view(
+    command: EnvFlags, spec: EnvSpec, shown: int, pace: Pace, of: int | None = None
+) -> LiveView:
+    """A window with the first drones of so many; it is open within a `with` block."""
+    names = spec.agents if shown == len(spec.agents) > 1 else ()
+    stage = Stage(command.shown_scene, shown, vehicle=command.vehicle, names=names)
+    return LiveView(stage, window.Window(stage, pace), pace, of=of or shown)
+
+
 @contextmanager
 def watched(simulator: Driver, command: "Sim") -> Iterator[None]:
     """Show a simulator, or hold it to real time, during the block, as the command says."""
     observers: list[Observer] = []
     with ExitStack() as opened:
         if command.view:
-            pace = Pace(0.0)
             drones = simulator.stepped.num_envs
-            names = simulator.spec.agents if len(simulator.spec.agents) > 1 else ()
-            shown = len(names) or min(drones, MAX_SHOWN)  # of the first world
-            stage = Stage(command.shown_scene, shown, vehicle=command.vehicle, names=names)
-            surface = window.Window(stage, pace)
-            live = opened.enter_context(LiveView(stage, surface, pace, of=drones))
+            several = len(simulator.spec.agents) > 1  # the first world is shown
+            shown = len(simulator.spec.agents) if several else min(drones, MAX_SHOWN)
+            view = open_view(command, simulator.spec, shown, Pace(0.0), drones)
+            observers.append(Watcher(opened.enter_context(view), simulator))
             print("shown in the window", flush=True)
-            observers.append(Watcher(live, simulator))
         if command.realtime:
             observers.append(Realtime(simulator.spec.control_period))
 

@@ -32,10 +32,9 @@ class View(EnvFlags):
     def run(self) -> int:
         """Fly and show, episode after episode."""
         from ..flights.filming import moments
-        from ..rendering import window
-        from ..rendering.live import LiveView, Pace
-        from ..rendering.stage import Stage
+        from ..rendering.live import Pace
         from ._env import words_of
+        from ._watch import open_view
 
         check_count("episodes", self.episodes)
         parse_scene(self.shown_scene)
@@ -43,10 +42,8 @@ class View(EnvFlags):
         first = next(flights)
         spec = first[0].spec
         drones = len(first)
-        pace = Pace(spec.control_period, self.speed)
         names = spec.agents if drones > 1 else ()
-        stage = Stage(self.shown_scene, drones, vehicle=self.vehicle, names=names)
-        with LiveView(stage, window.Window(stage, pace), pace) as live:
+        with open_view(self, spec, drones, Pace(spec.control_period, self.speed)) as live:
             print(f"showing {self.what} in the window (Ctrl-C ends)", flush=True)
             for flight in chain((first,), flights):
                 told = [moments(one) for one in flight]

@@ -5,6 +5,7 @@ from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import combinations
 from pathlib import Path
 from typing import Final
 
@@ -17,7 +18,6 @@ from ..rendering import Camera, Canvas, MetricValue, Moment, Stage
 from ..rendering.film import QUALITY, check_film, write_film
 from ..rendering.overlay import Overlay, graph_scale
 from ..scenes import parse_scene
-from .distances import least
 from .trajectories import Trajectory
 
 Floats = NDArray[np.float64]
@@ -83,9 +83,10 @@ class FilmTrack:
         found = []
         for world in self.episodes:
             longest = max(map(len, world)) + 1
-            positions = [one.pose[:, :3] for one in world]
-            padded = [np.pad(one, ((0, longest - len(one)), (0, 0)), "edge") for one in positions]
-            found.append(least(np.stack(padded, axis=1)))
+            rows = [np.minimum(np.arange(longest), len(one)) for one in world]
+            positions = [one.pose[own, :3] for one, own in zip(world, rows, strict=True)]
+            pairs = combinations(positions, 2)
+            found.append(np.min([np.linalg.norm(a - b, axis=1) for a, b in pairs], axis=0))
         return found
 
     def panel(self, episode: int, step: int) -> Moment:

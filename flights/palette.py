@@ -1,6 +1,5 @@
 """Order, names and colours of agents in all tables and figures."""
 
-from collections.abc import Iterable
 from typing import Final
 
 from ..agents import ALGORITHMS, CONTROLLERS
@@ -32,10 +31,3 @@ def agent_color(agent: str, dark: bool = False) -> str:
     """An agent's colour, the same in every figure and report; lighter for a dark ground."""
     spare = _SPARE[sum(agent.encode()) % len(_SPARE)]
     return _OWN.get(agent, spare)[dark]
-
-
-def sort_agents(names: Iterable[str]) -> list[str]:
-    """Agents in the order in which they are shown: algorithms, controllers, others."""
-    known = [*ALGORITHMS, *CONTROLLERS]
-    order = {name: place for place, name in enumerate(known)}
-    return sorted(set(names), key=lambda name: (order.get(name, len(known)), name))

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..agents import CONTROLLERS
-from ..agents.checkpoints import load
+from ..agents.checkpoints import Checkpoint, load
 from ..agents.policies import Policy
 from ..envs.config import EnvConfig
 from ..envs.registry import env_spec
@@ -197,29 +197,27 @@ class FlownPoses(_FlightPoses):
     def trajectories(self, vehicle: str | None) -> list[Trajectory]:
         """Flown in this process."""
         env_id = load_env(self.env or "rotorgram/Hover-v0")  # the plan is the user's own
+        controller = CONTROLLERS.get(self.agent)
+        checkpoint: Checkpoint | None = None
         options = dict(self.options)
-        policy: Policy | None = None
-        if self.agent in CONTROLLERS:
-            controller = CONTROLLERS[self.agent]
+        if controller is not None:
             options = {**controller.options, **options}
-            policy = controller(
-                env_spec(
-                    EnvConfig.from_keywords(env_id, vehicle=vehicle, drones=self.drones, **options)
-                )
-            )
         elif self.agent != "random":
             checkpoint = load(Path(self.agent))
-            trained = checkpoint.spec
             if self.env is None:
                 env_id = checkpoint.env_id
             if env_id == checkpoint.env_id:
-                options = {**trained.options, **options}
-            spec = env_spec(
-                EnvConfig.from_keywords(env_id, vehicle=vehicle, drones=self.drones, **options)
-            )
-            if vehicle is None and trained.vehicle_hash != spec.vehicle_hash:
+                options = {**checkpoint.options, **options}
+        spec = env_spec(
+            EnvConfig.from_keywords(env_id, vehicle=vehicle, drones=self.drones, **options)
+        )
+        policy: Policy | None = None
+        if controller is not None:
+            policy = controller(spec)
+        elif checkpoint is not None:
+            if vehicle is None and checkpoint.spec.vehicle_hash != spec.vehicle_hash:
                 raise InputError(
-                    f"plan: vehicle: expected {trained.vehicle}, on which {self.agent} was "
+                    f"plan: vehicle: expected {checkpoint.spec.vehicle}, on which {self.agent} was "
                     "trained, got none"
                 )
             policy = checkpoint.policy(spec)

@@ -12,9 +12,8 @@ import pytest
 from comparisons import ERROR, GATES, HEADLINE, spec_of, study_of, synthetic_folder
 from rich.console import Console
 from rotorgram.envs.spec import EnvSpec
-from rotorgram.flights.distances import least, nearest
 from rotorgram.flights.filming import Film, FilmTrack
-from rotorgram.flights.palette import agent_color, agent_label, sort_agents
+from rotorgram.flights.palette import agent_color, agent_label
 from rotorgram.flights.trajectories import Trajectory
 from rotorgram.models.errors import InputError
 from rotorgram.training import films
@@ -203,7 +202,6 @@ def test_names_and_colours_of_rows() -> None:
     assert row_label(Row(agent="a2c", name="wide")) == "wide"
     assert agent_color("a2c", dark=True) != agent_color("a2c")
     assert agent_label("zeta") == "zeta"
-    assert sort_agents(["zeta", "pid", "a2c", "vpg", "a2c"]) == ["vpg", "a2c", "pid", "zeta"]
 
 
 # ---- curves, by hand
@@ -309,20 +307,6 @@ def test_a_study_of_which_nothing_is_done_has_an_empty_report(tmp_path: Path) ->
 
 
 # ---- several drones in a world
-
-
-def line(*xs: float) -> np.ndarray:
-    """Positions of drones on a line along X, shape (1, A, 3)."""
-    return np.array([[(x, 10.0, 0.0) for x in xs]])
-
-
-def test_the_nearest_other_of_each_drone_that_flies() -> None:
-    assert nearest(line(0.0, 3.0, 4.0)).tolist() == [[3.0, 1.0, 1.0]]
-    assert least(line(0.0, 3.0, 4.0)).tolist() == [1.0]
-    assert nearest(np.array([[(0.0, 0.0, 0.0), (2.0, 3.0, 6.0)]])).tolist() == [[7.0, 7.0]]
-    np.testing.assert_array_equal(nearest(line(0.0, 3.0, NAN)), [[3.0, 3.0, NAN]])
-    np.testing.assert_array_equal(nearest(line(0.0, NAN, NAN)), [[NAN, NAN, NAN]])
-    np.testing.assert_array_equal(least(line(0.0, NAN)), [NAN])
 
 
 def flown(episode: int, *xs: float) -> Trajectory:
