@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict
 from functools import partial
+from itertools import combinations
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -19,7 +20,6 @@ from ..envs.autoreset import AdvancingVectorEnv
 from ..envs.config import EnvConfig
 from ..envs.registry import env_spec, load
 from ..envs.spec import EnvSpec
-from ..flights.distances import least
 from ..flights.executors import OnProgress, Tell, WorkersConfig, open_executor, run_jobs
 from ..flights.folders import locked
 from ..flights.trajectories import Trajectory, fly_episodes
@@ -193,10 +193,11 @@ def least_distance(flown: Sequence[Trajectory]) -> float:
     found = math.inf
     for first in range(0, len(flown), drones):
         world = flown[first : first + drones]
-        position = np.full((max(map(len, world)) + 1, drones, 3), np.nan)
-        for drone, one in enumerate(world):
-            position[: len(one) + 1, drone] = one.telemetry["position"]
-        found = min(found, float(np.nanmin(least(position))))
+        for one, other in combinations(world, 2):
+            both = min(len(one), len(other)) + 1  # rows in which both fly
+            positions = one.telemetry["position"][:both]
+            apart = np.linalg.norm(positions - other.telemetry["position"][:both], axis=1)
+            found = min(found, float(apart.min()))
     return found
 
 
