@@ -1,13 +1,12 @@
 """The controllers of the level `position`, flown to the goal of any task that tells where it is."""
 
 import math
-import re
 from typing import ClassVar, Final
 
 import numpy as np
 
-from ..envs.spec import ArraySpec, EnvSpec
-from ..models.errors import InputError, shortened
+from ..envs.spec import EnvSpec
+from ..models.errors import InputError
 from .networks import Floats
 from .policies import Observation, flat
 
@@ -45,17 +44,9 @@ class Geometric:
         level = "actions of the level position (--action position)"
         if names != _ACTION:
             raise InputError(f"geometric: expected {level}, got {', '.join(names) or 'others'}")
-        assert isinstance(action, ArraySpec)
-        found = re.search(r"approached at (\S+) /s, gravity (\S+) m/s²", action.frame)
-        if not found:
-            raise InputError(
-                "geometric: expected gain and gravity in the action's frame, "
-                f"got {shortened(action.frame)}"
-            )
-        assert found is not None
-        self._gain = float(found[1])
-        self._gravity = float(found[2])
-        self._units = np.array([float(unit.split()[0]) for unit in action.unit])
+        self._gain = spec.constant("position_gain", "geometric")
+        self._gravity = spec.constant("gravity", "geometric")
+        self._scale = spec.action_scale
         seen = [name for one in spec.observation for name in one.components or [""] * one.size]
         wanted = [f"{vector} {axis}" for vector in (*_VECTORS, "nose") for axis in "xyz"]
         missing = [name for name in wanted if name not in seen]
@@ -63,8 +54,7 @@ class Geometric:
         if missing:
             raise InputError(f"geometric: expected {expected}, got {spec.env_id} without it")
         self._at = {v: [seen.index(f"{v} {axis}") for axis in "xyz"] for v in (*_VECTORS, "nose")}
-        rotors = [i for i, name in enumerate(seen) if re.fullmatch(r"thrust \d+ over hover", name)]
-        self._rotors = rotors
+        self._rotors = [i for i, name in enumerate(seen) if name.endswith(" over hover")]
         self._swing: np.ndarray | None = None
         self._pull = 0.0  # of the payload on the craft, m/s² per m that it hangs aside
         share, cable = (spec.options.get(name) for name in ("payload_share", "cable"))
@@ -99,7 +89,7 @@ class Geometric:
         c, s = (now["nose"] / max(math.hypot(*now["nose"][:2]), 1e-6))[:2]
         x, y, z = offset
         turn = -math.atan2(s, c)
-        action = np.array((c * x + s * y, c * y - s * x, z, turn)) / self._units
+        action = np.array((c * x + s * y, c * y - s * x, z, turn)) / self._scale
         action[:2] /= max(1.0, math.hypot(*action[:2]))
         clipped: Floats = np.clip(action, -1.0, 1.0).astype(np.float32)
         return clipped
@@ -130,7 +120,7 @@ class Geometric:
         if self._swing is not None:
             pushed[:2] -= self._pull * now[_PAYLOAD[0]][:2]
         self._pushed = self._pushed + self._share * (pushed - self._pushed)
-        if np.abs(moving).max() > JUMP * self._units[0] * self._gain:
+        if np.abs(moving).max() > JUMP * self._scale[0] * self._gain:
             self._moving = np.zeros(3)
             return np.zeros(3)
         change: np.ndarray = self._share * (moving - self._moving)

@@ -5,12 +5,11 @@ Robotics Research, STAR 70, Springer 2011, in three dimensions.
 """
 
 import math
-import re
 from typing import ClassVar, Final
 
 import numpy as np
 
-from ..envs.spec import ArraySpec, EnvSpec
+from ..envs.spec import EnvSpec
 from ..models.errors import InputError
 from .networks import Floats
 from .policies import Observation, flat
@@ -46,23 +45,21 @@ class Orca:
     def __init__(self, spec: EnvSpec) -> None:
         action = spec.action
         seen = spec.observation[0]
-        if not isinstance(action, ArraySpec) or action.components[:1] != ("velocity x",):
-            got = ", ".join(action.components) or "others"
+        if action.components[:1] != ("velocity x",):
             raise InputError(
-                f"orca: expected actions of the level velocity (--action velocity), got {got}"
+                "orca: expected actions of the level velocity (--action velocity), "
+                f"got {', '.join(action.components) or 'others'}"
             )
-        found = re.search(r"drones with a radius of (\S+) m", seen.frame)
-        if not found:
-            raise InputError(f"orca: expected a task for several drones, got {spec.env_id}")
-        assert found is not None
-        self._radius = 2 * ROOM * float(found[1])
-        self._units = [float(unit.split()[0]) for unit in action.unit]
         names = list(seen.components)
         first = "neighbour 1 - position x"
+        if first not in names:
+            raise InputError(f"orca: expected a task for several drones, got {spec.env_id}")
+        self._radius = 2 * ROOM * spec.constant("radius", "orca")
+        self._scale = spec.action_scale
         self._goal, self._velocity, self._nose = (
             names.index(f"{name} x") for name in ("goal - position", "velocity", "nose")
         )
-        self._others = range(names.index(first), len(names), 7) if first in names else range(0)
+        self._others = range(names.index(first), len(names), 7)
         ahead = "target velocity x"
         self._ahead = names.index(ahead) if ahead in names else None
         self._spec = spec
@@ -80,7 +77,7 @@ class Orca:
         own = vector(self._velocity)
         goal = vector(self._goal)
         moves = (0.0, 0.0, 0.0) if self._ahead is None else vector(self._ahead)
-        most = SPEED * self._units[0]
+        most = SPEED * self._scale.item(0)
         wanted = _within(_sum(moves, goal, APPROACH), most)
         planes = [
             avoiding(vector(at), vector(at + 3), own, self._radius, self._spec.control_period)
@@ -92,8 +89,9 @@ class Orca:
         size = math.hypot(c, s) or 1.0
         c = c / size
         s = s / size
-        action = np.array((c * x + s * y, c * y - s * x, z, 0.0)) / self._units
-        return np.clip(action, -1.0, 1.0).astype(np.float32)
+        action = np.array((c * x + s * y, c * y - s * x, z, 0.0)) / self._scale
+        clipped: Floats = np.clip(action, -1.0, 1.0).astype(np.float32)
+        return clipped
 
 
 def avoiding(there: Vector, moves: Vector, own: Vector, radius: float, period: float) -> Plane:

@@ -29,7 +29,7 @@ class Results:
         self.world: World = world
         self.record: Record = record
         self.num_envs = record.out.size
-        self._quantities = quantities_of(task)
+        self._quantities = [quantity for quantity, _ in quantities_of(task)]
         self._arrays = {
             array.name: np.zeros((self.num_envs, *array.shape), array.dtype)
             for array in spec.observation
@@ -81,9 +81,7 @@ class Results:
     def telemetry(self) -> dict[str, NDArray[np.float64]]:
         """By the names of `spec.telemetry`, float64, shape (N, *shape)."""
         if self._telemetry is None:
-            self._telemetry = {
-                quantity.spec.name: quantity.values(self) for quantity in self._quantities
-            }
+            self._telemetry = {one.name: one.values(self) for one in self._quantities}
         return self._telemetry
 
     def row(self) -> list[float]:

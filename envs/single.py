@@ -17,8 +17,8 @@ from .spaces import action_space, observation_space, telemetry_names
 class SingleEnv(gym.Env[Any, Any]):
     """A drone that flies a task, in process.
 
-    `info` has every component of the telemetry by its name (positions and attitude in the paper's
-    frame, thrusts, metrics) and the terms of the reward as `reward_<term>`.
+    `info` has every component of the telemetry by its name (see `telemetry.py`) and the terms of
+    the reward as `reward_<term>`.
 
     Actions are rounded to float32; a number beyond a bound counts as the bound.
 

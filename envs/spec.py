@@ -1,4 +1,4 @@
-"""Specs: names, shapes, dtypes, bounds, units and frames of all that crosses the wire.
+"""Specs: names, shapes, dtypes, bounds, units, frames and constants of what crosses the wire.
 
 A simulator sends its `EnvSpec` in Hello, and an agent builds its spaces from it: it needs neither
 the env's code nor MuJoCo. This module imports the standard library and NumPy alone.
@@ -27,8 +27,16 @@ MAX_NAME: Final = 200  # characters of a name, unit or frame
 
 _DTYPES: Final = ("float32", "float64", "uint8", "int32", "int64")
 _CONTROL: Final = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")  # and halves of pairs
+_CONSTANT: Final = re.compile(r"[a-z][a-z0-9_]{0,63}")
 _LARGEST: Final = float(np.finfo(np.float64).max)
 _NO_BOUND: Final = {"low": -math.inf, "high": math.inf}
+
+WORLD: Final = "world"
+"""Frame of vectors x, y, z: z up, right-handed."""
+BODY: Final = "body"
+"""Frame of rotation rates about x forward, y left, z up."""
+BODY_TO_WORLD: Final = "body to world"
+"""Frame of a quaternion w, x, y, z."""
 
 Bound = float | tuple[float, ...]
 """One number for all elements, or one for each in C order. Infinite where there is no bound."""
@@ -225,7 +233,7 @@ class Mark(marks.Mark, _Part):
 class EnvSpec(_Part):
     """Everything that an agent must know of an env. Arrays are those of one drone."""
 
-    _optional = ("marks",)
+    _optional = ("constants", "marks")
 
     env_id: str
     options: Mapping[str, Any] = field(default_factory=dict)
@@ -243,12 +251,16 @@ class EnvSpec(_Part):
     telemetry: tuple[ArraySpec, ...] = ()
     """Further arrays of a State, for logs and pictures; the last, `metrics`, has the metrics."""
     metrics: tuple[Metric, ...] = ()
+    constants: Mapping[str, Bound] = field(default_factory=dict)
+    """Numbers that a controller needs: gravity, radius, gains, scales. `docs/protocol.md` has their
+    names and units."""
     marks: tuple[Mark, ...] = ()
     """What pictures show of the task."""
 
     def __post_init__(self) -> None:
         _check_text("env_id", self.env_id)
         object.__setattr__(self, "options", json_values(self.options))
+        object.__setattr__(self, "constants", _checked_constants(self.constants))
         period = self.control_period
         digits = self.vehicle_hash
         agents = self.agents
@@ -276,6 +288,20 @@ class EnvSpec(_Part):
         listed = [name for array in self.telemetry for name in component_names(array)]
         right = len({*listed}) == len(listed)
         _expect(right, "telemetry", "each component once", listed)
+
+    def constant(self, name: str, user: str) -> float:
+        """One of the constants. Raises `InputError`, which names its `user`, if it is not there."""
+        value = self.constants.get(name)
+        if not isinstance(value, float):
+            raise InputError(f"{user}: expected the constant {name!r} in the spec, got {value!r}")
+        return value
+
+    @property
+    def action_scale(self) -> np.ndarray:
+        """What 1 stands for in each number of an action, in its unit, float64, shape (k,)."""
+        scale = self.constants.get("action_scale", 1.0)
+        size = 1 if isinstance(self.action, Discrete) else self.action.size
+        return np.broadcast_to(np.asarray(scale, np.float64), size)
 
     @property
     def headline(self) -> Metric | None:
@@ -324,6 +350,23 @@ def component_names(array: ArraySpec) -> tuple[str, ...]:
     if array.size == 1:
         return (array.name,)
     return tuple(f"{array.name}[{index}]" for index in range(array.size))
+
+
+def _checked_constants(constants: Any) -> dict[str, Bound]:
+    _expect(isinstance(constants, Mapping), "constants", "an object", constants)
+    _expect(len(constants) <= MAX_ARRAYS, "constants", f"at most {MAX_ARRAYS}", len(constants))
+    checked: dict[str, Bound] = {}
+    for name, value in constants.items():
+        is_name = isinstance(name, str) and _CONSTANT.fullmatch(name)
+        _expect(is_name, "constants", "names of a to z, 0 to 9 and _", name)
+        several = isinstance(value, tuple | list)
+        numbers = tuple(value) if several else (value,)
+        right = all(_is_number(number) and abs(number) <= _LARGEST for number in numbers)
+        expected = f"at most {MAX_TOLD} finite numbers"
+        _expect(right and len(numbers) <= MAX_TOLD, f"constants: {name}", expected, value)
+        floats = tuple(map(float, numbers))
+        checked[name] = floats if several else floats[0]
+    return checked
 
 
 def _expect(right: object, name: str, expected: str, got: object) -> None:

@@ -46,8 +46,13 @@ def spec_of(
         agents=drone_names(config.drones),
         observation=tuple(observation),
         action=_action(task.controller),
-        telemetry=tuple(quantity.spec for quantity in quantities_of(task)),
+        telemetry=tuple(array for _, array in quantities_of(task)),
         metrics=task.metrics,
+        constants={
+            "gravity": task.vehicle.gravity,
+            "radius": task.vehicle.radius,
+            **getattr(task.controller, "constants", {}),
+        },
         marks=task.marks,
     )
 

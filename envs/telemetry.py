@@ -1,116 +1,192 @@
-"""The telemetry of a drone: each number is declared here, once."""
+"""The telemetry of a drone: each number is declared here, once.
+
+World frame: z up. Body frame: x forward, y left, z up. SI units.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..models.frames import attitudes_in_paper_frame, positions_in_paper_frame
 from ..sim import PARAMETERS, Randomization
-from ..sim.state import Array
-from .spec import ArraySpec
+from ..sim.state import Array, stack
+from .spec import BODY, BODY_TO_WORLD, WORLD, ArraySpec, Bound
 from .tasks.task import Task
 
 if TYPE_CHECKING:
     from .results import Results
 
+Names = tuple[str, ...]
+
 
 @dataclass(frozen=True, kw_only=True)
 class Quantity:
-    """A number or a vector of the telemetry: its spec, and how it is read of a loop."""
+    """A vector of the telemetry. What depends on the task is a function of it."""
 
-    spec: ArraySpec
+    name: str
+    components: Names | Callable[[Task], Names]
+    """A name for each number. None: the task's drones do not have it, as where a feature is off."""
+    unit: str | Names | Callable[[Task], Names] = ""
+    frame: str = ""
+    bounds: Callable[[Task], tuple[Bound, Bound]] = lambda task: (-np.inf, np.inf)
     read: Callable[["Results"], Array]
-    """Gives an array of shape (W, A, *shape), or () for a number of a single drone."""
+    """Gives an array of shape (W, A, n), or one that broadcasts to it; (n,) of a single drone."""
+
+    def spec(self, task: Task) -> ArraySpec | None:
+        """What crosses the wire; None where the task does not have it."""
+        components = self.components(task) if callable(self.components) else self.components
+        if not components:
+            return None
+        low, high = self.bounds(task)
+        return ArraySpec(
+            name=self.name,
+            shape=(len(components),),
+            dtype="float64",
+            low=low,
+            high=high,
+            unit=self.unit(task) if callable(self.unit) else self.unit,
+            frame=self.frame,
+            components=components,
+        )
 
     def values(self, loop: "Results") -> NDArray[np.float64]:
-        """float64, shape (N, *shape)."""
-        values = np.asarray(self.read(loop), np.float64)
-        return values.reshape(loop.num_envs, *self.spec.shape)
+        """A new array, float64, shape (N, n)."""
+        read = np.asarray(self.read(loop), np.float64)
+        rows = np.broadcast_to(read, (*loop.record.shape, read.shape[-1]))
+        return np.array(rows).reshape(loop.num_envs, -1)
 
 
-def quantities_of(task: Task) -> tuple[Quantity, ...]:
-    """What is told of each drone that flies a task, in the order in which it crosses the wire."""
-    quantities = [_POSITION, _ATTITUDE, _thrust(task)]
-    if drawn := Randomization(task.config.randomize, task.config.effects).names:
-        quantities.append(_drawn(drawn))
-    if task.config.effects.payload:
-        quantities.append(_PAYLOAD)
-    if type(task).goal is not Task.goal:
-        quantities.append(_GOAL)
-    if task.metrics:
-        quantities.append(_metrics(task))
-    return tuple(quantities)
+def quantities_of(task: Task) -> list[tuple[Quantity, ArraySpec]]:
+    """What a task's drones have, in the order in which it crosses the wire."""
+    found = []
+    for quantity in QUANTITIES:
+        spec = quantity.spec(task)
+        if spec is not None:
+            found.append((quantity, spec))
+    return found
 
 
-def _quantity(
-    name: str, components: tuple[str, ...], read: Callable[["Results"], Array], **rest: Any
-) -> Quantity:
-    spec = ArraySpec(
-        name=name, shape=(len(components),), dtype="float64", components=components, **rest
-    )
-    return Quantity(spec=spec, read=read)
+def _rotors(task: Task) -> Names:
+    return tuple(f"F{rotor + 1}" for rotor in range(task.vehicle.num_rotors))
 
 
-_POSITION = _quantity(
-    "position",
-    ("X", "Y", "Z"),
-    lambda loop: positions_in_paper_frame(loop.record.state.position),
-    unit="m",
-    frame="paper",
-)
-_ATTITUDE = _quantity(
-    "attitude",
-    ("phi", "theta", "psi"),
-    lambda loop: attitudes_in_paper_frame(loop.record.state.quaternion),
-    unit="deg",
-    frame="paper",
-)
-_PAYLOAD = _quantity(
-    "payload",
-    ("X_payload", "Y_payload", "Z_payload"),
-    lambda loop: positions_in_paper_frame(loop.record.state.payload),
-    unit="m",
-    frame="paper",
-)
-_GOAL = _quantity(
-    "goal",
-    ("X_goal", "Y_goal", "Z_goal"),
-    lambda loop: positions_in_paper_frame(loop.task.goal(loop.record.state)),
-    unit="m",
-    frame="paper",
-)
+def _thrust_bounds(task: Task) -> tuple[Bound, Bound]:
+    """Those of the commands: a rotor whose efficiency is drawn may leave them."""
+    low = np.atleast_2d(task.vehicle.thrust_low).min(axis=0)
+    high = np.atleast_2d(task.vehicle.thrust_high).max(axis=0)
+    return tuple(low.tolist()), tuple(high.tolist())
 
 
-def _thrust(task: Task) -> Quantity:
-    """Bounds are those of the commands: a rotor whose efficiency is drawn may leave them."""
-    vehicle = task.vehicle
-    return _quantity(
-        "thrust",
-        tuple(f"F{rotor + 1}" for rotor in range(vehicle.num_rotors)),
-        lambda loop: loop.record.state.thrust,
+def _battery(loop: "Results") -> Array:
+    effects = loop.world.effects
+    assert effects is not None
+    return stack([effects.charge, effects.voltage])
+
+
+def _wind_names(task: Task) -> Names:
+    effects = task.config.effects
+    winds = ("wind_x", "wind_y", "wind_z")
+    blows = effects.gusts > 0 or any(effects.wind)
+    return winds if blows or not set(winds).isdisjoint(_drawn(task)) else ()
+
+
+def _wind(loop: "Results") -> Array:
+    effects = loop.world.effects
+    assert effects is not None
+    return stack(effects.wind)
+
+
+def _drawn(task: Task) -> Names:
+    return Randomization(task.config.randomize, task.config.effects).names
+
+
+def _drawn_numbers(parameters: dict[str, Array]) -> Array:
+    return stack([parameters[name] for name in PARAMETERS if name in parameters])
+
+
+def _metric_names(task: Task) -> Names:
+    return tuple(metric.name for metric in task.metrics)
+
+
+QUANTITIES: Final = (
+    Quantity(
+        name="position",
+        components=("x", "y", "z"),
+        unit="m",
+        frame=WORLD,
+        read=lambda loop: loop.record.state.position,
+    ),
+    Quantity(
+        name="attitude",
+        components=("qw", "qx", "qy", "qz"),
+        frame=BODY_TO_WORLD,
+        read=lambda loop: loop.record.state.quaternion,
+    ),
+    Quantity(
+        name="velocity",
+        components=("vx", "vy", "vz"),
+        unit="m/s",
+        frame=WORLD,
+        read=lambda loop: loop.record.state.velocity,
+    ),
+    Quantity(
+        name="body_rates",
+        components=("rate_x", "rate_y", "rate_z"),
+        unit="rad/s",
+        frame=BODY,
+        read=lambda loop: loop.record.state.body_rates,
+    ),
+    Quantity(
+        name="thrust",
+        components=_rotors,
         unit="N",
-        low=tuple(np.atleast_2d(vehicle.thrust_low).min(axis=0).tolist()),
-        high=tuple(np.atleast_2d(vehicle.thrust_high).max(axis=0).tolist()),
-    )
-
-
-def _drawn(names: tuple[str, ...]) -> Quantity:
-    def read(loop: "Results") -> Array:
-        return np.stack([loop.world.parameters[name] for name in names], axis=-1)
-
-    units = tuple(PARAMETERS[name].unit for name in names)
-    return _quantity("drawn", tuple(f"drawn_{name}" for name in names), read, unit=units)
-
-
-def _metrics(task: Task) -> Quantity:
-    names = tuple(metric.name for metric in task.metrics)
-
-    def read(loop: "Results") -> Array:
-        metrics = loop.record.metrics
-        zero = np.zeros(loop.record.shape)
-        return np.stack([metrics[name] + zero for name in names], axis=-1)
-
-    return _quantity("metrics", names, read, unit=tuple(metric.unit for metric in task.metrics))
+        bounds=_thrust_bounds,
+        read=lambda loop: loop.record.state.thrust,
+    ),
+    Quantity(
+        name="battery",
+        components=lambda task: ("charge", "voltage") if task.config.effects.battery else (),
+        unit=("1", "V"),
+        read=_battery,
+    ),
+    Quantity(
+        name="wind",
+        components=_wind_names,
+        unit="m/s",
+        frame=WORLD,
+        read=_wind,
+    ),
+    Quantity(
+        name="drawn",
+        components=lambda task: tuple(f"drawn_{name}" for name in _drawn(task)),
+        unit=lambda task: tuple(PARAMETERS[name].unit for name in _drawn(task)),
+        read=lambda loop: _drawn_numbers(loop.world.parameters),
+    ),
+    Quantity(
+        name="payload",
+        components=lambda task: (
+            ("payload_x", "payload_y", "payload_z") if task.config.effects.payload else ()
+        ),
+        unit="m",
+        frame=WORLD,
+        read=lambda loop: loop.record.state.payload,
+    ),
+    Quantity(
+        name="goal",
+        components=lambda task: (
+            ("goal_x", "goal_y", "goal_z") if type(task).goal is not Task.goal else ()
+        ),
+        unit="m",
+        frame=WORLD,
+        read=lambda loop: loop.task.goal(loop.record.state),
+    ),
+    Quantity(
+        name="metrics",
+        components=_metric_names,
+        unit=lambda task: tuple(metric.unit for metric in task.metrics),
+        read=lambda loop: stack([loop.record.metrics[one.name] for one in loop.task.metrics]),
+    ),
+)
+"""All of them, in the order in which they cross the wire."""

@@ -29,7 +29,7 @@ truncated = False
 while not (terminated or truncated):
     observation, reward, terminated, truncated, info = env.step(pid.act(observation))
     total += reward
-print(f"return {total:.1f}, elevation {info['Y']:.3f} m of {info['Y_goal']} m")
+print(f"return {total:.1f}, elevation {info['z']:.3f} m of {info['goal_z']} m")
 print(env.statistics)
 env.close()  # tells the simulator, which ends
 simulator.wait()

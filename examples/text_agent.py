@@ -18,7 +18,7 @@ total = 0.0
 last = ""
 reply = b""
 while not reply.endswith(b"close"):
-    line, simulator = agent.recvfrom(1024)
+    line, simulator = agent.recvfrom(1200)
     sequence, *fields = line.decode().split(",")
     if fields == ["close"]:
         break

@@ -10,12 +10,10 @@ from numpy.typing import NDArray
 
 from ..envs.spec import ArraySpec, Discrete, component_names
 from ..models.errors import require
-from ..models.frames import pose_in_mujoco_frame
 from .trajectories import Trajectory
 
 Floats = NDArray[np.float64]
 
-_PAPER: Final = "paper"  # the frame of positions and angles with Y up
 QUATERNION: Final = ("qw", "qx", "qy", "qz")
 
 
@@ -60,14 +58,7 @@ def signals_of(flight: Trajectory) -> list[Signal]:
 
 def _telemetry(flight: Trajectory, array: ArraySpec) -> Signal:
     values = flight.telemetry[array.name].reshape(len(flight) + 1, -1)
-    if array.frame != _PAPER:
-        return Signal(array.name, component_names(array), _units(array), values)
-    if array.name == "attitude":
-        return Signal("attitude", QUATERNION, ("",) * 4, flight.pose[:, 3:])
-    prefix = "" if array.name == "position" else f"{array.name}_"
-    components = tuple(prefix + axis for axis in "xyz")
-    place = pose_in_mujoco_frame(values, np.zeros_like(values))[:, :3]
-    return Signal(array.name, components, ("m",) * 3, place)
+    return Signal(array.name, component_names(array), _units(array), values)
 
 
 def _units(array: ArraySpec) -> tuple[str, ...]:

@@ -20,7 +20,6 @@ from ..agents.policies import Policy
 from ..envs.autoreset import LOST, AdvancingVectorEnv, worlds_done
 from ..envs.spec import EnvSpec, canonical_id, component_names
 from ..models.errors import InputError
-from ..models.frames import pose_in_mujoco_frame
 
 Floats = NDArray[np.float64]
 
@@ -103,7 +102,7 @@ class Trajectory:
                     f"{self.spec.env_id}: expected telemetry of the {name}, "
                     f"got {', '.join(self.telemetry) or 'none'}"
                 )
-        return pose_in_mujoco_frame(self.telemetry["position"], self.telemetry["attitude"])
+        return np.concatenate((self.telemetry["position"], self.telemetry["attitude"]), axis=1)
 
     @property
     def headline(self) -> Floats:

@@ -27,7 +27,6 @@ from ..envs.spec import Mark
 from ..models.cameras import View, chosen_views
 from ..models.errors import InputError, shortened
 from ..models.fields import Limits, Text, check_fields, check_names, read_table
-from ..models.frames import pose_in_mujoco_frame
 from ..models.vehicle import Vehicle
 from ..scenes import scenes_of
 from ..sim.rotations import multiplied
@@ -397,6 +396,5 @@ def _poses_after(one: Trajectory, steps: NDArray[np.int_]) -> dict[str, Floats]:
     }
     for key in ("goal", "payload"):
         if key in arrays:
-            level = np.zeros_like(arrays[key][rows])
-            poses[key] = pose_in_mujoco_frame(arrays[key][rows], level)[:, :3]
+            poses[key] = arrays[key][rows]
     return poses

@@ -1,4 +1,4 @@
-"""Conversions between MuJoCo's frame and the paper's. No other module converts.
+"""Conversions between MuJoCo's frame and the paper's, for the text codec.
 
 MuJoCo: x forward, y left, z up, right-handed, quaternions scalar first.
 Paper and Unity: X right, Y up, Z forward, left-handed, degrees (paper, section 2.2, figure 4).
@@ -9,7 +9,7 @@ theta about Y, psi about Z. It gives no order: we take Unity's (`Transform.euler
 R = Ry(theta) · Rx(phi) · Rz(psi). Positive phi is nose down, positive theta is nose right, and
 positive psi is right side up.
 
-Every function accepts any leading axes, or none. A row gives the same bits alone and in a batch.
+Every function accepts any leading axes, or none.
 """
 
 from typing import Final
@@ -35,38 +35,32 @@ def attitudes_in_paper_frame(quaternions: ArrayLike) -> Array:
     """Unit quaternions (w, x, y, z) in MuJoCo's world -> (phi, theta, psi), degrees, (..., 3).
 
     phi lies in [-90, 90], the others in [-180, 180]. With the nose straight up or down only a sum
-    of theta and psi is defined: psi is then 0. Level craft that point forward, as all of the
-    elevation task, cost next to nothing.
+    of theta and psi is defined: psi is then 0.
     """
-    quaternions = np.asarray(quaternions, np.float64)
-    out = np.zeros((*quaternions.shape[:-1], 3))
-    if not np.count_nonzero(quaternions[..., 1:]):
-        return out
-    # One craft as four floats, many as four contiguous rows: the same bits, and fast for one.
-    if quaternions.size == 4:
-        w, mx, my, mz = quaternions.reshape(4).tolist()
-    else:
-        w, mx, my, mz = np.moveaxis(quaternions, -1, 0).copy()
-    x, y, z = my, -mz, -mx
-    sin_phi = 2 * (w * x - y * z)
-    vertical = np.count_nonzero(pole := abs(sin_phi) > _POLE)
-    if vertical:
-        sin_phi = np.clip(sin_phi, -1.0, 1.0)  # rounding may have taken it past 1
-    out[..., 0] = np.arcsin(sin_phi)
-    out[..., 1] = np.arctan2(2 * (w * y + x * z), 1 - 2 * (x * x + y * y))
-    out[..., 2] = np.arctan2(2 * (w * z + x * y), 1 - 2 * (x * x + z * z))
-    np.degrees(out, out=out)
-    if vertical:
-        theta = 2 * np.degrees(np.arctan2(y, w))
-        theta -= 360 * np.round(theta / 360)
-        there = np.stack([np.copysign(90.0, sin_phi), theta, np.zeros_like(theta)], axis=-1)
-        np.copyto(out, there, where=np.expand_dims(pole, -1))
-    return np.add(out, 0.0, out=out)  # no negative zeros
+    w, roll, x, yaw = np.moveaxis(np.asarray(quaternions, np.float64), -1, 0)
+    y = -yaw
+    z = -roll
+    sin_phi = np.clip(2 * (w * x - y * z), -1.0, 1.0)
+    phi = np.degrees(np.arcsin(sin_phi))
+    theta = np.degrees(np.arctan2(2 * (w * y + x * z), 1 - 2 * (x * x + y * y)))
+    psi = np.degrees(np.arctan2(2 * (w * z + x * y), 1 - 2 * (x * x + z * z)))
+    turned = 2 * np.degrees(np.arctan2(y, w))
+    turned = turned - 360 * np.round(turned / 360)
+    vertical = np.abs(sin_phi) > _POLE
+    phi = np.where(vertical, np.copysign(90.0, sin_phi), phi)
+    theta = np.where(vertical, turned, theta)
+    psi = np.where(vertical, 0.0, psi)
+    return np.stack((phi, theta, psi), axis=-1) + 0.0  # no negative zeros
 
 
-def pose_in_mujoco_frame(positions: ArrayLike, attitudes: ArrayLike) -> Array:
-    """(X, Y, Z), m, and (phi, theta, psi), degrees, -> `qpos` of a free joint, (..., 7)."""
+def positions_in_world_frame(positions: ArrayLike) -> Array:
+    """(X, Y, Z) in the paper's frame -> (x, y, z) in MuJoCo's world, m; both (..., 3)."""
     right, up, forward = np.moveaxis(np.asarray(positions, np.float64), -1, 0)
+    return np.stack((forward, -right, up), axis=-1) + 0.0  # no negative zeros
+
+
+def quaternions_in_world_frame(attitudes: ArrayLike) -> Array:
+    """(phi, theta, psi), degrees, (..., 3) -> (w, x, y, z) in MuJoCo's world, (..., 4)."""
     halves = np.radians(np.moveaxis(np.asarray(attitudes, np.float64), -1, 0)) / 2
     (a, b, c) = np.cos(halves)
     (d, e, f) = np.sin(halves)
@@ -75,4 +69,4 @@ def pose_in_mujoco_frame(positions: ArrayLike, attitudes: ArrayLike) -> Array:
     x = b * d * c + e * a * f
     y = e * a * c - b * d * f
     z = b * a * f - e * d * c
-    return np.stack((forward, -right, up, w, -z, x, -y), axis=-1) + 0.0
+    return np.stack((w, -z, x, -y), axis=-1) + 0.0

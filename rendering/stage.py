@@ -16,7 +16,6 @@ from numpy.typing import ArrayLike
 
 from ..models.errors import InputError, shortened
 from ..models.fleet import load_vehicles, members_of
-from ..models.frames import pose_in_mujoco_frame
 from ..models.mjcf import attach_craft, free_body
 from ..scenes.build import SCENE_PREFIX, build_scene
 from ..scenes.marks import Mark
@@ -96,18 +95,18 @@ class MetricValue(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Moment:
-    """One craft after one control step. Positions are in the paper's frame."""
+    """One craft after one control step. Positions are in the world frame, m."""
 
     position: _Vector
-    """X, Y, Z, m."""
-    attitude: _Vector
-    """phi, theta, psi, degrees."""
+    """x, y, z."""
+    attitude: tuple[float, ...]
+    """Quaternion from body to world: w, x, y, z."""
     thrusts: tuple[float, ...]
     """F1 to FR, N."""
     goal: _Vector | None = None
-    """Position to reach or hold, X, Y, Z, m; None if the task has no goal."""
+    """Position to reach or hold; None if the task has no goal."""
     payload: _Vector | None = None
-    """Position of what hangs below it on a cable, X, Y, Z, m; None if nothing does."""
+    """Position of what hangs below it on a cable; None if nothing does."""
     metrics: tuple[MetricValue, ...] = ()
     """The headline first."""
     marks: tuple[Mark, ...] = ()
@@ -128,7 +127,7 @@ class Moment:
     ) -> Self:
         """From a drone's telemetry, and `reward`, `step` and `episode`, which it does not have.
 
-        Telemetry is arrays by name: `position` (3,), `attitude` (3,), `thrust` (R,), `metrics` (M,)
+        Telemetry is arrays by name: `position` (3,), `attitude` (4,), `thrust` (R,), `metrics` (M,)
         and, if there are any, `goal` (3,) and `payload` (3,). The M metrics are told by name, unit
         and symbol.
         """
@@ -154,7 +153,7 @@ class Moment:
         """Names and values for an overlay; a rotor's largest thrust, N, sets the digits."""
         lines = [(metric.label, metric.text) for metric in self.metrics[:_MAX_METRICS]]
         heights = {"elevation": self.position, "goal": self.goal}
-        lines += [(name, f"{point[1]:.2f} m") for name, point in heights.items() if point]
+        lines += [(name, f"{point[2]:.2f} m") for name, point in heights.items() if point]
         unit, scale = ("N", 1.0) if thrust_high >= 1 else ("mN", 1e3)
         decimals = max(0, 2 - math.floor(math.log10(thrust_high * scale)))
         shown = self.thrusts
@@ -260,14 +259,13 @@ class Stage:
             pose = poses[i]
             path = self._paths[i]
             goal = None
-            pose[:] = pose_in_mujoco_frame(moment.position, moment.attitude)
-            pose[:3] += self._offsets[i]
+            pose[:3] = moment.position + self._offsets[i]
+            pose[3:] = moment.attitude
             if moment.goal is not None:
-                goal = pose_in_mujoco_frame(moment.goal, (0, 0, 0))[:3] + self._offsets[i]
+                goal = moment.goal + self._offsets[i]
             self._goals[i] = goal
             if moment.payload is not None:
-                hung = pose_in_mujoco_frame(moment.payload, (0, 0, 0))[:3]
-                self._payloads[i] = hung + self._offsets[i]
+                self._payloads[i] = moment.payload + self._offsets[i]
             if moment.step == 0 or moment.step < last.step or moment.episode != last.episode:
                 path.clear()
                 self._reach[i] = 0.0

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, Protocol
 
 from ..models import BACKENDS, MAX_DRONES, Backend
 from ..models.errors import InputError
-from .effects import EffectOptions
+from .effects import EffectOptions, Effects
 from .random import Draw, Random
 from .randomize import CENTER, Randomization
 from .snapshots import Arrays, Snapshot
@@ -39,6 +39,8 @@ class World(Protocol):
         state: As the last step or reset left it.
         random: The counters of all random numbers; `seed` seeds them.
         parameters: What was drawn for each drone's episode, by name, shape (W, A).
+        effects: What acts on drones besides gravity, contact and rotors that obey at once; None:
+            nothing.
 
     Class attributes:
         settings: Names of the backend's own arguments of `make_world`.
@@ -49,6 +51,7 @@ class World(Protocol):
     state: WorldState
     random: Random
     parameters: dict[str, Array]
+    effects: Effects | None
     settings: ClassVar[tuple[str, ...]]
 
     def reset(self, mask: Array, pose: InitialState) -> None:

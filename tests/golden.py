@@ -47,10 +47,11 @@ ONE: Final = EnvSpec(
     observation=(ArraySpec(name="observation", shape=(3,), low=-1.0, high=(1.0, 2.0, 3.0)),),
     action=Discrete(n=3),
     telemetry=(
-        ArraySpec(name="position", shape=(3,), unit="m", components=("X", "Y", "Z")),
+        ArraySpec(name="position", shape=(3,), unit="m", frame="world", components=("x", "y", "z")),
         ArraySpec(name="metrics", shape=(1,), unit="m", components=("error",)),
     ),
     metrics=(Metric(name="error", unit="m"),),
+    constants={"gravity": 9.8, "gains": (0.5, 2.0)},
 )
 TWO: Final = EnvSpec(
     env_id="a/Two-v0",
@@ -84,7 +85,7 @@ def one_state(sequence: int, **changes: Any) -> State:
         "session": SESSION, "sequence": sequence, "time": 0.0, "nonce": 0,
         "observations": (f4([0.25, -0.0, 1.5]),), "rewards": np.zeros(1),
         "terminated": np.zeros(1, bool), "truncated": np.zeros(1, bool),
-        "telemetry": (np.array([[1.0, 5.0, -2.0]]), np.array([[0.25]])),
+        "telemetry": (np.array([[-2.0, -1.0, 5.0]]), np.array([[0.25]])),
     }  # fmt: skip
     return State(**content | changes)
 
@@ -368,7 +369,7 @@ def text_lines() -> dict[str, Any]:
             "1,1e999,0,0" + numbers, "1,0x1,0,0" + numbers, "1,0,2,0" + numbers,
             "1,0,00,0" + numbers, "1, 0,0,0" + numbers, "1,0,0,0,1e39" + numbers[4:],
             "1,0,0,0" + numbers + " ", "1,0,0,0" + numbers + "\n\n", "1,close,",
-            "1," + 1100 * "0" + ",0,0" + numbers,
+            "1," + 1300 * "0" + ",0,0" + numbers,
         ],
         "malformed commands": [
             "", "1", "1,", "1,3", "1,-1", "1,+1", "1,02", "1,1.0", "1,1e0", "1,0,0", "01,1",

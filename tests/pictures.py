@@ -24,10 +24,10 @@ TINY: Final = DATA / "tiny.xml"
 def at(elevation: float, error: float = 0.0, *, goal: Any = True, **rest: Any) -> Moment:
     """A level craft over the origin, whose goal is `error` metres higher; goal=None: no goal."""
     fields: dict[str, Any] = {
-        "position": (0.0, elevation, 0.0),
-        "attitude": (0.0, 0.0, 0.0),
+        "position": (0.0, 0.0, elevation),
+        "attitude": (1.0, 0.0, 0.0, 0.0),
         "thrusts": (49.0, 49.0, 49.0, 49.0),
-        "goal": (0.0, elevation + error, 0.0) if goal is True else goal,
+        "goal": (0.0, 0.0, elevation + error) if goal is True else goal,
         "metrics": (MetricValue("elevation_error", error, "m", "E"),),
     }
     return Moment(**{**fields, **rest})

@@ -13,4 +13,5 @@ def layout_of(spec: EnvSpec, worlds: int = 1) -> Layout:
         action=None if isinstance(action, Discrete) else ArrayLayout(action.shape, action.dtype),
         choices=action.n if isinstance(action, Discrete) else 0,
         telemetry=tuple(a.shape for a in spec.telemetry),
+        frames=tuple(a.frame for a in spec.telemetry),
     )

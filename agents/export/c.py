@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from ...envs.spec import ArraySpec, Discrete, EnvSpec, component_names
+from ...envs.spec import BODY_TO_WORLD, ArraySpec, Discrete, EnvSpec, component_names
 from ...models.errors import InputError
 from ..networks import Affine, Floats, Normalise, Relu, Tanh
 from ..policies import NetworkPolicy
@@ -205,25 +205,27 @@ def _about(spec: EnvSpec, facts: Mapping[str, str]) -> list[str]:
         f"vehicle: {spec.vehicle} ({spec.vehicle_hash})",
         f"trained: {facts['algorithm']}, seed {facts['seed']}, {facts['env_steps']} env steps",
         "observation:",
-        *_described(spec.observation),
+        *_described(spec.observation, np.ones(1)),
     ]
     if isinstance(action, Discrete):
         lines.append("action, the number of a choice:")
         lines += [f"  {i}: {name}" for i, name in enumerate(_choices(action))]
     else:
-        lines += ["action:", *_described([action])]
+        lines += ["action:", *_described([action], spec.action_scale)]
     return [_comment(line).rstrip() for line in lines]
 
 
-def _described(arrays: Iterable[ArraySpec]) -> Iterator[str]:
+def _described(arrays: Iterable[ArraySpec], scale: np.ndarray) -> Iterator[str]:
     """A line for every element of some arrays, one after the other, as a policy takes them."""
     number = 0
     for array in arrays:
         units = (array.unit,) * array.size if isinstance(array.unit, str) else array.unit
         low, high = (bound.ravel().tolist() for bound in array.bounds())
+        scales = np.broadcast_to(scale, array.size).tolist()
         for place, name in enumerate(component_names(array)):
             unit = "" if units[place] == "1" else units[place]
-            bounds = f"{low[place]:g} to {high[place]:g} {unit}".rstrip()
+            scaled = "" if scales[place] == 1 else f"of {scales[place]:.7g} "
+            bounds = f"{low[place]:g} to {high[place]:g} {scaled}{unit}".rstrip()
             words = f"{bounds}, {array.frame}" if array.frame else bounds
             yield f"  {number}: {name}: {words}"
             number += 1
@@ -236,7 +238,7 @@ def _constants(policy: NetworkPolicy, facts: Mapping[str, str]) -> Iterator[str]
         "format": facts["format"],
         "observations": facts["inputs"],
         "actions": policy.actions.size,
-        "telemetry": sum(array.size for array in spec.telemetry),
+        "telemetry": sum(map(_text_size, spec.telemetry)),
         "control_period": f"{spec.control_period!r}",
         "seed": facts["seed"],
         "env_steps": facts["env_steps"],
@@ -245,6 +247,14 @@ def _constants(policy: NetworkPolicy, facts: Mapping[str, str]) -> Iterator[str]
         yield f"#define ROTORGRAM_{name.upper()} {number}"
     for name in ("algorithm", "env_id", "options", "vehicle", "vehicle_hash"):
         yield f"#define ROTORGRAM_{name.upper()} {_text(facts[name])}"
+    for name, value in spec.constants.items():
+        listed = "{ " + ", ".join(map(repr, value)) + " }" if isinstance(value, tuple) else value
+        yield f"#define ROTORGRAM_CONSTANT_{name.upper()} {listed}"
+
+
+def _text_size(array: ArraySpec) -> int:
+    """Numbers of an array of telemetry by the text codec, which has three angles of a rotation."""
+    return 3 if array.frame == BODY_TO_WORLD else array.size
 
 
 def _text(text: str) -> str:

@@ -1,7 +1,7 @@
 """What tasks for several drones share: who hears whom by radio, and the room between drones."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Final
 
 import numpy as np
@@ -89,8 +89,6 @@ class Swarm(GoalTask):
             numbers += along(f"{name} velocity - velocity", "m/s", MAX_SPEED)
             numbers.append(Number(f"{name} is there", "1", -1.0, 1.0))
         self.define_observation(self.band, numbers)
-        spheres = f"; drones with a radius of {vehicle.radius:.7g} m"
-        self.observation = tuple(replace(a, frame=a.frame + spheres) for a in self.observation)
         self._radii = np.array([one.radius for one in members_of(vehicle, self.count)])
         self.has_radio = self.count > 1
 

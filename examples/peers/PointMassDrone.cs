@@ -32,25 +32,30 @@ namespace Rotorgram
                 'name': 'action', 'shape': [1], 'low': -1, 'high': 1, 'components': ['collective']},
             'telemetry': [
                 {'name': 'position', 'shape': [3], 'dtype': 'float64', 'unit': 'm',
-                 'frame': 'paper', 'components': ['X', 'Y', 'Z']},
-                {'name': 'attitude', 'shape': [3], 'dtype': 'float64', 'unit': 'deg',
-                 'frame': 'paper', 'components': ['phi', 'theta', 'psi']},
+                 'frame': 'world', 'components': ['x', 'y', 'z']},
+                {'name': 'attitude', 'shape': [4], 'dtype': 'float64', 'frame': 'body to world',
+                 'components': ['qw', 'qx', 'qy', 'qz']},
+                {'name': 'velocity', 'shape': [3], 'dtype': 'float64', 'unit': 'm/s',
+                 'frame': 'world', 'components': ['vx', 'vy', 'vz']},
+                {'name': 'body_rates', 'shape': [3], 'dtype': 'float64', 'unit': 'rad/s',
+                 'frame': 'body', 'components': ['rate_x', 'rate_y', 'rate_z']},
                 {'name': 'thrust', 'shape': [4], 'dtype': 'float64', 'low': 0, 'high': 100,
                  'unit': 'N', 'components': ['F1', 'F2', 'F3', 'F4']},
-                {'name': 'goal', 'shape': [3], 'dtype': 'float64', 'unit': 'm', 'frame': 'paper',
-                 'components': ['X_goal', 'Y_goal', 'Z_goal']},
+                {'name': 'goal', 'shape': [3], 'dtype': 'float64', 'unit': 'm', 'frame': 'world',
+                 'components': ['goal_x', 'goal_y', 'goal_z']},
                 {'name': 'metrics', 'shape': [1], 'dtype': 'float64', 'unit': ['m'],
                  'components': ['elevation_error']}],
             'metrics': [{
                 'name': 'elevation_error', 'unit': 'm', 'goal': 'zero',
-                'settled': 0.05, 'held': 0.1, 'symbol': 'E', 'signed': true}]
+                'settled': 0.05, 'held': 0.1, 'symbol': 'E', 'signed': true}],
+            'constants': {'gravity': 9.8}
         }";
 
         readonly RotorgramSpec spec = new RotorgramSpec
         {
             Json = Json.Replace('\'', '"'),
             Observations = 3,
-            Telemetry = 14,
+            Telemetry = 21,
             Period = Substeps * PhysicsStep
         };
 
@@ -90,10 +95,12 @@ namespace Rotorgram
             state.Observations[0] = (float)(Target - Height);
             state.Observations[1] = (float)(0 - ClimbRate);
             state.Observations[2] = (float)(thrust / HoverThrust - 1);
-            state.Telemetry[1] = Height; // X, Z and the angles stay 0
-            for (int rotor = 6; rotor < 10; rotor++) state.Telemetry[rotor] = thrust;
-            state.Telemetry[11] = Target;
-            state.Telemetry[13] = Target - Height;
+            state.Telemetry[2] = Height; // x and y stay 0
+            state.Telemetry[3] = 1; // it is level: the quaternion is 1, 0, 0, 0
+            state.Telemetry[9] = ClimbRate;
+            for (int rotor = 13; rotor < 17; rotor++) state.Telemetry[rotor] = thrust;
+            state.Telemetry[19] = Target;
+            state.Telemetry[20] = Target - Height;
         }
 
         /// <summary>Put the craft there, level and at rest.</summary>

@@ -92,7 +92,7 @@ namespace Rotorgram
             state.Observations[0] = 0.25f;
             state.Observations[1] = -0f;
             state.Observations[2] = 1.5f;
-            new[] { 1, 5, -2, 0.25 }.CopyTo(state.Telemetry, 0);
+            new[] { -2, -1, 5, 0.25 }.CopyTo(state.Telemetry, 0);
             datagram.WriteState(session, 1, 0, nonce, state);
             Print("state 1 echoes the nonce", datagram);
             state.Rewards[0] = 0.5;

@@ -27,7 +27,7 @@
 #include <time.h>
 #include <unistd.h>
 
-enum { MAX_BYTES = 1024 };
+enum { MAX_BYTES = 1200 };
 
 #ifdef POLICY
 #include POLICY
@@ -49,10 +49,10 @@ static void act(const double *values, double *action)
         action[i] = chosen[i];
 }
 #else
-/* Of rotorgram/Elevation-v0: E, its rate, thrust / hover - 1; X, Y, Z, three angles, F1 to F4,
- * the goal X, Y, Z, and E again as the metric. */
+/* Of rotorgram/Elevation-v0: E, its rate, thrust / hover - 1; in the paper's frame X, Y, Z, three
+ * angles, three velocities and three body rates; F1 to F4, the goal X, Y, Z, and E as the metric. */
 #define LAST "last |E| %.6f m"
-enum { OBSERVATIONS = 3, ACTIONS = 1, TELEMETRY = 14 };
+enum { OBSERVATIONS = 3, ACTIONS = 1, TELEMETRY = 20 };
 
 static void act(const double *values, double *action)
 {

@@ -46,7 +46,7 @@ class BaseWorld:
         self._start = self.random.use(START)
         self._randomization = self.random.use(RANDOMIZATION)
         acting = Effects(vehicle, self._options, self.random.noise, self._drawn)
-        self.effects = acting if acting.works else None
+        self.effects: Effects | None = acting if acting.works else None
         self._on_rotors = acting.on_rotors
         self._check = contact_check(vehicle.timestep)
 

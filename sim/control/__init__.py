@@ -39,7 +39,8 @@ class Controller(Protocol):
     """Turns actions into thrusts.
 
     It may also have `every_step`, true where it is asked before each physics step and not once for
-    an action, and `units` and `frame` of its numbers, as of an `ArraySpec`.
+    an action, `units` and `frame` of its numbers, as of an `ArraySpec`, and `constants` of an
+    `EnvSpec`.
     """
 
     low: tuple[float, ...]

@@ -54,8 +54,9 @@ class Rates:
         self.gains = gains
         self.low = (-1.0,) * len(self.components)
         self.high = (1.0,) * len(self.components)
-        self.units = tuple(f"{size:.7g} {unit}" if unit else "1" for size, unit in self.ranges())
-        self._sizes = [size for size, _ in self.ranges()]
+        self.units = tuple(unit for _, unit in self.ranges())
+        self._sizes = tuple(size for size, _ in self.ranges())
+        self.constants: dict[str, float | tuple[float, ...]] = {"action_scale": self._sizes}
         self._mass = vehicle.mass
         self._gravity = vehicle.gravity
         self._hover = vehicle.mass * vehicle.gravity
@@ -73,7 +74,7 @@ class Rates:
 
     def ranges(self) -> list[tuple[float, str]]:
         """What an action of 1 stands for, and the unit; of a collective thrust it is its limit."""
-        return [(1.0, ""), *((rate, "rad/s") for rate in self.gains.most_rate)]
+        return [(1.0, "1"), *((rate, "rad/s") for rate in self.gains.most_rate)]
 
     def thrust(self, action: Array, state: WorldState) -> Array:
         """As `Controller.thrust`."""
@@ -148,7 +149,7 @@ class Attitude(Rates):
         """As of `Rates`."""
         gains = self.gains
         tilt = (gains.most_tilt, "rad")
-        return [(1.0, ""), tilt, tilt, (gains.most_rate[2], "rad/s")]
+        return [(1.0, "1"), tilt, tilt, (gains.most_rate[2], "rad/s")]
 
     def thrust(self, action: Array, state: WorldState) -> Array:
         """As `Controller.thrust`."""
@@ -226,8 +227,7 @@ class Position(Velocity):
 
     def __init__(self, vehicle: "Vehicle", gains: "Gains", effects: EffectOptions) -> None:
         super().__init__(vehicle, gains, effects)
-        approach = f"approached at {gains.position:.7g} /s, gravity {vehicle.gravity:.7g} m/s²"
-        self.frame = f"{_HEADING}, {approach}"
+        self.constants["position_gain"] = gains.position
 
     def ranges(self) -> list[tuple[float, str]]:
         """As of `Rates`."""

@@ -26,6 +26,7 @@ class MixedController:
         self.every_step = getattr(first, "every_step", False)
         self.units = getattr(first, "units", "")
         self.frame = getattr(first, "frame", "")
+        self.constants = getattr(first, "constants", {})
         self._controllers = controllers
         self._first = first
 

@@ -94,6 +94,25 @@ class Effects:
         self._take_wind(factors)
         return thrust
 
+    @property
+    def wind(self) -> list[Array]:
+        """Velocity of the air without downwash, world frame, m/s: x, y, z, each (W, A) or alike for
+        all.
+        """
+        if self._gusts is None:
+            return self._wind
+        return [mean + gust for mean, gust in zip(self._wind, self._gusts.velocity, strict=True)]
+
+    @property
+    def charge(self) -> Array:
+        """Of the battery, share, shape (W, A)."""
+        return self._rotors.charge
+
+    @property
+    def voltage(self) -> Array:
+        """Of the battery at its terminals, V, shape (W, A)."""
+        return self._rotors.voltage
+
     def _take_wind(self, factors: dict[str, Array]) -> None:
         both = zip(self._mean_wind, WINDS, strict=True)
         self._wind = [mean + factors.get(name, 0.0) for mean, name in both]
@@ -131,10 +150,9 @@ class Effects:
             mean, end, root = self._rotors.step(state.command, mask)
         if not self.on_body:
             return mean, end, None
-        wind = self._wind
         if self._gusts is not None:
-            gust = self._gusts.step(mask, self._noise.normal(mask))
-            wind = [a + b for a, b in zip(wind, gust, strict=True)]
+            self._gusts.step(mask, self._noise.normal(mask))
+        wind = self.wind
         if self._downwash is not None and state.position.ndim > 2 and state.position.shape[1] > 1:
             wind = [a + b for a, b in zip(wind, self._downwash.air(state), strict=True)]
         return mean, end, self._air.step(state, mean, root, wind, mask)

@@ -83,11 +83,8 @@ class Gusts(Kept):
             start += [math.sqrt(0.5) * sigma * z1, math.sqrt(0.125) * sigma * (z1 + z2)]
         self._state = kept(mask, start, self._state)
 
-    def step(self, mask: Array | None, normal: Array) -> Vector:
-        """Advance by a physics step; normal (W, A, 5).
-
-        Gives the gust, world frame, m/s, three of shape (W, A).
-        """
+    def step(self, mask: Array | None, normal: Array) -> None:
+        """Advance by a physics step; normal (W, A, 5)."""
         f, z, n = self._filters, self._state, _parts(normal)
         new = [f[0] * z[0] + f[1] * n[0]]
         for i, (e, r, a, b, c) in ((1, f[4:9]), (3, f[9:])):
@@ -95,7 +92,12 @@ class Gusts(Kept):
                 e * z[i] + a * n[i],
                 e * (z[i + 1] + r * z[i]) + b * n[i] + c * n[i + 1],
             ]
-        self._state = z = kept(mask, new, z)
+        self._state = kept(mask, new, z)
+
+    @property
+    def velocity(self) -> Vector:
+        """Of the gust, world frame, m/s, three of shape (W, A)."""
+        z = self._state
         (x, y) = self._along
         root = math.sqrt(3)
         u = z[0]

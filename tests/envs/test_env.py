@@ -77,7 +77,7 @@ class Flight:
 
     @property
     def height(self) -> float:
-        return float(self.loop.telemetry["position"][0, 1])
+        return float(self.loop.telemetry["position"][0, 2])
 
     @property
     def ends(self) -> tuple[bool, bool]:
@@ -249,7 +249,7 @@ def test_number_types_of_an_action_do_not_matter() -> None:
 def test_flight_follows_the_formula_of_constant_acceleration(mode: str, period: float) -> None:
     env = _env(action=mode, control_period=period, flight_band=50.0, target=60.0)
     _, info = env.reset(seed=2)
-    height = info["Y"]
+    height = info["z"]
     speed = 0.0
     thrust = 49.0
     for n in range(60):
@@ -260,12 +260,12 @@ def test_flight_follows_the_formula_of_constant_acceleration(mode: str, period: 
         height += speed * period + acceleration * period**2 / 2
         speed += acceleration * period
         observation, *_, info = env.step(_a(action))
-        assert info["Y"] == pytest.approx(height, abs=1e-9)
+        assert info["z"] == pytest.approx(height, abs=1e-9)
         assert info["elevation_error"] == pytest.approx(60 - height, abs=1e-9)
-        assert (info["X"], info["Z"]) == pytest.approx((0.0, 0.0), abs=1e-9)
-        assert info["X_goal"] == 0.0
-        assert info["Y_goal"] == 60.0
-        assert info["Z_goal"] == 0.0
+        assert (info["x"], info["y"]) == pytest.approx((0.0, 0.0), abs=1e-9)
+        assert info["goal_x"] == 0.0
+        assert info["goal_z"] == 60.0
+        assert info["goal_y"] == 0.0
         assert observation == pytest.approx([60 - height, -speed, thrust / 49 - 1], abs=1e-5)
 
 
@@ -291,15 +291,17 @@ def test_reward_and_observation_of_a_step_by_hand() -> None:
     assert loop.telemetry["thrust"].tolist() == [[49.0] * 4]
 
 
-def test_telemetry_is_in_the_papers_frame() -> None:
+def test_telemetry_has_z_up() -> None:
     flight = Flight(5.0)
     half = math.radians(20) / 2
     flight.state.position[:] = 1.0, 2.0, 5.0
     flight.state.quaternion[:] = math.cos(half), 0.0, 0.0, math.sin(half)  # to the left
     flight.step(0.0)
     told = flight.loop.telemetry
-    assert told["position"].ravel() == pytest.approx([-2.0, 5.0, 1.0], abs=1e-9)
-    assert told["attitude"].ravel() == pytest.approx([0.0, -20.0, 0.0], abs=1e-9)
+    assert told["position"].ravel() == pytest.approx([1.0, 2.0, 5.0], abs=1e-9)
+    assert told["attitude"].ravel() == pytest.approx(
+        [math.cos(half), 0.0, 0.0, math.sin(half)], abs=1e-9
+    )
 
 
 OPTIONS = st.fixed_dictionaries(
@@ -469,8 +471,8 @@ def test_seeds(env_id: str) -> None:
 def test_targets_and_starts_are_uniform() -> None:
     env = _env(target=(3.0, 7.0), start_band=0.5)
     infos = [env.reset(seed=None if n else 0)[1] for n in range(2000)]
-    targets = np.array([info["Y_goal"] for info in infos])
-    offsets = np.array([info["Y"] for info in infos]) - targets
+    targets = np.array([info["goal_z"] for info in infos])
+    offsets = np.array([info["z"] for info in infos]) - targets
     for values, low, high in ((targets, 3.0, 7.0), (offsets, -0.5, 0.5)):
         share = np.sort((values - low) / (high - low))
         # Kolmogorov-Smirnov: 1.95 / sqrt(n) is passed by chance once in a thousand times.

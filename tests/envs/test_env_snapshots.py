@@ -120,12 +120,12 @@ def test_a_closed_env_has_no_snapshot() -> None:
 def test_a_single_env_flies_on_rigid() -> None:
     env = gym.make(HOVER, backend="rigid")
     _, info = env.reset(seed=1)
-    assert isinstance(info["X"], float)
+    assert isinstance(info["x"], float)
     assert isinstance(info["reward_position"], float)
     alone = gym.make(HOVER)
     _, exact = alone.reset(seed=1)
     assert list(info) == list(exact)
-    assert [info[name] for name in "XYZ"] == pytest.approx([exact[name] for name in "XYZ"])
+    assert [info[name] for name in "xyz"] == pytest.approx([exact[name] for name in "xyz"])
 
 
 def test_parallel_envs_are_restored_and_copied() -> None:

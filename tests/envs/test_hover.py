@@ -110,21 +110,20 @@ def test_a_single_rotor_turns_the_craft() -> None:
     info: dict[str, float] = {}
     for _ in range(10):
         *_, info = env.step(np.array([0.2, 0, 0, 0], np.float32))
-    assert info["phi"] < -0.1  # nose up
-    assert info["psi"] < -0.1  # left side up
+    assert info["qy"] < -1e-3  # nose up
+    assert info["qx"] > 1e-3  # left side up
     assert info["heading_error"] > 0.01  # to the left, as its reaction is about +z
 
 
 def test_starts_fill_their_bands() -> None:
     env: Any = gym.make_vec(ID, num_envs=2000, goal=(3.0, -2.0, 7.0), heading=50.0)
     _, info = env.reset(seed=0)
-    # Paper's frame: X = -y, Y = z, Z = x.
-    for name, goal in (("X", 2.0), ("Y", 7.0), ("Z", 3.0)):
+    for name, goal in (("x", 3.0), ("y", -2.0), ("z", 7.0)):
         share = np.sort((info[name] - goal + 1) / 2)
         assert abs(share - np.linspace(0, 1, 2000)).max() < 1.95 / math.sqrt(2000)
-        assert info[f"{name}_goal"].tolist() == [goal] * 2000
-    up = env.telemetry["attitude"]
-    tilt = np.degrees(np.arccos(np.cos(np.radians(up[:, 0])) * np.cos(np.radians(up[:, 2]))))
+        assert info[f"goal_{name}"].tolist() == [goal] * 2000
+    aside = np.hypot(info["qx"], info["qy"])
+    tilt = np.degrees(2 * np.arcsin(aside))
     share = np.sort(tilt / 30.0)
     assert abs(share - np.linspace(0, 1, 2000)).max() < 1.95 / math.sqrt(2000)
     assert 30.0 - 0.1 < tilt.max() <= 30.0 + 1e-9

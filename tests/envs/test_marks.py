@@ -63,14 +63,14 @@ def test_a_gate_is_a_square_across_its_heading() -> None:
 
 
 def test_what_moves_is_at_the_goal_in_place_of_its_disc() -> None:
-    """The paper's (1, 0.3, 2) is (2, -1, 0.3) in MuJoCo's frame; the pad lies 0.3 m below."""
+    """The goal is at (2, -1, 0.3); the pad lies 0.3 m below."""
     pad = Mark(shape="disc", size=0.5, position=(0.0, 0.0, -0.3), moves=True)
-    ((kind, place, size),) = drawn(goal=(1.0, 0.3, 2.0), marks=(pad,))
+    ((kind, place, size),) = drawn(goal=(2.0, -1.0, 0.3), marks=(pad,))
     assert kind == CYLINDER
     assert place == pytest.approx([2.0, -1.0, 0.01], abs=1e-6)
     assert size == pytest.approx([0.5, 0.5, 0.01], abs=1e-6)
     ((kind, place, _),) = drawn(
-        goal=(1.0, 5.0, 2.0), marks=(Mark(shape="ball", size=0.3, moves=True),)
+        goal=(2.0, -1.0, 5.0), marks=(Mark(shape="ball", size=0.3, moves=True),)
     )
     assert kind == SPHERE
     assert place == pytest.approx([2.0, -1.0, 5.0])

@@ -50,18 +50,20 @@ def test_the_elevation_env_by_hand() -> None:
     assert spec.agents == ("drone_0",)
     assert spec.options["target"] == [4.0, 8.0]  # as JSON gives it back
     assert [array.name for array in spec.telemetry] == [
-        "position", "attitude", "thrust", "goal", "metrics",
+        "position", "attitude", "velocity", "body_rates", "thrust", "goal", "metrics",
     ]  # fmt: skip
     names = [name for array in spec.telemetry for name in component_names(array)]
     assert names == [
-        "X", "Y", "Z", "phi", "theta", "psi", "F1", "F2", "F3", "F4",
-        "X_goal", "Y_goal", "Z_goal", "elevation_error",
+        "x", "y", "z", "qw", "qx", "qy", "qz", "vx", "vy", "vz", "rate_x", "rate_y", "rate_z",
+        "F1", "F2", "F3", "F4", "goal_x", "goal_y", "goal_z", "elevation_error",
     ]  # fmt: skip
     assert all(array.dtype == "float64" for array in spec.telemetry)
     assert spec.headline == Metric(
         name="elevation_error", unit="m", settled=0.05, held=0.1, symbol="E", signed=True
     )
-    assert spec.telemetry[2].bounds()[1].tolist() == [100.0] * 4
+    assert {array.frame for array in spec.telemetry} == {"world", "body to world", "body", ""}
+    assert spec.constants["gravity"] == 9.8
+    assert spec.telemetry[4].bounds()[1].tolist() == [100.0] * 4
 
 
 def test_the_hover_env_by_hand() -> None:

@@ -131,7 +131,7 @@ def test_a_mask_resets_some_and_leaves_the_others(env_id: str) -> None:
     observations, info = env.reset(seed=[9, 1, 9, 1], options={"reset_mask": mask})
     assert observations[0].tobytes() == observations[2].tobytes()
     assert observations[[1, 3]].tobytes() == before[[1, 3]].tobytes()
-    assert (info["_Y"] == mask).all()
+    assert (info["_z"] == mask).all()
     with pytest.raises(gym.error.ResetNeeded, match="env 1 first"):
         env.step(hold)
     env.reset(options={"reset_mask": ~mask})
@@ -143,15 +143,15 @@ def test_targets_and_starts_of_ones_own() -> None:
     targets = np.array([3.0, 5.0, 400.0])
     starts = np.array([2.5, 7.0, 399.0])
     observations, info = env.reset(options={"target": targets, "start": starts})
-    assert info["Y"].tolist() == starts.tolist()
-    assert info["Y_goal"].tolist() == targets.tolist()
+    assert info["z"].tolist() == starts.tolist()
+    assert info["goal_z"].tolist() == targets.tolist()
     np.testing.assert_array_equal(observations[:, 0], (targets - starts).astype(np.float32))
     assert not env.step(np.zeros((3, 1), np.float32))[2].any()
     # Without a start, the seed gives how far from the target it is: as with the env's own target.
     plain, _ = env.reset(seed=1)
     observations, info = env.reset(seed=1, options={"target": 50.0})
     np.testing.assert_allclose(observations, plain, atol=1e-6)
-    np.testing.assert_allclose(info["Y"], 50.0 - plain[:, 0], atol=1e-5)
+    np.testing.assert_allclose(info["z"], 50.0 - plain[:, 0], atol=1e-5)
 
 
 @pytest.mark.parametrize(

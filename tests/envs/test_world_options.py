@@ -121,7 +121,7 @@ def test_over_udp_the_same_bits_and_what_was_drawn() -> None:
 def test_options_that_are_on_move_no_other_draw() -> None:
     plain = gym.make(HOVER, vehicle=str(RACER)).reset(seed=3)[1]
     changed = gym.make(HOVER, vehicle=str(RACER), **WORLD).reset(seed=3)[1]
-    assert [plain[axis] for axis in "XYZ"] == [changed[axis] for axis in "XYZ"]
+    assert [plain[axis] for axis in "xyz"] == [changed[axis] for axis in "xyz"]
 
 
 def test_without_them_nothing_is_told_of_them() -> None:

@@ -175,7 +175,7 @@ def test_minari_reads_it_and_its_env_flies_it_again(
                 assert same([r for r, *_ in outcomes], episode.rewards)
                 ends = [episode.terminations.tolist(), episode.truncations.tolist()]
                 assert [[e[1] for e in outcomes], [e[2] for e in outcomes]] == ends
-                assert len(episode.infos["Y"]) == len(episode.actions) + 1
+                assert len(episode.infos["z"]) == len(episode.actions) + 1
                 assert episode.infos["elevation_error"].dtype == np.float64
 
 

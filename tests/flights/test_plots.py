@@ -19,6 +19,7 @@ from rotorgram.udp.spawn import spawn_simulator
 pytest.importorskip("mcap")
 HEAD = [
     "time [s]", "episode", "drone", "x [m]", "y [m]", "z [m]", "qw", "qx", "qy", "qz",
+    "vx [m/s]", "vy [m/s]", "vz [m/s]", "rate_x [rad/s]", "rate_y [rad/s]", "rate_z [rad/s]",
     "F1 [N]", "F2 [N]", "F3 [N]", "F4 [N]", "goal_x [m]", "goal_y [m]", "goal_z [m]",
     "position_error [m]", "heading_error [deg]",
 ]  # fmt: skip
@@ -117,11 +118,10 @@ def test_wrong_words_of_log(
 
 
 def test_columns_of_a_flight_by_hand() -> None:
-    """The paper's X right, Y up, Z forward become x forward, y left, z up."""
     spec = env_spec(EnvConfig(env_id="rotorgram/Elevation-v0"))
     telemetry = {array.name: np.zeros((2, *array.shape)) for array in spec.telemetry}
-    telemetry["position"] = np.array([(1.0, 2.0, 3.0), (1.0, 2.5, 3.0)])
-    telemetry["attitude"] = np.array([(0.0, 0.0, 0.0), (0.0, 90.0, 0.0)])  # nose right
+    telemetry["position"] = np.array([(3.0, -1.0, 2.0), (3.0, -1.0, 2.5)])
+    telemetry["attitude"] = np.array([(1.0, 0.0, 0.0, 0.0), (0.6, 0.0, 0.0, -0.8)])
     flight = Trajectory(
         spec=spec,
         telemetry=telemetry,
@@ -136,8 +136,8 @@ def test_columns_of_a_flight_by_hand() -> None:
     assert columns["x"] == [3.0, 3.0]
     assert columns["y"] == [-1.0, -1.0]
     assert columns["z"] == [2.0, 2.5]
-    assert columns["qw"] == pytest.approx([1.0, math.sqrt(0.5)])
-    assert columns["qz"] == pytest.approx([0.0, -math.sqrt(0.5)])
+    assert columns["qw"] == [1.0, 0.6]
+    assert columns["qz"] == [0.0, -0.8]
     assert columns["reward"][1] == 0.5
 
 

@@ -77,19 +77,19 @@ def test_a_trajectory_is_what_the_env_tells() -> None:
         flown = fly(env, PID(SPEC), 7, episode=3)
         observation, info = env.reset(seed=7)
         policy = PID(SPEC)
-        heights = [info["Y"]]
+        heights = [info["z"]]
         errors = [info["elevation_error"]]
         rewards = []
         for _ in range(25):
             observation, reward, *_, info = env.step(policy.act(observation))
-            heights.append(info["Y"])
+            heights.append(info["z"])
             errors.append(info["elevation_error"])
             rewards.append(reward)
     assert len(flown) == 25
     assert flown.ending == "truncated"
     assert flown.seconds == 0.5
     assert flown.episode == 3
-    assert flown.telemetry["position"][:, 1].tolist() == heights
+    assert flown.telemetry["position"][:, 2].tolist() == heights
     assert flown.headline.tolist() == errors
     assert flown.rewards.tolist() == rewards
     assert flown.mean_thrust[0] == pytest.approx(49.0)
@@ -145,11 +145,11 @@ def test_any_drone_of_any_session(tmp_path: Path) -> None:
     with closing(gym.make(ELEVATION).unwrapped) as env:
         for seed, drone, steps in ((7, 0, 8), (8, 1, 5)):
             _, info = env.reset(seed=seed)
-            heights = [info["Y"]]
+            heights = [info["z"]]
             for _ in range(steps):
-                heights.append(env.step(actions[0])[4]["Y"])
+                heights.append(env.step(actions[0])[4]["z"])
             (found,) = recorded_trajectories(journal, [0], drone=drone)
-            assert found.telemetry["position"][:, 1].tolist() == heights
+            assert found.telemetry["position"][:, 2].tolist() == heights
             assert found.ending == "cut off"
     (second,) = recorded_trajectories(journal, [1], drone=1, session=1)
     assert len(second) == 3

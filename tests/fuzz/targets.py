@@ -110,7 +110,7 @@ def fuzz_text(data: bytes) -> None:
             check_numbers(message)
             assert isinstance(message, State | Command | Close)
             try:
-                again = text.encode(message)
+                again = text.encode(message, LAYOUT)
             except ValueError:  # 17 digits each do not fit where fewer did
                 expect(len(data) > 200, "not to be encoded", message)
                 continue

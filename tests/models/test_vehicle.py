@@ -98,10 +98,10 @@ def test_action_zero_hovers_and_any_other_climbs(files: dict[str, Path], name: s
         _, info = env.reset(seed=0)
         for _ in range(100):
             *_, info = env.step(np.array([action], np.float32))
-        turned = abs(np.array([info["phi"], info["theta"], info["psi"]])).max()
+        turned = np.degrees(2 * math.hypot(info["qx"], info["qy"], info["qz"]))
         assert turned < 1e-6
-        assert math.hypot(info["X"], info["Z"]) < 1e-6
-        heights[action] = info["Y"]
+        assert math.hypot(info["x"], info["y"]) < 1e-6
+        heights[action] = info["z"]
         thrusts = [info[f"F{i + 1}"] for i in range(vehicle.num_rotors)]
         # All rotors in proportion to hover: no torque, whatever the arms.
         share = np.array(thrusts) / vehicle.hover_thrust
@@ -117,11 +117,11 @@ def test_acceleration_is_that_of_newton(files: dict[str, Path], name: str) -> No
     loop = Loop(EnvConfig.from_keywords(ELEVATION, vehicle=files[name], action="offset"))
     still = np.zeros((1, 1), np.float32)
     loop.advance(still, np.ones(1, bool), [0])
-    start = loop.telemetry["position"][0, 1]
+    start = loop.telemetry["position"][0, 2]
     for _ in range(10):
         loop.advance(still + 0.25)
     force = float(loop.telemetry["thrust"].sum()) - vehicle.mass * vehicle.gravity
-    climbed = loop.telemetry["position"][0, 1] - start
+    climbed = loop.telemetry["position"][0, 2] - start
     assert climbed == pytest.approx(0.5 * force / vehicle.mass * 0.2**2, rel=1e-6)
 
 
@@ -161,8 +161,8 @@ def test_each_vehicle_has_the_spec_of_its_rotors(files: dict[str, Path]) -> None
     spec = env.unwrapped.env_spec  # type: ignore[attr-defined]
     assert spec.vehicle == "included"
     assert spec.vehicle_hash == Vehicle.load(files["included"]).hash
-    assert spec.telemetry[2].components == ("F1", "F2", "F3")
-    assert spec.telemetry[2].high == 9.0
+    assert spec.telemetry[4].components == ("F1", "F2", "F3")
+    assert spec.telemetry[4].high == 9.0
 
 
 @pytest.mark.parametrize(

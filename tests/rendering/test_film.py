@@ -34,10 +34,10 @@ def trajectory(*elevations: float, ending: Any = "truncated") -> Trajectory:
     zeros = np.zeros_like(heights)
     steps = len(heights)
     telemetry = {
-        "position": np.stack((zeros, heights, zeros), axis=1),
-        "attitude": np.zeros((steps, 3)),
+        "position": np.stack((zeros, zeros, heights), axis=1),
+        "attitude": np.tile((1.0, 0.0, 0.0, 0.0), (steps, 1)),
         "thrust": np.full((steps, 4), 49.0),
-        "goal": np.tile((0.0, 5.0, 0.0), (steps, 1)),
+        "goal": np.tile((0.0, 0.0, 5.0), (steps, 1)),
         "metrics": (5.0 - heights)[:, np.newaxis],
     }
     return Trajectory(

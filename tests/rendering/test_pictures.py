@@ -166,14 +166,14 @@ def test_a_craft_below_its_goal_is_so_far_below_the_disc(stage: Stage, canvas: C
 def test_without_a_goal_there_is_no_disc_and_the_craft_is_in_the_middle(
     camera: Camera, stage: Stage, canvas: Canvas
 ) -> None:
-    stage.show(at(7.0, goal=None, position=(3.0, 7.0, -2.0)))
+    stage.show(at(7.0, goal=None, position=(-2.0, -3.0, 7.0)))
     assert green_in(canvas.draw(camera)).sum() == 0
     if camera != "onboard":
         assert np.nonzero(craft_in(canvas, camera))[1].mean() == pytest.approx(WIDTH / 2, abs=3)
 
 
 def test_a_goal_may_be_anywhere(stage: Stage, canvas: Canvas) -> None:
-    stage.show(at(5.0, goal=(2.0, 5.0, 0.0)))  # 2 m to the right of the craft
+    stage.show(at(5.0, goal=(0.0, -2.0, 5.0)))  # 2 m to the right of the craft
     disc = np.nonzero(green_in(canvas.draw("chase")))[1].mean()
     craft = np.nonzero(craft_in(canvas, "chase"))[1].mean()
     assert disc - craft == pytest.approx(2 * pixels_per_metre(stage, "chase"), rel=0.2)

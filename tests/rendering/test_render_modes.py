@@ -180,8 +180,8 @@ def test_drones_of_one_world_are_in_one_picture_where_they_are() -> None:
     assert picture.dtype == np.uint8
     env.close()
     stage = Stage("plain", 2, names=("a", "b"))
-    still: Any = {"attitude": (0.0,) * 3, "thrusts": (49.0,) * 4}
-    stage.show(*(Moment(position=(x, 9.0, 2.0 * x), **still) for x in (1.0, 4.0)))
+    still: Any = {"attitude": (1.0, 0.0, 0.0, 0.0), "thrusts": (49.0,) * 4}
+    stage.show(*(Moment(position=(2.0 * x, -x, 9.0), **still) for x in (1.0, 4.0)))
     places = stage.data.qpos.reshape(2, 7)[:, :3]
     assert places == pytest.approx(np.array([[2.0, -1.0, 9.0], [8.0, -4.0, 9.0]]))
     assert stage.least_distance == pytest.approx(math.hypot(6.0, 3.0))
@@ -191,26 +191,27 @@ def test_drones_of_one_world_are_in_one_picture_where_they_are() -> None:
 def test_cameras_hold_every_craft_and_goal_of_one_world() -> None:
     stage = Stage("plain", 2, names=("a", "b"))
     stage.show(*(
-        Moment(position=(x, 9.0, 0.0), goal=(-5.0 * x, 9.0, 0.0), attitude=(0.0,) * 3,
+        Moment(position=(0.0, -x, 9.0), goal=(0.0, 5.0 * x, 9.0), attitude=(1.0, 0.0, 0.0, 0.0),
                thrusts=(49.0,) * 4)
         for x in (1.0, -4.0)
     ))  # fmt: skip
     radii = {"chase": 3.85, "top": 5.5, "front": 6.9, "side": 6.9, "free": 3.85}
-    for name, count in radii.items():  # the goals are at X = -5 and 20 m
+    for name, count in radii.items():  # the goals are at y = 5 and -20 m
         camera = stage.camera(name)
         assert camera.distance == pytest.approx(count * stage.radius + 25.0), name
-    assert stage.camera("chase").lookat[1] == pytest.approx(1.5)  # the craft at X = -1.5 m
+    assert stage.camera("chase").lookat[1] == pytest.approx(1.5)  # the craft at y = 1.5 m
     assert stage.camera("free").lookat[1] == pytest.approx(-7.5)  # and the goals at 7.5 m
 
 
 def test_drones_of_one_world_are_named_and_have_paths_and_goals_of_their_own_colour() -> None:
     stage = Stage("plain", 2, names=("a", "b"))
+    still: Any = {"attitude": (1.0, 0.0, 0.0, 0.0), "thrusts": (49.0,) * 4}
     for step in range(10):
-        stage.show(*(
-            Moment(position=(x, 9.0, 0.1 * step), goal=(x, 9.0, 5.0), attitude=(0.0,) * 3,
-                   thrusts=(49.0,) * 4, step=step)
-            for x in (1.0, 4.0)
-        ))  # fmt: skip
+        moments = []
+        for y in (-1.0, -4.0):
+            goal = (5.0, y, 9.0)
+            moments.append(Moment(position=(0.1 * step, y, 9.0), goal=goal, step=step, **still))
+        stage.show(*moments)
     scene = mujoco.MjvScene(stage.model, 1000)
     stage.decorate(scene)
     geoms = scene.geoms[: scene.ngeom]

@@ -22,8 +22,8 @@ live = LiveView(stage, surface, pace)
 for step in range(20):
     height = 5.0 + step / 20
     live.draw(*[
-        Moment(position=(0.0, height, 0.0), attitude=(0.0, 0.0, 0.0), thrusts=(49.0,) * 4,
-               goal=(0.0, 5.0, 0.0), step=step)
+        Moment(position=(0.0, 0.0, height), attitude=(1.0, 0.0, 0.0, 0.0), thrusts=(49.0,) * 4,
+               goal=(0.0, 0.0, 5.0), step=step)
     ] * 2)
     time.sleep(0.05)
 end = time.monotonic() + 60

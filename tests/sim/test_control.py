@@ -325,13 +325,18 @@ def env_of(level: str, **options: Any) -> Any:
 
 
 def test_the_spec_tells_names_units_and_frames() -> None:
-    action = env_of("position").env_spec.action
+    spec = env_of("position").env_spec
+    action = spec.action
     assert action.components == ("offset x", "offset y", "offset z", "offset of the heading")
-    assert action.unit == ("6.084548 m", "6.084548 m", "4 m", "3.141593 rad")
-    expected = "world turned by the heading, approached at 0.8831687 /s, gravity 9.8 m/s²"
-    assert action.frame == expected
-    action = env_of("rates").env_spec.action
-    assert action.unit[:2] == ("1", "11.06888 rad/s")
+    assert action.unit == ("m", "m", "m", "rad")
+    assert action.frame == "world turned by the heading"
+    assert spec.action_scale == pytest.approx([6.084548, 6.084548, 4.0, math.pi])
+    assert spec.constants["position_gain"] == pytest.approx(0.8831687)
+    assert spec.constants["gravity"] == 9.8
+    spec = env_of("rates").env_spec
+    action = spec.action
+    assert action.unit == ("1", "rad/s", "rad/s", "rad/s")
+    assert spec.action_scale[:2] == pytest.approx([1.0, 11.06888])
     assert action.low == -1.0
     assert action.high == 1.0
     assert action.shape == (4,)

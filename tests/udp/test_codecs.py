@@ -242,7 +242,7 @@ def test_text_comes_back_bit_for_bit(reward: float, told: float, seen: float, fl
         truncated=np.array([not flag]),
         telemetry=(np.array([[told, -0.0]]), np.array([1.5])),
     )
-    got = text.decode_state(text.encode(sent), of)
+    got = text.decode_state(text.encode(sent, of), of)
     assert isinstance(got, State)
     assert binary.encode(got, of) == binary.encode(sent, of)
     order = command(5, value=seen)
@@ -268,6 +268,34 @@ def test_layouts_that_text_cannot_tell(of: Any) -> None:
         text.check_layout(of)
 
 
+def test_text_is_in_the_paper_s_frame() -> None:
+    """A craft at x 3 m, y -1 m, z 2 m; its nose points right, it climbs and turns to the left."""
+    of = Layout(
+        drones=1,
+        observation=(ArrayLayout(shape=(1,)),),
+        action=ArrayLayout(shape=(1,)),
+        telemetry=((3,), (4,), (3,), (3,), (2,)),
+        frames=("world", "body to world", "world", "body", "world"),
+    )
+    half = math.sqrt(0.5)
+    telemetry = [(3.0, -1.0, 2.0), (half, 0.0, 0.0, -half), (0.0, 0.0, 0.5), (0.0, 0.0, 0.25)]
+    arrays = (*(np.array([row]) for row in telemetry), np.array([[7.0, 8.0]]))
+    observations = (np.zeros((1, 1), np.float32),)
+    sent = replace(state(1, of=of), observations=observations, telemetry=arrays)
+    fields = text.encode(sent, of).decode().split(",")
+    numbers = [float(field) for field in fields[5:]]
+    assert numbers[:3] == [1.0, 2.0, 3.0]  # right, up, forward
+    assert numbers[3:6] == pytest.approx([0.0, 90.0, 0.0])
+    assert numbers[6:9] == [0.0, 0.5, 0.0]
+    assert numbers[9:12] == [0.0, -0.25, 0.0]  # left-handed: to the right is positive
+    assert numbers[12:] == [7.0, 8.0]
+    assert text.telemetry_size(of) == 14
+    got = text.decode_state(text.encode(sent, of), of)
+    assert isinstance(got, State)
+    for there, back in zip(sent.telemetry, got.telemetry, strict=True):
+        assert back == pytest.approx(there)
+
+
 def of_numbers(count: int) -> Layout:
     """One drone whose line has so many numbers: the reward, three of observation, the telemetry."""
     action = ArrayLayout(shape=(1,))
@@ -276,7 +304,7 @@ def of_numbers(count: int) -> Layout:
 
 
 def test_the_longest_line_is_known_at_the_start() -> None:  # fault 57
-    of = of_numbers(40)
+    of = of_numbers(47)
     text.check_layout(of)
     longest = -2.2250738585072014e-308
     state_ = replace(
@@ -284,11 +312,11 @@ def test_the_longest_line_is_known_at_the_start() -> None:  # fault 57
         sequence=2**64 - 1,
         rewards=np.array([longest]),
         observations=(np.full((1, 3), -1.1754944e-38, np.float32),),
-        telemetry=(np.full((1, 36), longest),),
+        telemetry=(np.full((1, 43), longest),),
     )
-    assert 1000 < len(text.encode(state_)) <= 1024
-    with pytest.raises(InputError, match="lines of at most 1024 bytes, got up to 1049 with 41 num"):
-        text.check_layout(of_numbers(41))
+    assert 1175 < len(text.encode(state_, of)) <= 1200
+    with pytest.raises(InputError, match="lines of at most 1200 bytes, got up to 1224 with 48 num"):
+        text.check_layout(of_numbers(48))
 
 
 def test_a_hello_of_nothing_but_extensions_is_not_read() -> None:

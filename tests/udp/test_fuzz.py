@@ -114,7 +114,7 @@ def freed(receive: Any) -> Any:
     ("place", "name", "broken"),
     [
         (binary, "encode", lambda right: lambda *a: right(*a) + b"x"),
-        (text, "encode", lambda right: lambda message: right(message) + b"1"),
+        (text, "encode", lambda right: lambda *a: right(*a) + b"1"),
         (Key, "open", lambda right: lambda self, datagram, *a: datagram[OVERHEAD:]),
         (EnvSpec, "to_json", lambda right: lambda self: right(replace(self, control_period=9.0))),
         (Assembler, "take", lambda right: lambda self, datagram: right(self, datagram) and b"x"),

@@ -64,10 +64,12 @@ def test_the_bytes_are_those_of_the_page() -> None:
         "alive": by_hand(9, 1, b""),
         "missing: 0, 2 and 9 of 10": by_hand(10, 2, struct.pack("<BBHH2B", 4, 0, 10, 0, 5, 2)),
         "state 1 echoes the nonce": by_hand(
-            4, 1, struct.pack("<dQ3f4xd2B6x4d", 0, nonce, 0.25, -0.0, 1.5, 0, 0, 0, 1, 5, -2, 0.25)
+            4, 1, struct.pack("<dQ3f4xd2B6x4d", 0, nonce, 0.25, -0.0, 1.5, 0, 0, 0, -2, -1, 5, 0.25)
         ),
         "state, truncated": by_hand(
-            4, 2, struct.pack("<dQ3f4xd2B6x4d", 0.02, 0, 0.25, -0.0, 1.5, 0.5, 0, 1, 1, 5, -2, 0.25)
+            4,
+            2,
+            struct.pack("<dQ3f4xd2B6x4d", 0.02, 0, 0.25, -0.0, 1.5, 0.5, 0, 1, -2, -1, 5, 0.25),
         ),
         "state of two drones with a picture": by_hand(
             4,
@@ -201,16 +203,16 @@ def test_text_lines() -> None:
     commands = [text.decode_command(line.encode(), layout, 0) for line in lines["commands"]]
     first = states[0]
     assert isinstance(first, State)
-    assert text.encode(first).decode() == lines["states"][0]
+    assert text.encode(first, layout).decode() == lines["states"][0]
     assert first.rewards.item() == 0.5
     assert first.truncated.item() is True
     assert first.observations[0].tobytes() == struct.pack("<3f", 0.25, -0.0, 1.5)
-    assert [array.tolist() for array in first.telemetry] == [[[1.0, 5.0, -2.0]], [[0.25]]]
+    assert [array.tolist() for array in first.telemetry] == [[[-2.0, -1.0, 5.0]], [[0.25]]]
     assert [state.sequence for state in states] == [1, 0, 7, 2**64 - 1, 3]
     for other in states[1:4]:
         assert isinstance(other, State)
         assert [a.tolist() for a in other.observations] == [[[0.25, -0.0, 1.5]]]
-        assert [a.tolist() for a in other.telemetry] == [[[1.0, 5.0, -2.0]], [[0.25]]]
+        assert [a.tolist() for a in other.telemetry] == [[[-2.0, -1.0, 5.0]], [[0.25]]]
     assert [isinstance(state, Close) for state in states] == [False] * 4 + [True]
     assert [text.encode(command).decode() for command in commands] == [
         "1,2",

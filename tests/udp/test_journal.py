@@ -328,7 +328,7 @@ def test_a_refused_simulator(tmp_path: Path) -> None:
 
 CHANGES = {
     "reward": lambda s: replace(s, rewards=flip(s.rewards, 2)),
-    "telemetry theta": lambda s: replace(s, telemetry=flipped(s.telemetry, 1, 2, 1)),
+    "telemetry qx": lambda s: replace(s, telemetry=flipped(s.telemetry, 1, 2, 1)),
     "observation rate of the error": (
         lambda s: replace(s, observations=flipped(s.observations, 0, 2, 1))
     ),
@@ -592,7 +592,7 @@ def test_what_is_no_journal(tmp_path: Path) -> None:
     writer.start()
     writer.finish()
     path.write_bytes(buffer.getvalue())
-    with pytest.raises(ValueError, match="expected a journal of format 3, got 'another MCAP file'"):
+    with pytest.raises(ValueError, match="expected a journal of format 4, got 'another MCAP file'"):
         Verification(path)
     with pytest.raises(FileNotFoundError):
         Verification(tmp_path / "none")
@@ -636,7 +636,7 @@ def test_an_event_that_is_nested_too_deep(tmp_path: Path) -> None:
     with path.open("wb") as new:
         writer = Writer(new)
         writer.start()
-        writer.add_metadata("rotorgram", {"format": "3"})
+        writer.add_metadata("rotorgram", {"format": "4"})
         schema = writer.register_schema("rotorgram.Event", "jsonschema", b"{}")
         channel = writer.register_channel("/slot0/events", "json", schema)
         writer.add_message(channel, 0, b"[" * 200_000, 0)
@@ -689,7 +689,8 @@ def test_a_file_that_was_cut_is_read_up_to_the_cut(
 
 def test_a_damaged_file_is_read_up_to_the_damage(flight: SimpleNamespace, tmp_path: Path) -> None:
     data = bytearray(flight.simulator.read_bytes())
-    data[len(data) // 2] ^= 0x10
+    for at in range(len(data) // 2, len(data) // 2 + 1000):
+        data[at] ^= 0x10
     path = tmp_path / "damaged.mcap"
     path.write_bytes(data)
     summary = Summary(path)
@@ -843,4 +844,4 @@ def test_the_snippet_of_the_page(
     lines = capsys.readouterr().out.splitlines()
     states = [i.message for i in Recording(flight.simulator) if isinstance(i.message, State)]
     assert len(lines) == len(states)
-    assert float(lines[-1].split()[-1]) == states[-1].telemetry[0][0, 1]
+    assert float(lines[-1].split()[-1]) == states[-1].telemetry[0][0, 2]

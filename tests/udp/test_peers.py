@@ -156,7 +156,7 @@ def test_agent_flies_the_same_whatever_the_network_does(agent: list[str]) -> Non
     assert flown(agent, LOSSY, 60) == flown(agent, None, 60)
 
 
-TELEMETRY = ",0,5,0,0,0,0,49,49,49,49,0,5,0,0.5"
+TELEMETRY = ",0,5,0,0,0,0,0,0,0,0,0,0,49,49,49,49,0,5,0,0.5"
 GOLDEN = json.loads((ROOT / "docs" / "golden.json").read_text("utf-8"))
 JUNK_LINES = [
     *[line.encode() for line in GOLDEN["text of env one"]["malformed states"]],
@@ -325,26 +325,28 @@ def test_simulator_flies_the_closed_form_and_our_drone(simulator: list[str]) -> 
     for i, (action, observation, reward, *ends, info) in enumerate(seen):
         step = i % 251
         if step == 0:
-            y = info["Y"]
+            y = info["z"]
             v = 0.0
             thrust = 49.0
             assert abs(5 - y) <= 1
             # Ours starts elsewhere, which moves the whole flight by as much.
             fly(ours, 0.0, reset=True)
-            moved = y - ours.telemetry["position"][0, 1]
+            moved = y - ours.telemetry["position"][0, 2]
         else:
             thrust = min(100.0, max(0.0, thrust + 5 * min(1.0, max(-1.0, action))))
             u = 4 * thrust / 20 - 9.8
             y = y + v * 0.02 + u * 0.02**2 / 2
             v = v + u * 0.02
             fly(ours, action)
-            height = ours.telemetry["position"][0, 1]
-            assert info["Y"] == pytest.approx(height + moved, abs=1e-9)
+            height = ours.telemetry["position"][0, 2]
+            assert info["z"] == pytest.approx(height + moved, abs=1e-9)
             assert info["F1"] == pytest.approx(ours.telemetry["thrust"][0, 0], abs=1e-9)
-        assert [info[n] for n in ("X", "Z", "phi", "theta", "psi")] == [0.0] * 5
-        assert [info[n] for n in ("X_goal", "Y_goal", "Z_goal")] == [0.0, 5.0, 0.0]
-        assert info["elevation_error"] == 5.0 - info["Y"]
-        assert [info[n] for n in ("Y", "F1", "F2", "F3", "F4")] == pytest.approx(
+        still = ("x", "y", "qx", "qy", "qz", "vx", "vy", "rate_x", "rate_y", "rate_z")
+        assert [info[n] for n in still] == [0.0] * 10
+        assert [info[n] for n in ("qw", "goal_x", "goal_y", "goal_z")] == [1.0, 0.0, 0.0, 5.0]
+        assert info["vz"] == pytest.approx(v, abs=1e-9)
+        assert info["elevation_error"] == 5.0 - info["z"]
+        assert [info[n] for n in ("z", "F1", "F2", "F3", "F4")] == pytest.approx(
             [y, thrust, thrust, thrust, thrust], abs=1e-9
         )
         assert observation == pytest.approx([5 - y, -v, thrust / 49 - 1], abs=1e-6)
@@ -451,12 +453,15 @@ class Hand:
         assert worlds == 1
         assert len(got) == 40 + size
         assert EnvSpec.from_json(got[40:].decode()) == replace(
-            env_spec(EnvConfig(env_id=ENV_ID)), vehicle="point mass", vehicle_hash="0" * 32
+            env_spec(EnvConfig(env_id=ENV_ID)),
+            vehicle="point mass",
+            vehicle_hash="0" * 32,
+            constants={"gravity": 9.8},
         )
 
     def state(self, sequence: int) -> tuple[float, tuple[float, ...], tuple[float, ...], int, int]:
         got = self.next()
-        assert len(got) == 72 + 8 * 14
+        assert len(got) == 72 + 8 * 21
         assert got[:4] == b"\xa7\x52\x02\x04"
         assert struct.unpack_from("<QQ", got, 8) == (self.session, sequence)
         time, nonce = struct.unpack_from("<dQ", got, 24)
@@ -464,7 +469,7 @@ class Hand:
         assert nonce == (NONCE if sequence == 1 else 0)
         observation = struct.unpack_from("<3f", got, 40)
         (reward,) = struct.unpack_from("<d", got, 56)
-        return reward, struct.unpack_from("<14d", got, 72), observation, got[64], got[65]
+        return reward, struct.unpack_from("<21d", got, 72), observation, got[64], got[65]
 
     def closed(self, sequence: int, reason: str = "") -> None:
         assert self.next() == datagram(6, self.session, sequence, text_field(reason))
@@ -529,10 +534,12 @@ def test_simulator_obeys_the_rules(simulator: list[str]) -> None:
         reward, telemetry, observation, *ends = first
         assert reward == 0
         assert ends == [0, 0]
-        y, error = telemetry[1], telemetry[13]
-        assert telemetry == (0, y, 0, 0, 0, 0, 49, 49, 49, 49, 0, 5, 0, error)
-        assert error == 5 - y
-        assert observation == pytest.approx((5 - telemetry[1], 0, 0))
+        height = telemetry[2]
+        error = telemetry[20]
+        assert telemetry[:13] == (0, 0, height, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0)
+        assert telemetry[13:] == (49, 49, 49, 49, 0, 0, 5, error)
+        assert error == 5 - height
+        assert observation == pytest.approx((5 - height, 0, 0))
         hand.send(*junk(hand, 1))
         hand.repeat()
         hand.repeat()
@@ -545,7 +552,7 @@ def test_simulator_obeys_the_rules(simulator: list[str]) -> None:
         assert hand.state(3)[2] != observation
         # One step for one Command, however often it comes.
         hand.send(command(hand.session, 3, 0.5), *[command(hand.session, 3, 0.5)] * 3)
-        assert hand.state(4)[1][6:10] == (51.5,) * 4
+        assert hand.state(4)[1][13:17] == (51.5,) * 4
         hand.send(*junk(hand, 4))
         hand.repeat()
         # A frozen drone stays as it is, without a reward.
@@ -590,7 +597,7 @@ def test_simulator_ends_as_the_rules_say(simulator: list[str]) -> None:
             sequence += 1
             reward, telemetry, _, terminated, truncated = hand.state(sequence)
             hand.send(command(hand.session, sequence, 1e30))
-        error = abs(5 - telemetry[1])
+        error = abs(5 - telemetry[2])
         assert error > 3
         assert reward == pytest.approx((0.5 - error) / (0.5 + error) - 20)
         assert truncated == 0

@@ -239,7 +239,7 @@ TEXT_SIMULATOR = """
     agent = ("127.0.0.1", int(sys.argv[1]))
     elevation, rate, thrust, sequence = 5.0, 0.0, 49.0, 1
     while True:
-        seen = [5.0 - elevation, -rate, thrust / 49 - 1, 0, elevation, 0, 0, 0, 0, *[thrust] * 4,
+        seen = [5.0 - elevation, -rate, thrust / 49 - 1, 0, elevation, *[0] * 10, *[thrust] * 4,
                 0, 5.0, 0, 5.0 - elevation]
         fields = [sequence, 1.0, 0, 0, *seen]
         line = ",".join(map(str, fields)).encode()
@@ -247,7 +247,7 @@ TEXT_SIMULATOR = """
         while answer[0] != str(sequence):
             try:
                 sock.sendto(line, agent)
-                answer = sock.recv(1024).decode().split(",")
+                answer = sock.recv(1200).decode().split(",")
             except (TimeoutError, ConnectionError):
                 pass
         if answer[1] == "close":
@@ -270,7 +270,7 @@ def test_a_text_simulator_that_somebody_else_wrote() -> None:
         assert observation.tolist() == [0.0, 0.0, 0.0]
         observation, reward, terminated, truncated, info = remote.step(np.ones(1))
         rate = (4 * 54 / 20 - 9.8) * 0.02
-        assert info["Y"] == 5.0 + rate * 0.02
+        assert info["z"] == 5.0 + rate * 0.02
         assert info["F4"] == 54.0
         assert observation.tolist() == pytest.approx([-rate * 0.02, -rate, 54 / 49 - 1])
         assert (reward, terminated, truncated) == (1.0, False, False)

@@ -258,7 +258,7 @@ def test_a_mask_resets_some_and_the_others_hold() -> None:
                 for env in (remote, local)
             ]
             assert_same(*masked)
-            assert (masked[0][1]["_Y"] == mask).all()
+            assert (masked[0][1]["_z"] == mask).all()
         with pytest.raises(ValueError, match="reset_mask: expected an array of 4 bool"):
             remote.reset(options={"reset_mask": np.zeros(4, bool)})
 
@@ -284,7 +284,7 @@ def test_a_mask_before_the_first_reset_leaves_the_others_to_be_reset() -> None:
     with flying(2, 2) as (remote, _):
         for env in (remote, local):
             _, info = env.reset(seed=3, options=some)
-            assert info["_Y"].tolist() == [False, True, False, False]
+            assert info["_z"].tolist() == [False, True, False, False]
             with pytest.raises(gym.error.ResetNeeded, match="for env 0 first"):
                 env.step(actions)
         assert_same(remote.reset(seed=3, options=rest), local.reset(seed=3, options=rest))

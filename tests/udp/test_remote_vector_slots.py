@@ -126,7 +126,7 @@ def test_a_text_simulator_is_turned_away_where_two_drones_are_expected() -> None
         sock.sendto(line, remote.address)
         with pytest.raises(PeerSilent):
             remote.reset()
-        assert sock.recv(1024) == b"1,close"
+        assert sock.recv(1200) == b"1,close"
     remote.close()
 
 

@@ -1,6 +1,6 @@
 """Simulates a journal again, and compares every bit."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple, cast
@@ -12,6 +12,7 @@ from ...envs.registry import is_known
 from ...envs.spec import component_names
 from ...models import Backend
 from ...models.errors import InputError
+from ..protocol import text
 from ..protocol.messages import State
 from ..transport.stepped import Steppable, make_stepped
 from .reader import Item, Recording, Session, count_of, printable
@@ -25,7 +26,7 @@ class Difference(NamedTuple):
     sequence: int
     drone: int
     field: str
-    """`reward`, `terminated`, `truncated`, or the array and its component: `telemetry Y`."""
+    """`reward`, `terminated`, `truncated`, or the array and its component: `telemetry z`."""
     recorded: str
     """A float in hexadecimal with all its bits, and in decimal."""
     replayed: str
@@ -143,11 +144,22 @@ class SessionVerdict:
     def _compare(self, recorded: State) -> None:
         if not self._known or self._loop is None:
             self.unchecked += 1
-        elif difference := _difference(recorded, self._loop):
+        elif difference := _difference(recorded, self._loop, self._telemetry(self._loop)):
             self.differing += 1
             self.difference = self.difference or difference
         else:
             self.same += 1
+
+    def _telemetry(self, loop: Steppable) -> list[np.ndarray]:
+        """The replayed telemetry as the recording side had it."""
+        session = self.session
+        arrays = [loop.telemetry[spec.name] for spec in loop.spec.telemetry]
+        came_by_text = session.codec == "text" and session.hello.session == 0
+        if came_by_text:
+            arrays = text.in_world_frame(
+                text.in_paper_frame(arrays, session.layout), session.layout
+            )
+        return arrays
 
 
 class Verification(Recording):
@@ -215,9 +227,11 @@ class Verification(Recording):
         return printable(lines)
 
 
-def _difference(recorded: State, loop: Steppable) -> Difference | None:
+def _difference(
+    recorded: State, loop: Steppable, telemetry: Sequence[np.ndarray]
+) -> Difference | None:
     """The first number that differs in any bit; None if none does."""
-    for names, was, now in _arrays(recorded, loop):
+    for names, was, now in _arrays(recorded, loop, telemetry):
         if was.tobytes() == now.tobytes():
             continue
         for at, old in enumerate(was.flat):
@@ -229,18 +243,21 @@ def _difference(recorded: State, loop: Steppable) -> Difference | None:
     return None
 
 
-def _arrays(recorded: State, loop: Steppable) -> Iterator[tuple[list[str], np.ndarray, np.ndarray]]:
+def _arrays(
+    recorded: State, loop: Steppable, telemetry: Sequence[np.ndarray]
+) -> Iterator[tuple[list[str], np.ndarray, np.ndarray]]:
     """Names of the numbers of one drone, the recorded array and the replayed one."""
     yield ["reward"], recorded.rewards, loop.rewards
     yield ["terminated"], recorded.terminated, loop.terminated
     yield ["truncated"], recorded.truncated, loop.truncated
+    observations = [loop.observations[spec.name] for spec in loop.spec.observation]
     for what, specs, arrays, here in (
-        ("telemetry", loop.spec.telemetry, recorded.telemetry, loop.telemetry),
-        ("observation", loop.spec.observation, recorded.observations, loop.observations),
+        ("telemetry", loop.spec.telemetry, recorded.telemetry, telemetry),
+        ("observation", loop.spec.observation, recorded.observations, observations),
     ):
-        for spec, was in zip(specs, arrays, strict=True):
+        for spec, was, now in zip(specs, arrays, here, strict=True):
             names = [f"{what} {name}" for name in component_names(spec)]
-            yield names, was, np.ascontiguousarray(here[spec.name], was.dtype)
+            yield names, was, np.ascontiguousarray(now, was.dtype)
 
 
 def _digits(number: np.generic) -> str:

@@ -25,7 +25,7 @@ from ..protocol.messages import Command, Hello, Message, State
 from ..transport.stepped import Steppable
 
 ABOUT: Final = "rotorgram"  # name of the metadata about the whole file
-FORMAT: Final = "3"  # version of the file's content, beside the protocol's in each datagram
+FORMAT: Final = "4"  # version of the file's content, beside the protocol's in each datagram
 
 _CHUNK: Final = 1 << 16  # bytes; 2 ms to write
 _SECOND: Final = 10**9

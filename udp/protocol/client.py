@@ -552,7 +552,7 @@ class Client:
 
     def _encode(self, message: m.Hello | State | m.Close) -> bytes:
         if self.by_text and isinstance(message, State | m.Close):
-            return text.encode(message)
+            return text.encode(message, self.layout)
         return binary.encode(message, self.layout)
 
     def _record(self, message: Message, data: bytes) -> None:

@@ -64,6 +64,7 @@ class Layout:
         action: None if actions are discrete.
         choices: Discrete actions are 0 ... choices - 1; 0 if actions are an array.
         telemetry: Shape of each telemetry array of one drone.
+        frames: Frame of each, as of an `ArraySpec`; the text codec converts by it.
 
     Attributes:
         state: Observations, rewards (float64), terminated, truncated (bool), telemetry (float64).
@@ -82,6 +83,7 @@ class Layout:
         action: ArrayLayout | None,
         choices: int = 0,
         telemetry: tuple[tuple[int, ...], ...] = (),
+        frames: tuple[str, ...] = (),
     ) -> None:
         if not 1 <= drones <= MAX_DRONES:
             raise InputError(f"drones: expected 1 to {MAX_DRONES}, got {drones}")
@@ -90,6 +92,7 @@ class Layout:
         self.action = action
         self.choices = choices
         self.telemetry = telemetry
+        self.frames = frames or ("",) * len(telemetry)
 
         reward = ArrayLayout((), "float64")
         flag = ArrayLayout((), "bool")

@@ -1,14 +1,14 @@
-"""The text codec: one drone, numbers separated by commas, at most 1024 bytes of ASCII.
+"""The text codec: one drone, numbers separated by commas, at most 1,200 bytes of ASCII.
 
 The paper's peers turn arrays of numbers into bytes and back (section 2.1). There is no Hello. The
 grammar is in docs/protocol.md.
 
 Numbers are written as float64 with the fewest digits that read back as the same bits; a float32
-is written as the float64 of the same value.
+is written as the float64 of the same value. Telemetry is in the paper's frame.
 """
 
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from itertools import islice
 from math import isfinite, prod
 from typing import Final
@@ -16,11 +16,17 @@ from typing import Final
 import numpy as np
 
 from ...models.errors import InputError
+from ...models.frames import (
+    attitudes_in_paper_frame,
+    positions_in_paper_frame,
+    positions_in_world_frame,
+    quaternions_in_world_frame,
+)
 from .errors import DecodeError
 from .layout import Layout
 from .messages import FLY, MAX_UINT64, RESET, Close, Command, State
 
-MAX_LINE: Final = 1024
+MAX_LINE: Final = 1200
 _FLOAT: Final = "float32"
 _LONGEST_NUMBER: Final = 24  # bytes: -2.2250738585072014e-308
 _FIXED: Final = 24  # bytes of the longest sequence number and two flags, with their commas
@@ -47,8 +53,7 @@ def check_layout(layout: Layout) -> None:
         raise InputError(f"{what}: expected {expected}, got {got}: use binary")
     if not (action is None or (len(action.shape) == 1 and action.dtype == _FLOAT)):
         raise InputError(f"{what}: expected flat actions of float32, got {action}: use binary")
-    shapes = [slot.shape for slot in (*layout.observation_slots, *layout.telemetry_slots)]
-    state = 1 + sum(map(prod, shapes))  # the reward is a number too
+    state = 1 + arrays[0].shape[0] + telemetry_size(layout)  # the reward is a number too
     longest = _FIXED + (_LONGEST_NUMBER + 1) * max(state, prod(layout.actions.shape))
     if longest > MAX_LINE:
         raise InputError(
@@ -57,12 +62,71 @@ def check_layout(layout: Layout) -> None:
         )
 
 
-def encode(message: State | Command | Close) -> bytes:
-    """One line, without its end. Raises `InputError` if it is too long or cannot be told."""
+def telemetry_size(layout: Layout) -> int:
+    """Numbers of telemetry in a line."""
+    return sum(_telemetry_sizes(layout))
+
+
+def _telemetry_sizes(layout: Layout) -> list[int]:
+    sizes = []
+    for shape, frame in zip(layout.telemetry, layout.frames, strict=True):
+        sizes.append(3 if (shape, frame) in _TO_PAPER else prod(shape))
+    return sizes
+
+
+def in_paper_frame(telemetry: Iterable[np.ndarray], layout: Layout) -> list[np.ndarray]:
+    """The telemetry of one drone as a line has it."""
+    converted = []
+    for array, shape, frame in zip(telemetry, layout.telemetry, layout.frames, strict=True):
+        convert = _TO_PAPER.get((shape, frame))
+        converted.append(array if convert is None else convert(array))
+    return converted
+
+
+def in_world_frame(telemetry: Iterable[np.ndarray], layout: Layout) -> list[np.ndarray]:
+    """The reverse of `in_paper_frame`; a rotation comes back within rounding."""
+    converted = []
+    for array, shape, frame in zip(telemetry, layout.telemetry, layout.frames, strict=True):
+        convert = _FROM_PAPER.get((shape, frame))
+        converted.append(array if convert is None else convert(array))
+    return converted
+
+
+def _rates_in_paper_frame(rates: np.ndarray) -> np.ndarray:
+    """The paper's axes are left-handed: rotations about them have the other sign."""
+    return 0.0 - positions_in_paper_frame(rates)
+
+
+def _rates_in_body_frame(rates: np.ndarray) -> np.ndarray:
+    return 0.0 - positions_in_world_frame(rates)
+
+
+_Conversions = dict[tuple[tuple[int, ...], str], Callable[[np.ndarray], np.ndarray]]
+
+_TO_PAPER: Final[_Conversions] = {
+    ((3,), "world"): positions_in_paper_frame,
+    ((4,), "body to world"): attitudes_in_paper_frame,
+    ((3,), "body"): _rates_in_paper_frame,
+}
+"""Conversions of telemetry by shape and frame; other telemetry stays as it is."""
+_FROM_PAPER: Final[_Conversions] = {
+    ((3,), "world"): positions_in_world_frame,
+    ((4,), "body to world"): quaternions_in_world_frame,
+    ((3,), "body"): _rates_in_body_frame,
+}
+
+
+def encode(message: State | Command | Close, layout: Layout | None = None) -> bytes:
+    """One line, without its end; a State needs a layout.
+
+    Raises `InputError` if it is too long or cannot be written.
+    """
     match message:
         case State():
             flags = ["01"[message.terminated.item()], "01"[message.truncated.item()]]
-            arrays = (message.rewards, *message.observations, *message.telemetry)
+            assert layout is not None
+            telemetry = in_paper_frame(message.telemetry, layout)
+            arrays = (message.rewards, *message.observations, *telemetry)
             reward, *others = _numbers(arrays)
             fields = [reward, *flags, *others]
         case Command() if message.orders.item() == RESET:
@@ -92,16 +156,19 @@ def decode_state(datagram: bytes, layout: Layout) -> State | Close:
     if fields == ["close"]:
         return Close(session=0, sequence=sequence, reason="the simulator closed")
     observation = layout.observation_slots[0]
-    telemetry = layout.telemetry_slots
     size = observation.shape[1]
-    sizes = [prod(slot.shape) for slot in telemetry]
+    sizes = _telemetry_sizes(layout)
     expected = 3 + size + sum(sizes)
     if len(fields) != expected:
         raise DecodeError(
             f"state: expected {expected + 1} fields (sequence, reward, terminated, truncated, "
             f"{size} of observation, {sum(sizes)} of telemetry), got {len(fields) + 1}"
         )
-    told = iter(_floats("state: telemetry", fields[3 + size :]))
+    numbers = iter(_floats("state: telemetry", fields[3 + size :]))
+    telemetry = [np.array([[*islice(numbers, count)]]) for count in sizes]
+    shaped = []
+    for array, slot in zip(in_world_frame(telemetry, layout), layout.telemetry_slots, strict=True):
+        shaped.append(array.reshape(slot.shape))
     return State(
         session=0,
         sequence=sequence,
@@ -110,10 +177,7 @@ def decode_state(datagram: bytes, layout: Layout) -> State | Close:
         terminated=np.array([_flag("state: terminated", fields[1])]),
         truncated=np.array([_flag("state: truncated", fields[2])]),
         observations=(_float32("state: observation", fields[3 : 3 + size]),),
-        telemetry=tuple(
-            np.array([*islice(told, count)]).reshape(slot.shape)
-            for slot, count in zip(telemetry, sizes, strict=True)
-        ),
+        telemetry=tuple(shaped),
     )
 
 
