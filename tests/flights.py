@@ -4,9 +4,16 @@ import math
 from typing import Any
 
 import numpy as np
+from rotorgram.envs.config import EnvConfig
+from rotorgram.envs.specification import make_task
 from rotorgram.envs.state import State
 from rotorgram.sim import Draw
 from rotorgram.sim.random import Random
+
+
+def task_of(env_id: str, **options: Any) -> Any:
+    """A task for arrays of one drone in one world."""
+    return make_task(EnvConfig.from_keywords(env_id, **options))
 
 
 def state_of(rotors: int = 4, time: float = 0.0, **arrays: Any) -> State:

