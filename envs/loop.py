@@ -9,7 +9,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
 from ..models.errors import InputError
 from ..sim import Array, PhysicsError, Randomization, make_world
@@ -156,7 +155,7 @@ class Loop(Results):
         """
         self._pipeline.landing.prepare(self.record, clock.drones_of(self.record, drones))
 
-    def snapshot(self) -> dict[str, NDArray[Any]]:
+    def snapshot(self) -> dict[str, np.ndarray]:
         """Copies of all arrays that a later step depends on, by name.
 
         Raises `gymnasium.error.ClosedEnvironmentError` after `close`.

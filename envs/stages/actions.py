@@ -1,7 +1,6 @@
 """What an agent sends, checked; and actions that are late."""
 
 import math
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +26,7 @@ class Actions:
         self._choices = choices
         self._count = math.prod(shape)
 
-    def checked(self, given: Any, flown: Mask | None) -> NDArray[np.float64]:
+    def checked(self, given: object, flown: Mask | None) -> NDArray[np.float64]:
         """Actions as controllers take them: shape (W, A, k), finite. Raises `InputError`.
 
         Numbers are rounded to float32. Actions of drones that do not fly are ignored.
@@ -56,7 +55,7 @@ class Actions:
         return np.full(self._shape, float(number))
 
     def _refused(
-        self, values: NDArray[Any], right: NDArray[Any], expected: str, flown: Mask | None
+        self, values: np.ndarray, right: np.ndarray, expected: str, flown: Mask | None
     ) -> NDArray[np.float64]:
         wrong = ~right.all(axis=-1)
         refused = wrong if flown is None else wrong & flown

@@ -1,7 +1,5 @@
 """The clock: who flies and who begins in a step, and how far each episode is."""
 
-from typing import Any
-
 import gymnasium as gym
 import numpy as np
 
@@ -24,7 +22,7 @@ class Clock(Stage):
         record.steps = record.steps + 1
 
 
-def take(record: Record, resets: Any, frozen: Any) -> None:
+def take(record: Record, resets: object, frozen: object) -> None:
     """Set who flies and who begins, from masks of shape (N,), or None.
 
     Raises:
@@ -48,7 +46,7 @@ def take(record: Record, resets: Any, frozen: Any) -> None:
     record.begun = begun if begun is not None and begun.any() else None
 
 
-def mask_of(record: Record, given: Any) -> Mask:
+def mask_of(record: Record, given: object) -> Mask:
     """A mask of shape (N,) as one of shape (W, A), the same for all drones of a world.
 
     Raises `InputError`.
@@ -62,12 +60,10 @@ def mask_of(record: Record, given: Any) -> Mask:
     return drones
 
 
-def drones_of(record: Record, given: Any) -> Mask:
+def drones_of(record: Record, given: object) -> Mask:
     """A mask of shape (N,) as one of shape (W, A). Raises `InputError`."""
     expected = (record.out.size,)
-    dtype = getattr(given, "dtype", None)
-    shape = getattr(given, "shape", None)
-    if dtype != np.bool_ or shape != expected:
+    if not isinstance(given, np.ndarray) or (given.dtype, given.shape) != (np.bool_, expected):
         raise InputError(
             f"resets, frozen: expected bool of shape {expected}, got {shortened(given)}"
         )

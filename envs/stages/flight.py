@@ -1,10 +1,8 @@
 """Control, effects and physics: the stage that runs in substeps."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...sim import Controller, World
 from ...sim.snapshots import Arrays
@@ -30,7 +28,7 @@ class Flight(Stage):
         self._starts = range(0, substeps, held)
         self._held = held
 
-    def seed(self, mask: Mask, seeds: Sequence[int | None] | NDArray[Any]) -> None:
+    def seed(self, mask: Mask, seeds: Sequence[int | None] | np.ndarray) -> None:
         """Seed the world: starts, gusts, parameters, sensors."""
         self._world.seed(mask, seeds)
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from math import prod
-from typing import Any
+from typing import NoReturn
 
 import numpy as np
 
@@ -30,7 +30,7 @@ class Starts(Stage):
             start = self._task.begin(record.begun, record.draw)
         self._task.memory.expand(record.shape)
         expected = (*record.shape, 3)
-        got: Any = type(start).__name__
+        got: object = type(start).__name__
         if isinstance(start, InitialState):
             got = tuple(getattr(start.position, "shape", ()))
         if got != expected:
@@ -82,7 +82,7 @@ class Judge(Stage):
         record.metrics = outcome.metrics
         record.ended = outcome.terminated
 
-    def _check(self, observations: Any, outcome: Any, record: Record) -> None:
+    def _check(self, observations: object, outcome: object, record: Record) -> None:
         task = self._task
         names = [array.name for array in task.observation]
         if not isinstance(observations, Mapping):
@@ -106,7 +106,7 @@ class Judge(Stage):
         if "bool" not in str(kind):
             self._refuse("terminated as truth values", kind)
 
-    def _check_array(self, array: ArraySpec, values: Any, record: Record) -> None:
+    def _check_array(self, array: ArraySpec, values: object, record: Record) -> None:
         shape = tuple(getattr(values, "shape", ()))
         count = prod(record.shape)
         if prod(shape) != count * array.size:
@@ -116,5 +116,5 @@ class Judge(Stage):
                 f"an array of shape {shape}",
             )
 
-    def _refuse(self, expected: str, got: Any) -> None:
+    def _refuse(self, expected: str, got: object) -> NoReturn:
         raise InputError(f"{self._task.config.env_id}: expected {expected}, got {got}")

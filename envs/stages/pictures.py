@@ -140,9 +140,9 @@ class Pictures(Stage):
         for painter in self._painters:
             painter.cameras.close()
 
-    def snapshot(self, record: Record) -> dict[str, NDArray[Any]]:
+    def snapshot(self, record: Record) -> dict[str, np.ndarray]:
         """What each drone's cameras took last, and from where."""
-        taken: dict[str, NDArray[Any]] = {}
+        taken: dict[str, np.ndarray] = {}
         if "scenes" not in vars(record):
             return taken
         for painter in self._painters:
@@ -201,11 +201,11 @@ class Pictures(Stage):
         self,
         due: dict[str, NDArray[np.bool_]],
         fresh: NDArray[np.bool_],
-        rows: dict[str, NDArray[Any]],
+        rows: dict[str, np.ndarray],
         scenes: NDArray[np.int64],
         steps: NDArray[np.int64],
-    ) -> dict[str, NDArray[Any]]:
-        pictures: dict[str, NDArray[Any]] = {
+    ) -> dict[str, np.ndarray]:
+        pictures: dict[str, np.ndarray] = {
             view.name: np.empty((self._rows, *view.shape), view.dtype) for view in self.views
         }
 
@@ -237,7 +237,7 @@ class Pictures(Stage):
         """Number of each world's scene, (W,)."""
         return np.reshape(record.scenes, self._shape)[:, 0]
 
-    def _per_drone(self, values: Any) -> NDArray[Any]:
+    def _per_drone(self, values: Any) -> np.ndarray:
         """A row for each drone."""
         array = np.asarray(values)
         width = array.size // self._rows

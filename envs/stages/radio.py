@@ -1,7 +1,7 @@
 """The radio between the drones of a world: what each has heard last of each other."""
 
 from collections.abc import Callable
-from typing import Any, Final, Protocol
+from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -122,5 +122,5 @@ class Radio(Stage):
         return numbers_of("radio", record.keys, steps, self._own.shape[0])
 
 
-def _length(vectors: Any) -> Floats:
+def _length(vectors: Floats) -> Floats:
     return np.asarray(np.sqrt(np.sum(vectors * vectors, axis=-1)))

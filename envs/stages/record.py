@@ -67,9 +67,9 @@ class Record:
     start: InitialState
     state: State
     measured: State
-    observations: dict[str, NDArray[Any]]
-    past_observations: dict[str, NDArray[Any]]
-    history: dict[str, NDArray[Any]]
+    observations: dict[str, np.ndarray]
+    past_observations: dict[str, np.ndarray]
+    history: dict[str, np.ndarray]
     terms: dict[str, Array]
     metrics: dict[str, Array]
     ended: Array
@@ -125,7 +125,7 @@ class Record:
             if memory[name] is not old:
                 memory[name] = where(mask, memory[name], old)
 
-    def snapshot(self) -> dict[str, NDArray[Any]]:
+    def snapshot(self) -> dict[str, np.ndarray]:
         """Copies of what is kept and of the memory, by name."""
         known = vars(self)
         parts: dict[str, dict[str, Any]] = {"memory": vars(self.memory), "kept": {}}
@@ -201,7 +201,7 @@ class Stage:
 
     arrays: ClassVar[tuple[str, ...]] = ()
 
-    def seed(self, mask: Mask, seeds: Sequence[int | None] | NDArray[Any]) -> None:
+    def seed(self, mask: Mask, seeds: Sequence[int | None] | np.ndarray) -> None:
         """Start new sequences of random numbers for the worlds of a mask; seeds (W,)."""
 
     def begin(self, record: Record) -> None:
@@ -239,7 +239,7 @@ def where(mask: Mask, new: Array, old: Array) -> Array:
     return np.where(mask.reshape(mask.shape + (1,) * axes), new, old)
 
 
-def is_finite(values: NDArray[Any]) -> bool:
+def is_finite(values: np.ndarray) -> bool:
     """Whether all numbers are finite."""
     if values.size <= _SMALL and math.isfinite(sum(values.ravel().tolist())):
         return True

@@ -1,13 +1,11 @@
 """Arrays of the last control steps, (W, A, steps, *shape): the oldest step first."""
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from ...sim.state import Array
 from .record import Record, where
 
-Values = NDArray[Any]
+Values = np.ndarray
 
 
 def filled(values: Values, steps: int, axis: int) -> Values:
@@ -33,7 +31,7 @@ def later(past: Values | None, values: Values, steps: int, record: Record) -> Va
     return merged
 
 
-def taken(past: Values, age: Any, axis: int) -> Values:
+def taken(past: Values, age: Array, axis: int) -> Values:
     """Values of so many steps ago; the age has the shape (W, A), whole numbers."""
     index = past.shape[axis] - 1 - np.asarray(age).astype(int)
     if not axis:

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Final, Literal
 
 import numpy as np
 
@@ -134,7 +134,8 @@ class Elevation(Task):
             raise InputError(f"target: expected {expected}, got {shortened(options.target)}")
         increment = self.action == "increment"
         most = float(vehicle.thrust_high.max())
-        usual: Any = self.controller
+        usual = self.controller
+        assert isinstance(usual, CollectiveThrust)
         scale = options.thrust_scale or usual.newtons
         expected = f"at most {most:g} N, the largest thrust of a rotor"
         if not scale <= most:

@@ -6,7 +6,7 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 import numpy as np
 
@@ -260,7 +260,7 @@ class Racing(GoalTask):
         return row_of(self._gates, number)
 
 
-def read_track(given: Any) -> tuple[list[Gate], Start]:
+def read_track(given: object) -> tuple[list[Gate], Start]:
     """Gates of a track, and its start, a gate of size 0. Raises `InputError`."""
     if not isinstance(given, str):
         raise InputError(f"track: expected {_WAY}, got {shortened(given)}")
