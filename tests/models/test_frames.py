@@ -45,19 +45,12 @@ def test_level_is_zero_without_negative_zeros() -> None:
 
 # MuJoCo, right-handed: +z turns the nose left, +y puts the nose down, +x lowers the right side.
 # Unity, left-handed: +Y turns the nose right, +X puts the nose down, +Z raises the right side.
-@pytest.mark.parametrize("degrees", [-170.0, -60.0, 30.0, 89.0])
-def test_rotation_about_the_vertical_is_theta_with_the_sign_turned(degrees: float) -> None:
-    assert _attitude("z", degrees) == pytest.approx((0.0, -degrees, 0.0))
-
-
+@pytest.mark.parametrize(("axis", "sign"), [("z", (0, -1, 0)), ("y", (1, 0, 0)), ("x", (0, 0, -1))])
 @pytest.mark.parametrize("degrees", [-89.0, -60.0, 30.0, 89.0])
-def test_rotation_about_left_is_phi_with_its_sign(degrees: float) -> None:
-    assert _attitude("y", degrees) == pytest.approx((degrees, 0.0, 0.0))
-
-
-@pytest.mark.parametrize("degrees", [-170.0, -60.0, 30.0, 89.0])
-def test_rotation_about_forward_is_psi_with_the_sign_turned(degrees: float) -> None:
-    assert _attitude("x", degrees) == pytest.approx((0.0, 0.0, -degrees))
+def test_a_rotation_about_one_axis(axis: str, sign: tuple[int, ...], degrees: float) -> None:
+    attitude = Rotation.from_euler(axis, degrees, degrees=True)
+    expected = degrees * np.array(sign)
+    assert attitudes_in_paper_frame(_scalar_first(attitude)) == pytest.approx(expected)
 
 
 def test_a_pitch_of_30_degrees_then_a_yaw_by_hand() -> None:
@@ -100,21 +93,14 @@ def test_nose_straight_up_or_down(pitch: float, yaw: float, roll: float) -> None
     np.testing.assert_allclose(_unity(phi, theta, psi), expected, atol=1e-6)
 
 
-def _attitude(axis: str, degrees: float) -> np.ndarray:
-    return attitudes_in_paper_frame(_scalar_first(Rotation.from_euler(axis, degrees, degrees=True)))
-
-
 def _scalar_first(attitude: Rotation) -> np.ndarray:
     return attitude.as_quat(scalar_first=True)
 
 
 def _unity(phi: float, theta: float, psi: float) -> np.ndarray:
     """Unity's rotation matrix: Z first, then X, then Y, about fixed axes; angles in degrees."""
-    a, b, c = np.radians([phi, theta, psi])
-    about_x = [[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]]
-    about_y = [[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]]
-    about_z = [[np.cos(c), -np.sin(c), 0], [np.sin(c), np.cos(c), 0], [0, 0, 1]]
-    return np.array(about_y) @ np.array(about_x) @ np.array(about_z)
+    turned = Rotation.from_euler("YXZ", [theta, phi, psi], degrees=True)
+    return np.asarray(turned.as_matrix())
 
 
 def test_a_pose_by_hand_on_the_way_back() -> None:
