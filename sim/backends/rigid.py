@@ -23,6 +23,7 @@ from .body import RigidBody, mapped, motion
 from .hull import Hull
 
 DTYPES: Final = ("float32", "float64")
+_OF_STATE: Final = ("command", "thrust", "touching", "colliding")
 _LEVEL: Final = np.array((0.0, 0.0, 0.0, 1.0, *[0.0] * 9))  # rows of a craft at rest
 
 
@@ -77,17 +78,18 @@ class RigidWorld(BaseWorld):
         self._wrench: Array = None  # force and torque of effects over it, (6, W A)
         self._rows = np.repeat(_LEVEL.astype(self.dtype)[:, None], num_worlds * drones, axis=1)
         nobody = thrust[..., 0] > 0
-        self.state = WorldState(
-            **self._shown(), command=thrust, thrust=thrust, touching=nobody,
-            colliding=nobody if shape[1] > 1 else None,
-        )  # fmt: skip
-
+        moved = dict.fromkeys(("position", "quaternion", "velocity", "body_rates"))
+        self.state = WorldState(**moved, command=thrust, thrust=thrust, touching=nobody)
+        if drones > 1:
+            self.state.colliding = nobody
+        self._show()
         self._varying: np.ndarray | None = None
         self._function: kernel.Fly | None = None
         self._compiled = compiled
         if found and compiled is not False:
             ones = np.ones(num_worlds * drones)
-            self._vary(dict.fromkeys(self._drawn, ones))
+            self._body.vary(dict.fromkeys(self._drawn, ones))
+            self._pack()
             self._compile()
 
     def _compile(self) -> None:
@@ -130,8 +132,7 @@ class RigidWorld(BaseWorld):
         state.thrust = self._typed(begun["thrust"])
         state.command = np.where(rows, state.thrust, state.command)
         self._draw_parameters(mask)
-        if self.parameters:
-            self._vary({name: values.reshape(-1) for name, values in self.parameters.items()})
+        self._vary_drawn()
         if self.effects is not None:
             thrust = self.effects.begin(mask, state, self.parameters)
             state.thrust = self._typed(np.where(rows, thrust, state.thrust))
@@ -159,7 +160,10 @@ class RigidWorld(BaseWorld):
 
     def _fly(self, steps: int, mask: Array | None) -> None:
         """Fly some physics steps, between which nobody looks for contact."""
-        state, effects, acting, wrench = self.state, self.effects, self.state.command, None
+        state = self.state
+        effects = self.effects
+        acting = state.command
+        wrench = None
         at_once = self._at_once or steps
         for _ in range(steps // at_once):
             if effects is not None:
@@ -180,15 +184,8 @@ class RigidWorld(BaseWorld):
 
     def _snapshot(self) -> dict[str, np.ndarray]:
         state = self.state
-        arrays = {
-            "rows": self._rows,
-            "acting": self._acting,
-            "wrench": self._wrench,
-            "command": state.command,
-            "thrust": state.thrust,
-            "touching": state.touching,
-            "colliding": state.colliding,
-        }
+        arrays = {"rows": self._rows, "acting": self._acting, "wrench": self._wrench}
+        arrays |= {name: getattr(state, name) for name in _OF_STATE}
         return {name: array.copy() for name, array in arrays.items() if array is not None}
 
     def _restore(self, arrays: Arrays) -> None:
@@ -196,12 +193,11 @@ class RigidWorld(BaseWorld):
         self._rows = arrays["rows"].copy()
         self._acting = arrays["acting"].copy()
         self._wrench = None if wrench is None else wrench.copy()
-        for name in ("command", "thrust", "touching", "colliding"):
+        for name in _OF_STATE:
             if name in arrays:
                 setattr(self.state, name, arrays[name].copy())
         self._show()
-        if self.parameters:
-            self._vary({name: values.reshape(-1) for name, values in self.parameters.items()})
+        self._vary_drawn()
 
     def acceleration(self) -> Array:
         """As `World.acceleration`."""
@@ -219,9 +215,11 @@ class RigidWorld(BaseWorld):
     def close(self) -> None:
         """Nothing is to be released."""
 
-    def _vary(self, parameters: dict[str, Array]) -> None:
-        self._body.vary(parameters)
-        self._pack()
+    def _vary_drawn(self) -> None:
+        if self.parameters:
+            drawn = self.parameters.items()
+            self._body.vary({name: values.reshape(-1) for name, values in drawn})
+            self._pack()
 
     def _pack(self) -> None:
         """NumPy and compiled code take the same numbers of what varies."""
@@ -235,19 +233,14 @@ class RigidWorld(BaseWorld):
             return np.array(self._body.fly(rows, thrust, wrench, steps), self.dtype)
         return self._function(rows, thrust, wrench, self._varying, steps)
 
-    def _shown(self) -> dict[str, Array]:
-        """The rows as arrays of the state."""
-        columns = self._rows.T.reshape(*self.shape, 13)
-        return {
-            "position": columns[..., :3],
-            "quaternion": columns[..., 3:7],
-            "velocity": columns[..., 7:10],
-            "body_rates": columns[..., 10:],
-        }
-
     def _show(self) -> None:
-        for name, values in self._shown().items():
-            setattr(self.state, name, values)
+        """Set the state's arrays, views of the rows."""
+        state = self.state
+        columns = self._rows.T.reshape(*self.shape, 13)
+        state.position = columns[..., :3]
+        state.quaternion = columns[..., 3:7]
+        state.velocity = columns[..., 7:10]
+        state.body_rates = columns[..., 10:]
 
     def _typed(self, values: Array) -> Array:
         return np.astype(values, self.dtype, copy=False)
@@ -279,8 +272,7 @@ class RigidWorld(BaseWorld):
         if abs(self._rows).max() < mujoco.mjMAXVAL:  # not of NaN
             return
         bad = ~np.all(abs(self._rows) < mujoco.mjMAXVAL, axis=0)
-        worlds = np.any(bad.reshape(self.shape), axis=1)
-        ids = worlds.nonzero()[0].flatten().tolist()
+        ids = np.flatnonzero(bad.reshape(self.shape).any(axis=1)).tolist()
         raise PhysicsError(f"the rigid body has bad states in envs {ids[:5]}: reset the env")
 
 
