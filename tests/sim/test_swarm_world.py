@@ -6,7 +6,13 @@ from rotorgram.models import InputError, Vehicle
 from rotorgram.models.swarm import drone_names, swarm_model
 from rotorgram.sim import EffectOptions, InitialState, Randomization, World, make_world
 
-EFFECTS = {"motor_lag": True, "rotor_drag": True, "wind": (3.0, 1.0, 0.0), "gusts": 6.0}
+EFFECTS = {
+    "motor_lag": True,
+    "rotor_drag": True,
+    "wind": (3.0, 1.0, 0.0),
+    "gusts": 6.0,
+    "downwash": True,
+}
 DRAWN = {"mass": "uniform(0.8, 1.2)", "center_x": "uniform(-0.001, 0.001)"}
 
 
