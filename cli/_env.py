@@ -14,7 +14,7 @@ from ..models import Backend
 from ..models.errors import InputError
 from ..udp import RemoteVectorEnv
 from ..udp.spawn import spawn_simulator
-from ._flags import AgentFlags, EnvFlags, check_count, parse_address
+from ._flags import AgentFlags, EnvFlags, Options, check_count, parse_address
 
 CHECKPOINT: Final = "checkpoint.safetensors"
 Controller = type[PID] | type[Geometric] | type[Orca]
@@ -43,7 +43,7 @@ def trained(name: str, *others: str) -> Checkpoint:
 
 def chosen_env(
     command: EnvFlags, checkpoint: Checkpoint | Controller | None = None
-) -> tuple[str, dict[str, Any]]:
+) -> tuple[str, Options]:
     """Id of the task, and its options that are not the default.
 
     A checkpoint brings those that it was trained with, a controller those it needs;
@@ -76,7 +76,7 @@ def chosen_env(
     return env
 
 
-def _spec(command: EnvFlags, env: tuple[str, dict[str, Any]], drones: int) -> EnvSpec:
+def _spec(command: EnvFlags, env: tuple[str, Options], drones: int) -> EnvSpec:
     """The spec of an env with the vehicle of the flags."""
     env_id, options = env
     config = EnvConfig.from_keywords(env_id, vehicle=command.vehicle, drones=drones, **options)
@@ -116,7 +116,7 @@ def _check_vehicle(command: EnvFlags, checkpoint: Checkpoint, spec: EnvSpec) -> 
 
 def pilot_of(
     command: EnvFlags, what: str
-) -> tuple[Checkpoint | None, Policy | None, tuple[str, dict[str, Any]]]:
+) -> tuple[Checkpoint | None, Policy | None, tuple[str, Options]]:
     """Checkpoint (None without one), policy (None for `random`) and env of what flies here."""
     if what == "random":
         return None, None, chosen_env(command)
@@ -140,7 +140,7 @@ def words_of(trajectory: Trajectory) -> str:
 def remote_env(
     command: AgentFlags,
     env_id: str,
-    options: dict[str, Any],
+    options: Options,
     *,
     required: bool = True,
     num_envs: int | None = 1,

@@ -9,7 +9,18 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields, make_dataclass, replace
 from pathlib import Path
 from types import UnionType
-from typing import Annotated, Any, Final, TypeVar, Union, cast, get_args, get_origin, get_type_hints
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    Final,
+    TypeVar,
+    Union,
+    cast,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import tyro
 from tyro.conf import Fixed, Suppress, arg
@@ -18,10 +29,15 @@ from ..flights.folders import LOCK, new_folder
 from ..models import Backend
 from ..models.errors import InputError, shortened
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
 DEFAULT_ENV: Final = "rotorgram/Elevation-v0"
 _PLAIN_FLAGS: Final = ("action", "control_period", "episode_length", "history", "scene", "cameras")
 _WORLD_FLAGS: Final = ("effects", "randomize", "sensors")
-_NO_FLAG: Any = Suppress[Fixed[dict]]  # type: ignore[type-arg]
+Options = dict[str, Any]
+"""Options of a task and its env by name, values as of JSON."""
+_NO_FLAG: object = Suppress[Fixed[dict]]  # type: ignore[type-arg]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +52,7 @@ class Command:
         """Do it; the exit status."""
         raise NotImplementedError
 
-    def settings(self, kind: type[Any]) -> dict[str, Any]:
+    def settings(self, kind: type["DataclassInstance"]) -> Options:
         """Values of the flags that are fields of a class of settings."""
         return {f.name: getattr(self, f.name) for f in fields(kind) if hasattr(self, f.name)}
 
@@ -173,12 +189,12 @@ def parse(kind: type[C], prog: str, words: Sequence[str]) -> C:
     return cast(C, replace(command, options=chosen))
 
 
-def _file_values(kind: type[Any], path: str) -> dict[str, Any]:
+def _file_values(kind: type[EnvFlags], path: str) -> Options:
     """Values of a config's file by the names of fields. Raises `InputError`."""
     from ..envs.config import BackendConfig, read_toml
 
     options = read_toml(Path(path))
-    values: dict[str, Any] = {}
+    values: Options = {}
     for name in ("env", "env_id"):
         if name in options:
             values["env"] = options.pop(name)
@@ -193,22 +209,22 @@ def _file_values(kind: type[Any], path: str) -> dict[str, Any]:
 
 
 def _with_file(
-    command: Any, given: frozenset[str], options: dict[str, Any], file: Mapping[str, Any]
-) -> Any:
+    command: EnvFlags, given: frozenset[str], options: Options, file: Options
+) -> EnvFlags:
     """The command with what the file says and no flag does."""
     added = {name: value for name, value in file.items() if name not in {*given, "options"}}
     options = {**file.get("options", {}), **options}
     return replace(command, given=given | added.keys(), options=options, **added)
 
 
-def _world_options(command: Any, given: frozenset[str]) -> dict[str, Any]:
+def _world_options(command: EnvFlags, given: frozenset[str]) -> Options:
     """Options by name of the flags whose words are NAME or NAME=VALUE. Raises `InputError`."""
-    options: dict[str, Any] = {}
+    options: Options = {}
     for name in given.intersection(_PLAIN_FLAGS):
         options[name] = getattr(command, name)
     for flag in given.intersection(_WORLD_FLAGS):
         words = getattr(command, flag)
-        values: dict[str, Any] = {}
+        values: Options = {}
         for word in () if words == ("none",) else words:
             name, equals, text = word.partition("=")
             several = re.fullmatch(r"[-+.\deE]+(,[-+.\deE]+)+", text)
@@ -221,7 +237,7 @@ def _world_options(command: Any, given: frozenset[str]) -> dict[str, Any]:
     return options
 
 
-def _for_tyro(kind: type[Any], **namespace: Any) -> Any:
+def _for_tyro(kind: type["DataclassInstance"], **namespace: object) -> Any:
     """A dataclass without checks: wrong values are refused later, as every other wrong input.
 
     It has `Union[X, Y]` for `X | Y`: before Python 3.14 tyro imports typeguard for that, slowly.
@@ -236,7 +252,7 @@ def _for_tyro(kind: type[Any], **namespace: Any) -> Any:
             changed[one.name] = _NO_FLAG
             namespace[one.name] = field(default_factory=dict)
         if isinstance(hint, UnionType):
-            union: Any = Union[get_args(hint)]  # noqa: UP007
+            union: object = Union[get_args(hint)]  # noqa: UP007
             changed[one.name] = Annotated[union, *extras] if extras else union
     own = {"__annotations__": changed, "__doc__": kind.__doc__, "__post_init__": lambda self: None}
     return dataclass(frozen=True, kw_only=True)(type(kind.__name__, (kind,), own | namespace))
@@ -269,10 +285,10 @@ def _given(words: Sequence[str]) -> frozenset[str]:
     )
 
 
-def _without_requirements(words: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
+def _without_requirements(words: Sequence[str]) -> tuple[list[str], Options]:
     """The words without `--env.NAME VALUE`, and these: JSON values of a task not known here."""
     kept: list[str] = []
-    required: dict[str, Any] = {}
+    required: Options = {}
     rest = iter(words)
     for word in rest:
         name, equals, value = word.partition("=")
@@ -330,7 +346,7 @@ def refuse_settings(command: Command, folder: Path, *, free: tuple[str, ...]) ->
 
 def go_on_with(command: Command, words: str, folder: Path, *flags: str) -> str:
     """The line that tells how to resume: of the flags those that were given."""
-    line: list[Any] = ["rotorgram", *words.split(), "--resume", folder]
+    line: list[object] = ["rotorgram", *words.split(), "--resume", folder]
     for flag in flags:
         if flag in command.given:
             value = getattr(command, flag)

@@ -6,7 +6,7 @@ import re
 import shutil
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import fields
 from itertools import chain
 from pathlib import Path
@@ -146,25 +146,23 @@ def write_parquet(episodes: RecordedEpisodes, out: Path) -> tuple[int, int]:
 
     check_new_file(out, ".parquet")
     metadata = {"env_spec": episodes.spec.to_json()}
-    count = steps = waiting = 0
-    batches: list[pa.Table] = []
-    writer: Any = None
-    with _removed_on_error(out):
+    count = steps = 0
+    batch: list[pa.Table] = []
+    with _removed_on_error(out), ExitStack() as opened:
+        writer: pq.ParquetWriter | None = None
         for episode in episodes:
             table = _table(episodes.spec, count, episodes.journal, episode)
-            batch = table.replace_schema_metadata(metadata)
-            writer = writer or pq.ParquetWriter(out, batch.schema, compression="zstd")
-            batches.append(batch)
+            batch.append(table.replace_schema_metadata(metadata))
             count += 1
             steps += len(episode)
-            waiting += len(batch)
-            if waiting > _ROW_GROUP:
-                writer.write_table(pa.concat_tables(batches))
-                batches = []
-                waiting = 0
-        if batches:
-            writer.write_table(pa.concat_tables(batches))
-        writer.close()
+            if writer is None:
+                made = pq.ParquetWriter(out, batch[0].schema, compression="zstd")
+                writer = opened.enter_context(made)
+            if sum(map(len, batch)) > _ROW_GROUP:
+                writer.write_table(pa.concat_tables(batch))
+                batch = []
+        if batch and writer is not None:
+            writer.write_table(pa.concat_tables(batch))
     return count, steps
 
 
@@ -174,7 +172,7 @@ def _table(spec: EnvSpec, number: int, journal: str, episode: Trajectory) -> "pa
     rows = len(episode) + 1
     is_last = np.arange(1, rows) == rows - 1
 
-    def repeated(value: Any, kind: pa.DataType) -> pa.Array:
+    def repeated(value: object, kind: pa.DataType) -> pa.Array:
         return pa.repeat(pa.scalar(value, kind), rows)
 
     def with_null(values: Any) -> pa.Array:
@@ -207,7 +205,7 @@ def _table(spec: EnvSpec, number: int, journal: str, episode: Trajectory) -> "pa
     return pa.table(columns)
 
 
-def _columns(stem: str, array: ArraySpec, values: NDArray[Any]) -> "dict[str, pa.Array]":
+def _columns(stem: str, array: ArraySpec, values: NDArray[np.generic]) -> "dict[str, pa.Array]":
     """One column for each component of a vector; an array of more axes is one column of lists."""
     import pyarrow as pa
 
@@ -221,7 +219,9 @@ def _columns(stem: str, array: ArraySpec, values: NDArray[Any]) -> "dict[str, pa
     }
 
 
-def _components(array: ArraySpec, values: NDArray[Any]) -> Iterator[tuple[str, NDArray[Any]]]:
+def _components(
+    array: ArraySpec, values: NDArray[np.generic]
+) -> Iterator[tuple[str, NDArray[np.generic]]]:
     """Name and values of each component of an array over time."""
     flat = values.reshape(len(values), -1)
     for name, column in zip(component_names(array), flat.T, strict=True):

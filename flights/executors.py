@@ -215,10 +215,7 @@ def _begin_worker(ends: Connection, progress: _Progress) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the main process's affair
     Thread(target=_end_with, args=(ends,), daemon=True).start()
 
-    def report(*item: Any) -> None:
-        progress.put(item)
-
-    _worker.report = report
+    _worker.report = lambda *item: progress.put(item)
 
 
 def _end_with(ends: Connection) -> None:

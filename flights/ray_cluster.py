@@ -8,6 +8,7 @@ from typing import Any, Final
 
 from ..agents.checkpoints import software_versions
 from ..models.errors import InputError, require
+from .executors import Result
 
 _LISTENING_TIMEOUT: Final = 5.0  # s
 
@@ -64,10 +65,8 @@ class RayExecutor(Executor):
         self._ray.shutdown()
 
 
-def _failure(name: str, error: BaseException) -> Any:
+def _failure(name: str, error: BaseException) -> Result:
     """A job whose machine is lost, or lacks rotorgram or the versions of this machine."""
-    from .executors import Result
-
     cause = getattr(error, "cause", None) or error
     reason = str(cause).strip().splitlines()[-1]
     return Result(name, f"{name}: {reason}", None)

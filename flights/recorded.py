@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,9 +69,9 @@ class _Row(NamedTuple):
     """One drone after a State, and the action that led there; None at the start."""
 
     telemetry: list[NDArray[np.float64]]
-    observations: list[NDArray[Any]]
+    observations: list[NDArray[np.generic]]
     reward: float
-    action: NDArray[Any] | None
+    action: NDArray[np.generic] | None
 
 
 class SessionReader:
@@ -102,7 +102,7 @@ class SessionReader:
         self._seeds: list[int | None] = [None] * count
         self._episodes = [0] * count
 
-    def take(self, message: Any) -> Iterator[Trajectory]:
+    def take(self, message: object) -> Iterator[Trajectory]:
         """The next message of the session: the episodes that it ends, one after the other."""
         transition = self._walker.take(message)
         if transition is not None:
@@ -141,7 +141,7 @@ class SessionReader:
             first = drone - drone % self._drones  # the first drone's seed counts for its world
             self._seeds[drone] = None if seeds is None else seeds[first]
 
-    def _row(self, state: State, drone: int, action: NDArray[Any] | None) -> _Row:
+    def _row(self, state: State, drone: int, action: NDArray[np.generic] | None) -> _Row:
         observations = state.observations if self._observations else ()
         return _Row(
             telemetry=[np.array(values[drone]) for values in state.telemetry],

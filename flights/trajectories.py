@@ -58,12 +58,12 @@ class Trajectory:
     """Every telemetry array by name, float64, shape (T + 1, *shape), in the spec's units."""
     rewards: Floats
     """float64, shape (T,)."""
-    actions: NDArray[Any]
+    actions: NDArray[np.generic]
     """Shape (T, *shape), of the action's dtype; row k is flown from row k of the telemetry."""
     ending: Ending
     episode: int = 0
     """Its number."""
-    observations: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    observations: Mapping[str, NDArray[np.generic]] = field(default_factory=dict)
     """By name, shape (T + 1, *shape), of the spec's dtypes; empty where they were not asked for."""
     session: int = 1
     """Session of the journal, from 1, as `rotorgram replay` counts."""
@@ -212,7 +212,7 @@ def _fly_batch(
     nobody = np.zeros(env.num_envs, bool)
     telemetry = [env.telemetry]
     rewards: list[Floats] = []
-    actions: list[NDArray[Any]] = []
+    actions: list[NDArray[np.generic]] = []
     lengths = np.zeros(env.num_envs, int)
     terminated = nobody
     lost = env.lost.copy()
@@ -252,7 +252,7 @@ def _fly_batch(
 
 def _act(
     env: AdvancingVectorEnv, policies: Sequence[Policy | None], done: NDArray[np.bool_]
-) -> NDArray[Any]:
+) -> NDArray[np.generic]:
     """Actions of the drones that fly; 0 for the others."""
     space = env.single_action_space
     actions = np.zeros((env.num_envs, *(space.shape or ())), space.dtype)

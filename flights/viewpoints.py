@@ -322,9 +322,10 @@ class Plan:
         return found
 
 
-def _is_list_of(kind: type, values: Any) -> bool:
-    is_list = isinstance(values, list) and len(values) > 0
-    return is_list and all(isinstance(value, kind) for value in values)
+def _is_list_of(kind: type, values: object) -> bool:
+    if not isinstance(values, list) or not values:
+        return False
+    return all(isinstance(value, kind) for value in values)
 
 
 def _source(table: dict[str, Any], number: int) -> PoseSource:
