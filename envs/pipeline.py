@@ -67,22 +67,12 @@ class Pipeline:
             flying.append(ActionDelay(world, randomize.most_steps("action_delay"), neutral))
         flying += [Flight(world, parts, substeps, held), Clock()]
 
-        observing: list[Stage] = [Measure(world, period)]
-        if sensors is not None:
-            observing.append(Sensing(sensors, replaces=config.estimated))
-        observing.append(Remember(task))
-        if task.has_radio:
-            observing.append(Radio(task.options, period, shape[1], task.ended))
-        observing.append(Judge(task))
-        if sensors is not None:
-            observing.append(Readings(sensors, observed(task) if config.estimated else ()))
-        self.pictures: tuple[ArraySpec, ...] = ()
-        if config.cameras:
-            pictures = Pictures(task, world.random, shape)
-            self.pictures = pictures.specs
-            observing.append(pictures)
+        pictures = Pictures(task, world.random, shape) if config.cameras else None
+        self.pictures: tuple[ArraySpec, ...] = pictures.specs if pictures else ()
+        observing = self._observing(task, world, sensors, pictures)
         if randomize is not None and "observation_delay" in drawn:
-            observing.append(ObservationDelay(world, randomize.most_steps("observation_delay")))
+            longest = randomize.most_steps("observation_delay")
+            observing.append(ObservationDelay(world, longest))
         if config.history > 1:
             names = tuple(array.name for array in observed(task))
             observing.append(History(config.history, names, len(world.shape)))
@@ -92,3 +82,22 @@ class Pipeline:
         self.fly = [stage.step for stage in flying]
         self.begin = [stage.begin for stage in self.stages]
         self.observe = [stage.step for stage in observing]
+
+    def _observing(
+        self, task: Task, world: World, sensors: Sensors | None, pictures: Pictures | None
+    ) -> list[Stage]:
+        """From the measurement to the observation of the present."""
+        config = task.config
+        period = task.control_period
+        stages: list[Stage] = [Measure(world, period)]
+        if sensors is not None:
+            stages.append(Sensing(sensors, replaces=config.estimated))
+        stages.append(Remember(task))
+        if task.has_radio:
+            stages.append(Radio(task.options, period, config.drones, task.ended))
+        stages.append(Judge(task))
+        if sensors is not None:
+            stages.append(Readings(sensors, observed(task) if config.estimated else ()))
+        if pictures is not None:
+            stages.append(pictures)
+        return stages

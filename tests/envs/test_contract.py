@@ -34,8 +34,8 @@ from rotorgram.models import InputError, Vehicle
 
 RESET = {(7, 1), (8, 2), (16, 0)}
 """Steps at which a world is reset in mid-flight."""
-FROZEN = {(3, 2), (4, 2), (8, 0), (12, 1)}
-"""Steps at which a world rests."""
+FROZEN = {(3, 2), (4, 2), (8, 0), (11, 0), (12, 1)}
+"""Steps at which a world rests; at one of them its episode is over."""
 
 
 every_case = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
@@ -62,8 +62,9 @@ def flight(loop: Loop, steps: range) -> list[Step]:
     for step in steps:
         begins = [step == 0 or (step, world) in RESET for world in range(WORLDS)]
         rests = [(step, world) in FROZEN for world in range(WORLDS)]
-        resets = loop.done | np.repeat(begins, rows)
-        frozen = ~resets & np.repeat(rests, rows)
+        frozen = np.repeat(rests, rows)
+        resets = (loop.done | np.repeat(begins, rows)) & ~frozen
+        sent[step][resets | frozen] = np.nan  # ignored
         seeds = np.arange(loop.num_envs) + 100 * step
         loop.advance(sent[step], resets, seeds, frozen)
         flown.append(Step(sent[step], resets, seeds, frozen, results(loop), loop.done, loop.steps))

@@ -32,30 +32,6 @@ def shown(loop: Loop, drone: int) -> bytes:
     return b"".join(array[drone].tobytes() for array in arrays)
 
 
-@pytest.mark.parametrize("env_id", [ID, HOVER])
-def test_a_frozen_drone_is_as_before(env_id: str) -> None:
-    (held, actions), (free, _) = (started(env_id, episode_length=5) for _ in range(2))
-    first = np.array([True, False])
-    second = np.array([False, True])
-    for loop in (held, free):
-        loop.advance(actions)
-    before = shown(held, 0)
-    for wrong in (np.nan, 9.0):
-        given = actions.copy()
-        given[0] = wrong  # ignored
-        held.advance(given, second, frozen=first)
-        assert shown(held, 0) == before
-        assert (held.rewards[0], held.terminated[0], held.truncated[0]) == (0.0, False, False)
-    for _ in range(4):  # and its episode is as long as if it had not been frozen
-        held.advance(actions, second)
-        free.advance(actions, second)
-        assert shown(held, 0) == shown(free, 0)
-    assert held.truncated[0]
-    held.advance(actions, second, frozen=first)  # also when its episode is over
-    with pytest.raises(gym.error.ResetNeeded, match="env 0 first"):
-        held.advance(actions)
-
-
 def test_flags_of_those_that_do_not_fly() -> None:
     loop, actions = started(episode_length=1)
     loop.advance(actions)
