@@ -1,7 +1,7 @@
 """Envs of a simulator: the loop of a registered task, or Gymnasium envs one after the other."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol, SupportsFloat
+from typing import Any, Protocol
 
 import gymnasium as gym
 import numpy as np
@@ -96,24 +96,22 @@ class GymnasiumBatch:
     ) -> None:
         none = np.zeros(self.num_envs, bool)
         resets = none if resets is None else resets
-        frozen = none if frozen is None else frozen
-        waiting = self._waiting & ~resets & ~frozen
-        if waiting.any():
-            raise gym.error.ResetNeeded(f"step: expected a reset of env {waiting.argmax()} first")
-        for i, env in enumerate(self.envs):
-            reward: SupportsFloat = 0.0
-            terminated = truncated = False
+        flown = ~resets if frozen is None else ~(resets | frozen)
+        if (self._waiting & flown).any():
+            first = (self._waiting & flown).argmax()
+            raise gym.error.ResetNeeded(f"step: expected a reset of env {first} first")
+        for array in (self.rewards, self.terminated, self.truncated):
+            array[:] = 0
+        for i in np.flatnonzero(resets | flown).tolist():
+            env = self.envs[i]
             if resets[i]:
                 observation, info = env.reset(seed=None if seeds is None else int(seeds[i]))
-                self._keep(i, observation, info)
-            elif not frozen[i]:
+            else:
                 action = int(actions[i]) if isinstance(self.spec.action, Discrete) else actions[i]
-                observation, reward, terminated, truncated, info = env.step(action)
-                self._keep(i, observation, info)
-            self.rewards[i] = float(reward)
-            self.terminated[i] = terminated
-            self.truncated[i] = truncated
-            self._waiting[i] = terminated or truncated or (frozen[i] and self._waiting[i])
+                observation, reward, self.terminated[i], self.truncated[i], info = env.step(action)
+                self.rewards[i] = float(reward)
+            self._keep(i, observation, info)
+            self._waiting[i] = self.terminated[i] or self.truncated[i]
 
     def close(self) -> None:
         for env in self.envs:
