@@ -1,5 +1,6 @@
 """Films: every frame at its time, whole or not at all, panes side by side."""
 
+import gc
 import math
 import subprocess
 import sys
@@ -172,11 +173,13 @@ def test_a_picture_on_a_full_disk_is_named(tmp_path: Path, monkeypatch: pytest.M
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_an_encoder_that_fails_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", "/bin/false")
     with pytest.raises(OSError, match="ffmpeg: the film could not be written"):
         write_film(tmp_path / "film.mp4", greys(3), 25.0)
     assert list(tmp_path.iterdir()) == []
+    gc.collect()  # imageio-ffmpeg leaves the pipe of an encoder that ended open
 
 
 def test_a_picture_of_odd_size_may_be_anything_but_mp4(tmp_path: Path) -> None:
