@@ -52,17 +52,22 @@ class _Part:
     _optional: ClassVar[tuple[str, ...]] = ()
     """Fields that are left out where they have their default."""
 
-    def _to_content(self) -> dict[str, Any]:
-        return {
-            f.metadata.get("json", f.name): _plain(value)
-            for f in fields(self)  # type: ignore[arg-type]
-            if (value := getattr(self, f.name)) != f.default or f.name not in self._optional
-        }
+    def _to_content(self) -> dict[str, object]:
+        content = {}
+        for f in fields(self):  # type: ignore[arg-type]
+            value = getattr(self, f.name)
+            default = f.default if f.default_factory is MISSING else f.default_factory()
+            if value != default or f.name not in self._optional:
+                content[f.metadata.get("json", f.name)] = _plain(value)
+        return content
 
     @classmethod
-    def _fields(cls, content: Any) -> dict[str, Any]:
+    def _fields(cls, content: object) -> dict[str, Any]:
         """Keyword arguments from a JSON object; names that are not known are left out."""
-        _expect(isinstance(content, dict), "spec", f"an object for {cls.__name__}", content)
+        if not isinstance(content, dict):
+            raise SpecError(
+                f"spec: expected an object for {cls.__name__}, got {shortened(content)}"
+            )
         given = {}
         for f in fields(cls):  # type: ignore[arg-type]
             name = f.metadata.get("json", f.name)
@@ -75,7 +80,7 @@ class _Part:
         return given
 
     @classmethod
-    def _from_content(cls, content: Any) -> Self:
+    def _from_content(cls, content: object) -> Self:
         return cls(**cls._fields(content))
 
 
@@ -152,7 +157,7 @@ class ArraySpec(_Part):
         return low, high
 
     @classmethod
-    def _from_content(cls, content: Any) -> Self:
+    def _from_content(cls, content: object) -> Self:
         given = cls._fields(content)
         for name in _NO_BOUND.keys() & given:
             values = given[name] if isinstance(given[name], tuple) else (given[name],)
@@ -374,7 +379,7 @@ def _expect(right: object, name: str, expected: str, got: object) -> None:
         raise SpecError(f"{name}: expected {expected}, got {shortened(got)}")
 
 
-def _check_text(name: str, text: Any) -> None:
+def _check_text(name: str, text: object) -> None:
     right = isinstance(text, str) and len(text) <= MAX_NAME and not _CONTROL.search(text)
     expected = f"a text of at most {MAX_NAME} characters without control characters"
     _expect(right, name, expected, text)
@@ -386,7 +391,7 @@ def _check_words(name: str, words: Any) -> None:
         _check_text(name, word)
 
 
-def _is_number(value: Any) -> bool:
+def _is_number(value: object) -> bool:
     return type(value) in (int, float)
 
 
@@ -407,12 +412,12 @@ def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return content
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> object:
     """A field's value for JSON."""
     if isinstance(value, _Part):
         return value._to_content()
     if isinstance(value, tuple):
-        return [_plain(one) for one in value]
+        return [_plain(item) for item in value]
     return None if value in (math.inf, -math.inf) else value
 
 
