@@ -1,7 +1,9 @@
 """Heads: from the outputs of a network to distributions of actions, and their derivatives."""
 
 import math
-from typing import Final, Protocol
+from abc import abstractmethod
+from types import MappingProxyType
+from typing import Final
 
 import numpy as np
 
@@ -11,10 +13,10 @@ _LOG_STD: Final = np.array([-4.0, 1.0], np.float32)
 """Least and greatest logarithm of a standard deviation."""
 
 
-class Head(Protocol):
+class Head:
     """A distribution of actions (B, k), or (B, 1) of choices, by a network's outputs."""
 
-    shapes: Shapes
+    shapes: Shapes = MappingProxyType({})
     """Of its own weights, by name."""
 
     def bind(self, weights: Weights) -> None:
@@ -23,15 +25,19 @@ class Head(Protocol):
     def initialise(self, log_std: float) -> None:
         """Set the weights."""
 
+    @abstractmethod
     def noise(self, rng: np.random.Generator, steps: int) -> Floats:
         """Randomness for so many rows of `sample`, drawn at once: shape (steps, k)."""
 
+    @abstractmethod
     def sample(self, output: Floats, noise: Floats) -> Floats:
         """Actions, not clipped, from outputs and rows of `noise`; in the memory of the outputs."""
 
+    @abstractmethod
     def score(self, output: Floats, actions: Floats) -> tuple[Floats, float]:
         """Log-probabilities, shape (B,), and the mean entropy."""
 
+    @abstractmethod
     def back(self, by_log_probability: Floats, by_entropy: float) -> Floats:
         """Derivatives of a loss by the outputs, from those by what `score` gave last.
 
@@ -42,11 +48,11 @@ class Head(Protocol):
         """Keep its weights where they are sensible."""
 
 
-class Gaussian:
+class Gaussian(Head):
     """The outputs are means; the standard deviation is a weight, the same in every state."""
 
     def __init__(self, size: int) -> None:
-        self.shapes: Shapes = {"log_std": (size,)}
+        self.shapes = {"log_std": (size,)}
 
     def bind(self, weights: Weights) -> None:
         self.log_std = weights.arrays["log_std"]
@@ -83,18 +89,11 @@ class Gaussian:
         np.clip(self.log_std, *_LOG_STD, out=self.log_std)
 
 
-class Categorical:
+class Categorical(Head):
     """The outputs are logits of choices."""
 
     def __init__(self, size: int) -> None:
-        self.shapes: Shapes = {}
         self._size = size
-
-    def bind(self, weights: Weights) -> None:
-        """It has no weights."""
-
-    def initialise(self, log_std: float) -> None:
-        """It has no weights."""
 
     def noise(self, rng: np.random.Generator, steps: int) -> Floats:
         # The Gumbel trick: the largest of logits plus Gumbel noise is a categorical draw.
@@ -121,6 +120,3 @@ class Categorical:
         slope[self._chosen] += by_log_probability
         slope -= by_entropy / len(slope) * self._shares * (self._logs + self._entropy)
         return slope
-
-    def clamp(self) -> None:
-        """It has no weights."""

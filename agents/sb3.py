@@ -1,13 +1,13 @@
 """Stable-Baselines3: its A2C, PPO and SAC as references, and vector envs as it wants them."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, NoReturn, Self
 
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
-from numpy.typing import NDArray
 
+from ..envs.autoreset import Step
 from ..models.errors import InputError, require
 from . import learner
 from .a2c import A2C, A2CConfig
@@ -24,6 +24,11 @@ if TYPE_CHECKING:
     from stable_baselines3.common import callbacks as sb3_callbacks
     from stable_baselines3.common import logger as sb3_logger
     from stable_baselines3.common import vec_env as sb3_vec
+    from stable_baselines3.common.vec_env.base_vec_env import (
+        VecEnvIndices,
+        VecEnvObs,
+        VecEnvStepReturn,
+    )
 else:
     sb3 = require("stable_baselines3", "train", "sb3-a2c")
     torch = require("torch", "train", "sb3-a2c")
@@ -49,10 +54,10 @@ class SB3VecEnv(sb3_vec.VecEnv):
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
         self._actions = np.zeros(0)
 
-    def reset(self) -> Any:
+    def reset(self) -> "VecEnvObs":
         """Begin an episode for every env, with the seeds of `seed` if it was called."""
         seeds = self._seeds if any(seed is not None for seed in self._seeds) else None
-        observations, _ = self.env.reset(seed=seeds)  # type: ignore[arg-type]
+        observations: VecEnvObs = self.env.reset(seed=seeds)[0]  # type: ignore[arg-type]
         self._reset_seeds()
         return observations
 
@@ -60,11 +65,11 @@ class SB3VecEnv(sb3_vec.VecEnv):
         """Keep the actions for `step_wait`."""
         self._actions = actions
 
-    def step_wait(self) -> Any:
+    def step_wait(self) -> "VecEnvStepReturn":
         """Fly every env for one step."""
         observations, rewards, terminated, truncated, info = self.env.step(self._actions)
         ended = terminated | truncated
-        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        infos: list[dict[str, object]] = [{} for _ in range(self.num_envs)]
         for i in np.flatnonzero(ended).tolist():
             last = info["final_obs"]
             infos[i]["terminal_observation"] = (
@@ -77,22 +82,22 @@ class SB3VecEnv(sb3_vec.VecEnv):
         """Close the vector env."""
         self.env.close()
 
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+    def get_attr(self, attr_name: str, indices: "VecEnvIndices" = None) -> list[object]:
         """An attribute of the vector env, which all envs share."""
         return [getattr(self.env, attr_name)] * len(list(self._get_indices(indices)))
 
-    def env_method(self, *_: Any, **__: Any) -> Any:
+    def env_method(self, *_: object, **__: object) -> NoReturn:
         """Not possible: the envs are one, without attributes to set and methods to call."""
         raise NotImplementedError("the envs of a vector env are one")
 
     set_attr = env_method
 
-    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+    def env_is_wrapped(self, wrapper_class: object, indices: "VecEnvIndices" = None) -> list[bool]:
         """False: wrappers of single envs are not here."""
         return [False] * len(list(self._get_indices(indices)))
 
 
-class RecordedEnv(VectorEnv[Floats, Floats, NDArray[Any]]):
+class RecordedEnv(VectorEnv[Floats, Floats, np.ndarray]):
     """A recorder as a vector env of SAME_STEP, whatever the autoreset of its env.
 
     Observations are flat, continuous actions in the units of `ActionMap`, and every episode has the
@@ -112,12 +117,12 @@ class RecordedEnv(VectorEnv[Floats, Floats, NDArray[Any]]):
         self.single_observation_space = spaces.Box(low.astype("f"), high.astype("f"))
         self.single_action_space = spaces.Discrete(actions.outputs) if actions.discrete else box
 
-    def reset(self, **_: Any) -> tuple[Floats, dict[str, Any]]:
+    def reset(self, **_: object) -> tuple[Floats, dict[str, Any]]:
         """Begin an episode of every drone; arguments are not used."""
         self.recorder.reset()
         return self.recorder.observations, {}
 
-    def step(self, actions: Floats) -> Any:
+    def step(self, actions: Floats) -> Step:
         """Fly one step. `info` has `final_obs` where an episode ended."""
         recorder = self.recorder
         env = recorder.env
@@ -297,7 +302,7 @@ class _PPO(sb3.PPO):
         for name, parameter in self.policy.named_parameters():
             groups["value_net." in name].append(parameter)
         settings = self.policy.optimizer_kwargs
-        parts: Any = [{"params": parameters} for parameters in groups.values()]
+        parts = [{"params": parameters} for parameters in groups.values()]
         self.policy.optimizer = torch.optim.Adam(parts, **settings)
 
     def _update_learning_rate(self, optimizers: Any) -> None:
@@ -306,7 +311,7 @@ class _PPO(sb3.PPO):
         critic["lr"] = actor["lr"] * self.critic_share
 
 
-_Made = tuple[type, dict[str, Any], dict[str, Any]]
+_Made = tuple[type, dict[str, object], dict[str, object]]
 """A class of SB3, its settings, and those of its policy."""
 
 
@@ -314,14 +319,14 @@ def _on_policy(config: A2CConfig, steps: int, log: EpisodeRecorder) -> _Made:
     rollout = steps * log.num_envs
     hidden = list(config.hidden)
     epsilon = (PPO if isinstance(config, PPOConfig) else A2C).epsilon
-    settings: dict[str, Any] = {
+    settings: dict[str, object] = {
         "n_steps": steps,
         "gae_lambda": config.gae_lambda,
         "ent_coef": config.ent_coef,
         "vf_coef": config.vf_coef,
         "normalize_advantage": config.normalize and rollout > 1,
     }
-    policy = {
+    policy: dict[str, object] = {
         "net_arch": {"pi": hidden, "vf": hidden},
         "log_std_init": config.log_std,
         "optimizer_kwargs": {"eps": epsilon, "foreach": True},
@@ -341,7 +346,7 @@ def _sac(config: SACConfig, steps: int, log: EpisodeRecorder) -> _Made:
     if ActionMap(log.spec.action).discrete:
         raise InputError("sb3-sac: expected an env of continuous actions, got one of choices")
     aim = config.target_entropy
-    settings = {
+    settings: dict[str, object] = {
         "buffer_size": config.buffer_size,
         "learning_starts": config.learning_starts - 1,  # SB3 learns after more than so many
         "batch_size": config.batch_size,

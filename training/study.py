@@ -158,7 +158,7 @@ def _evaluate(
     """Tables of the evaluation of all stages: the last on `study.episodes` episodes of its own,
     each before it on `study.curve_episodes` of the set `curve`.
     """
-    rows: list[dict[str, Any]] = []
+    rows: list[dict[str, object]] = []
     flown: list[Trajectory] = []
     drones = row.env.drones
     most = max(study.curve_episodes, study.episodes) if len(stages) > 1 else study.episodes
