@@ -136,11 +136,11 @@ def _verdict(verdict: Verdict) -> str:
 def _settings(results: Results) -> dict[str, dict[str, object]]:
     """Settings by the title of their list."""
     study = results.study.to_dict()
-    rows = study.pop("rows")
+    study.pop("rows")
     found = {"study": study}
-    for row, settings in zip(results.study.rows, rows, strict=True):
+    for row in results.study.rows:
         config = {} if row.controller else asdict(row.config)
-        found[row.name] = {**settings, "hyperparameters": config}
+        found[row.name] = {**row.to_dict(), "hyperparameters": config}
     return {**found, "versions": results.config["versions"], "machine": results.config["machine"]}
 
 

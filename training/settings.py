@@ -152,7 +152,7 @@ class Row:
         for name, value in values.items():
             object.__setattr__(self, name, value)
 
-    def _brought_to(self, env: EnvConfig) -> dict[str, Any]:
+    def _brought_to(self, env: EnvConfig) -> dict[str, str]:
         """Options that the controller needs, where the env has the task's defaults."""
         usual = EnvConfig(env_id=env.env_id).options
         return {k: v for k, v in self.brought.items() if env.options.get(k) == usual.get(k)}
@@ -205,7 +205,7 @@ class Row:
         return self.agent in CONTROLLERS
 
     @property
-    def brought(self) -> Mapping[str, Any]:
+    def brought(self) -> Mapping[str, str]:
         """Options of the env that a controller needs."""
         return CONTROLLERS[self.agent].options if self.controller else {}
 
@@ -222,13 +222,13 @@ class Row:
             num_envs=self.num_envs, **settings,
         )  # fmt: skip
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """JSON values that `from_dict` reads."""
         content = {one.name: getattr(self, one.name) for one in fields(self)}
         return {**content, "set": dict(self.set), "env": keywords_of(self.env)}
 
     @classmethod
-    def from_dict(cls, where: str, table: object, env: Mapping[str, Any] | None = None) -> "Row":
+    def from_dict(cls, where: str, table: object, env: Mapping[str, object] | None = None) -> "Row":
         """A row from a table of TOML or JSON, whose `env` adds to the given keywords.
 
         Raises `InputError`, whose sentence begins with `where`.
@@ -262,7 +262,7 @@ def env_from(keywords: Mapping[str, Any]) -> EnvConfig:
     return EnvConfig(env_id=env_id, options=given, **named)
 
 
-def keywords_of(env: EnvConfig) -> dict[str, Any]:
+def keywords_of(env: EnvConfig) -> dict[str, object]:
     """The reverse of `env_from`."""
     env_id = env.own_task or env.env_id
     return {"env_id": env_id, "vehicle": env.vehicle, "drones": env.drones, **env.options}
@@ -312,7 +312,7 @@ class Study:
         seeds = range(self.first_seed, self.first_seed + self.seeds)
         return {f"{row.name} seed {seed}": (row, seed) for seed in seeds for row in self.rows}
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """JSON values that `from_dict` reads."""
         content = {one.name: getattr(self, one.name) for one in fields(self)}
         return {**content, "rows": [row.to_dict() for row in self.rows]}
@@ -328,7 +328,7 @@ class Study:
         return cls(rows=tuple(rows), **given)
 
     @classmethod
-    def from_toml(cls, path: Path, defaults: Mapping[str, Any] | None = None) -> "Study":
+    def from_toml(cls, path: Path, defaults: Mapping[str, object] | None = None) -> "Study":
         """A study from a TOML file of settings and `[[row]]` tables; an `[env]` is of all rows.
 
         A file without `[[row]]` is one row, named as the file. Raises `InputError`.
