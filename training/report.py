@@ -105,9 +105,9 @@ def _page(
         yield _figure(results.folder / "figures" / f"{name}.svg", PAPER.get(name, ""))
     if verdicts:
         yield f"<h2>Claims</h2>{''.join(map(_verdict, verdicts))}"
-    yield "<h2>Settings</h2>"
     for title, values in _settings(results).items():
-        yield _listing(title, values)
+        text = html.escape(json.dumps(values, indent=1, ensure_ascii=False))
+        yield f"<details><summary>{html.escape(title)}</summary><pre>{text}</pre></details>"
     yield "</body></html>"
 
 
@@ -142,11 +142,3 @@ def _settings(results: Results) -> dict[str, dict[str, object]]:
         config = {} if row.controller else asdict(row.config)
         found[row.name] = {**row.to_dict(), "hyperparameters": config}
     return {**found, "versions": results.config["versions"], "machine": results.config["machine"]}
-
-
-def _listing(title: str, values: dict[str, object]) -> str:
-    items = []
-    for name, value in values.items():
-        text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
-        items.append(f"<dt>{html.escape(name)}</dt><dd>{html.escape(text)}</dd>")
-    return f"<details><summary>{html.escape(title)}</summary><dl>{''.join(items)}</dl></details>"
