@@ -438,7 +438,7 @@ def flown_by_c(header: Path, seed: int) -> np.ndarray:
     compiled(tool("gcc"), *flags, *policy, "-o", program, PEERS / "agent.c", "-lm")
     actions: list[np.ndarray] = []
 
-    def observe(message: object, state: object) -> None:
+    def observe(message: object) -> None:
         if isinstance(message, Command) and message.orders[0] == FLY:
             actions.append(np.atleast_1d(message.actions[0]).astype(np.float64))
 
@@ -448,7 +448,8 @@ def flown_by_c(header: Path, seed: int) -> np.ndarray:
         simulator.observer = observe
         flight = Running(simulator)
         status, out, err = ended(agent)
-        assert (status, err) == (0, "")
+        assert err == ""
+        assert status == 0
         assert f"episode 1: {len(actions)} steps" in out
         flight.join()
     return np.array(actions)
