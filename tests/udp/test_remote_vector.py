@@ -191,28 +191,6 @@ def test_wrong_seeds(seed: Any) -> None:
         remote.reset(seed=2**64 - 4)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "sentence"),
-    [
-        ({"num_simulators": 0}, "num_simulators: expected 1 to 65536, got 0"),
-        (
-            {"num_envs": 0},
-            "num_envs: expected a multiple of num_simulators = 1, at most 65536, got 0",
-        ),
-        (
-            {"num_simulators": 2, "num_envs": 5},
-            "num_envs: expected a multiple of num_simulators = 2, at most 131072, got 5",
-        ),
-        ({"timeout": 0}, "timeout: expected seconds > 0, got 0"),
-        ({"address": ("0.0.0.0", 0)}, "0.0.0.0 is not a loopback address"),
-        ({"key_file": "/nowhere/key"}, "key file: cannot read /nowhere/key"),
-    ],
-)
-def test_wrong_arguments(arguments: dict[str, Any], sentence: str) -> None:
-    with pytest.raises(ValueError, match=f"^{sentence}"):
-        RemoteVectorEnv(**{"address": ANY, **arguments})
-
-
 # ---- autoreset
 
 
