@@ -197,7 +197,8 @@ def read_cameras(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[Camera, ..
     targets = modes.mjCAMLIGHT_TARGETBODY.value, modes.mjCAMLIGHT_TARGETBODYCOM.value
     for number in range(model.ncam):
         one = model.camera(number)
-        usable = is_name(one.name) and model.cam_projection[number] == perspective.value
+        usable = one.name.isidentifier() and len(one.name) <= MAX_LETTERS
+        usable = usable and model.cam_projection[number] == perspective.value
         if not usable or model.cam_mode[number] in targets:
             continue
         _check_numbers(f"camera {one.name}", model, number)
@@ -236,11 +237,6 @@ def read_cameras(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[Camera, ..
     for name in texts:
         raise InputError(f"{name}: expected a camera of that name and a key that it can have")
     return tuple(found)
-
-
-def is_name(name: object) -> bool:
-    """Whether a camera can be called so: also in an option with commas, and in a file's name."""
-    return isinstance(name, str) and name.isidentifier() and len(name) <= MAX_LETTERS
 
 
 def _check_numbers(name: str, model: mujoco.MjModel, number: int) -> None:
@@ -307,29 +303,18 @@ def own_cameras(radius: float, rest_height: float) -> tuple[Camera, ...]:
 
 
 def place_camera(spec: mujoco.MjSpec, body: mujoco.MjsBody, camera: Camera) -> None:
-    """Add a camera to a body of a spec."""
+    """Add a camera to a body of a spec; its rate and optics are custom texts."""
+    right = np.cross(camera.look, camera.up)
     added = body.add_camera(name=camera.name, pos=camera.position)
     added.alt.type = mujoco.mjtOrientation.mjORIENTATION_XYAXES
-    added.alt.xyaxes = axes_of(camera)
+    added.alt.xyaxes = np.concatenate((right, np.cross(right, camera.look)))
     added.fovy = math.degrees(camera.fovy)
     added.resolution = (camera.width, camera.height)
     added.output = sum(int(OUTPUTS[kind]) for kind in camera.kinds)
-    for name, data in texts_of(camera).items():
-        spec.add_text(name=name, data=data)
-
-
-def texts_of(camera: Camera) -> dict[str, str]:
-    """Names and data of the custom texts with which MJCF has a camera's rate and optics."""
-    told = {one.name: np.ravel(getattr(camera.optics, one.name)) for one in fields(Optics)}
-    told["rate"] = np.array([1 / camera.every if camera.every > 1 else 0.0])
-    return {
-        f"{_TEXTS}{camera.name}.{key}": " ".join(map(repr, values.tolist()))
-        for key, values in told.items()
-        if values.any()
-    }
-
-
-def axes_of(camera: Camera) -> tuple[float, ...]:
-    """MJCF's `xyaxes` of a camera: right, and up."""
-    right = np.cross(camera.look, camera.up)
-    return (*right.tolist(), *np.cross(right, camera.look).tolist())
+    texts = {one.name: np.ravel(getattr(camera.optics, one.name)) for one in fields(Optics)}
+    if camera.every > 1:
+        texts["rate"] = np.array([1 / camera.every])
+    for key, values in texts.items():
+        if values.any():
+            data = " ".join(map(repr, values.tolist()))
+            spec.add_text(name=f"{_TEXTS}{camera.name}.{key}", data=data)
