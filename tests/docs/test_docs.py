@@ -7,6 +7,8 @@ from typing import Any
 
 import pandas as pd
 import pytest
+from rotorgram.envs.config import EnvConfig
+from rotorgram.envs.registry import env_spec
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "docs" / "results"
@@ -93,6 +95,15 @@ def test_the_steps_of_the_ppo_example_are_those_that_were_measured() -> None:  #
     for rows in result("performance/ppo_example").values():
         steps = [row["return_200"] for row in rows]
         check("extending", f"{min(steps):,} to {max(steps):,}")
+
+
+def test_the_protocol_says_where_the_numbers_of_a_state_are() -> None:
+    places = []
+    at = 72  # behind the flags of one drone
+    for array in env_spec(EnvConfig()).telemetry:
+        places.append(f"{array.name} at {at}")
+        at += 8 * array.size
+    check("protocol", f"{', '.join(places)}; {at} bytes in all")
 
 
 def test_committed_results_are_small() -> None:
