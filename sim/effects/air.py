@@ -52,30 +52,33 @@ class AirEffects(Kept):
             self._angular = told.drag.angular
             self._moment = told.drag.moment
             known = (linear, quadratic, self._angular, self._moment)
-            given = any(value is not None for value in known)
-            expected = "drag.linear or drag.quadratic in the vehicle's file, which body_drag needs"
-            if not given:
-                raise InputError(f"vehicle: expected {expected}, got none")
-            none = (0.0, 0.0, 0.0)
-            self._linear = linear or none
-            self._quadratic = quadratic or none
+            if known == (None,) * 4:
+                raise InputError(
+                    "vehicle: expected drag.linear or drag.quadratic in the vehicle's file, which "
+                    "body_drag needs, got none"
+                )
+            self._linear = linear or _NOTHING
+            self._quadratic = quadratic or _NOTHING
             # Of a fall at its terminal velocity, sqrt(weight / quadratic), the slope of the drag.
             weight = vehicle.mass * vehicle.gravity
             slope = max(self._linear) + 2 * math.sqrt(max(self._quadratic) * weight)
             _check_stiffness(vehicle, slope, "drag of the body")
             most = 0.5 * float(np.linalg.eigvalsh(vehicle.inertia)[0]) / vehicle.timestep
-            stiffest = max(self._angular or none)
-            expected = f"at most {most:.4g} N m s, half the least inertia over the physics step"
+            stiffest = max(self._angular or _NOTHING)
             if not stiffest <= most:
-                raise InputError(f"drag.angular: expected {expected}, got {stiffest:.4g}")
+                raise InputError(
+                    f"drag.angular: expected at most {most:.4g} N m s, half the least inertia over "
+                    f"the physics step, got {stiffest:.4g}"
+                )
         if options.rotor_drag:
             (coefficient,) = told.need("rotors.thrust_coefficient", "rotor_drag")
             self._slope = math.sqrt(coefficient)  # of the square root of a thrust over the speed
             three = (told.rotors.drag, told.rotors.inflow, told.rotors.lift)
-            some = any(value is not None for value in three)
-            expected = "rotors.drag, inflow or lift in the vehicle's file, which rotor_drag needs"
-            if not some:
-                raise InputError(f"vehicle: expected {expected}, got none")
+            if three == (None,) * 3:
+                raise InputError(
+                    "vehicle: expected rotors.drag, inflow or lift in the vehicle's file, which "
+                    "rotor_drag needs, got none"
+                )
             self._drag, self._inflow, self._lift = (value or 0.0 for value in three)
             speeds = np.sqrt(np.maximum(vehicle.thrust_high, 0.0)) / self._slope
             slope = max(self._drag, self._inflow) * float(speeds.sum())
@@ -206,9 +209,11 @@ class AirEffects(Kept):
 def _check_stiffness(vehicle: "Vehicle", slope: float, what: str) -> None:
     """Refuse drag that the extrapolation over a physics step cannot follow."""
     most = 0.5 * vehicle.mass / vehicle.timestep
-    expected = f"{what} of at most {most:.4g} N s/m, half its mass over the physics step"
     if not slope <= most:
-        raise InputError(f"vehicle: expected {expected}, got {slope:.4g}")
+        raise InputError(
+            f"vehicle: expected {what} of at most {most:.4g} N s/m, half its mass over the physics "
+            f"step, got {slope:.4g}"
+        )
 
 
 def _motion(state: WorldState) -> list[Array]:
