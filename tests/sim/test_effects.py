@@ -484,7 +484,10 @@ def gusts(
     dice = np.random.default_rng(0)
     mask = np.ones((num, 1), bool)
     air.begin(mask, np.full((num, 1), height), dice.standard_normal((num, 1, 5)))
-    rows = [air.step(None, dice.standard_normal((num, 1, 5))) for _ in range(steps)]
+    rows = []
+    for _ in range(steps):
+        air.step(None, dice.standard_normal((num, 1, 5)))
+        rows.append(air.velocity)
     return np.array(rows)[..., 0].transpose(0, 2, 1)
 
 
