@@ -184,6 +184,24 @@ def test_both_sides_can_be_repeated_bit_for_bit(
     assert datagrams(both.agent, State)[1][40:] == datagrams(both.simulator, State)[1][40:]
 
 
+def test_a_tilted_flight_by_text_is_repeated(tmp_path: Path) -> None:
+    """Its attitude came as three angles: a quaternion arrives within rounding."""
+    files = [tmp_path / "agent.mcap", tmp_path / "simulator.mcap"]
+    hover = "rotorgram/Hover-v0"
+    remote = RemoteEnv(ANY, env_id=hover, options={}, connect=False, timeout=5, record=files[0])
+    running = Running(
+        Simulator(hover, server=remote.address, bind=ANY, codec="text", record=files[1])
+    )
+    remote.reset(seed=3)
+    for _ in range(10):
+        *_, info = remote.step(np.array([0.1, -0.1, 0.05, 0.0], np.float32))
+    assert abs(info["qx"]) > 1e-3
+    remote.close()
+    running.join()
+    for file in files:
+        assert Verification(file).identical
+
+
 WORLD: dict[str, Any] = {
     "effects": {
         "motor_lag": True, "body_drag": True, "wind": (2.0, 1.0, 0.0), "gusts": 3.0,
