@@ -409,7 +409,7 @@ def test_controllers_of_different_vehicles_share_their_ranges() -> None:
     up = min(one.most_offset[1] for one in gains)
     assert mixed.ranges() == [(level, "m"), (level, "m"), (up, "m"), (math.pi, "rad")]
     assert mixed.ranges() == pairs[1][0].ranges()
-    assert mixed.units[0] == f"{level:.7g} m"
+    assert mixed.constants["action_scale"] == (level, level, up, math.pi)
 
 
 # --- the page -------------------------------------------------------------------------------------
