@@ -6,7 +6,6 @@ A line fits into 80 columns: on narrow terminals the bar gives way, then the fig
 import math
 import sys
 import time
-from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Final
@@ -19,7 +18,6 @@ from rich.text import Text
 from ..flights.executors import OnProgress
 
 _LINE_EVERY: Final = 10.0  # s
-_RATE_OVER: Final = 10.0  # s: the rate is that of so long a time up to now
 
 
 @contextmanager
@@ -60,18 +58,11 @@ class Bars:
             self.progress.print(f"{name:14} done", highlight=False)
 
     def _update(self, name: str, done: int, total: int, words: str) -> Task:
-        """The task of a run, with its recent amounts done and their times."""
-        now = self.progress.get_time()
+        """The task of a run, with these amounts."""
         if name not in self._tasks:
-            # There is always a point: a bar may be drawn, by a thread of rich's, at any time.
-            points = deque([(now, done)])
-            number = self.progress.add_task(name, total=total, words=words, points=points)
+            number = self.progress.add_task(name, total=total, words=words)
             self._tasks[name] = next(t for t in self.progress.tasks if t.id == number)
         task = self._tasks[name]
-        points = task.fields["points"]
-        points.append((now, done))
-        while len(points) > 2 and points[1][0] <= now - _RATE_OVER:
-            points.popleft()
         self.progress.update(task.id, completed=done, total=total, words=words)
         return task
 
@@ -109,24 +100,15 @@ def _count(task: Task) -> str:
     return f"{_short(task.completed)}/{_short(task.total or 0)}"
 
 
-def _per_second(task: Task) -> float:
-    """0 where it is not known."""
-    points = task.fields["points"]
-    (began, before) = points[0]
-    (now, done) = points[-1]
-    return max(done - before, 0) / (now - began) if now > began else 0.0
-
-
 def _rate(task: Task) -> str:
-    rate = _per_second(task)
-    return f"{_short(rate)}/s" if rate else ""
+    return f"{_short(task.speed)}/s" if task.speed else ""
 
 
 def _times(task: Task) -> str:
     elapsed = task.finished_time if task.finished else task.elapsed
-    rate = _per_second(task)
     remaining = task.remaining
-    left = f", {_duration(math.ceil(remaining / rate))} left" if rate and remaining else ""
+    speed = task.speed
+    left = f", {_duration(math.ceil(remaining / speed))} left" if speed and remaining else ""
     return f"{_duration(elapsed or 0.0)}{left}"
 
 

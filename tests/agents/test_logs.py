@@ -365,7 +365,7 @@ def test_a_run_that_is_done_says_so(capsys: pytest.CaptureFixture[str]) -> None:
     lines("vpg seed 1", 0, 60, "simulate")
     clock.now += 2.0
     lines("vpg seed 1", 60, 60, "done")
-    assert capsys.readouterr().out.splitlines()[-1] == "vpg seed 1     60/60  30/s  0:02  done"
+    assert capsys.readouterr().out.splitlines()[-1] == "vpg seed 1     60/60  0:02  done"
     bars = Bars(Console(width=80, file=io.StringIO(), force_terminal=True), clock)
     bars("vpg seed 1", 60, 60, "done")
     assert drawn(bars, 80) == [], "it makes room"
