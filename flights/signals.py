@@ -1,6 +1,7 @@
 """Signals of a flight over time, z up and in SI units, and their table as CSV or Parquet."""
 
 import csv
+import io
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..envs.spec import ArraySpec, Discrete, component_names
 from ..models.errors import require
+from ..models.files import write_new
 from .trajectories import Trajectory
 
 Floats = NDArray[np.float64]
@@ -84,16 +86,17 @@ def write_csv(flights: Sequence[Trajectory], out: Path) -> int:
     The head has names and units, as `x [m]`. Numbers have all their digits; a missing one is empty.
     """
     rows = 0
-    with out.open("x", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        for flight in flights:
-            columns = list(columns_of(flight))
-            if not rows:
-                writer.writerow([f"{c.name} [{c.unit}]" if c.unit else c.name for c in columns])
-            numbers = (column.values.tolist() for column in columns)
-            for row in zip(*numbers, strict=True):
-                writer.writerow(["" if value != value else value for value in row])
-                rows += 1
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    for flight in flights:
+        columns = list(columns_of(flight))
+        if not rows:
+            writer.writerow([f"{c.name} [{c.unit}]" if c.unit else c.name for c in columns])
+        numbers = (column.values.tolist() for column in columns)
+        for row in zip(*numbers, strict=True):
+            writer.writerow(["" if value != value else value for value in row])
+            rows += 1
+    write_new(out, text.getvalue())
     return rows
 
 
@@ -116,5 +119,7 @@ def write_parquet_log(flights: Sequence[Trajectory], out: Path) -> int:
         )
         tables.append(pa.Table.from_arrays(arrays, schema=schema))
     table = pa.concat_tables(tables)
-    pq.write_table(table, out)
+    file = pa.BufferOutputStream()
+    pq.write_table(table, file)
+    write_new(out, file.getvalue().to_pybytes())
     return int(table.num_rows)

@@ -6,12 +6,12 @@ from pathlib import Path
 from .errors import InputError
 
 
-def write_new(path: Path, text: str) -> None:
-    """Write a new file in UTF-8. Raises `OSError`, which names it; then it is not there."""
+def write_new(path: Path, content: str | bytes) -> None:
+    """Write a new file, a text in UTF-8. Raises `OSError`, which names it; then it is not there."""
     file = path.open("xb")
     try:
         with file:
-            file.write(text.encode())
+            file.write(content.encode() if isinstance(content, str) else content)
     except BaseException as error:
         with suppress(OSError):
             path.unlink()

@@ -81,13 +81,7 @@ class MujocoWorld(BaseWorld):
         self._warnings = batch.warning  # of each kind the last info, and how many
         self._no_warnings = self._warnings.tobytes()
         self._no_contacts = self._contacts.tobytes()
-        crafts = members_of(vehicle, drones)
-        newtons = np.array([rotor.newtons for craft in crafts for rotor in craft.rotors])
-        self._newtons = None if (newtons == 1.0).all() else newtons
-        # Where controls are newtons, they are the thrusts, and without effects the commands too.
-        alike = self._newtons is None and self.effects is None
-        self._command = self._ctrl if alike else np.zeros_like(self._ctrl)
-        self._thrust = np.zeros_like(self._ctrl) if self._on_rotors else self._command
+        self._bind_thrusts(members_of(vehicle, drones))
         self._touching = np.zeros((num_worlds, drones), bool)
         self._colliding: np.ndarray | None = None
         if drones > 1:
@@ -108,6 +102,14 @@ class MujocoWorld(BaseWorld):
             payload_velocity=None if self._cable is None else moves,
         )
         assert np.shares_memory(self.state.position, qpos)
+
+    def _bind_thrusts(self, crafts: tuple[Vehicle, ...]) -> None:
+        """Controls in newtons are the thrusts, and without effects the commands too."""
+        newtons = np.array([rotor.newtons for craft in crafts for rotor in craft.rotors])
+        self._newtons = None if (newtons == 1.0).all() else newtons
+        alike = self._newtons is None and self.effects is None
+        self._command = self._ctrl if alike else np.zeros_like(self._ctrl)
+        self._thrust = np.zeros_like(self._ctrl) if self._on_rotors else self._command
 
     def reset(self, mask: Array, pose: InitialState) -> None:
         """As `World.reset`. Raises `InputError` for a payload that would hang in the ground."""

@@ -19,7 +19,7 @@ from ..protocol.messages import POLICIES, Hello
 from ..protocol.party import AgentLink, OneAgent, SeveralAgents, SwarmWorld, WorldRules
 from .driver import Driver
 from .sockets import TEXT_WAY_OUT, WAY_OUT, Port, resolve
-from .stepped import GymEnv, make_stepped
+from .stepped import GymEnv, Steppable, make_stepped
 
 DEFAULT_AGENT: Final = ("127.0.0.1", 8001)
 DEFAULT_SIMULATOR: Final = ("127.0.0.1", 8000)
@@ -94,24 +94,13 @@ class Simulator(Driver):
             failing.callback(stepped.close)
             spec = stepped.spec
             worlds = stepped.num_envs // len(spec.agents)
+            parts = {server: spec.agents} if agents is None else agents
             links: list[AgentLink] = []
-            for address, names in _shares(
-                {server: spec.agents} if agents is None else agents, spec
-            ):
+            for number, (address, names) in enumerate(_shares(parts, spec)):
                 there = resolve(address, insecure=insecure, way_out=way_out)
-                if not there[1]:
-                    raise InputError("server: expected the port of the agent, 1 to 65535, got 0")
                 own = replace(spec, agents=names)
-                hello = Hello(session=new_session(), spec=own.to_json(), worlds=worlds)
-                number = len(links)
-                client = Client(
-                    hello,
-                    layout_of(own, worlds),
-                    replace(config, drop_seed=config.drop_seed + number),
-                    largest=largest_datagram(there, config.max_datagram),
-                    by_text=by_text,
-                    key=key,
-                )
+                changed = replace(config, drop_seed=config.drop_seed + number)
+                client = _client(own, worlds, there, changed, by_text=by_text, key=key)
                 links.append(AgentLink(number, there, client, _rows(spec, names, worlds)))
             addresses = [link.address for link in links]
             if len(set(addresses)) < len(addresses):
@@ -126,18 +115,12 @@ class Simulator(Driver):
             rules: WorldRules
             if agents is None:
                 rules = OneAgent(stepped, layout, spec.control_period, links)
-            elif hasattr(stepped, "retire"):
-                world = cast(SwarmWorld, stepped)
-                rules = SeveralAgents(
-                    world,
-                    layout,
-                    spec.control_period,
-                    links,
-                    when_lost=when_lost,
-                    patience=patience,
-                )
             else:
-                raise InputError(f"env: expected a registered task for several drones, got {env!r}")
+                world = _swarm_world(stepped, env)
+                period = spec.control_period
+                rules = SeveralAgents(
+                    world, layout, period, links, when_lost=when_lost, patience=patience
+                )
             super().__init__(stepped, rules, port)
             if record:
                 self._record(record)
@@ -159,6 +142,30 @@ def _rows(spec: EnvSpec, names: tuple[str, ...], worlds: int) -> np.ndarray:
     """Rows of these drones in the arrays of all worlds, shape (n,)."""
     own = [spec.agents.index(name) for name in names]
     return np.array([len(spec.agents) * world + row for world in range(worlds) for row in own])
+
+
+def _client(
+    spec: EnvSpec,
+    worlds: int,
+    there: Address,
+    config: LinkConfig,
+    *,
+    by_text: bool,
+    key: Key | None,
+) -> Client:
+    """A client for the agent at an address, with a session of its own."""
+    if not there[1]:
+        raise InputError("server: expected the port of the agent, 1 to 65535, got 0")
+    hello = Hello(session=new_session(), spec=spec.to_json(), worlds=worlds)
+    largest = largest_datagram(there, config.max_datagram)
+    layout = layout_of(spec, worlds)
+    return Client(hello, layout, config, largest=largest, by_text=by_text, key=key)
+
+
+def _swarm_world(stepped: Steppable, env: object) -> SwarmWorld:
+    if not hasattr(stepped, "retire"):
+        raise InputError(f"env: expected a registered task for several drones, got {env!r}")
+    return cast(SwarmWorld, stepped)
 
 
 def _shares(agents: Agents, spec: EnvSpec) -> list[tuple[Address, tuple[str, ...]]]:
