@@ -64,7 +64,7 @@ def test_refused(keyed: bool, part: str, key: Path, capsys: pytest.CaptureFixtur
         options={} if keyed else {"target": 6.0},
         key_file=key if keyed else None,
         connect=False,
-        connect_timeout=1.0,
+        connect_timeout=3.0,
     )
     waiting = Thread(target=_wait, args=[env])
     waiting.start()
