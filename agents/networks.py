@@ -73,7 +73,7 @@ class Weights:
         return Weights(shapes, self.values[some], self.slopes[some])
 
     def load(self, arrays: Mapping[str, Floats]) -> None:
-        """Take over arrays by name. Raises `ValueError` unless they are all, in their shapes."""
+        """Take over arrays by name. Raises `ValueError` for other names or shapes."""
         got = {name: array.shape for name, array in arrays.items()}
         if got != self.shapes:
             raise ValueError(f"expected arrays of shapes {dict(self.shapes)}, got {got}")
@@ -98,6 +98,8 @@ class Layer:
     """
 
     shapes: Shapes = MappingProxyType({})
+    in_place: ClassVar[bool] = False
+    """Whether outputs take the memory of the inputs. A network's first layer gets a copy."""
 
     def bind(self, weights: Weights) -> None:
         """Compute with these arrays from now on."""
@@ -107,14 +109,17 @@ class Layer:
 
     @abstractmethod
     def forward(self, inputs: Floats) -> Floats:
-        """The outputs. Keeps what the derivatives need."""
+        """The outputs, which the next layer may overwrite. Keeps what the derivatives need."""
 
     def learn(self, slope: Floats) -> None:
         """Set the gradients of a loss, from its derivatives by the last outputs."""
 
     @abstractmethod
     def back(self, slope: Floats) -> Floats:
-        """Derivatives by the last inputs, from those by the outputs, which it may overwrite."""
+        """Derivatives by the last inputs, from those by the outputs, which it may overwrite.
+
+        It is called after `learn`, which may not.
+        """
 
 
 class Affine(Layer):
@@ -157,6 +162,8 @@ class Affine(Layer):
 class Relu(Layer):
     """max(x, 0), in the memory of the inputs."""
 
+    in_place = True
+
     def forward(self, inputs: Floats) -> Floats:
         self._outputs = np.maximum(inputs, _ZERO, out=inputs)
         return inputs
@@ -169,6 +176,8 @@ class Relu(Layer):
 class Tanh(Layer):
     """The hyperbolic tangent, in the memory of the inputs."""
 
+    in_place = True
+
     def forward(self, inputs: Floats) -> Floats:
         self._outputs = np.tanh(inputs, out=inputs)
         return inputs
@@ -179,7 +188,7 @@ class Tanh(Layer):
 
 
 class Normalise(Layer):
-    """(x - mean) · scale, with numbers that no loss moves; shape (n,) each."""
+    """(x - mean) · scale, with fixed numbers, of shape (n,) each."""
 
     def __init__(self, mean: Floats, scale: Floats) -> None:
         self.mean = mean
@@ -199,7 +208,7 @@ class Network:
     in `remembered`. Rollouts keep it for each drone, with 0 at the beginning of an episode.
 
     Attributes:
-        layers: They are in their order.
+        layers: In the order of evaluation.
         shapes: Of all weights: `layers.0.weight` and so on, counted by layers that have weights.
         remembered: The memory after `forward`, shape (B, m).
     """
@@ -226,12 +235,14 @@ class Network:
             layer.bind(weights.part(prefix))
 
     def initialise(self, rng: np.random.Generator, gain: float) -> None:
-        """Draw the weights, with the gain sqrt(2) but for the last layer."""
-        last = self.layers[-1]
+        """Draw the weights, with the gain sqrt(2) but for the last layer that has weights."""
+        last = [layer for layer in self.layers if layer.shapes][-1]
         for layer in self.layers:
             layer.initialise(rng, gain if layer is last else math.sqrt(2))
 
     def forward(self, inputs: Floats) -> Floats:
+        if self.layers[0].in_place:
+            inputs = inputs.copy()
         for layer in self.layers:
             inputs = layer.forward(inputs)
         return inputs
@@ -252,7 +263,7 @@ class Network:
 
 
 class MLP(Network):
-    """Layers of `relu` or `tanh` units (paper, section 2.3: one of 16) and one of plain sums."""
+    """Layers of `relu` or `tanh` units (paper, section 2.3: one of 16) and a linear one."""
 
     def build(self, inputs: int, outputs: int, config: Config) -> Sequence[Layer]:
         layers: list[Layer] = []

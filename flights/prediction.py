@@ -94,6 +94,8 @@ class Windows:
             start=np.tile(self.start, (times, 1)),
             truth=np.tile(self.truth, (times, 1, 1)),
             speeds=np.tile(self.speeds, (times, 1, 1)),
+            flight=np.tile(self.flight, times),
+            index=np.tile(self.index, times),
         )
 
     @classmethod

@@ -6,9 +6,20 @@ import numpy as np
 import pytest
 import torch
 from nets import mlp_of, random_policy
-from rotorgram.agents.networks import MLP, Weights, orthogonal
+from rotorgram.agents.config import Config
+from rotorgram.agents.networks import (
+    MLP,
+    Affine,
+    Layer,
+    Network,
+    Relu,
+    Tanh,
+    Weights,
+    orthogonal,
+)
 from rotorgram.agents.optimizers import Adam, clip_norm
 from rotorgram.agents.policies import NetworkPolicy
+from rotorgram.agents.vpg import VPGConfig
 from rotorgram.envs.spec import ArraySpec, Discrete
 from scripted import spec_of
 
@@ -160,3 +171,22 @@ def test_an_actor_begins_near_zero_and_a_net_with_gains() -> None:
     np.testing.assert_allclose(np.linalg.norm(arrays["layers.1.weight"], axis=1), 0.01, rtol=1e-5)
     assert arrays["log_std"].tolist() == [-0.5] * 3
     assert not arrays["layers.0.bias"].any()
+
+
+class Squashed(Network):
+    """It begins and ends with layers that work in the memory of their inputs."""
+
+    def build(self, inputs: int, outputs: int, config: Config) -> list[Layer]:
+        return [Tanh(), Affine(inputs, outputs), Relu()]
+
+
+def test_activations_may_come_first_and_last() -> None:
+    network = Squashed(2, 3, VPGConfig())
+    weights = Weights.zeros(network.shapes)
+    network.bind(weights)
+    network.initialise(np.random.default_rng(0), 0.01)
+    inputs = np.array([[0.5, -2.0]], np.float32)
+    network.forward(inputs)
+    assert inputs.tolist() == [[0.5, -2.0]]
+    columns = np.linalg.norm(weights.arrays["layers.0.weight"], axis=0)
+    np.testing.assert_allclose(columns, 0.01, rtol=1e-5)
