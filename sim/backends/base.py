@@ -43,8 +43,6 @@ class BaseWorld:
         self._randomize = randomize
         self._drawn = () if randomize is None else randomize.names
         self.random = Random(shape)
-        self._start = self.random.use(START)
-        self._randomization = self.random.use(RANDOMIZATION)
         acting = Effects(vehicle, self._options, self.random.noise, self._drawn)
         self.effects: Effects | None = acting if acting.works else None
         self._on_rotors = acting.on_rotors
@@ -57,7 +55,7 @@ class BaseWorld:
 
     def draw(self, mask: Array, chosen: Mapping[str, Array] | None = None) -> Draw:
         """As `World.draw`."""
-        return self.random.start(self._start, self._ids(mask), chosen)
+        return self.random.start(START, self._ids(mask), chosen)
 
     def snapshot(self) -> Snapshot:
         """As `World.snapshot`."""
@@ -74,7 +72,8 @@ class BaseWorld:
         self.parameters = {name: plain(array.copy()) for name, array in parameters.items()}
         self._restore(part_of(arrays, "state"))
         if self.effects is not None:
-            self.effects.restore(part_of(arrays, "effects"), self.state, self.parameters)
+            self.effects.restore(part_of(arrays, "effects"))
+            self.effects.take(self.state, self.parameters)
 
     def _snapshot(self) -> Snapshot:
         """Copies of the backend's own arrays."""
@@ -97,7 +96,7 @@ class BaseWorld:
     def _draw_parameters(self, mask: Array) -> None:
         """Draw the parameters of the worlds of a mask."""
         if self._randomize is not None:
-            draw = Draw(self.random, self._randomization, self._ids(mask))
+            draw = Draw(self.random, RANDOMIZATION, self._ids(mask))
             for name, new in self._randomize.draw(draw).items():
                 old = self.parameters.get(name)
                 self.parameters[name] = plain(new if old is None else np.where(mask, new, old))

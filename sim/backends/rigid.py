@@ -109,8 +109,7 @@ class RigidWorld(BaseWorld):
         Inertia, kg·m², (W A, 3, 3); a factor of the rotors' reactions, (W A,); and coefficients of
         the air by their names in a vehicle's file, (W, A) each.
         """
-        self._body.vary({"reaction": reaction})
-        self._body.set_inertia(inertia)
+        self._body.vary({"reaction": reaction}, inertia)
         self._pack()
         if self.effects is not None:
             self.effects.vary(air)
@@ -308,7 +307,7 @@ def _check_forces(vehicle: Vehicle) -> None:
     mujoco.mj_step(model, data)
     theirs = np.concatenate((data.qpos, data.qvel)) - rows
     right = np.abs(ours - theirs).max() <= 1e-9 * max(1.0, np.abs(theirs).max())
-    expected = "RK4, and no forces but gravity, rotors, linear_drag and a fluid's on inertia boxes"
+    expected = "RK4, and no forces but gravity, rotors and linear_drag"
     if not right:
         raise InputError(
             f"vehicle: expected {expected} (the backend rigid), got others in {vehicle.name}"

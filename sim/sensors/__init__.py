@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from ...models.errors import InputError, shortened
 from ...models.fields import check_names
-from ..snapshots import Arrays, Kept, Snapshot, joined, part_of
+from ..snapshots import Kept
 from ..state import Array, WorldState
 from .barometer import Barometer
 from .base import Reading, Sensor, Source, Values, chosen
@@ -132,18 +132,8 @@ class Sensors(Kept):
         if self._estimator is not None:
             self._estimator.update(mask, self._channels)
 
-    def snapshot(self) -> Snapshot:
-        """Copies of all arrays that a later reading depends on, by name."""
-        parts = {name: part.snapshot() for name, part in self._parts().items()}
-        return joined(parts) | super().snapshot()
-
-    def restore(self, arrays: Arrays) -> None:
-        """Put a snapshot back, after that of the world."""
-        super().restore(arrays)
-        for name, part in self._parts().items():
-            part.restore(part_of(arrays, name))
-
-    def _parts(self) -> dict[str, Kept]:
+    def parts(self) -> dict[str, Kept]:
+        """The channels, the sensors' errors and the estimator."""
         parts: dict[str, Kept] = dict(self._channels)
         for name, channel in self._channels.items():
             parts[f"{name} errors"] = channel.sensor
