@@ -98,7 +98,7 @@ class RotorEffects(Kept):
         if options.battery:
             charge = factors.get("battery_charge", 1.0) + 0.0 * component(thrust, 0)
             (self.charge,) = kept(mask, [charge], [self.charge])
-            self.voltage = self._terminal()
+            (self.voltage,) = kept(mask, [self._terminal()], [self.voltage])
         return _join(self._scaled(split(thrust)))
 
     def take(self, thrust: Array, factors: dict[str, Array]) -> None:
