@@ -11,14 +11,14 @@ from rotorgram.envs import Loop
 from rotorgram.sim import InitialState
 
 
-@pytest.mark.parametrize("case", ["rich", "rich, rigid"])
+@pytest.mark.parametrize("case", ["swarm", "swarm, rigid"])
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
 def test_worlds_are_copied(case: str, copied: Any) -> None:
     loop = Loop(FEATURES[case].config(), 2)
-    loop.advance(np.zeros((2, 4)), np.ones(2, bool), [1, 2])
+    loop.advance(np.zeros((4, 4)), np.ones(4, bool), range(4))
     world: Any = loop.world
     twin = copied(world)
-    some = np.array([[True], [False]])
+    some = np.array([[True, True], [False, False]])
     for either in (world, twin):
         for _ in range(3):
             start = either.draw(some).uniform(2.0, 3.0, (3,))
