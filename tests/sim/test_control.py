@@ -27,6 +27,7 @@ from rotorgram.sim.control.cascade import Position
 from rotorgram.sim.control.gains import shared_ranges
 from rotorgram.sim.control.mixed import MixedController
 
+approx = pytest.approx
 DATA = Path(__file__).parents[1] / "data"
 DOCS = Path(__file__).parents[2] / "docs"
 HOVER = "rotorgram/Hover-v0"
@@ -53,7 +54,7 @@ def thrusts(level: str, action: Any, **given: Any) -> list[float]:
     vehicle = Vehicle.load()
     controller = make_controller(level, vehicle, vehicle.timestep)
     found = controller.thrust(np.array(action, float), state_of(vehicle, **given))
-    return pytest.approx(found.tolist(), abs=2e-3)  # type: ignore[no-any-return]
+    return approx(found.tolist(), abs=2e-3)  # type: ignore[no-any-return]
 
 
 # --- gains and ranges -----------------------------------------------------------------------------
@@ -67,18 +68,18 @@ def test_gains_of_the_papers_craft() -> None:
     """
     gains = Gains.of(Vehicle.load(), 0.01)
     assert gains.lowest == 0.0
-    assert gains.highest == pytest.approx(400.0)
+    assert gains.highest == approx(400.0)
     assert gains.lead == 1.0
-    assert gains.attitude == pytest.approx(4.41584, abs=1e-4)
-    assert gains.rate == pytest.approx((8.83168, 8.83168, 1.39987), abs=1e-4)
-    assert gains.heading == pytest.approx(0.69994, abs=1e-4)
-    assert (gains.velocity, gains.position) == pytest.approx((2.20792, 0.88317), abs=1e-4)
-    assert gains.most_rate == pytest.approx((11.0689, 11.0689, 1.75449), abs=1e-4)
+    assert gains.attitude == approx(4.41584, abs=1e-4)
+    assert gains.rate == approx((8.83168, 8.83168, 1.39987), abs=1e-4)
+    assert gains.heading == approx(0.69994, abs=1e-4)
+    assert (gains.velocity, gains.position) == approx((2.20792, 0.88317), abs=1e-4)
+    assert gains.most_rate == approx((11.0689, 11.0689, 1.75449), abs=1e-4)
     # 196 N of 196 + 0.75 · 204 N = 349 N; 9.8 m/s² · tan; and half of g.
-    assert math.degrees(gains.most_tilt) == pytest.approx(55.833, abs=1e-3)
-    assert gains.most_acceleration == pytest.approx((14.4382, 4.9), abs=1e-3)
-    assert gains.most_velocity == pytest.approx((5.37368, 3.13050), abs=1e-4)  # sqrt(2 m · a)
-    assert gains.most_offset == pytest.approx((6.08455, 4.0), abs=1e-3)  # 5.37368 / 0.88317
+    assert math.degrees(gains.most_tilt) == approx(55.833, abs=1e-3)
+    assert gains.most_acceleration == approx((14.4382, 4.9), abs=1e-3)
+    assert gains.most_velocity == approx((5.37368, 3.13050), abs=1e-4)  # sqrt(2 m · a)
+    assert gains.most_offset == approx((6.08455, 4.0), abs=1e-3)  # 5.37368 / 0.88317
 
 
 def test_a_lag_slows_the_loops_and_is_led() -> None:
@@ -88,13 +89,13 @@ def test_a_lag_slows_the_loops_and_is_led() -> None:
     """
     vehicle = Vehicle.load("crazyflie2")
     gains = Gains.of(vehicle, 0.005, 0.072)
-    assert gains.attitude == pytest.approx(6.8966, abs=1e-4)
-    assert gains.lead == pytest.approx(2.8032, abs=1e-3)
+    assert gains.attitude == approx(6.8966, abs=1e-4)
+    assert gains.lead == approx(2.8032, abs=1e-3)
     assert Gains.of(vehicle, 0.005).attitude > 15.0
     state = state_of(vehicle, thrust=vehicle.hover_thrust - 0.001)
     controller = make_controller("rates", vehicle, 0.005, LAG)
     found = controller.thrust(np.zeros(4), state)
-    assert found == pytest.approx(vehicle.hover_thrust - 0.001 + 0.0028032, abs=1e-6)
+    assert found == approx(vehicle.hover_thrust - 0.001 + 0.0028032, abs=1e-6)
 
 
 def test_five_equal_poles() -> None:
@@ -182,7 +183,7 @@ def test_mixing_keeps_roll_and_pitch_before_collective_and_that_before_yaw() -> 
     controller: Any = make_controller("rates", vehicle, 0.01)
 
     def mixed(collective: float, *torque: float) -> Any:
-        return pytest.approx(controller.mixed(collective, torque), abs=1e-6)
+        return approx(controller.mixed(collective, torque), abs=1e-6)
 
     assert mixed(196.0, 100.0, 0.0, 0.0) == [74.0, 24.0, 24.0, 74.0]  # all fits
     assert mixed(400.0, 100.0, 0.0, 0.0) == [100.0, 50.0, 50.0, 100.0]  # less collective thrust
@@ -309,11 +310,11 @@ def test_loops_invert_the_thrust_curve() -> None:
     effects = EffectOptions(thrust_curve=True)
     controller = make_controller("rates", vehicle, vehicle.timestep, effects)
     command = controller.thrust(np.zeros(4), state_of(vehicle))
-    assert command == pytest.approx([4 * 0.517687] * 4, abs=1e-5)
+    assert command == approx([4 * 0.517687] * 4, abs=1e-5)
     world = make_world(vehicle, 1, effects=effects)
     world.reset(np.True_, InitialState(position=np.array((0.0, 0.0, 50.0))))
     world.step(command, 1)
-    assert world.state.thrust == pytest.approx(vehicle.hover_thrust, abs=1e-5)
+    assert world.state.thrust == approx(vehicle.hover_thrust, abs=1e-5)
     assert hover_error(vehicle=FILES["racer"], effects={"thrust_curve": True}) < 0.01
 
 
@@ -330,13 +331,13 @@ def test_the_spec_tells_names_units_and_frames() -> None:
     assert action.components == ("offset x", "offset y", "offset z", "offset of the heading")
     assert action.unit == ("m", "m", "m", "rad")
     assert action.frame == "world turned by the heading"
-    assert spec.action_scale == pytest.approx([6.084548, 6.084548, 4.0, math.pi])
-    assert spec.constants["position_gain"] == pytest.approx(0.8831687)
+    assert spec.action_scale == approx([6.084548, 6.084548, 4.0, math.pi])
+    assert spec.constants["position_gain"] == approx(0.8831687)
     assert spec.constants["gravity"] == 9.8
     spec = env_of("rates").env_spec
     action = spec.action
     assert action.unit == ("1", "rad/s", "rad/s", "rad/s")
-    assert spec.action_scale[:2] == pytest.approx([1.0, 11.06888])
+    assert spec.action_scale[:2] == approx([1.0, 11.06888])
     assert action.low == -1.0
     assert action.high == 1.0
     assert action.shape == (4,)
@@ -424,7 +425,7 @@ def test_the_page_tells_what_the_benchmark_wrote_and_the_code_gives() -> None:
     for name, given in told["gains"].items():
         gains = Gains.of(Vehicle.load(name), given["timestep"], given["lag"])
         for field in given.keys() - {"timestep", "lag"}:
-            assert getattr(gains, field) == pytest.approx(given[field], abs=1e-4)
+            assert getattr(gains, field) == approx(given[field], abs=1e-4)
         tilt = math.degrees(gains.most_tilt)
         (level, up) = gains.most_offset
         assert f"| {tilt:.0f} | {given['most_velocity'][0]:.2f}, " in page

@@ -27,6 +27,7 @@ from rotorgram.sim import (
 from rotorgram.sim.effects.gusts import Gusts
 from rotorgram.sim.effects.rotors import RotorEffects
 
+approx = pytest.approx
 ROOT = Path(__file__).parents[2]
 RACER = ROOT / "tests" / "data" / "racer.xml"
 # Of that file, typed here again.
@@ -166,7 +167,7 @@ def test_motor_lag_is_exponential_in_the_speed(first: float, then: float, time: 
     # (1/h) ∫ (a + b exp(-t/T))² dt from 0 to h, of four rotors.
     e = math.exp(-H / time)
     mean = a * a + 2 * a * b * (time / H) * (1 - e) + b * b * (time / (2 * H)) * (1 - e * e)
-    assert world.state.velocity[2] == pytest.approx(H * (4 * mean / M - G), rel=1e-12)
+    assert world.state.velocity[2] == approx(H * (4 * mean / M - G), rel=1e-12)
     fly(world, then, 19)
     root = a + b * math.exp(-20 * H / time)
     assert_allclose(world.state.thrust, root * root, rtol=1e-12)
@@ -221,7 +222,7 @@ def test_battery_charge_by_integration() -> None:
     assert rotors.charge == 1.0
     for _ in range(round(seconds / H)):
         rotors.step(thrust, None)
-    assert rotors.charge == pytest.approx((voltage - 9.9) / 2.7, rel=1e-4)
+    assert rotors.charge == approx((voltage - 9.9) / 2.7, rel=1e-4)
     assert 0.2 < rotors.charge < 0.9
 
 
@@ -249,7 +250,7 @@ def test_efficiency_of_one_rotor_turns_the_craft() -> None:
     lost = HOVER / 2
     expected = (0.12 * lost / 4e-3, -0.14 * lost / 5e-3, 0.02 * lost / 8e-3)
     assert_allclose(turn, expected, rtol=2e-3)
-    assert acceleration[2] == pytest.approx(-lost / M, rel=1e-2)
+    assert acceleration[2] == approx(-lost / M, rel=1e-2)
     assert_allclose(world.state.thrust, (HOVER, lost, HOVER, HOVER))
 
 
@@ -264,7 +265,7 @@ def test_linear_drag_is_exponential_and_turns_nothing() -> None:
     # It acts at the center of mass, 1 cm over the origin.
     assert_allclose(world.state.body_rates, 0.0, atol=1e-12)
     world = fly(begin(world, height=500.0), 0.0, 4000)
-    assert world.state.velocity[2] == pytest.approx(-M * G / 0.3, rel=1e-4)
+    assert world.state.velocity[2] == approx(-M * G / 0.3, rel=1e-4)
 
 
 def test_quadratic_drag_falls_as_a_hyperbolic_tangent() -> None:
@@ -274,9 +275,9 @@ def test_quadratic_drag_falls_as_a_hyperbolic_tangent() -> None:
     for seconds in (1.0, 2.0, 3.0):
         fly(world, 0.0, round(1.0 / H))
         fallen = terminal * math.tanh(G * seconds / terminal)
-        assert world.state.velocity[2] == pytest.approx(-fallen, rel=1e-5)
+        assert world.state.velocity[2] == approx(-fallen, rel=1e-5)
     fly(world, 0.0, 2000)
-    assert world.state.velocity[2] == pytest.approx(-terminal, rel=1e-5)
+    assert world.state.velocity[2] == approx(-terminal, rel=1e-5)
 
 
 def test_angular_drag_is_exponential() -> None:
@@ -352,7 +353,7 @@ def test_rotors_with_tilted_axes() -> None:
     Path("tilted.xml").write_text(text)
     vehicle = Vehicle.load("tilted.xml")
     thrust = vehicle.hover_thrust[0]
-    assert thrust == pytest.approx(HOVER / math.cos(0.3), rel=1e-6)
+    assert thrust == approx(HOVER / math.cos(0.3), rel=1e-6)
     world = world_of(vehicle, rotor_drag=True, ground_effect=True)
     velocity = np.array((3.0, 2.0, 1.0))
     height = 0.2
@@ -395,7 +396,7 @@ def test_ground_effect_at_heights(radii: float, ratio: float) -> None:
     vehicle = racer(1e-4, box="0.1 0.08 0.003")
     world = begin(world_of(vehicle, ground_effect=True), height=0.1 * radii - 0.02)
     acceleration, turn = pushed(world)
-    assert acceleration[2] == pytest.approx(G * (ratio - 1), rel=1e-6)
+    assert acceleration[2] == approx(G * (ratio - 1), rel=1e-6)
     assert_allclose(turn, 0.0, atol=1e-9)
 
 
@@ -541,7 +542,7 @@ def test_spectra_of_gusts() -> None:
             # (last - first) bins of `num` worlds; neighbours under the window count half.
             sigma = math.sqrt(2 / (num * (last - first)))
             share = density[first:last, axis].mean() / curve[first:last].mean()
-            assert share == pytest.approx(1.0, abs=5 * sigma + 0.03), (axis, first)
+            assert share == approx(1.0, abs=5 * sigma + 0.03), (axis, first)
 
 
 @pytest.mark.parametrize(("height", "feet"), [(0.0, 10.0), (30.48, 100.0), (900.0, 1000.0)])
@@ -554,20 +555,20 @@ def test_scales_of_gusts_at_heights(height: float, feet: float) -> None:
     assert_allclose(ratio, (across, across, 1.0), rtol=5 / math.sqrt(2 * num))
     r = SPEED * 0.3 / (feet * 0.3048)
     seen = (blown[0, :, 2] * blown[1, :, 2]).mean() / 0.64
-    assert seen == pytest.approx((1 - r / 2) * math.exp(-r), abs=5 * math.sqrt(2 / num))
+    assert seen == approx((1 - r / 2) * math.exp(-r), abs=5 * math.sqrt(2 / num))
 
 
 @pytest.mark.parametrize("step", [1e-5, 1e-3])
 def test_gusts_in_short_steps_are_numbers(step: float) -> None:
     blown = gusts(2000, 3, step, wind=(0.0, 0.0, 0.0), height=300.0)
     assert np.isfinite(blown).all()
-    assert blown.std() == pytest.approx(0.8, rel=0.1)
+    assert blown.std() == approx(0.8, rel=0.1)
     # In a short time t, with V = 1 m/s: E (u(t) - u(0))² = 2 σ² t / L.
     feet = 300 / 0.3048
     length = 300 / (0.177 + 0.000823 * feet) ** 1.2
     sigma = 0.8 / (0.177 + 0.000823 * feet) ** 0.4
     moved = np.square(blown[1, :, 0] - blown[0, :, 0]).mean()
-    assert moved == pytest.approx(2 * sigma**2 * step / length, rel=5 * math.sqrt(2 / 2000))
+    assert moved == approx(2 * sigma**2 * step / length, rel=5 * math.sqrt(2 / 2000))
 
 
 # --- a payload ------------------------------------------------------------------------------------
@@ -577,16 +578,16 @@ def test_the_tension_of_a_cable_is_the_weight_of_its_payload() -> None:
     world = begin(world_of(payload=0.15, cable=0.5))
     fly(world, HOVER * 0.75 / 0.6, 400)
     assert_allclose(world.state.velocity, 0.0, atol=1e-9)
-    assert world.state.position[2] == pytest.approx(50.0, abs=2e-3)  # the cable gives a little
+    assert world.state.position[2] == approx(50.0, abs=2e-3)  # the cable gives a little
     # With its own hover it sinks together with the payload, at g · 0.15 / 0.75.
     fly(begin(world), HOVER, 400)
-    assert world.state.velocity[2] == pytest.approx(-G * 0.15 / 0.75 * 2.0, rel=1e-3)
+    assert world.state.velocity[2] == approx(-G * 0.15 / 0.75 * 2.0, rel=1e-3)
 
 
 def test_a_cable_is_slack_in_free_fall() -> None:
     world = fly(begin(world_of(payload=0.15, cable=0.5)), 0.0, 200)
-    assert world.state.velocity[2] == pytest.approx(-G * 1.0, rel=1e-12)
-    assert world.state.payload_velocity[2] == pytest.approx(-G * 1.0, rel=1e-12)
+    assert world.state.velocity[2] == approx(-G * 1.0, rel=1e-12)
+    assert world.state.payload_velocity[2] == approx(-G * 1.0, rel=1e-12)
     assert world.state.payload_velocity[:2].tolist() == [0.0, 0.0]
     assert world_of().state.payload_velocity is None
 
@@ -614,7 +615,7 @@ def test_the_period_of_a_pendulum() -> None:
         last = offset
     period = (crossings[4] - crossings[0]) / 2
     expected = 2 * math.pi * math.sqrt(2.0 / 9.8) * math.sqrt(20 / 20.2)
-    assert period == pytest.approx(expected, rel=1e-3)
+    assert period == approx(expected, rel=1e-3)
 
 
 def test_a_cable_conserves_momentum() -> None:
@@ -639,7 +640,7 @@ def test_a_payload_touches_the_ground_before_the_craft_does() -> None:
     assert not world.state.touching
     fly(world, HOVER, 1, round(0.2 * seconds / H))
     assert world.state.touching
-    assert world.state.position[2] == pytest.approx(0.53, abs=0.05)
+    assert world.state.position[2] == approx(0.53, abs=0.05)
 
 
 def test_a_payload_that_hangs_in_the_ground_or_in_the_craft_is_refused() -> None:
@@ -812,8 +813,8 @@ def check_distribution(
     world = world_of(None, num, randomize={"mass": text})
     world.seed(np.ones((num, 1), bool), list(range(num)))
     values = begin(world).parameters["mass"]
-    assert values.mean() == pytest.approx(mean, abs=5 * deviation / math.sqrt(num) + 1e-12)
-    assert values.std() == pytest.approx(deviation, rel=5 / math.sqrt(num), abs=1e-12)
+    assert values.mean() == approx(mean, abs=5 * deviation / math.sqrt(num) + 1e-12)
+    assert values.std() == approx(deviation, rel=5 / math.sqrt(num), abs=1e-12)
     ends = (mean, mean) if low is None else (low, high)
     assert ends[0] <= values.min() <= values.max() <= ends[1]
 
@@ -959,7 +960,7 @@ def test_rotors_that_push_both_ways_lose_efficiency_and_pass_the_ground() -> Non
     world = begin(world_of(vehicle, **options), 0.3, velocity=[0.0, 0.0, 2.0])
     acceleration, _ = pushed(world, -0.8)
     # A reversed rotor has neither ground effect nor drag.
-    assert acceleration[2] == pytest.approx(-4 * 0.4 / M - G, rel=1e-9)
+    assert acceleration[2] == approx(-4 * 0.4 / M - G, rel=1e-9)
 
 
 # --- the page -------------------------------------------------------------------------------------

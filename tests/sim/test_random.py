@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from rotorgram.models.vehicle import Vehicle
 from rotorgram.sim import elementary, make_world
 from rotorgram.sim.random import (
@@ -51,7 +52,7 @@ def test_uniform_and_normal_by_hand() -> None:
     assert uniform(words).tolist() == [0.0, 0.5, 0.25, 1 - 2.0**-32]
     # Box and Muller: sqrt(-2 log(1 - 1/2)) at a quarter turn, and at no turn of size 0.
     found = normal(np.array((2**31, 0, 2**30, 0), np.uint32))
-    np.testing.assert_allclose(found, (0.0, 0.0, math.sqrt(2 * math.log(2)), 0.0), atol=1e-15)
+    assert_allclose(found, (0.0, 0.0, math.sqrt(2 * math.log(2)), 0.0), atol=1e-15)
 
 
 def test_normal_numbers_are_normal() -> None:

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.envs.parallel import LocalParallelEnv
 from rotorgram.models import Vehicle
@@ -111,7 +112,7 @@ def test_every_drone_has_the_draws_that_it_has_on_mujoco() -> None:
             world.step(thrust, 2, mask)
     for field in MOVED:
         one, other = (np.asarray(getattr(world.state, field)) for world in (ours, theirs))
-        np.testing.assert_allclose(one, other, atol=1e-9, rtol=0, err_msg=field)
+        assert_allclose(one, other, atol=1e-9, rtol=0, err_msg=field)
 
 
 def test_downwash_is_that_of_mujoco_and_of_a_world_alone() -> None:
@@ -131,7 +132,7 @@ def test_downwash_is_that_of_mujoco_and_of_a_world_alone() -> None:
         ours.step(thrust, 2)
         theirs.step(thrust, 2)
         alone.step(thrust[1:], 2)
-    np.testing.assert_allclose(ours.state.position, theirs.state.position, atol=1e-9, rtol=0)
+    assert_allclose(ours.state.position, theirs.state.position, atol=1e-9, rtol=0)
     assert ours.state.position[1].tobytes() == alone.state.position[0].tobytes()
     speed = ours.state.velocity[..., 2]
     assert (speed[:, 0] < speed[:, 8] - 0.1).all()  # the lowest, and that above all jets
@@ -265,7 +266,7 @@ def test_whole_episodes_agree_with_mujoco_until_a_touch(
     theirs = LocalVectorEnv(env_id, 8, radio_loss=0.2, **options)
     ours = LocalVectorEnv(env_id, 8, radio_loss=0.2, backend="rigid", dtype="float64", **options)
     seen = [env.reset(seed=5)[0] for env in (ours, theirs)]
-    np.testing.assert_array_equal(*seen)
+    assert_array_equal(*seen)
     met = False
     flown = 0
     for _ in range(500):
@@ -277,9 +278,9 @@ def test_whole_episodes_agree_with_mujoco_until_a_touch(
             break
         flown += 1
         seen = [env.observations for env in (ours, theirs)]
-        np.testing.assert_array_equal(ours.truncated, theirs.truncated)
-        np.testing.assert_allclose(*seen, atol=1e-6, rtol=1e-6)
-        np.testing.assert_allclose(ours.rewards, theirs.rewards, atol=1e-9, rtol=0)
+        assert_array_equal(ours.truncated, theirs.truncated)
+        assert_allclose(*seen, atol=1e-6, rtol=1e-6)
+        assert_allclose(ours.rewards, theirs.rewards, atol=1e-9, rtol=0)
         if ours.done.any():
             break
     assert flown > 30

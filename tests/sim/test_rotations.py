@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from rotorgram.sim import rotations
 
 HALF = math.sqrt(0.5)
@@ -36,19 +37,19 @@ def both(*arrays: np.ndarray) -> list[list[Any]]:
 def test_by_hand(function: Any, arguments: Any, expected: Any) -> None:
     for given in both(*arguments):
         turned = function(*given)
-        np.testing.assert_allclose(turned, np.broadcast_to(expected, turned.shape), atol=1e-15)
+        assert_allclose(turned, np.broadcast_to(expected, turned.shape), atol=1e-15)
 
 
 def test_a_rotation_vector_turns_the_body() -> None:
     for attitude, angle in both(LEFT, np.array((math.pi / 2, 0.0, 0.0))):
         turned = rotations.advanced(attitude, angle)
-        np.testing.assert_allclose(turned, np.full(turned.shape, 0.5), atol=1e-15)
+        assert_allclose(turned, np.full(turned.shape, 0.5), atol=1e-15)
     still = rotations.advanced(2 * LEFT, np.zeros(3))
-    np.testing.assert_allclose(still, LEFT, atol=1e-15)  # normalised
+    assert_allclose(still, LEFT, atol=1e-15)  # normalised
     many = np.array((1.0, 0.0, 0.0, 0.0))
     for _ in range(90):
         many = rotations.advanced(many, np.radians((0.0, 0.0, 1.0)))
-    np.testing.assert_allclose(many, LEFT, atol=1e-13)
+    assert_allclose(many, LEFT, atol=1e-13)
 
 
 def test_vectors_by_their_components() -> None:
