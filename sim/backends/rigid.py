@@ -15,7 +15,7 @@ from ...models.vehicle import Vehicle, craft_bodies
 from ..effects import EffectOptions
 from ..randomize import Randomization
 from ..snapshots import Arrays
-from ..state import Array, InitialState, WorldState, clip
+from ..state import Array, InitialState, WorldState, chosen, clip
 from ..world import PhysicsError
 from . import kernel
 from .base import BaseWorld
@@ -146,7 +146,7 @@ class RigidWorld(BaseWorld):
         """As `World.step`."""
         state = self.state
         # One number for all rotors counts for each.
-        state.command = self._kept(mask, self._typed(thrust + self._nothing), state.command)
+        state.command = chosen(mask, self._typed(thrust + self._nothing), state.command)
         if not self._on_rotors:
             state.thrust = state.command
         found = [state.touching, state.colliding] if again else [False, False]
@@ -164,22 +164,22 @@ class RigidWorld(BaseWorld):
         acting = state.command
         wrench = None
         at_once = self._at_once or steps
+        some = None if mask is None else mask.reshape(1, -1)  # of rows
         for _ in range(steps // at_once):
             if effects is not None:
                 acting, end, push = effects.step(state, mask)
                 if self._on_rotors:
-                    state.thrust = self._kept(mask, self._typed(end), state.thrust)
+                    state.thrust = chosen(mask, self._typed(end), state.thrust)
                 wrench = None if push is None else self._as_rows(push)
             if not self._on_rotors:  # as MuJoCo clamps controls
                 acting = clip(acting, self.vehicle.thrust_low, self.vehicle.thrust_high)
             new = self._flown(self._rows, self._as_rows(acting), wrench, at_once)
-            self._rows = new if mask is None else np.where(mask.reshape(-1), new, self._rows)
+            self._rows = chosen(some, new, self._rows)
             self._show()
-        self._acting = self._kept(mask, acting, self._acting)
+        self._acting = chosen(mask, acting, self._acting)
         if wrench is not None:
             old = 0.0 * wrench if self._wrench is None else self._wrench
-            new = wrench if mask is None else np.where(mask.reshape(-1), wrench, old)
-            self._wrench = new
+            self._wrench = chosen(some, wrench, old)
 
     def _snapshot(self) -> dict[str, np.ndarray]:
         state = self.state
@@ -248,9 +248,6 @@ class RigidWorld(BaseWorld):
         """Vectors (W, A, k) as rows (k, W A) of this dtype, one after the other in memory."""
         return np.asarray(self._typed(values).reshape(-1, values.shape[-1]).T, order="C")
 
-    def _kept(self, mask: Array | None, new: Array, old: Array) -> Array:
-        return new if mask is None else np.where(mask[..., None], new, old)
-
     def _contacts(self) -> list[Array]:
         """Which crafts touch anything and, of several, which another, bool, (W, A)."""
         rows = self._rows
@@ -265,7 +262,7 @@ class RigidWorld(BaseWorld):
         """Set what `_contacts` found, for the worlds of a mask."""
         for name, new in zip(("touching", "colliding"), found, strict=False):
             old = getattr(self.state, name)
-            setattr(self.state, name, new if mask is None else np.where(mask, new, old))
+            setattr(self.state, name, chosen(mask, new, old))
 
     def _refuse_bad(self) -> None:
         if abs(self._rows).max() < mujoco.mjMAXVAL:  # not of NaN

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any, Final
 from ...models.errors import InputError, shortened
 from ...models.fields import check_names
 from ..snapshots import Kept
-from ..state import Array, WorldState
+from ..state import Array, WorldState, chosen
 from .barometer import Barometer
-from .base import Reading, Sensor, Source, Values, chosen
+from .base import Reading, Sensor, Source, Values
 from .channel import Channel
 from .estimator import Estimator
 from .gps import Gps

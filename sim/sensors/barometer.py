@@ -4,8 +4,8 @@ import math
 from typing import TYPE_CHECKING, ClassVar, Final
 
 from ...models.fields import Limits
-from ..state import Array, clip
-from .base import Sensor, Setting, Values, chosen
+from ..state import Array, chosen, clip
+from .base import Sensor, Setting, Values
 
 if TYPE_CHECKING:
     from ..world import World

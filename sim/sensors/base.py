@@ -195,12 +195,3 @@ class Sensor(Source):
 
 def _is_whole(steps: float) -> bool:
     return abs(steps - round(steps)) < 1e-6 * max(steps, 1.0)
-
-
-def chosen(mask: Array, new: Array, old: Array) -> Array:
-    """`new`, (W, A) or (W, A, k), where the mask is true; elsewhere `old`, a number at first."""
-    if not getattr(mask, "ndim", 0):  # a single drone's
-        return new if mask else old
-    if getattr(new, "ndim", 0) > mask.ndim:
-        mask = mask[..., None]
-    return np.where(mask, new, old)

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..snapshots import Kept
-from ..state import Array, component
-from .base import Sensor, Values, chosen
+from ..state import Array, chosen, component
+from .base import Sensor, Values
 
 if TYPE_CHECKING:
     from ..world import World

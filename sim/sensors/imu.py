@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..rotations import to_body
-from ..state import Array
-from .base import Sensor, Values, chosen
+from ..state import Array, chosen
+from .base import Sensor, Values
 
 if TYPE_CHECKING:
     from ..world import World
