@@ -16,9 +16,8 @@ from ..effects import EffectOptions
 from ..randomize import Randomization
 from ..snapshots import Arrays
 from ..state import Array, InitialState, WorldState, chosen, clip
-from ..world import PhysicsError
+from ..world import PhysicsError, World
 from . import kernel
-from .base import BaseWorld
 from .body import RigidBody, mapped, motion
 from .hull import Hull
 
@@ -27,7 +26,7 @@ _OF_STATE: Final = ("command", "thrust", "touching", "colliding")
 _LEVEL: Final = np.array((0.0, 0.0, 0.0, 1.0, *[0.0] * 9))  # rows of a craft at rest
 
 
-class RigidWorld(BaseWorld):
+class RigidWorld(World):
     """W worlds of A drones over level ground: `World`, without contact.
 
     A craft that reaches the ground is `touching`, and flies on through it: a task ends an episode

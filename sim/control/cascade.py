@@ -107,6 +107,7 @@ class Rates:
         parts = [middle + scale * part for part in added]
         yaws = [(part, c) for part, (*_, c) in zip(parts, gains.mix, strict=True) if c]
         ends = [((low - part) / c, (high - part) / c)[:: 1 if c > 0 else -1] for part, c in yaws]
+        # Where there is no room, the upper end holds.
         yaw = _most([yaw, *(end for end, _ in ends)])
         yaw = _least([yaw, *(end for _, end in ends)])
         rotors = zip(gains.share, parts, gains.mix, strict=True)
