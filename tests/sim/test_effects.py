@@ -1,10 +1,10 @@
 """Effects against their closed forms."""
 
 import json
-import math
 import re
 import xml.etree.ElementTree as ET
 from itertools import pairwise
+from math import cos, exp, inf, log, log2, nan, pi, sin, sqrt, tanh
 from pathlib import Path
 from typing import Any
 
@@ -36,29 +36,7 @@ G = 9.81
 H = 0.005
 HOVER = M * G / 4
 K = 5e-6  # thrust = K speed²
-OMEGA = math.sqrt(HOVER / K)
-EVERYTHING: dict[str, Any] = {
-    "motor_lag": True,
-    "thrust_curve": True,
-    "battery": True,
-    "body_drag": True,
-    "rotor_drag": True,
-    "ground_effect": True,
-    "wind": (1.0, 2.0, 0.3),
-    "efficiency": (1.0, 0.9, 1.0, 0.95),
-}
-DRAWN = {
-    "mass": "uniform(0.8, 1.2)",
-    "inertia": "loguniform(0.5, 2)",
-    "center_x": "normal(0, 0.005)",
-    "center_z": "uniform(-0.01, 0.01)",
-    "thrust": "normal(1, 0.05)",
-    "time_constant": "choice(0.5, 1, 2)",
-    "battery_charge": "uniform(0.2, 1)",
-    "body_drag": "uniform(0.5, 1.5)",
-    "rotor_drag": "uniform(0.5, 1.5)",
-    "wind_x": "uniform(-1, 1)",
-}
+OMEGA = sqrt(HOVER / K)
 
 
 @pytest.fixture(autouse=True)
@@ -162,14 +140,14 @@ def states(world: World) -> list[np.ndarray]:
 @pytest.mark.parametrize(("first", "then", "time"), [(1.0, 3.0, 0.05), (3.0, 1.0, 0.08)])
 def test_motor_lag_is_exponential_in_the_speed(first: float, then: float, time: float) -> None:
     world = begin(world_of(motor_lag=True), thrust=[first] * 4)
-    a, b = math.sqrt(then), math.sqrt(first) - math.sqrt(then)
+    a, b = sqrt(then), sqrt(first) - sqrt(then)
     fly(world, then, 1)
     # (1/h) ∫ (a + b exp(-t/T))² dt from 0 to h, of four rotors.
-    e = math.exp(-H / time)
+    e = exp(-H / time)
     mean = a * a + 2 * a * b * (time / H) * (1 - e) + b * b * (time / (2 * H)) * (1 - e * e)
     assert world.state.velocity[2] == approx(H * (4 * mean / M - G), rel=1e-12)
     fly(world, then, 19)
-    root = a + b * math.exp(-20 * H / time)
+    root = a + b * exp(-20 * H / time)
     assert_allclose(world.state.thrust, root * root, rtol=1e-12)
     assert (world.state.command == then).all()
 
@@ -185,7 +163,7 @@ def test_a_very_short_and_a_very_long_time_constant() -> None:
         world_of(long, motor_lag=True, randomize={"time_constant": 100}), thrust=[1.0] * 4
     )
     fly(world, 3.0, 1)
-    assert_allclose(world.state.thrust - 1.0, 2 * (math.sqrt(3) - 1) * H / 1000, rtol=1e-5)
+    assert_allclose(world.state.thrust - 1.0, 2 * (sqrt(3) - 1) * H / 1000, rtol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -202,7 +180,7 @@ def test_battery_voltage_is_the_root_of_the_quadratic(resistance: str) -> None:
     """V = E - R I, with I V = 80 · 4 (F (V / 12.6)²)^1.5: a V² + V - E = 0."""
     vehicle = racer(battery_resistance=resistance, battery_capacity="1e4")
     a = float(resistance) * 80 * 4 * HOVER**1.5 / 12.6**3
-    voltage = (-1 + math.sqrt(1 + 4 * a * 12.6)) / (2 * a)
+    voltage = (-1 + sqrt(1 + 4 * a * 12.6)) / (2 * a)
     thrust = HOVER * (voltage / 12.6) ** 2
     for lag, steps in ((False, 1), (False, 2), (True, 300)):
         world = fly(begin(world_of(vehicle, battery=True, motor_lag=lag)), HOVER, steps)
@@ -238,7 +216,7 @@ def test_rotors_that_need_more_than_the_battery_gives() -> None:
     vehicle = racer(battery_resistance="0.5", battery_capacity="1e4")
     world = fly(begin(world_of(vehicle, battery=True, motor_lag=True), thrust=[4.0] * 4), 4.0, 1)
     # Of the first step: wanted is 4 · (6.3 / 12.6)², so that √F goes from 2 to 1.
-    assert_allclose(world.state.thrust, (1 + math.exp(-H / 0.08)) ** 2, rtol=1e-12)
+    assert_allclose(world.state.thrust, (1 + exp(-H / 0.08)) ** 2, rtol=1e-12)
 
 
 def test_efficiency_of_one_rotor_turns_the_craft() -> None:
@@ -260,7 +238,7 @@ def test_efficiency_of_one_rotor_turns_the_craft() -> None:
 def test_linear_drag_is_exponential_and_turns_nothing() -> None:
     vehicle = dragging()
     world = fly(begin(world_of(vehicle, body_drag=True), velocity=[5.0, 2.0, 0.0]), HOVER, 400)
-    left = math.exp(-0.3 / M * 2.0)
+    left = exp(-0.3 / M * 2.0)
     assert_allclose(world.state.velocity, (5 * left, 2 * left, 0.0), rtol=1e-5, atol=1e-9)
     # It acts at the center of mass, 1 cm over the origin.
     assert_allclose(world.state.body_rates, 0.0, atol=1e-12)
@@ -271,10 +249,10 @@ def test_linear_drag_is_exponential_and_turns_nothing() -> None:
 def test_quadratic_drag_falls_as_a_hyperbolic_tangent() -> None:
     vehicle = dragging(drag_quadratic="0.02 0.02 0.02")
     world = begin(world_of(vehicle, body_drag=True), height=500.0)
-    terminal = math.sqrt(M * G / 0.02)
+    terminal = sqrt(M * G / 0.02)
     for seconds in (1.0, 2.0, 3.0):
         fly(world, 0.0, round(1.0 / H))
-        fallen = terminal * math.tanh(G * seconds / terminal)
+        fallen = terminal * tanh(G * seconds / terminal)
         assert world.state.velocity[2] == approx(-fallen, rel=1e-5)
     fly(world, 0.0, 2000)
     assert world.state.velocity[2] == approx(-terminal, rel=1e-5)
@@ -284,7 +262,7 @@ def test_angular_drag_is_exponential() -> None:
     vehicle = dragging(drag_angular="0.01 0.01 0.02")
     world = fly(begin(world_of(vehicle, body_drag=True), body_rates=[0, 0, 5.0]), HOVER, 100)
     # Izz is 8e-3 kg m².
-    left = 5 * math.exp(-0.02 / 8e-3 * 0.5)
+    left = 5 * exp(-0.02 / 8e-3 * 0.5)
     assert_allclose(world.state.body_rates, (0, 0, left), rtol=1e-3, atol=1e-12)
     vehicle = dragging(drag_angular="0.5 0.5 0.5")
     refused(r"^drag.angular: expected at most 0\.4 N m s", world_of, vehicle, body_drag=True)
@@ -302,7 +280,7 @@ def test_the_moment_of_the_air_is_in_proportion_to_the_velocity() -> None:
 
 def test_body_drag_in_body_axes() -> None:
     vehicle = racer(1e-4)
-    nose_down = [math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0]  # body x is the world's -z
+    nose_down = [sqrt(0.5), 0.0, sqrt(0.5), 0.0]  # body x is the world's -z
     world = begin(
         world_of(vehicle, body_drag=True), quaternion=nose_down, velocity=[3.0, 4.0, -12.0]
     )
@@ -345,25 +323,25 @@ def test_rotors_of_a_turning_craft() -> None:
 
 def test_rotors_with_tilted_axes() -> None:
     """Rotors 1 and 2, on the right, lean outwards by 0.3 rad, and the others to the left."""
-    lean = {-1: math.sin(-0.3), 1: math.sin(0.3)}
+    lean = {-1: sin(-0.3), 1: sin(0.3)}
     text = RACER.read_text().replace('timestep="0.005"', 'timestep="1e-4"')
     for index, side in ((1, -1), (2, -1), (3, 1), (4, 1)):
         before = f'site="r{index}" gear="0 0 1'
-        text = text.replace(before, f'site="r{index}" gear="0 {lean[side]} {math.cos(0.3)}')
+        text = text.replace(before, f'site="r{index}" gear="0 {lean[side]} {cos(0.3)}')
     Path("tilted.xml").write_text(text)
     vehicle = Vehicle.load("tilted.xml")
     thrust = vehicle.hover_thrust[0]
-    assert thrust == approx(HOVER / math.cos(0.3), rel=1e-6)
+    assert thrust == approx(HOVER / cos(0.3), rel=1e-6)
     world = world_of(vehicle, rotor_drag=True, ground_effect=True)
     velocity = np.array((3.0, 2.0, 1.0))
     height = 0.2
     acceleration, turn = pushed(begin(world, height, velocity=velocity), vehicle.hover_thrust)
     force = np.zeros(3)
     torque = np.zeros(3)
-    speed = math.sqrt(thrust / K)
+    speed = sqrt(thrust / K)
     more = thrust * (1 / (1 - (0.1 / (4 * (height + 0.02))) ** 2) - 1)
     for x, y in ((0.14, -0.12), (-0.14, -0.12), (-0.14, 0.12), (0.14, 0.12)):
-        axis = np.array((0, lean[1 if y > 0 else -1], math.cos(0.3)))
+        axis = np.array((0, lean[1 if y > 0 else -1], cos(0.3)))
         along = velocity @ axis
         plane = velocity - along * axis
         push = -1e-4 * speed * plane
@@ -403,9 +381,9 @@ def test_ground_effect_at_heights(radii: float, ratio: float) -> None:
 def test_ground_effect_lifts_the_lower_rotors_more() -> None:
     angle = 0.1  # rolled to the right: rotors 1 and 2, on the right, are lower
     world = world_of(racer(1e-4), ground_effect=True)
-    begin(world, 0.2, quaternion=[math.cos(angle / 2), math.sin(angle / 2), 0, 0])
+    begin(world, 0.2, quaternion=[cos(angle / 2), sin(angle / 2), 0, 0])
     _, turn = pushed(world)
-    low, high = (0.2 + math.cos(angle) * 0.02 + math.sin(angle) * y for y in (-0.12, 0.12))
+    low, high = (0.2 + cos(angle) * 0.02 + sin(angle) * y for y in (-0.12, 0.12))
     more = [HOVER * (1 / (1 - (0.1 / (4 * z)) ** 2) - 1) for z in (low, high)]
     roll = 0.12 * 2 * (more[1] - more[0])
     assert_allclose(turn, (roll / 4e-3, 0, 0), rtol=1e-4, atol=1e-9)
@@ -416,7 +394,7 @@ def test_a_craft_drifts_to_the_velocity_of_the_wind() -> None:
     vehicle = dragging()
     world = begin(world_of(vehicle, body_drag=True, wind=(3, -2, 0.5)))
     fly(world, HOVER, 400)
-    share = 1 - math.exp(-0.3 / M * 2.0)
+    share = 1 - exp(-0.3 / M * 2.0)
     assert_allclose(world.state.velocity, np.array((3, -2, 0.5)) * share, rtol=1e-5)
     # A drawn wind adds to it.
     world = world_of(vehicle, body_drag=True, wind=(3, 0, 0), randomize={"wind_y": 4})
@@ -441,10 +419,19 @@ def test_drag_of_a_turning_craft_is_that_of_its_center() -> None:
     assert_allclose(turn, 0.0, atol=1e-9)
 
 
+EVERYTHING: dict[str, Any] = {
+    **dict.fromkeys(
+        ("motor_lag", "thrust_curve", "body_drag", "rotor_drag", "ground_effect"), True
+    ),
+    "wind": (1.0, 2.0, 0.3),
+    "efficiency": (1.0, 0.9, 1.0, 0.95),
+}
+
+
 @pytest.mark.parametrize(
     ("options", "height", "rates"),
     [
-        ({**EVERYTHING, "battery": False}, 0.6, [2.0, -1.0, 3.0]),
+        (EVERYTHING, 0.6, [2.0, -1.0, 3.0]),
         ({"ground_effect": True}, 0.07, [0] * 3),
     ],
     ids=["all", "ground_effect"],
@@ -459,7 +446,7 @@ def test_the_order_of_the_air_forces_is_two(
         fly(world, (3.0, 3.1, 3.2, 3.0), round(0.2 / step))
         ends.append(np.concatenate((world.state.position, world.state.velocity)))
     gaps = [float(np.linalg.norm(a - b)) for a, b in pairwise(ends)]
-    orders = [math.log2(a / b) for a, b in pairwise(gaps)]
+    orders = [log2(a / b) for a, b in pairwise(gaps)]
     assert all(1.8 < order < 2.2 for order in orders), (gaps, orders)
 
 
@@ -498,10 +485,10 @@ def test_gusts_are_stationary_from_the_first_step() -> None:
     num = 20_000
     blown = gusts(num, 40, 0.25)
     for row in (blown[0], blown[1], blown[-1]):
-        assert (abs(row.mean(axis=0)) < 5 * SIGMA_U / math.sqrt(num)).all()
+        assert (abs(row.mean(axis=0)) < 5 * SIGMA_U / sqrt(num)).all()
         share = row.var(axis=0) / np.square((SIGMA_U, SIGMA_U, SIGMA_W))
-        assert_allclose(share, 1.0, atol=5 * math.sqrt(2 / num))
-        assert_allclose(np.corrcoef(row.T), np.eye(3), atol=5 / math.sqrt(num))
+        assert_allclose(share, 1.0, atol=5 * sqrt(2 / num))
+        assert_allclose(np.corrcoef(row.T), np.eye(3), atol=5 / sqrt(num))
 
 
 def test_correlation_of_gusts_over_time() -> None:
@@ -512,10 +499,10 @@ def test_correlation_of_gusts_over_time() -> None:
     for count in (1, 5, 20, 60):
         seen = (blown[0] * blown[count]).mean(axis=0) / np.square((SIGMA_U, SIGMA_U, SIGMA_W))
         r = SPEED * step * count
-        along = math.exp(-r / L_U)
-        across = (1 - r / (2 * L_U)) * math.exp(-r / L_U)
-        up = (1 - r / (2 * L_W)) * math.exp(-r / L_W)
-        assert_allclose(seen, (across, along, up), atol=5 * math.sqrt(2 / num))
+        along = exp(-r / L_U)
+        across = (1 - r / (2 * L_U)) * exp(-r / L_U)
+        up = (1 - r / (2 * L_W)) * exp(-r / L_W)
+        assert_allclose(seen, (across, along, up), atol=5 * sqrt(2 / num))
 
 
 def test_spectra_of_gusts() -> None:
@@ -527,20 +514,20 @@ def test_spectra_of_gusts() -> None:
     window = np.hanning(steps)[:, None, None]
     power = abs(np.fft.rfft(blown * window, axis=0)) ** 2
     # One-sided over the angular frequency: 2 · step / (2π · Σ window²).
-    density = power.mean(axis=1) * step / (math.pi * np.square(window).sum())
-    omega = 2 * math.pi * np.fft.rfftfreq(steps, step)
+    density = power.mean(axis=1) * step / (pi * np.square(window).sum())
+    omega = 2 * pi * np.fft.rfftfreq(steps, step)
     x = omega * L_U / SPEED
     y = omega * L_W / SPEED
     expected = (
-        SIGMA_U**2 * 2 * L_U / (math.pi * SPEED) / (1 + x**2),
-        SIGMA_U**2 * L_U / (math.pi * SPEED) * (1 + 3 * x**2) / (1 + x**2) ** 2,
-        SIGMA_W**2 * L_W / (math.pi * SPEED) * (1 + 3 * y**2) / (1 + y**2) ** 2,
+        SIGMA_U**2 * 2 * L_U / (pi * SPEED) / (1 + x**2),
+        SIGMA_U**2 * L_U / (pi * SPEED) * (1 + 3 * x**2) / (1 + x**2) ** 2,
+        SIGMA_W**2 * L_W / (pi * SPEED) * (1 + 3 * y**2) / (1 + y**2) ** 2,
     )
     # Between what the window blurs and what sampling folds back.
     for axis, curve in enumerate(expected):
         for first, last in ((8, 16), (16, 32), (32, 64), (64, 128), (128, 256), (256, 400)):
             # (last - first) bins of `num` worlds; neighbours under the window count half.
-            sigma = math.sqrt(2 / (num * (last - first)))
+            sigma = sqrt(2 / (num * (last - first)))
             share = density[first:last, axis].mean() / curve[first:last].mean()
             assert share == approx(1.0, abs=5 * sigma + 0.03), (axis, first)
 
@@ -552,10 +539,10 @@ def test_scales_of_gusts_at_heights(height: float, feet: float) -> None:
     blown = gusts(num, 2, 0.3, height=height)
     ratio = blown[0].std(axis=0) / 0.8
     across = 1 / (0.177 + 0.000823 * feet) ** 0.4
-    assert_allclose(ratio, (across, across, 1.0), rtol=5 / math.sqrt(2 * num))
+    assert_allclose(ratio, (across, across, 1.0), rtol=5 / sqrt(2 * num))
     r = SPEED * 0.3 / (feet * 0.3048)
     seen = (blown[0, :, 2] * blown[1, :, 2]).mean() / 0.64
-    assert seen == approx((1 - r / 2) * math.exp(-r), abs=5 * math.sqrt(2 / num))
+    assert seen == approx((1 - r / 2) * exp(-r), abs=5 * sqrt(2 / num))
 
 
 @pytest.mark.parametrize("step", [1e-5, 1e-3])
@@ -568,7 +555,7 @@ def test_gusts_in_short_steps_are_numbers(step: float) -> None:
     length = 300 / (0.177 + 0.000823 * feet) ** 1.2
     sigma = 0.8 / (0.177 + 0.000823 * feet) ** 0.4
     moved = np.square(blown[1, :, 0] - blown[0, :, 0]).mean()
-    assert moved == approx(2 * sigma**2 * step / length, rel=5 * math.sqrt(2 / 2000))
+    assert moved == approx(2 * sigma**2 * step / length, rel=5 * sqrt(2 / 2000))
 
 
 # --- a payload ------------------------------------------------------------------------------------
@@ -597,7 +584,7 @@ def pendulum(vehicle: Vehicle, mass: float, cable: float, angle: float) -> tuple
     model = vehicle.with_payload(mass, cable)
     data = mujoco.MjData(model)
     data.qpos[:7] = (0, 0, 50, 1, 0, 0, 0)
-    data.qpos[7:10] = (cable * math.sin(angle), 0, 50 - cable * math.cos(angle))
+    data.qpos[7:10] = (cable * sin(angle), 0, 50 - cable * cos(angle))
     return model, data
 
 
@@ -614,7 +601,7 @@ def test_the_period_of_a_pendulum() -> None:
             crossings.append(data.time - 0.01 * offset / (offset - last))
         last = offset
     period = (crossings[4] - crossings[0]) / 2
-    expected = 2 * math.pi * math.sqrt(2.0 / 9.8) * math.sqrt(20 / 20.2)
+    expected = 2 * pi * sqrt(2.0 / 9.8) * sqrt(20 / 20.2)
     assert period == approx(expected, rel=1e-3)
 
 
@@ -635,7 +622,7 @@ def test_a_payload_touches_the_ground_before_the_craft_does() -> None:
     world = begin(world_of(payload=0.15, cable=0.5), height=0.7)
     assert not world.state.touching
     # It falls at g · (1 - 0.6 / 0.75), and the ball, 0.033 m in radius, has 0.167 m to go.
-    seconds = math.sqrt(2 * 0.167 / (0.2 * G))
+    seconds = sqrt(2 * 0.167 / (0.2 * G))
     fly(world, HOVER, 1, round(0.9 * seconds / H))
     assert not world.state.touching
     fly(world, HOVER, 1, round(0.2 * seconds / H))
@@ -665,11 +652,11 @@ def test_off_is_bit_for_bit_absence(num_worlds: int) -> None:
     assert flown[0] == flown[1] == flown[2]
 
 
-GUSTY = {**EVERYTHING, "gusts": 4.0, "payload": 0.05, "cable": 0.4}
+HUNG = {"motor_lag": True, "body_drag": True, "payload": 0.05, "cable": 0.4}
 
 
 def test_a_closed_world_keeps_its_state_and_no_memory_of_the_simulator() -> None:
-    world = fly(begin(world_of(None, 2, randomize=DRAWN, **GUSTY)), 2.0, 5)
+    world = fly(begin(world_of(None, 2, randomize={"mass": 1.2, "center_x": 0.01}, **HUNG)), 2.0, 5)
     before = world.state.position.copy()
     world.close()
     assert world.state.position.tobytes() == before.tobytes()
@@ -752,7 +739,7 @@ def test_drawn_drag_thrust_and_mass_scale_what_they_name() -> None:
     draggy = Vehicle.load(linear_drag=0.5)
     world = begin(world_of(draggy, randomize={"mass": 2.0}), velocity=[4.0, 0, 0])
     fly(world, 98.0, 100)
-    assert_allclose(world.state.velocity, (4 * math.exp(-0.5), 0, 0), rtol=1e-6, atol=1e-9)
+    assert_allclose(world.state.velocity, (4 * exp(-0.5), 0, 0), rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize("num_worlds", [1, 3])
@@ -802,7 +789,7 @@ def test_whole_numbers_have_equal_chances() -> None:
     world = begin(world_of(None, 3000, randomize={"action_delay": "uniform(0, 2)"}))
     values, counts = np.unique(world.parameters["action_delay"], return_counts=True)
     assert values.tolist() == [0.0, 1.0, 2.0]
-    assert (abs(counts - 1000) < 4 * math.sqrt(3000 * 2 / 9)).all()
+    assert (abs(counts - 1000) < 4 * sqrt(3000 * 2 / 9)).all()
 
 
 def check_distribution(
@@ -813,17 +800,17 @@ def check_distribution(
     world = world_of(None, num, randomize={"mass": text})
     world.seed(np.ones((num, 1), bool), list(range(num)))
     values = begin(world).parameters["mass"]
-    assert values.mean() == approx(mean, abs=5 * deviation / math.sqrt(num) + 1e-12)
-    assert values.std() == approx(deviation, rel=5 / math.sqrt(num), abs=1e-12)
+    assert values.mean() == approx(mean, abs=5 * deviation / sqrt(num) + 1e-12)
+    assert values.std() == approx(deviation, rel=5 / sqrt(num), abs=1e-12)
     ends = (mean, mean) if low is None else (low, high)
     assert ends[0] <= values.min() <= values.max() <= ends[1]
 
 
 def test_distributions() -> None:
-    check_distribution("uniform(0.8, 1.2)", 1.0, 0.4 / math.sqrt(12), 0.8, 1.2)
+    check_distribution("uniform(0.8, 1.2)", 1.0, 0.4 / sqrt(12), 0.8, 1.2)
     # The mean of 2^u with u from -1 to 1, and its mean square, (4 - 1/4) / (2 ln 4).
-    mean = 1.5 / math.log(4)
-    deviation = math.sqrt(3.75 / (2 * math.log(4)) - mean**2)
+    mean = 1.5 / log(4)
+    deviation = sqrt(3.75 / (2 * log(4)) - mean**2)
     check_distribution(" loguniform ( 0.5,2 ) ", mean, deviation, 0.5, 2.0)
     check_distribution("normal(1, 0.1)", 1.0, 0.1, 0.1, 10.0)
     check_distribution("normal(1, 1e5)", 5.05, 4.95, 0.1, 10.0)  # half at either bound
@@ -898,14 +885,14 @@ def test_wrong_options() -> None:
     wrong("expected some of motor_lag, .*, got 'drag'$", drag=True)
     wrong("motor_lag: expected true or false, got 1$", motor_lag=1)
     wrong("ground_effect: expected true or false, got 'yes'$", ground_effect="yes")
-    for wind in (3, (1, 2, 101), (1, 2, math.nan), "123", (True, 0, 0), None):
+    for wind in (3, (1, 2, 101), (1, 2, nan), "123", (True, 0, 0), None):
         wrong("wind: expected 3 numbers from -100 to 100 m/s, got ", wind=wind)
     wrong("gusts: expected a number from 0 to 100 m/s, got -1$", gusts=-1)
     wrong("gusts: expected a number from 0 to 100 m/s, got True$", gusts=True)
     wrong(r"gusts: expected a number from 0 to 100 m/s, got \(1,\)$", gusts=(1,))
     wrong("efficiency: expected numbers from 0 to 1 .*, got ", efficiency=(1, 2))
     wrong("efficiency: expected numbers from 0 to 1 .*, got 0.5$", efficiency=0.5)
-    wrong("payload: expected a number from 0 to 10000 kg, got inf$", payload=math.inf)
+    wrong("payload: expected a number from 0 to 10000 kg, got inf$", payload=inf)
     wrong("cable: expected a number from 0.05 to 100 m, got 0$", cable=0)
 
 

@@ -4,8 +4,8 @@ First the independent solution against closed forms, then ours against it, then 
 """
 
 import json
-import math
 from dataclasses import replace
+from math import exp, sqrt
 from pathlib import Path
 from typing import Any
 
@@ -72,7 +72,7 @@ def test_linear_drag_alike_in_all_directions_gives_an_exponential() -> None:
     t = 1.0
     end = np.array((2.0, 0.0, 0.0)) + DOWN / rate
     start = VELOCITY + np.cross(SPIN, center)
-    moved = end * t + (start - end) * (1 - math.exp(-rate * t)) / rate
+    moved = end * t + (start - end) * (1 - exp(-rate * t)) / rate
     centers = [
         flight.position[i] + rotation(flight.quaternion[i]) @ center for i in (0, -1)
     ]  # fmt: skip
@@ -90,7 +90,7 @@ def test_a_rotor_lags_and_drags_as_worked_out_by_hand() -> None:
     assert change[6:10] == approx((0, 0, 0, 0))
     assert change[13:] == approx((0.2 / 0.05, -0.2 / 0.08, 0, 0))
     # Speed sqrt(T / 5e-6); drag 1e-4 · speed · 2 m/s; lift 3e-3 · 4 m²/s² each.
-    drags = [1e-4 * r / math.sqrt(5e-6) * 2 for r in root]
+    drags = [1e-4 * r / sqrt(5e-6) * 2 for r in root]
     pushes = [r * r + 0.012 for r in root]
     assert change[3] == approx(-sum(drags) / 0.6)
     assert change[5] == approx(sum(pushes) / 0.6 - 9.81)
@@ -122,7 +122,7 @@ def test_every_vehicle_flies_as_its_equations_say(name: str) -> None:
 def test_the_thrusts_vary_and_turn_the_smallest_as_fast_as_the_page_says() -> None:
     given = thrusts(VEHICLES["tiny"])
     assert given.shape == (500, 4)
-    assert given.std(axis=0) == approx(0.3 / math.sqrt(3) * 0.0662, rel=0.1)
+    assert given.std(axis=0) == approx(0.3 / sqrt(3) * 0.0662, rel=0.1)
     flight = independent(VEHICLES["tiny"], given[:250], {}, 1e-9)
     assert 5 < np.linalg.norm(flight.rates, axis=1).max() < 35
 

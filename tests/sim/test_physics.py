@@ -1,6 +1,6 @@
 """The paper's vehicle flies by the paper's numbers and by closed forms; accuracy against cost."""
 
-import math
+from math import exp
 from pathlib import Path
 from typing import Any
 
@@ -129,7 +129,7 @@ def test_linear_drag_slows_a_hover_and_not_its_turn() -> None:
     data = ready(vehicle, 49)
     data.qvel[:] = (10, 0, 0, 0, 0, 1)
     fly(vehicle, data, 2.0)
-    assert data.qvel[0] == approx(10 * math.exp(-1), abs=1e-9)
+    assert data.qvel[0] == approx(10 * exp(-1), abs=1e-9)
     assert data.qvel[5] == approx(1, abs=1e-9)
 
 

@@ -5,6 +5,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import contracts
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -19,8 +20,7 @@ from rotorgram.sim.backends import kernel
 ELEVATION = "rotorgram/Elevation-v0"
 HOVER = "rotorgram/Hover-v0"
 DATA = Path(__file__).parents[1] / "data"
-FILES = {path.stem: path for path in sorted((*DATA.glob("*.xml"), *DATA.glob("*.toml")))}
-FILES |= {path.parent.name: path for path in sorted(QUAD_XML.parent.glob("*/*/vehicle.toml"))}
+FILES: dict[str, Any] = contracts.FILES | {"lively": DATA / "lively.toml"}
 del FILES["small"]  # in a fluid
 RACER = DATA / "racer.xml"
 HEXA = DATA / "hexa.xml"

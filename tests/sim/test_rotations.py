@@ -1,6 +1,6 @@
 """Rotations against values worked out by hand."""
 
-import math
+from math import pi, sqrt
 from typing import Any
 
 import numpy as np
@@ -8,7 +8,7 @@ import pytest
 from numpy.testing import assert_allclose
 from rotorgram.sim import rotations
 
-HALF = math.sqrt(0.5)
+HALF = sqrt(0.5)
 LEFT = np.array((HALF, 0.0, 0.0, HALF))  # 90° about z: the nose along y
 ROLLED = np.array((HALF, HALF, 0.0, 0.0))  # 90° about x: body y up, body z along -y
 V = np.array((1.0, 2.0, 3.0))
@@ -41,7 +41,7 @@ def test_by_hand(function: Any, arguments: Any, expected: Any) -> None:
 
 
 def test_a_rotation_vector_turns_the_body() -> None:
-    for attitude, angle in both(LEFT, np.array((math.pi / 2, 0.0, 0.0))):
+    for attitude, angle in both(LEFT, np.array((pi / 2, 0.0, 0.0))):
         turned = rotations.advanced(attitude, angle)
         assert_allclose(turned, np.full(turned.shape, 0.5), atol=1e-15)
     still = rotations.advanced(2 * LEFT, np.zeros(3))
@@ -61,4 +61,4 @@ def test_vectors_by_their_components() -> None:
 
 def test_euler_angles() -> None:
     """Yaw by 90°, then a roll by 90° about the new nose."""
-    assert rotations.euler(np.full(4, 0.5)) == pytest.approx((math.pi / 2, 0.0, math.pi / 2))
+    assert rotations.euler(np.full(4, 0.5)) == pytest.approx((pi / 2, 0.0, pi / 2))

@@ -4,6 +4,7 @@ import csv
 import json
 import math
 from collections.abc import Mapping
+from math import atan2, cos, exp, hypot, log, pi, radians, sin, sqrt
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -27,7 +28,7 @@ ELEVATION = "rotorgram/Elevation-v0"
 HOVER = "rotorgram/Hover-v0"
 PERIOD = 0.02
 LEVEL = (1.0, 0.0, 0.0, 0.0)
-LEFT = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))
+LEFT = (sqrt(0.5), 0.0, 0.0, sqrt(0.5))
 IMU = {"gyro_noise": 0.0, "accelerometer_noise": 0.0}
 GPS = {"noise": 0.0, "vertical_noise": 0.0, "velocity_noise": 0.0}
 NOISY = {
@@ -49,8 +50,8 @@ NOISY = {
 
 
 def about_x(degrees: float) -> tuple[float, ...]:
-    half = math.radians(degrees) / 2
-    return (math.cos(half), math.sin(half), 0.0, 0.0)
+    half = radians(degrees) / 2
+    return (cos(half), sin(half), 0.0, 0.0)
 
 
 def sensing(
@@ -66,6 +67,13 @@ def sensing(
     world.reset(every, InitialState(**shaped))
     made.begin(every)
     return world, made, every
+
+
+def edited(folder: Path, old: str, new: str) -> Path:
+    """A file of the paper's craft with another text in a place."""
+    file = folder / "edited.xml"
+    file.write_text(Vehicle.load().path.read_text().replace(old, new, 1))
+    return file
 
 
 def first(name: str, settings: Mapping[str, Any], **rest: Any) -> list[float]:
@@ -109,9 +117,7 @@ def test_imu_at_the_end_of_a_step() -> None:
 def test_imu_off_the_center_of_mass(tmp_path: Path) -> None:
     """The hub, 12 of 20 kg, 5 cm ahead: the center 3 cm ahead. Turning at 2 rad/s, the origin is
     drawn towards it by ω² r = 0.12 m/s²."""
-    text = Vehicle.load().path.read_text()
-    file = tmp_path / "ahead.xml"
-    file.write_text(text.replace('size="0.22 0.22 0.07"', 'size="0.22 0.22 0.07" pos="0.05 0 0"'))
+    file = edited(tmp_path, 'size="0.22 0.22 0.07"', 'size="0.22 0.22 0.07" pos="0.05 0 0"')
     reading = first("imu", IMU, file=file, body_rates=(0.0, 0.0, 2.0))
     assert reading == approx((0, 0, 2.0, 0.12, 0, 9.8), abs=1e-9)
 
@@ -119,10 +125,7 @@ def test_imu_off_the_center_of_mass(tmp_path: Path) -> None:
 def test_imu_feels_the_air(tmp_path: Path) -> None:
     """Drag of 2 N s/m in a wind of 5 m/s from behind: 10 N on 20 kg, as long as it stands still."""
     drag = '<custom><numeric name="rotorgram/drag.linear" data="2 2 2"/></custom>'
-    file = tmp_path / "draggy.xml"
-    text = Vehicle.load().path.read_text()
-    file.write_text(text.replace("<worldbody>", f"{drag}<worldbody>"))
-    vehicle = Vehicle.load(file)
+    vehicle = Vehicle.load(edited(tmp_path, "<worldbody>", f"{drag}<worldbody>"))
     every = np.True_
     world = make_world(vehicle, 1, effects=EffectOptions(body_drag=True, wind=(5.0, 0.0, 0.0)))
     sensors = Sensors(checked_sensors({"imu": IMU}), world, PERIOD)
@@ -146,9 +149,9 @@ def test_imu_bias_and_scale() -> None:
     _, sensors, every = sensing({"imu": settings}, 3000)
     bias, scale = np.split(sensors.readings["imu"].reshape(-1, 6), 2, axis=1)
     off = scale[:, 2] / 9.8 - 1
-    assert bias.std() == approx(0.1, abs=4 * 0.1 / math.sqrt(2 * 9000))
-    assert off.std() == approx(0.02, abs=4 * 0.02 / math.sqrt(2 * 3000))
-    assert abs(bias.mean()) < 4 * 0.1 / math.sqrt(9000)
+    assert bias.std() == approx(0.1, abs=4 * 0.1 / sqrt(2 * 9000))
+    assert off.std() == approx(0.02, abs=4 * 0.02 / sqrt(2 * 3000))
+    assert abs(bias.mean()) < 4 * 0.1 / sqrt(9000)
     sensors.sample(every)
     assert_allclose(sensors.readings["imu"][:, 0, :3], bias, atol=1e-15)
     some = np.arange(3000)[:, None] < 10
@@ -171,7 +174,7 @@ def test_barometer() -> None:
     # At sea level a pascal is 1 / (1.225 kg/m³ · 9.80665 m/s²) = 83.24 mm.
     _, sensors, _ = sensing({"barometer": {"noise": 2.0}}, 4000, position=(0.0, 0.0, 0.4))
     off = sensors.readings["barometer"].ravel() - 0.4
-    assert off.std() == approx(2 * 0.08324, abs=4 * 0.1665 / math.sqrt(8000))
+    assert off.std() == approx(2 * 0.08324, abs=4 * 0.1665 / sqrt(8000))
 
 
 def test_barometer_walks() -> None:
@@ -182,8 +185,8 @@ def test_barometer_walks() -> None:
         sensors.sample(every)
     pressure = isa_pressure(sensors.readings["barometer"].ravel()) - isa_pressure(5.0)
     # The bias of a reading is that before its own step of the walk.
-    expected = 0.5 * math.sqrt(200 * PERIOD)
-    assert pressure.std() == approx(expected, abs=4 * expected / math.sqrt(4000))
+    expected = 0.5 * sqrt(200 * PERIOD)
+    assert pressure.std() == approx(expected, abs=4 * expected / sqrt(4000))
 
 
 def test_magnetometer() -> None:
@@ -194,7 +197,7 @@ def test_magnetometer() -> None:
     assert first("magnetometer", {"noise": 0.0, "field": [0, 30, 0]}) == approx((0, 30, 0))
     _, sensors, _ = sensing({"magnetometer": {"noise": 0.3, "field": [0, 0, 0]}}, 2000)
     noise = sensors.readings["magnetometer"]
-    assert noise.std() == approx(0.3, abs=4 * 0.3 / math.sqrt(12_000))
+    assert noise.std() == approx(0.3, abs=4 * 0.3 / sqrt(12_000))
 
 
 def test_rangefinder() -> None:
@@ -206,10 +209,8 @@ def test_rangefinder() -> None:
 
 
 def test_rangefinder_sees_what_stands_in_a_vehicles_file(tmp_path: Path) -> None:
-    text = Vehicle.load().path.read_text()
     table = '<geom type="box" size="0.1 0.1 0.5" pos="7 0 0.5"/>'
-    file = tmp_path / "table.xml"
-    file.write_text(text.replace("<worldbody>", f"<worldbody>{table}"))
+    file = edited(tmp_path, "<worldbody>", f"<worldbody>{table}")
     settings = {"noise": 0.0, "limit": 8.0}
     for x, expected in ((0.0, 3.0), (7.0, 2.0)):
         reading = first("rangefinder", settings, file=file, position=(x, 0.0, 3.0))
@@ -217,15 +218,10 @@ def test_rangefinder_sees_what_stands_in_a_vehicles_file(tmp_path: Path) -> None
 
 
 def test_rangefinder_looks_past_what_is_fixed_to_the_craft(tmp_path: Path) -> None:
-    text = Vehicle.load().path.read_text()
     leg = '<body pos="0 0 -0.3"><geom type="box" size="0.1 0.1 0.1" mass="0"/></body>'
-    file = tmp_path / "leg.xml"
-    file.write_text(text.replace("<freejoint", f"{leg}<freejoint", 1))
-    world = make_world(Vehicle.load(file), 2)
-    position = np.zeros((2, 1, 3))
-    position[..., 2] = 3.0
-    world.reset(np.ones((2, 1), bool), InitialState(position=position))
-    assert_allclose(world.below(), 3.0, rtol=1e-6)
+    file = edited(tmp_path, "<freejoint", f"{leg}<freejoint")
+    settings = {"noise": 0.0, "limit": 8.0}
+    assert first("rangefinder", settings, file=file) == approx([5.0])
 
 
 def test_gps_and_motion_capture() -> None:
@@ -236,14 +232,14 @@ def test_gps_and_motion_capture() -> None:
     noisy = {"noise": 2.0, "vertical_noise": 3.0, "velocity_noise": 0.5}
     _, sensors, _ = sensing({"gps": noisy}, 4000, **pose)
     deviation = sensors.readings["gps"].reshape(-1, 6).std(axis=0)
-    assert_allclose(deviation, (2, 2, 3, 0.5, 0.5, 0.5), rtol=4 / math.sqrt(8000))
+    assert_allclose(deviation, (2, 2, 3, 0.5, 0.5, 0.5), rtol=4 / sqrt(8000))
     turned = {"noise": 0.0, "angle_noise": 0.02}
     _, sensors, _ = sensing({"motion_capture": turned}, 4000, **pose)
     quaternion = sensors.readings["motion_capture"][:, 0, 3:]
     assert_allclose(np.linalg.norm(quaternion, axis=1), 1.0, atol=1e-12)
     # The mean square of a rotation about three axes of σ is 3 σ².
     angle = 2 * np.arccos(np.clip(np.abs(quaternion @ LEFT), 0, 1))
-    assert math.sqrt((angle**2).mean() / 3) == approx(0.02, rel=4 / math.sqrt(24_000))
+    assert sqrt((angle**2).mean() / 3) == approx(0.02, rel=4 / sqrt(24_000))
 
 
 # --- the gyroscope's noise ------------------------------------------------------------------------
@@ -256,7 +252,7 @@ def allan_deviation(rates: np.ndarray, m: int) -> float:
     """
     angle = np.concatenate((np.zeros((1, rates.shape[1])), rates.cumsum(axis=0)))
     second = angle[2 * m :] - 2 * angle[m:-m] + angle[: -2 * m]
-    return math.sqrt(0.5 * np.mean((second / m) ** 2))
+    return sqrt(0.5 * np.mean((second / m) ** 2))
 
 
 def freedom(n: int, m: int) -> float:
@@ -286,13 +282,13 @@ def test_allan_deviation_of_the_gyroscope(rate: float) -> None:
     found = {}
     for m in (1, 2, 4, 16, 64, 256, 1024):
         time = m * interval
-        expected = math.sqrt(density**2 / time + walk**2 * time / 3)
+        expected = sqrt(density**2 / time + walk**2 * time / 3)
         found[m] = allan_deviation(rates, m)
         # Of a χ² with f degrees of freedom, the relative error of the square root: √(1 / 2f).
-        error = math.sqrt(0.5 / (freedom(samples, m) * rates.shape[1]))
+        error = sqrt(0.5 / (freedom(samples, m) * rates.shape[1]))
         assert found[m] == approx(expected, rel=4 * error), m
-    assert found[1] == approx(density / math.sqrt(interval), rel=0.02)
-    assert found[1024] == approx(walk * math.sqrt(1024 * interval / 3), rel=0.2)
+    assert found[1] == approx(density / sqrt(interval), rel=0.02)
+    assert found[1024] == approx(walk * sqrt(1024 * interval / 3), rel=0.2)
 
 
 # --- rate, delay and dropout ----------------------------------------------------------------------
@@ -328,7 +324,7 @@ def test_dropouts() -> None:
         assert (same == (now == before).any(axis=-1)).all()
         lost = lost + int(same.sum())
         before = now
-    assert lost / 1e5 == approx(0.3, abs=4 * math.sqrt(0.3 * 0.7 / 1e5))
+    assert lost / 1e5 == approx(0.3, abs=4 * sqrt(0.3 * 0.7 / 1e5))
 
 
 # --- options --------------------------------------------------------------------------------------
@@ -340,9 +336,7 @@ def test_a_vehicles_numbers_and_the_settings_that_replace_them(tmp_path: Path) -
         f'<numeric name="rotorgram/sensors.{name}" data="{value}"/>'
         for name, value in numbers.items()
     )
-    file = tmp_path / "sensing.xml"
-    text = Vehicle.load().path.read_text()
-    file.write_text(text.replace("<worldbody>", f"<custom>{told}</custom><worldbody>"))
+    file = edited(tmp_path, "<worldbody>", f"<custom>{told}</custom><worldbody>")
     fast = {"body_rates": (5.0, 0.0, 0.0)}
     assert sensing({"imu": True}, file=file, **fast)[1].readings["imu"][0] == 2.0
     assert first("imu", {"gyro_range": 4.0}, file=file, **fast)[0] == 4.0
@@ -443,7 +437,7 @@ def test_an_estimate_stays_within_the_bounds_of_a_task() -> None:
 
 # --- the estimate ---------------------------------------------------------------------------------
 
-HALF_LIFE = PERIOD / math.log(2)  # a time constant with which a step takes half of an error
+HALF_LIFE = PERIOD / log(2)  # a time constant with which a step takes half of an error
 
 
 def estimator(**state: Any) -> Estimator:
@@ -462,62 +456,58 @@ def channel(*value: float, fresh: bool = True) -> Any:
 def angles_of(quaternion: np.ndarray) -> np.ndarray:
     """Rotation vector of a quaternion."""
     size = np.linalg.norm(quaternion[1:])
-    return 2 * math.atan2(size, quaternion[0]) * quaternion[1:] / max(size, 1e-30)
+    return 2 * atan2(size, quaternion[0]) * quaternion[1:] / max(size, 1e-30)
 
 
 STILL = (0.0, 0.0, 0.0, 0.0, 0.0, 10.0)
 
 
+def after(channels: dict[str, Any], *imu: float, **state: Any) -> Estimator:
+    """A step from a state; at rest, unless the IMU reads otherwise."""
+    made = estimator(**state)
+    made.update(np.True_, {"imu": channel(*(imu or STILL)), **channels})
+    return made
+
+
 def test_a_step_of_position_by_hand() -> None:
     """a = 10.5 - 10 m/s² up for 0.02 s, then half of the rest for each measurement."""
-    made = estimator(position=(1, 2, 3), velocity=(0.5, 0, 0))
-    made.update(np.True_, {"imu": channel(0, 0, 0, 0, 0, 10.5)})
+    place = {"position": (1, 2, 3)}
+    made = after({}, 0, 0, 0, 0, 0, 10.5, velocity=(0.5, 0, 0), **place)
     assert made.position == approx((1.01, 2.0, 3.0001), abs=1e-12)
     assert made.velocity == approx((0.5, 0.0, 0.01), abs=1e-12)
-    made = estimator(position=(1, 2, 3))
-    made.update(np.True_, {"imu": channel(*STILL), "barometer": channel(104.0)})
+    made = after({"barometer": channel(104.0)}, **place)
     # Both poles at 1/2: g = 1 - 1/4, h = (1 - 1/2)² / 0.02 s; it is 1 m higher.
     assert made.position == approx((1.0, 2.0, 3.75))
     assert made.velocity == approx((0.0, 0.0, 12.5))
-    made = estimator(position=(1, 2, 3))
-    made.update(np.True_, {"imu": channel(*STILL), "gps": channel(2, 2, 5, 0, 1, 0)})
+    made = after({"gps": channel(2, 2, 5, 0, 1, 0)}, **place)
     assert made.position == approx((1.5, 2.0, 4.0))
     assert made.velocity == approx((0.0, 0.5, 0.0))
-    made = estimator(position=(1, 2, 3))
-    capture = channel(3, 2, 3, *LEVEL)
-    made.update(np.True_, {"imu": channel(*STILL), "motion_capture": capture})
+    made = after({"motion_capture": channel(3, 2, 3, *LEVEL)}, **place)
     assert made.position == approx((2.5, 2.0, 3.0))
     assert made.velocity == approx((25.0, 0.0, 0.0))
 
 
 def test_a_step_of_attitude_by_hand() -> None:
-    made = estimator()
-    made.update(np.True_, {"imu": channel(0.5, 0, 0, 0, 0, 0)})  # falls: nothing pulls
+    made = after({}, 0.5, 0, 0, 0, 0, 0)  # falls: nothing pulls
     assert angles_of(made.quaternion) == approx((0.01, 0, 0))
-    tilted = about_x(math.degrees(0.2))
-    made = estimator(quaternion=tilted)
-    made.update(np.True_, {"imu": channel(*STILL)})
-    assert angles_of(made.quaternion) == approx((0.2 - 0.5 * math.sin(0.2), 0, 0))
+    made = after({}, quaternion=about_x(math.degrees(0.2)))
+    assert angles_of(made.quaternion) == approx((0.2 - 0.5 * sin(0.2), 0, 0))
     # Nose north where it is believed to be east: field along -y... seen as along body x.
-    made = estimator()
-    made.update(np.True_, {"imu": channel(*STILL), "magnetometer": channel(20, 0, -40)})
-    assert angles_of(made.quaternion) == approx((0, 0, math.pi / 4))
-    turned = (math.cos(0.15), 0, 0, math.sin(0.15))
-    for sign in (1, -1):  # the same attitude
-        made = estimator()
-        capture = channel(0, 0, 0, *(sign * x for x in turned))
-        made.update(np.True_, {"imu": channel(*STILL), "motion_capture": capture})
-        assert angles_of(made.quaternion) == approx((0, 0, math.sin(0.15)))
+    made = after({"magnetometer": channel(20, 0, -40)})
+    assert angles_of(made.quaternion) == approx((0, 0, pi / 4))
+    turned = np.array((cos(0.15), 0, 0, sin(0.15)))
+    for attitude in (turned, -turned):  # the same one
+        made = after({"motion_capture": channel(0, 0, 0, *attitude)})
+        assert angles_of(made.quaternion) == approx((0, 0, sin(0.15)))
 
 
 def test_a_reading_counts_once() -> None:
-    made = estimator(position=(1, 2, 3))
     stale = {
         "barometer": channel(140.0, fresh=False), "gps": channel(9, 9, 9, 9, 9, 9, fresh=False),
         "motion_capture": channel(9, 9, 9, *LEFT, fresh=False),
         "magnetometer": channel(20, 0, -40, fresh=False),
     }  # fmt: skip
-    made.update(np.True_, {"imu": channel(*STILL), **stale})
+    made = after(stale, position=(1, 2, 3))
     assert made.position == approx((1, 2, 3))
     assert made.velocity == approx((0, 0, 0))
     assert made.quaternion == approx(LEVEL)
@@ -529,7 +519,7 @@ def test_a_gyroscopes_bias_tilts_the_estimate_by_so_much() -> None:
     bias = 0.5
     for _ in range(100):
         made.update(np.True_, {"imu": channel(bias, 0, 0, 0, 0, 10)})
-    assert math.sin(angles_of(made.quaternion)[0]) == approx(2 * bias * PERIOD)
+    assert sin(angles_of(made.quaternion)[0]) == approx(2 * bias * PERIOD)
 
 
 def test_errors_of_a_long_hover_are_those_of_the_biases() -> None:
@@ -544,12 +534,12 @@ def test_errors_of_a_long_hover_are_those_of_the_biases() -> None:
         made.sample(every)
     estimate = made.readings["estimate"][:, 0]
     turned = 2 * estimate[:, 7:10]  # small angles, about x, y, z
-    pole = math.exp(-PERIOD)
-    tilt = math.hypot(gyro * PERIOD / (1 - pole), force / 9.8)
+    pole = exp(-PERIOD)
+    tilt = hypot(gyro * PERIOD / (1 - pole), force / 9.8)
     # A step's rise of a T² is made up by h times what the barometer tells before the pull.
     height = force * (pole * PERIOD / (1 - pole)) ** 2
-    error = 4 / math.sqrt(2 * drones)
-    assert turned[:, :2].std() == approx(tilt, rel=error / math.sqrt(2) + 0.01)
+    error = 4 / sqrt(2 * drones)
+    assert turned[:, :2].std() == approx(tilt, rel=error / sqrt(2) + 0.01)
     assert (estimate[:, 2] - 5.0).std() == approx(height, rel=error + 0.01)
     assert turned[:, 2].std() == approx(12 * gyro, rel=error + 0.01)
     assert estimate[:, :2].std() > 10 * height  # nothing measures it
