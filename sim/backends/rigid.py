@@ -19,9 +19,10 @@ from ..state import Array, InitialState, WorldState, chosen, clip
 from ..world import PhysicsError, World
 from . import kernel
 from .body import RigidBody, mapped, motion
-from .hull import Hull
+from .hull import Hull, can_touch
 
 DTYPES: Final = ("float32", "float64")
+_OWN: Final = ("_rows", "_acting", "_wrench")
 _OF_STATE: Final = ("command", "thrust", "touching", "colliding")
 _LEVEL: Final = np.array((0.0, 0.0, 0.0, 1.0, *[0.0] * 9))  # rows of a craft at rest
 
@@ -181,19 +182,16 @@ class RigidWorld(World):
             self._wrench = chosen(some, wrench, old)
 
     def _snapshot(self) -> dict[str, np.ndarray]:
-        state = self.state
-        arrays = {"rows": self._rows, "acting": self._acting, "wrench": self._wrench}
-        arrays |= {name: getattr(state, name) for name in _OF_STATE}
+        arrays = {name: getattr(self, name) for name in _OWN}
+        arrays |= {name: getattr(self.state, name) for name in _OF_STATE}
         return {name: array.copy() for name, array in arrays.items() if array is not None}
 
     def _restore(self, arrays: Arrays) -> None:
-        wrench = arrays.get("wrench")
-        self._rows = arrays["rows"].copy()
-        self._acting = arrays["acting"].copy()
-        self._wrench = None if wrench is None else wrench.copy()
+        copies = {name: array.copy() for name, array in arrays.items()}
+        for name in _OWN:
+            setattr(self, name, copies.get(name))
         for name in _OF_STATE:
-            if name in arrays:
-                setattr(self.state, name, arrays[name].copy())
+            setattr(self.state, name, copies.get(name))
         self._show()
         self._vary_drawn()
 
@@ -275,10 +273,8 @@ def _check_obstacles(vehicle: Vehicle) -> None:
     """Refuse obstacles of the vehicle's file, through which drones would fly."""
     model = vehicle.model
     ours = np.isin(model.geom_bodyid, craft_bodies(model))
-    types = model.geom_contype
-    affinities = model.geom_conaffinity
     for i in np.flatnonzero(~ours & (model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)).tolist():
-        if ((types[i] & affinities[ours]) | (affinities[i] & types[ours])).any():
+        if can_touch(model, i, ours):
             name = model.geom(i).name or f"geom {i}"
             raise InputError(
                 f"vehicle: expected no obstacles with the backend rigid, which has none (the "

@@ -14,6 +14,7 @@ from ...models.errors import InputError, shortened
 from ...models.fields import check_names
 from ..snapshots import Kept
 from ..state import Array, WorldState, chosen
+from ..world import World
 from .barometer import Barometer
 from .base import Reading, Sensor, Source, Values
 from .channel import Channel
@@ -26,7 +27,6 @@ from .rangefinder import Rangefinder
 
 if TYPE_CHECKING:
     from ...models.vehicle import Vehicle
-    from ..world import World
 
 __all__ = ["SENSOR_TYPES", "Estimator", "Reading", "Sensors", "checked_sensors", "readings_of"]
 
@@ -99,7 +99,7 @@ class Sensors(Kept):
 
     arrays = ("_steps",)
 
-    def __init__(self, sensors: Values, world: "World", period: float) -> None:
+    def __init__(self, sensors: Values, world: World, period: float) -> None:
         self._world = world
         settings = _resolved(sensors, world.vehicle, period)
         estimate = settings.pop(_ESTIMATE, None)
