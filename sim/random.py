@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import elementary
-from .snapshots import Arrays, Snapshot
+from .snapshots import Arrays, Kept
 from .state import Array
 
 Words = NDArray[np.uint32]
@@ -24,12 +24,13 @@ Numbers = NDArray[np.float64]
 Ids = Any
 """Numbers of worlds, or `...` for all."""
 
-START: Final = "start"
-"""Use of the draws with which a task begins episodes."""
+# Numbers of uses, and the name of the noise of gusts.
+START: Final = crc32(b"start")
+"""The draws with which a task begins episodes."""
+RANDOMIZATION: Final = crc32(b"randomization")
+CAMERAS: Final = crc32(b"cameras")
+SCENES: Final = crc32(b"scenes")
 GUSTS: Final = "gusts"
-RANDOMIZATION: Final = "randomization"
-CAMERAS: Final = "cameras"
-SCENES: Final = "scenes"
 
 _MULTIPLIERS: Final = np.array((0xD2511F53, 0xCD9E8D57), np.uint64)
 _WEYL: Final = (0x9E3779B9, 0xBB67AE85)
@@ -105,7 +106,7 @@ def numbers_of(use: str, keys: Words, step: Words, count: int) -> Numbers:
     return uniform(words_of(both, use_number(use), np.zeros_like(step), step, count))
 
 
-class Random:
+class Random(Kept):
     """The counters of W worlds. Until a world is seeded its seed is unpredictable.
 
     Attributes:
@@ -113,6 +114,8 @@ class Random:
         keys: Of each world the low and the high word of its seed, shape (W, 2).
         episode: Number of the world's episode since it was seeded, shape (W,).
     """
+
+    arrays = ("keys", "episode", "_is_drawn")
 
     def __init__(self, shape: tuple[int, ...]) -> None:
         self.shape = shape
@@ -122,7 +125,6 @@ class Random:
         self.keys = _keys(seeds)
         self.episode = np.zeros(worlds, np.uint32)
         self._is_drawn = np.zeros(worlds, bool)  # whether the start of an episode was drawn
-        self._uses: dict[int, str] = {}
         self._noises: dict[str, Noise] = {}
 
     def seed(self, ids: Ids, seeds: Sequence[int | None]) -> None:
@@ -134,14 +136,6 @@ class Random:
                 self._is_drawn[world] = False
         for noise in self._noises.values():
             noise.forget(ids)
-
-    def use(self, name: str) -> int:
-        """The number of a new use. Raises `ValueError` if another has it."""
-        number = use_number(name)
-        if number in self._uses:
-            raise ValueError(f"random numbers: {name!r} has the number of {self._uses[number]!r}")
-        self._uses[number] = name
-        return number
 
     def start(self, use: int, ids: Ids, chosen: Mapping[str, Array] | None = None) -> "Draw":
         """Begin an episode of the worlds `ids` by drawing its start."""
@@ -158,7 +152,7 @@ class Random:
 
     def noise(self, name: str, size: int) -> "Noise":
         """So many normal numbers of each drone in every step."""
-        self._noises[name] = noise = Noise(self, self.use(name), size)
+        self._noises[name] = noise = Noise(self, use_number(name), size)
         return noise
 
     def shares(self, use: int, ids: Ids) -> Numbers:
@@ -171,20 +165,9 @@ class Random:
         words = words_of(self.keys[world], use, self.episode[world], step, 4)
         return np.random.Generator(np.random.Philox(key=words.view(np.uint64)))
 
-    def snapshot(self) -> Snapshot:
-        """Copies of the counters by name."""
-        return {name: array.copy() for name, array in self._arrays().items()}
-
-    def restore(self, arrays: Arrays) -> None:
-        """Put the counters of a snapshot back."""
-        for name, array in self._arrays().items():
-            array[...] = arrays[name]
-        for noise in self._noises.values():
-            noise.forget(...)
-
-    def _arrays(self) -> Snapshot:
-        counters = {"keys": self.keys, "episode": self.episode, "is_drawn": self._is_drawn}
-        return counters | {f"step {name}": noise.step for name, noise in self._noises.items()}
+    def parts(self) -> dict[str, Kept]:
+        """The noises."""
+        return dict(self._noises)
 
 
 def _keys(seeds: NDArray[np.uint64]) -> Words:
@@ -258,7 +241,7 @@ class Draw:
         return numbers[()]
 
 
-class Noise:
+class Noise(Kept):
     """Standard normal numbers of each drone in every step: `Random.noise` makes it.
 
     Steps are drawn ahead: that is a cache and no state.
@@ -266,6 +249,8 @@ class Noise:
     Attributes:
         step: Number of each world's next step in its episode, shape (W,).
     """
+
+    arrays = ("step",)
 
     def __init__(self, random: Random, use: int, size: int) -> None:
         worlds = len(random.keys)
@@ -286,6 +271,11 @@ class Noise:
     def forget(self, ids: Ids) -> None:
         """Seed, episode or step of some worlds have changed."""
         self._left[ids] = 0
+
+    def restore(self, arrays: Arrays) -> None:
+        """As `Kept.restore`."""
+        super().restore(arrays)
+        self.forget(...)
 
     def normal(self, mask: Array | None = None) -> Array:
         """The next numbers of the worlds of a mask, bool, shape (W, A), None for all.

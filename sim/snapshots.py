@@ -21,10 +21,15 @@ class Kept:
     arrays: ClassVar[tuple[str, ...]] = ()
     lists: ClassVar[tuple[str, ...]] = ()
 
+    def parts(self) -> "dict[str, Kept]":
+        """What it is made of, by name, with a state of their own."""
+        return {}
+
     def snapshot(self) -> Snapshot:
         """Copies by name; what has no value yet is left out."""
         values = {name: getattr(self, name) for name in (*self.arrays, *self.lists)}
-        return {name: np.array(value) for name, value in values.items() if value is not None}
+        own = {name: np.array(value) for name, value in values.items() if value is not None}
+        return own | joined({name: part.snapshot() for name, part in self.parts().items()})
 
     def restore(self, arrays: Arrays) -> None:
         """Put a snapshot back."""
@@ -37,6 +42,8 @@ class Kept:
                 setattr(self, name, None)
             else:
                 setattr(self, name, array.tolist() if array.ndim == 1 else list(array.copy()))
+        for name, part in self.parts().items():
+            part.restore(part_of(arrays, name))
 
 
 def joined(parts: Mapping[str, Arrays]) -> Snapshot:

@@ -99,14 +99,22 @@ def each(values: Array) -> Array:
     return values if isinstance(values, _NUMBERS) else values[..., None]
 
 
-def kept(mask: Array, new: Sequence[Array], old: Sequence[Array] | None) -> Sequence[Array]:
-    """Lists of arrays: the new for the worlds of a mask, None for all, and the old for the others.
-
-    Of a single drone, whose numbers are Python's, all are new; so they are where there is no old.
-    """
-    if mask is None or old is None or old[0] is None or isinstance(new[0], float):
+def chosen(mask: Array, new: Array, old: Array) -> Array:
+    """`new`, (W, A) or (W, A, k), where the mask is true, None for all; elsewhere `old`."""
+    if mask is None:
         return new
-    return [np.where(mask, a, b) for a, b in zip(new, old, strict=True)]
+    if not getattr(mask, "ndim", 0):  # a single drone's
+        return new if mask else old
+    if getattr(new, "ndim", 0) > mask.ndim:
+        mask = mask[..., None]
+    return np.where(mask, new, old)
+
+
+def kept(mask: Array, new: Sequence[Array], old: Sequence[Array] | None) -> Sequence[Array]:
+    """The same of lists of arrays; all are new where there is no old."""
+    if old is None or old[0] is None:
+        return new
+    return [chosen(mask, a, b) for a, b in zip(new, old, strict=True)]
 
 
 def plain(array: Array) -> Array:

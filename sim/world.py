@@ -1,16 +1,19 @@
-"""Worlds: one interface for all backends."""
+"""Worlds: what all backends have in common, and how they are made."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, ClassVar, Final, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Final
+
+import numpy as np
 
 from ..models import BACKENDS, MAX_DRONES, Backend
 from ..models.errors import InputError
 from .effects import EffectOptions, Effects
-from .random import Draw, Random
+from .random import RANDOMIZATION, START, Draw, Random
 from .randomize import CENTER, Randomization
-from .snapshots import Arrays, Snapshot
-from .state import Array, InitialState, WorldState
+from .snapshots import Arrays, Snapshot, joined, part_of
+from .state import Array, InitialState, WorldState, plain
 
 if TYPE_CHECKING:
     import mujoco
@@ -25,13 +28,16 @@ CONTACT_CHECK: Final = 0.02
 """Longest time between two checks for contact, s. A bounce of the paper's craft at full thrust
 lasts longer, unless its skids dip less than half a millimetre."""
 
+_ONLY: Final = np.zeros(1, int)
+_LEVEL: Final = np.array((1.0, 0.0, 0.0, 0.0))
+
 
 class PhysicsError(RuntimeError):
     """The physics reported a bad state; the numbers after it are meaningless."""
 
 
-class World(Protocol):
-    """W worlds of A drones.
+class World:
+    """W worlds of A drones; a seed gives the same draws on each backend, which sets `state`.
 
     Attributes:
         vehicle: The vehicle of every drone.
@@ -46,19 +52,50 @@ class World(Protocol):
         settings: Names of the backend's own arguments of `make_world`.
     """
 
-    vehicle: "Vehicle"
-    shape: tuple[int, ...]
-    state: WorldState
-    random: Random
-    parameters: dict[str, Array]
-    effects: Effects | None
     settings: ClassVar[tuple[str, ...]]
+    state: WorldState
+
+    def __init__(
+        self,
+        vehicle: "Vehicle",
+        shape: tuple[int, ...],
+        effects: EffectOptions | None,
+        randomize: Randomization | None,
+        arguments: Mapping[str, Any],
+    ) -> None:
+        self.vehicle = vehicle
+        self.shape = shape
+        self._arguments = {
+            **arguments,
+            "vehicle": vehicle,
+            "effects": effects,
+            "randomize": randomize,
+        }
+        self.parameters: dict[str, Array] = {}
+        self._options = effects or EffectOptions()
+        self._randomize = randomize
+        self._drawn = () if randomize is None else randomize.names
+        self.random = Random(shape)
+        acting = Effects(vehicle, self._options, self.random.noise, self._drawn)
+        self.effects = acting if acting.works else None
+        self._on_rotors = acting.on_rotors
+        self._check = max(1, round(CONTACT_CHECK / vehicle.timestep))  # physics steps
+
+    def seed(self, mask: Array, seeds: Sequence[int | None] | Array) -> None:
+        """Seed the worlds of a mask, seeds (W,); where it is None the random numbers go on."""
+        ids = self._ids(mask).tolist()
+        self.random.seed(ids, [seeds[i] for i in ids])
+
+    def draw(self, mask: Array, chosen: Mapping[str, Array] | None = None) -> Draw:
+        """Begin an episode of the worlds of a mask; `chosen` as of `random.Draw`."""
+        return self.random.start(START, self._ids(mask), chosen)
 
     def reset(self, mask: Array, pose: InitialState) -> None:
         """Reset the worlds of the mask, bool, shape (W, A), to their rows of `pose`.
 
         Here and in all masks the drones of a world have the same truth value.
         """
+        raise NotImplementedError
 
     def step(
         self, thrust: Array, substeps: int, mask: Array | None = None, *, again: bool = False
@@ -69,35 +106,82 @@ class World(Protocol):
         state's `touching` counts from that step on. A bad state raises `PhysicsError`, which names
         the worlds to be reset.
         """
-
-    def seed(self, mask: Array, seeds: Sequence[int | None] | Array) -> None:
-        """Seed the worlds of a mask, seeds (W,); where it is None the random numbers go on."""
-
-    def draw(self, mask: Array, chosen: Mapping[str, Array] | None = None) -> Draw:
-        """Begin an episode of the worlds of a mask; `chosen` as of `random.Draw`."""
+        raise NotImplementedError
 
     def acceleration(self) -> Array:
         """Of each body's origin at the present state and thrusts, world frame, m/s², (W, A, 3)."""
+        raise NotImplementedError
 
     def below(self) -> Array:
         """Distance from each body's origin along its -z axis to the first surface, m, (W, A).
 
         Infinite where there is none. Geoms of the craft do not count; a payload is a surface.
         """
-
-    def snapshot(self) -> Snapshot:
-        """Copies of all arrays that a later step depends on, by name."""
-
-    def restore(self, arrays: Arrays) -> None:
-        """Put a snapshot back; no step runs. No later bit differs from those that followed it."""
+        raise NotImplementedError
 
     def close(self) -> None:
         """Release threads and memory. The state keeps its numbers; nothing else can be called."""
+        raise NotImplementedError
 
+    def snapshot(self) -> Snapshot:
+        """Copies of all arrays that a later step depends on, by name."""
+        parts = {"random": self.random.snapshot(), "state": self._snapshot()}
+        parts["parameters"] = {name: np.array(x) for name, x in self.parameters.items()}
+        if self.effects is not None:
+            parts["effects"] = self.effects.snapshot()
+        return joined(parts)
 
-def contact_check(timestep: float) -> int:
-    """Physics steps between two checks for contact."""
-    return max(1, round(CONTACT_CHECK / timestep))
+    def restore(self, arrays: Arrays) -> None:
+        """Put a snapshot back; no step runs. No later bit differs from those that followed it."""
+        self.random.restore(part_of(arrays, "random"))
+        parameters = part_of(arrays, "parameters")
+        self.parameters = {name: plain(array.copy()) for name, array in parameters.items()}
+        self._restore(part_of(arrays, "state"))
+        if self.effects is not None:
+            self.effects.restore(part_of(arrays, "effects"))
+            self.effects.take(self.state, self.parameters)
+
+    def _snapshot(self) -> Snapshot:
+        """Copies of the backend's own arrays."""
+        raise NotImplementedError
+
+    def _restore(self, arrays: Arrays) -> None:
+        """Put those back; the parameters are as they were."""
+        raise NotImplementedError
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return partial(type(self), **self._arguments), (), self.snapshot()
+
+    def __setstate__(self, arrays: Arrays) -> None:
+        self.restore(arrays)
+
+    def _ids(self, mask: Array) -> np.ndarray:
+        """The worlds of a mask; of a single one it is always true."""
+        return np.flatnonzero(mask[:, 0]) if self.shape else _ONLY
+
+    def _draw_parameters(self, mask: Array) -> None:
+        """Draw the parameters of the worlds of a mask."""
+        if self._randomize is not None:
+            draw = Draw(self.random, RANDOMIZATION, self._ids(mask))
+            for name, new in self._randomize.draw(draw).items():
+                old = self.parameters.get(name)
+                self.parameters[name] = plain(new if old is None else np.where(mask, new, old))
+
+    def _begun(self, mask: Array, pose: InitialState) -> dict[str, Array]:
+        """The pose's arrays by their names; those of the state for worlds out of the mask."""
+        usual: dict[str, Array] = {
+            "position": 0.0,
+            "quaternion": _LEVEL,
+            "velocity": 0.0,
+            "body_rates": 0.0,
+            "thrust": self.vehicle.hover_thrust,
+        }
+        begun = {}
+        for name, default in usual.items():
+            given = getattr(pose, name)
+            old = getattr(self.state, name)
+            begun[name] = np.where(mask[..., None], default if given is None else given, old)
+        return begun
 
 
 def flown_model(

@@ -75,10 +75,37 @@ RICH: dict[str, Any] = {
     },
 }
 ESTIMATE = {"imu": True, "estimate": True, "observe": "estimate"}
+DRAWN = {
+    "inertia": "uniform(0.8, 1.2)", "center_x": "uniform(-0.001, 0.001)",
+    "thrust_1": "uniform(0.9, 1.0)", "time_constant": "uniform(0.8, 1.2)",
+    "wind_x": "uniform(-1, 1)", "body_drag": "uniform(0.5, 1.5)",
+}  # fmt: skip
+SENSORS = {
+    "imu": {"gyro_noise": 1e-3, "accelerometer_noise": 0.01, "gyro_bias": 0.01},
+    "barometer": {"noise": 1.0, "walk": 0.1}, "magnetometer": {"noise": 0.3},
+    "gps": {
+        "rate": 10.0, "delay": 0.04, "dropout": 0.2, "noise": 0.5, "vertical_noise": 1.0,
+        "velocity_noise": 0.1,
+    },
+    "motion_capture": {"noise": 0.001, "angle_noise": 0.01},
+    "rangefinder": {"noise": 0.01, "limit": 4.0}, "estimate": True,
+}  # fmt: skip
+SWARM: dict[str, Any] = {"vehicle": "crazyflie2", "randomize": DRAWN}
+SWARM["effects"] = {**RICH["effects"], "downwash": True}
+RACER: dict[str, Any] = {"vehicle": DATA / "racer.xml", "randomize": DRAWN, "sensors": SENSORS}
+RACER["effects"] = {**RICH["effects"], "thrust_curve": True, "efficiency": (1.0, 0.9, 1.0, 0.95)}
+WEAK = {"battery": True, "thrust_curve": True, "payload": 0.05, "cable": 0.4}
+CHARGED = {"battery_charge": "uniform(0, 1)", "thrust": "0.9", "payload": "uniform(0.5, 1.5)"}
 LOSSY = {"drones": 3, "radio_loss": 0.3, "radio_delay": 2, "radio_range": 30.0, "neighbours": 2}
 FEATURES = {
     "rich": Case(HOVER, RICH),
     "rich, rigid": Case(HOVER, {**RICH, "backend": "rigid"}),
+    "all": Case(HOVER, RACER),
+    "all, NumPy": Case(HOVER, {**RACER, "backend": "rigid", "compiled": False, "dtype": "float64"}),
+    "all, attitude": Case(HOVER, {**RACER, "action": "attitude"}),
+    "no lag": Case(HOVER, {**RACER, "effects": WEAK, "randomize": CHARGED}),
+    "swarm": Case(FORMATION, SWARM),
+    "swarm, rigid": Case(FORMATION, {**SWARM, "backend": "rigid"}),
     "estimate": Case(HOVER, {"vehicle": "crazyflie2", "sensors": ESTIMATE}),
     "discrete": Case(ELEVATION, {"action_type": "discrete", "observation": "error", "history": 4}),
     "late": Case(HOVER, {"randomize": {"observation_delay": "uniform(0, 0.07)"}, "history": 2}),

@@ -100,8 +100,6 @@ class Pictures(Stage):
         self._shape = shape
         self._rows = shape[0] * shape[1]
         self._random = random
-        self._noise = random.use(CAMERAS)
-        self._scenes = random.use(SCENES)
         self.views = views_of(task, shape[1])
         scenes = scenes_of(str(task.config.scene))
         self._count = len(scenes)
@@ -164,7 +162,7 @@ class Pictures(Stage):
         scenes = np.zeros(self._shape, int)
         if self._count > 1:
             ids = np.flatnonzero(begun)
-            shares = self._random.shares(self._scenes, ids)
+            shares = self._random.shares(SCENES, ids)
             scenes[ids] = (self._count * shares).astype(int)[:, None]
         record.scenes = scenes.reshape(record.shape)[()]
 
@@ -210,7 +208,7 @@ class Pictures(Stage):
         }
 
         def noise(world: int) -> np.random.Generator:
-            return self._random.generator(self._noise, world, steps[world * self._shape[1]])
+            return self._random.generator(CAMERAS, world, steps[world * self._shape[1]])
 
         def paint(painter: _Painter) -> None:
             worlds = painter.worlds & (scenes == painter.scene)

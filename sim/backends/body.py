@@ -18,7 +18,7 @@ import numpy as np
 from ...models.vehicle import Vehicle, craft_bodies
 from .. import elementary
 from ..randomize import CENTER
-from ..rotations import Rows, matrix, product
+from ..rotations import matrix, product, transposed
 from ..state import Array
 
 Vector = tuple[Array, Array, Array]
@@ -79,8 +79,6 @@ class Varying(NamedTuple):
     """Of the center of mass, body frame, m."""
     center: Vector
     """The center of mass, body frame, m."""
-    scale: Array
-    """Factor of the sides of the inertia boxes."""
 
 
 class RigidBody:
@@ -91,9 +89,8 @@ class RigidBody:
 
         origin'' = R (s - ω' × c - ω × (ω × c)) - g z,    I ω' = τ - ω × I ω.
 
-    `linear_drag` acts at the origin; a fluid acts on the inertia boxes of MuJoCo's bodies. The
-    stages of the classical Runge-Kutta method add up for rotation vectors, not for quaternions, so
-    it integrates the former (Munthe-Kaas, BIT 38, 1998).
+    `linear_drag` acts at the origin. The stages of the classical Runge-Kutta method add up for
+    rotation vectors, not for quaternions, so it integrates the former (Munthe-Kaas, BIT 38, 1998).
 
     Attributes:
         varying: As the last `vary` left it.
@@ -102,14 +99,12 @@ class RigidBody:
     varying: Varying
 
     def __init__(self, vehicle: Vehicle) -> None:
-        model = vehicle.model
-        rotors = vehicle.rotors
         self._step = vehicle.timestep
         self._gravity = vehicle.gravity
         self._drag = vehicle.linear_drag
         self._least = (vehicle.mass, vehicle.center_of_mass.tolist())
         axes, reactions, places = (
-            np.array([getattr(rotor, name) for rotor in rotors]).T
+            np.array([getattr(rotor, name) for rotor in vehicle.rotors]).T
             for name in ("axis", "reaction", "position")
         )
         levers = np.cross(places - vehicle.center_of_mass[:, None], axes, axis=0)
@@ -118,48 +113,38 @@ class RigidBody:
         self._levers = _sparse(levers, size)
         self._reactions = _sparse(reactions, size)
         self._torques = _sparse(levers + reactions)
-        boxes = _boxes(model)
-        self._inertias = _own_and_far(vehicle, boxes)
-        fluid = model.opt.density or model.opt.viscosity
-        self._fluid = _Fluid(model, boxes) if fluid else None
+        self._inertias = _own_and_far(vehicle)
         self._of_inertia = _euler(vehicle.inertia)
         self.vary({})
 
-    def vary(self, parameters: Mapping[str, Array]) -> None:
-        """Take drawn parameters by their names, each of shape (W,)."""
-        (mass, center) = self._least
-        (own, far) = self._inertias
-        inertia: Array
+    def vary(self, parameters: Mapping[str, Array], inertia: np.ndarray | None = None) -> None:
+        """Take drawn parameters by their names, each of shape (W,).
+
+        An inertia about the center of mass for each world, kg·m², (W, 3, 3), may replace the
+        vehicle's.
+        """
+        mass, center = self._least
+        own, far = self._inertias
         factor = parameters.get("mass", 1.0)
         more = parameters.get("inertia", 1.0)
         easier = 1.0 / factor
-        if isinstance(more, float) or not far.any():
-            easier = easier / more
-            inertia = own + far
+        turn, gyroscopic = self._of_inertia
+        if inertia is not None:
+            turn, gyroscopic = mapped(_euler_of_each(inertia), lambda x: x if x.any() else 0.0)
+        elif "inertia" in parameters and far.any():
+            turn, gyroscopic = _euler_of_each(own * more[:, None, None] + far)
         else:
-            parts = (own, more), (far, 1.0 + 0.0 * more)
-            inertia = sum(part * share[:, None, None] for part, share in parts)
+            easier = easier / more
         shift: Vector = tuple(parameters.get(name, 0.0) for name in CENTER)
-        varying = Varying(
+        self.varying = Varying(
             mass=mass * factor,
             easier=easier,
-            turn=self._of_inertia[0],
-            gyroscopic=self._of_inertia[1],
+            turn=turn,
+            gyroscopic=gyroscopic,
             reaction=parameters.get("reaction"),
             shift=shift,
             center=tuple(a + b for a, b in zip(shift, center, strict=True)),
-            scale=more**0.5,
         )
-        if not isinstance(inertia, np.ndarray) or inertia.ndim == 3:
-            turn, gyroscopic = _euler_of_each(inertia)
-            varying = varying._replace(turn=turn, gyroscopic=gyroscopic)
-        self.varying = varying
-
-    def set_inertia(self, inertia: np.ndarray) -> None:
-        """Take another inertia about the center of mass for each world, kg·m², (W, 3, 3)."""
-        turn, gyroscopic = _euler_of_each(inertia)
-        varying = self.varying._replace(easier=1.0, turn=turn, gyroscopic=gyroscopic)
-        self.varying = mapped(varying, lambda x: x if x.any() else 0.0)
 
     def fly(self, rows: Array, thrust: Array, wrench: Array = None, steps: int = 1) -> list[Array]:
         """The 13 rows of a state after physics steps, (W,) each, from those of `motion`.
@@ -176,11 +161,11 @@ class RigidBody:
         """Of thrusts, and a force and a torque, as of `fly`."""
         rotors = list(thrust)
         varying = self.varying
-        force = _times(self._axes, rotors)
+        force = _forth(self._axes, rotors)
         if varying.reaction is None:
-            torque = _times(self._torques, rotors)
+            torque = _forth(self._torques, rotors)
         else:
-            both = zip(_times(self._levers, rotors), _times(self._reactions, rotors), strict=True)
+            both = zip(_forth(self._levers, rotors), _forth(self._reactions, rotors), strict=True)
             torque = tuple(_sum(a, (b, varying.reaction)) for a, b in both)
         torque = _plus(torque, _cross(force, varying.shift))
         outer = _ZERO
@@ -195,19 +180,14 @@ class RigidBody:
         _, quaternion, velocity, rates = now
         inner, turning, outer = push
         varying = self.varying
-        center, off = varying.center, _is_there(varying.center)
-        turn: Rows | None = None
+        center = varying.center
+        off = _is_there(center)
         if self._drag:
             outer = _plus(outer, velocity, -self._drag)
-        if self._fluid is not None:
-            turn = matrix(quaternion)
-            force, torque = self._fluid.push(turn, velocity, rates, varying)
-            inner = _plus(inner, _scaled(force, 1.0 / varying.mass))
-            turning = _plus(turning, self._turned(_plus(torque, _cross(force, center))))
         if off and _is_there(outer):
-            turn = turn or matrix(quaternion)
             # The force at the origin has the torque -c × F about the center of mass.
-            lever = _cross(_scaled(_back(turn, outer), varying.mass), center)
+            inside = _forth(transposed(matrix(quaternion)), outer)
+            lever = _cross(_scaled(inside, varying.mass), center)
             turning = _plus(turning, self._turned(lever))
         turning = tuple(
             _sum(start, *((k, rates[i], rates[j]) for i, j, k in terms))
@@ -216,20 +196,19 @@ class RigidBody:
         if off:
             inner = _plus(inner, _cross(center, turning))
             inner = _plus(inner, _cross(_cross(rates, center), rates))
-        x, y, z = _plus(_to_world(quaternion, turn, inner), outer)
+        x, y, z = _plus(_to_world(quaternion, inner), outer)
         return (x, y, _sum(z, (-self._gravity,))), turning
 
     def advance(self, now: Motion, push: Push) -> Motion:
         """The motion after a physics step."""
         h = self._step
         (position, quaternion, velocity, rates) = now
-        moves = self._drag or self._fluid is not None  # the acceleration depends on the velocity
         stages = [(*self.acceleration(now, push), rates)]
         for part in (0.5 * h, 0.5 * h, h):
             linear, angular, spin = stages[-1]
             turned, square = _rotated(quaternion, spin, part)
             turning = _plus(rates, angular, part)
-            moved = _plus(velocity, linear, part) if moves else velocity
+            moved = _plus(velocity, linear, part) if self._drag else velocity
             now = Motion(None, turned, moved, turning)
             follows = _of_rotation_vector(spin, part, square, turning)
             stages.append((*self.acceleration(now, push), follows))
@@ -252,53 +231,6 @@ class RigidBody:
         return _scaled(_forth(self.varying.turn, torque), self.varying.easier)
 
 
-class _Fluid:
-    """Forces on the inertia boxes of MuJoCo's bodies in a fluid: its "inertia box model"."""
-
-    def __init__(self, model: mujoco.MjModel, boxes: list[Array]) -> None:
-        self._density = float(model.opt.density)
-        self._viscosity = float(model.opt.viscosity)
-        self._wind = (-model.opt.wind).tolist()
-        self._boxes = []
-        for mass, (x, y, z), axes, place in boxes:
-            sides = np.sqrt(6 / mass * np.maximum((y + z - x, x + z - y, x + y - z), 1e-15))
-            self._boxes.append((sides.tolist(), axes.tolist(), place.tolist()))
-
-    def push(
-        self, turn: Rows, velocity: Vector, rates: Vector, varying: Varying
-    ) -> tuple[Vector, Vector]:
-        """Force, N, and torque about the body's origin, N·m; both in the body frame.
-
-        A box's sides grow with the square root of its inertia over its mass.
-        """
-        air = _back(turn, _plus(velocity, self._wind))
-        scale = varying.scale
-        force = _ZERO
-        torque = _ZERO
-        area = scale * scale
-        volume = scale * scale * scale
-        for sides, axes, place in self._boxes:
-            center = _plus(varying.shift, place)
-            through = _back(axes, _plus(air, _cross(rates, center)))
-            spin = _back(axes, rates)
-            mean = sum(sides) / 3
-            pushes = []
-            twists = []
-            for i, (v, w) in enumerate(zip(through, spin, strict=True)):
-                a = sides[i - 2]
-                b = sides[i - 1]
-                slow = -3 * math.pi * mean * self._viscosity
-                fast = -0.5 * self._density * a * b
-                pushes.append(_sum(0.0, (slow, v, scale), (fast, v, abs(v), area)))
-                slow = -math.pi * mean**3 * self._viscosity
-                fast = -self._density * sides[i] * (a**4 + b**4) / 64
-                twists.append(_sum(0.0, (slow, w, volume), (fast, w, abs(w), area, volume)))
-            pushed = _forth(axes, pushes)
-            force = _plus(force, pushed)
-            torque = _plus(torque, _plus(_forth(axes, twists), _cross(center, pushed)))
-        return force, torque
-
-
 def motion(rows: Array) -> Motion:
     """The motion of states (13, W)."""
     x = list(rows)
@@ -313,23 +245,16 @@ def mapped(tree: Array, change: Callable[[Array], Array]) -> Array:
     return change(tree) if hasattr(tree, "shape") else tree
 
 
-def _boxes(model: mujoco.MjModel) -> list[Array]:
-    """Mass, principal inertia, their axes and center of each body with a mass, body frame."""
+def _own_and_far(vehicle: Vehicle) -> tuple[np.ndarray, np.ndarray]:
+    """The inertia as the sum of that of the bodies, and of their masses about the center."""
+    model = vehicle.model
     data = mujoco.MjData(model)
     data.qpos[:7] = (0, 0, 0, 1, 0, 0, 0)
     mujoco.mj_kinematics(model, data)
-    return [
-        (model.body_mass[i], model.body_inertia[i], data.ximat[i].reshape(3, 3), data.xipos[i])
-        for i in craft_bodies(model).tolist()
-        if model.body_mass[i] > 0
-    ]
-
-
-def _own_and_far(vehicle: Vehicle, boxes: list[Array]) -> tuple[np.ndarray, np.ndarray]:
-    """The inertia as the sum of that of the bodies, and of their masses about the center."""
     own = np.zeros((3, 3))
-    for _, inertia, axes, _ in boxes:
-        own += axes @ np.diag(inertia) @ axes.T
+    for i in craft_bodies(model).tolist():
+        axes = data.ximat[i].reshape(3, 3)
+        own += axes @ np.diag(model.body_inertia[i]) @ axes.T
     far = vehicle.inertia - own
     far[abs(far) < _NOTHING * abs(vehicle.inertia).max()] = 0.0
     return vehicle.inertia - far, far
@@ -385,11 +310,6 @@ def _sum(total: Array, *products: tuple[Array, ...]) -> Array:
     return total
 
 
-def _times(matrix: list[list[float]], rotors: list[Array]) -> Vector:
-    """A matrix (3, R) and thrusts of R rotors: three vectors."""
-    return tuple(_sum(0.0, *zip(row, rotors, strict=True)) for row in matrix)
-
-
 def _is_there(vector: Array) -> bool:
     return any(not isinstance(x, float) or x != 0.0 for x in vector)
 
@@ -413,19 +333,14 @@ def _cross(a: Array, b: Array) -> Vector:
 
 
 def _forth(matrix: Array, vector: Array) -> Vector:
-    """A matrix, three rows, and a vector."""
+    """A matrix of three rows, and what it is applied to: a vector, or the thrusts of rotors."""
     return tuple(_sum(0.0, *zip(row, vector, strict=True)) for row in matrix)
 
 
-def _back(matrix: Array, vector: Array) -> Vector:
-    """The transposed matrix and a vector."""
-    return _forth(tuple(zip(*matrix, strict=True)), vector)
-
-
-def _to_world(quaternion: Array, turn: Rows | None, vector: Vector) -> Vector:
-    """A body vector in the world frame; `turn` is the quaternion's matrix where it is known."""
-    if turn is not None or _is_there(vector[:2]):
-        return _forth(turn or matrix(quaternion), vector)
+def _to_world(quaternion: Array, vector: Vector) -> Vector:
+    """A body vector in the world frame."""
+    if _is_there(vector[:2]):
+        return _forth(matrix(quaternion), vector)
     w, x, y, z = quaternion
     up = vector[2]
     twice = up + up

@@ -70,19 +70,25 @@ class Hull:
         return np.max(centers @ down + radii + sizes, axis=0)
 
 
+def can_touch(model: mujoco.MjModel, geom: int, others: np.ndarray) -> bool:
+    """Whether a geom may collide with one of others, bool, (geoms,)."""
+    types = model.geom_contype
+    affinities = model.geom_conaffinity
+    pairs = (types[geom] & affinities[others]) | (affinities[geom] & types[others])
+    return bool(pairs.any())
+
+
 def _shapes(model: mujoco.MjModel) -> list[tuple[Array, ...]]:
     """Center, radius, axes as columns, s and t of each geom that meets the ground."""
     data = mujoco.MjData(model)
     data.qpos[:7] = (0, 0, 0, 1, 0, 0, 0)
     mujoco.mj_kinematics(model, data)
     ours = np.isin(model.geom_bodyid, craft_bodies(model))
-    types = model.geom_contype
-    affinities = model.geom_conaffinity
     shapes: list[tuple[Array, ...]] = []
     none = (0.0, 0.0, 0.0)
     kinds = mujoco.mjtGeom
     for i in np.flatnonzero(ours).tolist():
-        if not ((types[i] & affinities[~ours]) | (affinities[i] & types[~ours])).any():
+        if not can_touch(model, i, ~ours):
             continue
         place = data.geom_xpos[i].copy()
         axes = data.geom_xmat[i].reshape(3, 3).copy()

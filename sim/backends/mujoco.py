@@ -21,15 +21,14 @@ from ..randomize import Randomization
 from ..rotations import body_z
 from ..snapshots import Arrays
 from ..state import Array, InitialState, WorldState
-from ..world import PhysicsError, check_hung, flown_model
-from .base import BaseWorld
+from ..world import PhysicsError, World, check_hung, flown_model
 from .world_parameters import WorldParameters
 
 _FEW: Final = 8
 _SEEN: Final = np.array(SURROUNDINGS, np.uint8)
 
 
-class MujocoWorld(BaseWorld):
+class MujocoWorld(World):
     """W worlds of A drones over ground of their own: `World`. Drones of a world may collide.
 
     MuJoCo answers a bad state with a reset and a line in MUJOCO_LOG.TXT. Here it raises
@@ -123,15 +122,8 @@ class MujocoWorld(BaseWorld):
         self._warnings[ids] = 0
         state = self.state
         here = () if self.shape == () else ids
-        state.position[here] = pose.position[here]
-        for name, default in (
-            ("quaternion", (1, 0, 0, 0)),
-            ("velocity", 0),
-            ("body_rates", 0),
-            ("thrust", self.vehicle.hover_thrust),
-        ):
-            given = getattr(pose, name)
-            getattr(state, name)[here] = default if given is None else given[here]
+        for name, begun in self._begun(mask, pose).items():
+            getattr(state, name)[...] = begun
         state.command[here] = state.thrust[here]
         self._draw_parameters(mask)
         self._vary(ids)

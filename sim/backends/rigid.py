@@ -15,19 +15,19 @@ from ...models.vehicle import Vehicle, craft_bodies
 from ..effects import EffectOptions
 from ..randomize import Randomization
 from ..snapshots import Arrays
-from ..state import Array, InitialState, WorldState, clip
-from ..world import PhysicsError
+from ..state import Array, InitialState, WorldState, chosen, clip
+from ..world import PhysicsError, World
 from . import kernel
-from .base import BaseWorld
 from .body import RigidBody, mapped, motion
-from .hull import Hull
+from .hull import Hull, can_touch
 
 DTYPES: Final = ("float32", "float64")
+_OWN: Final = ("_rows", "_acting", "_wrench")
 _OF_STATE: Final = ("command", "thrust", "touching", "colliding")
 _LEVEL: Final = np.array((0.0, 0.0, 0.0, 1.0, *[0.0] * 9))  # rows of a craft at rest
 
 
-class RigidWorld(BaseWorld):
+class RigidWorld(World):
     """W worlds of A drones over level ground: `World`, without contact.
 
     A craft that reaches the ground is `touching`, and flies on through it: a task ends an episode
@@ -109,8 +109,7 @@ class RigidWorld(BaseWorld):
         Inertia, kg·m², (W A, 3, 3); a factor of the rotors' reactions, (W A,); and coefficients of
         the air by their names in a vehicle's file, (W, A) each.
         """
-        self._body.vary({"reaction": reaction})
-        self._body.set_inertia(inertia)
+        self._body.vary({"reaction": reaction}, inertia)
         self._pack()
         if self.effects is not None:
             self.effects.vary(air)
@@ -147,7 +146,7 @@ class RigidWorld(BaseWorld):
         """As `World.step`."""
         state = self.state
         # One number for all rotors counts for each.
-        state.command = self._kept(mask, self._typed(thrust + self._nothing), state.command)
+        state.command = chosen(mask, self._typed(thrust + self._nothing), state.command)
         if not self._on_rotors:
             state.thrust = state.command
         found = [state.touching, state.colliding] if again else [False, False]
@@ -165,37 +164,34 @@ class RigidWorld(BaseWorld):
         acting = state.command
         wrench = None
         at_once = self._at_once or steps
+        some = None if mask is None else mask.reshape(1, -1)  # of rows
         for _ in range(steps // at_once):
             if effects is not None:
                 acting, end, push = effects.step(state, mask)
                 if self._on_rotors:
-                    state.thrust = self._kept(mask, self._typed(end), state.thrust)
+                    state.thrust = chosen(mask, self._typed(end), state.thrust)
                 wrench = None if push is None else self._as_rows(push)
             if not self._on_rotors:  # as MuJoCo clamps controls
                 acting = clip(acting, self.vehicle.thrust_low, self.vehicle.thrust_high)
             new = self._flown(self._rows, self._as_rows(acting), wrench, at_once)
-            self._rows = new if mask is None else np.where(mask.reshape(-1), new, self._rows)
+            self._rows = chosen(some, new, self._rows)
             self._show()
-        self._acting = self._kept(mask, acting, self._acting)
+        self._acting = chosen(mask, acting, self._acting)
         if wrench is not None:
             old = 0.0 * wrench if self._wrench is None else self._wrench
-            new = wrench if mask is None else np.where(mask.reshape(-1), wrench, old)
-            self._wrench = new
+            self._wrench = chosen(some, wrench, old)
 
     def _snapshot(self) -> dict[str, np.ndarray]:
-        state = self.state
-        arrays = {"rows": self._rows, "acting": self._acting, "wrench": self._wrench}
-        arrays |= {name: getattr(state, name) for name in _OF_STATE}
+        arrays = {name: getattr(self, name) for name in _OWN}
+        arrays |= {name: getattr(self.state, name) for name in _OF_STATE}
         return {name: array.copy() for name, array in arrays.items() if array is not None}
 
     def _restore(self, arrays: Arrays) -> None:
-        wrench = arrays.get("wrench")
-        self._rows = arrays["rows"].copy()
-        self._acting = arrays["acting"].copy()
-        self._wrench = None if wrench is None else wrench.copy()
+        copies = {name: array.copy() for name, array in arrays.items()}
+        for name in _OWN:
+            setattr(self, name, copies.get(name))
         for name in _OF_STATE:
-            if name in arrays:
-                setattr(self.state, name, arrays[name].copy())
+            setattr(self.state, name, copies.get(name))
         self._show()
         self._vary_drawn()
 
@@ -249,9 +245,6 @@ class RigidWorld(BaseWorld):
         """Vectors (W, A, k) as rows (k, W A) of this dtype, one after the other in memory."""
         return np.asarray(self._typed(values).reshape(-1, values.shape[-1]).T, order="C")
 
-    def _kept(self, mask: Array | None, new: Array, old: Array) -> Array:
-        return new if mask is None else np.where(mask[..., None], new, old)
-
     def _contacts(self) -> list[Array]:
         """Which crafts touch anything and, of several, which another, bool, (W, A)."""
         rows = self._rows
@@ -266,7 +259,7 @@ class RigidWorld(BaseWorld):
         """Set what `_contacts` found, for the worlds of a mask."""
         for name, new in zip(("touching", "colliding"), found, strict=False):
             old = getattr(self.state, name)
-            setattr(self.state, name, new if mask is None else np.where(mask, new, old))
+            setattr(self.state, name, chosen(mask, new, old))
 
     def _refuse_bad(self) -> None:
         if abs(self._rows).max() < mujoco.mjMAXVAL:  # not of NaN
@@ -280,10 +273,8 @@ def _check_obstacles(vehicle: Vehicle) -> None:
     """Refuse obstacles of the vehicle's file, through which drones would fly."""
     model = vehicle.model
     ours = np.isin(model.geom_bodyid, craft_bodies(model))
-    types = model.geom_contype
-    affinities = model.geom_conaffinity
     for i in np.flatnonzero(~ours & (model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)).tolist():
-        if ((types[i] & affinities[ours]) | (affinities[i] & types[ours])).any():
+        if can_touch(model, i, ours):
             name = model.geom(i).name or f"geom {i}"
             raise InputError(
                 f"vehicle: expected no obstacles with the backend rigid, which has none (the "
@@ -308,7 +299,7 @@ def _check_forces(vehicle: Vehicle) -> None:
     mujoco.mj_step(model, data)
     theirs = np.concatenate((data.qpos, data.qvel)) - rows
     right = np.abs(ours - theirs).max() <= 1e-9 * max(1.0, np.abs(theirs).max())
-    expected = "RK4, and no forces but gravity, rotors, linear_drag and a fluid's on inertia boxes"
+    expected = "RK4, and no forces but gravity, rotors and linear_drag"
     if not right:
         raise InputError(
             f"vehicle: expected {expected} (the backend rigid), got others in {vehicle.name}"

@@ -17,7 +17,7 @@ Array code with any leading axes; of a single drone the numbers are Python's.
 """
 
 import math
-from functools import partial, reduce
+from functools import reduce
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -25,7 +25,7 @@ import numpy as np
 from ..effects import EffectOptions
 from ..effects.rotors import polynomial
 from ..rotations import Parts, Rows, dot, matrix, parts_of, times, transposed
-from ..state import Array, WorldState, clip, stack
+from ..state import Array, WorldState, clip, plain, square_root, stack
 
 if TYPE_CHECKING:
     from ...models.vehicle import Vehicle
@@ -103,12 +103,13 @@ class Rates:
         scale = clip((high - low) / clip(upper - lower, 1e-9 * high, math.inf), 0.0, 1.0)
         least = low - scale * lower
         most = high - scale * upper
-        middle = _smaller(_larger(collective + 0.0 * least, least), most)
+        middle = _least([_most([collective + 0.0 * least, least]), most])
         parts = [middle + scale * part for part in added]
         yaws = [(part, c) for part, (*_, c) in zip(parts, gains.mix, strict=True) if c]
         ends = [((low - part) / c, (high - part) / c)[:: 1 if c > 0 else -1] for part, c in yaws]
-        yaw = _larger(yaw, _most([end for end, _ in ends]))
-        yaw = _smaller(yaw, _least([end for _, end in ends]))
+        # Where there is no room, the upper end holds.
+        yaw = _most([yaw, *(end for end, _ in ends)])
+        yaw = _least([yaw, *(end for _, end in ends)])
         rotors = zip(gains.share, parts, gains.mix, strict=True)
         return [share * (part + c * yaw) for share, part, (*_, c) in rotors]
 
@@ -155,9 +156,10 @@ class Attitude(Rates):
         """As `Controller.thrust`."""
         share, roll, pitch, yaw_rate = self._scaled(action)
         axes = _axes(state.quaternion)
-        cosine = _cos(roll)
-        x, y = _turned(axes[0], cosine * _sin(pitch), -_sin(roll))
-        axis = x, y, cosine * _cos(pitch)
+        # Of numbers too by NumPy: a batch gets the bits of a single drone.
+        cosine = plain(np.cos(roll))
+        x, y = _turned(axes[0], cosine * plain(np.sin(pitch)), -plain(np.sin(roll)))
+        axis = x, y, cosine * plain(np.cos(pitch))
         return self.point(self._collective(share), axis, yaw_rate, axes, state)
 
     def point(
@@ -170,7 +172,7 @@ class Attitude(Rates):
         x, y, z = times(axes, axis)
         aside = _ASIDE * (z < 0.0)
         # Of the turn by θ about (-y, x, 0) / sin θ: over cos(θ / 2), which is sqrt((1 + z) / 2).
-        size = self.gains.attitude / _root(0.5 * (1.0 + z) + 0.25 * (aside * aside))
+        size = self.gains.attitude / square_root(0.5 * (1.0 + z) + 0.25 * (aside * aside))
         rates = size * (aside - y), size * x, yaw_rate * axes[2][2]
         return self.turn(collective, rates, state)
 
@@ -211,7 +213,7 @@ class Velocity(Attitude):
         share = clip(level / gravity * z / _length(x, y), 0.0, 1.0)
         x = share * x
         y = share * y
-        size = _root(x * x + y * y + z * z)
+        size = square_root(x * x + y * y + z * z)
         collective = self._mass * dot((x, y, z), axes[2])
         return self.point(collective, (x / size, y / size, z / size), yaw_rate, axes, state)
 
@@ -249,8 +251,8 @@ class Position(Velocity):
 
     def _gain(self, distance: Array, acceleration: float, speed: float) -> Array:
         """Velocity over offset, 1/s."""
-        braked = _root(0.5 * acceleration / distance)
-        return clip(_smaller(braked, speed / distance), 0.0, self.gains.position)
+        braked = square_root(0.5 * acceleration / distance)
+        return clip(_least([braked, speed / distance]), 0.0, self.gains.position)
 
 
 def _axes(quaternion: Array) -> Rows:
@@ -270,40 +272,12 @@ def _turned(nose: Parts, x: Array, y: Array) -> tuple[Array, Array]:
 
 
 def _length(x: Array, y: Array = 0.0) -> Array:
-    return _root(x * x + y * y + _TINY)
+    return square_root(x * x + y * y + _TINY)
 
 
 def _most(parts: list[Array]) -> Array:
-    return max(parts) if isinstance(parts[0], float) else reduce(_larger, parts)
+    return max(parts) if isinstance(parts[0], float) else reduce(np.maximum, parts)
 
 
 def _least(parts: list[Array]) -> Array:
-    return min(parts) if isinstance(parts[0], float) else reduce(_smaller, parts)
-
-
-def _root(square: Array) -> Array:
-    if isinstance(square, float):
-        return math.sqrt(square)
-    return np.sqrt(square)
-
-
-def _larger(a: Array, b: Array) -> Array:
-    if isinstance(a, float):
-        return max(a, b)
-    return np.maximum(a, b)
-
-
-def _smaller(a: Array, b: Array) -> Array:
-    if isinstance(a, float):
-        return min(a, b)
-    return np.minimum(a, b)
-
-
-def _by_name(name: str, angle: Array) -> Array:
-    """Of numbers too by NumPy: a batch gets the bits of a single drone."""
-    found = getattr(np, name)(angle)
-    return float(found) if isinstance(angle, float) else found
-
-
-_sin = partial(_by_name, "sin")
-_cos = partial(_by_name, "cos")
+    return min(parts) if isinstance(parts[0], float) else reduce(np.minimum, parts)

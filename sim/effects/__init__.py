@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 
 from ...models.errors import InputError
 from ..random import GUSTS, Noise
-from ..snapshots import Arrays, Kept, Snapshot, joined, part_of
+from ..snapshots import Kept
 from ..state import Array, WorldState, component
 from .air import AirEffects
 from .downwash import Downwash
@@ -31,7 +31,7 @@ __all__ = ["EffectOptions", "Effects"]
 WINDS: Final = ("wind_x", "wind_y", "wind_z")
 
 
-class Effects:
+class Effects(Kept):
     """The effects on W worlds, in the order in which they act.
 
     Attributes:
@@ -117,21 +117,16 @@ class Effects:
         both = zip(self._mean_wind, WINDS, strict=True)
         self._wind = [mean + factors.get(name, 0.0) for mean, name in both]
 
-    def snapshot(self) -> Snapshot:
-        """State of all effects by name."""
-        return joined({name: part.snapshot() for name, part in self._parts().items()})
-
-    def restore(self, arrays: Arrays, state: WorldState, factors: dict[str, Array]) -> None:
-        """Put a snapshot back, after the state and the factors of drawn parameters."""
-        for name, part in self._parts().items():
-            part.restore(part_of(arrays, name))
+    def take(self, state: WorldState, factors: dict[str, Array]) -> None:
+        """After a `restore`: the state, and factors as of `begin`."""
         if self.on_rotors:
             self._rotors.take(state.thrust, factors)
         if self.on_body:
             self._air.take(state.position, factors)
         self._take_wind(factors)
 
-    def _parts(self) -> dict[str, Kept]:
+    def parts(self) -> dict[str, Kept]:
+        """Rotors, air, and gusts."""
         parts: dict[str, Kept] = {"rotors": self._rotors, "air": self._air}
         if self._gusts is not None:
             parts["gusts"] = self._gusts

@@ -218,10 +218,7 @@ def _check_stiffness(vehicle: "Vehicle", slope: float, what: str) -> None:
 
 def _motion(state: WorldState) -> list[Array]:
     """Velocity and body rates, of a batch copies: six of shape (W, A)."""
-    both = (state.velocity, state.body_rates)
-    if state.velocity.ndim == 1:
-        return [number for array in both for number in array.tolist()]
-    return [array[..., axis] + 0.0 for array in both for axis in range(3)]
+    return [part + 0.0 for part in (*parts_of(state.velocity), *parts_of(state.body_rates))]
 
 
 def _turned(quaternion: Array, rates: Parts, time: float) -> Rows:

@@ -15,6 +15,7 @@ from typing import Final
 
 import numpy as np
 
+from ..rotations import parts_of
 from ..snapshots import Kept
 from ..state import Array, kept
 
@@ -75,7 +76,7 @@ class Gusts(Kept):
             filters += [e, r, a, q12 / a, np.sqrt(np.maximum(q22 - q12 * q12 / q11, 0.0))]
         self._filters = kept(mask, self._ours(filters, normal), self._filters)
         along, up = self._filters[2:4]
-        n = _parts(normal)
+        n = parts_of(normal)
         start = [along * n[0]]
         for index, sigma in ((1, along), (3, up)):
             z1 = n[index]
@@ -85,7 +86,9 @@ class Gusts(Kept):
 
     def step(self, mask: Array | None, normal: Array) -> None:
         """Advance by a physics step; normal (W, A, 5)."""
-        f, z, n = self._filters, self._state, _parts(normal)
+        f = self._filters
+        z = self._state
+        n = parts_of(normal)
         new = [f[0] * z[0] + f[1] * n[0]]
         for i, (e, r, a, b, c) in ((1, f[4:9]), (3, f[9:])):
             new += [
@@ -110,9 +113,3 @@ class Gusts(Kept):
             return [value.item() for value in values]
         lead = like.shape[:-1]
         return [value.reshape(lead) for value in values]
-
-
-def _parts(normal: Array) -> list[Array]:
-    if normal.ndim == 1:
-        return normal.tolist()  # type: ignore[no-any-return]
-    return [normal[..., index] for index in range(NUMBERS)]

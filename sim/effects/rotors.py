@@ -94,11 +94,11 @@ class RotorEffects(Kept):
         options = self._options
         self.take(thrust, factors)
         roots = [square_root(part) for part in split(thrust)]
-        self._roots = kept(mask[..., None], roots, self._roots)
+        self._roots = kept(mask, roots, self._roots)
         if options.battery:
             charge = factors.get("battery_charge", 1.0) + 0.0 * component(thrust, 0)
             (self.charge,) = kept(mask, [charge], [self.charge])
-            self.voltage = self._terminal()
+            (self.voltage,) = kept(mask, [self._terminal()], [self.voltage])
         return _join(self._scaled(split(thrust)))
 
     def take(self, thrust: Array, factors: dict[str, Array]) -> None:
@@ -144,7 +144,7 @@ class RotorEffects(Kept):
             roots = [one[1] for one in followed]
             middle = [one[2] for one in followed]
             end = [root * root for root in roots]
-            self._roots = kept(None if mask is None else mask[..., None], roots, self._roots)
+            self._roots = kept(mask, roots, self._roots)
         if options.battery:
             used = self._power(mean) / self.voltage * (self._step / self._coulombs)
             left = clip(self.charge - used, 0.0, 1.0)

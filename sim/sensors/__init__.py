@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Any, Final
 
 from ...models.errors import InputError, shortened
 from ...models.fields import check_names
-from ..snapshots import Arrays, Kept, Snapshot, joined, part_of
-from ..state import Array, WorldState
+from ..snapshots import Kept
+from ..state import Array, WorldState, chosen
+from ..world import World
 from .barometer import Barometer
-from .base import Reading, Sensor, Source, Values, chosen
+from .base import Reading, Sensor, Source, Values
 from .channel import Channel
 from .estimator import Estimator
 from .gps import Gps
@@ -26,7 +27,6 @@ from .rangefinder import Rangefinder
 
 if TYPE_CHECKING:
     from ...models.vehicle import Vehicle
-    from ..world import World
 
 __all__ = ["SENSOR_TYPES", "Estimator", "Reading", "Sensors", "checked_sensors", "readings_of"]
 
@@ -99,7 +99,7 @@ class Sensors(Kept):
 
     arrays = ("_steps",)
 
-    def __init__(self, sensors: Values, world: "World", period: float) -> None:
+    def __init__(self, sensors: Values, world: World, period: float) -> None:
         self._world = world
         settings = _resolved(sensors, world.vehicle, period)
         estimate = settings.pop(_ESTIMATE, None)
@@ -132,18 +132,8 @@ class Sensors(Kept):
         if self._estimator is not None:
             self._estimator.update(mask, self._channels)
 
-    def snapshot(self) -> Snapshot:
-        """Copies of all arrays that a later reading depends on, by name."""
-        parts = {name: part.snapshot() for name, part in self._parts().items()}
-        return joined(parts) | super().snapshot()
-
-    def restore(self, arrays: Arrays) -> None:
-        """Put a snapshot back, after that of the world."""
-        super().restore(arrays)
-        for name, part in self._parts().items():
-            part.restore(part_of(arrays, name))
-
-    def _parts(self) -> dict[str, Kept]:
+    def parts(self) -> dict[str, Kept]:
+        """The channels, the sensors' errors and the estimator."""
         parts: dict[str, Kept] = dict(self._channels)
         for name, channel in self._channels.items():
             parts[f"{name} errors"] = channel.sensor

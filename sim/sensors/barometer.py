@@ -1,14 +1,12 @@
 """Barometer."""
 
 import math
-from typing import TYPE_CHECKING, ClassVar, Final
+from typing import ClassVar, Final
 
 from ...models.fields import Limits
-from ..state import Array, clip
-from .base import Sensor, Setting, Values, chosen
-
-if TYPE_CHECKING:
-    from ..world import World
+from ..state import Array, chosen, clip
+from ..world import World
+from .base import Sensor, Setting, Values
 
 SEA_LEVEL_PRESSURE: Final = 101_325.0  # Pa. These are those of ISO 2533:1975
 SEA_LEVEL_TEMPERATURE: Final = 288.15  # K
@@ -67,7 +65,7 @@ class Barometer(Sensor):
         """No walk yet."""
         self._bias = chosen(mask, 0.0 * normal[..., :1], self._bias)
 
-    def measure(self, world: "World", normal: Array) -> Array:
+    def measure(self, world: World, normal: Array) -> Array:
         # An array of a single drone too: a power of Python's numbers may differ by a bit.
         height = world.state.position[..., 2:] + self.values["altitude"]
         exact = isa_pressure(clip(height, LOWEST, HIGHEST))

@@ -10,10 +10,10 @@ from ...models.errors import InputError
 from ...models.fields import Limits, check, check_names
 from ..snapshots import Kept
 from ..state import Array, clip
+from ..world import World
 
 if TYPE_CHECKING:
     from ...models.vehicle import Vehicle
-    from ..world import World
 
 FURTHEST: Final = 1e5  # Largest coordinate of a reading, m
 MAX_SPEED: Final = 1e3  # Largest speed of a reading along an axis, m/s
@@ -184,23 +184,14 @@ class Sensor(Source):
     def begin(self, mask: Array, normal: Array) -> None:
         """Draw an episode's errors for the drones of a mask."""
 
-    def read(self, world: "World", normal: Array) -> Array:
+    def read(self, world: World, normal: Array) -> Array:
         """A reading, shape (W, A, k). The normals of drones that are not read are 0."""
         return clip(self.measure(world, normal), self._low, self._high)
 
-    def measure(self, world: "World", normal: Array) -> Array:
+    def measure(self, world: World, normal: Array) -> Array:
         """A reading that may leave the bounds."""
         raise NotImplementedError
 
 
 def _is_whole(steps: float) -> bool:
     return abs(steps - round(steps)) < 1e-6 * max(steps, 1.0)
-
-
-def chosen(mask: Array, new: Array, old: Array) -> Array:
-    """`new`, (W, A) or (W, A, k), where the mask is true; elsewhere `old`, a number at first."""
-    if not getattr(mask, "ndim", 0):  # a single drone's
-        return new if mask else old
-    if getattr(new, "ndim", 0) > mask.ndim:
-        mask = mask[..., None]
-    return np.where(mask, new, old)

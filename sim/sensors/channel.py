@@ -2,16 +2,13 @@
 
 import math
 from statistics import NormalDist
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..snapshots import Kept
-from ..state import Array, component
-from .base import Sensor, Values, chosen
-
-if TYPE_CHECKING:
-    from ..world import World
+from ..state import Array, chosen, component
+from ..world import World
+from .base import Sensor, Values
 
 
 class Channel(Kept):
@@ -23,7 +20,7 @@ class Channel(Kept):
     arrays = ("_now", "_held")
     lists = ("_late",)
 
-    def __init__(self, kind: type[Sensor], values: Values, world: "World", period: float) -> None:
+    def __init__(self, kind: type[Sensor], values: Values, world: World, period: float) -> None:
         self._every = values["every"]
         self._lag = values["lag"]
         self.interval = self._every * period

@@ -9,8 +9,8 @@ import numpy as np
 
 from ...models.fields import Limits
 from ..rotations import advanced, between, cross, parts_of, to_world, world_z
-from ..state import Array, WorldState, clip, component, stack
-from .base import FURTHEST, MAX_SPEED, UNIT, Setting, Source, Values, chosen
+from ..state import Array, WorldState, chosen, clip, component, stack
+from .base import FURTHEST, MAX_SPEED, UNIT, Setting, Source, Values
 from .channel import Channel
 from .magnetometer import FIELD
 

@@ -1,14 +1,10 @@
 """Position and velocity by satellites."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from ..state import Array
+from ..world import World
 from .base import FURTHEST, MAX_SPEED, Sensor
-
-if TYPE_CHECKING:
-    from ..world import World
 
 
 class Gps(Sensor):
@@ -25,7 +21,7 @@ class Gps(Sensor):
     def high(self) -> list[float]:
         return [FURTHEST] * 3 + [MAX_SPEED] * 3
 
-    def measure(self, world: "World", normal: Array) -> Array:
+    def measure(self, world: World, normal: Array) -> Array:
         level, vertical, speed = (self.values[name] for name in self.needs)
         sigma = np.array((level, level, vertical, speed, speed, speed))
         exact = np.concat((world.state.position, world.state.velocity), axis=-1)

@@ -1,23 +1,21 @@
 """Gyroscope and accelerometer."""
 
 import math
-from typing import TYPE_CHECKING, ClassVar, Final
+from typing import ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..rotations import to_body
-from ..state import Array
-from .base import Sensor, Values, chosen
-
-if TYPE_CHECKING:
-    from ..world import World
+from ..state import Array, chosen
+from ..world import World
+from .base import Sensor, Values
 
 GYRO_RANGE: Final = math.radians(2000.0)  # rad/s: the largest setting of the BMI088
 ACCELEROMETER_RANGE: Final = 24 * 9.80665  # m/s²: the same
 
 
-def specific_force(world: "World") -> Array:
+def specific_force(world: World) -> Array:
     """Acceleration less that of gravity at the body's origin, body frame, m/s², shape (W, A, 3).
 
     R^T (a - g), with the attitude R and the acceleration a at the end of the control step, under
@@ -72,7 +70,7 @@ class Imu(Sensor):
         self._bias = chosen(mask, self._both("bias") * normal[..., :6], self._bias)
         self._scale = chosen(mask, self._both("scale") * normal[..., 6:], self._scale)
 
-    def measure(self, world: "World", normal: Array) -> Array:
+    def measure(self, world: World, normal: Array) -> Array:
         exact = np.concat((world.state.body_rates, specific_force(world)), axis=-1)
         reading = (1 + self._scale) * exact + self._bias + self._white * normal[..., :6]
         self._bias = self._bias + self._step * normal[..., 6:]

@@ -1,16 +1,14 @@
 """Magnetometer."""
 
-from typing import TYPE_CHECKING, ClassVar, Final
+from typing import ClassVar, Final
 
 import numpy as np
 
 from ...models.fields import Limits
 from ..rotations import to_body
 from ..state import Array
+from ..world import World
 from .base import Sensor, Setting
-
-if TYPE_CHECKING:
-    from ..world import World
 
 FIELD: Final = (1.287, 21.532, -43.231)
 """Earth's magnetic field at Zurich (47.377° N, 8.542° E, 408 m) on 2025-01-01: east, north and up,
@@ -32,6 +30,6 @@ class Magnetometer(Sensor):
         """1 mT, far from any reading but for a wrong noise."""
         return [1e3] * 3
 
-    def measure(self, world: "World", normal: Array) -> Array:
+    def measure(self, world: World, normal: Array) -> Array:
         field = np.array(self.values["field"]) + 0.0 * normal
         return to_body(world.state.quaternion, field) + self.values["noise"] * normal

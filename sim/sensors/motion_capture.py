@@ -1,15 +1,11 @@
 """Motion capture."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from ..rotations import advanced
 from ..state import Array
+from ..world import World
 from .base import FURTHEST, UNIT, Sensor
-
-if TYPE_CHECKING:
-    from ..world import World
 
 
 class MotionCapture(Sensor):
@@ -26,7 +22,7 @@ class MotionCapture(Sensor):
     def high(self) -> list[float]:
         return [FURTHEST] * 3 + [UNIT] * 4
 
-    def measure(self, world: "World", normal: Array) -> Array:
+    def measure(self, world: World, normal: Array) -> Array:
         state = world.state
         position = state.position + self.values["noise"] * normal[..., :3]
         turned = advanced(state.quaternion, self.values["angle_noise"] * normal[..., 3:])

@@ -1,12 +1,8 @@
 """Rangefinder."""
 
-from typing import TYPE_CHECKING
-
 from ..state import Array, clip, stack
+from ..world import World
 from .base import Sensor
-
-if TYPE_CHECKING:
-    from ..world import World
 
 
 class Rangefinder(Sensor):
@@ -29,6 +25,6 @@ class Rangefinder(Sensor):
     def low(self) -> list[float]:
         return [0.0]
 
-    def measure(self, world: "World", normal: Array) -> Array:
+    def measure(self, world: World, normal: Array) -> Array:
         distance = clip(world.below(), 0.0, self.values["limit"])
         return stack((distance,)) + self.values["noise"] * normal

@@ -1,10 +1,11 @@
 """Action levels: hand-computed thrusts, batch as single, and all vehicles fly."""
 
 import json
-import math
+from math import atan2, cos, degrees, pi, radians, sin, sqrt
 from pathlib import Path
 from typing import Any
 
+import contracts
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -27,6 +28,7 @@ from rotorgram.sim.control.cascade import Position
 from rotorgram.sim.control.gains import shared_ranges
 from rotorgram.sim.control.mixed import MixedController
 
+approx = pytest.approx
 DATA = Path(__file__).parents[1] / "data"
 DOCS = Path(__file__).parents[2] / "docs"
 HOVER = "rotorgram/Hover-v0"
@@ -34,9 +36,7 @@ MOCAP = {"noise": 0.001, "angle_noise": 0.002}
 ESTIMATE = {"imu": True, "motion_capture": MOCAP, "estimate": True, "observe": "estimate"}
 LAG = EffectOptions(motor_lag=True)
 CASCADE = ("rates", "attitude", "velocity", "position")
-FILES: dict[str, Any] = {"quad": QUAD_XML}
-FILES |= {path.stem: path for path in sorted(DATA.glob("*.xml"))} | {"lively": DATA / "lively.toml"}
-FILES |= {path.parent.name: path for path in sorted(QUAD_XML.parent.glob("*/*/vehicle.toml"))}
+FILES: dict[str, Any] = contracts.FILES | {"lively": DATA / "lively.toml"}
 
 
 def state_of(vehicle: Vehicle, **given: Any) -> WorldState:
@@ -53,7 +53,7 @@ def thrusts(level: str, action: Any, **given: Any) -> list[float]:
     vehicle = Vehicle.load()
     controller = make_controller(level, vehicle, vehicle.timestep)
     found = controller.thrust(np.array(action, float), state_of(vehicle, **given))
-    return pytest.approx(found.tolist(), abs=2e-3)  # type: ignore[no-any-return]
+    return approx(found.tolist(), abs=2e-3)  # type: ignore[no-any-return]
 
 
 # --- gains and ranges -----------------------------------------------------------------------------
@@ -67,18 +67,18 @@ def test_gains_of_the_papers_craft() -> None:
     """
     gains = Gains.of(Vehicle.load(), 0.01)
     assert gains.lowest == 0.0
-    assert gains.highest == pytest.approx(400.0)
+    assert gains.highest == approx(400.0)
     assert gains.lead == 1.0
-    assert gains.attitude == pytest.approx(4.41584, abs=1e-4)
-    assert gains.rate == pytest.approx((8.83168, 8.83168, 1.39987), abs=1e-4)
-    assert gains.heading == pytest.approx(0.69994, abs=1e-4)
-    assert (gains.velocity, gains.position) == pytest.approx((2.20792, 0.88317), abs=1e-4)
-    assert gains.most_rate == pytest.approx((11.0689, 11.0689, 1.75449), abs=1e-4)
+    assert gains.attitude == approx(4.41584, abs=1e-4)
+    assert gains.rate == approx((8.83168, 8.83168, 1.39987), abs=1e-4)
+    assert gains.heading == approx(0.69994, abs=1e-4)
+    assert (gains.velocity, gains.position) == approx((2.20792, 0.88317), abs=1e-4)
+    assert gains.most_rate == approx((11.0689, 11.0689, 1.75449), abs=1e-4)
     # 196 N of 196 + 0.75 · 204 N = 349 N; 9.8 m/s² · tan; and half of g.
-    assert math.degrees(gains.most_tilt) == pytest.approx(55.833, abs=1e-3)
-    assert gains.most_acceleration == pytest.approx((14.4382, 4.9), abs=1e-3)
-    assert gains.most_velocity == pytest.approx((5.37368, 3.13050), abs=1e-4)  # sqrt(2 m · a)
-    assert gains.most_offset == pytest.approx((6.08455, 4.0), abs=1e-3)  # 5.37368 / 0.88317
+    assert degrees(gains.most_tilt) == approx(55.833, abs=1e-3)
+    assert gains.most_acceleration == approx((14.4382, 4.9), abs=1e-3)
+    assert gains.most_velocity == approx((5.37368, 3.13050), abs=1e-4)  # sqrt(2 m · a)
+    assert gains.most_offset == approx((6.08455, 4.0), abs=1e-3)  # 5.37368 / 0.88317
 
 
 def test_a_lag_slows_the_loops_and_is_led() -> None:
@@ -88,13 +88,13 @@ def test_a_lag_slows_the_loops_and_is_led() -> None:
     """
     vehicle = Vehicle.load("crazyflie2")
     gains = Gains.of(vehicle, 0.005, 0.072)
-    assert gains.attitude == pytest.approx(6.8966, abs=1e-4)
-    assert gains.lead == pytest.approx(2.8032, abs=1e-3)
+    assert gains.attitude == approx(6.8966, abs=1e-4)
+    assert gains.lead == approx(2.8032, abs=1e-3)
     assert Gains.of(vehicle, 0.005).attitude > 15.0
     state = state_of(vehicle, thrust=vehicle.hover_thrust - 0.001)
     controller = make_controller("rates", vehicle, 0.005, LAG)
     found = controller.thrust(np.zeros(4), state)
-    assert found == pytest.approx(vehicle.hover_thrust - 0.001 + 0.0028032, abs=1e-6)
+    assert found == approx(vehicle.hover_thrust - 0.001 + 0.0028032, abs=1e-6)
 
 
 def test_five_equal_poles() -> None:
@@ -138,7 +138,7 @@ def test_attitude_by_hand() -> None:
     assert thrusts("attitude", (0, 0, 0.1, 0)) == [44.22705, 44.22705, 53.77295, 53.77295]
     # Rolled by 90°, to level: 2 sin 45° · 4.41584 · 8.83168 · 5.025725 = 277.185 N m to the right,
     # more than 200: with the collective thrust in the middle, two rotors at full thrust.
-    half = math.sqrt(0.5)
+    half = sqrt(0.5)
     assert thrusts("attitude", (0, 0, 0, 0), quaternion=np.array((half, half, 0.0, 0.0))) == [
         0.0,
         100.0,
@@ -157,7 +157,7 @@ def test_velocity_by_hand() -> None:
     # 0.1204821 rad; 2 sin of its half is 0.1204092; · 4.41584 · 8.83168 · 5.025725 = 23.60013 N m.
     assert thrusts("velocity", (0.1, 0, 0, 0)) == [43.09997, 43.09997, 54.90003, 54.90003]
     # With the nose to the left, forward is left: the same torque about the same body axis.
-    left = np.array((math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)))
+    left = np.array((sqrt(0.5), 0.0, 0.0, sqrt(0.5)))
     assert thrusts("velocity", (0.1, 0, 0, 0), quaternion=left) == [
         43.09997,
         43.09997,
@@ -182,7 +182,7 @@ def test_mixing_keeps_roll_and_pitch_before_collective_and_that_before_yaw() -> 
     controller: Any = make_controller("rates", vehicle, 0.01)
 
     def mixed(collective: float, *torque: float) -> Any:
-        return pytest.approx(controller.mixed(collective, torque), abs=1e-6)
+        return approx(controller.mixed(collective, torque), abs=1e-6)
 
     assert mixed(196.0, 100.0, 0.0, 0.0) == [74.0, 24.0, 24.0, 74.0]  # all fits
     assert mixed(400.0, 100.0, 0.0, 0.0) == [100.0, 50.0, 50.0, 100.0]  # less collective thrust
@@ -248,12 +248,12 @@ def flown(
     state = world.state
     for _ in range(round(time / vehicle.timestep)):
         w, x, y, z = state.quaternion
-        heading = math.atan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))
+        heading = atan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))
         action = np.zeros(4)
         if level == "position":
             offset = goal - state.position
-            c = math.cos(heading)
-            s = math.sin(heading)
+            c = cos(heading)
+            s = sin(heading)
             turned = c * offset[0] + s * offset[1], c * offset[1] - s * offset[0], offset[2]
             action = np.array((*turned, -heading)) / [size for size, _ in controller.ranges()]
         world.step(controller.thrust(action, state), 1)
@@ -264,14 +264,14 @@ def flown(
 def check_flights(vehicle: Vehicle) -> None:
     has_lag = vehicle.coefficients.rotors.time_constant is not None
     for effects in [EffectOptions(), LAG][: 1 + has_lag]:
-        tilted = (math.cos(0.2618), 0.6 * math.sin(0.2618), 0.8 * math.sin(0.2618), 0.0)  # by 30°
+        tilted = (cos(0.2618), 0.6 * sin(0.2618), 0.8 * sin(0.2618), 0.0)  # by 30°
         seen = np.array(flown(vehicle, "position", effects, tilted, 4.0))
         assert seen[:, 0].max() < 1.5
         settled = seen[round(3.0 / vehicle.timestep) :]
         assert settled[:, 0].max() < 0.05
-        assert abs(settled[-1, 2]) < math.radians(10)
+        assert abs(settled[-1, 2]) < radians(10)
         over = np.array(flown(vehicle, "attitude", effects, (0.0, 1.0, 0.0, 0.0), 2.0))
-        assert over[-1, 1] > math.cos(math.radians(3))
+        assert over[-1, 1] > cos(radians(3))
 
 
 @pytest.mark.parametrize("file", FILES.values(), ids=FILES)
@@ -309,11 +309,11 @@ def test_loops_invert_the_thrust_curve() -> None:
     effects = EffectOptions(thrust_curve=True)
     controller = make_controller("rates", vehicle, vehicle.timestep, effects)
     command = controller.thrust(np.zeros(4), state_of(vehicle))
-    assert command == pytest.approx([4 * 0.517687] * 4, abs=1e-5)
+    assert command == approx([4 * 0.517687] * 4, abs=1e-5)
     world = make_world(vehicle, 1, effects=effects)
     world.reset(np.True_, InitialState(position=np.array((0.0, 0.0, 50.0))))
     world.step(command, 1)
-    assert world.state.thrust == pytest.approx(vehicle.hover_thrust, abs=1e-5)
+    assert world.state.thrust == approx(vehicle.hover_thrust, abs=1e-5)
     assert hover_error(vehicle=FILES["racer"], effects={"thrust_curve": True}) < 0.01
 
 
@@ -330,13 +330,13 @@ def test_the_spec_tells_names_units_and_frames() -> None:
     assert action.components == ("offset x", "offset y", "offset z", "offset of the heading")
     assert action.unit == ("m", "m", "m", "rad")
     assert action.frame == "world turned by the heading"
-    assert spec.action_scale == pytest.approx([6.084548, 6.084548, 4.0, math.pi])
-    assert spec.constants["position_gain"] == pytest.approx(0.8831687)
+    assert spec.action_scale == approx([6.084548, 6.084548, 4.0, pi])
+    assert spec.constants["position_gain"] == approx(0.8831687)
     assert spec.constants["gravity"] == 9.8
     spec = env_of("rates").env_spec
     action = spec.action
     assert action.unit == ("1", "rad/s", "rad/s", "rad/s")
-    assert spec.action_scale[:2] == pytest.approx([1.0, 11.06888])
+    assert spec.action_scale[:2] == approx([1.0, 11.06888])
     assert action.low == -1.0
     assert action.high == 1.0
     assert action.shape == (4,)
@@ -407,9 +407,9 @@ def test_controllers_of_different_vehicles_share_their_ranges() -> None:
     mixed = MixedController(pairs)
     level = min(one.most_offset[0] for one in gains)
     up = min(one.most_offset[1] for one in gains)
-    assert mixed.ranges() == [(level, "m"), (level, "m"), (up, "m"), (math.pi, "rad")]
+    assert mixed.ranges() == [(level, "m"), (level, "m"), (up, "m"), (pi, "rad")]
     assert mixed.ranges() == pairs[1][0].ranges()
-    assert mixed.constants["action_scale"] == (level, level, up, math.pi)
+    assert mixed.constants["action_scale"] == (level, level, up, pi)
 
 
 # --- the page -------------------------------------------------------------------------------------
@@ -424,8 +424,8 @@ def test_the_page_tells_what_the_benchmark_wrote_and_the_code_gives() -> None:
     for name, given in told["gains"].items():
         gains = Gains.of(Vehicle.load(name), given["timestep"], given["lag"])
         for field in given.keys() - {"timestep", "lag"}:
-            assert getattr(gains, field) == pytest.approx(given[field], abs=1e-4)
-        tilt = math.degrees(gains.most_tilt)
+            assert getattr(gains, field) == approx(given[field], abs=1e-4)
+        tilt = degrees(gains.most_tilt)
         (level, up) = gains.most_offset
         assert f"| {tilt:.0f} | {given['most_velocity'][0]:.2f}, " in page
         assert f"{given['most_velocity'][1]:.2f} | {level:.2f}, {up:.2f} |" in page

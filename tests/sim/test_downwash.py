@@ -1,6 +1,6 @@
 """The jets below drones: their formula, their momentum, and what they do to the drones in them."""
 
-import math
+from math import cos, pi, radians, sin, sqrt
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ from rotorgram.models.library import vehicle_names
 from rotorgram.sim import EffectOptions, InitialState, World, make_world
 from rotorgram.sim.effects.downwash import Downwash
 
+approx = pytest.approx
 ROOT = Path(__file__).parents[2]
 BIRD = "hummingbird"
 # Of its file, typed here again: four rotors at 0.17 m, their radius, and its drag along z.
@@ -19,7 +20,7 @@ RADIUS = 0.1
 DRAG = 0.01
 MASS = Vehicle.load(BIRD).mass
 WEIGHT = MASS * Vehicle.load(BIRD).gravity
-SPEED = math.sqrt(WEIGHT / (2 * 1.225 * 4 * math.pi * RADIUS**2))  # at the rotors, in hover
+SPEED = sqrt(WEIGHT / (2 * 1.225 * 4 * pi * RADIUS**2))  # at the rotors, in hover
 
 
 def jet(below: float, beside: float = 0.0, thrust: float = WEIGHT) -> float:
@@ -29,14 +30,14 @@ def jet(below: float, beside: float = 0.0, thrust: float = WEIGHT) -> float:
 
 
 def test_the_profile_by_hand() -> None:
-    assert jet(5.0) == pytest.approx(SPEED * 10.11 / 10.817, rel=1e-6)
+    assert jet(5.0) == approx(SPEED * 10.11 / 10.817, rel=1e-6)
     half = 0.07668 * 10.817  # radius at which the velocity has halved
-    assert jet(5.0, half) == pytest.approx(jet(5.0) / 2, rel=1e-6)
-    assert jet(5.0, 2 * half) == pytest.approx(jet(5.0) / (1 + 4 * (math.sqrt(2) - 1)) ** 2)
-    assert jet(5.0, thrust=4 * WEIGHT) == pytest.approx(2 * jet(5.0))
-    assert jet(100.0) / jet(50.0) == pytest.approx(55.817 / 105.817)
+    assert jet(5.0, half) == approx(jet(5.0) / 2, rel=1e-6)
+    assert jet(5.0, 2 * half) == approx(jet(5.0) / (1 + 4 * (sqrt(2) - 1)) ** 2)
+    assert jet(5.0, thrust=4 * WEIGHT) == approx(2 * jet(5.0))
+    assert jet(100.0) / jet(50.0) == approx(55.817 / 105.817)
     # Nearer than 2.5 lengths the speed falls to 0 at the height of the rotors, and above it is 0.
-    assert [jet(x) / jet(2.5) for x in (1.25, 0.0, -1.0)] == pytest.approx([0.5, 0.0, 0.0])
+    assert [jet(x) / jet(2.5) for x in (1.25, 0.0, -1.0)] == approx([0.5, 0.0, 0.0])
     assert jet(5.0, thrust=-1.0) == 0.0
 
 
@@ -56,11 +57,11 @@ def test_the_momentum_of_a_jet_is_the_thrust_but_for_a_third(name: str) -> None:
         speed = downwash.velocity(np.full_like(radius, weight), far, radius)
         rings = speed**2 * radius
         integral = float(((rings[1:] + rings[:-1]) / 2 * np.diff(radius)).sum())
-        momentum = 1.225 * 2 * math.pi * integral
-        area = vehicle.num_rotors * math.pi * vehicle.coefficients.rotors.radius**2
-        shape = math.pi * (10.11 * 0.07668) ** 2 / (3 * (math.sqrt(2) - 1))
+        momentum = 1.225 * 2 * pi * integral
+        area = vehicle.num_rotors * pi * vehicle.coefficients.rotors.radius**2
+        shape = pi * (10.11 * 0.07668) ** 2 / (3 * (sqrt(2) - 1))
         expected = weight / (2 * area) * downwash.length**2 * shape
-        assert momentum == pytest.approx(expected, rel=1e-3)
+        assert momentum == approx(expected, rel=1e-3)
         assert 2 / 3 < momentum / weight < 1.0
 
 
@@ -88,8 +89,8 @@ def test_the_lower_drone_is_pushed_down_by_its_drag_and_the_upper_is_not() -> No
     velocity = hover(world)
     wind = jet(5.0)
     expected = -DRAG * wind * wind / MASS * world.vehicle.timestep
-    assert velocity[1] == pytest.approx([0.0, 0.0, expected], rel=1e-3, abs=1e-12)
-    assert velocity[0] == pytest.approx([0.0, 0.0, 0.0], abs=1e-12)
+    assert velocity[1] == approx([0.0, 0.0, expected], rel=1e-3, abs=1e-12)
+    assert velocity[0] == approx([0.0, 0.0, 0.0], abs=1e-12)
     assert hover(world, 200)[1, 2] < -0.2  # m/s, after 2 s
     assert abs(hover(world)[0, 2]) < 1e-9
 
@@ -99,30 +100,30 @@ def test_rotors_in_the_jet_lose_thrust_by_their_inflow() -> None:
     rotors = world.vehicle.coefficients.rotors
     speeds = np.sqrt(world.vehicle.hover_thrust / rotors.thrust_coefficient)
     lost = rotors.inflow * speeds.sum() * jet(5.0)
-    assert hover(world)[1, 2] == pytest.approx(-lost / MASS * world.vehicle.timestep, rel=1e-3)
+    assert hover(world)[1, 2] == approx(-lost / MASS * world.vehicle.timestep, rel=1e-3)
 
 
 def test_a_tilted_craft_blows_along_its_own_axis() -> None:
     """By 30° about y: its jet goes down and to -x, and misses the one straight below."""
-    tilt = math.radians(30)
-    quaternion = (math.cos(tilt / 2), 0.0, math.sin(tilt / 2), 0.0)
+    tilt = radians(30)
+    quaternion = (cos(tilt / 2), 0.0, sin(tilt / 2), 0.0)
     away = 8 * LENGTH
-    there = (-away * math.sin(tilt), 0.0, 20.0 - away * math.cos(tilt))
+    there = (-away * sin(tilt), 0.0, 20.0 - away * cos(tilt))
     world = birds([(0, 0, 20.0), there, (0, 0, 20.0 - away)], quaternion)
     air = np.stack(Downwash(world.vehicle).air(world.state), axis=-1)[0]
-    assert air[0] == pytest.approx([0.0, 0.0, 0.0], abs=1e-3)
+    assert air[0] == approx([0.0, 0.0, 0.0], abs=1e-3)
     own = jet(8.0)
-    side = jet(8.0 * math.cos(tilt), 8.0 * math.sin(tilt))
-    assert np.linalg.norm(air[1]) == pytest.approx(own, rel=0.02)  # the third one's edge besides
-    assert air[1] / np.linalg.norm(air[1]) == pytest.approx([-0.5, 0.0, -math.sqrt(0.75)], abs=1e-6)
-    assert np.linalg.norm(air[2]) == pytest.approx(side, rel=0.02)
+    side = jet(8.0 * cos(tilt), 8.0 * sin(tilt))
+    assert np.linalg.norm(air[1]) == approx(own, rel=0.02)  # the third one's edge besides
+    assert air[1] / np.linalg.norm(air[1]) == approx([-0.5, 0.0, -sqrt(0.75)], abs=1e-6)
+    assert np.linalg.norm(air[2]) == approx(side, rel=0.02)
     assert side < 0.1 * own
 
 
 def test_jets_of_several_add_up() -> None:
     world = birds([(0, 0, 20.0), (0, 0, 20.0 - 4 * LENGTH), (0, 0, 20.0 - 9 * LENGTH)])
     air = np.stack(Downwash(world.vehicle).air(world.state), axis=-1)[0]
-    assert air[2] == pytest.approx([0.0, 0.0, -(jet(9.0) + jet(5.0))], rel=1e-6)
+    assert air[2] == approx([0.0, 0.0, -(jet(9.0) + jet(5.0))], rel=1e-6)
 
 
 @pytest.mark.parametrize("places", [[(0, 0, 20.0)], [(0, 0, 20.0), (2.0, 0, 20.0)]])

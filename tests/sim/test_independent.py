@@ -4,8 +4,8 @@ First the independent solution against closed forms, then ours against it, then 
 """
 
 import json
-import math
 from dataclasses import replace
+from math import exp, sqrt
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,7 @@ from independent import (
 )
 from measuring import read_rows, write_rows
 
+approx = pytest.approx
 ROOT = Path(__file__).parents[2]
 DATA = ROOT / "tests" / "data"
 PAGE = ROOT / "docs" / "independent.md"
@@ -56,9 +57,9 @@ def test_without_thrust_it_falls_along_a_parabola_and_keeps_its_angular_momentum
     ):
         t = 0.02 * step
         fallen = origin + center + velocity * t + DOWN * t * t / 2
-        assert position + rotation(q) @ center == pytest.approx(fallen, abs=1e-9)
+        assert position + rotation(q) @ center == approx(fallen, abs=1e-9)
         momentum = rotation(q) @ (np.array((4e-3, 5e-3, 8e-3)) * rates)
-        assert momentum == pytest.approx((2e-3, -2e-3, 2.4e-3), abs=1e-12)
+        assert momentum == approx((2e-3, -2e-3, 2.4e-3), abs=1e-12)
 
 
 def test_linear_drag_alike_in_all_directions_gives_an_exponential() -> None:
@@ -71,11 +72,11 @@ def test_linear_drag_alike_in_all_directions_gives_an_exponential() -> None:
     t = 1.0
     end = np.array((2.0, 0.0, 0.0)) + DOWN / rate
     start = VELOCITY + np.cross(SPIN, center)
-    moved = end * t + (start - end) * (1 - math.exp(-rate * t)) / rate
+    moved = end * t + (start - end) * (1 - exp(-rate * t)) / rate
     centers = [
         flight.position[i] + rotation(flight.quaternion[i]) @ center for i in (0, -1)
     ]  # fmt: skip
-    assert centers[1] - centers[0] == pytest.approx(moved, abs=1e-9)
+    assert centers[1] - centers[0] == approx(moved, abs=1e-9)
 
 
 def test_a_rotor_lags_and_drags_as_worked_out_by_hand() -> None:
@@ -85,14 +86,14 @@ def test_a_rotor_lags_and_drags_as_worked_out_by_hand() -> None:
     wanted = np.array((1.44, 1.0, 1.44, 1.44))  # roots 1.2, 1.0, 1.2, 1.2
     y = np.concatenate(((0, 0, 0), (2, 0, 0), (1, 0, 0, 0), (0, 0, 0), root))
     change = equations.derivative(0.0, y, wanted)
-    assert change[:3] == pytest.approx((2, 0, 0))
-    assert change[6:10] == pytest.approx((0, 0, 0, 0))
-    assert change[13:] == pytest.approx((0.2 / 0.05, -0.2 / 0.08, 0, 0))
+    assert change[:3] == approx((2, 0, 0))
+    assert change[6:10] == approx((0, 0, 0, 0))
+    assert change[13:] == approx((0.2 / 0.05, -0.2 / 0.08, 0, 0))
     # Speed sqrt(T / 5e-6); drag 1e-4 · speed · 2 m/s; lift 3e-3 · 4 m²/s² each.
-    drags = [1e-4 * r / math.sqrt(5e-6) * 2 for r in root]
+    drags = [1e-4 * r / sqrt(5e-6) * 2 for r in root]
     pushes = [r * r + 0.012 for r in root]
-    assert change[3] == pytest.approx(-sum(drags) / 0.6)
-    assert change[5] == pytest.approx(sum(pushes) / 0.6 - 9.81)
+    assert change[3] == approx(-sum(drags) / 0.6)
+    assert change[5] == approx(sum(pushes) / 0.6 - 9.81)
     # Rotors at (±0.14, ±0.12), 0.01 m above the center of mass; reactions ±0.02 · T.
     sides = (-0.12, -0.12, 0.12, 0.12)
     fronts = (0.14, -0.14, -0.14, 0.14)
@@ -101,7 +102,7 @@ def test_a_rotor_lags_and_drags_as_worked_out_by_hand() -> None:
     pitch = -sum(x * f for x, f in zip(fronts, pushes, strict=True)) - 0.01 * sum(drags)
     yaw = sum(y * d for y, d in zip(sides, drags, strict=True))
     yaw += sum(k * r * r for k, r in zip(turns, root, strict=True))
-    assert change[10:13] == pytest.approx((roll, pitch / 5e-3, yaw / 8e-3))
+    assert change[10:13] == approx((roll, pitch / 5e-3, yaw / 8e-3))
 
 
 # --- ours against it ------------------------------------------------------------------------------
@@ -121,7 +122,7 @@ def test_every_vehicle_flies_as_its_equations_say(name: str) -> None:
 def test_the_thrusts_vary_and_turn_the_smallest_as_fast_as_the_page_says() -> None:
     given = thrusts(VEHICLES["tiny"])
     assert given.shape == (500, 4)
-    assert given.std(axis=0) == pytest.approx(0.3 / math.sqrt(3) * 0.0662, rel=0.1)
+    assert given.std(axis=0) == approx(0.3 / sqrt(3) * 0.0662, rel=0.1)
     flight = independent(VEHICLES["tiny"], given[:250], {}, 1e-9)
     assert 5 < np.linalg.norm(flight.rates, axis=1).max() < 35
 
@@ -141,7 +142,7 @@ def test_effects_are_of_second_order(effects: str, most_m: float, most_deg: floa
     assert [row.step_ms for row in rows] == [5.0, 2.5]
     assert rows[0].position_m < most_m
     assert rows[0].attitude_deg < most_deg
-    assert order(rows) == pytest.approx(2.0, abs=0.25)
+    assert order(rows) == approx(2.0, abs=0.25)
 
 
 def test_rotors_that_lag_drag_with_their_mean_speed() -> None:
@@ -158,7 +159,7 @@ def test_rotors_that_lag_drag_with_their_mean_speed() -> None:
 
 def test_the_rigid_body_is_of_fourth_order() -> None:
     rows = compare("tiny", VEHICLES["tiny"], ["none"], [0.01, 0.005], 2.0)
-    assert order(rows) == pytest.approx(4.0, abs=0.1)
+    assert order(rows) == approx(4.0, abs=0.1)
 
 
 # --- the page -------------------------------------------------------------------------------------
@@ -170,7 +171,7 @@ def test_a_table_is_read_as_it_was_written(tmp_path: Path) -> None:
     again = read_rows(tmp_path / "new" / "table.csv", Row)
     assert [row.vehicle for row in again] == ["racer", "racer"]
     assert [row.step_ms for row in again] == [10.0, 5.0]
-    assert again[0].position_m == pytest.approx(rows[0].position_m, rel=1e-3)
+    assert again[0].position_m == approx(rows[0].position_m, rel=1e-3)
 
 
 def test_the_page_shows_the_committed_table_of_every_vehicle() -> None:
@@ -190,7 +191,7 @@ def test_the_committed_flights_fly_again_alike() -> None:
     (told,) = (r for r in read_rows(FLIGHTS, Row) if r.vehicle == "tiny" and r.of_file)
     (row,) = compare("tiny", VEHICLES["tiny"], ["none"], [0.005])
     for name in ("fastest_rad_s", "fastest_m_s", "position_m", "attitude_deg"):
-        assert getattr(row, name) == pytest.approx(getattr(told, name), rel=0.02)
+        assert getattr(row, name) == approx(getattr(told, name), rel=0.02)
 
 
 def test_the_page_shows_the_committed_flights_beside_rotorpy() -> None:
@@ -220,14 +221,12 @@ def test_rotorpys_parameters_become_our_vehicle(tmp_path: Path) -> None:
     told = vehicle.coefficients
     assert vehicle.mass == 0.4
     assert vehicle.gravity == 9.81
-    assert vehicle.inertia == pytest.approx(
+    assert vehicle.inertia == approx(
         np.array(((1e-3, 0, 1e-4), (0, 2e-3, 0), (1e-4, 0, 2.5e-3))), abs=1e-9
     )
-    assert vehicle.thrust_high == pytest.approx([2.0] * 4)
+    assert vehicle.thrust_high == approx([2.0] * 4)
     signs = [(1, 1, 1, 1), (0.2, -0.2, -0.2, 0.2), (-0.1, -0.1, 0.1, 0.1)]
-    assert vehicle.allocation == pytest.approx(
-        np.array((*signs, (0.02, -0.02, 0.02, -0.02))), abs=1e-12
-    )
+    assert vehicle.allocation == approx(np.array((*signs, (0.02, -0.02, 0.02, -0.02))), abs=1e-12)
     assert told.rotors.thrust_coefficient == 2e-6
     assert told.rotors.time_constant == 0.01
     assert told.rotors.drag == 1e-4

@@ -1,6 +1,6 @@
 """The paper's vehicle flies by the paper's numbers and by closed forms; accuracy against cost."""
 
-import math
+from math import exp
 from pathlib import Path
 from typing import Any
 
@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from accuracy import Accuracy, accuracy, markdown
 from measuring import read_rows, write_rows
+from numpy.testing import assert_allclose
 from rotorgram.models import Vehicle
 
+approx = pytest.approx
 ROOT = Path(__file__).parents[2]
 DATA = Path(__file__).parents[1] / "data"
 
@@ -50,19 +52,19 @@ def test_inertia_by_hand() -> None:
     #   z: 0.8 * 0.0081 / 2 + 0.8 * 2 = 1.60324.
     ixx = 0.2132 + 2 * (0.000735 + 0.8003675) + 4 * 0.80258
     izz = 0.3872 + 4 * 0.8003675 + 4 * 1.60324
-    assert (ixx, izz) == pytest.approx((IXX, IZZ), abs=1e-12)
-    np.testing.assert_allclose(Vehicle.load().inertia, np.diag([ixx, ixx, izz]), atol=1e-9)
+    assert (ixx, izz) == approx((IXX, IZZ), abs=1e-12)
+    assert_allclose(Vehicle.load().inertia, np.diag([ixx, ixx, izz]), atol=1e-9)
 
 
 def test_forces_and_torques_meet_the_mass_and_the_inertia_of_the_paper() -> None:
     vehicle = Vehicle.load()
     data = ready(vehicle)
     fall = acceleration(vehicle, data)
-    assert fall == pytest.approx([0, 0, -GRAVITY, 0, 0, 0], abs=1e-9)
+    assert fall == approx([0, 0, -GRAVITY, 0, 0, 0], abs=1e-9)
     for axis, size in enumerate((MASS, MASS, MASS, IXX, IXX, IZZ)):
         data.qfrc_applied[:] = np.eye(6)[axis]
         answer = acceleration(vehicle, data) - fall
-        assert answer == pytest.approx(np.eye(6)[axis] / size, abs=1e-9)
+        assert answer == approx(np.eye(6)[axis] / size, abs=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -72,8 +74,8 @@ def test_forces_and_torques_meet_the_mass_and_the_inertia_of_the_paper() -> None
 def test_a_rotor_pushes_up_and_turns(rotor: int, torque: tuple[float, ...]) -> None:
     vehicle = Vehicle.load()
     answer = acceleration(vehicle, ready(vehicle, MAX_THRUST * np.eye(4)[rotor]))
-    assert answer[2] == pytest.approx(MAX_THRUST / MASS - GRAVITY, abs=1e-9)
-    assert answer[3:] * (IXX, IXX, IZZ) == pytest.approx(MAX_THRUST * np.array(torque), abs=1e-8)
+    assert answer[2] == approx(MAX_THRUST / MASS - GRAVITY, abs=1e-9)
+    assert answer[3:] * (IXX, IXX, IZZ) == approx(MAX_THRUST * np.array(torque), abs=1e-8)
 
 
 @pytest.mark.parametrize(("asked", "given"), [(0, 0), (49, 49), (100, 100), (150, 100), (-50, 0)])
@@ -82,8 +84,8 @@ def test_two_seconds_at_equal_thrusts(asked: float, given: float) -> None:
     data = ready(vehicle, asked)
     fly(vehicle, data, 2.0)
     climb = 4 * given / MASS - GRAVITY  # -9.8, 0 and 10.2 m/s²
-    assert data.qpos[2] - 1000 == pytest.approx(2 * climb, abs=1e-9)
-    assert data.qpos[:2] == pytest.approx([0, 0], abs=1e-9)
+    assert data.qpos[2] - 1000 == approx(2 * climb, abs=1e-9)
+    assert data.qpos[:2] == approx([0, 0], abs=1e-9)
 
 
 def test_tumbling_is_that_of_a_symmetric_top() -> None:
@@ -93,8 +95,8 @@ def test_tumbling_is_that_of_a_symmetric_top() -> None:
     data.qvel[3:] = SPIN
     fly(vehicle, data, 10.0)
     turned = complex(1, 2) * np.exp(1j * (IZZ - IXX) / IXX * 3 * 10)
-    assert data.qvel[3:] == pytest.approx([turned.real, turned.imag, 3], abs=1e-6)
-    assert data.qpos[2] == pytest.approx(1000 - 490, abs=1e-9)
+    assert data.qvel[3:] == approx([turned.real, turned.imag, 3], abs=1e-6)
+    assert data.qpos[2] == approx(1000 - 490, abs=1e-9)
 
 
 def test_it_rests_on_its_skids() -> None:
@@ -102,7 +104,7 @@ def test_it_rests_on_its_skids() -> None:
     data = ready(vehicle)
     data.qpos[2] = 0.45
     fly(vehicle, data, 5.0)
-    assert data.qpos[2] == pytest.approx(0.4, abs=1e-3)  # contacts are soft: it sinks by 0.1 mm
+    assert data.qpos[2] == approx(0.4, abs=1e-3)  # contacts are soft: it sinks by 0.1 mm
     assert np.abs(data.qvel).max() < 1e-6
 
 
@@ -119,7 +121,7 @@ def test_linear_drag_is_a_force_and_no_torque(name: str) -> None:
         mujoco.mj_forward(vehicle.model, data)
         answers.append(data.qfrc_passive.copy())
     force = -0.5 * without.mass * np.array((6, -8, 10))
-    assert answers[0] - answers[1] == pytest.approx([*force, 0, 0, 0], abs=1e-9)
+    assert answers[0] - answers[1] == approx([*force, 0, 0, 0], abs=1e-9)
 
 
 def test_linear_drag_slows_a_hover_and_not_its_turn() -> None:
@@ -127,8 +129,8 @@ def test_linear_drag_slows_a_hover_and_not_its_turn() -> None:
     data = ready(vehicle, 49)
     data.qvel[:] = (10, 0, 0, 0, 0, 1)
     fly(vehicle, data, 2.0)
-    assert data.qvel[0] == pytest.approx(10 * math.exp(-1), abs=1e-9)
-    assert data.qvel[5] == pytest.approx(1, abs=1e-9)
+    assert data.qvel[0] == approx(10 * exp(-1), abs=1e-9)
+    assert data.qvel[5] == approx(1, abs=1e-9)
 
 
 # --- accuracy against cost ------------------------------------------------------------------------
@@ -143,12 +145,12 @@ def _order(integrator: str, steps: tuple[float, ...]) -> float:
 
 
 def test_rk4_is_of_fourth_order_in_tumbling_flight() -> None:
-    assert _order("RK4", (0.004, 0.005, 0.01, 0.02)) == pytest.approx(4.0, abs=0.1)
+    assert _order("RK4", (0.004, 0.005, 0.01, 0.02)) == approx(4.0, abs=0.1)
 
 
 @pytest.mark.parametrize("integrator", ["Euler", "implicit", "implicitfast"])
 def test_the_others_are_of_first_order(integrator: str) -> None:
-    assert _order(integrator, (0.002, 0.004, 0.005, 0.01)) == pytest.approx(1.0, abs=0.1)
+    assert _order(integrator, (0.002, 0.004, 0.005, 0.01)) == approx(1.0, abs=0.1)
 
 
 def test_a_table_is_read_as_it_was_written(tmp_path: Path) -> None:
@@ -164,15 +166,15 @@ def test_the_committed_table_is_of_this_vehicle_and_on_the_page() -> None:
     told = {(row.integrator, row.step_ms): row for row in rows}
     for row in again:
         committed = told[row.integrator, row.step_ms]
-        assert row.position_m == pytest.approx(committed.position_m, rel=0.05)
-        assert row.attitude_deg == pytest.approx(committed.attitude_deg, rel=0.05)
-        assert row.sinks_mm == pytest.approx(committed.sinks_mm, rel=1e-3)
+        assert row.position_m == approx(committed.position_m, rel=0.05)
+        assert row.attitude_deg == approx(committed.attitude_deg, rel=0.05)
+        assert row.sinks_mm == approx(committed.sinks_mm, rel=1e-3)
 
 
 def test_the_step_of_the_papers_vehicle_is_as_true_as_the_page_says() -> None:
     rows = {(row.integrator, row.step_ms): row for row in read_rows(COMMITTED, Accuracy)}
     ours = rows["RK4", Vehicle.load().timestep * 1e3]
     assert ours.position_m < 1e-6
-    assert ours.sinks_mm == pytest.approx(rows["RK4", 2].sinks_mm, rel=0.02)
+    assert ours.sinks_mm == approx(rows["RK4", 2].sinks_mm, rel=0.02)
     assert ours.cost_us < 0.6 * rows["RK4", 5].cost_us
     assert rows["Euler", 5].position_m > 0.1

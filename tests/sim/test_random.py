@@ -4,9 +4,11 @@ import math
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from rotorgram.models.vehicle import Vehicle
 from rotorgram.sim import elementary, make_world
 from rotorgram.sim.random import (
+    START,
     Draw,
     Random,
     normal,
@@ -50,7 +52,7 @@ def test_uniform_and_normal_by_hand() -> None:
     assert uniform(words).tolist() == [0.0, 0.5, 0.25, 1 - 2.0**-32]
     # Box and Muller: sqrt(-2 log(1 - 1/2)) at a quarter turn, and at no turn of size 0.
     found = normal(np.array((2**31, 0, 2**30, 0), np.uint32))
-    np.testing.assert_allclose(found, (0.0, 0.0, math.sqrt(2 * math.log(2)), 0.0), atol=1e-15)
+    assert_allclose(found, (0.0, 0.0, math.sqrt(2 * math.log(2)), 0.0), atol=1e-15)
 
 
 def test_normal_numbers_are_normal() -> None:
@@ -138,29 +140,27 @@ def test_an_episode_begins_with_other_numbers_and_a_seed_repeats_them() -> None:
 
 def test_a_draw_begins_the_episode_of_the_reset_that_follows() -> None:
     random = Random((1, 1))
-    use = random.use("start")
     random.seed([0], [3])
     shares = []
     for episode in (1, 2):
-        shares.append(random.start(use, [0]).uniform(0.0, 1.0).item())
+        shares.append(random.start(START, [0]).uniform(0.0, 1.0).item())
         random.begin([0])
         assert random.episode.tolist() == [episode]
     random.begin([0])  # without a draw
     assert random.episode.tolist() == [3]
     key = np.array((3, 0), np.uint32)
     for share, episode in zip(shares, (1, 2), strict=True):
-        assert share == uniform(words_of(key, use, episode, 0, 1)).item()
+        assert share == uniform(words_of(key, START, episode, 0, 1)).item()
 
 
 def test_draws_follow_each_other_in_blocks() -> None:
     random = random_of(2, 3)
-    use = random.use("start")
-    draw = Draw(random, use, [1])
+    draw = Draw(random, START, [1])
     first = draw.uniform(2.0, 4.0)
     second = draw.normal(3.0, (2,))
     assert first[0].tolist() == [0.0] * 3
     assert second[0].tolist() == [[0.0] * 2] * 3
-    words = words_of(np.array((6, 0), np.uint32), use, 1, 0, 12)
+    words = words_of(np.array((6, 0), np.uint32), START, 1, 0, 12)
     assert first[1].tolist() == (2.0 + 2.0 * uniform(words[:3])).tolist()
     assert second[1].ravel().tolist() == (3.0 * normal(words[4:10])).tolist()
     many = draw.uniform(0.0, 1.0, (50,))  # more than are computed at once
@@ -176,13 +176,6 @@ def test_chosen_values_replace_a_draw_and_move_no_other() -> None:
     without.uniform(0.0, 1.0, name="target")
     after = [draw.uniform(0.0, 1.0).tolist() for draw in (with_choice, without)]
     assert after[0] == after[1]
-
-
-def test_equal_uses_are_refused() -> None:
-    random = Random(())
-    random.noise("wind", 1)
-    with pytest.raises(ValueError, match="'wind' has the number of 'wind'"):
-        random.use("wind")
 
 
 def test_what_was_given_stays_as_it_was() -> None:

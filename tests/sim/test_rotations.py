@@ -1,13 +1,14 @@
 """Rotations against values worked out by hand."""
 
-import math
+from math import pi, sqrt
 from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from rotorgram.sim import rotations
 
-HALF = math.sqrt(0.5)
+HALF = sqrt(0.5)
 LEFT = np.array((HALF, 0.0, 0.0, HALF))  # 90° about z: the nose along y
 ROLLED = np.array((HALF, HALF, 0.0, 0.0))  # 90° about x: body y up, body z along -y
 V = np.array((1.0, 2.0, 3.0))
@@ -36,19 +37,19 @@ def both(*arrays: np.ndarray) -> list[list[Any]]:
 def test_by_hand(function: Any, arguments: Any, expected: Any) -> None:
     for given in both(*arguments):
         turned = function(*given)
-        np.testing.assert_allclose(turned, np.broadcast_to(expected, turned.shape), atol=1e-15)
+        assert_allclose(turned, np.broadcast_to(expected, turned.shape), atol=1e-15)
 
 
 def test_a_rotation_vector_turns_the_body() -> None:
-    for attitude, angle in both(LEFT, np.array((math.pi / 2, 0.0, 0.0))):
+    for attitude, angle in both(LEFT, np.array((pi / 2, 0.0, 0.0))):
         turned = rotations.advanced(attitude, angle)
-        np.testing.assert_allclose(turned, np.full(turned.shape, 0.5), atol=1e-15)
+        assert_allclose(turned, np.full(turned.shape, 0.5), atol=1e-15)
     still = rotations.advanced(2 * LEFT, np.zeros(3))
-    np.testing.assert_allclose(still, LEFT, atol=1e-15)  # normalised
+    assert_allclose(still, LEFT, atol=1e-15)  # normalised
     many = np.array((1.0, 0.0, 0.0, 0.0))
     for _ in range(90):
         many = rotations.advanced(many, np.radians((0.0, 0.0, 1.0)))
-    np.testing.assert_allclose(many, LEFT, atol=1e-13)
+    assert_allclose(many, LEFT, atol=1e-13)
 
 
 def test_vectors_by_their_components() -> None:
@@ -60,4 +61,4 @@ def test_vectors_by_their_components() -> None:
 
 def test_euler_angles() -> None:
     """Yaw by 90°, then a roll by 90° about the new nose."""
-    assert rotations.euler(np.full(4, 0.5)) == pytest.approx((math.pi / 2, 0.0, math.pi / 2))
+    assert rotations.euler(np.full(4, 0.5)) == pytest.approx((pi / 2, 0.0, pi / 2))
