@@ -8,9 +8,9 @@ import mujoco
 from ..models import QUAD_XML
 from ..models.errors import InputError
 from ..models.mjcf import has_ground, read_spec
-from . import AIRPORT_XML, SCENE_XML, parse_scene
-from .generators import GENERATORS
-from .primitives import SKY, attach, clear
+from . import AIRPORT_XML, SCENE_XML, SEEDED_SCENES, parse_scene
+from .generators import add_seeded
+from .spec import clear
 
 AIRPORT_PREFIX: Final = "airport/"  # of all names that `add_airport` adds
 SCENE_PREFIX: Final = "scene/"  # of all names that `add_scene` adds for the plain scene
@@ -45,8 +45,8 @@ def add_scene(spec: mujoco.MjSpec, scene: str = "plain") -> None:
     _add_plain(spec)
     if name == "airport":
         add_airport(spec)
-    elif name in GENERATORS:
-        attach(spec, GENERATORS[name](seed))
+    elif name in SEEDED_SCENES:
+        add_seeded(spec, name, seed)
     spec.compiler.discardvisual = False
 
 
@@ -59,7 +59,7 @@ def _add_plain(spec: mujoco.MjSpec) -> None:
     else:
         spec.visual = scene.visual
         spec.stat = scene.stat
-    if any(texture.type == SKY for texture in spec.textures):
+    if any(texture.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX for texture in spec.textures):
         scene.delete(scene.texture("sky"))
     if spec.worldbody.lights:
         scene.delete(scene.light("sun"))
