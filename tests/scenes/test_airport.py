@@ -1,4 +1,4 @@
-"""The airport: looked at, never felt. Scenes move bit for bit as without it."""
+"""The airport alone; test_scenery.py has what it shares with the scenes of a seed."""
 
 import math
 import os
@@ -14,7 +14,6 @@ import pytest
 from rotorgram.models import InputError
 from rotorgram.scenes import AIRPORT_XML, add_airport, build_scene
 
-STEPS = 2_000
 OTHER = """
 <mujoco>
   <worldbody>
@@ -34,10 +33,10 @@ def other() -> mujoco.MjSpec:
     return mujoco.MjSpec.from_string(OTHER)
 
 
-def with_airport(make: Callable[[], mujoco.MjSpec], discard: bool = False) -> mujoco.MjModel:
+def with_airport(make: Callable[[], mujoco.MjSpec]) -> mujoco.MjModel:
     spec = make()
     add_airport(spec)
-    spec.compiler.discardvisual = discard
+    spec.compiler.discardvisual = False
     return spec.compile()
 
 
@@ -52,77 +51,6 @@ def airport(model: mujoco.MjModel) -> np.ndarray:
     ours = model.geom_bodyid == 0
     ours[model.geom("scene/floor").id] = False
     return np.flatnonzero(ours)
-
-
-def fly(model: mujoco.MjModel) -> tuple[bytes, set[int]]:
-    """State after every step of a flight with hops and landings, and the numbers of contacts."""
-    data = mujoco.MjData(model)
-    rng = np.random.default_rng(5)
-    states = []
-    contacts = set()
-    for step in range(STEPS):
-        if step % 40 == 0 and model.nu:
-            data.ctrl[:] = rng.uniform(30.0, 68.0) + rng.uniform(-1.0, 1.0, model.nu)
-        mujoco.mj_step(model, data)
-        states.append(np.concatenate([data.qpos, data.qvel]))
-        contacts.add(data.ncon)
-    assert not data.warning.number.any()
-    return np.array(states).tobytes(), contacts
-
-
-@pytest.mark.parametrize("make", [build_scene, other])
-@pytest.mark.parametrize("discard", [False, True])
-def test_motion_is_the_same_to_the_last_bit(
-    make: Callable[[], mujoco.MjSpec], discard: bool
-) -> None:
-    alone, contacts = fly(make().compile())
-    assert 0 in contacts
-    assert max(contacts) >= 2  # it flew, and it stood on the floor
-    assert fly(with_airport(make, discard)) == (alone, contacts)
-
-
-def test_nothing_is_added_but_geoms(model: mujoco.MjModel, airport: np.ndarray) -> None:
-    alone = build_scene().compile()
-    for count in ("nbody", "njnt", "nq", "nv", "nu", "nsensor", "nsite", "nmocap", "neq", "npair"):
-        assert getattr(model, count) == getattr(alone, count), count
-    assert model.nmesh == 0
-    assert model.nhfield == 0
-    assert model.nflex == 0
-    assert model.nskin == 0
-    assert model.body_mass.tolist() == alone.body_mass.tolist()
-    assert model.body_inertia.tolist() == alone.body_inertia.tolist()
-    assert 250 < len(airport) <= 400  # drawn in software too
-
-
-def test_the_airport_stands_still_and_touches_nothing(
-    model: mujoco.MjModel, airport: np.ndarray
-) -> None:
-    spec = mujoco.MjSpec.from_file(str(AIRPORT_XML))
-    assert len(airport) == len(spec.geoms)  # all of them in the world body, which is static
-    assert model.ngeom == build_scene().compile().ngeom + len(airport)
-    assert not model.geom_contype[airport].any()
-    assert not model.geom_conaffinity[airport].any()
-    assert set(model.geom_group[airport]) == {2}
-    assert {geom.mass for geom in spec.geoms} == {0.0}
-
-
-def test_discardvisual_drops_all_of_it() -> None:
-    spec = build_scene()
-    spec.compiler.discardvisual = True
-    alone = spec.compile()
-    model = with_airport(build_scene, discard=True)
-    assert model.ngeom == alone.ngeom
-    assert model.nmat == alone.nmat
-    assert model.ntex == alone.ntex
-
-
-@pytest.mark.parametrize("visual", [True, False])
-def test_a_scene_has_the_airport_that_was_asked_for(visual: bool) -> None:
-    spec = build_scene(scene="airport")
-    spec.compiler.discardvisual = not visual
-    assert spec.compile().ngeom == with_airport(build_scene, discard=not visual).ngeom
-    with pytest.raises(InputError, match=r"scene: expected 'plain' or 'airport' .* got 'mars'"):
-        build_scene(scene="mars")
 
 
 def test_only_the_floor_is_hidden() -> None:
@@ -141,17 +69,18 @@ def test_the_scenes_own_scale_stays(make: Callable[[], mujoco.MjSpec]) -> None:
     assert model.vis.map.zfar * model.stat.extent == pytest.approx(1200.0)
 
 
-def test_one_sky() -> None:
-    model = with_airport(build_scene)
-    skies = np.flatnonzero(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
-    assert [model.tex(i).name for i in skies] == ["airport/sky"]
-
-
 def test_a_second_airport_is_refused() -> None:
     spec = build_scene()
     add_airport(spec)
     with pytest.raises(InputError, match="spec: expected a scene without an airport"):
         add_airport(spec)
+
+
+def test_it_has_geoms_alone_and_not_too_many(airport: np.ndarray) -> None:
+    spec = mujoco.MjSpec.from_file(str(AIRPORT_XML))
+    assert len(airport) == len(spec.geoms)  # all of them in the world body, which is static
+    assert {geom.mass for geom in spec.geoms} == {0.0}
+    assert 250 < len(airport) <= 400  # drawn in software too
 
 
 def corners(model: mujoco.MjModel, geom: int) -> np.ndarray:
