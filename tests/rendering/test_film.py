@@ -75,14 +75,6 @@ def test_mp4_has_every_frame_at_its_time(tmp_path: Path) -> None:
     assert data.index(b"moov") < data.index(b"mdat")  # plays before it is loaded whole
 
 
-def test_the_first_frame_of_a_film_shows_the_flight(opengl: None, tmp_path: Path) -> None:
-    path = tmp_path / "film.mp4"
-    film(path, [track(trajectory(*[5.0] * 6))], FAST)
-    first, *_ = decoded(path, WIDTH, HEIGHT)
-    assert first.mean() > 100
-    assert first.std() > 20
-
-
 @pytest.mark.parametrize("package", ["PIL", "imageio_ffmpeg"])
 def test_a_missing_package_is_one_sentence(package: str, tmp_path: Path) -> None:
     code = f"""

@@ -62,23 +62,6 @@ def test_a_curve_that_leaves_its_scale_has_no_plateau(side: float) -> None:
     assert back[:, round(0.8 * width) : round(0.98 * width)].any(axis=0).all()
 
 
-def test_a_step_across_the_scale_is_drawn_and_marked_where_it_leaves() -> None:
-    overlay = overlay_of(640, 360, seconds=0.04)
-    green = lit(overlay, [0.0, 2.0, -2.0], 360, 640)
-    high, wide = green.shape
-    assert green[high // 2, round(0.7 * wide) : round(0.8 * wide)].any()  # through 0 after 0.03 s
-    assert not green[:, round(0.3 * wide) : round(0.6 * wide)].any()  # above from 0.01 to 0.025 s
-    assert not green[:, round(0.92 * wide) :].any()  # below from 0.035 s on
-
-
-def test_errors_beyond_the_band_stay_inside_the_strip() -> None:
-    overlay = overlay_of(320, 240, scale=(-0.5, 0.5))
-    drawn = overlay.draw(np.zeros((240, 320, 3), np.uint8), at(1.0), [0.0, 90.0, -90.0])
-    rows = np.nonzero((drawn[120:, :, 1] > 200) & (drawn[120:, :, 0] < 60))[0] + 120
-    assert rows.min() >= overlay.plot[1] - 2
-    assert rows.max() <= overlay.plot[3] + 2
-
-
 @pytest.mark.parametrize("size", [(640, 360), (320, 400), (320, 240), (1280, 720)])
 def test_full_thrusts_do_not_lie_on_their_name(size: tuple[int, int]) -> None:
     overlay = overlay_of(*size)
@@ -154,14 +137,6 @@ def test_an_overlay_covers_little_and_fits_any_size() -> None:
 )
 def test_a_graph_ends_at_round_numbers(values: list[float], expected: tuple[float, float]) -> None:
     assert graph_scale(values) == pytest.approx(expected)
-
-
-def test_a_graph_from_zero_has_zero_at_its_lower_end() -> None:
-    overlay = overlay_of(640, 360, scale=(0.0, 2.0))
-    green = lit(overlay, [1.0] * 51, 360, 640)
-    assert np.nonzero(green)[0].mean() == pytest.approx(green.shape[0] / 2, abs=2)
-    green = lit(overlay, [0.0] * 51, 360, 640)
-    assert np.nonzero(green)[0].mean() == pytest.approx(green.shape[0] - 1, abs=3)
 
 
 def test_lines_follow_the_task_and_the_vehicle() -> None:

@@ -148,17 +148,6 @@ def test_a_path_begins_anew_with_each_episode() -> None:
     assert count() == 0
 
 
-def test_many_stand_side_by_side() -> None:
-    stage = Stage("plain", drones=5)
-    stage.show(*[at(3.0 + i) for i in range(5)])
-    places = stage.data.qpos.reshape(5, 7)[:, :3]
-    assert places[:, 2].tolist() == [3.0, 4.0, 5.0, 6.0, 7.0]
-    gaps = np.linalg.norm(places[:, None, :2] - places[None, :, :2], axis=2)
-    assert gaps[~np.eye(5, dtype=bool)].min() == pytest.approx(4.0, abs=0.01)
-    with pytest.raises(InputError, match="moments: expected 5, got 1"):
-        stage.show(at(5.0))
-
-
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
