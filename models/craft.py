@@ -4,7 +4,7 @@ import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import mujoco
 
@@ -154,7 +154,7 @@ def _build(spec: mujoco.MjSpec, file: VehicleFile) -> None:
         _add_actuator(spec, file, rotor, site)
 
 
-def _along(axis: Vector) -> dict[str, object]:
+def _along(axis: Vector) -> dict[str, Any]:
     """How a geom whose z axis is this one is turned."""
     return {} if tuple(axis) == UP else {"zaxis": axis}
 
@@ -181,7 +181,7 @@ def _add_mass(body: mujoco.MjsBody, file: VehicleFile) -> None:
         if isinstance(part, Box):
             kind = _BOX
             size = _scaled(part.size, 0.5)
-            turn: dict[str, object] = {"euler": (0.0, 0.0, part.yaw)}
+            turn: dict[str, Any] = {"euler": (0.0, 0.0, part.yaw)}
         else:
             kind = _CYLINDER
             size = (part.radius, part.length / 2)

@@ -101,6 +101,14 @@ def free_body(spec: mujoco.MjSpec) -> mujoco.MjsBody:
     return next(body for body in spec.bodies if any(joint.type == free for joint in body.joints))
 
 
+def level_data(model: mujoco.MjModel) -> mujoco.MjData:
+    """All free bodies of a model level at the origin, and where that places the others."""
+    data = mujoco.MjData(model)
+    data.qpos.reshape(-1, 7)[:] = (0, 0, 0, 1, 0, 0, 0)
+    mujoco.mj_kinematics(model, data)
+    return data
+
+
 def switch_off_log_file() -> None:
     """Keep MuJoCo from writing MUJOCO_LOG.TXT; a log file of another name stays on."""
     config = mujoco.MjLogConfig.get()

@@ -21,7 +21,7 @@ from .cameras import Camera, own_cameras, read_cameras
 from .coefficients import PREFIX, Coefficients
 from .errors import InputError, shortened
 from .library import find_vehicle
-from .mjcf import free_body, vehicle_spec
+from .mjcf import free_body, level_data, vehicle_spec
 from .vehicle_file import read_vehicle_file
 
 _LEAST_TIMESTEP: Final = 1e-5  # s: a control step of 0.02 s then takes a hundredth of a second
@@ -134,9 +134,8 @@ class Vehicle:
     @cached_property
     def radius(self) -> float:
         """Of a sphere about the body's origin that holds all that can collide, m."""
-        model, data = self.model, mujoco.MjData(self.model)
-        data.qpos[:] = (0, 0, 0, 1, 0, 0, 0)
-        mujoco.mj_kinematics(model, data)
+        model = self.model
+        data = level_data(model)
         solid = (model.geom_contype | model.geom_conaffinity) > 0
         solid &= np.isin(model.geom_bodyid, craft_bodies(model))
         reach = np.linalg.norm(data.geom_xpos, axis=1) + model.geom_rbound
@@ -246,8 +245,7 @@ def compile_vehicle(
         text = spec.to_xml()
         model = spec.compile()
         _check_structure(model)
-        data = mujoco.MjData(model)
-        data.qpos[:] = (0, 0, 0, 1, 0, 0, 0)
+        data = level_data(model)
         mujoco.mj_forward(model, data)
     except InputError:
         raise
@@ -309,10 +307,7 @@ def payload_body(model: mujoco.MjModel) -> int:
 
 def body_axes(model: mujoco.MjModel) -> np.ndarray:
     """Axes of each body in the frame of the free body that it is of, as columns, (B, 3, 3)."""
-    data = mujoco.MjData(model)
-    data.qpos.reshape(-1, 7)[:] = (0, 0, 0, 1, 0, 0, 0)
-    mujoco.mj_kinematics(model, data)
-    axes: np.ndarray = data.xmat.reshape(-1, 3, 3).copy()
+    axes: np.ndarray = level_data(model).xmat.reshape(-1, 3, 3).copy()
     return axes
 
 

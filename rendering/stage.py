@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from ..models.errors import InputError, shortened
 from ..models.fleet import load_vehicles, members_of
-from ..models.mjcf import attach_craft, free_body
+from ..models.mjcf import attach_craft, free_body, level_data
 from ..scenes.build import SCENE_PREFIX, build_scene
 from ..scenes.marks import Mark
 from .gl import Offscreen
@@ -422,9 +422,7 @@ def least_distance(positions: np.ndarray) -> float:
 
 def _size(model: mujoco.MjModel) -> tuple[float, float]:
     """Radius of the craft about its body's origin, and height of its top above it, m."""
-    data = mujoco.MjData(model)
-    data.qpos[:] = (0, 0, 0, 1, 0, 0, 0)
-    mujoco.mj_kinematics(model, data)
+    data = level_data(model)
     craft = model.body_rootid[model.geom_bodyid] == model.jnt_bodyid[0]
     drawn = craft & (model.geom_group <= 2)
     chosen = drawn if drawn.any() else craft

@@ -572,7 +572,7 @@ def test_export_keeps_six_digits(text: str, tmp_path: Path) -> None:
     assert again.coefficients == vehicle.coefficients
     np.testing.assert_allclose(again.allocation, vehicle.allocation, rtol=1e-5)
     np.testing.assert_allclose(np.diag(again.inertia), np.diag(vehicle.inertia), rtol=1e-5)
-    with pytest.raises(InputError, match=r"^out: expected a name that ends in .xml, got"):
+    with pytest.raises(InputError, match=r"^out: expected a file that ends in .xml, got"):
         export_mjcf(vehicle.path, tmp_path / "out.txt")
     with pytest.raises(InputError, match=r"^out: expected the name of a new file, got .*out.xml"):
         export_mjcf(out, out)
