@@ -37,6 +37,7 @@ from .vehicle import (
     rotor_name,
     trim_thrust,
 )
+from .vehicle_file import inertia_matrix
 
 Array = NDArray[np.float64]
 
@@ -367,9 +368,7 @@ def _mend(spec: mujoco.MjSpec) -> Iterator[tuple[str, Array]]:
             continue
         moments = np.sort(np.array(body.inertia, np.float64))
         if np.isfinite(body.fullinertia[0]):
-            xx, yy, zz, xy, xz, yz = body.fullinertia
-            full = np.array(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))
-            moments[:] = np.linalg.eigvalsh(full)
+            moments[:] = np.linalg.eigvalsh(inertia_matrix(body.fullinertia))
         yield body.name or "a body without a name", moments
         if not (moments[0] > 0 and moments[0] + moments[1] >= moments[2] * (1 - _RELATIVE)):
             body.fullinertia = [math.nan, 0, 0, 0, 0, 0]

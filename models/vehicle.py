@@ -22,7 +22,7 @@ from .coefficients import PREFIX, Coefficients
 from .errors import InputError, shortened
 from .library import find_vehicle
 from .mjcf import free_body, level_data, vehicle_spec
-from .vehicle_file import read_vehicle_file
+from .vehicle_file import inertia_matrix, read_vehicle_file
 
 _LEAST_TIMESTEP: Final = 1e-5  # s: a control step of 0.02 s then takes a hundredth of a second
 _MAX_TIMESTEP: Final = 1.0  # s: that of the longest control step
@@ -387,8 +387,7 @@ def mass_properties(
     `data` is at the origin and level. Units and shapes as of `Vehicle`.
     """
     body = int(model.jnt_bodyid[0])
-    xx, yy, zz, xy, xz, yz = data.crb[body, :6]
-    inertia = np.array(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))
+    inertia = inertia_matrix(data.crb[body, :6])
     return float(model.body_subtreemass[body]), data.subtree_com[body].copy(), inertia
 
 

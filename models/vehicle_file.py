@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Annotated, Final, Literal, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .cameras import FOVY, MAX_LETTERS, OUTPUTS, Camera, Optics, steps_of
 from .coefficients import COEFFICIENTS, Battery, Drag, Rotors, Sensors
@@ -554,8 +555,7 @@ def _check_inertia(values: _Numbers) -> None:
             "body.inertia: expected 3 numbers: Ixx, Iyy, Izz, or 6: Ixx, Iyy, Izz, Ixy, Ixz, Iyz, "
             f"got {got}"
         )
-    xx, yy, zz, xy, xz, yz = (*values, 0.0, 0.0, 0.0)[:6]
-    low, middle, high = np.linalg.eigvalsh(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))).tolist()
+    low, middle, high = np.linalg.eigvalsh(inertia_matrix((*values, 0.0, 0.0, 0.0)[:6])).tolist()
     if not low > _LEAST_MOMENT:
         raise InputError(
             f"body.inertia: expected principal moments above {_LEAST_MOMENT:g} kg m², got {got}"
@@ -565,6 +565,12 @@ def _check_inertia(values: _Numbers) -> None:
             "body.inertia: expected principal moments of which none is larger than the sum of the "
             f"others, got {low:.4g}, {middle:.4g} and {high:.4g} kg m²"
         )
+
+
+def inertia_matrix(values: Sequence[float]) -> NDArray[np.float64]:
+    """Of Ixx, Iyy, Izz, Ixy, Ixz and Iyz, shape (3, 3)."""
+    xx, yy, zz, xy, xz, yz = values
+    return np.array(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))
 
 
 def _plain(tree: object) -> object:
