@@ -114,18 +114,6 @@ def test_the_heavy_hexacopter_follows_from_its_derivations() -> None:
     assert told["rotors.time_constant"].value == pytest.approx(time, rel=1e-2)
 
 
-def test_the_page_shows_all_published_inertias_of_the_crazyflie_brushless() -> None:
-    page = (FOLDER / "crazyflie_brushless" / "README.md").read_text(encoding="utf-8")
-    rows = page.split("| `body.inertia`, kg m² |")[1].split("\n| `")[0]
-    assert re.findall(r"(?:^|\n\|  \|) (.*?) \|", rows) == [
-        "**3.3e-05, 3.6e-05, 5.9e-05**",
-        "3.3e-05, 3.6e-05, 5.9e-05",
-        "2.5e-05, 2.8e-05, 4.9e-05",
-        "2.3951e-05, 2.3951e-05, 3.2347e-05",
-        "2.3951e-05, 2.3951e-05, 3.2347e-06",
-    ]
-
-
 def test_with_the_menagerie_s_turn_directions_the_skydio_x2_cannot_yaw(tmp_path: Path) -> None:
     text = (FOLDER / "skydio_x2" / "vehicle.toml").read_text(encoding="utf-8")
     ours = re.findall(r'turn = "(.*)"', text)

@@ -115,23 +115,6 @@ def test_sensors_at_hover(model: mujoco.MjModel, hovering: mujoco.MjData) -> Non
         assert hovering.sensor(name).data == pytest.approx(value, abs=1e-12), name
 
 
-def test_sensors_know_their_frames(model: mujoco.MjModel) -> None:
-    data = mujoco.MjData(model)
-    quarter = math.sqrt(0.5)  # nose to the left: body x is world y
-    data.qpos[:] = (1.0, 2.0, 3.0, quarter, 0.0, 0.0, quarter)
-    data.qvel[:] = (4.0, 5.0, 6.0, 0.1, 0.2, 0.3)
-    mujoco.mj_forward(model, data)
-    assert data.sensor("position").data == pytest.approx([1.0, 2.0, 3.0])
-    assert data.sensor("velocity").data == pytest.approx([4.0, 5.0, 6.0])  # world
-    assert data.sensor("gyro").data == pytest.approx([0.1, 0.2, 0.3])  # body
-    assert data.sensor("accelerometer").data == pytest.approx([0.0, 0.0, 0.0], abs=1e-12)  # falling
-
-
-def test_offscreen_buffer_is_large_enough(model: mujoco.MjModel) -> None:
-    assert model.vis.global_.offwidth >= 1280
-    assert model.vis.global_.offheight >= 720
-
-
 OWN = {
     "ground": '<geom name="own" type="plane" size="0 0 1"/>',
     "sun": '<light name="own" pos="0 0 5"/>',

@@ -1,17 +1,16 @@
 """The airport alone; test_scenery.py has what it shares with the scenes of a seed."""
 
 import math
-import os
-import subprocess
-import sys
 from collections.abc import Callable
+from contextlib import closing
 from itertools import combinations
-from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
-from rotorgram.models import InputError
+from rotorgram.models import InputError, Vehicle
+from rotorgram.models.cameras import chosen_views
+from rotorgram.rendering.cameras import Cameras
 from rotorgram.scenes import AIRPORT_XML, add_airport, build_scene
 
 OTHER = """
@@ -121,80 +120,26 @@ def test_flat_things_of_one_height_do_not_overlap(
             )
 
 
-NO_GL = 77
-DRAW = f"""
-import sys
-try:
-    import mujoco
-    import numpy as np
-    from rotorgram.scenes import build_scene
-    spec = build_scene(scene="airport")
-    # 12 m behind the craft and 2 m above it, looking forward: the horizon is the middle row
-    spec.worldbody.add_camera(name="eye", pos=[-12, 0, 4], quat=[0.5, 0.5, -0.5, -0.5], fovy=50)
-    model = spec.compile()
-    renderer = mujoco.Renderer(model, 120, 160)
-except Exception as error:
-    print(f"no OpenGL: {{error!r}}")
-    sys.exit({NO_GL})
-data = mujoco.MjData(model)
-data.qpos[2] = 2
-mujoco.mj_forward(model, data)
-renderer.update_scene(data, "eye")
-picture = renderer.render().copy()
-renderer.enable_segmentation_rendering()
-renderer.update_scene(data, "eye")
-geoms = renderer.render()[:, :, 0].copy()
-np.savez(sys.argv[1], picture=picture, geoms=geoms)
-renderer.close()
-"""
-
-
-@pytest.fixture(scope="module")
-def drawn(tmp_path_factory: pytest.TempPathFactory) -> tuple[np.ndarray, np.ndarray]:
-    """Picture (120, 160, 3) and geom of each pixel (120, 160), −1 the sky. Skips without OpenGL.
-
-    In a process of its own: MuJoCo chooses its OpenGL once, when it is imported.
-    """
-    file = tmp_path_factory.mktemp("airport") / "drawn.npz"
-    environment = {**os.environ, "MUJOCO_GL": os.environ.get("MUJOCO_GL", "egl")}
-    done = subprocess.run(
-        [sys.executable, "-c", DRAW, str(file)], env=environment, capture_output=True, text=True
-    )
-    if done.returncode == NO_GL:
-        pytest.skip(done.stdout.strip())
-    assert done.returncode == 0, done.stderr
-    with np.load(Path(file)) as arrays:
-        return arrays["picture"].astype(int), arrays["geoms"]
-
-
-def test_sky_above_the_horizon_and_ground_below(drawn: tuple[np.ndarray, np.ndarray]) -> None:
-    _, geoms = drawn
-    focal = 60 / math.tan(math.radians(25))  # pixels
-    antenna = math.atan2(34.5 - 4, 104 + 12)  # the tower's tip, as if straight ahead
-    clear = int(60 - focal * math.tan(antenna)) - 2
+def test_sky_is_above_the_horizon_and_ground_below(opengl: None) -> None:
+    vehicle = Vehicle.load()
+    views = chosen_views(["front@160x120", "front_segmentation@160x120"], vehicle.cameras)
+    state = {"position": np.array([[0.0, 0.0, 4.0]]), "quaternion": np.array([[1.0, 0, 0, 0]])}
+    everybody = np.ones(1, bool)
+    with closing(Cameras(vehicle, views, scene="airport")) as cameras:
+        cameras.take({view.name: everybody for view in views}, everybody, state)
+        picture = cameras.pictures["front"][0].astype(int)
+        seen = cameras.pictures["front_segmentation"][0, ..., 0]
+        names = cameras.objects
+    antenna = (34.5 - 4) / (104 - vehicle.radius)  # the tower's tip, as if straight ahead
+    clear = int(60 - 60 * antenna) - 2  # 90 degrees high: 60 pixels to each metre, 1 m ahead
     assert clear > 20
-    assert (geoms[:clear] == -1).all()
-    assert (geoms[62:] >= 0).all()  # the ground ends 1200 m away, 0.2 degrees below the horizon
-
-
-def test_drone_is_seen_before_it_at_its_size(
-    model: mujoco.MjModel, drawn: tuple[np.ndarray, np.ndarray]
-) -> None:
-    _, geoms = drawn
-    seen = (geoms >= 0) & (model.geom_bodyid[geoms] == model.body("quad").id)
-    columns = np.flatnonzero(seen.any(axis=0))
-    focal = 60 / math.tan(math.radians(25))
-    width = 2 * 1.4 / 11 * focal  # the rear rotors' discs, 11 m before the eye
-    assert columns.max() - columns.min() + 1 == pytest.approx(width, abs=2.5)
-    assert (columns.max() + columns.min()) / 2 == pytest.approx(79.5, abs=1.0)
-
-
-def test_colours(model: mujoco.MjModel, drawn: tuple[np.ndarray, np.ndarray]) -> None:
-    picture, geoms = drawn
-    red, green, blue = picture[geoms == -1].mean(axis=0)
+    assert (seen[:clear] == 0).all()
+    assert (seen[62:] > 0).all()  # the ground ends 1200 m away, 0.2 degrees below the horizon
+    red, green, blue = picture[seen == 0].mean(axis=0)
     assert blue > green > red  # sky
-    red, green, blue = picture[geoms == model.geom("airport/grass").id].mean(axis=0)
+    red, green, blue = picture[seen == names.index("airport/grass")].mean(axis=0)
     assert green > red > blue
-    red, green, blue = picture[geoms == model.geom("airport/apron").id].mean(axis=0)
+    red, green, blue = picture[seen == names.index("airport/apron")].mean(axis=0)
     assert max(red, green, blue) - min(red, green, blue) < 20  # grey
-    assert not (geoms == model.geom("scene/floor").id).any()  # hidden by the airport's own ground
+    hidden = names.index("scene/floor") if "scene/floor" in names else -1
+    assert not (seen == hidden).any()  # by the airport's own ground
