@@ -41,7 +41,7 @@ class _Direction(Limits):
         return f"{super().expected}, not all 0"
 
     def read(self, value: object) -> Any:
-        numbers = super().read(value)
+        numbers: Any = super().read(value)
         if math.hypot(*numbers) <= 1e-6:
             raise ValueError
         return numbers

@@ -81,17 +81,23 @@ def _pitched(angle: float) -> np.ndarray:
 # ---- noise
 
 
+def over_ground(cameras: Cameras, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Pictures of the ground by `noisy` of so many worlds, without noise and with it."""
+    level = state(*[(0.0, 0.0, 50.0)] * count, quaternion=_pitched(math.pi / 2))
+    plain = take(cameras, **level)["noisy"].astype(float)
+    dice = np.random.default_rng(1)
+    everybody = np.ones(count, bool)
+    cameras.take({"noisy": everybody}, everybody, level, lambda _: dice)
+    return plain, cameras.pictures["noisy"].astype(float)
+
+
 def test_noise_is_as_wide_as_told(made: Any, tmp_path: Path) -> None:
     """Over many pictures of the ground the mean is its colour, the spread that of √(a² v + b²)."""
     craft = vehicle_with(tmp_path, OPTICS.replace("exposure = 0.5", ""))
-    cameras = made("noisy", craft, shape=(40, 1))
-    level = state(*[(0.0, 0.0, 50.0)] * 40, quaternion=_pitched(math.pi / 2))
-    plain = take(cameras, **level)["noisy"].astype(float)
-    dice = np.random.default_rng(1)
-    cameras.take({"noisy": np.ones(40, bool)}, np.ones(40, bool), level, lambda _: dice)
+    plain, noisy = over_ground(made("noisy", craft, shape=(40, 1)), 40)
     between = (plain > 50) & (plain < 200)  # far from black and white, where it is cut
     assert between.mean() > 0.5
-    noise = (cameras.pictures["noisy"] / 255 - plain / 255)[between]
+    noise = ((noisy - plain) / 255)[between]
     expected = np.sqrt(0.04**2 * plain / 255 + 0.02**2)[between]
     assert (noise / expected).std() == pytest.approx(1.0, rel=0.02)
     assert abs(noise.mean()) < 5e-4
@@ -99,13 +105,9 @@ def test_noise_is_as_wide_as_told(made: Any, tmp_path: Path) -> None:
 
 def test_exposure_is_one_for_each_picture(made: Any, tmp_path: Path) -> None:
     craft = vehicle_with(tmp_path, OPTICS.replace("noise = [0.04, 0.02]", ""))
-    cameras = made("noisy", craft, shape=(60, 1))
-    level = state(*[(0.0, 0.0, 50.0)] * 60, quaternion=_pitched(math.pi / 2))
-    plain = take(cameras, **level)["noisy"].astype(float)
-    dice = np.random.default_rng(2)
-    cameras.take({"noisy": np.ones(60, bool)}, np.ones(60, bool), level, lambda _: dice)
+    both = over_ground(made("noisy", craft, shape=(60, 1)), 60)
     stops = []
-    for picture, own in zip(cameras.pictures["noisy"].astype(float), plain, strict=True):
+    for own, picture in zip(*both, strict=True):
         lit = picture < 255
         share = (picture * own)[lit].sum() / (own**2)[lit].sum()
         assert np.abs(picture - share * own)[lit].max() <= 1.0  # of 255: it is rounded twice
