@@ -305,9 +305,9 @@ HEIGHTS = '<hfield name="h" nrow="100000" ncol="100000" size="1 1 1 1"/></asset>
         (
             "</asset>",
             HEIGHTS,
-            "field or texture of at most 4096 × 4096 points, got",
+            "a nrow of at most 4096 in <hfield>, got 100000",
         ),
-        ("</asset>", COLOURS, "texture of at most 4096 × 4096 points, got 100000 × 100000"),
+        ("</asset>", COLOURS, "a width of at most 4096 in <texture>, got 100000"),
         ("</worldbody>", SPHERES + "</worldbody>", "expected at most 10000 elements, got 30000"),
         ("</worldbody>", NESTED + "</worldbody>", "expected at most 10000 elements"),
         ("<worldbody>", '<size memory="1"/><worldbody>', "expected an MJCF file, .* out of memory"),
