@@ -1,17 +1,16 @@
 """The airport alone; test_scenery.py has what it shares with the scenes of a seed."""
 
 import math
-from collections.abc import Callable
 from contextlib import closing
 from itertools import combinations
 
 import mujoco
 import numpy as np
 import pytest
-from rotorgram.models import InputError, Vehicle
+from rotorgram.models import Vehicle
 from rotorgram.models.cameras import chosen_views
 from rotorgram.rendering.cameras import Cameras
-from rotorgram.scenes import AIRPORT_XML, add_airport, build_scene
+from rotorgram.scenes import AIRPORT_XML, add_scene, build_scene
 
 OTHER = """
 <mujoco>
@@ -28,20 +27,9 @@ OTHER = """
 """
 
 
-def other() -> mujoco.MjSpec:
-    return mujoco.MjSpec.from_string(OTHER)
-
-
-def with_airport(make: Callable[[], mujoco.MjSpec]) -> mujoco.MjModel:
-    spec = make()
-    add_airport(spec)
-    spec.compiler.discardvisual = False
-    return spec.compile()
-
-
 @pytest.fixture(scope="module")
 def model() -> mujoco.MjModel:
-    return with_airport(build_scene)
+    return build_scene(scene="airport").compile()
 
 
 @pytest.fixture(scope="module")
@@ -52,27 +40,26 @@ def airport(model: mujoco.MjModel) -> np.ndarray:
     return np.flatnonzero(ours)
 
 
+def other_at_the_airport() -> mujoco.MjModel:
+    spec = mujoco.MjSpec.from_string(OTHER)
+    add_scene(spec, "airport")
+    return spec.compile()
+
+
 def test_only_the_floor_is_hidden() -> None:
-    model = with_airport(other)
+    model = other_at_the_airport()
     assert [model.geom(name).group[0] for name in ("floor", "wall", "deck")] == [3, 0, 0]
     assert model.geom("floor").contype[0] == 1
 
 
-@pytest.mark.parametrize("make", [build_scene, other])
-def test_the_scenes_own_scale_stays(make: Callable[[], mujoco.MjSpec]) -> None:
-    alone = make().compile()
-    model = with_airport(make)
-    assert model.stat.extent == alone.stat.extent
-    assert model.stat.center.tolist() == alone.stat.center.tolist()
-    assert model.vis.map.znear * model.stat.extent == pytest.approx(0.25)
-    assert model.vis.map.zfar * model.stat.extent == pytest.approx(1200.0)
-
-
-def test_a_second_airport_is_refused() -> None:
-    spec = build_scene()
-    add_airport(spec)
-    with pytest.raises(InputError, match="spec: expected a scene without an airport"):
-        add_airport(spec)
+def test_the_scenes_own_scale_stays(model: mujoco.MjModel) -> None:
+    plain = build_scene().compile()
+    other = mujoco.MjSpec.from_string(OTHER).compile()
+    for alone, there in ((plain, model), (other, other_at_the_airport())):
+        assert there.stat.extent == alone.stat.extent
+        assert there.stat.center.tolist() == alone.stat.center.tolist()
+        assert there.vis.map.znear * there.stat.extent == pytest.approx(0.25)
+        assert there.vis.map.zfar * there.stat.extent == pytest.approx(1200.0)
 
 
 def test_it_has_geoms_alone_and_not_too_many(airport: np.ndarray) -> None:
