@@ -19,7 +19,8 @@ import numpy as np
 from . import MAX_DRAG
 from .cameras import Camera, own_cameras, read_cameras
 from .coefficients import PREFIX, Coefficients
-from .errors import InputError, shortened
+from .errors import InputError
+from .fields import Limits, check
 from .library import find_vehicle
 from .mjcf import free_body, level_data, vehicle_spec
 from .vehicle_file import inertia_matrix, read_vehicle_file
@@ -104,17 +105,13 @@ class Vehicle:
         enter; numbers do, those of TOML with all digits, others to the six that MuJoCo writes.
         """
         file = find_vehicle(path)
-        right = isinstance(linear_drag, int | float | np.floating) and 0 <= linear_drag <= MAX_DRAG
-        if not right:
-            raise InputError(
-                f"linear_drag: expected a number from 0 to {MAX_DRAG:g} /s, "
-                f"got {shortened(linear_drag)}"
-            )
+        # No negative zero.
+        drag = check("linear_drag", Limits(0.0, MAX_DRAG, "/s"), linear_drag) + 0.0
         try:
             changed = tuple(one.stat().st_mtime_ns for one in _files(file))
         except OSError as error:
             raise InputError(f"vehicle: cannot read {path}: {error.strerror}") from None
-        return _load(file, float(linear_drag) + 0.0, changed)  # no negative zero
+        return _load(file, drag, changed)
 
     @property
     def num_rotors(self) -> int:
@@ -487,11 +484,12 @@ def _hover(rotors: tuple[Rotor, ...], allocation: np.ndarray, weight: float) -> 
     thrust = trim_thrust(rotors, allocation, weight)
     left = np.abs(allocation @ thrust - (weight, 0.0, 0.0, 0.0)).max()
     sideways = np.array([rotor.axis[:2] for rotor in rotors]).T @ thrust
-    hovers = left <= 1e-6 * _torque_scale(allocation, weight)
-    hovers = hovers and np.abs(sideways).max() <= _ROUNDED * weight
-    able = "rotors that can carry the level craft without a torque or a sideways force"
-    if not hovers:
-        raise InputError(f"vehicle: expected {able}, got ones that cannot")
+    balanced = left <= 1e-6 * _torque_scale(allocation, weight)
+    if not balanced or np.abs(sideways).max() > _ROUNDED * weight:
+        raise InputError(
+            "vehicle: expected rotors that can carry the level craft without a torque or a "
+            "sideways force, got ones that cannot"
+        )
     for rotor, newtons in zip(rotors, thrust.tolist(), strict=True):
         carries = f"rotor {rotor.name} to carry"
         part = f"{carries} a part of the weight of the level craft"
