@@ -305,12 +305,14 @@ def own_cameras(radius: float, rest_height: float) -> tuple[Camera, ...]:
 def place_camera(spec: mujoco.MjSpec, body: mujoco.MjsBody, camera: Camera) -> None:
     """Add a camera to a body of a spec; its rate and optics are custom texts."""
     right = np.cross(camera.look, camera.up)
-    added = body.add_camera(name=camera.name, pos=camera.position)
-    added.alt.type = mujoco.mjtOrientation.mjORIENTATION_XYAXES
-    added.alt.xyaxes = np.concatenate((right, np.cross(right, camera.look)))
-    added.fovy = math.degrees(camera.fovy)
-    added.resolution = (camera.width, camera.height)
-    added.output = sum(int(OUTPUTS[kind]) for kind in camera.kinds)
+    body.add_camera(
+        name=camera.name,
+        pos=camera.position,
+        xyaxes=np.concatenate((right, np.cross(right, camera.look))),
+        fovy=math.degrees(camera.fovy),
+        resolution=(camera.width, camera.height),
+        output=sum(int(OUTPUTS[kind]) for kind in camera.kinds),
+    )
     texts = {one.name: np.ravel(getattr(camera.optics, one.name)) for one in fields(Optics)}
     if camera.every > 1:
         texts["rate"] = np.array([1 / camera.every])

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 import mujoco
 import numpy as np
@@ -37,6 +37,7 @@ from .vehicle import (
     rotor_name,
     trim_thrust,
 )
+from .vehicle_file import inertia_matrix
 
 Array = NDArray[np.float64]
 
@@ -56,7 +57,8 @@ _COARSE: Final = 0.05  # rad: the turn in a step of the coarsest of three flight
 _TINY: Final = 1e-300  # divides where there is nothing to divide by
 
 
-class Rule(NamedTuple):
+@dataclass(frozen=True)
+class Rule:
     """How a number is judged."""
 
     equation: str
@@ -66,28 +68,20 @@ class Rule(NamedTuple):
     meaning: str
     """What it means if the check fails."""
     low: float = 0.0
-    """Least value that passes, where no expected value is computed."""
+    """Least value that passes."""
     high: float = 0.0
     """Largest value that passes."""
     unit: str = ""
+    """Of the numbers; empty for pure numbers."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Check:
-    """One line of the examination."""
+class Check(Rule):
+    """One line of the examination; its limits may be those of the craft."""
 
     name: str
     measured: float
     """NaN where it could not be measured: such a check fails."""
-    low: float
-    """Least value that passes."""
-    high: float
-    """Largest value that passes."""
-    unit: str
-    """Of the numbers; empty for pure numbers."""
-    equation: str
-    source: str
-    meaning: str
     expected: float | None = None
     """What `measured` is compared with; None for a range."""
     note: str = ""
@@ -252,14 +246,14 @@ def _judged(
         low = expected - tolerance
         high = expected + tolerance
     return Check(
-        name=key.format(*of),
-        measured=float(measured),
-        low=float(rule.low if low is None else low),
-        high=float(rule.high if high is None else high),
-        unit=rule.unit,
         equation=rule.equation,
         source=rule.source,
         meaning=meaning or rule.meaning.format(*of),
+        low=float(rule.low if low is None else low),
+        high=float(rule.high if high is None else high),
+        unit=rule.unit,
+        name=key.format(*of),
+        measured=float(measured),
         expected=expected,
         note=note,
     )
@@ -374,9 +368,7 @@ def _mend(spec: mujoco.MjSpec) -> Iterator[tuple[str, Array]]:
             continue
         moments = np.sort(np.array(body.inertia, np.float64))
         if np.isfinite(body.fullinertia[0]):
-            xx, yy, zz, xy, xz, yz = body.fullinertia
-            full = np.array(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))
-            moments[:] = np.linalg.eigvalsh(full)
+            moments[:] = np.linalg.eigvalsh(inertia_matrix(body.fullinertia))
         yield body.name or "a body without a name", moments
         if not (moments[0] > 0 and moments[0] + moments[1] >= moments[2] * (1 - _RELATIVE)):
             body.fullinertia = [math.nan, 0, 0, 0, 0, 0]

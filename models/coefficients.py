@@ -6,7 +6,7 @@ it cannot be switched on. SI units; body axes x forward, y left, z up.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Annotated, Any, Final
 
 from .errors import InputError
@@ -137,18 +137,13 @@ class Coefficients:
     @classmethod
     def read(cls, numbers: Mapping[str, object]) -> "Coefficients":
         """From numbers and lists of numbers by "group.name". Raises `InputError`."""
-        groups: dict[str, dict[str, Any]] = {one.name: {} for one in fields(cls)}
+        groups: dict[str, dict[str, Any]] = {}
         for name, value in numbers.items():
             group, _, key = name.partition(".")
             alike = [word for word in COEFFICIENTS if word.startswith(group + ".")]
             check_names([name], alike or COEFFICIENTS, "vehicle")
-            groups[group][key] = check(name, COEFFICIENTS[name], value)
-        return cls(
-            rotors=Rotors(**groups["rotors"]),
-            drag=Drag(**groups["drag"]),
-            battery=Battery(**groups["battery"]),
-            sensors=Sensors(**groups["sensors"]),
-        )
+            groups.setdefault(group, {})[key] = check(name, COEFFICIENTS[name], value)
+        return cls(**{group: GROUPS[group](**values) for group, values in groups.items()})
 
     def numbers(self) -> dict[str, tuple[float, ...]]:
         """The reverse of `read`: the coefficients of the file, by "group.name"."""
@@ -160,10 +155,10 @@ class Coefficients:
         return found
 
 
+GROUPS: Final = {"rotors": Rotors, "drag": Drag, "battery": Battery, "sensors": Sensors}
 COEFFICIENTS: Final[Mapping[str, Limits]] = {
-    **limits_of(Rotors, "rotors."),
-    **limits_of(Drag, "drag."),
-    **limits_of(Battery, "battery."),
-    **limits_of(Sensors, "sensors."),
+    name: limits
+    for group, kind in GROUPS.items()
+    for name, limits in limits_of(kind, f"{group}.").items()
 }
 """The limits of every coefficient, by "group.name"."""

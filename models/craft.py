@@ -4,7 +4,7 @@ import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import mujoco
 
@@ -79,27 +79,24 @@ def _add_geom(
     kind: mujoco.mjtGeom,
     rgba: Colour,
     size: Vector,
-    pos: Vector = (0.0, 0.0, 0.0),
     *,
-    ends: Vector = (),
-    axis: Vector = UP,
-    yaw: float = 0.0,
-    mass: float = 0.0,
     group: int = 2,
+    mass: float = 0.0,
     solid: bool = False,
+    **place: object,
 ) -> None:
-    """A geom at a place, or between two `ends`, that is drawn; a solid one collides."""
-    geom = body.add_geom(name=name, type=kind, rgba=rgba, pos=pos, mass=mass, group=group)
-    geom.size[: len(size)] = size
-    geom.contype = geom.conaffinity = int(solid)
-    if ends:
-        geom.fromto = ends
-    if tuple(axis) != UP:
-        geom.alt.type = mujoco.mjtOrientation.mjORIENTATION_ZAXIS
-        geom.alt.zaxis = axis
-    if yaw:
-        geom.alt.type = mujoco.mjtOrientation.mjORIENTATION_EULER
-        geom.alt.euler = (0.0, 0.0, yaw)
+    """A geom that is drawn; a solid one collides."""
+    body.add_geom(
+        name=name,
+        type=kind,
+        rgba=rgba,
+        size=(*size, 0.0, 0.0)[:3],
+        group=group,
+        mass=mass,
+        contype=int(solid),
+        conaffinity=int(solid),
+        **place,
+    )
 
 
 def _scaled(vector: Vector, factor: float) -> tuple[float, ...]:
@@ -136,33 +133,37 @@ def _build(spec: mujoco.MjSpec, file: VehicleFile) -> None:
     _add_geom(body, "hub", _BOX, _CARBON, half, group=seen, solid=True)
     for rotor, place in rotors:
         size = (0.09 * unit, motor)
+        turn = _along(rotor.axis)
         name = f"motor {rotor.name}"
-        _add_geom(
-            body, name, _CYLINDER, _SILVER, size, place, axis=rotor.axis, group=seen, solid=True
-        )
+        _add_geom(body, name, _CYLINDER, _SILVER, size, pos=place, group=seen, solid=True, **turn)
     _add_skids(body, half, unit, clearance)
     _add_looks(body, half)
     radius = file.rotors.radius or 0.4 * _nearest([place for _, place in rotors], reach)
     for number, (rotor, place) in enumerate(rotors, 1):
         if not file.body.parts and math.hypot(*place[:2]) > half[0]:
             ends = (0.0, 0.0, 0.0, *place)
-            _add_geom(body, f"arm{number}", _CYLINDER, _CARBON, (0.035 * unit,), ends=ends)
+            _add_geom(body, f"arm{number}", _CYLINDER, _CARBON, (0.035 * unit,), fromto=ends)
         up = _scaled(rotor.axis, 0.09 * unit / math.hypot(*rotor.axis))
         above = (place[0] + up[0], place[1] + up[1], place[2] + up[2])
         rgba = _FRONT_DISC if place[0] > 1e-6 * reach else _DISC
         _add_disc(body, f"disc{number}", rotor, radius, above, rgba)
         blade = _scaled((0.97, 0.09, 0.018), radius)
-        yaw = 0.4 + 1.5 * number if rotor.axis == UP else 0.0
-        _add_geom(body, "", _ELLIPSOID, _CARBON, blade, above, axis=rotor.axis, yaw=yaw)
-        site = body.add_site(name=rotor.name, pos=place, group=4)
-        site.size[0] = 0.02 * unit
+        turn = _along(rotor.axis) or {"euler": (0.0, 0.0, 0.4 + 1.5 * number)}
+        _add_geom(body, "", _ELLIPSOID, _CARBON, blade, pos=above, **turn)
+        site = body.add_site(name=rotor.name, pos=place, group=4, size=(0.02 * unit, 0.005, 0.005))
         _add_actuator(spec, file, rotor, site)
+
+
+def _along(axis: Vector) -> dict[str, Any]:
+    """How a geom whose z axis is this one is turned."""
+    return {} if tuple(axis) == UP else {"zaxis": axis}
 
 
 def _add_disc(
     body: mujoco.MjsBody, name: str, rotor: PlacedRotor, radius: float, place: Vector, rgba: Colour
 ) -> None:
-    _add_geom(body, name, _CYLINDER, rgba, (radius, 0.01 * radius), place, axis=rotor.axis)
+    size = (radius, 0.01 * radius)
+    _add_geom(body, name, _CYLINDER, rgba, size, pos=place, **_along(rotor.axis))
 
 
 def _sides(parts: Sequence[Box | Cylinder], unit: float) -> Vector:
@@ -177,17 +178,17 @@ def _add_mass(body: mujoco.MjsBody, file: VehicleFile) -> None:
     """Mass and inertia as given, or parts that have them."""
     table = file.body
     for number, part in enumerate(table.parts, 1):
+        if isinstance(part, Box):
+            kind = _BOX
+            size = _scaled(part.size, 0.5)
+            turn: dict[str, Any] = {"euler": (0.0, 0.0, part.yaw)}
+        else:
+            kind = _CYLINDER
+            size = (part.radius, part.length / 2)
+            turn = _along(part.axis)
         name = f"part{number}"
         place = part.position
-        if isinstance(part, Box):
-            size = _scaled(part.size, 0.5)
-            _add_geom(body, name, _BOX, _CARBON, size, place, yaw=part.yaw, mass=part.mass, group=1)
-        else:
-            size = (part.radius, part.length / 2)
-            axis = part.axis
-            _add_geom(
-                body, name, _CYLINDER, _CARBON, size, place, axis=axis, mass=part.mass, group=1
-            )
+        _add_geom(body, name, kind, _CARBON, size, pos=place, mass=part.mass, group=1, **turn)
     if table.parts:
         return
     assert table.mass is not None
@@ -209,18 +210,18 @@ def _add_skids(body: mujoco.MjsBody, half: Vector, unit: float, clearance: float
     for side, y in (("left", 0.45 * unit), ("right", -0.45 * unit)):
         ends = (-long, y, low, long, y, low)
         name = f"skid {side}"
-        _add_geom(body, name, _CAPSULE, _SILVER, (thick,), ends=ends, group=1, solid=True)
+        _add_geom(body, name, _CAPSULE, _SILVER, (thick,), fromto=ends, group=1, solid=True)
         for x in (-0.6 * long, 0.6 * long):
             top = (math.copysign(0.7 * half[0], x), math.copysign(0.8 * half[1], y), -half[2] / 2)
-            _add_geom(body, "", _CAPSULE, _SILVER, (0.7 * thick,), ends=(*top, x, y, low))
+            _add_geom(body, "", _CAPSULE, _SILVER, (0.7 * thick,), fromto=(*top, x, y, low))
 
 
 def _add_looks(body: mujoco.MjsBody, half: Vector) -> None:
     x, y, z = half
     shell = (1.2 * x, 0.9 * y, 1.7 * z)
     mark = (0.6 * x, 0.55 * y, 1.1 * z)
-    _add_geom(body, "canopy", _ELLIPSOID, _SHELL, shell, (0.0, 0.0, 0.7 * z))
-    _add_geom(body, "front mark", _ELLIPSOID, _ORANGE, mark, (0.9 * x, 0.0, 0.6 * z))
+    _add_geom(body, "canopy", _ELLIPSOID, _SHELL, shell, pos=(0.0, 0.0, 0.7 * z))
+    _add_geom(body, "front mark", _ELLIPSOID, _ORANGE, mark, pos=(0.9 * x, 0.0, 0.6 * z))
 
 
 def _nearest(places: Sequence[Vector], reach: float) -> float:

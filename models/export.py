@@ -5,7 +5,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from .errors import InputError
-from .files import write_new
+from .files import check_new_file, write_new
 from .library import find_vehicle
 from .mjcf import read_spec
 from .vehicle import Vehicle
@@ -14,10 +14,7 @@ from .vehicle_file import read_vehicle_file
 
 def export_mjcf(vehicle: Path | str, out: Path) -> None:
     """Write a vehicle's MJCF to a new file, with the six digits of MuJoCo. Raises `InputError`."""
-    if out.suffix.lower() != ".xml":
-        raise InputError(f"out: expected a name that ends in .xml, got {out}")
-    if out.exists():
-        raise InputError(f"out: expected the name of a new file, got {out}, which is there")
+    check_new_file(out, ".xml")
     path = find_vehicle(vehicle)
     Vehicle.load(path)  # refuses what cannot fly
     if path.suffix.lower() == ".toml":

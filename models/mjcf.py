@@ -12,20 +12,21 @@ from .craft import craft_spec
 from .errors import InputError
 from .vehicle_file import read_vehicle_file
 
-MAX_POINTS: Final = 4096  # rows and columns of a height field: 16.8 million points, 0.3 GB
 MAX_ELEMENTS: Final = 10_000  # of a file, each as often as it is repeated: seconds to compile
-MAX_SIZES: Final = {
+MAX_MEMORY: Final = 1 << 30  # bytes of MJCF's attribute `memory`
+MAX_NUMBERS: Final = 1 << 26  # of all height fields, textures, numerics and sensors: 0.5 GB
+_SIZES: Final = {
     "nuser_body": 100, "nuser_jnt": 100, "nuser_geom": 100, "nuser_site": 100, "nuser_cam": 100,
     "nuser_tendon": 100, "nuser_actuator": 100, "nuser_sensor": 100, "nuserdata": 1_000_000,
     "nkey": 100, "nconmax": 100_000, "njmax": 4000, "nstack": 10_000_000,
 }  # fmt: skip
-"""Largest attributes of MJCF's element `size`."""
-MAX_MEMORY: Final = 1 << 30  # bytes of MJCF's attribute `memory`
-MAX_LENGTH: Final = 10_000  # numbers of a custom numeric or of a sensor
-MAX_NUMBERS: Final = 1 << 26  # of all height fields, textures, numerics and sensors: 0.5 GB
-_SIDES: Final = ("nrow", "ncol", "width", "height")
-_LENGTHS: Final = ("size", "dim", "num", "nsample", "actdim")
-_LENGTHS_OF: Final = ("numeric", "user", "contact", "general", "plugin")
+_SIDES: Final = dict.fromkeys(("nrow", "ncol", "width", "height"), 4096)
+_LENGTHS: Final = dict.fromkeys(("size", "dim", "num", "nsample", "actdim"), 10_000)
+_ARRAYS: Final = {
+    **dict.fromkeys(("hfield", "texture"), _SIDES),
+    **dict.fromkeys(("numeric", "user", "contact", "general", "plugin"), _LENGTHS),
+}
+"""Largest attributes of the elements whose product is a number of numbers."""
 _REPEATED: Final = ("replicate", "composite", "flexcomp")
 _UNITS: Final = {"K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40, "P": 1 << 50, "E": 1 << 60}
 _GROUNDS: Final = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
@@ -101,6 +102,14 @@ def free_body(spec: mujoco.MjSpec) -> mujoco.MjsBody:
     return next(body for body in spec.bodies if any(joint.type == free for joint in body.joints))
 
 
+def level_data(model: mujoco.MjModel) -> mujoco.MjData:
+    """All free bodies of a model level at the origin, and where that places the others."""
+    data = mujoco.MjData(model)
+    data.qpos.reshape(-1, 7)[:] = (0, 0, 0, 1, 0, 0, 0)
+    mujoco.mj_kinematics(model, data)
+    return data
+
+
 def switch_off_log_file() -> None:
     """Keep MuJoCo from writing MUJOCO_LOG.TXT; a log file of another name stays on."""
     config = mujoco.MjLogConfig.get()
@@ -142,36 +151,22 @@ def _check_sizes(path: Path) -> None:
 
 
 def _check_element(element: ElementTree.Element) -> None:
-    if element.tag in ("hfield", "texture"):
-        sides = [element.get(side, "0") for side in _SIDES]
-        if any(_whole(side) > MAX_POINTS for side in sides):
-            got = " × ".join(side for side in sides if side != "0")
-            limit = f"at most {MAX_POINTS} × {MAX_POINTS} points"
-            _refuse(f"a height field or texture of {limit}", got)
-    elif element.tag == "size":
-        for name, largest in MAX_SIZES.items():
-            _check_size(element, name, largest)
-        memory = element.get("memory", "0").strip().upper()
-        unit = _UNITS.get(memory[-1:], 1)
-        if _whole(memory.rstrip("".join(_UNITS))) * unit > MAX_MEMORY:
-            _refuse(f"a memory of at most {MAX_MEMORY >> 30}G", memory)
-    elif element.tag in _LENGTHS_OF:
-        for name in _LENGTHS:
-            _check_size(element, name, MAX_LENGTH)
+    largest = _SIZES if element.tag == "size" else _ARRAYS.get(element.tag, {})
+    for name, most in largest.items():
+        text = element.get(name, "0")
+        if _whole(text) > most:
+            _refuse(f"a {name} of at most {most} in <{element.tag}>", text)
+    memory = element.get("memory", "0").strip().upper()
+    unit = _UNITS.get(memory[-1:], 1)
+    if _whole(memory.rstrip("".join(_UNITS))) * unit > MAX_MEMORY:
+        _refuse(f"a memory of at most {MAX_MEMORY >> 30}G", memory)
 
 
 def _numbers(element: ElementTree.Element) -> int:
     """How many numbers MuJoCo allocates for an asset, a custom numeric or a sensor."""
-    names = _SIDES if element.tag in ("hfield", "texture") else _LENGTHS
-    if element.tag not in ("hfield", "texture", *_LENGTHS_OF):
+    if element.tag not in _ARRAYS:
         return 0
-    return math.prod(max(1, _whole(element.get(name, "1"))) for name in names)
-
-
-def _check_size(element: ElementTree.Element, name: str, largest: int) -> None:
-    text = element.get(name, "0")
-    if _whole(text) > largest:
-        _refuse(f"a {name} of at most {largest} in <{element.tag}>", text)
+    return math.prod(max(1, _whole(element.get(name, "1"))) for name in _ARRAYS[element.tag])
 
 
 def _whole(text: str) -> int:

@@ -19,10 +19,11 @@ import numpy as np
 from . import MAX_DRAG
 from .cameras import Camera, own_cameras, read_cameras
 from .coefficients import PREFIX, Coefficients
-from .errors import InputError, shortened
+from .errors import InputError
+from .fields import Limits, check
 from .library import find_vehicle
-from .mjcf import free_body, vehicle_spec
-from .vehicle_file import read_vehicle_file
+from .mjcf import free_body, level_data, vehicle_spec
+from .vehicle_file import inertia_matrix, read_vehicle_file
 
 _LEAST_TIMESTEP: Final = 1e-5  # s: a control step of 0.02 s then takes a hundredth of a second
 _MAX_TIMESTEP: Final = 1.0  # s: that of the longest control step
@@ -104,17 +105,13 @@ class Vehicle:
         enter; numbers do, those of TOML with all digits, others to the six that MuJoCo writes.
         """
         file = find_vehicle(path)
-        right = isinstance(linear_drag, int | float | np.floating) and 0 <= linear_drag <= MAX_DRAG
-        if not right:
-            raise InputError(
-                f"linear_drag: expected a number from 0 to {MAX_DRAG:g} /s, "
-                f"got {shortened(linear_drag)}"
-            )
+        # No negative zero.
+        drag = check("linear_drag", Limits(0.0, MAX_DRAG, "/s"), linear_drag) + 0.0
         try:
             changed = tuple(one.stat().st_mtime_ns for one in _files(file))
         except OSError as error:
             raise InputError(f"vehicle: cannot read {path}: {error.strerror}") from None
-        return _load(file, float(linear_drag) + 0.0, changed)  # no negative zero
+        return _load(file, drag, changed)
 
     @property
     def num_rotors(self) -> int:
@@ -134,9 +131,8 @@ class Vehicle:
     @cached_property
     def radius(self) -> float:
         """Of a sphere about the body's origin that holds all that can collide, m."""
-        model, data = self.model, mujoco.MjData(self.model)
-        data.qpos[:] = (0, 0, 0, 1, 0, 0, 0)
-        mujoco.mj_kinematics(model, data)
+        model = self.model
+        data = level_data(model)
         solid = (model.geom_contype | model.geom_conaffinity) > 0
         solid &= np.isin(model.geom_bodyid, craft_bodies(model))
         reach = np.linalg.norm(data.geom_xpos, axis=1) + model.geom_rbound
@@ -246,8 +242,7 @@ def compile_vehicle(
         text = spec.to_xml()
         model = spec.compile()
         _check_structure(model)
-        data = mujoco.MjData(model)
-        data.qpos[:] = (0, 0, 0, 1, 0, 0, 0)
+        data = level_data(model)
         mujoco.mj_forward(model, data)
     except InputError:
         raise
@@ -309,10 +304,7 @@ def payload_body(model: mujoco.MjModel) -> int:
 
 def body_axes(model: mujoco.MjModel) -> np.ndarray:
     """Axes of each body in the frame of the free body that it is of, as columns, (B, 3, 3)."""
-    data = mujoco.MjData(model)
-    data.qpos.reshape(-1, 7)[:] = (0, 0, 0, 1, 0, 0, 0)
-    mujoco.mj_kinematics(model, data)
-    axes: np.ndarray = data.xmat.reshape(-1, 3, 3).copy()
+    axes: np.ndarray = level_data(model).xmat.reshape(-1, 3, 3).copy()
     return axes
 
 
@@ -392,8 +384,7 @@ def mass_properties(
     `data` is at the origin and level. Units and shapes as of `Vehicle`.
     """
     body = int(model.jnt_bodyid[0])
-    xx, yy, zz, xy, xz, yz = data.crb[body, :6]
-    inertia = np.array(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))
+    inertia = inertia_matrix(data.crb[body, :6])
     return float(model.body_subtreemass[body]), data.subtree_com[body].copy(), inertia
 
 
@@ -493,11 +484,12 @@ def _hover(rotors: tuple[Rotor, ...], allocation: np.ndarray, weight: float) -> 
     thrust = trim_thrust(rotors, allocation, weight)
     left = np.abs(allocation @ thrust - (weight, 0.0, 0.0, 0.0)).max()
     sideways = np.array([rotor.axis[:2] for rotor in rotors]).T @ thrust
-    hovers = left <= 1e-6 * _torque_scale(allocation, weight)
-    hovers = hovers and np.abs(sideways).max() <= _ROUNDED * weight
-    able = "rotors that can carry the level craft without a torque or a sideways force"
-    if not hovers:
-        raise InputError(f"vehicle: expected {able}, got ones that cannot")
+    balanced = left <= 1e-6 * _torque_scale(allocation, weight)
+    if not balanced or np.abs(sideways).max() > _ROUNDED * weight:
+        raise InputError(
+            "vehicle: expected rotors that can carry the level craft without a torque or a "
+            "sideways force, got ones that cannot"
+        )
     for rotor, newtons in zip(rotors, thrust.tolist(), strict=True):
         carries = f"rotor {rotor.name} to carry"
         part = f"{carries} a part of the weight of the level craft"

@@ -9,9 +9,10 @@ import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated, Final, Literal, TypeVar
+from typing import Annotated, Any, Final, Literal, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .cameras import FOVY, MAX_LETTERS, OUTPUTS, Camera, Optics, steps_of
 from .coefficients import COEFFICIENTS, Battery, Drag, Rotors, Sensors
@@ -22,7 +23,6 @@ T = TypeVar("T")
 _Vector = tuple[float, float, float]
 _Numbers = tuple[float, ...]
 _Place = Annotated[_Vector, Limits(-100.0, 100.0, "m", count=3)]
-_Axis = Annotated[_Vector, Limits(-1e3, 1e3, "1", count=3)]
 _Mass = Annotated[float, Limits(1e-6, 1e6, "kg")]
 _Length = Annotated[float, Limits(1e-5, 100.0, "m")]
 
@@ -30,6 +30,24 @@ AHEAD: Final = (1.0, 0.0, 0.0)
 UP: Final = (0.0, 0.0, 1.0)
 _MAX_BYTES: Final = 1_000_000  # it is read within a few seconds
 _LEAST_MOMENT: Final = 1e-15  # kg m²: MuJoCo's mjMINVAL
+
+
+@dataclass(frozen=True)
+class _Direction(Limits):
+    """Three numbers that are not all 0."""
+
+    @property
+    def expected(self) -> str:
+        return f"{super().expected}, not all 0"
+
+    def read(self, value: object) -> Any:
+        numbers: Any = super().read(value)
+        if math.hypot(*numbers) <= 1e-6:
+            raise ValueError
+        return numbers
+
+
+_Axis = Annotated[_Vector, _Direction(-1e3, 1e3, "1", count=3)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,7 +149,7 @@ class _CameraTable(Optics):
     look: _Axis = AHEAD
     up: _Axis | None = None
     fovy: Annotated[float, Limits(*FOVY, "rad")] = math.pi / 2
-    resolution: Annotated[_Numbers, Limits(1, 4096, "pixel", count=2)] = (64.0, 64.0)
+    resolution: Annotated[tuple[int, int], Limits(1, 4096, "pixel", whole=True, count=2)] = (64, 64)
     rate: Annotated[float, Limits(1e-3, 1.0, "1")] = 1.0
     kinds: Sequence[str] = ("rgb",)
     stands: bool = False
@@ -392,9 +410,7 @@ def _part(numbers: list[Number], given: object, where: str) -> Box | Cylinder:
         return _table(numbers, Box, given, where)
     if shape != "cylinder":
         raise InputError(f"{where}.shape: expected 'box' or 'cylinder', got {shortened(shape)}")
-    part = _table(numbers, Cylinder, given, where)
-    _check_axis(f"{where}.axis", part.axis)
-    return part
+    return _table(numbers, Cylinder, given, where)
 
 
 def _rotors(numbers: list[Number], given: object, model: Path | None) -> RotorTable:
@@ -461,7 +477,6 @@ def _rotor(numbers: list[Number], given: object, number: int, model: Path | None
     where = f"rotors.list[{number}]"
     table = {"name": f"rotor{number}", **_mapping(given, where)}
     rotor = _table(numbers, PlacedRotor, table, where)
-    _check_axis(f"{where}.axis", rotor.axis)
     places = rotor.places
     if model is None:
         if places:
@@ -497,7 +512,6 @@ def _camera(numbers: list[Number], given: object, where: str) -> Camera:
     table = _table(numbers, _CameraTable, given, where)
     _check_kinds(f"{where}.kinds", table.kinds)
     look = table.look
-    _check_axis(f"{where}.look", look)
     up = table.up
     if up is None:
         upright = math.hypot(*look[:2]) > 1e-6 * math.hypot(*look)
@@ -505,12 +519,9 @@ def _camera(numbers: list[Number], given: object, where: str) -> Camera:
     across = math.hypot(*np.cross(look, up))
     if not across > 1e-6 * math.hypot(*look) * math.hypot(*up):
         raise InputError(f"{where}.up: expected another direction than look, got {list(up)}")
-    width, height = (round(side) for side in table.resolution)
-    if (width, height) != table.resolution or width * height == 1:
-        raise InputError(
-            f"{where}.resolution: expected whole numbers, more than one pixel, "
-            f"got {list(table.resolution)}"
-        )
+    width, height = table.resolution
+    if (width, height) == (1, 1):
+        raise InputError(f"{where}.resolution: expected more than one pixel, got one")
     return Camera(
         name=table.name,
         width=width,
@@ -540,12 +551,6 @@ def _check_distinct(where: str, names: Sequence[str]) -> None:
             raise InputError(f"{where}: expected a name of its own for each, got {name!r} twice")
 
 
-def _check_axis(name: str, axis: Sequence[float]) -> None:
-    if math.hypot(*axis) <= 1e-6:
-        got = ", ".join(f"{one:g}" for one in axis)
-        raise InputError(f"{name}: expected a direction: three numbers, not all 0, got {got}")
-
-
 def _check_inertia(values: _Numbers) -> None:
     """Raise `InputError` unless a body of some masses can have it."""
     got = ", ".join(f"{one:g}" for one in values)
@@ -554,8 +559,7 @@ def _check_inertia(values: _Numbers) -> None:
             "body.inertia: expected 3 numbers: Ixx, Iyy, Izz, or 6: Ixx, Iyy, Izz, Ixy, Ixz, Iyz, "
             f"got {got}"
         )
-    xx, yy, zz, xy, xz, yz = (*values, 0.0, 0.0, 0.0)[:6]
-    low, middle, high = np.linalg.eigvalsh(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))).tolist()
+    low, middle, high = np.linalg.eigvalsh(inertia_matrix((*values, 0.0, 0.0, 0.0)[:6])).tolist()
     if not low > _LEAST_MOMENT:
         raise InputError(
             f"body.inertia: expected principal moments above {_LEAST_MOMENT:g} kg m², got {got}"
@@ -565,6 +569,12 @@ def _check_inertia(values: _Numbers) -> None:
             "body.inertia: expected principal moments of which none is larger than the sum of the "
             f"others, got {low:.4g}, {middle:.4g} and {high:.4g} kg m²"
         )
+
+
+def inertia_matrix(values: Sequence[float]) -> NDArray[np.float64]:
+    """Of Ixx, Iyy, Izz, Ixy, Ixz and Iyz, shape (3, 3)."""
+    xx, yy, zz, xy, xz, yz = values
+    return np.array(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))
 
 
 def _plain(tree: object) -> object:

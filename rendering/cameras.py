@@ -76,7 +76,7 @@ class Cameras:
         self.pictures = {
             view.name: np.zeros((rows, *view.shape), view.dtype) for view in self.views
         }
-        self._before: list[np.ndarray | None] = [None] * shape[0]
+        self._before = np.tile(self._poses.now(self.data), (shape[0], 1))
         self.model.vis.quality.offsamples = 4 if fine else 0
         self._scene = mujoco.MjvScene(self.model, self.model.ngeom + _ROOM)
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW.value] = fine
@@ -142,19 +142,13 @@ class Cameras:
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """What each drone took last, and where each world was then, by name."""
-        arrays = {name: pictures.copy() for name, pictures in self.pictures.items()}
-        like = next((one for one in self._before if one is not None), None)
-        if like is not None:
-            none = np.full_like(like, np.nan)
-            arrays["before"] = np.stack([none if one is None else one for one in self._before])
-        return arrays
+        pictures = {name: taken.copy() for name, taken in self.pictures.items()}
+        return {**pictures, "before": self._before.copy()}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Put a snapshot back."""
-        for name, pictures in self.pictures.items():
-            pictures[:] = arrays[name]
-        if "before" in arrays:
-            self._before = list(arrays["before"].copy())
+        for name, array in (self.pictures | {"before": self._before}).items():
+            array[:] = arrays[name]
 
     def lens(
         self, name: str, state: Mapping[str, np.ndarray], drone: int = 0, world: int = 0

@@ -1,7 +1,7 @@
 """What is written on pictures of a flight: its name, numbers, and a graph of the first metric."""
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from typing import Final, NamedTuple
 
@@ -20,7 +20,6 @@ from PIL import Image, ImageColor, ImageDraw, ImageFont  # noqa: E402
 Picture = NDArray[np.uint8]
 
 _GROUND: Final = (13, 18, 26, 150)  # of panels: some of the picture shows through
-_CLEAR: Final = (0, 0, 0, 0)
 _NAMES: Final = (164, 176, 190)
 _VALUES: Final = (238, 242, 246)
 _LEVEL: Final = (84, 96, 110)
@@ -130,18 +129,20 @@ class Overlay:
         image = Image.fromarray(picture)
         if image.size != self._size:
             raise InputError(f"picture: expected {self._size} pixels, got {image.size}")
-        _paint(image, self.panel, _GROUND, lambda pen: self._write_panel(pen, moment))
+        layer = Image.new("RGBA", image.size)
+        pen = ImageDraw.Draw(layer)
+        self._write_panel(pen, moment)
         if self.has_strip:
-            _paint(image, self.strip, _GROUND, lambda pen: self._write_strip(pen, len(values)))
-            left, upper, right, lower = self.plot
-            curve = Box(left - _MARGIN, upper - _MARGIN, right + _MARGIN, lower + _MARGIN)
-            _paint(image, curve, _CLEAR, lambda pen: self._draw_curve(pen, values), _FINER)
+            self._write_strip(pen, len(values))
         if note:  # below the panel, away from the craft
             left = self.panel.left
             upper = self.panel.lower + self._gap
             wide = self._font(1.25).getlength(note) + 2 * self._gap
             box = Box(left, upper, round(left + wide), round(upper + 1.9 * self._unit))
-            _paint(image, box, _GROUND, lambda pen: self._write_title(pen, note, _ALARM))
+            self._write_title(pen, box, note, _ALARM)
+        image.paste(layer, (0, 0), layer)
+        if self.has_strip:
+            self._draw_curve(image, values)
         return np.asarray(image)
 
     def _font(self, share: float = 1.0) -> ImageFont.FreeTypeFont:
@@ -164,64 +165,56 @@ class Overlay:
         lower = min(box.lower, height - self._gap)
         return box._replace(right=right, lower=lower)
 
-    def _write_title(self, pen: ImageDraw.ImageDraw, title: str, color: tuple[int, ...]) -> None:
-        middle = 0.95 * self._unit
-        pen.text((self._gap, middle), title, color, self._font(1.25), anchor="lm")
+    def _write_title(
+        self, pen: ImageDraw.ImageDraw, box: Box, title: str, color: tuple[int, ...]
+    ) -> None:
+        """A title on the ground of a box."""
+        pen.rectangle((*box[:2], box.right - 1, box.lower - 1), _GROUND)
+        place = (box.left + self._gap, box.upper + 0.95 * self._unit)
+        pen.text(place, title, color, self._font(1.25), anchor="lm")
 
     def _write_panel(self, pen: ImageDraw.ImageDraw, moment: Moment) -> None:
-        self._write_title(pen, self._title, self._color)
+        panel = self.panel
+        self._write_title(pen, panel, self._title, self._color)
         if not self.has_numbers:
             return
-        left = self._gap
-        right = (self.panel.right - self.panel.left) - left
         for number, (name, value) in enumerate(self._lines(moment)):
-            y = (2.0 + _LINE * number) * self._unit
-            pen.text((left, y), name, _NAMES, self._font())
-            pen.text((right, y), value, _VALUES, self._font(), anchor="ra")
+            y = panel.upper + (2.0 + _LINE * number) * self._unit
+            pen.text((panel.left + self._gap, y), name, _NAMES, self._font())
+            pen.text((panel.right - self._gap, y), value, _VALUES, self._font(), anchor="ra")
 
     def _write_strip(self, pen: ImageDraw.ImageDraw, count: int) -> None:
         assert self._metric is not None
         gap = self._gap
+        left, upper, right, lower = self.plot
         unit = f", {self._metric.unit}" if self._metric.unit else ""
-        seconds = f"{max(count - 1, 0) * self._period:.2f} s"
-        right = (self.strip.right - self.strip.left) - 2 * gap
         heading = f"{self._metric.label} over time{unit}"
-        pen.text((2 * gap, gap), heading, _NAMES, self._font())
-        pen.text((right, gap), seconds, _VALUES, self._font(), anchor="ra")
-        left = self.plot.left - self.strip.left
-        upper = self.plot.upper - self.strip.upper
-        lower = self.plot.lower - self.strip.upper
+        seconds = f"{max(count - 1, 0) * self._period:.2f} s"
+        strip = self.strip
+        pen.rectangle((*strip[:2], strip.right - 1, strip.lower - 1), _GROUND)
+        top = strip.upper + gap
+        pen.text((strip.left + 2 * gap, top), heading, _NAMES, self._font())
+        pen.text((right, top), seconds, _VALUES, self._font(), anchor="ra")
         low, high = self._scale
         for y, level in ((lower, low), ((lower + upper) / 2, (low + high) / 2), (upper, high)):
             pen.line((left, y, right, y), _LEVEL)
             pen.text((left - gap, y), f"{level:g}", _NAMES, self._font(0.85), anchor="rm")
 
-    def _draw_curve(self, pen: ImageDraw.ImageDraw, values: Sequence[float]) -> None:
+    def _draw_curve(self, image: Image.Image, values: Sequence[float]) -> None:
         """What is beyond the plot and its margin is cut off."""
+        left, upper, right, lower = self.plot
         low, high = self._scale
-        wide = (self.plot.right - self.plot.left) * _FINER
-        tall = (self.plot.lower - self.plot.upper) * _FINER
+        wide = (right - left) * _FINER
+        tall = (lower - upper) * _FINER
         times = np.arange(len(values)) * (wide * self._period / self._seconds)
         heights = tall * (high - np.asarray(values, np.float64)) / (high - low)
         points = np.stack((np.minimum(times, wide), heights), axis=1) + _MARGIN * _FINER
         curve = [(x, y) for x, y in points.tolist() if math.isfinite(y)]
         thick = max(_FINER, round(self._unit * _FINER / 6))
-        pen.line(curve, self._color, thick, joint="curve")
-
-
-def _paint(
-    image: Image.Image,
-    box: Box,
-    ground: tuple[int, ...],
-    write: Callable[[ImageDraw.ImageDraw], None],
-    finer: int = 1,
-) -> None:
-    """Write on a ground, in pixels from a corner of a box that may be finer, and put it there."""
-    size = (max(box.right - box.left, 1) * finer, max(box.lower - box.upper, 1) * finer)
-    layer = Image.new("RGBA", size, ground)
-    write(ImageDraw.Draw(layer))
-    layer = layer.reduce(finer)
-    image.paste(layer, box[:2], layer)
+        layer = Image.new("RGBA", (wide + 2 * _MARGIN * _FINER, tall + 2 * _MARGIN * _FINER))
+        ImageDraw.Draw(layer).line(curve, self._color, thick, joint="curve")
+        layer = layer.reduce(_FINER)
+        image.paste(layer, (left - _MARGIN, upper - _MARGIN), layer)
 
 
 @lru_cache

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from ..models.errors import InputError, shortened
 from ..models.fleet import load_vehicles, members_of
-from ..models.mjcf import attach_craft, free_body
+from ..models.mjcf import attach_craft, free_body, level_data
 from ..scenes.build import SCENE_PREFIX, build_scene
 from ..scenes.marks import Mark
 from .gl import Offscreen
@@ -230,8 +230,6 @@ class Stage:
         self.data = mujoco.MjData(self.model)
         self.moments: tuple[Moment, ...] = ()
         self._paths: list[deque[np.ndarray]] = [deque(maxlen=self._length) for _ in self._offsets]
-        self._goals: list[np.ndarray | None] = [None] * self.drones
-        self._payloads: list[np.ndarray | None] = [None] * self.drones
         # Distance between each craft and its goal for which a camera makes room, m.
         self._reach = np.zeros(self.drones)
         mujoco.mj_forward(self.model, self.data)
@@ -254,18 +252,14 @@ class Stage:
             raise InputError(f"vehicle: expected {expected}, got {got}")
         before = self.moments or moments
         self.moments = moments
+        goals = self._places("goal")
         poses = self.data.qpos.reshape(self.drones, 7)
         for i, (moment, last) in enumerate(zip(moments, before, strict=True)):
             pose = poses[i]
             path = self._paths[i]
-            goal = None
+            goal = goals[i]
             pose[:3] = moment.position + self._offsets[i]
             pose[3:] = moment.attitude
-            if moment.goal is not None:
-                goal = moment.goal + self._offsets[i]
-            self._goals[i] = goal
-            if moment.payload is not None:
-                self._payloads[i] = moment.payload + self._offsets[i]
             if moment.step == 0 or moment.step < last.step or moment.episode != last.episode:
                 path.clear()
                 self._reach[i] = 0.0
@@ -296,7 +290,7 @@ class Stage:
         places = self._offsets
         reach = float(self._reach.max())
         if len(self.names) > 1:  # the goals of one world lie apart, often far from their craft
-            goals = (goal for goal in self._goals if goal is not None)
+            goals = [goal for goal in self._places("goal") if goal is not None]
             places = np.array([*self._points(), *goals])
             reach = 0.0
         camera.distance = distance * self.radius + float(np.ptp(places, axis=0).max())
@@ -312,18 +306,19 @@ class Stage:
     @property
     def focus(self) -> np.ndarray:
         """Mean of the goals, or of the craft if there are none, MuJoCo's frame, shape (3,), m."""
-        goals = [goal for goal in self._goals if goal is not None]
+        goals = [goal for goal in self._places("goal") if goal is not None]
         return np.asarray((np.array(goals) if goals else self._points()).mean(axis=0))
 
     def decorate(self, scene: mujoco.MjvScene, *, goals: bool = True) -> None:
         """Add marks, payloads and fading paths to a scene, and discs at the goals if wanted."""
         drawn: set[Mark] = set()  # those of a world that all its drones tell
-        for moment, goal, offset in zip(self.moments, self._goals, self._offsets, strict=False):
+        places = self._places("goal")
+        for moment, goal, offset in zip(self.moments, places, self._offsets, strict=False):
             for mark in moment.marks:
                 if mark.moves or not self.names or mark not in drawn:
                     drawn.add(mark)
                     _draw_mark(scene, mark, offset, goal)
-        for payload, here in zip(self._payloads, self._points(), strict=True):
+        for payload, here in zip(self._places("payload"), self._points(), strict=False):
             if payload is not None:
                 size = (0.12 * self.radius,) * 3
                 _decoration(scene, mujoco.mjtGeom.mjGEOM_SPHERE, size, payload, _PAYLOAD)
@@ -332,7 +327,7 @@ class Stage:
         marked = any(moment.marks for moment in self.moments)
         if 1 < len(self.names) <= MAX_NAMES:
             self._write_names(scene)
-        lines = zip(self._paths, self._goals, self._points(), strict=True)
+        lines = zip(self._paths, places, self._points(), strict=False)
         for drone, (path, goal, here) in enumerate(lines):
             color = DRONE_COLORS[drone % len(DRONE_COLORS)] if self.names else _PATH
             if goals and goal is not None and not marked:
@@ -358,6 +353,12 @@ class Stage:
             label = _decoration(scene, mujoco.mjtGeom.mjGEOM_LABEL, (0.1,) * 3, above, _CABLE)
             if label is not None:
                 label.label = f"{name}   "  # without the spaces its end would be cut off
+
+    def _places(self, what: Literal["goal", "payload"]) -> list[np.ndarray | None]:
+        """Where it is drawn for each craft; None where there is none."""
+        points = [getattr(moment, what) for moment in self.moments]
+        places = zip(points, self._offsets, strict=False)
+        return [None if point is None else point + offset for point, offset in places]
 
     def _points(self) -> np.ndarray:
         """Positions of the craft, MuJoCo's frame, shape (drones, 3), m."""
@@ -422,9 +423,7 @@ def least_distance(positions: np.ndarray) -> float:
 
 def _size(model: mujoco.MjModel) -> tuple[float, float]:
     """Radius of the craft about its body's origin, and height of its top above it, m."""
-    data = mujoco.MjData(model)
-    data.qpos[:] = (0, 0, 0, 1, 0, 0, 0)
-    mujoco.mj_kinematics(model, data)
+    data = level_data(model)
     craft = model.body_rootid[model.geom_bodyid] == model.jnt_bodyid[0]
     drawn = craft & (model.geom_group <= 2)
     chosen = drawn if drawn.any() else craft

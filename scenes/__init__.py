@@ -10,17 +10,17 @@ from typing import TYPE_CHECKING, Final
 from ..models.errors import InputError, shortened
 
 if TYPE_CHECKING:
-    from .build import add_airport, add_scene, build_scene
+    from .build import add_scene, build_scene
 
 __all__ = [
-    "AIRPORT_XML", "MAX_SEEDS", "SCENES", "SCENE_XML", "SEEDED_SCENES", "add_airport", "add_scene",
+    "AIRPORT_XML", "MAX_SEEDS", "SCENES", "SCENE_XML", "SEEDED_SCENES", "add_scene",
     "build_scene", "parse_scene", "scenes_of",
 ]  # fmt: skip
 
 SCENE_XML: Final = Path(__file__).parent / "scene.xml"
 """Ground, sky and light of the scene `plain`."""
 AIRPORT_XML: Final = Path(__file__).parent / "airport.xml"
-"""The airport that `add_airport` adds."""
+"""The airport."""
 SCENES: Final = ("plain", "airport", "forest", "warehouse", "gates")
 SEEDED_SCENES: Final = SCENES[2:]
 """Those that are drawn from a seed."""

@@ -6,13 +6,11 @@ from typing import Final
 import mujoco
 
 from ..models import QUAD_XML
-from ..models.errors import InputError
 from ..models.mjcf import has_ground, read_spec
-from . import AIRPORT_XML, SCENE_XML, parse_scene
-from .generators import GENERATORS
-from .primitives import SKY, attach, clear
+from . import AIRPORT_XML, SCENE_XML, SEEDED_SCENES, parse_scene
+from .generators import add_seeded
+from .spec import clear
 
-AIRPORT_PREFIX: Final = "airport/"  # of all names that `add_airport` adds
 SCENE_PREFIX: Final = "scene/"  # of all names that `add_scene` adds for the plain scene
 _NEAR, _FAR = 0.25, 1200.0  # m: nearest and furthest distance that is drawn; the hills lie within
 
@@ -44,9 +42,9 @@ def add_scene(spec: mujoco.MjSpec, scene: str = "plain") -> None:
     name, seed = parse_scene(scene)
     _add_plain(spec)
     if name == "airport":
-        add_airport(spec)
-    elif name in GENERATORS:
-        attach(spec, GENERATORS[name](seed))
+        _add_airport(spec)
+    elif name in SEEDED_SCENES:
+        add_seeded(spec, name, seed)
     spec.compiler.discardvisual = False
 
 
@@ -59,30 +57,24 @@ def _add_plain(spec: mujoco.MjSpec) -> None:
     else:
         spec.visual = scene.visual
         spec.stat = scene.stat
-    if any(texture.type == SKY for texture in spec.textures):
+    if any(texture.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX for texture in spec.textures):
         scene.delete(scene.texture("sky"))
     if spec.worldbody.lights:
         scene.delete(scene.light("sun"))
     spec.attach(scene, prefix=SCENE_PREFIX, frame=spec.worldbody.add_frame())
 
 
-def add_airport(spec: mujoco.MjSpec) -> None:
-    """Put the airport of `AIRPORT_XML` around a scene, in place; compile the spec yourself.
+def _add_airport(spec: mujoco.MjSpec) -> None:
+    """Put the airport of `AIRPORT_XML` around a scene.
 
-    The origin of the world becomes the centre of a pad on the apron; +x points along runway 09, z
-    up, metres. The scene moves bit for bit as without it: its geoms collide with nothing, and only
-    a rangefinder would see them. `spec.compiler.discardvisual` drops them all.
-
-    Planes of the world body at z = 0 still carry what stands on them, but only geom group 3 draws
-    them. Sky, haze, shadow map, and the near and far end of drawing become the airport's. Raises
-    `InputError` if the scene has an airport already, `ValueError` if it does not compile.
+    The origin of the world becomes the centre of a pad on the apron; +x points along runway 09.
+    Sky, haze, shadow map, and the near and far end of drawing become the airport's. Its geoms
+    collide with nothing.
     """
-    if any(geom.name.startswith(AIRPORT_PREFIX) for geom in spec.geoms):
-        raise InputError("spec: expected a scene without an airport, got one that has it")
     clear(spec, _NEAR, _FAR, _SLICES)
     visual = spec.visual
     visual.map.haze = _HAZE
     visual.rgba.haze = _HAZE_COLOUR
     visual.quality.shadowsize = min(visual.quality.shadowsize, _SHADOW_PIXELS)
     airport = mujoco.MjSpec.from_file(str(AIRPORT_XML))
-    spec.attach(airport, prefix=AIRPORT_PREFIX, frame=spec.worldbody.add_frame())
+    spec.attach(airport, prefix="airport/", frame=spec.worldbody.add_frame())

@@ -137,7 +137,7 @@ def test_export(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         (["new", "mine.xml"], "file: expected a name that ends in .toml, got mine.xml"),
         (["new", "there.toml"], "file: expected the name of a new file, got there.toml"),
         (["export", "there.toml"], "vehicle: expected two files, .*, got one"),
-        (["export", "there.toml", "x.txt"], "out: expected a name that ends in .xml, got x.txt"),
+        (["export", "there.toml", "x.txt"], "out: expected a file that ends in .xml, got x.txt"),
         (
             ["export", "paper", "there.xml"],
             "out: expected the name of a new file, got there.xml, wh",

@@ -2,19 +2,18 @@
 
 import copy
 import pickle
-import socket
 
 import numpy as np
 import pytest
-from peers import ANY, Running
 from rotorgram.agents import Orca
 from rotorgram.envs import LocalVectorEnv
+from rotorgram.envs.config import EnvConfig
 from rotorgram.flights.trajectories import fly_episodes
 from rotorgram.models import InputError, Vehicle
 from rotorgram.models.fleet import Fleet, load_vehicles, members_of
 from rotorgram.sim import LEVELS, EffectOptions, InitialState, make_controller, make_world
 from rotorgram.sim.control import Gains
-from rotorgram.udp import LinkConfig, RemoteVectorEnv, Simulator
+from rotorgram.udp.spawn import spawn_simulator
 
 MIX = "crazyflie2,hummingbird,paper"
 FORMATION = "rotorgram/Formation-v0"
@@ -126,29 +125,20 @@ def test_the_clearance_is_between_the_spheres_of_each() -> None:
 
 
 def test_over_udp_it_is_the_same_to_the_bit() -> None:
-    local = LocalVectorEnv(CROSSING, 3, drones=3, vehicle=MIX)
-    dice = np.random.default_rng(1)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
-        taken.bind(ANY)
-        agent = taken.getsockname()
-    simulator = Simulator(
-        CROSSING, server=agent, bind=ANY, num_envs=3, drones=3, vehicle=MIX,
-        config=LinkConfig(timeout=60),
-    )  # fmt: skip
-    running = Running(simulator)
-    remote = RemoteVectorEnv(agent)
-    ours = local.reset(seed=5)[0]
-    theirs = remote.reset(seed=5)[0]
-    assert remote.env_spec == local.env_spec
-    for _ in range(40):
-        assert theirs.tobytes() == ours.tobytes()
-        actions = dice.uniform(-1, 1, (3, 4)).astype(np.float32)
-        (ours, *rest) = local.step(actions)
-        (theirs, *others) = remote.step(actions)
-        for mine, its in zip(rest[:3], others[:3], strict=True):
-            assert mine.tolist() == its.tolist()
-    remote.close()
-    running.join()
+    options = {"drones": 3, "vehicle": MIX}
+    local = LocalVectorEnv(CROSSING, 3, **options)
+    with spawn_simulator(EnvConfig.from_keywords(CROSSING, **options), num_envs=3) as remote:
+        assert remote.env_spec == local.env_spec
+        ours = local.reset(seed=5)
+        theirs = remote.reset(seed=5)
+        remote.action_space.seed(1)
+        for _ in range(40):
+            assert theirs[0].tobytes() == ours[0].tobytes()
+            actions = remote.action_space.sample()
+            ours = local.step(actions)
+            theirs = remote.step(actions)
+            for mine, its in zip(ours[1:4], theirs[1:4], strict=True):
+                assert mine.tolist() == its.tolist()
 
 
 def test_orca_crosses_with_different_vehicles() -> None:

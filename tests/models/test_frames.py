@@ -31,11 +31,6 @@ def test_position(mujoco: tuple[float, ...], paper: tuple[float, ...]) -> None:
     assert positions_in_paper_frame(mujoco).tolist() == list(paper)
 
 
-def test_map_is_a_reflection_because_the_frames_differ_in_handedness() -> None:
-    assert np.linalg.det(S) == pytest.approx(-1.0)
-    np.testing.assert_array_equal(positions_in_paper_frame(np.eye(3)).T, S)
-
-
 def test_level_is_zero_without_negative_zeros() -> None:
     zeros = np.zeros((2, 3))
     assert positions_in_paper_frame(zeros).tobytes() == zeros.tobytes()
@@ -62,21 +57,13 @@ def test_a_pitch_of_30_degrees_then_a_yaw_by_hand() -> None:
     assert nose == pytest.approx((-math.sqrt(0.75), -0.5, 0.0))
 
 
-def test_random_attitudes_against_rotation_matrices() -> None:
-    for attitude in Rotation.random(500, random_state=7):
-        phi, theta, psi = attitudes_in_paper_frame(_scalar_first(attitude))
-        assert -90 <= phi <= 90
-        assert -180 <= theta <= 180
-        assert -180 <= psi <= 180
-        expected = S @ attitude.as_matrix() @ S.T
-        np.testing.assert_allclose(_unity(phi, theta, psi), expected, atol=1e-9)
-
-
 @given(st.floats(-180, 180), st.floats(-89.9, 89.9), st.floats(-180, 180))
-def test_both_signs_of_a_quaternion_are_one_attitude(yaw: float, pitch: float, roll: float) -> None:
+def test_any_attitude_against_matrices(yaw: float, pitch: float, roll: float) -> None:
     q = _scalar_first(Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=True))
-    one, other = (_unity(*attitude) for attitude in attitudes_in_paper_frame([q, -q]))
-    np.testing.assert_allclose(one, other, atol=1e-9)
+    expected = S @ Rotation.from_quat(q, scalar_first=True).as_matrix() @ S.T
+    for attitude in attitudes_in_paper_frame([q, -q]):
+        assert (np.abs(attitude) <= (90, 180, 180)).all()
+        np.testing.assert_allclose(_unity(*attitude), expected, atol=1e-9)
 
 
 @pytest.mark.parametrize("pitch", [-90.0, 90.0])

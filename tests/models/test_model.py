@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 import rotorgram.models
 from rotorgram.models import QUAD_XML, InputError, Vehicle
-from rotorgram.models.mjcf import vehicle_spec
 from rotorgram.scenes import build_scene
 
 DATA = Path(__file__).parents[1] / "data"
@@ -116,23 +115,6 @@ def test_sensors_at_hover(model: mujoco.MjModel, hovering: mujoco.MjData) -> Non
         assert hovering.sensor(name).data == pytest.approx(value, abs=1e-12), name
 
 
-def test_sensors_know_their_frames(model: mujoco.MjModel) -> None:
-    data = mujoco.MjData(model)
-    quarter = math.sqrt(0.5)  # nose to the left: body x is world y
-    data.qpos[:] = (1.0, 2.0, 3.0, quarter, 0.0, 0.0, quarter)
-    data.qvel[:] = (4.0, 5.0, 6.0, 0.1, 0.2, 0.3)
-    mujoco.mj_forward(model, data)
-    assert data.sensor("position").data == pytest.approx([1.0, 2.0, 3.0])
-    assert data.sensor("velocity").data == pytest.approx([4.0, 5.0, 6.0])  # world
-    assert data.sensor("gyro").data == pytest.approx([0.1, 0.2, 0.3])  # body
-    assert data.sensor("accelerometer").data == pytest.approx([0.0, 0.0, 0.0], abs=1e-12)  # falling
-
-
-def test_offscreen_buffer_is_large_enough(model: mujoco.MjModel) -> None:
-    assert model.vis.global_.offwidth >= 1280
-    assert model.vis.global_.offheight >= 720
-
-
 OWN = {
     "ground": '<geom name="own" type="plane" size="0 0 1"/>',
     "sun": '<light name="own" pos="0 0 5"/>',
@@ -160,27 +142,6 @@ def test_a_file_keeps_its_ground_sun_and_sky_and_gets_those_it_lacks(
     assert grounds == ["own" if "ground" in own else "scene/floor"]
 
 
-def test_without_what_is_only_looked_at_the_physics_is_the_same() -> None:
-    models = [spec.compile() for spec in (build_scene(), vehicle_spec(QUAD_XML))]
-    assert models[0].ngeom > models[1].ngeom
-    dice = np.random.default_rng(0)
-    contacts = 0
-    data = [mujoco.MjData(model) for model in models]
-    for one in data:
-        one.qpos[:] = [0, 0, 3, 0.99, 0.1, 0.05, 0.02]
-        one.qpos[3:] /= np.linalg.norm(one.qpos[3:])
-    for _ in range(300):
-        thrusts = dice.uniform(20, 70, 4)
-        for model, one in zip(models, data, strict=True):
-            one.ctrl[:] = thrusts
-            mujoco.mj_step(model, one, 2)
-        contacts += data[0].ncon
-        for name in ("qpos", "qvel", "qacc", "sensordata"):
-            assert getattr(data[0], name).tobytes() == getattr(data[1], name).tobytes()
-        assert data[0].ncon == data[1].ncon
-    assert contacts > 0  # it came down
-
-
 # --- what follows from a compiled model -----------------------------------------------------------
 
 
@@ -203,8 +164,6 @@ def test_the_papers_vehicle() -> None:
     assert vehicle.max_acceleration == pytest.approx(10.2)
     assert vehicle.substeps(0.02) == 2
     assert vehicle.substeps(0.01) == 1
-    with pytest.raises(InputError, match=r"multiple of the physics step of 0\.01 s, .* got 0\.015"):
-        vehicle.substeps(0.015)
 
 
 def test_a_hexacopter_with_throttles_and_a_camera_in_front() -> None:
@@ -346,9 +305,9 @@ HEIGHTS = '<hfield name="h" nrow="100000" ncol="100000" size="1 1 1 1"/></asset>
         (
             "</asset>",
             HEIGHTS,
-            "field or texture of at most 4096 × 4096 points, got",
+            "a nrow of at most 4096 in <hfield>, got 100000",
         ),
-        ("</asset>", COLOURS, "texture of at most 4096 × 4096 points, got 100000 × 100000"),
+        ("</asset>", COLOURS, "a width of at most 4096 in <texture>, got 100000"),
         ("</worldbody>", SPHERES + "</worldbody>", "expected at most 10000 elements, got 30000"),
         ("</worldbody>", NESTED + "</worldbody>", "expected at most 10000 elements"),
         ("<worldbody>", '<size memory="1"/><worldbody>', "expected an MJCF file, .* out of memory"),

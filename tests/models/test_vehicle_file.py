@@ -52,39 +52,6 @@ turn = "cw"
 position = [-0.2, 0.2, 0.0]
 turn = "ccw"
 """
-PAPER = """
-name = "rotorgram quadcopter"
-gravity = 9.8
-[[body.parts]]
-shape = "box"
-mass = 12
-size = [0.44, 0.44, 0.14]
-{parts}
-[rotors]
-frame = "cross"
-arm = 1.4142135623730951
-thrust = [0, 100]
-reaction = 0.05
-""".format(
-    parts="".join(
-        f"""
-[[body.parts]]
-shape = "cylinder"
-mass = 1.2
-radius = 0.035
-length = 1.4142135623730951
-position = [{x / 2}, {y / 2}, 0]
-axis = [{x}, {y}, 0]
-[[body.parts]]
-shape = "cylinder"
-mass = 0.8
-radius = 0.09
-length = 0.12
-position = [{x}, {y}, 0]
-"""
-        for x, y in ((1, 1), (1, -1), (-1, -1), (-1, 1))
-    )
-)
 
 
 def write(folder: Path, text: str, name: str = "craft.toml") -> Path:
@@ -225,13 +192,14 @@ def test_the_hull_stands_where_the_file_says(tmp_path: Path) -> None:
     assert data.qpos[3] == pytest.approx(1.0, abs=1e-6)  # upright
 
 
-def test_the_papers_vehicle_as_toml_is_the_same_craft(tmp_path: Path) -> None:
-    toml = load(tmp_path, PAPER)
+def test_the_papers_vehicle_as_toml_is_the_same_craft() -> None:
+    toml = Vehicle.load("paper")
     xml = Vehicle.load()
     assert toml.mass == pytest.approx(20.0, rel=1e-14)
     assert toml.gravity == 9.8
     assert toml.timestep == 0.01
-    assert toml.rest_height == pytest.approx(0.4)
+    assert toml.rest_height == pytest.approx(0.4, abs=1e-6)
+    np.testing.assert_allclose(toml.thrust_high, xml.thrust_high)
     np.testing.assert_allclose(toml.inertia, xml.inertia, rtol=0, atol=1e-13)
     np.testing.assert_allclose(toml.allocation, xml.allocation, rtol=0, atol=1e-14)
     newtons = np.full(4, 49.0)
@@ -290,14 +258,6 @@ def test_the_hash_is_of_numbers_to_the_last_digit(tmp_path: Path) -> None:
     assert of('name = "craft"\n' + CRAFT.replace("1.5", "1.5000000001"), "fifth.toml") != plain
 
 
-def test_a_file_that_was_written_anew_is_read_anew(tmp_path: Path) -> None:
-    first = load(tmp_path, CRAFT)
-    assert Vehicle.load(first.path) is first
-    write(tmp_path, CRAFT.replace("1.5", "1.6"))
-    os.utime(first.path, ns=(1, 1))
-    assert Vehicle.load(first.path).mass == 1.6
-
-
 # ---- refusals
 
 
@@ -306,9 +266,6 @@ def test_a_file_that_was_written_anew_is_read_anew(tmp_path: Path) -> None:
     [
         ("mass = 1.5", "mass = -1.5", r"body.mass: .* from 1e-06 to 1e\+06 kg, got -1.5"),
         ("mass = 1.5", 'mass = "1.5"', "body.mass: expected a number .* kg, got '1.5'"),
-        ("mass = 1.5", "mass = true", "body.mass: expected a number .* kg, got True"),
-        ("mass = 1.5", "mass = nan", "body.mass: expected a number .* kg, got nan"),
-        ("mass = 1.5", "mass = [1, 2]", r"body.mass: expected a number .* kg, got \[1, 2\]"),
         ("mass = 1.5", "", "body: expected mass and inertia, or parts, got inertia"),
         ("mass = 1.5", "mas = 1.5", "body: expected some of .*mass, inertia.*, got 'mas'"),
         ("mass = 1.5", "mass = { value = 0 }", "body.mass: expected a number .*, got 0"),
@@ -381,7 +338,7 @@ def test_a_wrong_file_is_one_sentence(old: str, new: str, sentence: str, tmp_pat
         ('turn = "cw"', "", r"rotors.list\[1\]: expected turn, got none"),
         ('turn = "ccw"', 'turn = "left"', r"rotors.list\[2\].turn: expected .*, got 'left'"),
         ("position = [0.2, 0.2, 0.0]", "", r"rotors.list\[1\]: expected a position, got none"),
-        ('turn = "cw"', 'turn = "cw"\naxis = [0, 0, 0]', r"rotors.list\[1\].axis: .*, got 0, 0, 0"),
+        ('turn = "cw"', 'turn = "cw"\naxis = [0, 0, 0]', r"rotors.list\[1\].axis: .*, not all 0"),
         ('turn = "cw"', 'turn = "cw"\nlink = "x"', r"rotors.list\[1\]: .* a position, got link"),
         ('turn = "cw"', 'turn = "cw"\nname = "rotor2"', "rotors.list: .* name .*'rotor2' twice"),
         ("reaction", "arm = 0.3\nreaction", "rotors: expected no arm with a list, got 0.3"),
@@ -612,7 +569,7 @@ def test_export_keeps_six_digits(text: str, tmp_path: Path) -> None:
     assert again.coefficients == vehicle.coefficients
     np.testing.assert_allclose(again.allocation, vehicle.allocation, rtol=1e-5)
     np.testing.assert_allclose(np.diag(again.inertia), np.diag(vehicle.inertia), rtol=1e-5)
-    with pytest.raises(InputError, match=r"^out: expected a name that ends in .xml, got"):
+    with pytest.raises(InputError, match=r"^out: expected a file that ends in .xml, got"):
         export_mjcf(vehicle.path, tmp_path / "out.txt")
     with pytest.raises(InputError, match=r"^out: expected the name of a new file, got .*out.xml"):
         export_mjcf(out, out)
@@ -650,11 +607,7 @@ def test_a_mesh_without_a_path_is_refused(tmp_path: Path) -> None:
 def test_a_vehicle_goes_where_a_path_goes(tmp_path: Path) -> None:
     vehicle = load(tmp_path, CRAFT)
     assert pickle.loads(pickle.dumps(vehicle)) is vehicle
-    env = gym.make("rotorgram/Hover-v0", vehicle=str(vehicle.path))
-    env.reset(seed=0)
-    _, _, _, _, info = env.step(env.action_space.sample())
-    assert {"F1", "F2", "F3", "F4"} <= set(info)
-    many = gym.make_vec("rotorgram/Elevation-v0", num_envs=3, vehicle=vehicle.path)
+    many = gym.make_vec("rotorgram/Elevation-v0", num_envs=3, vehicle=str(vehicle.path))
     many.reset(seed=0)
     many.step(many.action_space.sample())
     many.close()

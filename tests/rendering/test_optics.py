@@ -8,37 +8,21 @@ from typing import Any
 import numpy as np
 import pytest
 from rotorgram.envs import LocalVectorEnv
-from rotorgram.envs.config import EnvConfig
 from rotorgram.models import InputError
 from rotorgram.models.cameras import Optics, chosen_views
 from rotorgram.models.lens import Lens, distorted, undistorted
 from rotorgram.models.vehicle import Vehicle
 from rotorgram.rendering.cameras import Cameras
-from rotorgram.udp.spawn import spawn_simulator
 from test_cameras import made, state, take, vehicle_with
 
 __all__ = ["made"]  # a fixture
 
 HOVER = "rotorgram/Hover-v0"
 BARREL = (-0.28, 0.07, 0.001, -0.0005, 0.01)
-OPTICS = """
-[[cameras]]
-name = "wide"
-resolution = [96, 72]
-fovy = 1.3
-distortion = [-0.28, 0.07, 0.001, -0.0005, 0.01]
-kinds = ["rgb", "depth", "segmentation"]
-
-[[cameras]]
-name = "noisy"
-resolution = [24, 18]
-exposure = 0.5
-noise = [0.04, 0.02]
-
-[[cameras]]
-name = "sharp"
-resolution = [96, 72]
-"""
+DATA = Path(__file__).parents[1] / "data"
+EYES = (DATA / "eyes.toml").read_text("utf-8")
+OPTICS = EYES[EYES.index("[[cameras]]") :]
+"""Tables of three cameras: wide, noisy and sharp."""
 
 
 # ---- lenses
@@ -97,17 +81,23 @@ def _pitched(angle: float) -> np.ndarray:
 # ---- noise
 
 
+def over_ground(cameras: Cameras, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Pictures of the ground by `noisy` of so many worlds, without noise and with it."""
+    level = state(*[(0.0, 0.0, 50.0)] * count, quaternion=_pitched(math.pi / 2))
+    plain = take(cameras, **level)["noisy"].astype(float)
+    dice = np.random.default_rng(1)
+    everybody = np.ones(count, bool)
+    cameras.take({"noisy": everybody}, everybody, level, lambda _: dice)
+    return plain, cameras.pictures["noisy"].astype(float)
+
+
 def test_noise_is_as_wide_as_told(made: Any, tmp_path: Path) -> None:
     """Over many pictures of the ground the mean is its colour, the spread that of √(a² v + b²)."""
     craft = vehicle_with(tmp_path, OPTICS.replace("exposure = 0.5", ""))
-    cameras = made("noisy", craft, shape=(40, 1))
-    level = state(*[(0.0, 0.0, 50.0)] * 40, quaternion=_pitched(math.pi / 2))
-    plain = take(cameras, **level)["noisy"].astype(float)
-    dice = np.random.default_rng(1)
-    cameras.take({"noisy": np.ones(40, bool)}, np.ones(40, bool), level, lambda _: dice)
+    plain, noisy = over_ground(made("noisy", craft, shape=(40, 1)), 40)
     between = (plain > 50) & (plain < 200)  # far from black and white, where it is cut
     assert between.mean() > 0.5
-    noise = (cameras.pictures["noisy"] / 255 - plain / 255)[between]
+    noise = ((noisy - plain) / 255)[between]
     expected = np.sqrt(0.04**2 * plain / 255 + 0.02**2)[between]
     assert (noise / expected).std() == pytest.approx(1.0, rel=0.02)
     assert abs(noise.mean()) < 5e-4
@@ -115,13 +105,9 @@ def test_noise_is_as_wide_as_told(made: Any, tmp_path: Path) -> None:
 
 def test_exposure_is_one_for_each_picture(made: Any, tmp_path: Path) -> None:
     craft = vehicle_with(tmp_path, OPTICS.replace("noise = [0.04, 0.02]", ""))
-    cameras = made("noisy", craft, shape=(60, 1))
-    level = state(*[(0.0, 0.0, 50.0)] * 60, quaternion=_pitched(math.pi / 2))
-    plain = take(cameras, **level)["noisy"].astype(float)
-    dice = np.random.default_rng(2)
-    cameras.take({"noisy": np.ones(60, bool)}, np.ones(60, bool), level, lambda _: dice)
+    both = over_ground(made("noisy", craft, shape=(60, 1)), 60)
     stops = []
-    for picture, own in zip(cameras.pictures["noisy"].astype(float), plain, strict=True):
+    for own, picture in zip(*both, strict=True):
         lit = picture < 255
         share = (picture * own)[lit].sum() / (own**2)[lit].sum()
         assert np.abs(picture - share * own)[lit].max() <= 1.0  # of 255: it is rounded twice
@@ -130,32 +116,26 @@ def test_exposure_is_one_for_each_picture(made: Any, tmp_path: Path) -> None:
     assert abs(np.mean(stops)) < 0.2
 
 
-def test_noise_is_that_of_the_seed(opengl: None, tmp_path: Path) -> None:
-    """The same in a batch and alone, over UDP and in process; another for another seed."""
-    vehicle = vehicle_with(tmp_path, OPTICS).path
-    options: dict[str, Any] = {"vehicle": vehicle, "cameras": "noisy", "action": "velocity"}
-    actions = np.zeros((2, 4), np.float32)
-    with (
-        closing(LocalVectorEnv(HOVER, 2, **options)) as both,
-        closing(LocalVectorEnv(HOVER, 1, **options)) as alone,
-        closing(LocalVectorEnv(HOVER, 1, **(options | {"cameras": "sharp@24x18"}))) as clean,
-    ):
-        first = both.reset(seed=[5, 6])[0]
-        single = alone.reset(seed=[6])[0]
-        sharp = clean.reset(seed=[6])[0]
+def test_noise_is_another_in_each_picture_and_flies_the_same(opengl: None) -> None:
+    """The contract of envs has that it is the same alone and in a batch, here and over UDP."""
+    noisy, clean = (
+        LocalVectorEnv(HOVER, 2, vehicle=DATA / "eyes.toml", cameras=cameras, action="velocity")
+        for cameras in ("noisy", "sharp@24x18")
+    )
+    with closing(noisy), closing(clean):
+        seen = noisy.reset(seed=[5, 6])[0]
+        sharp = clean.reset(seed=[5, 6])[0]
         for _ in range(3):
-            assert (first["noisy"][1] == single["noisy"][0]).all()
-            assert (first["noisy"][0] != first["noisy"][1]).any()
-            assert (single["noisy"] != sharp["sharp"]).any()
-            assert (single["observation"] == sharp["observation"]).all()  # it flies the same
-            before = single["noisy"]
-            first = both.step(actions)[0]
-            single = alone.step(actions[:1])[0]
-            sharp = clean.step(actions[:1])[0]
-            assert (single["noisy"] != before).any()
+            before = seen["noisy"].copy()
+            assert (before[0] != before[1]).any()
+            assert (before != sharp["sharp"]).any()
+            assert (seen["observation"] == sharp["observation"]).all()
+            seen = noisy.step(np.zeros((2, 4), np.float32))[0]
+            sharp = clean.step(np.zeros((2, 4), np.float32))[0]
+            assert (seen["noisy"] != before).any()
 
 
-# ---- files, and the wire
+# ---- files
 
 
 @pytest.mark.parametrize(
@@ -201,20 +181,3 @@ def test_a_lens_that_needs_too_much(tmp_path: Path) -> None:
     craft = vehicle_with(tmp_path, text.replace("[96, 72]\nfovy = 1.3", "[4000, 3000]\nfovy = 1.5"))
     with pytest.raises(InputError, match="distortion: expected a lens that needs at most 8192 pix"):
         Cameras(craft, chosen_views(["wide"], craft.cameras))
-
-
-def test_all_of_them_over_udp(opengl: None, tmp_path: Path) -> None:
-    vehicle = vehicle_with(tmp_path, OPTICS).path
-    options = {"cameras": "wide,noisy,sharp@24x18", "action": "velocity"}
-    with (
-        spawn_simulator(EnvConfig.from_keywords(HOVER, vehicle=vehicle, **options)) as remote,
-        closing(LocalVectorEnv(HOVER, 1, vehicle=vehicle, **options)) as local,
-    ):
-        told = remote.reset(seed=4)[0]
-        own = local.reset(seed=[4])[0]
-        for _ in range(3):
-            for name, picture in told.items():
-                assert (np.asarray(picture) == own[name][0]).all(), name
-            action = np.array([0.3, -0.2, 0.1, 0.5], np.float32)
-            told = remote.step(action)[0]
-            own = local.step(action[None])[0]

@@ -63,19 +63,6 @@ def test_the_craft_is_in_the_midst_of_the_picture_and_as_large_as_it_should_be(
         assert np.ptp(rows) < wide / 2
 
 
-@pytest.mark.parametrize("camera", CAMERAS)
-def test_the_craft_is_at_the_airport_too(camera: Camera, opengl: None) -> None:
-    with Canvas(Stage("airport"), WIDTH, HEIGHT, fast=True) as canvas:
-        canvas.stage.show(at(5.0, error=0.5))
-        craft = craft_in(canvas, camera)
-        picture = canvas.draw(camera).astype(int)
-    assert 0.002 < craft.mean() < 0.5
-    assert craft[:, : WIDTH // 2].sum() == pytest.approx(craft[:, WIDTH // 2 :].sum(), rel=0.4)
-    if camera != "top":
-        sky = picture[: HEIGHT // 12, -WIDTH // 8 :]
-        assert (sky[..., 2] - sky[..., 0]).mean() > 20
-
-
 def test_onboard_sees_the_front_rotors_to_both_sides(stage: Stage, canvas: Canvas) -> None:
     stage.show(at(5.0))
     seen = craft_in(canvas, "onboard")
@@ -85,16 +72,6 @@ def test_onboard_sees_the_front_rotors_to_both_sides(stage: Stage, canvas: Canva
     assert min(halves) > 0.01 * WIDTH * HEIGHT
     assert halves[0] == pytest.approx(halves[1], rel=0.4)  # the blades are turned differently
     assert not orange[: HEIGHT // 4].any()
-
-
-@pytest.mark.parametrize("camera", ["chase", "front", "side", "onboard"])
-def test_the_sky_is_above_the_ground(camera: Camera, stage: Stage, canvas: Canvas) -> None:
-    stage.show(at(5.0, goal=None))
-    picture = canvas.draw(camera).astype(int)
-    edges = picture[:, [0, WIDTH // 2, -1] if camera != "onboard" else [WIDTH // 2]]
-    blue = edges[..., 2] - edges[..., 0]
-    assert blue[: HEIGHT // 20].min() > 40
-    assert blue[-HEIGHT // 20 :].max() < 40
 
 
 def test_the_horizon_is_where_the_pitch_of_the_camera_puts_it(stage: Stage, canvas: Canvas) -> None:
@@ -170,13 +147,6 @@ def test_without_a_goal_there_is_no_disc_and_the_craft_is_in_the_middle(
     assert green_in(canvas.draw(camera)).sum() == 0
     if camera != "onboard":
         assert np.nonzero(craft_in(canvas, camera))[1].mean() == pytest.approx(WIDTH / 2, abs=3)
-
-
-def test_a_goal_may_be_anywhere(stage: Stage, canvas: Canvas) -> None:
-    stage.show(at(5.0, goal=(0.0, -2.0, 5.0)))  # 2 m to the right of the craft
-    disc = np.nonzero(green_in(canvas.draw("chase")))[1].mean()
-    craft = np.nonzero(craft_in(canvas, "chase"))[1].mean()
-    assert disc - craft == pytest.approx(2 * pixels_per_metre(stage, "chase"), rel=0.2)
 
 
 @pytest.mark.parametrize("world", ["plain", "airport"])

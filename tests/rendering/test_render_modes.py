@@ -148,17 +148,6 @@ def test_a_path_begins_anew_with_each_episode() -> None:
     assert count() == 0
 
 
-def test_many_stand_side_by_side() -> None:
-    stage = Stage("plain", drones=5)
-    stage.show(*[at(3.0 + i) for i in range(5)])
-    places = stage.data.qpos.reshape(5, 7)[:, :3]
-    assert places[:, 2].tolist() == [3.0, 4.0, 5.0, 6.0, 7.0]
-    gaps = np.linalg.norm(places[:, None, :2] - places[None, :, :2], axis=2)
-    assert gaps[~np.eye(5, dtype=bool)].min() == pytest.approx(4.0, abs=0.01)
-    with pytest.raises(InputError, match="moments: expected 5, got 1"):
-        stage.show(at(5.0))
-
-
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
@@ -180,8 +169,7 @@ def test_drones_of_one_world_are_in_one_picture_where_they_are() -> None:
     assert picture.dtype == np.uint8
     env.close()
     stage = Stage("plain", 2, names=("a", "b"))
-    still: Any = {"attitude": (1.0, 0.0, 0.0, 0.0), "thrusts": (49.0,) * 4}
-    stage.show(*(Moment(position=(2.0 * x, -x, 9.0), **still) for x in (1.0, 4.0)))
+    stage.show(*(at(9.0, position=(2.0 * x, -x, 9.0)) for x in (1.0, 4.0)))
     places = stage.data.qpos.reshape(2, 7)[:, :3]
     assert places == pytest.approx(np.array([[2.0, -1.0, 9.0], [8.0, -4.0, 9.0]]))
     assert stage.least_distance == pytest.approx(math.hypot(6.0, 3.0))
@@ -190,11 +178,11 @@ def test_drones_of_one_world_are_in_one_picture_where_they_are() -> None:
 
 def test_cameras_hold_every_craft_and_goal_of_one_world() -> None:
     stage = Stage("plain", 2, names=("a", "b"))
-    stage.show(*(
-        Moment(position=(0.0, -x, 9.0), goal=(0.0, 5.0 * x, 9.0), attitude=(1.0, 0.0, 0.0, 0.0),
-               thrusts=(49.0,) * 4)
-        for x in (1.0, -4.0)
-    ))  # fmt: skip
+    moments = []
+    for y in ((-1.0, 5.0), (4.0, -20.0)):
+        craft, goal = ((0.0, one, 9.0) for one in y)
+        moments.append(at(9.0, position=craft, goal=goal))
+    stage.show(*moments)
     radii = {"chase": 3.85, "top": 5.5, "front": 6.9, "side": 6.9, "free": 3.85}
     for name, count in radii.items():  # the goals are at y = 5 and -20 m
         camera = stage.camera(name)
@@ -205,13 +193,10 @@ def test_cameras_hold_every_craft_and_goal_of_one_world() -> None:
 
 def test_drones_of_one_world_are_named_and_have_paths_and_goals_of_their_own_colour() -> None:
     stage = Stage("plain", 2, names=("a", "b"))
-    still: Any = {"attitude": (1.0, 0.0, 0.0, 0.0), "thrusts": (49.0,) * 4}
     for step in range(10):
-        moments = []
-        for y in (-1.0, -4.0):
-            goal = (5.0, y, 9.0)
-            moments.append(Moment(position=(0.1 * step, y, 9.0), goal=goal, step=step, **still))
-        stage.show(*moments)
+        x = 0.1 * step
+        both = (at(9.0, position=(x, y, 9.0), goal=(5.0, y, 9.0), step=step) for y in (-1.0, -4.0))
+        stage.show(*both)
     scene = mujoco.MjvScene(stage.model, 1000)
     stage.decorate(scene)
     geoms = scene.geoms[: scene.ngeom]

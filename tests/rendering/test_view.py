@@ -189,29 +189,16 @@ def test_wrong_speed(speed: float) -> None:
 # What is written and where it is looked from.
 
 
-def test_lines_over_one_drone() -> None:
-    assert lines_over((moment(7, height=4.5, error=0.5, episode=3),), 100.0, "1 x", 1) == [
-        ("E", "0.500 m"),
-        ("elevation", "4.50 m"),
-        ("goal", "5.00 m"),
-        ("F1 to F4", "49 49 49 49 N"),
-        ("reward", "+0.250"),
-        ("step", "7"),
-        ("episode", "3"),
-        ("speed", "1 x"),
-    ]
-
-
 @pytest.mark.parametrize(("drones", "said"), [(2, "2"), (64, "2 of 64")])
 def test_lines_over_many_drones(drones: int, said: str) -> None:
-    lines = lines_over((moment(1), moment(2)), 100.0, "1 x", drones)
-    assert lines[0] == ("drones", f"{said} shown, numbers of the first")
-    assert ("step", "1") in lines
-
-
-def test_lines_over_drones_of_one_world_tell_how_near_they_are() -> None:
-    lines = lines_over((moment(1), moment(2)), 100.0, "1 x", 2, 1.234)
-    assert lines[:2] == [("drones", "2 shown, numbers of the first"), ("least distance", "1.23 m")]
+    own = moment(7).lines(100.0)
+    assert lines_over((moment(7), moment(2)), 100.0, "1 x", drones, 1.234) == [
+        ("drones", f"{said} shown, numbers of the first"),
+        ("least distance", "1.23 m"),
+        *own,
+        ("speed", "1 x"),
+    ]
+    assert lines_over((moment(7),), 100.0, "1 x", 1) == [*own, ("speed", "1 x")]
 
 
 def test_the_camera_goes_with_the_goal_and_leaves_the_mouse_its_turn(stage: Stage) -> None:

@@ -1,20 +1,17 @@
-"""The airport: looked at, never felt. Scenes move bit for bit as without it."""
+"""The airport alone; test_scenery.py has what it shares with the scenes of a seed."""
 
 import math
-import os
-import subprocess
-import sys
-from collections.abc import Callable
+from contextlib import closing
 from itertools import combinations
-from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
-from rotorgram.models import InputError
-from rotorgram.scenes import AIRPORT_XML, add_airport, build_scene
+from rotorgram.models import Vehicle
+from rotorgram.models.cameras import chosen_views
+from rotorgram.rendering.cameras import Cameras
+from rotorgram.scenes import AIRPORT_XML, add_scene, build_scene
 
-STEPS = 2_000
 OTHER = """
 <mujoco>
   <worldbody>
@@ -30,20 +27,9 @@ OTHER = """
 """
 
 
-def other() -> mujoco.MjSpec:
-    return mujoco.MjSpec.from_string(OTHER)
-
-
-def with_airport(make: Callable[[], mujoco.MjSpec], discard: bool = False) -> mujoco.MjModel:
-    spec = make()
-    add_airport(spec)
-    spec.compiler.discardvisual = discard
-    return spec.compile()
-
-
 @pytest.fixture(scope="module")
 def model() -> mujoco.MjModel:
-    return with_airport(build_scene)
+    return build_scene(scene="airport").compile()
 
 
 @pytest.fixture(scope="module")
@@ -54,104 +40,33 @@ def airport(model: mujoco.MjModel) -> np.ndarray:
     return np.flatnonzero(ours)
 
 
-def fly(model: mujoco.MjModel) -> tuple[bytes, set[int]]:
-    """State after every step of a flight with hops and landings, and the numbers of contacts."""
-    data = mujoco.MjData(model)
-    rng = np.random.default_rng(5)
-    states = []
-    contacts = set()
-    for step in range(STEPS):
-        if step % 40 == 0 and model.nu:
-            data.ctrl[:] = rng.uniform(30.0, 68.0) + rng.uniform(-1.0, 1.0, model.nu)
-        mujoco.mj_step(model, data)
-        states.append(np.concatenate([data.qpos, data.qvel]))
-        contacts.add(data.ncon)
-    assert not data.warning.number.any()
-    return np.array(states).tobytes(), contacts
-
-
-@pytest.mark.parametrize("make", [build_scene, other])
-@pytest.mark.parametrize("discard", [False, True])
-def test_motion_is_the_same_to_the_last_bit(
-    make: Callable[[], mujoco.MjSpec], discard: bool
-) -> None:
-    alone, contacts = fly(make().compile())
-    assert 0 in contacts
-    assert max(contacts) >= 2  # it flew, and it stood on the floor
-    assert fly(with_airport(make, discard)) == (alone, contacts)
-
-
-def test_nothing_is_added_but_geoms(model: mujoco.MjModel, airport: np.ndarray) -> None:
-    alone = build_scene().compile()
-    for count in ("nbody", "njnt", "nq", "nv", "nu", "nsensor", "nsite", "nmocap", "neq", "npair"):
-        assert getattr(model, count) == getattr(alone, count), count
-    assert model.nmesh == 0
-    assert model.nhfield == 0
-    assert model.nflex == 0
-    assert model.nskin == 0
-    assert model.body_mass.tolist() == alone.body_mass.tolist()
-    assert model.body_inertia.tolist() == alone.body_inertia.tolist()
-    assert 250 < len(airport) <= 400  # drawn in software too
-
-
-def test_the_airport_stands_still_and_touches_nothing(
-    model: mujoco.MjModel, airport: np.ndarray
-) -> None:
-    spec = mujoco.MjSpec.from_file(str(AIRPORT_XML))
-    assert len(airport) == len(spec.geoms)  # all of them in the world body, which is static
-    assert model.ngeom == build_scene().compile().ngeom + len(airport)
-    assert not model.geom_contype[airport].any()
-    assert not model.geom_conaffinity[airport].any()
-    assert set(model.geom_group[airport]) == {2}
-    assert {geom.mass for geom in spec.geoms} == {0.0}
-
-
-def test_discardvisual_drops_all_of_it() -> None:
-    spec = build_scene()
-    spec.compiler.discardvisual = True
-    alone = spec.compile()
-    model = with_airport(build_scene, discard=True)
-    assert model.ngeom == alone.ngeom
-    assert model.nmat == alone.nmat
-    assert model.ntex == alone.ntex
-
-
-@pytest.mark.parametrize("visual", [True, False])
-def test_a_scene_has_the_airport_that_was_asked_for(visual: bool) -> None:
-    spec = build_scene(scene="airport")
-    spec.compiler.discardvisual = not visual
-    assert spec.compile().ngeom == with_airport(build_scene, discard=not visual).ngeom
-    with pytest.raises(InputError, match=r"scene: expected 'plain' or 'airport' .* got 'mars'"):
-        build_scene(scene="mars")
+def other_at_the_airport() -> mujoco.MjModel:
+    spec = mujoco.MjSpec.from_string(OTHER)
+    add_scene(spec, "airport")
+    return spec.compile()
 
 
 def test_only_the_floor_is_hidden() -> None:
-    model = with_airport(other)
+    model = other_at_the_airport()
     assert [model.geom(name).group[0] for name in ("floor", "wall", "deck")] == [3, 0, 0]
     assert model.geom("floor").contype[0] == 1
 
 
-@pytest.mark.parametrize("make", [build_scene, other])
-def test_the_scenes_own_scale_stays(make: Callable[[], mujoco.MjSpec]) -> None:
-    alone = make().compile()
-    model = with_airport(make)
-    assert model.stat.extent == alone.stat.extent
-    assert model.stat.center.tolist() == alone.stat.center.tolist()
-    assert model.vis.map.znear * model.stat.extent == pytest.approx(0.25)
-    assert model.vis.map.zfar * model.stat.extent == pytest.approx(1200.0)
+def test_the_scenes_own_scale_stays(model: mujoco.MjModel) -> None:
+    plain = build_scene().compile()
+    other = mujoco.MjSpec.from_string(OTHER).compile()
+    for alone, there in ((plain, model), (other, other_at_the_airport())):
+        assert there.stat.extent == alone.stat.extent
+        assert there.stat.center.tolist() == alone.stat.center.tolist()
+        assert there.vis.map.znear * there.stat.extent == pytest.approx(0.25)
+        assert there.vis.map.zfar * there.stat.extent == pytest.approx(1200.0)
 
 
-def test_one_sky() -> None:
-    model = with_airport(build_scene)
-    skies = np.flatnonzero(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
-    assert [model.tex(i).name for i in skies] == ["airport/sky"]
-
-
-def test_a_second_airport_is_refused() -> None:
-    spec = build_scene()
-    add_airport(spec)
-    with pytest.raises(InputError, match="spec: expected a scene without an airport"):
-        add_airport(spec)
+def test_it_has_geoms_alone_and_not_too_many(airport: np.ndarray) -> None:
+    spec = mujoco.MjSpec.from_file(str(AIRPORT_XML))
+    assert len(airport) == len(spec.geoms)  # all of them in the world body, which is static
+    assert {geom.mass for geom in spec.geoms} == {0.0}
+    assert 250 < len(airport) <= 400  # drawn in software too
 
 
 def corners(model: mujoco.MjModel, geom: int) -> np.ndarray:
@@ -192,80 +107,26 @@ def test_flat_things_of_one_height_do_not_overlap(
             )
 
 
-NO_GL = 77
-DRAW = f"""
-import sys
-try:
-    import mujoco
-    import numpy as np
-    from rotorgram.scenes import build_scene
-    spec = build_scene(scene="airport")
-    # 12 m behind the craft and 2 m above it, looking forward: the horizon is the middle row
-    spec.worldbody.add_camera(name="eye", pos=[-12, 0, 4], quat=[0.5, 0.5, -0.5, -0.5], fovy=50)
-    model = spec.compile()
-    renderer = mujoco.Renderer(model, 120, 160)
-except Exception as error:
-    print(f"no OpenGL: {{error!r}}")
-    sys.exit({NO_GL})
-data = mujoco.MjData(model)
-data.qpos[2] = 2
-mujoco.mj_forward(model, data)
-renderer.update_scene(data, "eye")
-picture = renderer.render().copy()
-renderer.enable_segmentation_rendering()
-renderer.update_scene(data, "eye")
-geoms = renderer.render()[:, :, 0].copy()
-np.savez(sys.argv[1], picture=picture, geoms=geoms)
-renderer.close()
-"""
-
-
-@pytest.fixture(scope="module")
-def drawn(tmp_path_factory: pytest.TempPathFactory) -> tuple[np.ndarray, np.ndarray]:
-    """Picture (120, 160, 3) and geom of each pixel (120, 160), −1 the sky. Skips without OpenGL.
-
-    In a process of its own: MuJoCo chooses its OpenGL once, when it is imported.
-    """
-    file = tmp_path_factory.mktemp("airport") / "drawn.npz"
-    environment = {**os.environ, "MUJOCO_GL": os.environ.get("MUJOCO_GL", "egl")}
-    done = subprocess.run(
-        [sys.executable, "-c", DRAW, str(file)], env=environment, capture_output=True, text=True
-    )
-    if done.returncode == NO_GL:
-        pytest.skip(done.stdout.strip())
-    assert done.returncode == 0, done.stderr
-    with np.load(Path(file)) as arrays:
-        return arrays["picture"].astype(int), arrays["geoms"]
-
-
-def test_sky_above_the_horizon_and_ground_below(drawn: tuple[np.ndarray, np.ndarray]) -> None:
-    _, geoms = drawn
-    focal = 60 / math.tan(math.radians(25))  # pixels
-    antenna = math.atan2(34.5 - 4, 104 + 12)  # the tower's tip, as if straight ahead
-    clear = int(60 - focal * math.tan(antenna)) - 2
+def test_sky_is_above_the_horizon_and_ground_below(opengl: None) -> None:
+    vehicle = Vehicle.load()
+    views = chosen_views(["front@160x120", "front_segmentation@160x120"], vehicle.cameras)
+    state = {"position": np.array([[0.0, 0.0, 4.0]]), "quaternion": np.array([[1.0, 0, 0, 0]])}
+    everybody = np.ones(1, bool)
+    with closing(Cameras(vehicle, views, scene="airport")) as cameras:
+        cameras.take({view.name: everybody for view in views}, everybody, state)
+        picture = cameras.pictures["front"][0].astype(int)
+        seen = cameras.pictures["front_segmentation"][0, ..., 0]
+        names = cameras.objects
+    antenna = (34.5 - 4) / (104 - vehicle.radius)  # the tower's tip, as if straight ahead
+    clear = int(60 - 60 * antenna) - 2  # 90 degrees high: 60 pixels to each metre, 1 m ahead
     assert clear > 20
-    assert (geoms[:clear] == -1).all()
-    assert (geoms[62:] >= 0).all()  # the ground ends 1200 m away, 0.2 degrees below the horizon
-
-
-def test_drone_is_seen_before_it_at_its_size(
-    model: mujoco.MjModel, drawn: tuple[np.ndarray, np.ndarray]
-) -> None:
-    _, geoms = drawn
-    seen = (geoms >= 0) & (model.geom_bodyid[geoms] == model.body("quad").id)
-    columns = np.flatnonzero(seen.any(axis=0))
-    focal = 60 / math.tan(math.radians(25))
-    width = 2 * 1.4 / 11 * focal  # the rear rotors' discs, 11 m before the eye
-    assert columns.max() - columns.min() + 1 == pytest.approx(width, abs=2.5)
-    assert (columns.max() + columns.min()) / 2 == pytest.approx(79.5, abs=1.0)
-
-
-def test_colours(model: mujoco.MjModel, drawn: tuple[np.ndarray, np.ndarray]) -> None:
-    picture, geoms = drawn
-    red, green, blue = picture[geoms == -1].mean(axis=0)
+    assert (seen[:clear] == 0).all()
+    assert (seen[62:] > 0).all()  # the ground ends 1200 m away, 0.2 degrees below the horizon
+    red, green, blue = picture[seen == 0].mean(axis=0)
     assert blue > green > red  # sky
-    red, green, blue = picture[geoms == model.geom("airport/grass").id].mean(axis=0)
+    red, green, blue = picture[seen == names.index("airport/grass")].mean(axis=0)
     assert green > red > blue
-    red, green, blue = picture[geoms == model.geom("airport/apron").id].mean(axis=0)
+    red, green, blue = picture[seen == names.index("airport/apron")].mean(axis=0)
     assert max(red, green, blue) - min(red, green, blue) < 20  # grey
-    assert not (geoms == model.geom("scene/floor").id).any()  # hidden by the airport's own ground
+    hidden = names.index("scene/floor") if "scene/floor" in names else -1
+    assert not (seen == hidden).any()  # by the airport's own ground
