@@ -117,7 +117,7 @@ def test_a_simulator_takes_what_its_table_says(where: SimulatorState, sealed: bo
         link = to(simulator(sealed=sealed), where, wire)
         asked = link._asking if isinstance(message, Unknown) else b""
         taken = link.receive(wire(message, asked), 0.0)
-        then = SIMULATOR.get((where, Way.RECEIVED, type(message)))
+        then = SIMULATOR[where].get((Way.RECEIVED, type(message)))
         if then is SimulatorState.IDLE:  # it says Hello at once
             assert link.state is SimulatorState.HELLO
             assert link.hello.session == OTHER
@@ -146,7 +146,7 @@ def test_an_agent_takes_what_its_table_says(where: AgentState, sealed: bool) -> 
     ):
         server = agent_at(where, wire, sealed)
         event = server.receive(wire(message), HERE, 0.0)
-        then = AGENT.get((where, Way.RECEIVED, type(message)))
+        then = AGENT[where].get((Way.RECEIVED, type(message)))
         session = server.slots[0]
         if where is AgentState.CLOSED or (
             where is AgentState.WELCOMED and then is not AgentState.DECIDING
@@ -166,7 +166,7 @@ def test_only_what_the_table_says_can_be_sent() -> None:
     wire = Wire("agent", False)
     for where in SimulatorState:
         link = to(simulator(), where, wire)
-        if (where, Way.SENT, State) in SIMULATOR:
+        if (Way.SENT, State) in SIMULATOR[where]:
             send_state(link, 0.0, 0.0)
         else:
             with pytest.raises(ValueError, match="expected state ready"):

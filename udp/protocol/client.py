@@ -61,7 +61,7 @@ _LATEST: Final = 10.0
 for again before an agent takes the simulator for lost (30 s)."""
 _TOO_EARLY: Final = 1.5  # by so much round trips are taken for longer when answers come twice
 _SOON: Final = 0.25  # an agent that has waited for a State for less needs no Alive, s
-_AFTER_COMMAND: Final = SIMULATOR[SimulatorState.WAITING, Way.RECEIVED, Command]
+_AFTER_COMMAND: Final = SIMULATOR[SimulatorState.WAITING][Way.RECEIVED, Command]
 
 
 def new_session() -> int:
@@ -287,7 +287,7 @@ class Client:
 
     def close(self, reason: str, now: float) -> None:
         """End the exchange. An agent that has welcomed this simulator is told, until it answers."""
-        if (self.state, Way.SENT, m.Close) in SIMULATOR:
+        if (Way.SENT, m.Close) in SIMULATOR[self.state]:
             session = self.hello.session
             number = self.sequence
             self._send(m.Close(session=session, sequence=number, reason=one_line(reason)), now)
@@ -332,7 +332,7 @@ class Client:
         if message.session != self.hello.session:
             self._drop("foreign", f"session {message.session:016x}", now)
             return None
-        state = SIMULATOR.get((self.state, Way.RECEIVED, type(message)))
+        state = SIMULATOR[self.state].get((Way.RECEIVED, type(message)))
         number = getattr(message, "sequence", self.sequence)
         # There is one Close in a session, so its number does not matter.
         if state is None or (number != self.sequence and not isinstance(message, m.Close)):
@@ -518,7 +518,7 @@ class Client:
             self._record(message, data)
         self._transfer = transfer = Transfer(data, self._largest, self._window)
         self._transfer_key = self._key if kind is m.Hello else self._session_key
-        self.state = SIMULATOR[self.state, Way.SENT, kind]
+        self.state = SIMULATOR[self.state][Way.SENT, kind]
         self.sequence = 0 if isinstance(message, m.Hello) else message.sequence
         self.sends = self._tries = 1
         self._stretch = 1.0
@@ -560,7 +560,7 @@ class Client:
             self.tap(0, message, binary.encode(message, self.layout) if self.by_text else data)
 
     def _give_up(self) -> None:
-        self.state = SIMULATOR[self.state, Way.UNSAID, m.Close]
+        self.state = SIMULATOR[self.state][Way.UNSAID, m.Close]
         self._forget_transfer()
 
     def _forget_transfer(self) -> None:

@@ -19,7 +19,7 @@ from .messages import Command, Message, State, one_line
 from .statistics import Statistics
 from .transitions import AGENT, AgentState, Way
 
-_AFTER_STATE: Final = AGENT[AgentState.EXPECTING, Way.RECEIVED, State]
+_AFTER_STATE: Final = AGENT[AgentState.EXPECTING][Way.RECEIVED, State]
 
 
 class NoSuchSession(DecodeError):
@@ -107,7 +107,7 @@ class Session:
 
     def move(self, way: Way, kind: type[Message]) -> None:
         """Be in the state that such a message leads to. Raises `KeyError` if it may not."""
-        self.state = AGENT[self.state, way, kind]
+        self.state = AGENT[self.state][way, kind]
 
     def session_key(self) -> Key | None:
         """The key of its messages after the Welcome."""
@@ -144,7 +144,7 @@ class Session:
         )
         layout = self.layout
         data = text.encode(command) if self.is_text else binary.encode_step(command, layout)
-        self.state = AGENT[self.state, Way.SENT, Command]
+        self.state = AGENT[self.state][Way.SENT, Command]
         self.asked_at = self.heard_at = now
         self.reply = reply = Transfer(data, self._largest, self._window)
         outbox = self._outbox
@@ -233,7 +233,7 @@ class Session:
         if is_state and number > self.sequence + 1 and not self.is_text:
             raise NoSuchSession(f"State {number}")
         is_due = number == self.sequence + is_state or isinstance(message, m.Close)
-        if not is_due or (self.state, Way.RECEIVED, type(message)) not in AGENT:
+        if not is_due or (Way.RECEIVED, type(message)) not in AGENT[self.state]:
             self._drop("stale", now)
             return None
         if isinstance(message, State):
