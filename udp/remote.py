@@ -103,8 +103,6 @@ class RemoteEnv(_Remote, gym.Env[Any, Any]):
             it computes, it says so.
         max_datagram: Largest datagram, bytes, a seal not counted, at least 256. None: 65,483 on
             loopback, 1,200 elsewhere.
-        when_lost: What its drones do when this agent is lost to a simulator of several agents:
-            `hold`, `land` or `end`, see `Simulator`; None leaves it to the simulator.
         key_file: File with the key that the simulators have too (`rotorgram key`). With it any
             address is allowed, because only holders of the key can take part.
         insecure: Allow an address that is not loopback without a key.

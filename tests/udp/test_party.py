@@ -13,9 +13,7 @@ from rotorgram.udp.protocol.messages import (
     FLY,
     FREEZE,
     RESET,
-    WHEN_LOST,
     Close,
-    Extension,
     State,
 )
 from rotorgram.udp.protocol.party import AgentLink, Participation, SeveralAgents
@@ -28,14 +26,14 @@ TIMEOUT = 60.0
 class World:
     """Two drones; it notes what is done to it."""
 
-    def __init__(self) -> None:
+    def __init__(self, can_land: bool = True) -> None:
         self.height = np.zeros((2, 1), np.float32)
         self.rewards = np.zeros(2)
         self.terminated = self.truncated = self.out = np.zeros(2, bool)
         self.telemetry: dict[str, Any] = {}
         self.flown: list[list[float]] = []
         self.seeds: list[list[int] | None] = []
-        self.can_land = True
+        self.can_land = can_land
         self.landed = self.retired = np.zeros(2, bool)
 
     @property
@@ -64,10 +62,11 @@ class World:
 class Swarm:
     """Both sides of a world of two drones, each flown by an agent of its own."""
 
-    def __init__(self, *policies: str, shares: tuple[list[int], ...] = ([0], [1])) -> None:
+    def __init__(
+        self, policy: str = "hold", shares: tuple[list[int], ...] = ([0], [1]), **world: bool
+    ) -> None:
         self.now = 0.0
-        self.world = World()
-        self.policies = policies or ("hold", "hold")
+        self.world = World(**world)
         self.layout = layout(len(shares[0]))
         config = LinkConfig(timeout=TIMEOUT)
         links = []
@@ -75,18 +74,15 @@ class Swarm:
             client = Client(hello(70 + i), self.layout, config, draw_session=lambda i=i: 80 + i)
             links.append(AgentLink(i, ("127.0.0.1", 1000 + i), client, np.array(rows)))
         self.rules = SeveralAgents(
-            self.world, layout(2), 0.1, links, when_lost="hold", patience=PATIENCE
+            self.world, layout(2), 0.1, links, when_lost=policy, patience=PATIENCE
         )
-        self.agents = [self.agent(i) for i in range(len(shares))]
+        self.agents = [self.agent() for _ in shares]
         self.states: list[list[State]] = [[], []]
         self.closed = ["", ""]
         self.rules.start(0.0)
 
-    def agent(self, number: int, refusal: str = "") -> Server:
-        policy = Extension(number=WHEN_LOST, value=self.policies[number].encode())
-        return Server(
-            lambda _: refusal or self.layout, draw_nonce=lambda: NONCE, extensions=(policy,)
-        )
+    def agent(self, refusal: str = "") -> Server:
+        return Server(lambda _: refusal or self.layout, draw_nonce=lambda: NONCE)
 
     def pump(self) -> None:
         """Carry datagrams until nothing moves."""
@@ -129,16 +125,16 @@ class Swarm:
 
     def restart(self, number: int) -> None:
         """Another agent takes the place of one that was killed."""
-        self.agents[number] = self.agent(number)
+        self.agents[number] = self.agent()
 
     @property
     def participations(self) -> list[Participation]:
         return [link.participation for link in self.rules.links]
 
 
-def begun(*policies: str) -> Swarm:
+def begun(policy: str = "hold") -> Swarm:
     """A world in which both have flown a step."""
-    swarm = Swarm(*policies)
+    swarm = Swarm(policy)
     swarm.pump()
     for number in (0, 1):
         swarm.say(number, FLY, number + 1.0)
@@ -174,7 +170,7 @@ def test_all_have_to_ask_for_a_reset() -> None:
 
 @pytest.mark.parametrize("policy", ["hold", "land", "end"])
 def test_the_policy_flies_the_drones_of_a_silent_agent(policy: str) -> None:
-    swarm = begun("hold", policy)
+    swarm = begun(policy)
     swarm.say(0, FLY, 1.0)
     swarm.pump()
     swarm.wait(PATIENCE - 0.1)
@@ -199,22 +195,24 @@ def test_the_policy_flies_the_drones_of_a_silent_agent(policy: str) -> None:
     assert swarm.participations == [Participation.FLYING] * 2
 
 
-def test_an_agent_that_is_started_anew_before_the_first_step_flies_the_first_episode() -> None:
+def test_an_agent_that_is_started_anew_flies_from_the_next_episode_on() -> None:
     swarm = Swarm()
     swarm.pump()
     swarm.restart(0)
-    swarm.wait(1.0)  # its State is answered with Unknown; the first step waits for it
-    assert swarm.participations == [Participation.FLYING] * 2
-    assert swarm.rules.absences == []
-    swarm.say(0, FLY, 1.0)
+    swarm.wait(1.0)  # its State is answered with Unknown
+    assert swarm.participations == [Participation.READY, Participation.FLYING]
+    assert swarm.rules.absences == [(0, 1, 0, Participation.COMING)]
     swarm.say(1, FLY, 2.0)
     swarm.pump()
-    assert swarm.world.flown == [[1.0, 2.0]]
-    assert swarm.rules.episodes == 1
+    assert swarm.world.flown == [[0.0, 2.0]]
+    swarm.say(1, RESET, seed=9)
+    swarm.pump()
+    assert swarm.participations == [Participation.FLYING] * 2
+    assert swarm.rules.episodes == 2
 
 
 def test_an_agent_that_asks_for_a_reset_before_the_others_waits_for_them() -> None:
-    swarm = begun("hold", "end")
+    swarm = begun("end")
     swarm.say(1, RESET)
     swarm.say(0, FLY, 3.0)
     swarm.pump()
@@ -243,7 +241,7 @@ def test_an_agent_that_resets_a_start_gets_it_again() -> None:
 
 
 def test_a_late_agent_is_told_the_end_of_the_drones_that_were_in_flight() -> None:
-    swarm = Swarm("end", shares=([0, 1],))
+    swarm = Swarm("end", ([0, 1],))
     swarm.pump()
     fly = np.zeros((2, 1), np.float32), np.full(2, FLY, np.uint8), None
     swarm.world.out = np.array([True, False])
@@ -267,23 +265,13 @@ def test_an_agent_that_came_back_does_not_hide_the_seeds_of_the_others() -> None
     assert swarm.participations == [Participation.FLYING] * 2
 
 
-def test_an_agent_that_comes_back_to_land_where_the_vehicle_cannot_ends_nobodys_flight() -> None:
-    swarm = begun()
-    swarm.policies = ("hold", "land")
-    swarm.restart(1)
-    swarm.world.can_land = False
-    swarm.wait(1.0)
-    assert swarm.rules.links[1].when_lost == "hold"
-    notice = swarm.rules.links[1].client.statistics.take_notices()[-1]
-    assert notice == "the agent at 127.0.0.1:1001 cannot have land (no rotors): hold"
-    swarm = Swarm("land", "land")
-    swarm.world.can_land = False
+def test_a_vehicle_that_cannot_land_is_not_flown_with_that_policy() -> None:
     with pytest.raises(InputError, match="no rotors"):
-        swarm.pump()
+        Swarm("land", can_land=False)
 
 
 def test_different_orders_of_one_agent_close_its_link() -> None:
-    swarm = Swarm("hold", shares=([0, 1],))
+    swarm = Swarm("hold", ([0, 1],))
     swarm.pump()
     orders = np.array([FLY, FREEZE], np.uint8)
     swarm.agents[0].send_command(0, np.zeros((2, 1), np.float32), orders, None, swarm.now)
@@ -316,7 +304,7 @@ def test_a_command_that_the_world_cannot_follow_closes_one_link(order: int, reas
 
 def test_before_the_world_begins_a_refusal_and_silence_end_it() -> None:
     swarm = Swarm()
-    swarm.agents[1] = swarm.agent(1, "another vehicle")
+    swarm.agents[1] = swarm.agent("another vehicle")
     with pytest.raises(Refused, match=r"^the agent at 127.0.0.1:1001 refused: another vehicle$"):
         swarm.pump()
     silent = Swarm()

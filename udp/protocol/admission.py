@@ -91,7 +91,6 @@ class Admission:
         outbox: Outbox,
         accept: Callable[[m.Hello], Layout | str],
         keys: Mapping[bytes, Key],
-        extensions: tuple[m.Extension, ...],
         draw_nonce: Callable[[], int],
     ) -> None:
         self.closed = False
@@ -100,7 +99,6 @@ class Admission:
         self._outbox = outbox
         self._accept = accept
         self._keys = keys
-        self._extensions = extensions
         self._draw_nonce = draw_nonce
         self._queue: OrderedDict[Address, Session] = OrderedDict()  # QUEUED
         self._assembling: OrderedDict[tuple[Address, int], Assembler] = OrderedDict()
@@ -136,7 +134,7 @@ class Admission:
         if self._slots.takes(address):
             self._queue.pop(address, None)
             nonce = self._draw_nonce()
-            welcome = m.Welcome(session=hello.session, nonce=nonce, extensions=self._extensions)
+            welcome = m.Welcome(session=hello.session, nonce=nonce)
             session.send_welcome(welcome)
             keep(self.openings, (address, hello.session), session)
         else:

@@ -13,16 +13,13 @@ from typing import Final, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ...models.errors import InputError
 from .client import Address, Client, address_text
 from .errors import LinkError, PeerSilent, Refused
 from .layout import Layout
 from .messages import (
     FLY,
     FREEZE,
-    POLICIES,
     RESET,
-    WHEN_LOST,
     Close,
     Command,
     Message,
@@ -111,8 +108,6 @@ class AgentLink:
     """The exchange with it, with its statistics."""
     rows: Array
     """Rows of its drones in the world's arrays, shape (n,)."""
-    when_lost: str = "hold"
-    """Its policy, one of `POLICIES`."""
     participation: Participation = Participation.COMING
     command: Command | None = None
     """The Command that the next step or reset takes."""
@@ -127,9 +122,6 @@ class AgentLink:
     """Its drones that were flying when it was lost."""
     complained: float = -inf
     """When the message was sent whose missing answer is in the log."""
-
-    def __post_init__(self) -> None:
-        self.in_flight = np.zeros(len(self.rows), bool)
 
     @property
     def name(self) -> str:
@@ -361,27 +353,18 @@ class SeveralAgents(WorldRules):
         self._when_lost = when_lost
         self._patience = patience
         self._due: list[tuple[AgentLink, bool, bool]] = []  # States: to whom, again, cut
-        self._last_reason = ""
+        if when_lost == "land":  # raises where the vehicle cannot
+            world.land(np.zeros(layout.drones, bool))
 
     # ---- episodes and steps
 
     def step(self, now: float) -> bool:
         """Step or begin the world if it is time to."""
         flying = self._who(Participation.FLYING)
-        if all(link.participation is Participation.LEFT for link in self.links):
-            self.reason = self._last_reason
-            return False
         if not self.episodes:
             if len(self._who(Participation.READY)) < len(self.links):
                 return False
             self._begin(first=True)
-            return True
-        if again := self._started_anew():
-            if any(link.participation is Participation.COMING for link in again):
-                return False
-            for link in again:
-                link.participation = Participation.FLYING
-                self._queue(link)
             return True
         if not flying:
             if not self._who(Participation.WAITING, Participation.READY):
@@ -405,23 +388,10 @@ class SeveralAgents(WorldRules):
         else:
             self._fly(flying)
 
-    @property
-    def _is_first_start(self) -> bool:
-        """Whether the first episode has begun, and nothing was flown."""
-        return self.episodes == 1 and self.steps == 0
-
-    def _started_anew(self) -> list[AgentLink]:
-        """Agents that were started anew before the last one came: the first step waits for them."""
-        if not self._is_first_start:
-            return []
-        lost = {absence.agent for absence in self.absences}
-        coming = self._who(Participation.COMING, Participation.READY)
-        return [link for link in coming if link.number not in lost]
-
     def _begin(self, *, first: bool = False) -> None:
         """Begin an episode for all that take part."""
         joining = self._who(Participation.FLYING, Participation.WAITING, Participation.READY)
-        seeds = self._first_seeds(joining) if first else self._next_seeds(joining)
+        seeds = self._seeds(joining if first else [link for link in joining if link.command])
         self.seed = None if seeds is None else int(seeds[0])
         self._reset_all(seeds)
         self.episodes += first or self.steps > 0
@@ -435,22 +405,18 @@ class SeveralAgents(WorldRules):
             link.participation = Participation.FLYING
             self._queue(link)
 
-    def _first_seeds(self, joining: list[AgentLink]) -> NDArray[np.uint64]:
-        """As a simulator of one agent, by the agent of the first drone."""
-        link = min(joining, key=_first_row)
-        seed = link.client.hello.session if link.seed is None else link.seed
-        return first_seeds(seed, self._layout.drones)
-
-    def _next_seeds(self, joining: list[AgentLink]) -> NDArray[np.uint64] | None:
-        """The seed of the first drone whose agent asked for this reset; None if it gave none."""
-        asked = [link for link in joining if link.command is not None]
-        if not asked:
+    def _seeds(self, asking: list[AgentLink]) -> NDArray[np.uint64] | None:
+        """As the agent of the first drone says, of those that begin; None if it gives none."""
+        if not asking:
             return None
-        link = min(asked, key=_first_row)
-        assert link.command is not None
-        if link.command.seeds is None:
-            return None
-        return np.full(self._layout.drones, link.command.seeds[link.rows.argmin()], np.uint64)
+        drones = self._layout.drones
+        link = min(asking, key=lambda link: int(link.rows.min()))
+        if link.command is None:  # the first episode: as a simulator of one agent
+            return first_seeds(
+                link.client.hello.session if link.seed is None else link.seed, drones
+            )
+        seeds = link.command.seeds
+        return None if seeds is None else np.full(drones, seeds[link.rows.argmin()], np.uint64)
 
     def _fly(self, flying: list[AgentLink]) -> None:
         """Fly the world for one control period, if any agent flies in it."""
@@ -508,10 +474,10 @@ class SeveralAgents(WorldRules):
             flew = bool(link.in_flight.any())
         if flew:
             self._let_go(link)
-        if participation is Participation.LEFT:
-            self._last_reason = why
+        if all(other.participation is Participation.LEFT for other in self.links):
+            self.reason = why
         if why and flew:
-            notice = f"{link.name} is lost ({why}): {link.when_lost}"
+            notice = f"{link.name} is lost ({why}): {self._when_lost}"
             link.client.statistics.notice(notice)
 
     def _let_go(self, link: AgentLink) -> None:
@@ -520,9 +486,9 @@ class SeveralAgents(WorldRules):
         self.absences.append(absence)
         mask = np.zeros(self._layout.drones, bool)
         mask[link.rows] = True
-        if link.when_lost == "land":
+        if self._when_lost == "land":
             self._swarm.land(mask)
-        elif link.when_lost == "end":
+        elif self._when_lost == "end":
             self._swarm.retire(mask)
 
     def _out(self, link: AgentLink) -> Mask:
@@ -592,7 +558,7 @@ class SeveralAgents(WorldRules):
         if not self.episodes:
             raise PeerSilent(f"{why}, and the world begins when all have come")
         self._lose(link, Participation.LEFT, why)
-        if len(self._who(Participation.LEFT)) == len(self.links):
+        if self.reason is not None:
             raise PeerSilent(f"{why}, and no other is left")
 
     def receive(self, link: AgentLink, datagram: bytes, now: float) -> None:
@@ -600,10 +566,7 @@ class SeveralAgents(WorldRules):
         session = link.client.hello.session
         message = link.client.receive(datagram, now)
         if link.client.hello.session != session:  # its answer was Unknown
-            if self._is_first_start and link.participation is Participation.FLYING:
-                link.participation = Participation.COMING  # the first step waits for it
-            else:
-                self._lose(link, Participation.COMING, "it was started anew")
+            self._lose(link, Participation.COMING, "it was started anew")
         elif message is not None and link.participation is not Participation.LEFT:
             self._take(link, message, now)
 
@@ -616,7 +579,6 @@ class SeveralAgents(WorldRules):
         elif isinstance(message, Welcome):
             link.participation = Participation.READY
             link.seed = message.seed
-            self._take_policy(link, message)
         elif isinstance(message, Refuse | Close):
             if self.episodes:
                 self._lose(link, Participation.LEFT, message.reason or "the agent closed")
@@ -625,24 +587,6 @@ class SeveralAgents(WorldRules):
             else:
                 reason = message.reason or "no reason"
                 raise LinkError(f"{link.name} closed before the world began: {reason}")
-
-    def _take_policy(self, link: AgentLink, welcome: Welcome) -> None:
-        link.when_lost = self._when_lost
-        for extension in welcome.extensions:
-            if extension.number == WHEN_LOST:
-                policy = extension.value.decode("ascii", "replace")
-                if policy in POLICIES:  # else of another version: this side's policy stays
-                    link.when_lost = policy
-        if link.when_lost != "land":
-            return
-        try:
-            self._swarm.land(np.zeros(self._layout.drones, bool))
-        except InputError as error:
-            if not self.episodes:
-                raise
-            link.when_lost = self._when_lost  # one agent does not end the flight of others
-            notice = f"{link.name} cannot have land ({error}): {link.when_lost}"
-            link.client.statistics.notice(notice)
 
     def _take_late(self, link: AgentLink, now: float) -> None:
         """A Command of an agent that does not take part in the running episode."""
@@ -655,7 +599,3 @@ class SeveralAgents(WorldRules):
             self._queue(link, cut=True)
         else:
             self._dismiss(link, _NO_RESET, now)
-
-
-def _first_row(link: AgentLink) -> int:
-    return int(link.rows.min())

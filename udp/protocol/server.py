@@ -39,7 +39,6 @@ class Server:
             gives the layout to read it by. None, or a result of None: text is not flown.
         slots: Simulators to fly at the same time. Others wait until a slot is free.
         keys: Shared with the simulators, any of them. Then nothing unsealed is taken.
-        extensions: Of each Welcome.
         draw_nonce: Gives a random 64-bit number for each Welcome.
 
     Attributes:
@@ -57,7 +56,6 @@ class Server:
         slots: int = 1,
         keys: Sequence[Key] = (),
         max_datagram: int | None = None,
-        extensions: tuple[m.Extension, ...] = (),
         draw_nonce: Callable[[], int] = lambda: secrets.randbits(64),
     ) -> None:
         self.outbox = Outbox(max_datagram)
@@ -67,9 +65,7 @@ class Server:
         self._keys = {key.id: key for key in keys}
         self._slots = Slots(slots)
         self.slots = self._slots.sessions
-        self._admission = Admission(
-            self._slots, self.outbox, accept, self._keys, extensions, draw_nonce
-        )
+        self._admission = Admission(self._slots, self.outbox, accept, self._keys, draw_nonce)
         self._resend_at = self._deadline = 0.0
 
     # ---- what the caller does

@@ -47,9 +47,8 @@ class Simulator(Driver):
         config: Times of the exchange. `timeout`: longest wait for an agent that is to come, or to
             come back, s.
         key_file: As `AgentSettings`, and so are `insecure` and `record`.
-        when_lost: What the drones of one of several agents do when it is lost, unless it states a
-            policy: `hold` (the action that changes nothing), `land` (`Loop.land`) or `end` (rotors
-            stand still).
+        when_lost: What the drones of one of several agents do when it is lost: `hold` (the action
+            that changes nothing), `land` (`Loop.land`) or `end` (rotors stand still).
         patience: Longest wait for a Command of one of several agents, s.
         keywords: As of `EnvConfig.from_keywords`, with an id: `drones` of each world, `vehicle` …
 
