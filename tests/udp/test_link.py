@@ -450,7 +450,7 @@ def test_a_simulator_that_closes_before_its_first_state_is_answered(sealed: bool
     link.close("bye", 0.0)
     link.receive(reply, 0.0)
     assert link.state is SimulatorState.CLOSED
-    assert not server._admission.openings
+    assert not server.openings
 
 
 def test_a_state_0_is_not_answered() -> None:
@@ -483,8 +483,8 @@ def test_what_is_remembered_of_strangers_is_bounded() -> None:
         server.receive(binary.encode(hello(session=number)), ("127.0.0.1", number), 0.0)
         data = binary.frame(129, number, 0, b"\0\0\5\0\0\0\0\0" + binary.encode(long)[:1000])
         server.receive(data, ("127.0.0.2", number), 0.0)
-    assert len(server._admission.openings) <= 1024
-    assert len(server._admission._assembling) <= 16
+    assert len(server.openings) <= 1024
+    assert len(server._assembling) <= 16
 
 
 def test_refusals_and_their_size() -> None:
