@@ -134,6 +134,8 @@ class AgentConfig:
         env_id = self.env_id
         if env_id is None or not registry.is_known(env_id) or self.drones not in (None, 1):
             return None
+        if self.record:  # a journal begins with a Hello
+            return None
         try:
             spec = registry.env_spec(EnvConfig.from_keywords(env_id, **(self.options or {})))
             text.check_layout(layout_of(spec))
@@ -174,8 +176,10 @@ class Agent:
         self.address = self._port.address
         self._journal: Journal | None = None
         if config.record:
+            from .. import journal
+
             try:
-                self._journal = self._record(config.record)
+                self._journal = journal.Journal(config.record, side="agent")
                 server.outbox.tap = self._journal.tap
             except BaseException:
                 self._port.close()
@@ -210,14 +214,6 @@ class Agent:
             session.send_command(actions, what, seeds, now)
         self.lost = [""] * len(self.lost)
         self._gather(self._pending() if None in self.server.slots else list(orders))
-
-    def _record(self, path: Path | str) -> "Journal":
-        from ..journal import Journal
-
-        server = self.server
-        spec = self.config.text_spec
-        hello = Hello(session=0, spec=spec.to_json()) if spec else None
-        return Journal(path, side="agent", slots=server.slots, text_hello=hello)
 
     # ---- the exchange
 
@@ -406,7 +402,5 @@ def _flush(server: Server, port: Port) -> None:
             port.send(datagram, address)
         except OSError:  # as good as lost: the simulator asks again, or the wait ends in time
             outbox.statistics.counters["unsent"] += 1
-    statistics = outbox.statistics
-    now = time.monotonic()
-    if statistics.notices or now >= statistics.report_at:
-        log_notices(statistics, now)
+    if outbox.statistics.notices:
+        log_notices(outbox.statistics)

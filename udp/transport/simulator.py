@@ -13,6 +13,7 @@ from ...envs.config import DEFAULT_ENV, EnvConfig
 from ...envs.spec import EnvSpec
 from ...models.errors import InputError
 from ..layouts import layout_of
+from ..protocol import binary
 from ..protocol.auth import Key, read_keys
 from ..protocol.client import Address, Client, LinkConfig, largest_datagram, new_session
 from ..protocol.messages import POLICIES, Hello
@@ -130,11 +131,12 @@ class Simulator(Driver):
         from ..journal.writer import models_of
 
         about, models = models_of(self.stepped)
-        hello = self.link.hello
-        self._journal = Journal(
-            path, side="simulator", text_hello=hello, about=about, models=models
-        )
-        self.link.tap = self._journal.tap
+        link = self.link
+        codec = "text" if link.by_text else "binary"
+        self._journal = Journal(path, side="simulator", codec=codec, about=about, models=models)
+        link.tap = self._journal.tap
+        if link.by_text:  # says no Hello
+            link.tap(0, link.hello, binary.encode(link.hello))
 
 
 def _rows(spec: EnvSpec, names: tuple[str, ...], worlds: int) -> np.ndarray:
