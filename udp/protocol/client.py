@@ -25,7 +25,6 @@ from .fragments import (
     NEAR,
     Assembler,
     Transfer,
-    Window,
     check_largest,
     check_size,
     is_fragment,
@@ -230,7 +229,6 @@ class Client:
         self._dice = Random(config.drop_seed).random if config.drop else None
         self._is_queued = False
         self._assembler = Assembler(layout.seeded_command.size)
-        self._window = Window()
         self._transfer: Transfer | None = None  # of the outstanding message
         self._transfer_key: Key | None = None
         self._asking = b""  # the datagram that was sent last and wants an answer
@@ -516,7 +514,7 @@ class Client:
             data = self._encode(message)
         if self.tap:
             self._record(message, data)
-        self._transfer = transfer = Transfer(data, self._largest, self._window)
+        self._transfer = transfer = Transfer(data, self._largest)
         self._transfer_key = self._key if kind is m.Hello else self._session_key
         self.state = SIMULATOR[self.state][Way.SENT, kind]
         self.sequence = 0 if isinstance(message, m.Hello) else message.sequence
