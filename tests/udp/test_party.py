@@ -106,7 +106,12 @@ class Swarm:
         seeds = None if seed is None else np.array([seed], np.uint64)
         actions = np.full((1, 1), value, np.float32)
         orders = np.array([order], np.uint8)
-        self.agents[number].send_command(0, actions, orders, seeds, self.now)
+        self.send(number, actions, orders, seeds)
+
+    def send(self, number: int, actions: Any, orders: Any, seeds: Any = None) -> None:
+        (session,) = self.agents[number].slots
+        assert session is not None
+        session.send_command(actions, orders, seeds, self.now)
 
     def wait(self, seconds: float) -> None:
         """Let time pass, with every timer at its time."""
@@ -243,11 +248,11 @@ def test_an_agent_that_resets_a_start_gets_it_again() -> None:
 def test_a_late_agent_is_told_the_end_of_the_drones_that_were_in_flight() -> None:
     swarm = Swarm("end", ([0, 1],))
     swarm.pump()
-    fly = np.zeros((2, 1), np.float32), np.full(2, FLY, np.uint8), None
+    fly = np.zeros((2, 1), np.float32), np.full(2, FLY, np.uint8)
     swarm.world.out = np.array([True, False])
     swarm.wait(PATIENCE + 0.1)
     assert swarm.participations == [Participation.SILENT]
-    swarm.agents[0].send_command(0, *fly, swarm.now)
+    swarm.send(0, *fly)
     swarm.pump()
     assert swarm.states[0][-1].truncated.tolist() == [False, True]
     assert swarm.participations == [Participation.LATE]
@@ -274,9 +279,9 @@ def test_different_orders_of_one_agent_close_its_link() -> None:
     swarm = Swarm("hold", ([0, 1],))
     swarm.pump()
     orders = np.array([FLY, FREEZE], np.uint8)
-    swarm.agents[0].send_command(0, np.zeros((2, 1), np.float32), orders, None, swarm.now)
+    swarm.send(0, np.zeros((2, 1), np.float32), orders)
     swarm.pump()
-    reason = "orders: expected the same for all 2 drones, got different ones"
+    reason = "orders: expected to fly or to reset all 2 drones, got others"
     assert swarm.closed[0] == reason
     assert swarm.participations == [Participation.LEFT]
     assert swarm.world.flown == []
@@ -285,7 +290,7 @@ def test_different_orders_of_one_agent_close_its_link() -> None:
 @pytest.mark.parametrize(
     ("order", "reason"),
     [(FLY, "an action came after the end of an episode: expected a reset"),
-     (FREEZE, "orders: expected no frozen drone in a world that others fly on in, got some")],
+     (FREEZE, "orders: expected to fly or to reset all 1 drones, got others")],
 )  # fmt: skip
 def test_a_command_that_the_world_cannot_follow_closes_one_link(order: int, reason: str) -> None:
     swarm = begun()

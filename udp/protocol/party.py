@@ -18,7 +18,6 @@ from .errors import LinkError, PeerSilent, Refused
 from .layout import Layout
 from .messages import (
     FLY,
-    FREEZE,
     RESET,
     Close,
     Command,
@@ -118,7 +117,7 @@ class AgentLink:
     """Why datagrams do not reach it, as far as the transport knows."""
     shown: tuple[tuple[Array, ...], tuple[Array, ...]] = ((), ())
     """Observations and telemetry of its last State."""
-    in_flight: Mask = field(init=False)
+    in_flight: Mask = field(default_factory=lambda: np.zeros(0, bool))
     """Its drones that were flying when it was lost."""
     complained: float = -inf
     """When the message was sent whose missing answer is in the log."""
@@ -352,7 +351,7 @@ class SeveralAgents(WorldRules):
         self._swarm = world
         self._when_lost = when_lost
         self._patience = patience
-        self._due: list[tuple[AgentLink, bool, bool]] = []  # States: to whom, again, cut
+        self._due: list[tuple[AgentLink, bool]] = []  # States: to whom, cut
         if when_lost == "land":  # raises where the vehicle cannot
             world.land(np.zeros(layout.drones, bool))
 
@@ -373,7 +372,7 @@ class SeveralAgents(WorldRules):
             return True
         if any(link.command is None for link in flying):
             return False
-        if not any(self._close_wrong(link, flying, now) for link in flying):
+        if not any(self._close_wrong(link, now) for link in flying):
             self._follow(flying)
         return True
 
@@ -419,9 +418,8 @@ class SeveralAgents(WorldRules):
         return None if seeds is None else np.full(drones, seeds[link.rows.argmin()], np.uint64)
 
     def _fly(self, flying: list[AgentLink]) -> None:
-        """Fly the world for one control period, if any agent flies in it."""
+        """Fly the world for one control period."""
         layout = self._layout
-        flown = False
         actions = np.zeros(layout.actions.shape, layout.actions.dtype)
         if layout.choices:
             actions += (layout.choices - 1) // 2  # hold
@@ -433,27 +431,21 @@ class SeveralAgents(WorldRules):
             else:
                 staying.append(link)
                 actions[link.rows] = link.command.actions
-                flown |= link.order == FLY
-        if flown:
-            self._world.advance(actions, None, None, None)
-            self.steps += 1
-            orders = np.full(layout.drones, FLY, np.uint8)
-            self.cause = Command(session=0, sequence=self.steps, actions=actions, orders=orders)
-            self.moved = True
+        self._world.advance(actions, None, None, None)
+        self.steps += 1
+        orders = np.full(layout.drones, FLY, np.uint8)
+        self.cause = Command(session=0, sequence=self.steps, actions=actions, orders=orders)
+        self.moved = True
         for link in staying:
-            self._queue(link, again=link.order == FREEZE)
+            self._queue(link)
 
-    def _close_wrong(self, link: AgentLink, flying: list[AgentLink], now: float) -> bool:
+    def _close_wrong(self, link: AgentLink, now: float) -> bool:
         """Close the link to an agent whose Command the world cannot follow; whether it did."""
-        out = self._out(link)
         wrong = ""
-        nobody_flies = all(other.order in (FREEZE, RESET) for other in flying)
-        if link.order is None:
-            wrong = f"orders: expected the same for all {len(link.rows)} drones, got different ones"
-        elif link.order == FLY and out.all():
+        if link.order not in (FLY, RESET):
+            wrong = f"orders: expected to fly or to reset all {len(link.rows)} drones, got others"
+        elif link.order == FLY and self._out(link).all():
             wrong = _NO_RESET
-        elif link.order == FREEZE and not (nobody_flies or out.all()):
-            wrong = "orders: expected no frozen drone in a world that others fly on in, got some"
         if wrong:
             self._dismiss(link, wrong, now)
         return bool(wrong)
@@ -501,32 +493,30 @@ class SeveralAgents(WorldRules):
 
     # ---- States
 
-    def _queue(self, link: AgentLink, *, again: bool = False, cut: bool = False) -> None:
+    def _queue(self, link: AgentLink, *, cut: bool = False) -> None:
         """Send an agent the State of its drones with the next `answer`.
 
-        `again`: nothing has happened to them. `cut`: its episode was truncated. The arrays of both
-        are those of its last State: the world may be in another episode.
+        `cut`: its episode was truncated. Then the arrays are those of its last State: the world may
+        be in another episode.
         """
         link.command = None
-        self._due.append((link, again, cut))
+        self._due.append((link, cut))
 
     def answer(self, now: float) -> None:
         """Send the States that are due."""
         due = self._due
         self._due = []
-        for link, again, cut in due:
-            self._send(link, again, cut, now)
+        for link, cut in due:
+            self._send(link, cut, now)
 
-    def _send(self, link: AgentLink, again: bool, cut: bool, now: float) -> None:
+    def _send(self, link: AgentLink, cut: bool, now: float) -> None:
         world = self._world
         rows = link.rows
         client = link.client
-        nothing = np.zeros(len(rows), bool)
         rewards: Array = np.zeros(len(rows))
-        terminated = truncated = nothing
-        if cut:
-            truncated = link.in_flight
-        elif not again:
+        terminated: Array = np.zeros(len(rows), bool)
+        truncated = link.in_flight
+        if not cut:
             rewards = world.rewards[rows]
             terminated = world.terminated[rows]
             truncated = world.truncated[rows]
@@ -592,8 +582,6 @@ class SeveralAgents(WorldRules):
         """A Command of an agent that does not take part in the running episode."""
         if link.order == RESET:
             link.participation = Participation.WAITING
-        elif link.order == FREEZE:
-            self._queue(link, again=True)
         elif link.participation is Participation.SILENT and link.in_flight.any():
             link.participation = Participation.LATE
             self._queue(link, cut=True)
