@@ -116,7 +116,7 @@ def send_command(server: Server, slot: int, value: float, now: float) -> None:
     session = server.slots[slot]
     assert session is not None
     c = command(1, value=value, of=session.layout)
-    server.send_command(slot, c.actions, c.orders, None, now)
+    session.send_command(c.actions, c.orders, None, now)
 
 
 class Wire:

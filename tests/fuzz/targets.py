@@ -268,10 +268,10 @@ class Flight:
             self.seen.append(datagram)
 
     def decide(self) -> None:
-        for slot, session in enumerate(self.agent.slots):
+        for session in self.agent.slots:
             if session and session.state is AgentState.DECIDING:
                 orders = np.zeros(1, np.uint8)
-                self.agent.send_command(slot, np.ones(1, np.int64), orders, None, self.now)
+                session.send_command(np.ones(1, np.int64), orders, None, self.now)
 
     def give_agent(self, datagram: bytes, address: Address) -> None:
         agent = self.agent

@@ -7,8 +7,6 @@ answer.
 
 from contextlib import suppress
 
-import numpy as np
-
 from . import binary, text
 from . import messages as m
 from .admission import Admission, Arrival
@@ -45,23 +43,6 @@ class Server(Admission):
             if isinstance(state, State):
                 return session.take_state(state, datagram, now)
         return self._receive_any(session, Arrival(datagram, address, now))
-
-    def send_command(
-        self,
-        slot: int,
-        actions: np.ndarray,
-        orders: np.ndarray,
-        seeds: np.ndarray | None,
-        now: float,
-    ) -> None:
-        """Answer the last State of a slot: see `messages.Command`.
-
-        Raises `InputError` for an array that is not of the layout, or not finite; nothing was sent.
-        """
-        session = self.slots[slot]
-        if session is None:
-            raise ValueError("send_command: expected a session that is deciding, got a free slot")
-        session.send_command(actions, orders, seeds, now)
 
     def close(self, reason: str, now: float) -> None:
         """End every exchange and tell the simulators, until they answer."""

@@ -13,7 +13,7 @@ from . import messages as m
 from .auth import Key
 from .client import Address, Tap, largest_datagram
 from .errors import DecodeError
-from .fragments import Assembler, Transfer, Window, asks
+from .fragments import Assembler, Transfer, asks
 from .layout import Layout
 from .messages import Command, Message, State, one_line
 from .statistics import Statistics
@@ -102,7 +102,6 @@ class Session:
         self.is_plain = False  # whether it has a slot, and its messages are neither sealed nor text
         self._outbox = outbox
         self._assembler: Assembler | None = None
-        self._window = Window()
         self._largest = largest_datagram(peer, outbox.max_datagram)
 
     def move(self, way: Way, kind: type[Message]) -> None:
@@ -146,7 +145,7 @@ class Session:
         data = text.encode(command) if self.is_text else binary.encode_step(command, layout)
         self.state = AGENT[self.state][Way.SENT, Command]
         self.asked_at = self.heard_at = now
-        self.reply = reply = Transfer(data, self._largest, self._window)
+        self.reply = reply = Transfer(data, self._largest)
         outbox = self._outbox
         if reply.count == 1 and self.key is None:  # as `put`
             outbox.datagrams.append((data, self.peer))
@@ -190,7 +189,7 @@ class Session:
 
     def _send(self, data: bytes) -> None:
         """Send a message, and keep its bytes for a repeated State."""
-        self.reply = Transfer(data, self._largest, self._window)
+        self.reply = Transfer(data, self._largest)
         self._outbox.put(self.reply.start(), self.peer, self.key)
 
     # ---- what is received
