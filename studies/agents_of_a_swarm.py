@@ -102,7 +102,7 @@ class Twin:
         self.loop = Loop(EnvConfig(env_id=ENV_ID, drones=AGENTS))
         self.taken = 0  # absences that were repeated
         self.absent = np.zeros(AGENTS, bool)
-        kinds = ("silent", "coming", "late", "waiting", "left")
+        kinds = ("coming", "waiting", "left")
         self.counts = Counter({f"absent_{kind}": 0 for kind in kinds})
         self.shown = np.zeros((AGENTS, 3), np.float32)
 

@@ -181,21 +181,18 @@ def test_the_policy_flies_the_drones_of_a_silent_agent(policy: str) -> None:
     swarm.wait(PATIENCE - 0.1)
     assert swarm.participations[1] is Participation.FLYING
     swarm.wait(0.2)
-    assert swarm.participations[1] is Participation.SILENT
+    assert swarm.participations[1] is Participation.READY  # in a new session
     assert swarm.world.flown[1:] == [[1.0, 0.0]]
     assert swarm.world.landed.tolist() == [False, policy == "land"]
     assert swarm.world.retired.tolist() == [False, policy == "end"]
     (absence,) = swarm.rules.absences
-    assert absence == (1, 1, 1, Participation.SILENT)
-    swarm.say(1, FLY, 7.0)  # it comes back, and is told that its episode was truncated
+    assert absence == (1, 1, 1, Participation.COMING)
+    swarm.say(1, FLY, 7.0)  # it comes back, and gets State 1 of the next episode
     swarm.pump()
-    last = swarm.states[1][-1]
-    assert last.truncated.tolist() == [True]
-    assert last.rewards.tolist() == [0.0]
-    assert last.observations[0].item() == 2.0  # of its last State
-    swarm.say(1, RESET)
+    assert len(swarm.world.flown) == 2
     swarm.say(0, RESET, seed=3)
     swarm.pump()
+    assert swarm.states[1][-1].sequence == 1
     assert swarm.world.seeds[1:] == [[3, 3]]
     assert swarm.participations == [Participation.FLYING] * 2
 
@@ -243,19 +240,6 @@ def test_an_agent_that_resets_a_start_gets_it_again() -> None:
     swarm.pump()
     assert swarm.rules.episodes == 1
     assert len(swarm.states[0]) - len(swarm.states[1]) == 1
-
-
-def test_a_late_agent_is_told_the_end_of_the_drones_that_were_in_flight() -> None:
-    swarm = Swarm("end", ([0, 1],))
-    swarm.pump()
-    fly = np.zeros((2, 1), np.float32), np.full(2, FLY, np.uint8)
-    swarm.world.out = np.array([True, False])
-    swarm.wait(PATIENCE + 0.1)
-    assert swarm.participations == [Participation.SILENT]
-    swarm.send(0, *fly)
-    swarm.pump()
-    assert swarm.states[0][-1].truncated.tolist() == [False, True]
-    assert swarm.participations == [Participation.LATE]
 
 
 def test_an_agent_that_came_back_does_not_hide_the_seeds_of_the_others() -> None:  # fault 50
@@ -341,4 +325,4 @@ def test_time_that_this_process_was_stopped_counts_for_nobody() -> None:
     swarm.rules.handle_timers(swarm.now)
     assert swarm.participations == [Participation.FLYING] * 2
     swarm.wait(PATIENCE)
-    assert swarm.participations[1] is Participation.SILENT
+    assert swarm.participations[1] is Participation.READY

@@ -229,7 +229,7 @@ def test_one_that_is_killed_follows_its_policy_and_comes_back(policy: str) -> No
     assert loss.agent == 1
     assert loss.episode == 1
     assert 20 <= loss.step < LONG - 1
-    assert loss.participation in (Participation.SILENT, Participation.COMING)
+    assert loss.participation is Participation.COMING
     expected = in_process(3, 3, calm, (1, loss.step, policy), episode_length=LONG)
     assert [seen[i][0] for i in (0, 2)] == [expected[i][0] for i in (0, 2)]
     assert all(loss.agent != 1 or loss.participation is not Participation.LEFT for loss in later)

@@ -408,7 +408,10 @@ class Client:
         self.state = state
         self._record(message, plain)
         if isinstance(message, m.Unknown):
-            self._begin_again(now)
+            self.statistics.notice(
+                "the agent does not know this session (any more); beginning a new one"
+            )
+            self.begin_again(now)
             return None
         self._forget_transfer()
         if isinstance(message, m.Welcome):
@@ -491,11 +494,8 @@ class Client:
         unknown = [e.number for e in welcome.extensions if e.critical]
         return f"Welcome: expected no critical extension {unknown[0]}" if unknown else ""
 
-    def _begin_again(self, now: float) -> None:
-        """Say Hello to an agent that knows nothing of the session."""
-        self.statistics.notice(
-            "the agent does not know this session (any more); beginning a new one"
-        )
+    def begin_again(self, now: float) -> None:
+        """Say Hello in a new session to an agent that knows nothing of this one, or is silent."""
         self.hello = replace(self.hello, session=self._draw_session())
         self.sequence = 0
         self._session_key = None

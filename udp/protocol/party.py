@@ -5,7 +5,7 @@ Free of sockets and clocks, as `client`: a driver hands in datagrams and the tim
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Enum
 from math import inf
 from typing import Final, NamedTuple, Protocol
@@ -68,17 +68,13 @@ class Participation(Enum):
     """What an agent does in the running episode."""
 
     COMING = "coming"
-    """It has not welcomed this simulator yet, or not again after it was started anew."""
+    """It has not welcomed this simulator yet, or not again after it was silent or started anew."""
     READY = "ready"
     """It has, and gets its first State with the next episode."""
     FLYING = "flying"
     """The world waits for its Commands."""
     WAITING = "waiting"
     """It asked for a reset, and waits for it."""
-    SILENT = "silent"
-    """The world waited for its Command in vain, and still asks for it."""
-    LATE = "late"
-    """It came back, and was told that its episode was truncated."""
     LEFT = "left"
     """It closed, or was silent for too long."""
 
@@ -115,10 +111,6 @@ class AgentLink:
     """Of its Welcome."""
     trouble: str = ""
     """Why datagrams do not reach it, as far as the transport knows."""
-    shown: tuple[tuple[Array, ...], tuple[Array, ...]] = ((), ())
-    """Observations and telemetry of its last State."""
-    in_flight: Mask = field(default_factory=lambda: np.zeros(0, bool))
-    """Its drones that were flying when it was lost."""
     complained: float = -inf
     """When the message was sent whose missing answer is in the log."""
 
@@ -351,7 +343,7 @@ class SeveralAgents(WorldRules):
         self._swarm = world
         self._when_lost = when_lost
         self._patience = patience
-        self._due: list[tuple[AgentLink, bool]] = []  # States: to whom, cut
+        self._due: list[AgentLink] = []  # of States
         if when_lost == "land":  # raises where the vehicle cannot
             world.land(np.zeros(layout.drones, bool))
 
@@ -460,10 +452,7 @@ class SeveralAgents(WorldRules):
         link.participation = participation
         if participation is not Participation.WAITING:
             link.command = None
-        flew = False
-        if was is Participation.FLYING:
-            link.in_flight = ~self._out(link)
-            flew = bool(link.in_flight.any())
+        flew = was is Participation.FLYING and not self._out(link).all()
         if flew:
             self._let_go(link)
         if all(other.participation is Participation.LEFT for other in self.links):
@@ -493,41 +482,28 @@ class SeveralAgents(WorldRules):
 
     # ---- States
 
-    def _queue(self, link: AgentLink, *, cut: bool = False) -> None:
-        """Send an agent the State of its drones with the next `answer`.
-
-        `cut`: its episode was truncated. Then the arrays are those of its last State: the world may
-        be in another episode.
-        """
+    def _queue(self, link: AgentLink) -> None:
+        """Send an agent the State of its drones with the next `answer`."""
         link.command = None
-        self._due.append((link, cut))
+        self._due.append(link)
 
     def answer(self, now: float) -> None:
         """Send the States that are due."""
         due = self._due
         self._due = []
-        for link, cut in due:
-            self._send(link, cut, now)
-
-    def _send(self, link: AgentLink, cut: bool, now: float) -> None:
         world = self._world
-        rows = link.rows
-        client = link.client
-        rewards: Array = np.zeros(len(rows))
-        terminated: Array = np.zeros(len(rows), bool)
-        truncated = link.in_flight
-        if not cut:
-            rewards = world.rewards[rows]
-            terminated = world.terminated[rows]
-            truncated = world.truncated[rows]
-            link.shown = (
+        for link in due:
+            rows = link.rows
+            link.patient_until = now + self._patience
+            link.client.send_state(
+                link.client.sequence * self._period,
                 tuple(array[rows] for array in world.observations.values()),
+                world.rewards[rows],
+                world.terminated[rows],
+                world.truncated[rows],
                 tuple(array[rows] for array in world.telemetry.values()),
+                now,
             )
-        observations, telemetry = link.shown
-        link.patient_until = now + self._patience
-        time = client.sequence * self._period
-        client.send_state(time, observations, rewards, terminated, truncated, telemetry, now)
 
     # ---- timers and messages
 
@@ -541,7 +517,8 @@ class SeveralAgents(WorldRules):
         """Resend what is due, and lose agents that were silent for too long."""
         for link in self._who(Participation.FLYING):
             if link.command is None and now >= link.patient_until:
-                self._lose(link, Participation.SILENT, f"no Command for {self._patience:g} s")
+                self._lose(link, Participation.COMING, f"no Command for {self._patience:g} s")
+                link.client.begin_again(now)
         super().handle_timers(now)
 
     def _lose_silent(self, link: AgentLink, why: str) -> None:
@@ -564,8 +541,6 @@ class SeveralAgents(WorldRules):
         """Take in a message that moves the exchange with an agent on."""
         if isinstance(message, Command):
             link.command = message
-            if link.participation in (Participation.SILENT, Participation.LATE):
-                self._take_late(link, now)
         elif isinstance(message, Welcome):
             link.participation = Participation.READY
             link.seed = message.seed
@@ -577,13 +552,3 @@ class SeveralAgents(WorldRules):
             else:
                 reason = message.reason or "no reason"
                 raise LinkError(f"{link.name} closed before the world began: {reason}")
-
-    def _take_late(self, link: AgentLink, now: float) -> None:
-        """A Command of an agent that does not take part in the running episode."""
-        if link.order == RESET:
-            link.participation = Participation.WAITING
-        elif link.participation is Participation.SILENT and link.in_flight.any():
-            link.participation = Participation.LATE
-            self._queue(link, cut=True)
-        else:
-            self._dismiss(link, _NO_RESET, now)

@@ -79,6 +79,7 @@ SIMULATOR: Final[dict[SimulatorState, dict[tuple[Way, type[Message]], SimulatorS
         (_RECEIVED, Close): _S.CLOSED,
     },
     _S.WAITING: {
+        (_SENT, Hello): _S.HELLO,  # a new session, of several agents
         (_SENT, Missing): _S.WAITING,
         (_RECEIVED, Missing): _S.WAITING,
         (_RECEIVED, Alive): _S.WAITING,
