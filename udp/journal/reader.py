@@ -283,16 +283,6 @@ class Summary(Recording):
             of[item.session.index].take(item)
         self.sessions = list(of.values())
 
-    @property
-    def steps(self) -> int:
-        """Of all drones of all sessions."""
-        return sum(session.steps for session in self.sessions)
-
-    @property
-    def episodes(self) -> int:
-        """Episodes that ended, of all sessions."""
-        return sum(session.episodes for session in self.sessions)
-
     def __str__(self) -> str:
         side = f"written by the {self.about['side']}, " if "side" in self.about else ""
         head = f"{self.path}: {side}{self.ending}, {count_of(len(self.sessions), 'session')}"
