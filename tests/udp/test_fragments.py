@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from links import Pair, agent, hello, layout, lossy, send_command, simulator, state
+from links import Pair, agent, hello, layout, lossy, outgoing, send_command, simulator, state
 from relay import FaultConfig, Faults
 from rotorgram.models.errors import InputError
 from rotorgram.udp.protocol import binary
@@ -72,7 +72,7 @@ def test_messages_of_too_many_fragments_are_not_begun() -> None:
         simulator(of=of, largest=256)
     server = agent(of=of, max_datagram=256)
     server.receive(binary.encode(hello()), ("127.0.0.1", 1), 0.0)
-    ((refuse, _),) = server.take_outgoing()
+    ((refuse, _),) = outgoing(server)
     assert isinstance(binary.decode(refuse), Refuse)
     assert re.search(sentence, server.statistics.last_error)
     simulator(of=of, largest=277)
@@ -190,9 +190,9 @@ def test_small_fragments_to_other_machines() -> None:
         server = agent(of=of)
         for said in (hello(), state(1, of=of)):
             server.receive(binary.encode(said, of), (host, 1), 0.0)
-        server.take_outgoing()
+        outgoing(server)
         send_command(server, 0, 0.0, 0.0)
-        sizes = [len(datagram) for datagram, _ in server.take_outgoing()]
+        sizes = [len(datagram) for datagram, _ in outgoing(server)]
         assert max(sizes) == sum(sizes) if host == "127.0.0.1" else max(sizes) <= FAR
 
 

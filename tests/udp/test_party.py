@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from links import HERE, NONCE, hello, layout
+from links import HERE, NONCE, hello, layout, outgoing
 from rotorgram.models.errors import InputError
 from rotorgram.udp.protocol import binary
 from rotorgram.udp.protocol.client import Client, LinkConfig
@@ -91,14 +91,14 @@ class Swarm:
             moving = self.rules.step(self.now)
             self.rules.answer(self.now)
             for link, agent in zip(self.rules.links, self.agents, strict=True):
-                for datagram in link.client.take_outgoing():
+                for datagram in outgoing(link.client):
                     event = agent.receive(datagram, HERE, self.now)
                     if event and isinstance(event.message, State):
                         self.states[link.number].append(event.message)
                     elif event:
                         self.closed[link.number] = event.message.reason
                     moving = True
-                for datagram, _ in agent.take_outgoing():
+                for datagram, _ in outgoing(agent):
                     self.rules.receive(link, datagram, self.now)
                     moving = True
 
@@ -306,9 +306,9 @@ def test_an_agent_that_closes_before_the_world_begins_ends_it() -> None:
     swarm = Swarm()
     link = swarm.rules.links[0]
     server = swarm.agents[0]
-    for datagram in link.client.take_outgoing():
+    for datagram in outgoing(link.client):
         server.receive(datagram, HERE, 0.0)
-    for datagram, _ in server.take_outgoing():
+    for datagram, _ in outgoing(server):
         swarm.rules.receive(link, datagram, 0.0)
     assert link.participation is Participation.READY
     bye = binary.encode(Close(session=70, sequence=0, reason="no more"))

@@ -202,7 +202,7 @@ class Admission:
         if isinstance(message, State):
             return self._join(opening, message, plain, arrival)
         if isinstance(message, m.Close):
-            self.forget(opening)
+            del self.openings[opening.peer, opening.number]
             opening.move(Way.RECEIVED, m.Close)
             goodbye = binary.encode(opening.goodbye(""))
             self.outbox.put([goodbye], arrival.address, opening.session_key())
@@ -218,16 +218,12 @@ class Admission:
         if state.sequence != 1 or state.nonce != opening.welcome.nonce:
             # Its Hello was an old one: this simulator goes on with another agent, or a copy of
             # its Hello came late.
-            self.forget(opening)
+            del self.openings[opening.peer, opening.number]
             self.disown(plain, arrival)
             return None
-        for key, other in list(self.openings.items()):
-            # It, and what the same address began before it. Later ones stay: if this State came
-            # late, their Hello may still be repeated.
-            if key[0] == peer:
-                self.forget(other)
-            if other is opening:
-                break
+        for address, number in list(self.openings):  # it, and what else the address began
+            if address == peer:
+                del self.openings[address, number]
         layout = self._fit(opening.hello, peer)  # another one may have come since its Hello
         if isinstance(layout, str):
             reason = _cut(layout, len(plain) - _REASON_AT)
@@ -240,10 +236,6 @@ class Admission:
             self.disown(plain, arrival)  # another was quicker
             return None
         return self._seat(opening, state, plain)
-
-    def forget(self, opening: Session) -> None:
-        """Forget a session that was welcomed."""
-        del self.openings[opening.peer, opening.number]
 
     def disown(self, plain: bytes, arrival: Arrival) -> None:
         """Tell the simulator of an unknown session to begin another one.

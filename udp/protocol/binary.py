@@ -189,8 +189,6 @@ def encode_step(m: State | Command, layout: Layout) -> bytes:
                 arrays = (m.actions, m.orders, m.seeds)
     except struct.error as error:
         raise InputError(f"{type(m).__name__}: {error}") from None
-    if len(arrays) != len(record.slots):
-        raise InputError(f"State: expected {len(record.slots)} arrays, got {len(arrays)}")
     for slot, array in zip(record.slots, arrays, strict=True):
         if array.shape != slot.shape or array.dtype != slot.dtype:  # numbers are never converted
             raise InputError(

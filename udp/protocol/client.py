@@ -1,7 +1,7 @@
 """The simulator's side of the exchange (UDP client), free of sockets and clocks.
 
 A caller hands in datagrams with the time of their arrival (seconds of any monotonic clock), sends
-what `take_outgoing` gives, and calls `handle_timer` when `next_timer` says. Exactly one State is
+what `outgoing` has, and calls `handle_timer` when `next_timer` says. Exactly one State is
 outstanding at any time, so a sequence number suffices to step the physics once for each Command:
  the simulator repeats the same bytes until the Command of the same number comes.
 """
@@ -191,6 +191,7 @@ class Client:
         resend_at: When it is sent again; infinite if nothing is outstanding, as `deadline`.
         deadline: When the agent is given up.
         tap: None at first.
+        outgoing: Datagrams to send to the agent: the caller takes them.
     """
 
     def __init__(
@@ -254,10 +255,9 @@ class Client:
     ) -> State:
         """Send the next State, and return it: see `messages.State`.
 
-        Raises `InputError` for an array that is not of the layout, or not finite; nothing was sent.
+        Raises `InputError` for an array that is not of the layout, or not finite, and `KeyError`
+        where no State is due; nothing was sent.
         """
-        if self.state is not SimulatorState.READY:
-            raise ValueError(f"send_state: expected state ready, got {self.state.value}")
         state = State(
             session=self.hello.session,
             sequence=self.sequence + 1,
@@ -371,12 +371,6 @@ class Client:
     def pardon(self, seconds: float) -> None:
         """Move the deadline: this process was stopped for so long, and the agent could not know."""
         self.deadline += seconds
-
-    def take_outgoing(self) -> list[bytes]:
-        """Datagrams to send to the agent, each once."""
-        outgoing = self.outgoing
-        self.outgoing = []
-        return outgoing
 
     # ---- what came
 
@@ -508,6 +502,7 @@ class Client:
     def _send(self, message: m.Hello | State | m.Close, now: float) -> None:
         """Send a message and repeat it until it is answered."""
         kind = type(message)
+        after = SIMULATOR[self.state][Way.SENT, kind]
         if isinstance(message, State) and not self.by_text:
             data = binary.encode_step(message, self.layout)
         else:
@@ -516,7 +511,7 @@ class Client:
             self._record(message, data)
         self._transfer = transfer = Transfer(data, self._largest)
         self._transfer_key = self._key if kind is m.Hello else self._session_key
-        self.state = SIMULATOR[self.state][Way.SENT, kind]
+        self.state = after
         self.sequence = 0 if isinstance(message, m.Hello) else message.sequence
         self.sends = self._tries = 1
         self._stretch = 1.0

@@ -74,12 +74,6 @@ class Server(Admission):
                 session.repeat()
         self._resend_at = now + CLOSE_INTERVAL
 
-    def take_outgoing(self) -> list[tuple[bytes, Address]]:
-        """Datagrams to send and where to, each once."""
-        taken = self.outbox.datagrams
-        self.outbox.datagrams = []
-        return taken
-
     # ---- from a datagram to its session
 
     def _receive_any(self, session: Session | None, arrival: Arrival) -> Event | None:

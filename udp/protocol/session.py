@@ -130,10 +130,12 @@ class Session:
         seeds: np.ndarray | None,
         now: float,
     ) -> None:
-        """Answer the last State. Raises `InputError` if it cannot be encoded: nothing was sent."""
-        if self.state is not AgentState.DECIDING:
-            got = self.state.value
-            raise ValueError(f"send_command: expected a session that is deciding, got {got}")
+        """Answer the last State.
+
+        Raises `InputError` if it cannot be encoded, and `KeyError` where no Command is due; nothing
+        was sent.
+        """
+        after = AGENT[self.state][Way.SENT, Command]
         command = Command(
             session=self.number,
             sequence=self.sequence,
@@ -143,7 +145,7 @@ class Session:
         )
         layout = self.layout
         data = text.encode(command) if self.is_text else binary.encode_step(command, layout)
-        self.state = AGENT[self.state][Way.SENT, Command]
+        self.state = after
         self.asked_at = self.heard_at = now
         self.reply = reply = Transfer(data, self._largest)
         outbox = self._outbox
