@@ -147,14 +147,14 @@ def fly_several(
 
 def in_process(
     drones: int, episodes: int, act: Callable[[int, int, int], np.ndarray] = action_of,
-    lost: tuple[int, int, str] | None = None, first: int = 0, **options: Any,
+    lost: tuple[int, int, str] | None = None, **options: Any,
 ) -> dict[int, list[list[Step]]]:  # fmt: skip
     """The same in one process; `lost`: a drone, a step of the first episode, and its policy."""
     loop = Loop(EnvConfig.from_keywords(RISE, drones=drones, **options))
     seen: dict[int, list[list[Step]]] = {drone: [] for drone in range(drones)}
     for episode in range(episodes):
         nothing = np.zeros((drones, 1), np.float32)
-        loop.advance(nothing, np.ones(drones, bool), [first + episode] * drones)
+        loop.advance(nothing, np.ones(drones, bool), [episode] * drones)
         rows = loop.observations["observation"]
         flights = [[(rows[i].tobytes(), 0.0, False, False)] for i in range(drones)]
         step = 0
@@ -277,16 +277,17 @@ def test_a_journal_of_a_part_of_a_world_cannot_be_simulated_and_says_so_briefly(
     assert len(told[1]) < 500
 
 
-def test_an_agent_of_each_own_names() -> None:
+def test_agents_of_several_drones_each() -> None:
     agents = free_ports(2)
     seen = {}
-    shares = {agents[0]: ["drone_2", "drone_0"], agents[1]: ["drone_1"]}
-    with shared(shares, 3):
-        in_threads([
-            lambda: fly_several(agents[0], ["drone_2", "drone_0"], 1, seen),
-            lambda: fly_one(agents[1], 1, 1, seen),
-        ])  # fmt: skip
-    assert seen == in_process(3, 1, first=201)  # the seed of drone_0
+    halves = [["drone_0", "drone_1"], ["drone_2", "drone_3"]]
+    flights = [
+        lambda a=a, names=names: fly_several(a, names, 1, seen)
+        for a, names in zip(agents, halves, strict=True)
+    ]
+    with shared(agents, 4):
+        in_threads(flights)
+    assert seen == in_process(4, 1)
 
 
 def test_who_is_waited_for_is_told_soon(caplog: pytest.LogCaptureFixture) -> None:
@@ -313,8 +314,6 @@ def test_who_is_waited_for_is_told_soon(caplog: pytest.LogCaptureFixture) -> Non
          "agents: expected a divisor of 3 drones, got 2 agents"),
         ({"agents": []}, "agents: expected a divisor of 3 drones, got 0 agents"),
         ({"agents": [("127.0.0.1", 1)] * 3}, "agents: expected a different address of each"),
-        ({"agents": {("127.0.0.1", 1): ["drone_0", "drone_1"]}},
-         "agents: expected each of drone_0, drone_1, drone_2 once, got drone_0, drone_1"),
         ({"when_lost": "panic"}, "when_lost: expected one of hold, land, end, got 'panic'"),
         ({"patience": 0}, "patience: expected seconds > 0, got 0"),
         ({"env": "rotorgram/Hover-v0"}, "drones: expected 1 with rotorgram/Hover-v0"),

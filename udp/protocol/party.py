@@ -102,7 +102,7 @@ class AgentLink:
     client: Client
     """The exchange with it, with its statistics."""
     rows: Array
-    """Rows of its drones in the world's arrays, shape (n,)."""
+    """Rows of its drones in the arrays of a world, shape (n,): the first agent has the first."""
     participation: Participation = Participation.COMING
     command: Command | None = None
     """The Command that the next step or reset takes."""
@@ -401,13 +401,13 @@ class SeveralAgents(WorldRules):
         if not asking:
             return None
         drones = self._layout.drones
-        link = min(asking, key=lambda link: int(link.rows.min()))
+        link = asking[0]
         if link.command is None:  # the first episode: as a simulator of one agent
             return first_seeds(
                 link.client.hello.session if link.seed is None else link.seed, drones
             )
         seeds = link.command.seeds
-        return None if seeds is None else np.full(drones, seeds[link.rows.argmin()], np.uint64)
+        return None if seeds is None else np.full(drones, seeds[0], np.uint64)
 
     def _fly(self, flying: list[AgentLink]) -> None:
         """Fly the world for one control period."""

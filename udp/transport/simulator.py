@@ -1,6 +1,6 @@
 """The simulator: a UDP client that steps envs by the Commands of one agent, or of several."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from math import inf
@@ -25,8 +25,6 @@ from .stepped import GymEnv, Steppable, make_stepped
 DEFAULT_AGENT: Final = ("127.0.0.1", 8001)
 DEFAULT_SIMULATOR: Final = ("127.0.0.1", 8000)
 
-Agents = Sequence[Address] | Mapping[Address, Sequence[str]]
-
 
 class Simulator(Driver):
     """Simulated drones that an agent flies over UDP, or several agents.
@@ -41,7 +39,7 @@ class Simulator(Driver):
             Box or a Dict of Box, actions a Box or `Discrete`.
         server: Address (host, port) of the agent.
         agents: Addresses of several agents in its place. They share the drones evenly in their
-            order; or, by address, the names of the drones of each.
+            order.
         num_envs: Drones in all; None: those of one world.
         bind: Address of this side; port 0 takes a free port.
         codec: `binary`, or the paper's `text`.
@@ -64,7 +62,7 @@ class Simulator(Driver):
         env: str | EnvConfig | GymEnv = DEFAULT_ENV,
         *,
         server: Address = DEFAULT_AGENT,
-        agents: Agents | None = None,
+        agents: Sequence[Address] | None = None,
         num_envs: int | None = None,
         bind: Address = DEFAULT_SIMULATOR,
         codec: Literal["binary", "text"] = "binary",
@@ -94,14 +92,21 @@ class Simulator(Driver):
             failing.callback(stepped.close)
             spec = stepped.spec
             worlds = stepped.num_envs // len(spec.agents)
-            parts = {server: spec.agents} if agents is None else agents
+            servers = [server] if agents is None else list(agents)
+            drones = len(spec.agents)
+            if not servers or drones % len(servers):
+                raise InputError(
+                    f"agents: expected a divisor of {drones} drones, got {len(servers)} agents"
+                )
+            share = drones // len(servers)
             links: list[AgentLink] = []
-            for number, (address, names) in enumerate(_shares(parts, spec)):
+            for number, address in enumerate(servers):
                 there = resolve(address, insecure=insecure, way_out=way_out)
-                own = replace(spec, agents=names)
+                first = number * share
+                own = replace(spec, agents=spec.agents[first : first + share])
                 changed = replace(config, drop_seed=config.drop_seed + number)
                 client = _client(own, worlds, there, changed, by_text=by_text, key=key)
-                links.append(AgentLink(number, there, client, _rows(spec, names, worlds)))
+                links.append(AgentLink(number, there, client, first + np.arange(share)))
             addresses = [link.address for link in links]
             if len(set(addresses)) < len(addresses):
                 raise InputError(f"agents: expected a different address of each, got {addresses}")
@@ -139,12 +144,6 @@ class Simulator(Driver):
             link.tap(0, link.hello, binary.encode(link.hello))
 
 
-def _rows(spec: EnvSpec, names: tuple[str, ...], worlds: int) -> np.ndarray:
-    """Rows of these drones in the arrays of all worlds, shape (n,)."""
-    own = [spec.agents.index(name) for name in names]
-    return np.array([len(spec.agents) * world + row for world in range(worlds) for row in own])
-
-
 def _client(
     spec: EnvSpec,
     worlds: int,
@@ -167,20 +166,3 @@ def _swarm_world(stepped: Steppable, env: object) -> SwarmWorld:
     if not hasattr(stepped, "retire"):
         raise InputError(f"env: expected a registered task for several drones, got {env!r}")
     return cast(SwarmWorld, stepped)
-
-
-def _shares(agents: Agents, spec: EnvSpec) -> list[tuple[Address, tuple[str, ...]]]:
-    """Drones of each agent. Raises `InputError` unless every drone has one."""
-    names = spec.agents
-    if isinstance(agents, Mapping):
-        shares = [(address, tuple(own)) for address, own in agents.items()]
-        given = sorted(name for _, own in shares for name in own)
-        if not all(own for _, own in shares) or given != sorted(names):
-            got = ", ".join(given) or "none"
-            raise InputError(f"agents: expected each of {', '.join(names)} once, got {got}")
-        return shares
-    count = len(agents)
-    if not count or len(names) % count:
-        raise InputError(f"agents: expected a divisor of {len(names)} drones, got {count} agents")
-    size = len(names) // count
-    return [(address, names[i * size : (i + 1) * size]) for i, address in enumerate(agents)]
