@@ -10,7 +10,6 @@ from ._flags import BackendFlags, parse_address
 
 if TYPE_CHECKING:
     from ..udp import Simulator
-    from ..udp.transport.simulator import Agents
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,10 +28,9 @@ class Sim(BackendFlags):
     """Drones in all. Default: those of one world."""
     agents: tuple[str, ...] = ()
     """Several agents in place of one --server: HOST:PORT of each. They fly one world, and share its
-    drones evenly in their order; HOST:PORT=drone_0,drone_2 names those of one."""
+    drones evenly in their order."""
     when_lost: Literal["hold", "land", "end"] = "hold"
-    """What drones do whose agent is lost to --agents, unless it says so itself: hold, land or end
-    (rotors stand still)."""
+    """What drones do whose agent is lost, of --agents: hold, land or end (rotors stand still)."""
     patience: float = 10.0
     """Seconds that the world waits for the command of one of --agents."""
     codec: Literal["binary", "text"] = "binary"
@@ -73,7 +71,7 @@ class Sim(BackendFlags):
         simulator = Simulator(
             self.env_id,
             server=parse_address(self.server),
-            agents=self._agents() if several else None,
+            agents=[parse_address(agent) for agent in self.agents] if several else None,
             num_envs=self.num_envs,
             bind=parse_address(self.bind),
             codec=self.codec,
@@ -100,20 +98,6 @@ class Sim(BackendFlags):
                     where = " to {}:{}".format(*link.address) if several else ""
                     print(f"wire{where}: {link.client.statistics}", flush=True)
         return 0
-
-    def _agents(self) -> "Agents":
-        """Addresses of the agents, with their drones if they are named."""
-        if not self.agents:
-            raise InputError("--agents: expected HOST:PORT of each agent, got none")
-        named = {}
-        for agent in self.agents:
-            address, _, names = agent.partition("=")
-            if names:
-                named[parse_address(address)] = names.split(",")
-        if len(named) not in (0, len(self.agents)):
-            got = " ".join(self.agents)
-            raise InputError(f"--agents: expected drones of each agent or of none, got {got}")
-        return named or [parse_address(agent) for agent in self.agents]
 
     def _shown(self, simulator: "Simulator") -> AbstractContextManager[None]:
         if not (self.view or self.realtime):  # nothing that draws is imported

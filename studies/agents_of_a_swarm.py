@@ -5,7 +5,7 @@
 Eight drones fly in one world, each by an agent process of its own (`RemoteEnv`), through relays
 that lose 30 % of the datagrams, double 10 % and reorder 10 %. At random moments an agent is killed
 (SIGKILL) and started again, or stopped (SIGSTOP) for 2 s, which is longer than the world waits.
-Agents 0, 3 and 6 hold when they are lost, 1, 4 and 7 land, 2 and 5 end.
+The drone of an agent that is lost lands.
 
 An action is computed from every bit of the observation before it. A second world, in process, gets
 the seeds, the absences and the actions that the simulator took: every bit of every State has to be
@@ -40,7 +40,7 @@ from rotorgram.udp.protocol.messages import Command
 ENV_ID = "benchmark/Row-v0"
 FAULTS = {"drop": 0.3, "duplicate": 0.1, "reorder": 0.1}
 AGENTS, PATIENCE, STOPPED = 8, 1.0, 2.0  # drones and agents; s
-POLICIES = ("hold", "land", "end")
+POLICY = "land"
 ANY = ("127.0.0.1", 0)
 
 RELAYS = (Path(__file__).parents[1] / "tests/relay.py").read_text()
@@ -49,8 +49,8 @@ AGENT = """
 import json, sys, zlib
 import numpy as np
 from rotorgram.udp import PeerClosed, RemoteEnv
-port, policy = json.loads(sys.argv[1])
-env = RemoteEnv(("127.0.0.1", port), connect_timeout=600, when_lost=policy)
+port = json.loads(sys.argv[1])
+env = RemoteEnv(("127.0.0.1", port), connect_timeout=600)
 try:
     while True:
         observation, _ = env.reset()
@@ -102,7 +102,7 @@ class Twin:
         self.loop = Loop(EnvConfig(env_id=ENV_ID, drones=AGENTS))
         self.taken = 0  # absences that were repeated
         self.absent = np.zeros(AGENTS, bool)
-        kinds = ("silent", "coming", "late", "waiting", "left")
+        kinds = ("coming", "waiting", "left")
         self.counts = Counter({f"absent_{kind}": 0 for kind in kinds})
         self.shown = np.zeros((AGENTS, 3), np.float32)
 
@@ -118,10 +118,8 @@ class Twin:
             self.taken = sum(one.episode < rules.episodes for one in rules.absences)
         for absence in rules.absences[self.taken :]:
             self.absent = self.absent | (np.arange(AGENTS) == absence.agent)
-            policy = POLICIES[absence.agent % 3]
             mask = np.arange(AGENTS) == absence.agent
-            if policy != "hold":
-                (loop.land if policy == "land" else loop.retire)(mask)
+            loop.land(mask)
             self.counts[f"absent_{absence.participation.value}"] += 1
         self.taken = len(rules.absences)
         if isinstance(cause, Command):
@@ -145,12 +143,11 @@ class Twin:
 
 def fly_eight(kills: int, dice: random.Random) -> dict[str, object]:
     ports = free_ports(AGENTS)
-    settings = [[port, POLICIES[i % 3]] for i, port in enumerate(ports)]
-    agents = [launch(AGENT, each) for each in settings]
+    agents = [launch(AGENT, port) for port in ports]
     relays = launch(RELAYS, [[("127.0.0.1", port) for port in ports], FAULTS])
     addresses = [tuple(address) for address in json.loads(relays.stdout.readline())]
     simulator = Simulator(
-        ENV_ID, agents=addresses, drones=AGENTS, bind=ANY, patience=PATIENCE,
+        ENV_ID, agents=addresses, drones=AGENTS, bind=ANY, patience=PATIENCE, when_lost=POLICY,
         config=LinkConfig(timeout=600),
     )  # fmt: skip
     rules = simulator.rules
@@ -170,7 +167,7 @@ def fly_eight(kills: int, dice: random.Random) -> dict[str, object]:
                 agents[victim].kill()
                 agents[victim].wait()
                 time.sleep(dice.choice((0.0, 2 * PATIENCE)))
-                agents[victim] = launch(AGENT, settings[victim])
+                agents[victim] = launch(AGENT, ports[victim])
             else:
                 agents[victim].send_signal(signal.SIGSTOP)
                 time.sleep(STOPPED)

@@ -15,7 +15,7 @@ from rotorgram.envs.spec import ArraySpec, Discrete, EnvSpec, Metric
 from rotorgram.udp.layouts import layout_of
 from rotorgram.udp.protocol import binary
 from rotorgram.udp.protocol.auth import Key
-from rotorgram.udp.protocol.fragments import Transfer, Window
+from rotorgram.udp.protocol.fragments import Transfer
 from rotorgram.udp.protocol.messages import (
     Alive,
     Close,
@@ -281,7 +281,7 @@ def fragments(right: dict[str, bytes]) -> list[dict[str, Any]]:
     """Cases with the datagrams of a message that is larger than a datagram."""
     cases = []
     for name in ("hello", "state of two drones with a picture"):
-        transfer = Transfer(right[name], LARGEST, Window())
+        transfer = Transfer(right[name], LARGEST)
         cases.append(
             {
                 "name": f"fragments of at most {LARGEST} bytes",
@@ -295,7 +295,7 @@ def fragments(right: dict[str, bytes]) -> list[dict[str, Any]]:
 def wrong_fragments(right: dict[str, bytes]) -> list[tuple[str, bytes]]:
     """Name and bytes. Each is dropped."""
     message = right["state of two drones with a picture"]
-    first, *_ = Transfer(message, LARGEST, Window()).start()
+    first, *_ = Transfer(message, LARGEST).start()
     return [
         ("number 2 of 2", changed(first, 24, b"\x02\x00\x02\x00")),
         ("of no fragment at all", changed(first, 24, b"\x00\x00\x00\x00")),

@@ -104,6 +104,17 @@ def agent(
     return Server(lambda _: refusal or of, slots=slots, keys=keys, **rest)
 
 
+def outgoing(side: Client | Server) -> Any:
+    """The datagrams that a side has to send, each once."""
+    if isinstance(side, Client):
+        taken: Any = side.outgoing
+        side.outgoing = []
+    else:
+        taken = side.outbox.datagrams
+        side.outbox.datagrams = []
+    return taken
+
+
 def send_state(link: Client, value: float, now: float) -> State:
     """The next State of a client, every number of its observation the same."""
     s = state(1, value=value, of=link.layout)
@@ -116,7 +127,7 @@ def send_command(server: Server, slot: int, value: float, now: float) -> None:
     session = server.slots[slot]
     assert session is not None
     c = command(1, value=value, of=session.layout)
-    server.send_command(slot, c.actions, c.orders, None, now)
+    session.send_command(c.actions, c.orders, None, now)
 
 
 class Wire:
@@ -186,9 +197,9 @@ class Network:
 
     def _send(self) -> None:
         for number, client in enumerate(self.clients):
-            for datagram in client.take_outgoing():
+            for datagram in outgoing(client):
                 self._put("agent", number, datagram)
-        for datagram, address in self.server.take_outgoing():
+        for datagram, address in outgoing(self.server):
             self._put("simulator", self.addresses.index(address), datagram)
 
     def _put(self, to: str, number: int, datagram: bytes) -> None:

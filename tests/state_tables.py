@@ -14,7 +14,8 @@ HEADINGS: Final = {"### Simulator\n": SIMULATOR, "### Agent, for each simulator\
 def rows(table: Mapping[Any, Any]) -> str:
     return HEAD + "".join(
         f"| {state.value} | {way.value} | {message.__name__} | {after.value} |\n"
-        for (state, way, message), after in table.items()
+        for state, ways in table.items()
+        for (way, message), after in ways.items()
     )
 
 

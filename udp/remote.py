@@ -1,7 +1,7 @@
 """Drones in remote simulators as Gymnasium envs of the agent: one drone, or many."""
 
 from abc import abstractmethod
-from collections.abc import Collection
+from collections.abc import Sequence
 from typing import Any, Final, Unpack
 
 import gymnasium as gym
@@ -25,7 +25,7 @@ from .protocol.client import Address
 from .protocol.layout import MAX_DRONES
 from .protocol.messages import FLY, FREEZE, MAX_UINT64, RESET, State
 from .protocol.statistics import Statistics
-from .transport.agent import Agent, AgentConfig, AgentSettings, Order
+from .transport.agent import Agent, AgentConfig, AgentSettings
 from .transport.simulator import DEFAULT_AGENT
 
 Arrays = dict[str, np.ndarray]
@@ -103,8 +103,6 @@ class RemoteEnv(_Remote, gym.Env[Any, Any]):
             it computes, it says so.
         max_datagram: Largest datagram, bytes, a seal not counted, at least 256. None: 65,483 on
             loopback, 1,200 elsewhere.
-        when_lost: What its drones do when this agent is lost to a simulator of several agents:
-            `hold`, `land` or `end`, see `Simulator`; None leaves it to the simulator.
         key_file: File with the key that the simulators have too (`rotorgram key`). With it any
             address is allowed, because only holders of the key can take part.
         insecure: Allow an address that is not loopback without a key.
@@ -210,7 +208,7 @@ class RemoteEnv(_Remote, gym.Env[Any, Any]):
     def _info(self, state: State) -> Info:
         numbers: list[float] = []
         for array in state.telemetry:
-            numbers += array.tolist()[0] if array.ndim == 2 else array.ravel().tolist()
+            numbers += array.ravel().tolist()
         return dict(zip(self._names, numbers, strict=True))
 
 
@@ -371,7 +369,10 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
         reasons = [""] * self.num_simulators
         self._flying = False  # until the answers are there
         while pending:
-            self._agent.exchange(self._orders(pending, actions, resets, seeds, frozen))
+            orders = (RESET * resets + FREEZE * frozen).astype(np.uint8).reshape(self._shape)
+            rows = actions.reshape(*self._shape, *self._row)
+            numbers = [None] * len(slots) if seeds is None else seeds.reshape(self._shape)
+            self._agent.exchange({i: (rows[i], orders[i], numbers[i]) for i in pending})
             lost = self._agent.lost
             reasons = [new or old for new, old in zip(lost, reasons, strict=True)]
             if seeds is None or not any(lost):
@@ -407,36 +408,13 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
         seeds = checked_seeds(seed, self.num_envs, MAX_UINT64)
         return None if seeds is None else np.array(seeds, np.uint64)
 
-    def _orders(
-        self,
-        slots: Collection[int],
-        actions: np.ndarray,
-        resets: np.ndarray,
-        seeds: np.ndarray | None,
-        frozen: np.ndarray,
-    ) -> dict[int, Order]:
-        """Order of each simulator. The arrays are those of all drones."""
-        orders = (RESET * resets + FREEZE * frozen).astype(np.uint8).reshape(self._shape)
-        rows = actions.reshape(*self._shape, *self._row)
-        numbers = None if seeds is None else seeds.reshape(self._shape)
-        return {
-            slot: (rows[slot], orders[slot], None if numbers is None else numbers[slot])
-            for slot in slots
-        }
-
     def _take_states(self, still: np.ndarray) -> None:
         """Take over the States; rewards and flags are 0 for the drones that did not fly."""
         states = [self._agent.states[slot] for slot in range(self.num_simulators)]
         spec = self.env_spec
-        self._arrays = {
-            array.name: np.concatenate([state.observations[i] for state in states])
-            for i, array in enumerate(spec.observation)
-        }
+        self._arrays = _by_name(spec.observation, [state.observations for state in states])
         self.observations = joined(spec, self._arrays)
-        self.telemetry = {
-            array.name: np.concatenate([state.telemetry[i] for state in states])
-            for i, array in enumerate(spec.telemetry)
-        }
+        self.telemetry = _by_name(spec.telemetry, [state.telemetry for state in states])
         self.rewards = np.where(still, 0.0, np.concatenate([s.rewards for s in states]))
         self.terminated = np.concatenate([s.terminated for s in states]) & ~still
         self.truncated = np.concatenate([s.truncated for s in states]) & ~still
@@ -452,11 +430,13 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
         if array.shape == shape:
             array[idle] = 0
         sent = _checked_actions(array, self._dtype, shape)
-        if self._dtype.kind == "f" and not (finite := np.isfinite(sent)).all():
-            first = np.argwhere(~finite)[0].tolist()
-            raise InputError(f"action: expected finite numbers, got {sent[*first]} at {first}")
-        if isinstance(action, Discrete) and (wrong := (sent < 0) | (sent >= action.n)).any():
-            raise InputError(f"action: expected 0 to {action.n - 1}, got {sent[wrong][0]}")
+        right = np.isfinite(sent)
+        expected = "finite numbers"
+        if isinstance(action, Discrete):
+            right = (sent >= 0) & (sent < action.n)
+            expected = f"0 to {action.n - 1}"
+        if not right.all():
+            raise InputError(f"action: expected {expected}, got {sent[~right][0]}")
         return sent
 
     def _no_actions(self) -> np.ndarray:
@@ -465,6 +445,12 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
     def _losses(self) -> Info:
         reasons = self._reasons
         return {} if reasons is None else {LOST: reasons, f"_{LOST}": reasons != None}  # noqa: E711
+
+
+def _by_name(specs: Sequence[ArraySpec], states: Sequence[Sequence[np.ndarray]]) -> Arrays:
+    """The arrays of several simulators, one after the other."""
+    parts = zip(*states, strict=True)
+    return {spec.name: np.concatenate(part) for spec, part in zip(specs, parts, strict=True)}
 
 
 def _checked_actions(action: ArrayLike, dtype: np.dtype, shape: tuple[int, ...]) -> np.ndarray:

@@ -16,6 +16,7 @@ from typing import Any, Final
 import numpy as np
 from golden import LAYOUTS, SECRET, SESSION, fixed, messages, text_lines
 from golden import ONE as SPEC
+from links import outgoing
 from rotorgram.envs.spec import EnvSpec, SpecError
 from rotorgram.udp.protocol import binary, text
 from rotorgram.udp.protocol.auth import OVERHEAD, Key, is_sealed
@@ -252,10 +253,10 @@ class Flight:
     def flow(self) -> None:
         """All that is on its way arrives."""
         for address, link in self.simulators.items():
-            for datagram in link.take_outgoing():
+            for datagram in outgoing(link):
                 self.note(datagram)
                 self.give_agent(datagram, address)
-        for datagram, address in self.agent.take_outgoing():
+        for datagram, address in outgoing(self.agent):
             self.note(datagram)
             if address in self.simulators:
                 self.give_simulator(datagram, address)
@@ -268,10 +269,10 @@ class Flight:
             self.seen.append(datagram)
 
     def decide(self) -> None:
-        for slot, session in enumerate(self.agent.slots):
+        for session in self.agent.slots:
             if session and session.state is AgentState.DECIDING:
                 orders = np.zeros(1, np.uint8)
-                self.agent.send_command(slot, np.ones(1, np.int64), orders, None, self.now)
+                session.send_command(np.ones(1, np.int64), orders, None, self.now)
 
     def give_agent(self, datagram: bytes, address: Address) -> None:
         agent = self.agent

@@ -13,7 +13,7 @@ from math import inf
 
 import numpy as np
 import pytest
-from links import ONE, SECRET, Fate, hello, send_command, send_state
+from links import ONE, SECRET, Fate, hello, outgoing, send_command, send_state
 from rotorgram.udp import LinkConfig
 from rotorgram.udp.protocol.auth import Key
 from rotorgram.udp.protocol.client import Address, Client
@@ -169,9 +169,9 @@ class World:
 
     def _send(self) -> None:
         for physics in self.physics:
-            for datagram in physics.link.take_outgoing():
+            for datagram in outgoing(physics.link):
                 self._put(physics, "agent", datagram)
-        for datagram, address in self.agent.take_outgoing():
+        for datagram, address in outgoing(self.agent):
             if physics := self.of(address):
                 self._put(physics, "simulator", datagram)
 

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from links import HERE, NONCE, hello, layout
+from links import HERE, NONCE, hello, layout, outgoing
 from rotorgram.models.errors import InputError
 from rotorgram.udp.protocol import binary
 from rotorgram.udp.protocol.client import Client, LinkConfig
@@ -13,9 +13,7 @@ from rotorgram.udp.protocol.messages import (
     FLY,
     FREEZE,
     RESET,
-    WHEN_LOST,
     Close,
-    Extension,
     State,
 )
 from rotorgram.udp.protocol.party import AgentLink, Participation, SeveralAgents
@@ -28,14 +26,14 @@ TIMEOUT = 60.0
 class World:
     """Two drones; it notes what is done to it."""
 
-    def __init__(self) -> None:
+    def __init__(self, can_land: bool = True) -> None:
         self.height = np.zeros((2, 1), np.float32)
         self.rewards = np.zeros(2)
         self.terminated = self.truncated = self.out = np.zeros(2, bool)
         self.telemetry: dict[str, Any] = {}
         self.flown: list[list[float]] = []
         self.seeds: list[list[int] | None] = []
-        self.can_land = True
+        self.can_land = can_land
         self.landed = self.retired = np.zeros(2, bool)
 
     @property
@@ -64,10 +62,11 @@ class World:
 class Swarm:
     """Both sides of a world of two drones, each flown by an agent of its own."""
 
-    def __init__(self, *policies: str, shares: tuple[list[int], ...] = ([0], [1])) -> None:
+    def __init__(
+        self, policy: str = "hold", shares: tuple[list[int], ...] = ([0], [1]), **world: bool
+    ) -> None:
         self.now = 0.0
-        self.world = World()
-        self.policies = policies or ("hold", "hold")
+        self.world = World(**world)
         self.layout = layout(len(shares[0]))
         config = LinkConfig(timeout=TIMEOUT)
         links = []
@@ -75,18 +74,15 @@ class Swarm:
             client = Client(hello(70 + i), self.layout, config, draw_session=lambda i=i: 80 + i)
             links.append(AgentLink(i, ("127.0.0.1", 1000 + i), client, np.array(rows)))
         self.rules = SeveralAgents(
-            self.world, layout(2), 0.1, links, when_lost="hold", patience=PATIENCE
+            self.world, layout(2), 0.1, links, when_lost=policy, patience=PATIENCE
         )
-        self.agents = [self.agent(i) for i in range(len(shares))]
+        self.agents = [self.agent() for _ in shares]
         self.states: list[list[State]] = [[], []]
         self.closed = ["", ""]
         self.rules.start(0.0)
 
-    def agent(self, number: int, refusal: str = "") -> Server:
-        policy = Extension(number=WHEN_LOST, value=self.policies[number].encode())
-        return Server(
-            lambda _: refusal or self.layout, draw_nonce=lambda: NONCE, extensions=(policy,)
-        )
+    def agent(self, refusal: str = "") -> Server:
+        return Server(lambda _: refusal or self.layout, draw_nonce=lambda: NONCE)
 
     def pump(self) -> None:
         """Carry datagrams until nothing moves."""
@@ -95,14 +91,14 @@ class Swarm:
             moving = self.rules.step(self.now)
             self.rules.answer(self.now)
             for link, agent in zip(self.rules.links, self.agents, strict=True):
-                for datagram in link.client.take_outgoing():
+                for datagram in outgoing(link.client):
                     event = agent.receive(datagram, HERE, self.now)
                     if event and isinstance(event.message, State):
                         self.states[link.number].append(event.message)
                     elif event:
                         self.closed[link.number] = event.message.reason
                     moving = True
-                for datagram, _ in agent.take_outgoing():
+                for datagram, _ in outgoing(agent):
                     self.rules.receive(link, datagram, self.now)
                     moving = True
 
@@ -110,7 +106,12 @@ class Swarm:
         seeds = None if seed is None else np.array([seed], np.uint64)
         actions = np.full((1, 1), value, np.float32)
         orders = np.array([order], np.uint8)
-        self.agents[number].send_command(0, actions, orders, seeds, self.now)
+        self.send(number, actions, orders, seeds)
+
+    def send(self, number: int, actions: Any, orders: Any, seeds: Any = None) -> None:
+        (session,) = self.agents[number].slots
+        assert session is not None
+        session.send_command(actions, orders, seeds, self.now)
 
     def wait(self, seconds: float) -> None:
         """Let time pass, with every timer at its time."""
@@ -129,16 +130,16 @@ class Swarm:
 
     def restart(self, number: int) -> None:
         """Another agent takes the place of one that was killed."""
-        self.agents[number] = self.agent(number)
+        self.agents[number] = self.agent()
 
     @property
     def participations(self) -> list[Participation]:
         return [link.participation for link in self.rules.links]
 
 
-def begun(*policies: str) -> Swarm:
+def begun(policy: str = "hold") -> Swarm:
     """A world in which both have flown a step."""
-    swarm = Swarm(*policies)
+    swarm = Swarm(policy)
     swarm.pump()
     for number in (0, 1):
         swarm.say(number, FLY, number + 1.0)
@@ -174,47 +175,46 @@ def test_all_have_to_ask_for_a_reset() -> None:
 
 @pytest.mark.parametrize("policy", ["hold", "land", "end"])
 def test_the_policy_flies_the_drones_of_a_silent_agent(policy: str) -> None:
-    swarm = begun("hold", policy)
+    swarm = begun(policy)
     swarm.say(0, FLY, 1.0)
     swarm.pump()
     swarm.wait(PATIENCE - 0.1)
     assert swarm.participations[1] is Participation.FLYING
     swarm.wait(0.2)
-    assert swarm.participations[1] is Participation.SILENT
+    assert swarm.participations[1] is Participation.READY  # in a new session
     assert swarm.world.flown[1:] == [[1.0, 0.0]]
     assert swarm.world.landed.tolist() == [False, policy == "land"]
     assert swarm.world.retired.tolist() == [False, policy == "end"]
     (absence,) = swarm.rules.absences
-    assert absence == (1, 1, 1, Participation.SILENT)
-    swarm.say(1, FLY, 7.0)  # it comes back, and is told that its episode was truncated
+    assert absence == (1, 1, 1, Participation.COMING)
+    swarm.say(1, FLY, 7.0)  # it comes back, and gets State 1 of the next episode
     swarm.pump()
-    last = swarm.states[1][-1]
-    assert last.truncated.tolist() == [True]
-    assert last.rewards.tolist() == [0.0]
-    assert last.observations[0].item() == 2.0  # of its last State
-    swarm.say(1, RESET)
+    assert len(swarm.world.flown) == 2
     swarm.say(0, RESET, seed=3)
     swarm.pump()
+    assert swarm.states[1][-1].sequence == 1
     assert swarm.world.seeds[1:] == [[3, 3]]
     assert swarm.participations == [Participation.FLYING] * 2
 
 
-def test_an_agent_that_is_started_anew_before_the_first_step_flies_the_first_episode() -> None:
+def test_an_agent_that_is_started_anew_flies_from_the_next_episode_on() -> None:
     swarm = Swarm()
     swarm.pump()
     swarm.restart(0)
-    swarm.wait(1.0)  # its State is answered with Unknown; the first step waits for it
-    assert swarm.participations == [Participation.FLYING] * 2
-    assert swarm.rules.absences == []
-    swarm.say(0, FLY, 1.0)
+    swarm.wait(1.0)  # its State is answered with Unknown
+    assert swarm.participations == [Participation.READY, Participation.FLYING]
+    assert swarm.rules.absences == [(0, 1, 0, Participation.COMING)]
     swarm.say(1, FLY, 2.0)
     swarm.pump()
-    assert swarm.world.flown == [[1.0, 2.0]]
-    assert swarm.rules.episodes == 1
+    assert swarm.world.flown == [[0.0, 2.0]]
+    swarm.say(1, RESET, seed=9)
+    swarm.pump()
+    assert swarm.participations == [Participation.FLYING] * 2
+    assert swarm.rules.episodes == 2
 
 
 def test_an_agent_that_asks_for_a_reset_before_the_others_waits_for_them() -> None:
-    swarm = begun("hold", "end")
+    swarm = begun("end")
     swarm.say(1, RESET)
     swarm.say(0, FLY, 3.0)
     swarm.pump()
@@ -242,19 +242,6 @@ def test_an_agent_that_resets_a_start_gets_it_again() -> None:
     assert len(swarm.states[0]) - len(swarm.states[1]) == 1
 
 
-def test_a_late_agent_is_told_the_end_of_the_drones_that_were_in_flight() -> None:
-    swarm = Swarm("end", shares=([0, 1],))
-    swarm.pump()
-    fly = np.zeros((2, 1), np.float32), np.full(2, FLY, np.uint8), None
-    swarm.world.out = np.array([True, False])
-    swarm.wait(PATIENCE + 0.1)
-    assert swarm.participations == [Participation.SILENT]
-    swarm.agents[0].send_command(0, *fly, swarm.now)
-    swarm.pump()
-    assert swarm.states[0][-1].truncated.tolist() == [False, True]
-    assert swarm.participations == [Participation.LATE]
-
-
 def test_an_agent_that_came_back_does_not_hide_the_seeds_of_the_others() -> None:  # fault 50
     swarm = begun()
     swarm.restart(0)
@@ -267,28 +254,18 @@ def test_an_agent_that_came_back_does_not_hide_the_seeds_of_the_others() -> None
     assert swarm.participations == [Participation.FLYING] * 2
 
 
-def test_an_agent_that_comes_back_to_land_where_the_vehicle_cannot_ends_nobodys_flight() -> None:
-    swarm = begun()
-    swarm.policies = ("hold", "land")
-    swarm.restart(1)
-    swarm.world.can_land = False
-    swarm.wait(1.0)
-    assert swarm.rules.links[1].when_lost == "hold"
-    notice = swarm.rules.links[1].client.statistics.take_notices()[-1]
-    assert notice == "the agent at 127.0.0.1:1001 cannot have land (no rotors): hold"
-    swarm = Swarm("land", "land")
-    swarm.world.can_land = False
+def test_a_vehicle_that_cannot_land_is_not_flown_with_that_policy() -> None:
     with pytest.raises(InputError, match="no rotors"):
-        swarm.pump()
+        Swarm("land", can_land=False)
 
 
 def test_different_orders_of_one_agent_close_its_link() -> None:
-    swarm = Swarm("hold", shares=([0, 1],))
+    swarm = Swarm("hold", ([0, 1],))
     swarm.pump()
     orders = np.array([FLY, FREEZE], np.uint8)
-    swarm.agents[0].send_command(0, np.zeros((2, 1), np.float32), orders, None, swarm.now)
+    swarm.send(0, np.zeros((2, 1), np.float32), orders)
     swarm.pump()
-    reason = "orders: expected the same for all 2 drones, got different ones"
+    reason = "orders: expected to fly or to reset all 2 drones, got others"
     assert swarm.closed[0] == reason
     assert swarm.participations == [Participation.LEFT]
     assert swarm.world.flown == []
@@ -297,7 +274,7 @@ def test_different_orders_of_one_agent_close_its_link() -> None:
 @pytest.mark.parametrize(
     ("order", "reason"),
     [(FLY, "an action came after the end of an episode: expected a reset"),
-     (FREEZE, "orders: expected no frozen drone in a world that others fly on in, got some")],
+     (FREEZE, "orders: expected to fly or to reset all 1 drones, got others")],
 )  # fmt: skip
 def test_a_command_that_the_world_cannot_follow_closes_one_link(order: int, reason: str) -> None:
     swarm = begun()
@@ -316,7 +293,7 @@ def test_a_command_that_the_world_cannot_follow_closes_one_link(order: int, reas
 
 def test_before_the_world_begins_a_refusal_and_silence_end_it() -> None:
     swarm = Swarm()
-    swarm.agents[1] = swarm.agent(1, "another vehicle")
+    swarm.agents[1] = swarm.agent("another vehicle")
     with pytest.raises(Refused, match=r"^the agent at 127.0.0.1:1001 refused: another vehicle$"):
         swarm.pump()
     silent = Swarm()
@@ -329,9 +306,9 @@ def test_an_agent_that_closes_before_the_world_begins_ends_it() -> None:
     swarm = Swarm()
     link = swarm.rules.links[0]
     server = swarm.agents[0]
-    for datagram in link.client.take_outgoing():
+    for datagram in outgoing(link.client):
         server.receive(datagram, HERE, 0.0)
-    for datagram, _ in server.take_outgoing():
+    for datagram, _ in outgoing(server):
         swarm.rules.receive(link, datagram, 0.0)
     assert link.participation is Participation.READY
     bye = binary.encode(Close(session=70, sequence=0, reason="no more"))
@@ -348,4 +325,4 @@ def test_time_that_this_process_was_stopped_counts_for_nobody() -> None:
     swarm.rules.handle_timers(swarm.now)
     assert swarm.participations == [Participation.FLYING] * 2
     swarm.wait(PATIENCE)
-    assert swarm.participations[1] is Participation.SILENT
+    assert swarm.participations[1] is Participation.READY

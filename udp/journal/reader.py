@@ -39,7 +39,7 @@ class Session:
     """Counts the sessions of the file, from 1."""
     slot: int
     hello: Hello
-    """The text codec has no Hello. Then the recording side makes one, of session 0."""
+    """By text a simulator says none, and records one of its own."""
     codec: str
     """`binary` or `text`."""
     welcome: Welcome | None = None
@@ -60,11 +60,11 @@ class Session:
         return self.layout.drones
 
     @property
-    def seed(self) -> int | None:
-        """Of the reset before the first State. None if only the simulator knows it."""
+    def seed(self) -> int:
+        """Of the reset before the first State."""
         if self.welcome and self.welcome.seed is not None:
             return self.welcome.seed
-        return self.hello.session if self.hello.session or self.codec == "binary" else None
+        return self.hello.session
 
     def __str__(self) -> str:
         return f"session {self.index} (slot {self.slot}, {self.hello.session:016x})"
@@ -282,16 +282,6 @@ class Summary(Recording):
                 of[item.session.index] = SessionSummary(session=item.session, first=item.time)
             of[item.session.index].take(item)
         self.sessions = list(of.values())
-
-    @property
-    def steps(self) -> int:
-        """Of all drones of all sessions."""
-        return sum(session.steps for session in self.sessions)
-
-    @property
-    def episodes(self) -> int:
-        """Episodes that ended, of all sessions."""
-        return sum(session.episodes for session in self.sessions)
 
     def __str__(self) -> str:
         side = f"written by the {self.about['side']}, " if "side" in self.about else ""

@@ -1,6 +1,6 @@
 """Simulates a journal again, and compares every bit."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple, cast
@@ -12,7 +12,6 @@ from ...envs.registry import is_known
 from ...envs.spec import component_names
 from ...models import Backend
 from ...models.errors import InputError
-from ..protocol import text
 from ..protocol.messages import State
 from ..transport.stepped import Steppable, make_stepped
 from .reader import Item, Recording, Session, count_of, printable
@@ -47,8 +46,6 @@ class SessionVerdict:
     """What stepped the drones."""
     same: int = 0
     """States that are the same in every bit."""
-    unchecked: int = 0
-    """States before the first seed of a text session: its agent does not know how they began."""
     differing: int = 0
     """States that differ."""
     difference: Difference | None = None
@@ -58,7 +55,6 @@ class SessionVerdict:
     notes: list[str] = field(default_factory=list)
     """Other things that have changed."""
     _loop: "Steppable | None" = None
-    _known: bool = False  # whether the simulated drones are where the recorded ones were
 
     def __post_init__(self) -> None:
         self._walker = Walker(self.session)
@@ -71,8 +67,7 @@ class SessionVerdict:
     def lines(self) -> list[str]:
         """The verdict in words."""
         differing = f", {self.differing} not" if self.differing else ""
-        blind = f", {self.unchecked} before the first seed not compared" if self.unchecked else ""
-        lines = [f"{self.session}: {self.same} States the same in every bit{differing}{blind}"]
+        lines = [f"{self.session}: {self.same} States the same in every bit{differing}"]
         lines += [f"  first difference: {self.difference}"] if self.difference else []
         lines += [f"  {self.problem}"] if self.problem else []
         return lines + [f"  note: {note}" for note in self.notes]
@@ -106,9 +101,6 @@ class SessionVerdict:
         if transition.is_gap:
             number = transition.state.sequence - 1
             raise InputError(f"expected Command {number} before it, got none of that number")
-        if not self._known and (seeds is None or not resets.all()):
-            return
-        self._known = True
         if command is None:
             actions = self.session.layout.actions
             nothing = np.zeros(actions.shape, actions.dtype)
@@ -142,24 +134,12 @@ class SessionVerdict:
         return loop
 
     def _compare(self, recorded: State) -> None:
-        if not self._known or self._loop is None:
-            self.unchecked += 1
-        elif difference := _difference(recorded, self._loop, self._telemetry(self._loop)):
+        assert self._loop is not None
+        if difference := _difference(recorded, self._loop):
             self.differing += 1
             self.difference = self.difference or difference
         else:
             self.same += 1
-
-    def _telemetry(self, loop: Steppable) -> list[np.ndarray]:
-        """The replayed telemetry as the recording side had it."""
-        session = self.session
-        arrays = [loop.telemetry[spec.name] for spec in loop.spec.telemetry]
-        came_by_text = session.codec == "text" and session.hello.session == 0
-        if came_by_text:
-            arrays = text.in_world_frame(
-                text.in_paper_frame(arrays, session.layout), session.layout
-            )
-        return arrays
 
 
 class Verification(Recording):
@@ -227,11 +207,9 @@ class Verification(Recording):
         return printable(lines)
 
 
-def _difference(
-    recorded: State, loop: Steppable, telemetry: Sequence[np.ndarray]
-) -> Difference | None:
+def _difference(recorded: State, loop: Steppable) -> Difference | None:
     """The first number that differs in any bit; None if none does."""
-    for names, was, now in _arrays(recorded, loop, telemetry):
+    for names, was, now in _arrays(recorded, loop):
         if was.tobytes() == now.tobytes():
             continue
         for at, old in enumerate(was.flat):
@@ -243,21 +221,18 @@ def _difference(
     return None
 
 
-def _arrays(
-    recorded: State, loop: Steppable, telemetry: Sequence[np.ndarray]
-) -> Iterator[tuple[list[str], np.ndarray, np.ndarray]]:
+def _arrays(recorded: State, loop: Steppable) -> Iterator[tuple[list[str], np.ndarray, np.ndarray]]:
     """Names of the numbers of one drone, the recorded array and the replayed one."""
     yield ["reward"], recorded.rewards, loop.rewards
     yield ["terminated"], recorded.terminated, loop.terminated
     yield ["truncated"], recorded.truncated, loop.truncated
-    observations = [loop.observations[spec.name] for spec in loop.spec.observation]
     for what, specs, arrays, here in (
-        ("telemetry", loop.spec.telemetry, recorded.telemetry, telemetry),
-        ("observation", loop.spec.observation, recorded.observations, observations),
+        ("telemetry", loop.spec.telemetry, recorded.telemetry, loop.telemetry),
+        ("observation", loop.spec.observation, recorded.observations, loop.observations),
     ):
-        for spec, was, now in zip(specs, arrays, here, strict=True):
+        for spec, was in zip(specs, arrays, strict=True):
             names = [f"{what} {name}" for name in component_names(spec)]
-            yield names, was, np.ascontiguousarray(now, was.dtype)
+            yield names, was, np.ascontiguousarray(here[spec.name], was.dtype)
 
 
 def _digits(number: np.generic) -> str:

@@ -26,8 +26,7 @@ class Transition(NamedTuple):
     resets: Mask
     """Drones that were reset, shape (N,)."""
     seeds: NDArray[np.uint64] | None
-    """Of the drones that were reset, shape (N,). None: their generators went on, or it is unknown
-    how the session began."""
+    """Of the drones that were reset, shape (N,). None: their generators went on."""
 
     @property
     def is_gap(self) -> bool:
@@ -54,8 +53,7 @@ class Walker:
         drones = self.session.num_envs
         nobody = np.zeros(drones, bool)
         if before is None:
-            seed = self.session.seed  # drone i takes seed + i: rule 6 of the protocol
-            seeds = None if seed is None else first_seeds(seed, drones)
+            seeds = first_seeds(self.session.seed, drones)
             return Transition(message, None, True, nobody, ~nobody, seeds)
         command = self._command
         if command is None or not before == command.sequence == message.sequence - 1:

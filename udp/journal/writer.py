@@ -11,7 +11,7 @@ import platform
 import sys
 import time
 import weakref
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from errno import EINTR
 from importlib.metadata import PackageNotFoundError, version
@@ -20,7 +20,6 @@ from typing import Any, Final
 
 from mcap.writer import Writer
 
-from ..protocol import binary
 from ..protocol.messages import Command, Hello, Message, State
 from ..transport.stepped import Steppable
 
@@ -44,10 +43,7 @@ class Journal:
     Args:
         path: The file; it must not exist.
         side: `simulator` or `agent`.
-        slots: Sessions in the slots of an agent; another one in a slot is another session. Only the
-            text codec needs them: there all sessions have the same number.
-        text_hello: Stands for the Hello that the text codec does not have. An agent gives it the
-            session 0.
+        codec: Of the sessions.
         about: More metadata of the head, by name.
         models: MJCF of the vehicles, by the names of the attachments.
 
@@ -61,14 +57,11 @@ class Journal:
         path: Path | str,
         *,
         side: str,
-        slots: Sequence[object] = ("the only agent",),
-        text_hello: Hello | None = None,
+        codec: str = "binary",
         about: Mapping[str, str] | None = None,
         models: Mapping[str, str] | None = None,
     ) -> None:
-        self._slots = slots
-        self._text_hello = text_hello
-        self._holders: dict[int, object] = {}  # by slot: number of a binary session, or a text one
+        self._codec = codec
         self._size = 0  # bytes that are not written yet
         now = self._flushed = time.time_ns()
         versions = software()
@@ -96,12 +89,6 @@ class Journal:
             return
         now = time.time_ns()
         try:
-            if isinstance(message, Hello):
-                self._holders[slot] = message.session
-                self._add_event(slot, message, datagram, now, codec="binary")
-                return
-            if message.session != self._holders.get(slot):  # no Hello: by text
-                self._begin_by_text(slot, now)
             if isinstance(message, State | Command):
                 topic = "state" if isinstance(message, State) else "command"
                 channel = self._file.channel(f"/slot{slot}/{topic}", "rotorgram")
@@ -135,20 +122,11 @@ class Journal:
         self._size = 0
         self._flushed = now
 
-    def _begin_by_text(self, slot: int, now: int) -> None:
-        """Begin a session if this is the first message of a new text simulator."""
-        hello = self._text_hello
-        assert hello is not None, "the text codec needs a text_hello"
-        holder = self._slots[slot]
-        if holder is not self._holders.get(slot):
-            self._holders[slot] = holder
-            self._add_event(slot, hello, binary.encode(hello), now, codec="text")
-
-    def _add_event(
-        self, slot: int, message: Message, datagram: bytes, now: int, **more: str
-    ) -> None:
+    def _add_event(self, slot: int, message: Message, datagram: bytes, now: int) -> None:
         """Add a message for readers, with its datagram for programs."""
-        words = {"type": type(message).__name__, "session": f"{message.session:016x}", **more}
+        words = {"type": type(message).__name__, "session": f"{message.session:016x}"}
+        if isinstance(message, Hello):
+            words["codec"] = self._codec
         for name in ("worlds", "spec", "seed", "sequence", "reason"):
             if hasattr(message, name):
                 words[name] = getattr(message, name)

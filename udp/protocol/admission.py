@@ -5,8 +5,9 @@ Welcome: a recorded Hello that is sent again takes none, and neither does a send
 read. Memory for simulators without a slot is bounded.
 """
 
+import secrets
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple, TypeVar
 
 from ...models.errors import InputError
@@ -40,78 +41,79 @@ class Arrival(NamedTuple):
     now: float
 
 
-class Slots:
-    """The sessions of the simulators that an agent flies."""
-
-    def __init__(self, count: int) -> None:
-        self.sessions: list[Session | None] = [None] * count
-        self.of: dict[Address, Session] = {}
-        """By address of the simulator."""
-        self._ended: OrderedDict[int, None] = OrderedDict()  # numbers of sessions that had a slot
-
-    def seat(self, session: Session, state: State, plain: bytes) -> Event:
-        """Give a session its slot: that of an earlier one of its address, or a free one."""
-        earlier = self.of.get(session.peer)
-        slot = self.sessions.index(None) if earlier is None else earlier.slot
-        if earlier:
-            self.free(slot)
-        self.sessions[slot] = session
-        self.of[session.peer] = session
-        return session.join(slot, state, plain)
-
-    def free(self, slot: int) -> None:
-        """Give a slot to the next simulator that comes."""
-        session = self.sessions[slot]
-        self.sessions[slot] = None
-        if session:
-            session.move(Way.UNSAID, m.Close)
-            del self.of[session.peer]
-            if not session.is_text:
-                keep(self._ended, session.number, None)
-
-    def takes(self, address: Address) -> bool:
-        """Whether there is a slot for a simulator at this address."""
-        return None in self.sessions or address in self.of
-
-    def has(self, number: int, elsewhere: Address | None = None) -> bool:
-        """Whether a session of that number has a slot (not of this address)."""
-        return any(s and s.number == number and s.peer != elsewhere for s in self.sessions)
-
-    def had(self, number: int) -> bool:
-        """Whether a session of that number has or had a slot."""
-        return number in self._ended or self.has(number)
-
-
 class Admission:
-    """Simulators between their Hello and their slot."""
+    """The slots of an agent, and the simulators between their Hello and their slot.
+
+    Args:
+        accept: Looks at a Hello and gives the layout of its messages, or the reason to refuse it.
+        text_layout: A text simulator says no Hello: its first line opens the session, and this
+            gives the layout to read it by. None, or a result of None: text is not flown.
+        slots: Simulators to fly at the same time. Others wait until a slot is free.
+        keys: Shared with the simulators, any of them. Then nothing unsealed is taken.
+        draw_nonce: Gives a random 64-bit number for each Welcome.
+
+    Attributes:
+        slots: Session of each slot, None where it is free.
+        takes_text: Whether a text simulator may take a free slot.
+        outbox: Datagrams to send, and the tap.
+        statistics: Counts and times, over all simulators.
+        openings: Sessions that were welcomed, by address and number.
+    """
 
     def __init__(
         self,
-        slots: Slots,
-        outbox: Outbox,
         accept: Callable[[m.Hello], Layout | str],
-        keys: Mapping[bytes, Key],
-        extensions: tuple[m.Extension, ...],
-        draw_nonce: Callable[[], int],
+        text_layout: Callable[[], Layout | None] | None = None,
+        *,
+        slots: int = 1,
+        keys: Sequence[Key] = (),
+        max_datagram: int | None = None,
+        draw_nonce: Callable[[], int] = lambda: secrets.randbits(64),
     ) -> None:
-        self.closed = False
-        self.openings: OrderedDict[tuple[Address, int], Session] = OrderedDict()  # WELCOMED
-        self._slots = slots
-        self._outbox = outbox
+        self.outbox = Outbox(max_datagram)
+        self.statistics = self.outbox.statistics
+        self.slots: list[Session | None] = [None] * slots
+        self.takes_text = text_layout is not None
+        self.openings: OrderedDict[tuple[Address, int], Session] = OrderedDict()
+        self._closed = False
         self._accept = accept
-        self._keys = keys
-        self._extensions = extensions
+        self._text_layout = text_layout or (lambda: None)
+        self._keys = {key.id: key for key in keys}
         self._draw_nonce = draw_nonce
+        self._seated: dict[Address, Session] = {}
+        self._ended: OrderedDict[int, None] = OrderedDict()  # numbers of sessions that had a slot
         self._queue: OrderedDict[Address, Session] = OrderedDict()  # QUEUED
         self._assembling: OrderedDict[tuple[Address, int], Assembler] = OrderedDict()
         self._ended_text: OrderedDict[Address, tuple[bytes, int, float]] = OrderedDict()
 
-    def close(self, reason: str) -> None:
-        """Turn away all that come, and those that wait."""
-        self.closed = True
-        for queued in self._queue.values():
-            self.refuse(queued.number, reason, queued.peer, queued.room, queued.key)
-            queued.move(Way.SENT, m.Refuse)
+    # ---- slots
+
+    def free(self, slot: int) -> None:
+        """Give the slot of a simulator that has fallen silent to the next that comes."""
+        session = self.slots[slot]
+        self.slots[slot] = None
+        if session:
+            session.move(Way.UNSAID, m.Close)
+            del self._seated[session.peer]
+            if not session.is_text:
+                keep(self._ended, session.number, None)
+
+    def _seat(self, session: Session, state: State, plain: bytes) -> Event:
+        """Give a session its slot: that of an earlier one of its address, or a free one."""
+        earlier = self._seated.get(session.peer)
+        slot = self.slots.index(None) if earlier is None else earlier.slot
+        if earlier:
+            self.free(slot)
+        self.slots[slot] = session
+        self._seated[session.peer] = session
+        return session.join(slot, state, plain)
+
+    def _has_slot_for(self, address: Address) -> bool:
+        return None in self.slots or address in self._seated
+
+    def _has(self, number: int, elsewhere: Address | None = None) -> bool:
+        """Whether a session of that number has a slot (not of this address)."""
+        return any(s and s.number == number and s.peer != elsewhere for s in self.slots)
 
     # ---- Hello
 
@@ -120,10 +122,10 @@ class Admission:
         address = arrival.address
         size = len(arrival.datagram)
         opening = self.openings.get((address, hello.session))
-        if self._slots.had(hello.session):
+        if hello.session in self._ended or self._has(hello.session):
             self.drop("stale", "", arrival)
             return
-        if opening and not self.closed:
+        if opening and not self._closed:
             opening.repeat()
             self.drop("duplicate", "", arrival)
             return
@@ -132,23 +134,23 @@ class Admission:
             self.refuse(hello.session, layout, address, size, key)
             self.drop("refused", layout, arrival)
             return
-        session = Session(self._outbox, address, hello.session, layout, hello, key=key)
-        if self._slots.takes(address):
+        session = Session(self.outbox, address, hello.session, layout, hello, key=key)
+        if self._has_slot_for(address):
             self._queue.pop(address, None)
             nonce = self._draw_nonce()
-            welcome = m.Welcome(session=hello.session, nonce=nonce, extensions=self._extensions)
+            welcome = m.Welcome(session=hello.session, nonce=nonce)
             session.send_welcome(welcome)
             keep(self.openings, (address, hello.session), session)
         else:
             wait = binary.encode(m.Wait(session=session.number))
-            self._outbox.put([wait], address, key)
+            self.outbox.put([wait], address, key)
             session.move(Way.SENT, m.Wait)
             session.room = size - len(wait)
             keep(self._queue, address, session)
 
     def _fit(self, hello: m.Hello, address: Address) -> Layout | str:
         """The layout of a simulator that is accepted, or the reason to refuse it."""
-        if self.closed:
+        if self._closed:
             return "the agent has closed"
         low, high = hello.versions
         if not low <= binary.VERSION <= high:
@@ -159,7 +161,7 @@ class Admission:
         if isinstance(layout, str):
             return layout
         try:
-            largest = largest_datagram(address, self._outbox.max_datagram)
+            largest = largest_datagram(address, self.outbox.max_datagram)
             check_size(layout.seeded_command.size, largest)
         except InputError as error:
             return str(error)
@@ -172,7 +174,7 @@ class Admission:
         room = size - _REASON_AT - (OVERHEAD if key else 0)
         if room >= 0:
             refuse = m.Refuse(session=number, reason=_cut(reason, room))
-            self._outbox.put([binary.encode(refuse)], address, key)
+            self.outbox.put([binary.encode(refuse)], address, key)
 
     def assemble(
         self, fragment: bytes, opening: Session | None, arrival: Arrival, key: Key | None
@@ -185,25 +187,25 @@ class Admission:
             return None
         place = arrival.address, binary.peek(fragment)[1]
         assembler = self._assembling.get(place) or Assembler(binary.LONGEST_HELLO)
-        keep(self._assembling, place, assembler, max(_LEAST_ASSEMBLING, len(self._slots.sessions)))
+        keep(self._assembling, place, assembler, max(_LEAST_ASSEMBLING, len(self.slots)))
         whole = assembler.take(fragment)
         if whole is not None:
             del self._assembling[place]
         elif answer := assembler.ask(fragment):
-            self._outbox.put(answer, arrival.address, key)
+            self.outbox.put(answer, arrival.address, key)
         return whole
 
-    def receive(
+    def receive_opening(
         self, opening: Session, message: m.Message, plain: bytes, arrival: Arrival
     ) -> Event | None:
         """Take a message of a session that was welcomed."""
         if isinstance(message, State):
             return self._join(opening, message, plain, arrival)
         if isinstance(message, m.Close):
-            self.forget(opening)
+            del self.openings[opening.peer, opening.number]
             opening.move(Way.RECEIVED, m.Close)
             goodbye = binary.encode(opening.goodbye(""))
-            self._outbox.put([goodbye], arrival.address, opening.session_key())
+            self.outbox.put([goodbye], arrival.address, opening.session_key())
             return None
         self.drop("foreign", type(message).__name__, arrival)
         return None
@@ -216,32 +218,24 @@ class Admission:
         if state.sequence != 1 or state.nonce != opening.welcome.nonce:
             # Its Hello was an old one: this simulator goes on with another agent, or a copy of
             # its Hello came late.
-            self.forget(opening)
+            del self.openings[opening.peer, opening.number]
             self.disown(plain, arrival)
             return None
-        for key, other in list(self.openings.items()):
-            # It, and what the same address began before it. Later ones stay: if this State came
-            # late, their Hello may still be repeated.
-            if key[0] == peer:
-                self.forget(other)
-            if other is opening:
-                break
+        for address, number in list(self.openings):  # it, and what else the address began
+            if address == peer:
+                del self.openings[address, number]
         layout = self._fit(opening.hello, peer)  # another one may have come since its Hello
         if isinstance(layout, str):
             reason = _cut(layout, len(plain) - _REASON_AT)
             close = m.Close(session=opening.number, sequence=1, reason=reason)
-            self._outbox.put([binary.encode(close)], peer, opening.session_key())
+            self.outbox.put([binary.encode(close)], peer, opening.session_key())
             opening.move(Way.SENT, m.Close)
             self.drop("refused", layout, arrival)
             return None
-        if not self._slots.takes(peer) or self._slots.has(opening.number, elsewhere=peer):
+        if not self._has_slot_for(peer) or self._has(opening.number, elsewhere=peer):
             self.disown(plain, arrival)  # another was quicker
             return None
-        return self._slots.seat(opening, state, plain)
-
-    def forget(self, opening: Session) -> None:
-        """Forget a session that was welcomed."""
-        del self.openings[opening.peer, opening.number]
+        return self._seat(opening, state, plain)
 
     def disown(self, plain: bytes, arrival: Arrival) -> None:
         """Tell the simulator of an unknown session to begin another one.
@@ -255,42 +249,42 @@ class Admission:
         if not sequence:
             self.drop("malformed", "expected a State from 1 on, got 0", arrival)
             return
-        if self.closed or self._slots.has(number, elsewhere=address):
+        if self._closed or self._has(number, elsewhere=address):
             # Another address has it: no answer of ours may end it.
             self.drop("foreign", f"session {number:016x}", arrival)
             return
-        self._outbox.statistics.counters["foreign"] += 1  # mostly after a restart: no notice
+        self.statistics.counters["foreign"] += 1  # mostly after a restart: no notice
         reply = binary.encode(m.Unknown(session=number, sequence=sequence))
         if self._keys:  # of use only to the simulator that has sent this State
             key = self._keys.get(key_id(datagram))
             if key is None:
                 return
             reply = key.seal(reply, datagram)
-        self._outbox.put([reply], address, None)
+        self.outbox.put([reply], address, None)
 
     # ---- text: the first line opens the session
 
     def receive_first_line(
-        self, message: State | m.Close, layout: Layout, takes_text: bool, arrival: Arrival
+        self, message: State | m.Close, layout: Layout, arrival: Arrival
     ) -> Event | None:
         """A line of a text simulator that has no slot."""
         datagram, address, now = arrival
         if isinstance(message, m.Close):
-            self._outbox.statistics.counters["foreign"] += 1
+            self.statistics.counters["foreign"] += 1
             return None
         last, number, until = self._ended_text.get(address, (b"", 0, 0.0))
         is_late = last == datagram or 1 < number == message.sequence
         if is_late and now < until:
             reason = "a copy of the last line of a simulator that has closed"
-        elif self.closed:
+        elif self._closed:
             reason = "the agent has closed"
-        elif not takes_text or address in self._slots.of:
+        elif not self.takes_text or address in self._seated:
             reason = "text is not flown here"
-        elif None not in self._slots.sessions:
+        elif None not in self.slots:
             reason = "every slot is taken"
         else:
-            session = Session(self._outbox, address, 0, layout, None, line=datagram)
-            return self._slots.seat(session, message, b"")
+            session = Session(self.outbox, address, 0, layout, None, line=datagram)
+            return self._seat(session, message, b"")
         self.turn_text_away(message.sequence, "refused", reason, arrival)
         return None
 
@@ -298,7 +292,7 @@ class Admission:
         """Answer a line that is not flown, with no more bytes than it has."""
         line = text.encode(m.Close(session=0, sequence=sequence, reason=""))
         if len(line) <= len(arrival.datagram):
-            self._outbox.put([line], arrival.address, None)
+            self.outbox.put([line], arrival.address, None)
         self.drop(cause, reason, arrival)
 
     def remember_text(self, session: Session, sequence: int, now: float) -> None:
@@ -307,7 +301,7 @@ class Admission:
 
     def drop(self, cause: str, reason: str, arrival: Arrival) -> None:
         """Count a datagram that changes nothing."""
-        self._outbox.drop(cause, reason, arrival.address, arrival.now)
+        self.outbox.drop(cause, reason, arrival.address, arrival.now)
 
 
 def keep(table: OrderedDict[K, V], key: K, value: V, most: int = _MOST) -> None:

@@ -7,7 +7,7 @@ constants and structs below follow it, and `tests/golden.py` writes the bytes th
 import struct
 import zlib
 from math import isfinite
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -189,8 +189,6 @@ def encode_step(m: State | Command, layout: Layout) -> bytes:
                 arrays = (m.actions, m.orders, m.seeds)
     except struct.error as error:
         raise InputError(f"{type(m).__name__}: {error}") from None
-    if len(arrays) != len(record.slots):
-        raise InputError(f"State: expected {len(record.slots)} arrays, got {len(arrays)}")
     for slot, array in zip(record.slots, arrays, strict=True):
         if array.shape != slot.shape or array.dtype != slot.dtype:  # numbers are never converted
             raise InputError(
@@ -314,58 +312,33 @@ def _encode_body(m: Message) -> bytes:
 
 
 def _decode_body(kind: int, session: int, sequence: int, body: bytes) -> Message:
-    match kind:
-        case 1:
-            return _decode_hello(session, body)
-        case 2:
-            return _decode_welcome(session, body)
-        case 3:
-            return Refuse(session=session, reason=_decode_reason(body))
-        case 6:
-            return Close(session=session, sequence=sequence, reason=_decode_reason(body))
-        case 10:
-            of, count, first = _MISSING_BODY.unpack_from(body)
-            bitmap = body[_MISSING_BODY.size :]
-            return Missing(
-                session=session, sequence=sequence, kind=of, count=count, first=first, bitmap=bitmap
-            )
-    if body:
+    fields: dict[str, Any] = {"session": session}
+    if kind in _NUMBERED:
+        fields["sequence"] = sequence
+    message = _MESSAGES[kind - 1]
+    if message is Hello:
+        low, high, fields["worlds"], size = _HELLO_BODY.unpack_from(body)
+        fields["versions"] = low, high
+        at = _HELLO_BODY.size
+        most = min(MAX_SPEC, len(body) - at)
+        if size > most:
+            raise InputError(f"spec: expected at most {most} bytes, got {size}")
+        fields["spec"] = body[at : at + size].decode()
+        fields["extensions"] = _take_extensions(body, at + size)
+    elif message is Welcome:
+        fields["nonce"], seed, has_seed, fields["version"] = _WELCOME_BODY.unpack_from(body)
+        if has_seed > 1:
+            raise InputError(f"has seed: expected 0 or 1, got {has_seed}")
+        fields["seed"] = seed if has_seed else None
+        fields["extensions"] = _take_extensions(body, _WELCOME_BODY.size)
+    elif message is Missing:
+        fields["kind"], fields["count"], fields["first"] = _MISSING_BODY.unpack_from(body)
+        fields["bitmap"] = body[_MISSING_BODY.size :]
+    elif message in (Refuse, Close):
+        fields["reason"] = _decode_reason(body)
+    elif body:
         raise _wrong_size(body, 0)
-    match kind:
-        case 7:
-            return Wait(session=session)
-        case 8:
-            return Unknown(session=session, sequence=sequence)
-    return Alive(session=session, sequence=sequence)
-
-
-def _decode_hello(session: int, body: bytes) -> Hello:
-    low, high, worlds, size = _HELLO_BODY.unpack_from(body)
-    at = _HELLO_BODY.size
-    most = min(MAX_SPEC, len(body) - at)
-    if size > most:
-        raise InputError(f"spec: expected at most {most} bytes, got {size}")
-    return Hello(
-        session=session,
-        spec=body[at : at + size].decode(),
-        worlds=worlds,
-        versions=(low, high),
-        extensions=_take_extensions(body, at + size),
-    )
-
-
-def _decode_welcome(session: int, body: bytes) -> Welcome:
-    nonce, seed, has_seed, version = _WELCOME_BODY.unpack_from(body)
-    if has_seed > 1:
-        raise InputError(f"has seed: expected 0 or 1, got {has_seed}")
-    extensions = _take_extensions(body, _WELCOME_BODY.size)
-    return Welcome(
-        session=session,
-        nonce=nonce,
-        version=version,
-        seed=seed if has_seed else None,
-        extensions=extensions,
-    )
+    return message(**fields)
 
 
 def _decode_reason(body: bytes) -> str:

@@ -1,7 +1,7 @@
 """The simulator's side of the exchange (UDP client), free of sockets and clocks.
 
 A caller hands in datagrams with the time of their arrival (seconds of any monotonic clock), sends
-what `take_outgoing` gives, and calls `handle_timer` when `next_timer` says. Exactly one State is
+what `outgoing` has, and calls `handle_timer` when `next_timer` says. Exactly one State is
 outstanding at any time, so a sequence number suffices to step the physics once for each Command:
  the simulator repeats the same bytes until the Command of the same number comes.
 """
@@ -25,7 +25,6 @@ from .fragments import (
     NEAR,
     Assembler,
     Transfer,
-    Window,
     check_largest,
     check_size,
     is_fragment,
@@ -61,7 +60,7 @@ _LATEST: Final = 10.0
 for again before an agent takes the simulator for lost (30 s)."""
 _TOO_EARLY: Final = 1.5  # by so much round trips are taken for longer when answers come twice
 _SOON: Final = 0.25  # an agent that has waited for a State for less needs no Alive, s
-_AFTER_COMMAND: Final = SIMULATOR[SimulatorState.WAITING, Way.RECEIVED, Command]
+_AFTER_COMMAND: Final = SIMULATOR[SimulatorState.WAITING][Way.RECEIVED, Command]
 
 
 def new_session() -> int:
@@ -192,6 +191,7 @@ class Client:
         resend_at: When it is sent again; infinite if nothing is outstanding, as `deadline`.
         deadline: When the agent is given up.
         tap: None at first.
+        outgoing: Datagrams to send to the agent: the caller takes them.
     """
 
     def __init__(
@@ -230,7 +230,6 @@ class Client:
         self._dice = Random(config.drop_seed).random if config.drop else None
         self._is_queued = False
         self._assembler = Assembler(layout.seeded_command.size)
-        self._window = Window()
         self._transfer: Transfer | None = None  # of the outstanding message
         self._transfer_key: Key | None = None
         self._asking = b""  # the datagram that was sent last and wants an answer
@@ -256,10 +255,9 @@ class Client:
     ) -> State:
         """Send the next State, and return it: see `messages.State`.
 
-        Raises `InputError` for an array that is not of the layout, or not finite; nothing was sent.
+        Raises `InputError` for an array that is not of the layout, or not finite, and `KeyError`
+        where no State is due; nothing was sent.
         """
-        if self.state is not SimulatorState.READY:
-            raise ValueError(f"send_state: expected state ready, got {self.state.value}")
         state = State(
             session=self.hello.session,
             sequence=self.sequence + 1,
@@ -287,7 +285,7 @@ class Client:
 
     def close(self, reason: str, now: float) -> None:
         """End the exchange. An agent that has welcomed this simulator is told, until it answers."""
-        if (self.state, Way.SENT, m.Close) in SIMULATOR:
+        if (Way.SENT, m.Close) in SIMULATOR[self.state]:
             session = self.hello.session
             number = self.sequence
             self._send(m.Close(session=session, sequence=number, reason=one_line(reason)), now)
@@ -332,7 +330,7 @@ class Client:
         if message.session != self.hello.session:
             self._drop("foreign", f"session {message.session:016x}", now)
             return None
-        state = SIMULATOR.get((self.state, Way.RECEIVED, type(message)))
+        state = SIMULATOR[self.state].get((Way.RECEIVED, type(message)))
         number = getattr(message, "sequence", self.sequence)
         # There is one Close in a session, so its number does not matter.
         if state is None or (number != self.sequence and not isinstance(message, m.Close)):
@@ -374,12 +372,6 @@ class Client:
         """Move the deadline: this process was stopped for so long, and the agent could not know."""
         self.deadline += seconds
 
-    def take_outgoing(self) -> list[bytes]:
-        """Datagrams to send to the agent, each once."""
-        outgoing = self.outgoing
-        self.outgoing = []
-        return outgoing
-
     # ---- what came
 
     def _take(
@@ -410,7 +402,10 @@ class Client:
         self.state = state
         self._record(message, plain)
         if isinstance(message, m.Unknown):
-            self._begin_again(now)
+            self.statistics.notice(
+                "the agent does not know this session (any more); beginning a new one"
+            )
+            self.begin_again(now)
             return None
         self._forget_transfer()
         if isinstance(message, m.Welcome):
@@ -493,11 +488,8 @@ class Client:
         unknown = [e.number for e in welcome.extensions if e.critical]
         return f"Welcome: expected no critical extension {unknown[0]}" if unknown else ""
 
-    def _begin_again(self, now: float) -> None:
-        """Say Hello to an agent that knows nothing of the session."""
-        self.statistics.notice(
-            "the agent does not know this session (any more); beginning a new one"
-        )
+    def begin_again(self, now: float) -> None:
+        """Say Hello in a new session to an agent that knows nothing of this one, or is silent."""
         self.hello = replace(self.hello, session=self._draw_session())
         self.sequence = 0
         self._session_key = None
@@ -510,15 +502,16 @@ class Client:
     def _send(self, message: m.Hello | State | m.Close, now: float) -> None:
         """Send a message and repeat it until it is answered."""
         kind = type(message)
+        after = SIMULATOR[self.state][Way.SENT, kind]
         if isinstance(message, State) and not self.by_text:
             data = binary.encode_step(message, self.layout)
         else:
             data = self._encode(message)
         if self.tap:
             self._record(message, data)
-        self._transfer = transfer = Transfer(data, self._largest, self._window)
+        self._transfer = transfer = Transfer(data, self._largest)
         self._transfer_key = self._key if kind is m.Hello else self._session_key
-        self.state = SIMULATOR[self.state, Way.SENT, kind]
+        self.state = after
         self.sequence = 0 if isinstance(message, m.Hello) else message.sequence
         self.sends = self._tries = 1
         self._stretch = 1.0
@@ -560,7 +553,7 @@ class Client:
             self.tap(0, message, binary.encode(message, self.layout) if self.by_text else data)
 
     def _give_up(self) -> None:
-        self.state = SIMULATOR[self.state, Way.UNSAID, m.Close]
+        self.state = SIMULATOR[self.state][Way.UNSAID, m.Close]
         self._forget_transfer()
 
     def _forget_transfer(self) -> None:

@@ -32,9 +32,7 @@ MAX_FRAGMENTS: Final = 1 << 14
 _FRAGMENT: Final = struct.Struct("<HHB3x")
 _OVERHEAD: Final = HEADER_SIZE + _FRAGMENT.size
 _ASKS_AT: Final = 28
-_FIRST_BURST: Final = 3 << 16  # bytes: what the smallest buffer that systems give a socket holds
-_LARGEST_BURST: Final = 1 << 20
-_MAX_LOST: Final = 0.25  # A burst of which more was lost was too large for a buffer on its way
+_BURST: Final = 3 << 16  # bytes: what the smallest buffer that systems give a socket holds
 _LARGEST_BITMAP: Final = 128  # bytes of the bitmap of a Missing: it tells of 1,024 fragments
 
 
@@ -52,30 +50,15 @@ def check_size(size: int, largest: int) -> None:
         raise InputError(f"max_datagram: expected {expected}, got {largest}")
 
 
-class Window:
-    """Size of a burst. It grows while bursts arrive, and halves if much is lost."""
-
-    def __init__(self) -> None:
-        self.size = _FIRST_BURST  # bytes
-
-    def report(self, sent: int, lost: int) -> None:
-        """Take into account that so many fragments of a burst were lost."""
-        if lost > max(_MAX_LOST * sent, 1):
-            self.size = max(self.size // 2, _FIRST_BURST // 8)
-        elif lost == 0:
-            self.size = min(2 * self.size, _LARGEST_BURST)
-
-
 class Transfer:
     """One message on its way, or a line of text: in one datagram, or in fragments.
 
-    `largest` are the bytes of the largest datagram, a seal not counted. `window` is kept for the
-    next message to the same peer.
+    `largest` are the bytes of the largest datagram, a seal not counted.
     """
 
-    __slots__ = ("_burst", "_crc", "_next", "_slice", "_start", "_window", "count", "message")
+    __slots__ = ("_burst", "_crc", "_next", "_slice", "_start", "count", "message")
 
-    def __init__(self, message: bytes, largest: int, window: Window) -> None:
+    def __init__(self, message: bytes, largest: int) -> None:
         self.message = message
         self.count = 1
         if len(message) > largest:
@@ -84,7 +67,6 @@ class Transfer:
             self.count = ceil(len(message) / self._slice)  # fewer, where rounding made empty ones
             self._start = message[:3] + bytes((message[3] | binary.FRAGMENT,))
             self._crc = crc32(message[8:HEADER_SIZE], crc32(self._start))
-        self._window = window
         self._burst: list[int] = []
         self._next = 0  # no fragment from this one on was sent
 
@@ -100,8 +82,6 @@ class Transfer:
         if self.count != missing.count or not self._burst:
             return []
         numbers = missing.numbers()
-        lacking = set(numbers)
-        self._window.report(len(self._burst), sum(n in lacking for n in self._burst))
         covered = missing.first + 8 * len(missing.bitmap)
         numbers += range(max(self._next, covered), self.count)
         return self._send(numbers)
@@ -115,7 +95,7 @@ class Transfer:
     def _send(self, numbers: list[int]) -> list[bytes]:
         if not numbers:
             return []
-        burst = numbers[: max(self._window.size // self._slice, 2)]
+        burst = numbers[: max(_BURST // self._slice, 2)]
         self._burst = burst
         self._next = max(self._next, burst[-1] + 1)
         return [self._fragment(number, asks=number == burst[-1]) for number in burst]

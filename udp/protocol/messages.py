@@ -18,8 +18,6 @@ MAX_UINT64: Final = (1 << 64) - 1  # largest session, sequence number, nonce and
 MAX_TEXT: Final = 512  # longest reason, bytes of UTF-8
 MAX_SPEC: Final = 1 << 22  # longest spec, bytes of UTF-8
 
-WHEN_LOST: Final = 1
-"""Extension of a Welcome: one of `POLICIES` in ASCII, for a simulator of several agents."""
 POLICIES: Final = ("hold", "land", "end")
 """What drones do whose agent is lost: they take the action that changes nothing, they descend
 until they touch something, or their rotors stand still."""

@@ -5,7 +5,7 @@ Free of sockets and clocks, as `client`: a driver hands in datagrams and the tim
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Enum
 from math import inf
 from typing import Final, NamedTuple, Protocol
@@ -13,16 +13,12 @@ from typing import Final, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ...models.errors import InputError
 from .client import Address, Client, address_text
 from .errors import LinkError, PeerSilent, Refused
 from .layout import Layout
 from .messages import (
     FLY,
-    FREEZE,
-    POLICIES,
     RESET,
-    WHEN_LOST,
     Close,
     Command,
     Message,
@@ -72,17 +68,13 @@ class Participation(Enum):
     """What an agent does in the running episode."""
 
     COMING = "coming"
-    """It has not welcomed this simulator yet, or not again after it was started anew."""
+    """It has not welcomed this simulator yet, or not again after it was silent or started anew."""
     READY = "ready"
     """It has, and gets its first State with the next episode."""
     FLYING = "flying"
     """The world waits for its Commands."""
     WAITING = "waiting"
     """It asked for a reset, and waits for it."""
-    SILENT = "silent"
-    """The world waited for its Command in vain, and still asks for it."""
-    LATE = "late"
-    """It came back, and was told that its episode was truncated."""
     LEFT = "left"
     """It closed, or was silent for too long."""
 
@@ -110,9 +102,7 @@ class AgentLink:
     client: Client
     """The exchange with it, with its statistics."""
     rows: Array
-    """Rows of its drones in the world's arrays, shape (n,)."""
-    when_lost: str = "hold"
-    """Its policy, one of `POLICIES`."""
+    """Rows of its drones in the arrays of a world, shape (n,): the first agent has the first."""
     participation: Participation = Participation.COMING
     command: Command | None = None
     """The Command that the next step or reset takes."""
@@ -121,15 +111,8 @@ class AgentLink:
     """Of its Welcome."""
     trouble: str = ""
     """Why datagrams do not reach it, as far as the transport knows."""
-    shown: tuple[tuple[Array, ...], tuple[Array, ...]] = ((), ())
-    """Observations and telemetry of its last State."""
-    in_flight: Mask = field(init=False)
-    """Its drones that were flying when it was lost."""
     complained: float = -inf
     """When the message was sent whose missing answer is in the log."""
-
-    def __post_init__(self) -> None:
-        self.in_flight = np.zeros(len(self.rows), bool)
 
     @property
     def name(self) -> str:
@@ -360,28 +343,19 @@ class SeveralAgents(WorldRules):
         self._swarm = world
         self._when_lost = when_lost
         self._patience = patience
-        self._due: list[tuple[AgentLink, bool, bool]] = []  # States: to whom, again, cut
-        self._last_reason = ""
+        self._due: list[AgentLink] = []  # of States
+        if when_lost == "land":  # raises where the vehicle cannot
+            world.land(np.zeros(layout.drones, bool))
 
     # ---- episodes and steps
 
     def step(self, now: float) -> bool:
         """Step or begin the world if it is time to."""
         flying = self._who(Participation.FLYING)
-        if all(link.participation is Participation.LEFT for link in self.links):
-            self.reason = self._last_reason
-            return False
         if not self.episodes:
             if len(self._who(Participation.READY)) < len(self.links):
                 return False
             self._begin(first=True)
-            return True
-        if again := self._started_anew():
-            if any(link.participation is Participation.COMING for link in again):
-                return False
-            for link in again:
-                link.participation = Participation.FLYING
-                self._queue(link)
             return True
         if not flying:
             if not self._who(Participation.WAITING, Participation.READY):
@@ -390,7 +364,7 @@ class SeveralAgents(WorldRules):
             return True
         if any(link.command is None for link in flying):
             return False
-        if not any(self._close_wrong(link, flying, now) for link in flying):
+        if not any(self._close_wrong(link, now) for link in flying):
             self._follow(flying)
         return True
 
@@ -405,23 +379,10 @@ class SeveralAgents(WorldRules):
         else:
             self._fly(flying)
 
-    @property
-    def _is_first_start(self) -> bool:
-        """Whether the first episode has begun, and nothing was flown."""
-        return self.episodes == 1 and self.steps == 0
-
-    def _started_anew(self) -> list[AgentLink]:
-        """Agents that were started anew before the last one came: the first step waits for them."""
-        if not self._is_first_start:
-            return []
-        lost = {absence.agent for absence in self.absences}
-        coming = self._who(Participation.COMING, Participation.READY)
-        return [link for link in coming if link.number not in lost]
-
     def _begin(self, *, first: bool = False) -> None:
         """Begin an episode for all that take part."""
         joining = self._who(Participation.FLYING, Participation.WAITING, Participation.READY)
-        seeds = self._first_seeds(joining) if first else self._next_seeds(joining)
+        seeds = self._seeds(joining if first else [link for link in joining if link.command])
         self.seed = None if seeds is None else int(seeds[0])
         self._reset_all(seeds)
         self.episodes += first or self.steps > 0
@@ -435,27 +396,22 @@ class SeveralAgents(WorldRules):
             link.participation = Participation.FLYING
             self._queue(link)
 
-    def _first_seeds(self, joining: list[AgentLink]) -> NDArray[np.uint64]:
-        """As a simulator of one agent, by the agent of the first drone."""
-        link = min(joining, key=_first_row)
-        seed = link.client.hello.session if link.seed is None else link.seed
-        return first_seeds(seed, self._layout.drones)
-
-    def _next_seeds(self, joining: list[AgentLink]) -> NDArray[np.uint64] | None:
-        """The seed of the first drone whose agent asked for this reset; None if it gave none."""
-        asked = [link for link in joining if link.command is not None]
-        if not asked:
+    def _seeds(self, asking: list[AgentLink]) -> NDArray[np.uint64] | None:
+        """As the agent of the first drone says, of those that begin; None if it gives none."""
+        if not asking:
             return None
-        link = min(asked, key=_first_row)
-        assert link.command is not None
-        if link.command.seeds is None:
-            return None
-        return np.full(self._layout.drones, link.command.seeds[link.rows.argmin()], np.uint64)
+        drones = self._layout.drones
+        link = asking[0]
+        if link.command is None:  # the first episode: as a simulator of one agent
+            return first_seeds(
+                link.client.hello.session if link.seed is None else link.seed, drones
+            )
+        seeds = link.command.seeds
+        return None if seeds is None else np.full(drones, seeds[0], np.uint64)
 
     def _fly(self, flying: list[AgentLink]) -> None:
-        """Fly the world for one control period, if any agent flies in it."""
+        """Fly the world for one control period."""
         layout = self._layout
-        flown = False
         actions = np.zeros(layout.actions.shape, layout.actions.dtype)
         if layout.choices:
             actions += (layout.choices - 1) // 2  # hold
@@ -467,27 +423,21 @@ class SeveralAgents(WorldRules):
             else:
                 staying.append(link)
                 actions[link.rows] = link.command.actions
-                flown |= link.order == FLY
-        if flown:
-            self._world.advance(actions, None, None, None)
-            self.steps += 1
-            orders = np.full(layout.drones, FLY, np.uint8)
-            self.cause = Command(session=0, sequence=self.steps, actions=actions, orders=orders)
-            self.moved = True
+        self._world.advance(actions, None, None, None)
+        self.steps += 1
+        orders = np.full(layout.drones, FLY, np.uint8)
+        self.cause = Command(session=0, sequence=self.steps, actions=actions, orders=orders)
+        self.moved = True
         for link in staying:
-            self._queue(link, again=link.order == FREEZE)
+            self._queue(link)
 
-    def _close_wrong(self, link: AgentLink, flying: list[AgentLink], now: float) -> bool:
+    def _close_wrong(self, link: AgentLink, now: float) -> bool:
         """Close the link to an agent whose Command the world cannot follow; whether it did."""
-        out = self._out(link)
         wrong = ""
-        nobody_flies = all(other.order in (FREEZE, RESET) for other in flying)
-        if link.order is None:
-            wrong = f"orders: expected the same for all {len(link.rows)} drones, got different ones"
-        elif link.order == FLY and out.all():
+        if link.order not in (FLY, RESET):
+            wrong = f"orders: expected to fly or to reset all {len(link.rows)} drones, got others"
+        elif link.order == FLY and self._out(link).all():
             wrong = _NO_RESET
-        elif link.order == FREEZE and not (nobody_flies or out.all()):
-            wrong = "orders: expected no frozen drone in a world that others fly on in, got some"
         if wrong:
             self._dismiss(link, wrong, now)
         return bool(wrong)
@@ -502,16 +452,13 @@ class SeveralAgents(WorldRules):
         link.participation = participation
         if participation is not Participation.WAITING:
             link.command = None
-        flew = False
-        if was is Participation.FLYING:
-            link.in_flight = ~self._out(link)
-            flew = bool(link.in_flight.any())
+        flew = was is Participation.FLYING and not self._out(link).all()
         if flew:
             self._let_go(link)
-        if participation is Participation.LEFT:
-            self._last_reason = why
+        if all(other.participation is Participation.LEFT for other in self.links):
+            self.reason = why
         if why and flew:
-            notice = f"{link.name} is lost ({why}): {link.when_lost}"
+            notice = f"{link.name} is lost ({why}): {self._when_lost}"
             link.client.statistics.notice(notice)
 
     def _let_go(self, link: AgentLink) -> None:
@@ -520,9 +467,9 @@ class SeveralAgents(WorldRules):
         self.absences.append(absence)
         mask = np.zeros(self._layout.drones, bool)
         mask[link.rows] = True
-        if link.when_lost == "land":
+        if self._when_lost == "land":
             self._swarm.land(mask)
-        elif link.when_lost == "end":
+        elif self._when_lost == "end":
             self._swarm.retire(mask)
 
     def _out(self, link: AgentLink) -> Mask:
@@ -535,43 +482,28 @@ class SeveralAgents(WorldRules):
 
     # ---- States
 
-    def _queue(self, link: AgentLink, *, again: bool = False, cut: bool = False) -> None:
-        """Send an agent the State of its drones with the next `answer`.
-
-        `again`: nothing has happened to them. `cut`: its episode was truncated. The arrays of both
-        are those of its last State: the world may be in another episode.
-        """
+    def _queue(self, link: AgentLink) -> None:
+        """Send an agent the State of its drones with the next `answer`."""
         link.command = None
-        self._due.append((link, again, cut))
+        self._due.append(link)
 
     def answer(self, now: float) -> None:
         """Send the States that are due."""
         due = self._due
         self._due = []
-        for link, again, cut in due:
-            self._send(link, again, cut, now)
-
-    def _send(self, link: AgentLink, again: bool, cut: bool, now: float) -> None:
         world = self._world
-        rows = link.rows
-        client = link.client
-        nothing = np.zeros(len(rows), bool)
-        rewards: Array = np.zeros(len(rows))
-        terminated = truncated = nothing
-        if cut:
-            truncated = link.in_flight
-        elif not again:
-            rewards = world.rewards[rows]
-            terminated = world.terminated[rows]
-            truncated = world.truncated[rows]
-            link.shown = (
+        for link in due:
+            rows = link.rows
+            link.patient_until = now + self._patience
+            link.client.send_state(
+                link.client.sequence * self._period,
                 tuple(array[rows] for array in world.observations.values()),
+                world.rewards[rows],
+                world.terminated[rows],
+                world.truncated[rows],
                 tuple(array[rows] for array in world.telemetry.values()),
+                now,
             )
-        observations, telemetry = link.shown
-        link.patient_until = now + self._patience
-        time = client.sequence * self._period
-        client.send_state(time, observations, rewards, terminated, truncated, telemetry, now)
 
     # ---- timers and messages
 
@@ -585,14 +517,15 @@ class SeveralAgents(WorldRules):
         """Resend what is due, and lose agents that were silent for too long."""
         for link in self._who(Participation.FLYING):
             if link.command is None and now >= link.patient_until:
-                self._lose(link, Participation.SILENT, f"no Command for {self._patience:g} s")
+                self._lose(link, Participation.COMING, f"no Command for {self._patience:g} s")
+                link.client.begin_again(now)
         super().handle_timers(now)
 
     def _lose_silent(self, link: AgentLink, why: str) -> None:
         if not self.episodes:
             raise PeerSilent(f"{why}, and the world begins when all have come")
         self._lose(link, Participation.LEFT, why)
-        if len(self._who(Participation.LEFT)) == len(self.links):
+        if self.reason is not None:
             raise PeerSilent(f"{why}, and no other is left")
 
     def receive(self, link: AgentLink, datagram: bytes, now: float) -> None:
@@ -600,10 +533,7 @@ class SeveralAgents(WorldRules):
         session = link.client.hello.session
         message = link.client.receive(datagram, now)
         if link.client.hello.session != session:  # its answer was Unknown
-            if self._is_first_start and link.participation is Participation.FLYING:
-                link.participation = Participation.COMING  # the first step waits for it
-            else:
-                self._lose(link, Participation.COMING, "it was started anew")
+            self._lose(link, Participation.COMING, "it was started anew")
         elif message is not None and link.participation is not Participation.LEFT:
             self._take(link, message, now)
 
@@ -611,12 +541,9 @@ class SeveralAgents(WorldRules):
         """Take in a message that moves the exchange with an agent on."""
         if isinstance(message, Command):
             link.command = message
-            if link.participation in (Participation.SILENT, Participation.LATE):
-                self._take_late(link, now)
         elif isinstance(message, Welcome):
             link.participation = Participation.READY
             link.seed = message.seed
-            self._take_policy(link, message)
         elif isinstance(message, Refuse | Close):
             if self.episodes:
                 self._lose(link, Participation.LEFT, message.reason or "the agent closed")
@@ -625,37 +552,3 @@ class SeveralAgents(WorldRules):
             else:
                 reason = message.reason or "no reason"
                 raise LinkError(f"{link.name} closed before the world began: {reason}")
-
-    def _take_policy(self, link: AgentLink, welcome: Welcome) -> None:
-        link.when_lost = self._when_lost
-        for extension in welcome.extensions:
-            if extension.number == WHEN_LOST:
-                policy = extension.value.decode("ascii", "replace")
-                if policy in POLICIES:  # else of another version: this side's policy stays
-                    link.when_lost = policy
-        if link.when_lost != "land":
-            return
-        try:
-            self._swarm.land(np.zeros(self._layout.drones, bool))
-        except InputError as error:
-            if not self.episodes:
-                raise
-            link.when_lost = self._when_lost  # one agent does not end the flight of others
-            notice = f"{link.name} cannot have land ({error}): {link.when_lost}"
-            link.client.statistics.notice(notice)
-
-    def _take_late(self, link: AgentLink, now: float) -> None:
-        """A Command of an agent that does not take part in the running episode."""
-        if link.order == RESET:
-            link.participation = Participation.WAITING
-        elif link.order == FREEZE:
-            self._queue(link, again=True)
-        elif link.participation is Participation.SILENT and link.in_flight.any():
-            link.participation = Participation.LATE
-            self._queue(link, cut=True)
-        else:
-            self._dismiss(link, _NO_RESET, now)
-
-
-def _first_row(link: AgentLink) -> int:
-    return int(link.rows.min())

@@ -5,23 +5,18 @@ exchange with a simulator that has one. A repeated State is answered with the by
 answer.
 """
 
-import secrets
-from collections.abc import Callable, Sequence
 from contextlib import suppress
-
-import numpy as np
 
 from . import binary, text
 from . import messages as m
-from .admission import Admission, Arrival, Slots
+from .admission import Admission, Arrival
 from .auth import Key, is_sealed, key_id, message_of
 from .client import CLOSE_INTERVAL, CLOSE_LINGER, Address
 from .errors import DecodeError, Forged, VersionMismatch
 from .fragments import is_fragment
-from .layout import Layout
 from .messages import State
-from .session import Event, NoSuchSession, Outbox, Session
-from .transitions import AgentState
+from .session import Event, NoSuchSession, Session
+from .transitions import AgentState, Way
 
 __all__ = ["Event", "Server", "Session"]
 
@@ -30,54 +25,17 @@ class _KeyMismatch(Forged):
     """One side has a key, the other has none."""
 
 
-class Server:
-    """Welcomes simulators and answers each of their States once.
+class Server(Admission):
+    """Welcomes simulators and answers each of their States once. Arguments: see `Admission`."""
 
-    Args:
-        accept: Looks at a Hello and gives the layout of its messages, or the reason to refuse it.
-        text_layout: A text simulator says no Hello: its first line opens the session, and this
-            gives the layout to read it by. None, or a result of None: text is not flown.
-        slots: Simulators to fly at the same time. Others wait until a slot is free.
-        keys: Shared with the simulators, any of them. Then nothing unsealed is taken.
-        extensions: Of each Welcome.
-        draw_nonce: Gives a random 64-bit number for each Welcome.
-
-    Attributes:
-        slots: Session of each slot, None where it is free.
-        takes_text: Whether a text simulator may take a free slot.
-        outbox: Datagrams to send, and the tap.
-        statistics: Counts and times, over all simulators.
-    """
-
-    def __init__(
-        self,
-        accept: Callable[[m.Hello], Layout | str],
-        text_layout: Callable[[], Layout | None] | None = None,
-        *,
-        slots: int = 1,
-        keys: Sequence[Key] = (),
-        max_datagram: int | None = None,
-        extensions: tuple[m.Extension, ...] = (),
-        draw_nonce: Callable[[], int] = lambda: secrets.randbits(64),
-    ) -> None:
-        self.outbox = Outbox(max_datagram)
-        self.statistics = self.outbox.statistics
-        self.takes_text = text_layout is not None
-        self._text_layout = text_layout or (lambda: None)
-        self._keys = {key.id: key for key in keys}
-        self._slots = Slots(slots)
-        self.slots = self._slots.sessions
-        self._admission = Admission(
-            self._slots, self.outbox, accept, self._keys, extensions, draw_nonce
-        )
-        self._resend_at = self._deadline = 0.0
+    _resend_at = _deadline = 0.0
 
     # ---- what the caller does
 
     def receive(self, datagram: bytes, address: Address, now: float) -> Event | None:
         """Take a datagram; its effect, if it moves an exchange on."""
-        self.outbox.statistics.counters["received"] += 1
-        session = self._slots.of.get(address)
+        self.statistics.counters["received"] += 1
+        session = self._seated.get(address)
         if session and session.is_plain and session.state is AgentState.EXPECTING:
             number = session.number
             sequence = session.sequence + 1
@@ -86,45 +44,24 @@ class Server:
                 return session.take_state(state, datagram, now)
         return self._receive_any(session, Arrival(datagram, address, now))
 
-    def send_command(
-        self,
-        slot: int,
-        actions: np.ndarray,
-        orders: np.ndarray,
-        seeds: np.ndarray | None,
-        now: float,
-    ) -> None:
-        """Answer the last State of a slot: see `messages.Command`.
-
-        Raises `InputError` for an array that is not of the layout, or not finite; nothing was sent.
-        """
-        session = self.slots[slot]
-        if session is None:
-            raise ValueError("send_command: expected a session that is deciding, got a free slot")
-        session.send_command(actions, orders, seeds, now)
-
-    def free(self, slot: int) -> None:
-        """Give the slot of a simulator that has fallen silent to the next that comes."""
-        self._slots.free(slot)
-
     def close(self, reason: str, now: float) -> None:
         """End every exchange and tell the simulators, until they answer."""
-        if self._admission.closed:
+        if self._closed:
             return
         for session in self.slots:
             if session:
                 session.send_close(reason)
-        self._admission.close(reason)
+        self._closed = True
+        for queued in self._queue.values():
+            self.refuse(queued.number, reason, queued.peer, queued.room, queued.key)
+            queued.move(Way.SENT, m.Refuse)
         self._resend_at = now + CLOSE_INTERVAL
         self._deadline = now + CLOSE_LINGER
 
     def next_timer(self) -> float | None:
         """When `handle_timer` wants to be called; None if never."""
-        return (
-            min(self._resend_at, self._deadline)
-            if self._admission.closed and any(self.slots)
-            else None
-        )
+        is_closing = self._closed and any(self.slots)
+        return min(self._resend_at, self._deadline) if is_closing else None
 
     def handle_timer(self, now: float) -> None:
         """Repeat what is due: a Close that nobody has answered, until nobody will."""
@@ -136,12 +73,6 @@ class Server:
             elif session:
                 session.repeat()
         self._resend_at = now + CLOSE_INTERVAL
-
-    def take_outgoing(self) -> list[tuple[bytes, Address]]:
-        """Datagrams to send and where to, each once."""
-        taken = self.outbox.datagrams
-        self.outbox.datagrams = []
-        return taken
 
     # ---- from a datagram to its session
 
@@ -157,23 +88,22 @@ class Server:
 
     def _receive_binary(self, session: Session | None, arrival: Arrival) -> Event | None:
         address = arrival.address
-        admission = self._admission
         plain, key = self._open(arrival, session)
         kind, number, _ = binary.peek(plain)
         seated = session if session and session.number == number and not session.is_text else None
-        opening = None if seated else admission.openings.get((address, number))
+        opening = None if seated else self.openings.get((address, number))
         holder = seated or opening
         if is_fragment(plain):
             kind = binary.check(plain)[0] & ~binary.FRAGMENT
             if kind == binary.HELLO and not seated:
-                whole = admission.assemble(plain, opening, arrival, key)
+                whole = self.assemble(plain, opening, arrival, key)
             elif kind == binary.STATE and holder:
                 whole = holder.assemble(plain, arrival.now)
             elif kind == binary.STATE:
                 raise NoSuchSession(f"session {number:016x}")
             else:
                 whole = None
-                admission.drop("foreign", f"a fragment of type {kind}", arrival)
+                self.drop("foreign", f"a fragment of type {kind}", arrival)
             if whole is None:
                 return None
             plain = whole
@@ -182,12 +112,12 @@ class Server:
             raise NoSuchSession(f"session {number:016x}")
         message = binary.decode(plain, holder.layout if holder else None)
         if isinstance(message, m.Hello):
-            admission.receive_hello(message, arrival, key)
+            self.receive_hello(message, arrival, key)
             return None
         if seated:
             return self._receive_seated(seated, message, plain, arrival)
         assert opening is not None
-        return admission.receive(opening, message, plain, arrival)
+        return self.receive_opening(opening, message, plain, arrival)
 
     def _receive_seated(
         self, session: Session, message: m.Message, plain: bytes, arrival: Arrival
@@ -195,7 +125,7 @@ class Server:
         event = session.receive(message, plain, arrival.now)
         if event and isinstance(message, m.Close):
             if session.is_text:
-                self._admission.remember_text(session, message.sequence, arrival.now)
+                self.remember_text(session, message.sequence, arrival.now)
             self.free(session.slot)
         return event
 
@@ -210,9 +140,9 @@ class Server:
                 cause = "forged"
                 reason = "key: this agent has one (--key-file), text has none"
             if fields == ["close"]:  # two agents would answer each other's Closes for ever
-                self._admission.drop(cause, reason, arrival)
+                self.drop(cause, reason, arrival)
             else:
-                self._admission.turn_text_away(sequence, cause, reason, arrival)
+                self.turn_text_away(sequence, cause, reason, arrival)
             return None
         message = text.decode_state(datagram, layout)
         if session and session.is_text:
@@ -220,7 +150,7 @@ class Server:
             if event and isinstance(message, State):
                 session.line = datagram
             return event
-        return self._admission.receive_first_line(message, layout, self.takes_text, arrival)
+        return self.receive_first_line(message, layout, arrival)
 
     def _open(self, arrival: Arrival, session: Session | None) -> tuple[bytes, Key | None]:
         """A binary datagram without its seal, and the shared key that it was sealed with.
@@ -243,7 +173,7 @@ class Server:
             return shared.open(datagram), shared
         if session and session.number == number and session.key:
             return session.key.open(datagram), shared
-        opening = self._admission.openings.get((address, number))
+        opening = self.openings.get((address, number))
         if opening and (key := opening.session_key()):
             # If the Welcome was for an old copy of its Hello, it is as good as none.
             with suppress(Forged):
@@ -258,13 +188,13 @@ class Server:
         kind, number, _ = binary.peek(plain)
         if isinstance(error, NoSuchSession):
             if kind in (binary.STATE, binary.MISSING):
-                self._admission.disown(plain, arrival)
+                self.disown(plain, arrival)
             else:  # the answer to a Close of ours, mostly: not counted
                 self.statistics.counters["foreign"] += 1
             return
         if isinstance(error, _KeyMismatch | VersionMismatch) and kind == binary.HELLO:
             trusted = under_seal and not isinstance(error, _KeyMismatch)
             key = self._keys.get(key_id(datagram)) if trusted else None
-            self._admission.refuse(number, str(error), address, len(datagram), key)
+            self.refuse(number, str(error), address, len(datagram), key)
         cause = "forged" if isinstance(error, Forged) else "malformed"
-        self._admission.drop(cause, str(error), arrival)
+        self.drop(cause, str(error), arrival)

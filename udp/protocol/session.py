@@ -13,13 +13,13 @@ from . import messages as m
 from .auth import Key
 from .client import Address, Tap, largest_datagram
 from .errors import DecodeError
-from .fragments import Assembler, Transfer, Window, asks
+from .fragments import Assembler, Transfer, asks
 from .layout import Layout
 from .messages import Command, Message, State, one_line
 from .statistics import Statistics
 from .transitions import AGENT, AgentState, Way
 
-_AFTER_STATE: Final = AGENT[AgentState.EXPECTING, Way.RECEIVED, State]
+_AFTER_STATE: Final = AGENT[AgentState.EXPECTING][Way.RECEIVED, State]
 
 
 class NoSuchSession(DecodeError):
@@ -102,12 +102,11 @@ class Session:
         self.is_plain = False  # whether it has a slot, and its messages are neither sealed nor text
         self._outbox = outbox
         self._assembler: Assembler | None = None
-        self._window = Window()
         self._largest = largest_datagram(peer, outbox.max_datagram)
 
     def move(self, way: Way, kind: type[Message]) -> None:
         """Be in the state that such a message leads to. Raises `KeyError` if it may not."""
-        self.state = AGENT[self.state, way, kind]
+        self.state = AGENT[self.state][way, kind]
 
     def session_key(self) -> Key | None:
         """The key of its messages after the Welcome."""
@@ -131,10 +130,12 @@ class Session:
         seeds: np.ndarray | None,
         now: float,
     ) -> None:
-        """Answer the last State. Raises `InputError` if it cannot be encoded: nothing was sent."""
-        if self.state is not AgentState.DECIDING:
-            got = self.state.value
-            raise ValueError(f"send_command: expected a session that is deciding, got {got}")
+        """Answer the last State.
+
+        Raises `InputError` if it cannot be encoded, and `KeyError` where no Command is due; nothing
+        was sent.
+        """
+        after = AGENT[self.state][Way.SENT, Command]
         command = Command(
             session=self.number,
             sequence=self.sequence,
@@ -144,9 +145,9 @@ class Session:
         )
         layout = self.layout
         data = text.encode(command) if self.is_text else binary.encode_step(command, layout)
-        self.state = AGENT[self.state, Way.SENT, Command]
+        self.state = after
         self.asked_at = self.heard_at = now
-        self.reply = reply = Transfer(data, self._largest, self._window)
+        self.reply = reply = Transfer(data, self._largest)
         outbox = self._outbox
         if reply.count == 1 and self.key is None:  # as `put`
             outbox.datagrams.append((data, self.peer))
@@ -190,7 +191,7 @@ class Session:
 
     def _send(self, data: bytes) -> None:
         """Send a message, and keep its bytes for a repeated State."""
-        self.reply = Transfer(data, self._largest, self._window)
+        self.reply = Transfer(data, self._largest)
         self._outbox.put(self.reply.start(), self.peer, self.key)
 
     # ---- what is received
@@ -233,7 +234,7 @@ class Session:
         if is_state and number > self.sequence + 1 and not self.is_text:
             raise NoSuchSession(f"State {number}")
         is_due = number == self.sequence + is_state or isinstance(message, m.Close)
-        if not is_due or (self.state, Way.RECEIVED, type(message)) not in AGENT:
+        if not is_due or (Way.RECEIVED, type(message)) not in AGENT[self.state]:
             self._drop("stale", now)
             return None
         if isinstance(message, State):

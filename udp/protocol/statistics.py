@@ -8,7 +8,6 @@ import numpy as np
 from .messages import one_line
 
 NOTICE_INTERVAL: Final = 10.0  # shortest time between two notices of the same cause, s
-REPORT_INTERVAL: Final = 60.0  # time between two reports of all numbers, s
 
 _REMEMBERED: Final = 1 << 14
 _QUIET: Final = frozenset({"duplicate", "stale"})
@@ -29,8 +28,6 @@ class Statistics:
         """Sentences for the log, until `take_notices`."""
         self._next_notice: dict[str, float] = {}
         self._unsaid: Counter[str] = Counter()
-        self.report_at = 0.0
-        """When the next report of all numbers is due; 0 before the first call."""
 
     def drop(self, cause: str, reason: str, now: float) -> None:
         """Count a datagram that changes nothing; say so if it is time to."""
@@ -54,14 +51,6 @@ class Statistics:
         notices = self.notices
         self.notices = []
         return notices
-
-    def report_due(self, now: float) -> bool:
-        """Whether a minute has passed since the last report, or since the first call."""
-        is_first = not self.report_at
-        is_due = now >= self.report_at
-        if is_first or is_due:
-            self.report_at = now + REPORT_INTERVAL
-        return is_due and not is_first
 
     def numbers(self) -> dict[str, float]:
         """All of it as numbers by name, round trips in milliseconds: for logs of training."""

@@ -74,21 +74,14 @@ def _telemetry_sizes(layout: Layout) -> list[int]:
     return sizes
 
 
-def in_paper_frame(telemetry: Iterable[np.ndarray], layout: Layout) -> list[np.ndarray]:
-    """The telemetry of one drone as a line has it."""
+def _converted(
+    telemetry: Iterable[np.ndarray], layout: Layout, conversions: "_Conversions"
+) -> list[np.ndarray]:
+    """The telemetry of one drone in the other frames."""
     converted = []
     for array, shape, frame in zip(telemetry, layout.telemetry, layout.frames, strict=True):
-        convert = _TO_PAPER.get((shape, frame))
-        converted.append(array if convert is None else convert(array))
-    return converted
-
-
-def in_world_frame(telemetry: Iterable[np.ndarray], layout: Layout) -> list[np.ndarray]:
-    """The reverse of `in_paper_frame`; a rotation comes back within rounding."""
-    converted = []
-    for array, shape, frame in zip(telemetry, layout.telemetry, layout.frames, strict=True):
-        convert = _FROM_PAPER.get((shape, frame))
-        converted.append(array if convert is None else convert(array))
+        convert = conversions.get((shape, frame), np.asarray)
+        converted.append(convert(array))
     return converted
 
 
@@ -125,7 +118,7 @@ def encode(message: State | Command | Close, layout: Layout | None = None) -> by
         case State():
             flags = ["01"[message.terminated.item()], "01"[message.truncated.item()]]
             assert layout is not None
-            telemetry = in_paper_frame(message.telemetry, layout)
+            telemetry = _converted(message.telemetry, layout, _TO_PAPER)
             arrays = (message.rewards, *message.observations, *telemetry)
             reward, *others = _numbers(arrays)
             fields = [reward, *flags, *others]
@@ -167,7 +160,8 @@ def decode_state(datagram: bytes, layout: Layout) -> State | Close:
     numbers = iter(_floats("state: telemetry", fields[3 + size :]))
     telemetry = [np.array([[*islice(numbers, count)]]) for count in sizes]
     shaped = []
-    for array, slot in zip(in_world_frame(telemetry, layout), layout.telemetry_slots, strict=True):
+    converted = _converted(telemetry, layout, _FROM_PAPER)
+    for array, slot in zip(converted, layout.telemetry_slots, strict=True):
         shaped.append(array.reshape(slot.shape))
     return State(
         session=0,

@@ -7,7 +7,19 @@ sent, and are dropped when they come. A text simulator begins at READY, for it s
 from enum import Enum
 from typing import Final
 
-from . import messages as m
+from .messages import (
+    Alive,
+    Close,
+    Command,
+    Hello,
+    Message,
+    Missing,
+    Refuse,
+    State,
+    Unknown,
+    Wait,
+    Welcome,
+)
 
 
 class _Enum(Enum):
@@ -51,57 +63,71 @@ _SENT = Way.SENT
 _RECEIVED = Way.RECEIVED
 _UNSAID = Way.UNSAID
 
-SIMULATOR: Final[dict[tuple[SimulatorState, Way, type[m.Message]], SimulatorState]] = {
-    (_S.IDLE, _SENT, m.Hello): _S.HELLO,
-    (_S.HELLO, _RECEIVED, m.Missing): _S.HELLO,
-    (_S.HELLO, _RECEIVED, m.Wait): _S.HELLO,
-    (_S.HELLO, _RECEIVED, m.Welcome): _S.READY,
-    (_S.HELLO, _RECEIVED, m.Refuse): _S.CLOSED,
-    (_S.READY, _SENT, m.Alive): _S.READY,
-    (_S.READY, _SENT, m.State): _S.WAITING,
-    (_S.READY, _SENT, m.Close): _S.CLOSING,
-    (_S.READY, _RECEIVED, m.Close): _S.CLOSED,
-    (_S.WAITING, _SENT, m.Missing): _S.WAITING,
-    (_S.WAITING, _RECEIVED, m.Missing): _S.WAITING,
-    (_S.WAITING, _RECEIVED, m.Alive): _S.WAITING,
-    (_S.WAITING, _RECEIVED, m.Command): _S.READY,
-    (_S.WAITING, _RECEIVED, m.Unknown): _S.IDLE,
-    (_S.WAITING, _RECEIVED, m.Close): _S.CLOSED,
-    (_S.WAITING, _SENT, m.Close): _S.CLOSING,
-    (_S.CLOSING, _RECEIVED, m.Close): _S.CLOSED,
-    (_S.IDLE, _UNSAID, m.Close): _S.CLOSED,
-    (_S.HELLO, _UNSAID, m.Close): _S.CLOSED,
-    (_S.CLOSING, _UNSAID, m.Close): _S.CLOSED,
-    (_S.CLOSED, _UNSAID, m.Close): _S.CLOSED,
+SIMULATOR: Final[dict[SimulatorState, dict[tuple[Way, type[Message]], SimulatorState]]] = {
+    _S.IDLE: {(_SENT, Hello): _S.HELLO, (_UNSAID, Close): _S.CLOSED},
+    _S.HELLO: {
+        (_RECEIVED, Missing): _S.HELLO,
+        (_RECEIVED, Wait): _S.HELLO,
+        (_RECEIVED, Welcome): _S.READY,
+        (_RECEIVED, Refuse): _S.CLOSED,
+        (_UNSAID, Close): _S.CLOSED,
+    },
+    _S.READY: {
+        (_SENT, Alive): _S.READY,
+        (_SENT, State): _S.WAITING,
+        (_SENT, Close): _S.CLOSING,
+        (_RECEIVED, Close): _S.CLOSED,
+    },
+    _S.WAITING: {
+        (_SENT, Hello): _S.HELLO,  # a new session, of several agents
+        (_SENT, Missing): _S.WAITING,
+        (_RECEIVED, Missing): _S.WAITING,
+        (_RECEIVED, Alive): _S.WAITING,
+        (_RECEIVED, Command): _S.READY,
+        (_RECEIVED, Unknown): _S.IDLE,
+        (_RECEIVED, Close): _S.CLOSED,
+        (_SENT, Close): _S.CLOSING,
+    },
+    _S.CLOSING: {(_RECEIVED, Close): _S.CLOSED, (_UNSAID, Close): _S.CLOSED},
+    _S.CLOSED: {(_UNSAID, Close): _S.CLOSED},
 }
 
-AGENT: Final[dict[tuple[AgentState, Way, type[m.Message]], AgentState]] = {
-    (_A.NEW, _SENT, m.Refuse): _A.CLOSED,
-    (_A.NEW, _SENT, m.Wait): _A.QUEUED,
-    (_A.NEW, _SENT, m.Welcome): _A.WELCOMED,
-    (_A.NEW, _RECEIVED, m.State): _A.DECIDING,  # by text
-    (_A.QUEUED, _SENT, m.Wait): _A.QUEUED,
-    (_A.QUEUED, _SENT, m.Welcome): _A.WELCOMED,
-    (_A.QUEUED, _SENT, m.Refuse): _A.CLOSED,
-    (_A.WELCOMED, _SENT, m.Welcome): _A.WELCOMED,
-    (_A.WELCOMED, _SENT, m.Missing): _A.WELCOMED,
-    (_A.WELCOMED, _RECEIVED, m.State): _A.DECIDING,
-    (_A.WELCOMED, _RECEIVED, m.Close): _A.CLOSED,
-    (_A.WELCOMED, _SENT, m.Unknown): _A.CLOSED,
-    (_A.WELCOMED, _SENT, m.Close): _A.CLOSED,
-    (_A.DECIDING, _SENT, m.Alive): _A.DECIDING,
-    (_A.DECIDING, _SENT, m.Command): _A.EXPECTING,
-    (_A.DECIDING, _SENT, m.Close): _A.CLOSING,
-    (_A.DECIDING, _RECEIVED, m.Close): _A.CLOSED,
-    (_A.EXPECTING, _RECEIVED, m.Alive): _A.EXPECTING,
-    (_A.EXPECTING, _RECEIVED, m.Missing): _A.EXPECTING,
-    (_A.EXPECTING, _SENT, m.Missing): _A.EXPECTING,
-    (_A.EXPECTING, _RECEIVED, m.State): _A.DECIDING,
-    (_A.EXPECTING, _RECEIVED, m.Close): _A.CLOSED,
-    (_A.EXPECTING, _SENT, m.Close): _A.CLOSING,
-    (_A.CLOSING, _RECEIVED, m.Close): _A.CLOSED,
-    (_A.DECIDING, _UNSAID, m.Close): _A.CLOSED,
-    (_A.EXPECTING, _UNSAID, m.Close): _A.CLOSED,
-    (_A.CLOSING, _UNSAID, m.Close): _A.CLOSED,
-    (_A.CLOSED, _UNSAID, m.Close): _A.CLOSED,
+AGENT: Final[dict[AgentState, dict[tuple[Way, type[Message]], AgentState]]] = {
+    _A.NEW: {
+        (_SENT, Refuse): _A.CLOSED,
+        (_SENT, Wait): _A.QUEUED,
+        (_SENT, Welcome): _A.WELCOMED,
+        (_RECEIVED, State): _A.DECIDING,  # by text
+    },
+    _A.QUEUED: {
+        (_SENT, Wait): _A.QUEUED,
+        (_SENT, Welcome): _A.WELCOMED,
+        (_SENT, Refuse): _A.CLOSED,
+    },
+    _A.WELCOMED: {
+        (_SENT, Welcome): _A.WELCOMED,
+        (_SENT, Missing): _A.WELCOMED,
+        (_RECEIVED, State): _A.DECIDING,
+        (_RECEIVED, Close): _A.CLOSED,
+        (_SENT, Unknown): _A.CLOSED,
+        (_SENT, Close): _A.CLOSED,
+    },
+    _A.DECIDING: {
+        (_SENT, Alive): _A.DECIDING,
+        (_SENT, Command): _A.EXPECTING,
+        (_SENT, Close): _A.CLOSING,
+        (_RECEIVED, Close): _A.CLOSED,
+        (_UNSAID, Close): _A.CLOSED,
+    },
+    _A.EXPECTING: {
+        (_RECEIVED, Alive): _A.EXPECTING,
+        (_RECEIVED, Missing): _A.EXPECTING,
+        (_SENT, Missing): _A.EXPECTING,
+        (_RECEIVED, State): _A.DECIDING,
+        (_RECEIVED, Close): _A.CLOSED,
+        (_SENT, Close): _A.CLOSING,
+        (_UNSAID, Close): _A.CLOSED,
+    },
+    _A.CLOSING: {(_RECEIVED, Close): _A.CLOSED, (_UNSAID, Close): _A.CLOSED},
+    _A.CLOSED: {(_UNSAID, Close): _A.CLOSED},
 }

@@ -26,7 +26,7 @@ from ..protocol.client import Address, address_text
 from ..protocol.errors import PeerClosed, PeerSilent
 from ..protocol.fragments import check_largest
 from ..protocol.layout import Layout
-from ..protocol.messages import POLICIES, WHEN_LOST, Close, Extension, Hello, State
+from ..protocol.messages import Close, Hello, State
 from ..protocol.server import Event, Server
 from ..protocol.transitions import AgentState
 from .sockets import LONGEST_WAIT, PAUSE, Port, log_notices
@@ -49,7 +49,6 @@ class AgentSettings(TypedDict, total=False):
     connect_timeout: float
     timeout: float
     max_datagram: int | None
-    when_lost: str | None
     key_file: Path | str | None
     insecure: bool
     record: Path | str | None
@@ -68,7 +67,6 @@ class AgentConfig:
     connect_timeout: float = 60.0
     timeout: float = 30.0
     max_datagram: int | None = None
-    when_lost: str | None = None
     key_file: Path | str | None = None
     insecure: bool = False
     record: Path | str | None = None
@@ -85,19 +83,9 @@ class AgentConfig:
             if not (math.isfinite(seconds) and seconds > 0):
                 raise InputError(f"{name}: expected seconds > 0, got {seconds}")
         check_largest(self.max_datagram)
-        if not (self.when_lost is None or self.when_lost in POLICIES):
-            raise InputError(
-                f"when_lost: expected one of {', '.join(POLICIES)}, got {shortened(self.when_lost)}"
-            )
         if self.env_id is not None:
             self.env_id = canonical_id(self.env_id)
             self._expected_options(self.env_id)
-
-    @property
-    def extensions(self) -> tuple[Extension, ...]:
-        """Of a Welcome."""
-        said = self.when_lost
-        return (Extension(number=WHEN_LOST, value=said.encode()),) if said else ()
 
     def accept(self, hello: Hello) -> Layout | str:
         """The layout of a simulator, or why it is refused."""
@@ -146,6 +134,8 @@ class AgentConfig:
         env_id = self.env_id
         if env_id is None or not registry.is_known(env_id) or self.drones not in (None, 1):
             return None
+        if self.record:  # a journal begins with a Hello
+            return None
         try:
             spec = registry.env_spec(EnvConfig.from_keywords(env_id, **(self.options or {})))
             text.check_layout(layout_of(spec))
@@ -178,7 +168,6 @@ class Agent:
             slots=config.slots,
             keys=[Key(key, "agent") for key in keys],
             max_datagram=config.max_datagram,
-            extensions=config.extensions,
         )
         self.states: dict[int, State] = {}
         self.lost = [""] * config.slots
@@ -187,8 +176,10 @@ class Agent:
         self.address = self._port.address
         self._journal: Journal | None = None
         if config.record:
+            from .. import journal
+
             try:
-                self._journal = self._record(config.record)
+                self._journal = journal.Journal(config.record, side="agent")
                 server.outbox.tap = self._journal.tap
             except BaseException:
                 self._port.close()
@@ -223,14 +214,6 @@ class Agent:
             session.send_command(actions, what, seeds, now)
         self.lost = [""] * len(self.lost)
         self._gather(self._pending() if None in self.server.slots else list(orders))
-
-    def _record(self, path: Path | str) -> "Journal":
-        from ..journal import Journal
-
-        server = self.server
-        spec = self.config.text_spec
-        hello = Hello(session=0, spec=spec.to_json()) if spec else None
-        return Journal(path, side="agent", slots=server.slots, text_hello=hello)
 
     # ---- the exchange
 
@@ -419,7 +402,5 @@ def _flush(server: Server, port: Port) -> None:
             port.send(datagram, address)
         except OSError:  # as good as lost: the simulator asks again, or the wait ends in time
             outbox.statistics.counters["unsent"] += 1
-    statistics = outbox.statistics
-    now = time.monotonic()
-    if statistics.notices or now >= statistics.report_at:
-        log_notices(statistics, now)
+    if outbox.statistics.notices:
+        log_notices(outbox.statistics)

@@ -1,10 +1,9 @@
 """Drives the rules of a simulator: waits on its socket, steps its world, sends its States."""
 
-import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from math import inf
 from typing import TYPE_CHECKING, Final
 
@@ -59,8 +58,7 @@ class Driver(NotCopied):
     def run(self) -> str:
         """Fly until every agent has closed; the reason that the last one gave. Runs once.
 
-        The agents are told at once when the run ends, also by an error of the env. In the main
-        thread Ctrl-C ends it after the step that is being computed; a second one at once.
+        The agents are told at once when the run ends, also by an error of the env or by Ctrl-C.
 
         Raises:
             PeerSilent: Nothing came from an agent within the timeout, and no other is left.
@@ -76,18 +74,15 @@ class Driver(NotCopied):
         reason = "the simulator was stopped"
         finished = threading.Event()
         heart = threading.Thread(target=self._say_alive, args=(finished,), daemon=True)
-        with _deferred_interrupt(self.stop) as interrupted:
-            heart.start()
-            try:
-                return self._fly() or reason
-            except Exception as error:
-                reason = f"{type(error).__name__}: {error}"
-                raise
-            finally:
-                finished.set()
-                self._end(reason)
-                if interrupted:
-                    raise KeyboardInterrupt
+        heart.start()
+        try:
+            return self._fly() or reason
+        except Exception as error:
+            reason = f"{type(error).__name__}: {error}"
+            raise
+        finally:
+            finished.set()
+            self._end(reason)
 
     def stop(self) -> None:
         """Make `run` tell the agents and return, after the step that is being computed.
@@ -181,10 +176,8 @@ class Driver(NotCopied):
                     self._port.send(datagram, link.address)
                 except OSError as error:  # as good as lost
                     self._note_unsent(link, error)
-            statistics = client.statistics
-            now = time.monotonic()
-            if statistics.notices or now >= statistics.report_at:
-                log_notices(statistics, now)
+            if client.statistics.notices:
+                log_notices(client.statistics)
 
     def _note_unsent(self, link: AgentLink, error: OSError) -> None:
         """A full buffer or a network that is down: as good as lost."""
@@ -213,24 +206,3 @@ def _words(error: OSError, what: str) -> str:
     if isinstance(error, ConnectionError):
         return "nothing listens on that port"
     return f"{what} failed: {error.strerror}"
-
-
-@contextmanager
-def _deferred_interrupt(stop: Callable[[], None]) -> Iterator[list[bool]]:
-    """Have Ctrl-C call `stop`, and only a second one interrupt. The list says whether it came."""
-    came: list[bool] = []
-    is_main = threading.current_thread() is threading.main_thread()
-    if not is_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
-        yield came
-        return
-
-    def note(*_: object) -> None:
-        came.append(True)
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        stop()
-
-    signal.signal(signal.SIGINT, note)
-    try:
-        yield came
-    finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -1,6 +1,6 @@
 """The simulator: a UDP client that steps envs by the Commands of one agent, or of several."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from math import inf
@@ -13,6 +13,7 @@ from ...envs.config import DEFAULT_ENV, EnvConfig
 from ...envs.spec import EnvSpec
 from ...models.errors import InputError
 from ..layouts import layout_of
+from ..protocol import binary
 from ..protocol.auth import Key, read_keys
 from ..protocol.client import Address, Client, LinkConfig, largest_datagram, new_session
 from ..protocol.messages import POLICIES, Hello
@@ -23,8 +24,6 @@ from .stepped import GymEnv, Steppable, make_stepped
 
 DEFAULT_AGENT: Final = ("127.0.0.1", 8001)
 DEFAULT_SIMULATOR: Final = ("127.0.0.1", 8000)
-
-Agents = Sequence[Address] | Mapping[Address, Sequence[str]]
 
 
 class Simulator(Driver):
@@ -40,16 +39,15 @@ class Simulator(Driver):
             Box or a Dict of Box, actions a Box or `Discrete`.
         server: Address (host, port) of the agent.
         agents: Addresses of several agents in its place. They share the drones evenly in their
-            order; or, by address, the names of the drones of each.
+            order.
         num_envs: Drones in all; None: those of one world.
         bind: Address of this side; port 0 takes a free port.
         codec: `binary`, or the paper's `text`.
         config: Times of the exchange. `timeout`: longest wait for an agent that is to come, or to
             come back, s.
         key_file: As `AgentSettings`, and so are `insecure` and `record`.
-        when_lost: What the drones of one of several agents do when it is lost, unless it states a
-            policy: `hold` (the action that changes nothing), `land` (`Loop.land`) or `end` (rotors
-            stand still).
+        when_lost: What the drones of one of several agents do when it is lost: `hold` (the action
+            that changes nothing), `land` (`Loop.land`) or `end` (rotors stand still).
         patience: Longest wait for a Command of one of several agents, s.
         keywords: As of `EnvConfig.from_keywords`, with an id: `drones` of each world, `vehicle` …
 
@@ -64,7 +62,7 @@ class Simulator(Driver):
         env: str | EnvConfig | GymEnv = DEFAULT_ENV,
         *,
         server: Address = DEFAULT_AGENT,
-        agents: Agents | None = None,
+        agents: Sequence[Address] | None = None,
         num_envs: int | None = None,
         bind: Address = DEFAULT_SIMULATOR,
         codec: Literal["binary", "text"] = "binary",
@@ -94,14 +92,21 @@ class Simulator(Driver):
             failing.callback(stepped.close)
             spec = stepped.spec
             worlds = stepped.num_envs // len(spec.agents)
-            parts = {server: spec.agents} if agents is None else agents
+            servers = [server] if agents is None else list(agents)
+            drones = len(spec.agents)
+            if not servers or drones % len(servers):
+                raise InputError(
+                    f"agents: expected a divisor of {drones} drones, got {len(servers)} agents"
+                )
+            share = drones // len(servers)
             links: list[AgentLink] = []
-            for number, (address, names) in enumerate(_shares(parts, spec)):
+            for number, address in enumerate(servers):
                 there = resolve(address, insecure=insecure, way_out=way_out)
-                own = replace(spec, agents=names)
+                first = number * share
+                own = replace(spec, agents=spec.agents[first : first + share])
                 changed = replace(config, drop_seed=config.drop_seed + number)
                 client = _client(own, worlds, there, changed, by_text=by_text, key=key)
-                links.append(AgentLink(number, there, client, _rows(spec, names, worlds)))
+                links.append(AgentLink(number, there, client, first + np.arange(share)))
             addresses = [link.address for link in links]
             if len(set(addresses)) < len(addresses):
                 raise InputError(f"agents: expected a different address of each, got {addresses}")
@@ -131,17 +136,12 @@ class Simulator(Driver):
         from ..journal.writer import models_of
 
         about, models = models_of(self.stepped)
-        hello = self.link.hello
-        self._journal = Journal(
-            path, side="simulator", text_hello=hello, about=about, models=models
-        )
-        self.link.tap = self._journal.tap
-
-
-def _rows(spec: EnvSpec, names: tuple[str, ...], worlds: int) -> np.ndarray:
-    """Rows of these drones in the arrays of all worlds, shape (n,)."""
-    own = [spec.agents.index(name) for name in names]
-    return np.array([len(spec.agents) * world + row for world in range(worlds) for row in own])
+        link = self.link
+        codec = "text" if link.by_text else "binary"
+        self._journal = Journal(path, side="simulator", codec=codec, about=about, models=models)
+        link.tap = self._journal.tap
+        if link.by_text:  # says no Hello
+            link.tap(0, link.hello, binary.encode(link.hello))
 
 
 def _client(
@@ -166,20 +166,3 @@ def _swarm_world(stepped: Steppable, env: object) -> SwarmWorld:
     if not hasattr(stepped, "retire"):
         raise InputError(f"env: expected a registered task for several drones, got {env!r}")
     return cast(SwarmWorld, stepped)
-
-
-def _shares(agents: Agents, spec: EnvSpec) -> list[tuple[Address, tuple[str, ...]]]:
-    """Drones of each agent. Raises `InputError` unless every drone has one."""
-    names = spec.agents
-    if isinstance(agents, Mapping):
-        shares = [(address, tuple(own)) for address, own in agents.items()]
-        given = sorted(name for _, own in shares for name in own)
-        if not all(own for _, own in shares) or given != sorted(names):
-            got = ", ".join(given) or "none"
-            raise InputError(f"agents: expected each of {', '.join(names)} once, got {got}")
-        return shares
-    count = len(agents)
-    if not count or len(names) % count:
-        raise InputError(f"agents: expected a divisor of {len(names)} drones, got {count} agents")
-    size = len(names) // count
-    return [(address, names[i * size : (i + 1) * size]) for i, address in enumerate(agents)]

@@ -278,9 +278,7 @@ def _receive_any(selector: selectors.BaseSelector, timeout: float) -> tuple[byte
     raise TimeoutError
 
 
-def log_notices(statistics: Statistics, now: float) -> None:
-    """Write warnings, and a report each minute, to the log `rotorgram.udp`."""
+def log_notices(statistics: Statistics) -> None:
+    """Write warnings to the log `rotorgram.udp`."""
     for notice in statistics.take_notices():
         _log.warning("%s", notice)
-    if statistics.report_due(now):
-        _log.info("wire: %s", statistics)

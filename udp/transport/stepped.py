@@ -1,6 +1,6 @@
-"""Envs of a simulator: the loop of a registered task, or Gymnasium envs one after the other."""
+"""What a simulator steps: the loop of a registered task, or another Gymnasium env."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, Protocol
 
 import gymnasium as gym
@@ -20,7 +20,7 @@ GymEnv = gym.Env[Any, Any]
 
 
 class Steppable(World, Protocol):
-    """What a simulator steps: the loop of a registered task, or Gymnasium envs."""
+    """N drones of one spec."""
 
     spec: EnvSpec
     num_envs: int
@@ -37,14 +37,15 @@ def make_stepped(
 
     Args:
         env: Config, id of a registered task or of an env of Gymnasium, or one env itself.
-        num_envs: N, a multiple of the drones of a world; None: one world.
+        num_envs: N, a multiple of the drones of a world; None: one world. Of an env that is no task
+            of ours there is one.
         keywords: As of `EnvConfig.from_keywords`, with an id.
     """
     if isinstance(env, gym.Env):
         if keywords or num_envs not in (None, 1):
             got = ", ".join(keywords) or f"num_envs = {num_envs}"
             raise InputError(f"env: expected one env without keywords, got {got}")
-        return GymnasiumBatch([env], {})
+        return GymnasiumWorld(env, {})
     env = EnvConfig.from_keywords(env, **keywords)
     count = num_envs
     drones = env.drones
@@ -58,34 +59,34 @@ def make_stepped(
         from ...envs.loop import Loop
 
         return Loop(env, count // drones)
-    if env != EnvConfig(env_id=env.env_id, task=env.task):
+    if count > 1 or env != EnvConfig(env_id=env.env_id, task=env.task):
         raise InputError(
-            f"vehicle, backend, drones: expected none for {env.env_id!r}, which is no task of ours"
+            f"vehicle, backend, drones, num_envs: expected none for {env.env_id!r}, which is no "
+            "task of ours"
         )
     try:
-        envs = [gym.make(env.env_id, disable_env_checker=True, **env.task) for _ in range(count)]
+        made = gym.make(env.env_id, disable_env_checker=True, **env.task)
     except (gym.error.Error, ImportError) as error:
         raise InputError(f"env: expected a registered id, got {env.env_id!r}: {error}") from None
     except TypeError as error:
         raise InputError(f"options of {env.env_id}: {error}") from None
-    return GymnasiumBatch(envs, env.task)
+    return GymnasiumWorld(made, env.task)
 
 
-class GymnasiumBatch:
-    """Gymnasium envs, one after the other."""
+class GymnasiumWorld:
+    """One Gymnasium env."""
 
-    def __init__(self, envs: Sequence[GymEnv], options: Mapping[str, object]) -> None:
-        self.envs = envs
-        self.num_envs = len(envs)
-        self.spec = spec_of_gymnasium(envs[0], options)
-        n = self.num_envs
-        spec = self.spec
-        self.observations = {a.name: np.zeros((n, *a.shape), a.dtype) for a in spec.observation}
-        self.telemetry = {a.name: np.zeros((n, *a.shape)) for a in spec.telemetry}
-        self.rewards = np.zeros(n)
-        self.terminated = np.zeros(n, bool)
-        self.truncated = np.zeros(n, bool)
-        self._waiting = np.ones(n, bool)  # for a reset
+    num_envs = 1
+
+    def __init__(self, env: GymEnv, options: Mapping[str, object]) -> None:
+        self.spec = spec = spec_of_gymnasium(env, options)
+        self.observations = {a.name: np.zeros((1, *a.shape), a.dtype) for a in spec.observation}
+        self.telemetry = {a.name: np.zeros((1, *a.shape)) for a in spec.telemetry}
+        self.rewards = np.zeros(1)
+        self.terminated = np.zeros(1, bool)
+        self.truncated = np.zeros(1, bool)
+        self._env = env
+        self._is_waiting = True  # for a reset
 
     def advance(
         self,
@@ -94,30 +95,29 @@ class GymnasiumBatch:
         seeds: NDArray[np.uint64] | None,
         frozen: Mask | None,
     ) -> None:
-        none = np.zeros(self.num_envs, bool)
-        resets = none if resets is None else resets
-        flown = ~resets if frozen is None else ~(resets | frozen)
-        if (self._waiting & flown).any():
-            first = (self._waiting & flown).argmax()
-            raise gym.error.ResetNeeded(f"step: expected a reset of env {first} first")
+        is_reset = resets is not None and resets.all()
+        is_frozen = frozen is not None and frozen.all()
+        if self._is_waiting and not (is_reset or is_frozen):
+            raise gym.error.ResetNeeded("step: expected a reset first")
         for array in (self.rewards, self.terminated, self.truncated):
             array[:] = 0
-        for i in np.flatnonzero(resets | flown).tolist():
-            env = self.envs[i]
-            if resets[i]:
-                observation, info = env.reset(seed=None if seeds is None else int(seeds[i]))
-            else:
-                action = int(actions[i]) if isinstance(self.spec.action, Discrete) else actions[i]
-                observation, reward, self.terminated[i], self.truncated[i], info = env.step(action)
-                self.rewards[i] = float(reward)
-            self._keep(i, observation, info)
-            self._waiting[i] = self.terminated[i] or self.truncated[i]
+        if is_reset:
+            observation, info = self._env.reset(seed=None if seeds is None else int(seeds[0]))
+        elif is_frozen:
+            return
+        else:
+            action = int(actions[0]) if isinstance(self.spec.action, Discrete) else actions[0]
+            observation, reward, self.terminated[:], self.truncated[:], info = self._env.step(
+                action
+            )
+            self.rewards[:] = float(reward)
+        self._keep(observation, info)
+        self._is_waiting = bool(self.terminated[0] or self.truncated[0])
 
     def close(self) -> None:
-        for env in self.envs:
-            env.close()
+        self._env.close()
 
-    def _keep(self, i: int, observation: object, info: Mapping[str, Any]) -> None:
+    def _keep(self, observation: object, info: Mapping[str, Any]) -> None:
         for array in self.spec.observation:
             value = np.asarray(
                 observation[array.name] if isinstance(observation, dict) else observation
@@ -126,10 +126,10 @@ class GymnasiumBatch:
                 expected = f"{array.dtype} of shape {array.shape}"
                 got = f"{value.dtype} of shape {value.shape}"
                 raise InputError(f"observation {array.name}: expected {expected}, got {got}")
-            self.observations[array.name][i] = value
+            self.observations[array.name][0] = value
         for array in self.spec.telemetry:
             numbers = [info[name] for name in component_names(array)]
-            self.telemetry[array.name][i] = np.reshape(numbers, array.shape)
+            self.telemetry[array.name][0] = np.reshape(numbers, array.shape)
 
 
 def spec_of_gymnasium(env: GymEnv, options: Mapping[str, object]) -> EnvSpec:
