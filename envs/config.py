@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Self
 from ..models import BACKENDS, MAX_DRONES, Backend
 from ..models.errors import InputError, UnknownOption, shortened
 from ..models.fields import Choice, Limits, check, check_fields
+from ..models.library import vehicle_words
 from ..scenes import scenes_of
 from ..sim import EffectOptions, Randomization, checked_sensors
 from . import registry
@@ -46,7 +47,10 @@ class SceneConfig:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "seeds", tuple(self.seeds))
-        scenes_of(str(self))
+        texts = scenes_of(str(self))
+        seeds = [f"{self.name}:{seed}" for seed in self.seeds]
+        if seeds and list(texts) != seeds:
+            raise InputError(f"scene: expected consecutive seeds, got {shortened(self.seeds)}")
 
     def __str__(self) -> str:
         """The text that `parse` reads: `forest`, `forest:3` or `forest:0-7`."""
@@ -143,6 +147,9 @@ class EnvConfig:
     """Pictures that are observed: cameras of the vehicle as NAME, NAME_KIND or
     NAME@WIDTHxHEIGHT."""
     backend: BackendConfig = BackendConfig()
+    files: Mapping[str, Any] = field(default_factory=dict, hash=False, repr=False)
+    """Content of the files of `vehicle` by their names, as `models/bundle` has it; set by
+    `resolve`, which needs the files themselves no more."""
     vehicle_hash: str = ""
     """Hash of the vehicle's model; set by `resolve`."""
     task_hash: str = ""
@@ -152,7 +159,11 @@ class EnvConfig:
         check_fields(self)
         self._set(env_id=canonical_id(self.env_id))
         self._set(scene=SceneConfig.parse(self.scene), backend=BackendConfig.parse(self.backend))
-        self._set(vehicle=_vehicles(self.vehicle), cameras=_words("cameras", self.cameras))
+        self._set(vehicle=vehicle_words(self.vehicle), cameras=_words("cameras", self.cameras))
+        if self.files:
+            from ..models.bundle import checked_bundles
+
+            self._set(files=checked_bundles(self.files))
         self._set(sensors=checked_sensors(self.sensors))
         if not isinstance(self.effects, EffectOptions):
             self._set(effects=EffectOptions.from_options(self.effects))
@@ -259,15 +270,35 @@ class EnvConfig:
         """Whether controller and observation get the onboard estimate, once a control step."""
         return self.sensors.get("observe") == "estimate"
 
+    @property
+    def vehicle_paths(self) -> tuple[str, ...]:
+        """Names and files of the vehicles; a file that is not here is written to a temporary one."""
+        if not self.files:
+            return self.vehicle
+        from ..models.bundle import unpacked
+
+        files = {word: str(unpacked(word, bundle)) for word, bundle in self.files.items()}
+        return tuple(files.get(word, word) for word in self.vehicle)
+
     def load_vehicle(self) -> "Vehicle":
         """The vehicle, or a `Fleet` of several. Raises `InputError`."""
         from ..models.fleet import load_vehicles
 
-        words = ",".join(self.vehicle) or None
+        words = self.vehicle_paths or None
         return load_vehicles(words, self.drones, linear_drag=self.effects.linear_drag)
 
+    def embedded(self) -> Self:
+        """The same with the content of the vehicles' files, for a process that has not the files.
+
+        Raises `InputError`.
+        """
+        from ..models.bundle import bundles_of
+
+        missing = bundles_of([word for word in self.vehicle if word not in self.files])
+        return replace(self, files={**self.files, **missing}) if missing else self
+
     def resolve(self) -> Self:
-        """The same with the hashes of its files. Refuses by name what cannot be flown together.
+        """The same with its files and hashes. Refuses by name what cannot be flown together.
 
         Raises `InputError`.
         """
@@ -278,7 +309,8 @@ class EnvConfig:
             most = f" to {task.max_drones}" if task.max_drones > task.min_drones else ""
             expected = f"{task.min_drones}{most} with {self.env_id}"
             raise InputError(f"drones: expected {expected}, got {self.drones}")
-        vehicle = self.load_vehicle()
+        whole = self.embedded()
+        vehicle = whole.load_vehicle()
         vehicle.substeps(self.control_period or 0.0)
         several = len(self.vehicle) > 1
         if several and self.sensors:
@@ -287,7 +319,7 @@ class EnvConfig:
         randomize = Randomization(self.randomize, None)
         settings = self.backend.settings
         check_world(vehicle, self.backend.name, self.drones, self.effects, randomize, settings)
-        resolved = replace(self, vehicle_hash=vehicle.hash, task_hash=source_hash(task))
+        resolved = replace(whole, vehicle_hash=vehicle.hash, task_hash=source_hash(task))
         for name in ("vehicle_hash", "task_hash"):
             was = getattr(self, name)
             now = getattr(resolved, name)
@@ -300,7 +332,10 @@ class EnvConfig:
         """32 hexadecimal digits of the resolved config, without what changes no number."""
         resolved = self if self.vehicle_hash else self.resolve()
         content = resolved.to_dict()
-        content.pop("vehicle")  # its hash is there
+        for name in ("vehicle", "files"):  # their hash is there
+            content.pop(name)
+        if not self.cameras:
+            content.pop("scene")
         for name in ("num_threads", "compiled"):
             content["backend"].pop(name)
         text = json.dumps(content, sort_keys=True, separators=(",", ":"))
@@ -338,7 +373,7 @@ def read_toml(path: Path | str) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise InputError(f"config: expected a TOML file, got {file}: {error}") from None
     if "vehicle" in content:
-        words = _vehicles(content["vehicle"])
+        words = vehicle_words(content["vehicle"])
         beside = [file.parent / word for word in words]
         content["vehicle"] = tuple(
             str(near) if near.is_file() else word for near, word in zip(beside, words, strict=True)
@@ -364,20 +399,6 @@ def source_hash(task: type) -> str:
 
 def _names(kind: type) -> list[str]:
     return [one.name for one in fields(kind)]
-
-
-def _vehicles(given: Any) -> tuple[str, ...]:
-    """Names and files of vehicles, of a text with commas between them or of several texts."""
-    if isinstance(given, str | Path):
-        text = str(given)
-        several = isinstance(given, str) and "," in text and not Path(text).exists()
-        return tuple(word.strip() for word in text.split(",")) if several else (text,)
-    if not isinstance(given, list | tuple):
-        raise InputError(f"vehicle: expected names or files, got {shortened(given)}")
-    for word in given:
-        if not isinstance(word, str | Path):
-            raise InputError(f"vehicle: expected names or files, got {shortened(given)}")
-    return tuple(str(word) for word in given)
 
 
 def _words(name: str, given: Any) -> tuple[str, ...]:

@@ -27,6 +27,7 @@ MAX_NAME: Final = 200  # characters of a name, unit or frame
 
 _DTYPES: Final = ("float32", "float64", "uint8", "int32", "int64")
 _CONTROL: Final = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")  # and halves of pairs
+_DIGEST: Final = re.compile("[0-9a-f]{32}")
 _CONSTANT: Final = re.compile(r"[a-z][a-z0-9_]{0,63}")
 _LARGEST: Final = float(np.finfo(np.float64).max)
 _NO_BOUND: Final = {"low": -math.inf, "high": math.inf}
@@ -238,7 +239,7 @@ class Mark(marks.Mark, _Part):
 class EnvSpec(_Part):
     """Everything that an agent must know of an env. Arrays are those of one drone."""
 
-    _optional = ("constants", "marks")
+    _optional = ("config_digest", "constants", "marks")
 
     env_id: str
     options: Mapping[str, Any] = field(default_factory=dict)
@@ -249,6 +250,9 @@ class EnvSpec(_Part):
     """Name of the vehicle's model."""
     vehicle_hash: str = "0" * 32
     """32 hexadecimal digits: the same model, the same hash; zeros where there is none."""
+    config_digest: str = ""
+    """32 hexadecimal digits of the resolved `EnvConfig`, or empty. The same digest, the same
+    numbers."""
     agents: tuple[str, ...] = ("drone_0",)
     """One name for each drone of a world."""
     observation: tuple[ArraySpec, ...]
@@ -267,13 +271,15 @@ class EnvSpec(_Part):
         object.__setattr__(self, "options", json_values(self.options))
         object.__setattr__(self, "constants", _checked_constants(self.constants))
         period = self.control_period
-        digits = self.vehicle_hash
         agents = self.agents
         right = _is_number(period) and 1e-6 <= period <= 1e3
         _expect(right, "control_period", "1e-6 to 1e3 s", period)
         _check_text("vehicle", self.vehicle)
-        right = isinstance(digits, str) and bool(re.fullmatch("[0-9a-f]{32}", digits))
-        _expect(right, "vehicle_hash", "32 hex digits", digits)
+        for name in ("vehicle_hash", "config_digest"):
+            digits = getattr(self, name)
+            right = isinstance(digits, str) and _DIGEST.fullmatch(digits)
+            right = right or (digits == "" and name in self._optional)
+            _expect(right, name, "32 hex digits", digits)
         _check_words("agents", agents)
         right = 1 <= len({*agents}) == len(agents) <= MAX_AGENTS
         _expect(right, "agents", f"1 to {MAX_AGENTS} different names", agents)

@@ -43,6 +43,7 @@ def spec_of(
         control_period=task.control_period,
         vehicle=task.vehicle.name,
         vehicle_hash=task.vehicle.hash,
+        config_digest=config.digest,
         agents=drone_names(config.drones),
         observation=tuple(observation),
         action=_action(task.controller),
