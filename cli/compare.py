@@ -74,6 +74,6 @@ def _controller(name: str, beside: "Row") -> list["Row"]:
     from ..training.settings import Row
 
     with suppress(InputError):
-        CONTROLLERS[name](env_spec(beside.env.flown))
+        CONTROLLERS[name](env_spec(beside.env))
         return [Row(agent=name, name=name, env=beside.env)]
     return []

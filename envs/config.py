@@ -203,7 +203,7 @@ class EnvConfig:
         given = {name: value for name, value in keywords.items() if name not in options}
         given = {name: value for name, value in given.items() if value is not None}
         given.pop("task", None)
-        settings = {name: given.pop(name) for name in _BACKEND_KEYWORDS if name in given}
+        settings = {name: given.pop(name) for name in BACKEND_KEYWORDS if name in given}
         if settings:
             base = BackendConfig.parse(given.get("backend", BackendConfig()))
             given["backend"] = replace(base, **settings)
@@ -224,6 +224,23 @@ class EnvConfig:
         hidden = {name: value for name, value in self.task.items() if name in KEYWORDS}
         shown = {name: value for name, value in self.task.items() if name not in KEYWORDS}
         return json_values({**values, **shown, **({"task": hidden} if hidden else {})})
+
+    def keywords(self) -> dict[str, Any]:
+        """Keywords of `from_keywords` that make the same config, as JSON values."""
+        values: dict[str, Any] = {"env_id": self.own_task or self.env_id}
+        if self.vehicle:
+            values["vehicle"] = list(self.vehicle)
+        if self.backend != BackendConfig():
+            values["backend"] = asdict(self.backend)
+        if self.scene != SceneConfig():
+            values["scene"] = str(self.scene)
+        return {**values, "drones": self.drones, **self.flat_options()}
+
+    def changed(self, **keywords: Any) -> "EnvConfig":
+        """The same with other keywords. Raises `InputError`."""
+        given = {**self.keywords(), "env_id": self.env_id, **keywords}
+        other = EnvConfig.from_keywords(**given)
+        return replace(other, files=self.files) if other.vehicle == self.vehicle else other
 
     @classmethod
     def from_toml(cls, path: Path | str, **keywords: Any) -> "EnvConfig":
@@ -261,6 +278,11 @@ class EnvConfig:
         return None if name.startswith("rotorgram.") or name == "__main__" else name
 
     @property
+    def own_task(self) -> str | None:
+        """`module:id` of a user's task; None for ours."""
+        return f"{self.module}:{self.env_id}" if self.module else None
+
+    @property
     def task_options(self) -> "TaskOptions":
         """The task's options as its own dataclass."""
         return registry.task_type(self.env_id).Options.from_options(self.task)
@@ -272,7 +294,7 @@ class EnvConfig:
 
     @property
     def vehicle_paths(self) -> tuple[str, ...]:
-        """Names and files of the vehicles; a file that is not here is written to a temporary one."""
+        """Names and files of the vehicles; files that are not here are written to a folder."""
         if not self.files:
             return self.vehicle
         from ..models.bundle import unpacked
@@ -348,8 +370,9 @@ _OPTIONS: Final = (
     "cameras",
 )  # fmt: skip
 _FLAT: Final = (*_OPTIONS, "scene", "vehicle", "drones", "backend")
-_BACKEND_KEYWORDS: Final = ("num_threads", "dtype", "compiled")
-KEYWORDS: Final = (*_FLAT, *_BACKEND_KEYWORDS)
+BACKEND_KEYWORDS: Final = ("num_threads", "dtype", "compiled")
+"""Keywords that are settings of the backend."""
+KEYWORDS: Final = (*_FLAT, *BACKEND_KEYWORDS)
 """Keywords that are not options of a task."""
 
 

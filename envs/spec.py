@@ -277,7 +277,7 @@ class EnvSpec(_Part):
         _check_text("vehicle", self.vehicle)
         for name in ("vehicle_hash", "config_digest"):
             digits = getattr(self, name)
-            right = isinstance(digits, str) and _DIGEST.fullmatch(digits)
+            right = isinstance(digits, str) and bool(_DIGEST.fullmatch(digits))
             right = right or (digits == "" and name in self._optional)
             _expect(right, name, "32 hex digits", digits)
         _check_words("agents", agents)

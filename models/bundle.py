@@ -1,7 +1,6 @@
 """Vehicles' files as content: a config carries them to where the files themselves are not."""
 
 import base64
-import binascii
 import os
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
@@ -73,21 +72,23 @@ def _written(bundle: Bundle) -> TemporaryDirectory[str]:
 
 
 def _checked(given: object) -> Bundle:
-    pairs = given if isinstance(given, list | tuple) else ()
-    checked = []
-    for pair in pairs:
-        name, content = pair if isinstance(pair, list | tuple) and len(pair) == 2 else (0, 0)
-        inside = isinstance(name, str) and _is_inside(name)
-        try:
-            base64.b64decode(content, validate=True)
-        except (binascii.Error, TypeError, ValueError):
-            inside = False
-        if not inside:
-            raise InputError(f"files: expected a relative path and base64, got {shortened(pair)}")
-        checked.append((name, content))
-    if not checked:
+    if not isinstance(given, list | tuple) or not given:
         raise InputError(f"files: expected a list of paths and contents, got {shortened(given)}")
-    return tuple(checked)
+    for pair in given:
+        if not _is_file(pair):
+            raise InputError(f"files: expected a relative path and base64, got {shortened(pair)}")
+    return tuple((name, content) for name, content in given)
+
+
+def _is_file(pair: object) -> bool:
+    if not isinstance(pair, list | tuple) or len(pair) != 2:
+        return False
+    name, content = pair
+    try:
+        base64.b64decode(content, validate=True)
+    except (TypeError, ValueError):
+        return False
+    return isinstance(name, str) and _is_inside(name)
 
 
 def _is_inside(name: str) -> bool:

@@ -16,6 +16,7 @@ from rotorgram.agents import (
     store,
 )
 from rotorgram.cli import main
+from rotorgram.envs.config import EnvConfig
 from rotorgram.flights.trajectories import evaluation_seed
 from rotorgram.models.errors import InputError
 from rotorgram.training.settings import Run
@@ -36,12 +37,12 @@ def run_of(algorithm: str, drones: int = 4, **changes: Any) -> Run:
         seed=4,
         env_steps=1400,
         num_envs=drones,
-        **{"options": OPTIONS, **changes},
+        **{"env": EnvConfig.from_keywords(**OPTIONS), **changes},
     )
 
 
 def env_of(run: Run, **changes: Any) -> Any:
-    return vector(run.num_envs, **{**run.options, **changes})
+    return vector(run.num_envs, **{**run.env.flat_options(), **changes})
 
 
 def test_wrong_runs_are_one_sentence() -> None:
@@ -50,7 +51,6 @@ def test_wrong_runs_are_one_sentence() -> None:
         ({"seed": -1}, "seed: expected 0 or more, got -1"),
         ({"num_envs": 0}, "num_envs: expected 1 or more, got 0"),
         ({"env_steps": 71}, "env_steps: expected at least 72, got 71"),  # whole steps of 4 drones
-        ({"options": {"wind": 1}}, "wind"),
     ):
         with pytest.raises(InputError, match=sentence):
             replace(run, **changes)  # type: ignore[arg-type]
