@@ -134,7 +134,7 @@ class Train(AgentFlags, BackendFlags):
         ):  # fmt: skip
             spec = env.env_spec  # of the simulator that came
             if self.listen is not None:
-                run = replace(run, env=replace(config_of(spec, backend), vehicle=self.vehicle))
+                run = replace(run, env=config_of(spec, backend, self.vehicle))
             training = Training(run, env, start=start)
             about = {"vehicle_hash": spec.vehicle_hash, "versions": software_versions()}
             content = json.dumps({**run.to_dict(), **told, **about}, indent=2) + "\n"

@@ -7,15 +7,15 @@ import inspect
 import json
 import sys
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from hashlib import blake2b
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Self
 
 from ..models import BACKENDS, MAX_DRONES, Backend
-from ..models.errors import InputError, UnknownOption, shortened
-from ..models.fields import Choice, Limits, check, check_fields
+from ..models.errors import InputError, shortened
+from ..models.fields import Choice, Limits, check, check_fields, check_names, read_table
 from ..models.library import vehicle_words
 from ..scenes import scenes_of
 from ..sim import EffectOptions, Randomization, checked_sensors
@@ -66,7 +66,7 @@ class SceneConfig:
         if isinstance(scene, cls):
             return scene
         if isinstance(scene, Mapping):
-            return cls(**known_only("scene", scene, _names(cls)))
+            return read_table(cls, scene, "scene")
         texts = scenes_of(scene)
         seeds = [text.partition(":")[2] for text in texts]
         return cls(
@@ -96,7 +96,7 @@ class BackendConfig:
         if isinstance(backend, cls):
             return backend
         if isinstance(backend, Mapping):
-            return cls(**known_only("backend", backend, _names(cls)))
+            return read_table(cls, backend, "backend")
         return cls(name=backend)
 
     @property
@@ -200,13 +200,11 @@ class EnvConfig:
             return env_id
         options = {name: value for name, value in keywords.items() if name not in KEYWORDS}
         nested = options.pop("task", {})
-        given = {name: value for name, value in keywords.items() if name not in options}
-        given = {name: value for name, value in given.items() if value is not None}
-        given.pop("task", None)
+        given = {name: keywords[name] for name in KEYWORDS if keywords.get(name) is not None}
         settings = {name: given.pop(name) for name in BACKEND_KEYWORDS if name in given}
         if settings:
-            base = BackendConfig.parse(given.get("backend", BackendConfig()))
-            given["backend"] = replace(base, **settings)
+            backend = BackendConfig.parse(given.get("backend", "mujoco"))
+            given["backend"] = replace(backend, **settings)
         if not isinstance(nested, Mapping):
             raise InputError(f"task: expected options by name, got {shortened(nested)}")
         return cls(env_id=env_id, task={**options, **nested}, **given)
@@ -218,12 +216,11 @@ class EnvConfig:
         """
         values: dict[str, Any] = {name: getattr(self, name) for name in _OPTIONS}
         values["effects"] = self.effects.to_options()
-        if self.cameras:
-            values["scene"] = str(self.scene)
+        values["scene"] = str(self.scene) if self.cameras else None
+        values["task"] = {name: value for name, value in self.task.items() if name in KEYWORDS}
         values = {name: value for name, value in values.items() if value not in (None, (), {})}
-        hidden = {name: value for name, value in self.task.items() if name in KEYWORDS}
         shown = {name: value for name, value in self.task.items() if name not in KEYWORDS}
-        return json_values({**values, **shown, **({"task": hidden} if hidden else {})})
+        return json_values(values | shown)
 
     def keywords(self) -> dict[str, Any]:
         """Keywords of `from_keywords` that make the same config, as JSON values."""
@@ -266,7 +263,8 @@ class EnvConfig:
         version = given.pop("version", None)
         if version != VERSION:
             raise InputError(f"config: expected version {VERSION}, got {shortened(version)}")
-        return cls(**known_only("config", given, _names(cls)))
+        check_names(given, [one.name for one in fields(cls)], "config")
+        return cls(**given)
 
     # ---- checks that need more than one field, and the files
 
@@ -314,10 +312,12 @@ class EnvConfig:
 
         Raises `InputError`.
         """
+        words = [word for word in self.vehicle if word not in self.files]
+        if not words:
+            return self
         from ..models.bundle import bundles_of
 
-        missing = bundles_of([word for word in self.vehicle if word not in self.files])
-        return replace(self, files={**self.files, **missing}) if missing else self
+        return replace(self, files={**self.files, **bundles_of(words)})
 
     def resolve(self) -> Self:
         """The same with its files and hashes. Refuses by name what cannot be flown together.
@@ -376,14 +376,6 @@ KEYWORDS: Final = (*_FLAT, *BACKEND_KEYWORDS)
 """Keywords that are not options of a task."""
 
 
-def known_only(what: str, given: Mapping[str, Any], known: Sequence[str]) -> dict[str, Any]:
-    """The given values by name. Raises `UnknownOption` for a name that is not known."""
-    for name in given:
-        if name not in known:
-            raise UnknownOption(f"{what}: expected some of {', '.join(known)}, got {name!r}")
-    return dict(given)
-
-
 def read_toml(path: Path | str) -> dict[str, Any]:
     """Keywords of a config's file. Raises `InputError`."""
     file = Path(path)
@@ -418,10 +410,6 @@ def source_hash(task: type) -> str:
         digest.update(source.encode())
         found = True
     return digest.hexdigest() if found else ""
-
-
-def _names(kind: type) -> list[str]:
-    return [one.name for one in fields(kind)]
 
 
 def _words(name: str, given: Any) -> tuple[str, ...]:

@@ -9,12 +9,12 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields
-from typing import Any, ClassVar, Final, Literal, Self
+from typing import Annotated, Any, ClassVar, Final, Literal, Self
 
 import numpy as np
 
 from ..models.errors import InputError, shortened
-from ..models.fields import check_fields
+from ..models.fields import Limits, Text, check_fields
 from ..scenes import marks
 
 MAX_ELEMENTS: Final = 1 << 22  # numbers of all observations of one drone
@@ -27,6 +27,7 @@ MAX_NAME: Final = 200  # characters of a name, unit or frame
 
 _DTYPES: Final = ("float32", "float64", "uint8", "int32", "int64")
 _CONTROL: Final = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")  # and halves of pairs
+_SIZE: Final = Limits(0.0, above=True)
 _DIGEST: Final = re.compile("[0-9a-f]{32}")
 _CONSTANT: Final = re.compile(r"[a-z][a-z0-9_]{0,63}")
 _LARGEST: Final = float(np.finfo(np.float64).max)
@@ -194,15 +195,15 @@ class Metric(_Part):
 
     _optional = ("settled", "held", "symbol", "signed", "final")
 
-    name: str
-    unit: str
+    name: Annotated[str, Text(MAX_NAME)]
+    unit: Annotated[str, Text(MAX_NAME, empty=True)]
     goal: Literal["zero", "high"] = "zero"
     """`zero`: an error, signed or not; 0 is best. `high`: larger is better."""
-    settled: float | None = None
+    settled: Annotated[float | None, _SIZE] = None
     """Size of the error below which an episode counts as settled; None if undefined."""
-    held: float | None = None
+    held: Annotated[float | None, _SIZE] = None
     """Mean size of the error at the end of an episode below which its goal counts as held."""
-    symbol: str = ""
+    symbol: Annotated[str, Text(MAX_NAME, empty=True)] = ""
     """Short symbol for figures and overlays, as E; empty: the name."""
     signed: bool = False
     """Whether it changes sign where it passes its best: then there is an overshoot."""
@@ -211,18 +212,7 @@ class Metric(_Part):
     the last quarter. An episode that terminates with its goal held is then no crash."""
 
     def __post_init__(self) -> None:
-        for name in ("name", "unit", "symbol"):
-            _check_text(f"metric: {name}", getattr(self, name))
-        name = self.name
-        _expect(name, "metric", "a name", name)
-        _expect(self.goal in ("zero", "high"), name, "the goal 'zero' or 'high'", self.goal)
-        for field_name in ("signed", "final"):
-            value = getattr(self, field_name)
-            _expect(type(value) is bool, name, f"{field_name} to be true or false", value)
-        for field_name in ("settled", "held"):
-            value = getattr(self, field_name)
-            right = value is None or (_is_number(value) and 0 < value <= _LARGEST)
-            _expect(right, name, f"{field_name} > 0 or None", value)
+        check_fields(self, "metric: ", SpecError)
 
 
 @dataclass(frozen=True, kw_only=True)

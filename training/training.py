@@ -23,9 +23,10 @@ from .settings import Run
 _TELL_EVERY: Final = 0.2  # s
 
 
-def config_of(spec: EnvSpec, backend: Backend = "mujoco") -> EnvConfig:
+def config_of(spec: EnvSpec, backend: Backend, vehicle: str | None = None) -> EnvConfig:
     """The config of a simulator's env, as far as its spec has it. Raises `InputError`."""
     settings: dict[str, Any] = {"drones": len(spec.agents), "backend": backend}
+    settings["vehicle"] = vehicle
     if is_known(spec.env_id):
         return EnvConfig.from_keywords(spec.env_id, **settings, **spec.options)
     return EnvConfig(env_id=spec.env_id, task=spec.options, **settings)

@@ -277,7 +277,7 @@ def test_a_controller_brings_its_options_and_stands_in_the_table_of_its_task() -
     assert row.env.episode_length == 9
     assert row.name == "geometric Hover-v0 episode_length=9"
     assert row.task == Row(agent="ppo", env=hover, env_steps=41_000).task
-    velocity = replace(hover, action="velocity")
+    velocity = EnvConfig(env_id="rotorgram/Hover-v0", action="velocity")
     assert Row(agent="geometric", env=velocity).task == "Hover-v0 action=velocity"
 
 
