@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Self
 from ..models import BACKENDS, MAX_DRONES, Backend
 from ..models.errors import InputError, shortened
 from ..models.fields import Choice, Limits, check, check_fields, check_names, read_table
-from ..models.library import vehicle_words
+from ..models.library import is_of_the_library, vehicle_words
 from ..scenes import scenes_of
 from ..sim import EffectOptions, Randomization, checked_sensors
 from . import registry
@@ -313,11 +313,12 @@ class EnvConfig:
         Raises `InputError`.
         """
         words = [word for word in self.vehicle if word not in self.files]
+        words = [word for word in words if not is_of_the_library(word)]
         if not words:
             return self
-        from ..models.bundle import bundles_of
+        from ..models.bundle import read_bundle  # it imports MuJoCo
 
-        return replace(self, files={**self.files, **bundles_of(words)})
+        return replace(self, files={**self.files, **{word: read_bundle(word) for word in words}})
 
     def resolve(self) -> Self:
         """The same with its files and hashes. Refuses by name what cannot be flown together.

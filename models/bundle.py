@@ -10,7 +10,7 @@ from typing import Final
 from xml.etree import ElementTree
 
 from .errors import InputError, shortened
-from .library import find_vehicle, is_of_the_library
+from .library import find_vehicle
 from .vehicle_file import read_vehicle_file
 
 MAX_BYTES: Final = 1 << 26
@@ -19,11 +19,6 @@ _DIRECTORIES: Final = ("meshdir", "texturedir", "assetdir")
 
 Bundle = tuple[tuple[str, str], ...]
 """Pairs of a relative path with slashes and a file's bytes in base64; the vehicle's own first."""
-
-
-def bundles_of(vehicles: Sequence[str]) -> dict[str, Bundle]:
-    """The files of each vehicle that is not of the library. Raises `InputError`."""
-    return {word: read_bundle(word) for word in vehicles if not is_of_the_library(word)}
 
 
 def read_bundle(vehicle: Path | str) -> Bundle:

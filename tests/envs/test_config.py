@@ -284,6 +284,30 @@ def test_a_task_may_add_to_a_config_and_its_users_may_not_contradict_it() -> Non
         Loop(EnvConfig.from_keywords("rotorgram/PayloadHover-v0", effects={"payload": 1.0}))
 
 
+@pytest.mark.parametrize(
+    ("changes", "name"),
+    [({"effects": EffectOptions()}, "effects"), ({"history": 1}, "history"),
+     ({"sensors": {}}, "sensors"), ({"scene": SceneConfig()}, "scene")],
+)  # fmt: skip
+def test_a_task_that_drops_a_setting_is_refused(changes: dict[str, Any], name: str) -> None:
+    class Dropping(Hold):
+        """Drops what it is given."""
+
+        def adjust(self, config: EnvConfig) -> EnvConfig:
+            return replace(config, **changes)
+
+    register("config/Dropping-v0", Dropping)
+    config = EnvConfig.from_keywords(
+        "config/Dropping-v0",
+        effects={"gusts": 1},
+        history=2,
+        sensors={"imu": True},
+        scene="airport",
+    )
+    with pytest.raises(InputError, match=rf"^config/.*: expected adjust\(\) to keep {name}, got "):
+        Loop(config)
+
+
 def test_setup_runs_once_in_a_loop() -> None:
     class Counted(Hold):
         """Counts its setups."""
