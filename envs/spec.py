@@ -73,12 +73,11 @@ class _Part:
         given = {}
         for f in fields(cls):  # type: ignore[arg-type]
             name = f.metadata.get("json", f.name)
-            optional = f.default is not MISSING or f.default_factory is not MISSING
-            there = name in content
-            _expect(optional or there, "spec", f"{name} in {cls.__name__}", list(content))
-            if there:
+            if name in content:
                 value = content[name]
                 given[f.name] = tuple(value) if isinstance(value, list) else value
+            elif f.default is MISSING and f.default_factory is MISSING:
+                raise SpecError(f"spec: expected {name} in {cls.__name__}, got {list(content)}")
         return given
 
     @classmethod
@@ -108,12 +107,10 @@ class ArraySpec(_Part):
     """What the values 0, 1, 2... stand for, where they are numbers of something; or none."""
 
     def __post_init__(self) -> None:
-        _check_text("name", self.name)
-        _check_words(f"{self.name}: categories", self.categories)
         name = self.name
         shape = self.shape
-        units = self.unit
         names = self.components
+        _check_text("name", name)
         _expect(name, "name", "a name for an array", name)
         is_shape = isinstance(shape, tuple) and all(type(n) is int and n >= 1 for n in shape)
         _expect(is_shape, name, "a shape of whole numbers >= 1", shape)
@@ -128,11 +125,13 @@ class ArraySpec(_Part):
             first = int(wrong.argmax())
             got = f"{low.flat[first]} and {high.flat[first]}"
             raise SpecError(f"{name}: expected low <= high, got {got} at element {first}")
-        _check_words(f"{name}: unit", (units,) if isinstance(units, str) else units)
-        several = not isinstance(units, str)
-        _expect(not several or len(units) == self.size, name, f"{self.size} units", len(units))
+        one_unit = isinstance(self.unit, str)
+        units = (self.unit,) if one_unit else self.unit
+        _check_words(f"{name}: unit", units)
+        _expect(one_unit or len(units) == self.size, name, f"{self.size} units", len(units))
         _check_text(f"{name}: frame", self.frame)
         _check_words(f"{name}: components", names)
+        _check_words(f"{name}: categories", self.categories)
         right = not names or len({*names} - {""}) == len(names) == self.size
         _expect(right, name, f"{self.size} different components", names)
 

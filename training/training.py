@@ -2,7 +2,8 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Any, Final
 
@@ -12,11 +13,11 @@ from .. import agents
 from ..agents import Checkpoint, CheckpointError
 from ..agents.config import RolloutConfig
 from ..envs.autoreset import AdvancingVectorEnv
-from ..envs.config import EnvConfig
+from ..envs.config import BackendConfig, EnvConfig
 from ..envs.registry import is_known
 from ..envs.spec import EnvSpec
 from ..flights.executors import Tell
-from ..models import Backend
+from ..models import BACKENDS, Backend
 from ..models.errors import InputError
 from .settings import Run
 
@@ -104,15 +105,21 @@ class Training:
 
     @cached_property
     def env_config(self) -> EnvConfig | None:
-        """The resolved config of the env; None of an env that is not known here to be `run.env`."""
+        """The resolved config of the env: `run.env`, on the backend of the simulator that came.
+
+        None where the simulator has another config, or none of ours.
+        """
+        config = self.run.env
         digest = self.log.spec.config_digest
-        if not (digest and is_known(self.run.env.env_id)):
+        if not (digest and is_known(config.env_id)):
             return None
-        try:
-            resolved = self.run.env.resolve()
-        except InputError:  # its vehicle is a simulator's alone
-            return None
-        return resolved if resolved.digest == digest else None
+        others = [replace(config, backend=BackendConfig(name=name)) for name in BACKENDS]
+        for tried in (config, *others):
+            with suppress(InputError):  # the vehicle's file may be the simulator's alone
+                resolved = tried.resolve()
+                if resolved.digest == digest:
+                    return resolved
+        return None
 
     def train(
         self, on_update: Callable[[], bool] = lambda: True, tell: Tell = lambda *_: None
@@ -179,7 +186,7 @@ class Training:
             config=asdict(self.run.config),
             spec=self.log.spec,
             env=self.env_config,
-            backend=self.run.env.backend.name,
+            backend=(self.env_config or self.run.env).backend.name,
             seed=self.run.seed,
             env_steps=self.run.env_steps,
             actor=self.agent.actor(),
