@@ -133,7 +133,10 @@ class StudyFlags(BackendFlags, WorkersConfig):
     def given_of_study(self) -> dict[str, Any]:
         """Settings of the study that were given."""
         values = {name: getattr(self, name) for name in _OF_STUDIES}
-        return {name: value for name, value in values.items() if value is not None}
+        values = {name: value for name, value in values.items() if value is not None}
+        if "seeds" in values:
+            values.setdefault("episodes", 0)  # as many as the seeds need
+        return values
 
     def given_of_rows(self) -> dict[str, Any]:
         """Settings of rows that were given, but for the env and the changes."""

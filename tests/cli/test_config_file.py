@@ -9,6 +9,7 @@ import pytest
 from rotorgram.agents import load
 from rotorgram.cli import main
 from rotorgram.cli._flags import parse
+from rotorgram.cli.compare import Compare
 from rotorgram.cli.evaluate import Evaluate
 from rotorgram.cli.view import View
 from rotorgram.envs import EnvConfig, LocalVectorEnv
@@ -77,3 +78,19 @@ def test_a_policy_flies_with_the_config_of_its_training(
     assert "episodes   1" in capsys.readouterr().out
     assert main(["train", "a2c", "--resume", "run", "--env-steps", "80"]) == 0
     assert load(tmp_path / "run" / "checkpoint.safetensors").env == kept.env
+
+
+def test_files_of_a_comparison_have_the_same_settings_or_are_refused(tmp_path: Path) -> None:
+    files = []
+    for name, seeds in (("a", 3), ("b", 4)):
+        (tmp_path / f"{name}.toml").write_text(
+            f'seeds = {seeds}\nepisodes = 7\n[[row]]\nagent = "pid"\nname = "{name}"\n'
+        )
+        files.append(str(tmp_path / f"{name}.toml"))
+    alone = parse(Compare, "rotorgram compare", files[:1]).study()
+    assert alone.episodes == 7
+    with pytest.raises(InputError, match=r"^seeds: expected the same in all files, got 3 and 4$"):
+        parse(Compare, "rotorgram compare", files).study()
+    both = parse(Compare, "rotorgram compare", [*files, "--seeds", "2"]).study()
+    assert both.seeds == 2
+    assert both.episodes == 100  # 200 flights of each row
