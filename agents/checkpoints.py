@@ -22,6 +22,7 @@ from typing import Annotated, Any, Final
 
 import numpy as np
 
+from ..envs.config import EnvConfig
 from ..envs.spec import Discrete, EnvSpec
 from ..models import Backend
 from ..models.errors import InputError, require, shortened
@@ -58,6 +59,8 @@ class Checkpoint:
     """Hyperparameters."""
     spec: EnvSpec
     """Of the env: id, options, vehicle and shapes."""
+    env: EnvConfig | None = None
+    """The resolved config of the env; None where only its simulator has it."""
     backend: Backend = "mujoco"
     """What stepped the env in training."""
     seed: int
@@ -145,6 +148,7 @@ def store(checkpoint: Checkpoint, path: Path) -> None:
         "format": FORMAT,
         **{name: getattr(checkpoint, name) for name in _PLAIN},
         "spec": checkpoint.spec.to_json(),
+        "env": checkpoint.env.to_dict() if checkpoint.env else None,
         "position": {"env_steps": where.env_steps, "seconds": where.seconds},
     }
     numpy = require("safetensors.numpy", "train", "writing checkpoints")
@@ -182,8 +186,12 @@ def _read(data: bytes, parse: Callable[[bytes], dict[str, np.ndarray]]) -> Check
     for name, array in arrays.items():
         if not _is_finite(name, array):
             raise ValueError(f"expected finite numbers in {name}, got NaN or infinity")
+    env = EnvConfig.from_dict(meta.env) if meta.env else None
+    if env and env.env_id != spec.env_id:
+        raise ValueError(f"expected the config of {spec.env_id}, got that of {env.env_id}")
     checkpoint = Checkpoint(
         spec=spec,
+        env=env,
         actor=part_of(arrays, "policy/"),
         state=part_of(arrays, "state/"),
         position=_position(meta, arrays, spec),
@@ -209,6 +217,7 @@ class _Meta:
     algorithm: str
     config: dict[str, Any]
     spec: str
+    env: dict[str, Any] | None = None
     backend: Backend = "mujoco"
     seed: Annotated[int, Limits(0, 2**62, whole=True)]
     env_steps: Annotated[int, Limits(0, 2**62, whole=True)]

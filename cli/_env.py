@@ -2,11 +2,12 @@
 
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from ..agents import CONTROLLERS, PID, Checkpoint, Geometric, Orca, Policy, load
-from ..envs.config import EnvConfig
+from ..envs.config import BACKEND_KEYWORDS, EnvConfig
 from ..envs.registry import env_spec, is_known, task_type
 from ..envs.spec import EnvSpec
 from ..flights.trajectories import Trajectory
@@ -17,6 +18,7 @@ from ..udp.spawn import spawn_simulator
 from ._flags import AgentFlags, EnvFlags, Options, check_count, parse_address
 
 CHECKPOINT: Final = "checkpoint.safetensors"
+F = TypeVar("F", bound=EnvFlags)
 Controller = type[PID] | type[Geometric] | type[Orca]
 _CONNECT_TIMEOUT: Final = 30 * 24 * 3600.0  # s: Ctrl-C ends the wait for a simulator
 
@@ -91,6 +93,29 @@ def chosen_drones(command: EnvFlags, checkpoint: Checkpoint | Controller | None)
     return command.drones
 
 
+def chosen_vehicle(command: EnvFlags, checkpoint: Checkpoint | Controller | None) -> str | None:
+    """The vehicle of the flags, or that of the checkpoint's own env.
+
+    Where a simulator comes by itself, it is the simulator's.
+    """
+    env = checkpoint.env if isinstance(checkpoint, Checkpoint) else None
+    comes = getattr(command, "listen", None) is not None
+    another = "env" in command.given and env is not None and command.env_id != env.env_id
+    if env is None or comes or another or "vehicle" in command.given:
+        return command.vehicle
+    return ",".join(env.vehicle_paths) or None
+
+
+def with_vehicle(command: F, *names: str) -> F:
+    """The command with the vehicle of the first policy that has one, unless a flag names one."""
+    for name in names:
+        if name != "random" and Path(name).suffix != ".mcap":
+            vehicle = chosen_vehicle(command, load_checkpoint(name))
+            if vehicle is not None:
+                return replace(command, vehicle=vehicle)
+    return command
+
+
 def policy_for(command: EnvFlags, checkpoint: Checkpoint | Controller, spec: EnvSpec) -> Policy:
     """The policy of a checkpoint, or a controller. Raises `InputError` if it does not fit the env,
     or was trained on another vehicle and the user has not named one.
@@ -121,6 +146,7 @@ def pilot_of(
     if what == "random":
         return None, None, chosen_env(command)
     checkpoint = load_checkpoint(what)
+    command = replace(command, vehicle=chosen_vehicle(command, checkpoint))
     env = chosen_env(command, checkpoint)
     spec = _spec(command, env, chosen_drones(command, checkpoint))
     policy = policy_for(command, checkpoint, spec)
@@ -158,8 +184,9 @@ def remote_env(
     """
     if command.listen is not None:
         theirs = "it of the simulator that comes: rotorgram sim --backend"
-        if "backend" in command.given:
-            raise InputError(f"backend: expected {theirs}")
+        for name in ("backend", *BACKEND_KEYWORDS):
+            if name in {*command.given, *options}:
+                raise InputError(f"{name}: expected {theirs}")
         settings = {"env_id": env_id, "options": options or None} if required else {}
         opened = _waiting(command, command.listen, num_envs, num_simulators, **settings)
     else:

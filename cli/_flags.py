@@ -159,8 +159,11 @@ def parse(kind: type[C], prog: str, words: Sequence[str]) -> C:
     early = parser.parse_known_args(words)[0]
     file = _file_values(kind, early.config) if early.config else {}
     env_id = early.env or file.get("env") or DEFAULT_ENV
-    if early.env and canonical_id(early.env) != canonical_id(file.get("env", early.env)):
-        file.pop("options")  # they are another task's
+    of_file = canonical_id(file.get("env", env_id))
+    own_options = [name for name in file.get("options", {}) if name not in KEYWORDS]
+    if own_options and canonical_id(env_id) != of_file:
+        got = ", ".join(own_options)
+        raise InputError(f"config: expected no options of {of_file} with --env {env_id}, got {got}")
     listens = "listen" in given or getattr(kind, "listen", None) is not None
     if listens and ":" not in env_id and not registry.is_known(env_id):
         words, required = _without_requirements(words)
@@ -202,10 +205,12 @@ def _file_values(kind: type[EnvFlags], path: str) -> Options:
         values["vehicle"] = ",".join(options.pop("vehicle"))
     if "drones" in options:
         values["drones"] = options.pop("drones")
-    if "backend" in options and issubclass(kind, BackendFlags):
-        values["backend"] = BackendConfig.parse(options.pop("backend")).name
-    options.pop("backend", None)
-    return {**values, "options": options}
+    backend = BackendConfig.parse(options.pop("backend", "mujoco"))
+    if issubclass(kind, BackendFlags):
+        values["backend"] = backend.name
+    elif backend.name != "mujoco":
+        raise InputError(f"backend: expected mujoco with this command, got {backend.name}")
+    return {**values, "options": {**backend.settings, **options}}
 
 
 def _with_file(

@@ -17,8 +17,9 @@ from ..models.errors import InputError
 from ._flags import BackendFlags, folder_to_write, go_on_with, named_value, refuse_settings
 
 if TYPE_CHECKING:
+    from ..envs.config import EnvConfig
     from ..training.results import Results
-    from ..training.settings import EnvConfig, Row, Study
+    from ..training.settings import Row, Study
 
 _RESUMED: Final = ("jobs", "runner", "address", "resume", "film", "page")
 """Flags that a resumed command may be given: they change no number."""
@@ -119,10 +120,10 @@ class StudyFlags(BackendFlags, WorkersConfig):
 
     def env_config(self) -> "EnvConfig":
         """The env of the flags."""
-        from ..training.settings import EnvConfig
+        from ..envs.config import EnvConfig
 
-        return EnvConfig(
-            env_id=self.env_id, options=self.options, vehicle=self.vehicle, drones=self.drones
+        return EnvConfig.from_keywords(
+            self.env_id, vehicle=self.vehicle, drones=self.drones, **self.options
         )
 
     def changes(self) -> dict[str, Any]:
@@ -132,7 +133,10 @@ class StudyFlags(BackendFlags, WorkersConfig):
     def given_of_study(self) -> dict[str, Any]:
         """Settings of the study that were given."""
         values = {name: getattr(self, name) for name in _OF_STUDIES}
-        return {name: value for name, value in values.items() if value is not None}
+        values = {name: value for name, value in values.items() if value is not None}
+        if "seeds" in values:
+            values.setdefault("episodes", 0)  # as many as the seeds need
+        return values
 
     def given_of_rows(self) -> dict[str, Any]:
         """Settings of rows that were given, but for the env and the changes."""
@@ -147,14 +151,15 @@ class StudyFlags(BackendFlags, WorkersConfig):
         return tuple(self._changed(row) for row in rows)
 
     def _changed(self, row: "Row") -> "Row":
+        from ..envs.config import EnvConfig
+
         settings = self.given_of_rows()
         env = row.env
         if "env" in self.given:
-            env = replace(env, env_id=self.env_id, options={})
-        env = replace(env, options={**env.options, **self.options})
-        for name in ("vehicle", "drones"):
-            if name in self.given:
-                env = replace(env, **{name: getattr(self, name)})
+            kept = {"vehicle": env.vehicle, "drones": env.drones}
+            env = EnvConfig.from_keywords(self.env_id, **kept)
+        named = {name: getattr(self, name) for name in ("vehicle", "drones") if name in self.given}
+        env = env.changed(**named, **self.options)
         name = "" if row.name == row.default_name else row.name
         if row.controller:
             return replace(row, name=name, env=env)

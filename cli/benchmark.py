@@ -35,6 +35,4 @@ class Benchmark(StudyFlags):
             self.rows or BOARD, {"seeds": 10, "first_seed": 5000, "snapshots": 20}
         )
         settings = {"kind": "benchmark", **self.given_of_study()}
-        if "seeds" in self.given and "episodes" not in self.given:
-            settings["episodes"] = 0
         return replace(study, rows=self.changed(study.rows), **settings)

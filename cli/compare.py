@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 
 _CONTROLLERS: Final = ("pid", "orca")
 """Flown beside the agents where they can fly the env."""
+_OF_FILES: Final = ("seeds", "first_seed", "snapshots", "curve_episodes", "episodes", "evaluation",
+                    "wire", "keep_steps")  # fmt: skip
+"""Settings of a study that all files share."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,8 +47,13 @@ class Compare(StudyFlags):
 
         studies = [Study.from_toml(path) for path in self.files]
         rows = self.changed([row for study in studies for row in study.rows])
-        settings = {"kind": "compare", "episodes": 0, **self.given_of_study()}
-        return replace(studies[0], rows=rows, **settings)
+        settings = self.given_of_study()
+        for name in _OF_FILES:
+            values = {getattr(study, name): None for study in studies}
+            if len(values) > 1 and name not in settings:
+                got = " and ".join(map(str, values))
+                raise InputError(f"{name}: expected the same in all files, got {got}")
+        return replace(studies[0], rows=rows, kind="compare", **settings)
 
     def _of_agents(self) -> "Study":
         from ..training.settings import Kind, Row, Study
@@ -74,6 +82,6 @@ def _controller(name: str, beside: "Row") -> list["Row"]:
     from ..training.settings import Row
 
     with suppress(InputError):
-        CONTROLLERS[name](env_spec(beside.env.flown))
+        CONTROLLERS[name](env_spec(beside.env))
         return [Row(agent=name, name=name, env=beside.env)]
     return []

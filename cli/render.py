@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Literal, NamedTuple
 
@@ -61,6 +61,7 @@ class Render(EnvFlags):
         from ..flights.filming import Film, FilmTrack, film
         from ..rendering.film import check_film
         from ..rendering.gl import offscreen_context
+        from ._env import with_vehicle
         from ._progress import frame_bar
 
         width, height = parse_size(self.size)
@@ -70,6 +71,7 @@ class Render(EnvFlags):
         self._check()
         offscreen_context(16, 16).free()  # flying takes longer than finding no OpenGL
         found = [self._find(what) for what in self.what]
+        config = replace(config, vehicle=with_vehicle(self, *self.what).vehicle)
         names = self.names or _distinct([flown.name for flown in found], self.what)
         colors = _colors([flown.agent for flown in found])
         tracks = [
@@ -108,7 +110,7 @@ class Render(EnvFlags):
 
     def _find(self, what: str) -> "_Flown":
         """Flights of a policy or a journal."""
-        from ._env import chosen_drones, pilot_of
+        from ._env import chosen_drones, chosen_vehicle, pilot_of
 
         episodes = range(self.episode, self.episode + self.episodes)
         path = Path(what)
@@ -117,10 +119,11 @@ class Render(EnvFlags):
             return _Flown(path.stem, path.stem, recorded, 1)
         checkpoint, policy, env = pilot_of(self, what)
         drones = chosen_drones(self, checkpoint)
+        vehicle = chosen_vehicle(self, checkpoint)
         agent = checkpoint.algorithm if checkpoint else what
         name = what if what == "random" else agent_label(agent)
         flown = flown_trajectories(
-            policy, *env, episodes, vehicle=self.vehicle, of="final", drones=drones
+            policy, *env, episodes, vehicle=vehicle, of="final", drones=drones
         )
         return _Flown(agent, name, flown, drones)
 

@@ -53,19 +53,17 @@ class Sweep(StudyFlags):
         return Study(rows=tuple(rows), kind="sweep", evaluation="tuning", **settings)
 
     def _row(self, point: Mapping[str, Any]) -> "Row":
-        from dataclasses import replace
-
         from ..training.settings import Row
 
         changes = self.changes()
-        options = dict(self.options)
+        options: dict[str, Any] = {}
         for name, value in point.items():
             if name.startswith("env."):
                 options[name.removeprefix("env.").replace("-", "_")] = value
             else:
                 changes[name] = value
         words = [f"{name}={json.dumps(value)}" for name, value in point.items()]
-        env = replace(self.env_config(), options=options)
+        env = self.env_config().changed(**options)
         settings: dict[str, Any] = {"env_steps": 200_000, "num_envs": env.drones}
         settings |= {"backend": "mujoco"} | self.given_of_rows()
         name = " ".join(words).replace('"', "").replace(", ", ",")

@@ -8,7 +8,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -27,6 +27,7 @@ from ..agents import (
 )
 from ..agents.checkpoints import Checkpoint, software_versions, write_whole
 from ..agents.presets import PresetName
+from ..envs.config import EnvConfig
 from ..flights.folders import locked
 from ..models.errors import InputError, require
 from ..training.settings import Run
@@ -99,7 +100,7 @@ class Train(AgentFlags, BackendFlags):
         return self._resume(self.resume) if self.resume else self._begin()
 
     def _begin(self) -> int:
-        from ..training.training import Training
+        from ..training.training import Training, config_of
 
         check_count("drones", self.drones)
         start, told = self._start()
@@ -119,19 +120,24 @@ class Train(AgentFlags, BackendFlags):
         chosen = {name: getattr(base, name) if n is None else n for name, n in named.items()}
         if self.num_envs is None:  # whole worlds
             chosen["num_envs"] = max(base.num_envs // self.drones, 1) * self.drones
-        run = Run(config=config, **{**self.settings(Run), **chosen})
+        backend = chosen.pop("backend")
+        env_config = EnvConfig.from_keywords(
+            self.env_id, vehicle=self.vehicle, drones=self.drones, backend=backend, **self.options
+        )
+        run = Run(env=env_config, algorithm=self.algorithm, config=config, seed=self.seed, **chosen)
         required = bool(self.options) or "env" in self.given
         with (
             folder_to_write(self.out, f"{run.algorithm}-seed{run.seed}") as folder,
             self._env(self.env_id, self.options, required=required, num_envs=run.num_envs,
-                      drones=run.drones, backend=run.backend) as env,
+                      drones=self.drones, backend=backend) as env,
             locked(folder),
         ):  # fmt: skip
             spec = env.env_spec  # of the simulator that came
-            run = replace(run, env_id=spec.env_id, options=spec.options, drones=len(spec.agents))
+            if self.listen is not None:
+                run = replace(run, env=config_of(spec, backend, self.vehicle))
             training = Training(run, env, start=start)
             about = {"vehicle_hash": spec.vehicle_hash, "versions": software_versions()}
-            content = json.dumps({**asdict(run), **told, **about}, indent=2) + "\n"
+            content = json.dumps({**run.to_dict(), **told, **about}, indent=2) + "\n"
             write_whole(folder / "config.json", content.encode())
             return self._train(training, folder)
 
@@ -148,7 +154,7 @@ class Train(AgentFlags, BackendFlags):
 
     def _resume(self, folder: Path) -> int:
         from ..training.training import Training, is_finished
-        from ._env import CHECKPOINT
+        from ._env import CHECKPOINT, chosen_vehicle
 
         with locked(folder):
             kept = load(folder / CHECKPOINT)
@@ -167,8 +173,9 @@ class Train(AgentFlags, BackendFlags):
                 return 0
             for name, (then, now) in kept.other_versions().items():
                 print(f"note: {name} was {then} and is {now}: the numbers may differ", flush=True)
-            with self._env(kept.env_id, kept.options, required=True, num_envs=kept.num_envs,
-                           drones=len(kept.spec.agents), backend=kept.backend) as env:  # fmt: skip
+            again = replace(self, vehicle=chosen_vehicle(self, kept))
+            with again._env(kept.env_id, kept.options, required=True, num_envs=kept.num_envs,
+                            drones=len(kept.spec.agents), backend=kept.backend) as env:  # fmt: skip
                 return self._train(Training.resume(kept, env), folder)
 
     def _extended(self, kept: Checkpoint, folder: Path) -> Checkpoint:

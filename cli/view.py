@@ -33,7 +33,7 @@ class View(EnvFlags):
         """Fly and show, episode after episode."""
         from ..flights.filming import moments
         from ..rendering.live import Pace
-        from ._env import words_of
+        from ._env import with_vehicle, words_of
         from ._watch import open_view
 
         check_count("episodes", self.episodes)
@@ -43,7 +43,8 @@ class View(EnvFlags):
         spec = first[0].spec
         drones = len(first)
         names = spec.agents if drones > 1 else ()
-        with open_view(self, spec, drones, Pace(spec.control_period, self.speed)) as live:
+        shown = with_vehicle(self, self.what)
+        with open_view(shown, spec, drones, Pace(spec.control_period, self.speed)) as live:
             print(f"showing {self.what} in the window (Ctrl-C ends)", flush=True)
             for flight in chain((first,), flights):
                 told = [moments(one) for one in flight]
@@ -60,7 +61,7 @@ class View(EnvFlags):
 
     def _flights(self) -> Iterator[list[Trajectory]]:
         """Episode after episode, as long as there are any, each with a trajectory of each drone."""
-        from ._env import chosen_drones, pilot_of
+        from ._env import chosen_drones, chosen_vehicle, pilot_of
 
         if (path := Path(self.what)).suffix == ".mcap":
             if self.options.keys() - {"scene"}:
@@ -69,7 +70,8 @@ class View(EnvFlags):
             return
         checkpoint, policy, env = pilot_of(self, self.what)
         drones = chosen_drones(self, checkpoint)
+        vehicle = chosen_vehicle(self, checkpoint)
         for episode in count():
             yield flown_trajectories(
-                policy, *env, [episode], vehicle=self.vehicle, of="final", drones=drones
+                policy, *env, [episode], vehicle=vehicle, of="final", drones=drones
             )

@@ -9,9 +9,11 @@ Importing this package registers them. Gymnasium 1.0 stopped reading the entry p
 Neither loads MuJoCo before an env is made.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING
 
+from gymnasium import make, make_vec
+
+from .. import import_when_used
 from ..models.fields import Limits
 from .registry import register
 from .spec import ArraySpec, Discrete, EnvSpec, Mark, Metric
@@ -25,23 +27,13 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ArraySpec", "Discrete", "EnvConfig", "EnvSpec", "Limits", "LocalVectorEnv", "Loop", "Mark",
-    "Metric", "Outcome", "SingleEnv", "Task", "TaskOptions", "register",
+    "Metric", "Outcome", "SingleEnv", "Task", "TaskOptions", "make", "make_vec", "register",
 ]  # fmt: skip
 
-_HOMES: Final = {
-    "EnvConfig": "config",
-    "Loop": "loop",
-    "LocalVectorEnv": "vector",
-    "SingleEnv": "single",
-}
-
-
-def __getattr__(name: str) -> Any:
-    """Import what needs MuJoCo on first use (PEP 562)."""
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f".{_HOMES.get(name, 'tasks.task')}", __name__), name)
-
+_modules = dict.fromkeys(("Outcome", "Task", "TaskOptions"), ".tasks.task")  # they need MuJoCo
+_modules |= {"EnvConfig": ".config", "Loop": ".loop"}
+_modules |= {"LocalVectorEnv": ".vector", "SingleEnv": ".single"}
+__getattr__ = import_when_used(__name__, _modules)
 
 for _module, _name in (
     ("elevation", "Elevation"),

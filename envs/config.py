@@ -7,15 +7,16 @@ import inspect
 import json
 import sys
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from hashlib import blake2b
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Self
 
 from ..models import BACKENDS, MAX_DRONES, Backend
-from ..models.errors import InputError, UnknownOption, shortened
-from ..models.fields import Choice, Limits, check, check_fields
+from ..models.errors import InputError, shortened
+from ..models.fields import Choice, Limits, check, check_fields, check_names, read_table
+from ..models.library import is_of_the_library, vehicle_words
 from ..scenes import scenes_of
 from ..sim import EffectOptions, Randomization, checked_sensors
 from . import registry
@@ -46,7 +47,10 @@ class SceneConfig:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "seeds", tuple(self.seeds))
-        scenes_of(str(self))
+        texts = scenes_of(str(self))
+        seeds = [f"{self.name}:{seed}" for seed in self.seeds]
+        if seeds and list(texts) != seeds:
+            raise InputError(f"scene: expected consecutive seeds, got {shortened(self.seeds)}")
 
     def __str__(self) -> str:
         """The text that `parse` reads: `forest`, `forest:3` or `forest:0-7`."""
@@ -62,7 +66,7 @@ class SceneConfig:
         if isinstance(scene, cls):
             return scene
         if isinstance(scene, Mapping):
-            return cls(**known_only("scene", scene, _names(cls)))
+            return read_table(cls, scene, "scene")
         texts = scenes_of(scene)
         seeds = [text.partition(":")[2] for text in texts]
         return cls(
@@ -92,7 +96,7 @@ class BackendConfig:
         if isinstance(backend, cls):
             return backend
         if isinstance(backend, Mapping):
-            return cls(**known_only("backend", backend, _names(cls)))
+            return read_table(cls, backend, "backend")
         return cls(name=backend)
 
     @property
@@ -143,6 +147,9 @@ class EnvConfig:
     """Pictures that are observed: cameras of the vehicle as NAME, NAME_KIND or
     NAME@WIDTHxHEIGHT."""
     backend: BackendConfig = BackendConfig()
+    files: Mapping[str, Any] = field(default_factory=dict, hash=False, repr=False)
+    """Content of the files of `vehicle` by their names, as `models/bundle` has it; set by
+    `resolve`, which needs the files themselves no more."""
     vehicle_hash: str = ""
     """Hash of the vehicle's model; set by `resolve`."""
     task_hash: str = ""
@@ -152,7 +159,11 @@ class EnvConfig:
         check_fields(self)
         self._set(env_id=canonical_id(self.env_id))
         self._set(scene=SceneConfig.parse(self.scene), backend=BackendConfig.parse(self.backend))
-        self._set(vehicle=_vehicles(self.vehicle), cameras=_words("cameras", self.cameras))
+        self._set(vehicle=vehicle_words(self.vehicle), cameras=_words("cameras", self.cameras))
+        if self.files:
+            from ..models.bundle import checked_bundles
+
+            self._set(files=checked_bundles(self.files))
         self._set(sensors=checked_sensors(self.sensors))
         if not isinstance(self.effects, EffectOptions):
             self._set(effects=EffectOptions.from_options(self.effects))
@@ -189,13 +200,11 @@ class EnvConfig:
             return env_id
         options = {name: value for name, value in keywords.items() if name not in KEYWORDS}
         nested = options.pop("task", {})
-        given = {name: value for name, value in keywords.items() if name not in options}
-        given = {name: value for name, value in given.items() if value is not None}
-        given.pop("task", None)
-        settings = {name: given.pop(name) for name in _BACKEND_KEYWORDS if name in given}
+        given = {name: keywords[name] for name in KEYWORDS if keywords.get(name) is not None}
+        settings = {name: given.pop(name) for name in BACKEND_KEYWORDS if name in given}
         if settings:
-            base = BackendConfig.parse(given.get("backend", BackendConfig()))
-            given["backend"] = replace(base, **settings)
+            backend = BackendConfig.parse(given.get("backend", "mujoco"))
+            given["backend"] = replace(backend, **settings)
         if not isinstance(nested, Mapping):
             raise InputError(f"task: expected options by name, got {shortened(nested)}")
         return cls(env_id=env_id, task={**options, **nested}, **given)
@@ -207,12 +216,28 @@ class EnvConfig:
         """
         values: dict[str, Any] = {name: getattr(self, name) for name in _OPTIONS}
         values["effects"] = self.effects.to_options()
-        if self.cameras:
-            values["scene"] = str(self.scene)
+        values["scene"] = str(self.scene) if self.cameras else None
+        values["task"] = {name: value for name, value in self.task.items() if name in KEYWORDS}
         values = {name: value for name, value in values.items() if value not in (None, (), {})}
-        hidden = {name: value for name, value in self.task.items() if name in KEYWORDS}
         shown = {name: value for name, value in self.task.items() if name not in KEYWORDS}
-        return json_values({**values, **shown, **({"task": hidden} if hidden else {})})
+        return json_values(values | shown)
+
+    def keywords(self) -> dict[str, Any]:
+        """Keywords of `from_keywords` that make the same config, as JSON values."""
+        values: dict[str, Any] = {"env_id": self.own_task or self.env_id}
+        if self.vehicle:
+            values["vehicle"] = list(self.vehicle)
+        if self.backend != BackendConfig():
+            values["backend"] = asdict(self.backend)
+        if self.scene != SceneConfig():
+            values["scene"] = str(self.scene)
+        return {**values, "drones": self.drones, **self.flat_options()}
+
+    def changed(self, **keywords: Any) -> "EnvConfig":
+        """The same with other keywords. Raises `InputError`."""
+        given = {**self.keywords(), "env_id": self.env_id, **keywords}
+        other = EnvConfig.from_keywords(**given)
+        return replace(other, files=self.files) if other.vehicle == self.vehicle else other
 
     @classmethod
     def from_toml(cls, path: Path | str, **keywords: Any) -> "EnvConfig":
@@ -238,7 +263,8 @@ class EnvConfig:
         version = given.pop("version", None)
         if version != VERSION:
             raise InputError(f"config: expected version {VERSION}, got {shortened(version)}")
-        return cls(**known_only("config", given, _names(cls)))
+        check_names(given, [one.name for one in fields(cls)], "config")
+        return cls(**given)
 
     # ---- checks that need more than one field, and the files
 
@@ -250,6 +276,11 @@ class EnvConfig:
         return None if name.startswith("rotorgram.") or name == "__main__" else name
 
     @property
+    def own_task(self) -> str | None:
+        """`module:id` of a user's task; None for ours."""
+        return f"{self.module}:{self.env_id}" if self.module else None
+
+    @property
     def task_options(self) -> "TaskOptions":
         """The task's options as its own dataclass."""
         return registry.task_type(self.env_id).Options.from_options(self.task)
@@ -259,15 +290,38 @@ class EnvConfig:
         """Whether controller and observation get the onboard estimate, once a control step."""
         return self.sensors.get("observe") == "estimate"
 
+    @property
+    def vehicle_paths(self) -> tuple[str, ...]:
+        """Names and files of the vehicles; files that are not here are written to a folder."""
+        if not self.files:
+            return self.vehicle
+        from ..models.bundle import unpacked
+
+        files = {word: str(unpacked(word, bundle)) for word, bundle in self.files.items()}
+        return tuple(files.get(word, word) for word in self.vehicle)
+
     def load_vehicle(self) -> "Vehicle":
         """The vehicle, or a `Fleet` of several. Raises `InputError`."""
         from ..models.fleet import load_vehicles
 
-        words = ",".join(self.vehicle) or None
+        words = self.vehicle_paths or None
         return load_vehicles(words, self.drones, linear_drag=self.effects.linear_drag)
 
+    def embedded(self) -> Self:
+        """The same with the content of the vehicles' files, for a process that has not the files.
+
+        Raises `InputError`.
+        """
+        words = [word for word in self.vehicle if word not in self.files]
+        words = [word for word in words if not is_of_the_library(word)]
+        if not words:
+            return self
+        from ..models.bundle import read_bundle  # it imports MuJoCo
+
+        return replace(self, files={**self.files, **{word: read_bundle(word) for word in words}})
+
     def resolve(self) -> Self:
-        """The same with the hashes of its files. Refuses by name what cannot be flown together.
+        """The same with its files and hashes. Refuses by name what cannot be flown together.
 
         Raises `InputError`.
         """
@@ -278,7 +332,8 @@ class EnvConfig:
             most = f" to {task.max_drones}" if task.max_drones > task.min_drones else ""
             expected = f"{task.min_drones}{most} with {self.env_id}"
             raise InputError(f"drones: expected {expected}, got {self.drones}")
-        vehicle = self.load_vehicle()
+        whole = self.embedded()
+        vehicle = whole.load_vehicle()
         vehicle.substeps(self.control_period or 0.0)
         several = len(self.vehicle) > 1
         if several and self.sensors:
@@ -287,7 +342,7 @@ class EnvConfig:
         randomize = Randomization(self.randomize, None)
         settings = self.backend.settings
         check_world(vehicle, self.backend.name, self.drones, self.effects, randomize, settings)
-        resolved = replace(self, vehicle_hash=vehicle.hash, task_hash=source_hash(task))
+        resolved = replace(whole, vehicle_hash=vehicle.hash, task_hash=source_hash(task))
         for name in ("vehicle_hash", "task_hash"):
             was = getattr(self, name)
             now = getattr(resolved, name)
@@ -300,7 +355,10 @@ class EnvConfig:
         """32 hexadecimal digits of the resolved config, without what changes no number."""
         resolved = self if self.vehicle_hash else self.resolve()
         content = resolved.to_dict()
-        content.pop("vehicle")  # its hash is there
+        for name in ("vehicle", "files"):  # their hash is there
+            content.pop(name)
+        if not self.cameras:
+            content.pop("scene")
         for name in ("num_threads", "compiled"):
             content["backend"].pop(name)
         text = json.dumps(content, sort_keys=True, separators=(",", ":"))
@@ -313,17 +371,10 @@ _OPTIONS: Final = (
     "cameras",
 )  # fmt: skip
 _FLAT: Final = (*_OPTIONS, "scene", "vehicle", "drones", "backend")
-_BACKEND_KEYWORDS: Final = ("num_threads", "dtype", "compiled")
-KEYWORDS: Final = (*_FLAT, *_BACKEND_KEYWORDS)
+BACKEND_KEYWORDS: Final = ("num_threads", "dtype", "compiled")
+"""Keywords that are settings of the backend."""
+KEYWORDS: Final = (*_FLAT, *BACKEND_KEYWORDS)
 """Keywords that are not options of a task."""
-
-
-def known_only(what: str, given: Mapping[str, Any], known: Sequence[str]) -> dict[str, Any]:
-    """The given values by name. Raises `UnknownOption` for a name that is not known."""
-    for name in given:
-        if name not in known:
-            raise UnknownOption(f"{what}: expected some of {', '.join(known)}, got {name!r}")
-    return dict(given)
 
 
 def read_toml(path: Path | str) -> dict[str, Any]:
@@ -338,7 +389,7 @@ def read_toml(path: Path | str) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise InputError(f"config: expected a TOML file, got {file}: {error}") from None
     if "vehicle" in content:
-        words = _vehicles(content["vehicle"])
+        words = vehicle_words(content["vehicle"])
         beside = [file.parent / word for word in words]
         content["vehicle"] = tuple(
             str(near) if near.is_file() else word for near, word in zip(beside, words, strict=True)
@@ -360,24 +411,6 @@ def source_hash(task: type) -> str:
         digest.update(source.encode())
         found = True
     return digest.hexdigest() if found else ""
-
-
-def _names(kind: type) -> list[str]:
-    return [one.name for one in fields(kind)]
-
-
-def _vehicles(given: Any) -> tuple[str, ...]:
-    """Names and files of vehicles, of a text with commas between them or of several texts."""
-    if isinstance(given, str | Path):
-        text = str(given)
-        several = isinstance(given, str) and "," in text and not Path(text).exists()
-        return tuple(word.strip() for word in text.split(",")) if several else (text,)
-    if not isinstance(given, list | tuple):
-        raise InputError(f"vehicle: expected names or files, got {shortened(given)}")
-    for word in given:
-        if not isinstance(word, str | Path):
-            raise InputError(f"vehicle: expected names or files, got {shortened(given)}")
-    return tuple(str(word) for word in given)
 
 
 def _words(name: str, given: Any) -> tuple[str, ...]:

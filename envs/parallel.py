@@ -5,11 +5,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..models.errors import InputError, require, shortened
+from ..models.errors import InputError, require
 from ..sim.snapshots import Arrays
 from .autoreset import AdvancingVectorEnv
 from .rendering import RENDER_MODES
-from .spaces import action_space, observation_space
+from .spaces import action_space, checked_action, observation_space
 from .vector import LocalVectorEnv
 
 require("pettingzoo", "swarm", "the parallel env")
@@ -70,15 +70,15 @@ class AdvancingParallelEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc]
         """
         flown = self.agents
         world = self._world
-        right = isinstance(actions, dict) and actions.keys() >= set(flown)
-        got = sorted(actions) if isinstance(actions, dict) else type(actions).__name__
-        if not right:
+        if not isinstance(actions, dict) or not actions.keys() >= set(flown):
+            got = sorted(actions) if isinstance(actions, dict) else type(actions).__name__
             raise InputError(f"actions: expected a dict with {', '.join(flown)}, got {got}")
-        space = world.action_space
-        given = np.zeros(space.shape or (), space.dtype)
+        given = np.zeros(world.action_space.shape or (), world.action_space.dtype)
         with np.errstate(over="ignore"):  # an overflow is infinite, and refused as such
             for agent in flown:
-                given[self._rows[agent]] = self._checked(agent, actions[agent])
+                space = self.action_spaces[agent]
+                name = f"actions of {agent}"
+                given[self._rows[agent]] = checked_action(actions[agent], space, name)
         seen, rewards, terminated, truncated, info = world.step(given)
         left, scores, ends, cuts = (
             {agent: values[self._rows[agent]].item() for agent in flown}
@@ -97,26 +97,14 @@ class AdvancingParallelEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc]
         """Close the window or tell the simulator; release memory."""
         self._world.close()
 
-    def _checked(self, agent: str, action: Any) -> np.ndarray:
-        try:
-            array = np.asarray(action)
-        except ValueError:
-            array = np.asarray(None)
-        shape = self.action_spaces[agent].shape
-        right = array.dtype.kind in "iuf" and array.shape == shape
-        expected = f"an array of real numbers of shape {shape} for {agent}"
-        if not right:
-            raise InputError(f"actions: expected {expected}, got {shortened(action)}")
-        return array
-
     def _told(self, seen: Any, info: dict[str, Any], agents: list[str]) -> tuple[Told, Told]:
         """Observations and infos of some agents."""
         names = [name for name in info if not name.startswith("_")]
+        several = isinstance(seen, dict)
         observations = {}
         infos = {}
         for agent in agents:
             row = self._rows[agent]
-            several = isinstance(seen, dict)
             observations[agent] = {n: x[row] for n, x in seen.items()} if several else seen[row]
             infos[agent] = {name: info[name][row] for name in names if info[f"_{name}"][row]}
         return observations, infos

@@ -11,7 +11,7 @@ from ..sim.snapshots import Arrays
 from .config import EnvConfig
 from .loop import Loop
 from .rendering import RENDER_MODES, Renderer
-from .spaces import action_space, observation_space, telemetry_names
+from .spaces import action_space, checked_action, observation_space, telemetry_names
 
 
 class SingleEnv(gym.Env[Any, Any]):
@@ -116,23 +116,7 @@ class SingleEnv(gym.Env[Any, Any]):
     def _checked(self, action: Any) -> np.ndarray:
         if isinstance(action, np.ndarray) and (action.dtype, action.shape) == self._usual:
             return action
-        space, shape = self.action_space, self.action_space.shape
-        if isinstance(space, gym.spaces.Discrete):
-            if not space.contains(action):
-                expected = f"a whole number 0 to {space.n - 1}"
-                raise InputError(f"action: expected {expected}, got {action!r}")
-            return np.array((action,))
-        try:
-            array = np.asarray(action)
-        except ValueError:
-            array = np.asarray(None)
-        if array.dtype.kind not in "iuf":
-            raise InputError(
-                f"action: expected an array of shape {shape} of real numbers, got {action!r}"
-            )
-        if array.shape != shape:
-            raise InputError(f"action: expected an array of shape {shape}, got {array.shape}")
-        return array
+        return checked_action(action, self.action_space, "action")
 
     def _observation(self) -> Any:
         observations = self._loop.observations

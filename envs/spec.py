@@ -9,12 +9,12 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields
-from typing import Any, ClassVar, Final, Literal, Self
+from typing import Annotated, Any, ClassVar, Final, Literal, Self
 
 import numpy as np
 
 from ..models.errors import InputError, shortened
-from ..models.fields import check_fields
+from ..models.fields import Limits, Text, check_fields
 from ..scenes import marks
 
 MAX_ELEMENTS: Final = 1 << 22  # numbers of all observations of one drone
@@ -27,6 +27,8 @@ MAX_NAME: Final = 200  # characters of a name, unit or frame
 
 _DTYPES: Final = ("float32", "float64", "uint8", "int32", "int64")
 _CONTROL: Final = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")  # and halves of pairs
+_SIZE: Final = Limits(0.0, above=True)
+_DIGEST: Final = re.compile("[0-9a-f]{32}")
 _CONSTANT: Final = re.compile(r"[a-z][a-z0-9_]{0,63}")
 _LARGEST: Final = float(np.finfo(np.float64).max)
 _NO_BOUND: Final = {"low": -math.inf, "high": math.inf}
@@ -71,12 +73,11 @@ class _Part:
         given = {}
         for f in fields(cls):  # type: ignore[arg-type]
             name = f.metadata.get("json", f.name)
-            optional = f.default is not MISSING or f.default_factory is not MISSING
-            there = name in content
-            _expect(optional or there, "spec", f"{name} in {cls.__name__}", list(content))
-            if there:
+            if name in content:
                 value = content[name]
                 given[f.name] = tuple(value) if isinstance(value, list) else value
+            elif f.default is MISSING and f.default_factory is MISSING:
+                raise SpecError(f"spec: expected {name} in {cls.__name__}, got {list(content)}")
         return given
 
     @classmethod
@@ -106,12 +107,10 @@ class ArraySpec(_Part):
     """What the values 0, 1, 2... stand for, where they are numbers of something; or none."""
 
     def __post_init__(self) -> None:
-        _check_text("name", self.name)
-        _check_words(f"{self.name}: categories", self.categories)
         name = self.name
         shape = self.shape
-        units = self.unit
         names = self.components
+        _check_text("name", name)
         _expect(name, "name", "a name for an array", name)
         is_shape = isinstance(shape, tuple) and all(type(n) is int and n >= 1 for n in shape)
         _expect(is_shape, name, "a shape of whole numbers >= 1", shape)
@@ -126,11 +125,13 @@ class ArraySpec(_Part):
             first = int(wrong.argmax())
             got = f"{low.flat[first]} and {high.flat[first]}"
             raise SpecError(f"{name}: expected low <= high, got {got} at element {first}")
-        _check_words(f"{name}: unit", (units,) if isinstance(units, str) else units)
-        several = not isinstance(units, str)
-        _expect(not several or len(units) == self.size, name, f"{self.size} units", len(units))
+        one_unit = isinstance(self.unit, str)
+        units = (self.unit,) if one_unit else self.unit
+        _check_words(f"{name}: unit", units)
+        _expect(one_unit or len(units) == self.size, name, f"{self.size} units", len(units))
         _check_text(f"{name}: frame", self.frame)
         _check_words(f"{name}: components", names)
+        _check_words(f"{name}: categories", self.categories)
         right = not names or len({*names} - {""}) == len(names) == self.size
         _expect(right, name, f"{self.size} different components", names)
 
@@ -193,15 +194,15 @@ class Metric(_Part):
 
     _optional = ("settled", "held", "symbol", "signed", "final")
 
-    name: str
-    unit: str
+    name: Annotated[str, Text(MAX_NAME)]
+    unit: Annotated[str, Text(MAX_NAME, empty=True)]
     goal: Literal["zero", "high"] = "zero"
     """`zero`: an error, signed or not; 0 is best. `high`: larger is better."""
-    settled: float | None = None
+    settled: Annotated[float | None, _SIZE] = None
     """Size of the error below which an episode counts as settled; None if undefined."""
-    held: float | None = None
+    held: Annotated[float | None, _SIZE] = None
     """Mean size of the error at the end of an episode below which its goal counts as held."""
-    symbol: str = ""
+    symbol: Annotated[str, Text(MAX_NAME, empty=True)] = ""
     """Short symbol for figures and overlays, as E; empty: the name."""
     signed: bool = False
     """Whether it changes sign where it passes its best: then there is an overshoot."""
@@ -210,18 +211,7 @@ class Metric(_Part):
     the last quarter. An episode that terminates with its goal held is then no crash."""
 
     def __post_init__(self) -> None:
-        for name in ("name", "unit", "symbol"):
-            _check_text(f"metric: {name}", getattr(self, name))
-        name = self.name
-        _expect(name, "metric", "a name", name)
-        _expect(self.goal in ("zero", "high"), name, "the goal 'zero' or 'high'", self.goal)
-        for field_name in ("signed", "final"):
-            value = getattr(self, field_name)
-            _expect(type(value) is bool, name, f"{field_name} to be true or false", value)
-        for field_name in ("settled", "held"):
-            value = getattr(self, field_name)
-            right = value is None or (_is_number(value) and 0 < value <= _LARGEST)
-            _expect(right, name, f"{field_name} > 0 or None", value)
+        check_fields(self, "metric: ", SpecError)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -238,7 +228,7 @@ class Mark(marks.Mark, _Part):
 class EnvSpec(_Part):
     """Everything that an agent must know of an env. Arrays are those of one drone."""
 
-    _optional = ("constants", "marks")
+    _optional = ("config_digest", "constants", "marks")
 
     env_id: str
     options: Mapping[str, Any] = field(default_factory=dict)
@@ -249,6 +239,9 @@ class EnvSpec(_Part):
     """Name of the vehicle's model."""
     vehicle_hash: str = "0" * 32
     """32 hexadecimal digits: the same model, the same hash; zeros where there is none."""
+    config_digest: str = ""
+    """32 hexadecimal digits of the resolved `EnvConfig`, or empty. The same digest, the same
+    numbers."""
     agents: tuple[str, ...] = ("drone_0",)
     """One name for each drone of a world."""
     observation: tuple[ArraySpec, ...]
@@ -267,13 +260,15 @@ class EnvSpec(_Part):
         object.__setattr__(self, "options", json_values(self.options))
         object.__setattr__(self, "constants", _checked_constants(self.constants))
         period = self.control_period
-        digits = self.vehicle_hash
         agents = self.agents
         right = _is_number(period) and 1e-6 <= period <= 1e3
         _expect(right, "control_period", "1e-6 to 1e3 s", period)
         _check_text("vehicle", self.vehicle)
-        right = isinstance(digits, str) and bool(re.fullmatch("[0-9a-f]{32}", digits))
-        _expect(right, "vehicle_hash", "32 hex digits", digits)
+        for name in ("vehicle_hash", "config_digest"):
+            digits = getattr(self, name)
+            right = isinstance(digits, str) and bool(_DIGEST.fullmatch(digits))
+            right = right or (digits == "" and name in self._optional)
+            _expect(right, name, "32 hex digits", digits)
         _check_words("agents", agents)
         right = 1 <= len({*agents}) == len(agents) <= MAX_AGENTS
         _expect(right, "agents", f"1 to {MAX_AGENTS} different names", agents)

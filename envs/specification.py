@@ -28,7 +28,21 @@ def make_task(config: EnvConfig, shape: tuple[int, ...] = (1, 1)) -> Task:
     for name in ("controller", "observation"):
         if not hasattr(task, name):
             raise InputError(f"{env_id}: expected setup() to set self.{name}, it does not")
+    if task.config is not config:
+        _check_kept(config, task.config)
     return task
+
+
+def _check_kept(config: EnvConfig, adjusted: EnvConfig) -> None:
+    """Raise `InputError` if a task's `adjust` dropped or changed a setting of the user."""
+    now = adjusted.keywords()
+    for name, value in config.keywords().items():
+        other = now.get(name)
+        kept = other == value
+        if isinstance(value, dict) and isinstance(other, dict):
+            kept = value.items() <= other.items()
+        if not kept:
+            raise InputError(f"{config.env_id}: expected adjust() to keep {name}, got {other!r}")
 
 
 def spec_of(
@@ -43,6 +57,7 @@ def spec_of(
         control_period=task.control_period,
         vehicle=task.vehicle.name,
         vehicle_hash=task.vehicle.hash,
+        config_digest=config.digest,
         agents=drone_names(config.drones),
         observation=tuple(observation),
         action=_action(task.controller),

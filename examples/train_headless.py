@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 from rotorgram.agents import preset, store
+from rotorgram.envs import EnvConfig
 from rotorgram.flights.trajectories import fly_episodes
 from rotorgram.training.metrics import steady_state
 from rotorgram.training.settings import Run
@@ -28,19 +29,18 @@ args = parser.parse_args()
 run = Run(
     algorithm="a2c",
     config=preset("a2c", "tuned", steps_per_update=1024, learning_rate=0.02),
-    env_id="rotorgram/Elevation-v0",
-    options={"target": (4.0, 8.0)},  # a target of its own for every episode
+    env=EnvConfig(task={"target": (4.0, 8.0)}),  # a target of its own for every episode
     seed=0,
     env_steps=args.env_steps,
     num_envs=args.num_envs,
 )
-with spawn_simulator(run.flown, num_envs=run.num_envs) as drones:  # agent here, simulator beside it
+with spawn_simulator(run.env, num_envs=run.num_envs) as drones:  # agent here, simulator beside it
     training = Training(run, drones)
     training.train()
 store(training.checkpoint(), args.out)
 print(f"{training.log.env_steps:,} env steps in {training.log.seconds:.1f} s: {args.out}")
 
-with spawn_simulator(run.flown) as drone:
+with spawn_simulator(run.env) as drone:
     policy = training.agent.policy()
     trajectories = fly_episodes(drone, policy, episodes=5)
 errors = [abs(one.headline[1:]) for one in trajectories]

@@ -275,7 +275,7 @@ def flown_trajectories(
     options: Mapping[str, Any],
     episodes: Sequence[int],
     *,
-    vehicle: str | Path | None = None,
+    vehicle: str | Path | Sequence[str] | None = None,
     of: EpisodeSet = "curve",
     drones: int = 1,
     training_seed: int | None = None,

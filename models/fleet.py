@@ -11,6 +11,7 @@ from typing import Any, Self
 import numpy as np
 
 from .errors import InputError
+from .library import vehicle_words
 from .vehicle import Vehicle
 
 
@@ -77,21 +78,23 @@ class Fleet(Vehicle):
 
     def __reduce__(self) -> tuple[object, ...]:
         """Loaded again from its files."""
-        paths = ",".join(str(one.path) for one in self.members)
+        paths = [str(one.path) for one in self.members]
         return partial(load_vehicles, linear_drag=self.linear_drag), (paths, len(self.members))
 
 
-def load_vehicles(vehicle: Path | str | None, drones: int, *, linear_drag: float = 0.0) -> Vehicle:
-    """The vehicle of all drones of a world; or a `Fleet`, where the text names several.
+def load_vehicles(
+    vehicle: Path | str | Sequence[str] | None, drones: int, *, linear_drag: float = 0.0
+) -> Vehicle:
+    """The vehicle of all drones of a world; or a `Fleet`, where several are named.
 
-    These are names or files with commas between them: the vehicles of the drones in their order,
-    and from the first on again where there are more drones. Raises `InputError`.
+    These are names or files: the vehicles of the drones in their order, and from the first on again
+    where there are more drones. Raises `InputError`.
     """
-    several = isinstance(vehicle, str) and "," in vehicle and not Path(vehicle).exists()
-    names = [name.strip() for name in str(vehicle).split(",")] if several else [vehicle]
-    expected = f"at most one vehicle for each of {drones} drones"
-    if not len(names) <= drones:
-        raise InputError(f"vehicle: expected {expected}, got {len(names)}: {vehicle}")
+    names = vehicle_words(vehicle) or (None,)
+    if len(names) > drones:
+        expected = f"at most one vehicle for each of {drones} drones"
+        got = ",".join(map(str, names))
+        raise InputError(f"vehicle: expected {expected}, got {len(names)}: {got}")
     found = [Vehicle.load(name, linear_drag=linear_drag) for name in names]
     if len(set(found)) == 1:
         return found[0]

@@ -1,12 +1,13 @@
 """Where a vehicle's file is: a path, or the bare name of a vehicle that comes with the package."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
 from . import QUAD_XML
 from .errors import InputError, shortened
 
-__all__ = ["LIBRARY", "find_vehicle", "vehicle_names"]
+__all__ = ["LIBRARY", "find_vehicle", "is_of_the_library", "vehicle_names", "vehicle_words"]
 
 LIBRARY: Final = Path(__file__).parent / "vehicles"
 """One folder for each vehicle: `NAME/vehicle.toml`."""
@@ -15,6 +16,25 @@ LIBRARY: Final = Path(__file__).parent / "vehicles"
 def vehicle_names() -> list[str]:
     """Bare names of the vehicles that come with the package, sorted."""
     return sorted(file.parent.name for file in LIBRARY.glob("*/vehicle.toml"))
+
+
+def vehicle_words(given: object) -> tuple[str, ...]:
+    """Names and files of vehicles, of a text with commas between them or of several texts; none of
+    None. Raises `InputError`.
+    """
+    if given is None:
+        return ()
+    words: Sequence[object] = given if isinstance(given, list | tuple) else (given,)
+    if isinstance(given, str) and "," in given and not Path(given).exists():
+        words = [word.strip() for word in given.split(",")]
+    if not all(isinstance(word, str | Path) for word in words):
+        raise InputError(f"vehicle: expected names or files, got {shortened(given)}")
+    return tuple(map(str, words))
+
+
+def is_of_the_library(vehicle: str) -> bool:
+    """Whether a word is the bare name of such a vehicle, and of no file here."""
+    return vehicle in vehicle_names() and not Path(vehicle).is_file()
 
 
 def find_vehicle(vehicle: Path | str | None) -> Path:
@@ -28,7 +48,7 @@ def find_vehicle(vehicle: Path | str | None) -> Path:
         )
     path = Path(vehicle)
     word = str(vehicle)
-    if word in vehicle_names() and not path.is_file():
+    if is_of_the_library(word):
         return (LIBRARY / word / "vehicle.toml").resolve()
     if path.suffix == "" and path.name == word and not path.exists():
         known = ", ".join(vehicle_names())

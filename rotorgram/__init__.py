@@ -7,8 +7,9 @@
 """
 
 import sys
+from collections.abc import Callable, Mapping
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 # `python -m rotorgram.cli`: no file of the working directory takes the place of a package.
 _runs_ours = sys.argv[:1] == ["-m"] and "rotorgram" in " ".join(sys.orig_argv[:4])
@@ -28,20 +29,19 @@ __all__ = [
     "TaskOptions", "Vehicle", "load", "make", "make_vec", "register",
 ]  # fmt: skip
 
-_HOMES: Final = {
-    "RemoteEnv": "udp",
-    "RemoteVectorEnv": "udp",
-    "Vehicle": "models",
-    "load": "agents",
-}
+
+def import_when_used(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
+    """`__getattr__` of a package (PEP 562) that imports each name from its module on first use."""
+
+    def find(name: str) -> Any:
+        if name not in modules:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        return getattr(import_module(modules[name], package), name)
+
+    return find
 
 
-def __getattr__(name: str) -> Any:
-    """Import a name on first use (PEP 562)."""
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    envs = import_module(".envs", __name__)  # registers them
-    if name in ("make", "make_vec"):
-        return getattr(import_module("gymnasium"), name)
-    home = _HOMES.get(name)
-    return getattr(envs if home is None else import_module(f".{home}", __name__), name)
+_modules = dict.fromkeys(__all__, ".envs")
+_modules |= {"RemoteEnv": ".udp", "RemoteVectorEnv": ".udp", "Vehicle": ".models"}
+_modules |= {"load": ".agents"}
+__getattr__ = import_when_used(__name__, _modules)

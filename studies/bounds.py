@@ -18,7 +18,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 from rotorgram.agents.pid import SHARES
-from rotorgram.envs.config import EnvConfig as FlownConfig
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.loop import Loop
 from rotorgram.envs.spec import canonical_id
 from rotorgram.envs.tasks.elevation import ERROR_SCALE
@@ -27,7 +27,6 @@ from rotorgram.envs.tasks.recovery import Recovery, RecoveryOptions
 from rotorgram.envs.tasks.waypoints import WaypointsOptions
 from rotorgram.flights.trajectories import evaluation_seed
 from rotorgram.models.vehicle import Vehicle
-from rotorgram.training.settings import EnvConfig
 
 _HALVINGS: Final = 24
 RECOVERY: Final = "rotorgram/Recovery-v0"
@@ -41,16 +40,15 @@ def known_bounds(config: EnvConfig, episodes: int) -> dict[str, float]:
     """
     if canonical_id(config.env_id) != "rotorgram/Elevation-v0":
         return {}
-    flown = config.flown
-    loop = Loop(flown, episodes)
+    loop = Loop(config, episodes)
     seeds = [evaluation_seed(episode, "final") for episode in range(episodes)]
     loop.advance(np.zeros((episodes, 1), np.float32), np.ones(episodes, bool), seeds)
     starts = np.array(loop.telemetry["metrics"][:, 0])
     loop.close()
-    return elevation_bounds(flown, flown.load_vehicle(), starts)
+    return elevation_bounds(config, config.load_vehicle(), starts)
 
 
-def elevation_bounds(config: FlownConfig, vehicle: Vehicle, starts: Floats) -> dict[str, float]:
+def elevation_bounds(config: EnvConfig, vehicle: Vehicle, starts: Floats) -> dict[str, float]:
     """Mean returns of the two flights by name, over episodes that start at E in m, shape (n,)."""
     options = config.task_options
     steps = config.episode_length or 0
@@ -213,7 +211,7 @@ def recovery_bounds(
     angles = np.radians(np.arange(360.0))
     axes = np.stack((np.cos(angles), np.sin(angles), 0.0 * angles), axis=1)
     turn = max(map(vehicle.turning, axes)) / float(np.cos(np.radians(0.5)))  # between the axes
-    most = Recovery(FlownConfig.from_keywords(RECOVERY, **options.to_options()), vehicle).spin
+    most = Recovery(EnvConfig.from_keywords(RECOVERY, **options.to_options()), vehicle).spin
     rates = dice.uniform(-most, most, (count, 3))
     tilt = np.arccos(dice.uniform(-1.0, 1.0, count))
     climb = dice.uniform(0.0, options.start_speed, count) * dice.uniform(-1.0, 1.0, count)

@@ -18,6 +18,7 @@ import numpy as np
 from measuring import RESULTS, add_row, options
 from rotorgram.agents import find_preset
 from rotorgram.envs import LocalVectorEnv
+from rotorgram.envs.config import EnvConfig
 from rotorgram.flights.trajectories import fly_episodes
 from rotorgram.training.settings import Run
 from rotorgram.training.training import Training
@@ -44,7 +45,7 @@ def measure(row: str, seed: int) -> dict[str, object]:
     for track, env_steps in ROWS[row]:
         run = Run(
             algorithm="ppo", config=preset.config, seed=seed, env_steps=env_steps,
-            num_envs=preset.num_envs, env_id=RACING, options={"track": track},
+            num_envs=preset.num_envs, env=EnvConfig(env_id=RACING, task={"track": track}),
         )  # fmt: skip
         env = made(preset.num_envs, track, preset.backend)
         training = Training(run, env, start=kept)

@@ -73,7 +73,7 @@ print(json.dumps({"sent": sent, "datagrams_per_second": round(sent / seconds)}))
 
 
 def train(run: Run, flood_seconds: float) -> dict[str, Any]:
-    with spawn_simulator(run.flown, num_envs=1) as env:
+    with spawn_simulator(run.env, num_envs=1) as env:
         training = Training(run, env)
         flood = None
         marks = []
@@ -119,8 +119,6 @@ def main() -> None:
     run = Run(
         algorithm="a2c",
         config=preset("a2c", "tuned"),
-        env_id="rotorgram/Elevation-v0",
-        options={},
         seed=0,
         env_steps=args.env_steps,
     )

@@ -42,7 +42,7 @@ def steps_per_second(
     """By the clock, and per second of a processor."""
     config = preset(algorithm, "tuned", **changes)
     run = Run(algorithm=algorithm, config=config, seed=seed, **settings)
-    with spawn_simulator(run.trained, num_envs=run.num_envs) as env:
+    with spawn_simulator(run.env, num_envs=run.num_envs) as env:
         training = Training(run, env)
         before = processor_seconds()
         training.train()

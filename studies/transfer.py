@@ -28,6 +28,7 @@ from matplotlib.figure import Figure
 from measuring import RESULTS, options, write
 from rotorgram.agents import Geometric, load, preset, store
 from rotorgram.envs import LocalVectorEnv
+from rotorgram.envs.config import EnvConfig
 from rotorgram.flights.trajectories import fly_episodes
 from rotorgram.training.metrics import steady_state
 from rotorgram.training.settings import Run
@@ -100,7 +101,7 @@ def train(row: str, seed: int, env_steps: int, path: Path) -> None:
     options = {"effects": EFFECTS, **ROWS[row]}
     run = Run(
         algorithm="ppo", config=preset("ppo", "tuned", ENV), seed=seed, env_steps=env_steps,
-        num_envs=128, env_id=ENV, options=options, vehicle=VEHICLE,
+        num_envs=128, env=EnvConfig.from_keywords(ENV, vehicle=VEHICLE, **options),
     )  # fmt: skip
     env = made(run.num_envs, VEHICLE, options)
     training = Training(run, env)

@@ -44,6 +44,7 @@ ONE: Final = EnvSpec(
     control_period=0.02,
     vehicle="quad",
     vehicle_hash="00112233445566778899aabbccddeeff",
+    config_digest="ffeeddccbbaa99887766554433221100",
     observation=(ArraySpec(name="observation", shape=(3,), low=-1.0, high=(1.0, 2.0, 3.0)),),
     action=Discrete(n=3),
     telemetry=(

@@ -36,9 +36,8 @@ def film_study(
     env = rows[0].env
     # Small enough for a page that holds the film in itself.
     camera: Camera = "top" if env.drones > 1 else "front"  # no craft hides another
-    config = Film(
-        height=400, camera=camera, fast=True, quality=27, scene=scene, vehicle=env.vehicle
-    )
+    vehicle = ",".join(env.vehicle) or None
+    config = Film(height=400, camera=camera, fast=True, quality=27, scene=scene, vehicle=vehicle)
     fresh = out.with_name(f".fresh-{out.name}")
     fresh.unlink(missing_ok=True)
     headline = results.headline(rows[0])

@@ -6,17 +6,17 @@ Imports neither torch nor pandas.
 import json
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from hashlib import blake2b
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 from ..agents import ALGORITHMS, CONTROLLERS, Config, find_preset, preset
 from ..agents.presets import PresetName
-from ..envs import config as envs
-from ..envs.registry import env_spec, is_known, load, task_type
+from ..envs.config import DEFAULT_ENV, EnvConfig
+from ..envs.registry import env_spec, load
 from ..flights.trajectories import EpisodeSet
-from ..models import BACKENDS, Backend
+from ..models import Backend
 from ..models.errors import InputError, shortened
 from ..models.fields import Limits, check_fields, check_names
 
@@ -28,63 +28,11 @@ _LONGEST_WORD: Final = 60  # characters of an option's value in a name
 
 
 @dataclass(frozen=True, kw_only=True)
-class EnvConfig:
-    """The env that is flown."""
-
-    env_id: str = "rotorgram/Elevation-v0"
-    """Id of a registered task."""
-    options: Mapping[str, Any] = field(default_factory=dict)
-    """Options of the env by name. Those that are not given have their defaults."""
-    vehicle: str | None = None
-    """File or name of the vehicle; None: the paper's."""
-    backend: Backend = "mujoco"
-    """What steps it in training. A trained policy is always evaluated on `mujoco`."""
-    drones: int = 1
-    """Drones of each world, for a task of several."""
-
-    def __post_init__(self) -> None:
-        if self.backend not in BACKENDS:
-            raise InputError(f"backend: expected {' or '.join(BACKENDS)}, got {self.backend!r}")
-        if not self.drones >= 1:
-            raise InputError(f"drones: expected 1 or more, got {self.drones}")
-        options: dict[str, Any] = dict(self.options)
-        if is_known(self.env_id):
-            options = envs.EnvConfig.from_keywords(self.env_id, **options).flat_options()
-        object.__setattr__(self, "options", json.loads(json.dumps(options)))
-
-    @property
-    def env(self) -> dict[str, Any]:
-        """Its fields by name, but for the backend."""
-        env = {"env_id": self.env_id, "options": self.options, "vehicle": self.vehicle}
-        return {**env, "drones": self.drones}
-
-    @property
-    def flown(self) -> envs.EnvConfig:
-        """The same as the config of an env, on `mujoco`."""
-        keywords = {"vehicle": self.vehicle, "drones": self.drones, **self.options}
-        return envs.EnvConfig.from_keywords(self.env_id, **keywords)
-
-    @property
-    def trained(self) -> envs.EnvConfig:
-        """The same on the backend of the training."""
-        return replace(self.flown, backend=envs.BackendConfig(name=self.backend))
-
-    @property
-    def module(self) -> str | None:
-        """Module that another process must import to know the task; None for ours."""
-        name = task_type(self.env_id).__module__ if is_known(self.env_id) else "__main__"
-        return None if name.startswith("rotorgram.") or name == "__main__" else name
-
-    @property
-    def own_task(self) -> str | None:
-        """`module:id` of a user's task; None for ours."""
-        return f"{self.module}:{self.env_id}" if self.module else None
-
-
-@dataclass(frozen=True, kw_only=True)
-class Run(EnvConfig):
+class Run:
     """Settings of one training: all that its numbers depend on but the software."""
 
+    env: EnvConfig = field(default_factory=EnvConfig)
+    """Of the training, with its backend."""
     algorithm: str
     config: Config
     seed: int
@@ -94,19 +42,25 @@ class Run(EnvConfig):
     """Drones that train it at the same time."""
 
     def __post_init__(self) -> None:
-        super().__post_init__()
+        drones = self.env.drones
         if not self.seed >= 0:
             raise InputError(f"seed: expected 0 or more, got {self.seed}")
         if not self.num_envs >= 1:
             raise InputError(f"num_envs: expected 1 or more, got {self.num_envs}")
-        if self.num_envs % self.drones != 0:
+        if self.num_envs % drones != 0:
             raise InputError(
-                f"num_envs: expected a multiple of drones = {self.drones}, got {self.num_envs}"
+                f"num_envs: expected a multiple of drones = {drones}, got {self.num_envs}"
             )
-        episode_length = int(self.options.get("episode_length", 1))
-        least = self.config.least_steps(self.num_envs, episode_length)
+        # That of a task that is not known here is among the options.
+        episode_length = self.env.episode_length or self.env.task.get("episode_length", 1)
+        least = self.config.least_steps(self.num_envs, int(episode_length))
         if not self.env_steps >= least:
             raise InputError(f"env_steps: expected at least {least}, got {self.env_steps}")
+
+    def to_dict(self) -> dict[str, Any]:
+        """All settings as JSON values."""
+        content = {one.name: getattr(self, one.name) for one in fields(self)}
+        return {**content, "env": self.env.to_dict(), "config": asdict(self.config)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,8 +72,9 @@ class Row:
     name: str = ""
     """Unique in the study. Default: agent, preset, changes and env in words."""
     env: EnvConfig = field(default_factory=EnvConfig)
+    """It is evaluated on `mujoco`."""
     backend: Backend | None = None
-    """What steps the drones in training; None: as the preset says. Evaluated is on `mujoco`."""
+    """What steps the drones in training; None: as the preset says."""
     preset: PresetName = "tuned"
     """Hyperparameters: the paper's, or ours."""
     set: Mapping[str, Any] = field(default_factory=dict)
@@ -134,11 +89,13 @@ class Row:
         if self.agent not in known:
             raise InputError(f"agent: expected one of {', '.join(known)}, got {self.agent}")
         check_fields(self)
-        env = self.env
-        if self.controller:
-            env = replace(env, options={**env.options, **self._brought_to(env)})
-        self._set(env=replace(env, backend="mujoco"), name=self.name or self._name_of(env))
-        if env_spec(env.flown).headline is None:
+        backend = self.env.backend.name
+        if backend != "mujoco":
+            raise InputError(f"env: expected the backend mujoco, for evaluation, got {backend}")
+        brought = self._brought_to(self.env)
+        env = self.env.changed(**brought) if brought else self.env
+        self._set(env=env, name=self.name or self._name_of(env))
+        if env_spec(env).headline is None:
             raise InputError(f"env_id: expected one that names a metric, got {env.env_id}")
         if self.controller:
             return
@@ -154,8 +111,9 @@ class Row:
 
     def _brought_to(self, env: EnvConfig) -> dict[str, str]:
         """Options that the controller needs, where the env has the task's defaults."""
-        usual = EnvConfig(env_id=env.env_id).options
-        return {k: v for k, v in self.brought.items() if env.options.get(k) == usual.get(k)}
+        usual = EnvConfig(env_id=env.env_id).flat_options()
+        given = env.flat_options()
+        return {k: v for k, v in self.brought.items() if given.get(k) == usual.get(k)}
 
     def _set_defaults(self) -> None:
         found = find_preset(self.agent, self.preset, self.env.env_id)
@@ -176,15 +134,15 @@ class Row:
         return " ".join([*words, self._task_words(env)])
 
     def _task_words(self, env: EnvConfig) -> str:
-        usual = {**EnvConfig(env_id=env.env_id).options, **self.brought}
+        usual = {**EnvConfig(env_id=env.env_id).flat_options(), **self.brought}
         words = [env.env_id.rpartition("/")[2]]
-        for name, value in env.options.items():
+        for name, value in env.flat_options().items():
             if value != usual.get(name):
                 words.append(f"{name}={_word(value)}")
         if env.drones > 1:
             words.append(f"of {env.drones}")
         if env.vehicle:
-            words.append(f"with {env.vehicle}")
+            words.append(f"with {','.join(env.vehicle)}")
         return " ".join(words)
 
     @property
@@ -216,16 +174,20 @@ class Row:
 
     def run(self, seed: int) -> Run:
         """The training of a seed."""
-        settings = {**self.env.env, "backend": self.backend or "mujoco"}
+        backend = replace(self.env.backend, name=self.backend or "mujoco")
         return Run(
-            algorithm=self.agent, config=self.config, seed=seed, env_steps=self.env_steps,
-            num_envs=self.num_envs, **settings,
-        )  # fmt: skip
+            env=replace(self.env, backend=backend),
+            algorithm=self.agent,
+            config=self.config,
+            seed=seed,
+            env_steps=self.env_steps,
+            num_envs=self.num_envs,
+        )
 
     def to_dict(self) -> dict[str, object]:
         """JSON values that `from_dict` reads."""
         content = {one.name: getattr(self, one.name) for one in fields(self)}
-        return {**content, "set": dict(self.set), "env": keywords_of(self.env)}
+        return {**content, "set": dict(self.set), "env": self.env.keywords()}
 
     @classmethod
     def from_dict(cls, where: str, table: object, env: Mapping[str, object] | None = None) -> "Row":
@@ -253,19 +215,9 @@ def _word(value: object) -> str:
 
 
 def env_from(keywords: Mapping[str, Any]) -> EnvConfig:
-    """An env from flat keywords: `env_id`, `vehicle`, `drones`, and options. The module of an id
-    `module:Name-v0` is imported.
-    """
-    given = dict(keywords)
-    env_id = load(given.pop("env_id", EnvConfig().env_id))
-    named = {name: given.pop(name) for name in ("vehicle", "drones") if name in given}
-    return EnvConfig(env_id=env_id, options=given, **named)
-
-
-def keywords_of(env: EnvConfig) -> dict[str, object]:
-    """The reverse of `env_from`."""
-    env_id = env.own_task or env.env_id
-    return {"env_id": env_id, "vehicle": env.vehicle, "drones": env.drones, **env.options}
+    """An env from keywords. The module of an id `module:Name-v0` is imported."""
+    env_id = load(keywords.get("env_id", DEFAULT_ENV))
+    return EnvConfig.from_keywords(**{**keywords, "env_id": env_id})
 
 
 Kind = Literal["paper", "compare", "sweep", "benchmark"]

@@ -4,7 +4,7 @@ import math
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from itertools import combinations
 from pathlib import Path
@@ -79,15 +79,15 @@ def run_study(
     """
     parts = folder / PARTS
     jobs = {
-        name: job
-        for name, job in study.runs().items()
-        if not (parts / results.part_name(*job)).exists()
+        name: (_with_files(row), seed)
+        for name, (row, seed) in study.runs().items()
+        if not (parts / results.part_name(row, seed)).exists()
     }
     config = workers or WorkersConfig()
     with open_executor(config, len(jobs), on_progress) as executor, locked(folder):
         parts.mkdir(exist_ok=True)
         if not (folder / CONFIG_FILE).exists():  # a resumed study keeps its settings
-            specs = {row.name: env_spec(row.env.flown) for row in study.rows}
+            specs = {row.name: env_spec(row.env) for row in study.rows}
             results.write_config(folder, command, study, specs)
         for unfinished in parts.glob(".*"):
             shutil.rmtree(unfinished)
@@ -95,6 +95,12 @@ def run_study(
         fly = partial(_fly, study, own_tasks)
         run_jobs(executor, fly, jobs, partial(_keep, study, folder), on_progress)
         results.join_parts(folder)
+
+
+def _with_files(row: Row) -> Row:
+    """A row for a worker that may not have the files of its vehicle."""
+    env = row.env.embedded()
+    return row if env is row.env else replace(row, env=env)
 
 
 def _keep(study: Study, folder: Path, job: Job, done: Done) -> None:
@@ -120,7 +126,7 @@ def _fly(study: Study, own_tasks: set[str], job: Job, tell: Tell) -> Done:
         times = {"env_steps": 0, "seconds": 0.0, "steps_per_second": np.nan}
         return Done(_evaluate(study, row, seed, stages, times), None)
     run = row.run(seed)
-    with open_env(study.wire, run.trained, run.num_envs) as env:
+    with open_env(study.wire, run.env, run.num_envs) as env:
         training, times = train_run(run, env, tell, study.snapshots, study.keep_steps)
     stages = []
     for taken in training.taken:
@@ -163,7 +169,7 @@ def _evaluate(
     drones = row.env.drones
     most = max(study.curve_episodes, study.episodes) if len(stages) > 1 else study.episodes
     worlds = min(most, max(MAX_BATCH // drones, 1))
-    with open_env(study.wire, row.env.flown, worlds * drones) as env:
+    with open_env(study.wire, row.env, worlds * drones) as env:
         headline = Headline.of(env.env_spec)
         for stage in stages:
             last = stage is stages[-1]

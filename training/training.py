@@ -2,8 +2,10 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
-from typing import Final
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
+from typing import Any, Final
 
 import numpy as np
 
@@ -11,11 +13,24 @@ from .. import agents
 from ..agents import Checkpoint, CheckpointError
 from ..agents.config import RolloutConfig
 from ..envs.autoreset import AdvancingVectorEnv
+from ..envs.config import BackendConfig, EnvConfig
+from ..envs.registry import is_known
+from ..envs.spec import EnvSpec
 from ..flights.executors import Tell
+from ..models import BACKENDS, Backend
 from ..models.errors import InputError
 from .settings import Run
 
 _TELL_EVERY: Final = 0.2  # s
+
+
+def config_of(spec: EnvSpec, backend: Backend, vehicle: str | None = None) -> EnvConfig:
+    """The config of a simulator's env, as far as its spec has it. Raises `InputError`."""
+    settings: dict[str, Any] = {"drones": len(spec.agents), "backend": backend}
+    settings["vehicle"] = vehicle
+    if is_known(spec.env_id):
+        return EnvConfig.from_keywords(spec.env_id, **settings, **spec.options)
+    return EnvConfig(env_id=spec.env_id, task=spec.options, **settings)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,13 +95,31 @@ class Training:
         """Go on from a checkpoint. Raises what `agents.resume_agent` raises."""
         kept.check_resumable()
         try:
-            names = ("algorithm", "env_id", "options", "backend", "seed", "env_steps", "num_envs")
-            kept_settings = {name: getattr(kept, name) for name in names}
-            drones = len(kept.spec.agents)
-            run = Run(config=kept.hyperparameters, drones=drones, **kept_settings)
+            names = ("algorithm", "seed", "env_steps", "num_envs")
+            settings = {name: getattr(kept, name) for name in names}
+            config = kept.env or config_of(kept.spec, kept.backend)
+            run = Run(env=config, config=kept.hyperparameters, **settings)
         except (InputError, TypeError, ValueError) as error:
             raise CheckpointError(f"checkpoint: its parts do not fit together: {error}") from None
         return cls(run, env, kept=kept)
+
+    @cached_property
+    def env_config(self) -> EnvConfig | None:
+        """The resolved config of the env: `run.env`, on the backend of the simulator that came.
+
+        None where the simulator has another config, or none of ours.
+        """
+        config = self.run.env
+        digest = self.log.spec.config_digest
+        if not (digest and is_known(config.env_id)):
+            return None
+        others = [replace(config, backend=BackendConfig(name=name)) for name in BACKENDS]
+        for tried in (config, *others):
+            with suppress(InputError):  # the vehicle's file may be the simulator's alone
+                resolved = tried.resolve()
+                if resolved.digest == digest:
+                    return resolved
+        return None
 
     def train(
         self, on_update: Callable[[], bool] = lambda: True, tell: Tell = lambda *_: None
@@ -152,7 +185,8 @@ class Training:
             algorithm=self.run.algorithm,
             config=asdict(self.run.config),
             spec=self.log.spec,
-            backend=self.run.backend,
+            env=self.env_config,
+            backend=(self.env_config or self.run.env).backend.name,
             seed=self.run.seed,
             env_steps=self.run.env_steps,
             actor=self.agent.actor(),

@@ -61,13 +61,13 @@ def _fly(simulator: Driver) -> int:
 
 def _first_line() -> bytes:
     """Up to the first end of a line, and no byte more: the thread reads the rest."""
-    line = b""
+    line = bytearray()
     while not line.endswith(b"\n"):
         byte = os.read(0, 1 << 16)
         if not byte:
             break
         line += byte
-    return line
+    return bytes(line)
 
 
 def read_arguments(line: bytes) -> tuple[EnvConfig, dict[str, Any]]:

@@ -91,7 +91,8 @@ def start_simulator(
 
     `settings` are keyword arguments of `Simulator`.
     """
-    arguments = {"config": config.to_dict(), "module": config.module, "server": server}
+    content = config.embedded().to_dict()
+    arguments = {"config": content, "module": config.module, "server": server}
     arguments |= {"bind": ("127.0.0.1", 0), **settings}
     # A second thread of torch makes small tensors slower, and takes the agent's core.
     around = {"OMP_NUM_THREADS": "1", **os.environ, "PYTHONSAFEPATH": "1"}

@@ -1,17 +1,11 @@
 """Tasks: start, observation, reward, end and metrics of an episode."""
 
-from importlib import import_module
-from typing import Any
+from ... import import_when_used
 
 __all__ = [
     "Cable", "Crossing", "Elevation", "Escort", "Formation", "Hover", "Landing", "PayloadHover",
     "Racing", "Recovery", "Tracking", "Waypoints",
 ]  # fmt: skip
 
-
-def __getattr__(name: str) -> Any:
-    """Import a task on first use (PEP 562)."""
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module = "payload_hover" if name == "PayloadHover" else name.lower()
-    return getattr(import_module(f".{module}", __name__), name)
+_modules = {name: f".{name.lower()}" for name in __all__} | {"PayloadHover": ".payload_hover"}
+__getattr__ = import_when_used(__name__, _modules)

@@ -23,6 +23,7 @@ from rotorgram.agents.vpg import VPG
 from rotorgram.cli import main
 from rotorgram.cli._progress import Bars, Lines
 from rotorgram.cli._scalars import ScalarWriter
+from rotorgram.envs.config import EnvConfig
 from rotorgram.training.settings import Run
 from rotorgram.training.training import Training
 from tensorboard.backend.event_processing import plugin_event_accumulator
@@ -85,7 +86,7 @@ def test_discrete_actions_have_no_deviation(algorithm: str) -> None:
     size = {"episodes_per_update": 2} if algorithm == "vpg" else {"steps_per_update": 20}
     run = Run(
         algorithm=algorithm, config=preset(algorithm, "tuned", **size),
-        options={"action_type": "discrete"}, seed=0, env_steps=40,
+        env=EnvConfig.from_keywords(action_type="discrete"), seed=0, env_steps=40,
     )  # fmt: skip
     training = Training(run, env)
     assert not any(name.startswith("train/") for name in training.scalars()), "before an update"

@@ -22,6 +22,7 @@ from rotorgram.agents.registry import ALGORITHMS, Algorithm
 from rotorgram.agents.rollouts import Collector
 from rotorgram.cli import main
 from rotorgram.envs import LocalVectorEnv, register
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.tasks.hover import Hover
 from rotorgram.flights.palette import agent_label
 from rotorgram.models.errors import InputError
@@ -58,7 +59,12 @@ class Slow(A2C):
 
 def run_of(algorithm: str, config: Config) -> Run:
     return Run(
-        algorithm=algorithm, config=config, seed=3, env_steps=240, num_envs=4, options=OPTIONS
+        algorithm=algorithm,
+        config=config,
+        seed=3,
+        env_steps=240,
+        num_envs=4,
+        env=EnvConfig.from_keywords(**OPTIONS),
     )
 
 

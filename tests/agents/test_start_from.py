@@ -10,6 +10,7 @@ import pytest
 from rotorgram.agents import Checkpoint, load, preset, store
 from rotorgram.cli import main
 from rotorgram.envs import LocalVectorEnv
+from rotorgram.envs.config import EnvConfig
 from rotorgram.models.errors import InputError
 from rotorgram.training.settings import Run
 from rotorgram.training.training import Training
@@ -34,8 +35,8 @@ def training_of(
 ) -> Training:
     config = preset(algorithm, "tuned", **{**SMALL[algorithm], **changes})
     run = Run(algorithm=algorithm, config=config, seed=4, env_steps=400, num_envs=4,
-              env_id=env_id, options=options)  # fmt: skip
-    env: Any = LocalVectorEnv(run.env_id, 4, autoreset_mode="Disabled", **run.options)
+              env=EnvConfig.from_keywords(env_id, **options))  # fmt: skip
+    env: Any = LocalVectorEnv(run.env, 4, autoreset_mode="Disabled")
     return Training(run, env, start=start)
 
 

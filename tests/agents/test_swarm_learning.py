@@ -9,6 +9,7 @@ from rotorgram.agents import EpisodeRecorder, ResumeError, make_agent, preset
 from rotorgram.agents.rollouts import Collector, Rollout
 from rotorgram.agents.sb3 import RecordedEnv
 from rotorgram.envs import LocalVectorEnv
+from rotorgram.envs.config import EnvConfig
 from rotorgram.training.settings import Run
 from rotorgram.training.training import Training
 from swarms import RISE
@@ -114,9 +115,9 @@ def test_a_training_that_stops_anywhere_ends_with_the_same_bits(algorithm: str) 
         "vpg": {"episodes_per_update": 3},
         "sac": {"learning_starts": 60, "batch_size": 8, "hidden": (8,), "buffer_size": 500},
     }.get(algorithm, SMALL)
-    settings: dict[str, Any] = {"algorithm": algorithm, "env_id": RISE, "seed": 1, "num_envs": 6,
-                                "options": {"episode_length": 90}}  # fmt: skip
-    run = Run(config=preset(algorithm, "tuned", **small), env_steps=1200, **settings)
+    env_config = EnvConfig(env_id=RISE, episode_length=90)
+    run = Run(algorithm=algorithm, config=preset(algorithm, "tuned", **small), seed=1,
+              env_steps=1200, num_envs=6, env=env_config)  # fmt: skip
 
     def env() -> LocalVectorEnv:
         return LocalVectorEnv(RISE, 6, drones=3, autoreset_mode="Disabled", episode_length=90)
@@ -150,8 +151,8 @@ def test_a_training_of_other_worlds_is_not_resumed() -> None:
         options = {"episode_length": 90, **options}
         return LocalVectorEnv(RISE, 6, drones=drones, autoreset_mode="Disabled", **options)
 
-    run = Run(algorithm="mappo", config=preset("mappo", "tuned", **SMALL), env_id=RISE, seed=1,
-              env_steps=1200, num_envs=6, options={"episode_length": 90})  # fmt: skip
+    run = Run(algorithm="mappo", config=preset("mappo", "tuned", **SMALL), seed=1, env_steps=1200,
+              num_envs=6, env=EnvConfig(env_id=RISE, episode_length=90))  # fmt: skip
     training = Training(run, env(3))
     assert not training.train(lambda: False)
     kept = training.checkpoint()

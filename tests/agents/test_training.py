@@ -16,6 +16,8 @@ from rotorgram.agents import (
     store,
 )
 from rotorgram.cli import main
+from rotorgram.envs.config import BackendConfig, EnvConfig
+from rotorgram.envs.vector import LocalVectorEnv
 from rotorgram.flights.trajectories import evaluation_seed
 from rotorgram.models.errors import InputError
 from rotorgram.training.settings import Run
@@ -36,12 +38,12 @@ def run_of(algorithm: str, drones: int = 4, **changes: Any) -> Run:
         seed=4,
         env_steps=1400,
         num_envs=drones,
-        **{"options": OPTIONS, **changes},
+        **{"env": EnvConfig.from_keywords(**OPTIONS), **changes},
     )
 
 
 def env_of(run: Run, **changes: Any) -> Any:
-    return vector(run.num_envs, **{**run.options, **changes})
+    return vector(run.num_envs, **{**run.env.flat_options(), **changes})
 
 
 def test_wrong_runs_are_one_sentence() -> None:
@@ -50,7 +52,6 @@ def test_wrong_runs_are_one_sentence() -> None:
         ({"seed": -1}, "seed: expected 0 or more, got -1"),
         ({"num_envs": 0}, "num_envs: expected 1 or more, got 0"),
         ({"env_steps": 71}, "env_steps: expected at least 72, got 71"),  # whole steps of 4 drones
-        ({"options": {"wind": 1}}, "wind"),
     ):
         with pytest.raises(InputError, match=sentence):
             replace(run, **changes)  # type: ignore[arg-type]
@@ -58,6 +59,16 @@ def test_wrong_runs_are_one_sentence() -> None:
         replace(run_of("vpg"), env_steps=119)  # an episode of each
     with pytest.raises(InputError, match="env: expected one of 4 drones, got 3"):
         Training(run, env_of(replace(run, num_envs=3)))
+
+
+@pytest.mark.parametrize("backend", ["mujoco", "rigid"])
+def test_a_training_knows_the_config_that_is_flown(backend: str) -> None:
+    run = run_of("a2c")
+    flown = replace(run.env, backend=BackendConfig(name=backend))  # type: ignore[arg-type]
+    env = LocalVectorEnv(flown, 4, autoreset_mode="Disabled")
+    assert Training(run, env).env_config == flown.resolve()
+    other = LocalVectorEnv(replace(flown, history=2), 4, autoreset_mode="Disabled")
+    assert Training(run, other).env_config is None
 
 
 def test_training_and_evaluation_share_no_seed() -> None:

@@ -55,7 +55,8 @@ def imported(where: str) -> set[str]:
 
 def packages(names: set[str]) -> set[str]:
     """Packages of rotorgram among modules."""
-    return {name.split(".")[1] for name in names if name.startswith("rotorgram.")}
+    inner = {name.split(".")[1] for name in names if name.startswith("rotorgram.")}
+    return inner & set(PACKAGES)  # the package itself has import_when_used
 
 
 def others(names: set[str]) -> set[str]:

@@ -1,6 +1,8 @@
 """The config of an env: its forms, defaults, checks, files and digest."""
 
+import json
 import pickle
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -12,8 +14,11 @@ import pytest
 from rotorgram.envs import ArraySpec, EnvConfig, Loop, Outcome, Task, register
 from rotorgram.envs.config import BackendConfig, SceneConfig, source_hash
 from rotorgram.envs.tasks import Hover
+from rotorgram.envs.tasks.racing import TRACKS
+from rotorgram.models import QUAD_XML
 from rotorgram.models.errors import InputError
 from rotorgram.sim import EffectOptions, InitialState, stack
+from rotorgram.udp.spawn import spawn_simulator
 
 HOVER = "rotorgram/Hover-v0"
 FULL = {
@@ -168,16 +173,101 @@ def test_the_digest_is_of_what_changes_numbers() -> None:
     assert len({config.digest, *(other.digest for other in others)}) == 6
 
 
-def test_a_resolved_config_holds_its_vehicle_to_its_hash(tmp_path: Path) -> None:
-    from rotorgram.models import QUAD_XML
+TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 
-    file = tmp_path / "own.xml"
-    file.write_text(QUAD_XML.read_text())
-    resolved = EnvConfig(env_id=HOVER, vehicle=(str(file),)).resolve()
+
+def craft_files(folder: Path, kind: str) -> str:
+    """A vehicle's file of a kind, with all that it needs, in a new folder."""
+    craft = QUAD_XML.read_text()
+    folder.mkdir()
+    if kind == "mjcf":
+        (folder / "own.xml").write_text(craft)
+    if kind == "included":
+        (folder / "parts").mkdir()
+        (folder / "parts" / "craft.xml").write_text(craft)
+        (folder / "own.xml").write_text('<mujoco><include file="parts/craft.xml"/></mujoco>')
+    if kind == "mesh":
+        (folder / "hull.obj").write_text(TETRAHEDRON)
+        hull = '<asset><mesh name="hull" file="../hull.obj"/></asset><worldbody>'
+        (folder / "xml").mkdir()
+        (folder / "xml" / "own.xml").write_text(craft.replace("<worldbody>", hull, 1))
+        return str(folder / "xml" / "own.xml")
+    if kind == "toml":
+        (folder / "own.xml").write_text(craft)
+        (folder / "vehicle.toml").write_text('[model]\nfile = "own.xml"\n')
+        return str(folder / "vehicle.toml")
+    return str(folder / "own.xml")
+
+
+@pytest.mark.parametrize("kind", ["mjcf", "included", "mesh", "toml"])
+def test_a_resolved_config_needs_no_file(kind: str, tmp_path: Path) -> None:
+    vehicle = craft_files(tmp_path / "own", kind)
+    config = EnvConfig(env_id=HOVER, vehicle=vehicle)
+    resolved = config.resolve()
+    loaded = resolved.load_vehicle()
+    assert loaded.path == Path(vehicle)  # it is here, and as it was
+    shutil.rmtree(tmp_path / "own")
+    with pytest.raises(InputError, match=r"^vehicle: "):
+        config.resolve()
+    content = json.loads(json.dumps(resolved.to_dict()))
+    again = EnvConfig.from_dict(content)
+    assert again.resolve() == resolved
+    assert again.digest == resolved.digest
+    assert again.load_vehicle().hash == loaded.hash
+    assert again.load_vehicle().name == loaded.name
+    assert Loop(again).spec == Loop(resolved).spec
+
+
+def test_a_file_that_changes_is_flown_as_it_was(tmp_path: Path) -> None:
+    file = Path(craft_files(tmp_path / "own", "mjcf"))
+    resolved = EnvConfig(env_id=HOVER, vehicle=str(file)).resolve()
     assert resolved.resolve() == resolved
-    file.write_text(QUAD_XML.read_text().replace('ctrlrange="0 100"', 'ctrlrange="0 90"'))
+    file.write_text(file.read_text().replace('ctrlrange="0 100"', 'ctrlrange="0 90"'))
+    assert resolved.resolve() == resolved
+    assert resolved.load_vehicle().thrust_high.tolist() == [100.0] * 4
     with pytest.raises(InputError, match=r"^vehicle_hash: expected [0-9a-f]{32}, got "):
-        resolved.resolve()
+        replace(resolved, files={}).resolve()
+
+
+def test_the_digest_does_not_depend_on_where_files_lie(tmp_path: Path) -> None:
+    here = EnvConfig(env_id=HOVER, vehicle=craft_files(tmp_path / "here", "mjcf"))
+    there = EnvConfig(env_id=HOVER, vehicle=craft_files(tmp_path / "there", "mjcf"))
+    assert here.digest == there.digest
+
+
+def test_a_config_of_the_library_holds_no_files() -> None:
+    config = EnvConfig.from_keywords("rotorgram/Formation-v0", vehicle="paper,crazyflie2", drones=2)
+    assert config.resolve().files == {}
+
+
+@pytest.mark.parametrize(
+    "pair", [["../up.xml", ""], ["/etc/x.xml", ""], ["C:x.xml", ""], ["a.xml", "?"], ["a.xml"], 3]
+)
+def test_files_of_a_config_stay_in_their_folder(pair: Any) -> None:
+    content = EnvConfig(env_id=HOVER).to_dict() | {"files": {"a.xml": [pair]}}
+    with pytest.raises(InputError, match=r"^files: expected a relative path and base64, got "):
+        EnvConfig.from_dict(content)
+
+
+def test_a_track_is_embedded(tmp_path: Path) -> None:
+    file = tmp_path / "track.toml"
+    file.write_text((TRACKS / "oval.toml").read_text())
+    config = EnvConfig.from_keywords("rotorgram/Racing-v0", track=str(file))
+    assert config == EnvConfig(env_id="rotorgram/Racing-v0")  # with the gates of the oval
+
+
+def test_a_child_gets_the_vehicle_and_hello_the_digest(tmp_path: Path) -> None:
+    vehicle = craft_files(tmp_path / "own", "mjcf")
+    resolved = EnvConfig(env_id=HOVER, vehicle=vehicle).resolve()
+    shutil.rmtree(tmp_path / "own")
+    with spawn_simulator(resolved) as env:
+        assert env.env_spec.vehicle_hash == resolved.vehicle_hash
+        assert env.env_spec.config_digest == resolved.digest
+
+
+def test_seeds_that_do_not_follow_each_other_are_refused() -> None:
+    with pytest.raises(InputError, match=r"^scene: expected consecutive seeds, got \(1, 5\)$"):
+        SceneConfig(name="forest", seeds=(1, 5))
 
 
 def test_the_source_of_an_own_task_belongs_to_the_digest() -> None:
@@ -192,6 +282,30 @@ def test_a_task_may_add_to_a_config_and_its_users_may_not_contradict_it() -> Non
     assert loop.config.effects.payload == 0.0
     with pytest.raises(InputError, match=r"^effects: expected a payload that the options of"):
         Loop(EnvConfig.from_keywords("rotorgram/PayloadHover-v0", effects={"payload": 1.0}))
+
+
+@pytest.mark.parametrize(
+    ("changes", "name"),
+    [({"effects": EffectOptions()}, "effects"), ({"history": 1}, "history"),
+     ({"sensors": {}}, "sensors"), ({"scene": SceneConfig()}, "scene")],
+)  # fmt: skip
+def test_a_task_that_drops_a_setting_is_refused(changes: dict[str, Any], name: str) -> None:
+    class Dropping(Hold):
+        """Drops what it is given."""
+
+        def adjust(self, config: EnvConfig) -> EnvConfig:
+            return replace(config, **changes)
+
+    register("config/Dropping-v0", Dropping)
+    config = EnvConfig.from_keywords(
+        "config/Dropping-v0",
+        effects={"gusts": 1},
+        history=2,
+        sensors={"imu": True},
+        scene="airport",
+    )
+    with pytest.raises(InputError, match=rf"^config/.*: expected adjust\(\) to keep {name}, got "):
+        Loop(config)
 
 
 def test_setup_runs_once_in_a_loop() -> None:

@@ -21,6 +21,7 @@ from PIL import Image
 from rotorgram.agents import PID
 from rotorgram.agents.checkpoints import load
 from rotorgram.cli import main
+from rotorgram.envs.config import EnvConfig
 from rotorgram.flights import filming
 from rotorgram.flights.filming import Film, FilmTrack, film
 from rotorgram.flights.recorded import recorded_trajectories
@@ -28,7 +29,7 @@ from rotorgram.flights.trajectories import flown_trajectories
 from rotorgram.rendering import NoOpenGL
 from rotorgram.training.films import film_study
 from rotorgram.training.results import COLUMNS, Results, write_config, write_part
-from rotorgram.training.settings import EnvConfig, Row, Study
+from rotorgram.training.settings import Row, Study
 
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
@@ -303,7 +304,7 @@ def comparison(training: Path, tmp_path: Path) -> Results:
     folder = tmp_path / "comparison"
     folder.mkdir()
     trained = load(training / "checkpoint.safetensors")
-    env = EnvConfig(env_id=trained.env_id, options=trained.options)
+    env = EnvConfig.from_keywords(trained.env_id, **trained.options)
     rows = tuple(Row(agent=agent, name=agent, env=env) for agent in ("a2c", "pid"))
     study = Study(rows=rows, seeds=1)
     write_config(folder, "", study, dict.fromkeys(("a2c", "pid"), trained.spec))

@@ -13,13 +13,14 @@ from pathlib import Path
 import pandas as pd
 import pytest
 from rotorgram.agents.checkpoints import load, software_versions
+from rotorgram.envs.config import EnvConfig
 from rotorgram.flights import ray_cluster as module
 from rotorgram.flights.capture import capture
 from rotorgram.flights.executors import RunsFailed, WorkersConfig, open_executor, run_jobs
 from rotorgram.flights.folders import new_folder
 from rotorgram.flights.viewpoints import Plan
 from rotorgram.training.results import Results
-from rotorgram.training.settings import EnvConfig, Row, Study
+from rotorgram.training.settings import Row, Study
 from rotorgram.training.study import run_study
 
 # Ray listens beyond this machine. It reads these when it is imported.
@@ -30,7 +31,7 @@ os.environ |= {
 }
 ray = pytest.importorskip("ray", reason="needs Ray: pip install 'rotorgram[ray]'")
 
-ENV = EnvConfig(options={"episode_length": 50})
+ENV = EnvConfig(episode_length=50)
 STUDY = Study(
     rows=(
         Row(agent="a2c", name="a2c", env=ENV, env_steps=600),

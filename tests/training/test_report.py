@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 from comparisons import ERROR, GATES, HEADLINE, spec_of, study_of, synthetic_folder
 from rich.console import Console
+from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.spec import EnvSpec
 from rotorgram.flights.filming import Film, FilmTrack
 from rotorgram.flights.palette import agent_color, agent_label
@@ -27,7 +28,7 @@ from rotorgram.training.figures import (
 from rotorgram.training.metrics import Headline, shown_runs
 from rotorgram.training.report import VIDEO_FILE, write_report
 from rotorgram.training.results import COLUMNS, Results, write_config
-from rotorgram.training.settings import EnvConfig, Row, Study
+from rotorgram.training.settings import Row, Study
 from rotorgram.training.statistics import share_interval
 from rotorgram.training.study import least_distance
 from rotorgram.training.tables import (
@@ -143,7 +144,7 @@ def test_points_of_a_sweep_are_ranked_by_their_worst_seed_and_its_crashes(tmp_pa
 
 
 def test_rows_of_several_tasks_have_a_table_each_and_scores(tmp_path: Path) -> None:
-    other = EnvConfig(options={"observation": "error", "action": "offset"})
+    other = EnvConfig(action="offset", task={"observation": "error"})
     rows = tuple(
         Row(agent=agent, env=env, env_steps=2000)
         for env in (EnvConfig(), other) for agent in ("vpg", "a2c")
@@ -390,7 +391,7 @@ class FakePolicy:
 
 
 def test_a_film_is_of_one_task(tmp_path: Path) -> None:
-    other = EnvConfig(options={"action": "offset"})
+    other = EnvConfig(action="offset")
     rows = (Row(agent="pid", name="a"), Row(agent="pid", name="b", env=other))
     results = made_up(tmp_path, Study(rows=rows, seeds=1), runs_of("a", 0.1))
     with pytest.raises(InputError, match="film: expected rows of one task"):

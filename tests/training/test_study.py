@@ -21,16 +21,17 @@ from rotorgram.cli._flags import parse
 from rotorgram.cli.compare import Compare
 from rotorgram.cli.sweep import Sweep, parse_grid
 from rotorgram.envs import LocalVectorEnv
+from rotorgram.envs.config import EnvConfig, SceneConfig
 from rotorgram.flights.executors import RunsFailed, WorkersConfig
 from rotorgram.flights.folders import locked
 from rotorgram.flights.trajectories import evaluation_seed, fly_episodes
 from rotorgram.models.errors import InputError
 from rotorgram.training.metrics import measure_episode
 from rotorgram.training.results import Results, ResultsError, checkpoint_file
-from rotorgram.training.settings import BOARD, EnvConfig, Row, Study
+from rotorgram.training.settings import BOARD, Row, Study
 from rotorgram.training.study import open_env, run_study
 
-ENV = EnvConfig(options={"episode_length": 40, "flight_band": 1.2})
+ENV = EnvConfig(episode_length=40, task={"flight_band": 1.2})
 A2C = Row(agent="a2c", name="a2c", env=ENV, env_steps=600, set={"steps_per_update": 64})
 STUDY = Study(
     rows=(A2C, Row(agent="pid", name="pid", env=ENV)),
@@ -67,7 +68,7 @@ def test_a_run_is_what_its_checkpoint_flies_from_starts_of_its_seed(folder: Path
     assert runs == [("a2c", 0), ("a2c", 1), ("pid", 0), ("pid", 1)]
     policy = load(checkpoint_file(folder, A2C, 1)).policy()
     headline = results.headline(A2C)
-    with closing(LocalVectorEnv(ENV.env_id, 3, autoreset_mode="Disabled", **ENV.options)) as env:
+    with closing(LocalVectorEnv(ENV, 3, autoreset_mode="Disabled")) as env:
         flown = fly_episodes(env, policy, 3, "final", training_seed=1)
         others = fly_episodes(env, policy, 3, "final", training_seed=0)
     rows = [measure_episode(one, headline) for one in flown]
@@ -223,8 +224,8 @@ def test_two_files_are_rows_of_their_names(
     assert [row.config.hidden for row in results.study.rows] == [(8,), (8, 8)]
     for row in results.study.rows:
         assert row.config.gamma == 0.9
-        assert row.env.options["flight_band"] == 1.5
-        assert row.env.options["episode_length"] == 40
+        assert row.env.task["flight_band"] == 1.5
+        assert row.env.episode_length == 40
     assert not results.study.wire
     figures = {path.name for path in (tmp_path / "out" / "figures").iterdir()}
     assert figures == {"comparison.png", "comparison.pdf", "comparison.svg"}
@@ -270,24 +271,35 @@ def test_a_board_takes_own_tasks_and_changes(
 
 
 def test_a_controller_brings_its_options_and_stands_in_the_table_of_its_task() -> None:
-    hover = EnvConfig(env_id="rotorgram/Hover-v0", options={"episode_length": 9})
+    hover = EnvConfig(env_id="rotorgram/Hover-v0", episode_length=9)
     row = Row(agent="geometric", env=hover)
-    assert row.env.options["action"] == "position"
-    assert row.env.options["episode_length"] == 9
+    assert row.env.action == "position"
+    assert row.env.episode_length == 9
     assert row.name == "geometric Hover-v0 episode_length=9"
     assert row.task == Row(agent="ppo", env=hover, env_steps=41_000).task
-    velocity = replace(hover, options={"action": "velocity"})
+    velocity = EnvConfig(env_id="rotorgram/Hover-v0", action="velocity")
     assert Row(agent="geometric", env=velocity).task == "Hover-v0 action=velocity"
 
 
 def test_a_row_trains_on_the_backend_of_its_preset_or_its_own() -> None:
     hover = EnvConfig(env_id="rotorgram/Hover-v0")
     row = Row(agent="ppo", env=hover)
-    assert row.run(0).backend == "rigid"
-    assert "backend" not in row.env.env
-    assert Row(agent="ppo", env=hover, backend="mujoco").run(0).backend == "mujoco"
+    assert row.run(0).env.backend.name == "rigid"
+    assert row.env.backend.name == "mujoco"
+    assert Row(agent="ppo", env=hover, backend="mujoco").run(0).env.backend.name == "mujoco"
     with pytest.raises(InputError, match=r"ppo tuned Hover-v0: env_steps: expected at least"):
         Row(agent="ppo", env=hover, env_steps=100)
+
+
+def test_a_row_keeps_all_of_its_env_or_refuses_it() -> None:
+    with pytest.raises(InputError, match=r"^env: expected the backend mujoco, .*, got rigid$"):
+        Row(agent="ppo", env=EnvConfig.from_keywords(backend="rigid"))
+    env = EnvConfig.from_keywords(scene="forest:3", num_threads=2, vehicle="crazyflie2")
+    row = Row(agent="pid", env=env)
+    assert row.env.scene == SceneConfig(name="forest", seeds=(3,))
+    assert row.env.backend.num_threads == 2
+    content = json.loads(json.dumps(row.to_dict()))
+    assert Row.from_dict("here", content) == row
 
 
 def test_whole_worlds_train_a_swarm() -> None:
@@ -325,7 +337,7 @@ def test_points_are_all_combinations_of_settings_and_task_options() -> None:
     words = ["ppo", "--env", "rotorgram/Hover-v0", "--set", "gamma=0.9"]
     grid = ["--grid", "hidden=[64,64],[32]", "--grid", "env.start-band=0.5,1"]
     study = parse(Sweep, "rotorgram sweep", [*words, *grid]).study()
-    found = [(row.config.hidden, row.env.options["start_band"]) for row in study.rows]
+    found = [(row.config.hidden, row.env.task["start_band"]) for row in study.rows]
     assert found == [((64, 64), 0.5), ((64, 64), 1), ((32,), 0.5), ((32,), 1)]
     assert study.rows[0].name == "hidden=[64,64] env.start-band=0.5"
     assert study.first_seed == 1000
@@ -466,7 +478,7 @@ def test_the_committed_policies_fly_the_committed_numbers() -> None:
     for row in trained:
         policy = load(files[row.name]).policy()
         count = results.study.episodes
-        with open_env(False, row.env.flown, count) as env:
+        with open_env(False, row.env, count) as env:
             flown = fly_episodes(env, policy, count, "final")
         measured = [measure_episode(one, results.headline(row)) for one in flown]
         found = {

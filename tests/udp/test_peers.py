@@ -456,6 +456,7 @@ class Hand:
             env_spec(EnvConfig(env_id=ENV_ID)),
             vehicle="point mass",
             vehicle_hash="0" * 32,
+            config_digest="",  # it has no config
             constants={"gravity": 9.8},
         )
 
