@@ -73,31 +73,6 @@ def share_interval(count: int, total: int, level: float = 0.95) -> tuple[float, 
     return float(interval.low), float(interval.high)
 
 
-def probability_of_improvement(first: Strata, second: Strata) -> float:
-    """Probability that a run of the first agent has the higher score, on a task drawn at random:
-    the mean over the tasks of the Mann-Whitney U statistic over the number of pairs of runs.
-    """
-    pairs = zip(first, second, strict=True)
-    return float(np.mean([_beaten(finite(x), finite(y)) for x, y in pairs]))
-
-
-def improvement_interval(first: Strata, second: Strata, level: float = 0.95) -> tuple[float, float]:
-    """Interval of `probability_of_improvement`: by the bootstrap; where every resample is the same,
-    Wilson's of as many cases as the smaller agent has runs.
-    """
-    tasks = len(first)
-
-    def statistic(*samples: Floats, axis: int = -1) -> Floats:
-        pairs = zip(samples[:tasks], samples[tasks:], strict=True)
-        return np.asarray(np.mean([_beaten(x, y, axis) for x, y in pairs], axis=0))
-
-    low, high = _bootstrap([*first, *second], statistic, level)
-    if low == high and low in (0.0, 1.0):
-        runs = min(sum(finite(values).size for values in agent) for agent in (first, second))
-        return share_interval(round(low * runs), runs, level)
-    return low, high
-
-
 # ---- parts
 
 
@@ -123,10 +98,3 @@ def _bootstrap(
 
 def _difference(first: Floats, second: Floats, axis: int = -1) -> Floats:
     return trimmed_mean(first, axis) - trimmed_mean(second, axis)
-
-
-def _beaten(first: Floats, second: Floats, axis: int = -1) -> Floats:
-    """P(X > Y) + P(X = Y) / 2 along an axis."""
-    pairs = first.shape[axis] * second.shape[axis]
-    statistic = stats.mannwhitneyu(first, second, axis=axis, method="asymptotic").statistic
-    return np.asarray(statistic / pairs)

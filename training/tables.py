@@ -19,14 +19,7 @@ from ..flights.palette import agent_label
 from .metrics import Headline
 from .results import Results
 from .settings import Row
-from .statistics import (
-    Floats,
-    bootstrap_interval,
-    improvement_interval,
-    iqm,
-    probability_of_improvement,
-    share_interval,
-)
+from .statistics import Floats, bootstrap_interval, iqm, share_interval
 
 _TERMINAL_COLUMNS: Final = (0, 1, 2, 3, 6, 7, 8)  # those that fit 100 columns
 NOTHING: Final = "–"
@@ -304,7 +297,7 @@ def _markdown_table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str
 
 
 def _scores(results: Results) -> list[str]:
-    """Scores of trained agents over all of their tasks, and which agent is better."""
+    """Scores of trained agents over all of their tasks."""
     found: dict[str, dict[str, Floats]] = {}
     for row in results.study.rows:
         own = results.runs[results.runs["row"] == row.name]
@@ -314,35 +307,17 @@ def _scores(results: Results) -> list[str]:
     if len(found) < 2:
         return []
     totals = []
-    pairs = []
     for label, own in found.items():
         strata = list(own.values())
         low, high = bootstrap_interval(*strata)
         totals.append([label, str(len(own)), f"{iqm(*strata):.3f} ({low:.3f} to {high:.3f})"])
-        pairs.append([label, *(_improvement(own, other) for other in found.values())])
     return [
         "## Over all tasks",
         "Score: b / (b + e) for a steady size e and the bound b of holding (e / (b + e) of a "
         "metric that is to be high; of a share that is, e and b are what it lacks to 1), 0 with a "
-        "crash. Below: the probability that a run of the agent of the row has a higher score than "
-        "one of the column, over the tasks that both fly. An interval with 50 % in it decides "
-        "nothing.",
+        "crash.",
         _markdown_table(["Agent", "Tasks", "Score"], totals),
-        _markdown_table(["", *found], pairs),
     ]
-
-
-def _improvement(own: Mapping[str, Floats], other: Mapping[str, Floats]) -> str:
-    tasks = [task for task in own if task in other]
-    if own is other or not tasks:
-        return NOTHING
-    first = [own[task] for task in tasks]
-    second = [other[task] for task in tasks]
-    low, high = improvement_interval(first, second)
-    share = probability_of_improvement(first, second)
-    if math.isnan(low):
-        return f"{share:.0%}"
-    return f"{share:.0%} ({low:.0%} to {high:.0%})"
 
 
 def terminal_tables(results: Results, table: pd.DataFrame) -> list[Table]:
