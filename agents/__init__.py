@@ -74,7 +74,7 @@ def make_agent(algorithm: str, log: EpisodeRecorder, config: Config, seed: int) 
             f"algorithm: expected {algorithm} with its {row.config.__name__}, "
             f"got {type(config).__name__}"
         )
-    agent: Agent = row.agent_class().create(log, config, seed)
+    agent: Agent = row.agent_class()(log, config, seed)
     return agent
 
 

@@ -31,7 +31,6 @@ from .episodes import Episode, Position, ResumeError
 from .networks import Floats, named, part_of
 from .policies import NetworkPolicy, flat_size
 from .presets import preset
-from .registry import ALGORITHMS
 
 FORMAT: Final = 3
 _PLAIN: Final = ("algorithm", "config", "backend", "seed", "env_steps", "versions")
@@ -103,9 +102,7 @@ class Checkpoint:
 
     def policy(self, spec: EnvSpec | None = None) -> NetworkPolicy:
         """The policy, ready to fly that env or its own. Raises `InputError` if it does not fit."""
-        squash = ALGORITHMS[self.algorithm].squashed
-        config = self.hyperparameters
-        return NetworkPolicy.load(self.actor, spec or self.spec, config, squash=squash)
+        return NetworkPolicy.load(self.actor, spec or self.spec, self.hyperparameters)
 
     def other_versions(self) -> dict[str, tuple[str, str]]:
         """Software whose version was another: its version then and now."""

@@ -71,7 +71,7 @@ def score_gradients(agent: VPG | A2C, data: Rollout) -> list[dict[str, np.ndarra
 
 
 def test_vpg_follows_equation_2() -> None:
-    agent = VPG.create(log_of(), VPGConfig(gamma=0.5), seed=0)
+    agent = VPG(log_of(), VPGConfig(gamma=0.5), seed=0)
     data = rollout()
     returns = [1 + 1 + 1, 2 + 2, 4]
     scores = score_gradients(agent, data)
@@ -81,7 +81,7 @@ def test_vpg_follows_equation_2() -> None:
 
 
 def test_a2c_actor_follows_the_advantage_of_equation_3() -> None:
-    agent = A2C.create(log_of(), A2CConfig(gamma=0.5, steps_per_update=3), seed=0)
+    agent = A2C(log_of(), A2CConfig(gamma=0.5, steps_per_update=3), seed=0)
     data = rollout()
     value = values_of(agent, data.observations[:, 0])
     advantage = [
@@ -96,7 +96,7 @@ def test_a2c_actor_follows_the_advantage_of_equation_3() -> None:
 
 
 def test_a2c_critic_descends_the_squared_td_error_with_a_held_target() -> None:
-    agent = A2C.create(log_of(), A2CConfig(gamma=0.5, steps_per_update=3), seed=0)
+    agent = A2C(log_of(), A2CConfig(gamma=0.5, steps_per_update=3), seed=0)
     data = rollout()
     gradient_of(agent, data)
     bias = agent.weights.gradients["critic.layers.1.bias"].item()
@@ -116,7 +116,7 @@ def test_critic_bootstraps_through_the_limit_and_not_through_the_end(
     """
     config = A2CConfig(gamma=0.9, steps_per_update=16, learning_rate=0.02)
     log = log_of(ending)
-    agent = A2C.create(log, config, seed=0)
+    agent = A2C(log, config, seed=0)
     agent.train(log, 24_000, lambda: True)
     got = values_of(agent, np.zeros((1, 1), np.float32)).item()
     assert got == pytest.approx(value or 1 / (1 - 0.9 * 7 / 8), rel=0.02)
@@ -124,8 +124,8 @@ def test_critic_bootstraps_through_the_limit_and_not_through_the_end(
 
 def test_normalising_changes_the_actor_and_leaves_the_critic_alone() -> None:
     data = rollout()
-    plain = A2C.create(log_of(), A2CConfig(gamma=0.5, steps_per_update=3), seed=0)
-    normal = A2C.create(log_of(), A2CConfig(gamma=0.5, steps_per_update=3, normalize=True), seed=0)
+    plain = A2C(log_of(), A2CConfig(gamma=0.5, steps_per_update=3), seed=0)
+    normal = A2C(log_of(), A2CConfig(gamma=0.5, steps_per_update=3, normalize=True), seed=0)
     plain.gradient(data)
     gradients = gradient_of(normal, data)
     critic = "critic.layers.1.weight"
@@ -144,7 +144,7 @@ def test_entropy_bonus_widens_the_policy() -> None:
 
     def gradient(weight: float) -> float:
         config = A2CConfig(gamma=0.5, steps_per_update=3, ent_coef=weight)
-        return float(gradient_of(A2C.create(log_of(), config, seed=0), rollout())["log_std"][0])
+        return float(gradient_of(A2C(log_of(), config, seed=0), rollout())["log_std"][0])
 
     assert gradient(0.25) == pytest.approx(gradient(0.0) - 0.25, abs=1e-5)
 
@@ -221,7 +221,7 @@ def test_sb3_and_ours_make_the_same_updates_of_the_same_experience() -> None:
     env = Kept(episode_length=40, flight_band=1.1)
     log = EpisodeRecorder(env, seed=0)
     theirs: Any = make_agent("sb3-a2c", log, config, 0)
-    ours = A2C.create(log, config, seed=1)
+    ours = A2C(log, config, seed=1)
     assert len(train_both(theirs, ours, env, log, 640)) == 10
     assert any(e.truncated for e in log.episodes)
     assert any(e.terminated for e in log.episodes)
@@ -284,7 +284,7 @@ def test_unknown_names_are_named() -> None:
 
 def test_time_baseline_leaves_nothing_of_a_reward_that_no_action_changes() -> None:
     log = log_of("limit")
-    agent = VPG.create(log, VPGConfig(baseline="time", episodes_per_update=4), seed=0)
+    agent = VPG(log, VPGConfig(baseline="time", episodes_per_update=4), seed=0)
     collector = Collector(log, np.random.default_rng(0), agent.policy())
     data = collector.episodes(4, 10_000)
     assert len(data) == 32
@@ -295,8 +295,8 @@ def test_vpg_weights_with_baseline_and_scale_by_hand() -> None:
     """Two episodes, of two steps and one, gamma 0.5: R = 2, 2, 5; the mean at step 0 is 3.5."""
     config = VPGConfig(gamma=0.5, baseline="time", episodes_per_update=2)
     data = rollout(rewards=np.array([1.0, 2.0, 5.0]), terminated=np.array([False, True, True]))
-    np.testing.assert_allclose(VPG.create(log_of(), config, 0).returns(data), [-1.5, 0, 1.5])
-    scaled = VPG.create(log_of(), replace(config, normalize=True), 0).returns(data)
+    np.testing.assert_allclose(VPG(log_of(), config, 0).returns(data), [-1.5, 0, 1.5])
+    scaled = VPG(log_of(), replace(config, normalize=True), 0).returns(data)
     np.testing.assert_allclose(scaled, np.array([-1.5, 0, 1.5]) / np.sqrt(1.5), rtol=1e-6)
 
 

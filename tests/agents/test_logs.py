@@ -158,7 +158,7 @@ def fill(weights: Weights, value: float) -> None:
 
 def test_the_terms_of_a2c_by_hand() -> None:
     """V is the observation, so A = (1 - 1, 2 - 1.5)."""
-    agent = A2C.create(log_of(), A2CConfig(hidden=1, log_std=0.0, ent_coef=0.1), 0)
+    agent = A2C(log_of(), A2CConfig(hidden=1, log_std=0.0, ent_coef=0.1), 0)
     fill(agent.weights.part("actor."), 0.0)
     fill(agent.weights.part("critic."), 1.0)
     agent.gradient(TWO_STEPS)
@@ -172,7 +172,7 @@ def test_the_terms_of_a2c_by_hand() -> None:
 
 
 def test_the_terms_of_vpg_by_hand() -> None:
-    agent = VPG.create(log_of(), VPGConfig(hidden=1, log_std=0.0), 0)
+    agent = VPG(log_of(), VPGConfig(hidden=1, log_std=0.0), 0)
     fill(agent.weights.part("actor."), 0.0)
     agent.gradient(TWO_STEPS)
     logged = agent.scalars()
@@ -185,7 +185,7 @@ def test_ours_logs_what_sb3_logs_of_the_same_updates() -> None:
     env = Kept(episode_length=40)
     log = EpisodeRecorder(env, seed=0)
     theirs: Any = make_agent("sb3-a2c", log, config, 0)
-    for here, there in train_both(theirs, A2C.create(log, config, seed=1), env, log, 320):
+    for here, there in train_both(theirs, A2C(log, config, seed=1), env, log, 320):
         assert here.keys() == there.keys()
         for name, value in there.items():
             assert here[name] == pytest.approx(value, rel=2e-3, abs=2e-4), name

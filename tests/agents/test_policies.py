@@ -61,8 +61,10 @@ def test_observations_are_normalised_and_outputs_squashed() -> None:
     policy = policy_of(weights, BOX)
     np.testing.assert_allclose(policy.output(seen), [[20.8, 0.5]], rtol=1e-5)
     assert seen.tolist() == [[1.5, 5, 3]]
-    squashed = policy_of({k: w for k, w in weights.items() if k != "log_std"}, BOX, squash=True)
-    np.testing.assert_allclose(squashed.output(seen), [[1, np.tanh(0.5)]], rtol=1e-5)
+    layers = {name: array for name, array in weights.items() if name.startswith("layers.")}
+    squashed = policy_of(layers, BOX, squash=True)
+    shifted = np.array([[1, 0.3, 0]], np.float32)
+    np.testing.assert_allclose(squashed.output(shifted), [[1, np.tanh(0.5)]], rtol=1e-5)
 
 
 def test_gaussian_sampling_has_the_mean_and_deviation_of_the_policy() -> None:

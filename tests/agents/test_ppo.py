@@ -19,7 +19,7 @@ SMALL = PPOConfig(gamma=0.5, gae_lambda=0.5, steps_per_update=3, epochs=1, minib
 
 def filled(config: PPOConfig, actor: float = 0.0, critic: float = 0.0, seed: int = 0) -> PPO:
     """A linear critic V(s) = critic · s of one unit; an actor of constant weights."""
-    agent = PPO.create(log_of(), config, seed)
+    agent = PPO(log_of(), config, seed)
     for part, value in (("actor.", actor), ("critic.", critic)):
         for name, array in agent.weights.part(part).arrays.items():
             array[...] = value if name.endswith("weight") else 0.0
@@ -70,7 +70,7 @@ def columns(count: int) -> tuple[np.ndarray, ...]:
 
 def test_rates_of_actor_and_critic() -> None:
     """Adam's first step is the rate, whatever the gradient."""
-    agent = PPO.create(log_of(), replace(SMALL, learning_rate=0.01, critic_learning_rate=0.03), 0)
+    agent = PPO(log_of(), replace(SMALL, learning_rate=0.01, critic_learning_rate=0.03), 0)
     before = {name: array.copy() for name, array in agent.weights.arrays.items()}
     agent.update(rollout())
     for name, array in agent.weights.arrays.items():
@@ -80,7 +80,7 @@ def test_rates_of_actor_and_critic() -> None:
 
 
 def test_every_epoch_takes_every_transition_once() -> None:
-    agent = PPO.create(log_of(), replace(SMALL, epochs=4, minibatches=3, normalize=False), 0)
+    agent = PPO(log_of(), replace(SMALL, epochs=4, minibatches=3, normalize=False), 0)
     taken: list[tuple[np.ndarray, ...]] = []
     minibatch = agent.minibatch
 
@@ -116,7 +116,7 @@ def test_sb3_and_ours_make_the_same_updates_of_the_same_experience() -> None:
     env = Kept(episode_length=40, flight_band=1.1)
     log = EpisodeRecorder(env, seed=0)
     theirs: Any = make_agent("sb3-ppo", log, config, 0)
-    ours = PPO.create(log, config, seed=1)
+    ours = PPO(log, config, seed=1)
     epsilons = {group["eps"] for group in theirs.model.policy.optimizer.param_groups}
     assert epsilons == {PPO.epsilon} == {1e-5}  # fault 67
     for here, there in train_both(theirs, ours, env, log, 512):

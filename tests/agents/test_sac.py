@@ -247,7 +247,7 @@ def test_the_beginning_is_uniform() -> None:
     agent = agent_of(learning_starts=150)
     agent.train(log_of(Scripted(CALM)), 400, lambda: agent.warming_up)
     actions = agent.buffer.take(np.arange(len(agent.buffer)))[1]
-    assert agent.updates == 1
+    assert agent.optimizer.steps == 1
     assert abs(actions[:150]).max() < 1
     counts = np.histogram(actions[:150], bins=4, range=(-1, 1))[0]
     assert counts.min() > 45  # of 300 numbers 75 on average, 7.5 off by chance
