@@ -13,7 +13,7 @@ from ..models.fields import Limits
 from .config import RolloutConfig
 from .episodes import EpisodeRecorder
 from .learner import Learner
-from .networks import Floats, Network, Weights, bind_all, make_network
+from .networks import Floats, Module, Network, Weights, bind_all, make_network
 from .optimizers import Adam
 from .policies import ActionMap, flat_size
 from .rollouts import Collector, Rollout
@@ -172,7 +172,11 @@ class SAC(Learner):
         nets = [make_network(size + self.k, 1, config) for _ in range(4)]
         self._critics = nets[:2]
         self._targets = nets[2:]
-        modules = {"actor.": self._actor, "critic.0.": nets[0], "critic.1.": nets[1]}
+        modules: dict[str, Module] = {
+            "actor.": self._actor,
+            "critic.0.": nets[0],
+            "critic.1.": nets[1],
+        }
         self.weights = bind_all(modules, log_alpha=(1,))
         self.targets = bind_all({"0.": nets[2], "1.": nets[3]})
         rng = np.random.default_rng(self._weights_seed)

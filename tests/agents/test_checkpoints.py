@@ -5,6 +5,7 @@ import os
 import struct
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from drones import ENV, OPTIONS, vector
 from rotorgram.agents import (
     Checkpoint,
     CheckpointError,
+    Config,
     EpisodeRecorder,
     ResumeError,
     load,
@@ -32,7 +34,16 @@ SMALL: dict[str, dict[str, Any]] = {
     "a2c": {"steps_per_update": 64},
     "ppo": {"steps_per_update": 64, "epochs": 2, "minibatches": 3, "normalize_observations": True},
 }
+SAC: dict[str, Any] = {
+    "steps_per_update": 16, "gradient_steps": 2, "hidden": (8, 7), "batch_size": 16,
+    "learning_starts": 40, "buffer_size": 100,
+}  # fmt: skip
+"""The buffer is written over meanwhile."""
 TOTAL = 768
+
+
+def config_of(algorithm: str) -> Config:
+    return preset(algorithm, "tuned", **{**SMALL, "sac": SAC}[algorithm])
 
 
 def log_of(drones: int, seed: int = 5, **options: Any) -> EpisodeRecorder:
@@ -42,7 +53,7 @@ def log_of(drones: int, seed: int = 5, **options: Any) -> EpisodeRecorder:
 def checkpoint_of(algorithm: str, log: EpisodeRecorder, agent: Learner) -> Checkpoint:
     return Checkpoint(
         algorithm=algorithm,
-        config=vars(preset(algorithm, "tuned", **SMALL[algorithm])),
+        config=vars(config_of(algorithm)),
         spec=log.spec,
         seed=log.run_seed,
         env_steps=TOTAL,
@@ -53,15 +64,16 @@ def checkpoint_of(algorithm: str, log: EpisodeRecorder, agent: Learner) -> Check
 
 
 def trained(algorithm: str, log: EpisodeRecorder, updates: int = 10**9) -> Learner:
-    agent = make_agent(algorithm, log, preset(algorithm, "tuned", **SMALL[algorithm]), 5)
+    agent = make_agent(algorithm, log, config_of(algorithm), 5)
     calls = iter(range(updates - 1))
     agent.train(log, TOTAL, lambda: next(calls, None) is not None)
     return agent
 
 
-@pytest.mark.parametrize("kind", ["continuous", "discrete"])
 @pytest.mark.parametrize("drones", [1, 4])
-@pytest.mark.parametrize("algorithm", SMALL)
+@pytest.mark.parametrize(
+    ("algorithm", "kind"), [*product(SMALL, ["continuous", "discrete"]), ("sac", "continuous")]
+)
 def test_a_training_that_was_stopped_ends_as_if_it_had_not(
     algorithm: str, drones: int, kind: str, tmp_path: Path
 ) -> None:

@@ -7,17 +7,15 @@ import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
-from drones import Kept, log_of, vector
+from drones import log_of, vector
 from rich.console import Console
-from rotorgram.agents import A2CConfig, VPGConfig, make_agent, preset
+from rotorgram.agents import A2CConfig, VPGConfig, preset
 from rotorgram.agents.a2c import A2C
 from rotorgram.agents.checkpoints import Checkpoint, load, store
-from rotorgram.agents.episodes import EpisodeRecorder
 from rotorgram.agents.networks import Weights
 from rotorgram.agents.vpg import VPG
 from rotorgram.cli import main
@@ -27,7 +25,7 @@ from rotorgram.training.settings import Run
 from rotorgram.training.training import Training
 from tensorboard.backend.event_processing import plugin_event_accumulator
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from test_learning import rollout, train_both
+from test_learning import rollout
 
 DOCS = Path(__file__).parents[2] / "docs" / "algorithms"
 AGENTS = ["vpg", "a2c", "sb3-a2c"]
@@ -178,18 +176,6 @@ def test_the_terms_of_vpg_by_hand() -> None:
     logged = agent.scalars()
     assert logged["train/policy_loss"] == pytest.approx(-(1 * LOG_P[0] + 2 * LOG_P[1]) / 2)
     assert logged["train/entropy_loss"] == pytest.approx(-ENTROPY_OF_ONE)
-
-
-def test_ours_logs_what_sb3_logs_of_the_same_updates() -> None:
-    config = A2CConfig(steps_per_update=64, gae_lambda=0.95, learning_rate=0.01, normalize=True)
-    env = Kept(episode_length=40)
-    log = EpisodeRecorder(env, seed=0)
-    theirs: Any = make_agent("sb3-a2c", log, config, 0)
-    for here, there in train_both(theirs, A2C(log, config, seed=1), env, log, 320):
-        assert here.keys() == there.keys()
-        for name, value in there.items():
-            assert here[name] == pytest.approx(value, rel=2e-3, abs=2e-4), name
-    assert theirs.scalars()["train/n_updates"] == 5
 
 
 # ---- resuming
