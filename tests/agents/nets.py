@@ -53,10 +53,14 @@ def policy_of(
 
 
 def random_policy(
-    spec: EnvSpec, hidden: tuple[int, ...] = (16,), activation: str = "relu", size: float = 1.0
+    spec: EnvSpec,
+    hidden: tuple[int, ...] = (16,),
+    activation: str = "relu",
+    size: float = 1.0,
+    **kinds: bool,
 ) -> NetworkPolicy:
     """A policy of random weights of such a size."""
-    policy = NetworkPolicy(spec, config_of(hidden, activation))
+    policy = NetworkPolicy(spec, config_of(hidden, activation, **kinds))
     weights = Weights.zeros(policy.shapes)
     weights.values[:] = size * np.random.default_rng(3).normal(size=weights.values.size)
     policy.bind(weights)
