@@ -150,13 +150,8 @@ class EpisodeRecorder:
         Drones may begin their next episode instead, or stay as they are: bool, shape (N,). One
         whose episode has ended has to do either.
         """
-        self.advance(self.actions.to_envs(actions), begins, frozen)
-
-    def advance(
-        self, sent: np.ndarray, begins: Mask | None = None, frozen: Mask | None = None
-    ) -> None:
-        """The same with actions of the env, shape (N, k), or (N,) if discrete."""
         env = self.env
+        sent = self.actions.to_envs(actions)
         seeds = None
         idle = self._idle(frozen)
         if begins is not None:

@@ -272,15 +272,6 @@ def test_unknown_names_are_named() -> None:
         make_agent("sb3-ppo", log_of(), PPOConfig(normalize_observations=True), 0)
 
 
-def test_time_baseline_leaves_nothing_of_a_reward_that_no_action_changes() -> None:
-    log = log_of("limit")
-    agent = VPG(log, VPGConfig(baseline="time", episodes_per_update=4), seed=0)
-    collector = Collector(log, np.random.default_rng(0), agent.policy())
-    data = collector.episodes(4, 10_000)
-    assert len(data) == 32
-    np.testing.assert_allclose(agent.returns(data), 0, atol=1e-6)
-
-
 def test_vpg_weights_with_baseline_and_scale_by_hand() -> None:
     """Two episodes, of two steps and one, gamma 0.5: R = 2, 2, 5; the mean at step 0 is 3.5."""
     config = VPGConfig(gamma=0.5, baseline="time", episodes_per_update=2)

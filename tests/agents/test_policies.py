@@ -130,12 +130,6 @@ def test_weights_that_do_not_fit_are_refused() -> None:
             NetworkPolicy.load(wrong, BOX, Config())
 
 
-def test_the_first_policy_holds_the_thrust() -> None:
-    policy = random_policy(BOX)
-    policy.initialise(np.random.default_rng(0), -0.5)
-    assert np.abs(policy.act(np.array([3, 5, 1], np.float32))).max() < 0.1
-
-
 def test_the_paper_s_networks_have_one_hidden_layer_of_16_relu_units() -> None:
     config = preset("a2c", "paper")
     assert config.hidden == (16,)

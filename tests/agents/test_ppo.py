@@ -61,12 +61,6 @@ def test_the_clipped_objective_by_hand() -> None:
     assert gradients["critic.layers.1.bias"] == pytest.approx(-3.0)
 
 
-def columns(count: int) -> tuple[np.ndarray, ...]:
-    dice = np.random.default_rng(1)
-    shapes = [(count, 1), (count, 1), (count,), (count,), (count,)]
-    return tuple(dice.normal(size=shape).astype(np.float32) for shape in shapes)
-
-
 def test_rates_of_actor_and_critic() -> None:
     """Adam's first step is the rate, whatever the gradient."""
     agent = PPO(log_of(), replace(SMALL, learning_rate=0.01, critic_learning_rate=0.03), 0)
@@ -80,30 +74,32 @@ def test_rates_of_actor_and_critic() -> None:
 
 def test_every_epoch_takes_every_transition_once() -> None:
     agent = PPO(log_of(), replace(SMALL, epochs=4, minibatches=3, normalize=False), 0)
-    taken: list[tuple[np.ndarray, ...]] = []
+    taken: list[np.ndarray] = []
     minibatch = agent.minibatch
 
-    def keep(*arguments: np.ndarray) -> tuple[float, ...]:
-        taken.append(tuple(a.copy() for a in arguments))
-        return minibatch(*arguments)
+    def keep(*columns: np.ndarray) -> tuple[float, ...]:
+        taken.append(np.column_stack(columns))
+        return minibatch(*columns)
 
     agent.minibatch = keep  # type: ignore[method-assign]
-    dice = np.random.default_rng(0)
-    names = "observations", "actions", "next_observations"
-    many = {name: dice.normal(size=(20, 1)).astype(np.float32) for name in names}
-    many["rewards"] = dice.normal(size=20)
-    flags = dict.fromkeys(("terminated", "truncated"), np.zeros(20, bool))
-    kept = np.arange(20) != 7
-    data = rollout(**many, **flags, kept=kept)
+    numbers = np.arange(20, dtype=np.float32)
+    column = numbers[:, np.newaxis]
+    never = np.zeros(20, bool)
+    kept = numbers != 7
+    data = rollout(
+        observations=column, actions=column / 10, rewards=numbers, next_observations=column + 1,
+        terminated=never, truncated=never, kept=kept,
+    )  # fmt: skip
     agent.update(data)
-    assert [len(part[0]) for part in taken] == [6, 6, 7] * 4
+    assert [len(part) for part in taken] == [6, 6, 7] * 4
     assert agent.optimizer.steps == 12
-    orders = [[tuple(column[i].item() for column in part) for part in taken[first : first + 3]
-               for i in range(len(part[0]))] for first in range(0, 12, 3)]  # fmt: skip
-    for order in orders:
-        assert sorted(row[0] for row in order) == sorted(data.observations[kept, 0, 0].tolist())
-        assert sorted(order) == sorted(orders[0]), "the columns of a transition stay together"
-    assert len(set(map(tuple, orders))) == 4
+    epochs = np.array(np.split(np.concatenate(taken), 4))
+    orders = epochs[:, :, 0].argsort(axis=1)
+    expected = epochs[0, orders[0]]
+    assert expected[:, 0].tolist() == numbers[kept].tolist()
+    for epoch, order in zip(epochs, orders, strict=True):
+        np.testing.assert_array_equal(epoch[order], expected)  # a transition's columns together
+    assert len(np.unique(orders, axis=0)) == 4
 
 
 def test_the_tuned_preset_depends_on_the_task() -> None:

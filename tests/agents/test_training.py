@@ -10,13 +10,11 @@ from drones import OPTIONS, vector
 from rotorgram.agents import (
     CheckpointError,
     ResumeError,
-    episode_seed,
     load,
     preset,
     store,
 )
 from rotorgram.cli import main
-from rotorgram.flights.trajectories import evaluation_seed
 from rotorgram.models.errors import InputError
 from rotorgram.training.settings import Run
 from rotorgram.training.training import Training
@@ -58,24 +56,6 @@ def test_wrong_runs_are_one_sentence() -> None:
         replace(run_of("vpg"), env_steps=119)  # an episode of each
     with pytest.raises(InputError, match="env: expected one of 4 drones, got 3"):
         Training(run, env_of(replace(run, num_envs=3)))
-
-
-def test_training_and_evaluation_share_no_seed() -> None:
-    training = {episode_seed(run, episode) for run in range(10) for episode in range(300)}
-    sets = ("final", "curve", "tuning")
-    evaluation = [evaluation_seed(episode, of) for of in sets for episode in range(100)]  # type: ignore[arg-type]
-    assert training.isdisjoint(evaluation)
-
-
-def test_same_seed_same_numbers_and_other_seed_other_numbers() -> None:
-    def weights(seed: int) -> bytes:
-        run = replace(run_of("a2c", 1), seed=seed, env_steps=300)
-        training = Training(run, env_of(run))
-        training.train()
-        return training.agent.actor()["layers.1.weight"].tobytes()
-
-    assert weights(1) == weights(1)
-    assert weights(1) != weights(2)
 
 
 def test_progress_tells_of_every_drone() -> None:

@@ -9,7 +9,6 @@ import time
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -23,7 +22,7 @@ from rotorgram.cli.sweep import Sweep, parse_grid
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.flights.executors import RunsFailed, WorkersConfig
 from rotorgram.flights.folders import locked
-from rotorgram.flights.trajectories import evaluation_seed, fly_episodes
+from rotorgram.flights.trajectories import fly_episodes
 from rotorgram.models.errors import InputError
 from rotorgram.training.metrics import measure_episode
 from rotorgram.training.results import Results, ResultsError, checkpoint_file
@@ -79,15 +78,6 @@ def test_a_run_is_what_its_checkpoint_flies_from_starts_of_its_seed(folder: Path
     assert found["steps_per_second"] == pytest.approx(600 / found["seconds"])
     # The other seed's starts are others.  # fault 41
     assert all(a.headline[0] != b.headline[0] for a, b in zip(flown, others, strict=True))
-
-
-def test_evaluation_episodes_share_no_start() -> None:
-    sets: tuple[Any, ...] = ("final", "curve", "tuning")
-    seeds = {
-        evaluation_seed(episode, of, seed)
-        for episode in range(20) for of in sets for seed in (None, 0, 1, 2)
-    }  # fmt: skip
-    assert len(seeds) == 20 * 3 * 4
 
 
 def test_tables_flies_two_hundred_times_or_more() -> None:  # fault 41
