@@ -1,9 +1,8 @@
 """Statistics over seeds: interquartile means and intervals.
 
 The definitions are those of Agarwal et al., "Deep Reinforcement Learning at the Edge of the
-Statistical Precipice" (NeurIPS 2021, arXiv 2108.13264), computed by SciPy. The scores of an agent
-are *strata*: an array for each task, with a score for each run. A bootstrap resamples the runs of
-each task by themselves, always in the same way. Missing values (nan) are left out.
+Statistical Precipice" (NeurIPS 2021, arXiv 2108.13264), computed by SciPy. A bootstrap resamples
+the runs of an agent, always in the same way. Missing values (nan) are left out.
 """
 
 import math
@@ -18,7 +17,6 @@ _RESAMPLES: Final = 2000
 
 Floats = NDArray[np.float64]
 Values = Sequence[float] | NDArray[np.floating[Any]]
-Strata = Sequence[Values]
 
 
 def finite(values: Values) -> Floats:
@@ -32,25 +30,21 @@ def trimmed_mean(values: Values, axis: int = -1) -> Floats:
     return np.asarray(stats.trim_mean(values, 0.25, axis=axis))
 
 
-def iqm(*strata: Values) -> float:
-    """Interquartile mean: `trimmed_mean` of all scores of all tasks; nan if there is none."""
-    scores = np.concatenate([finite(values) for values in strata])
-    return float(trimmed_mean(scores)) if scores.size else math.nan
+def iqm(values: Values) -> float:
+    """Interquartile mean: `trimmed_mean`; nan if there is no value."""
+    known = finite(values)
+    return float(trimmed_mean(known)) if known.size else math.nan
 
 
-def bootstrap_interval(*strata: Values, level: float = 0.95) -> tuple[float, float]:
+def bootstrap_interval(values: Values, level: float = 0.95) -> tuple[float, float]:
     """Percentile-bootstrap interval of `iqm`.
 
-    A task with fewer than two runs gives (nan, nan): one seed shows no spread. With few seeds the
+    Fewer than two values give (nan, nan): one seed shows no spread. With few seeds the
     interval is narrower than it should be: at a level of 95 % it has the true value in 86 to 93 %
     of the cases with five runs, and in 91 % or more from ten on (400 simulated cases of a normal, a
     lognormal and a two-humped distribution each).
     """
-
-    def statistic(*samples: Floats, axis: int = -1) -> Floats:
-        return trimmed_mean(np.concatenate(samples, axis=axis), axis=axis)
-
-    return _bootstrap(strata, statistic, level)
+    return _bootstrap([values], trimmed_mean, level)
 
 
 def bootstrap_difference(
@@ -77,14 +71,14 @@ def share_interval(count: int, total: int, level: float = 0.95) -> tuple[float, 
 
 
 def _bootstrap(
-    strata: Strata, statistic: Callable[..., Floats], level: float
+    samples: Sequence[Values], statistic: Callable[..., Floats], level: float
 ) -> tuple[float, float]:
-    """Ends of the interval; nan if a task has fewer than two runs."""
-    scores = [finite(values) for values in strata]
-    if min(values.size for values in scores) < 2:
+    """Ends of the interval; nan if a sample has fewer than two values."""
+    known = [finite(values) for values in samples]
+    if min(values.size for values in known) < 2:
         return math.nan, math.nan
     found = stats.bootstrap(
-        scores,
+        known,
         statistic,
         n_resamples=_RESAMPLES,
         confidence_level=level,
