@@ -13,8 +13,7 @@ import pandas as pd
 import pytest
 from drones import log_of, vector
 from rich.console import Console
-from rotorgram.agents import A2CConfig, VPGConfig, preset
-from rotorgram.agents.a2c import A2C
+from rotorgram.agents import VPGConfig, preset
 from rotorgram.agents.checkpoints import Checkpoint, load, store
 from rotorgram.agents.networks import Weights
 from rotorgram.agents.vpg import VPG
@@ -152,21 +151,6 @@ LOG_P = [-0.045 - 0.9189385, -2.0 - 0.9189385]  # of the actions, of mean 0 and 
 def fill(weights: Weights, value: float) -> None:
     for name, array in weights.arrays.items():
         array[...] = value if name.endswith("weight") else 0.0
-
-
-def test_the_terms_of_a2c_by_hand() -> None:
-    """V is the observation, so A = (1 - 1, 2 - 1.5)."""
-    agent = A2C(log_of(), A2CConfig(hidden=1, log_std=0.0, ent_coef=0.1), 0)
-    fill(agent.weights.part("actor."), 0.0)
-    fill(agent.weights.part("critic."), 1.0)
-    agent.gradient(TWO_STEPS)
-    logged = agent.scalars()
-    assert logged["train/policy_loss"] == pytest.approx(-0.5 * LOG_P[1] / 2)
-    assert logged["train/value_loss"] == pytest.approx((0.0 + 0.25) / 2)
-    assert logged["train/entropy_loss"] == pytest.approx(-ENTROPY_OF_ONE)
-    assert logged["train/explained_variance"] == pytest.approx(1 - 0.0625 / 0.25)
-    assert logged["train/std"] == 1.0
-    assert logged["train/n_updates"] == 0
 
 
 def test_the_terms_of_vpg_by_hand() -> None:
