@@ -318,29 +318,21 @@ def test_no_text_of_a_spec_becomes_code(trained: Path, tmp_path: Path) -> None:
     count = len(EVIL)
     kept = load(trained / "checkpoint.safetensors")
     wicked = "".join(EVIL)
-    spec = replace(
-        kept.spec,
-        env_id=wicked,
-        vehicle=wicked[::-1],
-        options={"a\\": "*/\n#error\r\u0085\\\n??/\n", wicked: [wicked, "\0\x7f"]},
-        observation=(
-            ArraySpec(
-                name="*/",
-                shape=(count,),
-                unit=tuple(EVIL[::-1]),
-                frame=wicked,
-                components=tuple(EVIL),
-            ),
-        ),
-        action=ArraySpec(name="??/", shape=(2,), unit="*/", components=("\\", "/*")),
+    seen = ArraySpec(
+        name="*/", shape=(count,), unit=tuple(EVIL[::-1]), frame=wicked, components=tuple(EVIL)
     )
+    action = ArraySpec(name="??/", shape=(2,), unit="*/", components=("\\", "/*"))
+    options = {"a\\": "*/\n#error\r\u0085\\\n??/\n", wicked: [wicked, "\0\x7f"]}
+    named = {"env_id": wicked, "vehicle": wicked[::-1], "options": options}
+    spec = replace(kept.spec, **named, observation=(seen,), action=action)
     policy = policy_of(spec)
     crafted = replace(kept, spec=spec, actor=policy.arrays())
     files = {target: tmp_path / TARGETS[target] for target in TARGETS}
     for target, path in files.items():
         path.write_bytes(export(crafted, target))
-    options = json.dumps(dict(spec.options), ensure_ascii=False)
-    expected = [wicked, wicked[::-1], options]
+    written = json.dumps(options, ensure_ascii=False)
+    expected = [wicked, wicked[::-1], written]
+    # C of 1999 has trigraphs.
     assert constants_of_c(files["c"], "ENV_ID", "VEHICLE", "OPTIONS") == expected
     # Every line is one that the exporter began, and the header's comment ends where it should.
     head, _, rest = files["c"].read_text().partition("\n */\n#ifndef")
@@ -352,14 +344,6 @@ def test_no_text_of_a_spec_becomes_code(trained: Path, tmp_path: Path) -> None:
     assert "injected" not in code
     assert "#error" not in code
     assert "\u202e" not in head + rest  # it would show the text in another order than it has
-    observations = observations_of(spec, 50)
-    flags = [*CPP_FLAGS, "-trigraphs"]
-    (tmp_path / "main.c").write_text(C_MAIN)
-    compiled(tool("g++"), *flags, "-o", tmp_path / "main", tmp_path / "main.c")
-    expected_actions = by_policy(policy, observations)
-    np.testing.assert_allclose(
-        fed(observations, tmp_path / "main"), expected_actions, rtol=1e-4, atol=1e-4
-    )
     told = {entry.key: entry.value for entry in onnx.load(files["onnx"]).metadata_props}
     assert json.loads(told["observation"])[0]["components"] == EVIL
 
