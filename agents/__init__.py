@@ -159,7 +159,12 @@ def resume_agent(kept: Checkpoint, log: EpisodeRecorder) -> Agent:
         agent.set_state(kept.state)
     except _ERRORS as error:
         raise _unfit(error) from None
-    log.resume(kept.position)
+    try:
+        log.resume(kept.position)
+    except InputError:
+        raise
+    except (IndexError, TypeError, ValueError) as error:
+        raise _unfit(error) from None
     return agent
 
 
