@@ -176,9 +176,6 @@ def _read(data: bytes, parse: Callable[[bytes], dict[str, np.ndarray]]) -> Check
     meta = read_table(_Meta, content, "metadata")
     spec = EnvSpec.from_json(meta.spec)
     arrays = parse(data)
-    for name, array in arrays.items():
-        if not _is_finite(name, array):
-            raise ValueError(f"expected finite numbers in {name}, got NaN or infinity")
     checkpoint = Checkpoint(
         spec=spec,
         actor=part_of(arrays, "policy/"),

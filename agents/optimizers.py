@@ -44,12 +44,9 @@ class Adam:
         """Take over a state. Raises `ValueError` unless it is whole."""
         size = self.first.shape
         check_shapes("optimizer", arrays, {"first": size, "second": size, "steps": ()})
-        steps = int(arrays["steps"])
-        if steps < 0 or arrays["second"].min(initial=0.0) < 0:
-            raise ValueError(f"optimizer: expected no negative steps or squares, got {steps} steps")
         self.first[...] = arrays["first"]
         self.second[...] = arrays["second"]
-        self.steps = steps
+        self.steps = int(arrays["steps"])
 
 
 def clip_norm(slopes: Floats, most: float) -> float:
