@@ -1,4 +1,4 @@
-"""PPO: its loss and its minibatches by hand, its presets."""
+"""PPO: its minibatches, its rates and its presets."""
 
 import subprocess
 import sys
@@ -14,51 +14,6 @@ from rotorgram.models.errors import InputError
 from test_learning import rollout
 
 SMALL = PPOConfig(gamma=0.5, gae_lambda=0.5, steps_per_update=3, epochs=1, minibatches=1)
-
-
-def filled(config: PPOConfig, actor: float = 0.0, critic: float = 0.0, seed: int = 0) -> PPO:
-    """A linear critic V(s) = critic · s of one unit; an actor of constant weights."""
-    agent = PPO(log_of(), config, seed)
-    for part, value in (("actor.", actor), ("critic.", critic)):
-        for name, array in agent.weights.part(part).arrays.items():
-            array[...] = value if name.endswith("weight") else 0.0
-    return agent
-
-
-def test_the_clipped_objective_by_hand() -> None:
-    """Mean 0, deviation 1, of which log P(a) = -a²/2 - 0.9189; r is the exponential of the change.
-
-    | r | A | min(r A, clip(r) A) | dL / dlog P |
-    |---|---|---|---|
-    | 1.1 | 2 | 2.2 | 2.2 |
-    | 1.5 | 2 | 1.2 · 2 | 0 |
-    | 0.5 | 2 | 1 | 1 |
-    | 1.5 | -1 | -1.5 | -1.5 |
-    | 0.5 | -1 | -0.8 | 0 |
-    """
-    config = PPOConfig(hidden=1, log_std=0.0, normalize=False, clip=0.2)
-    agent = filled(config)
-    actions = np.array([0.5, 1.0, -2.0, 1.5, 0.3], np.float32)
-    ratio = np.array([1.1, 1.5, 0.5, 1.5, 0.5])
-    advantage = np.array([2, 2, 2, -1, -1], "f")
-    before = (-(actions**2) / 2 - 0.9189385 - np.log(ratio)).astype(np.float32)
-    seen = np.ones((5, 1), np.float32)
-    targets = np.array([1, 2, 3, 4, 5], np.float32)
-    gain, entropy, value_loss, distance, clipped = agent.minibatch(
-        seen, actions[:, np.newaxis], before, advantage, targets
-    )
-    assert gain == pytest.approx((2.2 + 2.4 + 1.0 - 1.5 - 0.8) / 5, rel=1e-5)
-    assert entropy == pytest.approx(0.5 + 0.9189385, rel=1e-6)
-    assert value_loss == pytest.approx((1 + 4 + 9 + 16 + 25) / 5)
-    assert distance == pytest.approx(np.mean(ratio - 1 - np.log(ratio)), rel=1e-5)
-    assert clipped == 4 / 5
-    slope = np.array([2.2, 0, 1, -1.5, 0]) / -5
-    gradients = agent.weights.gradients
-    # d log P / d mean = a and d log P / d log_std = a² - 1
-    assert gradients["actor.layers.1.bias"] == pytest.approx(slope @ actions, rel=1e-5)
-    assert gradients["actor.log_std"] == pytest.approx(slope @ (actions**2 - 1), rel=1e-5)
-    # 0.5 · mean of (0 - target)²
-    assert gradients["critic.layers.1.bias"] == pytest.approx(-3.0)
 
 
 def test_rates_of_actor_and_critic() -> None:

@@ -73,37 +73,6 @@ def test_a_deviation_at_its_limit_has_no_gradient() -> None:
         assert actor.weights.gradients["layers.1.bias"][1] == 0
 
 
-def test_critics_and_temperature_by_hand() -> None:
-    """All weights 0 but the last biases: Q = b. Policy: mean 0, σ 1, so u is the noise.
-
-    With noise 0 log π = -2 · 0.9189385 = -1.837877. Biases 1 and 3, targets 2 and 5, alpha 0.5,
-    gamma 0.9, reward 4: wanted 4 + 0.9 · (2 + 0.5 · 1.837877) = 6.627045; after an end 4.
-    """
-    agent = agent_of(gamma=0.9, alpha=0.5, learning_rate=0.01, tau=0.1)
-    agent.weights.values[:-1] = agent.targets.values[:] = 0
-    for i, (own, target) in enumerate(((1.0, 2.0), (3.0, 5.0))):
-        agent.weights.arrays[f"critic.{i}.layers.2.bias"][:] = own
-        agent.targets.arrays[f"{i}.layers.2.bias"][:] = target
-    states = np.zeros((2, N), np.float32)
-    actions = np.zeros((2, K), np.float32)
-    batch = states, actions, states, np.full(2, 4, np.float32), np.array([0, 1], np.float32)
-    agent.update(batch, actions, actions)
-    # Errors 1 - 6.627 and 1 - 4, mean -4.3135; 3 - 6.627 and 3 - 4, mean -2.3135: Adam's first
-    # step is the rate against the sign, and a tenth of it reaches the targets.
-    biases = [float(agent.weights.arrays[f"critic.{i}.layers.2.bias"][0]) for i in range(2)]
-    assert biases == pytest.approx([1.01, 3.01], abs=1e-6)
-    targets = [float(agent.targets.arrays[f"{i}.layers.2.bias"][0]) for i in range(2)]
-    assert targets == pytest.approx([2 + 0.1 * (1.01 - 2), 5 + 0.1 * (3.01 - 5)], abs=1e-6)
-    told = agent.scalars()
-    squares = (1 - 6.627045) ** 2 + 9 + (3 - 6.627045) ** 2 + 1
-    assert told["train/critic_loss"] == pytest.approx(squares / 4, rel=1e-5)
-    assert told["train/actor_loss"] == pytest.approx(0.5 * -1.837877 - 1.01, rel=1e-5)
-    # log alpha descends -log alpha · (log π + aim): aim -2, so alpha falls where π is too random.
-    loss = -math.log(0.5) * (-1.837877 - 2)
-    assert told["train/ent_coef_loss"] == pytest.approx(loss, rel=1e-5)
-    assert agent.weights.arrays["log_alpha"][0] == pytest.approx(math.log(0.5) - 0.01, abs=1e-6)
-
-
 def named_as_sb3(agent: SAC) -> dict[str, np.ndarray]:
     """The weights of ours under the names of SB3's policy."""
     weights = agent.weights.arrays
