@@ -3,6 +3,8 @@
 Only SB3's algorithms need torch.
 """
 
+from itertools import zip_longest
+
 from ..envs.spec import Discrete, EnvSpec, component_names
 from ..models.errors import InputError
 from .a2c import A2CConfig
@@ -74,7 +76,7 @@ def make_agent(algorithm: str, log: EpisodeRecorder, config: Config, seed: int) 
             f"algorithm: expected {algorithm} with its {row.config.__name__}, "
             f"got {type(config).__name__}"
         )
-    agent: Agent = row.agent_class().create(log, config, seed)
+    agent: Agent = row.agent_class()(log, config, seed)
     return agent
 
 
@@ -110,13 +112,9 @@ def _check_start(kept: Checkpoint, algorithm: str, spec: EnvSpec, config: Config
         )
     if not kept.num_envs:
         raise InputError("start-from: expected the checkpoint of a training, got a policy alone")
-    for (kind, wanted), (_, got) in zip(_parts(kept.spec), _parts(spec), strict=True):
-        expected = f"start-from: expected the {kind} of {kept.env_id}"
-        if len(got) != len(wanted):
-            raise InputError(f"{expected}, {len(wanted)}, got {len(got)}")
-        for own, other in zip(wanted, got, strict=True):
-            if own != other:
-                raise InputError(f"{expected} with {own!r}, got {other!r}")
+    for wanted, got in zip_longest(_names(kept.spec), _names(spec), fillvalue="none"):
+        if wanted != got:
+            raise InputError(f"start-from: expected {wanted} of {kept.env_id}, got {got}")
     begun_with = kept.hyperparameters
     for name in NETWORK_FIELDS:
         value = getattr(config, name)
@@ -125,12 +123,14 @@ def _check_start(kept: Checkpoint, algorithm: str, spec: EnvSpec, config: Config
             raise InputError(f"{name}: expected {own} of the training to start from, got {value}")
 
 
-def _parts(spec: EnvSpec) -> tuple[tuple[str, tuple[str, ...]], ...]:
-    """Names of what an env's policy sees, and of what it sets."""
-    seen = tuple(name for array in spec.observation for name in component_names(array))
+def _names(spec: EnvSpec) -> list[str]:
+    """Names of what an env's policy sees and sets."""
+    names: list[str] = []
+    for array in spec.observation:
+        names += [f"observation {name!r}" for name in component_names(array)]
     if isinstance(spec.action, Discrete):
-        return ("observed numbers", seen), ("choices", tuple(map(str, range(spec.action.n))))
-    return ("observed numbers", seen), ("actions", component_names(spec.action))
+        return [*names, f"{spec.action.n} choices"]
+    return names + [f"action {name!r}" for name in component_names(spec.action)]
 
 
 def _unfit(error: Exception) -> CheckpointError:
@@ -159,7 +159,12 @@ def resume_agent(kept: Checkpoint, log: EpisodeRecorder) -> Agent:
         agent.set_state(kept.state)
     except _ERRORS as error:
         raise _unfit(error) from None
-    log.resume(kept.position)
+    try:
+        log.resume(kept.position)
+    except InputError:
+        raise
+    except (IndexError, TypeError, ValueError) as error:
+        raise _unfit(error) from None
     return agent
 
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ..models.fields import Limits
 from .config import RolloutConfig
-from .learner import Learner
+from .learner import PolicyGradient
 from .networks import Floats
 from .rollouts import Collector, Rollout, advantages
 
@@ -30,7 +30,7 @@ class A2CConfig(RolloutConfig):
     """Weight of the policy's entropy."""
 
 
-class A2C(Learner):
+class A2C(PolicyGradient):
     """Two networks: the critic learns V(s), the actor follows the advantage.
 
     Algorithm 2 weighs the actor's gradient by Q in step 3; the text and Equation 3 by A, as here.

@@ -23,16 +23,15 @@ from typing import Annotated, Any, Final
 import numpy as np
 
 from ..envs.config import EnvConfig
-from ..envs.spec import Discrete, EnvSpec
+from ..envs.spec import EnvSpec
 from ..models import Backend
 from ..models.errors import InputError, require, shortened
 from ..models.fields import Limits, read_table
 from .config import Config
 from .episodes import Episode, Position, ResumeError
 from .networks import Floats, named, part_of
-from .policies import NetworkPolicy, flat_size
+from .policies import NetworkPolicy
 from .presets import preset
-from .registry import ALGORITHMS
 
 FORMAT: Final = 3
 _PLAIN: Final = ("algorithm", "config", "backend", "seed", "env_steps", "versions")
@@ -106,9 +105,7 @@ class Checkpoint:
 
     def policy(self, spec: EnvSpec | None = None) -> NetworkPolicy:
         """The policy, ready to fly that env or its own. Raises `InputError` if it does not fit."""
-        squash = ALGORITHMS[self.algorithm].squashed
-        config = self.hyperparameters
-        return NetworkPolicy.load(self.actor, spec or self.spec, config, squash=squash)
+        return NetworkPolicy.load(self.actor, spec or self.spec, self.hyperparameters)
 
     def other_versions(self) -> dict[str, tuple[str, str]]:
         """Software whose version was another: its version then and now."""
@@ -183,9 +180,6 @@ def _read(data: bytes, parse: Callable[[bytes], dict[str, np.ndarray]]) -> Check
     meta = read_table(_Meta, content, "metadata")
     spec = EnvSpec.from_json(meta.spec)
     arrays = parse(data)
-    for name, array in arrays.items():
-        if not _is_finite(name, array):
-            raise ValueError(f"expected finite numbers in {name}, got NaN or infinity")
     env = EnvConfig.from_dict(meta.env) if meta.env else None
     if env and env.env_id != spec.env_id:
         raise ValueError(f"expected the config of {spec.env_id}, got that of {env.env_id}")
@@ -194,7 +188,7 @@ def _read(data: bytes, parse: Callable[[bytes], dict[str, np.ndarray]]) -> Check
         env=env,
         actor=part_of(arrays, "policy/"),
         state=part_of(arrays, "state/"),
-        position=_position(meta, arrays, spec),
+        position=_position(meta, arrays),
         **{name: getattr(meta, name) for name in _PLAIN},
     )
     checkpoint.policy()  # raises if it does not fit
@@ -238,22 +232,17 @@ class _Meta:
             raise InputError(f"versions: expected values by name, got {shortened(self.versions)}")
 
 
-def _position(meta: _Meta, arrays: Mapping[str, np.ndarray], spec: EnvSpec) -> Position:
+def _position(meta: _Meta, arrays: Mapping[str, np.ndarray]) -> Position:
     """The position of a training, or of a policy alone."""
     progress = read_table(_Progress, meta.position, "position")
     position = _no_position(progress.env_steps, progress.seconds)
     if all(name.startswith("policy/") for name in arrays):
         return position
     columns = part_of(arrays, "episodes/")
-    kinds = {name: column.dtype.type for name, column in columns.items()}
-    if kinds != _COLUMNS:
-        raise ValueError(f"expected columns {sorted(_COLUMNS)} of episodes, got {sorted(kinds)}")
     rows = zip(*(columns[name].tolist() for name in _COLUMNS), strict=True)
     episodes = [Episode(**dict(zip(_COLUMNS, row, strict=True))) for row in rows]
     flown: dict[str, Any] = part_of(arrays, "position/")
-    position = replace(position, episodes=tuple(episodes), **flown)
-    _check_position(position, spec, meta.env_steps)
-    return position
+    return replace(position, episodes=tuple(episodes), **flown)
 
 
 def _no_position(env_steps: int, seconds: float) -> Position:
@@ -270,30 +259,6 @@ def _is_finite(name: str, array: np.ndarray) -> bool:
     # Without metrics the error of an episode is NaN, which is no divergence.
     allowed = name == "episodes/mean_size"
     return allowed or array.dtype.kind != "f" or bool(np.isfinite(array).all())
-
-
-def _check_position(position: Position, spec: EnvSpec, total: int) -> None:
-    """Raises `ValueError` unless shapes fit the env, and env steps those of the episodes."""
-    count = len(position.numbers)
-    longest = len(position.actions)
-    action = spec.action
-    drawn, kind = ((), "i") if isinstance(action, Discrete) else ((action.size,), "f")
-    expected: dict[str, Any] = dict.fromkeys(_POSITION, ((count,), "i"))
-    expected["actions"] = (longest, count, *drawn), kind
-    expected["observations"] = (count, flat_size(spec)), "f"
-    arrays = {name: getattr(position, name) for name in _POSITION}
-    got = {name: (array.shape, array.dtype.kind) for name, array in arrays.items()}
-    if got != expected or position.lengths.max() != longest:
-        raise ValueError(f"expected a position of shapes {expected}, got {got}")
-    ended = {episode.episode: episode.length for episode in position.episodes}
-    running = dict(zip(position.numbers.tolist(), position.lengths.tolist(), strict=True))
-    flown = sum({**running, **ended}.values())
-    steps = position.env_steps
-    if steps != flown or steps >= total + count:
-        raise ValueError(f"expected env_steps of {flown}, at most {total}, got {steps}")
-    least = min(int(arrays[name].min()) for name in ("numbers", "lengths", "first_steps"))
-    if least < (0 if steps else -count):
-        raise ValueError(f"expected numbers of 0 or more, got {least}")
 
 
 def write_whole(path: Path, data: bytes) -> None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Final, Literal
+from typing import Annotated, ClassVar, Final, Literal
 
 from ..models.fields import Limits, check_fields
 
@@ -30,6 +30,9 @@ class Config:
     """Initial logarithm of the policy's standard deviation, in units of the action."""
     normalize_observations: bool = False
     """Shift and scale observations to mean 0 and standard deviation 1 of all rollouts before."""
+
+    squashed: ClassVar[bool] = False
+    """Whether the policy bounds its output by tanh."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.hidden, Sequence):

@@ -116,7 +116,8 @@ class EpisodeRecorder:
         self._all = np.ones(count, bool)
         self._nothing = np.full(count, np.nan)
         self._flown: list[np.ndarray] = []  # actions; at least those of the running episodes
-        self._steps: list[NDArray[np.float64]] | None = [] if keep_steps else None
+        self._keep_steps = keep_steps
+        self._steps: list[NDArray[np.float64]] = []
         self._still = self.actions.to_envs(np.zeros((count, self.actions.size), np.float32))
 
     def start_clock(self) -> None:
@@ -150,13 +151,8 @@ class EpisodeRecorder:
         Drones may begin their next episode instead, or stay as they are: bool, shape (N,). One
         whose episode has ended has to do either.
         """
-        self.advance(self.actions.to_envs(actions), begins, frozen)
-
-    def advance(
-        self, sent: np.ndarray, begins: Mask | None = None, frozen: Mask | None = None
-    ) -> None:
-        """The same with actions of the env, shape (N, k), or (N,) if discrete."""
         env = self.env
+        sent = self.actions.to_envs(actions)
         seeds = None
         idle = self._idle(frozen)
         if begins is not None:
@@ -238,8 +234,6 @@ class EpisodeRecorder:
         `episode` (int64), and float32 of the shape (T,): `value` of the headline metric, `reward`,
         and `thrust`, the mean over the rotors in N. NaN where the env does not tell it.
         """
-        if self._steps is None:
-            raise ValueError("steps: expected a recorder with keep_steps")
         table = np.concatenate([np.zeros((0, 4)), *self._steps])
         columns: dict[str, np.ndarray] = {"episode": table[:, 0].astype(np.int64)}
         for place, name in enumerate(("value", "reward", "thrust"), 1):
@@ -251,7 +245,7 @@ class EpisodeRecorder:
         env = self.env
         self._forget(self._all)
         self._flown = []
-        self._steps = None if self._steps is None else []
+        self._steps = []
         env.reset(seed=self._seeds.tolist())
         lengths = position.lengths.reshape(-1, self._together).max(1).repeat(self._together)
         for step, actions in enumerate(position.actions):
@@ -302,7 +296,7 @@ class EpisodeRecorder:
         self._lengths += 1 if idle is None else ~idle
         self._rewards += self.env.rewards  # 0 of those that did not fly
         self._sizes += sizes if idle is None else np.where(idle, 0.0, sizes)
-        if self._steps is not None:
+        if self._keep_steps:
             thrust = telemetry["thrust"] if "thrust" in telemetry else self._nothing[:, np.newaxis]
             columns = (self._numbers, values, self.env.rewards, thrust.mean(axis=1))
             table = np.stack(columns, axis=1)

@@ -1,7 +1,6 @@
 """Heads: from the outputs of a network to distributions of actions, and their derivatives."""
 
 import math
-from abc import abstractmethod
 from types import MappingProxyType
 from typing import Final
 
@@ -14,7 +13,10 @@ _LOG_STD: Final = np.array([-4.0, 1.0], np.float32)
 
 
 class Head:
-    """A distribution of actions (B, k), or (B, 1) of choices, by a network's outputs."""
+    """A distribution of actions (B, k), or (B, 1) of choices, by a network's outputs.
+
+    This one has none: its policy flies the most likely action alone.
+    """
 
     shapes: Shapes = MappingProxyType({})
     """Of its own weights, by name."""
@@ -25,24 +27,24 @@ class Head:
     def initialise(self, log_std: float) -> None:
         """Set the weights."""
 
-    @abstractmethod
     def noise(self, rng: np.random.Generator, steps: int) -> Floats:
         """Randomness for so many rows of `sample`, drawn at once: shape (steps, k)."""
+        raise NotImplementedError
 
-    @abstractmethod
     def sample(self, output: Floats, noise: Floats) -> Floats:
         """Actions, not clipped, from outputs and rows of `noise`; in the memory of the outputs."""
+        raise NotImplementedError
 
-    @abstractmethod
     def score(self, output: Floats, actions: Floats) -> tuple[Floats, float]:
         """Log-probabilities, shape (B,), and the mean entropy."""
+        raise NotImplementedError
 
-    @abstractmethod
     def back(self, by_log_probability: Floats, by_entropy: float) -> Floats:
         """Derivatives of a loss by the outputs, from those by what `score` gave last.
 
         Sets the gradients of its own weights.
         """
+        raise NotImplementedError
 
     def clamp(self) -> None:
         """Keep its weights where they are sensible."""

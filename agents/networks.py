@@ -8,7 +8,7 @@ from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import ClassVar, Final, TypeVar
+from typing import ClassVar, Final, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,13 @@ def named(prefix: str, items: Mapping[str, Item]) -> dict[str, Item]:
 def part_of(items: Mapping[str, Item], prefix: str) -> dict[str, Item]:
     """The items with names that begin so, without this prefix."""
     return {k.removeprefix(prefix): item for k, item in items.items() if k.startswith(prefix)}
+
+
+def check_shapes(name: str, arrays: Mapping[str, np.ndarray], expected: Shapes) -> None:
+    """Raises `ValueError` unless these arrays are there, in these shapes, and no others."""
+    got = {key: array.shape for key, array in arrays.items()}
+    if got != expected:
+        raise ValueError(f"{name}: expected arrays of shapes {dict(expected)}, got {got}")
 
 
 @dataclass(frozen=True)
@@ -74,9 +81,7 @@ class Weights:
 
     def load(self, arrays: Mapping[str, Floats]) -> None:
         """Take over arrays by name. Raises `ValueError` for other names or shapes."""
-        got = {name: array.shape for name, array in arrays.items()}
-        if got != self.shapes:
-            raise ValueError(f"expected arrays of shapes {dict(self.shapes)}, got {got}")
+        check_shapes("weights", arrays, self.shapes)
         for name, array in self.arrays.items():
             array[...] = arrays[name]
 
@@ -221,9 +226,9 @@ class Network:
         self.layers = list(self.build(inputs, outputs, config))
         with_weights = [layer for layer in self.layers if layer.shapes]
         self._named = {f"layers.{i}.": layer for i, layer in enumerate(with_weights)}
-        self.shapes: dict[str, tuple[int, ...]] = {}
+        self.shapes: Shapes = {}
         for prefix, layer in self._named.items():
-            self.shapes |= named(prefix, layer.shapes)
+            self.shapes = {**self.shapes, **named(prefix, layer.shapes)}
 
     @abstractmethod
     def build(self, inputs: int, outputs: int, config: Config) -> Sequence[Layer]:
@@ -271,6 +276,26 @@ class MLP(Network):
             layers += [Affine(inputs, units), {"relu": Relu, "tanh": Tanh}[config.activation]()]
             inputs = units
         return [*layers, Affine(inputs, outputs)]
+
+
+class Module(Protocol):
+    """What computes with weights."""
+
+    shapes: Shapes
+
+    def bind(self, weights: Weights) -> None:
+        """Compute with these arrays from now on; they have the shapes of `shapes`."""
+
+
+def bind_all(modules: Mapping[str, Module], **others: tuple[int, ...]) -> Weights:
+    """The weights of modules, by the prefix of their names, and other arrays: all 0."""
+    shapes: dict[str, tuple[int, ...]] = {}
+    for prefix, module in modules.items():
+        shapes |= named(prefix, module.shapes)
+    weights = Weights.zeros(shapes | others)
+    for prefix, module in modules.items():
+        module.bind(weights.part(prefix))
+    return weights
 
 
 NETWORKS: Final[dict[str, type[Network]]] = {"mlp": MLP}

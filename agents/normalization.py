@@ -4,11 +4,13 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from .networks import Normalise, check_shapes
+
 _LEAST = 0.01
 """Least deviation to divide by: what hardly changes is not blown up."""
 
 
-class Moments:
+class Moments(Normalise):
     """Mean and variance of all rows so far, in float64 (Chan, Golub, LeVeque 1979, Eq. 2.1).
 
     Attributes:
@@ -40,11 +42,11 @@ class Moments:
 
     def load(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Take over a state. Raises `ValueError` unless it is whole."""
-        got = {name: array.shape for name, array in arrays.items()}
-        expected = {name: array.shape for name, array in self.arrays().items()}
-        if got != expected or arrays["squares"].min() < 0 or arrays["count"] < 0:
-            raise ValueError(f"observations: expected moments of shapes {expected}, got {got}")
-        self._count, self._mean, self._squares = (arrays[name].copy() for name in expected)
+        size = self._mean.shape
+        check_shapes("observations", arrays, {"count": (), "mean": size, "squares": size})
+        self._count = arrays["count"].copy()
+        self._mean = arrays["mean"].copy()
+        self._squares = arrays["squares"].copy()
         self._set()
 
     def _set(self) -> None:

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from .networks import Floats, Weights
+from .networks import Floats, Weights, check_shapes
 
 
 class Adam:
@@ -42,16 +42,11 @@ class Adam:
 
     def load(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Take over a state. Raises `ValueError` unless it is whole."""
-        got = {name: array.shape for name, array in arrays.items()}
-        expected = {"first": self.first.shape, "second": self.second.shape, "steps": ()}
-        if got != expected:
-            raise ValueError(f"optimizer: expected arrays of shapes {expected}, got {got}")
-        steps = int(arrays["steps"])
-        if steps < 0 or arrays["second"].min(initial=0.0) < 0:
-            raise ValueError(f"optimizer: expected no negative steps or squares, got {steps} steps")
+        size = self.first.shape
+        check_shapes("optimizer", arrays, {"first": size, "second": size, "steps": ()})
         self.first[...] = arrays["first"]
         self.second[...] = arrays["second"]
-        self.steps = steps
+        self.steps = int(arrays["steps"])
 
 
 def clip_norm(slopes: Floats, most: float) -> float:

@@ -9,7 +9,8 @@ from ..envs.spec import ArraySpec, Discrete, EnvSpec
 from ..models.errors import InputError
 from .config import Config
 from .heads import Categorical, Gaussian, Head
-from .networks import Floats, Layer, Normalise, Tanh, Weights, make_network
+from .networks import Floats, Layer, Shapes, Tanh, Weights, make_network
+from .normalization import Moments
 
 Observation = np.ndarray | Mapping[str, np.ndarray]
 """As an env gives it."""
@@ -98,54 +99,37 @@ class NetworkPolicy:
 
     Attributes:
         network: From inputs to the mean of the action, or to the logits of the choices, k numbers.
-        head: Distribution of the actions; None for a policy that only flies.
-        normaliser: (observation - mean) · scale, if the config has it: 0 and 1 at the beginning.
+        head: Distribution of the actions.
+        moments: Normalise the observations, if the config has it.
         actions: Map from outputs to actions of the env.
         shapes: Of its weights: those of the network and of the head.
     """
 
-    head: Head | None
-
-    def __init__(self, spec: EnvSpec, config: Config, *, squash: bool = False) -> None:
+    def __init__(self, spec: EnvSpec, config: Config) -> None:
         self.spec = spec
         self.actions = ActionMap(spec.action)
         size = flat_size(spec)
         outputs = self.actions.outputs
         self.network = make_network(size, outputs, config)
-        self.head = None
+        self.head: Head = Head() if config.squashed else Gaussian(outputs)
         if self.actions.discrete:
             self.head = Categorical(outputs)
-        elif not squash:
-            self.head = Gaussian(outputs)
-        self.shapes = dict(self.network.shapes)
-        if self.head is not None:
-            self.shapes |= self.head.shapes
-        self.normaliser: Normalise | None = None
-        if config.normalize_observations:
-            self.normaliser = Normalise(np.zeros(size, np.float32), np.ones(size, np.float32))
-        self._squash = [Tanh()] if squash else []
+        self.shapes: Shapes = {**self.network.shapes, **self.head.shapes}
+        self.moments = Moments(size) if config.normalize_observations else None
+        self._squash = [Tanh()] if config.squashed else []
         self.reset()
 
     @classmethod
-    def load(
-        cls,
-        weights: Mapping[str, Floats],
-        spec: EnvSpec,
-        config: Config,
-        *,
-        squash: bool = False,
-    ) -> "NetworkPolicy":
+    def load(cls, weights: Mapping[str, Floats], spec: EnvSpec, config: Config) -> "NetworkPolicy":
         """The policy of some weights, as `arrays` gives them.
 
-        With `squash` the output is tanh of the network's, and `log_std` is left out: it flies the
-        most likely actions alone. Raises `InputError` unless the weights are those that the env and
-        the config need.
+        Raises `InputError` unless they are those that the env and the config need.
         """
-        policy = cls(spec, config, squash=squash)
+        policy = cls(spec, config)
         expected = dict(policy.shapes)
-        if policy.normaliser is not None:
-            expected |= {"observation.mean": (flat_size(spec),)}
-            expected |= {"observation.scale": (flat_size(spec),)}
+        if policy.moments is not None:
+            size = (flat_size(spec),)
+            expected |= {"observation.mean": size, "observation.scale": size}
         got = {name: array.shape for name, array in weights.items()}
         if got != expected:
             raise InputError(
@@ -156,30 +140,28 @@ class NetworkPolicy:
         bound = Weights.zeros(policy.shapes)
         bound.load({name: weights[name] for name in policy.shapes})
         policy.bind(bound)
-        if policy.normaliser is not None:
-            policy.normaliser.mean = weights["observation.mean"]
-            policy.normaliser.scale = weights["observation.scale"]
+        if policy.moments is not None:
+            policy.moments.mean = weights["observation.mean"]
+            policy.moments.scale = weights["observation.scale"]
         return policy
 
     def bind(self, weights: Weights) -> None:
         """Compute with these arrays from now on; they have the shapes of `shapes`."""
         self.weights = weights
         self.network.bind(weights)
-        if self.head is not None:
-            self.head.bind(weights)
+        self.head.bind(weights)
 
     def initialise(self, rng: np.random.Generator, log_std: float) -> None:
         """Last layer near zero: the first policy gives the middle of the action space."""
         self.network.initialise(rng, 0.01)
-        if self.head is not None:
-            self.head.initialise(log_std)
+        self.head.initialise(log_std)
 
     def arrays(self) -> dict[str, Floats]:
         """Copies of all that `load` needs, by name."""
         arrays = {name: array.copy() for name, array in self.weights.arrays.items()}
-        if self.normaliser is not None:
-            arrays["observation.mean"] = self.normaliser.mean
-            arrays["observation.scale"] = self.normaliser.scale
+        if self.moments is not None:
+            arrays["observation.mean"] = self.moments.mean
+            arrays["observation.scale"] = self.moments.scale
         return arrays
 
     @property
@@ -190,7 +172,7 @@ class NetworkPolicy:
     @property
     def layers(self) -> list[Layer]:
         """All that happens between an observation and the output, in its order."""
-        first = [] if self.normaliser is None else [self.normaliser]
+        first = [] if self.moments is None else [self.moments]
         return [*first, *self.network.layers, *self._squash]
 
     def reset(self) -> None:
@@ -199,12 +181,12 @@ class NetworkPolicy:
 
     def inputs(self, observations: Floats) -> Floats:
         """Observations (..., n), and the memory behind them, as the network takes them."""
-        if self.normaliser is None:
+        if self.moments is None:
             return observations
         if not self.network.memory:
-            return self.normaliser.forward(observations)
-        size = len(self.normaliser.mean)
-        seen = self.normaliser.forward(observations[..., :size])
+            return self.moments.forward(observations)
+        size = len(self.moments.mean)
+        seen = self.moments.forward(observations[..., :size])
         return np.concatenate([seen, observations[..., size:]], axis=-1)
 
     def output(self, observations: Floats) -> Floats:
@@ -228,7 +210,6 @@ class NetworkPolicy:
 
     def draw_noise(self, rng: np.random.Generator, steps: int) -> Floats:
         """Randomness for so many rows of `sample`, drawn at once: shape (steps, k)."""
-        assert self.head is not None
         return self.head.noise(rng, steps)
 
     def sample(self, observations: Floats, noise: Floats) -> Floats:
@@ -237,7 +218,6 @@ class NetworkPolicy:
         Shape (N, 1), holding whole numbers, if they are discrete. Observations are flat, shape
         (N, n), with the memory; noise is N rows of `draw_noise`.
         """
-        assert self.head is not None
         return self.head.sample(self.output(observations), noise)
 
     def score(self, inputs: Floats, actions: Floats) -> tuple[Floats, float]:
@@ -245,10 +225,8 @@ class NetworkPolicy:
 
         Inputs are those of `inputs`, shape (B, n).
         """
-        assert self.head is not None
         return self.head.score(self.network.forward(inputs), actions)
 
     def backward(self, by_log_probability: np.ndarray, by_entropy: float = 0.0) -> None:
         """Set the gradients of a loss, from its derivatives by what `score` gave last."""
-        assert self.head is not None
         self.network.backward(self.head.back(by_log_probability, by_entropy))

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 class Agent(Protocol):
-    """What learns. Its class has `create(log, config, seed)`; SB3's has no `set_state`."""
+    """What learns, made of `(log, config, seed)`; SB3's has no `set_state`."""
 
     def train(self, log: EpisodeRecorder, env_steps: int, on_update: OnUpdate) -> None:
         """Train until the log counts `env_steps`, from the current state on. Raises `Diverged`."""
@@ -66,13 +66,11 @@ class Algorithm:
     """Name in tables and figures."""
     config: type[Config]
     agent: Any
-    """Class with `create`; or its module and name, which are imported when needed."""
+    """Class; or its module and name, which are imported when needed."""
     presets: str = ""
     """Algorithm with the same presets; empty: its own."""
     family: str = ""
     """Algorithms of one family begin with each other's networks; empty: with their own alone."""
-    squashed: bool = False
-    """Whether the policy bounds its output by tanh."""
     resumes: bool = True
     """Whether a stopped training goes on; otherwise it starts anew."""
     colors: Colors | None = None
@@ -94,12 +92,12 @@ ALGORITHMS: Final[dict[str, Algorithm]] = {
     "ppo": Algorithm("PPO", PPOConfig, PPO, family="own"),
     "ippo": Algorithm("IPPO", PPOConfig, PPO, family="own"),
     "mappo": Algorithm("MAPPO", PPOConfig, MAPPO, family="own"),
-    "sac": Algorithm("SAC", SACConfig, SAC, squashed=True),
+    "sac": Algorithm("SAC", SACConfig, SAC),
     "sb3-a2c": Algorithm(
         "SB3 A2C", A2CConfig, _SB3, "a2c", resumes=False, colors=("#009E73", "#2CC998")
     ),
     "sb3-ppo": Algorithm("SB3 PPO", PPOConfig, _SB3, "ppo", resumes=False),
-    "sb3-sac": Algorithm("SB3 SAC", SACConfig, _SB3, "sac", squashed=True, resumes=False),
+    "sb3-sac": Algorithm("SB3 SAC", SACConfig, _SB3, "sac", resumes=False),
 }
 
 Controller = PID | Geometric | Orca

@@ -3,20 +3,19 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Final, Self
+from typing import TYPE_CHECKING, Annotated, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..envs.spec import EnvSpec
 from ..models.errors import InputError
 from ..models.fields import Limits
 from .config import RolloutConfig
 from .episodes import EpisodeRecorder
-from .learner import OnUpdate, diverged, generator_array, seeds_of, set_generator
-from .networks import Floats, Network, Weights, make_network, named, part_of
+from .learner import Learner
+from .networks import Floats, Module, Network, Weights, bind_all, make_network
 from .optimizers import Adam
-from .policies import ActionMap, NetworkPolicy, flat_size
+from .policies import ActionMap, flat_size
 from .rollouts import Collector, Rollout
 
 if TYPE_CHECKING:
@@ -35,6 +34,7 @@ class SACConfig(RolloutConfig):
     Serves our SAC and Stable-Baselines3's.
     """
 
+    squashed: ClassVar[bool] = True
     hidden: tuple[int, ...] = (256, 256)
     """Units of each hidden layer of each network."""
     learning_rate: float = 0.0003
@@ -70,6 +70,7 @@ class SquashedActor:
 
     def __init__(self, net: Network) -> None:
         self.net = net
+        self.shapes = net.shapes
 
     def bind(self, weights: Weights) -> None:
         """Compute with these arrays from now on."""
@@ -140,41 +141,7 @@ class ReplayBuffer:
         return *(rows[:, part] for part in self._parts), rows[:, -2], rows[:, -1]
 
 
-@dataclass(frozen=True)
-class SACNetworks:
-    """What SAC moves, and the critics' targets."""
-
-    weights: Weights
-    targets: Weights
-    actor: SquashedActor
-    critics: list[Network]
-    target_critics: list[Network]
-
-    @classmethod
-    def create(cls, size: int, k: int, config: SACConfig, seed: int) -> Self:
-        """New networks for observations of n numbers and actions of k."""
-        actor = SquashedActor(make_network(size, 2 * k, config))
-        if actor.net.memory:
-            raise InputError(f"network: expected one without a memory, got {config.network}")
-        critics, targets = ([make_network(size + k, 1, config) for _ in "01"] for _ in "01")
-        twins = named("0.", critics[0].shapes) | named("1.", critics[1].shapes)
-        shapes = named("actor.", actor.net.shapes) | named("critic.", twins)
-        weights = Weights.zeros({**shapes, "log_alpha": (1,)})
-        held = Weights.zeros(twins)
-        rng = np.random.default_rng(seed)
-        actor.bind(weights.part("actor."))
-        actor.initialise(rng, config.log_std)
-        moved = weights.part("critic.")
-        for i in range(2):
-            critics[i].bind(moved.part(f"{i}."))
-            targets[i].bind(held.part(f"{i}."))
-            critics[i].initialise(rng, 1.0)
-        held.values[:] = moved.values
-        weights.arrays["log_alpha"][:] = math.log(config.alpha)
-        return cls(weights, held, actor, critics, targets)
-
-
-class SAC:
+class SAC(Learner):
     """Two critics learn Q(s, a) of the soft return, the actor follows the smaller of both.
 
     An update is the paper's Algorithm 1 with the temperature of its section 5, in the order of the
@@ -184,86 +151,86 @@ class SAC:
         weights: Of all networks: `actor.…`, `critic.0.…`, `critic.1.…`, and `log_alpha`.
         targets: Of the critics' targets: `0.…`, `1.…`.
         buffer: The replay buffer.
-        updates: Updates so far.
+        k: Numbers of an action.
     """
 
-    def __init__(
-        self,
-        spec: EnvSpec,
-        networks: SACNetworks,
-        buffer: ReplayBuffer,
-        config: SACConfig,
-        rng: np.random.Generator,
-    ) -> None:
-        self.spec = spec
-        self.config = config
-        self._rng = rng
-        self.updates = 0
-        self.weights = networks.weights
-        self.targets = networks.targets
-        self.buffer = buffer
-        self._actor = networks.actor
-        self._critics = networks.critics
-        self._targets = networks.target_critics
-        self._of_actor = self.weights.part("actor.")
-        self._of_critics = self.weights.part("critic.")
-        self._of_alpha = self.weights.part("log_alpha")
-        parts = {"actor": self._of_actor, "critic": self._of_critics, "alpha": self._of_alpha}
-        self._adams = {name: Adam(part) for name, part in parts.items()}
-        aim = config.target_entropy
-        self._aim = -float(self.k) if aim is None else aim
-        self.rate = config.learning_rate
-        self._numbers: dict[str, float] = {}
+    config: SACConfig
 
-    @classmethod
-    def create(cls, log: EpisodeRecorder, config: SACConfig, seed: int) -> Self:
-        """A new agent, with networks of the kind that the config names, for the env of a log."""
+    def __init__(self, log: EpisodeRecorder, config: SACConfig, seed: int) -> None:
+        super().__init__(log, config, seed)
         actions = ActionMap(log.spec.action)
-        size = flat_size(log.spec)
         if actions.discrete:
             raise InputError("sac: expected an env of continuous actions, got one of choices")
-        weights_seed, rng = seeds_of(seed)
-        networks = SACNetworks.create(size, actions.outputs, config, weights_seed)
-        buffer = ReplayBuffer(config.buffer_size, size, actions.outputs)
-        return cls(log.spec, networks, buffer, config, rng)
+        size = flat_size(log.spec)
+        self.k = actions.outputs
+        self.network = make_network(size, 2 * self.k, config)
+        if self.network.memory:
+            raise InputError(f"network: expected one without a memory, got {config.network}")
+        self.explorer = self
+        self.buffer = ReplayBuffer(config.buffer_size, size, self.k)
+        self._actor = SquashedActor(self.network)
+        nets = [make_network(size + self.k, 1, config) for _ in range(4)]
+        self._critics = nets[:2]
+        self._targets = nets[2:]
+        modules: dict[str, Module] = {
+            "actor.": self._actor,
+            "critic.0.": nets[0],
+            "critic.1.": nets[1],
+        }
+        self.weights = bind_all(modules, log_alpha=(1,))
+        self.targets = bind_all({"0.": nets[2], "1.": nets[3]})
+        rng = np.random.default_rng(self._weights_seed)
+        self._actor.initialise(rng, config.log_std)
+        for critic in self._critics:
+            critic.initialise(rng, 1.0)
+        self._of_critics = self.weights.part("critic.")
+        self._of_alpha = self.weights.part("log_alpha")
+        self._of_alpha.values[:] = math.log(config.alpha)
+        self.targets.values[:] = self._of_critics.values
+        self.optimizer = Adam(self._actor.weights)
+        self._critic_adam = Adam(self._of_critics)
+        self._alpha_adam = Adam(self._of_alpha)
+        self.parts = {
+            "optimizer.actor": self.optimizer,
+            "optimizer.critic": self._critic_adam,
+            "optimizer.alpha": self._alpha_adam,
+        }
+        aim = config.target_entropy
+        self._aim = -float(self.k) if aim is None else aim
 
-    @property
-    def k(self) -> int:
-        """Numbers of an action."""
-        return self.buffer.action
+    def collect(self, collector: Collector, most: int) -> Rollout:
+        """Fly a fixed number of steps, across episodes."""
+        return collector.steps(min(self.config.steps_per_update, most))
 
-    def train(self, log: EpisodeRecorder, env_steps: int, on_update: OnUpdate) -> None:
-        """Train until the log counts `env_steps`, from the current state on. Raises `Diverged`.
+    def learn(self, rollout: Rollout) -> None:
+        """Keep the transitions; once `learning_starts` of them are kept, learn from the buffer."""
+        self.buffer.add(rollout)
+        if not self.warming_up:
+            self.replay()
 
-        Actions are uniform until `learning_starts` transitions are kept. From then on each
-        `steps_per_update` env steps, rounded up to whole steps of all drones, are followed by
-        `gradient_steps` updates.
-        """
-        config = self.config
-        collector = Collector(log, self._rng, _Explorer(self))
-        while (before := log.env_steps) < env_steps:
-            self.buffer.add(collector.steps(min(config.steps_per_update, env_steps - before)))
-            if config.anneal:
-                self.rate = config.learning_rate * (1 - before / env_steps)
-            if not self.warming_up:
-                self.learn()
-            if not on_update():
-                return
-
-    def learn(self) -> None:
-        """Make `gradient_steps` updates, each from other transitions. Raises `Diverged`."""
+    def replay(self) -> None:
+        """Make `gradient_steps` updates, each from other transitions."""
         shape = self.config.gradient_steps, self.config.batch_size
         places = self._rng.integers(len(self.buffer), size=shape)
         noise = self._rng.standard_normal((2, *shape, self.k), dtype=np.float32)
         for i, some in enumerate(places):
             self.update(self.buffer.take(some), noise[0, i], noise[1, i])
-        if not np.isfinite(self.weights.values).all():
-            raise diverged(self.updates)
 
     @property
     def warming_up(self) -> bool:
-        """Whether there are too few transitions to learn from."""
+        """Whether there are too few transitions to learn from: actions are uniform."""
         return self.buffer.added < self.config.learning_starts
+
+    def draw_noise(self, rng: np.random.Generator, steps: int) -> Floats:
+        """As `Explorer.draw_noise`."""
+        shape = steps, self.k
+        if self.warming_up:
+            return rng.uniform(-1, 1, shape).astype(np.float32)
+        return rng.standard_normal(shape, dtype=np.float32)
+
+    def sample(self, observations: Floats, noise: Floats) -> Floats:
+        """As `Explorer.sample`."""
+        return noise if self.warming_up else self._actor.draw(observations, noise)[0]
 
     def update(self, batch: tuple[Floats, ...], noise: Floats, next_noise: Floats) -> None:
         """Learn from a batch of `ReplayBuffer.take`; noise is standard normal, shape (B, k)."""
@@ -277,14 +244,14 @@ class SAC:
         surplus = float(logs.mean()) + self._aim
         alpha_loss = -float(self._of_alpha.values[0]) * surplus
         self._of_alpha.slopes[:] = -surplus
-        self._adams["alpha"].step(rate)
+        self._alpha_adam.step(rate)
 
         ahead = np.minimum(*self._values(self._targets, next_states, next_actions))
         wanted = rewards + config.gamma * (1 - ends) * (ahead - np.float32(alpha) * next_logs)
         errors = [found - wanted for found in self._values(self._critics, states, done)]
         for net, error in zip(self._critics, errors, strict=True):
             net.backward(error[:, np.newaxis] / size)
-        self._adams["critic"].step(rate)
+        self._critic_adam.step(rate)
 
         found = self._values(self._critics, states, actions)
         first = found[0] <= found[1]
@@ -293,17 +260,16 @@ class SAC:
             slope = chosen[:, np.newaxis] * np.float32(-1 / size)
             by_actions += net.by_inputs(slope)[:, states.shape[1] :]
         self._actor.backward(by_actions, alpha / size)
-        self._adams["actor"].step(rate)
+        self.optimizer.step(rate)
         self.targets.values[:] += config.tau * (self._of_critics.values - self.targets.values)
-        self.updates += 1
         critic_loss = 0.5 * sum(float(error.dot(error)) for error in errors) / size
-        actor_loss = float((alpha * logs - np.minimum(*found)).mean())
-        self._numbers = {
-            "train/actor_loss": actor_loss,
-            "train/critic_loss": critic_loss,
-            "train/ent_coef": alpha,
-            "train/ent_coef_loss": alpha_loss,
-            "train/entropy_loss": float(logs.mean()),
+        actor_loss = (alpha * logs - np.minimum(*found)).mean()
+        self.terms = {
+            "actor_loss": actor_loss,
+            "critic_loss": critic_loss,
+            "ent_coef": alpha,
+            "ent_coef_loss": alpha_loss,
+            "entropy_loss": logs.mean(),
         }
 
     @staticmethod
@@ -314,41 +280,21 @@ class SAC:
 
     def actor(self) -> dict[str, Floats]:
         """Weights for `NetworkPolicy`, which squashes: the last layer gives the mean of u."""
-        arrays = {name: array.copy() for name, array in self._of_actor.arrays.items()}
+        arrays = {name: array.copy() for name, array in self._actor.weights.arrays.items()}
         for name in list(arrays)[-2:]:
             arrays[name] = arrays[name][: self.k].copy()
         return arrays
 
-    def policy(self) -> NetworkPolicy:
-        """The current policy, without exploration: a copy."""
-        return NetworkPolicy.load(self.actor(), self.spec, self.config, squash=True)
+    def arrays(self) -> dict[str, np.ndarray]:
+        kept = self.buffer.rows[: len(self.buffer)]
+        return {**super().arrays(), "targets": self.targets.values, "buffer": kept}
 
     def state(self) -> dict[str, np.ndarray]:
-        """All that the next update depends on, with the transitions that are kept."""
-        arrays = {"weights": self.weights.values.copy(), "targets": self.targets.values.copy(),
-                  "rng": generator_array(self._rng), "updates": np.array(self.updates),
-                  "buffer": self.buffer.rows[: len(self.buffer)].copy(),
-                  "added": np.array(self.buffer.added)}  # fmt: skip
-        for name, adam in self._adams.items():
-            arrays |= named(f"optimizer.{name}.", adam.arrays())
-        return arrays
+        return {**super().state(), "added": np.array(self.buffer.added)}
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> None:
-        """Take over a state. Raises `ValueError` or `KeyError` unless it is whole."""
-        added = int(state["added"])
-        pairs = {"weights": self.weights.values, "targets": self.targets.values,
-                 "buffer": self.buffer.rows[: max(added, 0)]}  # fmt: skip
-        for name, values in pairs.items():
-            if state[name].shape != values.shape:
-                raise ValueError(f"{name}: expected {values.shape}, got {state[name].shape}")
-        for name, values in pairs.items():
-            values[...] = state[name]
-        self.buffer.added = added
-        self.updates = int(state["updates"])
-        for name, adam in self._adams.items():
-            adam.load(part_of(state, f"optimizer.{name}."))
-        set_generator(self._rng, state["rng"])
-        self._numbers = {}
+        self.buffer.added = int(state["added"])
+        super().set_state(state)
 
     def start_from(self, kept: "Checkpoint") -> None:
         """Take over the weights of another training; the buffer begins empty.
@@ -357,29 +303,3 @@ class SAC:
         """
         self.weights.values[...] = kept.state["weights"]
         self.targets.values[...] = self._of_critics.values
-
-    def scalars(self) -> dict[str, float]:
-        """Numbers of the last update, under SB3's names; none before the first."""
-        if not self._numbers:
-            return {}
-        counts = {"train/learning_rate": self.rate, "train/n_updates": float(self.updates)}
-        return self._numbers | counts
-
-
-class _Explorer:
-    """Draws actions for a `Collector`: of the actor as it is now, or uniform while warming up."""
-
-    def __init__(self, agent: SAC) -> None:
-        self._agent = agent
-        self.network = agent._actor.net
-
-    def draw_noise(self, rng: np.random.Generator, steps: int) -> Floats:
-        shape = steps, self._agent.k
-        if self._agent.warming_up:
-            return rng.uniform(-1, 1, shape).astype(np.float32)
-        return rng.standard_normal(shape, dtype=np.float32)
-
-    def sample(self, observations: Floats, noise: Floats) -> Floats:
-        if self._agent.warming_up:
-            return noise
-        return self._agent._actor.draw(observations, noise)[0]

@@ -1,7 +1,7 @@
 """Stable-Baselines3: its A2C, PPO and SAC as references, and vector envs as it wants them."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NoReturn, Self
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 from gymnasium import spaces
@@ -187,11 +187,6 @@ class SB3Agent:
         # It keeps the numbers of the last update for us; SB3's own makes a folder in /tmp.
         self.model.set_logger(sb3_logger.Logger(folder=None, output_formats=[]))
 
-    @classmethod
-    def create(cls, log: EpisodeRecorder, config: A2CConfig | SACConfig, seed: int) -> Self:
-        """A new agent for the env of a log."""
-        return cls(log, config, seed)
-
     def train(self, log: EpisodeRecorder, env_steps: int, on_update: learner.OnUpdate) -> None:
         """As `Learner.train`. SB3 flies whole rollouts only: a last part of one is not flown."""
         whole = env_steps // self._rollout * self._rollout
@@ -242,8 +237,7 @@ class SB3Agent:
 
     def policy(self) -> NetworkPolicy:
         """The current policy, without exploration: a copy."""
-        squash = isinstance(self._config, SACConfig)
-        return NetworkPolicy.load(self.actor(), self.spec, self._config, squash=squash)
+        return NetworkPolicy.load(self.actor(), self.spec, self._config)
 
     def state(self) -> dict[str, np.ndarray]:
         """Weights of all networks, for `start_from`."""

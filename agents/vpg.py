@@ -8,7 +8,7 @@ import numpy as np
 from ..models.errors import InputError
 from ..models.fields import Limits
 from .config import Config
-from .learner import Learner
+from .learner import PolicyGradient
 from .networks import Floats
 from .rollouts import Collector, Rollout, rewards_to_go, step_of_episode
 
@@ -36,7 +36,7 @@ class VPGConfig(Config):
         return drones * episode_length if drones > 1 else 1
 
 
-class VPG(Learner):
+class VPG(PolicyGradient):
     """Raise the log-probability of every action by the return that followed it.
 
     The gradient of Equation 2, R_t · grad log P(a_t | s_t), averaged over the steps of an update.

@@ -50,7 +50,7 @@ class Updates:
             self.update = partial(self.agent.model.train, *batch)
         elif algorithm == "sac":
             self.agent.train(log, total, lambda: True)
-            self.update = self.agent.learn
+            self.update = self.agent.replay
         else:
             update = self.agent.update
             self.agent.update = lambda rollout: (self.rollouts.append(rollout), update(rollout))

@@ -266,7 +266,8 @@ def average_return(run: pd.DataFrame, share: float) -> Curve:
 
 
 def spread_over_seeds(curves: Sequence[Curve], grid: Floats | None = None) -> Spread:
-    """Put several seeds' curves, at least one, on one grid: interquartile mean and `extent`.
+    """Put several seeds' curves, at least one, on one grid: interquartile mean, and the
+    quartiles, or below four curves the extremes.
 
     Of a grid, ascending, shape (m,), the points are kept that all curves reach; without one there
     are 300 even points.
@@ -277,13 +278,9 @@ def spread_over_seeds(curves: Sequence[Curve], grid: Floats | None = None) -> Sp
         grid = np.linspace(start, max(start, end), 300)
     x = np.asarray(grid[(grid >= start) & (grid <= end)], float)
     values = np.stack([np.interp(x, curve.x, curve.y) for curve in curves])
-    low, high = np.quantile(values, extent(len(curves)), axis=0)
+    ends = (0.25, 0.75) if len(curves) >= 4 else (0.0, 1.0)
+    low, high = np.quantile(values, ends, axis=0)
     return Spread(x, trimmed_mean(values, axis=0), low, high)
-
-
-def extent(count: int) -> tuple[float, float]:
-    """Quantiles of a band over so many values: the quartiles, or the extremes below four."""
-    return (0.25, 0.75) if count >= 4 else (0.0, 1.0)
 
 
 # ---- what a film and a picture of paths show

@@ -105,9 +105,6 @@ def _page(
         yield _figure(results.folder / "figures" / f"{name}.svg", PAPER.get(name, ""))
     if verdicts:
         yield f"<h2>Claims</h2>{''.join(map(_verdict, verdicts))}"
-    for title, values in _settings(results).items():
-        text = html.escape(json.dumps(values, indent=1, ensure_ascii=False))
-        yield f"<details><summary>{html.escape(title)}</summary><pre>{text}</pre></details>"
     yield "</body></html>"
 
 
@@ -131,14 +128,3 @@ def _verdict(verdict: Verdict) -> str:
         f"{verdict.preset}). {html.escape(verdict.evidence)}</p>"
         f"<p>{html.escape(verdict.definition)}</p></section>"
     )
-
-
-def _settings(results: Results) -> dict[str, dict[str, object]]:
-    """Settings by the title of their list."""
-    study = results.study.to_dict()
-    study.pop("rows")
-    found = {"study": study}
-    for row in results.study.rows:
-        config = {} if row.controller else asdict(row.config)
-        found[row.name] = {**row.to_dict(), "hyperparameters": config}
-    return {**found, "versions": results.config["versions"], "machine": results.config["machine"]}

@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from itertools import groupby
 from typing import Final, Literal, NamedTuple
 
-import numpy as np
 import pandas as pd
 from rich import box
 from rich.table import Table
@@ -19,14 +18,7 @@ from ..flights.palette import agent_label
 from .metrics import Headline
 from .results import Results
 from .settings import Row
-from .statistics import (
-    Floats,
-    bootstrap_interval,
-    improvement_interval,
-    iqm,
-    probability_of_improvement,
-    share_interval,
-)
+from .statistics import bootstrap_interval, iqm, share_interval
 
 _TERMINAL_COLUMNS: Final = (0, 1, 2, 3, 6, 7, 8)  # those that fit 100 columns
 NOTHING: Final = "–"
@@ -118,29 +110,6 @@ def _share_interval(line: Mapping[str, float], headline: Headline) -> dict[str, 
     else:
         return {}
     return {"steady_low": low, "steady_high": high}
-
-
-def scores(own: pd.DataFrame, headline: Headline) -> Floats:
-    """Scores from 0 to 1 of the seeds of a row, shape (n,); NaN without a bound of the goal.
-
-    With the steady size and the bound at which a goal counts as held: bound / (bound + size), or
-    for a metric that is to be high size / (bound + size). A share that is to be high, without a
-    unit and with a bound below 1, counts by what it lacks to 1. So 1/2 is the bound itself, and 1
-    the best. A run with a crash that the size does not count, or without a value, scores 0.
-    """
-    size = own["steady"].to_numpy(float)
-    bound = headline.held
-    high = headline.high
-    if bound is None:
-        return np.full(len(own), np.nan)
-    if high and not headline.unit and bound < 1:
-        size = 1 - size
-        bound = 1 - bound
-        high = False
-    size = np.maximum(size, 0.0)
-    score = (size if high else bound) / (bound + size)
-    crashed = (own["crashed"] > 0) & (not headline.counts_crashes)
-    return np.where(crashed | np.isnan(size), 0.0, score)
 
 
 # ---- cells
@@ -278,7 +247,7 @@ NOTE: Final = (
 
 
 def markdown(results: Results, table: pd.DataFrame) -> str:
-    """All tables in Markdown, with a note; then scores over the tasks that rows share."""
+    """All tables in Markdown, with a note."""
     tables = task_tables(results, table)
     parts = []
     for task in tables:
@@ -287,8 +256,6 @@ def markdown(results: Results, table: pd.DataFrame) -> str:
         rows = [tuple(map(_markdown_cell, line)) for line in task.lines]
         parts.append(_markdown_table(task.headings, rows))
     parts.append(NOTE)
-    if len(tables) > 1:
-        parts += _scores(results)
     return "\n\n".join(parts) + "\n"
 
 
@@ -301,48 +268,6 @@ def _markdown_table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str
     # |E| in a cell would end the cell.
     escaped = [[cell.replace("|", r"\|") for cell in line] for line in lines]
     return "\n".join(f"| {' | '.join(line)} |" for line in escaped)
-
-
-def _scores(results: Results) -> list[str]:
-    """Scores of trained agents over all of their tasks, and which agent is better."""
-    found: dict[str, dict[str, Floats]] = {}
-    for row in results.study.rows:
-        own = results.runs[results.runs["row"] == row.name]
-        headline = results.headline(row)
-        if not row.controller and len(own) and headline.held is not None:
-            found.setdefault(row_label(row), {})[row.task] = scores(own, headline)
-    if len(found) < 2:
-        return []
-    totals = []
-    pairs = []
-    for label, own in found.items():
-        strata = list(own.values())
-        low, high = bootstrap_interval(*strata)
-        totals.append([label, str(len(own)), f"{iqm(*strata):.3f} ({low:.3f} to {high:.3f})"])
-        pairs.append([label, *(_improvement(own, other) for other in found.values())])
-    return [
-        "## Over all tasks",
-        "Score: b / (b + e) for a steady size e and the bound b of holding (e / (b + e) of a "
-        "metric that is to be high; of a share that is, e and b are what it lacks to 1), 0 with a "
-        "crash. Below: the probability that a run of the agent of the row has a higher score than "
-        "one of the column, over the tasks that both fly. An interval with 50 % in it decides "
-        "nothing.",
-        _markdown_table(["Agent", "Tasks", "Score"], totals),
-        _markdown_table(["", *found], pairs),
-    ]
-
-
-def _improvement(own: Mapping[str, Floats], other: Mapping[str, Floats]) -> str:
-    tasks = [task for task in own if task in other]
-    if own is other or not tasks:
-        return NOTHING
-    first = [own[task] for task in tasks]
-    second = [other[task] for task in tasks]
-    low, high = improvement_interval(first, second)
-    share = probability_of_improvement(first, second)
-    if math.isnan(low):
-        return f"{share:.0%}"
-    return f"{share:.0%} ({low:.0%} to {high:.0%})"
 
 
 def terminal_tables(results: Results, table: pd.DataFrame) -> list[Table]:

@@ -6,12 +6,16 @@ import numpy as np
 from rotorgram.agents.config import Config
 from rotorgram.agents.networks import MLP, Network, Weights
 from rotorgram.agents.policies import NetworkPolicy
+from rotorgram.agents.sac import SACConfig
 from rotorgram.envs.spec import EnvSpec
 
 
-def config_of(hidden: tuple[int, ...], activation: str, *, normalise: bool = False) -> Config:
+def config_of(
+    hidden: tuple[int, ...], activation: str, *, normalise: bool = False, squash: bool = False
+) -> Config:
     """With any number of hidden layers, none too."""
-    config = Config(activation=activation, normalize_observations=normalise)  # type: ignore[arg-type]
+    kind = SACConfig if squash else Config
+    config = kind(activation=activation, normalize_observations=normalise)  # type: ignore[arg-type]
     object.__setattr__(config, "hidden", hidden)
     return config
 
@@ -43,15 +47,20 @@ def policy_of(
     """The policy of an MLP with as many layers and units as the weights have."""
     last = sum(name.startswith("layers.") for name in weights) // 2 - 1
     hidden = tuple(weights[f"layers.{i}.bias"].shape[0] for i in range(last))
-    config = config_of(hidden, activation, normalise="observation.mean" in weights)
-    return NetworkPolicy.load(weights, spec, config, squash=squash)
+    normalise = "observation.mean" in weights
+    config = config_of(hidden, activation, normalise=normalise, squash=squash)
+    return NetworkPolicy.load(weights, spec, config)
 
 
 def random_policy(
-    spec: EnvSpec, hidden: tuple[int, ...] = (16,), activation: str = "relu", size: float = 1.0
+    spec: EnvSpec,
+    hidden: tuple[int, ...] = (16,),
+    activation: str = "relu",
+    size: float = 1.0,
+    **kinds: bool,
 ) -> NetworkPolicy:
     """A policy of random weights of such a size."""
-    policy = NetworkPolicy(spec, config_of(hidden, activation))
+    policy = NetworkPolicy(spec, config_of(hidden, activation, **kinds))
     weights = Weights.zeros(policy.shapes)
     weights.values[:] = size * np.random.default_rng(3).normal(size=weights.values.size)
     policy.bind(weights)

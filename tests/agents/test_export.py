@@ -5,7 +5,6 @@ import re
 import subprocess
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,7 @@ import onnx
 import onnxruntime
 import pytest
 from nets import policy_of as loaded
+from nets import random_policy
 from peers import ANY, Running
 from rotorgram.agents import load, store
 from rotorgram.agents.export import TARGETS, export, metadata
@@ -40,31 +40,27 @@ CHECKED = ["-Wconversion", "-fsanitize=address,undefined", "-fno-sanitize-recove
 
 
 def policy_of(
-    spec: EnvSpec,
-    hidden: tuple[int, ...] = (16,),
-    activation: str = "relu",
-    *,
-    squash: bool = False,
-    normalise: bool = False,
-    seed: int = 0,
+    spec: EnvSpec, hidden: tuple[int, ...] = (16,), activation: str = "relu", **kinds: bool
 ) -> NetworkPolicy:
     """A policy with random weights, whose outputs fill the range of actions."""
-    rng = np.random.default_rng(seed)
-    outputs = spec.action.n if isinstance(spec.action, Discrete) else spec.action.size
-    sizes = [flat_size(spec), *hidden, outputs]
-    weights = {}
-    for i, (inputs, units) in enumerate(pairwise(sizes)):
-        weights[f"layers.{i}.weight"] = rng.normal(size=(units, inputs)) / np.sqrt(inputs)
-        weights[f"layers.{i}.bias"] = 0.3 * rng.normal(size=units)
-    if not isinstance(spec.action, Discrete):
-        weights["log_std"] = np.zeros(outputs)
-    if normalise:
-        weights["observation.mean"] = rng.normal(size=sizes[0])
-        weights["observation.scale"] = np.exp(rng.normal(size=sizes[0]))
-    single = {name: array.astype(np.float32) for name, array in weights.items()}
-    if squash:
-        single.pop("log_std", None)
-    return loaded(single, spec, activation, squash=squash)
+    policy = random_policy(spec, hidden, activation, 0.1, **kinds)
+    random = policy.weights.values.copy()
+    rng = np.random.default_rng(0)
+    policy.network.initialise(rng, 1.0)
+    policy.weights.values[:] += random
+    if policy.moments is not None:
+        size = policy.inputs_size
+        policy.moments.mean = rng.normal(size=size).astype(np.float32)
+        policy.moments.scale = np.exp(0.3 * rng.normal(size=size)).astype(np.float32)
+    return policy
+
+
+def elevation() -> EnvSpec:
+    return env_spec(EnvConfig(env_id="rotorgram/Elevation-v0"))
+
+
+def hover(**keywords: str) -> EnvSpec:
+    return env_spec(EnvConfig.from_keywords("rotorgram/Hover-v0", **keywords))
 
 
 def told_of(spec: EnvSpec) -> dict[str, str]:
@@ -138,18 +134,10 @@ HALF_BOUNDED = spec_of(
     ArraySpec(name="a", shape=(3,), low=(0.0, -np.inf, -np.inf), high=(100.0, 0.5, np.inf))
 )
 CASES: dict[str, Callable[[], NetworkPolicy]] = {
-    "paper": lambda: policy_of(env_spec(EnvConfig(env_id="rotorgram/Elevation-v0"))),
-    "tanh": lambda: policy_of(
-        env_spec(EnvConfig(env_id="rotorgram/Hover-v0")), (64, 64), "tanh", normalise=True
-    ),
-    "squashed": lambda: policy_of(
-        env_spec(EnvConfig.from_keywords("rotorgram/Hover-v0", vehicle="crazyflie2")),
-        (32, 32),
-        squash=True,
-    ),
-    "hexa": lambda: policy_of(
-        env_spec(EnvConfig.from_keywords("rotorgram/Hover-v0", vehicle="heavy_hexa"))
-    ),
+    "paper": lambda: policy_of(elevation()),
+    "tanh": lambda: policy_of(hover(), (64, 64), "tanh", normalise=True),
+    "squashed": lambda: policy_of(hover(vehicle="crazyflie2"), (32, 32), squash=True),
+    "hexa": lambda: policy_of(hover(vehicle="heavy_hexa")),
     "half bounded": lambda: policy_of(HALF_BOUNDED, (8,), normalise=True),
     "choice": lambda: policy_of(CHOICE, (16, 8), "tanh", normalise=True),
     "linear": lambda: policy_of(spec_of(), ()),
@@ -213,9 +201,7 @@ def test_what_is_no_number_is_not_made_one(tmp_path: Path) -> None:
 def test_the_header_needs_nothing_but_a_compiler(tmp_path: Path) -> None:
     header = tmp_path / "rotorgram_policy.h"
     program = tmp_path / "policy.c"
-    policy = policy_of(
-        env_spec(EnvConfig(env_id="rotorgram/Hover-v0")), (64, 64), "tanh", squash=True
-    )
+    policy = policy_of(hover(), (64, 64), "tanh", squash=True)
     header.write_bytes(c_target.write(policy, told_of(policy.spec)))
     assert "#include" not in header.read_text()
     program.write_text(
@@ -284,15 +270,12 @@ def test_every_file_tells_what_it_is(trained: Path, tmp_path: Path) -> None:
     model = onnx.load(files["onnx"])
     told = {entry.key: entry.value for entry in model.metadata_props}
     assert [(one.domain, one.version) for one in model.opset_import] == [("", 13)]
-    assert told["format"] == "1"
-    assert told["algorithm"] == "a2c"
-    assert told["seed"] == "3"
-    assert told["inputs"] == "3"
-    assert int(told["env_steps"]) == kept.position.env_steps >= 512
-    assert told["env_id"] == "rotorgram/Elevation-v0"
-    assert told["control_period"] == "0.02"
-    assert told["vehicle"] == kept.spec.vehicle
-    assert told["vehicle_hash"] == kept.spec.vehicle_hash
+    plain = {
+        "format": "1", "algorithm": "a2c", "seed": "3", "inputs": "3", "control_period": "0.02",
+        "env_id": "rotorgram/Elevation-v0", "vehicle": kept.spec.vehicle,
+        "vehicle_hash": kept.spec.vehicle_hash, "env_steps": str(kept.position.env_steps),
+    }  # fmt: skip
+    assert plain.items() <= told.items()
     assert json.loads(told["options"]) == kept.options
     (observation,) = json.loads(told["observation"])
     names = ["elevation error", "rate of the error", "thrust over hover"]
@@ -335,29 +318,21 @@ def test_no_text_of_a_spec_becomes_code(trained: Path, tmp_path: Path) -> None:
     count = len(EVIL)
     kept = load(trained / "checkpoint.safetensors")
     wicked = "".join(EVIL)
-    spec = replace(
-        kept.spec,
-        env_id=wicked,
-        vehicle=wicked[::-1],
-        options={"a\\": "*/\n#error\r\u0085\\\n??/\n", wicked: [wicked, "\0\x7f"]},
-        observation=(
-            ArraySpec(
-                name="*/",
-                shape=(count,),
-                unit=tuple(EVIL[::-1]),
-                frame=wicked,
-                components=tuple(EVIL),
-            ),
-        ),
-        action=ArraySpec(name="??/", shape=(2,), unit="*/", components=("\\", "/*")),
+    seen = ArraySpec(
+        name="*/", shape=(count,), unit=tuple(EVIL[::-1]), frame=wicked, components=tuple(EVIL)
     )
+    action = ArraySpec(name="??/", shape=(2,), unit="*/", components=("\\", "/*"))
+    options = {"a\\": "*/\n#error\r\u0085\\\n??/\n", wicked: [wicked, "\0\x7f"]}
+    named = {"env_id": wicked, "vehicle": wicked[::-1], "options": options}
+    spec = replace(kept.spec, **named, observation=(seen,), action=action)
     policy = policy_of(spec)
     crafted = replace(kept, spec=spec, actor=policy.arrays())
     files = {target: tmp_path / TARGETS[target] for target in TARGETS}
     for target, path in files.items():
         path.write_bytes(export(crafted, target))
-    options = json.dumps(dict(spec.options), ensure_ascii=False)
-    expected = [wicked, wicked[::-1], options]
+    written = json.dumps(options, ensure_ascii=False)
+    expected = [wicked, wicked[::-1], written]
+    # C of 1999 has trigraphs.
     assert constants_of_c(files["c"], "ENV_ID", "VEHICLE", "OPTIONS") == expected
     # Every line is one that the exporter began, and the header's comment ends where it should.
     head, _, rest = files["c"].read_text().partition("\n */\n#ifndef")
@@ -369,14 +344,6 @@ def test_no_text_of_a_spec_becomes_code(trained: Path, tmp_path: Path) -> None:
     assert "injected" not in code
     assert "#error" not in code
     assert "\u202e" not in head + rest  # it would show the text in another order than it has
-    observations = observations_of(spec, 50)
-    flags = [*CPP_FLAGS, "-trigraphs"]
-    (tmp_path / "main.c").write_text(C_MAIN)
-    compiled(tool("g++"), *flags, "-o", tmp_path / "main", tmp_path / "main.c")
-    expected_actions = by_policy(policy, observations)
-    np.testing.assert_allclose(
-        fed(observations, tmp_path / "main"), expected_actions, rtol=1e-4, atol=1e-4
-    )
     told = {entry.key: entry.value for entry in onnx.load(files["onnx"]).metadata_props}
     assert json.loads(told["observation"])[0]["components"] == EVIL
 

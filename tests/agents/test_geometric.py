@@ -92,17 +92,14 @@ def test_gravity_is_the_vehicles(tmp_path: Path) -> None:
 
 def test_the_poles_of_a_swing() -> None:
     """p = 5 /s, ω² = 9 /s², a ninth of the mass: the swing's ω² of 10 /s², half damped."""
-    plant = np.array(
-        [
-            [0, 1, 0, 0, 0, 0],
-            [0, 0, 1, 0, 1, 0],
-            [0, 0, 0, 1, 0, 0],
-            [0, 0, -10, 0, -1, 0],
-            [0, 0, 0, 0, 0, 1],
-            [0, 0, 0, 0, -50, -10],
-        ]
-    )
-    closed = plant - np.outer((0, 0, 0, 0, 0, 50), swing_gains(1.0, 9.0, 1 / 9))
+    plant = np.zeros((6, 6))
+    plant[(0, 1, 1, 2, 4), (1, 2, 4, 3, 5)] = 1
+    plant[3, 2] = -10
+    plant[3, 4] = -1
+    plant[5, 4] = -50
+    plant[5, 5] = -10
+    closed = plant
+    closed[5] -= 50 * swing_gains(1.0, 9.0, 1 / 9)
     half = [-1.25 + 0.9682458j, -5 + 5j, -1.5811388 + 2.7386128j]
     expected = sorted([*half, *np.conj(half)], key=lambda pole: (pole.real, pole.imag))
     poles = sorted(np.linalg.eigvals(closed), key=lambda pole: (round(pole.real, 6), pole.imag))

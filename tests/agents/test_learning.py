@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from drones import LINE, ONE, Constant, Kept, log_of, vector
 from rotorgram.agents import (
     A2CConfig,
@@ -41,69 +40,50 @@ def rollout(**changes: Any) -> Rollout:
     )
 
 
-def gradient_of(agent: VPG | A2C, data: Rollout) -> dict[str, np.ndarray]:
+def slopes_of(agent: VPG | A2C, data: Rollout) -> dict[str, Any]:
+    """Derivatives of the loss by log P, shape (T,), by the entropy, and by V, shape (T,)."""
+    slopes: dict[str, Any] = {}
+
+    def actor(by_log_probability: np.ndarray, by_entropy: float = 0.0) -> None:
+        slopes["actor"] = by_log_probability
+        slopes["entropy"] = by_entropy
+
+    def critic(slope: np.ndarray) -> None:
+        slopes["critic"] = slope[:, 0]
+
+    agent._actor.backward = actor  # type: ignore[method-assign]
+    if agent.has_critic:
+        agent._critic.backward = critic  # type: ignore[method-assign]
     agent.gradient(data)
-    return {n: g.copy() for n, g in agent.weights.part("actor.").gradients.items()}
+    return slopes
 
 
-def values_of(agent: A2C, observations: np.ndarray) -> np.ndarray:
-    """V, by torch, of shape (T, 1) observations."""
-    arrays = {k: torch.from_numpy(a) for k, a in agent.weights.part("critic.").arrays.items()}
-    values: np.ndarray = torch_net(arrays, torch.from_numpy(observations)).numpy()[:, 0]
-    return values
+def a2c(**changes: Any) -> A2C:
+    config = A2CConfig(gamma=0.5, steps_per_update=3, **changes)
+    return A2C(log_of(), config, seed=0)
 
 
-def torch_net(arrays: dict[str, torch.Tensor], inputs: torch.Tensor) -> torch.Tensor:
-    hidden = torch.relu(inputs @ arrays["layers.0.weight"].T + arrays["layers.0.bias"])
-    return hidden @ arrays["layers.1.weight"].T + arrays["layers.1.bias"]
-
-
-def score_gradients(agent: VPG | A2C, data: Rollout) -> list[dict[str, np.ndarray]]:
-    """grad log P(a_t | s_t) for every t, by torch.distributions on an independent path."""
-    result = []
-    for observation, action in zip(data.observations[:, 0], data.actions[:, 0], strict=True):
-        arrays = {k: torch.tensor(a, requires_grad=True) for k, a in agent.actor().items()}
-        mean = torch_net(arrays, torch.from_numpy(observation[np.newaxis]))
-        normal: Any = torch.distributions.Normal(mean, arrays["log_std"].exp())
-        normal.log_prob(torch.from_numpy(action)).sum().backward()
-        result.append({n: p.grad.numpy() for n, p in arrays.items() if p.grad is not None})
-    return result
+def advantage_of(agent: A2C) -> np.ndarray:
+    """Equation 3 for `rollout`, whose last step terminates."""
+    first, second, third = agent._critic.forward(rollout().observations[:, 0])[:, 0]
+    return np.array([1 + 0.5 * second - first, 2 + 0.5 * third - second, 4 - third])
 
 
 def test_vpg_follows_equation_2() -> None:
-    agent = VPG.create(log_of(), VPGConfig(gamma=0.5), seed=0)
-    data = rollout()
-    returns = [1 + 1 + 1, 2 + 2, 4]
-    scores = score_gradients(agent, data)
-    for name, gradient in gradient_of(agent, data).items():
-        expected = -sum(r * s[name] for r, s in zip(returns, scores, strict=True)) / 3
-        np.testing.assert_allclose(gradient, expected, rtol=1e-4, atol=1e-6)
+    agent = VPG(log_of(), VPGConfig(gamma=0.5), seed=0)
+    slopes = slopes_of(agent, rollout())
+    returns = np.array([1 + 1 + 1, 2 + 2, 4])
+    np.testing.assert_allclose(slopes["actor"], -returns / 3)
+    assert slopes["entropy"] == 0.0
 
 
-def test_a2c_actor_follows_the_advantage_of_equation_3() -> None:
-    agent = A2C.create(log_of(), A2CConfig(gamma=0.5, steps_per_update=3), seed=0)
-    data = rollout()
-    value = values_of(agent, data.observations[:, 0])
-    advantage = [
-        1 + 0.5 * value[1] - value[0],
-        2 + 0.5 * value[2] - value[1],
-        4 - value[2],
-    ]
-    scores = score_gradients(agent, data)
-    for name, gradient in gradient_of(agent, data).items():
-        expected = -sum(a * s[name] for a, s in zip(advantage, scores, strict=True)) / 3
-        np.testing.assert_allclose(gradient, expected, rtol=1e-4, atol=1e-5)
-
-
-def test_a2c_critic_descends_the_squared_td_error_with_a_held_target() -> None:
-    agent = A2C.create(log_of(), A2CConfig(gamma=0.5, steps_per_update=3), seed=0)
-    data = rollout()
-    gradient_of(agent, data)
-    bias = agent.weights.gradients["critic.layers.1.bias"].item()
-    value = values_of(agent, data.observations[:, 0])
-    errors = [1 + 0.5 * value[1] - value[0], 2 + 0.5 * value[2] - value[1], 4 - value[2]]
-    # d/db of 0.5 * mean(error^2) with dV/db = 1 and the target constant
-    assert bias == pytest.approx(-np.mean(errors), rel=1e-4)
+def test_a2c_follows_equation_3_with_a_held_target() -> None:
+    agent = a2c()
+    slopes = slopes_of(agent, rollout())
+    advantage = advantage_of(agent)
+    np.testing.assert_allclose(slopes["actor"], -advantage / 3, rtol=1e-5)
+    # d/dV of 0.5 · mean(error²) with the target constant
+    np.testing.assert_allclose(slopes["critic"], -advantage / 3, rtol=1e-5)
 
 
 @pytest.mark.parametrize(("ending", "value"), [("limit", 10.0), ("end", None)])
@@ -116,37 +96,25 @@ def test_critic_bootstraps_through_the_limit_and_not_through_the_end(
     """
     config = A2CConfig(gamma=0.9, steps_per_update=16, learning_rate=0.02)
     log = log_of(ending)
-    agent = A2C.create(log, config, seed=0)
+    agent = A2C(log, config, seed=0)
     agent.train(log, 24_000, lambda: True)
-    got = values_of(agent, np.zeros((1, 1), np.float32)).item()
+    got = agent._critic.forward(np.zeros((1, 1), np.float32)).item()
     assert got == pytest.approx(value or 1 / (1 - 0.9 * 7 / 8), rel=0.02)
 
 
 def test_normalising_changes_the_actor_and_leaves_the_critic_alone() -> None:
-    data = rollout()
-    plain = A2C.create(log_of(), A2CConfig(gamma=0.5, steps_per_update=3), seed=0)
-    normal = A2C.create(log_of(), A2CConfig(gamma=0.5, steps_per_update=3, normalize=True), seed=0)
-    plain.gradient(data)
-    gradients = gradient_of(normal, data)
-    critic = "critic.layers.1.weight"
-    np.testing.assert_array_equal(plain.weights.gradients[critic], normal.weights.gradients[critic])
-    advantage = plain.advantages(data)[0][:, 0]
-    advantage -= advantage.sum() / 3
-    advantage /= np.sqrt((advantage**2).sum() / 2)
-    scores = score_gradients(normal, data)
-    for name, gradient in gradients.items():
-        expected = -sum(a * s[name] for a, s in zip(advantage, scores, strict=True)) / 3
-        np.testing.assert_allclose(gradient, expected, rtol=1e-3, atol=1e-5)
+    agent = a2c(normalize=True)
+    slopes = slopes_of(agent, rollout())
+    advantage = advantage_of(agent)
+    np.testing.assert_allclose(slopes["critic"], -advantage / 3, rtol=1e-5)
+    normal = advantage - advantage.mean()
+    normal /= np.sqrt((normal**2).sum() / 2)
+    np.testing.assert_allclose(slopes["actor"], -normal / 3, rtol=1e-4)
 
 
 def test_entropy_bonus_widens_the_policy() -> None:
-    """The entropy of a Gaussian grows by 1 per unit of log_std: the loss falls by its weight."""
-
-    def gradient(weight: float) -> float:
-        config = A2CConfig(gamma=0.5, steps_per_update=3, ent_coef=weight)
-        return float(gradient_of(A2C.create(log_of(), config, seed=0), rollout())["log_std"][0])
-
-    assert gradient(0.25) == pytest.approx(gradient(0.0) - 0.25, abs=1e-5)
+    slopes = slopes_of(a2c(ent_coef=0.25), rollout())
+    assert slopes["entropy"] == -0.25
 
 
 _PPO = {"steps_per_update": 16, "epochs": 2, "minibatches": 2}
@@ -212,21 +180,45 @@ def train_both(
     return told
 
 
-def test_sb3_and_ours_make_the_same_updates_of_the_same_experience() -> None:
-    """Ten updates agree."""
-    config = A2CConfig(
-        steps_per_update=64, gamma=0.98, gae_lambda=0.95, learning_rate=0.01, ent_coef=0.01,
-        normalize=True,
-    )  # fmt: skip
+SETTINGS: dict[str, Any] = {"steps_per_update": 64, "gamma": 0.98, "gae_lambda": 0.95,
+                            "ent_coef": 0.01, "normalize": True}  # fmt: skip
+PARITY = {
+    "a2c": A2CConfig(learning_rate=0.01, **SETTINGS),
+    "ppo": PPOConfig(
+        learning_rate=0.003, critic_learning_rate=0.01, epochs=5, minibatches=1, clip=0.1,
+        max_grad_norm=0.5, **SETTINGS,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("algorithm", PARITY)
+def test_sb3_and_ours_make_the_same_updates_of_the_same_experience(algorithm: str) -> None:
+    """Of PPO as one minibatch. What they log agrees too."""
+    config = PARITY[algorithm]
     env = Kept(episode_length=40, flight_band=1.1)
     log = EpisodeRecorder(env, seed=0)
-    theirs: Any = make_agent("sb3-a2c", log, config, 0)
-    ours = A2C.create(log, config, seed=1)
-    assert len(train_both(theirs, ours, env, log, 640)) == 10
+    theirs: Any = make_agent(f"sb3-{algorithm}", log, config, 0)
+    ours: Any = make_agent(algorithm, EpisodeRecorder(Kept(), seed=0), config, 1)
+    epsilons = {group["eps"] for group in theirs.model.policy.optimizer.param_groups}
+    assert epsilons == {ours.epsilon} == {1e-5 if algorithm == "ppo" else 1e-8}  # fault 67
+    updates = train_both(theirs, ours, env, log, 640)
+    assert len(updates) == 10
+    if algorithm == "ppo":  # the objective's bounds matter
+        assert max(there["train/clip_fraction"] for _, there in updates) > 0.1
+    for here, there in updates:
+        if algorithm == "a2c":
+            assert here.keys() == there.keys()
+            assert here == pytest.approx(there, rel=2e-3, abs=2e-4)
+            continue
+        assert here["train/clip_fraction"] == pytest.approx(there["train/clip_fraction"], abs=0.02)
+        assert here["train/value_loss"] == pytest.approx(there["train/value_loss"], rel=2e-3)
+        distance = pytest.approx(there["train/approx_kl"], rel=0.02, abs=1e-5)
+        assert here["train/approx_kl"] == distance
     assert any(e.truncated for e in log.episodes)
     assert any(e.terminated for e in log.episodes)
+    actor = ours.actor()
     for name, expected in theirs.actor().items():
-        np.testing.assert_allclose(ours.actor()[name], expected, atol=2e-4, err_msg=name)
+        np.testing.assert_allclose(actor[name], expected, atol=2e-4, err_msg=name)
 
 
 @pytest.mark.parametrize(
@@ -282,21 +274,12 @@ def test_unknown_names_are_named() -> None:
         make_agent("sb3-ppo", log_of(), PPOConfig(normalize_observations=True), 0)
 
 
-def test_time_baseline_leaves_nothing_of_a_reward_that_no_action_changes() -> None:
-    log = log_of("limit")
-    agent = VPG.create(log, VPGConfig(baseline="time", episodes_per_update=4), seed=0)
-    collector = Collector(log, np.random.default_rng(0), agent.policy())
-    data = collector.episodes(4, 10_000)
-    assert len(data) == 32
-    np.testing.assert_allclose(agent.returns(data), 0, atol=1e-6)
-
-
 def test_vpg_weights_with_baseline_and_scale_by_hand() -> None:
     """Two episodes, of two steps and one, gamma 0.5: R = 2, 2, 5; the mean at step 0 is 3.5."""
     config = VPGConfig(gamma=0.5, baseline="time", episodes_per_update=2)
     data = rollout(rewards=np.array([1.0, 2.0, 5.0]), terminated=np.array([False, True, True]))
-    np.testing.assert_allclose(VPG.create(log_of(), config, 0).returns(data), [-1.5, 0, 1.5])
-    scaled = VPG.create(log_of(), replace(config, normalize=True), 0).returns(data)
+    np.testing.assert_allclose(VPG(log_of(), config, 0).returns(data), [-1.5, 0, 1.5])
+    scaled = VPG(log_of(), replace(config, normalize=True), 0).returns(data)
     np.testing.assert_allclose(scaled, np.array([-1.5, 0, 1.5]) / np.sqrt(1.5), rtol=1e-6)
 
 

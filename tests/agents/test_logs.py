@@ -7,17 +7,14 @@ import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
-from drones import Kept, log_of, vector
+from drones import log_of, vector
 from rich.console import Console
-from rotorgram.agents import A2CConfig, VPGConfig, make_agent, preset
-from rotorgram.agents.a2c import A2C
+from rotorgram.agents import VPGConfig, preset
 from rotorgram.agents.checkpoints import Checkpoint, load, store
-from rotorgram.agents.episodes import EpisodeRecorder
 from rotorgram.agents.networks import Weights
 from rotorgram.agents.vpg import VPG
 from rotorgram.cli import main
@@ -28,7 +25,7 @@ from rotorgram.training.settings import Run
 from rotorgram.training.training import Training
 from tensorboard.backend.event_processing import plugin_event_accumulator
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from test_learning import rollout, train_both
+from test_learning import rollout
 
 DOCS = Path(__file__).parents[2] / "docs" / "algorithms"
 AGENTS = ["vpg", "a2c", "sb3-a2c"]
@@ -157,40 +154,13 @@ def fill(weights: Weights, value: float) -> None:
         array[...] = value if name.endswith("weight") else 0.0
 
 
-def test_the_terms_of_a2c_by_hand() -> None:
-    """V is the observation, so A = (1 - 1, 2 - 1.5)."""
-    agent = A2C.create(log_of(), A2CConfig(hidden=1, log_std=0.0, ent_coef=0.1), 0)
-    fill(agent.weights.part("actor."), 0.0)
-    fill(agent.weights.part("critic."), 1.0)
-    agent.gradient(TWO_STEPS)
-    logged = agent.scalars()
-    assert logged["train/policy_loss"] == pytest.approx(-0.5 * LOG_P[1] / 2)
-    assert logged["train/value_loss"] == pytest.approx((0.0 + 0.25) / 2)
-    assert logged["train/entropy_loss"] == pytest.approx(-ENTROPY_OF_ONE)
-    assert logged["train/explained_variance"] == pytest.approx(1 - 0.0625 / 0.25)
-    assert logged["train/std"] == 1.0
-    assert logged["train/n_updates"] == 0
-
-
 def test_the_terms_of_vpg_by_hand() -> None:
-    agent = VPG.create(log_of(), VPGConfig(hidden=1, log_std=0.0), 0)
+    agent = VPG(log_of(), VPGConfig(hidden=1, log_std=0.0), 0)
     fill(agent.weights.part("actor."), 0.0)
     agent.gradient(TWO_STEPS)
     logged = agent.scalars()
     assert logged["train/policy_loss"] == pytest.approx(-(1 * LOG_P[0] + 2 * LOG_P[1]) / 2)
     assert logged["train/entropy_loss"] == pytest.approx(-ENTROPY_OF_ONE)
-
-
-def test_ours_logs_what_sb3_logs_of_the_same_updates() -> None:
-    config = A2CConfig(steps_per_update=64, gae_lambda=0.95, learning_rate=0.01, normalize=True)
-    env = Kept(episode_length=40)
-    log = EpisodeRecorder(env, seed=0)
-    theirs: Any = make_agent("sb3-a2c", log, config, 0)
-    for here, there in train_both(theirs, A2C.create(log, config, seed=1), env, log, 320):
-        assert here.keys() == there.keys()
-        for name, value in there.items():
-            assert here[name] == pytest.approx(value, rel=2e-3, abs=2e-4), name
-    assert theirs.scalars()["train/n_updates"] == 5
 
 
 # ---- resuming

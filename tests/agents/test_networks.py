@@ -75,18 +75,6 @@ def test_arrays_are_views_of_one() -> None:
     assert weights.values.sum() == 6 + 14
 
 
-def test_forward_by_hand() -> None:
-    """Two inputs, layers of two and one units, one output."""
-    values = np.array([1, 2, -1, 1, 0.5, -0.5, 2, 1, 1, 3, 10])
-    inputs = np.array([[1, 1], [-1, 2]], np.float32)
-    # hidden: (3.5, -0.5) -> (3.5, 0) -> 8; (3.5, 2.5) -> 10.5
-    assert mlp_of((2, 2, 1, 1), "relu", values)[0].forward(inputs).tolist() == [[34.0], [41.5]]
-    first = np.tanh([3.5, -0.5])
-    second = np.tanh(2 * first[0] + first[1] + 1)
-    got = mlp_of((2, 2, 1, 1), "tanh", values)[0].forward(inputs)[0, 0]
-    assert got == pytest.approx(3 * second + 10, rel=1e-6)
-
-
 @pytest.mark.parametrize("activation", ["relu", "tanh"])
 @pytest.mark.parametrize("hidden", [(16,), (8, 9), (7, 6, 5)])
 def test_gradients_are_those_of_torch(hidden: tuple[int, ...], activation: str) -> None:

@@ -24,7 +24,7 @@ def test_moments_of_parts_are_those_of_the_whole() -> None:
     other.add(rows[:10])
     moments.add(rows[:10])
     assert other.mean.tobytes() == moments.mean.tobytes()
-    with pytest.raises(ValueError, match="observations: expected moments of shapes"):
+    with pytest.raises(ValueError, match="observations: expected arrays of shapes"):
         Moments(2).load(moments.arrays())
 
 

@@ -1,76 +1,24 @@
-"""PPO: its loss by hand and against torch, and the updates of SB3's on the same experience."""
+"""PPO: its minibatches, its rates and its presets."""
 
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from drones import Kept, log_of
-from rotorgram.agents import EpisodeRecorder, PPOConfig, find_preset, load, make_agent
+from drones import log_of
+from rotorgram.agents import PPOConfig, find_preset, load
 from rotorgram.agents.ppo import PPO
 from rotorgram.models.errors import InputError
-from test_learning import rollout, train_both
+from test_learning import rollout
 
 SMALL = PPOConfig(gamma=0.5, gae_lambda=0.5, steps_per_update=3, epochs=1, minibatches=1)
 
 
-def filled(config: PPOConfig, actor: float = 0.0, critic: float = 0.0, seed: int = 0) -> PPO:
-    """A linear critic V(s) = critic · s of one unit; an actor of constant weights."""
-    agent = PPO.create(log_of(), config, seed)
-    for part, value in (("actor.", actor), ("critic.", critic)):
-        for name, array in agent.weights.part(part).arrays.items():
-            array[...] = value if name.endswith("weight") else 0.0
-    return agent
-
-
-def test_the_clipped_objective_by_hand() -> None:
-    """Mean 0, deviation 1, of which log P(a) = -a²/2 - 0.9189; r is the exponential of the change.
-
-    | r | A | min(r A, clip(r) A) | dL / dlog P |
-    |---|---|---|---|
-    | 1.1 | 2 | 2.2 | 2.2 |
-    | 1.5 | 2 | 1.2 · 2 | 0 |
-    | 0.5 | 2 | 1 | 1 |
-    | 1.5 | -1 | -1.5 | -1.5 |
-    | 0.5 | -1 | -0.8 | 0 |
-    """
-    config = PPOConfig(hidden=1, log_std=0.0, normalize=False, clip=0.2)
-    agent = filled(config)
-    actions = np.array([0.5, 1.0, -2.0, 1.5, 0.3], np.float32)
-    ratio = np.array([1.1, 1.5, 0.5, 1.5, 0.5])
-    advantage = np.array([2, 2, 2, -1, -1], "f")
-    before = (-(actions**2) / 2 - 0.9189385 - np.log(ratio)).astype(np.float32)
-    seen = np.ones((5, 1), np.float32)
-    targets = np.array([1, 2, 3, 4, 5], np.float32)
-    gain, entropy, value_loss, distance, clipped = agent.minibatch(
-        seen, actions[:, np.newaxis], before, advantage, targets
-    )
-    assert gain == pytest.approx((2.2 + 2.4 + 1.0 - 1.5 - 0.8) / 5, rel=1e-5)
-    assert entropy == pytest.approx(0.5 + 0.9189385, rel=1e-6)
-    assert value_loss == pytest.approx((1 + 4 + 9 + 16 + 25) / 5)
-    assert distance == pytest.approx(np.mean(ratio - 1 - np.log(ratio)), rel=1e-5)
-    assert clipped == 4 / 5
-    slope = np.array([2.2, 0, 1, -1.5, 0]) / -5
-    gradients = agent.weights.gradients
-    # d log P / d mean = a and d log P / d log_std = a² - 1
-    assert gradients["actor.layers.1.bias"] == pytest.approx(slope @ actions, rel=1e-5)
-    assert gradients["actor.log_std"] == pytest.approx(slope @ (actions**2 - 1), rel=1e-5)
-    # 0.5 · mean of (0 - target)²
-    assert gradients["critic.layers.1.bias"] == pytest.approx(-3.0)
-
-
-def columns(count: int) -> tuple[np.ndarray, ...]:
-    dice = np.random.default_rng(1)
-    shapes = [(count, 1), (count, 1), (count,), (count,), (count,)]
-    return tuple(dice.normal(size=shape).astype(np.float32) for shape in shapes)
-
-
 def test_rates_of_actor_and_critic() -> None:
     """Adam's first step is the rate, whatever the gradient."""
-    agent = PPO.create(log_of(), replace(SMALL, learning_rate=0.01, critic_learning_rate=0.03), 0)
+    agent = PPO(log_of(), replace(SMALL, learning_rate=0.01, critic_learning_rate=0.03), 0)
     before = {name: array.copy() for name, array in agent.weights.arrays.items()}
     agent.update(rollout())
     for name, array in agent.weights.arrays.items():
@@ -80,56 +28,33 @@ def test_rates_of_actor_and_critic() -> None:
 
 
 def test_every_epoch_takes_every_transition_once() -> None:
-    agent = PPO.create(log_of(), replace(SMALL, epochs=4, minibatches=3, normalize=False), 0)
-    taken: list[tuple[np.ndarray, ...]] = []
+    agent = PPO(log_of(), replace(SMALL, epochs=4, minibatches=3, normalize=False), 0)
+    taken: list[np.ndarray] = []
     minibatch = agent.minibatch
 
-    def keep(*arguments: np.ndarray) -> tuple[float, ...]:
-        taken.append(tuple(a.copy() for a in arguments))
-        return minibatch(*arguments)
+    def keep(*columns: np.ndarray) -> tuple[float, ...]:
+        taken.append(np.column_stack(columns))
+        return minibatch(*columns)
 
     agent.minibatch = keep  # type: ignore[method-assign]
-    dice = np.random.default_rng(0)
-    names = "observations", "actions", "next_observations"
-    many = {name: dice.normal(size=(20, 1)).astype(np.float32) for name in names}
-    many["rewards"] = dice.normal(size=20)
-    flags = dict.fromkeys(("terminated", "truncated"), np.zeros(20, bool))
-    kept = np.arange(20) != 7
-    data = rollout(**many, **flags, kept=kept)
-    agent.update(data)
-    assert [len(part[0]) for part in taken] == [6, 6, 7] * 4
-    assert agent.optimizer.steps == 12
-    orders = [[tuple(column[i].item() for column in part) for part in taken[first : first + 3]
-               for i in range(len(part[0]))] for first in range(0, 12, 3)]  # fmt: skip
-    for order in orders:
-        assert sorted(row[0] for row in order) == sorted(data.observations[kept, 0, 0].tolist())
-        assert sorted(order) == sorted(orders[0]), "the columns of a transition stay together"
-    assert len(set(map(tuple, orders))) == 4
-
-
-def test_sb3_and_ours_make_the_same_updates_of_the_same_experience() -> None:
-    """As one minibatch."""
-    config = PPOConfig(
-        steps_per_update=64, gamma=0.98, gae_lambda=0.95, learning_rate=0.003, ent_coef=0.01,
-        critic_learning_rate=0.01, epochs=5, minibatches=1, clip=0.1, max_grad_norm=0.5,
+    numbers = np.arange(20, dtype=np.float32)
+    column = numbers[:, np.newaxis]
+    never = np.zeros(20, bool)
+    kept = numbers != 7
+    data = rollout(
+        observations=column, actions=column / 10, rewards=numbers, next_observations=column + 1,
+        terminated=never, truncated=never, kept=kept,
     )  # fmt: skip
-    env = Kept(episode_length=40, flight_band=1.1)
-    log = EpisodeRecorder(env, seed=0)
-    theirs: Any = make_agent("sb3-ppo", log, config, 0)
-    ours = PPO.create(log, config, seed=1)
-    epsilons = {group["eps"] for group in theirs.model.policy.optimizer.param_groups}
-    assert epsilons == {PPO.epsilon} == {1e-5}  # fault 67
-    for here, there in train_both(theirs, ours, env, log, 512):
-        assert here["train/clip_fraction"] == pytest.approx(there["train/clip_fraction"], abs=0.02)
-        assert here["train/value_loss"] == pytest.approx(there["train/value_loss"], rel=2e-3)
-        assert here["train/approx_kl"] == pytest.approx(
-            there["train/approx_kl"], rel=0.02, abs=1e-5
-        )
-    assert any(e.truncated for e in log.episodes)
-    assert any(e.terminated for e in log.episodes)
-    assert ours.optimizer.steps == 40
-    for name, expected in theirs.actor().items():
-        np.testing.assert_allclose(ours.actor()[name], expected, atol=2e-4, err_msg=name)
+    agent.update(data)
+    assert [len(part) for part in taken] == [6, 6, 7] * 4
+    assert agent.optimizer.steps == 12
+    epochs = np.array(np.split(np.concatenate(taken), 4))
+    orders = epochs[:, :, 0].argsort(axis=1)
+    expected = epochs[0, orders[0]]
+    assert expected[:, 0].tolist() == numbers[kept].tolist()
+    for epoch, order in zip(epochs, orders, strict=True):
+        np.testing.assert_array_equal(epoch[order], expected)  # a transition's columns together
+    assert len(np.unique(orders, axis=0)) == 4
 
 
 def test_the_tuned_preset_depends_on_the_task() -> None:

@@ -121,11 +121,11 @@ def test_what_does_not_fit_is_one_sentence() -> None:
         ({"hidden": (8,)}, r"hidden: expected \(16,\) of the training to start from, got \(8,\)"),
         (
             {"options": {**SHORT, "observation": "error"}},
-            "start-from: expected the observed numbers of rotorgram/Elevation-v0, 3, got 1",
+            "start-from: expected observation 'rate of the error' of rotorgram/Elevation-v0, got",
         ),
         (
             {"start": trained("ppo", rates, env_id=hover), "options": attitude, "env_id": hover},
-            "start-from: expected the actions of rotorgram/Hover-v0 with 'roll rate', got 'roll'",
+            "start-from: expected action 'roll rate' of rotorgram/Hover-v0, got action 'roll'",
         ),
         ({"start": replace(kept, state={})}, "checkpoint: its parts do not fit together"),
     ):

@@ -10,7 +10,6 @@ from drones import OPTIONS, vector
 from rotorgram.agents import (
     CheckpointError,
     ResumeError,
-    episode_seed,
     load,
     preset,
     store,
@@ -18,7 +17,6 @@ from rotorgram.agents import (
 from rotorgram.cli import main
 from rotorgram.envs.config import BackendConfig, EnvConfig
 from rotorgram.envs.vector import LocalVectorEnv
-from rotorgram.flights.trajectories import evaluation_seed
 from rotorgram.models.errors import InputError
 from rotorgram.training.settings import Run
 from rotorgram.training.training import Training
@@ -69,24 +67,6 @@ def test_a_training_knows_the_config_that_is_flown(backend: str) -> None:
     assert Training(run, env).env_config == flown.resolve()
     other = LocalVectorEnv(replace(flown, history=2), 4, autoreset_mode="Disabled")
     assert Training(run, other).env_config is None
-
-
-def test_training_and_evaluation_share_no_seed() -> None:
-    training = {episode_seed(run, episode) for run in range(10) for episode in range(300)}
-    sets = ("final", "curve", "tuning")
-    evaluation = [evaluation_seed(episode, of) for of in sets for episode in range(100)]  # type: ignore[arg-type]
-    assert training.isdisjoint(evaluation)
-
-
-def test_same_seed_same_numbers_and_other_seed_other_numbers() -> None:
-    def weights(seed: int) -> bytes:
-        run = replace(run_of("a2c", 1), seed=seed, env_steps=300)
-        training = Training(run, env_of(run))
-        training.train()
-        return training.agent.actor()["layers.1.weight"].tobytes()
-
-    assert weights(1) == weights(1)
-    assert weights(1) != weights(2)
 
 
 def test_progress_tells_of_every_drone() -> None:

@@ -1,9 +1,6 @@
 """Episodes and rollouts of any number of drones: seeds, logs, resuming, SB3's side."""
 
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
 from dataclasses import replace
-from threading import Thread
 from typing import Any
 
 import gymnasium as gym
@@ -16,8 +13,10 @@ from rotorgram.agents import EpisodeRecorder, ResumeError, episode_seed, make_ag
 from rotorgram.agents.rollouts import Collector
 from rotorgram.agents.sb3 import RecordedEnv, SB3VecEnv
 from rotorgram.envs import LocalVectorEnv
+from rotorgram.envs.config import EnvConfig
+from rotorgram.flights.trajectories import evaluation_seed
 from rotorgram.models.errors import InputError
-from rotorgram.udp import RemoteVectorEnv, Simulator
+from rotorgram.training.study import open_env
 
 N = 5
 
@@ -39,9 +38,16 @@ def random_actions(dice: np.random.Generator, drones: int = N) -> np.ndarray:
 # ---- episodes
 
 
-def test_episode_seeds_differ_between_runs_and_episodes() -> None:
-    seeds = {episode_seed(run, k) for run in range(20) for k in range(50)}
-    assert len(seeds) == 1000
+def test_no_two_episodes_have_the_same_seed() -> None:
+    """Of trainings, and of evaluations of any set and training."""
+    training = {episode_seed(run, episode) for run in range(20) for episode in range(300)}
+    sets: tuple[Any, ...] = ("final", "curve", "tuning")
+    runs = (None, 0, 1, 2)
+    numbers = range(100)
+    evaluation = {evaluation_seed(k, of, run) for of in sets for run in runs for k in numbers}
+    assert len(training) == 20 * 300
+    assert len(evaluation) == 3 * 4 * 100
+    assert training.isdisjoint(evaluation)
 
 
 def test_every_episode_has_the_seed_of_its_number() -> None:
@@ -259,38 +265,21 @@ def test_sb3_wants_same_step() -> None:
 # ---- over UDP
 
 
-@contextmanager
-def remote(simulators: int, drones: int) -> Iterator[RemoteVectorEnv]:
-    """A vector env whose drones are flown by simulators in threads."""
-    here = ("127.0.0.1", 0)
-    env = RemoteVectorEnv(
-        here, num_simulators=simulators, num_envs=simulators * drones, autoreset_mode="Disabled",
-        connect=False, connect_timeout=20, timeout=20,
-    )  # fmt: skip
-    with ExitStack() as stack:
-        stack.callback(env.close)
-        for _ in range(simulators):
-            simulator = Simulator(ENV, server=env.address, bind=here, num_envs=drones, **OPTIONS)
-            thread = Thread(target=simulator.run)
-            thread.start()
-            stack.callback(simulator.close)
-            stack.callback(thread.join)
-            stack.callback(simulator.stop)
-        env.connect()
-        yield env
-
-
 def test_over_udp_the_training_is_the_same_and_goes_on() -> None:
     config = preset("a2c", "tuned", steps_per_update=64)
-    here = EpisodeRecorder(vector(4), 1)
-    agent = make_agent("a2c", here, config, 1)
-    agent.train(here, 512, lambda: True)
-    with remote(2, 2) as env:
-        there = EpisodeRecorder(env, 1)
-        other = make_agent("a2c", there, config, 1)
-        other.train(there, 512, lambda: True)
-        for name, weight in agent.actor().items():
-            assert weight.tobytes() == other.actor()[name].tobytes()
+    flown = EnvConfig.from_keywords(ENV, **OPTIONS)
+
+    def trained(env: Any) -> tuple[EpisodeRecorder, dict[str, np.ndarray]]:
+        log = EpisodeRecorder(env, 1)
+        agent = make_agent("a2c", log, config, 1)
+        agent.train(log, 512, lambda: True)
+        return log, agent.actor()
+
+    here, expected = trained(vector(4))
+    with open_env(True, flown, 4) as env:
+        _, actor = trained(env)
+        for name, weight in expected.items():
+            assert weight.tobytes() == actor[name].tobytes()
         again = EpisodeRecorder(env, 1)
         again.resume(here.position())
-        assert again.position().observations.tobytes() == here.observations.tobytes()
+        assert again.observations.tobytes() == here.observations.tobytes()

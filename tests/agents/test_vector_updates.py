@@ -131,7 +131,7 @@ def test_a2c_learns_from_what_each_drone_flew(
     env = Scripted(script, discrete=discrete)
     log = log_of(env)
     config = A2CConfig(steps_per_update=steps, gae_lambda=gae_lambda, gamma=GAMMA)
-    agent = A2C.create(log, config, 3)
+    agent = A2C(log, config, 3)
     values: dict[bytes, float] = {}
 
     def estimates(rollout: Rollout) -> np.ndarray:
@@ -150,7 +150,7 @@ def test_a2c_learns_from_what_each_drone_flew(
 def test_vpg_learns_from_the_episodes_that_each_drone_flew(episodes: int, script: Script) -> None:
     env = Scripted(script)
     log = log_of(env)
-    agent = VPG.create(log, VPGConfig(episodes_per_update=episodes, gamma=GAMMA), 3)
+    agent = VPG(log, VPGConfig(episodes_per_update=episodes, gamma=GAMMA), 3)
 
     def returns(rollout: Rollout) -> np.ndarray:
         found = np.zeros(rollout.kept.shape)
@@ -180,10 +180,10 @@ def test_a_lost_simulator_teaches_nothing(script: Script) -> None:
     rollout = collector.episodes(len(script), 1000)
     assert len(rollout) == 20 * max(1, len(script) - 1)
     assert log.env_steps == len(rollout) + 3
-    np.testing.assert_allclose(VPG.create(log, config, 0).returns(rollout), 0, atol=1e-6)
+    np.testing.assert_allclose(VPG(log, config, 0).returns(rollout), 0, atol=1e-6)
 
     log, collector = collector_of(script)
-    agent: Any = A2C.create(log, A2CConfig(gamma=0.98, gae_lambda=0.98), 0)
+    agent: Any = A2C(log, A2CConfig(gamma=0.98, gae_lambda=0.98), 0)
     agent.weights.arrays["critic.layers.1.weight"][:] = 0
     agent.weights.arrays["critic.layers.1.bias"][:] = 50
     rollout = collector.steps(10 * len(script))
@@ -216,7 +216,7 @@ def test_parts_of_episodes_teach_nothing() -> None:
     assert len(rollout) == 40
     assert log.env_steps == 42
     config: Any = VPGConfig(gamma=0.98, baseline="time", normalize=True, episodes_per_update=4)
-    np.testing.assert_allclose(VPG.create(log, config, 0).returns(rollout), 0, atol=1e-6)
+    np.testing.assert_allclose(VPG(log, config, 0).returns(rollout), 0, atol=1e-6)
     log, collector = collector_of([[(20, "limit")]] * 2)
     assert len(collector.episodes(2, 38)) == 0
     assert log.env_steps == 38
