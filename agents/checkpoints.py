@@ -23,7 +23,7 @@ from typing import Annotated, Any, Final
 import numpy as np
 
 from ..envs.config import EnvConfig
-from ..envs.spec import EnvSpec
+from ..envs.spec import EnvSpec, canonical_id
 from ..models import Backend
 from ..models.errors import InputError, require, shortened
 from ..models.fields import Limits, read_table
@@ -181,7 +181,7 @@ def _read(data: bytes, parse: Callable[[bytes], dict[str, np.ndarray]]) -> Check
     spec = EnvSpec.from_json(meta.spec)
     arrays = parse(data)
     env = EnvConfig.from_dict(meta.env) if meta.env else None
-    if env and env.env_id != spec.env_id:
+    if env and env.env_id != canonical_id(spec.env_id):
         raise ValueError(f"expected the config of {spec.env_id}, got that of {env.env_id}")
     checkpoint = Checkpoint(
         spec=spec,

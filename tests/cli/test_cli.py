@@ -508,7 +508,7 @@ def test_worlds_of_the_simulator_that_comes(
     assert status == 0
     config = json.loads((tmp_path / "run" / "config.json").read_text())
     assert config["num_envs"] == 4
-    assert config["drones"] == 2
+    assert config["env"]["drones"] == 2
 
 
 def test_train_with_many_drones(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
