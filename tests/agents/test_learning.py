@@ -185,7 +185,7 @@ SETTINGS: dict[str, Any] = {"steps_per_update": 64, "gamma": 0.98, "gae_lambda":
 PARITY = {
     "a2c": A2CConfig(learning_rate=0.01, **SETTINGS),
     "ppo": PPOConfig(
-        learning_rate=0.003, critic_learning_rate=0.01, epochs=5, minibatches=1, clip=0.1,
+        learning_rate=0.003, critic_learning_rate=0.01, epochs=5, minibatches=1, clip=0.02,
         max_grad_norm=0.5, **SETTINGS,
     ),
 }  # fmt: skip
