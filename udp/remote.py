@@ -21,6 +21,7 @@ from ..envs.autoreset import (
 from ..envs.spaces import action_space, joined, observation_space, telemetry_names
 from ..envs.spec import ArraySpec, Discrete, EnvSpec
 from ..models.errors import InputError, NotCopied, shortened
+from .layouts import layout_of
 from .protocol.client import Address
 from .protocol.layout import MAX_DRONES
 from .protocol.messages import FLY, FREEZE, MAX_UINT64, RESET, State
@@ -65,13 +66,11 @@ class _Remote(NotCopied):
         """Counts and round trips of the wire, over all simulators."""
         return self._agent.server.statistics
 
-    def _take_actions(self, action: ArraySpec | Discrete, count: int) -> None:
+    def _take_actions(self, spec: EnvSpec, count: int) -> None:
         """Take dtype and shape of the actions of so many drones as they cross the wire."""
-        self._row: tuple[int, ...] = ()
-        self._dtype = np.dtype(np.int64)
-        if isinstance(action, ArraySpec):
-            self._row = action.shape
-            self._dtype = np.dtype(action.dtype)
+        slot = layout_of(spec).actions
+        self._row = slot.shape[1:]
+        self._dtype = slot.dtype
         self._nothing: np.ndarray = np.zeros((count, *self._row), self._dtype)
 
 
@@ -129,7 +128,6 @@ class RemoteEnv(_Remote, gym.Env[Any, Any]):
         connect: bool = True,
         **settings: Unpack[AgentSettings],
     ) -> None:
-        self.render_mode = None
         self._open(address, AgentConfig(drones=1, slots=1, **settings), connect)
 
     def connect(self) -> None:
@@ -196,7 +194,7 @@ class RemoteEnv(_Remote, gym.Env[Any, Any]):
         self.metadata = {"render_modes": [], "render_fps": fps}
         self._arrays = tuple(array.name for array in spec.observation)
         self._names = telemetry_names(spec)
-        self._take_actions(spec.action, 1)
+        self._take_actions(spec, 1)
 
     def _observation(self, state: State) -> Observation:
         """As the space has it, a copy."""
@@ -283,7 +281,7 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
         spec = self._agent.connect()
         num_envs = self.num_simulators * (self._agent.config.drones or 1)
         self._take_spec(spec, num_envs, self.metadata["autoreset_mode"])
-        self._take_actions(spec.action, num_envs)
+        self._take_actions(spec, num_envs)
         self._shape = self.num_simulators, num_envs // self.num_simulators
 
     def reset(
@@ -402,9 +400,6 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
 
     def _seeds(self, seed: int | Seeds | None) -> np.ndarray | None:
         """Seeds as they cross the wire. Raises `InputError`."""
-        shape = (self.num_envs,)
-        if isinstance(seed, np.ndarray) and seed.dtype == np.uint64 and seed.shape == shape:
-            return seed
         seeds = checked_seeds(seed, self.num_envs, MAX_UINT64)
         return None if seeds is None else np.array(seeds, np.uint64)
 

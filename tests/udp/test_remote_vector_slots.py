@@ -93,7 +93,7 @@ def test_a_slow_simulator_only_delays() -> None:
     [
         ({"num_envs": 1}, "expected a simulator of 2 drones, got one of 1"),
         ({"num_envs": 3}, "expected a simulator of 2 drones, got one of 3"),
-        ({"num_envs": 2, "env": "CartPole-v1"}, "expected"),
+        ({"num_envs": 2, "env": "rotorgram/Hover-v0"}, "expected"),
         (
             {"num_envs": 2, "effects": {"linear_drag": 0.5}},
             "expected effects not to be there, got {'linear_drag': 0.5}",

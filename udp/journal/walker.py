@@ -20,7 +20,6 @@ class Transition(NamedTuple):
     state: State
     command: Command | None
     """None: the first State of its session, or one whose Command is missing in the journal."""
-    is_first: bool
     flown: Mask
     """Drones that took a step, shape (N,)."""
     resets: Mask
@@ -31,7 +30,7 @@ class Transition(NamedTuple):
     @property
     def is_gap(self) -> bool:
         """Whether nobody knows what was flown."""
-        return self.command is None and not self.is_first
+        return self.command is None and not self.resets.any()
 
 
 class Walker:
@@ -54,9 +53,9 @@ class Walker:
         nobody = np.zeros(drones, bool)
         if before is None:
             seeds = first_seeds(self.session.seed, drones)
-            return Transition(message, None, True, nobody, ~nobody, seeds)
+            return Transition(message, None, nobody, ~nobody, seeds)
         command = self._command
         if command is None or not before == command.sequence == message.sequence - 1:
-            return Transition(message, None, False, nobody, nobody, None)
+            return Transition(message, None, nobody, nobody, None)
         flown = np.asarray(command.orders == FLY)
-        return Transition(message, command, False, flown, command.resets, command.seeds)
+        return Transition(message, command, flown, command.resets, command.seeds)
