@@ -7,9 +7,9 @@ import mujoco
 
 from ..models import QUAD_XML
 from ..models.mjcf import has_ground, read_spec
-from . import AIRPORT_XML, SCENE_XML, SEEDED_SCENES, parse_scene
-from .generators import add_seeded
-from .spec import clear
+from . import AIRPORT_XML, SCENE_XML, parse_scene
+from .generators import GENERATORS
+from .primitives import SKY, attach, clear
 
 SCENE_PREFIX: Final = "scene/"  # of all names that `add_scene` adds for the plain scene
 _NEAR, _FAR = 0.25, 1200.0  # m: nearest and furthest distance that is drawn; the hills lie within
@@ -43,8 +43,8 @@ def add_scene(spec: mujoco.MjSpec, scene: str = "plain") -> None:
     _add_plain(spec)
     if name == "airport":
         _add_airport(spec)
-    elif name in SEEDED_SCENES:
-        add_seeded(spec, name, seed)
+    elif name in GENERATORS:
+        attach(spec, GENERATORS[name](seed))
     spec.compiler.discardvisual = False
 
 
@@ -57,7 +57,7 @@ def _add_plain(spec: mujoco.MjSpec) -> None:
     else:
         spec.visual = scene.visual
         spec.stat = scene.stat
-    if any(texture.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX for texture in spec.textures):
+    if any(texture.type == SKY for texture in spec.textures):
         scene.delete(scene.texture("sky"))
     if spec.worldbody.lights:
         scene.delete(scene.light("sun"))

@@ -7,43 +7,38 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Final
 
-import mujoco
 import numpy as np
 
-from .spec import Colour, clear
-
-Point = tuple[float, float, float]
+from .primitives import Colour, Kind, Light, Material, Pattern, Point, Primitive, Scene
 
 CLEARANCE: Final = 8.0
 """Half the width of the space about the z axis that no primitive but a gate enters, m."""
+CLEARANCE_HEIGHT: Final = 20.0
+"""Height of that space, m."""
+
 _FOREST: Final = 60.0  # m: half the width of the wood
 _LENGTH, _WIDTH, _HEIGHT = 30.0, 20.0, 24.0  # m: half length, half width and height of the hall
 _GATES: Final = 8
 _OPENING: Final = 5.0  # m: the paper's craft is 2.8 m wide with its rotors
-_NEAR, _FAR = 0.25, 400.0  # m: nearest and furthest distance that is drawn
-_SLICES: Final = 20  # of a cylinder
-_GROUP: Final = 2  # of geoms
-_KINDS: Final = {
-    "plane": mujoco.mjtGeom.mjGEOM_PLANE,
-    "box": mujoco.mjtGeom.mjGEOM_BOX,
-    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
-    "ellipsoid": mujoco.mjtGeom.mjGEOM_ELLIPSOID,
-}
-_PATTERNS: Final = {
-    "checker": (mujoco.mjtBuiltin.mjBUILTIN_CHECKER, mujoco.mjtMark.mjMARK_NONE),
-    "edge": (mujoco.mjtBuiltin.mjBUILTIN_FLAT, mujoco.mjtMark.mjMARK_EDGE),
-    "random": (mujoco.mjtBuiltin.mjBUILTIN_FLAT, mujoco.mjtMark.mjMARK_RANDOM),
-}
-"""How MuJoCo draws the texture of a pattern, and what it marks on it."""
 
 
 class _Builder:
-    """Draws the numbers of a scene, and adds its parts to a spec. They touch and weigh nothing."""
+    """Collects the parts of a scene, and draws its numbers."""
 
-    def __init__(self, spec: mujoco.MjSpec, name: str, seed: int) -> None:
+    def __init__(self, seed: int) -> None:
         self.rng = np.random.Generator(np.random.PCG64(seed))
-        self._spec = spec
-        self._name = name
+        self.materials: list[Material] = []
+        self.primitives: list[Primitive] = []
+        self.lights: list[Light] = []
+
+    def scene(self, name: str, sky: tuple[Colour, Colour]) -> Scene:
+        return Scene(
+            name=name,
+            materials=tuple(self.materials),
+            primitives=tuple(self.primitives),
+            lights=tuple(self.lights),
+            sky=sky,
+        )
 
     def uniform(self, low: float, high: float) -> float:
         return float(self.rng.uniform(low, high))
@@ -57,75 +52,57 @@ class _Builder:
         self,
         name: str,
         colour: Colour,
-        pattern: str = "",
+        pattern: Pattern = "",
         repeat: float = 0.5,
         by: float = 0.06,
         gloss: float = 0.0,
-        emission: float = 0.0,
     ) -> str:
-        """The name of a new material whose colour is near another one; a pattern so often per m."""
-        colour = self.colour(colour, by) if by else colour
-        name = f"{self._name}/{name}"
-        added = self._spec.add_material(name=name, specular=gloss, emission=emission)
-        if not pattern:
-            added.rgba = (*colour, 1.0)
-            return name
-        second = np.array(colour) * self.rng.uniform(0.82, 0.94)
-        builtin, mark = _PATTERNS[pattern]
-        self._spec.add_texture(
-            name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, width=128, height=128, builtin=builtin,
-            rgb1=colour, rgb2=second, markrgb=second, random=0.2, mark=mark,
+        """The name of a new material whose colour is near another one."""
+        colour = self.colour(colour, by)
+        second = colour
+        if pattern:
+            red, green, blue = np.array(colour) * self.rng.uniform(0.82, 0.94)
+            second = float(red), float(green), float(blue)
+        material = Material(
+            name=name, colour=colour, pattern=pattern, second_colour=second, repeat=repeat,
+            gloss=gloss,
         )  # fmt: skip
-        added.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
-        added.texuniform = True
-        added.texrepeat = (repeat, repeat)
+        self.materials.append(material)
         return name
 
     def add(
         self,
         name: str,
-        kind: str,
+        kind: Kind,
         size: Iterable[float],
         position: Iterable[float],
         material: str,
         turn: Point = (0.0, 0.0, 0.0),
     ) -> None:
-        """A primitive of half lengths, or radius and half length; turned about x, y and then z."""
-        quaternion = np.empty(4)
-        mujoco.mju_euler2Quat(quaternion, np.array(turn), "XYZ")
-        self._spec.worldbody.add_geom(
-            name=f"{self._name}/{name}", type=_KINDS[kind], size=tuple(size), pos=tuple(position),
-            quat=quaternion, material=material, contype=0, conaffinity=0, group=_GROUP, mass=0.0,
-            density=0.0,
-        )  # fmt: skip
-
-    def light(
-        self, name: str, position: Point, direction: Point, diffuse: Colour, ambient: float
-    ) -> None:
-        """It casts no shadow: that of a slanted sun speckles the ground."""
-        self._spec.worldbody.add_light(
-            name=f"{self._name}/{name}", type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
-            castshadow=False, pos=position, dir=direction, diffuse=diffuse,
-            ambient=(ambient,) * 3, specular=(0, 0, 0),
-        )  # fmt: skip
-
-    def sky(self, top: Colour, horizon: Colour) -> None:
-        self._spec.add_texture(
-            name=f"{self._name}/sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, width=128,
-            height=768, builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, rgb1=top, rgb2=horizon,
-        )  # fmt: skip
+        a, b, c = map(float, size)
+        x, y, z = map(float, position)
+        primitive = Primitive(
+            name=name, kind=kind, size=(a, b, c), position=(x, y, z), turn=turn, material=material
+        )
+        self.primitives.append(primitive)
 
     def choose(self, words: Sequence[str]) -> str:
         return words[int(self.rng.integers(len(words)))]
 
-    def sun(self) -> None:
-        """Add a sun from a side of its own, and its sky."""
+    def sun(self) -> tuple[Colour, Colour]:
+        """Add a sun from a side of its own; returns the colours of its sky."""
         azimuth = self.uniform(0.0, 2 * math.pi)
         down = self.uniform(1.0, 2.5)
         bright = self.uniform(0.6, 0.8)
-        direction = (math.cos(azimuth), math.sin(azimuth), -down)
-        self.light("sun", (0.0, 0.0, 60.0), direction, (bright, bright, 0.95 * bright), 0.2)
-        self.sky(self.colour((0.40, 0.60, 0.86)), (0.93, 0.95, 0.97))
+        light = Light(
+            name="sun",
+            position=(0.0, 0.0, 60.0),
+            direction=(math.cos(azimuth), math.sin(azimuth), -down),
+            diffuse=(bright, bright, 0.95 * bright),
+            ambient=0.2,
+        )
+        self.lights.append(light)
+        return self.colour((0.40, 0.60, 0.86)), (0.93, 0.95, 0.97)
 
     def around(self, reach: float, far: float) -> tuple[float, float]:
         """A place up to `far` from which `reach` does not lead into the clear space."""
@@ -135,9 +112,10 @@ class _Builder:
                 return x, y
 
 
-def _forest(wood: _Builder) -> None:
+def forest(seed: int) -> Scene:
     """A wood of 120 m by 120 m: trees, shrubs and rocks."""
-    wood.sun()
+    wood = _Builder(seed)
+    sky = wood.sun()
     ground = wood.material("ground", (0.36, 0.42, 0.22), "random", 0.1)
     bark = [wood.material(f"bark_{i}", (0.36, 0.26, 0.17), "random") for i in range(2)]
     greens = (0.15, 0.33, 0.16), (0.26, 0.43, 0.15), (0.40, 0.47, 0.16), (0.30, 0.38, 0.20)
@@ -158,6 +136,7 @@ def _forest(wood: _Builder) -> None:
         x, y = wood.around(1.0, _FOREST)
         turn = (0.0, 0.0, wood.uniform(0, math.pi))
         wood.add(f"rock_{i}/stone", "ellipsoid", sides, (x, y, 0.2 * sides[2]), stone, turn)
+    return wood.scene("forest", sky)
 
 
 def _add_tree(wood: _Builder, name: str, bark: Sequence[str], leaves: Sequence[str]) -> None:
@@ -182,32 +161,40 @@ def _add_tree(wood: _Builder, name: str, bark: Sequence[str], leaves: Sequence[s
             wood.add(f"{name}/crown_{part}", "ellipsoid", (0.7 * wide,) * 3, position, leaf)
 
 
-def _warehouse(hall: _Builder) -> None:
+def warehouse(seed: int) -> Scene:
     """A hall of 60 m by 40 m, 24 m high. Racks, pallets and barrels stand along its walls."""
-    hall.sky(hall.colour((0.55, 0.60, 0.66)), hall.colour((0.62, 0.64, 0.66)))
+    hall = _Builder(seed)
+    sky = hall.colour((0.55, 0.60, 0.66)), hall.colour((0.62, 0.64, 0.66))
     floor = hall.material("floor", (0.55, 0.55, 0.53), "checker", 0.25)
     wall = hall.material("wall", (0.72, 0.72, 0.70), "edge", 0.3, by=0.03)
     roof = hall.material("roof", (0.50, 0.52, 0.55), "edge", 0.2)
     steel = hall.material("steel", (0.20, 0.34, 0.62), by=0.15, gloss=0.2)
     pallet = hall.material("pallet", (0.62, 0.48, 0.30), "random")
     glass = hall.material("glass", (0.70, 0.84, 0.93), "edge", 0.5)
-    lamp = hall.material("lamp", (1.0, 0.98, 0.90), by=0.0, emission=0.9)
+    hall.materials.append(Material(name="lamp", colour=(1.0, 0.98, 0.90), emission=0.9))
     tints = (0.72, 0.53, 0.33), (0.62, 0.44, 0.27), (0.25, 0.45, 0.66), (0.72, 0.24, 0.20)
     boxes = [hall.material(f"box_{i}", tint, "edge", 1.0, by=0.1) for i, tint in enumerate(tints)]
     hall.add("ground/floor", "plane", (_LENGTH, _WIDTH, 1), (0, 0, 0), floor)
-    _add_hall(hall, wall, roof, steel, glass, lamp)
+    _add_hall(hall, wall, roof, steel, glass)
     for i, x in enumerate((-15.0, 15.0)):
         bright = hall.uniform(0.28, 0.42)
-        direction = (-x / 30, hall.uniform(-0.4, 0.4), -1.0)
-        hall.light(f"light_{i}", (x, 0.0, 22.0), direction, (bright,) * 3, 0.15)
+        light = Light(
+            name=f"light_{i}",
+            position=(x, 0.0, 22.0),
+            direction=(-x / 30, hall.uniform(-0.4, 0.4), -1.0),
+            diffuse=(bright,) * 3,
+            ambient=0.15,
+        )
+        hall.lights.append(light)
     racks = [(x, y) for y in (-16.5, -11.0, 11.0, 16.5) for x in (-20.0, -7.0, 7.0, 20.0)]
     for i, (x, y) in enumerate(racks):
         _add_rack(hall, f"rack_{i}", x, y, steel, boxes)
     for i in range(20):
         _add_goods(hall, i, pallet, boxes)
+    return hall.scene("warehouse", sky)
 
 
-def _add_hall(hall: _Builder, wall: str, roof: str, steel: str, glass: str, lamp: str) -> None:
+def _add_hall(hall: _Builder, wall: str, roof: str, steel: str, glass: str) -> None:
     """Walls with windows, and a roof with lamps."""
     middle = _HEIGHT / 2
     right = math.pi / 2
@@ -226,7 +213,7 @@ def _add_hall(hall: _Builder, wall: str, roof: str, steel: str, glass: str, lamp
     for i, x in enumerate(np.linspace(-25.0, 25.0, 6)):
         hall.add(f"truss_{i}/beam", "box", (0.15, _WIDTH, 0.3), (x, 0, 23.4), steel)
         for j, y in enumerate((-11.0, 0.0, 11.0)):
-            hall.add(f"lamp_{3 * i + j}/tube", "box", (0.2, 1.2, 0.08), (x, y, 22.9), lamp)
+            hall.add(f"lamp_{3 * i + j}/tube", "box", (0.2, 1.2, 0.08), (x, y, 22.9), "lamp")
 
 
 def _add_rack(
@@ -261,9 +248,10 @@ def _add_goods(hall: _Builder, number: int, pallet: str, boxes: Sequence[str]) -
     hall.add(f"pallet_{number}/box", "box", half, (x, y, 0.16 + half[2]), tint)
 
 
-def _gates(track: _Builder) -> None:
+def gates(seed: int) -> Scene:
     """A ring of 8 gates, 5 m wide inside, with barriers, cones and stands around it."""
-    track.sun()
+    track = _Builder(seed)
+    sky = track.sun()
     grass = track.material("grass", (0.36, 0.50, 0.26), "checker", 0.08)
     steel = track.material("steel", (0.30, 0.31, 0.33), gloss=0.2)
     stand = track.material("stand", (0.60, 0.61, 0.63), "edge", 0.5)
@@ -290,6 +278,7 @@ def _gates(track: _Builder) -> None:
             size = (0.75, 9.0, height)
             turn = (0.0, 0.0, angle)
             track.add(f"stand_{i}/row_{row}", "box", size, position, stand, turn)
+    return track.scene("gates", sky)
 
 
 def _add_gate(track: _Builder, number: int, paint: Sequence[str], steel: str) -> None:
@@ -319,16 +308,9 @@ def _add_gate(track: _Builder, number: int, paint: Sequence[str], steel: str) ->
         track.add(f"gate_{number}/frame_{part}", "box", (0.15, half, bar), position, tint, turn)
 
 
-_GENERATORS: Final[dict[str, Callable[[_Builder], None]]] = {
-    "warehouse": _warehouse,
-    "forest": _forest,
-    "gates": _gates,
+GENERATORS: Final[dict[str, Callable[[int], Scene]]] = {
+    "warehouse": warehouse,
+    "forest": forest,
+    "gates": gates,
 }
-
-
-def add_seeded(spec: mujoco.MjSpec, name: str, seed: int) -> None:
-    """Add a scene of a seed to a spec, in place of its sky, its lights and its level ground."""
-    clear(spec, _NEAR, _FAR, _SLICES)
-    for light in spec.worldbody.lights:
-        light.active = False
-    _GENERATORS[name](_Builder(spec, name, seed))
+"""The function that draws each scene from a seed."""

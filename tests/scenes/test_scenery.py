@@ -13,8 +13,13 @@ from rotorgram.models.mjcf import vehicle_spec
 from rotorgram.models.vehicle import Vehicle
 from rotorgram.rendering.cameras import Cameras
 from rotorgram.scenes import SCENES, SEEDED_SCENES, build_scene, parse_scene
+from rotorgram.scenes.generators import GENERATORS
 
 scenes = pytest.mark.parametrize("scene", SEEDED_SCENES)
+
+
+def test_every_scene_of_a_seed_has_its_generator() -> None:
+    assert tuple(sorted(GENERATORS)) == tuple(sorted(SEEDED_SCENES))
 
 
 def ours(model: mujoco.MjModel, scene: str) -> list[str]:
