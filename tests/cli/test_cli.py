@@ -129,7 +129,7 @@ def test_help_names_the_default_backend(
             ["sim", "--agents", "here:1", "--server", "here:2"],
             "--server: cannot be used with --agents",
         ),
-        (["sim", "--agents"], "agents: expected a divisor of 1 drones, got 0 agents"),
+        (["sim", "--agents"], "agents: expected one address or more, got none"),
         (
             ["sim", *SWARM, "--bind", "127.0.0.1:0", "--agents", "127.0.0.1:0"],
             "server: expected the port of the agent, 1 to 65535, got 0",

@@ -312,7 +312,7 @@ def test_who_is_waited_for_is_told_soon(caplog: pytest.LogCaptureFixture) -> Non
     [
         ({"agents": [("127.0.0.1", i) for i in (1, 2)]},
          "agents: expected a divisor of 3 drones, got 2 agents"),
-        ({"agents": []}, "agents: expected a divisor of 3 drones, got 0 agents"),
+        ({"agents": []}, "agents: expected one address or more, got none"),
         ({"agents": [("127.0.0.1", 1)] * 3}, "agents: expected a different address of each"),
         ({"when_lost": "panic"}, "when_lost: expected one of hold, land, end, got 'panic'"),
         ({"patience": 0}, "patience: expected seconds > 0, got 0"),

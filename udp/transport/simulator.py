@@ -81,6 +81,8 @@ class Simulator(Driver):
         if when_lost not in POLICIES:
             raise InputError(f"when_lost: expected one of {', '.join(POLICIES)}, got {when_lost!r}")
         by_text = codec == "text"
+        if agents is not None and not agents:
+            raise InputError("agents: expected one address or more, got none")
         if agents is not None and (by_text or record or num_envs):
             raise InputError("agents: expected neither text, record nor num_envs with several")
         config = config or LinkConfig()
@@ -93,29 +95,16 @@ class Simulator(Driver):
             spec = stepped.spec
             worlds = stepped.num_envs // len(spec.agents)
             servers = [server] if agents is None else list(agents)
-            drones = len(spec.agents)
-            if not servers or drones % len(servers):
-                raise InputError(
-                    f"agents: expected a divisor of {drones} drones, got {len(servers)} agents"
-                )
-            share = drones // len(servers)
             links: list[AgentLink] = []
             for number, address in enumerate(servers):
                 there = resolve(address, insecure=insecure, way_out=way_out)
-                first = number * share
-                own = replace(spec, agents=spec.agents[first : first + share])
+                rows = _share(len(spec.agents), number, len(servers))
+                own = replace(spec, agents=spec.agents[rows[0] : rows[-1] + 1])
                 changed = replace(config, drop_seed=config.drop_seed + number)
                 client = _client(own, worlds, there, changed, by_text=by_text, key=key)
-                links.append(AgentLink(number, there, client, first + np.arange(share)))
-            addresses = [link.address for link in links]
-            if len(set(addresses)) < len(addresses):
-                raise InputError(f"agents: expected a different address of each, got {addresses}")
-            port = Port(bind, insecure=insecure, peers=addresses)
+                links.append(AgentLink(number, there, client, rows))
+            port = _open_port(bind, [link.address for link in links], insecure=insecure)
             failing.callback(port.close)
-            if port.address in addresses:
-                raise InputError(
-                    f"server: expected the address of an agent, got that of this side, {bind}"
-                )
             layout = layout_of(spec, worlds)
             rules: WorldRules
             if agents is None:
@@ -142,6 +131,24 @@ class Simulator(Driver):
         link.tap = self._journal.tap
         if link.by_text:  # says no Hello
             link.tap(0, link.hello, binary.encode(link.hello))
+
+
+def _share(drones: int, number: int, agents: int) -> np.ndarray:
+    """The drones of one of several agents, which have the same number each."""
+    if drones % agents:
+        raise InputError(f"agents: expected a divisor of {drones} drones, got {agents} agents")
+    share = drones // agents
+    return number * share + np.arange(share)
+
+
+def _open_port(bind: Address, agents: list[Address], *, insecure: bool) -> Port:
+    if len(set(agents)) < len(agents):
+        raise InputError(f"agents: expected a different address of each, got {agents}")
+    port = Port(bind, insecure=insecure, peers=agents)
+    if port.address in agents:
+        port.close()
+        raise InputError(f"server: expected the address of an agent, got that of this side, {bind}")
+    return port
 
 
 def _client(
