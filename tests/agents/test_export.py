@@ -155,7 +155,8 @@ def test_numbers_are_those_of_the_policy(case: str, runner: str, tmp_path: Path)
     assert actions.shape == expected.shape
     # Far outside the bounds, an observation of 1000 is itself known to 6e-5 alone.
     far = np.maximum(1.0, np.abs(observations).max(1, keepdims=True) / 10.0)
-    assert (np.abs(actions - expected) <= 1e-5 * (far + np.abs(expected))).all()
+    ratio = np.abs(actions - expected) / (far + np.abs(expected))
+    assert ratio.max() <= 2e-5  # kernels of other processors round elsewhere
     assert len(np.unique(expected, axis=0)) > (3 if case == "choice" else ROWS // 20)
 
 
