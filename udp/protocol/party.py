@@ -332,7 +332,6 @@ class SeveralAgents(WorldRules):
         layout: Layout,
         period: float,
         links: Sequence[AgentLink],
-        *,
         when_lost: str,
         patience: float,
     ) -> None:

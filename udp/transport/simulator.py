@@ -106,15 +106,13 @@ class Simulator(Driver):
             port = _open_port(bind, [link.address for link in links], insecure=insecure)
             failing.callback(port.close)
             layout = layout_of(spec, worlds)
+            period = spec.control_period
             rules: WorldRules
             if agents is None:
-                rules = OneAgent(stepped, layout, spec.control_period, links)
+                rules = OneAgent(stepped, layout, period, links)
             else:
                 world = _swarm_world(stepped, env)
-                period = spec.control_period
-                rules = SeveralAgents(
-                    world, layout, period, links, when_lost=when_lost, patience=patience
-                )
+                rules = SeveralAgents(world, layout, period, links, when_lost, patience)
             super().__init__(stepped, rules, port)
             if record:
                 self._record(record)
