@@ -48,8 +48,8 @@ def decoded(path: Path, width: int, height: int) -> np.ndarray:
 def nearest(picture: np.ndarray, others: Sequence[np.ndarray]) -> int:
     """The number of the picture that differs least; it differs by less than 1 of 255 in the mean.
 
-    MuJoCo sorts what is transparent by distance. What is as far away is drawn in either order, so
-    that discs that overlap change their colour a little from time to time.
+    In about 1 of 50 films some discs have another shade, by up to 34 of 255, in up to 0.7 % of the
+    pixels. What MuJoCo is given is the same; we do not know the cause.
     """
     apart = [abs(picture.astype(int) - other).mean() for other in others]
     number = int(np.argmin(apart))
@@ -58,12 +58,12 @@ def nearest(picture: np.ndarray, others: Sequence[np.ndarray]) -> int:
 
 
 def same(one: np.ndarray, other: np.ndarray) -> bool:
-    """Whether two pictures show the same: one pixel in 500 may be off, at an edge, and colours may
-    differ a little (see `nearest`).
+    """Whether two pictures show the same: drivers round differently from time to time, and now and
+    then a pixel at an edge falls to the other side.
     """
     if one.shape != other.shape:
         return False
-    off = abs(one.astype(int) - other).max(axis=-1) > 40
+    off = abs(one.astype(int) - other).max(axis=-1) > 3
     return bool(off.mean() <= 0.002)
 
 
