@@ -5,7 +5,7 @@ from .protocol.layout import ArrayLayout, Layout
 
 
 def layout_of(spec: EnvSpec, worlds: int = 1) -> Layout:
-    """The layout of so many worlds, each with every drone of the spec. Raises as `Layout`."""
+    """The layout of W = `worlds` worlds, each with every drone of the spec. Raises as `Layout`."""
     action = spec.action
     return Layout(
         drones=worlds * len(spec.agents),

@@ -313,7 +313,7 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
         return self.observations, self._info(mask)
 
     def step(self, actions: Any) -> Any:
-        """Fly every drone for one control period; what follows an episode, the autoreset says."""
+        """Fly every drone for one control period. The autoreset says what follows an episode."""
         if not self._flying:
             raise gym.error.ResetNeeded("step: expected a call of reset() first")
         self._reasons = None

@@ -6,6 +6,7 @@ import json
 import logging
 import os
 import re
+import signal
 import struct
 import sys
 import textwrap
@@ -760,6 +761,38 @@ def test_the_end_of_the_program_finishes_the_file(goodbye: str, tmp_path: Path) 
     summary = Summary(path)
     assert summary.complete
     assert [s.steps for s in summary.sessions] == [100]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_takes_effect_after_the_write(
+    number: int, flight: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One comes in the middle of each chunk, and one in the middle of the end."""
+
+    def interrupted(write: Callable[[Writer], None]) -> Callable[[Writer], None]:
+        def write_with_signal(writer: Writer) -> None:
+            signal.raise_signal(number)
+            write(writer)
+
+        return write_with_signal
+
+    path = tmp_path / "agent.mcap"
+    items = list(Recording(flight.agent))[:5]
+    monkeypatch.setattr(journal_module, "_CHUNK", 0)  # each message is a chunk
+    for name in ("flush", "finish"):
+        monkeypatch.setattr(Writer, name, interrupted(getattr(Writer, name)))
+    earlier = signal.signal(number, signal.default_int_handler)
+    try:
+        journal = Journal(path, side="agent")
+        for item in items:
+            with pytest.raises(KeyboardInterrupt):
+                journal.tap(item.session.slot, item.message, item.datagram)
+        with pytest.raises(KeyboardInterrupt):
+            journal.close()
+    finally:
+        signal.signal(number, earlier)
+    assert Recording(path).complete
+    assert datagrams(path, object) == [item.datagram for item in items]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no forks there")

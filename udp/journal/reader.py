@@ -89,7 +89,7 @@ class Recording:
 
     Attributes:
         path: The file.
-        about: Metadata of its head: side, env id, options, versions.
+        about: Metadata of its head: side, versions; of a simulator also config, backend, models.
         attachments: Files in its head, by name.
         complete: Whether the file was finished, and could be read as far as was tried.
         ending: How it ends, in words.

@@ -1,4 +1,4 @@
-"""Joins the Commands and States of a session: what each State followed from."""
+"""Joins the Commands and States of a session: each State with its cause."""
 
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -15,7 +15,7 @@ Mask = NDArray[np.bool_]
 
 
 class Transition(NamedTuple):
-    """A State, and what led to it."""
+    """A State, and the Command or reset before it."""
 
     state: State
     command: Command | None
@@ -29,7 +29,7 @@ class Transition(NamedTuple):
 
     @property
     def is_gap(self) -> bool:
-        """Whether nobody knows what was flown."""
+        """Whether the Command before the State is missing."""
         return self.command is None and not self.resets.any()
 
 

@@ -8,7 +8,9 @@ import json
 import logging
 import os
 import platform
+import signal
 import sys
+import threading
 import time
 import weakref
 from collections.abc import Iterator, Mapping
@@ -180,8 +182,8 @@ class McapFile:
     of them. `library` is name and version of the program. Every method but `close` and `give_up`
     raises `OSError` where it fails.
 
-    A write that an exception interrupts (a full device, Ctrl-C) may leave half a record. Then
-    nothing more can be written.
+    A write that an exception interrupts (a full device) may leave half a record. Then nothing more
+    can be written. Ctrl-C and SIGTERM take effect after the write.
     """
 
     def __init__(self, path: Path, library: str) -> None:
@@ -227,14 +229,15 @@ class McapFile:
         """Finish the file, or give it up where that fails. A fork leaves it to its parent."""
         if self.closed or os.getpid() != self._pid:
             return
-        try:
-            self.flush()
-            with self._whole():
-                self._writer.finish()
-            self.closed = True
-            self._file.close()
-        except OSError as error:
-            self.give_up(error)
+        with _deferred_signals():
+            try:
+                self.flush()
+                with self._whole():
+                    self._writer.finish()
+                self.closed = True
+                self._file.close()
+            except OSError as error:
+                self.give_up(error)
 
     def give_up(self, error: OSError) -> None:
         """Log why the journal ends here, and abandon the file: what was written can be read."""
@@ -253,7 +256,30 @@ class McapFile:
         """Write what is added here, up to the device. If that is interrupted, it is the last."""
         if self._broken:
             raise OSError(EINTR, "a write was interrupted")
-        self._broken = True
+        with _deferred_signals():
+            self._broken = True
+            yield
+            self._file.flush()
+            self._broken = False
+
+
+@contextmanager
+def _deferred_signals() -> Iterator[None]:
+    """Call the handlers of Ctrl-C and SIGTERM after the block: they run in the main thread."""
+    if threading.current_thread() is not threading.main_thread():
         yield
-        self._file.flush()
-        self._broken = False
+        return
+    came: list[int] = []
+    handlers: dict[int, Any] = {}
+    try:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            handler = signal.getsignal(number)
+            if handler is not None:  # None: not set by Python, and cannot be set again
+                handlers[number] = handler
+                signal.signal(number, lambda signum, _: came.append(signum))
+        yield
+    finally:
+        for each, handler in handlers.items():
+            signal.signal(each, handler)
+        for each in came:
+            signal.raise_signal(each)

@@ -25,9 +25,8 @@ _MOST: Final = 1024  # simulators remembered between Hello and State 1, in the q
 _LEAST_ASSEMBLING: Final = 16
 """Simulators without a slot of which fragments are kept; more, if there are more slots: so many
 may come at the same moment."""
-_TEXT_REMEMBERED: Final = 2.0  # for so long the last line of a closed text simulator is known, s
+_TEXT_REMEMBERED: Final = 2.0  # memory of the last line of a closed text simulator, s
 _REASON_AT: Final = binary.HEADER_SIZE + 2  # bytes of a Refuse or a Close before its reason
-
 
 K = TypeVar("K")
 V = TypeVar("V")

@@ -3,7 +3,7 @@
 A caller hands in datagrams with the time of their arrival (seconds of any monotonic clock), sends
 what `outgoing` has, and calls `handle_timer` when `next_timer` says. Exactly one State is
 outstanding at any time, so a sequence number suffices to step the physics once for each Command:
- the simulator repeats the same bytes until the Command of the same number comes.
+the simulator repeats the same bytes until the Command of the same number comes.
 """
 
 import secrets
@@ -47,18 +47,18 @@ Tap = Callable[[int, Message, bytes], None]
 simulator), the message, and its bytes in the binary codec, whole and not sealed."""
 
 CLOSE_INTERVAL: Final = 0.025
-"""A Close is repeated after so long, s, until the other side has answered it with its own."""
+"""Period of a repeated Close, s, until the other side has answered it with its own."""
 CLOSE_LINGER: Final = 0.25  # longest wait for that answer, s: the other side may be gone
 
 _FIRST_RESEND: Final = 0.2  # wait before a resend while no round trip has been measured, s
 _GRANULARITY: Final = 0.005  # least that is added to a round trip, s: a process may wait so long
 _LONGEST_RESEND: Final = 1.0  # longest wait before a resend, s
 _PATIENCE: Final = 8  # resends before the waits double: most that was lost was lost by chance
-_LATER: Final = 1.25  # each Alive for a State makes the wait before the next so much longer
+_LATER: Final = 1.25  # factor of the wait before the next resend, for each Alive for a State
 _LATEST: Final = 10.0
 """Longest such wait, s; a quarter of the timeout, if that is less. A Command that was lost is asked
 for again before an agent takes the simulator for lost (30 s)."""
-_TOO_EARLY: Final = 1.5  # by so much round trips are taken for longer when answers come twice
+_TOO_EARLY: Final = 1.5  # factor of the estimated round trip when answers come twice
 _SOON: Final = 0.25  # an agent that has waited for a State for less needs no Alive, s
 _AFTER_COMMAND: Final = SIMULATOR[SimulatorState.WAITING][Way.RECEIVED, Command]
 

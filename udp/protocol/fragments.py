@@ -38,7 +38,7 @@ _LARGEST_BITMAP: Final = 128  # bytes of the bitmap of a Missing: it tells of 1,
 
 def check_largest(largest: int | None) -> None:
     """Raise `InputError` for a largest datagram, bytes, that is too small."""
-    if not (largest is None or largest >= _LEAST):
+    if largest is not None and largest < _LEAST:
         raise InputError(f"max_datagram: expected at least {_LEAST}, got {largest}")
 
 
@@ -46,7 +46,7 @@ def check_size(size: int, largest: int) -> None:
     """Raise `InputError` if a message of so many bytes takes too many datagrams of the largest."""
     least = ceil(size / MAX_FRAGMENTS) + _OVERHEAD
     expected = f"at least {least} for messages of {size} bytes"
-    if not largest >= least:
+    if largest < least:
         raise InputError(f"max_datagram: expected {expected}, got {largest}")
 
 
@@ -78,7 +78,7 @@ class Transfer:
         return self._send(list(range(self.count)))
 
     def resend(self, missing: Missing) -> list[bytes]:
-        """The datagrams to send after the receiver has told what it lacks."""
+        """The datagrams to send after the receiver has said which fragments are missing."""
         if self.count != missing.count or not self._burst:
             return []
         numbers = missing.numbers()

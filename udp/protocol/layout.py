@@ -96,8 +96,8 @@ class Layout:
 
         reward = ArrayLayout((), "float64")
         flag = ArrayLayout((), "bool")
-        told = [ArrayLayout(shape, "float64") for shape in telemetry]
-        arrays = [*observation, reward, flag, flag, *told]
+        numbers = [ArrayLayout(shape, "float64") for shape in telemetry]
+        arrays = [*observation, reward, flag, flag, *numbers]
         slots = _slots(STATE_ARRAYS_AT, drones, arrays)
         first = len(observation)
         flags = slice(slots[first + 1].at, slots[first + 2].end)
@@ -110,8 +110,8 @@ class Layout:
         slots = _slots(COMMAND_ARRAYS_AT, drones, arrays)
         self.actions, orders, _ = slots
         flags = slice(orders.at, orders.end)
-        numbers = _numbers(slots[:1]) if action else None
-        self.command = Record(slots[:2], orders.end, flags, b"\0\1\2", numbers)
+        floats = _numbers(slots[:1]) if action else None
+        self.command = Record(slots[:2], orders.end, flags, b"\0\1\2", floats)
         self.seeded_command = self.command._replace(slots=slots, size=slots[-1].end)
         size = max(self.state.size, self.seeded_command.size)
         if size > MAX_MESSAGE:

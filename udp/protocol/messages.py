@@ -1,4 +1,4 @@
-"""Messages of the two sides. Imports the standard library and NumPy alone.
+"""Messages of the two sides.
 
 Every array has the drone as its first axis; a single drone is N = 1. Quantities are the env's own:
 this module knows nothing of drones but their number. Short messages check themselves. A `State` or
@@ -37,7 +37,7 @@ def one_line(text: str) -> str:
 
 def _check_text(name: str, text: str) -> None:
     size = len(text.encode())
-    if not size <= MAX_TEXT:
+    if size > MAX_TEXT:
         raise InputError(f"{name}: expected at most {MAX_TEXT} bytes of UTF-8, got {size}")
     if _CONTROL.search(text):
         raise InputError(f"{name}: expected no control characters, got {shortened(text)}")
@@ -57,7 +57,7 @@ class Extension:
         size = len(self.value)
         if not 0 <= number < 1 << 15:
             raise InputError(f"extension: expected a number 0 to 32767, got {number}")
-        if not size <= MAX_TEXT:
+        if size > MAX_TEXT:
             raise InputError(f"extension: expected at most {MAX_TEXT} bytes, got {size}")
 
 
@@ -77,7 +77,7 @@ class Hello:
 
     def __post_init__(self) -> None:
         worlds = self.worlds
-        (low, high) = self.versions
+        low, high = self.versions
         size = len(self.spec.encode())
         if not 1 <= worlds <= MAX_DRONES:
             raise InputError(f"worlds: expected 1 to {MAX_DRONES}, got {worlds}")

@@ -30,7 +30,7 @@ Array = np.ndarray
 Mask = NDArray[np.bool_]
 
 COMPLAIN_AFTER: Final = 1.0  # silence of an agent before the log says so, once a message, s
-_NO_RESET: Final = "an action came after the end of an episode: expected a reset"
+NO_RESET: Final = "an action came after the end of an episode: expected a reset"
 
 
 class World(Protocol):
@@ -436,7 +436,7 @@ class SeveralAgents(WorldRules):
         if link.order not in (FLY, RESET):
             wrong = f"orders: expected to fly or to reset all {len(link.rows)} drones, got others"
         elif link.order == FLY and self._out(link).all():
-            wrong = _NO_RESET
+            wrong = NO_RESET
         if wrong:
             self._dismiss(link, wrong, now)
         return bool(wrong)

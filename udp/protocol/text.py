@@ -184,7 +184,8 @@ def decode_command(datagram: bytes, layout: Layout, session: int) -> Command | C
     size = prod(actions.shape)
     reset = fields[0] == "reset"
     expected = f"sequence,reset[,seed] or sequence and {size} of action"
-    if len(fields) > 2 if reset else len(fields) != size:
+    fits = len(fields) <= 2 if reset else len(fields) == size
+    if not fits:
         raise DecodeError(f"command: expected {expected}, got {datagram[:80]!r}")
     seed = [_whole("command: seed", fields[1])] if reset and len(fields) == 2 else None
     return Command(
@@ -199,7 +200,8 @@ def decode_command(datagram: bytes, layout: Layout, session: int) -> Command | C
 def _action(fields: list[str], layout: Layout) -> np.ndarray:
     if not layout.choices:
         return _float32("command: action", fields)
-    choice, most = _whole("command: action", fields[0]), layout.choices - 1
+    choice = _whole("command: action", fields[0])
+    most = layout.choices - 1
     if choice > most:
         raise DecodeError(f"command: action: expected a choice 0 to {most}, got {choice}")
     return np.array([choice])

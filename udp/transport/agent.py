@@ -88,7 +88,7 @@ class AgentConfig:
             self._expected_options(self.env_id)
 
     def accept(self, hello: Hello) -> Layout | str:
-        """The layout of a simulator, or why it is refused."""
+        """The layout of a simulator, or the reason to refuse it."""
         try:
             spec = _spec(hello.spec)
             drones = hello.worlds * len(spec.agents)
@@ -156,7 +156,7 @@ class Agent:
         address: Address that this side listens on.
         config: What a simulator must be: once one has come, as that one.
         states: The last State of each slot.
-        lost: For each slot why its simulator was lost during the last exchange; "" if it was not.
+        lost: For each slot the reason of a loss during the last exchange; "" if there was none.
     """
 
     def __init__(self, address: Address, config: AgentConfig) -> None:
@@ -308,12 +308,13 @@ class Agent:
             if session is None:
                 lost = self.lost[slot]
                 dropped = self._last_dropped()
-                raise PeerSilent(
-                    f"{f'{lost}; no other' if lost else 'no simulator'} came to "
-                    f"{address_text(self.address)} for {self.config.connect_timeout:g} s"
-                    f"{'' if dropped in lost else dropped}"
-                )
-            if now < session.heard_at + self.config.timeout:  # it lives, and computes
+                if dropped in lost:
+                    dropped = ""
+                nobody = f"{lost}; no other" if lost else "no simulator"
+                here = address_text(self.address)
+                seconds = f"{self.config.connect_timeout:g} s"
+                raise PeerSilent(f"{nobody} came to {here} for {seconds}{dropped}")
+            if now < session.heard_at + self.config.timeout:  # it computes
                 self._deadlines[slot] = session.heard_at + self.config.timeout
                 continue
             here = address_text(self.address)

@@ -13,7 +13,7 @@ from ...models.errors import NotCopied
 from ..protocol.client import Address, Client
 from ..protocol.errors import LinkError
 from ..protocol.messages import Command
-from ..protocol.party import AgentLink, WorldRules
+from ..protocol.party import NO_RESET, AgentLink, WorldRules
 from .sockets import LONGEST_WAIT, PAUSE, Port, log_notices
 from .stepped import Steppable
 
@@ -24,7 +24,7 @@ _ALIVE_EVERY: Final = 0.5  # period of the message Alive while an agent waits fo
 
 Observer = Callable[[Command | None], None]
 """Called with the Command that moved the drones, or None where all of them were reset, once the
-world has moved: see `Driver.stepped`."""
+world has moved: see `Driver.observer`."""
 
 
 class Driver(NotCopied):
@@ -105,16 +105,14 @@ class Driver(NotCopied):
         self.close()
 
     def _fly(self) -> str:
-        """Until all agents have closed: why the last one did. Empty if this side was stopped."""
+        """Fly until all agents have closed: the reason of the last one. Empty after `stop`."""
         rules = self.rules
         rules.start(time.monotonic())
         while not self._stopped:
             try:
                 again = rules.step(time.monotonic())
             except gym.error.ResetNeeded as error:
-                raise LinkError(
-                    f"an action came after the end of an episode: expected a reset ({error})"
-                ) from None
+                raise LinkError(f"{NO_RESET} ({error})") from None
             rules.answer(time.monotonic())
             self._flush()
             if rules.moved:
@@ -144,7 +142,7 @@ class Driver(NotCopied):
         return ""
 
     def _end(self, reason: str) -> None:
-        """Tell the agents, until they have answered or will not."""
+        """Send Close to the agents until they answer, or their time for that is over."""
         rules = self.rules
         rules.close(reason, time.monotonic())
         self._flush()

@@ -28,7 +28,7 @@ from ..protocol.statistics import Statistics
 LONGEST_WAIT: Final = 0.1
 """Longest wait in one go, s: flags that other threads and signals set are looked at as often."""
 PAUSE: Final = 1.0
-"""A wait that took so much longer than it should, s: this process was stopped meanwhile."""
+"""If a wait takes longer than it should by this time, s, this process was stopped meanwhile."""
 
 _log: Final = logging.getLogger("rotorgram.udp")
 _LOOK: Final = 200e-6  # look of a wait before it sleeps, s: a step of one drone takes less
