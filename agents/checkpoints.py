@@ -108,11 +108,14 @@ class Checkpoint:
         return NetworkPolicy.load(self.actor, spec or self.spec, self.hyperparameters)
 
     def other_versions(self) -> dict[str, tuple[str, str]]:
-        """Software whose version was another: its version then and now."""
+        """Software that has another version now: its version then and now."""
         now = software_versions()
-        names = sorted({*self.versions, *now})
-        pairs = {name: (self.versions.get(name, "none"), now.get(name, "none")) for name in names}
-        return {name: pair for name, pair in pairs.items() if len({*pair}) > 1}
+        changed = {}
+        for name in sorted({*self.versions, *now}):
+            pair = self.versions.get(name, "none"), now.get(name, "none")
+            if pair[0] != pair[1]:
+                changed[name] = pair
+        return changed
 
 
 def software_versions() -> dict[str, str]:

@@ -87,8 +87,8 @@ class EpisodeRecorder:
     Attributes:
         actions: Map from a network's outputs to actions of the env.
         env_steps: Control steps of all drones together.
-        out: Whose episode has ended and the next has not begun: bool, shape (N,).
-        done: Those of them in whose world all are out: these are to begin.
+        out: Drones that wait for their next episode: bool, shape (N,).
+        done: Drones whose whole world is out: these are to begin.
         episodes: Ended episodes, in the order of their ends.
         drawn: For each that ended since the recorder was made, what was drawn for it, by name.
     """

@@ -11,9 +11,9 @@ from .networks import Floats
 from .policies import Observation, flat
 
 DAMPING: Final = 0.5  # Damping ratio of a payload's swing
-FILTER: Final = 20.0  # Filters forget so many times faster than the position loop answers
+FILTER: Final = 20.0  # Rate of the filters over that of the position loop
 OVER: Final = 2.5  # Gain of the velocity loop over the position loop's: `sim/control/gains.py`
-JUMP: Final = 4.0  # A goal that moves so many times as fast as the craft may was put elsewhere
+JUMP: Final = 4.0  # Speed of a goal, over the craft's largest, from which on it has jumped
 _ACTION: Final = ("offset x", "offset y", "offset z", "offset of the heading")
 _PAYLOAD: Final = ("payload - position", "payload velocity - velocity")
 _VECTORS: Final = ("goal - position", "velocity", "thrust axis")
@@ -50,9 +50,10 @@ class Geometric:
         seen = [name for one in spec.observation for name in one.components or [""] * one.size]
         wanted = [f"{vector} {axis}" for vector in (*_VECTORS, "nose") for axis in "xyz"]
         missing = [name for name in wanted if name not in seen]
-        expected = f"the observation {missing[0]!r}" if missing else ""
         if missing:
-            raise InputError(f"geometric: expected {expected}, got {spec.env_id} without it")
+            raise InputError(
+                f"geometric: expected the observation {missing[0]!r}, got {spec.env_id} without it"
+            )
         self._at = {v: [seen.index(f"{v} {axis}") for axis in "xyz"] for v in (*_VECTORS, "nose")}
         self._rotors = [i for i, name in enumerate(seen) if name.endswith(" over hover")]
         self._swing: np.ndarray | None = None
@@ -83,13 +84,17 @@ class Geometric:
         goes = self._follow(now)
         self._before = now
         k = self._gain
-        offset = now["goal - position"] + self._moving / k + (goes - self._pushed) / (OVER * k * k)
+        ahead = (goes - self._pushed) / (OVER * k * k)
+        offset = now["goal - position"] + self._moving / k + ahead
         if self._swing is not None:
             offset[:2] = self._steadied(now, before, goes)[:2]
-        c, s = (now["nose"] / max(math.hypot(*now["nose"][:2]), 1e-6))[:2]
+        nose = now["nose"][:2]
+        c, s = nose / max(math.hypot(*nose), 1e-6)
         x, y, z = offset
         turn = -math.atan2(s, c)
-        action = np.array((c * x + s * y, c * y - s * x, z, turn)) / self._scale
+        forward = c * x + s * y
+        left = c * y - s * x
+        action = np.array((forward, left, z, turn)) / self._scale
         action[:2] /= max(1.0, math.hypot(*action[:2]))
         clipped: Floats = np.clip(action, -1.0, 1.0).astype(np.float32)
         return clipped

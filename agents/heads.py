@@ -28,7 +28,7 @@ class Head:
         """Set the weights."""
 
     def noise(self, rng: np.random.Generator, steps: int) -> Floats:
-        """Randomness for so many rows of `sample`, drawn at once: shape (steps, k)."""
+        """Randomness for `steps` rows of `sample`, drawn at once: shape (steps, k)."""
         raise NotImplementedError
 
     def sample(self, output: Floats, noise: Floats) -> Floats:

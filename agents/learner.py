@@ -51,7 +51,7 @@ class Learner:
 
     @abstractmethod
     def collect(self, collector: Collector, most: int) -> Rollout:
-        """Fly for one update, at most so many env steps; an empty rollout makes none."""
+        """Fly at most `most` env steps for one update; an empty rollout makes no update."""
 
     @abstractmethod
     def learn(self, rollout: Rollout) -> None:
@@ -212,7 +212,7 @@ class PolicyGradient(Learner):
 
 
 def diverged(updates: int) -> Diverged:
-    """The error of weights that are not finite after so many updates."""
+    """The error of weights that are not finite after `updates` updates."""
     reason = f"weights are not finite after update {updates}"
     return Diverged(f"training diverged: {reason}; try a lower learning_rate")
 

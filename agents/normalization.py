@@ -30,7 +30,9 @@ class Moments(Normalise):
         mean = rows.mean(axis=0)
         count = self._count + len(rows)
         step = mean - self._mean
-        self._squares += ((rows - mean) ** 2).sum(0) + step**2 * self._count * len(rows) / count
+        within = ((rows - mean) ** 2).sum(0)
+        between = step**2 * self._count * len(rows) / count
+        self._squares += within + between
         self._mean += step * len(rows) / count
         self._count = count
         self._set()

@@ -89,7 +89,9 @@ class Orca:
         size = math.hypot(c, s) or 1.0
         c = c / size
         s = s / size
-        action = np.array((c * x + s * y, c * y - s * x, z, 0.0)) / self._scale
+        forward = c * x + s * y
+        left = c * y - s * x
+        action = np.array((forward, left, z, 0.0)) / self._scale
         clipped: Floats = np.clip(action, -1.0, 1.0).astype(np.float32)
         return clipped
 

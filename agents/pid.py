@@ -47,7 +47,8 @@ class PID:
         if "thrust" not in telemetry:
             raise InputError(f"pid: expected the telemetry thrust, got {sorted(telemetry)}")
         highest = telemetry["thrust"].bounds()[1]
-        self._hover = float(highest[0]) / (1 + float(spec.observation[0].bounds()[1][2]))
+        most_over_hover = float(spec.observation[0].bounds()[1][2])
+        self._hover = float(highest[0]) / (1 + most_over_hover)
         self._increment = options["action"] == "increment"
         share = SHARES[options["action"]]
         self._scale = options["thrust_scale"] or share * float(highest.max())

@@ -35,8 +35,11 @@ def flat(observations: Observation, spec: EnvSpec, *lead: int) -> np.ndarray:
     """
     if not isinstance(observations, Mapping):
         return np.asarray(observations, np.float32).reshape(*lead, -1)
-    parts = [observations[array.name] for array in spec.observation]
-    return np.concatenate([np.asarray(p, np.float32).reshape(*lead, -1) for p in parts], axis=-1)
+    parts = []
+    for array in spec.observation:
+        part = np.asarray(observations[array.name], np.float32)
+        parts.append(part.reshape(*lead, -1))
+    return np.concatenate(parts, axis=-1)
 
 
 def flat_size(spec: EnvSpec) -> int:
@@ -209,7 +212,7 @@ class NetworkPolicy:
         return self.actions.to_envs(output).reshape(self.spec.action.shape)
 
     def draw_noise(self, rng: np.random.Generator, steps: int) -> Floats:
-        """Randomness for so many rows of `sample`, drawn at once: shape (steps, k)."""
+        """Randomness for `steps` rows of `sample`, drawn at once: shape (steps, k)."""
         return self.head.noise(rng, steps)
 
     def sample(self, observations: Floats, noise: Floats) -> Floats:

@@ -82,7 +82,8 @@ class PPO(A2C):
                     raise diverged(self.optimizer.steps)
                 self.optimizer.step(rates)
         self.terms |= dict(zip(_TERMS, np.mean(terms, axis=0).tolist(), strict=True))
-        self.terms["approx_kl"] = np.mean([one[3] for one in terms[1 - len(cuts) :]])  # at the end
+        last_epoch = terms[1 - len(cuts) :]
+        self.terms["approx_kl"] = np.mean([one[3] for one in last_epoch])
 
     def minibatch(
         self,

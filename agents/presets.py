@@ -82,9 +82,10 @@ def find_preset(algorithm: str, name: str, env_id: str = DEFAULT_TASK) -> Preset
     if name not in names:
         raise InputError(f"preset: expected {' or '.join(names)} for {algorithm}, got {name!r}")
     own = row.presets or algorithm
-    tables = {
-        task: t for (other, kind, task), t in _tables().items() if (other, kind) == (own, name)
-    }
+    tables = {}
+    for (other, kind, task), table in _tables().items():
+        if (other, kind) == (own, name):
+            tables[task] = table
     found = next(_lineage(env_id, list(tables)), None)
     task = found or DEFAULT_TASK
     table = tables.get(task, {})

@@ -25,9 +25,9 @@ class Diverged(InputError):
 
 @dataclass(frozen=True)
 class Rollout:
-    """T steps of N drones. Rows that are not kept are no transitions: no loss has them.
+    """T steps of N drones. `kept` marks real transitions; losses skip the rest.
 
-    Recursions over time may run through them, for an episode ends before each.
+    Recursions over time may run through the rest, for an episode ends before each.
     """
 
     observations: Floats
@@ -59,7 +59,7 @@ class Rollout:
         return np.asarray(array[self.kept])
 
     def without_steps(self, lost: Mask) -> "Rollout":
-        """Without the steps whose simulator was lost: their rewards and observations are made up.
+        """Without the steps that lost their simulator: their rewards and observations are made up.
 
         The episode stops one step earlier: a value is carried over that, as over a truncation.
         """
@@ -80,7 +80,7 @@ class Explorer(Protocol):
     network: Network
 
     def draw_noise(self, rng: np.random.Generator, steps: int) -> Floats:
-        """Randomness for so many rows of `sample`."""
+        """Randomness for `steps` rows of `sample`."""
 
     def sample(self, observations: Floats, noise: Floats) -> Floats:
         """Actions, shape (N, k), of flat observations, shape (N, n), with the memory."""
@@ -108,7 +108,7 @@ class Collector:
         self._memory = memory
 
     def steps(self, count: int) -> Rollout:
-        """Whole steps of all drones, as many as so many transitions need, less those with a loss.
+        """Whole steps of all drones: the fewest for `count` transitions, without the lost steps.
 
         Running episodes go on in the next call. After an episode ends, that drone's next step
         begins the next episode and is no transition; if all have ended, no step is spent.
@@ -117,7 +117,7 @@ class Collector:
         return rollout.without_steps(lost)
 
     def episodes(self, count: int, most_steps: int) -> Rollout:
-        """Whole episodes, as many as there are drones or a multiple: at least so many.
+        """Whole episodes, the same number of each drone: at least `count`.
 
         A drone whose episode ends is frozen until all have ended. A round that `most_steps`
         cuts off is left out, but for a single drone's last fragment. Episodes with a lost simulator
@@ -130,7 +130,7 @@ class Collector:
         while rounds and log.env_steps < last:
             rollout, lost, done = self._fly(None, last - log.env_steps)
             rollout = rollout.without_episodes(lost)
-            if not (done or log.num_envs == 1):
+            if not done and log.num_envs > 1:
                 rollout = replace(rollout, kept=np.zeros_like(rollout.kept))
             flown.append(rollout)
             rounds -= bool(len(rollout))
@@ -138,7 +138,7 @@ class Collector:
         return Rollout(*map(np.concatenate, columns))
 
     def _fly(self, length: int | None, most_steps: int | None) -> tuple[Rollout, Mask, bool]:
-        """So many steps of all drones; or an episode of each, if it takes at most so many steps.
+        """`length` steps of all drones; or an episode of each, if it takes at most `most_steps`.
 
         Returns the rollout; the steps in which a simulator was lost, bool, shape (T, N); and
         whether all drones are at the end of an episode.
@@ -252,7 +252,8 @@ def advantages(
 
 def step_of_episode(ends: Mask) -> NDArray[np.int64]:
     """Number of each step within its episode, where the first row begins at 0."""
-    index = np.arange(len(ends)).reshape(-1, *(1,) * (ends.ndim - 1))
+    others = (1,) * (ends.ndim - 1)
+    index = np.arange(len(ends)).reshape(-1, *others)
     starts = np.zeros(ends.shape, int)
     starts[1:] = np.where(ends[:-1], index[1:], 0)
     result: NDArray[np.int64] = index - np.maximum.accumulate(starts)

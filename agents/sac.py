@@ -138,7 +138,8 @@ class ReplayBuffer:
     def take(self, places: NDArray[np.int64]) -> tuple[Floats, ...]:
         """(s, a, s', r, ends) of some rows: shapes (B, n), (B, k), (B, n), (B,), (B,)."""
         rows = self.rows[places]
-        return *(rows[:, part] for part in self._parts), rows[:, -2], rows[:, -1]
+        parts = [rows[:, part] for part in self._parts]
+        return *parts, rows[:, -2], rows[:, -1]
 
 
 class SAC(Learner):

@@ -58,7 +58,7 @@ class VPG(PolicyGradient):
         self.terms = {"gain": (log_probability * weights).mean(), "entropy": entropy}
 
     def returns(self, rollout: Rollout) -> Floats:
-        """R_t, less a baseline and scaled where the config says so, shape (rows,)."""
+        """R_t minus the baseline, scaled if `normalize`, shape (rows,)."""
         sums = rewards_to_go(rollout.rewards, rollout.ends, self.config.gamma)
         returns = rollout.rows(sums)
         if self.config.baseline == "time":

@@ -13,7 +13,7 @@ from .spaces import action_space, info_columns, observation_space
 from .spec import EnvSpec
 
 LOST: Final = "simulator_lost"
-"""Key of the `info` of a step: why the simulator was lost whose episode ends here as truncated."""
+"""Key in the `info` of a step that a lost simulator truncated: why it was lost."""
 
 Step = tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]
 Seeds = Sequence[int | None] | np.ndarray
@@ -151,7 +151,7 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
 
 
 def worlds_done(out: Any, drones: int) -> Any:
-    """Of drones that are out, bool, shape (N,), those of whose world all so many are."""
+    """Drones whose whole world is out; `out` is bool, shape (N,)."""
     if drones == 1 or not out.any():
         return out
     all_out = out.reshape(-1, drones).all(-1)

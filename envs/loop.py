@@ -23,7 +23,7 @@ from .stages.record import Mask, Record
 
 
 class Loop(Results):
-    """N drones of one env, each in a world of its own, or so many together.
+    """N drones of one env, each in its own world, or `config.drones` in each world.
 
     Drones of one world begin together. One whose episode ends before those of the others is *out*:
     its rotors stand still, it gets no reward and no second end, and the others fly on. The world is
@@ -40,8 +40,8 @@ class Loop(Results):
             of N drones, world by world, and are new after each `advance`.
 
     Raises:
-        InputError: An argument, seed or action is not what it should be; nothing has changed, but
-            for a start that the task refuses: see `advance`.
+        InputError: An argument, seed or action is not what it should be; nothing has changed,
+            unless the task refused a start: see `advance`.
         PhysicsError: A state is bad; reset the drones that flew.
         gymnasium.error.ResetNeeded: An action came before an episode's beginning or after its end.
         gymnasium.error.ClosedEnvironmentError: A step or a reset after `close`.
@@ -82,9 +82,9 @@ class Loop(Results):
     ) -> None:
         """Reset some drones, freeze some, and fly the others for one control period.
 
-        As `AdvancingVectorEnv.advance`; `chosen` has what replaces a draw, by the names of
-        `Task.reset_options`, shape (N,). Where the task refuses such a start, the others have
-        flown, those to be reset are where they were, and their random numbers have moved on.
+        As `AdvancingVectorEnv.advance`; `chosen`: values used in place of random draws, by the
+        names of `Task.reset_options`, shape (N,). If the task refuses such a start, the others have
+        flown; the drones to be reset have not moved, and their random numbers have moved on.
         """
         self._check_open()
         record = self.record
@@ -113,7 +113,7 @@ class Loop(Results):
         begin = self._pipeline.begin
         everybody = bool(begun.all())
         record.chosen = {}
-        if not (record.has_begun or everybody):  # the first time all of them
+        if not record.has_begun and not everybody:  # the first time all of them
             record.begun = begun | True
             record.run(None, begin)
             record.begun = begun

@@ -28,9 +28,9 @@ def register(env_id: str, task: "str | type[Task]") -> None:
     Raises `InputError` if the id is not as `name-v0` or `namespace/name-v0`, or belongs to another
     package's env.
     """
-    if not (isinstance(env_id, str) and _ID.fullmatch(env_id)):
+    if not isinstance(env_id, str) or not _ID.fullmatch(env_id):
         raise InputError(f"env id: expected name-v0 or namespace/name-v0, got {shortened(env_id)}")
-    if not (env_id in _tasks or env_id not in gymnasium.registry):
+    if env_id in gymnasium.registry and env_id not in _tasks:
         raise InputError(f"env id: expected one that is free, got {shortened(env_id)}")
     gymnasium.registry.pop(env_id, None)
     _tasks[env_id] = task
@@ -60,7 +60,7 @@ def load(env_id: str) -> str:
 
 
 def _import_here(module: str) -> None:
-    """Import a module that is installed, or that one alone of the working folder.
+    """Import an installed module, or else this one from the working folder.
 
     Nothing else of that folder is imported: `queue.py` there does not take the place of Python's.
     """

@@ -21,7 +21,7 @@ class Renderer:
     """`render` of an env: a picture of each world, or a window that shows them in real time."""
 
     def __init__(self, mode: str | None, loop: "Loop") -> None:
-        if not (mode is None or mode in RENDER_MODES):
+        if mode is not None and mode not in RENDER_MODES:
             raise InputError(
                 f"render_mode: expected None, 'human' or 'rgb_array', got {shortened(mode)}"
             )
@@ -38,7 +38,7 @@ class Renderer:
     def render(self, episodes: Sequence[int]) -> tuple[np.ndarray, ...] | None:
         """Pictures, uint8, shape (height, width, 3); None in other modes than `rgb_array`.
 
-        `episodes` says how many each drone has begun; where that is none, it raises `ResetNeeded`.
+        `episodes`: number of episodes that each drone has begun. Raises `ResetNeeded` if any is 0.
         """
         if self._mode is None:
             gym.logger.warn("render: expected render_mode='rgb_array' or 'human', got None")

@@ -141,7 +141,8 @@ class ArraySpec(_Part):
             values = np.asarray(bound, np.float64)
         except (TypeError, ValueError, OverflowError):
             values = np.asarray(np.nan)
-        right = values.shape in ((), self.shape, (self.size,)) and not np.isnan(values).any()
+        fits = values.shape in ((), self.shape, (self.size,))
+        right = fits and not np.isnan(values).any()
         _expect(right, self.name, f"one number for {name} or one for each element", bound)
         flat = values.ravel()
         return float(flat[0]) if (flat == flat[0]).all() else tuple(flat.tolist())
@@ -282,12 +283,12 @@ class EnvSpec(_Part):
             size = sum(array.size for array in arrays)
             _expect(size <= most, what, f"at most {most} elements in all", size)
         names = tuple(metric.name for metric in self.metrics)
-        told = next((a.components for a in self.telemetry if a.name == "metrics"), ())
+        in_telemetry = next((a.components for a in self.telemetry if a.name == "metrics"), ())
         expected = f"the components of the telemetry 'metrics' to be {shortened(names)}"
-        _expect(told == names, "metrics", expected, told)
-        listed = [name for array in self.telemetry for name in component_names(array)]
-        right = len({*listed}) == len(listed)
-        _expect(right, "telemetry", "each component once", listed)
+        _expect(in_telemetry == names, "metrics", expected, in_telemetry)
+        components = [name for array in self.telemetry for name in component_names(array)]
+        right = len({*components}) == len(components)
+        _expect(right, "telemetry", "each component once", components)
 
     def constant(self, name: str, user: str) -> float:
         """One of the constants. Raises `InputError`, which names its `user`, if it is not there."""

@@ -27,7 +27,7 @@ class Quantity:
 
     name: str
     components: Names | Callable[[Task], Names]
-    """A name for each number. None: the task's drones do not have it, as where a feature is off."""
+    """A name for each number. Empty: the env does not have it, as when a feature is off."""
     unit: str | Names | Callable[[Task], Names] = ""
     frame: str = ""
     bounds: Callable[[Task], tuple[Bound, Bound]] = lambda task: (-np.inf, np.inf)

@@ -122,16 +122,21 @@ FEATURES = {
 }
 
 
+def short(env_id: str) -> str:
+    """Name of a task, without namespace and version."""
+    return env_id.removeprefix("rotorgram/").removesuffix("-v0")
+
+
 def _levels() -> dict[str, Case]:
     """Each task at each of its levels; on `rigid` two levels of all tasks, and all of Hover."""
     cases = {}
     for env_id in TASKS:
         task = registry.task_type(env_id)
-        name = env_id[10:-3]
+        name = short(env_id)
         for level in task.actions:
             cases[f"{name}, {level}"] = Case(env_id, {"action": level})
-            brief = level not in (*task.actions[:1], task.action) and env_id != HOVER
-            if not brief and name not in ("Cable", "PayloadHover"):
+            on_rigid = env_id == HOVER or level in (*task.actions[:1], task.action)
+            if on_rigid and name not in ("Cable", "PayloadHover"):
                 options = {"action": level, "backend": "rigid"}
                 cases[f"{name}, {level}, rigid"] = Case(env_id, options)
     return cases
@@ -175,7 +180,7 @@ def _vehicles() -> dict[str, Case]:
         for column, (name, file) in enumerate(FILES.items()):
             if (row + column) % 3 == 0:
                 case = stormy(env_id, file)
-                cases[f"{env_id[10:-3]}, {name}"] = Case(env_id, {**case.options, "drones": 1})
+                cases[f"{short(env_id)}, {name}"] = Case(env_id, {**case.options, "drones": 1})
     return cases
 
 

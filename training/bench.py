@@ -125,7 +125,7 @@ class Layer:
 def bench(
     rounds: int, seconds: float, folder: Path, on_layer: Callable[[str, int, int], None]
 ) -> list[Layer]:
-    """Measure every layer in turns of so many seconds, and write `bench.json` into `folder`.
+    """Measure every layer in turns of `seconds`, and write `bench.json` into `folder`.
 
     `on_layer` is called before each turn: name of the layer, turns done, turns in all. Raises
     `InputError`.
@@ -158,7 +158,7 @@ def bench(
 
 
 def rate_of(step: Step, seconds: float, at_once: int = _STEPS_AT_ONCE) -> float:
-    """Env steps per second over so many seconds, with as many steps between looks at the clock."""
+    """Env steps per second over `seconds`, with `at_once` steps between looks at the clock."""
     start = time.perf_counter()
     now = start
     steps = 0

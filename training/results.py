@@ -240,8 +240,8 @@ class Results:
     def steps(self, phase: str, max_rows: int | None = None) -> pd.DataFrame:
         """Steps of one phase, "train" or "evaluation".
 
-        Of more than `max_rows` rows about so many are kept, picked at random but always the same
-        ones: a stride that divides the episode length would show the same moments of every episode.
+        Of more rows than `max_rows` about `max_rows` are kept, at random but always the same: a
+        stride that divides the episode length would show the same moments of every episode.
         """
         files = self._files("steps")
         if not files:

@@ -43,9 +43,9 @@ class Run:
 
     def __post_init__(self) -> None:
         drones = self.env.drones
-        if not self.seed >= 0:
+        if self.seed < 0:
             raise InputError(f"seed: expected 0 or more, got {self.seed}")
-        if not self.num_envs >= 1:
+        if self.num_envs < 1:
             raise InputError(f"num_envs: expected 1 or more, got {self.num_envs}")
         if self.num_envs % drones != 0:
             raise InputError(
@@ -54,7 +54,7 @@ class Run:
         # That of a task that is not known here is among the options.
         episode_length = self.env.episode_length or self.env.task.get("episode_length", 1)
         least = self.config.least_steps(self.num_envs, int(episode_length))
-        if not self.env_steps >= least:
+        if self.env_steps < least:
             raise InputError(f"env_steps: expected at least {least}, got {self.env_steps}")
 
     def to_dict(self) -> dict[str, Any]:

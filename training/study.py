@@ -145,8 +145,8 @@ def _constant(policy: Policy) -> Callable[[EnvSpec], Policy]:
 
 @contextmanager
 def open_env(wire: bool, config: EnvConfig, num_envs: int) -> Iterator[AdvancingVectorEnv]:
-    """An env of so many drones without autoreset: over UDP with a simulator process that the next
-    run of this process uses again, or in process.
+    """An env of `num_envs` drones without autoreset: over UDP with a simulator process, which the
+    next run of this process uses again, or in process.
     """
     if wire:
         with cached_simulator(config, num_envs=num_envs) as env:

@@ -61,7 +61,7 @@ class Training:
     """A run on an env, to be started, stopped and resumed at update boundaries.
 
     The env is a local or remote vector env, and not closed here.
-    Besides the untrained policy, so many `snapshots` are kept in `taken` for later evaluation,
+    Besides the untrained policy, `snapshots` policies are kept in `taken` for later evaluation,
     evenly spread. With `keep_steps` every step is kept, for `log.steps()`. A run that goes on does
     so from the checkpoint `kept`; a new one may begin with the networks of another training, those
     of the checkpoint `start`.
@@ -195,8 +195,8 @@ class Training:
         )
 
     def _recent_means(self, count: int) -> dict[str, float]:
-        """Over so many episodes, at least as many as drones: of those that began together the
-        shortest end first.
+        """Over the last `count` episodes, or one for each drone if that is more: of episodes that
+        began together the shortest end first.
         """
         recent = self.log.episodes[-max(count, self.run.num_envs) :]
         if not recent:

@@ -55,8 +55,8 @@ def export(checkpoint: Checkpoint, target: str) -> bytes:
 
 
 def _check_finite(policy: NetworkPolicy) -> None:
-    bounds = [np.abs(array.bounds()).max(axis=0).ravel() for array in policy.spec.observation]
-    largest = np.minimum(np.concatenate(bounds), _FAR)
+    bounds = [np.abs(array.bounds()).max(axis=0) for array in policy.spec.observation]
+    largest = np.minimum(np.concatenate(bounds, axis=None), _FAR)
     shares = np.random.default_rng(0).uniform(-1.0, 1.0, (_TRIED, largest.size))
     with np.errstate(over="ignore", invalid="ignore"):
         outputs = policy.output((shares * largest).astype(np.float32))

@@ -186,8 +186,10 @@ def _table(values: Floats) -> str:
     """
     finite = values.clip(-_LARGEST, _LARGEST)
     words = [_number(value) for value in finite.ravel().tolist()]
-    lines = (", ".join(words[i : i + 6]) for i in range(0, len(words), 6))
-    return ",\n".join(f"    {line}" for line in lines)
+    lines = []
+    for first in range(0, len(words), 6):
+        lines.append("    " + ", ".join(words[first : first + 6]))
+    return ",\n".join(lines)
 
 
 def _choices(action: Discrete) -> list[str]:

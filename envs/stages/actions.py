@@ -84,7 +84,7 @@ class Receive(Stage):
 
 
 class ActionDelay(Stage):
-    """An action takes effect so many control steps late, as drawn for each episode.
+    """An action takes effect late by a number of control steps that each episode draws.
 
     Args:
         world: Its parameter `action_delay`, control steps.

@@ -52,7 +52,8 @@ def mask_of(record: Record, given: object) -> Mask:
     Raises `InputError`.
     """
     drones = drones_of(record, given)
-    if drones.ndim and drones.shape[1] > 1 and not (drones == drones[:, :1]).all():
+    several = drones.ndim > 0 and drones.shape[1] > 1
+    if several and not (drones == drones[:, :1]).all():
         raise InputError(
             f"resets, frozen: expected all {drones.shape[1]} drones of a world or none, "
             "got some of them"

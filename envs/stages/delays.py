@@ -6,7 +6,7 @@ from .ring import later, taken
 
 
 class ObservationDelay(Stage):
-    """An observation arrives so many control steps late, as drawn for each episode.
+    """An observation arrives late by a number of control steps that each episode draws.
 
     The first one of an episode arrives at once, and again until another one does.
 

@@ -10,7 +10,7 @@ from .ring import Values, later
 
 
 class History(Stage):
-    """The last so many observations side by side, the oldest first.
+    """The last observations side by side, the oldest first.
 
     At the start of an episode all of them are the first one.
 
@@ -48,7 +48,7 @@ class History(Stage):
 
 
 def with_history(array: ArraySpec, steps: int) -> ArraySpec:
-    """The spec of so many values of an array side by side along its first axis."""
+    """The spec of `steps` values of an array, side by side along its first axis."""
     if steps == 1:
         return array
     length, *rest = array.shape or (1,)

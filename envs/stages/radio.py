@@ -29,20 +29,20 @@ class RadioOptions(Protocol):
 
 
 class Radio(Stage):
-    """Every drone sends in every step its position and velocity.
+    """Every drone sends its position and velocity in every step.
 
-    That arrives after a delay, at those within range then, unless it is lost. The receiver knows
-    how old it is, and assumes that the sender flew on straight; after `FORGOTTEN` seconds it knows
-    nothing.
+    A message arrives after a delay, at the drones within range then, unless it is lost. The
+    receiver knows its age, and assumes that the sender flew on straight; after `FORGOTTEN` seconds
+    it forgets the sender.
 
-    Sets `State.neighbours` of what is measured: of the nearest that are known relative position,
-    relative velocity, and 1; else zeros.
+    Sets `State.neighbours` of the measured state: relative position, relative velocity and 1 of the
+    nearest known drones; zeros if there are fewer.
 
     Args:
         options: Of the task.
         period: Time of a control step, s.
         drones: Of a world.
-        ended: Tells which drones have crashed: they are silent.
+        ended: Gives the drones that have crashed: they are silent.
     """
 
     arrays = ("said", "heard", "age", "keys", "silent")
@@ -89,7 +89,8 @@ class Radio(Stage):
         )
         record.said = pushed(record.said, message, 2)
         said = record.said[:, :, 0]
-        arrives = self._in_range(state.position, said[..., :3]) & (said[:, None, :, 6] == 0)
+        speaks = said[:, None, :, 6] == 0
+        arrives = self._in_range(state.position, said[..., :3]) & speaks
         if self._options.radio_loss:
             arrives &= self._chances(record) >= self._options.radio_loss
         record.heard = np.where(arrives[..., None], said[:, None, :, :6], record.heard)

@@ -9,7 +9,7 @@ Values = np.ndarray
 
 
 def filled(values: Values, steps: int, axis: int) -> Values:
-    """Values (W, A, *shape) for each of so many steps; `axis` is that of the steps."""
+    """Values (W, A, *shape), repeated for `steps` steps along a new axis."""
     return np.repeat(np.expand_dims(values, axis), steps, axis)
 
 
@@ -20,7 +20,7 @@ def pushed(past: Values, values: Values, axis: int) -> Values:
 
 
 def later(past: Values | None, values: Values, steps: int, record: Record) -> Values:
-    """The past of so many steps one step later; that of drones that begin is the present."""
+    """The past of `steps` steps, one step later; of drones that begin it is the present."""
     axis = len(record.shape)
     if past is None:
         return filled(values, steps, axis)
@@ -32,7 +32,7 @@ def later(past: Values | None, values: Values, steps: int, record: Record) -> Va
 
 
 def taken(past: Values, age: Array, axis: int) -> Values:
-    """Values of so many steps ago; the age has the shape (W, A), whole numbers."""
+    """Values of `age` steps ago; the age has the shape (W, A), whole numbers."""
     index = past.shape[axis] - 1 - np.asarray(age).astype(int)
     if not axis:
         present: Values = past[int(index)]

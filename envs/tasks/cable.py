@@ -72,9 +72,10 @@ class Cable(Swarm):
 
     (s - d) / (s + d) for the distance d of the payload to the goal, where s is half the distance
     between neighbouring drones; 0.1 s/m times the speed of the payload towards it; -0.1 s/m times
-    the speed of the payload relative to the drone; -0.02 s/rad times the size of the body rates;
-    with less than a diameter between the drone's sphere and another, down to -0.5 where they touch
-    and -1 where their middles do; and -280 on the step that terminates.
+    the speed of the payload relative to the drone, up to 4 m/s; -0.02 s/rad times the size of the
+    body rates, up to 20 rad/s; with less than a diameter between the drone's sphere and another,
+    down to -0.5 where they touch and -1 where their centres meet; and -280 on the step that
+    terminates.
 
     ## Start, termination, truncation
 
@@ -171,12 +172,10 @@ class Cable(Swarm):
         half = self._tilt / 2
         sine = math.sin(half)
         zero = 0.0 * azimuth
-        position = ball + self._around(turn)
+        cosine = math.cos(half) + zero
         return InitialState(
-            position=position,
-            quaternion=stack(
-                (math.cos(half) + zero, -sine * np.sin(azimuth), sine * np.cos(azimuth), zero)
-            ),
+            position=ball + self._around(turn),
+            quaternion=stack((cosine, -sine * np.sin(azimuth), sine * np.cos(azimuth), zero)),
             thrust=self.carrying(azimuth),
             payload=ball,
         )

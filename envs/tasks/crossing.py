@@ -36,8 +36,8 @@ class Crossing(Swarm):
 
     (s - d) / (s + d) for the distance d to the goal, where s is half the distance between
     neighbouring starts; 0.1 s/m times the speed towards it; -0.02 s/rad times the size of the body
-    rates; with less than a diameter between the drone's sphere and another, down to -0.5 where they
-    touch and -1 where their middles do; and -240 on the step that terminates.
+    rates, up to 20 rad/s; with less than a diameter between the drone's sphere and another, down to
+    -0.5 where they touch and -1 where their centres meet; and -240 on the step that terminates.
 
     ## Start, termination, truncation
 

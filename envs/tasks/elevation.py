@@ -54,10 +54,11 @@ class ElevationOptions(TaskOptions):
 
     def check(self) -> None:
         """Check the options of this task. Raises `InputError`."""
-        wider = self.flight_band > self.start_band
-        least = f"more than start_band = {self.start_band:g} m"
-        if not wider:
-            raise InputError(f"flight_band: expected {least}, got {shortened(self.flight_band)}")
+        if self.flight_band <= self.start_band:
+            raise InputError(
+                f"flight_band: expected more than start_band = {self.start_band:g} m, "
+                f"got {shortened(self.flight_band)}"
+            )
 
     @property
     def target_range(self) -> tuple[float, float]:
@@ -130,7 +131,7 @@ class Elevation(Task):
         low, high = options.target_range
         reasons = f"(start_band = {options.start_band:g} m, and {room:g} m of room)"
         expected = f"{least:g} m {reasons} to {FURTHEST:g} m"
-        if not (least <= low and high <= FURTHEST):
+        if low < least or high > FURTHEST:
             raise InputError(f"target: expected {expected}, got {shortened(options.target)}")
         increment = self.action == "increment"
         most = float(vehicle.thrust_high.max())
@@ -138,7 +139,7 @@ class Elevation(Task):
         assert isinstance(usual, CollectiveThrust)
         scale = options.thrust_scale or usual.newtons
         expected = f"at most {most:g} N, the largest thrust of a rotor"
-        if not scale <= most:
+        if scale > most:
             raise InputError(
                 f"thrust_scale: expected {expected}, got {shortened(options.thrust_scale)}"
             )

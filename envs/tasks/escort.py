@@ -55,8 +55,9 @@ class Escort(Swarm):
 
     (s - d) / (s + d) for the distance d to the own place, where s is half the distance between
     neighbouring starts; 0.1 s/m times the speed towards it, relative to it; -0.02 s/rad times the
-    size of the body rates; with less than a diameter between the drone's sphere and another, down
-    to -0.5 where they touch and -1 where their middles do; and -240 on the step that terminates.
+    size of the body rates, up to 20 rad/s; with less than a diameter between the drone's sphere and
+    another, down to -0.5 where they touch and -1 where their centres meet; and -240 on the step
+    that terminates.
 
     ## Start, termination, truncation
 
@@ -104,7 +105,8 @@ class Escort(Swarm):
         second = fast * memory.time + memory.beta
         zero = 0.0 * first
         place = stack((a * np.sin(first), a * np.sin(second), zero))
-        return place, stack((a * slow * np.cos(first), a * fast * np.cos(second), zero))
+        velocity = stack((a * slow * np.cos(first), a * fast * np.cos(second), zero))
+        return place, velocity
 
     def update_memory(self, state: State) -> None:
         """Move the target."""

@@ -31,9 +31,9 @@ PASSING_REWARD: Final = 1.0  # Of a course: added in a step in which a point or 
 COURSE_RATE_WEIGHT: Final = 0.002  # Of a course: cost of a body rate of 1 rad/s
 FASTEST_COUNTED: Final = 20.0  # A faster body rate costs no more, rad/s
 WORST_RATES: Final = -RATE_WEIGHT * FASTEST_COUNTED
-WORST_SWING: Final = -0.4
+WORST_SWING: Final = -0.4  # Of a payload at 4 m/s or faster
 COURSE_WORST_RATES: Final = -COURSE_RATE_WEIGHT * FASTEST_COUNTED
-COURSE_WORST_STEP: Final = -0.05
+COURSE_WORST_STEP: Final = -0.05  # Of a course: a hundredth of the cost of a crash
 LEAST_TILT_COSINE: Final = 0.0
 """Cosine of the tilt (90°) past which the craft counts as flipped over."""
 AIR: Final = 0.6  # Least room under a craft that starts, m
@@ -83,8 +83,8 @@ class GoalTask(Task):
     | 15... | thrust of each rotor over its hover thrust, minus 1 | 1 | |
 
     Numbers are clipped: positions at twice the flight band, speeds at 100 m/s, rates at 100 rad/s.
-    A derived class calls `define_observation` in `setup`, and has `further` for further numbers.
-    It has an option `goal`, or a method.
+    A derived class calls `define_observation` in `setup`, and gives further numbers in `further`.
+    It has an option `goal`, or overrides the method.
 
     With `body` the first two vectors are in the body frame, and the direction of world z in the
     body frame takes the place of nose and thrust axis: 12 + R numbers that no heading changes.
@@ -187,7 +187,7 @@ def nearness(distance: Array, scale: float = ERROR_SCALE) -> Array:
 def check_height(name: str, height: float, room: float) -> None:
     """Refuse an option whose point is too low, m, for `room` and air. Raises `InputError`."""
     least = room + AIR
-    if not height >= least:
+    if height < least:
         raise InputError(
             f"{name}: expected a height of at least {least:.4g} m above the ground, "
             f"got {height:.4g}"
@@ -197,7 +197,7 @@ def check_height(name: str, height: float, room: float) -> None:
 def check_band(flight_band: float, start_band: float) -> None:
     """Refuse a band that a start within a cube leaves. Raises `InputError`."""
     furthest = start_band * math.sqrt(3)
-    if not flight_band > furthest:
+    if flight_band <= furthest:
         raise InputError(
             f"flight_band: expected more than sqrt(3) · start_band = {furthest:.4g} m, "
             f"got {flight_band!r}"

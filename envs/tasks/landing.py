@@ -61,7 +61,7 @@ class LandingOptions(TaskOptions):
     def check(self) -> None:
         """Check the options of this task. Raises `InputError`."""
         lowest = self.start_height - self.start_band
-        if not lowest >= 0.5:
+        if lowest < 0.5:
             raise InputError(
                 "start_band: expected at most start_height - 0.5 m, "
                 f"got {shortened(self.start_band)}"
@@ -69,7 +69,7 @@ class LandingOptions(TaskOptions):
         reach = self.pad_path + math.sqrt(2) * self.start_band
         furthest = math.hypot(reach, self.start_height + self.start_band)
         expected = f"more than the {furthest:.4g} m of the furthest start"
-        if not self.flight_band > furthest:
+        if self.flight_band <= furthest:
             raise InputError(f"flight_band: expected {expected}, got {shortened(self.flight_band)}")
 
     @property

@@ -120,9 +120,9 @@ class Racing(GoalTask):
     ## Reward
 
     By how much the craft came nearer to the centre of the gate in this step, 1/m, the progress of
-    Song et al. 2021 (arXiv 2103.08624); 1 on the step that passes it; -0.002 s/rad times
-    the size of the body rates; and -5 on a step that terminates with gates left. The last two
-    weights are those of `Waypoints`.
+    Song et al. 2021 (arXiv 2103.08624); 1 on the step that passes it; -0.002 s/rad times the size
+    of the body rates, up to 20 rad/s; and -5 on a step that terminates with gates left. The last
+    two weights are those of `Waypoints`.
 
     A gate is passed in a step whose straight way goes through its opening in its direction; one
     gate in a step at most.
@@ -155,7 +155,7 @@ class Racing(GoalTask):
         gates, self._start = read_track(self.options.track)
         least = self.vehicle.rest_height + AIR + self.options.start_band
         got = self._start.position[2]
-        if not got >= least:
+        if got < least:
             raise InputError(
                 f"track: expected a start at least {least:.4g} m above the ground, got {got:g}"
             )
@@ -255,7 +255,7 @@ class Racing(GoalTask):
         return self._gate(self.memory.passed)[..., :3] + 0.0 * state.position
 
     def _gate(self, passed: Array) -> Array:
-        """The gate that is due after so many, shape (..., 6); after the last that one."""
+        """The next gate after `passed` gates, shape (..., 6); after the last gate, the last."""
         number = np.minimum(passed, self._total - 1.0) % self._count
         return row_of(self._gates, number)
 

@@ -53,7 +53,7 @@ class RecoveryOptions(TaskOptions):
     def check(self) -> None:
         """Check the options of this task. Raises `InputError`."""
         expected = f"more than near = {self.near:g} m"
-        if not self.flight_band > self.near:
+        if self.flight_band <= self.near:
             raise InputError(f"flight_band: expected {expected}, got {shortened(self.flight_band)}")
 
 

@@ -215,7 +215,7 @@ class Tracking(GoalTask):
         return self._at(self._table, 0.0) + 0.0 * state.position
 
     def _at(self, table: np.ndarray, ahead: float) -> Array:
-        """Row of a table so many steps ahead, of a `snap` times its points: shape (..., 3)."""
+        """Row of a table, `ahead` steps ahead; of a `snap` times its points: shape (..., 3)."""
         index = self.memory.index + ahead
         last = float(len(table))
         index = index % last if self._closed else clip(index, 0.0, last - 1.0)
@@ -314,7 +314,7 @@ def read_samples(given: str) -> np.ndarray:
     if not np.isfinite(samples).all():
         raise InputError("trajectory: expected finite numbers, got others")
     far = float(np.abs(samples[:, 1:]).max())
-    if not far <= FURTHEST:
+    if far > FURTHEST:
         raise InputError(f"trajectory: expected coordinates up to {FURTHEST:g} m, got {far:g}")
     if not (np.diff(samples[:, 0]) > 0).all():
         raise InputError("trajectory: expected times that rise, got others")
