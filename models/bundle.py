@@ -46,12 +46,12 @@ def checked_bundles(given: object) -> dict[str, Bundle]:
 
 
 def unpacked(vehicle: str, bundle: Bundle) -> Path:
-    """Path of a vehicle whose files are these: its own path, where they are the same today."""
+    """Path of a vehicle with these files: its own path if it has the same files today."""
     try:
         if read_bundle(vehicle) == bundle:
             return Path(vehicle)
     except InputError:
-        pass  # it is not here, or is another today
+        pass  # it is missing here, or has changed
     return Path(_written(bundle).name, bundle[0][0])
 
 

@@ -33,7 +33,7 @@ OUTPUTS: Final = {
 """Kinds that a file can name; `flow` is for an option to choose."""
 _TEXTS: Final = PREFIX + "cameras."
 _CHECKED: Final = 16  # places along a side at which a lens is tried
-_SIDE: Final = 64  # Pixels of a side, where the file tells none
+_SIDE: Final = 64  # Pixels of a side, if the file gives none
 MAX_LETTERS: Final = 64  # of a name
 FOVY: Final = (1e-3, 3.0)  # rad
 MAX_STEPS: Final = 1000  # from picture to picture
@@ -149,8 +149,10 @@ def chosen_views(words: Sequence[str], cameras: Iterable[Camera]) -> tuple[View,
         name, _, kind = text.rpartition("_")
         alone = text in known
         right = alone or (name in known and kind in KINDS)
-        expected = f"some of {', '.join(known)}, each with _{', _'.join(KINDS)} behind it or not"
         if not right:
+            expected = (
+                f"some of {', '.join(known)}, each with _{', _'.join(KINDS)} behind it or not"
+            )
             raise InputError(f"cameras: expected {expected}, got {shortened(word)}")
         camera = known[text if alone else name]
         if at:
@@ -169,8 +171,8 @@ def _size(word: str, text: str) -> tuple[int, int]:
     width, _, height = text.partition("x")
     right = all(side.isascii() and side.isdecimal() and len(side) < 9 for side in (width, height))
     right = right and all(1 <= int(side) <= MAX_PIXELS for side in (width, height))
-    expected = f"NAME@WIDTHxHEIGHT of 1 to {MAX_PIXELS} pixels each"
     if not right:
+        expected = f"NAME@WIDTHxHEIGHT of 1 to {MAX_PIXELS} pixels each"
         raise InputError(f"cameras: expected {expected}, got {shortened(word)}")
     return int(width), int(height)
 
@@ -206,16 +208,16 @@ def read_cameras(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[Camera, ..
         if (width, height) == (1, 1):  # MJCF's default
             width = height = _SIDE
         for side in (width, height):
-            expected = f"1 to {MAX_PIXELS} pixels a side"
             if not 1 <= side <= MAX_PIXELS:
+                expected = f"1 to {MAX_PIXELS} pixels a side"
                 raise InputError(f"camera {one.name}: expected {expected}, got {side}")
-        told = {
+        given = {
             key: texts.pop(f"{_TEXTS}{one.name}.{key}")
             for key in ("rate", *(each.name for each in fields(Optics)))
             if f"{_TEXTS}{one.name}.{key}" in texts
         }
-        rate = told.pop("rate", "1")
-        optics = {key: _read(text) for key, text in told.items()}
+        rate = given.pop("rate", "1")
+        optics = {key: _read(text) for key, text in given.items()}
         output = int(model.cam_output[number])
         axes = data.cam_xmat[number].reshape(3, 3)
         mine = model.body_rootid[model.cam_bodyid[number]] == model.jnt_bodyid[0]
@@ -274,8 +276,8 @@ def steps_of(name: str, rate: str | float) -> int:
     except (ValueError, ZeroDivisionError):
         steps = math.nan
     right = 1 <= steps <= MAX_STEPS and abs(steps - round(steps)) < 1e-6 * steps
-    expected = f"1 over a whole number of control steps up to {MAX_STEPS}"
     if not right:
+        expected = f"1 over a whole number of control steps up to {MAX_STEPS}"
         raise InputError(f"{name}.rate: expected {expected}, got {rate}")
     return round(steps)
 

@@ -98,7 +98,7 @@ class Check(Rule):
         return self.low <= self.measured <= self.high
 
     def report(self) -> dict[str, str | float | None]:
-        """For JSON: the fields by name, `tolerance` and `passed`; None for what is not finite."""
+        """For JSON: the fields by name, `tolerance` and `passed`; None for infinity and NaN."""
         values = vars(self) | {"tolerance": self.tolerance, "passed": self.passed}
         for name, value in values.items():
             if isinstance(value, float) and not math.isfinite(value):

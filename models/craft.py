@@ -107,9 +107,9 @@ def _scaled(vector: Vector, factor: float) -> tuple[float, ...]:
 
 
 def _build(spec: mujoco.MjSpec, file: VehicleFile) -> None:
-    """What weighs, what collides, what is drawn, and the rotors.
+    """Masses, geoms that collide, geoms that are drawn, and the rotors.
 
-    Lengths that the file does not say are those of quad.xml, in the proportion of the spans.
+    Missing lengths are those of quad.xml, in the proportion of the spans.
     """
     _set_options(spec, file)
     spec.compiler.degree = False
@@ -155,7 +155,7 @@ def _build(spec: mujoco.MjSpec, file: VehicleFile) -> None:
 
 
 def _along(axis: Vector) -> dict[str, Any]:
-    """How a geom whose z axis is this one is turned."""
+    """Orientation of a geom with this z axis."""
     return {} if tuple(axis) == UP else {"zaxis": axis}
 
 

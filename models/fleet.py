@@ -35,22 +35,24 @@ class Fleet(Vehicle):
         """
         first = vehicles[0]
         for one in vehicles:
-            expected = f"{first.num_rotors} rotors as of {first.name}"
             if one.num_rotors != first.num_rotors:
+                expected = f"{first.num_rotors} rotors as of {first.name}"
                 raise InputError(
                     f"vehicle: expected {expected}, got {one.num_rotors} of {one.name}"
                 )
         step = min(one.timestep for one in vehicles)
         kinds = {one: _under(one, step, first.gravity) for one in vehicles}
         members = tuple(kinds[one] for one in vehicles)
-        told: dict[str, Any] = {one.name: getattr(members[0], one.name) for one in fields(Vehicle)}
+        values: dict[str, Any] = {
+            one.name: getattr(members[0], one.name) for one in fields(Vehicle)
+        }
         for name in ("mass", "center_of_mass", "inertia", "allocation", "hover_thrust"):
-            told[name] = np.array([getattr(one, name) for one in members])
-        told["name"] = ", ".join(dict.fromkeys(one.name for one in members))
+            values[name] = np.array([getattr(one, name) for one in members])
+        values["name"] = ", ".join(dict.fromkeys(one.name for one in members))
         together = " ".join(one.hash for one in members)
-        told["hash"] = blake2b(together.encode(), digest_size=16).hexdigest()
-        told["rest_height"] = max(one.rest_height for one in members)
-        return cls(**told, members=members)
+        values["hash"] = blake2b(together.encode(), digest_size=16).hexdigest()
+        values["rest_height"] = max(one.rest_height for one in members)
+        return cls(**values, members=members)
 
     @cached_property
     def thrust_low(self) -> np.ndarray:
@@ -85,10 +87,10 @@ class Fleet(Vehicle):
 def load_vehicles(
     vehicle: Path | str | Sequence[str] | None, drones: int, *, linear_drag: float = 0.0
 ) -> Vehicle:
-    """The vehicle of all drones of a world; or a `Fleet`, where several are named.
+    """The vehicle of all drones of a world, or a `Fleet` if several are named.
 
-    These are names or files: the vehicles of the drones in their order, and from the first on again
-    where there are more drones. Raises `InputError`.
+    Names or files go to the drones in their order, and repeat from the first if there are more
+    drones. Raises `InputError`.
     """
     names = vehicle_words(vehicle) or (None,)
     if len(names) > drones:

@@ -19,8 +19,9 @@ def vehicle_names() -> list[str]:
 
 
 def vehicle_words(given: object) -> tuple[str, ...]:
-    """Names and files of vehicles, of a text with commas between them or of several texts; none of
-    None. Raises `InputError`.
+    """Names and files of vehicles, from a text with commas between them or from several texts.
+
+    None gives an empty tuple. Raises `InputError`.
     """
     if given is None:
         return ()
@@ -33,7 +34,7 @@ def vehicle_words(given: object) -> tuple[str, ...]:
 
 
 def is_of_the_library(vehicle: str) -> bool:
-    """Whether a word is the bare name of such a vehicle, and of no file here."""
+    """Whether a word is the bare name of a vehicle of the library, and no file has that name."""
     return vehicle in vehicle_names() and not Path(vehicle).is_file()
 
 
@@ -53,13 +54,12 @@ def find_vehicle(vehicle: Path | str | None) -> Path:
     if path.suffix == "" and path.name == word and not path.exists():
         known = ", ".join(vehicle_names())
         raise InputError(f"vehicle: expected a file, or one of {known}, got {word!r}")
-    if not (path.is_file() or not (path.exists() or path.is_symlink())):
+    if not path.is_file() and (path.exists() or path.is_symlink()):
         raise InputError(
             "vehicle: expected a file, "
             f"got {word}, which is a folder, a device or a link to nothing"
         )
-    urdf = path.suffix.lower() == ".urdf"
-    wanted = f"a TOML file that names the rotors, with [model] and file = {path.name!r}"
-    if urdf:
+    if path.suffix.lower() == ".urdf":
+        wanted = f"a TOML file that names the rotors, with [model] and file = {path.name!r}"
         raise InputError(f"vehicle: expected {wanted}, got the URDF file itself")
     return path.resolve()

@@ -1,4 +1,4 @@
-"""Several crafts in one world: its compiled model, and what of it is whose."""
+"""Several crafts in one world: its compiled model, and which parts belong to which craft."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -18,7 +18,7 @@ GROUNDED = "rotorgram/grounded"
 
 
 def drone_names(count: int) -> tuple[str, ...]:
-    """Names of so many drones of a world."""
+    """Names of the drones of a world."""
     return tuple(f"drone_{i}" for i in range(count))
 
 
@@ -37,9 +37,8 @@ def swarm_model(
     for vehicle in vehicles:
         for name in SHARED:
             ours, its = (getattr(one.model.opt, name) for one in (first, vehicle))
-            same = np.array_equal(ours, its)
-            got = f"{its} of {vehicle.name}"
-            if not same:
+            if not np.array_equal(ours, its):
+                got = f"{its} of {vehicle.name}"
                 raise InputError(
                     f"vehicle: expected a {name} of {ours} as of {first.name}, got {got}"
                 )

@@ -193,9 +193,8 @@ class Vehicle:
         data = mujoco.MjData(model)
         data.qpos[2] = high = self.rest_height + 2 * (cable + radius)
         data.qpos[7:10] = (0.0, 0.0, high - cable)
-        clear = not _touches(model, data, high)
-        expected = f"a length at which a payload with a radius of {radius:.3g} m hangs clear"
-        if not clear:
+        if _touches(model, data, high):
+            expected = f"a length at which a payload with a radius of {radius:.3g} m hangs clear"
             raise InputError(f"effects: cable: expected {expected}, got {cable:g} m")
         return model
 
@@ -284,7 +283,7 @@ def craft_bodies(model: mujoco.MjModel) -> np.ndarray:
 
 
 def owners(model: mujoco.MjModel) -> np.ndarray:
-    """The number of the craft of which each body is a part, -1 of none, shape (B,)."""
+    """Number of the craft to which each body belongs, -1 if none, shape (B,)."""
     owner = np.full(model.nbody, -1)
     for body in model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE].tolist():
         if model.body(body).name != _PAYLOAD:
@@ -303,7 +302,7 @@ def payload_body(model: mujoco.MjModel) -> int:
 
 
 def body_axes(model: mujoco.MjModel) -> np.ndarray:
-    """Axes of each body in the frame of the free body that it is of, as columns, (B, 3, 3)."""
+    """Axes of each body in the frame of its craft's free body, as columns, (B, 3, 3)."""
     axes: np.ndarray = level_data(model).xmat.reshape(-1, 3, 3).copy()
     return axes
 
@@ -322,8 +321,8 @@ def _check_structure(model: mujoco.MjModel) -> None:
     if heaviest > _MAX_MASS:
         raise InputError(f"vehicle: expected a mass of at most {_MAX_MASS:g} kg, got {heaviest:g}")
     free = int((model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).sum())
-    got = f"{free} free of {model.njnt} joints"
     if (free, model.njnt) != (1, 1):
+        got = f"{free} free of {model.njnt} joints"
         raise InputError(f"vehicle: expected one free body and no other joints, got {got}")
     if not model.nu:
         raise InputError("vehicle: expected at least one rotor, an actuator at a site, got none")
@@ -334,12 +333,12 @@ def _check_flyable(model: mujoco.MjModel) -> None:
     mass = float(model.body_subtreemass[model.jnt_bodyid[0]])
     gravity = model.opt.gravity
     right = mass > 0 and gravity[2] < 0 and not gravity[:2].any()
-    got = f"{mass:g} kg and {gravity.tolist()} m/s²"
     if not right:
+        got = f"{mass:g} kg and {gravity.tolist()} m/s²"
         raise InputError(f"vehicle: expected a mass > 0 and gravity along -z, got {got}")
     step = model.opt.timestep
-    limits = f"at least {_LEAST_TIMESTEP:g} s and at most {_MAX_TIMESTEP:g} s"
     if not _LEAST_TIMESTEP <= step <= _MAX_TIMESTEP:
+        limits = f"at least {_LEAST_TIMESTEP:g} s and at most {_MAX_TIMESTEP:g} s"
         raise InputError(f"vehicle: expected a physics step of {limits}, got {step:g}")
 
 
@@ -352,7 +351,7 @@ def _load(path: Path, drag: float, changed: tuple[int, ...]) -> Vehicle:
     mass, center, inertia = mass_properties(model, data)
     for index in range(model.nu):
         for expected, got in rotor_faults(model, index):
-            raise InputError(f"vehicle: expected {expected}, got {got}") from None
+            raise InputError(f"vehicle: expected {expected}, got {got}")
     rotors = tuple(read_rotor(model, data, index) for index in range(model.nu))
     allocation = allocate(rotors, center)
     model.dof_damping[0:3] = drag * mass
@@ -492,12 +491,12 @@ def _hover(rotors: tuple[Rotor, ...], allocation: np.ndarray, weight: float) -> 
         )
     for rotor, newtons in zip(rotors, thrust.tolist(), strict=True):
         carries = f"rotor {rotor.name} to carry"
-        part = f"{carries} a part of the weight of the level craft"
         if not newtons > _RELATIVE * weight:
+            part = f"{carries} a part of the weight of the level craft"
             raise InputError(f"vehicle: expected {part}, got {newtons:.4g} N")
-        share = f"{carries} its share of the weight, {newtons:.4g} N, within its limits"
-        got = f"{rotor.low:g} to {rotor.high:g} N"
         if not rotor.low <= newtons < rotor.high:
+            share = f"{carries} its share of the weight, {newtons:.4g} N, within its limits"
+            got = f"{rotor.low:g} to {rotor.high:g} N"
             raise InputError(f"vehicle: expected {share}, got {got}")
     return thrust
 
@@ -513,8 +512,8 @@ def find_rest_height(model: mujoco.MjModel, data: mujoco.MjData) -> float:
         return 0.0
     while _touches(model, data, high):
         high *= 2
-        got = f"one that touches something at {high:.0f} m"
-        if not high <= _MAX_HEIGHT:
+        if high > _MAX_HEIGHT:
+            got = f"one that touches something at {high:.0f} m"
             raise InputError(f"vehicle: expected a craft that is free above the ground, got {got}")
     while high - low > 1e-10 * high:
         middle = (low + high) / 2
@@ -532,9 +531,9 @@ def _hash(spec: mujoco.MjSpec, text: str, path: Path, drag: float) -> str:
     digest = blake2b(text.encode() + b"\0" + struct.pack("<d", drag), digest_size=16)
     folder = path.parent
     if _is_toml(path):
-        told = read_vehicle_file(path)
-        digest.update(told.content.encode())
-        folder = folder if told.model is None else told.model.parent
+        table = read_vehicle_file(path)
+        digest.update(table.content.encode())
+        folder = folder if table.model is None else table.model.parent
     for asset in (*spec.meshes, *spec.hfields):
         file = folder / spec.meshdir / asset.file
         if asset.file and file.is_file():

@@ -1,6 +1,6 @@
-"""What cameras see: the model that is drawn of a world, and the names of its objects.
+"""The model of a world that cameras draw, and the names of its objects.
 
-It is another than that of the physics, which never knows of it.
+Pictures have a model of their own; the physics does not see it.
 """
 
 from collections.abc import Sequence
@@ -108,11 +108,10 @@ def _add_mark(body: mujoco.MjsBody, name: str, mark: Mark, thickness: float) -> 
 
 
 def objects_in(model: mujoco.MjModel, names: Sequence[str]) -> tuple[tuple[str, ...], np.ndarray]:
-    """Names of the objects of a model, and the number of the one of each geom, behind a 0.
+    """Names of a model's objects, and the object number of each geom, after a leading 0.
 
-    All geoms of a craft are one object, and those of the world whose names begin alike up to their
-    last slash, if they have two or more. Geoms of the world without a name are told apart by their
-    material.
+    All geoms of a craft are one object. So are geoms of the world with names of two or more slashes
+    that agree up to the last one. A geom of the world without a name has that of its material.
     """
     known = {NOTHING: 0}
     numbers = [0]
@@ -123,8 +122,8 @@ def objects_in(model: mujoco.MjModel, names: Sequence[str]) -> tuple[tuple[str, 
         material = int(geom.matid[0])
         name = geom.name or (model.material(material).name if material >= 0 else _UNNAMED)
         head, _, _ = name.rpartition("/")
-        told = roots.get(root, head if "/" in head else name)
-        numbers.append(known.setdefault(told, len(known)))
+        label = roots.get(root, head if "/" in head else name)
+        numbers.append(known.setdefault(label, len(known)))
     return tuple(known), np.array(numbers, np.int32)
 
 

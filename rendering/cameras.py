@@ -1,7 +1,7 @@
 """Pictures that the cameras of drones take of their worlds: colours, depth, objects, optical flow.
 
-Each is of the state that it is given, exactly: nothing moves and no sensor is read in between. The
-model that is drawn is another than that of the physics, which never knows of it.
+A picture shows exactly the state that `take` gets: no time passes. Pictures have a model of their
+own; the physics does not see it.
 
 Pixels: row 0 is the top, column 0 the left; the middle of the first pixel is at (0.5, 0.5).
 A camera's frame here: x right, y down, z along its axis, as in computer vision.
@@ -26,21 +26,21 @@ from .gl import Offscreen
 
 _ROOM: Final = 1000  # geoms beyond those of the model
 _HIDDEN: Final = 5  # a group of geoms that is not drawn
-_FINER: Final = 2  # pixels of a pinhole's picture for one of a lens that distorts
+_FINER: Final = 2  # pixels of the pinhole's picture per pixel of a lens that distorts
 _FLIP: Final = np.array((1.0, -1.0, -1.0))  # from MuJoCo's camera frame to that of vision
 
 
 class Cameras:
     """Cameras of W worlds of A drones. Raises `InputError`, and `take` raises `NoOpenGL`.
 
-    Marks are those of the task's spec: gates, discs and balls of its world, or at each drone's goal
-    where they move. Views are what is taken, of one size each; `fine` draws smooth edges and
-    shadows, in several times the time.
+    Marks are those of the task's spec: gates, discs and balls, fixed in the world or moving with
+    each drone's goal. A view is one array of pictures, all of one size. `fine` draws smooth edges
+    and shadows, and takes several times as long.
 
     Attributes:
         views: As given.
-        objects: Names of the numbers of segmentation pictures, in their order.
-        pictures: By the names of the views, shape (N, H, W, channels): what each drone took last.
+        objects: Names of objects; a segmentation picture has their indices.
+        pictures: The last picture of each drone by the view's name, shape (N, H, W, channels).
     """
 
     def __init__(
@@ -85,11 +85,11 @@ class Cameras:
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
 
     def _camera_ids(self, view: View) -> list[int]:
-        """The camera of each drone of a world; of one that stands there the same."""
+        """The camera of each drone of a world; a fixed camera counts for all drones."""
         name = view.camera.name
-        one = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_CAMERA, name)
-        if one >= 0:
-            return [one] * len(self._names)
+        fixed = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_CAMERA, name)
+        if fixed >= 0:
+            return [fixed] * len(self._names)
         return [self.model.camera(f"{drone}/{name}").id for drone in self._names]
 
     @cached_property
@@ -114,13 +114,14 @@ class Cameras:
     ) -> None:
         """Take pictures of the worlds as they are.
 
-        `due` has by the name of a view which drones take one, bool, shape (N,); `fresh` which have
-        just begun an episode, before which there was no other step, so that nothing flows.
+        `due` has, by view name, the drones that take a picture, bool, shape (N,). `fresh` has the
+        drones that have just begun an episode: their optical flow is 0, for there is no earlier
+        frame.
 
         The state has `position` (N, 3) and `quaternion` (N, 4), and, where there are any, `goal`
         and `payload` (N, 3): MuJoCo's world frame, m. `flow` is since the last call. `dice` gives
-        the generator of a world's noise; without it there is none. `of` has the worlds that are
-        drawn, bool, shape (W,); None: all.
+        the generator of a world's noise; None: no noise. `of` has the worlds that are drawn, bool,
+        shape (W,); None: all.
         """
         worlds, drones = self._shape
         of_world = {name: np.reshape(mask, (worlds, drones)) for name, mask in due.items()}
@@ -129,7 +130,9 @@ class Cameras:
         first = fresh.reshape(worlds, drones).max(axis=1)
         with self._drawing.current():
             for world in range(worlds):
-                if not (needed[world] or flows) or not (of is None or of[world]):
+                if of is not None and not of[world]:
+                    continue
+                if not needed[world] and not flows:
                     continue
                 rows = slice(world * drones, (world + 1) * drones)
                 self._poses.set(self.data, {name: x[rows] for name, x in state.items()})
@@ -141,7 +144,7 @@ class Cameras:
                     self._before[world] = self._poses.now(self.data)
 
     def snapshot(self) -> dict[str, np.ndarray]:
-        """What each drone took last, and where each world was then, by name."""
+        """The last pictures, and the poses of each world's last frame, by name."""
         pictures = {name: taken.copy() for name, taken in self.pictures.items()}
         return {**pictures, "before": self._before.copy()}
 
@@ -183,7 +186,7 @@ class Cameras:
         before: np.ndarray | None,
         dice: np.random.Generator | None,
     ) -> np.ndarray:
-        """A view's picture, from what was drawn of its eye for others."""
+        """A view's picture; views of one camera share its drawings by `shot`."""
         if view.kind == "rgb":
             if shot.rgb is None:
                 colors, _ = self._render(eye, objects=False)
@@ -209,7 +212,7 @@ class Cameras:
         view_of = self._camera
         every = mujoco.mjtCatBit.mjCAT_ALL.value
         view_of.fixedcamid = eye.camera
-        # The scene lays an endless floor around the camera that it had: without this the last one.
+        # MuJoCo centres infinite planes on the scene's camera, so update it first.
         mujoco.mjv_updateCamera(self.model, self.data, view_of, scene)
         groups = self.model.geom_group[eye.discs]
         if objects:
@@ -238,28 +241,28 @@ class Cameras:
         if len(eye.numbers) != scene.ngeom + 1:  # the same geoms in each picture, in one order
             geom = mujoco.mjtObj.mjOBJ_GEOM.value
             eye.numbers = np.zeros(scene.ngeom + 1, np.int32)
-            for one in scene.geoms[: scene.ngeom]:
-                if one.segid >= 0 and one.objtype == geom:
-                    eye.numbers[one.segid + 1] = one.objid + 1
+            for drawn in scene.geoms[: scene.ngeom]:
+                if drawn.segid >= 0 and drawn.objtype == geom:
+                    eye.numbers[drawn.segid + 1] = drawn.objid + 1
         code = colors.astype(np.uint32)
         numbers: np.ndarray = eye.numbers[code[..., 0] | code[..., 1] << 8 | code[..., 2] << 16]
         return numbers
 
     def _meters(self, depth: np.ndarray) -> np.ndarray:
-        """Depth along the camera's axis, float32, m, of OpenGL's: 1 near, 0 far."""
+        """Depth along the camera's axis, float32, m, from OpenGL's depth: 1 near, 0 far."""
         extent = self.model.stat.extent
         clip = self.model.vis.map
         near, far = (float(np.float32(end * extent)) for end in (clip.znear, clip.zfar))
         meters = near * far / (near + depth.astype(np.float64) * (far - near))
-        told: np.ndarray = np.minimum(meters, FARTHEST).astype(np.float32)
-        return told
+        limited: np.ndarray = np.minimum(meters, FARTHEST).astype(np.float32)
+        return limited
 
     def _flow(
         self, eye: "_Eye", geoms: np.ndarray, depth: np.ndarray, before: np.ndarray
     ) -> np.ndarray:
-        """Pixels by which what a pixel sees has moved since the poses before, right and down.
+        """Motion of each pixel's point since the poses `before`, right and down, pixels.
 
-        What the camera could not see then, since it was beside or behind it: nan.
+        NaN where the point was beside or behind the camera then.
         """
         now = self._poses.frames(self.data)
         lens = eye.lens(self.data)
@@ -273,14 +276,15 @@ class Cameras:
         rays = eye.rays
         middles = eye.middles
         flow = np.empty(middles.shape, np.float32)
-        stands = np.array_equal(lens.rotation, old.rotation)
-        stands &= np.array_equal(lens.translation, old.translation)
-        # First what fills most pixels, as if it were in all: that is faster.
+        still = np.array_equal(lens.rotation, old.rotation)
+        still &= np.array_equal(lens.translation, old.translation)
+        # The body with most pixels first, over the whole picture without a mask: faster; the others
+        # overwrite theirs.
         pixels = np.bincount(bodies)
         most, *others = np.argsort(-pixels)[: np.count_nonzero(pixels)].tolist()
         for body in (most, *others):
             which = slice(None) if body == most else bodies == body
-            if stands and all(map(np.array_equal, now[body], past[body])):
+            if still and all(map(np.array_equal, now[body], past[body])):
                 flow[which] = 0.0
                 continue
             (place, axes) = now[body]
@@ -329,9 +333,9 @@ class _Eye:
         self.optics = camera.optics
         self._matrix = _matrix(model, number, size)
         self.numbers = np.zeros(0, np.int32)
-        """Of the geoms from 1, by their colours in pictures of objects."""
+        """Numbers of geoms from 1, by the colour code of segmentation."""
         self.discs = own_discs(model, number) if camera.carried else np.zeros(0, int)
-        """Geoms that it sees through where objects are concerned."""
+        """Geoms that depth and segmentation leave out."""
         distorts = any(self.optics.distortion)
         self.source = _Source(self._still, size) if distorts else None
         self.drawn = self.source.size if self.source else size
@@ -372,9 +376,9 @@ class _Source:
         low = seen.min(axis=0)
         high = seen.max(axis=0)
         width, height = (int(side) for side in np.ceil((high - low) / pitch))
-        expected = f"a lens that needs at most {_FINER * MAX_PIXELS} pixels of a pinhole a side"
         most = max(width, height)
-        if not most <= _FINER * MAX_PIXELS:
+        if most > _FINER * MAX_PIXELS:
+            expected = f"a lens that needs at most {_FINER * MAX_PIXELS} pixels of a pinhole a side"
             raise InputError(f"distortion: expected {expected}, got {most}")
         self.size = height, width
         self._low = low
@@ -383,7 +387,7 @@ class _Source:
         self._at = (lens.rays(*size)[..., :2] - low) / pitch - 0.5
 
     def aim(self, scene: mujoco.MjvScene) -> None:
-        """Let the scene's camera see as much."""
+        """Set the scene camera's frustum to what the lens sees."""
         (left, top) = self._low
         (right, bottom) = self._high
         for camera in scene.camera:
@@ -394,13 +398,13 @@ class _Source:
             camera.frustum_top = -near * top
 
     def nearest(self, picture: np.ndarray) -> np.ndarray:
-        """What the lens has, of the nearest pixels: numbers that must not be mixed."""
+        """The lens's picture from the nearest pixels, for numbers that must not be mixed."""
         columns, rows = np.rint(self._at).astype(int).transpose(2, 0, 1)
         taken: np.ndarray = picture[rows, columns]
         return taken
 
     def blended(self, colors: np.ndarray) -> np.ndarray:
-        """What the lens has of colours, between four pixels."""
+        """The lens's picture by bilinear interpolation, for colours."""
         columns, rows = np.floor(self._at).astype(int).transpose(2, 0, 1)
         right, down = (self._at % 1.0).transpose(2, 0, 1)[..., None]
         upper, lower = (

@@ -23,8 +23,8 @@ environment variable, so that the processes that this one starts know it too."""
 
 
 _state = {"used": False, "forked": False}
-"""Whether this process has opened OpenGL, and whether it was forked from one that had: there it
-would wait for threads that are not."""
+"""Whether this process has opened OpenGL, and whether it was forked from one that had: there
+OpenGL would wait for threads that do not exist."""
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=lambda: _state.update(forked=_state["used"]))
 

@@ -35,7 +35,7 @@ class Pace:
 
     Args:
         period: Time between two steps, s; 0 for as fast as possible.
-        speed: 2 is twice as fast as real time. One beyond `SPEEDS` raises `InputError`.
+        speed: 2 is twice as fast as real time. A speed beyond `SPEEDS` raises `InputError`.
     """
 
     def __init__(self, period: float, speed: float = 1.0) -> None:
@@ -59,7 +59,7 @@ class Pace:
         return f"{speed}, paused" if self.paused else speed
 
     def press(self, press: Press) -> None:
-        """Tell of a press, which `wait` then obeys; from any thread."""
+        """Queue a press for the next `wait`; from any thread."""
         self._presses.put(press)
 
     def wait(self, now: float) -> float | None:

@@ -123,7 +123,7 @@ class Overlay:
     ) -> Picture:
         """A copy of a picture, uint8, shape (height, width, 3), with everything on it.
 
-        `values` are those of the first metric from the episode's start to this moment, one each
+        `values` are those of the first metric from the episode's start to this moment, one per
         period; `note` is an event, such as "terminated".
         """
         image = Image.fromarray(picture)
@@ -219,7 +219,7 @@ class Overlay:
 
 @lru_cache
 def _font(size: float) -> ImageFont.FreeTypeFont:
-    """For so many pixels of the picture."""
+    """Pillow's font, for a height in pixels."""
     font = ImageFont.load_default(size)
     assert isinstance(font, ImageFont.FreeTypeFont)  # Pillow's wheels bring FreeType
     return font

@@ -1,6 +1,6 @@
 """Marks of a task, which pictures show and physics does not know: gates, discs, balls.
 
-Imports the standard library and models/errors.py alone.
+Imports the standard library and models/fields.py alone.
 """
 
 import math

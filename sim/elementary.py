@@ -57,7 +57,7 @@ def cos(x: Real) -> Real:
 
 
 def _wave(x: Real, quarters: float) -> Real:
-    """Sine of x plus so many quarter turns: reduction by Cody and Waite, then a series."""
+    """Sine of x plus `quarters` quarter turns: reduction by Cody and Waite, then a series."""
     is_single = x.dtype == _SINGLE
     near = np.rint(x * float(2 / _PI))
     rest = x

@@ -151,7 +151,7 @@ class Random(Kept):
             noise.begin(ids)
 
     def noise(self, name: str, size: int) -> "Noise":
-        """So many normal numbers of each drone in every step."""
+        """A source of `size` normal numbers for each drone and step."""
         self._noises[name] = noise = Noise(self, use_number(name), size)
         return noise
 
@@ -203,7 +203,7 @@ class Draw:
         return self._chosen.get(name, self._spread(drawn, size))
 
     def normal(self, scale: float, size: tuple[int, ...] = (), *, name: str = "") -> Array:
-        """Normal numbers with mean 0 and that standard deviation, shape (W, A, *size)."""
+        """Normal numbers, mean 0, standard deviation `scale`, shape (W, A, *size)."""
         count = self._random.drones * prod(size)
         drawn = scale * normal(self._next(size, count % 2))[:, :count]
         return self._chosen.get(name, self._spread(drawn, size))

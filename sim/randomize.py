@@ -23,14 +23,14 @@ class Parameter:
     """A parameter that can be drawn."""
 
     low: float
-    """Least value; a draw below it counts as it."""
+    """Least value; draws are clipped to it."""
     high: float
     """Largest value."""
     unit: str
     """Empty for a factor."""
     meaning: str
     needs: tuple[str, ...] = ()
-    """Effects of which one has to be on."""
+    """At least one of these effects must be on."""
 
 
 MAX_ROTORS: Final = 8  # Rotors whose thrust can be drawn on its own
@@ -61,7 +61,7 @@ PARAMETERS: Final = {
 }
 CENTER: Final = ("center_x", "center_y", "center_z")
 WHOLE: Final = ("action_delay", "observation_delay")
-"""Parameters that are whole numbers: of a uniform draw each has the same chance."""
+"""Parameters that are whole numbers; a uniform draw gives each the same chance."""
 _FORMS: Final = "uniform(low,high), loguniform(low,high), normal(mean,deviation), choice(a,b,...)"
 _TEXT: Final = re.compile(r"\s*([a-z]+)\s*\(([^()]*)\)\s*")
 
@@ -70,8 +70,8 @@ class Randomization:
     """Distributions by the parameter's name, as texts: "uniform(0.8, 1.2)", or a number.
 
     `uniform(low, high)`, `loguniform(low, high)`, `normal(mean, deviation)` and `choice(a, b, ...)`
-    with equal chances; a number is drawn as itself. Raises `InputError` for anything else, and for
-    a parameter whose effect is off; with None for the effects nothing is said of them.
+    with equal chances; a number stands for itself. Raises `InputError` for anything else, and for a
+    parameter whose effect is off. Effects None: this is not checked.
     """
 
     def __init__(self, texts: object, effects: EffectOptions | None) -> None:
@@ -96,16 +96,16 @@ class Randomization:
         return tuple(name for name in PARAMETERS if name in self._kinds)
 
     def to_options(self) -> dict[str, float | str]:
-        """The distributions by name, each in one way of writing: a number, or a text."""
-        told: dict[str, float | str] = {}
+        """The distributions by name in canonical form: a number, or a text."""
+        options: dict[str, float | str] = {}
         for name, (kind, numbers) in self._kinds.items():
             inside = ", ".join(repr(number).removesuffix(".0") for number in numbers)
             alone = kind == "choice" and len(numbers) == 1
-            told[name] = numbers[0] if alone else f"{kind}({inside})"
-        return told
+            options[name] = numbers[0] if alone else f"{kind}({inside})"
+        return options
 
     def most_steps(self, name: str) -> int:
-        """No draw of a delay is longer, control steps."""
+        """Longest delay that can be drawn, control steps."""
         kind, numbers = self._kinds[name]
         return round(PARAMETERS[name].high if kind == "normal" else max(numbers))
 

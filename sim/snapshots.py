@@ -22,11 +22,11 @@ class Kept:
     lists: ClassVar[tuple[str, ...]] = ()
 
     def parts(self) -> "dict[str, Kept]":
-        """What it is made of, by name, with a state of their own."""
+        """Parts that keep a state of their own, by name."""
         return {}
 
     def snapshot(self) -> Snapshot:
-        """Copies by name; what has no value yet is left out."""
+        """Copies by name; attributes without a value yet are left out."""
         values = {name: getattr(self, name) for name in (*self.arrays, *self.lists)}
         own = {name: np.array(value) for name, value in values.items() if value is not None}
         return own | joined({name: part.snapshot() for name, part in self.parts().items()})

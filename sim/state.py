@@ -39,9 +39,9 @@ class WorldState:
     is the command."""
     touching: Array
     """Whether any part was in contact since the last step or reset, bool, shape (W, A). On the
-    backend `rigid` drones are so with each other where their spheres overlap."""
+    backend `rigid` two drones touch where their spheres overlap."""
     colliding: Array = None
-    """Whether it was so with another drone; None where drones are alone."""
+    """Whether it was in contact with another drone; None in worlds of one drone."""
     payload: Array = None
     """Position of each drone's payload, world frame, m, shape (W, A, 3), which all drones of a
     world share; None without payloads."""
@@ -78,8 +78,8 @@ class InitialState:
     thrust: Array | None = None
     """N, shape (W, A, R)."""
     payload: Array | None = None
-    """Of the payload, world frame, m, shape (W, A, 3), alike for the drones of a world. None means
-    straight below the drone, which has to be alone."""
+    """Of the payload, world frame, m, shape (W, A, 3), the same for all drones of a world. None:
+    straight below the drone, in worlds of one drone only."""
 
 
 def clip(array: Array, low: Array, high: Array) -> Array:
@@ -95,7 +95,7 @@ def component(array: Array, index: int) -> Array:
 
 
 def each(values: Array) -> Array:
-    """A drone's number for each of several: with a last axis of one; of a single drone as it is."""
+    """Numbers of drones with a last axis of length 1; a single drone's number as it is."""
     return values if isinstance(values, _NUMBERS) else values[..., None]
 
 
@@ -111,7 +111,7 @@ def chosen(mask: Array, new: Array, old: Array) -> Array:
 
 
 def kept(mask: Array, new: Sequence[Array], old: Sequence[Array] | None) -> Sequence[Array]:
-    """The same of lists of arrays; all are new where there is no old."""
+    """`chosen` for lists of arrays; all are new if there are no old ones."""
     if old is None or old[0] is None:
         return new
     return [chosen(mask, a, b) for a, b in zip(new, old, strict=True)]
@@ -123,7 +123,7 @@ def plain(array: Array) -> Array:
 
 
 def square_root(array: Array) -> Array:
-    """Of numbers; of one below 0, as rounding may leave it, 0."""
+    """Square root; 0 of a number below 0, which rounding may leave."""
     if isinstance(array, float):
         return math.sqrt(array) if array > 0.0 else 0.0
     return np.sqrt(np.maximum(array, 0.0))

@@ -45,8 +45,7 @@ class World:
         state: As the last step or reset left it.
         random: The counters of all random numbers; `seed` seeds them.
         parameters: What was drawn for each drone's episode, by name, shape (W, A).
-        effects: What acts on drones besides gravity, contact and rotors that obey at once; None:
-            nothing.
+        effects: What acts on drones besides gravity, contact and ideal rotors; None: nothing.
 
     Class attributes:
         settings: Names of the backend's own arguments of `make_world`.
@@ -100,11 +99,11 @@ class World:
     def step(
         self, thrust: Array, substeps: int, mask: Array | None = None, *, again: bool = False
     ) -> None:
-        """Fly the worlds of the mask, None for all, for so many physics steps with these thrusts.
+        """Fly the worlds of the mask, None for all, for `substeps` physics steps.
 
-        Thrusts in N, shape (W, A, R). Where it goes on `again` after a step with the same mask, the
-        state's `touching` counts from that step on. A bad state raises `PhysicsError`, which names
-        the worlds to be reset.
+        Thrusts in N, shape (W, A, R). With `again`, the call continues a step with the same mask:
+        the state's `touching` keeps the contacts of that step. A bad state raises `PhysicsError`,
+        which names the worlds to be reset.
         """
         raise NotImplementedError
 
@@ -205,8 +204,8 @@ def flown_model(
 
 def check_hung(height: float, least: float) -> None:
     """Refuse a start at which the payload would hang in the ground. Raises `InputError`."""
-    expected = f"a height over {least:.4g} m, for the payload on its cable"
     if not height > least:
+        expected = f"a height over {least:.4g} m, for the payload on its cable"
         raise InputError(f"start: expected {expected}, got {height:.4g} m")
 
 
@@ -261,7 +260,7 @@ def make_world(
     randomize: Randomization | None = None,
     **settings: Any,
 ) -> World:
-    """W worlds of so many drones each.
+    """W worlds of `drones` drones each.
 
     Settings are `num_threads` of `mujoco`, `dtype` and `compiled` of `rigid`. Raises `InputError`.
     """

@@ -12,9 +12,9 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Final, NamedTuple
 
-import mujoco
 import numpy as np
 
+from ...models.mjcf import level_data
 from ...models.vehicle import Vehicle, craft_bodies
 from .. import elementary
 from ..randomize import CENTER
@@ -238,7 +238,7 @@ def motion(rows: Array) -> Motion:
 
 
 def mapped(tree: Array, change: Callable[[Array], Array]) -> Array:
-    """Tuples and lists in each other with every vector changed, in a fixed order."""
+    """Nested tuples and lists with `change` applied to every vector, in a fixed order."""
     if isinstance(tree, tuple | list):
         parts = [mapped(one, change) for one in tree]
         return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
@@ -248,9 +248,7 @@ def mapped(tree: Array, change: Callable[[Array], Array]) -> Array:
 def _own_and_far(vehicle: Vehicle) -> tuple[np.ndarray, np.ndarray]:
     """The inertia as the sum of that of the bodies, and of their masses about the center."""
     model = vehicle.model
-    data = mujoco.MjData(model)
-    data.qpos[:7] = (0, 0, 0, 1, 0, 0, 0)
-    mujoco.mj_kinematics(model, data)
+    data = level_data(model)
     own = np.zeros((3, 3))
     for i in craft_bodies(model).tolist():
         axes = data.ximat[i].reshape(3, 3)
@@ -333,7 +331,7 @@ def _cross(a: Array, b: Array) -> Vector:
 
 
 def _forth(matrix: Array, vector: Array) -> Vector:
-    """A matrix of three rows, and what it is applied to: a vector, or the thrusts of rotors."""
+    """Product of a matrix of three rows and a vector, or the thrusts of rotors."""
     return tuple(_sum(0.0, *zip(row, vector, strict=True)) for row in matrix)
 
 
@@ -358,7 +356,7 @@ def _rotated(quaternion: Array, rates: Vector, time: float) -> tuple[Array, Arra
 
 
 def _of_rotation_vector(spin: Vector, time: float, square: Array, rates: Vector) -> Vector:
-    """How fast the rotation vector r = spin · time changes at body rates in the turned frame.
+    """Derivative of the rotation vector r = spin · time at body rates in the turned frame.
 
     rates + r × rates / 2 + k r × (r × rates), k = (1 - |r| / 2 · cot(|r| / 2)) / |r|² (Bortz,
     IEEE Trans. AES-7, 1971): the sum of 2 / ((2 π n)² - |r|²) over n > 0. Here up to |r| = π.

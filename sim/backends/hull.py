@@ -5,6 +5,7 @@ from typing import Final
 import mujoco
 import numpy as np
 
+from ...models.mjcf import level_data
 from ...models.vehicle import Vehicle, craft_bodies
 from ..state import Array, clip
 
@@ -79,10 +80,8 @@ def can_touch(model: mujoco.MjModel, geom: int, others: np.ndarray) -> bool:
 
 
 def _shapes(model: mujoco.MjModel) -> list[tuple[Array, ...]]:
-    """Center, radius, axes as columns, s and t of each geom that meets the ground."""
-    data = mujoco.MjData(model)
-    data.qpos[:7] = (0, 0, 0, 1, 0, 0, 0)
-    mujoco.mj_kinematics(model, data)
+    """Center, radius, axes as columns, s and t of each geom that can touch the ground."""
+    data = level_data(model)
     ours = np.isin(model.geom_bodyid, craft_bodies(model))
     shapes: list[tuple[Array, ...]] = []
     none = (0.0, 0.0, 0.0)

@@ -36,7 +36,7 @@ class MujocoWorld(World):
     the whole process; a log file of another name stays on.
 
     A single world has no leading axes: NumPy's scalars are ten times faster than its arrays of one.
-    So many threads step the worlds; 0 takes one for each processor.
+    `num_threads` threads step the worlds; 0: one for each processor.
     """
 
     settings = ("num_threads",)
@@ -272,11 +272,12 @@ class MujocoWorld(World):
         if self._cable is None:
             return None
         drones = self._touching.shape[1]
-        if pose.payload is None:
-            expected = "one drone in a world, or a task whose start places it"
+        hung = pose.payload
+        if hung is None:
             if drones != 1:
+                expected = "one drone in a world, or a task whose start places it"
                 raise InputError(f"effects: payload: expected {expected}, got {drones} drones")
-        hung = pose.position - (0.0, 0.0, self._cable) if pose.payload is None else pose.payload
+            hung = pose.position - (0.0, 0.0, self._cable)
         return np.reshape(hung, (-1, drones, 3))[:, 0]
 
     def _place_payload(self, ids: np.ndarray, hung: np.ndarray) -> None:
@@ -306,8 +307,9 @@ class MujocoWorld(World):
 def _views(
     rows: np.ndarray, drones: int, size: int, lead: tuple[int, ...]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Of rows (W, n): so many numbers of each craft, and the place or speed of the payload after
-    them, the same for all crafts of a world.
+    """Views of rows (W, n): `size` numbers of each craft, and the payload's position or velocity.
+
+    The latter comes after the crafts, and is the same for all crafts of a world.
     """
     crafts = drones * size
     load = rows[:, None, crafts : crafts + 3]

@@ -1,6 +1,6 @@
 """The rigid body of a vehicle: no contact, in NumPy's arrays or compiled.
 
-It flies as `mujoco` does until a part touches the ground, or another drone, of which it tells.
+It flies as `mujoco` does until a part touches the ground or another drone, and reports the contact.
 """
 
 import logging
@@ -31,8 +31,8 @@ class RigidWorld(World):
     """W worlds of A drones over level ground: `World`, without contact.
 
     A craft that reaches the ground is `touching`, and flies on through it: a task ends an episode
-    there. So it is with two crafts whose spheres overlap, of `Vehicle.radius` about their origins:
-    earlier than their geoms would touch. A step makes new arrays for the state.
+    there. Two crafts touch where their spheres overlap, of `Vehicle.radius` about their origins:
+    earlier than their geoms would. A step makes new arrays for the state.
 
     Args:
         dtype: `float32` or `float64`.
@@ -52,17 +52,17 @@ class RigidWorld(World):
         dtype: str = "float32",
         compiled: bool | None = None,
     ) -> None:
-        if not (compiled is None or type(compiled) is bool):
+        if compiled is not None and type(compiled) is not bool:
             raise InputError(f"compiled: expected true or false, got {shortened(compiled)}")
         if dtype not in DTYPES:
             raise InputError(f"dtype: expected {' or '.join(DTYPES)}, got {dtype!r}")
         found = kernel.compiler()
-        expected = "false where no C compiler is found (cc, gcc, clang or the variable CC)"
-        if not (found or not compiled):
+        if compiled and not found:
+            expected = "false where no C compiler is found (cc, gcc, clang or the variable CC)"
             raise InputError(f"compiled: expected {expected}, got true")
         payload = 0.0 if effects is None else effects.payload
-        expected = "none with the backend rigid, which has no cable: fly it with mujoco"
         if payload:
+            expected = "none with the backend rigid, which has no cable: fly it with mujoco"
             raise InputError(f"effects: payload: expected {expected}, got {payload:g} kg")
         shape = (num_worlds, drones)
         arguments = {"num_worlds": num_worlds, "drones": drones, "dtype": dtype}
@@ -104,7 +104,7 @@ class RigidWorld(World):
             logging.getLogger(__name__).warning("rigid flies by NumPy: %s", error)
 
     def vary(self, inertia: Array, reaction: Array, air: Mapping[str, Array]) -> None:
-        """Give every drone numbers of its own, before the first reset; for `body_drag`.
+        """Set the numbers of every drone before the first reset; needs the effect `body_drag`.
 
         Inertia, kg·m², (W A, 3, 3); a factor of the rotors' reactions, (W A,); and coefficients of
         the air by their names in a vehicle's file, (W, A) each.
@@ -158,7 +158,7 @@ class RigidWorld(World):
         self._refuse_bad()
 
     def _fly(self, steps: int, mask: Array | None) -> None:
-        """Fly some physics steps, between which nobody looks for contact."""
+        """Fly physics steps without a contact check in between."""
         state = self.state
         effects = self.effects
         acting = state.command
@@ -218,7 +218,7 @@ class RigidWorld(World):
             self._pack()
 
     def _pack(self) -> None:
-        """NumPy and compiled code take the same numbers of what varies."""
+        """Give NumPy and compiled code the same varying numbers."""
         body = self._body
         body.varying = mapped(body.varying, lambda numbers: numbers.astype(self.dtype))
         self._varying = kernel.packed(body, self.dtype)
@@ -283,11 +283,11 @@ def _check_obstacles(vehicle: Vehicle) -> None:
 
 
 def _check_forces(vehicle: Vehicle) -> None:
-    """Refuse a vehicle that MuJoCo would move in another way: its joint, its integrator."""
+    """Refuse a vehicle that MuJoCo would move differently, by its joint or its integrator."""
     model, data = vehicle.model, mujoco.MjData(vehicle.model)
     data.qpos[2:7] = (vehicle.rest_height + 1e3, 0.8, 0.36, -0.36, 0.3168596)
     data.qvel[:] = (1.0, -2.0, 0.5, 0.4, 0.7, -0.6)
-    # With thrusts far beyond those of a hover, rounding would hide what differs.
+    # With thrusts far above hover, rounding would hide a difference.
     moderate = vehicle.hover_thrust + abs(vehicle.hover_thrust).mean()
     most = np.minimum(vehicle.thrust_high, moderate)
     thrust = 0.6 * vehicle.hover_thrust + 0.4 * most
@@ -299,8 +299,8 @@ def _check_forces(vehicle: Vehicle) -> None:
     mujoco.mj_step(model, data)
     theirs = np.concatenate((data.qpos, data.qvel)) - rows
     right = np.abs(ours - theirs).max() <= 1e-9 * max(1.0, np.abs(theirs).max())
-    expected = "RK4, and no forces but gravity, rotors and linear_drag"
     if not right:
+        expected = "RK4, and no forces but gravity, rotors and linear_drag"
         raise InputError(
             f"vehicle: expected {expected} (the backend rigid), got others in {vehicle.name}"
         )

@@ -38,8 +38,8 @@ SHARES: Final = {"increment": 0.05, "offset": 0.2}
 class Controller(Protocol):
     """Turns actions into thrusts.
 
-    It may also have `every_step`, true where it is asked before each physics step and not once for
-    an action, `units` and `frame` of its numbers, as of an `ArraySpec`, and `constants` of an
+    Optional attributes: `every_step`, true if `thrust` is called before each physics step and not
+    once per action; `units` and `frame` of its numbers, as in an `ArraySpec`; `constants` of an
     `EnvSpec`.
     """
 

@@ -2,7 +2,7 @@
 
 Attitude control after T. Lee, M. Leok, N. H. McClamroch, "Control of Complex Maneuvers for a
 Quadrotor UAV using Geometric Methods on SE(3)", arXiv 1003.2005, 2010: with the attitude R, the
-body rates Ω, what is wanted of them, R_d and Ω_d, and the inertia J,
+body rates Ω, their wanted values R_d and Ω_d, and the inertia J,
 
     f = (m a_d + m g e₃) · R e₃
     M = -k_R e_R - k_Ω e_Ω + Ω × J Ω,   e_Ω = Ω - Rᵀ R_d Ω_d,
@@ -73,7 +73,7 @@ class Rates:
             self._throttle = thrust, throttle
 
     def ranges(self) -> list[tuple[float, str]]:
-        """What an action of 1 stands for, and the unit; of a collective thrust it is its limit."""
+        """Value of an action of 1, and its unit; 1 is the limit of a collective thrust."""
         return [(1.0, "1"), *((rate, "rad/s") for rate in self.gains.most_rate)]
 
     def thrust(self, action: Array, state: WorldState) -> Array:

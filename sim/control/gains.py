@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from ...models.vehicle import Vehicle
 
 LEAD: Final = 3.0
-"""Rotors are driven to follow so many times faster than their own lag."""
+"""Rotors are driven to follow this many times faster than their own lag."""
 SURPLUS: Final = 0.75
 """Share of the thrust beyond the weight that holds the height at the largest tilt."""
 MAX_TILT: Final = math.radians(60.0)
@@ -52,14 +52,13 @@ class Gains:
     attitude: float
     """kₐ: rate of roll and pitch per error of the thrust axis, 1/s."""
     heading: float
-    """The same of the heading, 1/s."""
+    """Yaw rate per error of the heading, 1/s."""
     velocity: float
     """kᵥ: acceleration per error of the velocity, 1/s."""
     position: float
     """kₚ: velocity per error of the position, 1/s."""
     lead: float
-    """Change of a rotor's command per change of thrust that is wanted; 1 asks for what is wanted.
-    """
+    """Change of a rotor's command per wanted change of its thrust; 1 without a lag."""
     most_rate: tuple[float, float, float]
     """Range of a body rate about each axis, rad/s: what α stops within a quarter of a turn."""
     most_tilt: float
@@ -134,9 +133,7 @@ class Gains:
 
 
 def shared_ranges(several: Sequence[Gains]) -> list[Gains]:
-    """The gains of several vehicles with the ranges of the least able, so that a number of an
-    action stands for the same with all.
-    """
+    """Gains of several vehicles with the smallest ranges, so that actions mean the same to all."""
     names = ("most_rate", "most_velocity", "most_offset")
     least: dict[str, Any] = {
         name: tuple(np.min([getattr(one, name) for one in several], axis=0).tolist())

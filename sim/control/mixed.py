@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 class MixedController:
-    """As `Controller`: each flies the drones with its numbers. Actions mean the same to all.
+    """A `Controller` made of several: each flies its drones. Actions mean the same to all.
 
     Arrays are NumPy's, of shape (W, A, ...).
     """

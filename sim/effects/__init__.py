@@ -1,9 +1,9 @@
-"""Effects: what acts on a drone besides gravity, contact, and rotors that obey at once.
+"""Effects: what acts on a drone besides gravity, contact and ideal rotors (no lag, no losses).
 
 Each is off by default, and a world without effects computes the same bits as if there were none.
-They act once in every physics step: from a command they give the thrust of each rotor, and from the
-motion through the air a force and a torque, all as means over the step. Coefficients are those of
-the vehicle's file (`Vehicle.coefficients`).
+Each is computed once per physics step: the thrust of each rotor from its command, and a force and a
+torque from the motion through the air, all as means over the step. Coefficients are those of the
+vehicle's file (`Vehicle.coefficients`).
 
 Where the air is concerned, the motion is extrapolated to the middle of the step, so that the error
 is of second order in the step. Sums over rotors and axes are written out, since a drone has to get
@@ -47,12 +47,12 @@ class Effects(Kept):
         noise: Callable[[str, int], Noise],
         drawn: tuple[str, ...] = (),
     ) -> None:
-        """`noise` is that of the world; `drawn` has the names of what `begin` gets."""
+        """`noise`: that of the world. `drawn`: names of the randomised parameters in `factors`."""
         rotors = options.motor_lag or options.thrust_curve or options.battery
         scaled = [name for name in drawn if name.startswith("thrust")]
         rotor = max((int(name.partition("_")[2] or 0) for name in scaled), default=0)
         count = vehicle.num_rotors
-        if not rotor <= count:
+        if rotor > count:
             raise InputError(f"randomize: expected one of the {count} rotors, got thrust_{rotor}")
         self.on_rotors = bool(rotors or options.efficiency or scaled)
         moved = options.body_drag or options.rotor_drag
@@ -62,7 +62,7 @@ class Effects(Kept):
         self._air = AirEffects(vehicle, options)
         self._mean_wind = options.wind
         self._wind: list[Array] = [0.0, 0.0, 0.0]
-        if not (not options.wind_blows or moved):
+        if options.wind_blows and not moved:
             raise InputError(
                 "effects: expected body_drag or rotor_drag, on which wind acts, got neither"
             )
@@ -79,8 +79,8 @@ class Effects(Kept):
     def begin(self, mask: Array, state: WorldState, factors: dict[str, Array]) -> Array:
         """Begin episodes of the worlds of a mask, bool, (W, A), at their rows of `state`.
 
-        Factors of the drawn parameters by name, (W, A), for all worlds. Gives the thrusts of those
-        that begin, (W, A, R), N.
+        Factors of the drawn parameters by name, (W, A), for all worlds. Returns the thrusts of the
+        worlds that begin, (W, A, R), N.
         """
         thrust = state.thrust
         if self.on_rotors:
@@ -96,8 +96,9 @@ class Effects(Kept):
 
     @property
     def wind(self) -> list[Array]:
-        """Velocity of the air without downwash, world frame, m/s: x, y, z, each (W, A) or alike for
-        all.
+        """Velocity of the air without downwash, world frame, m/s: x, y, z.
+
+        Each has the shape (W, A), or is one number for all.
         """
         if self._gusts is None:
             return self._wind
@@ -135,9 +136,9 @@ class Effects(Kept):
     def step(self, state: WorldState, mask: Array | None) -> tuple[Array, Array, Array | None]:
         """Advance the worlds of a mask, None for all, by a physics step, from `state` on.
 
-        Gives the mean thrust of each rotor over the step and that at its end, N, (W, A, R), and,
-        or None, the force (world frame, N) with the torque about the body's origin (body frame,
-        N·m), (W, A, 6).
+        Returns the mean thrust of each rotor over the step and its thrust at the end, N, (W, A, R).
+        Third, (W, A, 6) or None, the force (world frame, N) and the torque about the body's origin
+        (body frame, N·m).
         """
         mean = end = state.command
         root = None

@@ -42,15 +42,16 @@ class AirEffects(Kept):
     def __init__(self, vehicle: "Vehicle", options: EffectOptions) -> None:
         self._options = options
         self._half = 0.5 * vehicle.timestep
-        told = vehicle.coefficients
+        coefficients = vehicle.coefficients
+        drag = coefficients.drag
         rotors = vehicle.rotors
         self._center: Parts = tuple(vehicle.center_of_mass.tolist())
         self._geometry = np.array([(*rotor.position, *rotor.axis) for rotor in rotors])
         if options.body_drag:
-            linear = told.drag.linear
-            quadratic = told.drag.quadratic
-            self._angular = told.drag.angular
-            self._moment = told.drag.moment
+            linear = drag.linear
+            quadratic = drag.quadratic
+            self._angular = drag.angular
+            self._moment = drag.moment
             known = (linear, quadratic, self._angular, self._moment)
             if known == (None,) * 4:
                 raise InputError(
@@ -71,9 +72,10 @@ class AirEffects(Kept):
                     f"the physics step, got {stiffest:.4g}"
                 )
         if options.rotor_drag:
-            (coefficient,) = told.need("rotors.thrust_coefficient", "rotor_drag")
+            (coefficient,) = coefficients.need("rotors.thrust_coefficient", "rotor_drag")
             self._slope = math.sqrt(coefficient)  # of the square root of a thrust over the speed
-            three = (told.rotors.drag, told.rotors.inflow, told.rotors.lift)
+            table = coefficients.rotors
+            three = (table.drag, table.inflow, table.lift)
             if three == (None,) * 3:
                 raise InputError(
                     "vehicle: expected rotors.drag, inflow or lift in the vehicle's file, which "
@@ -87,7 +89,7 @@ class AirEffects(Kept):
             turning = vehicle.mass * arm / float(np.linalg.eigvalsh(vehicle.inertia)[0])
             _check_stiffness(vehicle, slope * max(1.0, turning), "drag of the rotors")
         if options.ground_effect:
-            (self._radius,) = told.need("rotors.radius", "ground_effect")
+            (self._radius,) = coefficients.need("rotors.radius", "ground_effect")
         self._factors: dict[str, Array] = {}
         self._rotors: list[Array] = []
         self._before: Array = None
@@ -178,7 +180,7 @@ class AirEffects(Kept):
     def _push(self, rotor: Array, thrust: Array, root: Array | None, around: list[Array]) -> Parts:
         """Force of a part of the rotors besides their thrust, body axes; the root as of `step`.
 
-        `around` has velocity and body rates, of each body axis its part upwards, and the height of
+        `around`: velocity, body rates, the upward component of each body axis, and the height of
         the body's origin.
         """
         place, axis = rotor

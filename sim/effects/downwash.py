@@ -42,7 +42,7 @@ class Downwash:
 
         U = sqrt(T / (2 ρ n π R²)),  V = U B_d / (s / l - s₀) / (1 + (√2 - 1) (r / h)²)²,
 
-    and h = l S (s / l - s₀). Jets of several drones add up, which is ours. Raises `InputError` for
+    and h = l S (s / l - s₀). Jets of several drones add up: our choice. Raises `InputError` for
     a vehicle without `rotors.radius`, or with a single rotor, which has no length.
     """
 
@@ -55,9 +55,9 @@ class Downwash:
         self._area = vehicle.num_rotors * math.pi * radius**2
 
     def velocity(self, thrust: Array, below: Array, beside: Array) -> Array:
-        """Speed of the air of a jet, m/s, of craft with such a thrust, N.
+        """Speed of the air in a jet, m/s.
 
-        At distances below it and from its axis, m; all of one shape.
+        Thrust of the craft, N; distances below it and from its axis, m; all of one shape.
         """
         hover = (thrust.clip(0.0) / (2 * DENSITY * self._area)) ** 0.5
         depth = below / self.length

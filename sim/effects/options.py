@@ -46,7 +46,7 @@ class EffectOptions:
     """Share of its thrust that each rotor gives, 0 to 1; empty: all of it."""
     payload: Annotated[float, Limits(0.0, 1e4, "kg")] = 0.0
     """Mass that hangs on a cable from the body's origin, kg. Several drones of a world carry one
-    ball together, of so much for each."""
+    ball together, with this mass for each drone."""
     cable: Annotated[float, Limits(0.05, 100.0, "m")] = 1.0
     """Length of each cable, m."""
     linear_drag: Annotated[float, Limits(0.0, MAX_DRAG, "/s")] = 0.0
@@ -58,7 +58,7 @@ class EffectOptions:
 
     @classmethod
     def from_options(cls, options: object) -> Self:
-        """Options by name. An unknown name raises `InputError`, which names those there are."""
+        """Options by name. An unknown name raises `InputError`, which names the known ones."""
         if not isinstance(options, Mapping):
             raise InputError(
                 f"effects: expected a mapping from names to values, got {shortened(options)}"
@@ -68,10 +68,12 @@ class EffectOptions:
 
     def to_options(self) -> dict[str, object]:
         """The reverse of `from_options`: those that differ from their default."""
-        values = {one.name: getattr(self, one.name) for one in fields(self)}
-        return {
-            one.name: values[one.name] for one in fields(self) if values[one.name] != one.default
-        }
+        changed = {}
+        for one in fields(self):
+            value = getattr(self, one.name)
+            if value != one.default:
+                changed[one.name] = value
+        return changed
 
     @property
     def wind_blows(self) -> bool:

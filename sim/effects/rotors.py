@@ -42,39 +42,38 @@ class RotorEffects(Kept):
     def __init__(self, vehicle: "Vehicle", options: EffectOptions) -> None:
         self._options = options
         self._step = vehicle.timestep
-        told = vehicle.coefficients
+        coefficients = vehicle.coefficients
         self._limits = vehicle.thrust_low, vehicle.thrust_high
         if options.motor_lag:
-            (rise,) = told.need("rotors.time_constant", "motor_lag")
-            fall = told.rotors.time_constant_down
+            (rise,) = coefficients.need("rotors.time_constant", "motor_lag")
+            fall = coefficients.rotors.time_constant_down
             self._times = [rise] if fall in (None, rise) else [rise, fall]
         if options.thrust_curve:
-            (self._curve,) = told.need("rotors.curve", "thrust_curve")
+            (self._curve,) = coefficients.need("rotors.curve", "thrust_curve")
             most = max(polynomial(self._curve, i / 100) for i in range(101))
-            expected = (
-                "a curve that ends at the largest thrust, c₀ + c₁ + ... = 1, and is no higher"
-            )
             ends = sum(self._curve)
             if not (abs(ends - 1) < 1e-3 and most < 1 + 1e-3):
+                expected = (
+                    "a curve that ends at the largest thrust, c₀ + c₁ + ... = 1, and is no higher"
+                )
                 raise InputError(
                     f"rotors.curve: expected {expected}, "
                     f"got an end of {ends:.4g}, and up to {most:.4g}"
                 )
         if options.battery:
             names = "battery.full battery.empty battery.capacity battery.resistance rotors.power"
-            full, empty, capacity, self._resistance, self._watts = told.need(names, "battery")
-            expected = f"at most battery.full, {full:g} V"
-            got = f"{empty:g} V"
-            if not empty <= full:
-                raise InputError(f"battery.empty: expected {expected}, got {got}")
+            numbers = coefficients.need(names, "battery")
+            full, empty, capacity, self._resistance, self._watts = numbers
+            if empty > full:
+                expected = f"at most battery.full, {full:g} V"
+                raise InputError(f"battery.empty: expected {expected}, got {empty:g} V")
             self._full = full
             self._empty = empty
             self._coulombs = 3600 * capacity
-        if options.motor_lag or options.thrust_curve or options.battery:
-            pushes = bool((vehicle.thrust_low >= 0).all())
+        one_way = options.motor_lag or options.thrust_curve or options.battery
+        if one_way and (vehicle.thrust_low < 0).any():
             expected = "rotors that push one way only, for motor_lag, thrust_curve and battery"
-            if not pushes:
-                raise InputError(f"vehicle: expected {expected}, got a thrust below 0")
+            raise InputError(f"vehicle: expected {expected}, got a thrust below 0")
         share = options.efficiency
         count = vehicle.num_rotors
         if len(share) not in (0, count):
@@ -87,9 +86,9 @@ class RotorEffects(Kept):
         self.voltage: Array = None
 
     def begin(self, mask: Array, thrust: Array, factors: dict[str, Array]) -> Array:
-        """Begin at the speeds of rotors that would give such thrusts; factors (W, A) by parameter.
+        """Start the rotors at the speeds that these thrusts need; factors (W, A) by parameter.
 
-        Gives the thrusts that they do give, (W, A, R), N.
+        Returns the thrusts that they give, (W, A, R), N.
         """
         options = self._options
         self.take(thrust, factors)
@@ -159,23 +158,20 @@ class RotorEffects(Kept):
         return _join(self._scaled(mean)), _join(self._scaled(end)), speed
 
     def _scaled(self, parts: Parts) -> Parts:
-        """What rotors with their efficiency and the drawn factor give."""
+        """Thrusts after the efficiency and the drawn factors."""
         for scales in self._scales:
             parts = [part * scale for part, scale in zip(parts, scales, strict=True)]
         return parts
 
     def _answer(self, time: Array) -> tuple[Array, Array, Array]:
-        """Of a speed that follows with a time constant: what a physics step changes.
-
-        With exp(-t / time) over the step: 1 less its end, its mean, and the mean of its square.
-        """
+        """Of exp(-t / time) over a physics step: 1 - its end, its mean, the mean of its square."""
         ratio = self._step / time
         number = isinstance(ratio, float)
         gone = -(float(np.expm1(-ratio)) if number else np.expm1(-ratio))
         return gone, gone / ratio, gone * (2 - gone) / (2 * ratio)
 
     def _follow(self, root: Array, wanted: Array) -> tuple[Array, Array, Array]:
-        """Of what begins at `root` and follows `wanted` over a step: mean square, end and mean."""
+        """A root that follows `wanted` over a step: its mean square, its end and its mean."""
         off = root - wanted
         answer = self._answers[0]
         if len(self._answers) == 2:
@@ -200,7 +196,7 @@ class RotorEffects(Kept):
         return 2 * opened / (1 + square_root(1 + 4 * drop * opened))
 
     def _terminal(self) -> Array:
-        """Voltage at the rotors' speeds; where they need more than there is, half the open one."""
+        """Voltage at the rotors' speeds; half the open one if they need more than there is."""
         opened = self._open_voltage()
         power = self._power([root * root for root in self._roots])
         rest = opened * opened - 4 * self._resistance * power

@@ -92,7 +92,7 @@ def readings_of(sensors: Values, vehicle: "Vehicle", period: float) -> tuple[Rea
 
 
 class Sensors(Kept):
-    """The sensors of a world's drones, from `checked_sensors`, at so many s between two samples.
+    """The sensors of a world's drones, from `checked_sensors`, with `period` s between two samples.
 
     Raises `InputError`.
     """

@@ -63,7 +63,7 @@ class Source(Kept):
     Class attributes:
         name: In the option `sensors`, and of the observation's array.
         settings: Settings that are no coefficients of a vehicle.
-        frame: Of the reading, and so are `components` and `units`.
+        frame: Of the reading; so are `components` and `units`.
     """
 
     name: ClassVar[str]

@@ -14,7 +14,7 @@ from .base import Sensor, Values
 class Channel(Kept):
     """Samples a sensor, given as its class and all its settings, every `period` s.
 
-    A reading is kept with a last number, 1 where it is new and 0 where the one before was held.
+    A reading has one number more: 1 if it is new, 0 if the last reading was held.
     """
 
     arrays = ("_now", "_held")
@@ -54,7 +54,7 @@ class Channel(Kept):
         self._late = [chosen(mask, old, late) for late in self._late or [old] * self._lag]
 
     def sample(self, mask: Array, steps: Array) -> None:
-        """After a control step of the drones of a mask; so many steps are behind each drone."""
+        """After a control step of the drones of a mask; `steps` counts those of each episode."""
         due = mask if self._every == 1 else mask & (steps % self._every == 0)
         fresh = due
         if np.any(due):

@@ -19,14 +19,14 @@ _PARTS: Final = ("position", "velocity", "quaternion", "body_rates")
 
 
 class Estimator(Source):
-    """Complementary filter: what the IMU gives is integrated, and pulled to what measures it.
+    """Complementary filter: integrates the IMU and corrects by the other sensors.
 
     Attitude: R. Mahony, T. Hamel, J.-M. Pflimlin, "Nonlinear Complementary Filters on the Special
     Orthogonal Group", IEEE TAC 53(5), 2008, equation 32, without its bias; the accelerometer's
     direction counts in proportion to its size over g, the magnetometer turns about the vertical
     alone. Position and velocity: a g-h filter with two equal poles (E. Brookner, "Tracking and
     Kalman Filtering Made Easy", 1998, section 1.2). The filter begins at the exact state, and
-    takes a late reading for one of now.
+    treats delayed readings as current.
 
     Settings are time constants: of the attitude; of height and climb rate, which follow the
     barometer; of position and velocity, which follow motion capture and GPS.
@@ -35,8 +35,8 @@ class Estimator(Source):
         values: All settings.
         interval: Time of a step, s.
         gravity: m/s².
-        altitude: Of the ground above sea level, m.
-        field: Earth's, world frame, shape (3,).
+        altitude: Height of the ground above sea level, m.
+        field: Earth's magnetic field, world frame, µT, shape (3,).
     """
 
     name = "estimate"
@@ -95,7 +95,7 @@ class Estimator(Source):
         self.body_rates = chosen(mask, rates, self.body_rates)
 
     def _correction(self, force: Array, channels: Mapping[str, Channel]) -> Array:
-        """Rotation vector in the body frame that pulls the attitude to what measures it, rad."""
+        """Rotation vector in the body frame that corrects the attitude, rad."""
         up = world_z(self.quaternion)
         share = 1 - math.exp(-self.interval / self.values["attitude_time"])
         angle = share / self._gravity * stack(cross(parts_of(force), parts_of(up)))
@@ -113,7 +113,7 @@ class Estimator(Source):
     def _followed(
         self, position: Array, velocity: Array, channels: Mapping[str, Channel]
     ) -> tuple[Array, Array]:
-        """Position and velocity, pulled to what measures them."""
+        """Position and velocity, corrected by fresh readings."""
         if channel := channels.get("barometer"):
             zero = 0.0 * component(position, 2)
             off = component(channel.value, 0) - self._altitude - component(position, 2)
@@ -132,7 +132,7 @@ class Estimator(Source):
         return position, velocity
 
     def _gain(self, channel: Channel, time: str) -> Array:
-        """Share of an error that a fresh reading takes away; 0 where there is none."""
+        """Share of an error that a fresh reading removes; 0 without a fresh reading."""
         return (1 - math.exp(-channel.interval / self.values[time])) * channel.fresh
 
     def _gains(self, channel: Channel, time: str) -> tuple[Array, Array]:
@@ -145,5 +145,5 @@ class Estimator(Source):
         return np.concat([getattr(self, name) for name in _PARTS], axis=-1)
 
     def seen(self, state: WorldState) -> WorldState:
-        """A state with the estimate in place of what is estimated."""
+        """The state with estimated position, velocity, quaternion and body rates."""
         return replace(state, **{name: getattr(self, name) for name in _PARTS})
