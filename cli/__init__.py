@@ -2,8 +2,8 @@
 
 Exit statuses: 0 done; 1 an error of the user, the other side or the system, in one sentence, or a
 check that failed; 2 a wrong flag, no OpenGL for a command that draws, or a file to examine that is
-no vehicle; 130 Ctrl-C;
-141 standard output is closed; 143 SIGTERM. A bug of ours keeps its traceback.
+no vehicle; 130 Ctrl-C; 141 standard output is closed; 143 SIGTERM. A bug of ours keeps its
+traceback.
 """
 
 import ast
@@ -77,7 +77,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     _show_log()
     # A terminated command says Close to the other side before it ends.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
-    # Nor in a process that this one starts.
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _interrupt)
+    # Processes that this one starts import nothing from the working directory either.
     os.environ.setdefault("PYTHONSAFEPATH", "1")
     # A second thread of NumPy's products loses on small networks, and takes the simulator's core.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -101,6 +103,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"rotorgram: {_printable(sentence)}", file=sys.stderr)
         return getattr(error, "exit_status", 1)
     return status
+
+
+class _Interrupted(KeyboardInterrupt):
+    """Ctrl-C. After `KeyboardInterrupt` itself has ended an `exec`, which makes dataclasses,
+    `python -m` ends by the signal, and the exit status of `main` is lost.
+    """
+
+
+def _interrupt(*_: object) -> None:
+    raise _Interrupted
 
 
 def _run(words: list[str]) -> int:

@@ -29,8 +29,9 @@ def load_checkpoint(name: str) -> Checkpoint | Controller:
 
 
 def trained(name: str, *others: str) -> Checkpoint:
-    """The checkpoint of a file or a training's folder. Raises `InputError`, whose sentence names
-    the others that are right.
+    """The checkpoint of a file or a training's folder.
+
+    Raises `InputError`; the message also lists `others`.
     """
     path = Path(name)
     file = path / CHECKPOINT if path.is_dir() else path
@@ -56,20 +57,20 @@ def chosen_env(
     options = command.options
     if isinstance(checkpoint, type):
         level = checkpoint.options.get("action")
-        if level and "action" not in options and is_known(env_id):
-            right = level in task_type(env_id).actions
-            expected = f"a task flown by {level}"
-            if not right:
-                raise InputError(
-                    f"{checkpoint.__name__.lower()}: expected {expected}, "
-                    f"got {env_id}; name one with --env"
-                )
+        is_needed = level and "action" not in options and is_known(env_id)
+        if is_needed and level not in task_type(env_id).actions:
+            raise InputError(
+                f"{checkpoint.__name__.lower()}: expected a task flown by {level}, "
+                f"got {env_id}; name one with --env"
+            )
         return env_id, {**checkpoint.options, **options}
     if checkpoint is None or ("env" in command.given and env_id != checkpoint.env_id):
         return env_id, options
-    wanted = f"--env {checkpoint.env_id} with options of the task that the policy was trained on"
-    if not (not options or env_id == checkpoint.env_id):
-        raise InputError(f"env: expected {wanted}, got options of {env_id}")
+    if options and env_id != checkpoint.env_id:
+        raise InputError(
+            f"env: expected --env {checkpoint.env_id} with options of the task that the policy "
+            f"was trained on, got options of {env_id}"
+        )
     env = checkpoint.env_id, {**checkpoint.options, **options}
     own = getattr(command, "listen", None) is None  # a simulator of our own flies it
     if own and is_known(env[0]):
@@ -94,9 +95,9 @@ def chosen_drones(command: EnvFlags, checkpoint: Checkpoint | Controller | None)
 
 
 def chosen_vehicle(command: EnvFlags, checkpoint: Checkpoint | Controller | None) -> str | None:
-    """The vehicle of the flags, or that of the checkpoint's own env.
+    """The vehicle of the flags, or else the vehicle of the checkpoint's env.
 
-    Where a simulator comes by itself, it is the simulator's.
+    With --listen the simulator has the vehicle: only the flag counts.
     """
     env = checkpoint.env if isinstance(checkpoint, Checkpoint) else None
     comes = getattr(command, "listen", None) is not None
@@ -107,7 +108,7 @@ def chosen_vehicle(command: EnvFlags, checkpoint: Checkpoint | Controller | None
 
 
 def with_vehicle(command: F, *names: str) -> F:
-    """The command with the vehicle of the first policy that has one, unless a flag names one."""
+    """The command with the vehicle of its flag, or else of the first policy that has a vehicle."""
     for name in names:
         if name != "random" and Path(name).suffix != ".mcap":
             vehicle = chosen_vehicle(command, load_checkpoint(name))
@@ -127,16 +128,17 @@ def policy_for(command: EnvFlags, checkpoint: Checkpoint | Controller, spec: Env
 
 
 def _check_vehicle(command: EnvFlags, checkpoint: Checkpoint, spec: EnvSpec) -> None:
-    """Raise `InputError` for another vehicle than the policy's that the user has not named."""
+    """Raise `InputError` if the vehicle is not the policy's and the user has not named it."""
     trained = checkpoint.spec
     drags = [one.options.get("effects", {}).get("linear_drag") for one in (trained, spec)]
     same_drag = drags[0] == drags[1]
     other = trained.vehicle_hash != spec.vehicle_hash and same_drag
-    right = not other or "vehicle" in command.given
-    then, now = (f"{one.vehicle} (model {one.vehicle_hash[:8]})" for one in (trained, spec))
-    wanted = f"{then}, on which the policy was trained"
-    if not right:
-        raise InputError(f"vehicle: expected {wanted}, got {now}; name one with --vehicle")
+    if other and "vehicle" not in command.given:
+        then, now = (f"{one.vehicle} (model {one.vehicle_hash[:8]})" for one in (trained, spec))
+        raise InputError(
+            f"vehicle: expected {then}, on which the policy was trained, got {now}; "
+            "name one with --vehicle"
+        )
 
 
 def pilot_of(
@@ -177,7 +179,7 @@ def remote_env(
     """A remote env with a simulator of its own, on a backend, or those that come to
     `command.listen`; at the end the counters of the wire are printed.
 
-    It is a vector env without autoreset; None are as many drones as the first simulator has. Where
+    It is a vector env without autoreset. `num_envs` None: as many as the first simulator has. Where
     it is `required`, simulators that come must fly this task, with these options (not the default
     ones) if there are any; otherwise the first that comes decides. Raises `InputError` for flags
     that contradict each other.
@@ -190,16 +192,18 @@ def remote_env(
         settings = {"env_id": env_id, "options": options or None} if required else {}
         opened = _waiting(command, command.listen, num_envs, num_simulators, **settings)
     else:
-        alone = num_simulators == 1
-        local = not (command.key_file or command.insecure)
-        if not alone:
+        if num_simulators != 1:
             raise InputError(f"num-simulators: expected 1 without --listen, got {num_simulators}")
-        own = "them for a simulator of our own on this machine"
-        if not local:
-            raise InputError(f"key-file, insecure: expected them with --listen, got {own}")
-        reason = "the task is not known here without the module that registers it"
+        if command.key_file or command.insecure:
+            raise InputError(
+                "key-file, insecure: expected them with --listen, "
+                "got them for a simulator of our own on this machine"
+            )
         if not is_known(env_id):
-            raise InputError(f"env: expected --env MODULE:{env_id}, for {reason}")
+            raise InputError(
+                f"env: expected --env MODULE:{env_id}, "
+                "for the task is not known here without the module that registers it"
+            )
         config = EnvConfig.from_keywords(
             env_id, drones=drones, vehicle=command.vehicle, backend=backend, **options
         )
@@ -234,7 +238,7 @@ def _waiting(
         print(f"waiting for {waited} at {here} (Ctrl-C ends)", flush=True)
         remote.connect()
         came = len(remote.env_spec.agents)
-        if not ("drones" not in command.given or came == command.drones):
+        if "drones" in command.given and came != command.drones:
             raise InputError(
                 f"drones: expected a simulator of {command.drones} in each world, got one of {came}"
             )

@@ -283,11 +283,13 @@ def named_value(flag: str, word: str) -> tuple[str, Any]:
 
 def _given(words: Sequence[str]) -> frozenset[str]:
     """Names of the flags among the words, as fields are named."""
-    flags = (word[2:].partition("=")[0].replace("-", "_") for word in words if word[:2] == "--")
-    return frozenset(
-        prefix + dot + name.removeprefix("no_")
-        for prefix, dot, name in (flag.rpartition(".") for flag in flags)
-    )
+    names = set()
+    for word in words:
+        if word.startswith("--"):
+            flag = word.removeprefix("--").partition("=")[0].replace("-", "_")
+            prefix, dot, name = flag.rpartition(".")
+            names.add(prefix + dot + name.removeprefix("no_"))
+    return frozenset(names)
 
 
 def _without_requirements(words: Sequence[str]) -> tuple[list[str], Options]:
@@ -313,7 +315,8 @@ def _without_requirements(words: Sequence[str]) -> tuple[list[str], Options]:
 def parse_address(text: str) -> tuple[str, int]:
     """HOST:PORT as a pair. Raises `InputError`."""
     host, _, port = text.rpartition(":")
-    if not (host and port.isascii() and port.isdecimal() and int(port) <= 65535):
+    is_port = re.fullmatch(r"[0-9]{1,5}", port) is not None and int(port) <= 65535
+    if not host or not is_port:
         raise InputError(
             f"address: expected HOST:PORT with a port up to 65535, got {shortened(text)}"
         )
@@ -322,7 +325,7 @@ def parse_address(text: str) -> tuple[str, int]:
 
 def check_count(name: str, value: int | None) -> None:
     """Raises `InputError` for a number that is given and less than 1."""
-    if not (value is None or value >= 1):
+    if value is not None and value < 1:
         raise InputError(f"{name}: expected at least 1, got {value}")
 
 

@@ -163,7 +163,8 @@ class StudyFlags(BackendFlags, WorkersConfig):
         name = "" if row.name == row.default_name else row.name
         if row.controller:
             return replace(row, name=name, env=env)
-        return replace(row, name=name, env=env, set={**row.set, **self.changes()}, **settings)
+        changes = {**row.set, **self.changes()}
+        return replace(row, name=name, env=env, set=changes, **settings)
 
 
 def report(folder: Path, *, page: Path | None = None, film: bool = True) -> None:

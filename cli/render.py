@@ -147,7 +147,7 @@ def parse_size(text: str) -> tuple[int, int]:
 
 
 def _distinct(names: Sequence[str], what: Sequence[str]) -> list[str]:
-    """The names; equal ones get the words that the user typed, then a number."""
+    """The names; equal names get the words that the user typed, then a number."""
     longer = []
     for name, words in zip(names, what, strict=True):
         is_repeated = names.count(name) > 1 and words not in _ALIKE

@@ -3,13 +3,18 @@
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 from ..models.errors import InputError
 from ._flags import BackendFlags, parse_address
 
 if TYPE_CHECKING:
     from ..udp import Simulator
+
+_OF_ONE_AGENT: Final = ("server", "num_envs", "codec", "record")
+"""Flags that --agents excludes."""
+_OF_AGENTS: Final = ("when_lost", "patience")
+"""Flags that need --agents."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +35,7 @@ class Sim(BackendFlags):
     """Several agents in place of one --server: HOST:PORT of each. They fly one world, and share its
     drones evenly in their order."""
     when_lost: Literal["hold", "land", "end"] = "hold"
-    """What drones do whose agent is lost, of --agents: hold, land or end (rotors stand still)."""
+    """With --agents, what a lost agent's drones do: hold, land or end (rotors stand still)."""
     patience: float = 10.0
     """Seconds that the world waits for the command of one of --agents."""
     codec: Literal["binary", "text"] = "binary"
@@ -62,9 +67,7 @@ class Sim(BackendFlags):
 
         several = "agents" in self.given
         wrong = "with" if several else "without"
-        for name in (
-            ("server", "num_envs", "codec", "record") if several else ("when_lost", "patience")
-        ):
+        for name in _OF_ONE_AGENT if several else _OF_AGENTS:
             if name in self.given:
                 flag = f"--{name.replace('_', '-')}"
                 raise InputError(f"{flag}: cannot be used {wrong} --agents")

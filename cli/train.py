@@ -73,8 +73,8 @@ class Train(AgentFlags, BackendFlags):
     seed: int = 0
     """Seed of weights, actions and episodes."""
     env_steps: int | None = None
-    """Env steps to train for. Default: those of the preset. With --resume, more of them extend a
-    training; a learning rate that falls, falls over all of them."""
+    """Env steps to train for. Default: those of the preset. With --resume, a larger number
+    extends a training; a decreasing learning rate then decreases over all of them."""
     num_envs: int | None = None
     """Drones that fly at the same time, in lock-step. Env steps count all of them. Default: those
     of the preset."""
@@ -158,11 +158,13 @@ class Train(AgentFlags, BackendFlags):
 
         with locked(folder):
             kept = load(folder / CHECKPOINT)
-            others = f"a training of {self.algorithm}, {folder} holds one of {kept.algorithm}"
             if kept.algorithm != self.algorithm:
-                raise InputError(f"resume: expected {others}")
+                raise InputError(
+                    f"resume: expected a training of {self.algorithm}, "
+                    f"{folder} holds one of {kept.algorithm}"
+                )
             refuse_settings(self, folder, free=("algorithm", *_FREE))
-            if not ("env" not in self.given or self.env_id == kept.env_id):
+            if "env" in self.given and self.env_id != kept.env_id:
                 raise InputError(f"resume: expected --env {kept.env_id}, got {self.env}")
             if self.env_steps is not None:
                 kept = self._extended(kept, folder)
@@ -179,7 +181,7 @@ class Train(AgentFlags, BackendFlags):
                 return self._train(Training.resume(kept, env), folder)
 
     def _extended(self, kept: Checkpoint, folder: Path) -> Checkpoint:
-        """The checkpoint with more env steps to fly, which `config.json` gets too."""
+        """The checkpoint with more env steps to fly; `config.json` gets their number too."""
         env_steps = self.env_steps or 0
         if env_steps < kept.env_steps:
             raise InputError(

@@ -47,9 +47,11 @@ class View(EnvFlags):
         with open_view(shown, spec, drones, Pace(spec.control_period, self.speed)) as live:
             print(f"showing {self.what} in the window (Ctrl-C ends)", flush=True)
             for flight in chain((first,), flights):
-                told = [moments(one) for one in flight]
-                longest = max(map(len, told))
-                frames = zip(*(own + [own[-1]] * (longest - len(own)) for own in told), strict=True)
+                shown_moments = [moments(one) for one in flight]
+                longest = max(map(len, shown_moments))
+                # A drone whose episode has ended stays as it ended.
+                padded = [own + [own[-1]] * (longest - len(own)) for own in shown_moments]
+                frames = zip(*padded, strict=True)
                 if not all(live.draw_in_time(*frame) for frame in frames):
                     break
                 for one, name in zip(flight, names or ("",), strict=True):
@@ -63,7 +65,8 @@ class View(EnvFlags):
         """Episode after episode, as long as there are any, each with a trajectory of each drone."""
         from ._env import chosen_drones, chosen_vehicle, pilot_of
 
-        if (path := Path(self.what)).suffix == ".mcap":
+        path = Path(self.what)
+        if path.suffix == ".mcap":
             if self.options.keys() - {"scene"}:
                 raise InputError("env: expected no options with a journal, which has its own")
             yield from ([one] for one in recorded_trajectories(path))

@@ -12,8 +12,10 @@ import gymnasium as gym
 import numpy as np
 import rotorgram.envs  # noqa: F401  # registers the envs
 
-PLANS, HORIZON = 20, 40  # plans in each control step, and their control steps
-SPREAD, SHRINK = 0.5, 0.5  # of random changes of a plan
+PLANS = 20  # in each control step
+HORIZON = 40  # control steps of a plan
+SPREAD = 0.5  # of random changes of a plan, at first
+SHRINK = 0.5  # of the spread, after every fifth plan
 
 parser = argparse.ArgumentParser()
 parser.add_argument("--steps", type=int, default=150, help="control steps of 20 ms")

@@ -25,11 +25,11 @@ while not reply.endswith(b"close"):
     if sequence != last:  # a repeat gets the answer that it did not hear
         reward, terminated, truncated, error, rate, thrust = map(float, fields[:6])
         last = sequence
-        steps = steps + 1
-        total = total + reward
+        steps += 1
+        total += reward
         if terminated or truncated:
             print(f"episode {episodes}: {steps - 1} steps, return {total:.1f}", flush=True)
-            episodes = episodes + 1
+            episodes += 1
             steps = 0
             total = 0.0
             reply = f"{sequence},{'reset' if episodes < 3 else 'close'}".encode()

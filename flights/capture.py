@@ -191,7 +191,8 @@ def _take(job: _Job, tell: Tell) -> list[Frame]:
     with closing(opened) as cameras:
         for row in range(len(poses)):
             number = job.first + row
-            is_missing = number in job.missing  # others serve optical flow alone
+            # Other rows are drawn only as the earlier frame of a flow.
+            is_missing = number in job.missing
             due = dict.fromkeys(cameras.pictures, everybody & is_missing)
             begun = everybody & (row == 0)
             rng = {0: np.random.default_rng([job.plan.seed, 0, number])}  # sources count from 1

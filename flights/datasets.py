@@ -270,8 +270,8 @@ def write_minari(
         batch: list[Any] = []
         for episode in episodes:
             batch.append(_buffer(spec, episode))
-            count = count + 1
-            steps = steps + len(episode)
+            count += 1
+            steps += len(episode)
             if len(batch) == _BATCH:
                 data.update_dataset_from_buffer(batch)
                 batch = []

@@ -19,8 +19,8 @@ class FolderBusy(InputError):
 
 
 def new_folder(out: Path | None, name: str, runs: Path = Path("runs")) -> Path:
-    """Make the folder to write to: `out`, or one in `runs`, named by the command and the time; a
-    second one of the same second gets a number.
+    """Make the folder to write to: `out`, or one in `runs`, named by the command and the time; if
+    that name is taken, `-2`, `-3`… is added.
 
     Raises `InputError` if `out` exists, or the place allows no folder.
     """

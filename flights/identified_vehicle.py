@@ -18,9 +18,10 @@ _OF_FILE: Final = ("body.size", "body.ground_clearance", "rotors.speed")
 
 
 class Origin(NamedTuple):
-    """Source of a number and a reason; an empty source stands for that of the vehicle's file."""
+    """Where a number of the file comes from."""
 
     source: str
+    """Empty: the source in the vehicle's file."""
     why: str = ""
 
 
@@ -65,7 +66,8 @@ def vehicle_toml(vehicle: Vehicle, numbers: Numbers, origins: Mapping[str, Origi
                 continue
             origin = origins.get(name, Origin(""))
             known = given[name].source if name in given else f"as in {own}"
-            text = f"value = {_plain(value)}, source = {_quoted(origin.source or known)}"
+            source = origin.source or known
+            text = f"value = {_plain(value)}, source = {_quoted(source)}"
             if origin.why:
                 text += f", why = {_quoted(origin.why)}"
             lines.append(f"{name.rpartition('.')[2]} = {{ {text} }}")

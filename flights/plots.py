@@ -149,7 +149,7 @@ def _places(panels: Sequence[Panel]) -> list[tuple[int, int]]:
     column = 0
     for panel in panels:
         if column and (panel.wide or column == _COLUMNS):
-            row = row + 1
+            row += 1
             column = 0
         places.append((row, column))
         column += _COLUMNS if panel.wide else 1

@@ -2,6 +2,7 @@
 
 import csv
 import io
+import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -94,7 +95,7 @@ def write_csv(flights: Sequence[Trajectory], out: Path) -> int:
             writer.writerow([f"{c.name} [{c.unit}]" if c.unit else c.name for c in columns])
         numbers = (column.values.tolist() for column in columns)
         for row in zip(*numbers, strict=True):
-            writer.writerow(["" if value != value else value for value in row])
+            writer.writerow(["" if math.isnan(value) else value for value in row])
             rows += 1
     write_new(out, text.getvalue())
     return rows

@@ -6,7 +6,7 @@ RIGID and MUJOCO are folders of `rotorgram compare` with the same settings but f
 the number of seeds. Of the seeds that both have, the file has a row for each agent and measure: the
 interquartile means, the difference `mujoco` - `rigid`, and its 95 % bootstrap interval.
 
-It takes about a few seconds on two cores.
+It takes a few seconds on two cores.
 """
 
 from pathlib import Path
@@ -44,7 +44,7 @@ def compared(name: str, rigid: Path, mujoco: Path) -> list[dict[str, object]]:
     """The rows of a pair of folders."""
     seeds = [set(Results.read(folder).runs["seed"]) for folder in (rigid, mujoco)]
     both = seeds[0] & seeds[1]
-    if not len(both) > 1:
+    if len(both) < 2:
         raise InputError(
             f"{name}: expected folders with two seeds or more in common, got {len(both)}"
         )

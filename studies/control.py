@@ -75,7 +75,7 @@ STEPS: dict[str, tuple[int, float, str, float, Callable[[WorldState], float]]] =
 def response(name: str, level: str) -> dict[str, float]:
     """Rise time, overshoot and settling time of a step from hover."""
     vehicle = Vehicle.load(name)
-    (index, size, _, time, read) = STEPS[level]
+    index, size, _, time, read = STEPS[level]
     effects = EffectOptions(motor_lag=lag_of(vehicle) > 0)
     world = make_world(vehicle, 1, effects=effects)
     controller = make_controller(level, vehicle, vehicle.timestep, effects)

@@ -2,7 +2,7 @@
 
 Run `python studies/draw_cameras.py`; it needs no display.
 
-It takes about a few seconds on two cores.
+It takes a few seconds on two cores.
 """
 
 from measuring import IMAGES, options
@@ -30,14 +30,14 @@ def draw() -> Image.Image:
     rows = -(-len(views) // COLUMNS)
     size = (COLUMNS * (WIDTH + SPACE) - SPACE, rows * (HEIGHT + SPACE) - SPACE)
     sheet = Image.new("RGB", size, "white")
-    for number, (world, camera) in enumerate(views):
-        stage = Stage(world)
+    for number, (scene, camera) in enumerate(views):
+        stage = Stage(scene)
         with Canvas(stage, WIDTH * TIMES, HEIGHT * TIMES) as canvas:
             for moment in flight[: STEP + 1]:
                 stage.show(moment)
             picture = Image.fromarray(canvas.draw(camera)).reduce(TIMES)
         write = ImageDraw.Draw(picture)
-        name = camera if world == "airport" else f"{camera}, --scene {world}"
+        name = camera if scene == "airport" else f"{camera}, --scene {scene}"
         font = ImageFont.load_default(15)
         box = write.textbbox((10, 8), name, font)
         around = (box[0] - 5, box[1] - 4, box[2] + 5, box[3] + 4)

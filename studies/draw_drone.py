@@ -2,7 +2,7 @@
 
 Run `python studies/draw_drone.py`; it needs EGL (on Debian: libegl1, libgl1-mesa-dri).
 
-It takes about a few seconds on two cores.
+It takes a few seconds on two cores.
 """
 
 import os

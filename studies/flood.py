@@ -106,8 +106,8 @@ def train(run: Run, flood_seconds: float) -> dict[str, Any]:
             "agent": env.statistics.numbers(),
         }
     if len(marks) > 1:
-        (began, first) = marks[0]
-        (ended, last) = marks[-1]
+        began, first = marks[0]
+        ended, last = marks[-1]
         result["flooded_seconds"] = round(ended - began, 1)
         result["flooded_steps_per_second"] = round((last - first) / (ended - began))
     return result

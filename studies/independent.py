@@ -251,8 +251,8 @@ class Equations:
         acceleration = (turn @ (force.sum(axis=0) + body) + self.weight) / self.mass
         spin = self.inverse @ (torque - cross(rates, self.inertia @ rates))
         w = q[0]
-        (x, y_, z) = q[1:]
-        (a, b, c) = 0.5 * rates
+        x, y_, z = q[1:]
+        a, b, c = 0.5 * rates
         turning = (
             -x * a - y_ * b - z * c,
             w * a + y_ * c - z * b,

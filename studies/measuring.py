@@ -74,7 +74,7 @@ def in_turns(
 
 
 def timed(step: Callable[[], object], seconds: float) -> tuple[float, float]:
-    """Seconds of a step, by the clock and of a processor: means over as many as take so long."""
+    """Mean wall time and processor time of a step, s, over three steps or more of `seconds`."""
     count = 0
     began = time.perf_counter()
     used = time.process_time()

@@ -215,7 +215,9 @@ def simulated(vehicle: Vehicle, windows: Windows, *, rotors: bool = True) -> Flo
 def regressed(vehicle: Vehicle, flights: Sequence[FlightLog]) -> dict[str, float]:
     """Thrust coefficient and linear drag by a regression of accelerations, in body axes."""
     axes = np.array([rotor.axis for rotor in vehicle.rotors])
-    forces, axials, velocities = [], [], []
+    forces = []
+    axials = []
+    velocities = []
     for flight in flights:
         inner = slice(2, -2)
         quaternion = flight.states[inner, 3:7]

@@ -6,7 +6,7 @@ The env, a blocking echo of the same sizes whose two processes share a core, and
 its simulator take turns of a moment; medians over the rounds count. Prints microseconds, and the
 step as a multiple of env and echo together.
 
-It takes about a few seconds on two cores.
+It takes a few seconds on two cores.
 """
 
 from contextlib import ExitStack

@@ -69,7 +69,7 @@ typedef struct {
 
 static int udp;
 static struct sockaddr_in simulator; /* the one that this agent is pinned to, once `begun` */
-static char answer[MAX_BYTES];      /* the last one, which every repeat gets again */
+static char answer[MAX_BYTES];       /* the last one, which every repeat gets again */
 
 /* Parsing. Each function reads one piece of the grammar at *at and goes behind it, if it is there. */
 

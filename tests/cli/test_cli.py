@@ -115,6 +115,7 @@ def test_help_names_the_default_backend(
         (["train", "a2c", "--out", "/proc/run"], "out: cannot make /proc/run: "),
         (["train", "vpg", "--resume", "nowhere"], "nowhere: expected a folder, there is none"),
         (["sim", "--server", "127.0.0.1:99999"], "address: expected HOST:PORT"),
+        (["sim", "--server", "127.0.0.1:" + 5000 * "1"], "address: expected HOST:PORT"),
         (["sim", "--env", "rotorgram/Nothing-v0"], "env: expected a registered id"),
         (["sim", "--env", ":"], "env: expected MODULE:NAME with the name of a module, got ':'"),
         (["sim", "--env", "nowhere:Nothing-v0"], "env: expected a module nowhere here, got none"),
@@ -164,6 +165,27 @@ def test_wrong_flags_name_what_was_expected(
     assert status == 2
     assert "Traceback" not in out + err
     assert arguments[-1] in out + err or arguments[-2] in out + err
+
+
+INTERRUPTED = """
+import os, signal, sys
+from rotorgram import cli
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may ignore it
+cli._run = lambda words: exec("os.kill(os.getpid(), signal.SIGINT)")
+sys.exit(cli.main([]))
+"""
+
+
+def test_ctrl_c_while_a_dataclass_is_made_exits_with_130(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without our exception, Python ends a module that it runs by `-m` by the signal."""
+    (tmp_path / "interrupted.py").write_text(INTERRUPTED)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    command = [sys.executable, "-m", "interrupted"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 130
+    assert done.stderr == "rotorgram: interrupted\n"
 
 
 def test_no_command_and_an_unknown_one(capsys: pytest.CaptureFixture[str]) -> None:

@@ -160,7 +160,7 @@ def test_wrong_words_are_one_sentence(
     Path("there.toml").touch()
     Path("there.xml").touch()
     status, out, err = run(capsys, *words)
-    assert status == 2 if words[0] == "check" else 1
+    assert status == (2 if words[0] == "check" else 1)
     assert out == ""
     assert re.match(rf"rotorgram: {sentence}.*\n$", err)
 
