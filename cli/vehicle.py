@@ -73,8 +73,8 @@ class Vehicle(Command):
 
     new: write a commented file that flies. show: print derived values, and each number with its
     source. check: examine anyone's multirotor (mass, units, rotors, hover, integrator, flights,
-    floor); exit status 1 if a check fails, 2 if the file is no free body with actuators. export:
-    write MJCF for MuJoCo alone.
+    floor); exit status 1 if a check fails, 2 if flying refuses the file. export: write
+    MJCF for MuJoCo alone.
     """
 
     action: Positional[Literal["new", "show", "check", "export"]]

@@ -6,7 +6,7 @@ Body frame: that of the free body, x forward, y left, z up; SI units.
 
 import math
 import struct
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from hashlib import blake2b
@@ -226,21 +226,16 @@ class Vehicle:
         return partial(Vehicle.load, linear_drag=self.linear_drag), (str(self.path),)
 
 
-def compile_vehicle(
-    path: Path, repair: Callable[[mujoco.MjSpec], None] = lambda spec: None
-) -> tuple[mujoco.MjSpec, str, mujoco.MjModel, mujoco.MjData]:
-    """A file's spec, its text, its model, and the vehicle level at the origin.
-
-    `repair` may change the spec in place. Raises `InputError` if there is no free body with
-    actuators.
+def _compile(path: Path) -> tuple[mujoco.MjSpec, str, mujoco.MjModel, mujoco.MjData]:
+    """A file's spec, its text, its model, and the vehicle level at the origin. Raises
+    `InputError`.
     """
     try:
         spec = vehicle_spec(path)
-        repair(spec)
         spec.comment = ""
         text = spec.to_xml()
         model = spec.compile()
-        _check_structure(model)
+        _check_flyable(model)
         data = level_data(model)
         mujoco.mj_forward(model, data)
     except InputError:
@@ -307,16 +302,13 @@ def body_axes(model: mujoco.MjModel) -> np.ndarray:
     return axes
 
 
-def _check_structure(model: mujoco.MjModel) -> None:
-    """Raise `InputError` for a model that is no free body with actuators."""
-    for name in dir(model):
-        array = getattr(model, name)
-        finite = getattr(array, "dtype", None) != np.float64 or np.isfinite(array).all()
-        if not finite:
-            raise InputError(f"vehicle: expected finite numbers, got others in {name}")
-    for name in ("timestep", "gravity", "wind", "density", "viscosity"):
-        if not np.isfinite(getattr(model.opt, name)).all():
-            raise InputError(f"vehicle: expected finite numbers, got others in {name}")
+def _check_flyable(model: mujoco.MjModel) -> None:
+    """Raise `InputError` unless a model is one free body with actuators that can be stepped."""
+    for owner in (model, model.opt):
+        for name in dir(owner):
+            value = getattr(owner, name)
+            if isinstance(value, float | np.ndarray) and not np.isfinite(value).all():
+                raise InputError(f"vehicle: expected finite numbers, got others in {name}")
     heaviest = float(model.body_mass.max())
     if heaviest > _MAX_MASS:
         raise InputError(f"vehicle: expected a mass of at most {_MAX_MASS:g} kg, got {heaviest:g}")
@@ -326,14 +318,10 @@ def _check_structure(model: mujoco.MjModel) -> None:
         raise InputError(f"vehicle: expected one free body and no other joints, got {got}")
     if not model.nu:
         raise InputError("vehicle: expected at least one rotor, an actuator at a site, got none")
-
-
-def _check_flyable(model: mujoco.MjModel) -> None:
-    """Raise `InputError` for a vehicle's model that does not fall, or that cannot be stepped."""
     mass = float(model.body_subtreemass[model.jnt_bodyid[0]])
     gravity = model.opt.gravity
-    right = mass > 0 and gravity[2] < 0 and not gravity[:2].any()
-    if not right:
+    falls = mass > 0 and gravity[2] < 0 and not gravity[:2].any()
+    if not falls:
         got = f"{mass:g} kg and {gravity.tolist()} m/s²"
         raise InputError(f"vehicle: expected a mass > 0 and gravity along -z, got {got}")
     step = model.opt.timestep
@@ -345,15 +333,13 @@ def _check_flyable(model: mujoco.MjModel) -> None:
 @lru_cache(maxsize=32)
 def _load(path: Path, drag: float, changed: tuple[int, ...]) -> Vehicle:
     del changed  # a file that was written anew is another key
-    spec, text, model, data = compile_vehicle(path)
-    _check_flyable(model)
+    spec, text, model, data = _compile(path)
     gravity = -float(model.opt.gravity[2])
-    mass, center, inertia = mass_properties(model, data)
-    for index in range(model.nu):
-        for expected, got in rotor_faults(model, index):
-            raise InputError(f"vehicle: expected {expected}, got {got}")
-    rotors = tuple(read_rotor(model, data, index) for index in range(model.nu))
-    allocation = allocate(rotors, center)
+    body = int(model.jnt_bodyid[0])
+    mass = float(model.body_subtreemass[body])
+    center = data.subtree_com[body].copy()
+    rotors = tuple(_read_rotor(model, data, index) for index in range(model.nu))
+    allocation = _allocate(rotors, center)
     model.dof_damping[0:3] = drag * mass
     _group(model)
     return Vehicle(
@@ -365,86 +351,70 @@ def _load(path: Path, drag: float, changed: tuple[int, ...]) -> Vehicle:
         mass=mass,
         gravity=gravity,
         center_of_mass=center,
-        inertia=inertia,
+        inertia=inertia_matrix(data.crb[body, :6]),
         rotors=rotors,
         allocation=allocation,
         hover_thrust=_hover(rotors, allocation, mass * gravity),
-        rest_height=find_rest_height(model, data),
-        coefficients=read_coefficients(model),
+        rest_height=_find_rest_height(model, data),
+        coefficients=_read_coefficients(model),
         file_cameras=read_cameras(spec, model),
     )
 
 
-def mass_properties(
-    model: mujoco.MjModel, data: mujoco.MjData
-) -> tuple[float, np.ndarray, np.ndarray]:
-    """Mass, center of mass and inertia about it of the free body and what is welded to it.
-
-    `data` is at the origin and level. Units and shapes as of `Vehicle`.
-    """
-    body = int(model.jnt_bodyid[0])
-    inertia = inertia_matrix(data.crb[body, :6])
-    return float(model.body_subtreemass[body]), data.subtree_com[body].copy(), inertia
-
-
-def allocate(rotors: Sequence[Rotor], center: np.ndarray) -> np.ndarray:
+def _allocate(rotors: Sequence[Rotor], center: np.ndarray) -> np.ndarray:
     """`Vehicle.allocation`, shape (4, R), of rotors about a center of mass, body frame, m."""
-    arms = [np.array(rotor.position) - center for rotor in rotors]
-    torques = [np.cross(a, r.axis) + r.reaction for a, r in zip(arms, rotors, strict=True)]
-    return np.array([(r.axis[2], *t) for r, t in zip(rotors, torques, strict=True)]).T
+    columns = []
+    for rotor in rotors:
+        arm = np.array(rotor.position) - center
+        torque = np.cross(arm, rotor.axis) + rotor.reaction
+        columns.append((rotor.axis[2], *torque))
+    return np.array(columns).T
 
 
-def read_coefficients(model: mujoco.MjModel) -> Coefficients:
+def _read_coefficients(model: mujoco.MjModel) -> Coefficients:
     """Those among the custom numerics of a model. Raises `InputError` for a wrong one."""
-    numerics = [model.numeric(index) for index in range(model.nnumeric)]
-    ours = [one for one in numerics if one.name.startswith(PREFIX)]
     numbers = {}
-    for one in ours:
-        values = one.data.tolist()
-        numbers[one.name.removeprefix(PREFIX)] = values[0] if len(values) == 1 else values
+    for index in range(model.nnumeric):
+        numeric = model.numeric(index)
+        if numeric.name.startswith(PREFIX):
+            values = numeric.data.tolist()
+            name = numeric.name.removeprefix(PREFIX)
+            numbers[name] = values[0] if len(values) == 1 else values
     return Coefficients.read(numbers)
 
 
-def rotor_name(model: mujoco.MjModel, index: int) -> str:
-    """Name of an actuator, or its number from 1."""
-    return model.actuator(index).name or f"rotor{index + 1}"
-
-
-def rotor_faults(model: mujoco.MjModel, index: int) -> Iterator[tuple[str, str]]:
-    """(What is expected, what came) of an actuator that is no rotor."""
-    body = int(model.jnt_bodyid[0])
-    rotor = f"rotor {rotor_name(model, index)}"
+def _read_rotor(model: mujoco.MjModel, data: mujoco.MjData, index: int) -> Rotor:
+    """The rotor of an actuator; `data` is at the origin and level. Raises `InputError`."""
+    name = model.actuator(index).name or f"rotor{index + 1}"
     site, reference = model.actuator_trnid[index].tolist()
-    at_site = model.actuator_trntype[index] == mujoco.mjtTrn.mjTRN_SITE
-    if not at_site or model.body_rootid[model.site_bodyid[site]] != body:
-        yield f"{rotor} to be an actuator at a site of the body", ""
-    if reference >= 0:
-        yield f"{rotor} to act without a reference site", ""
-    plain = (
-        model.actuator_gaintype[index] == mujoco.mjtGain.mjGAIN_FIXED
-        and model.actuator_biastype[index] == mujoco.mjtBias.mjBIAS_NONE
-        and model.actuator_dyntype[index] == mujoco.mjtDyn.mjDYN_NONE
-    )
-    if not plain:
-        yield f"the thrust of {rotor} to be gain times control", ""
-    if math.hypot(*model.actuator_gear[index, :3]) * model.actuator_gainprm[index, 0] == 0.0:
-        yield f"{rotor} to have a force (gear times gain)", "0 N"
-    if not model.actuator_ctrllimited[index]:
-        yield f"{rotor} to have a thrust with limits (ctrlrange)", ""
-
-
-def read_rotor(model: mujoco.MjModel, data: mujoco.MjData, index: int) -> Rotor:
-    """The rotor of an actuator without faults; `data` is at the origin and level."""
-    site = int(model.actuator_trnid[index, 0])
     force = model.actuator_gear[index, :3]
     torque = model.actuator_gear[index, 3:]
     size = math.hypot(*force)
     newtons = size * float(model.actuator_gainprm[index, 0])
+    at_site = model.actuator_trntype[index] == mujoco.mjtTrn.mjTRN_SITE
+    is_plain = (
+        model.actuator_gaintype[index] == mujoco.mjtGain.mjGAIN_FIXED
+        and model.actuator_biastype[index] == mujoco.mjtBias.mjBIAS_NONE
+        and model.actuator_dyntype[index] == mujoco.mjtDyn.mjDYN_NONE
+    )
+    fault = ""
+    if not at_site or model.body_rootid[model.site_bodyid[site]] != model.jnt_bodyid[0]:
+        fault = f"rotor {name} to be an actuator at a site of the body, got another"
+    elif reference >= 0:
+        fault = f"rotor {name} to act without a reference site, got one"
+    elif not is_plain:
+        fault = f"the thrust of rotor {name} to be gain times control, got another law"
+    elif newtons == 0.0:
+        fault = f"rotor {name} to have a force (gear times gain), got 0 N"
+    elif not model.actuator_ctrllimited[index]:
+        fault = f"rotor {name} to have a thrust with limits (ctrlrange), got none"
+    if fault:
+        raise InputError(f"vehicle: expected {fault}")
     turn = data.site_xmat[site].reshape(3, 3)
     low, high = sorted((model.actuator_ctrlrange[index] * abs(newtons)).tolist())
     sign = math.copysign(1.0, newtons)
     return Rotor(
-        name=rotor_name(model, index),
+        name=name,
         position=tuple(data.site_xpos[site].tolist()),
         axis=tuple((turn @ force * (sign / size)).tolist()),
         reaction=tuple((turn @ torque * (sign / size)).tolist()),
@@ -454,37 +424,24 @@ def read_rotor(model: mujoco.MjModel, data: mujoco.MjData, index: int) -> Rotor:
     )
 
 
-def trim_thrust(rotors: Sequence[Rotor], allocation: np.ndarray, weight: float) -> np.ndarray:
-    """Thrusts that carry the weight best without a torque or a sideways force, shape (R,), N.
+def _hover(rotors: tuple[Rotor, ...], allocation: np.ndarray, weight: float) -> np.ndarray:
+    """Thrusts that carry the weight without a torque or a sideways force, shape (R,), N.
 
-    Equal, or the least that do. Limits of the rotors are not looked at.
+    Equal, or the least that do. Raises `InputError` if there are none above 0 and within the
+    rotors' limits.
     """
     wanted = np.array((weight, 0.0, 0.0, 0.0))
     sideways = np.array([rotor.axis[:2] for rotor in rotors]).T
+    scale = weight * max(1e-3, float(np.abs(allocation[1:]).max()))
     total = float(allocation[0].sum())
     thrust = np.full(len(rotors), weight / total if total > 0 else 0.0)
-    if np.abs(allocation @ thrust - wanted).max() > _RELATIVE * _torque_scale(allocation, weight):
+    if np.abs(allocation @ thrust - wanted).max() > _RELATIVE * scale:
         thrust = np.linalg.lstsq(allocation, wanted, rcond=None)[0]
     if np.abs(sideways @ thrust).max() > _ROUNDED * weight:
         every = np.vstack((allocation, sideways))
         thrust = np.linalg.lstsq(every, np.append(wanted, (0.0, 0.0)), rcond=None)[0]
-    return thrust
-
-
-def _torque_scale(allocation: np.ndarray, weight: float) -> float:
-    return weight * max(1e-3, float(np.abs(allocation[1:]).max()))
-
-
-def _hover(rotors: tuple[Rotor, ...], allocation: np.ndarray, weight: float) -> np.ndarray:
-    """`trim_thrust` of a vehicle that hovers with it.
-
-    Raises `InputError` if there are none above 0 and within the rotors' limits.
-    """
-    thrust = trim_thrust(rotors, allocation, weight)
-    left = np.abs(allocation @ thrust - (weight, 0.0, 0.0, 0.0)).max()
-    sideways = np.array([rotor.axis[:2] for rotor in rotors]).T @ thrust
-    balanced = left <= 1e-6 * _torque_scale(allocation, weight)
-    if not balanced or np.abs(sideways).max() > _ROUNDED * weight:
+    turns = np.abs(allocation @ thrust - wanted).max() > 1e-6 * scale
+    if turns or np.abs(sideways @ thrust).max() > _ROUNDED * weight:
         raise InputError(
             "vehicle: expected rotors that can carry the level craft without a torque or a "
             "sideways force, got ones that cannot"
@@ -501,7 +458,7 @@ def _hover(rotors: tuple[Rotor, ...], allocation: np.ndarray, weight: float) -> 
     return thrust
 
 
-def find_rest_height(model: mujoco.MjModel, data: mujoco.MjData) -> float:
+def _find_rest_height(model: mujoco.MjModel, data: mujoco.MjData) -> float:
     """Height at which the level body first touches anything, by bisection; 0 if it never does.
 
     Raises `InputError` if it touches something at any height, like a wall.

@@ -1,4 +1,4 @@
-"""Broken vehicles and what the examination says of each: every fault, found by its own check.
+"""Broken vehicles: every fault is refused in a sentence, or found by its own check.
 
     python studies/broken_vehicles.py [--out FILE.csv]
 
@@ -18,8 +18,8 @@ from typing import Final
 
 from measuring import RESULTS, options, table, write_rows
 from rotorgram.cli.vehicle import expectation
-from rotorgram.models import QUAD_XML
-from rotorgram.models.checks import Check, examine
+from rotorgram.models import QUAD_XML, InputError
+from rotorgram.models.checks import Check, examine, failed
 
 Edit = Callable[[str], str]
 
@@ -92,6 +92,9 @@ SITE1 = '<site name="rotor1" pos=" 1  1 0"'
 GEAR2 = 'site="rotor2" gear="0 0 1 0 0 -0.05"'
 SITE3 = '<site name="rotor3" pos="-1 -1 0"/>'
 MAST = '<body pos="3 0 0"><site name="rotor3"/></body></worldbody>'
+CARRY = "to carry a part of the weight of the level craft"
+SHARE = "to carry its share of the weight"
+BALANCE = "without a torque or a sideways force"
 PAIR = '<contact><pair geom1="hub" geom2="arm1"/></contact></mujoco>'
 
 BROKEN: Final[dict[str, tuple[Edit, str]]] = {
@@ -101,42 +104,42 @@ BROKEN: Final[dict[str, tuple[Edit, str]]] = {
         reactions(0.05, 0.05, -0.05, -0.05), "allocation: yaw apart from pitch"),
     "no reactions": (reactions(0, 0, 0, 0), "allocation: rank"),
     "one reaction of the wrong sign": (
-        reactions(0.05, -0.05, 0.05, 0.05), "turns: yaw of equal thrusts"),
+        reactions(0.05, -0.05, 0.05, 0.05), CARRY),
     "one reaction ten times too large": (
         reactions(0.05, -0.5, 0.05, -0.05), "turns: reaction of rotor2 / median"),
     "reaction a hundred times too large": (
         reactions(5, -5, 5, -5), "units: reaction / arm"),
-    "mass in grams": (scaled(" mass", 1000), "units: mass / arm³"),
+    "mass in grams": (scaled(" mass", 1000), SHARE),
     "lengths in millimetres": (scaled(" (?:pos|fromto|size)", 1000), "units: arm"),
     "inertia in kg·mm²": (
         inertial('diaginertia="5.03e6 5.03e6 1e7"'), "units: largest moment / (mass arm²)"),
     "inertia against the triangle inequality": (
-        inertial('diaginertia="2 2 10"'), "inertia: triangle inequality"),
+        inertial('diaginertia="2 2 10"'), "inertia must satisfy A + B >= C"),
     "inertia that is not positive": (
-        inertial('fullinertia="5 5 10 7 0 0"'), "inertia: smallest / largest moment"),
+        inertial('fullinertia="5 5 10 7 0 0"'), "inertia must have positive eigenvalues"),
     "angle in degrees where radians are read": (
-        replace((SITE1, f'{SITE1} euler="90 0 0"')), "lift of rotor1"),
+        replace((SITE1, f'{SITE1} euler="90 0 0"')), BALANCE),
     "rotor upside down": (
-        replace((GEAR2, 'site="rotor2" gear="0 0 -1 0 0 0.05"')), "lift of rotor2"),
+        replace((GEAR2, 'site="rotor2" gear="0 0 -1 0 0 0.05"')), CARRY),
     "rotors that lean to one side": (
         replace(('gear="0 0 1', 'gear="0.2 0 1')),
-        "trim: sideways acceleration / g"),
+        BALANCE),
     "rotor of another body": (
-        replace((SITE3, ""), ("</worldbody>", MAST)), "actuator rotor3: faults"),
+        replace((SITE3, ""), ("</worldbody>", MAST)), "rotor3 to be an actuator at a site"),
     "rotor without limits": (
         replace(('ctrllimited="true" ctrlrange="0 100"', 'ctrllimited="false"')),
-        "actuator rotor1: faults"),
+        "rotor1 to have a thrust with limits"),
     "rotors that give less than they are asked for": (
         replace(('ctrlrange="0 100"', 'ctrlrange="0 100" forcelimited="true" forcerange="0 80"')),
         "effect of rotor1: error per newton"),
     "too weak to hover": (
-        replace(('ctrlrange="0 100"', 'ctrlrange="0 45"')), "hover: thrust to weight"),
+        replace(('ctrlrange="0 100"', 'ctrlrange="0 45"')), SHARE),
     "thrust in millinewtons": (
         replace(('ctrlrange="0 100"', 'ctrlrange="0 100000"')), "hover: thrust to weight"),
     "center of mass beyond trim": (
         replace(('size="0.22 0.22 0.07" mass="12"',
                  'size="0.22 0.22 0.07" pos="1.8 0 0" mass="12"')),
-        "hover: thrust of rotor3"),
+        SHARE),
     "Euler's integrator": (replace(('integrator="RK4"', "")), "integrator: observed order"),
     "physics step of 50 ms": (replace(('timestep="0.01"', 'timestep="0.05"')), "physics step"),
     "physics step too long for its inertia": (
@@ -148,11 +151,11 @@ BROKEN: Final[dict[str, tuple[Edit, str]]] = {
         replace(('contype="1" conaffinity="1"', 'contype="0" conaffinity="0"')),
         "floor: height at rest"),
     "parts that touch each other": (
-        replace(("</mujoco>", PAIR)), "contacts in free flight"),
+        replace(("</mujoco>", PAIR)), "a craft that is free above the ground"),
     "gravity that points up": (
-        replace(('gravity="0 0 -9.8"', 'gravity="0 0 9.8"')), "gravity: part along -z"),
+        replace(('gravity="0 0 -9.8"', 'gravity="0 0 9.8"')), "gravity along -z"),
     "gravity in cm/s²": (
-        replace(('gravity="0 0 -9.8"', 'gravity="0 0 -980"')), "gravity: size"),
+        replace(('gravity="0 0 -9.8"', 'gravity="0 0 -980"')), SHARE),
     "armature of the free joint": (
         free('armature="0.5"'), "mass against a force of 1 N"),
     "damping of the free joint": (
@@ -162,7 +165,9 @@ BROKEN: Final[dict[str, tuple[Edit, str]]] = {
     "thrust coefficient of revolutions per minute": (
         numeric(rotors__radius=0.4, rotors__thrust_coefficient=1.2e-5), "units: tip speed"),
 }  # fmt: skip
-"""By what is wrong: how to break the paper's vehicle so, and the check that must find it."""
+"""By what is wrong: how to break the paper's vehicle so, and the check that must find it, or words
+of the sentence by which flying refuses the file.
+"""
 
 
 @dataclass(frozen=True)
@@ -171,19 +176,17 @@ class Row:
 
     fault: str
     found_by: str
-    """Name of the check that must find it."""
+    """Name of the check that must find it; of a file that flying refuses words of the sentence."""
     found: bool
     """Whether it did."""
     measured: str
-    """The check's measured value and its limits."""
+    """The check's measured value and its limits; empty if flying refuses the file."""
     meaning: str
-    """The check's sentence."""
+    """The sentence of the check, or of the refusal."""
     failed: int
     """How many checks failed."""
     checks: int
-    """How many there were."""
-    flies: bool
-    """Whether `--vehicle` accepts the file."""
+    """How many there were; 0 if flying refuses the file."""
 
 
 def break_vehicle(folder: Path, edit: Edit) -> Path:
@@ -195,32 +198,37 @@ def break_vehicle(folder: Path, edit: Edit) -> Path:
 
 def rows() -> list[Row]:
     """Examine every broken vehicle."""
-    told = []
+    found = []
     for fault, (edit, name) in BROKEN.items():
         with tempfile.TemporaryDirectory() as folder:
-            checks = examine(break_vehicle(Path(folder), edit))
-        told.append(_row(fault, name, checks))
-    return told
+            path = break_vehicle(Path(folder), edit)
+            try:
+                found.append(_row(fault, name, examine(path)))
+            except InputError as error:
+                sentence = str(error)
+                found.append(Row(fault, name, name in sentence, "", sentence, 0, 0))
+    return found
 
 
 def _row(fault: str, name: str, checks: Sequence[Check]) -> Row:
-    by_name = {check.name: check for check in checks}
-    check, bad = by_name[name], [check for check in checks if not check.passed]
+    check = next(check for check in checks if check.name == name)
     measured = f"{check.measured:.4g} ({expectation(check)}) {check.unit}".strip()
-    accepted = by_name["accepted by --vehicle"].passed
-    return Row(fault, name, check in bad, measured, check.meaning, len(bad), len(checks), accepted)
+    count = len(failed(checks))
+    return Row(fault, name, not check.passed, measured, check.meaning, count, len(checks))
 
 
-def markdown(told: Sequence[Row]) -> str:
+def markdown(rows: Sequence[Row]) -> str:
     """The table, in Markdown."""
-    rows = []
-    for row in told:
-        flies = "yes" if row.flies else "no"
-        failed = f"{row.failed} of {row.checks}"
-        rows.append((row.fault, row.found_by, row.measured, flies, failed))
-    return table(
-        ("what is wrong", "found by", "measured (expected)", "flies", "failed checks"), rows
-    )
+    lines = []
+    for row in rows:
+        if row.checks:
+            found_by = row.found_by
+            share = f"{row.failed} of {row.checks}"
+        else:
+            found_by = f"refused: … {row.found_by} …"
+            share = ""
+        lines.append((row.fault, found_by, row.measured, share))
+    return table(("what is wrong", "found by", "measured (expected)", "failed checks"), lines)
 
 
 def examination(checks: Sequence[Check]) -> str:
@@ -252,12 +260,12 @@ def read_report(path: Path) -> tuple[float, list[Check]]:
 def _main() -> None:
     out = RESULTS / "physics" / "broken_vehicles.csv"
     path = options(__doc__, out=out).parse_args().out
-    told = rows()
-    write_rows(path, told)
+    found = rows()
+    write_rows(path, found)
     begun = time.perf_counter()
     checks = examine()
     seconds = round(time.perf_counter() - begun, 3)
-    print(markdown(told), examination(checks), sep="\n\n")
+    print(markdown(found), examination(checks), sep="\n\n")
     report = {"seconds": seconds, "checks": [check.report() for check in checks]}
     text = json.dumps(report, indent=1, ensure_ascii=False, allow_nan=False)
     path.with_suffix(".json").write_text(text + "\n", "utf-8")
