@@ -14,8 +14,7 @@ from itertools import count, product
 from typing import Any, Final
 
 import numpy as np
-from golden import LAYOUTS, SECRET, SESSION, fixed, messages, text_lines
-from golden import ONE as SPEC
+from golden import LAYOUTS, LINES, SECRET, SESSION, SPECS, fixed, messages
 from links import outgoing
 from rotorgram.envs.spec import EnvSpec, SpecError
 from rotorgram.udp.protocol import binary, text
@@ -51,6 +50,7 @@ def expect(promise: bool, *got: object) -> None:
 # ---- codecs
 
 
+SPEC: Final = SPECS["one"]
 LAYOUT: Final = LAYOUTS["one"]
 
 
@@ -403,7 +403,6 @@ def fuzz_one(data: bytes) -> None:
 
 def seeds() -> Iterator[bytes]:
     """The first inputs: every message, every line, and some flights."""
-    lines = text_lines()
     for message in [message for _, env, message in messages() if env == "one"]:
         datagram = binary.encode(message, LAYOUT)
         yield b"\0" + datagram
@@ -420,7 +419,7 @@ def seeds() -> Iterator[bytes]:
     for order in ((0, 1, 2), (2, 0, 0, 1), (1, 2, 0, 1, 2, 0)):
         yield b"\x08" + b"".join(bytes([1, number, 3, 2, number, 7]) for number in order)
     yield b"\3" + SPEC.to_json().encode()
-    for line in [line.encode() for line in (*lines["states"], *lines["commands"])]:
+    for line in [line.encode() for line in (*LINES["states"], *LINES["commands"])]:
         yield b"\1" + line
         yield bytes([4, 0x22, 0, 0, 0, len(line)]) + line + b"\x07"
     for mode in range(0x30, 0x33):

@@ -1,7 +1,7 @@
 """The binary codec: messages to bytes and back, as pure functions. Little-endian throughout.
 
 `docs/protocol.md` has every field of every message at its offset, and what a reader ignores: the
-constants and structs below follow it, and `tests/golden.py` writes the bytes that both must give.
+constants and structs below follow it, and `docs/golden.json` has the bytes that both must give.
 """
 
 import struct
