@@ -272,14 +272,6 @@ def test_the_shifts_are_those_that_were_measured() -> None:
         assert cells.replace("–", "nan") == " | ".join(expected)
 
 
-def test_the_curriculum_is_the_one_that_was_measured() -> None:
-    lines = pd.read_csv(RESULTS / "transfer" / "curriculum.csv", dtype=str, keep_default_na=False)
-    assert len(lines) >= 10
-    for row in lines.itertuples(index=False):
-        share = f"{100 * float(row.left_out):.0f} %"
-        check("transfer", f"| {row.row} | {row.seed} | {share} | {row.seconds or '–'} |")
-
-
 def test_the_page_of_rigid_tells_what_was_measured() -> None:
     for drones, row in result("rigid/sizes")["processor_microseconds"].items():
         numbers = [f"{number:,}" for name, number in row.items() if "tensors" not in name]
