@@ -75,15 +75,14 @@ def chosen_env(
     own = getattr(command, "listen", None) is None  # a simulator of our own flies it
     if own and is_known(env[0]):
         drones = chosen_drones(command, checkpoint)
-        _check_vehicle(command, checkpoint, _spec(command, env, drones))
+        _check_vehicle(command, checkpoint, env_spec(_config(command, env, drones)))
     return env
 
 
-def _spec(command: EnvFlags, env: tuple[str, Options], drones: int) -> EnvSpec:
-    """The spec of an env with the vehicle of the flags."""
+def _config(command: EnvFlags, env: tuple[str, Options], drones: int) -> EnvConfig:
+    """The config of an env with the vehicle of the flags."""
     env_id, options = env
-    config = EnvConfig.from_keywords(env_id, vehicle=command.vehicle, drones=drones, **options)
-    return env_spec(config)
+    return EnvConfig.from_keywords(env_id, vehicle=command.vehicle, drones=drones, **options)
 
 
 def chosen_drones(command: EnvFlags, checkpoint: Checkpoint | Controller | None) -> int:
@@ -141,18 +140,16 @@ def _check_vehicle(command: EnvFlags, checkpoint: Checkpoint, spec: EnvSpec) -> 
         )
 
 
-def pilot_of(
-    command: EnvFlags, what: str
-) -> tuple[Checkpoint | None, Policy | None, tuple[str, Options]]:
+def pilot_of(command: EnvFlags, what: str) -> tuple[Checkpoint | None, Policy | None, EnvConfig]:
     """Checkpoint (None without one), policy (None for `random`) and env of what flies here."""
     if what == "random":
-        return None, None, chosen_env(command)
+        return None, None, _config(command, chosen_env(command), command.drones)
     checkpoint = load_checkpoint(what)
     command = replace(command, vehicle=chosen_vehicle(command, checkpoint))
     env = chosen_env(command, checkpoint)
-    spec = _spec(command, env, chosen_drones(command, checkpoint))
-    policy = policy_for(command, checkpoint, spec)
-    return None if isinstance(checkpoint, type) else checkpoint, policy, env
+    config = _config(command, env, chosen_drones(command, checkpoint))
+    policy = policy_for(command, checkpoint, env_spec(config))
+    return None if isinstance(checkpoint, type) else checkpoint, policy, config
 
 
 def words_of(trajectory: Trajectory) -> str:

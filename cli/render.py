@@ -110,22 +110,18 @@ class Render(EnvFlags):
 
     def _find(self, what: str) -> "_Flown":
         """Flights of a policy or a journal."""
-        from ._env import chosen_drones, chosen_vehicle, pilot_of
+        from ._env import pilot_of
 
         episodes = range(self.episode, self.episode + self.episodes)
         path = Path(what)
         if path.suffix == ".mcap":
             recorded = recorded_trajectories(path, episodes, session=self.session, drone=self.drone)
             return _Flown(path.stem, path.stem, recorded, 1)
-        checkpoint, policy, env = pilot_of(self, what)
-        drones = chosen_drones(self, checkpoint)
-        vehicle = chosen_vehicle(self, checkpoint)
+        checkpoint, policy, config = pilot_of(self, what)
         agent = checkpoint.algorithm if checkpoint else what
         name = what if what == "random" else agent_label(agent)
-        flown = flown_trajectories(
-            policy, *env, episodes, vehicle=vehicle, of="final", drones=drones
-        )
-        return _Flown(agent, name, flown, drones)
+        flown = flown_trajectories(policy, config, episodes, "final")
+        return _Flown(agent, name, flown, config.drones)
 
 
 class _Flown(NamedTuple):

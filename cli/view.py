@@ -63,7 +63,7 @@ class View(EnvFlags):
 
     def _flights(self) -> Iterator[list[Trajectory]]:
         """Episode after episode, as long as there are any, each with a trajectory of each drone."""
-        from ._env import chosen_drones, chosen_vehicle, pilot_of
+        from ._env import pilot_of
 
         path = Path(self.what)
         if path.suffix == ".mcap":
@@ -71,10 +71,6 @@ class View(EnvFlags):
                 raise InputError("env: expected no options with a journal, which has its own")
             yield from ([one] for one in recorded_trajectories(path))
             return
-        checkpoint, policy, env = pilot_of(self, self.what)
-        drones = chosen_drones(self, checkpoint)
-        vehicle = chosen_vehicle(self, checkpoint)
+        _, policy, config = pilot_of(self, self.what)
         for episode in count():
-            yield flown_trajectories(
-                policy, *env, [episode], vehicle=vehicle, of="final", drones=drones
-            )
+            yield flown_trajectories(policy, config, [episode], "final")

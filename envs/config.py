@@ -159,7 +159,7 @@ class EnvConfig:
         check_fields(self)
         self._set(env_id=canonical_id(self.env_id))
         self._set(scene=SceneConfig.parse(self.scene), backend=BackendConfig.parse(self.backend))
-        self._set(vehicle=vehicle_words(self.vehicle), cameras=_words("cameras", self.cameras))
+        self._set(vehicle=vehicle_words(self.vehicle), cameras=words_of("cameras", self.cameras))
         if self.files:
             from ..models.bundle import checked_bundles
 
@@ -413,7 +413,7 @@ def source_hash(task: type) -> str:
     return digest.hexdigest() if found else ""
 
 
-def _words(name: str, given: Any) -> tuple[str, ...]:
+def words_of(name: str, given: Any) -> tuple[str, ...]:
     """Words of a text with commas, or of several texts. Raises `InputError`."""
     texts = [given] if isinstance(given, str) else given
     if not isinstance(texts, list | tuple) or not all(isinstance(one, str) for one in texts):

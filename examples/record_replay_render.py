@@ -13,7 +13,7 @@ from rotorgram.agents import PID
 from rotorgram.envs import EnvConfig
 from rotorgram.flights.filming import Film, FilmTrack, film
 from rotorgram.flights.recorded import recorded_trajectories
-from rotorgram.flights.trajectories import fly
+from rotorgram.flights.trajectories import fly_episodes
 from rotorgram.udp.journal.replay import Verification
 from rotorgram.udp.spawn import spawn_simulator
 
@@ -22,8 +22,8 @@ journal = folder / "flight.mcap"
 if journal.exists():
     sys.exit(f"{journal} is there already: name another folder")
 
-with spawn_simulator(EnvConfig(), record=journal) as env:
-    trajectory = fly(env, PID(env.env_spec), seed=7)
+with spawn_simulator(EnvConfig(), num_envs=1, record=journal) as env:
+    (trajectory,) = fly_episodes(env, PID(env.env_spec), episodes=1)
 print(f"return {trajectory.rewards.sum():.1f}: {journal}")
 
 print(Verification(journal))

@@ -40,8 +40,8 @@ with spawn_simulator(run.env, num_envs=run.num_envs) as drones:  # agent here, s
 store(training.checkpoint(), args.out)
 print(f"{training.log.env_steps:,} env steps in {training.log.seconds:.1f} s: {args.out}")
 
-with spawn_simulator(run.env) as drone:
+with spawn_simulator(run.env, num_envs=5) as drones:
     policy = training.agent.policy()
-    trajectories = fly_episodes(drone, policy, episodes=5)
+    trajectories = fly_episodes(drones, policy, episodes=5)
 errors = [abs(one.headline[1:]) for one in trajectories]
 print(f"steady-state |E|: {np.mean([steady_state(error) for error in errors]):.3f} m")

@@ -25,7 +25,8 @@ def write_coco(
     """
     vehicle = Vehicle.load(plan.vehicle)
     kinds = set[str]()
-    for drones, scene, marks, payload in {sequence.stage for sequence in sequences}:
+    stages = {(one.drones, one.scene, one.marks, one.payload is not None) for one in sequences}
+    for drones, scene, marks, payload in stages:
         names = objects_of(vehicle, drones, scene, marks, payload=payload)
         kinds.update(map(category, names))
     categories = {kind: number for number, kind in enumerate(sorted(kinds - {NOTHING}), 1)}

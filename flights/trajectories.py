@@ -1,6 +1,6 @@
 """Trajectories: the record of a flight that evaluations, journals, films, data sets and logs share.
 
-`fly` and its relatives fly a policy without exploration, in any env; `flights/recorded.py` reads
+`fly_episodes` flies a policy without exploration, in any vector env; `flights/recorded.py` reads
 journals.
 """
 
@@ -9,16 +9,15 @@ from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
 from typing import Any, Final, Literal
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
 from ..agents.policies import Policy
-from ..envs.autoreset import LOST, AdvancingVectorEnv, worlds_done
-from ..envs.spec import EnvSpec, canonical_id, component_names
+from ..envs.autoreset import AdvancingVectorEnv, worlds_done
+from ..envs.config import EnvConfig
+from ..envs.spec import EnvSpec
 from ..models.errors import InputError
 
 Floats = NDArray[np.float64]
@@ -130,47 +129,8 @@ class Trajectory:
 # ---- flown
 
 
-def fly(env: gym.Env[Any, Any], policy: Policy | None, seed: int, episode: int = 0) -> Trajectory:
-    """One episode of a policy in an env of one drone, local or remote; again, if its simulator was
-    lost. Without a policy, actions are drawn at random, the same for the same seed.
-    """
-    lost = True
-    while lost:
-        observation, info = env.reset(seed=seed)
-        spec: EnvSpec = env.get_wrapper_attr("env_spec")  # of the simulator that came
-        if policy is None:
-            env.action_space.seed(seed)
-        else:
-            policy.reset()
-        infos = [info]
-        rewards = []
-        actions = []
-        terminated = truncated = lost = False
-        while not (terminated or truncated or lost):
-            action = env.action_space.sample() if policy is None else policy.act(observation)
-            observation, reward, terminated, truncated, info = env.step(action)
-            infos.append(info)
-            rewards.append(float(reward))
-            actions.append(np.array(action, np.float64))
-            lost = LOST in info
-    telemetry = {}
-    for array in spec.telemetry:
-        names = component_names(array)
-        rows = np.array([[info[name] for name in names] for info in infos], np.float64)
-        telemetry[array.name] = rows.reshape(len(infos), *array.shape)
-    return Trajectory(
-        spec=spec,
-        telemetry=telemetry,
-        rewards=np.array(rewards),
-        actions=np.array(actions),
-        ending="terminated" if terminated else "truncated",
-        episode=episode,
-        seed=seed,
-    )
-
-
 def fly_episodes(
-    env: Any,
+    env: AdvancingVectorEnv,
     policy: Policy | None,
     episodes: int,
     of: EpisodeSet = "curve",
@@ -179,15 +139,13 @@ def fly_episodes(
 ) -> list[Trajectory]:
     """Evaluation episodes of a set, from the number `first` on, in their order.
 
-    The env has one drone, or is a vector env without autoreset. A vector env flies as many at a
-    time as it has worlds, each drone with a copy of the policy and to the same bits as one after
-    the other. Without a policy actions are random. An episode of several drones of one world gives
-    a trajectory for each, in their order.
+    The env, without autoreset, flies as many at a time as it has worlds, each drone with a copy of
+    the policy and to the same bits as one after the other. An episode whose simulator was lost is
+    flown again. Without a policy, actions are drawn at random, the same for the same episode. An
+    episode of several drones of one world gives a trajectory for each, in their order.
     """
     numbers = range(first, first + episodes)
     seeds = {number: evaluation_seed(number, of, training_seed) for number in numbers}
-    if not isinstance(env, AdvancingVectorEnv):
-        return [fly(env, policy, seed, episode) for episode, seed in seeds.items()]
     flown: dict[int, list[Trajectory]] = {}
     worlds = env.num_envs // len(env.env_spec.agents)
     while missing := [episode for episode in seeds if episode not in flown]:
@@ -211,11 +169,11 @@ def _fly_batch(
     env.reset(seed=[*of_drones, *[0] * (env.num_envs - used)])
     nobody = np.zeros(env.num_envs, bool)
     telemetry = [env.telemetry]
-    rewards: list[Floats] = []
-    actions: list[NDArray[np.generic]] = []
+    rewards = []
+    actions = []
     lengths = np.zeros(env.num_envs, int)
     terminated = nobody
-    lost = env.lost.copy()
+    lost = env.lost
     done = lost | (np.arange(env.num_envs) >= used)
     while not done.all():
         chosen = _act(env, policies, done)
@@ -225,28 +183,27 @@ def _fly_batch(
         actions.append(chosen.astype(np.float64))
         lengths += ~done
         terminated = terminated | (env.terminated & ~done)
-        lost |= env.lost & ~done
+        lost = lost | (env.lost & ~done)
         done = done | env.terminated | env.truncated
     arrays = {name: np.array([row[name] for row in telemetry]) for name in telemetry[0]}
+    all_rewards = np.array(rewards)
+    all_actions = np.array(actions)
+    episodes = list(seeds)
     flown: dict[int, list[Trajectory]] = {}
-    for world, (episode, seed) in enumerate(seeds.items()):
-        first = world * drones
-        if lost[first]:
-            continue
-        flown[episode] = []
-        for drone in range(first, first + drones):
-            steps = int(lengths[drone])
-            trajectory = Trajectory(
-                spec=env.env_spec,
-                telemetry={name: rows[: steps + 1, drone] for name, rows in arrays.items()},
-                rewards=np.array([row[drone] for row in rewards[:steps]], np.float64),
-                actions=np.array([row[drone] for row in actions[:steps]]),
-                ending="terminated" if terminated[drone] else "truncated",
-                episode=episode,
-                drone=drone - first,
-                seed=seed,
-            )
-            flown[episode].append(trajectory)
+    for drone in np.flatnonzero(~lost[:used]).tolist():
+        episode = episodes[drone // drones]
+        steps = lengths[drone]
+        trajectory = Trajectory(
+            spec=env.env_spec,
+            telemetry={name: rows[: steps + 1, drone] for name, rows in arrays.items()},
+            rewards=all_rewards[:steps, drone],
+            actions=all_actions[:steps, drone],
+            ending="terminated" if terminated[drone] else "truncated",
+            episode=episode,
+            drone=drone % drones,
+            seed=seeds[episode],
+        )
+        flown.setdefault(episode, []).append(trajectory)
     return flown
 
 
@@ -271,24 +228,16 @@ def _act(
 
 def flown_trajectories(
     policy: Policy | None,
-    env_id: str,
-    options: Mapping[str, Any],
+    config: EnvConfig,
     episodes: Sequence[int],
-    *,
-    vehicle: str | Path | Sequence[str] | None = None,
     of: EpisodeSet = "curve",
-    drones: int = 1,
     training_seed: int | None = None,
 ) -> list[Trajectory]:
-    """Evaluation episodes of a set by number, flown in process: see `fly` and, for several drones
-    of one world, `fly_episodes`. The vehicle is a file or a name, None the paper's.
-    """
+    """Evaluation episodes of a set by number, flown in process as by `fly_episodes`."""
     from ..envs.vector import LocalVectorEnv  # which imports MuJoCo
 
-    name = canonical_id(env_id)  # a checkpoint may name a module, which is not to be imported
-    settings: dict[str, Any] = {"drones": drones, "vehicle": vehicle, **options}
     found: list[Trajectory] = []
-    with closing(LocalVectorEnv(name, drones, autoreset_mode="Disabled", **settings)) as world:
+    with closing(LocalVectorEnv(config, config.drones, autoreset_mode="Disabled")) as world:
         for episode in episodes:
             found += fly_episodes(world, policy, 1, of, episode, training_seed)
     return found

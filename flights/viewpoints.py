@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import cycle, pairwise
 from pathlib import Path
-from typing import Annotated, Any, Final, NamedTuple
+from typing import Annotated, Any, Final
 
 import mujoco
 import numpy as np
@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 from ..agents import CONTROLLERS
 from ..agents.checkpoints import Checkpoint, load
 from ..agents.policies import Policy
-from ..envs.config import EnvConfig
+from ..envs.config import EnvConfig, words_of
 from ..envs.registry import env_spec
 from ..envs.registry import load as load_env
 from ..envs.spec import Mark
 from ..models.cameras import View, chosen_views
 from ..models.errors import InputError, shortened
-from ..models.fields import Limits, Text, check_fields, check_names, read_table
+from ..models.fields import Choice, Limits, Text, check, check_fields, check_names, read_table
 from ..models.vehicle import Vehicle
 from ..scenes import scenes_of
 from ..sim.rotations import multiplied
@@ -37,20 +37,10 @@ Floats = NDArray[np.float64]
 
 MAX_FRAMES: Final = 1_000_000
 _FARTHEST: Final = 1e4  # m
-_MAX_BYTES: Final = 1_000_000  # of a plan
 
 _Count = Annotated[int, Limits(1, MAX_FRAMES, whole=True)]
 _Index = Annotated[int, Limits(0, whole=True)]
 _Angle = Annotated[float, Limits(0, math.pi, "rad")]
-
-
-class Stage(NamedTuple):
-    """What pictures of a sequence show besides the pose."""
-
-    drones: int
-    scene: str
-    marks: tuple[Mark, ...]
-    payload: bool
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -87,11 +77,6 @@ class PoseSequence:
     def drones(self) -> int:
         """A."""
         return int(self.position.shape[1])
-
-    @property
-    def stage(self) -> Stage:
-        """What its pictures show besides the pose."""
-        return Stage(self.drones, self.scene, self.marks, self.payload is not None)
 
     def part(self, first: int, end: int) -> "PoseSequence":
         """The poses from `first` to before `end`."""
@@ -196,9 +181,9 @@ class FlownPoses(_FlightPoses):
     def trajectories(self, vehicle: str | None) -> list[Trajectory]:
         """Flown in this process."""
         env_id = load_env(self.env or "rotorgram/Hover-v0")  # the plan is the user's own
+        options = dict(self.options)
         controller = CONTROLLERS.get(self.agent)
         checkpoint: Checkpoint | None = None
-        options = dict(self.options)
         if controller is not None:
             options = {**controller.options, **options}
         elif self.agent != "random":
@@ -207,9 +192,8 @@ class FlownPoses(_FlightPoses):
                 env_id = checkpoint.env_id
             if env_id == checkpoint.env_id:
                 options = {**checkpoint.options, **options}
-        spec = env_spec(
-            EnvConfig.from_keywords(env_id, vehicle=vehicle, drones=self.drones, **options)
-        )
+        config = EnvConfig.from_keywords(env_id, vehicle=vehicle, drones=self.drones, **options)
+        spec = env_spec(config)
         policy: Policy | None = None
         if controller is not None:
             policy = controller(spec)
@@ -221,9 +205,7 @@ class FlownPoses(_FlightPoses):
                 )
             policy = checkpoint.policy(spec)
         episodes = range(self.first, self.first + self.episodes)
-        return flown_trajectories(
-            policy, env_id, options, episodes, vehicle=vehicle, of="final", drones=self.drones
-        )
+        return flown_trajectories(policy, config, episodes, "final")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -275,31 +257,23 @@ class Plan:
     def __post_init__(self) -> None:
         check_fields(self, "plan: ")
         scenes_of(self.scene)
+        object.__setattr__(self, "cameras", words_of("plan: cameras", self.cameras))
         self.views()
 
     @classmethod
     def read(cls, path: Path) -> "Plan":
         """Read a TOML file. Raises `InputError`, or `OSError` where it cannot be read."""
-        size = path.stat().st_size
-        if size > _MAX_BYTES:
-            raise InputError(f"plan: expected at most {_MAX_BYTES} bytes, got {size}")
         try:
             text = path.read_text(encoding="utf-8")
             table = tomllib.loads(text)
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        except (ValueError, RecursionError) as error:
             raise InputError(f"plan: expected a TOML file, got {path.name}: {error}") from None
-        except RecursionError:
-            raise InputError("plan: expected a TOML file, got tables nested too deeply") from None
         check_names(table, [name for name in cls.__dataclass_fields__ if name != "text"], "plan")
-        cameras = table.get("cameras", list(cls.cameras))
-        poses = table.get("poses", [])
-        if not _is_list_of(str, cameras):
-            raise InputError(f"plan: cameras: expected a list of names, got {shortened(cameras)}")
-        if not _is_list_of(dict, poses):
+        poses = table.pop("poses", None)
+        if not isinstance(poses, list) or not poses:
             raise InputError(f"plan: expected a table [[poses]] or more, got {shortened(poses)}")
-        table["cameras"] = tuple(cameras)
-        table["poses"] = tuple(_source(one, number) for number, one in enumerate(poses, 1))
-        return cls(text=text, **table)
+        sources = [_source(one, number) for number, one in enumerate(poses, 1)]
+        return cls(text=text, poses=tuple(sources), **table)
 
     def views(self) -> tuple[View, ...]:
         """The pictures of each pose. Raises `InputError`."""
@@ -322,30 +296,21 @@ class Plan:
         return found
 
 
-def _is_list_of(kind: type, values: object) -> bool:
-    if not isinstance(values, list) or not values:
-        return False
-    return all(isinstance(value, kind) for value in values)
-
-
-def _source(table: dict[str, Any], number: int) -> PoseSource:
+def _source(table: object, number: int) -> PoseSource:
     """A source of poses from its table. Raises `InputError`."""
     name = f"plan: poses[{number}]"
-    word = table.pop("from", None)
-    if not isinstance(word, str) or word not in _SOURCES:
-        words = " or ".join(map(repr, _SOURCES))
-        raise InputError(f"{name}.from: expected {words}, got {shortened(word)}")
-    source = read_table(_SOURCES[word], table, name)
+    given = dict(table) if isinstance(table, Mapping) else {}
+    word = check(f"{name}.from", Choice(tuple(_SOURCES)), given.pop("from", None))
+    source = read_table(_SOURCES[word], given, name)
     if source.scene:
         scenes_of(source.scene)
     if isinstance(source, RandomPoses):
         lowest = source.center[2] - source.size[2] / 2
         if lowest < 0:
             raise InputError(f"{name}: expected a box above the ground, got one from {lowest:g} m")
-    if not isinstance(getattr(source, "options", {}), Mapping):
-        raise InputError(
-            f"{name}.options: expected options by name, got {shortened(table['options'])}"
-        )
+    if isinstance(source, FlownPoses) and not isinstance(source.options, Mapping):
+        got = shortened(source.options)
+        raise InputError(f"{name}.options: expected options by name, got {got}")
     return source
 
 

@@ -24,7 +24,8 @@ EPISODE, STEP = 1, 20  # on its way to the goal
 
 def draw() -> Image.Image:
     """Two columns; the last picture is of the plain floor."""
-    (flown,) = flown_trajectories(PID(env_spec(EnvConfig(env_id=ENV))), ENV, {}, [EPISODE])
+    config = EnvConfig(env_id=ENV)
+    (flown,) = flown_trajectories(PID(env_spec(config)), config, [EPISODE])
     flight = moments(flown)
     views = [("airport", camera) for camera in CAMERAS] + [("plain", "chase")]
     rows = -(-len(views) // COLUMNS)

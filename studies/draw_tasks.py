@@ -45,11 +45,9 @@ SCENES = {
 
 def draw(name: str, scene: Scene) -> Image.Image:
     """A picture of the task by its name without ending."""
-    env_id = f"rotorgram/{name}-v0"
     agent = CONTROLLERS[scene.agent]
-    options = agent.options
-    policy = agent(env_spec(EnvConfig.from_keywords(env_id, **options)))
-    (flown,) = flown_trajectories(policy, env_id, options, [0])
+    config = EnvConfig.from_keywords(f"rotorgram/{name}-v0", **agent.options)
+    (flown,) = flown_trajectories(agent(env_spec(config)), config, [0])
     stage = Stage()
     with Canvas(stage, WIDTH * TIMES, HEIGHT * TIMES) as canvas:
         for moment in moments(flown)[: scene.step + 1]:

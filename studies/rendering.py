@@ -115,7 +115,8 @@ def whole_film(flown: Trajectory) -> dict[str, float]:
 def main() -> None:
     out = RESULTS / "performance" / "rendering.json"
     args = options(__doc__, rounds=5, frames=20, out=out).parse_args()
-    (flown,) = flown_trajectories(PID(env_spec(EnvConfig(env_id=ENV))), ENV, {}, [EPISODE])
+    config = EnvConfig(env_id=ENV)
+    (flown,) = flown_trajectories(PID(env_spec(config)), config, [EPISODE])
     flight = moments(flown)
     rates, renderer = pictures(flight, args.rounds, args.frames)
     result = {

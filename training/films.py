@@ -6,6 +6,7 @@ from pathlib import Path
 from ..agents import CONTROLLERS
 from ..agents.checkpoints import load
 from ..agents.policies import Policy
+from ..envs.config import EnvConfig
 from ..flights.filming import Film, FilmTrack, OnFrame, film
 from ..flights.palette import agent_color
 from ..flights.trajectories import flown_trajectories
@@ -59,11 +60,11 @@ def _track(results: Results, row: Row, seed: int, episode: int) -> FilmTrack:
         policy = CONTROLLERS[row.agent](spec)
     else:
         policy = load(checkpoint_file(results.folder, row, seed)).policy()
-    flown = flown_trajectories(
-        policy, spec.env_id, spec.options, [episode], vehicle=row.env.vehicle,
-        of=results.study.evaluation, drones=row.env.drones, training_seed=seed,
-    )  # fmt: skip
+    drones = row.env.drones
+    vehicle = row.env.vehicle
+    config = EnvConfig.from_keywords(spec.env_id, vehicle=vehicle, drones=drones, **spec.options)
+    flown = flown_trajectories(policy, config, [episode], results.study.evaluation, seed)
     several = not row.controller and results.study.seeds > 1
     name = row_label(row) + (f", seed {seed}" if several else "")
     color = agent_color(row.agent if row.name == row.agent else row.name, dark=True)
-    return FilmTrack(name=name, color=color, trajectories=flown, drones=row.env.drones)
+    return FilmTrack(name=name, color=color, trajectories=flown, drones=drones)

@@ -27,6 +27,7 @@ from rotorgram.cli._flags import parse
 from rotorgram.cli._scalars import ScalarWriter
 from rotorgram.cli.serve import Serve
 from rotorgram.cli.sim import Sim
+from rotorgram.envs.config import EnvConfig
 from rotorgram.flights.trajectories import flown_trajectories
 from rotorgram.models import QUAD_XML, InputError
 from rotorgram.training.results import Results
@@ -617,7 +618,8 @@ def test_nothing_that_a_checkpoint_names_is_imported(
         store(named, folder / "checkpoint.safetensors")
         assert run(capsys, "evaluate", folder, "--episodes", 1)[0] == (not known)
         assert run(capsys, "train", "a2c", "--resume", folder)[0] == 1
-    (trajectory,) = flown_trajectories(named.policy(), name, named.options, [0])  # as `render`
+    config = EnvConfig.from_keywords(name, **named.options)
+    (trajectory,) = flown_trajectories(named.policy(), config, [0])  # as `render`
     assert trajectory.spec.env_id == "rotorgram/Elevation-v0"
     assert not imported.exists()
 

@@ -12,13 +12,13 @@ from peers import ANY, Running
 from rotorgram.agents.pid import PID
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
+from rotorgram.envs.vector import LocalVectorEnv
 from rotorgram.flights.recorded import recorded_trajectories
 from rotorgram.flights.trajectories import (
     EpisodeSet,
     Trajectory,
     evaluation_seed,
     flown_trajectories,
-    fly,
     fly_episodes,
 )
 from rotorgram.training.metrics import Headline, measure_episode
@@ -27,17 +27,26 @@ from rotorgram.udp.spawn import spawn_simulator
 
 ELEVATION = "rotorgram/Elevation-v0"
 SHORT: dict[str, Any] = {"episode_length": 25}  # half a second
-SPEC = env_spec(EnvConfig.from_keywords(ELEVATION, **SHORT))
+CONFIG = EnvConfig.from_keywords(ELEVATION, **SHORT)
+SPEC = env_spec(CONFIG)
 
 
 def same(one: Trajectory, other: Trajectory) -> bool:
     """Whether every bit of every number is the same."""
-    return (
-        (one.ending, one.episode, one.spec) == (other.ending, other.episode, other.spec)
-        and one.rewards.tobytes() == other.rewards.tobytes()
-        and set(one.telemetry) == set(other.telemetry)
-        and all(one.telemetry[k].tobytes() == other.telemetry[k].tobytes() for k in one.telemetry)
-    )
+    if (one.ending, one.episode, one.spec) != (other.ending, other.episode, other.spec):
+        return False
+    if one.rewards.tobytes() != other.rewards.tobytes():
+        return False
+    bits = {name: values.tobytes() for name, values in one.telemetry.items()}
+    return bits == {name: values.tobytes() for name, values in other.telemetry.items()}
+
+
+def config_of(**options: Any) -> EnvConfig:
+    return EnvConfig.from_keywords(ELEVATION, **options)
+
+
+def local(drones: int = 1, **options: Any) -> LocalVectorEnv:
+    return LocalVectorEnv(config_of(**options), drones, autoreset_mode="Disabled")
 
 
 class Clumsy:
@@ -55,11 +64,9 @@ class Clumsy:
 
 @pytest.mark.parametrize("drones", [2, 5, 8])
 def test_a_batch_is_bit_for_bit_as_one_after_the_other(drones: int) -> None:
-    options = {"episode_length": 120}
-    with closing(gym.make(ELEVATION, **options).unwrapped) as env:
+    with closing(local(episode_length=120)) as env:
         alone = fly_episodes(env, Clumsy(), 5)
-    made = gym.make_vec(ELEVATION, num_envs=drones, autoreset_mode="Disabled", **options)
-    with closing(made) as env:
+    with closing(local(drones, episode_length=120)) as env:
         together = fly_episodes(env, Clumsy(), 5)
     assert len({len(one) for one in alone}) > 1  # some crash
     assert {one.ending for one in alone} == {"terminated", "truncated"}
@@ -67,15 +74,15 @@ def test_a_batch_is_bit_for_bit_as_one_after_the_other(drones: int) -> None:
 
 
 def test_a_batch_over_udp_is_bit_for_bit_as_in_process() -> None:
-    flown = flown_trajectories(PID(SPEC), ELEVATION, SHORT, range(3))
-    with spawn_simulator(EnvConfig.from_keywords(ELEVATION, **SHORT), num_envs=2) as env:
+    flown = flown_trajectories(PID(SPEC), CONFIG, range(3))
+    with spawn_simulator(CONFIG, num_envs=2) as env:
         assert all(map(same, flown, fly_episodes(env, PID(SPEC), 3)))
 
 
 def test_a_trajectory_is_what_the_env_tells() -> None:
+    (flown,) = flown_trajectories(PID(SPEC), CONFIG, [3])
     with closing(gym.make(ELEVATION, **SHORT).unwrapped) as env:
-        flown = fly(env, PID(SPEC), 7, episode=3)
-        observation, info = env.reset(seed=7)
+        observation, info = env.reset(seed=evaluation_seed(3))
         policy = PID(SPEC)
         heights = [info["z"]]
         errors = [info["elevation_error"]]
@@ -111,13 +118,11 @@ def test_sets_of_evaluation_episodes_share_no_seed() -> None:
 
 def test_a_recorded_trajectory_is_the_one_that_was_flown(tmp_path: Path) -> None:
     journal = tmp_path / "pid.mcap"
-    with spawn_simulator(EnvConfig.from_keywords(ELEVATION, **SHORT), record=journal) as env:
-        for episode in range(2):
-            fly(env, PID(SPEC), evaluation_seed(episode))
+    with spawn_simulator(CONFIG, num_envs=1, record=journal) as env:
+        flown = fly_episodes(env, PID(SPEC), 2)
         env.reset(seed=3)  # given up at once: no episode
         env.reset(seed=4)
-        env.step(np.zeros(1, np.float32))  # cut off
-    flown = flown_trajectories(PID(SPEC), ELEVATION, SHORT, [0, 1])
+        env.step(np.zeros((1, 1), np.float32))  # cut off
     recorded = recorded_trajectories(journal, [0, 1, 2])
     assert all(map(same, flown, recorded))
     last = recorded[2]
@@ -166,7 +171,7 @@ def test_any_drone_of_any_session(tmp_path: Path) -> None:
 
 def test_a_journal_without_a_step_is_one_sentence(tmp_path: Path) -> None:
     journal = tmp_path / "nothing.mcap"
-    with spawn_simulator(EnvConfig.from_keywords(ELEVATION, **SHORT), record=journal) as env:
+    with spawn_simulator(CONFIG, record=journal) as env:
         env.reset(seed=0)
     with pytest.raises(ValueError, match="expected an episode with a step in it"):
         recorded_trajectories(journal, [0])
@@ -178,7 +183,7 @@ def test_a_journal_without_a_step_is_one_sentence(tmp_path: Path) -> None:
 
 
 def test_random_trajectories_are_the_same_for_the_same_episode() -> None:
-    first, second = flown_trajectories(None, ELEVATION, SHORT, [0, 1])
-    (again,) = flown_trajectories(None, ELEVATION, SHORT, [1])
+    first, second = flown_trajectories(None, CONFIG, [0, 1])
+    (again,) = flown_trajectories(None, CONFIG, [1])
     assert same(again, second)
     assert first.rewards.tolist() != second.rewards.tolist()

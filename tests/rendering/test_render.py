@@ -73,9 +73,8 @@ def test_a_checkpoint_on_film_flies_as_it_does_over_the_wire(
     assert run(capsys, "evaluate", training, "--episodes", 2, "--record", journal)[0] == 0
     trained = load(training / "checkpoint.safetensors")
     assert trained.options["episode_length"] == 25
-    (flown,) = flown_trajectories(
-        trained.policy(), trained.env_id, trained.options, [1], of="final"
-    )
+    config = EnvConfig.from_keywords(trained.env_id, **trained.options)
+    (flown,) = flown_trajectories(trained.policy(), config, [1], "final")
     (recorded,) = recorded_trajectories(journal, [1])
     for name, values in flown.telemetry.items():
         assert values.tobytes() == recorded.telemetry[name].tobytes()
@@ -128,10 +127,9 @@ def test_panes_of_the_same_have_names_of_their_own(
     assert run(capsys, "render", *what, *settings)[0] == 0
     names = [track.name for track in shown]
     assert names == ["PID 1", "PID 2", "random 1", "PID 3", "random 2"]
-    evaluated = flown_trajectories(
-        PID(shown[0].trajectories[0].spec), "rotorgram/Elevation-v0", {"episode_length": 10}, [1],
-        of="final",
-    )  # fmt: skip
+    policy = PID(shown[0].trajectories[0].spec)
+    config = EnvConfig.from_keywords("rotorgram/Elevation-v0", episode_length=10)
+    evaluated = flown_trajectories(policy, config, [1], "final")
     flown = (*evaluated, *shown[0].trajectories, *shown[3].trajectories)
     assert len({one.telemetry["position"].tobytes() for one in flown}) == 1
 
