@@ -5,12 +5,12 @@ import copy
 import re
 import shutil
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence, Sized
 from contextlib import ExitStack, contextmanager
 from dataclasses import fields
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import gymnasium as gym
 import numpy as np
@@ -19,19 +19,21 @@ from numpy.typing import NDArray
 from ..envs import registry
 from ..envs.config import EnvConfig
 from ..envs.spaces import action_space, joined, observation_space
-from ..envs.spec import ArraySpec, EnvSpec, component_names
+from ..envs.spec import ArraySpec, EnvSpec
 from ..models.errors import InputError, require
 from ..models.files import check_new_file
 from ..udp.journal.reader import Recording
 from .recorded import SessionReader
+from .signals import telemetry_of
 from .trajectories import Trajectory
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-_ROW_GROUP: Final = 1 << 17  # rows of a Parquet file that are written together
-_BATCH: Final = 100  # episodes that Minari gets together
+_ROW_GROUP: Final = 1 << 17  # steps that are written together
 _MINARI_ID: Final = re.compile(r"([\w-]{2,}/)*[\w-]+-v\d+", re.ASCII)
+
+Rows = TypeVar("Rows", bound=Sized)
 
 
 class RecordedEpisodes:
@@ -43,6 +45,8 @@ class RecordedEpisodes:
     Attributes:
         spec: The spec of the env.
         left_out: Episodes with at least one step that are not whole, so far.
+        count: Whole episodes, so far.
+        steps: Their steps.
         journal: Name of the file that the last episode comes from.
 
     Raises:
@@ -56,7 +60,7 @@ class RecordedEpisodes:
     def __init__(self, paths: Sequence[Path]) -> None:
         if not paths:
             raise InputError("journals: expected at least one file, got none")
-        self.left_out = 0
+        self.left_out = self.count = self.steps = 0
         self.journal = ""
         self._sessions: dict[int, Path] = {}
         episodes = self._whole(paths)
@@ -77,6 +81,8 @@ class RecordedEpisodes:
                 if episode.ending == "cut off":
                     self.left_out += 1
                 else:
+                    self.count += 1
+                    self.steps += len(episode)
                     yield episode
 
     def _read(self, path: Path) -> Iterator[Trajectory]:
@@ -146,24 +152,28 @@ def write_parquet(episodes: RecordedEpisodes, out: Path) -> tuple[int, int]:
 
     check_new_file(out, ".parquet")
     metadata = {"env_spec": episodes.spec.to_json()}
-    count = steps = 0
-    batch: list[pa.Table] = []
+    tables = (_table(episodes.spec, i, episodes.journal, one) for i, one in enumerate(episodes))
     with _removed_on_error(out), ExitStack() as opened:
         writer: pq.ParquetWriter | None = None
-        for episode in episodes:
-            table = _table(episodes.spec, count, episodes.journal, episode)
-            batch.append(table.replace_schema_metadata(metadata))
-            count += 1
-            steps += len(episode)
+        for batch in _batches(tables, _ROW_GROUP):
+            table = pa.concat_tables(batch).replace_schema_metadata(metadata)
             if writer is None:
-                made = pq.ParquetWriter(out, batch[0].schema, compression="zstd")
+                made = pq.ParquetWriter(out, table.schema, compression="zstd")
                 writer = opened.enter_context(made)
-            if sum(map(len, batch)) > _ROW_GROUP:
-                writer.write_table(pa.concat_tables(batch))
-                batch = []
-        if batch and writer is not None:
-            writer.write_table(pa.concat_tables(batch))
-    return count, steps
+            writer.write_table(table)
+    return episodes.count, episodes.steps
+
+
+def _batches(items: Iterable[Rows], most: int) -> Iterator[list[Rows]]:
+    """All items, together as soon as they have so many rows."""
+    batch: list[Rows] = []
+    for item in items:
+        batch.append(item)
+        if sum(map(len, batch)) > most:
+            yield batch
+            batch = []
+    if batch:
+        yield batch
 
 
 def _table(spec: EnvSpec, number: int, journal: str, episode: Trajectory) -> "pa.Table":
@@ -199,9 +209,9 @@ def _table(spec: EnvSpec, number: int, journal: str, episode: Trajectory) -> "pa
     columns["reward"] = with_null(episode.rewards)
     columns["terminated"] = with_null(is_last & (episode.ending == "terminated"))
     columns["truncated"] = with_null(is_last & (episode.ending == "truncated"))
-    for array in spec.telemetry:
-        for name, column in _components(array, episode.telemetry[array.name]):
-            columns[f"telemetry.{name}"] = pa.array(column)
+    for signal in telemetry_of(episode):
+        for name, _, values in signal.columns():
+            columns[f"telemetry.{name}"] = pa.array(values)
     return pa.table(columns)
 
 
@@ -217,15 +227,6 @@ def _columns(stem: str, array: ArraySpec, values: NDArray[np.generic]) -> "dict[
         f"{stem}.{name}": pa.array(np.ascontiguousarray(column))
         for name, column in zip(names, flat.T, strict=True)
     }
-
-
-def _components(
-    array: ArraySpec, values: NDArray[np.generic]
-) -> Iterator[tuple[str, NDArray[np.generic]]]:
-    """Name and values of each component of an array over time."""
-    flat = values.reshape(len(values), -1)
-    for name, column in zip(component_names(array), flat.T, strict=True):
-        yield name, np.ascontiguousarray(column)
 
 
 # ---- Minari
@@ -253,7 +254,6 @@ def write_minari(
     if path.exists():
         raise InputError(f"out: expected the id of a new data set, got {dataset_id}: {path} exists")
     spec = episodes.spec
-    count = steps = 0
     with _removed_on_error(path), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "`.*` is set to None|env_spec is None", UserWarning)
         data = create_dataset_from_buffers(
@@ -267,16 +267,9 @@ def write_minari(
             jpeg_encoding=False,
         )
         data.storage.update_metadata({"rotorgram_env_spec": spec.to_json()})
-        batch: list[Any] = []
-        for episode in episodes:
-            batch.append(_buffer(spec, episode))
-            count += 1
-            steps += len(episode)
-            if len(batch) == _BATCH:
-                data.update_dataset_from_buffer(batch)
-                batch = []
-        data.update_dataset_from_buffer(batch)
-    return count, steps
+        for batch in _batches((_buffer(spec, episode) for episode in episodes), _ROW_GROUP):
+            data.update_dataset_from_buffer(batch)
+    return episodes.count, episodes.steps
 
 
 def env_of(spec: EnvSpec, vehicle: Path | str | None = None) -> Any:
@@ -305,9 +298,9 @@ def _buffer(spec: EnvSpec, episode: Trajectory) -> Any:
 
     is_last = np.arange(1, len(episode) + 1) == len(episode)
     infos = {}
-    for array in spec.telemetry:
-        for name, column in _components(array, episode.telemetry[array.name]):
-            infos[name] = column.tolist()
+    for signal in telemetry_of(episode):
+        for name, _, values in signal.columns():
+            infos[name] = values.tolist()
     return EpisodeBuffer(
         seed=episode.seed,
         observations=joined(spec, dict(episode.observations)),

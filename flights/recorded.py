@@ -1,17 +1,21 @@
 """Trajectories of a journal: one reader for films, logs, plots, pictures and data sets."""
 
+import logging
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..envs.spec import ArraySpec
 from ..models.errors import InputError
 from ..udp.journal.reader import Recording, Session
 from ..udp.journal.walker import Transition, Walker
 from ..udp.protocol.messages import State
 from .trajectories import Ending, Trajectory
+
+Array = NDArray[Any]
 
 
 def recorded_trajectories(
@@ -46,9 +50,15 @@ def recorded_trajectories(
     if session is not None and session not in readers:
         known = f"1 to {len(readers)}" if readers else "a journal with sessions"
         raise InputError(f"session: expected {known}, got {session} for {path}")
-    chosen = next((number for number in sorted(readers) if readers[number].has_steps), None)
-    if chosen is None:
+    flew = sorted(number for number, reader in readers.items() if reader.has_steps)
+    if not flew:
         raise InputError(f"{path}: expected an episode with a step in it, got none")
+    chosen = flew[0]
+    if len(flew) > 1:
+        words = (
+            "%s: episodes of session %d; %d more flew, which log, plot and render --session show"
+        )
+        logging.getLogger(__name__).info(words, path.name, chosen, len(flew) - 1)
     last = readers[chosen].session.num_envs - 1
     if drone is not None and not 0 <= drone <= last:
         raise InputError(f"drone: expected 0 to {last} in {path}, got {drone}")
@@ -68,10 +78,10 @@ def recorded_trajectories(
 class _Row(NamedTuple):
     """One drone after a State, and the action that led there; None at the start."""
 
-    telemetry: list[NDArray[np.float64]]
-    observations: list[NDArray[np.generic]]
+    telemetry: list[Array]
+    observations: list[Array]
     reward: float
-    action: NDArray[np.generic] | None
+    action: Array | None
 
 
 class SessionReader:
@@ -141,7 +151,7 @@ class SessionReader:
             first = drone - drone % self._drones  # the first drone's seed counts for its world
             self._seeds[drone] = None if seeds is None else seeds[first]
 
-    def _row(self, state: State, drone: int, action: NDArray[np.generic] | None) -> _Row:
+    def _row(self, state: State, drone: int, action: Array | None) -> _Row:
         observations = state.observations if self._observations else ()
         return _Row(
             telemetry=[np.array(values[drone]) for values in state.telemetry],
@@ -157,24 +167,22 @@ class SessionReader:
         if len(rows) < 2:
             return
         spec = self.session.spec
-        telemetry = {
-            array.name: np.stack([row.telemetry[i] for row in rows])
-            for i, array in enumerate(spec.telemetry)
-        }
-        observations = {}
-        if self._observations:
-            for i, array in enumerate(spec.observation):
-                observations[array.name] = np.stack([row.observations[i] for row in rows])
         yield Trajectory(
             spec=spec,
-            telemetry=telemetry,
+            telemetry=_stacked(spec.telemetry, [row.telemetry for row in rows]),
             rewards=np.array([row.reward for row in rows[1:]]),
-            actions=np.stack([row.action for row in rows[1:] if row.action is not None]),
+            actions=np.stack([row.action for row in rows if row.action is not None]),
             ending=ending,
             episode=self._episodes[drone],
-            observations=observations,
+            observations=_stacked(spec.observation, [row.observations for row in rows]),
             session=self.session.index,
             drone=drone,
             seed=self._seeds[drone],
         )
         self._episodes[drone] += 1
+
+
+def _stacked(specs: Sequence[ArraySpec], rows: Sequence[Sequence[Array]]) -> dict[str, Array]:
+    """Arrays by name, over time; nothing, if the rows are empty."""
+    columns = zip(*rows, strict=True)
+    return {spec.name: np.stack(column) for spec, column in zip(specs, columns, strict=False)}

@@ -3,9 +3,9 @@
 import csv
 import io
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,15 @@ Floats = NDArray[np.float64]
 QUATERNION: Final = ("qw", "qx", "qy", "qz")
 
 
+class Column(NamedTuple):
+    """One number of flights over time."""
+
+    name: str
+    unit: str
+    values: NDArray[Any]
+    """Shape (T + 1,), of several flights below each other."""
+
+
 class Signal(NamedTuple):
     """An array of a flight's telemetry, its actions or its rewards."""
 
@@ -31,14 +40,18 @@ class Signal(NamedTuple):
     values: Floats
     """Shape (T + 1, n); nan where a row has none."""
 
+    def columns(self) -> list[Column]:
+        """Each number by itself."""
+        return list(map(Column, self.components, self.units, self.values.T))
 
-class Column(NamedTuple):
-    """One number of a flight over time."""
 
-    name: str
-    unit: str
-    values: Floats | NDArray[np.int_]
-    """Shape (T + 1,)."""
+def telemetry_of(flight: Trajectory) -> list[Signal]:
+    """All telemetry."""
+    signals = []
+    for array in flight.spec.telemetry:
+        values = flight.telemetry[array.name].reshape(len(flight) + 1, -1)
+        signals.append(Signal(array.name, component_names(array), _units(array), values))
+    return signals
 
 
 def signals_of(flight: Trajectory) -> list[Signal]:
@@ -46,22 +59,18 @@ def signals_of(flight: Trajectory) -> list[Signal]:
 
     An action stands in the row from which it is flown, a reward in the row to which it leads.
     """
-    signals = [_telemetry(flight, array) for array in flight.spec.telemetry]
     action = flight.spec.action
     actions = np.asarray(flight.actions, np.float64).reshape(len(flight), -1)
     missing = np.full((1, actions.shape[1]), np.nan)
     names = ("choice",) if isinstance(action, Discrete) else component_names(action)
     units = ("",) if isinstance(action, Discrete) else _units(action)
     components = tuple(f"action_{name}" for name in names)
-    signals.append(Signal("action", components, units, np.concatenate((actions, missing))))
     rewards = np.concatenate(([np.nan], flight.rewards))
-    signals.append(Signal("reward", ("reward",), ("",), rewards[:, None]))
-    return signals
-
-
-def _telemetry(flight: Trajectory, array: ArraySpec) -> Signal:
-    values = flight.telemetry[array.name].reshape(len(flight) + 1, -1)
-    return Signal(array.name, component_names(array), _units(array), values)
+    return [
+        *telemetry_of(flight),
+        Signal("action", components, units, np.concatenate((actions, missing))),
+        Signal("reward", ("reward",), ("",), rewards[:, None]),
+    ]
 
 
 def _units(array: ArraySpec) -> tuple[str, ...]:
@@ -69,16 +78,26 @@ def _units(array: ArraySpec) -> tuple[str, ...]:
     return tuple("" if unit == "1" else unit for unit in units)
 
 
-def columns_of(flight: Trajectory) -> Iterator[Column]:
-    """The time, the numbers of episode and drone, and every number of the signals."""
-    rows = len(flight) + 1
-    yield Column("time", "s", flight.times)
-    yield Column("episode", "", np.full(rows, flight.episode))
-    yield Column("drone", "", np.full(rows, flight.drone))
-    for signal in signals_of(flight):
-        columns = zip(signal.components, signal.units, signal.values.T, strict=True)
-        for name, unit, values in columns:
-            yield Column(name, unit, values)
+def columns_of(*flights: Trajectory) -> list[Column]:
+    """The time, the numbers of episode and drone, and every number of the signals; flights of one
+    spec below each other.
+    """
+    tables = []
+    for flight in flights:
+        rows = len(flight) + 1
+        columns = [
+            Column("time", "s", flight.times),
+            Column("episode", "", np.full(rows, flight.episode)),
+            Column("drone", "", np.full(rows, flight.drone)),
+        ]
+        for signal in signals_of(flight):
+            columns += signal.columns()
+        tables.append(columns)
+    joined = []
+    for parts in zip(*tables, strict=True):
+        values = np.concatenate([part.values for part in parts])
+        joined.append(parts[0]._replace(values=values))
+    return joined
 
 
 def write_csv(flights: Sequence[Trajectory], out: Path) -> int:
@@ -86,19 +105,14 @@ def write_csv(flights: Sequence[Trajectory], out: Path) -> int:
 
     The head has names and units, as `x [m]`. Numbers have all their digits; a missing one is empty.
     """
-    rows = 0
+    columns = columns_of(*flights)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    for flight in flights:
-        columns = list(columns_of(flight))
-        if not rows:
-            writer.writerow([f"{c.name} [{c.unit}]" if c.unit else c.name for c in columns])
-        numbers = (column.values.tolist() for column in columns)
-        for row in zip(*numbers, strict=True):
-            writer.writerow(["" if math.isnan(value) else value for value in row])
-            rows += 1
+    writer.writerow([f"{c.name} [{c.unit}]" if c.unit else c.name for c in columns])
+    for row in zip(*(column.values.tolist() for column in columns), strict=True):
+        writer.writerow(["" if math.isnan(value) else value for value in row])
     write_new(out, text.getvalue())
-    return rows
+    return len(columns[0].values)
 
 
 def write_parquet_log(flights: Sequence[Trajectory], out: Path) -> int:
@@ -110,16 +124,13 @@ def write_parquet_log(flights: Sequence[Trajectory], out: Path) -> int:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    tables = []
-    for flight in flights:
-        columns = list(columns_of(flight))
-        arrays = [pa.array(column.values, from_pandas=True) for column in columns]
-        schema = pa.schema(
-            pa.field(column.name, array.type, metadata={"unit": column.unit})
-            for column, array in zip(columns, arrays, strict=True)
-        )
-        tables.append(pa.Table.from_arrays(arrays, schema=schema))
-    table = pa.concat_tables(tables)
+    arrays = []
+    fields = []
+    for column in columns_of(*flights):
+        array = pa.array(column.values, from_pandas=True)
+        arrays.append(array)
+        fields.append(pa.field(column.name, array.type, metadata={"unit": column.unit}))
+    table = pa.Table.from_arrays(arrays, schema=pa.schema(fields))
     file = pa.BufferOutputStream()
     pq.write_table(table, file)
     write_new(out, file.getvalue().to_pybytes())
