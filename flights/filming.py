@@ -7,13 +7,14 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..envs.rendering import moment
 from ..models.errors import InputError
+from ..models.fields import Limits, check_fields
 from ..rendering import Camera, Canvas, MetricValue, Moment, Stage
 from ..rendering.film import QUALITY, check_film, write_film
 from ..rendering.overlay import Overlay, graph_scale
@@ -66,9 +67,8 @@ class FilmTrack:
     @cached_property
     def episodes(self) -> list[list[Trajectory]]:
         """The trajectories of each episode, one of each drone."""
-        flown = self.trajectories
-        drones = self.drones
-        return [flown[first : first + drones] for first in range(0, len(flown), drones)]
+        firsts = range(0, len(self.trajectories), self.drones)
+        return [self.trajectories[first : first + self.drones] for first in firsts]
 
     @cached_property
     def moments(self) -> list[list[list[Moment]]]:
@@ -76,15 +76,20 @@ class FilmTrack:
         return [[moments(one) for one in world] for world in self.episodes]
 
     @cached_property
-    def distances(self) -> list[Floats]:
-        """By episode the least distance between two drones after each control step, m, shape
-        (T + 1,). A drone whose episode has ended stays where it is, as in the pictures.
+    def curves(self) -> list[Floats]:
+        """The overlay's graph by episode, shape (T + 1,): the headline metric; of several drones
+        the least distance between two, m. A drone whose episode has ended stays where it is, as in
+        the pictures.
         """
+        if self.drones == 1:
+            return [one.headline for one in self.trajectories]
         found = []
         for world in self.episodes:
             longest = max(map(len, world)) + 1
-            rows = [np.minimum(np.arange(longest), len(one)) for one in world]
-            positions = [one.pose[own, :3] for one, own in zip(world, rows, strict=True)]
+            positions = []
+            for one in world:
+                rows = np.minimum(np.arange(longest), len(one))
+                positions.append(one.pose[rows, :3])
             pairs = combinations(positions, 2)
             found.append(np.min([np.linalg.norm(a - b, axis=1) for a, b in pairs], axis=0))
         return found
@@ -95,14 +100,8 @@ class FilmTrack:
         own = flown[min(step, len(flown) - 1)]
         if self.drones == 1:
             return own
-        distance = MetricValue("least distance", float(self.distances[episode][step]), "m")
+        distance = MetricValue("least distance", float(self.curves[episode][step]), "m")
         return replace(own, metrics=(distance, *own.metrics))
-
-    def curve(self, episode: int) -> Floats:
-        """The overlay's graph: the headline metric; of several drones the least distance, m."""
-        if self.drones == 1:
-            return self.episodes[episode][0].headline
-        return self.distances[episode]
 
     def note(self, episode: int, step: int) -> str:
         """Which trajectories have ended at a step otherwise than by the clock."""
@@ -122,14 +121,14 @@ class Film:
     height: int = 720
     camera: Camera = "chase"
     fps: float = 25.0
-    speed: float = 1.0
+    speed: Annotated[float, Limits(0.001, 1000)] = 1.0
     """Seconds of flight per second of film."""
     scene: str = "airport"
     vehicle: str | None = None
     """File or name of the vehicle; None: the paper's."""
     overlay: bool = True
     """Whether numbers and graphs are drawn. Of several panes the names always are."""
-    at: float | None = None
+    at: Annotated[float | None, Limits(0, unit="s")] = None
     """Only the picture at this time of the first episode, s."""
     fast: bool = False
     """Without shadows and smooth edges."""
@@ -137,11 +136,8 @@ class Film:
     """As of `write_film`."""
 
     def __post_init__(self) -> None:
+        check_fields(self)
         parse_scene(self.scene)
-        if not 0.001 <= self.speed <= 1000:
-            raise InputError(f"speed: expected 0.001 to 1000, got {self.speed:g}")
-        if self.at is not None and not 0 <= self.at < math.inf:
-            raise InputError(f"at: expected a time of 0 s or more, got {self.at:g}")
 
 
 def film(
@@ -170,10 +166,10 @@ def _times(tracks: Sequence[FilmTrack], config: Film, *, still: bool) -> list[tu
     counts = {(len(track.episodes), track.drones) for track in tracks}
     if len(counts) != 1 or not tracks[0].episodes:
         raise InputError("tracks: expected one or more, with as many episodes and drones each")
-    lengths = []
-    for episode in range(len(tracks[0].episodes)):
-        worlds = [track.episodes[episode] for track in tracks]
-        lengths.append(max(one.seconds for world in worlds for one in world))
+    lengths = [0.0] * len(tracks[0].episodes)
+    for track in tracks:
+        for episode, world in enumerate(track.episodes):
+            lengths[episode] = max(lengths[episode], *(one.seconds for one in world))
     if config.at is not None:
         return [(0, config.at)]
     if still:
@@ -244,7 +240,7 @@ class _Pane:
         self._config = config
         self._canvas = canvas
         self._stage = stage
-        self._is_named = len(tracks) > 1
+        self._has_overlay = config.overlay or len(tracks) > 1
         self._overlay = Overlay(
             canvas.width,
             canvas.height,
@@ -275,9 +271,9 @@ class _Pane:
             self._stage.show(*(own[min(now, len(own) - 1)] for own in flown))
         self._shown = episode, step
         self._picture = self._canvas.draw(config.camera, self._stage)
-        if config.overlay or self._is_named:
+        if self._has_overlay:
             note = track.note(episode, step) if config.overlay else ""
-            values = track.curve(episode)[: step + 1].tolist()
+            values = track.curves[episode][: step + 1].tolist()
             panel = track.panel(episode, step)
             self._picture = self._overlay.draw(self._picture, panel, values, note)
         return self._picture
@@ -285,13 +281,11 @@ class _Pane:
 
 def _scale(tracks: Sequence[FilmTrack]) -> tuple[float, float]:
     """Ends of the graph. Of a crash the start of the headline metric counts, unless all crashed."""
-    if tracks[0].drones > 1:
-        distances = [values for track in tracks for values in track.distances]
-        return graph_scale(np.concatenate(distances).tolist())
     flown = [one for track in tracks for one in track.trajectories]
     all_crashed = all(one.terminated for one in flown)
-    values = []
-    for one in flown:
-        is_cut = one.terminated and not all_crashed
-        values.append(one.headline[:1] if is_cut else one.headline)
-    return graph_scale(np.concatenate(values).tolist())
+    curves = []
+    for track in tracks:
+        for world, curve in zip(track.episodes, track.curves, strict=True):
+            is_cut = track.drones == 1 and world[0].terminated and not all_crashed
+            curves.append(curve[:1] if is_cut else curve)
+    return graph_scale(np.concatenate(curves).tolist())

@@ -273,7 +273,7 @@ def test_several_drones_tell_how_near_they_come() -> None:
     first = trajectory(5.0, 5.0, 5.0, ending="terminated")
     second = trajectory(8.0, 7.0, 6.0, 6.5)
     both = FilmTrack(name="ORCA", color="#7CC8F2", trajectories=[first, second], drones=2)
-    assert both.curve(0).tolist() == [3.0, 2.0, 1.0, 1.5]  # one that has ended stays there
+    assert both.curves[0].tolist() == [3.0, 2.0, 1.0, 1.5]  # one that has ended stays there
     distance, headline = both.panel(0, 1).metrics
     assert distance == MetricValue("least distance", 2.0, "m")
     assert headline.name == "elevation_error"
@@ -281,7 +281,7 @@ def test_several_drones_tell_how_near_they_come() -> None:
     assert both.panel(0, 3).metrics[0].value == 1.5
     assert [both.note(0, step) for step in range(4)] == ["", "", *["1 of 2 ended"] * 2]
     alone = track(second)
-    assert alone.curve(0).tolist() == [-3.0, -2.0, -1.0, -1.5]
+    assert alone.curves[0].tolist() == [-3.0, -2.0, -1.0, -1.5]
     assert [metric.name for metric in alone.panel(0, 0).metrics] == ["elevation_error"]
     assert [track(first).note(0, step) for step in (1, 2)] == ["", "terminated"]
 
