@@ -3,15 +3,18 @@
 Only SB3's algorithms need torch.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import zip_longest
 
 from ..envs.spec import Discrete, EnvSpec, component_names
 from ..models.errors import InputError
 from .a2c import A2CConfig
 from .checkpoints import Checkpoint, CheckpointError, load, store
-from .config import NETWORK_FIELDS, Config
+from .config import NETWORK_FIELDS, Config, SACConfig
 from .episodes import Episode, EpisodeRecorder, ResumeError, episode_seed
 from .geometric import Geometric
+from .learner import Learner
 from .orca import Orca
 from .pid import PID
 from .policies import NetworkPolicy, Policy
@@ -24,7 +27,6 @@ from .registry import (
     AlgorithmName,
     find_algorithm,
 )
-from .sac import SACConfig
 from .vpg import VPGConfig
 
 __all__ = [
@@ -59,12 +61,9 @@ __all__ = [
     "store",
 ]
 
-_ERRORS = (KeyError, TypeError, ValueError, RuntimeError, IndexError)
-"""What parts of a checkpoint that do not fit together raise."""
-
 
 def make_agent(algorithm: str, log: EpisodeRecorder, config: Config, seed: int) -> Agent:
-    """A new agent of a name in `ALGORITHMS`, for the env of a log; SB3's cannot `set_state`.
+    """A new agent of a name in `ALGORITHMS`, for the env of a log.
 
     Raises:
         InputError: No such algorithm, or a config of another one.
@@ -83,36 +82,22 @@ def make_agent(algorithm: str, log: EpisodeRecorder, config: Config, seed: int) 
 def start_agent(
     kept: Checkpoint, algorithm: str, log: EpisodeRecorder, config: Config, seed: int
 ) -> Agent:
-    """A new agent that begins with the networks of a checkpoint; all else of it is fresh.
+    """A new agent that begins with the policy of a checkpoint; all else of it is fresh.
 
-    The checkpoint is of the same algorithm; algorithms of one family take each other's policy, and
-    each other's critic where it has the same shape. Its task, vehicle and effects may be others,
-    its observation and action may not.
+    It takes the critic too where that has the same shape. Task, vehicle and effects may be others,
+    observation and action may not. SB3's agents begin with no checkpoint, and none with theirs.
 
     Raises:
         InputError: The checkpoint has other networks, or is a policy alone.
         CheckpointError: The parts of the checkpoint do not fit together.
     """
-    _check_start(kept, algorithm, log.spec, config)
-    agent = make_agent(algorithm, log, config, seed)
-    try:
-        agent.start_from(kept)
-    except _ERRORS as error:
-        raise _unfit(error) from None
-    return agent
-
-
-def _check_start(kept: Checkpoint, algorithm: str, spec: EnvSpec, config: Config) -> None:
-    family = find_algorithm(algorithm).family
-    alike = sorted(name for name, row in ALGORITHMS.items() if family and row.family == family)
-    names = alike or [algorithm]
-    if kept.algorithm not in names:
-        raise InputError(
-            f"start-from: expected a training of {', '.join(names)}, got {kept.algorithm}"
-        )
+    names = [name for name, row in ALGORITHMS.items() if row.resumes]
+    for name in (algorithm, kept.algorithm):
+        if name not in names:
+            raise InputError(f"start-from: expected a training of {', '.join(names)}, got {name}")
     if not kept.num_envs:
         raise InputError("start-from: expected the checkpoint of a training, got a policy alone")
-    for wanted, got in zip_longest(_names(kept.spec), _names(spec), fillvalue="none"):
+    for wanted, got in zip_longest(_names(kept.spec), _names(log.spec), fillvalue="none"):
         if wanted != got:
             raise InputError(f"start-from: expected {wanted} of {kept.env_id}, got {got}")
     begun_with = kept.hyperparameters
@@ -121,6 +106,11 @@ def _check_start(kept: Checkpoint, algorithm: str, spec: EnvSpec, config: Config
         own = getattr(begun_with, name)
         if value != own:
             raise InputError(f"{name}: expected {own} of the training to start from, got {value}")
+    agent = make_agent(algorithm, log, config, seed)
+    assert isinstance(agent, Learner)
+    with _fitting():
+        agent.start_from(kept)
+    return agent
 
 
 def _names(spec: EnvSpec) -> list[str]:
@@ -133,9 +123,16 @@ def _names(spec: EnvSpec) -> list[str]:
     return names + [f"action {name!r}" for name in component_names(spec.action)]
 
 
-def _unfit(error: Exception) -> CheckpointError:
-    reason = " ".join(str(error).split())
-    return CheckpointError(f"checkpoint: its parts do not fit together: {reason:.300}")
+@contextmanager
+def _fitting() -> Iterator[None]:
+    """Errors of parts of a checkpoint that do not fit together become `CheckpointError`."""
+    try:
+        yield
+    except ResumeError:
+        raise
+    except (KeyError, TypeError, ValueError, RuntimeError, IndexError) as error:
+        reason = " ".join(str(error).split())
+        raise CheckpointError(f"checkpoint: its parts do not fit together: {reason:.300}") from None
 
 
 def resume_agent(kept: Checkpoint, log: EpisodeRecorder) -> Agent:
@@ -151,20 +148,12 @@ def resume_agent(kept: Checkpoint, log: EpisodeRecorder) -> Agent:
     """
     kept.check_resumable()
     _check_same_env(kept.spec, log.spec)
-    try:
+    with _fitting():
         kept.policy()  # its networks are those of the config
         agent = make_agent(kept.algorithm, log, kept.hyperparameters, kept.seed)
-        if not find_algorithm(kept.algorithm).resumes:
-            return agent
-        agent.set_state(kept.state)
-    except _ERRORS as error:
-        raise _unfit(error) from None
-    try:
-        log.resume(kept.position)
-    except InputError:
-        raise
-    except (IndexError, TypeError, ValueError) as error:
-        raise _unfit(error) from None
+        if isinstance(agent, Learner):
+            agent.set_state(kept.state)
+            log.resume(kept.position)
     return agent
 
 

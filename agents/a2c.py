@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ..models.fields import Limits
 from .config import RolloutConfig
-from .learner import PolicyGradient
+from .learner import Learner
 from .networks import Floats
 from .rollouts import Collector, Rollout, advantages
 
@@ -30,7 +30,7 @@ class A2CConfig(RolloutConfig):
     """Weight of the policy's entropy."""
 
 
-class A2C(PolicyGradient):
+class A2C(Learner):
     """Two networks: the critic learns V(s), the actor follows the advantage.
 
     Algorithm 2 weighs the actor's gradient by Q in step 3; the text and Equation 3 by A, as here.
@@ -47,7 +47,7 @@ class A2C(PolicyGradient):
     def gradient(self, rollout: Rollout) -> None:
         """Of minus the mean of A · log P, plus the weighted squared error of the value."""
         config = self.config
-        observations = self.inputs(rollout.rows(rollout.observations))
+        observations = self._actor.inputs(rollout.rows(rollout.observations))
         advantage = rollout.rows(self.advantages(rollout)[0]).astype(np.float32)
         values = self._critic.forward(observations)[:, 0]
         targets = values + advantage
@@ -91,7 +91,7 @@ class A2C(PolicyGradient):
 
         Of drones that are not `flying`, bool, shape (T, N), another drone may not learn.
         """
-        return self.inputs(observations)
+        return self._actor.inputs(observations)
 
     def _values(self, seen: Floats) -> NDArray[np.float64]:
         """V(s), shape (...), of inputs of the critic, shape (..., m)."""

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Final, Literal
 
+from ..models.errors import InputError
 from ..models.fields import Limits, check_fields
 
 NETWORK_FIELDS: Final = ("network", "hidden", "activation", "normalize_observations")
@@ -57,3 +58,39 @@ class RolloutConfig(Config):
 
     def least_steps(self, drones: int, episode_length: int) -> int:
         return self.rollout_size(drones)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SACConfig(RolloutConfig):
+    """Stable-Baselines3's Soft Actor-Critic (Haarnoja et al. 2018, arXiv 1812.05905).
+
+    Defaults: its Table 1.
+    """
+
+    squashed: ClassVar[bool] = True
+    hidden: tuple[int, ...] = (256, 256)
+    """Units of each hidden layer of each network."""
+    learning_rate: float = 0.0003
+    """Of Adam: actor, critics and temperature."""
+    gradient_steps: Annotated[int, Limits(1, whole=True)] = 1
+    """Updates after each `steps_per_update` env steps."""
+    batch_size: Annotated[int, Limits(1, whole=True)] = 256
+    """Transitions of an update, drawn from the buffer."""
+    buffer_size: Annotated[int, Limits(1, whole=True)] = 1_000_000
+    """Transitions that are kept."""
+    learning_starts: Annotated[int, Limits(1, whole=True)] = 1_000
+    """Transitions of uniform actions before the first update. Table 1 has none."""
+    tau: Annotated[float, Limits(0.0, 1.0, above=True)] = 0.005
+    """Share of the critics that their targets take over in each update."""
+    alpha: Annotated[float, Limits(0.0, 1e30, above=True)] = 1.0
+    """Temperature at the beginning. Table 1 has none."""
+    target_entropy: float | None = None
+    """Entropy that the temperature aims at, nats; null: minus the number of actions."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.buffer_size < self.learning_starts:
+            raise InputError(
+                f"buffer_size: expected learning_starts ({self.learning_starts}) or more, "
+                f"got {self.buffer_size}"
+            )

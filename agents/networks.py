@@ -33,13 +33,6 @@ def part_of(items: Mapping[str, Item], prefix: str) -> dict[str, Item]:
     return {k.removeprefix(prefix): item for k, item in items.items() if k.startswith(prefix)}
 
 
-def check_shapes(name: str, arrays: Mapping[str, np.ndarray], expected: Shapes) -> None:
-    """Raises `ValueError` unless these arrays are there, in these shapes, and no others."""
-    got = {key: array.shape for key, array in arrays.items()}
-    if got != expected:
-        raise ValueError(f"{name}: expected arrays of shapes {dict(expected)}, got {got}")
-
-
 @dataclass(frozen=True)
 class Weights:
     """Arrays by name and their gradients, all of them views of two flat arrays.
@@ -72,27 +65,21 @@ class Weights:
 
     def part(self, prefix: str) -> "Weights":
         """The arrays with names that begin so, which are neighbours, without this prefix."""
-        names = [name for name in self.shapes if name.startswith(prefix)]
-        sizes = [math.prod(shape) for shape in self.shapes.values()]
-        first = sum(sizes[: list(self.shapes).index(names[0])])
-        shapes = {name.removeprefix(prefix): self.shapes[name] for name in names}
-        some = slice(first, first + sum(map(math.prod, shapes.values())))
-        return Weights(shapes, self.values[some], self.slopes[some])
+        spans = list(part_of(self._spans(), prefix).values())
+        some = slice(spans[0].start, spans[-1].stop)
+        return Weights(part_of(self.shapes, prefix), self.values[some], self.slopes[some])
 
-    def load(self, arrays: Mapping[str, Floats]) -> None:
-        """Take over arrays by name. Raises `ValueError` for other names or shapes."""
-        check_shapes("weights", arrays, self.shapes)
-        for name, array in self.arrays.items():
-            array[...] = arrays[name]
-
-    def _views(self, flat: Floats) -> dict[str, Floats]:
-        views: dict[str, Floats] = {}
+    def _spans(self) -> dict[str, slice]:
+        spans = {}
         first = 0
         for name, shape in self.shapes.items():
             last = first + math.prod(shape)
-            views[name] = flat[first:last].reshape(shape)
+            spans[name] = slice(first, last)
             first = last
-        return views
+        return spans
+
+    def _views(self, flat: Floats) -> dict[str, Floats]:
+        return {name: flat[span].reshape(self.shapes[name]) for name, span in self._spans().items()}
 
 
 class Layer:
@@ -192,43 +179,42 @@ class Tanh(Layer):
         return slope
 
 
-class Normalise(Layer):
-    """(x - mean) · scale, with fixed numbers, of shape (n,) each."""
+class Module(Protocol):
+    """What computes with weights."""
 
-    def __init__(self, mean: Floats, scale: Floats) -> None:
-        self.mean = mean
-        self.scale = scale
+    shapes: Shapes
 
-    def forward(self, inputs: Floats) -> Floats:
-        return (inputs - self.mean) * self.scale
+    def bind(self, weights: Weights) -> None:
+        """Compute with these arrays from now on; they have the shapes of `shapes`."""
 
-    def back(self, slope: Floats) -> Floats:
-        return slope * self.scale
+
+def shapes_of(modules: Mapping[str, Module]) -> Shapes:
+    """Shapes of the weights of modules, each with a prefix to its names."""
+    shapes: dict[str, tuple[int, ...]] = {}
+    for prefix, module in modules.items():
+        shapes |= named(prefix, module.shapes)
+    return shapes
+
+
+def bind_parts(modules: Mapping[str, Module], weights: Weights) -> None:
+    """Let each module compute with the weights of its prefix."""
+    for prefix, module in modules.items():
+        module.bind(weights.part(prefix))
 
 
 class Network:
     """Layers in a row, from inputs (B, n) to outputs (B, k). Subclasses build them.
 
-    A network with a memory takes it behind its inputs, (B, n + m), and leaves what it remembers
-    in `remembered`. Rollouts keep it for each drone, with 0 at the beginning of an episode.
-
     Attributes:
         layers: In the order of evaluation.
         shapes: Of all weights: `layers.0.weight` and so on, counted by layers that have weights.
-        remembered: The memory after `forward`, shape (B, m).
     """
-
-    memory: ClassVar[int] = 0
-    """Numbers that it remembers of each drone, m."""
-    remembered: Floats
 
     def __init__(self, inputs: int, outputs: int, config: Config) -> None:
         self.layers = list(self.build(inputs, outputs, config))
         with_weights = [layer for layer in self.layers if layer.shapes]
         self._named = {f"layers.{i}.": layer for i, layer in enumerate(with_weights)}
-        self.shapes: Shapes = {}
-        for prefix, layer in self._named.items():
-            self.shapes = {**self.shapes, **named(prefix, layer.shapes)}
+        self.shapes = shapes_of(self._named)
 
     @abstractmethod
     def build(self, inputs: int, outputs: int, config: Config) -> Sequence[Layer]:
@@ -236,16 +222,17 @@ class Network:
 
     def bind(self, weights: Weights) -> None:
         """Compute with these arrays from now on; they have the shapes of `shapes`."""
-        for prefix, layer in self._named.items():
-            layer.bind(weights.part(prefix))
+        bind_parts(self._named, weights)
 
     def initialise(self, rng: np.random.Generator, gain: float) -> None:
         """Draw the weights, with the gain sqrt(2) but for the last layer that has weights."""
-        last = [layer for layer in self.layers if layer.shapes][-1]
-        for layer in self.layers:
-            layer.initialise(rng, gain if layer is last else math.sqrt(2))
+        *others, last = self._named.values()
+        for layer in others:
+            layer.initialise(rng, math.sqrt(2))
+        last.initialise(rng, gain)
 
     def forward(self, inputs: Floats) -> Floats:
+        """The outputs; the inputs stay as they are."""
         if self.layers[0].in_place:
             inputs = inputs.copy()
         for layer in self.layers:
@@ -260,12 +247,6 @@ class Network:
             if layer is not first:
                 slope = layer.back(slope)
 
-    def by_inputs(self, slope: Floats) -> Floats:
-        """The derivatives by the last inputs, from those by the outputs; gradients stay."""
-        for layer in reversed(self.layers):
-            slope = layer.back(slope)
-        return slope
-
 
 class MLP(Network):
     """Layers of `relu` or `tanh` units (paper, section 2.3: one of 16) and a linear one."""
@@ -276,26 +257,6 @@ class MLP(Network):
             layers += [Affine(inputs, units), {"relu": Relu, "tanh": Tanh}[config.activation]()]
             inputs = units
         return [*layers, Affine(inputs, outputs)]
-
-
-class Module(Protocol):
-    """What computes with weights."""
-
-    shapes: Shapes
-
-    def bind(self, weights: Weights) -> None:
-        """Compute with these arrays from now on; they have the shapes of `shapes`."""
-
-
-def bind_all(modules: Mapping[str, Module], **others: tuple[int, ...]) -> Weights:
-    """The weights of modules, by the prefix of their names, and other arrays: all 0."""
-    shapes: dict[str, tuple[int, ...]] = {}
-    for prefix, module in modules.items():
-        shapes |= named(prefix, module.shapes)
-    weights = Weights.zeros(shapes | others)
-    for prefix, module in modules.items():
-        module.bind(weights.part(prefix))
-    return weights
 
 
 NETWORKS: Final[dict[str, type[Network]]] = {"mlp": MLP}

@@ -1,52 +1,49 @@
 """Adam, and the length of a gradient."""
 
 import math
-from collections.abc import Mapping
 
 import numpy as np
 
-from .networks import Floats, Weights, check_shapes
+from .networks import Floats, Weights
 
 
 class Adam:
-    """Kingma and Ba 2015, Algorithm 1, with their constants and torch's order of operations."""
+    """Kingma and Ba 2015, Algorithm 1, with their constants and torch's order of operations.
+
+    Attributes:
+        state: All that it keeps between two steps, by name: a checkpoint writes it in place.
+    """
 
     def __init__(self, weights: Weights, epsilon: float = 1e-8) -> None:
         self._weights = weights
         self._epsilon = epsilon
-        self.first = np.zeros_like(weights.values)
-        self.second = np.zeros_like(weights.values)
-        self.steps = 0
+        self._first = np.zeros_like(weights.values)
+        self._second = np.zeros_like(weights.values)
+        self._count = np.zeros((), np.int64)
+        self.state: dict[str, np.ndarray] = {
+            "first": self._first,
+            "second": self._second,
+            "steps": self._count,
+        }
+
+    @property
+    def steps(self) -> int:
+        """Steps so far."""
+        return int(self._count)
 
     def step(self, rate: float | Floats) -> None:
         """Move the weights against their gradients; rates may differ, float32, shape (P,)."""
-        self.steps += 1
+        self._count += 1
         slopes = self._weights.slopes
-        self.first += 0.1 * (slopes - self.first)
-        self.second *= 0.999
-        self.second += (0.001 * slopes) * slopes
-        scale = np.sqrt(self.second)
+        self._first += 0.1 * (slopes - self._first)
+        self._second *= 0.999
+        self._second += (0.001 * slopes) * slopes
+        scale = np.sqrt(self._second)
         scale /= math.sqrt(1 - 0.999**self.steps)
         scale += self._epsilon
-        np.divide(self.first, scale, out=scale)
+        np.divide(self._first, scale, out=scale)
         scale *= rate / (1 - 0.9**self.steps)
         self._weights.values[...] -= scale
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """Its state."""
-        return {
-            "first": self.first.copy(),
-            "second": self.second.copy(),
-            "steps": np.array(self.steps),
-        }
-
-    def load(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Take over a state. Raises `ValueError` unless it is whole."""
-        size = self.first.shape
-        check_shapes("optimizer", arrays, {"first": size, "second": size, "steps": ()})
-        self.first[...] = arrays["first"]
-        self.second[...] = arrays["second"]
-        self.steps = int(arrays["steps"])
 
 
 def clip_norm(slopes: Floats, most: float) -> float:

@@ -120,7 +120,6 @@ class NetworkPolicy:
         self.shapes: Shapes = {**self.network.shapes, **self.head.shapes}
         self.moments = Moments(size) if config.normalize_observations else None
         self._squash = [Tanh()] if config.squashed else []
-        self.reset()
 
     @classmethod
     def load(cls, weights: Mapping[str, Floats], spec: EnvSpec, config: Config) -> "NetworkPolicy":
@@ -140,9 +139,9 @@ class NetworkPolicy:
                 "other observations or actions; give the --vehicle and the --env options of its "
                 "training"
             )
-        bound = Weights.zeros(policy.shapes)
-        bound.load({name: weights[name] for name in policy.shapes})
-        policy.bind(bound)
+        policy.bind(Weights.zeros(policy.shapes))
+        for name, array in policy.weights.arrays.items():
+            array[...] = weights[name]
         if policy.moments is not None:
             policy.moments.mean = weights["observation.mean"]
             policy.moments.scale = weights["observation.scale"]
@@ -168,32 +167,20 @@ class NetworkPolicy:
         return arrays
 
     @property
-    def inputs_size(self) -> int:
-        """Length of a flat observation."""
-        return flat_size(self.spec)
-
-    @property
-    def layers(self) -> list[Layer]:
+    def layers(self) -> list[Layer | Moments]:
         """All that happens between an observation and the output, in its order."""
         first = [] if self.moments is None else [self.moments]
         return [*first, *self.network.layers, *self._squash]
 
     def reset(self) -> None:
-        """Forget the last episode."""
-        self._memory = np.zeros((1, self.network.memory), np.float32)
+        """Nothing of an episode is kept."""
 
     def inputs(self, observations: Floats) -> Floats:
-        """Observations (..., n), and the memory behind them, as the network takes them."""
-        if self.moments is None:
-            return observations
-        if not self.network.memory:
-            return self.moments.forward(observations)
-        size = len(self.moments.mean)
-        seen = self.moments.forward(observations[..., :size])
-        return np.concatenate([seen, observations[..., size:]], axis=-1)
+        """Observations (..., n) as the network takes them: normalised, if the config has it."""
+        return observations if self.moments is None else self.moments.forward(observations)
 
     def output(self, observations: Floats) -> Floats:
-        """Means, or logits, shape (N, k), of flat observations, shape (N, n), with the memory."""
+        """Means, or logits, shape (N, k), of flat observations, shape (N, n)."""
         values = self.network.forward(self.inputs(observations))
         for layer in self._squash:
             values = layer.forward(values)
@@ -201,25 +188,16 @@ class NetworkPolicy:
 
     def act(self, observation: Observation) -> Action:
         """The most likely action, inside the bounds of the env."""
-        seen = flat(observation, self.spec, 1)
-        if self.network.memory:
-            seen = np.concatenate([seen, self._memory], axis=1)
-        output = self.output(seen)
-        if self.network.memory:
-            self._memory = self.network.remembered
+        output = self.output(flat(observation, self.spec, 1))
         if isinstance(self.spec.action, Discrete):
             return int(output.argmax())
         return self.actions.to_envs(output).reshape(self.spec.action.shape)
-
-    def draw_noise(self, rng: np.random.Generator, steps: int) -> Floats:
-        """Randomness for `steps` rows of `sample`, drawn at once: shape (steps, k)."""
-        return self.head.noise(rng, steps)
 
     def sample(self, observations: Floats, noise: Floats) -> Floats:
         """Actions drawn from the policy, float32, shape (N, k), not clipped.
 
         Shape (N, 1), holding whole numbers, if they are discrete. Observations are flat, shape
-        (N, n), with the memory; noise is N rows of `draw_noise`.
+        (N, n); noise is N rows of `head.noise`.
         """
         return self.head.sample(self.output(observations), noise)
 

@@ -10,6 +10,7 @@ from typing import Any, Final, Literal
 from ..envs.registry import is_known, task_type
 from ..models import Backend
 from ..models.errors import InputError
+from ..models.fields import check_names
 from .config import Config
 from .registry import find_algorithm
 
@@ -65,8 +66,7 @@ def _lineage(env_id: str, tasks: list[str]) -> Iterator[str]:
 
 def preset_names(algorithm: str) -> list[str]:
     """Names of an algorithm's presets. One without any has `tuned`, its config's defaults."""
-    own = find_algorithm(algorithm).presets or algorithm
-    names = {name for other, name, _ in _tables() if other == own}
+    names = {name for other, name, _ in _tables() if other == algorithm}
     return sorted(names) or ["tuned"]
 
 
@@ -81,10 +81,9 @@ def find_preset(algorithm: str, name: str, env_id: str = DEFAULT_TASK) -> Preset
     names = preset_names(algorithm)
     if name not in names:
         raise InputError(f"preset: expected {' or '.join(names)} for {algorithm}, got {name!r}")
-    own = row.presets or algorithm
     tables = {}
     for (other, kind, task), table in _tables().items():
-        if (other, kind) == (own, name):
+        if (other, kind) == (algorithm, name):
             tables[task] = table
     found = next(_lineage(env_id, list(tables)), None)
     task = found or DEFAULT_TASK
@@ -97,11 +96,5 @@ def find_preset(algorithm: str, name: str, env_id: str = DEFAULT_TASK) -> Preset
 def preset(algorithm: str, name: str, env_id: str = DEFAULT_TASK, **changes: Any) -> Config:
     """Hyperparameters of a preset, with some of them changed. Raises `InputError`."""
     base = find_preset(algorithm, name, env_id or DEFAULT_TASK).config
-    known = [field.name for field in fields(base)]
-    unknown = sorted({*changes} - {*known})
-    if unknown:
-        raise InputError(
-            f"hyperparameters: expected some of {', '.join(sorted(known))}, "
-            f"got {', '.join(unknown)}"
-        )
+    check_names(changes, (field.name for field in fields(base)), "hyperparameters")
     return replace(base, **changes)

@@ -6,14 +6,14 @@ truncation and never over a termination; a recursion stops at either, and at the
 """
 
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..models.errors import InputError
 from .episodes import EpisodeRecorder
-from .networks import Floats, Network
+from .networks import Floats
+from .policies import NetworkPolicy
 
 Numbers = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -31,8 +31,7 @@ class Rollout:
     """
 
     observations: Floats
-    """Shape (T, N, n); of a policy with a memory (T, N, n + m), with the memory behind the
-    observation."""
+    """Shape (T, N, n)."""
     actions: Floats
     """As drawn, not clipped: shape (T, N, k); (T, N, 1) if discrete."""
     rewards: Numbers
@@ -74,38 +73,15 @@ class Rollout:
         return replace(self, kept=self.kept & (rewards_to_go(lost, self.ends, 1.0) == 0))
 
 
-class Explorer(Protocol):
-    """Draws actions for a collector, as `NetworkPolicy` does."""
-
-    network: Network
-
-    def draw_noise(self, rng: np.random.Generator, steps: int) -> Floats:
-        """Randomness for `steps` rows of `sample`."""
-
-    def sample(self, observations: Floats, noise: Floats) -> Floats:
-        """Actions, shape (N, k), of flat observations, shape (N, n), with the memory."""
-
-
 class Collector:
-    """Flies a policy, episode after episode, across calls; `rng` draws the actions.
-
-    The policy's memory of each drone, shape (N, m), is kept in the array `memory`, and is 0 where
-    an episode begins.
-    """
+    """Flies a policy, episode after episode, across calls; `rng` draws the actions."""
 
     def __init__(
-        self,
-        log: EpisodeRecorder,
-        rng: np.random.Generator,
-        policy: Explorer,
-        memory: Floats | None = None,
+        self, log: EpisodeRecorder, rng: np.random.Generator, policy: NetworkPolicy
     ) -> None:
         self._log = log
         self._rng = rng
         self._policy = policy
-        if memory is None:
-            memory = np.zeros((log.num_envs, policy.network.memory), np.float32)
-        self._memory = memory
 
     def steps(self, count: int) -> Rollout:
         """Whole steps of all drones: the fewest for `count` transitions, without the lost steps.
@@ -148,11 +124,11 @@ class Collector:
         stop = None if most_steps is None else log.env_steps + most_steps
         block = length or max(256 // count, 1)
         rows: list[tuple[np.ndarray, ...]] = []
-        observations = self._seen()
+        observations = log.observations
         waiting = int(np.count_nonzero(log.done))
         while len(rows) != length and (stop is None or log.env_steps < stop):
             if not len(rows) % block:
-                drawn = self._policy.draw_noise(self._rng, block * count)
+                drawn = self._policy.head.noise(self._rng, block * count)
                 noise = drawn.reshape(block, count, -1)
             actions = self._policy.sample(observations, noise[len(rows) % block])
             if not np.isfinite(actions).all():
@@ -162,8 +138,7 @@ class Collector:
             idle = log.done if waiting else None
             begins, frozen = (idle, None) if stop is None else (None, idle)
             log.fly(actions, begins, frozen)
-            self._remember(begins, frozen)
-            after = self._seen()
+            after = log.observations
             ends = (env.terminated, env.truncated, flying, env.lost)
             rows.append((observations, actions, env.rewards, after, *ends))
             observations = after
@@ -171,36 +146,13 @@ class Collector:
             if waiting == count:
                 if stop is not None:
                     break
-                self._begin()
-                observations = self._seen()
+                log.begin(log.done)
+                observations = log.observations
                 waiting = 0
         if waiting and (stop is None or waiting == count):
-            self._begin()
+            log.begin(log.done)
         *columns, lost = (np.array(column) for column in zip(*rows, strict=True))
         return Rollout(*columns), lost, waiting == count
-
-    def _begin(self) -> None:
-        """Begin the next episodes where they have ended."""
-        done = self._log.done
-        broken = self._log.begin(done)
-        self._memory[done | broken] = 0.0
-
-    def _seen(self) -> Floats:
-        """What the policy takes now: the observations, and behind them its memory."""
-        if not self._memory.size:
-            return self._log.observations
-        return np.concatenate([self._log.observations, self._memory], axis=1)
-
-    def _remember(self, begins: Mask | None, frozen: Mask | None) -> None:
-        """Keep the policy's new memory, but of drones that did not fly."""
-        if not self._memory.size:
-            return
-        new = self._policy.network.remembered
-        if frozen is not None:
-            new = np.where(frozen[:, np.newaxis], self._memory, new)
-        if begins is not None:
-            new = np.where(begins[:, np.newaxis], np.float32(0.0), new)
-        self._memory[...] = new
 
 
 def discounted_sums(values: np.ndarray, factors: np.ndarray) -> Numbers:

@@ -11,12 +11,11 @@ from ..envs.autoreset import Step
 from ..models.errors import InputError, require
 from . import learner
 from .a2c import A2C, A2CConfig
-from .checkpoints import Checkpoint
+from .config import SACConfig
 from .episodes import EpisodeRecorder
-from .networks import Floats, named, part_of
+from .networks import Floats
 from .policies import ActionMap, NetworkPolicy
 from .ppo import PPO, PPOConfig
-from .sac import SACConfig
 
 if TYPE_CHECKING:
     import stable_baselines3 as sb3
@@ -146,7 +145,7 @@ class SB3Agent:
     """SB3's A2C, PPO or SAC, by the class of its config, behind the interface of ours.
 
     All settings come from the same config: given the same experience, SB3 makes the same updates
-    as ours. A training runs from its beginning to its end: a checkpoint has its weights, and no
+    as ours. A training runs from its beginning to its end: a checkpoint has its policy, and no
     state to go on from.
 
     Attributes:
@@ -219,7 +218,8 @@ class SB3Agent:
 
     def actor(self) -> dict[str, np.ndarray]:
         """Weights of the policy, under our names."""
-        weights = self._weights()
+        parameters = self.model.policy.state_dict()
+        weights = {name: values.numpy().copy() for name, values in parameters.items()}
         hidden = "mlp_extractor.policy_net"
         output = "action_net"
         if isinstance(self._config, SACConfig):
@@ -240,20 +240,8 @@ class SB3Agent:
         return NetworkPolicy.load(self.actor(), self.spec, self._config)
 
     def state(self) -> dict[str, np.ndarray]:
-        """Weights of all networks, for `start_from`."""
-        return named("policy.", self._weights())
-
-    def _weights(self) -> dict[str, np.ndarray]:
-        parameters = self.model.policy.state_dict()
-        return {name: values.numpy().copy() for name, values in parameters.items()}
-
-    def start_from(self, kept: Checkpoint) -> None:
-        """As `Learner.start_from`."""
-        policy = self.model.policy
-        weights = part_of(kept.state, "policy.")
-        policy.load_state_dict({name: torch.from_numpy(w.copy()) for name, w in weights.items()})
-        if "log_std" in weights:
-            policy.log_std.data.fill_(self._config.log_std)
+        """Nothing: no training goes on from it."""
+        return {}
 
     def scalars(self) -> dict[str, float]:
         """Numbers of the last update, as SB3 logs them; none before the first."""

@@ -8,7 +8,7 @@ import numpy as np
 from ..models.errors import InputError
 from ..models.fields import Limits
 from .config import Config
-from .learner import PolicyGradient
+from .learner import Learner
 from .networks import Floats
 from .rollouts import Collector, Rollout, rewards_to_go, step_of_episode
 
@@ -36,7 +36,7 @@ class VPGConfig(Config):
         return drones * episode_length if drones > 1 else 1
 
 
-class VPG(PolicyGradient):
+class VPG(Learner):
     """Raise the log-probability of every action by the return that followed it.
 
     The gradient of Equation 2, R_t · grad log P(a_t | s_t), averaged over the steps of an update.
@@ -52,7 +52,7 @@ class VPG(PolicyGradient):
     def gradient(self, rollout: Rollout) -> None:
         """Of minus the mean of R_t · log P(a_t | s_t)."""
         weights = self.returns(rollout)
-        inputs = self.inputs(rollout.rows(rollout.observations))
+        inputs = self._actor.inputs(rollout.rows(rollout.observations))
         log_probability, entropy = self._actor.score(inputs, rollout.rows(rollout.actions))
         self._actor.backward(-weights / len(weights))
         self.terms = {"gain": (log_probability * weights).mean(), "entropy": entropy}

@@ -61,7 +61,7 @@ class Train(AgentFlags, BackendFlags):
     """
 
     algorithm: Positional[AlgorithmName]
-    """vpg, a2c, ppo, ippo, mappo, sac, sb3-a2c, sb3-ppo or sb3-sac."""
+    """vpg, a2c, ppo, ippo, mappo, sb3-a2c, sb3-ppo or sb3-sac."""
     preset: PresetName = "tuned"
     """Hyperparameters: the paper's (of vpg and a2c), or ours, which may depend on the task."""
     backend: BackendOfPreset = "mujoco"

@@ -1,4 +1,4 @@
-"""Samples per second of updates: our PPO, A2C and SAC beside SB3's, on data of the same env.
+"""Samples per second of updates: our PPO and A2C beside SB3's, on data of the same env.
 
     OMP_NUM_THREADS=1 python studies/updates.py [--seconds 3] [--cases ppo] [--out FILE.json]
 
@@ -6,14 +6,13 @@
 same. A sample is a transition in one step of Adam, so an epoch counts each of a rollout once. Ours
 and SB3's take turns, update by update, in one process: set OMP_NUM_THREADS=1; medians are compared.
 Computing the advantages is part of an update of ours, and of SB3's `train` it is not: SB3 does it
-while it flies. Both SACs draw their batches from the buffer within the update.
+while it flies.
 
 It takes about two minutes on two cores.
 """
 
 import os
 import time
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -28,8 +27,6 @@ CASES: dict[str, tuple[str, str, int, dict[str, int]]] = {
     "a2c, 256 steps of 1 drone": ("a2c", "rotorgram/Elevation-v0", 1, {}),
     "a2c, 1,024 steps of 64 drones": ("a2c", "rotorgram/Elevation-v0", 64,
                                       {"steps_per_update": 1024}),
-    "sac, Elevation-v0": ("sac", "rotorgram/Elevation-v0", 8, {"gradient_steps": 8}),
-    "sac, Hover-v0": ("sac", "rotorgram/Hover-v0", 64, {}),
 }  # fmt: skip
 """Algorithm, env, drones and changes to the preset `tuned`."""
 
@@ -42,15 +39,11 @@ class Updates:
         log = EpisodeRecorder(env, 0)
         self.agent: Any = make_agent(algorithm, log, config, 0)
         self.rollouts: list[Rollout] = []
-        total = 2 * config.rollout_size(drones) + getattr(config, "learning_starts", 0)
+        total = 2 * config.rollout_size(drones)
         if algorithm.startswith("sb3-"):
             self.agent.train(log, total, lambda: True)
             self.agent.model.on_update = lambda: True
-            batch = [config.gradient_steps, config.batch_size] if algorithm == "sb3-sac" else []
-            self.update = partial(self.agent.model.train, *batch)
-        elif algorithm == "sac":
-            self.agent.train(log, total, lambda: True)
-            self.update = self.agent.replay
+            self.update = self.agent.model.train
         else:
             update = self.agent.update
             self.agent.update = lambda rollout: (self.rollouts.append(rollout), update(rollout))
@@ -75,11 +68,8 @@ def measure(case: tuple[str, str, int, dict[str, int]], seconds: float) -> dict[
     while time.perf_counter() < until or len(times[algorithm]) < 5:
         for name, update in updates.items():
             times[name].append(update.seconds())
-    if algorithm == "sac":
-        batch, samples = config.batch_size, config.batch_size * config.gradient_steps
-    else:
-        batch = config.rollout_size(drones)
-        samples = batch * getattr(config, "epochs", 1)
+    batch = config.rollout_size(drones)
+    samples = batch * getattr(config, "epochs", 1)
     medians = {name: np.median(one, axis=0) for name, one in times.items()}
     wall, processor = medians[f"sb3-{algorithm}"] / medians[algorithm]
     return {

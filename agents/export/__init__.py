@@ -47,8 +47,6 @@ def export(checkpoint: Checkpoint, target: str) -> bytes:
         env_steps=checkpoint.position.env_steps,
     )
     policy = checkpoint.policy()
-    if policy.network.memory:
-        raise InputError("export: expected a policy without a memory, got one with a memory")
     _check_finite(policy)
     content: bytes = module.write(policy, facts)
     return content

@@ -11,8 +11,9 @@ import numpy as np
 
 from ...envs.spec import BODY_TO_WORLD, ArraySpec, Discrete, EnvSpec, component_names
 from ...models.errors import InputError
-from ..networks import Affine, Floats, Normalise, Relu, Tanh
-from ..policies import NetworkPolicy
+from ..networks import Affine, Floats, Relu, Tanh
+from ..normalization import Moments
+from ..policies import NetworkPolicy, flat_size
 
 _LARGEST: Final = float(np.finfo(np.float32).max)
 _PAIRS: Final = re.compile(r"(?<=\*)(?=/)|(?<=/)(?=\*)|(?<=\?)(?=\?)")
@@ -85,10 +86,10 @@ class _Program:
         self.buffers: dict[str, int] = {}
         self.lines: list[str] = []
         self.at = "observation"
-        self.size = policy.inputs_size
+        self.size = flat_size(policy.spec)
         self.uses_tanh = False
         for layer in policy.layers:
-            if isinstance(layer, Normalise):
+            if isinstance(layer, Moments):
                 self._normalise(layer)
             elif isinstance(layer, Affine):
                 self._affine(layer)
@@ -125,7 +126,7 @@ class _Program:
         else:
             self.lines += [f"{start} {{", *inner, "}"]
 
-    def _normalise(self, layer: Normalise) -> None:
+    def _normalise(self, layer: Moments) -> None:
         mean = self._table("mean", layer.mean)
         scale = self._table("scale", layer.scale)
         out = self._buffer(self.size)

@@ -9,8 +9,9 @@ import onnx.checker
 from onnx import TensorProto, helper, numpy_helper
 
 from ...models.errors import InputError
-from ..networks import Affine, Normalise, Relu, Tanh
-from ..policies import NetworkPolicy
+from ..networks import Affine, Relu, Tanh
+from ..normalization import Moments
+from ..policies import NetworkPolicy, flat_size
 
 OPSET: Final = 13  # the first in which ArgMax, Max and Min are as they are today
 _IR: Final = 7  # the format of files that came with this opset
@@ -42,7 +43,7 @@ def write(policy: NetworkPolicy, facts: Mapping[str, str]) -> bytes:
     graph = _Graph()
     actions = policy.actions
     for layer in policy.layers:
-        if isinstance(layer, Normalise):
+        if isinstance(layer, Moments):
             graph.then("Sub", layer.mean)
             graph.then("Mul", layer.scale)
         elif isinstance(layer, Affine):
@@ -66,7 +67,7 @@ def write(policy: NetworkPolicy, facts: Mapping[str, str]) -> bytes:
         kind = TensorProto.FLOAT
         shape.append(actions.outputs)
     graph.nodes[-1].output[0] = "action"
-    sizes: list[str | int | None] = ["batch", policy.inputs_size]
+    sizes: list[str | int | None] = ["batch", flat_size(policy.spec)]
     made = helper.make_graph(
         graph.nodes,
         "policy",

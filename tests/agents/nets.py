@@ -3,10 +3,9 @@
 from collections.abc import Mapping
 
 import numpy as np
-from rotorgram.agents.config import Config
+from rotorgram.agents.config import Config, SACConfig
 from rotorgram.agents.networks import MLP, Network, Weights
 from rotorgram.agents.policies import NetworkPolicy
-from rotorgram.agents.sac import SACConfig
 from rotorgram.envs.spec import EnvSpec
 
 

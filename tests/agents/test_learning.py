@@ -138,14 +138,13 @@ def test_learning_rate_falls_from_its_full_value_linearly(algorithm: str, anneal
 
 def copy_weights(theirs: Any, ours: A2C) -> None:
     """Of SB3's agent to ours."""
-    weights = theirs.state()
-    names = {"layers.0": "mlp_extractor.value_net.0", "layers.1": "value_net"}
-    ours.weights.part("actor.").load(theirs.actor())
-    ours.weights.part("critic.").load({
-        f"{mine}.{kind}": weights[f"policy.{name}.{kind}"]
-        for mine, name in names.items()
-        for kind in ("weight", "bias")
-    })  # fmt: skip
+    given = {f"actor.{name}": array for name, array in theirs.actor().items()}
+    tensors = theirs.model.policy.state_dict()
+    for mine, name in (("0", "mlp_extractor.value_net.0"), ("1", "value_net")):
+        for kind in ("weight", "bias"):
+            given[f"critic.layers.{mine}.{kind}"] = tensors[f"{name}.{kind}"].numpy()
+    for name, array in ours.weights.arrays.items():
+        array[...] = given[name]
 
 
 def train_both(
@@ -259,7 +258,7 @@ def test_unknown_names_are_named() -> None:
     for arguments, changes, sentence in (
         (("dqn", "paper"), {}, "algorithm: expected one of"),
         (("vpg", "best"), {}, "preset: expected paper or tuned for vpg, got 'best'"),
-        (("vpg", "paper"), {"rate": 1}, r"hyperparameters: expected some of .* got rate$"),
+        (("vpg", "paper"), {"rate": 1}, r"hyperparameters: expected some of .* got 'rate'$"),
     ):
         with pytest.raises(InputError, match=sentence):
             preset(*arguments, **changes)
@@ -358,7 +357,6 @@ def test_every_agent_trains_with_every_preset_and_kind_of_action(
         ("a2c", 8, 60_000, {"steps_per_update": 512}, 0.1),
         ("vpg", 4, 60_000, {}, 0.2),
         ("ppo", 32, 41_000, {}, 0.05),
-        ("sac", 8, 10_000, {}, 0.1),
     ],
 )
 def test_learns_to_hold_the_target(

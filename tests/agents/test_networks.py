@@ -69,10 +69,6 @@ def test_arrays_are_views_of_one() -> None:
     weights.gradients["a.x"][1] = 3
     assert weights.values.tolist() == [0, 0, 0, 0, 0, 0, 0, 0, 7, 7]
     assert weights.slopes.tolist() == [0, 0, 0, 3, 3, 3, 0, 0, 0, 0]
-    with pytest.raises(ValueError, match="expected arrays of shapes"):
-        weights.part("a.").load({"x": np.zeros((3, 2))})
-    weights.part("a.").load({"x": np.ones((2, 3))})
-    assert weights.values.sum() == 6 + 14
 
 
 @pytest.mark.parametrize("activation", ["relu", "tanh"])
@@ -82,16 +78,10 @@ def test_gradients_are_those_of_torch(hidden: tuple[int, ...], activation: str) 
     seen = normal(BATCH, INPUTS)
     slope = normal(BATCH, 2)
     theirs = tensors(weights)
-    inputs = torch.tensor(seen, requires_grad=True)
-    output = torch_mlp(theirs, inputs, activation)
+    output = torch_mlp(theirs, torch.from_numpy(seen), activation)
     (output * torch.from_numpy(slope)).sum().backward()
     np.testing.assert_allclose(net.forward(seen), output.detach(), rtol=1e-5, atol=1e-5)
     net.backward(slope)
-    before = weights.slopes.copy()
-    by_inputs = net.by_inputs(2 * slope) / 2
-    np.testing.assert_array_equal(weights.slopes, before)
-    assert inputs.grad is not None
-    np.testing.assert_allclose(by_inputs, inputs.grad, rtol=2e-5, atol=2e-6)
     agree(weights, theirs)
 
 

@@ -65,7 +65,7 @@ def test_observations_are_normalised_and_outputs_squashed() -> None:
 def test_gaussian_sampling_has_the_mean_and_deviation_of_the_policy() -> None:
     policy = random_policy(BOX)
     observation = np.ones((1, 3), np.float32)
-    noise = policy.draw_noise(np.random.default_rng(0), 40_000)
+    noise = policy.head.noise(np.random.default_rng(0), 40_000)
     drawn = policy.sample(np.repeat(observation, 40_000, axis=0), noise)
     std = np.exp(policy.arrays()["log_std"])
     mean = policy.output(observation)[0]
@@ -76,7 +76,7 @@ def test_gaussian_sampling_has_the_mean_and_deviation_of_the_policy() -> None:
 
 def test_categorical_sampling_has_the_probabilities_of_the_policy() -> None:
     policy = random_policy(CHOICE)
-    noise = policy.draw_noise(np.random.default_rng(0), 40_000)
+    noise = policy.head.noise(np.random.default_rng(0), 40_000)
     drawn = policy.sample(np.zeros((40_000, 3), np.float32), noise)
     counts = np.bincount(drawn[:, 0].astype(int), minlength=3)
     shares = np.exp(policy.output(np.zeros((1, 3), np.float32))[0])

@@ -5,21 +5,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import pytest
 from rotorgram.agents import (
     A2CConfig,
     Config,
     EpisodeRecorder,
+    PPOConfig,
     find_preset,
     load,
     make_agent,
     store,
 )
 from rotorgram.agents.a2c import A2C
-from rotorgram.agents.networks import NETWORKS, Affine, Floats, Layer, Network, Tanh
+from rotorgram.agents.networks import NETWORKS, Affine, Layer, Network, Tanh
 from rotorgram.agents.registry import ALGORITHMS, Algorithm
-from rotorgram.agents.rollouts import Collector
 from rotorgram.cli import main
 from rotorgram.envs import LocalVectorEnv, register
 from rotorgram.envs.config import EnvConfig
@@ -32,7 +31,6 @@ from rotorgram.training.training import Training
 
 ENV = "rotorgram/Elevation-v0"
 OPTIONS: dict[str, Any] = {"episode_length": 12, "start_band": 0.3, "flight_band": 0.4}
-M = 5
 
 
 def vector(drones: int = 4) -> LocalVectorEnv:
@@ -96,28 +94,21 @@ def test_a_new_algorithm_is_one_row(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 # ---- a row for a network
 
 
-class Recurrent(Network):
-    """One layer of tanh units, which see what they gave a step before."""
-
-    memory = M
+class Wide(Network):
+    """Two layers of tanh units."""
 
     def build(self, inputs: int, outputs: int, config: Config) -> Sequence[Layer]:
-        return [Affine(inputs + M, M), Tanh(), Affine(M, outputs)]
-
-    def forward(self, inputs: Floats) -> Floats:
-        first, bend, last = self.layers
-        self.remembered = bend.forward(first.forward(inputs))
-        return last.forward(self.remembered)
+        return [Affine(inputs, 5), Tanh(), Affine(5, 5), Tanh(), Affine(5, outputs)]
 
 
 @pytest.mark.parametrize("algorithm", ["vpg", "a2c", "ppo"])
 def test_a_network_of_one_s_own_trains_resumes_and_loads(
     algorithm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(NETWORKS, "recurrent", Recurrent)
+    monkeypatch.setitem(NETWORKS, "wide", Wide)
     sizes = {"episodes_per_update": 4} if algorithm == "vpg" else {"steps_per_update": 48}
     config = ALGORITHMS[algorithm].config(
-        network="recurrent", normalize_observations=True, learning_rate=0.01, **sizes
+        network="wide", normalize_observations=True, learning_rate=0.01, **sizes
     )
     whole, resumed = stopped_and_resumed(run_of(algorithm, config), tmp_path / "c")
     for name, array in whole.agent.state().items():
@@ -125,46 +116,14 @@ def test_a_network_of_one_s_own_trains_resumes_and_loads(
     begun = Training(whole.run, vector()).agent.actor()["layers.0.weight"]
     assert (resumed.agent.actor()["layers.0.weight"] != begun).any()
 
-    policy, same = load(tmp_path / "c").policy(), load(tmp_path / "c").policy()
-    seen = np.array([0.3, -0.1, 0.0], np.float32)
-    first = policy.act(seen)
-    assert policy.act(seen) != first  # it remembers the first time
-    policy.reset()
-    assert policy.act(seen) == same.act(seen) == first
-    monkeypatch.delitem(NETWORKS, "recurrent")
-    with pytest.raises(InputError, match="network: expected one of mlp, got 'recurrent'; import"):
+    monkeypatch.delitem(NETWORKS, "wide")
+    with pytest.raises(InputError, match="network: expected one of mlp, got 'wide'; import"):
         load(tmp_path / "c")
 
 
-def test_the_memory_begins_with_an_episode_and_is_kept_with_the_rollout(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setitem(NETWORKS, "recurrent", Recurrent)
-    log = EpisodeRecorder(vector(3), 0)
-    agent: Any = make_agent("a2c", log, A2CConfig(network="recurrent"), 0)
-    collector = Collector(log, np.random.default_rng(0), agent.policy())
-    rollouts = [collector.steps(60), collector.steps(60)]
-    seen, after, ends, kept = (
-        np.concatenate([getattr(rollout, name) for rollout in rollouts])
-        for name in ("observations", "next_observations", "ends", "kept")
-    )
-    assert seen.shape == (40, 3, 3 + M)
-    began = np.zeros_like(kept)
-    began[0] = True
-    began[1:] = ends[:-1] & kept[1:]
-    assert began[1:].any()
-    assert not seen[began][:, 3:].any()
-    goes_on = kept[1:] & ~began[1:]
-    np.testing.assert_array_equal(seen[1:][goes_on], after[:-1][goes_on])
-    assert (seen[1:][goes_on][:, 3:] != 0).all()
-
-
-@pytest.mark.parametrize("algorithm", ["mappo", "sac", "sb3-ppo"])
-def test_who_takes_no_memory_says_so(algorithm: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(NETWORKS, "recurrent", Recurrent)
-    config = ALGORITHMS[algorithm].config(network="recurrent")
-    with pytest.raises(InputError, match="network: expected "):
-        make_agent(algorithm, EpisodeRecorder(vector(), 0), config, 0)
+def test_sb3_takes_its_own_networks_alone() -> None:
+    with pytest.raises(InputError, match="network: expected mlp with SB3, got 'wide'"):
+        make_agent("sb3-ppo", EpisodeRecorder(vector(), 0), PPOConfig(network="wide"), 0)
 
 
 # ---- presets

@@ -1,6 +1,5 @@
 """Learning with several drones in a world: who counts, what the critic sees, and resuming."""
 
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -25,9 +24,10 @@ def log_of(worlds: int = 1, drones: int = 2, seed: int = 0, **options: Any) -> E
 class Climbers:
     """A policy of which every second drone, from the first on, climbs; the others hover."""
 
-    network = SimpleNamespace(memory=0)
+    def __init__(self) -> None:
+        self.head = self
 
-    def draw_noise(self, rng: np.random.Generator, steps: int) -> np.ndarray:
+    def noise(self, rng: np.random.Generator, steps: int) -> np.ndarray:
         return np.zeros((steps, 1), np.float32)
 
     def sample(self, observations: np.ndarray, noise: np.ndarray) -> np.ndarray:
@@ -109,12 +109,9 @@ def test_of_a_single_drone_the_central_critic_is_ppos() -> None:
     assert weights[0] == weights[1]
 
 
-@pytest.mark.parametrize("algorithm", ["ippo", "mappo", "vpg", "sac"])
+@pytest.mark.parametrize("algorithm", ["ippo", "mappo", "vpg"])
 def test_a_training_that_stops_anywhere_ends_with_the_same_bits(algorithm: str) -> None:
-    small: dict[str, Any] = {
-        "vpg": {"episodes_per_update": 3},
-        "sac": {"learning_starts": 60, "batch_size": 8, "hidden": (8,), "buffer_size": 500},
-    }.get(algorithm, SMALL)
+    small = {"episodes_per_update": 3} if algorithm == "vpg" else SMALL
     env_config = EnvConfig(env_id=RISE, episode_length=90)
     run = Run(algorithm=algorithm, config=preset(algorithm, "tuned", **small), seed=1,
               env_steps=1200, num_envs=6, env=env_config)  # fmt: skip

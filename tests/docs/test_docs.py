@@ -69,22 +69,6 @@ def test_the_seeds_of_vpg_that_do_not_hold_are_those_that_were_measured() -> Non
         assert f"| {row.seed} | {row[2]} | {slopes} |" in text
 
 
-def test_the_seeds_of_sac_are_those_that_were_measured() -> None:
-    measured = result("sac/elevation")
-    seeds = pd.DataFrame(measured["seeds"])
-    (steps,) = seeds["env_steps"].unique()
-    returns = seeds["return"]
-    loads = seeds["load_average"]
-    check(
-        "algorithms/sac",
-        f"After {steps:,} env steps {measured['hold']} of {measured['of']} seeds hold",
-        f"the worst seed's steady |E| is {seeds['error'].max():.3f} m",
-        f"returns are {returns.min():.0f} to {returns.max():.0f}",
-        f"the median was {measured['seconds']['median']:.0f} s",
-        f"the load average was {loads.min()} to {loads.max()}",
-    )
-
-
 def test_the_speeds_are_those_of_the_benchmark() -> None:
     speed = result("training_speed")
     for agent, median in speed["medians"].items():
