@@ -13,7 +13,7 @@ import os
 import platform
 import re
 import secrets
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 from importlib.metadata import PackageNotFoundError, version
@@ -110,12 +110,9 @@ class Checkpoint:
     def other_versions(self) -> dict[str, tuple[str, str]]:
         """Software that has another version now: its version then and now."""
         now = software_versions()
-        changed = {}
-        for name in sorted({*self.versions, *now}):
-            pair = self.versions.get(name, "none"), now.get(name, "none")
-            if pair[0] != pair[1]:
-                changed[name] = pair
-        return changed
+        names = sorted({*self.versions, *now})
+        pairs = {name: (self.versions.get(name, "none"), now.get(name, "none")) for name in names}
+        return {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
 
 
 def software_versions() -> dict[str, str]:
@@ -140,10 +137,9 @@ def store(checkpoint: Checkpoint, path: Path) -> None:
         for name, dtype in _COLUMNS.items():
             column = [getattr(episode, name) for episode in where.episodes]
             arrays[f"episodes/{name}"] = np.array(column, dtype)
-    for name, array in arrays.items():
-        if not _is_finite(name, array):
-            raise CheckpointError(f"checkpoint: training diverged, {name} is not finite")
-        arrays[name] = np.array(array, order="C")
+    for name in _not_finite(arrays):
+        raise CheckpointError(f"checkpoint: training diverged, {name} is not finite")
+    arrays = {name: np.array(array, order="C") for name, array in arrays.items()}
     meta = {
         "format": FORMAT,
         **{name: getattr(checkpoint, name) for name in _PLAIN},
@@ -166,26 +162,33 @@ def load(path: Path) -> Checkpoint:
         return _read(path.read_bytes(), numpy.load)
     except OSError as error:
         raise CheckpointError(f"checkpoint: cannot read {path}: {error.strerror}") from None
+    except InputError as error:
+        raise CheckpointError(f"{path}: {error}") from None
     except (require("safetensors", "train", "").SafetensorError, *_MALFORMED) as error:
         reason = " ".join(str(error).split())
-        raise CheckpointError(f"{path}: expected a rotorgram checkpoint: {reason:.200}") from None
+        raise CheckpointError(
+            f"{path}: expected a rotorgram checkpoint, got one with a wrong part ({reason:.200})"
+        ) from None
 
 
 def _read(data: bytes, parse: Callable[[bytes], dict[str, np.ndarray]]) -> Checkpoint:
     found = _CHECKSUM.search(data)
     checksum = hashlib.sha256(_with_checksum(data, b"0" * 64)).hexdigest().encode()
     if found is None or found[1] != checksum:
-        raise ValueError("expected a file without damage, got another checksum than it holds")
+        raise InputError("expected a rotorgram checkpoint, got another file or a damaged one")
     header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
     content = json.loads(header["__metadata__"]["rotorgram"])
     if content["format"] != FORMAT:
-        raise ValueError(f"expected format {FORMAT}, got {shortened(content['format'])}")
+        found_format = shortened(content["format"])
+        raise InputError(f"expected a checkpoint of format {FORMAT}, got {found_format}")
     meta = read_table(_Meta, content, "metadata")
     spec = EnvSpec.from_json(meta.spec)
     arrays = parse(data)
+    for name in _not_finite(arrays):
+        raise InputError(f"expected finite numbers, got NaN or infinity in {name}")
     env = EnvConfig.from_dict(meta.env) if meta.env else None
     if env and env.env_id != canonical_id(spec.env_id):
-        raise ValueError(f"expected the config of {spec.env_id}, got that of {env.env_id}")
+        raise InputError(f"expected the config of {spec.env_id}, got that of {env.env_id}")
     checkpoint = Checkpoint(
         spec=spec,
         env=env,
@@ -258,10 +261,12 @@ def _with_checksum(data: bytes, checksum: bytes) -> bytes:
     return _CHECKSUM.sub(b'"sha256":"%s"' % checksum, data, count=1)
 
 
-def _is_finite(name: str, array: np.ndarray) -> bool:
-    # Without metrics the error of an episode is NaN, which is no divergence.
-    allowed = name == "episodes/mean_size"
-    return allowed or array.dtype.kind != "f" or bool(np.isfinite(array).all())
+def _not_finite(arrays: Mapping[str, np.ndarray]) -> Iterator[str]:
+    """Names of arrays that hold NaN or infinity."""
+    for name, array in arrays.items():
+        # Without metrics the error of an episode is NaN, which is no divergence.
+        if name != "episodes/mean_size" and not np.isfinite(array).all():
+            yield name
 
 
 def write_whole(path: Path, data: bytes) -> None:

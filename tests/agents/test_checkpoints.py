@@ -2,6 +2,7 @@
 
 import json
 import os
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -131,59 +132,87 @@ def test_another_env_is_refused(kept: Checkpoint) -> None:
         resume_agent(replace(kept, position=position), log_of(2))
 
 
+DAMAGED = "expected a rotorgram checkpoint, got another file or a damaged one"
+
+
 def test_the_smallest_damage_is_noticed(kept: Checkpoint, tmp_path: Path) -> None:
     path = tmp_path / "c"
     store(kept, path)
     data = path.read_bytes()
     places = np.random.default_rng(0).choice(len(data), 300, replace=False)
+    files = [b"", b"x", data[:-1], data + b"x", data[:100], b"garbage" * 100]
     for place in [*range(8), *places.tolist()]:
         damaged = bytearray(data)
         damaged[place] ^= 1 << place % 8
-        path.write_bytes(damaged)
-        with pytest.raises(CheckpointError, match="expected a rotorgram checkpoint"):
+        files.append(damaged)
+    for content in files:
+        path.write_bytes(content)
+        with pytest.raises(CheckpointError) as told:
             load(path)
-    for wrong in (b"", b"x", data[:-1], data + b"x", data[:100], b"garbage" * 100):
-        path.write_bytes(wrong)
-        with pytest.raises(CheckpointError, match="expected a rotorgram checkpoint"):
-            load(path)
-    with pytest.raises(
-        CheckpointError, match=r"checkpoint: expected a file, got .*none, where there is none"
-    ):
-        load(tmp_path / "none")
+        assert str(told.value) == f"{path}: {DAMAGED}"
+    missing = tmp_path / "none"
+    with pytest.raises(CheckpointError) as told:
+        load(missing)
+    assert str(told.value) == f"checkpoint: expected a file, got {missing}, where there is none"
 
 
-def test_what_is_not_finite_is_never_stored(kept: Checkpoint, tmp_path: Path) -> None:
+def with_nan(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The arrays, the first number of which is NaN."""
+    copies = {name: array.copy() for name, array in arrays.items()}
+    numbers = [array for array in copies.values() if array.dtype.kind == "f"]
+    numbers[0].flat[0] = np.nan
+    return copies
+
+
+@pytest.mark.parametrize("part", ["actor", "state"])
+def test_what_is_not_finite_is_never_stored(part: str, kept: Checkpoint, tmp_path: Path) -> None:
     path = tmp_path / "c"
     store(kept, path)
     before = path.read_bytes()
-    for part in ("actor", "state"):
-        arrays = {name: array.copy() for name, array in getattr(kept, part).items()}
-        next(array for array in arrays.values() if array.dtype.kind == "f").flat[0] = np.nan
-        with pytest.raises(CheckpointError, match=r"training diverged, .* is not finite"):
-            store(replace(kept, **{part: arrays}), path)
+    wrong = replace(kept, **{part: with_nan(getattr(kept, part))})
+    with pytest.raises(CheckpointError, match=r"training diverged, .* is not finite"):
+        store(wrong, path)
     assert path.read_bytes() == before
     assert os.listdir(tmp_path) == ["c"]
 
 
+def test_what_is_not_finite_is_never_loaded(
+    kept: Checkpoint, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A crafted file with a good checksum."""
+    path = tmp_path / "c"
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoints, "_not_finite", lambda _: [])
+        store(replace(kept, actor=with_nan(kept.actor)), path)
+    with pytest.raises(CheckpointError) as told:
+        load(path)
+    name = f"policy/{next(iter(kept.actor))}"
+    assert str(told.value) == f"{path}: expected finite numbers, got NaN or infinity in {name}"
+
+
 @pytest.mark.parametrize(
-    "change",
+    ("change", "sentence"),
     [
-        {"config": None},
-        {"config": {}},
-        {"config": {"gamma": "[[["}},
-        {"env_steps": 10**400},
-        {"env_steps": 1.5},
-        {"seed": -1},
-        {"algorithm": ["vpg"]},
-        {"versions": []},
-        {"spec": SimpleNamespace(to_json=lambda: None)},
-        {"spec": SimpleNamespace(to_json=lambda: "{}")},
+        ({"config": None}, "expected a rotorgram checkpoint, got one with a wrong part ("),
+        ({"config": {}}, "config: expected all of"),
+        ({"config": {"gamma": "[[["}}, "gamma: expected a number from 0 to 1"),
+        ({"env_steps": 10**400}, "metadata.env_steps: expected a whole number"),
+        ({"env_steps": 1.5}, "metadata.env_steps: expected a whole number"),
+        ({"seed": -1}, "metadata.seed: expected a whole number"),
+        ({"algorithm": ["vpg"]}, "metadata.algorithm: expected a text"),
+        ({"versions": []}, "versions: expected values by name"),
+        ({"spec": SimpleNamespace(to_json=lambda: None)}, "metadata.spec: expected a text"),
+        ({"spec": SimpleNamespace(to_json=lambda: "{}")}, "spec: expected env_id in EnvSpec"),
     ],
 )
-def test_crafted_metadata_is_refused(change: Any, kept: Checkpoint, tmp_path: Path) -> None:
-    store(replace(kept, **change), tmp_path / "c")
-    with pytest.raises(CheckpointError, match="expected a rotorgram checkpoint"):
-        load(tmp_path / "c")
+def test_crafted_metadata_is_refused(
+    change: Any, sentence: str, kept: Checkpoint, tmp_path: Path
+) -> None:
+    path = tmp_path / "c"
+    store(replace(kept, **change), path)
+    with pytest.raises(CheckpointError) as told:
+        load(path)
+    assert sentence in str(told.value)
 
 
 def test_another_format_is_refused(
@@ -193,7 +222,7 @@ def test_another_format_is_refused(
     with monkeypatch.context() as patch:
         patch.setattr(checkpoints, "FORMAT", 1)
         store(kept, path)
-    with pytest.raises(CheckpointError, match="expected format 3, got 1"):
+    with pytest.raises(CheckpointError, match="expected a checkpoint of format 3, got 1"):
         load(path)
 
 
