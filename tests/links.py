@@ -24,8 +24,8 @@ from rotorgram.udp.protocol.messages import (
     Wait,
     Welcome,
 )
-from rotorgram.udp.protocol.server import Event, Server
-from rotorgram.udp.protocol.transitions import AgentState
+from rotorgram.udp.protocol.server import Server
+from rotorgram.udp.protocol.session import Event
 
 SESSION = 77
 OTHER = 78
@@ -257,7 +257,7 @@ class Fleet(Network):
 
     def agent_received(self, event: Any) -> None:
         slots = self.server.slots
-        if all(session and session.state is AgentState.DECIDING for session in slots):
+        if all(session and session.state == "deciding" for session in slots):
             self.steps += 1
             for slot in range(len(slots)):
                 send_command(self.server, slot, 0.0, self.now)

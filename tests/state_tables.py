@@ -13,7 +13,7 @@ HEADINGS: Final = {"### Simulator\n": SIMULATOR, "### Agent, for each simulator\
 
 def rows(table: Mapping[Any, Any]) -> str:
     return HEAD + "".join(
-        f"| {state.value} | {way.value} | {message.__name__} | {after.value} |\n"
+        f"| {state} | {way} | {message.__name__} | {after} |\n"
         for state, ways in table.items()
         for (way, message), after in ways.items()
     )

@@ -32,7 +32,6 @@ from rotorgram.udp.protocol.messages import (
     Welcome,
 )
 from rotorgram.udp.protocol.server import Server
-from rotorgram.udp.protocol.transitions import AgentState
 
 ADDRESSES: Final = [("10.0.0.1", 0), ("10.0.0.1", 1), ("10.6.6.6", 666)]
 """Of two simulators, and of an attacker."""
@@ -270,7 +269,7 @@ class Flight:
 
     def decide(self) -> None:
         for session in self.agent.slots:
-            if session and session.state is AgentState.DECIDING:
+            if session and session.state == "deciding":
                 orders = np.zeros(1, np.uint8)
                 session.send_command(np.ones(1, np.int64), orders, None, self.now)
 

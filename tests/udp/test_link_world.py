@@ -19,7 +19,6 @@ from rotorgram.udp.protocol.auth import Key
 from rotorgram.udp.protocol.client import Address, Client
 from rotorgram.udp.protocol.messages import Close, Command, Refuse, State, Welcome
 from rotorgram.udp.protocol.server import Server
-from rotorgram.udp.protocol.transitions import AgentState, SimulatorState
 
 SILENCE = 30.0
 """After so long the agent frees the place of a simulator, s."""
@@ -216,7 +215,7 @@ class World:
 
     def _free_the_silent(self) -> None:
         for slot, session in enumerate(self.agent.slots):
-            flies = session and session.state is not AgentState.CLOSING
+            flies = session and session.state != "closing"
             if flies and self.now - self.heard[slot] > SILENCE:
                 self.agent.free(slot)
 
@@ -282,7 +281,7 @@ def test_a_clean_restart_of_the_agent_costs_one_message_more() -> None:
     world = World(clean, codec="sealed")
     world.run_steps(10)
     physics = world.physics[0]
-    world.run(lambda: physics.link.state is SimulatorState.WAITING)
+    world.run(lambda: physics.link.state == "waiting")
     world._send()
     world._flying.clear()  # what was on its way to the one that was killed
     old = physics.session
@@ -327,7 +326,7 @@ def test_more_simulators_than_slots_take_turns(seed: int, codec: str) -> None:
         )
         for physics in [p for p in world.physics if len(p.steps.get(p.session, [])) >= 10]:
             physics.link.close("enough", world.now)
-            world.run(lambda p=physics: p.link.state is SimulatorState.CLOSED, most=1)  # type: ignore[misc]
+            world.run(lambda p=physics: p.link.state == "closed", most=1)  # type: ignore[misc]
             flown.add(physics.address)
             world.check()
             world.physics.remove(physics)
@@ -389,7 +388,7 @@ def test_a_close_is_answered_by_a_close(side: str, codec: str) -> None:
             physics.link.close("enough", world.now)
     else:
         world.agent.close("enough", world.now)
-    world.run(lambda: all(p.link.state is SimulatorState.CLOSED for p in world.physics), most=1)
+    world.run(lambda: all(p.link.state == "closed" for p in world.physics), most=1)
     world.run(lambda: world.agent.slots == [None, None], most=1)
     assert world.now - begun == pytest.approx(0.002, abs=1e-6)
     if side == "simulator":
@@ -415,9 +414,7 @@ def test_closes_that_are_lost_are_repeated(seed: int, side: str, codec: str) -> 
     if side != "simulator":
         world.agent.close("enough", world.now)
     begun = world.now
-    world.run(
-        lambda: physics.link.state is SimulatorState.CLOSED and world.agent.slots == [None], most=1
-    )
+    world.run(lambda: physics.link.state == "closed" and world.agent.slots == [None], most=1)
     assert world.now - begun < 0.26
     # None of it was left to the linger alone: ten tries each way.
     assert physics.ended or world.closes
@@ -430,7 +427,7 @@ def test_nobody_answers_a_close() -> None:
     world.physics[0].link.close("enough", world.now)
     world.agent.close("enough", world.now)
     begun = world.now
-    world.run(lambda: world.physics[0].link.state is SimulatorState.CLOSED, most=1)
+    world.run(lambda: world.physics[0].link.state == "closed", most=1)
     assert world.now - begun == pytest.approx(0.25)
     world.run(lambda: world.agent.slots == [None], most=1)
     assert world.now - begun == pytest.approx(0.25)

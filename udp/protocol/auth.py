@@ -75,6 +75,11 @@ class Key:
         return message
 
 
+def sealed(datagrams: list[bytes], key: Key | None) -> list[bytes]:
+    """The datagrams of a message as they are sent: sealed where there is a key."""
+    return [key.seal(datagram) for datagram in datagrams] if key else datagrams
+
+
 def is_sealed(datagram: bytes) -> bool:
     """Whether a datagram says of itself that it is sealed."""
     return datagram[:2] == _MAGIC

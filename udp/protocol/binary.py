@@ -58,10 +58,8 @@ _MESSAGES: Final = (
 """In the order of their types, from 1 on."""
 
 FRAGMENT: Final = 0x80  # set in the type of a fragment of a message
-OF_SESSION: Final = frozenset({STATE, COMMAND, CLOSE, ALIVE})
-"""Types that belong to an open session, as Missing does but for that of a Hello."""
-
-_NUMBERED: Final = OF_SESSION | {UNKNOWN, MISSING}  # types that have a sequence number
+_OF_SESSION: Final = frozenset({STATE, COMMAND, CLOSE, ALIVE})
+_NUMBERED: Final = _OF_SESSION | {UNKNOWN, MISSING}  # types that have a sequence number
 
 _HEADER: Final = struct.Struct("<2sBBIQQ")
 _NUMBERS: Final = struct.Struct("<QQ")  # session, sequence: the end of the header
@@ -162,6 +160,11 @@ def peek(datagram: bytes) -> tuple[int, int, int]:
         return 0, 0, 0
     _, _, kind, _, session, sequence = _HEADER.unpack_from(datagram)
     return kind & ~FRAGMENT, session, sequence
+
+
+def is_of_session(kind: int, sequence: int) -> bool:
+    """Whether a message belongs to an open session: a Missing of a Hello does not."""
+    return kind in _OF_SESSION or (kind == MISSING and sequence > 0)
 
 
 # ---- State and Command

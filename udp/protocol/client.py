@@ -18,7 +18,7 @@ import numpy as np
 from ...models.errors import InputError
 from . import binary, text
 from . import messages as m
-from .auth import Key, is_sealed, message_of
+from .auth import Key, is_sealed, message_of, sealed
 from .errors import DecodeError, Forged
 from .fragments import (
     FAR,
@@ -32,7 +32,7 @@ from .fragments import (
 from .layout import Layout
 from .messages import Command, Message, State, one_line
 from .statistics import Statistics
-from .transitions import SIMULATOR, SimulatorState, Way
+from .transitions import SIMULATOR, SimulatorState
 
 Address = tuple[str, int]  # IPv4 host and port
 
@@ -60,12 +60,17 @@ _LATEST: Final = 10.0
 for again before an agent takes the simulator for lost (30 s)."""
 _TOO_EARLY: Final = 1.5  # factor of the estimated round trip when answers come twice
 _SOON: Final = 0.25  # an agent that has waited for a State for less needs no Alive, s
-_AFTER_COMMAND: Final = SIMULATOR[SimulatorState.WAITING][Way.RECEIVED, Command]
+_AFTER_COMMAND: Final = SIMULATOR["waiting"]["received", Command]
 
 
 def new_session() -> int:
     """A random session number, not 0."""
     return secrets.randbits(64) or 1
+
+
+def critical_extension(message: m.Hello | m.Welcome) -> int | None:
+    """Number of the first critical extension: we know none."""
+    return next((each.number for each in message.extensions if each.critical), None)
 
 
 def largest_datagram(peer: Address, most: int | None = None) -> int:
@@ -212,7 +217,7 @@ class Client:
         check_size(max(layout.state.size, len(binary.encode(hello))), largest)
         self.hello = hello
         self.layout = layout
-        self.state = SimulatorState.READY if by_text else SimulatorState.IDLE
+        self.state: SimulatorState = "ready" if by_text else "idle"
         self.sequence = 0
         self.sends = self._tries = 0
         self._stretch = 1.0  # of the next wait, by the Alives for this State
@@ -220,18 +225,16 @@ class Client:
         self.config = config
         self._largest = largest
         self.by_text = by_text
-        self.is_keyed = key is not None
+        self.key = key
         self._is_plain = not by_text and key is None
-        self._key = key
-        self._session_key: Key | None = None
+        self._sealing = key  # from the Welcome on the key of the session
         self._nonce = 0
         self.tap: Tap | None = None
         self._draw_session = draw_session
-        self._dice = Random(config.drop_seed).random if config.drop else None
+        self._dice = Random(config.drop_seed) if config.drop else None
         self._is_queued = False
         self._assembler = Assembler(layout.seeded_command.size)
         self._transfer: Transfer | None = None  # of the outstanding message
-        self._transfer_key: Key | None = None
         self._asking = b""  # the datagram that was sent last and wants an answer
         self.outgoing: list[bytes] = []
         self._round_trips = RoundTrips()
@@ -240,7 +243,7 @@ class Client:
 
     def connect(self, now: float) -> None:
         """Say Hello, until a Welcome or a Refuse comes. With the text codec there is none."""
-        if self.state is SimulatorState.IDLE:
+        if self.state == "idle":
             self._send(self.hello, now)
 
     def send_state(
@@ -277,19 +280,19 @@ class Client:
 
         May be called from another thread than the others.
         """
-        waits = self.state is SimulatorState.READY and now > self._answered_at + _SOON
+        waits = self.state == "ready" and now > self._answered_at + _SOON
         if self.by_text or not waits or not self.sequence:
             return []
         alive = binary.encode(m.Alive(session=self.hello.session, sequence=self.sequence))
-        return [self._session_key.seal(alive) if self._session_key else alive]
+        return sealed([alive], self._sealing)
 
     def close(self, reason: str, now: float) -> None:
         """End the exchange. An agent that has welcomed this simulator is told, until it answers."""
-        if (Way.SENT, m.Close) in SIMULATOR[self.state]:
+        if ("sent", m.Close) in SIMULATOR[self.state]:
             session = self.hello.session
             number = self.sequence
             self._send(m.Close(session=session, sequence=number, reason=one_line(reason)), now)
-        elif self.state is not SimulatorState.CLOSING:
+        elif self.state != "closing":
             self._give_up()  # a Hello that was not answered is not repeated
 
     def receive(self, datagram: bytes, now: float) -> Message | None:
@@ -297,7 +300,7 @@ class Client:
         if self._dice and self._is_lost():
             return None
         self.statistics.counters["received"] += 1
-        if self.state is SimulatorState.WAITING and self._is_plain:
+        if self.state == "waiting" and self._is_plain:
             session = self.hello.session
             sequence = self.sequence
             message = binary.decode_due(binary.COMMAND, datagram, session, sequence, self.layout)
@@ -309,7 +312,9 @@ class Client:
     def _receive_any(self, datagram: bytes, now: float) -> Message | None:
         """Whatever comes: `receive` knows only the Command that is waited for."""
         try:
-            plain = datagram if self._key is None else self._open(datagram)
+            if self.key is None and is_sealed(datagram):
+                raise Forged("key: the agent has one, this simulator has none (--key-file)")
+            plain = self._open(datagram, self.key) if self.key else datagram
             if self.by_text:
                 message: Message = text.decode_command(plain, self.layout, self.hello.session)
             else:
@@ -320,25 +325,20 @@ class Client:
                     plain = whole
                 message = binary.decode(plain, self.layout)
         except DecodeError as error:
-            cause = "forged" if isinstance(error, Forged) else "malformed"
-            reason = str(error)
-            if self._key is None and is_sealed(datagram):
-                cause = "forged"
-                reason = "key: the agent has one, this simulator has none (--key-file)"
-            self._drop(cause, reason, now)
+            self._drop(error.cause, str(error), now)
             return None
         if message.session != self.hello.session:
             self._drop("foreign", f"session {message.session:016x}", now)
             return None
-        state = SIMULATOR[self.state].get((Way.RECEIVED, type(message)))
+        then = SIMULATOR[self.state].get(("received", type(message)))
         number = getattr(message, "sequence", self.sequence)
         # There is one Close in a session, so its number does not matter.
-        if state is None or (number != self.sequence and not isinstance(message, m.Close)):
+        if then is None or (number != self.sequence and not isinstance(message, m.Close)):
             if isinstance(message, Command) and self.sequence - message.sequence <= 1:
                 self._round_trips.answered_again()
             self._drop("stale", "", now)
             return None
-        return self._take(message, state, plain, now)
+        return self._take(message, then, plain, now)
 
     def next_timer(self) -> float:
         """When `handle_timer` wants to be called; infinite if never."""
@@ -349,7 +349,7 @@ class Client:
         if now < self.next_timer():
             return True
         if now >= self.deadline:
-            if self.state is SimulatorState.CLOSING:
+            if self.state == "closing":
                 self._give_up()
                 return True
             self._forget_transfer()
@@ -360,12 +360,10 @@ class Client:
         self._tries += 1
         self._round_trips.sent(now)
         assert self._transfer is not None
-        if missing := self._assembler.missing():  # of the answer
-            self._put([binary.encode(missing)], self._session_key)
-        else:
-            self._put(self._transfer.probe(), self._transfer_key)
-        closing = self.state is SimulatorState.CLOSING
-        self.resend_at = now + (CLOSE_INTERVAL if closing else self._round_trips.wait(self._tries))
+        missing = self._assembler.missing()  # of the answer
+        self._put([binary.encode(missing)] if missing else self._transfer.probe())
+        wait = self._round_trips.wait(self._tries)
+        self.resend_at = now + (CLOSE_INTERVAL if self.state == "closing" else wait)
         return True
 
     def pardon(self, seconds: float) -> None:
@@ -375,31 +373,21 @@ class Client:
     # ---- what came
 
     def _take(
-        self, message: Message, state: SimulatorState, plain: bytes, now: float
+        self, message: Message, then: SimulatorState, plain: bytes, now: float
     ) -> Message | None:
-        """A message that may come now."""
+        """A message that may come now, and leads to that state."""
         if isinstance(message, Command):
             self._take_command(message, plain, now)
             return message
-        was_closing = self.state is SimulatorState.CLOSING
         if isinstance(message, m.Missing | m.Wait | m.Alive):
             self.deadline = now + self.config.timeout  # the agent is there: this is no silence
-            if isinstance(message, m.Missing):
-                self._resend_missing(message, now)
-            elif isinstance(message, m.Alive):  # others are late
-                self._round_trips.answered(now, alive=True)
-                self._progress(now)
-                self._stretch *= _LATER
-                wait = self._round_trips.wait(1) * self._stretch
-                self.resend_at = now + min(wait, _LATEST, self.config.timeout / 4)
-            elif not self._is_queued:
-                self._is_queued = True
-                self.statistics.notice("every slot of the agent is taken; waiting for a free one")
+            self._wait_on(message, now)
             return None
         if isinstance(message, m.Welcome) and (reason := self._unfit(message)):
             self._drop("malformed", reason, now)
             return None
-        self.state = state
+        was_closing = self.state == "closing"
+        self.state = then
         self._record(message, plain)
         if isinstance(message, m.Unknown):
             self.statistics.notice(
@@ -411,15 +399,29 @@ class Client:
         if isinstance(message, m.Welcome):
             self.statistics.counters["sessions"] += 1
             self._nonce = message.nonce
-            if self._key:
-                self._session_key = self._key.for_session(message.session, message.nonce)
+            if self.key:
+                self._sealing = self.key.for_session(message.session, message.nonce)
         elif isinstance(message, m.Close) and not was_closing:
             close = m.Close(session=message.session, sequence=self.sequence, reason="")
             data = self._encode(close)
-            self._put([data], self._session_key)
+            self._put([data])
             self.statistics.counters["sent"] += 1
             self._record(close, data)
         return message
+
+    def _wait_on(self, message: m.Missing | m.Wait | m.Alive, now: float) -> None:
+        """The agent is there, and has no answer yet."""
+        if isinstance(message, m.Missing):
+            self._resend_missing(message, now)
+        elif isinstance(message, m.Alive):  # others are late
+            self._round_trips.answered(now, alive=True)
+            self._tries = 1
+            self._stretch *= _LATER
+            wait = self._round_trips.wait(1) * self._stretch
+            self.resend_at = now + min(wait, _LATEST, self.config.timeout / 4)
+        elif not self._is_queued:
+            self._is_queued = True
+            self.statistics.notice("every slot of the agent is taken; waiting for a free one")
 
     def _take_command(self, command: Command, plain: bytes, now: float) -> None:
         self.state = _AFTER_COMMAND
@@ -431,10 +433,8 @@ class Client:
         self.statistics.round_trips.append(now - self.asked_at)
         self._round_trips.answered(now)
 
-    def _open(self, datagram: bytes) -> bytes:
+    def _open(self, datagram: bytes, key: Key) -> bytes:
         """A datagram without its seal: the session's key, or the shared one for what opens it."""
-        key = self._key
-        assert key is not None
         if not is_sealed(datagram):
             message = binary.decode(datagram, self.layout)
             words = f" that says: {message.reason}" if isinstance(message, m.Refuse) else ""
@@ -442,10 +442,8 @@ class Client:
         kind, _, sequence = binary.peek(message_of(datagram))
         if kind == binary.UNKNOWN:  # answers this very State, not a forged one
             return key.open(datagram, self._asking)
-        if kind in binary.OF_SESSION or (kind == binary.MISSING and sequence):
-            if self._session_key is None:
-                raise Forged("a message of a session, and there is none")
-            key = self._session_key
+        if binary.is_of_session(kind, sequence):
+            key = self._sealing or key
         return key.open(datagram)
 
     def _assemble(self, fragment: bytes, now: float) -> bytes | None:
@@ -454,7 +452,7 @@ class Client:
         if session != self.hello.session:
             self._drop("foreign", f"session {session:016x}", now)
             return None
-        is_due = self.state is SimulatorState.WAITING and sequence == self.sequence
+        is_due = self.state == "waiting" and sequence == self.sequence
         if not is_due or kind != binary.COMMAND | binary.FRAGMENT:
             self._drop("stale", "", now)
             return None
@@ -462,7 +460,7 @@ class Client:
         self._progress(now)
         if whole is None and (answer := self._assembler.ask(fragment)):
             self._round_trips.sent(now)
-            self._put(answer, self._session_key)
+            self._put(answer)
         return whole
 
     def _progress(self, now: float) -> None:
@@ -477,7 +475,7 @@ class Client:
             return
         self.statistics.counters["resent"] += 1
         self._round_trips.sent(now)
-        self._put(self._transfer.resend(missing), self._transfer_key)
+        self._put(self._transfer.resend(missing))
         self._progress(now)
 
     def _unfit(self, welcome: m.Welcome) -> str:
@@ -485,14 +483,14 @@ class Client:
         low, high = self.hello.versions
         if not low <= welcome.version <= high:
             return f"Welcome: expected version {low} to {high}, got {welcome.version}"
-        unknown = [e.number for e in welcome.extensions if e.critical]
-        return f"Welcome: expected no critical extension {unknown[0]}" if unknown else ""
+        unknown = critical_extension(welcome)
+        return "" if unknown is None else f"Welcome: expected no critical extension {unknown}"
 
     def begin_again(self, now: float) -> None:
         """Say Hello in a new session to an agent that knows nothing of this one, or is silent."""
         self.hello = replace(self.hello, session=self._draw_session())
         self.sequence = 0
-        self._session_key = None
+        self._sealing = self.key
         self._is_queued = False
         self._assembler = Assembler(self.layout.seeded_command.size)
         self._send(self.hello, now)
@@ -502,7 +500,7 @@ class Client:
     def _send(self, message: m.Hello | State | m.Close, now: float) -> None:
         """Send a message and repeat it until it is answered."""
         kind = type(message)
-        after = SIMULATOR[self.state][Way.SENT, kind]
+        after = SIMULATOR[self.state]["sent", kind]
         if isinstance(message, State) and not self.by_text:
             data = binary.encode_step(message, self.layout)
         else:
@@ -510,7 +508,6 @@ class Client:
         if self.tap:
             self._record(message, data)
         self._transfer = transfer = Transfer(data, self._largest)
-        self._transfer_key = self._key if kind is m.Hello else self._session_key
         self.state = after
         self.sequence = 0 if isinstance(message, m.Hello) else message.sequence
         self.sends = self._tries = 1
@@ -519,7 +516,7 @@ class Client:
         if transfer.count == 1 and self._is_plain and not self._dice:
             self.outgoing.append(data)
         else:
-            self._put(transfer.start(), self._transfer_key)
+            self._put(transfer.start())
         self.asked_at = now
         if kind is m.Close:
             self.resend_at = now + CLOSE_INTERVAL
@@ -529,18 +526,17 @@ class Client:
             self.deadline = now + self.config.timeout
         self.statistics.counters["sent"] += 1
 
-    def _put(self, datagrams: list[bytes], key: Key | None) -> None:
-        sealed = [key.seal(datagram) for datagram in datagrams] if key else datagrams
-        if sealed:
-            self._asking = sealed[-1]
-        if self._dice:
-            sealed = [datagram for datagram in sealed if not self._is_lost()]
-        self.outgoing += sealed
+    def _put(self, datagrams: list[bytes]) -> None:
+        for datagram in sealed(datagrams, self._sealing):
+            self._asking = datagram
+            if not self._is_lost():
+                self.outgoing.append(datagram)
 
     def _is_lost(self) -> bool:
         """Whether the next datagram is lost on purpose."""
-        lost = self._dice is not None and self._dice() < self.config.drop
-        self.statistics.counters["dropped"] += lost
+        lost = self._dice is not None and self._dice.random() < self.config.drop
+        if lost:
+            self.statistics.counters["dropped"] += 1
         return lost
 
     def _encode(self, message: m.Hello | State | m.Close) -> bytes:
@@ -553,7 +549,7 @@ class Client:
             self.tap(0, message, binary.encode(message, self.layout) if self.by_text else data)
 
     def _give_up(self) -> None:
-        self.state = SIMULATOR[self.state][Way.UNSAID, m.Close]
+        self.state = SIMULATOR[self.state]["unsaid", m.Close]
         self._forget_transfer()
 
     def _forget_transfer(self) -> None:

@@ -4,6 +4,8 @@
 class DecodeError(Exception):
     """A datagram is not a message. It is counted and dropped; it never ends a run by itself."""
 
+    cause = "malformed"  # under which it is counted
+
 
 class VersionMismatch(DecodeError):
     """An intact binary datagram of another protocol version."""
@@ -11,6 +13,8 @@ class VersionMismatch(DecodeError):
 
 class Forged(DecodeError):
     """A datagram is not sealed with the key of this side and session, or not at all."""
+
+    cause = "forged"
 
 
 class LinkError(ConnectionError):

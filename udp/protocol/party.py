@@ -133,7 +133,7 @@ class AgentLink:
         words = f"no answer from {self.name} for {seconds:g} s, {message} sent {sends} times"
         if self.trouble:
             words += f"; {self.trouble}"
-        if client.is_keyed and not client.sequence:
+        if client.key and not client.sequence:
             words += "; an agent with another key does not answer"
         if last := client.statistics.last_error:
             words += f"; last datagram dropped: {last}"

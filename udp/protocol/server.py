@@ -1,34 +1,96 @@
 """The agent's side of the exchange (UDP server), free of sockets and clocks.
 
-It has slots, one for each simulator that it flies. `admission` gives them, `session` is the
-exchange with a simulator that has one. A repeated State is answered with the bytes of the first
-answer.
+It has slots, one for each simulator that it flies; `session` is the exchange with one of them. A
+Hello that fits is welcomed, and takes a slot only when its State 1 has come with the nonce of the
+Welcome: a recorded Hello that is sent again takes none, and neither does a sender that does not
+read. Memory for simulators without a slot is bounded.
 """
 
+import secrets
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
 from contextlib import suppress
+from typing import Final, NamedTuple, TypeVar
 
+from ...models.errors import InputError
 from . import binary, text
 from . import messages as m
-from .admission import Admission, Arrival
-from .auth import Key, is_sealed, key_id, message_of
-from .client import CLOSE_INTERVAL, CLOSE_LINGER, Address
+from .auth import OVERHEAD, Key, is_sealed, key_id, message_of
+from .client import CLOSE_INTERVAL, CLOSE_LINGER, Address, critical_extension, largest_datagram
 from .errors import DecodeError, Forged, VersionMismatch
-from .fragments import is_fragment
-from .messages import State
-from .session import Event, NoSuchSession, Session
-from .transitions import AgentState, Way
+from .fragments import Assembler, asks, check_size, is_fragment
+from .layout import Layout
+from .messages import State, one_line
+from .session import Event, NoSuchSession, Outbox, Session
 
-__all__ = ["Event", "Server", "Session"]
+_MOST: Final = 1024  # simulators remembered between Hello and State 1, in the queue, and after
+_LEAST_ASSEMBLING: Final = 16
+"""Simulators without a slot of which fragments are kept; more, if there are more slots: so many
+may come at the same moment."""
+_TEXT_REMEMBERED: Final = 2.0  # memory of the last line of a closed text simulator, s
+_REASON_AT: Final = binary.HEADER_SIZE + 2  # bytes of a Refuse or a Close before its reason
+
+K = TypeVar("K")
+V = TypeVar("V")
 
 
 class _KeyMismatch(Forged):
     """One side has a key, the other has none."""
 
 
-class Server(Admission):
-    """Welcomes simulators and answers each of their States once. Arguments: see `Admission`."""
+class _Arrival(NamedTuple):
+    """A datagram that came."""
 
-    _resend_at = _deadline = 0.0
+    datagram: bytes
+    address: Address
+    now: float
+
+
+class Server:
+    """Welcomes simulators and answers each of their States once.
+
+    Args:
+        accept: Looks at a Hello and gives the layout of its messages, or the reason to refuse it.
+        text_layout: A text simulator says no Hello: its first line opens the session, and this
+            gives the layout to read it by. A result of None: text is not flown.
+        slots: Simulators to fly at the same time. Others wait until a slot is free.
+        keys: Shared with the simulators, any of them. Then nothing unsealed is taken.
+        draw_nonce: Gives a random 64-bit number for each Welcome.
+
+    Attributes:
+        slots: Session of each slot, None where it is free.
+        takes_text: Whether a text simulator may take a free slot.
+        outbox: Datagrams to send, and the tap.
+        statistics: Counts and times, over all simulators.
+        openings: Sessions that were welcomed, by address and number.
+    """
+
+    def __init__(
+        self,
+        accept: Callable[[m.Hello], Layout | str],
+        text_layout: Callable[[], Layout | None] = lambda: None,
+        *,
+        slots: int = 1,
+        keys: Sequence[Key] = (),
+        max_datagram: int | None = None,
+        draw_nonce: Callable[[], int] = lambda: secrets.randbits(64),
+    ) -> None:
+        self.outbox = Outbox(max_datagram)
+        self.statistics = self.outbox.statistics
+        self.slots: list[Session | None] = [None] * slots
+        self.takes_text = True
+        self.openings: OrderedDict[tuple[Address, int], Session] = OrderedDict()
+        self._closed = False
+        self._resend_at = self._deadline = 0.0
+        self._accept = accept
+        self._text_layout = text_layout
+        self._keys = {key.id: key for key in keys}
+        self._draw_nonce = draw_nonce
+        self._seated: dict[Address, Session] = {}
+        self._ended: OrderedDict[int, None] = OrderedDict()  # numbers of sessions that had a slot
+        self._queue: OrderedDict[Address, Session] = OrderedDict()
+        self._assembling: OrderedDict[tuple[Address, int], Assembler] = OrderedDict()
+        self._ended_text: OrderedDict[Address, tuple[bytes, int, float]] = OrderedDict()
 
     # ---- what the caller does
 
@@ -36,13 +98,23 @@ class Server(Admission):
         """Take a datagram; its effect, if it moves an exchange on."""
         self.statistics.counters["received"] += 1
         session = self._seated.get(address)
-        if session and session.is_plain and session.state is AgentState.EXPECTING:
+        if session and session.is_plain and session.state == "expecting":
             number = session.number
             sequence = session.sequence + 1
             state = binary.decode_due(binary.STATE, datagram, number, sequence, session.layout)
             if isinstance(state, State):
                 return session.take_state(state, datagram, now)
-        return self._receive_any(session, Arrival(datagram, address, now))
+        return self._receive_any(session, _Arrival(datagram, address, now))
+
+    def free(self, slot: int) -> None:
+        """Give the slot of a simulator that has fallen silent to the next that comes."""
+        session = self.slots[slot]
+        self.slots[slot] = None
+        if session:
+            session.move("unsaid", m.Close)
+            del self._seated[session.peer]
+            if not session.is_text:
+                _keep(self._ended, session.number, None)
 
     def close(self, reason: str, now: float) -> None:
         """End every exchange and tell the simulators, until they answer."""
@@ -53,8 +125,8 @@ class Server(Admission):
                 session.send_close(reason)
         self._closed = True
         for queued in self._queue.values():
-            self.refuse(queued.number, reason, queued.peer, queued.room, queued.key)
-            queued.move(Way.SENT, m.Refuse)
+            self._refuse(queued.number, reason, queued.peer, queued.room, queued.key)
+            queued.move("sent", m.Refuse)
         self._resend_at = now + CLOSE_INTERVAL
         self._deadline = now + CLOSE_LINGER
 
@@ -76,7 +148,7 @@ class Server(Admission):
 
     # ---- from a datagram to its session
 
-    def _receive_any(self, session: Session | None, arrival: Arrival) -> Event | None:
+    def _receive_any(self, session: Session | None, arrival: _Arrival) -> Event | None:
         """Any datagram: `receive` knows only the State that a slot waits for."""
         try:
             if text.is_text(arrival.datagram):
@@ -86,63 +158,273 @@ class Server(Admission):
             self._refuse_undecoded(error, arrival)
             return None
 
-    def _receive_binary(self, session: Session | None, arrival: Arrival) -> Event | None:
-        address = arrival.address
+    def _receive_binary(self, session: Session | None, arrival: _Arrival) -> Event | None:
         plain, key = self._open(arrival, session)
         kind, number, _ = binary.peek(plain)
         seated = session if session and session.number == number and not session.is_text else None
-        opening = None if seated else self.openings.get((address, number))
+        opening = None if seated else self.openings.get((arrival.address, number))
         holder = seated or opening
         if is_fragment(plain):
             kind = binary.check(plain)[0] & ~binary.FRAGMENT
             if kind == binary.HELLO and not seated:
-                whole = self.assemble(plain, opening, arrival, key)
+                whole = self._assemble(plain, opening, arrival, key)
             elif kind == binary.STATE and holder:
                 whole = holder.assemble(plain, arrival.now)
             elif kind == binary.STATE:
-                raise NoSuchSession(f"session {number:016x}")
+                raise NoSuchSession
             else:
                 whole = None
-                self.drop("foreign", f"a fragment of type {kind}", arrival)
+                self._drop("foreign", f"a fragment of type {kind}", arrival)
             if whole is None:
                 return None
             plain = whole
         if holder is None and kind != binary.HELLO:
             binary.check(plain)
-            raise NoSuchSession(f"session {number:016x}")
+            raise NoSuchSession
         message = binary.decode(plain, holder.layout if holder else None)
         if isinstance(message, m.Hello):
-            self.receive_hello(message, arrival, key)
+            self._receive_hello(message, arrival, key)
             return None
         if seated:
             return self._receive_seated(seated, message, plain, arrival)
         assert opening is not None
-        return self.receive_opening(opening, message, plain, arrival)
+        return self._receive_opening(opening, message, plain, arrival)
 
     def _receive_seated(
-        self, session: Session, message: m.Message, plain: bytes, arrival: Arrival
+        self, session: Session, message: m.Message, plain: bytes, arrival: _Arrival
     ) -> Event | None:
         event = session.receive(message, plain, arrival.now)
         if event and isinstance(message, m.Close):
             if session.is_text:
-                self.remember_text(session, message.sequence, arrival.now)
+                last = session.line, message.sequence, arrival.now + _TEXT_REMEMBERED
+                _keep(self._ended_text, session.peer, last)
             self.free(session.slot)
         return event
 
-    def _receive_text(self, session: Session | None, arrival: Arrival) -> Event | None:
+    def _open(self, arrival: _Arrival, session: Session | None) -> tuple[bytes, Key | None]:
+        """A binary datagram without its seal, and the shared key that it was sealed with.
+
+        Raises `_KeyMismatch`, `Forged`, or `NoSuchSession` where it has no key here.
+        """
         datagram = arrival.datagram
+        if not is_sealed(datagram):
+            if self._keys:
+                words = "key: this agent has one (--key-file), and the simulator has none"
+                raise _KeyMismatch(words)
+            return datagram, None
+        if not self._keys:
+            raise _KeyMismatch("key: this agent has none (--key-file), and the simulator has")
+        shared = self._keys.get(key_id(datagram))
+        if shared is None:
+            raise Forged("key: the simulator has another one")
+        kind, number, sequence = binary.peek(message_of(datagram))
+        if not binary.is_of_session(kind, sequence):
+            return shared.open(datagram), shared
+        if session and session.number == number and session.key:
+            return session.key.open(datagram), shared
+        opening = self.openings.get((arrival.address, number))
+        if opening and (key := opening.session_key()):
+            # If the Welcome was for an old copy of its Hello, it is as good as none.
+            with suppress(Forged):
+                return key.open(datagram), shared
+        raise NoSuchSession
+
+    def _refuse_undecoded(self, error: DecodeError, arrival: _Arrival) -> None:
+        """Count it, and answer a Hello if its sender must change its configuration."""
+        datagram = arrival.datagram
+        under_seal = is_sealed(datagram)
+        plain = message_of(datagram) if under_seal else datagram
+        kind, number, _ = binary.peek(plain)
+        if isinstance(error, NoSuchSession):
+            if kind in (binary.STATE, binary.MISSING):
+                self._disown(plain, arrival)
+            else:  # the answer to a Close of ours, mostly: not counted
+                self.statistics.counters["foreign"] += 1
+            return
+        if isinstance(error, _KeyMismatch | VersionMismatch) and kind == binary.HELLO:
+            trusted = under_seal and not isinstance(error, _KeyMismatch)
+            key = self._keys.get(key_id(datagram)) if trusted else None
+            self._refuse(number, str(error), arrival.address, len(datagram), key)
+        self._drop(error.cause, str(error), arrival)
+
+    # ---- Hello
+
+    def _receive_hello(self, hello: m.Hello, arrival: _Arrival, key: Key | None) -> None:
+        """Welcome a simulator, refuse it, or let it wait."""
+        address = arrival.address
+        size = len(arrival.datagram)
+        place = address, hello.session
+        if hello.session in self._ended or self._has(hello.session):
+            self._drop("stale", "", arrival)
+            return
+        if place in self.openings and not self._closed:
+            self.openings[place].repeat()
+            self._drop("duplicate", "", arrival)
+            return
+        layout = self._fit(hello, address)
+        if isinstance(layout, str):
+            self._refuse(hello.session, layout, address, size, key)
+            self._drop("refused", layout, arrival)
+            return
+        session = Session(self.outbox, address, hello.session, layout, hello, key=key)
+        if self._has_slot_for(address):
+            self._queue.pop(address, None)
+            session.send_welcome(m.Welcome(session=hello.session, nonce=self._draw_nonce()))
+            _keep(self.openings, place, session)
+        else:
+            wait = binary.encode(m.Wait(session=session.number))
+            self.outbox.put([wait], address, key)
+            session.move("sent", m.Wait)
+            session.room = size - len(wait)
+            _keep(self._queue, address, session)
+
+    def _fit(self, hello: m.Hello, address: Address) -> Layout | str:
+        """The layout of a simulator that is accepted, or the reason to refuse it."""
+        if self._closed:
+            return "the agent has closed"
+        low, high = hello.versions
+        if not low <= binary.VERSION <= high:
+            return f"expected protocol version {binary.VERSION}, got {low} to {high}"
+        if (unknown := critical_extension(hello)) is not None:
+            return f"expected no critical extension of type {unknown}"
+        layout = self._accept(hello)
+        if isinstance(layout, str):
+            return layout
+        try:
+            largest = largest_datagram(address, self.outbox.max_datagram)
+            check_size(layout.seeded_command.size, largest)
+        except InputError as error:
+            return str(error)
+        return layout
+
+    def _refuse(
+        self, number: int, reason: str, address: Address, size: int, key: Key | None
+    ) -> None:
+        """Refuse a Hello that came in so many bytes, with no more than those."""
+        room = size - _REASON_AT - (OVERHEAD if key else 0)
+        if room >= 0:
+            refuse = m.Refuse(session=number, reason=_cut(reason, room))
+            self.outbox.put([binary.encode(refuse)], address, key)
+
+    def _assemble(
+        self, fragment: bytes, opening: Session | None, arrival: _Arrival, key: Key | None
+    ) -> bytes | None:
+        """The Hello of a simulator without a slot, once all its fragments are there."""
+        if opening:
+            if asks(fragment):
+                opening.repeat()
+            self._drop("duplicate", "", arrival)
+            return None
+        place = arrival.address, binary.peek(fragment)[1]
+        assembler = self._assembling.get(place) or Assembler(binary.LONGEST_HELLO)
+        _keep(self._assembling, place, assembler, max(_LEAST_ASSEMBLING, len(self.slots)))
+        whole = assembler.take(fragment)
+        if whole is not None:
+            del self._assembling[place]
+        elif answer := assembler.ask(fragment):
+            self.outbox.put(answer, arrival.address, key)
+        return whole
+
+    # ---- sessions that were welcomed, and slots
+
+    def _receive_opening(
+        self, opening: Session, message: m.Message, plain: bytes, arrival: _Arrival
+    ) -> Event | None:
+        """Take a message of a session that was welcomed."""
+        if isinstance(message, State):
+            return self._join(opening, message, plain, arrival)
+        if isinstance(message, m.Close):
+            del self.openings[opening.peer, opening.number]
+            opening.move("received", m.Close)
+            goodbye = binary.encode(opening.goodbye(""))
+            self.outbox.put([goodbye], arrival.address, opening.session_key())
+        else:
+            self._drop("foreign", type(message).__name__, arrival)
+        return None
+
+    def _join(
+        self, opening: Session, state: State, plain: bytes, arrival: _Arrival
+    ) -> Event | None:
+        """The first State of a session that was welcomed."""
+        assert opening.welcome is not None
+        assert opening.hello is not None
+        peer = opening.peer
+        if state.sequence != 1 or state.nonce != opening.welcome.nonce:
+            # Its Hello was an old one: this simulator goes on with another agent, or a copy of
+            # its Hello came late.
+            del self.openings[peer, opening.number]
+            self._disown(plain, arrival)
+            return None
+        for address, number in list(self.openings):  # it, and what else the address began
+            if address == peer:
+                del self.openings[address, number]
+        layout = self._fit(opening.hello, peer)  # another one may have come since its Hello
+        if isinstance(layout, str):
+            reason = _cut(layout, len(plain) - _REASON_AT)
+            close = m.Close(session=opening.number, sequence=1, reason=reason)
+            self.outbox.put([binary.encode(close)], peer, opening.session_key())
+            opening.move("sent", m.Close)
+            self._drop("refused", layout, arrival)
+            return None
+        if not self._has_slot_for(peer) or self._has(opening.number, elsewhere=peer):
+            self._disown(plain, arrival)  # another was quicker
+            return None
+        return self._seat(opening, state, plain)
+
+    def _seat(self, session: Session, state: State, plain: bytes) -> Event:
+        """Give a session its slot: that of an earlier one of its address, or a free one."""
+        earlier = self._seated.get(session.peer)
+        if earlier:
+            self.free(earlier.slot)
+        slot = earlier.slot if earlier else self.slots.index(None)
+        self.slots[slot] = session
+        self._seated[session.peer] = session
+        return session.join(slot, state, plain)
+
+    def _has_slot_for(self, address: Address) -> bool:
+        return None in self.slots or address in self._seated
+
+    def _has(self, number: int, elsewhere: Address | None = None) -> bool:
+        """Whether a session of that number has a slot (not of this address)."""
+        return any(s and s.number == number and s.peer != elsewhere for s in self.slots)
+
+    def _disown(self, plain: bytes, arrival: _Arrival) -> None:
+        """Tell the simulator of an unknown session to begin another one.
+
+        If it took a slot that was taken meanwhile, it will be told to wait.
+        """
+        _, number, sequence = binary.peek(plain)
+        if is_fragment(plain) and not asks(plain):
+            return  # one answer will do
+        if not sequence:
+            self._drop("malformed", "expected a State from 1 on, got 0", arrival)
+            return
+        if self._closed or self._has(number, elsewhere=arrival.address):
+            # Another address has it: no answer of ours may end it.
+            self._drop("foreign", f"session {number:016x}", arrival)
+            return
+        self.statistics.counters["foreign"] += 1  # mostly after a restart: no notice
+        reply = binary.encode(m.Unknown(session=number, sequence=sequence))
+        if self._keys:  # of use only to the simulator that has sent this State
+            key = self._keys.get(key_id(arrival.datagram))
+            if key is None:
+                return
+            reply = key.seal(reply, arrival.datagram)
+        self.outbox.put([reply], arrival.address, None)
+
+    # ---- text: the first line opens the session
+
+    def _receive_text(self, session: Session | None, arrival: _Arrival) -> Event | None:
+        datagram, address, now = arrival
         layout = None if self._keys else self._text_layout()
         if layout is None:
-            sequence, fields = text.split(datagram)
             cause = "refused"
             reason = "text is not flown here"
             if self._keys:
                 cause = "forged"
                 reason = "key: this agent has one (--key-file), text has none"
-            if fields == ["close"]:  # two agents would answer each other's Closes for ever
-                self.drop(cause, reason, arrival)
-            else:
-                self.turn_text_away(sequence, cause, reason, arrival)
+            sequence, fields = text.split(datagram)
+            self._turn_away(sequence, cause, reason, arrival, is_close=fields == ["close"])
             return None
         message = text.decode_state(datagram, layout)
         if session and session.is_text:
@@ -150,51 +432,48 @@ class Server(Admission):
             if event and isinstance(message, State):
                 session.line = datagram
             return event
-        return self.receive_first_line(message, layout, arrival)
+        if isinstance(message, m.Close):
+            self.statistics.counters["foreign"] += 1
+            return None
+        last, number, until = self._ended_text.get(address, (b"", 0, 0.0))
+        is_late = last == datagram or 1 < number == message.sequence
+        if is_late and now < until:
+            reason = "a copy of the last line of a simulator that has closed"
+        elif self._closed:
+            reason = "the agent has closed"
+        elif not self.takes_text or session:
+            reason = "text is not flown here"
+        elif None not in self.slots:
+            reason = "every slot is taken"
+        else:
+            session = Session(self.outbox, address, 0, layout, None, line=datagram)
+            return self._seat(session, message, b"")
+        self._turn_away(message.sequence, "refused", reason, arrival)
+        return None
 
-    def _open(self, arrival: Arrival, session: Session | None) -> tuple[bytes, Key | None]:
-        """A binary datagram without its seal, and the shared key that it was sealed with.
+    def _turn_away(
+        self, sequence: int, cause: str, reason: str, arrival: _Arrival, is_close: bool = False
+    ) -> None:
+        """Answer a line that is not flown, with no more bytes than it has."""
+        line = text.encode(m.Close(session=0, sequence=sequence, reason=""))
+        # Two agents would answer each other's Closes for ever.
+        if not is_close and len(line) <= len(arrival.datagram):
+            self.outbox.put([line], arrival.address, None)
+        self._drop(cause, reason, arrival)
 
-        Raises `_KeyMismatch`, `Forged`, or `NoSuchSession` where it has no key here.
-        """
-        datagram, address, _ = arrival
-        if not self._keys and not is_sealed(datagram):
-            return datagram, None
-        if not self._keys:
-            raise _KeyMismatch("key: this agent has none (--key-file), and the simulator has")
-        if not is_sealed(datagram):
-            raise _KeyMismatch("key: this agent has one (--key-file), and the simulator has none")
-        shared = self._keys.get(key_id(datagram))
-        if shared is None:
-            raise Forged("key: the simulator has another one")
-        plain = message_of(datagram)
-        kind, number, sequence = binary.peek(plain)
-        if kind not in binary.OF_SESSION and not (kind == binary.MISSING and sequence):
-            return shared.open(datagram), shared
-        if session and session.number == number and session.key:
-            return session.key.open(datagram), shared
-        opening = self.openings.get((address, number))
-        if opening and (key := opening.session_key()):
-            # If the Welcome was for an old copy of its Hello, it is as good as none.
-            with suppress(Forged):
-                return key.open(datagram), shared
-        raise NoSuchSession(f"session {number:016x}")
+    def _drop(self, cause: str, reason: str, arrival: _Arrival) -> None:
+        """Count a datagram that changes nothing."""
+        self.outbox.drop(cause, reason, arrival.address, arrival.now)
 
-    def _refuse_undecoded(self, error: DecodeError, arrival: Arrival) -> None:
-        """Count it, and answer a Hello if its sender must change its configuration."""
-        datagram, address, _ = arrival
-        under_seal = is_sealed(datagram)
-        plain = message_of(datagram) if under_seal else datagram
-        kind, number, _ = binary.peek(plain)
-        if isinstance(error, NoSuchSession):
-            if kind in (binary.STATE, binary.MISSING):
-                self.disown(plain, arrival)
-            else:  # the answer to a Close of ours, mostly: not counted
-                self.statistics.counters["foreign"] += 1
-            return
-        if isinstance(error, _KeyMismatch | VersionMismatch) and kind == binary.HELLO:
-            trusted = under_seal and not isinstance(error, _KeyMismatch)
-            key = self._keys.get(key_id(datagram)) if trusted else None
-            self.refuse(number, str(error), address, len(datagram), key)
-        cause = "forged" if isinstance(error, Forged) else "malformed"
-        self.drop(cause, str(error), arrival)
+
+def _keep(table: OrderedDict[K, V], key: K, value: V, most: int = _MOST) -> None:
+    """Put into a table that forgets its oldest entries."""
+    table[key] = value
+    table.move_to_end(key)
+    if len(table) > most:
+        table.popitem(last=False)
+
+
+def _cut(reason: str, room: int) -> str:
+    """A reason that takes at most so many bytes."""
+    return one_line(reason).encode()[:room].decode(errors="ignore")

@@ -10,7 +10,7 @@ import numpy as np
 
 from . import binary, text
 from . import messages as m
-from .auth import Key
+from .auth import Key, sealed
 from .client import Address, Tap, largest_datagram
 from .errors import DecodeError
 from .fragments import Assembler, Transfer, asks
@@ -19,7 +19,7 @@ from .messages import Command, Message, State, one_line
 from .statistics import Statistics
 from .transitions import AGENT, AgentState, Way
 
-_AFTER_STATE: Final = AGENT[AgentState.EXPECTING][Way.RECEIVED, State]
+_AFTER_STATE: Final = AGENT["expecting"]["received", State]
 
 
 class NoSuchSession(DecodeError):
@@ -48,8 +48,7 @@ class Outbox:
         self, datagrams: list[bytes], address: Address, key: Key | None, count: str = "sent"
     ) -> None:
         """Take the datagrams of a message, sealed where there is a key."""
-        for datagram in datagrams:
-            self.datagrams.append((key.seal(datagram) if key else datagram, address))
+        self.datagrams += [(datagram, address) for datagram in sealed(datagrams, key)]
         self.statistics.counters[count] += 1
 
     def drop(self, cause: str, reason: str, address: Address, now: float) -> None:
@@ -92,7 +91,7 @@ class Session:
         self.key = key
         self.line = line
         self.is_text = hello is None
-        self.state = AgentState.NEW
+        self.state: AgentState = "new"
         self.welcome: m.Welcome | None = None
         self.slot = -1
         self.sequence = 0
@@ -120,7 +119,7 @@ class Session:
     def send_welcome(self, welcome: m.Welcome) -> None:
         """Open the session for its State 1."""
         self.welcome = welcome
-        self.move(Way.SENT, m.Welcome)
+        self.move("sent", m.Welcome)
         self._send(binary.encode(welcome))
 
     def send_command(
@@ -135,7 +134,7 @@ class Session:
         Raises `InputError` if it cannot be encoded, and `KeyError` where no Command is due; nothing
         was sent.
         """
-        after = AGENT[self.state][Way.SENT, Command]
+        after = AGENT[self.state]["sent", Command]
         command = Command(
             session=self.number,
             sequence=self.sequence,
@@ -154,16 +153,16 @@ class Session:
             outbox.statistics.counters["sent"] += 1
         else:
             outbox.put(reply.start(), self.peer, self.key)
-        if self._outbox.tap:
-            self.record(command, data)
+        if outbox.tap:
+            self._record(command, data)
 
     def send_close(self, reason: str) -> None:
         """End the exchange."""
         close = self.goodbye(reason)
         data = text.encode(close) if self.is_text else binary.encode(close)
-        self.move(Way.SENT, m.Close)
+        self.move("sent", m.Close)
         self._send(data)
-        self.record(close, data)
+        self._record(close, data)
 
     def goodbye(self, reason: str) -> m.Close:
         """A Close of this session."""
@@ -174,16 +173,16 @@ class Session:
         assert self.reply is not None
         self._outbox.put(self.reply.start(), self.peer, self.key, "resent")
 
-    def answer_again(self) -> None:
+    def _answer_again(self) -> None:
         """Answer a State that came again: with Alive, while its Command is not there yet."""
-        if self.state is not AgentState.DECIDING:
+        if self.state != "deciding":
             self.repeat()
         elif not self.is_text:
             alive = m.Alive(session=self.number, sequence=self.sequence)
-            self.move(Way.SENT, m.Alive)
+            self.move("sent", m.Alive)
             self._outbox.put([binary.encode(alive)], self.peer, self.key)
 
-    def record(self, message: Message, data: bytes) -> None:
+    def _record(self, message: Message, data: bytes) -> None:
         """Show a message to the tap."""
         if self._outbox.tap:
             whole = binary.encode(message, self.layout) if self.is_text else data
@@ -200,14 +199,14 @@ class Session:
         """Take a slot with the first State."""
         self.key = self.session_key()
         self.slot = slot
-        self.move(Way.RECEIVED, State)
+        self.move("received", State)
         self.sequence = state.sequence
         self.is_plain = self.key is None and not self.is_text
         self._outbox.statistics.counters["sessions"] += 1
         for message in (self.hello, self.welcome):
             if message:
-                self.record(message, binary.encode(message))
-        self.record(state, plain)
+                self._record(message, binary.encode(message))
+        self._record(state, plain)
         return Event(slot, state, joined=True)
 
     def take_state(self, state: State, plain: bytes, now: float) -> Event:
@@ -216,7 +215,7 @@ class Session:
         self.state = _AFTER_STATE
         self._outbox.statistics.round_trips.append(now - self.asked_at)
         if self._outbox.tap:
-            self.record(state, plain)
+            self._record(state, plain)
         return Event(self.slot, state)
 
     def receive(self, message: Message, plain: bytes, now: float) -> Event | None:
@@ -228,43 +227,41 @@ class Session:
         is_state = isinstance(message, State)
         number = getattr(message, "sequence", 0)
         if is_state and number == self.sequence:
-            self.answer_again()
+            self._answer_again()
             self._drop("duplicate", now)
             return None
         if is_state and number > self.sequence + 1 and not self.is_text:
-            raise NoSuchSession(f"State {number}")
+            raise NoSuchSession
         is_due = number == self.sequence + is_state or isinstance(message, m.Close)
-        if not is_due or (Way.RECEIVED, type(message)) not in AGENT[self.state]:
+        if not is_due or ("received", type(message)) not in AGENT[self.state]:
             self._drop("stale", now)
             return None
         if isinstance(message, State):
             return self.take_state(message, plain, now)
         if isinstance(message, m.Close):
-            self.record(message, plain)
-            if self.state is not AgentState.CLOSING:
+            self._record(message, plain)
+            if self.state != "closing":
                 self.send_close("")
-            self.move(Way.RECEIVED, m.Close)
+            self.move("received", m.Close)
             return Event(self.slot, message)
-        self.move(Way.RECEIVED, type(message))
+        self.move("received", type(message))
         if isinstance(message, m.Alive):
             self.heard_at = now
-        elif isinstance(message, m.Missing):
-            if self.reply and message.kind == binary.COMMAND:
-                datagrams = self.reply.resend(message)
-                self._outbox.put(datagrams, self.peer, self.key, "resent")
-            else:
-                self._drop("stale", now)
+        elif isinstance(message, m.Missing) and self.reply and message.kind == binary.COMMAND:
+            self._outbox.put(self.reply.resend(message), self.peer, self.key, "resent")
+        else:
+            self._drop("stale", now)
         return None
 
     def assemble(self, fragment: bytes, now: float) -> bytes | None:
         """The State that is due, once all its fragments are there."""
         _, _, sequence = binary.peek(fragment)
         if sequence > self.sequence + 1:
-            raise NoSuchSession(f"State {sequence}")
+            raise NoSuchSession
         if sequence <= self.sequence:
             is_repeat = sequence == self.sequence and self.slot >= 0
             if is_repeat and asks(fragment):
-                self.answer_again()
+                self._answer_again()
             self._drop("duplicate" if is_repeat else "stale", now)
             return None
         self._assembler = self._assembler or Assembler(self.layout.state.size)

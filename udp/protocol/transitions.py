@@ -4,8 +4,7 @@ One table for each side says what a message does, sent or received; other messag
 sent, and are dropped when they come. A text simulator begins at READY, for it says no Hello.
 """
 
-from enum import Enum
-from typing import Final
+from typing import Final, Literal
 
 from .messages import (
     Alive,
@@ -21,113 +20,96 @@ from .messages import (
     Welcome,
 )
 
+Way = Literal["sent", "received", "unsaid"]
+"""Which way a message goes, seen from this side. `unsaid`: this side gives up, or another takes the
+slot, and nothing is sent."""
 
-class _Enum(Enum):
-    __hash__ = object.__hash__  # of Enum's own, a lookup in a table takes four times as long
+SimulatorState = Literal["idle", "hello", "ready", "waiting", "closing", "closed"]
+"""State of a simulator.
 
+* `idle`: nothing was said yet, or the agent does not know the session any more.
+* `hello`: it waits for a Welcome.
+* `ready`: it has a Welcome or a Command; it computes, then sends a State.
+* `waiting`: for the Command of the State sent last.
+* `closing`: it waits for the answer to its Close.
+"""
 
-class Way(_Enum):
-    """Which way a message goes, seen from this side."""
+AgentState = Literal["new", "queued", "welcomed", "deciding", "expecting", "closing", "closed"]
+"""State of an agent, for each simulator.
 
-    SENT = "sent"
-    RECEIVED = "received"
-    UNSAID = "unsaid"  # this side gives up, or another takes the slot: nothing is sent
-
-
-class SimulatorState(_Enum):
-    """Of a simulator."""
-
-    IDLE = "idle"  # nothing was said yet, or the agent does not know the session any more
-    HELLO = "hello"  # waits for a Welcome
-    READY = "ready"  # has a Welcome or a Command: computes, then sends a State
-    WAITING = "waiting"  # for the Command of the State sent last
-    CLOSING = "closing"  # waits for the answer to its Close
-    CLOSED = "closed"
-
-
-class AgentState(_Enum):
-    """Of an agent, for each simulator."""
-
-    NEW = "new"  # its Hello has come, or the first line of text
-    QUEUED = "queued"  # every slot is taken: it waits for one
-    WELCOMED = "welcomed"  # may take a slot: its State 1 is expected
-    DECIDING = "deciding"  # has a slot; its State waits for a Command
-    EXPECTING = "expecting"  # has a slot; its next State is expected
-    CLOSING = "closing"  # the answer to a Close is expected
-    CLOSED = "closed"
-
-
-_S = SimulatorState
-_A = AgentState
-_SENT = Way.SENT
-_RECEIVED = Way.RECEIVED
-_UNSAID = Way.UNSAID
+* `new`: its Hello has come, or the first line of text.
+* `queued`: every slot is taken; it waits for one.
+* `welcomed`: it may take a slot; its State 1 is expected.
+* `deciding`: it has a slot; its State waits for a Command.
+* `expecting`: it has a slot; its next State is expected.
+* `closing`: the answer to a Close is expected.
+"""
 
 SIMULATOR: Final[dict[SimulatorState, dict[tuple[Way, type[Message]], SimulatorState]]] = {
-    _S.IDLE: {(_SENT, Hello): _S.HELLO, (_UNSAID, Close): _S.CLOSED},
-    _S.HELLO: {
-        (_RECEIVED, Missing): _S.HELLO,
-        (_RECEIVED, Wait): _S.HELLO,
-        (_RECEIVED, Welcome): _S.READY,
-        (_RECEIVED, Refuse): _S.CLOSED,
-        (_UNSAID, Close): _S.CLOSED,
+    "idle": {("sent", Hello): "hello", ("unsaid", Close): "closed"},
+    "hello": {
+        ("received", Missing): "hello",
+        ("received", Wait): "hello",
+        ("received", Welcome): "ready",
+        ("received", Refuse): "closed",
+        ("unsaid", Close): "closed",
     },
-    _S.READY: {
-        (_SENT, Alive): _S.READY,
-        (_SENT, State): _S.WAITING,
-        (_SENT, Close): _S.CLOSING,
-        (_RECEIVED, Close): _S.CLOSED,
+    "ready": {
+        ("sent", Alive): "ready",
+        ("sent", State): "waiting",
+        ("sent", Close): "closing",
+        ("received", Close): "closed",
     },
-    _S.WAITING: {
-        (_SENT, Hello): _S.HELLO,  # a new session, of several agents
-        (_SENT, Missing): _S.WAITING,
-        (_RECEIVED, Missing): _S.WAITING,
-        (_RECEIVED, Alive): _S.WAITING,
-        (_RECEIVED, Command): _S.READY,
-        (_RECEIVED, Unknown): _S.IDLE,
-        (_RECEIVED, Close): _S.CLOSED,
-        (_SENT, Close): _S.CLOSING,
+    "waiting": {
+        ("sent", Hello): "hello",  # a new session, of several agents
+        ("sent", Missing): "waiting",
+        ("received", Missing): "waiting",
+        ("received", Alive): "waiting",
+        ("received", Command): "ready",
+        ("received", Unknown): "idle",
+        ("received", Close): "closed",
+        ("sent", Close): "closing",
     },
-    _S.CLOSING: {(_RECEIVED, Close): _S.CLOSED, (_UNSAID, Close): _S.CLOSED},
-    _S.CLOSED: {(_UNSAID, Close): _S.CLOSED},
+    "closing": {("received", Close): "closed", ("unsaid", Close): "closed"},
+    "closed": {("unsaid", Close): "closed"},
 }
 
 AGENT: Final[dict[AgentState, dict[tuple[Way, type[Message]], AgentState]]] = {
-    _A.NEW: {
-        (_SENT, Refuse): _A.CLOSED,
-        (_SENT, Wait): _A.QUEUED,
-        (_SENT, Welcome): _A.WELCOMED,
-        (_RECEIVED, State): _A.DECIDING,  # by text
+    "new": {
+        ("sent", Refuse): "closed",
+        ("sent", Wait): "queued",
+        ("sent", Welcome): "welcomed",
+        ("received", State): "deciding",  # by text
     },
-    _A.QUEUED: {
-        (_SENT, Wait): _A.QUEUED,
-        (_SENT, Welcome): _A.WELCOMED,
-        (_SENT, Refuse): _A.CLOSED,
+    "queued": {
+        ("sent", Wait): "queued",
+        ("sent", Welcome): "welcomed",
+        ("sent", Refuse): "closed",
     },
-    _A.WELCOMED: {
-        (_SENT, Welcome): _A.WELCOMED,
-        (_SENT, Missing): _A.WELCOMED,
-        (_RECEIVED, State): _A.DECIDING,
-        (_RECEIVED, Close): _A.CLOSED,
-        (_SENT, Unknown): _A.CLOSED,
-        (_SENT, Close): _A.CLOSED,
+    "welcomed": {
+        ("sent", Welcome): "welcomed",
+        ("sent", Missing): "welcomed",
+        ("received", State): "deciding",
+        ("received", Close): "closed",
+        ("sent", Unknown): "closed",
+        ("sent", Close): "closed",
     },
-    _A.DECIDING: {
-        (_SENT, Alive): _A.DECIDING,
-        (_SENT, Command): _A.EXPECTING,
-        (_SENT, Close): _A.CLOSING,
-        (_RECEIVED, Close): _A.CLOSED,
-        (_UNSAID, Close): _A.CLOSED,
+    "deciding": {
+        ("sent", Alive): "deciding",
+        ("sent", Command): "expecting",
+        ("sent", Close): "closing",
+        ("received", Close): "closed",
+        ("unsaid", Close): "closed",
     },
-    _A.EXPECTING: {
-        (_RECEIVED, Alive): _A.EXPECTING,
-        (_RECEIVED, Missing): _A.EXPECTING,
-        (_SENT, Missing): _A.EXPECTING,
-        (_RECEIVED, State): _A.DECIDING,
-        (_RECEIVED, Close): _A.CLOSED,
-        (_SENT, Close): _A.CLOSING,
-        (_UNSAID, Close): _A.CLOSED,
+    "expecting": {
+        ("received", Alive): "expecting",
+        ("received", Missing): "expecting",
+        ("sent", Missing): "expecting",
+        ("received", State): "deciding",
+        ("received", Close): "closed",
+        ("sent", Close): "closing",
+        ("unsaid", Close): "closed",
     },
-    _A.CLOSING: {(_RECEIVED, Close): _A.CLOSED, (_UNSAID, Close): _A.CLOSED},
-    _A.CLOSED: {(_UNSAID, Close): _A.CLOSED},
+    "closing": {("received", Close): "closed", ("unsaid", Close): "closed"},
+    "closed": {("unsaid", Close): "closed"},
 }

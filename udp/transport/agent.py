@@ -27,8 +27,8 @@ from ..protocol.errors import PeerClosed, PeerSilent
 from ..protocol.fragments import check_largest
 from ..protocol.layout import Layout
 from ..protocol.messages import Close, Hello, State
-from ..protocol.server import Event, Server
-from ..protocol.transitions import AgentState
+from ..protocol.server import Server
+from ..protocol.session import Event
 from .sockets import LONGEST_WAIT, PAUSE, Port, log_notices
 
 if TYPE_CHECKING:
@@ -264,7 +264,7 @@ class Agent:
         """Slots at which it is not the agent's turn."""
         pending = []
         for slot, session in enumerate(self.server.slots):
-            if session is None or session.state is not AgentState.DECIDING:
+            if session is None or session.state != "deciding":
                 pending.append(slot)  # a comprehension is one more call
         return pending
 
