@@ -120,7 +120,7 @@ class Twin:
             self.absent = self.absent | (np.arange(AGENTS) == absence.agent)
             mask = np.arange(AGENTS) == absence.agent
             loop.land(mask)
-            self.counts[f"absent_{absence.participation.value}"] += 1
+            self.counts[f"absent_{absence.participation}"] += 1
         self.taken = len(rules.absences)
         if isinstance(cause, Command):
             flying = ~(self.absent | loop.out)
@@ -179,7 +179,7 @@ def fly_eight(kills: int, dice: random.Random) -> dict[str, object]:
         while rules.episodes < wanted:
             assert thread.is_alive(), "the simulator failed"
             time.sleep(0.01)
-        present = [link.participation.value for link in rules.links]
+        present = [link.participation for link in rules.links]
     finally:
         simulator.stop()
         thread.join(60)

@@ -33,7 +33,7 @@ def main() -> int:
     # The agent closes the exchange; Ctrl-C in a terminal is meant for it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        env, settings = read_arguments(_first_line())
+        env, settings = read_arguments(sys.stdin.buffer.readline())
         with Simulator(env, config=LinkConfig(timeout=_FOR_EVER), **settings) as simulator:
             return _fly(simulator)
     except (LinkError, OSError, InputError, MissingPackage, NoOpenGL) as error:
@@ -57,17 +57,6 @@ def _fly(simulator: Driver) -> int:
     Thread(target=stop_with_stdin, daemon=True).start()
     simulator.run()
     return 128 + ended[0] if ended else 0
-
-
-def _first_line() -> bytes:
-    """Up to the first end of a line, and no byte more: the thread reads the rest."""
-    line = bytearray()
-    while not line.endswith(b"\n"):
-        byte = os.read(0, 1 << 16)
-        if not byte:
-            break
-        line += byte
-    return bytes(line)
 
 
 def read_arguments(line: bytes) -> tuple[EnvConfig, dict[str, Any]]:

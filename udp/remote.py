@@ -20,7 +20,8 @@ from ..envs.autoreset import (
 )
 from ..envs.spaces import action_space, joined, observation_space, telemetry_names
 from ..envs.spec import ArraySpec, Discrete, EnvSpec
-from ..models.errors import InputError, NotCopied, shortened
+from ..models.errors import InputError, NotCopied
+from ..models.fields import Limits, OrNone, check
 from .layouts import layout_of
 from .protocol.client import Address
 from .protocol.layout import MAX_DRONES
@@ -137,8 +138,7 @@ class RemoteEnv(_Remote, gym.Env[Any, Any]):
         self, *, seed: int | None = None, options: Info | None = None
     ) -> tuple[Observation, Info]:
         """Start an episode in the simulator, with its generator seeded where a seed is given."""
-        if not (seed is None or 0 <= seed <= MAX_UINT64):
-            raise InputError(f"seed: expected 0 to 2^64 - 1, got {seed}")
+        check("seed", OrNone(Limits(0, MAX_UINT64, whole=True)), seed)
         if options:
             raise InputError(f"options: expected none over UDP, got {options}")
         super().reset(seed=seed)
@@ -258,21 +258,16 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
         self.num_simulators = num_simulators
         self._reasons: np.ndarray | None = None  # of simulators that were lost in this step
         self.metadata = {"render_modes": [], "autoreset_mode": checked_mode(autoreset_mode)}
-        if not (type(num_simulators) is int and 1 <= num_simulators <= MAX_DRONES):
-            raise InputError(
-                f"num_simulators: expected 1 to {MAX_DRONES}, got {shortened(num_simulators)}"
-            )
+        check("num_simulators", Limits(1, MAX_DRONES, whole=True), num_simulators)
         drones = None
         if num_envs is not None:
             most = num_simulators * MAX_DRONES
-            right = type(num_envs) is int and 1 <= num_envs <= most
-            if not right or num_envs % num_simulators:
-                raise InputError(
-                    f"num_envs: expected a multiple of num_simulators = {num_simulators}, at most "
-                    f"{most}, got {shortened(num_envs)}"
-                )
+            check("num_envs", Limits(1, most, whole=True), num_envs)
+            drones, left = divmod(num_envs, num_simulators)
+            if left:
+                expected = f"a multiple of num_simulators = {num_simulators}"
+                raise InputError(f"num_envs: expected {expected}, got {num_envs}")
             self.num_envs = num_envs
-            drones = num_envs // num_simulators
         config = AgentConfig(drones=drones, slots=num_simulators, **settings)
         self._open(address, config, connect)
         self.closed = False

@@ -125,7 +125,10 @@ def test_help_names_the_default_backend(
         (["compare", "--agents", "vpg", "vpg"], "row: expected each row once, got vpg twice"),
         (["compare", "--out", "."], "expected a new folder"),
         (["report", "nowhere"], "nowhere"),
-        (["sim", "--num-envs", "0", "--bind", "127.0.0.1:0"], "num_envs: expected 1 to 65536"),
+        (
+            ["sim", "--num-envs", "0", "--bind", "127.0.0.1:0"],
+            "num_envs: expected a whole",
+        ),
         (["sim", "--key-file", "nowhere"], "key file: cannot read nowhere"),
         (
             ["sim", "--agents", "here:1", "--server", "here:2"],
@@ -142,7 +145,7 @@ def test_help_names_the_default_backend(
         (["train", "a2c", "--key-file", "nowhere"], "key-file, insecure: expected them with"),
         (["train", "a2c", "--store-every", "0"], "store-every: expected seconds > 0, got 0"),
         (["serve", "pid", "--listen", "0.0.0.0:0"], "--key-file), or insecure=True (--insecure)"),
-        (["sim", "--drop", "2"], "drop: expected a probability from 0 to 1, got 2"),
+        (["sim", "--drop", "2"], "drop: expected a number from 0 to 1, got 2"),
         (["replay", "nowhere.mcap"], "nowhere.mcap"),
     ],
 )

@@ -218,7 +218,6 @@ def test_sizes_that_do_not_fit() -> None:
         lambda: Welcome(session=1, nonce=2**64),
         lambda: Extension(number=1 << 15, value=b""),
         lambda: binary.encode(Wait(session=-1)),
-        lambda: binary.encode(state(1)),
     ):
         with pytest.raises(InputError, match=r"expected|argument"):
             make()
@@ -289,7 +288,7 @@ def test_text_is_in_the_paper_s_frame() -> None:
     assert numbers[6:9] == [0.0, 0.5, 0.0]
     assert numbers[9:12] == [0.0, -0.25, 0.0]  # left-handed: to the right is positive
     assert numbers[12:] == [7.0, 8.0]
-    assert text.telemetry_size(of) == 14
+    assert sum(text.telemetry_sizes(of)) == 14
     got = text.decode_state(text.encode(sent, of), of)
     assert isinstance(got, State)
     for there, back in zip(sent.telemetry, got.telemetry, strict=True):

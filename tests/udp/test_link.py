@@ -632,7 +632,7 @@ def test_every_message_is_shown_once() -> None:
 
 @pytest.mark.parametrize("drop", [-0.1, 1.1, float("nan")])
 def test_a_wrong_probability_of_loss(drop: float) -> None:
-    with pytest.raises(InputError, match=f"^drop: expected a probability from 0 to 1, got {drop}$"):
+    with pytest.raises(InputError, match=f"^drop: expected a number from 0 to 1, got {drop}$"):
         LinkConfig(drop=drop)
 
 

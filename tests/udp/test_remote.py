@@ -112,7 +112,7 @@ def test_wrong_actions_and_seeds_raise_and_nothing_has_happened() -> None:
             with pytest.raises(ValueError, match=sentence):
                 remote.step(action)
         for seed in (-1, 2**64):
-            with pytest.raises(ValueError, match="seed: expected 0 to"):
+            with pytest.raises(ValueError, match="seed: expected a whole number from 0 to"):
                 remote.reset(seed=seed)
         with pytest.raises(ValueError, match="options: expected none over UDP"):
             remote.reset(options={"start": 1})

@@ -44,17 +44,23 @@ posix = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals and fo
             lambda: Simulator(Broken(None), target=1),
             "env: expected one env without keywords",
         ),
-        (lambda: Simulator(num_envs=10**9), "num_envs: expected 1 to 65536"),
+        (lambda: Simulator(num_envs=10**9), "num_envs: expected a whole number from 1 to 65536"),
         (lambda: Simulator(num_envs=2, codec="text"), "text codec: expected one drone"),
         (lambda: RemoteEnv(ANY, env_id=ENV_ID, options={"wind": 1}), "wind"),
         (lambda: RemoteEnv(ANY, env_id="Own-v0", options={"wind": np.zeros(3)}), "JSON values"),
         (lambda: Simulator("Own-v0", wind=np.zeros(3)), "expected JSON values"),  # fault 3
-        (lambda: RemoteEnv(ANY, timeout=0), "timeout: expected seconds > 0, got 0"),
+        (lambda: RemoteEnv(ANY, timeout=0), "timeout: expected a number above 0 s, got 0"),
         (lambda: RemoteEnv(ANY, connect_timeout=float("nan")), "connect_timeout: expected"),
-        (lambda: RemoteEnv(ANY, max_datagram=32), "max_datagram: expected at least 256, got 32"),
-        (lambda: RemoteVectorEnv(ANY, num_envs=10**9), "num_envs: expected a multiple"),  # fault 32
+        (
+            lambda: RemoteEnv(ANY, max_datagram=32),
+            "max_datagram: .* of at least 256",
+        ),
+        (lambda: RemoteVectorEnv(ANY, num_envs=10**9), "num_envs: expected a whole"),  # fault 32
         (lambda: RemoteVectorEnv(ANY, num_envs=3, num_simulators=2), "multiple of num_simulators"),
-        (lambda: RemoteVectorEnv(ANY, num_simulators=0), "num_simulators: expected 1 to"),
+        (
+            lambda: RemoteVectorEnv(ANY, num_simulators=0),
+            "num_simulators: expected a whole",
+        ),
         (lambda: RemoteVectorEnv(ANY, num_envs=1, autoreset_mode="x"), "autoreset_mode: expected"),
         (lambda: RemoteEnv(("8.8.8.8", 1)), "not a loopback address"),
         (lambda: RemoteEnv(("127.0.0.1", 70000)), "address: expected"),

@@ -15,7 +15,6 @@ import time
 import weakref
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from errno import EINTR
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Final
@@ -70,19 +69,17 @@ class Journal:
         head = {f"version of {name}": number for name, number in versions.items()}
         head |= {"format": FORMAT, "side": side, **(about or {})}
         try:
-            file = McapFile(Path(path), f"rotorgram {versions.get('rotorgram', '')}")
+            self._file = file = McapFile(Path(path), f"rotorgram {versions.get('rotorgram', '')}")
         except FileExistsError:
             sentence = f"record: expected a file that does not exist yet, got {path}"
             raise FileExistsError(sentence) from None
         try:
             file.write_head(head, models or {}, now)
         except BaseException as error:
-            file.abandon()
             Path(path).unlink()
             if isinstance(error, OSError):
                 raise OSError(error.errno, error.strerror, str(path)) from None
             raise
-        self._file = file
         weakref.finalize(self, file.close)
 
     def tap(self, slot: int, message: Message, datagram: bytes) -> None:
@@ -90,42 +87,35 @@ class Journal:
         if self._file.closed:
             return
         now = time.time_ns()
-        try:
-            if isinstance(message, State | Command):
-                topic = "state" if isinstance(message, State) else "command"
-                channel = self._file.channel(f"/slot{slot}/{topic}", "rotorgram")
-                self._file.pending.append((channel, now, message.sequence, datagram))
-            else:
-                self._add_event(slot, message, datagram, now)
-            self._size += len(datagram)
-            if self._size > 4 * _CHUNK:  # nobody calls `write`
-                self._flush(now)
-        except OSError as error:
-            self._file.give_up(error)
+        if isinstance(message, State | Command):
+            topic = "state" if isinstance(message, State) else "command"
+            channel = self._file.channel(f"/slot{slot}/{topic}", "rotorgram")
+            self._file.pending.append((channel, now, message.sequence, datagram))
+        else:
+            channel = self._file.channel(f"/slot{slot}/events", "json")
+            self._file.pending.append((channel, now, 0, self._event(message, datagram)))
+        self._size += len(datagram)
+        if self._size > 4 * _CHUNK:  # nobody calls `write`
+            self._flush(now)
 
     def write(self) -> None:
         """Write the messages. Call it when there is time: while the other side is at work."""
-        if self._file.closed:
-            return
         now = time.time_ns()
-        try:
-            # Clocks are set back at times.
-            if self._size > _CHUNK or not 0 <= now - self._flushed < _SECOND:
-                self._flush(now)
-        except OSError as error:
-            self._file.give_up(error)
+        # Clocks are set back at times.
+        if self._size > _CHUNK or not 0 <= now - self._flushed < _SECOND:
+            self._flush(now)
 
     def close(self) -> None:
         """Write all, and finish the file. May be called again."""
         self._file.close()
 
     def _flush(self, now: int) -> None:
-        self._file.flush()
         self._size = 0
         self._flushed = now
+        self._file.flush()
 
-    def _add_event(self, slot: int, message: Message, datagram: bytes, now: int) -> None:
-        """Add a message for readers, with its datagram for programs."""
+    def _event(self, message: Message, datagram: bytes) -> bytes:
+        """A message for readers, with its datagram for programs."""
         words = {"type": type(message).__name__, "session": f"{message.session:016x}"}
         if isinstance(message, Hello):
             words["codec"] = self._codec
@@ -133,8 +123,7 @@ class Journal:
             if hasattr(message, name):
                 words[name] = getattr(message, name)
         words["datagram"] = datagram.hex()
-        channel = self._file.channel(f"/slot{slot}/events", "json")
-        self._file.pending.append((channel, now, 0, json.dumps(words).encode()))
+        return json.dumps(words).encode()
 
 
 def software() -> dict[str, str]:
@@ -179,11 +168,9 @@ class McapFile:
     """Appends whole chunks to a new file, so that a killed program leaves a readable one.
 
     Messages wait in a list, which costs the exchange next to nothing, until `flush` makes a chunk
-    of them. `library` is name and version of the program. Every method but `close` and `give_up`
-    raises `OSError` where it fails.
-
-    A write that an exception interrupts (a full device) may leave half a record. Then nothing more
-    can be written. Ctrl-C and SIGTERM take effect after the write.
+    of them. `library` is name and version of the program. A write that fails or is interrupted (a
+    full device) may leave half a record, so it is the last. Ctrl-C and SIGTERM take effect after
+    the write.
     """
 
     def __init__(self, path: Path, library: str) -> None:
@@ -195,7 +182,6 @@ class McapFile:
         self._channels: dict[str, int] = {}  # ids by topic
         self._file: Any = path.open("xb", buffering=_BUFFER)
         self._writer: Any = Writer(self._file, chunk_size=sys.maxsize, use_summary_offsets=False)
-        self._broken = False
         self._writer.start("", library)
         self._event = self._writer.register_schema(
             "rotorgram.Event", "jsonschema", b'{"type": "object"}'
@@ -209,58 +195,47 @@ class McapFile:
         return self._channels[topic]
 
     def write_head(self, about: Mapping[str, str], models: Mapping[str, str], time: int) -> None:
-        """Write the metadata, and the models as attachments."""
+        """Write the metadata, and the models as attachments. Raises `OSError`."""
         with self._whole():
             self._writer.add_metadata(ABOUT, dict(about))
             for name, model in models.items():
                 self._writer.add_attachment(0, time, name, "application/xml", model.encode())
 
-    def flush(self) -> None:
-        """Write all messages as one chunk."""
-        if self.closed or not self.pending:
+    def flush(self, *, finish: bool = False) -> None:
+        """Write all messages as one chunk; where that fails, log why the journal ends here."""
+        if self.closed:
             return
-        with self._whole():
-            for channel, time, sequence, data in self.pending:
-                self._writer.add_message(channel, time, data, time, sequence & 0xFFFFFFFF)
-            self.pending.clear()
-            self._writer.flush()
+        try:
+            with self._whole():
+                for channel, time, sequence, data in self.pending:
+                    self._writer.add_message(channel, time, data, time, sequence & 0xFFFFFFFF)
+                self.pending.clear()
+                self._writer.flush()
+                if finish:
+                    self._writer.finish()
+                    self.closed = True
+        except OSError as error:
+            sentence = "record: writing %s failed (%s): the flight goes on, its journal ends here"
+            _log.warning(sentence, self._path, error.strerror or error)
 
     def close(self) -> None:
         """Finish the file, or give it up where that fails. A fork leaves it to its parent."""
-        if self.closed or os.getpid() != self._pid:
-            return
-        with _deferred_signals():
-            try:
-                self.flush()
-                with self._whole():
-                    self._writer.finish()
-                self.closed = True
-                self._file.close()
-            except OSError as error:
-                self.give_up(error)
-
-    def give_up(self, error: OSError) -> None:
-        """Log why the journal ends here, and abandon the file: what was written can be read."""
-        sentence = "record: writing %s failed (%s): the flight goes on, its journal ends here"
-        _log.warning(sentence, self._path, error.strerror or error)
-        self.abandon()
-
-    def abandon(self) -> None:
-        """Close the file as it is. Pending messages are lost."""
-        self.closed = True
-        with suppress(OSError):
-            self._file.raw.close()  # its buffer still holds the bytes that a full device refused
+        if os.getpid() == self._pid:
+            self.flush(finish=True)
+            self._file.close()
 
     @contextmanager
     def _whole(self) -> Iterator[None]:
         """Write what is added here, up to the device. If that is interrupted, it is the last."""
-        if self._broken:
-            raise OSError(EINTR, "a write was interrupted")
         with _deferred_signals():
-            self._broken = True
-            yield
-            self._file.flush()
-            self._broken = False
+            try:
+                yield
+                self._file.flush()
+            except BaseException:
+                self.closed = True
+                with suppress(OSError):  # its buffer still holds bytes that a full device refused
+                    self._file.raw.close()
+                raise
 
 
 @contextmanager

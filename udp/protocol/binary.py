@@ -66,10 +66,8 @@ _NUMBERS: Final = struct.Struct("<QQ")  # session, sequence: the end of the head
 _HELLO_BODY: Final = struct.Struct("<BB2xII4x")
 _WELCOME_BODY: Final = struct.Struct("<QQBB6x")
 _REST_AT: Final = 8  # first byte after the checksum
-_STATE_BODY: Final = struct.Struct("<dQ")
-_STATE_HEAD: Final = struct.Struct("<QQdQ")  # numbers and body
-_COMMAND_BODY: Final = struct.Struct("<I4x")
-_COMMAND_HEAD: Final = struct.Struct("<QQI4x")  # numbers and body
+_STATE_HEAD: Final = struct.Struct("<QQdQ")  # session and sequence too
+_COMMAND_HEAD: Final = struct.Struct("<QQI4x")
 _MISSING_BODY: Final = struct.Struct("<BxHH")
 _EXTENSION: Final = struct.Struct("<HH")
 _START: Final = {kind: MAGIC + bytes((VERSION, kind)) for kind in (STATE, COMMAND)}
@@ -88,7 +86,8 @@ def encode(message: Message, layout: Layout | None = None) -> bytes:
     Raises `InputError` if a number, an array or the whole does not fit.
     """
     if isinstance(message, State | Command):
-        return encode_step(message, _expect(layout))
+        assert layout is not None
+        return encode_step(message, layout)
     kind = _MESSAGES.index(type(message)) + 1
     sequence = getattr(message, "sequence", 0)
     try:
@@ -130,7 +129,9 @@ def decode(datagram: bytes, layout: Layout | None = None) -> Message:
         raise DecodeError(f"type: expected 1 to {len(_MESSAGES)}, got {kind}")
     try:
         if kind in (STATE, COMMAND):
-            return _decode_step(kind, datagram, session, sequence, _expect(layout))
+            if layout is None:
+                raise InputError("expected a Hello before it, got none")
+            return _decode_step(kind, datagram, session, sequence, layout)
         return _decode_body(kind, session, sequence, datagram[HEADER_SIZE:])
     except (ValueError, struct.error) as error:
         raise DecodeError(f"{_MESSAGES[kind - 1].__name__.lower()}: {error}") from None
@@ -173,23 +174,23 @@ def is_of_session(kind: int, sequence: int) -> bool:
 def encode_step(m: State | Command, layout: Layout) -> bytes:
     """The bytes of a State or a Command, whole. Raises `InputError` as `encode`."""
     try:
+        time = 0.0
         if isinstance(m, State):
+            kind = STATE
             record = layout.state
-            start = _START[STATE]
-            crc = _START_CRC[STATE]
             time = m.time
             pieces = [_STATE_HEAD.pack(m.session, m.sequence, time, m.nonce)]
             arrays = (*m.observations, m.rewards, m.terminated, m.truncated, *m.telemetry)
-        else:
-            record = layout.command if m.seeds is None else layout.seeded_command
-            start = _START[COMMAND]
-            crc = _START_CRC[COMMAND]
-            time = 0.0
-            count = 0 if m.seeds is None else layout.drones
-            pieces = [_COMMAND_HEAD.pack(m.session, m.sequence, count)]
+        elif m.seeds is None:
+            kind = COMMAND
+            record = layout.command
+            pieces = [_COMMAND_HEAD.pack(m.session, m.sequence, 0)]
             arrays = (m.actions, m.orders)
-            if m.seeds is not None:
-                arrays = (m.actions, m.orders, m.seeds)
+        else:
+            kind = COMMAND
+            record = layout.seeded_command
+            pieces = [_COMMAND_HEAD.pack(m.session, m.sequence, layout.drones)]
+            arrays = (m.actions, m.orders, m.seeds)
     except struct.error as error:
         raise InputError(f"{type(m).__name__}: {error}") from None
     for slot, array in zip(record.slots, arrays, strict=True):
@@ -209,24 +210,23 @@ def encode_step(m: State | Command, layout: Layout) -> bytes:
     wrong = rest[flags.start - _REST_AT : flags.stop - _REST_AT].translate(None, record.legal)
     if wrong:
         raise _wrong_flags(wrong, record)
-    return start + zlib.crc32(rest, crc).to_bytes(4, "little") + rest
+    return _START[kind] + zlib.crc32(rest, _START_CRC[kind]).to_bytes(4, "little") + rest
 
 
 def _decode_step(
     kind: int, data: bytes, session: int, sequence: int, layout: Layout
 ) -> State | Command:
     time = 0.0
-    count = nonce = 0
     if kind == STATE:
         record = layout.state
-        time, nonce = _STATE_BODY.unpack_from(data, HEADER_SIZE)
+        _, _, time, nonce = _STATE_HEAD.unpack_from(data, _REST_AT)
     else:
-        (count,) = _COMMAND_BODY.unpack_from(data, HEADER_SIZE)
+        _, _, count = _COMMAND_HEAD.unpack_from(data, _REST_AT)
         if count not in (0, layout.drones):
             raise InputError(f"seeds: expected 0 or {layout.drones}, got {count}")
         record = layout.seeded_command if count else layout.command
     if len(data) != record.size:
-        raise _wrong_size(data, record.size)
+        raise InputError(f"expected {record.size} bytes, got {len(data)}")
     if wrong := data[record.flags].translate(None, record.legal):
         raise _wrong_flags(wrong, record)
     numbers = record.numbers
@@ -280,16 +280,6 @@ def _check_numbers(data: bytes, time: float, record: Record, layout: Layout) -> 
             raise InputError(f"action: expected a choice 0 to {most}, got {actions[beyond][0]}")
 
 
-def _expect(layout: Layout | None) -> Layout:
-    if layout is None:
-        raise InputError("expected a Hello before it, got none")
-    return layout
-
-
-def _wrong_size(data: bytes, size: int) -> InputError:
-    return InputError(f"expected {size} bytes, got {len(data)}")
-
-
 def _wrong_flags(wrong: bytes, record: Record) -> InputError:
     return InputError(f"flags: expected 0 to {record.legal[-1]}, got {wrong[0]}")
 
@@ -338,25 +328,22 @@ def _decode_body(kind: int, session: int, sequence: int, body: bytes) -> Message
         fields["kind"], fields["count"], fields["first"] = _MISSING_BODY.unpack_from(body)
         fields["bitmap"] = body[_MISSING_BODY.size :]
     elif message in (Refuse, Close):
-        fields["reason"] = _decode_reason(body)
+        (size,) = _LENGTH.unpack_from(body)
+        reason = body[_LENGTH.size :]
+        if len(reason) != size:
+            raise InputError(f"reason: expected {size} bytes, got {len(reason)}")
+        fields["reason"] = reason.decode()
     elif body:
-        raise _wrong_size(body, 0)
+        raise InputError(f"expected no bytes, got {len(body)}")
     return message(**fields)
 
 
-def _decode_reason(body: bytes) -> str:
-    (size,) = _LENGTH.unpack_from(body)
-    if len(body) != _LENGTH.size + size:
-        raise _wrong_size(body, _LENGTH.size + size)
-    return body[_LENGTH.size :].decode()
-
-
 def _extensions(extensions: tuple[Extension, ...]) -> bytes:
-    pieces: list[bytes] = []
+    data = b""
     for each in extensions:
         number = each.number | (_CRITICAL if each.critical else 0)
-        pieces += (_EXTENSION.pack(number, len(each.value)), each.value)
-    return b"".join(pieces)
+        data += _EXTENSION.pack(number, len(each.value)) + each.value
+    return data
 
 
 def _take_extensions(data: bytes, at: int) -> tuple[Extension, ...]:

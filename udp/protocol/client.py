@@ -11,24 +11,17 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import inf
 from random import Random
-from typing import Final
+from typing import Annotated, Final
 
 import numpy as np
 
 from ...models.errors import InputError
+from ...models.fields import Limits, check_fields
 from . import binary, text
 from . import messages as m
 from .auth import Key, is_sealed, message_of, sealed
 from .errors import DecodeError, Forged
-from .fragments import (
-    FAR,
-    NEAR,
-    Assembler,
-    Transfer,
-    check_largest,
-    check_size,
-    is_fragment,
-)
+from .fragments import FAR, LEAST, NEAR, Assembler, Transfer, check_size, is_fragment
 from .layout import Layout
 from .messages import Command, Message, State, one_line
 from .statistics import Statistics
@@ -83,23 +76,19 @@ def largest_datagram(peer: Address, most: int | None = None) -> int:
 class LinkConfig:
     """Times and sizes of a simulator's exchange."""
 
-    timeout: float = 120.0
+    timeout: Annotated[float, Limits(0, unit="s", above=True)] = 120.0
     """It gives up when nothing has answered for this long, s: longer than an agent waits for one
     to replace another that it has lost."""
-    max_datagram: int | None = None
+    max_datagram: Annotated[int | None, Limits(LEAST, whole=True)] = None
     """Largest datagram, bytes, a seal not counted, at least 256. None: 65,483 on loopback, 1,200
     elsewhere."""
-    drop: float = 0.0
+    drop: Annotated[float, Limits(0, 1)] = 0.0
     """Probability that a datagram is lost on purpose, sent or received, to try an agent: 0 to 1."""
     drop_seed: int = 0
     """The same seed loses the same datagrams, by their order."""
 
     def __post_init__(self) -> None:
-        if not 0 < self.timeout < inf:
-            raise InputError(f"timeout: expected a number > 0, got {self.timeout}")
-        if not 0 <= self.drop <= 1:
-            raise InputError(f"drop: expected a probability from 0 to 1, got {self.drop}")
-        check_largest(self.max_datagram)
+        check_fields(self)
 
 
 class RoundTrips:

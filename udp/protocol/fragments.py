@@ -26,7 +26,7 @@ NEAR: Final = 65_507 - 24
 """Largest datagram of the binary codec on loopback, bytes: UDP's over IPv4, less a seal."""
 FAR: Final = 1_200
 """The same elsewhere: less than any network's, so that no datagram is cut on its way."""
-_LEAST: Final = 256  # the smallest that either side may be set to, bytes
+LEAST: Final = 256  # the smallest that either side may be set to, bytes
 MAX_FRAGMENTS: Final = 1 << 14
 
 _FRAGMENT: Final = struct.Struct("<HHB3x")
@@ -34,12 +34,6 @@ _OVERHEAD: Final = HEADER_SIZE + _FRAGMENT.size
 _ASKS_AT: Final = 28
 _BURST: Final = 3 << 16  # bytes: what the smallest buffer that systems give a socket holds
 _LARGEST_BITMAP: Final = 128  # bytes of the bitmap of a Missing: it tells of 1,024 fragments
-
-
-def check_largest(largest: int | None) -> None:
-    """Raise `InputError` for a largest datagram, bytes, that is too small."""
-    if largest is not None and largest < _LEAST:
-        raise InputError(f"max_datagram: expected at least {_LEAST}, got {largest}")
 
 
 def check_size(size: int, largest: int) -> None:

@@ -106,6 +106,11 @@ class Welcome:
             if not 0 <= number <= MAX_UINT64:
                 raise InputError(f"{name}: expected 0 to 2^64 - 1, got {number}")
 
+    @property
+    def first_seed(self) -> int:
+        """Seed of the simulator's own first reset."""
+        return self.session if self.seed is None else self.seed
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Refuse:

@@ -6,9 +6,8 @@ Free of sockets and clocks, as `client`: a driver hands in datagrams and the tim
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from enum import Enum
 from math import inf
-from typing import Final, NamedTuple, Protocol
+from typing import Final, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,20 +15,12 @@ from numpy.typing import NDArray
 from .client import Address, Client, address_text
 from .errors import LinkError, PeerSilent, Refused
 from .layout import Layout
-from .messages import (
-    FLY,
-    RESET,
-    Close,
-    Command,
-    Message,
-    Refuse,
-    Welcome,
-)
+from .messages import FLY, RESET, Close, Command, Refuse, Welcome
 
 Array = np.ndarray
 Mask = NDArray[np.bool_]
 
-COMPLAIN_AFTER: Final = 1.0  # silence of an agent before the log says so, once a message, s
+_COMPLAIN_AFTER: Final = 1.0  # silence of an agent before the log says so, once a message, s
 NO_RESET: Final = "an action came after the end of an episode: expected a reset"
 
 
@@ -64,19 +55,15 @@ class SwarmWorld(World, Protocol):
     def retire(self, drones: Mask) -> None: ...
 
 
-class Participation(Enum):
-    """What an agent does in the running episode."""
+Participation = Literal["coming", "ready", "flying", "waiting", "left"]
+"""What an agent does in the running episode.
 
-    COMING = "coming"
-    """It has not welcomed this simulator yet, or not again after it was silent or started anew."""
-    READY = "ready"
-    """It has, and gets its first State with the next episode."""
-    FLYING = "flying"
-    """The world waits for its Commands."""
-    WAITING = "waiting"
-    """It asked for a reset, and waits for it."""
-    LEFT = "left"
-    """It closed, or was silent for too long."""
+* `coming`: it has not welcomed this simulator yet, or not again since it was silent or started.
+* `ready`: it has, and gets its first State with the next episode.
+* `flying`: the world waits for its Commands.
+* `waiting`: it asked for a reset, and waits for it.
+* `left`: it closed, or was silent for too long.
+"""
 
 
 class Absence(NamedTuple):
@@ -89,7 +76,7 @@ class Absence(NamedTuple):
     step: int
     """Control steps that its drones flew in that episode by its Commands."""
     participation: Participation
-    """`WAITING`: it asked for a reset while others flew on."""
+    """`waiting`: it asked for a reset while others flew on."""
 
 
 @dataclass(eq=False)
@@ -103,12 +90,12 @@ class AgentLink:
     """The exchange with it, with its statistics."""
     rows: Array
     """Rows of its drones in the arrays of a world, shape (n,): the first agent has the first."""
-    participation: Participation = Participation.COMING
+    participation: Participation = "coming"
     command: Command | None = None
     """The Command that the next step or reset takes."""
     patient_until: float = 0.0
-    seed: int | None = None
-    """Of its Welcome."""
+    seed: int = 0
+    """Of the first episode, as of its Welcome."""
     trouble: str = ""
     """Why datagrams do not reach it, as far as the transport knows."""
     complained: float = -inf
@@ -180,7 +167,10 @@ class WorldRules:
 
     def next_timer(self) -> float:
         """When `handle_timers` wants to be called; infinite if never."""
-        return min([link.client.next_timer() for link in self.links])
+        timer = inf
+        for link in self.links:
+            timer = min(timer, link.client.resend_at, link.client.deadline)
+        return timer
 
     def handle_timers(self, now: float) -> None:
         """Resend what is due. Raises `PeerSilent` where the flight cannot go on."""
@@ -189,10 +179,14 @@ class WorldRules:
             if now < client.next_timer():
                 continue
             sends = client.sends
+            began = client.asked_at
+            is_new = now > began + _COMPLAIN_AFTER and link.complained != began
             if not client.handle_timer(now):
                 self._lose_silent(link, link.silence(client.config.timeout, sends))
-            elif now > client.asked_at + COMPLAIN_AFTER and link.complained != client.asked_at:
-                self._complain(link)
+            elif is_new and (link.trouble or not client.sequence):
+                link.complained = began
+                words = link.silence(_COMPLAIN_AFTER, client.sends)
+                client.statistics.notice(f"{words}; asking for {client.config.timeout:g} s in all")
 
     def pardon(self, seconds: float) -> None:
         """Move all deadlines: this process was stopped, and the agents could not know."""
@@ -214,13 +208,6 @@ class WorldRules:
 
     def _lose_silent(self, link: AgentLink, why: str) -> None:
         raise NotImplementedError
-
-    def _complain(self, link: AgentLink) -> None:
-        client = link.client
-        if link.trouble or not client.sequence:
-            link.complained = client.asked_at
-            words = link.silence(COMPLAIN_AFTER, client.sends)
-            client.statistics.notice(f"{words}; asking for {client.config.timeout:g} s in all")
 
 
 def first_seeds(seed: int, drones: int) -> NDArray[np.uint64]:
@@ -273,8 +260,7 @@ class OneAgent(WorldRules):
         self._message = None
         self._answers = True
         if isinstance(message, Welcome):
-            seed = message.session if message.seed is None else message.seed
-            self._reset_all(first_seeds(seed, self._layout.drones))
+            self._reset_all(first_seeds(message.first_seed, self._layout.drones))
             return False
         if message.orders.tobytes() == self._all_fly:
             self._world.advance(message.actions, None, None, None)
@@ -300,11 +286,6 @@ class OneAgent(WorldRules):
             tuple(world.telemetry.values()),
             now,
         )
-
-    def next_timer(self) -> float:
-        """When `handle_timers` wants to be called; infinite if never."""
-        client = self._client
-        return min(client.resend_at, client.deadline)
 
     def _lose_silent(self, link: AgentLink, why: str) -> None:
         raise PeerSilent(why)
@@ -350,14 +331,11 @@ class SeveralAgents(WorldRules):
 
     def step(self, now: float) -> bool:
         """Step or begin the world if it is time to."""
-        flying = self._who(Participation.FLYING)
-        if not self.episodes:
-            if len(self._who(Participation.READY)) < len(self.links):
-                return False
-            self._begin(first=True)
-            return True
+        flying = self._who("flying")
+        if not self.episodes and len(self._who("ready")) < len(self.links):
+            return False
         if not flying:
-            if not self._who(Participation.WAITING, Participation.READY):
+            if not self._who("waiting", "ready"):
                 return False
             self._begin()
             return True
@@ -378,34 +356,31 @@ class SeveralAgents(WorldRules):
         else:
             self._fly(flying)
 
-    def _begin(self, *, first: bool = False) -> None:
+    def _begin(self) -> None:
         """Begin an episode for all that take part."""
-        joining = self._who(Participation.FLYING, Participation.WAITING, Participation.READY)
-        seeds = self._seeds(joining if first else [link for link in joining if link.command])
+        joining = self._who("flying", "waiting", "ready")
+        seeds = self._seeds(joining)
         self.seed = None if seeds is None else int(seeds[0])
         self._reset_all(seeds)
-        self.episodes += first or self.steps > 0
+        if self.steps or not self.episodes:
+            self.episodes += 1
         self.steps = 0
         # Absences of a start that nobody flew are noted again.
         self.absences = [absence for absence in self.absences if absence.episode < self.episodes]
         for link in self.links:
-            if link not in joining:
+            if link in joining:
+                link.participation = "flying"
+                self._queue(link)
+            else:
                 self._let_go(link)
-        for link in joining:
-            link.participation = Participation.FLYING
-            self._queue(link)
 
-    def _seeds(self, asking: list[AgentLink]) -> NDArray[np.uint64] | None:
+    def _seeds(self, joining: list[AgentLink]) -> NDArray[np.uint64] | None:
         """As the agent of the first drone says, of those that begin; None if it gives none."""
-        if not asking:
-            return None
         drones = self._layout.drones
-        link = asking[0]
-        if link.command is None:  # the first episode: as a simulator of one agent
-            return first_seeds(
-                link.client.hello.session if link.seed is None else link.seed, drones
-            )
-        seeds = link.command.seeds
+        if not self.episodes:  # as a simulator of one agent
+            return first_seeds(joining[0].seed, drones)
+        commands = [link.command for link in joining if link.command]
+        seeds = commands[0].seeds if commands else None
         return None if seeds is None else np.full(drones, seeds[0], np.uint64)
 
     def _fly(self, flying: list[AgentLink]) -> None:
@@ -418,7 +393,7 @@ class SeveralAgents(WorldRules):
         for link in flying:
             assert link.command is not None
             if link.order == RESET:
-                self._lose(link, Participation.WAITING)
+                self._lose(link, "waiting")
             else:
                 staying.append(link)
                 actions[link.rows] = link.command.actions
@@ -432,33 +407,29 @@ class SeveralAgents(WorldRules):
 
     def _close_wrong(self, link: AgentLink, now: float) -> bool:
         """Close the link to an agent whose Command the world cannot follow; whether it did."""
-        wrong = ""
         if link.order not in (FLY, RESET):
             wrong = f"orders: expected to fly or to reset all {len(link.rows)} drones, got others"
-        elif link.order == FLY and self._out(link).all():
+        elif link.order == FLY and self._is_out(link):
             wrong = NO_RESET
-        if wrong:
-            self._dismiss(link, wrong, now)
-        return bool(wrong)
-
-    def _dismiss(self, link: AgentLink, wrong: str, now: float) -> None:
+        else:
+            return False
         link.client.close(wrong, now)
-        self._lose(link, Participation.LEFT, wrong)
+        self._lose(link, "left", wrong)
+        return True
 
     def _lose(self, link: AgentLink, participation: Participation, why: str = "") -> None:
         """The policy of an agent flies its drones for the rest of the episode."""
-        was = link.participation
+        flew = link.participation == "flying" and not self._is_out(link)
         link.participation = participation
-        if participation is not Participation.WAITING:
+        if participation != "waiting":
             link.command = None
-        flew = was is Participation.FLYING and not self._out(link).all()
         if flew:
             self._let_go(link)
-        if all(other.participation is Participation.LEFT for other in self.links):
-            self.reason = why
-        if why and flew:
+        if flew and why:
             notice = f"{link.name} is lost ({why}): {self._when_lost}"
             link.client.statistics.notice(notice)
+        if len(self._who("left")) == len(self.links):
+            self.reason = why
 
     def _let_go(self, link: AgentLink) -> None:
         """Leave its drones to its policy."""
@@ -471,10 +442,9 @@ class SeveralAgents(WorldRules):
         elif self._when_lost == "end":
             self._swarm.retire(mask)
 
-    def _out(self, link: AgentLink) -> Mask:
-        """Which of its drones are out, shape (n,)."""
-        out: Mask = self._swarm.out[link.rows]
-        return out
+    def _is_out(self, link: AgentLink) -> bool:
+        """Whether all of its drones are out."""
+        return bool(self._swarm.out[link.rows].all())
 
     def _who(self, *wanted: Participation) -> list[AgentLink]:
         return [link for link in self.links if link.participation in wanted]
@@ -508,22 +478,22 @@ class SeveralAgents(WorldRules):
 
     def next_timer(self) -> float:
         """When `handle_timers` wants to be called; infinite if never."""
-        flying = self._who(Participation.FLYING)
+        flying = self._who("flying")
         patience = [link.patient_until for link in flying if link.command is None]
         return min([super().next_timer(), *patience])
 
     def handle_timers(self, now: float) -> None:
         """Resend what is due, and lose agents that were silent for too long."""
-        for link in self._who(Participation.FLYING):
+        for link in self._who("flying"):
             if link.command is None and now >= link.patient_until:
-                self._lose(link, Participation.COMING, f"no Command for {self._patience:g} s")
+                self._lose(link, "coming", f"no Command for {self._patience:g} s")
                 link.client.begin_again(now)
         super().handle_timers(now)
 
     def _lose_silent(self, link: AgentLink, why: str) -> None:
         if not self.episodes:
             raise PeerSilent(f"{why}, and the world begins when all have come")
-        self._lose(link, Participation.LEFT, why)
+        self._lose(link, "left", why)
         if self.reason is not None:
             raise PeerSilent(f"{why}, and no other is left")
 
@@ -532,20 +502,17 @@ class SeveralAgents(WorldRules):
         session = link.client.hello.session
         message = link.client.receive(datagram, now)
         if link.client.hello.session != session:  # its answer was Unknown
-            self._lose(link, Participation.COMING, "it was started anew")
-        elif message is not None and link.participation is not Participation.LEFT:
-            self._take(link, message, now)
-
-    def _take(self, link: AgentLink, message: Message, now: float) -> None:
-        """Take in a message that moves the exchange with an agent on."""
-        if isinstance(message, Command):
+            self._lose(link, "coming", "it was started anew")
+        elif link.participation == "left":
+            return
+        elif isinstance(message, Command):
             link.command = message
         elif isinstance(message, Welcome):
-            link.participation = Participation.READY
-            link.seed = message.seed
+            link.participation = "ready"
+            link.seed = message.first_seed
         elif isinstance(message, Refuse | Close):
             if self.episodes:
-                self._lose(link, Participation.LEFT, message.reason or "the agent closed")
+                self._lose(link, "left", message.reason or "the agent closed")
             elif isinstance(message, Refuse):
                 raise Refused(f"{link.name} refused: {message.reason}")
             else:

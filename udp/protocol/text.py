@@ -9,7 +9,6 @@ is written as the float64 of the same value. Telemetry is in the paper's frame.
 
 import re
 from collections.abc import Callable, Iterable
-from itertools import islice
 from math import isfinite, prod
 from typing import Final
 
@@ -23,11 +22,10 @@ from ...models.frames import (
     quaternions_in_world_frame,
 )
 from .errors import DecodeError
-from .layout import Layout
+from .layout import ArrayLayout, Layout
 from .messages import FLY, MAX_UINT64, RESET, Close, Command, State
 
 MAX_LINE: Final = 1200
-_FLOAT: Final = "float32"
 _LONGEST_NUMBER: Final = 24  # bytes: -2.2250738585072014e-308
 _FIXED: Final = 24  # bytes of the longest sequence number and two flags, with their commas
 _WHOLE: Final = re.compile(r"0|[1-9][0-9]{0,19}")
@@ -41,19 +39,17 @@ def is_text(datagram: bytes) -> bool:
 
 def check_layout(layout: Layout) -> None:
     """Raise `InputError` if the messages of a layout cannot be written as text."""
-    what = "text codec"
     arrays = layout.observation
     action = layout.action
     if layout.drones != 1:
-        raise InputError(f"{what}: expected one drone, got {layout.drones}: use binary")
-    flat = [len(array.shape) == 1 and array.dtype == _FLOAT for array in arrays]
-    got = ", ".join(f"{array.dtype} of shape {array.shape}" for array in arrays)
-    expected = "one flat array of float32 as observation"
-    if flat != [True]:
-        raise InputError(f"{what}: expected {expected}, got {got}: use binary")
-    if not (action is None or (len(action.shape) == 1 and action.dtype == _FLOAT)):
-        raise InputError(f"{what}: expected flat actions of float32, got {action}: use binary")
-    state = 1 + arrays[0].shape[0] + telemetry_size(layout)  # the reward is a number too
+        raise InputError(f"text codec: expected one drone, got {layout.drones}: use binary")
+    if [_is_flat(array) for array in arrays] != [True]:
+        got = ", ".join(f"{array.dtype} of shape {array.shape}" for array in arrays)
+        expected = "one flat array of float32 as observation"
+        raise InputError(f"text codec: expected {expected}, got {got}: use binary")
+    if not (action is None or _is_flat(action)):
+        raise InputError(f"text codec: expected flat actions of float32, got {action}: use binary")
+    state = 1 + arrays[0].shape[0] + sum(telemetry_sizes(layout))  # the reward is a number too
     longest = _FIXED + (_LONGEST_NUMBER + 1) * max(state, prod(layout.actions.shape))
     if longest > MAX_LINE:
         raise InputError(
@@ -62,12 +58,12 @@ def check_layout(layout: Layout) -> None:
         )
 
 
-def telemetry_size(layout: Layout) -> int:
-    """Numbers of telemetry in a line."""
-    return sum(_telemetry_sizes(layout))
+def _is_flat(array: ArrayLayout) -> bool:
+    return len(array.shape) == 1 and array.dtype == "float32"
 
 
-def _telemetry_sizes(layout: Layout) -> list[int]:
+def telemetry_sizes(layout: Layout) -> list[int]:
+    """Numbers of each array of telemetry in a line."""
     sizes = []
     for shape, frame in zip(layout.telemetry, layout.frames, strict=True):
         sizes.append(3 if (shape, frame) in _TO_PAPER else prod(shape))
@@ -150,15 +146,15 @@ def decode_state(datagram: bytes, layout: Layout) -> State | Close:
         return Close(session=0, sequence=sequence, reason="the simulator closed")
     observation = layout.observation_slots[0]
     size = observation.shape[1]
-    sizes = _telemetry_sizes(layout)
+    sizes = telemetry_sizes(layout)
     expected = 3 + size + sum(sizes)
     if len(fields) != expected:
         raise DecodeError(
             f"state: expected {expected + 1} fields (sequence, reward, terminated, truncated, "
             f"{size} of observation, {sum(sizes)} of telemetry), got {len(fields) + 1}"
         )
-    numbers = iter(_floats("state: telemetry", fields[3 + size :]))
-    telemetry = [np.array([[*islice(numbers, count)]]) for count in sizes]
+    numbers = np.array([[_floats("state: telemetry", fields[3 + size :])]])
+    telemetry = np.split(numbers, np.cumsum(sizes)[:-1], axis=2) if sizes else []
     shaped = []
     converted = _converted(telemetry, layout, _FROM_PAPER)
     for array, slot in zip(converted, layout.telemetry_slots, strict=True):
@@ -187,14 +183,15 @@ def decode_command(datagram: bytes, layout: Layout, session: int) -> Command | C
     fits = len(fields) <= 2 if reset else len(fields) == size
     if not fits:
         raise DecodeError(f"command: expected {expected}, got {datagram[:80]!r}")
-    seed = [_whole("command: seed", fields[1])] if reset and len(fields) == 2 else None
-    return Command(
+    command = Command(
         session=session,
         sequence=sequence,
         actions=np.zeros(actions.shape, actions.dtype) if reset else _action(fields, layout),
         orders=np.array([RESET if reset else FLY], np.uint8),
-        seeds=None if seed is None else np.array(seed, np.uint64),
     )
+    if reset and len(fields) == 2:
+        command.seeds = np.array([_whole("command: seed", fields[1])], np.uint64)
+    return command
 
 
 def _action(fields: list[str], layout: Layout) -> np.ndarray:

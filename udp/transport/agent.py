@@ -1,7 +1,6 @@
 """The agent's port, and the simulators that have a slot at it."""
 
 import logging
-import math
 import os
 import time
 import weakref
@@ -10,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass, fields
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, TypedDict
+from typing import TYPE_CHECKING, Annotated, Final, TypedDict
 
 import gymnasium as gym
 import numpy as np
@@ -19,12 +18,13 @@ from ...envs import registry
 from ...envs.config import EnvConfig
 from ...envs.spec import EnvSpec, canonical_id, json_values
 from ...models.errors import InputError, shortened
+from ...models.fields import Limits, check_fields
 from ..layouts import layout_of
 from ..protocol import text
 from ..protocol.auth import Key, read_keys
 from ..protocol.client import Address, address_text
 from ..protocol.errors import PeerClosed, PeerSilent
-from ..protocol.fragments import check_largest
+from ..protocol.fragments import LEAST
 from ..protocol.layout import Layout
 from ..protocol.messages import Close, Hello, State
 from ..protocol.server import Server
@@ -64,9 +64,9 @@ class AgentConfig:
     env_id: str | None = None
     options: Mapping[str, object] | None = None
     vehicle_hash: str | None = None
-    connect_timeout: float = 60.0
-    timeout: float = 30.0
-    max_datagram: int | None = None
+    connect_timeout: Annotated[float, Limits(0, unit="s", above=True)] = 60.0
+    timeout: Annotated[float, Limits(0, unit="s", above=True)] = 30.0
+    max_datagram: Annotated[int | None, Limits(LEAST, whole=True)] = None
     key_file: Path | str | None = None
     insecure: bool = False
     record: Path | str | None = None
@@ -78,11 +78,7 @@ class AgentConfig:
     """Of the simulator that joined last; None before the first."""
 
     def __post_init__(self) -> None:
-        for name in ("connect_timeout", "timeout"):
-            seconds = getattr(self, name)
-            if not (math.isfinite(seconds) and seconds > 0):
-                raise InputError(f"{name}: expected seconds > 0, got {seconds}")
-        check_largest(self.max_datagram)
+        check_fields(self)
         if self.env_id is not None:
             self.env_id = canonical_id(self.env_id)
             self._expected_options(self.env_id)

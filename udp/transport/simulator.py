@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
-from math import inf
 from pathlib import Path
 from typing import Any, Final, Literal, cast
 
@@ -12,6 +11,7 @@ import numpy as np
 from ...envs.config import DEFAULT_ENV, EnvConfig
 from ...envs.spec import EnvSpec
 from ...models.errors import InputError
+from ...models.fields import Choice, Limits, check
 from ..layouts import layout_of
 from ..protocol import binary
 from ..protocol.auth import Key, read_keys
@@ -74,12 +74,9 @@ class Simulator(Driver):
         patience: float = 10.0,
         **keywords: Any,
     ) -> None:
-        if codec not in ("binary", "text"):
-            raise InputError(f"codec: expected 'binary' or 'text', got {codec!r}")
-        if not (isinstance(patience, int | float) and 0 < patience < inf):
-            raise InputError(f"patience: expected seconds > 0, got {patience!r}")
-        if when_lost not in POLICIES:
-            raise InputError(f"when_lost: expected one of {', '.join(POLICIES)}, got {when_lost!r}")
+        check("codec", Choice(("binary", "text")), codec)
+        check("patience", Limits(0, unit="s", above=True), patience)
+        check("when_lost", Choice(POLICIES), when_lost)
         by_text = codec == "text"
         if agents is not None and not agents:
             raise InputError("agents: expected one address or more, got none")

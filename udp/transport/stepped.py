@@ -13,6 +13,7 @@ from ...envs.config import EnvConfig
 from ...envs.spaces import action_space, observation_space
 from ...envs.spec import ArraySpec, Discrete, EnvSpec, canonical_id, component_names
 from ...models.errors import InputError
+from ...models.fields import Limits, check
 from ..protocol.layout import MAX_DRONES
 from ..protocol.party import Mask, World
 
@@ -47,12 +48,9 @@ def make_stepped(
             raise InputError(f"env: expected one env without keywords, got {got}")
         return GymnasiumWorld(env, {})
     env = EnvConfig.from_keywords(env, **keywords)
-    count = num_envs
     drones = env.drones
-    if count is None:
-        count = drones
-    if type(count) is not int or not 1 <= count <= MAX_DRONES:
-        raise InputError(f"num_envs: expected 1 to {MAX_DRONES}, got {count!r}")
+    count = drones if num_envs is None else num_envs
+    check("num_envs", Limits(1, MAX_DRONES, whole=True), count)
     if count % drones:
         raise InputError(f"drones: expected a divisor of num_envs = {count}, got {drones}")
     if registry.is_known(env.env_id):
