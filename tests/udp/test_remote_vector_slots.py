@@ -54,7 +54,7 @@ def test_a_late_simulator_waits_until_another_leaves(caplog: pytest.LogCaptureFi
         while time.monotonic() - start < 1:
             remote.step(np.zeros((4, 1)))
             time.sleep(0.02)
-        assert late.simulator.link.state.value == "hello"
+        assert late.simulator.link.state == "hello"
         assert late.simulator.link.statistics.counters["refused"] == 0
         assert "every slot of the agent is taken; waiting for a free one" in caplog.text
         running[0].cut()

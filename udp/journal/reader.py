@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
-from typing import BinaryIO, Final, NamedTuple
+from typing import Any, BinaryIO, Final, NamedTuple
 
 import numpy as np
 import zstandard
@@ -62,9 +62,7 @@ class Session:
     @property
     def seed(self) -> int:
         """Of the reset before the first State."""
-        if self.welcome and self.welcome.seed is not None:
-            return self.welcome.seed
-        return self.hello.session
+        return self.welcome.first_seed if self.welcome else self.hello.session
 
     def __str__(self) -> str:
         return f"session {self.index} (slot {self.slot}, {self.hello.session:016x})"
@@ -135,9 +133,21 @@ class Recording:
             elif isinstance(record, records.Message) and record.channel_id in topics:
                 slot, topic = topics[record.channel_id]
                 session = sessions.get(slot)
-                message, datagram, codec = self._message(topic, record.data, session)
+                datagram = record.data
+                words: dict[str, Any] = {}
+                try:
+                    if topic == "events":
+                        words = json.loads(datagram)
+                        datagram = bytes.fromhex(words["datagram"])
+                    message = binary.decode(datagram, session.layout if session else None)
+                    if isinstance(message, Hello):
+                        layout_of(EnvSpec.from_json(message.spec), message.worlds)
+                except (ValueError, KeyError, TypeError, RecursionError, DecodeError) as error:
+                    wrong = "a message that cannot be read"
+                    raise InputError(f"{self.path}: {wrong}: {error}") from None
                 if isinstance(message, Hello):
                     count += 1
+                    codec = str(words.get("codec", ""))
                     session = sessions[slot] = Session(count, slot, message, codec)
                 elif session is None or message.session != session.hello.session:
                     raise InputError(
@@ -147,24 +157,6 @@ class Recording:
                 if isinstance(message, Welcome):
                     session.welcome = message
                 yield Item(session, record.log_time, message, datagram)
-
-    def _message(
-        self, topic: str, data: bytes, session: Session | None
-    ) -> tuple[Message, bytes, str]:
-        codec = ""
-        try:
-            if topic == "events":
-                words = json.loads(data)
-                data = bytes.fromhex(words["datagram"])
-                codec = str(words.get("codec", ""))
-            message = binary.decode(data, session.layout if session else None)
-            if isinstance(message, Hello):
-                layout_of(EnvSpec.from_json(message.spec), message.worlds)
-            return message, data, codec
-        except (
-            ValueError, KeyError, TypeError, RecursionError, DecodeError
-        ) as error:  # fmt: skip
-            raise InputError(f"{self.path}: a message that cannot be read: {error}") from None
 
     def _records(self) -> Iterator[records.McapRecord]:
         with self.path.open("rb") as file:
@@ -240,8 +232,7 @@ class SessionSummary:
     def take(self, item: Item) -> None:
         """Count a message of the session."""
         self.last = item.time
-        transition = self._walker.take(item.message)
-        if transition:
+        if transition := self._walker.take(item.message):
             self._count(transition)
         match item.message:
             case Close(reason=reason) if reason:
@@ -255,14 +246,13 @@ class SessionSummary:
 
     def _count(self, transition: Transition) -> None:
         state = transition.state
-        resets = transition.resets
         self.states += 1
         stepped = transition.flown & ~self._out
-        self._returns[resets] = 0.0
-        self._returns += np.where(stepped, state.rewards, 0.0)
+        self._returns[transition.resets] = 0.0
+        self._returns[stepped] += state.rewards[stepped]
         self.steps += int(stepped.sum())
         ended = (state.terminated | state.truncated) & stepped
-        self._out = (self._out | ended) & ~resets
+        self._out = (self._out | ended) & ~transition.resets
         self.episodes += int(ended.sum())
         self.returns += float(self._returns[ended].sum())
 

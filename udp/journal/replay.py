@@ -40,9 +40,9 @@ class SessionVerdict:
     """Simulates one session again, and counts what is the same."""
 
     session: Session
-    vehicle: Path | str | None = None
+    vehicle: Path | str | None
     """File or name of the vehicle that was flown; None: the paper's."""
-    backend: Backend = "mujoco"
+    backend: Backend
     """What stepped the drones."""
     same: int = 0
     """States that are the same in every bit."""
@@ -54,9 +54,9 @@ class SessionVerdict:
     """Reason if it cannot be repeated, or not to its end."""
     notes: list[str] = field(default_factory=list)
     """Other things that have changed."""
-    _loop: "Steppable | None" = None
 
     def __post_init__(self) -> None:
+        self._loop: Steppable | None = None
         self._walker = Walker(self.session)
 
     @property
@@ -68,8 +68,10 @@ class SessionVerdict:
         """The verdict in words."""
         differing = f", {self.differing} not" if self.differing else ""
         lines = [f"{self.session}: {self.same} States the same in every bit{differing}"]
-        lines += [f"  first difference: {self.difference}"] if self.difference else []
-        lines += [f"  {self.problem}"] if self.problem else []
+        if self.difference:
+            lines.append(f"  first difference: {self.difference}")
+        if self.problem:
+            lines.append(f"  {self.problem}")
         return lines + [f"  note: {note}" for note in self.notes]
 
     def take(self, item: Item) -> None:
@@ -79,34 +81,40 @@ class SessionVerdict:
             return
         state = transition.state
         try:
-            self._repeat(transition)
+            loop = self._repeat(transition)
         except Exception as error:  # the env's: the recorded run ended with it too
             what = str(error) or type(error).__name__
             self.problem = f"State {state.sequence} cannot be repeated: {what}"
+            return
+        difference = _difference(state, loop)
+        self.difference = self.difference or difference
+        if difference:
+            self.differing += 1
         else:
-            self._compare(state)
+            self.same += 1
 
     def close(self) -> None:
         """Release the drones."""
         if self._loop:
             self._loop.close()
+            self._loop = None
 
-    def _repeat(self, transition: Transition) -> None:
+    def _repeat(self, transition: Transition) -> Steppable:
         """Bring the drones to that State."""
         command = transition.command
         resets = transition.resets
         seeds = transition.seeds
-        if self._loop is None:
-            self._loop = self._make()
+        self._loop = loop = self._loop or self._make()
         if transition.is_gap:
             number = transition.state.sequence - 1
             raise InputError(f"expected Command {number} before it, got none of that number")
         if command is None:
             actions = self.session.layout.actions
             nothing = np.zeros(actions.shape, actions.dtype)
-            self._loop.advance(nothing, resets, seeds, None)
+            loop.advance(nothing, resets, seeds, None)
         else:
-            self._loop.advance(command.actions, resets, seeds, command.frozen)
+            loop.advance(command.actions, resets, seeds, command.frozen)
+        return loop
 
     def _make(self) -> Steppable:
         """The drones. Raises `InputError` unless their arrays are those of the recorded spec."""
@@ -132,14 +140,6 @@ class SessionVerdict:
                 words = f"expected an env of the {name} {was!s:.200}, got one of {now!s:.200}"
                 raise InputError(words)
         return loop
-
-    def _compare(self, recorded: State) -> None:
-        assert self._loop is not None
-        if difference := _difference(recorded, self._loop):
-            self.differing += 1
-            self.difference = self.difference or difference
-        else:
-            self.same += 1
 
 
 class Verification(Recording):
@@ -181,7 +181,7 @@ class Verification(Recording):
                     self.sessions.append(verdict)
                 verdict.take(item)
         finally:
-            for verdict in flying.values():
+            for verdict in self.sessions:
                 verdict.close()
 
     @property
@@ -195,15 +195,15 @@ class Verification(Recording):
         lines += [line for session in self.sessions for line in session.lines()]
         if not self.complete:
             lines.append(f"note: the file is {self.ending}")
-        compared = sum(session.same + session.differing for session in self.sessions)
         if self.identical:
             read = "" if self.complete else " as far as it can be read"
+            compared = sum(session.same for session in self.sessions)
             sessions = count_of(len(self.sessions), "session")
             lines.append(f"identical{read}: {compared} States in {sessions}")
-        elif compared or any(session.problem for session in self.sessions):
-            lines.append("not identical")
-        else:
+        elif all(session.identical for session in self.sessions):
             lines.append("nothing to compare")
+        else:
+            lines.append("not identical")
         return printable(lines)
 
 

@@ -131,8 +131,8 @@ class Assembler:
         """
         if len(fragment) <= _OVERHEAD:
             raise DecodeError(f"fragment: expected a slice of a message, got {len(fragment)} bytes")
-        number, count, asks = _FRAGMENT.unpack_from(fragment, HEADER_SIZE)
-        if not (number < count <= MAX_FRAGMENTS and asks <= 1):
+        number, count, is_asking = _FRAGMENT.unpack_from(fragment, HEADER_SIZE)
+        if not (number < count <= MAX_FRAGMENTS and is_asking <= 1):
             raise DecodeError(
                 f"fragment: expected one of at most {MAX_FRAGMENTS}, got {number} of {count}"
             )

@@ -13,7 +13,7 @@ from ...models.errors import NotCopied
 from ..protocol.client import Address, Client
 from ..protocol.errors import LinkError
 from ..protocol.messages import Command
-from ..protocol.party import NO_RESET, AgentLink, WorldRules
+from ..protocol.party import NO_RESET, WorldRules
 from .sockets import LONGEST_WAIT, PAUSE, Port, log_notices
 from .stepped import Steppable
 
@@ -135,8 +135,7 @@ class Driver(NotCopied):
             except OSError as error:
                 self._note(error, time.monotonic() - before - left)
                 continue
-            link = self._by_address.get(address)
-            if link:
+            if link := self._by_address.get(address):
                 link.trouble = ""
                 rules.receive(link, datagram, time.monotonic())
         return ""
@@ -151,12 +150,10 @@ class Driver(NotCopied):
             if timer == inf:
                 break
             left = timer - time.monotonic()
-            try:
+            with suppress(OSError):  # nothing came, or an earlier datagram found nobody
                 datagram, address = self._receive(max(left, 0.0))
                 if link := self._by_address.get(address):
                     link.client.receive(datagram, time.monotonic())
-            except OSError:  # nothing came, or an earlier datagram found nobody
-                pass
             for each in rules.links:
                 each.client.handle_timer(time.monotonic())
             self._flush()
@@ -172,15 +169,11 @@ class Driver(NotCopied):
             for datagram in outgoing:
                 try:
                     self._port.send(datagram, link.address)
-                except OSError as error:  # as good as lost
-                    self._note_unsent(link, error)
+                except OSError as error:  # a full buffer or no network: as good as lost
+                    client.statistics.counters["unsent"] += 1
+                    link.trouble = _words(error, "sending")
             if client.statistics.notices:
                 log_notices(client.statistics)
-
-    def _note_unsent(self, link: AgentLink, error: OSError) -> None:
-        """A full buffer or a network that is down: as good as lost."""
-        link.client.statistics.counters["unsent"] += 1
-        link.trouble = _words(error, "sending")
 
     def _note(self, error: OSError, pause: float) -> None:
         """Nothing came, and the wait was too long by `pause`, s. Raises `OSError` if closed."""

@@ -1,7 +1,7 @@
 """What a simulator steps: the loop of a registered task, or another Gymnasium env."""
 
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any, Protocol, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
@@ -97,20 +97,20 @@ class GymnasiumWorld:
         is_frozen = frozen is not None and frozen.all()
         if self._is_waiting and not (is_reset or is_frozen):
             raise gym.error.ResetNeeded("step: expected a reset first")
-        for array in (self.rewards, self.terminated, self.truncated):
-            array[:] = 0
+        reward: SupportsFloat = 0.0
+        terminated = truncated = False
         if is_reset:
             observation, info = self._env.reset(seed=None if seeds is None else int(seeds[0]))
-        elif is_frozen:
-            return
-        else:
+            self._keep(observation, info)
+            self._is_waiting = False
+        elif not is_frozen:
             action = int(actions[0]) if isinstance(self.spec.action, Discrete) else actions[0]
-            observation, reward, self.terminated[:], self.truncated[:], info = self._env.step(
-                action
-            )
-            self.rewards[:] = float(reward)
-        self._keep(observation, info)
-        self._is_waiting = bool(self.terminated[0] or self.truncated[0])
+            observation, reward, terminated, truncated, info = self._env.step(action)
+            self._keep(observation, info)
+            self._is_waiting = bool(terminated or truncated)
+        self.rewards[:] = float(reward)
+        self.terminated[:] = terminated
+        self.truncated[:] = truncated
 
     def close(self) -> None:
         self._env.close()
