@@ -61,7 +61,7 @@ def test_a_late_simulator_waits_until_another_leaves(caplog: pytest.LogCaptureFi
         remote._agent.config.timeout = 0.3
         *_, truncated, info = remote.step(np.zeros((4, 1)))
         assert truncated.sum() == 2
-        assert late.simulator.link.state.value == "waiting"
+        assert late.simulator.link.state == "waiting"
         reason = info["simulator_lost"][truncated][0]
         assert reason.startswith("no datagram from the simulator at 127.0.0.1:")
         remote.step(np.zeros((4, 1)))
