@@ -18,7 +18,7 @@ Imports the standard library alone.
 import inspect
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import KW_ONLY, MISSING, dataclass, fields
+from dataclasses import KW_ONLY, MISSING, dataclass, field, fields
 from numbers import Real
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Protocol, TypeVar, Union, get_args, get_origin
@@ -60,26 +60,20 @@ class Limits:
         kind = "whole number" if self.whole else "number"
         if self.count == 1:
             numbers = f"a {kind}"
-        elif self.count is None:
-            numbers = f"{self.least} or more {kind}s" if self.least else f"{kind}s"
-        else:
+        elif self.count:
             numbers = f"{self.count} {kind}s"
-        words = [numbers, self._range()]
-        if self.unit not in ("", "1"):
-            words.append(self.unit if self._is_bounded else f"in {self.unit}")
-        return " ".join(filter(None, words))
-
-    @property
-    def _is_bounded(self) -> bool:
-        return not (math.isinf(self.low) and math.isinf(self.high))
+        else:
+            numbers = f"{self.least} or more {kind}s" if self.least else f"{kind}s"
+        unit = "" if self.unit == "1" else self.unit
+        if math.isinf(self.low) and math.isinf(self.high):
+            unit = unit and f"in {unit}"
+        return " ".join(filter(None, (numbers, self._range(), unit)))
 
     def _range(self) -> str:
         low = _digits(self.low)
         high = _digits(self.high)
-        if not self._is_bounded:
-            return ""
         if math.isinf(self.low):
-            return f"of at most {high}"
+            return "" if math.isinf(self.high) else f"of at most {high}"
         if math.isinf(self.high):
             return f"above {low}" if self.above else f"of at least {low}"
         return f"above {low}, at most {high}" if self.above else f"from {low} to {high}"
@@ -87,9 +81,8 @@ class Limits:
     def read(self, value: Any) -> float | tuple[float, ...]:
         if self.count == 1:
             return self._number(value)
-        numbers = tuple(self._number(one) for one in value)
-        right = len(numbers) >= self.least if self.count is None else len(numbers) == self.count
-        if not right:
+        numbers = tuple(map(self._number, value))
+        if len(numbers) < self.least or self.count not in (None, len(numbers)):
             raise ValueError
         return numbers
 
@@ -119,7 +112,7 @@ class NumberOrPair:
     def read(self, value: Any) -> float | tuple[float, ...]:
         if not isinstance(value, tuple | list):
             return self.limits._number(value)
-        low, high = (self.limits._number(one) for one in value)
+        low, high = map(self.limits._number, value)
         if low > high:
             raise ValueError
         return low, high
@@ -163,9 +156,7 @@ class Text:
     def read(self, value: object) -> str:
         if not isinstance(value, str) or not (value or self.empty):
             raise ValueError
-        if self.longest is None:
-            return value
-        if len(value) > self.longest or not value.isprintable():
+        if self.longest is not None and not (len(value) <= self.longest and value.isprintable()):
             raise ValueError
         if self.identifier and not value.isidentifier():
             raise ValueError
@@ -249,23 +240,29 @@ def check_names(
             raise error(f"{where}: expected some of {', '.join(names)}, got {shortened(name)}")
 
 
+def optional(low: float, high: float, unit: str, count: int | None = 1) -> Any:
+    """A field of a dataclass that is None, or has a number or several within limits."""
+    rule = OrNone(Limits(low, high, unit, count=count))
+    return field(default=None, metadata={"rule": rule})
+
+
 def rules_of(kind: type) -> Mapping[str, Rule]:
     """The rules of a dataclass's fields, by name.
 
-    They are those of annotations: `Annotated` with a rule, `Literal`, and the types bool, int,
-    float and str. A class that gives a field another default keeps the rule of its base.
+    They are those of `optional` and of annotations: `Annotated` with a rule, `Literal`, and the
+    types bool, int, float and str. A class that gives a field another default keeps the rule of its
+    base.
     """
     if kind in _RULES:
         return _RULES[kind]
-    own = {one.name for one in fields(kind)}
-    rules: dict[str, Rule] = {}
+    rules: dict[str, Rule | None] = {}
     for base in reversed(kind.__mro__):
         for name, hint in inspect.get_annotations(base, eval_str=True).items():
-            rule = _rule_of(hint)
-            if name in own and rule is not None and not (name in rules and hint in _PLAIN):
-                rules[name] = rule
-    _RULES[kind] = rules
-    return rules
+            if hint not in _PLAIN or not rules.get(name):
+                rules[name] = _rule_of(hint)
+    found = {one.name: one.metadata.get("rule", rules[one.name]) for one in fields(kind)}
+    _RULES[kind] = {name: rule for name, rule in found.items() if rule is not None}
+    return _RULES[kind]
 
 
 _RULES: dict[type, Mapping[str, Rule]] = {}
@@ -298,8 +295,8 @@ def _rule_of(hint: object) -> Rule | None:
         return OrNone(rule) if rule else None
     if get_origin(hint) is Annotated:
         rules = [one for one in arguments[1:] if hasattr(one, "expected")]
-        optional = NoneType in get_args(arguments[0])
-        return OrNone(rules[0]) if rules and optional else next(iter(rules), None)
+        may_be_none = NoneType in get_args(arguments[0])
+        return OrNone(rules[0]) if rules and may_be_none else next(iter(rules), None)
     if get_origin(hint) is Literal and all(isinstance(word, str) for word in arguments):
         return Choice(arguments)
     return _PLAIN.get(hint)

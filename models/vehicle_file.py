@@ -6,8 +6,8 @@ Each table is a dataclass whose fields are the keys. Body frame: x forward, y le
 import json
 import math
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, TypeVar
 
@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .cameras import FOVY, MAX_LETTERS, OUTPUTS, Camera, Optics, steps_of
-from .coefficients import COEFFICIENTS, Battery, Drag, Rotors, Sensors
+from .coefficients import COEFFICIENTS, Battery, Drag, Rotors, Sensors, as_tuple
 from .errors import InputError, shortened
-from .fields import Limits, Text, check, check_names, limits_of, read_table
+from .fields import Limits, Text, check, limits_of, optional, read_table
 
 T = TypeVar("T")
 _Vector = tuple[float, float, float]
@@ -78,11 +78,11 @@ class Cylinder:
 class Body:
     """Mass and inertia, or parts that have them; and the hub."""
 
-    mass: Annotated[float | None, Limits(1e-6, 1e6, "kg")] = None
-    inertia: Annotated[_Numbers | None, Limits(-1e9, 1e9, "kg m²", count=None)] = None
+    mass: float | None = optional(1e-6, 1e6, "kg")
+    inertia: tuple[float, ...] | None = optional(-1e9, 1e9, "kg m²", count=None)
     center_of_mass: _Place = (0.0, 0.0, 0.0)
-    size: Annotated[_Vector | None, Limits(1e-4, 100.0, "m", count=3)] = None
-    ground_clearance: Annotated[float | None, Limits(1e-4, 100.0, "m")] = None
+    size: tuple[float, float, float] | None = optional(1e-4, 100.0, "m", count=3)
+    ground_clearance: float | None = optional(1e-4, 100.0, "m")
     parts: tuple[Box | Cylinder, ...] = ()
 
 
@@ -102,35 +102,29 @@ class PlacedRotor:
     body: str | None = None
     site: str | None = None
 
-    @property
-    def places(self) -> list[str]:
-        """Which of link, body and site the table has."""
-        return [name for name in ("link", "body", "site") if getattr(self, name) is not None]
-
 
 @dataclass(frozen=True, kw_only=True)
 class RotorTable(Rotors):
     """Rotors, all alike, in a frame or in a list."""
 
     frame: Literal["plus", "cross", "hexa", "octo"] | None = None
-    arm: Annotated[float | None, Limits(1e-3, 100.0, "m")] = None
-    height: Annotated[float | None, Limits(-100.0, 100.0, "m")] = None
-    thrust: Annotated[_Numbers | None, Limits(-1e6, 1e6, "N", count=2)] = None
-    speed: Annotated[_Numbers | None, Limits(0.0, 1e6, "rad/s", count=2)] = None
-    reaction: Annotated[float | None, Limits(0.0, 10.0, "N m/N")] = None
-    torque_coefficient: Annotated[float | None, Limits(0.0, 1.0, "N m s²/rad²")] = None
+    arm: float | None = optional(1e-3, 100.0, "m")
+    height: float | None = optional(-100.0, 100.0, "m")
+    thrust: tuple[float, float] | None = optional(-1e6, 1e6, "N", count=2)
+    speed: tuple[float, float] | None = optional(0.0, 1e6, "rad/s", count=2)
+    reaction: float | None = optional(0.0, 10.0, "N m/N")
+    torque_coefficient: float | None = optional(0.0, 1.0, "N m s²/rad²")
     list: tuple[PlacedRotor, ...] = ()
 
     @property
     def limits(self) -> tuple[float, float]:
         """Least and largest thrust of a rotor, N."""
-        numbers = self.thrust
-        if numbers is None:
-            assert self.speed is not None
-            assert self.thrust_coefficient is not None
-            numbers = tuple(self.thrust_coefficient * speed**2 for speed in self.speed)
-        low, high = numbers
-        return low, high
+        if self.thrust is not None:
+            return self.thrust
+        assert self.speed
+        assert self.thrust_coefficient
+        low, high = self.speed
+        return self.thrust_coefficient * low**2, self.thrust_coefficient * high**2
 
     @property
     def torque(self) -> float:
@@ -159,9 +153,9 @@ class _CameraTable(Optics):
 class _RealFlights:
     """Mean errors of its simulation after half a second of recorded flights."""
 
-    position: Annotated[float | None, Limits(0.0, 1e4, "m")] = None
-    velocity: Annotated[float | None, Limits(0.0, 1e4, "m/s")] = None
-    attitude: Annotated[float | None, Limits(0.0, 3.15, "rad")] = None
+    position: float | None = optional(0.0, 1e4, "m")
+    velocity: float | None = optional(0.0, 1e4, "m/s")
+    attitude: float | None = optional(0.0, 3.15, "rad")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,12 +164,28 @@ class _Model:
 
 
 @dataclass(frozen=True, kw_only=True)
+class _Sourced:
+    """A number with its provenance."""
+
+    value: object = None
+    source: str = ""
+    why: str = ""
+    others: object = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Other:
+    value: object = None
+    source: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
 class _File:
     """A whole file, its tables not read yet."""
 
     name: Annotated[str, Text(100)]
-    timestep: Annotated[float | None, Limits(1e-5, 1.0, "s")] = None
-    gravity: Annotated[float | None, Limits(1e-3, 1e3, "m/s²")] = None
+    timestep: float | None = optional(1e-5, 1.0, "s")
+    gravity: float | None = optional(1e-3, 1e3, "m/s²")
     model: object = None
     body: object = None
     rotors: object = None
@@ -246,12 +256,8 @@ class VehicleFile:
     @property
     def coefficients(self) -> dict[str, _Numbers]:
         """Those of effects and sensors, by "group.name"."""
-        found = {}
-        for number in self.numbers:
-            if number.name in COEFFICIENTS:
-                value = number.value
-                found[number.name] = value if isinstance(value, tuple) else (value,)
-        return found
+        ours = [number for number in self.numbers if number.name in COEFFICIENTS]
+        return {number.name: as_tuple(number.value) for number in ours}
 
     @property
     def real_flights(self) -> str:
@@ -281,13 +287,12 @@ def read_vehicle_file(path: Path) -> VehicleFile:
 def _read(path: Path, tree: dict[str, object]) -> VehicleFile:
     numbers: list[Number] = []
     name = path.parent.name if path.stem == "vehicle" else path.stem
-    file = _table(numbers, _File, {"name": name, **tree}, "vehicle")
+    tree = {"name": name, **tree}
+    file = _table(numbers, _File, tree, "vehicle")
     model = None if file.model is None else _model(path, file.model)
     body = _body(numbers, file.body, model)
     rotors = _rotors(numbers, file.rotors, model)
-    cameras = [
-        _camera(numbers, one, f"cameras[{i}]") for i, one in _listed(file.cameras, "cameras")
-    ]
+    cameras = [_camera(numbers, one, where) for where, one in _listed(file.cameras, "cameras")]
     _check_distinct("cameras", [camera.name for camera in cameras])
     for group, kind in _GROUPS.items():
         _table(numbers, kind, tree.get(group, {}), group)
@@ -295,7 +300,7 @@ def _read(path: Path, tree: dict[str, object]) -> VehicleFile:
     return VehicleFile(
         name=file.name,
         numbers=tuple(numbers),
-        content=json.dumps(_plain(physical | {"name": file.name}), sort_keys=True),
+        content=json.dumps(_plain(physical), sort_keys=True),
         model=model,
         timestep=file.timestep,
         gravity=file.gravity,
@@ -315,9 +320,8 @@ _GROUPS: Final[Mapping[str, type]] = {
 
 def _table(numbers: list[Number], kind: type[T], given: object, where: str) -> T:
     """A table as its dataclass; its numbers are added to those of the file."""
-    table = dict(_mapping(given, where))
-    source = _text(table, "source", where)
-    table.pop("source", None)
+    table = _mapping(given, where)
+    source = check(f"{where}.source", Text(empty=True), table.pop("source", ""))
     prefix = "" if where == "vehicle" else f"{where}."
     for name, limits in limits_of(kind).items():
         if name in table:
@@ -329,50 +333,44 @@ def _table(numbers: list[Number], kind: type[T], given: object, where: str) -> T
 
 def _number(name: str, limits: Limits, given: object, source: str) -> Number:
     """A number that is given plainly or with its provenance."""
-    if not isinstance(given, dict):
-        return Number(name=name, value=check(name, limits, given), unit=limits.unit, source=source)
-    check_names(given, ("value", "source", "why", "others"), name)
+    table = given if isinstance(given, dict) else {"value": given}
+    sourced = read_table(_Sourced, table, name)
     others = []
-    for i, one in _listed(given.get("others", []), f"{name}.others"):
-        where = f"{name}.others[{i}]"
-        other = _mapping(one, where)
-        check_names(other, ("value", "source"), where)
-        others.append((check(where, limits, other.get("value")), _text(other, "source", where)))
+    for where, one in _listed(sourced.others, f"{name}.others"):
+        other = read_table(_Other, _mapping(one, where), where)
+        others.append((check(where, limits, other.value), other.source))
     return Number(
         name=name,
-        value=check(name, limits, given.get("value")),
+        value=check(name, limits, sourced.value),
         unit=limits.unit,
-        source=_text(given, "source", name) or source,
-        why=_text(given, "why", name),
+        source=sourced.source or source,
+        why=sourced.why,
         others=tuple(others),
     )
 
 
-def _mapping(given: object, where: str) -> Mapping[str, object]:
+def _mapping(given: object, where: str) -> dict[str, Any]:
+    """A copy of a table."""
     if not isinstance(given, Mapping):
         raise InputError(f"{where}: expected a table, got {shortened(given)}")
-    return given
+    return dict(given)
 
 
-def _text(table: Mapping[str, object], key: str, where: str) -> str:
-    return str(check(f"{where}.{key}", Text(empty=True), table.get(key, "")))
-
-
-def _listed(given: object, where: str) -> Iterable[tuple[int, object]]:
-    """Tables of a list, and their numbers from 1."""
+def _listed(given: object, where: str) -> list[tuple[str, Any]]:
+    """Tables of a list, each with its name for errors."""
     if not isinstance(given, list | tuple):
         raise InputError(f"{where}: expected a list of tables, got {shortened(given)}")
-    return enumerate(given, 1)
+    return [(f"{where}[{i}]", one) for i, one in enumerate(given, 1)]
 
 
 def _model(path: Path, given: object) -> Path:
-    file = _table([], _Model, given, "model").file
-    if Path(file).suffix.lower() not in (".urdf", ".xml"):
+    file = read_table(_Model, _mapping(given, "model"), "model").file
+    model = path.parent / file
+    if model.suffix.lower() not in (".urdf", ".xml"):
         raise InputError(
             "model.file: expected a URDF file (.urdf) or an MJCF file (.xml), "
             f"got {shortened(file)}"
         )
-    model = path.parent / file
     if not model.is_file():
         raise InputError(f"model.file: expected a file that is there, got {shortened(file)}")
     return model
@@ -385,11 +383,10 @@ def _body(numbers: list[Number], given: object, model: Path | None) -> Body:
         return Body()
     if given is None:
         raise InputError("vehicle: expected a table [body], or [model] with a file, got neither")
-    table = dict(_mapping(given, "body"))
+    table = _mapping(given, "body")
     of_parts: list[Number] = []
-    if "parts" in table:
-        parts = _listed(table["parts"], "body.parts")
-        table["parts"] = tuple(_part(of_parts, one, f"body.parts[{i}]") for i, one in parts)
+    parts = _listed(table.get("parts", ()), "body.parts")
+    table["parts"] = tuple(_part(of_parts, one, where) for where, one in parts)
     body = _table(numbers, Body, table, "body")
     numbers += of_parts
     own = [key for key in ("mass", "inertia") if key in table]
@@ -417,41 +414,31 @@ def _rotors(numbers: list[Number], given: object, model: Path | None) -> RotorTa
     mjcf = model is not None and model.suffix.lower() == ".xml"
     if given is None and not mjcf:
         raise InputError("vehicle: expected a table [rotors], got none")
-    table = dict(_mapping({} if given is None else given, "rotors"))
+    table = _mapping({} if given is None else given, "rotors")
     of_list: list[Number] = []
-    if "list" in table:
-        listed = _listed(table["list"], "rotors.list")
-        table["list"] = tuple(_rotor(of_list, one, i, model) for i, one in listed)
-    rotors = _table(numbers, RotorTable, table, "rotors")
+    listed = enumerate(_listed(table.pop("list", ()), "rotors.list"), 1)
+    placed = tuple(_rotor(of_list, one, where, i, model) for i, (where, one) in listed)
+    rotors = _table(numbers, RotorTable, table | {"list": placed}, "rotors")
     numbers += of_list
-    if mjcf and not rotors.list and rotors.frame is None:  # those of the file
-        for key in table:
+    if mjcf and not placed and rotors.frame is None:  # those of the file
+        for key, value in table.items():
             if f"rotors.{key}" not in COEFFICIENTS and key != "source":
-                got = shortened(table[key])
+                got = shortened(value)
                 raise InputError(
                     f"rotors: expected no {key} for rotors of the model's file, got {got}"
                 )
         return rotors
     _check_thrust(rotors)
-    if rotors.frame is None or model is not None:
-        return _check_list(rotors, model)
-    if rotors.list:
-        raise InputError("rotors: expected a frame or a list, got both")
-    if rotors.arm is None:
-        raise InputError(f"rotors: expected arm of the frame {rotors.frame!r}, got none")
-    return replace(rotors, list=frame_rotors(rotors.frame, rotors.arm, rotors.height or 0.0))
-
-
-def _check_list(rotors: RotorTable, model: Path | None) -> RotorTable:
-    if rotors.frame is not None or not rotors.list:
+    if rotors.frame is not None and model is None:
+        return _framed(rotors, rotors.frame)
+    if rotors.frame is not None or not placed:
         wanted = "a frame or a list" if model is None else "a list"
         got = "neither" if rotors.frame is None else f"frame = {rotors.frame!r}"
         raise InputError(f"rotors: expected {wanted}, got {got}")
     for key in ("arm", "height"):
-        value = getattr(rotors, key)
-        if value is not None:
-            raise InputError(f"rotors: expected no {key} with a list, got {value:g}")
-    _check_distinct("rotors.list", [rotor.name for rotor in rotors.list])
+        if key in table:
+            raise InputError(f"rotors: expected no {key} with a list, got {shortened(table[key])}")
+    _check_distinct("rotors.list", [rotor.name for rotor in placed])
     return rotors
 
 
@@ -473,11 +460,12 @@ def _check_thrust(rotors: RotorTable) -> None:
         )
 
 
-def _rotor(numbers: list[Number], given: object, number: int, model: Path | None) -> PlacedRotor:
-    where = f"rotors.list[{number}]"
+def _rotor(
+    numbers: list[Number], given: object, where: str, number: int, model: Path | None
+) -> PlacedRotor:
     table = {"name": f"rotor{number}", **_mapping(given, where)}
     rotor = _table(numbers, PlacedRotor, table, where)
-    places = rotor.places
+    places = [name for name in ("link", "body", "site") if getattr(rotor, name) is not None]
     if model is None:
         if places:
             raise InputError(f"{where}: expected a position, got {places[0]}")
@@ -494,23 +482,32 @@ def _rotor(numbers: list[Number], given: object, number: int, model: Path | None
     return rotor
 
 
-def frame_rotors(frame: str, arm: float, height: float = 0.0) -> tuple[PlacedRotor, ...]:
-    """Rotors of a frame of `FRAMES`, `arm` from the body's origin and `height` above it, m."""
+def _framed(rotors: RotorTable, frame: str) -> RotorTable:
+    """Rotors of a frame of `FRAMES`."""
+    if rotors.list:
+        raise InputError("rotors: expected a frame or a list, got both")
+    if rotors.arm is None:
+        raise InputError(f"rotors: expected arm of the frame {frame!r}, got none")
     count, first = FRAMES[frame]
-    rotors = []
+    placed = []
     for i in range(count):
         angle = first - 2 * math.pi * i / count
         # 15 digits after the point: a rotor on an axis is exactly there.
-        x = round(arm * math.cos(angle), 15) + 0.0
-        y = round(arm * math.sin(angle), 15) + 0.0
+        x = round(rotors.arm * math.cos(angle), 15) + 0.0
+        y = round(rotors.arm * math.sin(angle), 15) + 0.0
         turn: Literal["cw", "ccw"] = "ccw" if i % 2 else "cw"
-        rotors.append(PlacedRotor(name=f"rotor{i + 1}", position=(x, y, height), turn=turn))
-    return tuple(rotors)
+        position = (x, y, rotors.height or 0.0)
+        placed.append(PlacedRotor(name=f"rotor{i + 1}", position=position, turn=turn))
+    return replace(rotors, list=tuple(placed))
 
 
 def _camera(numbers: list[Number], given: object, where: str) -> Camera:
     table = _table(numbers, _CameraTable, given, where)
-    _check_kinds(f"{where}.kinds", table.kinds)
+    kinds = table.kinds
+    right = isinstance(kinds, Sequence) and kinds and all(kind in [*OUTPUTS] for kind in kinds)
+    if not right:
+        words = ", ".join(OUTPUTS)
+        raise InputError(f"{where}.kinds: expected some of {words}, got {shortened(kinds)}")
     look = table.look
     up = table.up
     if up is None:
@@ -519,30 +516,22 @@ def _camera(numbers: list[Number], given: object, where: str) -> Camera:
     across = math.hypot(*np.cross(look, up))
     if not across > 1e-6 * math.hypot(*look) * math.hypot(*up):
         raise InputError(f"{where}.up: expected another direction than look, got {list(up)}")
-    width, height = table.resolution
-    if (width, height) == (1, 1):
+    if table.resolution == (1, 1):
         raise InputError(f"{where}.resolution: expected more than one pixel, got one")
+    width, height = table.resolution
     return Camera(
         name=table.name,
         width=width,
         height=height,
         fovy=table.fovy,
-        kinds=tuple(kind for kind in OUTPUTS if kind in table.kinds),
+        kinds=tuple(kind for kind in OUTPUTS if kind in kinds),
         every=steps_of(where, table.rate),
         carried=not table.stands,
         position=table.position,
         look=look,
         up=up,
-        optics=Optics(**{one.name: getattr(table, one.name) for one in fields(Optics)}),
+        optics=Optics(distortion=table.distortion, exposure=table.exposure, noise=table.noise),
     )
-
-
-def _check_kinds(name: str, kinds: object) -> None:
-    right = (
-        isinstance(kinds, Sequence) and bool(kinds) and all(kind in [*OUTPUTS] for kind in kinds)
-    )
-    if not right:
-        raise InputError(f"{name}: expected some of {', '.join(OUTPUTS)}, got {shortened(kinds)}")
 
 
 def _check_distinct(where: str, names: Sequence[str]) -> None:
