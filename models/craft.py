@@ -36,10 +36,21 @@ def craft_spec(file: VehicleFile, base: mujoco.MjSpec | None = None) -> mujoco.M
     """The vehicle alone, without ground; `base` is the spec of its model, changed in place."""
     spec = base or mujoco.MjSpec()
     spec.modelname = file.name
+    urdf = file.model is not None and file.model.suffix.lower() == ".urdf"
+    if urdf or file.model is None:
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
+        spec.option.timestep = DEFAULT_TIMESTEP
+        spec.option.gravity = (0.0, 0.0, -DEFAULT_GRAVITY)
+    if file.timestep:
+        spec.option.timestep = file.timestep
+    if file.gravity:
+        spec.option.gravity = (0.0, 0.0, -file.gravity)
     if file.model is None:
         _build(spec, file)
     else:
-        _complete(spec, file, file.model)
+        if urdf:
+            _free_root(spec, file.model.parent)
+        _add_rotors(spec, file)
     for name, values in file.coefficients.items():
         numeric = spec.numeric(PREFIX + name) or spec.add_numeric(name=PREFIX + name)
         numeric.size = len(values)
@@ -49,12 +60,6 @@ def craft_spec(file: VehicleFile, base: mujoco.MjSpec | None = None) -> mujoco.M
     for camera in file.cameras if crafts else ():
         place_camera(spec, crafts[0] if camera.carried else spec.worldbody, camera)
     return spec
-
-
-def _set_options(spec: mujoco.MjSpec, file: VehicleFile) -> None:
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
-    spec.option.timestep = file.timestep or DEFAULT_TIMESTEP
-    spec.option.gravity = (0.0, 0.0, -(file.gravity or DEFAULT_GRAVITY))
 
 
 def _add_actuator(
@@ -111,7 +116,6 @@ def _build(spec: mujoco.MjSpec, file: VehicleFile) -> None:
 
     Missing lengths are those of quad.xml, in the proportion of the spans.
     """
-    _set_options(spec, file)
     spec.compiler.degree = False
     rotors = [(rotor, rotor.position or (0.0, 0.0, 0.0)) for rotor in file.rotors.list]
     reach = max(math.hypot(*place) for _, place in rotors)
@@ -233,22 +237,19 @@ def _nearest(places: Sequence[Vector], reach: float) -> float:
 # ---- from a model's file
 
 
-def _complete(spec: mujoco.MjSpec, file: VehicleFile, model: Path) -> None:
-    """Add to the spec of a model's file what the TOML file says."""
-    urdf = model.suffix.lower() == ".urdf"
-    if urdf:
-        _find_meshes(spec, model.parent)
-        spec.compiler.fusestatic = False  # it would fuse the root with the world
-        root = spec.worldbody.first_body()
-        if root is None:
-            raise InputError("model.file: expected a URDF file with links, got none")
-        if not list(root.joints):
-            root.add_freejoint()
-        _set_options(spec, file)
-    if file.timestep:
-        spec.option.timestep = file.timestep
-    if file.gravity:
-        spec.option.gravity = (0.0, 0.0, -file.gravity)
+def _free_root(spec: mujoco.MjSpec, folder: Path) -> None:
+    """Find the meshes of a URDF file, and free its first link."""
+    _find_meshes(spec, folder)
+    spec.compiler.fusestatic = False  # it would fuse the root with the world
+    root = spec.worldbody.first_body()
+    if root is None:
+        raise InputError("model.file: expected a URDF file with links, got none")
+    if not list(root.joints):
+        root.add_freejoint()
+
+
+def _add_rotors(spec: mujoco.MjSpec, file: VehicleFile) -> None:
+    """Add the rotors of the list to a model without actuators."""
     rotors = file.rotors.list
     if rotors and list(spec.actuators):
         raise InputError(
@@ -281,15 +282,13 @@ def _rotor_site(
     spec: mujoco.MjSpec, file: VehicleFile, rotor: PlacedRotor, where: str
 ) -> mujoco.MjsSite:
     """The site of a rotor: one of the model, or a new one on one of its bodies."""
-    kind = "site" if rotor.site is not None else "body"
+    kind = "body" if rotor.site is None else "site"
     name = rotor.site or rotor.link or rotor.body
-    known = [one.name for one in (spec.sites if kind == "site" else spec.bodies)]
-    known = [one for one in known if one != "world"]
-    if name not in known:
-        raise InputError(
-            f"{where}: expected a {kind} of the model's file: {', '.join(known)}, got {name!r}"
-        )
-    if kind == "site":
+    known = [one.name for one in (spec.bodies if rotor.site is None else spec.sites)]
+    if name not in known or name == "world":
+        words = ", ".join(one for one in known if one != "world")
+        raise InputError(f"{where}: expected a {kind} of the model's file: {words}, got {name!r}")
+    if rotor.site is not None:
         return spec.site(name)
     body = spec.body(name)
     for joint in list(body.joints):  # a propeller that turns is welded on
