@@ -7,10 +7,11 @@ from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 from typing import Final
-from xml.etree import ElementTree
 
 from .errors import InputError, shortened
+from .files import find_in_package
 from .library import find_vehicle
+from .mjcf import read_xml
 from .vehicle_file import read_vehicle_file
 
 MAX_BYTES: Final = 1 << 26
@@ -76,6 +77,7 @@ def _checked(given: object) -> Bundle:
 
 
 def _is_file(pair: object) -> bool:
+    """Whether it is base64 behind a relative path that stays in its folder, on every system."""
     if not isinstance(pair, list | tuple) or len(pair) != 2:
         return False
     name, content = pair
@@ -83,14 +85,10 @@ def _is_file(pair: object) -> bool:
         base64.b64decode(content, validate=True)
     except (TypeError, ValueError):
         return False
-    return isinstance(name, str) and _is_inside(name)
-
-
-def _is_inside(name: str) -> bool:
-    """Whether a relative path stays in its folder, on every system."""
+    if not isinstance(name, str) or {"\\", ":", "\0"} & set(name):
+        return False
     path = PurePosixPath(name)
-    plain = not {"\\", ":", "\0"} & set(name)
-    return plain and bool(path.parts) and not path.is_absolute() and ".." not in path.parts
+    return bool(path.parts) and not path.is_absolute() and ".." not in path.parts
 
 
 def _files_of(file: Path) -> list[Path]:
@@ -108,12 +106,12 @@ def _with_assets(model: Path) -> list[Path]:
     """
     folder = model.parent
     parts = [model]
-    elements = _elements(model)
+    elements = list(read_xml(model).iter())
     for element in elements:
         inner = _normal(folder / element.get("file", ""))
         if element.tag in ("include", "model") and inner.is_file() and inner not in parts:
             parts.append(inner)
-            elements += _elements(inner)
+            elements += read_xml(inner).iter()
     folders = [folder]
     for element in elements:
         folders += [folder / element.get(name, "") for name in _DIRECTORIES]
@@ -127,23 +125,13 @@ def _with_assets(model: Path) -> list[Path]:
 def _found(text: str, folders: Sequence[Path]) -> list[Path]:
     """The file of an asset, by the rules of MuJoCo and of URDF's packages; or none."""
     if text.startswith("package://"):
-        inside = Path(text.removeprefix("package://"))
-        ways = [inside, Path(*inside.parts[1:])]
-        places = [folders[0], *folders[0].parents]
-    else:
-        ways = [Path(text), Path(Path(text).name)]  # MuJoCo strips the folders of a URDF file
-        places = list(folders)
-    candidates = [_normal(place / way) for place in places for way in ways]
+        file = find_in_package(text, folders[0])
+        return [] if file is None else [_normal(file)]
+    ways = [text, Path(text).name]  # MuJoCo strips the folders of a URDF file
+    candidates = [_normal(folder / way) for folder in folders for way in ways]
     return [path for path in candidates if path.is_file()][:1]
 
 
 def _normal(path: Path) -> Path:
     """Without `..`, and with links as they are: the files keep their places to each other."""
     return Path(os.path.normpath(path))
-
-
-def _elements(file: Path) -> list[ElementTree.Element]:
-    try:
-        return list(ElementTree.parse(file).iter())
-    except (OSError, ElementTree.ParseError):
-        return []  # MuJoCo says what is wrong with it

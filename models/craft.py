@@ -11,6 +11,7 @@ import mujoco
 from .cameras import place_camera
 from .coefficients import PREFIX
 from .errors import InputError
+from .files import find_in_package
 from .vehicle_file import UP, Box, Cylinder, PlacedRotor, VehicleFile
 
 Vector = Sequence[float]
@@ -238,8 +239,16 @@ def _nearest(places: Sequence[Vector], reach: float) -> float:
 
 
 def _free_root(spec: mujoco.MjSpec, folder: Path) -> None:
-    """Find the meshes of a URDF file, and free its first link."""
-    _find_meshes(spec, folder)
+    """Find the meshes of a URDF file's packages, and free its first link."""
+    for mesh in spec.meshes:
+        if mesh.file.startswith("package:"):
+            found = find_in_package(mesh.file, folder)
+            if found is None:
+                raise InputError(
+                    "model.file: expected its meshes in its folder or one above, "
+                    f"got no file for {mesh.file}"
+                )
+            mesh.file = os.path.relpath(found, folder)
     spec.compiler.fusestatic = False  # it would fuse the root with the world
     root = spec.worldbody.first_body()
     if root is None:
@@ -259,23 +268,6 @@ def _add_rotors(spec: mujoco.MjSpec, file: VehicleFile) -> None:
     for number, rotor in enumerate(rotors, 1):
         site = _rotor_site(spec, file, rotor, f"rotors.list[{number}]")
         _add_actuator(spec, file, rotor, site)
-
-
-def _find_meshes(spec: mujoco.MjSpec, folder: Path) -> None:
-    """Meshes of a package are looked for in the folder of a URDF file, and in those above it."""
-    for mesh in spec.meshes:
-        if not mesh.file.startswith("package:"):
-            continue
-        inside = Path(mesh.file.removeprefix("package:").lstrip("/"))
-        ways = inside, Path(*inside.parts[1:])  # with the package's name, or without
-        places = (up / way for up in (folder, *folder.parents) for way in ways)
-        found = next((place for place in places if place.is_file()), None)
-        if found is None:
-            raise InputError(
-                "model.file: expected its meshes in its folder or one above, "
-                f"got no file for {mesh.file}"
-            )
-        mesh.file = os.path.relpath(str(found), folder)
 
 
 def _rotor_site(

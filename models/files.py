@@ -1,4 +1,4 @@
-"""New files, whole or not at all. Imports the standard library alone."""
+"""New files, whole or not at all, and files of packages. Imports the standard library alone."""
 
 from contextlib import suppress
 from pathlib import Path
@@ -28,3 +28,11 @@ def check_new_file(out: Path, *endings: str) -> None:
         raise InputError(f"out: expected the name of a new file, got {out}, which exists")
     if not out.absolute().parent.is_dir():
         raise InputError(f"out: expected a folder that exists for it, got {out}")
+
+
+def find_in_package(name: str, folder: Path) -> Path | None:
+    """The file of "package://PACKAGE/FILE" in a folder or above it, with PACKAGE or without."""
+    inside = Path(name.removeprefix("package:").lstrip("/"))
+    ways = (inside, Path(*inside.parts[1:]))
+    places = (up / way for up in (folder, *folder.parents) for way in ways)
+    return next((place for place in places if place.is_file()), None)

@@ -129,7 +129,7 @@ def _check_sizes(path: Path) -> None:
     seen = {path}
     total = 0
     numbers = 0
-    waiting = [(_root(path), 1)]
+    waiting = [(read_xml(path), 1)]
     while waiting:
         element, times = waiting.pop()
         _check_element(element)
@@ -140,7 +140,7 @@ def _check_sizes(path: Path) -> None:
             inner = path.parent / element.get("file", "")
             if inner not in seen:
                 seen.add(inner)
-                waiting.append((_root(inner), times))
+                waiting.append((read_xml(inner), times))
         total += times
         numbers += times * _numbers(element)
         if numbers > MAX_NUMBERS:
@@ -181,8 +181,9 @@ def _refuse(expected: str, got: str) -> None:
     raise InputError(f"vehicle: expected {expected}, got {got:.80}")
 
 
-def _root(path: Path) -> ElementTree.Element:
+def read_xml(path: Path) -> ElementTree.Element:
+    """The root of a file, an empty element if there is none: MuJoCo says what is wrong."""
     try:
         return ElementTree.parse(path).getroot()
     except (OSError, ElementTree.ParseError):
-        return ElementTree.Element("")  # MuJoCo says what is wrong with it
+        return ElementTree.Element("")
