@@ -43,7 +43,7 @@ class _Job:
 
     plan: Plan
     poses: PoseSequence
-    """From the pose before the first frame to the last frame."""
+    """Those of the frames."""
     sequence: int
     """Number of the whole sequence."""
     first: int
@@ -147,12 +147,12 @@ def _jobs(
             numbers = range(start + first, start + end)
             missing = frozenset(number for number in numbers if not _is_whole(folder, number))
             if missing:
-                before = max(min(missing) - 1 - start, 0)
+                begin = min(missing) - start
                 yield _Job(
                     plan=plan,
-                    poses=poses.part(before, end),
+                    poses=poses.part(begin, end),
                     sequence=index,
-                    first=start + before,
+                    first=start + begin,
                     missing=missing,
                 )
         start += len(poses)
@@ -189,17 +189,12 @@ def _take(job: _Job, tell: Tell) -> list[Frame]:
         fine=job.plan.fine,
     )
     with closing(opened) as cameras:
-        for row in range(len(poses)):
-            number = job.first + row
-            # Other rows are drawn only as the earlier frame of a flow.
-            is_missing = number in job.missing
-            due = dict.fromkeys(cameras.pictures, everybody & is_missing)
-            begun = everybody & (row == 0)
-            rng = {0: np.random.default_rng([job.plan.seed, 0, number])}  # sources count from 1
-            cameras.take(due, begun, poses.state(row), rng.__getitem__)
-            if is_missing:
-                frames.append(_frame(job, row, cameras))
-                tell(len(frames), len(job.missing), "frames")
+        due = dict.fromkeys(cameras.pictures, everybody)
+        for number in sorted(job.missing):
+            row = number - job.first
+            cameras.take(due, poses.state(row))
+            frames.append(_frame(job, row, cameras))
+            tell(len(frames), len(job.missing), "frames")
     return frames
 
 
@@ -231,7 +226,6 @@ def _frame(job: _Job, row: int, cameras: "Cameras") -> Frame:
                 "matrix": lens.matrix.tolist(),
                 "rotation": lens.rotation.tolist(),
                 "translation": lens.translation.tolist(),
-                "distortion": list(lens.distortion),
                 "files": {path: len(data) for path, data in encoded.items()},
             }
             if view.kind == "segmentation":
@@ -253,15 +247,14 @@ def _frame(job: _Job, row: int, cameras: "Cameras") -> Frame:
 
 def _encoded(view: View, image: Picture) -> Iterator[tuple[str, bytes]]:
     """Ending and bytes of the files of a picture."""
-    if view.kind in ("depth", "flow"):
-        data = io.BytesIO()
-        np.save(data, image[..., 0] if view.kind == "depth" else image)
-        yield "npy", data.getvalue()
     if view.kind == "rgb":
         yield "png", _png(image)
     elif view.kind == "segmentation":
         yield "png", _png(image[..., 0].astype(np.uint16))
-    elif view.kind == "depth":
+    else:
+        data = io.BytesIO()
+        np.save(data, image[..., 0])
+        yield "npy", data.getvalue()
         depth = image[..., 0].astype(np.float64)
         millimetres = np.where(depth <= _FARTHEST, np.rint(1000 * depth), 0)
         yield "png", _png(millimetres.astype(np.uint16))

@@ -1,56 +1,39 @@
 """Cameras of a vehicle's file: where they sit, what they take, how often; their kinds of pictures.
 
-An MJCF file has them as its cameras, with `resolution`, `fovy` and `output`; the rate and what
-`Optics` has, for which MJCF has no words, are custom texts: "rotorgram/cameras.NAME.rate". A TOML
-file has a table `[[cameras]]` for each. A file without a `front` or a `down` gets ours.
+An MJCF file has them as its cameras, with `resolution`, `fovy` and `output`; the rate, for which
+MJCF has no word, is a custom text: "rotorgram/cameras.NAME.rate". A TOML file has a table
+`[[cameras]]` for each. A file without a `front` or a `down` gets ours.
 """
 
 import math
+import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Annotated, Final, Literal, get_args
+from dataclasses import dataclass, replace
+from typing import Final
 
 import mujoco
 import numpy as np
 
 from .coefficients import PREFIX
 from .errors import InputError, shortened
-from .fields import Limits, read_table
-from .lens import Lens
 
-Kind = Literal["rgb", "depth", "segmentation", "flow"]
-KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
-"""`rgb`: uint8, 3 channels. `depth`: float32, m, along the camera's axis. `segmentation`: int32, a
-number for each object. `flow`: float32, pixels to the right and down since the step before."""
-FARTHEST: Final = 1000.0
-"""Where drawing ends, and the depth where nothing is seen, m."""
-MAX_PIXELS: Final = 4096  # of a side
 OUTPUTS: Final = {
     "rgb": mujoco.mjtCamOutBit.mjCAMOUT_RGB,
     "depth": mujoco.mjtCamOutBit.mjCAMOUT_DEPTH,
     "segmentation": mujoco.mjtCamOutBit.mjCAMOUT_SEG,
 }
-"""Kinds that a file can name; `flow` is for an option to choose."""
+"""Kinds of pictures, and their bits in an MJCF file. `rgb`: uint8, 3 channels. `depth`: float32, m,
+along the camera's axis. `segmentation`: int32, a number for each object."""
+_DTYPES: Final = {"rgb": "uint8", "depth": "float32", "segmentation": "int32"}
+FARTHEST: Final = 1000.0
+"""Where drawing ends, and the depth where nothing is seen, m."""
+MAX_PIXELS: Final = 4096  # of a side
 _TEXTS: Final = PREFIX + "cameras."
-_CHECKED: Final = 16  # places along a side at which a lens is tried
 _SIDE: Final = 64  # Pixels of a side, if the file gives none
 MAX_LETTERS: Final = 64  # of a name
 FOVY: Final = (1e-3, 3.0)  # rad
 MAX_STEPS: Final = 1000  # from picture to picture
 _Vector = tuple[float, float, float]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Optics:
-    """What a camera does beyond a pinhole's sharp picture; by default nothing."""
-
-    distortion: Annotated[tuple[float, ...], Limits(-1e6, 1e6, "1", count=5)] = (0.0,) * 5
-    """k1, k2, p1, p2, k3 of its lens: see `lens.distorted`."""
-    exposure: Annotated[float, Limits(0.0, 10.0, "stop")] = 0.0
-    """Standard deviation of the exposure of a picture: e in light times 2^e, in colours."""
-    noise: Annotated[tuple[float, ...], Limits(0.0, 1.0, "1", count=2)] = (0.0, 0.0)
-    """a and b in: standard deviation of a colour v, 0 to 1, is √(a² v + b²): the noise of photons
-    and that of reading them, as of EMVA's standard 1288."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,7 +48,7 @@ class Camera:
     fovy: float = math.pi / 2
     """Vertical field of view, rad."""
     kinds: tuple[str, ...] = ("rgb",)
-    """What it takes: some of `KINDS`."""
+    """What it takes: some of `OUTPUTS`."""
     every: int = 1
     """Control steps from one picture to the next."""
     carried: bool = True
@@ -76,31 +59,15 @@ class Camera:
     """Direction in which it looks, in the same frame."""
     up: _Vector = (0.0, 0.0, 1.0)
     """Direction of the picture's upper edge, in the same frame."""
-    optics: Optics = Optics()
-
-    def __post_init__(self) -> None:
-        """Raises `InputError` where the lens folds the picture."""
-        half = math.tan(self.fovy / 2)
-        focal = _CHECKED / 2 / np.array((half * self.width / self.height, half))
-        middle = np.full(2, _CHECKED / 2)
-        matrix = np.block([[np.diag(focal), middle[:, None]], [np.zeros((1, 2)), np.ones((1, 1))]])
-        lens = Lens(matrix, np.eye(3), np.zeros(3), self.optics.distortion)
-        try:
-            lens.rays(_CHECKED, _CHECKED)
-        except InputError as error:
-            raise InputError(f"camera {self.name}.{error}") from None
 
     @property
     def words(self) -> str:
         """Where it is, where it looks and how it sees."""
-        place, look, lens = (
-            " ".join(f"{one:.4g}" for one in numbers)
-            for numbers in (self.position, self.look, self.optics.distortion)
-        )
+        place = " ".join(f"{one:.4g}" for one in self.position)
+        look = " ".join(f"{one:.4g}" for one in self.look)
         where = "the body" if self.carried else "the world"
         angle = f"{math.degrees(self.fovy):.4g} degrees high"
         words = f"at ({place}) m in {where}, looks along ({look}), {angle}"
-        words += f", distorts by ({lens})" if any(self.optics.distortion) else ""
         return words + (f", every {self.every} steps" if self.every > 1 else "")
 
 
@@ -119,23 +86,13 @@ class View:
     @property
     def shape(self) -> tuple[int, int, int]:
         """Rows from the top, columns from the left, channels."""
-        channels = {"rgb": 3, "flow": 2}.get(self.kind, 1)
+        channels = 3 if self.kind == "rgb" else 1
         return self.camera.height, self.camera.width, channels
 
     @property
     def dtype(self) -> str:
-        """`uint8`, `int32` or `float32`."""
-        return {"rgb": "uint8", "segmentation": "int32"}.get(self.kind, "float32")
-
-    @property
-    def unit(self) -> str:
-        """Of its numbers."""
-        return {"depth": "m", "flow": "pixel"}.get(self.kind, "")
-
-    @property
-    def frame(self) -> str:
-        """Where the camera is and looks, in words."""
-        return self.camera.words
+        """`uint8`, `float32` or `int32`."""
+        return _DTYPES[self.kind]
 
 
 def chosen_views(words: Sequence[str], cameras: Iterable[Camera]) -> tuple[View, ...]:
@@ -148,10 +105,10 @@ def chosen_views(words: Sequence[str], cameras: Iterable[Camera]) -> tuple[View,
         text, at, size = word.partition("@")
         name, _, kind = text.rpartition("_")
         alone = text in known
-        right = alone or (name in known and kind in KINDS)
+        right = alone or (name in known and kind in OUTPUTS)
         if not right:
             expected = (
-                f"some of {', '.join(known)}, each with _{', _'.join(KINDS)} behind it or not"
+                f"some of {', '.join(known)}, each with _{', _'.join(OUTPUTS)} behind it or not"
             )
             raise InputError(f"cameras: expected {expected}, got {shortened(word)}")
         camera = known[text if alone else name]
@@ -168,13 +125,12 @@ def chosen_views(words: Sequence[str], cameras: Iterable[Camera]) -> tuple[View,
 
 
 def _size(word: str, text: str) -> tuple[int, int]:
-    width, _, height = text.partition("x")
-    right = all(side.isascii() and side.isdecimal() and len(side) < 9 for side in (width, height))
-    right = right and all(1 <= int(side) <= MAX_PIXELS for side in (width, height))
-    if not right:
+    match = re.fullmatch(r"([0-9]{1,4})x([0-9]{1,4})", text)
+    width, height = map(int, match.groups()) if match else (0, 0)
+    if min(width, height) < 1 or max(width, height) > MAX_PIXELS:
         expected = f"NAME@WIDTHxHEIGHT of 1 to {MAX_PIXELS} pixels each"
         raise InputError(f"cameras: expected {expected}, got {shortened(word)}")
-    return int(width), int(height)
+    return width, height
 
 
 # ---- of a file
@@ -191,9 +147,7 @@ def read_cameras(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[Camera, ..
     found = []
     data = mujoco.MjData(model)
     data.qpos[:7] = (0, 0, 0, 1, 0, 0, 0)
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
-    mujoco.mj_camlight(model, data)
+    place_cameras(model, data)
     modes = mujoco.mjtCamLight
     perspective = mujoco.mjtProjection.mjPROJ_PERSPECTIVE
     targets = modes.mjCAMLIGHT_TARGETBODY.value, modes.mjCAMLIGHT_TARGETBODYCOM.value
@@ -211,13 +165,7 @@ def read_cameras(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[Camera, ..
             if not 1 <= side <= MAX_PIXELS:
                 expected = f"1 to {MAX_PIXELS} pixels a side"
                 raise InputError(f"camera {one.name}: expected {expected}, got {side}")
-        given = {
-            key: texts.pop(f"{_TEXTS}{one.name}.{key}")
-            for key in ("rate", *(each.name for each in fields(Optics)))
-            if f"{_TEXTS}{one.name}.{key}" in texts
-        }
-        rate = given.pop("rate", "1")
-        optics = {key: _read(text) for key, text in given.items()}
+        rate = texts.pop(f"{_TEXTS}{one.name}.rate", "1")
         output = int(model.cam_output[number])
         axes = data.cam_xmat[number].reshape(3, 3)
         mine = model.body_rootid[model.cam_bodyid[number]] == model.jnt_bodyid[0]
@@ -233,12 +181,18 @@ def read_cameras(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[Camera, ..
                 position=_vector(data.cam_xpos[number]),
                 look=_vector(-axes[:, 2]),
                 up=_vector(axes[:, 1]),
-                optics=read_table(Optics, optics, f"camera {one.name}"),
             )
         )
     for name in texts:
         raise InputError(f"{name}: expected a camera of that name and a key that it can have")
     return tuple(found)
+
+
+def place_cameras(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    """Put bodies, cameras and lights where the positions of the joints have them."""
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)  # the body that cameras and lights follow
+    mujoco.mj_camlight(model, data)
 
 
 def _check_numbers(name: str, model: mujoco.MjModel, number: int) -> None:
@@ -258,15 +212,6 @@ def _check_numbers(name: str, model: mujoco.MjModel, number: int) -> None:
     place = model.cam_pos[number].tolist()
     if not max(map(abs, place)) <= 1e4:
         raise InputError(f"{name}: expected a position within 1e4 m, got {place}")
-
-
-def _read(text: str) -> str | float | list[float]:
-    """Numbers of a text; itself where it has others."""
-    try:
-        numbers = [float(word) for word in text.split()]
-    except ValueError:
-        return text
-    return numbers[0] if len(numbers) == 1 else numbers
 
 
 def steps_of(name: str, rate: str | float) -> int:
@@ -305,7 +250,7 @@ def own_cameras(radius: float, rest_height: float) -> tuple[Camera, ...]:
 
 
 def place_camera(spec: mujoco.MjSpec, body: mujoco.MjsBody, camera: Camera) -> None:
-    """Add a camera to a body of a spec; its rate and optics are custom texts."""
+    """Add a camera to a body of a spec; its rate is a custom text."""
     right = np.cross(camera.look, camera.up)
     body.add_camera(
         name=camera.name,
@@ -315,10 +260,5 @@ def place_camera(spec: mujoco.MjSpec, body: mujoco.MjsBody, camera: Camera) -> N
         resolution=(camera.width, camera.height),
         output=sum(int(OUTPUTS[kind]) for kind in camera.kinds),
     )
-    texts = {one.name: np.ravel(getattr(camera.optics, one.name)) for one in fields(Optics)}
     if camera.every > 1:
-        texts["rate"] = np.array([1 / camera.every])
-    for key, values in texts.items():
-        if values.any():
-            data = " ".join(map(repr, values.tolist()))
-            spec.add_text(name=f"{_TEXTS}{camera.name}.{key}", data=data)
+        spec.add_text(name=f"{_TEXTS}{camera.name}.rate", data=repr(1 / camera.every))

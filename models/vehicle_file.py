@@ -14,7 +14,7 @@ from typing import Annotated, Any, Final, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from .cameras import FOVY, MAX_LETTERS, OUTPUTS, Camera, Optics, steps_of
+from .cameras import FOVY, MAX_LETTERS, OUTPUTS, Camera, steps_of
 from .coefficients import COEFFICIENTS, Battery, Drag, Rotors, Sensors, as_tuple
 from .errors import InputError, shortened
 from .fields import Limits, Text, check, limits_of, optional, read_table
@@ -137,7 +137,7 @@ class RotorTable(Rotors):
 
 
 @dataclass(frozen=True, kw_only=True)
-class _CameraTable(Optics):
+class _CameraTable:
     name: Annotated[str, Text(MAX_LETTERS, identifier=True)]
     position: _Place = (0.0, 0.0, 0.0)
     look: _Axis = AHEAD
@@ -530,7 +530,6 @@ def _camera(numbers: list[Number], given: object, where: str) -> Camera:
         position=table.position,
         look=look,
         up=up,
-        optics=Optics(distortion=table.distortion, exposure=table.exposure, noise=table.noise),
     )
 
 

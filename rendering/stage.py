@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..models.cameras import place_cameras
 from ..models.errors import InputError, shortened
 from ..models.fleet import load_vehicles, members_of
 from ..models.mjcf import attach_craft, free_body, level_data
@@ -268,9 +269,7 @@ class Stage:
             now = 0.0 if goal is None else float(np.linalg.norm(goal - pose[:3]))
             reach = self._reach[i]
             self._reach[i] = max(reach, min(now, _FAR * self.radius) if reach else now)
-        mujoco.mj_kinematics(self.model, self.data)
-        mujoco.mj_comPos(self.model, self.data)  # the body that cameras and lights follow
-        mujoco.mj_camlight(self.model, self.data)
+        place_cameras(self.model, self.data)
 
     def camera(self, name: Camera | Literal["free"]) -> mujoco.MjvCamera:
         """A camera for the last moments. All but `onboard` see every craft, and goals of one world.

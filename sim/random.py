@@ -28,7 +28,6 @@ Ids = Any
 START: Final = crc32(b"start")
 """The draws with which a task begins episodes."""
 RANDOMIZATION: Final = crc32(b"randomization")
-CAMERAS: Final = crc32(b"cameras")
 SCENES: Final = crc32(b"scenes")
 GUSTS: Final = "gusts"
 
@@ -159,11 +158,6 @@ class Random(Kept):
         """One number from 0 up to 1 for each of the worlds `ids` and their episode."""
         words = words_of(self.keys[ids], use, self.episode[ids], np.zeros(len(ids)), 1)
         return uniform(words[:, 0])
-
-    def generator(self, use: int, world: int, step: int) -> np.random.Generator:
-        """A generator for the many numbers that one step of a world takes, as a picture does."""
-        words = words_of(self.keys[world], use, self.episode[world], step, 4)
-        return np.random.Generator(np.random.Philox(key=words.view(np.uint64)))
 
     def parts(self) -> dict[str, Kept]:
         """The noises."""

@@ -3,12 +3,10 @@
     python studies/cameras.py [--seconds 1] [--repeats 7] [--out FILE.json]
     python studies/cameras.py --sheet FILE.png    pictures of every kind, to look at
     python studies/cameras.py --scenes FILE.png   scenes of two seeds each
-    python studies/cameras.py --optics FILE.png   what a camera does beyond a pinhole's
 
 Unless told otherwise a case draws the plain world with a Crazyflie from its camera `front`.
-`mujoco.Renderer` draws the same model without shadows and smooth edges, and gives the same kind; it
-has no optical flow: there ours is beside its depth. Cases take turns within a repeat, medians are
-told.
+`mujoco.Renderer` draws the same model without shadows and smooth edges, and gives the same kind.
+Cases take turns within a repeat, medians are told.
 
 It takes about ten minutes on two cores.
 """
@@ -18,7 +16,6 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 os.environ.setdefault("MUJOCO_GL", "egl")  # which MuJoCo's renderer needs before it is imported
@@ -28,7 +25,7 @@ import numpy as np
 from measuring import in_turns, medians, options, table, timed, write
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.envs.config import EnvConfig
-from rotorgram.models.cameras import KINDS, chosen_views
+from rotorgram.models.cameras import OUTPUTS, chosen_views
 from rotorgram.models.vehicle import Vehicle
 from rotorgram.rendering.cameras import Cameras
 from rotorgram.scenes import SEEDED_SCENES
@@ -46,41 +43,19 @@ Times = dict[str, float]
 WORLDS = ("plain", "airport", *SEEDED_SCENES)
 
 
-OPTICS = {
-    "pinhole": "",
-    "distortion": "distortion = [-0.25, 0.05, 0.001, -0.0005, 0.0]",
-    "noise": "exposure = 0.3\nnoise = [0.05, 0.02]",
-}
-
-
-def optical(folder: str) -> Vehicle:
-    """A Crazyflie with a camera for each of `OPTICS`, where its `front` is."""
-    text = Vehicle.load(VEHICLE).path.read_text("utf-8")
-    front = next(one for one in Vehicle.load(VEHICLE).cameras if one.name == "front")
-    for name, words in OPTICS.items():
-        place = [float(part) for part in front.position]
-        text += f'\n[[cameras]]\nname = "{name}"\nposition = {place}\n{words}\n'
-    file = Path(folder) / "optical.toml"
-    file.write_text(text, "utf-8")
-    return Vehicle.load(file)
-
-
-def ours(word: str, scene: str = "plain", vehicle: Vehicle | None = None) -> tuple[Step, Cameras]:
-    """A picture of a craft that flies and yaws, a little further from one to the next."""
-    vehicle = vehicle or Vehicle.load(VEHICLE)
+def ours(word: str, scene: str = "plain") -> tuple[Step, Cameras]:
+    """A picture of a craft that flies, a little further from one to the next."""
+    vehicle = Vehicle.load(VEHICLE)
     views = chosen_views([word], vehicle.cameras)
     cameras = Cameras(vehicle, views, scene=scene)
     everybody = np.ones(1, bool)
     place = np.array([[0.0, 0.0, 1.0]])
     turn = np.array([[1.0, 0.0, 0.0, 0.0]])
-    speeds = {"velocity": np.array([[3.0, 0.0, 0.0]]), "body_rates": np.array([[0.0, 0.0, 2.0]])}
     due = {views[0].name: everybody}
-    dice = {0: np.random.default_rng(0)}
 
     def step() -> None:
         place[0, 0] += 1e-3
-        state = {"position": place, "quaternion": turn, **speeds}
-        cameras.take(due, ~everybody, state, dice.__getitem__)
+        cameras.take(due, {"position": place, "quaternion": turn})
 
     step()
     return step, cameras
@@ -90,7 +65,7 @@ def theirs(kind: str, width: int, height: int, cameras: Cameras) -> Step:
     """The same by MuJoCo's renderer."""
     renderer = mujoco.Renderer(cameras.model, height, width)
     renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
-    if kind in ("depth", "flow"):
+    if kind == "depth":
         renderer.enable_depth_rendering()
     if kind == "segmentation":
         renderer.enable_segmentation_rendering()
@@ -110,7 +85,7 @@ def pictures(seconds: float, repeats: int) -> list[dict[str, Any]]:
     """Pictures per second by kind and size, ours and theirs."""
     rows = []
     for width, height in SIZES:
-        for kind in KINDS:
+        for kind in OUTPUTS:
             here, cameras = ours(f"front_{kind}@{width}x{height}")
             cases = {"ours": here, "theirs": theirs(kind, width, height, cameras)}
             taken = medians(in_turns(cases, repeats, lambda step: timed(step, seconds)[0]))
@@ -145,14 +120,6 @@ def surroundings(seconds: float, repeats: int) -> dict[str, Times]:
         )
         for kind in ("rgb", "depth")
     }
-
-
-def lenses(seconds: float, repeats: int) -> Times:
-    """Milliseconds of colours of 128 x 128 by what the camera does beyond a pinhole's."""
-    with TemporaryDirectory() as folder:
-        craft = optical(folder)
-        cases = {name: ours(f"{name}@128x128", "plain", craft) for name in OPTICS}
-    return milliseconds(cases, seconds, repeats)
 
 
 def threads(seconds: float, repeats: int) -> dict[str, float]:
@@ -218,7 +185,7 @@ def sheet(path: Path) -> None:
     ]
     rows = []
     for env_id, vehicle, eye, more, drones in cases:
-        kinds = ("down", eye, *(f"{eye}_{kind}" for kind in KINDS[1:]))
+        kinds = ("down", eye, *(f"{eye}_{kind}" for kind in [*OUTPUTS][1:]))
         words = [f"{name}@160x120" for name in kinds]
         env = LocalVectorEnv(
             env_id, drones, drones=drones, vehicle=vehicle, cameras=words, action="velocity", **more
@@ -228,37 +195,14 @@ def sheet(path: Path) -> None:
             env.step(np.tile(np.float32((0.3, 0.1, 0.0, 0.2)), (drones, 1)))
         seen = {name: array[0] for name, array in env.observations.items()}
         depth = np.log(seen[f"{eye}_depth"][..., 0])
-        flow = np.linalg.norm(seen[f"{eye}_flow"], axis=-1)
         shades = (
             colormaps["viridis_r"]((depth - depth.min()) / np.ptp(depth)),
             colormaps["tab20"](seen[f"{eye}_segmentation"][..., 0] % 20),
-            colormaps["magma"](flow / max(flow.max(), 1e-9)),
         )
         told = [(255 * shade[..., :3]).astype(np.uint8) for shade in shades]
         rows.append(np.hstack([seen["down"], seen[eye], *told]))
         env.close()
     image.imsave(path, np.vstack(rows))
-
-
-def optics(path: Path) -> None:
-    """Gates by a pinhole, by a lens that distorts, with noise, and read row by row in a turn."""
-    from PIL import Image
-
-    with TemporaryDirectory() as folder:
-        vehicle = optical(folder)
-        views = chosen_views([f"{name}@320x240" for name in OPTICS], vehicle.cameras)
-        cameras = Cameras(vehicle, views, scene="gates:2")
-        everybody = np.ones(1, bool)
-    state = {
-        "position": np.array([[0.0, 0.0, 5.0]]),
-        "quaternion": np.array([[1.0, 0.0, 0.0, 0.0]]),
-        "body_rates": np.array([[0.0, 0.0, 6.0]]),
-    }
-    dice = {0: np.random.default_rng(1)}
-    cameras.take(dict.fromkeys(OPTICS, everybody), everybody, state, dice.__getitem__)
-    row = np.hstack([cameras.pictures[name][0] for name in OPTICS])
-    Image.fromarray(row).quantize(128, dither=Image.Dither.NONE).save(path, optimize=True)
-    cameras.close()
 
 
 def scenes(path: Path) -> None:
@@ -274,7 +218,7 @@ def scenes(path: Path) -> None:
         row = []
         for seed in range(2):
             cameras = Cameras(vehicle, views, scene=f"{name}:{seed}", fine=True)
-            cameras.take({view.name: everybody for view in views}, everybody, state)
+            cameras.take({view.name: everybody for view in views}, state)
             row += [cameras.pictures[view.name][0] for view in views]
             cameras.close()
         rows.append(np.hstack(row))
@@ -291,7 +235,7 @@ def shown(row: dict[str, Any]) -> list[str]:
 
 def main() -> None:
     """Measure, print and write."""
-    drawings = {"sheet": sheet, "scenes": scenes, "optics": optics}
+    drawings = {"sheet": sheet, "scenes": scenes}
     files = dict.fromkeys(drawings, Path)
     args = options(__doc__, seconds=1.0, repeats=7, out=Path, **files).parse_args()
     for name, draw in drawings.items():
@@ -303,9 +247,8 @@ def main() -> None:
     print(table(head, map(shown, rows)))
     taken = {str(drones): steps(drones, args.seconds, args.repeats) for drones in (1, 16)}
     around = surroundings(args.seconds, args.repeats)
-    beyond = lenses(args.seconds, args.repeats)
     side_by_side = threads(args.seconds, args.repeats)
-    print(taken, around, beyond, side_by_side, sep="\n")
+    print(taken, around, side_by_side, sep="\n")
     if args.out:
         write(
             args.out,
@@ -313,7 +256,6 @@ def main() -> None:
                 "pictures": rows,
                 "milliseconds of a step": taken,
                 "milliseconds by world": around,
-                "milliseconds by optics": beyond,
                 "pictures per second of two cameras": side_by_side,
             },
         )

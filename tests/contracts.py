@@ -113,11 +113,7 @@ FEATURES = {
     "lossy radio, rigid": Case(FORMATION, {**LOSSY, "backend": "rigid"}),
     "line": Case("rotorgram/Landing-v0", {"motion": "line"}),
     "snap": Case("rotorgram/Tracking-v0", {"trajectory": "snap"}),
-    "pictures": Case(HOVER, {"cameras": "front@16x16,front_flow@16x16,down_segmentation@16x12"}),
-    "pictures of lenses": Case(
-        HOVER,
-        {"vehicle": DATA / "eyes.toml", "cameras": "wide@16x12,wide_flow@16x12,noisy,sharp@24x18"},
-    ),
+    "pictures": Case(HOVER, {"cameras": "front@16x16,front_depth@24x18,down_segmentation@16x12"}),
     "two laps": Case("rotorgram/Racing-v0", {"track": "dive", "laps": 2}),
 }
 

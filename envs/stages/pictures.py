@@ -13,7 +13,7 @@ from ...models.cameras import FARTHEST, View, chosen_views
 from ...models.errors import InputError
 from ...models.fleet import members_of
 from ...scenes import scenes_of
-from ...sim.random import CAMERAS, SCENES, Random
+from ...sim.random import SCENES, Random
 from ...sim.snapshots import Arrays
 from ..spec import ArraySpec
 from ..tasks.task import Task
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from ...rendering.cameras import Cameras
 
 _MAX_THREADS: Final = 16
-_BOUNDS: Final = {"rgb": (0.0, 255.0), "depth": (0.0, FARTHEST), "flow": (-np.inf, np.inf)}
+_UNITS: Final = {"depth": "m"}
 
 
 def views_of(task: Task, drones: int) -> tuple[View, ...]:
@@ -49,15 +49,16 @@ def views_of(task: Task, drones: int) -> tuple[View, ...]:
 
 def arrays_of(views: Sequence[View], objects: Sequence[str]) -> tuple[ArraySpec, ...]:
     """The arrays of pictures; objects are the names of what a segmentation tells apart."""
+    highest = {"rgb": 255.0, "depth": FARTHEST, "segmentation": len(objects) - 1.0}
     return tuple(
         ArraySpec(
             name=view.name,
             shape=view.shape,
             dtype=view.dtype,
-            low=_BOUNDS.get(view.kind, (0.0, 0.0))[0],
-            high=_BOUNDS.get(view.kind, (0.0, len(objects) - 1.0))[1],
-            unit=view.unit,
-            frame=view.frame,
+            low=0.0,
+            high=highest[view.kind],
+            unit=_UNITS.get(view.kind, ""),
+            frame=view.camera.words,
             categories=tuple(objects) if view.kind == "segmentation" else (),
         )
         for view in views
@@ -87,7 +88,7 @@ class Pictures(Stage):
 
     Args:
         task: Its options choose the cameras and the scene.
-        random: Of the world; noise and scenes draw from it.
+        random: Of the world; scenes draw from it.
         shape: (W, A).
     """
 
@@ -139,7 +140,7 @@ class Pictures(Stage):
             painter.cameras.close()
 
     def snapshot(self, record: Record) -> dict[str, np.ndarray]:
-        """What each drone's cameras took last, and from where."""
+        """What each drone's cameras took last."""
         taken: dict[str, np.ndarray] = {}
         if "scenes" not in vars(record):
             return taken
@@ -185,34 +186,29 @@ class Pictures(Stage):
         for view in self.views:
             due[view.name] = fresh | (flown & (steps % view.camera.every == 0))
         rows = {}
-        for name in ("position", "quaternion", "velocity", "body_rates"):
+        for name in ("position", "quaternion"):
             rows[name] = self._per_drone(getattr(state, name))
         if state.payload is not None:
             rows["payload"] = self._per_drone(state.payload)
         if self._goal_moves:
             rows["goal"] = self._per_drone(self._task.goal(state))
-        pictures = self._taken(due, fresh, rows, self._scenes_of(record), steps)
+        pictures = self._taken(due, rows, self._scenes_of(record))
         for name, picture in pictures.items():
             record.observations[name] = picture.reshape(*record.shape, *picture.shape[1:])
 
     def _taken(
         self,
         due: dict[str, NDArray[np.bool_]],
-        fresh: NDArray[np.bool_],
         rows: dict[str, np.ndarray],
         scenes: NDArray[np.int64],
-        steps: NDArray[np.int64],
     ) -> dict[str, np.ndarray]:
         pictures: dict[str, np.ndarray] = {
             view.name: np.empty((self._rows, *view.shape), view.dtype) for view in self.views
         }
 
-        def noise(world: int) -> np.random.Generator:
-            return self._random.generator(CAMERAS, world, steps[world * self._shape[1]])
-
         def paint(painter: _Painter) -> None:
             worlds = painter.worlds & (scenes == painter.scene)
-            painter.cameras.take(due, fresh, rows, noise, worlds)
+            painter.cameras.take(due, rows, worlds)
             drones = np.repeat(worlds, self._shape[1])
             for view in self.views:
                 picture = painter.cameras.pictures[view.name][drones]

@@ -164,7 +164,6 @@ ALONE = {name: case for name, case in (FEATURES | VEHICLES).items() if case.dron
 
 
 @pytest.mark.parametrize("case", ALONE.values(), ids=ALONE)
-@pytest.mark.filterwarnings("ignore:.*infinity")  # of flow
 def test_gymnasium_accepts_single_envs(case: Case) -> None:
     env = gym.make(case.env_id, disable_env_checker=True, **case.options).unwrapped
     assert isinstance(env, SingleEnv)

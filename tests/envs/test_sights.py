@@ -129,7 +129,7 @@ def test_pictures_of_the_backend_rigid(opengl: None) -> None:
         with closing(Cameras(craft, views, (2, 1))) as cameras:
             names = "position", "quaternion"
             state = {k: np.asarray(getattr(told, k)).reshape(2, -1) for k in names}
-            cameras.take({"down": np.ones(2, bool)}, np.ones(2, bool), state)
+            cameras.take({"down": np.ones(2, bool)}, state)
             assert (pictures == cameras.pictures["down"]).all()
             assert len(np.unique(pictures)) > 20
 

@@ -1,7 +1,6 @@
 """Labelled pictures: plans, labels against the pictures, formats, and what an interrupt leaves."""
 
 import json
-import math
 import shutil
 import signal
 import subprocess
@@ -26,7 +25,7 @@ ONE = WorkersConfig(jobs=1)
 LINE = [sys.executable, "-m", "rotorgram.cli", "capture", "plan.toml", "--out", "out"]
 PLAN = """
 vehicle = "crazyflie2"
-cameras = ["down@32x24", "down_depth@32x24", "down_segmentation@32x24", "front_flow@16x16"]
+cameras = ["down@32x24", "down_depth@32x24", "down_segmentation@32x24", "front@16x16"]
 seed = 7
 fine = false
 
@@ -177,7 +176,7 @@ def test_every_file_is_there(captured: Path) -> None:
     for frame in labels:
         kinds = [(one["camera"], one["kind"]) for one in frame["pictures"]]
         assert kinds == [
-            ("down", "rgb"), ("down", "depth"), ("down", "segmentation"), ("front", "flow")
+            ("down", "rgb"), ("down", "depth"), ("down", "segmentation"), ("front", "rgb")
         ]  # fmt: skip
         for one in frame["pictures"]:
             assert all((captured / file).is_file() for file in one["files"])
@@ -406,14 +405,6 @@ def test_a_full_disk_loses_nothing(
     assert not list(folder.rglob("*.tmp"))
     assert capture(plan_of(tmp_path), folder, ONE) == 8
     assert len(read_labels(folder, 8)) == 8
-
-
-def test_flow_is_since_the_pose_before(captured: Path) -> None:
-    flows = [np.load(captured / "flow" / "front" / f"{i:06}.npy") for i in range(8)]
-    assert not flows[0].any()
-    assert not flows[5].any()  # the first of the flight
-    assert all(flow.any() for flow in (flows[1], flows[6], flows[7]))
-    assert math.isfinite(float(np.abs(flows[7]).max()))
 
 
 def test_one_ctrl_c_ends_it(opengl: None, tmp_path: Path) -> None:

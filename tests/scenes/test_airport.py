@@ -113,7 +113,7 @@ def test_sky_is_above_the_horizon_and_ground_below(opengl: None) -> None:
     state = {"position": np.array([[0.0, 0.0, 4.0]]), "quaternion": np.array([[1.0, 0, 0, 0]])}
     everybody = np.ones(1, bool)
     with closing(Cameras(vehicle, views, scene="airport")) as cameras:
-        cameras.take({view.name: everybody for view in views}, everybody, state)
+        cameras.take({view.name: everybody for view in views}, state)
         picture = cameras.pictures["front"][0].astype(int)
         seen = cameras.pictures["front_segmentation"][0, ..., 0]
         names = cameras.objects

@@ -141,7 +141,7 @@ def test_cameras_see_its_objects(opengl: None, scene: str) -> None:
         place = np.array([[0.0, 0.0, 5.0]])
         turn = np.array([[1.0, 0.0, 0.0, 0.0]])
         due = {view.name: np.ones(1, bool) for view in views}
-        cameras.take(due, np.ones(1, bool), {"position": place, "quaternion": turn})
+        cameras.take(due, {"position": place, "quaternion": turn})
         seen = np.unique(cameras.pictures["front_segmentation"])
         objects = [cameras.objects[i] for i in seen]
         assert sum(one.startswith(f"{scene}/") for one in objects) > 4
