@@ -82,7 +82,7 @@ def _thrust_bounds(task: Task) -> tuple[Bound, Bound]:
 def _battery(loop: "Results") -> Array:
     effects = loop.world.effects
     assert effects is not None
-    return stack([effects.charge, effects.voltage])
+    return stack([effects.rotors.charge, effects.rotors.voltage])
 
 
 def _wind_names(task: Task) -> Names:

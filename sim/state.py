@@ -100,8 +100,8 @@ def each(values: Array) -> Array:
 
 
 def chosen(mask: Array, new: Array, old: Array) -> Array:
-    """`new`, (W, A) or (W, A, k), where the mask is true, None for all; elsewhere `old`."""
-    if mask is None:
+    """`new`, (W, A) or (W, A, k), where the mask is true, elsewhere `old`; None stands for all."""
+    if mask is None or old is None:
         return new
     if not getattr(mask, "ndim", 0):  # a single drone's
         return new if mask else old
@@ -111,8 +111,8 @@ def chosen(mask: Array, new: Array, old: Array) -> Array:
 
 
 def kept(mask: Array, new: Sequence[Array], old: Sequence[Array] | None) -> Sequence[Array]:
-    """`chosen` for lists of arrays; all are new if there are no old ones."""
-    if old is None or old[0] is None:
+    """`chosen` for lists of arrays."""
+    if old is None:
         return new
     return [chosen(mask, a, b) for a, b in zip(new, old, strict=True)]
 

@@ -1,9 +1,8 @@
 """Worlds: what all backends have in common, and how they are made."""
 
 from collections.abc import Mapping, Sequence
-from functools import partial
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, ClassVar, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -11,17 +10,17 @@ from ..models import BACKENDS, MAX_DRONES, Backend
 from ..models.errors import InputError
 from .effects import EffectOptions, Effects
 from .random import RANDOMIZATION, START, Draw, Random
-from .randomize import CENTER, Randomization
+from .randomize import Randomization
 from .snapshots import Arrays, Snapshot, joined, part_of
 from .state import Array, InitialState, WorldState, plain
 
 if TYPE_CHECKING:
-    import mujoco
-
     from ..models.vehicle import Vehicle
 
 _CLASSES: Final = {"mujoco": "MujocoWorld", "rigid": "RigidWorld"}
 """Backends by name: a class in the module of that name in `backends`."""
+_SETTINGS: Final = {"mujoco": ("num_threads",), "rigid": ("dtype", "compiled")}
+"""Names of each backend's own arguments of `make_world`."""
 
 MAX_WORLDS: Final = 1 << 16  # Most worlds of a batch
 CONTACT_CHECK: Final = 0.02
@@ -46,12 +45,8 @@ class World:
         random: The counters of all random numbers; `seed` seeds them.
         parameters: What was drawn for each drone's episode, by name, shape (W, A).
         effects: What acts on drones besides gravity, contact and ideal rotors; None: nothing.
-
-    Class attributes:
-        settings: Names of the backend's own arguments of `make_world`.
     """
 
-    settings: ClassVar[tuple[str, ...]]
     state: WorldState
 
     def __init__(
@@ -60,23 +55,16 @@ class World:
         shape: tuple[int, ...],
         effects: EffectOptions | None,
         randomize: Randomization | None,
-        arguments: Mapping[str, Any],
     ) -> None:
         self.vehicle = vehicle
         self.shape = shape
-        self._arguments = {
-            **arguments,
-            "vehicle": vehicle,
-            "effects": effects,
-            "randomize": randomize,
-        }
         self.parameters: dict[str, Array] = {}
         self._options = effects or EffectOptions()
         self._randomize = randomize
         self._drawn = () if randomize is None else randomize.names
         self.random = Random(shape)
         acting = Effects(vehicle, self._options, self.random.noise, self._drawn)
-        self.effects = acting if acting.works else None
+        self.effects = acting if acting.on_rotors or acting.on_body else None
         self._on_rotors = acting.on_rotors
         self._check = max(1, round(CONTACT_CHECK / vehicle.timestep))  # physics steps
 
@@ -124,7 +112,8 @@ class World:
 
     def snapshot(self) -> Snapshot:
         """Copies of all arrays that a later step depends on, by name."""
-        parts = {"random": self.random.snapshot(), "state": self._snapshot()}
+        state = {name: array.copy() for name, array in self._kept().items()}
+        parts = {"random": self.random.snapshot(), "state": state}
         parts["parameters"] = {name: np.array(x) for name, x in self.parameters.items()}
         if self.effects is not None:
             parts["effects"] = self.effects.snapshot()
@@ -140,19 +129,13 @@ class World:
             self.effects.restore(part_of(arrays, "effects"))
             self.effects.take(self.state, self.parameters)
 
-    def _snapshot(self) -> Snapshot:
-        """Copies of the backend's own arrays."""
+    def _kept(self) -> Arrays:
+        """The backend's own arrays."""
         raise NotImplementedError
 
     def _restore(self, arrays: Arrays) -> None:
-        """Put those back; the parameters are as they were."""
+        """Put copies of those back; the parameters are as they were."""
         raise NotImplementedError
-
-    def __reduce__(self) -> tuple[object, ...]:
-        return partial(type(self), **self._arguments), (), self.snapshot()
-
-    def __setstate__(self, arrays: Arrays) -> None:
-        self.restore(arrays)
 
     def _ids(self, mask: Array) -> np.ndarray:
         """The worlds of a mask; of a single one it is always true."""
@@ -183,37 +166,6 @@ class World:
         return begun
 
 
-def flown_model(
-    vehicle: "Vehicle", drones: int, effects: EffectOptions, drawn: Sequence[str]
-) -> "mujoco.MjModel":
-    """The model of a world: the vehicle's, or one with more crafts, with a payload or for a drawn
-    center of mass.
-    """
-    movable = bool(set(drawn) & set(CENTER))
-    if drones > 1:
-        from ..models.fleet import members_of  # which imports MuJoCo
-        from ..models.swarm import swarm_model
-
-        load = effects.payload * drones
-        crafts = members_of(vehicle, drones)
-        return swarm_model(crafts, movable=movable, payload=load, cable=effects.cable)
-    if effects.payload:
-        return vehicle.with_payload(effects.payload, effects.cable)
-    return vehicle.with_movable_center() if movable else vehicle.model
-
-
-def check_hung(height: float, least: float) -> None:
-    """Refuse a start at which the payload would hang in the ground. Raises `InputError`."""
-    if not height > least:
-        expected = f"a height over {least:.4g} m, for the payload on its cable"
-        raise InputError(f"start: expected {expected}, got {height:.4g} m")
-
-
-def _class_of(backend: Backend) -> Any:
-    """The class of a backend's worlds."""
-    return getattr(import_module(f".backends.{backend}", __package__), _CLASSES[backend])
-
-
 def check_world(
     vehicle: "Vehicle",
     backend: Backend,
@@ -240,7 +192,7 @@ def check_world(
                 "effects and randomize: expected none with several vehicles, "
                 f"got {', '.join(refused)}"
             )
-    known = _class_of(backend).settings
+    known = _SETTINGS[backend]
     for name, value in settings.items():
         if name not in known:
             several = "s" * (len(known) > 1)
@@ -267,7 +219,8 @@ def make_world(
     if not (type(num_worlds) is int and 1 <= num_worlds <= MAX_WORLDS):
         raise InputError(f"num_envs: expected 1 to {MAX_WORLDS}, got {num_worlds!r}")
     check_world(vehicle, backend, drones, effects, randomize, settings)
-    world: World = _class_of(backend)(
+    module = import_module(f".backends.{backend}", __package__)
+    world: World = getattr(module, _CLASSES[backend])(
         vehicle, num_worlds, drones=drones, effects=effects, randomize=randomize, **settings
     )
     return world

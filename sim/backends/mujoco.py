@@ -13,19 +13,24 @@ import numpy as np
 from mujoco.batch import Batch, SimulationError
 
 from ...models.errors import InputError
+from ...models.fields import Limits, check
 from ...models.fleet import members_of
-from ...models.swarm import CONTACTS, GROUNDED, contact_columns
+from ...models.swarm import CONTACTS, GROUNDED, contact_columns, swarm_model
 from ...models.vehicle import SURROUNDINGS, Vehicle, payload_radius
 from ..effects import EffectOptions, Effects
-from ..randomize import Randomization
+from ..randomize import CENTER, Randomization
 from ..rotations import body_z
 from ..snapshots import Arrays
 from ..state import Array, InitialState, WorldState
-from ..world import PhysicsError, World, check_hung, flown_model
+from ..world import PhysicsError, World
 from .world_parameters import WorldParameters
 
 _FEW: Final = 8
 _SEEN: Final = np.array(SURROUNDINGS, np.uint8)
+_VIEWS: Final = (
+    "_batch _ctrl _command _thrust _applied _contacts _counts _warnings _varied _qacc _warmstart"
+)
+"""Attributes that hold the simulator's memory."""
 
 
 class MujocoWorld(World):
@@ -39,8 +44,6 @@ class MujocoWorld(World):
     `num_threads` threads step the worlds; 0: one for each processor.
     """
 
-    settings = ("num_threads",)
-
     def __init__(
         self,
         vehicle: Vehicle,
@@ -51,36 +54,35 @@ class MujocoWorld(World):
         randomize: Randomization | None = None,
         num_threads: int = 0,
     ) -> None:
-        if type(num_threads) is not int or num_threads < 0:
-            raise InputError(f"num_threads: expected 0 or more, got {num_threads!r}")
+        check("num_threads", Limits(0, whole=True), num_threads)
         lead = (num_worlds, drones) if num_worlds * drones > 1 else ()
-        arguments = {"num_worlds": num_worlds, "drones": drones, "num_threads": num_threads}
-        super().__init__(vehicle, lead, effects, randomize, arguments)
-        options = self._options
-        drawn = self._drawn
+        super().__init__(vehicle, lead, effects, randomize)
         threads = 1 if num_worlds == 1 else num_threads
-        model = flown_model(vehicle, drones, options, drawn)
+        model = self._flown_model(drones)
         if self._on_rotors:  # commands are within their limits; thrusts need not be
             model = copy.copy(model)
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
         self._batch = batch = Batch(model, num_worlds, threads)
-        self._cable = options.cable if options.payload else None
-        self._least_height = options.cable + payload_radius(options.payload)
-        self._varied = WorldParameters(batch.model, drawn)
+        self._cable = self._options.cable if self._options.payload else None
+        self._varied = WorldParameters(batch.model, self._drawn)
         self._owner = None if threads == 1 else os.getpid()
         self._initial = batch.state[0].copy()
         # Live views of simulator memory, made once.
-        own = (*lead, -1)
-        (qpos, ball), (qvel, moves), (self._applied, _) = (
-            _views(batch.bind(name).reshape(num_worlds, -1), drones, size, lead)
-            for name, size in (("qpos", 7), ("qvel", 6), ("qfrc_applied", 6))
-        )
+        qpos, ball = _views(batch.bind("qpos"), drones, 7, lead)
+        qvel, moves = _views(batch.bind("qvel"), drones, 6, lead)
+        self._applied = batch.bind("qfrc_applied")[:, : 6 * drones]
         self._ctrl: np.ndarray = batch.bind("ctrl")
         self._contacts: np.ndarray = batch.bind("ncon")
         self._warnings = batch.warning  # of each kind the last info, and how many
         self._no_warnings = self._warnings.tobytes()
         self._no_contacts = self._contacts.tobytes()
-        self._bind_thrusts(members_of(vehicle, drones))
+        # Controls in newtons are the thrusts, and without effects the commands too.
+        crafts = members_of(vehicle, drones)
+        newtons = np.array([rotor.newtons for craft in crafts for rotor in craft.rotors])
+        self._newtons = None if (newtons == 1.0).all() else newtons
+        alike = self._newtons is None and self.effects is None
+        self._command = self._ctrl if alike else np.zeros_like(self._ctrl)
+        self._thrust = np.zeros_like(self._ctrl) if self._on_rotors else self._command
         self._touching = np.zeros((num_worlds, drones), bool)
         self._colliding: np.ndarray | None = None
         if drones > 1:
@@ -93,42 +95,44 @@ class MujocoWorld(World):
             quaternion=qpos[..., 3:7],
             velocity=qvel[..., :3],
             body_rates=qvel[..., 3:6],
-            command=self._command.reshape(own),
-            thrust=self._thrust.reshape(own),
+            command=self._command.reshape(*lead, -1),
+            thrust=self._thrust.reshape(*lead, -1),
             touching=self._touching.reshape(lead),
             colliding=self._colliding,
             payload=None if self._cable is None else ball,
             payload_velocity=None if self._cable is None else moves,
         )
-        assert np.shares_memory(self.state.position, qpos)
+        assert np.shares_memory(self.state.position, batch.state)
 
-    def _bind_thrusts(self, crafts: tuple[Vehicle, ...]) -> None:
-        """Controls in newtons are the thrusts, and without effects the commands too."""
-        newtons = np.array([rotor.newtons for craft in crafts for rotor in craft.rotors])
-        self._newtons = None if (newtons == 1.0).all() else newtons
-        alike = self._newtons is None and self.effects is None
-        self._command = self._ctrl if alike else np.zeros_like(self._ctrl)
-        self._thrust = np.zeros_like(self._ctrl) if self._on_rotors else self._command
+    def _flown_model(self, drones: int) -> mujoco.MjModel:
+        """The vehicle's, or one with more crafts, with a payload or for a drawn center of mass."""
+        vehicle = self.vehicle
+        payload = self._options.payload
+        cable = self._options.cable
+        movable = bool(set(self._drawn) & set(CENTER))
+        if drones > 1:
+            crafts = members_of(vehicle, drones)
+            return swarm_model(crafts, movable=movable, payload=payload * drones, cable=cable)
+        if payload:
+            return vehicle.with_payload(payload, cable)
+        return vehicle.with_movable_center() if movable else vehicle.model
 
     def reset(self, mask: Array, pose: InitialState) -> None:
         """As `World.reset`. Raises `InputError` for a payload that would hang in the ground."""
         self._check_process()
         ids = self._ids(mask)
-        hung = self._hung(pose)
-        if hung is not None and len(ids):
-            check_hung(hung[ids, 2].min() + self._options.cable, self._least_height)
+        hung = self._hung(pose, ids)
         self.random.begin(ids)
         self._batch.state[ids] = self._initial
         self._warnings[ids] = 0
-        state = self.state
-        here = () if self.shape == () else ids
         for name, begun in self._begun(mask, pose).items():
-            getattr(state, name)[...] = begun
-        state.command[here] = state.thrust[here]
+            getattr(self.state, name)[...] = begun
+        self._command[ids] = self._thrust[ids]
         self._draw_parameters(mask)
         self._vary(ids)
         if self.effects is not None:
-            state.thrust[here] = self.effects.begin(mask, state, self.parameters)[here]
+            thrust = self.effects.begin(mask, self.state, self.parameters)
+            self._thrust[ids] = np.reshape(thrust, self._ctrl.shape)[ids]
         if hung is not None:
             self._place_payload(ids, hung)
         self._apply_thrust(self._thrust, ids)
@@ -145,10 +149,12 @@ class MujocoWorld(World):
         self._check_process()
         ids = None if mask is None else self._ids(mask)
         some = ... if ids is None else ids
-        here = some if self.shape else ...
-        self.state.command[here] = thrust if here is ... else thrust[here]
+        if some is ... or not self.shape:
+            self.state.command[...] = thrust
+        else:
+            self.state.command[some] = thrust[some]
         if self.effects is None:
-            self._apply_thrust(self._command)
+            self._apply_thrust(self._command, ...)
         if not again:
             self._clear_contacts(some)
         while substeps > 0:
@@ -191,9 +197,6 @@ class MujocoWorld(World):
             arrays["colliding"] = self._colliding
         return arrays
 
-    def _snapshot(self) -> dict[str, np.ndarray]:
-        return {name: array.copy() for name, array in self._kept().items()}
-
     def _restore(self, arrays: Arrays) -> None:
         self._check_process()
         self._vary(np.arange(len(self._touching)))
@@ -204,14 +207,11 @@ class MujocoWorld(World):
     def _act(self, effects: Effects, mask: Array | None, some: Array) -> None:
         """Let the effects act on some worlds before a physics step."""
         mean, end, wrench = effects.step(self.state, mask)
-        if self._thrust is not self._command:
-            here = some if self.shape else ...
-            self.state.thrust[here] = end[here]
-        thrust = np.reshape(mean, self._ctrl.shape)
-        self._ctrl[some] = (thrust if self._newtons is None else thrust / self._newtons)[some]
+        if self._on_rotors:
+            self._thrust[some] = np.reshape(end, self._ctrl.shape)[some]
+        self._apply_thrust(np.reshape(mean, self._ctrl.shape), some)
         if wrench is not None:
-            here = some if self.shape else ...
-            self._applied[here] = wrench[here]
+            self._applied[some] = np.reshape(wrench, self._applied.shape)[some]
 
     def _clear_contacts(self, some: Array) -> None:
         """No contact of some worlds yet."""
@@ -236,17 +236,14 @@ class MujocoWorld(World):
         before = self._warmstart.copy()
         self._batch.forward()
         self._warmstart[:] = before
-        worlds, drones = self._touching.shape
-        own, _ = _views(self._qacc.reshape(worlds, -1), drones, 6, self.shape)
+        own, _ = _views(self._qacc, self._touching.shape[1], 6, self.shape)
         return own[..., :3].copy()
 
     def below(self) -> Array:
         """As `World.below`, by `mj_ray`."""
-        state = self.state
-        origin, down = (
-            array.reshape((*self._touching.shape, 3))
-            for array in (state.position, -body_z(state.quaternion))
-        )
+        shape = (*self._touching.shape, 3)
+        origin = self.state.position.reshape(shape)
+        down = -body_z(self.state.quaternion).reshape(shape)
         distance = self._batch.ray(origin, down, geomgroup=_SEEN)[0]
         return np.where(distance < 0, np.inf, distance).reshape(self.shape)[()]
 
@@ -256,19 +253,18 @@ class MujocoWorld(World):
             return  # a fork has none of the threads
         state = {name: copy.copy(getattr(self.state, name)) for name in WorldState.__slots__}
         self.state = WorldState(**state)
-        views = (
-            "_batch _ctrl _command _thrust _applied _contacts _counts _warnings _varied _qacc "
-            "_warmstart"
-        )
-        for view in views.split():
+        for view in _VIEWS.split():
             vars(self).pop(view, None)
 
     def _check_process(self) -> None:
         if self._owner is not None and os.getpid() != self._owner:  # it would wait for ever
             raise RuntimeError("the threads of an env do not follow into a fork: make another env")
 
-    def _hung(self, pose: InitialState) -> np.ndarray | None:
-        """Where the payload of each world begins, shape (W, 3)."""
+    def _hung(self, pose: InitialState, ids: np.ndarray) -> np.ndarray | None:
+        """Where the payload of each world begins, shape (W, 3).
+
+        Refuses starts of some worlds at which it would hang in the ground.
+        """
         if self._cable is None:
             return None
         drones = self._touching.shape[1]
@@ -278,7 +274,13 @@ class MujocoWorld(World):
                 expected = "one drone in a world, or a task whose start places it"
                 raise InputError(f"effects: payload: expected {expected}, got {drones} drones")
             hung = pose.position - (0.0, 0.0, self._cable)
-        return np.reshape(hung, (-1, drones, 3))[:, 0]
+        hung = np.reshape(hung, (-1, drones, 3))[:, 0]
+        height = hung[ids, 2].min(initial=np.inf) + self._cable
+        least = self._cable + payload_radius(self._options.payload)
+        if not height > least:
+            expected = f"a height over {least:.4g} m, for the payload on its cable"
+            raise InputError(f"start: expected {expected}, got {height:.4g} m")
+        return hung
 
     def _place_payload(self, ids: np.ndarray, hung: np.ndarray) -> None:
         """Put payloads there, moving along with the first craft."""
@@ -289,7 +291,7 @@ class MujocoWorld(World):
         qvel[ids, -6:-3] = qvel[ids, :3]
         qvel[ids, -3:] = 0.0
 
-    def _apply_thrust(self, thrust: np.ndarray, some: Array = ...) -> None:
+    def _apply_thrust(self, thrust: np.ndarray, some: Array) -> None:
         if self._newtons is not None:
             self._ctrl[some] = thrust[some] / self._newtons
         elif thrust is not self._ctrl:

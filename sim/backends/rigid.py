@@ -10,7 +10,8 @@ from typing import Final
 import mujoco
 import numpy as np
 
-from ...models.errors import InputError, shortened
+from ...models.errors import InputError
+from ...models.fields import Choice, Flag, OrNone, check
 from ...models.vehicle import Vehicle, craft_bodies
 from ..effects import EffectOptions
 from ..randomize import Randomization
@@ -21,7 +22,7 @@ from . import kernel
 from .body import RigidBody, mapped, motion
 from .hull import Hull, can_touch
 
-DTYPES: Final = ("float32", "float64")
+DTYPES: Final = Choice(("float32", "float64"))
 _OWN: Final = ("_rows", "_acting", "_wrench")
 _OF_STATE: Final = ("command", "thrust", "touching", "colliding")
 _LEVEL: Final = np.array((0.0, 0.0, 0.0, 1.0, *[0.0] * 9))  # rows of a craft at rest
@@ -39,8 +40,6 @@ class RigidWorld(World):
         compiled: Fly by a C function (`kernel.py`). None: where there is a C compiler.
     """
 
-    settings = ("dtype", "compiled")
-
     def __init__(
         self,
         vehicle: Vehicle,
@@ -52,10 +51,8 @@ class RigidWorld(World):
         dtype: str = "float32",
         compiled: bool | None = None,
     ) -> None:
-        if compiled is not None and type(compiled) is not bool:
-            raise InputError(f"compiled: expected true or false, got {shortened(compiled)}")
-        if dtype not in DTYPES:
-            raise InputError(f"dtype: expected {' or '.join(DTYPES)}, got {dtype!r}")
+        check("compiled", OrNone(Flag()), compiled)
+        check("dtype", DTYPES, dtype)
         found = kernel.compiler()
         if compiled and not found:
             expected = "false where no C compiler is found (cc, gcc, clang or the variable CC)"
@@ -65,35 +62,31 @@ class RigidWorld(World):
             expected = "none with the backend rigid, which has no cable: fly it with mujoco"
             raise InputError(f"effects: payload: expected {expected}, got {payload:g} kg")
         shape = (num_worlds, drones)
-        arguments = {"num_worlds": num_worlds, "drones": drones, "dtype": dtype}
-        super().__init__(vehicle, shape, effects, randomize, arguments | {"compiled": compiled})
+        super().__init__(vehicle, shape, effects, randomize)
         _check_obstacles(vehicle)
         _check_forces(vehicle)
         self.dtype = np.dtype(dtype)
         self._body = RigidBody(vehicle)
         self._hull = Hull(vehicle)
-        self._at_once = None if self.effects is None else 1  # physics steps of a call
         thrust = np.zeros((*shape, vehicle.num_rotors), self.dtype)
         self._nothing = self._acting = thrust  # mean over the last physics step
         self._wrench: Array = None  # force and torque of effects over it, (6, W A)
-        self._rows = np.repeat(_LEVEL.astype(self.dtype)[:, None], num_worlds * drones, axis=1)
         nobody = thrust[..., 0] > 0
         moved = dict.fromkeys(("position", "quaternion", "velocity", "body_rates"))
         self.state = WorldState(**moved, command=thrust, thrust=thrust, touching=nobody)
         if drones > 1:
             self.state.colliding = nobody
-        self._show()
+        self._show(np.repeat(_LEVEL.astype(self.dtype)[:, None], num_worlds * drones, axis=1))
         self._varying: np.ndarray | None = None
         self._function: kernel.Fly | None = None
-        self._compiled = compiled
-        if found and compiled is not False:
-            ones = np.ones(num_worlds * drones)
-            self._body.vary(dict.fromkeys(self._drawn, ones))
-            self._pack()
-            self._compile()
+        self._compiled = compiled if found else False
+        self._vary(dict.fromkeys(self._drawn, np.ones(num_worlds * drones)))
+        self._compile()
 
     def _compile(self) -> None:
-        """Compile the body as it varies now."""
+        """Compile the body as it varies now, unless NumPy flies it."""
+        if self._compiled is False:
+            return
         pushed = self.effects is not None and self.effects.on_body
         rotors = self.vehicle.num_rotors
         try:
@@ -101,6 +94,7 @@ class RigidWorld(World):
         except InputError as error:
             if self._compiled:
                 raise
+            self._compiled = False
             logging.getLogger(__name__).warning("rigid flies by NumPy: %s", error)
 
     def vary(self, inertia: Array, reaction: Array, air: Mapping[str, Array]) -> None:
@@ -109,12 +103,10 @@ class RigidWorld(World):
         Inertia, kg·m², (W A, 3, 3); a factor of the rotors' reactions, (W A,); and coefficients of
         the air by their names in a vehicle's file, (W, A) each.
         """
-        self._body.vary({"reaction": reaction}, inertia)
-        self._pack()
-        if self.effects is not None:
-            self.effects.vary(air)
-        if self._function is not None:
-            self._compile()
+        self._vary({"reaction": reaction}, inertia)
+        assert self.effects is not None
+        self.effects.air.vary(air)
+        self._compile()
 
     def reset(self, mask: Array, pose: InitialState) -> None:
         """As `World.reset`."""
@@ -126,8 +118,7 @@ class RigidWorld(World):
         unit = turn / np.sqrt(np.sum(turn * turn, axis=-1, keepdims=True))
         turn = np.where(rows, unit, turn)  # the others keep their bits
         parts = (begun["position"], turn, begun["velocity"], begun["body_rates"])
-        self._rows = self._as_rows(np.concat(parts, axis=-1))
-        self._show()
+        self._show(self._as_rows(np.concat(parts, axis=-1)))
         state.thrust = self._typed(begun["thrust"])
         state.command = np.where(rows, state.thrust, state.command)
         self._draw_parameters(mask)
@@ -163,7 +154,7 @@ class RigidWorld(World):
         effects = self.effects
         acting = state.command
         wrench = None
-        at_once = self._at_once or steps
+        at_once = steps if effects is None else 1  # physics steps of a call
         some = None if mask is None else mask.reshape(1, -1)  # of rows
         for _ in range(steps // at_once):
             if effects is not None:
@@ -173,18 +164,17 @@ class RigidWorld(World):
                 wrench = None if push is None else self._as_rows(push)
             if not self._on_rotors:  # as MuJoCo clamps controls
                 acting = clip(acting, self.vehicle.thrust_low, self.vehicle.thrust_high)
-            new = self._flown(self._rows, self._as_rows(acting), wrench, at_once)
-            self._rows = chosen(some, new, self._rows)
-            self._show()
+            new = self._flown(self._as_rows(acting), wrench, at_once)
+            self._show(chosen(some, new, self._rows))
         self._acting = chosen(mask, acting, self._acting)
         if wrench is not None:
             old = 0.0 * wrench if self._wrench is None else self._wrench
             self._wrench = chosen(some, wrench, old)
 
-    def _snapshot(self) -> dict[str, np.ndarray]:
+    def _kept(self) -> dict[str, np.ndarray]:
         arrays = {name: getattr(self, name) for name in _OWN}
         arrays |= {name: getattr(self.state, name) for name in _OF_STATE}
-        return {name: array.copy() for name, array in arrays.items() if array is not None}
+        return {name: array for name, array in arrays.items() if array is not None}
 
     def _restore(self, arrays: Arrays) -> None:
         copies = {name: array.copy() for name, array in arrays.items()}
@@ -192,14 +182,14 @@ class RigidWorld(World):
             setattr(self, name, copies.get(name))
         for name in _OF_STATE:
             setattr(self.state, name, copies.get(name))
-        self._show()
+        self._show(self._rows)
         self._vary_drawn()
 
     def acceleration(self) -> Array:
         """As `World.acceleration`."""
         push = self._body.push(self._as_rows(self._acting), self._wrench)
         linear, _ = self._body.acceleration(motion(self._rows), push)
-        return np.stack(list(linear), axis=-1).reshape(*self.shape, 3)
+        return np.stack(linear, axis=-1).reshape(*self.shape, 3)
 
     def below(self) -> Array:
         """As `World.below`: the ground is the only surface."""
@@ -212,27 +202,28 @@ class RigidWorld(World):
         """Nothing is to be released."""
 
     def _vary_drawn(self) -> None:
-        if self.parameters:
-            drawn = self.parameters.items()
-            self._body.vary({name: values.reshape(-1) for name, values in drawn})
-            self._pack()
+        """Give the bodies what was drawn for them."""
+        self._vary({name: values.reshape(-1) for name, values in self.parameters.items()})
 
-    def _pack(self) -> None:
-        """Give NumPy and compiled code the same varying numbers."""
+    def _vary(self, parameters: Mapping[str, Array], inertia: Array = None) -> None:
+        """As `RigidBody.vary`, with the same numbers for NumPy and compiled code."""
         body = self._body
-        body.varying = mapped(body.varying, lambda numbers: numbers.astype(self.dtype))
-        self._varying = kernel.packed(body, self.dtype)
+        if parameters:
+            body.vary(parameters, inertia)
+            body.varying = mapped(body.varying, lambda numbers: numbers.astype(self.dtype))
+            self._varying = kernel.packed(body, self.dtype)
 
-    def _flown(self, rows: Array, thrust: Array, wrench: Array, steps: int) -> np.ndarray:
+    def _flown(self, thrust: Array, wrench: Array, steps: int) -> np.ndarray:
         """New rows after physics steps: see `RigidBody.fly`."""
         if self._function is None:
-            return np.array(self._body.fly(rows, thrust, wrench, steps), self.dtype)
-        return self._function(rows, thrust, wrench, self._varying, steps)
+            return np.array(self._body.fly(self._rows, thrust, wrench, steps), self.dtype)
+        return self._function(self._rows, thrust, wrench, self._varying, steps)
 
-    def _show(self) -> None:
-        """Set the state's arrays, views of the rows."""
+    def _show(self, rows: np.ndarray) -> None:
+        """Take these rows, and set the state's arrays, views of them."""
+        self._rows = rows
         state = self.state
-        columns = self._rows.T.reshape(*self.shape, 13)
+        columns = rows.T.reshape(*self.shape, 13)
         state.position = columns[..., :3]
         state.quaternion = columns[..., 3:7]
         state.velocity = columns[..., 7:10]

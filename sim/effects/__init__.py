@@ -10,8 +10,8 @@ is of second order in the step. Sums over rotors and axes are written out, since
 the same bits alone and in a batch.
 """
 
-from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from ...models.errors import InputError
 from ..random import GUSTS, Noise
@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 
 __all__ = ["EffectOptions", "Effects"]
 
-WINDS: Final = ("wind_x", "wind_y", "wind_z")
-
 
 class Effects(Kept):
     """The effects on W worlds, in the order in which they act.
@@ -37,7 +35,8 @@ class Effects(Kept):
     Attributes:
         on_rotors: Whether the thrust of a rotor may differ from its command.
         on_body: Whether there is a force or a torque besides the rotors'.
-        works: Whether there is anything to do in a physics step.
+        rotors: From commands to thrusts.
+        air: From the motion to a force and a torque.
     """
 
     def __init__(
@@ -48,21 +47,21 @@ class Effects(Kept):
         drawn: tuple[str, ...] = (),
     ) -> None:
         """`noise`: that of the world. `drawn`: names of the randomised parameters in `factors`."""
-        rotors = options.motor_lag or options.thrust_curve or options.battery
-        scaled = [name for name in drawn if name.startswith("thrust")]
-        rotor = max((int(name.partition("_")[2] or 0) for name in scaled), default=0)
         count = vehicle.num_rotors
-        if rotor > count:
-            raise InputError(f"randomize: expected one of the {count} rotors, got thrust_{rotor}")
+        known = {f"thrust_{n}" for n in range(1, count + 1)} | {"thrust"}
+        scaled = [name for name in drawn if name.startswith("thrust")]
+        for name in scaled:
+            if name not in known:
+                raise InputError(f"randomize: expected one of the {count} rotors, got {name}")
+        rotors = options.motor_lag or options.thrust_curve or options.battery
         self.on_rotors = bool(rotors or options.efficiency or scaled)
         moved = options.body_drag or options.rotor_drag
         self.on_body = moved or options.ground_effect
-        self.works = self.on_rotors or self.on_body
-        self._rotors = RotorEffects(vehicle, options)
-        self._air = AirEffects(vehicle, options)
+        self.rotors = RotorEffects(vehicle, options)
+        self.air = AirEffects(vehicle, options)
         self._mean_wind = options.wind
-        self._wind: list[Array] = [0.0, 0.0, 0.0]
-        if options.wind_blows and not moved:
+        blows = options.gusts or options.downwash or any(options.wind)
+        if blows and not moved:
             raise InputError(
                 "effects: expected body_drag or rotor_drag, on which wind acts, got neither"
             )
@@ -72,26 +71,22 @@ class Effects(Kept):
             self._gusts = Gusts(options.gusts, options.wind, vehicle.timestep)
             self._noise = noise(GUSTS, NUMBERS)
 
-    def vary(self, air: Mapping[str, Array]) -> None:
-        """As `AirEffects.vary`."""
-        self._air.vary(air)
-
     def begin(self, mask: Array, state: WorldState, factors: dict[str, Array]) -> Array:
         """Begin episodes of the worlds of a mask, bool, (W, A), at their rows of `state`.
 
         Factors of the drawn parameters by name, (W, A), for all worlds. Returns the thrusts of the
         worlds that begin, (W, A, R), N.
         """
+        self.take(state, factors)
         thrust = state.thrust
         if self.on_rotors:
-            thrust = self._rotors.begin(mask, thrust, factors)
+            thrust = self.rotors.begin(mask, thrust, factors)
         if self.on_body:
-            self._air.begin(mask, state, factors)
+            self.air.begin(mask, state)
         if self._gusts is not None:
             height = component(state.position, 2)
             normal = self._noise.normal(mask)
             self._gusts.begin(mask, height, normal, factors.get("gusts", 1.0))
-        self._take_wind(factors)
         return thrust
 
     @property
@@ -104,31 +99,18 @@ class Effects(Kept):
             return self._wind
         return [mean + gust for mean, gust in zip(self._wind, self._gusts.velocity, strict=True)]
 
-    @property
-    def charge(self) -> Array:
-        """Of the battery, share, shape (W, A)."""
-        return self._rotors.charge
-
-    @property
-    def voltage(self) -> Array:
-        """Of the battery at its terminals, V, shape (W, A)."""
-        return self._rotors.voltage
-
-    def _take_wind(self, factors: dict[str, Array]) -> None:
-        both = zip(self._mean_wind, WINDS, strict=True)
-        self._wind = [mean + factors.get(name, 0.0) for mean, name in both]
-
     def take(self, state: WorldState, factors: dict[str, Array]) -> None:
-        """After a `restore`: the state, and factors as of `begin`."""
+        """Take factors as of `begin`, for arrays like those of a state."""
         if self.on_rotors:
-            self._rotors.take(state.thrust, factors)
+            self.rotors.take(state.thrust, factors)
         if self.on_body:
-            self._air.take(state.position, factors)
-        self._take_wind(factors)
+            self.air.take(state.position, factors)
+        both = zip(self._mean_wind, "xyz", strict=True)
+        self._wind = [mean + factors.get(f"wind_{axis}", 0.0) for mean, axis in both]
 
     def parts(self) -> dict[str, Kept]:
         """Rotors, air, and gusts."""
-        parts: dict[str, Kept] = {"rotors": self._rotors, "air": self._air}
+        parts: dict[str, Kept] = {"rotors": self.rotors, "air": self.air}
         if self._gusts is not None:
             parts["gusts"] = self._gusts
         return parts
@@ -143,7 +125,7 @@ class Effects(Kept):
         mean = end = state.command
         root = None
         if self.on_rotors:
-            mean, end, root = self._rotors.step(state.command, mask)
+            mean, end, root = self.rotors.step(state.command, mask)
         if not self.on_body:
             return mean, end, None
         if self._gusts is not None:
@@ -151,4 +133,4 @@ class Effects(Kept):
         wind = self.wind
         if self._downwash is not None and state.position.ndim > 2 and state.position.shape[1] > 1:
             wind = [a + b for a, b in zip(wind, self._downwash.air(state), strict=True)]
-        return mean, end, self._air.step(state, mean, root, wind, mask)
+        return mean, end, self.air.step(state, mean, root, wind, mask)

@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from ...models.coefficients import Drag
 from ...models.errors import InputError
-from ..rotations import Parts, Rows, add, cross, matrix, parts_of, product, times, transposed
+from ..rotations import Parts, Rows, add, cross, dot, matrix, parts_of, product, times, transposed
 from ..snapshots import Kept
 from ..state import Array, WorldState, clip, component, each, kept, square_root, stack
 from .options import EffectOptions
@@ -43,28 +44,24 @@ class AirEffects(Kept):
         self._options = options
         self._half = 0.5 * vehicle.timestep
         coefficients = vehicle.coefficients
-        drag = coefficients.drag
-        rotors = vehicle.rotors
         self._center: Parts = tuple(vehicle.center_of_mass.tolist())
-        self._geometry = np.array([(*rotor.position, *rotor.axis) for rotor in rotors])
+        self._geometry = np.array([(*rotor.position, *rotor.axis) for rotor in vehicle.rotors])
         if options.body_drag:
-            linear = drag.linear
-            quadratic = drag.quadratic
-            self._angular = drag.angular
-            self._moment = drag.moment
-            known = (linear, quadratic, self._angular, self._moment)
-            if known == (None,) * 4:
+            drag = coefficients.drag
+            if drag == Drag():
                 raise InputError(
                     "vehicle: expected drag.linear or drag.quadratic in the vehicle's file, which "
                     "body_drag needs, got none"
                 )
-            self._linear = linear or _NOTHING
-            self._quadratic = quadratic or _NOTHING
+            self._angular = drag.angular
+            self._moment = drag.moment
+            self._linear = drag.linear or _NOTHING
+            self._quadratic = drag.quadratic or _NOTHING
             # Of a fall at its terminal velocity, sqrt(weight / quadratic), the slope of the drag.
             weight = vehicle.mass * vehicle.gravity
             slope = max(self._linear) + 2 * math.sqrt(max(self._quadratic) * weight)
             _check_stiffness(vehicle, slope, "drag of the body")
-            most = 0.5 * float(np.linalg.eigvalsh(vehicle.inertia)[0]) / vehicle.timestep
+            most = 0.5 * _least_moment(vehicle) / vehicle.timestep
             stiffest = max(self._angular or _NOTHING)
             if not stiffest <= most:
                 raise InputError(
@@ -86,12 +83,10 @@ class AirEffects(Kept):
             slope = max(self._drag, self._inflow) * float(speeds.sum())
             # Of a turn: about the least moment of inertia, at the longest arm.
             arm = float(((self._geometry[:, :3] - vehicle.center_of_mass) ** 2).sum(axis=1).max())
-            turning = vehicle.mass * arm / float(np.linalg.eigvalsh(vehicle.inertia)[0])
+            turning = vehicle.mass * arm / _least_moment(vehicle)
             _check_stiffness(vehicle, slope * max(1.0, turning), "drag of the rotors")
         if options.ground_effect:
             (self._radius,) = coefficients.need("rotors.radius", "ground_effect")
-        self._factors: dict[str, Array] = {}
-        self._rotors: list[Array] = []
         self._before: Array = None
 
     def vary(self, numbers: Mapping[str, Array]) -> None:
@@ -103,21 +98,19 @@ class AirEffects(Kept):
         self._angular = tuple(numbers[f"drag.angular.{axis}"] for axis in "xyz")
         self._moment = tuple(numbers[f"drag.moment.{axis}"] for axis in "xy")
         self._slope = each(np.sqrt(numbers["rotors.thrust_coefficient"]))
-        names = ("rotors.drag", "rotors.inflow", "rotors.lift")
-        self._drag, self._inflow, self._lift = (each(numbers[name]) for name in names)
+        self._drag = each(numbers["rotors.drag"])
+        self._inflow = each(numbers["rotors.inflow"])
+        self._lift = each(numbers["rotors.lift"])
 
-    def begin(self, mask: Array, state: WorldState, factors: dict[str, Array]) -> None:
-        """Begin at the motion of a state; factors (W, A) by parameter."""
+    def begin(self, mask: Array, state: WorldState) -> None:
+        """Begin at the motion of a state."""
         self._before = kept(mask, _motion(state), self._before)
-        self.take(state.position, factors)
 
     def take(self, position: Array, factors: dict[str, Array]) -> None:
-        """Take the factors of drawn parameters, for positions of this shape."""
+        """Take the factors of drawn parameters, (W, A), by name, for positions of this shape."""
         self._factors = factors
-        rows = self._geometry.tolist()
-        if position.ndim > 1:
-            rows = [list(self._geometry.T)]
-        self._rotors = [(row[:3], row[3:]) for row in rows]
+        single = position.ndim == 1
+        self._rotors = self._geometry.tolist() if single else [list(self._geometry.T)]
 
     def step(
         self,
@@ -137,7 +130,7 @@ class AirEffects(Kept):
         # The middle of the step: half of the last step's change further.
         ahead = [1.5 * new - 0.5 * old for new, old in zip(now, self._before, strict=True)]
         self._before = kept(mask, now, self._before)
-        w: Parts = (ahead[3], ahead[4], ahead[5])
+        w = ahead[3:]
         turn = _turned(state.quaternion, w, self._half)
         through = (ahead[0] - wind[0], ahead[1] - wind[1], ahead[2] - wind[2])
         v = times(transposed(turn), through)
@@ -155,7 +148,7 @@ class AirEffects(Kept):
             for rotor, part, mean_root in zip(self._rotors, parts, roots, strict=True):
                 one = self._push(rotor, part, mean_root, around)
                 push = add(push, one)
-                twist = add(twist, cross(rotor[0], one))
+                twist = add(twist, cross(rotor[:3], one))
             force = add(force, [total([x]) for x in push])
             torque = add(torque, [total([x]) for x in twist])
         return stack((*times(turn, force), *torque))
@@ -163,7 +156,7 @@ class AirEffects(Kept):
     def _body(self, v: Parts, w: Parts) -> tuple[Parts, Parts]:
         """Drag of the body, body axes: force, and torque about the body's origin."""
         v = add(v, cross(w, self._center))
-        speed = square_root(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+        speed = square_root(dot(v, v))
         factor = self._factors.get("body_drag", 1.0)
         both = zip(self._linear, self._quadratic, v, strict=True)
         x, y, z = (-factor * (linear + quadratic * speed) * u for linear, quadratic, u in both)
@@ -183,29 +176,34 @@ class AirEffects(Kept):
         `around`: velocity, body rates, the upward component of each body axis, and the height of
         the body's origin.
         """
-        place, axis = rotor
+        place = rotor[:3]
+        axis = rotor[3:]
         thrust = clip(thrust, 0.0, math.inf)
         up = 0.0
         push: Parts = _NOTHING
         if self._options.rotor_drag:
             x, y, z = add(around, cross(around[3:6], place))
-            along = x * axis[0] + y * axis[1] + z * axis[2]
+            along = dot((x, y, z), axis)
             plane = (x - along * axis[0], y - along * axis[1], z - along * axis[2])
             root = square_root(thrust) if root is None else root
             speed = root / self._slope
             if "rotor_drag" in self._factors:
                 speed = speed * each(self._factors["rotor_drag"])
-            sideways = plane[0] * plane[0] + plane[1] * plane[1] + plane[2] * plane[2]
-            up = self._lift * sideways - self._inflow * speed * along
+            up = self._lift * dot(plane, plane) - self._inflow * speed * along
             drag = -self._drag * speed
             push = (drag * plane[0], drag * plane[1], drag * plane[2])
         if self._options.ground_effect:
             x, y, z, origin = around[6:]
-            height = origin + (x * place[0] + y * place[1] + z * place[2])
+            height = origin + dot((x, y, z), place)
             ratio = self._radius / (4 * clip(height, LEAST_HEIGHT * self._radius, math.inf))
             share = ratio * ratio
             up = up + thrust * (share / (1 - share))
         return push[0] + up * axis[0], push[1] + up * axis[1], push[2] + up * axis[2]
+
+
+def _least_moment(vehicle: "Vehicle") -> float:
+    """Least principal moment of inertia, kg·m²."""
+    return float(np.linalg.eigvalsh(vehicle.inertia)[0])
 
 
 def _check_stiffness(vehicle: "Vehicle", slope: float, what: str) -> None:

@@ -74,8 +74,3 @@ class EffectOptions:
             if value != one.default:
                 changed[one.name] = value
         return changed
-
-    @property
-    def wind_blows(self) -> bool:
-        """Whether the air moves."""
-        return self.gusts > 0 or self.downwash or any(self.wind)

@@ -3,19 +3,21 @@
 Rotors are a list of parts: of a single drone a number for each, of a batch one array (W, A, R).
 """
 
+from collections.abc import Sequence
+from operator import mul
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ...models.errors import InputError
 from ..snapshots import Kept
-from ..state import Array, clip, component, each, kept, square_root, stack
+from ..state import Array, chosen, clip, component, each, kept, plain, square_root, stack
 from .options import EffectOptions
 
 if TYPE_CHECKING:
     from ...models.vehicle import Vehicle
 
-Parts = list[Array]
+Parts = Sequence[Array]
 
 
 class RotorEffects(Kept):
@@ -53,30 +55,29 @@ class RotorEffects(Kept):
             most = max(polynomial(self._curve, i / 100) for i in range(101))
             ends = sum(self._curve)
             if not (abs(ends - 1) < 1e-3 and most < 1 + 1e-3):
-                expected = (
-                    "a curve that ends at the largest thrust, c₀ + c₁ + ... = 1, and is no higher"
-                )
                 raise InputError(
-                    f"rotors.curve: expected {expected}, "
-                    f"got an end of {ends:.4g}, and up to {most:.4g}"
+                    "rotors.curve: expected a curve that ends at the largest thrust, c₀ + c₁ + ... "
+                    f"= 1, and is no higher, got an end of {ends:.4g}, and up to {most:.4g}"
                 )
         if options.battery:
             names = "battery.full battery.empty battery.capacity battery.resistance rotors.power"
             numbers = coefficients.need(names, "battery")
-            full, empty, capacity, self._resistance, self._watts = numbers
-            if empty > full:
-                expected = f"at most battery.full, {full:g} V"
-                raise InputError(f"battery.empty: expected {expected}, got {empty:g} V")
-            self._full = full
-            self._empty = empty
+            self._full, self._empty, capacity, self._resistance, self._watts = numbers
             self._coulombs = 3600 * capacity
+            if self._empty > self._full:
+                raise InputError(
+                    f"battery.empty: expected at most battery.full, {self._full:g} V, "
+                    f"got {self._empty:g} V"
+                )
         one_way = options.motor_lag or options.thrust_curve or options.battery
         if one_way and (vehicle.thrust_low < 0).any():
-            expected = "rotors that push one way only, for motor_lag, thrust_curve and battery"
-            raise InputError(f"vehicle: expected {expected}, got a thrust below 0")
+            raise InputError(
+                "vehicle: expected rotors that push one way only, for motor_lag, thrust_curve and "
+                "battery, got a thrust below 0"
+            )
         share = options.efficiency
         count = vehicle.num_rotors
-        if len(share) not in (0, count):
+        if share and len(share) != count:
             raise InputError(
                 f"effects: efficiency: expected {count} numbers, one for each rotor, got {share}"
             )
@@ -86,27 +87,29 @@ class RotorEffects(Kept):
         self.voltage: Array = None
 
     def begin(self, mask: Array, thrust: Array, factors: dict[str, Array]) -> Array:
-        """Start the rotors at the speeds that these thrusts need; factors (W, A) by parameter.
+        """Start the rotors at the speeds that these thrusts need; factors as of `take`.
 
         Returns the thrusts that they give, (W, A, R), N.
         """
-        options = self._options
-        self.take(thrust, factors)
         roots = [square_root(part) for part in split(thrust)]
         self._roots = kept(mask, roots, self._roots)
-        if options.battery:
+        if self._options.battery:
             charge = factors.get("battery_charge", 1.0) + 0.0 * component(thrust, 0)
-            (self.charge,) = kept(mask, [charge], [self.charge])
-            (self.voltage,) = kept(mask, [self._terminal()], [self.voltage])
+            self.charge = chosen(mask, charge, self.charge)
+            self.voltage = chosen(mask, self._terminal(), self.voltage)
         return _join(self._scaled(split(thrust)))
 
     def take(self, thrust: Array, factors: dict[str, Array]) -> None:
-        """Take the factors of drawn parameters, (W, A), for thrusts of this shape."""
+        """Take the factors of drawn parameters, (W, A), by name, for thrusts of this shape."""
         options = self._options
-        self._low, self._high = (_of_rotors(x, thrust) for x in self._limits)
+        single = thrust.ndim == 1
+        low, high = self._limits
+        self._low = low.tolist() if single else [low]
+        self._high = high.tolist() if single else [high]
         self._scales = []
         if options.efficiency:
-            self._scales.append(_of_rotors(np.array(options.efficiency), thrust))
+            share = options.efficiency
+            self._scales.append(list(share) if single else [np.array(share)])
         if "thrust" in factors:
             self._scales.append([each(factors["thrust"])] * len(self._low))
         names = [f"thrust_{number}" for number in range(1, thrust.shape[-1] + 1)]
@@ -130,44 +133,41 @@ class RotorEffects(Kept):
             target = [h * clip(polynomial(self._curve, part / h), 0.0, 1.0) for part, h in both]
         if options.battery:
             if not options.motor_lag:
-                (self.voltage,) = kept(mask, [self._loaded(target)], [self.voltage])
+                self.voltage = chosen(mask, self._loaded(target), self.voltage)
             share = self.voltage / self._full
             scale = each(share * share)
             target = [part * scale for part in target]
-        mean = end = target
+        mean: Parts = target
+        end = target
         middle: Parts | None = None
         if options.motor_lag:
-            both = zip(self._roots, target, strict=True)
-            followed = [self._follow(root, square_root(part)) for root, part in both]
-            mean = [one[0] for one in followed]
-            roots = [one[1] for one in followed]
-            middle = [one[2] for one in followed]
+            wanted = map(square_root, target)
+            mean, roots, middle = zip(*map(self._follow, self._roots, wanted), strict=True)
             end = [root * root for root in roots]
             self._roots = kept(mask, roots, self._roots)
         if options.battery:
             used = self._power(mean) / self.voltage * (self._step / self._coulombs)
             left = clip(self.charge - used, 0.0, 1.0)
-            (self.charge,) = kept(mask, [left], [self.charge])
+            self.charge = chosen(mask, left, self.charge)
             if options.motor_lag:
                 self.voltage = self._terminal()
+        speed = None
         if middle is not None:
             for scales in self._scales:
-                both = zip(middle, scales, strict=True)
-                middle = [part * square_root(scale) for part, scale in both]
-        speed = None if middle is None else _join(middle)
+                middle = list(map(mul, middle, map(square_root, scales)))
+            speed = _join(middle)
         return _join(self._scaled(mean)), _join(self._scaled(end)), speed
 
     def _scaled(self, parts: Parts) -> Parts:
         """Thrusts after the efficiency and the drawn factors."""
         for scales in self._scales:
-            parts = [part * scale for part, scale in zip(parts, scales, strict=True)]
+            parts = list(map(mul, parts, scales))
         return parts
 
     def _answer(self, time: Array) -> tuple[Array, Array, Array]:
         """Of exp(-t / time) over a physics step: 1 - its end, its mean, the mean of its square."""
         ratio = self._step / time
-        number = isinstance(ratio, float)
-        gone = -(float(np.expm1(-ratio)) if number else np.expm1(-ratio))
+        gone = -plain(np.expm1(-ratio))
         return gone, gone / ratio, gone * (2 - gone) / (2 * ratio)
 
     def _follow(self, root: Array, wanted: Array) -> tuple[Array, Array, Array]:
@@ -226,11 +226,6 @@ def total(parts: Parts) -> Array:
 def _join(parts: Parts) -> Array:
     """The reverse of `split`."""
     return np.array(parts) if isinstance(parts[0], float) else parts[0]
-
-
-def _of_rotors(values: np.ndarray, like: Array) -> Parts:
-    """Numbers of the vehicle's rotors, shape (R,), as parts like those of an array."""
-    return values.tolist() if like.ndim == 1 else [values]
 
 
 def polynomial(coefficients: tuple[float, ...], x: Array) -> Array:

@@ -8,15 +8,15 @@ World frame: x east, y north, z up. Arrays have the leading axes of the world, n
 """
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from ...models.errors import InputError, shortened
-from ...models.fields import check_names
+from ...models.fields import Choice, check, check_names
 from ..snapshots import Kept
 from ..state import Array, WorldState, chosen
 from ..world import World
 from .barometer import Barometer
-from .base import Reading, Sensor, Source, Values
+from .base import Sensor, Source, Values
 from .channel import Channel
 from .estimator import Estimator
 from .gps import Gps
@@ -36,7 +36,20 @@ SENSOR_TYPES: Final[Mapping[str, type[Sensor]]] = {
 """In this order they are observed."""
 
 _ESTIMATE: Final = Estimator.name
+_OBSERVED: Final = Choice(("added", _ESTIMATE))
 _SOURCES: Final[Mapping[str, type[Source]]] = {**SENSOR_TYPES, _ESTIMATE: Estimator}
+
+
+class Reading(NamedTuple):
+    """What a sensor adds to an observation; the names are those of an `ArraySpec`."""
+
+    name: str
+    shape: tuple[int, ...]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    unit: tuple[str, ...]
+    frame: str
+    components: tuple[str, ...]
 
 
 def checked_sensors(given: object) -> dict[str, Any]:
@@ -60,11 +73,7 @@ def checked_sensors(given: object) -> dict[str, Any]:
                 f"sensors.{name}: expected true, or settings by name, got {shortened(settings)}"
             )
         sensors[name] = kind.checked(settings)
-    observe = given.get("observe", "added")
-    if observe not in ("added", _ESTIMATE):
-        raise InputError(
-            f"sensors.observe: expected 'added' or 'estimate', got {shortened(observe)}"
-        )
+    observe = check("sensors.observe", _OBSERVED, given.get("observe", "added"))
     if observe == _ESTIMATE:
         if _ESTIMATE not in sensors:
             raise InputError("sensors: expected estimate, which is to be observed, got none")
@@ -83,12 +92,17 @@ def _resolved(sensors: Values, vehicle: "Vehicle", period: float) -> dict[str, d
     }
 
 
-def readings_of(sensors: Values, vehicle: "Vehicle", period: float) -> tuple[Reading, ...]:
+def readings_of(sensors: Values, vehicle: "Vehicle", period: float) -> list[Reading]:
     """What sensors add to an observation, from `checked_sensors`. Raises `InputError`."""
-    settings = _resolved(sensors, vehicle, period)
-    if "observe" in sensors:
-        return ()
-    return tuple(_SOURCES[name](values, 1.0).reading for name, values in settings.items())
+    readings = []
+    for name, values in _resolved(sensors, vehicle, period).items():
+        kind = _SOURCES[name]
+        source = kind(values, period)
+        low = tuple(source.low())
+        high = tuple(source.high())
+        shape = (len(high),)
+        readings.append(Reading(name, shape, low, high, kind.units, kind.frame, kind.components))
+    return [] if "observe" in sensors else readings
 
 
 class Sensors(Kept):
@@ -102,17 +116,17 @@ class Sensors(Kept):
     def __init__(self, sensors: Values, world: World, period: float) -> None:
         self._world = world
         settings = _resolved(sensors, world.vehicle, period)
-        estimate = settings.pop(_ESTIMATE, None)
+        self._estimator = None
+        if _ESTIMATE in settings:
+            altitude = settings.get("barometer", {}).get("altitude", 0.0)
+            field = settings.get("magnetometer", {}).get("field", FIELD)
+            gravity = world.vehicle.gravity
+            values = settings.pop(_ESTIMATE)
+            self._estimator = Estimator(values, period, gravity, altitude, field)
         self._channels = {
             name: Channel(SENSOR_TYPES[name], values, world, period)
             for name, values in settings.items()
         }
-        self._estimator = None
-        if estimate is not None:
-            altitude = settings.get("barometer", {}).get("altitude", 0.0)
-            field = settings.get("magnetometer", {}).get("field", FIELD)
-            gravity = world.vehicle.gravity
-            self._estimator = Estimator(estimate, period, gravity, altitude, field)
         self._replaces = "observe" in sensors
         self._steps: Array = 0
 
@@ -152,6 +166,6 @@ class Sensors(Kept):
         return readings
 
     def seen(self) -> WorldState:
-        """The state that task and controller see: the exact one, or the estimate."""
-        state = self._world.state
-        return self._estimator.seen(state) if self._estimator and self._replaces else state
+        """The state that task and controller see with `observe` "estimate"."""
+        assert self._estimator is not None
+        return self._estimator.seen(self._world.state)

@@ -45,7 +45,7 @@ class Barometer(Sensor):
     columns = 2
     arrays = ("_bias",)
     defaults: ClassVar = {"walk": 0.0}
-    settings: ClassVar = {"altitude": Setting(0.0, Limits(-1e3, 9e3, "m"))}
+    own: ClassVar = {"altitude": Setting(0.0, Limits(-1e3, 9e3, "m"))}
     frame = "above sea level"
     components = ("pressure altitude",)
     units = ("m",)

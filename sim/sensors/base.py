@@ -3,13 +3,11 @@
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple
 
-import numpy as np
-
 from ...models.coefficients import COEFFICIENTS
 from ...models.errors import InputError
 from ...models.fields import Limits, check, check_names
 from ..snapshots import Kept
-from ..state import Array, clip
+from ..state import Array
 from ..world import World
 
 if TYPE_CHECKING:
@@ -25,10 +23,12 @@ Values = Mapping[str, Any]
 
 
 class Setting(NamedTuple):
-    """A setting that is no coefficient of a vehicle."""
+    """A setting of a sensor or of the estimate."""
 
     default: float | tuple[float, ...] | None
     limits: Limits
+    coefficient: str = ""
+    """Number of the vehicle's file that replaces the default; one of both has to be there."""
 
 
 SAMPLING: Final = {
@@ -41,18 +41,6 @@ SAMPLING: Final = {
 }
 
 
-class Reading(NamedTuple):
-    """What a sensor adds to an observation; the names are those of an `ArraySpec`."""
-
-    name: str
-    shape: tuple[int, ...]
-    low: tuple[float, ...]
-    high: tuple[float, ...]
-    unit: tuple[str, ...]
-    frame: str
-    components: tuple[str, ...]
-
-
 class Source(Kept):
     """Base of sensors and of the estimate.
 
@@ -62,13 +50,13 @@ class Source(Kept):
 
     Class attributes:
         name: In the option `sensors`, and of the observation's array.
-        settings: Settings that are no coefficients of a vehicle.
+        own: Settings that are no coefficients of a vehicle.
         frame: Of the reading; so are `components` and `units`.
     """
 
     name: ClassVar[str]
-    settings: ClassVar[Mapping[str, Setting]] = {}
-    frame: ClassVar[str] = ""
+    own: ClassVar[Mapping[str, Setting]] = {}
+    frame: ClassVar[str]
     components: ClassVar[tuple[str, ...]]
     units: ClassVar[tuple[str, ...]]
 
@@ -83,38 +71,42 @@ class Source(Kept):
     def low(self) -> list[float]:
         return [-bound for bound in self.high()]
 
-    @property
-    def reading(self) -> Reading:
-        """Spec of a reading."""
-        low = tuple(self.low())
-        high = tuple(self.high())
-        shape = (len(high),)
-        return Reading(self.name, shape, low, high, self.units, self.frame, self.components)
-
     @classmethod
-    def limits(cls) -> dict[str, Limits]:
-        """Limits of all settings by name."""
-        return {name: setting.limits for name, setting in cls.settings.items()}
+    def settings(cls) -> Mapping[str, Setting]:
+        """All settings by name."""
+        return cls.own
 
     @classmethod
     def checked(cls, given: Values) -> dict[str, Any]:
         """Settings by name as plain values. Raises `InputError`."""
-        limits = cls.limits()
-        check_names(given, limits, f"sensors.{cls.name}")
-        settings = {}
+        settings = cls.settings()
+        check_names(given, settings, f"sensors.{cls.name}")
+        values = {}
         for name, value in given.items():
-            number = check(f"sensors.{cls.name}.{name}", limits[name], value)
-            settings[name] = list(number) if isinstance(number, tuple) else number
-        return settings
+            number = check(f"sensors.{cls.name}.{name}", settings[name].limits, value)
+            values[name] = list(number) if isinstance(number, tuple) else number
+        return values
 
     @classmethod
     def resolved(cls, given: Values, vehicle: "Vehicle", period: float) -> dict[str, Any]:
         """All settings: those given, else those of the vehicle, else the defaults."""
-        return {name: one.default for name, one in cls.settings.items()} | dict(given)
+        values = {}
+        for name, (value, _, coefficient) in cls.settings().items():
+            if coefficient:
+                own = getattr(vehicle.coefficients.sensors, coefficient)
+                value = value if own is None else own
+            value = given.get(name, value)
+            if coefficient and value is None:
+                raise InputError(
+                    f"sensors.{cls.name}: expected {name} here, or sensors.{coefficient} in the "
+                    "vehicle's file, got none"
+                )
+            values[name] = value
+        return values
 
 
 class Sensor(Source):
-    """Base of sensors: exact values and white noise, within bounds.
+    """Base of sensors: exact values and white noise.
 
     Class attributes:
         prefix: What its coefficients' names begin with in a vehicle's file.
@@ -128,68 +120,43 @@ class Sensor(Source):
     defaults: ClassVar[Mapping[str, float]] = {}
     columns: ClassVar[int]
 
-    def __init__(self, values: Values, interval: float) -> None:
-        super().__init__(values, interval)
-        self._low = np.array(self.low())
-        self._high = np.array(self.high())
-
     @classmethod
-    def limits(cls) -> dict[str, Limits]:
-        names = (*cls.needs, *cls.defaults)
-        numbers = {name: COEFFICIENTS[f"sensors.{cls.prefix}{name}"] for name in names}
-        sampling = {name: setting.limits for name, setting in SAMPLING.items()}
-        return numbers | super().limits() | sampling
+    def settings(cls) -> Mapping[str, Setting]:
+        settings: dict[str, Setting] = {}
+        for name in (*cls.needs, *cls.defaults):
+            coefficient = cls.prefix + name
+            limits = COEFFICIENTS[f"sensors.{coefficient}"]
+            settings[name] = Setting(cls.defaults.get(name), limits, coefficient)
+        return {**settings, **cls.own, **SAMPLING}
 
     @classmethod
     def resolved(cls, given: Values, vehicle: "Vehicle", period: float) -> dict[str, Any]:
         """With `every` and `lag`, control steps between readings and of the delay."""
-        values: dict[str, Any] = {name: one.default for name, one in SAMPLING.items()}
-        values |= cls.defaults
-        for name in (*cls.needs, *cls.defaults):
-            own = getattr(vehicle.coefficients.sensors, cls.prefix + name)
-            if own is not None:
-                values[name] = own
-            elif name in cls.needs and name not in given:
-                raise InputError(
-                    f"sensors.{cls.name}: expected {name} here, or sensors.{cls.prefix}{name} in "
-                    "the vehicle's file, got none"
-                )
-        values |= super().resolved(given, vehicle, period)
-        values["every"] = cls._every(values["rate"], period)
-        values["lag"] = cls._lag(values["delay"], period)
-        return values
-
-    @classmethod
-    def _every(cls, rate: float | None, period: float) -> int:
-        if rate is None:
-            return 1
-        steps = 1 / (rate * period)
-        if round(steps) < 1 or not _is_whole(steps):
+        values = super().resolved(given, vehicle, period)
+        rate = values["rate"]
+        delay = values["delay"]
+        every = 1.0 if rate is None else 1 / (rate * period)
+        if round(every) < 1 or not _is_whole(every):
             raise InputError(
                 f"sensors.{cls.name}.rate: expected the control rate of {1 / period:g} Hz over a "
                 f"whole number, got {rate:g} Hz"
             )
-        return round(steps)
-
-    @classmethod
-    def _lag(cls, delay: float, period: float) -> int:
-        steps = delay / period
-        if round(steps) > MAX_DELAY or not _is_whole(steps):
+        lag = delay / period
+        if round(lag) > MAX_DELAY or not _is_whole(lag):
             raise InputError(
                 f"sensors.{cls.name}.delay: expected a whole number of control periods of "
                 f"{period:g} s, at most {MAX_DELAY}, got {delay:g} s"
             )
-        return round(steps)
+        return values | {"every": round(every), "lag": round(lag)}
 
     def begin(self, mask: Array, normal: Array) -> None:
         """Draw an episode's errors for the drones of a mask."""
 
-    def read(self, world: World, normal: Array) -> Array:
-        """A reading, shape (W, A, k). The normals of drones that are not read are 0."""
-        return clip(self.measure(world, normal), self._low, self._high)
-
     def measure(self, world: World, normal: Array) -> Array:
-        """A reading that may leave the bounds."""
+        """A reading, shape (W, A, k), which may leave the bounds.
+
+        The normals of drones that are not read are 0.
+        """
         raise NotImplementedError
 
 

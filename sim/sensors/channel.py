@@ -6,7 +6,7 @@ from statistics import NormalDist
 import numpy as np
 
 from ..snapshots import Kept
-from ..state import Array, chosen, component
+from ..state import Array, chosen, clip, component, kept
 from ..world import World
 from .base import Sensor, Values
 
@@ -25,6 +25,7 @@ class Channel(Kept):
         self._lag = values["lag"]
         self.interval = self._every * period
         self.sensor = kind(values, self.interval)
+        self._bounds = np.array(self.sensor.low()), np.array(self.sensor.high())
         self._world = world
         # One number more than the sensor takes decides whether a reading is lost.
         self._noise = world.random.noise(f"sensor {kind.name}", kind.columns + 1)
@@ -47,7 +48,7 @@ class Channel(Kept):
     def begin(self, mask: Array) -> None:
         """First reading of the drones of a mask."""
         self.sensor.begin(mask, self._noise.normal(mask)[..., :-1])
-        first = self.sensor.read(self._world, self._noise.normal(mask)[..., :-1])
+        first = self._read(self._noise.normal(mask))
         self._held = chosen(mask, first, self._held)
         self._now = chosen(mask, _with(first, 1.0), self._now)
         old = _with(first, 0.0)
@@ -55,16 +56,19 @@ class Channel(Kept):
 
     def sample(self, mask: Array, steps: Array) -> None:
         """After a control step of the drones of a mask; `steps` counts those of each episode."""
-        due = mask if self._every == 1 else mask & (steps % self._every == 0)
+        due = mask & (steps % self._every == 0)
         fresh = due
         if np.any(due):
             normal = self._noise.normal(due)
-            reading = self.sensor.read(self._world, normal[..., :-1])
             fresh = due & (component(normal, -1) >= self._lost)
-            self._held = chosen(fresh, reading, self._held)
+            self._held = chosen(fresh, self._read(normal), self._held)
         first, *rest = [*self._late, _with(self._held, fresh)]
         self._now = chosen(mask, first, self._now)
-        self._late = [chosen(mask, new, old) for new, old in zip(rest, self._late, strict=True)]
+        self._late = list(kept(mask, rest, self._late))
+
+    def _read(self, normal: Array) -> Array:
+        """A reading within the sensor's bounds."""
+        return clip(self.sensor.measure(self._world, normal[..., :-1]), *self._bounds)
 
 
 def _with(reading: Array, fresh: Array) -> Array:

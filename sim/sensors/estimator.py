@@ -41,7 +41,7 @@ class Estimator(Source):
 
     name = "estimate"
     arrays = _PARTS
-    settings: ClassVar = {
+    own: ClassVar = {
         "attitude_time": _TIME,
         "height_time": _TIME,
         "position_time": _TIME,

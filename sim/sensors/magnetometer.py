@@ -21,7 +21,7 @@ class Magnetometer(Sensor):
     name = "magnetometer"
     prefix = "magnetometer_"
     columns = 3
-    settings: ClassVar = {"field": Setting(FIELD, Limits(-100.0, 100.0, "µT", count=3))}
+    own: ClassVar = {"field": Setting(FIELD, Limits(-100.0, 100.0, "µT", count=3))}
     frame = "body"
     components = ("field x", "field y", "field z")
     units = ("µT",) * 3
