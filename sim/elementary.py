@@ -4,7 +4,6 @@ Each works in the precision of its argument, float32 or float64. Series are Tayl
 is named.
 """
 
-from fractions import Fraction
 from math import factorial
 from typing import Final
 
@@ -13,28 +12,19 @@ from numpy.typing import NDArray
 
 Real = NDArray[np.floating]
 
-_PI: Final = Fraction(31415926535897932384626433832795028841971693993751, 10**49)
-_LOG2: Final = Fraction(69314718055994530941723212145817656807550013436026, 10**50)
+_TURN: Final = 0.6366197723675814  # 2 / π
 _SQRT_HALF: Final = 0.7071067811865476
-
-
-def _parts(value: Fraction, bits: int, count: int) -> tuple[float, ...]:
-    """A number as a sum of floats: each but the last has few bits, so that n · part is exact."""
-    found = []
-    rest = value
-    for _ in range(count - 1):
-        exponent = -(rest.denominator // rest.numerator).bit_length()
-        unit = Fraction(2) ** (exponent - bits + 1)
-        part = (rest // unit) * unit
-        found.append(float(part))
-        rest -= part
-    return (*found, float(rest))
-
-
 _SINGLE: Final = np.dtype(np.float32)
-_HALF_PI: Final = {True: _parts(_PI / 2, 10, 4), False: _parts(_PI / 2, 32, 3)}
-"""By whether the precision is single."""
-_LOG2_PARTS: Final = {True: _parts(_LOG2, 14, 2), False: _parts(_LOG2, 40, 2)}
+# By whether the precision is single, a number as a sum of floats: all but the last have few bits,
+# 10 and 32 of π / 2, 14 and 40 of log(2), so that their products with whole numbers are exact.
+_HALF_PI: Final = {
+    True: (1.5703125, 0.00048351287841796875, 3.1385570764541626e-07, 6.077100506506192e-11),
+    False: (1.5707963267341256, 6.077100506303966e-11, 2.0222662487959506e-21),
+}
+_LOG2_PARTS: Final = {
+    True: (0.693115234375, 3.1946184945309415e-05),
+    False: (0.6931471805592082, 7.371002565167799e-13),
+}
 
 
 def polynomial(x: Real, coefficients: list[float]) -> Real:
@@ -59,7 +49,7 @@ def cos(x: Real) -> Real:
 def _wave(x: Real, quarters: float) -> Real:
     """Sine of x plus `quarters` quarter turns: reduction by Cody and Waite, then a series."""
     is_single = x.dtype == _SINGLE
-    near = np.rint(x * float(2 / _PI))
+    near = np.rint(x * _TURN)
     rest = x
     for part in _HALF_PI[is_single]:
         rest = rest - near * part

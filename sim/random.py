@@ -228,11 +228,10 @@ class Draw:
         return words
 
     def _spread(self, drawn: Numbers, size: tuple[int, ...]) -> Array:
-        shape = self._random.shape
-        numbers = np.zeros((*shape, *size))
-        ids = self._ids if shape else ...
-        numbers[ids] = drawn.reshape(-1, *shape[1:], *size) if shape else drawn.reshape(size)
-        return numbers[()]
+        random = self._random
+        numbers = np.zeros((len(random.keys), random.drones, *size))
+        numbers[self._ids] = drawn.reshape(-1, random.drones, *size)
+        return numbers.reshape((*random.shape, *size))[()]
 
 
 class Noise(Kept):
@@ -276,37 +275,19 @@ class Noise(Kept):
 
         Shape (W, A, size). The other worlds get zeros, and their steps do not advance.
         """
-        shape = self._random.shape
-        if not shape:
-            if mask is not None and not mask:
-                return np.zeros(self._size)
-            return self._single()
-        if mask is None:
-            return self._take(self._worlds)
-        ids = np.flatnonzero(mask[:, 0])
-        numbers = np.zeros((*shape, self._size))
-        numbers[ids] = self._take(ids)
-        return numbers
-
-    def _single(self) -> Numbers:
-        left = self._left.item()
-        if left == 0:
-            self._fill(self._worlds)
-            left = self._ahead
-        self._left[0] = left - 1
-        self.step[0] += 1
-        row: Numbers = self._rows[0, self._ahead - left, 0]
-        return row.copy()
-
-    def _take(self, ids: NDArray[np.int64]) -> Numbers:
+        random = self._random
+        ids = self._worlds
+        if mask is not None:
+            ids = np.flatnonzero(mask[:, 0] if random.shape else mask)
         missing = ids[self._left[ids] == 0]
         if missing.size:
             self._fill(missing)
         left = self._left[ids]
         self._left[ids] = left - 1
         self.step[ids] += np.uint32(1)
-        rows: Numbers = self._rows[ids, self._ahead - left]
-        return rows
+        numbers = np.zeros((len(self._worlds), random.drones, self._size))
+        numbers[ids] = self._rows[ids, self._ahead - left]
+        return numbers.reshape((*random.shape, self._size))
 
     def _fill(self, ids: NDArray[np.int64]) -> None:
         random = self._random

@@ -124,10 +124,10 @@ class Randomization:
                 low, high = np.log(numbers)
                 values = np.exp(draw.uniform(float(low), float(high)))
             else:
-                share = draw.uniform(0.0, 1.0)
-                values = numbers[0] + 0.0 * share
-                for index in range(1, len(numbers)):
-                    values = np.where(share >= index / len(numbers), numbers[index], values)
+                count = len(numbers)
+                ends = [index / count for index in range(1, count)]
+                chosen = np.searchsorted(ends, draw.uniform(0.0, 1.0), side="right")
+                values = np.take(numbers, chosen)
             values = clip(values, limits.low, limits.high)
             drawn[name] = np.round(values) if name in WHOLE else values
         return drawn

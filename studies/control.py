@@ -14,6 +14,7 @@ import json
 import math
 import statistics
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from measuring import RESULTS, in_turns, medians, options, timed, write
@@ -78,9 +79,9 @@ def response(name: str, level: str) -> dict[str, float]:
     index, size, _, time, read = STEPS[level]
     effects = EffectOptions(motor_lag=lag_of(vehicle) > 0)
     world = make_world(vehicle, 1, effects=effects)
-    controller = make_controller(level, vehicle, vehicle.timestep, effects)
+    controller: Any = make_controller(level, vehicle, vehicle.timestep, effects)
     world.reset(np.True_, InitialState(position=np.array((0.0, 0.0, 1000.0))))
-    unit = controller.ranges()[index][0]
+    unit = controller.constants["action_scale"][index]
     action = np.zeros(4)
     seen = []
     for _ in range(round(time / vehicle.timestep)):

@@ -36,7 +36,7 @@ class Landing(Stage):
         """The controller and its action, made when the first drone lands."""
         vehicle = self._world.vehicle
         controller: Any = make_controller("velocity", vehicle, self._period, self._effects)
-        fastest, _ = controller.ranges()[2]
+        fastest = controller.constants["action_scale"][2]
         down = (0.0, 0.0, -min(1.0, DESCENT / fastest), 0.0)
         return controller, np.broadcast_to(down, (*self._world.shape, len(down)))
 

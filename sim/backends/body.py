@@ -26,14 +26,15 @@ Vector = tuple[Array, Array, Array]
 _NOTHING: Final = 1e-12  # of the largest number of its kind: what rounding leaves
 _TINY: Final = 1e-30  # keeps the slope of a square root finite where nothing turns
 _ZERO: Final[Vector] = (0.0, 0.0, 0.0)
-_BORTZ: Final = tuple(
-    2 * (zeta - 1) / (2 * math.pi) ** (2 * n)
-    for n, zeta in enumerate(
-        (math.pi**2 / 6, math.pi**4 / 90, math.pi**6 / 945, math.pi**8 / 9450, math.pi**10 / 93555),
-        start=1,
-    )
+_BORTZ: Final = (
+    0.03267274151216445,
+    0.00010564110705334667,
+    5.637370282876806e-07,
+    3.3571419266571038e-09,
+    2.0742872904159143e-11,
 )
-"""Of Bortz's coefficient without its pole at a turn: powers 0, 2... of the angle."""
+"""Of Bortz's coefficient without its pole at a turn, powers 0, 2... of the angle:
+2 (ζ(2 n) - 1) / (2 π)^(2 n), n = 1 to 5, with Riemann's ζ."""
 _CROSS: Final = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(2, 0, 1)
 """Of a cross product: (a × b)ᵢ = Σ _CROSS[i, j, k] aⱼ bₖ."""
 

@@ -4,14 +4,16 @@ A controller has no memory: what it needs of the past is in the state. An action
 within bounds, or is one of some choices.
 """
 
-from typing import TYPE_CHECKING, Final, Protocol
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Final, Protocol, cast
+
+import numpy as np
 
 from ...models.errors import InputError, shortened
 from ..effects import EffectOptions
 from ..state import Array, WorldState
 from .cascade import Attitude, Position, Rates, Velocity
 from .gains import Gains, shared_ranges
-from .mixed import MixedController
 from .thrusts import CollectiveThrust, RotorThrust
 
 if TYPE_CHECKING:
@@ -59,6 +61,27 @@ class Controller(Protocol):
         """
 
 
+class MixedController:
+    """Controllers of drones of one world whose vehicles are not all alike: each flies its drones.
+
+    Actions mean the same to all; the other attributes are those of the first. Arrays are NumPy's,
+    of shape (W, A, ...).
+    """
+
+    def __init__(self, controllers: Sequence[tuple[Controller, Sequence[int]]]) -> None:
+        self._controllers = controllers
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._controllers[0][0], name)
+
+    def thrust(self, action: Array, state: WorldState) -> Array:
+        """As `Controller.thrust`."""
+        thrusts = np.empty(state.thrust.shape)
+        for controller, drones in self._controllers:
+            thrusts[:, drones] = controller.thrust(action[:, drones], state.of(drones))
+        return thrusts
+
+
 def make_controller(
     level: str, vehicle: "Vehicle", period: float, effects: EffectOptions | None = None
 ) -> Controller:
@@ -83,7 +106,8 @@ def make_controller(
     if len(members) == 1:
         return controllers[0]
     drones = [[i for i, own in enumerate(members) if own is kind] for kind in kinds]
-    return MixedController(list(zip(controllers, drones, strict=True)))
+    mixed = MixedController(list(zip(controllers, drones, strict=True)))
+    return cast(Controller, mixed)
 
 
 def _lag(vehicle: "Vehicle", effects: EffectOptions) -> float:

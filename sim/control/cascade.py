@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 _ASIDE: Final = 1e-3  # Upside down every way to turn is as short: it is about x
 _TINY: Final = 1e-12  # Added to squares under a root, whose slope at 0 is infinite
 _POINTS: Final = 1025  # of the table that inverts a thrust curve: right to 1e-6
-_HEADING: Final = "world turned by the heading"
 
 
 class Rates:
@@ -47,15 +46,15 @@ class Rates:
 
     every_step = True
     choices = 0
+    low: tuple[float, ...] = (-1.0,) * 4
+    high: tuple[float, ...] = (1.0,) * 4
     components: tuple[str, ...] = ("collective thrust", "roll rate", "pitch rate", "yaw rate")
+    units: tuple[str, ...] = ("1", "rad/s", "rad/s", "rad/s")
     frame = "body"
 
     def __init__(self, vehicle: "Vehicle", gains: "Gains", effects: EffectOptions) -> None:
         self.gains = gains
-        self.low = (-1.0,) * len(self.components)
-        self.high = (1.0,) * len(self.components)
-        self.units = tuple(unit for _, unit in self.ranges())
-        self._sizes = tuple(size for size, _ in self.ranges())
+        self._sizes = self.sizes(gains)
         self.constants: dict[str, float | tuple[float, ...]] = {"action_scale": self._sizes}
         self._mass = vehicle.mass
         self._gravity = vehicle.gravity
@@ -63,8 +62,8 @@ class Rates:
         self._up = gains.highest - self._hover
         self._down = self._hover - gains.lowest
         self._inertia = vehicle.inertia.tolist()
-        limits = vehicle.thrust_low.tolist(), vehicle.thrust_high.tolist()
-        self._limits = list(zip(*limits, strict=True))
+        self._low = vehicle.thrust_low.tolist()
+        self._high = vehicle.thrust_high.tolist()
         self._throttle: tuple[Array, Array] | None = None
         if effects.thrust_curve:
             (curve,) = vehicle.coefficients.need("rotors.curve", "thrust_curve")
@@ -72,9 +71,9 @@ class Rates:
             thrust = np.maximum.accumulate(polynomial(curve, throttle))
             self._throttle = thrust, throttle
 
-    def ranges(self) -> list[tuple[float, str]]:
-        """Value of an action of 1, and its unit; 1 is the limit of a collective thrust."""
-        return [(1.0, "1"), *((rate, "rad/s") for rate in self.gains.most_rate)]
+    def sizes(self, gains: "Gains") -> tuple[float, ...]:
+        """Values of actions of 1; that of a collective thrust is 1, which is its limit."""
+        return (1.0, *gains.most_rate)
 
     def thrust(self, action: Array, state: WorldState) -> Array:
         """As `Controller.thrust`."""
@@ -94,7 +93,7 @@ class Rates:
     def mixed(self, collective: Array, torque: Parts) -> list[Array]:
         """Thrust of each rotor, N, for a collective thrust, N, and a torque, N·m."""
         gains = self.gains
-        (roll, pitch, yaw) = torque
+        roll, pitch, yaw = torque
         low = gains.lowest
         high = gains.highest
         added = [a * roll + b * pitch for a, b, _ in gains.mix]
@@ -119,11 +118,10 @@ class Rates:
         if lead != 1.0:
             now = parts_of(state.thrust)
             wanted = [old + lead * (new - old) for old, new in zip(now, wanted, strict=True)]
-        limited = zip(wanted, self._limits, strict=True)
-        commands = [clip(part, low, high) for part, (low, high) in limited]
+        commands = list(map(clip, wanted, self._low, self._high))
         if self._throttle is not None:
-            both = zip(commands, self._limits, strict=True)
-            commands = [high * np.interp(part / high, *self._throttle) for part, (_, high) in both]
+            both = zip(commands, self._high, strict=True)
+            commands = [high * np.interp(part / high, *self._throttle) for part, high in both]
         return stack(commands)
 
     def _scaled(self, action: Array) -> list[Array]:
@@ -144,13 +142,11 @@ class Attitude(Rates):
     """
 
     components = ("collective thrust", "roll", "pitch", "yaw rate")
-    frame = _HEADING
+    units = ("1", "rad", "rad", "rad/s")
+    frame = "world turned by the heading"
 
-    def ranges(self) -> list[tuple[float, str]]:
-        """As of `Rates`."""
-        gains = self.gains
-        tilt = (gains.most_tilt, "rad")
-        return [(1.0, "1"), tilt, tilt, (gains.most_rate[2], "rad/s")]
+    def sizes(self, gains: "Gains") -> tuple[float, ...]:
+        return 1.0, gains.most_tilt, gains.most_tilt, gains.most_rate[2]
 
     def thrust(self, action: Array, state: WorldState) -> Array:
         """As `Controller.thrust`."""
@@ -186,12 +182,11 @@ class Velocity(Attitude):
     """
 
     components = ("velocity x", "velocity y", "velocity z", "yaw rate")
+    units = ("m/s", "m/s", "m/s", "rad/s")
 
-    def ranges(self) -> list[tuple[float, str]]:
-        """As of `Rates`."""
-        gains = self.gains
+    def sizes(self, gains: "Gains") -> tuple[float, ...]:
         level, up = gains.most_velocity
-        return [(level, "m/s"), (level, "m/s"), (up, "m/s"), (gains.most_rate[2], "rad/s")]
+        return level, level, up, gains.most_rate[2]
 
     def thrust(self, action: Array, state: WorldState) -> Array:
         """As `Controller.thrust`."""
@@ -226,23 +221,23 @@ class Position(Velocity):
     """
 
     components = ("offset x", "offset y", "offset z", "offset of the heading")
+    units = ("m", "m", "m", "rad")
 
     def __init__(self, vehicle: "Vehicle", gains: "Gains", effects: EffectOptions) -> None:
         super().__init__(vehicle, gains, effects)
         self.constants["position_gain"] = gains.position
 
-    def ranges(self) -> list[tuple[float, str]]:
-        """As of `Rates`."""
-        level, up = self.gains.most_offset
-        return [(level, "m"), (level, "m"), (up, "m"), (math.pi, "rad")]
+    def sizes(self, gains: "Gains") -> tuple[float, ...]:
+        level, up = gains.most_offset
+        return level, level, up, math.pi
 
     def thrust(self, action: Array, state: WorldState) -> Array:
         """As `Controller.thrust`."""
         x, y, z, heading = self._scaled(action)
         axes = _axes(state.quaternion)
         gains = self.gains
-        (level, up) = gains.most_acceleration
-        (fast, climb) = gains.most_velocity
+        level, up = gains.most_acceleration
+        fast, climb = gains.most_velocity
         along = self._gain(_length(x, y), level, fast)
         x, y = _turned(axes[0], along * x, along * y)
         z = self._gain(_length(z), up, climb) * z
