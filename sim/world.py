@@ -127,7 +127,7 @@ class World:
         self._restore(part_of(arrays, "state"))
         if self.effects is not None:
             self.effects.restore(part_of(arrays, "effects"))
-            self.effects.take(self.state, self.parameters)
+            self.effects.take(self.parameters)
 
     def _kept(self) -> Arrays:
         """The backend's own arrays."""

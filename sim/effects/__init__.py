@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 from ...models.errors import InputError
 from ..random import GUSTS, Noise
+from ..rotations import Parts, add
 from ..snapshots import Kept
 from ..state import Array, WorldState, component
 from .air import AirEffects
@@ -77,7 +78,7 @@ class Effects(Kept):
         Factors of the drawn parameters by name, (W, A), for all worlds. Returns the thrusts of the
         worlds that begin, (W, A, R), N.
         """
-        self.take(state, factors)
+        self.take(factors)
         thrust = state.thrust
         if self.on_rotors:
             thrust = self.rotors.begin(mask, thrust, factors)
@@ -90,21 +91,21 @@ class Effects(Kept):
         return thrust
 
     @property
-    def wind(self) -> list[Array]:
+    def wind(self) -> Parts:
         """Velocity of the air without downwash, world frame, m/s: x, y, z.
 
         Each has the shape (W, A), or is one number for all.
         """
         if self._gusts is None:
             return self._wind
-        return [mean + gust for mean, gust in zip(self._wind, self._gusts.velocity, strict=True)]
+        return add(self._wind, self._gusts.velocity)
 
-    def take(self, state: WorldState, factors: dict[str, Array]) -> None:
-        """Take factors as of `begin`, for arrays like those of a state."""
+    def take(self, factors: dict[str, Array]) -> None:
+        """Take factors as of `begin`."""
         if self.on_rotors:
-            self.rotors.take(state.thrust, factors)
+            self.rotors.take(factors)
         if self.on_body:
-            self.air.take(state.position, factors)
+            self.air.take(factors)
         both = zip(self._mean_wind, "xyz", strict=True)
         self._wind = [mean + factors.get(f"wind_{axis}", 0.0) for mean, axis in both]
 
@@ -132,5 +133,5 @@ class Effects(Kept):
             self._gusts.step(mask, self._noise.normal(mask))
         wind = self.wind
         if self._downwash is not None and state.position.ndim > 2 and state.position.shape[1] > 1:
-            wind = [a + b for a, b in zip(wind, self._downwash.air(state), strict=True)]
+            wind = add(wind, self._downwash.air(state))
         return mean, end, self.air.step(state, mean, root, wind, mask)

@@ -12,7 +12,7 @@ from ..rotations import Parts, Rows, add, cross, dot, matrix, parts_of, product,
 from ..snapshots import Kept
 from ..state import Array, WorldState, clip, component, each, kept, square_root, stack
 from .options import EffectOptions
-from .rotors import split, total
+from .rotors import total
 
 if TYPE_CHECKING:
     from ...models.vehicle import Vehicle
@@ -46,6 +46,7 @@ class AirEffects(Kept):
         coefficients = vehicle.coefficients
         self._center: Parts = tuple(vehicle.center_of_mass.tolist())
         self._geometry = np.array([(*rotor.position, *rotor.axis) for rotor in vehicle.rotors])
+        self._rotors = self._geometry.tolist()
         if options.body_drag:
             drag = coefficients.drag
             if drag == Drag():
@@ -106,18 +107,16 @@ class AirEffects(Kept):
         """Begin at the motion of a state."""
         self._before = kept(mask, _motion(state), self._before)
 
-    def take(self, position: Array, factors: dict[str, Array]) -> None:
-        """Take the factors of drawn parameters, (W, A), by name, for positions of this shape."""
+    def take(self, factors: dict[str, Array]) -> None:
+        """Take the factors of drawn parameters, (W, A), by name."""
         self._factors = factors
-        single = position.ndim == 1
-        self._rotors = self._geometry.tolist() if single else [list(self._geometry.T)]
 
     def step(
         self,
         state: WorldState,
         thrust: Array,
         root: Array | None,
-        wind: list[Array],
+        wind: Parts,
         mask: Array | None,
     ) -> Array:
         """Mean force, world frame, N, and torque about the body's origin, body frame, N·m.
@@ -141,16 +140,21 @@ class AirEffects(Kept):
         if self._options.rotor_drag or self._options.ground_effect:
             height = component(state.position, 2) + self._half * ahead[2]
             around = [each(number) for number in (*v, *w, *turn[2], height)]
-            push: Parts = _NOTHING
-            twist: Parts = _NOTHING
-            parts = split(thrust)
-            roots = [None] * len(parts) if root is None else split(root)
-            for rotor, part, mean_root in zip(self._rotors, parts, roots, strict=True):
-                one = self._push(rotor, part, mean_root, around)
-                push = add(push, one)
-                twist = add(twist, cross(rotor[:3], one))
-            force = add(force, [total([x]) for x in push])
-            torque = add(torque, [total([x]) for x in twist])
+            if thrust.ndim > 1:
+                push: Parts = self._push(self._geometry.T, thrust, root, around)
+                force = add(force, list(map(total, push)))
+                torque = add(torque, list(map(total, cross(list(self._geometry.T), push))))
+            else:  # numbers are faster than arrays of a few rotors
+                push = _NOTHING
+                twist: Parts = _NOTHING
+                parts = thrust.tolist()
+                roots = [None] * len(parts) if root is None else root.tolist()
+                for rotor, part, mean_root in zip(self._rotors, parts, roots, strict=True):
+                    one = self._push(rotor, part, mean_root, around)
+                    push = add(push, one)
+                    twist = add(twist, cross(rotor, one))
+                force = add(force, push)
+                torque = add(torque, twist)
         return stack((*times(turn, force), *torque))
 
     def _body(self, v: Parts, w: Parts) -> tuple[Parts, Parts]:
@@ -171,7 +175,7 @@ class AirEffects(Kept):
         return (x, y, z), torque
 
     def _push(self, rotor: Array, thrust: Array, root: Array | None, around: list[Array]) -> Parts:
-        """Force of a part of the rotors besides their thrust, body axes; the root as of `step`.
+        """Forces of rotors besides their thrusts, body axes; thrust and root as of `step`.
 
         `around`: velocity, body rates, the upward component of each body axis, and the height of
         the body's origin.

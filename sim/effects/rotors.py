@@ -1,23 +1,16 @@
-"""From the command of a rotor to its thrust: throttle, curve, battery, lag, efficiency.
+"""From the command of a rotor to its thrust: throttle, curve, battery, lag, efficiency."""
 
-Rotors are a list of parts: of a single drone a number for each, of a batch one array (W, A, R).
-"""
-
-from collections.abc import Sequence
-from operator import mul
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ...models.errors import InputError
 from ..snapshots import Kept
-from ..state import Array, chosen, clip, component, each, kept, plain, square_root, stack
+from ..state import Array, chosen, clip, component, each, plain, square_root, stack
 from .options import EffectOptions
 
 if TYPE_CHECKING:
     from ...models.vehicle import Vehicle
-
-Parts = Sequence[Array]
 
 
 class RotorEffects(Kept):
@@ -38,8 +31,7 @@ class RotorEffects(Kept):
         voltage: At its terminals, V, shape (W, A).
     """
 
-    arrays = ("charge", "voltage")
-    lists = ("_roots",)
+    arrays = ("charge", "voltage", "_roots")
 
     def __init__(self, vehicle: "Vehicle", options: EffectOptions) -> None:
         self._options = options
@@ -81,7 +73,7 @@ class RotorEffects(Kept):
             raise InputError(
                 f"effects: efficiency: expected {count} numbers, one for each rotor, got {share}"
             )
-        self._scales: list[Parts] = []
+        self._rotors = [f"thrust_{number}" for number in range(1, count + 1)]
         self._roots: Array = None  # of the thrusts, proportional to the rotors' speeds
         self.charge: Array = None
         self.voltage: Array = None
@@ -91,32 +83,25 @@ class RotorEffects(Kept):
 
         Returns the thrusts that they give, (W, A, R), N.
         """
-        roots = [square_root(part) for part in split(thrust)]
-        self._roots = kept(mask, roots, self._roots)
+        self._roots = chosen(mask, square_root(thrust), self._roots)
         if self._options.battery:
             charge = factors.get("battery_charge", 1.0) + 0.0 * component(thrust, 0)
             self.charge = chosen(mask, charge, self.charge)
             self.voltage = chosen(mask, self._terminal(), self.voltage)
-        return _join(self._scaled(split(thrust)))
+        return self._scaled(thrust)
 
-    def take(self, thrust: Array, factors: dict[str, Array]) -> None:
-        """Take the factors of drawn parameters, (W, A), by name, for thrusts of this shape."""
+    def take(self, factors: dict[str, Array]) -> None:
+        """Take the factors of drawn parameters, (W, A), by name."""
         options = self._options
-        single = thrust.ndim == 1
-        low, high = self._limits
-        self._low = low.tolist() if single else [low]
-        self._high = high.tolist() if single else [high]
-        self._scales = []
+        self._scales: list[Array] = []
         if options.efficiency:
-            share = options.efficiency
-            self._scales.append(list(share) if single else [np.array(share)])
+            self._scales.append(np.array(options.efficiency))
         if "thrust" in factors:
-            self._scales.append([each(factors["thrust"])] * len(self._low))
-        names = [f"thrust_{number}" for number in range(1, thrust.shape[-1] + 1)]
-        if factors.keys() & set(names):
-            self._scales.append(split(stack([factors.get(name, 1.0) for name in names])))
+            self._scales.append(each(factors["thrust"]))
+        if factors.keys() & set(self._rotors):
+            self._scales.append(stack([factors.get(name, 1.0) for name in self._rotors]))
         if options.motor_lag:
-            scale = each(factors["time_constant"]) if "time_constant" in factors else 1.0
+            scale = each(factors.get("time_constant", 1.0))
             self._answers = [self._answer(time * scale) for time in self._times]
 
     def step(self, command: Array, mask: Array | None) -> tuple[Array, Array, Array | None]:
@@ -126,43 +111,37 @@ class RotorEffects(Kept):
         where the thrusts do not change over it.
         """
         options = self._options
-        limits = zip(split(command), self._low, self._high, strict=True)
-        target = [clip(part, low, high) for part, low, high in limits]
+        low, high = self._limits
+        target = clip(command, low, high)
         if options.thrust_curve:
-            both = zip(target, self._high, strict=True)
-            target = [h * clip(polynomial(self._curve, part / h), 0.0, 1.0) for part, h in both]
+            target = high * clip(polynomial(self._curve, target / high), 0.0, 1.0)
         if options.battery:
             if not options.motor_lag:
                 self.voltage = chosen(mask, self._loaded(target), self.voltage)
             share = self.voltage / self._full
-            scale = each(share * share)
-            target = [part * scale for part in target]
-        mean: Parts = target
-        end = target
-        middle: Parts | None = None
+            target = target * each(share * share)
+        mean = end = target
+        middle = None
         if options.motor_lag:
-            wanted = map(square_root, target)
-            mean, roots, middle = zip(*map(self._follow, self._roots, wanted), strict=True)
-            end = [root * root for root in roots]
-            self._roots = kept(mask, roots, self._roots)
+            mean, roots, middle = self._follow(square_root(target))
+            end = roots * roots
+            self._roots = chosen(mask, roots, self._roots)
         if options.battery:
             used = self._power(mean) / self.voltage * (self._step / self._coulombs)
             left = clip(self.charge - used, 0.0, 1.0)
             self.charge = chosen(mask, left, self.charge)
             if options.motor_lag:
                 self.voltage = self._terminal()
-        speed = None
         if middle is not None:
-            for scales in self._scales:
-                middle = list(map(mul, middle, map(square_root, scales)))
-            speed = _join(middle)
-        return _join(self._scaled(mean)), _join(self._scaled(end)), speed
+            for scale in self._scales:
+                middle = middle * square_root(scale)
+        return self._scaled(mean), self._scaled(end), middle
 
-    def _scaled(self, parts: Parts) -> Parts:
+    def _scaled(self, thrust: Array) -> Array:
         """Thrusts after the efficiency and the drawn factors."""
-        for scales in self._scales:
-            parts = list(map(mul, parts, scales))
-        return parts
+        for scale in self._scales:
+            thrust = thrust * scale
+        return thrust
 
     def _answer(self, time: Array) -> tuple[Array, Array, Array]:
         """Of exp(-t / time) over a physics step: 1 - its end, its mean, the mean of its square."""
@@ -170,26 +149,22 @@ class RotorEffects(Kept):
         gone = -plain(np.expm1(-ratio))
         return gone, gone / ratio, gone * (2 - gone) / (2 * ratio)
 
-    def _follow(self, root: Array, wanted: Array) -> tuple[Array, Array, Array]:
-        """A root that follows `wanted` over a step: its mean square, its end and its mean."""
-        off = root - wanted
-        answer = self._answers[0]
+    def _follow(self, wanted: Array) -> tuple[Array, Array, Array]:
+        """Roots that follow `wanted` over a step: their mean square, their end and their mean."""
+        off = self._roots - wanted
+        gone, first, second = self._answers[0]
         if len(self._answers) == 2:
             rises = off < 0
-            if isinstance(off, float):
-                answer = self._answers[not rises]
-            else:
-                pairs = zip(*self._answers, strict=True)
-                answer = tuple(np.where(rises, up, down + 0.0 * off) for up, down in pairs)
-        gone, first, second = answer
+            pairs = zip(*self._answers, strict=True)
+            gone, first, second = (np.where(rises, up, down + 0.0 * off) for up, down in pairs)
         # The square of: wanted + off · exp(-t / time).
         mean = wanted * wanted + off * (2 * wanted * first + off * second)
-        return mean, root - off * gone, wanted + off * first
+        return mean, self._roots - off * gone, wanted + off * first
 
     def _open_voltage(self) -> Array:
         return self._empty + (self._full - self._empty) * self.charge
 
-    def _loaded(self, target: Parts) -> Array:
+    def _loaded(self, target: Array) -> Array:
         """Voltage where the rotors give `target` · (voltage / full)² at once."""
         opened = self._open_voltage()
         drop = self._resistance * self._power(target) / self._full**3
@@ -198,34 +173,21 @@ class RotorEffects(Kept):
     def _terminal(self) -> Array:
         """Voltage at the rotors' speeds; half the open one if they need more than there is."""
         opened = self._open_voltage()
-        power = self._power([root * root for root in self._roots])
+        power = self._power(self._roots * self._roots)
         rest = opened * opened - 4 * self._resistance * power
         return 0.5 * (opened + square_root(rest))
 
-    def _power(self, thrusts: Parts) -> Array:
+    def _power(self, thrust: Array) -> Array:
         """Electrical power of all rotors, W, shape (W, A)."""
-        return self._watts * total([part * square_root(part) for part in thrusts])
+        return self._watts * total(thrust * square_root(thrust))
 
 
-def split(values: Array) -> Parts:
-    """Rotors' numbers, (W, A, R), as parts."""
-    return values.tolist() if values.ndim == 1 else [values]
-
-
-def total(parts: Parts) -> Array:
+def total(values: Array) -> Array:
     """Sum over the rotors, one after the other: the same bits alone and in a batch."""
-    if not isinstance(parts[0], float):
-        values = parts[0]
-        parts = [values[..., index] for index in range(values.shape[-1])]
-    result = parts[0]
-    for part in parts[1:]:
-        result = result + part
+    result = component(values, 0)
+    for rotor in range(1, values.shape[-1]):
+        result = result + component(values, rotor)
     return result
-
-
-def _join(parts: Parts) -> Array:
-    """The reverse of `split`."""
-    return np.array(parts) if isinstance(parts[0], float) else parts[0]
 
 
 def polynomial(coefficients: tuple[float, ...], x: Array) -> Array:

@@ -196,6 +196,7 @@ def test_battery_charge_by_integration() -> None:
     voltage = 1 / (1 / 12.6 + b * seconds)
     rotors = RotorEffects(vehicle, EffectOptions(battery=True))
     thrust = np.full(4, HOVER)
+    rotors.take({})
     rotors.begin(np.True_, thrust, {})
     assert rotors.charge == 1.0
     for _ in range(round(seconds / H)):
