@@ -183,7 +183,7 @@ def test_wrong_seeds(seed: Any) -> None:
     [
         ({"num_envs": 0}, "num_envs: expected 1 to 65536, got 0"),
         ({"num_envs": 10**9}, "num_envs: expected 1 to 65536, got 1000000000"),
-        ({"num_threads": -1}, "num_threads: expected 0 or more, got -1"),
+        ({"num_threads": -1}, "num_threads: expected a whole number of at least 0, got -1"),
         ({"device": "cuda"}, "options: expected some of target, .*, got an .* .device"),
         ({"backend": "bullet"}, "backend: expected mujoco or rigid, got 'bullet'"),
         ({"autoreset_mode": "never"}, "autoreset_mode: expected 'NextStep' or 'SameStep'"),
