@@ -12,7 +12,7 @@ from .errors import InputError, shortened
 from .files import find_in_package
 from .library import find_vehicle
 from .mjcf import read_xml
-from .vehicle_file import read_vehicle_file
+from .vehicle_file import model_of
 
 MAX_BYTES: Final = 1 << 26
 """Largest size of all files of a vehicle."""
@@ -26,7 +26,7 @@ def read_bundle(vehicle: Path | str) -> Bundle:
     """A vehicle's file, and all files that it names by relative paths. Raises `InputError`."""
     path = find_vehicle(vehicle)
     try:
-        files = _files_of(path)
+        files = list(dict.fromkeys([path, *_with_assets(model_of(path))]))
         size = sum(file.stat().st_size for file in files)
         if size > MAX_BYTES:
             raise InputError(f"vehicle: expected files of at most {MAX_BYTES} bytes, got {size}")
@@ -91,14 +91,6 @@ def _is_file(pair: object) -> bool:
     return bool(path.parts) and not path.is_absolute() and ".." not in path.parts
 
 
-def _files_of(file: Path) -> list[Path]:
-    """A vehicle's file first, and the files that it needs, each once."""
-    if file.suffix.lower() != ".toml":
-        return _with_assets(file)
-    model = read_vehicle_file(file).model
-    return [file] if model is None else [file, *_with_assets(model)]
-
-
 def _with_assets(model: Path) -> list[Path]:
     """An MJCF or URDF file, what it includes, and its meshes, height fields and textures.
 
@@ -119,7 +111,7 @@ def _with_assets(model: Path) -> list[Path]:
         for name, text in element.items():
             if name.startswith("file") and text and not Path(text).is_absolute():
                 parts += _found(text, folders)
-    return list(dict.fromkeys(parts))
+    return parts
 
 
 def _found(text: str, folders: Sequence[Path]) -> list[Path]:

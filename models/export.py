@@ -9,7 +9,7 @@ from .files import check_new_file, write_new
 from .library import find_vehicle
 from .mjcf import read_spec
 from .vehicle import Vehicle
-from .vehicle_file import read_vehicle_file
+from .vehicle_file import model_of
 
 
 def export_mjcf(vehicle: Path | str, out: Path) -> None:
@@ -17,15 +17,13 @@ def export_mjcf(vehicle: Path | str, out: Path) -> None:
     check_new_file(out, ".xml")
     path = find_vehicle(vehicle)
     Vehicle.load(path)  # refuses what cannot fly
-    if path.suffix.lower() == ".toml":
-        path = read_vehicle_file(path).model or path
     try:
-        root = ElementTree.fromstring(read_spec(find_vehicle(vehicle)).to_xml())
+        root = ElementTree.fromstring(read_spec(path).to_xml())
     except (ValueError, RuntimeError) as error:
         raise InputError(f"vehicle: expected a model that MuJoCo can write, got {error}") from None
     for compiler in root.iter("compiler"):  # folders of meshes and textures, as seen from `out`
         for key in ("meshdir", "texturedir"):
-            folder = path.parent / compiler.get(key, "")
+            folder = model_of(path).parent / compiler.get(key, "")
             compiler.set(key, os.path.relpath(folder, out.resolve().parent))
     text = ElementTree.tostring(root, encoding="unicode") + "\n"
     write_new(out, text)

@@ -28,7 +28,7 @@ _ARRAYS: Final = {
 }
 """Largest attributes of the elements whose product is a number of numbers."""
 _REPEATED: Final = ("replicate", "composite", "flexcomp")
-_UNITS: Final = {"K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40, "P": 1 << 50, "E": 1 << 60}
+_UNITS: Final = "KMGTPE"  # each is 1024 times the one before
 _GROUNDS: Final = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
 
 
@@ -157,8 +157,8 @@ def _check_element(element: ElementTree.Element) -> None:
         if _whole(text) > most:
             _refuse(f"a {name} of at most {most} in <{element.tag}>", text)
     memory = element.get("memory", "0").strip().upper()
-    unit = _UNITS.get(memory[-1:], 1)
-    if _whole(memory.rstrip("".join(_UNITS))) * unit > MAX_MEMORY:
+    number = _whole(memory.rstrip(_UNITS))
+    if number << 10 * (_UNITS.find(memory[-1:]) + 1) > MAX_MEMORY:
         _refuse(f"a memory of at most {MAX_MEMORY >> 30}G", memory)
 
 

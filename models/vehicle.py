@@ -23,7 +23,7 @@ from .errors import InputError
 from .fields import Limits, check
 from .library import find_vehicle
 from .mjcf import free_body, level_data, vehicle_spec
-from .vehicle_file import inertia_matrix, read_vehicle_file
+from .vehicle_file import inertia_matrix, model_of, read_vehicle_file
 
 _LEAST_TIMESTEP: Final = 1e-5  # s: a control step of 0.02 s then takes a hundredth of a second
 _MAX_TIMESTEP: Final = 1.0  # s: that of the longest control step
@@ -108,7 +108,7 @@ class Vehicle:
         # No negative zero.
         drag = check("linear_drag", Limits(0.0, MAX_DRAG, "/s"), linear_drag) + 0.0
         try:
-            changed = tuple(one.stat().st_mtime_ns for one in _files(file))
+            changed = tuple(one.stat().st_mtime_ns for one in (file, model_of(file)))
         except OSError as error:
             raise InputError(f"vehicle: cannot read {path}: {error.strerror}") from None
         return _load(file, drag, changed)
@@ -178,44 +178,34 @@ class Vehicle:
             )
         return round(ratio)
 
-    def with_payload(self, mass: float, cable: float) -> mujoco.MjModel:
-        """The model with a ball of a mass, kg, on a cable of a length, m, from the body's origin.
-
-        The cable is a tendon that is slack below its length, and as stiff as MuJoCo's limits. The
-        ball has the density of water, and a free joint: `qpos` and `qvel` have it after the craft.
-        Centers of mass may be moved. Raises `InputError` if the ball touches the craft when it
-        hangs straight below.
-        """
-        spec, craft = self._spec()
-        radius = payload_radius(mass)
-        hang_payload(spec, {"": craft}, mass, cable)
-        model = self._compiled(spec)
-        data = mujoco.MjData(model)
-        data.qpos[2] = high = self.rest_height + 2 * (cable + radius)
-        data.qpos[7:10] = (0.0, 0.0, high - cable)
-        if _touches(model, data, high):
-            expected = f"a length at which a payload with a radius of {radius:.3g} m hangs clear"
-            raise InputError(f"effects: cable: expected {expected}, got {cable:g} m")
-        return model
-
-    def with_movable_center(self) -> mujoco.MjModel:
+    def movable(self, payload: float = 0.0, cable: float = 0.0) -> mujoco.MjModel:
         """The model, compiled so that centers of mass may be moved: MuJoCo spares work where one
         is the body's origin.
-        """
-        return self._compiled(self._spec()[0])
 
-    def _spec(self) -> tuple[mujoco.MjSpec, mujoco.MjsBody]:
-        """Vehicle and ground to be changed, and the free body in them."""
+        A payload, kg, is a ball on a cable of a length, m, from the body's origin. The cable is a
+        tendon that is slack below its length, and as stiff as MuJoCo's limits. The ball has the
+        density of water, and a free joint: `qpos` and `qvel` have it after the craft. Raises
+        `InputError` if the ball touches the craft when it hangs straight below.
+        """
         spec = vehicle_spec(self.path)
         craft = free_body(spec)
         craft.simple = False  # its inertia is no diagonal matrix once its center has moved
-        return spec, craft
-
-    def _compiled(self, spec: mujoco.MjSpec) -> mujoco.MjModel:
+        if payload:
+            hang_payload(spec, {"": craft}, payload, cable)
         model = spec.compile()
         model.dof_damping[0:3] = self.model.dof_damping[0:3]
         _group(model)
+        if payload and self._meets(model, payload_radius(payload), cable):
+            clear = f"a payload with a radius of {payload_radius(payload):.3g} m hangs clear"
+            raise InputError(f"effects: cable: expected a length at which {clear}, got {cable:g} m")
         return model
+
+    def _meets(self, model: mujoco.MjModel, radius: float, cable: float) -> bool:
+        """Whether a payload touches the craft when it hangs straight below."""
+        data = mujoco.MjData(model)
+        high = self.rest_height + 2 * (cable + radius)
+        data.qpos[7:10] = (0.0, 0.0, high - cable)
+        return _touches(model, data, high)
 
     def __deepcopy__(self, memo: object) -> Self:
         """Itself: it never changes."""
@@ -242,7 +232,7 @@ def _compile(path: Path) -> tuple[mujoco.MjSpec, str, mujoco.MjModel, mujoco.MjD
         raise
     except (ValueError, RuntimeError, mujoco.FatalError) as error:
         reason = " ".join(str(error).split())
-        kind = "a vehicle" if _is_toml(path) else "an MJCF file"
+        kind = "a vehicle" if path.suffix.lower() == ".toml" else "an MJCF file"
         raise InputError(f"vehicle: expected {kind}, got {path.name}: {reason}") from None
     return spec, text, model, data
 
@@ -257,7 +247,7 @@ def hang_payload(
 ) -> None:
     """Add a ball of a mass, kg, and a cable of a length, m, to it from each craft's origin.
 
-    The crafts have the prefixes of their names as keys. See `Vehicle.with_payload`.
+    The crafts have the prefixes of their names as keys. See `Vehicle.movable`.
     """
     ball = spec.worldbody.add_body(name=_PAYLOAD)
     ball.pos = next(iter(crafts.values())).pos - (0.0, 0.0, cable)
@@ -292,7 +282,7 @@ def _group(model: mujoco.MjModel) -> None:
 
 
 def payload_body(model: mujoco.MjModel) -> int:
-    """Id of the payload of a model from `Vehicle.with_payload`."""
+    """Id of the payload of a model from `Vehicle.movable`."""
     return int(model.body(_PAYLOAD).id)
 
 
@@ -486,23 +476,11 @@ def _touches(model: mujoco.MjModel, data: mujoco.MjData, height: float) -> bool:
 
 def _hash(spec: mujoco.MjSpec, text: str, path: Path, drag: float) -> str:
     digest = blake2b(text.encode() + b"\0" + struct.pack("<d", drag), digest_size=16)
-    folder = path.parent
-    if _is_toml(path):
-        table = read_vehicle_file(path)
-        digest.update(table.content.encode())
-        folder = folder if table.model is None else table.model.parent
+    folder = model_of(path).parent
+    if path.suffix.lower() == ".toml":
+        digest.update(read_vehicle_file(path).content.encode())
     for asset in (*spec.meshes, *spec.hfields):
         file = folder / spec.meshdir / asset.file
         if asset.file and file.is_file():
             digest.update(file.read_bytes())
     return digest.hexdigest()
-
-
-def _files(path: Path) -> tuple[Path, ...]:
-    """A vehicle's file, and that of its model if it names one."""
-    model = read_vehicle_file(path).model if _is_toml(path) else None
-    return (path,) if model is None else (path, model)
-
-
-def _is_toml(path: Path) -> bool:
-    return path.suffix.lower() == ".toml"

@@ -284,6 +284,13 @@ def read_vehicle_file(path: Path) -> VehicleFile:
         ) from None
 
 
+def model_of(path: Path) -> Path:
+    """The model's file that a vehicle's TOML file names; else the file itself."""
+    if path.suffix.lower() != ".toml":
+        return path
+    return read_vehicle_file(path).model or path
+
+
 def _read(path: Path, tree: dict[str, object]) -> VehicleFile:
     numbers: list[Number] = []
     name = path.parent.name if path.stem == "vehicle" else path.stem

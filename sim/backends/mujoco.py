@@ -113,9 +113,9 @@ class MujocoWorld(World):
         if drones > 1:
             crafts = members_of(vehicle, drones)
             return swarm_model(crafts, movable=movable, payload=payload * drones, cable=cable)
-        if payload:
-            return vehicle.with_payload(payload, cable)
-        return vehicle.with_movable_center() if movable else vehicle.model
+        if movable or payload:
+            return vehicle.movable(payload, cable)
+        return vehicle.model
 
     def reset(self, mask: Array, pose: InitialState) -> None:
         """As `World.reset`. Raises `InputError` for a payload that would hang in the ground."""

@@ -582,7 +582,7 @@ def test_a_cable_is_slack_in_free_fall() -> None:
 
 def pendulum(vehicle: Vehicle, mass: float, cable: float, angle: float) -> tuple[Any, Any]:
     """Model and data with a payload that hangs at an angle in x, under a craft at 50 m."""
-    model = vehicle.with_payload(mass, cable)
+    model = vehicle.movable(mass, cable)
     data = mujoco.MjData(model)
     data.qpos[:7] = (0, 0, 50, 1, 0, 0, 0)
     data.qpos[7:10] = (cable * sin(angle), 0, 50 - cable * cos(angle))
