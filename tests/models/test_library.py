@@ -124,3 +124,11 @@ def test_with_the_menagerie_s_turn_directions_the_skydio_x2_cannot_yaw(tmp_path:
     allocation = Vehicle.load(file).allocation
     assert np.linalg.matrix_rank(allocation, rtol=1e-6) == 3
     assert allocation[3] == pytest.approx(allocation[1] * 0.0201 / 0.18)
+
+
+def test_the_crazyflies_rangefinder_has_the_noise_of_its_driver_at_its_limit() -> None:
+    """zranger2.c: 2.5 mm · (1 + exp(k (d - 2.5 m))), which is 5 mm at d = 2.5 m."""
+    for name in ("crazyflie2", "crazyflie_brushless"):
+        sensors = Vehicle.load(name).coefficients.sensors
+        assert sensors.range_noise == 0.005
+        assert sensors.range_limit == 2.5

@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import mujoco
@@ -263,71 +264,40 @@ def test_a_file_that_was_written_anew_is_loaded_anew(tmp_path: Path) -> None:
 
 # --- what is no vehicle ---------------------------------------------------------------------------
 
-FREE = '<freejoint name="free"/>'
-WALL = '<worldbody><geom type="plane" size="1 1 1"/><geom type="plane" size="1 1 1" zaxis="1 0 0"/>'
-SECOND = '<body pos="3 0 0"><freejoint/><geom size="0.1" mass="1"/></body></worldbody>'
-ROTOR1 = '<motor name="rotor1" class="quad" site="rotor1" gear="0 0 1 0 0  0.05"/>'
-PUSHER = '<actuator><motor name="push" class="quad" site="imu" gear="1 0 0 0 0 0"/>'
-SPHERES = '<replicate count="3000000" offset="0 0 1"><geom size="0.1"/></replicate>'
-NESTED = 2 * '<replicate count="300">' + '<geom size="0.1"/>' + 2 * "</replicate>"
-GRID = '<flexcomp name="f" type="grid" count="300 300 300" spacing="1 1 1" dim="3"/>'
-COLOURS = '<texture name="t" type="2d" builtin="flat" width="100000" height="100000"/></asset>'
-HEIGHTS = '<hfield name="h" nrow="100000" ncol="100000" size="1 1 1 1"/></asset>'
+REFUSALS = tomllib.loads((DATA / "refusals.toml").read_text("utf-8"))
+
+
+@pytest.mark.parametrize(("old", "new", "sentence"), REFUSALS["mjcf"])
+def test_what_is_no_vehicle_is_refused_in_one_sentence(
+    tmp_path: Path, old: str, new: str, sentence: str
+) -> None:
+    path = _moved(tmp_path, old, new)
+    with pytest.raises(InputError, match=f"^vehicle: .*{sentence}") as refusal:
+        Vehicle.load(path)
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("tag", ["include", "model"])
+def test_sizes_of_other_files_are_bounded_too(tmp_path: Path, tag: str) -> None:
+    (tmp_path / "other.xml").write_text('<mujoco><size nuserdata="9999999"/></mujoco>')
+    other = f'<asset><{tag} name="other" file="other.xml"/>'
+    path = _moved(tmp_path, "<asset>", other)
+    with pytest.raises(InputError, match="a nuserdata of at most 1000000 in <size>, got 9999999"):
+        Vehicle.load(path)
+
+
+HEIGHTS = '<hfield nrow="4096" ncol="4096" size="1 1 1 1"/>'
+NUMERIC = '<numeric name="a" size="9000" data="0"/>'
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
-    [
-        (FREE, "", "expected one free body and no other joints, got 0 free of 0 joints"),
-        ("</worldbody>", SECOND, "expected one free body and no other joints, got 2 free of 2"),
-        (FREE, '<joint type="hinge"/>', "got 0 free of 1 joints"),
-        (ROTOR1, ROTOR1.replace('site="rotor1"', 'joint="free"'), "rotor1 to be an actuator at a"),
-        (
-            ROTOR1,
-            ROTOR1.replace("motor", "position").replace("gear", 'kp="2" gear'),
-            "rotor rotor1",
-        ),
-        (ROTOR1, ROTOR1.replace("gear", 'refsite="imu" gear'), "rotor1 to act without a reference"),
-        (
-            ROTOR1,
-            ROTOR1.replace("0 0 1 0", "0 0 0 0"),
-            "rotor1 to have a force .gear times gain., got 0 N",
-        ),
-        ('ctrllimited="true"', 'ctrllimited="false"', "rotor1 to have a thrust with limits"),
-        ('ctrlrange="0 100"', 'ctrlrange="0 40"', r"49 N, within its limits, got 0 to 40 N"),
-        ('gear="0 0 1', 'gear="0.2 0 1', "without a torque or a sideways force, got ones"),
-        ("<actuator>", PUSHER, "rotor push to carry a part of the weight of the level craft, got"),
-        ('gravity="0 0 -9.8"', 'gravity="0 1 -9.8"', "gravity along -z, got 20 kg and"),
-        ('gravity="0 0 -9.8"', 'gravity="0 0 0"', "gravity along -z, got 20 kg and"),
-        ("<worldbody>", WALL, "free above the ground, got one that touches something at .* m"),
-        ('timestep="0.01"', 'timestep="1e-8"', "physics step of at least .* s, got 1e-08"),
-        ('mass="', 'mass="0" user="', "expected an MJCF file, got quad.xml: .*mass"),
-        (
-            "</asset>",
-            HEIGHTS,
-            "a nrow of at most 4096 in <hfield>, got 100000",
-        ),
-        ("</asset>", COLOURS, "a width of at most 4096 in <texture>, got 100000"),
-        ("</worldbody>", SPHERES + "</worldbody>", "expected at most 10000 elements, got 30000"),
-        ("</worldbody>", NESTED + "</worldbody>", "expected at most 10000 elements"),
-        ("<worldbody>", '<size memory="1"/><worldbody>', "expected an MJCF file, .* out of memory"),
-        ("</worldbody>", GRID + "</worldbody>", "expected at most 10000 elements, got 270000"),
-        ('timestep="0.01"', 'timestep="1e300"', "physics step of .* at most 1 s, got 1e"),
-        ('ctrlrange="0 100"', 'ctrlrange="0 inf"', "finite numbers, got others in actuator_c"),
-        (
-            'name="rotor1" pos="',
-            'name="rotor1" pos="nan 0 0" user="',
-            "finite numbers, got others in ",
-        ),
-        ("<mujoco", "<robot", "expected an MJCF file, got quad.xml: "),
-    ],
+    "parts", [f"<asset>{5 * HEIGHTS}</asset>", f"<custom>{8000 * NUMERIC}</custom>"]
 )
-def test_what_is_no_vehicle_is_refused_in_one_sentence(
-    tmp_path: Path, old: str, new: str, said: str
-) -> None:
-    with pytest.raises(InputError, match=f"^vehicle: .*{said}") as refusal:
-        Vehicle.load(_moved(tmp_path, old, new))
-    assert "\n" not in str(refusal.value)
+def test_all_parts_together_are_bounded(tmp_path: Path, parts: str) -> None:
+    """Each is small enough; together they take more than 0.5 GB."""
+    path = _moved(tmp_path, "</mujoco>", f"{parts}</mujoco>")
+    with pytest.raises(InputError, match="at most 67108864 numbers of assets and sensors, got"):
+        Vehicle.load(path)
 
 
 def test_a_file_that_is_not_there() -> None:

@@ -7,6 +7,7 @@ import math
 import os
 import pickle
 import re
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from rotorgram.models.vehicle_file import ENTRIES, FRAMES, read_vehicle_file
 from rotorgram.rendering.stage import Stage
 
 ROOT = Path(__file__).parents[2]
+DATA = ROOT / "tests" / "data"
 PAGE = (ROOT / "docs" / "vehicles.md").read_text(encoding="utf-8")
 
 BODY = """
@@ -261,142 +263,52 @@ def test_the_hash_is_of_numbers_to_the_last_digit(tmp_path: Path) -> None:
 # ---- refusals
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "sentence"),
-    [
-        ("mass = 1.5", "mass = -1.5", r"body.mass: .* from 1e-06 to 1e\+06 kg, got -1.5"),
-        ("mass = 1.5", 'mass = "1.5"', "body.mass: expected a number .* kg, got '1.5'"),
-        ("mass = 1.5", "", "body: expected mass and inertia, or parts, got inertia"),
-        ("mass = 1.5", "mas = 1.5", "body: expected some of .*mass, inertia.*, got 'mas'"),
-        ("mass = 1.5", "mass = { value = 0 }", "body.mass: expected a number .*, got 0"),
-        ("mass = 1.5", "mass = { source = 'x' }", "body.mass: expected a number .*, got None"),
-        ("mass = 1.5", "mass = { value = 1, src = 'x' }", "body.mass: expected some of value, sou"),
-        ("mass = 1.5", "mass = { value = 1, source = 3 }", "body.mass.source: expected a text, go"),
-        (
-            "mass = 1.5",
-            "mass = { value = 1, others = [ { value = -1, source = 'x' } ] }",
-            r"body.mass.others\[1\]: expected a number .* kg, got -1",
-        ),
-        ("[0.02, 0.021, 0.035]", "[0.02, 0.021]", "body.inertia: expected 3 numbers: Ixx.*, got 0"),
-        (
-            "[0.02, 0.021, 0.035]",
-            "[0.02, 0.021, 0.042]",
-            "body.inertia: expected .*none is larger than the sum.*, got 0.02, 0.021 and 0.042 kg",
-        ),
-        ("[0.02, 0.021, 0.035]", "[0.02, 0.021, -1]", "body.inertia: .* above 1e-15 kg m², got 0"),
-        ("[body]", "[bdoy]", "vehicle: expected some of .*body, rotors.*, got 'bdoy'"),
-        ("[body]", "[[body]]", r"body: expected a table, got \[\{'mass"),
-        (BODY, "", r"vehicle: expected a table \[body\], or \[model\] with a file, got neither"),
-        (BODY, "body.parts = []", "body: expected mass and inertia, or parts, got neither"),
-        (
-            "mass = 1.5",
-            "mass = 1.5\nparts = [ { shape = 'box', mass = 1, size = [1, 1, 1] } ]",
-            "body: expected parts, or mass and inertia, got mass, inertia too",
-        ),
-        ("mass = 1.5", "mass = 1.5\nground_clearance = 0.001", "body.ground_clearance: .* more th"),
-        ('frame = "cross"', 'frame = "tri"', "rotors.frame: expected 'plus' or .*, got 'tri'"),
-        ('frame = "cross"\n', "", "rotors: expected a frame or a list, got neither"),
-        ("arm = 0.3\n", "", "rotors: expected arm of the frame 'cross', got none"),
-        ("arm = 0.3", "arm = 300", "rotors.arm: expected a number from 0.001 to 100 m, got 300"),
-        ("[0, 8]", "[8, 0]", "rotors: expected a lower and a higher thrust, got 8 and 0 N"),
-        ("[0, 8]", "[0, 8, 9]", "rotors.thrust: expected 2 numbers from .* N, got"),
-        ("thrust = [0, 8]\n", "", "rotors: expected thrust, or speed .*, got neither"),
-        ("thrust =", "speed =", "rotors: expected thrust_coefficient with speed, got none"),
-        ("arm", "speed = [0, 9]\narm", "rotors: expected thrust, or .*, got thrust and speed"),
-        ("reaction = 0.016\n", "", "rotors: expected reaction, or .*, got neither"),
-        ("[0, 8]", "[0, 3]", "vehicle: expected rotor rotor1 to carry its share of the weight"),
-        ("[rotors]", "timestep = 2\n[rotors]", "body: expected some of .*, got 'timestep'"),
-        (CRAFT, "timestep = 2\n" + CRAFT, "timestep: expected a number from 1e-05 to 1 s, got 2"),
-        (CRAFT, "name = 3\n" + CRAFT, "vehicle.name: expected a text .*, got 3"),
-        (CRAFT, 'name = "a\\nb"\n' + CRAFT, r"vehicle.name: expected a text of .*, got 'a\\nb'"),
-        (CRAFT, f'name = "{101 * "n"}"\n' + CRAFT, "vehicle.name: expected a text of 1 to 100 "),
-        (CRAFT, f"{1000 * 'k'} = 1\n" + CRAFT, "vehicle: expected some of .*, got 'k{78}…$"),
-        (CRAFT, f"a = {5000 * '['}", "vehicle: expected a TOML .* too many in each other"),
-        (CRAFT, "#" * 1_000_001, "vehicle: expected a TOML file of at most 1000000 bytes, got"),
-        ("arm", "curve = []\narm", r"rotors.curve: .* numbers from -10 to 10, got \[\]$"),
-        (CRAFT, "mass 1.5", "vehicle: expected a TOML file, got craft.toml: "),
-        (
-            CRAFT,
-            CRAFT + "[drag]\nlinear = 0.1\n",
-            "drag.linear: expected 3 numbers from 0 to 10000 N s/m, got 0.1",
-        ),
-        (CRAFT, CRAFT + "[drag]\nlin = 1\n", "drag: expected some of linear, .*, got 'lin'"),
-        (CRAFT, CRAFT + "[model]\nfile = 'x.obj'", "model.file: expected a URDF .*got 'x.obj'"),
-        (CRAFT, CRAFT + "[model]\nfile = 'x.xml'", "model.file: expected a file that is there"),
-    ],
-)  # fmt: skip
+REFUSALS = tomllib.loads((DATA / "refusals.toml").read_text("utf-8"))
+
+
+@pytest.mark.parametrize(("old", "new", "sentence"), REFUSALS["toml"])
 def test_a_wrong_file_is_one_sentence(old: str, new: str, sentence: str, tmp_path: Path) -> None:
     assert old in CRAFT
+    text = CRAFT.replace(old, new, 1)
     with pytest.raises(InputError, match=f"^{sentence}") as caught:
-        load(tmp_path, CRAFT.replace(old, new, 1))
+        load(tmp_path, text)
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "sentence"),
+    ("start", "sentence"),
     [
-        ('turn = "cw"', "", r"rotors.list\[1\]: expected turn, got none"),
-        ('turn = "ccw"', 'turn = "left"', r"rotors.list\[2\].turn: expected .*, got 'left'"),
-        ("position = [0.2, 0.2, 0.0]", "", r"rotors.list\[1\]: expected a position, got none"),
-        ('turn = "cw"', 'turn = "cw"\naxis = [0, 0, 0]', r"rotors.list\[1\].axis: .*, not all 0"),
-        ('turn = "cw"', 'turn = "cw"\nlink = "x"', r"rotors.list\[1\]: .* a position, got link"),
-        ('turn = "cw"', 'turn = "cw"\nname = "rotor2"', "rotors.list: .* name .*'rotor2' twice"),
-        ("reaction", "arm = 0.3\nreaction", "rotors: expected no arm with a list, got 0.3"),
-        ("reaction", 'frame = "plus"\nreaction', "rotors: expected a frame or a list, got both"),
+        (f'name = "{101 * "n"}"', "vehicle.name: expected a text of 1 to 100 "),
+        (f"{1000 * 'k'} = 1", "vehicle: expected some of .*, got 'k{78}…$"),
+        (f"a = {5000 * '['}", "vehicle: expected a TOML .* too many in each other"),
+        ("#" * 1_000_001, "vehicle: expected a TOML file of at most 1000000 bytes, got"),
     ],
-)  # fmt: skip
+    ids=["name", "key", "depth", "size"],
+)
+def test_a_long_file_is_one_sentence(start: str, sentence: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=f"^{sentence}"):
+        load(tmp_path, f"{start}\n{CRAFT}")
+
+
+@pytest.mark.parametrize(("old", "new", "sentence"), REFUSALS["list"])
 def test_a_wrong_list_is_one_sentence(old: str, new: str, sentence: str, tmp_path: Path) -> None:
     assert old in LISTED
+    text = BODY + LISTED.replace(old, new, 1)
     with pytest.raises(InputError, match=f"^{sentence}"):
-        load(tmp_path, BODY + LISTED.replace(old, new, 1))
+        load(tmp_path, text)
 
 
-@pytest.mark.parametrize(
-    ("part", "sentence"),
-    [
-        ("mass = 1", r"body.parts\[1\].shape: expected 'box' or 'cylinder', got None"),
-        ("shape = 'box'\nmass = 1", r"body.parts\[1\]: expected size, got none"),
-        ("shape = 'cylinder'\nmass = 1\nradius = 1", r"body.parts\[1\]: expected length, got none"),
-        ("shape = 'box'\nsize = [1, 1, 1]", r"body.parts\[1\]: expected mass, got none"),
-        (
-            "shape = 'box'\nmass = 1\nsize = [1, 1, 1]\nradius = 2",
-            r"body.parts\[1\]: expected some of shape, mass, position, size, yaw, got 'radius'",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("part", "sentence"), REFUSALS["part"])
 def test_a_wrong_part_is_one_sentence(part: str, sentence: str, tmp_path: Path) -> None:
+    text = CRAFT.replace(BODY, f"[[body.parts]]\n{part}\n")
     with pytest.raises(InputError, match=f"^{sentence}"):
-        load(tmp_path, CRAFT.replace(BODY, f"[[body.parts]]\n{part}\n"))
+        load(tmp_path, text)
 
 
 # ---- models of their own
 
 
-URDF = """<?xml version="1.0"?>
-<robot name="urdf quad">
-  <link name="base">
-    <inertial><origin xyz="0 0 0.01"/><mass value="0.8"/>
-      <inertia ixx="0.004" ixy="0" ixz="0" iyy="0.005" iyz="0" izz="0.008"/></inertial>
-    <visual><geometry><mesh filename="package://quad/body.dae"/></geometry></visual>
-    <collision><geometry><box size="0.2 0.2 0.1"/></geometry></collision>
-  </link>
-  {links}
-</robot>
-"""
-LINKS = "".join(
-    f"""
-  <link name="prop{i}"><inertial><mass value="0.05"/>
-    <inertia ixx="1e-5" ixy="0" ixz="0" iyy="1e-5" iyz="0" izz="2e-5"/></inertial></link>
-  <joint name="spin{i}" type="{kind}"><parent link="base"/><child link="prop{i}"/>
-    <origin xyz="{x} {y} 0.04"/><axis xyz="0 0 1"/></joint>
-"""
-    for i, x, y, kind in (
-        (1, 0.2, 0.2, "continuous"),
-        (2, 0.2, -0.2, "continuous"),
-        (3, -0.2, -0.2, "fixed"),
-        (4, -0.2, 0.2, "fixed"),
-    )
-)
+URDF = (DATA / "quad.urdf").read_text("utf-8")
 OF_URDF = """
 [model]
 file = "quad.urdf"
@@ -421,7 +333,7 @@ turn = "ccw"
 
 
 def test_urdf(tmp_path: Path) -> None:
-    write(tmp_path, URDF.format(links=LINKS), "quad.urdf")
+    write(tmp_path, URDF, "quad.urdf")
     vehicle = load(tmp_path, OF_URDF)
     assert vehicle.mass == pytest.approx(1.0, rel=1e-14)
     np.testing.assert_allclose(vehicle.center_of_mass, (0, 0, 0.016), atol=1e-15)
@@ -446,7 +358,7 @@ def test_urdf(tmp_path: Path) -> None:
 def test_meshes_of_a_package_are_found_above_a_urdf_file(place: str, tmp_path: Path) -> None:
     (tmp_path / "urdf").mkdir()
     mesh = f'<mesh filename="package://{tmp_path.name}/{place}"/>'
-    urdf = URDF.format(links=LINKS).replace('<box size="0.2 0.2 0.1"/>', mesh)
+    urdf = URDF.replace('<box size="0.2 0.2 0.1"/>', mesh)
     write(tmp_path / "urdf", urdf, "quad.urdf")
     with pytest.raises(
         InputError, match=r"^model.file: expected its meshes .*, got no file for pack"
@@ -464,29 +376,22 @@ def test_a_urdf_file_without_links(tmp_path: Path) -> None:
         load(tmp_path, OF_URDF)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "sentence"),
-    [
-        ('link = "prop1"', 'link = "prop9"', r"rotors.list\[1\]: .* a body .*prop1, .*'prop9'"),
-        ('link = "prop1"', "", r"rotors.list\[1\]: .* link, body and site .*, got none"),
-        ("[rotors]", BODY + "[rotors]", "body: expected none beside a model's file"),
-        ('link = "prop1"', 'link = "prop3"', "vehicle: .* one free body and no other joints"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("old", "new", "sentence"), REFUSALS["model"])
 def test_a_wrong_model_is_one_sentence(old: str, new: str, sentence: str, tmp_path: Path) -> None:
-    write(tmp_path, URDF.format(links=LINKS), "quad.urdf")
+    write(tmp_path, URDF, "quad.urdf")
+    text = OF_URDF.replace(old, new, 1)
     with pytest.raises(InputError, match=f"^{sentence}"):
-        load(tmp_path, OF_URDF.replace(old, new, 1))
+        load(tmp_path, text)
 
 
 def test_a_urdf_file_needs_a_file_that_names_its_rotors(tmp_path: Path) -> None:
-    file = write(tmp_path, URDF.format(links=LINKS), "quad.urdf")
+    file = write(tmp_path, URDF, "quad.urdf")
     with pytest.raises(InputError, match=r"^vehicle: expected a TOML file that names the rotors"):
         Vehicle.load(file)
 
 
 def test_mjcf_with_coefficients_from_toml(tmp_path: Path) -> None:
-    source = ROOT / "tests" / "data" / "tiny.xml"
+    source = DATA / "tiny.xml"
     (tmp_path / "tiny.xml").write_bytes(source.read_bytes())
     more = '[model]\nfile = "tiny.xml"\n[rotors]\nradius = 0.023\n[sensors]\nrange_limit = 4\n'
     vehicle = load(tmp_path, more)
@@ -508,7 +413,7 @@ def test_mjcf_with_coefficients_from_toml(tmp_path: Path) -> None:
 
 
 def test_rotors_at_sites_of_mjcf(tmp_path: Path) -> None:
-    text = (ROOT / "tests" / "data" / "tiny.xml").read_text()
+    text = (DATA / "tiny.xml").read_text()
     write(tmp_path, re.sub("<actuator>.*</actuator>", "", text, flags=re.DOTALL), "bare.xml")
     sites = OF_URDF.replace("quad.urdf", "bare.xml").replace("position = [-0.2, 0.2, 0.04]\n", "")
     for number, link in enumerate(("prop1", "prop2", "prop3", "base"), 1):
@@ -537,7 +442,7 @@ def test_meshes_of_a_models_file(tmp_path: Path) -> None:
     mesh = tmp_path / "shapes" / "hull.stl"
     (tmp_path / "out").mkdir()
     tetrahedron(mesh, 0.05)
-    tiny = (ROOT / "tests" / "data" / "tiny.xml").read_text()
+    tiny = (DATA / "tiny.xml").read_text()
     text = tiny.replace("<option", '<compiler meshdir="shapes"/><option', 1).replace(
         "<worldbody>", '<asset><mesh name="hull" file="hull.stl"/></asset><worldbody>'
     )
@@ -559,7 +464,7 @@ def test_meshes_of_a_models_file(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("text", [CRAFT + "radius = 0.0987\n", OF_URDF])
 def test_export_keeps_six_digits(text: str, tmp_path: Path) -> None:
-    write(tmp_path, URDF.format(links=LINKS), "quad.urdf")
+    write(tmp_path, URDF, "quad.urdf")
     vehicle = load(tmp_path, text)
     out = tmp_path / "sub" / "out.xml"
     out.parent.mkdir()
@@ -593,7 +498,7 @@ def test_what_is_no_file_is_one_sentence(tmp_path: Path) -> None:
 
 
 def test_a_mesh_without_a_path_is_refused(tmp_path: Path) -> None:
-    text = URDF.format(links=LINKS)
+    text = URDF
     end = text.index("</link>")
     mesh = '<collision><geometry><mesh filename="package://"/></geometry></collision>'
     write(tmp_path, text[:end] + mesh + text[end:], "quad.urdf")
