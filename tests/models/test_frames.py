@@ -16,6 +16,27 @@ from scipy.spatial.transform import Rotation
 
 # (x, y, z) -> (X, Y, Z): right is minus left, up is up, forward is forward.
 S = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+# MuJoCo, right-handed: +z turns the nose left, +y puts the nose down, +x lowers the right side.
+# Unity, left-handed: +Y turns the nose right, +X puts the nose down, +Z raises the right side.
+SIGNS = {"z": (0, -1, 0), "y": (1, 0, 0), "x": (0, 0, -1)}
+ANGLE = st.floats(-180, 180)
+COORDINATE = st.floats(-100, 100)
+
+
+def scalar_first(attitude: Rotation) -> np.ndarray:
+    return attitude.as_quat(scalar_first=True)
+
+
+def unity(phi: float, theta: float, psi: float) -> np.ndarray:
+    """Unity's rotation matrix: Z first, then X, then Y, about fixed axes; angles in degrees."""
+    turned = Rotation.from_euler("YXZ", [theta, phi, psi], degrees=True)
+    return np.asarray(turned.as_matrix())
+
+
+def turned_by(yaw: float, pitch: float, roll: float) -> tuple[np.ndarray, np.ndarray]:
+    """Quaternion in MuJoCo's world, and rotation matrix in Unity's."""
+    attitude = Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=True)
+    return scalar_first(attitude), S @ attitude.as_matrix() @ S.T
 
 
 @pytest.mark.parametrize(
@@ -28,78 +49,68 @@ S = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
     ],
 )
 def test_position(mujoco: tuple[float, ...], paper: tuple[float, ...]) -> None:
-    assert positions_in_paper_frame(mujoco).tolist() == list(paper)
+    assert tuple(positions_in_paper_frame(mujoco)) == paper
 
 
 def test_level_is_zero_without_negative_zeros() -> None:
     zeros = np.zeros((2, 3))
-    assert positions_in_paper_frame(zeros).tobytes() == zeros.tobytes()
     level = np.array([[1.0, 0.0, 0.0, 0.0], [-1.0, -0.0, -0.0, -0.0]])
-    assert attitudes_in_paper_frame(level).tobytes() == zeros.tobytes()
+    places = positions_in_paper_frame(zeros)
+    attitudes = attitudes_in_paper_frame(level)
+    assert places.tobytes() == zeros.tobytes()
+    assert attitudes.tobytes() == zeros.tobytes()
 
 
-# MuJoCo, right-handed: +z turns the nose left, +y puts the nose down, +x lowers the right side.
-# Unity, left-handed: +Y turns the nose right, +X puts the nose down, +Z raises the right side.
-@pytest.mark.parametrize(("axis", "sign"), [("z", (0, -1, 0)), ("y", (1, 0, 0)), ("x", (0, 0, -1))])
+@pytest.mark.parametrize("axis", SIGNS)
 @pytest.mark.parametrize("degrees", [-89.0, -60.0, 30.0, 89.0])
-def test_a_rotation_about_one_axis(axis: str, sign: tuple[int, ...], degrees: float) -> None:
+def test_a_rotation_about_one_axis(axis: str, degrees: float) -> None:
     attitude = Rotation.from_euler(axis, degrees, degrees=True)
-    expected = degrees * np.array(sign)
-    assert attitudes_in_paper_frame(_scalar_first(attitude)) == pytest.approx(expected)
+    found = attitudes_in_paper_frame(scalar_first(attitude))
+    assert found == pytest.approx(degrees * np.array(SIGNS[axis]))
 
 
 def test_a_pitch_of_30_degrees_then_a_yaw_by_hand() -> None:
     # Nose down by 30 degrees, then the whole craft turned left by 90: the nose points to -X, and
     # sin 30 below the horizon. Unity calls that 30 about X first and then -90 about Y.
     attitude = Rotation.from_euler("yz", [30.0, 90.0], degrees=True)
-    assert attitudes_in_paper_frame(_scalar_first(attitude)) == pytest.approx((30.0, -90.0, 0.0))
+    angles = attitudes_in_paper_frame(scalar_first(attitude))
     nose = positions_in_paper_frame(attitude.apply([1.0, 0.0, 0.0]))
+    assert angles == pytest.approx((30.0, -90.0, 0.0))
     assert nose == pytest.approx((-math.sqrt(0.75), -0.5, 0.0))
 
 
-@given(st.floats(-180, 180), st.floats(-89.9, 89.9), st.floats(-180, 180))
+@given(ANGLE, st.floats(-89.9, 89.9), ANGLE)
 def test_any_attitude_against_matrices(yaw: float, pitch: float, roll: float) -> None:
-    q = _scalar_first(Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=True))
-    expected = S @ Rotation.from_quat(q, scalar_first=True).as_matrix() @ S.T
-    for attitude in attitudes_in_paper_frame([q, -q]):
+    quaternion, expected = turned_by(yaw, pitch, roll)
+    for attitude in attitudes_in_paper_frame([quaternion, -quaternion]):
         assert (np.abs(attitude) <= (90, 180, 180)).all()
-        np.testing.assert_allclose(_unity(*attitude), expected, atol=1e-9)
+        np.testing.assert_allclose(unity(*attitude), expected, atol=1e-9)
 
 
 @pytest.mark.parametrize("pitch", [-90.0, 90.0])
 @pytest.mark.parametrize("yaw", [-179.0, -90.0, 0.0, 45.0, 179.0])
 @pytest.mark.parametrize("roll", [0.0, 30.0, -120.0])
 def test_nose_straight_up_or_down(pitch: float, yaw: float, roll: float) -> None:
-    attitude = Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=True)
-    phi, theta, psi = attitudes_in_paper_frame(_scalar_first(attitude))
+    quaternion, expected = turned_by(yaw, pitch, roll)
+    phi, theta, psi = attitudes_in_paper_frame(quaternion)
     assert phi == pitch
     assert psi == 0.0
     assert -180 <= theta <= 180
     # At the pole an angle is known to the square root of the rounding only.
-    expected = S @ attitude.as_matrix() @ S.T
-    np.testing.assert_allclose(_unity(phi, theta, psi), expected, atol=1e-6)
-
-
-def _scalar_first(attitude: Rotation) -> np.ndarray:
-    return attitude.as_quat(scalar_first=True)
-
-
-def _unity(phi: float, theta: float, psi: float) -> np.ndarray:
-    """Unity's rotation matrix: Z first, then X, then Y, about fixed axes; angles in degrees."""
-    turned = Rotation.from_euler("YXZ", [theta, phi, psi], degrees=True)
-    return np.asarray(turned.as_matrix())
+    np.testing.assert_allclose(unity(phi, theta, psi), expected, atol=1e-6)
 
 
 def test_a_pose_by_hand_on_the_way_back() -> None:
     # 1 m right, 2 m up, 3 m forward, nose 90 degrees to the right: MuJoCo turns by -90 about +z.
     half = math.sqrt(0.5)
+    place = positions_in_world_frame((1.0, 2.0, 3.0))
     turned = quaternions_in_world_frame((0.0, 90.0, 0.0))
-    assert positions_in_world_frame((1.0, 2.0, 3.0)).tolist() == [3.0, -1.0, 2.0]
+    assert place.tolist() == [3.0, -1.0, 2.0]
     assert turned == pytest.approx([half, 0.0, 0.0, -half])
 
 
 @given(
-    st.tuples(*[st.floats(-100, 100)] * 3),
+    st.tuples(COORDINATE, COORDINATE, COORDINATE),
     st.tuples(st.floats(-89, 89), st.floats(-179, 179), st.floats(-179, 179)),
 )
 def test_there_and_back(
@@ -107,20 +118,22 @@ def test_there_and_back(
 ) -> None:
     place = positions_in_world_frame(position)
     quaternion = quaternions_in_world_frame(attitude)
-    assert positions_in_paper_frame(place).tolist() == list(position)
+    assert tuple(positions_in_paper_frame(place)) == position
     assert attitudes_in_paper_frame(quaternion) == pytest.approx(attitude, abs=1e-6)
 
 
 @pytest.mark.parametrize("shape", [(), (7,), (3, 5), (0,)])
 def test_any_leading_axes(shape: tuple[int, ...]) -> None:
-    quaternions = Rotation.random(15, random_state=3).as_quat(scalar_first=True)
-    quaternions = quaternions[: math.prod(shape)].reshape(*shape, 4)
+    count = math.prod(shape)
+    quaternions = np.tile([0.5, -0.5, 0.5, 0.5], (count, 1)).reshape(*shape, 4)
     attitudes = attitudes_in_paper_frame(quaternions)
+    places = positions_in_paper_frame(attitudes)
     assert attitudes.shape == (*shape, 3)
-    assert positions_in_paper_frame(attitudes).shape == (*shape, 3)
-    assert positions_in_world_frame(attitudes).shape == (*shape, 3)
+    assert places.shape == (*shape, 3)
+    assert positions_in_world_frame(places).shape == (*shape, 3)
     assert quaternions_in_world_frame(attitudes).shape == (*shape, 4)
 
 
 def test_nan_stays_nan_and_is_no_warning() -> None:
-    assert np.isnan(attitudes_in_paper_frame([[np.nan] * 4, [1.0, 0.0, 0.0, 0.0]])[0]).all()
+    attitudes = attitudes_in_paper_frame([[np.nan] * 4, [1.0, 0.0, 0.0, 0.0]])
+    assert np.isnan(attitudes[0]).all()
