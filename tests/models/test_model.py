@@ -21,7 +21,8 @@ from rotorgram.scenes import build_scene
 DATA = Path(__file__).parents[1] / "data"
 ROTORS = ("rotor1", "rotor2", "rotor3", "rotor4")
 REACTIONS = (0.05, -0.05, 0.05, -0.05)  # N·m per newton
-PLACES = [(1.0, 1.0, 0.0), (1.0, -1.0, 0.0), (-1.0, -1.0, 0.0), (-1.0, 1.0, 0.0)]
+BY_HAND = tomllib.loads((DATA / "by_hand.toml").read_text("utf-8"))
+PLACES = BY_HAND["paper"]["places"]
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +58,7 @@ def test_one_free_body_and_four_thrusts(model: mujoco.MjModel) -> None:
     assert model.na == 0
     assert model.actuator_ctrlrange.tolist() == [[0.0, 100.0]] * 4
     for rotor, place, reaction in zip(ROTORS, PLACES, REACTIONS, strict=True):
-        assert tuple(model.site(rotor).pos) == place
+        assert model.site(rotor).pos.tolist() == place
         assert model.actuator(rotor).gear.tolist() == [0.0, 0.0, 1.0, 0.0, 0.0, reaction]
 
 
@@ -104,14 +105,9 @@ def test_hover_keyframe_is_steady(hovering: mujoco.MjData) -> None:
 
 
 def test_sensors_at_hover(model: mujoco.MjModel, hovering: mujoco.MjData) -> None:
-    expected = {
-        "position": [0.0, 0.0, 5.0],
-        "orientation": [1.0, 0.0, 0.0, 0.0],
-        "velocity": [0.0, 0.0, 0.0],
-        "gyro": [0.0, 0.0, 0.0],
-        "accelerometer": [0.0, 0.0, 9.8],  # at rest it feels what holds it up
-    }
-    assert [model.sensor(i).name for i in range(model.nsensor)] == list(expected)
+    expected = BY_HAND["sensors"]
+    names = [model.sensor(i).name for i in range(model.nsensor)]
+    assert names == list(expected)
     for name, value in expected.items():
         assert hovering.sensor(name).data == pytest.approx(value, abs=1e-12), name
 
@@ -134,10 +130,10 @@ def test_a_file_keeps_its_ground_sun_and_sky_and_gets_those_it_lacks(
     (tmp_path / "vehicle.xml").write_text(text.replace("<worldbody>", f"{sky}<worldbody>", 1))
     model = build_scene(tmp_path / "vehicle.xml").compile()
     suns = [model.light(i).name for i in range(model.nlight)]
-    skies = [model.tex(i).name for i in range(model.ntex)
-             if model.tex_type[i] == mujoco.mjtTexture.mjTEXTURE_SKYBOX]  # fmt: skip
-    grounds = [model.geom(i).name for i in range(model.ngeom)
-               if model.geom_type[i] == mujoco.mjtGeom.mjGEOM_PLANE]  # fmt: skip
+    is_sky = model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX
+    is_ground = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+    skies = [model.tex(i).name for i in np.flatnonzero(is_sky)]
+    grounds = [model.geom(i).name for i in np.flatnonzero(is_ground)]
     assert suns == ["own" if "sun" in own else "scene/sun"]
     assert skies == ["own" if "sky" in own else "scene/sky"]
     assert grounds == ["own" if "ground" in own else "scene/floor"]
@@ -155,11 +151,12 @@ def test_the_papers_vehicle() -> None:
     assert vehicle.center_of_mass == pytest.approx(0.0, abs=1e-15)
     assert vehicle.rest_height == 0.4
     assert [rotor.name for rotor in vehicle.rotors] == list(ROTORS)
-    assert [rotor.position for rotor in vehicle.rotors] == PLACES
-    assert {(rotor.axis, rotor.low, rotor.high) for rotor in vehicle.rotors} == {
-        ((0.0, 0.0, 1.0), 0.0, 100.0)
-    }
-    expected = [[1, 1, 1, 1], [1, -1, -1, 1], [-1, -1, 1, 1], REACTIONS]
+    assert [list(rotor.position) for rotor in vehicle.rotors] == PLACES
+    for rotor in vehicle.rotors:
+        assert rotor.axis == (0.0, 0.0, 1.0)
+        assert rotor.low == 0.0
+        assert rotor.high == 100.0
+    expected = BY_HAND["paper"]["allocation"]
     np.testing.assert_allclose(vehicle.allocation, expected, atol=1e-15)
     assert vehicle.hover_thrust == pytest.approx([49.0] * 4, abs=1e-12)
     assert vehicle.max_acceleration == pytest.approx(10.2)
@@ -173,8 +170,11 @@ def test_a_hexacopter_with_throttles_and_a_camera_in_front() -> None:
     assert vehicle.mass == pytest.approx(3.03)
     assert vehicle.center_of_mass[:2] == pytest.approx([0.25 * 0.12 / 3.03, 0.25 * 0.01 / 3.03])
     assert vehicle.num_rotors == 6
-    assert {(rotor.low, rotor.high, rotor.newtons) for rotor in vehicle.rotors} == {(0, 12, 12)}
-    assert [rotor.reaction[2] * 12 for rotor in vehicle.rotors] == pytest.approx([0.19, -0.19] * 3)
+    assert vehicle.thrust_low.tolist() == [0] * 6
+    assert vehicle.thrust_high.tolist() == [12] * 6
+    assert [rotor.newtons for rotor in vehicle.rotors] == [12] * 6
+    reactions = [rotor.reaction[2] * 12 for rotor in vehicle.rotors]
+    assert reactions == pytest.approx([0.19, -0.19] * 3)
     front = vehicle.hover_thrust[0]
     rear = vehicle.hover_thrust[3]
     assert front > 3.03 * 9.81 / 6 > rear
@@ -186,11 +186,8 @@ def test_a_hexacopter_with_throttles_and_a_camera_in_front() -> None:
 def test_rotors_whose_sites_point_down() -> None:
     vehicle = Vehicle.load(DATA / "small.xml")
     assert all(rotor.axis == pytest.approx((0, 0, 1)) for rotor in vehicle.rotors)
-    np.testing.assert_allclose(
-        vehicle.allocation,
-        [[1] * 4, [0.18, -0.18, -0.18, 0.18], [-0.14, -0.14, 0.14, 0.14], [0.018, -0.018] * 2],
-        atol=1e-12,
-    )
+    expected = BY_HAND["small"]["allocation"]
+    np.testing.assert_allclose(vehicle.allocation, expected, atol=1e-12)
 
 
 def test_tilted_rotors_share_the_weight_without_a_drift(tmp_path: Path) -> None:
@@ -236,7 +233,9 @@ def test_hash_names_vehicle_and_drag_and_not_the_folder(tmp_path: Path) -> None:
     for comment in ("<!-- ", "<!-- else "):
         (tmp_path / "other.xml").write_text(QUAD_XML.read_text().replace("<!-- ", comment))
         assert Vehicle.load(tmp_path / "other.xml").hash == name
-    assert len({name, Vehicle.load(linear_drag=0.5).hash, Vehicle.load(linear_drag=0.25).hash}) == 3
+    drags = [Vehicle.load(linear_drag=drag).hash for drag in (0.0, 0.25, 0.5)]
+    assert drags[0] == name
+    assert len(set(drags)) == 3
 
 
 @pytest.mark.parametrize(

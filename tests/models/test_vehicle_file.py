@@ -23,6 +23,7 @@ from rotorgram.rendering.stage import Stage
 
 ROOT = Path(__file__).parents[2]
 DATA = ROOT / "tests" / "data"
+BY_HAND = tomllib.loads((DATA / "by_hand.toml").read_text("utf-8"))
 PAGE = (ROOT / "docs" / "vehicles.md").read_text(encoding="utf-8")
 
 BODY = """
@@ -79,30 +80,16 @@ def flown(model: mujoco.MjModel, newtons: np.ndarray, steps: int = 200) -> np.nd
 # ---- rotors
 
 
-H = math.sqrt(0.5)
-C = math.cos(math.pi / 8)
-S = math.sin(math.pi / 8)
-Q = math.sqrt(0.75)
-PLACES = {
-    # of the rotors, by hand: clockwise seen from above
-    "plus": [(1, 0), (0, -1), (-1, 0), (0, 1)],
-    "cross": [(H, H), (H, -H), (-H, -H), (-H, H)],
-    "hexa": [(Q, 0.5), (Q, -0.5), (0, -1), (-Q, -0.5), (-Q, 0.5), (0, 1)],
-    "octo": [(C, S), (C, -S), (S, -C), (-S, -C), (-C, -S), (-C, S), (-S, C), (S, C)],
-}
-
-
 @pytest.mark.parametrize("frame", FRAMES)
 def test_frames(frame: str, tmp_path: Path) -> None:
     vehicle = load(tmp_path, CRAFT.replace('"cross"', f'"{frame}"'))
-    places = 0.3 * np.array(PLACES[frame])
-    positions = np.array([rotor.position for rotor in vehicle.rotors])
-    np.testing.assert_allclose(positions, np.c_[places, 0 * places[:, 0]], atol=1e-15)
-    count = len(places)
-    np.testing.assert_allclose(vehicle.allocation[0], np.ones(count))
-    np.testing.assert_allclose(vehicle.allocation[1], places[:, 1], atol=1e-15)
-    np.testing.assert_allclose(vehicle.allocation[2], -places[:, 0], atol=1e-15)
-    np.testing.assert_allclose(vehicle.allocation[3], [0.016, -0.016] * (count // 2))
+    x, y = 0.3 * np.array(BY_HAND["frames"][frame]).T
+    count = len(x)
+    ones = np.ones(count)
+    positions = np.array([rotor.position for rotor in vehicle.rotors]).T
+    np.testing.assert_allclose(positions, [x, y, 0 * ones], atol=1e-15)
+    turns = [0.016, -0.016] * (count // 2)
+    np.testing.assert_allclose(vehicle.allocation, [ones, y, -x, turns], atol=1e-15)
     assert np.linalg.matrix_rank(vehicle.allocation) == 4
     np.testing.assert_allclose(vehicle.hover_thrust, 1.5 * 9.81 / count)
     assert [rotor.name for rotor in vehicle.rotors] == [f"rotor{i + 1}" for i in range(count)]
@@ -263,6 +250,16 @@ def test_the_hash_is_of_numbers_to_the_last_digit(tmp_path: Path) -> None:
 # ---- refusals
 
 
+TETRAHEDRON = """
+v {low} {low} {low}
+v {high} {high} {low}
+v {high} {low} {high}
+v {low} {high} {high}
+f 1 2 3
+f 1 4 2
+f 1 3 4
+f 2 4 3
+"""
 REFUSALS = tomllib.loads((DATA / "refusals.toml").read_text("utf-8"))
 
 
@@ -341,9 +338,7 @@ def test_urdf(tmp_path: Path) -> None:
     moments = np.diag(vehicle.inertia)
     expected = (0.004 + 2.88e-5 + 0.00815520, 0.005 + 2.88e-5 + 0.00815520, 0.02408)
     np.testing.assert_allclose(moments, expected, rtol=1e-12)
-    np.testing.assert_allclose(vehicle.allocation[1], (0.2, -0.2, -0.2, 0.2), rtol=1e-14)
-    np.testing.assert_allclose(vehicle.allocation[2], (-0.2, -0.2, 0.2, 0.2), rtol=1e-14)
-    np.testing.assert_allclose(vehicle.allocation[3], (0.02, -0.02, 0.02, -0.02), rtol=1e-14)
+    np.testing.assert_allclose(vehicle.allocation, BY_HAND["urdf"]["allocation"], rtol=1e-14)
     assert vehicle.rest_height == pytest.approx(0.05)
     assert vehicle.timestep == 0.01
     assert vehicle.gravity == 9.81
@@ -354,7 +349,7 @@ def test_urdf(tmp_path: Path) -> None:
     assert env.action_space.shape == (4,)
 
 
-@pytest.mark.parametrize("place", ["hull.stl", "meshes/hull.stl"])
+@pytest.mark.parametrize("place", ["hull.obj", "meshes/hull.obj"])
 def test_meshes_of_a_package_are_found_above_a_urdf_file(place: str, tmp_path: Path) -> None:
     (tmp_path / "urdf").mkdir()
     mesh = f'<mesh filename="package://{tmp_path.name}/{place}"/>'
@@ -430,21 +425,18 @@ def test_rotors_at_sites_of_mjcf(tmp_path: Path) -> None:
 
 
 def tetrahedron(file: Path, size: float) -> None:
-    """Binary STL of a tetrahedron in a cube of twice the size, m."""
-    a, b, c, d = size * np.array(((-1, -1, -1), (1, 1, -1), (1, -1, 1), (-1, 1, 1)))
-    faces = np.array(((a, b, c), (a, d, b), (a, c, d), (b, d, c)), "<f4").reshape(4, 9)
-    rows = [bytes(12) + face.tobytes() + bytes(2) for face in faces]
+    """Wavefront file of a tetrahedron in a cube of twice the size, m."""
     file.parent.mkdir(exist_ok=True)
-    file.write_bytes(bytes(80) + b"\4\0\0\0" + b"".join(rows))
+    file.write_text(TETRAHEDRON.format(high=size, low=-size))
 
 
 def test_meshes_of_a_models_file(tmp_path: Path) -> None:
-    mesh = tmp_path / "shapes" / "hull.stl"
+    mesh = tmp_path / "shapes" / "hull.obj"
     (tmp_path / "out").mkdir()
     tetrahedron(mesh, 0.05)
     tiny = (DATA / "tiny.xml").read_text()
     text = tiny.replace("<option", '<compiler meshdir="shapes"/><option', 1).replace(
-        "<worldbody>", '<asset><mesh name="hull" file="hull.stl"/></asset><worldbody>'
+        "<worldbody>", '<asset><mesh name="hull" file="hull.obj"/></asset><worldbody>'
     )
     hull = '<freejoint/><geom type="mesh" mesh="hull" mass="0.01" contype="1" conaffinity="1"/>'
     write(tmp_path, text.replace("<freejoint/>", hull), "model.xml")
