@@ -44,9 +44,12 @@ def test_every_number_has_a_source_that_the_page_names(name: str) -> None:
 def test_a_choice_between_sources_that_differ_by_5_percent_is_explained(name: str) -> None:
     for number in numbers(name).values():
         used = np.asarray(number.value)
-        scale = float(np.abs(used).max())
-        apart = [np.abs(used - np.asarray(value)).max() / scale for value, _ in number.others]
-        assert not apart or max(apart) < 0.05 or number.why, number.name
+        scale = np.abs(used).max()
+        apart = 0.0
+        for value, _ in number.others:
+            difference = np.abs(used - np.asarray(value)).max()
+            apart = max(apart, difference / scale)
+        assert apart < 0.05 or number.why, number.name
 
 
 def test_a_source_that_names_no_work_is_refused() -> None:
@@ -80,7 +83,8 @@ def test_its_picture_is_small(name: str) -> None:
 )
 def test_rotors_turn_as_those_of_the_platform(name: str, yaw: str) -> None:
     vehicle = Vehicle.load(FOLDER / name / "vehicle.toml")
-    assert "".join("+" if torque > 0 else "-" for torque in vehicle.allocation[3]) == yaw
+    signs = "".join("+" if torque > 0 else "-" for torque in vehicle.allocation[3])
+    assert signs == yaw
 
 
 def test_the_skydio_x2_has_the_inertia_of_the_menagerie_s_ellipsoids() -> None:
@@ -89,9 +93,10 @@ def test_the_skydio_x2_has_the_inertia_of_the_menagerie_s_ellipsoids() -> None:
     vehicle = Vehicle.load(FOLDER / "skydio_x2" / "vehicle.toml")
     height = (0.5 * 0.05 + 0.5 * 0.08 + 0.325 * 0.02) / 1.325
     assert vehicle.center_of_mass == pytest.approx([0, 0, height], abs=1e-6)
-    zz = 0.25 * 4 * (0.13**2 + 0.13**2) / 5 + 1.0 * (0.14**2 + 0.18**2)
-    zz += 0.325 * (0.16**2 + 0.04**2) / 5
-    assert vehicle.inertia[2, 2] == pytest.approx(zz, abs=1e-6)
+    discs = 4 * 0.25 * (0.13**2 + 0.13**2) / 5
+    arms = 4 * 0.25 * (0.14**2 + 0.18**2)
+    body = 0.325 * (0.16**2 + 0.04**2) / 5
+    assert vehicle.inertia[2, 2] == pytest.approx(discs + arms + body, abs=1e-6)
     xz = -0.25 * 0.14 * 2 * (0.08 - 0.05)  # -Σ m x z of the rotors
     assert vehicle.inertia[0, 2] == pytest.approx(xz, abs=1e-6)
 
@@ -115,12 +120,14 @@ def test_the_heavy_hexacopter_follows_from_its_derivations() -> None:
 
 
 def test_with_the_menagerie_s_turn_directions_the_skydio_x2_cannot_yaw(tmp_path: Path) -> None:
-    text = (FOLDER / "skydio_x2" / "vehicle.toml").read_text(encoding="utf-8")
+    file = FOLDER / "skydio_x2" / "vehicle.toml"
+    text = file.read_text("utf-8")
     ours = re.findall(r'turn = "(.*)"', text)
     assert ours == ["ccw", "cw", "ccw", "cw"]
     there = iter(["ccw", "cw", "cw", "ccw"])  # its gears have the yaw torques -, +, +, -
     file = tmp_path / "x2.toml"
-    file.write_text(re.sub(r'turn = ".*"', lambda _: f'turn = "{next(there)}"', text), "utf-8")
+    turned = re.sub(r'turn = ".*"', lambda _: f'turn = "{next(there)}"', text)
+    file.write_text(turned, "utf-8")
     allocation = Vehicle.load(file).allocation
     assert np.linalg.matrix_rank(allocation, rtol=1e-6) == 3
     assert allocation[3] == pytest.approx(allocation[1] * 0.0201 / 0.18)

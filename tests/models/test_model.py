@@ -70,7 +70,9 @@ def test_nothing_is_added_silently(model: mujoco.MjModel) -> None:
 def test_yaw_constant_follows_from_a_measured_propeller(model: mujoco.MjModel) -> None:
     # APC 10x4.7 at 6528 rpm, UIUC's static data: C_T 0.1274, C_P 0.0531; k = D C_P / (2 pi C_T)
     diameter = 2 * model.geom("disc1").size[0]
-    assert diameter * 0.0531 / (2 * math.pi * 0.1274) == pytest.approx(0.05, rel=0.1)
+    power_to_thrust = 0.0531 / 0.1274
+    reaction = diameter * power_to_thrust / (2 * math.pi)
+    assert reaction == pytest.approx(0.05, rel=0.1)
 
 
 def test_every_mass_is_written_out() -> None:
@@ -78,8 +80,11 @@ def test_every_mass_is_written_out() -> None:
     assert not any(math.isnan(geom.mass) for geom in geoms)
     assert all(geom.density == 0.0 for geom in geoms)
     heavy = {geom.name: geom.mass for geom in geoms if geom.mass > 0}
-    parts = {f"arm{i}": 1.2 for i in range(1, 5)} | {f"motor{i}": 0.8 for i in range(1, 5)}
-    assert heavy == {"hub": 12.0} | parts
+    expected = {"hub": 12.0}
+    for number in range(1, 5):
+        expected[f"arm{number}"] = 1.2
+        expected[f"motor{number}"] = 0.8
+    assert heavy == expected
     assert sum(heavy.values()) == pytest.approx(20.0, abs=1e-12)
 
 
@@ -168,7 +173,8 @@ def test_a_hexacopter_with_throttles_and_a_camera_in_front() -> None:
     vehicle = Vehicle.load(DATA / "hexa.xml")
     # 1.8 + 0.6 + 6 · 0.05 + 2 · 0.04 kg centred in x and y, and 0.25 kg of camera at (0.12, 0.01)
     assert vehicle.mass == pytest.approx(3.03)
-    assert vehicle.center_of_mass[:2] == pytest.approx([0.25 * 0.12 / 3.03, 0.25 * 0.01 / 3.03])
+    camera = np.array((0.12, 0.01))
+    assert vehicle.center_of_mass[:2] == pytest.approx(0.25 * camera / 3.03)
     assert vehicle.num_rotors == 6
     assert vehicle.thrust_low.tolist() == [0] * 6
     assert vehicle.thrust_high.tolist() == [12] * 6
@@ -185,7 +191,8 @@ def test_a_hexacopter_with_throttles_and_a_camera_in_front() -> None:
 
 def test_rotors_whose_sites_point_down() -> None:
     vehicle = Vehicle.load(DATA / "small.xml")
-    assert all(rotor.axis == pytest.approx((0, 0, 1)) for rotor in vehicle.rotors)
+    for rotor in vehicle.rotors:
+        assert rotor.axis == pytest.approx((0, 0, 1))
     expected = BY_HAND["small"]["allocation"]
     np.testing.assert_allclose(vehicle.allocation, expected, atol=1e-12)
 
@@ -316,7 +323,7 @@ def test_paths_come_without_mujoco() -> None:
         "rotorgram.models.Vehicle\n"
         "assert 'mujoco' in sys.modules\n"
     )
-    subprocess.run([sys.executable, "-c", code], check=True, env=dict(os.environ))
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_unknown_names_are_refused() -> None:

@@ -83,9 +83,10 @@ def test_action_zero_hovers_and_any_other_climbs(files: dict[str, Path], name: s
         _, info = env.reset(seed=0)
         for _ in range(100):
             *_, info = env.step(np.array([action], np.float32))
-        turned = np.degrees(2 * math.hypot(info["qx"], info["qy"], info["qz"]))
-        assert turned < 1e-6
-        assert math.hypot(info["x"], info["y"]) < 1e-6
+        sine = math.hypot(info["qx"], info["qy"], info["qz"])
+        aside = math.hypot(info["x"], info["y"])
+        assert np.degrees(2 * sine) < 1e-6
+        assert aside < 1e-6
         heights[action] = info["z"]
         thrusts = [info[f"F{i + 1}"] for i in range(vehicle.num_rotors)]
         # All rotors in proportion to hover: no torque, whatever the arms.
@@ -113,16 +114,17 @@ def test_acceleration_is_that_of_newton(files: dict[str, Path], name: str) -> No
 def test_unequal_arms_gears_gains_and_an_offset_mass(files: dict[str, Path]) -> None:
     vehicle = Vehicle.load(files["unequal"])
     assert vehicle.mass == pytest.approx(2.3)
-    assert vehicle.center_of_mass == pytest.approx(np.array([0.05, -0.02, -0.06]) * 0.3 / 2.3)
+    offset = np.array([0.05, -0.02, -0.06])
+    assert vehicle.center_of_mass == pytest.approx(offset * 0.3 / 2.3)
     assert vehicle.thrust_high.tolist() == pytest.approx([20.0] * 4)
     assert [rotor.newtons for rotor in vehicle.rotors] == [2.0, 4.0, 1.0, 0.5]
-    for rotor, reaction in zip(vehicle.rotors, (0.02, -0.02, 0.02, -0.02), strict=True):
-        assert rotor.reaction == pytest.approx((0.0, 0.0, reaction))
+    for rotor, sign in zip(vehicle.rotors, (1, -1, 1, -1), strict=True):
+        assert rotor.reaction == pytest.approx((0.0, 0.0, 0.02 * sign))
     hover = vehicle.hover_thrust
     assert hover.sum() == pytest.approx(2.3 * 9.81)
     arms = np.array([rotor.position for rotor in vehicle.rotors]) - vehicle.center_of_mass
-    assert (arms[:, 0] * hover).sum() == pytest.approx(0.0, abs=1e-9)
-    assert (arms[:, 1] * hover).sum() == pytest.approx(0.0, abs=1e-9)
+    torques = hover @ arms[:, :2]
+    assert torques == pytest.approx(np.zeros(2), abs=1e-9)
     assert len(set(hover.round(3).tolist())) > 1
 
 

@@ -72,7 +72,8 @@ def flown(model: mujoco.MjModel, newtons: np.ndarray, steps: int = 200) -> np.nd
     data.qpos[2] = 100.0
     data.qvel[3:] = 0.3, -0.2, 0.1
     for step in range(steps):
-        data.ctrl[:] = newtons * (1 + 0.2 * np.sin(0.1 * step + np.arange(model.nu)))
+        phases = 0.1 * step + np.arange(model.nu)
+        data.ctrl[:] = newtons * (1 + 0.2 * np.sin(phases))
         mujoco.mj_step(model, data)
     return np.concatenate((data.qpos, data.qvel))
 
@@ -113,10 +114,11 @@ def test_a_list_of_tilted_rotors_above_the_origin(tmp_path: Path) -> None:
     first = vehicle.rotors[0]
     assert first.axis == pytest.approx((0.0, side, up))
     assert first.reaction == pytest.approx((0.0, 0.016 * side, 0.016 * up))
-    # position × axis: (y az - z ay, z ax - x az, x ay - y ax)
-    torque = (0.2 * up - 0.05 * side, -0.2 * up, 0.2 * side)
-    torque = (torque[0], torque[1] + 0.016 * side, torque[2] + 0.016 * up)
-    assert vehicle.allocation[:, 0] == pytest.approx((up, *torque))
+    # position × axis: (y az - z ay, z ax - x az, x ay - y ax), and the reaction along the axis
+    roll = 0.2 * up - 0.05 * side
+    pitch = 0.016 * side - 0.2 * up
+    yaw = 0.2 * side + 0.016 * up
+    assert vehicle.allocation[:, 0] == pytest.approx((up, roll, pitch, yaw))
 
 
 def test_thrust_and_reaction_from_speeds_and_coefficients(tmp_path: Path) -> None:
@@ -162,12 +164,14 @@ axis = [0, 2, 0]
     # The box has its 0.3 m along y: (m / 12) (b² + c²). The cylinder lies along y: m r² / 2 about
     # it, m (3 r² + l²) / 12 across. Both are moved by Steiner, the box by 0.05 m along z, the
     # cylinder by 0.15 m: m d² about x and y.
-    box = np.array((0.1 * (0.09 + 0.01), 0.1 * (0.04 + 0.01), 0.1 * (0.04 + 0.09)))
     across = 0.4 * (3 * 0.0004 + 0.09) / 12
     along = 0.4 * 0.0004 / 2
-    rod = np.array((across, along, across))
-    moved = (1.2 * 0.05**2 + 0.4 * 0.15**2) * np.array((1, 1, 0))
-    np.testing.assert_allclose(vehicle.inertia, np.diag(box + rod + moved), rtol=0, atol=1e-15)
+    moved = 1.2 * 0.05**2 + 0.4 * 0.15**2
+    xx = 0.1 * (0.09 + 0.01) + across + moved
+    yy = 0.1 * (0.04 + 0.01) + along + moved
+    zz = 0.1 * (0.04 + 0.09) + across
+    expected = np.diag([xx, yy, zz])
+    np.testing.assert_allclose(vehicle.inertia, expected, rtol=0, atol=1e-15)
 
 
 def test_the_hull_stands_where_the_file_says(tmp_path: Path) -> None:
@@ -442,10 +446,10 @@ def test_meshes_of_a_models_file(tmp_path: Path) -> None:
     write(tmp_path, text.replace("<freejoint/>", hull), "model.xml")
     vehicle = load(tmp_path, '[model]\nfile = "model.xml"\n')
     assert vehicle.rest_height == pytest.approx(0.05, abs=1e-4)
-    export_mjcf(vehicle.path, tmp_path / "out" / "craft.xml")
-    assert Vehicle.load(tmp_path / "out" / "craft.xml").rest_height == pytest.approx(
-        vehicle.rest_height, abs=1e-6
-    )
+    out = tmp_path / "out" / "craft.xml"
+    export_mjcf(vehicle.path, out)
+    exported = Vehicle.load(out)
+    assert exported.rest_height == pytest.approx(vehicle.rest_height, abs=1e-6)
     tetrahedron(mesh, 0.06)
     os.utime(mesh, (1, 1))  # MuJoCo keeps meshes by the second
     os.utime(tmp_path / "model.xml", (1, 1))
