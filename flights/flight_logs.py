@@ -70,27 +70,25 @@ def read_log(
     table = _our_columns(path, columns or {}, vehicle.num_rotors)
     states = np.stack([table[name] for name in MOTION], axis=1)
     states[:, 3:7] = _without_flips(states[:, 3:7])
-    speeds = _of_rotors(table, SPEED, vehicle)
+    measured = _of_rotors(table, SPEED, vehicle)
     commands = _of_rotors(table, SPEED_COMMAND, vehicle)
     throttle = _of_rotors(table, THROTTLE, vehicle)
     if commands is None and throttle is not None:
         commands = _commanded_speeds(path, throttle, vehicle)
-    speeds_or_commands = commands if speeds is None else speeds
-    if speeds_or_commands is None:
+    speeds = commands if measured is None else measured
+    if speeds is None:
         names = " or ".join(kind.format(f"1...{vehicle.num_rotors}") for kind in _KINDS)
         _refuse(path, f"columns {names}", "none")
-    _check_speeds(path, vehicle, speeds_or_commands)
-    samples = np.concatenate((states, speeds_or_commands), axis=1)
-    if commands is not None:
-        _check_speeds(path, vehicle, commands)
-        samples = np.concatenate((samples, commands), axis=1)
-    rows = _consistent_rows(path, table["t"], samples)
+    followed = speeds if commands is None else commands
+    samples = np.concatenate((states, speeds, followed), axis=1)
+    _check_speeds(path, vehicle, samples[:, len(MOTION) :])
+    later = _later_rows(path, table["t"])
+    rows = _consistent_rows(path, table["t"], samples, later)
     times = table["t"][rows]
     grid = _grid(path, times, period)
     uniform = np.stack([np.interp(grid, times, column) for column in samples[rows].T], axis=1)
-    states, speeds_or_commands, commands_after = np.split(
-        uniform, (len(MOTION), len(MOTION) + vehicle.num_rotors), axis=1
-    )
+    ends = len(MOTION), len(MOTION) + vehicle.num_rotors
+    states, speeds, followed = np.split(uniform, ends, axis=1)
     length = np.linalg.norm(states[:, 3:7], axis=1, keepdims=True)
     if not (length > 0.5).all():
         _refuse(path, "quaternions of length 1", f"{length.min():.3g}")
@@ -99,10 +97,10 @@ def read_log(
         name=path.stem,
         period=period,
         states=states,
-        speeds=speeds_or_commands,
-        measured=speeds is not None,
-        commands=None if commands is None else commands_after,
-        left_out=_later(table["t"]).size - rows.size,
+        speeds=speeds,
+        measured=measured is not None,
+        commands=None if commands is None else followed,
+        left_out=len(later) - len(rows),
     )
 
 
@@ -192,8 +190,8 @@ def _of_rotors(table: Mapping[str, Floats], kind: str, vehicle: Vehicle) -> Floa
 
 def _commanded_speeds(path: Path, throttle: Floats, vehicle: Vehicle) -> Floats:
     """Speeds at which the vehicle as it is gives the commanded share of its largest thrust."""
-    low = float(throttle.min(initial=0.0))
-    high = float(throttle.max(initial=0.0))
+    low = throttle.min(initial=0.0)
+    high = throttle.max(initial=0.0)
     if low <= -0.01 or high >= 1.01:
         _refuse(path, "throttle from 0 to 1", f"{low:.3g} to {high:.3g}")
     (coefficient,) = vehicle.coefficients.need("rotors.thrust_coefficient", "a log of commands")
@@ -223,22 +221,20 @@ def _without_flips(quaternions: Floats) -> Floats:
 # ---- samples
 
 
-def _later(times: Floats) -> Rows:
+def _later_rows(path: Path, times: Floats) -> Rows:
     """Samples with a later time than all before."""
-    later = times[1:] > np.maximum.accumulate(times)[:-1]
-    return np.flatnonzero(np.concatenate(([True], later)))
-
-
-def _consistent_rows(path: Path, times: Floats, samples: Floats) -> Rows:
-    """Samples with a later time than those before, without single impossible ones."""
-    if len(times) < 2:
-        _refuse(path, "two or more samples", str(len(times)))
     if not np.isfinite(times).all():
         _refuse(path, "finite times", "others")
-    rows = _later(times)
+    latest = np.maximum.accumulate(times)
+    return np.flatnonzero(np.diff(latest, prepend=-np.inf) > 0)
+
+
+def _consistent_rows(path: Path, times: Floats, samples: Floats, rows: Rows) -> Rows:
+    """The rows without single impossible samples."""
     if not np.isfinite(samples[rows]).all():
         _refuse(path, "finite numbers", "others")
-    least = len(rows) - max(1, int(_MOST_LEFT_OUT * len(rows)))
+    most = max(1, int(_MOST_LEFT_OUT * len(rows)))
+    least = len(rows) - most
     rule = "positions and attitudes that agree with velocities and rates"
     while len(bad := np.flatnonzero(~_agree(times, samples, rows))):
         step = int(bad[0])
@@ -251,7 +247,7 @@ def _consistent_rows(path: Path, times: Floats, samples: Floats) -> Rows:
             _refuse(path, rule, f"a jump at {times[rows[step + 1]]:.6g} s")
         rows = rest
         if len(rows) < least:
-            _refuse(path, rule, f"more than {len(_later(times)) - least} samples that do not")
+            _refuse(path, rule, f"more than {most} samples that do not")
     return rows
 
 
@@ -261,9 +257,9 @@ def _agree(times: Floats, states: Floats, rows: Rows) -> NDArray[np.bool_]:
     second = states[rows[1:]]
     seconds = np.diff(times[rows])[:, None]
     with np.errstate(all="ignore"):
-        moved = 0.5 * (first[:, 7:10] + second[:, 7:10]) * seconds
-        distance = np.linalg.norm(second[:, :3] - first[:, :3] - moved, axis=1)
-        turned = np.linalg.norm(0.5 * (first[:, 10:13] + second[:, 10:13]) * seconds, axis=1)
+        change = 0.5 * (first[:, 7:13] + second[:, 7:13]) * seconds
+        distance = np.linalg.norm(second[:, :3] - first[:, :3] - change[:, :3], axis=1)
+        turned = np.linalg.norm(change[:, 3:], axis=1)
         cosine = np.abs((first[:, 3:7] * second[:, 3:7]).sum(axis=1))
         angle = 2 * np.arccos(np.clip(cosine, 0.0, 1.0))
         near = distance <= _POSITION_ERROR
@@ -312,10 +308,12 @@ def _ulog(path: Path) -> Columns:
     times = {topic: topics[topic]["timestamp"].astype(np.float64) for topic in used}
     first = max(own[0] for own in times.values())
     last = min(own[-1] for own in times.values())
-    base = times[_RATES][(times[_RATES] >= first) & (times[_RATES] <= last)]
+    base = times[_RATES]
+    base = base[(base >= first) & (base <= last)]
     attitude = topics[_ATTITUDE]
-    smooth = _without_flips(np.stack([attitude[f"q[{i}]"] for i in range(4)], axis=1))
-    attitude |= {f"q[{i}]": smooth[:, i] for i in range(4)}
+    names = [f"q[{i}]" for i in range(4)]
+    smooth = _without_flips(np.stack([attitude[name] for name in names], axis=1))
+    attitude |= zip(names, smooth.T, strict=True)
     columns = {"t": (base - base[:1]) * 1e-6}
 
     def take(ours: str, topic: str, field: str, factor: float = 1.0) -> None:

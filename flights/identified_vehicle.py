@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from ..models.vehicle import Vehicle
 from ..models.vehicle_file import read_vehicle_file
-from .identify import LAG, Estimate, Identified
+from .identify import LAG, Identified
 from .prediction import Numbers, inertia_of
 
 _AXES: Final = ("x", "y", "z")
@@ -34,9 +34,13 @@ def identified_toml(vehicle: Vehicle, found: Identified) -> str:
     origins: dict[str, Origin] = {}
     for estimate in found.estimates:
         entry, axis = _entry(estimate.name)
+        sentence = f"95 % interval {estimate.low:.4g} to {estimate.high:.4g}"
+        if estimate.kept:
+            sentence = f"the vehicle's own value, {estimate.kept}"
+        if axis:
+            sentence = f"{axis}: {sentence}"
         before = origins.get(entry, Origin(""))
-        sentence = f"{axis}: {_sentence(estimate)}" if axis else _sentence(estimate)
-        why = "; ".join(filter(None, (before.why, sentence)))
+        why = f"{before.why}; {sentence}" if before.why else sentence
         origins[entry] = Origin(before.source if estimate.kept else source, why)
     return vehicle_toml(vehicle, found.numbers, origins)
 
@@ -121,12 +125,6 @@ def _rotors(vehicle: Vehicle) -> Iterator[str]:
             f"axis = {_plain(rotor.axis)}",
             f'turn = "{"cw" if clockwise else "ccw"}"',
         )
-
-
-def _sentence(estimate: Estimate) -> str:
-    if estimate.kept:
-        return f"the vehicle's own value, {estimate.kept}"
-    return f"95 % interval {estimate.low:.4g} to {estimate.high:.4g}"
 
 
 def _plain(value: ArrayLike) -> str:

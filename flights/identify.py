@@ -11,7 +11,7 @@ it cannot be distinguished from another number.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,8 +52,7 @@ Group = tuple[str, ...]
 """Names of numbers that stay equal."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Estimate:
+class Estimate(NamedTuple):
     """One number of the result."""
 
     name: str
@@ -97,22 +96,21 @@ def identify(
     for name in names:
         if name not in KNOWN:
             raise InputError(f"fit: expected some of {', '.join(KNOWN)}, got {name!r}")
-    with_commands = [log.commands is not None for log in logs]
-    if any(with_commands) and not all(with_commands):
+    if len({log.commands is None for log in logs}) > 1:
         raise InputError("logs: expected commands in all of them or in none")
     base = numbers_of(vehicle)
-    if with_commands[0]:
+    if logs[0].commands is not None:
         base[LAG] = vehicle.coefficients.rotors.time_constant or 0.05
     free = [name for name in names if name in base]
-    steps = _steps(window, logs[0].period)
-    windows = _cut(logs, base, steps)
+    windows = _cut(logs, base, _steps(window, logs[0].period))
     clusters = _clusters(windows)
-    if clusters.max() + 1 < _LEAST_SEGMENTS:
+    segments = int(clusters.max()) + 1
+    if segments < _LEAST_SEGMENTS:
         raise InputError(
             f"logs: expected at least {_LEAST_SEGMENTS} segments of {SEGMENT:g} s in the logs, "
-            f"got {clusters.max() + 1}"
+            f"got {segments}"
         )
-    point: Numbers = base
+    point = dict(base)
     kept: dict[str, Estimate] = {}
     while True:
         fit = Fit(vehicle, windows, point, [(name,) for name in free], logs=logs)
@@ -121,15 +119,14 @@ def identify(
         estimates = {}
         for name, width in zip(free, half.tolist(), strict=True):
             value = point[name]
-            ends = {"low": value - width, "high": value + width}
-            estimates[name] = Estimate(name=name, value=value, **ends)
+            estimates[name] = Estimate(name, value, value - width, value + width)
         undetermined = _undetermined(list(estimates.values()), correlation)
         if not undetermined:
             break
         for name, reason in undetermined.items():
-            kept[name] = replace(estimates[name], value=base[name], kept=reason)
+            kept[name] = estimates[name]._replace(value=base[name], kept=reason)
             free.remove(name)
-        point = {**point, **{name: base[name] for name in undetermined}}
+            point[name] = base[name]
     found = estimates | kept
     return Identified(
         numbers=point,
@@ -137,7 +134,7 @@ def identify(
         before=fit.mean_errors(base),
         after=fit.mean_errors(point),
         windows=len(windows.start),
-        segments=int(clusters.max()) + 1,
+        segments=segments,
         logs=tuple(log.name for log in logs),
     )
 
@@ -182,10 +179,10 @@ def _undetermined(estimates: Sequence[Estimate], correlation: Floats) -> dict[st
     ratios = {}
     for one in estimates:
         ratios[one.name] = (one.high - one.value) / abs(one.value) if one.value else np.inf
-    most = max(ratios.values(), default=0.0)
+    worst = min(max(ratios.values(), default=0.0), 4 * WIDEST)
     reasons = {}
     for name, ratio in ratios.items():
-        if ratio > WIDEST and ratio >= min(most, 4 * WIDEST):
+        if ratio > WIDEST and ratio >= worst:
             interval = "any number" if ratio > 10 else f"± {ratio:.0%}"
             reasons[name] = f"not excited: 95 % interval {interval}"
     return reasons
@@ -231,7 +228,7 @@ class Fit:
             solution = least_squares(
                 lambda x: self._rows(x[None]).ravel(),
                 self._x,
-                self._slopes,
+                lambda x: self._jacobian(x, 1e-6)[1].reshape(len(x), -1).T,
                 bounds=(self._lowest, np.inf),
                 x_scale="jac",
                 loss="soft_l1",
@@ -253,15 +250,12 @@ class Fit:
         """Of the 95 % intervals, infinite where nothing depends on a number; correlations."""
         from scipy.stats import t
 
-        steps = 1e-4 * np.maximum(np.abs(self._x), 1e-2)
-        rows = self._rows(_neighbours(self._x, steps))
-        base = rows[0]
-        jacobian = (rows[1:] - base) / steps[:, None, None]
+        base, jacobian = self._jacobian(self._x, 1e-4)
         weight = 1 / np.sqrt(1 + base * base)  # of the loss soft_l1
         bread = np.einsum("imk,jmk,mk->ij", jacobian, jacobian, weight)
         scores = np.einsum("imk,mk->mi", jacobian, weight * base)
         count = int(clusters.max()) + 1
-        sums = np.zeros((count, len(steps)))
+        sums = np.zeros((count, len(bread)))
         np.add.at(sums, clusters, scores)
         size = np.sqrt(np.diag(bread))
         felt = size > 1e-9 * size.max(initial=1e-300)
@@ -274,10 +268,15 @@ class Fit:
         root = np.where(felt, np.sqrt(np.diag(inverse)), 1.0)
         # More drag than a physics step can follow is no estimate.
         stiffest = 0.5 * self._vehicle.mass / self._windows.period
-        for i, (name, *_) in enumerate(self._groups):
-            if name.startswith("drag.linear") and self._x[i] * self._scales[i] > stiffest:
-                half[i] = np.inf
+        is_drag = np.array([group[0].startswith("drag.linear") for group in self._groups], bool)
+        half[is_drag & (self._x * self._scales > stiffest)] = np.inf
         return half, inverse / np.outer(root, root)
+
+    def _jacobian(self, x: Floats, step: float) -> tuple[Floats, Floats]:
+        """Residuals (M, K), and their slopes (n, M, K): all are one stacked prediction."""
+        steps = step * np.maximum(np.abs(x), 1e-2)
+        rows = self._rows(np.concatenate((x[None], x + np.diag(steps))))
+        return rows[0], (rows[1:] - rows[0]) / steps[:, None, None]
 
     def _numbers(self, x: Floats) -> dict[str, float]:
         numbers = dict(self._start)
@@ -337,27 +336,15 @@ class Fit:
 
     def _speed_differences(self, numbers: Numbers) -> Floats:
         """Speeds that follow the commands less those measured, in each window, (M, K)."""
-        flights = [
-            replace(log, speeds=with_lag(log, numbers[LAG]).speeds - log.speeds)
-            for log in self._logs
-        ]
+        flights = []
+        for log in self._logs:
+            late = with_lag(log, numbers[LAG]).speeds - log.speeds
+            flights.append(replace(log, speeds=late))
         steps = self._windows.speeds.shape[1]
         cut = Windows.cut(flights, steps, steps)
         begun = cut.index > 0  # in the first window they come from where the command was
         rows: Floats = (cut.speeds * begun[:, None, None]).reshape(len(begun), -1)
         return rows
-
-    def _slopes(self, x: Floats) -> Floats:
-        """The Jacobian: all columns are one stacked prediction."""
-        steps = 1e-6 * np.maximum(np.abs(x), 1e-2)
-        table = self._rows(_neighbours(x, steps)).reshape(len(x) + 1, -1)
-        slopes: Floats = (table[1:] - table[0]).T / steps
-        return slopes
-
-
-def _neighbours(x: Floats, steps: Floats) -> Floats:
-    """The point, and one with a step along each axis."""
-    return np.concatenate((x[None], x + np.diag(steps)))
 
 
 def _shifted(start: Floats, sizes: Floats) -> Floats:

@@ -11,7 +11,7 @@ import copy
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Final, Self
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,12 +52,11 @@ def numbers_of(vehicle: Vehicle) -> dict[str, float]:
     own["body.inertia"] = np.diag(vehicle.inertia).tolist()
     own["rotors.reaction"] = [float(np.mean(reactions))]
     numbers = dict.fromkeys(NAMES, 0.0)
-    for name, values in own.items():
-        if name in numbers:
-            numbers[name] = values[0]
-        for axis, value in zip("xyz", values, strict=False):
-            if f"{name}.{axis}" in numbers:
-                numbers[f"{name}.{axis}"] = value
+    for entry, values in own.items():
+        names = [entry] if entry in numbers else [f"{entry}.{axis}" for axis in "xyz"]
+        for name, value in zip(names, values, strict=False):
+            if name in numbers:
+                numbers[name] = value
     return numbers
 
 
@@ -89,14 +88,12 @@ class Windows:
 
     def repeated(self, times: int) -> Self:
         """The same windows several times, one lot after the other."""
-        return replace(
-            self,
-            start=np.tile(self.start, (times, 1)),
-            truth=np.tile(self.truth, (times, 1, 1)),
-            speeds=np.tile(self.speeds, (times, 1, 1)),
-            flight=np.tile(self.flight, times),
-            index=np.tile(self.index, times),
-        )
+        arrays: dict[str, Any] = {
+            name: np.concatenate([values] * times)
+            for name, values in vars(self).items()
+            if isinstance(values, np.ndarray)
+        }
+        return replace(self, **arrays)
 
     @classmethod
     def cut(
@@ -107,23 +104,21 @@ class Windows:
         The only horizon is the last step, unless others are given.
         """
         chosen = np.array(horizons or [steps])
-        starts = [np.arange(0, len(flight.states) - steps, stride) for flight in flights]
-        states = []
-        truth = []
-        speeds = []
-        for flight, first in zip(flights, starts, strict=True):
-            states.append(flight.states[first])
-            truth.append(flight.states[first[:, None] + chosen])
-            speeds.append(flight.speeds[first[:, None] + np.arange(steps)])
-        counts = [len(first) for first in starts]
+        arrays = []
+        for number, flight in enumerate(flights):
+            first = np.arange(0, len(flight.states) - steps, stride)
+            truth = flight.states[first[:, None] + chosen]
+            speeds = flight.speeds[first[:, None] + np.arange(steps)]
+            arrays.append((flight.states[first], truth, speeds, np.full_like(first, number), first))
+        start, truth, speeds, numbers, index = map(np.concatenate, zip(*arrays, strict=True))
         return cls(
             period=flights[0].period,
             horizons=tuple(chosen.tolist()),
-            start=np.concatenate(states),
-            truth=np.concatenate(truth),
-            speeds=np.concatenate(speeds),
-            flight=np.repeat(np.arange(len(flights)), counts),
-            index=np.concatenate(starts),
+            start=start,
+            truth=truth,
+            speeds=speeds,
+            flight=numbers,
+            index=index,
         )
 
 
