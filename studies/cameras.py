@@ -22,7 +22,7 @@ os.environ.setdefault("MUJOCO_GL", "egl")  # which MuJoCo's renderer needs befor
 
 import mujoco
 import numpy as np
-from measuring import in_turns, medians, options, table, timed, write
+from measuring import options, seconds_of, table, write
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.envs.config import EnvConfig
 from rotorgram.models.cameras import OUTPUTS, chosen_views
@@ -88,7 +88,7 @@ def pictures(seconds: float, repeats: int) -> list[dict[str, Any]]:
         for kind in OUTPUTS:
             here, cameras = ours(f"front_{kind}@{width}x{height}")
             cases = {"ours": here, "theirs": theirs(kind, width, height, cameras)}
-            taken = medians(in_turns(cases, repeats, lambda step: timed(step, seconds)[0]))
+            taken = seconds_of(cases, repeats, seconds)
             cameras.close()
             rows.append(
                 {
@@ -106,7 +106,7 @@ def pictures(seconds: float, repeats: int) -> list[dict[str, Any]]:
 def milliseconds(cases: dict[str, tuple[Step, Cameras]], seconds: float, repeats: int) -> Times:
     """Of a picture of each case, in turns."""
     steps = {name: step for name, (step, _) in cases.items()}
-    taken = medians(in_turns(steps, repeats, lambda step: timed(step, seconds)[0]))
+    taken = seconds_of(steps, repeats, seconds)
     for _, cameras in cases.values():
         cameras.close()
     return {name: round(1e3 * time, 2) for name, time in taken.items()}
@@ -130,7 +130,7 @@ def threads(seconds: float, repeats: int) -> dict[str, float]:
             "one thread": lambda: [step() for step, _ in each],
             "two threads": lambda: [*pool.map(lambda one: one[0](), each)],
         }
-        taken = medians(in_turns(cases, repeats, lambda step: timed(step, seconds)[0]))
+        taken = seconds_of(cases, repeats, seconds)
     for _, cameras in each:
         cameras.close()
     return {name: round(2 / time, 1) for name, time in taken.items()}
@@ -153,7 +153,7 @@ def steps(drones: int, seconds: float, repeats: int) -> dict[str, float]:
         if drones > 1:
             several = opened.enter_context(two_simulators(drones, flown["seeing"]))
             cases["seeing over UDP, two simulators"] = advanced(several, drones)
-        taken = medians(in_turns(cases, repeats, lambda step: timed(step, seconds)[0]))
+        taken = seconds_of(cases, repeats, seconds)
     return {name: round(time * 1e3, 3) for name, time in taken.items()}
 
 

@@ -84,6 +84,13 @@ def timed(step: Callable[[], object], seconds: float) -> tuple[float, float]:
     return (time.perf_counter() - began) / count, (time.process_time() - used) / count
 
 
+def seconds_of(
+    steps: Mapping[Name, Callable[[], object]], rounds: int, seconds: float
+) -> dict[Name, float]:
+    """Median wall time of each step, s, of rounds of so many seconds in turns."""
+    return medians(in_turns(steps, rounds, lambda step: timed(step, seconds)[0]))
+
+
 def medians(measured: Mapping[Name, list[float]]) -> dict[Name, float]:
     """Median of what was measured of each way."""
     return {name: statistics.median(values) for name, values in measured.items()}

@@ -44,24 +44,16 @@ from rotorgram.sim.world import make_world
 START: Final = Path(__file__).with_name("nanodrone.toml")
 HORIZONS: Final = (1, 10, 50)
 MEASURES: Final = ("position_m", "attitude_rad", "velocity_m_s", "rates_rad_s")
-PUBLISHED: Final = {
-    "naive": ((0.0143, 0.0071, 0.0329, 0.0796), (0.1430, 0.0692, 0.3182, 0.3596),
-              (0.6797, 0.3041, 1.4749, 0.8837)),
-    "physics": ((0.0013, 0.0011, 0.0080, 0.0796), (0.0126, 0.0205, 0.0570, 0.3596),
-                (0.1269, 0.2544, 0.5781, 0.8837)),
-    "MLP": ((0.0032, 0.0022, 0.0116, 0.1138), (0.0305, 0.0331, 0.0890, 0.5949),
-            (0.1712, 0.2268, 0.5720, 0.9005)),
-    "hybrid": ((0.0016, 0.0027, 0.0092, 0.0912), (0.0166, 0.0376, 0.0613, 0.4880),
-               (0.1119, 0.2306, 0.5556, 0.5979)),
-    "LSTM": ((0.0079, 0.0066, 0.0247, 0.1021), (0.0390, 0.0372, 0.1175, 0.4292),
-             (0.2572, 0.2325, 0.7407, 1.2407)),
-}  # fmt: skip
+PUBLISHED: Final[dict[str, dict[str, list[float]]]] = json.loads(
+    Path(__file__).with_name("nanodrone_published.json").read_text()
+)
 """Rows of the benchmark's table: position, attitude, velocity, rates at each horizon."""
 _WORLDS: Final = 2048
 _UP: Final = 100.0  # m: far from the ground, which no effect here feels
 _UNTURNED: Final = 1e3  # kg m²: an inertia that no rotor turns
 _STRIDE: Final = 50  # samples between two starts of a fit: windows do not overlap
 
+FORCES: Final = ("rotors.thrust_coefficient", *(f"drag.linear.{axis}" for axis in "xyz"))
 K: Final = ("rotors.thrust_coefficient",)
 DRAG: Final = (("drag.linear.x", "drag.linear.y"), ("drag.linear.z",))
 ROTOR_DRAG: Final = (("rotors.drag",), ("rotors.inflow",))
@@ -80,13 +72,18 @@ class Variant:
     regressed: bool = False
     """Whether thrust and drag are those of a regression of accelerations, and not fitted too."""
 
+    @property
+    def names(self) -> list[str]:
+        """Numbers that the flights decide."""
+        fitted = [name for group in self.groups for name in group]
+        return [*FORCES, *fitted] if self.regressed else fitted
+
 
 VARIANTS: Final = (
     Variant("rates constant, published thrust coefficient", (), False),
     Variant("+ thrust coefficient fitted", (K,), False),
     Variant("+ drag of the body", (K, *DRAG), False),
     Variant("or drag and inflow of the rotors instead", (K, *ROTOR_DRAG), False),
-    Variant("rates decay, no torques", (K, *DRAG, *DAMPING), False),
     Variant("rotors turn the craft, published inertia", (K, *DRAG)),
     Variant("+ inertia fitted", (K, *DRAG, *INERTIA)),
     Variant("+ moment of the air", (K, *DRAG, *INERTIA, *MOMENT)),
@@ -99,7 +96,6 @@ VARIANTS: Final = (
                   for name in (kind + "x", kind + "y", kind + "z")),
              ("drag.moment.x",), ("drag.moment.y",))),
 )  # fmt: skip
-FORCES: Final = ("rotors.thrust_coefficient", *(f"drag.linear.{axis}" for axis in "xyz"))
 
 
 def main() -> int:
@@ -121,21 +117,17 @@ def main() -> int:
         numbers = _fitted(variant, base, held, cut, train)
         text, vehicle = _vehicle(base, numbers, variant)
         row = _row(variant.name, simulated(vehicle, windows), windows, test)
-        predicted = predict(base, [_flown(variant, numbers)], windows)
-        ours = _row(variant.name, predicted, windows, test)
-        row["numpy"] = ours["errors"][HORIZONS[-1]]
         row["unseen_kinds"] = _unseen(variant, base, held, train)
         reference = rows[1] if len(rows) > 1 else row
         ratios = np.divide(row["unseen_kinds"], reference["unseen_kinds"])
         row["unseen_score"] = float(ratios[:3].mean())  # 1: as the published physics
-        names = [*(FORCES if variant.regressed else ()), *(n for g in variant.groups for n in g)]
-        row["numbers"] = {name: numbers[name] for name in names}
+        row["numbers"] = {name: numbers[name] for name in variant.names}
         row["file"] = text
         row["fit_s"] = round(time.monotonic() - begun, 1)
         rows.append(row)
         _show(row, "ours")
     for name, errors in PUBLISHED.items():
-        theirs = dict(zip(HORIZONS, errors, strict=True))
+        theirs = {int(h): numbers for h, numbers in errors.items()}
         _show({"name": name, "published_formula": theirs}, "theirs")
     _write(given.out, rows, len(windows.index), given.stride)
     return 0
@@ -252,12 +244,9 @@ def _fitted(
 ) -> Numbers:
     """The numbers of a variant; where rates are constant, forces are fitted with them constant."""
     begun = regressed(base, flights) if variant.regressed else {}
-    start = _flown(variant, {**held, **begun})
     if not variant.groups:
         return held
-    if not variant.turns:
-        decaying = [name for group in DAMPING if group in variant.groups for name in group]
-        start = {**start, **dict.fromkeys(decaying, _UNTURNED / 0.5)}  # time constant: 0.5 s
+    start = _flown(variant, {**held, **begun})
     found = Fit(base, windows, start, variant.groups).solve()
     if variant.turns:
         return found
@@ -265,7 +254,7 @@ def _fitted(
 
 
 def _flown(variant: Variant, numbers: Numbers) -> Numbers:
-    """Without torques of the rotors: an inertia that they cannot turn, and damping in its ratio."""
+    """Without torques of the rotors: an inertia that they cannot turn."""
     if variant.turns:
         return numbers
     return {**numbers, **{f"body.inertia.{axis}": _UNTURNED for axis in "xyz"}}
@@ -273,8 +262,7 @@ def _flown(variant: Variant, numbers: Numbers) -> Numbers:
 
 def _vehicle(base: Vehicle, numbers: Numbers, variant: Variant) -> tuple[str, Vehicle]:
     """The text of a vehicle file that says these numbers, and its vehicle."""
-    names = [*(FORCES if variant.regressed else ()), *(n for g in variant.groups for n in g)]
-    said = {name.rpartition(".")[0] if name.count(".") > 1 else name for name in names}
+    said = {name.rpartition(".")[0] if name.count(".") > 1 else name for name in variant.names}
     source = "studies/real_flights.py: fitted on the training flights of arXiv 2512.14450"
     origins = dict.fromkeys(said, Origin(source))
     text = vehicle_toml(base, _flown(variant, numbers), origins)
@@ -343,23 +331,23 @@ def _show(row: Mapping, whose: str) -> None:
 
 def _write(out: Path, rows: Sequence[Mapping], starts: int, stride: int) -> None:
     out.mkdir(parents=True, exist_ok=True)
-    with (out / "variants.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["model", "formula", "horizon", *MEASURES])
-        for row in rows:
-            for kind in ("errors", "published formula"):
-                for h, errors in row[kind.replace(" ", "_")].items():
-                    writer.writerow([row["name"], kind, h, *(f"{x:.5f}" for x in errors)])
-        for name, errors in PUBLISHED.items():
-            for h, one in zip(HORIZONS, errors, strict=True):
-                writer.writerow([f"published: {name}", "published formula", h, *one])
-    with (out / "flights.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["model", "flight", "horizon", *MEASURES])
-        for row in rows:
-            for name, told in row["flights"].items():
-                for h, errors in told.items():
-                    writer.writerow([row["name"], name, h, *(f"{x:.5f}" for x in errors)])
+    variants = []
+    flights = []
+    for row in rows:
+        for kind in ("errors", "published formula"):
+            for h, errors in row[kind.replace(" ", "_")].items():
+                variants.append([row["name"], kind, h, *(f"{x:.5f}" for x in errors)])
+        for flight, told in row["flights"].items():
+            for h, errors in told.items():
+                flights.append([row["name"], flight, h, *(f"{x:.5f}" for x in errors)])
+    for name, told in PUBLISHED.items():
+        for h, errors in told.items():
+            variants.append([f"published: {name}", "published formula", h, *errors])
+    for name, kind, lines in (("variants", "formula", variants), ("flights", "flight", flights)):
+        with (out / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(["model", kind, "horizon", *MEASURES])
+            writer.writerows(lines)
     # Chosen by kinds of flights that the fit had not seen, among the training flights.
     chosen = min(rows[1:], key=lambda row: row["unseen_score"])
     position, attitude, velocity, _ = chosen["errors"][HORIZONS[-1]]
@@ -376,11 +364,10 @@ def _write(out: Path, rows: Sequence[Mapping], starts: int, stride: int) -> None
         "measures": MEASURES,
         "ours": chosen["errors"][50],
         "ours_by_the_published_formula": chosen["published_formula"][50],
-        "published": {name: errors[-1] for name, errors in PUBLISHED.items()},
+        "published": {name: errors["50"] for name, errors in PUBLISHED.items()},
         "numbers": chosen["numbers"],
         "unseen_kinds": {row["name"]: row["unseen_kinds"] for row in rows[1:]},
         "unseen_score": {row["name"]: row["unseen_score"] for row in rows[1:]},
-        "ours_in_numpy": chosen["numpy"],
     }
     (out / "summary.json").write_text(json.dumps(summary, indent=1, ensure_ascii=False) + "\n")
 

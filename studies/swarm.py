@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measuring import in_turns, medians, options, table, timed, write
+from measuring import options, seconds_of, table, write
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.envs.config import EnvConfig
 from rotorgram.udp.spawn import spawn_simulator
@@ -58,7 +58,7 @@ def measure(counts: list[int], seconds: float, repeats: int) -> dict[str, dict[s
             cases["one world", drones] = physics(drones, together=True)
             cases["with the task", drones] = advanced(local, drones)
             cases["over UDP", drones] = advanced(opened.enter_context(pair), drones)
-        taken = medians(in_turns(cases, repeats, lambda step: timed(step, seconds)[0]))
+        taken = seconds_of(cases, repeats, seconds)
     found: dict[str, dict[str, float]] = {}
     for (name, drones), time in taken.items():
         found.setdefault(name, {})[str(drones)] = round(time / drones * 1e6, 2)

@@ -14,9 +14,6 @@ It takes about two minutes on two cores.
 """
 
 import os
-import statistics
-import time
-from pathlib import Path
 
 import numpy as np
 from measuring import RESULTS, medians, options, write
@@ -26,28 +23,16 @@ from rotorgram.training.training import Training
 from rotorgram.udp.spawn import spawn_simulator
 
 
-def processor_seconds() -> float:
-    """Of this process and its simulator, by Linux."""
-    (task,) = Path("/proc/self/task").glob(str(os.getpid()))
-    used = time.process_time()
-    for child in (task / "children").read_text().split():
-        fields = Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()
-        used += (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-    return used
-
-
 def steps_per_second(
     algorithm: str, changes: dict[str, int], seed: int, **settings: object
-) -> tuple[float, float]:
-    """By the clock, and per second of a processor."""
+) -> float:
+    """Of a training, without the start of its simulator."""
     config = preset(algorithm, "tuned", **changes)
     run = Run(algorithm=algorithm, config=config, seed=seed, **settings)
     with spawn_simulator(run.env, num_envs=run.num_envs) as env:
         training = Training(run, env)
-        before = processor_seconds()
         training.train()
-        used = processor_seconds() - before
-        return training.log.env_steps / training.log.seconds, training.log.env_steps / used
+        return training.log.env_steps / training.log.seconds
 
 
 def main() -> None:
@@ -58,38 +43,26 @@ def main() -> None:
     changes = {"steps_per_update": args.steps_per_update} if args.steps_per_update else {}
     settings = {name: getattr(args, name) for name in ("env_steps", "num_envs", "backend")}
     rates: dict[str, list[float]] = {agent: [] for agent in args.agents}
-    used: dict[str, list[float]] = {agent: [] for agent in args.agents}
     for repeat in range(args.repeats):
-        for agent in args.agents:
-            rate, of_processor = steps_per_second(agent, changes, repeat, **settings)
-            rates[agent].append(round(rate, 1))
-            used[agent].append(round(of_processor, 1))
-            print(f"{agent:8} {rate:8,.0f} env steps/s, {of_processor:8,.0f} of a processor's",
-                  flush=True)  # fmt: skip
+        for agent, own in rates.items():
+            own.append(round(steps_per_second(agent, changes, repeat, **settings), 1))
+            print(f"{agent:8} {own[-1]:8,.0f} env steps/s", flush=True)
     middle = medians(rates)
-    ratios, ratios_used = (
-        {
-            agent: round(statistics.median(np.divide(values, told["sb3-a2c"]).tolist()), 2)
-            for agent, values in told.items()
-        }
-        for told in (rates, used)
-    )
+    ratios = {}
+    for agent, own in rates.items():
+        beside = np.divide(own, rates["sb3-a2c"])
+        ratios[agent] = round(float(np.median(beside)), 2)
     result = {
         **settings,
         "changes": changes,
         "rates": rates,
         "medians": middle,
         "ratio_to_sb3": ratios,
-        "rates_per_processor_second": used,
-        "ratio_to_sb3_per_processor_second": ratios_used,
         "load_average": round(os.getloadavg()[0], 1),
     }
     write(args.out, result)
     for agent, median in middle.items():
-        print(
-            f"{agent:8} median {median:8,.0f} env steps/s, {ratios[agent]:.2f} x SB3's A2C, "
-            f"{ratios_used[agent]:.2f} x per second of a processor"
-        )
+        print(f"{agent:8} median {median:8,.0f} env steps/s, {ratios[agent]:.2f} x SB3's A2C")
 
 
 if __name__ == "__main__":
