@@ -1,12 +1,14 @@
 """Logs and plots of flights: their columns, units and pictures."""
 
 import csv
-import math
+from contextlib import closing
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from cases import CASES, each
+from peers import ANY, Running
 from rotorgram.cli import main
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
@@ -14,27 +16,29 @@ from rotorgram.flights.plots import panels_of, roll_pitch_yaw
 from rotorgram.flights.recorded import recorded_trajectories
 from rotorgram.flights.signals import Signal, columns_of
 from rotorgram.flights.trajectories import Trajectory
+from rotorgram.udp import RemoteVectorEnv, Simulator
 from rotorgram.udp.spawn import spawn_simulator
 
 pytest.importorskip("mcap")
-HEAD = [
-    "time [s]", "episode", "drone", "x [m]", "y [m]", "z [m]", "qw", "qx", "qy", "qz",
-    "vx [m/s]", "vy [m/s]", "vz [m/s]", "rate_x [rad/s]", "rate_y [rad/s]", "rate_z [rad/s]",
-    "F1 [N]", "F2 [N]", "F3 [N]", "F4 [N]", "goal_x [m]", "goal_y [m]", "goal_z [m]",
-    "position_error [m]", "heading_error [deg]",
-]  # fmt: skip
+HEAD = CASES["hover"]["head"]
 
 
 @pytest.fixture(scope="module")
 def journal(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three steps of a first episode, which is given up, and two of a second one."""
     path = tmp_path_factory.mktemp("journals") / "hover.mcap"
+    action = np.array([0.1, 0.0, 0.0, 0.0], np.float32)
     with spawn_simulator(EnvConfig(env_id="rotorgram/Hover-v0"), record=path) as env:
         for steps in (3, 2):
             env.reset(seed=steps)
             for _ in range(steps):
-                env.step(np.array([0.1, 0.0, 0.0, 0.0], np.float32))
+                env.step(action)
     return path
+
+
+def log(journal: Path, out: Path, *words: str) -> None:
+    kind = f"--{out.suffix[1:]}"
+    assert main(["log", str(journal), kind, "--out", str(out), *words]) == 0
 
 
 def table(file: Path) -> tuple[list[str], list[list[str]]]:
@@ -49,37 +53,38 @@ def test_a_log_has_the_time_first_and_units(
     monkeypatch.chdir(tmp_path)
     assert main(["log", str(journal), "--csv"]) == 0
     head, rows = table(tmp_path / "hover.csv")
-    assert head[: len(HEAD)] == HEAD
+    width = len(HEAD)
+    actions = head[width:-1]
+    assert head[:width] == HEAD
     assert head[-1] == "reward"
-    assert all(name.startswith("action_") for name in head[len(HEAD) : -1])
-    assert [row[:3] for row in rows] == [
-        ["0.0", "0", "0"], ["0.02", "0", "0"], ["0.04", "0", "0"], ["0.06", "0", "0"],
-        ["0.0", "1", "0"], ["0.02", "1", "0"], ["0.04", "1", "0"],
-    ]  # fmt: skip
-    rewards = [row[-1] for row in rows]
-    assert [reward == "" for reward in rewards] == [True, False, False, False, True, False, False]
-    assert rows[3][len(HEAD)] == "", "no action is flown from the last row"
-    assert float(rows[0][len(HEAD)]) == pytest.approx(0.1)
+    assert all(name.startswith("action_") for name in actions)
+    assert [row[:3] for row in rows] == CASES["hover"]["rows"]
+    begins = [row[-1] == "" for row in rows]
+    assert begins == [True, False, False, False, True, False, False]
+    assert rows[3][width] == "", "no action is flown from the last row"
+    assert float(rows[0][width]) == pytest.approx(0.1)
 
 
 def test_positions_of_a_log_have_z_up(journal: Path, tmp_path: Path) -> None:
     """Fault 63: the goal of Hover is 5 m high."""
     out = tmp_path / "log.csv"
-    assert main(["log", str(journal), "--csv", "--episode", "1", "--out", str(out)]) == 0
+    log(journal, out, "--episode", "1")
     head, rows = table(out)
     assert len(rows) == 3
-    for name, expected in (("goal_x [m]", 0.0), ("goal_y [m]", 0.0), ("goal_z [m]", 5.0)):
-        assert {float(row[head.index(name)]) for row in rows} == {expected}
-    norm = sum(float(rows[2][head.index(q)]) ** 2 for q in ("qw", "qx", "qy", "qz"))
-    assert norm == pytest.approx(1.0)
+    for axis, expected in zip("xyz", (0.0, 0.0, 5.0), strict=True):
+        column = head.index(f"goal_{axis} [m]")
+        assert {float(row[column]) for row in rows} == {expected}
+    first = head.index("qw")
+    quaternion = np.array(rows[2][first : first + 4], float)
+    assert np.linalg.norm(quaternion) == pytest.approx(1.0)
 
 
 def test_parquet_has_the_same_numbers_and_units_in_metadata(journal: Path, tmp_path: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet")
     out = tmp_path / "log.parquet"
     text = tmp_path / "log.csv"
-    assert main(["log", str(journal), "--parquet", "--out", str(out)]) == 0
-    assert main(["log", str(journal), "--csv", "--out", str(text)]) == 0
+    log(journal, out)
+    log(journal, text)
     read = parquet.read_table(out)
     assert read.column_names[:4] == ["time", "episode", "drone", "x"]
     assert read.schema.field("x").metadata == {b"unit": b"m"}
@@ -90,18 +95,7 @@ def test_parquet_has_the_same_numbers_and_units_in_metadata(journal: Path, tmp_p
         assert column == [row[i] for row in rows], name
 
 
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        ([], "log: expected either --csv or --parquet"),
-        (["--csv", "--parquet"], "log: expected either --csv or --parquet"),
-        (["--csv", "--out", "log.parquet"], "out: expected a file that ends in .csv"),
-        (["--csv", "--out", "there.csv"], "out: expected the name of a new file, got there.csv"),
-        (["--csv", "--out", "no/log.csv"], "out: expected a folder that exists for it"),
-        (["--csv", "--episode", "2"], "episode: expected 0 to 1"),
-        (["--csv", "--drone", "1"], "drone: expected 0 to 0"),
-    ],
-)
+@each("words, sentence", "log")
 def test_wrong_words_of_log(
     journal: Path,
     tmp_path: Path,
@@ -131,26 +125,21 @@ def test_columns_of_a_flight_by_hand() -> None:
         episode=7,
     )
     columns = {column.name: column.values.tolist() for column in columns_of(flight)}
-    assert columns["time"] == [0.0, 0.02]
-    assert columns["episode"] == [7, 7]
-    assert columns["x"] == [3.0, 3.0]
-    assert columns["y"] == [-1.0, -1.0]
-    assert columns["z"] == [2.0, 2.5]
-    assert columns["qw"] == [1.0, 0.6]
-    assert columns["qz"] == [0.0, -0.8]
+    expected = {
+        "time": [0.0, 0.02],
+        "episode": [7, 7],
+        "x": [3.0, 3.0],
+        "y": [-1.0, -1.0],
+        "z": [2.0, 2.5],
+        "qw": [1.0, 0.6],
+        "qz": [0.0, -0.8],
+    }
+    assert {name: columns[name] for name in expected} == expected
     assert columns["reward"][1] == 0.5
 
 
-@pytest.mark.parametrize(
-    ("quaternion", "degrees"),
-    [
-        ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
-        ((math.cos(0.1), math.sin(0.1), 0.0, 0.0), (11.459, 0.0, 0.0)),
-        ((math.cos(0.2), 0.0, math.sin(0.2), 0.0), (0.0, 22.918, 0.0)),
-        ((math.cos(0.3), 0.0, 0.0, math.sin(0.3)), (0.0, 0.0, 34.377)),
-    ],
-)
-def test_roll_pitch_and_yaw(quaternion: tuple[float, ...], degrees: tuple[float, ...]) -> None:
+@each("quaternion, degrees", "angles")
+def test_roll_pitch_and_yaw(quaternion: list[float], degrees: list[float]) -> None:
     angles = np.degrees(roll_pitch_yaw(np.array([quaternion])))
     np.testing.assert_allclose(angles, [degrees], atol=1e-3)
 
@@ -163,75 +152,84 @@ def test_a_yaw_of_two_turns_has_no_jump() -> None:
 
 
 def test_panels_are_of_what_any_flight_has() -> None:
-    rows = np.zeros((2, 8))
-
-    def signal(name: str, unit: str, *components: str) -> Signal:
-        return Signal(name, components, (unit,) * len(components), rows[:, : len(components)])
-
-    first = [
-        signal("thrust", "N", "F1", "F2"),
-        signal("position", "m", "x", "y", "z"),
-        signal("reward", "", "reward"),
-    ]
-    second = [signal("voltage", "V", "voltage"), signal("wind", "m/s", "wx", "wy", "wz")]
-    flights = [{one.name: one for one in flight} for flight in (first, second)]
-    panels = [(panel.label, panel.wide) for panel in panels_of(flights)]
-    assert panels == [
-        ("x (m)", False), ("y (m)", False), ("z (m)", False),
-        ("wx (m/s)", False), ("wy (m/s)", False), ("wz (m/s)", False),
-        ("thrust (N)", True), ("voltage (V)", False),
-    ]  # fmt: skip
-
-
-def texts(svg: Path) -> list[str]:
-    tree = ElementTree.parse(svg)
-    return [element.text or "" for element in tree.iter("{http://www.w3.org/2000/svg}text")]
+    case = CASES["panels"]
+    flights = []
+    for which in ("first", "second"):
+        flight = {}
+        for name, components in case[which].items():
+            units = (case["units"][name],) * len(components)
+            values = np.zeros((2, len(components)))
+            flight[name] = Signal(name, tuple(components), units, values)
+        flights.append(flight)
+    panels = panels_of(flights)
+    assert [panel.label for panel in panels] == case["labels"]
+    assert [panel.label for panel in panels if panel.wide] == case["wide"]
 
 
 def test_a_plot_lays_flights_over_each_other(journal: Path, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     out = tmp_path / "two.svg"
     assert main(["plot", str(journal), str(journal), "--names", "A", "B", "--out", str(out)]) == 0
-    shown = texts(out)
+    tree = ElementTree.parse(out)
+    texts = {element.text for element in tree.iter("{http://www.w3.org/2000/svg}text")}
     labels = ["x (m)", "roll (deg)", "yaw (deg)", "thrust (N)", "position error (m)", "time (s)"]
-    assert {"A", "B", "goal", "F1", "F4", *labels} <= {*shown}
+    assert {"A", "B", "goal", "F1", "F4", *labels} <= texts
 
 
-@pytest.mark.parametrize("ending", ["png", "pdf", "svg"])
-def test_formats_of_a_plot(journal: Path, tmp_path: Path, ending: str) -> None:
+@pytest.mark.parametrize(
+    ("ending", "start"), [("png", b"\x89PNG"), ("pdf", b"%PDF"), ("svg", b"<?xml")]
+)
+def test_formats_of_a_plot(journal: Path, tmp_path: Path, ending: str, start: bytes) -> None:
     pytest.importorskip("matplotlib")
     out = tmp_path / f"flight.{ending}"
     assert main(["plot", str(journal), "--episodes", "2", "--out", str(out)]) == 0
-    start = {"png": b"\x89PNG", "pdf": b"%PDF", "svg": b"<?xml"}[ending]
     assert out.read_bytes().startswith(start)
     assert main(["plot", str(journal), "--out", str(out)]) == 1, "a file is not overwritten"
 
 
+@each("words, sentence", "plot")
 def test_wrong_words_of_plot(
-    journal: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    journal: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    words: list[str],
+    sentence: str,
 ) -> None:
-    out = tmp_path / "flight.png"
-    for words, sentence in (
-        ((str(journal), "--out", str(tmp_path / "a.gif")), "ends in .png or .pdf or .svg"),
-        ((str(journal), "--out", str(out), "--names", "A", "B"), "names: expected one for each of"),
-        ((str(tmp_path / "no.mcap"), "--out", str(out)), "expected a journal (.mcap)"),
-        (("--out", str(out)), "flights: expected at least one journal, got none"),
-    ):
-        assert main(["plot", *words]) == 1
-        assert sentence in capsys.readouterr().err
-    assert not out.exists()
+    monkeypatch.chdir(tmp_path)
+    given = [str(journal) if word == "JOURNAL" else word for word in words]
+    assert main(["plot", *given]) == 1
+    assert sentence in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 def test_all_drones_of_a_journal(tmp_path: Path) -> None:
     path = tmp_path / "two.mcap"
-    with spawn_simulator(
-        EnvConfig(env_id="rotorgram/Elevation-v0"), num_envs=2, record=path
-    ) as env:
+    config = EnvConfig(env_id="rotorgram/Elevation-v0")
+    with spawn_simulator(config, num_envs=2, record=path) as env:
         env.reset(seed=[1, 2])
         for _ in range(2):
             env.step(np.zeros((2, 1), np.float32))
     flights = recorded_trajectories(path, drone=None)
-    assert [(one.drone, one.episode, one.seed, len(one)) for one in flights] == [
-        (0, 0, 1, 2),
-        (1, 0, 2, 2),
-    ]
+    numbers = [(one.drone, one.episode, one.seed, len(one)) for one in flights]
+    assert numbers == [(0, 0, 1, 2), (1, 0, 2, 2)]
+
+
+def test_a_journal_of_several_sessions_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "two.mcap"
+    remote = RemoteVectorEnv(
+        ANY, record=path, connect=False, timeout=5, num_envs=2, num_simulators=2
+    )
+    with closing(remote):
+        simulators = [Running(Simulator(server=remote.address, bind=ANY)) for _ in range(2)]
+        remote.reset(seed=[1, 2])
+        remote.step(np.zeros((2, 1), np.float32))
+    for simulator in simulators:
+        simulator.join()
+    log(path, tmp_path / "first.csv")
+    expected = "two.mcap: episodes of session 1; 1 more flew, which log, plot and render --session"
+    assert expected in capsys.readouterr().err
+    log(path, tmp_path / "second.csv", "--session", "2")
+    assert capsys.readouterr().err == ""
