@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cases import CASES
 from rotorgram.cli import main
 from rotorgram.flights.flight_logs import MOTION, FlightLog, read_log
 from rotorgram.flights.identify import identify
@@ -19,22 +20,8 @@ pandas = pytest.importorskip("pandas")
 
 LIVELY = Path(__file__).parents[1] / "data" / "lively.toml"
 SPEEDS = [f"m{i}_rads" for i in range(1, 5)]
-TRUE = {
-    "rotors.thrust_coefficient": 3e-6,
-    "rotors.time_constant": 0.04,
-    "body.inertia.x": 2.0e-3,
-    "body.inertia.y": 2.5e-3,
-    "body.inertia.z": 4.0e-3,
-    "drag.linear.x": 0.15,
-    "drag.linear.y": 0.2,
-    "drag.linear.z": 0.1,
-}
-WRONG = {
-    "inertia = [2.0e-3, 2.5e-3, 4.0e-3]": "inertia = [2.8e-3, 3.2e-3, 3.0e-3]",
-    "thrust_coefficient = 3e-6": "thrust_coefficient = 2.5e-6",
-    "time_constant = 0.04": "time_constant = 0.06",
-    "linear = [0.15, 0.2, 0.1]": "linear = [0.3, 0.05, 0.3]",
-}
+TRUE = CASES["lively"]
+WRONG = CASES["wrong"].values()
 """What the file to be corrected says instead."""
 
 
@@ -63,20 +50,20 @@ def flown(
         thrust = mix @ (lift, *torque, 0.01 * (wanted[3] - w[2]))
         thrust = np.clip(thrust, 0.1, 2.9)
         turned = q + 0.002 * rng.normal(size=4)
-        motion = (
-            state.position + 0.003 * rng.normal(size=3),
-            turned / np.linalg.norm(turned),
-            state.velocity + 0.03 * rng.normal(size=3),
-            w + 0.03 * rng.normal(size=3),
-        )
+        turned /= np.linalg.norm(turned)
+        position = state.position + 0.003 * rng.normal(size=3)
+        velocity = state.velocity + 0.03 * rng.normal(size=3)
+        rates = w + 0.03 * rng.normal(size=3)
         speeds = np.sqrt(state.thrust / 3e-6) + 0.5 * rng.normal(size=4)
         commands = np.sqrt(thrust / 3e-6)
-        rows.append(np.concatenate(([every * step], *motion, speeds, commands)))
+        row = ([every * step], position, turned, velocity, rates, speeds, commands)
+        rows.append(np.concatenate(row))
         world.step(thrust, round(every / 0.005))
     assert state.position[2] > 10.0
     world.close()
     commanded = [f"m{i}_command_rads" for i in range(1, 5)]
-    pandas.DataFrame(rows, columns=["t", *MOTION, *SPEEDS, *commanded]).to_csv(path, index=False)
+    table = pandas.DataFrame(rows, columns=["t", *MOTION, *SPEEDS, *commanded])
+    table.to_csv(path, index=False)
     return path
 
 
@@ -88,7 +75,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def wrong(tmp_path: Path) -> Path:
     text = LIVELY.read_text()
-    for right, other in WRONG.items():
+    for right, other in WRONG:
         assert right in text
         text = text.replace(right, other)
     file = tmp_path / "wrong.toml"
@@ -111,10 +98,12 @@ def test_known_values_come_back(log: Path, wrong: Path, tmp_path: Path, measured
     for one in found.estimates:
         true = TRUE[one.name]
         half = one.high - one.value
+        error = abs(one.value - true)
         assert not one.kept
         assert half < 0.2 * true
-        assert abs(one.value - true) < 1.5 * half
-        missed += [one.name] if abs(one.value - true) > half else []
+        assert error < 1.5 * half
+        if error > half:
+            missed.append(one.name)
     assert len(missed) <= 1  # of eight intervals of 95 %
     assert found.after[2] < 0.25 * found.before[2]
 
@@ -126,9 +115,7 @@ def test_a_hover_tells_the_thrust_alone(wrong: Path, tmp_path: Path) -> None:
     thrust = found.pop("rotors.thrust_coefficient")
     assert not thrust.kept
     assert thrust.value == pytest.approx(3e-6, rel=0.01)
-    own = {"body.inertia.x": 2.8e-3, "body.inertia.y": 3.2e-3, "drag.linear.x": 0.3}
-    own |= {"body.inertia.z": 3.0e-3, "drag.linear.y": 0.05, "drag.linear.z": 0.3}
-    for name, value in own.items():
+    for name, value in CASES["wrong_numbers"].items():
         assert found[name].kept.startswith(("not excited", "not told apart")), name
         assert found[name].value == pytest.approx(value)
 
@@ -155,9 +142,10 @@ def test_the_command_writes_a_vehicle_that_loads(
     assert "95 % interval" in told
     assert "clustered over 15 segments of 2 s" in told
     vehicle = Vehicle.load(out)
+    rotors = vehicle.coefficients.rotors
     assert vehicle.mass == 0.5
-    assert vehicle.coefficients.rotors.thrust_coefficient == pytest.approx(3e-6, rel=0.02)
-    assert vehicle.coefficients.rotors.time_constant == pytest.approx(0.04, rel=0.05)
+    assert rotors.thrust_coefficient == pytest.approx(3e-6, rel=0.02)
+    assert rotors.time_constant == pytest.approx(0.04, rel=0.05)
     np.testing.assert_allclose(np.diag(vehicle.inertia)[:2], (2.0e-3, 2.5e-3), rtol=0.1)
     text = out.read_text()
     assert 'source = "identified from lively"' in text
@@ -191,8 +179,7 @@ def test_a_prediction_is_the_simulator_s(tmp_path: Path) -> None:
     flight = FlightLog(name="", period=0.005, speeds=np.tile(speeds, (101, 1)), states=states)
     windows = Windows.cut([flight], 100, 200)
     predicted = predict(vehicle, [numbers_of(vehicle)], windows)[0, 0]
-    state = world.state
-    truth = np.concatenate((state.position, state.quaternion, state.velocity, state.body_rates))
+    truth = np.concatenate([getattr(world.state, name) for name in start])
     errors = np.abs(differences(predicted, truth))
     assert errors[:2].max() < 2e-4  # position and attitude
     assert errors[2:].max() < 1e-3
