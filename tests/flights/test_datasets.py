@@ -35,13 +35,14 @@ def recording(
     path: Path, env_id: str = ELEVATION, drones: int = 1, faults: FaultConfig | None = None,
     **options: Any,
 ) -> Iterator[Any]:  # fmt: skip
-    """An agent's env over the wire; the simulator keeps the journal, or the agent of a fleet."""
-    times: dict[str, Any] = {"timeout": 5, "connect_timeout": 5, "connect": False}
-    remote: Any = (
-        RemoteEnv(ANY, record=path, **times)
-        if drones == 1
-        else RemoteVectorEnv(ANY, num_envs=drones, record=path, **times)
-    )
+    """An agent's env over the wire; the agent keeps the journal."""
+    settings: dict[str, Any] = {"timeout": 5, "connect_timeout": 5, "connect": False}
+    settings["record"] = path
+    remote: Any
+    if drones == 1:
+        remote = RemoteEnv(ANY, **settings)
+    else:
+        remote = RemoteVectorEnv(ANY, num_envs=drones, **settings)
     with relaying(remote.address, faults or FaultConfig()) as relay:
         simulator = Simulator(
             env_id, server=relay.address, bind=ANY, num_envs=drones, config=LinkConfig(timeout=5),
@@ -55,23 +56,16 @@ def recording(
             running.join()
 
 
-def fly_one(remote: RemoteEnv, seeds: list[int | None], most: int = 10**6) -> list[Any]:
-    """Episodes of one drone, at random: (observation, reward) of each step of each."""
+def fly_one(remote: RemoteEnv, seeds: list[int | None], most: int = 10**6) -> None:
+    """Episodes of one drone, at random, of at most so many steps."""
     remote.reset(seed=0)
     remote.action_space.seed(1)
-    episodes = []
     for seed in seeds:
-        observation, _ = remote.reset(seed=seed)
-        seen = [(observation, None)]
-        done = False
-        while not done and len(seen) <= most:
-            observation, reward, terminated, truncated, _ = remote.step(
-                remote.action_space.sample()
-            )
-            seen.append((observation, reward))
-            done = terminated or truncated
-        episodes.append(seen)
-    return episodes
+        remote.reset(seed=seed)
+        for _ in range(most):
+            _, _, terminated, truncated, _ = remote.step(remote.action_space.sample())
+            if terminated or truncated:
+                break
 
 
 def fly_fleet(remote: RemoteVectorEnv, steps: int) -> None:
@@ -88,16 +82,24 @@ def same(a: Any, b: Any) -> bool:
     return bool(np.asarray(a).tobytes() == np.asarray(b).tobytes())
 
 
-def flown_again(env: gym.Env[Any, Any], seed: int, actions: Any) -> tuple[list[Any], list[Any]]:
-    """Observations and (reward, terminated, truncated) of these actions from this seed."""
+def assert_flies_again(
+    env: gym.Env[Any, Any], seed: int, actions: Any, observations: dict[str, Any], *told: Any
+) -> None:
+    """These actions from this seed give the same bits; `told` are rewards and both flags."""
     observation, _ = env.reset(seed=seed)
-    observations = [observation]
+    flown = [observation]
     outcomes = []
     for action in actions:
-        observation, reward, terminated, truncated, _ = env.step(action)
-        observations.append(observation)
-        outcomes.append((reward, terminated, truncated))
-    return observations, outcomes
+        observation, *outcome, _ = env.step(action)
+        flown.append(observation)
+        outcomes.append(outcome)
+    for name, recorded in observations.items():
+        again = [one[name] if isinstance(one, dict) else one for one in flown]
+        assert same(np.stack(again), recorded)
+    rewards, terminated, truncated = zip(*outcomes, strict=True)
+    assert same(rewards, told[0])
+    assert list(terminated) == told[1].tolist()
+    assert list(truncated) == told[2].tolist()
 
 
 @pytest.mark.parametrize("env_id", [ELEVATION, HOVER])
@@ -114,69 +116,64 @@ def test_what_is_read_flies_again_to_the_same_bits(
     episodes = RecordedEpisodes([path])
     table = tmp_path / "flight.parquet"
     count, steps = write_parquet(episodes, table)
-    made = env_of(episodes.spec)
-    with gym.make(made, disable_env_checker=True) as env:
-        read = pq.read_table(table)
-        frame = {name: read[name].to_numpy() for name in read.column_names if name != "journal"}
-        assert read.num_rows == steps + count
-        assert count == 3 or (drones == 3 and count > 3)
+    read = pq.read_table(table)
+    frame = {name: read[name].to_numpy() for name in read.column_names if name != "journal"}
+    assert read.num_rows == steps + count
+    assert count == 3 or (drones == 3 and count > 3)
+    with gym.make(env_of(episodes.spec), disable_env_checker=True) as env:
         for episode in range(count):
             rows = frame["episode"] == episode
             own = {name: values[rows] for name, values in frame.items()}
-            names = [name for name in own if name.startswith("observation")]
-            recorded = np.stack([own[name] for name in names], axis=1)
-            acted = np.stack([v for n, v in own.items() if n.startswith("action")], axis=1)
+            seen = [values for name, values in own.items() if name.startswith("observation")]
+            acted = [values for name, values in own.items() if name.startswith("action")]
+            recorded = np.stack(seen, axis=1)
+            actions = np.stack(acted, axis=1)[:-1]
+            seed = int(read["seed"].filter(rows)[0].as_py())
+            rewards = own["reward"][:-1].astype(np.float64)
+            ends = own["terminated"][:-1], own["truncated"][:-1]
             assert recorded.dtype == np.float32
             assert own["step"].tolist() == list(range(len(recorded)))
-            observations, outcomes = flown_again(
-                env, int(read["seed"].filter(rows)[0].as_py()), acted[:-1]
-            )
-            assert same(np.stack(observations), recorded)
-            assert same([r for r, *_ in outcomes], own["reward"][:-1].astype(np.float64))
-            assert [e for _, e, _ in outcomes] == own["terminated"][:-1].tolist()
-            assert [t for *_, t in outcomes] == own["truncated"][:-1].tolist()
+            assert_flies_again(env, seed, actions, {"": recorded}, rewards, *ends)
 
 
-def test_minari_reads_it_and_its_env_flies_it_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    minari = pytest.importorskip("minari")
+@pytest.fixture
+def minari(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     pytest.importorskip("h5py")
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
-    flights = {
-        "box": {"action_type": "continuous"},
-        "choice": {"action_type": "discrete"},
-        "dict": {"sensors": {"barometer": {"noise": 0.1}}},
-    }
-    for name, options in flights.items():
-        path = tmp_path / f"{name}.mcap"
-        with recording(path, faults=LOSSY, **options) as remote:
-            fly_one(remote, [5, 2**64 - 1, None])
-            spaces = remote.observation_space, remote.action_space
-        dataset_id = f"rotorgram/{name}-v0"
-        episodes = RecordedEpisodes([path])
-        assert write_minari(episodes, dataset_id)[0] == 3
-        data = minari.load_dataset(dataset_id)
-        assert (data.observation_space, data.action_space) == spaces
-        assert data.total_episodes == 3
-        seeds = [one.get("seed") for one in data.storage.get_episode_metadata(range(3))]
-        assert seeds == [5, 2**64 - 1, None]
-        assert json.loads(data.storage.metadata["rotorgram_env_spec"])["env_id"] == ELEVATION
-        with data.recover_environment(disable_env_checker=True) as env:
-            assert (env.observation_space, env.action_space) == spaces
-            for seed, episode in zip(seeds[:2], data, strict=False):
-                observations, outcomes = flown_again(env, seed, episode.actions)
-                recorded = episode.observations
-                if name == "dict":
-                    for key, values in recorded.items():
-                        assert same(np.stack([told[key] for told in observations]), values)
-                else:
-                    assert same(np.stack(observations), recorded)
-                assert same([r for r, *_ in outcomes], episode.rewards)
-                ends = [episode.terminations.tolist(), episode.truncations.tolist()]
-                assert [[e[1] for e in outcomes], [e[2] for e in outcomes]] == ends
-                assert len(episode.infos["z"]) == len(episode.actions) + 1
-                assert episode.infos["elevation_error"].dtype == np.float64
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "sets"))
+    return pytest.importorskip("minari")
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"action_type": "continuous"},
+        {"action_type": "discrete"},
+        {"sensors": {"barometer": {"noise": 0.1}}},
+    ],
+)
+def test_minari_reads_it_and_its_env_flies_it_again(
+    minari: Any, tmp_path: Path, options: dict[str, Any]
+) -> None:
+    path = tmp_path / "flight.mcap"
+    with recording(path, faults=LOSSY, **options) as remote:
+        fly_one(remote, [5, 2**64 - 1, None])
+        spaces = remote.observation_space, remote.action_space
+    assert write_minari(RecordedEpisodes([path]), "rotorgram/flight-v0")[0] == 3
+    data = minari.load_dataset("rotorgram/flight-v0")
+    assert (data.observation_space, data.action_space) == spaces
+    assert data.total_episodes == 3
+    seeds = [one.get("seed") for one in data.storage.get_episode_metadata(range(3))]
+    assert seeds == [5, 2**64 - 1, None]
+    assert json.loads(data.storage.metadata["rotorgram_env_spec"])["env_id"] == ELEVATION
+    with data.recover_environment(disable_env_checker=True) as env:
+        assert (env.observation_space, env.action_space) == spaces
+        for seed, episode in zip(seeds[:2], data, strict=False):
+            seen = episode.observations
+            recorded = seen if isinstance(seen, dict) else {"": seen}
+            told = episode.rewards, episode.terminations, episode.truncations
+            assert_flies_again(env, seed, episode.actions, recorded, *told)
+            assert len(episode.infos["z"]) == len(episode.actions) + 1
+            assert episode.infos["elevation_error"].dtype == np.float64
 
 
 def test_episodes_that_are_not_whole_are_left_out(tmp_path: Path) -> None:
@@ -286,10 +283,8 @@ def test_a_write_that_fails_names_the_file_and_leaves_none(tmp_path: Path) -> No
     assert not out.exists()
 
 
-def test_minari_needs_an_id_that_is_new(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("minari")
-    pytest.importorskip("h5py")
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "sets"))
+@pytest.mark.usefixtures("minari")
+def test_minari_needs_an_id_that_is_new(tmp_path: Path) -> None:
     path = tmp_path / "flight.mcap"
     with recording(path, episode_length=4) as remote:
         fly_one(remote, [1])

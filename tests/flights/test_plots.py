@@ -13,7 +13,6 @@ from rotorgram.cli import main
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 from rotorgram.flights.plots import panels_of, roll_pitch_yaw
-from rotorgram.flights.recorded import recorded_trajectories
 from rotorgram.flights.signals import Signal, columns_of
 from rotorgram.flights.trajectories import Trajectory
 from rotorgram.udp import RemoteVectorEnv, Simulator
@@ -201,18 +200,6 @@ def test_wrong_words_of_plot(
     assert main(["plot", *given]) == 1
     assert sentence in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
-
-
-def test_all_drones_of_a_journal(tmp_path: Path) -> None:
-    path = tmp_path / "two.mcap"
-    config = EnvConfig(env_id="rotorgram/Elevation-v0")
-    with spawn_simulator(config, num_envs=2, record=path) as env:
-        env.reset(seed=[1, 2])
-        for _ in range(2):
-            env.step(np.zeros((2, 1), np.float32))
-    flights = recorded_trajectories(path, drone=None)
-    numbers = [(one.drone, one.episode, one.seed, len(one)) for one in flights]
-    assert numbers == [(0, 0, 1, 2), (1, 0, 2, 2)]
 
 
 def test_a_journal_of_several_sessions_says_so(

@@ -95,7 +95,6 @@ def test_a_trajectory_is_what_the_env_tells() -> None:
     assert len(flown) == 25
     assert flown.ending == "truncated"
     assert flown.seconds == 0.5
-    assert flown.episode == 3
     assert flown.telemetry["position"][:, 2].tolist() == heights
     assert flown.headline.tolist() == errors
     assert flown.rewards.tolist() == rewards
@@ -159,6 +158,9 @@ def test_any_drone_of_any_session(tmp_path: Path) -> None:
     (second,) = recorded_trajectories(journal, [1], drone=1, session=1)
     assert len(second) == 3
     assert second.episode == 1
+    everybody = recorded_trajectories(journal, drone=None)
+    numbers = [(one.drone, one.episode, one.seed, len(one)) for one in everybody]
+    assert numbers == [(0, 0, 7, 8), (1, 0, 8, 5), (1, 1, None, 3)]
     for choice, sentence in (
         ({"drone": 2}, "drone: expected 0 to 1 in .*, got 2"),
         ({"drone": -1}, "drone: expected 0 to 1"),
