@@ -27,9 +27,6 @@ if TYPE_CHECKING:
 Agent: TypeAlias = "Learner | SB3Agent"
 """What learns, made of `(log, config, seed)`."""
 
-Colors = tuple[str, str]
-"""Of an agent in figures, on a light and on a dark ground."""
-
 
 @dataclass(frozen=True)
 class Algorithm:
@@ -42,7 +39,8 @@ class Algorithm:
     """Class; or its module and name, which are imported when needed."""
     resumes: bool = True
     """Whether a stopped training goes on, and another begins with its networks."""
-    colors: Colors | None = None
+    color: str = ""
+    """Of its curves in figures; empty: one of the palette."""
 
     def agent_class(self) -> Any:
         """The class. Raises `MissingPackage`."""
@@ -55,12 +53,12 @@ class Algorithm:
 _SB3: Final = ".sb3:SB3Agent"
 
 ALGORITHMS: Final[dict[str, Algorithm]] = {
-    "vpg": Algorithm("VPG", VPGConfig, VPG, colors=("#D55E00", "#F58A3C")),
-    "a2c": Algorithm("A2C", A2CConfig, A2C, colors=("#0072B2", "#55B0F0")),
+    "vpg": Algorithm("VPG", VPGConfig, VPG, color="#D55E00"),
+    "a2c": Algorithm("A2C", A2CConfig, A2C, color="#0072B2"),
     "ppo": Algorithm("PPO", PPOConfig, PPO),
     "ippo": Algorithm("IPPO", PPOConfig, PPO),
     "mappo": Algorithm("MAPPO", PPOConfig, MAPPO),
-    "sb3-a2c": Algorithm("SB3 A2C", A2CConfig, _SB3, resumes=False, colors=("#009E73", "#2CC998")),
+    "sb3-a2c": Algorithm("SB3 A2C", A2CConfig, _SB3, resumes=False, color="#009E73"),
     "sb3-ppo": Algorithm("SB3 PPO", PPOConfig, _SB3, resumes=False),
     "sb3-sac": Algorithm("SB3 SAC", SACConfig, _SB3, resumes=False),
 }

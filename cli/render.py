@@ -4,15 +4,18 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, Literal, NamedTuple
+from typing import TYPE_CHECKING, Final, Literal
 
 from tyro.conf import Positional
 
-from ..flights.palette import DARK_COLORS, agent_color, agent_label
+from ..flights.palette import agent_label
 from ..flights.recorded import recorded_trajectories
-from ..flights.trajectories import Trajectory, flown_trajectories
+from ..flights.trajectories import flown_trajectories
 from ..models.errors import InputError
 from ._flags import EnvFlags, check_count
+
+if TYPE_CHECKING:
+    from ..flights.filming import FilmTrack
 
 _ALIKE: Final = ("pid", "geometric", "orca", "random")  # words that are no names of files
 
@@ -45,7 +48,7 @@ class Render(EnvFlags):
     at: float | None = None
     """With a .png: the time of the picture in the first episode, s. Default: its end."""
     overlay: bool = True
-    """Whether numbers and curves are on the picture. Of several flights the names always are."""
+    """Whether time and numbers are on the picture. Of several flights the names always are."""
     fast: bool = False
     """Without shadows and smooth edges: several times as fast where software draws."""
     names: tuple[str, ...] = ()
@@ -58,7 +61,7 @@ class Render(EnvFlags):
 
     def run(self) -> int:
         """Fly or read, draw, and say where."""
-        from ..flights.filming import Film, FilmTrack, film
+        from ..flights.filming import Film, film
         from ..rendering.film import check_film
         from ..rendering.gl import offscreen_context
         from ._env import with_vehicle
@@ -72,12 +75,8 @@ class Render(EnvFlags):
         offscreen_context(16, 16).free()  # flying takes longer than finding no OpenGL
         found = [self._find(what) for what in self.what]
         config = replace(config, vehicle=with_vehicle(self, *self.what).vehicle)
-        names = self.names or _distinct([flown.name for flown in found], self.what)
-        colors = _colors([flown.agent for flown in found])
-        tracks = [
-            FilmTrack(name=name, color=color, trajectories=flown.trajectories, drones=flown.drones)
-            for name, color, flown in zip(names, colors, found, strict=True)
-        ]
+        names = self.names or _distinct([track.name for track in found], self.what)
+        tracks = [replace(track, name=name) for track, name in zip(found, names, strict=True)]
         longest = max(track.trajectories[0].seconds for track in tracks)
         if self.at is not None and self.at > longest:
             raise InputError(f"at: expected 0 to {longest:g} s, the flight's end, got {self.at:g}")
@@ -108,29 +107,21 @@ class Render(EnvFlags):
         if self.options.keys() - {"scene"} and all(journals):
             raise InputError("env: expected no options with a journal, which has its own")
 
-    def _find(self, what: str) -> "_Flown":
+    def _find(self, what: str) -> "FilmTrack":
         """Flights of a policy or a journal."""
+        from ..flights.filming import FilmTrack
         from ._env import pilot_of
 
         episodes = range(self.episode, self.episode + self.episodes)
         path = Path(what)
         if path.suffix == ".mcap":
             recorded = recorded_trajectories(path, episodes, session=self.session, drone=self.drone)
-            return _Flown(path.stem, path.stem, recorded, 1)
+            return FilmTrack(name=path.stem, trajectories=recorded)
         checkpoint, policy, config = pilot_of(self, what)
         agent = checkpoint.algorithm if checkpoint else what
         name = what if what == "random" else agent_label(agent)
         flown = flown_trajectories(policy, config, episodes, "final")
-        return _Flown(agent, name, flown, config.drones)
-
-
-class _Flown(NamedTuple):
-    """Flights of one pane."""
-
-    agent: str
-    name: str
-    trajectories: list[Trajectory]
-    drones: int
+        return FilmTrack(name=name, trajectories=flown, drones=config.drones)
 
 
 def parse_size(text: str) -> tuple[int, int]:
@@ -153,13 +144,3 @@ def _distinct(names: Sequence[str], what: Sequence[str]) -> list[str]:
         number = longer[: place + 1].count(name)
         distinct.append(name if longer.count(name) == 1 else f"{name} {number}")
     return distinct
-
-
-def _colors(agents: Sequence[str]) -> list[str]:
-    """Each agent's own; where that is taken, one that is free."""
-    colors: list[str] = []
-    for agent in agents:
-        own = agent_color(agent, dark=True)
-        free = [color for color in DARK_COLORS if color not in colors]
-        colors.append(own if own not in colors or not free else free[-1])
-    return colors

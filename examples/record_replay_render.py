@@ -29,6 +29,6 @@ print(f"return {trajectory.rewards.sum():.1f}: {journal}")
 print(Verification(journal))
 
 # A film needs OpenGL; flying and comparing do not.
-track = FilmTrack(name="PID", color="#E69F00", trajectories=recorded_trajectories(journal, [0]))
+track = FilmTrack(name="PID", trajectories=recorded_trajectories(journal, [0]))
 film(folder / "flight.mp4", [track], Film(width=640, height=360, camera="side", fast=True))
 print(f"film: {folder / 'flight.mp4'}")

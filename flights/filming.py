@@ -3,9 +3,8 @@
 import math
 from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from itertools import combinations
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -15,13 +14,12 @@ from numpy.typing import NDArray
 from ..envs.rendering import moment
 from ..models.errors import InputError
 from ..models.fields import Limits, check_fields
-from ..rendering import Camera, Canvas, MetricValue, Moment, Stage
+from ..rendering import Camera, Canvas, Moment, Stage
 from ..rendering.film import QUALITY, check_film, write_film
-from ..rendering.overlay import Overlay, graph_scale
+from ..rendering.gl import Lines
 from ..scenes import parse_scene
 from .trajectories import Trajectory
 
-Floats = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 OnFrame = Callable[[int, int], object]
 """Called with frames drawn, and frames in all."""
@@ -30,7 +28,7 @@ MAX_FRAMES: Final = 1_000_000
 """Largest number of frames of a film: 11 hours of it."""
 _SPACE: Final = 2  # pixels between panes
 _DARK: Final = (13, 18, 26)
-_ASPECT: Final = 1.2  # of a pane that shows a craft and its graph well
+_ASPECT: Final = 1.2  # of a pane that shows a craft well
 
 
 def moments(trajectory: Trajectory) -> list[Moment]:
@@ -56,8 +54,6 @@ class FilmTrack:
     """One pane of a film: a name and its trajectories."""
 
     name: str
-    color: str
-    """Colour of name and curve, "#RRGGBB"."""
     trajectories: list[Trajectory]
     """Episode after episode; with several drones those of each episode in the order of the drones.
     """
@@ -74,34 +70,6 @@ class FilmTrack:
     def moments(self) -> list[list[list[Moment]]]:
         """The moments by episode and drone."""
         return [[moments(one) for one in world] for world in self.episodes]
-
-    @cached_property
-    def curves(self) -> list[Floats]:
-        """The overlay's graph by episode, shape (T + 1,): the headline metric; of several drones
-        the least distance between two, m. A drone whose episode has ended stays where it is, as in
-        the pictures.
-        """
-        if self.drones == 1:
-            return [one.headline for one in self.trajectories]
-        found = []
-        for world in self.episodes:
-            longest = max(map(len, world)) + 1
-            positions = []
-            for one in world:
-                rows = np.minimum(np.arange(longest), len(one))
-                positions.append(one.pose[rows, :3])
-            pairs = combinations(positions, 2)
-            found.append(np.min([np.linalg.norm(a - b, axis=1) for a, b in pairs], axis=0))
-        return found
-
-    def panel(self, episode: int, step: int) -> Moment:
-        """Content of the overlay: the first drone, and the least distance if there are others."""
-        flown = self.moments[episode][0]
-        own = flown[min(step, len(flown) - 1)]
-        if self.drones == 1:
-            return own
-        distance = MetricValue("least distance", float(self.curves[episode][step]), "m")
-        return replace(own, metrics=(distance, *own.metrics))
 
     def note(self, episode: int, step: int) -> str:
         """Which trajectories have ended at a step otherwise than by the clock."""
@@ -127,7 +95,7 @@ class Film:
     vehicle: str | None = None
     """File or name of the vehicle; None: the paper's."""
     overlay: bool = True
-    """Whether numbers and graphs are drawn. Of several panes the names always are."""
+    """Whether time and numbers are written. Of several panes the names always are."""
     at: Annotated[float | None, Limits(0, unit="s")] = None
     """Only the picture at this time of the first episode, s."""
     fast: bool = False
@@ -213,7 +181,8 @@ def _frames(
     names = tracks[0].trajectories[0].spec.agents if drones > 1 else ()
     stage = Stage(config.scene, drones, vehicle=config.vehicle, names=names)
     with Canvas(stage, width, height, fast=config.fast) as canvas:
-        panes = [_Pane(track, config, canvas, stage.twin(), tracks) for track in tracks]
+        named = len(tracks) > 1
+        panes = [_Pane(track, config, canvas, stage.twin(), named) for track in tracks]
         for number, (episode, seconds) in enumerate(times, 1):
             frame = np.full((config.height, config.width, 3), _DARK, np.uint8)
             for place, pane in enumerate(panes):
@@ -234,26 +203,13 @@ class _Pane:
         config: Film,
         canvas: Canvas,
         stage: Stage,
-        tracks: Sequence[FilmTrack],
+        named: bool,
     ) -> None:
         self._track = track
         self._config = config
         self._canvas = canvas
         self._stage = stage
-        self._has_overlay = config.overlay or len(tracks) > 1
-        self._overlay = Overlay(
-            canvas.width,
-            canvas.height,
-            title=track.name,
-            color=track.color,
-            like=track.panel(0, 0),
-            vehicle=stage.vehicle,
-            period=track.trajectories[0].spec.control_period,
-            of=stage.names[0] if stage.names else "",
-            seconds=max(one.seconds for other in tracks for one in other.trajectories),
-            scale=_scale(tracks),
-            numbers=config.overlay,
-        )
+        self._named = named
         self._picture: Picture = np.empty(0, np.uint8)
         self._shown = (-1, -1)  # episode and step
 
@@ -270,22 +226,22 @@ class _Pane:
         for now in range(first, step + 1):  # paths have no gaps
             self._stage.show(*(own[min(now, len(own) - 1)] for own in flown))
         self._shown = episode, step
-        self._picture = self._canvas.draw(config.camera, self._stage)
-        if self._has_overlay:
-            note = track.note(episode, step) if config.overlay else ""
-            values = track.curves[episode][: step + 1].tolist()
-            panel = track.panel(episode, step)
-            self._picture = self._overlay.draw(self._picture, panel, values, note)
+        lines = self._lines(episode, step)
+        self._picture = self._canvas.draw(config.camera, self._stage, lines)
         return self._picture
 
-
-def _scale(tracks: Sequence[FilmTrack]) -> tuple[float, float]:
-    """Ends of the graph. Of a crash the start of the headline metric counts, unless all crashed."""
-    flown = [one for track in tracks for one in track.trajectories]
-    all_crashed = all(one.terminated for one in flown)
-    curves = []
-    for track in tracks:
-        for world, curve in zip(track.episodes, track.curves, strict=True):
-            is_cut = track.drones == 1 and world[0].terminated and not all_crashed
-            curves.append(curve[:1] if is_cut else curve)
-    return graph_scale(np.concatenate(curves).tolist())
+    def _lines(self, episode: int, step: int) -> Lines:
+        """Name and time; the first metric, of several drones the least distance; early ends."""
+        track = self._track
+        if not self._config.overlay:
+            return [(track.name, "")] if self._named else []
+        seconds = step * track.trajectories[0].spec.control_period
+        lines = [(track.name, f"{seconds:.2f} s")]
+        distance = self._stage.least_distance
+        if distance is not None:
+            lines.append(("least distance", f"{distance:.2f} m"))
+        else:
+            metrics = self._stage.moments[0].metrics[:1]
+            lines += [(metric.label, metric.text) for metric in metrics]
+        note = track.note(episode, step)
+        return [*lines, (note, "")] if note else lines

@@ -4,21 +4,14 @@ from typing import Final
 
 from ..agents import ALGORITHMS, CONTROLLERS
 
-# Okabe and Ito's palette: told apart by readers with colour-blindness. The second of a pair is the
-# same hue, lighter, for a dark ground.
-_CONTROLLERS: Final = ("#555555", "#B4BCC4")
-_SPARE: Final = (
-    ("#CC79A7", "#E29AC3"),
-    ("#E69F00", "#F0B840"),
-    ("#56B4E9", "#7CC8F2"),
-    ("#8C564B", "#C9938A"),
-)
+# Okabe and Ito's palette: told apart by readers with colour-blindness.
+_CONTROLLER: Final = "#555555"
+_SPARE: Final = ("#CC79A7", "#E69F00", "#56B4E9", "#8C564B")
 FLIGHT_COLORS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8C564B")
 """Colours of flights and rotors on a light ground, the same palette."""
-_OWN: Final = {name: row.colors for name, row in ALGORITHMS.items() if row.colors} | dict.fromkeys(
-    CONTROLLERS, _CONTROLLERS
+_OWN: Final = {name: row.color for name, row in ALGORITHMS.items() if row.color} | dict.fromkeys(
+    CONTROLLERS, _CONTROLLER
 )
-DARK_COLORS: Final = [dark for _, dark in (*_OWN.values(), *_SPARE)]
 
 
 def agent_label(agent: str) -> str:
@@ -27,7 +20,7 @@ def agent_label(agent: str) -> str:
     return row.label if row else agent
 
 
-def agent_color(agent: str, dark: bool = False) -> str:
-    """An agent's colour, the same in every figure and report; lighter for a dark ground."""
+def agent_color(agent: str) -> str:
+    """An agent's colour, the same in every figure and report."""
     spare = _SPARE[sum(agent.encode()) % len(_SPARE)]
-    return _OWN.get(agent, spare)[dark]
+    return _OWN.get(agent, spare)

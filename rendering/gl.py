@@ -3,7 +3,7 @@
 import ctypes.util
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
@@ -14,8 +14,12 @@ if TYPE_CHECKING:
     import mujoco
     import numpy as np
 
+Lines = Sequence[tuple[str, str]]
+"""Names and values that are written on a picture."""
+
 _OFF: Final = ("disable", "disabled", "off", "false", "0")
 _ON: Final = ("enable", "enabled", "on", "true", "1", "glfw", "glx", "wgl")
+_LARGE: Final = 480  # pixels: higher pictures have large letters
 _LIBRARIES: Final = {"egl": "EGL", "osmesa": "OSMesa", "cgl": "OpenGL"}
 _HIDDEN: Final = "ROTORGRAM_GL"
 """Keeps `MUJOCO_GL` as the user set it while `hidden_gl_setting` hides it from MuJoCo. An
@@ -84,6 +88,13 @@ def _refuse_forked() -> None:
         )
 
 
+def columns(lines: Lines) -> tuple[str, str]:
+    """The two columns of MuJoCo's overlay."""
+    names = "\n".join(name for name, _ in lines)
+    values = "\n".join(value for _, value in lines)
+    return names, values
+
+
 class Offscreen:
     """MuJoCo's drawing of a model without a window, from any thread, in pictures of up to a size.
 
@@ -116,10 +127,14 @@ class Offscreen:
         return block
 
     def draw(
-        self, scene: "mujoco.MjvScene", pixels: "np.ndarray", depth: "np.ndarray | None" = None
+        self,
+        scene: "mujoco.MjvScene",
+        pixels: "np.ndarray",
+        depth: "np.ndarray | None" = None,
+        lines: Lines = (),
     ) -> None:
         """Draw a scene into arrays of one size, the lowest row first: colours, uint8 (H, W, 3), and
-        OpenGL's depth, float32 (H, W), 1 near and 0 far.
+        OpenGL's depth, float32 (H, W), 1 near and 0 far. Lines are written over it.
         """
         import mujoco
 
@@ -127,6 +142,11 @@ class Offscreen:
         try:
             with self.current():
                 mujoco.mjr_render(rect, scene, self._context)
+                if lines:
+                    is_large = rect.height > _LARGE
+                    font = mujoco.mjtFont.mjFONT_BIG if is_large else mujoco.mjtFont.mjFONT_NORMAL
+                    corner = mujoco.mjtGridPos.mjGRID_TOPLEFT
+                    mujoco.mjr_overlay(font, corner, rect, *columns(lines), self._context)
                 mujoco.mjr_readPixels(pixels, depth, rect, self._context)
         except (mujoco.FatalError, RuntimeError) as error:  # the driver was restarted
             raise NoOpenGL(f"OpenGL: expected a context to draw with, lost it: {error}") from None

@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 
 from ..models.errors import InputError
+from .gl import Lines
 from .stage import Moment, Stage
 
 MAX_SHOWN: Final = 16
@@ -21,8 +22,6 @@ MAX_SHOWN: Final = 16
 _PICTURES: Final = 30.0  # a second, at most
 _NAP: Final = 0.02  # s, at most, before keys are looked at again
 
-Lines = list[tuple[str, str]]
-"""Names and values."""
 Press = Literal["pause", "step", "slower", "faster"]
 """Effect of a key."""
 SPEEDS: Final = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0, 4.0, 8.0)

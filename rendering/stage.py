@@ -20,7 +20,7 @@ from ..models.fleet import load_vehicles, members_of
 from ..models.mjcf import attach_craft, free_body, level_data
 from ..scenes.build import SCENE_PREFIX, build_scene
 from ..scenes.marks import Mark
-from .gl import Offscreen
+from .gl import Lines, Offscreen
 
 Camera = Literal["chase", "front", "side", "top", "onboard"]
 CAMERAS: Final[tuple[Camera, ...]] = get_args(Camera)
@@ -55,7 +55,7 @@ _SAMPLES = 4  # of every pixel, for smooth edges; software has no more
 # Lengths below are in radii of the craft.
 _SPACING: Final = 2.2  # between craft that fly side by side
 _NEAR: Final = 0.14  # at most: where drawing begins
-_LOWER: Final = 0.06  # of their distance front and side look below the goal: there is the graph
+_LOWER: Final = 0.06  # of their distance front and side look below the goal
 _VIEWS: Final[dict[str, tuple[float, float, float, float]]] = {
     "chase": (0.0, -17.0, 3.85, math.inf),
     "front": (180.0, -7.0, 6.9, 1.65),  # from a little above the goal: its disc is seen
@@ -386,8 +386,12 @@ class Canvas(AbstractContextManager["Canvas"]):
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW.value] = not fast
         self._option = mujoco.MjvOption()
 
-    def draw(self, camera: Camera = "chase", stage: Stage | None = None) -> np.ndarray:
-        """The stage, or a twin of it, as it is now: a new array, uint8, (height, width, 3)."""
+    def draw(
+        self, camera: Camera = "chase", stage: Stage | None = None, lines: Lines = ()
+    ) -> np.ndarray:
+        """The stage, or a twin of it, as it is now, with lines of text over it: a new array, uint8,
+        (height, width, 3).
+        """
         stage = stage or self.stage
         if stage.model is not self.stage.model:
             raise ValueError("stage: expected the canvas's own or a twin of it, got another")
@@ -403,7 +407,7 @@ class Canvas(AbstractContextManager["Canvas"]):
         # From on board, at the goal, its disc would fill the lower half.
         stage.decorate(scene, goals=camera != "onboard")
         pixels = np.empty((self.height, self.width, 3), np.uint8)
-        self._drawing.draw(scene, pixels)
+        self._drawing.draw(scene, pixels, lines=lines)
         return np.ascontiguousarray(pixels[::-1])  # OpenGL's first row is the lowest
 
     def close(self) -> None:

@@ -13,7 +13,8 @@ from typing import Final
 import mujoco
 
 from ..models.errors import NoOpenGL
-from .live import Aim, Lines, Pace, Press
+from .gl import Lines, columns
+from .live import Aim, Pace, Press
 from .stage import Stage
 
 KEYS: Final[dict[int, Press]] = {
@@ -95,8 +96,7 @@ class Window:
 
 
 def _text(place: mujoco.mjtGridPos, lines: Lines) -> tuple[object, ...]:
-    names, values = ("\n".join(column) for column in zip(*lines, strict=True))
-    return mujoco.mjtFontScale.mjFONTSCALE_100, place, names, values
+    return mujoco.mjtFontScale.mjFONTSCALE_100, place, *columns(lines)
 
 
 def _tasks() -> set[int]:

@@ -15,17 +15,14 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 from measuring import RESULTS, options, write
 from rotorgram.agents import PID
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 from rotorgram.flights.filming import Film, FilmTrack, film, moments
 from rotorgram.flights.trajectories import Trajectory, flown_trajectories
-from rotorgram.models import Vehicle
 from rotorgram.rendering import Canvas, Moment, Stage
 from rotorgram.rendering.gl import offscreen_context
-from rotorgram.rendering.overlay import Overlay
 
 SIZES = ((640, 360), (1280, 720))
 ENV = "rotorgram/Elevation-v0"
@@ -71,34 +68,9 @@ def driver() -> str:
     return name
 
 
-def overlays(flight: list[Moment], rounds: int, frames: int) -> dict[str, float]:
-    """Milliseconds for panel and graph of a picture."""
-    times = {}
-    values = [moment.metrics[0].value for moment in flight]
-    for width, height in SIZES:
-        overlay = Overlay(
-            width,
-            height,
-            title="PID",
-            like=flight[0],
-            vehicle=Vehicle.load(),
-            period=0.02,
-            seconds=5.0,
-            scale=(-1.0, 1.0),
-        )
-        picture = np.zeros((height, width, 3), np.uint8)
-
-        def draw(number: int, overlay: Overlay = overlay, picture: np.ndarray = picture) -> None:
-            overlay.draw(picture, flight[number], values[: number + 1])
-
-        best = max(rate(draw, frames) for _ in range(rounds))
-        times[f"{width}x{height}"] = round(1000 / best, 2)
-    return times
-
-
 def whole_film(flown: Trajectory) -> dict[str, float]:
     """Five seconds at 1280x720 as MP4, once."""
-    track = FilmTrack(name="PID", color="#B4BCC4", trajectories=[flown])
+    track = FilmTrack(name="PID", trajectories=[flown])
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "film.mp4"
         start = time.perf_counter()
@@ -123,7 +95,6 @@ def main() -> None:
         "rounds": args.rounds,
         "frames": args.frames,
         "pictures_per_second": rates,
-        "overlay_milliseconds": overlays(flight, args.rounds, args.frames),
         "film": whole_film(flown),
         "renderer": renderer,
         "load": [round(load, 1) for load in os.getloadavg()],

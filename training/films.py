@@ -8,7 +8,6 @@ from ..agents.checkpoints import load
 from ..agents.policies import Policy
 from ..envs.config import EnvConfig
 from ..flights.filming import Film, FilmTrack, OnFrame, film
-from ..flights.palette import agent_color
 from ..flights.trajectories import flown_trajectories
 from ..models.errors import InputError
 from ..rendering import Camera, NoOpenGL
@@ -66,5 +65,4 @@ def _track(results: Results, row: Row, seed: int, episode: int) -> FilmTrack:
     flown = flown_trajectories(policy, config, [episode], results.study.evaluation, seed)
     several = not row.controller and results.study.seeds > 1
     name = row_label(row) + (f", seed {seed}" if several else "")
-    color = agent_color(row.agent if row.name == row.agent else row.name, dark=True)
-    return FilmTrack(name=name, color=color, trajectories=flown, drones=drones)
+    return FilmTrack(name=name, trajectories=flown, drones=drones)

@@ -32,6 +32,8 @@ PAGES = [
 ]
 FENCE = re.compile(r"^```(.*?)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 LANGUAGES = {"python", "python continued", "sh", "text", "toml", "mermaid"}
+DRAWING = ("cameras", "rotorgram.rendering", "flights.filming")
+"""Words of programs that need OpenGL."""
 COMPILED = {"c"}  # tests/agents/test_export.py compiles and runs it
 
 
@@ -112,10 +114,17 @@ def simulators_for(code: str, port: int, folder: Path) -> list[subprocess.Popen[
     ("page", "code"), PROGRAMS, ids=[f"{page}-{i}" for i, (page, _) in enumerate(PROGRAMS)]
 )
 def test_python_runs_as_pasted(
-    page: str, code: str, training: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    page: str,
+    code: str,
+    training: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    request: pytest.FixtureRequest,
 ) -> None:
     if "import minari" in code:
         pytest.importorskip("minari")
+    if any(word in code for word in DRAWING):
+        request.getfixturevalue("opengl")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
     for there, here, _ in INSTEAD.get(page, ()):
         code = code.replace(there, here)

@@ -24,7 +24,9 @@ def run_script(script: str, folder: Path, *arguments: str) -> str:
 
 
 @pytest.mark.parametrize("script", SHORT)
-def test_it_runs(script: str, tmp_path: Path) -> None:
+def test_it_runs(script: str, tmp_path: Path, request: pytest.FixtureRequest) -> None:
+    if "render" in script:
+        request.getfixturevalue("opengl")
     arguments, expected = SHORT[script]
     assert re.search(expected, run_script(script, tmp_path, *arguments))
 

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 from pictures import HEIGHT, HEXA, TINY, WIDTH, at, same
 from rotorgram.models import InputError
-from rotorgram.rendering import CAMERAS, Camera, Canvas, Stage
-from rotorgram.rendering.overlay import Overlay
+from rotorgram.rendering import CAMERAS, Camera, Canvas, MetricValue, Stage
 
 
 @pytest.fixture(scope="module")
@@ -92,24 +91,15 @@ def green_in(picture: np.ndarray) -> np.ndarray:
     return disc
 
 
-@pytest.mark.parametrize(
-    ("camera", "size"), [("front", (320, 400)), ("side", (640, 360)), ("side", (1280, 720))]
-)
+@pytest.mark.parametrize("camera", ["front", "side"])
 @pytest.mark.parametrize("error", [-3.0, 3.0])
-def test_a_craft_3_m_from_its_goal_is_above_the_strip(
-    error: float, camera: Camera, size: tuple[int, int], stage: Stage, canvas: Canvas
+def test_a_craft_3_m_from_its_goal_is_in_the_picture(
+    error: float, camera: Camera, stage: Stage, canvas: Canvas
 ) -> None:
-    moment = at(5.0 - error, error)
-    overlay = Overlay(*size, title="PID", like=moment, vehicle=stage.vehicle, period=0.02,
-                      seconds=5.0, scale=(-1.0, 1.0))  # fmt: skip
-    stage.show(moment)
-    rows, columns = np.nonzero(craft_in(canvas, camera))
-    scale = size[1] / HEIGHT  # the height says how large things are
-    assert rows.min() * scale > 0.05 * size[1]
-    assert rows.max() * scale < overlay.strip.upper
-    across = (columns - WIDTH / 2) * scale + size[0] / 2
-    free = (across > overlay.panel.right) | (rows * scale > overlay.panel.lower)
-    assert free.mean() > 0.45  # about half of it or more is beside the panel, or below
+    stage.show(at(5.0 - error, error))
+    rows = np.nonzero(craft_in(canvas, camera))[0]
+    assert rows.min() > 0.05 * HEIGHT
+    assert rows.max() < 0.8 * HEIGHT
 
 
 @pytest.mark.parametrize("camera", ["front", "side"])
@@ -260,3 +250,36 @@ def test_shadows_and_smooth_edges_are_there_unless_it_is_to_be_fast(opengl: None
     darker = (rough - smooth).min(axis=2) > 30
     assert darker.sum() > 50  # the shadow, below the craft
     assert np.nonzero(darker)[0].mean() > HEIGHT / 2
+
+
+def test_lines_are_written_in_the_upper_left_corner(stage: Stage, canvas: Canvas) -> None:
+    stage.show(at(5.0))
+    plain = canvas.draw("side")
+    written = canvas.draw("side", lines=[("PID", "0.50 s"), ("E", "-0.079 m")])
+    rows, columns = np.nonzero((plain != written).any(axis=2))
+    assert rows.size > 500
+    assert rows.max() < HEIGHT / 2
+    assert columns.max() < 0.75 * WIDTH
+    assert written.max(axis=2)[: HEIGHT // 2].max() > 240  # white letters
+
+
+def test_lines_follow_the_task_and_the_vehicle() -> None:
+    hover = at(1.0, 0.25, metrics=(MetricValue("position_error", 0.25, "m", "e"),
+                                   MetricValue("heading_error", -12.345, "deg"),
+                                   MetricValue("gates_passed", 3.0)))  # fmt: skip
+    assert hover.lines(100.0) == [
+        ("e", "0.250 m"),
+        ("heading error", "-12.35 deg"),
+        ("gates passed", "3"),
+        ("elevation", "1.00 m"),
+        ("goal", "1.25 m"),
+        ("F1 to F4", "49 49 49 49 N"),
+        ("reward", "+0.000"),
+        ("step", "0"),
+        ("episode", "0"),
+    ]
+    free = at(1.0, goal=None, metrics=(), thrusts=(0.066,) * 4).lines(0.15)
+    assert free[:2] == [("elevation", "1.00 m"), ("F1 to F4", "66 66 66 66 mN")]
+    assert at(1.0, thrusts=(3.25,)).lines(13.0)[3] == ("F1", "3.2 N")
+    six = at(1.0, thrusts=(5.0, 7.0, 5.0, 7.0, 5.0, 7.0)).lines(30.0)
+    assert six[3] == ("F1 to F6, mean", "6.0 N")

@@ -86,14 +86,12 @@ def test_a_checkpoint_on_film_flies_as_it_does_over_the_wire(
     assert err == ""
     assert f"film: {out} (13 pictures of 642x240)" in said  # 0.5 s, both ends
     last = decoded(out, 642, 240)[-1].astype(int)
-    tracks = [
-        FilmTrack(name="it", color="#7CC8F2", trajectories=[one]) for one in (flown, recorded)
-    ]
+    tracks = [FilmTrack(name="it", trajectories=[one]) for one in (flown, recorded)]
     config = Film(width=642, height=240, camera="front", scene="plain", fast=True, overlay=False)
     film(tmp_path / "plain.png", tracks, config)
     bare = pixels(tmp_path / "plain.png").astype(int)
     assert abs(bare[:, :320] - bare[:, 322:]).max() <= 3  # the same flight twice
-    assert abs(last - bare).mean() > 10
+    assert abs(last - bare).mean() > 2
 
 
 def test_gif_pictures_and_names(
@@ -115,13 +113,21 @@ def test_gif_pictures_and_names(
     assert pixels(picture).shape == (HEIGHT, WIDTH, 3)
 
 
+@pytest.fixture
+def any_opengl(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is drawn: what is tested works without OpenGL."""
+    monkeypatch.setattr(gl, "offscreen_context", lambda *_: SimpleNamespace(free=lambda: None))
+
+
 def test_panes_of_the_same_have_names_of_their_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    any_opengl: None,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     """And show the episodes that `evaluate` flies."""
     shown: list[Any] = []
     monkeypatch.setattr(filming, "film", lambda out, tracks, *_: shown.extend(tracks) or 1)
-    monkeypatch.setattr(gl, "offscreen_context", lambda *_: SimpleNamespace(free=lambda: None))
     what = ("pid", "pid", "random", "pid", "random")
     settings = ("--episode-length", 10, "--episode", 1, "--out", tmp_path / "film.gif")
     assert run(capsys, "render", *what, *settings)[0] == 0
@@ -154,6 +160,7 @@ def test_panes_of_the_same_have_names_of_their_own(
     ],
 )
 def test_wrong_input_is_one_sentence(
+    any_opengl: None,
     arguments: list[str],
     sentence: str,
     tmp_path: Path,
@@ -349,7 +356,6 @@ def test_the_page_tells_what_the_benchmark_wrote() -> None:
     page = (docs / "rendering.md").read_text()
     told = json.loads((docs / "results" / "performance" / "rendering.json").read_text())
     rates = told["pictures_per_second"]
-    overlay = told["overlay_milliseconds"]
     for size in ("640x360", "1280x720"):
-        assert f"| {size} | {rates[size]} | {rates[f'{size}, fast']} | {overlay[size]} |" in page
+        assert f"| {size} | {rates[size]} | {rates[f'{size}, fast']} |" in page
     assert (docs / "images" / "cameras.jpg").stat().st_size < 200_000

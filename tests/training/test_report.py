@@ -14,7 +14,7 @@ from rich.console import Console
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.spec import EnvSpec
 from rotorgram.flights.filming import Film, FilmTrack
-from rotorgram.flights.palette import agent_color, agent_label
+from rotorgram.flights.palette import agent_label
 from rotorgram.flights.trajectories import Trajectory
 from rotorgram.models.errors import InputError
 from rotorgram.training import films
@@ -171,7 +171,6 @@ def test_names_and_colours_of_rows() -> None:
     assert (row_label(a2c), row_color(a2c)) == ("A2C", "#0072B2")
     assert row_label(Row(agent="sb3-ppo", preset="tuned")) == "SB3 PPO tuned"
     assert row_label(Row(agent="a2c", name="wide")) == "wide"
-    assert agent_color("a2c", dark=True) != agent_color("a2c")
     assert agent_label("zeta") == "zeta"
 
 
