@@ -9,6 +9,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from numpy.typing import NDArray
 
 from ..models.errors import InputError
 from ..sim import Array, PhysicsError, Randomization, make_world
@@ -16,13 +17,13 @@ from ..sim.snapshots import Arrays, joined, part_of
 from .autoreset import Seeds, checked_seeds
 from .config import EnvConfig
 from .pipeline import Pipeline
-from .results import Results
 from .specification import make_task, spec_of
 from .stages import clock
 from .stages.record import Mask, Record
+from .telemetry import quantities_of
 
 
-class Loop(Results):
+class Loop:
     """N drones of one env, each in its own world, or `config.drones` in each world.
 
     Drones of one world begin together. One whose episode ends before those of the others is *out*:
@@ -38,6 +39,12 @@ class Loop(Results):
         config: As given, resolved.
         task, world: Their arrays have the leading axes of the world; all others here have one axis
             of N drones, world by world, and are new after each `advance`.
+        num_envs: N.
+        observations: By name, shape (N, *shape), of the declared dtypes.
+        rewards: float64, shape (N,); 0 for a drone that did not fly.
+        terminated, truncated: bool, shape (N,).
+        done: bool, shape (N,): the world's episode has ended and the next has not begun.
+        out: bool, shape (N,): its own has ended.
 
     Raises:
         InputError: An argument, seed or action is not what it should be; nothing has changed,
@@ -52,11 +59,11 @@ class Loop(Results):
         backend = config.backend
         shape = (num_worlds, config.drones)
         alone = shape == (1, 1) and backend.name == "mujoco"
-        task = make_task(config, () if alone else shape)
+        self.task = task = make_task(config, () if alone else shape)
         self.vehicle = task.vehicle
         flown = task.config
         randomize = Randomization(flown.randomize, flown.effects) if flown.randomize else None
-        world = make_world(
+        self.world = world = make_world(
             self.vehicle,
             num_worlds,
             backend.name,
@@ -68,9 +75,12 @@ class Loop(Results):
         self._pipeline = pipeline = Pipeline(task, world, shape, randomize)
         self.spec = spec_of(config, task, pipeline.pictures)
         kept = tuple(name for stage in pipeline.stages for name in stage.arrays)
-        record = Record(world.shape, task.memory, kept)
+        self.record = Record(world.shape, task.memory, kept)
+        self.num_envs = num_worlds * config.drones
+        self._quantities = quantities_of(task)
+        self._telemetry: dict[str, NDArray[np.float64]] | None = None
         self._closed = False
-        super().__init__(task, world, self.spec, record)
+        self._take()
 
     def advance(
         self,
@@ -105,7 +115,7 @@ class Loop(Results):
         if record.begun is not None:
             self._begin(record.begun, seeds, chosen or {})
         self._observe()
-        self.take()
+        self._take()
 
     def _begin(self, begun: Mask, seeds: Any, chosen: Mapping[str, np.ndarray]) -> None:
         """Begin episodes: the task sets the start, and the other stages follow from it."""
@@ -145,7 +155,7 @@ class Loop(Results):
         leaving = clock.drones_of(self.record, drones) & ~self.record.out
         if leaving.any():
             self.record.end(leaving)
-            self.take_ends()
+            self._take_ends()
 
     def land(self, drones: Array) -> None:
         """Bring drones down until they touch something, then retire them; bool, shape (N,).
@@ -185,7 +195,7 @@ class Loop(Results):
         record.restore(kept)
         for stage in self._pipeline.stages:
             stage.restore(record, part_of(snapshot, type(stage).__name__))
-        self.take()
+        self._take()
 
     def __reduce__(self) -> Any:
         worlds = self.num_envs // self.config.drones
@@ -193,6 +203,65 @@ class Loop(Results):
 
     def __setstate__(self, snapshot: Arrays) -> None:
         self.restore(snapshot)
+
+    def _take(self) -> None:
+        """New arrays of N drones, of the declared dtypes."""
+        record = self.record
+        count = self.num_envs
+        self._telemetry = None
+        known = vars(record).get("observations")
+        self.observations = {}
+        for array in self.spec.observation:
+            shape = (count, *array.shape)
+            if known is None:  # before an episode
+                self.observations[array.name] = np.zeros(shape, array.dtype)
+            else:
+                values = np.array(known[array.name], array.dtype)
+                self.observations[array.name] = values.reshape(shape)
+        self.rewards = np.array(record.reward).reshape(count)
+        self.terminated = np.array(record.terminated).reshape(count)
+        self.truncated = np.array(record.truncated).reshape(count)
+        self._take_ends()
+
+    def _take_ends(self) -> None:
+        self.done = np.array(self.record.done).reshape(self.num_envs)
+        self.out = np.array(self.record.out).reshape(self.num_envs)
+
+    @property
+    def steps(self) -> NDArray[np.int64]:
+        """Control steps of each running episode, shape (N,)."""
+        return np.array(self.record.steps).reshape(self.num_envs)
+
+    @property
+    def reward_terms(self) -> dict[str, NDArray[np.float64]]:
+        """Terms of the last rewards by name, each of shape (N,)."""
+        return self._per_drone(self.record.terms)
+
+    @property
+    def metrics(self) -> dict[str, NDArray[np.float64]]:
+        """Metrics of the task by name, each of shape (N,)."""
+        return self._per_drone(self.record.metrics)
+
+    @property
+    def telemetry(self) -> dict[str, NDArray[np.float64]]:
+        """By the names of `spec.telemetry`, float64, shape (N, *shape)."""
+        if self._telemetry is None:
+            self._telemetry = {one.name: one.values(self) for one in self._quantities}
+        return self._telemetry
+
+    def row(self) -> list[float]:
+        """The telemetry of a single drone in a row."""
+        row: list[float] = []
+        for quantity in self._quantities:
+            row += quantity.read(self).ravel().tolist()
+        return row
+
+    def _per_drone(self, arrays: Mapping[str, Array]) -> dict[str, NDArray[np.float64]]:
+        rows = {}
+        for name, values in arrays.items():
+            row = np.broadcast_to(values, self.record.shape)
+            rows[name] = np.array(row).reshape(self.num_envs)
+        return rows
 
     def close(self) -> None:
         """Release threads and memory; what the last step gave can be read on."""

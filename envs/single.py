@@ -128,6 +128,6 @@ class SingleEnv(gym.Env[Any, Any]):
         loop = self._loop
         info = self._blank.copy()  # faster than to insert one name after the other
         info |= zip(self._blank, loop.row(), strict=False)
-        for name, term in loop.terms.items():
+        for name, term in loop.record.terms.items():
             info["reward_" + name] = term.item() if isinstance(term, np.ndarray) else float(term)
         return info

@@ -7,14 +7,15 @@ the env's code nor MuJoCo. This module imports the standard library and NumPy al
 import json
 import math
 import re
-from collections.abc import Mapping
+import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields
 from typing import Annotated, Any, ClassVar, Final, Literal, Self
 
 import numpy as np
 
 from ..models.errors import InputError, shortened
-from ..models.fields import Limits, Text, check_fields
+from ..models.fields import Limits, Text, check, check_fields
 from ..scenes import marks
 
 MAX_ELEMENTS: Final = 1 << 22  # numbers of all observations of one drone
@@ -24,14 +25,6 @@ MAX_ARRAYS: Final = 64  # arrays of an observation or of the telemetry
 MAX_AGENTS: Final = 1024  # drones of one world
 MAX_MARKS: Final = 256  # things that pictures show
 MAX_NAME: Final = 200  # characters of a name, unit or frame
-
-_DTYPES: Final = ("float32", "float64", "uint8", "int32", "int64")
-_CONTROL: Final = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")  # and halves of pairs
-_SIZE: Final = Limits(0.0, above=True)
-_DIGEST: Final = re.compile("[0-9a-f]{32}")
-_CONSTANT: Final = re.compile(r"[a-z][a-z0-9_]{0,63}")
-_LARGEST: Final = float(np.finfo(np.float64).max)
-_NO_BOUND: Final = {"low": -math.inf, "high": math.inf}
 
 WORLD: Final = "world"
 """Frame of vectors x, y, z: z up, right-handed."""
@@ -46,6 +39,34 @@ Bound = float | tuple[float, ...]
 
 class SpecError(InputError):
     """A spec is wrong: nothing of that kind can cross the wire."""
+
+
+@dataclass(frozen=True)
+class _Pattern:
+    """A text that matches a pattern, or a tuple of such texts."""
+
+    pattern: str
+    expected: str
+    kind: type = str
+
+    def read(self, value: Any) -> object:
+        if not isinstance(value, self.kind):
+            raise TypeError
+        for word in (value,) if self.kind is str else value:
+            if not re.fullmatch(self.pattern, word):
+                raise ValueError
+        return value
+
+
+_VISIBLE: Final = r"[^\x00-\x1f\x7f-\x9f\ud800-\udfff]"  # nor halves of surrogate pairs
+_SHORT: Final = f"of at most {MAX_NAME} characters without control characters"
+_NAME: Final = _Pattern(f"{_VISIBLE}{{1,{MAX_NAME}}}", f"a name {_SHORT}")
+_TEXT: Final = _Pattern(f"{_VISIBLE}{{0,{MAX_NAME}}}", f"a text {_SHORT}")
+_TEXTS: Final = _Pattern(_TEXT.pattern, f"a tuple of texts {_SHORT}", tuple)
+_HASH: Final = _Pattern("[0-9a-f]{32}", "32 hex digits")
+_DIGEST: Final = _Pattern("([0-9a-f]{32})?", "32 hex digits")
+_CONSTANT: Final = _Pattern("[a-z][a-z0-9_]{0,63}", "a name of a to z, 0 to 9 and _")
+_SIZE: Final = Limits(0.0, above=True)
 
 
 class _Part:
@@ -91,61 +112,51 @@ class ArraySpec(_Part):
 
     _optional = ("low", "high", "unit", "frame", "components", "categories")
 
-    name: str
+    name: Annotated[str, _NAME]
     shape: tuple[int, ...]
-    dtype: str = "float32"
-    """`float32`, `float64`, `uint8`, `int32` or `int64`."""
+    dtype: Literal["float32", "float64", "uint8", "int32", "int64"] = "float32"
     low: Bound = -math.inf
     high: Bound = math.inf
     unit: str | tuple[str, ...] = ""
     """One for all elements, or one for each."""
-    frame: str = ""
+    frame: Annotated[str, _TEXT] = ""
     """Frame of reference; empty where there is none."""
-    components: tuple[str, ...] = ()
+    components: Annotated[tuple[str, ...], _TEXTS] = ()
     """A name for each element, or none."""
-    categories: tuple[str, ...] = ()
+    categories: Annotated[tuple[str, ...], _TEXTS] = ()
     """What the values 0, 1, 2... stand for, where they are numbers of something; or none."""
 
     def __post_init__(self) -> None:
+        check_fields(self, "array: ", SpecError)
         name = self.name
         shape = self.shape
-        names = self.components
-        _check_text("name", name)
-        _expect(name, "name", "a name for an array", name)
         is_shape = isinstance(shape, tuple) and all(type(n) is int and n >= 1 for n in shape)
         _expect(is_shape, name, "a shape of whole numbers >= 1", shape)
         _expect(len(shape) <= MAX_DIMENSIONS, name, f"at most {MAX_DIMENSIONS} axes", len(shape))
         _expect(self.size <= MAX_ELEMENTS, name, f"at most {MAX_ELEMENTS} elements", shape)
-        _expect(self.dtype in _DTYPES, name, f"a dtype of {', '.join(_DTYPES)}", self.dtype)
-        for end in _NO_BOUND:
-            object.__setattr__(self, end, self._bound(end))
+        object.__setattr__(self, "low", self._bound("low", -math.inf))
+        object.__setattr__(self, "high", self._bound("high", math.inf))
         low, high = self.bounds()
         wrong = ~((low <= high) & (low < np.inf) & (high > -np.inf))
         if wrong.any():
             first = int(wrong.argmax())
             got = f"{low.flat[first]} and {high.flat[first]}"
             raise SpecError(f"{name}: expected low <= high, got {got} at element {first}")
-        one_unit = isinstance(self.unit, str)
-        units = (self.unit,) if one_unit else self.unit
-        _check_words(f"{name}: unit", units)
-        _expect(one_unit or len(units) == self.size, name, f"{self.size} units", len(units))
-        _check_text(f"{name}: frame", self.frame)
-        _check_words(f"{name}: components", names)
-        _check_words(f"{name}: categories", self.categories)
-        right = not names or len({*names} - {""}) == len(names) == self.size
-        _expect(right, name, f"{self.size} different components", names)
+        units = (self.unit,) * self.size if isinstance(self.unit, str) else self.unit
+        check(f"{name}: unit", _TEXTS, units, SpecError)
+        _expect(len(units) == self.size, name, f"{self.size} units", len(units))
+        _check_components(name, self.components, self.size)
 
-    def _bound(self, name: str) -> Bound:
-        bound: Any = getattr(self, name)
-        try:
-            values = np.asarray(bound, np.float64)
-        except (TypeError, ValueError, OverflowError):
-            values = np.asarray(np.nan)
-        fits = values.shape in ((), self.shape, (self.size,))
-        right = fits and not np.isnan(values).any()
-        _expect(right, self.name, f"one number for {name} or one for each element", bound)
-        flat = values.ravel()
-        return float(flat[0]) if (flat == flat[0]).all() else tuple(flat.tolist())
+    def _bound(self, name: str, infinite: float) -> Bound:
+        """A bound as it is kept; JSON has null for infinity."""
+        given: Any = getattr(self, name)
+        objects = np.asarray(given, object)
+        numbers = [infinite if number is None else number for number in objects.ravel().tolist()]
+        right = objects.shape in ((), self.shape, (self.size,))
+        right = right and all(_is_number(number) for number in numbers)
+        _expect(right, self.name, f"one number for {name} or one for each element", given)
+        kept = tuple(map(float, numbers))
+        return kept[0] if len(set(kept)) == 1 else kept
 
     @property
     def size(self) -> int:
@@ -154,20 +165,9 @@ class ArraySpec(_Part):
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """(low, high), float64, of the array's shape."""
-        pair = [np.asarray(bound, np.float64) for bound in (self.low, self.high)]
-        low, high = (np.broadcast_to(bound, self.size).reshape(self.shape) for bound in pair)
-        return low, high
-
-    @classmethod
-    def _from_content(cls, content: object) -> Self:
-        given = cls._fields(content)
-        for name in _NO_BOUND.keys() & given:
-            values = given[name] if isinstance(given[name], tuple) else (given[name],)
-            right = all(value is None or _is_number(value) for value in values)
-            _expect(right, "bounds", "numbers or null", given[name])
-            values = tuple(_NO_BOUND[name] if value is None else value for value in values)
-            given[name] = values if isinstance(given[name], tuple) else values[0]
-        return cls(**given)
+        low = np.broadcast_to(np.asarray(self.low, np.float64), self.size)
+        high = np.broadcast_to(np.asarray(self.high, np.float64), self.size)
+        return low.reshape(self.shape), high.reshape(self.shape)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -176,17 +176,16 @@ class Discrete(_Part):
 
     _optional = ("components",)
 
-    name: str = "action"
-    n: int = field(metadata={"json": "choices"})
-    components: tuple[str, ...] = ()
+    name: Annotated[str, _TEXT] = "action"
+    n: Annotated[int, Limits(1, 1 << 24, "choices", whole=True)] = field(
+        metadata={"json": "choices"}
+    )
+    components: Annotated[tuple[str, ...], _TEXTS] = ()
     """A name for each choice, or none."""
 
     def __post_init__(self) -> None:
-        n, names = self.n, self.components
-        _expect(type(n) is int and 1 <= n <= 1 << 24, "action", "1 to 2^24 choices", n)
-        _check_text("action", self.name)
-        _check_words("action: components", names)
-        _expect(not names or len(names) == n, "action", f"{n} components", names)
+        check_fields(self, "action: ", SpecError)
+        _check_components("action", self.components, self.n)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -231,19 +230,19 @@ class EnvSpec(_Part):
 
     _optional = ("config_digest", "constants", "marks")
 
-    env_id: str
+    env_id: Annotated[str, _TEXT]
     options: Mapping[str, Any] = field(default_factory=dict)
     """Every option of the env, as JSON values."""
-    control_period: float
+    control_period: Annotated[float, Limits(1e-6, 1e3, "s")]
     """Time that one step simulates, s."""
-    vehicle: str = ""
+    vehicle: Annotated[str, _TEXT] = ""
     """Name of the vehicle's model."""
-    vehicle_hash: str = "0" * 32
+    vehicle_hash: Annotated[str, _HASH] = "0" * 32
     """32 hexadecimal digits: the same model, the same hash; zeros where there is none."""
-    config_digest: str = ""
+    config_digest: Annotated[str, _DIGEST] = ""
     """32 hexadecimal digits of the resolved `EnvConfig`, or empty. The same digest, the same
     numbers."""
-    agents: tuple[str, ...] = ("drone_0",)
+    agents: Annotated[tuple[str, ...], _TEXTS] = ("drone_0",)
     """One name for each drone of a world."""
     observation: tuple[ArraySpec, ...]
     action: ArraySpec | Discrete
@@ -257,29 +256,16 @@ class EnvSpec(_Part):
     """What pictures show of the task."""
 
     def __post_init__(self) -> None:
-        _check_text("env_id", self.env_id)
+        check_fields(self, "", SpecError)
         object.__setattr__(self, "options", json_values(self.options))
         object.__setattr__(self, "constants", _checked_constants(self.constants))
-        period = self.control_period
-        agents = self.agents
-        right = _is_number(period) and 1e-6 <= period <= 1e3
-        _expect(right, "control_period", "1e-6 to 1e3 s", period)
-        _check_text("vehicle", self.vehicle)
-        for name in ("vehicle_hash", "config_digest"):
-            digits = getattr(self, name)
-            right = isinstance(digits, str) and bool(_DIGEST.fullmatch(digits))
-            right = right or (digits == "" and name in self._optional)
-            _expect(right, name, "32 hex digits", digits)
-        _check_words("agents", agents)
-        right = 1 <= len({*agents}) == len(agents) <= MAX_AGENTS
-        _expect(right, "agents", f"1 to {MAX_AGENTS} different names", agents)
+        _check_different("agents", self.agents, MAX_AGENTS)
+        _expect(self.agents, "agents", "at least one name", self.agents)
         _expect(self.observation, "observation", "at least one array", self.observation)
         _expect(len(self.marks) <= MAX_MARKS, "marks", f"at most {MAX_MARKS}", len(self.marks))
         for what, most in (("observation", MAX_ELEMENTS), ("telemetry", MAX_TOLD)):
             arrays = getattr(self, what)
-            listed = [array.name for array in arrays]
-            right = len({*listed}) == len(listed) <= MAX_ARRAYS
-            _expect(right, what, f"at most {MAX_ARRAYS} different names", listed)
+            _check_different(what, [array.name for array in arrays], MAX_ARRAYS)
             size = sum(array.size for array in arrays)
             _expect(size <= most, what, f"at most {most} elements in all", size)
         names = tuple(metric.name for metric in self.metrics)
@@ -287,8 +273,7 @@ class EnvSpec(_Part):
         expected = f"the components of the telemetry 'metrics' to be {shortened(names)}"
         _expect(in_telemetry == names, "metrics", expected, in_telemetry)
         components = [name for array in self.telemetry for name in component_names(array)]
-        right = len({*components}) == len(components)
-        _expect(right, "telemetry", "each component once", components)
+        _check_different("telemetry: components", components, MAX_TOLD)
 
     def constant(self, name: str, user: str) -> float:
         """One of the constants. Raises `InputError`, which names its `user`, if it is not there."""
@@ -327,16 +312,19 @@ class EnvSpec(_Part):
         except (ValueError, RecursionError) as error:
             raise SpecError(f"spec: expected JSON, got {text[:80]!r}: {error}") from None
         given = cls._fields(content)
-        kinds: dict[str, type[_Part]] = {
-            "observation": ArraySpec, "telemetry": ArraySpec, "metrics": Metric, "marks": Mark
-        }  # fmt: skip
-        for name in kinds.keys() & given:
-            _expect(isinstance(given[name], tuple), name, "a list", given[name])
-            given[name] = tuple(map(kinds[name]._from_content, given[name]))
+        for name, kind in _KINDS.items():
+            parts = given.get(name, ())
+            _expect(isinstance(parts, tuple), name, "a list", parts)
+            given[name] = tuple(map(kind._from_content, parts))
         action = given["action"]
         is_discrete = isinstance(action, dict) and "choices" in action
         given["action"] = (Discrete if is_discrete else ArraySpec)._from_content(action)
         return cls(**given)
+
+
+_KINDS: Final[dict[str, type[_Part]]] = {
+    "observation": ArraySpec, "telemetry": ArraySpec, "metrics": Metric, "marks": Mark,
+}  # fmt: skip
 
 
 def canonical_id(env_id: str) -> str:
@@ -358,15 +346,11 @@ def _checked_constants(constants: Any) -> dict[str, Bound]:
     _expect(len(constants) <= MAX_ARRAYS, "constants", f"at most {MAX_ARRAYS}", len(constants))
     checked: dict[str, Bound] = {}
     for name, value in constants.items():
-        is_name = isinstance(name, str) and _CONSTANT.fullmatch(name)
-        _expect(is_name, "constants", "names of a to z, 0 to 9 and _", name)
+        check("constants", _CONSTANT, name, SpecError)
         several = isinstance(value, tuple | list)
-        numbers = tuple(value) if several else (value,)
-        right = all(_is_number(number) and abs(number) <= _LARGEST for number in numbers)
-        expected = f"at most {MAX_TOLD} finite numbers"
-        _expect(right and len(numbers) <= MAX_TOLD, f"constants: {name}", expected, value)
-        floats = tuple(map(float, numbers))
-        checked[name] = floats if several else floats[0]
+        _expect(not several or len(value) <= MAX_TOLD, name, f"at most {MAX_TOLD} numbers", value)
+        rule = Limits(count=None, least=0) if several else Limits()
+        checked[name] = check(f"constants: {name}", rule, value, SpecError)
     return checked
 
 
@@ -375,20 +359,21 @@ def _expect(right: object, name: str, expected: str, got: object) -> None:
         raise SpecError(f"{name}: expected {expected}, got {shortened(got)}")
 
 
-def _check_text(name: str, text: object) -> None:
-    right = isinstance(text, str) and len(text) <= MAX_NAME and not _CONTROL.search(text)
-    expected = f"a text of at most {MAX_NAME} characters without control characters"
-    _expect(right, name, expected, text)
-
-
-def _check_words(name: str, words: Any) -> None:
-    _expect(isinstance(words, tuple), name, "a tuple of texts", words)
-    for word in words:
-        _check_text(name, word)
-
-
 def _is_number(value: object) -> bool:
-    return type(value) in (int, float)
+    """Whether it is a number of float64, infinity among them."""
+    if not isinstance(value, int | float):
+        return False
+    return abs(value) <= sys.float_info.max or abs(value) == math.inf
+
+
+def _check_different(what: str, names: Sequence[str], most: int) -> None:
+    right = len(set(names)) == len(names) <= most
+    _expect(right, what, f"at most {most} different names", names)
+
+
+def _check_components(name: str, components: tuple[str, ...], size: int) -> None:
+    right = not components or len({*components} - {""}) == len(components) == size
+    _expect(right, name, f"{size} different components", components)
 
 
 def _finite(text: str) -> float:
@@ -428,5 +413,5 @@ def json_values(options: Any) -> dict[str, Any]:
             f"options: expected JSON values, got {shortened(options)}: {error}"
         ) from None
     for name in plain:
-        _check_text("options", name)
+        check("options", _TEXT, name, SpecError)
     return plain

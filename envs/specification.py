@@ -61,7 +61,7 @@ def spec_of(
         agents=drone_names(config.drones),
         observation=tuple(observation),
         action=_action(task.controller),
-        telemetry=tuple(array for _, array in quantities_of(task)),
+        telemetry=tuple(quantity.spec for quantity in quantities_of(task)),
         metrics=task.metrics,
         constants={
             "gravity": task.vehicle.gravity,

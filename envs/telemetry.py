@@ -5,6 +5,7 @@ World frame: z up. Body frame: x forward, y left, z up. SI units.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -16,177 +17,125 @@ from .spec import BODY, BODY_TO_WORLD, WORLD, ArraySpec, Bound
 from .tasks.task import Task
 
 if TYPE_CHECKING:
-    from .results import Results
+    from .loop import Loop
 
 Names = tuple[str, ...]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Quantity:
-    """A vector of the telemetry. What depends on the task is a function of it."""
+    """A vector of the telemetry."""
 
     name: str
-    components: Names | Callable[[Task], Names]
-    """A name for each number. Empty: the env does not have it, as when a feature is off."""
-    unit: str | Names | Callable[[Task], Names] = ""
-    frame: str = ""
-    bounds: Callable[[Task], tuple[Bound, Bound]] = lambda task: (-np.inf, np.inf)
-    read: Callable[["Results"], Array]
+    components: Names
+    unit: str | Names
+    read: Callable[["Loop"], Array]
     """Gives an array of shape (W, A, n), or one that broadcasts to it; (n,) of a single drone."""
+    frame: str = ""
+    low: Bound = -np.inf
+    high: Bound = np.inf
 
-    def spec(self, task: Task) -> ArraySpec | None:
-        """What crosses the wire; None where the task does not have it."""
-        components = self.components(task) if callable(self.components) else self.components
-        if not components:
-            return None
-        low, high = self.bounds(task)
+    @property
+    def spec(self) -> ArraySpec:
+        """What crosses the wire."""
         return ArraySpec(
             name=self.name,
-            shape=(len(components),),
+            shape=(len(self.components),),
             dtype="float64",
-            low=low,
-            high=high,
-            unit=self.unit(task) if callable(self.unit) else self.unit,
+            low=self.low,
+            high=self.high,
+            unit=self.unit,
             frame=self.frame,
-            components=components,
+            components=self.components,
         )
 
-    def values(self, loop: "Results") -> NDArray[np.float64]:
+    def values(self, loop: "Loop") -> NDArray[np.float64]:
         """A new array, float64, shape (N, n)."""
         read = np.asarray(self.read(loop), np.float64)
         rows = np.broadcast_to(read, (*loop.record.shape, read.shape[-1]))
         return np.array(rows).reshape(loop.num_envs, -1)
 
 
-def quantities_of(task: Task) -> list[tuple[Quantity, ArraySpec]]:
+def _of_state(name: str, components: Names, unit: str, frame: str) -> Quantity:
+    return Quantity(name, components, unit, attrgetter(f"record.state.{name}"), frame)
+
+
+POSE: Final = (
+    _of_state("position", ("x", "y", "z"), "m", WORLD),
+    Quantity(
+        "attitude",
+        ("qw", "qx", "qy", "qz"),
+        "",
+        attrgetter("record.state.quaternion"),
+        BODY_TO_WORLD,
+    ),
+    _of_state("velocity", ("vx", "vy", "vz"), "m/s", WORLD),
+    _of_state("body_rates", ("rate_x", "rate_y", "rate_z"), "rad/s", BODY),
+)
+"""What every drone has."""
+
+
+def quantities_of(task: Task) -> list[Quantity]:
     """What a task's drones have, in the order in which it crosses the wire."""
-    found = []
-    for quantity in QUANTITIES:
-        spec = quantity.spec(task)
-        if spec is not None:
-            found.append((quantity, spec))
-    return found
+    effects = task.config.effects
+    drawn = Randomization(task.config.randomize, effects).names
+    quantities = [*POSE, _thrust(task)]
+    if effects.battery:
+        quantities.append(Quantity("battery", ("charge", "voltage"), ("1", "V"), _battery))
+    winds = ("wind_x", "wind_y", "wind_z")
+    blows = effects.gusts > 0 or any(effects.wind)
+    if blows or not set(winds).isdisjoint(drawn):
+        quantities.append(Quantity("wind", winds, "m/s", _wind, WORLD))
+    if drawn:
+        names = tuple(f"drawn_{name}" for name in drawn)
+        units = tuple(PARAMETERS[name].unit for name in drawn)
+        quantities.append(Quantity("drawn", names, units, _drawn))
+    if effects.payload:
+        names = ("payload_x", "payload_y", "payload_z")
+        quantities.append(_of_state("payload", names, "m", WORLD))
+    if type(task).goal is not Task.goal:
+        quantities.append(Quantity("goal", ("goal_x", "goal_y", "goal_z"), "m", _goal, WORLD))
+    if task.metrics:
+        names = tuple(metric.name for metric in task.metrics)
+        units = tuple(metric.unit for metric in task.metrics)
+        quantities.append(Quantity("metrics", names, units, _metrics))
+    return quantities
 
 
-def _rotors(task: Task) -> Names:
-    return tuple(f"F{rotor + 1}" for rotor in range(task.vehicle.num_rotors))
+def _thrust(task: Task) -> Quantity:
+    """Its bounds are those of the commands: a rotor whose efficiency is drawn may leave them."""
+    vehicle = task.vehicle
+    return Quantity(
+        "thrust",
+        tuple(f"F{rotor + 1}" for rotor in range(vehicle.num_rotors)),
+        "N",
+        attrgetter("record.state.thrust"),
+        low=tuple(np.atleast_2d(vehicle.thrust_low).min(axis=0).tolist()),
+        high=tuple(np.atleast_2d(vehicle.thrust_high).max(axis=0).tolist()),
+    )
 
 
-def _thrust_bounds(task: Task) -> tuple[Bound, Bound]:
-    """Those of the commands: a rotor whose efficiency is drawn may leave them."""
-    low = np.atleast_2d(task.vehicle.thrust_low).min(axis=0)
-    high = np.atleast_2d(task.vehicle.thrust_high).max(axis=0)
-    return tuple(low.tolist()), tuple(high.tolist())
-
-
-def _battery(loop: "Results") -> Array:
+def _battery(loop: "Loop") -> Array:
     effects = loop.world.effects
     assert effects is not None
     return stack([effects.rotors.charge, effects.rotors.voltage])
 
 
-def _wind_names(task: Task) -> Names:
-    effects = task.config.effects
-    winds = ("wind_x", "wind_y", "wind_z")
-    blows = effects.gusts > 0 or any(effects.wind)
-    return winds if blows or not set(winds).isdisjoint(_drawn(task)) else ()
-
-
-def _wind(loop: "Results") -> Array:
+def _wind(loop: "Loop") -> Array:
     effects = loop.world.effects
     assert effects is not None
     return stack(effects.wind)
 
 
-def _drawn(task: Task) -> Names:
-    return Randomization(task.config.randomize, task.config.effects).names
+def _drawn(loop: "Loop") -> Array:
+    drawn = loop.world.parameters
+    return stack([drawn[name] for name in PARAMETERS if name in drawn])
 
 
-def _drawn_numbers(parameters: dict[str, Array]) -> Array:
-    return stack([parameters[name] for name in PARAMETERS if name in parameters])
+def _goal(loop: "Loop") -> Array:
+    return loop.task.goal(loop.record.state)
 
 
-def _metric_names(task: Task) -> Names:
-    return tuple(metric.name for metric in task.metrics)
-
-
-QUANTITIES: Final = (
-    Quantity(
-        name="position",
-        components=("x", "y", "z"),
-        unit="m",
-        frame=WORLD,
-        read=lambda loop: loop.record.state.position,
-    ),
-    Quantity(
-        name="attitude",
-        components=("qw", "qx", "qy", "qz"),
-        frame=BODY_TO_WORLD,
-        read=lambda loop: loop.record.state.quaternion,
-    ),
-    Quantity(
-        name="velocity",
-        components=("vx", "vy", "vz"),
-        unit="m/s",
-        frame=WORLD,
-        read=lambda loop: loop.record.state.velocity,
-    ),
-    Quantity(
-        name="body_rates",
-        components=("rate_x", "rate_y", "rate_z"),
-        unit="rad/s",
-        frame=BODY,
-        read=lambda loop: loop.record.state.body_rates,
-    ),
-    Quantity(
-        name="thrust",
-        components=_rotors,
-        unit="N",
-        bounds=_thrust_bounds,
-        read=lambda loop: loop.record.state.thrust,
-    ),
-    Quantity(
-        name="battery",
-        components=lambda task: ("charge", "voltage") if task.config.effects.battery else (),
-        unit=("1", "V"),
-        read=_battery,
-    ),
-    Quantity(
-        name="wind",
-        components=_wind_names,
-        unit="m/s",
-        frame=WORLD,
-        read=_wind,
-    ),
-    Quantity(
-        name="drawn",
-        components=lambda task: tuple(f"drawn_{name}" for name in _drawn(task)),
-        unit=lambda task: tuple(PARAMETERS[name].unit for name in _drawn(task)),
-        read=lambda loop: _drawn_numbers(loop.world.parameters),
-    ),
-    Quantity(
-        name="payload",
-        components=lambda task: (
-            ("payload_x", "payload_y", "payload_z") if task.config.effects.payload else ()
-        ),
-        unit="m",
-        frame=WORLD,
-        read=lambda loop: loop.record.state.payload,
-    ),
-    Quantity(
-        name="goal",
-        components=lambda task: (
-            ("goal_x", "goal_y", "goal_z") if type(task).goal is not Task.goal else ()
-        ),
-        unit="m",
-        frame=WORLD,
-        read=lambda loop: loop.task.goal(loop.record.state),
-    ),
-    Quantity(
-        name="metrics",
-        components=_metric_names,
-        unit=lambda task: tuple(metric.unit for metric in task.metrics),
-        read=lambda loop: stack([loop.record.metrics[one.name] for one in loop.task.metrics]),
-    ),
-)
-"""All of them, in the order in which they cross the wire."""
+def _metrics(loop: "Loop") -> Array:
+    metrics = loop.record.metrics
+    return stack([metrics[metric.name] for metric in loop.task.metrics])

@@ -6,9 +6,8 @@ from typing import NoReturn
 
 import numpy as np
 
-from ...models.errors import InputError
+from ...models.errors import InputError, shortened
 from ...sim import InitialState, World
-from ..spec import ArraySpec
 from ..tasks.task import Outcome, Task
 from .record import Record, Stage
 
@@ -85,36 +84,26 @@ class Judge(Stage):
     def _check(self, observations: object, outcome: object, record: Record) -> None:
         task = self._task
         names = [array.name for array in task.observation]
-        if not isinstance(observations, Mapping):
-            self._refuse(f"observe() to return a dict of {names}", type(observations).__name__)
-        if not observations.keys() >= set(names):
-            self._refuse(f"observe() to return a dict of {names}", list(observations))
+        given = list(observations) if isinstance(observations, Mapping) else observations
+        if not isinstance(observations, Mapping) or not observations.keys() >= set(names):
+            self._refuse(f"observe() to return a dict of {names}", given)
+        count = prod(record.shape)
         for array in task.observation:
-            self._check_array(array, observations[array.name], record)
+            shape = np.shape(observations[array.name])
+            if prod(shape) != count * array.size:
+                expected = f"{array.name} of shape {array.shape} for each of {count} drones"
+                self._refuse(f"observe() to return {expected}", f"an array of shape {shape}")
         if not isinstance(outcome, Outcome):
-            self._refuse("outcome() to return an Outcome", type(outcome).__name__)
+            self._refuse("outcome() to return an Outcome", outcome)
         for metric in task.metrics:
             if metric.name not in outcome.metrics:
                 self._refuse(f"the metric {metric.name!r}", list(outcome.metrics))
-        each = any(np.ndim(term) for term in outcome.reward.values())
-        if record.shape and not each:
-            self._refuse(
-                "a reward for each drone",
-                f"{outcome.reward}: make an array of it, as 1.0 + 0.0 * state.position[..., 2]",
-            )
-        kind = getattr(outcome.terminated, "dtype", type(outcome.terminated).__name__)
-        if "bool" not in str(kind):
-            self._refuse("terminated as truth values", kind)
-
-    def _check_array(self, array: ArraySpec, values: object, record: Record) -> None:
-        shape = tuple(getattr(values, "shape", ()))
-        count = prod(record.shape)
-        if prod(shape) != count * array.size:
-            self._refuse(
-                f"observe() to return {array.name} of shape {array.shape} for each of {count} "
-                "drones",
-                f"an array of shape {shape}",
-            )
+        if record.shape and not any(np.ndim(term) for term in outcome.reward.values()):
+            got = f"{outcome.reward}: make an array of it, as 1.0 + 0.0 * state.position[..., 2]"
+            self._refuse("a reward for each drone", got)
+        if np.asarray(outcome.terminated).dtype != np.bool_:
+            self._refuse("terminated as truth values", outcome.terminated)
 
     def _refuse(self, expected: str, got: object) -> NoReturn:
-        raise InputError(f"{self._task.config.env_id}: expected {expected}, got {got}")
+        said = got if isinstance(got, str) else shortened(got)
+        raise InputError(f"{self._task.config.env_id}: expected {expected}, got {said}")

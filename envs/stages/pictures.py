@@ -29,22 +29,27 @@ _UNITS: Final = {"depth": "m"}
 def views_of(task: Task, drones: int) -> tuple[View, ...]:
     """What the option `cameras` of a task chooses. Raises `InputError`."""
     words = task.config.cameras
-    kinds = dict.fromkeys(members_of(task.vehicle, drones))
-    first, *others = (chosen_views(words, one.cameras) for one in kinds)
+    vehicles = dict.fromkeys(members_of(task.vehicle, drones))
+    first, *others = (chosen_views(words, vehicle.cameras) for vehicle in vehicles)
+    expected = [view.name for view in first]
     for views in others:
-        names = [[view.name for view in some] for some in (first, views)]
-        if names[0] != names[1]:
-            raise InputError(
-                f"cameras: expected {', '.join(names[0])} of all vehicles, got {names[1]}"
-            )
+        names = [view.name for view in views]
+        if names != expected:
+            got = f"{', '.join(expected)} of all vehicles, got {names}"
+            raise InputError(f"cameras: expected {got}")
         for ours, its in zip(first, views, strict=True):
-            a, b = ours.camera, its.camera
-            same = (ours.shape, a.every, a.carried) == (its.shape, b.every, b.carried)
-            same &= a.carried or a == b  # of a world there is one alone
-            expected = "one of the same size and rate on all vehicles, or the same in their world"
-            if not same:
-                raise InputError(f"camera {ours.name}: expected {expected}, got others")
+            if _as_arrays(ours) != _as_arrays(its):
+                raise InputError(
+                    f"camera {ours.name}: expected one of the same size and rate on all vehicles, "
+                    "or the same in their world, got others"
+                )
     return first
+
+
+def _as_arrays(view: View) -> object:
+    """What two vehicles must have in common; of a world there is one camera for all."""
+    camera = view.camera
+    return view.shape, camera.every, camera if not camera.carried else None
 
 
 def arrays_of(views: Sequence[View], objects: Sequence[str]) -> tuple[ArraySpec, ...]:

@@ -1,31 +1,20 @@
 """The radio between the drones of a world: what each has heard last of each other."""
 
 from collections.abc import Callable
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...sim import numbers_of
 from ..state import State
+from ..tasks.goal import length
+from ..tasks.swarm import SwarmOptions
 from .record import Mask, Record, Stage
 from .ring import filled, pushed
 
 FORGOTTEN: Final = 1.0  # A drone that was not heard for so long is no neighbour any more, s
 Floats = NDArray[np.float64]
-
-
-class RadioOptions(Protocol):
-    """Options of a task whose drones have a radio."""
-
-    neighbours: int
-    """Drones in the observation of each: the nearest that it hears."""
-    radio_range: float
-    """Largest distance at which a drone is heard, m."""
-    radio_delay: int
-    """Control steps that a message takes."""
-    radio_loss: float
-    """Share of messages that are lost."""
 
 
 class Radio(Stage):
@@ -48,11 +37,7 @@ class Radio(Stage):
     arrays = ("said", "heard", "age", "keys", "silent")
 
     def __init__(
-        self,
-        options: RadioOptions,
-        period: float,
-        drones: int,
-        ended: Callable[[State], Mask],
+        self, options: SwarmOptions, period: float, drones: int, ended: Callable[[State], Mask]
     ) -> None:
         self._options = options
         self._period = period
@@ -64,13 +49,12 @@ class Radio(Stage):
         lots = record.draw.uniform(0.0, 1.0)
         position = np.broadcast_to(record.start.position, (*record.shape, 3))
         rest = np.concatenate((position, 0.0 * position), axis=-1)
-        silent = np.zeros(record.shape)
-        message = np.concatenate((rest, silent[..., None]), axis=-1)
+        message = np.concatenate((rest, np.zeros((*record.shape, 1))), axis=-1)
         record.said = filled(message, self._options.radio_delay + 1, 2)
         record.heard = np.repeat(rest[:, None], self._own.shape[0], axis=1)
         record.age = np.where(self._in_range(position, position), 0.0, np.inf)
         record.keys = (lots * 2.0**32).astype(np.uint32)
-        record.silent = silent > 0
+        record.silent = np.zeros(record.shape, bool)
 
     def step(self, record: Record) -> None:
         """Send and receive, then observe."""
@@ -82,46 +66,36 @@ class Radio(Stage):
 
     def _exchange(self, record: Record) -> None:
         state = record.state
-        delay = self._options.radio_delay
+        options = self._options
         record.silent = record.silent | self._ended(state)
-        message = np.concatenate(
-            (state.position, state.velocity, record.silent[..., None]), axis=-1
-        )
-        record.said = pushed(record.said, message, 2)
+        parts = (state.position, state.velocity, record.silent[..., None])
+        record.said = pushed(record.said, np.concatenate(parts, axis=-1), 2)
         said = record.said[:, :, 0]
-        speaks = said[:, None, :, 6] == 0
-        arrives = self._in_range(state.position, said[..., :3]) & speaks
-        if self._options.radio_loss:
-            arrives &= self._chances(record) >= self._options.radio_loss
+        arrives = self._in_range(state.position, said[..., :3]) & (said[:, None, :, 6] == 0)
+        if options.radio_loss:
+            steps = (record.steps - 1).astype(np.uint32)
+            chances = numbers_of("radio", record.keys, steps, self._own.shape[0])
+            arrives &= chances >= options.radio_loss  # (W, receiver, sender)
         record.heard = np.where(arrives[..., None], said[:, None, :, :6], record.heard)
-        record.age = np.where(arrives, float(delay), record.age + 1.0)
+        record.age = np.where(arrives, float(options.radio_delay), record.age + 1.0)
 
     def _nearest(self, record: Record, position: Floats, velocity: Floats) -> Floats:
-        time = record.age[..., None] * self._period
-        known = (time[..., 0] <= FORGOTTEN) & ~self._own
-        passed = np.where(known[..., None], time, 0.0)
+        time = record.age * self._period
+        known = (time <= FORGOTTEN) & ~self._own
+        passed = np.where(known, time, 0.0)[..., None]
         heard = record.heard
         there = heard[..., :3] + heard[..., 3:] * passed - position[:, :, None]
         moves = heard[..., 3:] - velocity[:, :, None]
-        distance = np.where(known, _length(there), np.inf)
+        numbers = np.concatenate((there, moves, np.ones_like(passed)), axis=-1)
+        numbers = np.where(known[..., None], numbers, 0.0)
+        distance = np.where(known, length(there), np.inf)
         count = self._options.neighbours
         order = np.argsort(distance, axis=-1, kind="stable")[..., :count, None]
-        parts = (there, moves, np.ones_like(there[..., :1]))
-        numbers = np.where(known[..., None], np.concatenate(parts, axis=-1), 0.0)
         nearest = np.take_along_axis(numbers, order, axis=2)
         neighbours = np.zeros((*record.shape, count, 7))
         neighbours[:, :, : nearest.shape[2]] = nearest
         return neighbours
 
     def _in_range(self, receivers: Floats, senders: Floats) -> Mask:
-        apart = _length(senders[:, None] - receivers[:, :, None])
+        apart = length(senders[:, None] - receivers[:, :, None])
         return np.asarray(apart <= self._options.radio_range)
-
-    def _chances(self, record: Record) -> Floats:
-        """Numbers from 0 to 1 of each message of this step, (W, receiver, sender)."""
-        steps = (record.steps - 1).astype(np.uint32)
-        return numbers_of("radio", record.keys, steps, self._own.shape[0])
-
-
-def _length(vectors: Floats) -> Floats:
-    return np.asarray(np.sqrt(np.sum(vectors * vectors, axis=-1)))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...sim import Draw, InitialState
-from ...sim.snapshots import Arrays, joined, part_of
+from ...sim.snapshots import Arrays, joined
 from ...sim.state import Array, WorldState
 from ..memory import Memory
 from ..state import State
@@ -17,7 +17,6 @@ Mask = NDArray[np.bool_]
 Look = Callable[[], WorldState]
 """Gives the state that a controller sees: the exact one, or the estimate."""
 
-_MAPPINGS = ("observations", "terms", "metrics", "past_observations", "history")
 _SMALL = 64  # Up to this many numbers Python's loop is faster than NumPy's call
 
 
@@ -128,32 +127,32 @@ class Record:
     def snapshot(self) -> dict[str, np.ndarray]:
         """Copies of what is kept and of the memory, by name."""
         known = vars(self)
-        parts: dict[str, dict[str, Any]] = {"memory": vars(self.memory), "kept": {}}
+        alone: dict[str, Any] = {}
+        parts = {"memory": vars(self.memory), "kept": alone}
         for name in self.kept:
-            if name in known:
-                values = known[name]
-                if name in _MAPPINGS:
-                    parts[name] = values
-                else:
-                    parts["kept"][name] = values
+            values = known.get(name)
+            if isinstance(values, Mapping):
+                parts[name] = {**values}
+            elif values is not None:
+                alone[name] = values
         return {name: np.array(values) for name, values in joined(parts).items()}
 
     def restore(self, arrays: Arrays) -> None:
         """Put a snapshot back."""
-        values: dict[str, Any] = {}
-        for name, array in part_of(arrays, "kept").items():
-            values[name] = array.copy()[()]
-        for name in _MAPPINGS:
-            mapping = {key: array.copy()[()] for key, array in part_of(arrays, name).items()}
-            if mapping or name == "metrics":
-                values[name] = mapping
+        known = vars(self)
         for name in self.kept:
-            vars(self).pop(name, None)
-        vars(self).update(values)
+            known.pop(name, None)
         vars(self.memory).clear()
+        self.metrics = {}
         with self.memory.open("begin"):
-            for name, array in part_of(arrays, "memory").items():
-                setattr(self.memory, name, array.copy())
+            for key, array in arrays.items():
+                part, _, name = key.partition("/")
+                if part == "memory":
+                    setattr(self.memory, name, array.copy())
+                elif part == "kept":
+                    known[name] = array.copy()[()]
+                else:
+                    known.setdefault(part, {})[name] = array.copy()[()]
         self.flown = self.begun = self.leaving = None
         self.count()
 

@@ -19,7 +19,6 @@ from .goal import (
     check_height,
     length,
     nearness,
-    rates_cost,
     swing_cost,
     with_payload,
 )
@@ -213,17 +212,12 @@ class Cable(Swarm):
         missing = self._missing(state)
         distance = length(missing)
         room = self.clearance(state)
-        ended = self.ended(state)
         closing = np.sum(missing * state.payload_velocity, axis=-1)
-        return Outcome(
-            reward={
-                "payload": nearness(distance, self.gap / 2),
-                "approach": APPROACH_WEIGHT * closing / (distance + TINY),
-                "swing": swing_cost(state),
-                "room": self.proximity_penalty(room),
-                "rates": rates_cost(state),
-                "termination": self.crash(ended),
-            },
-            terminated=ended,
-            metrics={"payload_error": distance, "clearance": room},
-        )
+        terms = {
+            "payload": nearness(distance, self.gap / 2),
+            "approach": APPROACH_WEIGHT * closing / (distance + TINY),
+            "swing": swing_cost(state),
+            "room": self.proximity_penalty(room),
+        }
+        metrics = {"payload_error": distance, "clearance": room}
+        return self.judged(state, terms, self.ended(state), metrics)

@@ -10,7 +10,7 @@ from ...models.fields import Limits
 from ...sim import Array, Draw, InitialState, stack
 from ..spec import Metric
 from ..state import State
-from .goal import FURTHEST, MAX_SPEED, along
+from .goal import FURTHEST, MAX_SPEED, Speed, along
 from .swarm import Swarm, SwarmOptions, ring
 
 
@@ -18,7 +18,7 @@ from .swarm import Swarm, SwarmOptions, ring
 class EscortOptions(SwarmOptions):
     """Options of `rotorgram/Escort-v0`."""
 
-    target_speed: Annotated[float, Limits(0.0, MAX_SPEED, "m/s")] = 1.0
+    target_speed: Speed = 1.0
     """Largest speed of the target, m/s."""
     target_path: Annotated[float, Limits(0.01, FURTHEST, "m")] = 5.0
     """Furthest distance of the target from the center along x and y, m."""

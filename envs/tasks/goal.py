@@ -22,7 +22,7 @@ from ...sim import (
 from ..config import EnvConfig
 from ..spec import ArraySpec
 from ..state import State
-from .task import Task
+from .task import Outcome, Task
 
 ERROR_SCALE: Final = 0.5  # Distance at which the reward for nearness crosses zero, m
 RATE_WEIGHT: Final = 0.02  # Cost of a body rate of 1 rad/s
@@ -54,9 +54,20 @@ class Number(NamedTuple):
 Point = Annotated[tuple[float, float, float], Limits(-FURTHEST, FURTHEST, "m", count=3)]
 """Of an option: x, y, z in MuJoCo's world frame (z up), m."""
 
+Distance = Annotated[float, Limits(0.0, FURTHEST, "m")]
+"""Of an option, m."""
 
-Sides = Annotated[tuple[float, float, float], Limits(0.0, FURTHEST, "m", count=3)]
-"""Of an option: lengths along x, y and z, m."""
+Margin = Annotated[float, Limits(0.1, FURTHEST, "m")]
+"""Of an option: how far a craft may leave its way, m."""
+
+Speed = Annotated[float, Limits(0.0, MAX_SPEED, "m/s")]
+"""Of an option, m/s."""
+
+Tilt = Annotated[float, Limits(0.0, 80.0, "degrees")]
+"""Of an option: largest tilt at the start, degrees."""
+
+Heading = Annotated[float, Limits(-360.0, 360.0, "degrees")]
+"""Of an option: a direction about z, degrees, anticlockwise from x."""
 
 
 def with_payload(config: EnvConfig, mass: float, cable: float) -> EnvConfig:
@@ -158,6 +169,26 @@ class GoalTask(Task):
         """Whether drones are outside of their band, touch anything, or flipped over, (W, A)."""
         return outside | state.touching | (state.tilt_cosine < LEAST_TILT_COSINE)
 
+    def judged(
+        self,
+        state: State,
+        terms: dict[str, Array],
+        crashed: Array,
+        metrics: dict[str, Array],
+        finished: Array = False,
+        rate_weight: float = RATE_WEIGHT,
+    ) -> Outcome:
+        """Terms of a reward, and what body rates and a crash cost.
+
+        A crash ends the episode, and so does a task that is finished: then nothing is a crash.
+        """
+        reward = {
+            **terms,
+            "rates": rates_cost(state, rate_weight),
+            "termination": self.crash(crashed > finished),
+        }
+        return Outcome(reward=reward, terminated=crashed | finished, metrics=metrics)
+
     def turned(self, vectors: Array) -> Array:
         """World vectors in the world frame turned by the wanted heading, shape (..., 3)."""
         if self.wanted == 0.0:
@@ -219,7 +250,7 @@ def length(vectors: Array) -> Array:
     return np.sqrt(np.sum(vectors * vectors, axis=-1))
 
 
-def rates_cost(state: State, weight: float = RATE_WEIGHT) -> Array:
+def rates_cost(state: State, weight: float) -> Array:
     """Reward for body rates, (W, A): minus the weight times their size, rad/s."""
     return -weight * np.minimum(length(state.body_rates), FASTEST_COUNTED)
 

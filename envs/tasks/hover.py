@@ -11,16 +11,17 @@ from ...sim import Array, Draw, InitialState, body_x, component, stack
 from ..spec import Metric
 from ..state import State
 from .goal import (
-    FURTHEST,
     WORST_RATES,
+    Distance,
     GoalTask,
+    Heading,
     Point,
+    Tilt,
     at,
     check_band,
     check_height,
     length,
     nearness,
-    rates_cost,
 )
 from .task import Outcome, TaskOptions
 
@@ -33,15 +34,15 @@ class HoverOptions(TaskOptions):
 
     goal: Point = (0.0, 0.0, 5.0)
     """Position to hold: x, y, z in MuJoCo's world frame (z up), m."""
-    heading: Annotated[float, Limits(-360.0, 360.0, "degrees")] = 0.0
+    heading: Heading = 0.0
     """Direction of the nose to hold, degrees about z, anticlockwise from x."""
-    start_band: Annotated[float, Limits(0.0, FURTHEST, "m")] = 1.0
+    start_band: Distance = 1.0
     """Largest distance of the start from the goal along each axis, m."""
-    start_tilt: Annotated[float, Limits(0.0, 80.0, "degrees")] = 30.0
+    start_tilt: Tilt = 30.0
     """Largest tilt at the start, degrees, about a horizontal axis drawn uniformly."""
     start_heading: Annotated[float, Limits(0.0, 180.0, "degrees")] = 30.0
     """Largest error of the heading at the start, degrees."""
-    flight_band: Annotated[float, Limits(0.0, FURTHEST, "m")] = 3.0
+    flight_band: Distance = 3.0
     """An episode terminates when the craft is further than this from its goal, m."""
 
     def check(self) -> None:
@@ -122,13 +123,9 @@ class Hover(GoalTask):
         off = np.atan2(component(nose, 1), component(nose, 0)) - self.wanted
         heading = np.atan2(np.sin(off), np.cos(off)) * (180 / math.pi)
         crashed = self.crashed(state, distance > self.options.flight_band)
-        return Outcome(
-            reward={
-                "position": nearness(distance),
-                "heading": -HEADING_WEIGHT / 180 * abs(heading),
-                "rates": rates_cost(state),
-                "termination": self.crash(crashed),
-            },
-            terminated=crashed,
-            metrics={"position_error": distance, "heading_error": heading},
-        )
+        terms = {
+            "position": nearness(distance),
+            "heading": -HEADING_WEIGHT / 180 * abs(heading),
+        }
+        metrics = {"position_error": distance, "heading_error": heading}
+        return self.judged(state, terms, crashed, metrics)

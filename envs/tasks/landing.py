@@ -167,8 +167,10 @@ class Landing(GoalTask):
         zero = 0.0 * phase
         circle = options.motion == "circle"
         memory = self.memory
-        memory.phase, memory.rate = phase, speed / options.pad_path  # rad, rad/s
-        memory.cosine, memory.sine = np.cos(direction), np.sin(direction)  # of the line
+        memory.phase = phase  # rad
+        memory.rate = speed / options.pad_path  # rad/s
+        memory.cosine = np.cos(direction)  # of the line
+        memory.sine = np.sin(direction)
         memory.side = np.where(side < 0, zero - 1.0, zero + 1.0) if circle else zero
         position = stack((zero, zero, zero + self._height + options.start_height)) + offset
         rest = 0.0 * position
@@ -192,25 +194,22 @@ class Landing(GoalTask):
         memory.velocity = state.velocity
         memory.upright = state.tilt_cosine
 
-    def further(self, state: State) -> tuple[Array, Array]:
+    def further(self, state: State) -> list[Array]:
         """The velocity of the pad."""
-        return self._pad()[1]
+        return [self._pad_velocity()[..., :2]]
 
     def outcome(self, state: State) -> Outcome:
         """Progress and the end: a landing, a crash, a flip-over, or outside the band."""
         options = self.options
         touching = state.touching
-        speed = self._relative(self.memory.arrival)
-        away = self.goal(state) - state.position
-        x = component(away, 0)
-        y = component(away, 1)
-        distance = square_root(x * x + y * y)
-        drift = square_root(speed[0] * speed[0] + speed[1] * speed[1])
+        relative = self.memory.arrival - self._pad_velocity()
+        away = self._goal() - state.position
+        distance = _level(away)
         landed = (
             touching
             & (distance <= options.pad_radius)
-            & (-speed[2] <= options.sink)
-            & (drift <= options.drift)
+            & (-component(relative, 2) <= options.sink)
+            & (_level(relative) <= options.drift)
             & (self.memory.arrival_upright >= self._least_upright)
         )
         terminated = self.crashed(state, length(away) > options.flight_band)
@@ -226,7 +225,7 @@ class Landing(GoalTask):
             metrics={
                 "landed": landed * 1.0,
                 "pad_distance": distance,
-                "relative_speed": length(stack(speed)),
+                "relative_speed": length(relative),
             },
         )
 
@@ -235,32 +234,33 @@ class Landing(GoalTask):
         return self._goal()
 
     def _goal(self) -> Array:
-        x, y = self._pad()[0]
-        return stack((x, y, 0.0 * x + self._height))
-
-    def _pad(self) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        """Position, m, and velocity, m/s, of the pad's centre, x and y, world frame."""
         path = self.options.pad_path
-        c = path * np.cos(self.memory.phase)
-        s = path * np.sin(self.memory.phase)
+        phase = self.memory.phase
+        return self._turned(path * np.cos(phase), path * np.sin(phase), self._height)
 
-        def turned(along: Array, across: Array) -> tuple[Array, Array]:
-            across = self.memory.side * across
-            return (
-                self.memory.cosine * along - self.memory.sine * across,
-                self.memory.sine * along + self.memory.cosine * across,
-            )
+    def _pad_velocity(self) -> Array:
+        """World frame, m/s, (W, A, 3)."""
+        path = self.options.pad_path
+        memory = self.memory
+        ahead = -memory.rate * (path * np.sin(memory.phase))
+        return self._turned(ahead, memory.rate * (path * np.cos(memory.phase)), 0.0)
 
-        return turned(c, s), turned(-self.memory.rate * s, self.memory.rate * c)
-
-    def _relative(self, velocity: Array) -> tuple[Array, Array, Array]:
-        """A velocity, (..., 3), as the pad sees it, m/s."""
-        x, y, z = (component(velocity, i) for i in range(3))
-        _, (across, along) = self._pad()
-        return x - across, y - along, z
+    def _turned(self, along: Array, across: Array, height: float) -> Array:
+        """A vector along and across the pad's line, or on its circle, in the world frame."""
+        memory = self.memory
+        across = memory.side * across
+        x = memory.cosine * along - memory.sine * across
+        y = memory.sine * along + memory.cosine * across
+        return stack((x, y, 0.0 * x + height))
 
     def _potential_of(self, position: Array, velocity: Array) -> Array:
         """Minus the distance to the goal, m, and what the relative speed counts."""
-        away = self._goal() - position
-        speed = length(stack(self._relative(velocity)))
-        return -(length(away) + MATCHING_TIME * speed)
+        speed = length(velocity - self._pad_velocity())
+        return -(length(self._goal() - position) + MATCHING_TIME * speed)
+
+
+def _level(vectors: Array) -> Array:
+    """Horizontal sizes of vectors, (W, A)."""
+    x = component(vectors, 0)
+    y = component(vectors, 1)
+    return square_root(x * x + y * y)

@@ -20,19 +20,20 @@ from ..config import EnvConfig
 from ..spec import Metric
 from ..state import State
 from .goal import (
-    FURTHEST,
     MAX_SPEED,
     WORST_RATES,
     WORST_SWING,
+    Distance,
     GoalTask,
     Point,
+    Speed,
+    Tilt,
     along,
     at,
     check_band,
     check_height,
     length,
     nearness,
-    rates_cost,
     swing_cost,
     with_payload,
 )
@@ -49,13 +50,13 @@ class PayloadHoverOptions(TaskOptions):
     """Mass of the payload over that of the vehicle."""
     cable: Annotated[float, Limits(0.05, 100.0, "m")] = 1.0
     """Length of the cable, m."""
-    start_band: Annotated[float, Limits(0.0, FURTHEST, "m")] = 1.0
+    start_band: Distance = 1.0
     """Largest distance of the payload from the goal along each axis at the start, m."""
-    start_speed: Annotated[float, Limits(0.0, 100.0, "m/s")] = 1.0
+    start_speed: Speed = 1.0
     """Largest horizontal speed at the start along each axis, m/s, of craft and payload alike."""
-    start_tilt: Annotated[float, Limits(0.0, 80.0, "degrees")] = 15.0
+    start_tilt: Tilt = 15.0
     """Largest tilt at the start, degrees, about a horizontal axis drawn uniformly."""
-    flight_band: Annotated[float, Limits(0.0, FURTHEST, "m")] = 3.0
+    flight_band: Distance = 3.0
     """An episode terminates when the payload is further than this from its goal, m."""
 
     def check(self) -> None:
@@ -170,13 +171,6 @@ class PayloadHover(GoalTask):
         x, y, z = (component(hung, i) for i in range(3))
         swing = np.atan2(square_root(x * x + y * y), z) * (180 / math.pi)
         crashed = self.crashed(state, distance > self.options.flight_band)
-        return Outcome(
-            reward={
-                "payload": nearness(distance),
-                "swing": swing_cost(state),
-                "rates": rates_cost(state),
-                "termination": self.crash(crashed),
-            },
-            terminated=crashed,
-            metrics={"payload_error": distance, "swing": swing},
-        )
+        terms = {"payload": nearness(distance), "swing": swing_cost(state)}
+        metrics = {"payload_error": distance, "swing": swing}
+        return self.judged(state, terms, crashed, metrics)

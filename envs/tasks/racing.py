@@ -3,7 +3,6 @@
 import json
 import math
 import tomllib
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Final
@@ -25,18 +24,20 @@ from ...sim import (
 from ..spec import Mark, Metric
 from ..state import State
 from .goal import (
-    AIR,
     COURSE_RATE_WEIGHT,
     COURSE_WORST_STEP,
     FURTHEST,
     PASSING_REWARD,
+    Distance,
     GoalTask,
+    Heading,
+    Margin,
     Number,
     Point,
     along,
     at,
+    check_height,
     length,
-    rates_cost,
     row_of,
 )
 from .task import Outcome, TaskOptions
@@ -52,20 +53,24 @@ class Start:
     """Where a race starts."""
 
     position: Point
-    heading: Annotated[float, Limits(-360.0, 360.0, "degrees")]
+    heading: Heading
     """Direction of the nose about z, anticlockwise from x."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Gate:
-    """A square opening that stands upright."""
+class Gate(Start):
+    """A square opening that stands upright: its centre, and the direction in which it is passed."""
 
-    position: Point
-    """Of its centre."""
-    heading: Annotated[float, Limits(-360.0, 360.0, "degrees")]
-    """Direction in which it is passed, about z, anticlockwise from x."""
     size: Annotated[float, Limits(0.01, FURTHEST, "m")]
     """Width and height."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Track:
+    """Content of a track's file."""
+
+    gates: object
+    start: object
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,9 +82,9 @@ class RacingOptions(TaskOptions):
     JSON, so that it crosses the wire."""
     laps: Annotated[int, Limits(1, MAX_LAPS, whole=True)] = 1
     """Rounds of all gates."""
-    start_band: Annotated[float, Limits(0.0, FURTHEST, "m")] = 0.5
+    start_band: Distance = 0.5
     """Largest distance of the start from that of the track along each axis, m."""
-    margin: Annotated[float, Limits(0.1, FURTHEST, "m")] = 5.0
+    margin: Margin = 5.0
     """An episode terminates when the craft is further than this from the line between the gate that
     it has passed, or the start, and the next one, m."""
 
@@ -153,14 +158,10 @@ class Racing(GoalTask):
     def setup(self) -> None:
         """See the class."""
         gates, self._start = read_track(self.options.track)
-        least = self.vehicle.rest_height + AIR + self.options.start_band
-        got = self._start.position[2]
-        if got < least:
-            raise InputError(
-                f"track: expected a start at least {least:.4g} m above the ground, got {got:g}"
-            )
-        self._total = len(gates) * self.options.laps
+        room = self.vehicle.rest_height + self.options.start_band
+        check_height("track: start", self._start.position[2], room)
         self._count = len(gates)
+        self._total = self._count * self.options.laps
         self.marks = tuple(
             Mark(shape="gate", size=gate.size, position=gate.position, heading=gate.heading)
             for gate in gates
@@ -239,16 +240,9 @@ class Racing(GoalTask):
         memory = self.memory
         left = self._total - memory.passed
         crashed = self.crashed(state, memory.off > self.options.margin)
-        return Outcome(
-            reward={
-                "progress": memory.progress,
-                "passing": PASSING_REWARD * memory.passing,
-                "rates": rates_cost(state, COURSE_RATE_WEIGHT),
-                "termination": self.crash(crashed & (left > 0.5)),
-            },
-            terminated=crashed | (left < 0.5),
-            metrics={"gates_left": left, "flight_time": state.time, "lap_time": memory.lap},
-        )
+        terms = {"progress": memory.progress, "passing": PASSING_REWARD * memory.passing}
+        metrics = {"gates_left": left, "flight_time": state.time, "lap_time": memory.lap}
+        return self.judged(state, terms, crashed, metrics, left < 0.5, COURSE_RATE_WEIGHT)
 
     def goal(self, state: State) -> Array:
         """The centre of the next gate."""
@@ -260,10 +254,8 @@ class Racing(GoalTask):
         return row_of(self._gates, number)
 
 
-def read_track(given: object) -> tuple[list[Gate], Start]:
-    """Gates of a track, and its start, a gate of size 0. Raises `InputError`."""
-    if not isinstance(given, str):
-        raise InputError(f"track: expected {_WAY}, got {shortened(given)}")
+def read_track(given: str) -> tuple[list[Gate], Start]:
+    """Gates of a track, and its start. Raises `InputError`."""
     try:
         if given.lstrip().startswith("{"):
             content = json.loads(given)
@@ -277,13 +269,9 @@ def read_track(given: object) -> tuple[list[Gate], Start]:
         raise InputError(
             f"track: expected {_WAY} ({names}), got {shortened(given)}: {reason:.120}"
         ) from None
-    if not (isinstance(content, Mapping) and isinstance(content.get("gates"), list)):
-        raise InputError(f"track: expected a list of gates, got {shortened(content)}")
-    unknown = sorted({*content} - {"gates", "start"})
-    if unknown:
-        raise InputError(f"track: expected gates and start, got {unknown}")
-    rows = content["gates"]
-    if not 1 <= len(rows) <= MAX_GATES:
-        raise InputError(f"track: expected 1 to {MAX_GATES} gates, got {len(rows)}")
+    track = read_table(_Track, content, "track")
+    rows = track.gates
+    if not isinstance(rows, list) or not 1 <= len(rows) <= MAX_GATES:
+        raise InputError(f"track: expected 1 to {MAX_GATES} gates, got {shortened(rows)}")
     gates = [read_table(Gate, row, f"track: gate {i}") for i, row in enumerate(rows, start=1)]
-    return gates, read_table(Start, content.get("start"), "track: start")
+    return gates, read_table(Start, track.start, "track: start")

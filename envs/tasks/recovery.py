@@ -18,7 +18,7 @@ from ...sim import (
 )
 from ..spec import Metric
 from ..state import State
-from .goal import WORST_RATES, GoalTask, Point, at, check_height, length, nearness, rates_cost
+from .goal import WORST_RATES, GoalTask, Point, Speed, at, check_height, length, nearness
 from .task import Outcome, TaskOptions
 
 ERROR_SCALE: Final = 1.0  # Distance at which the reward for nearness crosses zero, m
@@ -33,7 +33,7 @@ class RecoveryOptions(TaskOptions):
 
     goal: Point = (0.0, 0.0, 20.0)
     """Where it is thrown, and has to come back to: x, y, z in MuJoCo's world frame (z up), m."""
-    start_speed: Annotated[float, Limits(0.0, 100.0, "m/s")] = 3.0
+    start_speed: Speed = 3.0
     """Largest speed at the start, m/s, in a direction drawn uniformly."""
     spin: Annotated[float, Limits(0.0, 100.0, "rad/s")] = 10.0
     """Largest rate about each body axis at the start, rad/s; no faster than the vehicle's largest
@@ -180,21 +180,17 @@ class Recovery(GoalTask):
         """Nearness to the goal, tilt and spin; the end at a crash or outside the band."""
         distance = length(self.goal(state) - state.position)
         terminated = (distance > self.options.flight_band) | state.touching
-        return Outcome(
-            reward={
-                "position": nearness(distance, ERROR_SCALE),
-                "tilt": TILT_WEIGHT * (state.tilt_cosine - 1.0),
-                "rates": rates_cost(state),
-                "termination": self.crash(terminated),
-            },
-            terminated=terminated,
-            metrics={
-                "recovered": self._recovered(state) * 1.0,
-                "recovery_time": self.memory.missed,
-                "height_lost": self.options.goal[2] - self.memory.lowest,
-                "position_error": distance,
-            },
-        )
+        terms = {
+            "position": nearness(distance, ERROR_SCALE),
+            "tilt": TILT_WEIGHT * (state.tilt_cosine - 1.0),
+        }
+        metrics = {
+            "recovered": self._recovered(state) * 1.0,
+            "recovery_time": self.memory.missed,
+            "height_lost": self.options.goal[2] - self.memory.lowest,
+            "position_error": distance,
+        }
+        return self.judged(state, terms, terminated, metrics)
 
     def _recovered(self, state: State) -> Array:
         """Whether it is near, slow and upright, bool, shape (W, A)."""

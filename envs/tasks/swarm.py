@@ -10,17 +10,17 @@ from ...models.fields import Limits
 from ...sim import Array, Draw, clip
 from ..state import State
 from .goal import (
-    FURTHEST,
     MAX_SPEED,
     WORST_RATES,
+    Distance,
     GoalTask,
+    Margin,
     Number,
     Point,
     along,
     check_height,
     length,
     nearness,
-    rates_cost,
 )
 from .task import Outcome, TaskOptions
 
@@ -39,11 +39,11 @@ class SwarmOptions(TaskOptions):
     """Middle of starts and goals: x, y, z in MuJoCo's world frame (z up), m."""
     spacing: Annotated[float, Limits(2.0, 1e3, "diameters")] = 3.0
     """Distance between neighbouring starts, and goals, over the diameter of the vehicle."""
-    margin: Annotated[float, Limits(0.1, FURTHEST, "m")] = 10.0
+    margin: Margin = 10.0
     """An episode terminates for a drone that is so much further from its goal than any start, m."""
     neighbours: Annotated[int, Limits(0, 16, "drones", whole=True)] = 7
     """Drones in the observation of each: the nearest that it hears."""
-    radio_range: Annotated[float, Limits(0.0, FURTHEST, "m")] = 100.0
+    radio_range: Distance = 100.0
     """Furthest distance at which a drone is heard, m."""
     radio_delay: Annotated[int, Limits(0, 100, "control steps", whole=True)] = 0
     """Control steps from what a drone says to where it is heard."""
@@ -147,18 +147,13 @@ class Swarm(GoalTask):
         towards = to_goal * (state.velocity - self.goal_velocity())
         closing = towards[..., 0] + towards[..., 1] + towards[..., 2]
         room = self.clearance(state)
-        ended = self.ended(state)
-        return Outcome(
-            reward={
-                "position": nearness(distance, self.gap / 2),
-                "approach": APPROACH_WEIGHT * closing / (distance + TINY),
-                "room": self.proximity_penalty(room),
-                "rates": rates_cost(state),
-                "termination": self.crash(ended),
-            },
-            terminated=ended,
-            metrics={"position_error": distance, "clearance": room},
-        )
+        terms = {
+            "position": nearness(distance, self.gap / 2),
+            "approach": APPROACH_WEIGHT * closing / (distance + TINY),
+            "room": self.proximity_penalty(room),
+        }
+        metrics = {"position_error": distance, "clearance": room}
+        return self.judged(state, terms, self.ended(state), metrics)
 
     def goal_velocity(self) -> Array:
         """Velocity of each drone's goal, world frame, m/s, shape (W, A, 3), or 0."""

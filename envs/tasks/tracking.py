@@ -4,7 +4,6 @@ import csv
 import json
 import math
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Final
 
 import numpy as np
@@ -24,20 +23,19 @@ from ..state import State
 from .goal import (
     FURTHEST,
     WORST_RATES,
+    Distance,
     GoalTask,
     Point,
     along,
     check_height,
     length,
     nearness,
-    rates_cost,
     row_of,
 )
 from .task import Outcome, TaskOptions
 
 MAX_SAMPLES: Final = 20_000  # Rows of a file
 MAX_POINTS: Final = 16  # That a minimum-snap trajectory goes through
-_KINDS: Final = ("circle", "lemniscate", "snap")
 _EXPECTED: Final = "circle, lemniscate, snap, or a CSV file with columns t, x, y, z"
 
 
@@ -51,7 +49,7 @@ class TrackingOptions(TaskOptions):
     between its rows. The rows of a file are kept as JSON, so that they cross the wire."""
     center: Point = (0.0, 0.0, 5.0)
     """Middle of a circle, a lemniscate, or the box of points: world frame, m."""
-    radius: Annotated[float, Limits(0.0, FURTHEST, "m")] = 2.0
+    radius: Distance = 2.0
     """Of the circle, half the length of the lemniscate, or half the width of the box, which is half
     as high, m."""
     period: Annotated[float, Limits(0.1, 1e4, "s")] = 10.0
@@ -62,14 +60,14 @@ class TrackingOptions(TaskOptions):
     """Later points of the trajectory in the observation, 0 to 20."""
     preview_time: Annotated[float, Limits(0.0, 100.0, "s")] = 0.2
     """Time between these, s."""
-    start_band: Annotated[float, Limits(0.0, FURTHEST, "m")] = 0.3
+    start_band: Distance = 0.3
     """Largest distance of the start from the trajectory along each axis, m."""
     flight_band: Annotated[float, Limits(0.01, FURTHEST, "m")] = 3.0
     """An episode terminates when the craft is further than this from where it should be, m."""
 
     def check(self) -> None:
         """Check the options of this task. Raises `InputError`."""
-        if self.trajectory not in _KINDS:
+        if self.trajectory != "snap" and self.trajectory not in _CURVES:
             rows = json.dumps(read_samples(self.trajectory).tolist(), separators=(",", ":"))
             object.__setattr__(self, "trajectory", rows)
 
@@ -132,34 +130,28 @@ class Tracking(GoalTask):
         options = self.options
         step = self.control_period
         middle = np.array(options.center)
-        self._closed = options.trajectory in ("circle", "lemniscate")
-        self._drawn = options.trajectory == "snap"
-        if self._closed:
-            count = max(2, round(options.period / step))
-            phases = 2 * np.pi * np.arange(count) / count
-            curve = _circle if options.trajectory == "circle" else _lemniscate
-            self._table, self._rates = curve(phases, options.radius, 2 * np.pi / (count * step))
-            self._table = self._table + middle
-        elif self._drawn:
-            times = np.arange(math.ceil(options.period / step) + 1) * step / options.period
-            self._table, rates = (
-                snap_basis(options.points, np.minimum(times, 1.0), derivative)
-                for derivative in (0, 1)
-            )
-            self._rates = rates / options.period
-        else:
-            rows = read_samples(options.trajectory)
-            times = rows[0, 0] + np.arange(math.ceil(np.ptp(rows[:, 0]) / step) + 1) * step
-            table = [np.interp(times, rows[:, 0], rows[:, axis]) for axis in (1, 2, 3)]
-            self._table = np.column_stack(table)
-            self._rates = np.gradient(self._table, step, axis=0)
-            self._rates[-1] = 0.0  # it stays
+        kind = options.trajectory
+        self._closed = kind in _CURVES
+        self._drawn = kind == "snap"
         box = options.radius * np.array((1.0, 1.0, 0.5))
-        low, high = (
-            (middle - box, middle + box)
-            if self._drawn
-            else (self._table.min(axis=0), self._table.max(axis=0))
-        )
+        if self._drawn:
+            times = np.arange(math.ceil(options.period / step) + 1) * step / options.period
+            times = np.minimum(times, 1.0)
+            self._table = snap_basis(options.points, times)
+            self._rates = snap_basis(options.points, times, 1) / options.period
+            low = middle - box
+            high = middle + box
+        else:
+            if self._closed:
+                count = max(2, round(options.period / step))
+                phases = 2 * np.pi * np.arange(count) / count
+                rate = 2 * np.pi / (count * step)
+                places, self._rates = _CURVES[kind](phases, options.radius, rate)
+                self._table = places + middle
+            else:
+                self._table, self._rates = _sampled(read_samples(kind), step)
+            low = self._table.min(axis=0)
+            high = self._table.max(axis=0)
         check_height("trajectory", low[2], self.vehicle.rest_height + options.start_band)
         self._box = middle, box
         reach = float(np.linalg.norm(high - low)) + 2 * options.flight_band
@@ -182,8 +174,9 @@ class Tracking(GoalTask):
             self.memory.points = np.stack([middle + half * place for place in places], axis=-2)
         self.memory.index = index  # row of the table
         offset = draw.uniform(-band, band, (3,))
-        position, velocity = (self._at(table, 0.0) for table in (self._table, self._rates))
-        return InitialState(position=position + offset, velocity=velocity + 0.0 * offset)
+        position = self._at(self._table, 0.0) + offset
+        velocity = self._at(self._rates, 0.0) + 0.0 * offset
+        return InitialState(position=position, velocity=velocity)
 
     def update_memory(self, state: State) -> None:
         """Go on along the trajectory."""
@@ -200,15 +193,8 @@ class Tracking(GoalTask):
         distance = length(self.goal(state) - state.position)
         crashed = self.crashed(state, distance > self.options.flight_band)
         speed = length(self._at(self._rates, 0.0))
-        return Outcome(
-            reward={
-                "position": nearness(distance),
-                "rates": rates_cost(state),
-                "termination": self.crash(crashed),
-            },
-            terminated=crashed,
-            metrics={"tracking_error": distance, "reference_speed": speed},
-        )
+        metrics = {"tracking_error": distance, "reference_speed": speed}
+        return self.judged(state, {"position": nearness(distance)}, crashed, metrics)
 
     def goal(self, state: State) -> Array:
         """Where it should be."""
@@ -246,6 +232,19 @@ def _lemniscate(phase: np.ndarray, radius: float, rate: float) -> tuple[np.ndarr
     return radius * place, radius * rate * np.column_stack((x, y, zero))
 
 
+_CURVES: Final = {"circle": _circle, "lemniscate": _lemniscate}
+
+
+def _sampled(rows: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
+    """Positions, m, and velocities, m/s, (L, 3), of each control step along the rows of a file."""
+    given = rows[:, 0]
+    times = given[0] + np.arange(math.ceil(np.ptp(given) / step) + 1) * step
+    places = np.column_stack([np.interp(times, given, along) for along in rows[:, 1:].T])
+    rates = np.gradient(places, step, axis=0)
+    rates[-1] = 0.0  # it stays
+    return places, rates
+
+
 def snap_basis(points: int, times: np.ndarray, derivative: int = 0) -> np.ndarray:
     """Share of each point in a minimum-snap trajectory, or in its derivative: shape (L, K).
 
@@ -258,25 +257,21 @@ def snap_basis(points: int, times: np.ndarray, derivative: int = 0) -> np.ndarra
         """Of the coefficients, for a derivative by the piece's own time from 0 to 1."""
         values = np.zeros(8 * pieces)
         for n in range(order, 8):
-            power = 1.0 if n == order else at ** (n - order)
-            values[8 * piece + n] = math.factorial(n) / math.factorial(n - order) * power
+            values[8 * piece + n] = math.perm(n, order) * at ** (n - order)
         return values
 
     rows = []
-    given = []
     for piece in range(pieces):
-        for end in (0, 1):
-            rows.append(row(piece, float(end), 0))
-            given.append(np.eye(points)[piece + end])
-    nothing = np.zeros(points)
+        rows += [row(piece, 0.0, 0), row(piece, 1.0, 0)]
     for order in range(1, 7):
         for piece in range(pieces - 1):
             rows.append(row(piece, 1.0, order) - row(piece + 1, 0.0, order))
-            given.append(nothing)
         if order <= 3:
             rows += [row(0, 0.0, order), row(pieces - 1, 1.0, order)]
-            given += [nothing, nothing]
-    coefficients = np.linalg.solve(np.array(rows), np.array(given))
+    ends = np.repeat(np.eye(points), 2, axis=0)[1:-1]  # of each piece
+    given = np.zeros((len(rows), points))
+    given[: len(ends)] = ends
+    coefficients = np.linalg.solve(np.array(rows), given)
     found = []
     for time in times.tolist():
         piece = min(int(time * pieces), pieces - 1)
@@ -290,8 +285,6 @@ def read_samples(given: str) -> np.ndarray:
 
     Raises `InputError`.
     """
-    if not isinstance(given, str):
-        raise InputError(f"trajectory: expected {_EXPECTED}, got {shortened(given)}")
     try:
         if given.lstrip().startswith("["):
             rows = json.loads(given)
@@ -302,12 +295,12 @@ def read_samples(given: str) -> np.ndarray:
         samples: np.ndarray = np.array(rows, np.float64)
     except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
         reason = getattr(error, "strerror", None) or str(error)  # without the file's name
-        reason = f"no column {error}" if isinstance(error, KeyError) else reason
-        got = f"{str(Path(given[:80]))!r}: {' '.join(reason.split()):.120}"
+        if isinstance(error, KeyError):
+            reason = f"no column {error}"
+        got = f"{shortened(given)}: {' '.join(reason.split()):.120}"
         raise InputError(f"trajectory: expected {_EXPECTED}, got {got}") from None
     shape = samples.shape
-    right = samples.ndim == 2 and shape[1:] == (4,) and 2 <= len(samples) <= MAX_SAMPLES
-    if not right:
+    if shape[1:] != (4,) or not 2 <= len(samples) <= MAX_SAMPLES:
         raise InputError(
             f"trajectory: expected 2 to {MAX_SAMPLES} rows of t, x, y, z, got shape {shape}"
         )

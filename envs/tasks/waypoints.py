@@ -16,12 +16,11 @@ from .goal import (
     FURTHEST,
     PASSING_REWARD,
     GoalTask,
+    Margin,
     Point,
-    Sides,
     along,
     check_height,
     length,
-    rates_cost,
     row_of,
 )
 from .task import Outcome, TaskOptions
@@ -37,7 +36,7 @@ class WaypointsOptions(TaskOptions):
     """Points of an episode, 1 to 64."""
     center: Point = (0.0, 0.0, 5.0)
     """Middle of the box in which points and start are drawn: x, y, z in MuJoCo's world frame, m."""
-    box: Sides = (
+    box: Annotated[tuple[float, float, float], Limits(0.0, FURTHEST, "m", count=3)] = (
         3.0,
         3.0,
         1.5,
@@ -45,7 +44,7 @@ class WaypointsOptions(TaskOptions):
     """From that middle to the sides of the box, along x, y and z, m."""
     radius: Annotated[float, Limits(1e-3, FURTHEST, "m")] = 0.3
     """A point is reached by a craft that is nearer to it than this at a control step, m."""
-    margin: Annotated[float, Limits(0.1, FURTHEST, "m")] = 3.0
+    margin: Margin = 3.0
     """An episode terminates when the craft is further outside the box than this, m."""
 
 
@@ -143,17 +142,9 @@ class Waypoints(GoalTask):
         left = options.points - memory.reached
         off = abs(state.position - np.array(options.center))
         crashed = self.crashed(state, plain((off > self._sides).any(axis=-1)))
-        finished = left < 0.5
-        return Outcome(
-            reward={
-                "progress": memory.progress,
-                "passing": PASSING_REWARD * memory.passed,
-                "rates": rates_cost(state, COURSE_RATE_WEIGHT),
-                "termination": self.crash(crashed & (left > 0.5)),
-            },
-            terminated=crashed | finished,
-            metrics={"points_left": left, "flight_time": state.time},
-        )
+        terms = {"progress": memory.progress, "passing": PASSING_REWARD * memory.passed}
+        metrics = {"points_left": left, "flight_time": state.time}
+        return self.judged(state, terms, crashed, metrics, left < 0.5, COURSE_RATE_WEIGHT)
 
     def goal(self, state: State) -> Array:
         """The next point."""

@@ -88,7 +88,7 @@ def test_a_number_is_added_in_one_place(
         unit="m/s",
         read=lambda loop: np.linalg.norm(loop.record.state.velocity, axis=-1, keepdims=True),
     )
-    monkeypatch.setattr(telemetry, "QUANTITIES", (*telemetry.QUANTITIES, speed))
+    monkeypatch.setattr(telemetry, "POSE", (*telemetry.POSE, speed))
     monkeypatch.chdir(tmp_path)
     action = np.full(4, 0.1, np.float32)
     env: Any = gym.make(HOVER)
@@ -96,7 +96,7 @@ def test_a_number_is_added_in_one_place(
     *_, here = env.step(action)
     velocity = [here[name] for name in ("vx", "vy", "vz")]
     assert here["speed"] == pytest.approx(np.linalg.norm(velocity))
-    assert env.unwrapped.env_spec.telemetry[-1].unit == "m/s"
+    assert env.unwrapped.env_spec.telemetry[4].unit == "m/s"
     with flying(HOVER, record=tmp_path / "flight.mcap") as pair:
         pair.remote.reset(seed=1)
         *_, there = pair.remote.step(action)
