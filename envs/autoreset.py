@@ -15,7 +15,8 @@ from .spec import EnvSpec
 LOST: Final = "simulator_lost"
 """Key in the `info` of a step that a lost simulator truncated: why it was lost."""
 
-Step = tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]
+Info = dict[str, Any]
+Step = tuple[Any, np.ndarray, np.ndarray, np.ndarray, Info]
 Seeds = Sequence[int | None] | np.ndarray
 
 
@@ -56,8 +57,8 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
 
     @abstractmethod
     def reset(
-        self, *, seed: int | Seeds | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+        self, *, seed: int | Seeds | None = None, options: Info | None = None
+    ) -> tuple[Any, Info]:
         """Begin an episode, for all drones or some."""
 
     @abstractmethod
@@ -83,13 +84,10 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
         mode = self.autoreset_mode
         resets = self.done if mode == AutoresetMode.NEXT_STEP and self.done.any() else None
         self.advance(self._shaped(actions), resets)
-        rewards = self.rewards
-        terminated = self.terminated
-        truncated = self.truncated
-        info = self._info(~self._nobody)
+        step = (self.rewards, self.terminated, self.truncated, self._info(~self._nobody))
         if mode == AutoresetMode.SAME_STEP and self.done.any():
-            truncated, info = self._begin_next(truncated, info)
-        return self.observations, rewards, terminated, truncated, info
+            step = self._begin_next(*step)
+        return self.observations, *step
 
     def _take_spec(self, spec: EnvSpec, num_envs: int, mode: AutoresetMode | str) -> None:
         """Set spaces and other attributes from a spec. Raises `InputError`.
@@ -120,33 +118,34 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
     def _no_actions(self) -> np.ndarray:
         return np.zeros(self.action_space.shape or (), np.float32)
 
-    def _begin_next(self, truncated: Any, last_info: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-        """SAME_STEP: reset those whose episode ended; the info, with that of their last step.
+    def _begin_next(
+        self, rewards: np.ndarray, terminated: np.ndarray, truncated: np.ndarray, last: Info
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Info]:
+        """SAME_STEP: reset those whose episode ended; the info gets that of their last step.
 
         A simulator that is lost meanwhile truncates the episodes of its frozen drones: they begin
         their next as well.
         """
-        last = self.observations
+        observations = self.observations
         ended = self._nobody
         while self.done.any():
             truncated = truncated | self.lost
             ended = ended | self.done
             self.advance(self._no_actions(), self.done, None, ~self.done)
-        masks = {name: mask & ended for name, mask in last_info.items() if name.startswith("_")}
+        masks = {name: mask & ended for name, mask in last.items() if name.startswith("_")}
         info = self._info(~self._nobody)
-        info |= {"final_obs": last, "_final_obs": ended}
-        finals = last_info | masks | self._losses()
-        info |= {"final_info": finals, "_final_info": ended | self._nobody}
-        return truncated, info
+        info |= {"final_obs": observations, "_final_obs": ended}
+        info |= {"final_info": last | masks | self._losses(), "_final_info": ended.copy()}
+        return rewards, terminated, truncated, info
 
-    def _losses(self) -> dict[str, Any]:
+    def _losses(self) -> Info:
         """What the info of this step says of simulators that were lost, in any round trip."""
         return {}
 
-    def _info(self, mask: np.ndarray) -> dict[str, Any]:
+    def _info(self, mask: np.ndarray) -> Info:
         """The telemetry of the drones by its components, each name with its mask."""
         columns = info_columns(self.env_spec, self.telemetry)
-        info: dict[str, Any] = {name: column.copy() for name, column in columns.items()}
+        info: Info = {name: column.copy() for name, column in columns.items()}
         return info | {f"_{name}": mask for name in info} | self._losses()
 
 
@@ -186,22 +185,22 @@ def checked_seeds(seed: Any, num_envs: int, most: int | None = None) -> Seeds | 
     """
     if seed is None:
         return None
-
-    def is_seed(number: Any) -> bool:
-        if number is None:
-            return most is None
-        return isinstance(number, int | np.integer) and 0 <= int(number) <= (most or int(number))
-
     numbers: Seeds = seed
     if isinstance(seed, int | np.integer):
         numbers = range(int(seed), int(seed) + num_envs)
     several = isinstance(numbers, Sequence | np.ndarray) and getattr(numbers, "ndim", 1) == 1
-    some = numbers
-    if isinstance(numbers, np.ndarray) and numbers.dtype.kind == "u" and numbers.size:
-        some = [int(numbers.max())]  # speaks for thousands, as a training has them
-    if not (several and len(numbers) == num_envs and all(map(is_seed, some))):
+    right = several and len(numbers) == num_envs
+    if right and getattr(numbers, "dtype", None) != np.uint64:  # thousands, as a training has them
+        right = all(_is_seed(number, most) for number in numbers)
+    if not right:
         up_to = "from 0 on" if most is None else f"from 0 to 2^{most.bit_length()} - 1"
         raise InputError(
             f"seed: expected a whole number {up_to}, or {num_envs} of them, got {seed!r}"
         )
     return numbers
+
+
+def _is_seed(number: Any, most: int | None) -> bool:
+    if number is None:
+        return most is None
+    return isinstance(number, int | np.integer) and 0 <= int(number) <= (most or int(number))

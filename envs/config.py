@@ -67,11 +67,9 @@ class SceneConfig:
             return scene
         if isinstance(scene, Mapping):
             return read_table(cls, scene, "scene")
-        texts = scenes_of(scene)
-        seeds = [text.partition(":")[2] for text in texts]
-        return cls(
-            name=texts[0].partition(":")[0], seeds=tuple(int(seed) for seed in seeds if seed)
-        )
+        parts = [text.partition(":") for text in scenes_of(scene)]
+        seeds = tuple(int(seed) for _, _, seed in parts if seed)
+        return cls(name=parts[0][0], seeds=seeds)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,8 +85,7 @@ class BackendConfig:
     """Of `rigid`: None compiles where a compiler is found. It changes no number."""
 
     def __post_init__(self) -> None:
-        if self.name not in BACKENDS:
-            raise InputError(f"backend: expected {' or '.join(BACKENDS)}, got {self.name!r}")
+        check("backend", Choice(BACKENDS), self.name)
 
     @classmethod
     def parse(cls, backend: Any) -> Self:

@@ -80,13 +80,11 @@ class AdvancingParallelEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc]
                 name = f"actions of {agent}"
                 given[self._rows[agent]] = checked_action(actions[agent], space, name)
         seen, rewards, terminated, truncated, info = world.step(given)
-        left, scores, ends, cuts = (
-            {agent: values[self._rows[agent]].item() for agent in flown}
-            for values in (world.out, rewards, terminated, truncated)
-        )
-        self.agents = [agent for agent in flown if not left[agent]]
+        self.agents = [agent for agent in flown if not world.out[self._rows[agent]]]
         observations, infos = self._told(seen, info, flown)
-        return observations, scores, ends, cuts, infos
+        scores = self._numbers(rewards, flown)
+        ends = self._numbers(terminated, flown)
+        return observations, scores, ends, self._numbers(truncated, flown), infos
 
     def render(self) -> Any:
         """A picture of the world, uint8, shape (360, 480, 3), with `rgb_array`; None otherwise."""
@@ -96,6 +94,9 @@ class AdvancingParallelEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc]
     def close(self) -> None:
         """Close the window or tell the simulator; release memory."""
         self._world.close()
+
+    def _numbers(self, values: np.ndarray, agents: list[str]) -> Told:
+        return {agent: values[self._rows[agent]].item() for agent in agents}
 
     def _told(self, seen: Any, info: dict[str, Any], agents: list[str]) -> tuple[Told, Told]:
         """Observations and infos of some agents."""

@@ -43,15 +43,12 @@ class SingleEnv(gym.Env[Any, Any]):
     metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 50}  # noqa: RUF012
 
     def __init__(
-        self,
-        env_id: str | EnvConfig,
-        render_mode: str | None = None,
-        **keywords: Any,
+        self, env_id: str | EnvConfig, render_mode: str | None = None, **keywords: Any
     ) -> None:
-        self.config = EnvConfig.from_keywords(env_id, **keywords)
-        if self.config.drones > 1:
-            raise InputError(f"drones: expected 1 in a single env, got {self.config.drones}")
-        self._loop = loop = Loop(self.config)
+        self.config = config = EnvConfig.from_keywords(env_id, **keywords)
+        if config.drones > 1:
+            raise InputError(f"drones: expected 1 in a single env, got {config.drones}")
+        self._loop = loop = Loop(config)
         self.render_mode = render_mode
         self._renderer = Renderer(render_mode, loop)
         self.env_spec = loop.spec
@@ -86,13 +83,8 @@ class SingleEnv(gym.Env[Any, Any]):
         loop.advance(self._checked(action))
         if self.render_mode == "human":
             self.render()
-        return (
-            self._observation(),
-            loop.rewards.item(),
-            loop.terminated.item(),
-            loop.truncated.item(),
-            self._info(),
-        )
+        flags = loop.terminated.item(), loop.truncated.item()
+        return self._observation(), loop.rewards.item(), *flags, self._info()
 
     def render(self) -> Any:
         """A picture of now, uint8, shape (360, 480, 3), with `rgb_array`; None otherwise."""

@@ -15,7 +15,7 @@ from typing import Annotated, Any, ClassVar, Final, Literal, Self
 import numpy as np
 
 from ..models.errors import InputError, shortened
-from ..models.fields import Limits, Text, check, check_fields
+from ..models.fields import Choice, Limits, Text, check, check_fields
 from ..scenes import marks
 
 MAX_ELEMENTS: Final = 1 << 22  # numbers of all observations of one drone
@@ -47,14 +47,14 @@ class _Pattern:
 
     pattern: str
     expected: str
-    kind: type = str
+    several: bool = False
 
     def read(self, value: Any) -> object:
-        if not isinstance(value, self.kind):
+        words = value if self.several else (value,)
+        if not isinstance(words, tuple):
             raise TypeError
-        for word in (value,) if self.kind is str else value:
-            if not re.fullmatch(self.pattern, word):
-                raise ValueError
+        if not all(re.fullmatch(self.pattern, word) for word in words):
+            raise ValueError
         return value
 
 
@@ -62,10 +62,11 @@ _VISIBLE: Final = r"[^\x00-\x1f\x7f-\x9f\ud800-\udfff]"  # nor halves of surroga
 _SHORT: Final = f"of at most {MAX_NAME} characters without control characters"
 _NAME: Final = _Pattern(f"{_VISIBLE}{{1,{MAX_NAME}}}", f"a name {_SHORT}")
 _TEXT: Final = _Pattern(f"{_VISIBLE}{{0,{MAX_NAME}}}", f"a text {_SHORT}")
-_TEXTS: Final = _Pattern(_TEXT.pattern, f"a tuple of texts {_SHORT}", tuple)
+_TEXTS: Final = _Pattern(_TEXT.pattern, f"a tuple of texts {_SHORT}", several=True)
 _HASH: Final = _Pattern("[0-9a-f]{32}", "32 hex digits")
 _DIGEST: Final = _Pattern("([0-9a-f]{32})?", "32 hex digits")
 _CONSTANT: Final = _Pattern("[a-z][a-z0-9_]{0,63}", "a name of a to z, 0 to 9 and _")
+_DTYPE: Final = Choice(("float32", "float64", "uint8", "int32", "int64"))
 _SIZE: Final = Limits(0.0, above=True)
 
 
@@ -114,7 +115,8 @@ class ArraySpec(_Part):
 
     name: Annotated[str, _NAME]
     shape: tuple[int, ...]
-    dtype: Literal["float32", "float64", "uint8", "int32", "int64"] = "float32"
+    dtype: Annotated[str, _DTYPE] = "float32"
+    """`float32`, `float64`, `uint8`, `int32` or `int64`."""
     low: Bound = -math.inf
     high: Bound = math.inf
     unit: str | tuple[str, ...] = ""

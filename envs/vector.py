@@ -4,10 +4,11 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from ..models.errors import InputError
+from ..models.fields import check_names
 from ..sim.snapshots import Arrays
 from .autoreset import AdvancingVectorEnv, Seeds, checked_mask, checked_seeds
 from .config import EnvConfig
@@ -16,7 +17,7 @@ from .rendering import RENDER_MODES, Renderer
 from .spaces import joined
 
 
-class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
+class LocalVectorEnv(AdvancingVectorEnv):
     """N drones that fly a task in process, bit for bit as N single ones do.
 
     With several `drones` to a world, N is a multiple of them. One whose episode ends is `out`, with
@@ -36,6 +37,9 @@ class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
         render_mode: None, `rgb_array` (N pictures) or `human` (a window shows sixteen of them).
         autoreset_mode: `AutoresetMode`, or its value.
         keywords: As of `EnvConfig.from_keywords`: `drones` of each world, `vehicle`, `backend` …
+
+    Attributes:
+        loop: What it steps, with its world and its task.
 
     Raises:
         InputError: An option, seed or action is not what it should be; the drones are as before.
@@ -59,7 +63,7 @@ class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
         if type(num_envs) is not int or num_envs % config.drones != 0:
             expected = f"a multiple of drones = {config.drones}"
             raise InputError(f"num_envs: expected {expected}, got {num_envs!r}")
-        self._loop = loop = Loop(config, num_envs // config.drones)
+        self.loop = loop = Loop(config, num_envs // config.drones)
         self.render_mode = render_mode
         self._renderer = Renderer(render_mode, loop)
         self._take_spec(loop.spec, num_envs, autoreset_mode)
@@ -67,11 +71,6 @@ class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
         self._nobody = self.lost = self.done = self.out = loop.done
         self._episodes = np.zeros(num_envs, int)
         self.closed = False
-
-    @property
-    def loop(self) -> Loop:
-        """The loop that it steps: its world and its task."""
-        return self._loop
 
     def reset(
         self, *, seed: int | Seeds | None = None, options: dict[str, Any] | None = None
@@ -98,7 +97,7 @@ class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
     def close_extras(self, **kwargs: Any) -> None:
         """Close the window, if there is one; release threads and memory."""
         self._renderer.close()
-        self._loop.close()
+        self.loop.close()
 
     def advance(
         self,
@@ -109,7 +108,7 @@ class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
         chosen: Mapping[str, np.ndarray] | None = None,
     ) -> None:
         """As `AdvancingVectorEnv.advance`; `chosen` as of `Loop.advance`."""
-        loop = self._loop
+        loop = self.loop
         loop.advance(actions, resets, seeds, frozen, chosen)
         self._take_results()
         if self.render_mode is not None:
@@ -119,25 +118,25 @@ class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
 
     def snapshot(self) -> dict[str, NDArray[Any]]:
         """Copies of all arrays that a later step depends on, by name."""
-        return self._loop.snapshot() | {"episodes": self._episodes.copy()}
+        return self.loop.snapshot() | {"episodes": self._episodes.copy()}
 
     def restore(self, snapshot: Arrays) -> None:
         """Put back a snapshot of an env of the same config and size. No later bit differs."""
-        self._loop.restore(snapshot)
+        self.loop.restore(snapshot)
         self._episodes = snapshot["episodes"].copy()
         self._take_results()
 
     @property
     def telemetry(self) -> Any:  # type: ignore[override]  # made when it is asked for
         """By name, float64, shape (N, *shape)."""
-        return self._loop.telemetry
+        return self.loop.telemetry
 
     def _info(self, mask: Any) -> dict[str, Any]:
-        terms = {f"reward_{name}": term for name, term in self._loop.reward_terms.items()}
+        terms = {f"reward_{name}": term for name, term in self.loop.reward_terms.items()}
         return super()._info(mask) | terms | {f"_{name}": mask for name in terms}
 
     def _take_results(self) -> None:
-        loop = self._loop
+        loop = self.loop
         self.observations = joined(loop.spec, loop.observations)
         self.rewards = loop.rewards
         self.terminated = loop.terminated
@@ -146,15 +145,13 @@ class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
         self.out = loop.out
 
     def _choice(self, name: str, value: Any) -> np.ndarray:
-        if name not in self._loop.task.reset_options:
-            expected = ", ".join(("reset_mask", *self._loop.task.reset_options))
-            raise InputError(f"options: expected some of {expected}, got {name!r}")
+        check_names([name], ("reset_mask", *self.loop.task.reset_options), "options")
         try:
-            values = np.asarray(value, np.float64)
+            values = np.full(self.num_envs, value, np.float64)
         except (TypeError, ValueError):
             values = np.array(np.nan)
-        if values.shape not in ((), (self.num_envs,)) or not np.isfinite(values).all():
+        if not np.isfinite(values).all():
             raise InputError(
                 f"{name}: expected a finite number, or shape ({self.num_envs},), got {value!r}"
             )
-        return np.broadcast_to(values, self.num_envs).copy()
+        return values
