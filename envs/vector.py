@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from gymnasium.vector import AutoresetMode
+from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
 from ..models.errors import InputError
@@ -17,7 +17,7 @@ from .rendering import RENDER_MODES, Renderer
 from .spaces import joined
 
 
-class LocalVectorEnv(AdvancingVectorEnv):
+class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
     """N drones that fly a task in process, bit for bit as N single ones do.
 
     With several `drones` to a world, N is a multiple of them. One whose episode ends is `out`, with

@@ -19,6 +19,8 @@ from rotorgram.models import QUAD_XML, Vehicle
 
 DATA = Path(__file__).parent / "data"
 ORACLE = DATA / "oracle.json"
+TABLES: dict[str, Any] = json.loads((DATA / "envs.json").read_text())
+"""Rows of the parametrized tests of envs/, by the tests' names."""
 TASKS = sorted(name for name in gym.registry if name.startswith("rotorgram/"))
 HOVER = "rotorgram/Hover-v0"
 ELEVATION = "rotorgram/Elevation-v0"

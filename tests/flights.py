@@ -17,7 +17,10 @@ def task_of(env_id: str, **options: Any) -> Any:
 
 
 def state_of(rotors: int = 4, time: float = 0.0, **arrays: Any) -> State:
-    """A single level craft at rest at (0, 0, 5), but for the arrays that are given."""
+    """A single level craft at rest at (0, 0, 5), but for the arrays that are given.
+
+    `about`: arguments of the function of that name, in place of a quaternion.
+    """
     fields: dict[str, Any] = {
         "position": (0.0, 0.0, 5.0),
         "quaternion": (1.0, 0.0, 0.0, 0.0),
@@ -26,6 +29,8 @@ def state_of(rotors: int = 4, time: float = 0.0, **arrays: Any) -> State:
         "thrust": (49.0,) * rotors,
         "touching": False,
     }
+    if "about" in arrays:
+        arrays["quaternion"] = about(*arrays.pop("about"))
     given = {name: np.array(value) for name, value in {**fields, **arrays}.items()}
     steps = round(time / 0.02)
     return State(**given, command=given["thrust"], action=np.zeros(rotors), steps=steps, time=time)

@@ -5,6 +5,7 @@ import math
 import mujoco
 import numpy as np
 import pytest
+from contracts import TABLES
 from rotorgram.agents import Geometric
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.flights.trajectories import fly_episodes
@@ -130,13 +131,7 @@ def test_the_geometric_controllers_carry_it_to_its_goal(vehicle: str | None, dro
 
 @pytest.mark.parametrize(
     ("drones", "options", "sentence"),
-    [
-        (1, {}, "drones: expected 2 to 32 with rotorgram/Cable-v0, got 1"),
-        (2, {"payload_share": 5.0}, "payload_share: expected a load that the rotors of .* carry"),
-        (2, {"angle": 80}, "angle: expected a number from 5 to 60 degrees, got 80"),
-        (2, {"center": (0, 0, 3)}, "center: expected a height of at least .* m, got 3"),
-        (2, {"effects": {"payload": 1}}, "effects: expected a payload that the options"),
-    ],
+    TABLES["what cannot be carried is told"],
 )
 def test_what_cannot_be_carried_is_told(
     drones: int, options: dict[str, object], sentence: str

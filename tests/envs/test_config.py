@@ -11,6 +11,7 @@ from typing import Any
 
 import gymnasium as gym
 import pytest
+from contracts import TABLES
 from rotorgram.envs import ArraySpec, EnvConfig, Loop, Outcome, Task, register
 from rotorgram.envs.config import BackendConfig, SceneConfig, source_hash
 from rotorgram.envs.tasks import Hover
@@ -125,17 +126,7 @@ def test_a_file_and_keywords_that_win(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("keywords", "sentence"),
-    [
-        ({"frameskip": 4}, "options: expected some of goal, .*compiled, got an unex.* 'frameskip'"),
-        ({"task": 3}, "task: expected options by name, got 3"),
-        ({"vehicle": 3}, "vehicle: expected names or files, got 3"),
-        ({"cameras": 3}, "cameras: expected names, with commas between them, got 3"),
-        ({"scene": {"nam": "plain"}}, "scene: expected some of name, seeds, got 'nam'"),
-        ({"backend": "bullet"}, "backend: expected mujoco or rigid, got 'bullet'"),
-        ({"backend": {"name": "rigid", "x": 1}}, "backend: expected some of name, .*, got 'x'"),
-        ({"action": "thrusts"}, "action: expected 'rotors' or .*, got 'thrusts'"),
-        ({"drones": 0}, "drones: expected a whole number from 1 to 1024, got 0"),
-    ],
+    TABLES["a wrong field is one sentence"],
 )
 def test_a_wrong_field_is_one_sentence(keywords: dict[str, Any], sentence: str) -> None:
     with pytest.raises(InputError, match=f"^{sentence}$"):
@@ -144,12 +135,7 @@ def test_a_wrong_field_is_one_sentence(keywords: dict[str, Any], sentence: str) 
 
 @pytest.mark.parametrize(
     ("keywords", "sentence"),
-    [
-        ({"drones": 2}, "drones: expected 1 with rotorgram/Hover-v0, got 2"),
-        ({"backend": "rigid", "num_threads": 2}, "num_threads: expected dtype or compiled, "),
-        ({"dtype": "float64"}, "dtype: expected num_threads, the setting of the backend mujoco"),
-        ({"control_period": 0.015}, "control_period: expected a positive multiple of .*timestep"),
-    ],
+    TABLES["what does not go together is refused by name"],
 )
 def test_what_does_not_go_together_is_refused_by_name(
     keywords: dict[str, Any], sentence: str

@@ -8,11 +8,12 @@ import gymnasium as gym
 import numpy as np
 import pandas as pd
 import pytest
+from contracts import TABLES
 from rotorgram.cli import main
 from rotorgram.envs import LocalVectorEnv, registry
 from rotorgram.envs.tasks.task import HORIZON
 
-from flights import Shares, about, state_of, task_of
+from flights import Shares, state_of, task_of
 
 PRESETS = Path(__file__).parents[2] / "agents" / "presets.toml"
 ELEVATION = "rotorgram/Elevation-v0"  # as the paper has it
@@ -62,12 +63,7 @@ def test_wide_starts_are_learned(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("change", "crashed"),
-    [
-        ({}, False),
-        ({"quaternion": about((0, 1, 0), 89.0)}, False),
-        ({"quaternion": about((1, 0, 0), 91.0)}, True),
-        ({"touching": True}, True),
-    ],
+    TABLES["contact and a tilt above 90 degrees end a flight"],
     ids=str,
 )
 @pytest.mark.parametrize("name", ["Hover", "Landing", "PayloadHover", "Racing", "Tracking"])

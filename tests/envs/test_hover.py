@@ -7,6 +7,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from contracts import TABLES
 from rotorgram.envs import Loop
 from rotorgram.envs.config import EnvConfig
 from rotorgram.models.vehicle import Vehicle
@@ -43,15 +44,7 @@ def test_observations_are_clipped_to_their_bounds() -> None:
 
 @pytest.mark.parametrize(
     ("change", "terms", "terminated"),
-    [
-        ({}, {"position": 1.0, "heading": 0.0, "rates": 0.0, "termination": 0.0}, False),
-        ({"position": (0.3, 0.4, 5.0)}, {"position": 0.0}, False),
-        ({"position": (0.0, 0.0, 6.5)}, {"position": -0.5}, False),
-        ({"quaternion": about((0, 0, 1), 90.0)}, {"heading": -0.1}, False),
-        ({"quaternion": about((0, 0, 1), -179.9)}, {"heading": -0.2 * 179.9 / 180}, False),
-        ({"body_rates": (3.0, 0.0, 4.0)}, {"rates": -0.1}, False),
-        ({"position": (3.01, 0.0, 5.0)}, {"termination": -160.0}, True),
-    ],
+    TABLES["hover: outcome by hand"],
     ids=str,
 )
 def test_outcome_by_hand(change: dict[str, Any], terms: dict[str, float], terminated: bool) -> None:

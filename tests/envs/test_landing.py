@@ -6,6 +6,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from contracts import TABLES
 from pilot import Pilot, fly, limited
 from rotorgram.models import Vehicle
 
@@ -82,20 +83,7 @@ STILL = {"motion": "line", "pad_speed": 0.0}  # a pad that rests at (2, 0)
 
 @pytest.mark.parametrize(
     ("before", "at", "landed"),
-    [
-        ({"velocity": (0.0, 0.0, -0.99)}, {}, True),
-        ({"velocity": (0.0, 0.0, -1.01)}, {}, False),
-        ({"velocity": (0.3, 0.39, -0.5)}, {}, True),
-        ({"velocity": (0.3, 0.41, -0.5)}, {}, False),
-        ({"velocity": (0.0, 0.0, 0.5)}, {}, True),  # its tail touches as it rises
-        ({"quaternion": about((1, 0, 0), 14.9)}, {}, True),
-        ({"quaternion": about((0, 1, 0), 15.1)}, {}, False),
-        ({}, {"position": (2.0, 0.49, REST)}, True),
-        ({}, {"position": (2.0, -0.51, REST)}, False),
-        # What contact does to speed and tilt does not count.
-        ({}, {"velocity": (3.0, 0.0, 2.0), "quaternion": about((1, 0, 0), 40.0)}, True),
-        ({"velocity": (0.0, 0.0, -3.0)}, {"velocity": (0.0, 0.0, 0.1)}, False),
-    ],
+    TABLES["what is a landing"],
 )
 def test_what_is_a_landing(before: dict[str, Any], at: dict[str, Any], landed: bool) -> None:
     task = begun(**STILL)
@@ -146,11 +134,7 @@ def test_progress_by_hand() -> None:
 
 @pytest.mark.parametrize(
     ("change", "terminated"),
-    [
-        ({}, False),
-        ({"position": (2.0, 9.9, REST)}, False),
-        ({"position": (2.0, 10.1, REST)}, True),
-    ],
+    TABLES["landing: ends"],
     ids=str,
 )
 def test_ends(change: dict[str, Any], terminated: bool) -> None:
@@ -163,10 +147,7 @@ def test_ends(change: dict[str, Any], terminated: bool) -> None:
 
 @pytest.mark.parametrize(
     ("vehicle", "motion", "effects"),
-    [
-        ("paper", "circle", {}),
-        ("crazyflie2", "line", {"body_drag": True, "rotor_drag": True, "wind": [1.2, -0.8, 0.0]}),
-    ],
+    TABLES["a pilot lands and a stone does not"],
 )
 def test_a_pilot_lands_and_a_stone_does_not(vehicle: str, motion: str, effects: Any) -> None:
     """On either path, with a 20 kg and a 27 g craft, also in wind."""

@@ -5,6 +5,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from contracts import TABLES
 from pictures import at
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
@@ -79,18 +80,7 @@ def test_what_moves_is_at_the_goal_in_place_of_its_disc() -> None:
 
 @pytest.mark.parametrize(
     ("fields", "sentence"),
-    [
-        (
-            {"shape": "cube", "size": 1.0},
-            "mark: shape: expected 'gate' or 'disc' or 'ball'",
-        ),
-        ({"shape": "ball", "size": 0.0}, "mark: size: expected a number above 0 m, got 0.0"),
-        (
-            {"shape": "ball", "size": 1.0, "position": (0.0,)},
-            "mark: position: expected 3 numbers in m",
-        ),
-        ({"shape": "ball", "size": 1.0, "moves": 1}, "mark: moves: expected true or false, got 1"),
-    ],
+    TABLES["wrong marks"],
 )
 def test_wrong_marks(fields: dict[str, Any], sentence: str) -> None:
     with pytest.raises(SpecError) as error:

@@ -6,6 +6,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from contracts import TABLES
 from pilot import Pilot, fly, limited
 from rotorgram.envs import Loop
 from rotorgram.envs.config import EnvConfig
@@ -66,17 +67,7 @@ def test_observation_by_hand() -> None:
 
 @pytest.mark.parametrize(
     ("change", "terms", "terminated"),
-    [
-        ({}, {"payload": 1.0, "swing": 0.0, "rates": 0.0, "termination": 0.0}, False),
-        ({"payload": (0.3, 0.4, 4.0)}, {"payload": 0.0}, False),
-        ({"payload": (0.0, 0.0, 2.5)}, {"payload": -0.5}, False),
-        ({"payload_velocity": (0.0, 0.3, 0.4)}, {"swing": -0.05}, False),
-        ({"payload_velocity": (0.0, 3.0, 4.0)}, {"swing": -0.4}, False),  # no more than this
-        ({"velocity": (1.0, 0, 0), "payload_velocity": (1.0, 0, 0)}, {"swing": 0.0}, False),
-        ({"body_rates": (3.0, 0.0, 4.0)}, {"rates": -0.1}, False),
-        ({"payload": (2.99, 0.0, 4.0)}, {"termination": 0.0}, False),
-        ({"payload": (3.01, 0.0, 4.0)}, {"termination": -180.0}, True),
-    ],
+    TABLES["outcome by hand"],
     ids=str,
 )
 def test_outcome_by_hand(change: dict[str, Any], terms: dict[str, float], terminated: bool) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from contracts import TABLES
 from pilot import Pilot, fly, limited
 from rotorgram.models import Vehicle
 from rotorgram.models.errors import InputError
@@ -60,17 +61,7 @@ def test_observation_by_hand() -> None:
 
 @pytest.mark.parametrize(
     ("before", "after", "passes"),
-    [
-        ((1.9, 0.0, 5.0), (2.1, 0.0, 5.0), True),
-        ((1.9, 0.0, 5.0), (2.0, 0.0, 5.0), True),  # just on its plane
-        ((1.9, 0.0, 5.0), (1.99, 0.0, 5.0), False),
-        ((1.9, 0.49, 5.49), (2.1, 0.49, 5.49), True),
-        ((1.9, 0.51, 5.0), (2.1, 0.51, 5.0), False),
-        ((1.9, 0.0, 4.49), (2.1, 0.0, 4.49), False),
-        ((1.9, 0.6, 5.0), (2.1, 0.2, 5.0), True),  # in the middle of the step 0.4 aside
-        ((1.9, 0.8, 5.0), (2.1, 0.4, 5.0), False),  # 0.6 aside
-        ((2.1, 0.8, 5.0), (1.9, 0.0, 5.0), False),  # backwards
-    ],
+    TABLES["what is a pass"],
 )
 def test_what_is_a_pass(before: Any, after: Any, passes: bool) -> None:
     task = begun()
@@ -105,12 +96,7 @@ def test_a_lap_by_hand() -> None:
 
 @pytest.mark.parametrize(
     ("place", "rest", "ends"),
-    [
-        ((1.0, 4.9, 5.0), {}, False),  # aside of the line from start to gate
-        ((1.0, 5.1, 5.0), {}, True),
-        ((-4.9, 0.0, 5.0), {}, False),  # behind its beginning
-        ((-5.1, 0.0, 5.0), {}, True),
-    ],
+    TABLES["ends"],
 )
 def test_ends(place: Any, rest: dict[str, Any], ends: bool) -> None:
     outcome = moved(begun(), *place, **rest)
@@ -133,26 +119,7 @@ def test_a_track_of_a_file_crosses_the_wire(tmp_path: Path) -> None:
     assert again.goal(state_of()).tolist() == [1.0, 2.0, 6.0]
 
 
-GATE = {"position": [2, 0, 5], "heading": 0, "size": 1}
-START = {"position": [0, 0, 5], "heading": 0}
-
-
-@pytest.mark.parametrize(
-    ("content", "sentence"),
-    [
-        ("loop", "track: expected a track of ours, a TOML file of gates, .* (dive, oval), got"),
-        ("../tracks/oval", "track: expected a track of ours"),
-        ({"gates": []}, "track: expected 1 to 64 gates, got 0"),
-        ({"gates": [GATE], "walls": []}, "track: expected gates and start, got ['walls']"),
-        ({"gates": [GATE]}, "track: start: expected values by name (position, heading), got None"),
-        ({"gates": [{**GATE, "size": 0}]}, "track: gate 1.size: expected a number from"),
-        ({"gates": [{**GATE, "heading": "n"}]}, "track: gate 1.heading: expected a number"),
-        ({"gates": [{**GATE, "position": [1]}]}, "track: gate 1.position: expected 3 numbers from"),
-        ({"gates": [GATE, 3]}, "track: gate 2: expected values by name (position"),
-        ({"gates": [GATE], "start": {**START, "position": [0, 0, 1]}},
-         "track: expected a start at least 1.5 m above the ground, got 1"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("content", "sentence"), TABLES["wrong tracks"])
 def test_wrong_tracks(content: Any, sentence: str) -> None:
     text = content if isinstance(content, str) else json.dumps(content)
     with pytest.raises(InputError) as error:

@@ -7,6 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from bounds import least_height_lost, recovery_bounds
+from contracts import TABLES
 from pilot import Pilot, fly, limited
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.loop import Loop
@@ -147,17 +148,7 @@ PLACE = {"position": (0.0, 0.0, 20.0)}
 
 @pytest.mark.parametrize(
     ("change", "terms", "terminated"),
-    [
-        ({}, {"position": 1.0, "tilt": 0.0, "rates": 0.0, "termination": 0.0}, False),
-        ({"position": (0.6, 0.8, 20.0)}, {"position": 0.0}, False),
-        ({"position": (0.0, 0.0, 17.0)}, {"position": -0.5}, False),
-        ({"quaternion": about((1, 0, 0), 90.0)}, {"tilt": -0.25, "termination": 0.0}, False),
-        ({"quaternion": about((1, 0, 0), 180.0)}, {"tilt": -0.5, "termination": 0.0}, False),
-        ({"body_rates": (3.0, 0.0, 4.0)}, {"rates": -0.1}, False),
-        ({"position": (0.0, 0.0, 5.1)}, {"termination": 0.0}, False),
-        ({"position": (0.0, 0.0, 4.9)}, {"termination": -190.0}, True),
-        ({"touching": True}, {"termination": -190.0}, True),
-    ],
+    TABLES["recovery: outcome by hand"],
     ids=str,
 )
 def test_outcome_by_hand(change: dict[str, Any], terms: dict[str, float], terminated: bool) -> None:
@@ -169,16 +160,7 @@ def test_outcome_by_hand(change: dict[str, Any], terms: dict[str, float], termin
 
 @pytest.mark.parametrize(
     ("change", "recovered"),
-    [
-        ({}, True),
-        ({"position": (0.49, 0.0, 20.0)}, True),
-        ({"position": (0.0, 0.51, 20.0)}, False),
-        ({"velocity": (0.0, 0.0, 0.49)}, True),
-        ({"velocity": (0.3, 0.0, 0.41)}, False),
-        ({"quaternion": about((1, 0, 0), 14.9)}, True),
-        ({"quaternion": about((0, 1, 0), 15.1)}, False),
-        ({"quaternion": about((0, 0, 1), 120.0)}, True),  # any heading
-    ],
+    TABLES["what is recovered"],
     ids=str,
 )
 def test_what_is_recovered(change: dict[str, Any], recovered: bool) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from contracts import TABLES
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 from peers import ANY, Running
@@ -190,28 +191,7 @@ def test_a_simulator_that_cannot_draw_says_so_before_it_greets() -> None:
 
 @pytest.mark.parametrize(
     ("options", "sentence"),
-    [
-        ({"cameras": "rear"}, "cameras: expected some of chase, portrait, front, down, each with"),
-        ({"cameras": 3}, "cameras: expected names, with commas between them, got 3"),
-        ({"cameras": "front", "scene": "moon"}, "scene: expected 'plain' or 'airport'"),
-        (
-            {"cameras": "front", "scene": "plain:0-2"},
-            "scene: expected one of .* up to 64 seeds, as",
-        ),
-        (
-            {"cameras": "front", "scene": "forest:3-1"},
-            "scene: expected one of .* up to 64 seeds, as",
-        ),
-        (
-            {"cameras": "front", "scene": "forest:0-64"},
-            "scene: expected one of .* up to 64 seeds, as",
-        ),
-        (
-            {"cameras": "front", "scene": "forest:0-x"},
-            "scene: expected one of .* up to 64 seeds, as",
-        ),
-        ({"cameras": "front", "scene": 3}, "scene: expected 'plain' or 'airport'"),
-    ],
+    TABLES["wrong options"],
 )
 def test_wrong_options(options: dict[str, Any], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):

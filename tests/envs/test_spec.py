@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from contracts import TABLES
 from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -193,47 +194,35 @@ def test_the_module_of_an_id_is_no_part_of_it() -> None:
 # --- refusals -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("build", "sentence"),
-    [
-        (lambda: ArraySpec(name="", shape=()), "name: expected a name"),
-        (lambda: ArraySpec(name="a\x1b[2J", shape=()), "name: .*without control"),
-        (lambda: ArraySpec(name="a", shape=(0,)), "a: expected a shape of whole numbers >= 1"),
-        (lambda: ArraySpec(name="a", shape=(2.0,)), "a: expected a shape"),  # type: ignore[arg-type]
-        (lambda: ArraySpec(name="a", shape=(1 << 30,)), "a: expected at most 4194304 elements"),
-        (lambda: ArraySpec(name="a", shape=(1,) * 65), "a: expected at most 16 axes, got 65"),
-        (lambda: ArraySpec(name="a", shape=(), dtype="float16"), "a: expected a dtype of float32"),
-        (lambda: ArraySpec(name="a", shape=(2,), low=(1.0,)), "a: expected one number for low"),
-        (lambda: ArraySpec(name="a", shape=(), low=math.nan), "a: expected one number for low"),
-        (lambda: ArraySpec(name="a", shape=(), low=2.0, high=1.0), "a: expected low <= high"),
-        (lambda: ArraySpec(name="a", shape=(), low=math.inf), "a: expected low <= high"),
-        (lambda: ArraySpec(name="a", shape=(2,), components=("x", "x")), "a: expected 2 different"),
-        (lambda: ArraySpec(name="a", shape=(2,), unit=("m",)), "a: expected 2 units, got 1"),
-        (lambda: Discrete(n=0), "action: expected 1 to 2.24 choices, got 0"),
-        (lambda: Discrete(n=2, components=("a",)), "action: expected 2 components"),
-        (lambda: Metric(name="", unit="m"), "metric: name: expected a text of 1 to 200"),
-        (lambda: Metric(name="e", unit="m", goal="low"), "metric: goal: expected 'zero' or"),  # type: ignore[arg-type]
-        (lambda: Metric(name="e", unit="m", settled=0.0), "metric: settled: .* number above 0"),
-        (lambda: Metric(name="e", unit="m", held=10**400), "metric: held: .* number above 0"),
-        (lambda: spec_of(control_period=1e6), "control_period: expected 1e-6 to 1e3 s"),
-        (lambda: spec_of(vehicle_hash="xyz"), "vehicle_hash: expected 32 hex digits"),
-        (lambda: spec_of(agents=("a", "a")), "agents: expected 1 to 1024 different names"),
-        (lambda: spec_of(observation=()), "observation: expected at least one array"),
-        (lambda: spec_of(observation=(PICTURE, PICTURE)), "observation: .* different names"),
-        (lambda: spec_of(options={"a": object()}), "options: expected JSON values"),
-        (lambda: spec_of(options={"a": ["\ud800"]}), "options: expected JSON values"),
-        (lambda: spec_of(options={"a": math.nan}), "options: expected JSON values"),
-        (
-            lambda: spec_of(metrics=(Metric(name="e", unit="m"),)),
-            "metrics: expected the components",
-        ),
-    ],
-)
-def test_what_makes_no_sense_is_one_sentence(build: Any, sentence: str) -> None:
+KINDS: dict[str, Any] = {
+    "ArraySpec": ArraySpec, "Discrete": Discrete, "Metric": Metric, "EnvSpec": spec_of
+}  # fmt: skip
+
+
+def refused(kind: str, fields: dict[str, Any], sentence: str) -> None:
+    values = {}
+    for name, value in fields.items():
+        values[name] = tuple(value) if isinstance(value, list) else value
     with pytest.raises(SpecError, match=f"^{sentence}") as caught:
-        build()
+        KINDS[kind](**values)
     assert isinstance(caught.value, InputError)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("kind", "fields", "sentence"), TABLES["what makes no sense is one sentence"]
+)
+def test_what_makes_no_sense_is_one_sentence(
+    kind: str, fields: dict[str, Any], sentence: str
+) -> None:
+    refused(kind, fields, sentence)
+
+
+def test_parts_that_do_not_fit_together_are_refused() -> None:
+    refused("EnvSpec", {"observation": [PICTURE, PICTURE]}, "observation: .* different names")
+    refused("EnvSpec", {"options": {"a": object()}}, "options: expected JSON values")
+    error = Metric(name="e", unit="m")
+    refused("EnvSpec", {"metrics": [error]}, "metrics: expected the components")
 
 
 def test_a_short_spec_cannot_ask_for_much_memory() -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from contracts import TABLES
 from hypothesis import given
 from hypothesis import strategies as st
 from rotorgram.envs.config import EnvConfig
@@ -81,32 +82,7 @@ def test_float32_bounds_lie_outside_the_float64_ones() -> None:
 
 @pytest.mark.parametrize(
     ("options", "cases"),
-    [
-        (
-            {},
-            # (present thrust, action, next thrust)
-            [
-                (49.0, 0.0, 49.0),
-                (49.0, 1.0, 54.0),
-                (49.0, -0.5, 46.5),
-                (49.0, 7.0, 54.0),  # an action counts as 1 at most
-                (95.0, 1.0, 100.0),
-                (96.0, 1.0, 100.0),
-                (4.0, -1.0, 0.0),
-            ],
-        ),
-        (
-            {"action": "offset"},
-            # the present thrust does not count
-            [(90.0, 0.0, 49.0), (90.0, 1.0, 69.0), (0.0, -0.5, 39.0), (49.0, -9.0, 29.0)],
-        ),
-        (
-            {"action": "offset", "thrust_scale": 100.0},
-            [(49.0, 1.0, 100.0), (49.0, -0.5, 0.0), (49.0, 0.5, 99.0)],
-        ),
-        ({"action_type": "discrete"}, [(49.0, 0, 44.0), (49.0, 1, 49.0), (49.0, 2, 54.0)]),
-        ({"thrust_scale": 7.0}, [(49.0, 1.0, 56.0)]),
-    ],
+    TABLES["thrust"],
     ids=str,
 )
 def test_thrust(options: dict[str, Any], cases: list[tuple[float, float, float]]) -> None:
@@ -120,7 +96,7 @@ def test_thrust(options: dict[str, Any], cases: list[tuple[float, float, float]]
 
 @pytest.mark.parametrize(
     ("error", "reward"),
-    [(0.0, 1.0), (0.5, 0.0), (-0.5, 0.0), (1.5, -0.5), (-1.5, -0.5), (0.125, 0.6), (2.0, -0.6)],
+    TABLES["reward"],
 )
 def test_reward(error: float, reward: float) -> None:
     state = state_of(2, position=[[0, 0, 5.0 - error]] * 2, touching=[False, True])

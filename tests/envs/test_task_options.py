@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from contracts import TASKS
+from contracts import TABLES, TASKS
 from rotorgram.envs import registry
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
@@ -76,42 +76,7 @@ def test_numpy_numbers_become_python_numbers() -> None:
 
 @pytest.mark.parametrize(
     ("task", "options", "sentence"),
-    [
-        ("Elevation", {"target": 1.9}, r"target: expected 2 m \(start_band = 1 m, .* got 1.9"),
-        ("Elevation", {"target": 2e6}, r"target: expected 2 m .* to 1e\+06 m, got 2000000.0"),
-        ("Elevation", {"flight_band": 1.0}, "flight_band: expected more than start_band = 1 m"),
-        ("Elevation", {"thrust_scale": 101.0}, "thrust_scale: expected at most 100 N, .*, got 101"),
-        ("Elevation", {"episode_length": 0}, "episode_length: expected a whole number .*, got 0"),
-        ("Elevation", {"control_period": 0.0}, "control_period: expected a number from 1e-06 to 1"),
-        (
-            "Elevation",
-            {"control_period": 0.025},
-            "control_period: expected a positive multiple .* 0.01 s, .*, got 0.025",
-        ),
-        ("Elevation", {"action": "delta"}, "action: expected 'increment' or 'offset', got 'delta'"),
-        ("Hover", {"goal": (0.0, 0.0, 1.9)}, "goal: expected a height of at least 2 m above"),
-        ("Hover", {"flight_band": 1.7}, "flight_band: expected more than .* = 1.732 m, got 1.7"),
-        ("Landing", {"start_height": 1.0}, "start_band: expected at most start_height - 0.5 m"),
-        ("Landing", {"flight_band": 6.0}, "flight_band: expected more than the 6.054 m of the"),
-        ("PayloadHover", {"goal": (0, 0, 1.5)}, "goal: expected a height of at least 1.678 m"),
-        ("PayloadHover", {"flight_band": 1.7}, "flight_band: expected more than .* = 1.732 m"),
-        (
-            "PayloadHover",
-            {"effects": {"payload": 2.0}},
-            "effects: expected a payload that the options of the task describe, got payload",
-        ),
-        ("PayloadHover", {"randomize": {"gusts": "uniform(1, 2)"}}, "randomize: gusts: expected"),
-        ("Recovery", {"goal": (0.0, 0.0, 0.9)}, "goal: expected a height of at least 1 m above"),
-        ("Recovery", {"flight_band": 0.5}, "flight_band: expected more than near = 0.5 m, got 0.5"),
-        ("Waypoints", {"center": (0, 0, 2)}, "center: expected a height of at least 2.5 m above"),
-        ("Formation", {"center": (0, 0, 1)}, "center: expected a height of at least"),
-        ("Tracking", {"trajectory": "spiral"}, "trajectory: expected circle, lemniscate, snap, or"),
-        ("Tracking", {"trajectory": "[[0,1,2]]"}, "trajectory: expected 2 to 20000 rows of t, x,"),
-        ("Tracking", {"trajectory": "[[0,0,0,5],[0,1,0,5]]"}, "trajectory: expected times that"),
-        ("Tracking", {"trajectory": "[[0,0,0,5],[1,1e9,0,5]]"}, "trajectory: expected coordinates"),
-        ("Tracking", {"trajectory": '[["a"]]'}, "trajectory: expected circle, lemniscate, snap"),
-        ("Tracking", {"center": (0, 0, 1.2)}, "trajectory: expected a height of at least 1.3 m"),
-    ],
+    TABLES["options that do not go together"],
 )
 def test_options_that_do_not_go_together(task: str, options: dict[str, Any], sentence: str) -> None:
     with pytest.raises(InputError, match=f"^{sentence}") as caught:
@@ -121,15 +86,7 @@ def test_options_that_do_not_go_together(task: str, options: dict[str, Any], sen
 
 @pytest.mark.parametrize(
     "options",
-    [
-        {"target": 2.0},
-        {"start_band": 0.0, "target": 1.0},
-        {"control_period": 0.01},
-        {"control_period": 1},
-        {"episode_length": 250.0},
-        {"thrust_scale": 100},
-        {"target": 1e6},
-    ],
+    TABLES["extremes are allowed"],
     ids=str,
 )
 def test_extremes_are_allowed(options: dict[str, Any]) -> None:

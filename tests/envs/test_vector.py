@@ -10,6 +10,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from contracts import TABLES
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from mujoco.batch import Batch, SimulationError
 from rotorgram.envs import LocalVectorEnv, Loop
@@ -180,16 +181,7 @@ def test_wrong_seeds(seed: Any) -> None:
 
 @pytest.mark.parametrize(
     ("arguments", "expected"),
-    [
-        ({"num_envs": 0}, "num_envs: expected 1 to 65536, got 0"),
-        ({"num_envs": 10**9}, "num_envs: expected 1 to 65536, got 1000000000"),
-        ({"num_threads": -1}, "num_threads: expected a whole number of at least 0, got -1"),
-        ({"device": "cuda"}, "options: expected some of target, .*, got an .* .device"),
-        ({"backend": "bullet"}, "backend: expected mujoco or rigid, got 'bullet'"),
-        ({"autoreset_mode": "never"}, "autoreset_mode: expected 'NextStep' or 'SameStep'"),
-        ({"render_mode": "ansi"}, "render_mode: expected None, 'human' or 'rgb_array', got 'ansi'"),
-        ({"speed": 1}, "options: expected some of target"),
-    ],
+    TABLES["wrong arguments"],
 )
 def test_wrong_arguments(arguments: dict[str, Any], expected: str) -> None:
     with pytest.raises(InputError, match=f"^{expected}"):

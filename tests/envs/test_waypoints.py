@@ -6,6 +6,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from contracts import TABLES
 from pilot import Pilot, fly, limited
 from rotorgram.models import Vehicle
 
@@ -80,13 +81,7 @@ def test_progress_and_passing_by_hand() -> None:
 
 @pytest.mark.parametrize(
     ("place", "rest", "ends"),
-    [
-        ((5.99, 0.0, 5.0), {}, False),
-        ((6.01, 0.0, 5.0), {}, True),
-        ((0.0, -6.01, 5.0), {}, True),
-        ((0.0, 0.0, 9.49), {}, False),
-        ((0.0, 0.0, 9.51), {}, True),
-    ],
+    TABLES["waypoints: ends"],
 )
 def test_ends(place: tuple[float, float, float], rest: dict[str, Any], ends: bool) -> None:
     task = begun(MIDDLE, (0.0, 0.0, 0.0), ABOVE)

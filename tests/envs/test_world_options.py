@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import rotorgram.envs  # noqa: F401
+from contracts import TABLES
 from rotorgram.cli import main
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.memory import Memory
@@ -197,16 +198,7 @@ def test_files_of_a_comparison_tell_what_was_drawn(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("options", "sentence"),
-    [
-        ({"effects": {"motor": True}}, "effects: expected some of motor_lag, .*, got 'motor'"),
-        ({"effects": 3}, "effects: expected a mapping from names to values, got 3"),
-        ({"effects": {"wind": [1.0]}}, r"effects: wind: expected 3 numbers .* m/s, got \[1.0\]"),
-        ({"effects": {"motor_lag": True}, "vehicle": None}, "expected rotors.time_constant"),
-        ({"randomize": {"mas": "1"}}, "randomize: expected some of mass, .*, got 'mas'"),
-        ({"randomize": {"mass": "big"}}, r"randomize: mass: expected uniform.*, got 'big'"),
-        ({"randomize": {"action_delay": 101}}, "from 0 to 100 steps, got 101"),
-        ({"randomize": {"time_constant": "1"}}, "expected the effect motor_lag, got it switched"),
-    ],
+    TABLES["a wrong one gives one sentence"],
 )
 def test_a_wrong_one_gives_one_sentence(options: dict[str, Any], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence) as raised:
