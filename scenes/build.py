@@ -4,20 +4,22 @@ from pathlib import Path
 from typing import Final
 
 import mujoco
+import numpy as np
 
 from ..models import QUAD_XML
 from ..models.mjcf import has_ground, read_spec
 from . import AIRPORT_XML, SCENE_XML, parse_scene
-from .generators import GENERATORS
-from .primitives import SKY, attach, clear
+from .generators import GENERATORS, SKY, Builder
 
 SCENE_PREFIX: Final = "scene/"  # of all names that `add_scene` adds for the plain scene
-_NEAR, _FAR = 0.25, 1200.0  # m: nearest and furthest distance that is drawn; the hills lie within
+_NEAR: Final = 0.25  # m: nearest distance that is drawn
+_FAR: Final = 1200.0  # m: furthest distance at the airport; the hills lie within
+_SEEDED_FAR: Final = 400.0  # m: that of the scenes of a seed
+_HIDDEN_GROUP: Final = 3  # viewers draw groups 0 to 2 unless the user asks for others
 
 # The depth of a directional light's shadow map spans the whole of _FAR, and a map of finer pixels
 # than 12 mm (1024 over the 12 m around the craft) speckles flat ground at this span.
 _SHADOW_PIXELS: Final = 1024
-_SLICES: Final = 40  # of a cylinder: the camera comes near to the pad's ring
 _HAZE: Final = 0.1  # of the distance to the horizon
 _HAZE_COLOUR: Final = (0.80, 0.88, 0.96, 1.0)  # the sky's colour where it meets the ground
 
@@ -44,7 +46,7 @@ def add_scene(spec: mujoco.MjSpec, scene: str = "plain") -> None:
     if name == "airport":
         _add_airport(spec)
     elif name in GENERATORS:
-        attach(spec, GENERATORS[name](seed))
+        _add_seeded(spec, name, seed)
     spec.compiler.discardvisual = False
 
 
@@ -71,10 +73,53 @@ def _add_airport(spec: mujoco.MjSpec) -> None:
     Sky, haze, shadow map, and the near and far end of drawing become the airport's. Its geoms
     collide with nothing.
     """
-    clear(spec, _NEAR, _FAR, _SLICES)
+    _clear(spec, _FAR, 40)  # the camera comes near to the pad's ring
     visual = spec.visual
     visual.map.haze = _HAZE
     visual.rgba.haze = _HAZE_COLOUR
     visual.quality.shadowsize = min(visual.quality.shadowsize, _SHADOW_PIXELS)
     airport = mujoco.MjSpec.from_file(str(AIRPORT_XML))
     spec.attach(airport, prefix="airport/", frame=spec.worldbody.add_frame())
+
+
+def _add_seeded(spec: mujoco.MjSpec, name: str, seed: int) -> None:
+    """Put a scene of a seed in place of a spec's sky, lights and the look of its level ground."""
+    _clear(spec, _SEEDED_FAR, 20)
+    for light in spec.worldbody.lights:
+        light.active = False
+    GENERATORS[name](Builder(spec, name, seed))
+
+
+def _clear(spec: mujoco.MjSpec, far: float, slices: int) -> None:
+    """Hide level ground, delete the sky, set the furthest distance that is drawn, m, and into how
+    many slices cylinders are cut.
+
+    The scale of the spec stays as it is without more: MuJoCo measures distances, shadows and the
+    free camera's first distance in extents of the model.
+    """
+    scene = spec.copy()
+    scene.compiler.discardvisual = False
+    model = scene.compile()
+    for geom, compiled in zip(spec.geoms, scene.geoms, strict=True):
+        if _is_ground(model, compiled.id):
+            geom.group = _HIDDEN_GROUP
+    for texture in list(spec.textures):
+        if texture.type == SKY:
+            spec.delete(texture)
+    stat = spec.stat
+    visual = spec.visual
+    stat.extent = model.stat.extent
+    stat.center = model.stat.center
+    stat.meansize = model.stat.meansize
+    visual.map.znear = _NEAR / model.stat.extent
+    visual.map.zfar = far / model.stat.extent
+    visual.quality.numslices = max(visual.quality.numslices, slices)
+
+
+def _is_ground(model: mujoco.MjModel, geom: int) -> bool:
+    """Whether a geom is a plane of the world body at z = 0 that faces up."""
+    if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_PLANE or model.geom_bodyid[geom] != 0:
+        return False
+    rotation = np.empty(9)
+    mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
+    return bool(np.isclose(rotation[8], 1.0) and model.geom_pos[geom, 2] == 0.0)

@@ -1,121 +1,149 @@
-"""Scenes from a seed, as primitives: a forest, a warehouse, a track of gates.
+"""Scenes from a seed: a forest, a warehouse, a track of gates.
 
 World frame: z up, m. A generator draws all numbers of a scene from one stream, in one order.
 """
 
 import math
-from collections.abc import Callable, Iterable, Sequence
-from typing import Final
+from collections.abc import Callable, Sequence
+from typing import Final, Literal
 
+import mujoco
 import numpy as np
-
-from .primitives import Colour, Kind, Light, Material, Pattern, Point, Primitive, Scene
+from numpy.typing import ArrayLike as Vector
 
 CLEARANCE: Final = 8.0
-"""Half the width of the space about the z axis that no primitive but a gate enters, m."""
+"""Half the width of the space about the z axis that nothing but a gate enters, m."""
 CLEARANCE_HEIGHT: Final = 20.0
 """Height of that space, m."""
+GROUP: Final = 2
+"""Group of the geoms of a scene."""
+SKY: Final = mujoco.mjtTexture.mjTEXTURE_SKYBOX
 
 _FOREST: Final = 60.0  # m: half the width of the wood
 _LENGTH, _WIDTH, _HEIGHT = 30.0, 20.0, 24.0  # m: half length, half width and height of the hall
 _GATES: Final = 8
 _OPENING: Final = 5.0  # m: the paper's craft is 2.8 m wide with its rotors
 
+Kind = Literal["plane", "box", "cylinder", "ellipsoid"]
+Pattern = Literal["", "checker", "edge", "random"]
 
-class _Builder:
-    """Collects the parts of a scene, and draws its numbers."""
+_KINDS: Final = {
+    "plane": mujoco.mjtGeom.mjGEOM_PLANE,
+    "box": mujoco.mjtGeom.mjGEOM_BOX,
+    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
+    "ellipsoid": mujoco.mjtGeom.mjGEOM_ELLIPSOID,
+}
+_FLAT: Final = mujoco.mjtBuiltin.mjBUILTIN_FLAT
+_PATTERNS: Final = {
+    "checker": (mujoco.mjtBuiltin.mjBUILTIN_CHECKER, mujoco.mjtMark.mjMARK_NONE),
+    "edge": (_FLAT, mujoco.mjtMark.mjMARK_EDGE),
+    "random": (_FLAT, mujoco.mjtMark.mjMARK_RANDOM),
+}
 
-    def __init__(self, seed: int) -> None:
+
+class Builder:
+    """Adds the parts of a scene to a spec, and draws its numbers. Nothing of it touches or weighs
+    anything."""
+
+    def __init__(self, spec: mujoco.MjSpec, scene: str, seed: int) -> None:
+        self.spec = spec
+        self.scene = scene
         self.rng = np.random.Generator(np.random.PCG64(seed))
-        self.materials: list[Material] = []
-        self.primitives: list[Primitive] = []
-        self.lights: list[Light] = []
-
-    def scene(self, name: str, sky: tuple[Colour, Colour]) -> Scene:
-        return Scene(
-            name=name,
-            materials=tuple(self.materials),
-            primitives=tuple(self.primitives),
-            lights=tuple(self.lights),
-            sky=sky,
-        )
 
     def uniform(self, low: float, high: float) -> float:
         return float(self.rng.uniform(low, high))
 
-    def colour(self, base: Colour, by: float = 0.06) -> Colour:
+    def choose(self, words: Sequence[str]) -> str:
+        return words[int(self.rng.integers(len(words)))]
+
+    def colour(self, base: Vector, by: float = 0.06) -> np.ndarray:
         """A colour near `base`."""
-        red, green, blue = np.clip(np.array(base) + self.rng.uniform(-by, by, 3), 0.02, 1.0)
-        return float(red), float(green), float(blue)
+        return np.clip(np.array(base) + self.rng.uniform(-by, by, 3), 0.02, 1.0)
+
+    def around(self, reach: float, far: float) -> tuple[float, float]:
+        """A place up to `far` from which `reach` does not lead into the clear space."""
+        while True:
+            x, y = self.rng.uniform(-far, far, 2).tolist()
+            if max(abs(x), abs(y)) > CLEARANCE + reach:
+                return x, y
 
     def material(
         self,
         name: str,
-        colour: Colour,
+        colour: Vector,
         pattern: Pattern = "",
         repeat: float = 0.5,
         by: float = 0.06,
         gloss: float = 0.0,
     ) -> str:
-        """The name of a new material whose colour is near another one."""
-        colour = self.colour(colour, by)
-        second = colour
-        if pattern:
-            red, green, blue = np.array(colour) * self.rng.uniform(0.82, 0.94)
-            second = float(red), float(green), float(blue)
-        material = Material(
-            name=name, colour=colour, pattern=pattern, second_colour=second, repeat=repeat,
-            gloss=gloss,
+        """The name of a new material of a colour near another one. Its pattern has so many
+        repetitions per metre.
+        """
+        first = self.colour(colour, by)
+        whole = f"{self.scene}/{name}"
+        material = self.spec.add_material(name=whole, specular=gloss)
+        if not pattern:
+            material.rgba = (*first, 1.0)
+            return name
+        second = first * self.rng.uniform(0.82, 0.94)
+        builtin, mark = _PATTERNS[pattern]
+        self.spec.add_texture(
+            name=whole, type=mujoco.mjtTexture.mjTEXTURE_2D, width=128, height=128,
+            builtin=builtin, rgb1=first, rgb2=second, markrgb=second, random=0.2, mark=mark,
         )  # fmt: skip
-        self.materials.append(material)
+        material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = whole
+        material.texuniform = True
+        material.texrepeat = (repeat, repeat)
         return name
 
     def add(
         self,
         name: str,
         kind: Kind,
-        size: Iterable[float],
-        position: Iterable[float],
+        size: Vector,
+        position: Vector,
         material: str,
-        turn: Point = (0.0, 0.0, 0.0),
+        turn: Vector = (0.0, 0.0, 0.0),
     ) -> None:
-        a, b, c = map(float, size)
-        x, y, z = map(float, position)
-        primitive = Primitive(
-            name=name, kind=kind, size=(a, b, c), position=(x, y, z), turn=turn, material=material
-        )
-        self.primitives.append(primitive)
+        """Add a geom that is turned about x, y and z, one after the other."""
+        quaternion = np.empty(4)
+        mujoco.mju_euler2Quat(quaternion, np.array(turn, float), "XYZ")
+        self.spec.worldbody.add_geom(
+            name=f"{self.scene}/{name}", type=_KINDS[kind], size=size, pos=position,
+            quat=quaternion, material=f"{self.scene}/{material}", contype=0, conaffinity=0,
+            group=GROUP, mass=0.0, density=0.0,
+        )  # fmt: skip
 
-    def choose(self, words: Sequence[str]) -> str:
-        return words[int(self.rng.integers(len(words)))]
+    def light(
+        self, name: str, position: Vector, direction: Vector, diffuse: Vector, ambient: float
+    ) -> None:
+        """Add a light from one direction. A shadow of a slanted one would speckle the ground."""
+        self.spec.worldbody.add_light(
+            name=f"{self.scene}/{name}", type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+            castshadow=False, pos=position, dir=direction, diffuse=diffuse,
+            ambient=(ambient,) * 3, specular=(0, 0, 0),
+        )  # fmt: skip
 
-    def sun(self) -> tuple[Colour, Colour]:
-        """Add a sun from a side of its own; returns the colours of its sky."""
+    def sky(self, top: Vector, horizon: Vector) -> None:
+        """Add a sky of two colours."""
+        self.spec.add_texture(
+            name=f"{self.scene}/sky", type=SKY, builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+            rgb1=top, rgb2=horizon, width=128, height=768,
+        )  # fmt: skip
+
+    def sun(self) -> None:
+        """Add a sun from a side of its own, and its sky."""
         azimuth = self.uniform(0.0, 2 * math.pi)
         down = self.uniform(1.0, 2.5)
         bright = self.uniform(0.6, 0.8)
-        light = Light(
-            name="sun",
-            position=(0.0, 0.0, 60.0),
-            direction=(math.cos(azimuth), math.sin(azimuth), -down),
-            diffuse=(bright, bright, 0.95 * bright),
-            ambient=0.2,
-        )
-        self.lights.append(light)
-        return self.colour((0.40, 0.60, 0.86)), (0.93, 0.95, 0.97)
-
-    def around(self, reach: float, far: float) -> tuple[float, float]:
-        """A place up to `far` from which `reach` does not lead into the clear space."""
-        while True:
-            x, y = (float(value) for value in self.rng.uniform(-far, far, 2))
-            if max(abs(x), abs(y)) > CLEARANCE + reach:
-                return x, y
+        direction = (math.cos(azimuth), math.sin(azimuth), -down)
+        self.light("sun", (0.0, 0.0, 60.0), direction, (bright, bright, 0.95 * bright), 0.2)
+        self.sky(self.colour((0.40, 0.60, 0.86)), (0.93, 0.95, 0.97))
 
 
-def forest(seed: int) -> Scene:
+def forest(wood: Builder) -> None:
     """A wood of 120 m by 120 m: trees, shrubs and rocks."""
-    wood = _Builder(seed)
-    sky = wood.sun()
+    wood.sun()
     ground = wood.material("ground", (0.36, 0.42, 0.22), "random", 0.1)
     bark = [wood.material(f"bark_{i}", (0.36, 0.26, 0.17), "random") for i in range(2)]
     greens = (0.15, 0.33, 0.16), (0.26, 0.43, 0.15), (0.40, 0.47, 0.16), (0.30, 0.38, 0.20)
@@ -136,10 +164,9 @@ def forest(seed: int) -> Scene:
         x, y = wood.around(1.0, _FOREST)
         turn = (0.0, 0.0, wood.uniform(0, math.pi))
         wood.add(f"rock_{i}/stone", "ellipsoid", sides, (x, y, 0.2 * sides[2]), stone, turn)
-    return wood.scene("forest", sky)
 
 
-def _add_tree(wood: _Builder, name: str, bark: Sequence[str], leaves: Sequence[str]) -> None:
+def _add_tree(wood: Builder, name: str, bark: Sequence[str], leaves: Sequence[str]) -> None:
     x, y = wood.around(3.2, _FOREST)
     tall = wood.uniform(6.0, 15.0)
     wide = wood.uniform(1.4, 3.0)
@@ -161,40 +188,34 @@ def _add_tree(wood: _Builder, name: str, bark: Sequence[str], leaves: Sequence[s
             wood.add(f"{name}/crown_{part}", "ellipsoid", (0.7 * wide,) * 3, position, leaf)
 
 
-def warehouse(seed: int) -> Scene:
+def warehouse(hall: Builder) -> None:
     """A hall of 60 m by 40 m, 24 m high. Racks, pallets and barrels stand along its walls."""
-    hall = _Builder(seed)
-    sky = hall.colour((0.55, 0.60, 0.66)), hall.colour((0.62, 0.64, 0.66))
+    hall.sky(hall.colour((0.55, 0.60, 0.66)), hall.colour((0.62, 0.64, 0.66)))
     floor = hall.material("floor", (0.55, 0.55, 0.53), "checker", 0.25)
     wall = hall.material("wall", (0.72, 0.72, 0.70), "edge", 0.3, by=0.03)
     roof = hall.material("roof", (0.50, 0.52, 0.55), "edge", 0.2)
     steel = hall.material("steel", (0.20, 0.34, 0.62), by=0.15, gloss=0.2)
     pallet = hall.material("pallet", (0.62, 0.48, 0.30), "random")
     glass = hall.material("glass", (0.70, 0.84, 0.93), "edge", 0.5)
-    hall.materials.append(Material(name="lamp", colour=(1.0, 0.98, 0.90), emission=0.9))
+    hall.spec.add_material(
+        name="warehouse/lamp", rgba=(1.0, 0.98, 0.90, 1.0), specular=0.0, emission=0.9
+    )
     tints = (0.72, 0.53, 0.33), (0.62, 0.44, 0.27), (0.25, 0.45, 0.66), (0.72, 0.24, 0.20)
     boxes = [hall.material(f"box_{i}", tint, "edge", 1.0, by=0.1) for i, tint in enumerate(tints)]
     hall.add("ground/floor", "plane", (_LENGTH, _WIDTH, 1), (0, 0, 0), floor)
     _add_hall(hall, wall, roof, steel, glass)
     for i, x in enumerate((-15.0, 15.0)):
         bright = hall.uniform(0.28, 0.42)
-        light = Light(
-            name=f"light_{i}",
-            position=(x, 0.0, 22.0),
-            direction=(-x / 30, hall.uniform(-0.4, 0.4), -1.0),
-            diffuse=(bright,) * 3,
-            ambient=0.15,
-        )
-        hall.lights.append(light)
+        direction = (-x / 30, hall.uniform(-0.4, 0.4), -1.0)
+        hall.light(f"light_{i}", (x, 0.0, 22.0), direction, (bright,) * 3, 0.15)
     racks = [(x, y) for y in (-16.5, -11.0, 11.0, 16.5) for x in (-20.0, -7.0, 7.0, 20.0)]
     for i, (x, y) in enumerate(racks):
         _add_rack(hall, f"rack_{i}", x, y, steel, boxes)
     for i in range(20):
         _add_goods(hall, i, pallet, boxes)
-    return hall.scene("warehouse", sky)
 
 
-def _add_hall(hall: _Builder, wall: str, roof: str, steel: str, glass: str) -> None:
+def _add_hall(hall: Builder, wall: str, roof: str, steel: str, glass: str) -> None:
     """Walls with windows, and a roof with lamps."""
     middle = _HEIGHT / 2
     right = math.pi / 2
@@ -217,7 +238,7 @@ def _add_hall(hall: _Builder, wall: str, roof: str, steel: str, glass: str) -> N
 
 
 def _add_rack(
-    hall: _Builder, name: str, x: float, y: float, steel: str, boxes: Sequence[str]
+    hall: Builder, name: str, x: float, y: float, steel: str, boxes: Sequence[str]
 ) -> None:
     for j, (dx, dy) in enumerate(((-4.0, -0.6), (-4.0, 0.6), (4.0, -0.6), (4.0, 0.6))):
         hall.add(f"{name}/post_{j}", "box", (0.07, 0.07, 3.6), (x + dx, y + dy, 3.6), steel)
@@ -232,7 +253,7 @@ def _add_rack(
                 hall.add(f"{name}/box_{4 * level + slot}", "box", half, position, tint)
 
 
-def _add_goods(hall: _Builder, number: int, pallet: str, boxes: Sequence[str]) -> None:
+def _add_goods(hall: Builder, number: int, pallet: str, boxes: Sequence[str]) -> None:
     """A barrel, or a box on a pallet; the first six stand in the middle."""
     if number < 6:
         x, y = hall.around(1.0, _WIDTH - 6.5)
@@ -248,10 +269,9 @@ def _add_goods(hall: _Builder, number: int, pallet: str, boxes: Sequence[str]) -
     hall.add(f"pallet_{number}/box", "box", half, (x, y, 0.16 + half[2]), tint)
 
 
-def gates(seed: int) -> Scene:
+def gates(track: Builder) -> None:
     """A ring of 8 gates, 5 m wide inside, with barriers, cones and stands around it."""
-    track = _Builder(seed)
-    sky = track.sun()
+    track.sun()
     grass = track.material("grass", (0.36, 0.50, 0.26), "checker", 0.08)
     steel = track.material("steel", (0.30, 0.31, 0.33), gloss=0.2)
     stand = track.material("stand", (0.60, 0.61, 0.63), "edge", 0.5)
@@ -278,10 +298,9 @@ def gates(seed: int) -> Scene:
             size = (0.75, 9.0, height)
             turn = (0.0, 0.0, angle)
             track.add(f"stand_{i}/row_{row}", "box", size, position, stand, turn)
-    return track.scene("gates", sky)
 
 
-def _add_gate(track: _Builder, number: int, paint: Sequence[str], steel: str) -> None:
+def _add_gate(track: Builder, number: int, paint: Sequence[str], steel: str) -> None:
     half = _OPENING / 2
     bar = 0.25
     angle = 2 * math.pi * number / _GATES + track.uniform(-0.15, 0.15)
@@ -308,9 +327,9 @@ def _add_gate(track: _Builder, number: int, paint: Sequence[str], steel: str) ->
         track.add(f"gate_{number}/frame_{part}", "box", (0.15, half, bar), position, tint, turn)
 
 
-GENERATORS: Final[dict[str, Callable[[int], Scene]]] = {
+GENERATORS: Final[dict[str, Callable[[Builder], None]]] = {
     "warehouse": warehouse,
     "forest": forest,
     "gates": gates,
 }
-"""The function that draws each scene from a seed."""
+"""The function that builds each scene."""
