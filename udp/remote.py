@@ -157,7 +157,7 @@ class RemoteEnv(_Remote, gym.Env[Any, Any]):
         """Fly for one control period. The action is sent in the dtype of its space."""
         if not self._flying:
             raise gym.error.ResetNeeded("step: expected a call of reset() first")
-        actions = action if isinstance(action, np.ndarray) else np.asarray(action)
+        actions = np.asarray(action)
         if actions.dtype != self._dtype or actions.shape != self._row:
             actions = _checked_actions(actions, self._dtype, self._row)
         actions = actions[np.newaxis]
@@ -449,17 +449,13 @@ def _checked_actions(action: ArrayLike, dtype: np.dtype, shape: tuple[int, ...])
     Raises `InputError` for another shape, and what is not real or cannot be of that dtype.
     """
     array = np.asarray(action)
-    if array.shape != shape:
-        raise InputError(f"action: expected an array of shape {shape}, got shape {array.shape}")
-    if array.dtype == dtype:
-        return array
-    if array.dtype.kind not in ("iuf" if dtype.kind == "f" else "iu"):
-        expected = "real" if dtype.kind == "f" else "whole"
-        raise InputError(f"action: expected {expected} numbers, got {array.dtype}")
-    if dtype.kind == "f":
-        with np.errstate(over="ignore", under="ignore"):  # independent of the program's settings
-            return array.astype(dtype)  # an overflow is infinite, and refused as such
-    whole = array.astype(dtype)
-    if (whole != array).any():
+    is_real = dtype.kind == "f"
+    if array.shape != shape or array.dtype.kind not in ("iuf" if is_real else "iu"):
+        numbers = "real" if is_real else "whole"
+        got = f"{array.dtype} of shape {array.shape}"
+        raise InputError(f"action: expected {numbers} numbers of shape {shape}, got {got}")
+    with np.errstate(over="ignore", under="ignore"):  # independent of the program's settings
+        sent = array.astype(dtype)  # an overflow is infinite, and refused as such
+    if not is_real and (sent != array).any():
         raise InputError(f"action: expected numbers of {dtype}, got {array}")
-    return whole
+    return sent

@@ -16,13 +16,7 @@ from ..envs.config import EnvConfig
 from .protocol.client import Address
 from .protocol.errors import PeerClosed, PeerSilent
 from .remote import RemoteEnv, RemoteVectorEnv
-
-__all__ = [
-    "cached_simulator",
-    "close_cached_simulators",
-    "spawn_simulator",
-    "start_simulator",
-]
+from .transport.agent import AgentSettings
 
 Remote = RemoteEnv | RemoteVectorEnv
 _START_TIMEOUT: Final = 60.0
@@ -52,10 +46,9 @@ def spawn_simulator(
         PeerSilent: The simulator runs and does not answer.
     """
     count = config.drones if num_envs is None else num_envs
-    settings: dict[str, Any] = {
+    settings: AgentSettings = {
         "env_id": config.env_id,
         "options": config.flat_options(),
-        "connect": False,
         "connect_timeout": _POLL,
         "timeout": _ANSWER_TIMEOUT,
         "record": record,
@@ -63,9 +56,11 @@ def spawn_simulator(
     here = ("127.0.0.1", 0)
     env: Remote
     if num_envs is None and count == 1:
-        env = RemoteEnv(here, **settings)
+        env = RemoteEnv(here, connect=False, **settings)
     else:
-        env = RemoteVectorEnv(here, num_envs=count, autoreset_mode="Disabled", **settings)
+        env = RemoteVectorEnv(
+            here, num_envs=count, autoreset_mode="Disabled", connect=False, **settings
+        )
     with TemporaryFile("w+") as said:
         process = start_simulator(config, env.address, num_envs=count, stderr=said)
         try:

@@ -106,8 +106,11 @@ def test_wrong_actions_and_seeds_raise_and_nothing_has_happened() -> None:
         for action, sentence in [
             (np.array([np.nan]), "action: expected finite numbers"),
             (np.array([np.inf]), "action: expected finite numbers"),
-            (np.zeros(2), r"action: expected an array of shape \(1,\), got shape \(2,\)"),
-            (0.5, r"expected an array of shape \(1,\), got shape \(\)"),
+            (
+                np.zeros(2),
+                r"action: expected real numbers of shape \(1,\), got float64 of shape \(2,\)",
+            ),
+            (0.5, r"expected real numbers of shape \(1,\), got float64 of shape \(\)"),
         ]:
             with pytest.raises(ValueError, match=sentence):
                 remote.step(action)

@@ -100,7 +100,7 @@ class Session:
         self.asked_at = self.heard_at = 0.0
         self.is_plain = False  # whether it has a slot, and its messages are neither sealed nor text
         self._outbox = outbox
-        self._assembler: Assembler | None = None
+        self._assembler = Assembler(layout.state.size)
         self._largest = largest_datagram(peer, outbox.max_datagram)
 
     def move(self, way: Way, kind: type[Message]) -> None:
@@ -264,7 +264,6 @@ class Session:
                 self._answer_again()
             self._drop("duplicate" if is_repeat else "stale", now)
             return None
-        self._assembler = self._assembler or Assembler(self.layout.state.size)
         self.heard_at = now
         whole = self._assembler.take(fragment)
         if whole is None and (answer := self._assembler.ask(fragment)):

@@ -267,79 +267,69 @@ class Agent:
     def _handle(self, event: Event, address: Address) -> None:
         slot = event.slot
         message = event.message
-        if isinstance(message, Close):
-            self._lose(slot, f"the simulator at {address_text(address)} closed: {message.reason}")
-            if not any(self.server.slots):
-                _flush(self.server, self._port)
-                raise PeerClosed(self.lost[slot])
-            self._say_waiting(slot)
-            return
-        if event.joined:
-            self._welcome(slot, address)
-        self.states[slot] = message
-
-    def _welcome(self, slot: int, address: Address) -> None:
-        """Another simulator has this slot now."""
         session = self.server.slots[slot]
-        config = self.config
-        assert session is not None
-        self._keep_sockets()
-        if session.hello:
-            self.server.takes_text = False
-            config.spec = _spec(session.hello.spec)
+        if isinstance(message, Close):
+            reason = f"the simulator at {address_text(address)} closed: {message.reason}"
+            if not any(self.server.slots):
+                self.lost[slot] = reason
+                self._keep_sockets()
+                _flush(self.server, self._port)
+                raise PeerClosed(reason)
+            self._lose(slot, reason)
+            return
+        if event.joined and session:  # another simulator has this slot now
+            config = self.config
+            if session.hello:
+                self.server.takes_text = False
+                config.spec = _spec(session.hello.spec)
+            else:
+                config.spec = config.text_spec
             config.drones = session.layout.drones
-        else:
-            config.spec = config.text_spec
-            config.drones = 1
-        if slot in self.states and not self.lost[slot]:
-            self._lose(slot, f"the simulator at {address_text(address)} was started anew")
-            _log.warning("%s", self.lost[slot])
+            self._keep_sockets()
+            if slot in self.states and not self.lost[slot]:
+                self._lose(slot, f"the simulator at {address_text(address)} was started anew")
+        self.states[slot] = message
 
     def _give_up(self, pending: list[int], now: float) -> None:
         """Free the slots of silent simulators. Raises `PeerSilent` if no other took a free slot."""
+        config = self.config
+        here = address_text(self.address)
         for slot in pending:
             if now < self._deadlines[slot]:
                 continue
             session = self.server.slots[slot]
+            last = self.server.statistics.last_error
+            dropped = f"; last datagram dropped: {last}" if last else ""
             if session is None:
                 lost = self.lost[slot]
-                dropped = self._last_dropped()
                 if dropped in lost:
                     dropped = ""
                 nobody = f"{lost}; no other" if lost else "no simulator"
-                here = address_text(self.address)
-                seconds = f"{self.config.connect_timeout:g} s"
+                seconds = f"{config.connect_timeout:g} s"
                 raise PeerSilent(f"{nobody} came to {here} for {seconds}{dropped}")
-            if now < session.heard_at + self.config.timeout:  # it computes
-                self._deadlines[slot] = session.heard_at + self.config.timeout
+            if now < session.heard_at + config.timeout:  # it computes
+                self._deadlines[slot] = session.heard_at + config.timeout
                 continue
-            here = address_text(self.address)
             there = address_text(session.peer)
-            reason = (
-                f"no datagram from the simulator at {there} for {self.config.timeout:g} s, "
-                f"waiting at {here} for State {session.sequence + 1}{self._last_dropped()}"
-            )
             self.server.free(slot)
-            self._lose(slot, reason)
-            self._say_waiting(slot)
+            self._lose(
+                slot,
+                f"no datagram from the simulator at {there} for {config.timeout:g} s, "
+                f"waiting at {here} for State {session.sequence + 1}{dropped}",
+            )
 
     def _keep_sockets(self) -> None:
         self._port.keep([session.peer for session in self.server.slots if session])
 
     def _lose(self, slot: int, reason: str) -> None:
         self.lost[slot] = reason
-        self._deadlines[slot] = time.monotonic() + self.config.connect_timeout
-        self._keep_sockets()
-
-    def _say_waiting(self, slot: int) -> None:
-        here = address_text(self.address)
         wait = self.config.connect_timeout
-        long = f"{wait:g} s " if wait < 86_400 else ""  # commands wait without limit
-        _log.warning("%s; waiting %sfor another at %s", self.lost[slot], long, here)
-
-    def _last_dropped(self) -> str:
-        last = self.server.statistics.last_error
-        return f"; last datagram dropped: {last}" if last else ""
+        self._deadlines[slot] = time.monotonic() + wait
+        self._keep_sockets()
+        if self.server.slots[slot] is None:
+            long = f"{wait:g} s " if wait < 86_400 else ""  # commands wait without limit
+            reason += f"; waiting {long}for another at {address_text(self.address)}"
+        _log.warning("%s", reason)
 
 
 @lru_cache(maxsize=4)

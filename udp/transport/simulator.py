@@ -9,7 +9,6 @@ from typing import Any, Final, Literal, cast
 import numpy as np
 
 from ...envs.config import DEFAULT_ENV, EnvConfig
-from ...envs.spec import EnvSpec
 from ...models.errors import InputError
 from ...models.fields import Choice, Limits, check
 from ..layouts import layout_of
@@ -20,7 +19,7 @@ from ..protocol.messages import POLICIES, Hello
 from ..protocol.party import AgentLink, OneAgent, SeveralAgents, SwarmWorld, WorldRules
 from .driver import Driver
 from .sockets import TEXT_WAY_OUT, WAY_OUT, Port, resolve
-from .stepped import GymEnv, Steppable, make_stepped
+from .stepped import GymEnv, GymnasiumWorld, make_stepped
 
 DEFAULT_AGENT: Final = ("127.0.0.1", 8001)
 DEFAULT_SIMULATOR: Final = ("127.0.0.1", 8000)
@@ -91,25 +90,36 @@ class Simulator(Driver):
             failing.callback(stepped.close)
             spec = stepped.spec
             worlds = stepped.num_envs // len(spec.agents)
+            layout = layout_of(spec, worlds)
             servers = [server] if agents is None else list(agents)
             links: list[AgentLink] = []
             for number, address in enumerate(servers):
                 there = resolve(address, insecure=insecure, way_out=way_out)
+                if not there[1]:
+                    raise InputError("server: expected the port of the agent, 1 to 65535, got 0")
                 rows = _share(len(spec.agents), number, len(servers))
                 own = replace(spec, agents=spec.agents[rows[0] : rows[-1] + 1])
-                changed = replace(config, drop_seed=config.drop_seed + number)
-                client = _client(own, worlds, there, changed, by_text=by_text, key=key)
+                client = Client(
+                    Hello(session=new_session(), spec=own.to_json(), worlds=worlds),
+                    layout_of(own, worlds),
+                    replace(config, drop_seed=config.drop_seed + number),
+                    largest=largest_datagram(there, config.max_datagram),
+                    by_text=by_text,
+                    key=key,
+                )
                 links.append(AgentLink(number, there, client, rows))
             port = _open_port(bind, [link.address for link in links], insecure=insecure)
             failing.callback(port.close)
-            layout = layout_of(spec, worlds)
-            period = spec.control_period
             rules: WorldRules
             if agents is None:
-                rules = OneAgent(stepped, layout, period, links)
+                rules = OneAgent(stepped, layout, spec.control_period, links)
+            elif isinstance(stepped, GymnasiumWorld):
+                raise InputError(f"env: expected a registered task for several drones, got {env!r}")
             else:
-                world = _swarm_world(stepped, env)
-                rules = SeveralAgents(world, layout, period, links, when_lost, patience)
+                world = cast(SwarmWorld, stepped)
+                rules = SeveralAgents(
+                    world, layout, spec.control_period, links, when_lost, patience
+                )
             super().__init__(stepped, rules, port)
             if record:
                 self._record(record)
@@ -144,27 +154,3 @@ def _open_port(bind: Address, agents: list[Address], *, insecure: bool) -> Port:
         port.close()
         raise InputError(f"server: expected the address of an agent, got that of this side, {bind}")
     return port
-
-
-def _client(
-    spec: EnvSpec,
-    worlds: int,
-    there: Address,
-    config: LinkConfig,
-    *,
-    by_text: bool,
-    key: Key | None,
-) -> Client:
-    """A client for the agent at an address, with a session of its own."""
-    if not there[1]:
-        raise InputError("server: expected the port of the agent, 1 to 65535, got 0")
-    hello = Hello(session=new_session(), spec=spec.to_json(), worlds=worlds)
-    largest = largest_datagram(there, config.max_datagram)
-    layout = layout_of(spec, worlds)
-    return Client(hello, layout, config, largest=largest, by_text=by_text, key=key)
-
-
-def _swarm_world(stepped: Steppable, env: object) -> SwarmWorld:
-    if not hasattr(stepped, "retire"):
-        raise InputError(f"env: expected a registered task for several drones, got {env!r}")
-    return cast(SwarmWorld, stepped)

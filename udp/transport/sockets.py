@@ -175,6 +175,7 @@ class Port:
         self._own: dict[Address, Socket] = {}
         self._simulators = selectors.DefaultSelector()
         self._all = selectors.DefaultSelector()
+        self._selectors = self._simulators, self._all
         self._all.register(self._everybody, selectors.EVENT_READ)
         self._missing = False  # whether a simulator's datagrams come to the socket for all senders
         self._next_look = 0.0
@@ -185,7 +186,7 @@ class Port:
         """Have a socket for each of these, and no others."""
         for peer in self._own.keys() - set(peers):
             sock = self._own.pop(peer)
-            for selector in (self._simulators, self._all):
+            for selector in self._selectors:
                 selector.unregister(sock)
             sock.close()
         if sys.platform == "linux":  # others sort the datagrams of one port by other rules
@@ -246,9 +247,8 @@ class Port:
     def close(self) -> None:
         """Close every socket."""
         self.keep(())
-        self._simulators.close()
-        self._all.close()
-        self._everybody.close()
+        for each in (*self._selectors, self._everybody):
+            each.close()
 
     def _add(self, peer: Address) -> None:
         try:
@@ -267,7 +267,7 @@ class Port:
         finally:
             self._everybody.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 0)
         self._own[peer] = sock
-        for selector in (self._simulators, self._all):
+        for selector in self._selectors:
             selector.register(sock, selectors.EVENT_READ)
 
 
