@@ -8,17 +8,14 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import VectorEnv
-from peers import ANY, ENV_ID, Running
+from peers import ANY, ENV_ID, Running, simulate
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 from rotorgram.envs.spec import component_names
 from rotorgram.udp import (
-    LinkConfig,
     RemoteVectorEnv,
-    Simulator,
 )
 
-QUICK = LinkConfig(timeout=10)
 SPEC = env_spec(EnvConfig(env_id=ENV_ID))
 NAMES = [name for array in SPEC.telemetry for name in component_names(array)]
 
@@ -42,10 +39,6 @@ def flying(
         remote.close()
         for one in running:
             one.join()
-
-
-def simulate(remote: RemoteVectorEnv, config: LinkConfig = QUICK, **arguments: Any) -> Running:
-    return Running(Simulator(server=remote.address, config=config, **{"bind": ANY, **arguments}))
 
 
 @contextmanager

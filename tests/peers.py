@@ -7,11 +7,13 @@ import textwrap
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
-from rotorgram.udp import Simulator
+from rotorgram.udp import LinkConfig, Simulator
 
 ANY = ("127.0.0.1", 0)
 ENV_ID = "rotorgram/Elevation-v0"
+QUICK = LinkConfig(timeout=8)
 
 
 class Running:
@@ -39,6 +41,12 @@ class Running:
         """End it without a word to the agent, as if it had been killed."""
         self.simulator.close()
         assert isinstance(self.join(), OSError)
+
+
+def simulate(agent: Any, config: LinkConfig = QUICK, **arguments: Any) -> Running:
+    """A simulator for an agent, given itself or by its address."""
+    server = getattr(agent, "address", agent)
+    return Running(Simulator(server=server, config=config, **{"bind": ANY, **arguments}))
 
 
 def launch(code: str, *arguments: object, stdin: int | None = None) -> subprocess.Popen[str]:

@@ -9,15 +9,11 @@ import gymnasium as gym
 import numpy as np
 import rotorgram.envs  # noqa: F401
 from gymnasium import spaces
-from peers import ANY, ENV_ID, Running
+from peers import ANY, ENV_ID, simulate
 from rotorgram.envs.spec import component_names
 from rotorgram.udp import (
-    LinkConfig,
     RemoteEnv,
-    Simulator,
 )
-
-QUICK = LinkConfig(timeout=5)
 
 
 @contextmanager
@@ -25,12 +21,9 @@ def flying(env: Any = ENV_ID, codec: Any = "binary", **options: Any) -> Iterator
     """A RemoteEnv, and a simulator for it in a thread."""
     known = {"env_id": ENV_ID, "options": options} if codec == "text" else {}
     remote = RemoteEnv(ANY, connect=False, timeout=5, connect_timeout=5, **known)
-    simulator = Simulator(
-        env, server=remote.address, bind=ANY, codec=codec, config=QUICK, **options
-    )
-    running = Running(simulator)
+    running = simulate(remote, env=env, codec=codec, **options)
     try:
-        yield SimpleNamespace(remote=remote, simulator=simulator, running=running)
+        yield SimpleNamespace(remote=remote, simulator=running.simulator, running=running)
     finally:
         remote.close()
         running.join()

@@ -10,8 +10,8 @@ from statistics import median
 from types import FrameType
 
 import numpy as np
-from peers import ANY, Running
-from rotorgram.udp import RemoteEnv, Simulator, protocol
+from peers import ANY, simulate
+from rotorgram.udp import RemoteEnv, protocol
 
 UDP = str(Path(protocol.__file__).parents[1])
 STEPS = 41
@@ -31,7 +31,7 @@ def test_a_step_of_one_drone_takes_few_calls() -> None:
     totals = []
     with closing(RemoteEnv(ANY, connect=False, timeout=5)) as remote:
         threading.setprofile(profile)
-        running = Running(Simulator(server=remote.address, bind=ANY))
+        running = simulate(remote)
         threading.setprofile(None)  # type: ignore[arg-type]
         remote.reset(seed=1)
         action = np.zeros(1, np.float32)

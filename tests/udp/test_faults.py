@@ -7,9 +7,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import rotorgram.envs  # noqa: F401
-from peers import ANY, ENV_ID, Running
+from peers import ANY, ENV_ID, simulate
 from relay import FaultConfig, Faults, relaying, udp_socket
-from rotorgram.udp import LinkConfig, RemoteVectorEnv, Simulator
+from rotorgram.udp import LinkConfig, RemoteVectorEnv
 from rotorgram.udp.protocol.auth import write_key
 
 COUNT = 20_000
@@ -79,9 +79,7 @@ def test_many_drones_fly_through_a_path_that_drops_fragments(mtu: int, tmp_path:
     remote = RemoteVectorEnv(ANY, num_envs=64, key_file=key, connect=False, **largest)
     with relaying(remote.address, faults) as relay:
         config = LinkConfig(timeout=20, **largest)
-        simulator = Running(
-            Simulator(server=relay.address, bind=ANY, num_envs=64, key_file=key, config=config)
-        )
+        simulator = simulate(relay, num_envs=64, key_file=key, config=config)
         local = gym.make_vec(ENV_ID, num_envs=64)
         assert remote.reset(seed=1)[0].tobytes() == local.reset(seed=1)[0].tobytes()
         actions = np.random.default_rng(0).uniform(-1, 1, (20, 64, 1)).astype(np.float32)

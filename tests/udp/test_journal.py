@@ -24,7 +24,7 @@ import pytest
 import zstandard
 from mcap.reader import make_reader
 from mcap.writer import Writer
-from peers import ANY, ENV_ID, Running, launch
+from peers import ANY, ENV_ID, launch, simulate
 from relay import FaultConfig, relaying
 from rotorgram.cli.replay import Replay
 from rotorgram.envs.config import EnvConfig
@@ -47,7 +47,6 @@ from rotorgram.udp.protocol.auth import write_key
 from rotorgram.udp.protocol.messages import Close, Command, Hello, Message, State, Welcome
 
 PAGE = Path(__file__).parents[2] / "docs" / "journal.md"
-QUICK = LinkConfig(timeout=5)
 TIMES: dict[str, Any] = {"timeout": 5, "connect_timeout": 5}
 
 
@@ -95,11 +94,8 @@ def pair(
         remote = RemoteEnv(ANY, **common)
     else:
         remote = RemoteVectorEnv(ANY, num_envs=drones, **common)
-    simulator = Simulator(
-        server=remote.address, bind=ANY, num_envs=drones, codec=codec, config=QUICK,
-        key_file=key_file, record=files["simulator"], **options,
-    )  # fmt: skip
-    running = Running(simulator)
+    ours = {"key_file": key_file, "record": files["simulator"], **options}
+    running = simulate(remote, num_envs=drones, codec=codec, **ours)
     try:
         yield SimpleNamespace(remote=remote, **files)
     finally:
@@ -190,7 +186,7 @@ def test_a_tilted_flight_by_text_is_repeated(tmp_path: Path) -> None:
     file = tmp_path / "simulator.mcap"
     hover = "rotorgram/Hover-v0"
     remote = RemoteEnv(ANY, env_id=hover, options={}, connect=False, timeout=5)
-    running = Running(Simulator(hover, server=remote.address, bind=ANY, codec="text", record=file))
+    running = simulate(remote, env=hover, codec="text", record=file)
     remote.reset(seed=3)
     for _ in range(10):
         *_, info = remote.step(np.array([0.1, -0.1, 0.05, 0.0], np.float32))
@@ -203,7 +199,7 @@ def test_a_tilted_flight_by_text_is_repeated(tmp_path: Path) -> None:
 def test_an_agent_with_a_journal_does_not_fly_text(tmp_path: Path) -> None:
     record = tmp_path / "agent.mcap"
     with closing(RemoteEnv(ANY, env_id=ENV_ID, connect=False, record=record, **TIMES)) as remote:
-        running = Running(Simulator(server=remote.address, bind=ANY, codec="text", config=QUICK))
+        running = simulate(remote, codec="text")
         with pytest.raises(PeerSilent, match="text is not flown here"):
             remote.connect()
         assert isinstance(running.join(), Refused)
@@ -257,11 +253,7 @@ def test_a_journal_has_the_model_of_each_vehicle_of_a_mix(tmp_path: Path) -> Non
     }  # fmt: skip
     path = tmp_path / "mix.mcap"
     with closing(RemoteVectorEnv(ANY, num_envs=3, connect=False, **TIMES)) as remote:
-        simulator = Simulator(
-            server=remote.address, bind=ANY, drones=3, num_envs=3, record=path, config=QUICK,
-            **options,
-        )  # fmt: skip
-        running = Running(simulator)
+        running = simulate(remote, drones=3, num_envs=3, record=path, **options)
         fly(remote, 3)
     running.join()
     recording = Recording(path)
@@ -314,9 +306,7 @@ def changed_spec(**values: Any) -> Callable[[Message], Message]:
 def test_a_flight_of_another_env_is_recorded_and_not_repeated(tmp_path: Path) -> None:
     path = tmp_path / "pole.mcap"
     remote = RemoteEnv(ANY, env_id="CartPole-v1", connect=False, **TIMES)
-    simulator = Simulator("CartPole-v1", server=remote.address, bind=ANY, config=QUICK,
-                          record=path, sutton_barto_reward=True)  # fmt: skip
-    running = Running(simulator)
+    running = simulate(remote, env="CartPole-v1", record=path, sutton_barto_reward=True)
     with remote:
         fly(remote, 60)
     running.join()
@@ -341,8 +331,7 @@ def test_a_flight_that_never_began(tmp_path: Path) -> None:
 def test_a_refused_simulator(tmp_path: Path) -> None:
     path = tmp_path / "refused.mcap"
     with RemoteEnv(ANY, env_id=ENV_ID, connect=False, timeout=5, connect_timeout=1) as remote:
-        simulator = Simulator("CartPole-v1", server=remote.address, bind=ANY, record=path)
-        running = Running(simulator)
+        running = simulate(remote, env="CartPole-v1", record=path)
         with pytest.raises(PeerSilent):
             remote.connect()
         assert isinstance(running.join(), Refused)
@@ -443,10 +432,7 @@ def test_a_missing_command_is_noticed(flight: SimpleNamespace, tmp_path: Path) -
 def test_several_simulators_at_once(tmp_path: Path) -> None:
     path = tmp_path / "agent.mcap"
     remote = RemoteVectorEnv(ANY, num_simulators=2, num_envs=4, connect=False, record=path, **TIMES)
-    running = [
-        Running(Simulator(server=remote.address, bind=ANY, num_envs=2, config=QUICK))
-        for _ in range(2)
-    ]
+    running = [simulate(remote, num_envs=2) for _ in range(2)]
     seen = fly(remote, 300)
     remote.close()
     for one in running:
@@ -468,7 +454,7 @@ def test_an_agent_that_was_started_anew(tmp_path: Path) -> None:
     killed = launch(RECORD, 0, tmp_path / "killed.mcap", 20, "wait")
     assert killed.stdout is not None
     address = "127.0.0.1", int(killed.stdout.readline())
-    running = Running(Simulator(server=address, bind=ANY, config=QUICK, record=path))
+    running = simulate(address, record=path)
     while not killed.stdout.readline().startswith("flown"):
         pass
     killed.kill()
@@ -491,7 +477,7 @@ def test_loss_and_repetition_do_not_enter(tmp_path: Path) -> None:
     faults = FaultConfig(drop=0.1, duplicate=0.1, reorder=0.1, corrupt=0.05, seed=3)
     remote = RemoteEnv(ANY, connect=False, record=ours, **TIMES)
     with relaying(remote.address, faults) as relay:
-        running = Running(Simulator(server=relay.address, bind=ANY, config=QUICK, record=theirs))
+        running = simulate(relay, record=theirs)
         fly(remote, 200)
         remote.close()
         running.join()
@@ -727,10 +713,7 @@ def test_sigkill_costs_at_most_a_second(tmp_path: Path) -> None:
     process = launch(RECORD, 0, path, 10**9)
     assert process.stdout is not None
     port = int(process.stdout.readline())
-    simulator = Simulator(
-        server=("127.0.0.1", port), bind=ANY, config=LinkConfig(timeout=1), record=None
-    )
-    running = Running(simulator)
+    running = simulate(("127.0.0.1", port), LinkConfig(timeout=1))
     start = time.monotonic()
     last = ""
     while time.monotonic() - start < 2.5:
@@ -754,7 +737,7 @@ def test_the_end_of_the_program_finishes_the_file(goodbye: str, tmp_path: Path) 
     process = launch(textwrap.dedent(RECORD) + goodbye + "\n", 0, path, 100)
     assert process.stdout is not None
     port = int(process.stdout.readline())
-    running = Running(Simulator(server=("127.0.0.1", port), bind=ANY, config=QUICK))
+    running = simulate(("127.0.0.1", port))
     _, errors = process.communicate(timeout=30)
     assert bool(errors) == bool(goodbye)
     assert running.join() == "the agent closed"
@@ -810,7 +793,7 @@ for _ in range(50):
     process = launch(textwrap.dedent(RECORD) + fork, 0, path, 100)
     assert process.stdout is not None
     server = "127.0.0.1", int(process.stdout.readline())
-    running = Running(Simulator(server=server, bind=ANY, config=QUICK))
+    running = simulate(server)
     _, errors = process.communicate(timeout=30)
     assert errors == ""
     assert running.join() == "the agent closed"

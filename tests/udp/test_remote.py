@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 import rotorgram.envs  # noqa: F401
 from gymnasium.utils.env_checker import check_env
-from peers import ANY, ENV_ID, Running, launch, plain_socket
-from remotes import QUICK, assert_parity, flying
+from peers import ANY, ENV_ID, QUICK, launch, plain_socket, simulate
+from remotes import assert_parity, flying
 from rotorgram.udp import (
     RemoteEnv,
     RemoteVectorEnv,
@@ -197,7 +197,7 @@ def test_strangers_change_nothing_but_counters() -> None:
 
 def test_welcome_may_seed_the_first_reset() -> None:
     with plain_socket() as sock:
-        running = Running(Simulator(server=sock.getsockname(), bind=ANY, config=QUICK))
+        running = simulate(sock.getsockname())
         datagram, address = sock.recvfrom(65507)
         hello = binary.decode(datagram)
         sock.sendto(binary.encode(Welcome(session=hello.session, nonce=5, seed=0)), address)

@@ -2,6 +2,7 @@
 
 import errno
 import gc
+import io
 import json
 import os
 import re
@@ -17,8 +18,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import rotorgram.envs  # noqa: F401
-from peers import ANY, ENV_ID, Running, plain_socket
-from remotes import QUICK, Broken
+from peers import ANY, ENV_ID, QUICK, Running, plain_socket, simulate
+from remotes import Broken
 from rotorgram.envs.config import EnvConfig
 from rotorgram.udp import (
     LinkConfig,
@@ -186,7 +187,7 @@ def test_closed_by_another_thread_while_it_waits() -> None:
 @pytest.mark.quiet
 def test_a_simulator_that_falls_silent() -> None:
     with RemoteEnv(ANY, connect=False, connect_timeout=1, timeout=0.5) as remote:
-        running = Running(Simulator(server=remote.address, bind=ANY, config=QUICK))
+        running = simulate(remote)
         remote.reset(seed=0)
         running.cut()
         gone = (
@@ -201,7 +202,7 @@ def test_a_simulator_that_falls_silent() -> None:
             remote.step(np.zeros(1))
         with pytest.raises(PeerSilent, match=f"^{gone}; no other came"):  # a reset waits again
             remote.reset()
-        running = Running(Simulator(server=remote.address, bind=ANY, config=QUICK))
+        running = simulate(remote)
         local = gym.make(ENV_ID)
         assert remote.reset(seed=3)[0].tobytes() == local.reset(seed=3)[0].tobytes()
     assert running.join() == "the agent closed"
@@ -224,7 +225,7 @@ def test_the_simulator_program_ends_on_sigterm_and_tells_the_agent() -> None:
 
 def test_a_forgotten_env_tells_the_simulator() -> None:
     remote = RemoteEnv(ANY, connect=False)
-    running = Running(Simulator(server=remote.address, bind=ANY, config=QUICK))
+    running = simulate(remote)
     remote.reset()
     del remote
     gc.collect()
@@ -240,7 +241,7 @@ def test_a_forgotten_env_tells_the_simulator() -> None:
 )
 def test_an_env_that_fails(value: float | None, sentence: str) -> None:
     remote = RemoteEnv(ANY, connect=False)
-    running = Running(Simulator(Broken(value), server=remote.address, bind=ANY, config=QUICK))
+    running = simulate(remote, env=Broken(value))
     remote.reset()
     remote.step(np.zeros(1))
     remote.step(np.zeros(1))
@@ -264,8 +265,9 @@ def test_a_simulator_of_our_own_waits_as_long_as_its_agent_lives(
     monkeypatch.setattr(udp_main, "Simulator", Made)
     monkeypatch.setattr(signal, "signal", lambda *_: None)
     words = {"config": EnvConfig().to_dict(), "server": ["127.0.0.1", 9], "bind": ANY}
-    parts = [json.dumps(words).encode() + b"\n"]
-    monkeypatch.setattr(os, "read", lambda *_: parts.pop() if parts else b"")
+    line = json.dumps(words).encode() + b"\n"
+    monkeypatch.setattr(sys, "stdin", SimpleNamespace(buffer=io.BytesIO(line)))
+    monkeypatch.setattr(os, "read", lambda *_: b"")
     assert udp_main.main() == 0
     assert made[0] >= 86_400
 

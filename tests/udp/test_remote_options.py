@@ -15,8 +15,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
-from peers import ANY, ENV_ID, Running, launch, plain_socket
-from remotes import QUICK, Broken, flying
+from peers import ANY, ENV_ID, QUICK, Running, launch, plain_socket, simulate
+from remotes import Broken, flying
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 from rotorgram.models import QUAD_XML
@@ -161,7 +161,7 @@ WAYPOINTS = [[1.25, -0.5, 0.01 * i] for i in range(40)]
 )
 def test_refusals_say_why(wanted: Any, env: str, given: Any, sentence: str) -> None:
     with RemoteEnv(ANY, connect=False, connect_timeout=0.6, **wanted) as remote:
-        running = Running(Simulator(env, server=remote.address, bind=ANY, config=QUICK, **given))
+        running = simulate(remote, env=env, **given)
         with pytest.raises(ConnectionError):
             remote.connect()
         error = running.join()
@@ -173,7 +173,7 @@ def test_spaces_in_a_distribution_do_not_differ() -> None:
     wanted = {"randomize": {"mass": "uniform(0.9,1.1)"}}
     with RemoteEnv(ANY, connect=False, env_id=ENV_ID, options=wanted) as remote:
         given = {"randomize": {"mass": " uniform( 0.9, 1.1 )"}}
-        running = Running(Simulator(ENV_ID, server=remote.address, bind=ANY, config=QUICK, **given))
+        running = simulate(remote, **given)
         remote.connect()
         assert remote.env_spec.options["randomize"] == {"mass": "uniform(0.9, 1.1)"}
     running.join()
@@ -193,7 +193,7 @@ def test_spaces_in_a_distribution_do_not_differ() -> None:
 )
 def test_what_fits_flies(wanted: Any, env: str, given: Any) -> None:
     with RemoteEnv(ANY, connect=False, connect_timeout=5, **wanted) as remote:
-        running = Running(Simulator(env, server=remote.address, bind=ANY, config=QUICK, **given))
+        running = simulate(remote, env=env, **given)
         remote.reset(seed=1)
         assert remote.env_spec.env_id in (ENV_ID, "Own-v0")
     assert running.join() == "the agent closed"
@@ -282,7 +282,7 @@ def test_a_long_step_is_no_silence() -> None:  # fault 33
             return super().step(action)
 
     with RemoteEnv(ANY, connect=False, timeout=1.5) as remote:
-        running = Running(Simulator(Slow(), server=remote.address, bind=ANY, config=QUICK))
+        running = simulate(remote, env=Slow())
         remote.reset(seed=1)
         *_, truncated, info = remote.step(1)
         assert not truncated
@@ -404,7 +404,7 @@ def test_an_agent_that_asks_for_an_env_needs_no_mujoco(tmp_path: Path) -> None:
     agent = launch(code, tmp_path / "j")
     assert agent.stdout is not None
     server = "127.0.0.1", int(agent.stdout.readline())
-    running = Running(Simulator(server=server, bind=ANY, config=QUICK))
+    running = simulate(server)
     out, err = agent.communicate(timeout=60)
     assert out == "(3,)\n"
     assert err == ""
@@ -413,7 +413,7 @@ def test_an_agent_that_asks_for_an_env_needs_no_mujoco(tmp_path: Path) -> None:
 
 def test_text_needs_an_env_that_is_known_here() -> None:
     with RemoteEnv(ANY, connect=False, connect_timeout=0.5) as remote:
-        running = Running(Simulator(server=remote.address, bind=ANY, codec="text", config=QUICK))
+        running = simulate(remote, codec="text")
         with pytest.raises(ConnectionError):
             remote.connect()
         running.simulator.stop()

@@ -6,16 +6,15 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from fleets import NAMES, QUICK, Failing, assert_parity, assert_same, flying, simulate, sync
+from fleets import NAMES, Failing, assert_parity, assert_same, flying, sync
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
-from peers import ANY, ENV_ID, Running, plain_socket
+from peers import ANY, ENV_ID, plain_socket, simulate
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.udp import (
     PeerSilent,
     RemoteVectorEnv,
-    Simulator,
 )
 
 # ---- parity
@@ -96,9 +95,7 @@ def test_what_a_step_gives_is_the_callers() -> None:
 def test_the_first_simulator_says_how_many_drones_there_are() -> None:
     with plain_socket() as sock:
         address = sock.getsockname()
-    running = [
-        Running(Simulator(server=address, bind=ANY, num_envs=3, config=QUICK)) for _ in range(2)
-    ]
+    running = [simulate(address, num_envs=3) for _ in range(2)]
     with closing(RemoteVectorEnv(address, num_simulators=2)) as remote:
         assert remote.num_envs == 6
         assert remote.num_simulators == 2

@@ -15,10 +15,9 @@ from fleets import (
     assert_same,
     flying,
     random_actions,
-    simulate,
     sync,
 )
-from peers import ANY, ENV_ID, plain_socket
+from peers import ANY, ENV_ID, plain_socket, simulate
 from rotorgram.udp import (
     LinkConfig,
     PeerSilent,

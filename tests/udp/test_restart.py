@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import rotorgram.envs  # noqa: F401
-from peers import ANY, ENV_ID, Running, launch, plain_socket
+from peers import ANY, ENV_ID, Running, launch, plain_socket, simulate
 from relay import FaultConfig, relaying
 from remotes import assert_parity
 from rotorgram.envs.config import EnvConfig
@@ -31,7 +31,6 @@ from rotorgram.udp.protocol.auth import write_key
 from rotorgram.udp.spawn import start_simulator
 
 LOSSY = FaultConfig(drop=0.3, duplicate=0.1, reorder=0.2, seed=2)
-QUICK = LinkConfig(timeout=10)
 AT_ONCE = 5.0
 """Far from every timeout. Of that an interpreter with MuJoCo takes 0.2 s to end, or 1 s and more
 on a busy machine."""
@@ -282,11 +281,7 @@ def keyed(
     agent_key: str | None, simulator_key: str | None, codec: Any = "binary"
 ) -> Iterator[tuple[RemoteEnv, Running]]:
     remote = RemoteEnv(ANY, env_id=ENV_ID, connect=False, connect_timeout=0.6, key_file=agent_key)
-    config = LinkConfig(timeout=0.5)
-    simulator = Simulator(
-        server=remote.address, bind=ANY, codec=codec, config=config, key_file=simulator_key
-    )
-    running = Running(simulator)
+    running = simulate(remote, LinkConfig(timeout=0.5), codec=codec, key_file=simulator_key)
     try:
         yield remote, running
     finally:
@@ -350,13 +345,8 @@ def test_a_key_allows_every_address(key_file: str) -> None:
             "this port may fly the drone"
         )
     with RemoteEnv(("0.0.0.0", 0), connect=False, key_file=key_file) as remote:
-        simulator = Simulator(
-            server=("127.0.0.1", remote.address[1]),
-            bind=("0.0.0.0", 0),
-            config=QUICK,
-            key_file=key_file,
-        )
-        running = Running(simulator)
+        address = "127.0.0.1", remote.address[1]
+        running = simulate(address, bind=("0.0.0.0", 0), key_file=key_file)
         assert_parity(remote, 100, (1,))
         remote.close()
         assert running.join() == "the agent closed"
