@@ -14,7 +14,7 @@ from ..rendering import window
 from ..rendering.live import MAX_SHOWN, LiveView, Pace
 from ..rendering.stage import Stage
 from ..udp.protocol.messages import Command
-from ..udp.transport.driver import Driver, Observer
+from ..udp.transport.simulator import Observer, Simulator
 from ._flags import EnvFlags
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ class Watcher:
     would take the simulator for lost. If the view is closed or fails, the simulator goes on.
     """
 
-    def __init__(self, live: LiveView, simulator: Driver) -> None:
+    def __init__(self, live: LiveView, simulator: Simulator) -> None:
         self._live: LiveView | None = live
         self._loop: Any = simulator.stepped  # the command flies registered tasks alone
         self._steps = np.zeros(live.stage.drones, np.int64)
@@ -83,7 +83,7 @@ def open_view(
 
 
 @contextmanager
-def watched(simulator: Driver, command: "Sim") -> Iterator[None]:
+def watched(simulator: Simulator, command: "Sim") -> Iterator[None]:
     """Show a simulator, or hold it to real time, during the block, as the command says."""
     observers: list[Observer] = []
     with ExitStack() as opened:

@@ -19,7 +19,6 @@ from ..models.errors import InputError, MissingPackage, NoOpenGL, shortened
 from ..models.fields import check_names
 from .protocol.client import LinkConfig
 from .protocol.errors import LinkError
-from .transport.driver import Driver
 from .transport.simulator import Simulator
 
 _KEYS: Final = ("config", "module", "num_envs", "server", "bind", "codec", "key_file", "insecure",
@@ -41,7 +40,7 @@ def main() -> int:
         return 1
 
 
-def _fly(simulator: Driver) -> int:
+def _fly(simulator: Simulator) -> int:
     ended: list[int] = []
 
     def end(number: int, _: object) -> None:

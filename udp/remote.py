@@ -354,28 +354,29 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
         frozen: np.ndarray,
     ) -> np.ndarray:
         """One exchange with each simulator; why that of each drone was lost, or "", shape (N,)."""
-        slots = range(self.num_simulators)
-        pending = list(slots)
-        if frozen is not self._nobody:
-            asleep: np.ndarray = np.all(frozen.reshape(self._shape), axis=1)
-            pending = [slot for slot in slots if not asleep[slot]]
+        asleep: np.ndarray = np.all(self._by_slot(frozen), axis=1)
+        pending = np.flatnonzero(~asleep).tolist()
         reasons = [""] * self.num_simulators
         self._flying = False  # until the answers are there
         while pending:
-            orders = (RESET * resets + FREEZE * frozen).astype(np.uint8).reshape(self._shape)
-            rows = actions.reshape(*self._shape, *self._row)
-            numbers = [None] * len(slots) if seeds is None else seeds.reshape(self._shape)
+            orders = self._by_slot((RESET * resets + FREEZE * frozen).astype(np.uint8))
+            rows = self._by_slot(actions)
+            numbers = [None] * len(reasons) if seeds is None else self._by_slot(seeds)
             self._agent.exchange({i: (rows[i], orders[i], numbers[i]) for i in pending})
             lost = self._agent.lost
             reasons = [new or old for new, old in zip(lost, reasons, strict=True)]
-            if seeds is None or not any(lost):
+            if seeds is None:
                 break
             # A simulator in place of a lost one knows no seeds.
-            starting: np.ndarray = np.any(resets.reshape(self._shape), axis=1)
-            pending = [slot for slot in slots if lost[slot] and starting[slot]]
+            starting: np.ndarray = np.any(self._by_slot(resets), axis=1)
+            pending = [slot for slot, reason in enumerate(lost) if reason and starting[slot]]
             actions = self._nothing
             frozen = ~resets
         return np.repeat(np.array(reasons, object), self._shape[1])
+
+    def _by_slot(self, array: np.ndarray) -> np.ndarray:
+        """An array of all drones as rows of each simulator, shape (M, N / M, ...)."""
+        return array.reshape(*self._shape, *array.shape[1:])
 
     def _break_off(self, before: tuple[Arrays, Arrays], reasons: np.ndarray) -> None:
         """Truncate the episodes of lost drones: these States are the start of the next ones."""

@@ -32,7 +32,8 @@ from rotorgram.udp import __main__ as udp_main
 from rotorgram.udp.protocol import binary
 from rotorgram.udp.protocol.messages import Hello
 from rotorgram.udp.spawn import start_simulator
-from rotorgram.udp.transport import driver, sockets
+from rotorgram.udp.transport import simulator as driver
+from rotorgram.udp.transport import sockets
 
 # ---- silence and ends
 

@@ -7,11 +7,13 @@ multiple of 8 bytes, and the size of a message is exactly where its last array e
 import math
 import struct
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from ...models.errors import InputError
+from ...models.fields import Limits, check
 
 MAX_DRONES: Final = 1 << 16  # most drones of one simulator
 MAX_MESSAGE: Final = 1 << 24  # largest message in all its fragments, bytes
@@ -55,16 +57,9 @@ class Record(NamedTuple):
     """Reads the floats from the first array on, for a quick check; None if NumPy is faster."""
 
 
+@dataclass(kw_only=True, eq=False)
 class Layout:
     """Layout of the messages of one simulator.
-
-    Args:
-        drones: N, of all worlds together.
-        observation: Arrays of one drone.
-        action: None if actions are discrete.
-        choices: Discrete actions are 0 ... choices - 1; 0 if actions are an array.
-        telemetry: Shape of each telemetry array of one drone.
-        frames: Frame of each, as of an `ArraySpec`; the text codec converts by it.
 
     Attributes:
         state: Observations, rewards (float64), terminated, truncated (bool), telemetry (float64).
@@ -75,42 +70,41 @@ class Layout:
         InputError: The drones are too many, or a message would be larger than `MAX_MESSAGE`.
     """
 
-    def __init__(
-        self,
-        *,
-        drones: int,
-        observation: tuple[ArrayLayout, ...],
-        action: ArrayLayout | None,
-        choices: int = 0,
-        telemetry: tuple[tuple[int, ...], ...] = (),
-        frames: tuple[str, ...] = (),
-    ) -> None:
-        if not 1 <= drones <= MAX_DRONES:
-            raise InputError(f"drones: expected 1 to {MAX_DRONES}, got {drones}")
-        self.drones = drones
-        self.observation = observation
-        self.action = action
-        self.choices = choices
-        self.telemetry = telemetry
-        self.frames = frames or ("",) * len(telemetry)
+    drones: int
+    """N, of all worlds together."""
+    observation: tuple[ArrayLayout, ...]
+    """Arrays of one drone."""
+    action: ArrayLayout | None
+    """None if actions are discrete."""
+    choices: int = 0
+    """Discrete actions are 0 ... choices - 1; 0 if actions are an array."""
+    telemetry: tuple[tuple[int, ...], ...] = ()
+    """Shape of each telemetry array of one drone."""
+    frames: tuple[str, ...] = ()
+    """Frame of each, as of an `ArraySpec`; the text codec converts by it."""
+
+    def __post_init__(self) -> None:
+        drones = self.drones
+        check("drones", Limits(1, MAX_DRONES, whole=True), drones)
+        self.frames = self.frames or ("",) * len(self.telemetry)
 
         reward = ArrayLayout((), "float64")
         flag = ArrayLayout((), "bool")
-        numbers = [ArrayLayout(shape, "float64") for shape in telemetry]
-        arrays = [*observation, reward, flag, flag, *numbers]
+        numbers = [ArrayLayout(shape, "float64") for shape in self.telemetry]
+        arrays = [*self.observation, reward, flag, flag, *numbers]
         slots = _slots(STATE_ARRAYS_AT, drones, arrays)
-        first = len(observation)
+        first = len(self.observation)
         flags = slice(slots[first + 1].at, slots[first + 2].end)
         self.state = Record(slots, slots[-1].end, flags, b"\0\1", _numbers(slots))
         self.observation_slots = slots[:first]
         self.telemetry_slots = slots[first + 3 :]
 
-        actions = action or ArrayLayout((), "int64")
+        actions = self.action or ArrayLayout((), "int64")
         arrays = [actions, ArrayLayout((), "uint8"), ArrayLayout((), "uint64")]
         slots = _slots(COMMAND_ARRAYS_AT, drones, arrays)
         self.actions, orders, _ = slots
         flags = slice(orders.at, orders.end)
-        floats = _numbers(slots[:1]) if action else None
+        floats = _numbers(slots[:1]) if self.action else None
         self.command = Record(slots[:2], orders.end, flags, b"\0\1\2", floats)
         self.seeded_command = self.command._replace(slots=slots, size=slots[-1].end)
         size = max(self.state.size, self.seeded_command.size)

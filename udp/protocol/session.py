@@ -4,6 +4,7 @@ Every change of state goes through the table `AGENT`. `server` opens sessions an
 of a datagram; `Outbox` takes what they send.
 """
 
+from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -57,51 +58,42 @@ class Outbox:
         self.statistics.drop(cause, f"from {host}:{port}: {reason}", now)
 
 
+@dataclass(eq=False)
 class Session:
-    """An exchange with one simulator, pinned to its address and codec.
+    """An exchange with one simulator, pinned to its address and codec."""
 
-    Attributes:
-        peer: Address of the simulator.
-        number: Session number; 0 with the text codec.
-        hello, welcome: None with the text codec.
-        key: The shared key, and that of the session once it has a slot; None without keys.
-        slot: Its slot; -1 before it has one.
-        sequence: Number of the State that came last.
-        reply: The answer to the last State, or the Welcome.
-        heard_at: When it last said that it computes, or sent a fragment that was missing.
-        room: Bytes that a Refuse may have while it waits for a slot.
-        line: Its last line, by text.
-    """
+    outbox: Outbox
+    peer: Address
+    """Address of the simulator."""
+    number: int
+    """Session number; 0 with the text codec."""
+    layout: Layout
+    hello: m.Hello | None
+    """None with the text codec, and so is `welcome`."""
+    key: Key | None = None
+    """The shared key, and that of the session once it has a slot; None without keys."""
+    line: bytes = b""
+    """Its last line, by text."""
+    state: AgentState = "new"
+    welcome: m.Welcome | None = None
+    slot: int = -1
+    """Its slot; -1 before it has one."""
+    sequence: int = 0
+    """Number of the State that came last."""
+    reply: Transfer | None = None
+    """The answer to the last State, or the Welcome."""
+    room: int = 0
+    """Bytes that a Refuse may have while it waits for a slot."""
+    asked_at: float = 0.0
+    heard_at: float = 0.0
+    """When it last said that it computes, or sent a fragment that was missing."""
+    is_plain: bool = False
+    """Whether it has a slot, and its messages are neither sealed nor text."""
 
-    def __init__(
-        self,
-        outbox: Outbox,
-        peer: Address,
-        number: int,
-        layout: Layout,
-        hello: m.Hello | None,
-        *,
-        key: Key | None = None,
-        line: bytes = b"",
-    ) -> None:
-        self.peer = peer
-        self.number = number
-        self.layout = layout
-        self.hello = hello
-        self.key = key
-        self.line = line
-        self.is_text = hello is None
-        self.state: AgentState = "new"
-        self.welcome: m.Welcome | None = None
-        self.slot = -1
-        self.sequence = 0
-        self.reply: Transfer | None = None
-        self.room = 0
-        self.asked_at = self.heard_at = 0.0
-        self.is_plain = False  # whether it has a slot, and its messages are neither sealed nor text
-        self._outbox = outbox
-        self._assembler = Assembler(layout.state.size)
-        self._largest = largest_datagram(peer, outbox.max_datagram)
+    def __post_init__(self) -> None:
+        self.is_text = self.hello is None
+        self._assembler = Assembler(self.layout.state.size)
+        self._largest = largest_datagram(self.peer, self.outbox.max_datagram)
 
     def move(self, way: Way, kind: type[Message]) -> None:
         """Be in the state that such a message leads to. Raises `KeyError` if it may not."""
@@ -147,7 +139,7 @@ class Session:
         self.state = after
         self.asked_at = self.heard_at = now
         self.reply = reply = Transfer(data, self._largest)
-        outbox = self._outbox
+        outbox = self.outbox
         if reply.count == 1 and self.key is None:  # as `put`
             outbox.datagrams.append((data, self.peer))
             outbox.statistics.counters["sent"] += 1
@@ -171,7 +163,7 @@ class Session:
     def repeat(self) -> None:
         """Send the last answer again, the same bytes."""
         assert self.reply is not None
-        self._outbox.put(self.reply.start(), self.peer, self.key, "resent")
+        self.outbox.put(self.reply.start(), self.peer, self.key, "resent")
 
     def _answer_again(self) -> None:
         """Answer a State that came again: with Alive, while its Command is not there yet."""
@@ -180,18 +172,18 @@ class Session:
         elif not self.is_text:
             alive = m.Alive(session=self.number, sequence=self.sequence)
             self.move("sent", m.Alive)
-            self._outbox.put([binary.encode(alive)], self.peer, self.key)
+            self.outbox.put([binary.encode(alive)], self.peer, self.key)
 
     def _record(self, message: Message, data: bytes) -> None:
         """Show a message to the tap."""
-        if self._outbox.tap:
+        if self.outbox.tap:
             whole = binary.encode(message, self.layout) if self.is_text else data
-            self._outbox.tap(self.slot, message, whole)
+            self.outbox.tap(self.slot, message, whole)
 
     def _send(self, data: bytes) -> None:
         """Send a message, and keep its bytes for a repeated State."""
         self.reply = Transfer(data, self._largest)
-        self._outbox.put(self.reply.start(), self.peer, self.key)
+        self.outbox.put(self.reply.start(), self.peer, self.key)
 
     # ---- what is received
 
@@ -202,7 +194,7 @@ class Session:
         self.move("received", State)
         self.sequence = state.sequence
         self.is_plain = self.key is None and not self.is_text
-        self._outbox.statistics.counters["sessions"] += 1
+        self.outbox.statistics.counters["sessions"] += 1
         for message in (self.hello, self.welcome):
             if message:
                 self._record(message, binary.encode(message))
@@ -213,8 +205,8 @@ class Session:
         """The next State, which is expected."""
         self.sequence = state.sequence
         self.state = _AFTER_STATE
-        self._outbox.statistics.round_trips.append(now - self.asked_at)
-        if self._outbox.tap:
+        self.outbox.statistics.round_trips.append(now - self.asked_at)
+        if self.outbox.tap:
             self._record(state, plain)
         return Event(self.slot, state)
 
@@ -248,7 +240,7 @@ class Session:
         if isinstance(message, m.Alive):
             self.heard_at = now
         elif isinstance(message, m.Missing) and self.reply and message.kind == binary.COMMAND:
-            self._outbox.put(self.reply.resend(message), self.peer, self.key, "resent")
+            self.outbox.put(self.reply.resend(message), self.peer, self.key, "resent")
         else:
             self._drop("stale", now)
         return None
@@ -267,8 +259,8 @@ class Session:
         self.heard_at = now
         whole = self._assembler.take(fragment)
         if whole is None and (answer := self._assembler.ask(fragment)):
-            self._outbox.put(answer, self.peer, self.session_key())
+            self.outbox.put(answer, self.peer, self.session_key())
         return whole
 
     def _drop(self, cause: str, now: float) -> None:
-        self._outbox.drop(cause, "", self.peer, now)
+        self.outbox.drop(cause, "", self.peer, now)
