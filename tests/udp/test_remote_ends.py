@@ -18,7 +18,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import rotorgram.envs  # noqa: F401
-from peers import ANY, ENV_ID, QUICK, Running, plain_socket, simulate
+from peers import ANY, ENV_ID, QUICK, plain_socket, simulate
 from remotes import Broken
 from rotorgram.envs.config import EnvConfig
 from rotorgram.udp import (
@@ -65,9 +65,7 @@ def test_nothing_listens() -> None:
 
 def test_an_agent_that_hears_but_never_answers() -> None:
     with plain_socket() as sock:
-        simulator = Simulator(server=sock.getsockname(), bind=ANY, config=LinkConfig(timeout=0.3))
-        running = Running(simulator)
-        error = running.join()
+        error = simulate(sock.getsockname(), LinkConfig(timeout=0.3)).join()
         assert isinstance(error, PeerSilent)
         sends = int(re.findall(r"for 0.3 s, Hello sent (\d+) times", str(error))[0])
         datagrams = [sock.recv(65507) for _ in range(sends)]

@@ -263,12 +263,11 @@ def reset_for_ever(remote: RemoteEnv) -> None:
 
 def test_stop_from_another_thread() -> None:  # fault 7
     with RemoteEnv(ANY, connect=False) as remote:
-        simulator = Simulator(server=remote.address, bind=ANY, config=QUICK)
-        running = Running(simulator)
+        running = simulate(remote)
         remote.reset()
         begun = time.monotonic()
         for _ in range(3):
-            simulator.stop()
+            running.simulator.stop()
         with pytest.raises(PeerClosed, match="closed: the simulator was stopped"):
             reset_for_ever(remote)
         assert time.monotonic() - begun < 2
@@ -382,10 +381,7 @@ def test_an_env_that_the_papers_vehicle_cannot_fly(tmp_path: Path) -> None:
         plain_socket() as stranger,
     ):
         stranger.sendto(b"1", remote.address)
-        simulator = Simulator(
-            server=remote.address, bind=ANY, vehicle=vehicle, config=QUICK, **options
-        )
-        running = Running(simulator)
+        running = simulate(remote, vehicle=vehicle, **options)
         remote.reset(seed=1)
         assert remote.control_period == 0.015
     assert running.join() == "the agent closed"

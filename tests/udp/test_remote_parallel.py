@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from peers import ANY, Running
+from peers import ANY, simulate
 from relay import FaultConfig, relaying
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.envs.parallel import LocalParallelEnv
@@ -32,9 +32,8 @@ def flying(
         agent = taken.getsockname()
     with ExitStack() as stack:
         server = stack.enter_context(relaying(agent, faults)).address if faults else agent
-        simulator = Simulator(RISE, server=server, bind=ANY, num_envs=num_envs, drones=drones,
-                              config=LinkConfig(timeout=60))  # fmt: skip
-        running = Running(simulator)
+        patient = LinkConfig(timeout=60)
+        running = simulate(server, patient, env=RISE, num_envs=num_envs, drones=drones)
         yield agent
         running.join()
 
