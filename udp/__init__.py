@@ -5,7 +5,7 @@ envs of it, and `journal` files. The protocol needs no Gymnasium.
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from .protocol.client import Address, LinkConfig
 from .protocol.errors import DecodeError, LinkError, PeerClosed, PeerSilent, Refused
@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     """Import what needs Gymnasium on first use (PEP 562)."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -75,7 +75,7 @@ class _Remote(NotCopied):
         self._nothing: np.ndarray = np.zeros((count, *self._row), self._dtype)
 
 
-class RemoteEnv(_Remote, gym.Env[Any, Any]):
+class RemoteEnv(_Remote, gym.Env[Observation, ArrayLike]):
     """A drone in a remote simulator, flown in lock-step over UDP.
 
     The simulator may start before or after. Its Hello brings the spec of its env, and the spaces
@@ -389,7 +389,7 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
         earlier = np.full(self.num_envs, None) if self._reasons is None else self._reasons
         self._reasons = np.where(self.lost, reasons, earlier)
 
-    def close_extras(self, **kwargs: Any) -> None:
+    def close_extras(self, **kwargs: object) -> None:
         """Tell the simulators and close the socket."""
         self._agent.close()
         self._flying = False

@@ -80,15 +80,15 @@ def spawn_simulator(
 
 
 def start_simulator(
-    config: EnvConfig, server: Address, *, stderr: IO[str] | None = None, **settings: Any
+    config: EnvConfig, server: Address, *, stderr: IO[str] | None = None, **settings: object
 ) -> subprocess.Popen[bytes]:
     """A simulator in a process of its own, on a free port; it ends when its stdin is closed.
 
     `settings` are keyword arguments of `Simulator`.
     """
     content = config.embedded().to_dict()
-    arguments = {"config": content, "module": config.module, "server": server}
-    arguments |= {"bind": ("127.0.0.1", 0), **settings}
+    arguments: dict[str, object] = {"config": content, "module": config.module}
+    arguments |= {"server": server, "bind": ("127.0.0.1", 0), **settings}
     # A second thread of torch makes small tensors slower, and takes the agent's core.
     around = {"OMP_NUM_THREADS": "1", **os.environ, "PYTHONSAFEPATH": "1"}
     process = subprocess.Popen(_COMMAND, stdin=subprocess.PIPE, stderr=stderr, env=around)

@@ -130,6 +130,8 @@ class AgentLink:
 class WorldRules:
     """Base of the rules: the links, their timers and their ends.
 
+    The caller hands each datagram to `receive`, and calls `step` and `answer` after it.
+
     Attributes:
         links: The agents.
         reason: Why the flight has ended; None before.
@@ -152,18 +154,6 @@ class WorldRules:
         """Say Hello to every agent."""
         for link in self.links:
             link.client.connect(now)
-
-    def receive(self, link: AgentLink, datagram: bytes, now: float) -> None:
-        """Take a datagram of an agent. Raises `LinkError` where the flight cannot go on."""
-        raise NotImplementedError
-
-    def step(self, now: float) -> bool:
-        """Move the world if it is time to. Whether another call may move it again at once."""
-        raise NotImplementedError
-
-    def answer(self, now: float) -> None:
-        """Send the States after a step."""
-        raise NotImplementedError
 
     def next_timer(self) -> float:
         """When `handle_timers` wants to be called; infinite if never."""
@@ -253,7 +243,7 @@ class OneAgent(WorldRules):
             self.reason = message.reason or "the agent closed"
 
     def step(self, now: float) -> bool:
-        """Follow the last message."""
+        """Follow the last message. Whether another call may move the world again at once."""
         message = self._message
         if message is None:
             return False
@@ -330,7 +320,7 @@ class SeveralAgents(WorldRules):
     # ---- episodes and steps
 
     def step(self, now: float) -> bool:
-        """Step or begin the world if it is time to."""
+        """Step or begin the world if it is time to; whether another call may move it again."""
         flying = self._who("flying")
         if not self.episodes and len(self._who("ready")) < len(self.links):
             return False
@@ -518,3 +508,6 @@ class SeveralAgents(WorldRules):
             else:
                 reason = message.reason or "no reason"
                 raise LinkError(f"{link.name} closed before the world began: {reason}")
+
+
+Rules = OneAgent | SeveralAgents

@@ -63,32 +63,23 @@ class Session:
     """An exchange with one simulator, pinned to its address and codec."""
 
     outbox: Outbox
-    peer: Address
-    """Address of the simulator."""
-    number: int
-    """Session number; 0 with the text codec."""
+    peer: Address  # address of the simulator
+    number: int  # session number; 0 with the text codec
     layout: Layout
-    hello: m.Hello | None
-    """None with the text codec, and so is `welcome`."""
+    hello: m.Hello | None  # none with the text codec, and so is `welcome`
+    # The shared key, and that of the session once it has a slot; None without keys.
     key: Key | None = None
-    """The shared key, and that of the session once it has a slot; None without keys."""
-    line: bytes = b""
-    """Its last line, by text."""
+    line: bytes = b""  # its last line, by text
     state: AgentState = "new"
     welcome: m.Welcome | None = None
-    slot: int = -1
-    """Its slot; -1 before it has one."""
-    sequence: int = 0
-    """Number of the State that came last."""
-    reply: Transfer | None = None
-    """The answer to the last State, or the Welcome."""
-    room: int = 0
-    """Bytes that a Refuse may have while it waits for a slot."""
+    slot: int = -1  # its slot; -1 before it has one
+    sequence: int = 0  # number of the State that came last
+    reply: Transfer | None = None  # the answer to the last State, or the Welcome
+    room: int = 0  # bytes that a Refuse may have while it waits for a slot
     asked_at: float = 0.0
+    # When it last said that it computes, or sent a fragment that was missing.
     heard_at: float = 0.0
-    """When it last said that it computes, or sent a fragment that was missing."""
-    is_plain: bool = False
-    """Whether it has a slot, and its messages are neither sealed nor text."""
+    is_plain: bool = False  # whether it has a slot, and its messages are neither sealed nor text
 
     def __post_init__(self) -> None:
         self.is_text = self.hello is None

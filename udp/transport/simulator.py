@@ -7,7 +7,7 @@ from contextlib import ExitStack, suppress
 from dataclasses import replace
 from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, cast
+from typing import TYPE_CHECKING, Final, Literal, cast
 
 import gymnasium as gym
 import numpy as np
@@ -25,9 +25,9 @@ from ..protocol.party import (
     NO_RESET,
     AgentLink,
     OneAgent,
+    Rules,
     SeveralAgents,
     SwarmWorld,
-    WorldRules,
 )
 from .sockets import LONGEST_WAIT, PAUSE, TEXT_WAY_OUT, WAY_OUT, Port, log_notices, resolve
 from .stepped import GymEnv, GymnasiumWorld, make_stepped
@@ -97,7 +97,7 @@ class Simulator(NotCopied):
         record: Path | str | None = None,
         when_lost: str = "hold",
         patience: float = 10.0,
-        **keywords: Any,
+        **keywords: object,
     ) -> None:
         check("codec", Choice(("binary", "text")), codec)
         check("patience", Limits(0, unit="s", above=True), patience)
@@ -136,7 +136,7 @@ class Simulator(NotCopied):
                 links.append(AgentLink(number, there, client, rows))
             port = _open_port(bind, [link.address for link in links], insecure=insecure)
             failing.callback(port.close)
-            rules: WorldRules
+            rules: Rules
             if agents is None:
                 rules = OneAgent(stepped, layout, spec.control_period, links)
             elif isinstance(stepped, GymnasiumWorld):

@@ -155,7 +155,7 @@ def spec_of_gymnasium(env: GymEnv, options: Mapping[str, object]) -> EnvSpec:
     )
 
 
-def _array(name: str, space: spaces.Space[Any]) -> ArraySpec:
+def _array(name: str, space: object) -> ArraySpec:
     if not isinstance(space, spaces.Box):
         raise InputError(f"{name} space: expected Box, a Dict of Box, or Discrete, got {space}")
     low, high = (tuple(b.astype(np.float64).ravel().tolist()) for b in (space.low, space.high))
