@@ -155,114 +155,129 @@ Fate = Callable[[bytes], list[tuple[float, bytes]]]
 
 
 class Network:
-    """Simulators and an agent, joined by a network with a clock of its own."""
+    """Simulators and an agent, joined by a network with a clock of its own.
 
-    def __init__(
-        self, clients: list[Client], server: Server, fate: Fate, addresses: list[Address]
-    ) -> None:
-        self.clients = clients
+    Time passes from one event to the next: an arrival or a timer.
+    """
+
+    def __init__(self, server: Server, fate: Fate, clients: dict[Address, Client]) -> None:
         self.server = server
         self.fate = fate
-        self.addresses = addresses
+        self.clients = clients
         self.now = 0.0
         self.sent = 0
+        self.flying: list[tuple[float, int, bool, Address, bytes]] = []
+        """When it arrives, its number, whether at the agent, the simulator's address, the bytes."""
         self._copies = 0
-        self._flying: list[tuple[float, int, str, int, bytes]] = []
 
-    def count(self) -> int:
-        """Steps so far."""
-        raise NotImplementedError
-
-    def agent_received(self, event: Any) -> None:
+    def agent_received(self, event: Any, address: Address) -> None:
         """The agent took a datagram: what its server made of it."""
         raise NotImplementedError
 
-    def simulator_received(self, client: Client, message: Message | None) -> None:
-        """A simulator took a datagram."""
+    def simulator_received(self, address: Address, datagram: bytes) -> None:
+        """A datagram reaches a simulator."""
         raise NotImplementedError
 
-    def run(self, steps: int) -> None:
-        for client in self.clients:
-            client.connect(self.now)
-        while self.count() < steps:
-            self._send()
-            timers = [client.next_timer() or inf for client in self.clients]
-            due = min(timers)
-            assert due < inf or self._flying, "nothing will ever happen"
-            if self._flying and self._flying[0][0] <= due:
+    def silence(self, address: Address) -> None:
+        """A simulator gave its agent up."""
+        raise AssertionError("silent")
+
+    def free_slots(self) -> None:
+        """Look for simulators that were silent."""
+
+    def pass_time(self, until: Callable[[], bool], most: float = inf) -> None:
+        """Let time pass until something is so; at most that many seconds."""
+        end = self.now + most
+        while not until():
+            self.send()
+            assert self.now < end, f"not in {most} s"
+            timers = [client.next_timer() for client in self.clients.values()]
+            due = min([self.server.next_timer() or inf, *timers])
+            if self.flying and self.flying[0][0] <= due:
                 self._arrive()
-                continue
-            self.now = max(self.now, due)
-            assert self.clients[timers.index(due)].handle_timer(self.now), "silent"
+            else:
+                assert due < inf, "nothing will ever happen"
+                self.now = max(self.now, due)
+                self.server.handle_timer(self.now)
+                for address, client in self.clients.items():
+                    if not client.handle_timer(self.now):
+                        self.silence(address)
+            self.free_slots()
 
-    def _send(self) -> None:
-        for number, client in enumerate(self.clients):
+    def send(self) -> None:
+        """Put what both sides have to send on its way."""
+        for address, client in self.clients.items():
             for datagram in outgoing(client):
-                self._put("agent", number, datagram)
+                self._put(True, address, datagram)
         for datagram, address in outgoing(self.server):
-            self._put("simulator", self.addresses.index(address), datagram)
+            if address in self.clients:
+                self._put(False, address, datagram)
 
-    def _put(self, to: str, number: int, datagram: bytes) -> None:
+    def _put(self, up: bool, address: Address, datagram: bytes) -> None:
         self.sent += 1
         for delay, copy in self.fate(datagram):
             self._copies += 1
-            heappush(self._flying, (self.now + delay, self._copies, to, number, copy))
+            heappush(self.flying, (self.now + delay, self._copies, up, address, copy))
 
     def _arrive(self) -> None:
-        self.now, _, to, number, datagram = heappop(self._flying)
-        if to == "agent":
-            event = self.server.receive(datagram, self.addresses[number], self.now)
-            self.agent_received(event)
-        else:
-            client = self.clients[number]
-            self.simulator_received(client, client.receive(datagram, self.now))
+        arrival, _, up, address, datagram = heappop(self.flying)
+        self.now = max(self.now, arrival)
+        if up:
+            self.agent_received(self.server.receive(datagram, address, self.now), address)
+        elif address in self.clients:  # whoever is there now: a killed process reads nothing
+            self.simulator_received(address, datagram)
 
 
 class Pair(Network):
     """One simulator counts its steps in its observation, the agent its choices in its action."""
 
     def __init__(self, client: Client, server: Server, fate: Fate, peer: Address = HERE) -> None:
-        super().__init__([client], server, fate, [peer])
+        super().__init__(server, fate, {peer: client})
         self.client = client
         self.steps: list[float] = []
         """Actions in the order in which the simulator stepped them."""
         self.seen: list[float] = []
         """Observations in the order in which the agent took them."""
 
-    def count(self) -> int:
-        return len(self.steps)
+    def run(self, steps: int) -> None:
+        self.client.connect(self.now)
+        self.pass_time(lambda: len(self.steps) >= steps)
 
-    def agent_received(self, event: Any) -> None:
+    def agent_received(self, event: Any, address: Address) -> None:
         if isinstance(event, Event) and isinstance(event.message, State):
             self.seen.append(float(event.message.observations[0].flat[0]))
             send_command(self.server, event.slot, len(self.seen), self.now)
 
-    def simulator_received(self, client: Client, message: Message | None) -> None:
+    def simulator_received(self, address: Address, datagram: bytes) -> None:
+        message = self.client.receive(datagram, self.now)
         if isinstance(message, Command):
             self.steps.append(float(message.actions.flat[0]))
         if isinstance(message, Command | Welcome):
-            send_state(client, len(self.steps), self.now)
+            send_state(self.client, len(self.steps), self.now)
 
 
 class Fleet(Network):
     """Simulators, one for each slot of an agent that answers all of their States at once."""
 
     def __init__(self, clients: list[Client], server: Server, fate: Fate) -> None:
-        addresses = [(HERE[0], number) for number in range(len(clients))]
-        super().__init__(clients, server, fate, addresses)
+        super().__init__(server, fate, {(HERE[0], i): each for i, each in enumerate(clients)})
         self.steps = 0
 
-    def count(self) -> int:
-        return self.steps
+    def run(self, steps: int) -> None:
+        for client in self.clients.values():
+            client.connect(self.now)
+        self.pass_time(lambda: self.steps >= steps)
 
-    def agent_received(self, event: Any) -> None:
+    def agent_received(self, event: Any, address: Address) -> None:
         slots = self.server.slots
         if all(session and session.state == "deciding" for session in slots):
             self.steps += 1
             for slot in range(len(slots)):
                 send_command(self.server, slot, 0.0, self.now)
 
-    def simulator_received(self, client: Client, message: Message | None) -> None:
+    def simulator_received(self, address: Address, datagram: bytes) -> None:
+        client = self.clients[address]
+        message = client.receive(datagram, self.now)
         if isinstance(message, Command | Welcome):
             send_state(client, 0.0, self.now)
 

@@ -6,14 +6,12 @@ whether every command was chosen once and stepped once.
 
 import itertools
 import random
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from heapq import heappop, heappush
-from math import inf
+from typing import Any
 
 import numpy as np
 import pytest
-from links import ONE, SECRET, Fate, hello, outgoing, send_command, send_state
+from links import ONE, SECRET, Fate, Network, hello, send_command, send_state
 from rotorgram.udp import LinkConfig
 from rotorgram.udp.protocol.auth import Key
 from rotorgram.udp.protocol.client import Address, Client
@@ -77,17 +75,15 @@ class Physics:
             self.ended = message.reason or "closed"
 
 
-class World:
-    """All of it. Time passes from one event to the next: an arrival or a timer."""
+class World(Network):
+    """Several simulators, and an agent; each side may be started anew."""
 
     def __init__(
         self, fate: Fate, *, codec: str = "binary", simulators: int = 1, slots: int | None = None
     ) -> None:
-        self.fate = fate
         self.text = codec == "text"
         self.sealed = codec == "sealed"
         self.slots = simulators if slots is None else slots
-        self.now = 1000.0
         self.chosen: dict[tuple[Address, int], list[list[float]]] = {}
         """Actions that each agent chose in each session, in the order of its States."""
         self.asked = 0
@@ -96,23 +92,27 @@ class World:
         self.closes: list[str] = []
         self.physics: list[Physics] = []
         self._numbers = itertools.count(1)
-        self._order = itertools.count()
-        self._flying: list[tuple[float, int, Physics, str, bytes]] = []
-        self.start_agent()
+        super().__init__(self.new_agent(), fate, {})
+        self.now = 1000.0
+        self.heard: list[float] = [self.now] * self.slots
         for number in range(simulators):
             self.start_simulator(("10.0.0.1", number))
 
     # ---- who there is
 
+    def new_agent(self) -> Server:
+        keys = [Key(SECRET, "agent")] if self.sealed else []
+        return Server(lambda _: ONE, lambda: ONE, slots=self.slots, keys=keys)
+
     def start_agent(self) -> None:
         """A new one at the same address: it knows nothing of what was."""
-        keys = [Key(SECRET, "agent")] if self.sealed else []
-        self.agent = Server(lambda _: ONE, lambda: ONE, slots=self.slots, keys=keys)
-        self.heard: list[float] = [self.now] * self.slots
+        self.server = self.new_agent()
+        self.heard = [self.now] * self.slots
 
     def start_simulator(self, address: Address) -> Physics:
         """Another one, in place of that at the same address, which is dead at once."""
-        self.physics = [p for p in self.physics if p.address != address]
+        if old := self.of(address):
+            self.remove(old)
         key = Key(SECRET, "simulator") if self.sealed else None
         link = Client(
             hello(session=next(self._numbers)),
@@ -122,36 +122,22 @@ class World:
             key=key,
             draw_session=lambda: next(self._numbers),
         )
-        self.physics.append(Physics(address, link))
+        physics = Physics(address, link)
+        self.physics.append(physics)
+        self.clients[address] = link
         link.connect(self.now)
         if self.text:
-            self.physics[-1].send_state(self.now)
-        return self.physics[-1]
+            physics.send_state(self.now)
+        return physics
+
+    def remove(self, physics: Physics) -> None:
+        self.physics.remove(physics)
+        del self.clients[physics.address]
 
     def of(self, address: Address) -> Physics | None:
         return next((p for p in self.physics if p.address == address), None)
 
     # ---- what happens
-
-    def run(self, until: Callable[[], bool], most: float = 1e9) -> None:
-        """Let time pass until something is so; at most that many seconds."""
-        end = self.now + most
-        while not until():
-            self._send()
-            assert self.now < end, f"not in {most} s"
-            timers = [(t, p) for p in self.physics if (t := p.link.next_timer()) < inf]
-            first = min((timer for timer, _ in timers), default=float("inf"))
-            first = min(first, self.agent.next_timer() or float("inf"))
-            if self._flying and self._flying[0][0] <= first:
-                self._arrive()
-            else:
-                assert first < float("inf"), "nothing will ever happen"
-                self.now = max(self.now, first)
-                self.agent.handle_timer(self.now)
-                for _, physics in timers:
-                    if not physics.link.handle_timer(self.now):
-                        physics.ended = "silent"
-            self._free_the_silent()
 
     def run_steps(self, count: int, most: float = 1e9) -> None:
         """Until each simulator has made so many more steps in one session."""
@@ -164,30 +150,19 @@ class World:
                 if p in self.physics
             )
 
-        self.run(done, most)
+        self.pass_time(done, most)
 
-    def _send(self) -> None:
-        for physics in self.physics:
-            for datagram in outgoing(physics.link):
-                self._put(physics, "agent", datagram)
-        for datagram, address in outgoing(self.agent):
-            if physics := self.of(address):
-                self._put(physics, "simulator", datagram)
+    def simulator_received(self, address: Address, datagram: bytes) -> None:
+        physics = self.of(address)
+        assert physics is not None
+        physics.receive(datagram, self.now)
 
-    def _put(self, physics: Physics, to: str, datagram: bytes) -> None:
-        for delay, arriving in self.fate(datagram):
-            item = (self.now + delay, next(self._order), physics, to, arriving)
-            heappush(self._flying, item)
+    def silence(self, address: Address) -> None:
+        physics = self.of(address)
+        assert physics is not None
+        physics.ended = "silent"
 
-    def _arrive(self) -> None:
-        arrival, _, physics, to, datagram = heappop(self._flying)
-        self.now = max(self.now, arrival)
-        if to == "simulator":
-            # Who is at that address now: a process that was killed reads nothing.
-            if there := self.of(physics.address):
-                there.receive(datagram, self.now)
-            return
-        event = self.agent.receive(datagram, physics.address, self.now)
+    def agent_received(self, event: Any, address: Address) -> None:
         if event is None:
             return
         self.heard[event.slot] = self.now
@@ -197,7 +172,7 @@ class World:
         self._choose(event.slot, event.message, event.joined)
 
     def _choose(self, slot: int, message: State, joined: bool) -> None:
-        session = self.agent.slots[slot]
+        session = self.server.slots[slot]
         assert session is not None
         by_agents = self.chosen.setdefault((session.peer, message.session), [])
         if joined:
@@ -211,13 +186,13 @@ class World:
         self.asked += 1
         value = float(np.float32(1 / self.asked))
         by_agents[-1].append(value)
-        send_command(self.agent, slot, value, self.now)
+        send_command(self.server, slot, value, self.now)
 
-    def _free_the_silent(self) -> None:
-        for slot, session in enumerate(self.agent.slots):
+    def free_slots(self) -> None:
+        for slot, session in enumerate(self.server.slots):
             flies = session and session.state != "closing"
             if flies and self.now - self.heard[slot] > SILENCE:
-                self.agent.free(slot)
+                self.server.free(slot)
 
     def check(self) -> None:
         """Every step was chosen, in that order; of what was chosen all but the last was stepped."""
@@ -245,7 +220,7 @@ def test_each_command_is_stepped_once_whatever_the_network(
     world.run_steps(150)
     world.check()
     assert all(len(p.steps[p.session]) >= 150 for p in world.physics)
-    counters = world.agent.statistics.counters
+    counters = world.server.statistics.counters
     assert counters["sessions"] == simulators
     assert counters["duplicate"] > 50
     assert all(p.link.statistics.counters["resent"] > 25 for p in world.physics)
@@ -269,7 +244,7 @@ def test_a_clean_network_repeats_nothing() -> None:
     assert world.now == pytest.approx(1000.0 + 0.002 * 101)
     physics = world.physics[0]
     assert physics.link.statistics.counters == {"sent": 102, "received": 101, "sessions": 1}
-    assert world.agent.statistics.counters == {"sent": 101, "received": 101, "sessions": 1}
+    assert world.server.statistics.counters == {"sent": 101, "received": 101, "sessions": 1}
     assert len(physics.link.statistics.round_trips) == 100
     assert max(physics.link.statistics.round_trips) == pytest.approx(0.002)
 
@@ -281,16 +256,16 @@ def test_a_clean_restart_of_the_agent_costs_one_message_more() -> None:
     world = World(clean, codec="sealed")
     world.run_steps(10)
     physics = world.physics[0]
-    world.run(lambda: physics.link.state == "waiting")
-    world._send()
-    world._flying.clear()  # what was on its way to the one that was killed
+    world.pass_time(lambda: physics.link.state == "waiting")
+    world.send()
+    world.flying.clear()  # what was on its way to the one that was killed
     old = physics.session
     world.start_agent()
     world.run_steps(10)
     assert physics.session != old
     world.check()
     # The resent State brings an Unknown, then comes the Hello; the tenth Command is on its way.
-    counters = world.agent.statistics.counters
+    counters = world.server.statistics.counters
     assert counters == {"received": 12, "sent": 12, "foreign": 1, "sessions": 1}
     assert len(physics.steps[old]) == 10
 
@@ -321,15 +296,15 @@ def test_more_simulators_than_slots_take_turns(seed: int, codec: str) -> None:
     world = World(bad(seed), codec=codec, simulators=4, slots=2)
     flown: set[Address] = set()
     while len(flown) < 4:
-        world.run(
+        world.pass_time(
             lambda: any(len(p.steps.get(p.session, [])) >= 10 for p in world.physics), most=100
         )
         for physics in [p for p in world.physics if len(p.steps.get(p.session, [])) >= 10]:
             physics.link.close("enough", world.now)
-            world.run(lambda p=physics: p.link.state == "closed", most=1)  # type: ignore[misc]
+            world.pass_time(lambda p=physics: p.link.state == "closed", most=1)  # type: ignore[misc]
             flown.add(physics.address)
             world.check()
-            world.physics.remove(physics)
+            world.remove(physics)
     assert not any(p.ended for p in world.physics)
 
 
@@ -341,7 +316,7 @@ def test_after_any_trouble_all_fly_again(seed: int, codec: str) -> None:
     dice = random.Random(seed)
     for _ in range(12):
         end = world.now + dice.choice([0.005, 0.3, 1.0, 4.0])
-        world.run(lambda end=end: world.now >= end)  # type: ignore[misc]
+        world.pass_time(lambda end=end: world.now >= end)  # type: ignore[misc]
         if dice.random() < 0.4:
             world.start_agent()
         elif dice.random() < 0.7:
@@ -368,9 +343,9 @@ def test_a_text_simulator_that_is_started_again_is_taken_in_after_the_silence() 
     world.run_steps(20)
     begun = world.now
     world.start_simulator(world.physics[0].address)  # its numbers are old ones
-    world.run(lambda: bool(world.joined[1:]), most=100)
+    world.pass_time(lambda: bool(world.joined[1:]), most=100)
     assert world.now - begun == pytest.approx(SILENCE, abs=1)
-    assert world.agent.statistics.counters["stale"] > 20
+    assert world.server.statistics.counters["stale"] > 20
     world.run_steps(20)
 
 
@@ -387,9 +362,9 @@ def test_a_close_is_answered_by_a_close(side: str, codec: str) -> None:
         for physics in world.physics:
             physics.link.close("enough", world.now)
     else:
-        world.agent.close("enough", world.now)
-    world.run(lambda: all(p.link.state == "closed" for p in world.physics), most=1)
-    world.run(lambda: world.agent.slots == [None, None], most=1)
+        world.server.close("enough", world.now)
+    world.pass_time(lambda: all(p.link.state == "closed" for p in world.physics), most=1)
+    world.pass_time(lambda: world.server.slots == [None, None], most=1)
     assert world.now - begun == pytest.approx(0.002, abs=1e-6)
     if side == "simulator":
         assert world.closes == ["the simulator closed" if codec == "text" else "enough"] * 2
@@ -397,7 +372,7 @@ def test_a_close_is_answered_by_a_close(side: str, codec: str) -> None:
         reason = "the agent closed" if codec == "text" else "enough"
         assert [p.ended for p in world.physics] == [reason] * 2
     sent = sum(p.link.statistics.counters["resent"] for p in world.physics)
-    assert sent == world.agent.statistics.counters["resent"] == 0
+    assert sent == world.server.statistics.counters["resent"] == 0
 
 
 @pytest.mark.parametrize("codec", ["binary", "text", "sealed"])
@@ -412,9 +387,9 @@ def test_closes_that_are_lost_are_repeated(seed: int, side: str, codec: str) -> 
     if side != "agent":
         physics.link.close("enough", world.now)
     if side != "simulator":
-        world.agent.close("enough", world.now)
+        world.server.close("enough", world.now)
     begun = world.now
-    world.run(lambda: physics.link.state == "closed" and world.agent.slots == [None], most=1)
+    world.pass_time(lambda: physics.link.state == "closed" and world.server.slots == [None], most=1)
     assert world.now - begun < 0.26
     # None of it was left to the linger alone: ten tries each way.
     assert physics.ended or world.closes
@@ -425,9 +400,9 @@ def test_nobody_answers_a_close() -> None:
     world.run_steps(5)
     world.fate = lambda datagram: []
     world.physics[0].link.close("enough", world.now)
-    world.agent.close("enough", world.now)
+    world.server.close("enough", world.now)
     begun = world.now
-    world.run(lambda: world.physics[0].link.state == "closed", most=1)
+    world.pass_time(lambda: world.physics[0].link.state == "closed", most=1)
     assert world.now - begun == pytest.approx(0.25)
-    world.run(lambda: world.agent.slots == [None], most=1)
+    world.pass_time(lambda: world.server.slots == [None], most=1)
     assert world.now - begun == pytest.approx(0.25)
