@@ -69,7 +69,12 @@ def spawn_simulator(
         except PeerSilent as error:
             if process.poll() is None:
                 raise
-            raise PeerClosed(_last_words(said, process.returncode)) from error
+            said.seek(0)
+            words = said.read().strip() or "it said nothing"
+            _, own, sentence = words.rpartition("rotorgram simulator: ")
+            if not own:
+                sentence = f"the simulator ended with status {process.returncode}: {words}"
+            raise PeerClosed(sentence) from error
         finally:
             env.close()
             try:
@@ -111,13 +116,6 @@ def _connect(env: Remote, process: subprocess.Popen[bytes]) -> None:
             if time.monotonic() > deadline:
                 said = f"the simulator runs, and did not connect in {_START_TIMEOUT:g} s"
                 raise PeerSilent(said) from error
-
-
-def _last_words(said: IO[str], status: int) -> str:
-    said.seek(0)
-    words = said.read().strip() or "it said nothing"
-    _, own, sentence = words.rpartition("rotorgram simulator: ")
-    return sentence if own else f"the simulator ended with status {status}: {words}"
 
 
 _cached: dict[str, tuple[Remote, ExitStack]] = {}

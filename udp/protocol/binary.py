@@ -88,10 +88,24 @@ def encode(message: Message, layout: Layout | None = None) -> bytes:
     if isinstance(message, State | Command):
         assert layout is not None
         return encode_step(message, layout)
-    kind = _MESSAGES.index(type(message)) + 1
-    sequence = getattr(message, "sequence", 0)
+    body = b""
     try:
-        return frame(kind, message.session, sequence, _encode_body(message))
+        match message:
+            case Hello():
+                spec = message.spec.encode()
+                body = _HELLO_BODY.pack(*message.versions, message.worlds, len(spec)) + spec
+                body += _extensions(message.extensions)
+            case Welcome(nonce=nonce, seed=seed):
+                body = _WELCOME_BODY.pack(nonce, seed or 0, seed is not None, message.version)
+                body += _extensions(message.extensions)
+            case Refuse() | Close():
+                reason = message.reason.encode()
+                body = _LENGTH.pack(len(reason)) + reason
+            case Missing():
+                body = _MISSING_BODY.pack(message.kind, message.count, message.first)
+                body += message.bitmap
+        kind = _MESSAGES.index(type(message)) + 1
+        return frame(kind, message.session, getattr(message, "sequence", 0), body)
     except struct.error as error:
         raise InputError(f"{type(message).__name__}: {error}") from None
 
@@ -285,23 +299,6 @@ def _wrong_flags(wrong: bytes, record: Record) -> InputError:
 
 
 # ---- the bodies of all others
-
-
-def _encode_body(m: Message) -> bytes:
-    match m:
-        case Hello():
-            spec = m.spec.encode()
-            head = _HELLO_BODY.pack(*m.versions, m.worlds, len(spec))
-            return head + spec + _extensions(m.extensions)
-        case Welcome():
-            head = _WELCOME_BODY.pack(m.nonce, m.seed or 0, m.seed is not None, m.version)
-            return head + _extensions(m.extensions)
-        case Refuse() | Close():
-            reason = m.reason.encode()
-            return _LENGTH.pack(len(reason)) + reason
-        case Missing():
-            return _MISSING_BODY.pack(m.kind, m.count, m.first) + m.bitmap
-    return b""
 
 
 def _decode_body(kind: int, session: int, sequence: int, body: bytes) -> Message:

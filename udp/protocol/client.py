@@ -401,7 +401,14 @@ class Client:
     def _wait_on(self, message: m.Missing | m.Wait | m.Alive, now: float) -> None:
         """The agent is there, and has no answer yet."""
         if isinstance(message, m.Missing):
-            self._resend_missing(message, now)
+            transfer = self._transfer
+            if transfer is None or message.kind != binary.peek(transfer.message)[0]:
+                self._drop("stale", "", now)
+                return
+            self.statistics.counters["resent"] += 1
+            self._round_trips.sent(now)
+            self._put(transfer.resend(message))
+            self._progress(now)
         elif isinstance(message, m.Alive):  # others are late
             self._round_trips.answered(now, alive=True)
             self._tries = 1
@@ -456,16 +463,6 @@ class Client:
         """The agent is there and works on the outstanding message."""
         self._tries = 1
         self.resend_at = now + self._round_trips.wait(1)
-
-    def _resend_missing(self, missing: m.Missing, now: float) -> None:
-        """Send again what the agent lacks of the outstanding message."""
-        if self._transfer is None or missing.kind != binary.peek(self._transfer.message)[0]:
-            self._drop("stale", "", now)
-            return
-        self.statistics.counters["resent"] += 1
-        self._round_trips.sent(now)
-        self._put(self._transfer.resend(missing))
-        self._progress(now)
 
     def _unfit(self, welcome: m.Welcome) -> str:
         """The reason to refuse a Welcome, or ""."""
