@@ -26,7 +26,7 @@ from ..envs.config import EnvConfig
 from ..envs.spec import EnvSpec, canonical_id
 from ..models import Backend
 from ..models.errors import InputError, require, shortened
-from ..models.fields import Limits, read_table
+from ..models.fields import Limits, check_fields
 from .config import Config
 from .episodes import Episode, Position, ResumeError
 from .networks import Floats, named, part_of
@@ -62,8 +62,8 @@ class Checkpoint:
     """The resolved config of the env; None where only its simulator has it."""
     backend: Backend = "mujoco"
     """What stepped the env in training."""
-    seed: int
-    env_steps: int
+    seed: Annotated[int, Limits(0, 2**62, whole=True)]
+    env_steps: Annotated[int, Limits(0, 2**62, whole=True)]
     """Env steps that the whole training is to have."""
     actor: Mapping[str, Floats]
     """Weights for `NetworkPolicy`."""
@@ -94,9 +94,8 @@ class Checkpoint:
 
     def policy_alone(self) -> "Checkpoint":
         """Without the state and the position, which only a training needs."""
-        where = self.position
-        position = _no_position(where.env_steps, where.seconds)
-        return replace(self, state={}, position=position)
+        flown = Position(env_steps=self.position.env_steps, seconds=self.position.seconds)
+        return replace(self, state={}, position=flown)
 
     def check_resumable(self) -> None:
         """Raises `ResumeError` for a policy alone."""
@@ -181,80 +180,45 @@ def _read(data: bytes, parse: Callable[[bytes], dict[str, np.ndarray]]) -> Check
     if content["format"] != FORMAT:
         found_format = shortened(content["format"])
         raise InputError(f"expected a checkpoint of format {FORMAT}, got {found_format}")
-    meta = read_table(_Meta, content, "metadata")
-    spec = EnvSpec.from_json(meta.spec)
+    spec = EnvSpec.from_json(content["spec"])
+    env = EnvConfig.from_dict(content["env"]) if content.get("env") else None
+    if env and env.env_id != canonical_id(spec.env_id):
+        raise InputError(f"expected the config of {spec.env_id}, got that of {env.env_id}")
     arrays = parse(data)
     for name in _not_finite(arrays):
         raise InputError(f"expected finite numbers, got NaN or infinity in {name}")
-    env = EnvConfig.from_dict(meta.env) if meta.env else None
-    if env and env.env_id != canonical_id(spec.env_id):
-        raise InputError(f"expected the config of {spec.env_id}, got that of {env.env_id}")
     checkpoint = Checkpoint(
         spec=spec,
         env=env,
         actor=part_of(arrays, "policy/"),
         state=part_of(arrays, "state/"),
-        position=_position(meta, arrays),
-        **{name: getattr(meta, name) for name in _PLAIN},
+        position=_position(content["position"], arrays),
+        **{name: content[name] for name in _PLAIN},
     )
+    check_fields(checkpoint)
+    if not isinstance(checkpoint.versions, dict):
+        raise InputError(f"versions: expected values by name, got {checkpoint.versions!r:.80}")
+    checkpoint.config.setdefault("network", "mlp")
+    complete = json.loads(json.dumps(vars(checkpoint.hyperparameters)))  # a tuple is a list there
+    if complete != checkpoint.config:
+        raise InputError(
+            f"config: expected all of {sorted(complete)}, got {shortened(checkpoint.config)}"
+        )
     checkpoint.policy()  # raises if it does not fit
     return checkpoint
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Progress:
-    """What a training has flown."""
-
-    env_steps: Annotated[int, Limits(0, 2**62, whole=True)]
-    seconds: Annotated[float, Limits(0.0)]
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Meta:
-    """What a file holds besides arrays, as JSON."""
-
-    format: int
-    algorithm: str
-    config: dict[str, Any]
-    spec: str
-    env: dict[str, Any] | None = None
-    backend: Backend = "mujoco"
-    seed: Annotated[int, Limits(0, 2**62, whole=True)]
-    env_steps: Annotated[int, Limits(0, 2**62, whole=True)]
-    position: dict[str, object]
-    """As `_Progress`."""
-    versions: dict[str, str]
-
-    def __post_init__(self) -> None:
-        """Complete the config, and raise `InputError` for a wrong one."""
-        self.config.setdefault("network", "mlp")
-        config = vars(preset(self.algorithm, "tuned", **self.config))
-        complete = json.loads(json.dumps(config))  # a tuple is a list there
-        if complete != json.loads(json.dumps(self.config)):
-            raise InputError(
-                f"config: expected all of {sorted(complete)}, got {shortened(self.config)}"
-            )
-        if not isinstance(self.versions, dict):
-            raise InputError(f"versions: expected values by name, got {shortened(self.versions)}")
-
-
-def _position(meta: _Meta, arrays: Mapping[str, np.ndarray]) -> Position:
+def _position(progress: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Position:
     """The position of a training, or of a policy alone."""
-    progress = read_table(_Progress, meta.position, "position")
-    position = _no_position(progress.env_steps, progress.seconds)
-    if all(name.startswith("policy/") for name in arrays):
-        return position
+    position = Position(**progress)
+    check_fields(position, "position.")
     columns = part_of(arrays, "episodes/")
+    if not columns:
+        return position
     rows = zip(*(columns[name].tolist() for name in _COLUMNS), strict=True)
-    episodes = [Episode(**dict(zip(_COLUMNS, row, strict=True))) for row in rows]
+    episodes = [Episode(*row) for row in rows]
     flown: dict[str, Any] = part_of(arrays, "position/")
     return replace(position, episodes=tuple(episodes), **flown)
-
-
-def _no_position(env_steps: int, seconds: float) -> Position:
-    """Of a policy alone: what the training had flown, and no drones."""
-    none: dict[str, Any] = {name: np.zeros(0, np.int64) for name in _POSITION}
-    return Position(env_steps=env_steps, seconds=seconds, **none)
 
 
 def _with_checksum(data: bytes, checksum: bytes) -> bytes:

@@ -5,7 +5,8 @@ keeps no simulator's state: it resets to the same seed and repeats the same acti
 """
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from ..envs.autoreset import AdvancingVectorEnv, worlds_done
 from ..envs.spec import EnvSpec
 from ..models.errors import InputError
+from ..models.fields import Limits
 from .networks import Floats
 from .policies import ActionMap, flat
 
@@ -30,7 +32,7 @@ def episode_seed(run_seed: int, episode: int) -> int:
     return int(sequence.generate_state(1, np.uint64)[0])
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Episode:
     """One finished training episode."""
 
@@ -51,23 +53,27 @@ class Episode:
     """Whether it was truncated because its simulator was lost, not by its time limit."""
 
 
+def _none() -> Any:
+    return np.zeros(0, np.int64)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Position:
-    """Position of a run of N drones."""
+    """Position of a run of N drones; N is 0 of a policy alone, which has no arrays."""
 
-    env_steps: int
-    seconds: float
+    env_steps: Annotated[int, Limits(0, 2**62, whole=True)]
+    seconds: Annotated[float, Limits(0.0)]
     """Wall time since training began, s."""
-    actions: np.ndarray
+    actions: np.ndarray = field(default_factory=_none)
     """Actions of the env: float32, shape (t, N, k), or int64, shape (t, N), for the t steps of the
     longest running episode."""
-    observations: Floats
+    observations: Floats = field(default_factory=_none)
     """Observations after the last of them, flat: float32, shape (N, n)."""
-    numbers: Counts
+    numbers: Counts = field(default_factory=_none)
     """Of the running episodes: int64, shape (N,), as their steps in `lengths`, and the env steps of
     the run before each in `first_steps`."""
-    lengths: Counts
-    first_steps: Counts
+    lengths: Counts = field(default_factory=_none)
+    first_steps: Counts = field(default_factory=_none)
     episodes: tuple[Episode, ...] = ()
     """Ended episodes, in the order of their ends."""
 

@@ -8,7 +8,7 @@ from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import ClassVar, Final, Protocol, TypeVar
+from typing import Final, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +19,6 @@ from .config import Config
 Floats = NDArray[np.float32]
 Shapes = Mapping[str, tuple[int, ...]]
 Item = TypeVar("Item")
-
-_ZERO: Final = np.zeros((1, 1), np.float32)
 
 
 def named(prefix: str, items: Mapping[str, Item]) -> dict[str, Item]:
@@ -90,8 +88,6 @@ class Layer:
     """
 
     shapes: Shapes = MappingProxyType({})
-    in_place: ClassVar[bool] = False
-    """Whether outputs take the memory of the inputs. A network's first layer gets a copy."""
 
     def bind(self, weights: Weights) -> None:
         """Compute with these arrays from now on."""
@@ -101,7 +97,7 @@ class Layer:
 
     @abstractmethod
     def forward(self, inputs: Floats) -> Floats:
-        """The outputs, which the next layer may overwrite. Keeps what the derivatives need."""
+        """The outputs. Keeps what the derivatives need."""
 
     def learn(self, slope: Floats) -> None:
         """Set the gradients of a loss, from its derivatives by the last outputs."""
@@ -119,14 +115,12 @@ class Affine(Layer):
 
     def __init__(self, inputs: int, outputs: int) -> None:
         self.shapes = {"weight": (outputs, inputs), "bias": (outputs,)}
-        self._ones = np.ones(0, np.float32)
 
     def bind(self, weights: Weights) -> None:
         arrays = weights.arrays
         slopes = weights.gradients
         self.weight = arrays["weight"]
         self.bias = arrays["bias"][np.newaxis]
-        self._columns = self.weight.T
         self._by_weight = slopes["weight"]
         self._by_bias = slopes["bias"]
 
@@ -136,15 +130,14 @@ class Affine(Layer):
 
     def forward(self, inputs: Floats) -> Floats:
         self._inputs = inputs
-        outputs: Floats = inputs.dot(self._columns)
+        outputs: Floats = inputs.dot(self.weight.T)
         outputs += self.bias
         return outputs
 
     def learn(self, slope: Floats) -> None:
-        if len(self._ones) != len(slope):
-            self._ones = np.ones(len(slope), np.float32)
+        ones = np.ones(len(slope), np.float32)
         np.dot(slope.T, self._inputs, out=self._by_weight)
-        np.dot(self._ones, slope, out=self._by_bias)
+        np.dot(ones, slope, out=self._by_bias)
 
     def back(self, slope: Floats) -> Floats:
         by_inputs: Floats = slope.dot(self.weight)
@@ -152,13 +145,11 @@ class Affine(Layer):
 
 
 class Relu(Layer):
-    """max(x, 0), in the memory of the inputs."""
-
-    in_place = True
+    """max(x, 0)."""
 
     def forward(self, inputs: Floats) -> Floats:
-        self._outputs = np.maximum(inputs, _ZERO, out=inputs)
-        return inputs
+        self._outputs = np.maximum(inputs, np.float32(0.0))
+        return self._outputs
 
     def back(self, slope: Floats) -> Floats:
         slope *= self._outputs > 0
@@ -166,13 +157,11 @@ class Relu(Layer):
 
 
 class Tanh(Layer):
-    """The hyperbolic tangent, in the memory of the inputs."""
-
-    in_place = True
+    """The hyperbolic tangent."""
 
     def forward(self, inputs: Floats) -> Floats:
-        self._outputs = np.tanh(inputs, out=inputs)
-        return inputs
+        self._outputs: Floats = np.tanh(inputs)
+        return self._outputs
 
     def back(self, slope: Floats) -> Floats:
         slope *= 1 - self._outputs * self._outputs
@@ -233,8 +222,6 @@ class Network:
 
     def forward(self, inputs: Floats) -> Floats:
         """The outputs; the inputs stay as they are."""
-        if self.layers[0].in_place:
-            inputs = inputs.copy()
         for layer in self.layers:
             inputs = layer.forward(inputs)
         return inputs

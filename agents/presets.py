@@ -39,19 +39,18 @@ class Preset:
 
 
 @cache
-def _tables() -> dict[tuple[str, str, str], dict[str, Any]]:
-    """The tables of the file by algorithm, name and task."""
+def _tables(algorithm: str) -> dict[str, dict[str, dict[str, Any]]]:
+    """An algorithm's tables of the file by preset and task."""
     content = tomllib.loads(_FILE.read_text(encoding="utf-8"))
-    found: dict[tuple[str, str, str], dict[str, Any]] = {}
+    found: dict[str, dict[str, dict[str, Any]]] = {}
     for table in content["preset"]:
         algorithms = table.pop("algorithms")
         tasks = table.pop("tasks")
         name = table.pop("name", "tuned")
-        base = content["settings"][table.pop("settings")] if "settings" in table else {}
-        for algorithm in algorithms:
-            for task in tasks:
-                found[algorithm, name, task] = base | table
-    return found
+        base = content["settings"].get(table.pop("settings", None), {})
+        if algorithm in algorithms:
+            found.setdefault(name, {}).update(dict.fromkeys(tasks, base | table))
+    return found or {"tuned": {}}
 
 
 def _lineage(env_id: str, tasks: list[str]) -> Iterator[str]:
@@ -66,8 +65,7 @@ def _lineage(env_id: str, tasks: list[str]) -> Iterator[str]:
 
 def preset_names(algorithm: str) -> list[str]:
     """Names of an algorithm's presets. One without any has `tuned`, its config's defaults."""
-    names = {name for other, name, _ in _tables() if other == algorithm}
-    return sorted(names) or ["tuned"]
+    return sorted(_tables(algorithm))
 
 
 def find_preset(algorithm: str, name: str, env_id: str = DEFAULT_TASK) -> Preset:
@@ -81,10 +79,7 @@ def find_preset(algorithm: str, name: str, env_id: str = DEFAULT_TASK) -> Preset
     names = preset_names(algorithm)
     if name not in names:
         raise InputError(f"preset: expected {' or '.join(names)} for {algorithm}, got {name!r}")
-    tables = {}
-    for (other, kind, task), table in _tables().items():
-        if (other, kind) == (algorithm, name):
-            tables[task] = table
+    tables = _tables(algorithm)[name]
     found = next(_lineage(env_id, list(tables)), None)
     task = found or DEFAULT_TASK
     table = tables.get(task, {})

@@ -1,7 +1,7 @@
 """Stable-Baselines3: its A2C, PPO and SAC as references, and vector envs as it wants them."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 import numpy as np
 from gymnasium import spaces
@@ -14,7 +14,7 @@ from .a2c import A2C, A2CConfig
 from .config import SACConfig
 from .episodes import EpisodeRecorder
 from .networks import Floats
-from .policies import ActionMap, NetworkPolicy
+from .policies import NetworkPolicy
 from .ppo import PPO, PPOConfig
 
 if TYPE_CHECKING:
@@ -108,12 +108,11 @@ class RecordedEnv(VectorEnv[Floats, Floats, np.ndarray]):
         self.recorder = recorder
         self.num_envs = recorder.num_envs
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
-        bounds = [array.bounds() for array in recorder.spec.observation]
-        low = np.concatenate([pair[0].ravel() for pair in bounds])
-        high = np.concatenate([pair[1].ravel() for pair in bounds])
+        bounds = [np.reshape(array.bounds(), (2, -1)) for array in recorder.spec.observation]
+        low, high = np.concatenate(bounds, axis=1).astype(np.float32)
+        self.single_observation_space = spaces.Box(low, high)
         actions = recorder.actions
         box = spaces.Box(-1, 1, (actions.size,))
-        self.single_observation_space = spaces.Box(low.astype("f"), high.astype("f"))
         self.single_action_space = spaces.Discrete(actions.outputs) if actions.discrete else box
 
     def reset(self, **_: object) -> tuple[Floats, dict[str, Any]]:
@@ -166,17 +165,22 @@ class SB3Agent:
         self._rollout = config.rollout_size(log.num_envs)
         torch.set_num_threads(1)  # such small nets lose by a second thread
         steps = self._rollout // log.num_envs
+        policy: dict[str, object] = {
+            "net_arch": list(config.hidden),
+            "activation_fn": {"relu": torch.nn.ReLU, "tanh": torch.nn.Tanh}[config.activation],
+        }
         if isinstance(config, SACConfig):
-            kind, settings, policy_settings = _sac(config, steps, log)
+            settings = _sac_settings(config, steps, log)
         else:
-            kind, settings, policy_settings = _on_policy(config, steps, log)
-        activation = {"relu": torch.nn.ReLU, "tanh": torch.nn.Tanh}[config.activation]
-        self.model = kind(
+            settings = _on_policy_settings(config, steps, log)
+            optimizer = {"eps": _EPSILONS[type(config)], "foreach": True}
+            policy |= {"log_std_init": config.log_std, "optimizer_kwargs": optimizer}
+        self.model = _MODELS[type(config)](
             "MlpPolicy",
             SB3VecEnv(RecordedEnv(log)),
             learning_rate=self._learning_rate,
             gamma=config.gamma,
-            policy_kwargs={"activation_fn": activation, **policy_settings},
+            policy_kwargs=policy,
             seed=learner.seeds_of(seed)[0] % 2**32,
             device="cpu",
             **settings,
@@ -293,14 +297,12 @@ class _PPO(sb3.PPO):
         critic["lr"] = actor["lr"] * self.critic_share
 
 
-_Made = tuple[type, dict[str, object], dict[str, object]]
-"""A class of SB3, its settings, and those of its policy."""
+_MODELS: Final[dict[type, Any]] = {A2CConfig: sb3.A2C, PPOConfig: _PPO, SACConfig: sb3.SAC}
+_EPSILONS: Final[dict[type, float]] = {A2CConfig: A2C.epsilon, PPOConfig: PPO.epsilon}
 
 
-def _on_policy(config: A2CConfig, steps: int, log: EpisodeRecorder) -> _Made:
+def _on_policy_settings(config: A2CConfig, steps: int, log: EpisodeRecorder) -> dict[str, object]:
     rollout = steps * log.num_envs
-    hidden = list(config.hidden)
-    epsilon = (PPO if isinstance(config, PPOConfig) else A2C).epsilon
     settings: dict[str, object] = {
         "n_steps": steps,
         "gae_lambda": config.gae_lambda,
@@ -308,27 +310,22 @@ def _on_policy(config: A2CConfig, steps: int, log: EpisodeRecorder) -> _Made:
         "vf_coef": config.vf_coef,
         "normalize_advantage": config.normalize and rollout > 1,
     }
-    policy: dict[str, object] = {
-        "net_arch": {"pi": hidden, "vf": hidden},
-        "log_std_init": config.log_std,
-        "optimizer_kwargs": {"eps": epsilon, "foreach": True},
-    }
     if not isinstance(config, PPOConfig):
-        return sb3.A2C, {**settings, "max_grad_norm": float("inf"), "use_rms_prop": False}, policy
-    settings |= {
+        return {**settings, "max_grad_norm": float("inf"), "use_rms_prop": False}
+    return {
+        **settings,
         "max_grad_norm": config.max_grad_norm,
         "batch_size": -(-rollout // config.minibatches),
         "n_epochs": config.epochs,
         "clip_range": config.clip,
     }
-    return _PPO, settings, policy
 
 
-def _sac(config: SACConfig, steps: int, log: EpisodeRecorder) -> _Made:
-    if ActionMap(log.spec.action).discrete:
+def _sac_settings(config: SACConfig, steps: int, log: EpisodeRecorder) -> dict[str, object]:
+    if log.actions.discrete:
         raise InputError("sb3-sac: expected an env of continuous actions, got one of choices")
     aim = config.target_entropy
-    settings: dict[str, object] = {
+    return {
         "buffer_size": config.buffer_size,
         "learning_starts": config.learning_starts - 1,  # SB3 learns after more than so many
         "batch_size": config.batch_size,
@@ -338,4 +335,3 @@ def _sac(config: SACConfig, steps: int, log: EpisodeRecorder) -> _Made:
         "ent_coef": f"auto_{config.alpha}",
         "target_entropy": "auto" if aim is None else aim,
     }
-    return sb3.SAC, settings, {"net_arch": list(config.hidden)}
