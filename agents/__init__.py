@@ -75,8 +75,12 @@ def make_agent(algorithm: str, log: EpisodeRecorder, config: Config, seed: int) 
             f"algorithm: expected {algorithm} with its {row.config.__name__}, "
             f"got {type(config).__name__}"
         )
-    agent: Agent = row.agent_class()(log, config, seed)
-    return agent
+    if row.agent is not None:
+        return row.agent(log, config, seed)
+    from .sb3 import SB3Agent
+
+    assert isinstance(config, A2CConfig | SACConfig)
+    return SB3Agent(log, config, seed)
 
 
 def start_agent(

@@ -5,6 +5,7 @@ keeps no simulator's state: it resets to the same seed and repeats the same acti
 """
 
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
@@ -110,7 +111,6 @@ class EpisodeRecorder:
         self.drawn: dict[int, dict[str, float]] = {}
         self.out: Mask = np.zeros(count, bool)
         self.done: Mask = self.out
-        self._drawn = [array for array in self.spec.telemetry if array.name == "drawn"]
         self._together = len(self.spec.agents)
         self._began: float | None = None
         self._numbers = np.arange(-count, 0)  # of the running episodes
@@ -119,8 +119,7 @@ class EpisodeRecorder:
         self._rewards = np.zeros(count)
         self._sizes = np.zeros(count)
         self._seeds = np.zeros(count, np.uint64)
-        self._all = np.ones(count, bool)
-        self._nothing = np.full(count, np.nan)
+        self._nothing = np.full((count, 1), np.nan)
         self._flown: list[np.ndarray] = []  # actions; at least those of the running episodes
         self._keep_steps = keep_steps
         self._steps: list[NDArray[np.float64]] = []
@@ -148,7 +147,7 @@ class EpisodeRecorder:
 
     def reset(self) -> None:
         """Begin an episode of every drone."""
-        self._number(self._all)
+        self._number(np.ones(self.num_envs, bool))
         self.env.reset(seed=self._seeds.tolist())
 
     def fly(self, actions: Floats, begins: Mask | None = None, frozen: Mask | None = None) -> None:
@@ -221,7 +220,7 @@ class EpisodeRecorder:
         self.episodes = list(position.episodes)
         self._numbers[:] = position.numbers
         self._first_steps[:] = position.first_steps
-        self._draw_seeds(self._all)
+        self._draw_seeds(range(self.num_envs))
         while self._repeat(position):  # a simulator was lost: once more, with the next
             pass
         expected = position.observations
@@ -240,16 +239,19 @@ class EpisodeRecorder:
         `episode` (int64), and float32 of the shape (T,): `value` of the headline metric, `reward`,
         and `thrust`, the mean over the rotors in N. NaN where the env does not tell it.
         """
-        table = np.concatenate([np.zeros((0, 4)), *self._steps])
-        columns: dict[str, np.ndarray] = {"episode": table[:, 0].astype(np.int64)}
-        for place, name in enumerate(("value", "reward", "thrust"), 1):
-            columns[name] = table[:, place].astype(np.float32)
-        return columns
+        episode, *others = np.concatenate([np.zeros((0, 4)), *self._steps]).T
+        value, reward, thrust = np.array(others, np.float32)
+        return {
+            "episode": episode.astype(np.int64),
+            "value": value,
+            "reward": reward,
+            "thrust": thrust,
+        }
 
     def _repeat(self, position: Position) -> bool:
         """Fly the actions of a position; whether a simulator was lost."""
         env = self.env
-        self._forget(self._all)
+        self._forget(np.ones(self.num_envs, bool))
         self._flown = []
         self._steps = []
         env.reset(seed=self._seeds.tolist())
@@ -277,7 +279,7 @@ class EpisodeRecorder:
         """Give these drones their next episodes."""
         self._numbers[drones] = self._numbers.max() + 1 + np.arange(drones.sum())
         self._first_steps[drones] = self.env_steps
-        self._draw_seeds(drones)
+        self._draw_seeds(np.flatnonzero(drones).tolist())
         self._forget(drones)
 
     def _forget(self, drones: Mask) -> None:
@@ -291,21 +293,21 @@ class EpisodeRecorder:
         self.out = self.out | ended
         self.done = worlds_done(self.out, self._together)
 
-    def _draw_seeds(self, drones: Mask) -> None:
-        for drone in np.flatnonzero(drones).tolist():
+    def _draw_seeds(self, drones: Iterable[int]) -> None:
+        for drone in drones:
             self._seeds[drone] = episode_seed(self.run_seed, int(self._numbers[drone]))
 
     def _keep_step(self, idle: Mask | None) -> None:
         telemetry = self.env.telemetry
-        values = telemetry["metrics"][:, 0] if "metrics" in telemetry else self._nothing
+        metrics = telemetry.get("metrics", self._nothing)
+        values = metrics[:, 0]
         sizes = np.abs(values)
         self._lengths += 1 if idle is None else ~idle
         self._rewards += self.env.rewards  # 0 of those that did not fly
         self._sizes += sizes if idle is None else np.where(idle, 0.0, sizes)
         if self._keep_steps:
-            thrust = telemetry["thrust"] if "thrust" in telemetry else self._nothing[:, np.newaxis]
-            columns = (self._numbers, values, self.env.rewards, thrust.mean(axis=1))
-            table = np.stack(columns, axis=1)
+            thrust = telemetry.get("thrust", self._nothing).mean(axis=1)
+            table = np.stack((self._numbers, values, self.env.rewards, thrust), axis=1)
             self._steps.append(table if idle is None else table[~idle])
 
     def _keep_episodes(self, ended: Mask) -> None:
@@ -313,8 +315,7 @@ class EpisodeRecorder:
         flown = ended & (self._lengths > 0)  # others were lost before their first step
         for drone in np.flatnonzero(flown).tolist():
             self._keep_episode(drone)
-        running = self._lengths[~ended]
-        keep = int(running.max()) if running.size else 0
+        keep = int(np.max(self._lengths, where=~ended, initial=0))
         self._flown = self._flown[len(self._flown) - keep :]
 
     def _keep_episode(self, drone: int) -> None:
@@ -332,6 +333,7 @@ class EpisodeRecorder:
             simulator_lost=bool(env.lost[drone]),
         )
         self.episodes.append(episode)
-        for array in self._drawn:
-            values = env.telemetry["drawn"][drone].tolist()
-            self.drawn[episode.episode] = dict(zip(array.components, values, strict=True))
+        for array in self.spec.telemetry:
+            if array.name == "drawn":
+                values = env.telemetry["drawn"][drone].tolist()
+                self.drawn[episode.episode] = dict(zip(array.components, values, strict=True))

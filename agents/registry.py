@@ -4,14 +4,14 @@ To add an algorithm, write its config and its class in a module of its own, and 
 presets, if it has any, are in `presets.toml`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
 
 from ..models.errors import InputError
 from .a2c import A2C, A2CConfig
 from .config import Config, SACConfig
+from .episodes import EpisodeRecorder
 from .geometric import Geometric
 from .mappo import MAPPO
 from .orca import Orca
@@ -35,32 +35,26 @@ class Algorithm:
     label: str
     """Name in tables and figures."""
     config: type[Config]
-    agent: Any
-    """Class; or its module and name, which are imported when needed."""
-    resumes: bool = True
-    """Whether a stopped training goes on, and another begins with its networks."""
+    agent: "Callable[[EpisodeRecorder, Any, int], Learner] | None" = None
+    """Class; None: Stable-Baselines3's, which is imported when needed."""
     color: str = ""
     """Of its curves in figures; empty: one of the palette."""
 
-    def agent_class(self) -> Any:
-        """The class. Raises `MissingPackage`."""
-        if not isinstance(self.agent, str):
-            return self.agent
-        module, _, name = self.agent.partition(":")
-        return getattr(import_module(module, __package__), name)
+    @property
+    def resumes(self) -> bool:
+        """Whether a stopped training goes on, and another begins with its networks."""
+        return self.agent is not None
 
-
-_SB3: Final = ".sb3:SB3Agent"
 
 ALGORITHMS: Final[dict[str, Algorithm]] = {
-    "vpg": Algorithm("VPG", VPGConfig, VPG, color="#D55E00"),
-    "a2c": Algorithm("A2C", A2CConfig, A2C, color="#0072B2"),
+    "vpg": Algorithm("VPG", VPGConfig, VPG, "#D55E00"),
+    "a2c": Algorithm("A2C", A2CConfig, A2C, "#0072B2"),
     "ppo": Algorithm("PPO", PPOConfig, PPO),
     "ippo": Algorithm("IPPO", PPOConfig, PPO),
     "mappo": Algorithm("MAPPO", PPOConfig, MAPPO),
-    "sb3-a2c": Algorithm("SB3 A2C", A2CConfig, _SB3, resumes=False, color="#009E73"),
-    "sb3-ppo": Algorithm("SB3 PPO", PPOConfig, _SB3, resumes=False),
-    "sb3-sac": Algorithm("SB3 SAC", SACConfig, _SB3, resumes=False),
+    "sb3-a2c": Algorithm("SB3 A2C", A2CConfig, color="#009E73"),
+    "sb3-ppo": Algorithm("SB3 PPO", PPOConfig),
+    "sb3-sac": Algorithm("SB3 SAC", SACConfig),
 }
 
 Controller = PID | Geometric | Orca

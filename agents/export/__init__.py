@@ -14,6 +14,8 @@ import numpy as np
 from ...envs.spec import EnvSpec
 from ...models.errors import InputError, require
 from ..checkpoints import Checkpoint
+from ..networks import Affine, Relu, Tanh
+from ..normalization import Moments
 from ..policies import NetworkPolicy, flat_size
 
 FORMAT: Final = 1
@@ -26,9 +28,8 @@ _TRIED = 256
 _FAR = 100.0
 """Observations that a policy is tried with, and their largest numbers where they have no bound."""
 
-_SPEC: Final = (
-    "env_id", "options", "control_period", "vehicle", "vehicle_hash", "observation", "action"
-)  # fmt: skip
+
+_SPEC: Final = ("env_id", "options", "control_period", "vehicle", "vehicle_hash", "observation")
 
 
 def export(checkpoint: Checkpoint, target: str) -> bytes:
@@ -47,6 +48,12 @@ def export(checkpoint: Checkpoint, target: str) -> bytes:
         env_steps=checkpoint.position.env_steps,
     )
     policy = checkpoint.policy()
+    for layer in policy.layers:
+        if not isinstance(layer, Moments | Affine | Relu | Tanh):
+            raise InputError(
+                f"export: expected layers of normalise, affine, relu and tanh, "
+                f"got {type(layer).__name__}"
+            )
     _check_finite(policy)
     content: bytes = module.write(policy, facts)
     return content
@@ -77,7 +84,7 @@ def metadata(spec: EnvSpec, *, algorithm: str, seed: int, env_steps: int) -> dic
         "seed": seed,
         "env_steps": env_steps,
         "inputs": flat_size(spec),
-        **{name: fields[name] for name in _SPEC},
+        **{name: fields[name] for name in (*_SPEC, "action")},
     }
     return {
         name: value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)

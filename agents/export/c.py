@@ -10,7 +10,6 @@ from typing import Final
 import numpy as np
 
 from ...envs.spec import BODY_TO_WORLD, ArraySpec, Discrete, EnvSpec, component_names
-from ...models.errors import InputError
 from ..networks import Affine, Floats, Relu, Tanh
 from ..normalization import Moments
 from ..policies import NetworkPolicy, flat_size
@@ -60,7 +59,9 @@ def write(policy: NetworkPolicy, facts: Mapping[str, str]) -> bytes:
     for name, values in program.tables.items():
         numbers = _table(values)
         parts.append(f"static const float rotorgram_{name}[{values.size}] = {{\n{numbers}\n}};")
-    parts += [_LAYER, _TANH] if program.uses_tanh else [_LAYER]
+    parts.append(_LAYER)
+    if any(isinstance(layer, Tanh) for layer in policy.layers):
+        parts.append(_TANH)
     parts += [
         "\n/* The action for an observation. */",
         f"static inline void rotorgram_policy(const float observation[{facts['inputs']}],",
@@ -87,7 +88,6 @@ class _Program:
         self.lines: list[str] = []
         self.at = "observation"
         self.size = flat_size(policy.spec)
-        self.uses_tanh = False
         for layer in policy.layers:
             if isinstance(layer, Moments):
                 self._normalise(layer)
@@ -95,14 +95,8 @@ class _Program:
                 self._affine(layer)
             elif isinstance(layer, Relu):
                 self._each(f"{self.at}[i] = {self.at}[i] < 0.0f ? 0.0f : {self.at}[i];")
-            elif isinstance(layer, Tanh):
-                self.uses_tanh = True
-                self._each(f"{self.at}[i] = rotorgram_tanh({self.at}[i]);")
             else:
-                raise InputError(
-                    f"export: expected layers of normalise, affine, relu and tanh, "
-                    f"got {type(layer).__name__}"
-                )
+                self._each(f"{self.at}[i] = rotorgram_tanh({self.at}[i]);")
         if policy.actions.discrete:
             self._choose()
         else:
@@ -112,38 +106,32 @@ class _Program:
         self.tables[name] = values
         return f"rotorgram_{name}"
 
-    def _buffer(self, size: int) -> str:
-        free = "b" if self.at == "a" else "a"
-        self.buffers[free] = max(size, self.buffers.get(free, 0))
-        return free
+    def _move(self, size: int) -> tuple[str, str]:
+        """Names of the array so far and of the next one, of this size."""
+        before = self.at
+        self.at = "b" if before == "a" else "a"
+        self.buffers[self.at] = max(size, self.buffers.get(self.at, 0))
+        return before, self.at
 
-    def _each(self, *statements: str) -> None:
+    def _each(self, statement: str) -> None:
         """A loop over the numbers so far."""
-        start = f"for (int i = 0; i < {self.size}; i++)"
-        inner = [f"    {statement}" for statement in statements]
-        if len(inner) == 1:
-            self.lines += [start, *inner]
-        else:
-            self.lines += [f"{start} {{", *inner, "}"]
+        self.lines += [f"for (int i = 0; i < {self.size}; i++)", f"    {statement}"]
 
     def _normalise(self, layer: Moments) -> None:
         mean = self._table("mean", layer.mean)
         scale = self._table("scale", layer.scale)
-        out = self._buffer(self.size)
-        self._each(f"{out}[i] = ({self.at}[i] - {mean}[i]) * {scale}[i];")
-        self.at = out
+        inputs, outputs = self._move(self.size)
+        self._each(f"{outputs}[i] = ({inputs}[i] - {mean}[i]) * {scale}[i];")
 
     def _affine(self, layer: Affine) -> None:
-        outputs, inputs = layer.weight.shape
+        units, count = layer.weight.shape
         number = sum(name.startswith("weight_") for name in self.tables)
         weight = self._table(f"weight_{number}", layer.weight)
         bias = self._table(f"bias_{number}", layer.bias)
-        out = self._buffer(outputs)
-        self.lines.append(
-            f"rotorgram_layer({weight}, {bias}, {self.at}, {inputs}, {out}, {outputs});"
-        )
-        self.at = out
-        self.size = outputs
+        inputs, outputs = self._move(units)
+        arguments = f"{weight}, {bias}, {inputs}, {count}, {outputs}, {units}"
+        self.lines.append(f"rotorgram_layer({arguments});")
+        self.size = units
 
     def _choose(self) -> None:
         self.lines.append("action[0] = 0.0f;")
@@ -152,16 +140,17 @@ class _Program:
 
     def _act(self, policy: NetworkPolicy) -> None:
         """Map the outputs to the range of the action, and clip them to its bounds."""
-        actions = policy.actions
-        middle = self._table("action_middle", actions.middle)
-        half = self._table("action_half", actions.half)
-        low = self._table("action_low", actions.low)
-        high = self._table("action_high", actions.high)
-        self._each(
-            f"float y = {middle}[i] + {half}[i] * {self.at}[i];",
-            f"y = y < {low}[i] ? {low}[i] : y;",
-            f"action[i] = y > {high}[i] ? {high}[i] : y;",
+        middle, half, low, high = (
+            self._table(f"action_{name}", getattr(policy.actions, name))
+            for name in ("middle", "half", "low", "high")
         )
+        self.lines += [
+            f"for (int i = 0; i < {self.size}; i++) {{",
+            f"    float y = {middle}[i] + {half}[i] * {self.at}[i];",
+            f"    y = y < {low}[i] ? {low}[i] : y;",
+            f"    action[i] = y > {high}[i] ? {high}[i] : y;",
+            "}",
+        ]
 
 
 def _comment(text: str) -> str:
@@ -187,14 +176,8 @@ def _table(values: Floats) -> str:
     """
     finite = values.clip(-_LARGEST, _LARGEST)
     words = [_number(value) for value in finite.ravel().tolist()]
-    lines = []
-    for first in range(0, len(words), 6):
-        lines.append("    " + ", ".join(words[first : first + 6]))
-    return ",\n".join(lines)
-
-
-def _choices(action: Discrete) -> list[str]:
-    return list(action.components) or [str(i) for i in range(action.n)]
+    lines = [", ".join(words[first : first + 6]) for first in range(0, len(words), 6)]
+    return ",\n".join(f"    {line}" for line in lines)
 
 
 def _about(spec: EnvSpec, facts: Mapping[str, str]) -> list[str]:
@@ -212,7 +195,8 @@ def _about(spec: EnvSpec, facts: Mapping[str, str]) -> list[str]:
     ]
     if isinstance(action, Discrete):
         lines.append("action, the number of a choice:")
-        lines += [f"  {i}: {name}" for i, name in enumerate(_choices(action))]
+        choices = action.components or range(action.n)
+        lines += [f"  {i}: {name}" for i, name in enumerate(choices)]
     else:
         lines += ["action:", *_described([action], spec.action_scale)]
     return [_comment(line).rstrip() for line in lines]
@@ -229,8 +213,8 @@ def _described(arrays: Iterable[ArraySpec], scale: np.ndarray) -> Iterator[str]:
             unit = "" if units[place] == "1" else units[place]
             scaled = "" if scales[place] == 1 else f"of {scales[place]:.7g} "
             bounds = f"{low[place]:g} to {high[place]:g} {scaled}{unit}".rstrip()
-            words = f"{bounds}, {array.frame}" if array.frame else bounds
-            yield f"  {number}: {name}: {words}"
+            frame = f", {array.frame}" if array.frame else ""
+            yield f"  {number}: {name}: {bounds}{frame}"
             number += 1
 
 
