@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rotorgram.agents import Checkpoint, load, preset, store
+from rotorgram.agents import Checkpoint, load, preset
 from rotorgram.cli import main
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.envs.config import EnvConfig
@@ -16,14 +16,15 @@ from rotorgram.training.settings import Run
 from rotorgram.training.training import Training
 
 SHORT = {"episode_length": 30, "start_band": 0.3, "flight_band": 0.4}
+HOVER = "rotorgram/Hover-v0"
 OURS = "vpg, a2c, ppo, ippo, mappo"
 WINDY = {**SHORT, "effects": {"linear_drag": 0.5}}
 SMALL: dict[str, dict[str, Any]] = {
     "vpg": {"episodes_per_update": 4},
     "a2c": {"steps_per_update": 40},
     "ppo": {"steps_per_update": 40, "epochs": 2, "minibatches": 2},
-    "sb3-ppo": {"steps_per_update": 40, "epochs": 2, "minibatches": 2},
 }
+SMALL["sb3-ppo"] = SMALL["ppo"]
 
 
 def training_of(
@@ -34,8 +35,9 @@ def training_of(
     **changes: Any,
 ) -> Training:
     config = preset(algorithm, "tuned", **{**SMALL[algorithm], **changes})
-    run = Run(algorithm=algorithm, config=config, seed=4, env_steps=400, num_envs=4,
-              env=EnvConfig.from_keywords(env_id, **options))  # fmt: skip
+    env_config = EnvConfig.from_keywords(env_id, **options)
+    sizes = {"env_steps": 400, "num_envs": 4}
+    run = Run(algorithm=algorithm, config=config, seed=4, env=env_config, **sizes)
     env: Any = LocalVectorEnv(run.env, 4, autoreset_mode="Disabled")
     return Training(run, env, start=start)
 
@@ -46,43 +48,42 @@ def trained(algorithm: str, options: Any = SHORT, **changes: Any) -> Checkpoint:
     return training.checkpoint()
 
 
-def same(one: Any, other: Any) -> bool:
-    return {k: v.tobytes() for k, v in one.items()} == {k: v.tobytes() for k, v in other.items()}
-
-
-def layers(actor: Any) -> dict[str, np.ndarray]:
-    return {name: array for name, array in actor.items() if name != "log_std"}
+def layers(actor: Any) -> dict[str, bytes]:
+    return {name: array.tobytes() for name, array in actor.items() if name != "log_std"}
 
 
 @pytest.mark.parametrize("algorithm", ["vpg", "a2c", "ppo"])
 def test_it_begins_with_the_networks_and_with_nothing_else(algorithm: str) -> None:
     kept = trained(algorithm)
-    agent, new = (training_of(algorithm, start=start).agent for start in (kept, None))
-    assert same(layers(agent.actor()), layers(kept.actor))
-    assert not same(layers(agent.actor()), layers(new.actor()))
-    state = agent.state()
-    log_std = agent.actor()["log_std"]  # the noise is that of the preset
+    agent: Any = training_of(algorithm, start=kept).agent
+    new = training_of(algorithm).agent
+    actor = agent.actor()
+    assert layers(actor) == layers(kept.actor)
+    assert layers(actor) != layers(new.actor())
+    log_std = actor["log_std"]  # the noise is that of the preset
     assert log_std == (0.0 if algorithm == "ppo" else -0.5)
-    assert kept.actor["log_std"] != log_std
+    assert log_std != kept.actor["log_std"]
     if algorithm != "vpg":
-        critic = agent.weights.part("critic.").values  # type: ignore[union-attr]
+        critic = agent.weights.part("critic.").values
         assert critic.tobytes() == kept.state["weights"][-critic.size :].tobytes()
+    state = agent.state()
     assert state["optimizer.steps"] == 0
     assert not state["optimizer.first"].any()
 
 
 def test_the_policy_of_vpg_starts_ppo_whose_critic_is_new() -> None:
     kept = trained("vpg")
-    agent, new = (training_of("ppo", start=start).agent for start in (kept, None))
-    assert same(layers(agent.actor()), layers(kept.actor))
-    critics = [one.weights.part("critic.").values for one in (agent, new)]  # type: ignore[union-attr]
+    agent: Any = training_of("ppo", start=kept).agent
+    new: Any = training_of("ppo").agent
+    assert layers(agent.actor()) == layers(kept.actor)
+    critics = [one.weights.part("critic.").values for one in (agent, new)]
     assert critics[0].tobytes() == critics[1].tobytes()
 
 
 def test_the_normalisation_goes_on_where_it_was() -> None:
     kept = trained("ppo", normalize_observations=True)
     training = training_of("ppo", start=kept, normalize_observations=True)
-    assert same(layers(training.agent.actor()), layers(kept.actor))
+    assert layers(training.agent.actor()) == layers(kept.actor)
     assert np.abs(kept.actor["observation.mean"]).max() > 0
     training.train()
     counts = kept.state["observations.count"], training.agent.state()["observations.count"]
@@ -91,40 +92,50 @@ def test_the_normalisation_goes_on_where_it_was() -> None:
     assert counts == (first, first + second)
 
 
-def test_a_second_stage_that_was_stopped_ends_as_if_it_had_not(tmp_path: Path) -> None:
-    kept = trained("ppo")
-    unbroken = training_of("ppo", start=kept)
-    stopped = training_of("ppo", start=kept)
-    unbroken.train()
-    assert not stopped.train(lambda: False)
-    store(stopped.checkpoint(), tmp_path / "stage")
-    resumed = Training.resume(load(tmp_path / "stage"), stopped.env)
-    assert resumed.train()
-    assert same(resumed.agent.state(), unbroken.agent.state())
+@pytest.fixture(scope="module")
+def kept() -> Checkpoint:
+    return trained("ppo")
 
 
-def test_what_does_not_fit_is_one_sentence() -> None:
-    kept = trained("ppo")
-    sb3 = replace(kept, algorithm="sb3-ppo")
-    rates, attitude = ({"action": level} for level in ("rates", "attitude"))
-    hover = "rotorgram/Hover-v0"
-    for changes, sentence in (
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
         ({"algorithm": "sb3-ppo"}, f"start-from: expected a training of {OURS}, got sb3-ppo"),
-        ({"start": kept.policy_alone()}, "start-from: expected the checkpoint of a training, got"),
-        ({"start": sb3}, f"start-from: expected a training of {OURS}, got sb3-ppo"),
-        ({"hidden": (8,)}, r"hidden: expected \(16,\) of the training to start from, got \(8,\)"),
+        ({"hidden": (8,)}, "hidden: expected (16,) of the training to start from, got (8,)"),
         (
             {"options": {**SHORT, "observation": "error"}},
             "start-from: expected observation 'rate of the error' of rotorgram/Elevation-v0, got",
         ),
         (
-            {"start": trained("ppo", rates, env_id=hover), "options": attitude, "env_id": hover},
-            "start-from: expected action 'roll rate' of rotorgram/Hover-v0, got action 'roll'",
+            {"env_id": HOVER, "options": {"action": "attitude"}},
+            "start-from: expected observation 'elevation error' of rotorgram/Elevation-v0, got",
         ),
-        ({"start": replace(kept, state={})}, "checkpoint: its parts do not fit together"),
+    ],
+)
+def test_a_training_that_does_not_fit_is_refused(
+    changes: dict[str, Any], sentence: str, kept: Checkpoint
+) -> None:
+    with pytest.raises(InputError) as told:
+        training_of(**{"algorithm": "ppo", "start": kept, **changes})
+    assert str(told.value).startswith(sentence)
+
+
+def test_other_actions_are_refused() -> None:
+    kept = trained("ppo", {"action": "rates"}, env_id=HOVER)
+    sentence = "start-from: expected action 'roll rate' of rotorgram/Hover-v0, got action 'roll'"
+    with pytest.raises(InputError, match=sentence):
+        training_of("ppo", {"action": "attitude"}, kept, HOVER)
+
+
+def test_a_checkpoint_that_does_not_fit_is_refused(kept: Checkpoint) -> None:
+    sb3 = replace(kept, algorithm="sb3-ppo")
+    for start, sentence in (
+        (sb3, f"start-from: expected a training of {OURS}, got sb3-ppo"),
+        (kept.policy_alone(), "start-from: expected the checkpoint of a training, got a policy"),
+        (replace(kept, state={}), "checkpoint: its parts do not fit together"),
     ):
         with pytest.raises(InputError, match=sentence):
-            training_of(**{"algorithm": "ppo", "start": kept, **changes})
+            training_of("ppo", start=start)
 
 
 def test_a_curriculum_is_a_chain_of_trainings(
