@@ -5,7 +5,6 @@ import re
 import subprocess
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,7 @@ import onnx
 import onnxruntime
 import pytest
 from nets import policy_of as loaded
+from nets import random_policy
 from peers import ANY, Running
 from rotorgram.agents import load, store
 from rotorgram.agents.export import TARGETS, export, metadata
@@ -40,28 +40,19 @@ CHECKED = ["-Wconversion", "-fsanitize=address,undefined", "-fno-sanitize-recove
 
 
 def policy_of(
-    spec: EnvSpec,
-    hidden: tuple[int, ...] = (16,),
-    activation: str = "relu",
-    *,
-    squash: bool = False,
-    normalise: bool = False,
+    spec: EnvSpec, hidden: tuple[int, ...] = (16,), activation: str = "relu", **kinds: bool
 ) -> NetworkPolicy:
     """A policy with random weights, whose outputs fill the range of actions."""
+    policy = random_policy(spec, hidden, activation, 0.3, **kinds)
     rng = np.random.default_rng(0)
-    outputs = spec.action.n if isinstance(spec.action, Discrete) else spec.action.size
-    sizes = [flat_size(spec), *hidden, outputs]
-    weights = {}
-    for i, (inputs, units) in enumerate(pairwise(sizes)):
-        weights[f"layers.{i}.weight"] = rng.normal(size=(units, inputs)) / np.sqrt(inputs)
-        weights[f"layers.{i}.bias"] = 0.3 * rng.normal(size=units)
-    if not isinstance(spec.action, Discrete) and not squash:
-        weights["log_std"] = np.zeros(outputs)
-    if normalise:
-        weights["observation.mean"] = rng.normal(size=sizes[0])
-        weights["observation.scale"] = np.exp(rng.normal(size=sizes[0]))
-    single = {name: array.astype(np.float32) for name, array in weights.items()}
-    return loaded(single, spec, activation, squash=squash)
+    for array in policy.weights.arrays.values():
+        if array.ndim == 2:
+            array[...] = rng.normal(size=array.shape) / np.sqrt(array.shape[1])
+    if policy.moments is not None:
+        size = flat_size(spec)
+        policy.moments.mean = rng.normal(size=size).astype(np.float32)
+        policy.moments.scale = np.exp(rng.normal(size=size)).astype(np.float32)
+    return policy
 
 
 def elevation() -> EnvSpec:
@@ -281,10 +272,16 @@ def test_every_file_tells_what_it_is(trained: Path, tmp_path: Path) -> None:
     told = {entry.key: entry.value for entry in model.metadata_props}
     assert [(one.domain, one.version) for one in model.opset_import] == [("", 13)]
     plain = {
-        "format": "1", "algorithm": "a2c", "seed": "3", "inputs": "3", "control_period": "0.02",
-        "env_id": "rotorgram/Elevation-v0", "vehicle": kept.spec.vehicle,
-        "vehicle_hash": kept.spec.vehicle_hash, "env_steps": str(kept.position.env_steps),
-    }  # fmt: skip
+        "format": "1",
+        "algorithm": "a2c",
+        "seed": "3",
+        "inputs": "3",
+        "control_period": "0.02",
+        "env_id": "rotorgram/Elevation-v0",
+        "vehicle": kept.spec.vehicle,
+        "vehicle_hash": kept.spec.vehicle_hash,
+        "env_steps": str(kept.position.env_steps),
+    }
     assert plain.items() <= told.items()
     assert json.loads(told["options"]) == kept.options
     (observation,) = json.loads(told["observation"])
@@ -294,7 +291,8 @@ def test_every_file_tells_what_it_is(trained: Path, tmp_path: Path) -> None:
     assert observation["frame"] == "world, up"
     action = json.loads(told["action"])
     assert action["components"] == ["collective"]
-    assert (action["low"], action["high"]) == (-1.0, 1.0)
+    assert action["low"] == -1.0
+    assert action["high"] == 1.0
     macros = ["ALGORITHM", "ENV_ID", "OPTIONS", "VEHICLE", "VEHICLE_HASH"]
     expected = [told[name.lower()] for name in macros]
     assert constants_of_c(files["c"], *macros) == expected
@@ -304,57 +302,50 @@ def test_every_file_tells_what_it_is(trained: Path, tmp_path: Path) -> None:
         assert f"\n#define ROTORGRAM_{name} {number}\n" in header
 
 
-EVIL = [
-    "*/ int injected; /*",
-    "*/",
-    "/*",
-    "/",
-    "*",
-    "**//**/",
-    "\\",
-    "??/",
-    "?",
-    "??/*",
-    '"); #error "',
-    "</summary>&amp;<script>",
-    "{0}%s%n$(x)`x`",
-    "m/s² ° µ 漢字 🚁",
-    "\u202e abc \u2028 #error \u2029 \ufeff",
-]
+EVIL = json.loads((ROOT / "tests" / "data" / "evil_texts.json").read_text(encoding="utf-8"))
 """Legal in a spec: no control character, at most 200 characters."""
+WICKED = "".join(EVIL)
+OPTIONS = {"a\\": "*/\n#error\r\u0085\\\n??/\n", WICKED: [WICKED, "\0\x7f"]}
 
 
-def test_no_text_of_a_spec_becomes_code(trained: Path, tmp_path: Path) -> None:
-    count = len(EVIL)
+@pytest.fixture
+def evil(trained: Path, tmp_path: Path) -> dict[str, Path]:
+    """Files of each target, with such texts wherever a spec has one."""
     kept = load(trained / "checkpoint.safetensors")
-    wicked = "".join(EVIL)
-    seen = ArraySpec(
-        name="*/", shape=(count,), unit=tuple(EVIL[::-1]), frame=wicked, components=tuple(EVIL)
-    )
+    names = tuple(EVIL)
+    units = names[::-1]
+    seen = ArraySpec(name="*/", shape=(len(names),), unit=units, frame=WICKED, components=names)
     action = ArraySpec(name="??/", shape=(2,), unit="*/", components=("\\", "/*"))
-    options = {"a\\": "*/\n#error\r\u0085\\\n??/\n", wicked: [wicked, "\0\x7f"]}
-    named = {"env_id": wicked, "vehicle": wicked[::-1], "options": options}
+    named = {"env_id": WICKED, "vehicle": WICKED[::-1], "options": OPTIONS}
     spec = replace(kept.spec, **named, observation=(seen,), action=action)
-    policy = policy_of(spec)
-    crafted = replace(kept, spec=spec, actor=policy.arrays())
+    crafted = replace(kept, spec=spec, actor=policy_of(spec).arrays())
     files = {target: tmp_path / TARGETS[target] for target in TARGETS}
     for target, path in files.items():
         path.write_bytes(export(crafted, target))
-    written = json.dumps(options, ensure_ascii=False)
-    expected = [wicked, wicked[::-1], written]
+    return files
+
+
+def test_no_text_of_a_spec_becomes_code_of_c(evil: dict[str, Path]) -> None:
+    written = json.dumps(OPTIONS, ensure_ascii=False)
     # C of 1999 has trigraphs.
-    assert constants_of_c(files["c"], "ENV_ID", "VEHICLE", "OPTIONS") == expected
+    texts = constants_of_c(evil["c"], "ENV_ID", "VEHICLE", "OPTIONS")
+    assert texts == [WICKED, WICKED[::-1], written]
     # Every line is one that the exporter began, and the header's comment ends where it should.
-    head, _, rest = files["c"].read_text().partition("\n */\n#ifndef")
-    assert all(line[:2] in ("/*", " *") for line in head.split("\n"))
+    header = evil["c"].read_text()
+    head, _, rest = header.partition("\n */\n#ifndef")
+    assert {line[:2] for line in head.split("\n")} == {"/*", " *"}
     assert head.count("*/") == 0
     assert "/*" not in head[2:]
-    assert "??" not in head + rest
+    assert "??" not in header
     code = re.sub(r'"(\\.|[^"\\])*"', "", rest)
     assert "injected" not in code
     assert "#error" not in code
-    assert "\u202e" not in head + rest  # it would show the text in another order than it has
-    told = {entry.key: entry.value for entry in onnx.load(files["onnx"]).metadata_props}
+    assert "\u202e" not in header  # it would show the text in another order than it has
+
+
+def test_onnx_has_every_text_of_a_spec_as_it_is(evil: dict[str, Path]) -> None:
+    model = onnx.load(evil["onnx"])
+    told = {entry.key: entry.value for entry in model.metadata_props}
     assert json.loads(told["observation"])[0]["components"] == EVIL
 
 

@@ -5,10 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from nets import mlp_of, random_policy
+from nets import bound, mlp_of, random_policy
 from rotorgram.agents.config import Config
 from rotorgram.agents.networks import (
-    MLP,
     Affine,
     Layer,
     Network,
@@ -30,12 +29,6 @@ BATCH = 17
 
 def normal(*shape: int) -> np.ndarray:
     return DICE.normal(size=shape).astype(np.float32)
-
-
-def mlp(hidden: tuple[int, ...], outputs: int, activation: str) -> tuple[MLP, Weights]:
-    net, weights = mlp_of((INPUTS, *hidden, outputs), activation)
-    weights.values[:] = 0.5 * normal(weights.values.size)
-    return net, weights
 
 
 def actor(*, discrete: bool) -> NetworkPolicy:
@@ -74,7 +67,8 @@ def test_arrays_are_views_of_one() -> None:
 @pytest.mark.parametrize("activation", ["relu", "tanh"])
 @pytest.mark.parametrize("hidden", [(16,), (8, 9), (7, 6, 5)])
 def test_gradients_are_those_of_torch(hidden: tuple[int, ...], activation: str) -> None:
-    net, weights = mlp(hidden, 2, activation)
+    net, weights = mlp_of((INPUTS, *hidden, 2), activation)
+    weights.values[:] = 0.5 * normal(weights.values.size)
     seen = normal(BATCH, INPUTS)
     slope = normal(BATCH, 2)
     theirs = tensors(weights)
@@ -89,7 +83,9 @@ def test_gradients_are_those_of_torch(hidden: tuple[int, ...], activation: str) 
 def test_log_probability_entropy_and_their_gradients_are_those_of_torch(discrete: bool) -> None:
     ours = actor(discrete=discrete)
     seen = normal(BATCH, INPUTS)
-    actions = DICE.integers(3, size=(BATCH, 1)).astype("f") if discrete else 2 * normal(BATCH, 3)
+    actions = 2 * normal(BATCH, 3)
+    if discrete:
+        actions = DICE.integers(3, size=(BATCH, 1)).astype(np.float32)
     theirs = tensors(ours.weights)
     output = torch_mlp(theirs, torch.from_numpy(seen), "relu")
     given = torch.from_numpy(actions)
@@ -145,14 +141,16 @@ def test_an_actor_begins_near_zero_and_a_net_with_gains() -> None:
     ours = actor(discrete=False)
     ours.initialise(np.random.default_rng(0), -0.5)
     arrays = ours.weights.arrays
-    np.testing.assert_allclose(np.linalg.norm(arrays["layers.0.weight"], axis=0), 2**0.5, rtol=1e-5)
-    np.testing.assert_allclose(np.linalg.norm(arrays["layers.1.weight"], axis=1), 0.01, rtol=1e-5)
+    columns = np.linalg.norm(arrays["layers.0.weight"], axis=0)
+    rows = np.linalg.norm(arrays["layers.1.weight"], axis=1)
+    np.testing.assert_allclose(columns, 2**0.5, rtol=1e-5)
+    np.testing.assert_allclose(rows, 0.01, rtol=1e-5)
     assert arrays["log_std"].tolist() == [-0.5] * 3
     assert not arrays["layers.0.bias"].any()
 
 
 class Squashed(Network):
-    """It begins and ends with layers that work in the memory of their inputs."""
+    """It begins and ends with layers without weights."""
 
     def build(self, inputs: int, outputs: int, config: Config) -> list[Layer]:
         return [Tanh(), Affine(inputs, outputs), Relu()]
@@ -160,8 +158,7 @@ class Squashed(Network):
 
 def test_activations_may_come_first_and_last() -> None:
     network = Squashed(2, 3, VPGConfig())
-    weights = Weights.zeros(network.shapes)
-    network.bind(weights)
+    weights = bound(network)
     network.initialise(np.random.default_rng(0), 0.01)
     inputs = np.array([[0.5, -2.0]], np.float32)
     network.forward(inputs)
