@@ -67,5 +67,18 @@ class Kept(LocalVectorEnv):
             self.results.append((self.observations[0], *numbers))
 
 
+def infos_of(env: Any, policy: Any, seed: int = 0) -> list[dict[str, Any]]:
+    """The info of each step of an episode, which no event ends."""
+    policy.reset()
+    observation, _ = env.reset(seed=seed)
+    infos = []
+    truncated = False
+    while not truncated:
+        observation, _, terminated, truncated, info = env.step(policy.act(observation))
+        infos.append(info)
+        assert not terminated
+    return infos
+
+
 def log_of(ending: str = "end") -> EpisodeRecorder:
     return EpisodeRecorder(Constant(ending), seed=0)

@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import rotorgram.envs  # noqa: F401
+from drones import infos_of
 from remotes import flying
 from rotorgram.agents import Geometric
 from rotorgram.agents.geometric import swing_gains
@@ -39,41 +40,40 @@ if MOVING not in gym.registry:
     register(MOVING, Moving)
 
 
-def errors_of(env: Any, seed: int = 0) -> list[tuple[float, float]]:
-    """Distance to the goal, m, and error of the heading, degrees, after each step."""
-    policy = Geometric(env.get_wrapper_attr("env_spec"))
-    observation, _ = env.reset(seed=seed)
-    errors = []
-    truncated = False
-    while not truncated:
-        observation, _, terminated, truncated, info = env.step(policy.act(observation))
-        errors.append((info["position_error"], info["heading_error"]))
-        assert not terminated
-    return errors
+def flown(env: Any, seed: int = 0) -> list[dict[str, Any]]:
+    """The info of each step."""
+    return infos_of(env, Geometric(env.get_wrapper_attr("env_spec")), seed)
+
+
+def distances(env: Any) -> list[float]:
+    """To the goal after each step, m."""
+    return [info["position_error"] for info in flown(env)]
 
 
 @pytest.mark.parametrize("file", FILES.values(), ids=FILES)
 def test_every_vehicle_goes_to_the_goal_and_the_heading(file: Path) -> None:
-    errors = errors_of(gym.make(HOVER, action="position", vehicle=file, heading=90.0))
-    assert errors[0][0] > 0.3
-    assert max(distance for distance, _ in errors[200:]) < 0.02
-    assert abs(errors[-1][1]) < abs(errors[0][1]) / 4
+    infos = flown(gym.make(HOVER, action="position", vehicle=file, heading=90.0))
+    errors = [info["position_error"] for info in infos]
+    headings = [abs(info["heading_error"]) for info in infos]
+    assert errors[0] > 0.3
+    assert max(errors[200:]) < 0.02
+    assert headings[-1] < headings[0] / 4
 
 
 def test_a_goal_that_moves_is_followed() -> None:
     """Without the goal's velocity and acceleration it would stay 1 / 0.88 m behind."""
-    errors = errors_of(gym.make(MOVING, action="position", episode_length=400))
-    assert max(distance for distance, _ in errors[300:]) < 0.15
+    errors = distances(gym.make(MOVING, action="position", episode_length=400))
+    assert max(errors[300:]) < 0.15
 
 
 def test_wind_and_a_payload_are_held_against() -> None:
     """3 m/s push 27 g sideways by 0.04 N; a payload of a tenth of the mass pulls it down."""
     effects = {"body_drag": True, "wind": (3.0, 0.0, 0.0), "motor_lag": True}
     env = gym.make(HOVER, action="position", vehicle="crazyflie2", effects=effects)
-    assert errors_of(env)[-1][0] < 0.02
+    assert distances(env)[-1] < 0.02
     effects = {"payload": 2.0, "cable": 0.5}
     env = gym.make(HOVER, action="position", effects=effects, goal=(0, 0, 8), episode_length=500)
-    assert errors_of(env)[-1][0] < 0.05
+    assert distances(env)[-1] < 0.05
 
 
 def test_gravity_is_the_vehicles(tmp_path: Path) -> None:
@@ -111,16 +111,9 @@ def test_a_payload_swings_no_more(vehicle: str | None) -> None:
     """The payload alone would swing for minutes: MuJoCo's cable has hardly any damping."""
     options = {} if vehicle is None else {"vehicle": vehicle}
     env = gym.make(PAYLOAD, action="position", **options)
-    policy = Geometric(env.get_wrapper_attr("env_spec"))
-    observation, _ = env.reset(seed=100)
-    swings = []
-    errors = []
-    truncated = False
-    while not truncated:
-        observation, _, terminated, truncated, info = env.step(policy.act(observation))
-        swings.append(info["swing"])
-        errors.append(info["payload_error"])
-        assert not terminated
+    infos = flown(env, seed=100)
+    swings = [info["swing"] for info in infos]
+    errors = [info["payload_error"] for info in infos]
     assert max(swings) > 5.0
     assert max(swings[200:]) < 1.5
     assert max(errors[200:]) < 0.1
@@ -130,15 +123,17 @@ def test_an_estimate_is_flown_by() -> None:
     """The accelerometer's bias moves the estimate itself by some 0.2 m."""
     sensors = {"imu": True, "motion_capture": MOCAP, "estimate": True, "observe": "estimate"}
     env = gym.make(HOVER, action="position", vehicle="crazyflie2", sensors=sensors)
-    assert max(distance for distance, _ in errors_of(env)[150:]) < 0.3
+    assert max(distances(env)[150:]) < 0.3
 
 
 def test_from_hello_alone_over_udp() -> None:
     with flying(HOVER, action="position", vehicle="crazyflie2") as pair:
         pair.remote.connect()
-        remote = errors_of(pair.remote)
-    assert remote == errors_of(gym.make(HOVER, action="position", vehicle="crazyflie2"))
-    assert remote[-1][0] < 0.01
+        remote = flown(pair.remote)
+    local = flown(gym.make(HOVER, action="position", vehicle="crazyflie2"))
+    for name in ("position_error", "heading_error"):
+        assert [info[name] for info in remote] == [info[name] for info in local]
+    assert remote[-1]["position_error"] < 0.01
 
 
 def test_it_says_what_it_needs() -> None:

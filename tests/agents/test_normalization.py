@@ -24,12 +24,16 @@ def test_the_policy_has_the_moments_of_all_rollouts_before_it() -> None:
     """Reward and weights apart, what is seen decides: mean and deviation of the rollouts."""
     env: Any = LocalVectorEnv("rotorgram/Elevation-v0", 4, autoreset_mode="Disabled")
     log = EpisodeRecorder(env, 0)
-    agent: Any = make_agent("a2c", log, A2CConfig(normalize_observations=True,
-                                                  steps_per_update=40), 0)  # fmt: skip
+    config = A2CConfig(normalize_observations=True, steps_per_update=40)
+    agent: Any = make_agent("a2c", log, config, 0)
     update = agent.update
     seen = []
-    agent.update = lambda rollout: (seen.append(rollout.rows(rollout.observations)),
-                                    update(rollout))[1]  # fmt: skip
+
+    def keep_and_update(rollout: Any) -> None:
+        seen.append(rollout.rows(rollout.observations))
+        update(rollout)
+
+    agent.update = keep_and_update
 
     def check() -> bool:
         rows = np.concatenate(seen).astype(float)

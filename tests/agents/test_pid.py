@@ -7,11 +7,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import rotorgram.envs  # noqa: F401
+from drones import ENV, infos_of
 from rotorgram.agents import PID
 from rotorgram.models.errors import InputError
 from scripted import spec_of
-
-ENV = "rotorgram/Elevation-v0"
 
 
 @pytest.mark.parametrize("mode", ["increment", "offset"])
@@ -20,14 +19,7 @@ def test_pid_holds_the_target(mode: str, drag: float) -> None:
     env: Any = gym.make(ENV, action=mode, effects={"linear_drag": drag})
     policy = PID(env.get_wrapper_attr("env_spec"))
     for seed in range(3):
-        policy.reset()
-        observation, _ = env.reset(seed=seed)
-        errors = []
-        truncated = False
-        while not truncated:
-            observation, _, terminated, truncated, info = env.step(policy.act(observation))
-            errors.append(abs(info["elevation_error"]))
-            assert not terminated
+        errors = [abs(info["elevation_error"]) for info in infos_of(env, policy, seed)]
         assert np.mean(errors[-60:]) < 0.02
 
 
@@ -44,13 +36,19 @@ def test_pid_takes_the_vehicle_from_the_spec() -> None:
     assert policy.act(np.array([9.0, 0.0, 0.0], np.float32)).tolist() == [1.0]
 
 
-def test_pid_says_what_it_needs() -> None:
-    for options, sentence in (
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
         ({"observation": "error"}, "observation='full'"),
         ({"action_type": "discrete"}, "action_type='continuous'"),
-    ):
-        env: Any = gym.make(ENV, **options)
-        with pytest.raises(InputError, match=sentence):
-            PID(env.get_wrapper_attr("env_spec"))
+    ],
+)
+def test_pid_says_what_it_needs(options: dict[str, str], sentence: str) -> None:
+    env: Any = gym.make(ENV, **options)
+    with pytest.raises(InputError, match=sentence):
+        PID(env.get_wrapper_attr("env_spec"))
+
+
+def test_pid_flies_elevation_alone() -> None:
     with pytest.raises(InputError, match="expected the env rotorgram/Elevation-v0"):
         PID(spec_of())

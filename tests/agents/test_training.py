@@ -44,19 +44,30 @@ def env_of(run: Run, **changes: Any) -> Any:
     return vector(run.num_envs, **{**run.env.flat_options(), **changes})
 
 
-def test_wrong_runs_are_one_sentence() -> None:
+@pytest.mark.parametrize(
+    ("algorithm", "changes", "sentence"),
+    [
+        ("a2c", {"seed": -1}, "seed: expected 0 or more, got -1"),
+        ("a2c", {"num_envs": 0}, "num_envs: expected 1 or more, got 0"),
+        # Whole steps of 4 drones.
+        ("a2c", {"env_steps": 71}, "env_steps: expected at least 72, got 71"),
+        # An episode of each.
+        ("vpg", {"env_steps": 119}, "env_steps: expected at least 120, got 119"),
+    ],
+)
+def test_wrong_runs_are_one_sentence(
+    algorithm: str, changes: dict[str, Any], sentence: str
+) -> None:
+    run = run_of(algorithm)
+    with pytest.raises(InputError, match=sentence):
+        replace(run, **changes)
+
+
+def test_an_env_of_other_drones_is_refused() -> None:
     run = run_of("a2c")
-    for changes, sentence in (
-        ({"seed": -1}, "seed: expected 0 or more, got -1"),
-        ({"num_envs": 0}, "num_envs: expected 1 or more, got 0"),
-        ({"env_steps": 71}, "env_steps: expected at least 72, got 71"),  # whole steps of 4 drones
-    ):
-        with pytest.raises(InputError, match=sentence):
-            replace(run, **changes)  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="env_steps: expected at least 120, got 119"):
-        replace(run_of("vpg"), env_steps=119)  # an episode of each
+    env = env_of(replace(run, num_envs=3))
     with pytest.raises(InputError, match="env: expected one of 4 drones, got 3"):
-        Training(run, env_of(replace(run, num_envs=3)))
+        Training(run, env)
 
 
 @pytest.mark.parametrize("backend", ["mujoco", "rigid"])
@@ -91,14 +102,14 @@ def test_what_cannot_be_resumed_is_refused() -> None:
     kept = training.checkpoint()
     with pytest.raises(ResumeError, match="resume: expected an env with options"):
         Training.resume(kept, env_of(run, effects={"linear_drag": 0.5}))
-    with pytest.raises(
-        ResumeError,
-        match=r"resume: expected rotorgram quadcopter .*, got Crazyflie 2.* with --vehicle$",
-    ):
+    vehicles = r"resume: expected rotorgram quadcopter .*, got Crazyflie 2.* with --vehicle$"
+    with pytest.raises(ResumeError, match=vehicles):
         Training.resume(kept, env_of(run, vehicle="crazyflie2"))
-    with pytest.raises(CheckpointError, match="its parts do not fit together"):
-        Training.resume(replace(kept, config={**kept.config, "hidden": 8}), env_of(run))
-    with pytest.raises(CheckpointError, match="its parts do not fit together: seed: expected"):
+    unfit = "its parts do not fit together"
+    hidden = {**kept.config, "hidden": 8}
+    with pytest.raises(CheckpointError, match=unfit):
+        Training.resume(replace(kept, config=hidden), env_of(run))
+    with pytest.raises(CheckpointError, match=f"{unfit}: seed: expected"):
         Training.resume(replace(kept, seed=-1), env_of(run))
 
 
