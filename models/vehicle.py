@@ -133,8 +133,8 @@ class Vehicle:
         """Of a sphere about the body's origin that holds all that can collide, m."""
         model = self.model
         data = level_data(model)
-        solid = (model.geom_contype | model.geom_conaffinity) > 0
-        solid &= np.isin(model.geom_bodyid, craft_bodies(model))
+        solid = craft_geoms(model)
+        solid &= (model.geom_contype | model.geom_conaffinity) > 0
         reach = np.linalg.norm(data.geom_xpos, axis=1) + model.geom_rbound
         return float(reach[solid].max(initial=0.0))
 
@@ -194,7 +194,7 @@ class Vehicle:
             hang_payload(spec, {"": craft}, payload, cable)
         model = spec.compile()
         model.dof_damping[0:3] = self.model.dof_damping[0:3]
-        _group(model)
+        model.geom_group[:] = craft_geoms(model)
         if payload and self._meets(model, payload_radius(payload), cable):
             clear = f"a payload with a radius of {payload_radius(payload):.3g} m hangs clear"
             raise InputError(f"effects: cable: expected a length at which {clear}, got {cable:g} m")
@@ -276,9 +276,9 @@ def owners(model: mujoco.MjModel) -> np.ndarray:
     return owner
 
 
-def _group(model: mujoco.MjModel) -> None:
-    """Put the craft's geoms into a group of their own: see `SURROUNDINGS`."""
-    model.geom_group[:] = np.isin(model.geom_bodyid, craft_bodies(model))
+def craft_geoms(model: mujoco.MjModel) -> np.ndarray:
+    """Which geoms are those of the first free body, and of what is welded to it."""
+    return np.isin(model.geom_bodyid, craft_bodies(model))
 
 
 def payload_body(model: mujoco.MjModel) -> int:
@@ -331,7 +331,7 @@ def _load(path: Path, drag: float, changed: tuple[int, ...]) -> Vehicle:
     rotors = tuple(_read_rotor(model, data, index) for index in range(model.nu))
     allocation = _allocate(rotors, center)
     model.dof_damping[0:3] = drag * mass
-    _group(model)
+    model.geom_group[:] = craft_geoms(model)  # see `SURROUNDINGS`
     return Vehicle(
         path=path,
         name=str(spec.modelname),

@@ -137,7 +137,9 @@ class RotorTable(Rotors):
 
 
 @dataclass(frozen=True, kw_only=True)
-class _CameraTable:
+class CameraTable:
+    """A camera."""
+
     name: Annotated[str, Text(MAX_LETTERS, identifier=True)]
     position: _Place = (0.0, 0.0, 0.0)
     look: _Axis = AHEAD
@@ -150,7 +152,7 @@ class _CameraTable:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _RealFlights:
+class RealFlights:
     """Mean errors of its simulation after half a second of recorded flights."""
 
     position: float | None = optional(0.0, 1e4, "m")
@@ -180,7 +182,7 @@ class _Other:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _File:
+class Tables:
     """A whole file, its tables not read yet."""
 
     name: Annotated[str, Text(100)]
@@ -195,19 +197,6 @@ class _File:
     cameras: object = ()
     real_flights: object = None
 
-
-ENTRIES: Final[Mapping[str, Limits]] = {
-    **limits_of(_File),
-    **limits_of(Body, "body."),
-    **limits_of(Box, "body.parts."),
-    **limits_of(Cylinder, "body.parts."),
-    **limits_of(RotorTable, "rotors."),
-    **limits_of(PlacedRotor, "rotors.list."),
-    **COEFFICIENTS,
-    **limits_of(_CameraTable, "cameras."),
-    **limits_of(_RealFlights, "real_flights."),
-}
-"""Every number of a file by its dotted name."""
 
 FRAMES: Final[Mapping[str, tuple[int, float]]] = {
     "plus": (4, 0.0),
@@ -295,7 +284,7 @@ def _read(path: Path, tree: dict[str, object]) -> VehicleFile:
     numbers: list[Number] = []
     name = path.parent.name if path.stem == "vehicle" else path.stem
     tree = {"name": name, **tree}
-    file = _table(numbers, _File, tree, "vehicle")
+    file = _table(numbers, Tables, tree, "vehicle")
     model = None if file.model is None else _model(path, file.model)
     body = _body(numbers, file.body, model)
     rotors = _rotors(numbers, file.rotors, model)
@@ -321,7 +310,7 @@ _GROUPS: Final[Mapping[str, type]] = {
     "drag": Drag,
     "battery": Battery,
     "sensors": Sensors,
-    "real_flights": _RealFlights,
+    "real_flights": RealFlights,
 }
 
 
@@ -509,7 +498,7 @@ def _framed(rotors: RotorTable, frame: str) -> RotorTable:
 
 
 def _camera(numbers: list[Number], given: object, where: str) -> Camera:
-    table = _table(numbers, _CameraTable, given, where)
+    table = _table(numbers, CameraTable, given, where)
     kinds = table.kinds
     right = isinstance(kinds, Sequence) and kinds and all(kind in [*OUTPUTS] for kind in kinds)
     if not right:

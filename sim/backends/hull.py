@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from ...models.mjcf import level_data
-from ...models.vehicle import Vehicle, craft_bodies
+from ...models.vehicle import Vehicle, craft_geoms
 from ..state import Array, clip
 
 _ROUNDED: Final = 1e-6  # m: what is no margin of a contact
@@ -82,7 +82,7 @@ def can_touch(model: mujoco.MjModel, geom: int, others: np.ndarray) -> bool:
 def _shapes(model: mujoco.MjModel) -> list[tuple[Array, ...]]:
     """Center, radius, axes as columns, s and t of each geom that can touch the ground."""
     data = level_data(model)
-    ours = np.isin(model.geom_bodyid, craft_bodies(model))
+    ours = craft_geoms(model)
     shapes: list[tuple[Array, ...]] = []
     none = (0.0, 0.0, 0.0)
     kinds = mujoco.mjtGeom

@@ -12,7 +12,7 @@ import numpy as np
 
 from ...models.errors import InputError
 from ...models.fields import Choice, Flag, OrNone, check
-from ...models.vehicle import Vehicle, craft_bodies
+from ...models.vehicle import Vehicle, craft_geoms
 from ..effects import EffectOptions
 from ..randomize import Randomization
 from ..snapshots import Arrays
@@ -263,7 +263,7 @@ class RigidWorld(World):
 def _check_obstacles(vehicle: Vehicle) -> None:
     """Refuse obstacles of the vehicle's file, through which drones would fly."""
     model = vehicle.model
-    ours = np.isin(model.geom_bodyid, craft_bodies(model))
+    ours = craft_geoms(model)
     for i in np.flatnonzero(~ours & (model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)).tolist():
         if can_touch(model, i, ours):
             name = model.geom(i).name or f"geom {i}"

@@ -16,9 +16,11 @@ import mujoco
 import numpy as np
 import pytest
 import rotorgram.envs  # noqa: F401  registers the envs
-from rotorgram.models import InputError, Vehicle, library
+from rotorgram.models import InputError, Vehicle, library, vehicle_file
+from rotorgram.models.coefficients import Battery, Drag, Sensors
 from rotorgram.models.export import export_mjcf
-from rotorgram.models.vehicle_file import ENTRIES, FRAMES, read_vehicle_file
+from rotorgram.models.fields import Limits, limits_of
+from rotorgram.models.vehicle_file import FRAMES, read_vehicle_file
 from rotorgram.rendering.stage import Stage
 
 ROOT = Path(__file__).parents[2]
@@ -539,11 +541,33 @@ def test_bare_names_are_of_the_library(tmp_path: Path, monkeypatch: pytest.Monke
 # ---- the page
 
 
+TABLES = {
+    "": vehicle_file.Tables,
+    "body.": vehicle_file.Body,
+    "body.parts.": vehicle_file.Box,
+    "rotors.": vehicle_file.RotorTable,
+    "rotors.list.": vehicle_file.PlacedRotor,
+    "drag.": Drag,
+    "battery.": Battery,
+    "sensors.": Sensors,
+    "cameras.": vehicle_file.CameraTable,
+    "real_flights.": vehicle_file.RealFlights,
+}
+
+
+def limits_of_all() -> dict[str, Limits]:
+    """Of every number of a file, by its dotted name."""
+    found = limits_of(vehicle_file.Cylinder, "body.parts.")
+    for prefix, kind in TABLES.items():
+        found |= limits_of(kind, prefix)
+    return found
+
+
 def test_the_page_has_every_field_with_its_limits() -> None:
     rows = re.findall(r"^\| `([\w.]+)` \| ([^|]*) \| ([^|]*) \| ([^|]*) \|", PAGE, re.MULTILINE)
     page = {name: (count, unit, limits) for name, count, unit, limits in rows}
     fields = {}
-    for name, limits in ENTRIES.items():
+    for name, limits in limits_of_all().items():
         count = {None: "1 or more"}.get(limits.count, str(limits.count))
         fields[name] = (count, limits.unit, f"{limits.low:g} to {limits.high:g}")
     fields["body.inertia"] = ("3 or 6", "kg m²", "-1e+09 to 1e+09")
