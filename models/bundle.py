@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
-from typing import Final
+from typing import Any, Final
 
 from .errors import InputError, shortened
 from .files import find_in_package
@@ -76,19 +76,16 @@ def _checked(given: object) -> Bundle:
     return tuple((name, content) for name, content in given)
 
 
-def _is_file(pair: object) -> bool:
+def _is_file(pair: Any) -> bool:
     """Whether it is base64 behind a relative path that stays in its folder, on every system."""
-    if not isinstance(pair, list | tuple) or len(pair) != 2:
-        return False
-    name, content = pair
     try:
+        name, content = pair
+        path = PurePosixPath(name)
         base64.b64decode(content, validate=True)
     except (TypeError, ValueError):
         return False
-    if not isinstance(name, str) or {"\\", ":", "\0"} & set(name):
-        return False
-    path = PurePosixPath(name)
-    return bool(path.parts) and not path.is_absolute() and ".." not in path.parts
+    inside = bool(path.parts) and not path.is_absolute() and ".." not in path.parts
+    return inside and not {"\\", ":", "\0"} & set(name)
 
 
 def _with_assets(model: Path) -> list[Path]:

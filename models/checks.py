@@ -12,7 +12,7 @@ import math
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Final
@@ -100,14 +100,12 @@ def _judged(
     *of: str,
     expected: float | None = None,
     tolerance: float = 0.0,
-    high: float | None = None,
     note: str = "",
 ) -> Check:
-    """A check by its row of `RULES`; limits that depend on the craft replace those of the row."""
+    """A check by its row of `RULES`; limits around `expected` replace those of the row."""
     rule = RULES[key]
     low = rule.low
-    if high is None:
-        high = rule.high
+    high = rule.high
     if expected is not None:
         low = expected - tolerance
         high = expected + tolerance
@@ -168,9 +166,7 @@ class _Craft:
     def convergence(self) -> "_Convergence":
         """From one tumbling turn at a step, at its half and at its quarter."""
         vehicle = self.vehicle
-        rows = vehicle.allocation[1:3]
-        ends = np.maximum(rows * vehicle.thrust_low, rows * vehicle.thrust_high)
-        fastest = float((ends.sum(axis=1) / np.diag(vehicle.inertia)[:2]).max())
+        fastest = max(vehicle.turning((1.0, 0.0, 0.0)), vehicle.turning((0.0, 1.0, 0.0)))
         turn = min(max(0.1 * fastest, 1.0), _FASTEST_TURN)
         attitudes = [self._tumble(turn, _COARSE / turn / 2**half) for half in range(3)]
         coarse = _angle(attitudes[0], attitudes[1])
@@ -371,7 +367,8 @@ def _physics_step(craft: _Craft) -> Iterator[Check]:
     step, why = _recommended_step(craft)
     error = math.degrees(craft.convergence.at(craft.vehicle.timestep))
     note = f"{error:.3g}° a second; {why}"
-    yield _judged("physics step", craft.vehicle.timestep, high=step * (1 + _EXACT), note=note)
+    check = _judged("physics step", craft.vehicle.timestep, note=note)
+    yield replace(check, high=step * (1 + _EXACT))
 
 
 def _floor(craft: _Craft) -> Iterator[Check]:

@@ -153,9 +153,7 @@ def as_tuple(value: float | tuple[float, ...]) -> tuple[float, ...]:
 
 
 GROUPS: Final = {"rotors": Rotors, "drag": Drag, "battery": Battery, "sensors": Sensors}
-COEFFICIENTS: Final[Mapping[str, Limits]] = {
-    name: limits
-    for group, kind in GROUPS.items()
-    for name, limits in limits_of(kind, f"{group}.").items()
-}
+COEFFICIENTS: Final[dict[str, Limits]] = {}
 """The limits of every coefficient, by "group.name"."""
+for _group, _kind in GROUPS.items():
+    COEFFICIENTS.update(limits_of(_kind, f"{_group}."))

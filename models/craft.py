@@ -3,10 +3,12 @@
 import math
 import os
 from collections.abc import Sequence
+from itertools import combinations
 from pathlib import Path
 from typing import Any, Final
 
 import mujoco
+import numpy as np
 
 from .cameras import place_camera
 from .coefficients import PREFIX
@@ -14,9 +16,10 @@ from .errors import InputError
 from .files import find_in_package
 from .vehicle_file import UP, Box, Cylinder, PlacedRotor, VehicleFile
 
-Vector = Sequence[float]
+Vector = Sequence[float] | np.ndarray
 Colour = tuple[float, float, float, float]
 
+_ORIGIN: Final = (0.0, 0.0, 0.0)
 DEFAULT_TIMESTEP: Final = 0.01
 """Physics step of a file without one, s."""
 DEFAULT_GRAVITY: Final = 9.81
@@ -118,7 +121,7 @@ def _build(spec: mujoco.MjSpec, file: VehicleFile) -> None:
     Missing lengths are those of quad.xml, in the proportion of the spans.
     """
     spec.compiler.degree = False
-    rotors = [(rotor, rotor.position or (0.0, 0.0, 0.0)) for rotor in file.rotors.list]
+    rotors = [(rotor, rotor.position or _ORIGIN) for rotor in file.rotors.list]
     reach = max(math.hypot(*place) for _, place in rotors)
     reach = max(reach, file.rotors.radius or 0.0, 1e-2)
     unit = reach / math.sqrt(2)  # 1 m of quad.xml
@@ -146,10 +149,10 @@ def _build(spec: mujoco.MjSpec, file: VehicleFile) -> None:
     radius = file.rotors.radius or 0.4 * _nearest([place for _, place in rotors], reach)
     for number, (rotor, place) in enumerate(rotors, 1):
         if not file.body.parts and math.hypot(*place[:2]) > half[0]:
-            ends = (0.0, 0.0, 0.0, *place)
+            ends = (*_ORIGIN, *place)
             _add_geom(body, f"arm{number}", _CYLINDER, _CARBON, (0.035 * unit,), fromto=ends)
         up = _scaled(rotor.axis, 0.09 * unit / math.hypot(*rotor.axis))
-        above = (place[0] + up[0], place[1] + up[1], place[2] + up[2])
+        above = np.add(place, up)
         rgba = _FRONT_DISC if place[0] > 1e-6 * reach else _DISC
         _add_disc(body, f"disc{number}", rotor, radius, above, rgba)
         blade = _scaled((0.97, 0.09, 0.018), radius)
@@ -231,7 +234,7 @@ def _add_looks(body: mujoco.MjsBody, half: Vector) -> None:
 
 def _nearest(places: Sequence[Vector], reach: float) -> float:
     """Shortest distance between two rotors that are not above each other, m."""
-    distances = [math.dist(a[:2], b[:2]) for i, a in enumerate(places) for b in places[:i]]
+    distances = [math.dist(a[:2], b[:2]) for a, b in combinations(places, 2)]
     return min((one for one in distances if one > 0.1 * reach), default=reach)
 
 
@@ -286,7 +289,7 @@ def _rotor_site(
     for joint in list(body.joints):  # a propeller that turns is welded on
         if joint.type != mujoco.mjtJoint.mjJNT_FREE:
             spec.delete(joint)
-    place = rotor.position or (0.0, 0.0, 0.0)
+    place = rotor.position or _ORIGIN
     if file.rotors.radius is not None:
         _add_disc(body, "", rotor, file.rotors.radius, place, _DISC)
     return body.add_site(name=f"rotor/{rotor.name}", pos=place, group=4)

@@ -15,11 +15,15 @@ from .vehicle_file import read_vehicle_file
 MAX_ELEMENTS: Final = 10_000  # of a file, each as often as it is repeated: seconds to compile
 MAX_MEMORY: Final = 1 << 30  # bytes of MJCF's attribute `memory`
 MAX_NUMBERS: Final = 1 << 26  # of all height fields, textures, numerics and sensors: 0.5 GB
+_USER: Final = ("body", "jnt", "geom", "site", "cam", "tendon", "actuator", "sensor")
 _SIZES: Final = {
-    "nuser_body": 100, "nuser_jnt": 100, "nuser_geom": 100, "nuser_site": 100, "nuser_cam": 100,
-    "nuser_tendon": 100, "nuser_actuator": 100, "nuser_sensor": 100, "nuserdata": 1_000_000,
-    "nkey": 100, "nconmax": 100_000, "njmax": 4000, "nstack": 10_000_000,
-}  # fmt: skip
+    **{f"nuser_{kind}": 100 for kind in _USER},
+    "nkey": 100,
+    "njmax": 4000,
+    "nconmax": 100_000,
+    "nuserdata": 1_000_000,
+    "nstack": 10_000_000,
+}
 _SIDES: Final = dict.fromkeys(("nrow", "ncol", "width", "height"), 4096)
 _LENGTHS: Final = dict.fromkeys(("size", "dim", "num", "nsample", "actdim"), 10_000)
 _ARRAYS: Final = {
