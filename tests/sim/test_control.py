@@ -1,7 +1,7 @@
 """Action levels: hand-computed thrusts, batch as single, and all vehicles fly."""
 
 import json
-from math import atan2, cos, degrees, pi, radians, sin, sqrt
+from math import atan2, cos, degrees, pi, radians, sin
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,6 @@ from rotorgram.sim import (
     LEVELS,
     EffectOptions,
     Gains,
-    InitialState,
     WorldState,
     make_controller,
     make_world,
@@ -27,6 +26,8 @@ from rotorgram.sim import (
 from rotorgram.sim.control import MixedController
 from rotorgram.sim.control.cascade import Position
 from rotorgram.sim.control.gains import shared_ranges
+from tables import SIM
+from worlds import begin
 
 approx = pytest.approx
 DATA = Path(__file__).parents[1] / "data"
@@ -46,14 +47,6 @@ def state_of(vehicle: Vehicle, **given: Any) -> WorldState:
     usual |= {"velocity": np.zeros(3), "body_rates": np.zeros(3)}
     usual |= {"command": thrust, "thrust": thrust, "touching": np.zeros((), bool)}
     return WorldState(**(usual | given))
-
-
-def thrusts(level: str, action: Any, **given: Any) -> list[float]:
-    """Of the paper's craft."""
-    vehicle = Vehicle.load()
-    controller = make_controller(level, vehicle, vehicle.timestep)
-    found = controller.thrust(np.array(action, float), state_of(vehicle, **given))
-    return approx(found.tolist(), abs=2e-3)  # type: ignore[no-any-return]
 
 
 # --- gains and ranges -----------------------------------------------------------------------------
@@ -112,86 +105,22 @@ def test_five_equal_poles() -> None:
 # --- each level by hand ---------------------------------------------------------------------------
 
 
-def test_rates_by_hand() -> None:
-    assert thrusts("rates", (0, 0, 0, 0)) == [49.0, 49.0, 49.0, 49.0]
-    assert thrusts("rates", (1, 0, 0, 0)) == [100.0] * 4
-    assert thrusts("rates", (0.5, 0, 0, 0)) == [74.5] * 4  # 49 + 0.5 · 51
-    assert thrusts("rates", (-7, 0, 0, 0)) == [0.0] * 4  # beyond the bound is the bound
-    # 1.10689 rad/s · 8.83168 /s · 5.025725 kg m² = 49.1298 N m: 12.2825 N of each rotor.
-    assert thrusts("rates", (0, 0.1, 0, 0)) == [61.2825, 36.7175, 36.7175, 61.2825]
-    assert thrusts("rates", (0, 0, 0.1, 0)) == [36.7175, 36.7175, 61.2825, 61.2825]
-    # 0.175449 · 1.39987 · 10.00163 = 2.45646 N m; a rotor gives 0.05 N m/N, four share it.
-    assert thrusts("rates", (0, 0, 0, 0.1)) == [61.2823, 36.7177, 61.2823, 36.7177]
-
-
-def test_the_gyroscopic_torque_by_hand() -> None:
-    """At the rates that are wanted, (0, 2, 1) rad/s: 2 · 1 · (10.00163 - 5.025725) N m of roll."""
-    wanted = (0, 0, 2 / 11.06889, 1 / 1.754486)
-    spinning = thrusts("rates", wanted, body_rates=np.array((0.0, 2.0, 1.0)))
-    assert spinning == [51.48795, 46.51205, 46.51205, 51.48795]
-
-
-def test_attitude_by_hand() -> None:
-    # A roll of 0.0974452 rad: 2 sin of its half is 0.0974067; times 4.41584 /s, 8.83168 /s and
-    # 5.025725 kg m² it is 19.0918 N m.
-    assert thrusts("attitude", (0, 0.1, 0, 0)) == [53.77295, 44.22705, 44.22705, 53.77295]
-    assert thrusts("attitude", (0, 0, 0.1, 0)) == [44.22705, 44.22705, 53.77295, 53.77295]
-    # Rolled by 90°, to level: 2 sin 45° · 4.41584 · 8.83168 · 5.025725 = 277.185 N m to the right,
-    # more than 200: with the collective thrust in the middle, two rotors at full thrust.
-    half = sqrt(0.5)
-    assert thrusts("attitude", (0, 0, 0, 0), quaternion=np.array((half, half, 0.0, 0.0))) == [
-        0.0,
-        100.0,
-        100.0,
-        0.0,
-    ]
-    # Upside down the error is 2 rad, about x.
-    over = np.array((0.0, 1.0, 0.0, 0.0))
-    assert thrusts("attitude", (0, 0, 0, 0), quaternion=over) == [100.0, 0.0, 0.0, 100.0]
-
-
-def test_velocity_by_hand() -> None:
-    # 0.313050 m/s · 2.20792 /s = 0.691189 m/s²: 20 kg · 10.491189 m/s² over four.
-    assert thrusts("velocity", (0, 0, 0.1, 0)) == [52.45595] * 4
-    # 0.537368 m/s · 2.20792 /s = 1.186466 m/s² forward: a tilt of atan(1.186466 / 9.8) =
-    # 0.1204821 rad; 2 sin of its half is 0.1204092; · 4.41584 · 8.83168 · 5.025725 = 23.60013 N m.
-    assert thrusts("velocity", (0.1, 0, 0, 0)) == [43.09997, 43.09997, 54.90003, 54.90003]
-    # With the nose to the left, forward is left: the same torque about the same body axis.
-    left = np.array((sqrt(0.5), 0.0, 0.0, sqrt(0.5)))
-    assert thrusts("velocity", (0.1, 0, 0, 0), quaternion=left) == [
-        43.09997,
-        43.09997,
-        54.90003,
-        54.90003,
-    ]
-
-
-def test_position_by_hand() -> None:
-    # 0.4 m · 0.883168 /s · 2.20792 /s = 0.779998 m/s².
-    assert thrusts("position", (0, 0, 0.1, 0)) == [52.89999] * 4
-    # 4 m: half of 4.9 m/s² stops from 3.1305 m/s, within 2 m; 3.1305 · 2.20792 is 6.91190 m/s², up
-    # as it is, and down no more than 4.9.
-    assert thrusts("position", (0, 0, 1, 0)) == [83.5595] * 4
-    assert thrusts("position", (0, 0, -1, 0)) == [24.5] * 4
-    # 0.0314159 rad · 0.69994 /s · 1.39987 /s · 10.00163 kg m² = 0.307878 N m.
-    assert thrusts("position", (0, 0, 0, 0.01)) == [50.53939, 47.46061, 50.53939, 47.46061]
+@pytest.mark.parametrize("table", SIM["thrusts"])
+def test_thrusts_by_hand(table: dict[str, Any]) -> None:
+    vehicle = Vehicle.load()
+    controller = make_controller(table["level"], vehicle, vehicle.timestep)
+    given = {name: np.array(values) for name, values in table.get("state", {}).items()}
+    state = state_of(vehicle, **given)
+    for action, expected in table["rows"]:
+        found = controller.thrust(np.array(action, float), state)
+        assert found == approx(expected, abs=2e-3)
 
 
 def test_mixing_keeps_roll_and_pitch_before_collective_and_that_before_yaw() -> None:
-    vehicle = Vehicle.load()
-    controller: Any = make_controller("rates", vehicle, 0.01)
-
-    def mixed(collective: float, *torque: float) -> Any:
-        return approx(controller.mixed(collective, torque), abs=1e-6)
-
-    assert mixed(196.0, 100.0, 0.0, 0.0) == [74.0, 24.0, 24.0, 74.0]  # all fits
-    assert mixed(400.0, 100.0, 0.0, 0.0) == [100.0, 50.0, 50.0, 100.0]  # less collective thrust
-    assert mixed(0.0, 100.0, 0.0, 0.0) == [50.0, 0.0, 0.0, 50.0]  # more of it
-    assert mixed(196.0, 900.0, 0.0, 5.0) == [100.0, 0.0, 0.0, 100.0]  # no room: no yaw
-    assert mixed(196.0, 300.0, 300.0, 0.0) == [50.0, 0.0, 50.0, 100.0]  # both scaled alike
-    assert mixed(196.0, 0.0, 0.0, 1.0) == [54.0, 44.0, 54.0, 44.0]
-    assert mixed(196.0, 0.0, 0.0, 30.0) == [98.0, 0.0, 98.0, 0.0]  # yaw takes what is left
-    assert mixed(198.0, 100.0, 0.0, 30.0) == [99.0, 0.0, 49.0, 50.0]  # which is 98 / 20 N m
+    controller: Any = make_controller("rates", Vehicle.load(), 0.01)
+    for (collective, *torque), expected in SIM["mixed"]["rows"]:
+        found = controller.mixed(collective, torque)
+        assert found == approx(expected, abs=1e-6)
 
 
 # --- array code -----------------------------------------------------------------------------------
@@ -243,7 +172,7 @@ def flown(
     controller: Any = make_controller(level, vehicle, vehicle.timestep, effects)
     goal = np.array((0.0, 0.0, 50.0))
     start = np.array((0.8, -0.6, 0.5)) if level == "position" else np.zeros(3)
-    world.reset(np.True_, InitialState(position=goal + start, quaternion=np.array(quaternion)))
+    begin(world, position=goal + start, quaternion=quaternion)
     seen = []
     state = world.state
     for _ in range(round(time / vehicle.timestep)):
@@ -311,7 +240,7 @@ def test_loops_invert_the_thrust_curve() -> None:
     command = controller.thrust(np.zeros(4), state_of(vehicle))
     assert command == approx([4 * 0.517687] * 4, abs=1e-5)
     world = make_world(vehicle, 1, effects=effects)
-    world.reset(np.True_, InitialState(position=np.array((0.0, 0.0, 50.0))))
+    begin(world, position=(0.0, 0.0, 50.0))
     world.step(command, 1)
     assert world.state.thrust == approx(vehicle.hover_thrust, abs=1e-5)
     assert hover_error(vehicle=FILES["racer"], effects={"thrust_curve": True}) < 0.01
@@ -363,7 +292,7 @@ def test_loops_run_in_every_physics_step_unless_they_see_an_estimate(
 def test_a_touch_in_an_earlier_physics_step_counts() -> None:
     vehicle = Vehicle.load()
     world = make_world(vehicle, 1)
-    world.reset(np.True_, InitialState(position=np.array((0.0, 0.0, vehicle.rest_height - 1e-3))))
+    begin(world, position=(0.0, 0.0, vehicle.rest_height - 1e-3))
     full = np.full(4, 100.0)
     world.step(full, 1)
     assert world.state.touching

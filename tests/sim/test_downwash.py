@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from rotorgram.models import InputError, Vehicle
 from rotorgram.models.library import vehicle_names
-from rotorgram.sim import EffectOptions, InitialState, World, make_world
+from rotorgram.sim import EffectOptions, World, make_world
 from rotorgram.sim.effects.downwash import Downwash
+from worlds import begin
 
 approx = pytest.approx
 ROOT = Path(__file__).parents[2]
@@ -33,11 +34,14 @@ def test_the_profile_by_hand() -> None:
     assert jet(5.0) == approx(SPEED * 10.11 / 10.817, rel=1e-6)
     half = 0.07668 * 10.817  # radius at which the velocity has halved
     assert jet(5.0, half) == approx(jet(5.0) / 2, rel=1e-6)
-    assert jet(5.0, 2 * half) == approx(jet(5.0) / (1 + 4 * (sqrt(2) - 1)) ** 2)
+    share = 1 + 4 * (sqrt(2) - 1)
+    assert jet(5.0, 2 * half) == approx(jet(5.0) / share**2)
     assert jet(5.0, thrust=4 * WEIGHT) == approx(2 * jet(5.0))
     assert jet(100.0) / jet(50.0) == approx(55.817 / 105.817)
     # Nearer than 2.5 lengths the speed falls to 0 at the height of the rotors, and above it is 0.
-    assert [jet(x) / jet(2.5) for x in (1.25, 0.0, -1.0)] == approx([0.5, 0.0, 0.0])
+    assert jet(1.25) == approx(jet(2.5) / 2)
+    assert jet(0.0) == 0.0
+    assert jet(-1.0) == 0.0
     assert jet(5.0, thrust=-1.0) == 0.0
 
 
@@ -56,8 +60,7 @@ def test_the_momentum_of_a_jet_is_the_thrust_but_for_a_third(name: str) -> None:
         far = np.full_like(radius, depth * downwash.length)
         speed = downwash.velocity(np.full_like(radius, weight), far, radius)
         rings = speed**2 * radius
-        integral = float(((rings[1:] + rings[:-1]) / 2 * np.diff(radius)).sum())
-        momentum = 1.225 * 2 * pi * integral
+        momentum = 1.225 * 2 * pi * np.trapezoid(rings, radius)
         area = vehicle.num_rotors * pi * vehicle.coefficients.rotors.radius**2
         shape = pi * (10.11 * 0.07668) ** 2 / (3 * (sqrt(2) - 1))
         expected = weight / (2 * area) * downwash.length**2 * shape
@@ -65,16 +68,17 @@ def test_the_momentum_of_a_jet_is_the_thrust_but_for_a_third(name: str) -> None:
         assert 2 / 3 < momentum / weight < 1.0
 
 
-def birds(positions: Any, quaternion: Any = (1.0, 0.0, 0.0, 0.0), **effects: Any) -> World:
-    """One world of birds at rest at these positions, at hover thrust."""
+def birds(*lengths: Any, quaternion: Any = (1.0, 0.0, 0.0, 0.0), **effects: Any) -> World:
+    """One world of birds at rest at 20 m, and places from there in lengths, at hover thrust."""
     options = EffectOptions(**effects)
-    count = len(positions)
+    count = len(lengths)
     world = make_world(Vehicle.load(BIRD), 1, drones=count, effects=options)
-    every = np.ones(world.shape, bool)[()]
-    turned = np.broadcast_to(quaternion, (1, count, 4))
-    place = np.array(positions, float).reshape(*world.shape, 3)
-    world.reset(every, InitialState(position=place, quaternion=turned.reshape(*world.shape, 4)))
-    return world
+    place = LENGTH * np.array(lengths) + (0.0, 0.0, 20.0)
+    return begin(world, position=place.reshape(*world.shape, 3), quaternion=quaternion)
+
+
+TOP = (0.0, 0.0, 0.0)
+LOWER = (0.0, 0.0, -5.0)
 
 
 def hover(world: World, steps: int = 1) -> np.ndarray:
@@ -85,7 +89,7 @@ def hover(world: World, steps: int = 1) -> np.ndarray:
 
 
 def test_the_lower_drone_is_pushed_down_by_its_drag_and_the_upper_is_not() -> None:
-    world = birds([(0, 0, 20.0), (0, 0, 20.0 - 5 * LENGTH)], body_drag=True, downwash=True)
+    world = birds(TOP, LOWER, body_drag=True, downwash=True)
     velocity = hover(world)
     wind = jet(5.0)
     expected = -DRAG * wind * wind / MASS * world.vehicle.timestep
@@ -96,7 +100,7 @@ def test_the_lower_drone_is_pushed_down_by_its_drag_and_the_upper_is_not() -> No
 
 
 def test_rotors_in_the_jet_lose_thrust_by_their_inflow() -> None:
-    world = birds([(0, 0, 20.0), (0, 0, 20.0 - 5 * LENGTH)], rotor_drag=True, downwash=True)
+    world = birds(TOP, LOWER, rotor_drag=True, downwash=True)
     rotors = world.vehicle.coefficients.rotors
     speeds = np.sqrt(world.vehicle.hover_thrust / rotors.thrust_coefficient)
     lost = rotors.inflow * speeds.sum() * jet(5.0)
@@ -107,37 +111,37 @@ def test_a_tilted_craft_blows_along_its_own_axis() -> None:
     """By 30° about y: its jet goes down and to -x, and misses the one straight below."""
     tilt = radians(30)
     quaternion = (cos(tilt / 2), 0.0, sin(tilt / 2), 0.0)
-    away = 8 * LENGTH
-    there = (-away * sin(tilt), 0.0, 20.0 - away * cos(tilt))
-    world = birds([(0, 0, 20.0), there, (0, 0, 20.0 - away)], quaternion)
+    there = (-8 * sin(tilt), 0.0, -8 * cos(tilt))
+    world = birds(TOP, there, (0.0, 0.0, -8.0), quaternion=quaternion)
     air = np.stack(Downwash(world.vehicle).air(world.state), axis=-1)[0]
     assert air[0] == approx([0.0, 0.0, 0.0], abs=1e-3)
     own = jet(8.0)
     side = jet(8.0 * cos(tilt), 8.0 * sin(tilt))
-    assert np.linalg.norm(air[1]) == approx(own, rel=0.02)  # the third one's edge besides
-    assert air[1] / np.linalg.norm(air[1]) == approx([-0.5, 0.0, -sqrt(0.75)], abs=1e-6)
+    speed = np.linalg.norm(air[1])
+    assert speed == approx(own, rel=0.02)  # the third one's edge besides
+    assert air[1] / speed == approx([-0.5, 0.0, -sqrt(0.75)], abs=1e-6)
     assert np.linalg.norm(air[2]) == approx(side, rel=0.02)
     assert side < 0.1 * own
 
 
 def test_jets_of_several_add_up() -> None:
-    world = birds([(0, 0, 20.0), (0, 0, 20.0 - 4 * LENGTH), (0, 0, 20.0 - 9 * LENGTH)])
+    world = birds(TOP, (0.0, 0.0, -4.0), (0.0, 0.0, -9.0))
     air = np.stack(Downwash(world.vehicle).air(world.state), axis=-1)[0]
     assert air[2] == approx([0.0, 0.0, -(jet(9.0) + jet(5.0))], rel=1e-6)
 
 
-@pytest.mark.parametrize("places", [[(0, 0, 20.0)], [(0, 0, 20.0), (2.0, 0, 20.0)]])
+@pytest.mark.parametrize("places", [[TOP], [TOP, (6.0, 0.0, 0.0)]])
 def test_alone_and_side_by_side_it_changes_no_bit(places: Any) -> None:
     flown = []
     for on in (True, False):
-        world = birds(places, body_drag=True, wind=(1.0, 0.5, 0.0), downwash=on)
+        world = birds(*places, body_drag=True, wind=(1.0, 0.5, 0.0), downwash=on)
         flown.append(hover(world, 5).tobytes())
     assert flown[0] == flown[1]
 
 
 def test_what_lacks_is_one_sentence() -> None:
     with pytest.raises(InputError, match="effects: expected body_drag or rotor_drag, on which"):
-        birds([(0, 0, 9), (0, 0, 5)], downwash=True)
+        birds(TOP, LOWER, downwash=True)
     with pytest.raises(InputError, match=r"rotors\.radius in .*, which downwash needs"):
         Downwash(Vehicle.load())
     with pytest.raises(InputError, match="effects: downwash: expected true or false, got 1"):

@@ -4,13 +4,14 @@ import json
 import re
 import xml.etree.ElementTree as ET
 from itertools import pairwise
-from math import cos, exp, inf, log, log2, nan, pi, sin, sqrt, tanh
+from math import cos, exp, log, log2, pi, sin, sqrt, tanh
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
+import worlds
 from numpy.testing import assert_allclose
 from rotorgram.envs import Loop
 from rotorgram.envs.config import EnvConfig
@@ -19,13 +20,13 @@ from rotorgram.models.library import vehicle_names
 from rotorgram.sim import (
     PARAMETERS,
     EffectOptions,
-    InitialState,
     Randomization,
     World,
     make_world,
 )  # fmt: skip
 from rotorgram.sim.effects.gusts import Gusts
 from rotorgram.sim.effects.rotors import RotorEffects
+from tables import SIM
 
 approx = pytest.approx
 ROOT = Path(__file__).parents[2]
@@ -97,14 +98,7 @@ def world_of(
 
 def begin(world: World, height: float = 50.0, mask: Any = None, **pose: Any) -> World:
     """Reset the worlds of a mask, level over the origin unless the pose says otherwise."""
-
-    def everywhere(values: Any) -> Any:
-        return np.broadcast_to(np.array(values, float), (*world.shape, len(values))).copy()
-
-    mask = np.ones(world.shape, bool)[()] if mask is None else mask
-    poses = {name: everywhere(values) for name, values in pose.items()}
-    world.reset(mask, InitialState(position=everywhere((0.0, 0.0, height)), **poses))
-    return world
+    return worlds.begin(world, mask, position=(0.0, 0.0, height), **pose)
 
 
 def fly(world: World, thrust: Any, steps: int, substeps: int = 1) -> World:
@@ -836,22 +830,13 @@ def test_a_single_drone_draws_beyond_its_bounds() -> None:
 
 
 def test_wrong_distributions() -> None:
-    def wrong(sentence: str, **drawn: Any) -> None:
-        refused(sentence, Randomization, drawn, EffectOptions())
-
+    effects = EffectOptions()
+    for sentence, drawn in SIM["wrong"]["randomize"]:
+        refused(sentence, Randomization, drawn, effects)
     refused("^randomize: expected a mapping from .*, got 'mass'$", Randomization, "mass", None)
-    wrong("^randomize: expected some of mass, .*, got 'weight'$", weight="1")
-    wrong("^randomize: center_x: .* from -10 to 10 m, got ", center_x="loguniform(0,1)")
-    wrong("^randomize: time_constant: expected the effect motor_lag, ", time_constant="1")
-    wrong("expected the effect battery, got it switched off$", battery_charge="1")
-    wrong("expected the effect body_drag or rotor_drag, got it switched off$", wind_x="1")
-    texts: Any = (
-        "uniform(1)", "uniform(2,1)", "uniform(0,1)", "triangular(1,2)", "normal(1,-1)",
-        "normal(1,inf)", "normal(0,1)", "loguniform(-1,1)", "choice()", "choice(1,99)", "0.8,1.2",
-        "nan", "uniform(1,2", "", True, None, [1], {}, 11, 0.01,
-    )  # fmt: skip
-    for text in texts:
-        wrong(r"^randomize: mass: expected uniform.*, with .* from 0\.1 to 10, got ", mass=text)
+    sentence = r"^randomize: mass: expected uniform.*, with .* from 0\.1 to 10, got "
+    for text in (None, *SIM["wrong"]["masses"]):
+        refused(sentence, Randomization, {"mass": text}, effects)
 
 
 @pytest.mark.parametrize("num_worlds", [1, 4])
@@ -878,59 +863,20 @@ def test_randomisation_and_gusts_do_not_move_the_starts(num_worlds: int) -> None
 
 
 def test_wrong_options() -> None:
-    def wrong(sentence: str, **options: Any) -> None:
-        refused(f"^effects: {sentence}", EffectOptions.from_options, options)
-
-    refused(r"from names to values, got \[1\]$", EffectOptions.from_options, [1])
-    refused("^effects: expected some of .*, got 1$", EffectOptions.from_options, {1: 2})
-    wrong("expected some of motor_lag, .*, got 'drag'$", drag=True)
-    wrong("motor_lag: expected true or false, got 1$", motor_lag=1)
-    wrong("ground_effect: expected true or false, got 'yes'$", ground_effect="yes")
-    for wind in (3, (1, 2, 101), (1, 2, nan), "123", (True, 0, 0), None):
-        wrong("wind: expected 3 numbers from -100 to 100 m/s, got ", wind=wind)
-    wrong("gusts: expected a number from 0 to 100 m/s, got -1$", gusts=-1)
-    wrong("gusts: expected a number from 0 to 100 m/s, got True$", gusts=True)
-    wrong(r"gusts: expected a number from 0 to 100 m/s, got \(1,\)$", gusts=(1,))
-    wrong("efficiency: expected numbers from 0 to 1 .*, got ", efficiency=(1, 2))
-    wrong("efficiency: expected numbers from 0 to 1 .*, got 0.5$", efficiency=0.5)
-    wrong("payload: expected a number from 0 to 10000 kg, got inf$", payload=inf)
-    wrong("cable: expected a number from 0.05 to 100 m, got 0$", cable=0)
+    build = EffectOptions.from_options
+    for sentence, options in SIM["wrong"]["effects"]:
+        refused(f"^effects: {sentence}", build, options)
+    refused("^effects: wind: expected 3 numbers .*, got None", build, {"wind": None})
+    refused(r"from names to values, got \[1\]$", build, [1])
+    refused("^effects: expected some of .*, got 1$", build, {1: 2})
 
 
-def test_effects_that_a_vehicle_cannot_have() -> None:
-    def wrong(sentence: str, /, **given: Any) -> None:
-        """Effects, and numbers of `racer`."""
-        known = EffectOptions.__dataclass_fields__
-        effects = {name: given.pop(name) for name in known if name in given}
-        refused(sentence, world_of, racer(**given), **effects)
-
-    time = "rotors.time_constant in the vehicle's file, which motor_lag needs,"
-    wrong(time, motor_lag=True, rotors_time_constant=None)
-    wrong("push one way only, .*, got a thrust below 0$", motor_lag=True, low="-1")
-    wrong("rotors.curve in the .*, got none$", thrust_curve=True, rotors_curve=None)
-    end = "^rotors.curve: expected a curve .*, got an end of 0.5,"
-    wrong(end, thrust_curve=True, rotors_curve="0 0.5")
-    most = r"^rotors.curve: expected .* up to 1\.333$"
-    wrong(most, thrust_curve=True, rotors_curve="0 4 -3")
-    wrong("rotors.power in the .*, got none$", battery=True, rotors_power=None)
-    empty = r"empty: expected at most battery\.full, 12\.6 V, got 13 V$"
-    wrong(empty, battery=True, battery_empty="13")
-    none = {"drag_linear": None, "drag_quadratic": None}
-    wrong("drag.linear or drag.quadratic in .*, got none$", body_drag=True, **none)
-    most = "drag of the body of at most 60 N s/m, .*, got 1"
-    wrong(rf"{most}\d\d\.\d$", body_drag=True, drag_linear="100 0 0")
-    wrong(rf"{most}53\.\d$", body_drag=True, drag_quadratic="1000 0 0")
-    most = "drag of the rotors of at most 60 N s/m, .*, got 183$"
-    wrong(most, rotor_drag=True, rotors_inflow="0.01")
-    coefficient = {"rotors_thrust_coefficient": None}
-    wrong("rotors.thrust_coefficient in .*, got none$", rotor_drag=True, **coefficient)
-    none = dict.fromkeys(("rotors_drag", "rotors_inflow", "rotors_lift"))
-    wrong("rotors.drag, inflow or lift in .*, got none$", rotor_drag=True, **none)
-    wrong("rotors.radius in .*, got none$", ground_effect=True, rotors_radius=None)
-    wrong(r"efficiency: expected 4 numbers, .*, got \(1\.0, 1\.0\)$", efficiency=(1, 1))
-    air = "^effects: expected body_drag or rotor_drag, on which wind acts, got neither$"
-    wrong(air, wind=(1, 0, 0))
-    wrong(air, gusts=3, ground_effect=True)
+@pytest.mark.parametrize(("sentence", "effects", "numbers"), SIM["wrong"]["vehicles"])
+def test_effects_that_a_vehicle_cannot_have(
+    sentence: str, effects: dict[str, Any], numbers: dict[str, str]
+) -> None:
+    known = {name: text or None for name, text in numbers.items()}
+    refused(sentence, world_of, racer(**known), **effects)
 
 
 def test_options_are_kept_as_floats_and_come_back() -> None:

@@ -31,6 +31,7 @@ from independent import (
     vehicles,
 )
 from measuring import read_rows, write_rows
+from tables import SIM
 
 approx = pytest.approx
 ROOT = Path(__file__).parents[2]
@@ -208,15 +209,8 @@ def test_the_page_shows_the_committed_flights_beside_rotorpy() -> None:
 
 def test_rotorpys_parameters_become_our_vehicle(tmp_path: Path) -> None:
     """Of made-up numbers; an order of rotors and signs of turning like RotorPy's."""
-    params = {
-        "mass": 0.4, "Ixx": 1e-3, "Iyy": 2e-3, "Izz": 2.5e-3, "Ixy": 0.0, "Ixz": 1e-4, "Iyz": 0.0,
-        "rotor_pos": [[0.1, 0.2, 0.0], [0.1, -0.2, 0.0], [-0.1, -0.2, 0.0], [-0.1, 0.2, 0.0]],
-        "rotor_directions": [1, -1, 1, -1], "rotor_speed_max": 1000.0, "tau_m": 0.01, "g": 9.81,
-        "k_eta": 2e-6, "k_m": 4e-8, "k_d": 1e-4, "k_z": 2e-4, "k_h": 3e-3,
-        "c_Dx": 0.01, "c_Dy": 0.02, "c_Dz": 0.03,
-    }  # fmt: skip
     file = tmp_path / "made_up.xml"
-    file.write_text(rotorpy.mjcf(params))
+    file.write_text(rotorpy.mjcf(SIM["rotorpy"]))
     vehicle = Vehicle.load(file)
     told = vehicle.coefficients
     assert vehicle.mass == 0.4

@@ -14,8 +14,10 @@ from rotorgram.envs import LocalVectorEnv, Loop
 from rotorgram.envs.config import EnvConfig
 from rotorgram.models import QUAD_XML, Vehicle
 from rotorgram.models.errors import InputError
-from rotorgram.sim import InitialState, PhysicsError, Randomization, World, make_world
+from rotorgram.sim import PhysicsError, Randomization, make_world
 from rotorgram.sim.backends import kernel
+from tables import SIM
+from worlds import begin
 
 ELEVATION = "rotorgram/Elevation-v0"
 HOVER = "rotorgram/Hover-v0"
@@ -43,10 +45,6 @@ def tumbling(dice: np.random.Generator, count: int = N) -> dict[str, np.ndarray]
     }
 
 
-def begin(world: World, **pose: np.ndarray) -> None:
-    world.reset(np.ones(world.shape, bool), InitialState(**pose))
-
-
 def angle(ours: Any, theirs: np.ndarray) -> float:
     """Largest angle between attitudes, rad."""
     q = np.asarray(ours, np.float64)
@@ -70,16 +68,16 @@ def test_flies_as_mujoco_for_five_seconds(name: str, drag: float) -> None:
     theirs = make_world(vehicle, N, num_threads=1)
     substeps = vehicle.substeps(0.02)
     for world in (ours, theirs):
-        world.reset(EVERY, InitialState(**pose))
+        begin(world, **pose)
     for _ in range(250):
         thrust = vehicle.hover_thrust * dice.uniform(0.9, 1.1, (N, 1, vehicle.num_rotors))
         for world in (ours, theirs):
             world.step(thrust, substeps)
     assert not theirs.state.touching.any()
     assert abs(theirs.state.velocity).max() > 3
-    assert abs(ours.state.position - theirs.state.position).max() < 1e-6
+    assert_allclose(ours.state.position, theirs.state.position, atol=1e-6, rtol=0)
     assert angle(ours.state.quaternion, theirs.state.quaternion) < 1e-6
-    assert abs(ours.acceleration() - theirs.acceleration()).max() < 1e-6
+    assert_allclose(ours.acceleration(), theirs.acceleration(), atol=1e-6, rtol=0)
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
@@ -91,10 +89,10 @@ def test_compiled_and_numpy_fly_the_same_bits(name: str, dtype: str) -> None:
         arrays(vehicle, dtype=dtype, randomize=mass, compiled=choice) for choice in (None, False)
     )
     dice = np.random.default_rng(0)
-    pose = InitialState(**tumbling(dice))
+    pose = tumbling(dice)
     for world in (compiled, plain):
         world.seed(EVERY, range(N))
-        world.reset(EVERY, pose)
+        begin(world, **pose)
     for _ in range(20):
         thrust = vehicle.hover_thrust * dice.uniform(0.5, 1.5, (N, 1, vehicle.num_rotors))
         for world in (compiled, plain):
@@ -112,7 +110,7 @@ def test_strong_rotors_and_a_light_craft_fly(share: float, most: str, tmp_path: 
     file.write_text(text, encoding="utf-8")
     vehicle = Vehicle.load(file)
     world = arrays(vehicle, 1)
-    begin(world, position=np.full((1, 1, 3), 9.0))
+    begin(world, position=(9.0, 9.0, 9.0))
     world.step(np.tile(vehicle.hover_thrust, (1, 1, 1)), 4)
     assert world.state.position == pytest.approx(np.full((1, 1, 3), 9.0), abs=1e-9)
 
@@ -121,8 +119,8 @@ def test_strong_rotors_and_a_light_craft_fly(share: float, most: str, tmp_path: 
 def test_compiled_a_fast_spin_is_exact(dtype: str) -> None:
     """Three and a half turns in a control step of two physics steps: half a turn about z."""
     world = arrays(Vehicle.load(), 1, dtype)
-    rates = np.array([[[0.0, 0.0, 7 * np.pi / 0.02]]])
-    world.reset(EVERY[:1], InitialState(position=np.full((1, 1, 3), 5.0), body_rates=rates))
+    spin = 7 * np.pi / 0.02
+    begin(world, position=(5.0, 5.0, 5.0), body_rates=(0.0, 0.0, spin))
     world.step(np.zeros((1, 1, 4)), 2)
     near = 1e-5 if dtype == "float32" else 1e-12
     w, x, y, z = world.state.quaternion[0, 0].tolist()
@@ -136,11 +134,12 @@ def test_arrays_have_the_same_bits_alone_and_in_a_batch() -> None:
     pose = tumbling(dice, many)
     thrust = vehicle.hover_thrust * dice.uniform(0.9, 1.1, (many, 1, 6))
     batch = arrays(vehicle, many, "float32")
-    batch.reset(np.ones((many, 1), bool), InitialState(**pose))
+    begin(batch, **pose)
     batch.step(thrust, 2)
     for i in (0, 18):
         alone = arrays(vehicle, 1, "float32")
-        alone.reset(EVERY[:1], InitialState(**{name: x[i : i + 1] for name, x in pose.items()}))
+        own = {name: values[i : i + 1] for name, values in pose.items()}
+        begin(alone, **own)
         alone.step(thrust[i : i + 1], 2)
         for name in ("position", "quaternion", "velocity", "body_rates"):
             one = getattr(alone.state, name)
@@ -187,9 +186,7 @@ def test_without_a_compiler_numpy_flies(monkeypatch: pytest.MonkeyPatch) -> None
     with pytest.raises(InputError, match=r"^compiled: expected false where no C compiler is found"):
         arrays(vehicle, compiled=True)
     world = arrays(vehicle)
-    world.reset(
-        EVERY, InitialState(position=np.full((N, 1, 3), 9.0), velocity=np.full((N, 1, 3), 1.0))
-    )
+    begin(world, position=(9.0, 9.0, 9.0), velocity=(1.0, 1.0, 1.0))
     world.step(np.zeros((N, 1, 4)), 1)
     # v' = -0.123 v - (0, 0, g) over 0.01 s, solved.
     left = np.exp(-0.123 * 0.01)
@@ -200,7 +197,7 @@ def test_without_a_compiler_numpy_flies(monkeypatch: pytest.MonkeyPatch) -> None
 def test_a_free_fall_is_exact() -> None:
     vehicle = Vehicle.load(linear_drag=0.0)
     world = arrays(vehicle, 1, "float32")
-    begin(world, position=np.full((1, 1, 3), 10.0), velocity=np.array([[[1.0, 2.0, 3.0]]]))
+    begin(world, position=(10.0, 10.0, 10.0), velocity=(1.0, 2.0, 3.0))
     world.step(np.zeros((1, 1, 4)), 100)  # 1 s
     expected = (11.0, 12.0, 13.0 - 9.8 / 2)
     assert_allclose(world.state.position[0, 0], expected, atol=1e-4, rtol=0)
@@ -208,36 +205,19 @@ def test_a_free_fall_is_exact() -> None:
     assert_allclose(world.state.velocity[0, 0], expected, atol=1e-5, rtol=0)
 
 
-EFFECTS = {
-    "motor_lag": True, "thrust_curve": True, "battery": True, "body_drag": True,
-    "rotor_drag": True, "ground_effect": True, "wind": (4.0, -3.0, 1.0), "gusts": 5.0,
-    "efficiency": (0.9, 1.0, 1.0, 1.0),
-}  # fmt: skip
-DRAWN = {
-    "mass": "uniform(0.8, 1.2)", "inertia": "uniform(0.8, 1.2)", "center_x": "uniform(-0.01, 0.01)",
-    "center_z": "uniform(-0.01, 0.01)", "reaction": "uniform(0.5, 1.5)",
-    "thrust_1": "uniform(0.9, 1.1)",
-}  # fmt: skip
-
-
 @pytest.mark.parametrize(
     ("file", "effects"),
-    [(RACER, EFFECTS), (HEXA, {})],
+    [(RACER, SIM["rigid"]["effects"]), (HEXA, {"linear_drag": 0.2})],
     ids=["racer, all effects", "welded bodies"],
 )
 def test_effects_and_drawn_parameters(file: Path, effects: dict[str, Any]) -> None:
     """With float64 a seed draws what it draws on mujoco, gusts among it."""
-    options = {
-        "effects": effects | {"linear_drag": 0.2},
-        "randomize": DRAWN,
-        "flight_band": 10.0,
-    }
-    options["goal"] = (0, 0, 60)
-    config = EnvConfig.from_keywords(
-        HOVER, vehicle=file, backend="rigid", dtype="float64", **options
-    )
-    ours = Loop(config, N)
-    theirs = Loop(EnvConfig.from_keywords(HOVER, vehicle=file, **options), N)
+    drawn = SIM["rigid"]["drawn"]
+    options = {"vehicle": file, "effects": effects, "randomize": drawn}
+    options |= {"flight_band": 10.0, "goal": (0, 0, 60)}
+    rigid = EnvConfig.from_keywords(HOVER, backend="rigid", dtype="float64", **options)
+    ours = Loop(rigid, N)
+    theirs = Loop(EnvConfig.from_keywords(HOVER, **options), N)
     still = np.zeros((N, ours.vehicle.num_rotors), np.float32)
     for loop in (ours, theirs):
         loop.advance(still, EVERY[:, 0], range(7, 7 + N))
@@ -257,8 +237,11 @@ def test_effects_and_drawn_parameters(file: Path, effects: dict[str, Any]) -> No
 def test_acceleration_and_below() -> None:
     world = arrays(Vehicle.load(), 3)
     half = np.sqrt(0.5)
-    turned = np.array([[[1.0, 0, 0, 0]], [[half, half, 0, 0]], [[np.cos(0.5), 0, np.sin(0.5), 0]]])
-    begin(world, position=np.full((3, 1, 3), 2.0), quaternion=turned)
+    turned = np.zeros((3, 1, 4))
+    turned[0, 0, 0] = 1.0
+    turned[1, 0, :2] = half
+    turned[2, 0, ::2] = np.cos(0.5), np.sin(0.5)
+    begin(world, position=(2.0, 2.0, 2.0), quaternion=turned)
     # At hover thrust: level it stays, on its side it falls and is pushed along -y.
     expected = [[0.0, 0.0, 0.0], [0.0, -9.8, -9.8]]
     assert_allclose(world.acceleration()[:2, 0], expected, atol=1e-12, rtol=0)
@@ -281,7 +264,7 @@ def test_touches_the_ground_where_mujoco_does(file: Path) -> None:
     for _ in range(40):
         middle = (low + high) / 2
         place = np.stack((0 * middle, 0 * middle, middle), axis=-1)[:, None]
-        theirs.reset(np.ones((count, 1), bool), InitialState(position=place, quaternion=turned))
+        begin(theirs, position=place, quaternion=turned)
         touching = theirs.state.touching[:, 0]
         low = np.where(touching, middle, low)
         high = np.where(touching, high, middle)
@@ -289,7 +272,7 @@ def test_touches_the_ground_where_mujoco_does(file: Path) -> None:
     for offset in (small, -small):
         place = np.stack((0 * high, 0 * high, high + offset), axis=-1)[:, None]
         begin(ours, position=place, quaternion=turned)
-        theirs.reset(np.ones((count, 1), bool), InitialState(position=place, quaternion=turned))
+        begin(theirs, position=place, quaternion=turned)
         assert ours.state.touching.tolist() == theirs.state.touching.tolist()
         assert bool(ours.state.touching[0]) == (offset < 0)
 
@@ -372,9 +355,9 @@ def test_a_bad_state_raises_and_a_reset_mends_it() -> None:
     every = np.ones(2, bool)
     still = np.zeros((2, 1))
     loop.advance(still, every, [0, 1])
-    begin(
-        loop.world, position=np.full((2, 1, 3), 9.0), velocity=np.array([[[0.0] * 3], [[1e30] * 3]])
-    )
+    velocity = np.zeros((2, 1, 3))
+    velocity[1] = 1e30
+    begin(loop.world, position=(9.0, 9.0, 9.0), velocity=velocity)
     with pytest.raises(PhysicsError, match=r"bad states in envs \[1\]: reset the env"):
         loop.advance(still)
     with pytest.raises(gym.error.ResetNeeded):

@@ -10,20 +10,17 @@ from rotorgram.envs.parallel import LocalParallelEnv
 from rotorgram.models import Vehicle
 from rotorgram.sim import (
     EffectOptions,
-    InitialState,
     Randomization,
-    World,
     make_world,
 )
+from tables import SIM
+from worlds import begin
 
 FORMATION = "rotorgram/Formation-v0"
 CROSSING = "rotorgram/Crossing-v0"
 MOVED = ("position", "quaternion", "velocity", "body_rates", "thrust")
 EFFECTS = {"motor_lag": True, "rotor_drag": True, "wind": (3.0, 1.0, 0.0)}
-DRAWN = {
-    "mass": "uniform(0.8, 1.2)", "inertia": "uniform(0.8, 1.2)", "center_x": "uniform(-0.01, 0.01)",
-    "reaction": "uniform(0.5, 1.5)", "thrust_1": "uniform(0.9, 1.1)",
-}  # fmt: skip
+DRAWN = SIM["rigid"]["drawn"]
 
 
 def arrays(vehicle: Vehicle, worlds: int, drones: int, dtype: str = "float64", **rest: Any) -> Any:
@@ -50,10 +47,6 @@ def near_hover(vehicle: Vehicle, steps: int, *shape: int) -> np.ndarray:
     """Random thrusts, N, shape (steps, *shape, R)."""
     share = np.random.default_rng(1).uniform(0.9, 1.1, (steps, *shape, vehicle.num_rotors))
     return share * vehicle.hover_thrust
-
-
-def begin(world: World, mask: Any = None, **pose: np.ndarray) -> None:
-    world.reset(np.ones(world.shape, bool) if mask is None else mask, InitialState(**pose))
 
 
 # --- flights --------------------------------------------------------------------------------------
@@ -151,7 +144,7 @@ def test_spheres_touch_at_two_radii_and_fly_on(name: str | None) -> None:
     vehicle = Vehicle.load(name, linear_drag=0.0)
     radius = vehicle.radius
     looks = round(0.02 / vehicle.timestep)
-    world = make_world(vehicle, 2, "rigid", drones=3, dtype="float64")
+    world = arrays(vehicle, 2, 3)
     position = np.zeros((2, 3, 3))
     velocity = np.zeros((2, 3, 3))
     position[..., 2] = 1000.0
@@ -161,7 +154,7 @@ def test_spheres_touch_at_two_radii_and_fly_on(name: str | None) -> None:
     none = np.zeros((2, 3, vehicle.num_rotors))
 
     pose = {"position": position, "velocity": velocity, "thrust": none}
-    begin(world, np.ones((2, 3), bool), **pose)
+    begin(world, **pose)
     state = world.state
     seen = []
     assert not state.touching.any()
@@ -217,10 +210,10 @@ def test_it_tells_a_touch_earlier_than_mujoco() -> None:
     """Frames of 2 m side by side meet at 2 m or later; their spheres do before."""
     vehicle = Vehicle.load()
     place = np.array([[[0.0, 0.0, 20.0], [1.99 * vehicle.radius, 0.0, 20.0]]])
-    worlds = arrays(vehicle, 1, 2), make_world(vehicle, 1, drones=2)
-    for world in worlds:
-        begin(world, position=place)
-    assert [world.state.touching.tolist() for world in worlds] == [[[True] * 2], [[False] * 2]]
+    ours = begin(arrays(vehicle, 1, 2), position=place)
+    theirs = begin(make_world(vehicle, 1, drones=2), position=place)
+    assert ours.state.touching.all()
+    assert not theirs.state.touching.any()
 
 
 def test_a_mask_moves_and_tells_of_its_worlds_alone() -> None:
@@ -243,9 +236,9 @@ def test_a_mask_moves_and_tells_of_its_worlds_alone() -> None:
     assert world.state.colliding.tolist() == [[True, True], [False, False]]
     assert world.state.thrust[0] == pytest.approx(np.broadcast_to(vehicle.hover_thrust, (2, 4)))
     # 0.1 g over 0.02 s.
-    assert world.state.velocity[..., 2] == pytest.approx(
-        np.array([[0.0] * 2, [0.1 * vehicle.gravity * 0.02] * 2])
-    )
+    climb = 0.1 * vehicle.gravity * 0.02
+    assert world.state.velocity[0, :, 2].tolist() == [0.0, 0.0]
+    assert world.state.velocity[1, :, 2] == pytest.approx([climb, climb])
     begin(world, first, position=apart)
     assert not world.state.touching.any()
 

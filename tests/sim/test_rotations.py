@@ -7,48 +7,35 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from rotorgram.sim import rotations
+from tables import SIM
 
 HALF = sqrt(0.5)
 LEFT = np.array((HALF, 0.0, 0.0, HALF))  # 90° about z: the nose along y
-ROLLED = np.array((HALF, HALF, 0.0, 0.0))  # 90° about x: body y up, body z along -y
 V = np.array((1.0, 2.0, 3.0))
 
 
-def both(*arrays: np.ndarray) -> list[list[Any]]:
+@pytest.mark.parametrize(("function", "arguments", "expected"), SIM["rotations"]["rows"])
+def test_by_hand(function: str, arguments: list[Any], expected: list[float]) -> None:
     """As a single drone has them, and as a batch of two."""
-    return [list(arrays), [np.broadcast_to(a, (2, 1, a.shape[-1])) for a in arrays]]
-
-
-@pytest.mark.parametrize(
-    ("function", "arguments", "expected"),
-    [
-        (rotations.to_world, (LEFT, V), (-2.0, 1.0, 3.0)),
-        (rotations.to_body, (LEFT, V), (2.0, -1.0, 3.0)),
-        (rotations.to_world, (ROLLED, V), (1.0, -3.0, 2.0)),
-        (rotations.to_body, (ROLLED, V), (1.0, 3.0, -2.0)),
-        (rotations.body_z, (ROLLED,), (0.0, -1.0, 0.0)),
-        (rotations.world_z, (ROLLED,), (0.0, 1.0, 0.0)),
-        (rotations.body_x, (LEFT,), (0.0, 1.0, 0.0)),
-        # First to the left, then rolled about the new nose: body z points along world x.
-        (rotations.multiplied, (LEFT, ROLLED), (0.5, 0.5, 0.5, 0.5)),
-        (rotations.between, (LEFT, np.array((0.5, 0.5, 0.5, 0.5))), (HALF, HALF, 0.0, 0.0)),
-    ],
-)
-def test_by_hand(function: Any, arguments: Any, expected: Any) -> None:
-    for given in both(*arguments):
-        turned = function(*given)
-        assert_allclose(turned, np.broadcast_to(expected, turned.shape), atol=1e-15)
+    for size in ((), (2, 1)):
+        given = [np.broadcast_to(vector, (*size, len(vector))) for vector in arguments]
+        turned = getattr(rotations, function)(*given)
+        assert turned.shape == (*size, len(expected))
+        assert_allclose(turned - expected, 0.0, atol=1e-15)
 
 
 def test_a_rotation_vector_turns_the_body() -> None:
-    for attitude, angle in both(LEFT, np.array((pi / 2, 0.0, 0.0))):
-        turned = rotations.advanced(attitude, angle)
-        assert_allclose(turned, np.full(turned.shape, 0.5), atol=1e-15)
+    roll = np.array((pi / 2, 0.0, 0.0))
+    turned = rotations.advanced(LEFT, roll)
+    assert_allclose(turned, [0.5] * 4, atol=1e-15)
+    batch = rotations.advanced(np.tile(LEFT, (2, 1, 1)), np.tile(roll, (2, 1, 1)))
+    assert_allclose(batch, np.full((2, 1, 4), 0.5), atol=1e-15)
     still = rotations.advanced(2 * LEFT, np.zeros(3))
     assert_allclose(still, LEFT, atol=1e-15)  # normalised
     many = np.array((1.0, 0.0, 0.0, 0.0))
+    degree = np.radians((0.0, 0.0, 1.0))
     for _ in range(90):
-        many = rotations.advanced(many, np.radians((0.0, 0.0, 1.0)))
+        many = rotations.advanced(many, degree)
     assert_allclose(many, LEFT, atol=1e-13)
 
 

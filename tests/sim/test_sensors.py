@@ -19,9 +19,11 @@ from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 from rotorgram.models.errors import InputError
 from rotorgram.models.vehicle import Vehicle
-from rotorgram.sim import EffectOptions, InitialState, World, checked_sensors, make_world
+from rotorgram.sim import EffectOptions, World, checked_sensors, make_world
 from rotorgram.sim.sensors import Estimator, Sensors
 from rotorgram.sim.sensors.barometer import isa_height, isa_pressure
+from tables import SIM
+from worlds import begin
 
 approx = pytest.approx
 ELEVATION = "rotorgram/Elevation-v0"
@@ -31,22 +33,7 @@ LEVEL = (1.0, 0.0, 0.0, 0.0)
 LEFT = (sqrt(0.5), 0.0, 0.0, sqrt(0.5))
 IMU = {"gyro_noise": 0.0, "accelerometer_noise": 0.0}
 GPS = {"noise": 0.0, "vertical_noise": 0.0, "velocity_noise": 0.0}
-NOISY = {
-    "imu": {
-        "gyro_noise": 1e-3, "gyro_walk": 1e-4, "gyro_bias": 0.01, "gyro_scale": 0.01,
-        "accelerometer_noise": 0.01, "accelerometer_walk": 1e-3, "accelerometer_bias": 0.1,
-        "accelerometer_scale": 0.01,
-    },
-    "magnetometer": {"noise": 0.3},
-    "barometer": {"noise": 1.0, "walk": 0.1, "rate": 25, "altitude": 400.0},
-    "rangefinder": {"noise": 0.02, "limit": 6.0},
-    "gps": {
-        "noise": 1.0, "vertical_noise": 2.0, "velocity_noise": 0.1, "rate": 10, "delay": 0.1,
-        "dropout": 0.2,
-    },
-    "motion_capture": {"noise": 1e-3, "angle_noise": 1e-2, "delay": 0.02, "dropout": 0.1},
-    "estimate": True,
-}  # fmt: skip
+NOISY = SIM["noisy"]
 
 
 def about_x(degrees: float) -> tuple[float, ...]:
@@ -61,10 +48,9 @@ def sensing(
     world = make_world(Vehicle.load(file), worlds, num_threads=1)
     every: Any = np.ones(world.shape, bool)[()]
     start = {"position": (0.0, 0.0, 5.0), **pose}
-    shaped = {k: np.broadcast_to(v, (*world.shape, len(v))).copy() for k, v in start.items()}
     made = Sensors(checked_sensors(sensors), world, PERIOD)
     world.seed(every, [100 + i for i in range(worlds)])
-    world.reset(every, InitialState(**shaped))
+    begin(world, **start)
     made.begin(every)
     return world, made, every
 
@@ -129,7 +115,7 @@ def test_imu_feels_the_air(tmp_path: Path) -> None:
     every = np.True_
     world = make_world(vehicle, 1, effects=EffectOptions(body_drag=True, wind=(5.0, 0.0, 0.0)))
     sensors = Sensors(checked_sensors({"imu": IMU}), world, PERIOD)
-    world.reset(every, InitialState(position=np.array((0.0, 0.0, 5.0))))
+    begin(world, position=(0.0, 0.0, 5.0))
     sensors.begin(every)
     world.step(vehicle.hover_thrust, 1)
     sensors.sample(every)
@@ -352,33 +338,14 @@ def test_options_are_plain_values_in_one_order() -> None:
     )
 
 
-def refused(sentence: str, sensors: Any) -> None:
-    with pytest.raises(InputError, match=f"^sensors{sentence}") as caught:
-        env_spec(EnvConfig.from_keywords(HOVER, sensors=sensors))
-    assert "\n" not in str(caught.value)
-
-
 def test_a_wrong_option_gives_one_sentence() -> None:
-    refused(r": expected settings by sensor, got \[\]", [])
-    refused(": expected some of imu, .*estimate, observe, got 'radar'", {"radar": True})
-    refused(".imu: expected true, or settings by name, got 3", {"imu": 3})
-    refused(".imu: expected true, or settings by name, got 0", {"imu": 0})
-    refused(".imu: expected some of gyro_noise, .*, got 'noise'", {"imu": {"noise": 1}})
-    pascals = "expected a number from 0 to 10000 Pa, got -1"
-    refused(f".barometer.noise: {pascals}", {"barometer": {"noise": -1}})
-    field = {"noise": 0, "field": [1, 2]}
-    refused(".magnetometer.field: expected 3 numbers from -100 to 100 µT", {"magnetometer": field})
-    none = "expected noise here, or sensors.barometer_noise in the vehicle's file, got none"
-    refused(f".barometer: {none}", {"barometer": True})
-    rate = ".gps.rate: expected the control rate of 50 Hz over a whole number, got"
-    refused(f"{rate} 30 Hz", {"gps": GPS | {"rate": 30}})
-    refused(f"{rate} 100 Hz", {"gps": GPS | {"rate": 100}})
-    periods = "a whole number of control periods of 0.02 s, at most 1000, got 0.03 s"
-    refused(f".gps.delay: expected {periods}", {"gps": GPS | {"delay": 0.03}})
-    refused(".gps.delay: expected a number from 0 to 10 s, got 11", {"gps": GPS | {"delay": 11}})
-    refused(": expected imu, which estimate needs, got none", {"estimate": True})
-    refused(": expected estimate, which is to be observed, got none", {"observe": "estimate"})
-    refused(".observe: expected 'added' or 'estimate', got 'all'", {"observe": "all"})
+    wrong = SIM["wrong"]
+    of_gps = [(sentence, {"gps": GPS | settings}) for sentence, settings in wrong["gps"]]
+    empty = (r": expected settings by sensor, got \[\]", [])
+    for sentence, sensors in (empty, *of_gps, *wrong["sensors"]):
+        with pytest.raises(InputError, match=f"^sensors{sentence}") as caught:
+            env_spec(EnvConfig.from_keywords(HOVER, sensors=sensors))
+        assert "\n" not in str(caught.value)
 
 
 # --- as a part of an env --------------------------------------------------------------------------

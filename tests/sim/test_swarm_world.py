@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from rotorgram.models import InputError, Vehicle
 from rotorgram.models.swarm import drone_names, swarm_model
-from rotorgram.sim import EffectOptions, InitialState, make_world
+from rotorgram.sim import EffectOptions, make_world
+from worlds import begin
 
 
 def test_a_collision_keeps_momentum_and_gains_no_energy() -> None:
@@ -14,9 +15,7 @@ def test_a_collision_keeps_momentum_and_gains_no_energy() -> None:
     position = np.array([[[-1.5, 0.0, 50.0], [1.5, 0.1, 50.05]]])
     velocity = np.array([[[2.0, 0.0, 0.0], [-2.0, 0.0, 0.0]]])
     none = np.zeros((1, 2, vehicle.num_rotors))
-    world.reset(
-        np.ones((1, 2), bool), InitialState(position=position, velocity=velocity, thrust=none)
-    )
+    begin(world, position=position, velocity=velocity, thrust=none)
     state = world.state
     met = False
     time = 0.0
@@ -53,12 +52,12 @@ def test_the_ground_and_another_drone_are_told_apart() -> None:
     position[..., 2] = 20.0
     position[0, 2, 2] = vehicle.rest_height - 1e-4
     position[1, 1] = position[1, 0] + (0.0, 0.0, 0.05)
-    world.reset(np.ones((2, 3), bool), InitialState(position=position))
+    begin(world, position=position)
     assert world.state.touching.tolist() == [[False, False, True], [True, True, False]]
     assert world.state.colliding.tolist() == [[False, False, False], [True, True, False]]
     position[1, 1, 2] = 25.0
     only = np.array([[False] * 3, [True] * 3])
-    world.reset(only, InitialState(position=position))
+    begin(world, only, position=position)
     assert world.state.touching.tolist() == [[False, False, True], [False, False, False]]
     assert not world.state.colliding.any()
 
@@ -69,9 +68,8 @@ def test_what_a_swarm_cannot_have_is_one_sentence() -> None:
         make_world(vehicle, 1, drones=0)
     payload = EffectOptions.from_options({"payload": 1.0, "cable": 1.0})
     world = make_world(vehicle, 1, drones=2, effects=payload)
-    above = np.full((1, 2, 3), 5.0)
     with pytest.raises(InputError, match=r"payload: expected one drone in a world, or a task .* 2"):
-        world.reset(np.ones((1, 2), bool), InitialState(position=above))
+        begin(world, position=(5.0, 5.0, 5.0))
     with pytest.raises(InputError, match=r"expected a timestep of 0.01 as of"):
         swarm_model([vehicle, Vehicle.load("crazyflie2")])
 
