@@ -133,7 +133,8 @@ def states(world: World) -> list[np.ndarray]:
 
 @pytest.mark.parametrize(("first", "then", "time"), [(1.0, 3.0, 0.05), (3.0, 1.0, 0.08)])
 def test_motor_lag_is_exponential_in_the_speed(first: float, then: float, time: float) -> None:
-    world = begin(world_of(motor_lag=True), thrust=[first] * 4)
+    world = world_of(motor_lag=True)
+    begin(world, thrust=[first] * 4)
     a, b = sqrt(then), sqrt(first) - sqrt(then)
     fly(world, then, 1)
     # (1/h) ∫ (a + b exp(-t/T))² dt from 0 to h, of four rotors.
@@ -148,14 +149,14 @@ def test_motor_lag_is_exponential_in_the_speed(first: float, then: float, time: 
 
 def test_a_very_short_and_a_very_long_time_constant() -> None:
     short = racer(rotors_time_constant="1e-4", rotors_time_constant_down=None)
-    world = begin(world_of(short, motor_lag=True, randomize={"time_constant": 0.01}))
+    world = world_of(short, motor_lag=True, randomize={"time_constant": 0.01})
+    begin(world)
     fly(world, 3.0, 1)
     assert_allclose(world.state.thrust, 3.0, rtol=1e-12)
     # Of the step 4 (√3 - √1)/1000 s · √1 · h · 2, to first order in the step.
     long = racer(rotors_time_constant="10", rotors_time_constant_down=None)
-    world = begin(
-        world_of(long, motor_lag=True, randomize={"time_constant": 100}), thrust=[1.0] * 4
-    )
+    world = world_of(long, motor_lag=True, randomize={"time_constant": 100})
+    begin(world, thrust=[1.0] * 4)
     fly(world, 3.0, 1)
     assert_allclose(world.state.thrust - 1.0, 2 * (sqrt(3) - 1) * H / 1000, rtol=1e-5)
 
@@ -165,7 +166,9 @@ def test_a_very_short_and_a_very_long_time_constant() -> None:
     [(0.0, 0.0), (2.0, 4 * (0.4 * 0.5 + 0.6 * 0.25)), (4.0, 4.0), (9.0, 4.0), (-1.0, 0.0)],
 )
 def test_thrust_curve_at_throttles(command: float, thrust: float) -> None:
-    world = fly(begin(world_of(thrust_curve=True)), command, 1)
+    world = world_of(thrust_curve=True)
+    begin(world)
+    fly(world, command, 1)
     assert_allclose(world.state.thrust, thrust, rtol=1e-14)
 
 
@@ -177,7 +180,9 @@ def test_battery_voltage_is_the_root_of_the_quadratic(resistance: str) -> None:
     voltage = (-1 + sqrt(1 + 4 * a * 12.6)) / (2 * a)
     thrust = HOVER * (voltage / 12.6) ** 2
     for lag, steps in ((False, 1), (False, 2), (True, 300)):
-        world = fly(begin(world_of(vehicle, battery=True, motor_lag=lag)), HOVER, steps)
+        world = world_of(vehicle, battery=True, motor_lag=lag)
+        begin(world)
+        fly(world, HOVER, steps)
         assert_allclose(world.state.thrust, thrust, rtol=1e-6)
 
 
@@ -209,13 +214,16 @@ def test_an_empty_battery_stays_at_its_empty_voltage() -> None:
 def test_rotors_that_need_more_than_the_battery_gives() -> None:
     """Half the open voltage is where a source gives its most; the speeds then fall."""
     vehicle = racer(battery_resistance="0.5", battery_capacity="1e4")
-    world = fly(begin(world_of(vehicle, battery=True, motor_lag=True), thrust=[4.0] * 4), 4.0, 1)
+    world = world_of(vehicle, battery=True, motor_lag=True)
+    begin(world, thrust=[4.0] * 4)
+    fly(world, 4.0, 1)
     # Of the first step: wanted is 4 · (6.3 / 12.6)², so that √F goes from 2 to 1.
     assert_allclose(world.state.thrust, (1 + exp(-H / 0.08)) ** 2, rtol=1e-12)
 
 
 def test_efficiency_of_one_rotor_turns_the_craft() -> None:
-    world = begin(world_of(efficiency=(1, 0.5, 1, 1)))
+    world = world_of(efficiency=(1, 0.5, 1, 1))
+    begin(world)
     assert_allclose(world.state.thrust, (HOVER, HOVER / 2, HOVER, HOVER))
     assert_allclose(world.state.command, HOVER)
     acceleration, turn = pushed(world)
@@ -232,18 +240,22 @@ def test_efficiency_of_one_rotor_turns_the_craft() -> None:
 
 def test_linear_drag_is_exponential_and_turns_nothing() -> None:
     vehicle = dragging()
-    world = fly(begin(world_of(vehicle, body_drag=True), velocity=[5.0, 2.0, 0.0]), HOVER, 400)
+    world = world_of(vehicle, body_drag=True)
+    begin(world, velocity=[5.0, 2.0, 0.0])
+    fly(world, HOVER, 400)
     left = exp(-0.3 / M * 2.0)
     assert_allclose(world.state.velocity, (5 * left, 2 * left, 0.0), rtol=1e-5, atol=1e-9)
     # It acts at the center of mass, 1 cm over the origin.
     assert_allclose(world.state.body_rates, 0.0, atol=1e-12)
-    world = fly(begin(world, height=500.0), 0.0, 4000)
+    begin(world, height=500.0)
+    fly(world, 0.0, 4000)
     assert world.state.velocity[2] == approx(-M * G / 0.3, rel=1e-4)
 
 
 def test_quadratic_drag_falls_as_a_hyperbolic_tangent() -> None:
     vehicle = dragging(drag_quadratic="0.02 0.02 0.02")
-    world = begin(world_of(vehicle, body_drag=True), height=500.0)
+    world = world_of(vehicle, body_drag=True)
+    begin(world, height=500.0)
     terminal = sqrt(M * G / 0.02)
     for seconds in (1.0, 2.0, 3.0):
         fly(world, 0.0, round(1.0 / H))
@@ -255,7 +267,9 @@ def test_quadratic_drag_falls_as_a_hyperbolic_tangent() -> None:
 
 def test_angular_drag_is_exponential() -> None:
     vehicle = dragging(drag_angular="0.01 0.01 0.02")
-    world = fly(begin(world_of(vehicle, body_drag=True), body_rates=[0, 0, 5.0]), HOVER, 100)
+    world = world_of(vehicle, body_drag=True)
+    begin(world, body_rates=[0, 0, 5.0])
+    fly(world, HOVER, 100)
     # Izz is 8e-3 kg m².
     left = 5 * exp(-0.02 / 8e-3 * 0.5)
     assert_allclose(world.state.body_rates, (0, 0, left), rtol=1e-3, atol=1e-12)
@@ -265,7 +279,8 @@ def test_angular_drag_is_exponential() -> None:
 
 def test_the_moment_of_the_air_is_in_proportion_to_the_velocity() -> None:
     vehicle = dragging(1e-4, drag_moment="3e-4 5e-4")
-    world = begin(world_of(vehicle, body_drag=True, wind=(0.5, 0, 0)), velocity=[2.5, -1.0, 3.0])
+    world = world_of(vehicle, body_drag=True, wind=(0.5, 0, 0))
+    begin(world, velocity=[2.5, -1.0, 3.0])
     acceleration, turn = pushed(world, 0.0)
     # 3e-4 · -1 over 4e-3 kg m², and -5e-4 · 2 over 5e-3 kg m².
     assert_allclose(turn, (-0.075, -0.2, 0.0), rtol=1e-6, atol=1e-9)
@@ -276,9 +291,8 @@ def test_the_moment_of_the_air_is_in_proportion_to_the_velocity() -> None:
 def test_body_drag_in_body_axes() -> None:
     vehicle = racer(1e-4)
     nose_down = [sqrt(0.5), 0.0, sqrt(0.5), 0.0]  # body x is the world's -z
-    world = begin(
-        world_of(vehicle, body_drag=True), quaternion=nose_down, velocity=[3.0, 4.0, -12.0]
-    )
+    world = world_of(vehicle, body_drag=True)
+    begin(world, quaternion=nose_down, velocity=[3.0, 4.0, -12.0])
     # Body axes: x forward 12, y 4, z: the world's x, 3. |v| = 13.
     acceleration, _ = pushed(world, 0.0)
     x = -(0.1 + 0.02 * 13) * 3
@@ -289,7 +303,8 @@ def test_body_drag_in_body_axes() -> None:
 
 def test_rotors_in_sideways_and_vertical_motion() -> None:
     vehicle = racer(1e-4)
-    world = begin(world_of(vehicle, rotor_drag=True), velocity=[3.0, 0.0, 0.0])
+    world = world_of(vehicle, rotor_drag=True)
+    begin(world, velocity=[3.0, 0.0, 0.0])
     acceleration, turn = pushed(world)
     drag = -4 * 1e-4 * OMEGA * 3
     lift = 4 * 3e-3 * 9
@@ -306,11 +321,13 @@ def test_rotors_in_sideways_and_vertical_motion() -> None:
 
 def test_rotors_of_a_turning_craft() -> None:
     world = world_of(racer(1e-4), rotor_drag=True)
-    _, turn = pushed(begin(world, body_rates=[0.0, 0.0, 5.0]))
+    begin(world, body_rates=[0.0, 0.0, 5.0])
+    _, turn = pushed(world)
     # Each rotor goes around at 5 rad/s and a radius² of 0.14² + 0.12².
     yaw = -4 * 1e-4 * OMEGA * 5 * (0.14**2 + 0.12**2)
     assert_allclose(turn, (0, 0, yaw / 8e-3), rtol=1e-3, atol=1e-6)
-    _, turn = pushed(begin(world, body_rates=[5.0, 0.0, 0.0]))
+    begin(world, body_rates=[5.0, 0.0, 0.0])
+    _, turn = pushed(world)
     # Inflow at ±0.12 m; in the plane 0.02 · 5 m/s, whose force has an arm of 1 cm.
     roll = -4 * OMEGA * 5 * (2e-4 * 0.12**2 + 1e-4 * 0.02 * 0.01)
     assert_allclose(turn, (roll / 4e-3, 0, 0), rtol=1e-3, atol=1e-6)
@@ -330,7 +347,8 @@ def test_rotors_with_tilted_axes() -> None:
     world = world_of(vehicle, rotor_drag=True, ground_effect=True)
     velocity = np.array((3.0, 2.0, 1.0))
     height = 0.2
-    acceleration, turn = pushed(begin(world, height, velocity=velocity), vehicle.hover_thrust)
+    begin(world, height, velocity=velocity)
+    acceleration, turn = pushed(world, vehicle.hover_thrust)
     force = np.zeros(3)
     torque = np.zeros(3)
     speed = sqrt(thrust / K)
@@ -352,10 +370,14 @@ def test_rotors_with_tilted_axes() -> None:
 def test_drag_at_its_limit_is_stable() -> None:
     """Half of the mass over the physics step, 60 N s/m; the rotors' as a turn's."""
     vehicle = dragging(drag_linear="60 60 60")
-    world = fly(begin(world_of(vehicle, body_drag=True), velocity=[5.0, -5.0, 0.0]), HOVER, 100)
+    world = world_of(vehicle, body_drag=True)
+    begin(world, velocity=[5.0, -5.0, 0.0])
+    fly(world, HOVER, 100)
     assert_allclose(world.state.velocity, 0.0, atol=1e-9)
     vehicle = racer(rotors_inflow="0.003", rotors_drag="0", rotors_lift="0")
-    world = fly(begin(world_of(vehicle, rotor_drag=True), body_rates=[3.0, 0.0, 0.0]), HOVER, 400)
+    world = world_of(vehicle, rotor_drag=True)
+    begin(world, body_rates=[3.0, 0.0, 0.0])
+    fly(world, HOVER, 400)
     assert_allclose(world.state.body_rates, 0.0, atol=1e-9)
 
 
@@ -367,7 +389,8 @@ def test_ground_effect_at_heights(radii: float, ratio: float) -> None:
     # Rotors of a radius of 0.1 m, 0.02 m over the origin. Below half a radius it grows no further;
     # the box, here thin, does not touch there.
     vehicle = racer(1e-4, box="0.1 0.08 0.003")
-    world = begin(world_of(vehicle, ground_effect=True), height=0.1 * radii - 0.02)
+    world = world_of(vehicle, ground_effect=True)
+    begin(world, height=0.1 * radii - 0.02)
     acceleration, turn = pushed(world)
     assert acceleration[2] == approx(G * (ratio - 1), rel=1e-6)
     assert_allclose(turn, 0.0, atol=1e-9)
@@ -387,7 +410,8 @@ def test_ground_effect_lifts_the_lower_rotors_more() -> None:
 
 def test_a_craft_drifts_to_the_velocity_of_the_wind() -> None:
     vehicle = dragging()
-    world = begin(world_of(vehicle, body_drag=True, wind=(3, -2, 0.5)))
+    world = world_of(vehicle, body_drag=True, wind=(3, -2, 0.5))
+    begin(world)
     fly(world, HOVER, 400)
     share = 1 - exp(-0.3 / M * 2.0)
     assert_allclose(world.state.velocity, np.array((3, -2, 0.5)) * share, rtol=1e-5)
@@ -400,14 +424,17 @@ def test_a_craft_drifts_to_the_velocity_of_the_wind() -> None:
 def test_linear_drag_of_the_option_is_against_the_ground_in_any_wind() -> None:
     file = dragging().path
     vehicle = Vehicle.load(file, linear_drag=0.5)
-    world = fly(begin(world_of(vehicle, body_drag=True, wind=(0, 0, 3))), HOVER, 4000)
+    world = world_of(vehicle, body_drag=True, wind=(0, 0, 3))
+    begin(world)
+    fly(world, HOVER, 4000)
     # 0.3 (3 - v) = 0.5 · 0.6 v.
     assert_allclose(world.state.velocity, (0, 0, 1.5), rtol=1e-6, atol=1e-9)
 
 
 def test_drag_of_a_turning_craft_is_that_of_its_center() -> None:
     vehicle = dragging(1e-4)
-    world = begin(world_of(vehicle, body_drag=True), body_rates=[5.0, 0, 0])
+    world = world_of(vehicle, body_drag=True)
+    begin(world, body_rates=[5.0, 0, 0])
     acceleration, turn = pushed(world, 0.0)
     # The center of mass, 1 cm over the origin, moves at -0.05 m/s along y, and about the origin.
     assert_allclose(acceleration, (0, 0.3 * 0.05 / M, 25 * 0.01 - G), rtol=1e-2)
@@ -557,7 +584,8 @@ def test_gusts_in_short_steps_are_numbers(step: float) -> None:
 
 
 def test_the_tension_of_a_cable_is_the_weight_of_its_payload() -> None:
-    world = begin(world_of(payload=0.15, cable=0.5))
+    world = world_of(payload=0.15, cable=0.5)
+    begin(world)
     fly(world, HOVER * 0.75 / 0.6, 400)
     assert_allclose(world.state.velocity, 0.0, atol=1e-9)
     assert world.state.position[2] == approx(50.0, abs=2e-3)  # the cable gives a little
@@ -567,7 +595,9 @@ def test_the_tension_of_a_cable_is_the_weight_of_its_payload() -> None:
 
 
 def test_a_cable_is_slack_in_free_fall() -> None:
-    world = fly(begin(world_of(payload=0.15, cable=0.5)), 0.0, 200)
+    world = world_of(payload=0.15, cable=0.5)
+    begin(world)
+    fly(world, 0.0, 200)
     assert world.state.velocity[2] == approx(-G * 1.0, rel=1e-12)
     assert world.state.payload_velocity[2] == approx(-G * 1.0, rel=1e-12)
     assert world.state.payload_velocity[:2].tolist() == [0.0, 0.0]
@@ -614,7 +644,8 @@ def test_a_cable_conserves_momentum() -> None:
 
 
 def test_a_payload_touches_the_ground_before_the_craft_does() -> None:
-    world = begin(world_of(payload=0.15, cable=0.5), height=0.7)
+    world = world_of(payload=0.15, cable=0.5)
+    begin(world, height=0.7)
     assert not world.state.touching
     # It falls at g · (1 - 0.6 / 0.75), and the ball, 0.033 m in radius, has 0.167 m to go.
     seconds = sqrt(2 * 0.167 / (0.2 * G))
@@ -641,7 +672,8 @@ def test_off_is_bit_for_bit_absence(num_worlds: int) -> None:
     off = EffectOptions(motor_lag=False, wind=(0, 0, 0), efficiency=(), gusts=0)
     flown = []
     for effects in (None, EffectOptions(), off):
-        world = begin(make_world(vehicle, num_worlds, effects=effects), 0.5, velocity=[1, 2, 0])
+        world = make_world(vehicle, num_worlds, effects=effects)
+        begin(world, 0.5, velocity=[1, 2, 0])
         fly(world, (1.4, 1.5, 1.3, 1.4), 50, 4)
         flown.append(b"".join(array.tobytes() for array in states(world)))
     assert flown[0] == flown[1] == flown[2]
@@ -651,7 +683,9 @@ HUNG = {"motor_lag": True, "body_drag": True, "payload": 0.05, "cable": 0.4}
 
 
 def test_a_closed_world_keeps_its_state_and_no_memory_of_the_simulator() -> None:
-    world = fly(begin(world_of(None, 2, randomize={"mass": 1.2, "center_x": 0.01}, **HUNG)), 2.0, 5)
+    world = world_of(None, 2, randomize={"mass": 1.2, "center_x": 0.01}, **HUNG)
+    begin(world)
+    fly(world, 2.0, 5)
     before = world.state.position.copy()
     world.close()
     assert world.state.position.tobytes() == before.tobytes()
@@ -674,7 +708,8 @@ def test_drawn_mass_inertia_and_center_are_those_of_a_compiled_model() -> None:
     data.qvel[3:6] = (0.3, 0.2, 0.1)
     data.ctrl[:] = HOVER
     drawn = {"mass": 1.2, "inertia": 1.1, "center_x": 0.02, "center_y": -0.01, "center_z": 0.005}
-    world = begin(world_of(randomize=drawn), body_rates=[0.3, 0.2, 0.1])
+    world = world_of(randomize=drawn)
+    begin(world, body_rates=[0.3, 0.2, 0.1])
     fly(world, HOVER, 200)
     mujoco.mj_step(model, data, 200)
     state = world.state
@@ -691,7 +726,8 @@ def test_a_drawn_center_turns_every_vehicle(name: str | None) -> None:
     weight = vehicle.mass * vehicle.gravity
     x = 0.02 * vehicle.inertia[0, 0] / weight
     y = -0.03 * vehicle.inertia[1, 1] / weight
-    world = begin(world_of(vehicle, randomize={"center_x": x, "center_y": y}))
+    world = world_of(vehicle, randomize={"center_x": x, "center_y": y})
+    begin(world)
     rates = fly_hovering(world).state.body_rates / vehicle.timestep
     # The thrust m g acts at (-x, -y) from the center: the torque is (-y m g, x m g, 0).
     turn = np.linalg.solve(vehicle.inertia, (-y * weight, x * weight, 0.0))
@@ -724,7 +760,8 @@ def test_a_center_that_moves_back_to_zero_is_zero() -> None:
 def test_drawn_drag_thrust_and_mass_scale_what_they_name() -> None:
     drawn = {"mass": 2.0, "thrust": 1.5, "body_drag": 0.5}
     vehicle = dragging(1e-4)
-    world = begin(world_of(vehicle, body_drag=True, randomize=drawn), velocity=[4.0, 0, 0])
+    world = world_of(vehicle, body_drag=True, randomize=drawn)
+    begin(world, velocity=[4.0, 0, 0])
     acceleration, _ = pushed(world)
     assert_allclose(
         acceleration, (-0.5 * 0.3 * 4 / 1.2, 0, 1.5 * 4 * HOVER / 1.2 - G), rtol=1e-4, atol=1e-9
@@ -732,7 +769,8 @@ def test_drawn_drag_thrust_and_mass_scale_what_they_name() -> None:
     assert_allclose(world.state.thrust, 1.5 * HOVER)
     # The drag of Unity's bodies is an acceleration: it does not know the mass.
     draggy = Vehicle.load(linear_drag=0.5)
-    world = begin(world_of(draggy, randomize={"mass": 2.0}), velocity=[4.0, 0, 0])
+    world = world_of(draggy, randomize={"mass": 2.0})
+    begin(world, velocity=[4.0, 0, 0])
     fly(world, 98.0, 100)
     assert_allclose(world.state.velocity, (4 * exp(-0.5), 0, 0), rtol=1e-6, atol=1e-9)
 
@@ -740,7 +778,9 @@ def test_drawn_drag_thrust_and_mass_scale_what_they_name() -> None:
 @pytest.mark.parametrize("num_worlds", [1, 3])
 def test_a_drawn_reaction_one_rotor_and_a_payload(num_worlds: int) -> None:
     drawn = {"reaction": 2.0, "thrust_2": 0.5}
-    world = fly(begin(world_of(None, num_worlds, "mujoco", drawn)), HOVER, 1)
+    world = world_of(None, num_worlds, "mujoco", drawn)
+    begin(world)
+    fly(world, HOVER, 1)
     rates = world.state.body_rates.reshape(-1, 3)
     # Rotor 2 at (-0.14, -0.12) lacks half of its thrust; of the turns it lacks -0.02 twice.
     lost = 0.5 * HOVER * H
@@ -754,8 +794,10 @@ def test_a_drawn_reaction_one_rotor_and_a_payload(num_worlds: int) -> None:
 
 
 def test_a_drawn_strength_of_gusts() -> None:
-    ours = begin(world_of(randomize={"gusts": 2.0}, gusts=2.0, body_drag=True))
-    theirs = begin(world_of(gusts=4.0, body_drag=True))
+    ours = world_of(randomize={"gusts": 2.0}, gusts=2.0, body_drag=True)
+    begin(ours)
+    theirs = world_of(gusts=4.0, body_drag=True)
+    begin(theirs)
     for world in (ours, theirs):
         world.seed(np.True_, [3])
         fly(begin(world), HOVER, 20)
@@ -781,7 +823,8 @@ def test_distributions_are_told_in_one_way_of_writing() -> None:
 
 
 def test_whole_numbers_have_equal_chances() -> None:
-    world = begin(world_of(None, 3000, randomize={"action_delay": "uniform(0, 2)"}))
+    world = world_of(None, 3000, randomize={"action_delay": "uniform(0, 2)"})
+    begin(world)
     values, counts = np.unique(world.parameters["action_delay"], return_counts=True)
     assert values.tolist() == [0.0, 1.0, 2.0]
     assert (abs(counts - 1000) < 4 * sqrt(3000 * 2 / 9)).all()
@@ -891,7 +934,8 @@ def test_options_are_kept_as_floats_and_come_back() -> None:
 def test_rotors_that_push_both_ways_lose_efficiency_and_pass_the_ground() -> None:
     vehicle = racer(1e-4, low="-1")
     options = {"efficiency": (0.5,) * 4, "ground_effect": True, "rotor_drag": True}
-    world = begin(world_of(vehicle, **options), 0.3, velocity=[0.0, 0.0, 2.0])
+    world = world_of(vehicle, **options)
+    begin(world, 0.3, velocity=[0.0, 0.0, 2.0])
     acceleration, _ = pushed(world, -0.8)
     # A reversed rotor has neither ground effect nor drag.
     assert acceleration[2] == approx(-4 * 0.4 / M - G, rel=1e-9)
