@@ -35,7 +35,8 @@ def test_the_profile_by_hand() -> None:
     half = 0.07668 * 10.817  # radius at which the velocity has halved
     assert jet(5.0, half) == approx(jet(5.0) / 2, rel=1e-6)
     share = 1 + 4 * (sqrt(2) - 1)
-    assert jet(5.0, 2 * half) == approx(jet(5.0) / share**2)
+    expected = jet(5.0) / share**2
+    assert jet(5.0, 2 * half) == approx(expected)
     assert jet(5.0, thrust=4 * WEIGHT) == approx(2 * jet(5.0))
     assert jet(100.0) / jet(50.0) == approx(55.817 / 105.817)
     # Nearer than 2.5 lengths the speed falls to 0 at the height of the rotors, and above it is 0.
@@ -104,7 +105,8 @@ def test_rotors_in_the_jet_lose_thrust_by_their_inflow() -> None:
     rotors = world.vehicle.coefficients.rotors
     speeds = np.sqrt(world.vehicle.hover_thrust / rotors.thrust_coefficient)
     lost = rotors.inflow * speeds.sum() * jet(5.0)
-    assert hover(world)[1, 2] == approx(-lost / MASS * world.vehicle.timestep, rel=1e-3)
+    expected = -lost / MASS * world.vehicle.timestep
+    assert hover(world)[1, 2] == approx(expected, rel=1e-3)
 
 
 def test_a_tilted_craft_blows_along_its_own_axis() -> None:
@@ -119,7 +121,8 @@ def test_a_tilted_craft_blows_along_its_own_axis() -> None:
     side = jet(8.0 * cos(tilt), 8.0 * sin(tilt))
     speed = np.linalg.norm(air[1])
     assert speed == approx(own, rel=0.02)  # the third one's edge besides
-    assert air[1] / speed == approx([-0.5, 0.0, -sqrt(0.75)], abs=1e-6)
+    expected = [-0.5, 0.0, -sqrt(0.75)]
+    assert air[1] / speed == approx(expected, abs=1e-6)
     assert np.linalg.norm(air[2]) == approx(side, rel=0.02)
     assert side < 0.1 * own
 
@@ -127,7 +130,8 @@ def test_a_tilted_craft_blows_along_its_own_axis() -> None:
 def test_jets_of_several_add_up() -> None:
     world = birds(TOP, (0.0, 0.0, -4.0), (0.0, 0.0, -9.0))
     air = np.stack(Downwash(world.vehicle).air(world.state), axis=-1)[0]
-    assert air[2] == approx([0.0, 0.0, -(jet(9.0) + jet(5.0))], rel=1e-6)
+    expected = [0.0, 0.0, -(jet(9.0) + jet(5.0))]
+    assert air[2] == approx(expected, rel=1e-6)
 
 
 @pytest.mark.parametrize("places", [[TOP], [TOP, (6.0, 0.0, 0.0)]])

@@ -140,7 +140,8 @@ def test_motor_lag_is_exponential_in_the_speed(first: float, then: float, time: 
     # (1/h) ∫ (a + b exp(-t/T))² dt from 0 to h, of four rotors.
     e = exp(-H / time)
     mean = a * a + 2 * a * b * (time / H) * (1 - e) + b * b * (time / (2 * H)) * (1 - e * e)
-    assert world.state.velocity[2] == approx(H * (4 * mean / M - G), rel=1e-12)
+    expected = H * (4 * mean / M - G)
+    assert world.state.velocity[2] == approx(expected, rel=1e-12)
     fly(world, then, 19)
     root = a + b * exp(-20 * H / time)
     assert_allclose(world.state.thrust, root * root, rtol=1e-12)
@@ -158,7 +159,8 @@ def test_a_very_short_and_a_very_long_time_constant() -> None:
     world = world_of(long, motor_lag=True, randomize={"time_constant": 100})
     begin(world, thrust=[1.0] * 4)
     fly(world, 3.0, 1)
-    assert_allclose(world.state.thrust - 1.0, 2 * (sqrt(3) - 1) * H / 1000, rtol=1e-5)
+    expected = 2 * (sqrt(3) - 1) * H / 1000
+    assert_allclose(world.state.thrust - 1.0, expected, rtol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -208,7 +210,8 @@ def test_an_empty_battery_stays_at_its_empty_voltage() -> None:
     vehicle = racer(battery_resistance="0", battery_capacity="1e-3")
     world = world_of(vehicle, battery=True, randomize={"battery_charge": 0})
     fly(begin(world), HOVER, 50)
-    assert_allclose(world.state.thrust, HOVER * (9.9 / 12.6) ** 2, rtol=1e-12)
+    expected = HOVER * (9.9 / 12.6) ** 2
+    assert_allclose(world.state.thrust, expected, rtol=1e-12)
 
 
 def test_rotors_that_need_more_than_the_battery_gives() -> None:
@@ -218,7 +221,8 @@ def test_rotors_that_need_more_than_the_battery_gives() -> None:
     begin(world, thrust=[4.0] * 4)
     fly(world, 4.0, 1)
     # Of the first step: wanted is 4 · (6.3 / 12.6)², so that √F goes from 2 to 1.
-    assert_allclose(world.state.thrust, (1 + exp(-H / 0.08)) ** 2, rtol=1e-12)
+    expected = (1 + exp(-H / 0.08)) ** 2
+    assert_allclose(world.state.thrust, expected, rtol=1e-12)
 
 
 def test_efficiency_of_one_rotor_turns_the_craft() -> None:
@@ -244,7 +248,8 @@ def test_linear_drag_is_exponential_and_turns_nothing() -> None:
     begin(world, velocity=[5.0, 2.0, 0.0])
     fly(world, HOVER, 400)
     left = exp(-0.3 / M * 2.0)
-    assert_allclose(world.state.velocity, (5 * left, 2 * left, 0.0), rtol=1e-5, atol=1e-9)
+    expected = (5 * left, 2 * left, 0.0)
+    assert_allclose(world.state.velocity, expected, rtol=1e-5, atol=1e-9)
     # It acts at the center of mass, 1 cm over the origin.
     assert_allclose(world.state.body_rates, 0.0, atol=1e-12)
     begin(world, height=500.0)
@@ -272,7 +277,8 @@ def test_angular_drag_is_exponential() -> None:
     fly(world, HOVER, 100)
     # Izz is 8e-3 kg m².
     left = 5 * exp(-0.02 / 8e-3 * 0.5)
-    assert_allclose(world.state.body_rates, (0, 0, left), rtol=1e-3, atol=1e-12)
+    expected = (0, 0, left)
+    assert_allclose(world.state.body_rates, expected, rtol=1e-3, atol=1e-12)
     vehicle = dragging(drag_angular="0.5 0.5 0.5")
     refused(r"^drag.angular: expected at most 0\.4 N m s", world_of, vehicle, body_drag=True)
 
@@ -283,7 +289,8 @@ def test_the_moment_of_the_air_is_in_proportion_to_the_velocity() -> None:
     begin(world, velocity=[2.5, -1.0, 3.0])
     acceleration, turn = pushed(world, 0.0)
     # 3e-4 · -1 over 4e-3 kg m², and -5e-4 · 2 over 5e-3 kg m².
-    assert_allclose(turn, (-0.075, -0.2, 0.0), rtol=1e-6, atol=1e-9)
+    expected = (-0.075, -0.2, 0.0)
+    assert_allclose(turn, expected, rtol=1e-6, atol=1e-9)
     # The origin is 1 cm below the center of mass, which only falls.
     assert_allclose(acceleration, (0.002, -0.00075, -G), rtol=1e-3)
 
@@ -298,7 +305,8 @@ def test_body_drag_in_body_axes() -> None:
     x = -(0.1 + 0.02 * 13) * 3
     y = -(0.06 + 0.012 * 13) * 4
     z = (0.05 + 0.01 * 13) * 12
-    assert_allclose(acceleration, (x / M, y / M, z / M - G), rtol=1e-3)
+    expected = (x / M, y / M, z / M - G)
+    assert_allclose(acceleration, expected, rtol=1e-3)
 
 
 def test_rotors_in_sideways_and_vertical_motion() -> None:
@@ -311,11 +319,13 @@ def test_rotors_in_sideways_and_vertical_motion() -> None:
     # The rotors are 1 cm over the center of mass, and the origin 1 cm under it.
     pitch = 0.01 * drag / 5e-3
     assert_allclose(turn, (0, pitch, 0), rtol=1e-3, atol=1e-9)
-    assert_allclose(acceleration, (drag / M - 0.01 * pitch, 0, lift / M), rtol=1e-3, atol=1e-6)
+    expected = (drag / M - 0.01 * pitch, 0, lift / M)
+    assert_allclose(acceleration, expected, rtol=1e-3, atol=1e-6)
     world = begin(world, velocity=[0.0, 0.0, 2.0])
     acceleration, turn = pushed(world)
     loss = 4 * 2e-4 * OMEGA * 2
-    assert_allclose(acceleration, (0, 0, -loss / M), rtol=1e-3, atol=1e-9)
+    expected = (0, 0, -loss / M)
+    assert_allclose(acceleration, expected, rtol=1e-3, atol=1e-9)
     assert_allclose(turn, 0.0, atol=1e-9)
 
 
@@ -325,12 +335,14 @@ def test_rotors_of_a_turning_craft() -> None:
     _, turn = pushed(world)
     # Each rotor goes around at 5 rad/s and a radius² of 0.14² + 0.12².
     yaw = -4 * 1e-4 * OMEGA * 5 * (0.14**2 + 0.12**2)
-    assert_allclose(turn, (0, 0, yaw / 8e-3), rtol=1e-3, atol=1e-6)
+    expected = (0, 0, yaw / 8e-3)
+    assert_allclose(turn, expected, rtol=1e-3, atol=1e-6)
     begin(world, body_rates=[5.0, 0.0, 0.0])
     _, turn = pushed(world)
     # Inflow at ±0.12 m; in the plane 0.02 · 5 m/s, whose force has an arm of 1 cm.
     roll = -4 * OMEGA * 5 * (2e-4 * 0.12**2 + 1e-4 * 0.02 * 0.01)
-    assert_allclose(turn, (roll / 4e-3, 0, 0), rtol=1e-3, atol=1e-6)
+    expected = (roll / 4e-3, 0, 0)
+    assert_allclose(turn, expected, rtol=1e-3, atol=1e-6)
 
 
 def test_rotors_with_tilted_axes() -> None:
@@ -404,7 +416,8 @@ def test_ground_effect_lifts_the_lower_rotors_more() -> None:
     low, high = (0.2 + cos(angle) * 0.02 + sin(angle) * y for y in (-0.12, 0.12))
     more = [HOVER * (1 / (1 - (0.1 / (4 * z)) ** 2) - 1) for z in (low, high)]
     roll = 0.12 * 2 * (more[1] - more[0])
-    assert_allclose(turn, (roll / 4e-3, 0, 0), rtol=1e-4, atol=1e-9)
+    expected = (roll / 4e-3, 0, 0)
+    assert_allclose(turn, expected, rtol=1e-4, atol=1e-9)
     assert roll < 0
 
 
@@ -414,7 +427,8 @@ def test_a_craft_drifts_to_the_velocity_of_the_wind() -> None:
     begin(world)
     fly(world, HOVER, 400)
     share = 1 - exp(-0.3 / M * 2.0)
-    assert_allclose(world.state.velocity, np.array((3, -2, 0.5)) * share, rtol=1e-5)
+    expected = np.array((3, -2, 0.5)) * share
+    assert_allclose(world.state.velocity, expected, rtol=1e-5)
     # A drawn wind adds to it.
     world = world_of(vehicle, body_drag=True, wind=(3, 0, 0), randomize={"wind_y": 4})
     fly(begin(world), HOVER, 400)
@@ -428,7 +442,8 @@ def test_linear_drag_of_the_option_is_against_the_ground_in_any_wind() -> None:
     begin(world)
     fly(world, HOVER, 4000)
     # 0.3 (3 - v) = 0.5 · 0.6 v.
-    assert_allclose(world.state.velocity, (0, 0, 1.5), rtol=1e-6, atol=1e-9)
+    expected = (0, 0, 1.5)
+    assert_allclose(world.state.velocity, expected, rtol=1e-6, atol=1e-9)
 
 
 def test_drag_of_a_turning_craft_is_that_of_its_center() -> None:
@@ -437,7 +452,8 @@ def test_drag_of_a_turning_craft_is_that_of_its_center() -> None:
     begin(world, body_rates=[5.0, 0, 0])
     acceleration, turn = pushed(world, 0.0)
     # The center of mass, 1 cm over the origin, moves at -0.05 m/s along y, and about the origin.
-    assert_allclose(acceleration, (0, 0.3 * 0.05 / M, 25 * 0.01 - G), rtol=1e-2)
+    expected = (0, 0.3 * 0.05 / M, 25 * 0.01 - G)
+    assert_allclose(acceleration, expected, rtol=1e-2)
     assert_allclose(turn, 0.0, atol=1e-9)
 
 
@@ -524,7 +540,8 @@ def test_correlation_of_gusts_over_time() -> None:
         along = exp(-r / L_U)
         across = (1 - r / (2 * L_U)) * exp(-r / L_U)
         up = (1 - r / (2 * L_W)) * exp(-r / L_W)
-        assert_allclose(seen, (across, along, up), atol=5 * sqrt(2 / num))
+        expected = (across, along, up)
+        assert_allclose(seen, expected, atol=5 * sqrt(2 / num))
 
 
 def test_spectra_of_gusts() -> None:
@@ -561,7 +578,8 @@ def test_scales_of_gusts_at_heights(height: float, feet: float) -> None:
     blown = gusts(num, 2, 0.3, height=height)
     ratio = blown[0].std(axis=0) / 0.8
     across = 1 / (0.177 + 0.000823 * feet) ** 0.4
-    assert_allclose(ratio, (across, across, 1.0), rtol=5 / sqrt(2 * num))
+    expected = (across, across, 1.0)
+    assert_allclose(ratio, expected, rtol=5 / sqrt(2 * num))
     r = SPEED * 0.3 / (feet * 0.3048)
     seen = (blown[0, :, 2] * blown[1, :, 2]).mean() / 0.64
     assert seen == approx((1 - r / 2) * exp(-r), abs=5 * sqrt(2 / num))
@@ -577,7 +595,8 @@ def test_gusts_in_short_steps_are_numbers(step: float) -> None:
     length = 300 / (0.177 + 0.000823 * feet) ** 1.2
     sigma = 0.8 / (0.177 + 0.000823 * feet) ** 0.4
     moved = np.square(blown[1, :, 0] - blown[0, :, 0]).mean()
-    assert moved == approx(2 * sigma**2 * step / length, rel=5 * sqrt(2 / 2000))
+    expected = 2 * sigma**2 * step / length
+    assert moved == approx(expected, rel=5 * sqrt(2 / 2000))
 
 
 # --- a payload ------------------------------------------------------------------------------------
@@ -591,7 +610,8 @@ def test_the_tension_of_a_cable_is_the_weight_of_its_payload() -> None:
     assert world.state.position[2] == approx(50.0, abs=2e-3)  # the cable gives a little
     # With its own hover it sinks together with the payload, at g · 0.15 / 0.75.
     fly(begin(world), HOVER, 400)
-    assert world.state.velocity[2] == approx(-G * 0.15 / 0.75 * 2.0, rel=1e-3)
+    expected = -G * 0.15 / 0.75 * 2.0
+    assert world.state.velocity[2] == approx(expected, rel=1e-3)
 
 
 def test_a_cable_is_slack_in_free_fall() -> None:
@@ -639,7 +659,8 @@ def test_a_cable_conserves_momentum() -> None:
     mujoco.mj_subtreeVel(model, data)
     craft, ball = model.jnt_bodyid
     momentum = 0.6 * data.subtree_linvel[craft] + 0.15 * data.subtree_linvel[ball]
-    assert_allclose(momentum, 0.15 * np.array((2.0, 1.0, -3.0)) - (0, 0, 0.75 * G), rtol=1e-7)
+    expected = 0.15 * np.array((2.0, 1.0, -3.0)) - (0, 0, 0.75 * G)
+    assert_allclose(momentum, expected, rtol=1e-7)
     assert data.qvel[2] != -G  # it did pull
 
 
@@ -713,10 +734,14 @@ def test_drawn_mass_inertia_and_center_are_those_of_a_compiled_model() -> None:
     fly(world, HOVER, 200)
     mujoco.mj_step(model, data, 200)
     state = world.state
-    assert_allclose(state.position, data.qpos[:3], rtol=0, atol=1e-12)
-    assert_allclose(state.quaternion, data.qpos[3:7], rtol=0, atol=1e-12)
-    assert_allclose(state.velocity, data.qvel[:3], rtol=0, atol=1e-12)
-    assert_allclose(state.body_rates, data.qvel[3:6], rtol=0, atol=1e-12)
+    expected = data.qpos[:3]
+    assert_allclose(state.position, expected, rtol=0, atol=1e-12)
+    expected = data.qpos[3:7]
+    assert_allclose(state.quaternion, expected, rtol=0, atol=1e-12)
+    expected = data.qvel[:3]
+    assert_allclose(state.velocity, expected, rtol=0, atol=1e-12)
+    expected = data.qvel[3:6]
+    assert_allclose(state.body_rates, expected, rtol=0, atol=1e-12)
     assert abs(state.body_rates).max() > 1
 
 
@@ -763,16 +788,16 @@ def test_drawn_drag_thrust_and_mass_scale_what_they_name() -> None:
     world = world_of(vehicle, body_drag=True, randomize=drawn)
     begin(world, velocity=[4.0, 0, 0])
     acceleration, _ = pushed(world)
-    assert_allclose(
-        acceleration, (-0.5 * 0.3 * 4 / 1.2, 0, 1.5 * 4 * HOVER / 1.2 - G), rtol=1e-4, atol=1e-9
-    )
+    expected = (-0.5 * 0.3 * 4 / 1.2, 0, 1.5 * 4 * HOVER / 1.2 - G)
+    assert_allclose(acceleration, expected, rtol=1e-4, atol=1e-9)
     assert_allclose(world.state.thrust, 1.5 * HOVER)
     # The drag of Unity's bodies is an acceleration: it does not know the mass.
     draggy = Vehicle.load(linear_drag=0.5)
     world = world_of(draggy, randomize={"mass": 2.0})
     begin(world, velocity=[4.0, 0, 0])
     fly(world, 98.0, 100)
-    assert_allclose(world.state.velocity, (4 * exp(-0.5), 0, 0), rtol=1e-6, atol=1e-9)
+    expected = (4 * exp(-0.5), 0, 0)
+    assert_allclose(world.state.velocity, expected, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize("num_worlds", [1, 3])
@@ -938,7 +963,8 @@ def test_rotors_that_push_both_ways_lose_efficiency_and_pass_the_ground() -> Non
     begin(world, 0.3, velocity=[0.0, 0.0, 2.0])
     acceleration, _ = pushed(world, -0.8)
     # A reversed rotor has neither ground effect nor drag.
-    assert acceleration[2] == approx(-4 * 0.4 / M - G, rel=1e-9)
+    expected = -4 * 0.4 / M - G
+    assert acceleration[2] == approx(expected, rel=1e-9)
 
 
 # --- the page -------------------------------------------------------------------------------------

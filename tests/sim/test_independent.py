@@ -89,7 +89,8 @@ def test_a_rotor_lags_and_drags_as_worked_out_by_hand() -> None:
     change = equations.derivative(0.0, y, wanted)
     assert change[:3] == approx((2, 0, 0))
     assert change[6:10] == approx((0, 0, 0, 0))
-    assert change[13:] == approx((0.2 / 0.05, -0.2 / 0.08, 0, 0))
+    expected = (0.2 / 0.05, -0.2 / 0.08, 0, 0)
+    assert change[13:] == approx(expected)
     # Speed sqrt(T / 5e-6); drag 1e-4 · speed · 2 m/s; lift 3e-3 · 4 m²/s² each.
     drags = [1e-4 * r / sqrt(5e-6) * 2 for r in root]
     pushes = [r * r + 0.012 for r in root]
@@ -123,7 +124,8 @@ def test_every_vehicle_flies_as_its_equations_say(name: str) -> None:
 def test_the_thrusts_vary_and_turn_the_smallest_as_fast_as_the_page_says() -> None:
     given = thrusts(VEHICLES["tiny"])
     assert given.shape == (500, 4)
-    assert given.std(axis=0) == approx(0.3 / sqrt(3) * 0.0662, rel=0.1)
+    expected = 0.3 / sqrt(3) * 0.0662
+    assert given.std(axis=0) == approx(expected, rel=0.1)
     flight = independent(VEHICLES["tiny"], given[:250], {}, 1e-9)
     assert 5 < np.linalg.norm(flight.rates, axis=1).max() < 35
 
@@ -215,12 +217,12 @@ def test_rotorpys_parameters_become_our_vehicle(tmp_path: Path) -> None:
     told = vehicle.coefficients
     assert vehicle.mass == 0.4
     assert vehicle.gravity == 9.81
-    assert vehicle.inertia == approx(
-        np.array(((1e-3, 0, 1e-4), (0, 2e-3, 0), (1e-4, 0, 2.5e-3))), abs=1e-9
-    )
+    expected = np.array(((1e-3, 0, 1e-4), (0, 2e-3, 0), (1e-4, 0, 2.5e-3)))
+    assert vehicle.inertia == approx(expected, abs=1e-9)
     assert vehicle.thrust_high == approx([2.0] * 4)
     signs = [(1, 1, 1, 1), (0.2, -0.2, -0.2, 0.2), (-0.1, -0.1, 0.1, 0.1)]
-    assert vehicle.allocation == approx(np.array((*signs, (0.02, -0.02, 0.02, -0.02))), abs=1e-12)
+    expected = np.array((*signs, (0.02, -0.02, 0.02, -0.02)))
+    assert vehicle.allocation == approx(expected, abs=1e-12)
     assert told.rotors.thrust_coefficient == 2e-6
     assert told.rotors.time_constant == 0.01
     assert told.rotors.drag == 1e-4

@@ -53,14 +53,16 @@ def test_inertia_by_hand() -> None:
     ixx = 0.2132 + 2 * (0.000735 + 0.8003675) + 4 * 0.80258
     izz = 0.3872 + 4 * 0.8003675 + 4 * 1.60324
     assert (ixx, izz) == approx((IXX, IZZ), abs=1e-12)
-    assert_allclose(Vehicle.load().inertia, np.diag([ixx, ixx, izz]), atol=1e-9)
+    expected = np.diag([ixx, ixx, izz])
+    assert_allclose(Vehicle.load().inertia, expected, atol=1e-9)
 
 
 def test_forces_and_torques_meet_the_mass_and_the_inertia_of_the_paper() -> None:
     vehicle = Vehicle.load()
     data = ready(vehicle)
     fall = acceleration(vehicle, data)
-    assert fall == approx([0, 0, -GRAVITY, 0, 0, 0], abs=1e-9)
+    expected = [0, 0, -GRAVITY, 0, 0, 0]
+    assert fall == approx(expected, abs=1e-9)
     for axis, size in enumerate((MASS, MASS, MASS, IXX, IXX, IZZ)):
         data.qfrc_applied[:] = np.eye(6)[axis]
         answer = acceleration(vehicle, data) - fall
@@ -75,7 +77,8 @@ def test_a_rotor_pushes_up_and_turns(rotor: int, torque: tuple[float, ...]) -> N
     vehicle = Vehicle.load()
     answer = acceleration(vehicle, ready(vehicle, MAX_THRUST * np.eye(4)[rotor]))
     assert answer[2] == approx(MAX_THRUST / MASS - GRAVITY, abs=1e-9)
-    assert answer[3:] * (IXX, IXX, IZZ) == approx(MAX_THRUST * np.array(torque), abs=1e-8)
+    expected = MAX_THRUST * np.array(torque)
+    assert answer[3:] * (IXX, IXX, IZZ) == approx(expected, abs=1e-8)
 
 
 @pytest.mark.parametrize(("asked", "given"), [(0, 0), (49, 49), (100, 100), (150, 100), (-50, 0)])
@@ -95,7 +98,8 @@ def test_tumbling_is_that_of_a_symmetric_top() -> None:
     data.qvel[3:] = SPIN
     fly(vehicle, data, 10.0)
     turned = complex(1, 2) * np.exp(1j * (IZZ - IXX) / IXX * 3 * 10)
-    assert data.qvel[3:] == approx([turned.real, turned.imag, 3], abs=1e-6)
+    expected = [turned.real, turned.imag, 3]
+    assert data.qvel[3:] == approx(expected, abs=1e-6)
     assert data.qpos[2] == approx(1000 - 490, abs=1e-9)
 
 
@@ -121,7 +125,8 @@ def test_linear_drag_is_a_force_and_no_torque(name: str) -> None:
         mujoco.mj_forward(vehicle.model, data)
         answers.append(data.qfrc_passive.copy())
     force = -0.5 * without.mass * np.array((6, -8, 10))
-    assert answers[0] - answers[1] == approx([*force, 0, 0, 0], abs=1e-9)
+    expected = [*force, 0, 0, 0]
+    assert answers[0] - answers[1] == approx(expected, abs=1e-9)
 
 
 def test_linear_drag_slows_a_hover_and_not_its_turn() -> None:
@@ -129,7 +134,8 @@ def test_linear_drag_slows_a_hover_and_not_its_turn() -> None:
     data = ready(vehicle, 49)
     data.qvel[:] = (10, 0, 0, 0, 0, 1)
     fly(vehicle, data, 2.0)
-    assert data.qvel[0] == approx(10 * exp(-1), abs=1e-9)
+    expected = 10 * exp(-1)
+    assert data.qvel[0] == approx(expected, abs=1e-9)
     assert data.qvel[5] == approx(1, abs=1e-9)
 
 

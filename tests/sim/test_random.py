@@ -43,7 +43,8 @@ def test_uniform_and_normal_by_hand() -> None:
     assert uniform(words).tolist() == [0.0, 0.5, 0.25, 1 - 2.0**-32]
     # Box and Muller: sqrt(-2 log(1 - 1/2)) at a quarter turn, and at no turn of size 0.
     found = normal(np.array((2**31, 0, 2**30, 0), np.uint32))
-    assert_allclose(found, (0.0, 0.0, math.sqrt(2 * math.log(2)), 0.0), atol=1e-15)
+    expected = (0.0, 0.0, math.sqrt(2 * math.log(2)), 0.0)
+    assert_allclose(found, expected, atol=1e-15)
 
 
 def test_normal_numbers_are_normal() -> None:

@@ -112,7 +112,8 @@ def test_strong_rotors_and_a_light_craft_fly(share: float, most: str, tmp_path: 
     world = arrays(vehicle, 1)
     begin(world, position=(9.0, 9.0, 9.0))
     world.step(np.tile(vehicle.hover_thrust, (1, 1, 1)), 4)
-    assert world.state.position == pytest.approx(np.full((1, 1, 3), 9.0), abs=1e-9)
+    expected = np.full((1, 1, 3), 9.0)
+    assert world.state.position == pytest.approx(expected, abs=1e-9)
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
@@ -124,7 +125,8 @@ def test_compiled_a_fast_spin_is_exact(dtype: str) -> None:
     world.step(np.zeros((1, 1, 4)), 2)
     near = 1e-5 if dtype == "float32" else 1e-12
     w, x, y, z = world.state.quaternion[0, 0].tolist()
-    assert [w, x, y, abs(z)] == pytest.approx([0.0, 0.0, 0.0, 1.0], abs=near)
+    expected = [0.0, 0.0, 0.0, 1.0]
+    assert [w, x, y, abs(z)] == pytest.approx(expected, abs=near)
 
 
 def test_arrays_have_the_same_bits_alone_and_in_a_batch() -> None:

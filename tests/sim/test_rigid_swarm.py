@@ -76,7 +76,8 @@ def test_drones_that_keep_apart_fly_bit_for_bit_as_alone(
         ours = getattr(together.state, field)
         theirs = getattr(alone.state, field)
         assert ours.tobytes() == theirs.tobytes(), field
-    assert together.acceleration() == pytest.approx(alone.acceleration().reshape(2, 3, 3), abs=1e-9)
+    expected = alone.acceleration().reshape(2, 3, 3)
+    assert together.acceleration() == pytest.approx(expected, abs=1e-9)
     assert not together.state.touching.any()
     assert not together.state.colliding.any()
 
@@ -234,7 +235,8 @@ def test_a_mask_moves_and_tells_of_its_worlds_alone() -> None:
     world.step(thrust, 2, second)
     assert world.state.position[0].tobytes() == before
     assert world.state.colliding.tolist() == [[True, True], [False, False]]
-    assert world.state.thrust[0] == pytest.approx(np.broadcast_to(vehicle.hover_thrust, (2, 4)))
+    expected = np.broadcast_to(vehicle.hover_thrust, (2, 4))
+    assert world.state.thrust[0] == pytest.approx(expected)
     # 0.1 g over 0.02 s.
     climb = 0.1 * vehicle.gravity * 0.02
     assert world.state.velocity[0, :, 2].tolist() == [0.0, 0.0]

@@ -87,7 +87,8 @@ def test_imu_of_a_craft_that_stands() -> None:
     for _ in range(100):  # until it has come to rest
         world.step(np.zeros(4), 2)
     sensors.sample(every)
-    assert sensors.readings["imu"] == approx((0, 0, 0, 0, 0, 9.8), abs=1e-3)
+    expected = (0, 0, 0, 0, 0, 9.8)
+    assert sensors.readings["imu"] == approx(expected, abs=1e-3)
 
 
 def test_imu_at_the_end_of_a_step() -> None:
@@ -96,7 +97,8 @@ def test_imu_at_the_end_of_a_step() -> None:
     world.step(np.array((60.0, 50.0, 40.0, 30.0)), 2)
     sensors.sample(every)
     reading = sensors.readings["imu"]
-    assert reading[3:] == approx((0.0, 0.0, 180.0 / 20.0), abs=1e-9)
+    expected = (0.0, 0.0, 180.0 / 20.0)
+    assert reading[3:] == approx(expected, abs=1e-9)
     assert_array_equal(reading[:3], world.state.body_rates)
 
 
@@ -105,7 +107,8 @@ def test_imu_off_the_center_of_mass(tmp_path: Path) -> None:
     drawn towards it by ω² r = 0.12 m/s²."""
     file = edited(tmp_path, 'size="0.22 0.22 0.07"', 'size="0.22 0.22 0.07" pos="0.05 0 0"')
     reading = first("imu", IMU, file=file, body_rates=(0.0, 0.0, 2.0))
-    assert reading == approx((0, 0, 2.0, 0.12, 0, 9.8), abs=1e-9)
+    expected = (0, 0, 2.0, 0.12, 0, 9.8)
+    assert reading == approx(expected, abs=1e-9)
 
 
 def test_imu_feels_the_air(tmp_path: Path) -> None:
@@ -119,7 +122,8 @@ def test_imu_feels_the_air(tmp_path: Path) -> None:
     sensors.begin(every)
     world.step(vehicle.hover_thrust, 1)
     sensors.sample(every)
-    assert sensors.readings["imu"][3:] == approx((0.5, 0.0, 9.8), abs=1e-3)
+    expected = (0.5, 0.0, 9.8)
+    assert sensors.readings["imu"][3:] == approx(expected, abs=1e-3)
 
 
 def test_imu_within_its_range() -> None:
@@ -177,10 +181,12 @@ def test_barometer_walks() -> None:
 
 def test_magnetometer() -> None:
     """Level with the nose east, it has the field of the world; with the nose north, turned."""
-    assert first("magnetometer", {"noise": 0.0}) == approx((1.287, 21.532, -43.231))
+    expected = (1.287, 21.532, -43.231)
+    assert first("magnetometer", {"noise": 0.0}) == approx(expected)
     turned = first("magnetometer", {"noise": 0.0}, quaternion=LEFT)
     assert turned == approx((21.532, -1.287, -43.231))
-    assert first("magnetometer", {"noise": 0.0, "field": [0, 30, 0]}) == approx((0, 30, 0))
+    expected = (0, 30, 0)
+    assert first("magnetometer", {"noise": 0.0, "field": [0, 30, 0]}) == approx(expected)
     _, sensors, _ = sensing({"magnetometer": {"noise": 0.3, "field": [0, 0, 0]}}, 2000)
     noise = sensors.readings["magnetometer"]
     assert noise.std() == approx(0.3, abs=4 * 0.3 / sqrt(12_000))
@@ -214,7 +220,8 @@ def test_gps_and_motion_capture() -> None:
     pose = {"position": (1.0, -2.0, 3.0), "velocity": (4.0, 5.0, -6.0), "quaternion": LEFT}
     assert first("gps", GPS, **pose) == [1.0, -2.0, 3.0, 4.0, 5.0, -6.0]
     exact = {"noise": 0.0, "angle_noise": 0.0}
-    assert first("motion_capture", exact, **pose) == approx([1.0, -2.0, 3.0, *LEFT])
+    expected = [1.0, -2.0, 3.0, *LEFT]
+    assert first("motion_capture", exact, **pose) == approx(expected)
     noisy = {"noise": 2.0, "vertical_noise": 3.0, "velocity_noise": 0.5}
     _, sensors, _ = sensing({"gps": noisy}, 4000, **pose)
     deviation = sensors.readings["gps"].reshape(-1, 6).std(axis=0)
@@ -458,14 +465,16 @@ def test_a_step_of_attitude_by_hand() -> None:
     made = after({}, 0.5, 0, 0, 0, 0, 0)  # falls: nothing pulls
     assert angles_of(made.quaternion) == approx((0.01, 0, 0))
     made = after({}, quaternion=about_x(math.degrees(0.2)))
-    assert angles_of(made.quaternion) == approx((0.2 - 0.5 * sin(0.2), 0, 0))
+    expected = (0.2 - 0.5 * sin(0.2), 0, 0)
+    assert angles_of(made.quaternion) == approx(expected)
     # Nose north where it is believed to be east: field along -y... seen as along body x.
     made = after({"magnetometer": channel(20, 0, -40)})
     assert angles_of(made.quaternion) == approx((0, 0, pi / 4))
     turned = np.array((cos(0.15), 0, 0, sin(0.15)))
     for attitude in (turned, -turned):  # the same one
         made = after({"motion_capture": channel(0, 0, 0, *attitude)})
-        assert angles_of(made.quaternion) == approx((0, 0, sin(0.15)))
+        expected = (0, 0, sin(0.15))
+        assert angles_of(made.quaternion) == approx(expected)
 
 
 def test_a_reading_counts_once() -> None:
@@ -520,8 +529,10 @@ def test_an_exact_estimate_of_a_steady_climb() -> None:
         world.step(np.full(4, 55.0), 2)
         made.sample(every)
     estimate = made.readings["estimate"]
-    assert estimate[:3] == approx(world.state.position.tolist(), abs=1e-9)
-    assert estimate[3:6] == approx(world.state.velocity.tolist(), abs=1e-9)
+    expected = world.state.position.tolist()
+    assert estimate[:3] == approx(expected, abs=1e-9)
+    expected = world.state.velocity.tolist()
+    assert estimate[3:6] == approx(expected, abs=1e-9)
     assert estimate[6:10] == approx(LEVEL, abs=1e-12)
     # 55 N · 4 / 20 kg - 9.8 = 1.2 m/s² for 2 s
     assert estimate[2] == approx(5.0 + 0.5 * 1.2 * 4)
