@@ -6,12 +6,12 @@ no vehicle; 130 Ctrl-C; 141 standard output is closed; 143 SIGTERM. A bug of our
 traceback.
 """
 
-import ast
 import atexit
 import gc
 import io
 import logging
 import os
+import re
 import signal
 import sys
 from collections.abc import Sequence
@@ -19,36 +19,36 @@ from errno import ENOSPC, EPIPE
 from importlib import import_module
 from pathlib import Path
 from shutil import get_terminal_size
-from typing import TYPE_CHECKING, Final, TypeGuard, cast
+from typing import TYPE_CHECKING, Final, TypeGuard
 
 if TYPE_CHECKING:
     from ._flags import Command
 
 __all__ = ["COMMANDS", "EXTRAS", "main"]
 
-COMMANDS: Final = {
-    "sim": "Sim",
-    "train": "Train",
-    "serve": "Serve",
-    "evaluate": "Evaluate",
-    "export": "Export",
-    "view": "View",
-    "compare": "Compare",
-    "sweep": "Sweep",
-    "benchmark": "Benchmark",
-    "report": "Report",
-    "render": "Render",
-    "bench": "Bench",
-    "vehicle": "Vehicle",
-    "identify": "Identify",
-    "key": "Key",
-    "replay": "Replay",
-    "log": "Log",
-    "plot": "Plot",
-    "dataset": "Dataset",
-    "capture": "Capture",
-}
-"""Class of each command, in the module of the command's name."""
+COMMANDS: Final = (
+    "sim",
+    "train",
+    "serve",
+    "evaluate",
+    "export",
+    "view",
+    "compare",
+    "sweep",
+    "benchmark",
+    "report",
+    "render",
+    "bench",
+    "vehicle",
+    "identify",
+    "key",
+    "replay",
+    "log",
+    "plot",
+    "dataset",
+    "capture",
+)
+"""Each is a class in the module of its name: `Sim` in `sim`."""
 
 EXTRAS: Final = {
     "train": ("torch", "stable_baselines3", "tensorboard", "safetensors", "pandas",
@@ -135,19 +135,18 @@ def _run(words: list[str]) -> int:
     if get_terminal_size().columns < 40:  # tyro does not end on narrower terminals
         os.environ["COLUMNS"] = "40"
     with hidden_gl_setting():  # importing OpenGL takes time, also for a command that draws nothing
-        module = import_module("." + name.replace("-", "_"), __name__)
-        kind: type[Command] = getattr(module, COMMANDS[name])
+        module = import_module(f".{name}", __name__)
+        kind: type[Command] = getattr(module, name.title())
         return parse(kind, f"rotorgram {name}", words[1:]).run()
 
 
 def _help() -> str:
     lines = ["usage: rotorgram [-h] [--version] COMMAND ...", "", _ABOUT, "", "commands:"]
-    for name, kind in COMMANDS.items():
-        file = name.replace("-", "_") + ".py"  # read, not imported: for speed
-        body = ast.parse(Path(__file__).with_name(file).read_bytes()).body
-        (node,) = (one for one in body if getattr(one, "name", "") == kind)
-        summary = ast.get_docstring(cast(ast.ClassDef, node)) or ""
-        lines.append(f"  {name:12} {summary.partition(chr(10))[0]}")
+    for name in COMMANDS:
+        text = Path(__file__).with_name(f"{name}.py").read_text("utf-8")  # for speed, not imported
+        summary = re.search(rf'class {name.title()}\(.*\n    """([^"\n]*)', text)
+        assert summary
+        lines.append(f"  {name:12} {summary[1]}")
     return "\n".join([*lines, "", "rotorgram COMMAND --help lists the flags of a command."])
 
 

@@ -1,4 +1,4 @@
-"""Envs and policies that flags name: a task's id and options, checkpoints, remote envs."""
+"""Envs and policies that flags name: checkpoints, controllers, remote envs."""
 
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from ..agents import CONTROLLERS, PID, Checkpoint, Geometric, Orca, Policy, load
-from ..envs.config import BACKEND_KEYWORDS, EnvConfig
+from ..envs.config import BACKEND_KEYWORDS
 from ..envs.registry import env_spec, is_known, task_type
 from ..envs.spec import EnvSpec
 from ..flights.trajectories import Trajectory
@@ -15,7 +15,7 @@ from ..models import Backend
 from ..models.errors import InputError
 from ..udp import RemoteVectorEnv
 from ..udp.spawn import spawn_simulator
-from ._flags import AgentFlags, EnvFlags, Options, check_count, parse_address
+from ._flags import AgentFlags, EnvFlags, check_count, parse_address
 
 CHECKPOINT: Final = "checkpoint.safetensors"
 F = TypeVar("F", bound=EnvFlags)
@@ -35,23 +35,22 @@ def trained(name: str, *others: str) -> Checkpoint:
     """
     path = Path(name)
     file = path / CHECKPOINT if path.is_dir() else path
-    several = path / "checkpoints"
-    got = f"{name}, where there is no file {file}"
-    got += f": look into {several}" if several.is_dir() else ""
-    expected = ", ".join([*others, "a checkpoint or the folder of a training"])
     if not file.is_file():
+        expected = ", ".join([*others, "a checkpoint or the folder of a training"])
+        got = f"{name}, where there is no file {file}"
+        several = path / "checkpoints"
+        if several.is_dir():
+            got += f": look into {several}"
         raise InputError(f"policy: expected {expected}, got {got}")
     return load(file)
 
 
-def chosen_env(
-    command: EnvFlags, checkpoint: Checkpoint | Controller | None = None
-) -> tuple[str, Options]:
-    """Id of the task, and its options that are not the default.
+def fitted(command: F, checkpoint: Checkpoint | Controller) -> F:
+    """The command with the env that a checkpoint was trained in, or with the options that a
+    controller needs.
 
-    A checkpoint brings those that it was trained with, a controller those it needs;
-    options that the user set win. Raises `InputError` if they are of another task than the
-    checkpoint's.
+    What the user set wins. With --listen the simulator has the vehicle. Raises `InputError` if the
+    options are of another task than the checkpoint's.
     """
     env_id = command.env_id
     options = command.options
@@ -63,57 +62,23 @@ def chosen_env(
                 f"{checkpoint.__name__.lower()}: expected a task flown by {level}, "
                 f"got {env_id}; name one with --env"
             )
-        return env_id, {**checkpoint.options, **options}
-    if checkpoint is None or ("env" in command.given and env_id != checkpoint.env_id):
-        return env_id, options
-    if options and env_id != checkpoint.env_id:
-        raise InputError(
-            f"env: expected --env {checkpoint.env_id} with options of the task that the policy "
-            f"was trained on, got options of {env_id}"
-        )
-    env = checkpoint.env_id, {**checkpoint.options, **options}
-    own = getattr(command, "listen", None) is None  # a simulator of our own flies it
-    if own and is_known(env[0]):
-        drones = chosen_drones(command, checkpoint)
-        _check_vehicle(command, checkpoint, env_spec(_config(command, env, drones)))
-    return env
-
-
-def _config(command: EnvFlags, env: tuple[str, Options], drones: int) -> EnvConfig:
-    """The config of an env with the vehicle of the flags."""
-    env_id, options = env
-    return EnvConfig.from_keywords(env_id, vehicle=command.vehicle, drones=drones, **options)
-
-
-def chosen_drones(command: EnvFlags, checkpoint: Checkpoint | Controller | None) -> int:
-    """Drones of each world: those of the flag, or with which the checkpoint was trained."""
-    if isinstance(checkpoint, Checkpoint) and "drones" not in command.given:
-        same = "env" not in command.given or command.env_id == checkpoint.env_id
-        return len(checkpoint.spec.agents) if same else command.drones
-    return command.drones
-
-
-def chosen_vehicle(command: EnvFlags, checkpoint: Checkpoint | Controller | None) -> str | None:
-    """The vehicle of the flags, or else the vehicle of the checkpoint's env.
-
-    With --listen the simulator has the vehicle: only the flag counts.
-    """
-    env = checkpoint.env if isinstance(checkpoint, Checkpoint) else None
-    comes = getattr(command, "listen", None) is not None
-    another = "env" in command.given and env is not None and command.env_id != env.env_id
-    if env is None or comes or another or "vehicle" in command.given:
-        return command.vehicle
-    return ",".join(env.vehicle_paths) or None
-
-
-def with_vehicle(command: F, *names: str) -> F:
-    """The command with the vehicle of its flag, or else of the first policy that has a vehicle."""
-    for name in names:
-        if name != "random" and Path(name).suffix != ".mcap":
-            vehicle = chosen_vehicle(command, load_checkpoint(name))
-            if vehicle is not None:
-                return replace(command, vehicle=vehicle)
-    return command
+        return replace(command, options={**checkpoint.options, **options})
+    if env_id != checkpoint.env_id:
+        if "env" in command.given:
+            return command
+        if options:
+            raise InputError(
+                f"env: expected --env {checkpoint.env_id} with options of the task that the "
+                f"policy was trained on, got options of {env_id}"
+            )
+    changes: dict[str, Any] = {"env": checkpoint.env_id}
+    changes["options"] = {**checkpoint.options, **options}
+    if "drones" not in command.given:
+        changes["drones"] = len(checkpoint.spec.agents)
+    listens = getattr(command, "listen", None) is not None
+    if checkpoint.env and not listens and "vehicle" not in command.given:
+        changes["vehicle"] = ",".join(checkpoint.env.vehicle_paths) or None
+    return replace(command, **changes)
 
 
 def policy_for(command: EnvFlags, checkpoint: Checkpoint | Controller, spec: EnvSpec) -> Policy:
@@ -122,34 +87,28 @@ def policy_for(command: EnvFlags, checkpoint: Checkpoint | Controller, spec: Env
     """
     if isinstance(checkpoint, type):
         return checkpoint(spec)
-    _check_vehicle(command, checkpoint, spec)
-    return checkpoint.policy(spec)
-
-
-def _check_vehicle(command: EnvFlags, checkpoint: Checkpoint, spec: EnvSpec) -> None:
-    """Raise `InputError` if the vehicle is not the policy's and the user has not named it."""
-    trained = checkpoint.spec
-    drags = [one.options.get("effects", {}).get("linear_drag") for one in (trained, spec)]
+    own = checkpoint.spec
+    drags = [one.options.get("effects", {}).get("linear_drag") for one in (own, spec)]
     same_drag = drags[0] == drags[1]
-    other = trained.vehicle_hash != spec.vehicle_hash and same_drag
+    other = own.vehicle_hash != spec.vehicle_hash and same_drag
     if other and "vehicle" not in command.given:
-        then, now = (f"{one.vehicle} (model {one.vehicle_hash[:8]})" for one in (trained, spec))
+        then, now = (f"{one.vehicle} (model {one.vehicle_hash[:8]})" for one in (own, spec))
         raise InputError(
             f"vehicle: expected {then}, on which the policy was trained, got {now}; "
             "name one with --vehicle"
         )
+    return checkpoint.policy(spec)
 
 
-def pilot_of(command: EnvFlags, what: str) -> tuple[Checkpoint | None, Policy | None, EnvConfig]:
-    """Checkpoint (None without one), policy (None for `random`) and env of what flies here."""
+def pilot_of(command: F, what: str) -> tuple[F, Policy | None, str]:
+    """The command with the env of a policy, the policy (None for `random`) and the agent's name."""
     if what == "random":
-        return None, None, _config(command, chosen_env(command), command.drones)
+        return command, None, what
     checkpoint = load_checkpoint(what)
-    command = replace(command, vehicle=chosen_vehicle(command, checkpoint))
-    env = chosen_env(command, checkpoint)
-    config = _config(command, env, chosen_drones(command, checkpoint))
-    policy = policy_for(command, checkpoint, env_spec(config))
-    return None if isinstance(checkpoint, type) else checkpoint, policy, config
+    command = fitted(command, checkpoint)
+    policy = policy_for(command, checkpoint, env_spec(command.env_config()))
+    agent = what if isinstance(checkpoint, type) else checkpoint.algorithm
+    return command, policy, agent
 
 
 def words_of(trajectory: Trajectory) -> str:
@@ -164,13 +123,10 @@ def words_of(trajectory: Trajectory) -> str:
 @contextmanager
 def remote_env(
     command: AgentFlags,
-    env_id: str,
-    options: Options,
     *,
     required: bool = True,
     num_envs: int | None = 1,
     num_simulators: int = 1,
-    drones: int = 1,
     backend: Backend = "mujoco",
 ) -> Iterator[RemoteVectorEnv]:
     """A remote env with a simulator of its own, on a backend, or those that come to
@@ -181,10 +137,12 @@ def remote_env(
     ones) if there are any; otherwise the first that comes decides. Raises `InputError` for flags
     that contradict each other.
     """
+    env_id = command.env_id
+    options = command.options
     if command.listen is not None:
-        theirs = "it of the simulator that comes: rotorgram sim --backend"
         for name in ("backend", *BACKEND_KEYWORDS):
             if name in {*command.given, *options}:
+                theirs = "it of the simulator that comes: rotorgram sim --backend"
                 raise InputError(f"{name}: expected {theirs}")
         settings = {"env_id": env_id, "options": options or None} if required else {}
         opened = _waiting(command, command.listen, num_envs, num_simulators, **settings)
@@ -201,10 +159,9 @@ def remote_env(
                 f"env: expected --env MODULE:{env_id}, "
                 "for the task is not known here without the module that registers it"
             )
-        config = EnvConfig.from_keywords(
-            env_id, drones=drones, vehicle=command.vehicle, backend=backend, **options
-        )
-        opened = spawn_simulator(config, num_envs=num_envs or drones, record=command.record)
+        config = command.env_config(backend=backend)
+        drones = num_envs or command.drones
+        opened = spawn_simulator(config, num_envs=drones, record=command.record)
     with opened as env:
         try:
             yield env
@@ -221,12 +178,18 @@ def _waiting(
         from ..models.fleet import load_vehicles  # an agent needs no MuJoCo otherwise
 
         settings["vehicle_hash"] = load_vehicles(command.vehicle, command.drones).hash
-    settings |= {
-        "connect": False, "connect_timeout": _CONNECT_TIMEOUT, "key_file": command.key_file,
-        "insecure": command.insecure, "record": command.record,
-        "num_simulators": num_simulators, "autoreset_mode": "Disabled",
-    }  # fmt: skip
-    remote = RemoteVectorEnv(parse_address(listen), num_envs=num_envs, **settings)
+    remote = RemoteVectorEnv(
+        parse_address(listen),
+        num_envs=num_envs,
+        num_simulators=num_simulators,
+        connect=False,
+        connect_timeout=_CONNECT_TIMEOUT,
+        key_file=command.key_file,
+        insecure=command.insecure,
+        record=command.record,
+        autoreset_mode="Disabled",
+        **settings,
+    )
     with closing(remote):
         waited = "a simulator" if num_simulators == 1 else f"{num_simulators} simulators"
         share = (num_envs or 0) // num_simulators

@@ -2,11 +2,9 @@
 
 import json
 import re
-import shlex
 from argparse import ArgumentParser
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, fields, make_dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from types import UnionType
 from typing import (
@@ -18,26 +16,42 @@ from typing import (
     Union,
     cast,
     get_args,
-    get_origin,
     get_type_hints,
 )
 
 import tyro
 from tyro.conf import Fixed, Suppress, arg
+from tyro.constructors import PrimitiveConstructorSpec
 
-from ..flights.folders import LOCK, new_folder
 from ..models import Backend
 from ..models.errors import InputError, shortened
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
+    from ..envs.config import EnvConfig
+
+    Words = tuple[str, ...]
+    NamedValues = tuple[Words, ...]
+else:  # tyro imports typeguard, slowly, for a tuple of a stated type
+    Words = tuple
+    NamedValues = Annotated[
+        tuple,
+        PrimitiveConstructorSpec(
+            nargs="*",
+            metavar="NAME=VALUE …",
+            instance_from_str=tuple,
+            is_instance=lambda _: True,
+            str_from_instance=list,
+            _action="append",
+        ),
+    ]
+
 DEFAULT_ENV: Final = "rotorgram/Elevation-v0"
 _PLAIN_FLAGS: Final = ("action", "control_period", "episode_length", "history", "scene", "cameras")
 _WORLD_FLAGS: Final = ("effects", "randomize", "sensors")
 Options = dict[str, Any]
 """Options of a task and its env by name, values as of JSON."""
-_NO_FLAG: object = Suppress[Fixed[dict]]  # type: ignore[type-arg]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,15 +97,15 @@ class EnvFlags(Command):
     """Ground and obstacles: plain, airport, forest, warehouse or gates; the last three from a
     seed, as forest:3, or from one of several for each episode, as forest:0-7. Films and views
     show one scene; their default is the airport."""
-    cameras: tuple[str, ...] = ()
+    cameras: Words = ()
     """Pictures that are observed: cameras of the vehicle, each NAME, NAME_KIND or
     NAME@WIDTHxHEIGHT."""
-    effects: tuple[str, ...] = ()
+    effects: Words = ()
     """Effects on the vehicle, each NAME or NAME=VALUE: motor_lag wind=3,0,0. `none` switches off
     those of a checkpoint. docs/effects.md lists them."""
-    randomize: tuple[str, ...] = ()
+    randomize: Words = ()
     """Parameters that are drawn for each episode, each NAME=DISTRIBUTION: mass=uniform(0.8,1.2)."""
-    sensors: tuple[str, ...] = ()
+    sensors: Words = ()
     """Sensors whose readings are observed, each NAME or NAME=SETTINGS: imu gps={"rate":10}, and
     observe=estimate. docs/sensors.md lists them."""
     drones: int = 1
@@ -104,6 +118,13 @@ class EnvFlags(Command):
     def env_id(self) -> str:
         """The task without its module."""
         return self.env.rpartition(":")[2]
+
+    def env_config(self, **settings: Any) -> "EnvConfig":
+        """The env of the flags."""
+        from ..envs.config import EnvConfig
+
+        env = {"vehicle": self.vehicle, "drones": self.drones, **self.options}
+        return EnvConfig.from_keywords(self.env_id, **env, **settings)
 
     @property
     def shown_scene(self) -> str:
@@ -124,17 +145,23 @@ BackendOfPreset = Annotated[Backend, arg(help_behavior_hint="(default: the prese
 
 
 @dataclass(frozen=True, kw_only=True)
-class AgentFlags(EnvFlags):
-    """A command that flies over the wire: the UDP server."""
+class WireFlags(EnvFlags):
+    """One side of the wire."""
 
-    listen: Annotated[str | None, arg(metavar="HOST:PORT")] = None
-    """Wait here for a simulator instead of starting one."""
     key_file: Path | None = None
-    """Key that the simulator has too (rotorgram key): needed beyond this machine."""
+    """Key that the other side has too (rotorgram key): needed beyond this machine."""
     insecure: bool = False
     """Allow an address beyond this machine without a key: anyone who reaches it may take part."""
     record: Path | None = None
     """MCAP file to write every message to."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AgentFlags(WireFlags):
+    """A command that flies over the wire: the UDP server."""
+
+    listen: Annotated[str | None, arg(metavar="HOST:PORT")] = None
+    """Wait here for a simulator instead of starting one."""
 
 
 C = TypeVar("C", bound=Command)
@@ -146,121 +173,116 @@ def parse(kind: type[C], prog: str, words: Sequence[str]) -> C:
     Raises `InputError` if the task or one of its options is not what it should be.
     """
     given = _given(words)
-    plain = _for_tyro(kind)
     if not issubclass(kind, EnvFlags):
-        return cast(C, replace(tyro.cli(plain, prog=prog, args=words), given=given))
-    from ..envs import registry
-    from ..envs.config import KEYWORDS, EnvConfig
-    from ..envs.spec import canonical_id
+        return cast(C, replace(tyro.cli(_for_tyro(kind), prog=prog, args=words), given=given))
+    return cast(C, _with_env(kind, prog, words, given))
 
-    parser = ArgumentParser(prog, add_help=False, allow_abbrev=False)
-    parser.add_argument("--env")
-    parser.add_argument("--config")
-    early = parser.parse_known_args(words)[0]
-    file = _file_values(kind, early.config) if early.config else {}
-    env_id = early.env or file.get("env") or DEFAULT_ENV
-    of_file = canonical_id(file.get("env", env_id))
-    own_options = [name for name in file.get("options", {}) if name not in KEYWORDS]
-    if own_options and canonical_id(env_id) != of_file:
-        got = ", ".join(own_options)
-        raise InputError(f"config: expected no options of {of_file} with --env {env_id}, got {got}")
+
+def _with_env(
+    kind: type["EnvFlags"], prog: str, words: Sequence[str], given: frozenset[str]
+) -> "EnvFlags":
+    from ..envs import registry
+    from ..envs.config import KEYWORDS
+
+    early = ArgumentParser(prog, add_help=False, allow_abbrev=False)
+    early.add_argument("--env")
+    early.add_argument("--config")
+    found = early.parse_known_args(words)[0]
+    file = _file_values(kind, found.config, found.env) if found.config else {}
+    env_id = found.env or file.get("env", DEFAULT_ENV)
     listens = "listen" in given or getattr(kind, "listen", None) is not None
     if listens and ":" not in env_id and not registry.is_known(env_id):
-        words, required = _without_requirements(words)
-        command = tyro.cli(plain, prog=prog, args=words)
-        options = required | _world_options(command, given)
-        return cast(C, _with_file(command, given, options, file))
+        own, words = _own_options(prog, words)
+        command = tyro.cli(_for_tyro(kind), prog=prog, args=words)
+        check_count("drones", command.drones)
+        return _with_options(command, given, own, file)
     env_id = registry.load(env_id)
-    options_type = registry.task_type(env_id).Options
-    raw = _for_tyro(options_type, __doc__=f"Options of {env_id}.")
-    typed = make_dataclass(
-        kind.__name__,
-        [("options", Annotated[raw, arg(name="env")], field(default_factory=raw))],
-        bases=(plain,),
-        namespace={"__doc__": kind.__doc__},
-        frozen=True,
-        kw_only=True,
-    )
-    command = tyro.cli(typed, prog=prog, args=words)
-    names = sorted(name.removeprefix("env.") for name in given if name.startswith("env."))
-    own = {name: getattr(command.options, name) for name in names}
+    options = _for_tyro(registry.task_type(env_id).Options, f"Options of {env_id}.")
+    command = tyro.cli(_for_tyro(kind, options=options), prog=prog, args=words)
+    names = [name.removeprefix("env.") for name in given if name.startswith("env.")]
+    own = {name: getattr(command.options, name) for name in sorted(names)}
     clashing = {name: own.pop(name) for name in names if name in KEYWORDS}
-    options = own | _world_options(command, given) | ({"task": clashing} if clashing else {})
-    command = _with_file(command, given, options, file)
-    checked = EnvConfig.from_keywords(env_id, **command.options).flat_options()
+    if clashing:
+        own["task"] = clashing
+    command = _with_options(command, given, own, file)
+    checked = command.env_config().flat_options()
     chosen = {name: checked.get(name, value) for name, value in command.options.items()}
-    return cast(C, replace(command, options=chosen))
+    return replace(command, options=chosen)
 
 
-def _file_values(kind: type[EnvFlags], path: str) -> Options:
+def _file_values(kind: type[EnvFlags], path: str, env: str | None) -> Options:
     """Values of a config's file by the names of fields. Raises `InputError`."""
-    from ..envs.config import BackendConfig, read_toml
+    from ..envs.config import KEYWORDS, BackendConfig, read_toml
+    from ..envs.spec import canonical_id
 
-    options = read_toml(Path(path))
+    options = read_toml(path)
     values: Options = {}
-    for name in ("env", "env_id"):
+    for name, key in (("env", "env"), ("env_id", "env"), ("drones", "drones")):
         if name in options:
-            values["env"] = options.pop(name)
+            values[key] = options.pop(name)
     if "vehicle" in options:
         values["vehicle"] = ",".join(options.pop("vehicle"))
-    if "drones" in options:
-        values["drones"] = options.pop("drones")
     backend = BackendConfig.parse(options.pop("backend", "mujoco"))
     if issubclass(kind, BackendFlags):
         values["backend"] = backend.name
     elif backend.name != "mujoco":
         raise InputError(f"backend: expected mujoco with this command, got {backend.name}")
+    env_id = values.get("env", DEFAULT_ENV)
+    own = [name for name in options if name not in KEYWORDS]
+    if own and env and canonical_id(env) != canonical_id(env_id):
+        got = ", ".join(own)
+        raise InputError(f"config: expected no options of {env_id} with --env {env}, got {got}")
     return {**values, "options": {**backend.settings, **options}}
 
 
-def _with_file(
-    command: EnvFlags, given: frozenset[str], options: Options, file: Options
+def _with_options(
+    command: EnvFlags, given: frozenset[str], own: Options, file: Options
 ) -> EnvFlags:
-    """The command with what the file says and no flag does."""
+    """The command with options of the task, of other flags, and what only the file says."""
     added = {name: value for name, value in file.items() if name not in {*given, "options"}}
-    options = {**file.get("options", {}), **options}
+    options = {**file.get("options", {}), **own}
+    for name in given.intersection(_PLAIN_FLAGS):
+        options[name] = getattr(command, name)
+    for name in given.intersection(_WORLD_FLAGS):
+        options[name] = _named_values(name, getattr(command, name))
     return replace(command, given=given | added.keys(), options=options, **added)
 
 
-def _world_options(command: EnvFlags, given: frozenset[str]) -> Options:
-    """Options by name of the flags whose words are NAME or NAME=VALUE. Raises `InputError`."""
-    options: Options = {}
-    for name in given.intersection(_PLAIN_FLAGS):
-        options[name] = getattr(command, name)
-    for flag in given.intersection(_WORLD_FLAGS):
-        words = getattr(command, flag)
-        values: Options = {}
-        for word in () if words == ("none",) else words:
-            name, equals, text = word.partition("=")
-            several = re.fullmatch(r"[-+.\deE]+(,[-+.\deE]+)+", text)
-            value = parse_value(f"[{text}]" if several else text)
-            key = name.replace("-", "_")
-            if key in values:
-                raise InputError(f"{flag}: expected each name once, got {key!r} twice")
-            values[key] = value if equals else True
-        options[flag] = values
-    return options
+def _named_values(flag: str, words: Words) -> Options:
+    """Values of words NAME or NAME=VALUE by name. Raises `InputError`."""
+    values: Options = {}
+    if words == ("none",):
+        return values
+    for word in words:
+        name, equals, text = word.partition("=")
+        several = re.fullmatch(r"[-+.\deE]+(,[-+.\deE]+)+", text)
+        key = name.replace("-", "_")
+        if key in values:
+            raise InputError(f"{flag}: expected each name once, got {key!r} twice")
+        values[key] = True
+        if equals:
+            values[key] = parse_value(f"[{text}]" if several else text)
+    return values
 
 
-def _for_tyro(kind: type["DataclassInstance"], **namespace: object) -> Any:
+def _for_tyro(kind: type["DataclassInstance"], doc: str | None = None, options: Any = None) -> Any:
     """A dataclass without checks: wrong values are refused later, as every other wrong input.
 
-    It has `Union[X, Y]` for `X | Y`: before Python 3.14 tyro imports typeguard for that, slowly.
+    `options` is the type of the field of that name. The class has `Union[X, Y]` for `X | Y`: before
+    Python 3.14 tyro imports typeguard for that, slowly.
     """
-    hints = get_type_hints(kind, include_extras=True)
-    changed = {}
-    for one in fields(kind):
-        hint = hints[one.name]
-        extras = getattr(hint, "__metadata__", ())  # of Annotated
-        hint = hint.__origin__ if extras else hint
-        if get_origin(hint) is Mapping:  # of words, which flags of their own give
-            changed[one.name] = _NO_FLAG
-            namespace[one.name] = field(default_factory=dict)
-        if isinstance(hint, UnionType):
-            union: object = Union[get_args(hint)]  # noqa: UP007
-            changed[one.name] = Annotated[union, *extras] if extras else union
-    own = {"__annotations__": changed, "__doc__": kind.__doc__, "__post_init__": lambda self: None}
-    return dataclass(frozen=True, kw_only=True)(type(kind.__name__, (kind,), own | namespace))
+    changed: dict[str, object] = {}
+    for name, hint in get_type_hints(kind, include_extras=True).items():
+        extras = getattr(hint, "__metadata__", (None,))  # of Annotated
+        plain = getattr(hint, "__origin__", hint) if hasattr(hint, "__metadata__") else hint
+        if isinstance(plain, UnionType):
+            changed[name] = Annotated[Union[get_args(plain)], *extras]  # noqa: UP007
+    namespace: Options = {"__annotations__": changed, "__doc__": doc or kind.__doc__}
+    namespace["__post_init__"] = lambda self: None
+    if options:
+        changed["options"] = Annotated[options, arg(name="env")]
+        namespace["options"] = field(default_factory=options)
+    return dataclass(frozen=True, kw_only=True)(type(kind.__name__, (kind,), namespace))
 
 
 def parse_value(text: str) -> Any:
@@ -269,16 +291,6 @@ def parse_value(text: str) -> Any:
         return json.loads({"True": "true", "False": "false", "None": "null"}.get(text, text))
     except (ValueError, RecursionError):
         return text
-
-
-def named_value(flag: str, word: str) -> tuple[str, Any]:
-    """NAME=VALUE, a value in JSON or a text. Raises `InputError`."""
-    name, equals, value = word.partition("=")
-    if not equals:
-        raise InputError(f"{flag}: expected NAME=VALUE, got {word!r}")
-    if name == "hidden" and "," in value and not value.startswith("["):
-        raise InputError(f"{flag}: expected a list as hidden=[{value}], got {word!r}")
-    return name, parse_value(value)
 
 
 def _given(words: Sequence[str]) -> frozenset[str]:
@@ -292,24 +304,14 @@ def _given(words: Sequence[str]) -> frozenset[str]:
     return frozenset(names)
 
 
-def _without_requirements(words: Sequence[str]) -> tuple[list[str], Options]:
-    """The words without `--env.NAME VALUE`, and these: JSON values of a task not known here."""
-    kept: list[str] = []
-    required: Options = {}
-    rest = iter(words)
-    for word in rest:
-        name, equals, value = word.partition("=")
-        if not name.startswith("--env."):
-            kept.append(word)
-            continue
-        text = value if equals else next(rest, None)
-        if text is None:
-            raise InputError(f"{name}: expected a value, got none")
-        required[name.removeprefix("--env.").replace("-", "_")] = parse_value(text)
-    return kept, required
-
-
-# ---- checks: addresses, counts, folders, and the settings that a resumed run keeps
+def _own_options(prog: str, words: Sequence[str]) -> tuple[Options, list[str]]:
+    """JSON values of `--env.NAME VALUE` for a task that is not known here, and the other words."""
+    parser = ArgumentParser(prog, add_help=False, allow_abbrev=False)
+    for flag in {word.partition("=")[0] for word in words if word.startswith("--env.")}:
+        name = flag.removeprefix("--env.").replace("-", "_")
+        parser.add_argument(flag, dest=name, type=parse_value)
+    own, others = parser.parse_known_args(words)
+    return vars(own), others
 
 
 def parse_address(text: str) -> tuple[str, int]:
@@ -327,36 +329,3 @@ def check_count(name: str, value: int | None) -> None:
     """Raises `InputError` for a number that is given and less than 1."""
     if value is not None and value < 1:
         raise InputError(f"{name}: expected at least 1, got {value}")
-
-
-@contextmanager
-def folder_to_write(out: Path | None, name: str) -> Iterator[Path]:
-    """A new folder, by default named by the time; removed if the block fails before it writes."""
-    folder = new_folder(out, name)
-    try:
-        yield folder
-    except BaseException:
-        with suppress(OSError):  # it holds something
-            if {file.name for file in folder.iterdir()} == {LOCK}:
-                (folder / LOCK).unlink()
-            folder.rmdir()
-        raise
-
-
-def refuse_settings(command: Command, folder: Path, *, free: tuple[str, ...]) -> None:
-    """Raises `InputError` if a setting but the free ones was given: a resumed run keeps its own."""
-    flags = ["--" + name.replace("_", "-") for name in sorted(command.given.difference(free))]
-    if flags:
-        raise InputError(
-            f"resume: expected the settings of {folder}, got others by {', '.join(flags)}"
-        )
-
-
-def go_on_with(command: Command, words: str, folder: Path, *flags: str) -> str:
-    """The line that tells how to resume: of the flags those that were given."""
-    line: list[object] = ["rotorgram", *words.split(), "--resume", folder]
-    for flag in flags:
-        if flag in command.given:
-            value = getattr(command, flag)
-            line += [f"--{flag.replace('_', '-')}", *([] if value is True else [value])]
-    return f"go on with: {shlex.join(map(str, line))}"

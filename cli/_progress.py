@@ -12,8 +12,6 @@ from typing import Final
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, Task, TextColumn
-from rich.table import Column
-from rich.text import Text
 
 from ..flights.executors import OnProgress
 
@@ -43,11 +41,10 @@ class Bars:
     """Shows each run by a bar, with its figures and words. The clock tells seconds."""
 
     def __init__(self, console: Console, clock: Callable[[], float] = time.monotonic) -> None:
-        self.progress = Progress(
-            TextColumn("{task.description}"), BarColumn(bar_width=None), _Figures(_count),
-            _Figures(_rate), _Figures(_times), TextColumn("{task.fields[words]}"),
-            console=console, get_time=clock,
-        )  # fmt: skip
+        columns = ("{task.description}", "{task.fields[figures]}")
+        name, figures = (TextColumn(text, markup=False) for text in columns)
+        bar = BarColumn(bar_width=None)
+        self.progress = Progress(name, bar, figures, console=console, get_time=clock)
         self._tasks: dict[str, Task] = {}
 
     def __call__(self, name: str, done: int, total: int, words: str) -> None:
@@ -60,10 +57,11 @@ class Bars:
     def _update(self, name: str, done: int, total: int, words: str) -> Task:
         """The task of a run, with these amounts."""
         if name not in self._tasks:
-            number = self.progress.add_task(name, total=total, words=words)
+            number = self.progress.add_task(name, figures="")
             self._tasks[name] = next(t for t in self.progress.tasks if t.id == number)
         task = self._tasks[name]
-        self.progress.update(task.id, completed=done, total=total, words=words)
+        self.progress.update(task.id, completed=done, total=total)
+        self.progress.update(task.id, figures=_figures(task, words))
         return task
 
 
@@ -80,36 +78,21 @@ class Lines(Bars):
         now = self.progress.get_time()
         if words == "done" or now - self._last.get(name, now - _LINE_EVERY) >= _LINE_EVERY:
             self._last[name] = now
-            figures = (_count(task), _rate(task), _times(task), words)
             with suppress(OSError):  # no line is worth a run
-                print(f"{name:14} {'  '.join(filter(None, figures))}", flush=True)
+                print(f"{name:14} {task.fields['figures']}", flush=True)
 
 
-class _Figures(TextColumn):
-    """A column with the text that a function gives for a task."""
-
-    def __init__(self, figures: Callable[[Task], str]) -> None:
-        super().__init__("", table_column=Column(no_wrap=True, justify="right"))
-        self._figures = figures
-
-    def render(self, task: Task) -> Text:
-        return Text(self._figures(task))
-
-
-def _count(task: Task) -> str:
-    return f"{_short(task.completed)}/{_short(task.total or 0)}"
-
-
-def _rate(task: Task) -> str:
-    return f"{_short(task.speed)}/s" if task.speed else ""
-
-
-def _times(task: Task) -> str:
+def _figures(task: Task, words: str) -> str:
+    """Amounts, rate, times and words of a run."""
+    texts = [f"{_short(task.completed)}/{_short(task.total or 0)}"]
     elapsed = task.finished_time if task.finished else task.elapsed
-    remaining = task.remaining
-    speed = task.speed
-    left = f", {_duration(math.ceil(remaining / speed))} left" if speed and remaining else ""
-    return f"{_duration(elapsed or 0.0)}{left}"
+    times = _duration(elapsed or 0.0)
+    if task.speed:
+        texts.append(f"{_short(task.speed)}/s")
+        if task.remaining:
+            times += f", {_duration(math.ceil(task.remaining / task.speed))} left"
+    texts += [times, words]
+    return " ".join(filter(None, texts))
 
 
 def _short(number: float) -> str:

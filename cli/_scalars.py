@@ -30,7 +30,8 @@ class ScalarWriter:
         folder.mkdir(parents=True, exist_ok=True)
         # Not TensorFlow's or torch's writer: they name a file by the clock, and TensorBoard reads
         # files in the order of their names. After the clock went back it would skip the new one.
-        name = f"{_PREFIX}{_next_number(folder):010}.rotorgram"
+        number = len(list(folder.glob(f"{_PREFIX}*")))
+        name = f"{_PREFIX}{number:010}.rotorgram"
         self._file = open(folder / name, "xb")  # noqa: SIM115  until `close`
         self._records = RecordWriter(self._file)
         self._add(Event(file_version="brain.Event:2"), 0)
@@ -63,10 +64,3 @@ class ScalarWriter:
         event.step = step
         event.wall_time = time.time()
         self._records.write(event.SerializeToString())
-
-
-def _next_number(folder: Path) -> int:
-    """The time, s; after a clock that went back, one more than in the last name."""
-    numbers = [path.name.split(".")[3] for path in folder.glob(f"{_PREFIX}*")]
-    following = [int(number) + 1 for number in numbers if number.isdecimal()]
-    return max(int(time.time()), *following, 0)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from tyro.conf import Positional, arg
 
-from ._flags import BackendOfPreset
+from ._flags import BackendOfPreset, Words
 from ._study import StudyFlags
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ class Benchmark(StudyFlags):
     Ctrl-C keeps the runs that are done; --resume flies the others.
     """
 
-    kinds: ClassVar[tuple[str, ...]] = ("benchmark",)
+    kinds: ClassVar[Words] = ("benchmark",)
 
     rows: Positional[Annotated[Path | None, arg(metavar="FILE")]] = None
     """TOML file of rows. Default: those of docs/baselines.md."""
@@ -35,4 +35,5 @@ class Benchmark(StudyFlags):
             self.rows or BOARD, {"seeds": 10, "first_seed": 5000, "snapshots": 20}
         )
         settings = {"kind": "benchmark", **self.given_of_study()}
-        return replace(study, rows=self.changed(study.rows), **settings)
+        rows = tuple(map(self.changed, study.rows))
+        return replace(study, rows=rows, **settings)

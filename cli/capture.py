@@ -2,15 +2,15 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from tyro.conf import Positional
 
+from ..flights.executors import WorkersConfig
 from ._flags import Command
 
 
 @dataclass(frozen=True, kw_only=True)
-class Capture(Command):
+class Capture(Command, WorkersConfig):
     """Take the pictures of a plan, with depth, objects, boxes and poses, and write a data set.
 
     Interrupted by Ctrl-C, or by a disk that is full, it keeps what it has: the same line again goes
@@ -21,17 +21,10 @@ class Capture(Command):
     """TOML file: cameras, scene, where to take pictures from. docs/capture.md has its fields."""
     out: Path
     """Folder to write to: a new one, or one of the same plan to go on with."""
-    jobs: int | None = None
-    """Workers. Default: one for each core of this machine, or of the cluster."""
-    runner: Literal["processes", "ray"] = "processes"
-    """processes: of this machine. ray: a Ray cluster (pip install 'rotorgram[ray]')."""
-    address: str | None = None
-    """The cluster's: ray://HOST:PORT of its client server, or HOST:PORT on one of its machines."""
 
     def run(self) -> int:
         """Take them; say where and how many."""
         from ..flights.capture import capture
-        from ..flights.executors import WorkersConfig
         from ..flights.viewpoints import Plan
         from ..models.errors import InputError
         from ..rendering.gl import offscreen_context

@@ -3,13 +3,13 @@
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
+from typing import TYPE_CHECKING, Annotated, ClassVar, Final
 
 from tyro.conf import Positional, arg
 
 from ..agents import AlgorithmName
 from ..models.errors import InputError
-from ._flags import DEFAULT_ENV
+from ._flags import DEFAULT_ENV, Words
 from ._study import StudyFlags
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ class Compare(StudyFlags):
     Without files it is the paper's comparison: each agent flies over its own pair of sockets.
     """
 
-    kinds: ClassVar[tuple[str, ...]] = ("paper", "compare")
+    kinds: ClassVar[Words] = ("paper", "compare")
 
     files: Positional[Annotated[tuple[Path, ...], arg(metavar="FILE")]] = ()
     """TOML files: of one row (agent, env, set, …), named by its file, or of [[row]] tables. They
@@ -46,27 +46,23 @@ class Compare(StudyFlags):
         from ..training.settings import Study
 
         studies = [Study.from_toml(path) for path in self.files]
-        rows = self.changed([row for study in studies for row in study.rows])
+        rows = [self.changed(row) for study in studies for row in study.rows]
         settings = self.given_of_study()
         for name in _OF_FILES:
             values = {getattr(study, name): None for study in studies}
             if len(values) > 1 and name not in settings:
                 got = " and ".join(map(str, values))
                 raise InputError(f"{name}: expected the same in all files, got {got}")
-        return replace(studies[0], rows=rows, kind="compare", **settings)
+        return replace(studies[0], rows=tuple(rows), kind="compare", **settings)
 
     def _of_agents(self) -> "Study":
-        from ..training.settings import Kind, Row, Study
+        from ..training.settings import Kind, Study
 
         env = self.env_config()
-        settings: dict[str, Any] = {"env_steps": 200_000, "num_envs": env.drones}
-        settings |= {"backend": "mujoco"} | self.given_of_rows()
+        changes = self.changes()
         if not self.agents:
             raise InputError("agents: expected at least one, got none")
-        rows = [
-            Row(agent=agent, name=agent, env=env, set=self.changes(), **settings)
-            for agent in self.agents
-        ]
+        rows = [self.new_row(agent, agent, changes, env) for agent in self.agents]
         rows += [row for name in _CONTROLLERS for row in _controller(name, rows[0])]
         paper = env.env_id == DEFAULT_ENV
         kind: Kind = "paper" if paper else "compare"

@@ -1,6 +1,6 @@
 """`rotorgram evaluate`: fly episodes without exploration, print the means."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated
 
 from tyro.conf import Positional, arg
@@ -23,23 +23,12 @@ class Evaluate(AgentFlags, BackendFlags):
 
         from ..flights.trajectories import fly_episodes
         from ..training.metrics import Headline, measure_episode
-        from ._env import (
-            chosen_drones,
-            chosen_env,
-            chosen_vehicle,
-            load_checkpoint,
-            policy_for,
-            remote_env,
-        )
+        from ._env import fitted, load_checkpoint, policy_for, remote_env
 
         check_count("episodes", self.episodes)
         checkpoint = load_checkpoint(self.policy)
-        command = replace(self, vehicle=chosen_vehicle(self, checkpoint))
-        drones = chosen_drones(command, checkpoint)
-        env_id, options = chosen_env(command, checkpoint)
-        with remote_env(
-            command, env_id, options, num_envs=drones, drones=drones, backend=self.backend
-        ) as env:
+        command = fitted(self, checkpoint)
+        with remote_env(command, num_envs=command.drones, backend=self.backend) as env:
             headline = Headline.of(env.env_spec)
             policy = policy_for(command, checkpoint, env.env_spec)
             trajectories = fly_episodes(env, policy, self.episodes, "final")

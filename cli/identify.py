@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from ._flags import Command
+from ._flags import Command, Words
 
 if TYPE_CHECKING:
     from ..flights.identify import Identified
@@ -26,9 +26,9 @@ class Identify(Command):
     """File of the vehicle, TOML or MJCF, with a thrust coefficient, or a name of the library."""
     out: Annotated[Path, arg(metavar="NEW.toml")]
     """File to write: the vehicle with what was identified, and intervals."""
-    columns: tuple[str, ...] = ()
+    columns: Words = ()
     """Names in the logs, as OURS=THEIRS or OURS=THEIRS*FACTOR: m1_rads=rpm1*0.10472."""
-    fit: tuple[str, ...] = ()
+    fit: Words = ()
     """What to identify. Default: the five of above; besides them there are rotors.drag,
     rotors.inflow, rotors.lift, drag.angular.x, y, z and drag.moment.x, y."""
     window: float = 0.5

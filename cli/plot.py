@@ -5,7 +5,7 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
-from ._flags import Command
+from ._flags import Command, Words
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,7 +28,7 @@ class Plot(Command):
     """The first episode, from 0."""
     episodes: int = 1
     """Number of episodes of each journal."""
-    names: tuple[str, ...] = ()
+    names: Words = ()
     """Names in the legend, one for each flight. Default: the journals' names."""
 
     def run(self) -> int:

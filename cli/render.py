@@ -4,7 +4,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Literal
 
 from tyro.conf import Positional
 
@@ -12,12 +12,10 @@ from ..flights.palette import agent_label
 from ..flights.recorded import recorded_trajectories
 from ..flights.trajectories import flown_trajectories
 from ..models.errors import InputError
-from ._flags import EnvFlags, check_count
+from ._flags import EnvFlags, Words, check_count
 
 if TYPE_CHECKING:
     from ..flights.filming import FilmTrack
-
-_ALIKE: Final = ("pid", "geometric", "orca", "random")  # words that are no names of files
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,7 +25,7 @@ class Render(EnvFlags):
     Needs no display. Exit status 2 where there is no OpenGL.
     """
 
-    what: Positional[tuple[str, ...]]
+    what: Positional[Words]
     """Checkpoint, folder of a training, pid, geometric, orca, random, or a journal (.mcap).
     Policies fly evaluation episodes without exploration."""
     out: Path
@@ -51,7 +49,7 @@ class Render(EnvFlags):
     """Whether time and numbers are on the picture. Of several flights the names always are."""
     fast: bool = False
     """Without shadows and smooth edges: several times as fast where software draws."""
-    names: tuple[str, ...] = ()
+    names: Words = ()
     """Titles, one for each flight. Default: the policies."""
     session: int | None = None
     """With a journal: which session, from 1, as rotorgram replay counts. Default: the first that
@@ -64,7 +62,6 @@ class Render(EnvFlags):
         from ..flights.filming import Film, film
         from ..rendering.film import check_film
         from ..rendering.gl import offscreen_context
-        from ._env import with_vehicle
         from ._progress import frame_bar
 
         width, height = parse_size(self.size)
@@ -74,9 +71,10 @@ class Render(EnvFlags):
         self._check()
         offscreen_context(16, 16).free()  # flying takes longer than finding no OpenGL
         found = [self._find(what) for what in self.what]
-        config = replace(config, vehicle=with_vehicle(self, *self.what).vehicle)
-        names = self.names or _distinct([track.name for track in found], self.what)
-        tracks = [replace(track, name=name) for track, name in zip(found, names, strict=True)]
+        vehicles = [vehicle for _, vehicle in found if vehicle]
+        config = replace(config, vehicle=next(iter(vehicles), None))
+        names = self.names or _distinct([track.name for track, _ in found])
+        tracks = [replace(track, name=name) for (track, _), name in zip(found, names, strict=True)]
         longest = max(track.trajectories[0].seconds for track in tracks)
         if self.at is not None and self.at > longest:
             raise InputError(f"at: expected 0 to {longest:g} s, the flight's end, got {self.at:g}")
@@ -107,8 +105,8 @@ class Render(EnvFlags):
         if self.options.keys() - {"scene"} and all(journals):
             raise InputError("env: expected no options with a journal, which has its own")
 
-    def _find(self, what: str) -> "FilmTrack":
-        """Flights of a policy or a journal."""
+    def _find(self, what: str) -> "tuple[FilmTrack, str | None]":
+        """Flights of a policy or a journal, and the vehicle."""
         from ..flights.filming import FilmTrack
         from ._env import pilot_of
 
@@ -116,12 +114,12 @@ class Render(EnvFlags):
         path = Path(what)
         if path.suffix == ".mcap":
             recorded = recorded_trajectories(path, episodes, session=self.session, drone=self.drone)
-            return FilmTrack(name=path.stem, trajectories=recorded)
-        checkpoint, policy, config = pilot_of(self, what)
-        agent = checkpoint.algorithm if checkpoint else what
+            return FilmTrack(name=path.stem, trajectories=recorded), self.vehicle
+        command, policy, agent = pilot_of(self, what)
+        flown = flown_trajectories(policy, command.env_config(), episodes, "final")
         name = what if what == "random" else agent_label(agent)
-        flown = flown_trajectories(policy, config, episodes, "final")
-        return FilmTrack(name=name, trajectories=flown, drones=config.drones)
+        track = FilmTrack(name=name, trajectories=flown, drones=command.drones)
+        return track, command.vehicle
 
 
 def parse_size(text: str) -> tuple[int, int]:
@@ -133,14 +131,10 @@ def parse_size(text: str) -> tuple[int, int]:
     return width, height
 
 
-def _distinct(names: Sequence[str], what: Sequence[str]) -> list[str]:
-    """The names; equal names get the words that the user typed, then a number."""
-    longer = []
-    for name, words in zip(names, what, strict=True):
-        is_repeated = names.count(name) > 1 and words not in _ALIKE
-        longer.append(f"{name}, {Path(words).stem}" if is_repeated else name)
+def _distinct(names: Sequence[str]) -> list[str]:
+    """The names; equal names get a number."""
     distinct = []
-    for place, name in enumerate(longer):
-        number = longer[: place + 1].count(name)
-        distinct.append(name if longer.count(name) == 1 else f"{name} {number}")
+    for place, name in enumerate(names):
+        number = names[: place + 1].count(name)
+        distinct.append(name if names.count(name) == 1 else f"{name} {number}")
     return distinct

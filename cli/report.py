@@ -10,18 +10,16 @@ from ._flags import Command
 
 @dataclass(frozen=True, kw_only=True)
 class Report(Command):
-    """Draw figures, tables and page of a study again from its files."""
+    """Write figures and tables of a study again from its files."""
 
     folder: Positional[Path]
     """Folder that `rotorgram compare`, `sweep` or `benchmark` wrote."""
     page: Path | None = None
     """Markdown page to write besides the report."""
-    film: bool = True
-    """Whether the agents are filmed, if there is no film yet, where there is OpenGL."""
 
     def run(self) -> int:
         """Write figures and report from the files, and print the tables."""
         from ._study import report
 
-        report(self.folder, page=self.page, film=self.film)
+        report(self.folder, self.page)
         return 0

@@ -27,12 +27,12 @@ class Serve(AgentFlags):
         """Fly episode after episode."""
         from ..flights.trajectories import fly_episodes
         from ..udp import LinkError
-        from ._env import chosen_env, load_checkpoint, policy_for, remote_env, words_of
+        from ._env import fitted, load_checkpoint, policy_for, remote_env, words_of
 
         check_count("episodes", self.episodes)
         checkpoint = load_checkpoint(self.policy)
         episode = 0
-        with remote_env(self, *chosen_env(self, checkpoint), num_envs=None) as env:
+        with remote_env(fitted(self, checkpoint), num_envs=None) as env:
             policy = policy_for(self, checkpoint, env.env_spec)
             names = env.env_spec.agents
             worlds = env.num_envs // len(names)

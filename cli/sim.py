@@ -2,11 +2,10 @@
 
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
 from ..models.errors import InputError
-from ._flags import BackendFlags, parse_address
+from ._flags import BackendFlags, WireFlags, Words, parse_address
 
 if TYPE_CHECKING:
     from ..udp import Simulator
@@ -18,7 +17,7 @@ _OF_AGENTS: Final = ("when_lost", "patience")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sim(BackendFlags):
+class Sim(BackendFlags, WireFlags):
     """Simulate drones for an agent: the UDP client.
 
     Waits for the agent, flies by its commands and ends when it closes. An agent that is killed and
@@ -31,7 +30,7 @@ class Sim(BackendFlags):
     """Address of this side, HOST:PORT; port 0 takes a free one."""
     num_envs: int | None = None
     """Drones in all. Default: those of one world."""
-    agents: tuple[str, ...] = ()
+    agents: Words = ()
     """Several agents in place of one --server: HOST:PORT of each. They fly one world, and share its
     drones evenly in their order."""
     when_lost: Literal["hold", "land", "end"] = "hold"
@@ -46,12 +45,6 @@ class Sim(BackendFlags):
     """Lose each datagram, sent or received, with this probability: tries an agent under loss."""
     drop_seed: int = 0
     """The same seed loses the same datagrams."""
-    key_file: Path | None = None
-    """Key that the agent has too (rotorgram key): needed beyond this machine."""
-    insecure: bool = False
-    """Allow addresses beyond this machine without a key: anyone who reaches them may take part."""
-    record: Path | None = None
-    """MCAP file to write every message to."""
     view: bool = False
     """Show up to 16 drones in a window. Lock-step does not wait for it. Keys: docs/viewing.md."""
     realtime: bool = False
@@ -72,7 +65,7 @@ class Sim(BackendFlags):
                 flag = f"--{name.replace('_', '-')}"
                 raise InputError(f"{flag}: cannot be used {wrong} --agents")
         simulator = Simulator(
-            self.env_id,
+            self.env_config(backend=self.backend),
             server=parse_address(self.server),
             agents=[parse_address(agent) for agent in self.agents] if several else None,
             num_envs=self.num_envs,
@@ -84,10 +77,6 @@ class Sim(BackendFlags):
             record=self.record,
             when_lost=self.when_lost,
             patience=self.patience,
-            drones=self.drones,
-            vehicle=self.vehicle,
-            backend=self.backend,
-            **self.options,
         )
         links = simulator.rules.links
         there = f"{len(links)} agents" if several else f"the agent at {self.server}"

@@ -3,14 +3,14 @@
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from itertools import product
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from itertools import chain, product
+from typing import TYPE_CHECKING, ClassVar
 
-from tyro.conf import Positional, UseAppendAction, arg
+from tyro.conf import Positional
 
 from ..agents import AlgorithmName
 from ..models.errors import InputError
-from ._flags import parse_value
+from ._flags import NamedValues, Options, Words, parse_value
 from ._study import StudyFlags
 
 if TYPE_CHECKING:
@@ -24,13 +24,11 @@ class Sweep(StudyFlags):
     Ctrl-C keeps the runs that are done; --resume flies the others.
     """
 
-    kinds: ClassVar[tuple[str, ...]] = ("sweep",)
+    kinds: ClassVar[Words] = ("sweep",)
 
     algorithm: Positional[AlgorithmName]
     """The algorithm."""
-    grid: UseAppendAction[
-        Annotated[tuple[tuple[str, ...], ...], arg(metavar="NAME=VALUE,... ...")]
-    ] = ()
+    grid: NamedValues = ()
     """Values to try, in JSON: learning_rate=0.003,0.01 hidden=[64,64],[32,32], and options of the
     task as env.start_band=0.5,2. Every combination is a point."""
 
@@ -42,37 +40,32 @@ class Sweep(StudyFlags):
         """A row for each point, on seeds that no comparison uses by default."""
         from ..training.settings import Study
 
-        grid = parse_grid(word for words in self.grid for word in words)
+        grid = parse_grid(chain.from_iterable(self.grid))
         if not grid:
             raise InputError("grid: expected at least one hyperparameter, got none")
         rows = [
             self._row(dict(zip(grid, values, strict=True))) for values in product(*grid.values())
         ]
-        settings: dict[str, Any] = {"seeds": 3, "first_seed": 1000, "snapshots": 1}
+        settings: Options = {"seeds": 3, "first_seed": 1000, "snapshots": 1}
         settings |= self.given_of_study()
         return Study(rows=tuple(rows), kind="sweep", evaluation="tuning", **settings)
 
-    def _row(self, point: Mapping[str, Any]) -> "Row":
-        from ..training.settings import Row
-
+    def _row(self, point: Mapping[str, object]) -> "Row":
         changes = self.changes()
-        options: dict[str, Any] = {}
+        options: Options = {}
         for name, value in point.items():
             if name.startswith("env."):
                 options[name.removeprefix("env.").replace("-", "_")] = value
             else:
                 changes[name] = value
         words = [f"{name}={json.dumps(value)}" for name, value in point.items()]
-        env = self.env_config().changed(**options)
-        settings: dict[str, Any] = {"env_steps": 200_000, "num_envs": env.drones}
-        settings |= {"backend": "mujoco"} | self.given_of_rows()
         name = " ".join(words).replace('"', "").replace(", ", ",")
-        return Row(agent=self.algorithm, name=name, env=env, set=changes, **settings)
+        return self.new_row(self.algorithm, name, changes, self.env_config().changed(**options))
 
 
-def parse_grid(words: Iterable[str]) -> dict[str, tuple[Any, ...]]:
+def parse_grid(words: Iterable[str]) -> dict[str, tuple[object, ...]]:
     """Values by the name of their hyperparameter, each in JSON. Raises `InputError`."""
-    grid: dict[str, tuple[Any, ...]] = {}
+    grid: dict[str, tuple[object, ...]] = {}
     for word in words:
         name, equals, text = word.partition("=")
         if not equals:
@@ -87,7 +80,7 @@ def parse_grid(words: Iterable[str]) -> dict[str, tuple[Any, ...]]:
     return grid
 
 
-def _values(text: str) -> tuple[Any, ...]:
+def _values(text: str) -> tuple[object, ...]:
     """JSON values with commas between them; without brackets, words are texts."""
     try:
         return tuple(json.loads(f"[{text}]"))

@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import math
+import os
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -11,9 +12,10 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields, replace
 from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from threading import Timer
+from typing import TYPE_CHECKING, Final
 
-from tyro.conf import Positional, UseAppendAction, arg
+from tyro.conf import Positional
 
 from ..agents import (
     NETWORK_FIELDS,
@@ -26,67 +28,44 @@ from ..agents import (
     store,
 )
 from ..agents.checkpoints import Checkpoint, software_versions, write_whole
-from ..agents.presets import PresetName
-from ..envs.config import EnvConfig
 from ..flights.folders import locked
 from ..models.errors import InputError, require
 from ..training.settings import Run
-from ._flags import (
-    AgentFlags,
-    BackendFlags,
-    BackendOfPreset,
-    check_count,
-    folder_to_write,
-    go_on_with,
-    named_value,
-    refuse_settings,
-)
+from ._flags import AgentFlags, BackendOfPreset, Options
+from ._training import TrainingFlags, folder_to_write
 
 if TYPE_CHECKING:
     from ..training.training import Training
 
 EPISODES: Final = "episodes.csv"
-_FREE: Final = ("resume", "listen", "num_simulators", "key_file", "insecure", "record",
-                "store_every", "env", "vehicle", "env_steps")  # fmt: skip
+_WIRE: Final = ("env", "vehicle", "listen", "num_simulators", "key_file", "insecure")
+_FREE: Final = (*_WIRE, "record", "store_every", "env_steps")
 """Flags that a resumed training may be given."""
 _UPDATE_WITHIN: Final = 2.0  # s
 
 
 @dataclass(frozen=True, kw_only=True)
-class Train(AgentFlags, BackendFlags):
+class Train(AgentFlags, TrainingFlags):
     """Train an agent: the UDP server.
 
     Starts a simulator process of its own, or waits for one with --listen. Ctrl-C stops at the next
-    update with everything written; --resume goes on to the same numbers (sb3-… start anew).
+    update with everything written; --resume goes on to the same numbers (sb3-… start anew), or to
+    more env steps, by --env-steps.
     """
 
     algorithm: Positional[AlgorithmName]
     """vpg, a2c, ppo, ippo, mappo, sb3-a2c, sb3-ppo or sb3-sac."""
-    preset: PresetName = "tuned"
-    """Hyperparameters: the paper's (of vpg and a2c), or ours, which may depend on the task."""
     backend: BackendOfPreset = "mujoco"
     """What steps the drones: mujoco, or rigid (without contact, fast)."""
     preset_of: str | None = None
     """Id of the task with the preset. Default: the one that is trained, or that it derives from."""
-    set: UseAppendAction[Annotated[tuple[tuple[str, ...], ...], arg(metavar="NAME=VALUE …")]] = ()
-    """Changes to the preset, such as gamma=0.99 steps_per_update=64."""
     seed: int = 0
     """Seed of weights, actions and episodes."""
-    env_steps: int | None = None
-    """Env steps to train for. Default: those of the preset. With --resume, a larger number
-    extends a training; a decreasing learning rate then decreases over all of them."""
-    num_envs: int | None = None
-    """Drones that fly at the same time, in lock-step. Env steps count all of them. Default: those
-    of the preset."""
     num_simulators: int = 1
     """With --listen: simulators to wait for, each with its share of the drones."""
-    out: Path | None = None
-    """Folder to write to. Default: runs/ALGORITHM-seedSEED-TIME."""
     start_from: Path | None = None
     """Checkpoint, or folder of a training, with whose networks to begin: the next stage of a
     curriculum. Their sizes and the normalisation are the checkpoint's."""
-    resume: Path | None = None
-    """Folder of a training to go on with; it keeps its settings."""
     store_every: float = 10.0
     """Seconds between two checkpoints; a resumed training flies again from the last one."""
 
@@ -101,51 +80,57 @@ class Train(AgentFlags, BackendFlags):
 
     def _begin(self) -> int:
         from ..training.training import Training, config_of
+        from ._env import remote_env
 
-        check_count("drones", self.drones)
-        start, told = self._start()
+        start, origin = self._start()
         changes = {name: start.config[name] for name in NETWORK_FIELDS} if start else {}
-        changes |= dict(named_value("set", word) for words in self.set for word in words)
+        changes |= self.changes()
         task = self.preset_of or self.env_id
         base = find_preset(self.algorithm, self.preset, task)
-        config = preset(self.algorithm, self.preset, task, **changes)
         if not base.fits:
+            if self.preset_of:
+                raise InputError(
+                    f"preset-of: expected a task with a preset of {self.algorithm}, got {task}"
+                )
             print(
                 f"note: there is no preset of {self.algorithm} for {task}, nor for a task that it "
                 f"derives from: it gets that of {base.env_id}; --preset-of ID names another",
                 flush=True,
             )
-        named: dict[str, Any] = {"num_envs": self.num_envs, "env_steps": self.env_steps}
-        named["backend"] = self.backend if "backend" in self.given else None
-        chosen = {name: getattr(base, name) if n is None else n for name, n in named.items()}
-        if self.num_envs is None:  # whole worlds
-            chosen["num_envs"] = max(base.num_envs // self.drones, 1) * self.drones
-        backend = chosen.pop("backend")
-        env_config = EnvConfig.from_keywords(
-            self.env_id, vehicle=self.vehicle, drones=self.drones, backend=backend, **self.options
+        config = preset(self.algorithm, self.preset, task, **changes)
+        backend = self.backend if "backend" in self.given else base.backend
+        whole_worlds = max(base.num_envs // self.drones, 1) * self.drones
+        run = Run(
+            env=self.env_config(backend=backend),
+            algorithm=self.algorithm,
+            config=config,
+            seed=self.seed,
+            env_steps=self.env_steps or base.env_steps,
+            num_envs=self.num_envs or whole_worlds,
         )
-        run = Run(env=env_config, algorithm=self.algorithm, config=config, seed=self.seed, **chosen)
-        required = bool(self.options) or "env" in self.given
-        with (
-            folder_to_write(self.out, f"{run.algorithm}-seed{run.seed}") as folder,
-            self._env(self.env_id, self.options, required=required, num_envs=run.num_envs,
-                      drones=self.drones, backend=backend) as env,
-            locked(folder),
-        ):  # fmt: skip
+        opened = remote_env(
+            self,
+            required=bool(self.options) or "env" in self.given,
+            num_envs=run.num_envs,
+            num_simulators=self.num_simulators,
+            backend=backend,
+        )
+        name = f"{run.algorithm}-seed{run.seed}"
+        with folder_to_write(self.out, name) as folder, opened as env, locked(folder):
             spec = env.env_spec  # of the simulator that came
             if self.listen is not None:
                 run = replace(run, env=config_of(spec, backend, self.vehicle))
             training = Training(run, env, start=start)
             about = {"vehicle_hash": spec.vehicle_hash, "versions": software_versions()}
-            content = json.dumps({**run.to_dict(), **told, **about}, indent=2) + "\n"
-            write_whole(folder / "config.json", content.encode())
+            _write_json(folder / "config.json", {**run.to_dict(), **origin, **about})
             return self._train(training, folder)
 
-    def _start(self) -> tuple[Checkpoint | None, dict[str, Any]]:
+    def _start(self) -> tuple[Checkpoint | None, Options]:
         """The checkpoint to start from, and what `config.json` has of it."""
         from ._env import CHECKPOINT
 
-        if not (path := self.start_from):
+        path = self.start_from
+        if path is None:
             return None, {}
         file = path / CHECKPOINT if path.is_dir() else path
         kept = load(file)
@@ -154,7 +139,7 @@ class Train(AgentFlags, BackendFlags):
 
     def _resume(self, folder: Path) -> int:
         from ..training.training import Training, is_finished
-        from ._env import CHECKPOINT, chosen_vehicle
+        from ._env import CHECKPOINT, fitted, remote_env
 
         with locked(folder):
             kept = load(folder / CHECKPOINT)
@@ -163,11 +148,11 @@ class Train(AgentFlags, BackendFlags):
                     f"resume: expected a training of {self.algorithm}, "
                     f"{folder} holds one of {kept.algorithm}"
                 )
-            refuse_settings(self, folder, free=("algorithm", *_FREE))
+            self.refuse_settings(folder, _FREE)
             if "env" in self.given and self.env_id != kept.env_id:
                 raise InputError(f"resume: expected --env {kept.env_id}, got {self.env}")
             if self.env_steps is not None:
-                kept = self._extended(kept, folder)
+                kept = _extended(kept, folder, self.env_steps)
             if is_finished(kept):
                 flown = kept.position.env_steps
                 print(f"already trained {flown:,} of {kept.env_steps:,} env steps")
@@ -175,29 +160,14 @@ class Train(AgentFlags, BackendFlags):
                 return 0
             for name, (then, now) in kept.other_versions().items():
                 print(f"note: {name} was {then} and is {now}: the numbers may differ", flush=True)
-            again = replace(self, vehicle=chosen_vehicle(self, kept))
-            with again._env(kept.env_id, kept.options, required=True, num_envs=kept.num_envs,
-                            drones=len(kept.spec.agents), backend=kept.backend) as env:  # fmt: skip
-                return self._train(Training.resume(kept, env), folder)
-
-    def _extended(self, kept: Checkpoint, folder: Path) -> Checkpoint:
-        """The checkpoint with more env steps to fly; `config.json` gets their number too."""
-        env_steps = self.env_steps or 0
-        if env_steps < kept.env_steps:
-            raise InputError(
-                f"env_steps: expected {kept.env_steps} or more, to which {folder} is to be "
-                f"trained, got {env_steps}"
+            opened = remote_env(
+                fitted(self, kept),
+                num_envs=kept.num_envs,
+                num_simulators=self.num_simulators,
+                backend=kept.backend,
             )
-        file = folder / "config.json"
-        content = {**json.loads(file.read_text(encoding="utf-8")), "env_steps": env_steps}
-        write_whole(file, (json.dumps(content, indent=2) + "\n").encode())
-        return replace(kept, env_steps=env_steps)
-
-    def _env(self, env_id: str, options: dict[str, Any], **settings: Any) -> Any:
-        """The env of the training, over the wire."""
-        from ._env import remote_env
-
-        return remote_env(self, env_id, options, num_simulators=self.num_simulators, **settings)
+            with opened as env:
+                return self._train(Training.resume(kept, env), folder)
 
     def _train(self, training: "Training", folder: Path) -> int:
         from ._env import CHECKPOINT
@@ -206,8 +176,7 @@ class Train(AgentFlags, BackendFlags):
         if not find_algorithm(self.algorithm).resumes:
             stopped = "it starts anew" if self.resume else "--resume starts it anew"
             print(f"note: {self.algorithm} keeps no state of a training: {stopped}", flush=True)
-        flags = ("env", "vehicle", "listen", "num_simulators", "key_file", "insecure")
-        go_on = go_on_with(self, f"train {self.algorithm}", folder, *flags)
+        go_on = self.go_on_with(f"train {self.algorithm}", folder, *_WIRE)
         keeper = _Keeper(training, folder, self.store_every)
         try:
             with _stop_at_update() as stop_is_asked, bars() as progress:
@@ -235,6 +204,23 @@ class Train(AgentFlags, BackendFlags):
         print(f"{flown / training.log.seconds:,.0f} env steps per second")
         print(f"checkpoint: {folder / CHECKPOINT}" if finished else go_on)
         return 0 if finished else 128 + signal.SIGINT
+
+
+def _extended(kept: Checkpoint, folder: Path, env_steps: int) -> Checkpoint:
+    """The checkpoint with more env steps to fly; `config.json` gets their number too."""
+    if env_steps < kept.env_steps:
+        raise InputError(
+            f"env_steps: expected {kept.env_steps} or more, to which {folder} is to be "
+            f"trained, got {env_steps}"
+        )
+    file = folder / "config.json"
+    content = json.loads(file.read_text(encoding="utf-8"))
+    _write_json(file, {**content, "env_steps": env_steps})
+    return replace(kept, env_steps=env_steps)
+
+
+def _write_json(file: Path, content: Options) -> None:
+    write_whole(file, (json.dumps(content, indent=2) + "\n").encode())
 
 
 class _Keeper:
@@ -289,11 +275,9 @@ def _stop_at_update() -> Iterator[Callable[[], bool]]:
     Asked again, or if no update comes soon (no simulator answers), it stops at once.
     """
     asked = False
-    timers = hasattr(signal, "setitimer")
-
-    def set_timer(seconds: float) -> None:
-        if timers:
-            signal.setitimer(signal.ITIMER_REAL, seconds)
+    # As another Ctrl-C would: it ends a wait for a simulator too.
+    timer = Timer(_UPDATE_WITHIN, os.kill, (os.getpid(), signal.SIGINT))
+    timer.daemon = True
 
     def ask(*_: object) -> None:
         nonlocal asked
@@ -302,18 +286,17 @@ def _stop_at_update() -> Iterator[Callable[[], bool]]:
         asked = True
         with suppress(OSError):  # standard output may take no more
             print("stopping at the next update; Ctrl-C again stops now", flush=True)
-        set_timer(_UPDATE_WITHIN)
+        timer.start()
 
     def reached() -> bool:
         if asked:  # there is time to write now
-            set_timer(0)
+            timer.cancel()
         return asked
 
-    numbers = [signal.SIGINT, signal.SIGTERM, *([signal.SIGALRM] if timers else [])]
-    before = {number: signal.signal(number, ask) for number in numbers}
+    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield reached
     finally:
-        set_timer(0)
+        timer.cancel()
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 from tyro.conf import Positional, arg
 
 from ..models.errors import InputError
-from ..models.files import write_new
+from ..models.files import check_new_file, write_new
 from ._flags import Command
 
 if TYPE_CHECKING:
@@ -124,10 +124,7 @@ class Vehicle(Command):
 
     def _new(self) -> None:
         path = Path(self.file)
-        if path.suffix.lower() != ".toml":
-            raise InputError(f"file: expected a name that ends in .toml, got {self.file}")
-        if path.exists():
-            raise InputError(f"file: expected the name of a new file, got {path}, which is there")
+        check_new_file(path, ".toml")
         count = {"hexa": 6, "octo": 8}.get(self.frame, 4)
         listed = self.frame == "list"
         space = " " * (24 - len(self.frame))
@@ -154,8 +151,6 @@ class Vehicle(Command):
         print("\nrotors: position, direction, torque besides that of the position per thrust")
         for rotor in craft.rotors:
             print(f"{rotor.name:17} {_rotor_words(rotor)}")
-        for upper, lower in _coaxial_pairs(craft):
-            print(f"{upper} is above {lower}: {lower} loses no thrust in its wake here")
         print("\ncameras: pictures, place")
         for camera in craft.cameras:
             size = f"{camera.width} × {camera.height}"
@@ -200,16 +195,6 @@ def _derived(craft: "Craft") -> Iterator[tuple[str, str]]:
     yield "hover throttle", f"{_listed((100 * shares).round(2))} %"
     yield "thrust to weight", f"{most / weight:.4g}"
     yield "hash", craft.hash
-
-
-def _coaxial_pairs(craft: "Craft") -> Iterator[tuple[str, str]]:
-    """Names of two rotors on one axis, the upper one first."""
-    near = 0.05 * max(math.hypot(*rotor.position[:2]) for rotor in craft.rotors)
-    for upper in craft.rotors:
-        for lower in craft.rotors:
-            apart = math.dist(upper.position[:2], lower.position[:2])
-            if apart <= near and upper.position[2] > lower.position[2]:
-                yield upper.name, lower.name
 
 
 def _rotor_words(rotor: "Rotor") -> str:

@@ -1,7 +1,6 @@
 """`rotorgram view`: flights live, flown in process or read from a journal."""
 
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import chain, count, islice
 from pathlib import Path
@@ -9,7 +8,7 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from ..flights.recorded import recorded_trajectories
-from ..flights.trajectories import Trajectory, flown_trajectories
+from ..flights.trajectories import flown_trajectories
 from ..models.errors import InputError
 from ..scenes import parse_scene
 from ._flags import EnvFlags, check_count
@@ -33,20 +32,28 @@ class View(EnvFlags):
         """Fly and show, episode after episode."""
         from ..flights.filming import moments
         from ..rendering.live import Pace
-        from ._env import with_vehicle, words_of
+        from ._env import pilot_of, words_of
         from ._watch import open_view
 
         check_count("episodes", self.episodes)
         parse_scene(self.shown_scene)
-        flights = islice(self._flights(), self.episodes)
+        path = Path(self.what)
+        shown = self
+        if path.suffix == ".mcap":
+            if self.options.keys() - {"scene"}:
+                raise InputError("env: expected no options with a journal, which has its own")
+            flights = ([one] for one in recorded_trajectories(path))
+        else:
+            shown, policy, _ = pilot_of(self, self.what)
+            config = shown.env_config()
+            flights = (flown_trajectories(policy, config, [one], "final") for one in count())
         first = next(flights)
         spec = first[0].spec
         drones = len(first)
-        names = spec.agents if drones > 1 else ()
-        shown = with_vehicle(self, self.what)
+        names = spec.agents if drones > 1 else ("",)
         with open_view(shown, spec, drones, Pace(spec.control_period, self.speed)) as live:
             print(f"showing {self.what} in the window (Ctrl-C ends)", flush=True)
-            for flight in chain((first,), flights):
+            for flight in islice(chain((first,), flights), self.episodes):
                 shown_moments = [moments(one) for one in flight]
                 longest = max(map(len, shown_moments))
                 # A drone whose episode has ended stays as it ended.
@@ -54,23 +61,9 @@ class View(EnvFlags):
                 frames = zip(*padded, strict=True)
                 if not all(live.draw_in_time(*frame) for frame in frames):
                     break
-                for one, name in zip(flight, names or ("",), strict=True):
+                for one, name in zip(flight, names, strict=True):
                     of = f" of {name}" if name else ""
                     print(f"episode {one.episode}{of}: {words_of(one)}", flush=True)
             while live.is_running and not live.wants:  # the last picture is still to come
                 time.sleep(0.02)
         return 0
-
-    def _flights(self) -> Iterator[list[Trajectory]]:
-        """Episode after episode, as long as there are any, each with a trajectory of each drone."""
-        from ._env import pilot_of
-
-        path = Path(self.what)
-        if path.suffix == ".mcap":
-            if self.options.keys() - {"scene"}:
-                raise InputError("env: expected no options with a journal, which has its own")
-            yield from ([one] for one in recorded_trajectories(path))
-            return
-        _, policy, config = pilot_of(self, self.what)
-        for episode in count():
-            yield flown_trajectories(policy, config, [episode], "final")

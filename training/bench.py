@@ -29,13 +29,11 @@ from numpy.typing import NDArray
 from ..agents.checkpoints import software_versions, write_whole
 from ..envs.autoreset import AdvancingVectorEnv
 from ..envs.config import EnvConfig
-from ..envs.loop import Loop
+from ..envs.registry import env_spec
 from ..envs.vector import LocalVectorEnv
 from ..models.fields import Limits, check
 from ..models.vehicle import Vehicle
 from ..udp.layouts import layout_of
-from ..udp.protocol import binary
-from ..udp.protocol.messages import Command, State
 from ..udp.spawn import spawn_simulator
 from .results import machine
 
@@ -55,9 +53,8 @@ class Ratio:
 
     name: str
     of: Callable[[Rates], float]
-    target: float
-    at_most: bool = False
-    """Whether less is better."""
+    target: str
+    """What it is to be, in words."""
 
     def value(self, layers: Sequence["Layer"]) -> float:
         """Median over the rounds."""
@@ -65,26 +62,16 @@ class Ratio:
         rounds = zip(*(layer.rates for layer in layers), strict=True)
         return statistics.median(self.of(dict(zip(names, rates, strict=True))) for rates in rounds)
 
-    @property
-    def target_text(self) -> str:
-        """The target, with its sign."""
-        return f"{'≤' if self.at_most else '≥'} {self.target:g}"
 
-    def reached(self, value: float) -> bool:
-        """Whether a value is on the right side of the target."""
-        return value <= self.target if self.at_most else value >= self.target
-
-
-def _over(above: str, below: str, target: float) -> Ratio:
-    return Ratio(name=f"{above} ÷ {below}", of=lambda r: r[above] / r[below], target=target)
+def _over(above: str, below: str, least: float) -> Ratio:
+    return Ratio(name=f"{above} ÷ {below}", of=lambda r: r[above] / r[below], target=f"≥ {least:g}")
 
 
 RATIOS: Final = (
     Ratio(
         name="time of a step, UDP, 1 ÷ (env + UDP echo)",
         of=lambda r: (1 / r["UDP, 1"]) / (1 / r["env"] + 1 / r["UDP echo"]),
-        target=1.6,
-        at_most=True,
+        target="≤ 1.6",
     ),
     _over("env", "mj_step", 0.2),
     _over("vector env, 1024", "Batch.step, 1024", 0.85),
@@ -139,21 +126,35 @@ def bench(
         group = [layer for layer in _LAYERS if (layer[2] == 1) == single]
         rates: dict[str, list[float]] = {name: [] for name, *_ in group}
         with ExitStack() as stack:
-            opened = []
-            for name, _, drones, open_ in group:
+            steps = {}
+            for name, _, _, open_ in group:
                 on_layer(f"opening {name}", done, turns)
-                opened.append((name, drones, open_(stack)))
+                steps[name] = open_(stack)
+            names = list(steps)
             for number in range(rounds + 1):
-                first = number % len(opened)
-                for name, drones, step in opened[first:] + opened[:first]:
+                for name in names:
                     on_layer(name, done, turns)
                     done += 1
-                    rate = rate_of(step, seconds, _STEPS_AT_ONCE if drones == 1 else 1)
+                    rate = rate_of(steps[name], seconds, _STEPS_AT_ONCE if single else 1)
                     if number:  # the first round warms up
                         rates[name].append(round(rate, 1))
+                names.append(names.pop(0))
         for name, about, drones, _ in group:
             layers.append(Layer(name=name, about=about, drones=drones, rates=tuple(rates[name])))
-    _write(layers, rounds, seconds, folder)
+    values = {
+        ratio.name: {"value": round(ratio.value(layers), 3), "target": ratio.target}
+        for ratio in RATIOS
+    }
+    content = {
+        "rounds": rounds,
+        "seconds": seconds,
+        "layers": [asdict(layer) for layer in layers],
+        "medians": {layer.name: layer.rate for layer in layers},
+        "ratios": values,
+        "machine": machine(),
+        "versions": software_versions(),
+    }
+    write_whole(folder / "bench.json", (json.dumps(content, indent=2) + "\n").encode())
     return layers
 
 
@@ -167,23 +168,6 @@ def rate_of(step: Step, seconds: float, at_once: int = _STEPS_AT_ONCE) -> float:
             steps += step()
         now = time.perf_counter()
     return steps / (now - start)
-
-
-def _write(layers: Sequence[Layer], rounds: int, seconds: float, folder: Path) -> None:
-    values = {
-        ratio.name: {"value": round(ratio.value(layers), 3), "target": ratio.target_text}
-        for ratio in RATIOS
-    }
-    content = {
-        "rounds": rounds,
-        "seconds": seconds,
-        "layers": [asdict(layer) for layer in layers],
-        "medians": {layer.name: layer.rate for layer in layers},
-        "ratios": values,
-        "machine": machine(),
-        "versions": software_versions(),
-    }
-    write_whole(folder / "bench.json", (json.dumps(content, indent=2) + "\n").encode())
 
 
 # ---- the layers: each is opened for as long as the stack is
@@ -256,34 +240,16 @@ def _vector_step(env: AdvancingVectorEnv) -> Step:
     return step
 
 
-def _sizes() -> tuple[int, int]:
-    """Bytes of a State and a Command of one drone."""
-    action = np.zeros((1, 1), np.float32)
-    with closing(Loop(EnvConfig(env_id=ENV_ID))) as loop:
-        loop.advance(action, np.ones(1, bool))
-        state = State(
-            session=1,
-            sequence=2,
-            time=0.02,
-            observations=tuple(loop.observations.values()),
-            telemetry=tuple(loop.telemetry.values()),
-            **{name: getattr(loop, name) for name in ("rewards", "terminated", "truncated")},
-        )
-        layout = layout_of(loop.spec, 1)
-    command = Command(session=1, sequence=2, actions=action, orders=np.zeros(1, np.uint8))
-    return len(binary.encode(state, layout)), len(binary.encode(command, layout))
-
-
 def udp_echo(stack: ExitStack) -> Step:
     """A raw exchange of datagrams of the sizes of a State and a Command: two Python processes with
     blocking sockets, on one core, where a wake-up costs least.
     """
-    state_size, command_size = _sizes()
-    words = [sys.executable, "-c", _ECHO, str(command_size)]
+    layout = layout_of(env_spec(EnvConfig(env_id=ENV_ID)))
+    words = [sys.executable, "-c", _ECHO, str(layout.command.size)]
     process = stack.enter_context(subprocess.Popen(words, stdout=subprocess.PIPE))
     assert process.stdout is not None
     address = ("127.0.0.1", int(process.stdout.readline()))
-    message = bytes(state_size)
+    message = bytes(layout.state.size)
     sock = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
     sock.settimeout(1.0)
     stack.callback(sock.sendto, b"", address)
@@ -321,17 +287,15 @@ def _remote(stack: ExitStack) -> Step:
     return single_step(stack.enter_context(spawn_simulator(EnvConfig(env_id=ENV_ID))))
 
 
+def _vector(stack: ExitStack, drones: int) -> Step:
+    return _vector_step(stack.enter_context(closing(LocalVectorEnv(ENV_ID, drones))))
+
+
 def _remote_vector(stack: ExitStack, drones: int) -> Step:
     opened = spawn_simulator(EnvConfig(env_id=ENV_ID), num_envs=drones)
     return _vector_step(stack.enter_context(opened))
 
 
-def _vector(stack: ExitStack, drones: int) -> Step:
-    env = stack.enter_context(closing(LocalVectorEnv(ENV_ID, drones)))
-    return _vector_step(env)
-
-
-_MANY: Final = (64, 1024, 4096)
 _LAYERS: Final[list[tuple[str, str, int, Callable[[ExitStack], Step]]]] = [
     ("mj_step", "mj_step with the substeps of one control step", 1, _mj_step),
     ("env", "the single env's step", 1, local_env),
@@ -341,6 +305,6 @@ _LAYERS: Final[list[tuple[str, str, int, Callable[[ExitStack], Step]]]] = [
 ]
 """Name, what it is, drones, and how it is opened."""
 
-for _n in _MANY:
+for _n in (64, 1024, 4096):
     _LAYERS.append((f"vector env, {_n}", "the vector env", _n, partial(_vector, drones=_n)))
     _LAYERS.append((f"UDP, {_n}", "RemoteVectorEnv", _n, partial(_remote_vector, drones=_n)))

@@ -16,7 +16,7 @@ on the good side of it.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final, Literal, NamedTuple
+from typing import Final, Literal
 
 import numpy as np
 import pandas as pd
@@ -65,6 +65,8 @@ _GRID: Final = 100
 
 _TOO_FEW: Final = f"fewer than {MIN_SEEDS} seeds with a value decide nothing"
 
+_Claim = tuple[str, str, str]
+"""A claim, its place in the paper, and the definition of its measure."""
 Outcome = Literal["borne out", "not borne out", "undecided", "not tested"]
 
 
@@ -103,13 +105,12 @@ def convergence_step(run: pd.DataFrame) -> float:
     if len(run) < MIN_EPISODES:
         return np.nan
     ends = metrics.episode_ends(run)
-    total = np.concatenate([[0.0], np.cumsum(run["return"].to_numpy())])
     grid = ends[-1] * np.arange(1, _GRID + 1) / _GRID
     # Episodes first..last-1 ended within the window behind each grid point.
     last = np.searchsorted(ends, grid, side="right")
     first = np.searchsorted(ends, grid - SMOOTHING_SHARE * ends[-1], side="right")
     filled = last > first  # no episode ended in the window: the level is unknown there
-    level = (total[last] - total[first])[filled] / (last - first)[filled]
+    level = metrics.mean_returns(run, first[filled], last[filled])
     steps = grid[filled]
     begin = int(np.searchsorted(steps, grid[round(SMOOTHING_SHARE * _GRID) - 1]))
     if level[-1] - level[begin] <= LEARNING_RISE * level[steps > 0.75 * ends[-1]].std():
@@ -146,13 +147,7 @@ def judge_claims(
     ]
 
 
-class _Claim(NamedTuple):
-    claim: str
-    source: str
-    definition: str
-
-
-_CONVERGES: Final = _Claim(
+_CONVERGES: Final = (
     "A2C converges later than VPG: it “takes much more episodes to converge”.",
     "Section 3, Figure 6 (“A2C converge slower than VPG”)",
     f"Convergence: the env step from which the training return, averaged over "
@@ -162,12 +157,12 @@ _CONVERGES: Final = _Claim(
     "in the last quarter did not converge and is left out. Env steps are compared, not episodes, "
     "because crashes make episodes of unequal length.",
 )
-_REWARD: Final = _Claim(
+_REWARD: Final = (
     "A2C's long-run average reward is higher: it “can reach to higher average reward”.",
     "Section 3, Figures 6 and 7 (“A2C outperform the VPG on the long run”)",
     "Long run: the mean return of the episodes in the last quarter of training.",
 )
-_FLUCTUATES: Final = _Claim(
+_FLUCTUATES: Final = (
     "A2C fluctuates less than VPG: “with much more stability”, “with minimum fluctuation”.",
     "Section 3, Figures 6 and 8",
     "Fluctuation: the standard deviation of the episode return around its centred moving average "
@@ -177,7 +172,7 @@ _LATER: Final = (" env steps", "did not converge")
 
 
 def _holding_claim(headline: Headline) -> _Claim:
-    return _Claim(
+    return (
         "Both agents hold the target: “both implemented algorithms achieve high stability, by "
         "achieving convergence to the required performance”.",
         "Abstract; section 3, Figure 8",
@@ -189,8 +184,9 @@ def _holding_claim(headline: Headline) -> _Claim:
 
 
 def _verdict(claim: _Claim, preset: str, judged: tuple[Outcome, str]) -> Verdict:
+    words, source, definition = claim
     outcome, evidence = judged
-    return Verdict(claim.claim, claim.source, preset, outcome, claim.definition, evidence)
+    return Verdict(words, source, preset, outcome, definition, evidence)
 
 
 def _compare(
@@ -269,7 +265,7 @@ def judge_no_worse(runs: pd.DataFrame, preset: str, headline: Headline) -> Verdi
     The headline metric has a bound of its goal.
     """
     margin = MARGIN_SHARE * (headline.held or np.nan)
-    claim = _Claim(
+    claim = (
         "Our A2C is no worse than Stable-Baselines3's after as many env steps.",
         OURS,
         "No worse: of the interquartile means of the steady "

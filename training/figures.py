@@ -19,9 +19,9 @@ from matplotlib.ticker import EngFormatter
 from ..flights.palette import agent_color
 from . import metrics
 from .metrics import Curve, Spread
-from .results import Results
+from .results import Results, file_words
 from .settings import Row
-from .tables import by_task, row_label
+from .tables import by_task, row_label, seeds_text
 
 AVERAGING_SHARE: Final = 0.05
 """Share of training over which the average reward is a running mean."""
@@ -44,8 +44,7 @@ FORMATS: Final = ("png", "pdf", "svg")
 _MAX_STEP_ROWS: Final = 400_000
 _MAX_TRAJECTORIES: Final = 40
 _MAX_POINTS: Final = 2000
-_OUTER: Final = 0.18  # opacity of the 5–95 % band
-_INNER: Final = 0.38  # and of the 25–75 % band
+_BANDS: Final = ((0.05, 0.95, 0.18), (0.25, 0.75, 0.38))  # quantiles, and the band's opacity
 _STYLE: Final = Path(__file__).parent / "assets" / "figures.mplstyle"
 _GREY: Final = "#333333"
 
@@ -72,8 +71,7 @@ def _figures(results: Results, table: pd.DataFrame) -> Iterator[tuple[str, Figur
     rows = [row for row in results.study.rows if row.name in table.index]
     tasks = by_task(rows, together=results.study.kind == "sweep")
     for task, own in tasks:
-        words = "".join(letter if letter.isalnum() else "-" for letter in task).lower()
-        name = "comparison" if len(tasks) == 1 else f"comparison_{words}"
+        name = "comparison" if len(tasks) == 1 else f"comparison_{file_words(task)}"
         yield name, draw_comparison(results, table, own)
     if results.study.kind == "paper":
         trained = [row for row in rows if not row.controller]
@@ -96,19 +94,21 @@ def draw_comparison(results: Results, table: pd.DataFrame, rows: Sequence[Row]) 
     curves = learning_curves(results.evaluations, [row.name for row in rows])
     figure = Figure(figsize=(10.5, max(3.4, 1.4 + 0.35 * len(rows))), dpi=110)
     left, right = figure.subplots(1, 2, width_ratios=[1.5, 1])
+    for place, row in enumerate(reversed(rows)):
+        color = row_color(row)
+        line = table.loc[row.name]
+        ends = [line["steady_low"], line["steady_high"]]
+        right.plot(line["steady"], place, "o", color=color)
+        right.plot(ends, [place, place], color=color, lw=2.5, alpha=0.6)
     for row in rows:
         if row.name in curves:
             _plot(left, curves[row.name], row_color(row), row_label(row), marker="o")
-    for place, row in enumerate(reversed(rows)):
-        line = table.loc[row.name]
-        ends = [line["steady_low"], line["steady_high"]]
-        right.plot(line["steady"], place, "o", color=row_color(row))
-        right.plot(ends, [place, place], color=row_color(row), lw=2.5, alpha=0.6)
     _env_steps_axis(left)
-    left.set_ylabel(headline.labelled(f"steady {headline.size_symbol} in evaluation"))
+    steady = f"steady {headline.size_symbol}"
+    left.set_ylabel(headline.labelled(f"{steady} in evaluation"))
     right.set_yticks(range(len(rows)), [row_label(row) for row in reversed(rows)])
     right.set_ylim(-0.7, len(rows) - 0.3)
-    right.set_xlabel(headline.labelled(f"steady {headline.size_symbol}, 95 % interval"))
+    right.set_xlabel(headline.labelled(f"{steady}, 95 % interval"))
     if headline.held is not None:
         left.axhline(headline.held, color=_GREY, lw=0.9, ls=":")
         right.axvline(headline.held, color=_GREY, lw=0.9, ls=":")
@@ -140,19 +140,20 @@ def learning_curves(evaluations: pd.DataFrame, names: Sequence[str]) -> dict[str
 def draw_reward(results: Results, rows: Sequence[Row]) -> Figure:
     """Figure 6: a panel per agent (episodes and average), and all averages in one panel."""
     figure, axes = _panels(len(rows) + 1, "fig6_reward")
+    together = axes[-1]
     for axis, row in zip(axes, rows, strict=False):
         runs = metrics.training_runs(results.episodes, row.name)
-        if not runs:
-            continue
-        curves = [metrics.average_return(run, AVERAGING_SHARE) for run in runs]
-        average = metrics.spread_over_seeds(curves)
-        color = row_color(row)
-        _scatter_episodes(axis, pd.concat(runs), color)
-        _plot(axis, average, color, "average reward")
-        _plot(axes[-1], average, color, row_label(row))
-        axis.set_title(f"{row_label(row)} ({len(runs)} seed{'s' * (len(runs) != 1)})")
-        axis.sharey(axes[0])  # the averages keep a scale of their own
-    axes[-1].set_title("Average reward")
+        if runs:
+            average = metrics.spread_over_seeds(
+                [metrics.average_return(run, AVERAGING_SHARE) for run in runs]
+            )
+            color = row_color(row)
+            _scatter_episodes(axis, pd.concat(runs), color)
+            _plot(axis, average, color, "average reward")
+            _plot(together, average, color, row_label(row))
+            axis.set_title(f"{row_label(row)} ({seeds_text(len(runs))})")
+            axis.sharey(axes[0])  # the averages keep a scale of their own
+    together.set_title("Average reward")
     for axis in axes:
         _env_steps_axis(axis)
         axis.set_ylabel("reward per episode")
@@ -170,8 +171,8 @@ def draw_cumulative(results: Results, rows: Sequence[Row]) -> Figure:
             total = run["return"].cumsum().to_numpy()
             over_steps.append(Curve(metrics.episode_ends(run), total))
             over_episodes.append(Curve(np.arange(1.0, len(total) + 1), total))
-        for axis, curves in ((left, over_steps), (right, over_episodes)):
-            if curves:
+        if over_steps:
+            for axis, curves in ((left, over_steps), (right, over_episodes)):
                 _plot(axis, metrics.spread_over_seeds(curves), row_color(row), row_label(row))
     _env_steps_axis(left)
     right.set_xlabel("training episodes")
@@ -196,8 +197,8 @@ def draw_error(results: Results, rows: Sequence[Row]) -> Figure:
         own = training[training["row"] == row.name]
         if len(own):
             fan = value_fan(own)
-            above.fill_between(fan.index, fan[0.05], fan[0.95], color=color, alpha=_OUTER, lw=0)
-            above.fill_between(fan.index, fan[0.25], fan[0.75], color=color, alpha=_INNER, lw=0)
+            for low, high, alpha in _BANDS:
+                above.fill_between(fan.index, fan[low], fan[high], color=color, alpha=alpha, lw=0)
             above.plot(fan.index, fan[0.5], color=color, lw=1.2)
         for time, value in trajectories(flown[flown["row"] == row.name], period):
             below.plot(time, value, color=color, lw=0.8, alpha=0.45)
@@ -242,16 +243,11 @@ def trajectories(steps: pd.DataFrame, control_period: float) -> list[Curve]:
 # ---- parts
 
 
-def _panels(count: int, name: str) -> tuple[Figure, list[Axes]]:
-    """A figure with some panels, at most three side by side, and the paper's words below."""
-    columns = count if count <= 3 else 2
-    rows = -(-count // columns)
-    figure = Figure(figsize=(4.5 * max(columns, 2), 3.4 * rows + 0.4), dpi=110)
-    axes = list(figure.subplots(rows, columns, squeeze=False).flat)
-    for unused in axes[count:]:
-        unused.remove()
+def _panels(count: int, name: str) -> tuple[Figure, Sequence[Axes]]:
+    """A figure with panels side by side, and the paper's words below."""
+    figure = Figure(figsize=(4.0 * count, 3.8), dpi=110)
     figure.supxlabel(PAPER[name], fontsize=8, wrap=True)
-    return figure, axes[:count]
+    return figure, figure.subplots(1, count)
 
 
 def _plot(axis: Axes, spread: Spread, color: str, label: str, marker: str | None = None) -> None:

@@ -10,9 +10,9 @@ of its metric counts crashes already, as the share of landings does.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -22,6 +22,10 @@ from ..envs.spec import EnvSpec, Metric
 from ..flights.trajectories import Trajectory
 from ..models.errors import InputError
 from .statistics import Floats, Values, trimmed_mean
+
+Places = NDArray[np.int64]
+
+_MEANS: Final = ("steady", "settling_time", "overshoot", "return")
 
 
 class Curve(NamedTuple):
@@ -75,7 +79,7 @@ class Headline(Metric):
 
     def amount(self, number: str) -> str:
         """A number with the unit: "0.1 m"."""
-        return f"{number} {self.unit}" if self.unit else number
+        return f"{number} {self.unit}".rstrip()
 
     @property
     def held_text(self) -> str:
@@ -193,8 +197,8 @@ def measure_run(evaluations: pd.DataFrame, headline: Headline) -> dict[str, floa
     """
     final = final_evaluations(evaluations)
     crashed = headline.crashed(final)
-    settling = final["settling_time"].mask(crashed)
-    steady = float(final["steady"].mean())
+    final = final.assign(settling_time=final["settling_time"].mask(crashed))
+    means = {name: float(final[name].mean()) for name in _MEANS}
     safe = headline.counts_crashes or not crashed.any()
     whole = bool(final["steady"].notna().all())
     steps = math.nan
@@ -202,14 +206,11 @@ def measure_run(evaluations: pd.DataFrame, headline: Headline) -> dict[str, floa
     if evaluations["env_steps"].max() > 0 and headline.held is not None:
         steps, seconds = first_lasting_snapshot(evaluations, headline)
     return {
-        "steady": steady,
-        "settling_time": float(settling.mean()),
-        "overshoot": float(final["overshoot"].mean()),
-        "return": float(final["return"].mean()),
+        **means,
         "episodes": len(final),
-        "settled": int(settling.notna().sum()),
+        "settled": int(final["settling_time"].notna().sum()),
         "crashed": int(crashed.sum()),
-        "held": int(safe and whole and bool(headline.holds([steady])[0])),
+        "held": int(safe and whole and bool(headline.holds([means["steady"]])[0])),
         "env_steps_to_hold": steps,
         "seconds_to_hold": seconds,
     }
@@ -254,15 +255,20 @@ def episode_ends(episodes: pd.DataFrame) -> Floats:
     return np.asarray(episodes["last_step"], float)
 
 
+def mean_returns(run: pd.DataFrame, first: Places, last: Places) -> Floats:
+    """Mean return of one run's episodes from each of the first places to before the last ones."""
+    total = np.concatenate([[0.0], np.cumsum(run["return"].to_numpy())])
+    return np.asarray((total[last] - total[first]) / (last - first))
+
+
 def average_return(run: pd.DataFrame, share: float) -> Curve:
     """Running mean of one run's return, over the episodes that ended in the last `share` of it: a
     point at the end of every episode, which is always in its mean.
     """
     ends = episode_ends(run)
-    total = np.concatenate([[0.0], np.cumsum(run["return"].to_numpy())])
     last = np.arange(1, len(ends) + 1)
     first = np.minimum(np.searchsorted(ends, ends - share * ends[-1], side="right"), last - 1)
-    return Curve(ends, (total[last] - total[first]) / (last - first))
+    return Curve(ends, mean_returns(run, first, last))
 
 
 def spread_over_seeds(curves: Sequence[Curve], grid: Floats | None = None) -> Spread:
@@ -281,24 +287,3 @@ def spread_over_seeds(curves: Sequence[Curve], grid: Floats | None = None) -> Sp
     ends = (0.25, 0.75) if len(curves) >= 4 else (0.0, 1.0)
     low, high = np.quantile(values, ends, axis=0)
     return Spread(x, trimmed_mean(values, axis=0), low, high)
-
-
-# ---- what a film and a picture of paths show
-
-
-def shown_runs(
-    runs: pd.DataFrame, evaluations: pd.DataFrame, headline: Headline
-) -> tuple[Mapping[str, int], int]:
-    """A seed of each row, and an episode.
-
-    Of a row's seeds the middle one, by the steady state in the final evaluation (of an even number
-    the better of the two in the middle); of the episodes of that evaluation the one that starts
-    furthest from its goal.
-    """
-    seeds: dict[str, int] = {}
-    for row, own in runs.groupby("row", sort=False):
-        order = own.sort_values("steady", ascending=not headline.high, kind="stable")
-        seeds[str(row)] = int(order["seed"].iloc[(len(order) - 1) // 2])
-    shown = final_evaluations(evaluations)
-    starts = headline.size(shown["start"].to_numpy())
-    return seeds, int(shown["episode"].iloc[int(np.argmax(starts))])

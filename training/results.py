@@ -116,9 +116,13 @@ def machine() -> dict[str, object]:
 
 def part_name(row: Row, seed: int) -> str:
     """Name of the files of a run."""
-    letters = (letter if letter.isalnum() or letter in ".=+_" else "-" for letter in row.name)
-    words = "".join(letters).strip("-").lower()
-    return f"{words}-seed{seed}"
+    return f"{file_words(row.name)}-seed{seed}"
+
+
+def file_words(text: str) -> str:
+    """A text as part of a file's name."""
+    letters = (letter if letter.isalnum() or letter in ".=+_" else "-" for letter in text)
+    return "".join(letters).strip("-").lower()
 
 
 def checkpoint_file(folder: Path, row: Row, seed: int) -> Path:
@@ -215,13 +219,7 @@ class Results:
     def runs(self) -> pd.DataFrame:
         """Of the runs that are done, in the order of the rows and seeds."""
         path = self.folder / "runs.csv"
-        if path.exists():
-            runs = _read_csv(path)
-        elif files := _parts_of(self.folder, "runs"):
-            runs = _concatenated(files)
-        else:
-            return pd.DataFrame(columns=list(COLUMNS["runs"]))
-        _check_columns(path, "runs", list(runs.columns))
+        runs = _read_csv(path) if path.exists() else self._table("runs")
         order = {row.name: place for place, row in enumerate(self.study.rows)}
         return runs.sort_values(
             ["row", "seed"], key=lambda values: values.map(order).fillna(values), ignore_index=True
@@ -276,9 +274,11 @@ def _read_csv(path: Path) -> pd.DataFrame:
         text = pd.read_csv(path, dtype=str)
         # By way of texts, so that every number keeps its bits.
         types = {name: int if name in _COUNTS else float for name in text.columns[1:]}
-        return text.astype(types)
+        runs = text.astype(types)
     except ValueError as error:  # an empty file, or a value that is not of the column's type
         raise ResultsError(f"{path}: expected the runs of a study: {error}") from None
+    _check_columns(path, "runs", list(runs.columns))
+    return runs
 
 
 def _check_columns(path: Path, name: str, present: list[str]) -> None:

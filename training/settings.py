@@ -4,7 +4,6 @@ Imports neither torch nor pandas.
 """
 
 import json
-import tomllib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from hashlib import blake2b
@@ -13,12 +12,12 @@ from typing import Annotated, Any, Final, Literal
 
 from ..agents import ALGORITHMS, CONTROLLERS, Config, find_preset, preset
 from ..agents.presets import PresetName
-from ..envs.config import DEFAULT_ENV, EnvConfig
+from ..envs.config import DEFAULT_ENV, EnvConfig, read_toml
 from ..envs.registry import env_spec, load
 from ..flights.trajectories import EpisodeSet
 from ..models import Backend
 from ..models.errors import InputError, shortened
-from ..models.fields import Limits, check_fields, check_names
+from ..models.fields import Limits, check_fields, read_table
 
 MIN_FLIGHTS: Final = 200
 """Evaluation flights of each row of a study, over all its seeds."""
@@ -35,18 +34,15 @@ class Run:
     """Of the training, with its backend."""
     algorithm: str
     config: Config
-    seed: int
+    seed: Annotated[int, Limits(0, whole=True)]
     env_steps: int
     """Of all drones together."""
-    num_envs: int = 1
+    num_envs: Annotated[int, Limits(1, whole=True)] = 1
     """Drones that train it at the same time."""
 
     def __post_init__(self) -> None:
+        check_fields(self)
         drones = self.env.drones
-        if self.seed < 0:
-            raise InputError(f"seed: expected 0 or more, got {self.seed}")
-        if self.num_envs < 1:
-            raise InputError(f"num_envs: expected 1 or more, got {self.num_envs}")
         if self.num_envs % drones != 0:
             raise InputError(
                 f"num_envs: expected a multiple of drones = {drones}, got {self.num_envs}"
@@ -92,14 +88,25 @@ class Row:
         backend = self.env.backend.name
         if backend != "mujoco":
             raise InputError(f"env: expected the backend mujoco, for evaluation, got {backend}")
-        brought = self._brought_to(self.env)
-        env = self.env.changed(**brought) if brought else self.env
-        self._set(env=env, name=self.name or self._name_of(env))
-        if env_spec(env).headline is None:
-            raise InputError(f"env_id: expected one that names a metric, got {env.env_id}")
+        usual = EnvConfig(env_id=self.env.env_id).flat_options()
+        given = self.env.flat_options()
+        brought = {k: v for k, v in self.brought.items() if given.get(k) == usual.get(k)}
+        if brought:
+            self._set(env=self.env.changed(**brought))
+        self._set(name=self.name or self.default_name)
+        if env_spec(self.env).headline is None:
+            raise InputError(f"env_id: expected one that names a metric, got {self.env.env_id}")
         if self.controller:
             return
-        self._set_defaults()
+        found = find_preset(self.agent, self.preset, self.env.env_id)
+        drones = self.env.drones
+        whole_worlds = max(found.num_envs // drones, 1) * drones
+        self._set(
+            env_steps=self.env_steps or found.env_steps,
+            num_envs=self.num_envs or whole_worlds,
+            backend=self.backend or found.backend,
+            set=json.loads(json.dumps(dict(self.set))),
+        )
         try:
             self.run(0)
         except InputError as error:
@@ -109,31 +116,21 @@ class Row:
         for name, value in values.items():
             object.__setattr__(self, name, value)
 
-    def _brought_to(self, env: EnvConfig) -> dict[str, str]:
-        """Options that the controller needs, where the env has the task's defaults."""
-        usual = EnvConfig(env_id=env.env_id).flat_options()
-        given = env.flat_options()
-        return {k: v for k, v in self.brought.items() if given.get(k) == usual.get(k)}
-
-    def _set_defaults(self) -> None:
-        found = find_preset(self.agent, self.preset, self.env.env_id)
-        drones = self.env.drones
-        usual = max(found.num_envs // drones, 1) * drones  # whole worlds
-        self._set(
-            env_steps=self.env_steps or found.env_steps,
-            num_envs=self.num_envs or usual,
-            backend=self.backend or found.backend,
-            set=json.loads(json.dumps(dict(self.set))),
-        )
-
-    def _name_of(self, env: EnvConfig) -> str:
+    @property
+    def default_name(self) -> str:
+        """Name of a row that is given none."""
         words = [self.agent]
         if not self.controller:
             words.append(self.preset)
         words += [f"{name}={_word(value)}" for name, value in self.set.items()]
-        return " ".join([*words, self._task_words(env)])
+        return " ".join([*words, self.task])
 
-    def _task_words(self, env: EnvConfig) -> str:
+    @property
+    def task(self) -> str:
+        """The env in words: its name, options that are neither the task's defaults nor a
+        controller's, the vehicle.
+        """
+        env = self.env
         usual = {**EnvConfig(env_id=env.env_id).flat_options(), **self.brought}
         words = [env.env_id.rpartition("/")[2]]
         for name, value in env.flat_options().items():
@@ -144,18 +141,6 @@ class Row:
         if env.vehicle:
             words.append(f"with {','.join(env.vehicle)}")
         return " ".join(words)
-
-    @property
-    def default_name(self) -> str:
-        """Name of a row that is given none."""
-        return self._name_of(self.env)
-
-    @property
-    def task(self) -> str:
-        """The env in words: its name, options that are neither the task's defaults nor a
-        controller's, the vehicle.
-        """
-        return self._task_words(self.env)
 
     @property
     def controller(self) -> bool:
@@ -195,13 +180,12 @@ class Row:
 
         Raises `InputError`, whose sentence begins with `where`.
         """
-        given = _fields(where, table, cls)
-        if "agent" not in given:
-            raise InputError(f"{where}: expected an agent, got none")
-        _table(f"{where}: set", given.get("set", {}))
-        own = _table(f"{where}: env", given.get("env", {}))
         try:
-            return cls(**{**given, "env": env_from({**(env or {}), **own})})
+            given = _table("row", table)
+            given["set"] = _table("set", given.get("set", {}))
+            own = _table("env", given.get("env", {}))
+            given["env"] = env_from({**(env or {}), **own})
+            return read_table(cls, given, "row")
         except InputError as error:
             raise InputError(f"{where}: {error}") from None
 
@@ -272,12 +256,9 @@ class Study:
     @classmethod
     def from_dict(cls, where: str, content: object) -> "Study":
         """Raises `InputError`, whose sentence begins with `where`."""
-        given = _fields(where, content, cls)
-        rows = [
-            Row.from_dict(f"{where}: row {place}", table)
-            for place, table in enumerate(given.pop("rows", []), 1)
-        ]
-        return cls(rows=tuple(rows), **given)
+        given = _table(where, content)
+        given["rows"] = _rows(where, given.get("rows", []), {})
+        return read_table(cls, given, where)
 
     @classmethod
     def from_toml(cls, path: Path, defaults: Mapping[str, object] | None = None) -> "Study":
@@ -292,32 +273,17 @@ class Study:
         tables = content.pop("row")
         if type(tables) is not list:
             raise InputError(f"{path}: row: expected [[row]] tables, got {shortened(tables)}")
-        given = _fields(f"{path}", content, cls)
-        rows = [
-            Row.from_dict(f"{path}: row {place}", table, env)
-            for place, table in enumerate(tables, 1)
-        ]
-        return cls(**{**(defaults or {}), "rows": tuple(rows), **given})
+        rows = _rows(f"{path}", tables, env)
+        return read_table(cls, {**(defaults or {}), **content, "rows": rows}, f"{path}")
 
 
-def read_toml(path: Path) -> dict[str, Any]:
-    """Content of a TOML file. Raises `InputError`."""
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: expected a TOML file of rows: {error.strerror}") from None
-    except ValueError as error:
-        raise InputError(f"{path}: expected a TOML file of rows, got: {error}") from None
+def _rows(where: str, tables: list[object], env: Mapping[str, object]) -> tuple[Row, ...]:
+    return tuple(
+        Row.from_dict(f"{where}: row {place}", table, env) for place, table in enumerate(tables, 1)
+    )
 
 
 def _table(where: str, table: object) -> dict[str, Any]:
     if not isinstance(table, dict):
         raise InputError(f"{where}: expected a table, got {shortened(table)}")
     return dict(table)
-
-
-def _fields(where: str, table: object, kind: type[Row | Study]) -> dict[str, Any]:
-    """The table. Raises `InputError` unless each name is a field."""
-    given = _table(where, table)
-    check_names(given, [one.name for one in fields(kind)], where)
-    return given

@@ -2,7 +2,7 @@
 
 import math
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict, replace
 from functools import partial
@@ -15,11 +15,9 @@ import pandas as pd
 
 from ..agents import CONTROLLERS
 from ..agents.checkpoints import Checkpoint, store
-from ..agents.policies import Policy
 from ..envs.autoreset import AdvancingVectorEnv
 from ..envs.config import EnvConfig
 from ..envs.registry import env_spec, load
-from ..envs.spec import EnvSpec
 from ..flights.executors import OnProgress, Tell, WorkersConfig, open_executor, run_jobs
 from ..flights.folders import locked
 from ..flights.trajectories import Trajectory, fly_episodes
@@ -28,21 +26,13 @@ from . import results
 from .metrics import Headline, measure_episode, measure_run
 from .results import CONFIG_FILE, PARTS
 from .settings import Row, Study
-from .training import Training, train_run
+from .training import Snapshot, Training
 
 MAX_BATCH: Final = 64
 """Most evaluation episodes that are flown at a time."""
 
 Job = tuple[Row, int]
 """A row and a seed."""
-
-
-class Stage(NamedTuple):
-    """A policy, and the training behind it."""
-
-    policy: Callable[[EnvSpec], Policy]
-    env_steps: int = 0
-    seconds: float = 0.0
 
 
 class Done(NamedTuple):
@@ -122,25 +112,24 @@ def _fly(study: Study, own_tasks: set[str], job: Job, tell: Tell) -> Done:
     for task in own_tasks:
         load(task)
     if row.controller:
-        stages = [Stage(CONTROLLERS[row.agent])]
+        policy = CONTROLLERS[row.agent](env_spec(row.env))
         times = {"env_steps": 0, "seconds": 0.0, "steps_per_second": np.nan}
-        return Done(_evaluate(study, row, seed, stages, times), None)
+        untrained = [Snapshot(env_steps=0, seconds=0.0, policy=policy)]
+        return Done(_evaluate(study, row, seed, untrained, times), None)
     run = row.run(seed)
     with open_env(study.wire, run.env, run.num_envs) as env:
-        training, times = train_run(run, env, tell, study.snapshots, study.keep_steps)
-    stages = []
-    for taken in training.taken:
-        stages.append(Stage(_constant(taken.policy), taken.env_steps, taken.seconds))
-    tables = _evaluate(study, row, seed, stages, times)
+        training = Training(run, env, snapshots=study.snapshots, keep_steps=study.keep_steps)
+        training.train(tell=tell)
+    steps = training.log.env_steps
+    seconds = training.log.seconds
+    times = {"env_steps": steps, "seconds": seconds, "steps_per_second": steps / seconds}
+    tell(run.env_steps, run.env_steps, "evaluating")
+    tables = _evaluate(study, row, seed, training.taken, times)
     tables["episodes"] = _episodes(training)
     if study.keep_steps:
-        steps = _steps("train", **training.log.steps())
-        tables["steps"] = pd.concat([steps, tables["steps"]], ignore_index=True)
+        flown = _steps("train", **training.log.steps())
+        tables["steps"] = pd.concat([flown, tables["steps"]], ignore_index=True)
     return Done(tables, training.checkpoint())
-
-
-def _constant(policy: Policy) -> Callable[[EnvSpec], Policy]:
-    return lambda spec: policy
 
 
 @contextmanager
@@ -159,34 +148,40 @@ def open_env(wire: bool, config: EnvConfig, num_envs: int) -> Iterator[Advancing
 
 
 def _evaluate(
-    study: Study, row: Row, seed: int, stages: Sequence[Stage], times: dict[str, float]
+    study: Study, row: Row, seed: int, snapshots: Sequence[Snapshot], times: dict[str, float]
 ) -> dict[str, pd.DataFrame]:
-    """Tables of the evaluation of all stages: the last on `study.episodes` episodes of its own,
+    """Tables of the evaluation of all snapshots: the last on `study.episodes` episodes of its own,
     each before it on `study.curve_episodes` of the set `curve`.
     """
     rows: list[dict[str, object]] = []
     flown: list[Trajectory] = []
     drones = row.env.drones
-    most = max(study.curve_episodes, study.episodes) if len(stages) > 1 else study.episodes
+    most = study.episodes
+    if len(snapshots) > 1:
+        most = max(most, study.curve_episodes)
     worlds = min(most, max(MAX_BATCH // drones, 1))
     with open_env(study.wire, row.env, worlds * drones) as env:
         headline = Headline.of(env.env_spec)
-        for stage in stages:
-            last = stage is stages[-1]
+        for one in snapshots:
+            last = one is snapshots[-1]
             count = study.episodes if last else study.curve_episodes
             episodes = study.evaluation if last else "curve"
-            policy = stage.policy(env.env_spec)
-            flown = fly_episodes(env, policy, count, episodes, training_seed=seed)
+            flown = fly_episodes(env, one.policy, count, episodes, training_seed=seed)
             label = {"row": row.name, "seed": seed}
-            label |= {"env_steps": stage.env_steps, "seconds": stage.seconds}
-            rows += [label | measure_episode(one, headline) for one in flown]
+            label |= {"env_steps": one.env_steps, "seconds": one.seconds}
+            rows += [label | measure_episode(each, headline) for each in flown]
     evaluations = pd.DataFrame(rows)
     measures = {**times, **measure_run(evaluations, headline)}
     if drones > 1:
         measures["least_distance"] = least_distance(flown)
     tables = {"runs": pd.DataFrame([measures]), "evaluations": evaluations}
     if study.keep_steps:
-        tables["steps"] = pd.concat([_flown_steps(one) for one in flown], ignore_index=True)
+        parts = []
+        for each in flown:
+            values = {"value": each.headline[1:], "thrust": each.mean_thrust[1:]}
+            steps = _steps("evaluation", episode=each.episode, reward=each.rewards, **values)
+            parts.append(steps)
+        tables["steps"] = pd.concat(parts, ignore_index=True)
     return tables
 
 
@@ -220,13 +215,6 @@ def _episodes(training: Training) -> pd.DataFrame:
     names = list(results.COLUMNS["episodes"][2:])
     drawn = [name for name in (rows[0] if rows else ()) if name not in names]
     return pd.DataFrame(rows, columns=[*names, *drawn])
-
-
-def _flown_steps(one: Trajectory) -> pd.DataFrame:
-    return _steps(
-        "evaluation", episode=one.episode, value=one.headline[1:], reward=one.rewards,
-        thrust=one.mean_thrust[1:],
-    )  # fmt: skip
 
 
 def _steps(phase: str, **columns: Any) -> pd.DataFrame:

@@ -1,11 +1,10 @@
 """The table of a study: one line for each row, measures over its seeds, as text.
 
-Cells are made once; the terminal, Markdown and HTML show the same ones.
+Cells are made once; the terminal and Markdown show the same ones.
 """
 
-import html
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
 from typing import Final, Literal, NamedTuple
 
@@ -38,7 +37,6 @@ class TaskTable(NamedTuple):
     """The rows that fly one task."""
 
     task: str
-    headline: Headline
     headings: tuple[str, ...]
     lines: list[tuple[Cell, ...]]
 
@@ -75,9 +73,7 @@ def results_table(results: Results) -> pd.DataFrame:
 
 def _measures(own: pd.DataFrame, headline: Headline) -> dict[str, float]:
     trained = own["env_steps"].max() > 0
-    line: dict[str, float] = {"seeds": len(own)}
-    for name in _COUNTS:
-        line[name] = int(own[name].sum())
+    line: dict[str, float] = {"seeds": len(own), **own[list(_COUNTS)].sum()}
     for name in own.columns.intersection(_MEASURES):
         values = own[name].to_numpy(float)
         line[name] = iqm(values)
@@ -125,7 +121,7 @@ def task_tables(results: Results, table: pd.DataFrame) -> list[TaskTable]:
         headline = results.headline(own[0])
         swarm = own[0].env.drones > 1 and "least_distance" in table
         lines = [_line(row, table.loc[row.name].to_dict(), headline, swarm) for row in own]
-        found.append(TaskTable(task, headline, headings(headline, swarm), lines))
+        found.append(TaskTable(task, headings(headline, swarm), lines))
     return found
 
 
@@ -156,7 +152,7 @@ def headings(headline: Headline, swarm: bool = False) -> tuple[str, ...]:
 
 def _line(row: Row, line: Mapping[str, float], headline: Headline, swarm: bool) -> tuple[Cell, ...]:
     seeds = int(line["seeds"])
-    names = [f"{seeds} seed{'s' * (seeds != 1)}"]
+    names = [seeds_text(seeds)]
     if not row.controller:
         names.append(f"{count_text(line['env_steps'])} env steps")
     settling = Cell(NOTHING)
@@ -179,6 +175,11 @@ def _line(row: Row, line: Mapping[str, float], headline: Headline, swarm: bool) 
         Cell(count_text(line["env_steps_to_hold"]), tuple(reached)),
         Cell(count_text(line["steps_per_second"])),
     )
+
+
+def seeds_text(count: int) -> str:
+    """1 seed, 2 seeds."""
+    return f"{count} seed{'s' * (count != 1)}"
 
 
 def row_label(row: Row) -> str:
@@ -253,59 +254,37 @@ def markdown(results: Results, table: pd.DataFrame) -> str:
     for task in tables:
         if len(tables) > 1:
             parts.append(f"## {task.task}")
-        rows = [tuple(map(_markdown_cell, line)) for line in task.lines]
-        parts.append(_markdown_table(task.headings, rows))
-    parts.append(NOTE)
-    return "\n\n".join(parts) + "\n"
+        lines = [list(task.headings), ["---"] + ["---:"] * (len(task.headings) - 1)]
+        for cells in task.lines:
+            lines.append([_in_parentheses(cell) for cell in cells])
+        texts = [" | ".join(cell.replace("|", r"\|") for cell in line) for line in lines]
+        parts.append("\n".join(f"| {text} |" for text in texts))
+    return "\n\n".join([*parts, NOTE]) + "\n"
 
 
-def _markdown_cell(cell: Cell) -> str:
+def _in_parentheses(cell: Cell) -> str:
     return f"{cell.value} ({'; '.join(cell.details)})" if cell.details else cell.value
 
 
-def _markdown_table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [titles, ["---", *["---:"] * (len(titles) - 1)], *rows]
-    # |E| in a cell would end the cell.
-    escaped = [[cell.replace("|", r"\|") for cell in line] for line in lines]
-    return "\n".join(f"| {' | '.join(line)} |" for line in escaped)
-
-
-def terminal_tables(results: Results, table: pd.DataFrame) -> list[Table]:
+def terminal_tables(results: Results, table: pd.DataFrame) -> Iterator[Table]:
     """The tables for a terminal of 100 columns."""
-    return [_terminal_table(task) for task in task_tables(results, table)]
-
-
-def _terminal_table(task: TaskTable) -> Table:
-    shown = Table(
-        title=task.task,
-        title_justify="left",
-        box=box.SIMPLE_HEAD,
-        padding=(0, 1, 0, 0),
-        show_edge=False,
-        pad_edge=False,
-        caption="Below a value: its 95 % interval, and how many episodes (or seeds) got there.",
-        caption_justify="left",
-    )
-    for place in _TERMINAL_COLUMNS:
-        justify: Literal["left", "right"] = "right" if place else "left"
-        shown.add_column(task.headings[place], justify=justify, overflow="fold")
-    for line in task.lines:
-        shown_cells = [line[place] for place in _TERMINAL_COLUMNS]
-        # Text, not markup: a name may hold brackets.
-        texts = [Text("\n".join([cell.value, *cell.details])) for cell in shown_cells]
-        shown.add_row(*texts, end_section=True)
-    return shown
-
-
-def html_table(task: TaskTable) -> str:
-    """A table in HTML."""
-    head = "".join(f"<th>{html.escape(heading)}</th>" for heading in task.headings)
-    lines = []
-    for line in task.lines:
-        lines.append(f"<tr>{''.join(map(_html_cell, line))}</tr>")
-    return f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(lines)}</tbody></table>"
-
-
-def _html_cell(cell: Cell) -> str:
-    details = "".join(f"<small>{html.escape(text)}</small>" for text in cell.details)
-    return f"<td>{html.escape(cell.value)}{details}</td>"
+    for task in task_tables(results, table):
+        shown = Table(
+            title=task.task,
+            title_justify="left",
+            box=box.SIMPLE_HEAD,
+            padding=(0, 1, 0, 0),
+            show_edge=False,
+            pad_edge=False,
+            caption="Below a value: its 95 % interval, and how many episodes (or seeds) got there.",
+            caption_justify="left",
+        )
+        for place in _TERMINAL_COLUMNS:
+            justify: Literal["left", "right"] = "right" if place else "left"
+            shown.add_column(task.headings[place], justify=justify, overflow="fold")
+        for line in task.lines:
+            cells = [line[place] for place in _TERMINAL_COLUMNS]
+            # Text, not markup: a name may hold brackets.
+            texts = [Text("\n".join([cell.value, *cell.details])) for cell in cells]
+            shown.add_row(*texts, end_section=True)
+        yield shown

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -26,11 +26,10 @@ _TELL_EVERY: Final = 0.2  # s
 
 def config_of(spec: EnvSpec, backend: Backend, vehicle: str | None = None) -> EnvConfig:
     """The config of a simulator's env, as far as its spec has it. Raises `InputError`."""
-    settings: dict[str, Any] = {"drones": len(spec.agents), "backend": backend}
-    settings["vehicle"] = vehicle
-    if is_known(spec.env_id):
-        return EnvConfig.from_keywords(spec.env_id, **settings, **spec.options)
-    return EnvConfig(env_id=spec.env_id, task=spec.options, **settings)
+    options = spec.options if is_known(spec.env_id) else {"task": spec.options}
+    return EnvConfig.from_keywords(
+        spec.env_id, drones=len(spec.agents), backend=backend, vehicle=vehicle, **options
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +38,7 @@ class Snapshot:
 
     env_steps: int
     seconds: float
-    policy: agents.NetworkPolicy
+    policy: agents.Policy
 
 
 def is_finished(kept: Checkpoint) -> bool:
@@ -210,16 +209,3 @@ class Training:
             seconds = log.seconds
             policy = self.agent.policy()
             self.taken.append(Snapshot(env_steps=log.env_steps, seconds=seconds, policy=policy))
-
-
-def train_run(
-    run: Run, env: AdvancingVectorEnv, tell: Tell, snapshots: int = 0, keep_steps: bool = False
-) -> tuple[Training, dict[str, float]]:
-    """Train to the end: the training, and its `env_steps`, `seconds` and `steps_per_second`."""
-    training = Training(run, env, snapshots=snapshots, keep_steps=keep_steps)
-    training.train(tell=tell)
-    steps = training.log.env_steps
-    seconds = training.log.seconds
-    tell(run.env_steps, run.env_steps, "evaluating")
-    times = {"env_steps": steps, "seconds": seconds, "steps_per_second": steps / seconds}
-    return training, times

@@ -300,9 +300,9 @@ def test_lines_come_every_ten_seconds_with_the_same_figures(
     clock = Clock()
     fly(Lines(clock), clock, "a2c seed 0", 25)
     assert capsys.readouterr().out.splitlines() == [
-        "a2c seed 0     0/200k  0:00  return 224, |E| 0.02 m",
-        "a2c seed 0     51,200/200k  5,120/s  0:10, 0:30 left  return 224, |E| 0.02 m",
-        "a2c seed 0     102.4k/200k  5,120/s  0:20, 0:20 left  return 224, |E| 0.02 m",
+        "a2c seed 0     0/200k 0:00 return 224, |E| 0.02 m",
+        "a2c seed 0     51,200/200k 5,120/s 0:10, 0:30 left return 224, |E| 0.02 m",
+        "a2c seed 0     102.4k/200k 5,120/s 0:20, 0:20 left return 224, |E| 0.02 m",
     ]
 
 
@@ -313,7 +313,7 @@ def test_what_was_flown_before_a_resume_is_no_rate(capsys: pytest.CaptureFixture
     clock.now += 10.0
     lines("a2c seed 0", 160_000, 200_000, "")
     assert capsys.readouterr().out.splitlines()[1] == (
-        "a2c seed 0     160k/200k  1,000/s  0:10, 0:40 left"
+        "a2c seed 0     160k/200k 1,000/s 0:10, 0:40 left"
     )
 
 
@@ -327,7 +327,7 @@ def test_the_rate_is_that_of_the_last_seconds(capsys: pytest.CaptureFixture[str]
         clock.now += 1.0
     lines("a2c seed 0", done, 10_000_000, "")
     *_, last = capsys.readouterr().out.splitlines()
-    assert "  500/s  1h06m, 3h20m left" in last
+    assert " 500/s 1h06m, 3h20m left" in last
 
 
 def test_a_run_that_is_done_says_so(capsys: pytest.CaptureFixture[str]) -> None:
@@ -336,7 +336,7 @@ def test_a_run_that_is_done_says_so(capsys: pytest.CaptureFixture[str]) -> None:
     lines("vpg seed 1", 0, 60, "simulate")
     clock.now += 2.0
     lines("vpg seed 1", 60, 60, "done")
-    assert capsys.readouterr().out.splitlines()[-1] == "vpg seed 1     60/60  0:02  done"
+    assert capsys.readouterr().out.splitlines()[-1] == "vpg seed 1     60/60 0:02 done"
     bars = Bars(Console(width=80, file=io.StringIO(), force_terminal=True), clock)
     bars("vpg seed 1", 60, 60, "done")
     assert drawn(bars, 80) == [], "it makes room"

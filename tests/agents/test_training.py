@@ -47,8 +47,8 @@ def env_of(run: Run, **changes: Any) -> Any:
 @pytest.mark.parametrize(
     ("algorithm", "changes", "sentence"),
     [
-        ("a2c", {"seed": -1}, "seed: expected 0 or more, got -1"),
-        ("a2c", {"num_envs": 0}, "num_envs: expected 1 or more, got 0"),
+        ("a2c", {"seed": -1}, "seed: expected a whole number of at least 0, got -1"),
+        ("a2c", {"num_envs": 0}, "num_envs: expected a whole number of at least 1, got 0"),
         # Whole steps of 4 drones.
         ("a2c", {"env_steps": 71}, "env_steps: expected at least 72, got 71"),
         # An episode of each.

@@ -24,8 +24,3 @@ def test_an_extended_training_is_one_of_as_many_env_steps(
     actor, other = (load(path / "checkpoint.safetensors").actor for path in (first, whole))
     assert {k: v.tobytes() for k, v in actor.items()} == {k: v.tobytes() for k, v in other.items()}
     assert json.loads((first / "config.json").read_text())["env_steps"] == 1280
-
-
-def test_a_list_without_brackets_names_the_syntax(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["train", "a2c", "--set", "hidden=64,64"]) == 1
-    assert "set: expected a list as hidden=[64,64], got 'hidden=64,64'" in capsys.readouterr().err

@@ -8,49 +8,35 @@ from typing import get_args, get_type_hints
 
 import mujoco
 import pytest
-from rotorgram.cli import main
+from commands import WRONG, Capsys, output, run, words_of
 from rotorgram.cli import vehicle as command
 from rotorgram.models import Vehicle
 from rotorgram.models.vehicle_file import FRAMES
 
 DATA = Path(__file__).parents[1] / "data"
-SHARED = """
-[body]
-mass = 1.6
-inertia = [0.02, 0.02, 0.035]
-
-[rotors]
-thrust = [0.0, 6.0]
-reaction = 0.016
-
-"""
 
 
-def run(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str, str]:
-    status = main(["vehicle", *map(str, words)])
-    captured = capsys.readouterr()
-    return status, captured.out, captured.err
+def vehicle(capsys: Capsys, *words: object) -> str:
+    """Output of `rotorgram vehicle`, which ends well."""
+    return output(capsys, "vehicle", *words)
 
 
 @pytest.mark.parametrize("frame", [*FRAMES, "list"])
-def test_a_new_file_flies_as_it_is(
-    frame: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_new_file_flies_as_it_is(frame: str, tmp_path: Path, capsys: Capsys) -> None:
     file = tmp_path / "mine.toml"
-    status, out, _ = run(capsys, "new", file, "--frame", frame)
-    assert status == 0
+    out = vehicle(capsys, "new", file, "--frame", frame)
     assert out == f"vehicle: {file} (rotorgram vehicle check {file} examines it)\n"
-    vehicle = Vehicle.load(file)
-    assert vehicle.num_rotors == {"hexa": 6, "octo": 8}.get(frame, 4)
-    assert vehicle.thrust_high.sum() == pytest.approx(30.0)
-    assert run(capsys, "check", file)[0] == 0
+    craft = Vehicle.load(file)
+    assert craft.num_rotors == {"hexa": 6, "octo": 8}.get(frame, 4)
+    assert craft.thrust_high.sum() == pytest.approx(30.0)
+    vehicle(capsys, "check", file)
 
 
 def test_a_new_file_is_still_one_with_what_its_comments_offer(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: Capsys
 ) -> None:
     file = tmp_path / "mine.toml"
-    run(capsys, "new", file, "--frame", "list")
+    vehicle(capsys, "new", file, "--frame", "list")
     text = file.read_text(encoding="utf-8")
     offered = re.sub(r"^# (?=\[|\w+ = )", "", text, flags=re.MULTILINE)
     file.write_text(offered, encoding="utf-8")
@@ -68,7 +54,7 @@ def test_the_frames_are_those_of_the_file() -> None:
     assert get_args(hint) == (*FRAMES, "list")
 
 
-def test_show(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_show(tmp_path: Path, capsys: Capsys) -> None:
     file = tmp_path / "mine.toml"
     file.write_text(
         'name = "shown"\n[body]\ninertia = [0.02, 0.021, 0.035]\n[body.mass]\nvalue = 2\n'
@@ -77,8 +63,7 @@ def test_show(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         '[[cameras]]\nname = "low"\nresolution = [160, 120]\nrate = 0.5\nlook = [0, 0, -1]\n'
         'kinds = ["rgb", "depth"]\nfovy = 1.0\n'
     )
-    status, out, _ = run(capsys, "show", file)
-    assert status == 0
+    out = vehicle(capsys, "show", file)
     assert out.startswith(f"shown ({file})\n")
     for line in (
         "mass              2 kg",
@@ -95,80 +80,52 @@ def test_show(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     ):
         assert f"\n{line}\n" in out
     for what in (DATA / "tiny.xml", Vehicle.load().path):
-        status, out, _ = run(capsys, "show", what)
-        assert status == 0
+        out = vehicle(capsys, "show", what)
         assert "\nmass " in out
 
 
-def test_show_has_what_a_models_file_tells(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_show_has_what_a_models_file_tells(tmp_path: Path, capsys: Capsys) -> None:
     model = (DATA / "racer.xml").read_text(encoding="utf-8")
     (tmp_path / "racer.xml").write_text(model, encoding="utf-8")
     file = tmp_path / "mine.toml"
     file.write_text('[model]\nfile = "racer.xml"\n[rotors]\nradius = 0.25\n')
     assert 'name="rotorgram/rotors.time_constant" data="0.05"' in model
-    status, out, _ = run(capsys, "show", file)
-    assert status == 0
+    out = vehicle(capsys, "show", file)
     numbers, others = out.split("\nnumbers of mine.toml\n")[1].split("coefficients of racer.xml\n")
     assert numbers == "rotors.radius = 0.25 m\n\n"
     assert "rotors.time_constant = 0.05\n" in others
     assert "radius" not in others
 
 
-def test_export(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_export(tmp_path: Path, capsys: Capsys) -> None:
     file = tmp_path / "mine.toml"
     out = tmp_path / "mine.xml"
-    run(capsys, "new", file)
-    status, words, _ = run(capsys, "export", file, out)
-    assert status == 0
+    vehicle(capsys, "new", file)
+    words = vehicle(capsys, "export", file, out)
     assert words == f"vehicle: {out}\n"
     model = mujoco.MjModel.from_xml_path(str(out))
     assert model.body_mass[1] == 1.5
-    assert run(capsys, "export", DATA / "hexa.xml", tmp_path / "hexa.xml")[0] == 0
-    assert Vehicle.load(tmp_path / "hexa.xml").num_rotors == 6
+    vehicle(capsys, "export", DATA / "hexa.xml", tmp_path / "hexa.xml")
     again = Vehicle.load(tmp_path / "hexa.xml")
+    assert again.num_rotors == 6
     assert again.mass == pytest.approx(Vehicle.load(DATA / "hexa.xml").mass, rel=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        (["new", "mine.xml"], "file: expected a name that ends in .toml, got mine.xml"),
-        (["new", "there.toml"], "file: expected the name of a new file, got there.toml"),
-        (["export", "there.toml"], "vehicle: expected two files, .*, got one"),
-        (["export", "there.toml", "x.txt"], "out: expected a file that ends in .xml, got x.txt"),
-        (
-            ["export", "paper", "there.xml"],
-            "out: expected the name of a new file, got there.xml, wh",
-        ),
-        (["show", "there.toml", "x.xml"], "vehicle: expected one file for show, got x.xml too"),
-        (["show", "there.toml", "--frame", "cross"], "frame: expected no --frame but with new"),
-        (["show", "nobodys"], "vehicle: expected a file, or one of .*paper.*, got 'nobodys'"),
-        (["check", "nowhere.toml"], "vehicle: cannot read nowhere.toml: No such file"),
-        (["check", "there.toml"], "vehicle: expected a table .body., or .model. .*, got neither"),
-    ],
-)
+@pytest.mark.parametrize(("line", "sentence"), WRONG["vehicle"])
 def test_wrong_words_are_one_sentence(
-    words: list[str],
-    sentence: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    line: str, sentence: str, tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("there.toml").touch()
     Path("there.xml").touch()
-    status, out, err = run(capsys, *words)
-    assert status == (2 if words[0] == "check" else 1)
+    status, out, err = run(capsys, "vehicle", *words_of(line))
+    assert status == (2 if line.startswith("check") else 1)
     assert out == ""
     assert re.match(rf"rotorgram: {sentence}.*\n$", err)
 
 
-def test_an_action_that_there_is_not(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as caught:
-        run(capsys, "fly", "x.toml")
-    assert caught.value.code == 2
+def test_an_action_that_there_is_not(capsys: Capsys) -> None:
+    assert run(capsys, "vehicle", "fly", "x.toml")[0] == 2
 
 
 def test_a_wrong_flag_loads_nothing_heavy() -> None:
@@ -183,36 +140,16 @@ def test_a_wrong_flag_loads_nothing_heavy() -> None:
     assert done.stdout == "set()\n"
 
 
-def test_every_command_takes_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_command_takes_the_file(tmp_path: Path, capsys: Capsys) -> None:
     file = tmp_path / "mine.toml"
     folder = tmp_path / "run"
-    run(capsys, "new", file, "--frame", "hexa")
-    task = ["--env", "rotorgram/Hover-v0", "--vehicle", str(file)]
-    assert main(["train", "a2c", *task, "--env-steps", "256", "--out", str(folder)]) == 0
-    journal = str(tmp_path / "flight.mcap")
-    evaluate = ["evaluate", str(folder), "--episodes", "1", "--vehicle", str(file)]
-    assert main([*evaluate, "--record", journal]) == 0
-    assert main(["replay", journal, "--verify", "--vehicle", str(file)]) == 0
-    capsys.readouterr()
-    assert main(["replay", journal, "--verify"]) == 1  # the paper's has other rotors
-    assert re.search("the vehicle was .*: --vehicle names its file", capsys.readouterr().out)
-
-
-def test_show_has_a_hover_thrust_for_each_rotor_and_names_coaxial_pairs(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    corners = ((0.2, 0.2), (0.2, -0.2), (-0.2, -0.2), (-0.2, 0.2))
-    rotors = ""
-    for layer, height in (("top", 0.05), ("low", -0.05)):
-        for i, (x, y) in enumerate(corners):
-            turn = "cw" if (layer == "top") == (i % 2 == 0) else "ccw"
-            rotors += f'[[rotors.list]]\nname = "{layer}{i}"\nturn = "{turn}"\n'
-            rotors += f"position = [{x}, {y}, {height}]\n"
-    file = tmp_path / "x8.toml"
-    file.write_text(f"{SHARED}{rotors}")
-    status, out, _ = run(capsys, "show", file)
-    assert status == 0
-    (hover,) = (line for line in out.splitlines() if line.startswith("hover thrust"))
-    assert hover == "hover thrust      " + ", ".join(["1.962"] * 8) + " N"
-    assert "top0 is above low0: low0 loses no thrust in its wake here" in out
-    assert "low0 is above" not in out
+    journal = tmp_path / "flight.mcap"
+    own = ("--vehicle", file)
+    vehicle(capsys, "new", file, "--frame", "hexa")
+    task = ("--env", "rotorgram/Hover-v0", *own)
+    output(capsys, "train", "a2c", *task, "--env-steps", 256, "--out", folder)
+    output(capsys, "evaluate", folder, "--episodes", 1, *own, "--record", journal)
+    output(capsys, "replay", journal, "--verify", *own)
+    status, out, _ = run(capsys, "replay", journal, "--verify")
+    assert status == 1  # the paper's has other rotors
+    assert re.search("the vehicle was .*: --vehicle names its file", out)

@@ -21,52 +21,68 @@ from scipy.optimize import linprog
 
 
 def flown(distance: float, towards: float, against: float, **rest: float) -> np.ndarray:
-    one = np.array([distance]), 250, 0.02, np.array([towards]), np.array([against])
-    return bang_bang(*one, **rest)[0]
+    accelerations = np.array([towards]), np.array([against])
+    return bang_bang(np.array([distance]), 250, 0.02, *accelerations, **rest)[0]
+
+
+def seconds(*times: float) -> list[int]:
+    """Places of the steps that end at these times."""
+    return [round(time / 0.02) - 1 for time in times]
 
 
 def test_equal_accelerations_meet_in_the_middle() -> None:
     # 4 m at 1 m/s²: two seconds of thrust, two of braking.
     left = flown(4.0, 1.0, 1.0)
-    assert left[[49, 99, 149, 199, 249]] == pytest.approx([3.5, 2.0, 0.5, 0.0, 0.0], abs=1e-4)
+    found = left[seconds(1, 2, 3, 4, 5)]
+    assert found == pytest.approx([3.5, 2.0, 0.5, 0.0, 0.0], abs=1e-4)
 
 
 def test_unequal_accelerations_switch_earlier_or_later() -> None:
     # t_1 = sqrt(2 d b / (a (a + b))) and t_2 = a t_1 / b: 1 s and 3 s for d = 6 m, a = 3, b = 1.
     left = flown(6.0, 3.0, 1.0)
-    assert left[[49, 199]] == pytest.approx([4.5, 0.0], abs=1e-4)
+    found = left[seconds(1, 4)]
+    assert found == pytest.approx([4.5, 0.0], abs=1e-4)
 
 
 def test_limited_changes_take_four_equal_parts() -> None:
     # Steps of 0.1 m/s² each 0.02 s are 5 m/s³. Four parts of n steps, from 0 to 0.1 n m/s² and
     # back, twice: the sum of sums gives 2 n³ · 0.1 · 0.02² m.
     steps = 20
-    left = flown(2 * steps**3 * 0.1 * 0.02**2, 50.0, 50.0, change=0.1)
-    assert abs(left[4 * steps :]).max() < 1e-4
+    distance = 2 * steps**3 * 0.1 * 0.02**2
+    left = flown(distance, 50.0, 50.0, change=0.1)
+    after = left[4 * steps :]
+    assert abs(after).max() < 1e-4
     assert left[4 * steps - 4] > 1e-4
     assert left[2 * steps - 1] == pytest.approx(left[0] / 2, rel=0.05)
 
 
 def test_drag_makes_way_and_braking_shorter() -> None:
-    assert flown(6.0, 3.0, 1.0, drag=1.0)[49] > flown(6.0, 3.0, 1.0)[49]
-    assert abs(flown(1.0, 3.0, 1.0, drag=1.0)[-1]) < 1e-4
+    slowed = flown(6.0, 3.0, 1.0, drag=1.0)
+    free = flown(6.0, 3.0, 1.0)
+    assert slowed[49] > free[49]
+    short = flown(1.0, 3.0, 1.0, drag=1.0)
+    assert abs(short[-1]) < 1e-4
 
 
 def test_returns_of_the_papers_task() -> None:
     starts = (np.arange(40) - 19.5) / 20
-    bounds = elevation_bounds(EnvConfig(), Vehicle.load(), starts)
+    paper = Vehicle.load()
+    bounds = elevation_bounds(EnvConfig(), paper, starts)
     # (s - |E|) / (s + |E|) with s = 0.5 m, over |E| uniform in 0 to 1 m: log 3 - 1 per step.
     assert bounds["hover"] == pytest.approx(250 * (np.log(3) - 1), rel=0.005)
     assert bounds["time-optimal"] == pytest.approx(232, abs=1)
     # Nothing is better than to be there at once, and thrust without inertia is better than with.
-    free = elevation_bounds(EnvConfig(task={"thrust_scale": 100.0}), Vehicle.load(), starts)
+    without_inertia = EnvConfig(task={"thrust_scale": 100.0})
+    free = elevation_bounds(without_inertia, paper, starts)
     assert bounds["time-optimal"] < free["time-optimal"] < 250
-    assert elevation_reward(np.array([0.0, 0.5, -1.5])).tolist() == [1.0, 0.0, -0.5]
+    rewards = elevation_reward(np.array([0.0, 0.5, -1.5]))
+    assert rewards.tolist() == [1.0, 0.0, -0.5]
 
 
 def test_offsets_limit_the_acceleration_and_not_its_change() -> None:
     config = EnvConfig(action="offset", effects={"linear_drag": 2.0})
-    bounds = elevation_bounds(config, Vehicle.load(linear_drag=2.0), np.array([1.0]))
+    vehicle = Vehicle.load(linear_drag=2.0)
+    bounds = elevation_bounds(config, vehicle, np.array([1.0]))
     left = flown(1.0, 4.0, 4.0, drag=2.0)  # four rotors, 20 N each, 20 kg
     assert bounds["time-optimal"] == pytest.approx(elevation_reward(left).sum())
 
@@ -105,8 +121,10 @@ def test_the_largest_return_is_nearly_that_of_the_time_optimal_flight(start: flo
     returns = [-np.inf]
     while len(returns) < 4 or returns[-1] > returns[-2] + 1e-3:
         weights = np.concatenate([np.zeros(steps), slopes])
-        sizes = linprog(weights, limits, most, bounds=box).x[steps:]
-        returns.append(float(elevation_reward(sizes).sum()) + 250 - steps)
+        found = linprog(weights, limits, most, bounds=box)
+        sizes = found.x[steps:]
+        flown_return = float(elevation_reward(sizes).sum())
+        returns.append(flown_return + 250 - steps)
         slopes = 1 / (0.5 + sizes) ** 2
     best = max(returns)
     optimal = elevation_bounds(EnvConfig(), Vehicle.load(), np.array([start]))
@@ -118,19 +136,23 @@ def test_least_time_of_a_course_by_hand() -> None:
     east = (2.0, 0.0, 0.0)
     none = np.zeros(2)
     # 1 m/s² without gravity: 2 m take sqrt(2 · 2) s, and there and back 2 sqrt(2) + sqrt(2 · 2) s.
-    assert course_time(np.array((start, east)), none[:1], 1.0, 0.0) == pytest.approx(2.0)
+    there = np.array((start, east))
+    assert course_time(there, none[:1], 1.0, 0.0) == pytest.approx(2.0)
     back = np.array((start, east, start))
-    assert course_time(back, none, 1.0, 0.0) == pytest.approx(2 * np.sqrt(2) + 2)
+    expected = 2 * np.sqrt(2) + 2
+    assert course_time(back, none, 1.0, 0.0) == pytest.approx(expected)
     # A radius of 0.5 m: 1.5 m there, 1 m back.
     near = course_time(back, none + 0.5, 1.0, 0.0)
     assert near == pytest.approx(2 * np.sqrt(1.5) + np.sqrt(2))
     # A point on the way does not stop it, and one within reach of the start takes no time.
     on = np.array((start, (1.0, 0.0, 0.0), east))
     assert course_time(on, none, 1.0, 0.0) == pytest.approx(2.0)
-    assert course_time(np.array((start, east)), np.array((2.0,)), 1.0, 0.0) == 0.0
+    assert course_time(there, np.array((2.0,)), 1.0, 0.0) == 0.0
     # Along u of 30° above the way, 2 m away: cos 30° · 2 m by 5 - 3 sin 30° m/s².
-    level = course_time(np.array((start, east)), none[:1], 5.0, 3.0)
-    largest = max(np.cos(e) / (5 - 3 * np.sin(e)) for e in np.radians(np.arange(0, 80, 10)))
+    level = course_time(there, none[:1], 5.0, 3.0)
+    angles = np.radians(np.arange(0, 80, 10))
+    ratios = np.cos(angles) / (5 - 3 * np.sin(angles))
+    largest = ratios.max()
     assert level == pytest.approx(np.sqrt(2 * 2 * largest))
     # Level flight has 4 of the 5 m/s², and nothing is faster: sqrt(2 · 2 / 4) s, within 1 %.
     assert 0.99 < level <= 1.0
@@ -138,7 +160,9 @@ def test_least_time_of_a_course_by_hand() -> None:
 
 def test_courses_of_a_vehicle_with_more_points_or_rounds_take_longer() -> None:
     paper = Vehicle.load()
-    few, many = (waypoints_time(WaypointsOptions(points=n), paper, 8) for n in (2, 4))
-    once, twice = (racing_time(RacingOptions(laps=n), paper) for n in (1, 2))
+    few = waypoints_time(WaypointsOptions(points=2), paper, 8)
+    many = waypoints_time(WaypointsOptions(points=4), paper, 8)
     assert 0.0 < few < many
+    once = racing_time(RacingOptions(laps=1), paper)
+    twice = racing_time(RacingOptions(laps=2), paper)
     assert 0.0 < once < twice

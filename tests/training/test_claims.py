@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 from comparisons import GATES, HEADLINE, spec_of
 from rotorgram.training.claims import (
+    Verdict,
     convergence_step,
     fluctuation,
     judge_claims,
@@ -24,10 +25,12 @@ COUNT = 100
 def run(returns: np.ndarray, agent: str = "a2c", seed: int = 0) -> pd.DataFrame:
     """The training episodes of a run, of 10 steps each."""
     number = np.arange(len(returns))
-    frame = pd.DataFrame({"episode": number, "first_step": number * LENGTH, "return": returns})
-    frame = frame.assign(row=agent, seed=seed, length=LENGTH, mean_size=0.0)
-    frame = frame.assign(last_step=frame["first_step"] + LENGTH)
-    return frame.assign(terminated=False, truncated=True, seconds=0.0)[list(COLUMNS["episodes"])]
+    begin = number * LENGTH
+    frame = pd.DataFrame({"episode": number, "first_step": begin, "return": returns})
+    frame["last_step"] = begin + LENGTH
+    frame = frame.assign(row=agent, seed=seed, length=LENGTH, mean_size=0.0, seconds=0.0)
+    frame = frame.assign(terminated=False, truncated=True)
+    return frame[list(COLUMNS["episodes"])]
 
 
 def step_at(episode: int, top: float = 1.0) -> np.ndarray:
@@ -35,46 +38,55 @@ def step_at(episode: int, top: float = 1.0) -> np.ndarray:
 
 
 def training(make: Callable[[str, int], np.ndarray], seeds: int = 50) -> pd.DataFrame:
-    return pd.concat(
-        run(make(agent, seed), agent, seed) for agent in ("a2c", "vpg") for seed in range(seeds)
-    )
+    runs = []
+    for agent in ("a2c", "vpg"):
+        runs += [run(make(agent, seed), agent, seed) for seed in range(seeds)]
+    return pd.concat(runs)
 
 
 def evaluated(**errors: list[float]) -> pd.DataFrame:
     """The table `runs`, of steady errors by agent; a seed holds below 0.1 m."""
-    rows = [
-        {"row": agent, "seed": seed, "steady": error, "held": int(error < 0.1)}
-        | {"episodes": 1, "crashed": 0}
-        for agent, values in errors.items()
-        for seed, error in enumerate(values)
-    ]
-    return pd.DataFrame(rows)
+    tables = []
+    for agent, values in errors.items():
+        table = pd.DataFrame({"steady": values}).rename_axis("seed").reset_index()
+        table["held"] = (table["steady"] < 0.1).astype(int)
+        tables.append(table.assign(row=agent, episodes=1, crashed=0))
+    return pd.concat(tables, ignore_index=True)
 
 
 HELD = evaluated(a2c=[0.01] * 80, vpg=[0.02] * 80)
 
 
+def judged(episodes: pd.DataFrame, evaluations: pd.DataFrame = HELD) -> list[Verdict]:
+    return judge_claims(episodes, evaluations, "paper", HEADLINE)
+
+
 def outcomes(episodes: pd.DataFrame, evaluations: pd.DataFrame = HELD) -> list[str]:
-    return [verdict.verdict for verdict in judge_claims(episodes, evaluations, "paper", HEADLINE)]
+    return [verdict.verdict for verdict in judged(episodes, evaluations)]
 
 
 def test_convergence_step_of_a_step_curve():
     # The step comes at env step 500; the mean over 100 steps is within 10 % of the new level
     # when 9 of its 10 episodes lie behind the step.
     assert convergence_step(run(step_at(50))) == 590.0
-    assert convergence_step(run(step_at(50, top=3.0) - 100.0)) == 590.0
-    assert math.isnan(convergence_step(run(step_at(5)[:9])))
+    lower = step_at(50, top=3.0) - 100.0
+    assert convergence_step(run(lower)) == 590.0
+    short = step_at(5)[:9]
+    assert math.isnan(convergence_step(run(short)))
 
 
 def test_what_does_not_rise_does_not_converge():
-    assert math.isnan(convergence_step(run(np.full(COUNT, 7.0))))
-    assert math.isnan(convergence_step(run(step_at(50, top=-3.0))))  # it unlearns
+    flat = np.full(COUNT, 7.0)
+    unlearning = step_at(50, top=-3.0)
+    assert math.isnan(convergence_step(run(flat)))
+    assert math.isnan(convergence_step(run(unlearning)))
     # Blocks of ten episodes at 0 and 1 in turn. The level ends where the last block lies, and its
     # standard deviation in the last quarter is 0.28 or, with a last block of 1.0, 0.29: the rise
     # is 2.9 of them, or 3.4.
     swinging = np.repeat(np.resize([0.0, 1.0], 10), 10)
-    assert math.isnan(convergence_step(run(np.where(np.arange(COUNT) < 90, swinging, 0.8))))
     assert convergence_step(run(swinging)) == 990.0
+    swinging[90:] = 0.8
+    assert math.isnan(convergence_step(run(swinging)))
 
 
 def test_flat_noise_does_not_converge_and_a_rise_in_the_same_noise_does():
@@ -99,23 +111,27 @@ def test_convergence_step_where_windows_are_empty():
 def test_long_run_return_is_the_mean_of_the_last_quarter():
     returns = np.concatenate([np.full(75, -100.0), np.arange(25.0)])
     assert long_run_return(run(returns)) == 12.0
-    assert math.isnan(long_run_return(run(np.ones(9))))
+    few = run(np.ones(9))
+    assert math.isnan(long_run_return(few))
 
 
 def test_fluctuation_ignores_trends_and_sees_alternation():
-    assert fluctuation(run(np.full(COUNT, 3.0))) == 0.0
+    flat = run(np.full(COUNT, 3.0))
+    assert fluctuation(flat) == 0.0
     # A ramp equals its centred mean but for the last five episodes, whose window is cut: they lie
     # 2.5, 2, 1.5, 1 and 0.5 above it, in a quarter of 25 episodes.
     ends = np.array([0.0] * 20 + [0.5, 1.0, 1.5, 2.0, 2.5])
-    assert fluctuation(run(np.arange(float(COUNT)))) == pytest.approx(ends.std(ddof=1))
+    ramp = run(np.arange(float(COUNT)))
+    assert fluctuation(ramp) == pytest.approx(ends.std(ddof=1))
     alternating = np.resize([1.0, -1.0], COUNT)
     # Eleven alternating values have the mean -1/11 of the middle one, so it lies 12/11 off; the
     # last five windows are cut and differ a little.
-    assert fluctuation(run(alternating)) == pytest.approx(12 / 11, rel=0.05)
-    assert fluctuation(run(5 * alternating)) == pytest.approx(
-        5 * fluctuation(run(alternating)), rel=1e-12
-    )
-    assert math.isnan(fluctuation(run(np.ones(9))))
+    once = fluctuation(run(alternating))
+    assert once == pytest.approx(12 / 11, rel=0.05)
+    five_times = fluctuation(run(5 * alternating))
+    assert five_times == pytest.approx(5 * once, rel=1e-12)
+    few = run(np.ones(9))
+    assert math.isnan(fluctuation(few))
 
 
 def paper_like(agent: str, seed: int) -> np.ndarray:
@@ -148,7 +164,7 @@ def test_alike_agents_leave_claims_undecided():
 @pytest.mark.parametrize("seeds", [1, 5, 29])
 def test_few_seeds_decide_nothing(seeds):
     errors = evaluated(a2c=[0.01] * seeds, vpg=[0.01] * seeds)
-    verdicts = judge_claims(training(paper_like, seeds), errors, "paper", HEADLINE)
+    verdicts = judged(training(paper_like, seeds), errors)
     assert [verdict.verdict for verdict in verdicts] == ["undecided"] * 4
     for verdict in verdicts[:3]:
         assert "fewer than 30 seeds with a value decide nothing" in verdict.evidence
@@ -160,34 +176,36 @@ def test_runs_that_did_not_converge_are_counted_and_left_out():
         flat = agent == "a2c" and seed == 0
         return np.zeros(COUNT) if flat else paper_like(agent, seed)
 
-    verdict = judge_claims(training(one_flat, seeds=31), HELD, "paper", HEADLINE)[0]
+    verdict = judged(training(one_flat, seeds=31))[0]
     assert verdict.verdict == "borne out"
     assert "(30 of 31 seeds, 1 did not converge), VPG" in verdict.evidence
     assert "(31 seeds);" in verdict.evidence
-    verdict = judge_claims(training(one_flat, seeds=30), HELD, "paper", HEADLINE)[0]
-    assert verdict.verdict == "undecided"
+    assert outcomes(training(one_flat, seeds=30))[0] == "undecided"
     flat = training(lambda agent, seed: np.zeros(COUNT))
-    verdict = judge_claims(flat, HELD, "paper", HEADLINE)[0]
+    verdict = judged(flat)[0]
     assert "A2C no value (0 of 50 seeds, 50 did not converge), VPG no value" in verdict.evidence
 
 
 def test_an_agent_that_was_not_trained_is_not_tested():
     episodes = training(paper_like)
     only = episodes[episodes["row"] == "a2c"]
-    verdicts = judge_claims(only, evaluated(a2c=[0.01] * 30), "paper", HEADLINE)
+    verdicts = judged(only, evaluated(a2c=[0.01] * 30))
     assert [verdict.verdict for verdict in verdicts] == ["not tested"] * 4
     assert verdicts[0].evidence == "VPG was not trained."
-    assert outcomes(episodes.iloc[:0], evaluated(pid=[0.0])) == ["not tested"] * 4
+    none = episodes.iloc[:0]
+    assert outcomes(none, evaluated(pid=[0.0])) == ["not tested"] * 4
 
 
 def test_one_agent_that_fails_refutes_both_even_if_the_other_was_not_trained():
     episodes = training(paper_like)
     only = episodes[episodes["row"] == "a2c"]
-    verdict = judge_claims(only, evaluated(a2c=[0.5] * 30), "paper", HEADLINE)[3]
+    failed = evaluated(a2c=[0.5] * 30)
+    verdict = judged(only, failed)[3]
     assert verdict.verdict == "not borne out"
     assert "VPG not trained" in verdict.evidence
     # What is merely open leaves the claim about both untested.
-    assert outcomes(only, evaluated(a2c=[0.01] * 4))[3] == "not tested"
+    few = evaluated(a2c=[0.01] * 4)
+    assert outcomes(only, few)[3] == "not tested"
 
 
 @pytest.mark.parametrize(
@@ -206,16 +224,15 @@ def test_one_agent_that_fails_refutes_both_even_if_the_other_was_not_trained():
 )
 def test_holding_the_target(vpg, expected):
     errors = evaluated(a2c=[0.01] * 80, vpg=vpg)
-    verdict = judge_claims(training(paper_like), errors, "paper", HEADLINE)[3]
+    verdict = judged(training(paper_like), errors)[3]
     assert verdict.verdict == expected
-    assert "A2C 0.01 m, holds in 80 of 80 seeds, 99.58 % interval of the share 90.7% to 100.0%" in (
-        verdict.evidence
-    )
+    a2c = "A2C 0.01 m, holds in 80 of 80 seeds, 99.58 % interval of the share 90.7% to 100.0%"
+    assert a2c in verdict.evidence
 
 
 def test_a_crash_in_the_evaluation_is_not_holding():
     errors = HELD.assign(crashed=[1, *[0] * 159], held=[0, *[1] * 159])
-    verdict = judge_claims(training(paper_like), errors, "paper", HEADLINE)[3]
+    verdict = judged(training(paper_like), errors)[3]
     assert verdict.verdict == "undecided"
     assert "holds in 79 of 80 seeds" in verdict.evidence
     assert "1 of 80 episodes crashed" in verdict.evidence
@@ -223,8 +240,9 @@ def test_a_crash_in_the_evaluation_is_not_holding():
 
 def test_runs_that_are_too_short_are_named():
     episodes = training(paper_like, seeds=31)
-    short = (episodes["row"] == "vpg") & (episodes["seed"] == 3) & (episodes["episode"] >= 5)
-    convergence, verdict = judge_claims(episodes[~short], HELD, "paper", HEADLINE)[:2]
+    of_vpg = (episodes["row"] == "vpg") & (episodes["seed"] == 3)
+    short = of_vpg & (episodes["episode"] >= 5)
+    convergence, verdict, *_ = judged(episodes[~short])
     assert verdict.verdict == "borne out"
     # 8, and 25 alternating halves that begin and end with -0.5.
     assert "A2C 10 (31 seeds), VPG 7.98 (30 of 31 seeds)" in verdict.evidence
@@ -259,10 +277,12 @@ def test_no_worse_is_shown_by_a_margin(ours, theirs, expected):
 
 def test_no_worse_of_what_is_to_be_high_and_of_what_was_not_trained():
     high = Headline.of(spec_of(GATES))  # held from 3 gates on: the margin is 0.6 of a gate
-    evaluations = evaluated(a2c=[4.5] * 30, **{"sb3-a2c": [5.0] * 30})
-    assert judge_no_worse(evaluations, "tuned", high).verdict == "borne out"
-    worse = evaluated(a2c=[4.0] * 30, **{"sb3-a2c": [5.0] * 30})
+    theirs = {"sb3-a2c": [5.0] * 30}
+    alike = evaluated(a2c=[4.5] * 30, **theirs)
+    assert judge_no_worse(alike, "tuned", high).verdict == "borne out"
+    worse = evaluated(a2c=[4.0] * 30, **theirs)
     assert judge_no_worse(worse, "tuned", high).verdict == "not borne out"
-    verdict = judge_no_worse(evaluated(a2c=[4.5] * 30), "tuned", high)
+    alone = evaluated(a2c=[4.5] * 30)
+    verdict = judge_no_worse(alone, "tuned", high)
     assert verdict.verdict == "not tested"
     assert verdict.evidence == "sb3-a2c was not trained."

@@ -1,7 +1,10 @@
 """Metrics against values computed by hand."""
 
 import math
+import tomllib
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -22,19 +25,30 @@ from rotorgram.training.metrics import (
 )
 from rotorgram.training.results import COLUMNS
 
+DATA = Path(__file__).parents[1] / "data"
+BY_HAND = tomllib.loads((DATA / "measures.toml").read_text())
 
-def evaluations(*rows: tuple[object, ...]) -> pd.DataFrame:
-    """Rows of (row, seed, env_steps, steady, settling_time, terminated)."""
-    names = ["row", "seed", "env_steps", "steady", "settling_time", "terminated"]
-    frame = pd.DataFrame(rows, columns=names)
+
+def evaluations(*names: str) -> pd.DataFrame:
+    """Evaluation episodes of the data, by name."""
+    columns = ["row", "seed", "env_steps", "steady", "settling_time", "terminated"]
+    rows = [row for name in names for row in BY_HAND["evaluations"][name]]
+    frame = pd.DataFrame(rows, columns=columns)
     frame["episode"] = frame.groupby(["row", "seed", "env_steps"]).cumcount()
-    frame = frame.assign(seconds=frame["env_steps"] / 100, length=10, start=1.0, overshoot=0.2)
-    return frame.assign(**{"return": 5.0})[list(COLUMNS["evaluations"])]
+    frame["seconds"] = frame["env_steps"] / 100
+    frame = frame.assign(length=10, start=1.0, overshoot=0.2)
+    frame["return"] = 5.0
+    return frame[list(COLUMNS["evaluations"])]
 
 
 def per_seed(frame: pd.DataFrame, headline: Headline, name: str) -> list[float]:
     """A measure of each seed."""
     return [measure_run(run, headline)[name] for _, run in frame.groupby("seed")]
+
+
+def headline_of(metric: Metric, **changes: Any) -> Headline:
+    """The headline of a metric, with some changes."""
+    return Headline.of(spec_of(replace(metric, **changes)))
 
 
 def test_the_steady_state_is_the_mean_size_of_the_last_quarter():
@@ -48,24 +62,24 @@ def test_the_steady_state_is_the_mean_size_of_the_last_quarter():
 
 def test_of_a_final_metric_an_end_that_holds_the_goal_is_no_crash():
     landed = Metric(name="landed", unit="", goal="high", held=0.75, final=True)
-    rows = [("a", 0, 100, value, math.nan, True) for value in (1.0, 1.0, 1.0, 0.0)]
-    frame = evaluations(*rows, *(("a", 1, 100, 1.0, math.nan, True) for _ in range(4)))
-    final = Headline.of(spec_of(landed))
+    frame = evaluations("landings")
+    final = headline_of(landed)
     assert per_seed(frame, final, "crashed") == [1, 0]
     # Three of four are the bound: the mean counts the crash, which is not held against it again.
     assert per_seed(frame, final, "held") == [1, 1]
-    once = Headline.of(spec_of(replace(landed, final=False)))
+    once = headline_of(landed, final=False)
     assert per_seed(frame, once, "crashed") == [4, 4]
     assert per_seed(frame, once, "held") == [0, 0]
-    for held, expected in ((0.75, 100.0), (0.76, math.nan)):
-        headline = Headline.of(spec_of(replace(landed, held=held)))
-        steps, _ = first_lasting_snapshot(frame[frame["seed"] == 0], headline)
-        assert steps == pytest.approx(expected, nan_ok=True)
+    first = frame[frame["seed"] == 0]
+    steps, _ = first_lasting_snapshot(first, headline_of(landed, held=0.75))
+    assert steps == 100.0
+    steps, _ = first_lasting_snapshot(first, headline_of(landed, held=0.76))
+    assert math.isnan(steps)
 
 
 def test_a_headline_says_how_its_numbers_are_read():
-    gates = Headline.of(spec_of(GATES))
-    distance = Headline.of(spec_of(replace(ERROR, signed=False)))
+    gates = headline_of(GATES)
+    distance = headline_of(ERROR, signed=False)
     assert HEADLINE.size_symbol == "|E|"
     assert distance.size_symbol == "E"
     assert gates.size_symbol == "gates_passed"
@@ -80,81 +94,49 @@ def test_a_headline_says_how_its_numbers_are_read():
 def test_the_bound_of_a_goal():
     low = HEADLINE.holds([0.05, 0.1, math.nan])
     assert low.tolist() == [True, False, False]
-    high = Headline.of(spec_of(GATES)).holds([2.9, 3.0, math.nan])
+    high = headline_of(GATES).holds([2.9, 3.0, math.nan])
     assert high.tolist() == [False, True, False]
 
 
-@pytest.mark.parametrize(
-    ("errors", "expected"),
-    [
-        ([1.0, 0.04, 0.2, 0.03, -0.04], 0.3),  # leaves the band once more at step 2
-        ([0.01, 0.02], 0.0),
-        ([1.0, 0.5, 0.05], math.nan),  # the band is open: 0.05 is not below 0.05
-        ([0.01, 0.02, 1.0], math.nan),
-        ([1.0, 0.0, math.nan], math.nan),
-        ([], math.nan),
-    ],
-)
-def test_settling_time(errors, expected):
-    value = settling_time(np.array(errors), control_period=0.1, tolerance=0.05)
+@pytest.mark.parametrize(("errors", "expected"), BY_HAND["settling"])
+def test_settling_time(errors: list[float], expected: float) -> None:
+    value = settling_time(errors, control_period=0.1, tolerance=0.05)
     assert value == pytest.approx(expected, nan_ok=True)
 
 
-@pytest.mark.parametrize(
-    ("errors", "expected"),
-    [
-        ([2.0, 0.5, -0.3, 0.1], 0.3),
-        ([-2.0, 0.4, -0.1], 0.4),
-        ([2.0, 1.0, 0.5], 0.0),
-        ([0.0, 0.1, -0.2], 0.2),
-        ([], math.nan),
-    ],
-)
-def test_overshoot(errors, expected):
-    assert overshoot(np.array(errors)) == pytest.approx(expected, nan_ok=True)
+@pytest.mark.parametrize(("errors", "expected"), BY_HAND["overshoot"])
+def test_overshoot(errors: list[float], expected: float) -> None:
+    assert overshoot(errors) == pytest.approx(expected, nan_ok=True)
 
 
 def test_reaching_the_target_counts_from_the_first_snapshot_that_lasts():
-    errors = {0: 2.0, 100: 0.05, 200: 0.3, 300: 0.05, 400: 0.09}
-    run = evaluations(*(("a2c", 0, steps, error, 1.0, False) for steps, error in errors.items()))
+    run = evaluations("snapshots")
     assert first_lasting_snapshot(run, HEADLINE) == (300.0, 3.0)
-    assert first_lasting_snapshot(run.iloc[::-1], HEADLINE)[0] == 300.0  # whatever the rows' order
+    backwards = run.iloc[::-1]
+    assert first_lasting_snapshot(backwards, HEADLINE)[0] == 300.0
     worse = run.assign(steady=run["steady"] + 0.02)  # the last is 0.11 m
     assert np.isnan(first_lasting_snapshot(worse, HEADLINE)).all()
-    gates = Headline.of(spec_of(GATES))
     passed = run.assign(steady=[5.0, 2.0, 3.0, 4.0, 3.0])
-    assert first_lasting_snapshot(passed, gates) == (200.0, 2.0)
+    assert first_lasting_snapshot(passed, headline_of(GATES)) == (200.0, 2.0)
 
 
 def test_a_snapshot_is_its_mean_and_a_crash_or_a_gap_is_a_miss():
-    good = [("a2c", 0, 100, 0.05, 1.0, False), ("a2c", 0, 100, 0.13, 1.0, False)]
-    assert first_lasting_snapshot(evaluations(*good), HEADLINE)[0] == 100.0  # mean 0.09
-    crash = ("a2c", 0, 100, 0.0, math.nan, True)
-    assert math.isnan(first_lasting_snapshot(evaluations(*good, crash), HEADLINE)[0])
-    gap = ("a2c", 0, 100, math.nan, math.nan, False)
-    assert math.isnan(first_lasting_snapshot(evaluations(*good, gap), HEADLINE)[0])
+    steps, _ = first_lasting_snapshot(evaluations("good"), HEADLINE)
+    assert steps == 100.0  # mean 0.09
+    for miss in ("crash", "gap"):
+        steps, _ = first_lasting_snapshot(evaluations("good", miss), HEADLINE)
+        assert math.isnan(steps)
 
 
 def test_a_run_holds_without_a_crash_and_without_a_gap():
-    frame = evaluations(
-        ("a2c", 0, 100, 0.05, 1.0, False), ("a2c", 0, 100, 0.13, 1.0, False),
-        ("a2c", 1, 100, 0.01, 1.0, False), ("a2c", 1, 100, 0.01, 1.0, True),
-        ("a2c", 2, 100, 0.01, 1.0, False), ("a2c", 2, 100, math.nan, math.nan, False),
-        ("a2c", 3, 100, 0.2, 1.0, False),
-    )  # fmt: skip
-    assert per_seed(frame, HEADLINE, "held") == [1, 0, 0, 0]
+    assert per_seed(evaluations("seeds"), HEADLINE, "held") == [1, 0, 0, 0]
 
 
 def test_the_final_evaluation_is_each_runs_own_last_snapshot():
-    frame = evaluations(
-        ("a2c", 0, 100, 1.0, math.nan, False),
-        ("a2c", 0, 200, 0.1, 2.0, False),
-        ("a2c", 0, 200, 0.3, 9.0, True),
-        ("a2c", 1, 150, 0.5, math.nan, False),
-        ("pid", 0, 0, 0.0, 1.0, False),
-    )
+    frame = evaluations("last_snapshots")
     assert final_evaluations(frame)["env_steps"].tolist() == [200, 200, 150, 0]
-    first = measure_run(frame[(frame["row"] == "a2c") & (frame["seed"] == 0)], HEADLINE)
+    a2c = frame[frame["row"] == "a2c"]
+    first = measure_run(a2c[a2c["seed"] == 0], HEADLINE)
     assert first["steady"] == pytest.approx(0.2)
     assert first["settling_time"] == 2.0  # a crash has not settled, whatever its row says
     assert first["episodes"] == 2
@@ -178,12 +160,14 @@ def test_spread_over_seeds_keeps_to_what_all_seeds_reach():
         return Curve(np.array([0.0, end]), np.array([height, height]))
 
     grid = np.array([0.0, 5.0, 10.0])
-    three = spread_over_seeds([line(10, 1.0), line(10, 2.0), line(6, 6.0)], grid)
+    curves = [line(10, 1.0), line(10, 2.0), line(6, 6.0)]
+    three = spread_over_seeds(curves, grid)
     assert three.x.tolist() == [0.0, 5.0]
     assert three.middle.tolist() == [3.0, 3.0]
     assert three.low.tolist() == [1.0, 1.0]
     assert three.high.tolist() == [6.0, 6.0]
-    five = spread_over_seeds([line(10, height) for height in (0.0, 1.0, 2.0, 3.0, 40.0)], grid)
+    curves = [line(10, height) for height in (0.0, 1.0, 2.0, 3.0, 40.0)]
+    five = spread_over_seeds(curves, grid)
     assert five.low[0] == 1.0
     assert five.middle[0] == 2.0
     assert five.high[0] == 3.0

@@ -3,9 +3,6 @@
 import json
 import os
 import signal
-import subprocess
-import sys
-import time
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -13,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from commands import WRONG, Capsys, output, refused, run, start, wait_until, words_of
 from comparisons import study_of, synthetic_folder
 from rotorgram.agents import load, preset
-from rotorgram.cli import main
 from rotorgram.cli._flags import parse
 from rotorgram.cli.compare import Compare
 from rotorgram.cli.sweep import Sweep, parse_grid
@@ -40,14 +37,7 @@ ONE = WorkersConfig(jobs=1)
 DATA = Path(__file__).parents[1] / "data"
 COMMITTED = Path(__file__).parents[2] / "docs" / "results" / "baselines"
 TIMES = ["seconds", "steps_per_second", "seconds_to_hold"]
-FLAGS = ("--env-steps", "300", "--episodes", "1", "--episode-length", "40", "--no-film")
-
-
-def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
-    """Exit status, standard output and standard error of a command."""
-    status = main([str(a) for a in arguments])
-    captured = capsys.readouterr()
-    return status, captured.out, captured.err
+FLAGS = ("--env-steps", "300", "--episodes", "1", "--episode-length", "40")
 
 
 @pytest.fixture(scope="module")
@@ -140,9 +130,7 @@ def test_a_folder_is_written_by_one_process(work: str, tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.iterdir()} == before | {".lock"}
 
 
-def test_a_run_that_fails_is_named_and_the_others_are_kept(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_that_fails_is_named_and_the_others_are_kept(tmp_path: Path, capsys: Capsys) -> None:
     # Adam's step is as large as the learning rate: the second update overflows.
     folder = tmp_path / "out"
     flags = ("--grid", "learning_rate=0.01,1e29", "--seeds", 1, *FLAGS, "--jobs", 1)
@@ -159,20 +147,13 @@ def test_a_run_that_fails_is_named_and_the_others_are_kept(
     assert len(Results.read(folder).runs) == 1
 
 
-def test_ctrl_c_keeps_what_is_done(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_ctrl_c_keeps_what_is_done(tmp_path: Path, capsys: Capsys) -> None:
     folder = tmp_path / "out"
     flags = ["--grid", "gamma=0.9,0.99", "--seeds", "2", "--jobs", "1", *FLAGS]
     flags[flags.index("--env-steps") + 1] = "4000"
-    process = subprocess.Popen(
-        [sys.executable, "-m", "rotorgram.cli", "sweep", "vpg", *flags, "--out", str(folder)],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
-    )  # fmt: skip
+    process = start("sweep", "vpg", *flags, "--out", folder)
     try:
-        deadline = time.monotonic() + 60
-        while not list(folder.glob("parts/gamma*")):
-            assert process.poll() is None
-            assert time.monotonic() < deadline
-            time.sleep(0.01)
+        wait_until(lambda: list(folder.glob("parts/gamma*")), process)
         os.killpg(process.pid, signal.SIGINT)
         out, err = process.communicate(timeout=20)
     finally:
@@ -182,8 +163,8 @@ def test_ctrl_c_keeps_what_is_done(tmp_path: Path, capsys: pytest.CaptureFixture
     assert f"go on with: rotorgram sweep vpg --resume {folder}\n" in out
     kept = Results.read(folder).runs
     assert 1 <= len(kept) < 4
-    assert run(capsys, "report", folder)[0] == 0
-    assert run(capsys, "sweep", "vpg", "--resume", folder, "--jobs", 1)[0] == 0
+    output(capsys, "report", folder)
+    output(capsys, "sweep", "vpg", "--resume", folder, "--jobs", 1)
     whole = Results.read(folder).runs
     assert len(whole) == 4
     merged = whole.merge(kept)  # the same bits, times too
@@ -194,24 +175,20 @@ def test_ctrl_c_keeps_what_is_done(tmp_path: Path, capsys: pytest.CaptureFixture
         (("sweep", "vpg", *resume, "--seeds", 3), "got others by --seeds"),
         (("compare", *resume), "expected a folder of rotorgram compare"),
     ):
-        status, _, err = run(capsys, *words)
-        assert status == 1
-        assert sentence in err
+        assert sentence in refused(capsys, *words)
 
 
 # ---- rows and files
 
 
-def test_two_files_are_rows_of_their_names(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_two_files_are_rows_of_their_names(tmp_path: Path, capsys: Capsys) -> None:
     text = 'agent = "a2c"\nenv_steps = 300\nset = {{ hidden = {} }}\n[env]\nepisode_length = 40\n'
     for name, hidden in (("a", "[8]"), ("b", "[8, 8]")):
         (tmp_path / f"{name}.toml").write_text(text.format(hidden))
     files = [tmp_path / "a.toml", tmp_path / "b.toml"]
-    flags = ("--seeds", 2, "--episodes", 2, "--snapshots", 1, "--jobs", 1, "--no-film")
+    flags = ("--seeds", 2, "--episodes", 2, "--snapshots", 1, "--jobs", 1)
     more = ("--set", "gamma=0.9", "--env.flight-band", "1.5", "--out", tmp_path / "out")
-    assert run(capsys, "compare", *files, *flags, *more)[0] == 0
+    output(capsys, "compare", *files, *flags, *more)
     results = Results.read(tmp_path / "out")
     assert [row.name for row in results.study.rows] == ["a", "b"]
     assert [row.config.hidden for row in results.study.rows] == [(8,), (8, 8)]
@@ -242,7 +219,7 @@ rotorgram.envs.register("Near-v0", Near)
 
 
 def test_a_board_takes_own_tasks_and_changes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capsys
 ) -> None:  # fault 60
     monkeypatch.chdir(tmp_path)
     (tmp_path / "near_task.py").write_text(OWN_TASK)
@@ -339,69 +316,16 @@ def test_points_are_all_combinations_of_settings_and_task_options() -> None:
     assert study.rows[3].config.gamma == 0.9
 
 
-@pytest.mark.parametrize(
-    ("flags", "sentence"),
-    [
-        ([], "grid: expected at least one hyperparameter, got none"),
-        (["--grid", "gamma"], "grid: expected NAME=VALUE,VALUE,…, got 'gamma'"),
-        (["--grid", "hidden=[64,"], "grid: expected values in JSON, got '[64,'"),
-        (["--grid", "speed=1,2"], "hyperparameters: expected some of"),
-        (["--grid", "env.speed=1,2"], "speed"),
-        (["--grid", "gamma=0.9,1.1"], "gamma: expected a number from 0 to 1, got 1.1"),
-        (["--grid", "gamma=0.9,0.90"], "grid: expected each gamma once, got 0.9 twice"),
-        (["--grid", "gamma=0.9", "gamma=0.8"], "grid: expected each name once, got gamma twice"),
-        (["--grid", "gamma=0.9", "--set", "gamma"], "set: expected NAME=VALUE, got 'gamma'"),
-        (
-            ["--grid", "gamma=0.9", "--set", "hidden=64,64"],
-            "set: expected a list as hidden=[64,64], got 'hidden=64,64'",
-        ),
-        (["--grid", "gamma=0.9", "--env-steps", "9"], "env_steps: expected at least 256, got 9"),
-        (["--grid", "gamma=0.9", "--jobs", "0"], "jobs: expected at least 1, got 0"),
-        (["--grid", "gamma=0.9", "--address", "a:1"], "address: expected it with runner ray"),
-        (["--grid", "gamma=0.9", "--env.target", "1"], "target: expected"),
-        (["--grid", "gamma=0.9", "--out", "."], "exists already"),
-        (["--resume", "nowhere"], "got one without config.json"),
-    ],
-)
+@pytest.mark.parametrize(("line", "sentence"), WRONG["sweep"])
 def test_wrong_input_is_one_sentence(
-    flags: list[str],
-    sentence: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    line: str, sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capsys
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    status, out, err = run(capsys, "sweep", "a2c", *flags)
-    assert status == 1
-    assert out == ""
-    assert err.startswith("rotorgram: ")
-    assert sentence in err
-    assert err.count("\n") == 1
+    assert sentence in refused(capsys, "sweep", "a2c", *words_of(line))
     assert not list(tmp_path.iterdir()), "nothing has flown"
 
 
-@pytest.mark.parametrize(
-    ("text", "sentence"),
-    [
-        ("row = []", "row: expected at least one, got none"),
-        ('[[row]]\nagent = "lqg"', "agent: expected one of pid, "),
-        ('[[row]]\nagent = "a2c"\n[[row]]\nagent = "a2c"', "row: expected each row once, got a2c"),
-        ('[[row]]\nagent = "a2c"\nenv = {env_id = "x/Y-v0"}', "expected a registered id"),
-        ('[[row]]\nagent = "a2c"\ncolour = 1', "row 1: expected some of agent, name, env, backend"),
-        ("[[row]]\nnum_envs = 8", "row 1: expected an agent, got none"),
-        ('[[row]]\nagent = "a2c"\nenv = 3', "env: expected a table, got 3"),
-        ("row = [3]", "row 1: expected a table, got 3"),
-        ("row = 3", "row: expected [[row]] tables, got 3"),
-        ('[[rows]]\nagent = "pid"', "expected some of agent, name"),
-        (
-            'seeds = 1.5\n[[row]]\nagent = "pid"',
-            "seeds: expected a whole number",
-        ),
-        ('[[row]]\nagent = "a2c"\nenv_steps = 100', "env_steps: expected at least 256, got 100"),
-        ('seeds = 0\n[[row]]\nagent = "pid"', "seeds: expected a whole number of at least 1"),
-        ("[[row", "expected a TOML file of rows"),
-    ],
-)
+@pytest.mark.parametrize(("text", "sentence"), WRONG["rows"])
 def test_wrong_files_are_one_sentence(text: str, sentence: str, tmp_path: Path) -> None:
     path = tmp_path / "rows.toml"
     path.write_text(text)

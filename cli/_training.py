@@ -1,0 +1,80 @@
+"""Flags of commands that train, the folder that they write, and resuming."""
+
+import shlex
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+
+from ..agents.presets import PresetName
+from ..flights.folders import LOCK, new_folder
+from ..models.errors import InputError
+from ._flags import BackendFlags, NamedValues, Options, Words, check_count, parse_value
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingFlags(BackendFlags):
+    """A command that trains."""
+
+    set: NamedValues = ()
+    """Changes to the preset of every agent: gamma=0.99 hidden=[64,64]."""
+    preset: PresetName = "tuned"
+    """Hyperparameters: the paper's (of vpg and a2c), or ours, which may depend on the task."""
+    env_steps: int | None = None
+    """Env steps of each training, of all its drones together."""
+    num_envs: int | None = None
+    """Drones that fly at the same time, in lock-step, in each training."""
+    out: Path | None = None
+    """Folder to write; it must not exist. Default: one in runs, named by the command and the time.
+    """
+    resume: Path | None = None
+    """Folder of an interrupted command to go on with; it keeps its settings."""
+
+    def changes(self) -> Options:
+        """Changes to the preset by name, of `--set`. Raises `InputError`."""
+        check_count("env_steps", self.env_steps)
+        check_count("num_envs", self.num_envs)
+        changes = {}
+        for word in chain.from_iterable(self.set):
+            name, equals, value = word.partition("=")
+            if not equals:
+                raise InputError(f"set: expected NAME=VALUE, got {word!r}")
+            changes[name] = parse_value(value)
+        return changes
+
+    def refuse_settings(self, folder: Path, free: Words) -> None:
+        """Raises `InputError` if a setting but the free ones was given: a resumed run keeps its
+        own.
+        """
+        names = sorted(self.given.difference(free, ("algorithm", "resume")))
+        flags = ["--" + name.replace("_", "-") for name in names]
+        if flags:
+            raise InputError(
+                f"resume: expected the settings of {folder}, got others by {', '.join(flags)}"
+            )
+
+    def go_on_with(self, words: str, folder: Path, *flags: str) -> str:
+        """The line that tells how to resume, with those of the flags that were given."""
+        line: list[object] = ["rotorgram", *words.split(), "--resume", folder]
+        for flag in flags:
+            if flag in self.given:
+                line.append(f"--{flag.replace('_', '-')}")
+                value = getattr(self, flag)
+                if value is not True:
+                    line.append(value)
+        return f"go on with: {shlex.join(map(str, line))}"
+
+
+@contextmanager
+def folder_to_write(out: Path | None, name: str) -> Iterator[Path]:
+    """A new folder, by default named by the time; removed if the block fails before it writes."""
+    folder = new_folder(out, name)
+    try:
+        yield folder
+    except BaseException:
+        with suppress(OSError):  # it holds something
+            if {file.name for file in folder.iterdir()} == {LOCK}:
+                (folder / LOCK).unlink()
+            folder.rmdir()
+        raise
