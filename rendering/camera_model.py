@@ -17,7 +17,7 @@ from ..models.swarm import drone_names
 from ..models.vehicle import Vehicle
 from ..scenes import add_scene
 from ..scenes.marks import Mark
-from .stage import MARK_GEOMS, scale_drawing
+from .stage import MARK_COLORS, MARK_GEOMS, scale_drawing
 
 NOTHING: Final = "nothing"
 """Name of what a segmentation picture has where it sees no object: number 0."""
@@ -29,7 +29,6 @@ _NEAREST: Final = 0.05  # Where drawing begins, over the vehicle's radius
 _THINNEST: Final = 0.04  # Thickness of a disc, over the height at which the lowest craft rests
 _PLAIN: Final = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's colour of a geom that has that of its material
 _UNNAMED: Final = "unnamed"
-_COLOR: Final = {"gate": (0.96, 0.42, 0.08, 1.0), "disc": (0.13, 0.78, 0.52, 1.0)}
 
 
 def objects_of(
@@ -95,7 +94,7 @@ def _add(
 
 def _add_mark(body: mujoco.MjsBody, name: str, mark: Mark, thickness: float) -> None:
     """A mark of a task, as viewers show it; discs have a thickness, m."""
-    rgba = _COLOR.get(mark.shape, _COLOR["disc"])
+    rgba = (*MARK_COLORS[mark.shape], 1.0)
     parts = mark.parts(thickness)
     for number, part in enumerate(parts):
         own = f"{name}/{number}" if len(parts) > 1 else name
@@ -115,20 +114,14 @@ def objects_in(model: mujoco.MjModel, names: Sequence[str]) -> tuple[tuple[str, 
     """
     known = {NOTHING: 0}
     numbers = [0]
-    roots = {int(model.body(one).rootid[0]): one.partition("/")[0] for one in _bodies(model, names)}
+    crafts = model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]
+    roots = dict(zip(model.body_rootid[crafts].tolist(), names, strict=True))
     for number in range(model.ngeom):
         geom = model.geom(number)
-        root = int(model.body_rootid[geom.bodyid[0]])
         material = int(geom.matid[0])
         name = geom.name or (model.material(material).name if material >= 0 else _UNNAMED)
         head, _, _ = name.rpartition("/")
-        label = roots.get(root, head if "/" in head else name)
-        numbers.append(known.setdefault(label, len(known)))
+        label = head if "/" in head else name
+        root = int(model.body_rootid[geom.bodyid[0]])
+        numbers.append(known.setdefault(roots.get(root, label), len(known)))
     return tuple(known), np.array(numbers, np.int32)
-
-
-def _bodies(model: mujoco.MjModel, names: Sequence[str]) -> list[str]:
-    """Names of the bodies with a free joint."""
-    free = model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]
-    found = [model.body(int(body)).name for body in free]
-    return [name for name in found if name.partition("/")[0] in names]

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from ..models.cameras import place_cameras
 from ..models.errors import InputError, shortened
+from ..models.fields import Limits, check
 from ..models.fleet import load_vehicles, members_of
 from ..models.mjcf import attach_craft, free_body, level_data
 from ..scenes.build import SCENE_PREFIX, build_scene
@@ -28,11 +29,12 @@ CAMERAS: Final[tuple[Camera, ...]] = get_args(Camera)
 _MAX_METRICS = 4  # with a line of their own
 _MAX_THRUSTS = 4  # rotors with a number of their own
 _TRAIL, _EVERY = 150, 3  # control steps of a path, and of one piece of it
-_PAYLOAD = (0.96, 0.42, 0.08, 1.0)
+_ORANGE: Final = (0.96, 0.42, 0.08)
+_GREEN: Final = (0.13, 0.78, 0.52)
+MARK_COLORS: Final = {"gate": _ORANGE, "disc": _GREEN, "ball": _GREEN}
+"""Red, green and blue, 0 to 1, of marks."""
+_PAYLOAD = (*_ORANGE, 1.0)
 _CABLE = (0.13, 0.14, 0.16, 1.0)
-_DISC = (0.13, 0.78, 0.52, 0.30)
-_DUE = (0.13, 0.78, 0.52, 0.9)  # The gate that is next, and a pad
-_GATE = (0.96, 0.42, 0.08, 0.9)
 _PATH = (1.0, 0.85, 0.25)
 DRONE_COLORS: Final = (
     _PATH, (0.34, 0.71, 0.91), (0.90, 0.62, 0.0), (0.0, 0.62, 0.45), (0.80, 0.47, 0.65),
@@ -48,8 +50,10 @@ MARK_GEOMS: Final = {
     "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
 }
 """How parts of marks are drawn."""
+_CAPSULE: Final = mujoco.mjtGeom.mjGEOM_CAPSULE
 _ONBOARD: Final = "stage/onboard"
 _ROOM = 10_000  # geoms
+_SIDES: Final = Limits(16, 8192, "pixels", whole=True)
 _SAMPLES = 4  # of every pixel, for smooth edges; software has no more
 
 # Lengths below are in radii of the craft.
@@ -289,12 +293,11 @@ class Stage:
         places = self._offsets
         reach = float(self._reach.max())
         if len(self.names) > 1:  # the goals of one world lie apart, often far from their craft
-            goals = [goal for goal in self._places("goal") if goal is not None]
-            places = np.array([*self._points(), *goals])
+            places = np.array([*self._points, *self._goals])
             reach = 0.0
         camera.distance = distance * self.radius + float(np.ptp(places, axis=0).max())
         if holds == math.inf:
-            camera.lookat[:] = self._points().mean(axis=0)
+            camera.lookat[:] = self._points.mean(axis=0)
         else:
             camera.distance += _BACK * max(reach - holds * self.radius, 0.0)
             camera.lookat[:] = self.focus
@@ -305,8 +308,9 @@ class Stage:
     @property
     def focus(self) -> np.ndarray:
         """Mean of the goals, or of the craft if there are none, MuJoCo's frame, shape (3,), m."""
-        goals = [goal for goal in self._places("goal") if goal is not None]
-        return np.asarray((np.array(goals) if goals else self._points()).mean(axis=0))
+        goals = self._goals
+        points = np.array(goals) if goals else self._points
+        return np.asarray(points.mean(axis=0))
 
     def decorate(self, scene: mujoco.MjvScene, *, goals: bool = True) -> None:
         """Add marks, payloads and fading paths to a scene, and discs at the goals if wanted."""
@@ -317,41 +321,35 @@ class Stage:
                 if mark.moves or not self.names or mark not in drawn:
                     drawn.add(mark)
                     _draw_mark(scene, mark, offset, goal)
-        for payload, here in zip(self._places("payload"), self._points(), strict=False):
+        for payload, here in zip(self._places("payload"), self._points, strict=False):
             if payload is not None:
                 size = (0.12 * self.radius,) * 3
-                _decoration(scene, mujoco.mjtGeom.mjGEOM_SPHERE, size, payload, _PAYLOAD)
-                kind = mujoco.mjtGeom.mjGEOM_CAPSULE
-                _connect(scene, kind, 0.012 * self.radius, here, payload, _CABLE)
+                _decorate(scene, mujoco.mjtGeom.mjGEOM_SPHERE, size, payload, _PAYLOAD)
+                _connect(scene, _CAPSULE, 0.012 * self.radius, here, payload, _CABLE)
         marked = any(moment.marks for moment in self.moments)
         if 1 < len(self.names) <= MAX_NAMES:
-            self._write_names(scene)
-        lines = zip(self._paths, places, self._points(), strict=False)
+            for name, here in zip(self.names, self._points, strict=True):
+                above = here + np.array((0.0, 0.0, 0.9 * self.radius))
+                label = _decorate(scene, mujoco.mjtGeom.mjGEOM_LABEL, (0.1,) * 3, above, _CABLE)
+                if label is not None:
+                    label.label = f"{name}   "  # without the spaces its end would be cut off
+        lines = zip(self._paths, places, self._points, strict=False)
         for drone, (path, goal, here) in enumerate(lines):
             color = DRONE_COLORS[drone % len(DRONE_COLORS)] if self.names else _PATH
             if goals and goal is not None and not marked:
                 size = (0.93 * self.radius, 0.0033 * self.radius, 0.0)  # radius, half of its height
-                disc = (*color, _DISC[3]) if len(self.names) > 1 else _DISC
-                _decoration(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, size, goal, disc)
+                own = color if len(self.names) > 1 else _GREEN
+                disc = (*own, 0.3)
+                _decorate(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, size, goal, disc)
             for number, (start, end) in enumerate(pairwise([*path, here]), 1):
-                if np.array_equal(start, end):
-                    continue
-                kind = mujoco.mjtGeom.mjGEOM_CAPSULE
-                rgba = (*color, 0.85 * number / len(path))
-                _connect(scene, kind, 0.019 * self.radius, start, end, rgba)
+                if not np.array_equal(start, end):
+                    rgba = (*color, 0.85 * number / len(path))
+                    _connect(scene, _CAPSULE, 0.019 * self.radius, start, end, rgba)
 
     @property
     def least_distance(self) -> float | None:
         """Least distance between the origins of two drones of the world now, m; None of one."""
-        return least_distance(self._points()) if len(self.names) > 1 else None
-
-    def _write_names(self, scene: mujoco.MjvScene) -> None:
-        """A name over each craft."""
-        for name, here in zip(self.names, self._points(), strict=True):
-            above = here + np.array((0.0, 0.0, 0.9 * self.radius))
-            label = _decoration(scene, mujoco.mjtGeom.mjGEOM_LABEL, (0.1,) * 3, above, _CABLE)
-            if label is not None:
-                label.label = f"{name}   "  # without the spaces its end would be cut off
+        return least_distance(self._points) if len(self.names) > 1 else None
 
     def _places(self, what: Literal["goal", "payload"]) -> list[np.ndarray | None]:
         """Where it is drawn for each craft; None where there is none."""
@@ -359,6 +357,12 @@ class Stage:
         places = zip(points, self._offsets, strict=False)
         return [None if point is None else point + offset for point, offset in places]
 
+    @property
+    def _goals(self) -> list[np.ndarray]:
+        """Where goals are drawn."""
+        return [goal for goal in self._places("goal") if goal is not None]
+
+    @property
     def _points(self) -> np.ndarray:
         """Positions of the craft, MuJoCo's frame, shape (drones, 3), m."""
         return np.asarray(self.data.qpos.reshape(self.drones, 7)[:, :3])
@@ -374,15 +378,13 @@ class Canvas(AbstractContextManager["Canvas"]):
         self, stage: Stage, width: int = 640, height: int = 480, *, fast: bool = False
     ) -> None:
         for name, pixels in (("width", width), ("height", height)):
-            if not 16 <= pixels <= 8192:
-                raise InputError(f"{name}: expected 16 to 8192 pixels, got {pixels}")
+            check(name, _SIDES, pixels)
         self.stage = stage
         self.width = width
         self.height = height
-        model = stage.model
-        model.vis.quality.offsamples = 0 if fast else _SAMPLES
-        self._drawing = Offscreen(model, width, height)
-        self._scene = mujoco.MjvScene(model, _ROOM)
+        stage.model.vis.quality.offsamples = 0 if fast else _SAMPLES
+        self._drawing = Offscreen(stage.model, width, height)
+        self._scene = mujoco.MjvScene(stage.model, _ROOM)
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW.value] = not fast
         self._option = mujoco.MjvOption()
 
@@ -395,12 +397,10 @@ class Canvas(AbstractContextManager["Canvas"]):
         stage = stage or self.stage
         if stage.model is not self.stage.model:
             raise ValueError("stage: expected the canvas's own or a twin of it, got another")
-        model = stage.model
-        data = stage.data
         scene = self._scene
         view = stage.camera(camera)
         every = mujoco.mjtCatBit.mjCAT_ALL.value
-        mujoco.mjv_updateScene(model, data, self._option, None, view, every, scene)
+        mujoco.mjv_updateScene(stage.model, stage.data, self._option, None, view, every, scene)
         for light in scene.lights[: scene.nlight]:
             if light.headlight and camera == "top":  # it would add itself to the sun
                 light.diffuse[:] = 0.0
@@ -468,15 +468,16 @@ def _draw_mark(
     if mark.moves and goal is None:
         return
     centre = (goal if mark.moves and goal is not None else offset) + mark.position
-    rgba = {"gate": _GATE, "disc": _DUE, "ball": _DISC}[mark.shape]
+    color = MARK_COLORS[mark.shape]
     if mark.shape == "gate" and goal is not None and np.abs(goal - centre).max() < 1e-3:
-        rgba = _DUE
+        color = _GREEN
+    rgba = (*color, 0.3 if mark.shape == "ball" else 0.9)
     for part in mark.parts(0.04 * mark.size):
         start = centre + part.start
         end = centre + part.end
         kind = MARK_GEOMS[part.kind]
         if part.kind == "sphere":
-            _decoration(scene, kind, (part.radius,) * 3, start, rgba)
+            _decorate(scene, kind, (part.radius,) * 3, start, rgba)
         else:
             _connect(scene, kind, part.radius, start, end, rgba)
 
@@ -490,19 +491,19 @@ def _connect(
     rgba: Sequence[float],
 ) -> None:
     """Add a cylinder or a capsule between two points."""
-    geom = _decoration(scene, kind, (1.0, 1.0, 1.0), start, rgba)
+    geom = _decorate(scene, kind, (1.0, 1.0, 1.0), start, rgba)
     if geom is not None:
         mujoco.mjv_connector(geom, kind, radius, start, end)
 
 
-def _decoration(
+def _decorate(
     scene: mujoco.MjvScene,
     kind: mujoco.mjtGeom,
     size: Sequence[float],
     centre: np.ndarray,
     rgba: Sequence[float],
 ) -> mujoco.MjvGeom | None:
-    """A new geom that casts no shadow; None if the scene is full."""
+    """Add a geom that casts no shadow; None if the scene is full."""
     if scene.ngeom == scene.maxgeom:
         return None
     geom = scene.geoms[scene.ngeom]
