@@ -105,8 +105,28 @@ def moments(loop: "Loop", episodes: Sequence[int]) -> "list[Moment]":
 
 
 def moment(spec: EnvSpec, telemetry: Mapping[str, Any], **rest: Any) -> "Moment":
-    """The `Moment` of one drone, with `reward`, `step` and `episode` as `Moment` has them."""
-    from ..rendering import Moment
+    """The `Moment` of one drone, with `reward`, `step` and `episode` as `Moment` has them.
 
-    metrics = [(metric.name, metric.unit, metric.symbol) for metric in spec.metrics]
-    return Moment.of(telemetry, metrics, marks=spec.marks, **rest)
+    Telemetry is arrays by name: `position` (3,), `attitude` (4,), `thrust` (R,), and, if there are
+    any, `metrics` (M,), `goal` (3,) and `payload` (3,).
+    """
+    from ..rendering import MetricValue, Moment
+
+    numbers: dict[str, Any] = {}
+    for name in ("position", "attitude", "thrust", "metrics", "goal", "payload"):
+        if name in telemetry:
+            numbers[name] = tuple(np.asarray(telemetry[name], float).tolist())
+    metrics = []
+    if spec.metrics:
+        for metric, value in zip(spec.metrics, numbers["metrics"], strict=True):
+            metrics.append(MetricValue(metric.name, value, metric.unit, metric.symbol))
+    return Moment(
+        position=numbers["position"],
+        attitude=numbers["attitude"],
+        thrusts=numbers["thrust"],
+        goal=numbers.get("goal"),
+        payload=numbers.get("payload"),
+        metrics=tuple(metrics),
+        marks=spec.marks,
+        **rest,
+    )

@@ -16,6 +16,7 @@ import numpy as np
 
 from .coefficients import PREFIX
 from .errors import InputError, shortened
+from .fields import Limits, check
 
 OUTPUTS: Final = {
     "rgb": mujoco.mjtCamOutBit.mjCAMOUT_RGB,
@@ -32,6 +33,8 @@ _TEXTS: Final = PREFIX + "cameras."
 _SIDE: Final = 64  # Pixels of a side, if the file gives none
 MAX_LETTERS: Final = 64  # of a name
 FOVY: Final = (1e-3, 3.0)  # rad
+_DEGREES: Final = Limits(math.degrees(FOVY[0]), math.degrees(FOVY[1]), "degrees")
+_SIDES: Final = Limits(1, MAX_PIXELS, "pixels", whole=True)
 MAX_STEPS: Final = 1000  # from picture to picture
 _Vector = tuple[float, float, float]
 
@@ -105,12 +108,11 @@ def chosen_views(words: Sequence[str], cameras: Iterable[Camera]) -> tuple[View,
         text, at, size = word.partition("@")
         name, _, kind = text.rpartition("_")
         alone = text in known
-        right = alone or (name in known and kind in OUTPUTS)
-        if not right:
-            expected = (
-                f"some of {', '.join(known)}, each with _{', _'.join(OUTPUTS)} behind it or not"
+        if not alone and (name not in known or kind not in OUTPUTS):
+            raise InputError(
+                f"cameras: expected some of {', '.join(known)}, each with "
+                f"_{', _'.join(OUTPUTS)} behind it or not, got {shortened(word)}"
             )
-            raise InputError(f"cameras: expected {expected}, got {shortened(word)}")
         camera = known[text if alone else name]
         if at:
             width, height = _size(word, size)
@@ -162,9 +164,7 @@ def read_cameras(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[Camera, ..
         if (width, height) == (1, 1):  # MJCF's default
             width = height = _SIDE
         for side in (width, height):
-            if not 1 <= side <= MAX_PIXELS:
-                expected = f"1 to {MAX_PIXELS} pixels a side"
-                raise InputError(f"camera {one.name}: expected {expected}, got {side}")
+            check(f"camera {one.name}.resolution", _SIDES, side)
         rate = texts.pop(f"{_TEXTS}{one.name}.rate", "1")
         output = int(model.cam_output[number])
         axes = data.cam_xmat[number].reshape(3, 3)
@@ -197,21 +197,14 @@ def place_cameras(model: mujoco.MjModel, data: mujoco.MjData) -> None:
 
 def _check_numbers(name: str, model: mujoco.MjModel, number: int) -> None:
     """Raise `InputError` unless a camera of a model can see something."""
-    low, high = (math.degrees(end) for end in FOVY)
-    fovy = float(model.cam_fovy[number])
     focal = model.cam_intrinsic[number, :2].tolist()
     sensor = model.cam_sensorsize[number]
     if sensor.any() and not min(*focal, *sensor) > 0:
         raise InputError(
             f"{name}: expected a focal length above 0 with its sensorsize, got {focal}"
         )
-    if not low <= fovy <= high:
-        raise InputError(
-            f"{name}: expected fovy from {low:.3g} to {high:.4g} degrees, got {fovy:g}"
-        )
-    place = model.cam_pos[number].tolist()
-    if not max(map(abs, place)) <= 1e4:
-        raise InputError(f"{name}: expected a position within 1e4 m, got {place}")
+    check(f"{name}.fovy", _DEGREES, float(model.cam_fovy[number]))
+    check(f"{name}.pos", Limits(-1e4, 1e4, "m", count=3), model.cam_pos[number].tolist())
 
 
 def steps_of(name: str, rate: str | float) -> int:

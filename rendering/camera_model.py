@@ -73,11 +73,18 @@ def drawn_model(
 
 
 def own_discs(model: mujoco.MjModel, camera: int) -> np.ndarray:
-    """Numbers of the geoms of a camera's craft that are seen through, as its rotors' discs are."""
+    """Numbers of the geoms of a camera's craft that are seen through, as its rotors' discs are.
+
+    None of a camera that no craft carries.
+    """
+    root = model.body_rootid[model.cam_bodyid[camera]]
+    fixed = model.cam_mode[camera] == mujoco.mjtCamLight.mjCAMLIGHT_FIXED.value
+    if not fixed or not model.body_jntnum[root]:
+        return np.zeros(0, int)
     plain = (model.geom_rgba == _PLAIN).all(axis=1)
     materials = np.append(model.mat_rgba[:, 3], 1.0)[model.geom_matid]
     alpha = np.where(plain, materials, model.geom_rgba[:, 3])
-    own = model.body_rootid[model.geom_bodyid] == model.body_rootid[model.cam_bodyid[camera]]
+    own = model.body_rootid[model.geom_bodyid] == root
     discs: np.ndarray = np.flatnonzero(own & (alpha < 1))
     return discs
 

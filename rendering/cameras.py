@@ -91,11 +91,6 @@ class Cameras:
             view.name: np.zeros((rows, *view.shape), view.dtype) for view in self.views
         }
         self._cameras = {view.name: self._camera_ids(view, names) for view in self.views}
-        self._discs: dict[int, np.ndarray] = {}
-        for view in self.views:
-            for camera in self._cameras[view.name]:
-                discs = own_discs(self.model, camera) if view.camera.carried else np.zeros(0, int)
-                self._discs[camera] = discs
         self._geoms: dict[int, np.ndarray] = {}
         free = self.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE
         self._poses = self.model.jnt_qposadr[free][:, None] + np.arange(7)
@@ -216,7 +211,7 @@ class Cameras:
         self._camera.fixedcamid = camera
         # MuJoCo centres infinite planes on the scene's camera, so update it first.
         mujoco.mjv_updateCamera(self.model, self.data, self._camera, scene)
-        discs = self._discs[camera]
+        discs = own_discs(self.model, camera)
         groups = self.model.geom_group[discs]
         if objects:
             self.model.geom_group[discs] = _HIDDEN

@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 
 from ..models.errors import InputError
+from ..models.fields import Limits, check
 from .gl import Lines
 from .stage import Moment, Stage
 
@@ -38,12 +39,8 @@ class Pace:
     """
 
     def __init__(self, period: float, speed: float = 1.0) -> None:
-        low = SPEEDS[0]
-        high = SPEEDS[-1]
-        if not low <= speed <= high:
-            raise InputError(f"speed: expected {low:g} to {high:g}, got {speed:g}")
         self.period = period
-        self.speed = speed
+        self.speed: float = check("speed", Limits(SPEEDS[0], SPEEDS[-1]), speed)
         self.paused = False
         self._presses: SimpleQueue[Press] = SimpleQueue()
         self._asked = 0  # steps that a pause lets pass

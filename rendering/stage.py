@@ -3,16 +3,15 @@
 import copy
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple, Self, get_args
+from typing import Final, Literal, NamedTuple, get_args
 
 import mujoco
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ..models.cameras import place_cameras
 from ..models.errors import InputError, shortened
@@ -122,37 +121,6 @@ class Moment:
     """Control steps since the episode began; 0 at its start."""
     episode: int = 0
     """Episodes before this one."""
-
-    @classmethod
-    def of(
-        cls,
-        telemetry: Mapping[str, ArrayLike],
-        metrics: Sequence[tuple[str, str, str]],
-        **rest: Any,
-    ) -> Self:
-        """From a drone's telemetry, and `reward`, `step` and `episode`, which it does not have.
-
-        Telemetry is arrays by name: `position` (3,), `attitude` (4,), `thrust` (R,), `metrics` (M,)
-        and, if there are any, `goal` (3,) and `payload` (3,). The M metrics are told by name, unit
-        and symbol.
-        """
-
-        def told(name: str) -> tuple[Any, ...]:
-            return tuple(np.asarray(telemetry[name], float).tolist())
-
-        values = told("metrics") if metrics else ()
-        return cls(
-            position=told("position"),
-            attitude=told("attitude"),
-            thrusts=told("thrust"),
-            goal=told("goal") if "goal" in telemetry else None,
-            payload=told("payload") if "payload" in telemetry else None,
-            metrics=tuple(
-                MetricValue(name, value, unit, symbol)
-                for (name, unit, symbol), value in zip(metrics, values, strict=True)
-            ),
-            **rest,
-        )
 
     def lines(self, thrust_high: float) -> list[tuple[str, str]]:
         """Names and values for an overlay; a rotor's largest thrust, N, sets the digits."""

@@ -182,7 +182,7 @@ def test_without_a_period_every_step_is_due() -> None:
 
 @pytest.mark.parametrize("speed", [0.0, -1.0, 1 / 17, 8.5, float("nan")])
 def test_wrong_speed(speed: float) -> None:
-    with pytest.raises(InputError, match=r"^speed: expected 0.0625 to 8, got"):
+    with pytest.raises(InputError, match=r"^speed: expected a number from 0.0625 to 8, got"):
         Pace(0.02, speed)
 
 
@@ -479,7 +479,7 @@ def test_no_display(
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        (("--speed", "9"), "speed: expected 0.0625 to 8, got 9"),
+        (("--speed", "9"), "speed: expected a number from 0.0625 to 8, got 9.0"),
         (("--episodes", "0"), "episodes: expected at least 1, got 0"),
     ],
 )
