@@ -11,9 +11,8 @@ import json
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import mujoco
 import numpy as np
@@ -37,8 +36,7 @@ _FARTHEST: Final = 65.535  # m: the largest number of millimetres in 16 bits
 Picture = NDArray[np.generic]
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Job:
+class _Job(NamedTuple):
     """Some frames of a sequence."""
 
     plan: Plan
@@ -46,20 +44,12 @@ class _Job:
     """Those of the frames."""
     sequence: int
     """Number of the whole sequence."""
-    first: int
-    """Number of the frame of the first pose."""
-    missing: frozenset[int]
-    """Numbers of the frames to take."""
+    numbers: list[int]
+    """Of the frames."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Frame:
-    """The pictures and labels of a pose."""
-
-    number: int
-    files: dict[str, bytes]
-    """By their paths in the folder."""
-    labels: Labels
+Frame = tuple[dict[str, bytes], Labels]
+"""Files of a pose by their paths in the folder, and its labels."""
 
 
 def capture(
@@ -85,14 +75,14 @@ def capture(
         longest = min(_MOST_FRAMES, -(-count // (2 * workers)))
         jobs = {}
         for job in _jobs(plan, sequences, folder, longest):
-            jobs[f"frames {min(job.missing)} to {max(job.missing)}"] = job
+            jobs[f"frames {job.numbers[0]} to {job.numbers[-1]}"] = job
 
         def keep(_: _Job, frames: list[Frame]) -> None:
-            for frame in frames:
-                for name, data in frame.files.items():
+            for files, labels in frames:
+                for name, data in files.items():
                     write_whole(folder / name, data)
-                labels = json.dumps(frame.labels, separators=(",", ":"))
-                write_whole(label_file(folder, frame.number), labels.encode())
+                text = json.dumps(labels, separators=(",", ":"))
+                write_whole(label_file(folder, labels["frame"]), text.encode())
 
         if jobs:
             with open_executor(config, len(jobs), on_progress) as executor:
@@ -143,18 +133,11 @@ def _jobs(
     start = 0  # number of the first frame of the sequence
     for index, poses in enumerate(sequences):
         for first in range(0, len(poses), longest):
-            end = min(first + longest, len(poses))
-            numbers = range(start + first, start + end)
-            missing = frozenset(number for number in numbers if not _is_whole(folder, number))
+            rows = range(first, min(first + longest, len(poses)))
+            missing = [row for row in rows if not _is_whole(folder, start + row)]
             if missing:
-                begin = min(missing) - start
-                yield _Job(
-                    plan=plan,
-                    poses=poses.part(begin, end),
-                    sequence=index,
-                    first=start + begin,
-                    missing=missing,
-                )
+                numbers = [start + row for row in missing]
+                yield _Job(plan, poses.at(missing), index, numbers)
         start += len(poses)
 
 
@@ -190,18 +173,17 @@ def _take(job: _Job, tell: Tell) -> list[Frame]:
     )
     with closing(opened) as cameras:
         due = dict.fromkeys(cameras.pictures, everybody)
-        for number in sorted(job.missing):
-            row = number - job.first
+        for row in range(len(poses)):
             cameras.take(due, poses.state(row))
             frames.append(_frame(job, row, cameras))
-            tell(len(frames), len(job.missing), "frames")
+            tell(len(frames), len(poses), "frames")
     return frames
 
 
 def _frame(job: _Job, row: int, cameras: "Cameras") -> Frame:
     """Files and labels of the pictures that the cameras have just taken."""
     poses = job.poses
-    number = job.first + row
+    number = job.numbers[row]
     state = poses.state(row)
     names = drone_names(poses.drones)
     files: dict[str, bytes] = {}
@@ -242,7 +224,7 @@ def _frame(job: _Job, row: int, cameras: "Cameras") -> Frame:
         "pose": {name: values.tolist() for name, values in state.items()},
         "pictures": pictures,
     }
-    return Frame(number=number, files=files, labels=labels)
+    return files, labels
 
 
 def _encoded(view: View, image: Picture) -> Iterator[tuple[str, bytes]]:

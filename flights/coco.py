@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -32,23 +32,38 @@ def write_coco(
     categories = {kind: number for number, kind in enumerate(sorted(kinds - {NOTHING}), 1)}
     images: list[Labels] = []
     annotations: list[Labels] = []
-    for image, picture in _segmented(frames):
-        images.append(image)
-        for thing in picture["objects"]:
-            annotation = {
-                "id": len(annotations) + 1,
-                "image_id": image["id"],
-                "category_id": categories[category(thing["name"])],
-                "bbox": thing["box"],
-                "area": thing["area"],
-                "iscrowd": 0,
-                "segmentation": {
-                    "size": [image["height"], image["width"]],
-                    "counts": thing["runs"],
-                },
-                "object": thing["name"],
+    for frame in frames:
+        colors: dict[tuple[object, ...], str] = {}
+        for picture in frame["pictures"]:
+            if picture["kind"] == "rgb":
+                (colors[_view(picture)],) = picture["files"]
+        for picture in frame["pictures"]:
+            if picture["kind"] != "segmentation":
+                continue
+            # An image is named by the colours of its camera in the same size, if there are any.
+            (own,) = picture["files"]
+            image = {
+                "id": len(images) + 1,
+                "file_name": colors.get(_view(picture), own),
+                "width": picture["width"],
+                "height": picture["height"],
+                "sequence": frame["sequence"],
+                "time": frame["time"],
             }
-            annotations.append(annotation)
+            images.append(image)
+            for thing in picture["objects"]:
+                size = [picture["height"], picture["width"]]
+                annotation = {
+                    "id": len(annotations) + 1,
+                    "image_id": image["id"],
+                    "category_id": categories[category(thing["name"])],
+                    "bbox": thing["box"],
+                    "area": thing["area"],
+                    "iscrowd": 0,
+                    "segmentation": {"size": size, "counts": thing["runs"]},
+                    "object": thing["name"],
+                }
+                annotations.append(annotation)
     content = {
         "images": images,
         "annotations": annotations,
@@ -60,32 +75,6 @@ def write_coco(
 def category(name: str) -> str:
     """Kind of an object: its name without numbers, as forest/tree of forest/tree_12."""
     return re.sub(r"_\d+\b", "", name)
-
-
-def _segmented(frames: Sequence[Labels]) -> Iterator[tuple[Labels, Labels]]:
-    """COCO's image and our labels of each segmentation picture.
-
-    An image is named by the colours of its camera in the same size, or else by its segmentation.
-    """
-    count = 0
-    for frame in frames:
-        files: dict[tuple[object, ...], str] = {}
-        for picture in frame["pictures"]:
-            if picture["kind"] == "rgb":
-                (files[_view(picture)],) = picture["files"]
-        for picture in frame["pictures"]:
-            if picture["kind"] == "segmentation":
-                count += 1
-                (own,) = picture["files"]
-                image = {
-                    "id": count,
-                    "file_name": files.get(_view(picture), own),
-                    "width": picture["width"],
-                    "height": picture["height"],
-                    "sequence": frame["sequence"],
-                    "time": frame["time"],
-                }
-                yield image, picture
 
 
 def _view(picture: Labels) -> tuple[object, ...]:

@@ -117,17 +117,13 @@ def _results(
             return
         done, submitted = wait(submitted, return_when=FIRST_COMPLETED)
         for future in done:
-            yield _result(future)
-
-
-def _result(future: Future[Result]) -> Result:
-    try:
-        return future.result()
-    except BrokenProcessPool:
-        raise RunsFailed(
-            "a worker was killed, perhaps for want of memory (try fewer --jobs); "
-            "what was done before is kept"
-        ) from None
+            try:
+                yield future.result()
+            except BrokenProcessPool:
+                raise RunsFailed(
+                    "a worker was killed, perhaps for want of memory (try fewer --jobs); "
+                    "what was done before is kept"
+                ) from None
 
 
 @contextmanager

@@ -9,7 +9,8 @@ import tomllib
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import cycle, pairwise
+from itertools import cycle, groupby, pairwise
+from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -50,8 +51,6 @@ class PoseSequence:
     MuJoCo's world frame, m.
     """
 
-    name: str
-    """Name of its source."""
     times: Floats
     """Since the start of the episode, shape (T,), s; those of random places are 0."""
     position: Floats
@@ -67,6 +66,8 @@ class PoseSequence:
     payload: Floats | None = None
     """Shape (T, A, 3)."""
     marks: tuple[Mark, ...] = ()
+    name: str = ""
+    """Name of its source."""
     scene: str = "plain"
     """Surroundings of the drones."""
 
@@ -78,10 +79,10 @@ class PoseSequence:
         """A."""
         return int(self.position.shape[1])
 
-    def part(self, first: int, end: int) -> "PoseSequence":
-        """The poses from `first` to before `end`."""
+    def at(self, rows: slice | list[int]) -> "PoseSequence":
+        """Some of the poses."""
         arrays: dict[str, Any] = {
-            name: values[first:end]
+            name: values[rows]
             for name, values in vars(self).items()
             if isinstance(values, np.ndarray)
         }
@@ -103,7 +104,7 @@ class PoseSource:
 
     @abstractmethod
     def sequences(
-        self, name: str, vehicle: str | None, rng: np.random.Generator, scenes: int
+        self, vehicle: str | None, rng: np.random.Generator, scenes: int
     ) -> list[PoseSequence]:
         """Its poses, for so many scenes in turn. Raises `InputError`."""
 
@@ -118,7 +119,7 @@ class RandomPoses(PoseSource):
     tilt: _Angle = 0.3
 
     def sequences(
-        self, name: str, vehicle: str | None, rng: np.random.Generator, scenes: int
+        self, vehicle: str | None, rng: np.random.Generator, scenes: int
     ) -> list[PoseSequence]:
         """One part for each scene, all nearly as long."""
         shares = rng.uniform(-0.5, 0.5, (self.count, 3))
@@ -127,12 +128,10 @@ class RandomPoses(PoseSource):
         heading = np.stack((np.cos(half), zero, zero, np.sin(half)), axis=-1)
         quaternion = multiplied(_tilts((self.count,), self.tilt, rng), heading)
         position = np.array(self.center) + np.array(self.size) * shares
-        whole = PoseSequence(
-            name=name, times=zero, position=position[:, None], quaternion=quaternion[:, None]
-        )
+        whole = PoseSequence(times=zero, position=position[:, None], quaternion=quaternion[:, None])
         parts = min(scenes, self.count)
         ends = np.linspace(0, self.count, parts + 1).astype(int).tolist()
-        return [whole.part(first, end) for first, end in pairwise(ends)]
+        return [whole.at(slice(*pair)) for pair in pairwise(ends)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,24 +144,23 @@ class _FlightPoses(PoseSource):
     tilt: _Angle = 0.0
     """Cameras are tilted by up to this angle."""
 
-    @property
-    def drones(self) -> int:
-        """Drones of a world."""
-        return 1
-
     @abstractmethod
     def trajectories(self, vehicle: str | None) -> list[Trajectory]:
         """Episode after episode, each with a trajectory of every drone. Raises `InputError`."""
 
     def sequences(
-        self, name: str, vehicle: str | None, rng: np.random.Generator, scenes: int
+        self, vehicle: str | None, rng: np.random.Generator, scenes: int
     ) -> list[PoseSequence]:
         """One sequence for each episode."""
-        flown = self.trajectories(vehicle)
         found = []
-        for first in range(0, len(flown), self.drones):
-            sequence = _sequence(name, flown[first : first + self.drones], self.every)
-            found.append(_moved(sequence, self.aside, self.tilt, rng))
+        low = (-self.aside, -self.aside, 0.0)
+        for _, world in groupby(self.trajectories(vehicle), key=attrgetter("episode")):
+            sequence = _sequence(list(world), self.every)
+            shape = sequence.position.shape
+            position = sequence.position + rng.uniform(low, self.aside, shape)
+            tilts = _tilts(shape[:-1], self.tilt, rng)
+            quaternion = multiplied(tilts, sequence.quaternion)
+            found.append(replace(sequence, position=position, quaternion=quaternion))
         return found
 
 
@@ -287,9 +285,9 @@ class Plan:
             name = f"{number} {kinds[type(source)]}"
             rng = np.random.default_rng([self.seed, number])
             scenes = scenes_of(source.scene or self.scene)
-            sequences = source.sequences(name, self.vehicle, rng, len(scenes))
+            sequences = source.sequences(self.vehicle, rng, len(scenes))
             for sequence, scene in zip(sequences, cycle(scenes), strict=False):
-                found.append(replace(sequence, scene=scene))
+                found.append(replace(sequence, name=name, scene=scene))
         count = sum(map(len, found))
         if count > MAX_FRAMES:
             raise InputError(f"plan: expected at most {MAX_FRAMES} poses, got {count}")
@@ -314,25 +312,16 @@ def _source(table: object, number: int) -> PoseSource:
     return source
 
 
-def _moved(
-    sequence: PoseSequence, aside: float, tilt: float, rng: np.random.Generator
-) -> PoseSequence:
-    """The cameras up to so far aside, m, or higher, and tilted up to an angle more, rad."""
-    shape = sequence.position.shape
-    moves = rng.uniform((-aside, -aside, 0.0), aside, shape)
-    quaternion = multiplied(_tilts(shape[:-1], tilt, rng), sequence.quaternion)
-    return replace(sequence, position=sequence.position + moves, quaternion=quaternion)
-
-
 def _tilts(shape: tuple[int, ...], largest: float, rng: np.random.Generator) -> Floats:
     """Rotations by up to an angle, rad, about any level axis, quaternions, (*shape, 4)."""
     axis = rng.uniform(-np.pi, np.pi, shape)
     half = largest * np.sqrt(rng.uniform(0, 1, shape)) / 2
-    x, y = np.sin(half) * np.cos(axis), np.sin(half) * np.sin(axis)
+    x = np.sin(half) * np.cos(axis)
+    y = np.sin(half) * np.sin(axis)
     return np.stack((np.cos(half), x, y, np.zeros(shape)), axis=-1)
 
 
-def _sequence(name: str, world: Sequence[Trajectory], every: int) -> PoseSequence:
+def _sequence(world: Sequence[Trajectory], every: int) -> PoseSequence:
     """Every so many steps of the trajectories of the drones of a world."""
     steps = np.arange(0, max(map(len, world)) + 1, every)
     spec = world[0].spec
@@ -341,7 +330,7 @@ def _sequence(name: str, world: Sequence[Trajectory], every: int) -> PoseSequenc
         key: np.stack([poses[key] for poses in drones], axis=1) for key in drones[0]
     }
     times = steps.astype(np.float64) * spec.control_period
-    return PoseSequence(name=name, times=times, marks=spec.marks, **arrays)
+    return PoseSequence(times=times, marks=spec.marks, **arrays)
 
 
 def _poses_after(one: Trajectory, steps: NDArray[np.int_]) -> dict[str, Floats]:
