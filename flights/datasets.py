@@ -22,8 +22,8 @@ from ..envs.spaces import action_space, joined, observation_space
 from ..envs.spec import ArraySpec, EnvSpec
 from ..models.errors import InputError, require
 from ..models.files import check_new_file
-from ..udp.journal.reader import Recording
-from .recorded import SessionReader
+from ..udp.journal.reader import Session
+from .recorded import read_episodes
 from .signals import telemetry_of
 from .trajectories import Trajectory
 
@@ -77,28 +77,15 @@ class RecordedEpisodes:
     def _whole(self, paths: Sequence[Path]) -> Iterator[Trajectory]:
         for path in paths:
             self.journal = path.name
-            for episode in self._read(path):
-                if episode.ending == "cut off":
+            for one in read_episodes(path, observations=True):
+                if isinstance(one, Session):
+                    self._check(path, one.spec, one.hello.session)
+                elif one.ending == "cut off":
                     self.left_out += 1
                 else:
                     self.count += 1
-                    self.steps += len(episode)
-                    yield episode
-
-    def _read(self, path: Path) -> Iterator[Trajectory]:
-        """All episodes of a journal."""
-        flying: dict[int, SessionReader] = {}  # the last session of each slot
-        for item in Recording(path):
-            reader = flying.get(item.session.slot)
-            if reader is None or reader.session is not item.session:
-                if reader is not None:
-                    yield from reader.finish()
-                self._check(path, item.session.spec, item.session.hello.session)
-                reader = SessionReader(item.session, observations=True)
-                flying[item.session.slot] = reader
-            yield from reader.take(item.message)
-        for reader in flying.values():
-            yield from reader.finish()
+                    self.steps += len(one)
+                    yield one
 
     def _check(self, path: Path, spec: EnvSpec, session: int) -> None:
         """Refuse another spec than that of the first session, and a session that was read."""
@@ -180,7 +167,6 @@ def _table(spec: EnvSpec, number: int, journal: str, episode: Trajectory) -> "pa
     import pyarrow as pa
 
     rows = len(episode) + 1
-    is_last = np.arange(1, rows) == rows - 1
 
     def repeated(value: object, kind: pa.DataType) -> pa.Array:
         return pa.repeat(pa.scalar(value, kind), rows)
@@ -207,12 +193,19 @@ def _table(spec: EnvSpec, number: int, journal: str, episode: Trajectory) -> "pa
         actions = {"action": pa.array(episode.actions)}
     columns |= {name: with_null(values) for name, values in actions.items()}
     columns["reward"] = with_null(episode.rewards)
-    columns["terminated"] = with_null(is_last & (episode.ending == "terminated"))
-    columns["truncated"] = with_null(is_last & (episode.ending == "truncated"))
+    for ending in ("terminated", "truncated"):
+        columns[ending] = with_null(_ends(episode, ending))
     for signal in telemetry_of(episode):
         for name, _, values in signal.columns():
             columns[f"telemetry.{name}"] = pa.array(values)
     return pa.table(columns)
+
+
+def _ends(episode: Trajectory, ending: str) -> NDArray[np.bool_]:
+    """Whether each step ended it so."""
+    ends = np.zeros(len(episode), bool)
+    ends[-1] = episode.ending == ending
+    return ends
 
 
 def _columns(stem: str, array: ArraySpec, values: NDArray[np.generic]) -> "dict[str, pa.Array]":
@@ -223,10 +216,7 @@ def _columns(stem: str, array: ArraySpec, values: NDArray[np.generic]) -> "dict[
     if len(array.shape) > 1:
         return {stem: pa.FixedSizeListArray.from_arrays(pa.array(flat.ravel()), array.size)}
     names = array.components or map(str, range(array.size))
-    return {
-        f"{stem}.{name}": pa.array(np.ascontiguousarray(column))
-        for name, column in zip(names, flat.T, strict=True)
-    }
+    return {f"{stem}.{name}": pa.array(column) for name, column in zip(names, flat.T, strict=True)}
 
 
 # ---- Minari
@@ -279,9 +269,8 @@ def env_of(spec: EnvSpec, vehicle: Path | str | None = None) -> Any:
     if not registry.is_known(spec.env_id):
         return None
     try:
-        here = registry.env_spec(
-            EnvConfig.from_keywords(spec.env_id, vehicle=vehicle, **spec.options)
-        )
+        config = EnvConfig.from_keywords(spec.env_id, vehicle=vehicle, **spec.options)
+        here = registry.env_spec(config)
     except InputError:  # options that this vehicle does not have
         return None
     if here != spec:
@@ -296,7 +285,6 @@ def env_of(spec: EnvSpec, vehicle: Path | str | None = None) -> Any:
 def _buffer(spec: EnvSpec, episode: Trajectory) -> Any:
     from minari.data_collector.episode_buffer import EpisodeBuffer
 
-    is_last = np.arange(1, len(episode) + 1) == len(episode)
     infos = {}
     for signal in telemetry_of(episode):
         for name, _, values in signal.columns():
@@ -306,7 +294,7 @@ def _buffer(spec: EnvSpec, episode: Trajectory) -> Any:
         observations=joined(spec, dict(episode.observations)),
         actions=episode.actions,
         rewards=episode.rewards,
-        terminations=is_last & (episode.ending == "terminated"),
-        truncations=is_last & (episode.ending == "truncated"),
+        terminations=_ends(episode, "terminated"),
+        truncations=_ends(episode, "truncated"),
         infos=infos,
     )

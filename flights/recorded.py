@@ -38,33 +38,26 @@ def recorded_trajectories(
     """
     if not path.is_file():
         raise InputError(f"{path}: expected a journal (.mcap), got no such file")
-    readers: dict[int, SessionReader] = {}
-    flown: dict[int, list[Trajectory]] = {}
-    for item in Recording(path):
-        number = item.session.index
-        if number not in readers:
-            readers[number] = SessionReader(item.session, drone)
-            flown[number] = []
-        if session in (None, number):
-            flown[number] += readers[number].take(item.message)
-    if session is not None and session not in readers:
-        known = f"1 to {len(readers)}" if readers else "a journal with sessions"
+    sessions: list[Session] = []
+    found: list[Trajectory] = []
+    for one in read_episodes(path, drone):
+        if isinstance(one, Session):
+            sessions.append(one)
+        elif session in (None, one.session):
+            found.append(one)
+    if session is not None and not 1 <= session <= len(sessions):
+        known = f"1 to {len(sessions)}" if sessions else "a journal with sessions"
         raise InputError(f"session: expected {known}, got {session} for {path}")
-    flew = sorted(number for number, reader in readers.items() if reader.has_steps)
-    if not flew:
-        raise InputError(f"{path}: expected an episode with a step in it, got none")
-    chosen = flew[0]
-    if len(flew) > 1:
-        words = (
-            "%s: episodes of session %d; %d more flew, which log, plot and render --session show"
-        )
-        logging.getLogger(__name__).info(words, path.name, chosen, len(flew) - 1)
-    last = readers[chosen].session.num_envs - 1
-    if drone is not None and not 0 <= drone <= last:
-        raise InputError(f"drone: expected 0 to {last} in {path}, got {drone}")
-    found = [*flown[chosen], *readers[chosen].finish()]
+    drones = max((one.num_envs for one in sessions if session in (None, one.index)), default=1)
+    if drone is not None and not 0 <= drone < drones:
+        raise InputError(f"drone: expected 0 to {drones - 1} in {path}, got {drone}")
     if not found:
-        raise InputError(f"{path}: expected an episode of drone {drone}, got none")
+        raise InputError(f"{path}: expected an episode with a step in it, got none")
+    flew = sorted({one.session for one in found})
+    if len(flew) > 1:
+        found = [one for one in found if one.session == flew[0]]
+        words = "%s: session %d of %d that flew; --session of log, plot and render takes another"
+        logging.getLogger(__name__).info(words, path.name, flew[0], len(flew))
     found.sort(key=lambda one: (one.drone, one.episode))
     if episodes is None:
         return found
@@ -73,6 +66,31 @@ def recorded_trajectories(
         if not 0 <= episode <= last:
             raise InputError(f"episode: expected 0 to {last} in {path}, got {episode}")
     return [one for episode in episodes for one in found if one.episode == episode]
+
+
+def read_episodes(
+    path: Path, drone: int | None = None, *, observations: bool = False
+) -> Iterator[Session | Trajectory]:
+    """The sessions of a journal as they begin, their episodes as they end.
+
+    A Command that is missing in the journal cuts off all episodes: nobody knows what was flown.
+
+    Args:
+        path: The journal.
+        drone: The one whose trajectories are made; None: all.
+        observations: Whether they get their observations.
+    """
+    flying: dict[int, _SessionReader] = {}  # the last session of each slot
+    for item in Recording(path):
+        slot = item.session.slot
+        if slot not in flying or flying[slot].session is not item.session:
+            if slot in flying:
+                yield from flying[slot].finish()
+            yield item.session
+            flying[slot] = _SessionReader(item.session, drone, observations)
+        yield from flying[slot].take(item.message)
+    for reader in flying.values():
+        yield from reader.finish()
 
 
 class _Row(NamedTuple):
@@ -84,25 +102,11 @@ class _Row(NamedTuple):
     action: Array | None
 
 
-class SessionReader:
-    """Makes trajectories from the messages of one session.
+class _SessionReader:
+    """Makes trajectories from the messages of one session."""
 
-    A Command that is missing in the journal cuts off all episodes: nobody knows what was flown.
-
-    Args:
-        session: The session of the messages.
-        drone: The one whose trajectories are made; None: all.
-        observations: Whether they get their observations.
-
-    Attributes:
-        has_steps: Whether any drone has flown a step.
-    """
-
-    def __init__(
-        self, session: Session, drone: int | None = None, *, observations: bool = False
-    ) -> None:
+    def __init__(self, session: Session, drone: int | None, observations: bool) -> None:
         self.session = session
-        self.has_steps = False
         self._observations = observations
         self._drones = len(session.spec.agents)
         count = session.num_envs
@@ -129,7 +133,6 @@ class SessionReader:
         if transition.is_gap:
             yield from self.finish()
             return
-        self.has_steps |= bool(transition.flown.any())
         for drone in np.flatnonzero(transition.flown & self._chosen).tolist():
             if command is None or not self._rows[drone]:
                 continue  # its episode has ended
