@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, Final, TypeVar, get_type_hints
 
 RESULTS: Final = Path("docs/results")
-IMAGES: Final = Path(__file__).parents[1] / "docs" / "images"
 Name = TypeVar("Name")
 Way = TypeVar("Way")
 Value = TypeVar("Value")
