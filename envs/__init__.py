@@ -44,9 +44,9 @@ for _module, _name in (
     ("landing", "Landing"),
     ("recovery", "Recovery"),
     ("payload_hover", "PayloadHover"),
-    ("formation", "Formation"),
-    ("crossing", "Crossing"),
-    ("escort", "Escort"),
+    ("swarm", "Formation"),
+    ("swarm", "Crossing"),
+    ("swarm", "Escort"),
     ("cable", "Cable"),
 ):
     register(f"rotorgram/{_name}-v0", f"rotorgram.envs.tasks.{_module}:{_name}")

@@ -202,9 +202,9 @@ class EnvConfig:
         if settings:
             backend = BackendConfig.parse(given.get("backend", "mujoco"))
             given["backend"] = replace(backend, **settings)
-        if not isinstance(nested, Mapping):
-            raise InputError(f"task: expected options by name, got {shortened(nested)}")
-        return cls(env_id=env_id, task={**options, **nested}, **given)
+        if isinstance(nested, Mapping):
+            nested = {**options, **nested}
+        return cls(env_id=env_id, task=nested, **given)
 
     def flat_options(self) -> dict[str, Any]:
         """Keywords of everything but the vehicle, the drones and the backend, as JSON values.

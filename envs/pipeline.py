@@ -6,17 +6,15 @@ from .spec import ArraySpec
 from .specification import observed
 from .stages.actions import ActionDelay, Actions, Receive
 from .stages.clock import Clock
-from .stages.delays import ObservationDelay
 from .stages.ends import Ends
 from .stages.flight import Control, Flight, StandStill
-from .stages.history import History
+from .stages.history import History, ObservationDelay
 from .stages.judge import Judge, Remember, Starts
 from .stages.landing import Landed, Landing
-from .stages.measure import Measure
+from .stages.measure import Measure, Readings, Sensing
 from .stages.pictures import Pictures
 from .stages.radio import Radio
 from .stages.record import Stage
-from .stages.sensing import Readings, Sensing
 from .tasks.task import Task
 
 

@@ -56,8 +56,7 @@ class SingleEnv(gym.Env[Any, Any]):
         self.metadata = self.metadata | {"render_fps": max(1, round(1 / self.control_period))}
         self.observation_space = observation_space(loop.spec)
         self.action_space = action_space(loop.spec)
-        self._usual = self.action_space.dtype, self.action_space.shape
-        self._blank = dict.fromkeys(telemetry_names(loop.spec), 0.0)
+        self._names = telemetry_names(loop.spec)
         arrays = loop.spec.observation
         self._only = arrays[0].name if len(arrays) == 1 else ""
         self._all = np.ones(1, bool)
@@ -80,7 +79,7 @@ class SingleEnv(gym.Env[Any, Any]):
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Fly for one control period. See the task for shapes, units and ends."""
         loop = self._loop
-        loop.advance(self._checked(action))
+        loop.advance(checked_action(action, self.action_space, "action"))
         if self.render_mode == "human":
             self.render()
         flags = loop.terminated.item(), loop.truncated.item()
@@ -105,11 +104,6 @@ class SingleEnv(gym.Env[Any, Any]):
         self._renderer.close()
         self._loop.close()
 
-    def _checked(self, action: Any) -> np.ndarray:
-        if isinstance(action, np.ndarray) and (action.dtype, action.shape) == self._usual:
-            return action
-        return checked_action(action, self.action_space, "action")
-
     def _observation(self) -> Any:
         observations = self._loop.observations
         if self._only:  # the loop makes new arrays with each step
@@ -118,8 +112,7 @@ class SingleEnv(gym.Env[Any, Any]):
 
     def _info(self) -> dict[str, Any]:
         loop = self._loop
-        info = self._blank.copy()  # faster than to insert one name after the other
-        info |= zip(self._blank, loop.row(), strict=False)
+        info = dict(zip(self._names, loop.row(), strict=True))
         for name, term in loop.record.terms.items():
             info["reward_" + name] = term.item() if isinstance(term, np.ndarray) else float(term)
         return info

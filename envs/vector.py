@@ -138,11 +138,8 @@ class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
     def _take_results(self) -> None:
         loop = self.loop
         self.observations = joined(loop.spec, loop.observations)
-        self.rewards = loop.rewards
-        self.terminated = loop.terminated
-        self.truncated = loop.truncated
-        self.done = loop.done
-        self.out = loop.out
+        for name in ("rewards", "terminated", "truncated", "done", "out"):
+            setattr(self, name, getattr(loop, name))
 
     def _choice(self, name: str, value: Any) -> np.ndarray:
         check_names([name], ("reset_mask", *self.loop.task.reset_options), "options")

@@ -21,7 +21,7 @@ from rotorgram.agents.pid import SHARES
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.loop import Loop
 from rotorgram.envs.spec import canonical_id
-from rotorgram.envs.tasks.elevation import ERROR_SCALE
+from rotorgram.envs.tasks.goal import ERROR_SCALE
 from rotorgram.envs.tasks.racing import RacingOptions, read_track
 from rotorgram.envs.tasks.recovery import Recovery, RecoveryOptions
 from rotorgram.envs.tasks.waypoints import WaypointsOptions

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from ...models.errors import InputError
 from ...sim import World
+from .history import filled, pushed, taken
 from .record import Mask, Record, Stage, is_finite
-from .ring import filled, pushed, taken
 
 
 class Actions:

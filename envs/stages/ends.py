@@ -53,16 +53,12 @@ class Ends(Stage):
             record.end(ends)
 
     def _check(self, record: Record, reward: NDArray[np.float64]) -> None:
-        arrays = record.observations.values()
-        if is_finite(reward) and all(map(is_finite, arrays)):
-            return
-        count = self._nobody.size
-        for name, values in (*record.observations.items(), ("reward", reward)):
-            rows = np.reshape(values, (count, -1))
-            wrong = ~np.isfinite(rows).all(axis=1)
-            if wrong.any():
-                first = int(wrong.argmax())
-                raise InputError(
-                    f"{self._env_id}: expected finite numbers for {name}, got "
-                    f"{rows[first].tolist()} for env {first}"
-                )
+        for name, values in {**record.observations, "the reward": reward}.items():
+            if is_finite(values):
+                continue
+            rows = np.reshape(values, (self._nobody.size, -1))
+            first = int(np.argmin(np.isfinite(rows).all(axis=1)))
+            raise InputError(
+                f"{self._env_id}: expected finite numbers for {name}, got "
+                f"{rows[first].tolist()} for env {first}"
+            )

@@ -1,12 +1,18 @@
-"""Observations of the last steps side by side."""
+"""Arrays of the last control steps: observations side by side, and observations that are late.
+
+They have the shape (W, A, steps, *shape), the oldest step first.
+"""
 
 from dataclasses import replace
 
 import numpy as np
 
+from ...sim import World
+from ...sim.state import Array
 from ..spec import ArraySpec
-from .record import Record, Stage
-from .ring import Values, later
+from .record import Record, Stage, where
+
+Values = np.ndarray
 
 
 class History(Stage):
@@ -47,6 +53,36 @@ class History(Stage):
         return history.reshape(*lead, -1, *rest)
 
 
+class ObservationDelay(Stage):
+    """An observation arrives late by a number of control steps that each episode draws.
+
+    The first one of an episode arrives at once, and again until another one does.
+
+    Args:
+        world: Its parameter `observation_delay`, control steps.
+        longest: No delay is longer.
+    """
+
+    arrays = ("past_observations",)
+
+    def __init__(self, world: World, longest: int) -> None:
+        self._world = world
+        self._steps = longest + 1
+        self._axis = len(world.shape)
+
+    def step(self, record: Record) -> None:
+        """A drone that begins fills its past with the present."""
+        past = vars(record).get("past_observations", {})
+        age = self._world.parameters["observation_delay"]
+        sent = {}
+        arrived = {}
+        for name, values in record.observations.items():
+            sent[name] = later(past.get(name), values, self._steps, record)
+            arrived[name] = taken(sent[name], age, self._axis)
+        record.past_observations = sent
+        record.observations = arrived
+
+
 def with_history(array: ArraySpec, steps: int) -> ArraySpec:
     """The spec of `steps` values of an array, side by side along its first axis."""
     if steps == 1:
@@ -65,3 +101,37 @@ def with_history(array: ArraySpec, steps: int) -> ArraySpec:
         unit=array.unit if isinstance(array.unit, str) else array.unit * steps,
         components=tuple(names),
     )
+
+
+def filled(values: Values, steps: int, axis: int) -> Values:
+    """Values (W, A, *shape), repeated for `steps` steps along a new axis."""
+    return np.repeat(np.expand_dims(values, axis), steps, axis)
+
+
+def pushed(past: Values, values: Values, axis: int) -> Values:
+    """The past one step later: without its oldest values, and with new ones."""
+    kept = past[(slice(None),) * axis + (slice(1, None),)]
+    return np.concatenate((kept, np.expand_dims(values, axis)), axis)
+
+
+def later(past: Values | None, values: Values, steps: int, record: Record) -> Values:
+    """The past of `steps` steps, one step later; of drones that begin it is the present."""
+    axis = len(record.shape)
+    if past is None:
+        return filled(values, steps, axis)
+    new = pushed(past, values, axis)
+    if record.begun is None:
+        return new
+    merged: Values = where(record.begun, filled(values, steps, axis), new)
+    return merged
+
+
+def taken(past: Values, age: Array, axis: int) -> Values:
+    """Values of `age` steps ago; the age has the shape (W, A), whole numbers."""
+    index = past.shape[axis] - 1 - np.asarray(age).astype(int)
+    if not axis:
+        present: Values = past[int(index)]
+        return present
+    index = index.reshape(index.shape + (1,) * (past.ndim - axis))
+    chosen: Values = np.take_along_axis(past, index, axis).squeeze(axis)
+    return chosen

@@ -80,8 +80,6 @@ class _Painter(NamedTuple):
 
     cameras: "Cameras"
     scene: int
-    objects: np.ndarray
-    """Numbers of its objects among those of all scenes."""
     worlds: np.ndarray
     """bool, shape (W,)."""
 
@@ -107,30 +105,20 @@ class Pictures(Stage):
         self._rows = shape[0] * shape[1]
         self._random = random
         self.views = views_of(task, shape[1])
-        scenes = scenes_of(str(task.config.scene))
-        self._count = len(scenes)
+        self._scenes = scenes_of(str(task.config.scene))
         self._threads = min(os.cpu_count() or 1, shape[0], _MAX_THREADS)
-        parts = np.arange(shape[0]) % -(-self._threads // len(scenes))
-        cameras = []
-        for number, scene in enumerate(scenes):
-            for part in range(parts.max() + 1):
-                payload = task.config.effects.payload > 0
-                drawn = Cameras(
-                    task.vehicle,
-                    self.views,
-                    shape,
-                    scene=scene,
-                    marks=task.marks,
-                    payload=payload,
-                )
-                cameras.append((number, drawn, parts == part))
-        names = objects_of_all([drawn.objects for _, drawn, _ in cameras])
+        parts = np.arange(shape[0]) % -(-self._threads // len(self._scenes))
+        payload = task.config.effects.payload > 0
         self._painters = []
-        for number, drawn, worlds in cameras:
-            objects = np.array([names.index(name) for name in drawn.objects], np.int32)
-            self._painters.append(_Painter(drawn, number, objects, worlds))
+        for number, scene in enumerate(self._scenes):
+            for part in range(parts.max() + 1):
+                cameras = Cameras(
+                    task.vehicle, self.views, shape, scene=scene, marks=task.marks, payload=payload
+                )
+                self._painters.append(_Painter(cameras, number, parts == part))
+        self._names = objects_of_all([painter.cameras.objects for painter in self._painters])
         self._goal_moves = any(mark.moves for mark in task.marks)
-        self.specs = arrays_of(self.views, names)
+        self.specs = arrays_of(self.views, self._names)
 
     @cached_property
     def _pool(self) -> ThreadPoolExecutor:
@@ -166,10 +154,11 @@ class Pictures(Stage):
         """Draw the scene of each world."""
         begun = self._per_drone(record.begun).reshape(self._shape).any(axis=1)
         scenes = np.zeros(self._shape, int)
-        if self._count > 1:
+        count = len(self._scenes)
+        if count > 1:
             ids = np.flatnonzero(begun)
             shares = self._random.shares(SCENES, ids)
-            scenes[ids] = (self._count * shares).astype(int)[:, None]
+            scenes[ids] = (count * shares).astype(int)[:, None]
         record.scenes = scenes.reshape(record.shape)[()]
 
     def step(self, record: Record) -> None:
@@ -178,14 +167,10 @@ class Pictures(Stage):
         A drone takes one with the first state of an episode, and with every so many control steps
         of it.
         """
-        count = self._rows
         state = record.state
-        fresh = np.zeros(count, bool)
-        flown = np.ones(count, bool)
-        if record.begun is not None:
-            fresh = self._per_drone(record.begun)
-        if record.flown is not None:
-            flown = self._per_drone(record.flown)
+        nobody = np.zeros(self._rows, bool)
+        fresh = nobody if record.begun is None else self._per_drone(record.begun)
+        flown = ~nobody if record.flown is None else self._per_drone(record.flown)
         steps = self._per_drone(record.steps)
         due = {}
         for view in self.views:
@@ -207,9 +192,9 @@ class Pictures(Stage):
         rows: dict[str, np.ndarray],
         scenes: NDArray[np.int64],
     ) -> dict[str, np.ndarray]:
-        pictures: dict[str, np.ndarray] = {
-            view.name: np.empty((self._rows, *view.shape), view.dtype) for view in self.views
-        }
+        pictures: dict[str, np.ndarray] = {}
+        for view in self.views:
+            pictures[view.name] = np.empty((self._rows, *view.shape), view.dtype)
 
         def paint(painter: _Painter) -> None:
             worlds = painter.worlds & (scenes == painter.scene)
@@ -218,7 +203,8 @@ class Pictures(Stage):
             for view in self.views:
                 picture = painter.cameras.pictures[view.name][drones]
                 if view.kind == "segmentation":
-                    picture = painter.objects[picture]
+                    numbers = [self._names.index(name) for name in painter.cameras.objects]
+                    picture = np.array(numbers, np.int32)[picture]
                 pictures[view.name][drones] = picture
 
         painters = []

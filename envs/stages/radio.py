@@ -10,8 +10,8 @@ from ...sim import numbers_of
 from ..state import State
 from ..tasks.goal import length
 from ..tasks.swarm import SwarmOptions
+from .history import filled, pushed
 from .record import Mask, Record, Stage
-from .ring import filled, pushed
 
 FORGOTTEN: Final = 1.0  # A drone that was not heard for so long is no neighbour any more, s
 Floats = NDArray[np.float64]

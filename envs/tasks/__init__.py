@@ -8,4 +8,5 @@ __all__ = [
 ]  # fmt: skip
 
 _modules = {name: f".{name.lower()}" for name in __all__} | {"PayloadHover": ".payload_hover"}
+_modules |= dict.fromkeys(("Crossing", "Escort", "Formation"), ".swarm")
 __getattr__ = import_when_used(__name__, _modules)

@@ -92,7 +92,7 @@ class Cable(Swarm):
     worst_step = Swarm.worst_step + WORST_SWING
     metrics = (
         Metric(name="payload_error", unit="m", settled=0.1, held=0.1, symbol="e"),
-        Metric(name="clearance", unit="m", goal="high"),
+        *Swarm.metrics[1:],
     )
     min_drones = 2
     max_drones = 32

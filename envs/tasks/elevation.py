@@ -12,7 +12,6 @@ from ...sim import (
     Array,
     CollectiveThrust,
     Draw,
-    EffectOptions,
     InitialState,
     clip,
     component,
@@ -20,13 +19,12 @@ from ...sim import (
 )  # fmt: skip
 from ..spec import ArraySpec, Metric
 from ..state import State
+from .goal import AIR, nearness
 from .task import Outcome, Task, TaskOptions
 
-ERROR_SCALE: Final = 0.5  # |E| at which the reward crosses zero, m
 TERMINATION_REWARD: Final = -20.0
 """Added to the reward of the step that terminates an episode (crash, flip-over, out of band)."""
 MAX_TILT_COSINE: Final = 0.5  # Cosine of the tilt (60°) past which the craft counts as flipped over
-AIR: Final = 0.6  # Least room under a craft that starts, m
 FURTHEST: Final = 1e6
 """Highest target and widest flight band, m: far inside what MuJoCo and float32 can hold."""
 
@@ -127,37 +125,41 @@ class Elevation(Task):
         options = self.options
         vehicle = self.vehicle
         room = vehicle.rest_height + AIR
-        self.least_target = least = room + options.start_band
+        least = room + options.start_band
         low, high = options.target_range
-        reasons = f"(start_band = {options.start_band:g} m, and {room:g} m of room)"
-        expected = f"{least:g} m {reasons} to {FURTHEST:g} m"
         if low < least or high > FURTHEST:
-            raise InputError(f"target: expected {expected}, got {shortened(options.target)}")
-        increment = self.action == "increment"
+            reasons = f"(start_band = {options.start_band:g} m, and {room:g} m of room)"
+            raise InputError(
+                f"target: expected {least:g} m {reasons} to {FURTHEST:g} m, "
+                f"got {shortened(options.target)}"
+            )
         most = float(vehicle.thrust_high.max())
         usual = self.controller
         assert isinstance(usual, CollectiveThrust)
         scale = options.thrust_scale or usual.newtons
-        expected = f"at most {most:g} N, the largest thrust of a rotor"
         if scale > most:
             raise InputError(
-                f"thrust_scale: expected {expected}, got {shortened(options.thrust_scale)}"
+                f"thrust_scale: expected at most {most:g} N, the largest thrust of a rotor, "
+                f"got {scale:g}"
             )
         self.controller = CollectiveThrust(
-            vehicle, scale, increment=increment, discrete=options.action_type == "discrete"
+            vehicle,
+            scale,
+            increment=self.action == "increment",
+            discrete=options.action_type == "discrete",
         )
         self._hover = float(vehicle.hover_thrust[0])
-        self.observation = (spec := self._observation_spec(),)
-        config = self.config
-        ideal = config.effects == EffectOptions() and not config.randomize
-        self._bounds = None if ideal else spec.bounds()
+        spec = self._observation_spec()
+        self.observation = (spec,)
+        self._bounds = spec.bounds()
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """Level, at rest, near the target."""
         band = self.options.start_band
         target = draw.uniform(*self.options.target_range, name="target")
         start = draw.uniform(-band, band) + target
-        if (chosen := draw.chosen("start")) is not None:
+        chosen = draw.chosen("start")
+        if chosen is not None:
             start = chosen
         self._check(target, start, mask)
         self.memory.target = target
@@ -166,17 +168,12 @@ class Elevation(Task):
     def observe(self, state: State) -> dict[str, Array]:
         """E, its rate and the thrust; or E alone."""
         error = self.memory.target - component(state.position, 2)
-        if self.options.observation == "error":
-            return {"observation": self._within(stack((error,)))}
-        rate = 0.0 - component(state.velocity, 2)
-        thrust = component(state.thrust, 0) / self._hover - 1.0
-        return {"observation": self._within(stack((error, rate, thrust)))}
-
-    def _within(self, values: Array) -> Array:
-        """Values within the bounds, which only effects or a vehicle that was drawn could leave."""
-        if self._bounds is None:
-            return values
-        return clip(values, *self._bounds)
+        numbers = [error]
+        if self.options.observation == "full":
+            rate = 0.0 - component(state.velocity, 2)
+            numbers += [rate, component(state.thrust, 0) / self._hover - 1.0]
+        # Only effects, or a vehicle that was drawn, could leave the bounds.
+        return {"observation": clip(stack(numbers), *self._bounds)}
 
     def outcome(self, state: State) -> Outcome:
         """Nearness to the target; the end at a crash, a flip-over, or outside the band."""
@@ -184,10 +181,9 @@ class Elevation(Task):
         distance = abs(error)
         outside = distance > self.options.flight_band
         terminated = outside | state.touching | (state.tilt_cosine < MAX_TILT_COSINE)
-        elevation = (ERROR_SCALE - distance) / (ERROR_SCALE + distance)
         termination = terminated * TERMINATION_REWARD + 0.0  # no negative zeros
         return Outcome(
-            reward={"elevation": elevation, "termination": termination},
+            reward={"elevation": nearness(distance), "termination": termination},
             terminated=terminated,
             metrics={"elevation_error": error},
         )
@@ -217,13 +213,13 @@ class Elevation(Task):
     def _observation_spec(self) -> ArraySpec:
         least = self.vehicle.thrust_low[0] / self._hover - 1
         most = self.vehicle.thrust_high[0] / self._hover - 1
-        low = np.array((-self.error_bound, -self.rate_bound, least))
-        high = np.array((self.error_bound, self.rate_bound, most))
+        lows = np.array((-self.error_bound, -self.rate_bound, least), np.float32)
+        highs = np.array((self.error_bound, self.rate_bound, most), np.float32)
         size = 3 if self.options.observation == "full" else 1
         # Rounding to float32 may move a bound inwards by half a unit: step outwards once.
         outwards = np.float32(np.inf)
-        low = np.nextafter(low.astype(np.float32), -outwards)[:size]
-        high = np.nextafter(high.astype(np.float32), outwards)[:size]
+        low = np.nextafter(lows, -outwards)[:size]
+        high = np.nextafter(highs, outwards)[:size]
         return ArraySpec(
             name="observation",
             shape=(size,),

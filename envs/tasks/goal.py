@@ -200,6 +200,13 @@ class GoalTask(Task):
         return stack((c * x + s * y, c * y - s * x, vectors[..., 2]))
 
 
+def tilted(angle: Array, azimuth: Array) -> Array:
+    """Quaternions, (W, A, 4), of tilts by an angle about the level axis at an azimuth, rad."""
+    sine = np.sin(angle / 2)
+    w = np.cos(angle / 2)
+    return stack((w, sine * np.cos(azimuth), sine * np.sin(azimuth), 0.0 * w))
+
+
 def at(point: Sequence[float], like: Array) -> Array:
     """A point for every drone, (W, A, 3); `like` has a number for each."""
     return stack([0.0 * like + value for value in point])

@@ -35,6 +35,7 @@ from .goal import (
     length,
     nearness,
     swing_cost,
+    tilted,
     with_payload,
 )
 from .task import Outcome, TaskOptions
@@ -137,16 +138,15 @@ class PayloadHover(GoalTask):
         band = options.start_band
         fastest = options.start_speed
         offset = draw.uniform(-band, band, (3,))
-        tilt = draw.uniform(0.0, math.radians(options.start_tilt)) / 2
+        tilt = draw.uniform(0.0, math.radians(options.start_tilt))
         azimuth = draw.uniform(-math.pi, math.pi)
         along = draw.uniform(-fastest, fastest)
         across = draw.uniform(-fastest, fastest)
-        sine = np.sin(tilt)
         zero = 0.0 * tilt
         carrying = (1.0 + options.payload_share) * self.vehicle.hover_thrust
         return InitialState(
             position=self._above(zero) + offset,
-            quaternion=stack((np.cos(tilt), sine * np.cos(azimuth), sine * np.sin(azimuth), zero)),
+            quaternion=tilted(tilt, azimuth),
             velocity=stack((along, across, zero)),
             thrust=carrying + each(zero),
         )
