@@ -24,7 +24,6 @@ TABLES: dict[str, Any] = json.loads((DATA / "envs.json").read_text())
 TASKS = sorted(name for name in gym.registry if name.startswith("rotorgram/"))
 HOVER = "rotorgram/Hover-v0"
 ELEVATION = "rotorgram/Elevation-v0"
-FORMATION = "rotorgram/Formation-v0"
 FILES = {"quad": QUAD_XML}
 FILES |= {path.stem: path for path in sorted(DATA.glob("*.xml"))}
 FILES |= {path.parent.name: path for path in sorted(QUAD_XML.parent.glob("*/*/vehicle.toml"))}
@@ -55,69 +54,16 @@ class Case:
         return EnvConfig.from_keywords(self.env_id, **options)
 
 
-RICH: dict[str, Any] = {
-    "vehicle": "crazyflie2",
-    "effects": {
-        "motor_lag": True,
-        "battery": True,
-        "body_drag": True,
-        "rotor_drag": True,
-        "ground_effect": True,
-        **STORM,
-    },
-    "sensors": {
-        "imu": True,
-        "motion_capture": {"noise": 0.001, "angle_noise": 0.01, "delay": 0.04},
-    },
-    "history": 3,
-    "randomize": {
-        "mass": "uniform(0.9, 1.1)",
-        "action_delay": "choice(0, 1, 2)",
-        "observation_delay": "choice(0, 1, 2)",
-    },
-}
-ESTIMATE = {"imu": True, "estimate": True, "observe": "estimate"}
-DRAWN = {
-    "inertia": "uniform(0.8, 1.2)", "center_x": "uniform(-0.001, 0.001)",
-    "thrust_1": "uniform(0.9, 1.0)", "time_constant": "uniform(0.8, 1.2)",
-    "wind_x": "uniform(-1, 1)", "body_drag": "uniform(0.5, 1.5)",
-}  # fmt: skip
-SENSORS = {
-    "imu": {"gyro_noise": 1e-3, "accelerometer_noise": 0.01, "gyro_bias": 0.01},
-    "barometer": {"noise": 1.0, "walk": 0.1}, "magnetometer": {"noise": 0.3},
-    "gps": {
-        "rate": 10.0, "delay": 0.04, "dropout": 0.2, "noise": 0.5, "vertical_noise": 1.0,
-        "velocity_noise": 0.1,
-    },
-    "motion_capture": {"noise": 0.001, "angle_noise": 0.01},
-    "rangefinder": {"noise": 0.01, "limit": 4.0}, "estimate": True,
-}  # fmt: skip
-SWARM: dict[str, Any] = {"vehicle": "crazyflie2", "randomize": DRAWN}
-SWARM["effects"] = {**RICH["effects"], "downwash": True}
-RACER: dict[str, Any] = {"vehicle": DATA / "racer.xml", "randomize": DRAWN, "sensors": SENSORS}
-RACER["effects"] = {**RICH["effects"], "thrust_curve": True, "efficiency": (1.0, 0.9, 1.0, 0.95)}
-WEAK = {"battery": True, "thrust_curve": True, "payload": 0.05, "cable": 0.4}
-CHARGED = {"battery_charge": "uniform(0, 1)", "thrust": "0.9", "payload": "uniform(0.5, 1.5)"}
-LOSSY = {"drones": 3, "radio_loss": 0.3, "radio_delay": 2, "radio_range": 30.0, "neighbours": 2}
-FEATURES = {
-    "rich": Case(HOVER, RICH),
-    "rich, rigid": Case(HOVER, {**RICH, "backend": "rigid"}),
-    "all": Case(HOVER, RACER),
-    "all, NumPy": Case(HOVER, {**RACER, "backend": "rigid", "compiled": False, "dtype": "float64"}),
-    "all, attitude": Case(HOVER, {**RACER, "action": "attitude"}),
-    "no lag": Case(HOVER, {**RACER, "effects": WEAK, "randomize": CHARGED}),
-    "swarm": Case(FORMATION, SWARM),
-    "swarm, rigid": Case(FORMATION, {**SWARM, "backend": "rigid"}),
-    "estimate": Case(HOVER, {"vehicle": "crazyflie2", "sensors": ESTIMATE}),
-    "discrete": Case(ELEVATION, {"action_type": "discrete", "observation": "error", "history": 4}),
-    "late": Case(HOVER, {"randomize": {"observation_delay": "uniform(0, 0.07)"}, "history": 2}),
-    "lossy radio": Case(FORMATION, LOSSY),
-    "lossy radio, rigid": Case(FORMATION, {**LOSSY, "backend": "rigid"}),
-    "line": Case("rotorgram/Landing-v0", {"motion": "line"}),
-    "snap": Case("rotorgram/Tracking-v0", {"trajectory": "snap"}),
-    "pictures": Case(HOVER, {"cameras": "front@16x16,front_depth@24x18,down_segmentation@16x12"}),
-    "two laps": Case("rotorgram/Racing-v0", {"track": "dive", "laps": 2}),
-}
+def _features() -> dict[str, Case]:
+    """Cases of a file; a vehicle's file is beside it."""
+    cases = {}
+    rows = json.loads((DATA / "features.json").read_text())
+    for name, (env_id, options) in rows.items():
+        vehicle = str(options.get("vehicle"))
+        if (DATA / vehicle).is_file():
+            options["vehicle"] = DATA / vehicle
+        cases[name] = Case(env_id, options)
+    return cases
 
 
 def short(env_id: str) -> str:
@@ -184,6 +130,7 @@ def _vehicles() -> dict[str, Case]:
 
 LEVELS = _levels()
 VEHICLES = _vehicles()
+FEATURES = _features()
 CASES = LEVELS | FEATURES | VEHICLES
 
 

@@ -53,7 +53,7 @@ class Ends(Stage):
             record.end(ends)
 
     def _check(self, record: Record, reward: NDArray[np.float64]) -> None:
-        for name, values in {**record.observations, "the reward": reward}.items():
+        for name, values in (*record.observations.items(), ("reward", reward)):
             if is_finite(values):
                 continue
             rows = np.reshape(values, (self._nobody.size, -1))

@@ -19,7 +19,7 @@ from ...sim import (
 )  # fmt: skip
 from ..spec import ArraySpec, Metric
 from ..state import State
-from .goal import AIR, nearness
+from .goal import AIR, check_more, nearness
 from .task import Outcome, Task, TaskOptions
 
 TERMINATION_REWARD: Final = -20.0
@@ -52,11 +52,7 @@ class ElevationOptions(TaskOptions):
 
     def check(self) -> None:
         """Check the options of this task. Raises `InputError`."""
-        if self.flight_band <= self.start_band:
-            raise InputError(
-                f"flight_band: expected more than start_band = {self.start_band:g} m, "
-                f"got {shortened(self.flight_band)}"
-            )
+        check_more("flight_band", self.flight_band, "start_band", self.start_band)
 
     @property
     def target_range(self) -> tuple[float, float]:

@@ -232,14 +232,15 @@ def check_height(name: str, height: float, room: float) -> None:
         )
 
 
+def check_more(name: str, size: float, what: str, least: float) -> None:
+    """Refuse an option, m, that is no larger than something. Raises `InputError`."""
+    if size <= least:
+        raise InputError(f"{name}: expected more than {what} = {least:.4g} m, got {size!r}")
+
+
 def check_band(flight_band: float, start_band: float) -> None:
     """Refuse a band that a start within a cube leaves. Raises `InputError`."""
-    furthest = start_band * math.sqrt(3)
-    if flight_band <= furthest:
-        raise InputError(
-            f"flight_band: expected more than sqrt(3) · start_band = {furthest:.4g} m, "
-            f"got {flight_band!r}"
-        )
+    check_more("flight_band", flight_band, "sqrt(3) · start_band", start_band * math.sqrt(3))
 
 
 def row_of(rows: Array, index: Array) -> Array:

@@ -102,7 +102,8 @@ class Hover(GoalTask):
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """At rest near the goal, tilted and turned."""
         options = self.options
-        offset = draw.uniform(-options.start_band, options.start_band, (3,))
+        band = options.start_band
+        offset = draw.uniform(-band, band, (3,))
         tilt = draw.uniform(0.0, math.radians(options.start_tilt)) / 2
         azimuth = draw.uniform(-math.pi, math.pi)
         off = math.radians(options.start_heading)

@@ -16,6 +16,7 @@ from .goal import (
     COURSE_WORST_RATES,
     GoalTask,
     along,
+    check_more,
     length,
     rates_cost,
 )
@@ -60,17 +61,14 @@ class LandingOptions(TaskOptions):
 
     def check(self) -> None:
         """Check the options of this task. Raises `InputError`."""
-        lowest = self.start_height - self.start_band
-        if lowest < 0.5:
+        if self.start_height - self.start_band < 0.5:
             raise InputError(
                 "start_band: expected at most start_height - 0.5 m, "
                 f"got {shortened(self.start_band)}"
             )
         reach = self.pad_path + math.sqrt(2) * self.start_band
         furthest = math.hypot(reach, self.start_height + self.start_band)
-        expected = f"more than the {furthest:.4g} m of the furthest start"
-        if self.flight_band <= furthest:
-            raise InputError(f"flight_band: expected {expected}, got {shortened(self.flight_band)}")
+        check_more("flight_band", self.flight_band, "the furthest start", furthest)
 
     @property
     def pad_speeds(self) -> tuple[float, float]:

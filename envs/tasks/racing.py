@@ -198,35 +198,38 @@ class Racing(GoalTask):
     def update_memory(self, state: State) -> None:
         """Whether the gate was passed, how much nearer it came, and the times of rounds."""
         memory = self.memory
-        now = state.position
-        before = memory.position
         gate = self._gate(memory.passed)
         center = gate[..., :3]
-        x, y, half = (component(gate, i) for i in (3, 4, 5))
-        a = before - center
-        b = now - center
-        ahead, behind = (component(p, 0) * x + component(p, 1) * y for p in (b, a))
+        half = component(gate, 5)
+        before = memory.position - center
+        now = state.position - center
+        behind = self._ahead(gate, before)
+        ahead = self._ahead(gate, now)
         through = (behind < 0.0) & (ahead >= 0.0)
         share = each(plain(behind / np.where(through, behind - ahead, -1.0)))
-        crossing = a + share * (b - a)
-        aside = component(crossing, 1) * x - component(crossing, 0) * y
-        inside = (abs(aside) <= half) & (abs(component(crossing, 2)) <= half)
+        crossing = before + share * (now - before)
+        x, y, z = (component(crossing, i) for i in range(3))
+        aside = y * component(gate, 3) - x * component(gate, 4)
+        inside = (abs(aside) <= half) & (abs(z) <= half)
         left = memory.passed < self._total
         passing = plain(through & inside & left) * 1.0
         passed = memory.passed + passing
         whole = (passing > 0.5) & (passed % self._count == 0.0)
         way = center - memory.behind
-        come = now - memory.behind
+        come = state.position - memory.behind
         along = plain(np.sum(come * way, axis=-1)) / (plain(np.sum(way * way, axis=-1)) + 1e-12)
-        behind_now = np.where(each(passing > 0.5), center, memory.behind)
         memory.off = length(come - each(clip(along, 0.0, 1.0)) * way)
-        memory.progress = length(a) - length(b)
+        memory.progress = length(before) - length(now)
         memory.passed = passed
         memory.passing = passing
         memory.lap = np.where(whole, state.time - memory.lap_began, memory.lap)
         memory.lap_began = np.where(whole, state.time, memory.lap_began)
-        memory.position = now
-        memory.behind = behind_now
+        memory.position = state.position
+        memory.behind = np.where(each(passing > 0.5), center, memory.behind)
+
+    def _ahead(self, gate: Array, way: Array) -> Array:
+        """How far a way from the centre of a gate leads in its direction, m, (W, A)."""
+        return component(way, 0) * component(gate, 3) + component(way, 1) * component(gate, 4)
 
     def further(self, state: State) -> tuple[Array, ...]:
         """The direction of the next gate, the gate after it, and the size of the next."""

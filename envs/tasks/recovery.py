@@ -6,7 +6,6 @@ from typing import Annotated, Final, Literal
 
 import numpy as np
 
-from ...models.errors import InputError, shortened
 from ...models.fields import Limits
 from ...sim import (
     Array,
@@ -18,7 +17,17 @@ from ...sim import (
 )
 from ..spec import Metric
 from ..state import State
-from .goal import WORST_RATES, GoalTask, Point, Speed, at, check_height, length, nearness
+from .goal import (
+    WORST_RATES,
+    GoalTask,
+    Point,
+    Speed,
+    at,
+    check_height,
+    check_more,
+    length,
+    nearness,
+)
 from .task import Outcome, TaskOptions
 
 ERROR_SCALE: Final = 1.0  # Distance at which the reward for nearness crosses zero, m
@@ -52,9 +61,7 @@ class RecoveryOptions(TaskOptions):
 
     def check(self) -> None:
         """Check the options of this task. Raises `InputError`."""
-        expected = f"more than near = {self.near:g} m"
-        if self.flight_band <= self.near:
-            raise InputError(f"flight_band: expected {expected}, got {shortened(self.flight_band)}")
+        check_more("flight_band", self.flight_band, "near", self.near)
 
 
 class Recovery(GoalTask):
@@ -136,9 +143,8 @@ class Recovery(GoalTask):
         check_height("goal", options.goal[2], vehicle.rest_height)
         turning = [min(vehicle.turning(axis), vehicle.turning(-axis)) for axis in np.eye(3)]
         self.spin = np.minimum(options.spin, STOP_TIME * np.array(turning))
-        self.body = options.frame == "body"
-        if options.frame is None:
-            self.body = self.action in ("rotors", "rates")
+        usual = "body" if self.action in ("rotors", "rates") else "world"
+        self.body = (options.frame or usual) == "body"
         self.define_observation(options.flight_band)
         self._least_upright = math.cos(math.radians(options.upright))
 
@@ -146,14 +152,12 @@ class Recovery(GoalTask):
         """At the goal, thrown."""
         options = self.options
         turn = math.pi
-        share, a, b = (
-            draw.uniform(low, high) for low, high in ((0, 1), (-turn, turn), (-turn, turn))
-        )
+        share = draw.uniform(0.0, 1.0)
+        a = draw.uniform(-turn, turn)
+        b = draw.uniform(-turn, turn)
         long = np.sqrt(share)
         short = np.sqrt(1.0 - share)
-        quaternion = stack((
-            long * np.cos(b), short * np.sin(a), short * np.cos(a), long * np.sin(b)
-        ))  # fmt: skip
+        parts = (long * np.cos(b), short * np.sin(a), short * np.cos(a), long * np.sin(b))
         speed = draw.uniform(0.0, options.start_speed)
         climb = draw.uniform(-1.0, 1.0)
         azimuth = draw.uniform(-turn, turn)
@@ -164,7 +168,7 @@ class Recovery(GoalTask):
         self.memory.lowest = options.goal[2]  # m
         return InitialState(
             position=at(options.goal, share),
-            quaternion=quaternion,
+            quaternion=stack(parts),
             velocity=velocity,
             body_rates=rates * self.spin,
         )
