@@ -1,6 +1,7 @@
 """Moments, films and pixels for the tests of what is drawn."""
 
 import subprocess
+import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -15,6 +16,7 @@ from rotorgram.rendering import MetricValue, Moment
 WIDTH = 160
 HEIGHT = 120
 DATA: Final = Path(__file__).parent / "data"
+TABLES: Final[dict[str, Any]] = tomllib.loads((DATA / "pictures.toml").read_text("utf-8"))
 HEXA: Final = DATA / "meadow_hexa.xml"
 """Six rotors of up to 30 N, 0.62 m from centre to tip, with a ground of its own."""
 TINY: Final = DATA / "tiny.xml"

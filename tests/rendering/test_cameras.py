@@ -9,6 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from pictures import TABLES
 from rotorgram.envs.spec import Mark
 from rotorgram.models import InputError
 from rotorgram.models.cameras import FARTHEST, Camera, chosen_views
@@ -142,18 +143,7 @@ def test_cameras_that_are_left_out(made: Any, tmp_path: Path, words: str) -> Non
     assert seen["front"].std() > 1
 
 
-@pytest.mark.parametrize(
-    ("lens", "sentence"),
-    [
-        (
-            'fovy="0"',
-            r"camera eye.fovy: expected a number from 0.0572\d* to 171.8\d* degrees, got 0",
-        ),
-        ('fovy="179.99"', "camera eye.fovy: expected a number from 0.05"),
-        ('sensorsize=".01 .01"', "camera eye: expected a focal length above 0 with its sensorsize"),
-        ('pos="1e300 0 0"', "camera eye.pos: expected 3 numbers from -10000 to 10000 m"),
-    ],
-)
+@pytest.mark.parametrize(("lens", "sentence"), TABLES["wrong_mjcf_cameras"])
 def test_wrong_cameras_of_an_mjcf_file(tmp_path: Path, lens: str, sentence: str) -> None:
     file = paper_with(tmp_path, f'<camera name="eye" resolution="40 30" {lens}/>')
     with pytest.raises(InputError, match=sentence):
@@ -182,32 +172,7 @@ def test_every_vehicle_has_two() -> None:
     assert down.up == (1.0, 0.0, 0.0)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "sentence"),
-    [
-        (
-            'name = "belly"',
-            'name = "0"',
-            r"\[1\].name: expected up to 64 letters, digits and _, got",
-        ),
-        ('"depth", "rgb"', '"heat"', "kinds: expected some of rgb, depth, segmentation, got"),
-        ("fovy = 1.0", "fovy = 4", r"\[1\].fovy: expected a number from 0.001 to 3 rad, got 4"),
-        (
-            "rate = 0.5",
-            "rate = 0.3",
-            r"\[1\].rate: expected 1 over a whole number of control steps",
-        ),
-        ("[1.0, 0.0, 0.0]", "[-1, 0, 2]", r"\[1\].up: expected another direction than look"),
-        ("[48, 32]", "[48.5, 32]", r"\[1\].resolution: expected"),
-        (
-            "rate = 0.5",
-            "distortion = [0.1]",
-            "cameras.1.: expected some of name, position, look, .* got 'distortion'",
-        ),
-        ("stands = true", "stands = 1.5", r"\[2\].stands: expected true or false, got 1.5"),
-        ('"tower"', '"belly"', "cameras: expected a name of its own for each, got 'belly' twice"),
-    ],
-)
+@pytest.mark.parametrize(("old", "new", "sentence"), TABLES["wrong_cameras"])
 def test_wrong_cameras_of_a_file(tmp_path: Path, old: str, new: str, sentence: str) -> None:
     assert old in BELLY
     with pytest.raises(InputError, match=sentence):
@@ -223,13 +188,7 @@ def test_words_choose_views(tmp_path: Path) -> None:
         ("front_depth", (10, 20, 1), "float32"),
         ("down_segmentation", (64, 64, 1), "int32"),
     ]
-    for word, sentence in {
-        "rear": "cameras: expected some of .*belly.*, each with _rgb, _depth.* got 'rear'",
-        "front_flow": "got 'front_flow'",
-        "front@0x4": "expected NAME@WIDTHxHEIGHT of 1 to 4096 pixels each, got 'front@0x4'",
-        "front@64": "got 'front@64'",
-        "front@64x5000": "got 'front@64x5000'",
-    }.items():
+    for word, sentence in TABLES["wrong_words"]:
         with pytest.raises(InputError, match=sentence):
             chosen_views([word], cameras)
     assert len(chosen_views(["front", "front_rgb", "belly", "belly_depth"], cameras)) == 3

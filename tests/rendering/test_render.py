@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 import rotorgram.rendering.gl as gl
-from pictures import HEIGHT, WIDTH, decoded, pixels
+from pictures import HEIGHT, TABLES, WIDTH, decoded, pixels
 from PIL import Image
 from rotorgram.agents import PID
 from rotorgram.agents.checkpoints import load
@@ -135,35 +135,17 @@ def test_panes_of_the_same_have_names_of_their_own(
     assert len({one.telemetry["position"].tobytes() for one in flown}) == 1
 
 
-@pytest.mark.parametrize(
-    ("arguments", "sentence"),
-    [
-        (["pid", "--out", "film.avi"], "film: expected a name that ends in"),
-        (["pid", "--out", "."], "is there already"),
-        (["pid", "--out", "film.mp4", "--size", "641x360"], "film: expected an even width"),
-        (["pid", "--out", "film.mp4", "--size", "large"], "size: expected WIDTHxHEIGHT"),
-        (["pid", "--out", "film.mp4", "--size", "9x9"], "size: expected WIDTHxHEIGHT"),
-        (["pid", "--out", "film.mp4", "--speed", "0"], "speed: expected"),
-        (["pid", "--out", "film.mp4", "--episode", "-1"], "episode: expected 0 or more"),
-        (["pid", "--out", "film.mp4", "--episodes", "0"], "episodes: expected at least 1"),
-        (["pid", "--out", "film.mp4", "--names", "a", "b"], "names: expected one for each of 1"),
-        (["pid", "--out", "film.mp4", "--at", "-1"], "at: expected"),
-        (["--out", "film.mp4"], "what: expected a checkpoint, pid, geometric, random or a journal"),
-        (["nowhere", "--out", "film.mp4"], "policy: expected pid, geometric, orca, a checkpoint"),
-        (["nowhere.mcap", "--out", "film.mp4"], "nowhere.mcap"),
-        (["pid", "--out", "film.mp4", "--env.observation", "error"], "pid: expected"),
-    ],
-)
+@pytest.mark.parametrize(("words", "sentence"), TABLES["wrong_films"])
 def test_wrong_input_is_one_sentence(
     any_opengl: None,
-    arguments: list[str],
+    words: str,
     sentence: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    status, _, err = run(capsys, "render", *arguments)
+    status, _, err = run(capsys, "render", *words.split())
     assert status == 1
     assert err.startswith("rotorgram: ")
     assert sentence in err
@@ -264,17 +246,7 @@ def test_without_libegl_it_says_what_to_install(
     assert run(capsys, "evaluate", "pid", "--episodes", 1, "--episode-length", 5)[0] == 0
 
 
-@pytest.mark.parametrize(
-    ("variables", "tried"),
-    [
-        ({}, ["egl"]),
-        ({"DISPLAY": ":0"}, ["egl", "glfw"]),
-        ({"DISPLAY": ":0", "MUJOCO_GL": "egl"}, ["egl"]),
-        ({"MUJOCO_GL": "osmesa"}, ["osmesa"]),
-        ({"MUJOCO_GL": "on"}, ["glfw"]),
-        ({"MUJOCO_GL": "off"}, []),
-    ],
-)
+@pytest.mark.parametrize(("variables", "tried"), TABLES["libraries"])
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems have their own")
 def test_which_opengl_is_tried(
     variables: dict[str, str], tried: list[str], monkeypatch: pytest.MonkeyPatch

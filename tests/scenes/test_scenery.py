@@ -6,6 +6,7 @@ from contextlib import closing
 import mujoco
 import numpy as np
 import pytest
+from pictures import TABLES
 from rotorgram.models import QUAD_XML, InputError
 from rotorgram.models.cameras import chosen_views
 from rotorgram.models.library import find_vehicle, vehicle_names
@@ -150,14 +151,6 @@ def test_cameras_see_its_objects(opengl: None, scene: str) -> None:
 def test_names_and_seeds() -> None:
     assert [parse_scene(name) for name in SCENES] == [(name, 0) for name in SCENES]
     assert parse_scene("forest:12") == ("forest", 12)
-    for wrong in (
-        "moon",
-        "airport:1",
-        "forest:",
-        "forest:-1",
-        "forest:1.5",
-        "forest:9999999999",
-        "",
-    ):
+    for wrong in TABLES["wrong_scenes"]:
         with pytest.raises(InputError, match=r"scene: expected 'plain' or .* as 'forest:3', got"):
             parse_scene(wrong)
