@@ -3,7 +3,6 @@
 Knows nothing of tasks, rewards or Gymnasium.
 """
 
-from ..models import BACKENDS, Backend
 from .control import LEVELS, CollectiveThrust, Controller, Gains, RotorThrust, make_controller
 from .effects import EffectOptions
 from .random import Draw, numbers_of
@@ -24,11 +23,9 @@ from .state import (
 from .world import PhysicsError, World, make_world
 
 __all__ = [
-    "BACKENDS",
     "LEVELS",
     "PARAMETERS",
     "Array",
-    "Backend",
     "CollectiveThrust",
     "Controller",
     "Draw",

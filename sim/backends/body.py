@@ -22,6 +22,10 @@ from ..rotations import matrix, product, transposed
 from ..state import Array
 
 Vector = tuple[Array, Array, Array]
+Push = tuple[Vector, Vector, Vector]
+"""What acts on a body, constant over a physics step, besides gravity and the air: the force of the
+rotors over the mass, body frame, m/s²; the angular acceleration by the torque about the center of
+mass, body frame, rad/s²; the force at the body's origin over the mass, world frame, m/s²."""
 
 _NOTHING: Final = 1e-12  # of the largest number of its kind: what rounding leaves
 _TINY: Final = 1e-30  # keeps the slope of a square root finite where nothing turns
@@ -50,17 +54,6 @@ class Motion(NamedTuple):
     """World frame, three."""
     rates: Array
     """Angular velocity, body frame, three."""
-
-
-class Push(NamedTuple):
-    """What acts on a body, constant over a physics step, besides gravity and the air."""
-
-    inner: Vector
-    """Force of the rotors over the mass, body frame, m/s²."""
-    turning: Vector
-    """Angular acceleration by the torque about the center of mass, body frame, rad/s²."""
-    outer: Vector
-    """Force at the body's origin over the mass, world frame, m/s²."""
 
 
 class Varying(NamedTuple):
@@ -174,7 +167,7 @@ class RigidBody:
             parts = list(wrench)
             outer = _scaled(parts[:3], 1.0 / varying.mass)
             torque = _plus(torque, parts[3:])
-        return Push(_scaled(force, 1.0 / varying.mass), self._turned(torque), outer)
+        return _scaled(force, 1.0 / varying.mass), self._turned(torque), outer
 
     def acceleration(self, now: Motion, push: Push) -> tuple[Vector, Vector]:
         """Of the body's origin, world frame, m/s², and angular, body frame, rad/s²."""

@@ -76,13 +76,7 @@ class MujocoWorld(World):
         self._warnings = batch.warning  # of each kind the last info, and how many
         self._no_warnings = self._warnings.tobytes()
         self._no_contacts = self._contacts.tobytes()
-        # Controls in newtons are the thrusts, and without effects the commands too.
-        crafts = members_of(vehicle, drones)
-        newtons = np.array([rotor.newtons for craft in crafts for rotor in craft.rotors])
-        self._newtons = None if (newtons == 1.0).all() else newtons
-        alike = self._newtons is None and self.effects is None
-        self._command = self._ctrl if alike else np.zeros_like(self._ctrl)
-        self._thrust = np.zeros_like(self._ctrl) if self._on_rotors else self._command
+        self._bind_thrusts(members_of(vehicle, drones))
         self._touching = np.zeros((num_worlds, drones), bool)
         self._colliding: np.ndarray | None = None
         if drones > 1:
@@ -103,6 +97,14 @@ class MujocoWorld(World):
             payload_velocity=None if self._cable is None else moves,
         )
         assert np.shares_memory(self.state.position, batch.state)
+
+    def _bind_thrusts(self, crafts: tuple[Vehicle, ...]) -> None:
+        """Controls in newtons are the thrusts, and without effects the commands too."""
+        newtons = np.array([rotor.newtons for craft in crafts for rotor in craft.rotors])
+        self._newtons = None if (newtons == 1.0).all() else newtons
+        alike = self._newtons is None and self.effects is None
+        self._command = self._ctrl if alike else np.zeros_like(self._ctrl)
+        self._thrust = np.zeros_like(self._ctrl) if self._on_rotors else self._command
 
     def _flown_model(self, drones: int) -> mujoco.MjModel:
         """The vehicle's, or one with more crafts, with a payload or for a drawn center of mass."""

@@ -88,13 +88,14 @@ class Gains:
         `period` is the time between two looks at the state, s, and `lag` the time constant of the
         rotors, s.
         """
-        able = "a vehicle whose rotors roll, pitch and yaw it, for this action"
         rank = int(np.linalg.matrix_rank(vehicle.allocation / _rows(vehicle.allocation)))
         if rank != 4:
             raise InputError(
-                f"vehicle: expected {able}, got {vehicle.name}, an allocation of rank {rank}"
+                "vehicle: expected a vehicle whose rotors roll, pitch and yaw it, for this action, "
+                f"got {vehicle.name}, an allocation of rank {rank}"
             )
-        gravity, weight = vehicle.gravity, vehicle.mass * vehicle.gravity
+        gravity = vehicle.gravity
+        weight = vehicle.mass * gravity
         share = vehicle.hover_thrust / weight
         mix = np.linalg.pinv(vehicle.allocation)[:, 1:] / share[:, np.newaxis]
         lowest = float((vehicle.thrust_low / share).max())
@@ -139,8 +140,8 @@ def shared_ranges(several: Sequence[Gains]) -> list[Gains]:
         name: tuple(np.min([getattr(one, name) for one in several], axis=0).tolist())
         for name in names
     }
-    for name in ("most_tilt", "position"):
-        least[name] = min(getattr(one, name) for one in several)
+    least["most_tilt"] = min(one.most_tilt for one in several)
+    least["position"] = min(one.position for one in several)
     return [replace(one, **least) for one in several]
 
 

@@ -98,10 +98,9 @@ def readings_of(sensors: Values, vehicle: "Vehicle", period: float) -> list[Read
     for name, values in _resolved(sensors, vehicle, period).items():
         kind = _SOURCES[name]
         source = kind(values, period)
-        low = tuple(source.low())
-        high = tuple(source.high())
-        shape = (len(high),)
-        readings.append(Reading(name, shape, low, high, kind.units, kind.frame, kind.components))
+        shape = (len(kind.components),)
+        bounds = source.low(), source.high()
+        readings.append(Reading(name, shape, *bounds, kind.units, kind.frame, kind.components))
     return [] if "observe" in sensors else readings
 
 

@@ -49,17 +49,15 @@ class Barometer(Sensor):
     frame = "above sea level"
     components = ("pressure altitude",)
     units = ("m",)
+    top = (HIGHEST + 1,)
 
     def __init__(self, values: Values, interval: float) -> None:
         super().__init__(values, interval)
         self._step = values["walk"] * math.sqrt(interval)
         self._bias: Array = 0.0
 
-    def high(self) -> list[float]:
-        return [HIGHEST + 1]
-
-    def low(self) -> list[float]:
-        return [LOWEST - 1]
+    def low(self) -> tuple[float, ...]:
+        return (LOWEST - 1,)
 
     def begin(self, mask: Array, normal: Array) -> None:
         """No walk yet."""

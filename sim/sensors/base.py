@@ -52,6 +52,7 @@ class Source(Kept):
         name: In the option `sensors`, and of the observation's array.
         own: Settings that are no coefficients of a vehicle.
         frame: Of the reading; so are `components` and `units`.
+        top: Upper bound of each component, unless `high` computes it.
     """
 
     name: ClassVar[str]
@@ -59,17 +60,18 @@ class Source(Kept):
     frame: ClassVar[str]
     components: ClassVar[tuple[str, ...]]
     units: ClassVar[tuple[str, ...]]
+    top: ClassVar[tuple[float, ...]]
 
     def __init__(self, values: Values, interval: float) -> None:
         self.values = values
         self.interval = interval
 
-    def high(self) -> list[float]:
+    def high(self) -> tuple[float, ...]:
         """Upper bound of each component."""
-        raise NotImplementedError
+        return self.top
 
-    def low(self) -> list[float]:
-        return [-bound for bound in self.high()]
+    def low(self) -> tuple[float, ...]:
+        return tuple(-bound for bound in self.high())
 
     @classmethod
     def settings(cls) -> Mapping[str, Setting]:

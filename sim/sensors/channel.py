@@ -25,7 +25,8 @@ class Channel(Kept):
         self._lag = values["lag"]
         self.interval = self._every * period
         self.sensor = kind(values, self.interval)
-        self._bounds = np.array(self.sensor.low()), np.array(self.sensor.high())
+        self._low = np.array(self.sensor.low())
+        self._high = np.array(self.sensor.high())
         self._world = world
         # One number more than the sensor takes decides whether a reading is lost.
         self._noise = world.random.noise(f"sensor {kind.name}", kind.columns + 1)
@@ -68,7 +69,7 @@ class Channel(Kept):
 
     def _read(self, normal: Array) -> Array:
         """A reading within the sensor's bounds."""
-        return clip(self.sensor.measure(self._world, normal[..., :-1]), *self._bounds)
+        return clip(self.sensor.measure(self._world, normal[..., :-1]), self._low, self._high)
 
 
 def _with(reading: Array, fresh: Array) -> Array:

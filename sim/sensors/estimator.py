@@ -49,6 +49,7 @@ class Estimator(Source):
     frame = "world; body rates: body"
     components = ("x", "y", "z", "vx", "vy", "vz", "qw", "qx", "qy", "qz", "wx", "wy", "wz")
     units = ("m",) * 3 + ("m/s",) * 3 + ("1",) * 4 + ("rad/s",) * 3
+    top = (FURTHEST,) * 3 + (MAX_SPEED,) * 3 + (UNIT,) * 4 + (2 * MAX_SPEED,) * 3
 
     def __init__(
         self,
@@ -66,9 +67,6 @@ class Estimator(Source):
         self.velocity: Array = 0.0
         self.quaternion: Array = 0.0
         self.body_rates: Array = 0.0
-
-    def high(self) -> list[float]:
-        return [FURTHEST] * 3 + [MAX_SPEED] * 3 + [UNIT] * 4 + [2 * MAX_SPEED] * 3
 
     def begin(self, mask: Array, state: WorldState, imu: Array) -> None:
         """Take over the exact state of the drones of a mask."""

@@ -17,9 +17,7 @@ class Gps(Sensor):
     frame = "world"
     components = ("x", "y", "z", "vx", "vy", "vz")
     units = ("m",) * 3 + ("m/s",) * 3
-
-    def high(self) -> list[float]:
-        return [FURTHEST] * 3 + [MAX_SPEED] * 3
+    top = (FURTHEST,) * 3 + (MAX_SPEED,) * 3
 
     def measure(self, world: World, normal: Array) -> Array:
         level, vertical, speed = (self.values[name] for name in self.needs)

@@ -61,9 +61,8 @@ class Imu(Sensor):
     def _both(self, what: str) -> NDArray[np.float64]:
         return np.repeat([self.values[f"gyro_{what}"], self.values[f"accelerometer_{what}"]], 3)
 
-    def high(self) -> list[float]:
-        high: list[float] = self._both("range").tolist()
-        return high
+    def high(self) -> tuple[float, ...]:
+        return tuple(self._both("range").tolist())
 
     def begin(self, mask: Array, normal: Array) -> None:
         """Bias and error of scale."""

@@ -25,10 +25,7 @@ class Magnetometer(Sensor):
     frame = "body"
     components = ("field x", "field y", "field z")
     units = ("µT",) * 3
-
-    def high(self) -> list[float]:
-        """1 mT, far from any reading but for a wrong noise."""
-        return [1e3] * 3
+    top = (1e3,) * 3  # far from any reading but for a wrong noise
 
     def measure(self, world: World, normal: Array) -> Array:
         field = np.array(self.values["field"]) + 0.0 * normal

@@ -18,9 +18,7 @@ class MotionCapture(Sensor):
     frame = "world; quaternion: body to world"
     components = ("x", "y", "z", "qw", "qx", "qy", "qz")
     units = ("m",) * 3 + ("1",) * 4
-
-    def high(self) -> list[float]:
-        return [FURTHEST] * 3 + [UNIT] * 4
+    top = (FURTHEST,) * 3 + (UNIT,) * 4
 
     def measure(self, world: World, normal: Array) -> Array:
         state = world.state

@@ -19,11 +19,11 @@ class Rangefinder(Sensor):
     components = ("distance",)
     units = ("m",)
 
-    def high(self) -> list[float]:
-        return [self.values["limit"]]
+    def high(self) -> tuple[float, ...]:
+        return (self.values["limit"],)
 
-    def low(self) -> list[float]:
-        return [0.0]
+    def low(self) -> tuple[float, ...]:
+        return (0.0,)
 
     def measure(self, world: World, normal: Array) -> Array:
         distance = clip(world.below(), 0.0, self.values["limit"])
