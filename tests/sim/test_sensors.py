@@ -2,9 +2,8 @@
 
 import csv
 import json
-import math
 from collections.abc import Mapping
-from math import atan2, cos, exp, hypot, log, pi, radians, sin, sqrt
+from math import atan2, cos, exp, hypot, log, radians, sin, sqrt
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -67,19 +66,31 @@ def first(name: str, settings: Mapping[str, Any], **rest: Any) -> list[float]:
     return sensing({name: settings}, **rest)[1].readings[name].tolist()
 
 
+def readings(name: str, settings: Mapping[str, Any], worlds: int, **pose: Any) -> np.ndarray:
+    """First readings of a sensor of so many drones, shape (worlds, k)."""
+    _, sensors, _ = sensing({name: settings}, worlds, **pose)
+    return np.array(sensors.readings[name][:, 0])
+
+
 # --- what each measures ---------------------------------------------------------------------------
 
 
-def test_imu() -> None:
-    def reads(*expected: float, **pose: Any) -> None:
-        assert first("imu", IMU, **pose) == approx(expected, abs=1e-9)
+EXACT: dict[str, Any] = {
+    "imu": IMU,
+    "gps": GPS,
+    "motion_capture": {"noise": 0.0, "angle_noise": 0.0},
+    "rangefinder": {"noise": 0.0, "limit": 8.0},
+    "barometer": {"noise": 0.0},
+    "magnetometer": {"noise": 0.0},
+}
 
-    reads(0, 0, 0, 0, 0, 9.8)  # hovers: the thrust carries the weight
-    reads(0, 0, 0, 0, 0, 0, thrust=[0.0] * 4)  # falls
-    reads(0, 0, 0, 0, 0, 19.6, thrust=[98.0] * 4)
-    # Tilted, it still feels its thrust alone: an accelerometer does not tell the tilt.
-    reads(0, 0, 0, 0, 0, 9.8, quaternion=about_x(50.0))
-    reads(0.1, -0.2, 3.0, 0, 0, 9.8, body_rates=(0.1, -0.2, 3.0))
+
+@pytest.mark.parametrize(("name", "settings", "pose", "expected"), SIM["reads"]["rows"])
+def test_first_readings(
+    name: str, settings: dict[str, Any], pose: dict[str, Any], expected: list[float]
+) -> None:
+    reading = first(name, EXACT[name] | settings, **pose)
+    assert reading == approx(expected, abs=1e-9)
 
 
 def test_imu_of_a_craft_that_stands() -> None:
@@ -159,11 +170,9 @@ def test_the_standard_atmosphere() -> None:
     assert isa_height(isa_pressure(heights)) == approx(heights, abs=1e-8)
 
 
-def test_barometer() -> None:
-    assert first("barometer", {"noise": 0.0, "altitude": 430.0}) == approx([435.0])
+def test_noise_of_the_barometer() -> None:
     # At sea level a pascal is 1 / (1.225 kg/m³ · 9.80665 m/s²) = 83.24 mm.
-    _, sensors, _ = sensing({"barometer": {"noise": 2.0}}, 4000, position=(0.0, 0.0, 0.4))
-    off = sensors.readings["barometer"].ravel() - 0.4
+    off = readings("barometer", {"noise": 2.0}, 4000, position=(0.0, 0.0, 0.4)) - 0.4
     assert off.std() == approx(2 * 0.08324, abs=4 * 0.1665 / sqrt(8000))
 
 
@@ -179,31 +188,16 @@ def test_barometer_walks() -> None:
     assert pressure.std() == approx(expected, abs=4 * expected / sqrt(4000))
 
 
-def test_magnetometer() -> None:
-    """Level with the nose east, it has the field of the world; with the nose north, turned."""
-    expected = (1.287, 21.532, -43.231)
-    assert first("magnetometer", {"noise": 0.0}) == approx(expected)
-    turned = first("magnetometer", {"noise": 0.0}, quaternion=LEFT)
-    assert turned == approx((21.532, -1.287, -43.231))
-    expected = (0, 30, 0)
-    assert first("magnetometer", {"noise": 0.0, "field": [0, 30, 0]}) == approx(expected)
-    _, sensors, _ = sensing({"magnetometer": {"noise": 0.3, "field": [0, 0, 0]}}, 2000)
-    noise = sensors.readings["magnetometer"]
+def test_noise_of_the_magnetometer() -> None:
+    settings = {"noise": 0.3, "field": [0, 0, 0]}
+    noise = readings("magnetometer", settings, 2000)
     assert noise.std() == approx(0.3, abs=4 * 0.3 / sqrt(12_000))
-
-
-def test_rangefinder() -> None:
-    """Height over the cosine of the tilt, and no further than 8 m."""
-    for degrees, expected in ((0.0, 3.0), (60.0, 6.0), (75.0, 8.0), (180.0, 8.0)):
-        pose = {"position": (1.0, 2.0, 3.0), "quaternion": about_x(degrees)}
-        reading = first("rangefinder", {"noise": 0.0, "limit": 8.0}, **pose)
-        assert reading == approx([expected], abs=1e-9)
 
 
 def test_rangefinder_sees_what_stands_in_a_vehicles_file(tmp_path: Path) -> None:
     table = '<geom type="box" size="0.1 0.1 0.5" pos="7 0 0.5"/>'
     file = edited(tmp_path, "<worldbody>", f"<worldbody>{table}")
-    settings = {"noise": 0.0, "limit": 8.0}
+    settings = EXACT["rangefinder"]
     for x, expected in ((0.0, 3.0), (7.0, 2.0)):
         reading = first("rangefinder", settings, file=file, position=(x, 0.0, 3.0))
         assert reading == approx([expected], abs=1e-9)
@@ -212,23 +206,17 @@ def test_rangefinder_sees_what_stands_in_a_vehicles_file(tmp_path: Path) -> None
 def test_rangefinder_looks_past_what_is_fixed_to_the_craft(tmp_path: Path) -> None:
     leg = '<body pos="0 0 -0.3"><geom type="box" size="0.1 0.1 0.1" mass="0"/></body>'
     file = edited(tmp_path, "<freejoint", f"{leg}<freejoint")
-    settings = {"noise": 0.0, "limit": 8.0}
-    assert first("rangefinder", settings, file=file) == approx([5.0])
+    assert first("rangefinder", EXACT["rangefinder"], file=file) == approx([5.0])
 
 
 def test_gps_and_motion_capture() -> None:
     pose = {"position": (1.0, -2.0, 3.0), "velocity": (4.0, 5.0, -6.0), "quaternion": LEFT}
     assert first("gps", GPS, **pose) == [1.0, -2.0, 3.0, 4.0, 5.0, -6.0]
-    exact = {"noise": 0.0, "angle_noise": 0.0}
-    expected = [1.0, -2.0, 3.0, *LEFT]
-    assert first("motion_capture", exact, **pose) == approx(expected)
     noisy = {"noise": 2.0, "vertical_noise": 3.0, "velocity_noise": 0.5}
-    _, sensors, _ = sensing({"gps": noisy}, 4000, **pose)
-    deviation = sensors.readings["gps"].reshape(-1, 6).std(axis=0)
+    deviation = readings("gps", noisy, 4000, **pose).std(axis=0)
     assert_allclose(deviation, (2, 2, 3, 0.5, 0.5, 0.5), rtol=4 / sqrt(8000))
     turned = {"noise": 0.0, "angle_noise": 0.02}
-    _, sensors, _ = sensing({"motion_capture": turned}, 4000, **pose)
-    quaternion = sensors.readings["motion_capture"][:, 0, 3:]
+    quaternion = readings("motion_capture", turned, 4000, **pose)[:, 3:]
     assert_allclose(np.linalg.norm(quaternion, axis=1), 1.0, atol=1e-12)
     # The mean square of a rotation about three axes of σ is 3 σ².
     angle = 2 * np.arccos(np.clip(np.abs(quaternion @ LEFT), 0, 1))
@@ -436,45 +424,19 @@ def angles_of(quaternion: np.ndarray) -> np.ndarray:
 STILL = (0.0, 0.0, 0.0, 0.0, 0.0, 10.0)
 
 
-def after(channels: dict[str, Any], *imu: float, **state: Any) -> Estimator:
-    """A step from a state; at rest, unless the IMU reads otherwise."""
-    made = estimator(**state)
-    made.update(np.True_, {"imu": channel(*(imu or STILL)), **channels})
-    return made
-
-
-def test_a_step_of_position_by_hand() -> None:
-    """a = 10.5 - 10 m/s² up for 0.02 s, then half of the rest for each measurement."""
-    place = {"position": (1, 2, 3)}
-    made = after({}, 0, 0, 0, 0, 0, 10.5, velocity=(0.5, 0, 0), **place)
-    assert made.position == approx((1.01, 2.0, 3.0001), abs=1e-12)
-    assert made.velocity == approx((0.5, 0.0, 0.01), abs=1e-12)
-    made = after({"barometer": channel(104.0)}, **place)
-    # Both poles at 1/2: g = 1 - 1/4, h = (1 - 1/2)² / 0.02 s; it is 1 m higher.
-    assert made.position == approx((1.0, 2.0, 3.75))
-    assert made.velocity == approx((0.0, 0.0, 12.5))
-    made = after({"gps": channel(2, 2, 5, 0, 1, 0)}, **place)
-    assert made.position == approx((1.5, 2.0, 4.0))
-    assert made.velocity == approx((0.0, 0.5, 0.0))
-    made = after({"motion_capture": channel(3, 2, 3, *LEVEL)}, **place)
-    assert made.position == approx((2.5, 2.0, 3.0))
-    assert made.velocity == approx((25.0, 0.0, 0.0))
-
-
-def test_a_step_of_attitude_by_hand() -> None:
-    made = after({}, 0.5, 0, 0, 0, 0, 0)  # falls: nothing pulls
-    assert angles_of(made.quaternion) == approx((0.01, 0, 0))
-    made = after({}, quaternion=about_x(math.degrees(0.2)))
-    expected = (0.2 - 0.5 * sin(0.2), 0, 0)
-    assert angles_of(made.quaternion) == approx(expected)
-    # Nose north where it is believed to be east: field along -y... seen as along body x.
-    made = after({"magnetometer": channel(20, 0, -40)})
-    assert angles_of(made.quaternion) == approx((0, 0, pi / 4))
-    turned = np.array((cos(0.15), 0, 0, sin(0.15)))
-    for attitude in (turned, -turned):  # the same one
-        made = after({"motion_capture": channel(0, 0, 0, *attitude)})
-        expected = (0, 0, sin(0.15))
-        assert angles_of(made.quaternion) == approx(expected)
+@pytest.mark.parametrize("row", SIM["estimates"])
+def test_a_step_by_hand(row: dict[str, Any]) -> None:
+    """At rest, unless the IMU reads otherwise; then half of the rest for each measurement."""
+    made = estimator(**row.get("state", {}))
+    others = row.keys() - {"state", "imu", "position", "velocity", "turned"}
+    channels = {name: channel(*row[name]) for name in others}
+    channels["imu"] = channel(*row.get("imu", STILL))
+    made.update(np.True_, channels)
+    if "turned" in row:
+        assert angles_of(made.quaternion) == approx(row["turned"])
+    else:
+        assert made.position == approx(row["position"], abs=1e-12)
+        assert made.velocity == approx(row["velocity"], abs=1e-12)
 
 
 def test_a_reading_counts_once() -> None:
@@ -483,7 +445,8 @@ def test_a_reading_counts_once() -> None:
         "motion_capture": channel(9, 9, 9, *LEFT, fresh=False),
         "magnetometer": channel(20, 0, -40, fresh=False),
     }  # fmt: skip
-    made = after(stale, position=(1, 2, 3))
+    made = estimator(position=(1, 2, 3))
+    made.update(np.True_, {"imu": channel(*STILL), **stale})
     assert made.position == approx((1, 2, 3))
     assert made.velocity == approx((0, 0, 0))
     assert made.quaternion == approx(LEVEL)
