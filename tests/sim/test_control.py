@@ -158,7 +158,8 @@ def test_a_batch_has_the_bits_of_single_drones(name: str, level: str) -> None:
     assert (batch <= vehicle.thrust_high).all()
     for i in range(50):
         one = WorldState(**{name: array[i, 0] for name, array in given.items()})
-        assert controller.thrust(actions[i, 0], one).tobytes() == batch[i, 0].tobytes()
+        found = controller.thrust(actions[i, 0], one).tobytes()
+        assert found == batch[i, 0].tobytes()
 
 
 # --- every vehicle flies --------------------------------------------------------------------------
@@ -211,7 +212,8 @@ def test_every_vehicle_holds_a_position_and_turns_upright_without_tuning(file: P
 @pytest.mark.parametrize("frame", ["plus", "hexa", "octo"])
 def test_a_new_vehicle_flies_without_tuning(frame: str, tmp_path: Path) -> None:
     file = tmp_path / "mine.toml"
-    assert main(["vehicle", "new", str(file), "--frame", frame]) == 0
+    status = main(["vehicle", "new", str(file), "--frame", frame])
+    assert status == 0
     check_flights(Vehicle.load(file))
 
 
@@ -243,7 +245,8 @@ def test_loops_invert_the_thrust_curve() -> None:
     begin(world, position=(0.0, 0.0, 50.0))
     world.step(command, 1)
     assert world.state.thrust == approx(vehicle.hover_thrust, abs=1e-5)
-    assert hover_error(vehicle=FILES["racer"], effects={"thrust_curve": True}) < 0.01
+    found = hover_error(vehicle=FILES["racer"], effects={"thrust_curve": True})
+    assert found < 0.01
 
 
 # --- in an env ------------------------------------------------------------------------------------

@@ -620,7 +620,8 @@ def test_a_cable_is_slack_in_free_fall() -> None:
     fly(world, 0.0, 200)
     assert world.state.velocity[2] == approx(-G * 1.0, rel=1e-12)
     assert world.state.payload_velocity[2] == approx(-G * 1.0, rel=1e-12)
-    assert world.state.payload_velocity[:2].tolist() == [0.0, 0.0]
+    found = world.state.payload_velocity[:2].tolist()
+    assert found == [0.0, 0.0]
     assert world_of().state.payload_velocity is None
 
 
@@ -840,7 +841,8 @@ def test_distributions_are_told_in_one_way_of_writing() -> None:
         "thrust": "normal(1,5e-2)", "center_z": "choice( 0,0.125 )", "reaction": "1.25",
     }  # fmt: skip
     told = Randomization(texts, None).to_options()
-    assert json.loads(json.dumps(told)) == {
+    found = json.loads(json.dumps(told))
+    assert found == {
         "mass": "uniform(0.8, 1.2)", "inertia": 1.5, "center_x": 0.0,
         "thrust": "normal(1, 0.05)", "center_z": "choice(0, 0.125)", "reaction": 1.25,
     }  # fmt: skip

@@ -98,7 +98,8 @@ def test_compiled_and_numpy_fly_the_same_bits(name: str, dtype: str) -> None:
         for world in (compiled, plain):
             world.step(thrust, 2)
     for name in ("position", "quaternion", "velocity", "body_rates"):
-        assert getattr(compiled.state, name).tobytes() == getattr(plain.state, name).tobytes()
+        found = getattr(compiled.state, name).tobytes()
+        assert found == getattr(plain.state, name).tobytes()
 
 
 @pytest.mark.parametrize(("share", "most"), [(1.0, "1e6"), (5e-8, "100"), (5e-8, "1e6")])
@@ -202,7 +203,8 @@ def test_a_free_fall_is_exact() -> None:
     begin(world, position=(10.0, 10.0, 10.0), velocity=(1.0, 2.0, 3.0))
     world.step(np.zeros((1, 1, 4)), 100)  # 1 s
     expected = (11.0, 12.0, 13.0 - 9.8 / 2)
-    assert_allclose(world.state.position[0, 0], expected, atol=1e-4, rtol=0)
+    found = world.state.position[0, 0]
+    assert_allclose(found, expected, atol=1e-4, rtol=0)
     expected = (1.0, 2.0, 3.0 - 9.8)
     assert_allclose(world.state.velocity[0, 0], expected, atol=1e-5, rtol=0)
 
@@ -247,7 +249,8 @@ def test_acceleration_and_below() -> None:
     # At hover thrust: level it stays, on its side it falls and is pushed along -y.
     expected = [[0.0, 0.0, 0.0], [0.0, -9.8, -9.8]]
     assert_allclose(world.acceleration()[:2, 0], expected, atol=1e-12, rtol=0)
-    assert world.below()[:, 0] == pytest.approx([2.0, np.inf, 2.0 / np.cos(1.0)])
+    found = world.below()[:, 0]
+    assert found == pytest.approx([2.0, np.inf, 2.0 / np.cos(1.0)])
 
 
 @pytest.mark.parametrize("file", FILES.values(), ids=FILES)
@@ -275,7 +278,8 @@ def test_touches_the_ground_where_mujoco_does(file: Path) -> None:
         place = np.stack((0 * high, 0 * high, high + offset), axis=-1)[:, None]
         begin(ours, position=place, quaternion=turned)
         begin(theirs, position=place, quaternion=turned)
-        assert ours.state.touching.tolist() == theirs.state.touching.tolist()
+        found = ours.state.touching.tolist()
+        assert found == theirs.state.touching.tolist()
         assert bool(ours.state.touching[0]) == (offset < 0)
 
 
@@ -366,4 +370,5 @@ def test_a_bad_state_raises_and_a_reset_mends_it() -> None:
         loop.advance(still)
     loop.advance(still, every, [0, 1])
     loop.advance(still)
-    assert abs(loop.observations["observation"][:, 1:]).max() < 1e-6
+    found = abs(loop.observations["observation"][:, 1:]).max()
+    assert found < 1e-6

@@ -127,7 +127,8 @@ def test_downwash_is_that_of_mujoco_and_of_a_world_alone() -> None:
         theirs.step(thrust, 2)
         alone.step(thrust[1:], 2)
     assert_allclose(ours.state.position, theirs.state.position, atol=1e-9, rtol=0)
-    assert ours.state.position[1].tobytes() == alone.state.position[0].tobytes()
+    found = ours.state.position[1].tobytes()
+    assert found == alone.state.position[0].tobytes()
     speed = ours.state.velocity[..., 2]
     assert (speed[:, 0] < speed[:, 8] - 0.1).all()  # the lowest, and that above all jets
 
@@ -169,7 +170,8 @@ def test_spheres_touch_at_two_radii_and_fly_on(name: str | None) -> None:
     # Apart by 3 - 0.4 n radii: below 2 from n = 3 on, past each other, and until n = 12.
     assert seen == [False] * 2 + [True] * 10 + [False] * 2
     expected = 10 * radius * np.array((1.0, -1.0, 0.0))
-    assert np.asarray(state.velocity[0, :, 0]) == pytest.approx(expected, abs=1e-12)
+    found = np.asarray(state.velocity[0, :, 0])
+    assert found == pytest.approx(expected, abs=1e-12)
 
 
 def test_a_touch_is_told_of_all_looks_of_a_control_step() -> None:
@@ -201,7 +203,8 @@ def test_of_128_drones_those_that_overlap_are_told() -> None:
     position[0, 127, :2] = position[0, 40, 0], 1.999 * radius  # beside the 41st, and near two more
     position[1, 0, 2] = position[1, 1, 2] = 0.0  # on the ground, no drone among them
     begin(world, position=position)
-    assert np.flatnonzero(world.state.colliding[0]).tolist() == [40, 127]
+    found = np.flatnonzero(world.state.colliding[0]).tolist()
+    assert found == [40, 127]
     assert np.flatnonzero(world.state.touching[0]).tolist() == [40, 127]
     assert np.flatnonzero(world.state.touching[1]).tolist() == [0, 1]
     assert not world.state.colliding[1].any()
@@ -229,7 +232,8 @@ def test_a_mask_moves_and_tells_of_its_worlds_alone() -> None:
     first = np.array([[True] * 2, [False] * 2])
     second = np.array([[False] * 2, [True] * 2])
     begin(world, second, position=apart)
-    assert world.state.touching.tolist() == [[True, True], [False, False]]
+    found = world.state.touching.tolist()
+    assert found == [[True, True], [False, False]]
     thrust = np.broadcast_to(1.1 * vehicle.hover_thrust, (2, 2, 4))
     before = world.state.position[0].tobytes()
     world.step(thrust, 2, second)
