@@ -200,7 +200,7 @@ def checked_seeds(seed: Any, num_envs: int, most: int | None = None) -> Seeds | 
     return numbers
 
 
-def _is_seed(number: Any, most: int | None) -> bool:
+def _is_seed(number: object, most: int | None) -> bool:
     if number is None:
         return most is None
     return isinstance(number, int | np.integer) and 0 <= int(number) <= (most or int(number))

@@ -20,12 +20,13 @@ from ..models.library import is_of_the_library, vehicle_words
 from ..scenes import scenes_of
 from ..sim import EffectOptions, Randomization, checked_sensors
 from . import registry
-from .spec import canonical_id, json_values
+from .spec import Values, canonical_id, json_values
 
 if TYPE_CHECKING:
     from ..models.vehicle import Vehicle
     from .tasks.task import TaskOptions
 
+Options = Mapping[str, Any]
 VERSION: Final = 1
 """Version of a config's JSON."""
 DEFAULT_ENV: Final = "rotorgram/Elevation-v0"
@@ -97,7 +98,7 @@ class BackendConfig:
         return cls(name=backend)
 
     @property
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> Values:
         """Settings that are not None, as keyword arguments of `sim.make_world`."""
         values = {name: value for name, value in asdict(self).items() if value is not None}
         del values["name"]
@@ -116,7 +117,7 @@ class EnvConfig:
 
     env_id: str = DEFAULT_ENV
     """Id of a registered task, without a module."""
-    task: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    task: Options = field(default_factory=dict, hash=False)
     """Options of the task by name."""
     vehicle: tuple[str, ...] = ()
     """Names of the library, or files; several for the drones of a world in turn. None given: the
@@ -136,15 +137,15 @@ class EnvConfig:
     """Number of the last observations that are observed side by side, the oldest first. A reset
     fills them with the first observation."""
     effects: EffectOptions = _NO_EFFECTS
-    randomize: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    randomize: Options = field(default_factory=dict, hash=False)
     """Distributions of what is drawn for each episode: names of `sim.PARAMETERS` to texts."""
-    sensors: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    sensors: Options = field(default_factory=dict, hash=False)
     """Settings by sensor, or true; see `sim/sensors`."""
     cameras: tuple[str, ...] = ()
     """Pictures that are observed: cameras of the vehicle as NAME, NAME_KIND or
     NAME@WIDTHxHEIGHT."""
     backend: BackendConfig = BackendConfig()
-    files: Mapping[str, Any] = field(default_factory=dict, hash=False, repr=False)
+    files: Options = field(default_factory=dict, hash=False, repr=False)
     """Content of the files of `vehicle` by their names, as `models/bundle` has it; set by
     `resolve`, which needs the files themselves no more."""
     vehicle_hash: str = ""
@@ -167,7 +168,7 @@ class EnvConfig:
         self._set(randomize=Randomization(self.randomize, None).to_options())
         if not isinstance(self.task, Mapping):
             raise InputError(f"task: expected options by name, got {shortened(self.task)}")
-        options: Mapping[str, Any] = self.task
+        options: Options = self.task
         if registry.is_known(self.env_id):
             task = registry.task_type(self.env_id)
             defaults = {name: getattr(task, name) for name in _FROM_TASK}
@@ -206,12 +207,12 @@ class EnvConfig:
             nested = {**options, **nested}
         return cls(env_id=env_id, task=nested, **given)
 
-    def flat_options(self) -> dict[str, Any]:
+    def flat_options(self) -> Values:
         """Keywords of everything but the vehicle, the drones and the backend, as JSON values.
 
         Every option of the task, and every other field that is not empty.
         """
-        values: dict[str, Any] = {name: getattr(self, name) for name in _OPTIONS}
+        values: Values = {name: getattr(self, name) for name in _OPTIONS}
         values["effects"] = self.effects.to_options()
         values["scene"] = str(self.scene) if self.cameras else None
         values["task"] = {name: value for name, value in self.task.items() if name in KEYWORDS}
@@ -219,9 +220,9 @@ class EnvConfig:
         shown = {name: value for name, value in self.task.items() if name not in KEYWORDS}
         return json_values(values | shown)
 
-    def keywords(self) -> dict[str, Any]:
+    def keywords(self) -> Values:
         """Keywords of `from_keywords` that make the same config, as JSON values."""
-        values: dict[str, Any] = {"env_id": self.own_task or self.env_id}
+        values: Values = {"env_id": self.own_task or self.env_id}
         if self.vehicle:
             values["vehicle"] = list(self.vehicle)
         if self.backend != BackendConfig():
@@ -244,7 +245,7 @@ class EnvConfig:
         """
         return cls.from_keywords(**read_toml(path) | keywords)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Values:
         """All fields as JSON values, with the version."""
         content = {one.name: getattr(self, one.name) for one in fields(self)}
         content |= {"effects": self.effects.to_options()}
@@ -252,7 +253,7 @@ class EnvConfig:
         return json_values({"version": VERSION, **content})
 
     @classmethod
-    def from_dict(cls, content: Any) -> Self:
+    def from_dict(cls, content: object) -> Self:
         """The reverse of `to_dict`. Raises `InputError`."""
         if not isinstance(content, Mapping):
             raise InputError(f"config: expected an object, got {shortened(content)}")
@@ -374,7 +375,7 @@ KEYWORDS: Final = (*_FLAT, *BACKEND_KEYWORDS)
 """Keywords that are not options of a task."""
 
 
-def read_toml(path: Path | str) -> dict[str, Any]:
+def read_toml(path: Path | str) -> Values:
     """Keywords of a config's file. Raises `InputError`."""
     file = Path(path)
     try:

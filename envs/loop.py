@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..models.errors import InputError
 from ..sim import Array, PhysicsError, Randomization, make_world
-from ..sim.snapshots import Arrays, joined, part_of
+from ..sim.snapshots import Arrays, Snapshot, joined, part_of
 from .autoreset import Seeds, checked_seeds
 from .config import EnvConfig
 from .pipeline import Pipeline
@@ -165,7 +165,7 @@ class Loop:
         """
         self._pipeline.landing.prepare(self.record, clock.drones_of(self.record, drones))
 
-    def snapshot(self) -> dict[str, np.ndarray]:
+    def snapshot(self) -> Snapshot:
         """Copies of all arrays that a later step depends on, by name.
 
         Raises `gymnasium.error.ClosedEnvironmentError` after `close`.

@@ -3,11 +3,10 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..models.errors import InputError, require
-from ..sim.snapshots import Arrays
-from .autoreset import AdvancingVectorEnv
+from ..sim.snapshots import Arrays, Snapshot
+from .autoreset import AdvancingVectorEnv, Info
 from .rendering import RENDER_MODES
 from .spaces import action_space, checked_action, observation_space
 from .vector import LocalVectorEnv
@@ -54,9 +53,7 @@ class AdvancingParallelEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc]
         """The same object for an agent in every call."""
         return self.action_spaces[agent]
 
-    def reset(
-        self, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Told, Told]:
+    def reset(self, seed: int | None = None, options: Info | None = None) -> tuple[Told, Told]:
         """Begin an episode with all agents; a seed makes it reproducible. `options` are ignored."""
         seen, info = self._world.reset(seed=seed)
         self.agents = list(self.possible_agents)
@@ -98,7 +95,7 @@ class AdvancingParallelEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc]
     def _numbers(self, values: np.ndarray, agents: list[str]) -> Told:
         return {agent: values[self._rows[agent]].item() for agent in agents}
 
-    def _told(self, seen: Any, info: dict[str, Any], agents: list[str]) -> tuple[Told, Told]:
+    def _told(self, seen: Any, info: Info, agents: list[str]) -> tuple[Told, Told]:
         """Observations and infos of some agents."""
         names = [name for name in info if not name.startswith("_")]
         several = isinstance(seen, dict)
@@ -142,7 +139,7 @@ class LocalParallelEnv(AdvancingParallelEnv):
         self.render_mode = render_mode
         self.metadata["render_modes"] = RENDER_MODES
 
-    def snapshot(self) -> dict[str, NDArray[Any]]:
+    def snapshot(self) -> Snapshot:
         """Copies of all arrays that a later step depends on, by name."""
         flying = [agent in self.agents for agent in self.possible_agents]
         return self._local.snapshot() | {"agents": np.array(flying)}

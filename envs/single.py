@@ -4,10 +4,10 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
 from ..models.errors import InputError
-from ..sim.snapshots import Arrays
+from ..sim.snapshots import Arrays, Snapshot
+from .autoreset import Info
 from .config import EnvConfig
 from .loop import Loop
 from .rendering import RENDER_MODES, Renderer
@@ -40,7 +40,7 @@ class SingleEnv(gym.Env[Any, Any]):
         rotorgram.rendering.NoOpenGL: There is nothing to draw with, or no display.
     """
 
-    metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 50}  # noqa: RUF012
+    metadata: Info = {"render_modes": RENDER_MODES, "render_fps": 50}  # noqa: RUF012
 
     def __init__(
         self, env_id: str | EnvConfig, render_mode: str | None = None, **keywords: Any
@@ -63,9 +63,7 @@ class SingleEnv(gym.Env[Any, Any]):
         self._no_action = np.zeros((1, len(loop.task.controller.low)), np.float32)
         self._episodes = 0
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Begin an episode; a seed makes it reproducible. `options` has no keys."""
         if options:
             raise InputError(f"reset: expected no options, got {options!r}")
@@ -76,7 +74,7 @@ class SingleEnv(gym.Env[Any, Any]):
             self.render()
         return self._observation(), self._info()
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, Info]:
         """Fly for one control period. See the task for shapes, units and ends."""
         loop = self._loop
         loop.advance(checked_action(action, self.action_space, "action"))
@@ -90,7 +88,7 @@ class SingleEnv(gym.Env[Any, Any]):
         pictures = self._renderer.render([self._episodes])
         return pictures[0] if pictures else None
 
-    def snapshot(self) -> dict[str, NDArray[Any]]:
+    def snapshot(self) -> Snapshot:
         """Copies of all arrays that a later step depends on, by name."""
         return self._loop.snapshot() | {"episodes": np.array(self._episodes)}
 
@@ -110,7 +108,7 @@ class SingleEnv(gym.Env[Any, Any]):
             return observations[self._only][0]
         return {name: values[0] for name, values in observations.items()}
 
-    def _info(self) -> dict[str, Any]:
+    def _info(self) -> Info:
         loop = self._loop
         info = dict(zip(self._names, loop.row(), strict=True))
         for name, term in loop.record.terms.items():

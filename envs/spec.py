@@ -33,6 +33,9 @@ BODY: Final = "body"
 BODY_TO_WORLD: Final = "body to world"
 """Frame of a quaternion w, x, y, z."""
 
+Values = dict[str, Any]
+"""Values by name, as JSON has them."""
+
 Bound = float | tuple[float, ...]
 """One number for all elements, or one for each in C order. Infinite where there is no bound."""
 
@@ -86,7 +89,7 @@ class _Part:
         return content
 
     @classmethod
-    def _fields(cls, content: object) -> dict[str, Any]:
+    def _fields(cls, content: object) -> Values:
         """Keyword arguments from a JSON object; names that are not known are left out."""
         if not isinstance(content, dict):
             raise SpecError(
@@ -385,7 +388,7 @@ def _finite(text: str) -> float:
     return value
 
 
-def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _without_repeats(pairs: list[tuple[str, Any]]) -> Values:
     """A JSON object. Raises `ValueError` for a name that it has twice."""
     content = dict(pairs)
     if len(content) < len(pairs):
@@ -404,12 +407,12 @@ def _plain(value: object) -> object:
     return None if value in (math.inf, -math.inf) else value
 
 
-def json_values(options: Any) -> dict[str, Any]:
+def json_values(options: Any) -> Values:
     """Options as JSON gives them back: tuples become lists. Raises `SpecError`."""
     try:
         text = json.dumps({**options}, allow_nan=False, ensure_ascii=False)
         text.encode()  # half a surrogate pair cannot be sent
-        plain: dict[str, Any] = json.loads(text)
+        plain: Values = json.loads(text)
     except (TypeError, ValueError, RecursionError) as error:
         raise SpecError(
             f"options: expected JSON values, got {shortened(options)}: {error}"

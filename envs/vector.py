@@ -5,12 +5,11 @@ from typing import Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
-from numpy.typing import NDArray
 
 from ..models.errors import InputError
 from ..models.fields import check_names
-from ..sim.snapshots import Arrays
-from .autoreset import AdvancingVectorEnv, Seeds, checked_mask, checked_seeds
+from ..sim.snapshots import Arrays, Snapshot
+from .autoreset import AdvancingVectorEnv, Info, Seeds, checked_mask, checked_seeds
 from .config import EnvConfig
 from .loop import Loop
 from .rendering import RENDER_MODES, Renderer
@@ -73,8 +72,8 @@ class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
         self.closed = False
 
     def reset(
-        self, *, seed: int | Seeds | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+        self, *, seed: int | Seeds | None = None, options: Info | None = None
+    ) -> tuple[Any, Info]:
         """Begin an episode, for all drones or some.
 
         Args:
@@ -116,7 +115,7 @@ class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
             if self.render_mode == "human":
                 self.render()
 
-    def snapshot(self) -> dict[str, NDArray[Any]]:
+    def snapshot(self) -> Snapshot:
         """Copies of all arrays that a later step depends on, by name."""
         return self.loop.snapshot() | {"episodes": self._episodes.copy()}
 
@@ -131,7 +130,7 @@ class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
         """By name, float64, shape (N, *shape)."""
         return self.loop.telemetry
 
-    def _info(self, mask: Any) -> dict[str, Any]:
+    def _info(self, mask: Any) -> Info:
         terms = {f"reward_{name}": term for name, term in self.loop.reward_terms.items()}
         return super()._info(mask) | terms | {f"_{name}": mask for name in terms}
 

@@ -14,7 +14,7 @@ from ...models.errors import InputError
 from ...models.fleet import members_of
 from ...scenes import scenes_of
 from ...sim.random import SCENES, Random
-from ...sim.snapshots import Arrays
+from ...sim.snapshots import Arrays, Snapshot
 from ..spec import ArraySpec
 from ..tasks.task import Task
 from .record import Record, Stage
@@ -132,9 +132,9 @@ class Pictures(Stage):
         for painter in self._painters:
             painter.cameras.close()
 
-    def snapshot(self, record: Record) -> dict[str, np.ndarray]:
+    def snapshot(self, record: Record) -> Snapshot:
         """What each drone's cameras took last."""
-        taken: dict[str, np.ndarray] = {}
+        taken: Snapshot = {}
         if "scenes" not in vars(record):
             return taken
         for painter in self._painters:
@@ -189,9 +189,9 @@ class Pictures(Stage):
     def _taken(
         self,
         due: dict[str, NDArray[np.bool_]],
-        rows: dict[str, np.ndarray],
+        rows: Arrays,
         scenes: NDArray[np.int64],
-    ) -> dict[str, np.ndarray]:
+    ) -> Arrays:
         pictures: dict[str, np.ndarray] = {}
         for view in self.views:
             pictures[view.name] = np.empty((self._rows, *view.shape), view.dtype)

@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...sim import Draw, InitialState
-from ...sim.snapshots import Arrays, joined
+from ...sim.snapshots import Arrays, Snapshot, joined
 from ...sim.state import Array, WorldState
 from ..memory import Memory
 from ..state import State
 
 Mask = NDArray[np.bool_]
+ByName = dict[str, np.ndarray]
 Look = Callable[[], WorldState]
 """Gives the state that a controller sees: the exact one, or the estimate."""
 
@@ -66,9 +67,9 @@ class Record:
     start: InitialState
     state: State
     measured: State
-    observations: dict[str, np.ndarray]
-    past_observations: dict[str, np.ndarray]
-    history: dict[str, np.ndarray]
+    observations: ByName
+    past_observations: ByName
+    history: ByName
     terms: dict[str, Array]
     metrics: dict[str, Array]
     ended: Array
@@ -124,7 +125,7 @@ class Record:
             if memory[name] is not old:
                 memory[name] = where(mask, memory[name], old)
 
-    def snapshot(self) -> dict[str, np.ndarray]:
+    def snapshot(self) -> Snapshot:
         """Copies of what is kept and of the memory, by name."""
         known = vars(self)
         alone: dict[str, Any] = {}

@@ -15,6 +15,7 @@ from ..state import State
 from .goal import (
     MAX_SPEED,
     WORST_SWING,
+    Share,
     along,
     check_height,
     length,
@@ -30,7 +31,7 @@ from .task import Outcome
 class CableOptions(SwarmOptions):
     """Options of `rotorgram/Cable-v0`. `center` is the point for the payload."""
 
-    payload_share: Annotated[float, Limits(0.001, 10.0)] = 0.2
+    payload_share: Share = 0.2
     """Mass of the payload over that of all vehicles together."""
     angle: Annotated[float, Limits(5.0, 60.0, "degrees")] = 30.0
     """Angle of the cables to the vertical at the start, degrees. Their length follows from it and

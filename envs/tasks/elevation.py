@@ -19,7 +19,7 @@ from ...sim import (
 )  # fmt: skip
 from ..spec import ArraySpec, Metric
 from ..state import State
-from .goal import AIR, check_more, nearness
+from .goal import AIR, check_more, ends_of, nearness
 from .task import Outcome, Task, TaskOptions
 
 TERMINATION_REWARD: Final = -20.0
@@ -53,11 +53,6 @@ class ElevationOptions(TaskOptions):
     def check(self) -> None:
         """Check the options of this task. Raises `InputError`."""
         check_more("flight_band", self.flight_band, "start_band", self.start_band)
-
-    @property
-    def target_range(self) -> tuple[float, float]:
-        """Lowest and highest target elevation, m."""
-        return self.target if isinstance(self.target, tuple) else (self.target, self.target)
 
 
 class Elevation(Task):
@@ -122,7 +117,7 @@ class Elevation(Task):
         vehicle = self.vehicle
         room = vehicle.rest_height + AIR
         least = room + options.start_band
-        low, high = options.target_range
+        low, high = ends_of(options.target)
         if low < least or high > FURTHEST:
             reasons = f"(start_band = {options.start_band:g} m, and {room:g} m of room)"
             raise InputError(
@@ -152,7 +147,7 @@ class Elevation(Task):
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """Level, at rest, near the target."""
         band = self.options.start_band
-        target = draw.uniform(*self.options.target_range, name="target")
+        target = draw.uniform(*ends_of(self.options.target), name="target")
         start = draw.uniform(-band, band) + target
         chosen = draw.chosen("start")
         if chosen is not None:

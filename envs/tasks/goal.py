@@ -57,11 +57,23 @@ Point = Annotated[tuple[float, float, float], Limits(-FURTHEST, FURTHEST, "m", c
 Distance = Annotated[float, Limits(0.0, FURTHEST, "m")]
 """Of an option, m."""
 
+Size = Annotated[float, Limits(0.01, FURTHEST, "m")]
+"""Of an option: a length that is not 0, m."""
+
 Margin = Annotated[float, Limits(0.1, FURTHEST, "m")]
 """Of an option: how far a craft may leave its way, m."""
 
 Speed = Annotated[float, Limits(0.0, MAX_SPEED, "m/s")]
 """Of an option, m/s."""
+
+SlowSpeed = Annotated[float, Limits(0.01, MAX_SPEED, "m/s")]
+"""Of an option: a limit of a speed, m/s."""
+
+Upright = Annotated[float, Limits(0.1, 90.0, "degrees")]
+"""Of an option: a limit of a tilt, degrees."""
+
+Share = Annotated[float, Limits(0.001, 10.0)]
+"""Of an option: mass of a payload over that of a vehicle."""
 
 Tilt = Annotated[float, Limits(0.0, 80.0, "degrees")]
 """Of an option: largest tilt at the start, degrees."""
@@ -210,6 +222,11 @@ def tilted(angle: Array, azimuth: Array) -> Array:
 def at(point: Sequence[float], like: Array) -> Array:
     """A point for every drone, (W, A, 3); `like` has a number for each."""
     return stack([0.0 * like + value for value in point])
+
+
+def ends_of(range_: float | tuple[float, float]) -> tuple[float, float]:
+    """Low and high end of an option that is a number or a pair."""
+    return range_ if isinstance(range_, tuple) else (range_, range_)
 
 
 def along(name: str, unit: str, size: float, axes: str = "xyz") -> list[Number]:

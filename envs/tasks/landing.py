@@ -15,8 +15,11 @@ from .goal import (
     COURSE_RATE_WEIGHT,
     COURSE_WORST_RATES,
     GoalTask,
+    SlowSpeed,
+    Upright,
     along,
     check_more,
+    ends_of,
     length,
     rates_cost,
 )
@@ -46,11 +49,11 @@ class LandingOptions(TaskOptions):
     for each episode."""
     pad_radius: Annotated[float, Limits(0.01, FURTHEST, "m")] = 0.5
     """A landing's largest horizontal distance of the body's origin from the pad's centre, m."""
-    sink: Annotated[float, Limits(0.01, 100.0, "m/s")] = 1.0
+    sink: SlowSpeed = 1.0
     """A landing's largest vertical speed, m/s."""
-    drift: Annotated[float, Limits(0.01, 100.0, "m/s")] = 0.5
+    drift: SlowSpeed = 0.5
     """A landing's largest horizontal speed relative to the pad, m/s."""
-    tilt: Annotated[float, Limits(0.1, 90.0, "degrees")] = 15.0
+    tilt: Upright = 15.0
     """A landing's largest tilt, degrees."""
     start_height: Annotated[float, Limits(0.1, FURTHEST, "m")] = 4.0
     """Mean height at the start above that of a craft on the ground, m."""
@@ -69,12 +72,6 @@ class LandingOptions(TaskOptions):
         reach = self.pad_path + math.sqrt(2) * self.start_band
         furthest = math.hypot(reach, self.start_height + self.start_band)
         check_more("flight_band", self.flight_band, "the furthest start", furthest)
-
-    @property
-    def pad_speeds(self) -> tuple[float, float]:
-        """Least and largest speed of the pad, m/s."""
-        speed = self.pad_speed
-        return speed if isinstance(speed, tuple) else (speed, speed)
 
 
 class Landing(GoalTask):
@@ -146,7 +143,7 @@ class Landing(GoalTask):
     def setup(self) -> None:
         """See the class."""
         options = self.options
-        fastest = options.pad_speeds[1] + 0.001
+        fastest = ends_of(options.pad_speed)[1] + 0.001
         pad = along("velocity of the pad", "m/s", fastest, "xy")
         self.define_observation(options.flight_band, pad)
         self._least_upright = math.cos(math.radians(options.tilt))
@@ -158,7 +155,7 @@ class Landing(GoalTask):
         """Level and at rest above the pad's path."""
         options = self.options
         offset = draw.uniform(-options.start_band, options.start_band, (3,))
-        speed = draw.uniform(*options.pad_speeds)
+        speed = draw.uniform(*ends_of(options.pad_speed))
         direction = draw.uniform(-math.pi, math.pi)
         phase = draw.uniform(-math.pi, math.pi)
         side = draw.uniform(-1.0, 1.0)

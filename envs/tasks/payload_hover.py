@@ -26,6 +26,7 @@ from .goal import (
     Distance,
     GoalTask,
     Point,
+    Share,
     Speed,
     Tilt,
     along,
@@ -47,7 +48,7 @@ class PayloadHoverOptions(TaskOptions):
 
     goal: Point = (0.0, 0.0, 4.0)
     """Point at which to hold the payload: x, y, z in MuJoCo's world frame (z up), m."""
-    payload_share: Annotated[float, Limits(0.001, 10.0)] = 0.1
+    payload_share: Share = 0.1
     """Mass of the payload over that of the vehicle."""
     cable: Annotated[float, Limits(0.05, 100.0, "m")] = 1.0
     """Length of the cable, m."""

@@ -26,7 +26,6 @@ from ..state import State
 from .goal import (
     COURSE_RATE_WEIGHT,
     COURSE_WORST_STEP,
-    FURTHEST,
     PASSING_REWARD,
     Distance,
     GoalTask,
@@ -34,6 +33,7 @@ from .goal import (
     Margin,
     Number,
     Point,
+    Size,
     along,
     at,
     check_height,
@@ -61,7 +61,7 @@ class Start:
 class Gate(Start):
     """A square opening that stands upright: its centre, and the direction in which it is passed."""
 
-    size: Annotated[float, Limits(0.01, FURTHEST, "m")]
+    size: Size
     """Width and height."""
 
 

@@ -21,7 +21,9 @@ from .goal import (
     WORST_RATES,
     GoalTask,
     Point,
+    SlowSpeed,
     Speed,
+    Upright,
     at,
     check_height,
     check_more,
@@ -49,9 +51,9 @@ class RecoveryOptions(TaskOptions):
     torque about that axis stops in 0.5 s."""
     near: Annotated[float, Limits(0.01, 1e3, "m")] = 0.5
     """A craft has recovered while it is nearer to the goal than this, m, ..."""
-    slow: Annotated[float, Limits(0.01, 100.0, "m/s")] = 0.5
+    slow: SlowSpeed = 0.5
     """... slower than this, m/s, ..."""
-    upright: Annotated[float, Limits(0.1, 90.0, "degrees")] = 15.0
+    upright: Upright = 15.0
     """... and tilted by less than this, degrees."""
     flight_band: Annotated[float, Limits(0.1, 1e4, "m")] = 15.0
     """An episode terminates when the craft is further than this from its goal, m."""

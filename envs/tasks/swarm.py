@@ -12,7 +12,6 @@ from ...sim import Array, Draw, InitialState, clip, stack
 from ..spec import Metric
 from ..state import State
 from .goal import (
-    FURTHEST,
     MAX_SPEED,
     WORST_RATES,
     Distance,
@@ -20,6 +19,7 @@ from .goal import (
     Margin,
     Number,
     Point,
+    Size,
     Speed,
     along,
     check_height,
@@ -357,7 +357,7 @@ class EscortOptions(SwarmOptions):
 
     target_speed: Speed = 1.0
     """Largest speed of the target, m/s."""
-    target_path: Annotated[float, Limits(0.01, FURTHEST, "m")] = 5.0
+    target_path: Size = 5.0
     """Furthest distance of the target from the center along x and y, m."""
 
 

@@ -26,6 +26,7 @@ from .goal import (
     Distance,
     GoalTask,
     Point,
+    Size,
     along,
     check_height,
     length,
@@ -62,7 +63,7 @@ class TrackingOptions(TaskOptions):
     """Time between these, s."""
     start_band: Distance = 0.3
     """Largest distance of the start from the trajectory along each axis, m."""
-    flight_band: Annotated[float, Limits(0.01, FURTHEST, "m")] = 3.0
+    flight_band: Size = 3.0
     """An episode terminates when the craft is further than this from where it should be, m."""
 
     def check(self) -> None:
