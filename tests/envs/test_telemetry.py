@@ -6,6 +6,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from contracts import TABLES
 from remotes import flying
 from rotorgram.cli import main
 from rotorgram.envs import telemetry
@@ -19,20 +20,7 @@ USUAL = ["position", "attitude", "velocity", "body_rates", "thrust"]
 BREEZE: dict[str, Any] = {"body_drag": True, "wind": (1.0, -2.0, 0.5)}
 
 
-@pytest.mark.parametrize(
-    ("options", "more"),
-    [
-        ({}, []),
-        ({"effects": {"battery": True}}, ["battery"]),
-        ({"effects": BREEZE}, ["wind"]),
-        ({"effects": {"rotor_drag": True, "gusts": 3.0}}, ["wind"]),
-        (
-            {"effects": {"body_drag": True}, "randomize": {"wind_y": "uniform(0, 1)"}},
-            ["wind", "drawn"],
-        ),
-        ({"randomize": {"mass": "uniform(0.9, 1.1)"}}, ["drawn"]),
-    ],
-)
+@pytest.mark.parametrize(("options", "more"), TABLES["what is off has no telemetry"])
 def test_what_is_off_has_no_telemetry(options: dict[str, Any], more: list[str]) -> None:
     spec = env_spec(EnvConfig.from_keywords(HOVER, vehicle="crazyflie2", **options))
     names = [array.name for array in spec.telemetry]
