@@ -22,12 +22,7 @@ from rotorgram.sim import EffectOptions, InitialState, stack
 from rotorgram.udp.spawn import spawn_simulator
 
 HOVER = "rotorgram/Hover-v0"
-FULL = {
-    "vehicle": "crazyflie2,crazyflie2", "drones": 2, "scene": "forest:2-4", "action": "rates",
-    "control_period": 0.04, "episode_length": 9, "history": 3, "effects": {"motor_lag": True},
-    "randomize": {"mass": "uniform(0.9,1.1)"}, "sensors": {"imu": True}, "cameras": "front,down",
-    "backend": "rigid", "dtype": "float64", "compiled": False, "spacing": 4,
-}  # fmt: skip
+FULL = TABLES["config: FULL"]
 
 
 class Hold(Task):

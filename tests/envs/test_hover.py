@@ -21,12 +21,9 @@ HEXA = Path(__file__).parents[1] / "data" / "hexa.xml"
 def test_observation_by_hand() -> None:
     """Turned left by 90 degrees where the nose shall point along y: all is seen from there."""
     task = task_of(ID, goal=(1.0, 2.0, 6.0), heading=90.0)
-    state = state_of(
-        quaternion=about((0, 0, 1), 90.0), velocity=(3.0, 4.0, 5.0), body_rates=(0.1, 0.2, 0.3),
-        thrust=(49.0, 98.0, 0.0, 24.5),
-    )  # fmt: skip
+    state = state_of(**TABLES["hover: observation by hand, state"])
     seen = task.observe(state)["observation"]
-    expected = [2, -1, 1, 4, -3, 5, 1, 0, 0, 0, 0, 1, 0.1, 0.2, 0.3, 0, 1, -1, -0.5]
+    expected = TABLES["hover: observation by hand, expected"]
     assert seen == pytest.approx(expected, abs=1e-12)
     # Rolled left by 30 degrees: the thrust points to the right, -y.
     tilted = task_of(ID).observe(state_of(quaternion=about((1, 0, 0), 30.0)))["observation"]

@@ -10,7 +10,7 @@ from contracts import TABLES
 from pilot import Pilot, fly, limited
 from rotorgram.models import Vehicle
 
-from flights import Shares, about, state_of, task_of
+from flights import Shares, state_of, task_of
 
 ID = "rotorgram/Landing-v0"
 REST = 0.4  # height of the paper's craft on the ground, m
@@ -62,10 +62,7 @@ def test_a_pad_on_a_line() -> None:
 
 def test_observation_by_hand() -> None:
     task = begun()
-    state = state_of(
-        position=(1.0, -1.0, 3.4), velocity=(1.0, 2.0, -3.0), body_rates=(0.1, 0.2, 0.3),
-        quaternion=about((1, 0, 0), 30.0), thrust=(49.0, 98.0, 0.0, 24.5),
-    )  # fmt: skip
+    state = state_of(**TABLES["landing: observation by hand, state"])
     seen = task.observe(state)["observation"]
     half = 0.5
     root = math.sqrt(3) / 2

@@ -47,11 +47,7 @@ def test_the_task_hangs_the_payload_itself(vehicle: str) -> None:
 
 def test_observation_by_hand() -> None:
     task = task_of(ID, goal=(1.0, 2.0, 6.0))
-    state = state_of(
-        position=(0.5, 2.0, 6.0), velocity=(1.0, 2.0, -3.0), body_rates=(0.1, 0.2, 0.3),
-        quaternion=about((1, 0, 0), 30.0), thrust=(49.0, 98.0, 0.0, 24.5),
-        payload=(0.1, 2.3, 5.2), payload_velocity=(1.5, 1.0, -3.0),
-    )  # fmt: skip
+    state = state_of(**TABLES["payload hover: observation by hand, state"])
     seen = task.observe(state)["observation"]
     half = 0.5
     root = math.sqrt(3) / 2

@@ -17,7 +17,7 @@ from rotorgram.models import Vehicle
 from rotorgram.models.errors import InputError
 from scipy.special import fresnel
 
-from flights import Shares, about, state_of, task_of
+from flights import Shares, state_of, task_of
 
 ID = "rotorgram/Recovery-v0"
 NOW = np.bool_(True)
@@ -105,24 +105,18 @@ def test_throws_fill_their_ranges(starts: Any) -> None:
 
 
 def test_observation_by_hand() -> None:
-    state = state_of(
-        position=(1.0, -2.0, 15.0), velocity=(1.0, 2.0, -3.0), body_rates=(0.1, 0.2, 0.3),
-        quaternion=about((0, 1, 0), 180.0), thrust=(49.0, 98.0, 0.0, 24.5),
-    )  # fmt: skip
+    state = state_of(**TABLES["recovery: observation by hand, state"])
     seen = begun(frame="world").observe(state)["observation"]
-    expected = [-1, 2, 5, 1, 2, -3, -1, 0, 0, 0, 0, -1, 0.1, 0.2, 0.3, 0, 1, -1, -0.5]
+    expected = TABLES["recovery: observation by hand, expected"]
     assert seen == pytest.approx(expected, abs=1e-12)
 
 
 def test_observation_in_the_body_frame_by_hand() -> None:
     """Turned left by 90° and then rolled by 90°, right side down: body x is world y, body y is
     world z, and body z is world x."""
-    state = state_of(
-        position=(1.0, -2.0, 15.0), velocity=(1.0, 2.0, -3.0), body_rates=(0.1, 0.2, 0.3),
-        quaternion=(0.5, 0.5, 0.5, 0.5), thrust=(49.0, 98.0, 0.0, 24.5),
-    )  # fmt: skip
+    state = state_of(**TABLES["recovery: observation in the body frame by hand, state"])
     seen = begun().observe(state)["observation"]
-    expected = [2, 5, -1, 2, -3, 1, 0, 1, 0, 0.1, 0.2, 0.3, 0, 1, -1, -0.5]
+    expected = TABLES["recovery: observation in the body frame by hand, expected"]
     assert seen == pytest.approx(expected, abs=1e-12)
     (spec,) = task_of(ID).observation
     assert spec.components[5:8] == ("velocity z", "up x", "up y")
@@ -178,10 +172,7 @@ def test_time_and_height_lost_by_hand() -> None:
         task.update_memory(state)
         metrics = task.outcome(state).metrics
         told.append([metrics[name] for name in ("recovered", "recovery_time", "height_lost")])
-    expected = [
-        (0, 0.02, 1.0), (0, 0.04, 3.5), (0, 0.06, 3.5), (1, 0.06, 3.5),
-        (0, 0.10, 3.5), (1, 0.10, 3.5), (1, 0.10, 3.5), (1, 0.10, 3.5),
-    ]  # fmt: skip
+    expected = TABLES["recovery: time and height lost by hand, expected"]
     np.testing.assert_allclose(told, expected, atol=1e-12)
     task.begin(NOW, Shares(*[0.5] * 7))
     metrics = task.outcome(state_of(**PLACE)).metrics

@@ -46,7 +46,7 @@ def test_observation_by_hand() -> None:
     task = begun(MIDDLE, EAST, ABOVE)  # at (0, 0, 5), to (3, 0, 5) and (3, 0, 6.5)
     state = state_of(position=(1.0, -1.0, 4.0), velocity=(1.0, 2.0, 3.0))
     seen = task.observe(state)["observation"]
-    expected = [2, 1, 1, 1, 2, 3, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 2, 1, 2.5]
+    expected = TABLES["waypoints: observation by hand, expected"]
     assert seen == pytest.approx(expected)
     (spec,) = task.observation
     assert spec.components[:3] == ("goal - position x", "goal - position y", "goal - position z")

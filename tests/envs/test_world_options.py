@@ -23,15 +23,7 @@ from rotorgram.udp.spawn import spawn_simulator
 RACER = Path(__file__).parents[1] / "data" / "racer.xml"
 ELEVATION = "rotorgram/Elevation-v0"
 HOVER = "rotorgram/Hover-v0"
-WORLD: dict[str, Any] = {
-    "effects": {"motor_lag": True, "body_drag": True, "wind": [0.5, 0.0, 0.0], "gusts": 2.0},
-    "randomize": {
-        "mass": "uniform(0.9, 1.1)",
-        "wind_y": "normal(0, 0.5)",
-        "action_delay": "choice(0, 1, 2)",
-        "observation_delay": 1,
-    },
-}
+WORLD: dict[str, Any] = TABLES["world options: WORLD"]
 
 
 def actions(steps: int, rotors: int = 4) -> np.ndarray:
