@@ -10,6 +10,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from cases import each
 from peers import ANY, Running
 from relay import FaultConfig, relaying
 from rotorgram.cli import main
@@ -229,50 +230,60 @@ def test_several_journals_are_one_data_set(tmp_path: Path) -> None:
     assert {f"telemetry.{name}" for name in spec.telemetry[-1].components} < {*read.column_names}
 
 
-def test_wrong_input_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    good, other, short = (tmp_path / f"{name}.mcap" for name in ("good", "other", "short"))
-    with recording(good, episode_length=4) as remote:
-        fly_one(remote, [1])
-    with recording(other, episode_length=5) as remote:
-        fly_one(remote, [1])
-    with recording(short, episode_length=5) as remote:
-        fly_one(remote, [1], most=2)
-    (text := tmp_path / "notes.mcap").write_text("no journal at all")
-    (cut := tmp_path / "cut.mcap").write_bytes(good.read_bytes()[:100])  # before its first chunk
-    (there := tmp_path / "there.parquet").write_bytes(b"mine")
+@pytest.fixture(scope="module")
+def journals(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of journals: whole, of other options, not to the end of an episode, and none."""
+    folder = tmp_path_factory.mktemp("journals")
+    for name, length, most in (("good", 4, 4), ("other", 5, 5), ("short", 5, 2)):
+        with recording(folder / f"{name}.mcap", episode_length=length) as remote:
+            fly_one(remote, [1], most)
+    (folder / "notes.mcap").write_text("no journal at all")
+    before_the_first_chunk = (folder / "good.mcap").read_bytes()[:100]
+    (folder / "cut.mcap").write_bytes(before_the_first_chunk)
+    return folder
+
+
+def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:
+    """The one line that a command answers."""
+    assert main(["dataset", *map(str, words)]) == 1
+    sentence = capsys.readouterr().err
+    assert sentence.count("\n") == 1
+    return sentence
+
+
+@each("names, sentence", "dataset")
+def test_wrong_journals_are_one_sentence(
+    journals: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    names: list[str],
+    sentence: str,
+) -> None:
     out = tmp_path / "new.parquet"
+    paths = [journals / name for name in names]
+    assert sentence in refused(capsys, *paths, "--to", "parquet", "--out", out)
+    assert not out.exists()
 
-    def told(*words: object) -> str:
-        assert main(["dataset", *map(str, words)]) == 1
-        sentence = capsys.readouterr().err
-        assert sentence.count("\n") == 1
-        assert not out.exists()
-        return sentence
 
-    def parquet(*paths: Path, out: Path = out) -> str:
-        return told(*paths, "--to", "parquet", "--out", out)
-
-    assert "at least one file, got none" in parquet()
-    assert "No such file" in parquet(tmp_path / "nowhere.mcap")
-    assert "expected an MCAP file" in parquet(text)
-    assert "expected a whole episode, got no step of a flight" in parquet(cut)
-    assert "expected journals of one env, all with the options" in parquet(good, other)
-    assert "expected each flight once" in parquet(good, good)
-    assert "expected a whole episode, got none of 1" in parquet(short)
-    assert f"expected the name of a new file, got {there}, which exists" in parquet(good, out=there)
+def test_a_wrong_place_is_one_sentence(
+    journals: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    there = tmp_path / "there.parquet"
+    there.write_bytes(b"mine")
+    words = (journals / "good.mcap", "--to", "parquet", "--out")
+    expected = f"expected the name of a new file, got {there}, which exists"
+    assert expected in refused(capsys, *words, there)
     assert there.read_bytes() == b"mine"
+    assert "a folder that exists" in refused(capsys, *words, tmp_path / "no" / "new.parquet")
     wrong = ("--to", "minari", "--out", "some/flight-v0", "--vehicle", "nobodys.toml")
-    assert "vehicle: cannot read nobodys.toml: No such file" in told(good, *wrong)
-    assert "a folder that exists" in parquet(good, out=tmp_path / "no" / "new.parquet")
+    expected = "vehicle: cannot read nobodys.toml: No such file"
+    assert expected in refused(capsys, journals / "good.mcap", *wrong)
 
 
-def test_a_write_that_fails_names_the_file_and_leaves_none(tmp_path: Path) -> None:
-    journal = tmp_path / "flight.mcap"
-    with recording(journal, episode_length=5) as remote:
-        fly_one(remote, [1])
+def test_a_write_that_fails_names_the_file_and_leaves_none(journals: Path, tmp_path: Path) -> None:
     out = tmp_path / "flight.parquet"
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    episodes = RecordedEpisodes([journal])
+    episodes = RecordedEpisodes([journals / "good.mcap"])
     resource.setrlimit(resource.RLIMIT_FSIZE, (100, limits[1]))  # bytes, of any file
     try:
         with pytest.raises(OSError, match="too large") as error:
@@ -284,13 +295,11 @@ def test_a_write_that_fails_names_the_file_and_leaves_none(tmp_path: Path) -> No
 
 
 @pytest.mark.usefixtures("minari")
-def test_minari_needs_an_id_that_is_new(tmp_path: Path) -> None:
-    path = tmp_path / "flight.mcap"
-    with recording(path, episode_length=4) as remote:
-        fly_one(remote, [1])
+def test_minari_needs_an_id_that_is_new(journals: Path) -> None:
+    paths = [journals / "good.mcap"]
     for wrong in ("../flight-v0", "a/flight-v0", "flight", "rotorgram/flight-v"):
         with pytest.raises(InputError, match="out: expected an id of Minari"):
-            write_minari(RecordedEpisodes([path]), wrong)
-    write_minari(RecordedEpisodes([path]), "flight-v0")
+            write_minari(RecordedEpisodes(paths), wrong)
+    write_minari(RecordedEpisodes(paths), "flight-v0")
     with pytest.raises(InputError, match="out: expected the id of a new data set"):
-        write_minari(RecordedEpisodes([path]), "flight-v0")
+        write_minari(RecordedEpisodes(paths), "flight-v0")

@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 from rotorgram.flights.executors import (
-    OnProgress,
     RunsFailed,
     Tell,
     WorkersConfig,
@@ -36,41 +35,41 @@ def is_killed(job: int, tell: Tell) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def do(config: WorkersConfig, function: Any, jobs: dict[str, int], shown: list[Any]) -> list[Any]:
-    results: list[Any] = []
-    on_progress: OnProgress = lambda *item: shown.append(item)  # noqa: E731
-    with open_executor(config, len(jobs), on_progress) as executor:
-        keep = lambda job, value: results.append((job, value))  # noqa: E731
-        run_jobs(executor, function, jobs, keep, on_progress)
-        deadline = time.monotonic() + 5
-        while ("four", 4, 10, "halved") not in shown and time.monotonic() < deadline:
-            time.sleep(0.01)
-    return sorted(results)
+def silent(*_: object) -> None:
+    """Progress that nobody shows, results that nobody keeps."""
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_results_come_with_their_jobs_and_progress_is_reported(jobs: int) -> None:
     shown: list[Any] = []
+    kept: dict[int, float] = {}
     given = {"two": 2, "four": 4, "eight": 8}
-    assert do(WorkersConfig(jobs=jobs), half, given, shown) == [(2, 1.0), (4, 2.0), (8, 4.0)]
+
+    def on_progress(*item: Any) -> None:
+        shown.append(item)
+
+    with open_executor(WorkersConfig(jobs=jobs), len(given), on_progress) as executor:
+        run_jobs(executor, half, given, kept.__setitem__, on_progress)
+        deadline = time.monotonic() + 5
+        while ("four", 4, 10, "halved") not in shown and time.monotonic() < deadline:
+            time.sleep(0.01)
+    assert kept == {2: 1.0, 4: 2.0, 8: 4.0}
     assert ("four", 4, 10, "halved") in shown
     assert {("two", 1, 1, "done"), ("all runs", 0, 3, ""), ("all runs", 3, 3, "")} <= set(shown)
 
 
 def test_a_job_that_fails_is_a_sentence_and_the_others_are_kept() -> None:
-    kept: list[int] = []
-    keep = lambda job, value: kept.append(job)  # noqa: E731
+    kept: dict[int, float] = {}
     sentence = pytest.raises(RunsFailed, match=r"^1 of 3 runs failed: c: ValueError: 3 is odd$")
     with open_executor(WorkersConfig(jobs=1), 3) as executor, sentence:
-        run_jobs(executor, half, {"a": 2, "c": 3, "b": 4}, keep, lambda *_: None)
-    assert kept == [2, 4]
+        run_jobs(executor, half, {"a": 2, "c": 3, "b": 4}, kept.__setitem__, silent)
+    assert kept == {2: 1.0, 4: 2.0}
 
 
 def test_a_worker_that_is_killed_is_one_sentence() -> None:
     sentence = pytest.raises(RunsFailed, match=r"^a worker was killed, .* before is kept$")
     with open_executor(WorkersConfig(jobs=2), 2) as executor, sentence:
-        keep = lambda *_: None  # noqa: E731
-        run_jobs(executor, is_killed, {"one": 1, "two": 2}, keep, lambda *_: None)
+        run_jobs(executor, is_killed, {"one": 1, "two": 2}, silent, silent)
 
 
 def test_no_file_of_the_working_directory_is_run(
@@ -79,12 +78,11 @@ def test_no_file_of_the_working_directory_is_run(
     (tmp_path / "queue.py").write_text("raise SystemExit('foreign code')")
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
-    found: list[str] = []
+    found: dict[int, str] = {}
     with open_executor(WorkersConfig(jobs=2), 2) as executor:
-        keep = lambda job, value: found.append(value)  # noqa: E731
-        run_jobs(executor, name_of_queue, {"one": 1, "two": 2}, keep, lambda *_: None)
+        run_jobs(executor, name_of_queue, {"one": 1, "two": 2}, found.__setitem__, silent)
     assert len(found) == 2
-    assert not any(str(tmp_path) in file for file in found)
+    assert not any(str(tmp_path) in file for file in found.values())
     assert "PYTHONSAFEPATH" not in os.environ
 
 
