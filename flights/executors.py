@@ -87,7 +87,7 @@ def run_jobs(
     Raises:
         RunsFailed: At the end, if jobs failed; at once, if a worker was killed.
     """
-    failures: list[str] = []
+    failures = []
     on_progress("all runs", 0, len(jobs), "")
     for number, result in enumerate(_results(executor, function, jobs), 1):
         if result.failure:

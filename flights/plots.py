@@ -176,8 +176,10 @@ def _draw_panel(
             (line,) = axes.plot(flight.times, values, style, color=own, linewidth=1.2)
             if len(panel.components) > 1:
                 keys.setdefault(signal.components[component], line)
-        if flight.ending == "terminated":
-            _mark_end(axes, flight, signal, panel.components, color)
+        if flight.terminated:  # a cross
+            ends = signal.values[-1, list(panel.components)]
+            for end in ends:
+                axes.plot(flight.times[-1], end, "x", color=color, markersize=6)
         if panel.signal == "position":
             for other, style in _ON_POSITION.items():
                 if other in signals[name]:
@@ -192,11 +194,3 @@ def _draw_panel(
     if keys:
         ncols = len(keys) if panel.wide else 1
         axes.legend(keys.values(), keys.keys(), loc="best", ncols=ncols, fontsize=8)
-
-
-def _mark_end(
-    axes: "Axes", flight: Trajectory, signal: Signal, components: Sequence[int], color: str
-) -> None:
-    """A cross where a flight was terminated, by a crash or the like."""
-    for component in components:
-        axes.plot(flight.times[-1], signal.values[-1, component], "x", color=color, markersize=6)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..envs.spec import ArraySpec
 from ..models.errors import InputError
 from ..udp.journal.reader import Recording, Session
-from ..udp.journal.walker import Transition, Walker
+from ..udp.journal.walker import Walker
 from ..udp.protocol.messages import State
 from .trajectories import Ending, Trajectory
 
@@ -119,20 +119,12 @@ class _SessionReader:
     def take(self, message: object) -> Iterator[Trajectory]:
         """The next message of the session: the episodes that it ends, one after the other."""
         transition = self._walker.take(message)
-        if transition is not None:
-            yield from self._follow(transition)
-
-    def finish(self) -> Iterator[Trajectory]:
-        """The episodes that the journal's end cuts off."""
-        for drone in range(len(self._rows)):
-            yield from self._end(drone, "cut off")
-
-    def _follow(self, transition: Transition) -> Iterator[Trajectory]:
+        if transition is None:
+            return
         state = transition.state
         command = transition.command
         if transition.is_gap:
             yield from self.finish()
-            return
         for drone in np.flatnonzero(transition.flown & self._chosen).tolist():
             if command is None or not self._rows[drone]:
                 continue  # its episode has ended
@@ -141,18 +133,17 @@ class _SessionReader:
                 yield from self._end(drone, "terminated")
             elif state.truncated[drone]:
                 yield from self._end(drone, "truncated")
-        if transition.resets.any():
-            seeds = None if transition.seeds is None else transition.seeds.tolist()
-            yield from self._begin(state, transition.resets, seeds)
-
-    def _begin(
-        self, state: State, drones: NDArray[np.bool_], seeds: list[int] | None
-    ) -> Iterator[Trajectory]:
-        for drone in np.flatnonzero(drones & self._chosen).tolist():
+        for drone in np.flatnonzero(transition.resets & self._chosen).tolist():
             yield from self._end(drone, "cut off")
             self._rows[drone] = [self._row(state, drone, None)]
             first = drone - drone % self._drones  # the first drone's seed counts for its world
-            self._seeds[drone] = None if seeds is None else seeds[first]
+            seeds = transition.seeds
+            self._seeds[drone] = None if seeds is None else int(seeds[first])
+
+    def finish(self) -> Iterator[Trajectory]:
+        """The episodes that the journal's end cuts off."""
+        for drone in range(len(self._rows)):
+            yield from self._end(drone, "cut off")
 
     def _row(self, state: State, drone: int, action: Array | None) -> _Row:
         observations = state.observations if self._observations else ()

@@ -106,18 +106,17 @@ class Trajectory:
     @property
     def headline(self) -> Floats:
         """The headline metric, shape (T + 1,); nan where the env names none."""
-        return self._rows("metrics" if self.spec.headline else "")[:, 0]
+        if self.spec.headline is None:
+            return np.full(len(self) + 1, np.nan)
+        return self.telemetry["metrics"][:, 0]
 
     @property
     def mean_thrust(self) -> Floats:
         """Mean over the rotors, N, shape (T + 1,); nan without telemetry of thrust."""
-        mean: Floats = self._rows("thrust").mean(axis=1)
+        if "thrust" not in self.telemetry:
+            return np.full(len(self) + 1, np.nan)
+        mean: Floats = self.telemetry["thrust"].mean(axis=1)
         return mean
-
-    def _rows(self, name: str) -> Floats:
-        """Telemetry, shape (T + 1, n); a column of nan where there is none of that name."""
-        array = self.telemetry.get(name, np.full(len(self) + 1, np.nan))
-        return np.asarray(array).reshape(len(self) + 1, -1)
 
     def step_at(self, seconds: float) -> int:
         """Number of the row at that time; the last, from its end on."""
