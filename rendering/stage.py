@@ -219,10 +219,11 @@ class Stage:
             raise InputError(f"moments: expected {self.drones}, got {len(moments)}")
         craft = self.vehicle
         rotors = len(moments[0].thrusts)
-        expected = f"a file with {rotors} rotors, as in the flight"
-        got = f"{craft.path.name} with {craft.num_rotors}"
         if rotors != craft.num_rotors:
-            raise InputError(f"vehicle: expected {expected}, got {got}")
+            raise InputError(
+                f"vehicle: expected a file with {rotors} rotors, as in the flight, "
+                f"got {craft.path.name} with {craft.num_rotors}"
+            )
         before = self.moments or moments
         self.moments = moments
         goals = self._places("goal")
@@ -282,33 +283,34 @@ class Stage:
 
     def decorate(self, scene: mujoco.MjvScene, *, goals: bool = True) -> None:
         """Add marks, payloads and fading paths to a scene, and discs at the goals if wanted."""
+        marked = any(moment.marks for moment in self.moments)
         drawn: set[Mark] = set()  # those of a world that all its drones tell
-        places = self._places("goal")
-        for moment, goal, offset in zip(self.moments, places, self._offsets, strict=False):
+        labels = self.names if 1 < len(self.names) <= MAX_NAMES else ()
+        goals_at = self._places("goal")
+        payloads = self._places("payload")
+        for drone, moment in enumerate(self.moments):
+            here = self._points[drone]
+            goal = goals_at[drone]
+            payload = payloads[drone]
             for mark in moment.marks:
                 if mark.moves or not self.names or mark not in drawn:
                     drawn.add(mark)
-                    _draw_mark(scene, mark, offset, goal)
-        for payload, here in zip(self._places("payload"), self._points, strict=False):
+                    _draw_mark(scene, mark, self._offsets[drone], goal)
             if payload is not None:
                 size = (0.12 * self.radius,) * 3
                 _decorate(scene, mujoco.mjtGeom.mjGEOM_SPHERE, size, payload, _PAYLOAD)
                 _connect(scene, _CAPSULE, 0.012 * self.radius, here, payload, _CABLE)
-        marked = any(moment.marks for moment in self.moments)
-        if 1 < len(self.names) <= MAX_NAMES:
-            for name, here in zip(self.names, self._points, strict=True):
+            if labels:
                 above = here + np.array((0.0, 0.0, 0.9 * self.radius))
                 label = _decorate(scene, mujoco.mjtGeom.mjGEOM_LABEL, (0.1,) * 3, above, _CABLE)
                 if label is not None:
-                    label.label = f"{name}   "  # without the spaces its end would be cut off
-        lines = zip(self._paths, places, self._points, strict=False)
-        for drone, (path, goal, here) in enumerate(lines):
+                    label.label = f"{labels[drone]}   "  # without the spaces its end is cut off
             color = DRONE_COLORS[drone % len(DRONE_COLORS)] if self.names else _PATH
             if goals and goal is not None and not marked:
                 size = (0.93 * self.radius, 0.0033 * self.radius, 0.0)  # radius, half of its height
                 own = color if len(self.names) > 1 else _GREEN
-                disc = (*own, 0.3)
-                _decorate(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, size, goal, disc)
+                _decorate(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, size, goal, (*own, 0.3))
+            path = self._paths[drone]
             for number, (start, end) in enumerate(pairwise([*path, here]), 1):
                 if not np.array_equal(start, end):
                     rgba = (*color, 0.85 * number / len(path))

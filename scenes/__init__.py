@@ -3,6 +3,7 @@
 Pictures show them; physics does not know them. Importing this package does not import MuJoCo.
 """
 
+import re
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -30,15 +31,15 @@ MAX_SEEDS: Final = 64
 
 def parse_scene(text: str) -> tuple[str, int]:
     """Name and seed of a scene: NAME, or NAME:SEED of one with a seed. Raises `InputError`."""
-    name, colon, number = text.partition(":") if isinstance(text, str) else ("", "", "")
-    is_seed = number.isascii() and number.isdecimal() and len(number) < 10
-    if name not in SCENES or (colon and not (name in SEEDED_SCENES and is_seed)):
+    found = re.fullmatch(r"(\w+)(:[0-9]{1,9})?", str(text))
+    name, seed = found.groups() if found else ("", None)
+    if name not in SCENES or (seed and name not in SEEDED_SCENES):
         names = " or ".join(map(repr, SCENES))
         raise InputError(
             f"scene: expected {names}, the last three with a seed or not, as 'forest:3', "
             f"got {shortened(text)}"
         )
-    return name, int(number or 0)
+    return name, int(seed[1:]) if seed else 0
 
 
 def scenes_of(text: str) -> tuple[str, ...]:
@@ -46,23 +47,19 @@ def scenes_of(text: str) -> tuple[str, ...]:
 
     Raises `InputError`.
     """
-    name, _, numbers = text.partition(":") if isinstance(text, str) else (text, "", "")
-    first, dash, last = numbers.partition("-")
-    if not dash:
+    if "-" not in str(text):
         parse_scene(text)
         return (text,)
-    try:
-        low, high = (parse_scene(f"{name}:{end}")[1] for end in (first, last))
-    except InputError:
-        low = 0
-        high = -1
-    if not 0 <= high - low < MAX_SEEDS:
+    found = re.fullmatch(r"(\w+):([0-9]{1,9})-([0-9]{1,9})", text)
+    name, first, last = found.groups() if found else ("", 0, 0)
+    seeds = range(int(first), int(last) + 1)
+    if name not in SEEDED_SCENES or not 1 <= len(seeds) <= MAX_SEEDS:
         names = ", ".join(map(repr, SEEDED_SCENES))
         raise InputError(
             f"scene: expected one of {names} with up to {MAX_SEEDS} seeds, as 'forest:0-7', "
             f"got {shortened(text)}"
         )
-    return tuple(f"{name}:{seed}" for seed in range(low, high + 1))
+    return tuple(f"{name}:{seed}" for seed in seeds)
 
 
 def __getattr__(name: str) -> object:
