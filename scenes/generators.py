@@ -4,8 +4,10 @@ World frame: z up, m. A generator draws all numbers of a scene from one stream, 
 """
 
 import math
-from collections.abc import Callable, Sequence
-from typing import Final, Literal
+import tomllib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Final, Literal
 
 import mujoco
 import numpy as np
@@ -19,13 +21,15 @@ GROUP: Final = 2
 """Group of the geoms of a scene."""
 SKY: Final = mujoco.mjtTexture.mjTEXTURE_SKYBOX
 
+MATERIALS: Final[Mapping[str, Mapping[str, Mapping[str, Any]]]] = tomllib.loads(
+    Path(__file__).with_name("materials.toml").read_text("utf-8")
+)
 _FOREST: Final = 60.0  # m: half the width of the wood
 _LENGTH, _WIDTH, _HEIGHT = 30.0, 20.0, 24.0  # m: half length, half width and height of the hall
 _GATES: Final = 8
 _OPENING: Final = 5.0  # m: the paper's craft is 2.8 m wide with its rotors
 
 Kind = Literal["plane", "box", "cylinder", "ellipsoid"]
-Pattern = Literal["", "checker", "edge", "random"]
 
 _KINDS: Final = {
     "plane": mujoco.mjtGeom.mjGEOM_PLANE,
@@ -53,8 +57,10 @@ class Builder:
     def uniform(self, low: float, high: float) -> float:
         return float(self.rng.uniform(low, high))
 
-    def choose(self, words: Sequence[str]) -> str:
-        return words[int(self.rng.integers(len(words)))]
+    def choose(self, name: str) -> str:
+        """One of the materials of several colours."""
+        count = len(MATERIALS[self.scene][name]["colours"])
+        return f"{name}_{self.rng.integers(count)}"
 
     def colour(self, base: Vector, by: float = 0.06) -> np.ndarray:
         """A colour near `base`."""
@@ -67,34 +73,32 @@ class Builder:
             if max(abs(x), abs(y)) > CLEARANCE + reach:
                 return x, y
 
-    def material(
-        self,
-        name: str,
-        colour: Vector,
-        pattern: Pattern = "",
-        repeat: float = 0.5,
-        by: float = 0.06,
-        gloss: float = 0.0,
-    ) -> str:
-        """The name of a new material of a colour near another one. Its pattern has so many
-        repetitions per metre.
-        """
-        first = self.colour(colour, by)
-        whole = f"{self.scene}/{name}"
-        material = self.spec.add_material(name=whole, specular=gloss)
-        if not pattern:
-            material.rgba = (*first, 1.0)
-            return name
-        second = first * self.rng.uniform(0.82, 0.94)
-        builtin, mark = _PATTERNS[pattern]
+    def paint(self) -> None:
+        """Add the materials of the scene, in colours near those of the table."""
+        for name, look in MATERIALS[self.scene].items():
+            colours = look["colours"]
+            for number, base in enumerate(colours):
+                colour = self.colour(base, look.get("by", 0.06))
+                own = f"{self.scene}/{name}" + (f"_{number}" if len(colours) > 1 else "")
+                material = self.spec.add_material(name=own, specular=look.get("gloss", 0.0))
+                if "pattern" in look:
+                    self._add_pattern(material, colour, look)
+                else:
+                    material.rgba = (*colour, 1.0)
+
+    def _add_pattern(
+        self, material: mujoco.MjsMaterial, colour: np.ndarray, look: Mapping[str, Any]
+    ) -> None:
+        second = colour * self.rng.uniform(0.82, 0.94)
+        repeat = look.get("repeat", 0.5)
+        builtin, mark = _PATTERNS[look["pattern"]]
         self.spec.add_texture(
-            name=whole, type=mujoco.mjtTexture.mjTEXTURE_2D, width=128, height=128,
-            builtin=builtin, rgb1=first, rgb2=second, markrgb=second, random=0.2, mark=mark,
+            name=material.name, type=mujoco.mjtTexture.mjTEXTURE_2D, width=128, height=128,
+            builtin=builtin, rgb1=colour, rgb2=second, markrgb=second, random=0.2, mark=mark,
         )  # fmt: skip
-        material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = whole
+        material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = material.name
         material.texuniform = True
         material.texrepeat = (repeat, repeat)
-        return name
 
     def add(
         self,
@@ -144,18 +148,14 @@ class Builder:
 def forest(wood: Builder) -> None:
     """A wood of 120 m by 120 m: trees, shrubs and rocks."""
     wood.sun()
-    ground = wood.material("ground", (0.36, 0.42, 0.22), "random", 0.1)
-    bark = [wood.material(f"bark_{i}", (0.36, 0.26, 0.17), "random") for i in range(2)]
-    greens = (0.15, 0.33, 0.16), (0.26, 0.43, 0.15), (0.40, 0.47, 0.16), (0.30, 0.38, 0.20)
-    leaves = [wood.material(f"leaves_{i}", green, "random", 0.7) for i, green in enumerate(greens)]
-    stone = wood.material("stone", (0.48, 0.47, 0.45), "random", 0.6)
-    wood.add("ground/floor", "plane", (150, 150, 1), (0, 0, 0), ground)
+    wood.paint()
+    wood.add("ground/floor", "plane", (150, 150, 1), (0, 0, 0), "ground")
     for i in range(110):
-        _add_tree(wood, f"tree_{i}", bark, leaves)
+        _add_tree(wood, f"tree_{i}")
     for i in range(60):
         wide = wood.uniform(0.4, 1.2)
         x, y = wood.around(wide, _FOREST)
-        leaf = wood.choose(leaves)
+        leaf = wood.choose("leaves")
         size = (wide, wide, 0.7 * wide)
         position = (x, y, 0.4 * wide)
         wood.add(f"shrub_{i}/crown", "ellipsoid", size, position, leaf)
@@ -163,17 +163,17 @@ def forest(wood: Builder) -> None:
         sides = wood.rng.uniform(0.3, 1.0, 3)
         x, y = wood.around(1.0, _FOREST)
         turn = (0.0, 0.0, wood.uniform(0, math.pi))
-        wood.add(f"rock_{i}/stone", "ellipsoid", sides, (x, y, 0.2 * sides[2]), stone, turn)
+        wood.add(f"rock_{i}/stone", "ellipsoid", sides, (x, y, 0.2 * sides[2]), "stone", turn)
 
 
-def _add_tree(wood: Builder, name: str, bark: Sequence[str], leaves: Sequence[str]) -> None:
+def _add_tree(wood: Builder, name: str) -> None:
     x, y = wood.around(3.2, _FOREST)
     tall = wood.uniform(6.0, 15.0)
     wide = wood.uniform(1.4, 3.0)
     kind = int(wood.rng.integers(3))
-    leaf = wood.choose(leaves)
+    leaf = wood.choose("leaves")
     trunk = (0.13 + 0.012 * tall, 0.3 * tall, 0)
-    wood.add(f"{name}/trunk", "cylinder", trunk, (x, y, 0.3 * tall), bark[kind % 2])
+    wood.add(f"{name}/trunk", "cylinder", trunk, (x, y, 0.3 * tall), f"bark_{kind % 2}")
     if kind == 0:  # a fir: three storeys, each narrower
         for storey, (height, width) in enumerate(((0.40, 1.0), (0.62, 0.72), (0.84, 0.42))):
             size = (wide * width, wide * width, 0.18 * tall)
@@ -191,98 +191,84 @@ def _add_tree(wood: Builder, name: str, bark: Sequence[str], leaves: Sequence[st
 def warehouse(hall: Builder) -> None:
     """A hall of 60 m by 40 m, 24 m high. Racks, pallets and barrels stand along its walls."""
     hall.sky(hall.colour((0.55, 0.60, 0.66)), hall.colour((0.62, 0.64, 0.66)))
-    floor = hall.material("floor", (0.55, 0.55, 0.53), "checker", 0.25)
-    wall = hall.material("wall", (0.72, 0.72, 0.70), "edge", 0.3, by=0.03)
-    roof = hall.material("roof", (0.50, 0.52, 0.55), "edge", 0.2)
-    steel = hall.material("steel", (0.20, 0.34, 0.62), by=0.15, gloss=0.2)
-    pallet = hall.material("pallet", (0.62, 0.48, 0.30), "random")
-    glass = hall.material("glass", (0.70, 0.84, 0.93), "edge", 0.5)
-    hall.spec.add_material(
-        name="warehouse/lamp", rgba=(1.0, 0.98, 0.90, 1.0), specular=0.0, emission=0.9
-    )
-    tints = (0.72, 0.53, 0.33), (0.62, 0.44, 0.27), (0.25, 0.45, 0.66), (0.72, 0.24, 0.20)
-    boxes = [hall.material(f"box_{i}", tint, "edge", 1.0, by=0.1) for i, tint in enumerate(tints)]
-    hall.add("ground/floor", "plane", (_LENGTH, _WIDTH, 1), (0, 0, 0), floor)
-    _add_hall(hall, wall, roof, steel, glass)
+    hall.paint()
+    lamp = hall.spec.add_material(name="warehouse/lamp", specular=0.0, emission=0.9)
+    lamp.rgba = (1.0, 0.98, 0.90, 1.0)
+    hall.add("ground/floor", "plane", (_LENGTH, _WIDTH, 1), (0, 0, 0), "floor")
+    _add_hall(hall)
     for i, x in enumerate((-15.0, 15.0)):
         bright = hall.uniform(0.28, 0.42)
         direction = (-x / 30, hall.uniform(-0.4, 0.4), -1.0)
         hall.light(f"light_{i}", (x, 0.0, 22.0), direction, (bright,) * 3, 0.15)
     racks = [(x, y) for y in (-16.5, -11.0, 11.0, 16.5) for x in (-20.0, -7.0, 7.0, 20.0)]
     for i, (x, y) in enumerate(racks):
-        _add_rack(hall, f"rack_{i}", x, y, steel, boxes)
+        _add_rack(hall, f"rack_{i}", x, y)
     for i in range(20):
-        _add_goods(hall, i, pallet, boxes)
+        _add_goods(hall, i)
 
 
-def _add_hall(hall: Builder, wall: str, roof: str, steel: str, glass: str) -> None:
+def _add_hall(hall: Builder) -> None:
     """Walls with windows, and a roof with lamps."""
     middle = _HEIGHT / 2
     right = math.pi / 2
-    hall.add("roof/sheet", "plane", (_LENGTH, _WIDTH, 1), (0, 0, _HEIGHT), roof, (math.pi, 0, 0))
+    hall.add("roof/sheet", "plane", (_LENGTH, _WIDTH, 1), (0, 0, _HEIGHT), "roof", (math.pi, 0, 0))
     for name, sign in (("west", -1), ("east", 1)):
         position = (sign * _LENGTH, 0, middle)
         turn = (0.0, -sign * right, 0.0)
-        hall.add(f"wall_{name}/sheet", "plane", (middle, _WIDTH, 1), position, wall, turn)
+        hall.add(f"wall_{name}/sheet", "plane", (middle, _WIDTH, 1), position, "wall", turn)
     for name, sign in (("south", -1), ("north", 1)):
         place = (0, sign * _WIDTH, middle)
         turn = (sign * right, 0.0, 0.0)
-        hall.add(f"wall_{name}/sheet", "plane", (_LENGTH, middle, 1), place, wall, turn)
+        hall.add(f"wall_{name}/sheet", "plane", (_LENGTH, middle, 1), place, "wall", turn)
         for i, x in enumerate(np.linspace(-24.0, 24.0, 7)):
             window = (x, sign * (_WIDTH - 0.05), 19.0)
-            hall.add(f"wall_{name}/window_{i}", "box", (2.5, 0.04, 1.6), window, glass)
+            hall.add(f"wall_{name}/window_{i}", "box", (2.5, 0.04, 1.6), window, "glass")
     for i, x in enumerate(np.linspace(-25.0, 25.0, 6)):
-        hall.add(f"truss_{i}/beam", "box", (0.15, _WIDTH, 0.3), (x, 0, 23.4), steel)
+        hall.add(f"truss_{i}/beam", "box", (0.15, _WIDTH, 0.3), (x, 0, 23.4), "steel")
         for j, y in enumerate((-11.0, 0.0, 11.0)):
             hall.add(f"lamp_{3 * i + j}/tube", "box", (0.2, 1.2, 0.08), (x, y, 22.9), "lamp")
 
 
-def _add_rack(
-    hall: Builder, name: str, x: float, y: float, steel: str, boxes: Sequence[str]
-) -> None:
+def _add_rack(hall: Builder, name: str, x: float, y: float) -> None:
     for j, (dx, dy) in enumerate(((-4.0, -0.6), (-4.0, 0.6), (4.0, -0.6), (4.0, 0.6))):
-        hall.add(f"{name}/post_{j}", "box", (0.07, 0.07, 3.6), (x + dx, y + dy, 3.6), steel)
+        hall.add(f"{name}/post_{j}", "box", (0.07, 0.07, 3.6), (x + dx, y + dy, 3.6), "steel")
     for level in range(3):
         deck = 0.3 + 2.3 * level
-        hall.add(f"{name}/shelf_{level}", "box", (4.0, 0.7, 0.05), (x, y, deck), steel)
+        hall.add(f"{name}/shelf_{level}", "box", (4.0, 0.7, 0.05), (x, y, deck), "steel")
         for slot, dx in enumerate((-3.0, -1.0, 1.0, 3.0)):
             half = hall.rng.uniform((0.5, 0.4, 0.4), (0.9, 0.6, 0.9))
-            tint = hall.choose(boxes)
+            tint = hall.choose("box")
             if hall.rng.random() < 0.85:  # else the slot is empty
                 position = (x + dx, y, deck + 0.06 + half[2])
                 hall.add(f"{name}/box_{4 * level + slot}", "box", half, position, tint)
 
 
-def _add_goods(hall: Builder, number: int, pallet: str, boxes: Sequence[str]) -> None:
+def _add_goods(hall: Builder, number: int) -> None:
     """A barrel, or a box on a pallet; the first six stand in the middle."""
     if number < 6:
         x, y = hall.around(1.0, _WIDTH - 6.5)
     else:
         x = hall.uniform(-28, 28)
         y = float(hall.rng.choice((-13.7, 13.7))) + hall.uniform(-0.3, 0.3)
-    tint = hall.choose(boxes)
+    tint = hall.choose("box")
     if number % 2:
         hall.add(f"barrel_{number}/drum", "cylinder", (0.4, 0.6, 0), (x, y, 0.6), tint)
         return
     half = hall.rng.uniform((0.3, 0.3, 0.2), (0.6, 0.6, 0.6))
-    hall.add(f"pallet_{number}/deck", "box", (0.6, 0.6, 0.07), (x, y, 0.08), pallet)
+    hall.add(f"pallet_{number}/deck", "box", (0.6, 0.6, 0.07), (x, y, 0.08), "pallet")
     hall.add(f"pallet_{number}/box", "box", half, (x, y, 0.16 + half[2]), tint)
 
 
 def gates(track: Builder) -> None:
     """A ring of 8 gates, 5 m wide inside, with barriers, cones and stands around it."""
     track.sun()
-    grass = track.material("grass", (0.36, 0.50, 0.26), "checker", 0.08)
-    steel = track.material("steel", (0.30, 0.31, 0.33), gloss=0.2)
-    stand = track.material("stand", (0.60, 0.61, 0.63), "edge", 0.5)
-    tints = (0.90, 0.30, 0.10), (0.10, 0.42, 0.80), (0.92, 0.80, 0.12), (0.75, 0.12, 0.45)
-    paint = [track.material(f"paint_{i}", tint, "checker", 1.0) for i, tint in enumerate(tints)]
-    track.add("ground/floor", "plane", (150, 150, 1), (0, 0, 0), grass)
+    track.paint()
+    track.add("ground/floor", "plane", (150, 150, 1), (0, 0, 0), "grass")
     for i in range(_GATES):
-        _add_gate(track, i, paint, steel)
+        _add_gate(track, i)
     for i in range(40):
         x, y = track.around(1.5, 40.0)
-        tint = track.choose(paint)
+        tint = track.choose("paint")
         turn = (0.0, 0.0, track.uniform(0, math.pi))
         if i % 2:
             track.add(f"barrier_{i}/block", "box", (1.2, 0.25, 0.45), (x, y, 0.45), tint, turn)
@@ -297,17 +283,17 @@ def gates(track: Builder) -> None:
             position = (distance * math.cos(angle), distance * math.sin(angle), height)
             size = (0.75, 9.0, height)
             turn = (0.0, 0.0, angle)
-            track.add(f"stand_{i}/row_{row}", "box", size, position, stand, turn)
+            track.add(f"stand_{i}/row_{row}", "box", size, position, "stand", turn)
 
 
-def _add_gate(track: Builder, number: int, paint: Sequence[str], steel: str) -> None:
+def _add_gate(track: Builder, number: int) -> None:
     half = _OPENING / 2
     bar = 0.25
     angle = 2 * math.pi * number / _GATES + track.uniform(-0.15, 0.15)
     radius = track.uniform(15.0, 20.0)
     height = track.uniform(5.0, 12.0)
     heading = angle + math.pi / 2 + track.uniform(-0.3, 0.3)  # anticlockwise round the ring
-    tint = track.choose(paint)
+    tint = track.choose("paint")
     turn = (0.0, 0.0, heading)
     x = radius * math.cos(angle)
     y = radius * math.sin(angle)
@@ -321,7 +307,7 @@ def _add_gate(track: Builder, number: int, paint: Sequence[str], steel: str) -> 
         track.add(name, "box", size, (side_x, side_y, height), tint, turn)
         name = f"gate_{number}/post_{part}"
         size = (0.1, foot, 0)
-        track.add(name, "cylinder", size, (side_x, side_y, foot), steel)
+        track.add(name, "cylinder", size, (side_x, side_y, foot), "steel")
     for part, sign in (("top", 1), ("bottom", -1)):
         position = (x, y, height + sign * (half + bar))
         track.add(f"gate_{number}/frame_{part}", "box", (0.15, half, bar), position, tint, turn)
