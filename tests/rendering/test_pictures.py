@@ -65,24 +65,37 @@ def test_the_craft_is_in_the_midst_of_the_picture_and_as_large_as_it_should_be(
 def test_onboard_sees_the_front_rotors_to_both_sides(stage: Stage, canvas: Canvas) -> None:
     stage.show(at(5.0))
     seen = craft_in(canvas, "onboard")
-    red, _, blue = np.moveaxis(canvas.draw("onboard").astype(int), 2, 0)
-    orange = seen & (red > blue + 40)  # the front rotors' colour
-    halves = orange[:, : WIDTH // 2].sum(), orange[:, WIDTH // 2 :].sum()
-    assert min(halves) > 0.01 * WIDTH * HEIGHT
-    assert halves[0] == pytest.approx(halves[1], rel=0.4)  # the blades are turned differently
+    orange = seen & orange_in(canvas.draw("onboard"))  # the front rotors' colour
+    left = orange[:, : WIDTH // 2].sum()
+    right = orange[:, WIDTH // 2 :].sum()
+    assert min(left, right) > 0.01 * WIDTH * HEIGHT
+    assert left == pytest.approx(right, rel=0.4)  # the blades are turned differently
     assert not orange[: HEIGHT // 4].any()
 
 
 def test_the_horizon_is_where_the_pitch_of_the_camera_puts_it(stage: Stage, canvas: Canvas) -> None:
     stage.show(at(5.0))
     for camera in ("chase", "side"):
-        down = math.radians(-stage.camera(camera).elevation)
-        focal = HEIGHT / 2 / math.tan(math.radians(stage.model.vis.global_.fovy) / 2)
+        view = stage.camera(camera)
+        down = math.radians(-view.elevation)
+        focal = pixels_per_metre(stage, camera) * view.distance
         row = HEIGHT / 2 - focal * math.tan(down)
         picture = canvas.draw(camera).astype(int)
         # The floor's checks begin there: above it a row has one colour.
-        lively = np.nonzero(np.ptp(picture[:, :40], axis=1).max(axis=1) > 12)[0]
+        spread = np.ptp(picture[:, :40], axis=1).max(axis=1)
+        lively = np.flatnonzero(spread > 12)
         assert lively.min() == pytest.approx(row, abs=9), camera
+
+
+def mean_row(mask: np.ndarray) -> float:
+    rows, _ = np.nonzero(mask)
+    return float(rows.mean())
+
+
+def orange_in(picture: np.ndarray) -> np.ndarray:
+    red, _, blue = np.moveaxis(picture.astype(int), 2, 0)
+    orange: np.ndarray = red > blue + 40
+    return orange
 
 
 def green_in(picture: np.ndarray) -> np.ndarray:
@@ -106,7 +119,8 @@ def test_a_craft_3_m_from_its_goal_is_in_the_picture(
 def test_cameras_that_stand_still_stay_above_the_ground(camera: Camera, stage: Stage) -> None:
     stage.show(at(0.2))
     view = stage.camera(camera)
-    assert view.lookat[2] - view.distance * math.sin(math.radians(view.elevation)) > 1.0
+    above = -view.distance * math.sin(math.radians(view.elevation))
+    assert view.lookat[2] + above > 1.0
 
 
 def test_onboard_has_no_disc_in_its_way(stage: Stage, canvas: Canvas) -> None:
@@ -118,15 +132,18 @@ def test_onboard_has_no_disc_in_its_way(stage: Stage, canvas: Canvas) -> None:
 @pytest.mark.parametrize("camera", ["chase", "front", "side", "top"])
 def test_the_disc_marks_the_goal(camera: Camera, stage: Stage, canvas: Canvas) -> None:
     stage.show(at(5.0, error=-0.2))
-    assert green_in(canvas.draw(camera)).sum() > 20
-    assert green_in(canvas.draw(camera, stage.twin())).sum() == 0  # nothing shown yet
+    picture = canvas.draw(camera)
+    assert green_in(picture).sum() > 20
+    empty = canvas.draw(camera, stage.twin())  # nothing shown yet
+    assert green_in(empty).sum() == 0
 
 
 def test_a_craft_below_its_goal_is_so_far_below_the_disc(stage: Stage, canvas: Canvas) -> None:
     stage.show(at(4.0, error=1.0))
-    disc = np.nonzero(green_in(canvas.draw("side")))[0].mean()
-    craft = np.nonzero(craft_in(canvas, "side"))[0].mean()
-    assert craft - disc == pytest.approx(pixels_per_metre(stage, "side"), abs=4)
+    disc = mean_row(green_in(canvas.draw("side")))
+    craft = mean_row(craft_in(canvas, "side"))
+    metre = pixels_per_metre(stage, "side")
+    assert craft - disc == pytest.approx(metre, abs=4)
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
@@ -136,7 +153,8 @@ def test_without_a_goal_there_is_no_disc_and_the_craft_is_in_the_middle(
     stage.show(at(7.0, goal=None, position=(-2.0, -3.0, 7.0)))
     assert green_in(canvas.draw(camera)).sum() == 0
     if camera != "onboard":
-        assert np.nonzero(craft_in(canvas, camera))[1].mean() == pytest.approx(WIDTH / 2, abs=3)
+        _, columns = np.nonzero(craft_in(canvas, camera))
+        assert columns.mean() == pytest.approx(WIDTH / 2, abs=3)
 
 
 @pytest.mark.parametrize("world", ["plain", "airport"])
@@ -188,11 +206,12 @@ def test_a_crash_does_not_move_the_camera_out_of_sight(stage: Stage) -> None:
 def test_craft_side_by_side_stand_as_far_apart_as_their_size_asks(opengl: None) -> None:
     for vehicle, gap in ((None, 4.0), (HEXA, 1.37), (TINY, 0.153)):
         stage = Stage("plain", 5, vehicle=vehicle)
-        thrusts = tuple(stage.vehicle.hover_thrust)
-        stage.show(*[at(3 * stage.radius, thrusts=thrusts)] * 5)
+        moment = at(3 * stage.radius, thrusts=tuple(stage.vehicle.hover_thrust))
+        stage.show(*[moment] * 5)
         places = stage.data.qpos.reshape(5, 7)[:, :2]
         apart = np.linalg.norm(places[:, None] - places, axis=2)
-        assert apart[~np.eye(5, dtype=bool)].min() == pytest.approx(gap, rel=0.01)
+        others = apart[np.triu_indices(5, 1)]
+        assert others.min() == pytest.approx(gap, rel=0.01)
         with Canvas(stage, WIDTH, HEIGHT, fast=True) as canvas:
             for camera in ("chase", "front", "side", "top"):
                 rows, columns = np.nonzero(craft_in(canvas, camera))
@@ -203,7 +222,8 @@ def test_craft_side_by_side_stand_as_far_apart_as_their_size_asks(opengl: None) 
 def test_a_vehicle_without_its_texture_is_one_sentence(tmp_path: Path) -> None:
     file = tmp_path / "hexa.xml"
     texture = '<asset><texture name="t" type="2d" file="no.png"/><material name="m" texture="t"/>'
-    file.write_text(HEXA.read_text().replace("<worldbody>", f"{texture}</asset><worldbody>", 1))
+    text = HEXA.read_text()
+    file.write_text(text.replace("<worldbody>", f"{texture}</asset><worldbody>", 1))
     for world in ("plain", "airport"):
         with pytest.raises(InputError, match=r"vehicle: expected a file that can be drawn, got: "):
             Stage(world, vehicle=file)  # type: ignore[arg-type]
@@ -217,15 +237,13 @@ def test_a_moment_of_another_vehicle_is_one_sentence() -> None:
 def test_the_path_leads_to_where_it_was(stage: Stage, canvas: Canvas) -> None:
     for step in range(61):
         stage.show(at(3.0 + step / 40, goal=None, step=step))  # 1.5 m upwards
-    red, _, blue = np.moveaxis(canvas.draw("chase").astype(int), 2, 0)
     hidden = craft_in(canvas, "chase")
-    path = (red > blue + 40) & ~hidden
-    rows = np.nonzero(path)[0]
-    assert rows.size > 10
-    assert rows.mean() > np.nonzero(hidden)[0].mean()  # below the craft
+    path = orange_in(canvas.draw("chase")) & ~hidden
+    assert path.sum() > 10
+    assert mean_row(path) > mean_row(hidden)  # below the craft
     stage.show(at(4.5, goal=None, step=0))  # another episode
-    red, _, blue = np.moveaxis(canvas.draw("chase").astype(int), 2, 0)
-    assert ((red > blue + 40) & ~hidden).sum() < 5
+    path = orange_in(canvas.draw("chase")) & ~hidden
+    assert path.sum() < 5
 
 
 def test_twins_share_a_canvas_and_nothing_else(stage: Stage, canvas: Canvas) -> None:
@@ -249,24 +267,27 @@ def test_shadows_and_smooth_edges_are_there_unless_it_is_to_be_fast(opengl: None
         rough = canvas.draw("chase").astype(int)
     darker = (rough - smooth).min(axis=2) > 30
     assert darker.sum() > 50  # the shadow, below the craft
-    assert np.nonzero(darker)[0].mean() > HEIGHT / 2
+    assert mean_row(darker) > HEIGHT / 2
 
 
 def test_lines_are_written_in_the_upper_left_corner(stage: Stage, canvas: Canvas) -> None:
     stage.show(at(5.0))
     plain = canvas.draw("side")
     written = canvas.draw("side", lines=[("PID", "0.50 s"), ("E", "-0.079 m")])
-    rows, columns = np.nonzero((plain != written).any(axis=2))
+    changed = (plain != written).any(axis=2)
+    rows, columns = np.nonzero(changed)
     assert rows.size > 500
     assert rows.max() < HEIGHT / 2
     assert columns.max() < 0.75 * WIDTH
-    assert written.max(axis=2)[: HEIGHT // 2].max() > 240  # white letters
+    upper = written[: HEIGHT // 2]
+    assert upper.max() > 240  # white letters
 
 
 def test_lines_follow_the_task_and_the_vehicle() -> None:
-    hover = at(1.0, 0.25, metrics=(MetricValue("position_error", 0.25, "m", "e"),
-                                   MetricValue("heading_error", -12.345, "deg"),
-                                   MetricValue("gates_passed", 3.0)))  # fmt: skip
+    position = MetricValue("position_error", 0.25, "m", "e")
+    heading = MetricValue("heading_error", -12.345, "deg")
+    gates = MetricValue("gates_passed", 3.0)
+    hover = at(1.0, 0.25, metrics=(position, heading, gates))
     assert hover.lines(100.0) == [
         ("e", "0.250 m"),
         ("heading error", "-12.35 deg"),

@@ -73,15 +73,19 @@ def corners(model: mujoco.MjModel, geom: int) -> np.ndarray:
     """(4, 2) corners of a horizontal plane, m."""
     rotation = np.empty(9)
     mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
-    half = model.geom_size[geom, :2] * [[1, 1], [1, -1], [-1, -1], [-1, 1]]
-    return np.asarray(model.geom_pos[geom, :2] + half @ rotation.reshape(3, 3)[:2, :2].T)
+    level = rotation.reshape(3, 3)[:2, :2]
+    signs = [[1, 1], [1, -1], [-1, -1], [-1, 1]]
+    half = model.geom_size[geom, :2] * signs
+    return np.asarray(model.geom_pos[geom, :2] + half @ level.T)
 
 
 def overlap(a: np.ndarray, b: np.ndarray) -> bool:
     """Whether two rectangles share more than an edge: no separating axis along any side."""
     for side in (a[0] - a[1], a[1] - a[2], b[0] - b[1], b[1] - b[2]):
         axis = side / np.linalg.norm(side)
-        if (a @ axis).max() - (b @ axis).min() < 1e-6 or (b @ axis).max() - (a @ axis).min() < 1e-6:
+        ours = a @ axis
+        others = b @ axis
+        if min(ours.max() - others.min(), others.max() - ours.min()) < 1e-6:
             return False
     return True
 
@@ -90,21 +94,19 @@ def test_flat_things_of_one_height_do_not_overlap(
     model: mujoco.MjModel, airport: np.ndarray
 ) -> None:
     """Where two did, both would be drawn, and lit twice."""
-    flat = [
-        geom
-        for geom in airport
-        if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE
-        and abs(model.geom_quat[geom, 1:3]).max() < 1e-9
-        and model.geom_size[geom, 0] > 0  # not the grass, which has no end
-    ]
+    planes = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+    level = abs(model.geom_quat[:, 1:3]).max(axis=1) < 1e-9
+    ends = model.geom_size[:, 0] > 0  # not the grass, which has no end
+    flat = [geom for geom in airport if planes[geom] and level[geom] and ends[geom]]
     assert len(flat) > 80
-    assert all(model.geom_pos[geom, 2] <= 0.0 for geom in flat)
+    places = model.geom_pos
+    heights = places[:, 2]
+    assert heights[flat].max() <= 0.0
     for a, b in combinations(flat, 2):
-        if math.isclose(model.geom_pos[a, 2], model.geom_pos[b, 2], abs_tol=1e-9):
-            assert not overlap(corners(model, a), corners(model, b)), (
-                model.geom_pos[a].tolist(),
-                model.geom_pos[b].tolist(),
-            )
+        if math.isclose(heights[a], heights[b], abs_tol=1e-9):
+            one = corners(model, a)
+            other = corners(model, b)
+            assert not overlap(one, other), (places[a].tolist(), places[b].tolist())
 
 
 def test_sky_is_above_the_horizon_and_ground_below(opengl: None) -> None:
@@ -122,11 +124,14 @@ def test_sky_is_above_the_horizon_and_ground_below(opengl: None) -> None:
     assert clear > 20
     assert (seen[:clear] == 0).all()
     assert (seen[62:] > 0).all()  # the ground ends 1200 m away, 0.2 degrees below the horizon
-    red, green, blue = picture[seen == 0].mean(axis=0)
-    assert blue > green > red  # sky
-    red, green, blue = picture[seen == names.index("airport/grass")].mean(axis=0)
+    sky = seen == 0
+    red, green, blue = picture[sky].mean(axis=0)
+    assert blue > green > red
+    grass = seen == names.index("airport/grass")
+    red, green, blue = picture[grass].mean(axis=0)
     assert green > red > blue
-    red, green, blue = picture[seen == names.index("airport/apron")].mean(axis=0)
-    assert max(red, green, blue) - min(red, green, blue) < 20  # grey
+    apron = seen == names.index("airport/apron")
+    grey = picture[apron].mean(axis=0)
+    assert np.ptp(grey) < 20
     hidden = names.index("scene/floor") if "scene/floor" in names else -1
     assert not (seen == hidden).any()  # by the airport's own ground
