@@ -1,11 +1,12 @@
 """The controllers of the level `position`, flown to the goal of any task that tells where it is."""
 
 import math
+from collections.abc import Mapping
 from typing import ClassVar, Final
 
 import numpy as np
 
-from ..envs.spec import EnvSpec
+from ..envs.spec import EnvSpec, component_names
 from ..models.errors import InputError
 from .networks import Floats
 from .policies import Observation, flat
@@ -39,28 +40,29 @@ class Geometric:
     """Options of the env that it flies."""
 
     def __init__(self, spec: EnvSpec) -> None:
-        action = spec.action
-        names = action.components
-        level = "actions of the level position (--action position)"
+        names = spec.action.components
         if names != _ACTION:
-            raise InputError(f"geometric: expected {level}, got {', '.join(names) or 'others'}")
+            raise InputError(
+                "geometric: expected actions of the level position (--action position), "
+                f"got {', '.join(names) or 'others'}"
+            )
         self._gain = spec.constant("position_gain", "geometric")
         self._gravity = spec.constant("gravity", "geometric")
         self._scale = spec.action_scale
-        seen = [name for one in spec.observation for name in one.components or [""] * one.size]
-        wanted = [f"{vector} {axis}" for vector in (*_VECTORS, "nose") for axis in "xyz"]
-        missing = [name for name in wanted if name not in seen]
-        if missing:
-            raise InputError(
-                f"geometric: expected the observation {missing[0]!r}, got {spec.env_id} without it"
-            )
-        self._at = {v: [seen.index(f"{v} {axis}") for axis in "xyz"] for v in (*_VECTORS, "nose")}
-        self._rotors = [i for i, name in enumerate(seen) if name.endswith(" over hover")]
+        seen = [name for array in spec.observation for name in component_names(array)]
+        places = {name: place for place, name in enumerate(seen)}
+        self._at = {v: _vector(places, v) for v in (*_VECTORS, "nose", *_PAYLOAD)}
+        for vector in (*_VECTORS, "nose"):
+            if not self._at[vector]:
+                raise InputError(
+                    f"geometric: expected the observation '{vector} x', "
+                    f"got {spec.env_id} without it"
+                )
+        self._rotors = [place for name, place in places.items() if name.endswith(" over hover")]
         self._swing: np.ndarray | None = None
         self._pull = 0.0  # of the payload on the craft, m/s² per m that it hangs aside
         share, cable = (spec.options.get(name) for name in ("payload_share", "cable"))
-        if share and cable and all(f"{v} {axis}" in seen for v in _PAYLOAD for axis in "xyz"):
-            self._at |= {v: [seen.index(f"{v} {axis}") for axis in "xyz"] for v in _PAYLOAD}
+        if share and cable and all(self._at[vector] for vector in _PAYLOAD):
             self._swing = swing_gains(self._gain, self._gravity / cable, share)
             self._pull = share * self._gravity / cable
         self._spec = spec
@@ -77,7 +79,7 @@ class Geometric:
     def act(self, observation: Observation) -> Floats:
         """Offset and heading as the env's action, float32, shape (4,)."""
         numbers = flat(observation, self._spec).astype(np.float64)
-        now = {name: numbers[at] for name, at in self._at.items()}
+        now = {name: numbers[at] for name, at in self._at.items() if at}
         lift = self._gravity * (1.0 + (numbers[self._rotors].mean() if self._rotors else 0.0))
         now["force"] = lift * now["thrust axis"] - (0.0, 0.0, self._gravity)
         before = self._before or now
@@ -131,6 +133,12 @@ class Geometric:
         change: np.ndarray = self._share * (moving - self._moving)
         self._moving = self._moving + change
         return change / period
+
+
+def _vector(places: Mapping[str, int], name: str) -> list[int]:
+    """Places of the components of a vector in the observation; empty where one is missing."""
+    names = [f"{name} {axis}" for axis in "xyz"]
+    return [places[one] for one in names] if places.keys() >= {*names} else []
 
 
 def swing_gains(position: float, frequency: float, share: float) -> np.ndarray:

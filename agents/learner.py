@@ -85,7 +85,7 @@ class Learner:
                 with np.errstate(over="ignore", invalid="ignore"):  # Diverged is raised below
                     self._learn(rollout)
                 if not np.isfinite(self.weights.values).all():
-                    raise diverged(self.optimizer.steps)
+                    raise Diverged(f"weights are not finite after update {self.optimizer.steps}")
             if not on_update():
                 return
 
@@ -163,12 +163,6 @@ class Learner:
             numbers["std"] = np.exp(deviations).mean()
         numbers |= {"learning_rate": self.rate, "n_updates": self.optimizer.steps, **terms}
         return {f"train/{name}": float(value) for name, value in numbers.items()}
-
-
-def diverged(updates: int) -> Diverged:
-    """The error of weights that are not finite after `updates` updates."""
-    reason = f"weights are not finite after update {updates}"
-    return Diverged(f"training diverged: {reason}; try a lower learning_rate")
 
 
 def seeds_of(seed: int) -> tuple[int, np.random.Generator]:

@@ -119,7 +119,8 @@ class NetworkPolicy:
             self.head = Categorical(outputs)
         self.shapes: Shapes = {**self.network.shapes, **self.head.shapes}
         self.moments = Moments(size) if config.normalize_observations else None
-        self._squash = [Tanh()] if config.squashed else []
+        if config.squashed:
+            self.network.layers.append(Tanh())
 
     @classmethod
     def load(cls, weights: Mapping[str, Floats], spec: EnvSpec, config: Config) -> "NetworkPolicy":
@@ -170,7 +171,7 @@ class NetworkPolicy:
     def layers(self) -> list[Layer | Moments]:
         """All that happens between an observation and the output, in its order."""
         first = [] if self.moments is None else [self.moments]
-        return [*first, *self.network.layers, *self._squash]
+        return [*first, *self.network.layers]
 
     def reset(self) -> None:
         """Nothing of an episode is kept."""
@@ -181,10 +182,7 @@ class NetworkPolicy:
 
     def output(self, observations: Floats) -> Floats:
         """Means, or logits, shape (N, k), of flat observations, shape (N, n)."""
-        values = self.network.forward(self.inputs(observations))
-        for layer in self._squash:
-            values = layer.forward(values)
-        return values
+        return self.network.forward(self.inputs(observations))
 
     def act(self, observation: Observation) -> Action:
         """The most likely action, inside the bounds of the env."""

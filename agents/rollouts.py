@@ -22,6 +22,9 @@ Mask = NDArray[np.bool_]
 class Diverged(InputError):
     """Weights or actions are not finite. Checkpoints from before are whole."""
 
+    def __init__(self, reason: str) -> None:
+        super().__init__(f"training diverged: {reason}; try a lower learning_rate")
+
 
 @dataclass(frozen=True)
 class Rollout:
@@ -132,8 +135,7 @@ class Collector:
                 noise = drawn.reshape(block, count, -1)
             actions = self._policy.sample(observations, noise[len(rows) % block])
             if not np.isfinite(actions).all():
-                hint = "try a lower learning_rate"
-                raise Diverged(f"training diverged: actions are not finite; {hint}")
+                raise Diverged("actions are not finite")
             flying = ~log.out
             idle = log.done if waiting else None
             begins, frozen = (idle, None) if stop is None else (None, idle)

@@ -9,13 +9,14 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 
 from ..envs.autoreset import Step
 from ..models.errors import InputError, require
-from . import learner
 from .a2c import A2C, A2CConfig
 from .config import SACConfig
 from .episodes import EpisodeRecorder
+from .learner import OnUpdate, seeds_of
 from .networks import Floats
 from .policies import NetworkPolicy
 from .ppo import PPO, PPOConfig
+from .rollouts import Diverged
 
 if TYPE_CHECKING:
     import stable_baselines3 as sb3
@@ -181,7 +182,7 @@ class SB3Agent:
             learning_rate=self._learning_rate,
             gamma=config.gamma,
             policy_kwargs=policy,
-            seed=learner.seeds_of(seed)[0] % 2**32,
+            seed=seeds_of(seed)[0] % 2**32,
             device="cpu",
             **settings,
         )
@@ -190,7 +191,7 @@ class SB3Agent:
         # It keeps the numbers of the last update for us; SB3's own makes a folder in /tmp.
         self.model.set_logger(sb3_logger.Logger(folder=None, output_formats=[]))
 
-    def train(self, log: EpisodeRecorder, env_steps: int, on_update: learner.OnUpdate) -> None:
+    def train(self, log: EpisodeRecorder, env_steps: int, on_update: OnUpdate) -> None:
         """As `Learner.train`. SB3 flies whole rollouts only: a last part of one is not flown."""
         whole = env_steps // self._rollout * self._rollout
         if not whole:
@@ -213,7 +214,8 @@ class SB3Agent:
     def _check_finite(self) -> None:
         parameters = self.model.policy.parameters()
         if not all(bool(torch.isfinite(parameter).all()) for parameter in parameters):
-            raise learner.diverged(int(self.scalars().get("train/n_updates", 1)))
+            updates = int(self.scalars().get("train/n_updates", 1))
+            raise Diverged(f"weights are not finite after update {updates}")
 
     def _learning_rate(self, left: float) -> float:
         # SB3 counts what is left after the rollout; ours, and so here, before it.
