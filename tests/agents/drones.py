@@ -1,5 +1,7 @@
 """Vector envs that the agents' tests train in."""
 
+import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +17,14 @@ OPTIONS: dict[str, Any] = {"episode_length": 30, "start_band": 0.3, "flight_band
 """Short episodes, some of which crash."""
 ONE = ArraySpec(name="action", shape=(1,), low=-1.0, high=1.0)
 LINE = spec_of(ONE, [ArraySpec(name="observation", shape=(1,), low=-1.0, high=1.0)])
+
+
+_CASES = Path(__file__).parents[1] / "data" / "agents.json"
+
+
+def cases(name: str) -> Any:
+    """A table of inputs and of what is expected of them."""
+    return json.loads(_CASES.read_text(encoding="utf-8"))[name]
 
 
 def vector(drones: int = 1, mode: str = "Disabled", **options: Any) -> LocalVectorEnv:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from drones import ENV, OPTIONS, vector
+from drones import ENV, OPTIONS, cases, vector
 from rotorgram.agents import (
     Checkpoint,
     CheckpointError,
@@ -197,32 +197,26 @@ def test_what_is_not_finite_is_never_loaded(
     assert str(told.value) == f"{path}: expected finite numbers, got NaN or infinity in {name}"
 
 
-@pytest.mark.parametrize(
-    ("change", "sentence"),
-    [
-        ({"config": None}, "expected a rotorgram checkpoint, got one with a wrong part ("),
-        ({"config": {}}, "config: expected all of"),
-        ({"config": {"gamma": "[[["}}, "gamma: expected a number from 0 to 1"),
-        ({"env_steps": 10**400}, "env_steps: expected a whole number"),
-        ({"env_steps": 1.5}, "env_steps: expected a whole number"),
-        ({"seed": -1}, "seed: expected a whole number"),
-        ({"algorithm": ["vpg"]}, "algorithm: expected a text"),
-        ({"versions": 5}, "versions: expected values by name"),
-        (
-            {"spec": SimpleNamespace(to_json=lambda: None)},
-            "expected a rotorgram checkpoint, got one with a wrong part (",
-        ),
-        ({"spec": SimpleNamespace(to_json=lambda: "{}")}, "spec: expected env_id in EnvSpec"),
-    ],
-)
-def test_crafted_metadata_is_refused(
-    change: Any, sentence: str, kept: Checkpoint, tmp_path: Path
-) -> None:
-    path = tmp_path / "c"
-    store(replace(kept, **change), path)
+def refusal_of(kept: Checkpoint, path: Path) -> str:
+    """The sentence about a crafted file."""
+    store(kept, path)
     with pytest.raises(CheckpointError) as told:
         load(path)
-    assert sentence in str(told.value)
+    return str(told.value)
+
+
+@pytest.mark.parametrize("case", cases("crafted_metadata"), ids=str)
+def test_crafted_metadata_is_refused(case: Any, kept: Checkpoint, tmp_path: Path) -> None:
+    crafted = replace(kept, **case["change"])
+    assert case["sentence"] in refusal_of(crafted, tmp_path / "c")
+
+
+@pytest.mark.parametrize(("text", "sentence"), [(None, "wrong part"), ("{}", "expected env_id in")])
+def test_a_crafted_spec_is_refused(
+    text: str | None, sentence: str, kept: Checkpoint, tmp_path: Path
+) -> None:
+    spec: Any = SimpleNamespace(to_json=lambda: text)
+    assert sentence in refusal_of(replace(kept, spec=spec), tmp_path / "c")
 
 
 def test_another_format_is_refused(
@@ -236,21 +230,12 @@ def test_another_format_is_refused(
         load(path)
 
 
-WRONG_SHAPES: list[tuple[str, tuple[int, ...]]] = [
-    ("optimizer.steps", (3,)),
-    ("optimizer.second", (7, 7)),
-    ("optimizer.9999.exp_avg", (1,)),
-    ("weights", (9,)),
-    ("rng", (3,)),
-]
-
-
 @pytest.fixture(scope="module")
 def normalised() -> Checkpoint:
     return short_training("ppo")
 
 
-@pytest.mark.parametrize(("name", "shape"), WRONG_SHAPES)
+@pytest.mark.parametrize(("name", "shape"), cases("wrong_states"))
 def test_parts_that_do_not_fit_are_refused(
     name: str, shape: tuple[int, ...], normalised: Checkpoint
 ) -> None:
@@ -273,17 +258,7 @@ def test_a_config_that_does_not_fit_is_refused(config: Any, normalised: Checkpoi
         resume_agent(wrong, log_of(2))
 
 
-@pytest.mark.parametrize(
-    ("name", "shape"),
-    [
-        ("numbers", (3,)),
-        ("lengths", (2,)),
-        ("first_steps", (3,)),
-        ("observations", (2, 4)),
-        ("actions", (1000, 2, 1)),
-        ("actions", (10, 2, 7)),
-    ],
-)
+@pytest.mark.parametrize(("name", "shape"), cases("wrong_positions"))
 def test_a_position_that_does_not_fit_is_refused(
     name: str, shape: tuple[int, ...], kept: Checkpoint
 ) -> None:

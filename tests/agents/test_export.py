@@ -6,11 +6,13 @@ import subprocess
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
 import onnxruntime
 import pytest
+from drones import cases
 from nets import policy_of as loaded
 from nets import random_policy
 from peers import ANY, Running
@@ -349,24 +351,14 @@ def test_onnx_has_every_text_of_a_spec_as_it_is(evil: dict[str, Path]) -> None:
     assert json.loads(told["observation"])[0]["components"] == EVIL
 
 
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        (
-            ["pid", "--to", "c"],
-            "policy: expected a checkpoint or the folder of a training, got pid",
-        ),
-        (["nowhere", "--to", "c"], "there is no file nowhere"),
-        (["RUN", "--to", "c", "--out", "."], "out: expected the name of a new file, got ."),
-        (["RUN", "--to", "c", "--out", "/dev/null/a.h"], "/dev/null/a.h: "),
-    ],
-)
+@pytest.mark.parametrize("case", cases("wrong_exports"), ids=str)
 def test_wrong_input_is_one_sentence(
-    words: list[str], sentence: str, trained: Path, capsys: pytest.CaptureFixture[str]
+    case: Any, trained: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["export", *(str(trained) if word == "RUN" else word for word in words)]) == 1
+    words = [str(trained) if word == "RUN" else word for word in case["words"]]
+    assert main(["export", *words]) == 1
     error = capsys.readouterr().err
-    assert sentence in error
+    assert case["sentence"] in error
     assert error.count("\n") == 1
 
 

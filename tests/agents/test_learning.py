@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from drones import LINE, ONE, Constant, Kept, log_of, vector
+from drones import LINE, ONE, Constant, Kept, cases, log_of, vector
 from rotorgram.agents import (
     A2CConfig,
     Config,
@@ -237,19 +237,11 @@ def test_wrong_hyperparameters_are_one_sentence(case: dict[str, Any]) -> None:
     assert str(told.value).startswith(case["sentence"])
 
 
-@pytest.mark.parametrize(
-    ("algorithm", "name", "changes", "sentence"),
-    [
-        ("dqn", "paper", {}, "algorithm: expected one of"),
-        ("vpg", "best", {}, "preset: expected paper or tuned for vpg, got 'best'"),
-        ("vpg", "paper", {"rate": 1}, r"hyperparameters: expected some of .* got 'rate'$"),
-    ],
-)
-def test_unknown_names_are_named(
-    algorithm: str, name: str, changes: dict[str, Any], sentence: str
-) -> None:
-    with pytest.raises(InputError, match=sentence):
-        preset(algorithm, name, **changes)
+@pytest.mark.parametrize("case", cases("wrong_names"), ids=str)
+def test_unknown_names_are_named(case: Any) -> None:
+    algorithm, name = case["preset"]
+    with pytest.raises(InputError, match=case["sentence"]):
+        preset(algorithm, name, **case["changes"])
 
 
 @pytest.mark.parametrize(
@@ -351,34 +343,26 @@ def test_every_agent_trains_with_every_preset_and_kind_of_action(
     assert any(not np.array_equal(before[k], array) for k, array in agent.actor().items())
 
 
-@pytest.mark.parametrize(
-    ("algorithm", "drones", "env_steps", "changes", "bound"),
-    [
-        ("a2c", 8, 60_000, {"steps_per_update": 512}, 0.1),
-        ("vpg", 4, 60_000, {}, 0.2),
-        ("ppo", 32, 41_000, {}, 0.05),
-    ],
-)
-def test_learns_to_hold_the_target(
-    algorithm: str, drones: int, env_steps: int, changes: dict[str, Any], bound: float
-) -> None:
+@pytest.mark.parametrize("case", cases("learning"), ids=lambda case: case["algorithm"])
+def test_learns_to_hold_the_target(case: Any) -> None:
     """Short learning, far from its final precision: the better of two seeds comes close.
 
     Rounding differs between processors, and with it a single training's fate.
     """
 
     def late_error(agent: Any) -> float:
-        policy = agent.policy()
-        flown = fly_episodes(vector(5), policy, 5)
+        flown = fly_episodes(vector(5), agent.policy(), 5)
         return float(np.mean([np.abs(one.headline[-60:]).mean() for one in flown]))
 
+    algorithm = case["algorithm"]
+    config = preset(algorithm, "tuned", **case["changes"])
     before = []
     after = []
     for seed in (0, 1):
-        log = EpisodeRecorder(vector(drones), seed)
-        agent = make_agent(algorithm, log, preset(algorithm, "tuned", **changes), seed)
+        log = EpisodeRecorder(vector(case["drones"]), seed)
+        agent = make_agent(algorithm, log, config, seed)
         before.append(late_error(agent))
-        agent.train(log, env_steps, lambda: True)
+        agent.train(log, case["env_steps"], lambda: True)
         after.append(late_error(agent))
     assert np.mean(before) > 0.3
-    assert min(after) < bound
+    assert min(after) < case["bound"]

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from drones import cases
 from nets import policy_of, random_policy
 from rotorgram.agents.config import Config
 from rotorgram.agents.policies import ActionMap, NetworkPolicy, flat
@@ -89,22 +90,13 @@ def test_categorical_sampling_has_the_probabilities_of_the_policy() -> None:
     assert envs.shape == (DRAWS,)
 
 
-@pytest.mark.parametrize(
-    ("outputs", "action"),
-    [
-        ((0, 0, 0, 0), [[50, 0], [15, 0]]),
-        ((0.5, 1, -1, 2), [[75, 2], [10, 2]]),
-        ((9, -9, 9, 9), [[100, -2], [20, 3]]),
-    ],
-)
-def test_zero_is_the_middle_of_the_space_and_one_its_bound(
-    outputs: tuple[float, ...], action: list[list[float]]
-) -> None:
+@pytest.mark.parametrize("case", cases("mapped_actions"))
+def test_zero_is_the_middle_of_the_space_and_one_its_bound(case: Any) -> None:
     low = (0.0, -2.0, 10.0, -np.inf)
     high = (100.0, 2.0, 20.0, 3.0)
     spec = spec_of(ArraySpec(name="a", shape=(2, 2), low=low, high=high))
-    policy = constant(spec, *outputs)
-    assert policy.act(np.zeros(3, np.float32)).tolist() == action
+    policy = constant(spec, *case["outputs"])
+    assert policy.act(np.zeros(3, np.float32)).tolist() == case["action"]
 
 
 def test_a_choice_is_the_largest_output() -> None:
@@ -128,16 +120,7 @@ def test_observations_of_many_arrays_are_joined_in_the_order_of_the_spec() -> No
     assert flat(one, spec).dtype == np.float32
 
 
-@pytest.mark.parametrize(
-    ("name", "shape"),
-    [
-        ("log_std", (3,)),
-        ("layers.0.weight", (16, 4)),
-        ("layers.1.bias", (2, 1)),
-        ("layers.2.bias", (2,)),
-        ("observation.mean", (3,)),
-    ],
-)
+@pytest.mark.parametrize(("name", "shape"), cases("wrong_weights"))
 def test_weights_that_do_not_fit_are_refused(name: str, shape: tuple[int, ...]) -> None:
     weights = random_policy(BOX).arrays()
     weights[name] = np.zeros(shape, np.float32)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from drones import cases
 from rotorgram.agents import Checkpoint, load, preset
 from rotorgram.cli import main
 from rotorgram.envs import LocalVectorEnv
@@ -97,27 +98,12 @@ def kept() -> Checkpoint:
     return trained("ppo")
 
 
-@pytest.mark.parametrize(
-    ("changes", "sentence"),
-    [
-        ({"algorithm": "sb3-ppo"}, f"start-from: expected a training of {OURS}, got sb3-ppo"),
-        ({"hidden": (8,)}, "hidden: expected (16,) of the training to start from, got (8,)"),
-        (
-            {"options": {**SHORT, "observation": "error"}},
-            "start-from: expected observation 'rate of the error' of rotorgram/Elevation-v0, got",
-        ),
-        (
-            {"env_id": HOVER, "options": {"action": "attitude"}},
-            "start-from: expected observation 'elevation error' of rotorgram/Elevation-v0, got",
-        ),
-    ],
-)
-def test_a_training_that_does_not_fit_is_refused(
-    changes: dict[str, Any], sentence: str, kept: Checkpoint
-) -> None:
+@pytest.mark.parametrize("case", cases("wrong_starts"), ids=str)
+def test_a_training_that_does_not_fit_is_refused(case: Any, kept: Checkpoint) -> None:
+    arguments = {"algorithm": "ppo", "start": kept, **case["changes"]}
     with pytest.raises(InputError) as told:
-        training_of(**{"algorithm": "ppo", "start": kept, **changes})
-    assert str(told.value).startswith(sentence)
+        training_of(**arguments)
+    assert str(told.value).startswith(case["sentence"])
 
 
 def test_other_actions_are_refused() -> None:

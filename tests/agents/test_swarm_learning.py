@@ -1,11 +1,10 @@
 """Learning with several drones in a world: who counts, what the critic sees, and resuming."""
 
-import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from drones import cases
 from rotorgram.agents import EpisodeRecorder, ResumeError, make_agent, preset
 from rotorgram.agents.rollouts import Collector, Rollout
 from rotorgram.agents.sb3 import RecordedEnv
@@ -15,7 +14,6 @@ from rotorgram.training.settings import Run
 from rotorgram.training.training import Training
 from swarms import RISE
 
-DATA = Path(__file__).parents[1] / "data"
 SMALL = {"steps_per_update": 48, "epochs": 2, "minibatches": 2}
 
 
@@ -111,8 +109,7 @@ def test_what_the_central_critic_sees_by_hand() -> None:
     seen = agent.seen(observations, flying)
     assert seen.shape == (1, 6, 9)
     # Its own, the next one's, the one's after that; the third is out.
-    expected = json.loads((DATA / "central_critic.json").read_text(encoding="utf-8"))
-    assert seen[0].tolist() == expected
+    assert seen[0].tolist() == cases("central_critic")
 
 
 def test_of_a_single_drone_the_central_critic_is_ppos() -> None:
@@ -153,28 +150,15 @@ def test_a_training_that_stops_anywhere_ends_with_the_same_bits(algorithm: str) 
     assert lengths[0] == lengths[1]
 
 
-@pytest.mark.parametrize(
-    ("changes", "sentence"),
-    [
-        (
-            {"drones": 2},
-            "resume: expected an env with agents ('drone_0', 'drone_1', 'drone_2'), "
-            "got ('drone_0', 'drone_1')",
-        ),
-        (
-            {"episode_length": 80},
-            "resume: expected an env with options {'episode_length': 90}, "
-            "got {'episode_length': 80}",
-        ),
-    ],
-)
-def test_a_training_of_other_worlds_is_not_resumed(changes: dict[str, int], sentence: str) -> None:
+@pytest.mark.parametrize("case", cases("other_worlds"), ids=str)
+def test_a_training_of_other_worlds_is_not_resumed(case: Any) -> None:
     training = Training(run_of("mappo"), env_of())
     assert not training.train(lambda: False)
     kept = training.checkpoint()
+    other = env_of(**case["changes"])
     with pytest.raises(ResumeError) as told:
-        Training.resume(kept, env_of(**changes))
-    assert str(told.value) == sentence
+        Training.resume(kept, other)
+    assert str(told.value) == case["sentence"]
 
 
 def test_sb3_sees_zeros_of_one_that_is_out_until_its_world_ends() -> None:

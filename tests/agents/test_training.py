@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from drones import OPTIONS, vector
+from drones import OPTIONS, cases, vector
 from rotorgram.agents import (
     CheckpointError,
     ResumeError,
@@ -44,23 +44,12 @@ def env_of(run: Run, **changes: Any) -> Any:
     return vector(run.num_envs, **{**run.env.flat_options(), **changes})
 
 
-@pytest.mark.parametrize(
-    ("algorithm", "changes", "sentence"),
-    [
-        ("a2c", {"seed": -1}, "seed: expected a whole number of at least 0, got -1"),
-        ("a2c", {"num_envs": 0}, "num_envs: expected a whole number of at least 1, got 0"),
-        # Whole steps of 4 drones.
-        ("a2c", {"env_steps": 71}, "env_steps: expected at least 72, got 71"),
-        # An episode of each.
-        ("vpg", {"env_steps": 119}, "env_steps: expected at least 120, got 119"),
-    ],
-)
-def test_wrong_runs_are_one_sentence(
-    algorithm: str, changes: dict[str, Any], sentence: str
-) -> None:
-    run = run_of(algorithm)
-    with pytest.raises(InputError, match=sentence):
-        replace(run, **changes)
+@pytest.mark.parametrize("case", cases("wrong_runs"), ids=str)
+def test_wrong_runs_are_one_sentence(case: Any) -> None:
+    """An update takes whole steps of 4 drones, or an episode of each."""
+    run = run_of(case["algorithm"])
+    with pytest.raises(InputError, match=case["sentence"]):
+        replace(run, **case["changes"])
 
 
 def test_an_env_of_other_drones_is_refused() -> None:
