@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import AutoresetMode
 from rotorgram.agents import EpisodeRecorder
+from rotorgram.agents.rollouts import Rollout
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.envs.autoreset import AdvancingVectorEnv
 from rotorgram.envs.spec import ArraySpec, EnvSpec
@@ -25,6 +26,16 @@ _CASES = Path(__file__).parents[1] / "data" / "agents.json"
 def cases(name: str) -> Any:
     """A table of inputs and of what is expected of them."""
     return json.loads(_CASES.read_text(encoding="utf-8"))[name]
+
+
+def rollout(name: str = "three steps", **changes: np.ndarray) -> Rollout:
+    """Steps of one drone, of a table of such a name, with other columns by name."""
+    table = {key: np.array(column, np.float32) for key, column in cases("rollouts")[name].items()}
+    never = np.zeros(len(table["rewards"]), bool)
+    flags = {"truncated": never, "kept": ~never, "terminated": table.pop("terminated") == 1}
+    rewards = table.pop("rewards").astype(float)
+    columns = {**table, **flags, "rewards": rewards, **changes}
+    return Rollout(**{key: column[:, np.newaxis] for key, column in columns.items()})
 
 
 def vector(drones: int = 1, mode: str = "Disabled", **options: Any) -> LocalVectorEnv:

@@ -57,6 +57,12 @@ def policy_of(
     return policy
 
 
+def plain_spec(actions: int) -> EnvSpec:
+    """Of so many actions and one observation, without bounds."""
+    action = ArraySpec(name="a", shape=(actions,))
+    return spec_of(action, [ArraySpec(name="o", shape=(1,))])
+
+
 def elevation() -> EnvSpec:
     return env_spec(EnvConfig(env_id="rotorgram/Elevation-v0"))
 
@@ -168,7 +174,7 @@ def test_tanh_is_exact_from_the_smallest_number_to_the_largest(runner: str, tmp_
     small = np.geomspace(1e-30, 10, 10_001)
     numbers = np.concatenate([near, small, -small, [0.0, 9.1, -9.1, 1e30, -1e30, np.inf, -np.inf]])
     seen = numbers.astype(np.float32)[:, np.newaxis]
-    spec = spec_of(ArraySpec(name="a", shape=(1,)), [ArraySpec(name="o", shape=(1,))])
+    spec = plain_spec(1)
     one = np.ones((1, 1), np.float32)
     zero = np.zeros(1, np.float32)
     policy = loaded({"layers.0.weight": one, "layers.0.bias": zero}, spec, squash=True)
@@ -184,7 +190,7 @@ def test_weights_keep_every_bit(runner: str, tmp_path: Path) -> None:
     numbers = [1e-45, 1.1754944e-38, 3.4028235e38, 1 / 3, -0.1, 16777217.0, 1e-5, 123456.79, 2.0]
     bias = np.array(numbers, np.float32)
     count = len(numbers)
-    spec = spec_of(ArraySpec(name="a", shape=(count,)), [ArraySpec(name="o", shape=(1,))])
+    spec = plain_spec(count)
     weights = {
         "layers.0.weight": np.zeros((count, 1), np.float32),
         "layers.0.bias": bias,
@@ -228,16 +234,13 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("trained") / "run"
     words = "train a2c --env-steps 512 --num-envs 8 --seed 3 --out"
     assert main([*words.split(), str(folder)]) == 0
-    law = np.array([9.0, 6.0, -9.8], np.float32)
-    actor = {
-        "layers.0.weight": np.stack([law, -law, *np.zeros((14, 3), np.float32)]),
-        "layers.0.bias": np.zeros(16, np.float32),
-        "layers.1.weight": np.array([[1.0, -1.0, *[0.0] * 14]], np.float32),
-        "layers.1.bias": np.zeros(1, np.float32),
-        "log_std": np.zeros(1, np.float32),
-    }
     path = folder / "checkpoint.safetensors"
-    store(replace(load(path), actor=actor), path)
+    kept = load(path)
+    actor = {name: np.zeros_like(array) for name, array in kept.actor.items()}
+    law = np.array([9.0, 6.0, -9.8])
+    actor["layers.0.weight"][:2] = law, -law
+    actor["layers.1.weight"][0, :2] = 1.0, -1.0
+    store(replace(kept, actor=actor), path)
     return folder
 
 

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from drones import LINE, ONE, Constant, Kept, cases, log_of, vector
+from drones import LINE, ONE, Constant, Kept, cases, log_of, rollout, vector
 from rotorgram.agents import (
+    ALGORITHMS,
     A2CConfig,
-    Config,
     EpisodeRecorder,
     PPOConfig,
     VPGConfig,
@@ -27,22 +27,6 @@ from rotorgram.flights.trajectories import fly_episodes
 from rotorgram.models.errors import InputError
 
 DATA = Path(__file__).parents[1] / "data"
-
-
-def rollout(**changes: Any) -> Rollout:
-    """Three steps of one drone."""
-    never = np.zeros(3, bool)
-    fields = {
-        "observations": np.array([[0.5], [-1.0], [2.0]], np.float32),
-        "actions": np.array([[1.5], [-0.5], [0.0]], np.float32),
-        "rewards": np.array([1.0, 2.0, 4.0]),
-        "next_observations": np.array([[-1.0], [2.0], [0.0]], np.float32),
-        "terminated": np.array([False, False, True]),
-        "truncated": never,
-        "kept": ~never,
-        **changes,
-    }
-    return Rollout(**{name: column[:, np.newaxis] for name, column in fields.items()})
 
 
 def slopes_of(agent: VPG | A2C, data: Rollout) -> dict[str, Any]:
@@ -244,34 +228,21 @@ def test_unknown_names_are_named(case: Any) -> None:
         preset(algorithm, name, **case["changes"])
 
 
-@pytest.mark.parametrize(
-    ("algorithm", "config", "sentence"),
-    [
-        ("a2c", VPGConfig(), "algorithm: expected a2c with its A2CConfig, got VPGConfig"),
-        ("a2c", PPOConfig(), "algorithm: expected a2c with its A2CConfig, got PPOConfig"),
-        ("sb3-a2c", PPOConfig(), "algorithm: expected sb3-a2c with its A2CConfig, got PPOConfig"),
-        ("ppo", A2CConfig(), "algorithm: expected ppo with its PPOConfig, got A2CConfig"),
-        (
-            "sb3-ppo",
-            PPOConfig(normalize_observations=True),
-            "normalize_observations: expected false with SB3",
-        ),
-    ],
-)
-def test_a_config_that_an_agent_does_not_take(
-    algorithm: str, config: Config, sentence: str
-) -> None:
-    with pytest.raises(InputError, match=sentence):
-        make_agent(algorithm, log_of(), config, 0)
+@pytest.mark.parametrize("case", cases("wrong_configs"), ids=str)
+def test_a_config_that_an_agent_does_not_take(case: Any) -> None:
+    config = ALGORITHMS[case["of"]].config(**case["changes"])
+    with pytest.raises(InputError, match=case["sentence"]):
+        make_agent(case["algorithm"], log_of(), config, 0)
 
 
 def test_vpg_weights_with_baseline_and_scale_by_hand() -> None:
     """Two episodes, of two steps and one, gamma 0.5: R = 2, 2, 5; the mean at step 0 is 3.5."""
     config = VPGConfig(gamma=0.5, baseline="time", episodes_per_update=2)
-    data = rollout(rewards=np.array([1.0, 2.0, 5.0]), terminated=np.array([False, True, True]))
-    np.testing.assert_allclose(VPG(log_of(), config, 0).returns(data), [-1.5, 0, 1.5])
+    data = rollout("episodes of two steps and one")
+    returns = VPG(log_of(), config, 0).returns(data)
+    np.testing.assert_allclose(returns, [-1.5, 0, 1.5])
     scaled = VPG(log_of(), replace(config, normalize=True), 0).returns(data)
-    np.testing.assert_allclose(scaled, np.array([-1.5, 0, 1.5]) / np.sqrt(1.5), rtol=1e-6)
+    np.testing.assert_allclose(scaled, returns / np.sqrt(1.5), rtol=1e-6)
 
 
 def test_what_is_stored_is_not_clipped_and_what_is_flown_is_in_the_units_of_the_env() -> None:

@@ -7,11 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drones import log_of
+from drones import log_of, rollout
 from rotorgram.agents import PPOConfig, find_preset, load
 from rotorgram.agents.ppo import PPO
 from rotorgram.models.errors import InputError
-from test_learning import rollout
 
 SMALL = PPOConfig(gamma=0.5, gae_lambda=0.5, steps_per_update=3, epochs=1, minibatches=1)
 
