@@ -1,7 +1,7 @@
 """Stable-Baselines3: its A2C, PPO and SAC as references, and vector envs as it wants them."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Final, NoReturn
+from typing import Any, Final, NoReturn
 
 import numpy as np
 from gymnasium import spaces
@@ -18,7 +18,7 @@ from .policies import NetworkPolicy
 from .ppo import PPO, PPOConfig
 from .rollouts import Diverged
 
-if TYPE_CHECKING:
+try:
     import stable_baselines3 as sb3
     import torch
     from stable_baselines3.common import callbacks as sb3_callbacks
@@ -29,12 +29,10 @@ if TYPE_CHECKING:
         VecEnvObs,
         VecEnvStepReturn,
     )
-else:
-    sb3 = require("stable_baselines3", "train", "sb3-a2c")
-    torch = require("torch", "train", "sb3-a2c")
-    sb3_logger = sb3.common.logger
-    sb3_vec = sb3.common.vec_env
-    sb3_callbacks = sb3.common.callbacks
+except ModuleNotFoundError:
+    for _package in ("torch", "stable_baselines3"):
+        require(_package, "train", "sb3-a2c")
+    raise
 
 
 class SB3VecEnv(sb3_vec.VecEnv):
@@ -54,7 +52,7 @@ class SB3VecEnv(sb3_vec.VecEnv):
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
         self._actions = np.zeros(0)
 
-    def reset(self) -> "VecEnvObs":
+    def reset(self) -> VecEnvObs:
         """Begin an episode for every env, with the seeds of `seed` if it was called."""
         seeds = self._seeds if any(seed is not None for seed in self._seeds) else None
         observations: VecEnvObs = self.env.reset(seed=seeds)[0]  # type: ignore[arg-type]
@@ -65,7 +63,7 @@ class SB3VecEnv(sb3_vec.VecEnv):
         """Keep the actions for `step_wait`."""
         self._actions = actions
 
-    def step_wait(self) -> "VecEnvStepReturn":
+    def step_wait(self) -> VecEnvStepReturn:
         """Fly every env for one step."""
         observations, rewards, terminated, truncated, info = self.env.step(self._actions)
         ended = terminated | truncated
@@ -82,7 +80,7 @@ class SB3VecEnv(sb3_vec.VecEnv):
         """Close the vector env."""
         self.env.close()
 
-    def get_attr(self, attr_name: str, indices: "VecEnvIndices" = None) -> list[object]:
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[object]:
         """An attribute of the vector env, which all envs share."""
         return [getattr(self.env, attr_name)] * len(list(self._get_indices(indices)))
 
@@ -92,7 +90,7 @@ class SB3VecEnv(sb3_vec.VecEnv):
 
     set_attr = env_method
 
-    def env_is_wrapped(self, wrapper_class: object, indices: "VecEnvIndices" = None) -> list[bool]:
+    def env_is_wrapped(self, wrapper_class: object, indices: VecEnvIndices = None) -> list[bool]:
         """False: wrappers of single envs are not here."""
         return [False] * len(list(self._get_indices(indices)))
 
