@@ -1,5 +1,6 @@
 """Peers for the tests of the wire: simulators in threads and processes."""
 
+import json
 import socket
 import subprocess
 import sys
@@ -7,6 +8,7 @@ import textwrap
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from rotorgram.udp import LinkConfig, Simulator
@@ -14,6 +16,8 @@ from rotorgram.udp import LinkConfig, Simulator
 ANY = ("127.0.0.1", 0)
 ENV_ID = "rotorgram/Elevation-v0"
 QUICK = LinkConfig(timeout=8)
+TABLES: dict[str, Any] = json.loads((Path(__file__).parent / "data" / "udp.json").read_text())
+"""Rows of the tests of the wire, by what they are."""
 
 
 class Running:

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from links import Pair, agent, hello, layout, lossy, outgoing, send_command, simulator, state
+from peers import TABLES
 from relay import FaultConfig, Faults
 from rotorgram.models.errors import InputError
 from rotorgram.udp.protocol import binary
@@ -151,10 +152,7 @@ def test_a_missing_bitmap_has_the_size_of_its_numbers() -> None:
 
 
 @pytest.mark.parametrize("sealed", [False, True])
-@pytest.mark.parametrize(
-    ("drones", "loss", "least"),
-    [(1024, 0.01, 200), (1024, 0.05, 100), (64, 0.05, 150), (64, 0.3, 30), (1, 0.3, 60)],
-)
+@pytest.mark.parametrize(("drones", "loss", "least"), TABLES["steps a second"])
 def test_steps_a_second_where_datagrams_are_lost(
     drones: int, loss: float, least: float, sealed: bool
 ) -> None:

@@ -24,7 +24,7 @@ import pytest
 import zstandard
 from mcap.reader import make_reader
 from mcap.writer import Writer
-from peers import ANY, ENV_ID, launch, simulate
+from peers import ANY, ENV_ID, TABLES, launch, simulate
 from relay import FaultConfig, relaying
 from rotorgram.cli.replay import Replay
 from rotorgram.envs.config import EnvConfig
@@ -205,28 +205,10 @@ def test_an_agent_with_a_journal_does_not_fly_text(tmp_path: Path) -> None:
         assert isinstance(running.join(), Refused)
 
 
-WORLD: dict[str, Any] = {
-    "effects": {
-        "motor_lag": True, "body_drag": True, "wind": (2.0, 1.0, 0.0), "gusts": 3.0,
-        "payload": 0.004, "cable": 0.3,
-    },
-    "randomize": {
-        "mass": "uniform(0.8, 1.2)", "center_x": "normal(0, 0.001)", "thrust": "normal(1, 0.1)",
-        "wind_x": "normal(0, 1)", "action_delay": "uniform(0, 3)",
-        "observation_delay": "uniform(0, 2)",
-    },
-    "sensors": {
-        "imu": True, "estimate": True,
-        "motion_capture": {
-            "noise": 0.001, "angle_noise": 0.01, "rate": 25, "delay": 0.1, "dropout": 0.2
-        },
-    },
-}  # fmt: skip
-
-
 @pytest.mark.parametrize("drones", [1, 3])
 def test_what_acts_is_drawn_and_is_measured_is_repeated(drones: int, tmp_path: Path) -> None:
-    options = {**WORLD, "vehicle": "crazyflie2", "env": "rotorgram/Hover-v0", "episode_length": 40}
+    world = TABLES["effects, draws and sensors"]
+    options = {**world, "vehicle": "crazyflie2", "env": "rotorgram/Hover-v0", "episode_length": 40}
     with pair(tmp_path, drones=drones, **options) as both:
         assert fly(both.remote, 150, seed=None).episodes > 1
         if drones > 1:

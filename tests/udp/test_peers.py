@@ -19,6 +19,7 @@ from random import Random
 
 import numpy as np
 import pytest
+from peers import TABLES
 from relay import FaultConfig, relaying
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.loop import Loop
@@ -248,21 +249,7 @@ def golden(name: str) -> str:
 
 
 def test_simulator_writes_and_reads_the_golden_datagrams(simulator: list[str]) -> None:
-    read = {
-        "welcome": "Welcome 0123456789abcdef 0 fedcba9876543210 False 0",
-        "welcome with a seed": "Welcome 0123456789abcdef 0 fedcba9876543210 True 7",
-        "welcome with a critical extension": "malformed",
-        "refuse": "Refuse 0123456789abcdef 0 busy",
-        "wait": "Wait 0123456789abcdef 0",
-        "unknown": "Unknown 0123456789abcdef 1",
-        "command to fly choice 2": "Command 0123456789abcdef 1 2 Fly 0",
-        "command to reset, with a seed": "Command 0123456789abcdef 1 0 Reset 18446744073709551615",
-        "command: fly, freeze": "Command 0123456789abcdef 3 0.5 -1 Fly Freeze 0 0",
-        "command: reset, fly; with seeds": (
-            "Command 0123456789abcdef 3 0.5 -1 Reset Fly 18446744073709551615 5"
-        ),
-        "close": "Close 0123456789abcdef 1 done",
-    }
+    read = TABLES["golden datagrams that a simulator reads"]
     envs = {case["name"]: case["env"] for case in GOLDEN["messages"]}
     given = [f"{envs[name]}:{golden(name)}" for name in read]
     # What concerns a simulator, and can be told without the state of a link.

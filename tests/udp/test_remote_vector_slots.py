@@ -17,7 +17,7 @@ from fleets import (
     random_actions,
     sync,
 )
-from peers import ANY, ENV_ID, plain_socket, simulate
+from peers import ANY, ENV_ID, TABLES, plain_socket, simulate
 from rotorgram.udp import (
     LinkConfig,
     PeerSilent,
@@ -87,19 +87,7 @@ def test_a_slow_simulator_only_delays() -> None:
     assert [one.join() for one in running] == ["the agent closed"] * 2
 
 
-@pytest.mark.parametrize(
-    ("arguments", "sentence"),
-    [
-        ({"num_envs": 1}, "expected a simulator of 2 drones, got one of 1"),
-        ({"num_envs": 3}, "expected a simulator of 2 drones, got one of 3"),
-        ({"num_envs": 2, "env": "rotorgram/Hover-v0"}, "expected"),
-        (
-            {"num_envs": 2, "effects": {"linear_drag": 0.5}},
-            "expected effects not to be there, got {'linear_drag': 0.5}",
-        ),
-        ({"num_envs": 2, "observation": "error"}, "expected observation 'full', got 'error'"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "sentence"), TABLES["refused beside others"])
 def test_another_kind_of_simulator_is_refused(arguments: dict[str, Any], sentence: str) -> None:
     """With a place still free; what counts is the first that came, and the number asked for."""
     remote = RemoteVectorEnv(ANY, num_simulators=2, num_envs=4, connect=False, connect_timeout=0.5)

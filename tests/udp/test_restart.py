@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import rotorgram.envs  # noqa: F401
-from peers import ANY, ENV_ID, Running, launch, plain_socket, simulate
+from peers import ANY, ENV_ID, TABLES, Running, launch, plain_socket, simulate
 from relay import FaultConfig, relaying
 from remotes import assert_parity
 from rotorgram.envs.config import EnvConfig
@@ -120,15 +120,7 @@ def ends(process: subprocess.Popen[str]) -> str:
 @posix
 @pytest.mark.parametrize(
     ("network", "kind", "same"),
-    [
-        ("clean", "binary", True),
-        ("clean", "binary", False),
-        ("lossy", "binary", True),
-        ("lossy", "binary", False),
-        ("clean", "key", True),
-        ("clean", "key", False),
-        ("clean", "text", True),  # at another port it would be turned away: there is no Wait
-    ],
+    TABLES["killed simulators"],  # text only at its port: elsewhere there is no Wait
     indirect=["network"],
 )
 def test_a_killed_simulator_is_replaced(network: Any, kind: str, same: bool, key_file: str) -> None:
@@ -289,14 +281,7 @@ def keyed(
         running.join()
 
 
-@pytest.mark.parametrize(
-    ("agent_key", "simulator_key", "sentence"),
-    [
-        ("key", None, "key: this agent has one (--key-file), and the simulator has none"),
-        (None, "key", "key: this agent has none (--key-file), and the simulator has"),
-        ("key", "another", "key: the simulator has another one"),
-    ],
-)
+@pytest.mark.parametrize(("agent_key", "simulator_key", "sentence"), TABLES["keys that differ"])
 def test_keys_that_differ(
     agent_key: str | None,
     simulator_key: str | None,

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from peers import ANY, Running, launch
+from peers import ANY, TABLES, Running, launch
 from relay import FaultConfig, relaying
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.loop import Loop
@@ -306,22 +306,12 @@ def test_who_is_waited_for_is_told_soon(caplog: pytest.LogCaptureFixture) -> Non
     assert re.match(expected, caplog.messages[0])
 
 
-@pytest.mark.parametrize(
-    ("changes", "sentence"),
-    [
-        ({"agents": [("127.0.0.1", i) for i in (1, 2)]},
-         "agents: expected a divisor of 3 drones, got 2 agents"),
-        ({"agents": []}, "agents: expected one address or more, got none"),
-        ({"agents": [("127.0.0.1", 1)] * 3}, "agents: expected a different address of each"),
-        ({"when_lost": "panic"}, "when_lost: expected 'hold' or 'land' or 'end', got 'panic'"),
-        ({"patience": 0}, "patience: expected a number above 0 s, got 0"),
-        ({"env": "rotorgram/Hover-v0"}, "drones: expected 1 with rotorgram/Hover-v0"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("changes", "sentence"), TABLES["wrong arguments of a shared world"])
 def test_wrong_arguments_are_told(changes: dict[str, Any], sentence: str) -> None:
     given = {"env": RISE, "agents": [("127.0.0.1", 1)], "drones": 3, "bind": ANY, **changes}
+    given["agents"] = [tuple(agent) for agent in given["agents"]]
     with pytest.raises(InputError) as told:
-        Simulator(given.pop("env"), **given)
+        Simulator(**given)
     assert str(told.value).startswith(sentence)
 
 

@@ -153,8 +153,8 @@ def decode_state(datagram: bytes, layout: Layout) -> State | Close:
             f"state: expected {expected + 1} fields (sequence, reward, terminated, truncated, "
             f"{size} of observation, {sum(sizes)} of telemetry), got {len(fields) + 1}"
         )
-    numbers = np.array([[_floats("state: telemetry", fields[3 + size :])]])
-    telemetry = np.split(numbers, np.cumsum(sizes)[:-1], axis=2) if sizes else []
+    numbers = np.array([_floats("state: telemetry", fields[3 + size :])])
+    telemetry = np.split(numbers, np.cumsum(sizes)[:-1], axis=1) if sizes else []
     shaped = []
     converted = _converted(telemetry, layout, _FROM_PAPER)
     for array, slot in zip(converted, layout.telemetry_slots, strict=True):
