@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from ..envs.spec import ArraySpec
 from ..models.errors import InputError
-from ..udp.journal.reader import Recording, Session
-from ..udp.journal.walker import Walker
+from ..udp.journal.reader import Recording, Session, Walker
 from ..udp.protocol.messages import State
 from .trajectories import Ending, Trajectory
 

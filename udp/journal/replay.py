@@ -14,8 +14,7 @@ from ...models import Backend
 from ...models.errors import InputError
 from ..protocol.messages import State
 from ..transport.stepped import Steppable, make_stepped
-from .reader import Item, Recording, Session, count_of, printable
-from .walker import Transition, Walker
+from .reader import Item, Recording, Session, Transition, Walker, count_of, printable
 from .writer import software
 
 
