@@ -19,7 +19,6 @@ from rotorgram.udp.protocol.layout import MAX_DRONES, ArrayLayout, Layout
 from rotorgram.udp.protocol.messages import (
     Close,
     Command,
-    Extension,
     Hello,
     Message,
     Refuse,
@@ -216,7 +215,6 @@ def test_sizes_that_do_not_fit() -> None:
         lambda: Close(session=1, sequence=1, reason="x" * 513),
         lambda: Close(session=1, sequence=1, reason="a\nb"),
         lambda: Welcome(session=1, nonce=2**64),
-        lambda: Extension(number=1 << 15, value=b""),
         lambda: binary.encode(Wait(session=-1)),
     ):
         with pytest.raises(InputError, match=r"expected|argument"):

@@ -78,9 +78,11 @@ def plain(value: Any) -> Any:
         return list(map(str, numbers)) if value.dtype == np.uint64 else numbers
     if isinstance(value, bytes):
         return value.hex()
+    if isinstance(value, Extension):
+        return {name: plain(one) for name, one in value._asdict().items()}
     if isinstance(value, tuple):
         return [plain(one) for one in value]
-    if isinstance(value, Extension | binary.Message):
+    if isinstance(value, binary.Message):
         return {field.name: plain(getattr(value, field.name)) for field in fields(value)}
     if isinstance(value, int) and value > 2**32:
         return str(value)

@@ -8,7 +8,6 @@ import os
 import re
 import signal
 import struct
-import sys
 import textwrap
 import time
 from collections.abc import Callable, Iterator
@@ -760,7 +759,6 @@ def test_a_signal_takes_effect_after_the_write(
     assert datagrams(path, object) == [item.datagram for item in items]
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="no forks there")
 @pytest.mark.parametrize("goodbye", ["sys.exit()", "del remote; os._exit(0)"])
 def test_a_forked_child_leaves_its_parents_file_alone(goodbye: str, tmp_path: Path) -> None:
     path = tmp_path / "agent.mcap"  # fault 34

@@ -33,8 +33,6 @@ GOLDEN = {
     "Unknown": binary.encode(Unknown(session=SESSION, sequence=1)),
 }
 
-posix = pytest.mark.skipif(os.name != "posix", reason="modes of files are those of POSIX")
-
 
 # ---- the bytes
 
@@ -128,7 +126,6 @@ def test_a_key_is_written_and_read(tmp_path: Path) -> None:
     assert (secret,) != read_keys(second)
 
 
-@posix
 def test_only_its_owner_may_read_a_key(tmp_path: Path) -> None:
     path = tmp_path / "key"
     before = os.umask(0)
@@ -196,7 +193,6 @@ def test_a_file_of_several_keys(tmp_path: Path) -> None:
     assert read_keys(path) == (SECRET, bytes(32))
 
 
-@posix
 def test_a_fifo_as_key_file_does_not_hang(tmp_path: Path) -> None:  # fault 37
     path = tmp_path / "fifo"
     os.mkfifo(path, 0o600)

@@ -124,7 +124,6 @@ def test_a_wait_may_be_longer_than_the_system_waits_in_one_go(
 
 
 @pytest.mark.quiet
-@pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 def test_signals_neither_end_nor_extend_a_wait() -> None:
     before = signal.signal(signal.SIGALRM, lambda *_: None)
     try:
@@ -207,7 +206,6 @@ def test_a_simulator_that_falls_silent() -> None:
     assert running.join() == "the agent closed"
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 def test_the_simulator_program_ends_on_sigterm_and_tells_the_agent() -> None:
     with RemoteEnv(ANY, connect=False, connect_timeout=20, timeout=10) as remote:
         process = start_simulator(EnvConfig(), remote.address)

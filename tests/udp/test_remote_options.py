@@ -26,9 +26,6 @@ from rotorgram.udp.__main__ import read_arguments
 from rotorgram.udp.protocol.messages import Hello
 from rotorgram.udp.transport.agent import AgentConfig
 
-posix = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals and forks")
-
-
 # ---- arguments
 
 
@@ -285,7 +282,6 @@ with Simulator(Slow(), server=("127.0.0.1", int(sys.argv[1])), bind=("127.0.0.1"
 """
 
 
-@posix
 def test_sides_that_were_stopped_for_a_while_end_no_episode() -> None:  # fault 25
     agent = launch(AGENT)
     assert agent.stdout is not None
@@ -302,7 +298,6 @@ def test_sides_that_were_stopped_for_a_while_end_no_episode() -> None:  # fault 
     assert simulator.communicate(timeout=20) == ("the agent closed\n", "")
 
 
-@posix
 def test_a_forked_child_does_not_close_its_parents_flight() -> None:  # fault 34
     with flying() as pair:
         pair.remote.reset(seed=1)

@@ -4,7 +4,6 @@ import json
 import re
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -34,8 +33,6 @@ LOSSY = FaultConfig(drop=0.3, duplicate=0.1, reorder=0.2, seed=2)
 AT_ONCE = 5.0
 """Far from every timeout. Of that an interpreter with MuJoCo takes 0.2 s to end, or 1 s and more
 on a busy machine."""
-posix = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
-
 SIMULATE = """
     import json, sys
     from rotorgram.udp import LinkConfig, Simulator
@@ -117,7 +114,6 @@ def ends(process: subprocess.Popen[str]) -> str:
 # ---- the simulator is killed
 
 
-@posix
 @pytest.mark.parametrize(
     ("network", "kind", "same"),
     TABLES["killed simulators"],  # text only at its port: elsewhere there is no Wait
@@ -156,7 +152,6 @@ def test_a_killed_simulator_is_replaced(network: Any, kind: str, same: bool, key
             assert ends(second) == "the agent closed"
 
 
-@posix
 def test_a_simulator_that_was_frozen_begins_anew() -> None:
     """Its place was given up: the session is over, and is not taken up where it was."""
     with RemoteEnv(ANY, connect=False, timeout=0.5) as remote:
@@ -180,7 +175,6 @@ def test_a_simulator_that_was_frozen_begins_anew() -> None:
 # ---- the agent is killed
 
 
-@posix
 @pytest.mark.parametrize(
     "options", [{}, {"codec": "text"}, {"key_file": "yes"}], ids=["binary", "text", "key"]
 )
@@ -219,7 +213,6 @@ def seconds_until_both_end(signalled: Any, other: Any) -> float:
     return time.monotonic() - start
 
 
-@posix
 @pytest.mark.parametrize("codec", ["binary", "text"])
 @pytest.mark.parametrize("side", ["simulator", "agent"])
 def test_ctrl_c_ends_both_at_once(side: str, network: Any, codec: str) -> None:
@@ -238,7 +231,6 @@ def test_ctrl_c_ends_both_at_once(side: str, network: Any, codec: str) -> None:
             assert re.search(sentence, agent.stderr.read())
 
 
-@posix
 def test_ctrl_c_with_nobody_there_ends_at_once() -> None:
     with plain_socket() as sock, simulating(sock.getsockname()) as simulator:
         sock.recv(65507)  # its Hello
@@ -250,7 +242,6 @@ def test_ctrl_c_with_nobody_there_ends_at_once() -> None:
                 assert "KeyboardInterrupt" in process.stderr.read()
 
 
-@posix
 def test_a_simulator_ends_with_its_standard_input() -> None:
     """That of a program which was killed: before the first Welcome and in mid-flight."""
     with RemoteEnv(ANY, connect=False) as remote, plain_socket() as nobody:

@@ -109,7 +109,7 @@ def read_keys(path: Path | str) -> tuple[bytes, ...]:
         text = Path(path).read_bytes() if is_file else b""
     except OSError as error:
         raise InputError(f"key file: cannot read {path}: {error.strerror}") from None
-    if os.name == "posix" and is_file and mode & 0o077:
+    if is_file and mode & 0o077:
         expected = f"{path} to be readable by its owner alone (chmod 600)"
         raise InputError(f"key file: expected {expected}, got mode {mode & 0o777:o}")
     try:

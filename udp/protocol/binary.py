@@ -351,9 +351,9 @@ def _take_extensions(data: bytes, at: int) -> tuple[Extension, ...]:
         number, size = _EXTENSION.unpack_from(data, at)
         at += _EXTENSION.size
         value = data[at : at + size]
-        if len(value) < size:
-            raise InputError(f"extension: expected {size} bytes, got {len(value)}")
-        critical = bool(number & _CRITICAL)
-        extensions.append(Extension(number=number & ~_CRITICAL, value=value, critical=critical))
+        if len(value) < size or size > MAX_TEXT:
+            expected = f"at most {MAX_TEXT} bytes, all {size} of them"
+            raise InputError(f"extension: expected {expected}, got {len(value)}")
+        extensions.append(Extension(number & ~_CRITICAL, value, bool(number & _CRITICAL)))
         at += size
     return tuple(extensions)

@@ -7,7 +7,7 @@ a `Command` means something only with the `Layout` of its Hello: the codec check
 
 import re
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -43,22 +43,14 @@ def _check_text(name: str, text: str) -> None:
         raise InputError(f"{name}: expected no control characters, got {shortened(text)}")
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Extension:
+class Extension(NamedTuple):
     """Something of a later version or of a user, in Hello or Welcome."""
 
     number: int
+    """0 to 32,767."""
     value: bytes
     critical: bool = False
     """Whether a side that does not know it must not go on."""
-
-    def __post_init__(self) -> None:
-        number = self.number
-        size = len(self.value)
-        if not 0 <= number < 1 << 15:
-            raise InputError(f"extension: expected a number 0 to 32767, got {number}")
-        if size > MAX_TEXT:
-            raise InputError(f"extension: expected at most {MAX_TEXT} bytes, got {size}")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
