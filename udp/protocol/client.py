@@ -8,7 +8,7 @@ the simulator repeats the same bytes until the Command of the same number comes.
 
 import secrets
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from math import inf
 from random import Random
 from typing import Annotated, Final
@@ -164,6 +164,7 @@ class RoundTrips:
         return min(self.interval * 2.0 ** min(tries - _PATIENCE, 16), _LONGEST_RESEND)
 
 
+@dataclass(eq=False)
 class Client:
     """Says Hello, then exchanges States for Commands.
 
@@ -188,41 +189,35 @@ class Client:
         outgoing: Datagrams to send to the agent: the caller takes them.
     """
 
-    def __init__(
-        self,
-        hello: m.Hello,
-        layout: Layout,
-        config: LinkConfig,
-        *,
-        largest: int = NEAR,
-        by_text: bool = False,
-        key: Key | None = None,
-        draw_session: Callable[[], int] = new_session,
-    ) -> None:
-        if by_text:
-            if key:
+    hello: m.Hello
+    layout: Layout
+    config: LinkConfig
+    _: KW_ONLY
+    largest: int = NEAR
+    by_text: bool = False
+    key: Key | None = None
+    draw_session: Callable[[], int] = new_session
+
+    def __post_init__(self) -> None:
+        if self.by_text:
+            if self.key:
                 raise InputError("text codec: expected no key, got one: only binary can be sealed")
-            text.check_layout(layout)
-        check_size(max(layout.state.size, len(binary.encode(hello))), largest)
-        self.hello = hello
-        self.layout = layout
-        self.state: SimulatorState = "ready" if by_text else "idle"
+            text.check_layout(self.layout)
+        size = max(self.layout.state.size, len(binary.encode(self.hello)))
+        check_size(size, self.largest)
+        self.state: SimulatorState = "ready" if self.by_text else "idle"
         self.sequence = 0
         self.sends = self._tries = 0
         self._stretch = 1.0  # of the next wait, by the Alives for this State
         self.statistics = Statistics()
-        self.config = config
-        self._largest = largest
-        self.by_text = by_text
-        self.key = key
-        self._is_plain = not by_text and key is None
-        self._sealing = key  # from the Welcome on the key of the session
+        self._is_plain = not self.by_text and self.key is None
+        self._sealing = self.key  # from the Welcome on the key of the session
         self._nonce = 0
         self.tap: Tap | None = None
-        self._draw_session = draw_session
-        self._dice = Random(config.drop_seed) if config.drop else None
+        drop = self.config.drop
+        self._dice = Random(self.config.drop_seed) if drop else None
         self._is_queued = False
-        self._assembler = Assembler(layout.seeded_command.size)
+        self._assembler = Assembler(self.layout.seeded_command.size)
         self._transfer: Transfer | None = None  # of the outstanding message
         self._asking = b""  # the datagram that was sent last and wants an answer
         self.outgoing: list[bytes] = []
@@ -474,7 +469,7 @@ class Client:
 
     def begin_again(self, now: float) -> None:
         """Say Hello in a new session to an agent that knows nothing of this one, or is silent."""
-        self.hello = replace(self.hello, session=self._draw_session())
+        self.hello = replace(self.hello, session=self.draw_session())
         self.sequence = 0
         self._sealing = self.key
         self._is_queued = False
@@ -493,7 +488,7 @@ class Client:
             data = self._encode(message)
         if self.tap:
             self._record(message, data)
-        self._transfer = transfer = Transfer(data, self._largest)
+        self._transfer = transfer = Transfer(data, self.largest)
         self.state = after
         self.sequence = 0 if isinstance(message, m.Hello) else message.sequence
         self.sends = self._tries = 1

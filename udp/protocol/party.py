@@ -4,7 +4,7 @@ Free of sockets and clocks, as `client`: a driver hands in datagrams and the tim
 `step` and `answer`. `OneAgent` commands every drone; `SeveralAgents` share the drones of one world.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import inf
 from typing import Final, Literal, NamedTuple, Protocol
@@ -127,6 +127,7 @@ class AgentLink:
         return words
 
 
+@dataclass(eq=False)
 class WorldRules:
     """Base of the rules: the links, their timers and their ends.
 
@@ -139,16 +140,15 @@ class WorldRules:
         moved: Whether the world has moved since the driver looked.
     """
 
-    def __init__(
-        self, world: World, layout: Layout, period: float, links: Sequence[AgentLink]
-    ) -> None:
-        self.links = list(links)
+    world: World
+    layout: Layout
+    period: float  # of a control step, s
+    links: list[AgentLink]
+
+    def __post_init__(self) -> None:
         self.reason: str | None = None
         self.cause: Command | None = None
         self.moved = False
-        self._world = world
-        self._layout = layout
-        self._period = period
 
     def start(self, now: float) -> None:
         """Say Hello to every agent."""
@@ -190,9 +190,9 @@ class WorldRules:
             link.client.close(reason, now)
 
     def _reset_all(self, seeds: NDArray[np.uint64] | None) -> None:
-        actions = self._layout.actions
+        actions = self.layout.actions
         nothing = np.zeros(actions.shape, actions.dtype)
-        self._world.advance(nothing, np.ones(self._layout.drones, bool), seeds, None)
+        self.world.advance(nothing, np.ones(self.layout.drones, bool), seeds, None)
         self.cause = None
         self.moved = True
 
@@ -205,18 +205,17 @@ def first_seeds(seed: int, drones: int) -> NDArray[np.uint64]:
     return np.uint64(seed) + np.arange(drones, dtype=np.uint64)
 
 
+@dataclass(eq=False)
 class OneAgent(WorldRules):
     """One agent commands every drone, each by its own order."""
 
-    def __init__(
-        self, world: World, layout: Layout, period: float, links: Sequence[AgentLink]
-    ) -> None:
-        super().__init__(world, layout, period, links)
+    def __post_init__(self) -> None:
+        super().__post_init__()
         (self._link,) = self.links
         self._client = self._link.client
         self._message: Command | Welcome | None = None
         self._answers = False
-        self._all_fly = bytes(layout.drones)  # orders
+        self._all_fly = bytes(self.layout.drones)  # orders
 
     def start(self, now: float) -> None:
         """Say Hello; by text, where the agent says nothing before it, send the first State."""
@@ -250,12 +249,12 @@ class OneAgent(WorldRules):
         self._message = None
         self._answers = True
         if isinstance(message, Welcome):
-            self._reset_all(first_seeds(message.first_seed, self._layout.drones))
+            self._reset_all(first_seeds(message.first_seed, self.layout.drones))
             return False
         if message.orders.tobytes() == self._all_fly:
-            self._world.advance(message.actions, None, None, None)
+            self.world.advance(message.actions, None, None, None)
         else:
-            self._world.advance(message.actions, message.resets, message.seeds, message.frozen)
+            self.world.advance(message.actions, message.resets, message.seeds, message.frozen)
         self.cause = message
         self.moved = True
         return False
@@ -265,10 +264,10 @@ class OneAgent(WorldRules):
         if not self._answers:
             return
         self._answers = False
-        world = self._world
+        world = self.world
         client = self._client
         client.send_state(
-            client.sequence * self._period,
+            client.sequence * self.period,
             tuple(world.observations.values()),
             world.rewards,
             world.terminated,
@@ -281,6 +280,7 @@ class OneAgent(WorldRules):
         raise PeerSilent(why)
 
 
+@dataclass(eq=False)
 class SeveralAgents(WorldRules):
     """One world, in which each agent owns some of the drones.
 
@@ -297,25 +297,18 @@ class SeveralAgents(WorldRules):
         seed: Of the running episode; None: the streams of the episode before went on.
     """
 
-    def __init__(
-        self,
-        world: SwarmWorld,
-        layout: Layout,
-        period: float,
-        links: Sequence[AgentLink],
-        when_lost: str,
-        patience: float,
-    ) -> None:
-        super().__init__(world, layout, period, links)
+    world: SwarmWorld
+    when_lost: str
+    patience: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
         self.absences: list[Absence] = []
         self.episodes = self.steps = 0
         self.seed: int | None = None
-        self._swarm = world
-        self._when_lost = when_lost
-        self._patience = patience
         self._due: list[AgentLink] = []  # of States
-        if when_lost == "land":  # raises where the vehicle cannot
-            world.land(np.zeros(layout.drones, bool))
+        if self.when_lost == "land":  # raises where the vehicle cannot
+            self.world.land(np.zeros(self.layout.drones, bool))
 
     # ---- episodes and steps
 
@@ -366,7 +359,7 @@ class SeveralAgents(WorldRules):
 
     def _seeds(self, joining: list[AgentLink]) -> NDArray[np.uint64] | None:
         """As the agent of the first drone says, of those that begin; None if it gives none."""
-        drones = self._layout.drones
+        drones = self.layout.drones
         if not self.episodes:  # as a simulator of one agent
             return first_seeds(joining[0].seed, drones)
         commands = [link.command for link in joining if link.command]
@@ -375,7 +368,7 @@ class SeveralAgents(WorldRules):
 
     def _fly(self, flying: list[AgentLink]) -> None:
         """Fly the world for one control period."""
-        layout = self._layout
+        layout = self.layout
         actions = np.zeros(layout.actions.shape, layout.actions.dtype)
         if layout.choices:
             actions += (layout.choices - 1) // 2  # hold
@@ -387,7 +380,7 @@ class SeveralAgents(WorldRules):
             else:
                 staying.append(link)
                 actions[link.rows] = link.command.actions
-        self._world.advance(actions, None, None, None)
+        self.world.advance(actions, None, None, None)
         self.steps += 1
         orders = np.full(layout.drones, FLY, np.uint8)
         self.cause = Command(session=0, sequence=self.steps, actions=actions, orders=orders)
@@ -416,7 +409,7 @@ class SeveralAgents(WorldRules):
         if flew:
             self._let_go(link)
         if flew and why:
-            notice = f"{link.name} is lost ({why}): {self._when_lost}"
+            notice = f"{link.name} is lost ({why}): {self.when_lost}"
             link.client.statistics.notice(notice)
         if len(self._who("left")) == len(self.links):
             self.reason = why
@@ -425,16 +418,16 @@ class SeveralAgents(WorldRules):
         """Leave its drones to its policy."""
         absence = Absence(link.number, self.episodes, self.steps, link.participation)
         self.absences.append(absence)
-        mask = np.zeros(self._layout.drones, bool)
+        mask = np.zeros(self.layout.drones, bool)
         mask[link.rows] = True
-        if self._when_lost == "land":
-            self._swarm.land(mask)
-        elif self._when_lost == "end":
-            self._swarm.retire(mask)
+        if self.when_lost == "land":
+            self.world.land(mask)
+        elif self.when_lost == "end":
+            self.world.retire(mask)
 
     def _is_out(self, link: AgentLink) -> bool:
         """Whether all of its drones are out."""
-        return bool(self._swarm.out[link.rows].all())
+        return bool(self.world.out[link.rows].all())
 
     def _who(self, *wanted: Participation) -> list[AgentLink]:
         return [link for link in self.links if link.participation in wanted]
@@ -450,12 +443,12 @@ class SeveralAgents(WorldRules):
         """Send the States that are due."""
         due = self._due
         self._due = []
-        world = self._world
+        world = self.world
         for link in due:
             rows = link.rows
-            link.patient_until = now + self._patience
+            link.patient_until = now + self.patience
             link.client.send_state(
-                link.client.sequence * self._period,
+                link.client.sequence * self.period,
                 tuple(array[rows] for array in world.observations.values()),
                 world.rewards[rows],
                 world.terminated[rows],
@@ -476,7 +469,7 @@ class SeveralAgents(WorldRules):
         """Resend what is due, and lose agents that were silent for too long."""
         for link in self._who("flying"):
             if link.command is None and now >= link.patient_until:
-                self._lose(link, "coming", f"no Command for {self._patience:g} s")
+                self._lose(link, "coming", f"no Command for {self.patience:g} s")
                 link.client.begin_again(now)
         super().handle_timers(now)
 
