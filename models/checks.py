@@ -19,7 +19,7 @@ from typing import Final
 
 import mujoco
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from .fields import check_names
 from .mjcf import vehicle_spec
@@ -32,6 +32,8 @@ _HEIGHT: Final = 1000.0  # m: flights begin here, and none reaches the floor
 _SPIN: Final = np.array((1.0, 2.0, 3.0)) / math.sqrt(14)  # an axis that is no axis of symmetry
 _FASTEST_TURN: Final = math.radians(2000)  # rad/s: the range of common gyroscopes (Bosch BMI088)
 
+_THRUSTS: Final = mujoco.mjtDisableBit.mjDSBL_ACTUATION
+_CONTACTS: Final = mujoco.mjtDisableBit.mjDSBL_CONTACT
 _EXACT: Final = 1e-9  # tolerance where the integrator is exact: the rounding errors of a flight
 _RELATIVE: Final = 1e-6  # tolerance of measured masses, inertias and thrusts
 _ATTITUDE: Final = math.radians(0.01)  # rad: error of a second that a physics step may make
@@ -103,24 +105,13 @@ def _judged(
     note: str = "",
 ) -> Check:
     """A check by its row of `RULES`; limits around `expected` replace those of the row."""
-    rule = RULES[key]
-    low = rule.low
-    high = rule.high
+    values = dict(vars(RULES[key]))
+    values["meaning"] = values["meaning"].format(*of)
     if expected is not None:
-        low = expected - tolerance
-        high = expected + tolerance
-    return Check(
-        equation=rule.equation,
-        source=rule.source,
-        meaning=rule.meaning.format(*of),
-        low=low,
-        high=high,
-        unit=rule.unit,
-        name=key.format(*of),
-        measured=float(measured),
-        expected=expected,
-        note=note,
-    )
+        values["low"] = expected - tolerance
+        values["high"] = expected + tolerance
+    name = key.format(*of)
+    return Check(**values, name=name, measured=float(measured), expected=expected, note=note)
 
 
 def failed(checks: Iterable[Check]) -> list[Check]:
@@ -142,25 +133,21 @@ class _Craft:
         self.model.opt.viscosity = 0.0
         self.model.opt.wind = 0.0
         self.moments: Array = np.linalg.eigvalsh(self.vehicle.inertia)
-        places = [np.array(rotor.position) for rotor in self.vehicle.rotors]
-        apart = np.array(places) - self.vehicle.center_of_mass
+        places = np.array([rotor.position for rotor in self.vehicle.rotors])
+        apart = places - self.vehicle.center_of_mass
         self.arm = max(float(np.linalg.norm(apart[:, :2], axis=1).mean()), 1e-12)
 
-    def falling(self, contact: bool = False, **options: ArrayLike) -> mujoco.MjModel:
-        """A copy of the model without thrusts, not even the least, and with other `opt` fields."""
-        model = copy.copy(self.model)
-        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
-        if not contact:
-            model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
-        for name, value in options.items():
-            setattr(model.opt, name, value)
-        return model
+    def at_rest(self, *disabled: mujoco.mjtDisableBit) -> tuple[mujoco.MjModel, mujoco.MjData]:
+        """A copy of the model with some features off, and the craft level, at rest, at `_HEIGHT`.
 
-    def ready(self, model: mujoco.MjModel) -> mujoco.MjData:
-        """The craft level, at rest, at `_HEIGHT`."""
+        Without actuation there is no thrust, not even the least.
+        """
+        model = copy.copy(self.model)
+        for bit in disabled:
+            model.opt.disableflags |= bit
         data = mujoco.MjData(model)
         data.qpos[:] = (0.0, 0.0, _HEIGHT, 1.0, 0.0, 0.0, 0.0)
-        return data
+        return model, data
 
     @cached_property
     def convergence(self) -> "_Convergence":
@@ -178,8 +165,9 @@ class _Craft:
 
     def _tumble(self, turn: float, step: float) -> Array:
         """Attitude after `_TURN` at a rate, rad/s, and a physics step, s."""
-        model = self.falling(gravity=np.zeros(3), timestep=step)
-        data = self.ready(model)
+        model, data = self.at_rest(_THRUSTS, _CONTACTS)
+        model.opt.gravity = 0.0
+        model.opt.timestep = step
         data.qvel[3:] = turn * _SPIN
         data.qfrc_applied[3] = 0.05 * self.moments[0] * turn**2  # a sphere turns exactly without
         _fly(model, data, _TURN / turn)
@@ -241,8 +229,7 @@ def _gravity(craft: _Craft) -> Iterator[Check]:
 
 def _inertia(craft: _Craft) -> Iterator[Check]:
     mass = craft.vehicle.mass
-    model = craft.falling()
-    data = craft.ready(model)
+    model, data = craft.at_rest(_THRUSTS)
     force = np.array((1.0, 0.0, 0.0))
     data.qfrc_applied[:] = (*force, *np.cross(craft.vehicle.center_of_mass, force))
     mujoco.mj_forward(model, data)
@@ -272,10 +259,10 @@ def _units(craft: _Craft) -> Iterator[Check]:
 
 
 def _rotors(craft: _Craft) -> Iterator[Check]:
-    data = craft.ready(craft.model)
+    model, data = craft.at_rest()
     data.ctrl[:] = [rotor.high / rotor.newtons for rotor in craft.vehicle.rotors]
-    mujoco.mj_forward(craft.model, data)
-    forces = data.actuator_force * np.linalg.norm(craft.model.actuator_gear[:, :3], axis=1)
+    mujoco.mj_forward(model, data)
+    forces = data.actuator_force * np.linalg.norm(model.actuator_gear[:, :3], axis=1)
     for rotor, newtons in zip(craft.vehicle.rotors, np.abs(forces), strict=True):
         off = abs(newtons - rotor.high) / max(abs(rotor.high), _TINY)
         key = "effect of {}: error per newton"
@@ -321,8 +308,7 @@ def _hover(craft: _Craft) -> Iterator[Check]:
 
 
 def _free_fall(craft: _Craft) -> Iterator[Check]:
-    model = craft.falling()
-    data = craft.ready(model)
+    model, data = craft.at_rest(_THRUSTS, _CONTACTS)
     seconds = _fly(model, data, 2.0)
     depth = craft.vehicle.gravity * seconds**2 / 2
     fallen = _HEIGHT - float(data.qpos[2])
@@ -373,8 +359,7 @@ def _physics_step(craft: _Craft) -> Iterator[Check]:
 
 def _floor(craft: _Craft) -> Iterator[Check]:
     rest = craft.vehicle.rest_height
-    model = craft.falling(contact=True)
-    data = craft.ready(model)
+    model, data = craft.at_rest(_THRUSTS)
     data.qpos[2] = rest + 0.05
     _fly(model, data, 2.0)
     yield _judged("floor: height at rest", data.qpos[2], expected=rest, tolerance=1e-3)

@@ -288,18 +288,18 @@ _PLAIN: Mapping[object, Rule] = {
 
 
 def _rule_of(hint: object) -> Rule | None:
-    arguments = get_args(hint)
-    if get_origin(hint) in (Union, UnionType) and NoneType in arguments:
-        others = [one for one in arguments if one is not NoneType]
-        rule = _rule_of(others[0]) if len(others) == 1 else None
-        return OrNone(rule) if rule else None
+    kinds = get_args(hint)
     if get_origin(hint) is Annotated:
-        rules = [one for one in arguments[1:] if hasattr(one, "expected")]
-        may_be_none = NoneType in get_args(arguments[0])
-        return OrNone(rules[0]) if rules and may_be_none else next(iter(rules), None)
-    if get_origin(hint) is Literal and all(isinstance(word, str) for word in arguments):
-        return Choice(arguments)
-    return _PLAIN.get(hint)
+        rule: Rule | None = next((mark for mark in kinds[1:] if hasattr(mark, "expected")), None)
+        kinds = get_args(kinds[0])
+    elif get_origin(hint) in (Union, UnionType):
+        others = [kind for kind in kinds if kind is not NoneType]
+        rule = _rule_of(others[0]) if len(others) == 1 else None
+    elif get_origin(hint) is Literal and all(isinstance(word, str) for word in kinds):
+        rule = Choice(kinds)
+    else:
+        rule = _PLAIN.get(hint)
+    return OrNone(rule) if rule and NoneType in kinds else rule
 
 
 def _digits(value: float) -> str:
