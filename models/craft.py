@@ -14,12 +14,11 @@ from .cameras import place_camera
 from .coefficients import PREFIX
 from .errors import InputError
 from .files import find_in_package
-from .vehicle_file import UP, Box, Cylinder, PlacedRotor, VehicleFile
+from .vehicle_file import ORIGIN, UP, Box, Cylinder, PlacedRotor, VehicleFile
 
 Vector = Sequence[float] | np.ndarray
 Colour = tuple[float, float, float, float]
 
-_ORIGIN: Final = (0.0, 0.0, 0.0)
 DEFAULT_TIMESTEP: Final = 0.01
 """Physics step of a file without one, s."""
 DEFAULT_GRAVITY: Final = 9.81
@@ -121,7 +120,7 @@ def _build(spec: mujoco.MjSpec, file: VehicleFile) -> None:
     Missing lengths are those of quad.xml, in the proportion of the spans.
     """
     spec.compiler.degree = False
-    rotors = [(rotor, rotor.position or _ORIGIN) for rotor in file.rotors.list]
+    rotors = [(rotor, rotor.position or ORIGIN) for rotor in file.rotors.list]
     reach = max(math.hypot(*place) for _, place in rotors)
     reach = max(reach, file.rotors.radius or 0.0, 1e-2)
     unit = reach / math.sqrt(2)  # 1 m of quad.xml
@@ -149,7 +148,7 @@ def _build(spec: mujoco.MjSpec, file: VehicleFile) -> None:
     radius = file.rotors.radius or 0.4 * _nearest([place for _, place in rotors], reach)
     for number, (rotor, place) in enumerate(rotors, 1):
         if not file.body.parts and math.hypot(*place[:2]) > half[0]:
-            ends = (*_ORIGIN, *place)
+            ends = (*ORIGIN, *place)
             _add_geom(body, f"arm{number}", _CYLINDER, _CARBON, (0.035 * unit,), fromto=ends)
         up = _scaled(rotor.axis, 0.09 * unit / math.hypot(*rotor.axis))
         above = np.add(place, up)
@@ -289,7 +288,7 @@ def _rotor_site(
     for joint in list(body.joints):  # a propeller that turns is welded on
         if joint.type != mujoco.mjtJoint.mjJNT_FREE:
             spec.delete(joint)
-    place = rotor.position or _ORIGIN
+    place = rotor.position or ORIGIN
     if file.rotors.radius is not None:
         _add_disc(body, "", rotor, file.rotors.radius, place, _DISC)
     return body.add_site(name=f"rotor/{rotor.name}", pos=place, group=4)

@@ -26,6 +26,7 @@ _Place = Annotated[_Vector, Limits(-100.0, 100.0, "m", count=3)]
 _Mass = Annotated[float, Limits(1e-6, 1e6, "kg")]
 _Length = Annotated[float, Limits(1e-5, 100.0, "m")]
 
+ORIGIN: Final = (0.0, 0.0, 0.0)
 AHEAD: Final = (1.0, 0.0, 0.0)
 UP: Final = (0.0, 0.0, 1.0)
 _MAX_BYTES: Final = 1_000_000  # it is read within a few seconds
@@ -56,7 +57,7 @@ class Box:
 
     shape: str
     mass: _Mass
-    position: _Place = (0.0, 0.0, 0.0)
+    position: _Place = ORIGIN
     size: Annotated[_Vector, Limits(1e-5, 100.0, "m", count=3)]
     """Sides along x, y and z."""
     yaw: Annotated[float, Limits(-2 * math.pi, 2 * math.pi, "rad")] = 0.0
@@ -68,7 +69,7 @@ class Cylinder:
 
     shape: str
     mass: _Mass
-    position: _Place = (0.0, 0.0, 0.0)
+    position: _Place = ORIGIN
     radius: _Length
     length: _Length
     axis: _Axis = UP
@@ -80,7 +81,7 @@ class Body:
 
     mass: float | None = optional(1e-6, 1e6, "kg")
     inertia: tuple[float, ...] | None = optional(-1e9, 1e9, "kg m²", count=None)
-    center_of_mass: _Place = (0.0, 0.0, 0.0)
+    center_of_mass: _Place = ORIGIN
     size: tuple[float, float, float] | None = optional(1e-4, 100.0, "m", count=3)
     ground_clearance: float | None = optional(1e-4, 100.0, "m")
     parts: tuple[Box | Cylinder, ...] = ()
@@ -141,7 +142,7 @@ class CameraTable:
     """A camera."""
 
     name: Annotated[str, Text(MAX_LETTERS, identifier=True)]
-    position: _Place = (0.0, 0.0, 0.0)
+    position: _Place = ORIGIN
     look: _Axis = AHEAD
     up: _Axis | None = None
     fovy: Annotated[float, Limits(*FOVY, "rad")] = math.pi / 2
@@ -380,21 +381,19 @@ def _body(numbers: list[Number], given: object, model: Path | None) -> Body:
     if given is None:
         raise InputError("vehicle: expected a table [body], or [model] with a file, got neither")
     table = _mapping(given, "body")
-    of_parts: list[Number] = []
-    parts = _listed(table.get("parts", ()), "body.parts")
-    table["parts"] = tuple(_part(of_parts, one, where) for where, one in parts)
+    listed = _listed(table.pop("parts", ()), "body.parts")
     body = _table(numbers, Body, table, "body")
-    numbers += of_parts
+    parts = tuple(_part(numbers, one, where) for where, one in listed)
     own = [key for key in ("mass", "inertia") if key in table]
-    if body.parts and own:
+    if parts and own:
         raise InputError(f"body: expected parts, or mass and inertia, got {', '.join(own)} too")
-    if not body.parts and len(own) < 2:
+    if not parts and len(own) < 2:
         raise InputError(
             f"body: expected mass and inertia, or parts, got {''.join(own) or 'neither'}"
         )
     if body.inertia is not None:
         _check_inertia(body.inertia)
-    return body
+    return replace(body, parts=parts)
 
 
 def _part(numbers: list[Number], given: object, where: str) -> Box | Cylinder:
@@ -411,11 +410,10 @@ def _rotors(numbers: list[Number], given: object, model: Path | None) -> RotorTa
     if given is None and not mjcf:
         raise InputError("vehicle: expected a table [rotors], got none")
     table = _mapping({} if given is None else given, "rotors")
-    of_list: list[Number] = []
     listed = enumerate(_listed(table.pop("list", ()), "rotors.list"), 1)
-    placed = tuple(_rotor(of_list, one, where, i, model) for i, (where, one) in listed)
-    rotors = _table(numbers, RotorTable, table | {"list": placed}, "rotors")
-    numbers += of_list
+    rotors = _table(numbers, RotorTable, table, "rotors")
+    placed = tuple(_rotor(numbers, one, where, i, model) for i, (where, one) in listed)
+    rotors = replace(rotors, list=placed)
     if mjcf and not placed and rotors.frame is None:  # those of the file
         for key, value in table.items():
             if f"rotors.{key}" not in COEFFICIENTS and key != "source":
