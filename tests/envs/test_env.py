@@ -294,21 +294,13 @@ def test_telemetry_has_z_up() -> None:
     )
 
 
-OPTIONS = st.fixed_dictionaries(
-    {
-        "action": st.sampled_from(["increment", "offset"]),
-        "observation": st.sampled_from(["full", "error"]),
-        "control_period": st.sampled_from([0.01, 0.02, 0.1, 1.0]),
-        "effects": st.sampled_from([{}, {}, {"linear_drag": 2.0}, {"linear_drag": 100.0}]),
-        "thrust_scale": st.sampled_from([None, 100.0]),
-        "flight_band": st.sampled_from([1.01, 3.0, 20.0]),
-        "target": st.sampled_from([2.0, 5.0, (2.0, 30.0)]),
-    }
-)
+CHOICES: dict[str, Any] = TABLES["env: options whose bounds are never left"]
+OPTIONS = st.fixed_dictionaries({name: st.sampled_from(values) for name, values in CHOICES.items()})
+PIECE = st.tuples(st.floats(-1, 1), st.integers(1, 60))
 
 
 @settings(max_examples=40, deadline=None)
-@given(OPTIONS, st.integers(0, 2**32), st.lists(st.tuples(st.floats(-1, 1), st.integers(1, 60))))
+@given(OPTIONS, st.integers(0, 2**32), st.lists(PIECE))
 def test_bounds_are_never_left(
     options: dict[str, Any], seed: int, pieces: list[tuple[float, int]]
 ) -> None:

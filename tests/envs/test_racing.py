@@ -18,13 +18,7 @@ from flights import Shares, state_of, task_of
 ID = "rotorgram/Racing-v0"
 NOW = np.bool_(True)
 # Along x, then a turn to the left: a gate at x = 2, one at y = 3; start at the origin, 5 m high.
-TRACK = json.dumps({
-    "gates": [
-        {"position": [2, 0, 5], "heading": 0, "size": 1.0},
-        {"position": [2, 3, 5], "heading": 90, "size": 2.0},
-    ],
-    "start": {"position": [0, 0, 5], "heading": 90},
-})  # fmt: skip
+TRACK = json.dumps(TABLES["racing: TRACK"])
 
 
 def begun(**options: Any) -> Any:

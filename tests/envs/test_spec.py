@@ -97,15 +97,19 @@ def arrays(draw: st.DrawFn) -> ArraySpec:
     wide = draw(st.booleans())
     least = np.min(low)
     high = math.inf if wide else np.maximum(low, least).max() + draw(st.floats(0, 10))
+    dtype = draw(st.sampled_from(["float32", "float64", "uint8", "int32", "int64"]))
+    unit = draw(st.one_of(WORDS, st.just(("m",) * size)))
+    names = tuple(f"c{index}" for index in range(size))
+    components = draw(st.sampled_from([(), names]))
     return ArraySpec(
         name=draw(WORDS),
         shape=shape,
-        dtype=draw(st.sampled_from(["float32", "float64", "uint8", "int32", "int64"])),
+        dtype=dtype,
         low=tuple(low) if isinstance(low, list) else low,
         high=high,
-        unit=draw(st.one_of(WORDS, st.just(("m",) * size))),
+        unit=unit,
         frame=draw(WORDS),
-        components=draw(st.sampled_from([(), tuple(f"c{i}" for i in range(size))])),
+        components=components,
     )
 
 
@@ -117,14 +121,18 @@ def specs(draw: st.DrawFn) -> EnvSpec:
         ArraySpec(name="metrics", shape=(1,), dtype="float64", components=(metric.name,))
         for metric in metrics
     )
+    options = st.dictionaries(WORDS, st.one_of(NUMBERS, WORDS, st.lists(NUMBERS)))
+    agents = draw(st.lists(WORDS, min_size=1, max_size=3, unique=True))
+    choices = st.builds(Discrete, n=st.integers(1, 1 << 24))
+    action = draw(st.one_of(arrays(), choices))
     return spec_of(
-        options=draw(st.dictionaries(WORDS, st.one_of(NUMBERS, WORDS, st.lists(NUMBERS)))),
+        options=draw(options),
         control_period=draw(st.floats(1e-6, 1e3)),
         vehicle=draw(WORDS),
         vehicle_hash="0123456789abcdef" * 2,
-        agents=tuple(draw(st.lists(WORDS, min_size=1, max_size=3, unique=True))),
+        agents=tuple(agents),
         observation=tuple(seen),
-        action=draw(st.one_of(arrays(), st.builds(Discrete, n=st.integers(1, 1 << 24)))),
+        action=action,
         telemetry=told,
         metrics=metrics,
     )
