@@ -13,6 +13,7 @@ import gymnasium as gym
 import numpy as np
 
 from ...envs.config import DEFAULT_ENV, EnvConfig
+from ...envs.spec import EnvSpec
 from ...models.errors import InputError, NotCopied
 from ...models.fields import Choice, Limits, check
 from ..layouts import layout_of
@@ -82,6 +83,10 @@ class Simulator(NotCopied):
         OSError: The port is in use, or the record cannot be written.
     """
 
+    observer: Observer | None = None
+    _stopped = _ran = False
+    _journal: "Journal | None" = None
+
     def __init__(
         self,
         env: str | EnvConfig | GymEnv = DEFAULT_ENV,
@@ -103,14 +108,13 @@ class Simulator(NotCopied):
         check("patience", Limits(0, unit="s", above=True), patience)
         check("when_lost", Choice(POLICIES), when_lost)
         by_text = codec == "text"
-        if agents is not None and not agents:
-            raise InputError("agents: expected one address or more, got none")
-        if agents is not None and (by_text or record or num_envs):
-            raise InputError("agents: expected neither text, record nor num_envs with several")
-        config = config or LinkConfig()
+        if agents is not None:
+            if not agents:
+                raise InputError("agents: expected one address or more, got none")
+            if by_text or record or num_envs:
+                raise InputError("agents: expected neither text, record nor num_envs with several")
         key = Key(read_keys(key_file)[0], "simulator") if key_file else None
         insecure = insecure or key is not None
-        way_out = TEXT_WAY_OUT if by_text else WAY_OUT
         with ExitStack() as failing:  # closes what is open if a later step fails
             stepped = make_stepped(env, num_envs, keywords)
             failing.callback(stepped.close)
@@ -118,22 +122,10 @@ class Simulator(NotCopied):
             worlds = stepped.num_envs // len(spec.agents)
             layout = layout_of(spec, worlds)
             servers = [server] if agents is None else list(agents)
-            links: list[AgentLink] = []
-            for number, address in enumerate(servers):
-                there = resolve(address, insecure=insecure, way_out=way_out)
-                if not there[1]:
-                    raise InputError("server: expected the port of the agent, 1 to 65535, got 0")
-                rows = _share(len(spec.agents), number, len(servers))
-                own = replace(spec, agents=spec.agents[rows[0] : rows[-1] + 1])
-                client = Client(
-                    Hello(session=new_session(), spec=own.to_json(), worlds=worlds),
-                    layout_of(own, worlds),
-                    replace(config, drop_seed=config.drop_seed + number),
-                    largest=largest_datagram(there, config.max_datagram),
-                    by_text=by_text,
-                    key=key,
-                )
-                links.append(AgentLink(number, there, client, rows))
+            times = config or LinkConfig()
+            links = _links(
+                spec, worlds, servers, times, insecure=insecure, by_text=by_text, key=key
+            )
             port = _open_port(bind, [link.address for link in links], insecure=insecure)
             failing.callback(port.close)
             rules: Rules
@@ -149,13 +141,10 @@ class Simulator(NotCopied):
             self.stepped = stepped
             self.spec = spec
             self.address: Address = port.address
-            self.observer: Observer | None = None
             self.rules = rules
             self._port = port
             self._receive = port.receiver()
             self._by_address = {link.address: link for link in links}
-            self._stopped = self._ran = False
-            self._journal: Journal | None = None
             if record:
                 self._record(record)
             failing.pop_all()
@@ -321,6 +310,37 @@ def _share(drones: int, number: int, agents: int) -> np.ndarray:
         raise InputError(f"agents: expected a divisor of {drones} drones, got {agents} agents")
     share = drones // agents
     return number * share + np.arange(share)
+
+
+def _links(
+    spec: EnvSpec,
+    worlds: int,
+    servers: Sequence[Address],
+    config: LinkConfig,
+    *,
+    insecure: bool,
+    by_text: bool,
+    key: Key | None,
+) -> list[AgentLink]:
+    """A client for each agent, with a session of its own."""
+    way_out = TEXT_WAY_OUT if by_text else WAY_OUT
+    links = []
+    for number, address in enumerate(servers):
+        there = resolve(address, insecure=insecure, way_out=way_out)
+        if not there[1]:
+            raise InputError("server: expected the port of the agent, 1 to 65535, got 0")
+        rows = _share(len(spec.agents), number, len(servers))
+        own = replace(spec, agents=spec.agents[rows[0] : rows[-1] + 1])
+        client = Client(
+            Hello(session=new_session(), spec=own.to_json(), worlds=worlds),
+            layout_of(own, worlds),
+            replace(config, drop_seed=config.drop_seed + number),
+            largest=largest_datagram(there, config.max_datagram),
+            by_text=by_text,
+            key=key,
+        )
+        links.append(AgentLink(number, there, client, rows))
+    return links
 
 
 def _open_port(bind: Address, agents: list[Address], *, insecure: bool) -> Port:
