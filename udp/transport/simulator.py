@@ -129,15 +129,14 @@ class Simulator(NotCopied):
             port = _open_port(bind, [link.address for link in links], insecure=insecure)
             failing.callback(port.close)
             rules: Rules
+            period = spec.control_period
             if agents is None:
-                rules = OneAgent(stepped, layout, spec.control_period, links)
+                rules = OneAgent(stepped, layout, period, links)
             elif isinstance(stepped, GymnasiumWorld):
                 raise InputError(f"env: expected a registered task for several drones, got {env!r}")
             else:
                 world = cast(SwarmWorld, stepped)
-                rules = SeveralAgents(
-                    world, layout, spec.control_period, links, when_lost, patience
-                )
+                rules = SeveralAgents(world, layout, period, links, when_lost, patience)
             self.stepped = stepped
             self.spec = spec
             self.address: Address = port.address
