@@ -152,14 +152,13 @@ def _distribution(name: str, text: object) -> tuple[str, tuple[float, ...]]:
 
 
 def _is_right(kind: str, numbers: tuple[float, ...], limits: Parameter) -> bool:
-    low = limits.low
-    high = limits.high
+    within = [limits.low <= number <= limits.high for number in numbers]
     if kind == "choice":
-        return bool(numbers) and all(low <= number <= high for number in numbers)
+        return bool(numbers) and all(within)
     if len(numbers) != 2:
         return False
     first, second = numbers
     if kind == "normal":
-        return low <= first <= high and 0 <= second < math.inf
-    is_ordered = low <= first <= second <= high
+        return within[0] and 0 <= second < math.inf
+    is_ordered = all(within) and first <= second
     return is_ordered and (kind == "uniform" or (kind == "loguniform" and first > 0))

@@ -9,12 +9,13 @@ import numpy as np
 
 from ...models.fields import Limits
 from ..rotations import advanced, between, cross, parts_of, to_world, world_z
-from ..state import Array, WorldState, chosen, clip, component, stack
+from ..state import Array, WorldState, chosen, clip, component, each, stack
 from .base import FURTHEST, MAX_SPEED, UNIT, Setting, Source, Values
 from .channel import Channel
 from .magnetometer import FIELD
 
 _TIME: Final = Setting(1.0, Limits(1e-3, 1e4, "s"))
+_UP: Final = np.array((0.0, 0.0, 1.0))
 _PARTS: Final = ("position", "velocity", "quaternion", "body_rates")
 
 
@@ -82,8 +83,7 @@ class Estimator(Source):
         rates = imu[..., :3]
         force = imu[..., 3:]
         turned = advanced(self.quaternion, rates * period + self._correction(force, channels))
-        gravity = np.array((0.0, 0.0, self._gravity))
-        acceleration = to_world(turned, force) - gravity
+        acceleration = to_world(turned, force) - self._gravity * _UP
         position = self.position + period * self.velocity + 0.5 * period**2 * acceleration
         velocity = self.velocity + period * acceleration
         position, velocity = self._followed(position, velocity, channels)
@@ -101,11 +101,11 @@ class Estimator(Source):
             field = to_world(self.quaternion, channel.value)
             off = self._north - np.atan2(component(field, 1), component(field, 0))
             off = np.atan2(np.sin(off), np.cos(off)) * self._gain(channel, "attitude_time")
-            angle = angle + stack((off,)) * up
+            angle = angle + each(off) * up
         if channel := channels.get("motion_capture"):
             error = between(self.quaternion, channel.value[..., 3:])
             sign = 2.0 * self._gain(channel, "attitude_time") * np.sign(component(error, 0))
-            angle = angle + stack((sign,)) * error[..., 1:]
+            angle = angle + each(sign) * error[..., 1:]
         return angle
 
     def _followed(
@@ -113,18 +113,17 @@ class Estimator(Source):
     ) -> tuple[Array, Array]:
         """Position and velocity, corrected by fresh readings."""
         if channel := channels.get("barometer"):
-            zero = 0.0 * component(position, 2)
             off = component(channel.value, 0) - self._altitude - component(position, 2)
             g, h = self._gains(channel, "height_time")
-            position = position + stack((zero, zero, g * off))
-            velocity = velocity + stack((zero, zero, h * off))
+            position = position + each(g * off) * _UP
+            velocity = velocity + each(h * off) * _UP
         if channel := channels.get("motion_capture"):
             g, h = self._gains(channel, "position_time")
             off = channel.value[..., :3] - position
-            position = position + stack((g,)) * off
-            velocity = velocity + stack((h,)) * off
+            position = position + each(g) * off
+            velocity = velocity + each(h) * off
         if channel := channels.get("gps"):
-            gain = stack((self._gain(channel, "position_time"),))
+            gain = each(self._gain(channel, "position_time"))
             position = position + gain * (channel.value[..., :3] - position)
             velocity = velocity + gain * (channel.value[..., 3:] - velocity)
         return position, velocity
