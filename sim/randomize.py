@@ -5,8 +5,10 @@ A parameter is a factor of the vehicle's own value, 1 being that value, or a num
 
 import math
 import re
-from collections.abc import Mapping
+import tomllib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -29,36 +31,14 @@ class Parameter:
     unit: str
     """Empty for a factor."""
     meaning: str
-    needs: tuple[str, ...] = ()
+    needs: Sequence[str] = ()
     """At least one of these effects must be on."""
 
 
-MAX_ROTORS: Final = 8  # Rotors whose thrust can be drawn on its own
-_AIR: Final = ("body_drag", "rotor_drag")
-PARAMETERS: Final = {
-    "mass": Parameter(0.1, 10.0, "", "mass of the vehicle; its inertia goes with it"),
-    "inertia": Parameter(0.1, 10.0, "", "inertia of the vehicle, besides what its mass does"),
-    "center_x": Parameter(-10.0, 10.0, "m", "shift of the center of mass, forward"),
-    "center_y": Parameter(-10.0, 10.0, "m", "shift of the center of mass, to the left"),
-    "center_z": Parameter(-10.0, 10.0, "m", "shift of the center of mass, up"),
-    "reaction": Parameter(0.0, 10.0, "", "torque of every rotor about its axis, per thrust"),
-    "payload": Parameter(0.1, 10.0, "", "mass of the payload", ("payload",)),
-    "thrust": Parameter(0.0, 10.0, "", "thrust of every rotor at the same command"),
-    **{
-        f"thrust_{n}": Parameter(0.0, 10.0, "", f"thrust of rotor {n} at the same command")
-        for n in range(1, MAX_ROTORS + 1)
-    },
-    "time_constant": Parameter(0.01, 100.0, "", "time constant of the rotors", ("motor_lag",)),
-    "battery_charge": Parameter(0.0, 1.0, "1", "charge at the start", ("battery",)),
-    "body_drag": Parameter(0.0, 10.0, "", "drag of the body", ("body_drag",)),
-    "rotor_drag": Parameter(0.0, 10.0, "", "drag and inflow of the rotors", ("rotor_drag",)),
-    "wind_x": Parameter(-100.0, 100.0, "m/s", "wind along x, besides the option's", _AIR),
-    "wind_y": Parameter(-100.0, 100.0, "m/s", "wind along y, besides the option's", _AIR),
-    "wind_z": Parameter(-100.0, 100.0, "m/s", "wind upwards, besides the option's", _AIR),
-    "gusts": Parameter(0.0, 10.0, "", "speed of the gusts", ("gusts",)),
-    "action_delay": Parameter(0, 100, "steps", "control steps before an action takes effect"),
-    "observation_delay": Parameter(0, 100, "steps", "age of an observation, control steps"),
-}
+_FILE: Final = Path(__file__).parent / "parameters.toml"
+_TABLES: Final = tomllib.loads(_FILE.read_text(encoding="utf-8"))
+PARAMETERS: Final = {name: Parameter(**table) for name, table in _TABLES.items()}
+"""What can be drawn, by name."""
 CENTER: Final = ("center_x", "center_y", "center_z")
 WHOLE: Final = ("action_delay", "observation_delay")
 """Parameters that are whole numbers; a uniform draw gives each the same chance."""
