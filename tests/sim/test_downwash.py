@@ -107,7 +107,8 @@ def test_rotors_in_the_jet_lose_thrust_by_their_inflow() -> None:
     speeds = np.sqrt(world.vehicle.hover_thrust / rotors.thrust_coefficient)
     lost = rotors.inflow * speeds.sum() * jet(5.0)
     expected = -lost / MASS * world.vehicle.timestep
-    assert hover(world)[1, 2] == approx(expected, rel=1e-3)
+    found = hover(world)[1, 2]
+    assert found == approx(expected, rel=1e-3)
 
 
 def test_a_tilted_craft_blows_along_its_own_axis() -> None:

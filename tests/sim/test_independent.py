@@ -58,9 +58,11 @@ def test_without_thrust_it_falls_along_a_parabola_and_keeps_its_angular_momentum
     ):
         t = 0.02 * step
         fallen = origin + center + velocity * t + DOWN * t * t / 2
-        assert position + rotation(q) @ center == approx(fallen, abs=1e-9)
+        found = position + rotation(q) @ center
+        assert found == approx(fallen, abs=1e-9)
         momentum = rotation(q) @ (np.array((4e-3, 5e-3, 8e-3)) * rates)
-        assert momentum == approx((2e-3, -2e-3, 2.4e-3), abs=1e-12)
+        expected = (2e-3, -2e-3, 2.4e-3)
+        assert momentum == approx(expected, abs=1e-12)
 
 
 def test_linear_drag_alike_in_all_directions_gives_an_exponential() -> None:
@@ -77,7 +79,8 @@ def test_linear_drag_alike_in_all_directions_gives_an_exponential() -> None:
     centers = [
         flight.position[i] + rotation(flight.quaternion[i]) @ center for i in (0, -1)
     ]  # fmt: skip
-    assert centers[1] - centers[0] == approx(moved, abs=1e-9)
+    found = centers[1] - centers[0]
+    assert found == approx(moved, abs=1e-9)
 
 
 def test_a_rotor_lags_and_drags_as_worked_out_by_hand() -> None:
@@ -125,7 +128,8 @@ def test_the_thrusts_vary_and_turn_the_smallest_as_fast_as_the_page_says() -> No
     given = thrusts(VEHICLES["tiny"])
     assert given.shape == (500, 4)
     expected = 0.3 / sqrt(3) * 0.0662
-    assert given.std(axis=0) == approx(expected, rel=0.1)
+    found = given.std(axis=0)
+    assert found == approx(expected, rel=0.1)
     flight = independent(VEHICLES["tiny"], given[:250], {}, 1e-9)
     assert 5 < np.linalg.norm(flight.rates, axis=1).max() < 35
 
@@ -174,7 +178,8 @@ def test_a_table_is_read_as_it_was_written(tmp_path: Path) -> None:
     again = read_rows(tmp_path / "new" / "table.csv", Row)
     assert [row.vehicle for row in again] == ["racer", "racer"]
     assert [row.step_ms for row in again] == [10.0, 5.0]
-    assert again[0].position_m == approx(rows[0].position_m, rel=1e-3)
+    expected = rows[0].position_m
+    assert again[0].position_m == approx(expected, rel=1e-3)
 
 
 def test_the_page_shows_the_committed_table_of_every_vehicle() -> None:
@@ -194,7 +199,8 @@ def test_the_committed_flights_fly_again_alike() -> None:
     (told,) = (r for r in read_rows(FLIGHTS, Row) if r.vehicle == "tiny" and r.of_file)
     (row,) = compare("tiny", VEHICLES["tiny"], ["none"], [0.005])
     for name in ("fastest_rad_s", "fastest_m_s", "position_m", "attitude_deg"):
-        assert getattr(row, name) == approx(getattr(told, name), rel=0.02)
+        expected = getattr(told, name)
+        assert getattr(row, name) == approx(expected, rel=0.02)
 
 
 def test_the_page_shows_the_committed_flights_beside_rotorpy() -> None:

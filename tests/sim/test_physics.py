@@ -88,8 +88,10 @@ def test_two_seconds_at_equal_thrusts(asked: float, given: float) -> None:
     data = ready(vehicle, asked)
     fly(vehicle, data, 2.0)
     climb = 4 * given / MASS - GRAVITY  # -9.8, 0 and 10.2 m/s²
-    assert data.qpos[2] - 1000 == approx(2 * climb, abs=1e-9)
-    assert data.qpos[:2] == approx([0, 0], abs=1e-9)
+    found = data.qpos[2] - 1000
+    assert found == approx(2 * climb, abs=1e-9)
+    expected = [0, 0]
+    assert data.qpos[:2] == approx(expected, abs=1e-9)
 
 
 def test_tumbling_is_that_of_a_symmetric_top() -> None:
@@ -127,7 +129,8 @@ def test_linear_drag_is_a_force_and_no_torque(name: str) -> None:
         answers.append(data.qfrc_passive.copy())
     force = -0.5 * without.mass * np.array((6, -8, 10))
     expected = [*force, 0, 0, 0]
-    assert answers[0] - answers[1] == approx(expected, abs=1e-9)
+    found = answers[0] - answers[1]
+    assert found == approx(expected, abs=1e-9)
 
 
 def test_linear_drag_slows_a_hover_and_not_its_turn() -> None:
@@ -184,6 +187,7 @@ def test_the_step_of_the_papers_vehicle_is_as_true_as_the_page_says() -> None:
     rows = {(row.integrator, row.step_ms): row for row in read_rows(COMMITTED, Accuracy)}
     ours = rows["RK4", Vehicle.load().timestep * 1e3]
     assert ours.position_m < 1e-6
-    assert ours.sinks_mm == approx(rows["RK4", 2].sinks_mm, rel=0.02)
+    expected = rows["RK4", 2].sinks_mm
+    assert ours.sinks_mm == approx(expected, rel=0.02)
     assert ours.cost_us < 0.6 * rows["RK4", 5].cost_us
     assert rows["Euler", 5].position_m > 0.1

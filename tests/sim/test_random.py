@@ -96,7 +96,8 @@ def numbers(seed: int, step: int, count: int = 2, episode: int = 1) -> list[floa
 def test_a_single_drone_has_the_numbers_of_its_seed() -> None:
     noise = random_of().noise("wind", 2)
     for step in range(600):  # more than are drawn ahead
-        assert noise.normal().tolist() == numbers(5, step)
+        found = noise.normal().tolist()
+        assert found == numbers(5, step)
 
 
 @pytest.mark.parametrize("drones", [1, 3])
@@ -105,7 +106,8 @@ def test_a_batch_is_so_many_single_worlds(drones: int) -> None:
     for step in range(100):
         rows = noise.normal().reshape(3, -1)
         for world in range(3):
-            assert rows[world].tolist() == numbers(5 + world, step, 2 * drones)
+            found = rows[world].tolist()
+            assert found == numbers(5 + world, step, 2 * drones)
 
 
 def test_a_world_outside_of_the_mask_stays_where_it_is() -> None:
@@ -159,7 +161,8 @@ def test_draws_follow_each_other_in_blocks() -> None:
     first = draw.uniform(2.0, 4.0)
     second = draw.normal(3.0, (2,))
     assert first[0].tolist() == [0.0] * 3
-    assert second[0].tolist() == [[0.0] * 2] * 3
+    found = second[0].tolist()
+    assert found == [[0.0] * 2] * 3
     words = words_of(np.array((6, 0), np.uint32), START, 1, 0, 12)
     uniforms = 2.0 + 2.0 * uniform(words[:3])
     normals = 3.0 * normal(words[4:10])

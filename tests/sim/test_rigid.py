@@ -75,8 +75,10 @@ def test_flies_as_mujoco_for_five_seconds(name: str, drag: float) -> None:
             world.step(thrust, substeps)
     assert not theirs.state.touching.any()
     assert abs(theirs.state.velocity).max() > 3
-    assert_allclose(ours.state.position, theirs.state.position, atol=1e-6, rtol=0)
-    assert angle(ours.state.quaternion, theirs.state.quaternion) < 1e-6
+    expected = theirs.state.position
+    assert_allclose(ours.state.position, expected, atol=1e-6, rtol=0)
+    found = angle(ours.state.quaternion, theirs.state.quaternion)
+    assert found < 1e-6
     assert_allclose(ours.acceleration(), theirs.acceleration(), atol=1e-6, rtol=0)
 
 
@@ -147,7 +149,8 @@ def test_arrays_have_the_same_bits_alone_and_in_a_batch() -> None:
         for name in ("position", "quaternion", "velocity", "body_rates"):
             one = getattr(alone.state, name)
             all_ = getattr(batch.state, name)
-            assert one[0].tobytes() == all_[i].tobytes()
+            found = one[0].tobytes()
+            assert found == all_[i].tobytes()
 
 
 @pytest.mark.parametrize(
@@ -194,7 +197,8 @@ def test_without_a_compiler_numpy_flies(monkeypatch: pytest.MonkeyPatch) -> None
     # v' = -0.123 v - (0, 0, g) over 0.01 s, solved.
     left = np.exp(-0.123 * 0.01)
     expected = (left, left, left - 9.8 / 0.123 * (1 - left))
-    assert_allclose(world.state.velocity[0, 0], expected, rtol=1e-9)
+    found = world.state.velocity[0, 0]
+    assert_allclose(found, expected, rtol=1e-9)
 
 
 def test_a_free_fall_is_exact() -> None:
@@ -226,7 +230,8 @@ def test_effects_and_drawn_parameters(file: Path, effects: dict[str, Any]) -> No
     for loop in (ours, theirs):
         loop.advance(still, EVERY[:, 0], range(7, 7 + N))
     for name, values in theirs.world.parameters.items():
-        assert ours.world.parameters[name].tolist() == values.tolist()
+        found = ours.world.parameters[name].tolist()
+        assert found == values.tolist()
     dice = np.random.default_rng(1)
     frozen = np.array([False, True, False, False])
     for step in range(20):

@@ -126,7 +126,8 @@ def test_downwash_is_that_of_mujoco_and_of_a_world_alone() -> None:
         ours.step(thrust, 2)
         theirs.step(thrust, 2)
         alone.step(thrust[1:], 2)
-    assert_allclose(ours.state.position, theirs.state.position, atol=1e-9, rtol=0)
+    expected = theirs.state.position
+    assert_allclose(ours.state.position, expected, atol=1e-9, rtol=0)
     found = ours.state.position[1].tobytes()
     assert found == alone.state.position[0].tobytes()
     speed = ours.state.velocity[..., 2]
@@ -186,7 +187,8 @@ def test_a_touch_is_told_of_all_looks_of_a_control_step() -> None:
         begin(world, position=position, velocity=velocity, thrust=none)
         for i, count in enumerate(steps):
             world.step(none, count, again=i > 0)
-        assert world.state.position[0, 0, 0] > 5 * radius
+        found = world.state.position[0, 0, 0]
+        assert found > 5 * radius
         world.step(none, 2, np.zeros((1, 2), bool))  # frozen: nothing is forgotten
         assert world.state.colliding.all()
         world.step(none, 2)
@@ -288,7 +290,8 @@ def test_whole_episodes_agree_with_mujoco_until_a_touch(
     if met:
         room = ours.loop.metrics["clearance"]
         assert (ours.terminated == (room < 0)).all()
-        assert theirs.loop.metrics["clearance"] == pytest.approx(room, abs=1e-6)
+        found = theirs.loop.metrics["clearance"]
+        assert found == pytest.approx(room, abs=1e-6)
         assert not theirs.terminated.any()
 
 

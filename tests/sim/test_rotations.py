@@ -29,7 +29,8 @@ def test_a_rotation_vector_turns_the_body() -> None:
     turned = rotations.advanced(LEFT, roll)
     assert_allclose(turned, [0.5] * 4, atol=1e-15)
     batch = rotations.advanced(np.tile(LEFT, (2, 1, 1)), np.tile(roll, (2, 1, 1)))
-    assert_allclose(batch, np.full((2, 1, 4), 0.5), atol=1e-15)
+    expected = np.full((2, 1, 4), 0.5)
+    assert_allclose(batch, expected, atol=1e-15)
     still = rotations.advanced(2 * LEFT, np.zeros(3))
     assert_allclose(still, LEFT, atol=1e-15)  # normalised
     many = np.array((1.0, 0.0, 0.0, 0.0))
@@ -42,12 +43,15 @@ def test_a_rotation_vector_turns_the_body() -> None:
 def test_vectors_by_their_components() -> None:
     assert rotations.cross(V, (4.0, 5.0, 6.0)) == (-3.0, 6.0, -3.0)
     turn = rotations.matrix(LEFT)
-    assert rotations.times(turn, V) == pytest.approx((-2.0, 1.0, 3.0))
+    expected = (-2.0, 1.0, 3.0)
+    assert rotations.times(turn, V) == pytest.approx(expected)
     found = rotations.times(rotations.transposed(turn), V)
-    assert found == pytest.approx((2.0, -1.0, 3.0))
+    expected = (2.0, -1.0, 3.0)
+    assert found == pytest.approx(expected)
 
 
 def test_euler_angles() -> None:
     """Yaw by 90°, then a roll by 90° about the new nose."""
     found = rotations.euler(np.full(4, 0.5))
-    assert found == pytest.approx((pi / 2, 0.0, pi / 2))
+    expected = (pi / 2, 0.0, pi / 2)
+    assert found == pytest.approx(expected)

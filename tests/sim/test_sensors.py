@@ -219,7 +219,8 @@ def test_gps_and_motion_capture() -> None:
     assert first("gps", GPS, **pose) == [1.0, -2.0, 3.0, 4.0, 5.0, -6.0]
     noisy = {"noise": 2.0, "vertical_noise": 3.0, "velocity_noise": 0.5}
     deviation = readings("gps", noisy, 4000, **pose).std(axis=0)
-    assert_allclose(deviation, (2, 2, 3, 0.5, 0.5, 0.5), rtol=4 / sqrt(8000))
+    expected = (2, 2, 3, 0.5, 0.5, 0.5)
+    assert_allclose(deviation, expected, rtol=4 / sqrt(8000))
     turned = {"noise": 0.0, "angle_noise": 0.02}
     quaternion = readings("motion_capture", turned, 4000, **pose)[:, 3:]
     assert_allclose(np.linalg.norm(quaternion, axis=1), 1.0, atol=1e-12)
