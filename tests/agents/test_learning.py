@@ -214,7 +214,7 @@ def test_sb3_and_ours_make_the_same_updates_of_the_same_experience(algorithm: st
 WRONG = tomllib.loads((DATA / "wrong_hyperparameters.toml").read_text(encoding="utf-8"))["case"]
 
 
-@pytest.mark.parametrize("case", WRONG, ids=lambda case: case["sentence"].partition(":")[0])
+@pytest.mark.parametrize("case", WRONG, ids=str)
 def test_wrong_hyperparameters_are_one_sentence(case: dict[str, Any]) -> None:
     with pytest.raises(InputError) as told:
         preset(case["algorithm"], "tuned", **case["changes"])
@@ -314,7 +314,7 @@ def test_every_agent_trains_with_every_preset_and_kind_of_action(
     assert any(not np.array_equal(before[k], array) for k, array in agent.actor().items())
 
 
-@pytest.mark.parametrize("case", cases("learning"), ids=lambda case: case["algorithm"])
+@pytest.mark.parametrize("case", cases("learning"), ids=str)
 def test_learns_to_hold_the_target(case: Any) -> None:
     """Short learning, far from its final precision: the better of two seeds comes close.
 
