@@ -368,10 +368,9 @@ _OPTIONS: Final = (
     "episode_length", "action", "control_period", "history", "effects", "randomize", "sensors",
     "cameras",
 )  # fmt: skip
-_FLAT: Final = (*_OPTIONS, "scene", "vehicle", "drones", "backend")
 BACKEND_KEYWORDS: Final = ("num_threads", "dtype", "compiled")
 """Keywords that are settings of the backend."""
-KEYWORDS: Final = (*_FLAT, *BACKEND_KEYWORDS)
+KEYWORDS: Final = (*_OPTIONS, "scene", "vehicle", "drones", "backend", *BACKEND_KEYWORDS)
 """Keywords that are not options of a task."""
 
 
