@@ -236,7 +236,7 @@ class Agent:
             datagram = None
             try:
                 datagram, address = self._port.receive(left, strangers=None in slots)
-            except (OSError, ValueError):  # nothing came, or the socket is closed
+            except (OSError, ValueError):  # nothing came; or (Windows) one came back
                 if not self.close.alive:  # another thread has closed the env
                     raise gym.error.ClosedEnvironmentError("the env was closed") from None
             now = time.monotonic()

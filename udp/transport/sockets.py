@@ -88,8 +88,9 @@ class Socket(socket.socket):
         self.setblocking(False)
         with suppress(OSError):  # room for the fragments of a large message, if the system has it
             self.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
-        self._poll = select.poll()
-        self._poll.register(self.fileno(), select.POLLIN)
+        self._poll = select.poll() if hasattr(select, "poll") else None
+        if self._poll:
+            self._poll.register(self.fileno(), select.POLLIN)
         self._asleep = 0  # of the next waits so many sleep at once
         self._row = 1  # and so many after the next wait in which nothing came
 
@@ -119,7 +120,11 @@ class Socket(socket.socket):
                     self._row = max(1, self._row // 2)
                     return came
             self._asleep = self._row = min(4 * self._row, _MAX_ASLEEP)
-        self._poll.poll(ceil(1e3 * min(timeout, LONGEST_WAIT)))
+        timeout = min(timeout, LONGEST_WAIT)
+        if self._poll:
+            self._poll.poll(ceil(1e3 * timeout))
+        elif self.fileno() >= 0:  # Windows
+            select.select([self], [], [], timeout)
         try:  # OSError if another thread has closed it
             return self.recvfrom(_MAX_DATAGRAM)
         except BlockingIOError:
