@@ -147,9 +147,10 @@ class ArraySpec(_Part):
             first = int(wrong.argmax())
             got = f"{low.flat[first]} and {high.flat[first]}"
             raise SpecError(f"{name}: expected low <= high, got {got} at element {first}")
-        units = (self.unit,) * self.size if isinstance(self.unit, str) else self.unit
+        one_unit = isinstance(self.unit, str)
+        units = (self.unit,) if one_unit else self.unit
         check(f"{name}: unit", _TEXTS, units, SpecError)
-        _expect(len(units) == self.size, name, f"{self.size} units", len(units))
+        _expect(one_unit or len(units) == self.size, name, f"{self.size} units", len(units))
         _check_components(name, self.components, self.size)
 
     def _bound(self, name: str, infinite: float) -> Bound:
