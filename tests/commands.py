@@ -13,7 +13,6 @@ from rotorgram.cli import main
 
 WRONG = tomllib.loads((Path(__file__).parent / "data" / "wrong_words.toml").read_text("utf-8"))
 """Pairs of wrong words and a part of the sentence that refuses them, by what they are."""
-SMALL_UPDATES = ("--set", "steps_per_update=100")
 
 Capsys = pytest.CaptureFixture[str]
 Process = subprocess.Popen[str]
@@ -38,10 +37,11 @@ def output(capsys: Capsys, *arguments: object) -> str:
     return out
 
 
-def refused(capsys: Capsys, *arguments: object, status: int = 1) -> str:
-    """The one sentence with which a command ends."""
-    ended, _, err = run(capsys, *arguments)
+def refused(capsys: Capsys, *arguments: object, status: int = 1, silent: bool = False) -> str:
+    """The one sentence with which a command ends, `silent`: before it says anything else."""
+    ended, out, err = run(capsys, *arguments)
     assert ended == status
+    assert not (silent and out)
     assert err.startswith("rotorgram: ")
     assert err.count("\n") == 1
     return err

@@ -98,6 +98,18 @@ def kept() -> Checkpoint:
     return trained("ppo")
 
 
+def test_a_second_stage_that_was_stopped_ends_as_if_it_had_not(kept: Checkpoint) -> None:
+    unbroken = training_of("ppo", start=kept)
+    stopped = training_of("ppo", start=kept)
+    assert unbroken.train()
+    assert not stopped.train(lambda: False)
+    resumed = Training.resume(stopped.checkpoint(), stopped.env)
+    assert resumed.train()
+    expected = unbroken.agent.state()
+    for name, array in resumed.agent.state().items():
+        assert array.tobytes() == expected[name].tobytes(), name
+
+
 @pytest.mark.parametrize("case", cases("wrong_starts"), ids=str)
 def test_a_training_that_does_not_fit_is_refused(case: Any, kept: Checkpoint) -> None:
     arguments = {"algorithm": "ppo", "start": kept, **case["changes"]}

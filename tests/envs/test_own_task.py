@@ -163,6 +163,7 @@ def test_agents_are_compared_on_it(here: Path) -> None:
     words = ["--env", ID, "--agents", "a2c", "--seeds", "1", "--env-steps", "2048"]
     words += ["--episodes", "1", "--snapshots", "1", "--out", "comparison"]
     rotorgram(here, "compare", *words)
+    assert (here / "comparison" / "results.md").is_file()
     evaluations = pd.read_parquet(here / "comparison" / "evaluations.parquet")
     assert set(evaluations["env_steps"]) == {0, 2048}
     assert evaluations["steady"].notna().all()

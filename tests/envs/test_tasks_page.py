@@ -22,7 +22,6 @@ from rotorgram.models import Vehicle
 
 PAGE = (Path(__file__).parents[2] / "docs" / "tasks.md").read_text(encoding="utf-8")
 ROWS = re.findall(r"^\| `([\w-]+)` \| .* \| `(\w+)` \| ([\dR+ ]+) \|", PAGE, re.MULTILINE)
-TRACKING = "rotorgram/Tracking-v0"
 TASKS = sorted(name for name in gym.registry if name.startswith("rotorgram/"))
 
 

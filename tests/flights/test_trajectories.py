@@ -95,6 +95,7 @@ def test_a_trajectory_is_what_the_env_tells() -> None:
     assert len(flown) == 25
     assert flown.ending == "truncated"
     assert flown.seconds == 0.5
+    assert flown.episode == 3
     assert flown.telemetry["position"][:, 2].tolist() == heights
     assert flown.headline.tolist() == errors
     assert flown.rewards.tolist() == rewards

@@ -118,6 +118,12 @@ def test_the_sentence_is_that_of_flying(tmp_path: Path) -> None:
     assert str(again.value) == str(refusal.value)
 
 
+def test_a_wrong_coefficient_is_refused(tmp_path: Path) -> None:
+    path = break_vehicle(tmp_path, numeric(rotors__radius=400))
+    with pytest.raises(InputError, match=r"^rotors.radius: expected a number from 0.001 to 10 m,"):
+        examine(path)
+
+
 def test_a_long_physics_step_is_examined_soon(tmp_path: Path) -> None:
     path = broken(tmp_path, ('timestep="0.01"', 'timestep="0.5"'))
     begun = time.perf_counter()

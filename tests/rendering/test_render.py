@@ -86,7 +86,7 @@ def test_a_checkpoint_on_film_flies_as_it_does_over_the_wire(
     film(tmp_path / "plain.png", tracks, config)
     bare = pixels(tmp_path / "plain.png").astype(int)
     assert abs(bare[:, :320] - bare[:, 322:]).max() <= 3  # the same flight twice
-    assert abs(last - bare).mean() > 2
+    assert abs(last - bare)[:60].mean() > 10  # what is written above
 
 
 def test_gif_pictures_and_names(

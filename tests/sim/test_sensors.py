@@ -3,7 +3,7 @@
 import csv
 import json
 from collections.abc import Mapping
-from math import atan2, cos, exp, hypot, log, radians, sin, sqrt
+from math import atan2, exp, hypot, log, sin, sqrt
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -33,11 +33,6 @@ LEFT = (sqrt(0.5), 0.0, 0.0, sqrt(0.5))
 IMU = {"gyro_noise": 0.0, "accelerometer_noise": 0.0}
 GPS = {"noise": 0.0, "vertical_noise": 0.0, "velocity_noise": 0.0}
 NOISY = SIM["noisy"]
-
-
-def about_x(degrees: float) -> tuple[float, ...]:
-    half = radians(degrees) / 2
-    return (cos(half), sin(half), 0.0, 0.0)
 
 
 def sensing(

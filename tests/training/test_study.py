@@ -321,7 +321,7 @@ def test_wrong_input_is_one_sentence(
     line: str, sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capsys
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert sentence in refused(capsys, "sweep", "a2c", *words_of(line))
+    assert sentence in refused(capsys, "sweep", "a2c", *words_of(line), silent=True)
     assert not list(tmp_path.iterdir()), "nothing has flown"
 
 

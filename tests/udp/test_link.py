@@ -338,7 +338,8 @@ def test_wrong_numbers_of_the_config() -> None:
 def test_the_queue_is_refused_when_the_agent_closes() -> None:
     server = agent_at("deciding", Wire("simulator", False))
     server.receive(binary.encode(hello(session=OTHER)), STRANGER, 0.0)
-    outgoing(server)
+    ((reply, _),) = outgoing(server)
+    assert plain(reply) == Wait(session=OTHER)
     server.close("over", 0.0)
     told = {address: plain(d) for d, address in outgoing(server)}
     assert isinstance(told[HERE], Close)
