@@ -1,5 +1,6 @@
 """What `compare`, `sweep` and `benchmark` share: flags, resuming, the report."""
 
+import logging
 import shlex
 import sys
 from dataclasses import dataclass, replace
@@ -8,15 +9,16 @@ from typing import TYPE_CHECKING, ClassVar, Final
 
 from ..flights.executors import RunsFailed, WorkersConfig
 from ..flights.folders import FolderBusy
-from ..models.errors import InputError, require
+from ..models.errors import InputError, NoOpenGL, require
 from ._flags import Options, Words
 from ._training import TrainingFlags, folder_to_write
 
 if TYPE_CHECKING:
     from ..envs.config import EnvConfig
+    from ..training.results import Results
     from ..training.settings import Row, Study
 
-_RESUMED: Final = ("jobs", "runner", "address", "page")
+_RESUMED: Final = ("jobs", "runner", "address", "film", "page")
 """Flags that a resumed command may be given: they change no number."""
 _OF_ROWS: Final = ("preset", "env_steps", "num_envs", "backend")
 _OF_STUDIES: Final = ("seeds", "first_seed", "snapshots", "episodes")
@@ -37,6 +39,8 @@ class StudyFlags(TrainingFlags, WorkersConfig):
     """Policies kept during each training, for the learning curves."""
     episodes: int | None = None
     """Evaluation episodes of each final policy. Default: 200 over all seeds, 20 at least."""
+    film: bool = True
+    """Whether the agents are filmed side by side for the report, where there is OpenGL."""
     page: Path | None = None
     """Markdown page to write besides the report."""
 
@@ -71,9 +75,9 @@ class StudyFlags(TrainingFlags, WorkersConfig):
             if any(folder.iterdir()) and not isinstance(error, FolderBusy):
                 print(self.go_on_with(self.words, folder, "runner", "address"))
             if isinstance(error, RunsFailed):  # the others are reported all the same
-                report(folder, self.page)
+                report(folder, self.page, film=False)
             raise
-        report(folder, self.page)
+        report(folder, self.page, self.film)
         return 0
 
     def _resumed(self, folder: Path) -> "Study":
@@ -132,18 +136,35 @@ class StudyFlags(TrainingFlags, WorkersConfig):
         return replace(row, name=name, env=env, set=changes, **self.given_of_rows())
 
 
-def report(folder: Path, page: Path | None) -> None:
-    """Write figures and report from the folder's files, and print the tables."""
+def report(folder: Path, page: Path | None, film: bool) -> None:
+    """Write figures, film and report from the folder's files, and print the tables."""
     from rich.console import Console
 
-    from ..training.report import PAGE_FILE, write_report
+    from ..training.report import PAGE_FILE, VIDEO_FILE, write_report
     from ..training.results import Results
     from ..training.tables import terminal_tables
 
     results = Results.read(folder)
+    video = folder / VIDEO_FILE
     table = write_report(results, page)
     Console(width=100).print(*terminal_tables(results, table))
+    # Only now: if the film fails, there is a report.
+    if film and results.study.kind in ("paper", "compare") and not video.exists():
+        _film(results, video)
+        write_report(results, page)
     print(f"{len(results.runs)} of {len(results.study.runs())} runs done")
     if page:
         print(f"page: {page}")
     print(f"report: {folder / PAGE_FILE}")
+
+
+def _film(results: "Results", out: Path) -> None:
+    """Film a study; where that cannot be, such as without OpenGL, the log says why."""
+    try:
+        from ..training.films import film_study
+        from ._progress import frame_bar
+
+        with frame_bar(out.name) as on_frame:
+            film_study(results, out, on_frame)
+    except (OSError, InputError, ImportError, NoOpenGL) as error:
+        logging.getLogger(__name__).info("no film of the agents: %s", error)

@@ -10,16 +10,18 @@ from ._flags import Command
 
 @dataclass(frozen=True, kw_only=True)
 class Report(Command):
-    """Write figures and tables of a study again from its files."""
+    """Draw figures, tables and page of a study again from its files."""
 
     folder: Positional[Path]
     """Folder that `rotorgram compare`, `sweep` or `benchmark` wrote."""
     page: Path | None = None
     """Markdown page to write besides the report."""
+    film: bool = True
+    """Whether the agents are filmed, if there is no film yet, where there is OpenGL."""
 
     def run(self) -> int:
         """Write figures and report from the files, and print the tables."""
         from ._study import report
 
-        report(self.folder, self.page)
+        report(self.folder, self.page, self.film)
         return 0

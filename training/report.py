@@ -1,24 +1,35 @@
-"""The report of a study, from its files: figures, tables as CSV and Markdown, verdicts as JSON."""
+"""The report of a study: figures, a page, the table as CSV and Markdown, the verdicts as JSON.
 
+All of it is written from the study's files, into the study's folder; the page refers to nothing
+outside itself.
+"""
+
+import base64
+import html
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from string import Template
 from typing import Final
 
+import numpy as np
 import pandas as pd
 
 from ..models.errors import require
 from .claims import Verdict, judge_claims, judge_no_worse
-from .figures import draw_figures
+from .figures import PAPER, draw_figures
 from .results import Results
-from .tables import markdown, results_table
+from .tables import markdown, results_table, task_tables
 
-PAGE_FILE: Final = "results.md"
+PAGE_FILE: Final = "report.html"
+VIDEO_FILE: Final = "video.mp4"
+"""The rows side by side; the page has it in itself if it lies in the folder."""
+_PAGE: Final = Path(__file__).parent / "assets" / "report.html"
 
 
 def write_report(results: Results, page: Path | None = None) -> pd.DataFrame:
-    """Draw the figures and write tables and verdicts into the folder; the table.
+    """Draw the figures and write page, tables and verdicts into the folder; the table.
 
     `page` is a Markdown file that gets the tables too.
     """
@@ -27,15 +38,18 @@ def write_report(results: Results, page: Path | None = None) -> pd.DataFrame:
     table = results_table(results)
     table.to_csv(folder / "results.csv")
     verdicts = judge(results)
-    text = _head(results) + markdown(results, table) + _claims(verdicts)
-    (folder / PAGE_FILE).write_text(text, encoding="utf-8")
+    claims = _claims(verdicts)
+    text = _head(results) + markdown(results, table) + claims
+    (folder / "results.md").write_text(text, encoding="utf-8")
     if page:
         page.write_text(text, encoding="utf-8")
     if verdicts:
-        claims = json.dumps([asdict(verdict) for verdict in verdicts], indent=2, ensure_ascii=False)
-        (folder / "claims.json").write_text(claims + "\n", encoding="utf-8")
-    if len(table):
-        draw_figures(results, table)
+        found = json.dumps([asdict(verdict) for verdict in verdicts], indent=2, ensure_ascii=False)
+        (folder / "claims.json").write_text(found + "\n", encoding="utf-8")
+    figures = draw_figures(results, table) if len(table) else []
+    content = "\n".join([*_page(results, table, figures), f"<pre>{html.escape(claims)}</pre>"])
+    page_text = Template(_PAGE.read_text(encoding="utf-8")).substitute(content=content)
+    (folder / PAGE_FILE).write_text(page_text, encoding="utf-8")
     return table
 
 
@@ -83,3 +97,26 @@ def _claims(verdicts: Sequence[Verdict]) -> str:
         text += f"\n* {one.claim} ({one.source}; preset {one.preset}.)\n"
         text += f"  **{one.verdict}**: {one.evidence} {one.definition}\n"
     return text
+
+
+def _page(results: Results, table: pd.DataFrame, figures: Sequence[str]) -> Iterator[str]:
+    """Command, film, tables and figures in HTML."""
+    yield f"<pre>{html.escape(results.config['command'])}</pre>"
+    video = results.folder / VIDEO_FILE
+    if video.is_file():
+        yield f'<video controls loop muted src="{_embedded(video, "video/mp4")}"></video>'
+    for task in task_tables(results, table):
+        texts = ["\n".join([cell.value, *cell.details]) for line in task.lines for cell in line]
+        cells = np.reshape(texts, (len(task.lines), -1))
+        yield f"<h2>{html.escape(task.task)}</h2>"
+        yield pd.DataFrame(cells, columns=task.headings).to_html(index=False, border=0)
+    for name in figures:
+        source = _embedded(results.folder / "figures" / f"{name}.svg", "image/svg+xml")
+        caption = html.escape(PAPER.get(name, name))
+        yield f'<figure><img alt="{name}" src="{source}">'
+        yield f"<figcaption>{caption}</figcaption></figure>"
+
+
+def _embedded(file: Path, kind: str) -> str:
+    """A file as an address that holds it."""
+    return f"data:{kind};base64,{base64.b64encode(file.read_bytes()).decode('ascii')}"

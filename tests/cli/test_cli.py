@@ -5,6 +5,7 @@ import logging
 import os
 import re
 import shlex
+import shutil
 import signal
 import socket
 import subprocess
@@ -760,7 +761,7 @@ def test_compare_writes_everything(tmp_path: Path, capsys: Capsys) -> None:
         capsys, "compare", "--out", folder, "--seeds", 1, "--env-steps", 1100,
         "--snapshots", 2, "--episodes", 2, "--episode-length", 50,
     )  # fmt: skip
-    assert f"report: {folder / 'results.md'}" in out.replace("\n", "")
+    assert f"report: {folder / 'report.html'}" in out.replace("\n", "")
     results = Results.read(folder)
     assert sorted(set(results.runs.row)) == ["a2c", "pid", "sb3-a2c", "vpg"]
     assert sorted(set(results.evaluations.row)) == ["a2c", "pid", "sb3-a2c", "vpg"]
@@ -769,12 +770,19 @@ def test_compare_writes_everything(tmp_path: Path, capsys: Capsys) -> None:
     assert steps[steps.row == "vpg"].step.tolist() == list(range(1, 1101))
     names = {p.name for p in (folder / "checkpoints").iterdir()}
     assert names == {f"{a}-seed0.safetensors" for a in ("vpg", "a2c", "sb3-a2c")}
+    page = (folder / "report.html").read_text()
+    assert page.count("<figure>") == 4
     assert len(list((folder / "figures").glob("*.png"))) == 4
+    assert (folder / "video.mp4").exists() == ("data:video/mp4;base64," in page)
     assert (folder / "results.csv").exists()
     assert results.specs["a2c"].options["episode_length"] == 50
     assert len(results.specs["a2c"].vehicle_hash) == 32
-    (folder / "results.md").unlink()
+    # What is needed for the film alone is not needed for the report.
+    shutil.rmtree(folder / "checkpoints")
+    for name in ("video.mp4", "report.html", "results.md"):
+        (folder / name).unlink(missing_ok=True)
     output(capsys, "report", folder)
+    assert "data:video/mp4" not in (folder / "report.html").read_text()
     assert "| A2C (1 seed; 1,100 env steps) |" in (folder / "results.md").read_text()
 
 

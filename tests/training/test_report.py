@@ -1,5 +1,6 @@
 """Tables, figures, page and film of a study, on small made-up folders and by hand."""
 
+import base64
 import json
 from dataclasses import replace
 from io import StringIO
@@ -12,8 +13,11 @@ from comparisons import ERROR, GATES, HEADLINE, spec_of, study_of, synthetic_fol
 from rich.console import Console
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.spec import EnvSpec
+from rotorgram.flights.filming import Film, FilmTrack
 from rotorgram.flights.palette import agent_label
 from rotorgram.flights.trajectories import Trajectory
+from rotorgram.models.errors import InputError
+from rotorgram.training import films
 from rotorgram.training.figures import (
     draw_figures,
     learning_curves,
@@ -21,7 +25,8 @@ from rotorgram.training.figures import (
     trajectories,
     value_fan,
 )
-from rotorgram.training.report import write_report
+from rotorgram.training.metrics import shown_runs
+from rotorgram.training.report import VIDEO_FILE, write_report
 from rotorgram.training.results import COLUMNS, Results, write_config
 from rotorgram.training.settings import Row, Study
 from rotorgram.training.statistics import share_interval
@@ -209,8 +214,22 @@ def test_learning_curves_are_interquartile_means_of_seeds() -> None:
 @pytest.fixture(scope="module")
 def comparison(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = synthetic_folder(tmp_path_factory.mktemp("comparison") / "results")
+    (folder / VIDEO_FILE).write_bytes(b"a film")
     write_report(Results.read(folder))
     return folder
+
+
+def test_the_page_has_figures_tables_and_film_and_no_script(comparison: Path) -> None:
+    text = (comparison / "report.html").read_text(encoding="utf-8")
+    for name in ("comparison", "fig6_reward", "fig7_cumulative_reward", "fig8_error"):
+        picture = (comparison / "figures" / f"{name}.svg").read_bytes()
+        assert f"data:image/svg+xml;base64,{base64.b64encode(picture).decode()}" in text
+    assert f"data:video/mp4;base64,{base64.b64encode(b'a film').decode()}" in text
+    assert "<script" not in text
+    # The command has signs of HTML in it.
+    assert "rotorgram compare --seeds 3 &lt;folder&gt;" in text
+    assert text.count("<tr") == 5  # a head and four agents
+    assert "It gives no numbers." in text
 
 
 def test_figures_are_written_in_three_formats_and_always_the_same(comparison: Path) -> None:
@@ -278,6 +297,13 @@ def test_the_least_distance_is_that_of_all_episodes_while_both_fly() -> None:
     assert least_distance([*apart, *near]) == 2.0
 
 
+def test_the_middle_seed_and_the_furthest_start_are_shown() -> None:
+    runs = pd.concat([runs_of("ippo", 0.3, 0.1, 0.2), runs_of("orca", 0.0)])
+    starts = [("ippo", 0, 0, episode, start) for episode, start in enumerate((1.0, -4.0, 2.0))]
+    table = pd.DataFrame(starts, columns=["row", "seed", "env_steps", "episode", "start"])
+    assert shown_runs(runs, table, HEADLINE) == ({"ippo": 2, "orca": 0}, 1)
+
+
 @pytest.fixture(scope="module")
 def swarm(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Results of worlds of two drones, with agents that were compared."""
@@ -302,6 +328,43 @@ def test_a_swarm_has_the_least_distance_in_place_of_the_overshoot(swarm: Path) -
     assert "Overshoot" not in text
     assert not (swarm / "claims.json").exists()
     assert [path.name for path in (swarm / "figures").glob("*.svg")] == ["comparison.svg"]
+
+
+def test_the_film_shows_the_middle_seed_of_each_row(
+    swarm: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    filmed: list[object] = []
+
+    def film(path: Path, tracks: list[FilmTrack], config: Film, _: object) -> None:
+        path.touch()
+        filmed.extend((shot.name, shot.drones) for shot in tracks)
+        filmed.append(config.camera)
+
+    monkeypatch.setattr(films, "film", film)
+    monkeypatch.setattr(films, "load", lambda path: filmed.append(path.name) or FakePolicy)
+    monkeypatch.setattr(films, "flown_trajectories", lambda *_, **__: [])
+    results = Results.read(swarm)
+    seeds, _ = shown_runs(results.runs, results.evaluations, HEADLINE)
+    films.film_study(results, tmp_path / "film.mp4")
+    files = [f"{row}-seed{seed}.safetensors" for row, seed in seeds.items()]
+    labels = [(f"{row.upper()}, seed {seed}", 2) for row, seed in seeds.items()]
+    assert filmed == [*files, *labels, "top"]
+
+
+class FakePolicy:
+    """A checkpoint."""
+
+    @staticmethod
+    def policy() -> None:
+        return None
+
+
+def test_a_film_is_of_one_task(tmp_path: Path) -> None:
+    other = EnvConfig(action="offset")
+    rows = (Row(agent="pid", name="a"), Row(agent="pid", name="b", env=other))
+    results = made_up(tmp_path, Study(rows=rows, seeds=1), runs_of("a", 0.1))
+    with pytest.raises(InputError, match="film: expected rows of one task"):
+        films.film_study(results, tmp_path / "film.mp4")
 
 
 def test_a_headline_without_a_bound_holds_nothing(tmp_path: Path) -> None:
