@@ -33,15 +33,15 @@ from .networks import Floats, named, part_of
 from .policies import NetworkPolicy
 from .presets import preset
 
-FORMAT: Final = 3
-_PLAIN: Final = ("algorithm", "config", "backend", "seed", "env_steps", "versions")
-_POSITION: Final = ("actions", "observations", "numbers", "lengths", "first_steps")
+FORMAT = 3
+_PLAIN = ("algorithm", "config", "backend", "seed", "env_steps", "versions")
+_POSITION = ("actions", "observations", "numbers", "lengths", "first_steps")
 _COLUMNS: Final[dict[str, type[np.generic]]] = {
     f.name: {int: np.int64, float: np.float64, bool: np.bool_}[f.type]  # type: ignore[index]
     for f in fields(Episode)
 }
-_CHECKSUM: Final = re.compile(rb'"sha256":"([0-9a-f]{64})"')
-_MALFORMED: Final = (KeyError, TypeError, ValueError, AttributeError, IndexError, RecursionError)
+_CHECKSUM = re.compile(rb'"sha256":"([0-9a-f]{64})"')
+_MALFORMED = (KeyError, TypeError, ValueError, AttributeError, IndexError, RecursionError)
 """Errors that reading a crafted file can raise."""
 
 

@@ -2,12 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Final, Literal
+from typing import Annotated, ClassVar, Literal
 
 from ..models.errors import InputError
 from ..models.fields import Limits, check_fields
 
-NETWORK_FIELDS: Final = ("network", "hidden", "activation", "normalize_observations")
+NETWORK_FIELDS = ("network", "hidden", "activation", "normalize_observations")
 """Hyperparameters that say what networks there are."""
 
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from typing import ClassVar, Final
+from typing import ClassVar
 
 import numpy as np
 
@@ -11,13 +11,13 @@ from ..models.errors import InputError
 from .networks import Floats
 from .policies import Observation, flat
 
-DAMPING: Final = 0.5  # Damping ratio of a payload's swing
-FILTER: Final = 20.0  # Rate of the filters over that of the position loop
-OVER: Final = 2.5  # Gain of the velocity loop over the position loop's: `sim/control/gains.py`
-JUMP: Final = 4.0  # Speed of a goal, over the craft's largest, from which on it has jumped
-_ACTION: Final = ("offset x", "offset y", "offset z", "offset of the heading")
-_PAYLOAD: Final = ("payload - position", "payload velocity - velocity")
-_VECTORS: Final = ("goal - position", "velocity", "thrust axis")
+DAMPING = 0.5  # Damping ratio of a payload's swing
+FILTER = 20.0  # Rate of the filters over that of the position loop
+OVER = 2.5  # Gain of the velocity loop over the position loop's: `sim/control/gains.py`
+JUMP = 4.0  # Speed of a goal, over the craft's largest, from which on it has jumped
+_ACTION = ("offset x", "offset y", "offset z", "offset of the heading")
+_PAYLOAD = ("payload - position", "payload velocity - velocity")
+_VECTORS = ("goal - position", "velocity", "thrust axis")
 
 
 class Geometric:

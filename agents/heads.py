@@ -2,13 +2,12 @@
 
 import math
 from types import MappingProxyType
-from typing import Final
 
 import numpy as np
 
 from .networks import Floats, Shapes, Weights
 
-_LOG_STD: Final = np.array([-4.0, 1.0], np.float32)
+_LOG_STD = np.array([-4.0, 1.0], np.float32)
 """Least and greatest logarithm of a standard deviation."""
 
 

@@ -5,7 +5,7 @@ Robotics Research, STAR 70, Springer 2011, in three dimensions.
 """
 
 import math
-from typing import ClassVar, Final
+from typing import ClassVar
 
 import numpy as np
 
@@ -14,12 +14,12 @@ from ..models.errors import InputError
 from .networks import Floats
 from .policies import Observation, flat
 
-HORIZON: Final = 3.0  # Time ahead for which nothing may touch, s
-ROOM: Final = 1.15  # Spheres are taken for larger, since a velocity is not reached at once
-APPROACH: Final = 0.8  # Wanted velocity over the distance from the goal, 1/s
-SPEED: Final = 0.6  # Share of the range of the velocity that is asked for
-_ROUNDS: Final = 60  # Most rounds of projections
-_DONE: Final = 1e-6  # m/s
+HORIZON = 3.0  # Time ahead for which nothing may touch, s
+ROOM = 1.15  # Spheres are taken for larger, since a velocity is not reached at once
+APPROACH = 0.8  # Wanted velocity over the distance from the goal, 1/s
+SPEED = 0.6  # Share of the range of the velocity that is asked for
+_ROUNDS = 60  # Most rounds of projections
+_DONE = 1e-6  # m/s
 
 Vector = tuple[float, float, float]
 Plane = tuple[Vector, float]

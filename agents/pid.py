@@ -1,7 +1,7 @@
 """A hand-tuned PID controller: the classical baseline of `Elevation-v0`."""
 
 from collections.abc import Mapping
-from typing import ClassVar, Final
+from typing import ClassVar
 
 import numpy as np
 
@@ -10,13 +10,13 @@ from ..models.errors import InputError
 from .networks import Floats
 from .policies import Observation
 
-ENV_ID: Final = "rotorgram/Elevation-v0"
-GRAVITY: Final = 9.8  # m/s²: the paper's
-PROPORTIONAL: Final = 9.0  # 1/s²: closed-loop natural frequency of 3 rad/s
-DERIVATIVE: Final = 5.4  # 1/s: damping ratio 0.9
-INTEGRAL: Final = 1.0  # 1/s³: there is no steady load to remove here; an unknown mass would be one
-INTEGRAL_BAND: Final = 0.02  # m: the integral grows only this near the target, against windup
-SHARES: Final = {"increment": 0.05, "offset": 0.2}
+ENV_ID = "rotorgram/Elevation-v0"
+GRAVITY = 9.8  # m/s²: the paper's
+PROPORTIONAL = 9.0  # 1/s²: closed-loop natural frequency of 3 rad/s
+DERIVATIVE = 5.4  # 1/s: damping ratio 0.9
+INTEGRAL = 1.0  # 1/s³: there is no steady load to remove here; an unknown mass would be one
+INTEGRAL_BAND = 0.02  # m: the integral grows only this near the target, against windup
+SHARES = {"increment": 0.05, "offset": 0.2}
 """Thrust per unit of action over the rotors' largest, where the option `thrust_scale` is None."""
 
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Annotated, Final
+from typing import Annotated
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from .networks import Floats
 from .optimizers import clip_norm
 from .rollouts import Rollout
 
-_TERMS: Final = ("gain", "entropy", "value_loss", "approx_kl", "clip_fraction")
+_TERMS = ("gain", "entropy", "value_loss", "approx_kl", "clip_fraction")
 
 
 @dataclass(frozen=True, kw_only=True)

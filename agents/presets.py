@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Literal
 
 from ..envs.registry import is_known, task_type
 from ..models import Backend
@@ -15,11 +15,11 @@ from .config import Config
 from .registry import find_algorithm
 
 PresetName = Literal["paper", "tuned"]
-DEFAULT_TASK: Final = "rotorgram/Elevation-v0"
+DEFAULT_TASK = "rotorgram/Elevation-v0"
 """Its presets serve tasks for which there is no other."""
 
-_FILE: Final = Path(__file__).with_name("presets.toml")
-_FLIGHT: Final = ("num_envs", "env_steps", "backend")
+_FILE = Path(__file__).with_name("presets.toml")
+_FLIGHT = ("num_envs", "env_steps", "backend")
 
 
 @dataclass(frozen=True, kw_only=True)

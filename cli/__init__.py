@@ -19,14 +19,14 @@ from errno import ENOSPC, EPIPE
 from importlib import import_module
 from pathlib import Path
 from shutil import get_terminal_size
-from typing import TYPE_CHECKING, Final, TypeGuard
+from typing import TYPE_CHECKING, TypeGuard
 
 if TYPE_CHECKING:
     from ._flags import Command
 
 __all__ = ["COMMANDS", "EXTRAS", "main"]
 
-COMMANDS: Final = (
+COMMANDS = (
     "sim",
     "train",
     "serve",
@@ -50,7 +50,7 @@ COMMANDS: Final = (
 )
 """Each is a class in the module of its name: `Sim` in `sim`."""
 
-EXTRAS: Final = {
+EXTRAS = {
     "train": ("torch", "stable_baselines3", "tensorboard", "safetensors", "pandas",
               "pyarrow", "scipy"),
     "record": ("mcap",),
@@ -63,7 +63,7 @@ EXTRAS: Final = {
 }  # fmt: skip
 """Import names of the packages of each extra, as pyproject.toml lists them."""
 
-_ABOUT: Final = "A MuJoCo drone simulator that reinforcement-learning agents fly over UDP."
+_ABOUT = "A MuJoCo drone simulator that reinforcement-learning agents fly over UDP."
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, TypeVar
 
 from ..agents import CONTROLLERS, PID, Checkpoint, Geometric, Orca, Policy, load
 from ..envs.config import BACKEND_KEYWORDS
@@ -17,10 +17,10 @@ from ..udp import RemoteVectorEnv
 from ..udp.spawn import spawn_simulator
 from ._flags import AgentFlags, EnvFlags, check_count, parse_address
 
-CHECKPOINT: Final = "checkpoint.safetensors"
+CHECKPOINT = "checkpoint.safetensors"
 F = TypeVar("F", bound=EnvFlags)
 Controller = type[PID] | type[Geometric] | type[Orca]
-_CONNECT_TIMEOUT: Final = 30 * 24 * 3600.0  # s: Ctrl-C ends the wait for a simulator
+_CONNECT_TIMEOUT = 30 * 24 * 3600.0  # s: Ctrl-C ends the wait for a simulator
 
 
 def load_checkpoint(name: str) -> Checkpoint | Controller:

@@ -11,7 +11,6 @@ from typing import (
     TYPE_CHECKING,
     Annotated,
     Any,
-    Final,
     TypeVar,
     Union,
     cast,
@@ -47,9 +46,9 @@ else:  # tyro imports typeguard, slowly, for a tuple of a stated type
         ),
     ]
 
-DEFAULT_ENV: Final = "rotorgram/Elevation-v0"
-_PLAIN_FLAGS: Final = ("action", "control_period", "episode_length", "history", "scene", "cameras")
-_WORLD_FLAGS: Final = ("effects", "randomize", "sensors")
+DEFAULT_ENV = "rotorgram/Elevation-v0"
+_PLAIN_FLAGS = ("action", "control_period", "episode_length", "history", "scene", "cameras")
+_WORLD_FLAGS = ("effects", "randomize", "sensors")
 Options = dict[str, Any]
 """Options of a task and its env by name, values as of JSON."""
 

@@ -8,14 +8,13 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import Final
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, Task, TextColumn
 
 from ..flights.executors import OnProgress
 
-_LINE_EVERY: Final = 10.0  # s
+_LINE_EVERY = 10.0  # s
 
 
 @contextmanager

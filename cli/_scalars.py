@@ -3,15 +3,14 @@
 import math
 import time
 from pathlib import Path
-from typing import Final
 
 from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 from tensorboard.compat.proto.summary_pb2 import Summary
 from tensorboard.summary.writer.record_writer import RecordWriter
 
-_POINTS: Final = 200  # of each curve: the width of a chart, and less than 1 MB for all
-_LEAST: Final = 100  # env steps between two points: in short runs more would cost time
-_PREFIX: Final = "events.out.tfevents."
+_POINTS = 200  # of each curve: the width of a chart, and less than 1 MB for all
+_LEAST = 100  # env steps between two points: in short runs more would cost time
+_PREFIX = "events.out.tfevents."
 
 
 class ScalarWriter:

@@ -5,7 +5,7 @@ import shlex
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Final
+from typing import TYPE_CHECKING, ClassVar
 
 from ..flights.executors import RunsFailed, WorkersConfig
 from ..flights.folders import FolderBusy
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
     from ..training.results import Results
     from ..training.settings import Row, Study
 
-_RESUMED: Final = ("jobs", "runner", "address", "film", "page")
+_RESUMED = ("jobs", "runner", "address", "film", "page")
 """Flags that a resumed command may be given: they change no number."""
-_OF_ROWS: Final = ("preset", "env_steps", "num_envs", "backend")
-_OF_STUDIES: Final = ("seeds", "first_seed", "snapshots", "episodes")
+_OF_ROWS = ("preset", "env_steps", "num_envs", "backend")
+_OF_STUDIES = ("seeds", "first_seed", "snapshots", "episodes")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,7 +3,7 @@
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, Final
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from tyro.conf import Positional, arg
 
@@ -15,9 +15,9 @@ from ._study import StudyFlags
 if TYPE_CHECKING:
     from ..training.settings import Row, Study
 
-_CONTROLLERS: Final = ("pid", "orca")
+_CONTROLLERS = ("pid", "orca")
 """Flown beside the agents where they can fly the env."""
-_OF_FILES: Final = ("seeds", "first_seed", "snapshots", "curve_episodes", "episodes", "evaluation",
+_OF_FILES = ("seeds", "first_seed", "snapshots", "curve_episodes", "episodes", "evaluation",
                     "wire", "keep_steps")  # fmt: skip
 """Settings of a study that all files share."""
 

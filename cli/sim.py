@@ -2,7 +2,7 @@
 
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Literal
 
 from ..models.errors import InputError
 from ._flags import BackendFlags, WireFlags, Words, parse_address
@@ -10,9 +10,9 @@ from ._flags import BackendFlags, WireFlags, Words, parse_address
 if TYPE_CHECKING:
     from ..udp import Simulator
 
-_OF_ONE_AGENT: Final = ("server", "num_envs", "codec", "record")
+_OF_ONE_AGENT = ("server", "num_envs", "codec", "record")
 """Flags that --agents excludes."""
-_OF_AGENTS: Final = ("when_lost", "patience")
+_OF_AGENTS = ("when_lost", "patience")
 """Flags that need --agents."""
 
 

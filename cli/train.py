@@ -13,7 +13,7 @@ from dataclasses import dataclass, fields, replace
 from hashlib import sha256
 from pathlib import Path
 from threading import Timer
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
@@ -37,11 +37,11 @@ from ._training import TrainingFlags, folder_to_write
 if TYPE_CHECKING:
     from ..training.training import Training
 
-EPISODES: Final = "episodes.csv"
-_WIRE: Final = ("env", "vehicle", "listen", "num_simulators", "key_file", "insecure")
-_FREE: Final = (*_WIRE, "record", "store_every", "env_steps")
+EPISODES = "episodes.csv"
+_WIRE = ("env", "vehicle", "listen", "num_simulators", "key_file", "insecure")
+_FREE = (*_WIRE, "record", "store_every", "env_steps")
 """Flags that a resumed training may be given."""
-_UPDATE_WITHIN: Final = 2.0  # s
+_UPDATE_WITHIN = 2.0  # s
 
 
 @dataclass(frozen=True, kw_only=True)

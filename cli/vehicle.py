@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from ..models.checks import Check
     from ..models.vehicle_file import VehicleFile
 
-_FRAME: Final = """\
+_FRAME = """\
 frame = "{frame}"{space}# docs/vehicles.md has pictures of the frames
 arm = 0.25                        # m, from the body's origin to each rotor
 """
-_LIST: Final = """
+_LIST = """
 [[rotors.list]]                   # one for each rotor, in the order of actions
 position = [0.2, 0.2, 0.0]        # m, where its thrust acts
 axis = [0.0, 0.0, 1.0]            # of its thrust
@@ -41,7 +41,7 @@ turn = "cw"
 position = [-0.2, 0.2, 0.0]
 turn = "ccw"
 """
-_NEW: Final = """\
+_NEW = """\
 # A vehicle for rotorgram. It flies as it is; replace the numbers by those of your craft.
 # SI units; body axes x forward, y left, z up. docs/vehicles.md has every field.
 # For any number you may write where it is from: {{ value = 1.5, source = "scales" }}.

@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
@@ -12,7 +12,7 @@ from ..models.errors import InputError
 from .spaces import action_space, info_columns, observation_space
 from .spec import EnvSpec
 
-LOST: Final = "simulator_lost"
+LOST = "simulator_lost"
 """Key in the `info` of a step that a lost simulator truncated: why it was lost."""
 
 Info = dict[str, Any]

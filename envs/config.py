@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from hashlib import blake2b
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Self
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from ..models import BACKENDS, MAX_DRONES, Backend
 from ..models.errors import InputError, shortened
@@ -27,14 +27,14 @@ if TYPE_CHECKING:
     from .tasks.task import TaskOptions
 
 Options = Mapping[str, Any]
-VERSION: Final = 1
+VERSION = 1
 """Version of a config's JSON."""
-DEFAULT_ENV: Final = "rotorgram/Elevation-v0"
-MAX_CONTROL_PERIOD: Final = 1.0  # s
-MAX_EPISODE_LENGTH: Final = 1 << 31  # control steps
-MAX_HISTORY: Final = 1000  # observations side by side
-_MAX_FILE: Final = 1 << 24  # bytes
-_NO_EFFECTS: Final = EffectOptions()
+DEFAULT_ENV = "rotorgram/Elevation-v0"
+MAX_CONTROL_PERIOD = 1.0  # s
+MAX_EPISODE_LENGTH = 1 << 31  # control steps
+MAX_HISTORY = 1000  # observations side by side
+_MAX_FILE = 1 << 24  # bytes
+_NO_EFFECTS = EffectOptions()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -363,14 +363,14 @@ class EnvConfig:
         return blake2b(text.encode(), digest_size=16).hexdigest()
 
 
-_FROM_TASK: Final = ("action", "control_period", "episode_length")
-_OPTIONS: Final = (
+_FROM_TASK = ("action", "control_period", "episode_length")
+_OPTIONS = (
     "episode_length", "action", "control_period", "history", "effects", "randomize", "sensors",
     "cameras",
 )  # fmt: skip
-BACKEND_KEYWORDS: Final = ("num_threads", "dtype", "compiled")
+BACKEND_KEYWORDS = ("num_threads", "dtype", "compiled")
 """Keywords that are settings of the backend."""
-KEYWORDS: Final = (*_OPTIONS, "scene", "vehicle", "drones", "backend", *BACKEND_KEYWORDS)
+KEYWORDS = (*_OPTIONS, "scene", "vehicle", "drones", "backend", *BACKEND_KEYWORDS)
 """Keywords that are not options of a task."""
 
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from .config import EnvConfig
     from .tasks.task import Task
 
-_ID: Final = re.compile(r"([\w.-]+/)?[\w.-]+-v\d+")
+_ID = re.compile(r"([\w.-]+/)?[\w.-]+-v\d+")
 _tasks: Final[dict[str, "str | type[Task]"]] = {}
 
 

@@ -1,7 +1,7 @@
 """Render modes of the envs. Code that draws is imported on first use."""
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from ..rendering.live import LiveView
     from .loop import Loop
 
-RENDER_MODES: Final = ["human", "rgb_array"]
+RENDER_MODES = ["human", "rgb_array"]
 
 
 class Renderer:

@@ -18,19 +18,19 @@ from ..models.errors import InputError, shortened
 from ..models.fields import Choice, Limits, Text, check, check_fields
 from ..scenes import marks
 
-MAX_ELEMENTS: Final = 1 << 22  # numbers of all observations of one drone
-MAX_TOLD: Final = 1 << 14  # numbers of all its telemetry: each has a name in `info`
-MAX_DIMENSIONS: Final = 16  # axes of an array
-MAX_ARRAYS: Final = 64  # arrays of an observation or of the telemetry
-MAX_AGENTS: Final = 1024  # drones of one world
-MAX_MARKS: Final = 256  # things that pictures show
-MAX_NAME: Final = 200  # characters of a name, unit or frame
+MAX_ELEMENTS = 1 << 22  # numbers of all observations of one drone
+MAX_TOLD = 1 << 14  # numbers of all its telemetry: each has a name in `info`
+MAX_DIMENSIONS = 16  # axes of an array
+MAX_ARRAYS = 64  # arrays of an observation or of the telemetry
+MAX_AGENTS = 1024  # drones of one world
+MAX_MARKS = 256  # things that pictures show
+MAX_NAME = 200  # characters of a name, unit or frame
 
-WORLD: Final = "world"
+WORLD = "world"
 """Frame of vectors x, y, z: z up, right-handed."""
-BODY: Final = "body"
+BODY = "body"
 """Frame of rotation rates about x forward, y left, z up."""
-BODY_TO_WORLD: Final = "body to world"
+BODY_TO_WORLD = "body to world"
 """Frame of a quaternion w, x, y, z."""
 
 Values = dict[str, Any]
@@ -61,16 +61,16 @@ class _Pattern:
         return value
 
 
-_VISIBLE: Final = r"[^\x00-\x1f\x7f-\x9f\ud800-\udfff]"  # nor halves of surrogate pairs
-_SHORT: Final = f"of at most {MAX_NAME} characters without control characters"
-_NAME: Final = _Pattern(f"{_VISIBLE}{{1,{MAX_NAME}}}", f"a name {_SHORT}")
-_TEXT: Final = _Pattern(f"{_VISIBLE}{{0,{MAX_NAME}}}", f"a text {_SHORT}")
-_TEXTS: Final = _Pattern(_TEXT.pattern, f"a tuple of texts {_SHORT}", several=True)
-_HASH: Final = _Pattern("[0-9a-f]{32}", "32 hex digits")
-_DIGEST: Final = _Pattern("([0-9a-f]{32})?", "32 hex digits")
-_CONSTANT: Final = _Pattern("[a-z][a-z0-9_]{0,63}", "a name of a to z, 0 to 9 and _")
-_DTYPE: Final = Choice(("float32", "float64", "uint8", "int32", "int64"))
-_SIZE: Final = Limits(0.0, above=True)
+_VISIBLE = r"[^\x00-\x1f\x7f-\x9f\ud800-\udfff]"  # nor halves of surrogate pairs
+_SHORT = f"of at most {MAX_NAME} characters without control characters"
+_NAME = _Pattern(f"{_VISIBLE}{{1,{MAX_NAME}}}", f"a name {_SHORT}")
+_TEXT = _Pattern(f"{_VISIBLE}{{0,{MAX_NAME}}}", f"a text {_SHORT}")
+_TEXTS = _Pattern(_TEXT.pattern, f"a tuple of texts {_SHORT}", several=True)
+_HASH = _Pattern("[0-9a-f]{32}", "32 hex digits")
+_DIGEST = _Pattern("([0-9a-f]{32})?", "32 hex digits")
+_CONSTANT = _Pattern("[a-z][a-z0-9_]{0,63}", "a name of a to z, 0 to 9 and _")
+_DTYPE = Choice(("float32", "float64", "uint8", "int32", "int64"))
+_SIZE = Limits(0.0, above=True)
 
 
 class _Part:

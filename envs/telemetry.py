@@ -6,7 +6,7 @@ World frame: z up. Body frame: x forward, y left, z up. SI units.
 from collections.abc import Callable
 from dataclasses import dataclass
 from operator import attrgetter
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,7 +60,7 @@ def _of_state(name: str, components: Names, unit: str, frame: str) -> Quantity:
     return Quantity(name, components, unit, attrgetter(f"record.state.{name}"), frame)
 
 
-POSE: Final = (
+POSE = (
     _of_state("position", ("x", "y", "z"), "m", WORLD),
     Quantity(
         "attitude",

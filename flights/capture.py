@@ -12,7 +12,7 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import mujoco
 import numpy as np
@@ -31,8 +31,8 @@ from .viewpoints import Plan, PoseSequence
 if TYPE_CHECKING:
     from ..rendering.cameras import Cameras
 
-_MOST_FRAMES: Final = 64  # of a job
-_FARTHEST: Final = 65.535  # m: the largest number of millimetres in 16 bits
+_MOST_FRAMES = 64  # of a job
+_FARTHEST = 65.535  # m: the largest number of millimetres in 16 bits
 Picture = NDArray[np.generic]
 
 

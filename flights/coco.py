@@ -4,7 +4,7 @@ import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from ..agents.checkpoints import write_whole
 from ..models.vehicle import Vehicle
@@ -13,7 +13,7 @@ from .viewpoints import Plan, PoseSequence
 
 Labels = dict[str, Any]
 """The labels of one frame or picture: an object of JSON."""
-_SAME_VIEW: Final = ("camera", "drone", "width", "height")
+_SAME_VIEW = ("camera", "drone", "width", "height")
 
 
 def write_coco(

@@ -10,7 +10,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import fields
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import gymnasium as gym
 import numpy as np
@@ -30,8 +30,8 @@ from .trajectories import Trajectory
 if TYPE_CHECKING:
     import pyarrow as pa
 
-_ROW_GROUP: Final = 1 << 17  # steps that are written together
-_MINARI_ID: Final = re.compile(r"([\w-]{2,}/)*[\w-]+-v\d+", re.ASCII)
+_ROW_GROUP = 1 << 17  # steps that are written together
+_MINARI_ID = re.compile(r"([\w-]{2,}/)*[\w-]+-v\d+", re.ASCII)
 
 Rows = TypeVar("Rows", bound=Sized)
 

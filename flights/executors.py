@@ -19,7 +19,7 @@ from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from multiprocessing.queues import SimpleQueue
 from threading import Thread
-from typing import Any, Final, Literal, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 from ..models.errors import InputError
 
@@ -31,7 +31,7 @@ _Job = TypeVar("_Job")
 _Value = TypeVar("_Value")
 _Progress = SimpleQueue[tuple[str, int, int, str] | None]
 
-_CHILD_ENVIRONMENT: Final = {
+_CHILD_ENVIRONMENT = {
     "PYTHONSAFEPATH": "1",  # no file of the working directory takes the place of a package
     "OMP_NUM_THREADS": "1",  # a second thread makes small tensors slower
 }

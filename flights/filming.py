@@ -6,7 +6,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,11 +24,11 @@ Picture = NDArray[np.uint8]
 OnFrame = Callable[[int, int], object]
 """Called with frames drawn, and frames in all."""
 
-MAX_FRAMES: Final = 1_000_000
+MAX_FRAMES = 1_000_000
 """Largest number of frames of a film: 11 hours of it."""
-_SPACE: Final = 2  # pixels between panes
-_DARK: Final = (13, 18, 26)
-_ASPECT: Final = 1.2  # of a pane that shows a craft well
+_SPACE = 2  # pixels between panes
+_DARK = (13, 18, 26)
+_ASPECT = 1.2  # of a pane that shows a craft well
 
 
 def moments(trajectory: Trajectory) -> list[Moment]:

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, NoReturn
+from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,21 +16,21 @@ Rows = NDArray[np.int_]
 Columns = Mapping[str, NDArray[np.generic]]
 """Columns of a file by name, each of shape (N,)."""
 
-MOTION: Final = ("x", "y", "z", "qw", "qx", "qy", "qz", "vx", "vy", "vz", "wx", "wy", "wz")
+MOTION = ("x", "y", "z", "qw", "qx", "qy", "qz", "vx", "vy", "vz", "wx", "wy", "wz")
 """Columns that a log must have besides the time t, s: position, m, and velocity, m/s, world frame
 with z up; quaternion from body to world; body rates, rad/s, in a body frame x forward, y left,
 z up."""
-SPEED: Final = "m{}_rads"
-SPEED_COMMAND: Final = "m{}_command_rads"
-THROTTLE: Final = "m{}_throttle"
+SPEED = "m{}_rads"
+SPEED_COMMAND = "m{}_command_rads"
+THROTTLE = "m{}_throttle"
 """Columns of rotor 1, 2...: measured speed and commanded speed, rad/s, and throttle, 0 to 1, which
 is the share of the largest thrust. A log has measured speeds, or one of the commands, or both."""
-_KINDS: Final = (SPEED, SPEED_COMMAND, THROTTLE)
-_LONGEST_GAP: Final = 0.1  # s: longer gaps are not interpolated
-_POSITION_ERROR: Final = 0.5  # m: between two samples, besides the distance by the velocity
-_ATTITUDE_ERROR: Final = 0.5  # rad: the same for the attitude
-_MOST_LEFT_OUT: Final = 0.01  # share of the samples
-_FASTEST: Final = 5.0  # rotor speed, as a multiple of that at the largest thrust
+_KINDS = (SPEED, SPEED_COMMAND, THROTTLE)
+_LONGEST_GAP = 0.1  # s: longer gaps are not interpolated
+_POSITION_ERROR = 0.5  # m: between two samples, besides the distance by the velocity
+_ATTITUDE_ERROR = 0.5  # rad: the same for the attitude
+_MOST_LEFT_OUT = 0.01  # share of the samples
+_FASTEST = 5.0  # rotor speed, as a multiple of that at the largest thrust
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -282,12 +282,12 @@ def _grid(path: Path, times: Floats, period: float) -> Floats:
 
 # ---- PX4
 
-_POSITION: Final = "vehicle_local_position"
-_ATTITUDE: Final = "vehicle_attitude"
-_RATES: Final = "vehicle_angular_velocity"
-_ESC: Final = "esc_status"
-_MOTORS: Final = "actuator_motors"
-_MOST_ROTORS: Final = 12
+_POSITION = "vehicle_local_position"
+_ATTITUDE = "vehicle_attitude"
+_RATES = "vehicle_angular_velocity"
+_ESC = "esc_status"
+_MOTORS = "actuator_motors"
+_MOST_ROTORS = 12
 
 
 def _ulog(path: Path) -> Columns:

@@ -6,11 +6,10 @@ from contextlib import contextmanager
 from datetime import datetime
 from itertools import count
 from pathlib import Path
-from typing import Final
 
 from ..models.errors import InputError
 
-LOCK: Final = ".lock"
+LOCK = ".lock"
 """File in a folder that its writer holds locked."""
 
 

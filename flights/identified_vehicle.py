@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterator, Mapping
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,8 +12,8 @@ from ..models.vehicle_file import read_vehicle_file
 from .identify import LAG, Identified
 from .prediction import Numbers, inertia_of
 
-_AXES: Final = ("x", "y", "z")
-_OF_FILE: Final = ("body.size", "body.ground_clearance", "rotors.speed")
+_AXES = ("x", "y", "z")
+_OF_FILE = ("body.size", "body.ground_clearance", "rotors.speed")
 """Entries of a file that the vehicle itself no longer has."""
 
 

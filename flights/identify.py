@@ -11,7 +11,7 @@ it cannot be distinguished from another number.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,22 +31,22 @@ from .prediction import (
     predict,
 )
 
-LAG: Final = "rotors.time_constant"
-KNOWN: Final = (*NAMES, LAG)
+LAG = "rotors.time_constant"
+KNOWN = (*NAMES, LAG)
 """Numbers that can be identified."""
-DEFAULT: Final = (
+DEFAULT = (
     "rotors.thrust_coefficient", LAG, "body.inertia.x", "body.inertia.y", "body.inertia.z",
     "drag.linear.x", "drag.linear.y", "drag.linear.z", "rotors.reaction",
 )  # fmt: skip
 """Identified by default. Of two that cannot be distinguished the later keeps its value."""
-WIDEST: Final = 0.5
+WIDEST = 0.5
 """A number is not excited if its 95 % interval reaches further than this share, either way."""
-ALIKE: Final = 0.98
+ALIKE = 0.98
 """Two numbers cannot be distinguished if their estimates correlate more than this."""
-SEGMENT: Final = 2.0
+SEGMENT = 2.0
 """Length of a cluster, s: four of the default windows."""
-_LEAST_SEGMENTS: Final = 5
-_ROUNDS: Final = 2  # of estimating the spreads anew
+_LEAST_SEGMENTS = 5
+_ROUNDS = 2  # of estimating the spreads anew
 
 Group = tuple[str, ...]
 """Names of numbers that stay equal."""

@@ -1,15 +1,13 @@
 """Order, names and colours of agents in all tables and figures."""
 
-from typing import Final
-
 from ..agents import ALGORITHMS, CONTROLLERS
 
 # Okabe and Ito's palette: told apart by readers with colour-blindness.
-_CONTROLLER: Final = "#555555"
-_SPARE: Final = ("#CC79A7", "#E69F00", "#56B4E9", "#8C564B")
-FLIGHT_COLORS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8C564B")
+_CONTROLLER = "#555555"
+_SPARE = ("#CC79A7", "#E69F00", "#56B4E9", "#8C564B")
+FLIGHT_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8C564B")
 """Colours of flights and rotors on a light ground, the same palette."""
-_OWN: Final = {name: row.color for name, row in ALGORITHMS.items() if row.color} | dict.fromkeys(
+_OWN = {name: row.color for name, row in ALGORITHMS.items() if row.color} | dict.fromkeys(
     CONTROLLERS, _CONTROLLER
 )
 

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from itertools import cycle
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,17 +21,17 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-FORMATS: Final = (".png", ".pdf", ".svg")
-_COLUMNS: Final = 3
-_FIRST: Final = (
+FORMATS = (".png", ".pdf", ".svg")
+_COLUMNS = 3
+_FIRST = (
     "position", "velocity", "attitude", "body_rates", "rates", "thrust", "battery", "voltage",
     "wind",
 )  # fmt: skip
 """Order of the signals; others follow."""
-_ON_POSITION: Final = {"goal": "--", "payload": ":"}
+_ON_POSITION = {"goal": "--", "payload": ":"}
 """Signals that are drawn beside the position, and their line style."""
-_HIDDEN: Final = ("time", "drawn", "action", "reward", *_ON_POSITION)
-_STYLES: Final = ("-", "--", ":", "-.")
+_HIDDEN = ("time", "drawn", "action", "reward", *_ON_POSITION)
+_STYLES = ("-", "--", ":", "-.")
 """Line styles of the numbers in one panel."""
 _WIDTH, _ROW = 11.0, 1.75  # inches
 

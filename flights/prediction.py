@@ -11,7 +11,7 @@ import copy
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any, Final, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,16 +29,16 @@ Floats = NDArray[np.float64]
 Numbers = Mapping[str, float]
 """Numbers of a vehicle by the names of `NAMES`, in the units of `models/coefficients.py`."""
 
-NAMES: Final = (
+NAMES = (
     "rotors.thrust_coefficient", "rotors.reaction", "rotors.drag", "rotors.inflow", "rotors.lift",
     "body.inertia.x", "body.inertia.y", "body.inertia.z",
     "drag.linear.x", "drag.linear.y", "drag.linear.z",
     "drag.angular.x", "drag.angular.y", "drag.angular.z", "drag.moment.x", "drag.moment.y",
 )  # fmt: skip
 """Numbers that move a vehicle and can be fitted."""
-_ON_ROTORS: Final = ("rotors.drag", "rotors.inflow", "rotors.lift")
-_MORE_THRUST: Final = 100.0  # times the vehicle's limit: predictions never reach it
-_LOST: Final = 1e6  # every number of a state after a prediction that diverged
+_ON_ROTORS = ("rotors.drag", "rotors.inflow", "rotors.lift")
+_MORE_THRUST = 100.0  # times the vehicle's limit: predictions never reach it
+_LOST = 1e6  # every number of a state after a prediction that diverged
 
 
 def numbers_of(vehicle: Vehicle) -> dict[str, float]:

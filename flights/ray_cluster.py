@@ -4,13 +4,13 @@ import logging
 import socket
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
-from typing import Any, Final
+from typing import Any
 
 from ..agents.checkpoints import software_versions
 from ..models.errors import InputError, require
 from .executors import Result
 
-_LISTENING_TIMEOUT: Final = 5.0  # s
+_LISTENING_TIMEOUT = 5.0  # s
 
 
 class RayExecutor(Executor):

@@ -5,7 +5,7 @@ import io
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from .trajectories import Trajectory
 
 Floats = NDArray[np.float64]
 
-QUATERNION: Final = ("qw", "qx", "qy", "qz")
+QUATERNION = ("qw", "qx", "qy", "qz")
 
 
 class Column(NamedTuple):

@@ -22,7 +22,7 @@ from ..models.errors import InputError
 
 Floats = NDArray[np.float64]
 
-_EVALUATION: Final = 20230324  # the day the paper appeared
+_EVALUATION = 20230324  # the day the paper appeared
 
 EpisodeSet = Literal["final", "curve", "tuning"]
 """Evaluation episodes that share no start: `final` for the figures that are reported, `curve` for

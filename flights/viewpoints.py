@@ -36,8 +36,8 @@ from .trajectories import Trajectory, flown_trajectories
 
 Floats = NDArray[np.float64]
 
-MAX_FRAMES: Final = 1_000_000
-_FARTHEST: Final = 1e4  # m
+MAX_FRAMES = 1_000_000
+_FARTHEST = 1e4  # m
 
 _Count = Annotated[int, Limits(1, MAX_FRAMES, whole=True)]
 _Index = Annotated[int, Limits(0, whole=True)]

@@ -17,15 +17,15 @@ __all__ = [
     "Rotor", "Vehicle",
 ]  # fmt: skip
 
-QUAD_XML: Final = Path(__file__).parent / "quad.xml"
+QUAD_XML = Path(__file__).parent / "quad.xml"
 """The paper's vehicle."""
 Backend = Literal["mujoco", "rigid"]
 """What steps vehicles. `mujoco`: threads of this machine, float64. `rigid`: the rigid body alone,
 no contact, in NumPy or in compiled C."""
 BACKENDS: Final[tuple[Backend, ...]] = get_args(Backend)
-MAX_DRONES: Final = 1024
+MAX_DRONES = 1024
 """Most drones of a world."""
-MAX_DRAG: Final = 100.0
+MAX_DRAG = 100.0
 """Largest linear drag, 1/s. RK4 at 10 ms is within 0.1 % there, and unstable above 278 /s."""
 
 

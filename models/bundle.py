@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
-from typing import Any, Final
+from typing import Any
 
 from .errors import InputError, shortened
 from .files import find_in_package
@@ -14,9 +14,9 @@ from .library import find_vehicle
 from .mjcf import read_xml
 from .vehicle_file import model_of
 
-MAX_BYTES: Final = 1 << 26
+MAX_BYTES = 1 << 26
 """Largest size of all files of a vehicle."""
-_DIRECTORIES: Final = ("meshdir", "texturedir", "assetdir")
+_DIRECTORIES = ("meshdir", "texturedir", "assetdir")
 
 Bundle = tuple[tuple[str, str], ...]
 """Pairs of a relative path with slashes and a file's bytes in base64; the vehicle's own first."""

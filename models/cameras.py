@@ -9,7 +9,6 @@ import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
 
 import mujoco
 import numpy as np
@@ -18,24 +17,24 @@ from .coefficients import PREFIX
 from .errors import InputError, shortened
 from .fields import Limits, check
 
-OUTPUTS: Final = {
+OUTPUTS = {
     "rgb": mujoco.mjtCamOutBit.mjCAMOUT_RGB,
     "depth": mujoco.mjtCamOutBit.mjCAMOUT_DEPTH,
     "segmentation": mujoco.mjtCamOutBit.mjCAMOUT_SEG,
 }
 """Kinds of pictures, and their bits in an MJCF file. `rgb`: uint8, 3 channels. `depth`: float32, m,
 along the camera's axis. `segmentation`: int32, a number for each object."""
-_DTYPES: Final = {"rgb": "uint8", "depth": "float32", "segmentation": "int32"}
-FARTHEST: Final = 1000.0
+_DTYPES = {"rgb": "uint8", "depth": "float32", "segmentation": "int32"}
+FARTHEST = 1000.0
 """Where drawing ends, and the depth where nothing is seen, m."""
-MAX_PIXELS: Final = 4096  # of a side
-_TEXTS: Final = PREFIX + "cameras."
-_SIDE: Final = 64  # Pixels of a side, if the file gives none
-MAX_LETTERS: Final = 64  # of a name
-FOVY: Final = (1e-3, 3.0)  # rad
-_DEGREES: Final = Limits(math.degrees(FOVY[0]), math.degrees(FOVY[1]), "degrees")
-_SIDES: Final = Limits(1, MAX_PIXELS, "pixels", whole=True)
-MAX_STEPS: Final = 1000  # from picture to picture
+MAX_PIXELS = 4096  # of a side
+_TEXTS = PREFIX + "cameras."
+_SIDE = 64  # Pixels of a side, if the file gives none
+MAX_LETTERS = 64  # of a name
+FOVY = (1e-3, 3.0)  # rad
+_DEGREES = Limits(math.degrees(FOVY[0]), math.degrees(FOVY[1]), "degrees")
+_SIDES = Limits(1, MAX_PIXELS, "pixels", whole=True)
+MAX_STEPS = 1000  # from picture to picture
 _Vector = tuple[float, float, float]
 
 

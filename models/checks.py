@@ -27,19 +27,19 @@ from .vehicle import Vehicle
 
 Array = NDArray[np.float64]
 
-_MAX_STEPS: Final = 4000  # of a flight: tiny physics steps shorten it
-_HEIGHT: Final = 1000.0  # m: flights begin here, and none reaches the floor
-_SPIN: Final = np.array((1.0, 2.0, 3.0)) / math.sqrt(14)  # an axis that is no axis of symmetry
-_FASTEST_TURN: Final = math.radians(2000)  # rad/s: the range of common gyroscopes (Bosch BMI088)
+_MAX_STEPS = 4000  # of a flight: tiny physics steps shorten it
+_HEIGHT = 1000.0  # m: flights begin here, and none reaches the floor
+_SPIN = np.array((1.0, 2.0, 3.0)) / math.sqrt(14)  # an axis that is no axis of symmetry
+_FASTEST_TURN = math.radians(2000)  # rad/s: the range of common gyroscopes (Bosch BMI088)
 
-_THRUSTS: Final = mujoco.mjtDisableBit.mjDSBL_ACTUATION
-_CONTACTS: Final = mujoco.mjtDisableBit.mjDSBL_CONTACT
-_EXACT: Final = 1e-9  # tolerance where the integrator is exact: the rounding errors of a flight
-_RELATIVE: Final = 1e-6  # tolerance of measured masses, inertias and thrusts
-_ATTITUDE: Final = math.radians(0.01)  # rad: error of a second that a physics step may make
-_TURN: Final = 8.0  # rad: length of a tumbling flight
-_COARSE: Final = 0.05  # rad: the turn in a step of the coarsest of three flights
-_TINY: Final = 1e-300  # divides where there is nothing to divide by
+_THRUSTS = mujoco.mjtDisableBit.mjDSBL_ACTUATION
+_CONTACTS = mujoco.mjtDisableBit.mjDSBL_CONTACT
+_EXACT = 1e-9  # tolerance where the integrator is exact: the rounding errors of a flight
+_RELATIVE = 1e-6  # tolerance of measured masses, inertias and thrusts
+_ATTITUDE = math.radians(0.01)  # rad: error of a second that a physics step may make
+_TURN = 8.0  # rad: length of a tumbling flight
+_COARSE = 0.05  # rad: the turn in a step of the coarsest of three flights
+_TINY = 1e-300  # divides where there is nothing to divide by
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class Check(Rule):
         return values
 
 
-_RULES: Final = tomllib.loads((Path(__file__).parent / "rules.toml").read_text("utf-8"))
+_RULES = tomllib.loads((Path(__file__).parent / "rules.toml").read_text("utf-8"))
 RULES: Final[Mapping[str, Rule]] = {name: Rule(**row) for name, row in _RULES.items()}
 """Every check by its name; {} stands for a rotor, an axis or a group."""
 

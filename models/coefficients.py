@@ -13,7 +13,7 @@ from typing import Any, Final
 from .errors import InputError
 from .fields import Limits, check, check_names, limits_of, optional
 
-PREFIX: Final = "rotorgram/"
+PREFIX = "rotorgram/"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,7 +152,7 @@ def as_tuple(value: float | tuple[float, ...]) -> tuple[float, ...]:
     return value if isinstance(value, tuple) else (value,)
 
 
-GROUPS: Final = {"rotors": Rotors, "drag": Drag, "battery": Battery, "sensors": Sensors}
+GROUPS = {"rotors": Rotors, "drag": Drag, "battery": Battery, "sensors": Sensors}
 COEFFICIENTS: Final[dict[str, Limits]] = {}
 """The limits of every coefficient, by "group.name"."""
 for _group, _kind in GROUPS.items():

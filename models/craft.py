@@ -5,7 +5,7 @@ import os
 from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -19,20 +19,20 @@ from .vehicle_file import ORIGIN, UP, Box, Cylinder, PlacedRotor, VehicleFile
 Vector = Sequence[float] | np.ndarray
 Colour = tuple[float, float, float, float]
 
-DEFAULT_TIMESTEP: Final = 0.01
+DEFAULT_TIMESTEP = 0.01
 """Physics step of a file without one, s."""
-DEFAULT_GRAVITY: Final = 9.81
+DEFAULT_GRAVITY = 9.81
 """Downward acceleration of a file without one, m/s²."""
-_CARBON: Final = (0.13, 0.14, 0.16, 1.0)
-_SHELL: Final = (0.93, 0.94, 0.95, 1.0)
-_SILVER: Final = (0.62, 0.65, 0.69, 1.0)
-_ORANGE: Final = (0.96, 0.42, 0.08, 1.0)
-_FRONT_DISC: Final = (0.98, 0.50, 0.12, 0.42)
-_DISC: Final = (0.20, 0.46, 0.78, 0.42)
-_BOX: Final = mujoco.mjtGeom.mjGEOM_BOX
-_CAPSULE: Final = mujoco.mjtGeom.mjGEOM_CAPSULE
-_CYLINDER: Final = mujoco.mjtGeom.mjGEOM_CYLINDER
-_ELLIPSOID: Final = mujoco.mjtGeom.mjGEOM_ELLIPSOID
+_CARBON = (0.13, 0.14, 0.16, 1.0)
+_SHELL = (0.93, 0.94, 0.95, 1.0)
+_SILVER = (0.62, 0.65, 0.69, 1.0)
+_ORANGE = (0.96, 0.42, 0.08, 1.0)
+_FRONT_DISC = (0.98, 0.50, 0.12, 0.42)
+_DISC = (0.20, 0.46, 0.78, 0.42)
+_BOX = mujoco.mjtGeom.mjGEOM_BOX
+_CAPSULE = mujoco.mjtGeom.mjGEOM_CAPSULE
+_CYLINDER = mujoco.mjtGeom.mjGEOM_CYLINDER
+_ELLIPSOID = mujoco.mjtGeom.mjGEOM_ELLIPSOID
 
 
 def craft_spec(file: VehicleFile, base: mujoco.MjSpec | None = None) -> mujoco.MjSpec:

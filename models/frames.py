@@ -12,14 +12,12 @@ positive psi is right side up.
 Every function accepts any leading axes, or none.
 """
 
-from typing import Final
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
-_POLE: Final = 1 - 1e-12  # sine of phi past which (within 1e-4 degrees) the nose counts as vertical
+_POLE = 1 - 1e-12  # sine of phi past which (within 1e-4 degrees) the nose counts as vertical
 
 
 def positions_in_paper_frame(positions: ArrayLike) -> Array:

@@ -2,14 +2,13 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
 
 from . import QUAD_XML
 from .errors import InputError, shortened
 
 __all__ = ["LIBRARY", "find_vehicle", "is_of_the_library", "vehicle_names", "vehicle_words"]
 
-LIBRARY: Final = Path(__file__).parent / "vehicles"
+LIBRARY = Path(__file__).parent / "vehicles"
 """One folder for each vehicle: `NAME/vehicle.toml`."""
 
 

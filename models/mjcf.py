@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
 from xml.etree import ElementTree
 
 import mujoco
@@ -12,11 +11,11 @@ from .craft import craft_spec
 from .errors import InputError
 from .vehicle_file import read_vehicle_file
 
-MAX_ELEMENTS: Final = 10_000  # of a file, each as often as it is repeated: seconds to compile
-MAX_MEMORY: Final = 1 << 30  # bytes of MJCF's attribute `memory`
-MAX_NUMBERS: Final = 1 << 26  # of all height fields, textures, numerics and sensors: 0.5 GB
-_USER: Final = ("body", "jnt", "geom", "site", "cam", "tendon", "actuator", "sensor")
-_SIZES: Final = {
+MAX_ELEMENTS = 10_000  # of a file, each as often as it is repeated: seconds to compile
+MAX_MEMORY = 1 << 30  # bytes of MJCF's attribute `memory`
+MAX_NUMBERS = 1 << 26  # of all height fields, textures, numerics and sensors: 0.5 GB
+_USER = ("body", "jnt", "geom", "site", "cam", "tendon", "actuator", "sensor")
+_SIZES = {
     **{f"nuser_{kind}": 100 for kind in _USER},
     "nkey": 100,
     "njmax": 4000,
@@ -24,16 +23,16 @@ _SIZES: Final = {
     "nuserdata": 1_000_000,
     "nstack": 10_000_000,
 }
-_SIDES: Final = dict.fromkeys(("nrow", "ncol", "width", "height"), 4096)
-_LENGTHS: Final = dict.fromkeys(("size", "dim", "num", "nsample", "actdim"), 10_000)
-_ARRAYS: Final = {
+_SIDES = dict.fromkeys(("nrow", "ncol", "width", "height"), 4096)
+_LENGTHS = dict.fromkeys(("size", "dim", "num", "nsample", "actdim"), 10_000)
+_ARRAYS = {
     **dict.fromkeys(("hfield", "texture"), _SIDES),
     **dict.fromkeys(("numeric", "user", "contact", "general", "plugin"), _LENGTHS),
 }
 """Largest attributes of the elements whose product is a number of numbers."""
-_REPEATED: Final = ("replicate", "composite", "flexcomp")
-_UNITS: Final = "KMGTPE"  # each is 1024 times the one before
-_GROUNDS: Final = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
+_REPEATED = ("replicate", "composite", "flexcomp")
+_UNITS = "KMGTPE"  # each is 1024 times the one before
+_GROUNDS = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
 
 
 def read_spec(path: Path) -> mujoco.MjSpec:

@@ -1,7 +1,6 @@
 """Several crafts in one world: its compiled model, and which parts belong to which craft."""
 
 from collections.abc import Sequence
-from typing import Final
 
 import mujoco
 import numpy as np
@@ -10,7 +9,7 @@ from .errors import InputError
 from .mjcf import add_ground, swarm_spec
 from .vehicle import Vehicle, hang_payload, owners
 
-SHARED: Final = ("timestep", "gravity", "integrator", "density", "viscosity", "wind", "magnetic")
+SHARED = ("timestep", "gravity", "integrator", "density", "viscosity", "wind", "magnetic")
 """Options that a world has once, so that its vehicles have to agree."""
 CONTACTS = "rotorgram/contacts"
 GROUNDED = "rotorgram/grounded"

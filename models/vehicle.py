@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from hashlib import blake2b
 from pathlib import Path
-from typing import Final, Self
+from typing import Self
 
 import mujoco
 import numpy as np
@@ -25,17 +25,17 @@ from .library import find_vehicle
 from .mjcf import free_body, level_data, vehicle_spec
 from .vehicle_file import inertia_matrix, model_of, read_vehicle_file
 
-_LEAST_TIMESTEP: Final = 1e-5  # s: a control step of 0.02 s then takes a hundredth of a second
-_MAX_TIMESTEP: Final = 1.0  # s: that of the longest control step
-_FIRST_HEIGHT: Final = 6.0  # m: where most craft touch nothing
-_MAX_HEIGHT: Final = 1e4  # m: above it no craft may touch anything
-_MAX_MASS: Final = 1e9  # kg: its squares overflow nowhere
-_RELATIVE: Final = 1e-9  # of a hover's torques and forces: what rounding leaves
-_ROUNDED: Final = 1e-5  # of the weight, sideways: what a file's six digits leave
+_LEAST_TIMESTEP = 1e-5  # s: a control step of 0.02 s then takes a hundredth of a second
+_MAX_TIMESTEP = 1.0  # s: that of the longest control step
+_FIRST_HEIGHT = 6.0  # m: where most craft touch nothing
+_MAX_HEIGHT = 1e4  # m: above it no craft may touch anything
+_MAX_MASS = 1e9  # kg: its squares overflow nowhere
+_RELATIVE = 1e-9  # of a hover's torques and forces: what rounding leaves
+_ROUNDED = 1e-5  # of the weight, sideways: what a file's six digits leave
 
-_PAYLOAD: Final = "rotorgram/payload"  # the body's name
+_PAYLOAD = "rotorgram/payload"  # the body's name
 
-SURROUNDINGS: Final = (True, False, False, False, False, False)
+SURROUNDINGS = (True, False, False, False, False, False)
 """Of a vehicle's model the groups of geoms that are not the craft's, for rays."""
 
 

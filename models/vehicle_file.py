@@ -26,11 +26,11 @@ _Place = Annotated[_Vector, Limits(-100.0, 100.0, "m", count=3)]
 _Mass = Annotated[float, Limits(1e-6, 1e6, "kg")]
 _Length = Annotated[float, Limits(1e-5, 100.0, "m")]
 
-ORIGIN: Final = (0.0, 0.0, 0.0)
-AHEAD: Final = (1.0, 0.0, 0.0)
-UP: Final = (0.0, 0.0, 1.0)
-_MAX_BYTES: Final = 1_000_000  # it is read within a few seconds
-_LEAST_MOMENT: Final = 1e-15  # kg m²: MuJoCo's mjMINVAL
+ORIGIN = (0.0, 0.0, 0.0)
+AHEAD = (1.0, 0.0, 0.0)
+UP = (0.0, 0.0, 1.0)
+_MAX_BYTES = 1_000_000  # it is read within a few seconds
+_LEAST_MOMENT = 1e-15  # kg m²: MuJoCo's mjMINVAL
 
 
 @dataclass(frozen=True)

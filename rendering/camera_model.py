@@ -5,7 +5,6 @@ Pictures have a model of their own; the physics does not see it.
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Final
 
 import mujoco
 import numpy as np
@@ -19,16 +18,16 @@ from ..scenes import add_scene
 from ..scenes.marks import Mark
 from .stage import MARK_COLORS, MARK_GEOMS, scale_drawing
 
-NOTHING: Final = "nothing"
+NOTHING = "nothing"
 """Name of what a segmentation picture has where it sees no object: number 0."""
-GOAL: Final = "goal"
+GOAL = "goal"
 """Of the body of a drone's marks that move, behind the drone's name and a slash."""
-PAYLOAD: Final = "payload"
+PAYLOAD = "payload"
 """Of the body of the payload, which all drones of a world share."""
-_NEAREST: Final = 0.05  # Where drawing begins, over the vehicle's radius
-_THINNEST: Final = 0.04  # Thickness of a disc, over the height at which the lowest craft rests
-_PLAIN: Final = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's colour of a geom that has that of its material
-_UNNAMED: Final = "unnamed"
+_NEAREST = 0.05  # Where drawing begins, over the vehicle's radius
+_THINNEST = 0.04  # Thickness of a disc, over the height at which the lowest craft rests
+_PLAIN = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's colour of a geom that has that of its material
+_UNNAMED = "unnamed"
 
 
 def objects_of(

@@ -9,7 +9,7 @@ A camera's frame here: x right, y down, z along its axis, as in computer vision.
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -22,9 +22,9 @@ from ..scenes.marks import Mark
 from .camera_model import GOAL, PAYLOAD, drawn_model, objects_in, own_discs
 from .gl import Offscreen
 
-_ROOM: Final = 1000  # geoms beyond those of the model
-_HIDDEN: Final = 5  # a group of geoms that is not drawn
-_FLIP: Final = np.array((1.0, -1.0, -1.0))  # from MuJoCo's camera frame to that of vision
+_ROOM = 1000  # geoms beyond those of the model
+_HIDDEN = 5  # a group of geoms that is not drawn
+_FLIP = np.array((1.0, -1.0, -1.0))  # from MuJoCo's camera frame to that of vision
 
 
 class Lens(NamedTuple):

@@ -7,7 +7,6 @@ from fractions import Fraction
 from itertools import chain
 from pathlib import Path
 from types import ModuleType
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +19,7 @@ require("PIL", "render", "what is written on pictures and into films")
 
 from PIL import Image  # noqa: E402
 
-QUALITY: Final = 20
+QUALITY = 20
 """x264's constant rate factor: less is better and larger."""
 
 

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from ..models.errors import NoOpenGL, shortened
 
@@ -17,11 +17,11 @@ if TYPE_CHECKING:
 Lines = Sequence[tuple[str, str]]
 """Names and values that are written on a picture."""
 
-_OFF: Final = ("disable", "disabled", "off", "false", "0")
-_ON: Final = ("enable", "enabled", "on", "true", "1", "glfw", "glx", "wgl")
-_LARGE: Final = 480  # pixels: higher pictures have large letters
-_LIBRARIES: Final = {"egl": "EGL", "osmesa": "OSMesa", "cgl": "OpenGL"}
-_HIDDEN: Final = "ROTORGRAM_GL"
+_OFF = ("disable", "disabled", "off", "false", "0")
+_ON = ("enable", "enabled", "on", "true", "1", "glfw", "glx", "wgl")
+_LARGE = 480  # pixels: higher pictures have large letters
+_LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa", "cgl": "OpenGL"}
+_HIDDEN = "ROTORGRAM_GL"
 """Keeps `MUJOCO_GL` as the user set it while `hidden_gl_setting` hides it from MuJoCo. An
 environment variable, so that the processes that this one starts know it too."""
 

@@ -8,7 +8,7 @@ import time
 from contextlib import AbstractContextManager
 from queue import SimpleQueue
 from threading import Event, Thread
-from typing import Final, Literal, Protocol
+from typing import Literal, Protocol
 
 import mujoco
 import numpy as np
@@ -18,16 +18,16 @@ from ..models.fields import Limits, check
 from .gl import Lines
 from .stage import Moment, Stage
 
-MAX_SHOWN: Final = 16
+MAX_SHOWN = 16
 """Most craft side by side; of more, the first ones are shown."""
-_PICTURES: Final = 30.0  # a second, at most
-_NAP: Final = 0.02  # s, at most, before keys are looked at again
+_PICTURES = 30.0  # a second, at most
+_NAP = 0.02  # s, at most, before keys are looked at again
 
 Press = Literal["pause", "step", "slower", "faster"]
 """Effect of a key."""
-SPEEDS: Final = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0, 4.0, 8.0)
+SPEEDS = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0, 4.0, 8.0)
 """Steps of `slower` and `faster`; 1 is real time."""
-_CATCH_UP: Final = 0.1  # Longest delay that later steps make up for, s
+_CATCH_UP = 0.1  # Longest delay that later steps make up for, s
 
 
 class Pace:

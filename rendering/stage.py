@@ -28,37 +28,37 @@ CAMERAS: Final[tuple[Camera, ...]] = get_args(Camera)
 _MAX_METRICS = 4  # with a line of their own
 _MAX_THRUSTS = 4  # rotors with a number of their own
 _TRAIL, _EVERY = 150, 3  # control steps of a path, and of one piece of it
-_ORANGE: Final = (0.96, 0.42, 0.08)
-_GREEN: Final = (0.13, 0.78, 0.52)
-MARK_COLORS: Final = {"gate": _ORANGE, "disc": _GREEN, "ball": _GREEN}
+_ORANGE = (0.96, 0.42, 0.08)
+_GREEN = (0.13, 0.78, 0.52)
+MARK_COLORS = {"gate": _ORANGE, "disc": _GREEN, "ball": _GREEN}
 """Red, green and blue, 0 to 1, of marks."""
 _PAYLOAD = (*_ORANGE, 1.0)
 _CABLE = (0.13, 0.14, 0.16, 1.0)
 _PATH = (1.0, 0.85, 0.25)
-DRONE_COLORS: Final = (
+DRONE_COLORS = (
     _PATH, (0.34, 0.71, 0.91), (0.90, 0.62, 0.0), (0.0, 0.62, 0.45), (0.80, 0.47, 0.65),
     (0.0, 0.45, 0.70), (0.84, 0.37, 0.0), (0.55, 0.34, 0.29),
 )  # fmt: skip
 """Red, green and blue, 0 to 1, of the drones of one world, their paths and goals, again from the
 first: Okabe and Ito's, told apart with colour-blindness."""
-MAX_NAMES: Final = 16
+MAX_NAMES = 16
 """Drones of one world whose names are shown; more would hide them."""
-MARK_GEOMS: Final = {
+MARK_GEOMS = {
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
     "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
     "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
 }
 """How parts of marks are drawn."""
-_CAPSULE: Final = mujoco.mjtGeom.mjGEOM_CAPSULE
-_ONBOARD: Final = "stage/onboard"
+_CAPSULE = mujoco.mjtGeom.mjGEOM_CAPSULE
+_ONBOARD = "stage/onboard"
 _ROOM = 10_000  # geoms
-_SIDES: Final = Limits(16, 8192, "pixels", whole=True)
+_SIDES = Limits(16, 8192, "pixels", whole=True)
 _SAMPLES = 4  # of every pixel, for smooth edges; software has no more
 
 # Lengths below are in radii of the craft.
-_SPACING: Final = 2.2  # between craft that fly side by side
-_NEAR: Final = 0.14  # at most: where drawing begins
-_LOWER: Final = 0.06  # of their distance front and side look below the goal
+_SPACING = 2.2  # between craft that fly side by side
+_NEAR = 0.14  # at most: where drawing begins
+_LOWER = 0.06  # of their distance front and side look below the goal
 _VIEWS: Final[dict[str, tuple[float, float, float, float]]] = {
     "chase": (0.0, -17.0, 3.85, math.inf),
     "front": (180.0, -7.0, 6.9, 1.65),  # from a little above the goal: its disc is seen
@@ -68,9 +68,9 @@ _VIEWS: Final[dict[str, tuple[float, float, float, float]]] = {
 }
 """Azimuth and elevation in degrees, distance, and the distance between craft and goal that the
 picture holds: if they are further apart, the camera is further away."""
-_BACK: Final = 2.6  # distance of a camera per distance between craft and goal
-_FOVY: Final = 50.0  # vertical field of view of every camera but `onboard`, degrees
-_FAR: Final = 10.0  # Cameras move back until craft and goal are as far apart, or as at the start
+_BACK = 2.6  # distance of a camera per distance between craft and goal
+_FOVY = 50.0  # vertical field of view of every camera but `onboard`, degrees
+_FAR = 10.0  # Cameras move back until craft and goal are as far apart, or as at the start
 
 _Vector = tuple[float, float, float]
 

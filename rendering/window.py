@@ -26,9 +26,9 @@ KEYS: Final[dict[int, Press]] = {
     334: "faster",  # + of the number pad
 }
 """GLFW's keys. MuJoCo's passive viewer uses none of them."""
-_HELP: Final = [("space", "pause"), ("right arrow", "one step"), ("- and +", "slower, faster")]
-_INSTEAD: Final = "make a film instead (rotorgram render)"
-_NICENESS: Final = 10  # of the threads that draw: the simulation comes first
+_HELP = [("space", "pause"), ("right arrow", "one step"), ("- and +", "slower, faster")]
+_INSTEAD = "make a film instead (rotorgram render)"
+_NICENESS = 10  # of the threads that draw: the simulation comes first
 
 
 class NoDisplay(NoOpenGL):

@@ -6,7 +6,7 @@ Pictures show them; physics does not know them. Importing this package does not 
 import re
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from ..models.errors import InputError, shortened
 
@@ -18,14 +18,14 @@ __all__ = [
     "build_scene", "parse_scene", "scenes_of",
 ]  # fmt: skip
 
-SCENE_XML: Final = Path(__file__).parent / "scene.xml"
+SCENE_XML = Path(__file__).parent / "scene.xml"
 """Ground, sky and light of the scene `plain`."""
-AIRPORT_XML: Final = Path(__file__).parent / "airport.xml"
+AIRPORT_XML = Path(__file__).parent / "airport.xml"
 """The airport."""
-SCENES: Final = ("plain", "airport", "forest", "warehouse", "gates")
-SEEDED_SCENES: Final = SCENES[2:]
+SCENES = ("plain", "airport", "forest", "warehouse", "gates")
+SEEDED_SCENES = SCENES[2:]
 """Those that are drawn from a seed."""
-MAX_SEEDS: Final = 64
+MAX_SEEDS = 64
 """Seeds of a scene among which episodes choose."""
 
 

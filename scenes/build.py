@@ -1,7 +1,6 @@
 """Add a scene to a vehicle's spec: what it lacks of ground, sky and light, and all around it."""
 
 from pathlib import Path
-from typing import Final
 
 import mujoco
 import numpy as np
@@ -11,17 +10,17 @@ from ..models.mjcf import has_ground, read_spec
 from . import AIRPORT_XML, SCENE_XML, parse_scene
 from .generators import GENERATORS, SKY, Builder
 
-SCENE_PREFIX: Final = "scene/"  # of all names that `add_scene` adds for the plain scene
-_NEAR: Final = 0.25  # m: nearest distance that is drawn
-_FAR: Final = 1200.0  # m: furthest distance at the airport; the hills lie within
-_SEEDED_FAR: Final = 400.0  # m: that of the scenes of a seed
-_HIDDEN_GROUP: Final = 3  # viewers draw groups 0 to 2 unless the user asks for others
+SCENE_PREFIX = "scene/"  # of all names that `add_scene` adds for the plain scene
+_NEAR = 0.25  # m: nearest distance that is drawn
+_FAR = 1200.0  # m: furthest distance at the airport; the hills lie within
+_SEEDED_FAR = 400.0  # m: that of the scenes of a seed
+_HIDDEN_GROUP = 3  # viewers draw groups 0 to 2 unless the user asks for others
 
 # The depth of a directional light's shadow map spans the whole of _FAR, and a map of finer pixels
 # than 12 mm (1024 over the 12 m around the craft) speckles flat ground at this span.
-_SHADOW_PIXELS: Final = 1024
-_HAZE: Final = 0.1  # of the distance to the horizon
-_HAZE_COLOUR: Final = (0.80, 0.88, 0.96, 1.0)  # the sky's colour where it meets the ground
+_SHADOW_PIXELS = 1024
+_HAZE = 0.1  # of the distance to the horizon
+_HAZE_COLOUR = (0.80, 0.88, 0.96, 1.0)  # the sky's colour where it meets the ground
 
 
 def build_scene(vehicle: Path | str | None = None, scene: str = "plain") -> mujoco.MjSpec:

@@ -13,32 +13,32 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike as Vector
 
-CLEARANCE: Final = 8.0
+CLEARANCE = 8.0
 """Half the width of the space about the z axis that nothing but a gate enters, m."""
-CLEARANCE_HEIGHT: Final = 20.0
+CLEARANCE_HEIGHT = 20.0
 """Height of that space, m."""
-GROUP: Final = 2
+GROUP = 2
 """Group of the geoms of a scene."""
-SKY: Final = mujoco.mjtTexture.mjTEXTURE_SKYBOX
+SKY = mujoco.mjtTexture.mjTEXTURE_SKYBOX
 
 MATERIALS: Final[Mapping[str, Mapping[str, Mapping[str, Any]]]] = tomllib.loads(
     Path(__file__).with_name("materials.toml").read_text("utf-8")
 )
-_FOREST: Final = 60.0  # m: half the width of the wood
+_FOREST = 60.0  # m: half the width of the wood
 _LENGTH, _WIDTH, _HEIGHT = 30.0, 20.0, 24.0  # m: half length, half width and height of the hall
-_GATES: Final = 8
-_OPENING: Final = 5.0  # m: the paper's craft is 2.8 m wide with its rotors
+_GATES = 8
+_OPENING = 5.0  # m: the paper's craft is 2.8 m wide with its rotors
 
 Kind = Literal["plane", "box", "cylinder", "ellipsoid"]
 
-_KINDS: Final = {
+_KINDS = {
     "plane": mujoco.mjtGeom.mjGEOM_PLANE,
     "box": mujoco.mjtGeom.mjGEOM_BOX,
     "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
     "ellipsoid": mujoco.mjtGeom.mjGEOM_ELLIPSOID,
 }
-_FLAT: Final = mujoco.mjtBuiltin.mjBUILTIN_FLAT
-_PATTERNS: Final = {
+_FLAT = mujoco.mjtBuiltin.mjBUILTIN_FLAT
+_PATTERNS = {
     "checker": (mujoco.mjtBuiltin.mjBUILTIN_CHECKER, mujoco.mjtMark.mjMARK_NONE),
     "edge": (_FLAT, mujoco.mjtMark.mjMARK_EDGE),
     "random": (_FLAT, mujoco.mjtMark.mjMARK_RANDOM),

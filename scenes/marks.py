@@ -5,14 +5,14 @@ Imports the standard library and models/fields.py alone.
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Final, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 from ..models.fields import Limits
 
 Point = tuple[float, float, float]
 
-_BAR: Final = 0.025  # radius of a gate's bars, over the gate's width
-_CORNERS: Final = ((-1, -1), (1, -1), (1, 1), (-1, 1))
+_BAR = 0.025  # radius of a gate's bars, over the gate's width
+_CORNERS = ((-1, -1), (1, -1), (1, 1), (-1, 1))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,23 +5,22 @@ is named.
 """
 
 from math import factorial
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 Real = NDArray[np.floating]
 
-_TURN: Final = 0.6366197723675814  # 2 / π
-_SQRT_HALF: Final = 0.7071067811865476
-_SINGLE: Final = np.dtype(np.float32)
+_TURN = 0.6366197723675814  # 2 / π
+_SQRT_HALF = 0.7071067811865476
+_SINGLE = np.dtype(np.float32)
 # By whether the precision is single, a number as a sum of floats: all but the last have few bits,
 # 10 and 32 of π / 2, 14 and 40 of log(2), so that their products with whole numbers are exact.
-_HALF_PI: Final = {
+_HALF_PI = {
     True: (1.5703125, 0.00048351287841796875, 3.1385570764541626e-07, 6.077100506506192e-11),
     False: (1.5707963267341256, 6.077100506303966e-11, 2.0222662487959506e-21),
 }
-_LOG2_PARTS: Final = {
+_LOG2_PARTS = {
     True: (0.693115234375, 3.1946184945309415e-05),
     False: (0.6931471805592082, 7.371002565167799e-13),
 }

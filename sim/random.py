@@ -9,7 +9,7 @@ numbers of another. A batch of W worlds has the numbers of W single ones.
 from collections.abc import Mapping, Sequence
 from math import prod
 from secrets import randbits
-from typing import Any, Final
+from typing import Any
 from zlib import crc32
 
 import numpy as np
@@ -25,19 +25,19 @@ Ids = Any
 """Numbers of worlds, or `...` for all."""
 
 # Numbers of uses, and the name of the noise of gusts.
-START: Final = crc32(b"start")
+START = crc32(b"start")
 """The draws with which a task begins episodes."""
-RANDOMIZATION: Final = crc32(b"randomization")
-SCENES: Final = crc32(b"scenes")
-GUSTS: Final = "gusts"
+RANDOMIZATION = crc32(b"randomization")
+SCENES = crc32(b"scenes")
+GUSTS = "gusts"
 
-_MULTIPLIERS: Final = np.array((0xD2511F53, 0xCD9E8D57), np.uint64)
-_WEYL: Final = (0x9E3779B9, 0xBB67AE85)
-_ROUNDS: Final = 10
-_UNIT: Final = 2.0**-32
-_TURN: Final = 6.283185307179586
-_AHEAD: Final = 256  # Most rows of numbers that are drawn ahead, over all worlds
-_BLOCKS: Final = 16  # Least blocks that a `Draw` computes at once for a world
+_MULTIPLIERS = np.array((0xD2511F53, 0xCD9E8D57), np.uint64)
+_WEYL = (0x9E3779B9, 0xBB67AE85)
+_ROUNDS = 10
+_UNIT = 2.0**-32
+_TURN = 6.283185307179586
+_AHEAD = 256  # Most rows of numbers that are drawn ahead, over all worlds
+_BLOCKS = 16  # Least blocks that a `Draw` computes at once for a world
 
 
 def philox(counter: Words, key: Words) -> Words:

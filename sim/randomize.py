@@ -9,7 +9,6 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 
@@ -35,15 +34,15 @@ class Parameter:
     """At least one of these effects must be on."""
 
 
-_FILE: Final = Path(__file__).parent / "parameters.toml"
-_TABLES: Final = tomllib.loads(_FILE.read_text(encoding="utf-8"))
-PARAMETERS: Final = {name: Parameter(**table) for name, table in _TABLES.items()}
+_FILE = Path(__file__).parent / "parameters.toml"
+_TABLES = tomllib.loads(_FILE.read_text(encoding="utf-8"))
+PARAMETERS = {name: Parameter(**table) for name, table in _TABLES.items()}
 """What can be drawn, by name."""
-CENTER: Final = ("center_x", "center_y", "center_z")
-WHOLE: Final = ("action_delay", "observation_delay")
+CENTER = ("center_x", "center_y", "center_z")
+WHOLE = ("action_delay", "observation_delay")
 """Parameters that are whole numbers; a uniform draw gives each the same chance."""
-_FORMS: Final = "uniform(low,high), loguniform(low,high), normal(mean,deviation), choice(a,b,...)"
-_TEXT: Final = re.compile(r"\s*([a-z]+)\s*\(([^()]*)\)\s*")
+_FORMS = "uniform(low,high), loguniform(low,high), normal(mean,deviation), choice(a,b,...)"
+_TEXT = re.compile(r"\s*([a-z]+)\s*\(([^()]*)\)\s*")
 
 
 class Randomization:

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,18 +17,18 @@ from .state import Array, InitialState, WorldState, plain
 if TYPE_CHECKING:
     from ..models.vehicle import Vehicle
 
-_CLASSES: Final = {"mujoco": "MujocoWorld", "rigid": "RigidWorld"}
+_CLASSES = {"mujoco": "MujocoWorld", "rigid": "RigidWorld"}
 """Backends by name: a class in the module of that name in `backends`."""
-_SETTINGS: Final = {"mujoco": ("num_threads",), "rigid": ("dtype", "compiled")}
+_SETTINGS = {"mujoco": ("num_threads",), "rigid": ("dtype", "compiled")}
 """Names of each backend's own arguments of `make_world`."""
 
-MAX_WORLDS: Final = 1 << 16  # Most worlds of a batch
-CONTACT_CHECK: Final = 0.02
+MAX_WORLDS = 1 << 16  # Most worlds of a batch
+CONTACT_CHECK = 0.02
 """Longest time between two checks for contact, s. A bounce of the paper's craft at full thrust
 lasts longer, unless its skids dip less than half a millimetre."""
 
-_ONLY: Final = np.zeros(1, int)
-_LEVEL: Final = np.array((1.0, 0.0, 0.0, 0.0))
+_ONLY = np.zeros(1, int)
+_LEVEL = np.array((1.0, 0.0, 0.0, 0.0))
 
 
 class PhysicsError(RuntimeError):

@@ -37,9 +37,9 @@ from ..udp.layouts import layout_of
 from ..udp.spawn import spawn_simulator
 from .results import machine
 
-ENV_ID: Final = "rotorgram/Elevation-v0"
-_PERIOD: Final = 0.02  # s, of a control step
-_STEPS_AT_ONCE: Final = 64  # of one drone between two looks at the clock
+ENV_ID = "rotorgram/Elevation-v0"
+_PERIOD = 0.02  # s, of a control step
+_STEPS_AT_ONCE = 64  # of one drone between two looks at the clock
 
 Step = Callable[[], int]
 """Flies a step of all drones; the number of env steps that it made."""
@@ -67,7 +67,7 @@ def _over(above: str, below: str, least: float) -> Ratio:
     return Ratio(name=f"{above} ÷ {below}", of=lambda r: r[above] / r[below], target=f"≥ {least:g}")
 
 
-RATIOS: Final = (
+RATIOS = (
     Ratio(
         name="time of a step, UDP, 1 ÷ (env + UDP echo)",
         of=lambda r: (1 / r["UDP, 1"]) / (1 / r["env"] + 1 / r["UDP echo"]),
@@ -79,7 +79,7 @@ RATIOS: Final = (
 )
 """Figures of rates, with their targets."""
 
-_ECHO: Final = """
+_ECHO = """
 import socket, sys
 sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 sock.bind(("127.0.0.1", 0))

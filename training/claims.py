@@ -16,7 +16,7 @@ on the good side of it.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Literal
 
 import numpy as np
 import pandas as pd
@@ -25,45 +25,45 @@ from . import metrics
 from .metrics import Headline
 from .statistics import Floats, bootstrap_difference, iqm, share_interval
 
-MIN_SEEDS: Final = 30
+MIN_SEEDS = 30
 """Seeds with a value that each agent needs before a claim is decided.
 
 Fewer are too few for what differs between seeds: one seed in ten on which an agent fails is missing
 from ten seeds in a third of the cases, from thirty in a twenty-fifth; and a claim decided on ten
 seeds became undecided on ten fresh ones.
 """
-CLAIMS: Final = 4
+CLAIMS = 4
 """Claims of the paper that are judged."""
-COMPARISONS: Final = 3
+COMPARISONS = 3
 """Comparisons of `docs/results.md` that judge them."""
-LEVEL: Final = 1 - 0.05 / (CLAIMS * COMPARISONS)
+LEVEL = 1 - 0.05 / (CLAIMS * COMPARISONS)
 """Level of the interval of each verdict."""
-_INTERVAL: Final = f"{100 * LEVEL:.2f} % interval"
-HOLDING_SHARE: Final = 0.9
+_INTERVAL = f"{100 * LEVEL:.2f} % interval"
+HOLDING_SHARE = 0.9
 """Share of its seeds that an agent holds the target in, for the paper's claim. Ours: 74 seeds that
 all hold show it, and no number of seeds shows that every seed does."""
-MARGIN_SHARE: Final = 0.2
+MARGIN_SHARE = 0.2
 """Margin of non-inferiority, as a share of the bound below which a goal counts as held. Ours: for
 the elevation task 0.02 m, a hundredth of the craft's width and far above what its agents differ by.
 """
-OURS: Final = "A claim of this software, not of the paper"
+OURS = "A claim of this software, not of the paper"
 
-MIN_EPISODES: Final = 10
+MIN_EPISODES = 10
 """Training episodes below which a run's curve says nothing."""
-CONVERGENCE_BAND: Final = 0.1
+CONVERGENCE_BAND = 0.1
 """Share of the smoothed curve's range within which it counts as converged."""
-SMOOTHING_SHARE: Final = 0.1
+SMOOTHING_SHARE = 0.1
 """Share of training over which the episode return is averaged."""
-LEARNING_RISE: Final = 3.0
+LEARNING_RISE = 3.0
 """Rise, in standard deviations of the late level, above which a curve counts as learning.
 
 About 7 % of curves of uncorrelated noise without any trend exceed it (simulated).
 """
-FLUCTUATION_WINDOW: Final = 11
+FLUCTUATION_WINDOW = 11
 """Episodes in the centred moving average around which the fluctuation is measured."""
-_GRID: Final = 100
+_GRID = 100
 
-_TOO_FEW: Final = f"fewer than {MIN_SEEDS} seeds with a value decide nothing"
+_TOO_FEW = f"fewer than {MIN_SEEDS} seeds with a value decide nothing"
 
 _Claim = tuple[str, str, str]
 """A claim, its place in the paper, and the definition of its measure."""
@@ -147,7 +147,7 @@ def judge_claims(
     ]
 
 
-_CONVERGES: Final = (
+_CONVERGES = (
     "A2C converges later than VPG: it “takes much more episodes to converge”.",
     "Section 3, Figure 6 (“A2C converge slower than VPG”)",
     f"Convergence: the env step from which the training return, averaged over "
@@ -157,18 +157,18 @@ _CONVERGES: Final = (
     "in the last quarter did not converge and is left out. Env steps are compared, not episodes, "
     "because crashes make episodes of unequal length.",
 )
-_REWARD: Final = (
+_REWARD = (
     "A2C's long-run average reward is higher: it “can reach to higher average reward”.",
     "Section 3, Figures 6 and 7 (“A2C outperform the VPG on the long run”)",
     "Long run: the mean return of the episodes in the last quarter of training.",
 )
-_FLUCTUATES: Final = (
+_FLUCTUATES = (
     "A2C fluctuates less than VPG: “with much more stability”, “with minimum fluctuation”.",
     "Section 3, Figures 6 and 8",
     "Fluctuation: the standard deviation of the episode return around its centred moving average "
     f"over {FLUCTUATION_WINDOW} episodes, in the last quarter of training.",
 )
-_LATER: Final = (" env steps", "did not converge")
+_LATER = (" env steps", "did not converge")
 
 
 def _holding_claim(headline: Headline) -> _Claim:

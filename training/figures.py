@@ -7,7 +7,6 @@ them ends. Drawn with matplotlib's object interface, so that no display or globa
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 import pandas as pd
@@ -23,9 +22,9 @@ from .results import Results, file_words
 from .settings import Row
 from .tables import by_task, row_label, seeds_text
 
-AVERAGING_SHARE: Final = 0.05
+AVERAGING_SHARE = 0.05
 """Share of training over which the average reward is a running mean."""
-PAPER: Final = {
+PAPER = {
     "fig6_reward": (
         "The paper's Figure 6 says: “A2C converge slower than VPG, with much more stability”; A2C "
         "“can reach to higher average reward with minimum fluctuation”. It gives no numbers."
@@ -39,14 +38,14 @@ PAPER: Final = {
     ),
 }
 """What the paper publishes beside its figures, by the name of ours."""
-FORMATS: Final = ("png", "pdf", "svg")
+FORMATS = ("png", "pdf", "svg")
 
-_MAX_STEP_ROWS: Final = 400_000
-_MAX_TRAJECTORIES: Final = 40
-_MAX_POINTS: Final = 2000
-_BANDS: Final = ((0.05, 0.95, 0.18), (0.25, 0.75, 0.38))  # quantiles, and the band's opacity
-_STYLE: Final = Path(__file__).parent / "assets" / "figures.mplstyle"
-_GREY: Final = "#333333"
+_MAX_STEP_ROWS = 400_000
+_MAX_TRAJECTORIES = 40
+_MAX_POINTS = 2000
+_BANDS = ((0.05, 0.95, 0.18), (0.25, 0.75, 0.38))  # quantiles, and the band's opacity
+_STYLE = Path(__file__).parent / "assets" / "figures.mplstyle"
+_GREY = "#333333"
 
 
 def draw_figures(results: Results, table: pd.DataFrame) -> list[str]:

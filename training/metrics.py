@@ -12,7 +12,7 @@ of its metric counts crashes already, as the share of landings does.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -25,7 +25,7 @@ from .statistics import Floats, Values, trimmed_mean
 
 Places = NDArray[np.int64]
 
-_MEANS: Final = ("steady", "settling_time", "overshoot", "return")
+_MEANS = ("steady", "settling_time", "overshoot", "return")
 
 
 class Curve(NamedTuple):

@@ -11,7 +11,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from string import Template
-from typing import Final
 
 import numpy as np
 import pandas as pd
@@ -22,10 +21,10 @@ from .figures import PAPER, draw_figures
 from .results import Results
 from .tables import markdown, results_table, task_tables
 
-PAGE_FILE: Final = "report.html"
-VIDEO_FILE: Final = "video.mp4"
+PAGE_FILE = "report.html"
+VIDEO_FILE = "video.mp4"
 """The rows side by side; the page has it in itself if it lies in the folder."""
-_PAGE: Final = Path(__file__).parent / "assets" / "report.html"
+_PAGE = Path(__file__).parent / "assets" / "report.html"
 
 
 def write_report(results: Results, page: Path | None = None) -> pd.DataFrame:

@@ -36,9 +36,9 @@ from ..models.errors import InputError
 from .metrics import Headline
 from .settings import Row, Study
 
-CONFIG_FILE: Final = "config.json"
-PARTS: Final = "parts"
-CHECKPOINTS: Final = "checkpoints"
+CONFIG_FILE = "config.json"
+PARTS = "parts"
+CHECKPOINTS = "checkpoints"
 
 COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
     "runs": (
@@ -79,7 +79,7 @@ COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
 where a world has several drones.
 """
 
-_COUNTS: Final = ("seed", "env_steps", "episodes", "settled", "crashed", "held")
+_COUNTS = ("seed", "env_steps", "episodes", "settled", "crashed", "held")
 
 Tables = Mapping[str, pd.DataFrame]
 """Tables by name."""

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from hashlib import blake2b
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Literal
 
 from ..agents import ALGORITHMS, CONTROLLERS, Config, find_preset, preset
 from ..agents.presets import PresetName
@@ -19,11 +19,11 @@ from ..models import Backend
 from ..models.errors import InputError, shortened
 from ..models.fields import Limits, check_fields, read_table
 
-MIN_FLIGHTS: Final = 200
+MIN_FLIGHTS = 200
 """Evaluation flights of each row of a study, over all its seeds."""
-BOARD: Final = Path(__file__).parent / "assets" / "baselines.toml"
+BOARD = Path(__file__).parent / "assets" / "baselines.toml"
 """The rows of our own board."""
-_LONGEST_WORD: Final = 60  # characters of an option's value in a name
+_LONGEST_WORD = 60  # characters of an option's value in a name
 
 
 @dataclass(frozen=True, kw_only=True)

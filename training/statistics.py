@@ -7,13 +7,13 @@ the runs of an agent, always in the same way. Missing values (nan) are left out.
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-_RESAMPLES: Final = 2000
+_RESAMPLES = 2000
 
 Floats = NDArray[np.float64]
 Values = Sequence[float] | NDArray[np.floating[Any]]

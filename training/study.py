@@ -8,7 +8,7 @@ from dataclasses import asdict, replace
 from functools import partial
 from itertools import combinations
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -28,7 +28,7 @@ from .results import CONFIG_FILE, PARTS
 from .settings import Row, Study
 from .training import Snapshot, Training
 
-MAX_BATCH: Final = 64
+MAX_BATCH = 64
 """Most evaluation episodes that are flown at a time."""
 
 Job = tuple[Row, int]

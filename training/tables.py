@@ -6,7 +6,7 @@ Cells are made once; the terminal and Markdown show the same ones.
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
-from typing import Final, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import pandas as pd
 from rich import box
@@ -19,11 +19,11 @@ from .results import Results
 from .settings import Row
 from .statistics import bootstrap_interval, iqm, share_interval
 
-_TERMINAL_COLUMNS: Final = (0, 1, 2, 3, 6, 7, 8)  # those that fit 100 columns
-NOTHING: Final = "–"
+_TERMINAL_COLUMNS = (0, 1, 2, 3, 6, 7, 8)  # those that fit 100 columns
+NOTHING = "–"
 """Shown where there is no value."""
-_MEASURES: Final = ("steady", "settling_time", "overshoot", "return", "least_distance")
-_COUNTS: Final = ("episodes", "settled", "crashed")
+_MEASURES = ("steady", "settling_time", "overshoot", "return", "least_distance")
+_COUNTS = ("episodes", "settled", "crashed")
 
 
 class Cell(NamedTuple):
@@ -234,7 +234,7 @@ def count_text(value: float) -> str:
     return NOTHING if math.isnan(value) else f"{value:,.0f}"
 
 
-NOTE: Final = (
+NOTE = (
     "Interquartile means over seeds with 95 % bootstrap intervals, from the deterministic "
     "evaluation after training; each seed flies episodes of its own. Shares have Wilson's 95 % "
     "interval. Steady: mean size of the metric in the last quarter of an episode, or at its end if "

@@ -5,7 +5,6 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from typing import Final
 
 import numpy as np
 
@@ -21,7 +20,7 @@ from ..models import BACKENDS, Backend
 from ..models.errors import InputError
 from .settings import Run
 
-_TELL_EVERY: Final = 0.2  # s
+_TELL_EVERY = 0.2  # s
 
 
 def config_of(spec: EnvSpec, backend: Backend, vehicle: str | None = None) -> EnvConfig:

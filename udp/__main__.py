@@ -11,7 +11,7 @@ import os
 import signal
 import sys
 from threading import Thread
-from typing import Any, Final
+from typing import Any
 
 from ..envs import registry
 from ..envs.config import EnvConfig
@@ -21,9 +21,9 @@ from .protocol.client import LinkConfig
 from .protocol.errors import LinkError
 from .transport.simulator import Simulator
 
-_KEYS: Final = ("config", "module", "num_envs", "server", "bind", "codec", "key_file", "insecure",
+_KEYS = ("config", "module", "num_envs", "server", "bind", "codec", "key_file", "insecure",
                 "record")  # fmt: skip
-_FOR_EVER: Final = 30 * 86_400.0
+_FOR_EVER = 30 * 86_400.0
 """Seconds that an agent may be silent while it holds standard input."""
 
 

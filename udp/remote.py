@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any, Final, Unpack
+from typing import Any, Unpack
 
 import gymnasium as gym
 import numpy as np
@@ -33,8 +33,8 @@ from .transport.simulator import DEFAULT_AGENT
 Arrays = dict[str, np.ndarray]
 Info = dict[str, Any]
 Observation = Any  # an array, or a dict of arrays
-_FLY: Final = np.array([FLY], np.uint8)
-_RESET: Final = np.array([RESET], np.uint8)
+_FLY = np.array([FLY], np.uint8)
+_RESET = np.array([RESET], np.uint8)
 
 
 class _Remote(NotCopied):

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import IO, Any, Final
+from typing import IO, Any
 
 from ..envs.config import EnvConfig
 from .protocol.client import Address
@@ -19,12 +19,12 @@ from .remote import RemoteEnv, RemoteVectorEnv
 from .transport.agent import AgentSettings
 
 Remote = RemoteEnv | RemoteVectorEnv
-_START_TIMEOUT: Final = 60.0
-_ANSWER_TIMEOUT: Final = 10.0
-_STOP_TIMEOUT: Final = 5.0
-_POLL: Final = 0.5
+_START_TIMEOUT = 60.0
+_ANSWER_TIMEOUT = 10.0
+_STOP_TIMEOUT = 5.0
+_POLL = 0.5
 # -P: no file of the working directory takes the place of a package.
-_COMMAND: Final = (sys.executable, "-P", "-m", "rotorgram.udp")
+_COMMAND = (sys.executable, "-P", "-m", "rotorgram.udp")
 
 
 @contextmanager

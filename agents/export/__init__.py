@@ -7,7 +7,6 @@ The action is the deterministic one. Every number is float32.
 
 import json
 from importlib import import_module
-from typing import Final
 
 import numpy as np
 
@@ -18,10 +17,10 @@ from ..networks import Affine, Relu, Tanh
 from ..normalization import Moments
 from ..policies import NetworkPolicy, flat_size
 
-FORMAT: Final = 1
+FORMAT = 1
 """Version of the metadata and of the names in the files."""
 
-TARGETS: Final = {"onnx": "policy.onnx", "c": "rotorgram_policy.h"}
+TARGETS = {"onnx": "policy.onnx", "c": "rotorgram_policy.h"}
 """Name of the file of each target, by default."""
 
 _TRIED = 256
@@ -29,7 +28,7 @@ _FAR = 100.0
 """Observations that a policy is tried with, and their largest numbers where they have no bound."""
 
 
-_SPEC: Final = ("env_id", "options", "control_period", "vehicle", "vehicle_hash", "observation")
+_SPEC = ("env_id", "options", "control_period", "vehicle", "vehicle_hash", "observation")
 
 
 def export(checkpoint: Checkpoint, target: str) -> bytes:

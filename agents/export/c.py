@@ -5,7 +5,6 @@ A spec comes from a file or a peer, so that none of its texts may be trusted.
 
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Final
 
 import numpy as np
 
@@ -14,9 +13,9 @@ from ..networks import Affine, Floats, Relu, Tanh
 from ..normalization import Moments
 from ..policies import NetworkPolicy, flat_size
 
-_LARGEST: Final = float(np.finfo(np.float32).max)
-_PAIRS: Final = re.compile(r"(?<=\*)(?=/)|(?<=/)(?=\*)|(?<=\?)(?=\?)")
-_LAYER: Final = """
+_LARGEST = float(np.finfo(np.float32).max)
+_PAIRS = re.compile(r"(?<=\*)(?=/)|(?<=/)(?=\*)|(?<=\?)(?=\?)")
+_LAYER = """
 /* out = weight . in + bias */
 static inline void rotorgram_layer(const float *weight, const float *bias, const float *in,
                                    int inputs, float *out, int outputs)
@@ -28,7 +27,7 @@ static inline void rotorgram_layer(const float *weight, const float *bias, const
         out[i] = sum + bias[i];
     }
 }"""
-_TANH: Final = """
+_TANH = """
 /* tanh to 5e-7: of x / 8 by Lambert's continued fraction, then three times
  * tanh 2y = 2 tanh y / (1 + tanh^2 y). Beyond 9.1 the nearest float is 1. */
 static inline float rotorgram_tanh(float x)

@@ -1,7 +1,6 @@
 """ONNX: a graph of Sub, Mul, Gemm, Relu or Tanh, Add, Max and Min, built node by node."""
 
 from collections.abc import Mapping
-from typing import Final
 
 import numpy as np
 import onnx
@@ -12,8 +11,8 @@ from ..networks import Affine
 from ..normalization import Moments
 from ..policies import NetworkPolicy, flat_size
 
-OPSET: Final = 13  # the first in which ArgMax, Max and Min are as they are today
-_IR: Final = 7  # the format of files that came with this opset
+OPSET = 13  # the first in which ArgMax, Max and Min are as they are today
+_IR = 7  # the format of files that came with this opset
 
 
 class _Graph:

@@ -1,7 +1,7 @@
 """Drones of a lost agent land by themselves."""
 
 from functools import cached_property
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ...sim import EffectOptions, World, make_controller
 from .record import Look, Mask, Record, Stage, where
 
-DESCENT: Final = 0.7  # m/s: PX4's default of MPC_LAND_SPEED
+DESCENT = 0.7  # m/s: PX4's default of MPC_LAND_SPEED
 
 
 class Landing(Stage):

@@ -4,7 +4,7 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +22,8 @@ from .record import Record, Stage
 if TYPE_CHECKING:
     from ...rendering.cameras import Cameras
 
-_MAX_THREADS: Final = 16
-_UNITS: Final = {"depth": "m"}
+_MAX_THREADS = 16
+_UNITS = {"depth": "m"}
 
 
 def views_of(task: Task, drones: int) -> tuple[View, ...]:

@@ -1,7 +1,6 @@
 """The radio between the drones of a world: what each has heard last of each other."""
 
 from collections.abc import Callable
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +12,7 @@ from ..tasks.swarm import SwarmOptions
 from .history import filled, pushed
 from .record import Mask, Record, Stage
 
-FORGOTTEN: Final = 1.0  # A drone that was not heard for so long is no neighbour any more, s
+FORGOTTEN = 1.0  # A drone that was not heard for so long is no neighbour any more, s
 Floats = NDArray[np.float64]
 
 

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Final, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -22,10 +22,10 @@ from ..state import State
 from .goal import AIR, check_more, ends_of, nearness
 from .task import Outcome, Task, TaskOptions
 
-TERMINATION_REWARD: Final = -20.0
+TERMINATION_REWARD = -20.0
 """Added to the reward of the step that terminates an episode (crash, flip-over, out of band)."""
-MAX_TILT_COSINE: Final = 0.5  # Cosine of the tilt (60°) past which the craft counts as flipped over
-FURTHEST: Final = 1e6
+MAX_TILT_COSINE = 0.5  # Cosine of the tilt (60°) past which the craft counts as flipped over
+FURTHEST = 1e6
 """Highest target and widest flight band, m: far inside what MuJoCo and float32 can hold."""
 
 ActionType = Literal["continuous", "discrete"]

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Annotated, Final, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
@@ -24,22 +24,22 @@ from ..spec import ArraySpec
 from ..state import State
 from .task import Outcome, Task
 
-ERROR_SCALE: Final = 0.5  # Distance at which the reward for nearness crosses zero, m
-RATE_WEIGHT: Final = 0.02  # Cost of a body rate of 1 rad/s
-SWING_WEIGHT: Final = 0.1  # Cost of a payload that moves at 1 m/s relative to the craft
-PASSING_REWARD: Final = 1.0  # Of a course: added in a step in which a point or gate is passed
-COURSE_RATE_WEIGHT: Final = 0.002  # Of a course: cost of a body rate of 1 rad/s
-FASTEST_COUNTED: Final = 20.0  # A faster body rate costs no more, rad/s
-WORST_RATES: Final = -RATE_WEIGHT * FASTEST_COUNTED
-WORST_SWING: Final = -0.4  # Of a payload at 4 m/s or faster
-COURSE_WORST_RATES: Final = -COURSE_RATE_WEIGHT * FASTEST_COUNTED
-COURSE_WORST_STEP: Final = -0.05  # Of a course: a hundredth of the cost of a crash
-LEAST_TILT_COSINE: Final = 0.0
+ERROR_SCALE = 0.5  # Distance at which the reward for nearness crosses zero, m
+RATE_WEIGHT = 0.02  # Cost of a body rate of 1 rad/s
+SWING_WEIGHT = 0.1  # Cost of a payload that moves at 1 m/s relative to the craft
+PASSING_REWARD = 1.0  # Of a course: added in a step in which a point or gate is passed
+COURSE_RATE_WEIGHT = 0.002  # Of a course: cost of a body rate of 1 rad/s
+FASTEST_COUNTED = 20.0  # A faster body rate costs no more, rad/s
+WORST_RATES = -RATE_WEIGHT * FASTEST_COUNTED
+WORST_SWING = -0.4  # Of a payload at 4 m/s or faster
+COURSE_WORST_RATES = -COURSE_RATE_WEIGHT * FASTEST_COUNTED
+COURSE_WORST_STEP = -0.05  # Of a course: a hundredth of the cost of a crash
+LEAST_TILT_COSINE = 0.0
 """Cosine of the tilt (90°) past which the craft counts as flipped over."""
-AIR: Final = 0.6  # Least room under a craft that starts, m
-FURTHEST: Final = 1e4  # Furthest goal, m
-MAX_SPEED: Final = 100.0  # Speed past which an observation is clipped, m/s
-MAX_RATE: Final = 100.0  # Body rate past which an observation is clipped, rad/s
+AIR = 0.6  # Least room under a craft that starts, m
+FURTHEST = 1e4  # Furthest goal, m
+MAX_SPEED = 100.0  # Speed past which an observation is clipped, m/s
+MAX_RATE = 100.0  # Body rate past which an observation is clipped, rad/s
 
 
 class Number(NamedTuple):

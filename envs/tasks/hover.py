@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Final
+from typing import Annotated
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from .goal import (
 )
 from .task import Outcome, TaskOptions
 
-HEADING_WEIGHT: Final = 0.2  # Cost of a heading half a turn off
+HEADING_WEIGHT = 0.2  # Cost of a heading half a turn off
 
 
 @dataclass(frozen=True, kw_only=True)

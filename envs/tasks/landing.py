@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Final, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -25,11 +25,11 @@ from .goal import (
 )
 from .task import Outcome, TaskOptions
 
-MATCHING_TIME: Final = 0.5  # Progress that 1 m/s less relative speed is worth, over 1 m less way, s
-LANDING_REWARD: Final = 20.0  # Added to the reward of a step that ends with a landing
-TIME_COST: Final = 0.1  # Of each step
-FASTEST_PAD: Final = 20.0  # m/s
-FURTHEST: Final = 1e3  # m
+MATCHING_TIME = 0.5  # Progress that 1 m/s less relative speed is worth, over 1 m less way, s
+LANDING_REWARD = 20.0  # Added to the reward of a step that ends with a landing
+TIME_COST = 0.1  # Of each step
+FASTEST_PAD = 20.0  # m/s
+FURTHEST = 1e3  # m
 
 Motion = Literal["circle", "line"]
 

@@ -5,7 +5,7 @@ import math
 import tomllib
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated
 
 import numpy as np
 
@@ -42,10 +42,10 @@ from .goal import (
 )
 from .task import Outcome, TaskOptions
 
-TRACKS: Final = Path(__file__).parent.parent / "tracks"
-MAX_GATES: Final = 64
-MAX_LAPS: Final = 1000
-_WAY: Final = "a track of ours, a TOML file of gates, or its content as JSON"
+TRACKS = Path(__file__).parent.parent / "tracks"
+MAX_GATES = 64
+MAX_LAPS = 1000
+_WAY = "a track of ours, a TOML file of gates, or its content as JSON"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Final, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -32,9 +32,9 @@ from .goal import (
 )
 from .task import Outcome, TaskOptions
 
-ERROR_SCALE: Final = 1.0  # Distance at which the reward for nearness crosses zero, m
-TILT_WEIGHT: Final = 0.25  # Cost of a tilt of 90°; upside down it is twice as much
-STOP_TIME: Final = 0.5  # Longest time to stop the spin about an axis by all torque about it, s
+ERROR_SCALE = 1.0  # Distance at which the reward for nearness crosses zero, m
+TILT_WEIGHT = 0.25  # Cost of a tilt of 90°; upside down it is twice as much
+STOP_TIME = 0.5  # Longest time to stop the spin about an axis by all torque about it, s
 Frame = Literal["body", "world"]
 
 

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Final, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -28,11 +28,11 @@ from .goal import (
 )
 from .task import Outcome, TaskOptions
 
-MAX_DRONES: Final = 128
-APPROACH_WEIGHT: Final = 0.1  # Of a speed of 1 m/s towards the goal, in each step
-ROOM_WEIGHT: Final = 0.5  # Cost of spheres that touch; nothing from a diameter apart on
-TINY: Final = 1e-9  # m
-JITTER: Final = 0.2  # Of a start, in each axis, over the distance between starts
+MAX_DRONES = 128
+APPROACH_WEIGHT = 0.1  # Of a speed of 1 m/s towards the goal, in each step
+ROOM_WEIGHT = 0.5  # Cost of spheres that touch; nothing from a diameter apart on
+TINY = 1e-9  # m
+JITTER = 0.2  # Of a start, in each axis, over the distance between starts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -215,7 +215,7 @@ def grid(count: int) -> np.ndarray:
 
 
 Formed = Literal["ring", "line", "grid"]
-_PLACES: Final = {"ring": ring, "line": line, "grid": grid}
+_PLACES = {"ring": ring, "line": line, "grid": grid}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,7 +7,7 @@ functions, and never changes an array in place.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, ClassVar, Final, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from ...models.errors import InputError, UnknownOption
 from ...models.fields import check_fields
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from ...models.vehicle import Vehicle
     from ..config import EnvConfig
 
-HORIZON: Final = 100  # 1 / (1 - γ) of the largest discount, γ = 0.99: see `Task.crash`
+HORIZON = 100  # 1 / (1 - γ) of the largest discount, γ = 0.99: see `Task.crash`
 
 
 @dataclass(frozen=True, kw_only=True)

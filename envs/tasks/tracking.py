@@ -4,7 +4,7 @@ import csv
 import json
 import math
 from dataclasses import dataclass
-from typing import Annotated, Final
+from typing import Annotated
 
 import numpy as np
 
@@ -35,9 +35,9 @@ from .goal import (
 )
 from .task import Outcome, TaskOptions
 
-MAX_SAMPLES: Final = 20_000  # Rows of a file
-MAX_POINTS: Final = 16  # That a minimum-snap trajectory goes through
-_EXPECTED: Final = "circle, lemniscate, snap, or a CSV file with columns t, x, y, z"
+MAX_SAMPLES = 20_000  # Rows of a file
+MAX_POINTS = 16  # That a minimum-snap trajectory goes through
+_EXPECTED = "circle, lemniscate, snap, or a CSV file with columns t, x, y, z"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -233,7 +233,7 @@ def _lemniscate(phase: np.ndarray, radius: float, rate: float) -> tuple[np.ndarr
     return radius * place, radius * rate * np.column_stack((x, y, zero))
 
 
-_CURVES: Final = {"circle": _circle, "lemniscate": _lemniscate}
+_CURVES = {"circle": _circle, "lemniscate": _lemniscate}
 
 
 def _sampled(rows: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Final
+from typing import Annotated
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from .goal import (
 )
 from .task import Outcome, TaskOptions
 
-MAX_POINTS: Final = 64
+MAX_POINTS = 64
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -27,10 +27,10 @@ Push = tuple[Vector, Vector, Vector]
 rotors over the mass, body frame, m/s²; the angular acceleration by the torque about the center of
 mass, body frame, rad/s²; the force at the body's origin over the mass, world frame, m/s²."""
 
-_NOTHING: Final = 1e-12  # of the largest number of its kind: what rounding leaves
-_TINY: Final = 1e-30  # keeps the slope of a square root finite where nothing turns
+_NOTHING = 1e-12  # of the largest number of its kind: what rounding leaves
+_TINY = 1e-30  # keeps the slope of a square root finite where nothing turns
 _ZERO: Final[Vector] = (0.0, 0.0, 0.0)
-_BORTZ: Final = (
+_BORTZ = (
     0.03267274151216445,
     0.00010564110705334667,
     5.637370282876806e-07,
@@ -39,7 +39,7 @@ _BORTZ: Final = (
 )
 """Of Bortz's coefficient without its pole at a turn, powers 0, 2... of the angle:
 2 (ζ(2 n) - 1) / (2 π)^(2 n), n = 1 to 5, with Riemann's ζ."""
-_CROSS: Final = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(2, 0, 1)
+_CROSS = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(2, 0, 1)
 """Of a cross product: (a × b)ᵢ = Σ _CROSS[i, j, k] aⱼ bₖ."""
 
 

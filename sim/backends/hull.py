@@ -1,7 +1,5 @@
 """Which crafts of W worlds reach level ground, by their solid geoms, or each other, by spheres."""
 
-from typing import Final
-
 import mujoco
 import numpy as np
 
@@ -9,7 +7,7 @@ from ...models.mjcf import level_data
 from ...models.vehicle import Vehicle, craft_geoms
 from ..state import Array, clip
 
-_ROUNDED: Final = 1e-6  # m: what is no margin of a contact
+_ROUNDED = 1e-6  # m: what is no margin of a contact
 
 
 class Hull:

@@ -16,7 +16,6 @@ from collections.abc import Callable
 from functools import lru_cache
 from itertools import count
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
@@ -27,11 +26,11 @@ from ..state import Array
 from .body import RigidBody, mapped
 
 Precision = np.dtype[np.floating]
-ROWS: Final = 13
-COMPILE_SECONDS: Final = 60.0
+ROWS = 13
+COMPILE_SECONDS = 60.0
 """Time limit of the compiler, s."""
 
-_FLAGS: Final = (
+_FLAGS = (
     "-O3",
     "-march=native",
     "-fno-math-errno",
@@ -39,7 +38,7 @@ _FLAGS: Final = (
     "-fopenmp-simd",
     "-ffp-contract=off",
 )
-_EXPRESSIONS: Final = {
+_EXPRESSIONS = {
     np.add: "{} + {}",
     np.subtract: "{} - {}",
     np.multiply: "{} * {}",
@@ -56,7 +55,7 @@ _EXPRESSIONS: Final = {
     np.where: "{} ? {} : {}",
 }
 """NumPy's functions in C. Together with `-ffp-contract=off` they give the same bits."""
-_SOURCE: Final = """#include <math.h>
+_SOURCE = """#include <math.h>
 #include <tgmath.h>
 typedef {kind} T;
 void fly(long count, long steps, const T *rows, const T *thrust, const T *wrench, const T *varying,

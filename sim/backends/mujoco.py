@@ -6,7 +6,6 @@ of threads.
 
 import copy
 import os
-from typing import Final
 
 import mujoco
 import numpy as np
@@ -25,9 +24,9 @@ from ..state import Array, InitialState, WorldState
 from ..world import PhysicsError, World
 from .world_parameters import WorldParameters
 
-_FEW: Final = 8
-_SEEN: Final = np.array(SURROUNDINGS, np.uint8)
-_VIEWS: Final = (
+_FEW = 8
+_SEEN = np.array(SURROUNDINGS, np.uint8)
+_VIEWS = (
     "_batch _ctrl _command _thrust _applied _contacts _counts _warnings _varied _qacc _warmstart"
 )
 """Attributes that hold the simulator's memory."""

@@ -5,7 +5,6 @@ It flies as `mujoco` does until a part touches the ground or another drone, and 
 
 import logging
 from collections.abc import Mapping
-from typing import Final
 
 import mujoco
 import numpy as np
@@ -22,10 +21,10 @@ from . import kernel
 from .body import RigidBody, mapped, motion
 from .hull import Hull, can_touch
 
-DTYPES: Final = Choice(("float32", "float64"))
-_OWN: Final = ("_rows", "_acting", "_wrench")
-_OF_STATE: Final = ("command", "thrust", "touching", "colliding")
-_LEVEL: Final = np.array((0.0, 0.0, 0.0, 1.0, *[0.0] * 9))  # rows of a craft at rest
+DTYPES = Choice(("float32", "float64"))
+_OWN = ("_rows", "_acting", "_wrench")
+_OF_STATE = ("command", "thrust", "touching", "colliding")
+_LEVEL = np.array((0.0, 0.0, 0.0, 1.0, *[0.0] * 9))  # rows of a craft at rest
 
 
 class RigidWorld(World):

@@ -1,7 +1,6 @@
 """Drawn parameters of the compiled model: which of its fields they change, and to what."""
 
 from collections.abc import Mapping, Sequence
-from typing import Final
 
 import mujoco
 import numpy as np
@@ -10,7 +9,7 @@ from ...models.vehicle import body_axes, owners, payload_body
 from ..randomize import CENTER
 from ..state import Array, stack
 
-_FIELDS: Final = {
+_FIELDS = {
     "mass": ("body_mass", "body_inertia", "dof_damping"),  # Unity's drag goes with the mass
     "inertia": ("body_inertia",),
     "payload": ("body_mass", "body_inertia"),

@@ -29,11 +29,11 @@ _CASCADE: Final[dict[str, type[Rates]]] = {
     "velocity": Velocity,
     "position": Position,
 }
-LEVELS: Final = ("rotors", *_CASCADE, "increment", "offset")
+LEVELS = ("rotors", *_CASCADE, "increment", "offset")
 """What an action may set: the thrust of each rotor; collective thrust and body rates; collective
 thrust, roll, pitch and yaw rate; velocity and yaw rate; position and heading; a change of all
 thrusts; all thrusts."""
-SHARES: Final = {"increment": 0.05, "offset": 0.2}
+SHARES = {"increment": 0.05, "offset": 0.2}
 """Thrust of one unit of action over the rotors' largest thrust."""
 
 

@@ -18,7 +18,7 @@ Array code with any leading axes; of a single drone the numbers are Python's.
 
 import math
 from functools import reduce
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -31,9 +31,9 @@ if TYPE_CHECKING:
     from ...models.vehicle import Vehicle
     from .gains import Gains
 
-_ASIDE: Final = 1e-3  # Upside down every way to turn is as short: it is about x
-_TINY: Final = 1e-12  # Added to squares under a root, whose slope at 0 is infinite
-_POINTS: Final = 1025  # of the table that inverts a thrust curve: right to 1e-6
+_ASIDE = 1e-3  # Upside down every way to turn is as short: it is about x
+_TINY = 1e-12  # Added to squares under a root, whose slope at 0 is infinite
+_POINTS = 1025  # of the table that inverts a thrust curve: right to 1e-6
 
 
 class Rates:

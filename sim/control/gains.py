@@ -22,7 +22,7 @@ Yaw has a p of its own, by the same rule from its own α.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,14 +32,14 @@ from ...models.errors import InputError
 if TYPE_CHECKING:
     from ...models.vehicle import Vehicle
 
-LEAD: Final = 3.0
+LEAD = 3.0
 """Rotors are driven to follow this many times faster than their own lag."""
-SURPLUS: Final = 0.75
+SURPLUS = 0.75
 """Share of the thrust beyond the weight that holds the height at the largest tilt."""
-MAX_TILT: Final = math.radians(60.0)
-BRAKING: Final = 2.0
+MAX_TILT = math.radians(60.0)
+BRAKING = 2.0
 """Distance in which half the largest acceleration stops the craft from its largest speed, m."""
-LEAST_ROOM: Final = 0.05
+LEAST_ROOM = 0.05
 """Least room for torques around hover, of the range of thrust: a craft may hover at its least."""
 
 

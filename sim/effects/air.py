@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,11 +17,11 @@ from .rotors import total
 if TYPE_CHECKING:
     from ...models.vehicle import Vehicle
 
-LEAST_HEIGHT: Final = 0.5
+LEAST_HEIGHT = 0.5
 """Height of a rotor over the ground, in radii, below which the ground effect grows no further: our
 choice, since the formula has a pole at a quarter of a radius."""
 
-_NOTHING: Final = (0.0, 0.0, 0.0)
+_NOTHING = (0.0, 0.0, 0.0)
 
 
 class AirEffects(Kept):

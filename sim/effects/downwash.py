@@ -6,7 +6,7 @@ Automation Letters 2025, arXiv 2403.13321, measured below hovering drones of sev
 """
 
 import math
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,19 +17,19 @@ from ..state import Array, WorldState
 if TYPE_CHECKING:
     from ...models.vehicle import Vehicle
 
-DECAY: Final = 10.11
+DECAY = 10.11
 """B_d: velocity on the axis over that at the rotors in hover, times the distance from the jet's
 origin in lengths of the craft. It and the two below are those that the authors of GADEN, a gas
 simulator, use with the paper's equations; we could not read the paper's own table."""
-SPREAD: Final = 0.07668
+SPREAD = 0.07668
 """S: radius at which the velocity has halved, over the distance from the jet's origin."""
-ORIGIN: Final = -5.817
+ORIGIN = -5.817
 """s₀: of the jet, in lengths below the craft."""
-NEAR: Final = 2.5
+NEAR = 2.5
 """Lengths below the craft from which on the flow is a jet, by the paper. Nearer, the jets of single
 rotors merge; there we take the profile of this distance, with a speed that grows from 0 beside the
 rotors in proportion to the distance below them."""
-DENSITY: Final = 1.225
+DENSITY = 1.225
 """Of the air at sea level (ICAO standard atmosphere, ISO 2533), kg/m³."""
 
 

@@ -11,7 +11,6 @@ h / (0.177 + 0.000823 h)^1.2, σ_w = 0.1 W20 and σ_u = σ_v = σ_w / (0.177 + 0
 """
 
 import math
-from typing import Final
 
 import numpy as np
 
@@ -19,12 +18,12 @@ from ..rotations import parts_of
 from ..snapshots import Kept
 from ..state import Array, kept
 
-FOOT: Final = 0.3048  # m
+FOOT = 0.3048  # m
 LOWEST, HIGHEST = 10 * FOOT, 1000 * FOOT  # m: where the low-altitude model is defined
-LEAST_SPEED: Final = 1.0
+LEAST_SPEED = 1.0
 """Least speed at which the field passes a drone, m/s. The specification is for aircraft, which do
 not stand in the air; this is our choice."""
-NUMBERS: Final = 5  # Normal numbers that a step takes
+NUMBERS = 5  # Normal numbers that a step takes
 
 Vector = tuple[Array, Array, Array]
 

@@ -2,13 +2,13 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Annotated, Final, Self
+from typing import Annotated, Self
 
 from ...models import MAX_DRAG
 from ...models.errors import InputError, shortened
 from ...models.fields import Limits, check_fields, check_names
 
-MAX_WIND: Final = 100.0  # m/s
+MAX_WIND = 100.0  # m/s
 
 
 @dataclass(frozen=True, kw_only=True)

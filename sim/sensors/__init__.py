@@ -35,8 +35,8 @@ SENSOR_TYPES: Final[Mapping[str, type[Sensor]]] = {
 }
 """In this order they are observed."""
 
-_ESTIMATE: Final = Estimator.name
-_OBSERVED: Final = Choice(("added", _ESTIMATE))
+_ESTIMATE = Estimator.name
+_OBSERVED = Choice(("added", _ESTIMATE))
 _SOURCES: Final[Mapping[str, type[Source]]] = {**SENSOR_TYPES, _ESTIMATE: Estimator}
 
 

@@ -1,19 +1,19 @@
 """Barometer."""
 
 import math
-from typing import ClassVar, Final
+from typing import ClassVar
 
 from ...models.fields import Limits
 from ..state import Array, chosen, clip
 from ..world import World
 from .base import Sensor, Setting, Values
 
-SEA_LEVEL_PRESSURE: Final = 101_325.0  # Pa. These are those of ISO 2533:1975
-SEA_LEVEL_TEMPERATURE: Final = 288.15  # K
-LAPSE_RATE: Final = 0.0065  # K/m, up to 11 km
-LOWEST: Final = -5_000.0  # m
-HIGHEST: Final = 11_000.0
-_EXPONENT: Final = 9.80665 / (287.052_87 * LAPSE_RATE)
+SEA_LEVEL_PRESSURE = 101_325.0  # Pa. These are those of ISO 2533:1975
+SEA_LEVEL_TEMPERATURE = 288.15  # K
+LAPSE_RATE = 0.0065  # K/m, up to 11 km
+LOWEST = -5_000.0  # m
+HIGHEST = 11_000.0
+_EXPONENT = 9.80665 / (287.052_87 * LAPSE_RATE)
 
 
 def isa_pressure(height: Array) -> Array:
@@ -30,7 +30,7 @@ def isa_height(pressure: Array) -> Array:
     return SEA_LEVEL_TEMPERATURE / LAPSE_RATE * (1 - share)
 
 
-_PRESSURES: Final = (isa_pressure(HIGHEST), isa_pressure(LOWEST))
+_PRESSURES = (isa_pressure(HIGHEST), isa_pressure(LOWEST))
 
 
 class Barometer(Sensor):

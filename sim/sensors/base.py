@@ -1,7 +1,7 @@
 """What all sensors share: their settings, the spec of their readings, white noise."""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 from ...models.coefficients import COEFFICIENTS
 from ...models.errors import InputError
@@ -13,10 +13,10 @@ from ..world import World
 if TYPE_CHECKING:
     from ...models.vehicle import Vehicle
 
-FURTHEST: Final = 1e5  # Largest coordinate of a reading, m
-MAX_SPEED: Final = 1e3  # Largest speed of a reading along an axis, m/s
-MAX_DELAY: Final = 1000  # Longest delay, control steps
-UNIT: Final = 1.001  # Bound of a unit quaternion's components
+FURTHEST = 1e5  # Largest coordinate of a reading, m
+MAX_SPEED = 1e3  # Largest speed of a reading along an axis, m/s
+MAX_DELAY = 1000  # Longest delay, control steps
+UNIT = 1.001  # Bound of a unit quaternion's components
 
 Values = Mapping[str, Any]
 """Settings by name: numbers, tuples of numbers, None."""
@@ -31,7 +31,7 @@ class Setting(NamedTuple):
     """Number of the vehicle's file that replaces the default; one of both has to be there."""
 
 
-SAMPLING: Final = {
+SAMPLING = {
     # Readings per second: the control rate over a whole number. None: the control rate.
     "rate": Setting(None, Limits(1e-3, 1e6, "Hz")),
     # Age of a reading when it is observed: a whole number of control periods.

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import ClassVar, Final
+from typing import ClassVar
 
 import numpy as np
 
@@ -14,9 +14,9 @@ from .base import FURTHEST, MAX_SPEED, UNIT, Setting, Source, Values
 from .channel import Channel
 from .magnetometer import FIELD
 
-_TIME: Final = Setting(1.0, Limits(1e-3, 1e4, "s"))
-_UP: Final = np.array((0.0, 0.0, 1.0))
-_PARTS: Final = ("position", "velocity", "quaternion", "body_rates")
+_TIME = Setting(1.0, Limits(1e-3, 1e4, "s"))
+_UP = np.array((0.0, 0.0, 1.0))
+_PARTS = ("position", "velocity", "quaternion", "body_rates")
 
 
 class Estimator(Source):

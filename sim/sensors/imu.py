@@ -1,7 +1,7 @@
 """Gyroscope and accelerometer."""
 
 import math
-from typing import ClassVar, Final
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +11,8 @@ from ..state import Array, chosen
 from ..world import World
 from .base import Sensor, Values
 
-GYRO_RANGE: Final = math.radians(2000.0)  # rad/s: the largest setting of the BMI088
-ACCELEROMETER_RANGE: Final = 24 * 9.80665  # m/s²: the same
+GYRO_RANGE = math.radians(2000.0)  # rad/s: the largest setting of the BMI088
+ACCELEROMETER_RANGE = 24 * 9.80665  # m/s²: the same
 
 
 def specific_force(world: World) -> Array:

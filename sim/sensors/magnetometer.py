@@ -1,6 +1,6 @@
 """Magnetometer."""
 
-from typing import ClassVar, Final
+from typing import ClassVar
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from ..state import Array
 from ..world import World
 from .base import Sensor, Setting
 
-FIELD: Final = (1.287, 21.532, -43.231)
+FIELD = (1.287, 21.532, -43.231)
 """Earth's magnetic field at Zurich (47.377° N, 8.542° E, 408 m) on 2025-01-01: east, north and up,
 µT. World Magnetic Model WMM2025, NOAA NCEI and British Geological Survey."""
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
-from typing import Any, BinaryIO, Final, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 import zstandard
@@ -36,10 +36,10 @@ from ..protocol.messages import (
 from ..protocol.party import Mask, first_seeds
 from .writer import ABOUT, FORMAT
 
-MAX_CHUNK: Final = 2 * MAX_MESSAGE
+MAX_CHUNK = 2 * MAX_MESSAGE
 """Most bytes of a record or of a decompressed chunk that is read. Ours are of 64 KiB, or of one
 message and 256 KiB where that is longer."""
-_TOPIC: Final = re.compile(r"/slot([0-9]{1,9})/(state|command|events)")
+_TOPIC = re.compile(r"/slot([0-9]{1,9})/(state|command|events)")
 
 
 @dataclass(eq=False)

@@ -17,22 +17,22 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from mcap.writer import Writer
 
 from ..protocol.messages import Command, Hello, Message, State
 from ..transport.stepped import Steppable
 
-ABOUT: Final = "rotorgram"  # name of the metadata about the whole file
-FORMAT: Final = "4"  # version of the file's content, beside the protocol's in each datagram
+ABOUT = "rotorgram"  # name of the metadata about the whole file
+FORMAT = "4"  # version of the file's content, beside the protocol's in each datagram
 
-_CHUNK: Final = 1 << 16  # bytes; 2 ms to write
-_SECOND: Final = 10**9
-_BUFFER: Final = 1 << 20  # bytes; more than a chunk, so that its records reach the file at once
-_PACKAGES: Final = ("rotorgram", "mujoco", "gymnasium", "numpy", "mcap")
+_CHUNK = 1 << 16  # bytes; 2 ms to write
+_SECOND = 10**9
+_BUFFER = 1 << 20  # bytes; more than a chunk, so that its records reach the file at once
+_PACKAGES = ("rotorgram", "mujoco", "gymnasium", "numpy", "mcap")
 
-_log: Final = logging.getLogger("rotorgram.udp")
+_log = logging.getLogger("rotorgram.udp")
 
 
 class Journal:

@@ -16,18 +16,18 @@ from contextlib import suppress
 from hashlib import blake2b
 from hmac import compare_digest
 from pathlib import Path
-from typing import Final, Literal
+from typing import Literal
 
 from ...models.errors import InputError
 from .errors import Forged
 
-KEY_SIZE: Final = 32  # bytes of a shared key
-OVERHEAD: Final = 24  # bytes that sealing adds to a datagram
+KEY_SIZE = 32  # bytes of a shared key
+OVERHEAD = 24  # bytes that sealing adds to a datagram
 
-_MAGIC: Final = b"\xa7S"
-_ID_SIZE: Final = 6
-_TAG_AT: Final = 2 + _ID_SIZE
-_TAG_SIZE: Final = 16
+_MAGIC = b"\xa7S"
+_ID_SIZE = 6
+_TAG_AT = 2 + _ID_SIZE
+_TAG_SIZE = 16
 
 Side = Literal["simulator", "agent"]
 

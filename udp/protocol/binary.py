@@ -7,7 +7,7 @@ constants and structs below follow it, and `docs/golden.json` has the bytes that
 import struct
 import zlib
 from math import isfinite
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -31,19 +31,19 @@ from .messages import (
     Welcome,
 )
 
-MAGIC: Final = b"\xa7R"  # not UTF-8, so that no text datagram begins with it
-VERSION: Final = 2
-HEADER_SIZE: Final = 24
+MAGIC = b"\xa7R"  # not UTF-8, so that no text datagram begins with it
+VERSION = 2
+HEADER_SIZE = 24
 
-HELLO: Final = 1
-REFUSE: Final = 3
-STATE: Final = 4
-COMMAND: Final = 5
-CLOSE: Final = 6
-UNKNOWN: Final = 8
-ALIVE: Final = 9
-MISSING: Final = 10
-_MESSAGES: Final = (
+HELLO = 1
+REFUSE = 3
+STATE = 4
+COMMAND = 5
+CLOSE = 6
+UNKNOWN = 8
+ALIVE = 9
+MISSING = 10
+_MESSAGES = (
     Hello,
     Welcome,
     Refuse,
@@ -57,25 +57,25 @@ _MESSAGES: Final = (
 )
 """In the order of their types, from 1 on."""
 
-FRAGMENT: Final = 0x80  # set in the type of a fragment of a message
-_OF_SESSION: Final = frozenset({STATE, COMMAND, CLOSE, ALIVE})
-_NUMBERED: Final = _OF_SESSION | {UNKNOWN, MISSING}  # types that have a sequence number
+FRAGMENT = 0x80  # set in the type of a fragment of a message
+_OF_SESSION = frozenset({STATE, COMMAND, CLOSE, ALIVE})
+_NUMBERED = _OF_SESSION | {UNKNOWN, MISSING}  # types that have a sequence number
 
-_HEADER: Final = struct.Struct("<2sBBIQQ")
-_NUMBERS: Final = struct.Struct("<QQ")  # session, sequence: the end of the header
-_HELLO_BODY: Final = struct.Struct("<BB2xII4x")
-_WELCOME_BODY: Final = struct.Struct("<QQBB6x")
-_REST_AT: Final = 8  # first byte after the checksum
-_STATE_HEAD: Final = struct.Struct("<QQdQ")  # session and sequence too
-_COMMAND_HEAD: Final = struct.Struct("<QQI4x")
-_MISSING_BODY: Final = struct.Struct("<BxHH")
-_EXTENSION: Final = struct.Struct("<HH")
-_START: Final = {kind: MAGIC + bytes((VERSION, kind)) for kind in (STATE, COMMAND)}
-_START_CRC: Final = {kind: zlib.crc32(start) for kind, start in _START.items()}
-_LENGTH: Final = struct.Struct("<H")
-_CRITICAL: Final = 1 << 15
-_MAX_EXTENSIONS: Final = 64
-LONGEST_HELLO: Final = (
+_HEADER = struct.Struct("<2sBBIQQ")
+_NUMBERS = struct.Struct("<QQ")  # session, sequence: the end of the header
+_HELLO_BODY = struct.Struct("<BB2xII4x")
+_WELCOME_BODY = struct.Struct("<QQBB6x")
+_REST_AT = 8  # first byte after the checksum
+_STATE_HEAD = struct.Struct("<QQdQ")  # session and sequence too
+_COMMAND_HEAD = struct.Struct("<QQI4x")
+_MISSING_BODY = struct.Struct("<BxHH")
+_EXTENSION = struct.Struct("<HH")
+_START = {kind: MAGIC + bytes((VERSION, kind)) for kind in (STATE, COMMAND)}
+_START_CRC = {kind: zlib.crc32(start) for kind, start in _START.items()}
+_LENGTH = struct.Struct("<H")
+_CRITICAL = 1 << 15
+_MAX_EXTENSIONS = 64
+LONGEST_HELLO = (
     HEADER_SIZE + _HELLO_BODY.size + MAX_SPEC + _MAX_EXTENSIONS * (_EXTENSION.size + MAX_TEXT)
 )  # bytes
 

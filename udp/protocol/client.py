@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, replace
 from math import inf
 from random import Random
-from typing import Annotated, Final
+from typing import Annotated
 
 import numpy as np
 
@@ -39,21 +39,21 @@ Tap = Callable[[int, Message, bytes], None]
 """Sees every message once, when it is first sent or taken: the number of its slot (0 at the
 simulator), the message, and its bytes in the binary codec, whole and not sealed."""
 
-CLOSE_INTERVAL: Final = 0.025
+CLOSE_INTERVAL = 0.025
 """Period of a repeated Close, s, until the other side has answered it with its own."""
-CLOSE_LINGER: Final = 0.25  # longest wait for that answer, s: the other side may be gone
+CLOSE_LINGER = 0.25  # longest wait for that answer, s: the other side may be gone
 
-_FIRST_RESEND: Final = 0.2  # wait before a resend while no round trip has been measured, s
-_GRANULARITY: Final = 0.005  # least that is added to a round trip, s: a process may wait so long
-_LONGEST_RESEND: Final = 1.0  # longest wait before a resend, s
-_PATIENCE: Final = 8  # resends before the waits double: most that was lost was lost by chance
-_LATER: Final = 1.25  # factor of the wait before the next resend, for each Alive for a State
-_LATEST: Final = 10.0
+_FIRST_RESEND = 0.2  # wait before a resend while no round trip has been measured, s
+_GRANULARITY = 0.005  # least that is added to a round trip, s: a process may wait so long
+_LONGEST_RESEND = 1.0  # longest wait before a resend, s
+_PATIENCE = 8  # resends before the waits double: most that was lost was lost by chance
+_LATER = 1.25  # factor of the wait before the next resend, for each Alive for a State
+_LATEST = 10.0
 """Longest such wait, s; a quarter of the timeout, if that is less. A Command that was lost is asked
 for again before an agent takes the simulator for lost (30 s)."""
-_TOO_EARLY: Final = 1.5  # factor of the estimated round trip when answers come twice
-_SOON: Final = 0.25  # an agent that has waited for a State for less needs no Alive, s
-_AFTER_COMMAND: Final = SIMULATOR["waiting"]["received", Command]
+_TOO_EARLY = 1.5  # factor of the estimated round trip when answers come twice
+_SOON = 0.25  # an agent that has waited for a State for less needs no Alive, s
+_AFTER_COMMAND = SIMULATOR["waiting"]["received", Command]
 
 
 def new_session() -> int:

@@ -10,7 +10,6 @@ are sent again, and the bursts follow each other at the pace of the round trip.
 
 import struct
 from math import ceil
-from typing import Final
 from zlib import crc32
 
 import numpy as np
@@ -22,18 +21,18 @@ from .errors import DecodeError
 from .layout import MAX_MESSAGE
 from .messages import Missing
 
-NEAR: Final = 65_507 - 24
+NEAR = 65_507 - 24
 """Largest datagram of the binary codec on loopback, bytes: UDP's over IPv4, less a seal."""
-FAR: Final = 1_200
+FAR = 1_200
 """The same elsewhere: less than any network's, so that no datagram is cut on its way."""
-LEAST: Final = 256  # the smallest that either side may be set to, bytes
-MAX_FRAGMENTS: Final = 1 << 14
+LEAST = 256  # the smallest that either side may be set to, bytes
+MAX_FRAGMENTS = 1 << 14
 
-_FRAGMENT: Final = struct.Struct("<HHB3x")
-_OVERHEAD: Final = HEADER_SIZE + _FRAGMENT.size
-_ASKS_AT: Final = 28
-_BURST: Final = 3 << 16  # bytes: what the smallest buffer that systems give a socket holds
-_LARGEST_BITMAP: Final = 128  # bytes of the bitmap of a Missing: it tells of 1,024 fragments
+_FRAGMENT = struct.Struct("<HHB3x")
+_OVERHEAD = HEADER_SIZE + _FRAGMENT.size
+_ASKS_AT = 28
+_BURST = 3 << 16  # bytes: what the smallest buffer that systems give a socket holds
+_LARGEST_BITMAP = 128  # bytes of the bitmap of a Missing: it tells of 1,024 fragments
 
 
 def check_size(size: int, largest: int) -> None:

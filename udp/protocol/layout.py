@@ -8,20 +8,20 @@ import math
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from ...models.errors import InputError
 from ...models.fields import Limits, check
 
-MAX_DRONES: Final = 1 << 16  # most drones of one simulator
-MAX_MESSAGE: Final = 1 << 24  # largest message in all its fragments, bytes
-STATE_ARRAYS_AT: Final = 40
-COMMAND_ARRAYS_AT: Final = 32
+MAX_DRONES = 1 << 16  # most drones of one simulator
+MAX_MESSAGE = 1 << 24  # largest message in all its fragments, bytes
+STATE_ARRAYS_AT = 40
+COMMAND_ARRAYS_AT = 32
 
-_LETTERS: Final = {"float32": "f", "float64": "d"}  # names of `struct`
-_SMALL: Final = 256  # up to this many numbers Python's loop is faster than NumPy's calls
+_LETTERS = {"float32": "f", "float64": "d"}  # names of `struct`
+_SMALL = 256  # up to this many numbers Python's loop is faster than NumPy's calls
 
 
 class ArrayLayout(NamedTuple):

@@ -7,26 +7,26 @@ a `Command` means something only with the `Layout` of its Hello: the codec check
 
 import re
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from ...models.errors import InputError, shortened
 from .layout import MAX_DRONES
 
-MAX_UINT64: Final = (1 << 64) - 1  # largest session, sequence number, nonce and seed
-MAX_TEXT: Final = 512  # longest reason, bytes of UTF-8
-MAX_SPEC: Final = 1 << 22  # longest spec, bytes of UTF-8
+MAX_UINT64 = (1 << 64) - 1  # largest session, sequence number, nonce and seed
+MAX_TEXT = 512  # longest reason, bytes of UTF-8
+MAX_SPEC = 1 << 22  # longest spec, bytes of UTF-8
 
-POLICIES: Final = ("hold", "land", "end")
+POLICIES = ("hold", "land", "end")
 """What drones do whose agent is lost: they take the action that changes nothing, they descend
 until they touch something, or their rotors stand still."""
 
-FLY: Final = 0
-RESET: Final = 1
-FREEZE: Final = 2  # order to a drone: fly its action, reset instead of it, or do nothing
+FLY = 0
+RESET = 1
+FREEZE = 2  # order to a drone: fly its action, reset instead of it, or do nothing
 
-_CONTROL: Final = re.compile(r"[\x00-\x1f\x7f-\x9f]")
+_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")
 
 
 def one_line(text: str) -> str:

@@ -7,7 +7,7 @@ Free of sockets and clocks, as `client`: a driver hands in datagrams and the tim
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import inf
-from typing import Final, Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +20,8 @@ from .messages import FLY, RESET, Close, Command, Refuse, Welcome
 Array = np.ndarray
 Mask = NDArray[np.bool_]
 
-_COMPLAIN_AFTER: Final = 1.0  # silence of an agent before the log says so, once a message, s
-NO_RESET: Final = "an action came after the end of an episode: expected a reset"
+_COMPLAIN_AFTER = 1.0  # silence of an agent before the log says so, once a message, s
+NO_RESET = "an action came after the end of an episode: expected a reset"
 
 
 class World(Protocol):

@@ -10,7 +10,7 @@ import secrets
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import Final, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 from ...models.errors import InputError
 from . import binary, text
@@ -23,12 +23,12 @@ from .layout import Layout
 from .messages import State, one_line
 from .session import Event, NoSuchSession, Outbox, Session
 
-_MOST: Final = 1024  # simulators remembered between Hello and State 1, in the queue, and after
-_LEAST_ASSEMBLING: Final = 16
+_MOST = 1024  # simulators remembered between Hello and State 1, in the queue, and after
+_LEAST_ASSEMBLING = 16
 """Simulators without a slot of which fragments are kept; more, if there are more slots: so many
 may come at the same moment."""
-_TEXT_REMEMBERED: Final = 2.0  # memory of the last line of a closed text simulator, s
-_REASON_AT: Final = binary.HEADER_SIZE + 2  # bytes of a Refuse or a Close before its reason
+_TEXT_REMEMBERED = 2.0  # memory of the last line of a closed text simulator, s
+_REASON_AT = binary.HEADER_SIZE + 2  # bytes of a Refuse or a Close before its reason
 
 K = TypeVar("K")
 V = TypeVar("V")

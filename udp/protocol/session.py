@@ -5,7 +5,7 @@ of a datagram; `Outbox` takes what they send.
 """
 
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from .messages import Command, Message, State, one_line
 from .statistics import Statistics
 from .transitions import AGENT, AgentState, Way
 
-_AFTER_STATE: Final = AGENT["expecting"]["received", State]
+_AFTER_STATE = AGENT["expecting"]["received", State]
 
 
 class NoSuchSession(DecodeError):

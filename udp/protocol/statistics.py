@@ -1,16 +1,15 @@
 """Statistics of one side of the wire: counts, round trips, and notices at a bounded rate."""
 
 from collections import Counter, deque
-from typing import Final
 
 import numpy as np
 
 from .messages import one_line
 
-NOTICE_INTERVAL: Final = 10.0  # shortest time between two notices of the same cause, s
+NOTICE_INTERVAL = 10.0  # shortest time between two notices of the same cause, s
 
-_REMEMBERED: Final = 1 << 14
-_QUIET: Final = frozenset({"duplicate", "stale"})
+_REMEMBERED = 1 << 14
+_QUIET = frozenset({"duplicate", "stale"})
 """Events of every network that loses datagrams: counted, without a notice."""
 
 

@@ -25,11 +25,11 @@ from .errors import DecodeError
 from .layout import ArrayLayout, Layout
 from .messages import FLY, MAX_UINT64, RESET, Close, Command, State
 
-MAX_LINE: Final = 1200
-_LONGEST_NUMBER: Final = 24  # bytes: -2.2250738585072014e-308
-_FIXED: Final = 24  # bytes of the longest sequence number and two flags, with their commas
-_WHOLE: Final = re.compile(r"0|[1-9][0-9]{0,19}")
-_NUMBER: Final = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+MAX_LINE = 1200
+_LONGEST_NUMBER = 24  # bytes: -2.2250738585072014e-308
+_FIXED = 24  # bytes of the longest sequence number and two flags, with their commas
+_WHOLE = re.compile(r"0|[1-9][0-9]{0,19}")
+_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 
 def is_text(datagram: bytes) -> bool:

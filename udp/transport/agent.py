@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass, fields
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, TypedDict
+from typing import TYPE_CHECKING, Annotated, TypedDict
 
 import gymnasium as gym
 import numpy as np
@@ -34,7 +34,7 @@ from .sockets import LONGEST_WAIT, PAUSE, Port, log_notices
 if TYPE_CHECKING:
     from ..journal import Journal
 
-_log: Final = logging.getLogger("rotorgram.udp")
+_log = logging.getLogger("rotorgram.udp")
 
 Order = tuple[np.ndarray, np.ndarray, np.ndarray | None]
 """Actions, orders and seeds of the drones of one simulator: see `messages.Command`."""

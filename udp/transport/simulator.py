@@ -7,7 +7,7 @@ from contextlib import ExitStack, suppress
 from dataclasses import replace
 from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal, cast
+from typing import TYPE_CHECKING, Literal, cast
 
 import gymnasium as gym
 import numpy as np
@@ -36,9 +36,9 @@ from .stepped import GymEnv, GymnasiumWorld, make_stepped
 if TYPE_CHECKING:
     from ..journal import Journal
 
-DEFAULT_AGENT: Final = ("127.0.0.1", 8001)
-DEFAULT_SIMULATOR: Final = ("127.0.0.1", 8000)
-_ALIVE_EVERY: Final = 0.5  # period of the message Alive while an agent waits for a State, s
+DEFAULT_AGENT = ("127.0.0.1", 8001)
+DEFAULT_SIMULATOR = ("127.0.0.1", 8000)
+_ALIVE_EVERY = 0.5  # period of the message Alive while an agent waits for a State, s
 
 Observer = Callable[[Command | None], None]
 """Called with the Command that moved the drones, or None where all of them were reset, once the

@@ -19,33 +19,32 @@ from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from functools import partial
 from math import ceil
-from typing import Final
 
 from ...models.errors import InputError
 from ..protocol.client import Address, address_text
 from ..protocol.statistics import Statistics
 
-LONGEST_WAIT: Final = 0.1
+LONGEST_WAIT = 0.1
 """Longest wait in one go, s: flags that other threads and signals set are looked at as often."""
-PAUSE: Final = 1.0
+PAUSE = 1.0
 """If a wait takes longer than it should by this time, s, this process was stopped meanwhile."""
 
-_log: Final = logging.getLogger("rotorgram.udp")
-_LOOK: Final = 200e-6  # look of a wait before it sleeps, s: a step of one drone takes less
-_LOST: Final = 60e-6  # time between two looks if another process had the core, s; else 2e-6
-_MAX_ASLEEP: Final = 64  # waits at most that sleep at once before one looks again
-_STRANGERS_EVERY: Final = 0.01  # time between two looks at strangers while no slot is free, s
-_BUFFER: Final = 1 << 22  # bytes of datagrams that a socket may hold until they are looked at
-_MAX_DATAGRAM: Final = 65507  # largest payload of a UDP datagram over IPv4, bytes
-WAY_OUT: Final = (
+_log = logging.getLogger("rotorgram.udp")
+_LOOK = 200e-6  # look of a wait before it sleeps, s: a step of one drone takes less
+_LOST = 60e-6  # time between two looks if another process had the core, s; else 2e-6
+_MAX_ASLEEP = 64  # waits at most that sleep at once before one looks again
+_STRANGERS_EVERY = 0.01  # time between two looks at strangers while no slot is free, s
+_BUFFER = 1 << 22  # bytes of datagrams that a socket may hold until they are looked at
+_MAX_DATAGRAM = 65507  # largest payload of a UDP datagram over IPv4, bytes
+WAY_OUT = (
     "a key that both sides share (key_file, --key-file), or insecure=True (--insecure) where "
     "everybody who reaches this port may fly the drone"
 )
-TEXT_WAY_OUT: Final = (
+TEXT_WAY_OUT = (
     "the binary codec and a key, or insecure=True (--insecure) where everybody who reaches this "
     "port may fly the drone: text cannot be sealed"
 )
-_SENTENCES: Final = {
+_SENTENCES = {
     errno.EADDRINUSE: "the port is in use: choose another one, or end the program on it",
     errno.EADDRNOTAVAIL: "this machine has no such address",
     errno.EACCES: "ports below 1024 need more rights: choose a higher one",
