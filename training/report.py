@@ -12,14 +12,13 @@ from dataclasses import asdict
 from pathlib import Path
 from string import Template
 
-import numpy as np
 import pandas as pd
 
 from ..models.errors import require
 from .claims import Verdict, judge_claims, judge_no_worse
 from .figures import PAPER, draw_figures
 from .results import Results
-from .tables import markdown, results_table, task_tables
+from .tables import Cell, markdown, results_table, task_tables
 
 PAGE_FILE = "report.html"
 VIDEO_FILE = "video.mp4"
@@ -105,15 +104,19 @@ def _page(results: Results, table: pd.DataFrame, figures: Sequence[str]) -> Iter
     if video.is_file():
         yield f'<video controls loop muted src="{_embedded(video, "video/mp4")}"></video>'
     for task in task_tables(results, table):
-        texts = ["\n".join([cell.value, *cell.details]) for line in task.lines for cell in line]
-        cells = np.reshape(texts, (len(task.lines), -1))
+        heads = map(html.escape, task.headings)
+        lines = [map(_cell, line) for line in task.lines]
         yield f"<h2>{html.escape(task.task)}</h2>"
-        yield pd.DataFrame(cells, columns=task.headings).to_html(index=False, border=0)
+        yield pd.DataFrame(lines, columns=heads).to_html(index=False, border=0, escape=False)
     for name in figures:
         source = _embedded(results.folder / "figures" / f"{name}.svg", "image/svg+xml")
         caption = html.escape(PAPER.get(name, name))
         yield f'<figure><img alt="{name}" src="{source}">'
         yield f"<figcaption>{caption}</figcaption></figure>"
+
+
+def _cell(cell: Cell) -> str:
+    return "<br>".join(map(html.escape, [cell.value, *cell.details]))
 
 
 def _embedded(file: Path, kind: str) -> str:

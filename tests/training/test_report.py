@@ -230,6 +230,7 @@ def test_the_page_has_figures_tables_and_film_and_no_script(comparison: Path) ->
     assert "rotorgram compare --seeds 3 &lt;folder&gt;" in text
     assert text.count("<tr") == 5  # a head and four agents
     assert "It gives no numbers." in text
+    assert "<td>PID<br>3 seeds</td>" in text
 
 
 def test_figures_are_written_in_three_formats_and_always_the_same(comparison: Path) -> None:
