@@ -803,7 +803,7 @@ def test_an_interrupted_comparison_goes_on(tmp_path: Path, capsys: Capsys) -> No
     assert f"go on with: rotorgram compare --resume {folder}" in out
     assert err == "rotorgram: interrupted\n"
     assert "got others by --seeds" in refused(capsys, "compare", "--resume", folder, "--seeds", 4)
-    output(capsys, "compare", "--resume", folder, "--jobs", 1)
+    output(capsys, "compare", "--resume", folder, "--jobs", 1, "--no-film")
     runs = Results.read(folder).runs
     assert runs[runs.row == "vpg"].seed.tolist() == [0, 1, 2]
     assert not (folder / "parts").exists()

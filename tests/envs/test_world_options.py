@@ -178,7 +178,7 @@ def test_a_policy_flies_with_the_vehicle_that_has_its_effects(
 
 def test_files_of_a_comparison_tell_what_was_drawn(tmp_path: Path) -> None:
     words = ["--agents", "vpg", "--seeds", "1", "--env-steps", "1500", "--episodes", "2"]
-    words += ["--jobs", "1", "--episode-length", "50"]
+    words += ["--jobs", "1", "--episode-length", "50", "--no-film"]
     words += ["--randomize", "mass=uniform(0.9,1.1)", "--out", str(tmp_path / "c")]
     assert main(["compare", *words]) == 0
     for name in ("episodes.parquet", "evaluations.parquet"):

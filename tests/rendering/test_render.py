@@ -12,6 +12,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import pandas as pd
 import pytest
 import rotorgram.rendering.gl as gl
 from pictures import HEIGHT, TABLES, WIDTH, decoded, pixels
@@ -25,6 +26,9 @@ from rotorgram.flights.filming import Film, FilmTrack, film
 from rotorgram.flights.recorded import recorded_trajectories
 from rotorgram.flights.trajectories import flown_trajectories
 from rotorgram.rendering import NoOpenGL
+from rotorgram.training.films import film_study
+from rotorgram.training.results import COLUMNS, Results, write_config, write_part
+from rotorgram.training.settings import Row, Study
 
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
@@ -265,6 +269,50 @@ def test_which_opengl_is_tried(
     with pytest.raises(NoOpenGL):
         gl.offscreen_context(16, 16)
     assert asked == [f"mujoco.{name}" for name in tried]
+
+
+# ---- the film of a comparison
+
+
+@pytest.fixture
+def comparison(training: Path, tmp_path: Path) -> Results:
+    """A study of which one seed of A2C is done, beside a PID."""
+    folder = tmp_path / "comparison"
+    (folder / "checkpoints").mkdir(parents=True)
+    data = (training / "checkpoint.safetensors").read_bytes()
+    (folder / "checkpoints" / "a2c-seed0.safetensors").write_bytes(data)
+    trained = load(training / "checkpoint.safetensors")
+    env = EnvConfig.from_keywords(trained.env_id, **trained.options)
+    rows = tuple(Row(agent=agent, name=agent, env=env) for agent in ("a2c", "pid"))
+    specs = dict.fromkeys(("a2c", "pid"), trained.spec)
+    write_config(folder, "", Study(rows=rows, seeds=1), specs)
+    for row in rows:
+        tables = {}
+        for name in ("evaluations", "runs"):
+            tables[name] = pd.DataFrame(0.0, index=[0], columns=list(COLUMNS[name][2:]))
+        tables["evaluations"]["episode"] = 0
+        write_part(folder, row, 0, tables)
+    return Results.read(folder)
+
+
+def test_the_film_of_a_comparison_shows_its_agents(comparison: Results, opengl: None) -> None:
+    out = comparison.folder / "video.mp4"
+    film_study(comparison, out)
+    frames = decoded(out, 1280, 400)
+    assert len(frames) == 13
+    left = frames[0][:, :639].astype(int)
+    right = frames[0][:, 641:].astype(int)
+    assert abs(left[100:300] - right[100:300]).mean() < 8  # they start alike
+    names = sorted(path.name for path in comparison.folder.iterdir())
+    assert names == ["checkpoints", "config.json", "parts", "video.mp4"]
+
+
+def test_a_comparison_without_opengl_has_no_film(comparison: Results, no_egl: None) -> None:
+    out = comparison.folder / "video.mp4"
+    with pytest.raises(NoOpenGL) as told:
+        film_study(comparison, out)
+    assert SENTENCE in str(told.value)
+    assert not out.exists()
 
 
 # ---- the page

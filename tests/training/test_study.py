@@ -37,7 +37,7 @@ ONE = WorkersConfig(jobs=1)
 DATA = Path(__file__).parents[1] / "data"
 COMMITTED = Path(__file__).parents[2] / "docs" / "results" / "baselines"
 TIMES = ["seconds", "steps_per_second", "seconds_to_hold"]
-FLAGS = ("--env-steps", "300", "--episodes", "1", "--episode-length", "40")
+FLAGS = ("--env-steps", "300", "--episodes", "1", "--episode-length", "40", "--no-film")
 
 
 @pytest.fixture(scope="module")
@@ -186,7 +186,7 @@ def test_two_files_are_rows_of_their_names(tmp_path: Path, capsys: Capsys) -> No
     for name, hidden in (("a", "[8]"), ("b", "[8, 8]")):
         (tmp_path / f"{name}.toml").write_text(text.format(hidden))
     files = [tmp_path / "a.toml", tmp_path / "b.toml"]
-    flags = ("--seeds", 2, "--episodes", 2, "--snapshots", 1, "--jobs", 1)
+    flags = ("--seeds", 2, "--episodes", 2, "--snapshots", 1, "--jobs", 1, "--no-film")
     more = ("--set", "gamma=0.9", "--env.flight-band", "1.5", "--out", tmp_path / "out")
     output(capsys, "compare", *files, *flags, *more)
     results = Results.read(tmp_path / "out")
