@@ -106,17 +106,21 @@ def chosen_views(words: Sequence[str], cameras: Iterable[Camera]) -> tuple[View,
     for word in words:
         text, at, size = word.partition("@")
         name, _, kind = text.rpartition("_")
-        alone = text in known
-        if not alone and (name not in known or kind not in OUTPUTS):
+        if text in known:
+            camera = known[text]
+            kinds = camera.kinds
+        elif name in known and kind in OUTPUTS:
+            camera = known[name]
+            kinds = (kind,)
+        else:
             raise InputError(
                 f"cameras: expected some of {', '.join(known)}, each with "
                 f"_{', _'.join(OUTPUTS)} behind it or not, got {shortened(word)}"
             )
-        camera = known[text if alone else name]
         if at:
             width, height = _size(word, size)
             camera = replace(camera, width=width, height=height)
-        for one in camera.kinds if alone else (kind,):
+        for one in kinds:
             view = View(camera=camera, kind=one)
             if views.setdefault(view.name, view) != view:
                 raise InputError(

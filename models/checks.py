@@ -291,8 +291,9 @@ def _turns(craft: _Craft) -> Iterator[Check]:
     sizes = np.abs(reactions)
     total = float(sizes.sum())
     share = float(reactions.sum()) / total if total > 0 else math.nan
-    # The wrong sign of one of R rotors gives 2 / R more; an odd one has 1 / R by itself.
-    tolerance = (1.5 if len(rotors) % 2 else 1) / len(rotors)
+    # The wrong sign of one of R rotors gives 2 / R more; an odd R has 1 / R by itself.
+    half = 1.5 if len(rotors) % 2 else 1.0
+    tolerance = half / len(rotors)
     yield _judged("turns: yaw of equal thrusts", share, expected=0, tolerance=tolerance)
     median = float(np.median(sizes)) or math.nan
     for rotor, size in zip(rotors, sizes, strict=True):

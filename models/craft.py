@@ -60,8 +60,10 @@ def craft_spec(file: VehicleFile, base: mujoco.MjSpec | None = None) -> mujoco.M
         numeric.data = values
     free = mujoco.mjtJoint.mjJNT_FREE
     crafts = [body for body in spec.bodies if any(j.type == free for j in body.joints)]
-    for camera in file.cameras if crafts else ():
-        place_camera(spec, crafts[0] if camera.carried else spec.worldbody, camera)
+    if crafts:
+        for camera in file.cameras:
+            body = crafts[0] if camera.carried else spec.worldbody
+            place_camera(spec, body, camera)
     return spec
 
 
@@ -276,9 +278,14 @@ def _rotor_site(
     spec: mujoco.MjSpec, file: VehicleFile, rotor: PlacedRotor, where: str
 ) -> mujoco.MjsSite:
     """The site of a rotor: one of the model, or a new one on one of its bodies."""
-    kind = "body" if rotor.site is None else "site"
+    if rotor.site is None:
+        kind = "body"
+        parts = spec.bodies
+    else:
+        kind = "site"
+        parts = spec.sites
     name = rotor.site or rotor.link or rotor.body
-    known = [one.name for one in (spec.bodies if rotor.site is None else spec.sites)]
+    known = [part.name for part in parts]
     if name not in known or name == "world":
         words = ", ".join(one for one in known if one != "world")
         raise InputError(f"{where}: expected a {kind} of the model's file: {words}, got {name!r}")

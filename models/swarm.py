@@ -35,7 +35,8 @@ def swarm_model(
     names = drone_names(len(vehicles))
     for vehicle in vehicles:
         for name in SHARED:
-            ours, its = (getattr(one.model.opt, name) for one in (first, vehicle))
+            ours = getattr(first.model.opt, name)
+            its = getattr(vehicle.model.opt, name)
             if not np.array_equal(ours, its):
                 got = f"{its} of {vehicle.name}"
                 raise InputError(

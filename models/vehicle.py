@@ -464,7 +464,10 @@ def _find_rest_height(model: mujoco.MjModel, data: mujoco.MjData) -> float:
             raise InputError(f"vehicle: expected a craft that is free above the ground, got {got}")
     while high - low > 1e-10 * high:
         middle = (low + high) / 2
-        low, high = (middle, high) if _touches(model, data, middle) else (low, middle)
+        if _touches(model, data, middle):
+            low = middle
+        else:
+            high = middle
     return round(high, 9)
 
 

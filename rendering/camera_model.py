@@ -104,7 +104,8 @@ def _add_mark(body: mujoco.MjsBody, name: str, mark: Mark, thickness: float) -> 
     parts = mark.parts(thickness)
     for number, part in enumerate(parts):
         own = f"{name}/{number}" if len(parts) > 1 else name
-        start, end = (np.add(mark.position, point) for point in (part.start, part.end))
+        start = np.add(mark.position, part.start)
+        end = np.add(mark.position, part.end)
         place = {"pos": start}
         if part.kind != "sphere":
             place = {"fromto": np.concatenate((start, end))}

@@ -248,8 +248,8 @@ class Cameras:
     def _meters(self, depth: np.ndarray) -> np.ndarray:
         """Depth along the camera's axis, float32, m, from OpenGL's depth: 1 near, 0 far."""
         extent = self.model.stat.extent
-        clip = self.model.vis.map
-        near, far = (float(np.float32(end * extent)) for end in (clip.znear, clip.zfar))
+        near = float(np.float32(self.model.vis.map.znear * extent))
+        far = float(np.float32(self.model.vis.map.zfar * extent))
         meters = near * far / (near + depth.astype(np.float64) * (far - near))
         limited: np.ndarray = np.minimum(meters, FARTHEST).astype(np.float32)
         return limited

@@ -198,7 +198,8 @@ class LiveView(AbstractContextManager["LiveView"]):
             self._error = error
 
     def _paint_one(self) -> None:
-        if fresh := self._fresh.is_set():
+        fresh = self._fresh.is_set()
+        if fresh:
             self._fresh.clear()  # before the moments are read: what comes meanwhile is drawn next
         moments = self._latest
         if not moments or not (fresh or self.pace.words != self._said):

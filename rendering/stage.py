@@ -27,7 +27,8 @@ CAMERAS: Final[tuple[Camera, ...]] = get_args(Camera)
 
 _MAX_METRICS = 4  # with a line of their own
 _MAX_THRUSTS = 4  # rotors with a number of their own
-_TRAIL, _EVERY = 150, 3  # control steps of a path, and of one piece of it
+_TRAIL = 150  # control steps of a path
+_EVERY = 3  # control steps of one piece of it
 _ORANGE = (0.96, 0.42, 0.08)
 _GREEN = (0.13, 0.78, 0.52)
 MARK_COLORS = {"gate": _ORANGE, "disc": _GREEN, "ball": _GREEN}
@@ -240,8 +241,9 @@ class Stage:
             if moment.step // _EVERY != last.step // _EVERY or not path:  # steps may be left out
                 path.append(pose[:3].copy())
             now = 0.0 if goal is None else float(np.linalg.norm(goal - pose[:3]))
-            reach = self._reach[i]
-            self._reach[i] = max(reach, min(now, _FAR * self.radius) if reach else now)
+            if self._reach[i]:
+                now = min(now, _FAR * self.radius)
+            self._reach[i] = max(self._reach[i], now)
         place_cameras(self.model, self.data)
 
     def camera(self, name: Camera | Literal["free"]) -> mujoco.MjvCamera:
@@ -404,7 +406,8 @@ def _size(model: mujoco.MjModel) -> tuple[float, float]:
         return 1.0, 0.0
     centres = data.geom_xpos[chosen]
     bounds = model.geom_rbound[chosen]
-    boxes, rows = model.geom_aabb[chosen], data.geom_xmat[chosen, 6:]  # of z in body axes
+    boxes = model.geom_aabb[chosen]
+    rows = data.geom_xmat[chosen, 6:]  # of z in body axes
     tops = centres[:, 2] + (rows * boxes[:, :3] + abs(rows) * boxes[:, 3:]).sum(axis=1)
     radius = float((np.linalg.norm(centres, axis=1) + bounds).max())
     return max(radius, 1e-3), float(tops.max())
@@ -437,7 +440,8 @@ def _draw_mark(
     """Add a mark; a gate that is the goal has the goal's colour."""
     if mark.moves and goal is None:
         return
-    centre = (goal if mark.moves and goal is not None else offset) + mark.position
+    origin = goal if mark.moves and goal is not None else offset
+    centre = origin + mark.position
     color = MARK_COLORS[mark.shape]
     if mark.shape == "gate" and goal is not None and np.abs(goal - centre).max() < 1e-3:
         color = _GREEN
