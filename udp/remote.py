@@ -451,7 +451,8 @@ def _checked_actions(action: ArrayLike, dtype: np.dtype, shape: tuple[int, ...])
     """
     array = np.asarray(action)
     is_real = dtype.kind == "f"
-    if array.shape != shape or array.dtype.kind not in ("iuf" if is_real else "iu"):
+    kinds = "iuf" if is_real else "iu"
+    if array.shape != shape or array.dtype.kind not in kinds:
         numbers = "real" if is_real else "whole"
         got = f"{array.dtype} of shape {array.shape}"
         raise InputError(f"action: expected {numbers} numbers of shape {shape}, got {got}")

@@ -150,7 +150,8 @@ class Recording:
                     if topic == "events":
                         words = json.loads(datagram)
                         datagram = bytes.fromhex(words["datagram"])
-                    message = binary.decode(datagram, session.layout if session else None)
+                    layout = session.layout if session else None
+                    message = binary.decode(datagram, layout)
                     if isinstance(message, Hello):
                         layout_of(EnvSpec.from_json(message.spec), message.worlds)
                 except (ValueError, KeyError, TypeError, RecursionError, DecodeError) as error:
@@ -290,7 +291,8 @@ class SessionSummary:
     def take(self, item: Item) -> None:
         """Count a message of the session."""
         self.last = item.time
-        if transition := self._walker.take(item.message):
+        transition = self._walker.take(item.message)
+        if transition is not None:
             self._count(transition)
         match item.message:
             case Close(reason=reason) if reason:

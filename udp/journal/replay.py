@@ -103,7 +103,9 @@ class SessionVerdict:
         command = transition.command
         resets = transition.resets
         seeds = transition.seeds
-        self._loop = loop = self._loop or self._make()
+        if self._loop is None:
+            self._loop = self._make()
+        loop = self._loop
         if transition.is_gap:
             number = transition.state.sequence - 1
             raise InputError(f"expected Command {number} before it, got none of that number")
@@ -243,8 +245,9 @@ def _other_versions(about: dict[str, str]) -> list[str]:
     """Versions that differ from those that wrote the journal, where it was the simulator's."""
     if about.get("side") != "simulator":
         return []
-    return [
-        f"recorded with {name} {about[key]}, repeated with {number}"
-        for name, number in software().items()
-        if name != "mcap" and (key := f"version of {name}") in about and about[key] != number
-    ]
+    notes = []
+    for name, number in software().items():
+        recorded = about.get(f"version of {name}", number)
+        if name != "mcap" and recorded != number:
+            notes.append(f"recorded with {name} {recorded}, repeated with {number}")
+    return notes

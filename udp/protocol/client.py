@@ -345,9 +345,11 @@ class Client:
         self._round_trips.sent(now)
         assert self._transfer is not None
         missing = self._assembler.missing()  # of the answer
-        self._put([binary.encode(missing)] if missing else self._transfer.probe())
-        wait = self._round_trips.wait(self._tries)
-        self.resend_at = now + (CLOSE_INTERVAL if self.state == "closing" else wait)
+        datagrams = [binary.encode(missing)] if missing else self._transfer.probe()
+        self._put(datagrams)
+        closing = self.state == "closing"
+        wait = CLOSE_INTERVAL if closing else self._round_trips.wait(self._tries)
+        self.resend_at = now + wait
         return True
 
     def pardon(self, seconds: float) -> None:

@@ -137,7 +137,8 @@ class Server:
 
     def handle_timer(self, now: float) -> None:
         """Repeat what is due: a Close that nobody has answered, until nobody will."""
-        if (timer := self.next_timer()) is None or now < timer:
+        timer = self.next_timer()
+        if timer is None or now < timer:
             return
         for slot, session in enumerate(self.slots):
             if session and now >= self._deadline:
@@ -285,7 +286,8 @@ class Server:
         low, high = hello.versions
         if not low <= binary.VERSION <= high:
             return f"expected protocol version {binary.VERSION}, got {low} to {high}"
-        if (unknown := critical_extension(hello)) is not None:
+        unknown = critical_extension(hello)
+        if unknown is not None:
             return f"expected no critical extension of type {unknown}"
         layout = self._accept(hello)
         if isinstance(layout, str):

@@ -183,12 +183,14 @@ def decode_command(datagram: bytes, layout: Layout, session: int) -> Command | C
     fits = len(fields) <= 2 if reset else len(fields) == size
     if not fits:
         raise DecodeError(f"command: expected {expected}, got {datagram[:80]!r}")
-    command = Command(
-        session=session,
-        sequence=sequence,
-        actions=np.zeros(actions.shape, actions.dtype) if reset else _action(fields, layout),
-        orders=np.array([RESET if reset else FLY], np.uint8),
-    )
+    if reset:
+        order = RESET
+        action = np.zeros(actions.shape, actions.dtype)
+    else:
+        order = FLY
+        action = _action(fields, layout)
+    orders = np.array([order], np.uint8)
+    command = Command(session=session, sequence=sequence, actions=action, orders=orders)
     if reset and len(fields) == 2:
         command.seeds = np.array([_whole("command: seed", fields[1])], np.uint64)
     return command
