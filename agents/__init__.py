@@ -169,9 +169,9 @@ def _check_same_env(then: EnvSpec, now: EnvSpec) -> None:
         if expected == got or got == "0" * 32:  # the hash of a peer that gives none
             continue
         if name == "vehicle_hash":
-            before, found = (f"{s.vehicle} (model {s.vehicle_hash[:8]})" for s in (then, now))
             raise ResumeError(
-                f"resume: expected {before}, got {found}; name the vehicle with --vehicle"
+                f"resume: expected {then.vehicle_text}, got {now.vehicle_text}; "
+                "name the vehicle with --vehicle"
             )
         if name == "options":
             different = [key for key in {**expected, **got} if expected.get(key) != got.get(key)]

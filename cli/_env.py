@@ -92,10 +92,9 @@ def policy_for(command: EnvFlags, checkpoint: Checkpoint | Controller, spec: Env
     same_drag = drags[0] == drags[1]
     other = own.vehicle_hash != spec.vehicle_hash and same_drag
     if other and "vehicle" not in command.given:
-        then, now = (f"{one.vehicle} (model {one.vehicle_hash[:8]})" for one in (own, spec))
         raise InputError(
-            f"vehicle: expected {then}, on which the policy was trained, got {now}; "
-            "name one with --vehicle"
+            f"vehicle: expected {own.vehicle_text}, on which the policy was trained, "
+            f"got {spec.vehicle_text}; name one with --vehicle"
         )
     return checkpoint.policy(spec)
 
@@ -114,7 +113,8 @@ def pilot_of(command: F, what: str) -> tuple[F, Policy | None, str]:
 def words_of(trajectory: Trajectory) -> str:
     """Return of an episode, and the headline metric at its end."""
     words = f"return {trajectory.rewards.sum():.1f}"
-    if (metric := trajectory.spec.headline) is None:
+    metric = trajectory.spec.headline
+    if metric is None:
         return words
     value = f"{trajectory.headline[-1]:.3f} {metric.unit}".rstrip()
     return f"{words}, last {metric.symbol or metric.name} {value}"

@@ -296,6 +296,11 @@ class EnvSpec(_Part):
         return np.broadcast_to(np.asarray(scale, np.float64), size)
 
     @property
+    def vehicle_text(self) -> str:
+        """Name of the vehicle, and the first digits of its hash."""
+        return f"{self.vehicle} (model {self.vehicle_hash[:8]})"
+
+    @property
     def headline(self) -> Metric | None:
         """The metric that decides; None where the env names none."""
         return self.metrics[0] if self.metrics else None
