@@ -235,13 +235,17 @@ class Network:
                 slope = layer.back(slope)
 
 
+_ACTIVATIONS: Final = {"relu": Relu, "tanh": Tanh}
+
+
 class MLP(Network):
     """Layers of `relu` or `tanh` units (paper, section 2.3: one of 16) and a linear one."""
 
     def build(self, inputs: int, outputs: int, config: Config) -> Sequence[Layer]:
         layers: list[Layer] = []
+        activation = _ACTIVATIONS[config.activation]
         for units in config.hidden:
-            layers += [Affine(inputs, units), {"relu": Relu, "tanh": Tanh}[config.activation]()]
+            layers += [Affine(inputs, units), activation()]
             inputs = units
         return [*layers, Affine(inputs, outputs)]
 

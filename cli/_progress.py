@@ -33,15 +33,20 @@ def bars() -> Iterator[OnProgress]:
 def frame_bar(name: str) -> Iterator[Callable[[int, int], None]]:
     """A function that shows how many frames of a film are drawn: (done, total)."""
     with bars() as show:
-        yield lambda done, total: show(name, done, total, "done" if done == total else "frames")
+
+        def show_frame(done: int, total: int) -> None:
+            words = "done" if done == total else "frames"
+            show(name, done, total, words)
+
+        yield show_frame
 
 
 class Bars:
     """Shows each run by a bar, with its figures and words. The clock tells seconds."""
 
     def __init__(self, console: Console, clock: Callable[[], float] = time.monotonic) -> None:
-        columns = ("{task.description}", "{task.fields[figures]}")
-        name, figures = (TextColumn(text, markup=False) for text in columns)
+        name = TextColumn("{task.description}", markup=False)
+        figures = TextColumn("{task.fields[figures]}", markup=False)
         bar = BarColumn(bar_width=None)
         self.progress = Progress(name, bar, figures, console=console, get_time=clock)
         self._tasks: dict[str, Task] = {}

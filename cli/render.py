@@ -136,5 +136,6 @@ def _distinct(names: Sequence[str]) -> list[str]:
     distinct = []
     for place, name in enumerate(names):
         number = names[: place + 1].count(name)
-        distinct.append(name if names.count(name) == 1 else f"{name} {number}")
+        is_alone = names.count(name) == 1
+        distinct.append(name if is_alone else f"{name} {number}")
     return distinct

@@ -36,7 +36,8 @@ def write_coco(
         colors: dict[tuple[object, ...], str] = {}
         for picture in frame["pictures"]:
             if picture["kind"] == "rgb":
-                (colors[_view(picture)],) = picture["files"]
+                (file_name,) = picture["files"]
+                colors[_view(picture)] = file_name
         for picture in frame["pictures"]:
             if picture["kind"] != "segmentation":
                 continue

@@ -60,7 +60,9 @@ class RecordedEpisodes:
     def __init__(self, paths: Sequence[Path]) -> None:
         if not paths:
             raise InputError("journals: expected at least one file, got none")
-        self.left_out = self.count = self.steps = 0
+        self.left_out = 0
+        self.count = 0
+        self.steps = 0
         self.journal = ""
         self._sessions: dict[int, Path] = {}
         episodes = self._whole(paths)

@@ -33,7 +33,8 @@ _ON_POSITION = {"goal": "--", "payload": ":"}
 _HIDDEN = ("time", "drawn", "action", "reward", *_ON_POSITION)
 _STYLES = ("-", "--", ":", "-.")
 """Line styles of the numbers in one panel."""
-_WIDTH, _ROW = 11.0, 1.75  # inches
+_WIDTH = 11.0  # inches
+_ROW = 1.75  # inches
 
 
 class Panel(NamedTuple):

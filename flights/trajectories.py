@@ -165,7 +165,8 @@ def _fly_batch(
             own.reset()
     of_drones = [seed for seed in seeds.values() for _ in range(drones)]
     env.single_action_space.seed(of_drones[0])
-    env.reset(seed=[*of_drones, *[0] * (env.num_envs - used)])
+    spare = [0] * (env.num_envs - used)
+    env.reset(seed=of_drones + spare)
     nobody = np.zeros(env.num_envs, bool)
     telemetry = [env.telemetry]
     rewards = []

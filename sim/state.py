@@ -85,7 +85,9 @@ class InitialState:
 def clip(array: Array, low: Array, high: Array) -> Array:
     """The nearest numbers within bounds: numbers, or arrays of the same kind."""
     if isinstance(array, float):  # a single drone's number, NumPy's among them
-        return low if array < low else high if array > high else array
+        if array < low:
+            return low
+        return high if array > high else array
     return np.minimum(np.maximum(array, low), high)  # a third of the time of NumPy's clip
 
 

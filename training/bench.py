@@ -123,6 +123,7 @@ def bench(
     done = 0
     layers = []
     for single in (True, False):
+        at_once = _STEPS_AT_ONCE if single else 1
         group = [layer for layer in _LAYERS if (layer[2] == 1) == single]
         rates: dict[str, list[float]] = {name: [] for name, *_ in group}
         with ExitStack() as stack:
@@ -135,7 +136,7 @@ def bench(
                 for name in names:
                     on_layer(name, done, turns)
                     done += 1
-                    rate = rate_of(steps[name], seconds, _STEPS_AT_ONCE if single else 1)
+                    rate = rate_of(steps[name], seconds, at_once)
                     if number:  # the first round warms up
                         rates[name].append(round(rate, 1))
                 names.append(names.pop(0))

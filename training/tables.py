@@ -257,8 +257,11 @@ def markdown(results: Results, table: pd.DataFrame) -> str:
         lines = [list(task.headings), ["---"] + ["---:"] * (len(task.headings) - 1)]
         for cells in task.lines:
             lines.append([_in_parentheses(cell) for cell in cells])
-        texts = [" | ".join(cell.replace("|", r"\|") for cell in line) for line in lines]
-        parts.append("\n".join(f"| {text} |" for text in texts))
+        rows = []
+        for line in lines:
+            escaped = [cell.replace("|", r"\|") for cell in line]
+            rows.append(f"| {' | '.join(escaped)} |")
+        parts.append("\n".join(rows))
     return "\n\n".join([*parts, NOTE]) + "\n"
 
 

@@ -30,13 +30,14 @@ def views_of(task: Task, drones: int) -> tuple[View, ...]:
     """What the option `cameras` of a task chooses. Raises `InputError`."""
     words = task.config.cameras
     vehicles = dict.fromkeys(members_of(task.vehicle, drones))
-    first, *others = (chosen_views(words, vehicle.cameras) for vehicle in vehicles)
+    chosen = [chosen_views(words, vehicle.cameras) for vehicle in vehicles]
+    first = chosen[0]
     expected = [view.name for view in first]
-    for views in others:
+    for views in chosen[1:]:
         names = [view.name for view in views]
         if names != expected:
-            got = f"{', '.join(expected)} of all vehicles, got {names}"
-            raise InputError(f"cameras: expected {got}")
+            wanted = ", ".join(expected)
+            raise InputError(f"cameras: expected {wanted} of all vehicles, got {names}")
         for ours, its in zip(first, views, strict=True):
             if _as_arrays(ours) != _as_arrays(its):
                 raise InputError(
@@ -55,8 +56,10 @@ def _as_arrays(view: View) -> object:
 def arrays_of(views: Sequence[View], objects: Sequence[str]) -> tuple[ArraySpec, ...]:
     """The arrays of pictures; objects are the names of what a segmentation tells apart."""
     highest = {"rgb": 255.0, "depth": FARTHEST, "segmentation": len(objects) - 1.0}
-    return tuple(
-        ArraySpec(
+    arrays = []
+    for view in views:
+        categories = tuple(objects) if view.kind == "segmentation" else ()
+        array = ArraySpec(
             name=view.name,
             shape=view.shape,
             dtype=view.dtype,
@@ -64,10 +67,10 @@ def arrays_of(views: Sequence[View], objects: Sequence[str]) -> tuple[ArraySpec,
             high=highest[view.kind],
             unit=_UNITS.get(view.kind, ""),
             frame=view.camera.words,
-            categories=tuple(objects) if view.kind == "segmentation" else (),
+            categories=categories,
         )
-        for view in views
-    )
+        arrays.append(array)
+    return tuple(arrays)
 
 
 def objects_of_all(scenes: Sequence[Sequence[str]]) -> tuple[str, ...]:

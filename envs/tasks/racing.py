@@ -208,7 +208,9 @@ class Racing(GoalTask):
         through = (behind < 0.0) & (ahead >= 0.0)
         share = each(plain(behind / np.where(through, behind - ahead, -1.0)))
         crossing = before + share * (now - before)
-        x, y, z = (component(crossing, i) for i in range(3))
+        x = component(crossing, 0)
+        y = component(crossing, 1)
+        z = component(crossing, 2)
         aside = y * component(gate, 3) - x * component(gate, 4)
         inside = (abs(aside) <= half) & (abs(z) <= half)
         left = memory.passed < self._total
