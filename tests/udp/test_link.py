@@ -266,6 +266,19 @@ def test_an_agent_that_waits_for_others_is_not_silent() -> None:
     assert not link.handle_timer(19.0)
 
 
+def test_a_missing_of_other_fragments_changes_nothing() -> None:
+    wire = Wire("agent", False)
+    link = to(simulator(), "waiting", wire)
+    for kind, count in ((4, 1), (4, 2), (5, 1)):
+        missing = Missing(
+            session=SESSION, sequence=1, kind=kind, count=count, first=0, bitmap=b"\1"
+        )
+        assert link.receive(wire(missing), 9.0) is None
+    assert dropped(link) == {"stale": 3}
+    assert not outgoing(link)
+    assert not link.handle_timer(10.0)
+
+
 @pytest.mark.parametrize(("timeout", "longest"), [(20.0, 5.0), (120.0, 10.0)])
 def test_an_agent_that_waits_for_long_is_asked_before_the_timeout(
     timeout: float, longest: float

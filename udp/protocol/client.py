@@ -366,7 +366,6 @@ class Client:
             self._take_command(message, plain, now)
             return message
         if isinstance(message, m.Missing | m.Wait | m.Alive):
-            self.deadline = now + self.config.timeout  # the agent is there: this is no silence
             self._wait_on(message, now)
             return None
         if isinstance(message, m.Welcome) and (reason := self._unfit(message)):
@@ -399,12 +398,15 @@ class Client:
         """The agent is there, and has no answer yet."""
         if isinstance(message, m.Missing):
             transfer = self._transfer
-            if transfer is None or message.kind != binary.peek(transfer.message)[0]:
+            assert transfer is not None
+            is_ours = message.kind == binary.peek(transfer.message)[0]
+            fragments = transfer.resend(message) if is_ours else []
+            if not fragments:
                 self._drop("stale", "", now)
                 return
             self.statistics.counters["resent"] += 1
             self._round_trips.sent(now)
-            self._put(transfer.resend(message))
+            self._put(fragments)
             self._progress(now)
         elif isinstance(message, m.Alive):  # others are late
             self._round_trips.answered(now, alive=True)
@@ -415,6 +417,7 @@ class Client:
         elif not self._is_queued:
             self._is_queued = True
             self.statistics.notice("every slot of the agent is taken; waiting for a free one")
+        self.deadline = now + self.config.timeout  # the agent is there: this is no silence
 
     def _take_command(self, command: Command, plain: bytes, now: float) -> None:
         self.state = _AFTER_COMMAND
