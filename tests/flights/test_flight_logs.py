@@ -15,6 +15,7 @@ pandas = pytest.importorskip("pandas")
 LIVELY = Vehicle.load(Path(__file__).parents[1] / "data" / "lively.toml")
 SPEEDS = [f"m{i}_rads" for i in range(1, 5)]
 COMMANDS = [f"m{i}_command_rads" for i in range(1, 5)]
+ATTITUDE = ["qw", "qx", "qy", "qz"]
 FRAME = pandas.DataFrame
 Read = Callable[..., FlightLog]
 
@@ -23,7 +24,8 @@ Read = Callable[..., FlightLog]
 def table() -> FRAME:
     """2 s along x at 1 m/s, rolling by 0.5 rad/s; a command that steps after 0.1 s."""
     time = 0.01 * np.arange(200)
-    frame = pandas.DataFrame(0.0, index=range(200), columns=["t", *MOTION, *SPEEDS, *COMMANDS])
+    columns = ["t", *MOTION, *SPEEDS, *COMMANDS]
+    frame = pandas.DataFrame(0.0, index=range(200), columns=columns)
     frame["t"] = time
     frame["x"] = time
     frame["vx"] = 1.0
@@ -47,21 +49,26 @@ def read(tmp_path: Path) -> Read:
 
 
 def test_lag_is_the_closed_form(table: FRAME, read: Read) -> None:
-    speeds = with_lag(read(table), 0.05).speeds
+    log = read(table)
+    speeds = with_lag(log, 0.05).speeds
     assert speeds[10, 0] == pytest.approx(500.0)
-    assert speeds[15, 2] == pytest.approx(600 - 100 * np.exp(-0.05 / 0.05))
+    left = 100 * np.exp(-0.05 / 0.05)
+    assert speeds[15, 2] == pytest.approx(600 - left)
 
 
 def test_columns_may_have_other_names_units_and_times(table: FRAME, read: Read) -> None:
-    table["rpm"] = table.pop("m1_rads") * 60 / (2 * np.pi)
+    speed = table.pop("m1_rads")
+    table["rpm"] = speed * 60 / (2 * np.pi)
     table = table.rename(columns={"x": "pos_x"})
-    table[["qw", "qx", "qy", "qz"]] *= np.where(np.arange(200) % 3, 1, -1)[:, None]
+    signs = np.where(np.arange(200) % 3, 1, -1)
+    table[ATTITUDE] *= signs[:, None]
     names = {"x": "pos_x", "m1_rads": "rpm*0.10471975511965977"}
     log = read(table, names, period=0.005)
     time = 0.005 * np.arange(399)
     np.testing.assert_allclose(log.states[:, 0], time, atol=1e-12)
     np.testing.assert_allclose(log.speeds, 600.0)
-    np.testing.assert_allclose(np.abs(log.states[:, 3]), np.cos(0.25 * time), atol=1e-5)
+    sizes = np.abs(log.states[:, 3])
+    np.testing.assert_allclose(sizes, np.cos(0.25 * time), atol=1e-5)
 
 
 def without_speeds(table: FRAME) -> FRAME:
@@ -73,7 +80,8 @@ def with_a_gap(table: FRAME) -> FRAME:
 
 
 def with_a_jump(table: FRAME) -> FRAME:
-    return table.assign(x=table.x + 5.0 * (table.index >= 100))
+    later = table.index >= 100
+    return table.assign(x=table.x + 5.0 * later)
 
 
 def with_a_fast_rotor(table: FRAME) -> FRAME:
@@ -98,8 +106,9 @@ def test_a_wrong_log_is_refused(
     table: FRAME, read: Read, change: Callable[[FRAME], FRAME], sentence: str
 ) -> None:
     """An empty log too: fault 54."""
+    wrong = change(table)
     with pytest.raises(InputError, match=sentence):
-        read(change(table))
+        read(wrong)
 
 
 @pytest.mark.parametrize("impossible", [1e6, 1e308, -50.0])
@@ -114,16 +123,21 @@ def test_an_impossible_sample_is_left_out(
     table.loc[row, column] = impossible
     log = read(table)
     assert log.left_out == 1
-    assert len(log.states) == (200 if row == 60 else 199)
+    inside = row == 60
+    count = 200 if inside else 199
+    assert len(log.states) == count
     start = 0.01 if row == 0 else 0.0
-    time = start + 0.01 * np.arange(len(log.states))
-    np.testing.assert_allclose(log.states[:, 0], time, atol=1e-9)
+    expected = start + 0.01 * np.arange(count)
+    times = log.states[:, 0]
+    np.testing.assert_allclose(times, expected, atol=1e-9)
 
 
 def test_a_jump_of_the_attitude_is_left_out(table: FRAME, read: Read) -> None:
-    assert read(table).left_out == 0
-    table.loc[60, ["qw", "qx", "qy", "qz"]] = (0.0, 0.0, 1.0, 0.0)  # on its head
-    assert read(table).left_out == 1
+    log = read(table)
+    assert log.left_out == 0
+    table.loc[60, ATTITUDE] = (0.0, 0.0, 1.0, 0.0)  # on its head
+    log = read(table)
+    assert log.left_out == 1
 
 
 TOPICS = {
@@ -135,27 +149,32 @@ TOPICS = {
 
 
 def message(kind: str, content: bytes) -> bytes:
-    return struct.pack("<HB", len(content), ord(kind)) + content
+    head = struct.pack("<HB", len(content), ord(kind))
+    return head + content
 
 
 def ulog(path: Path) -> Path:
     """A PX4 log of 2 s: a climb at 1 m/s past 3 m north and 2 m east, rolled by 0.2 rad."""
-    parts = [b"\x55\x4c\x6f\x67\x01\x12\x35\x01" + struct.pack("<Q", 0)]
-    parts.append(message("B", bytes(40)))
+    magic = b"\x55\x4c\x6f\x67\x01\x12\x35\x01"
+    begin = struct.pack("<Q", 0)
+    parts = [magic, begin, message("B", bytes(40))]
     for topic, fields in TOPICS.items():
-        parts.append(message("F", f"{topic}:uint64_t timestamp;{fields};".encode()))
+        form = f"{topic}:uint64_t timestamp;{fields};"
+        parts.append(message("F", form.encode()))
     for index, topic in enumerate(TOPICS):
-        parts.append(message("A", struct.pack("<BH", 0, index) + topic.encode()))
+        numbers = struct.pack("<BH", 0, index)
+        parts.append(message("A", numbers + topic.encode()))
+    attitude = (np.cos(0.1), np.sin(0.1), 0.0, 0.0)
+    rates = (0.1, 0.2, 0.3)
+    motors = (0.25, 0.5, 0.75, 1.0, *[np.nan] * 8)
     for step in range(201):
-        rows = (
-            (3.0, 2.0, -5.0 - 0.01 * step, 0.0, 0.0, -1.0),
-            (np.cos(0.1), np.sin(0.1), 0.0, 0.0),
-            (0.1, 0.2, 0.3),
-            (0.25, 0.5, 0.75, 1.0, *[np.nan] * 8),
-        )
-        for index, row in enumerate(rows):
-            head = struct.pack("<HQ", index, 1_000_000 + step * 10_000)
-            parts.append(message("D", head + np.array(row, "<f4").tobytes()))
+        down = -5.0 - 0.01 * step
+        motion = (3.0, 2.0, down, 0.0, 0.0, -1.0)
+        time = 1_000_000 + step * 10_000
+        for index, row in enumerate((motion, attitude, rates, motors)):
+            head = struct.pack("<HQ", index, time)
+            content = np.array(row, "<f4").tobytes()
+            parts.append(message("D", head + content))
     path.write_bytes(b"".join(parts))
     return path
 
@@ -165,11 +184,14 @@ def test_a_ulog_file_comes_in_our_frames(tmp_path: Path) -> None:
     log = read_log(ulog(tmp_path / "flight.ulg"), LIVELY)
     assert not log.measured
     # North east down becomes north, west, up; forward right down becomes forward, left, up.
-    np.testing.assert_allclose(log.states[100, :3], (3.0, -2.0, 6.0), atol=1e-6)
-    np.testing.assert_allclose(log.states[50, 7:10], (0.0, 0.0, 1.0), atol=1e-6)
+    position = log.states[100, :3]
+    np.testing.assert_allclose(position, (3.0, -2.0, 6.0), atol=1e-6)
+    velocity = log.states[50, 7:10]
+    np.testing.assert_allclose(velocity, (0.0, 0.0, 1.0), atol=1e-6)
     attitude = (np.cos(0.1), np.sin(0.1), 0.0, 0.0)
     np.testing.assert_allclose(log.states[7, 3:7], attitude, atol=1e-6)
-    np.testing.assert_allclose(log.states[7, 10:], (0.1, -0.2, -0.3), atol=1e-6)
+    rates = log.states[7, 10:]
+    np.testing.assert_allclose(rates, (0.1, -0.2, -0.3), atol=1e-6)
     # A quarter of the largest thrust, 3 N, at 3e-6 N s²/rad², is 500 rad/s.
     assert log.speeds[7, 0] == pytest.approx(500.0)
     assert log.speeds[7, 3] == pytest.approx(1000.0)

@@ -1,6 +1,7 @@
 """The paper's frame against signs worked out by hand and against rotation matrices."""
 
 import math
+import tomllib
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from rotorgram.models.frames import (
     quaternions_in_world_frame,
 )
 from scipy.spatial.transform import Rotation
+from tables import DATA
 
 # (x, y, z) -> (X, Y, Z): right is minus left, up is up, forward is forward.
 S = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
@@ -21,6 +23,10 @@ S = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
 SIGNS = {"z": (0, -1, 0), "y": (1, 0, 0), "x": (0, 0, -1)}
 ANGLE = st.floats(-180, 180)
 COORDINATE = st.floats(-100, 100)
+POSITION = st.tuples(COORDINATE, COORDINATE, COORDINATE)
+BELOW_180 = st.floats(-179, 179)
+ATTITUDE = st.tuples(st.floats(-89, 89), BELOW_180, BELOW_180)
+BY_HAND = tomllib.loads((DATA / "by_hand.toml").read_text(encoding="utf-8"))
 
 
 def scalar_first(attitude: Rotation) -> np.ndarray:
@@ -29,27 +35,23 @@ def scalar_first(attitude: Rotation) -> np.ndarray:
 
 def unity(phi: float, theta: float, psi: float) -> np.ndarray:
     """Unity's rotation matrix: Z first, then X, then Y, about fixed axes; angles in degrees."""
-    turned = Rotation.from_euler("YXZ", [theta, phi, psi], degrees=True)
+    angles = [theta, phi, psi]
+    turned = Rotation.from_euler("YXZ", angles, degrees=True)
     return np.asarray(turned.as_matrix())
 
 
 def turned_by(yaw: float, pitch: float, roll: float) -> tuple[np.ndarray, np.ndarray]:
     """Quaternion in MuJoCo's world, and rotation matrix in Unity's."""
-    attitude = Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=True)
-    return scalar_first(attitude), S @ attitude.as_matrix() @ S.T
+    angles = [yaw, pitch, roll]
+    attitude = Rotation.from_euler("ZYX", angles, degrees=True)
+    matrix = S @ attitude.as_matrix() @ S.T
+    return scalar_first(attitude), matrix
 
 
-@pytest.mark.parametrize(
-    ("mujoco", "paper"),
-    [
-        ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),  # forward
-        ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0)),  # left
-        ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0)),  # up
-        ((1.5, -2.5, 3.5), (2.5, 3.5, 1.5)),
-    ],
-)
-def test_position(mujoco: tuple[float, ...], paper: tuple[float, ...]) -> None:
-    assert tuple(positions_in_paper_frame(mujoco)) == paper
+@pytest.mark.parametrize(("mujoco", "paper"), BY_HAND["positions"])
+def test_position(mujoco: list[float], paper: list[float]) -> None:
+    found = positions_in_paper_frame(mujoco)
+    assert found.tolist() == paper
 
 
 def test_level_is_zero_without_negative_zeros() -> None:
@@ -66,7 +68,8 @@ def test_level_is_zero_without_negative_zeros() -> None:
 def test_a_rotation_about_one_axis(axis: str, degrees: float) -> None:
     attitude = Rotation.from_euler(axis, degrees, degrees=True)
     found = attitudes_in_paper_frame(scalar_first(attitude))
-    assert found == pytest.approx(degrees * np.array(SIGNS[axis]))
+    expected = degrees * np.array(SIGNS[axis])
+    assert found == pytest.approx(expected)
 
 
 def test_a_pitch_of_30_degrees_then_a_yaw_by_hand() -> None:
@@ -74,7 +77,8 @@ def test_a_pitch_of_30_degrees_then_a_yaw_by_hand() -> None:
     # sin 30 below the horizon. Unity calls that 30 about X first and then -90 about Y.
     attitude = Rotation.from_euler("yz", [30.0, 90.0], degrees=True)
     angles = attitudes_in_paper_frame(scalar_first(attitude))
-    nose = positions_in_paper_frame(attitude.apply([1.0, 0.0, 0.0]))
+    forward = attitude.apply([1.0, 0.0, 0.0])
+    nose = positions_in_paper_frame(forward)
     assert angles == pytest.approx((30.0, -90.0, 0.0))
     assert nose == pytest.approx((-math.sqrt(0.75), -0.5, 0.0))
 
@@ -83,8 +87,10 @@ def test_a_pitch_of_30_degrees_then_a_yaw_by_hand() -> None:
 def test_any_attitude_against_matrices(yaw: float, pitch: float, roll: float) -> None:
     quaternion, expected = turned_by(yaw, pitch, roll)
     for attitude in attitudes_in_paper_frame([quaternion, -quaternion]):
-        assert (np.abs(attitude) <= (90, 180, 180)).all()
-        np.testing.assert_allclose(unity(*attitude), expected, atol=1e-9)
+        sizes = np.abs(attitude)
+        assert (sizes <= (90, 180, 180)).all()
+        found = unity(*attitude)
+        np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
 @pytest.mark.parametrize("pitch", [-90.0, 90.0])
@@ -97,7 +103,8 @@ def test_nose_straight_up_or_down(pitch: float, yaw: float, roll: float) -> None
     assert psi == 0.0
     assert -180 <= theta <= 180
     # At the pole an angle is known to the square root of the rounding only.
-    np.testing.assert_allclose(unity(phi, theta, psi), expected, atol=1e-6)
+    found = unity(phi, theta, psi)
+    np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
 def test_a_pose_by_hand_on_the_way_back() -> None:
@@ -109,31 +116,32 @@ def test_a_pose_by_hand_on_the_way_back() -> None:
     assert turned == pytest.approx([half, 0.0, 0.0, -half])
 
 
-@given(
-    st.tuples(COORDINATE, COORDINATE, COORDINATE),
-    st.tuples(st.floats(-89, 89), st.floats(-179, 179), st.floats(-179, 179)),
-)
-def test_there_and_back(
-    position: tuple[float, float, float], attitude: tuple[float, float, float]
-) -> None:
+@given(POSITION, ATTITUDE)
+def test_there_and_back(position: tuple[float, ...], attitude: tuple[float, ...]) -> None:
     place = positions_in_world_frame(position)
+    back = positions_in_paper_frame(place)
+    assert tuple(back) == position
     quaternion = quaternions_in_world_frame(attitude)
-    assert tuple(positions_in_paper_frame(place)) == position
-    assert attitudes_in_paper_frame(quaternion) == pytest.approx(attitude, abs=1e-6)
+    turned = attitudes_in_paper_frame(quaternion)
+    assert turned == pytest.approx(attitude, abs=1e-6)
 
 
 @pytest.mark.parametrize("shape", [(), (7,), (3, 5), (0,)])
 def test_any_leading_axes(shape: tuple[int, ...]) -> None:
     count = math.prod(shape)
-    quaternions = np.tile([0.5, -0.5, 0.5, 0.5], (count, 1)).reshape(*shape, 4)
+    rows = np.tile([0.5, -0.5, 0.5, 0.5], (count, 1))
+    quaternions = rows.reshape(*shape, 4)
     attitudes = attitudes_in_paper_frame(quaternions)
-    places = positions_in_paper_frame(attitudes)
     assert attitudes.shape == (*shape, 3)
+    places = positions_in_paper_frame(attitudes)
     assert places.shape == (*shape, 3)
-    assert positions_in_world_frame(places).shape == (*shape, 3)
-    assert quaternions_in_world_frame(attitudes).shape == (*shape, 4)
+    back = positions_in_world_frame(places)
+    assert back.shape == (*shape, 3)
+    turned = quaternions_in_world_frame(attitudes)
+    assert turned.shape == (*shape, 4)
 
 
 def test_nan_stays_nan_and_is_no_warning() -> None:
-    attitudes = attitudes_in_paper_frame([[np.nan] * 4, [1.0, 0.0, 0.0, 0.0]])
+    unknown = [np.nan] * 4
+    attitudes = attitudes_in_paper_frame([unknown, [1.0, 0.0, 0.0, 0.0]])
     assert np.isnan(attitudes[0]).all()

@@ -6,7 +6,7 @@ import subprocess
 import sys
 import textwrap
 from collections.abc import Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -33,15 +33,17 @@ def trajectory(*elevations: float, ending: Any = "truncated") -> Trajectory:
     heights = np.array(elevations)
     zeros = np.zeros_like(heights)
     steps = len(heights)
+    errors = 5.0 - heights
     telemetry = {
         "position": np.stack((zeros, zeros, heights), axis=1),
         "attitude": np.tile((1.0, 0.0, 0.0, 0.0), (steps, 1)),
         "thrust": np.full((steps, 4), 49.0),
         "goal": np.tile((0.0, 0.0, 5.0), (steps, 1)),
-        "metrics": (5.0 - heights)[:, np.newaxis],
+        "metrics": errors[:, np.newaxis],
     }
+    config = EnvConfig(env_id="rotorgram/Elevation-v0")
     return Trajectory(
-        spec=env_spec(EnvConfig(env_id="rotorgram/Elevation-v0")),
+        spec=env_spec(config),
         telemetry=telemetry,
         rewards=np.zeros(steps - 1),
         actions=np.zeros((steps - 1, 1)),
@@ -53,20 +55,31 @@ def track(*trajectories: Trajectory, name: str = "PID") -> FilmTrack:
     return FilmTrack(name=name, trajectories=list(trajectories))
 
 
+def swarm(*trajectories: Trajectory) -> FilmTrack:
+    """The two drones of one world."""
+    spec = replace(trajectories[0].spec, agents=("a", "b"))
+    world = [replace(one, spec=spec) for one in trajectories]
+    return FilmTrack(name="ORCA", trajectories=world, drones=2)
+
+
 def greys(count: int, width: int = 64, height: int = 48) -> Iterator[np.ndarray]:
     """Frames that grow brighter by 4 each."""
     for number in range(count):
-        yield np.full((height, width, 3), 20 + 4 * number, np.uint8)
+        brightness = 20 + 4 * number
+        yield np.full((height, width, 3), brightness, np.uint8)
 
 
 def test_mp4_has_every_frame_at_its_time(tmp_path: Path) -> None:
     path = tmp_path / "new" / "grey.mp4"
-    assert write_film(path, greys(30), 25.0) == 30
+    written = write_film(path, greys(30), 25.0)
+    assert written == 30
     told = ffmpeg_facts(path)
     for fact in ("Video: h264", "yuv420p", "64x48", "25 fps"):
         assert fact in told
-    frames = decoded(path, 64, 48).mean(axis=(1, 2, 3))
-    np.testing.assert_allclose(frames, [20 + 4 * number for number in range(30)], atol=3)
+    frames = decoded(path, 64, 48)
+    found = frames.mean(axis=(1, 2, 3))
+    expected = 20 + 4 * np.arange(30)
+    np.testing.assert_allclose(found, expected, atol=3)
     count, seconds = count_frames_and_secs(str(path))
     assert count == 30
     assert seconds == pytest.approx(1.2, abs=0.01)
@@ -88,10 +101,8 @@ def test_a_missing_package_is_one_sentence(package: str, tmp_path: Path) -> None
         except MissingPackage as error:
             print(error)
         """
-    done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(code)],
-        cwd=tmp_path, capture_output=True, text=True, check=True,
-    )  # fmt: skip
+    command = [sys.executable, "-c", textwrap.dedent(code)]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
     assert f"needs the package {package}: pip install 'rotorgram[render]'" in done.stdout
     assert list(tmp_path.iterdir()) == []
 
@@ -101,21 +112,28 @@ def test_gif_repeats_with_every_frame(tmp_path: Path) -> None:
     write_film(path, greys(7), 20.0)
     with Image.open(path) as gif:
         assert gif.info["loop"] == 0
-        assert (gif.size, gif.n_frames) == ((64, 48), 7)  # type: ignore[attr-defined]
+        assert gif.size == (64, 48)
+        assert gif.n_frames == 7  # type: ignore[attr-defined]
         for number in range(7):
             gif.seek(number)
             assert gif.info["duration"] == 50
-            assert np.asarray(gif.convert("RGB")).mean() == pytest.approx(20 + 4 * number, abs=1)
+            image = gif.convert("RGB")
+            expected = 20 + 4 * number
+            assert np.asarray(image).mean() == pytest.approx(expected, abs=1)
 
 
 def test_folder_and_picture_are_exact(tmp_path: Path) -> None:
-    write_film(tmp_path / "frames", greys(3), 25.0)
-    files = sorted((tmp_path / "frames").iterdir())
-    assert [file.name for file in files] == ["0001.png", "0002.png", "0003.png"]
-    for file, frame in zip(files, greys(3), strict=True):
+    frames = list(greys(3))
+    folder = tmp_path / "frames"
+    write_film(folder, frames, 25.0)
+    files = sorted(folder.iterdir())
+    names = [file.name for file in files]
+    assert names == ["0001.png", "0002.png", "0003.png"]
+    for file, frame in zip(files, frames, strict=True):
         np.testing.assert_array_equal(pixels(file), frame)
-    write_film(tmp_path / "last.png", greys(3), 25.0)
-    np.testing.assert_array_equal(pixels(tmp_path / "last.png"), list(greys(3))[-1])
+    last = tmp_path / "last.png"
+    write_film(last, frames, 25.0)
+    np.testing.assert_array_equal(pixels(last), frames[-1])
 
 
 @pytest.mark.parametrize("name", ["film.mp4", "film.gif", "film.png", "film"])
@@ -129,20 +147,26 @@ def test_what_is_broken_off_leaves_nothing(name: str, tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    ("count", "width", "height", "name", "fps", "sentence"), TABLES["wrong_files"]
-)
+WRONG = TABLES["wrong_files"]
+
+
+@pytest.mark.parametrize(("count", "width", "height", "name", "fps", "sentence"), WRONG)
 def test_what_is_no_film_is_one_sentence(
     count: int, width: int, height: int, name: str, fps: float, sentence: str, tmp_path: Path
 ) -> None:
-    (tmp_path / "there").mkdir()
+    there = tmp_path / "there"
+    there.mkdir()
+    frames = greys(count, width, height)
     with pytest.raises(InputError, match=sentence):
-        write_film(tmp_path / name, greys(count, width, height), fps)
-    assert [path.name for path in tmp_path.iterdir()] == ["there"]
+        write_film(tmp_path / name, frames, fps)
+    left = list(tmp_path.iterdir())
+    assert left == [there]
 
 
 def test_a_frame_of_another_size_or_kind_is_our_fault(tmp_path: Path) -> None:
-    for frames in ([*greys(1), *greys(1, 32)], [np.zeros((48, 64))]):
+    sizes = [*greys(1), *greys(1, 32)]
+    kind = [np.zeros((48, 64))]
+    for frames in (sizes, kind):
         with pytest.raises(ValueError, match="film: expected frames of uint8") as raised:
             write_film(tmp_path / "film", iter(frames), 25.0)
         assert not isinstance(raised.value, InputError)
@@ -154,9 +178,10 @@ def test_a_picture_on_a_full_disk_is_named(tmp_path: Path, monkeypatch: pytest.M
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Image.Image, "save", full)
+    picture = tmp_path / "a.png"
     with pytest.raises(OSError, match="No space left on device") as told:
-        write_film(tmp_path / "a.png", greys(1), 25.0)
-    assert told.value.filename == str(tmp_path / "a.png")
+        write_film(picture, greys(1), 25.0)
+    assert told.value.filename == str(picture)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -170,17 +195,19 @@ def test_an_encoder_that_fails_says_why(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_a_picture_of_odd_size_may_be_anything_but_mp4(tmp_path: Path) -> None:
-    check_film(tmp_path / "film.gif", 63, 47, 25.0)
-    check_film(tmp_path / "film", 63, 47, 30.0)
-    write_film(tmp_path / "film.gif", greys(2, 63, 47), 25.0)
-    write_film(tmp_path / "film", greys(2, 63, 47), 30.0)
-    for path in (tmp_path / "film.gif", tmp_path / "film" / "0001.png"):
+    gif = tmp_path / "film.gif"
+    folder = tmp_path / "film"
+    for path, fps in ((gif, 25.0), (folder, 30.0)):
+        check_film(path, 63, 47, fps)
+        write_film(path, greys(2, 63, 47), fps)
+    for path in (gif, folder / "0001.png"):
         assert pixels(path).shape == (47, 63, 3)
 
 
 @pytest.mark.parametrize(("count", "size", "expected"), TABLES["panes"])
 def test_panes_are_about_as_high_as_wide(count: int, size: list[int], expected: list[int]) -> None:
-    assert list(grid(count, *size)) == expected
+    found = grid(count, *size)
+    assert list(found) == expected
 
 
 def frames_of(folder: Path) -> list[np.ndarray]:
@@ -189,41 +216,49 @@ def frames_of(folder: Path) -> list[np.ndarray]:
 
 def filmed(folder: Path, *tracks: FilmTrack, **settings: Any) -> list[np.ndarray]:
     """The frames of a film."""
-    out = folder / f"film{len(list(folder.iterdir()))}"
-    config = Film(**{**asdict(FAST), **settings})
-    assert film(out, tracks, config) == len(list(out.iterdir()))
-    return frames_of(out)
+    number = len(list(folder.iterdir()))
+    out = folder / f"film{number}"
+    config = replace(FAST, **settings)
+    written = film(out, tracks, config)
+    frames = frames_of(out)
+    assert written == len(frames)
+    return frames
 
 
 def test_a_frame_shows_the_step_of_its_time(opengl: None, tmp_path: Path) -> None:
-    flight = track(trajectory(*(4.0 + step / 10 for step in range(11))))  # 0.2 s
-    times = (0, 0.019, 0.02, 0.06, 0.2, 9)
-    assert [flight.trajectories[0].step_at(t) for t in times] == [0, 0, 1, 3, 10, 10]
+    climb = trajectory(*(4.0 + step / 10 for step in range(11)))  # 0.2 s
+    for time, step in ((0, 0), (0.019, 0), (0.02, 1), (0.06, 3), (0.2, 10), (9, 10)):
+        assert climb.step_at(time) == step
+    flight = track(climb)
     every = filmed(tmp_path, flight, fps=50.0)
     assert len(every) == 11
-    shown: dict[tuple[float, float], list[int]] = {}
-    for fps, speed in ((25.0, 1.0), (25.0, 2.0), (50.0, 0.5)):
+    slow = [step // 2 for step in range(21)]
+    for fps, speed, expected in (
+        (25.0, 1.0, [0, 2, 4, 6, 8, 10]),
+        (25.0, 2.0, [0, 4, 8]),
+        (50.0, 0.5, slow),
+    ):
         frames = filmed(tmp_path, flight, fps=fps, speed=speed)
-        shown[fps, speed] = [nearest(frame, every) for frame in frames]
-    assert shown[25.0, 1.0] == [0, 2, 4, 6, 8, 10]
-    assert shown[25.0, 2.0] == [0, 4, 8]
-    assert shown[50.0, 0.5] == [step // 2 for step in range(21)]
+        shown = [nearest(frame, every) for frame in frames]
+        assert shown == expected
 
 
 def test_panes_are_the_single_pictures_side_by_side(opengl: None, tmp_path: Path) -> None:
     one = trajectory(5.0, 5.1, 5.2)
     other = trajectory(4.0, 3.9, 3.8)
-    both = filmed(tmp_path, track(one), track(other), width=2 * WIDTH + 2)
-    panes = ((one, slice(0, WIDTH)), (other, slice(WIDTH + 2, None)))
+    width = 2 * WIDTH + 2
+    both = filmed(tmp_path, track(one), track(other), width=width)
     high = HEIGHT // 4
     for number, frame in enumerate(both):
-        assert frame.shape == (HEIGHT, 2 * WIDTH + 2, 3)
-        for flight, columns in panes:
+        assert frame.shape == (HEIGHT, width, 3)
+        left = frame[:, :WIDTH]
+        right = frame[:, WIDTH + 2 :]
+        for flight, pane in ((one, left), (other, right)):
             single = filmed(tmp_path, track(flight))[number]
-            pane = frame[:, columns]
             assert same(pane[high:], single[high:])
             assert not same(pane[:high], single[:high])  # of several the names are told
-        assert (frame[:, WIDTH : WIDTH + 2] == (13, 18, 26)).all()
+        between = frame[:, WIDTH : WIDTH + 2]
+        assert (between == (13, 18, 26)).all()
 
 
 def test_a_flight_that_ended_stays_on_its_last_picture(opengl: None, tmp_path: Path) -> None:
@@ -268,25 +303,21 @@ def test_lines_have_name_time_metric_and_end(
     assert written[1] == [("PID", "0.02 s"), ("E", "1.000 m")]
     assert written[2] == [("PID", "0.04 s"), ("E", "2.000 m"), ("terminated", "")]
     written.clear()
-    spec = replace(first.spec, agents=("a", "b"))
-    world = [replace(one, spec=spec) for one in (first, second)]
-    both = FilmTrack(name="ORCA", trajectories=world, drones=2)
+    both = swarm(first, second)
     filmed(tmp_path, both, overlay=True, fps=50.0)
-    names, values = zip(*[lines[1] for lines in written], strict=True)
+    second_lines = [lines[1] for lines in written]
+    names, values = zip(*second_lines, strict=True)
     assert set(names) == {"least distance"}
     assert values == ("3.00 m", "4.00 m", "5.00 m", "2.00 m")
     assert written[2][2] == ("1 of 2 ended", "")
 
 
 def test_a_film_of_several_drones(opengl: None, tmp_path: Path) -> None:
-    spec = replace(trajectory(5.0, 5.0).spec, agents=("a", "b"))
-    pictures = []
-    for heights in ((8.0, 7.5, 7.0), (8.0, 7.5, 8.0)):
-        flights = trajectory(5.0, 5.0, 5.0), trajectory(*heights)
-        world = [replace(one, spec=spec) for one in flights]
-        both = FilmTrack(name="ORCA", trajectories=world, drones=2)
-        pictures.append(filmed(tmp_path, both, overlay=True))
-    near, far = pictures
+    still = trajectory(5.0, 5.0, 5.0)
+    lower = swarm(still, trajectory(8.0, 7.5, 7.0))
+    higher = swarm(still, trajectory(8.0, 7.5, 8.0))
+    near = filmed(tmp_path, lower, overlay=True)
+    far = filmed(tmp_path, higher, overlay=True)
     assert len(near) == len(far) == 2
     assert same(near[0], far[0])
     assert not same(near[1], far[1])  # the second is where it is
@@ -298,10 +329,12 @@ def test_episodes_follow_one_another_and_pictures_are_of_a_time(
     flight = track(trajectory(5.0, 5.1, 5.2), trajectory(4.0, 3.9, 3.8, 3.7, 3.6))
     frames = filmed(tmp_path, flight)
     assert len(frames) == 2 + 3
-    for settings, expected in (({}, 4), ({"at": 0.04}, 1)):
-        out = tmp_path / f"picture{len(settings)}.png"
-        assert film(out, [flight], Film(**{**asdict(FAST), **settings})) == 1
+    out = tmp_path / "picture.png"
+    for config, expected in ((FAST, 4), (replace(FAST, at=0.04), 1)):
+        written = film(out, [flight], config)
+        assert written == 1
         assert nearest(pixels(out), frames) == expected
+        out.unlink()
 
 
 def test_wrong_films_are_one_sentence(tmp_path: Path) -> None:
@@ -312,11 +345,9 @@ def test_wrong_films_are_one_sentence(tmp_path: Path) -> None:
     ):
         with pytest.raises(InputError, match=sentence):
             Film(**settings)  # type: ignore[arg-type]
-    for tracks in (
-        [],
-        [track()],
-        [track(trajectory(5.0)), track(trajectory(5.0), trajectory(5.0))],
-    ):
+    flight = trajectory(5.0)
+    uneven = [track(flight), track(flight, flight)]
+    for tracks in ([], [track()], uneven):
         with pytest.raises(InputError, match="tracks: expected one or more"):
             film(tmp_path / "film.gif", tracks, FAST)
 
@@ -324,9 +355,9 @@ def test_wrong_films_are_one_sentence(tmp_path: Path) -> None:
 def test_a_film_without_end_is_refused(tmp_path: Path) -> None:
     """A peer may name a control period of a quarter of an hour; the film would hold hours."""
     flown = trajectory(*[5.0] * 50)
-    slow = replace(flown, spec=replace(flown.spec, control_period=1e3))
-    with pytest.raises(
-        InputError, match=r"film: expected at most 1,000,000 frames, got 1,22\d,\d+"
-    ):
+    spec = replace(flown.spec, control_period=1e3)
+    slow = replace(flown, spec=spec)
+    sentence = r"film: expected at most 1,000,000 frames, got 1,22\d,\d+"
+    with pytest.raises(InputError, match=sentence):
         film(tmp_path / "film.gif", [track(slow)], FAST)
     assert not list(tmp_path.iterdir())

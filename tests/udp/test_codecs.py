@@ -2,22 +2,20 @@
 
 import math
 import struct
-import zlib
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-from golden import LAYOUTS, changed, messages
+from golden import LAYOUTS, changed, fixed, messages
 from hypothesis import given
 from hypothesis import strategies as st
-from links import ONE, command, hello, layout, state
+from links import ONE, close, command, hello, layout, state
 from rotorgram.models.errors import InputError
 from rotorgram.udp.protocol import binary, text
 from rotorgram.udp.protocol.errors import DecodeError, VersionMismatch
 from rotorgram.udp.protocol.layout import MAX_DRONES, ArrayLayout, Layout
 from rotorgram.udp.protocol.messages import (
-    Close,
     Command,
     Hello,
     Message,
@@ -32,21 +30,34 @@ DTYPES = ("float32", "float64", "uint8", "int32", "int64")
 
 @st.composite
 def layouts(draw: st.DrawFn) -> Layout:
-    shapes = st.lists(st.integers(1, 3), max_size=2).map(tuple)
-    arrays = st.builds(ArrayLayout, shape=shapes, dtype=st.sampled_from(DTYPES))
+    lengths = st.integers(1, 3)
+    shapes = st.lists(lengths, max_size=2).map(tuple)
+    dtypes = st.sampled_from(DTYPES)
+    arrays = st.builds(ArrayLayout, shape=shapes, dtype=dtypes)
     discrete = draw(st.booleans())
+    drones = draw(st.integers(1, 5))
+    observation = draw(st.lists(arrays, min_size=1, max_size=3))
+    action = None
+    choices = 0
+    if discrete:
+        choices = draw(st.integers(1, 9))
+    else:
+        action = draw(arrays)
+    telemetry = draw(st.lists(shapes, max_size=3))
     return Layout(
-        drones=draw(st.integers(1, 5)),
-        observation=tuple(draw(st.lists(arrays, min_size=1, max_size=3))),
-        action=None if discrete else draw(arrays),
-        choices=draw(st.integers(1, 9)) if discrete else 0,
-        telemetry=tuple(draw(st.lists(shapes, max_size=3))),
+        drones=drones,
+        observation=tuple(observation),
+        action=action,
+        choices=choices,
+        telemetry=tuple(telemetry),
     )
 
 
 def random_array(dice: np.random.Generator, dtype: np.dtype, shape: tuple[int, ...]) -> np.ndarray:
     if dtype.kind == "f":
-        return (dice.normal(size=shape) * 10.0 ** dice.integers(-30, 30)).astype(dtype)
+        numbers = dice.normal(size=shape)
+        scale = 10.0 ** dice.integers(-30, 30)
+        return (numbers * scale).astype(dtype)
     return dice.integers(0, 200, shape).astype(dtype)
 
 
@@ -54,23 +65,24 @@ def random_array(dice: np.random.Generator, dtype: np.dtype, shape: tuple[int, .
 def test_any_state_and_command_comes_back(of: Layout, seed: int) -> None:
     dice = np.random.default_rng(seed)
     n = of.drones
+    observations = [random_array(dice, s.dtype, s.shape) for s in of.observation_slots]
+    telemetry = [random_array(dice, s.dtype, s.shape) for s in of.telemetry_slots]
     sent = State(
         session=3,
         sequence=9,
         time=0.25,
-        observations=tuple(random_array(dice, s.dtype, s.shape) for s in of.observation_slots),
+        observations=tuple(observations),
         rewards=dice.normal(size=n),
         terminated=dice.random(n) < 0.5,
         truncated=dice.random(n) < 0.5,
-        telemetry=tuple(random_array(dice, s.dtype, s.shape) for s in of.telemetry_slots),
+        telemetry=tuple(telemetry),
     )
     assert_comes_back(sent, of, of.state.size)
     actions = random_array(dice, of.actions.dtype, of.actions.shape)
     if of.choices:
         actions %= of.choices
-    order = Command(
-        session=3, sequence=9, actions=actions, orders=dice.integers(0, 3, n).astype(np.uint8)
-    )
+    orders = dice.integers(0, 3, n).astype(np.uint8)
+    order = Command(session=3, sequence=9, actions=actions, orders=orders)
     assert_comes_back(order, of, of.command.size)
     order.seeds = dice.integers(0, 2**64, n, np.uint64)
     assert_comes_back(order, of, of.seeded_command.size)
@@ -122,14 +134,17 @@ def test_only_the_datagram_that_is_due_takes_the_short_way(due: Message) -> None
         for value in range(256):
             near = bytearray(data)
             near[at] = value
-            assert (read(bytes(near)) is None) == (value != data[at])
-            crc = zlib.crc32(near[8:], zlib.crc32(near[:4]))
-            near[4:8] = crc.to_bytes(4, "little")
-            assert (read(bytes(near)) is None) == (near != data)
+            taken = read(bytes(near))
+            assert (taken is None) == (value != data[at])
+            right = fixed(bytes(near))
+            taken = read(right)
+            assert (taken is None) == (right != data)
     for end in range(len(data)):
         assert read(data[:end]) is None
-    for body in (b"", data[24:-1], data[24:] + b"\0"):  # with a right checksum
-        assert read(binary.frame(data[3], session, sequence, body)) is None
+    body = data[24:]
+    for wrong in (b"", body[:-1], body + b"\0"):  # with a right checksum
+        datagram = binary.frame(data[3], session, sequence, wrong)
+        assert read(datagram) is None
 
 
 @given(st.binary(max_size=100), st.integers(0, 255), st.integers(0, 20))
@@ -142,7 +157,8 @@ def test_any_bytes_with_a_right_checksum_are_read_or_refused(
     except DecodeError:
         return
     if not isinstance(message, State | Command | Hello | Welcome):  # reserved bytes may differ
-        assert binary.decode(binary.encode(message, ONE), ONE) == message
+        again = binary.encode(message, ONE)
+        assert binary.decode(again, ONE) == message
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
@@ -152,7 +168,9 @@ def test_what_is_not_finite_does_not_travel(value: float, drones: int) -> None:
     for change in ("observations", "rewards", "telemetry"):
         wrong = state(1, of=of)
         array = getattr(wrong, change)
-        (array if change == "rewards" else array[0]).flat[-1] = value
+        if change != "rewards":
+            array = array[0]
+        array.flat[-1] = value
         with pytest.raises(InputError, match="finite"):
             binary.encode(wrong, of)
     action = command(1, of=of)
@@ -161,64 +179,69 @@ def test_what_is_not_finite_does_not_travel(value: float, drones: int) -> None:
         binary.encode(action, of)
     data = binary.encode(state(1, of=of), of)
     at = of.state.slots[1].at
-    forged = data[24:at] + struct.pack("<d", value) + data[at + 8 :]
+    number = struct.pack("<d", value)
+    body = data[24:at] + number + data[at + 8 :]
+    forged = binary.frame(4, 1, 1, body)
     with pytest.raises(DecodeError, match="finite"):
-        binary.decode(binary.frame(4, 1, 1, forged), of)
+        binary.decode(forged, of)
 
 
 def test_finite_numbers_whose_sum_is_not_travel() -> None:
     of = layout(1, 1, ((2,),))
     huge = state(1, of=of)
     huge.telemetry[0][:] = 1.7e308
-    back = binary.decode(binary.encode(huge, of), of)
+    data = binary.encode(huge, of)
+    back = binary.decode(data, of)
     assert isinstance(back, State)
     assert (back.telemetry[0] == 1.7e308).all()
 
 
 def test_arrays_are_never_converted() -> None:
     of = layout(2, 2)
-    for wrong in (np.zeros((2, 2)), np.zeros((2, 3), np.float32), np.zeros((2, 2), complex)):
+    order = command(1, of=of)
+    for shape, dtype in (((2, 2), float), ((2, 3), np.float32), ((2, 2), complex)):
+        order.actions = np.zeros(shape, dtype)
         with pytest.raises(InputError, match=r"expected float32 of shape \(2, 2\)"):
-            binary.encode(
-                Command(session=1, sequence=1, actions=wrong, orders=np.zeros(2, np.uint8)), of
-            )
+            binary.encode(order, of)
 
 
 def test_a_discrete_action_is_checked_for_every_drone() -> None:  # fault 13
     of = Layout(drones=2, observation=(ArrayLayout(shape=()),), action=None, choices=3)
+    wrong = command(1, of=of)
     for order in (0, 1, 2):
+        wrong.orders[1] = order
         for action in (-1, 3):
-            wrong = Command(
-                session=1,
-                sequence=1,
-                actions=np.array([0, action]),
-                orders=np.array([0, order], np.uint8),
-            )
+            wrong.actions[1] = action
             with pytest.raises(InputError, match="a choice 0 to 2, got"):
                 binary.encode(wrong, of)
 
 
 def test_versions() -> None:
-    refuse = Refuse(session=1, reason="x")
+    data = binary.encode(hello())
+    newer = changed(data, 2, b"\3")
     with pytest.raises(VersionMismatch, match="expected 2, got 3"):
-        binary.decode(changed(binary.encode(hello()), 2, b"\3"))
-    assert binary.decode(changed(binary.encode(refuse), 2, b"\3")) == refuse
+        binary.decode(newer)
+    refuse = Refuse(session=1, reason="x")
+    data = binary.encode(refuse)
+    newer = changed(data, 2, b"\3")
+    assert binary.decode(newer) == refuse
 
 
 def test_sizes_that_do_not_fit() -> None:
-    for make in (
-        lambda: layout(MAX_DRONES + 1),
-        lambda: layout(MAX_DRONES, 300),
-        lambda: hello(worlds=0),
-        lambda: hello(versions=(3, 2)),
-        lambda: hello(spec=""),
-        lambda: Close(session=1, sequence=1, reason="x" * 513),
-        lambda: Close(session=1, sequence=1, reason="a\nb"),
-        lambda: Welcome(session=1, nonce=2**64),
-        lambda: binary.encode(Wait(session=-1)),
-    ):
-        with pytest.raises(InputError, match=r"expected|argument"):
-            make()
+    for drones, size in ((MAX_DRONES + 1, 1), (MAX_DRONES, 300)):
+        with pytest.raises(InputError, match="expected"):
+            layout(drones, size)
+    for change in ({"worlds": 0}, {"versions": (3, 2)}, {"spec": ""}):
+        with pytest.raises(InputError, match="expected"):
+            hello(**change)
+    for reason in ("x" * 513, "a\nb"):
+        with pytest.raises(InputError, match="expected"):
+            close(1, reason=reason)
+    with pytest.raises(InputError, match="expected"):
+        Welcome(session=1, nonce=2**64)
+    wait = Wait(session=-1)
+    with pytest.raises(InputError, match=r"expected|argument"):
+        binary.encode(wait)
 
 
 # ---- text
@@ -229,37 +252,29 @@ FLOATS = st.floats(allow_nan=False, allow_infinity=False)
 @given(FLOATS, FLOATS, st.floats(width=32, allow_nan=False, allow_infinity=False), st.booleans())
 def test_text_comes_back_bit_for_bit(reward: float, told: float, seen: float, flag: bool) -> None:
     of = layout(1, 1, ((2,), ()))
-    sent = State(
-        session=0,
-        sequence=2**64 - 1,
-        time=0.0,
-        observations=(np.array([[seen]], np.float32),),
-        rewards=np.array([reward]),
-        terminated=np.array([flag]),
-        truncated=np.array([not flag]),
-        telemetry=(np.array([[told, -0.0]]), np.array([1.5])),
-    )
-    got = text.decode_state(text.encode(sent, of), of)
+    sent = state(2**64 - 1, session=0, of=of)
+    sent.observations[0][:] = seen
+    sent.rewards[:] = reward
+    sent.terminated[:] = flag
+    sent.truncated[:] = not flag
+    sent.telemetry[0][:] = told, -0.0
+    sent.telemetry[1][:] = 1.5
+    line = text.encode(sent, of)
+    got = text.decode_state(line, of)
     assert isinstance(got, State)
     assert binary.encode(got, of) == binary.encode(sent, of)
     order = command(5, value=seen)
-    back = text.decode_command(text.encode(order), ONE, 77)
+    line = text.encode(order)
+    back = text.decode_command(line, ONE, 77)
     assert isinstance(back, Command)
     assert binary.encode(back, ONE) == binary.encode(order, ONE)
 
 
-@pytest.mark.parametrize(
-    "of",
-    [
-        layout(2),
-        Layout(drones=1, observation=(ArrayLayout(shape=(2, 2)),), action=ArrayLayout(shape=(1,))),
-        Layout(
-            drones=1,
-            observation=(ArrayLayout(shape=(2,), dtype="uint8"),),
-            action=ArrayLayout(shape=(1,)),
-        ),
-    ],
-)
+MATRIX = replace(ONE, observation=(ArrayLayout(shape=(2, 2)),))
+BYTES = replace(ONE, observation=(ArrayLayout(shape=(2,), dtype="uint8"),))
+
+
+@pytest.mark.parametrize("of", [layout(2), MATRIX, BYTES])
 def test_layouts_that_text_cannot_tell(of: Any) -> None:
     with pytest.raises(InputError, match="text codec"):
         text.check_layout(of)
@@ -267,19 +282,18 @@ def test_layouts_that_text_cannot_tell(of: Any) -> None:
 
 def test_text_is_in_the_paper_s_frame() -> None:
     """A craft at x 3 m, y -1 m, z 2 m; its nose points right, it climbs and turns to the left."""
-    of = Layout(
-        drones=1,
-        observation=(ArrayLayout(shape=(1,)),),
-        action=ArrayLayout(shape=(1,)),
-        telemetry=((3,), (4,), (3,), (3,), (2,)),
-        frames=("world", "body to world", "world", "body", "world"),
-    )
+    frames = ("world", "body to world", "world", "body", "world")
+    of = replace(ONE, telemetry=((3,), (4,), (3,), (3,), (2,)), frames=frames)
     half = math.sqrt(0.5)
-    telemetry = [(3.0, -1.0, 2.0), (half, 0.0, 0.0, -half), (0.0, 0.0, 0.5), (0.0, 0.0, 0.25)]
-    arrays = (*(np.array([row]) for row in telemetry), np.array([[7.0, 8.0]]))
-    observations = (np.zeros((1, 1), np.float32),)
-    sent = replace(state(1, of=of), observations=observations, telemetry=arrays)
-    fields = text.encode(sent, of).decode().split(",")
+    sent = state(1, of=of)
+    position, attitude, velocity, rates, other = sent.telemetry
+    position[0] = (3.0, -1.0, 2.0)
+    attitude[0] = (half, 0.0, 0.0, -half)
+    velocity[0] = (0.0, 0.0, 0.5)
+    rates[0] = (0.0, 0.0, 0.25)
+    other[0] = (7.0, 8.0)
+    line = text.encode(sent, of)
+    fields = line.decode().split(",")
     numbers = [float(field) for field in fields[5:]]
     assert numbers[:3] == [1.0, 2.0, 3.0]  # right, up, forward
     assert numbers[3:6] == pytest.approx([0.0, 90.0, 0.0])
@@ -287,7 +301,7 @@ def test_text_is_in_the_paper_s_frame() -> None:
     assert numbers[9:12] == [0.0, -0.25, 0.0]  # left-handed: to the right is positive
     assert numbers[12:] == [7.0, 8.0]
     assert sum(text.telemetry_sizes(of)) == 14
-    got = text.decode_state(text.encode(sent, of), of)
+    got = text.decode_state(line, of)
     assert isinstance(got, State)
     for there, back in zip(sent.telemetry, got.telemetry, strict=True):
         assert back == pytest.approx(there)
@@ -295,23 +309,19 @@ def test_text_is_in_the_paper_s_frame() -> None:
 
 def of_numbers(count: int) -> Layout:
     """One drone whose line has so many numbers: the reward, three of observation, the telemetry."""
-    action = ArrayLayout(shape=(1,))
-    observation = (ArrayLayout(shape=(3,)),)
-    return Layout(drones=1, observation=observation, action=action, telemetry=((count - 4,),))
+    observation = ArrayLayout(shape=(3,))
+    return replace(ONE, observation=(observation,), telemetry=((count - 4,),))
 
 
 def test_the_longest_line_is_known_at_the_start() -> None:  # fault 57
     of = of_numbers(47)
     text.check_layout(of)
     longest = -2.2250738585072014e-308
-    state_ = replace(
-        state(1, of=of),
-        sequence=2**64 - 1,
-        rewards=np.array([longest]),
-        observations=(np.full((1, 3), -1.1754944e-38, np.float32),),
-        telemetry=(np.full((1, 43), longest),),
-    )
-    assert 1175 < len(text.encode(state_, of)) <= 1200
+    sent = state(2**64 - 1, value=-1.1754944e-38, of=of)
+    sent.rewards[:] = longest
+    sent.telemetry[0][:] = longest
+    line = text.encode(sent, of)
+    assert 1175 < len(line) <= 1200
     with pytest.raises(InputError, match="lines of at most 1200 bytes, got up to 1224 with 48 num"):
         text.check_layout(of_numbers(48))
 
@@ -319,8 +329,11 @@ def test_the_longest_line_is_known_at_the_start() -> None:  # fault 57
 def test_a_hello_of_nothing_but_extensions_is_not_read() -> None:
     """Four bytes each: a million of them fit into a Hello, and take seconds."""
     start = struct.pack("<BB2xII4x", 2, 2, 1, 2) + b"{}"
-    some = binary.decode(binary.frame(binary.HELLO, 1, 0, start + bytes(4 * 64)))
+    body = start + bytes(4 * 64)
+    data = binary.frame(binary.HELLO, 1, 0, body)
+    some = binary.decode(data)
     assert isinstance(some, Hello)
     assert len(some.extensions) == 64
+    data = binary.frame(binary.HELLO, 1, 0, body + bytes(4))
     with pytest.raises(DecodeError, match="extensions: expected at most 64"):
-        binary.decode(binary.frame(binary.HELLO, 1, 0, start + bytes(4 * 65)))
+        binary.decode(data)
