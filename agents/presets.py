@@ -1,6 +1,5 @@
 """Presets: hyperparameters of an algorithm for a task, from `presets.toml`."""
 
-import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from functools import cache
@@ -11,6 +10,7 @@ from ..envs.registry import is_known, task_type
 from ..models import Backend
 from ..models.errors import InputError
 from ..models.fields import check_names
+from ..models.files import read_toml
 from .config import Config
 from .registry import find_algorithm
 
@@ -41,7 +41,7 @@ class Preset:
 @cache
 def _tables(algorithm: str) -> dict[str, dict[str, dict[str, Any]]]:
     """An algorithm's tables of the file by preset and task."""
-    content = tomllib.loads(_FILE.read_text(encoding="utf-8"))
+    content = read_toml(_FILE, "presets")
     found: dict[str, dict[str, dict[str, Any]]] = {}
     for table in content["preset"]:
         algorithms = table.pop("algorithms")

@@ -211,10 +211,10 @@ def _with_env(
 
 def _file_values(kind: type[EnvFlags], path: str, env: str | None) -> Options:
     """Values of a config's file by the names of fields. Raises `InputError`."""
-    from ..envs.config import KEYWORDS, BackendConfig, read_toml
+    from ..envs.config import KEYWORDS, BackendConfig, read_keywords
     from ..envs.spec import canonical_id
 
-    options = read_toml(path)
+    options = read_keywords(path)
     values: Options = {}
     for name, key in (("env", "env"), ("env_id", "env"), ("drones", "drones")):
         if name in options:

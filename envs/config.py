@@ -6,16 +6,16 @@ Defaults come from the task, then from a file, then from flags or keyword argume
 import inspect
 import json
 import sys
-import tomllib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from hashlib import blake2b
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from ..models import BACKENDS, MAX_DRONES, Backend
 from ..models.errors import InputError, shortened
 from ..models.fields import Choice, Limits, check, check_fields, check_names, read_table
+from ..models.files import read_toml
 from ..models.library import is_of_the_library, vehicle_words
 from ..scenes import scenes_of
 from ..sim import EffectOptions, Randomization, checked_sensors
@@ -33,7 +33,6 @@ DEFAULT_ENV = "rotorgram/Elevation-v0"
 MAX_CONTROL_PERIOD = 1.0  # s
 MAX_EPISODE_LENGTH = 1 << 31  # control steps
 MAX_HISTORY = 1000  # observations side by side
-_MAX_FILE = 1 << 24  # bytes
 _NO_EFFECTS = EffectOptions()
 
 
@@ -78,15 +77,16 @@ class BackendConfig:
     """What steps the drones."""
 
     name: Backend = "mujoco"
-    num_threads: int | None = None
+    num_threads: Annotated[int | None, Limits(0, whole=True)] = None
     """Threads of `mujoco`; 0: one for each processor; None: as the backend chooses."""
-    dtype: str | None = None
+    dtype: Literal["float32", "float64"] | None = None
     """Of `rigid`: `float32`, the default, or `float64`."""
     compiled: bool | None = None
     """Of `rigid`: None compiles where a compiler is found. It changes no number."""
 
     def __post_init__(self) -> None:
         check("backend", Choice(BACKENDS), self.name)
+        check_fields(self)
 
     @classmethod
     def parse(cls, backend: Any) -> Self:
@@ -243,7 +243,7 @@ class EnvConfig:
 
         A relative path of a vehicle is looked for beside the file first. Raises `InputError`.
         """
-        return cls.from_keywords(**read_toml(path) | keywords)
+        return cls.from_keywords(**read_keywords(path) | keywords)
 
     def to_dict(self) -> Values:
         """All fields as JSON values, with the version."""
@@ -374,17 +374,13 @@ KEYWORDS = (*_OPTIONS, "scene", "vehicle", "drones", "backend", *BACKEND_KEYWORD
 """Keywords that are not options of a task."""
 
 
-def read_toml(path: Path | str) -> Values:
+def read_keywords(path: Path | str) -> Values:
     """Keywords of a config's file. Raises `InputError`."""
     file = Path(path)
     try:
-        if file.stat().st_size > _MAX_FILE:
-            raise InputError(f"config: expected at most {_MAX_FILE} bytes, got more in {file}")
-        content = tomllib.loads(file.read_text("utf-8"))
+        content = read_toml(file, "config")
     except OSError as error:
         raise InputError(f"config: cannot read {file}: {error.strerror}") from None
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"config: expected a TOML file, got {file}: {error}") from None
     if "vehicle" in content:
         words = vehicle_words(content["vehicle"])
         beside = [file.parent / word for word in words]

@@ -5,7 +5,6 @@ random places come from its seed, flights from the seeds of the evaluation episo
 """
 
 import math
-import tomllib
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -28,6 +27,7 @@ from ..envs.spec import Mark
 from ..models.cameras import View, chosen_views
 from ..models.errors import InputError, shortened
 from ..models.fields import Choice, Limits, Text, check, check_fields, check_names, read_table
+from ..models.files import read_toml
 from ..models.vehicle import Vehicle
 from ..scenes import scenes_of
 from ..sim.rotations import multiplied
@@ -261,17 +261,13 @@ class Plan:
     @classmethod
     def read(cls, path: Path) -> "Plan":
         """Read a TOML file. Raises `InputError`, or `OSError` where it cannot be read."""
-        try:
-            text = path.read_text(encoding="utf-8")
-            table = tomllib.loads(text)
-        except (ValueError, RecursionError) as error:
-            raise InputError(f"plan: expected a TOML file, got {path.name}: {error}") from None
+        table = read_toml(path, "plan")
         check_names(table, [name for name in cls.__dataclass_fields__ if name != "text"], "plan")
         poses = table.pop("poses", None)
         if not isinstance(poses, list) or not poses:
             raise InputError(f"plan: expected a table [[poses]] or more, got {shortened(poses)}")
         sources = [_source(one, number) for number, one in enumerate(poses, 1)]
-        return cls(text=text, poses=tuple(sources), **table)
+        return cls(text=path.read_text("utf-8"), poses=tuple(sources), **table)
 
     def views(self) -> tuple[View, ...]:
         """The pictures of each pose. Raises `InputError`."""

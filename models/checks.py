@@ -9,7 +9,6 @@ World frame: z up. Body frame: x forward, y left, z up. SI units and radians thr
 
 import copy
 import math
-import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -22,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .fields import check_names
+from .files import read_toml
 from .mjcf import vehicle_spec
 from .vehicle import Vehicle
 
@@ -91,7 +91,7 @@ class Check(Rule):
         return values
 
 
-_RULES = tomllib.loads((Path(__file__).parent / "rules.toml").read_text("utf-8"))
+_RULES = read_toml(Path(__file__).with_name("rules.toml"), "rules")
 RULES: Final[Mapping[str, Rule]] = {name: Rule(**row) for name, row in _RULES.items()}
 """Every check by its name; {} stands for a rotor, an axis or a group."""
 

@@ -1,9 +1,30 @@
-"""New files, whole or not at all, and files of packages. Imports the standard library alone."""
+"""TOML files, new files, and files of packages. Imports the standard library alone."""
 
+import tomllib
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from .errors import InputError
+
+_MAX_BYTES = 1_000_000  # it is read within a few seconds
+
+
+def read_toml(path: Path, what: str) -> dict[str, Any]:
+    """Tables of a TOML file.
+
+    Raises `InputError`, whose sentence begins with `what`, or `OSError` where it cannot be read.
+    """
+    size = path.stat().st_size
+    if size > _MAX_BYTES:
+        raise InputError(f"{what}: expected a TOML file of at most {_MAX_BYTES} bytes, got {size}")
+    try:
+        return tomllib.loads(path.read_text("utf-8"))
+    except RecursionError:
+        reason = "tables or lists, too many in each other"
+    except ValueError as error:
+        reason = str(error)
+    raise InputError(f"{what}: expected a TOML file, got {path.name}: {reason}")
 
 
 def write_new(path: Path, content: str | bytes) -> None:

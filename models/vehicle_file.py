@@ -5,7 +5,6 @@ Each table is a dataclass whose fields are the keys. Body frame: x forward, y le
 
 import json
 import math
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,6 +17,7 @@ from .cameras import FOVY, MAX_LETTERS, OUTPUTS, Camera, steps_of
 from .coefficients import COEFFICIENTS, Battery, Drag, Rotors, Sensors, as_tuple
 from .errors import InputError, shortened
 from .fields import Limits, Text, check, limits_of, optional, read_table
+from .files import read_toml
 
 T = TypeVar("T")
 _Vector = tuple[float, float, float]
@@ -29,7 +29,6 @@ _Length = Annotated[float, Limits(1e-5, 100.0, "m")]
 ORIGIN = (0.0, 0.0, 0.0)
 AHEAD = (1.0, 0.0, 0.0)
 UP = (0.0, 0.0, 1.0)
-_MAX_BYTES = 1_000_000  # it is read within a few seconds
 _LEAST_MOMENT = 1e-15  # kg m²: MuJoCo's mjMINVAL
 
 
@@ -260,31 +259,9 @@ def read_vehicle_file(path: Path) -> VehicleFile:
     """Read a TOML file. Raises `InputError` with the name and the range of the first wrong field,
     `OSError` if the file cannot be read.
     """
-    size = path.stat().st_size
-    if size > _MAX_BYTES:
-        raise InputError(f"vehicle: expected a TOML file of at most {_MAX_BYTES} bytes, got {size}")
-    try:
-        return _read(path, tomllib.loads(path.read_text(encoding="utf-8")))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"vehicle: expected a TOML file, got {path.name}: {error}") from None
-    except RecursionError:
-        raise InputError(
-            "vehicle: expected a TOML file with tables as in docs/vehicles.md, "
-            "got too many in each other"
-        ) from None
-
-
-def model_of(path: Path) -> Path:
-    """The model's file that a vehicle's TOML file names; else the file itself."""
-    if path.suffix.lower() != ".toml":
-        return path
-    return read_vehicle_file(path).model or path
-
-
-def _read(path: Path, tree: dict[str, object]) -> VehicleFile:
     numbers: list[Number] = []
     name = path.parent.name if path.stem == "vehicle" else path.stem
-    tree = {"name": name, **tree}
+    tree = {"name": name, **read_toml(path, "vehicle")}
     file = _table(numbers, Tables, tree, "vehicle")
     model = None if file.model is None else _model(path, file.model)
     body = _body(numbers, file.body, model)
@@ -305,6 +282,13 @@ def _read(path: Path, tree: dict[str, object]) -> VehicleFile:
         rotors=rotors,
         cameras=tuple(cameras),
     )
+
+
+def model_of(path: Path) -> Path:
+    """The model's file that a vehicle's TOML file names; else the file itself."""
+    if path.suffix.lower() != ".toml":
+        return path
+    return read_vehicle_file(path).model or path
 
 
 _GROUPS: Final[Mapping[str, type]] = {

@@ -4,7 +4,6 @@ World frame: z up, m. A generator draws all numbers of a scene from one stream, 
 """
 
 import math
-import tomllib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -12,6 +11,8 @@ from typing import Any, Final, Literal
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike as Vector
+
+from ..models.files import read_toml
 
 CLEARANCE = 8.0
 """Half the width of the space about the z axis that nothing but a gate enters, m."""
@@ -21,8 +22,8 @@ GROUP = 2
 """Group of the geoms of a scene."""
 SKY = mujoco.mjtTexture.mjTEXTURE_SKYBOX
 
-MATERIALS: Final[Mapping[str, Mapping[str, Mapping[str, Any]]]] = tomllib.loads(
-    Path(__file__).with_name("materials.toml").read_text("utf-8")
+MATERIALS: Final[Mapping[str, Mapping[str, Mapping[str, Any]]]] = read_toml(
+    Path(__file__).with_name("materials.toml"), "materials"
 )
 _FOREST = 60.0  # m: half the width of the wood
 _LENGTH, _WIDTH, _HEIGHT = 30.0, 20.0, 24.0  # m: half length, half width and height of the hall

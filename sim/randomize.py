@@ -5,7 +5,6 @@ A parameter is a factor of the vehicle's own value, 1 being that value, or a num
 
 import math
 import re
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy as np
 
 from ..models.errors import InputError, shortened
 from ..models.fields import check_names
+from ..models.files import read_toml
 from .effects import EffectOptions
 from .random import Draw
 from .state import Array, clip
@@ -34,8 +34,7 @@ class Parameter:
     """At least one of these effects must be on."""
 
 
-_FILE = Path(__file__).parent / "parameters.toml"
-_TABLES = tomllib.loads(_FILE.read_text(encoding="utf-8"))
+_TABLES = read_toml(Path(__file__).with_name("parameters.toml"), "parameters")
 PARAMETERS = {name: Parameter(**table) for name, table in _TABLES.items()}
 """What can be drawn, by name."""
 CENTER = ("center_x", "center_y", "center_z")

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 
 from ..agents import ALGORITHMS, CONTROLLERS, Config, find_preset, preset
 from ..agents.presets import PresetName
-from ..envs.config import DEFAULT_ENV, EnvConfig, read_toml
+from ..envs.config import DEFAULT_ENV, EnvConfig, read_keywords
 from ..envs.registry import env_spec, load
 from ..flights.trajectories import EpisodeSet
 from ..models import Backend
@@ -266,7 +266,7 @@ class Study:
 
         A file without `[[row]]` is one row, named as the file. Raises `InputError`.
         """
-        content = read_toml(path)
+        content = read_keywords(path)
         if "row" not in content:
             content = {"row": [{"name": path.stem, **content}]}
         env = content.pop("env", {})

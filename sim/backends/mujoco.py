@@ -12,7 +12,6 @@ import numpy as np
 from mujoco.batch import Batch, SimulationError
 
 from ...models.errors import InputError
-from ...models.fields import Limits, check
 from ...models.fleet import members_of
 from ...models.swarm import CONTACTS, GROUNDED, contact_columns, swarm_model
 from ...models.vehicle import SURROUNDINGS, Vehicle, payload_radius
@@ -53,7 +52,6 @@ class MujocoWorld(World):
         randomize: Randomization | None = None,
         num_threads: int = 0,
     ) -> None:
-        check("num_threads", Limits(0, whole=True), num_threads)
         lead = (num_worlds, drones) if num_worlds * drones > 1 else ()
         super().__init__(vehicle, lead, effects, randomize)
         threads = 1 if num_worlds == 1 else num_threads

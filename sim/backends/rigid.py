@@ -10,7 +10,6 @@ import mujoco
 import numpy as np
 
 from ...models.errors import InputError
-from ...models.fields import Choice, Flag, OrNone, check
 from ...models.vehicle import Vehicle, craft_geoms
 from ..effects import EffectOptions
 from ..randomize import Randomization
@@ -21,7 +20,6 @@ from . import kernel
 from .body import RigidBody, mapped, motion
 from .hull import Hull, can_touch
 
-DTYPES = Choice(("float32", "float64"))
 _OWN = ("_rows", "_acting", "_wrench")
 _OF_STATE = ("command", "thrust", "touching", "colliding")
 _LEVEL = np.array((0.0, 0.0, 0.0, 1.0, *[0.0] * 9))  # rows of a craft at rest
@@ -50,8 +48,6 @@ class RigidWorld(World):
         dtype: str = "float32",
         compiled: bool | None = None,
     ) -> None:
-        check("compiled", OrNone(Flag()), compiled)
-        check("dtype", DTYPES, dtype)
         found = kernel.compiler()
         if compiled and not found:
             expected = "false where no C compiler is found (cc, gcc, clang or the variable CC)"
