@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
 from ..models.errors import InputError
-from ..models.fields import Limits, check_fields
+from ..models.fields import Limits, PositiveInt, check_fields
 
 NETWORK_FIELDS = ("network", "hidden", "activation", "normalize_observations")
 """Hyperparameters that say what networks there are."""
@@ -49,7 +49,7 @@ class Config:
 class RolloutConfig(Config):
     """Hyperparameters of an algorithm with rollouts of a fixed size."""
 
-    steps_per_update: Annotated[int, Limits(1, whole=True)] = 1
+    steps_per_update: PositiveInt = 1
     """Env steps between updates (paper: one), of all drones together."""
 
     def rollout_size(self, drones: int) -> int:
@@ -72,13 +72,13 @@ class SACConfig(RolloutConfig):
     """Units of each hidden layer of each network."""
     learning_rate: float = 0.0003
     """Of Adam: actor, critics and temperature."""
-    gradient_steps: Annotated[int, Limits(1, whole=True)] = 1
+    gradient_steps: PositiveInt = 1
     """Updates after each `steps_per_update` env steps."""
-    batch_size: Annotated[int, Limits(1, whole=True)] = 256
+    batch_size: PositiveInt = 256
     """Transitions of an update, drawn from the buffer."""
-    buffer_size: Annotated[int, Limits(1, whole=True)] = 1_000_000
+    buffer_size: PositiveInt = 1_000_000
     """Transitions that are kept."""
-    learning_starts: Annotated[int, Limits(1, whole=True)] = 1_000
+    learning_starts: PositiveInt = 1_000
     """Transitions of uniform actions before the first update. Table 1 has none."""
     tau: Annotated[float, Limits(0.0, 1.0, above=True)] = 0.005
     """Share of the critics that their targets take over in each update."""

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import numpy as np
 
-from ..models.fields import Limits
+from ..models.fields import Limits, PositiveInt
 from .a2c import A2C, A2CConfig
 from .networks import Floats
 from .optimizers import clip_norm
@@ -32,9 +32,9 @@ class PPOConfig(A2CConfig):
     """Lambda of generalised advantage estimation (table 3)."""
     normalize: bool = True
     """Shift and scale the advantages of a minibatch to mean 0 and standard deviation 1."""
-    epochs: Annotated[int, Limits(1, whole=True)] = 10
+    epochs: PositiveInt = 10
     """Passes over a rollout (table 3)."""
-    minibatches: Annotated[int, Limits(1, whole=True)] = 32
+    minibatches: PositiveInt = 32
     """Parts of a rollout, each for one step of Adam (table 3: of 64 transitions)."""
     clip: Annotated[float, Limits(0.0, above=True)] = 0.2
     """Change of an action's probability that the objective rewards (table 3)."""

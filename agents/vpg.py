@@ -1,12 +1,12 @@
 """Vanilla Policy Gradient: the paper's Algorithm 1, Equations 1 and 2."""
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 
 from ..models.errors import InputError
-from ..models.fields import Limits
+from ..models.fields import PositiveInt
 from .config import Config
 from .learner import Learner
 from .networks import Floats
@@ -17,7 +17,7 @@ from .rollouts import Collector, Rollout, rewards_to_go, step_of_episode
 class VPGConfig(Config):
     """Vanilla Policy Gradient (paper, section 2.3, Algorithm 1). Defaults: the paper's setting."""
 
-    episodes_per_update: Annotated[int, Limits(1, whole=True)] = 1
+    episodes_per_update: PositiveInt = 1
     """Episodes flown with one policy ("a set of drone data"; the paper gives no number)."""
     baseline: Literal["none", "time"] = "none"
     """Taken off the returns: nothing (paper), or their mean at the same step of the episode."""

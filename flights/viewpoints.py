@@ -26,7 +26,17 @@ from ..envs.registry import load as load_env
 from ..envs.spec import Mark
 from ..models.cameras import View, chosen_views
 from ..models.errors import InputError, shortened
-from ..models.fields import Choice, Limits, Text, check, check_fields, check_names, read_table
+from ..models.fields import (
+    Choice,
+    Limits,
+    NonNegativeInt,
+    PositiveInt,
+    Text,
+    check,
+    check_fields,
+    check_names,
+    read_table,
+)
 from ..models.files import read_toml
 from ..models.vehicle import Vehicle
 from ..scenes import scenes_of
@@ -40,7 +50,6 @@ MAX_FRAMES = 1_000_000
 _FARTHEST = 1e4  # m
 
 _Count = Annotated[int, Limits(1, MAX_FRAMES, whole=True)]
-_Index = Annotated[int, Limits(0, whole=True)]
 _Angle = Annotated[float, Limits(0, math.pi, "rad")]
 
 
@@ -173,7 +182,7 @@ class FlownPoses(_FlightPoses):
     agent: Annotated[str, Text()] = "geometric"
     options: Mapping[str, Any] = field(default_factory=dict)
     episodes: _Count = 1
-    first: _Index = 0
+    first: NonNegativeInt = 0
     drones: _Count = 1
 
     def trajectories(self, vehicle: str | None) -> list[Trajectory]:
@@ -211,8 +220,8 @@ class JournalPoses(_FlightPoses):
     """Episodes of one drone of a journal."""
 
     file: Annotated[str, Text()]
-    session: Annotated[int | None, Limits(1, whole=True)] = None
-    drone: _Index = 0
+    session: PositiveInt | None = None
+    drone: NonNegativeInt = 0
 
     def trajectories(self, vehicle: str | None) -> list[Trajectory]:
         """Read from the journal."""
@@ -249,7 +258,7 @@ class Plan:
     seed: Annotated[int, Limits(0, (1 << 63) - 1, whole=True)] = 0
     fine: bool = True
     """With shadows and smooth edges."""
-    least_area: Annotated[int, Limits(1, whole=True)] = 1
+    least_area: PositiveInt = 1
     """Pixels that an object needs to get a label."""
 
     def __post_init__(self) -> None:

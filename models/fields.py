@@ -99,6 +99,10 @@ class Limits:
         return int(value)
 
 
+PositiveInt = Annotated[int, Limits(1, whole=True)]
+NonNegativeInt = Annotated[int, Limits(0, whole=True)]
+
+
 @dataclass(frozen=True)
 class NumberOrPair:
     """A number within limits, or a pair (low, high) of them."""

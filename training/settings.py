@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from hashlib import blake2b
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 from ..agents import ALGORITHMS, CONTROLLERS, Config, find_preset, preset
 from ..agents.presets import PresetName
@@ -17,7 +17,7 @@ from ..envs.registry import env_spec, load
 from ..flights.trajectories import EpisodeSet
 from ..models import Backend
 from ..models.errors import InputError, shortened
-from ..models.fields import Limits, check_fields, read_table
+from ..models.fields import NonNegativeInt, PositiveInt, check_fields, read_table
 
 MIN_FLIGHTS = 200
 """Evaluation flights of each row of a study, over all its seeds."""
@@ -34,10 +34,10 @@ class Run:
     """Of the training, with its backend."""
     algorithm: str
     config: Config
-    seed: Annotated[int, Limits(0, whole=True)]
+    seed: NonNegativeInt
     env_steps: int
     """Of all drones together."""
-    num_envs: Annotated[int, Limits(1, whole=True)] = 1
+    num_envs: PositiveInt = 1
     """Drones that train it at the same time."""
 
     def __post_init__(self) -> None:
@@ -75,9 +75,9 @@ class Row:
     """Hyperparameters: the paper's, or ours."""
     set: Mapping[str, Any] = field(default_factory=dict)
     """Hyperparameters that differ from the preset's."""
-    env_steps: Annotated[int, Limits(0, whole=True)] = 0
+    env_steps: NonNegativeInt = 0
     """Env steps of each training, of all its drones together; 0: those of the preset."""
-    num_envs: Annotated[int, Limits(0, whole=True)] = 0
+    num_envs: NonNegativeInt = 0
     """Drones that fly at the same time in each training; 0: those of the preset."""
 
     def __post_init__(self) -> None:
@@ -214,13 +214,13 @@ class Study:
     rows: tuple[Row, ...]
     kind: Kind = "compare"
     """paper: the paper's comparison, with its figures and verdicts. sweep: rows are ranked."""
-    seeds: Annotated[int, Limits(1, whole=True)] = 5
-    first_seed: Annotated[int, Limits(0, whole=True)] = 0
-    snapshots: Annotated[int, Limits(1, whole=True)] = 10
+    seeds: PositiveInt = 5
+    first_seed: NonNegativeInt = 0
+    snapshots: PositiveInt = 10
     """Policies kept during each training, for the learning curves."""
-    curve_episodes: Annotated[int, Limits(1, whole=True)] = 10
+    curve_episodes: PositiveInt = 10
     """Evaluation episodes of each of them."""
-    episodes: Annotated[int, Limits(0, whole=True)] = 0
+    episodes: NonNegativeInt = 0
     """Evaluation episodes of each final policy; 0: as many as make `MIN_FLIGHTS` of a row."""
     evaluation: EpisodeSet = "final"
     """Set of the episodes of the final evaluation."""
