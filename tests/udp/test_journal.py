@@ -668,6 +668,10 @@ def test_a_damaged_file_is_read_up_to_the_damage(flight: SimpleNamespace, tmp_pa
     summary = Summary(path)
     assert not summary.complete
     assert summary.ending.startswith("damaged (")
+    recording = Recording(path)
+    for _ in range(2):
+        list(recording)
+        assert recording.ending.startswith("damaged ("), "also when it is read again"
     assert all(session.identical for session in Verification(path).sessions)
     assert Replay(file=path, verify=True).run() == 1, "a script must not take it for verified"
 

@@ -118,7 +118,7 @@ class Recording:
             if not MCAP0_MAGIC.startswith(head):
                 raise InputError(f"{self.path}: expected an MCAP file, got another")
             file.seek(-len(head), 2)
-            self.complete = file.read() == MCAP0_MAGIC
+            self._has_end = self.complete = file.read() == MCAP0_MAGIC
         self.ending = "complete" if self.complete else "cut off before its end"
         for record in self._records():
             if isinstance(record, records.Metadata) and record.name == ABOUT:
@@ -177,7 +177,7 @@ class Recording:
             except OSError:
                 raise
             except Exception as error:  # half a record raises anything
-                what = f"damaged ({error})" if self.complete else "cut off"
+                what = f"damaged ({error})" if self._has_end else "cut off"
                 self.complete = False
                 self.ending = f"{what} at or before byte {file.tell()}"
 

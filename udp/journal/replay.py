@@ -138,8 +138,11 @@ class SessionVerdict:
             now = getattr(loop.spec, name)
             if was != now:
                 loop.close()
-                words = f"expected an env of the {name} {was!s:.200}, got one of {now!s:.200}"
-                raise InputError(words)
+                same = [a == b for a, b in zip(str(was), str(now), strict=False)]
+                start = max(0, [*same, False].index(False) - 40)
+                shown = [str(one)[start : start + 80] for one in (was, now)]
+                words = "expected an env of the {} …{}…, got one of …{}…"
+                raise InputError(words.format(name, *shown))
         return loop
 
 
