@@ -34,22 +34,29 @@ def arrays(vehicle: Vehicle, num_worlds: int = N, dtype: str = "float64", **rest
     return make_world(vehicle, num_worlds, "rigid", dtype=dtype, **rest)
 
 
+def attitudes(dice: np.random.Generator, count: int) -> np.ndarray:
+    turned = dice.normal(size=(count, 1, 4))
+    return turned / np.linalg.norm(turned, axis=-1, keepdims=True)
+
+
 def tumbling(dice: np.random.Generator, count: int = N) -> dict[str, np.ndarray]:
     """Starts high up, at any attitude."""
-    turned = dice.normal(size=(count, 1, 4))
+    shape = (count, 1, 3)
+    turned = attitudes(dice, count)
     return {
-        "position": dice.uniform(1000.0, 1001.0, (count, 1, 3)),
-        "quaternion": turned / np.linalg.norm(turned, axis=-1, keepdims=True),
-        "velocity": dice.normal(size=(count, 1, 3)),
-        "body_rates": dice.normal(size=(count, 1, 3)),
+        "position": dice.uniform(1000.0, 1001.0, shape),
+        "quaternion": turned,
+        "velocity": dice.normal(size=shape),
+        "body_rates": dice.normal(size=shape),
     }
 
 
 def angle(ours: Any, theirs: np.ndarray) -> float:
     """Largest angle between attitudes, rad."""
     q = np.asarray(ours, np.float64)
-    p = theirs
-    apart = np.minimum(abs(q - p).max(axis=-1), abs(q + p).max(axis=-1))
+    difference = abs(q - theirs).max(axis=-1)
+    total = abs(q + theirs).max(axis=-1)
+    apart = np.minimum(difference, total)
     return 4 * float(apart.max())
 
 
@@ -70,7 +77,8 @@ def test_flies_as_mujoco_for_five_seconds(name: str, drag: float) -> None:
     for world in (ours, theirs):
         begin(world, **pose)
     for _ in range(250):
-        thrust = vehicle.hover_thrust * dice.uniform(0.9, 1.1, (N, 1, vehicle.num_rotors))
+        share = dice.uniform(0.9, 1.1, (N, 1, vehicle.num_rotors))
+        thrust = vehicle.hover_thrust * share
         for world in (ours, theirs):
             world.step(thrust, substeps)
     assert not theirs.state.touching.any()
@@ -86,35 +94,44 @@ def test_flies_as_mujoco_for_five_seconds(name: str, drag: float) -> None:
 @pytest.mark.parametrize("name", FILES)
 def test_compiled_and_numpy_fly_the_same_bits(name: str, dtype: str) -> None:
     vehicle = Vehicle.load(FILES[name], linear_drag=0.2)
-    mass = Randomization({"mass": "uniform(0.8, 1.2)", "center_x": "uniform(0, 0.01)"}, None)
-    compiled, plain = (
-        arrays(vehicle, dtype=dtype, randomize=mass, compiled=choice) for choice in (None, False)
-    )
+    drawn = {"mass": "uniform(0.8, 1.2)", "center_x": "uniform(0, 0.01)"}
+    mass = Randomization(drawn, None)
+    compiled = arrays(vehicle, dtype=dtype, randomize=mass)
+    plain = arrays(vehicle, dtype=dtype, randomize=mass, compiled=False)
     dice = np.random.default_rng(0)
     pose = tumbling(dice)
     for world in (compiled, plain):
         world.seed(EVERY, range(N))
         begin(world, **pose)
     for _ in range(20):
-        thrust = vehicle.hover_thrust * dice.uniform(0.5, 1.5, (N, 1, vehicle.num_rotors))
+        share = dice.uniform(0.5, 1.5, (N, 1, vehicle.num_rotors))
+        thrust = vehicle.hover_thrust * share
         for world in (compiled, plain):
             world.step(thrust, 2)
     for name in ("position", "quaternion", "velocity", "body_rates"):
-        found = getattr(compiled.state, name).tobytes()
-        assert found == getattr(plain.state, name).tobytes()
+        found = getattr(compiled.state, name)
+        expected = getattr(plain.state, name)
+        assert found.tobytes() == expected.tobytes()
 
 
 @pytest.mark.parametrize(("share", "most"), [(1.0, "1e6"), (5e-8, "100"), (5e-8, "1e6")])
 def test_strong_rotors_and_a_light_craft_fly(share: float, most: str, tmp_path: Path) -> None:
     """20 kg and 1e-6 kg: two control steps at hover, at rest."""
-    text = QUAD_XML.read_text(encoding="utf-8").replace('"0 100"', f'"0 {most}"')
-    text = re.sub(r'mass="([0-9.]+)"', lambda found: f'mass="{float(found[1]) * share}"', text)
+
+    def lighter(found: re.Match[str]) -> str:
+        mass = float(found[1]) * share
+        return f'mass="{mass}"'
+
+    text = QUAD_XML.read_text(encoding="utf-8")
+    text = text.replace('"0 100"', f'"0 {most}"')
+    text = re.sub(r'mass="([0-9.]+)"', lighter, text)
     file = tmp_path / "extreme.xml"
     file.write_text(text, encoding="utf-8")
     vehicle = Vehicle.load(file)
     world = arrays(vehicle, 1)
     begin(world, position=(9.0, 9.0, 9.0))
-    world.step(np.tile(vehicle.hover_thrust, (1, 1, 1)), 4)
+    thrust = np.tile(vehicle.hover_thrust, (1, 1, 1))
+    world.step(thrust, 4)
     expected = np.full((1, 1, 3), 9.0)
     assert world.state.position == pytest.approx(expected, abs=1e-9)
 
@@ -174,13 +191,16 @@ def test_a_compiler_that_misbehaves_is_told_in_one_sentence(
     tool.write_bytes(script)
     tool.chmod(0o755)
     monkeypatch.setenv("CC", f"'{tool}' -O1")
-    monkeypatch.setattr(kernel, "COMPILE_SECONDS", 0.2 if b"sleep" in script else 60.0)
+    seconds = 0.2 if b"sleep" in script else 60.0
+    monkeypatch.setattr(kernel, "COMPILE_SECONDS", seconds)
+    vehicle = Vehicle.load(linear_drag=0.124)
     with pytest.raises(InputError, match=rf"^compiled: expected [^\n]*{reason}"):
-        arrays(Vehicle.load(linear_drag=0.124), compiled=True)
-    assert arrays(Vehicle.load(linear_drag=0.124)).shape == (N, 1)  # by NumPy
-    assert len(caplog.messages) == 1
-    assert caplog.messages[0].startswith("rigid flies by NumPy: compiled: expected ")
-    assert caplog.messages[0].isprintable()
+        arrays(vehicle, compiled=True)
+    world = arrays(vehicle)
+    assert world.shape == (N, 1)  # by NumPy
+    (message,) = caplog.messages
+    assert message.startswith("rigid flies by NumPy: compiled: expected ")
+    assert message.isprintable()
 
 
 def test_without_a_compiler_numpy_flies(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -196,7 +216,8 @@ def test_without_a_compiler_numpy_flies(monkeypatch: pytest.MonkeyPatch) -> None
     world.step(np.zeros((N, 1, 4)), 1)
     # v' = -0.123 v - (0, 0, g) over 0.01 s, solved.
     left = np.exp(-0.123 * 0.01)
-    expected = (left, left, left - 9.8 / 0.123 * (1 - left))
+    fallen = 9.8 / 0.123 * (1 - left)
+    expected = (left, left, left - fallen)
     found = world.state.velocity[0, 0]
     assert_allclose(found, expected, rtol=1e-9)
 
@@ -237,10 +258,12 @@ def test_effects_and_drawn_parameters(file: Path, effects: dict[str, Any]) -> No
     for step in range(20):
         actions = dice.uniform(-0.1, 0.1, still.shape).astype(np.float32)
         for loop in (ours, theirs):
-            loop.advance(actions, frozen=frozen if step == 3 else None)
+            mask = frozen if step == 3 else None
+            loop.advance(actions, frozen=mask)
         for name in ("position", "velocity", "body_rates", "quaternion", "thrust"):
-            one, other = (getattr(loop.world.state, name) for loop in (ours, theirs))
-            assert_allclose(one, other, atol=1e-9, rtol=0)
+            found = getattr(ours.world.state, name)
+            expected = getattr(theirs.world.state, name)
+            assert_allclose(found, expected, atol=1e-9, rtol=0)
 
 
 def test_acceleration_and_below() -> None:
@@ -253,7 +276,8 @@ def test_acceleration_and_below() -> None:
     begin(world, position=(2.0, 2.0, 2.0), quaternion=turned)
     # At hover thrust: level it stays, on its side it falls and is pushed along -y.
     expected = [[0.0, 0.0, 0.0], [0.0, -9.8, -9.8]]
-    assert_allclose(world.acceleration()[:2, 0], expected, atol=1e-12, rtol=0)
+    acceleration = world.acceleration()[:2, 0]
+    assert_allclose(acceleration, expected, atol=1e-12, rtol=0)
     found = world.below()[:, 0]
     assert found == pytest.approx([2.0, np.inf, 2.0 / np.cos(1.0)])
 
@@ -264,23 +288,23 @@ def test_touches_the_ground_where_mujoco_does(file: Path) -> None:
     vehicle = Vehicle.load(file)
     dice = np.random.default_rng(3)
     count = 24
-    turned = dice.normal(size=(count, 1, 4))
-    turned /= np.linalg.norm(turned, axis=-1, keepdims=True)
+    turned = attitudes(dice, count)
     turned[0] = (1.0, 0.0, 0.0, 0.0)
     ours = arrays(vehicle, count)
     theirs = make_world(vehicle, count, num_threads=1)
+    place = np.zeros((count, 1, 3))
     low = np.zeros(count)
     high = np.full(count, float(vehicle.model.stat.extent) * 2)
     for _ in range(40):
         middle = (low + high) / 2
-        place = np.stack((0 * middle, 0 * middle, middle), axis=-1)[:, None]
+        place[:, 0, 2] = middle
         begin(theirs, position=place, quaternion=turned)
         touching = theirs.state.touching[:, 0]
         low = np.where(touching, middle, low)
         high = np.where(touching, high, middle)
     small = 1e-4 * vehicle.rest_height
     for offset in (small, -small):
-        place = np.stack((0 * high, 0 * high, high + offset), axis=-1)[:, None]
+        place[:, 0, 2] = high + offset
         begin(ours, position=place, quaternion=turned)
         begin(theirs, position=place, quaternion=turned)
         found = ours.state.touching.tolist()
@@ -295,10 +319,9 @@ def test_touches_the_ground_where_mujoco_does(file: Path) -> None:
 @pytest.mark.parametrize("file", [None, HEXA, "crazyflie_brushless"])
 def test_whole_episodes_agree_with_mujoco(env_id: str, size: float, file: Any) -> None:
     """From the same seeds: observations within a float32's rounding, rewards 1e-9, ends alike."""
-    theirs = LocalVectorEnv(env_id, N, vehicle=file, autoreset_mode="Disabled")
-    ours = LocalVectorEnv(
-        env_id, N, vehicle=file, autoreset_mode="Disabled", backend="rigid", dtype="float64",
-    )  # fmt: skip
+    options = {"vehicle": file, "autoreset_mode": "Disabled"}
+    theirs = LocalVectorEnv(env_id, N, **options)
+    ours = LocalVectorEnv(env_id, N, backend="rigid", dtype="float64", **options)
     first = ours.reset(seed=5)[0]
     expected = theirs.reset(seed=5)[0]
     assert_array_equal(first, expected)
@@ -332,15 +355,19 @@ def test_whole_episodes_agree_with_mujoco(env_id: str, size: float, file: Any) -
     ],
 )
 def test_wrong_arguments(arguments: dict[str, Any], expected: str) -> None:
+    options = {"backend": "rigid", **arguments}
     with pytest.raises(InputError, match=f"^{expected}"):
-        LocalVectorEnv(HOVER, **{"num_envs": 2, "backend": "rigid", **arguments})
+        LocalVectorEnv(HOVER, 2, **options)
 
 
 def test_what_mujoco_moves_in_another_way_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "other.xml"
+
     def racer(options: str) -> Any:
-        text = RACER.read_text().replace('integrator="RK4"', options)
-        (tmp_path / "other.xml").write_text(text)
-        return arrays(Vehicle.load(tmp_path / "other.xml"))
+        text = RACER.read_text()
+        file.write_text(text.replace('integrator="RK4"', options))
+        vehicle = Vehicle.load(file)
+        return arrays(vehicle)
 
     racer('integrator="RK4" wind="3 0 0"')  # without a fluid it does nothing
     for options in ('integrator="Euler"', 'integrator="RK4" density="1.2"'):
@@ -349,20 +376,25 @@ def test_what_mujoco_moves_in_another_way_is_refused(tmp_path: Path) -> None:
 
 
 def test_obstacles_of_a_file_are_refused_by_name(tmp_path: Path) -> None:
-    text = (DATA / "racer.xml").read_text()
+    file = tmp_path / "wood.xml"
+    text = RACER.read_text()
     tree = '<geom name="tree" type="cylinder" size="0.1 2" pos="1 0 2"/></worldbody>'
-    (tmp_path / "wood.xml").write_text(text.replace("</worldbody>", tree, 1))
-    vehicle = Vehicle.load(tmp_path / "wood.xml")
+    wood = text.replace("</worldbody>", tree, 1)
+    file.write_text(wood)
+    vehicle = Vehicle.load(file)
     make_world(vehicle, 1)
     with pytest.raises(InputError, match=r"^vehicle: expected no obstacles .* got tree in racer"):
         arrays(vehicle)
     seen = tree.replace("/>", ' contype="0" conaffinity="0"/>')  # which nothing touches
-    (tmp_path / "wood.xml").write_text(text.replace("</worldbody>", seen, 1))
-    arrays(Vehicle.load(tmp_path / "wood.xml"))
+    wood = text.replace("</worldbody>", seen, 1)
+    file.write_text(wood)
+    vehicle = Vehicle.load(file)
+    arrays(vehicle)
 
 
 def test_a_bad_state_raises_and_a_reset_mends_it() -> None:
-    loop = Loop(EnvConfig.from_keywords(ELEVATION, backend="rigid"), 2)
+    config = EnvConfig.from_keywords(ELEVATION, backend="rigid")
+    loop = Loop(config, 2)
     every = np.ones(2, bool)
     still = np.zeros((2, 1))
     loop.advance(still, every, [0, 1])
@@ -375,5 +407,6 @@ def test_a_bad_state_raises_and_a_reset_mends_it() -> None:
         loop.advance(still)
     loop.advance(still, every, [0, 1])
     loop.advance(still)
-    found = abs(loop.observations["observation"][:, 1:]).max()
+    observations = loop.observations["observation"]
+    found = abs(observations[:, 1:]).max()
     assert found < 1e-6
