@@ -292,8 +292,9 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
             options: `reset_mask`: bool, shape (N,): which drones; the others are frozen.
         """
         options = options or {}
-        if unknown := [name for name in options if name != "reset_mask"]:
-            raise InputError(f"options: expected reset_mask or none over UDP, got {unknown[0]!r}")
+        for name in options:
+            if name != "reset_mask":
+                raise InputError(f"options: expected reset_mask or none over UDP, got {name!r}")
         in_flight = "reset_mask" in options and self._flying
         if not in_flight:
             self.connect()
@@ -329,11 +330,12 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
             raise gym.error.ResetNeeded("step: expected a call of reset() first")
         resets = self._nobody if resets is None else resets
         frozen = self._nobody if frozen is None else frozen & ~resets
+        still = resets | frozen
         grounded = self.done | self._idle
-        if (waiting := grounded & ~(resets | frozen)).any():
+        waiting = grounded & ~still
+        if waiting.any():
             first = int(waiting.argmax())
             raise gym.error.ResetNeeded(f"step: expected a call of reset() for env {first} first")
-        still = resets | frozen
         sent = self._sent(actions, still)
         before = self._arrays, self.telemetry
         reasons = self._exchange(sent, resets, self._seeds(seeds), frozen)

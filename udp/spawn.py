@@ -136,7 +136,8 @@ def cached_simulator(config: EnvConfig, *, num_envs: int | None = None) -> Itera
     try:
         yield env
     except BaseException:
-        _cached.pop(key)[1].close()
+        del _cached[key]
+        stack.close()
         raise
 
 
@@ -144,4 +145,5 @@ def cached_simulator(config: EnvConfig, *, num_envs: int | None = None) -> Itera
 def close_cached_simulators() -> None:
     """Close what `cached_simulator` left open."""
     while _cached:
-        _cached.popitem()[1][1].close()
+        _, (_, stack) = _cached.popitem()
+        stack.close()
