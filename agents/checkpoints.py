@@ -18,7 +18,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -36,10 +36,8 @@ from .presets import preset
 FORMAT = 3
 _PLAIN = ("algorithm", "config", "backend", "seed", "env_steps", "versions")
 _POSITION = ("actions", "observations", "numbers", "lengths", "first_steps")
-_COLUMNS: Final[dict[str, type[np.generic]]] = {
-    f.name: {int: np.int64, float: np.float64, bool: np.bool_}[f.type]  # type: ignore[index]
-    for f in fields(Episode)
-}
+_DTYPES: dict[Any, type[np.generic]] = {int: np.int64, float: np.float64, bool: np.bool_}
+_COLUMNS = {one.name: _DTYPES[one.type] for one in fields(Episode)}
 _CHECKSUM = re.compile(rb'"sha256":"([0-9a-f]{64})"')
 _MALFORMED = (KeyError, TypeError, ValueError, AttributeError, IndexError, RecursionError)
 """Errors that reading a crafted file can raise."""
@@ -155,6 +153,7 @@ def store(checkpoint: Checkpoint, path: Path) -> None:
 def load(path: Path) -> Checkpoint:
     """Read a checkpoint. Raises `CheckpointError` or `MissingPackage`."""
     numpy = require("safetensors.numpy", "train", "reading checkpoints")
+    damage = require("safetensors", "train", "reading checkpoints").SafetensorError
     if not path.is_file():
         raise CheckpointError(f"checkpoint: expected a file, got {path}, where there is none")
     try:
@@ -163,7 +162,7 @@ def load(path: Path) -> Checkpoint:
         raise CheckpointError(f"checkpoint: cannot read {path}: {error.strerror}") from None
     except InputError as error:
         raise CheckpointError(f"{path}: {error}") from None
-    except (require("safetensors", "train", "").SafetensorError, *_MALFORMED) as error:
+    except (damage, *_MALFORMED) as error:
         reason = " ".join(str(error).split())
         raise CheckpointError(
             f"{path}: expected a rotorgram checkpoint, got one with a wrong part ({reason:.200})"
@@ -175,7 +174,8 @@ def _read(data: bytes, parse: Callable[[bytes], dict[str, np.ndarray]]) -> Check
     checksum = hashlib.sha256(_with_checksum(data, b"0" * 64)).hexdigest().encode()
     if found is None or found[1] != checksum:
         raise InputError("expected a rotorgram checkpoint, got another file or a damaged one")
-    header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
+    size = int.from_bytes(data[:8], "little")
+    header = json.loads(data[8 : 8 + size])
     content = json.loads(header["__metadata__"]["rotorgram"])
     if content["format"] != FORMAT:
         found_format = shortened(content["format"])

@@ -61,7 +61,8 @@ class Geometric:
         self._rotors = [place for name, place in places.items() if name.endswith(" over hover")]
         self._swing: np.ndarray | None = None
         self._pull = 0.0  # of the payload on the craft, m/s² per m that it hangs aside
-        share, cable = (spec.options.get(name) for name in ("payload_share", "cable"))
+        share = spec.options.get("payload_share")
+        cable = spec.options.get("cable")
         if share and cable and all(self._at[vector] for vector in _PAYLOAD):
             self._swing = swing_gains(self._gain, self._gravity / cable, share)
             self._pull = share * self._gravity / cable
@@ -80,7 +81,8 @@ class Geometric:
         """Offset and heading as the env's action, float32, shape (4,)."""
         numbers = flat(observation, self._spec).astype(np.float64)
         now = {name: numbers[at] for name, at in self._at.items() if at}
-        lift = self._gravity * (1.0 + (numbers[self._rotors].mean() if self._rotors else 0.0))
+        over_hover = numbers[self._rotors].mean() if self._rotors else 0.0
+        lift = self._gravity * (1.0 + over_hover)
         now["force"] = lift * now["thrust axis"] - (0.0, 0.0, self._gravity)
         before = self._before or now
         goes = self._follow(now)
@@ -121,7 +123,8 @@ class Geometric:
         period = self._period
         if before is None:
             return np.zeros(3)
-        moved, faster = (now[name] - before[name] for name in ("goal - position", "velocity"))
+        moved = now["goal - position"] - before["goal - position"]
+        faster = now["velocity"] - before["velocity"]
         moving = moved / period + (now["velocity"] + before["velocity"]) / 2
         pushed = faster / period - (now["force"] + before["force"]) / 2
         if self._swing is not None:

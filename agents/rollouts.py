@@ -92,7 +92,8 @@ class Collector:
         Running episodes go on in the next call. After an episode ends, that drone's next step
         begins the next episode and is no transition; if all have ended, no step is spent.
         """
-        rollout, lost, _ = self._fly(-(-count // self._log.num_envs), None)
+        length = -(-count // self._log.num_envs)
+        rollout, lost, _ = self._fly(length, None)
         return rollout.without_steps(lost)
 
     def episodes(self, count: int, most_steps: int) -> Rollout:
@@ -112,7 +113,8 @@ class Collector:
             if not done and log.num_envs > 1:
                 rollout = replace(rollout, kept=np.zeros_like(rollout.kept))
             flown.append(rollout)
-            rounds -= bool(len(rollout))
+            if len(rollout):
+                rounds -= 1
         columns = zip(*(vars(part).values() for part in flown), strict=True)
         return Rollout(*map(np.concatenate, columns))
 
@@ -122,7 +124,9 @@ class Collector:
         Returns the rollout; the steps in which a simulator was lost, bool, shape (T, N); and
         whether all drones are at the end of an episode.
         """
-        log, env, count = self._log, self._log.env, self._log.num_envs
+        log = self._log
+        env = log.env
+        count = log.num_envs
         log.start()
         stop = None if most_steps is None else log.env_steps + most_steps
         block = length or max(256 // count, 1)
@@ -138,8 +142,10 @@ class Collector:
                 raise Diverged("actions are not finite")
             flying = ~log.out
             idle = log.done if waiting else None
-            begins, frozen = (idle, None) if stop is None else (None, idle)
-            log.fly(actions, begins, frozen)
+            if stop is None:
+                log.fly(actions, idle, None)
+            else:
+                log.fly(actions, None, idle)
             after = log.observations
             ends = (env.terminated, env.truncated, flying, env.lost)
             rows.append((observations, actions, env.rewards, after, *ends))

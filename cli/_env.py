@@ -193,7 +193,8 @@ def _waiting(
     with closing(remote):
         waited = "a simulator" if num_simulators == 1 else f"{num_simulators} simulators"
         share = (num_envs or 0) // num_simulators
-        waited += f" of {share} drones" if share > 1 else ""
+        if share > 1:
+            waited += f" of {share} drones"
         here = "{}:{}".format(*remote.address)
         print(f"waiting for {waited} at {here} (Ctrl-C ends)", flush=True)
         remote.connect()

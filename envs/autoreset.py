@@ -203,4 +203,6 @@ def checked_seeds(seed: Any, num_envs: int, most: int | None = None) -> Seeds | 
 def _is_seed(number: object, most: int | None) -> bool:
     if number is None:
         return most is None
-    return isinstance(number, int | np.integer) and 0 <= int(number) <= (most or int(number))
+    if not isinstance(number, int | np.integer) or number < 0:
+        return False
+    return most is None or int(number) <= most

@@ -56,7 +56,8 @@ class Renderer:
         if self._canvas is None:
             one = len(now) == drones
             stage = Stage(drones=drones, vehicle=self._loop.vehicle.path, trail=one, names=names)
-            self._canvas = Canvas(stage, *((480, 360) if one else (240, 180)))
+            size = (480, 360) if one else (240, 180)
+            self._canvas = Canvas(stage, *size)
         canvas = self._canvas
         pictures = []
         for first in range(0, len(now), drones):
@@ -92,16 +93,13 @@ def moments(loop: "Loop", episodes: Sequence[int]) -> "list[Moment]":
     telemetry = loop.telemetry
     steps = loop.steps
     rewards = loop.rewards
-    return [
-        moment(
-            loop.spec,
-            {name: values[i] for name, values in telemetry.items()},
-            reward=float(rewards[i]),
-            step=int(steps[i]),
-            episode=episode,
-        )
-        for i, episode in enumerate(episodes)
-    ]
+    found = []
+    for i, episode in enumerate(episodes):
+        row = {name: values[i] for name, values in telemetry.items()}
+        reward = float(rewards[i])
+        step = int(steps[i])
+        found.append(moment(loop.spec, row, reward=reward, step=step, episode=episode))
+    return found
 
 
 def moment(spec: EnvSpec, telemetry: Mapping[str, Any], **rest: Any) -> "Moment":

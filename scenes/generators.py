@@ -15,9 +15,7 @@ from numpy.typing import ArrayLike as Vector
 from ..models.files import read_toml
 
 CLEARANCE = 8.0
-"""Half the width of the space about the z axis that nothing but a gate enters, m."""
-CLEARANCE_HEIGHT = 20.0
-"""Height of that space, m."""
+"""Half the width of the space about the z axis, 20 m high, that nothing but a gate enters, m."""
 GROUP = 2
 """Group of the geoms of a scene."""
 SKY = mujoco.mjtTexture.mjTEXTURE_SKYBOX

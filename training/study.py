@@ -213,7 +213,8 @@ def _episodes(training: Training) -> pd.DataFrame:
         content |= {"return": content.pop("total_reward"), "last_step": last}
         rows.append(content | log.drawn.get(episode.episode, {}))
     names = list(results.COLUMNS["episodes"][2:])
-    drawn = [name for name in (rows[0] if rows else ()) if name not in names]
+    first = rows[0] if rows else {}
+    drawn = [name for name in first if name not in names]
     return pd.DataFrame(rows, columns=[*names, *drawn])
 
 

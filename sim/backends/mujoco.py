@@ -136,7 +136,8 @@ class MujocoWorld(World):
             self._place_payload(ids, hung)
         self._apply_thrust(self._thrust, ids)
         # To wake the threads takes longer than a few worlds.
-        for some in (ids,) if len(ids) > _FEW else ids[:, None]:
+        groups = ids[None] if len(ids) > _FEW else ids[:, None]
+        for some in groups:
             self._batch.forward(some if self.shape else None)
         self._clear_contacts(ids)
         self._add_contacts(ids)
