@@ -11,10 +11,13 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import pytest
 import rotorgram.envs  # noqa: F401
 from numpy.typing import NDArray
 from rotorgram.envs import Loop, registry
 from rotorgram.envs.config import EnvConfig
+from rotorgram.envs.registry import env_spec
+from rotorgram.envs.spec import EnvSpec
 from rotorgram.models import QUAD_XML, Vehicle
 
 DATA = Path(__file__).parent / "data"
@@ -24,6 +27,9 @@ TABLES: dict[str, Any] = json.loads((DATA / "envs.json").read_text())
 TASKS = sorted(name for name in gym.registry if name.startswith("rotorgram/"))
 HOVER = "rotorgram/Hover-v0"
 ELEVATION = "rotorgram/Elevation-v0"
+NOW = np.bool_(True)
+GOAL_OFFSET = ("goal - position x", "goal - position y", "goal - position z")
+on_both_tasks = pytest.mark.parametrize("env_id", [ELEVATION, HOVER])
 FILES = {"quad": QUAD_XML}
 FILES |= {path.stem: path for path in sorted(DATA.glob("*.xml"))}
 FILES |= {path.parent.name: path for path in sorted(QUAD_XML.parent.glob("*/*/vehicle.toml"))}
@@ -32,6 +38,40 @@ WORLDS = 3
 STEPS = 24
 LENGTH = 9
 """Control steps of an episode."""
+
+
+def rows_of(table: str, names: str, **options: Any) -> pytest.MarkDecorator:
+    """A test's parameters, by comma and name: the rows of a table."""
+    return pytest.mark.parametrize(names, TABLES[table], **options)
+
+
+def spec_with(env_id: str, **options: Any) -> EnvSpec:
+    return env_spec(EnvConfig.from_keywords(env_id, **options))
+
+
+def loop_of(env_id: str, num_envs: int = 1, **options: Any) -> Loop:
+    return Loop(EnvConfig.from_keywords(env_id, **options), num_envs)
+
+
+def zero_actions(drones: int, size: int = 1) -> NDArray[np.float32]:
+    """Actions of 0."""
+    return np.zeros((drones, size), np.float32)
+
+
+def everyone(drones: int) -> NDArray[np.bool_]:
+    """A mask of all drones."""
+    return np.ones(drones, bool)
+
+
+def observed(task: Any, state: Any) -> Any:
+    """The array of a task that observes a single one."""
+    return task.observe(state)["observation"]
+
+
+def check_outcome(outcome: Any, terms: dict[str, float], terminated: bool) -> None:
+    for name, value in terms.items():
+        assert outcome.reward[name] == pytest.approx(value, abs=1e-12)
+    assert outcome.terminated == terminated
 
 
 @dataclass(frozen=True)

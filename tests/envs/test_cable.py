@@ -5,7 +5,7 @@ import math
 import mujoco
 import numpy as np
 import pytest
-from contracts import TABLES
+from contracts import rows_of, zero_actions
 from rotorgram.agents import Geometric
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.flights.trajectories import fly_episodes
@@ -106,7 +106,7 @@ def test_a_symmetric_flight_stays_symmetric() -> None:
 def test_the_flight_of_one_world_ends_for_all_its_drones() -> None:
     env = LocalVectorEnv(CABLE, 6, drones=3, autoreset_mode="Disabled", action="rotors")
     env.reset(seed=0)
-    actions = np.zeros((6, 4), np.float32)
+    actions = zero_actions(6, 4)
     actions[1] = -1.0  # one drone of the first world lets go
     for _ in range(400):
         _, rewards, terminated, *_ = env.step(actions)
@@ -129,10 +129,7 @@ def test_the_geometric_controllers_carry_it_to_its_goal(vehicle: str | None, dro
         assert errors[-125:].mean() < (0.01 if vehicle else 0.1)
 
 
-@pytest.mark.parametrize(
-    ("drones", "options", "sentence"),
-    TABLES["what cannot be carried is told"],
-)
+@rows_of("what cannot be carried is told", "drones, options, sentence")
 def test_what_cannot_be_carried_is_told(
     drones: int, options: dict[str, object], sentence: str
 ) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 
 import gymnasium as gym
 import pytest
-from contracts import TABLES
+from contracts import TABLES, rows_of
 from rotorgram.envs import ArraySpec, EnvConfig, Loop, Outcome, Task, register
 from rotorgram.envs.config import BackendConfig, SceneConfig, source_hash
 from rotorgram.envs.tasks import Hover
@@ -119,19 +119,13 @@ def test_a_file_and_keywords_that_win(tmp_path: Path) -> None:
         EnvConfig.from_toml(tmp_path / "nowhere.toml")
 
 
-@pytest.mark.parametrize(
-    ("keywords", "sentence"),
-    TABLES["a wrong field is one sentence"],
-)
+@rows_of("a wrong field is one sentence", "keywords, sentence")
 def test_a_wrong_field_is_one_sentence(keywords: dict[str, Any], sentence: str) -> None:
     with pytest.raises(InputError, match=f"^{sentence}$"):
         EnvConfig.from_keywords(HOVER, **keywords)
 
 
-@pytest.mark.parametrize(
-    ("keywords", "sentence"),
-    TABLES["what does not go together is refused by name"],
-)
+@rows_of("what does not go together is refused by name", "keywords, sentence")
 def test_what_does_not_go_together_is_refused_by_name(
     keywords: dict[str, Any], sentence: str
 ) -> None:

@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pandas as pd
 import pytest
-from contracts import TABLES
+from contracts import rows_of
 from rotorgram.cli import main
 from rotorgram.envs import LocalVectorEnv, registry
 from rotorgram.envs.tasks.task import HORIZON
@@ -61,11 +61,7 @@ def test_wide_starts_are_learned(tmp_path: Path) -> None:
     assert last["length"].mean() > 240
 
 
-@pytest.mark.parametrize(
-    ("change", "crashed"),
-    TABLES["contact and a tilt above 90 degrees end a flight"],
-    ids=str,
-)
+@rows_of("contact and a tilt above 90 degrees end a flight", "change, crashed", ids=str)
 @pytest.mark.parametrize("name", ["Hover", "Landing", "PayloadHover", "Racing", "Tracking"])
 def test_contact_and_a_tilt_above_90_degrees_end_a_flight(
     name: str, change: dict[str, Any], crashed: bool

@@ -13,14 +13,12 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from contracts import TABLES
+from contracts import TABLES, everyone, loop_of, on_both_tasks, spec_with, zero_actions
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rotorgram.envs import Loop, SingleEnv
-from rotorgram.envs.config import EnvConfig
-from rotorgram.envs.registry import env_spec
+from rotorgram.envs import SingleEnv
 from rotorgram.envs.tasks.elevation import Elevation
 from rotorgram.models.errors import InputError
 from rotorgram.sim import PhysicsError
@@ -59,10 +57,10 @@ class Flight:
     """A loop with one drone that begins where it is told; its state can be written."""
 
     def __init__(self, start: float, target: float = 5.0, **options: Any) -> None:
-        self.loop = Loop(EnvConfig.from_keywords(ID, **{"target": target, **options}))
+        self.loop = loop_of(ID, **{"target": target, **options})
         chosen = {"start": np.array([start]), "target": np.array([target])}
-        every = np.ones(1, bool)
-        self.loop.advance(np.zeros((1, 1), np.float32), every, [0], chosen=chosen)
+        every = everyone(1)
+        self.loop.advance(zero_actions(1), every, [0], chosen=chosen)
         self.state = self.loop.world.state
 
     def step(self, action: float) -> None:
@@ -107,7 +105,7 @@ def test_contract(env_id: str, options: dict[str, Any]) -> None:
     assert all(type(value) is float for value in info.values())
     assert {metric.name for metric in spec.metrics} <= set(info)
     assert env.control_period == spec.control_period
-    assert spec == env_spec(EnvConfig.from_keywords(env_id, **options))
+    assert spec == spec_with(env_id, **options)
     before = observation.copy()
     env.step(env.action_space.sample())
     assert observation.tobytes() == before.tobytes()  # nobody else's memory
@@ -167,7 +165,7 @@ def test_docstring_tables_agree_with_the_spaces() -> None:
     header, *rows = _table("Observation")
     assert header == ["index", "quantity", "unit", "bounds"]
     assert [row[0] for row in rows] == [str(i) for i in range(space.shape[0])]
-    assert [row[2] for row in rows] == list(env_spec(EnvConfig(env_id=ID)).observation[0].unit)
+    assert [row[2] for row in rows] == list(spec_with(ID).observation[0].unit)
     for row, low, high in zip(rows, space.low.tolist(), space.high.tolist(), strict=True):
         bounds = f"-{row[3][1:]} ... {row[3][1:]}" if row[3].startswith("±") else row[3]
         told = [float(part) for part in bounds.split(" ... ")]
@@ -406,7 +404,7 @@ def test_a_bad_state_raises_and_leaves_no_log(
     with pytest.raises(ResetNeeded):
         flight.step(0.0)
     for one in (flight, twin):
-        one.loop.advance(_a(0.0), np.ones(1, bool), [4])
+        one.loop.advance(_a(0.0), everyone(1), [4])
         one.step(0.5)
     assert flight.loop.row() == twin.loop.row()
 
@@ -428,7 +426,7 @@ def test_a_log_file_that_the_user_named_stays_on(tmp_path: Path) -> None:
         old.set()
 
 
-@pytest.mark.parametrize("env_id", [ID, HOVER])
+@on_both_tasks
 def test_a_step_before_a_reset(env_id: str) -> None:
     env = _env(env_id)
     with pytest.raises(ResetNeeded, match=r"step: expected a call of reset\(\) for env 0 first"):
@@ -438,7 +436,7 @@ def test_a_step_before_a_reset(env_id: str) -> None:
 # --- seeds ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("env_id", [ID, HOVER])
+@on_both_tasks
 def test_seeds(env_id: str) -> None:
     one = _env(env_id)
     other = _env(env_id)

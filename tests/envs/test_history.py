@@ -5,9 +5,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from contracts import spec_with
 from rotorgram.agents import PID
-from rotorgram.envs.config import EnvConfig
-from rotorgram.envs.registry import env_spec
 from rotorgram.models.errors import InputError
 
 HOVER = "rotorgram/Hover-v0"
@@ -56,8 +55,8 @@ def test_readings_of_sensors_have_a_history_of_their_own() -> None:
 
 
 def test_the_spec_names_every_number() -> None:
-    usual = env_spec(EnvConfig(env_id=ELEVATION))
-    long = env_spec(EnvConfig.from_keywords(ELEVATION, history=3))
+    usual = spec_with(ELEVATION)
+    long = spec_with(ELEVATION, history=3)
     (one,) = usual.observation
     (three,) = long.observation
     assert three.shape == (9,)
@@ -71,7 +70,7 @@ def test_the_spec_names_every_number() -> None:
     assert three.low == one.low * 3
     assert three.high == one.high * 3
     assert usual.options["history"] == 1
-    assert env_spec(EnvConfig.from_keywords(ELEVATION, history=1)) == usual
+    assert spec_with(ELEVATION, history=1) == usual
 
 
 def test_the_error_alone_with_its_past() -> None:
@@ -101,4 +100,4 @@ def test_the_pid_reads_the_newest() -> None:
 def test_a_wrong_history_gives_one_sentence(count: Any) -> None:
     expected = r"^history: expected a whole number from 1 to 1000 observations, got "
     with pytest.raises(InputError, match=expected):
-        env_spec(EnvConfig.from_keywords(HOVER, history=count))
+        spec_with(HOVER, history=count)

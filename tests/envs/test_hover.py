@@ -7,9 +7,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from contracts import TABLES
-from rotorgram.envs import Loop
-from rotorgram.envs.config import EnvConfig
+from contracts import TABLES, check_outcome, everyone, loop_of, observed, rows_of, zero_actions
 from rotorgram.models.vehicle import Vehicle
 
 from flights import about, state_of, task_of
@@ -22,33 +20,27 @@ def test_observation_by_hand() -> None:
     """Turned left by 90 degrees where the nose shall point along y: all is seen from there."""
     task = task_of(ID, goal=(1.0, 2.0, 6.0), heading=90.0)
     state = state_of(**TABLES["hover: observation by hand, state"])
-    seen = task.observe(state)["observation"]
+    seen = observed(task, state)
     expected = TABLES["hover: observation by hand, expected"]
     assert seen == pytest.approx(expected, abs=1e-12)
     # Rolled left by 30 degrees: the thrust points to the right, -y.
-    tilted = task_of(ID).observe(state_of(quaternion=about((1, 0, 0), 30.0)))["observation"]
+    tilted = observed(task_of(ID), state_of(quaternion=about((1, 0, 0), 30.0)))
     assert tilted[6:12] == pytest.approx([1, 0, 0, 0, -0.5, math.sqrt(3) / 2], abs=1e-12)
 
 
 def test_observations_are_clipped_to_their_bounds() -> None:
     task = task_of(ID)
     far = state_of(position=(1e6, 0, 5), velocity=(0, -1e6, 0), body_rates=(0, 0, 1e6))
-    seen = task.observe(far)["observation"]
+    seen = observed(task, far)
     assert seen[0] == -6.0
     assert seen[4] == -100.0
     assert seen[14] == 100.0
 
 
-@pytest.mark.parametrize(
-    ("change", "terms", "terminated"),
-    TABLES["hover: outcome by hand"],
-    ids=str,
-)
+@rows_of("hover: outcome by hand", "change, terms, terminated", ids=str)
 def test_outcome_by_hand(change: dict[str, Any], terms: dict[str, float], terminated: bool) -> None:
     outcome = task_of(ID).outcome(state_of(**change))
-    for name, value in terms.items():
-        assert outcome.reward[name] == pytest.approx(value, abs=1e-12)
-    assert outcome.terminated == terminated
+    check_outcome(outcome, terms, terminated)
 
 
 def test_metrics_by_hand() -> None:
@@ -63,15 +55,15 @@ def test_thrust_below_zero_is_observed(tmp_path: Path) -> None:
     text = Vehicle.load().path.read_text()
     file = tmp_path / "reverse.xml"
     file.write_text(text.replace('ctrlrange="0 100"', 'ctrlrange="-20 100"'))
-    seen = task_of(ID, vehicle=file).observe(state_of(thrust=(-20.0,) * 4))["observation"]
+    seen = observed(task_of(ID, vehicle=file), state_of(thrust=(-20.0,) * 4))
     assert seen[15:] == pytest.approx([-20 / 49 - 1] * 4)
 
 
 @pytest.mark.parametrize("file", [None, HEXA], ids=["paper", "hexa"])
 def test_actions_are_thrusts_between_the_limits(file: Path | None) -> None:
     vehicle = Vehicle.load(file)
-    loop = Loop(EnvConfig.from_keywords(ID, vehicle=file))
-    every = np.ones(1, bool)
+    loop = loop_of(ID, vehicle=file)
+    every = everyone(1)
     n = vehicle.num_rotors
     for action, expected in (
         (0.0, vehicle.hover_thrust),
@@ -80,7 +72,7 @@ def test_actions_are_thrusts_between_the_limits(file: Path | None) -> None:
         (9.0, vehicle.thrust_high),
         (-0.5, (vehicle.hover_thrust + vehicle.thrust_low) / 2),
     ):
-        loop.advance(np.zeros((1, n), np.float32), every, [0])
+        loop.advance(zero_actions(1, n), every, [0])
         loop.advance(np.full((1, n), action, np.float32))
         np.testing.assert_allclose(loop.telemetry["thrust"][0], expected, rtol=1e-12)
 

@@ -6,7 +6,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from contracts import TABLES
+from contracts import GOAL_OFFSET, NOW, TABLES, observed, rows_of
 from pilot import Pilot, fly, limited
 from rotorgram.models import Vehicle
 
@@ -15,7 +15,6 @@ from flights import Shares, state_of, task_of
 ID = "rotorgram/Landing-v0"
 REST = 0.4  # height of the paper's craft on the ground, m
 MIDDLE = (0.5, 0.5, 0.5)  # of the start's band
-NOW = np.bool_(True)
 
 
 def begun(direction: float = 0.5, phase: float = 0.5, side: float = 1.0, **options: Any) -> Any:
@@ -44,7 +43,7 @@ def test_a_pad_on_a_circle() -> None:
     assert task.goal(state_of()) == pytest.approx([2.0, 0.0, REST])
     moved(task, 100)
     assert task.goal(state_of()) == pytest.approx([2 * math.cos(1), 2 * math.sin(1), REST])
-    seen = task.observe(state_of(velocity=(9.0, 9.0, 9.0)))["observation"]
+    seen = observed(task, state_of(velocity=(9.0, 9.0, 9.0)))
     assert seen[19:] == pytest.approx([-math.sin(1), math.cos(1)])  # after 15 and 4 rotors
     right = moved(begun(side=0.0), 100)
     assert right.goal(state_of()) == pytest.approx([2 * math.cos(1), -2 * math.sin(1), REST])
@@ -54,7 +53,7 @@ def test_a_pad_on_a_line() -> None:
     """Along y (a quarter of the way round), from the middle (φ = 90°) backwards."""
     task = begun(direction=0.75, phase=0.75, motion="line", pad_path=3.0, pad_speed=1.5)
     assert task.goal(state_of()) == pytest.approx([0.0, 0.0, REST])
-    seen = task.observe(state_of())["observation"]
+    seen = observed(task, state_of())
     assert seen[19:] == pytest.approx([0.0, -1.5])  # its largest speed is in the middle
     moved(task, 50)  # φ grows by 1.5 / 3 · 1 s
     assert task.goal(state_of()) == pytest.approx([0.0, -3 * math.sin(0.5), REST])
@@ -63,14 +62,14 @@ def test_a_pad_on_a_line() -> None:
 def test_observation_by_hand() -> None:
     task = begun()
     state = state_of(**TABLES["landing: observation by hand, state"])
-    seen = task.observe(state)["observation"]
+    seen = observed(task, state)
     half = 0.5
     root = math.sqrt(3) / 2
     expected = [1, 1, -3, 1, 2, -3, 1, 0, 0, 0, -half, root, 0.1, 0.2, 0.3, 0, 1, -1, -0.5, 0, 1]
     assert seen == pytest.approx(expected, abs=1e-12)
     (spec,) = task.observation
     assert spec.shape == (21,)
-    assert spec.components[:3] == ("goal - position x", "goal - position y", "goal - position z")
+    assert spec.components[:3] == GOAL_OFFSET
     assert spec.components[19:] == ("velocity of the pad x", "velocity of the pad y")
     assert spec.bounds()[1][[0, 19]].tolist() == [20.0, 1.001]
 
@@ -78,10 +77,7 @@ def test_observation_by_hand() -> None:
 STILL = {"motion": "line", "pad_speed": 0.0}  # a pad that rests at (2, 0)
 
 
-@pytest.mark.parametrize(
-    ("before", "at", "landed"),
-    TABLES["what is a landing"],
-)
+@rows_of("what is a landing", "before, at, landed")
 def test_what_is_a_landing(before: dict[str, Any], at: dict[str, Any], landed: bool) -> None:
     task = begun(**STILL)
     place = {"position": (2.0, 0.0, REST + 0.01), **before}
@@ -129,11 +125,7 @@ def test_progress_by_hand() -> None:
     assert reward["termination"] == reward["landing"] == 0.0
 
 
-@pytest.mark.parametrize(
-    ("change", "terminated"),
-    TABLES["landing: ends"],
-    ids=str,
-)
+@rows_of("landing: ends", "change, terminated", ids=str)
 def test_ends(change: dict[str, Any], terminated: bool) -> None:
     task = begun(**STILL)
     outcome = task.outcome(state_of(**{"position": (2.0, 3.0, 3.0), **change}))
@@ -142,10 +134,7 @@ def test_ends(change: dict[str, Any], terminated: bool) -> None:
     assert outcome.metrics["landed"] == 0.0
 
 
-@pytest.mark.parametrize(
-    ("vehicle", "motion", "effects"),
-    TABLES["a pilot lands and a stone does not"],
-)
+@rows_of("a pilot lands and a stone does not", "vehicle, motion, effects")
 def test_a_pilot_lands_and_a_stone_does_not(vehicle: str, motion: str, effects: Any) -> None:
     """On either path, with a 20 kg and a 27 g craft, also in wind."""
     craft = Vehicle.load(vehicle)

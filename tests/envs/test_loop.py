@@ -7,9 +7,9 @@ from typing import Any, ClassVar
 import gymnasium as gym
 import numpy as np
 import pytest
+from contracts import everyone, loop_of, zero_actions
 from gymnasium.utils.env_checker import check_env
 from rotorgram.envs import ArraySpec, Loop, Metric, Outcome, Task, register, registry
-from rotorgram.envs.config import EnvConfig
 from rotorgram.models.errors import InputError
 from rotorgram.sim import CollectiveThrust, InitialState, stack
 
@@ -20,9 +20,9 @@ HEXA = Path(__file__).parents[1] / "data" / "hexa.xml"
 
 def started(env_id: str = ID, num_envs: int = 2, **options: Any) -> tuple[Loop, np.ndarray]:
     """A loop with running episodes, and actions for it."""
-    loop = Loop(EnvConfig.from_keywords(env_id, **options), num_envs)
+    loop = loop_of(env_id, num_envs, **options)
     actions = np.full((num_envs, len(loop.task.controller.low)), 0.4, np.float32)
-    loop.advance(actions, np.ones(num_envs, bool), range(num_envs))
+    loop.advance(actions, everyone(num_envs), range(num_envs))
     return loop, actions
 
 
@@ -51,22 +51,22 @@ def test_wrong_seeds_are_refused_before_the_others_fly() -> None:
 
 
 def test_a_first_reset_that_is_refused_begins_nothing() -> None:
-    loop = Loop(EnvConfig(env_id=ID), 2)
-    still = np.zeros((2, 1), np.float32)
+    loop = loop_of(ID, 2)
+    still = zero_actions(2)
     some = np.array([True, False])
     with pytest.raises(InputError, match=r"^start: expected at least"):
-        loop.advance(still, np.ones(2, bool), chosen={"start": np.full(2, 1e5)})
+        loop.advance(still, everyone(2), chosen={"start": np.full(2, 1e5)})
     loop.advance(still, some, frozen=~some)
     assert abs(loop.telemetry["position"][:, 2] - 5.0).max() <= 1.0
 
 
 def test_the_first_reset_may_be_of_some() -> None:
-    loop = Loop(EnvConfig(env_id=ID), 3)
-    every = np.ones(3, bool)
-    still = np.zeros((3, 1), np.float32)
+    loop = loop_of(ID, 3)
+    every = everyone(3)
+    still = zero_actions(3)
     some = np.array([False, True, False])
     loop.advance(still, some, [7, 7, 7], frozen=~some)
-    alone = Loop(EnvConfig(env_id=ID))
+    alone = loop_of(ID)
     alone.advance(still[:1], every[:1], [7])
     assert shown(loop, 1) == shown(alone, 0)
     with pytest.raises(gym.error.ResetNeeded, match="env 0 first"):
@@ -141,13 +141,13 @@ class Counting(Careless):
 def test_a_tasks_memory_is_that_of_the_drones_that_flew(num_envs: int) -> None:
     register("counting-v0", Counting)
     try:
-        loop = Loop(EnvConfig(env_id="counting-v0"), num_envs)
+        loop = loop_of("counting-v0", num_envs)
     finally:
         gym.registry.pop("counting-v0")
-    actions = np.zeros((num_envs, 1), np.float32)
-    everyone = np.ones(num_envs, bool)
+    actions = zero_actions(num_envs)
+    every = everyone(num_envs)
     first = np.arange(num_envs) == 0
-    loop.advance(actions, everyone, range(num_envs))
+    loop.advance(actions, every, range(num_envs))
     assert loop.metrics["climb"].tolist() == [0.0] * num_envs
     loop.advance(actions)
     loop.advance(actions, frozen=first)
@@ -161,7 +161,7 @@ def test_a_task_without_a_method_is_told_which() -> None:
     register("unfinished-v0", type("Unfinished", (Task,), {"setup": Careless.setup}))
     try:
         with pytest.raises(InputError, match=r"a task with a method begin\(\), got Unfinished"):
-            Loop(EnvConfig(env_id="unfinished-v0"))
+            loop_of("unfinished-v0")
     finally:
         gym.registry.pop("unfinished-v0")
 
@@ -175,9 +175,9 @@ def careless() -> Iterator[str]:
 
 @pytest.mark.parametrize("num_envs", [1, 3])
 def test_what_a_step_gave_stays_as_it_was(careless: str, num_envs: int) -> None:
-    loop = Loop(EnvConfig.from_keywords(careless, episode_length=3), num_envs)
+    loop = loop_of(careless, num_envs, episode_length=3)
     actions = np.ones((num_envs, 1), np.float32)
-    loop.advance(actions, np.ones(num_envs, bool), range(num_envs))
+    loop.advance(actions, everyone(num_envs), range(num_envs))
     loop.advance(actions)
     given = [*loop.observations.values(), *loop.metrics.values(), *loop.reward_terms.values()]
     given += [loop.rewards, loop.terminated, loop.truncated, *loop.telemetry.values()]
@@ -205,9 +205,9 @@ def test_a_task_may_give_constants_and_float32(num_envs: int) -> None:
             return outcome
 
     register("Plain-v0", Plain)
-    loop = Loop(EnvConfig(env_id="Plain-v0"), num_envs)
-    still = np.zeros((num_envs, 1), np.float32)
-    loop.advance(still, np.ones(num_envs, bool), chosen={"start": np.full(num_envs, 4.5)})
+    loop = loop_of("Plain-v0", num_envs)
+    still = zero_actions(num_envs)
+    loop.advance(still, everyone(num_envs), chosen={"start": np.full(num_envs, 4.5)})
     loop.advance(still)
     assert loop.rewards.dtype == np.float64
     assert loop.rewards.tolist() == [5.5] * num_envs
@@ -232,7 +232,7 @@ def test_ids() -> None:
     assert registry.is_known(HOVER)
     assert registry.is_known(f"rotorgram.envs:{ID}")
     with pytest.raises(InputError, match=r"^env: expected a registered id .*, got 'CartPole-v1'"):
-        Loop(EnvConfig(env_id="CartPole-v1"))
+        loop_of("CartPole-v1")
     with pytest.raises(InputError, match=r"^env id: expected one that is free, got 'CartPole-v1'"):
         register("CartPole-v1", Careless)
     for wrong in ("landing", "my landing-v0", 3):
@@ -278,10 +278,10 @@ def test_numbers_of_a_task_that_are_not_finite_go_no_further(num_envs: int, wron
             return outcome
 
     register("Broken-v0", Broken)
-    loop = Loop(EnvConfig(env_id="Broken-v0"), num_envs)
-    everybody = np.ones(num_envs, bool)
+    loop = loop_of("Broken-v0", num_envs)
+    everybody = everyone(num_envs)
     with pytest.raises(InputError, match=rf"Broken-v0: expected finite numbers for {wrong}"):
-        loop.advance(np.zeros((num_envs, 1), np.float32), everybody)
+        loop.advance(zero_actions(num_envs), everybody)
 
 
 @pytest.mark.parametrize("num_envs", [1, 3])
@@ -300,12 +300,12 @@ def test_a_start_that_is_none(num_envs: int, start: Any, got: str) -> None:
             return start
 
     register("Lost-v0", Lost)
-    loop = Loop(EnvConfig(env_id="Lost-v0"), num_envs)
+    loop = loop_of("Lost-v0", num_envs)
     sentence = (
         rf"^Lost-v0: expected begin\(\) to return an InitialState with a position of .*, got {got}$"
     )
     with pytest.raises(InputError, match=sentence):
-        loop.advance(np.zeros((num_envs, 1), np.float32), np.ones(num_envs, bool))
+        loop.advance(zero_actions(num_envs), everyone(num_envs))
 
 
 # --- what a task sees, and what it remembers ------------------------------------------------------
@@ -324,10 +324,10 @@ class Watching(Careless):
 def looped(task: type[Task], num_envs: int) -> tuple[Loop, np.ndarray]:
     register("looped-v0", task)
     try:
-        loop = Loop(EnvConfig(env_id="looped-v0"), num_envs)
+        loop = loop_of("looped-v0", num_envs)
     finally:
         gym.registry.pop("looped-v0")
-    loop.advance(np.zeros((num_envs, 1), np.float32), np.ones(num_envs, bool), range(num_envs))
+    loop.advance(zero_actions(num_envs), everyone(num_envs), range(num_envs))
     return loop, np.full((num_envs, 1), 0.5, np.float32)
 
 

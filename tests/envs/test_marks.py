@@ -5,10 +5,8 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from contracts import TABLES
+from contracts import rows_of, spec_with
 from pictures import at
-from rotorgram.envs.config import EnvConfig
-from rotorgram.envs.registry import env_spec
 from rotorgram.envs.rendering import moment
 from rotorgram.envs.spec import EnvSpec, Mark, SpecError
 from rotorgram.rendering import Stage
@@ -39,18 +37,18 @@ def drawn(**fields: Any) -> list[tuple[int, list[float], list[float]]]:
 
 
 def test_tasks_have_their_marks_and_the_wire_keeps_them() -> None:
-    racing = env_spec(EnvConfig.from_keywords("rotorgram/Racing-v0", track=TRACK))
+    racing = spec_with("rotorgram/Racing-v0", track=TRACK)
     assert racing.marks == (GATE,)
     assert EnvSpec.from_json(racing.to_json()) == racing
-    waypoints = env_spec(EnvConfig.from_keywords("rotorgram/Waypoints-v0", radius=0.4))
+    waypoints = spec_with("rotorgram/Waypoints-v0", radius=0.4)
     assert waypoints.marks == (Mark(shape="ball", size=0.4, moves=True),)
-    (pad,) = env_spec(EnvConfig(env_id="rotorgram/Landing-v0")).marks
+    (pad,) = spec_with("rotorgram/Landing-v0").marks
     assert (pad.shape, pad.size, pad.moves) == ("disc", 0.5, True)
-    assert "marks" not in env_spec(EnvConfig(env_id="rotorgram/Hover-v0")).to_json()
+    assert "marks" not in spec_with("rotorgram/Hover-v0").to_json()
 
 
 def test_a_moment_has_the_marks_of_its_spec() -> None:
-    spec = env_spec(EnvConfig.from_keywords("rotorgram/Racing-v0", track=TRACK))
+    spec = spec_with("rotorgram/Racing-v0", track=TRACK)
     telemetry = {array.name: np.zeros(array.shape) for array in spec.telemetry}
     assert moment(spec, telemetry).marks == (GATE,)
 
@@ -78,10 +76,7 @@ def test_what_moves_is_at_the_goal_in_place_of_its_disc() -> None:
     assert drawn(goal=None, marks=(pad,)) == []
 
 
-@pytest.mark.parametrize(
-    ("fields", "sentence"),
-    TABLES["wrong marks"],
-)
+@rows_of("wrong marks", "fields, sentence")
 def test_wrong_marks(fields: dict[str, Any], sentence: str) -> None:
     with pytest.raises(SpecError) as error:
         Mark(**fields)

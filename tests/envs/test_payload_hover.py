@@ -6,17 +6,24 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from contracts import TABLES
+from contracts import (
+    GOAL_OFFSET,
+    NOW,
+    TABLES,
+    check_outcome,
+    everyone,
+    loop_of,
+    observed,
+    rows_of,
+    spec_with,
+    zero_actions,
+)
 from pilot import Pilot, fly, limited
-from rotorgram.envs import Loop
-from rotorgram.envs.config import EnvConfig
-from rotorgram.envs.registry import env_spec
 from rotorgram.models import Vehicle
 
 from flights import Shares, about, state_of, task_of
 
 ID = "rotorgram/PayloadHover-v0"
-NOW = np.bool_(True)
 AT_GOAL = {"payload": (0.0, 0.0, 4.0), "payload_velocity": (0.0, 0.0, 0.0)}  # the craft at 5 m
 
 
@@ -33,12 +40,12 @@ def test_a_start_by_hand() -> None:
 def test_the_task_hangs_the_payload_itself(vehicle: str) -> None:
     """The world has it, the spec tells it, and what the effects say of it is replaced."""
     options = {"payload_share": 0.2, "cable": 0.7, "effects": {"efficiency": (1.0, 1.0, 0.9, 1.0)}}
-    told = env_spec(EnvConfig.from_keywords(ID, **options, vehicle=vehicle))
+    told = spec_with(ID, **options, vehicle=vehicle)
     assert "payload" in [array.name for array in told.telemetry]
     assert told.options["effects"] == {"efficiency": [1.0, 1.0, 0.9, 1.0]}
-    assert env_spec(EnvConfig.from_keywords(ID, **told.options, vehicle=vehicle)) == told
-    loop = Loop(EnvConfig.from_keywords(ID, vehicle=vehicle, **options))
-    loop.advance(np.zeros((1, 4), np.float32), np.ones(1, bool), [0])
+    assert spec_with(ID, **told.options, vehicle=vehicle) == told
+    loop = loop_of(ID, vehicle=vehicle, **options)
+    loop.advance(zero_actions(1, 4), everyone(1), [0])
     state = loop.world.state
     assert state.position - state.payload == pytest.approx([0.0, 0.0, 0.7])
     assert state.payload_velocity.tolist() == state.velocity.tolist()
@@ -48,29 +55,23 @@ def test_the_task_hangs_the_payload_itself(vehicle: str) -> None:
 def test_observation_by_hand() -> None:
     task = task_of(ID, goal=(1.0, 2.0, 6.0))
     state = state_of(**TABLES["payload hover: observation by hand, state"])
-    seen = task.observe(state)["observation"]
+    seen = observed(task, state)
     half = 0.5
     root = math.sqrt(3) / 2
     craft = [0.5, 0, 1, 1, 2, -3, 1, 0, 0, 0, -half, root, 0.1, 0.2, 0.3, 0, 1, -1, -0.5]
     assert seen == pytest.approx([*craft, -0.4, 0.3, -0.8, 0.5, -1, 0], abs=1e-12)
     assert task.goal(state).tolist() == [1.0, 2.0, 6.0]
     (spec,) = task.observation
-    assert spec.components[:3] == ("goal - position x", "goal - position y", "goal - position z")
+    assert spec.components[:3] == GOAL_OFFSET
     assert spec.components[19] == "payload - position x"
     assert spec.components[24] == "payload velocity - velocity z"
     assert spec.bounds()[1][[0, 19, 24]].tolist() == [6.0, 2.0, 100.0]
 
 
-@pytest.mark.parametrize(
-    ("change", "terms", "terminated"),
-    TABLES["outcome by hand"],
-    ids=str,
-)
+@rows_of("outcome by hand", "change, terms, terminated", ids=str)
 def test_outcome_by_hand(change: dict[str, Any], terms: dict[str, float], terminated: bool) -> None:
     outcome = task_of(ID).outcome(state_of(**{**AT_GOAL, **change}))
-    for name, value in terms.items():
-        assert outcome.reward[name] == pytest.approx(value, abs=1e-12)
-    assert outcome.terminated == terminated
+    check_outcome(outcome, terms, terminated)
 
 
 def test_metrics_by_hand() -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from contracts import TABLES
+from contracts import GOAL_OFFSET, NOW, TABLES, observed, rows_of
 from pilot import Pilot, fly, limited
 from rotorgram.models import Vehicle
 from rotorgram.models.errors import InputError
@@ -16,7 +16,6 @@ from rotorgram.models.errors import InputError
 from flights import Shares, state_of, task_of
 
 ID = "rotorgram/Racing-v0"
-NOW = np.bool_(True)
 # Along x, then a turn to the left: a gate at x = 2, one at y = 3; start at the origin, 5 m high.
 TRACK = json.dumps(TABLES["racing: TRACK"])
 
@@ -44,19 +43,16 @@ def test_a_start_by_hand() -> None:
 def test_observation_by_hand() -> None:
     task = begun()
     state = state_of(position=(1.0, 0.5, 4.0), velocity=(1.0, 2.0, 3.0))
-    seen = task.observe(state)["observation"]
+    seen = observed(task, state)
     expected = TABLES["racing: observation by hand, expected"]
     assert seen == pytest.approx([*expected, 1, 0, 1, 2.5, 1, 0, 1, 0.5], abs=1e-12)
     (spec,) = task.observation
-    assert spec.components[:3] == ("goal - position x", "goal - position y", "goal - position z")
+    assert spec.components[:3] == GOAL_OFFSET
     assert spec.bounds()[1][0] == pytest.approx(math.hypot(2, 3) + 10.0)
     assert task.goal(state).tolist() == [2.0, 0.0, 5.0]
 
 
-@pytest.mark.parametrize(
-    ("before", "after", "passes"),
-    TABLES["what is a pass"],
-)
+@rows_of("what is a pass", "before, after, passes")
 def test_what_is_a_pass(before: Any, after: Any, passes: bool) -> None:
     task = begun()
     assert moved(task, *before).metrics["gates_left"] == 2
@@ -88,10 +84,7 @@ def test_a_lap_by_hand() -> None:
     assert outcome.reward["termination"] == 0.0
 
 
-@pytest.mark.parametrize(
-    ("place", "rest", "ends"),
-    TABLES["ends"],
-)
+@rows_of("ends", "place, rest, ends")
 def test_ends(place: Any, rest: dict[str, Any], ends: bool) -> None:
     outcome = moved(begun(), *place, **rest)
     assert bool(outcome.terminated) == ends
@@ -113,7 +106,7 @@ def test_a_track_of_a_file_crosses_the_wire(tmp_path: Path) -> None:
     assert again.goal(state_of()).tolist() == [1.0, 2.0, 6.0]
 
 
-@pytest.mark.parametrize(("content", "sentence"), TABLES["wrong tracks"])
+@rows_of("wrong tracks", "content, sentence")
 def test_wrong_tracks(content: Any, sentence: str) -> None:
     text = content if isinstance(content, str) else json.dumps(content)
     with pytest.raises(InputError) as error:

@@ -7,11 +7,18 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from bounds import least_height_lost, recovery_bounds
-from contracts import TABLES
+from contracts import (
+    NOW,
+    TABLES,
+    check_outcome,
+    everyone,
+    loop_of,
+    observed,
+    rows_of,
+    spec_with,
+    zero_actions,
+)
 from pilot import Pilot, fly, limited
-from rotorgram.envs.config import EnvConfig
-from rotorgram.envs.loop import Loop
-from rotorgram.envs.registry import env_spec
 from rotorgram.envs.tasks.recovery import RecoveryOptions
 from rotorgram.models import Vehicle
 from rotorgram.models.errors import InputError
@@ -20,7 +27,6 @@ from scipy.special import fresnel
 from flights import Shares, state_of, task_of
 
 ID = "rotorgram/Recovery-v0"
-NOW = np.bool_(True)
 COUNT = 4000
 LARGE = 1.95 / math.sqrt(COUNT)  # distance of Kolmogorov and Smirnov that one in a thousand exceeds
 
@@ -57,8 +63,8 @@ def test_a_slow_turner_spins_slower() -> None:
 
 @pytest.fixture(scope="module")
 def starts() -> Any:
-    loop = Loop(EnvConfig.from_keywords(ID, spin=5.0), COUNT)
-    loop.advance(np.zeros((COUNT, 4), np.float32), np.ones(COUNT, bool), list(range(COUNT)))
+    loop = loop_of(ID, COUNT, spin=5.0)
+    loop.advance(zero_actions(COUNT, 4), everyone(COUNT), list(range(COUNT)))
     state = loop.world.state
     arrays = {
         name: getattr(state, name)[:, 0].copy()
@@ -106,7 +112,7 @@ def test_throws_fill_their_ranges(starts: Any) -> None:
 
 def test_observation_by_hand() -> None:
     state = state_of(**TABLES["recovery: observation by hand, state"])
-    seen = begun(frame="world").observe(state)["observation"]
+    seen = observed(begun(frame="world"), state)
     expected = TABLES["recovery: observation by hand, expected"]
     assert seen == pytest.approx(expected, abs=1e-12)
 
@@ -115,7 +121,7 @@ def test_observation_in_the_body_frame_by_hand() -> None:
     """Turned left by 90° and then rolled by 90°, right side down: body x is world y, body y is
     world z, and body z is world x."""
     state = state_of(**TABLES["recovery: observation in the body frame by hand, state"])
-    seen = begun().observe(state)["observation"]
+    seen = observed(begun(), state)
     expected = TABLES["recovery: observation in the body frame by hand, expected"]
     assert seen == pytest.approx(expected, abs=1e-12)
     (spec,) = task_of(ID).observation
@@ -134,29 +140,19 @@ def test_the_frame_is_by_default_that_of_the_action(action: str, frame: str) -> 
     with pytest.raises(
         InputError, match=r"^frame: expected 'body' or 'world', or none, got 'nose'"
     ):
-        env_spec(EnvConfig.from_keywords(ID, frame="nose"))
+        spec_with(ID, frame="nose")
 
 
 PLACE = {"position": (0.0, 0.0, 20.0)}
 
 
-@pytest.mark.parametrize(
-    ("change", "terms", "terminated"),
-    TABLES["recovery: outcome by hand"],
-    ids=str,
-)
+@rows_of("recovery: outcome by hand", "change, terms, terminated", ids=str)
 def test_outcome_by_hand(change: dict[str, Any], terms: dict[str, float], terminated: bool) -> None:
     outcome = begun().outcome(state_of(**{**PLACE, **change}))
-    for name, value in terms.items():
-        assert outcome.reward[name] == pytest.approx(value, abs=1e-12)
-    assert outcome.terminated == terminated
+    check_outcome(outcome, terms, terminated)
 
 
-@pytest.mark.parametrize(
-    ("change", "recovered"),
-    TABLES["what is recovered"],
-    ids=str,
-)
+@rows_of("what is recovered", "change, recovered", ids=str)
 def test_what_is_recovered(change: dict[str, Any], recovered: bool) -> None:
     outcome = begun().outcome(state_of(**{**PLACE, **change}))
     assert outcome.metrics["recovered"] == recovered

@@ -11,7 +11,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from contracts import TABLES
+from contracts import everyone, rows_of, spec_with, zero_actions
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 from peers import ANY, Running
@@ -19,7 +19,6 @@ from relay import FaultConfig, relaying
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.parallel import LocalParallelEnv
-from rotorgram.envs.registry import env_spec
 from rotorgram.models import InputError
 from rotorgram.models.cameras import chosen_views
 from rotorgram.models.vehicle import Vehicle
@@ -45,7 +44,7 @@ def test_the_checker_of_gymnasium(opengl: None) -> None:
 
 
 def test_a_spec_tells_of_pictures() -> None:
-    spec = env_spec(EnvConfig.from_keywords(LANDING, cameras=[EYES]))
+    spec = spec_with(LANDING, cameras=[EYES])
     down, depth, objects = spec.observation[1:]
     assert objects.categories == ("nothing", "scene/floor", "drone_0", "task/disc_0 of drone_0")
     assert down.categories == ()
@@ -53,7 +52,7 @@ def test_a_spec_tells_of_pictures() -> None:
     assert down.frame.endswith("m in the body, looks along (0 0 -1), 90 degrees high")
     assert spec.options["cameras"] == EYES.split(",")
     assert type(spec).from_json(spec.to_json()) == spec
-    assert "cameras" not in env_spec(EnvConfig(env_id=LANDING)).options
+    assert "cameras" not in spec_with(LANDING).options
 
 
 def test_the_flight_is_that_without_cameras(opengl: None) -> None:
@@ -97,11 +96,7 @@ def test_drones_of_one_world_see_each_other(opengl: None) -> None:
         LocalParallelEnv("rotorgram/Formation-v0", drones=3, cameras=words, formation="line")
     ) as env:
         seen = env.reset(seed=2)[0]
-        names = env_spec(
-            EnvConfig.from_keywords(
-                "rotorgram/Formation-v0", cameras=[words], vehicle=None, drones=3
-            )
-        )
+        names = spec_with("rotorgram/Formation-v0", cameras=[words], vehicle=None, drones=3)
         objects = names.observation[1].categories
         assert {f"drone_{i}" for i in range(3)} < {*objects}
         assert env.observation_space("drone_1")["front_segmentation"].shape == (48, 48, 1)
@@ -130,7 +125,7 @@ def test_pictures_of_the_backend_rigid(opengl: None) -> None:
         with closing(Cameras(craft, views, (2, 1))) as cameras:
             names = "position", "quaternion"
             state = {k: np.asarray(getattr(told, k)).reshape(2, -1) for k in names}
-            cameras.take({"down": np.ones(2, bool)}, state)
+            cameras.take({"down": everyone(2)}, state)
             assert (pictures == cameras.pictures["down"]).all()
             assert len(np.unique(pictures)) > 20
 
@@ -142,12 +137,9 @@ def test_each_episode_has_a_world_of_its_own(opengl: None) -> None:
         "action": "velocity", "episode_length": 2,
     }  # fmt: skip
     seeds = [3, 4, 5, 6]
-    still = np.zeros((4, 4), np.float32)
+    still = zero_actions(4, 4)
     with closing(LocalVectorEnv(HOVER, 4, autoreset_mode="Disabled", **options)) as env:
-        assert (
-            env.env_spec.observation
-            == env_spec(EnvConfig.from_keywords(HOVER, **options)).observation
-        )
+        assert env.env_spec.observation == spec_with(HOVER, **options).observation
         names = env.env_spec.observation[2].categories
         first = env.reset(seed=seeds)[0]
         second = env.step(still)[0]
@@ -189,13 +181,10 @@ def test_a_simulator_that_cannot_draw_says_so_before_it_greets() -> None:
             agent.recv(9)
 
 
-@pytest.mark.parametrize(
-    ("options", "sentence"),
-    TABLES["wrong options"],
-)
+@rows_of("wrong options", "options, sentence")
 def test_wrong_options(options: dict[str, Any], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
-        env_spec(EnvConfig.from_keywords(HOVER, **options))
+        spec_with(HOVER, **options)
 
 
 def test_words_may_come_one_by_one() -> None:

@@ -6,12 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from contracts import TABLES
+from contracts import TABLES, on_both_tasks, rows_of, spec_with
 from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rotorgram.envs.config import EnvConfig
-from rotorgram.envs.registry import env_spec
 from rotorgram.envs.spaces import action_space, info_columns, observation_space
 from rotorgram.envs.spec import (
     ArraySpec,
@@ -45,7 +43,7 @@ def spec_of(**rest: Any) -> EnvSpec:
 
 
 def test_the_elevation_env_by_hand() -> None:
-    spec = env_spec(EnvConfig.from_keywords(ID, target=(4, 8)))
+    spec = spec_with(ID, target=(4, 8))
     assert spec.env_id == ID
     assert spec.control_period == 0.02
     assert spec.agents == ("drone_0",)
@@ -68,7 +66,7 @@ def test_the_elevation_env_by_hand() -> None:
 
 
 def test_the_hover_env_by_hand() -> None:
-    spec = env_spec(EnvConfig(env_id=HOVER))
+    spec = spec_with(HOVER)
     assert spec.observation[0].shape == (19,)
     assert spec.action == ArraySpec(
         name="action", shape=(4,), low=-1.0, high=1.0, components=("F1", "F2", "F3", "F4")
@@ -77,9 +75,9 @@ def test_the_hover_env_by_hand() -> None:
     assert spec.telemetry[-1].unit == ("m", "deg")
 
 
-@pytest.mark.parametrize("env_id", [ID, HOVER])
+@on_both_tasks
 def test_json_there_and_back(env_id: str) -> None:
-    spec = env_spec(EnvConfig(env_id=env_id))
+    spec = spec_with(env_id)
     text = spec.to_json()
     assert EnvSpec.from_json(text) == spec
     assert EnvSpec.from_json(text).to_json() == text
@@ -217,9 +215,7 @@ def refused(kind: str, fields: dict[str, Any], sentence: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("kind", "fields", "sentence"), TABLES["what makes no sense is one sentence"]
-)
+@rows_of("what makes no sense is one sentence", "kind, fields, sentence")
 def test_what_makes_no_sense_is_one_sentence(
     kind: str, fields: dict[str, Any], sentence: str
 ) -> None:
@@ -242,7 +238,7 @@ def test_a_short_spec_cannot_ask_for_much_memory() -> None:
         spec_of(telemetry=arrays[:1])
 
 
-GOOD = json.loads(env_spec(EnvConfig(env_id=HOVER)).to_json())
+GOOD = json.loads(spec_with(HOVER).to_json())
 JSON = st.recursive(
     st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=9)),
     lambda inner: st.one_of(
@@ -294,7 +290,7 @@ def test_text_that_is_no_spec(text: str) -> None:
         EnvSpec.from_json(text)
 
 
-@pytest.mark.parametrize("period", TABLES["no control period"])
+@rows_of("no control period", "period")
 def test_a_control_period_and_what_follows_that_is_no_spec(period: str) -> None:
     text = spec_of().to_json()
     assert PERIOD in text

@@ -2,18 +2,18 @@
 
 import numpy as np
 import pytest
-from rotorgram.envs.config import EnvConfig
+from contracts import everyone, loop_of, zero_actions
 from rotorgram.envs.loop import Loop
 from rotorgram.models import InputError
 from swarms import RISE
 
-HOVER = np.zeros((2, 1), np.float32)
+HOVER = zero_actions(2)
 
 
 def begun(worlds: int = 1, drones: int = 2, **options: int) -> Loop:
-    loop = Loop(EnvConfig.from_keywords(RISE, drones=drones, **options), worlds)
+    loop = loop_of(RISE, worlds, drones=drones, **options)
     rows = worlds * drones
-    loop.advance(np.zeros((rows, 1), np.float32), np.ones(rows, bool), range(rows))
+    loop.advance(zero_actions(rows), everyone(rows), range(rows))
     return loop
 
 
@@ -51,7 +51,7 @@ def test_one_that_ends_is_out_and_the_others_fly_on() -> None:
     assert loop.telemetry["thrust"][0].tolist() == [0.0] * 4
     with pytest.raises(Exception, match="reset"):
         loop.advance(up)
-    loop.advance(up, np.ones(2, bool))
+    loop.advance(up, everyone(2))
     assert not (loop.out | loop.done).any()
 
 
@@ -82,4 +82,4 @@ def test_half_a_world_cannot_be_reset_or_frozen() -> None:
 def test_a_task_that_is_flown_alone_refuses_more() -> None:
     expected = "drones: expected 1 with rotorgram/Hover-v0, got 2"
     with pytest.raises(InputError, match=expected):
-        Loop(EnvConfig.from_keywords("rotorgram/Hover-v0", drones=2))
+        loop_of("rotorgram/Hover-v0", drones=2)

@@ -5,14 +5,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from contracts import spec_with, zero_actions
 from pettingzoo.test import parallel_api_test, parallel_seed_test
 from rotorgram.agents import Orca
 from rotorgram.agents.orca import avoiding, nearest
 from rotorgram.envs import LocalVectorEnv
-from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.memory import Memory
 from rotorgram.envs.parallel import LocalParallelEnv
-from rotorgram.envs.registry import env_spec
 from rotorgram.envs.stages.radio import Radio
 from rotorgram.envs.stages.record import Record
 from rotorgram.envs.state import State
@@ -177,12 +176,12 @@ def test_a_crash_ends_the_episode_of_those_that_touch_and_they_fall_silent() -> 
     env.reset(seed=4)
     state = env.loop.world.state
     state.position[0, 1] = state.position[0, 0] + (0.3, 0.0, 0.1)  # one in the other
-    env.advance(np.zeros((3, 4), np.float32))
+    env.advance(zero_actions(3, 4))
     assert env.terminated.tolist() == [True, True, False]
     assert env.done.tolist() == [False] * 3
     assert env.loop.reward_terms["termination"] == pytest.approx([-240, -240, 0])
     for _ in range(60):  # longer than a second
-        env.advance(np.zeros((3, 4), np.float32))
+        env.advance(zero_actions(3, 4))
     there = env.observations.reshape(3, -1)[2, 19:].reshape(7, 7)[:, 6]
     assert not there.any()
 
@@ -194,7 +193,7 @@ def test_the_target_moves_no_faster_than_it_may_and_its_velocity_is_told() -> No
     before = task.target()[0]
     speeds = []
     for _ in range(400):
-        seen, *_ = env.step(np.zeros((2, 4), np.float32))
+        seen, *_ = env.step(zero_actions(2, 4))
         now, velocity = task.target()
         speeds.append(np.linalg.norm(velocity, axis=-1).max())
         assert (now - before) / PERIOD == pytest.approx(velocity, abs=0.1)
@@ -257,9 +256,9 @@ def test_eight_drones_cross_without_touching(crossing: LocalVectorEnv) -> None:
 
 def test_what_orca_cannot_fly_is_one_sentence() -> None:
     with pytest.raises(InputError, match="orca: expected a task for several drones, got"):
-        Orca(env_spec(EnvConfig.from_keywords("rotorgram/Hover-v0", action="velocity")))
+        Orca(spec_with("rotorgram/Hover-v0", action="velocity"))
     with pytest.raises(InputError, match=r"orca: expected actions of the level velocity"):
-        Orca(env_spec(EnvConfig.from_keywords(TASKS[0], action="position")))
+        Orca(spec_with(TASKS[0], action="position"))
 
 
 @pytest.mark.parametrize("height", [4.0, -4.0])

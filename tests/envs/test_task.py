@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from contracts import TABLES
+from contracts import observed, rows_of, spec_with
 from hypothesis import given
 from hypothesis import strategies as st
 from rotorgram.envs.config import EnvConfig
-from rotorgram.envs.registry import env_spec
 from rotorgram.envs.specification import make_task
 from rotorgram.envs.tasks.elevation import ElevationOptions
 from rotorgram.sim import WorldState
@@ -62,7 +61,7 @@ def test_defaults() -> None:
 def test_bounds_by_hand() -> None:
     # 2 * 10.2 * 6 = 122.4; half a period at 10.2 m/s2: 0.102, squared 0.010404.
     # sqrt(122.410404) = 11.06392354; one period more: + 0.204.
-    low, high = env_spec(EnvConfig(env_id=ID)).observation[0].bounds()
+    low, high = spec_with(ID).observation[0].bounds()
     np.testing.assert_allclose(high, [3.2253585, 11.267928, 100 / 49 - 1], rtol=1e-6)
     np.testing.assert_allclose(low, [-3.2253585, -11.267928, -1.0], rtol=1e-6)
 
@@ -80,11 +79,7 @@ def test_float32_bounds_lie_outside_the_float64_ones() -> None:
 # --- arithmetic -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("options", "cases"),
-    TABLES["thrust"],
-    ids=str,
-)
+@rows_of("thrust", "options, cases", ids=str)
 def test_thrust(options: dict[str, Any], cases: list[tuple[float, float, float]]) -> None:
     present, actions, expected = (np.array(column) for column in zip(*cases, strict=True))
     state = state_of(len(cases), thrust=np.repeat(present, 4))
@@ -94,10 +89,7 @@ def test_thrust(options: dict[str, Any], cases: list[tuple[float, float, float]]
     assert np.broadcast_to(thrust, (len(cases), 1, 4)).tolist() == [[[f] * 4] for f in expected]
 
 
-@pytest.mark.parametrize(
-    ("error", "reward"),
-    TABLES["reward"],
-)
+@rows_of("reward", "error, reward")
 def test_reward(error: float, reward: float) -> None:
     state = state_of(2, position=[[0, 0, 5.0 - error]] * 2, touching=[False, True])
     outcome = task_of(2).outcome(state)
@@ -129,8 +121,8 @@ def test_ends_by_hand() -> None:
 
 def test_observation_by_hand() -> None:
     state = state_of(1, position=[0, 0, 4.25], velocity=[1, 2, -0.5], thrust=[73.5] * 4)
-    assert task_of(1).observe(state)["observation"].tolist() == [[[0.75, 0.5, 0.5]]]
-    assert task_of(1, observation="error").observe(state)["observation"].tolist() == [[[0.75]]]
+    assert observed(task_of(1), state).tolist() == [[[0.75, 0.5, 0.5]]]
+    assert observed(task_of(1, observation="error"), state).tolist() == [[[0.75]]]
 
 
 # --- the page ---------------------------------------------------------------------------------
@@ -141,7 +133,7 @@ def test_the_page_tells_the_metrics_of_both_tasks() -> None:
     rows = [line for line in page.splitlines() if re.match(r"\| `\w+-v0` \| `\w+_error`", line)]
     told = []
     for env_id in (ID, "rotorgram/Hover-v0"):
-        for metric in env_spec(EnvConfig(env_id=env_id)).metrics:
+        for metric in spec_with(env_id).metrics:
             bounds = [f"{x:g}" if x else "" for x in (metric.settled, metric.held)]
             told.append((env_id.split("/")[1], metric.name, metric.unit, *bounds))
     cells = [[cell.strip(" `") for cell in row.strip("| ").split("|")] for row in rows]

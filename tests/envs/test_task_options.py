@@ -7,10 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from contracts import TABLES, TASKS
+from contracts import TASKS, rows_of, spec_with
 from rotorgram.envs import registry
-from rotorgram.envs.config import EnvConfig
-from rotorgram.envs.registry import env_spec
 from rotorgram.models.errors import InputError
 from rotorgram.models.fields import Choice, Limits, NumberOrPair, OrNone, Rule, rules_of
 
@@ -74,20 +72,13 @@ def test_numpy_numbers_become_python_numbers() -> None:
     assert kinds == {type(options.to_options()["start_tilt"])} == {float}
 
 
-@pytest.mark.parametrize(
-    ("task", "options", "sentence"),
-    TABLES["options that do not go together"],
-)
+@rows_of("options that do not go together", "task, options, sentence")
 def test_options_that_do_not_go_together(task: str, options: dict[str, Any], sentence: str) -> None:
     with pytest.raises(InputError, match=f"^{sentence}") as caught:
-        env_spec(EnvConfig.from_keywords(f"rotorgram/{task}-v0", **options))
+        spec_with(f"rotorgram/{task}-v0", **options)
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    "options",
-    TABLES["extremes are allowed"],
-    ids=str,
-)
+@rows_of("extremes are allowed", "options", ids=str)
 def test_extremes_are_allowed(options: dict[str, Any]) -> None:
-    env_spec(EnvConfig.from_keywords("rotorgram/Elevation-v0", **options))
+    spec_with("rotorgram/Elevation-v0", **options)

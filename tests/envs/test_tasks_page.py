@@ -13,8 +13,8 @@ from bounds import (
     recovery_bounds,
     waypoints_time,
 )
-from rotorgram.envs.config import EnvConfig
-from rotorgram.envs.registry import env_spec, task_type
+from contracts import spec_with
+from rotorgram.envs.registry import task_type
 from rotorgram.envs.tasks.racing import RacingOptions
 from rotorgram.envs.tasks.recovery import RecoveryOptions
 from rotorgram.envs.tasks.waypoints import WaypointsOptions
@@ -33,7 +33,7 @@ def test_the_table_has_every_task() -> None:
 @pytest.mark.parametrize("vehicle", [None, "heavy_hexa"])
 def test_headline_and_size(name: str, headline: str, size: str, vehicle: str | None) -> None:
     drones = 2 if name == "Cable-v0" else 1
-    spec = env_spec(EnvConfig.from_keywords(f"rotorgram/{name}", vehicle=vehicle, drones=drones))
+    spec = spec_with(f"rotorgram/{name}", vehicle=vehicle, drones=drones)
     assert spec.headline is not None
     assert spec.headline.name == headline
     number, *rotors = size.split(" + ")

@@ -6,12 +6,10 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from contracts import TABLES
+from contracts import rows_of, spec_with
 from remotes import flying
 from rotorgram.cli import main
 from rotorgram.envs import telemetry
-from rotorgram.envs.config import EnvConfig
-from rotorgram.envs.registry import env_spec
 from rotorgram.envs.telemetry import Quantity
 from rotorgram.envs.vector import LocalVectorEnv
 
@@ -20,9 +18,9 @@ USUAL = ["position", "attitude", "velocity", "body_rates", "thrust"]
 BREEZE: dict[str, Any] = {"body_drag": True, "wind": (1.0, -2.0, 0.5)}
 
 
-@pytest.mark.parametrize(("options", "more"), TABLES["what is off has no telemetry"])
+@rows_of("what is off has no telemetry", "options, more")
 def test_what_is_off_has_no_telemetry(options: dict[str, Any], more: list[str]) -> None:
-    spec = env_spec(EnvConfig.from_keywords(HOVER, vehicle="crazyflie2", **options))
+    spec = spec_with(HOVER, vehicle="crazyflie2", **options)
     names = [array.name for array in spec.telemetry]
     assert names == [*USUAL, *more, "goal", "metrics"]
 

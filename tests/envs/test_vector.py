@@ -10,11 +10,10 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from contracts import TABLES
+from contracts import TABLES, everyone, loop_of, on_both_tasks, rows_of, zero_actions
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from mujoco.batch import Batch, SimulationError
-from rotorgram.envs import LocalVectorEnv, Loop
-from rotorgram.envs.config import EnvConfig
+from rotorgram.envs import LocalVectorEnv
 from rotorgram.models.errors import InputError
 from rotorgram.sim import PhysicsError
 from rotorgram.udp import RemoteVectorEnv
@@ -96,7 +95,7 @@ def test_the_number_of_threads_changes_nothing() -> None:
     assert results[0] == results[1] == results[2]
 
 
-@pytest.mark.parametrize("env_id", [ID, HOVER])
+@on_both_tasks
 def test_what_a_step_gives_is_the_callers(env_id: str) -> None:
     env = LocalVectorEnv(env_id, 3, autoreset_mode="SameStep", episode_length=2)
     env.reset(seed=0)
@@ -117,7 +116,7 @@ def test_what_a_step_gives_is_the_callers(env_id: str) -> None:
         np.testing.assert_allclose(second[1], (0.5 - abs(error)) / (0.5 + abs(error)), rtol=1e-6)
 
 
-@pytest.mark.parametrize("env_id", [ID, HOVER])
+@on_both_tasks
 def test_a_mask_resets_some_and_leaves_the_others(env_id: str) -> None:
     env: Any = LocalVectorEnv(env_id, 4, autoreset_mode="Disabled", episode_length=3)
     env.reset(seed=5)
@@ -147,7 +146,7 @@ def test_targets_and_starts_of_ones_own() -> None:
     assert info["z"].tolist() == starts.tolist()
     assert info["goal_z"].tolist() == targets.tolist()
     np.testing.assert_array_equal(observations[:, 0], (targets - starts).astype(np.float32))
-    assert not env.step(np.zeros((3, 1), np.float32))[2].any()
+    assert not env.step(zero_actions(3))[2].any()
     # Without a start, the seed gives how far from the target it is: as with the env's own target.
     plain, _ = env.reset(seed=1)
     observations, info = env.reset(seed=1, options={"target": 50.0})
@@ -171,10 +170,7 @@ def test_wrong_seeds(seed: Any) -> None:
         LocalVectorEnv(ID, 2).reset(seed=seed)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
-    TABLES["wrong arguments"],
-)
+@rows_of("wrong arguments", "arguments, expected")
 def test_wrong_arguments(arguments: dict[str, Any], expected: str) -> None:
     with pytest.raises(InputError, match=f"^{expected}"):
         LocalVectorEnv(ID, **{"num_envs": 2, **arguments})
@@ -199,13 +195,13 @@ def test_wrong_actions_change_nothing(kind: str, actions: np.ndarray, expected: 
 
 def test_a_step_before_a_reset() -> None:
     with pytest.raises(gym.error.ResetNeeded):
-        LocalVectorEnv(ID, 2).step(np.zeros((2, 1), np.float32))
+        LocalVectorEnv(ID, 2).step(zero_actions(2))
 
 
 def test_a_bad_state_raises_and_a_reset_mends_it() -> None:
-    loop = Loop(EnvConfig(env_id=ID), 3)
-    still = np.zeros((3, 1), np.float32)
-    every = np.ones(3, bool)
+    loop = loop_of(ID, 3)
+    still = zero_actions(3)
+    every = everyone(3)
     loop.advance(still, every, [0, 1, 2])
     before = loop.observations["observation"].copy()
     loop.world.state.velocity[1, 0, 2] = 1e12
@@ -220,14 +216,14 @@ def test_a_bad_state_raises_and_a_reset_mends_it() -> None:
 
 def test_an_error_of_the_physics_leaves_no_warnings(monkeypatch: pytest.MonkeyPatch) -> None:
     """Env 1 goes bad in the call in which MuJoCo fails in env 0."""
-    loop = Loop(EnvConfig(env_id=ID), 2)
+    loop = loop_of(ID, 2)
     step = Batch.step
 
     def failing(batch: Any, *arguments: Any, **named: Any) -> None:
         step(batch, *arguments, **named)
         raise SimulationError(np.array([0]), "out of memory")
 
-    still = np.zeros((2, 1), np.float32)
+    still = zero_actions(2)
     first = np.array([True, False])
     loop.advance(still, first | True, [0, 1])
     loop.world.state.velocity[1, 0, 2] = 1e12
@@ -251,7 +247,7 @@ def test_tilted_drones_cost_what_level_ones_do() -> None:
     best = dict.fromkeys(envs, float("inf"))
     for env in envs.values():
         env.reset(seed=0)
-    actions = np.zeros((1024, 4), np.float32)
+    actions = zero_actions(1024, 4)
     for _ in range(8):
         for tilt, env in envs.items():
             begun = time.perf_counter()
@@ -273,7 +269,7 @@ def test_a_closed_env_says_so(num_envs: int) -> None:
     before = env.telemetry["position"].copy()
     env.close()
     env.close()
-    for call in (env.reset, lambda: env.step(np.zeros((num_envs, 1), np.float32))):
+    for call in (env.reset, lambda: env.step(zero_actions(num_envs))):
         with pytest.raises(gym.error.ClosedEnvironmentError, match="expected an open env"):
             call()
     assert env.telemetry["position"].tobytes() == before.tobytes()
@@ -300,7 +296,7 @@ def test_threads_do_not_follow_into_a_fork() -> None:
     """A child has no thread that would step its drones: it is told, and does not wait for them."""
     vector = gym.make_vec(ID, num_envs=2, num_threads=2)
     vector.reset(seed=1)
-    action = np.zeros((2, 1), np.float32)
+    action = zero_actions(2)
     vector.step(action)
     child = os.fork()
     if child == 0:

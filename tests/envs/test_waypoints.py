@@ -4,16 +4,14 @@ import math
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 import pytest
-from contracts import TABLES
+from contracts import GOAL_OFFSET, NOW, TABLES, observed, rows_of
 from pilot import Pilot, fly, limited
 from rotorgram.models import Vehicle
 
 from flights import Shares, state_of, task_of
 
 ID = "rotorgram/Waypoints-v0"
-NOW = np.bool_(True)
 
 
 def begun(*places: tuple[float, float, float], **options: Any) -> Any:
@@ -45,15 +43,15 @@ def test_starts_and_points_by_hand() -> None:
 def test_observation_by_hand() -> None:
     task = begun(MIDDLE, EAST, ABOVE)  # at (0, 0, 5), to (3, 0, 5) and (3, 0, 6.5)
     state = state_of(position=(1.0, -1.0, 4.0), velocity=(1.0, 2.0, 3.0))
-    seen = task.observe(state)["observation"]
+    seen = observed(task, state)
     expected = TABLES["waypoints: observation by hand, expected"]
     assert seen == pytest.approx(expected)
     (spec,) = task.observation
-    assert spec.components[:3] == ("goal - position x", "goal - position y", "goal - position z")
+    assert spec.components[:3] == GOAL_OFFSET
     assert spec.components[-1] == "point after - position z"
     assert spec.bounds()[1][0] == pytest.approx(2 * math.hypot(6.0, 6.0, 4.5))
     moved(task, 3.0, 0.0, 5.0)  # the last point is also the one after it
-    seen = task.observe(state_of(position=(3.0, 0.0, 6.0)))["observation"]
+    seen = observed(task, state_of(position=(3.0, 0.0, 6.0)))
     assert seen[[0, 1, 2, -3, -2, -1]] == pytest.approx([0, 0, 0.5, 0, 0, 0.5])
 
 
@@ -79,10 +77,7 @@ def test_progress_and_passing_by_hand() -> None:
     assert outcome.reward["termination"] == 0.0
 
 
-@pytest.mark.parametrize(
-    ("place", "rest", "ends"),
-    TABLES["waypoints: ends"],
-)
+@rows_of("waypoints: ends", "place, rest, ends")
 def test_ends(place: tuple[float, float, float], rest: dict[str, Any], ends: bool) -> None:
     task = begun(MIDDLE, (0.0, 0.0, 0.0), ABOVE)
     outcome = moved(task, *place, **rest)

@@ -10,11 +10,10 @@ import numpy as np
 import pandas as pd
 import pytest
 import rotorgram.envs  # noqa: F401
-from contracts import TABLES
+from contracts import TABLES, rows_of, spec_with
 from rotorgram.cli import main
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.memory import Memory
-from rotorgram.envs.registry import env_spec
 from rotorgram.envs.stages.actions import ActionDelay
 from rotorgram.envs.stages.record import Record
 from rotorgram.models.errors import InputError
@@ -118,11 +117,11 @@ def test_options_that_are_on_move_no_other_draw() -> None:
 
 
 def test_without_them_nothing_is_told_of_them() -> None:
-    spec = env_spec(EnvConfig(env_id=HOVER))
+    spec = spec_with(HOVER)
     assert "effects" not in spec.options
     assert "randomize" not in spec.options
     assert "drawn" not in [array.name for array in spec.telemetry]
-    told = env_spec(EnvConfig.from_keywords(HOVER, **WORLD, vehicle=str(RACER)))
+    told = spec_with(HOVER, **WORLD, vehicle=str(RACER))
     assert told.options["effects"]["wind"] == [0.5, 0.0, 0.0]
     assert told.options["randomize"]["observation_delay"] == 1
     drawn = next(array for array in told.telemetry if array.name == "drawn")
@@ -188,10 +187,7 @@ def test_files_of_a_comparison_tell_what_was_drawn(tmp_path: Path) -> None:
         assert drawn.nunique() > 1
 
 
-@pytest.mark.parametrize(
-    ("options", "sentence"),
-    TABLES["a wrong one gives one sentence"],
-)
+@rows_of("a wrong one gives one sentence", "options, sentence")
 def test_a_wrong_one_gives_one_sentence(options: dict[str, Any], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence) as raised:
         gym.make(HOVER, **{"vehicle": str(RACER), **options})
