@@ -7,7 +7,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from contracts import GOAL_OFFSET, NOW, TABLES, observed
+from contracts import GOAL_OFFSET, NOW, TABLES, observed, rows_of
 from pilot import Pilot, fly, limited
 from rotorgram.envs.tasks.tracking import snap_basis
 from rotorgram.models import Vehicle
@@ -25,18 +25,23 @@ def begun(share: float = 0.0, **options: Any) -> Any:
     return task
 
 
+def goal_after(task: Any, steps: int) -> Any:
+    state = state_of()
+    for _ in range(steps):
+        task.update_memory(state)
+    return task.goal(state)
+
+
 def test_a_circle_by_hand() -> None:
     """2 m in 10 s: after a quarter it is at the top, as fast as 2 π 2 m / 10 s."""
     task = task_of(ID, center=(1.0, 2.0, 6.0))
     pose = task.begin(NOW, Shares(0.25, (1.0, 0.5, 0.5)))
     assert pose.position == pytest.approx([1.3, 4.0, 6.0], abs=1e-9)  # 0.3 m aside
     assert pose.velocity == pytest.approx([-0.4 * math.pi, 0.0, 0.0], abs=1e-9)
-    for _ in range(125):  # another quarter
-        task.update_memory(state_of())
-    assert task.goal(state_of()) == pytest.approx([-1.0, 2.0, 6.0])
-    for _ in range(375):  # and round
-        task.update_memory(state_of())
-    assert task.goal(state_of()) == pytest.approx([1.0, 4.0, 6.0])
+    another_quarter = goal_after(task, 125)
+    assert another_quarter == pytest.approx([-1.0, 2.0, 6.0])
+    around = goal_after(task, 375)
+    assert around == pytest.approx([1.0, 4.0, 6.0])
 
 
 def test_a_lemniscate_by_hand() -> None:
@@ -45,7 +50,9 @@ def test_a_lemniscate_by_hand() -> None:
     assert task.goal(state_of()) == pytest.approx([math.sqrt(2), 1.0, 5.0])
     table = task._table
     step = 0.02
-    assert task._rates[1:-1] == pytest.approx((table[2:] - table[:-2]) / (2 * step), abs=1e-4)
+    way = table[2:] - table[:-2]
+    inner_rates = task._rates[1:-1]
+    assert inner_rates == pytest.approx(way / (2 * step), abs=1e-4)
 
 
 def test_observation_by_hand() -> None:
@@ -60,7 +67,8 @@ def test_observation_by_hand() -> None:
 
 
 def test_reward_and_metrics_by_hand() -> None:
-    outcome = begun().outcome(state_of(position=(2.0, 1.5, 5.0), body_rates=(3.0, 0.0, 4.0)))
+    state = state_of(position=(2.0, 1.5, 5.0), body_rates=(3.0, 0.0, 4.0))
+    outcome = begun().outcome(state)
     assert outcome.reward["position"] == pytest.approx(-0.5)
     assert outcome.reward["rates"] == pytest.approx(-0.1)
     assert outcome.metrics["tracking_error"] == pytest.approx(1.5)
@@ -68,26 +76,22 @@ def test_reward_and_metrics_by_hand() -> None:
     assert not outcome.terminated
 
 
-@pytest.mark.parametrize(
-    ("state", "ends"),
-    [
-        ({"position": (4.99, 0.0, 5.0)}, False),
-        ({"position": (5.01, 0.0, 5.0)}, True),
-    ],
-)
+@rows_of("tracking: ends", "state, ends")
 def test_ends(state: dict[str, Any], ends: bool) -> None:
-    outcome = begun().outcome(state_of(**{"position": (2.0, 0.0, 5.0), **state}))
+    outcome = begun().outcome(state_of(**state))
     assert bool(outcome.terminated) == ends
-    assert outcome.reward["termination"] == pytest.approx(-140.0 if ends else 0.0)
+    assert outcome.reward["termination"] == pytest.approx(-140.0 * ends)
 
 
 def test_minimum_snap_from_rest_to_rest() -> None:
     """Between two points it is 35 τ⁴ - 84 τ⁵ + 70 τ⁶ - 20 τ⁷; half of the way at half the time."""
     times = np.linspace(0.0, 1.0, 11)
     share = 35 * times**4 - 84 * times**5 + 70 * times**6 - 20 * times**7
-    assert snap_basis(2, times) == pytest.approx(np.column_stack((1 - share, share)), abs=1e-9)
+    shares = np.column_stack((1 - share, share))
+    assert snap_basis(2, times) == pytest.approx(shares, abs=1e-9)
     rate = 140 * times**3 - 420 * times**4 + 420 * times**5 - 140 * times**6
-    assert snap_basis(2, times, 1)[:, 1] == pytest.approx(rate, abs=1e-8)
+    rates = snap_basis(2, times, 1)
+    assert rates[:, 1] == pytest.approx(rate, abs=1e-8)
 
 
 @pytest.mark.parametrize("points", [3, 5, 16])
@@ -96,14 +100,18 @@ def test_minimum_snap_through_points(points: int) -> None:
     assert snap_basis(points, knots) == pytest.approx(np.eye(points), abs=1e-6)
     ends = np.array([0.0, 1.0])
     for order in (1, 2, 3):
-        assert np.abs(snap_basis(points, ends, order)).max() < 1e-4 * points**order
+        at_ends = snap_basis(points, ends, order)
+        assert np.abs(at_ends).max() < 1e-4 * points**order
     # Six derivatives are continuous, and points on a line of any place add up to 1.
     inner = knots[1:-1]
     little = 1e-9
     for order in range(7):
-        before, after = (snap_basis(points, inner + side, order) for side in (-little, little))
+        before = snap_basis(points, inner - little, order)
+        after = snap_basis(points, inner + little, order)
         assert before == pytest.approx(after, abs=1e-4 * points ** (order + 1))
-    assert snap_basis(points, np.linspace(0, 1, 37)).sum(axis=1) == pytest.approx(1.0, abs=1e-6)
+    times = np.linspace(0, 1, 37)
+    total = snap_basis(points, times).sum(axis=1)
+    assert total == pytest.approx(1.0, abs=1e-6)
 
 
 def test_nothing_snaps_less() -> None:
@@ -112,10 +120,14 @@ def test_nothing_snaps_less() -> None:
     points = np.array([0.0, 1.0, -0.5])
     snap = snap_basis(3, times, 4) @ points
     # A bump that is 0 at 0, 1/2 and 1 with four derivatives at the ends: (τ (1 - τ))⁵ (τ - 1/2).
-    bump = np.polynomial.Polynomial([0, 1, -1]) ** 5 * np.polynomial.Polynomial([-0.5, 1])
+    ends = np.polynomial.Polynomial([0, 1, -1])
+    middle = np.polynomial.Polynomial([-0.5, 1])
+    bump = ends**5 * middle
     change = bump.deriv(4)(times)
-    sizes = (np.trapezoid(values**2, times) for values in (snap, change))
-    assert abs(np.trapezoid(snap * change, times)) < 1e-4 * math.sqrt(math.prod(sizes))
+    snap_size = np.trapezoid(snap**2, times)
+    change_size = np.trapezoid(change**2, times)
+    product = np.trapezoid(snap * change, times)
+    assert abs(product) < 1e-4 * math.sqrt(snap_size * change_size)
 
 
 def test_a_snap_by_hand() -> None:
@@ -124,10 +136,8 @@ def test_a_snap_by_hand() -> None:
     pose = task.begin(NOW, Shares(0.0, (0.0, 0.5, 0.5), (1.0, 1.0, 1.0), HALF))
     assert pose.position == pytest.approx([-2.0, 0.0, 5.0])
     assert pose.velocity == pytest.approx([0.0, 0.0, 0.0], abs=1e-9)
-    for steps, place in ((200, (0.0, 1.0, 5.5)), (200, (2.0, 2.0, 6.0)), (100, (2.0, 2.0, 6.0))):
-        for _ in range(steps):
-            task.update_memory(state_of())
-        assert task.goal(state_of()) == pytest.approx(place, abs=1e-6)
+    for steps, place in TABLES["tracking: a snap by hand, steps and places"]:
+        assert goal_after(task, steps) == pytest.approx(place, abs=1e-6)
 
 
 def test_a_file_without_a_column_is_told_its_name(tmp_path: Path) -> None:
@@ -148,16 +158,11 @@ def test_a_file_crosses_the_wire(tmp_path: Path) -> None:
     pose = task.begin(NOW, Shares(0.0, HALF))
     assert pose.position.tolist() == [0.0, 0.0, 5.0]
     assert pose.velocity == pytest.approx([1.0, 0.0, 0.0])
-    for steps, place in ((25, (0.5, 0.0, 5.0)), (75, (1.0, 1.0, 5.5)), (200, (1.0, 2.0, 6.0))):
-        for _ in range(steps):
-            task.update_memory(state_of())
-        assert task.goal(state_of()) == pytest.approx(place)
+    for steps, place in TABLES["tracking: a file, steps and places"]:
+        assert goal_after(task, steps) == pytest.approx(place)
 
 
-@pytest.mark.parametrize(
-    ("trajectory", "name"),
-    [("circle", None), ("lemniscate", None), ("snap", None), ("lemniscate", "crazyflie2")],
-)
+@rows_of("tracking: a pilot flies it", "trajectory, name")
 def test_a_pilot_flies_it(trajectory: str, name: str | None) -> None:
     """Without feed-forward of the acceleration."""
     vehicle = Vehicle.load(name)
@@ -165,7 +170,8 @@ def test_a_pilot_flies_it(trajectory: str, name: str | None) -> None:
     first = 15 + vehicle.num_rotors
 
     def wanted(seen: np.ndarray) -> np.ndarray:
-        speed = limited(2.0 * seen[:, :3], 2.0) + seen[:, first : first + 3]
+        reference = seen[:, first : first + 3]
+        speed = limited(2.0 * seen[:, :3], 2.0) + reference
         return 3.0 * (speed - seen[:, 3:6])
 
     metrics = fly(env, Pilot(vehicle), wanted, 3)
