@@ -4,6 +4,7 @@ import math
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import pytest
 from contracts import GOAL_OFFSET, NOW, TABLES, observed, rows_of
 from pilot import Pilot, fly, limited
@@ -49,20 +50,25 @@ def test_observation_by_hand() -> None:
     (spec,) = task.observation
     assert spec.components[:3] == GOAL_OFFSET
     assert spec.components[-1] == "point after - position z"
-    assert spec.bounds()[1][0] == pytest.approx(2 * math.hypot(6.0, 6.0, 4.5))
+    _, high = spec.bounds()
+    diagonal = math.hypot(6.0, 6.0, 4.5)
+    assert high[0] == pytest.approx(2 * diagonal)
     moved(task, 3.0, 0.0, 5.0)  # the last point is also the one after it
     seen = observed(task, state_of(position=(3.0, 0.0, 6.0)))
-    assert seen[[0, 1, 2, -3, -2, -1]] == pytest.approx([0, 0, 0.5, 0, 0, 0.5])
+    assert seen[:3] == pytest.approx([0, 0, 0.5])
+    assert seen[-3:] == pytest.approx([0, 0, 0.5])
 
 
 def test_progress_and_passing_by_hand() -> None:
     task = begun(MIDDLE, EAST, ABOVE, radius=0.5)
     outcome = moved(task, 1.0, 0.0, 5.0, body_rates=(3.0, 0.0, 4.0))
-    assert {name: float(value) for name, value in outcome.reward.items()} == pytest.approx(
-        {"progress": 1.0, "passing": 0.0, "rates": -0.01, "termination": 0.0}
-    )
-    assert moved(task, 0.5, 0.0, 5.0).reward["progress"] == pytest.approx(-0.5)
-    assert moved(task, 2.5, 0.0, 5.0).metrics["points_left"] == 2  # 0.5 m away is not nearer
+    expected = {"progress": 1.0, "passing": 0.0, "rates": -0.01, "termination": 0.0}
+    told = {name: float(value) for name, value in outcome.reward.items()}
+    assert told == pytest.approx(expected)
+    outcome = moved(task, 0.5, 0.0, 5.0)
+    assert outcome.reward["progress"] == pytest.approx(-0.5)
+    outcome = moved(task, 2.5, 0.0, 5.0)
+    assert outcome.metrics["points_left"] == 2  # 0.5 m away is not nearer
     outcome = moved(task, 2.6, 0.0, 5.0, time=0.08)
     assert outcome.reward["progress"] == pytest.approx(0.1)
     assert outcome.reward["passing"] == 1.0
@@ -71,7 +77,8 @@ def test_progress_and_passing_by_hand() -> None:
     assert not outcome.terminated
     # The way to the next point counts from here: to (3, 0, 6.5) it was hypot(0.4, 1.5).
     outcome = moved(task, 3.0, 0.0, 6.4)
-    assert outcome.reward["progress"] == pytest.approx(math.hypot(0.4, 1.5) - 0.1)
+    whole = math.hypot(0.4, 1.5)
+    assert outcome.reward["progress"] == pytest.approx(whole - 0.1)
     assert outcome.metrics["points_left"] == 0
     assert outcome.terminated
     assert outcome.reward["termination"] == 0.0
@@ -82,14 +89,19 @@ def test_ends(place: tuple[float, float, float], rest: dict[str, Any], ends: boo
     task = begun(MIDDLE, (0.0, 0.0, 0.0), ABOVE)
     outcome = moved(task, *place, **rest)
     assert bool(outcome.terminated) == ends
-    assert outcome.reward["termination"] == pytest.approx(-5.0 if ends else 0.0)
+    assert outcome.reward["termination"] == pytest.approx(-5.0 * ends)
 
 
 @pytest.mark.parametrize("name", [None, "crazyflie2"])
 def test_a_pilot_flies_it(name: str | None) -> None:
     env = gym.make_vec(ID, 8, vehicle=name, autoreset_mode="Disabled")
     pilot = Pilot(Vehicle.load(name))
-    metrics = fly(env, pilot, lambda seen: 2 * (limited(2 * seen[:, :3], 2.0) - seen[:, 3:6]), 3)
+
+    def wanted(seen: np.ndarray) -> np.ndarray:
+        speed = limited(2 * seen[:, :3], 2.0)
+        return 2 * (speed - seen[:, 3:6])
+
+    metrics = fly(env, pilot, wanted, 3)
     left, time = metrics[-1].T
     assert left.tolist() == [0.0] * 8
     assert time.max() < 15.0
