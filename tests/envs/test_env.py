@@ -13,7 +13,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from contracts import TABLES, everyone, loop_of, on_both_tasks, spec_with, zero_actions
+from contracts import TABLES, everyone, loop_of, on_both_tasks, rows_of, spec_with, zero_actions
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
@@ -80,7 +80,8 @@ class Flight:
 
     @property
     def ends(self) -> tuple[bool, bool]:
-        return bool(self.loop.terminated[0]), bool(self.loop.truncated[0])
+        loop = self.loop
+        return bool(loop.terminated[0]), bool(loop.truncated[0])
 
     def fly_out(self, action: float) -> int:
         """Steps until the episode is over."""
@@ -101,20 +102,25 @@ def test_contract(env_id: str, options: dict[str, Any]) -> None:
     observation, info = env.reset(seed=1)
     spec = env.env_spec
     telling = [name for array in spec.telemetry for name in array.components]
-    assert list(info)[: len(telling)] == telling
-    assert all(type(value) is float for value in info.values())
-    assert {metric.name for metric in spec.metrics} <= set(info)
+    told = list(info)
+    assert told[: len(telling)] == telling
+    types = {type(value) for value in info.values()}
+    assert types == {float}
+    metrics = {metric.name for metric in spec.metrics}
+    assert metrics <= set(info)
     assert env.control_period == spec.control_period
     assert spec == spec_with(env_id, **options)
     before = observation.copy()
-    env.step(env.action_space.sample())
+    action = env.action_space.sample()
+    env.step(action)
     assert observation.tobytes() == before.tobytes()  # nobody else's memory
 
 
 def test_stable_baselines_accepts_them() -> None:
     checker = pytest.importorskip("stable_baselines3.common.env_checker")
     for env_id in (ID, HOVER):
-        checker.check_env(_env(env_id))
+        env = _env(env_id)
+        checker.check_env(env)
 
 
 def test_module_prefix_needs_no_import_and_importing_loads_no_simulator() -> None:
@@ -136,7 +142,9 @@ def test_options_through_make() -> None:
     env.reset(seed=1)
     assert env.observation_space.shape == (1,)
     assert env.env_spec.options["target"] == 6.0
-    assert [env.step(_a(0))[3] for _ in range(3)] == [False, False, True]
+    steps = [env.step(_a(0)) for _ in range(3)]
+    truncated = [step[3] for step in steps]
+    assert truncated == [False, False, True]
     with pytest.raises(
         InputError, match=r"^options: expected some of .*target.*, got an .* 'targt'"
     ):
@@ -150,33 +158,49 @@ def test_options_through_make() -> None:
 
 
 def test_frames_per_second_follow_the_control_period() -> None:
-    assert _env().metadata["render_fps"] == 50
-    assert _env(control_period=0.1).metadata["render_fps"] == 10
+    usual = _env()
+    assert usual.metadata["render_fps"] == 50
+    slow = _env(control_period=0.1)
+    assert slow.metadata["render_fps"] == 10
 
 
 def _table(heading: str) -> list[list[str]]:
-    text = (inspect.getdoc(Elevation) or "").split(f"## {heading}")[1].split("\n## ")[0]
-    rows = [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("| ")]
-    return [[cell.strip() for cell in row] for row in rows]
+    text = inspect.getdoc(Elevation) or ""
+    _, after = text.split(f"## {heading}")
+    section, *_ = after.split("\n## ")
+    rows = []
+    for line in section.splitlines():
+        if line.startswith("| "):
+            cells = line.strip("| ").split(" | ")
+            rows.append([cell.strip() for cell in cells])
+    return rows
 
 
 def test_docstring_tables_agree_with_the_spaces() -> None:
     space: Any = _env().observation_space
     header, *rows = _table("Observation")
     assert header == ["index", "quantity", "unit", "bounds"]
-    assert [row[0] for row in rows] == [str(i) for i in range(space.shape[0])]
-    assert [row[2] for row in rows] == list(spec_with(ID).observation[0].unit)
-    for row, low, high in zip(rows, space.low.tolist(), space.high.tolist(), strict=True):
-        bounds = f"-{row[3][1:]} ... {row[3][1:]}" if row[3].startswith("±") else row[3]
-        told = [float(part) for part in bounds.split(" ... ")]
+    indices, _, units, bounds = zip(*rows, strict=True)
+    count = space.shape[0]
+    assert list(indices) == [str(i) for i in range(count)]
+    (observation,) = spec_with(ID).observation
+    assert units == tuple(observation.unit)
+    for text, low, high in zip(bounds, space.low.tolist(), space.high.tolist(), strict=True):
+        if text.startswith("±"):
+            told = [-float(text[1:]), float(text[1:])]
+        else:
+            told = [float(part) for part in text.split(" ... ")]
         assert told == pytest.approx([low, high], abs=5e-4)
-    for row in _table("Action")[1:3]:
-        kind = _env(action_type=row[0].strip("`")).action_space
-        assert repr(kind).replace(".0", "") == row[1].strip("`")
-    for mode, formula in _table("Action")[4:6]:
+    actions = _table("Action")
+    for kind, told_space, *_ in actions[1:3]:
+        env = _env(action_type=kind.strip("`"))
+        text = repr(env.action_space)
+        assert text.replace(".0", "") == told_space.strip("`")
+    for mode, formula in actions[4:6]:
         flight = Flight(5.0, action=mode.strip("`"))
         flight.step(1.0)
-        newtons = float(re.findall(r"(\d+) a", formula)[0])
+        numbers = re.findall(r"(\d+) a", formula)
+        newtons = float(numbers[0])
         assert flight.loop.telemetry["thrust"].tolist() == [[49.0 + newtons] * 4]
 
 
@@ -186,21 +210,25 @@ def test_docstring_tables_agree_with_the_spaces() -> None:
 @pytest.mark.parametrize(("mode", "newtons"), [("increment", 5.0), ("offset", 20.0)])
 def test_discrete_actions_fly_as_the_continuous_ones(mode: str, newtons: float) -> None:
     for index, action in enumerate((-1.0, 0.0, 1.0)):
-        few, many = (_env(action=mode, action_type=k) for k in ("discrete", "continuous"))
+        few = _env(action=mode, action_type="discrete")
+        many = _env(action=mode, action_type="continuous")
         few.reset(seed=3)
         many.reset(seed=3)
         one = few.step(np.int64(index))
         other = many.step(_a(action))
         assert one[0].tobytes() == other[0].tobytes()
         assert one[1:] == other[1:]
-        assert one[4]["F1"] == one[4]["F4"] == 49.0 + newtons * action
+        info = one[4]
+        assert info["F1"] == 49.0 + newtons * action
+        assert info["F4"] == info["F1"]
 
 
 def test_thrust_is_clipped() -> None:
     env = _env(thrust_scale=30.0, flight_band=4.0)
     env.reset(seed=0)
-    thrusts = [env.step(_a(a))[4]["F3"] for a in (1, 1, 0, -1, -1, -1, -1)]
-    assert thrusts == [79, 100, 100, 70, 40, 10, 0]
+    for action, thrust in TABLES["thrust is clipped"]:
+        *_, info = env.step(_a(action))
+        assert info["F3"] == thrust
 
 
 COMPLEX = ("continuous", [1j], r"expected an array .* of real numbers, got \[1j\]")
@@ -210,9 +238,10 @@ COMPLEX = ("continuous", [1j], r"expected an array .* of real numbers, got \[1j\
     ("kind", "action", "sentence"), [*TABLES["a wrong action changes nothing"], COMPLEX]
 )
 def test_a_wrong_action_changes_nothing(kind: str, action: Any, sentence: str) -> None:
-    env, twin = (_env(action_type=kind) for _ in range(2))
-    for one in (env, twin):
-        one.reset(seed=5)
+    env = _env(action_type=kind)
+    twin = _env(action_type=kind)
+    env.reset(seed=5)
+    twin.reset(seed=5)
     with pytest.raises(InputError, match=f"^actions?: {sentence}"):
         env.step(action)
     good = 2 if kind == "discrete" else _a(0.3)
@@ -224,9 +253,12 @@ def test_number_types_of_an_action_do_not_matter() -> None:
     for action in (_a(0.1), [0.1], (0.1,), np.array([0.1]), np.array([0.1], ">f8")):
         env = _env()
         env.reset(seed=0)
-        infos.append(env.step(action)[4])
-    assert all(info == infos[0] for info in infos)
-    assert infos[0]["F1"] == 49.0 + 5.0 * float(np.float32(0.1))
+        *_, info = env.step(action)
+        infos.append(info)
+    first = infos[0]
+    assert infos == [first] * len(infos)
+    tenth = float(np.float32(0.1))
+    assert first["F1"] == 49.0 + 5.0 * tenth
 
 
 # --- flight -----------------------------------------------------------------------------------
@@ -242,19 +274,26 @@ def test_flight_follows_the_formula_of_constant_acceleration(mode: str, period: 
     thrust = 49.0
     for n in range(60):
         action = (1.0, -0.25, 0.5, -1.0)[n // 3 % 4]  # exact in float32
-        thrust = min(100.0, max(0.0, thrust + 5 * action if mode == "increment" else
-                                49 + 20 * action))  # fmt: skip
+        if mode == "increment":
+            thrust += 5 * action
+        else:
+            thrust = 49 + 20 * action
+        thrust = min(100.0, max(0.0, thrust))
         acceleration = 4 * thrust / 20 - 9.8
-        height += speed * period + acceleration * period**2 / 2
+        height += speed * period
+        height += acceleration * period**2 / 2
         speed += acceleration * period
         observation, *_, info = env.step(_a(action))
+        error = 60 - height
         assert info["z"] == pytest.approx(height, abs=1e-9)
-        assert info["elevation_error"] == pytest.approx(60 - height, abs=1e-9)
-        assert (info["x"], info["y"]) == pytest.approx((0.0, 0.0), abs=1e-9)
+        assert info["elevation_error"] == pytest.approx(error, abs=1e-9)
+        assert info["x"] == pytest.approx(0.0, abs=1e-9)
+        assert info["y"] == pytest.approx(0.0, abs=1e-9)
         assert info["goal_x"] == 0.0
         assert info["goal_z"] == 60.0
         assert info["goal_y"] == 0.0
-        assert observation == pytest.approx([60 - height, -speed, thrust / 49 - 1], abs=1e-5)
+        expected = [error, -speed, thrust / 49 - 1]
+        assert observation == pytest.approx(expected, abs=1e-5)
 
 
 def test_flight_with_drag_follows_the_exponential() -> None:
@@ -262,8 +301,10 @@ def test_flight_with_drag_follows_the_exponential() -> None:
     flight = Flight(5.0, action="offset", effects={"linear_drag": drag}, flight_band=20.0)
     for n in range(1, 101):
         flight.step(1.0)  # hover + 20 N each: 4 m/s2
-        fallen = (1 - math.exp(-drag * n * 0.02)) / drag
-        assert flight.height == pytest.approx(5.0 + 4 / drag * (n * 0.02 - fallen), abs=1e-8)
+        time = n * 0.02
+        lag = (1 - math.exp(-drag * time)) / drag
+        risen = 4 / drag * (time - lag)
+        assert flight.height == pytest.approx(5.0 + risen, abs=1e-8)
 
 
 def test_reward_and_observation_of_a_step_by_hand() -> None:
@@ -282,14 +323,14 @@ def test_reward_and_observation_of_a_step_by_hand() -> None:
 def test_telemetry_has_z_up() -> None:
     flight = Flight(5.0)
     half = math.radians(20) / 2
-    flight.state.position[:] = 1.0, 2.0, 5.0
-    flight.state.quaternion[:] = math.cos(half), 0.0, 0.0, math.sin(half)  # to the left
+    position = [1.0, 2.0, 5.0]
+    quaternion = [math.cos(half), 0.0, 0.0, math.sin(half)]  # to the left
+    flight.state.position[:] = position
+    flight.state.quaternion[:] = quaternion
     flight.step(0.0)
     told = flight.loop.telemetry
-    assert told["position"].ravel() == pytest.approx([1.0, 2.0, 5.0], abs=1e-9)
-    assert told["attitude"].ravel() == pytest.approx(
-        [math.cos(half), 0.0, 0.0, math.sin(half)], abs=1e-9
-    )
+    assert told["position"].ravel() == pytest.approx(position, abs=1e-9)
+    assert told["attitude"].ravel() == pytest.approx(quaternion, abs=1e-9)
 
 
 CHOICES: dict[str, Any] = TABLES["env: options whose bounds are never left"]
@@ -329,8 +370,10 @@ def test_fastest_crossing_stays_within_the_bounds(side: float, period: float) ->
         while not over:
             observation, _, over, *_ = env.step(_a(push))
             assert observation in space
-            fastest = max(fastest, abs(observation[1]) / space.high[1])
-            if -side * observation[0] > turn:
+            error, rate, _ = observation
+            share = abs(rate) / space.high[1]
+            fastest = max(fastest, share)
+            if -side * error > turn:
                 push = -side
     assert fastest > 0.4  # the bound is not idle
 
@@ -343,7 +386,8 @@ def test_truncated_by_the_time_limit() -> None:
     env.reset(seed=0)
     for n in range(250):
         _, reward, terminated, truncated, info = env.step(_a(0.0))
-        assert (terminated, truncated) == (False, n == 249)
+        assert not terminated
+        assert truncated == (n == 249)
     assert info["reward_termination"] == 0.0
     assert reward == info["reward_elevation"]
     with pytest.raises(ResetNeeded, match=r"expected a call of reset\(\) for env 0 first"):
@@ -358,7 +402,8 @@ def test_terminated_by_the_band_and_never_truncated_too(length: int) -> None:
     assert flight.fly_out(1.0) == 62
     assert flight.ends == (True, False)
     assert flight.height == pytest.approx(8.0752, abs=1e-9)
-    assert flight.loop.rewards[0] == pytest.approx((0.5 - 3.0752) / (0.5 + 3.0752) - 20)
+    elevation = (0.5 - 3.0752) / (0.5 + 3.0752)
+    assert flight.loop.rewards[0] == pytest.approx(elevation - 20)
     with pytest.raises(ResetNeeded):
         flight.step(0.0)
 
@@ -372,13 +417,14 @@ def test_terminated_by_the_floor() -> None:
 
 def test_a_bounce_within_a_long_control_period_is_a_crash() -> None:
     flight = Flight(1.5, target=2.0, flight_band=50.0, control_period=1.0, thrust_scale=51.0)
-    flight.state.position[2], flight.state.velocity[2] = 0.5, -3.0  # floor, and up again
+    flight.state.position[2] = 0.5
+    flight.state.velocity[2] = -3.0  # to the floor, and up again
     flight.step(1.0)
     assert flight.height > 1.0
     assert flight.ends == (True, False)
 
 
-@pytest.mark.parametrize(("degrees", "over"), [(59.0, False), (61.0, True), (180.0, True)])
+@rows_of("terminated by tilt", "degrees, over")
 @pytest.mark.parametrize("axis", [1, 2])
 def test_terminated_by_tilt(degrees: float, over: bool, axis: int) -> None:
     flight = Flight(5.0)
@@ -387,7 +433,8 @@ def test_terminated_by_tilt(degrees: float, over: bool, axis: int) -> None:
     flight.state.quaternion[axis] = math.sin(half)
     flight.step(0.0)
     assert flight.ends == (over, False)
-    assert flight.loop.reward_terms["termination"].tolist() == [-20.0 if over else 0.0]
+    cost = flight.loop.reward_terms["termination"]
+    assert cost.tolist() == [-20.0 * over]
 
 
 @pytest.mark.parametrize(("field", "warning"), [("position", "QPOS"), ("velocity", "QVEL")])
@@ -421,7 +468,8 @@ def test_a_log_file_that_the_user_named_stays_on(tmp_path: Path) -> None:
         flight.state.velocity[0] = math.nan
         with pytest.raises(PhysicsError):
             flight.step(0.0)
-        assert "QVEL" in (tmp_path / "mine.txt").read_text()
+        text = (tmp_path / "mine.txt").read_text()
+        assert "QVEL" in text
     finally:
         old.set()
 
@@ -438,13 +486,16 @@ def test_a_step_before_a_reset(env_id: str) -> None:
 
 @on_both_tasks
 def test_seeds(env_id: str) -> None:
-    one = _env(env_id)
-    other = _env(env_id)
-    starts = [one.reset(seed=seed)[0].tobytes() for seed in range(10)]
-    starts += [one.reset()[0].tobytes() for _ in range(5)]  # goes on with the stream
-    again = [other.reset(seed=seed)[0].tobytes() for seed in range(10)]
-    again += [other.reset()[0].tobytes() for _ in range(5)]
-    assert starts == again
+    def begun() -> list[bytes]:
+        env = _env(env_id)
+        starts = []
+        for seed in (*range(10), *[None] * 5):  # at last it goes on with the stream
+            observation, _ = env.reset(seed=seed)
+            starts.append(observation.tobytes())
+        return starts
+
+    starts = begun()
+    assert starts == begun()
     assert len(set(starts)) == 15
 
 
@@ -452,11 +503,13 @@ def test_targets_and_starts_are_uniform() -> None:
     env = _env(target=(3.0, 7.0), start_band=0.5)
     infos = [env.reset(seed=None if n else 0)[1] for n in range(2000)]
     targets = np.array([info["goal_z"] for info in infos])
-    offsets = np.array([info["z"] for info in infos]) - targets
+    heights = np.array([info["z"] for info in infos])
+    offsets = heights - targets
     for values, low, high in ((targets, 3.0, 7.0), (offsets, -0.5, 0.5)):
         share = np.sort((values - low) / (high - low))
+        distance = np.abs(share - np.linspace(0, 1, 2000))
         # Kolmogorov-Smirnov: 1.95 / sqrt(n) is passed by chance once in a thousand times.
-        assert np.abs(share - np.linspace(0, 1, 2000)).max() < 1.95 / math.sqrt(2000)
+        assert distance.max() < 1.95 / math.sqrt(2000)
 
 
 # --- what a policy on E alone can do ----------------------------------------------------------
@@ -470,7 +523,8 @@ def _errors(gain: float, steps: int, **options: Any) -> np.ndarray:
     errors = [0.2]
     while not flight.over:
         flight.step(gain * errors[-1])
-        errors.append(float(flight.observation[0]))
+        (error,) = flight.observation
+        errors.append(float(error))
     return np.array(errors[1:])
 
 
@@ -489,33 +543,40 @@ def test_offset_on_error_alone_oscillates_without_drag() -> None:
     # 1 + w^2 h^2 / 2 = 1.0004 in each step.
     errors = _errors(0.5, 1000, action="offset")
     assert len(errors) == 1000
-    peaks = np.abs(errors[1:-1])[np.diff(np.sign(np.diff(errors))) != 0]
-    periods = np.diff(np.flatnonzero(np.diff(np.sign(errors)) != 0)) * 2 * 0.02
+    turns = np.diff(np.sign(np.diff(errors))) != 0
+    peaks = np.abs(errors[1:-1][turns])
+    crossings = np.diff(np.sign(errors)) != 0
+    half_periods = np.diff(np.flatnonzero(crossings))
+    periods = half_periods * 2 * 0.02
     assert periods == pytest.approx(2 * math.pi / math.sqrt(2), rel=0.02)
     steps = math.pi / math.sqrt(2) / 0.02
-    assert peaks[1:] / peaks[:-1] == pytest.approx(1.0004 ** (steps / 2), rel=1e-3)
+    growth = peaks[1:] / peaks[:-1]
+    assert growth == pytest.approx(1.0004 ** (steps / 2), rel=1e-3)
     assert np.abs(errors[-250:]).max() > 0.2
 
 
-@pytest.mark.parametrize(("gain", "drag"), [(0.05, 0.5), (0.5, 2.0), (1.0, 0.5), (1.0, 2.0)])
+@rows_of("offset on error alone converges with drag", "gain, drag")
 def test_offset_on_error_alone_converges_with_drag(gain: float, drag: float) -> None:
-    slowest = -np.roots([1.0, drag, 4 * gain]).real.max()
+    roots = np.roots([1.0, drag, 4 * gain])
+    slowest = -roots.real.max()
     assert slowest > 0
-    errors = _errors(
-        gain, round(10 / slowest / 0.02), action="offset", effects={"linear_drag": drag}
-    )
+    steps = round(10 / slowest / 0.02)
+    errors = _errors(gain, steps, action="offset", effects={"linear_drag": drag})
     assert np.abs(errors[-10:]).max() < 2e-4  # ten time constants: 0.2 m * e^-10 = 9e-6 m
 
 
 def test_offset_with_the_wrong_sign_diverges() -> None:
-    assert abs(_errors(-0.5, 1000, action="offset", effects={"linear_drag": 2.0})[-1]) > 3.0
+    errors = _errors(-0.5, 1000, action="offset", effects=DRAG)
+    assert abs(errors[-1]) > 3.0
 
 
 def test_increment_on_the_full_observation_can_converge() -> None:
     # a = 0.4 E + 0.4 E' - f with f = F / 49 N - 1: with u = 9.8 f, E'' = -u and
     # u' = 50 a = 20 E + 20 E' - 5.1 u, so s^3 + 5.1 s^2 + 20 s + 20: stable, since 5.1 * 20 > 20.
-    assert np.roots([1.0, 50 / 9.8, 20.0, 20.0]).real.max() < -1
+    roots = np.roots([1.0, 50 / 9.8, 20.0, 20.0])
+    assert roots.real.max() < -1
     flight = Flight(4.8)
     for _ in range(250):
-        flight.step(float(flight.observation @ [0.4, 0.4, -1.0]))
+        action = flight.observation @ [0.4, 0.4, -1.0]
+        flight.step(float(action))
     assert abs(flight.observation[0]) < 2e-3

@@ -1,6 +1,5 @@
 """Options and arithmetic of the elevation task against values worked out by hand."""
 
-import math
 import re
 from dataclasses import asdict
 from pathlib import Path
@@ -8,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from contracts import observed, rows_of, spec_with
+from contracts import TABLES, observed, rows_of, spec_with
 from hypothesis import given
 from hypothesis import strategies as st
 from rotorgram.envs.config import EnvConfig
@@ -16,21 +15,20 @@ from rotorgram.envs.specification import make_task
 from rotorgram.envs.tasks.elevation import ElevationOptions
 from rotorgram.sim import WorldState
 
+from flights import about
+from flights import state_of as one_state
+
 ID = "rotorgram/Elevation-v0"
 
 
 def state_of(n: int, **arrays: Any) -> WorldState:
     """Level craft at rest at 5 m and at hover thrust, but for the arrays that are given."""
-    fields = {
-        "position": np.full((n, 1, 3), (0.0, 0.0, 5.0)),
-        "quaternion": np.full((n, 1, 4), (1.0, 0.0, 0.0, 0.0)),
-        "velocity": np.zeros((n, 1, 3)),
-        "body_rates": np.zeros((n, 1, 3)),
-        "thrust": np.full((n, 1, 4), 49.0),
-        "touching": np.zeros((n, 1), bool),
-    }
-    for name, values in arrays.items():
-        fields[name] = np.asarray(values, fields[name].dtype).reshape(fields[name].shape)
+    one = one_state()
+    fields = {}
+    for name in ("position", "quaternion", "velocity", "body_rates", "thrust", "touching"):
+        usual = getattr(one, name)
+        values = np.asarray(arrays.get(name, [usual] * n), usual.dtype)
+        fields[name] = values.reshape(n, 1, *usual.shape)
     return WorldState(**fields, command=fields["thrust"])
 
 
@@ -83,10 +81,11 @@ def test_float32_bounds_lie_outside_the_float64_ones() -> None:
 def test_thrust(options: dict[str, Any], cases: list[tuple[float, float, float]]) -> None:
     present, actions, expected = (np.array(column) for column in zip(*cases, strict=True))
     state = state_of(len(cases), thrust=np.repeat(present, 4))
-    thrust = task_of(len(cases), **options).controller.thrust(
-        actions.astype(float).reshape(-1, 1, 1), state
-    )
-    assert np.broadcast_to(thrust, (len(cases), 1, 4)).tolist() == [[[f] * 4] for f in expected]
+    controller = task_of(len(cases), **options).controller
+    sent = actions.astype(float).reshape(-1, 1, 1)
+    thrust = controller.thrust(sent, state)
+    given = np.broadcast_to(thrust, (len(cases), 1, 4))
+    assert given.tolist() == [[[f] * 4] for f in expected]
 
 
 @rows_of("reward", "error, reward")
@@ -108,21 +107,20 @@ def test_reward_falls_with_distance_and_is_bounded(a: float, b: float) -> None:
 
 
 def test_ends_by_hand() -> None:
-    half = [math.radians(degrees) / 2 for degrees in (0, 0, 0, 59.9, 60.1, 180, 0)]
-    state = state_of(
-        7,
-        position=[[0, 0, z] for z in (2.0, 1.999, 8.1, 5, 5, 5, 5)],
-        quaternion=[[math.cos(h), 0.6 * math.sin(h), 0.8 * math.sin(h), 0] for h in half],
-        touching=[False] * 6 + [True],
-    )
-    ended = task_of(7).outcome(state).terminated.ravel().tolist()
-    assert ended == [False, True, True, False, True, True, True]
+    heights, tilts, touching, expected = zip(*TABLES["elevation: ends"], strict=True)
+    places = [[0, 0, z] for z in heights]
+    turned = [about((0.6, 0.8, 0), degrees) for degrees in tilts]
+    state = state_of(7, position=places, quaternion=turned, touching=touching)
+    ended = task_of(7).outcome(state).terminated
+    assert ended.ravel().tolist() == list(expected)
 
 
 def test_observation_by_hand() -> None:
     state = state_of(1, position=[0, 0, 4.25], velocity=[1, 2, -0.5], thrust=[73.5] * 4)
-    assert observed(task_of(1), state).tolist() == [[[0.75, 0.5, 0.5]]]
-    assert observed(task_of(1, observation="error"), state).tolist() == [[[0.75]]]
+    full = observed(task_of(1), state)
+    assert full.tolist() == [[[0.75, 0.5, 0.5]]]
+    error = observed(task_of(1, observation="error"), state)
+    assert error.tolist() == [[[0.75]]]
 
 
 # --- the page ---------------------------------------------------------------------------------
@@ -130,17 +128,19 @@ def test_observation_by_hand() -> None:
 
 def test_the_page_tells_the_metrics_of_both_tasks() -> None:
     page = (Path(__file__).parents[2] / "docs" / "task.md").read_text()
-    rows = [line for line in page.splitlines() if re.match(r"\| `\w+-v0` \| `\w+_error`", line)]
-    told = []
+    expected = []
     for env_id in (ID, "rotorgram/Hover-v0"):
         for metric in spec_with(env_id).metrics:
             bounds = [f"{x:g}" if x else "" for x in (metric.settled, metric.held)]
-            told.append((env_id.split("/")[1], metric.name, metric.unit, *bounds))
-    cells = [[cell.strip(" `") for cell in row.strip("| ").split("|")] for row in rows]
-    assert [
-        (task, metric.split("`")[0], unit, settled, held)
-        for task, metric, unit, settled, held in ([*row, ""][:5] for row in cells)
-    ] == told
+            name = env_id.split("/")[1]
+            expected.append([name, metric.name, metric.unit, *bounds])
+    told = []
+    for line in page.splitlines():
+        if re.match(r"\| `\w+-v0` \| `\w+_error`", line):
+            cells = [cell.strip(" `") for cell in line.strip("| ").split("|")]
+            task, metric, *rest = [*cells, ""][:5]
+            told.append([task, metric.split("`")[0], *rest])
+    assert told == expected
 
 
 def test_the_page_and_the_class_tell_the_same_numbers() -> None:
