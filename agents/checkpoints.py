@@ -29,7 +29,7 @@ from ..models.errors import InputError, require, shortened
 from ..models.fields import Limits, check_fields
 from .config import Config
 from .episodes import Episode, Position, ResumeError
-from .networks import Floats, named, part_of
+from .networks import ByName, Floats, named, part_of
 from .policies import NetworkPolicy
 from .presets import preset
 
@@ -169,7 +169,7 @@ def load(path: Path) -> Checkpoint:
         ) from None
 
 
-def _read(data: bytes, parse: Callable[[bytes], dict[str, np.ndarray]]) -> Checkpoint:
+def _read(data: bytes, parse: Callable[[bytes], ByName]) -> Checkpoint:
     found = _CHECKSUM.search(data)
     checksum = hashlib.sha256(_with_checksum(data, b"0" * 64)).hexdigest().encode()
     if found is None or found[1] != checksum:

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..envs.spec import EnvSpec, component_names
 from ..models.errors import InputError
-from .networks import Floats
+from .networks import ByName, Floats
 from .policies import Observation, flat
 
 DAMPING = 0.5  # Damping ratio of a payload's swing
@@ -73,7 +73,7 @@ class Geometric:
 
     def reset(self) -> None:
         """Forget the last episode."""
-        self._before: dict[str, np.ndarray] | None = None
+        self._before: ByName | None = None
         self._moving = np.zeros(3)
         self._pushed = np.zeros(3)
 
@@ -103,9 +103,7 @@ class Geometric:
         clipped: Floats = np.clip(action, -1.0, 1.0).astype(np.float32)
         return clipped
 
-    def _steadied(
-        self, now: dict[str, np.ndarray], before: dict[str, np.ndarray], goes: np.ndarray
-    ) -> np.ndarray:
+    def _steadied(self, now: ByName, before: ByName, goes: np.ndarray) -> np.ndarray:
         """The offset at which the loops ask for the acceleration of `swing_gains`, m."""
         assert self._swing is not None
         faster = (now["force"] - before["force"]) / self._period
@@ -117,7 +115,7 @@ class Geometric:
         offset: np.ndarray = wanted / (OVER * k * k) + now["velocity"] / k
         return offset
 
-    def _follow(self, now: dict[str, np.ndarray]) -> np.ndarray:
+    def _follow(self, now: ByName) -> np.ndarray:
         """Filter the goal's velocity and what pushes; return the goal's acceleration, m/s²."""
         before = self._before
         period = self._period

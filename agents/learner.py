@@ -9,7 +9,7 @@ import numpy as np
 
 from .config import Config
 from .episodes import EpisodeRecorder
-from .networks import Floats, Module, Weights, bind_parts, make_network, named, shapes_of
+from .networks import ByName, Floats, Module, Weights, bind_parts, make_network, named, shapes_of
 from .optimizers import Adam
 from .policies import NetworkPolicy, flat_size
 from .rollouts import Collector, Diverged, Rollout
@@ -103,7 +103,7 @@ class Learner:
         """The current policy, without exploration: a copy."""
         return NetworkPolicy.load(self.actor(), self.spec, self.config)
 
-    def state(self) -> dict[str, np.ndarray]:
+    def state(self) -> ByName:
         """All that the next update depends on: copies."""
         arrays = {name: array.copy() for name, array in self._state().items()}
         generator = json.dumps(self._rng.bit_generator.state).encode()
@@ -123,7 +123,7 @@ class Learner:
             self._actor.moments.refresh()
         self.terms = {}
 
-    def _state(self) -> dict[str, np.ndarray]:
+    def _state(self) -> ByName:
         """The state without the generator: no copies."""
         arrays = {"weights": self.weights.values, **named("optimizer.", self.optimizer.state)}
         if self._actor.moments is not None:

@@ -17,6 +17,7 @@ from ..models.errors import InputError
 from .config import Config
 
 Floats = NDArray[np.float32]
+ByName = dict[str, np.ndarray]
 Shapes = Mapping[str, tuple[int, ...]]
 Item = TypeVar("Item")
 

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from .networks import Floats, Weights
+from .networks import ByName, Floats, Weights
 
 
 class Adam:
@@ -20,7 +20,7 @@ class Adam:
         self._first = np.zeros_like(weights.values)
         self._second = np.zeros_like(weights.values)
         self._count = np.zeros((), np.int64)
-        self.state: dict[str, np.ndarray] = {
+        self.state: ByName = {
             "first": self._first,
             "second": self._second,
             "steps": self._count,

@@ -13,7 +13,7 @@ from .a2c import A2C, A2CConfig
 from .config import SACConfig
 from .episodes import EpisodeRecorder
 from .learner import OnUpdate, seeds_of
-from .networks import Floats
+from .networks import ByName, Floats
 from .policies import NetworkPolicy
 from .ppo import PPO, PPOConfig
 from .rollouts import Diverged
@@ -220,7 +220,7 @@ class SB3Agent:
         share = min(left + self._ahead, 1.0) if self._config.anneal else 1.0
         return self._config.learning_rate * share
 
-    def actor(self) -> dict[str, np.ndarray]:
+    def actor(self) -> ByName:
         """Weights of the policy, under our names."""
         parameters = self.model.policy.state_dict()
         weights = {name: values.numpy().copy() for name, values in parameters.items()}
@@ -243,7 +243,7 @@ class SB3Agent:
         """The current policy, without exploration: a copy."""
         return NetworkPolicy.load(self.actor(), self.spec, self._config)
 
-    def state(self) -> dict[str, np.ndarray]:
+    def state(self) -> ByName:
         """Nothing: no training goes on from it."""
         return {}
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
+from numpy.typing import ArrayLike
 
 from ..models.errors import InputError
 from .spaces import action_space, info_columns, observation_space
@@ -16,11 +17,13 @@ LOST = "simulator_lost"
 """Key in the `info` of a step that a lost simulator truncated: why it was lost."""
 
 Info = dict[str, Any]
-Step = tuple[Any, np.ndarray, np.ndarray, np.ndarray, Info]
+Observation = Any
+"""An array, or a dict of arrays."""
+Step = tuple[Observation, np.ndarray, np.ndarray, np.ndarray, Info]
 Seeds = Sequence[int | None] | np.ndarray
 
 
-class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
+class AdvancingVectorEnv(VectorEnv[Observation, ArrayLike, np.ndarray]):
     """A vector env that is stepped by `advance`, the step of the wire.
 
     `advance` sets the arrays below to new ones; those of earlier steps do not change.
@@ -40,7 +43,7 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
 
     env_spec: EnvSpec
     control_period: float
-    observations: Any
+    observations: Observation
     rewards: np.ndarray
     terminated: np.ndarray
     truncated: np.ndarray
@@ -58,7 +61,7 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
     @abstractmethod
     def reset(
         self, *, seed: int | Seeds | None = None, options: Info | None = None
-    ) -> tuple[Any, Info]:
+    ) -> tuple[Observation, Info]:
         """Begin an episode, for all drones or some."""
 
     @abstractmethod
@@ -79,7 +82,7 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
         are.
         """
 
-    def step(self, actions: Any) -> Step:
+    def step(self, actions: ArrayLike) -> Step:
         """Fly every drone for one control period; after an episode the autoreset mode decides."""
         mode = self.autoreset_mode
         resets = self.done if mode == AutoresetMode.NEXT_STEP and self.done.any() else None
@@ -107,7 +110,7 @@ class AdvancingVectorEnv(VectorEnv[Any, Any, Any]):
         fps = max(1, round(1 / spec.control_period))
         self.metadata = {"render_modes": [], "render_fps": fps, "autoreset_mode": mode}
 
-    def _shaped(self, actions: Any) -> Any:
+    def _shaped(self, actions: ArrayLike) -> np.ndarray:
         array = np.asarray(actions)
         expected = self.action_space.shape
         if array.shape != expected:

@@ -406,7 +406,7 @@ def source_hash(task: type) -> str:
     return digest.hexdigest() if found else ""
 
 
-def words_of(name: str, given: Any) -> tuple[str, ...]:
+def words_of(name: str, given: object) -> tuple[str, ...]:
     """Words of a text with commas, or of several texts. Raises `InputError`."""
     texts = [given] if isinstance(given, str) else given
     if not isinstance(texts, list | tuple) or not all(isinstance(one, str) for one in texts):

@@ -19,7 +19,7 @@ from .config import EnvConfig
 from .pipeline import Pipeline
 from .specification import make_task, spec_of
 from .stages import clock
-from .stages.record import Mask, Record
+from .stages.record import Floats, Mask, Record
 from .telemetry import quantities_of
 
 
@@ -78,7 +78,7 @@ class Loop:
         self.record = Record(world.shape, task.memory, kept)
         self.num_envs = num_worlds * config.drones
         self._quantities = quantities_of(task)
-        self._telemetry: dict[str, NDArray[np.float64]] | None = None
+        self._telemetry: dict[str, Floats] | None = None
         self._closed = False
         self._take()
 
@@ -88,7 +88,7 @@ class Loop:
         resets: Array | None = None,
         seeds: Seeds | None = None,
         frozen: Array | None = None,
-        chosen: Mapping[str, np.ndarray] | None = None,
+        chosen: Arrays | None = None,
     ) -> None:
         """Reset some drones, freeze some, and fly the others for one control period.
 
@@ -117,7 +117,7 @@ class Loop:
         self._observe()
         self._take()
 
-    def _begin(self, begun: Mask, seeds: Any, chosen: Mapping[str, np.ndarray]) -> None:
+    def _begin(self, begun: Mask, seeds: Any, chosen: Arrays) -> None:
         """Begin episodes: the task sets the start, and the other stages follow from it."""
         record = self.record
         begin = self._pipeline.begin
@@ -233,17 +233,17 @@ class Loop:
         return np.array(self.record.steps).reshape(self.num_envs)
 
     @property
-    def reward_terms(self) -> dict[str, NDArray[np.float64]]:
+    def reward_terms(self) -> dict[str, Floats]:
         """Terms of the last rewards by name, each of shape (N,)."""
         return self._per_drone(self.record.terms)
 
     @property
-    def metrics(self) -> dict[str, NDArray[np.float64]]:
+    def metrics(self) -> dict[str, Floats]:
         """Metrics of the task by name, each of shape (N,)."""
         return self._per_drone(self.record.metrics)
 
     @property
-    def telemetry(self) -> dict[str, NDArray[np.float64]]:
+    def telemetry(self) -> dict[str, Floats]:
         """By the names of `spec.telemetry`, float64, shape (N, *shape)."""
         if self._telemetry is None:
             self._telemetry = {one.name: one.values(self) for one in self._quantities}
@@ -256,7 +256,7 @@ class Loop:
             row += quantity.read(self).ravel().tolist()
         return row
 
-    def _per_drone(self, arrays: Mapping[str, Array]) -> dict[str, NDArray[np.float64]]:
+    def _per_drone(self, arrays: Mapping[str, Array]) -> dict[str, Floats]:
         rows = {}
         for name, values in arrays.items():
             row = np.broadcast_to(values, self.record.shape)

@@ -20,7 +20,7 @@ class Memory:
     def __init__(self) -> None:
         object.__setattr__(self, "_phase", "begin")
 
-    def __setattr__(self, name: str, value: Any) -> None:
+    def __setattr__(self, name: str, value: object) -> None:
         """Raises `AttributeError` where a task may not change its memory."""
         if self._phase == "closed":
             raise AttributeError(

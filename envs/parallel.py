@@ -6,7 +6,7 @@ import numpy as np
 
 from ..models.errors import InputError, require
 from ..sim.snapshots import Arrays, Snapshot
-from .autoreset import AdvancingVectorEnv, Info
+from .autoreset import AdvancingVectorEnv, Info, Observation
 from .rendering import RENDER_MODES
 from .spaces import action_space, checked_action, observation_space
 from .vector import LocalVectorEnv
@@ -95,7 +95,7 @@ class AdvancingParallelEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc]
     def _numbers(self, values: np.ndarray, agents: list[str]) -> Told:
         return {agent: values[self._rows[agent]].item() for agent in agents}
 
-    def _told(self, seen: Any, info: Info, agents: list[str]) -> tuple[Told, Told]:
+    def _told(self, seen: Observation, info: Info, agents: list[str]) -> tuple[Told, Told]:
         """Observations and infos of some agents."""
         names = [name for name in info if not name.startswith("_")]
         several = isinstance(seen, dict)

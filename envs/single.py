@@ -4,17 +4,18 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..models.errors import InputError
 from ..sim.snapshots import Arrays, Snapshot
-from .autoreset import Info
+from .autoreset import Info, Observation
 from .config import EnvConfig
 from .loop import Loop
 from .rendering import RENDER_MODES, Renderer
 from .spaces import action_space, checked_action, observation_space, telemetry_names
 
 
-class SingleEnv(gym.Env[Any, Any]):
+class SingleEnv(gym.Env[Observation, ArrayLike]):
     """A drone that flies a task, in process.
 
     `info` has every component of the telemetry by its name (see `telemetry.py`) and the terms of
@@ -63,7 +64,9 @@ class SingleEnv(gym.Env[Any, Any]):
         self._no_action = np.zeros((1, len(loop.task.controller.low)), np.float32)
         self._episodes = 0
 
-    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
+    def reset(
+        self, *, seed: int | None = None, options: Info | None = None
+    ) -> tuple[Observation, Info]:
         """Begin an episode; a seed makes it reproducible. `options` has no keys."""
         if options:
             raise InputError(f"reset: expected no options, got {options!r}")
@@ -74,7 +77,7 @@ class SingleEnv(gym.Env[Any, Any]):
             self.render()
         return self._observation(), self._info()
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, Info]:
+    def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, Info]:
         """Fly for one control period. See the task for shapes, units and ends."""
         loop = self._loop
         loop.advance(checked_action(action, self.action_space, "action"))
@@ -83,7 +86,7 @@ class SingleEnv(gym.Env[Any, Any]):
         flags = loop.terminated.item(), loop.truncated.item()
         return self._observation(), loop.rewards.item(), *flags, self._info()
 
-    def render(self) -> Any:
+    def render(self) -> np.ndarray | None:
         """A picture of now, uint8, shape (360, 480, 3), with `rgb_array`; None otherwise."""
         pictures = self._renderer.render([self._episodes])
         return pictures[0] if pictures else None
@@ -102,7 +105,7 @@ class SingleEnv(gym.Env[Any, Any]):
         self._renderer.close()
         self._loop.close()
 
-    def _observation(self) -> Any:
+    def _observation(self) -> Observation:
         observations = self._loop.observations
         if self._only:  # the loop makes new arrays with each step
             return observations[self._only][0]

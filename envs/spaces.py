@@ -36,7 +36,7 @@ def action_space(spec: EnvSpec) -> spaces.Space[Any]:
     return box(spec.action)
 
 
-def checked_action(action: Any, space: spaces.Space[Any], name: str) -> np.ndarray:
+def checked_action(action: object, space: spaces.Space[Any], name: str) -> np.ndarray:
     """A single env's action as an array of its space's shape. Raises `InputError`."""
     if isinstance(space, spaces.Discrete):
         if not space.contains(action):
@@ -55,7 +55,7 @@ def checked_action(action: Any, space: spaces.Space[Any], name: str) -> np.ndarr
     return array
 
 
-def joined(spec: EnvSpec, arrays: Mapping[str, Any]) -> Any:
+def joined(spec: EnvSpec, arrays: Mapping[str, np.ndarray]) -> Any:
     """Observation arrays as the space has them: the only one, or a dict."""
     return arrays[spec.observation[0].name] if len(spec.observation) == 1 else dict(arrays)
 

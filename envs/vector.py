@@ -1,22 +1,22 @@
 """Many drones behind Gymnasium's vector signature: the loop with a world for each."""
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
+from numpy.typing import ArrayLike
 
 from ..models.errors import InputError
 from ..models.fields import check_names
 from ..sim.snapshots import Arrays, Snapshot
-from .autoreset import AdvancingVectorEnv, Info, Seeds, checked_mask, checked_seeds
+from .autoreset import AdvancingVectorEnv, Info, Observation, Seeds, checked_mask, checked_seeds
 from .config import EnvConfig
 from .loop import Loop
 from .rendering import RENDER_MODES, Renderer
 from .spaces import joined
 
 
-class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
+class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Observation, ArrayLike, np.ndarray]):
     """N drones that fly a task in process, bit for bit as N single ones do.
 
     With several `drones` to a world, N is a multiple of them. One whose episode ends is `out`, with
@@ -73,7 +73,7 @@ class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
 
     def reset(
         self, *, seed: int | Seeds | None = None, options: Info | None = None
-    ) -> tuple[Any, Info]:
+    ) -> tuple[Observation, Info]:
         """Begin an episode, for all drones or some.
 
         Args:
@@ -93,7 +93,7 @@ class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
         """With `rgb_array` a picture of each drone, uint8, shape (180, 240, 3); otherwise None."""
         return self._renderer.render(self._episodes.tolist())
 
-    def close_extras(self, **kwargs: Any) -> None:
+    def close_extras(self, **kwargs: object) -> None:
         """Close the window, if there is one; release threads and memory."""
         self._renderer.close()
         self.loop.close()
@@ -104,7 +104,7 @@ class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
         resets: np.ndarray | None = None,
         seeds: Seeds | None = None,
         frozen: np.ndarray | None = None,
-        chosen: Mapping[str, np.ndarray] | None = None,
+        chosen: Arrays | None = None,
     ) -> None:
         """As `AdvancingVectorEnv.advance`; `chosen` as of `Loop.advance`."""
         loop = self.loop
@@ -126,11 +126,11 @@ class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
         self._take_results()
 
     @property
-    def telemetry(self) -> Any:  # type: ignore[override]  # made when it is asked for
+    def telemetry(self) -> Arrays:  # type: ignore[override]  # made when it is asked for
         """By name, float64, shape (N, *shape)."""
         return self.loop.telemetry
 
-    def _info(self, mask: Any) -> Info:
+    def _info(self, mask: np.ndarray) -> Info:
         terms = {f"reward_{name}": term for name, term in self.loop.reward_terms.items()}
         return super()._info(mask) | terms | {f"_{name}": mask for name in terms}
 
@@ -140,7 +140,7 @@ class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
         for name in ("rewards", "terminated", "truncated", "done", "out"):
             setattr(self, name, getattr(loop, name))
 
-    def _choice(self, name: str, value: Any) -> np.ndarray:
+    def _choice(self, name: str, value: object) -> np.ndarray:
         check_names([name], ("reset_mask", *self.loop.task.reset_options), "options")
         try:
             values = np.full(self.num_envs, value, np.float64)

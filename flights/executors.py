@@ -157,7 +157,7 @@ class _ThisProcess(Executor):
     def __init__(self, on_progress: OnProgress) -> None:
         _worker.report = on_progress
 
-    def submit(self, function: Callable[..., Any], /, *args: Any, **_: Any) -> Future[Any]:
+    def submit(self, function: Callable[..., Any], /, *args: Any, **_: object) -> Future[Any]:
         future: Future[Any] = Future()
         future.set_result(function(*args))
         return future

@@ -17,11 +17,11 @@ class RayExecutor(Executor):
     """Submits tasks of one core each. Raises `InputError` if there is no cluster at the address."""
 
     def __init__(self, address: str | None, jobs: int | None) -> None:
-        self._ray: Any = require("ray", "ray", "the runner ray")
+        self._ray = require("ray", "ray", "the runner ray")
         self._connect(address or "auto")
         cores = int(self._ray.cluster_resources().get("CPU", 0))  # 0: machines start on demand
         self.workers = jobs or max(cores, 1)
-        self._submitted: dict[Future[Any], Any] = {}
+        self._submitted: dict[Future[Result], object] = {}
 
     def _connect(self, address: str) -> None:
         host, _, port = address.removeprefix("ray://").rpartition(":")
@@ -37,14 +37,14 @@ class RayExecutor(Executor):
                 f"address: expected a Ray cluster at {address}, got: {reason}"
             ) from None
 
-    def submit(self, function: Callable[..., Any], /, *args: Any, **_: Any) -> Future[Any]:
+    def submit(self, function: Callable[..., Any], /, *args: Any, **_: object) -> Future[Any]:
         """Submit a function of `executors`, whose second argument is the job's name."""
         remote = self._ray.remote(num_cpus=1)(_with_same_software)
         reference = remote.remote(software_versions(), function, *args)
-        future: Future[Any] = Future()
+        future: Future[Result] = Future()
         self._submitted[future] = reference
 
-        def finish(done: Future[Any]) -> None:
+        def finish(done: Future[Result]) -> None:
             if self._submitted.pop(future, None) is None:  # cancelled
                 return
             error = done.exception()
@@ -72,7 +72,9 @@ def _failure(name: str, error: BaseException) -> Result:
     return Result(name, f"{name}: {reason}", None)
 
 
-def _with_same_software(versions: dict[str, str], function: Callable[..., Any], *args: Any) -> Any:
+def _with_same_software(
+    versions: dict[str, str], function: Callable[..., Result], *args: object
+) -> Result:
     """Call a function; `config.json` names one version of each package. (In a worker.)"""
     for package, here in software_versions().items():
         if here != versions[package]:

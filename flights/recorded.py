@@ -3,10 +3,9 @@
 import logging
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..envs.spec import ArraySpec
 from ..models.errors import InputError
@@ -14,7 +13,7 @@ from ..udp.journal.reader import Recording, Session, Walker
 from ..udp.protocol.messages import State
 from .trajectories import Ending, Trajectory
 
-Array = NDArray[Any]
+Array = np.ndarray
 
 
 def recorded_trajectories(

@@ -5,7 +5,7 @@ import io
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,7 @@ class Column(NamedTuple):
 
     name: str
     unit: str
-    values: NDArray[Any]
+    values: np.ndarray
     """Shape (T + 1,), of several flights below each other."""
 
 

@@ -22,6 +22,7 @@ from ..scenes.marks import Mark
 from .camera_model import GOAL, PAYLOAD, drawn_model, objects_in, own_discs
 from .gl import Offscreen
 
+Arrays = Mapping[str, np.ndarray]
 _ROOM = 1000  # geoms beyond those of the model
 _HIDDEN = 5  # a group of geoms that is not drawn
 _FLIP = np.array((1.0, -1.0, -1.0))  # from MuJoCo's camera frame to that of vision
@@ -132,8 +133,8 @@ class Cameras:
 
     def take(
         self,
-        due: Mapping[str, np.ndarray],
-        state: Mapping[str, np.ndarray],
+        due: Arrays,
+        state: Arrays,
         of: np.ndarray | None = None,
     ) -> None:
         """Take pictures of the worlds as they are.
@@ -158,14 +159,12 @@ class Cameras:
         """The last pictures, by name."""
         return {name: taken.copy() for name, taken in self.pictures.items()}
 
-    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+    def restore(self, arrays: Arrays) -> None:
         """Put a snapshot back."""
         for name, array in self.pictures.items():
             array[:] = arrays[name]
 
-    def lens(
-        self, name: str, state: Mapping[str, np.ndarray], drone: int = 0, world: int = 0
-    ) -> Lens:
+    def lens(self, name: str, state: Arrays, drone: int = 0, world: int = 0) -> Lens:
         """The lens of a view's camera, of a drone of a world, in a state as of `take`."""
         self._pose(state, world)
         camera = self._cameras[name][drone]
@@ -174,7 +173,7 @@ class Cameras:
         height, width = self.pictures[name].shape[1:3]
         return Lens(_matrix(self.model, camera, width, height), rotation, translation)
 
-    def _pose(self, state: Mapping[str, np.ndarray], world: int) -> slice:
+    def _pose(self, state: Arrays, world: int) -> slice:
         """Put the model where a state has a world; the rows of the world's drones."""
         drones = self._shape[1]
         rows = slice(world * drones, (world + 1) * drones)
@@ -186,7 +185,7 @@ class Cameras:
         place_cameras(self.model, self.data)
         return rows
 
-    def _draw_world(self, first: int, due: Mapping[str, np.ndarray]) -> None:
+    def _draw_world(self, first: int, due: Arrays) -> None:
         """Pictures of the world that `data` is in. Views of one camera share its drawings."""
         drawn: dict[tuple[int, int, int, bool], tuple[np.ndarray, np.ndarray]] = {}
         for view in self.views:

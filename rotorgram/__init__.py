@@ -33,7 +33,7 @@ __all__ = [
 def import_when_used(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
     """`__getattr__` of a package (PEP 562) that imports each name from its module on first use."""
 
-    def find(name: str) -> Any:
+    def find(name: str) -> object:
         if name not in modules:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         return getattr(import_module(modules[name], package), name)

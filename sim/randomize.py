@@ -16,7 +16,7 @@ from ..models.fields import check_names
 from ..models.files import read_toml
 from .effects import EffectOptions
 from .random import Draw
-from .state import Array, clip
+from .state import ByName, clip
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class Randomization:
         kind, numbers = self._kinds[name]
         return round(PARAMETERS[name].high if kind == "normal" else max(numbers))
 
-    def draw(self, draw: Draw) -> dict[str, Array]:
+    def draw(self, draw: Draw) -> ByName:
         """Values by name, shape (W, A)."""
         drawn = {}
         for name in self.names:

@@ -1,13 +1,12 @@
 """State as named arrays, so that it can be copied, put back, and stored."""
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-Snapshot = dict[str, NDArray[Any]]
-Arrays = Mapping[str, NDArray[Any]]
+Snapshot = dict[str, np.ndarray]
+Arrays = Mapping[str, np.ndarray]
 
 
 class Kept:

@@ -18,6 +18,7 @@ _NUMBERS = (float, int)
 
 Array = Any
 """A NumPy array; of a single drone also a number."""
+ByName = dict[str, Array]
 
 
 @dataclass(kw_only=True, slots=True)

@@ -12,7 +12,7 @@ from .effects import EffectOptions, Effects
 from .random import RANDOMIZATION, START, Draw, Random
 from .randomize import Randomization
 from .snapshots import Arrays, Snapshot, joined, part_of
-from .state import Array, InitialState, WorldState, plain
+from .state import Array, ByName, InitialState, WorldState, plain
 
 if TYPE_CHECKING:
     from ..models.vehicle import Vehicle
@@ -58,7 +58,7 @@ class World:
     ) -> None:
         self.vehicle = vehicle
         self.shape = shape
-        self.parameters: dict[str, Array] = {}
+        self.parameters: ByName = {}
         self._options = effects or EffectOptions()
         self._randomize = randomize
         self._drawn = () if randomize is None else randomize.names
@@ -149,9 +149,9 @@ class World:
                 old = self.parameters.get(name)
                 self.parameters[name] = plain(new if old is None else np.where(mask, new, old))
 
-    def _begun(self, mask: Array, pose: InitialState) -> dict[str, Array]:
+    def _begun(self, mask: Array, pose: InitialState) -> ByName:
         """The pose's arrays by their names; those of the state for worlds out of the mask."""
-        usual: dict[str, Array] = {
+        usual: ByName = {
             "position": 0.0,
             "quaternion": _LEVEL,
             "velocity": 0.0,

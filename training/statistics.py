@@ -7,7 +7,6 @@ the runs of an agent, always in the same way. Missing values (nan) are left out.
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +15,7 @@ from scipy import stats
 _RESAMPLES = 2000
 
 Floats = NDArray[np.float64]
-Values = Sequence[float] | NDArray[np.floating[Any]]
+Values = Sequence[float] | NDArray[np.floating]
 
 
 def finite(values: Values) -> Floats:

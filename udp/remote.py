@@ -12,7 +12,9 @@ from numpy.typing import ArrayLike
 from ..envs.autoreset import (
     LOST,
     AdvancingVectorEnv,
+    Observation,
     Seeds,
+    Step,
     checked_mask,
     checked_mode,
     checked_seeds,
@@ -32,7 +34,6 @@ from .transport.simulator import DEFAULT_AGENT
 
 Arrays = dict[str, np.ndarray]
 Info = dict[str, Any]
-Observation = Any  # an array, or a dict of arrays
 _FLY = np.array([FLY], np.uint8)
 _RESET = np.array([RESET], np.uint8)
 
@@ -210,7 +211,7 @@ class RemoteEnv(_Remote, gym.Env[Observation, ArrayLike]):
         return dict(zip(self._names, numbers, strict=True))
 
 
-class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
+class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Observation, ArrayLike, np.ndarray]):
     """The M · N drones of M simulators with N drones each, in lock-step over one socket.
 
     The simulators may be on any machines, and come in any order: each takes the first slot that is
@@ -308,7 +309,7 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Any, Any, Any]):
         self.advance(self._nothing, mask, seeds, ~mask)
         return self.observations, self._info(mask)
 
-    def step(self, actions: Any) -> Any:
+    def step(self, actions: ArrayLike) -> Step:
         """Fly every drone for one control period. The autoreset says what follows an episode."""
         if not self._flying:
             raise gym.error.ResetNeeded("step: expected a call of reset() first")

@@ -3,12 +3,11 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...models.errors import InputError
 from ...sim import World
 from .history import filled, pushed, taken
-from .record import Mask, Record, Stage, is_finite
+from .record import Floats, Mask, Record, Stage, is_finite
 
 
 class Actions:
@@ -26,7 +25,7 @@ class Actions:
         self._choices = choices
         self._count = math.prod(shape)
 
-    def checked(self, given: object, flown: Mask | None) -> NDArray[np.float64]:
+    def checked(self, given: object, flown: Mask | None) -> Floats:
         """Actions as controllers take them: shape (W, A, k), finite. Raises `InputError`.
 
         Numbers are rounded to float32. Actions of drones that do not fly are ignored.
@@ -49,14 +48,14 @@ class Actions:
             return values.astype(np.float64)
         return self._refused(values, np.isfinite(values), "finite numbers", flown)
 
-    def neutral(self) -> NDArray[np.float64]:
+    def neutral(self) -> Floats:
         """Actions that change nothing, shape (W, A, k)."""
         number = (self._choices - 1) // 2 if self._choices else 0
         return np.full(self._shape, float(number))
 
     def _refused(
         self, values: np.ndarray, right: np.ndarray, expected: str, flown: Mask | None
-    ) -> NDArray[np.float64]:
+    ) -> Floats:
         wrong = ~right.all(axis=-1)
         refused = wrong if flown is None else wrong & flown
         if refused.any():
@@ -71,7 +70,7 @@ class Receive(Stage):
 
     arrays = ("action",)
 
-    def __init__(self, neutral: NDArray[np.float64]) -> None:
+    def __init__(self, neutral: Floats) -> None:
         self._neutral = neutral
 
     def begin(self, record: Record) -> None:
@@ -94,7 +93,7 @@ class ActionDelay(Stage):
 
     arrays = ("actions_sent",)
 
-    def __init__(self, world: World, longest: int, neutral: NDArray[np.float64]) -> None:
+    def __init__(self, world: World, longest: int, neutral: Floats) -> None:
         self._world = world
         self._axis = neutral.ndim - 1
         self._start = filled(neutral, longest + 1, self._axis)

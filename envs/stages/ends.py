@@ -1,11 +1,10 @@
 """Rewards and ends of a step."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...models.errors import InputError
 from ...sim.state import Array
-from .record import Record, Stage, is_finite
+from .record import Floats, Record, Stage, is_finite
 
 
 class Ends(Stage):
@@ -52,7 +51,7 @@ class Ends(Stage):
         if ends.any():
             record.end(ends)
 
-    def _check(self, record: Record, reward: NDArray[np.float64]) -> None:
+    def _check(self, record: Record, reward: Floats) -> None:
         for name, values in (*record.observations.items(), ("reward", reward)):
             if is_finite(values):
                 continue

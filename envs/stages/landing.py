@@ -4,10 +4,9 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...sim import EffectOptions, World, make_controller
-from .record import Look, Mask, Record, Stage, where
+from .record import Floats, Look, Mask, Record, Stage, where
 
 DESCENT = 0.7  # m/s: PX4's default of MPC_LAND_SPEED
 
@@ -32,7 +31,7 @@ class Landing(Stage):
         self._effects = effects
 
     @cached_property
-    def _descent(self) -> tuple[Any, NDArray[np.float64]]:
+    def _descent(self) -> tuple[Any, Floats]:
         """The controller and its action, made when the first drone lands."""
         vehicle = self._world.vehicle
         controller: Any = make_controller("velocity", vehicle, self._period, self._effects)

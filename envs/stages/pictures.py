@@ -4,7 +4,7 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -225,7 +225,7 @@ class Pictures(Stage):
         """Number of each world's scene, (W,)."""
         return np.reshape(record.scenes, self._shape)[:, 0]
 
-    def _per_drone(self, values: Any) -> np.ndarray:
+    def _per_drone(self, values: object) -> np.ndarray:
         """A row for each drone."""
         array = np.asarray(values)
         width = array.size // self._rows

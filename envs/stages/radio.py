@@ -3,17 +3,15 @@
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...sim import numbers_of
 from ..state import State
 from ..tasks.goal import length
 from ..tasks.swarm import SwarmOptions
 from .history import filled, pushed
-from .record import Mask, Record, Stage
+from .record import Floats, Mask, Record, Stage
 
 FORGOTTEN = 1.0  # A drone that was not heard for so long is no neighbour any more, s
-Floats = NDArray[np.float64]
 
 
 class Radio(Stage):

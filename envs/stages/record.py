@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 from ...sim import Draw, InitialState
 from ...sim.snapshots import Arrays, Snapshot, joined
-from ...sim.state import Array, WorldState
+from ...sim.state import Array, ByName, WorldState
 from ..memory import Memory
 from ..state import State
 
 Mask = NDArray[np.bool_]
-ByName = dict[str, np.ndarray]
+Floats = NDArray[np.float64]
 Look = Callable[[], WorldState]
 """Gives the state that a controller sees: the exact one, or the estimate."""
 
@@ -58,10 +58,10 @@ class Record:
     """
 
     chosen: Mapping[str, Array]
-    sent: NDArray[np.float64]
-    action: NDArray[np.float64]
-    received: NDArray[np.float64]
-    actions_sent: NDArray[np.float64]
+    sent: Floats
+    action: Floats
+    received: Floats
+    actions_sent: Floats
     thrust: Array
     draw: Draw
     start: InitialState
@@ -70,17 +70,17 @@ class Record:
     observations: ByName
     past_observations: ByName
     history: ByName
-    terms: dict[str, Array]
-    metrics: dict[str, Array]
+    terms: ByName
+    metrics: ByName
     ended: Array
-    reward: NDArray[np.float64]
+    reward: Floats
     terminated: Mask
     truncated: Mask
     landing: Mask
     scenes: NDArray[np.int64]
-    said: NDArray[np.float64]
-    heard: NDArray[np.float64]
-    age: NDArray[np.float64]
+    said: Floats
+    heard: Floats
+    age: Floats
     keys: NDArray[np.uint32]
     silent: Mask
 

@@ -141,7 +141,7 @@ class Task:
                 f"got {self.action!r}"
             )
 
-    def __setattr__(self, name: str, value: Any) -> None:
+    def __setattr__(self, name: str, value: object) -> None:
         """Raises `AttributeError` after `setup`: what changes belongs into `memory`."""
         if "_is_set_up" in vars(self):
             raise AttributeError(

@@ -19,7 +19,7 @@ from ..effects import EffectOptions, Effects
 from ..randomize import CENTER, Randomization
 from ..rotations import body_z
 from ..snapshots import Arrays
-from ..state import Array, InitialState, WorldState
+from ..state import Array, ByName, InitialState, WorldState
 from ..world import PhysicsError, World
 from .world_parameters import WorldParameters
 
@@ -185,7 +185,7 @@ class MujocoWorld(World):
             self._batch.expand(field)[ids] = rows
         self._batch.set_const(ids)
 
-    def _kept(self) -> dict[str, np.ndarray]:
+    def _kept(self) -> ByName:
         """All that a later step depends on; `mjSTATE_INTEGRATION` has the warm start too."""
         arrays = {
             "integration": self._batch.state,

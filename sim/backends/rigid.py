@@ -14,7 +14,7 @@ from ...models.vehicle import Vehicle, craft_geoms
 from ..effects import EffectOptions
 from ..randomize import Randomization
 from ..snapshots import Arrays
-from ..state import Array, InitialState, WorldState, chosen, clip
+from ..state import Array, ByName, InitialState, WorldState, chosen, clip
 from ..world import PhysicsError, World
 from . import kernel
 from .body import RigidBody, mapped, motion
@@ -166,7 +166,7 @@ class RigidWorld(World):
             old = 0.0 * wrench if self._wrench is None else self._wrench
             self._wrench = chosen(some, wrench, old)
 
-    def _kept(self) -> dict[str, np.ndarray]:
+    def _kept(self) -> ByName:
         arrays = {name: getattr(self, name) for name in _OWN}
         arrays |= {name: getattr(self.state, name) for name in _OF_STATE}
         return {name: array for name, array in arrays.items() if array is not None}

@@ -7,7 +7,7 @@ import numpy as np
 
 from ...models.vehicle import body_axes, owners, payload_body
 from ..randomize import CENTER
-from ..state import Array, stack
+from ..state import Array, ByName, stack
 
 _FIELDS = {
     "mass": ("body_mass", "body_inertia", "dof_damping"),  # Unity's drag goes with the mass
@@ -43,7 +43,7 @@ class WorldParameters:
             np.maximum(one, 0) for one in (owner, owner[model.dof_bodyid], of_sites)
         )
 
-    def values(self, parameters: Mapping[str, Array]) -> dict[str, Array]:
+    def values(self, parameters: Mapping[str, Array]) -> ByName:
         """The fields by name, each (N, ...), of N worlds with these parameters, each (N, A)."""
         where = np.where
         given = {name: parameters[name] for name in self._names}

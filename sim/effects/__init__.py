@@ -17,7 +17,7 @@ from ...models.errors import InputError
 from ..random import GUSTS, Noise
 from ..rotations import Parts, add
 from ..snapshots import Kept
-from ..state import Array, WorldState, component
+from ..state import Array, ByName, WorldState, component
 from .air import AirEffects
 from .downwash import Downwash
 from .gusts import NUMBERS, Gusts
@@ -72,7 +72,7 @@ class Effects(Kept):
             self._gusts = Gusts(options.gusts, options.wind, vehicle.timestep)
             self._noise = noise(GUSTS, NUMBERS)
 
-    def begin(self, mask: Array, state: WorldState, factors: dict[str, Array]) -> Array:
+    def begin(self, mask: Array, state: WorldState, factors: ByName) -> Array:
         """Begin episodes of the worlds of a mask, bool, (W, A), at their rows of `state`.
 
         Factors of the drawn parameters by name, (W, A), for all worlds. Returns the thrusts of the
@@ -100,7 +100,7 @@ class Effects(Kept):
             return self._wind
         return add(self._wind, self._gusts.velocity)
 
-    def take(self, factors: dict[str, Array]) -> None:
+    def take(self, factors: ByName) -> None:
         """Take factors as of `begin`."""
         if self.on_rotors:
             self.rotors.take(factors)

@@ -10,7 +10,7 @@ from ...models.coefficients import Drag
 from ...models.errors import InputError
 from ..rotations import Parts, Rows, add, cross, dot, matrix, parts_of, product, times, transposed
 from ..snapshots import Kept
-from ..state import Array, WorldState, clip, component, each, kept, square_root, stack
+from ..state import Array, ByName, WorldState, clip, component, each, kept, square_root, stack
 from .options import EffectOptions
 from .rotors import total
 
@@ -107,7 +107,7 @@ class AirEffects(Kept):
         """Begin at the motion of a state."""
         self._before = kept(mask, _motion(state), self._before)
 
-    def take(self, factors: dict[str, Array]) -> None:
+    def take(self, factors: ByName) -> None:
         """Take the factors of drawn parameters, (W, A), by name."""
         self._factors = factors
 

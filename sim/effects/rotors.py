@@ -6,7 +6,7 @@ import numpy as np
 
 from ...models.errors import InputError
 from ..snapshots import Kept
-from ..state import Array, chosen, clip, component, each, plain, square_root, stack
+from ..state import Array, ByName, chosen, clip, component, each, plain, square_root, stack
 from .options import EffectOptions
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ class RotorEffects(Kept):
         self.charge: Array = None
         self.voltage: Array = None
 
-    def begin(self, mask: Array, thrust: Array, factors: dict[str, Array]) -> Array:
+    def begin(self, mask: Array, thrust: Array, factors: ByName) -> Array:
         """Start the rotors at the speeds that these thrusts need; factors as of `take`.
 
         Returns the thrusts that they give, (W, A, R), N.
@@ -90,7 +90,7 @@ class RotorEffects(Kept):
             self.voltage = chosen(mask, self._terminal(), self.voltage)
         return self._scaled(thrust)
 
-    def take(self, factors: dict[str, Array]) -> None:
+    def take(self, factors: ByName) -> None:
         """Take the factors of drawn parameters, (W, A), by name."""
         options = self._options
         self._scales: list[Array] = []

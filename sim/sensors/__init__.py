@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 from ...models.errors import InputError, shortened
 from ...models.fields import Choice, check, check_names
 from ..snapshots import Kept
-from ..state import Array, WorldState, chosen
+from ..state import Array, ByName, WorldState, chosen
 from ..world import World
 from .barometer import Barometer
 from .base import Sensor, Source, Values
@@ -155,7 +155,7 @@ class Sensors(Kept):
         return parts
 
     @property
-    def readings(self) -> dict[str, Array]:
+    def readings(self) -> ByName:
         """What the observation gets, by name, shapes (W, A, k)."""
         if self._replaces:
             return {}
