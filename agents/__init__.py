@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from itertools import zip_longest
 
 from ..envs.spec import Discrete, EnvSpec, component_names
-from ..models.errors import InputError
+from ..models.errors import InputError, one_line
 from .a2c import A2CConfig
 from .checkpoints import Checkpoint, CheckpointError, load, store
 from .config import NETWORK_FIELDS, Config, SACConfig
@@ -135,7 +135,7 @@ def _fitting() -> Iterator[None]:
     except ResumeError:
         raise
     except (KeyError, TypeError, ValueError, RuntimeError, IndexError) as error:
-        reason = " ".join(str(error).split())
+        reason = one_line(error)
         raise CheckpointError(f"checkpoint: its parts do not fit together: {reason:.300}") from None
 
 

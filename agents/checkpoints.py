@@ -25,7 +25,7 @@ import numpy as np
 from ..envs.config import EnvConfig
 from ..envs.spec import EnvSpec, canonical_id
 from ..models import Backend
-from ..models.errors import InputError, require, shortened
+from ..models.errors import InputError, one_line, require, shortened
 from ..models.fields import Limits, check_fields
 from .config import Config
 from .episodes import Episode, Position, ResumeError
@@ -163,7 +163,7 @@ def load(path: Path) -> Checkpoint:
     except InputError as error:
         raise CheckpointError(f"{path}: {error}") from None
     except (damage, *_MALFORMED) as error:
-        reason = " ".join(str(error).split())
+        reason = one_line(error)
         raise CheckpointError(
             f"{path}: expected a rotorgram checkpoint, got one with a wrong part ({reason:.200})"
         ) from None

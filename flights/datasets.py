@@ -3,10 +3,9 @@ Parquet. See `docs/datasets.md`."""
 
 import copy
 import re
-import shutil
 import warnings
 from collections.abc import Iterable, Iterator, Sequence, Sized
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import fields
 from itertools import chain
 from pathlib import Path
@@ -21,7 +20,7 @@ from ..envs.config import EnvConfig
 from ..envs.spaces import action_space, joined, observation_space
 from ..envs.spec import ArraySpec, EnvSpec
 from ..models.errors import InputError, require
-from ..models.files import check_new_file
+from ..models.files import check_new_file, removed_on_error
 from ..udp.journal.reader import Session
 from .recorded import read_episodes
 from .signals import telemetry_of
@@ -109,21 +108,6 @@ class RecordedEpisodes:
             self._sessions[session] = path
 
 
-@contextmanager
-def _removed_on_error(path: Path) -> Iterator[None]:
-    """Remove half a data set. An `OSError` without a file's name gets this one."""
-    try:
-        yield
-    except BaseException as error:
-        if path.is_dir():
-            shutil.rmtree(path)
-        else:
-            path.unlink(missing_ok=True)
-        if isinstance(error, OSError) and not error.filename:
-            raise OSError(error.errno, error.strerror or str(error), str(path)) from None
-        raise
-
-
 # ---- Parquet
 
 
@@ -142,7 +126,7 @@ def write_parquet(episodes: RecordedEpisodes, out: Path) -> tuple[int, int]:
     check_new_file(out, ".parquet")
     metadata = {"env_spec": episodes.spec.to_json()}
     tables = (_table(episodes.spec, i, episodes.journal, one) for i, one in enumerate(episodes))
-    with _removed_on_error(out), ExitStack() as opened:
+    with removed_on_error(out), ExitStack() as opened:
         writer: pq.ParquetWriter | None = None
         for batch in _batches(tables, _ROW_GROUP):
             table = pa.concat_tables(batch).replace_schema_metadata(metadata)
@@ -246,7 +230,7 @@ def write_minari(
     if path.exists():
         raise InputError(f"out: expected the id of a new data set, got {dataset_id}: {path} exists")
     spec = episodes.spec
-    with _removed_on_error(path), warnings.catch_warnings():
+    with removed_on_error(path), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "`.*` is set to None|env_spec is None", UserWarning)
         data = create_dataset_from_buffers(
             dataset_id,

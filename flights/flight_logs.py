@@ -8,7 +8,7 @@ from typing import NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from ..models.errors import InputError, require
+from ..models.errors import InputError, one_line, require
 from ..models.vehicle import Vehicle
 
 Floats = NDArray[np.float64]
@@ -158,7 +158,7 @@ def _table(path: Path) -> Columns:
     try:
         frame = pandas.read_csv(path) if kind == ".csv" else pandas.read_parquet(path)
     except ValueError as error:  # of pandas and pyarrow
-        reason = " ".join(str(error).split())
+        reason = one_line(error)
         raise InputError(f"log: expected a {kind} file, got {path.name}: {reason:.80}") from None
     return {str(name): frame[name].to_numpy() for name in frame}
 

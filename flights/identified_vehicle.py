@@ -63,18 +63,17 @@ def vehicle_toml(vehicle: Vehicle, numbers: Numbers, origins: Mapping[str, Origi
         f"timestep = {vehicle.timestep!r}",
         f"gravity = {vehicle.gravity!r}",
     ]
-    for group in dict.fromkeys(name.partition(".")[0] for name in values):
-        lines += ["", f"[{group}]"]
-        for name, value in values.items():
-            if not name.startswith(f"{group}."):
-                continue
-            origin = origins.get(name, Origin(""))
-            known = given[name].source if name in given else f"as in {own}"
-            source = origin.source or known
-            text = f"value = {_plain(value)}, source = {_quoted(source)}"
-            if origin.why:
-                text += f", why = {_quoted(origin.why)}"
-            lines.append(f"{name.rpartition('.')[2]} = {{ {text} }}")
+    tables: dict[str, list[str]] = {}
+    for name, value in values.items():
+        origin = origins.get(name, Origin(""))
+        known = given[name].source if name in given else f"as in {own}"
+        text = f"value = {_plain(value)}, source = {_quoted(origin.source or known)}"
+        if origin.why:
+            text += f", why = {_quoted(origin.why)}"
+        group, _, key = name.partition(".")
+        tables.setdefault(group, []).append(f"{key} = {{ {text} }}")
+    for group, rows in tables.items():
+        lines += ["", f"[{group}]", *rows]
         if group == "rotors":
             lines += _rotors(vehicle)
     return "\n".join([*lines, ""])

@@ -7,7 +7,7 @@ from concurrent.futures import Executor, Future
 from typing import Any
 
 from ..agents.checkpoints import software_versions
-from ..models.errors import InputError, require
+from ..models.errors import InputError, one_line, require
 from .executors import Result
 
 _LISTENING_TIMEOUT = 5.0  # s
@@ -32,7 +32,7 @@ class RayExecutor(Executor):
         except (OSError, RuntimeError, ValueError) as error:
             text = str(getattr(error, "strerror", None) or error)
             # The client server sends its traceback, which ends with the reason.
-            reason = " ".join(text.rpartition("Error: ")[2].split())
+            reason = one_line(text.rpartition("Error: ")[2])
             raise InputError(
                 f"address: expected a Ray cluster at {address}, got: {reason}"
             ) from None

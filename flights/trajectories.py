@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -213,7 +213,7 @@ def _act(
     """Actions of the drones that fly; 0 for the others."""
     space = env.single_action_space
     actions = np.zeros((env.num_envs, *(space.shape or ())), space.dtype)
-    observations: Any = env.observations
+    observations = env.observations
     for drone in np.flatnonzero(~done).tolist():
         policy = policies[drone]
         if policy is None:

@@ -34,6 +34,11 @@ class NotCopied:
         raise TypeError("a running env cannot be copied or pickled: make another one")
 
 
+def one_line(text: object) -> str:
+    """The text, or that of an error, without line breaks."""
+    return " ".join(str(text).split())
+
+
 def shortened(value: object) -> str:
     """The value's `repr` for an error, of at most 80 characters."""
     text = repr(value)

@@ -1,7 +1,9 @@
 """TOML files, new files, and files of packages. Imports the standard library alone."""
 
+import shutil
 import tomllib
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -27,18 +29,26 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
     raise InputError(f"{what}: expected a TOML file, got {path.name}: {reason}")
 
 
+@contextmanager
+def removed_on_error(path: Path) -> Iterator[None]:
+    """Remove half a file or folder. An `OSError` without a file's name gets this one."""
+    try:
+        yield
+    except BaseException as error:
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
+        if isinstance(error, OSError) and not error.filename:
+            raise OSError(error.errno, error.strerror or str(error), str(path)) from None
+        raise
+
+
 def write_new(path: Path, content: str | bytes) -> None:
     """Write a new file, a text in UTF-8. Raises `OSError`, which names it; then it is not there."""
     file = path.open("xb")
-    try:
-        with file:
-            file.write(content.encode() if isinstance(content, str) else content)
-    except BaseException as error:
-        with suppress(OSError):
-            path.unlink()
-        if isinstance(error, OSError):
-            raise OSError(error.errno, error.strerror, str(path)) from None
-        raise
+    with removed_on_error(path), file:
+        file.write(content.encode() if isinstance(content, str) else content)
 
 
 def check_new_file(out: Path, *endings: str) -> None:

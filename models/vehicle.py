@@ -19,7 +19,7 @@ import numpy as np
 from . import MAX_DRAG
 from .cameras import Camera, own_cameras, read_cameras
 from .coefficients import PREFIX, Coefficients
-from .errors import InputError
+from .errors import InputError, one_line
 from .fields import Limits, check
 from .library import find_vehicle
 from .mjcf import free_body, level_data, vehicle_spec
@@ -231,7 +231,7 @@ def _compile(path: Path) -> tuple[mujoco.MjSpec, str, mujoco.MjModel, mujoco.MjD
     except InputError:
         raise
     except (ValueError, RuntimeError, mujoco.FatalError) as error:
-        reason = " ".join(str(error).split())
+        reason = one_line(error)
         kind = "a vehicle" if path.suffix.lower() == ".toml" else "an MJCF file"
         raise InputError(f"vehicle: expected {kind}, got {path.name}: {reason}") from None
     return spec, text, model, data

@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager, contextmanager
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from ..models.errors import NoOpenGL, shortened
+from ..models.errors import NoOpenGL, one_line, shortened
 
 if TYPE_CHECKING:
     import mujoco
@@ -70,7 +70,7 @@ def offscreen_context(width: int, height: int) -> Any:
             with context.as_current():
                 return context
         except Exception as error:  # each library fails in a way of its own
-            words = " ".join(str(error).split()) or type(error).__name__
+            words = one_line(error) or type(error).__name__
             if isinstance(error, AttributeError):  # PyOpenGL's way to say so
                 words = "its library is not installed"
             reasons.append(f"{name}: {words:.200}")

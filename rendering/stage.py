@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from ..models.cameras import place_cameras
-from ..models.errors import InputError, shortened
+from ..models.errors import InputError, one_line, shortened
 from ..models.fields import Limits, check
 from ..models.fleet import load_vehicles, members_of
 from ..models.mjcf import attach_craft, free_body, level_data
@@ -180,7 +180,7 @@ class Stage:
         except InputError:
             raise
         except ValueError as error:  # a texture is missing, which the physics does not need
-            reason = " ".join(str(error).split())
+            reason = one_line(error)
             raise InputError(f"vehicle: expected a file that can be drawn, got: {reason}") from None
         self.radius = max(radius for radius, _ in sizes)
         top = sizes[0][1]

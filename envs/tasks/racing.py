@@ -9,7 +9,7 @@ from typing import Annotated
 
 import numpy as np
 
-from ...models.errors import InputError, shortened
+from ...models.errors import InputError, one_line, shortened
 from ...models.fields import Limits, read_table
 from ...sim import (
     Array,
@@ -270,7 +270,7 @@ def read_track(given: str) -> tuple[list[Gate], Start]:
             content = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         names = ", ".join(sorted(path.stem for path in TRACKS.glob("*.toml")))
-        reason = " ".join((getattr(error, "strerror", None) or str(error)).split())
+        reason = one_line(getattr(error, "strerror", None) or error)
         raise InputError(
             f"track: expected {_WAY} ({names}), got {shortened(given)}: {reason:.120}"
         ) from None

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import numpy as np
 
-from ...models.errors import InputError, shortened
+from ...models.errors import InputError, one_line, shortened
 from ...models.fields import Limits
 from ...sim import (
     Array,
@@ -298,7 +298,7 @@ def read_samples(given: str) -> np.ndarray:
         reason = getattr(error, "strerror", None) or str(error)  # without the file's name
         if isinstance(error, KeyError):
             reason = f"no column {error}"
-        got = f"{shortened(given)}: {' '.join(reason.split()):.120}"
+        got = f"{shortened(given)}: {one_line(reason):.120}"
         raise InputError(f"trajectory: expected {_EXPECTED}, got {got}") from None
     shape = samples.shape
     if shape[1:] != (4,) or not 2 <= len(samples) <= MAX_SAMPLES:

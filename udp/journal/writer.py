@@ -21,6 +21,7 @@ from typing import Any
 
 from mcap.writer import Writer
 
+from ...models.files import removed_on_error
 from ..protocol.messages import Command, Hello, Message, State
 from ..transport.stepped import Steppable
 
@@ -73,13 +74,8 @@ class Journal:
         except FileExistsError:
             sentence = f"record: expected a file that does not exist yet, got {path}"
             raise FileExistsError(sentence) from None
-        try:
+        with removed_on_error(Path(path)):
             file.write_head(head, models or {}, now)
-        except BaseException as error:
-            Path(path).unlink()
-            if isinstance(error, OSError):
-                raise OSError(error.errno, error.strerror, str(path)) from None
-            raise
         weakref.finalize(self, file.close)
 
     def tap(self, slot: int, message: Message, datagram: bytes) -> None:
