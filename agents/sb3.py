@@ -284,11 +284,13 @@ class _PPO(sb3.PPO):
     def set_rates(self, config: PPOConfig) -> None:
         rate = config.learning_rate
         self.critic_share = (config.critic_learning_rate or rate) / rate
-        groups: dict[bool, list[torch.nn.Parameter]] = {False: [], True: []}
+        actor: list[torch.nn.Parameter] = []
+        critic: list[torch.nn.Parameter] = []
         for name, parameter in self.policy.named_parameters():
-            groups["value_net." in name].append(parameter)
+            group = critic if "value_net." in name else actor
+            group.append(parameter)
         settings = self.policy.optimizer_kwargs
-        parts = [{"params": parameters} for parameters in groups.values()]
+        parts = [{"params": actor}, {"params": critic}]
         self.policy.optimizer = torch.optim.Adam(parts, **settings)
 
     def _update_learning_rate(self, optimizers: Any) -> None:

@@ -60,14 +60,16 @@ class Sim(BackendFlags, WireFlags):
 
         several = "agents" in self.given
         wrong = "with" if several else "without"
-        for name in _OF_ONE_AGENT if several else _OF_AGENTS:
+        others = _OF_ONE_AGENT if several else _OF_AGENTS
+        for name in others:
             if name in self.given:
                 flag = f"--{name.replace('_', '-')}"
                 raise InputError(f"{flag}: cannot be used {wrong} --agents")
+        agents = [parse_address(agent) for agent in self.agents] if several else None
         simulator = Simulator(
             self.env_config(backend=self.backend),
             server=parse_address(self.server),
-            agents=[parse_address(agent) for agent in self.agents] if several else None,
+            agents=agents,
             num_envs=self.num_envs,
             bind=parse_address(self.bind),
             codec=self.codec,

@@ -316,7 +316,8 @@ class EnvConfig:
             return self
         from ..models.bundle import read_bundle  # it imports MuJoCo
 
-        return replace(self, files={**self.files, **{word: read_bundle(word) for word in words}})
+        read = {word: read_bundle(word) for word in words}
+        return replace(self, files={**self.files, **read})
 
     def resolve(self) -> Self:
         """The same with its files and hashes. Refuses by name what cannot be flown together.

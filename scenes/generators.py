@@ -78,7 +78,9 @@ class Builder:
             colours = look["colours"]
             for number, base in enumerate(colours):
                 colour = self.colour(base, look.get("by", 0.06))
-                own = f"{self.scene}/{name}" + (f"_{number}" if len(colours) > 1 else "")
+                own = f"{self.scene}/{name}"
+                if len(colours) > 1:
+                    own += f"_{number}"
                 material = self.spec.add_material(name=own, specular=look.get("gloss", 0.0))
                 if "pattern" in look:
                     self._add_pattern(material, colour, look)

@@ -213,7 +213,9 @@ def _compare(
     evidence += f"difference {_number(difference)}, {_INTERVAL} {_range(low, high)}"
     if low <= 0.0 <= high:
         return "undecided", f"{evidence}."
-    return ("borne out" if (low > 0.0) == larger else "not borne out"), f"{evidence}."
+    agrees = (low > 0.0) == larger
+    outcome: Outcome = "borne out" if agrees else "not borne out"
+    return outcome, f"{evidence}."
 
 
 def _measured(name: str, numbers: Floats, runs: list[pd.DataFrame], words: tuple[str, str]) -> str:
@@ -279,7 +281,8 @@ def judge_no_worse(runs: pd.DataFrame, preset: str, headline: Headline) -> Verdi
 
 def _no_worse(runs: pd.DataFrame, margin: float, headline: Headline) -> tuple[Outcome, str]:
     names = ("a2c", "sb3-a2c")
-    ours, theirs = (runs[runs["row"] == name] for name in names)
+    ours = runs[runs["row"] == "a2c"]
+    theirs = runs[runs["row"] == "sb3-a2c"]
     missing = [name for name in names if name not in set(runs["row"])]
     if missing:
         return "not tested", _untrained(missing)
@@ -291,7 +294,8 @@ def _no_worse(runs: pd.DataFrame, margin: float, headline: Headline) -> tuple[Ou
     )
     if min(np.isfinite(values).sum() for values in pair) < MIN_SEEDS:
         return "undecided", f"{evidence}; {_TOO_FEW}."
-    held, their_held = ours["held"].mean(), theirs["held"].mean()
+    held = ours["held"].mean()
+    their_held = theirs["held"].mean()
     evidence += f", 95 % interval {headline.amount(_range(low, high))}; "
     evidence += f"{held:.0%} of the seeds of A2C hold, {their_held:.0%} of SB3's."
     best, worst = (-high, -low) if headline.high else (low, high)

@@ -202,7 +202,8 @@ def _held(line: Mapping[str, float], seeds: int) -> Cell:
 
 
 def _crashes(line: Mapping[str, float]) -> Cell:
-    low, high = (100 * line[f"crash_rate_{end}"] for end in ("low", "high"))
+    low = 100 * line["crash_rate_low"]
+    high = 100 * line["crash_rate_high"]
     rate = number_text(100 * line["crash_rate"])
     interval = f"{number_text(low)} to {number_text(high)} %"
     return Cell(f"{rate} %", (interval, f"{int(line['crashed'])} of {int(line['episodes'])}"))
