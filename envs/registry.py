@@ -49,6 +49,8 @@ def load(env_id: str) -> str:
     The module of "module:Name-v0" is looked for in the working folder too. Raises `InputError`:
     there is no such module, or it registers no such env.
     """
+    if not isinstance(env_id, str):
+        raise InputError(f"env: expected the id of a task, got {env_id!r}")
     module, colon, name = env_id.rpartition(":")
     if colon:
         if not module or module.startswith("."):

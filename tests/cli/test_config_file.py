@@ -80,6 +80,13 @@ def test_a_policy_flies_with_the_config_of_its_training(
     assert load(tmp_path / "run" / "checkpoint.safetensors").env == kept.env
 
 
+def test_the_env_of_a_file_is_an_id(tmp_path: Path) -> None:
+    path = tmp_path / "env.toml"
+    path.write_text('[env]\nenv_id = "rotorgram/Hover-v0"\n')
+    with pytest.raises(InputError, match=r"^env: expected the id of a task, got \{"):
+        parse(Compare, "rotorgram compare", ["--config", str(path)])
+
+
 def test_files_of_a_comparison_have_the_same_settings_or_are_refused(tmp_path: Path) -> None:
     files = []
     for name, seeds in (("a", 3), ("b", 4)):
