@@ -15,7 +15,7 @@ from rotorgram.sim import CollectiveThrust, InitialState, stack
 
 ID = "rotorgram/Elevation-v0"
 HOVER = "rotorgram/Hover-v0"
-HEXA = Path(__file__).parents[1] / "data" / "hexa.xml"
+one_or_several = pytest.mark.parametrize("num_envs", [1, 3])
 
 
 def started(env_id: str = ID, num_envs: int = 2, **options: Any) -> tuple[Loop, np.ndarray]:
@@ -35,8 +35,10 @@ def shown(loop: Loop, drone: int) -> bytes:
 def test_flags_of_those_that_do_not_fly() -> None:
     loop, actions = started(episode_length=1)
     loop.advance(actions)
-    assert loop.truncated.tolist() == loop.done.tolist() == [True, True]
-    loop.advance(actions, np.array([True, False]), None, np.array([False, True]))
+    assert loop.truncated.tolist() == [True, True]
+    assert loop.done.tolist() == [True, True]
+    first = np.array([True, False])
+    loop.advance(actions, first, None, ~first)
     assert loop.truncated.tolist() == [False, False]
     assert loop.rewards.tolist() == [0.0, 0.0]
     assert loop.done.tolist() == [False, True]
@@ -81,17 +83,23 @@ def test_seeds_of_a_wire() -> None:
     loop, actions = started(num_envs=3)
     before = shown(loop, 1)
     seeds = np.array([2**64 - 1, 5, 2**64 - 1], np.uint64)
-    loop.advance(actions, np.array([True, False, True]), seeds, np.array([False, True, False]))
-    assert shown(loop, 0) == shown(loop, 2) != shown(loop, 1) == before
+    resets = np.array([True, False, True])
+    loop.advance(actions, resets, seeds, ~resets)
+    assert shown(loop, 1) == before
+    assert shown(loop, 0) != before
+    assert shown(loop, 2) == shown(loop, 0)
 
 
 def test_a_draw_that_is_switched_off_moves_no_other() -> None:
     """Equal ends draw all the same: a start tilt of 0 leaves heading and offset as they were."""
-    (tilted, _), (level, _) = (started(HOVER, start_tilt=tilt) for tilt in (30.0, 0.0))
+    tilted, _ = started(HOVER, start_tilt=30.0)
+    level, _ = started(HOVER, start_tilt=0.0)
     np.testing.assert_array_equal(tilted.telemetry["position"], level.telemetry["position"])
-    assert abs(level.telemetry["attitude"][:, 1:3]).max() < 1e-12
+    tilts = level.telemetry["attitude"][:, 1:3]
+    assert abs(tilts).max() < 1e-12
     headings = level.telemetry["metrics"][:, 1]
-    np.testing.assert_allclose(tilted.telemetry["metrics"][:, 1], headings, atol=8.0)
+    others = tilted.telemetry["metrics"][:, 1]
+    np.testing.assert_allclose(others, headings, atol=8.0)
 
 
 # --- a task that gives whatever a task may give ---------------------------------------------------
@@ -104,10 +112,9 @@ class Careless(Task):
 
     def setup(self) -> None:
         self.controller = CollectiveThrust(self.vehicle, 10.0, increment=False)
-        self.observation = (
-            ArraySpec(name="position", shape=(3,), dtype="float64", low=-1e3, high=1e3),
-            ArraySpec(name="picture", shape=(2, 2), dtype="uint8"),
-        )
+        position = ArraySpec(name="position", shape=(3,), dtype="float64", low=-1e3, high=1e3)
+        picture = ArraySpec(name="picture", shape=(2, 2), dtype="uint8")
+        self.observation = (position, picture)
 
     def begin(self, mask: Any, draw: Any) -> InitialState:
         return InitialState(position=stack((0.0, 0.0, draw.uniform(3.0, 4.0))))
@@ -137,7 +144,7 @@ class Counting(Careless):
         return Outcome(reward={"none": climb}, terminated=False, metrics=count)
 
 
-@pytest.mark.parametrize("num_envs", [1, 3])
+@one_or_several
 def test_a_tasks_memory_is_that_of_the_drones_that_flew(num_envs: int) -> None:
     register("counting-v0", Counting)
     try:
@@ -173,7 +180,7 @@ def careless() -> Iterator[str]:
     gym.registry.pop("careless-v0")
 
 
-@pytest.mark.parametrize("num_envs", [1, 3])
+@one_or_several
 def test_what_a_step_gave_stays_as_it_was(careless: str, num_envs: int) -> None:
     loop = loop_of(careless, num_envs, episode_length=3)
     actions = np.ones((num_envs, 1), np.float32)
@@ -187,14 +194,15 @@ def test_what_a_step_gave_stays_as_it_was(careless: str, num_envs: int) -> None:
     assert loop.truncated.all()
     for array, before in zip(given, kept, strict=True):
         assert array.tobytes() == before.tobytes()
-    assert loop.observations["picture"].dtype == np.uint8
-    assert loop.observations["picture"].tolist() == [[[1, 2], [3, 3]]] * num_envs
+    picture = loop.observations["picture"]
+    assert picture.dtype == np.uint8
+    assert picture.tolist() == [[[1, 2], [3, 3]]] * num_envs
     assert loop.observations["position"].shape == (num_envs, 3)
     # 40 N on 20 kg: 2 m/s² for 3 steps of 0.02 s
     assert loop.metrics["climb"] == pytest.approx(0.12, abs=1e-9)
 
 
-@pytest.mark.parametrize("num_envs", [1, 3])
+@one_or_several
 def test_a_task_may_give_constants_and_float32(num_envs: int) -> None:
     class Plain(registry.task_type(ID)):  # type: ignore[misc]
         def outcome(self, state: Any) -> Any:
@@ -263,13 +271,15 @@ def test_what_a_user_typed_is_imported_and_nothing_else(
     gym.registry.pop("Typed-v0")
 
 
-@pytest.mark.parametrize("num_envs", [1, 3])
+@one_or_several
 @pytest.mark.parametrize("wrong", ["observation", "reward"])
 def test_numbers_of_a_task_that_are_not_finite_go_no_further(num_envs: int, wrong: str) -> None:
     class Broken(registry.task_type(ID)):  # type: ignore[misc]
         def observe(self, state: Any) -> Any:
-            seen = super().observe(state)
-            return {"observation": seen["observation"] * (np.nan if wrong == "observation" else 1)}
+            seen = super().observe(state)["observation"]
+            if wrong == "observation":
+                seen = seen * np.nan
+            return {"observation": seen}
 
         def outcome(self, state: Any) -> Any:
             outcome = super().outcome(state)
@@ -284,7 +294,7 @@ def test_numbers_of_a_task_that_are_not_finite_go_no_further(num_envs: int, wron
         loop.advance(zero_actions(num_envs), everybody)
 
 
-@pytest.mark.parametrize("num_envs", [1, 3])
+@one_or_several
 @pytest.mark.parametrize(
     ("start", "got"),
     [
@@ -331,25 +341,32 @@ def looped(task: type[Task], num_envs: int) -> tuple[Loop, np.ndarray]:
     return loop, np.full((num_envs, 1), 0.5, np.float32)
 
 
-@pytest.mark.parametrize("num_envs", [1, 3])
+@one_or_several
 def test_states_are_safe_to_keep(num_envs: int) -> None:
     """A task that kept `state.thrust` once saw the simulator's memory (fault 43)."""
     Watching.seen.clear()
     loop, actions = looped(Watching, num_envs)
-    heights = [loop.record.state.position[..., 2].tolist()]
+
+    def height(state: Any) -> Any:
+        return state.position[..., 2].tolist()
+
+    heights = [height(loop.record.state)]
     for _ in range(3):
         loop.advance(actions)
-        heights.append(loop.record.state.position[..., 2].tolist())
-    assert [state.position[..., 2].tolist() for state in Watching.seen] == heights
-    assert len({str(row) for row in heights}) == 4
+        heights.append(height(loop.record.state))
+    seen = [height(state) for state in Watching.seen]
+    assert seen == heights
+    different = {str(row) for row in heights}
+    assert len(different) == 4
     first, second = Watching.seen[:2]
-    assert np.ptp(second.thrust - first.thrust) == 0.0
-    assert (second.thrust - first.thrust).flat[0] == 5.0  # 10 N for an action of 1
+    added = second.thrust - first.thrust
+    assert np.ptp(added) == 0.0
+    assert added.flat[0] == 5.0  # 10 N for an action of 1
     with pytest.raises(ValueError, match="read-only"):
         first.position[..., 2] = 0.0
 
 
-@pytest.mark.parametrize("num_envs", [1, 3])
+@one_or_several
 def test_a_task_sees_action_and_time(num_envs: int) -> None:
     Watching.seen.clear()
     loop, actions = looped(Watching, num_envs)
@@ -357,10 +374,14 @@ def test_a_task_sees_action_and_time(num_envs: int) -> None:
     loop.advance(actions)
     drones = np.arange(num_envs)
     loop.advance(actions, drones == 0, None, drones > 0)
-    assert [np.ravel(state.action)[0] for state in Watching.seen] == [0.0, 0.5, 0.5, 0.0]
-    assert [np.ravel(state.steps)[0] for state in Watching.seen] == [0, 1, 2, 0]
-    assert [np.ravel(state.time)[0] for state in Watching.seen] == [0.0, 0.02, 0.04, 0.0]
-    assert np.ravel(Watching.seen[-1].action)[1:].tolist() == [0.5] * (num_envs - 1)
+    sent = [np.ravel(state.action)[0] for state in Watching.seen]
+    assert sent == [0.0, 0.5, 0.5, 0.0]
+    steps = [np.ravel(state.steps)[0] for state in Watching.seen]
+    assert steps == [0, 1, 2, 0]
+    times = [np.ravel(state.time)[0] for state in Watching.seen]
+    assert times == [0.0, 0.02, 0.04, 0.0]
+    last = np.ravel(Watching.seen[-1].action)
+    assert last[1:].tolist() == [0.5] * (num_envs - 1)
 
 
 def test_a_task_remembers_in_its_memory_alone() -> None:

@@ -75,10 +75,11 @@ def test_bit_for_bit_that_of_single_envs(
     ended = 0
     for _ in range(250):
         actions = actions_of(ours, dice)
-        steps = ours.step(actions), theirs.step(actions)
-        for one, other in zip(*steps, strict=True):
+        step = ours.step(actions)
+        for one, other in zip(step, theirs.step(actions), strict=True):
             same(one, other)
-        ended += int((steps[0][2] | steps[0][3]).sum())
+        ends = step[2] | step[3]
+        ended += int(ends.sum())
     assert ended >= N
     ours.close()
 
@@ -89,8 +90,9 @@ def test_the_number_of_threads_changes_nothing() -> None:
         env = LocalVectorEnv(HOVER, 9, num_threads=threads)
         dice = np.random.default_rng(1)
         flown = [env.reset(seed=0)[0].tobytes()]
-        flown += [b"".join(x.tobytes() for x in env.step(actions_of(env, dice))[:4])
-                  for _ in range(60)]  # fmt: skip
+        for _ in range(60):
+            step = env.step(actions_of(env, dice))
+            flown += [array.tobytes() for array in step[:4]]
         results.append(flown)
     assert results[0] == results[1] == results[2]
 
@@ -112,8 +114,9 @@ def test_what_a_step_gives_is_the_callers(env_id: str) -> None:
     # The reward is that of the last step, though the next episode has begun.
     assert second[4]["final_obs"].tobytes() != second[0].tobytes()
     if env_id == ID:
-        error = second[4]["final_obs"][:, 0].astype(float)
-        np.testing.assert_allclose(second[1], (0.5 - abs(error)) / (0.5 + abs(error)), rtol=1e-6)
+        error = abs(second[4]["final_obs"][:, 0].astype(float))
+        reward = (0.5 - error) / (0.5 + error)
+        np.testing.assert_allclose(second[1], reward, rtol=1e-6)
 
 
 @on_both_tasks
@@ -135,7 +138,8 @@ def test_a_mask_resets_some_and_leaves_the_others(env_id: str) -> None:
     with pytest.raises(gym.error.ResetNeeded, match="env 1 first"):
         env.step(hold)
     env.reset(options={"reset_mask": ~mask})
-    assert not env.step(hold)[3].any()
+    _, _, _, truncated, _ = env.step(hold)
+    assert not truncated.any()
 
 
 def test_targets_and_starts_of_ones_own() -> None:
@@ -145,8 +149,10 @@ def test_targets_and_starts_of_ones_own() -> None:
     observations, info = env.reset(options={"target": targets, "start": starts})
     assert info["z"].tolist() == starts.tolist()
     assert info["goal_z"].tolist() == targets.tolist()
-    np.testing.assert_array_equal(observations[:, 0], (targets - starts).astype(np.float32))
-    assert not env.step(zero_actions(3))[2].any()
+    errors = (targets - starts).astype(np.float32)
+    np.testing.assert_array_equal(observations[:, 0], errors)
+    _, _, terminated, *_ = env.step(zero_actions(3))
+    assert not terminated.any()
     # Without a start, the seed gives how far from the target it is: as with the env's own target.
     plain, _ = env.reset(seed=1)
     observations, info = env.reset(seed=1, options={"target": 50.0})
@@ -189,13 +195,15 @@ def test_wrong_actions_change_nothing(kind: str, actions: np.ndarray, expected: 
         env.reset(seed=0)
     with pytest.raises(InputError, match=f"^actions: .*{expected}"):
         envs[0].step(actions)
-    for one, other in zip(*(env.step(good) for env in envs), strict=True):
+    first, second = (env.step(good) for env in envs)
+    for one, other in zip(first, second, strict=True):
         same(one, other)
 
 
 def test_a_step_before_a_reset() -> None:
+    env = LocalVectorEnv(ID, 2)
     with pytest.raises(gym.error.ResetNeeded):
-        LocalVectorEnv(ID, 2).step(zero_actions(2))
+        env.step(zero_actions(2))
 
 
 def test_a_bad_state_raises_and_a_reset_mends_it() -> None:
@@ -240,26 +248,28 @@ def test_an_error_of_the_physics_leaves_no_warnings(monkeypatch: pytest.MonkeyPa
 @pytest.mark.quiet
 def test_tilted_drones_cost_what_level_ones_do() -> None:
     """1,024 drones, telemetry and all: nothing is computed drone by drone."""
-    envs = {
-        tilt: LocalVectorEnv(HOVER, 1024, num_threads=1, start_tilt=tilt, start_heading=tilt)
-        for tilt in (0.0, 30.0)
-    }
-    best = dict.fromkeys(envs, float("inf"))
-    for env in envs.values():
+    envs = {}
+    for tilt in (0.0, 30.0):
+        env = LocalVectorEnv(HOVER, 1024, num_threads=1, start_tilt=tilt, start_heading=tilt)
         env.reset(seed=0)
+        envs[tilt] = env
+    best = dict.fromkeys(envs, float("inf"))
     actions = zero_actions(1024, 4)
     for _ in range(8):
         for tilt, env in envs.items():
             begun = time.perf_counter()
             env.step(actions)
-            best[tilt] = min(best[tilt], time.perf_counter() - begun)
+            spent = time.perf_counter() - begun
+            best[tilt] = min(best[tilt], spent)
     assert best[30.0] < 2.0 * best[0.0] + 1e-3
 
 
 def test_the_registered_entry_point() -> None:
     for env_id in (ID, HOVER):
-        assert gym.spec(env_id).vector_entry_point == "rotorgram.envs.vector:LocalVectorEnv"
-        assert isinstance(gym.make_vec(env_id, num_envs=2), LocalVectorEnv)
+        registered = gym.spec(env_id)
+        assert registered.vector_entry_point == "rotorgram.envs.vector:LocalVectorEnv"
+        env = gym.make_vec(env_id, num_envs=2)
+        assert isinstance(env, LocalVectorEnv)
 
 
 @pytest.mark.parametrize("num_envs", [1, 4])
