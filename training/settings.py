@@ -271,6 +271,8 @@ class Study:
             content = {"row": [{"name": path.stem, **content}]}
         env = content.pop("env", {})
         tables = content.pop("row")
+        if "rows" in content:
+            raise InputError(f"{path}: rows: expected [[row]] tables, got the name rows")
         if type(tables) is not list:
             raise InputError(f"{path}: row: expected [[row]] tables, got {shortened(tables)}")
         rows = _rows(f"{path}", tables, env)
