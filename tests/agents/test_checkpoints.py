@@ -42,7 +42,8 @@ def config_of(algorithm: str) -> Config:
 
 
 def log_of(drones: int, seed: int = 5, **options: Any) -> EpisodeRecorder:
-    return EpisodeRecorder(vector(drones, **{**OPTIONS, **options}), seed)
+    env = vector(drones, **{**OPTIONS, **options})
+    return EpisodeRecorder(env, seed)
 
 
 def checkpoint_of(algorithm: str, log: EpisodeRecorder, agent: Learner) -> Checkpoint:
@@ -69,7 +70,8 @@ def trained(algorithm: str, log: EpisodeRecorder, updates: int = 10**9) -> Learn
 def short_training(algorithm: str, drones: int = 2, **options: Any) -> Checkpoint:
     """Stopped after three updates."""
     log = log_of(drones, **options)
-    return checkpoint_of(algorithm, log, trained(algorithm, log, updates=3))
+    agent = trained(algorithm, log, updates=3)
+    return checkpoint_of(algorithm, log, agent)
 
 
 @pytest.mark.parametrize("drones", [1, 4])
@@ -98,8 +100,9 @@ def test_a_training_that_was_stopped_ends_as_if_it_had_not(
     assert state.keys() == expected.keys()
     for name, array in state.items():
         assert array.tobytes() == expected[name].tobytes(), name
-    episodes = [[replace(e, seconds=0.0) for e in one.episodes] for one in (log, whole)]
-    assert episodes[0] == episodes[1]
+    found = [replace(episode, seconds=0.0) for episode in log.episodes]
+    wanted = [replace(episode, seconds=0.0) for episode in whole.episodes]
+    assert found == wanted
 
 
 @pytest.fixture(scope="module")
@@ -118,25 +121,34 @@ def test_a_checkpoint_tells_where_it_comes_from(kept: Checkpoint) -> None:
     assert kept.other_versions() == {}
     other = replace(kept, versions={**kept.versions, "torch": "0.1"})
     assert other.other_versions() == {"torch": ("0.1", kept.versions["torch"])}
-    assert kept.policy().act(np.zeros(3, np.float32)).shape == (1,)
+    policy = kept.policy()
+    action = policy.act(np.zeros(3, np.float32))
+    assert action.shape == (1,)
+    spec = log_of(1, observation="error").spec
     with pytest.raises(InputError, match="policy: expected weights of shapes"):
-        kept.policy(log_of(1, observation="error").spec)
+        kept.policy(spec)
 
 
-@pytest.mark.parametrize(
-    "options", [{"effects": {"linear_drag": 0.1}}, {"target": 8.0}, {"action_type": "discrete"}]
-)
+DRAG = {"effects": {"linear_drag": 0.1}}
+
+
+@pytest.mark.parametrize("options", [DRAG, {"target": 8.0}, {"action_type": "discrete"}])
 def test_another_env_is_refused(options: dict[str, Any], kept: Checkpoint) -> None:
+    log = log_of(2, **options)
     with pytest.raises(ResumeError, match="an env with options"):
-        resume_agent(kept, log_of(2, **options))
+        resume_agent(kept, log)
 
 
 def test_an_env_that_does_not_repeat_is_refused(kept: Checkpoint) -> None:
+    log = log_of(3)
     with pytest.raises(ResumeError, match="expected a training with 3 drones, got one with 2"):
-        resume_agent(kept, log_of(3))
-    position = replace(kept.position, actions=kept.position.actions * 0.5)
+        resume_agent(kept, log)
+    actions = kept.position.actions * 0.5
+    position = replace(kept.position, actions=actions)
+    crafted = replace(kept, position=position)
+    log = log_of(2)
     with pytest.raises(ResumeError, match="does not repeat the episodes"):
-        resume_agent(replace(kept, position=position), log_of(2))
+        resume_agent(crafted, log)
 
 
 DAMAGED = "expected a rotorgram checkpoint, got another file or a damaged one"
@@ -176,7 +188,8 @@ def test_what_is_not_finite_is_never_stored(part: str, kept: Checkpoint, tmp_pat
     path = tmp_path / "c"
     store(kept, path)
     before = path.read_bytes()
-    wrong = replace(kept, **{part: with_nan(getattr(kept, part))})
+    arrays = with_nan(getattr(kept, part))
+    wrong = replace(kept, **{part: arrays})
     with pytest.raises(CheckpointError, match=r"training diverged, .* is not finite"):
         store(wrong, path)
     assert path.read_bytes() == before
@@ -190,10 +203,12 @@ def test_what_is_not_finite_is_never_loaded(
     path = tmp_path / "c"
     with monkeypatch.context() as patch:
         patch.setattr(checkpoints, "_not_finite", lambda _: [])
-        store(replace(kept, actor=with_nan(kept.actor)), path)
+        crafted = replace(kept, actor=with_nan(kept.actor))
+        store(crafted, path)
     with pytest.raises(CheckpointError) as told:
         load(path)
-    name = f"policy/{next(iter(kept.actor))}"
+    first = next(iter(kept.actor))
+    name = f"policy/{first}"
     assert str(told.value) == f"{path}: expected finite numbers, got NaN or infinity in {name}"
 
 
@@ -208,7 +223,8 @@ def refusal_of(kept: Checkpoint, path: Path) -> str:
 @pytest.mark.parametrize("case", cases("crafted_metadata"), ids=str)
 def test_crafted_metadata_is_refused(case: Any, kept: Checkpoint, tmp_path: Path) -> None:
     crafted = replace(kept, **case["change"])
-    assert case["sentence"] in refusal_of(crafted, tmp_path / "c")
+    refusal = refusal_of(crafted, tmp_path / "c")
+    assert case["sentence"] in refusal
 
 
 @pytest.mark.parametrize(("text", "sentence"), [(None, "wrong part"), ("{}", "expected env_id in")])
@@ -216,7 +232,9 @@ def test_a_crafted_spec_is_refused(
     text: str | None, sentence: str, kept: Checkpoint, tmp_path: Path
 ) -> None:
     spec: Any = SimpleNamespace(to_json=lambda: text)
-    assert sentence in refusal_of(replace(kept, spec=spec), tmp_path / "c")
+    crafted = replace(kept, spec=spec)
+    refusal = refusal_of(crafted, tmp_path / "c")
+    assert sentence in refusal
 
 
 def test_another_format_is_refused(
@@ -239,23 +257,31 @@ def normalised() -> Checkpoint:
 def test_parts_that_do_not_fit_are_refused(
     name: str, shape: tuple[int, ...], normalised: Checkpoint
 ) -> None:
-    state = {**normalised.state, name: np.zeros(shape, np.float32)}
+    array = np.zeros(shape, np.float32)
+    state = {**normalised.state, name: array}
+    wrong = replace(normalised, state=state)
+    log = log_of(2)
     with pytest.raises(CheckpointError, match="its parts do not fit together"):
-        resume_agent(replace(normalised, state=state), log_of(2))
+        resume_agent(wrong, log)
 
 
 @pytest.mark.parametrize("name", ["optimizer.first", "observations.count", "weights", "rng"])
 def test_a_missing_part_is_refused(name: str, normalised: Checkpoint) -> None:
-    state = {key: array for key, array in normalised.state.items() if key != name}
+    state = dict(normalised.state)
+    del state[name]
+    wrong = replace(normalised, state=state)
+    log = log_of(2)
     with pytest.raises(CheckpointError, match="its parts do not fit together"):
-        resume_agent(replace(normalised, state=state), log_of(2))
+        resume_agent(wrong, log)
 
 
 @pytest.mark.parametrize("config", [{"hidden": [10**9]}, {"gamma": 7}, {"other": 1}])
 def test_a_config_that_does_not_fit_is_refused(config: Any, normalised: Checkpoint) -> None:
-    wrong = replace(normalised, config={**normalised.config, **config})
+    given = {**normalised.config, **config}
+    wrong = replace(normalised, config=given)
+    log = log_of(2)
     with pytest.raises(CheckpointError, match="its parts do not fit together"):
-        resume_agent(wrong, log_of(2))
+        resume_agent(wrong, log)
 
 
 @pytest.mark.parametrize(("name", "shape"), cases("wrong_positions"))

@@ -49,26 +49,32 @@ def policy_of(
     rng = np.random.default_rng(0)
     for array in policy.weights.arrays.values():
         if array.ndim == 2:
-            array[...] = rng.normal(size=array.shape) / np.sqrt(array.shape[1])
+            numbers = rng.normal(size=array.shape)
+            array[...] = numbers / np.sqrt(array.shape[1])
     if policy.moments is not None:
         size = flat_size(spec)
-        policy.moments.mean = rng.normal(size=size).astype(np.float32)
-        policy.moments.scale = np.exp(rng.normal(size=size)).astype(np.float32)
+        mean = rng.normal(size=size)
+        scale = np.exp(rng.normal(size=size))
+        policy.moments.mean = mean.astype(np.float32)
+        policy.moments.scale = scale.astype(np.float32)
     return policy
 
 
 def plain_spec(actions: int) -> EnvSpec:
     """Of so many actions and one observation, without bounds."""
     action = ArraySpec(name="a", shape=(actions,))
-    return spec_of(action, [ArraySpec(name="o", shape=(1,))])
+    observation = ArraySpec(name="o", shape=(1,))
+    return spec_of(action, [observation])
 
 
 def elevation() -> EnvSpec:
-    return env_spec(EnvConfig(env_id="rotorgram/Elevation-v0"))
+    config = EnvConfig(env_id="rotorgram/Elevation-v0")
+    return env_spec(config)
 
 
 def hover(**keywords: str) -> EnvSpec:
-    return env_spec(EnvConfig.from_keywords("rotorgram/Hover-v0", **keywords))
+    config = EnvConfig.from_keywords("rotorgram/Hover-v0", **keywords)
+    return env_spec(config)
 
 
 def told_of(spec: EnvSpec) -> dict[str, str]:
@@ -78,15 +84,21 @@ def told_of(spec: EnvSpec) -> dict[str, str]:
 def observations_of(spec: EnvSpec, rows: int = ROWS) -> np.ndarray:
     """Half of them around 0 and up to the bounds, half up to a hundred times as far."""
     rng = np.random.default_rng(1)
-    bounds = [np.abs(np.stack(array.bounds())).max(0).ravel() for array in spec.observation]
+    bounds = []
+    for array in spec.observation:
+        sizes = np.abs(np.stack(array.bounds()))
+        bounds.append(sizes.max(0).ravel())
     far = np.minimum(np.concatenate(bounds), 10.0)
     drawn = far * rng.uniform(-1, 1, (rows, far.size))
-    drawn[rows // 2 :] *= 10.0 ** rng.uniform(0, 2, (rows - rows // 2, 1))
+    half = rows // 2
+    exponents = rng.uniform(0, 2, (rows - half, 1))
+    drawn[half:] *= 10.0**exponents
     return drawn.astype(np.float32)
 
 
 def by_policy(policy: NetworkPolicy, observations: np.ndarray) -> np.ndarray:
-    return np.array([np.atleast_1d(policy.act(row)).ravel() for row in observations], np.float64)
+    actions = [np.ravel(policy.act(row)) for row in observations]
+    return np.array(actions, np.float64)
 
 
 # Each runs the file of a target on observations, in a folder.
@@ -120,17 +132,21 @@ def fed(observations: np.ndarray, *command: object) -> np.ndarray:
     done = subprocess.run(words, input=observations.tobytes(), capture_output=True, timeout=60)
     assert done.returncode == 0
     assert done.stderr == b""
-    return np.frombuffer(done.stdout, np.float32).reshape(len(observations), -1)
+    actions = np.frombuffer(done.stdout, np.float32)
+    return actions.reshape(len(observations), -1)
 
 
 def by_gcc(
     policy: NetworkPolicy, observations: np.ndarray, folder: Path, compiler: str = "gcc"
 ) -> np.ndarray:
-    (folder / "rotorgram_policy.h").write_bytes(c_target.write(policy, told_of(policy.spec)))
-    (folder / "main.c").write_text(C_MAIN)
+    header = folder / "rotorgram_policy.h"
+    main = folder / "main.c"
+    program = folder / "main"
+    header.write_bytes(c_target.write(policy, told_of(policy.spec)))
+    main.write_text(C_MAIN)
     flags = [*C_FLAGS, *CHECKED] if compiler == "gcc" else CPP_FLAGS
-    compiled(tool(compiler), *flags, "-o", folder / "main", folder / "main.c")
-    return fed(observations, folder / "main")
+    compiled(tool(compiler), *flags, "-o", program, main)
+    return fed(observations, program)
 
 
 def by_gpp(policy: NetworkPolicy, observations: np.ndarray, folder: Path) -> np.ndarray:
@@ -138,9 +154,8 @@ def by_gpp(policy: NetworkPolicy, observations: np.ndarray, folder: Path) -> np.
 
 
 CHOICE = spec_of(Discrete(n=5, components=("a", "b", "c", "d", "e")))
-HALF_BOUNDED = spec_of(
-    ArraySpec(name="a", shape=(3,), low=(0.0, -np.inf, -np.inf), high=(100.0, 0.5, np.inf))
-)
+HALF = ArraySpec(name="a", shape=(3,), low=(0.0, -np.inf, -np.inf), high=(100.0, 0.5, np.inf))
+HALF_BOUNDED = spec_of(HALF)
 CASES: dict[str, Callable[[], NetworkPolicy]] = {
     "paper": lambda: policy_of(elevation()),
     "tanh": lambda: policy_of(hover(), (64, 64), "tanh", normalise=True),
@@ -162,17 +177,22 @@ def test_numbers_are_those_of_the_policy(case: str, runner: str, tmp_path: Path)
     actions = RUNNERS[runner](policy, observations, tmp_path)
     assert actions.shape == expected.shape
     # Far outside the bounds, an observation of 1000 is itself known to 6e-5 alone.
-    far = np.maximum(1.0, np.abs(observations).max(1, keepdims=True) / 10.0)
-    ratio = np.abs(actions - expected) / (far + np.abs(expected))
+    largest = np.abs(observations).max(1, keepdims=True)
+    far = np.maximum(1.0, largest / 10.0)
+    error = np.abs(actions - expected)
+    ratio = error / (far + np.abs(expected))
     assert ratio.max() <= 1e-5
-    assert len(np.unique(expected, axis=0)) > (3 if case == "choice" else ROWS // 20)
+    different = np.unique(expected, axis=0)
+    least = 3 if case == "choice" else ROWS // 20
+    assert len(different) > least
 
 
 @pytest.mark.parametrize("runner", RUNNERS)
 def test_tanh_is_exact_from_the_smallest_number_to_the_largest(runner: str, tmp_path: Path) -> None:
     near = np.linspace(-12, 12, 20_001)
     small = np.geomspace(1e-30, 10, 10_001)
-    numbers = np.concatenate([near, small, -small, [0.0, 9.1, -9.1, 1e30, -1e30, np.inf, -np.inf]])
+    corners = [0.0, 9.1, -9.1, 1e30, -1e30, np.inf, -np.inf]
+    numbers = np.concatenate([near, small, -small, corners])
     seen = numbers.astype(np.float32)[:, np.newaxis]
     spec = plain_spec(1)
     one = np.ones((1, 1), np.float32)
@@ -180,7 +200,8 @@ def test_tanh_is_exact_from_the_smallest_number_to_the_largest(runner: str, tmp_
     policy = loaded({"layers.0.weight": one, "layers.0.bias": zero}, spec, squash=True)
     actions = RUNNERS[runner](policy, seen, tmp_path)
     expected = np.tanh(seen.astype(np.float64))
-    assert (np.abs(actions - expected) <= 5e-7 * np.abs(expected)).all()
+    error = np.abs(actions - expected)
+    assert (error <= 5e-7 * np.abs(expected)).all()
     assert np.abs(actions).max() == pytest.approx(1.0, abs=1.3e-7)
 
 
@@ -196,15 +217,19 @@ def test_weights_keep_every_bit(runner: str, tmp_path: Path) -> None:
         "layers.0.bias": bias,
         "log_std": np.zeros(count, np.float32),
     }
-    actions = RUNNERS[runner](loaded(weights, spec), np.ones((1, 1), np.float32), tmp_path)
+    policy = loaded(weights, spec)
+    seen = np.ones((1, 1), np.float32)
+    actions = RUNNERS[runner](policy, seen, tmp_path)
     assert actions.tolist() == [bias.tolist()]
 
 
 def test_what_is_no_number_is_not_made_one(tmp_path: Path) -> None:
     for case in ("paper", "tanh", "squashed"):
         policy = CASES[case]()
-        seen = np.full((1, flat_size(policy.spec)), np.nan, np.float32)
-        assert np.isnan(by_gcc(policy, seen, tmp_path)).all()
+        size = flat_size(policy.spec)
+        seen = np.full((1, size), np.nan, np.float32)
+        actions = by_gcc(policy, seen, tmp_path)
+        assert np.isnan(actions).all()
 
 
 def test_the_header_needs_nothing_but_a_compiler(tmp_path: Path) -> None:
@@ -219,8 +244,9 @@ def test_the_header_needs_nothing_but_a_compiler(tmp_path: Path) -> None:
         "void act(const float *o, float *a) { rotorgram_policy(o, a); }\n"
     )
     strict = ["-Wconversion", "-Wdouble-promotion", "-Wshadow", "-ffreestanding"]
-    compiled(tool("gcc"), *C_FLAGS, *strict, "-c", "-o", tmp_path / "policy.o", program)
-    compiled(tool("nm"), "-u", tmp_path / "policy.o")  # names that a library would have to give
+    object_file = tmp_path / "policy.o"
+    compiled(tool("gcc"), *C_FLAGS, *strict, "-c", "-o", object_file, program)
+    compiled(tool("nm"), "-u", object_file)  # names that a library would have to give
     program.write_text('#include "rotorgram_policy.h"\nint main(void) { return 0; }\n')
     compiled(tool("gcc"), *C_FLAGS, "-o", tmp_path / "unused", program)
 
@@ -259,15 +285,17 @@ def constants_of_c(header: Path, *names: str) -> list[str]:
         '#include <stdio.h>\n#include "rotorgram_policy.h"\n'
         f"int main(void) {{ {macros} return 0; }}\n"
     )
-    compiled(tool("gcc"), *C_FLAGS, "-o", program.with_suffix(""), program)
-    return said(program.with_suffix(""))
+    binary = program.with_suffix("")
+    compiled(tool("gcc"), *C_FLAGS, "-o", binary, program)
+    return said(binary)
 
 
 def said(*command: object) -> list[str]:
     """Texts that a program prints, each with a 0 behind it."""
     words = [str(word) for word in command]
     done = subprocess.run(words, capture_output=True, timeout=60, check=True)
-    return done.stdout.decode().split("\0")[:-1]
+    *texts, _ = done.stdout.decode().split("\0")
+    return texts
 
 
 def test_every_file_tells_what_it_is(trained: Path, tmp_path: Path) -> None:
@@ -275,7 +303,9 @@ def test_every_file_tells_what_it_is(trained: Path, tmp_path: Path) -> None:
     files = {target: exported(trained, target, tmp_path) for target in TARGETS}
     model = onnx.load(files["onnx"])
     told = {entry.key: entry.value for entry in model.metadata_props}
-    assert [(one.domain, one.version) for one in model.opset_import] == [("", 13)]
+    (operators,) = model.opset_import
+    assert operators.domain == ""
+    assert operators.version == 13
     plain = {
         "format": "1",
         "algorithm": "a2c",
@@ -303,7 +333,8 @@ def test_every_file_tells_what_it_is(trained: Path, tmp_path: Path) -> None:
     assert constants_of_c(files["c"], *macros) == expected
     header = files["c"].read_text()
     assert "\n *   1: rate of the error: -11.2679 to 11.2679 m/s, world, up\n" in header
-    for name, number in {"FORMAT": 1, "SEED": 3, "CONTROL_PERIOD": 0.02, "ACTIONS": 1}.items():
+    numbers = {"FORMAT": 1, "SEED": 3, "CONTROL_PERIOD": 0.02, "ACTIONS": 1}
+    for name, number in numbers.items():
         assert f"\n#define ROTORGRAM_{name} {number}\n" in header
 
 
@@ -338,7 +369,8 @@ def test_no_text_of_a_spec_becomes_code_of_c(evil: dict[str, Path]) -> None:
     # Every line is one that the exporter began, and the header's comment ends where it should.
     header = evil["c"].read_text()
     head, _, rest = header.partition("\n */\n#ifndef")
-    assert {line[:2] for line in head.split("\n")} == {"/*", " *"}
+    begins = {line[:2] for line in head.split("\n")}
+    assert begins == {"/*", " *"}
     assert head.count("*/") == 0
     assert "/*" not in head[2:]
     assert "??" not in header
@@ -351,7 +383,8 @@ def test_no_text_of_a_spec_becomes_code_of_c(evil: dict[str, Path]) -> None:
 def test_onnx_has_every_text_of_a_spec_as_it_is(evil: dict[str, Path]) -> None:
     model = onnx.load(evil["onnx"])
     told = {entry.key: entry.value for entry in model.metadata_props}
-    assert json.loads(told["observation"])[0]["components"] == EVIL
+    (observation,) = json.loads(told["observation"])
+    assert observation["components"] == EVIL
 
 
 @pytest.mark.parametrize("case", cases("wrong_exports"), ids=str)

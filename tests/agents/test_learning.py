@@ -87,8 +87,10 @@ def test_critic_bootstraps_through_the_limit_and_not_through_the_end(
     log = log_of(ending)
     agent = A2C(log, config, seed=0)
     agent.train(log, 24_000, lambda: True)
-    got = agent._critic.forward(np.zeros((1, 1), np.float32)).item()
-    assert got == pytest.approx(value or 1 / (1 - 0.9 * 7 / 8), rel=0.02)
+    state = np.zeros((1, 1), np.float32)
+    got = agent._critic.forward(state).item()
+    expected = value or 1 / (1 - 0.9 * 7 / 8)
+    assert got == pytest.approx(expected, rel=0.02)
 
 
 def test_normalising_changes_the_actor_and_leaves_the_critic_alone() -> None:
@@ -102,7 +104,8 @@ def test_normalising_changes_the_actor_and_leaves_the_critic_alone() -> None:
 
 
 def test_entropy_bonus_widens_the_policy() -> None:
-    slopes = slopes_of(a2c(ent_coef=0.25), rollout())
+    agent = a2c(ent_coef=0.25)
+    slopes = slopes_of(agent, rollout())
     assert slopes["entropy"] == -0.25
 
 
@@ -120,7 +123,13 @@ def test_learning_rate_falls_from_its_full_value_linearly(algorithm: str, anneal
     log = log_of("limit")
     agent: Any = make_agent(algorithm, log, config, 0)
     rates: list[float] = []
-    agent.train(log, 64, lambda: rates.append(agent.scalars()["train/learning_rate"]) is None)
+
+    def keep_rate() -> bool:
+        scalars = agent.scalars()
+        rates.append(scalars["train/learning_rate"])
+        return True
+
+    agent.train(log, 64, keep_rate)
     expected = [0.01, 0.0075, 0.005, 0.0025] if anneal else [0.01] * 4
     assert rates == pytest.approx(expected)
 
@@ -131,7 +140,8 @@ def weights_of_sb3(theirs: Any) -> dict[str, np.ndarray]:
     tensors = theirs.model.policy.state_dict()
     for number, name in enumerate(("mlp_extractor.value_net.0", "value_net")):
         for kind in ("weight", "bias"):
-            weights[f"critic.layers.{number}.{kind}"] = tensors[f"{name}.{kind}"].numpy()
+            tensor = tensors[f"{name}.{kind}"]
+            weights[f"critic.layers.{number}.{kind}"] = tensor.numpy()
     return weights
 
 
@@ -156,11 +166,12 @@ def train_both(
 
     def follow() -> bool:
         names = ("next_observations", "rewards", "terminated", "truncated")
-        columns = map(np.array, zip(*env.results, strict=True))
-        flown = dict(zip(names, columns, strict=True))
+        columns = zip(*env.results, strict=True)
+        flown = {name: np.array(rows) for name, rows in zip(names, columns, strict=True)}
         env.results.clear()
         kept = np.ones(len(flown["rewards"]), bool)
-        ours.update(rollout(**seen, **flown, kept=kept))
+        given = rollout(**seen, **flown, kept=kept)
+        ours.update(given)
         told.append((ours.scalars(), theirs.scalars()))
         return True
 
@@ -290,7 +301,8 @@ def test_a_training_that_diverges_says_so(algorithm: str) -> None:
 def test_huge_weights_of_a_training_that_diverges_are_no_error_of_the_env(algorithm: str) -> None:
     """Finite weights may still overflow in the policy's sums, long before the next update."""
     log = log_of("limit")
-    agent: Any = make_agent(algorithm, log, preset(algorithm, "paper", **SMALL[algorithm]), 0)
+    config = preset(algorithm, "paper", **SMALL[algorithm])
+    agent: Any = make_agent(algorithm, log, config, 0)
     overwrite(agent, lambda array: array.fill(3e38 if array.ndim == 2 else 1.0))
     with pytest.raises(Diverged, match=r"training diverged: actions .* try a lower learning_rate"):
         agent.train(log, 2000, lambda: True)
@@ -304,14 +316,17 @@ def test_huge_weights_of_a_training_that_diverges_are_no_error_of_the_env(algori
 def test_every_agent_trains_with_every_preset_and_kind_of_action(
     algorithm: str, name: str, action_type: str
 ) -> None:
-    log = EpisodeRecorder(vector(action_type=action_type, episode_length=60), seed=0)
-    agent = make_agent(algorithm, log, preset(algorithm, name), 0)
+    env = vector(action_type=action_type, episode_length=60)
+    log = EpisodeRecorder(env, seed=0)
+    config = preset(algorithm, name)
+    agent = make_agent(algorithm, log, config, 0)
     rollouts = 1024 if "ppo" in algorithm else 512
     before = agent.actor()
     steps = 150 if name == "paper" else rollouts
     agent.train(log, steps, lambda: True)
     assert log.env_steps == steps
-    assert any(not np.array_equal(before[k], array) for k, array in agent.actor().items())
+    changed = [not np.array_equal(before[k], array) for k, array in agent.actor().items()]
+    assert any(changed)
 
 
 @pytest.mark.parametrize("case", cases("learning"), ids=str)
@@ -323,7 +338,8 @@ def test_learns_to_hold_the_target(case: Any) -> None:
 
     def late_error(agent: Any) -> float:
         flown = fly_episodes(vector(5), agent.policy(), 5)
-        return float(np.mean([np.abs(one.headline[-60:]).mean() for one in flown]))
+        errors = [np.abs(one.headline[-60:]).mean() for one in flown]
+        return float(np.mean(errors))
 
     algorithm = case["algorithm"]
     config = preset(algorithm, "tuned", **case["changes"])

@@ -73,8 +73,10 @@ def test_gradients_are_those_of_torch(hidden: tuple[int, ...], activation: str) 
     slope = normal(BATCH, 2)
     theirs = tensors(weights)
     output = torch_mlp(theirs, torch.from_numpy(seen), activation)
-    (output * torch.from_numpy(slope)).sum().backward()
-    np.testing.assert_allclose(net.forward(seen), output.detach(), rtol=1e-5, atol=1e-5)
+    weighted = output * torch.from_numpy(slope)
+    weighted.sum().backward()
+    found = net.forward(seen)
+    np.testing.assert_allclose(found, output.detach(), rtol=1e-5, atol=1e-5)
     net.backward(slope)
     agree(weights, theirs)
 
@@ -101,7 +103,9 @@ def test_log_probability_entropy_and_their_gradients_are_those_of_torch(discrete
     np.testing.assert_allclose(got, expected.detach(), rtol=1e-5, atol=1e-5)
     assert mean == pytest.approx(entropy.item(), rel=1e-5)
     slope = normal(BATCH)
-    ((expected * torch.from_numpy(slope)).sum() - 0.7 * entropy).backward()
+    weighted = expected * torch.from_numpy(slope)
+    loss = weighted.sum() - 0.7 * entropy
+    loss.backward()
     ours.backward(slope, -0.7)
     agree(ours.weights, theirs)
 
@@ -113,7 +117,8 @@ def test_adam_is_torch_s() -> None:
     reference = torch.optim.Adam([theirs], lr=0.01)
     ours = Adam(weights)
     for step in range(50):
-        weights.slopes[:] = normal(40) * 10.0 ** (step % 5 - 3)
+        scale = 10.0 ** (step % 5 - 3)
+        weights.slopes[:] = scale * normal(40)
         theirs.grad = torch.from_numpy(weights.slopes.copy())
         reference.step()
         ours.step(0.01)
@@ -132,7 +137,8 @@ def test_a_norm_is_clipped_as_in_torch() -> None:
 def test_the_first_weights_are_orthogonal(shape: tuple[int, int]) -> None:
     q = orthogonal(np.random.default_rng(1), shape, 2.0)
     product = q @ q.T if shape[0] < shape[1] else q.T @ q
-    np.testing.assert_allclose(product, 4 * np.eye(min(shape)), atol=1e-12)
+    identity = np.eye(min(shape))
+    np.testing.assert_allclose(product, 4 * identity, atol=1e-12)
     other = orthogonal(np.random.default_rng(2), shape, 2.0)
     assert not np.allclose(q, other)
 

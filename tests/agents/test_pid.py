@@ -17,7 +17,8 @@ from scripted import spec_of
 @pytest.mark.parametrize("drag", [0.0, 0.5])
 def test_pid_holds_the_target(mode: str, drag: float) -> None:
     env: Any = gym.make(ENV, action=mode, effects={"linear_drag": drag})
-    policy = PID(env.get_wrapper_attr("env_spec"))
+    spec = env.get_wrapper_attr("env_spec")
+    policy = PID(spec)
     for seed in range(3):
         errors = [abs(info["elevation_error"]) for info in infos_of(env, policy, seed)]
         assert np.mean(errors[-60:]) < 0.02
@@ -28,27 +29,34 @@ def test_pid_takes_the_vehicle_from_the_spec() -> None:
     spec: Any = gym.make(ENV, action="offset").get_wrapper_attr("env_spec")
     arrays = {array.name: array for array in spec.telemetry}
     thrust = replace(arrays["thrust"], low=0.0, high=30.0)
-    telemetry = tuple(thrust if a.name == "thrust" else a for a in spec.telemetry)
+    arrays["thrust"] = thrust
+    telemetry = tuple(arrays.values())
     seen = replace(spec.observation[0], low=-9.0, high=(9.0, 9.0, 30 / 12 - 1))
-    policy = PID(replace(spec, telemetry=telemetry, observation=(seen,)))
-    action = policy.act(np.array([0.1, 0.0, 0.0], np.float32))
+    other = replace(spec, telemetry=telemetry, observation=(seen,))
+    policy = PID(other)
+    near = np.array([0.1, 0.0, 0.0], np.float32)
+    action = policy.act(near)
     assert action == pytest.approx([0.9 * 12 / 9.8 / 6], rel=1e-6)
-    assert policy.act(np.array([9.0, 0.0, 0.0], np.float32)).tolist() == [1.0]
+    far = np.array([9.0, 0.0, 0.0], np.float32)
+    action = policy.act(far)
+    assert action.tolist() == [1.0]
 
 
-@pytest.mark.parametrize(
-    ("options", "sentence"),
-    [
-        ({"observation": "error"}, "observation='full'"),
-        ({"action_type": "discrete"}, "action_type='continuous'"),
-    ],
-)
+WRONG = [
+    ({"observation": "error"}, "observation='full'"),
+    ({"action_type": "discrete"}, "action_type='continuous'"),
+]
+
+
+@pytest.mark.parametrize(("options", "sentence"), WRONG)
 def test_pid_says_what_it_needs(options: dict[str, str], sentence: str) -> None:
     env: Any = gym.make(ENV, **options)
+    spec = env.get_wrapper_attr("env_spec")
     with pytest.raises(InputError, match=sentence):
-        PID(env.get_wrapper_attr("env_spec"))
+        PID(spec)
 
 
 def test_pid_flies_elevation_alone() -> None:
+    spec = spec_of()
     with pytest.raises(InputError, match="expected the env rotorgram/Elevation-v0"):
-        PID(spec_of())
+        PID(spec)

@@ -31,9 +31,11 @@ def test_a_loaded_policy_gives_what_the_learning_one_gives(
 ) -> None:
     learning = random_policy(spec, hidden, activation)
     policy = policy_of(learning.arrays(), spec, activation)
-    observations = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
+    numbers = np.random.default_rng(0).normal(size=(50, 3))
+    observations = numbers.astype(np.float32)
     expected = learning.network.forward(observations)
-    np.testing.assert_array_equal(policy.output(observations), expected)
+    found = policy.output(observations)
+    np.testing.assert_array_equal(found, expected)
     first = policy.output(observations[:1])
     np.testing.assert_allclose(first, expected[:1], rtol=1e-5, atol=1e-5)
 
@@ -50,11 +52,13 @@ def test_observations_are_normalised_and_outputs_squashed() -> None:
     others = {"log_std": noise, "observation.mean": mean, "observation.scale": scale}
     seen = np.array([[1.5, 5, 3]], np.float32)
     policy = policy_of(layers | others, BOX)
-    np.testing.assert_allclose(policy.output(seen), [[20.8, 0.5]], rtol=1e-5)
+    found = policy.output(seen)
+    np.testing.assert_allclose(found, [[20.8, 0.5]], rtol=1e-5)
     assert seen.tolist() == [[1.5, 5, 3]]
     squashed = policy_of(layers, BOX, squash=True)
     shifted = np.array([[1, 0.3, 0]], np.float32)
-    np.testing.assert_allclose(squashed.output(shifted), [[1, np.tanh(0.5)]], rtol=1e-5)
+    found = squashed.output(shifted)
+    np.testing.assert_allclose(found, [[1, np.tanh(0.5)]], rtol=1e-5)
 
 
 DRAWS = 40_000
@@ -63,7 +67,8 @@ DRAWS = 40_000
 def drawn_of(policy: NetworkPolicy, observation: np.ndarray) -> np.ndarray:
     """Many actions for the same observation."""
     noise = policy.head.noise(np.random.default_rng(0), DRAWS)
-    return policy.sample(np.repeat(observation, DRAWS, axis=0), noise)
+    observations = np.repeat(observation, DRAWS, axis=0)
+    return policy.sample(observations, noise)
 
 
 def test_gaussian_sampling_has_the_mean_and_deviation_of_the_policy() -> None:

@@ -31,7 +31,8 @@ def test_advantages_by_hand(name: str) -> None:
     values = np.array(case["values"])
     after = np.array(case["next_values"])
     factors = {"gamma": case["gamma"], "gae_lambda": case["gae_lambda"]}
-    got = advantages(np.ones(3), values, after, terminated, truncated, **factors)
+    rewards = np.ones(3)
+    got = advantages(rewards, values, after, terminated, truncated, **factors)
     assert got.tolist() == case["expected"]
 
 
@@ -45,14 +46,17 @@ def test_value_is_carried_over_truncation_and_not_over_termination(
     none = np.zeros(3)
     after = np.array([0.0, 0.0, 100.0])
     ends = last & terminated, last & truncated
-    got = advantages(np.ones(3), none, after, *ends, gamma=0.9, gae_lambda=gae_lambda)
-    assert got[2] == (1.0 if terminated else 91.0)
+    rewards = np.ones(3)
+    got = advantages(rewards, none, after, *ends, gamma=0.9, gae_lambda=gae_lambda)
+    expected = 1.0 if terminated else 91.0
+    assert got[2] == expected
 
 
 @pytest.mark.parametrize("name", CASES["steps"])
 def test_step_of_episode(name: str) -> None:
     case = CASES["steps"][name]
-    steps = step_of_episode(np.array(case["ends"], bool))
+    ends = np.array(case["ends"], bool)
+    steps = step_of_episode(ends)
     assert steps.tolist() == case["expected"]
 
 
@@ -66,4 +70,5 @@ def test_sums_of_any_length_are_those_of_the_recursion(length: int) -> None:
     for value, factor in zip(values[::-1], factors[::-1], strict=True):
         following = value + factor * following
         expected.insert(0, following)
-    np.testing.assert_allclose(discounted_sums(values, factors), expected, rtol=1e-12)
+    found = discounted_sums(values, factors)
+    np.testing.assert_allclose(found, expected, rtol=1e-12)

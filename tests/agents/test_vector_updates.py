@@ -113,13 +113,16 @@ class Followed:
     def _check(
         self, rollout: Rollout, weights: np.ndarray, kept: list[Row], wanted: np.ndarray
     ) -> None:
-        seen = by_drone(rollout, rollout.observations)
-        assert seen.tobytes() == np.array([row.observation for row in kept]).tobytes()
-        done = np.array([row.action for row in kept])
+        found = by_drone(rollout, rollout.observations)
+        seen = np.array([row.observation for row in kept])
+        assert found.tobytes() == seen.tobytes()
         actions = by_drone(rollout, rollout.actions)
         low, high = (0, 2) if self.log.actions.discrete else (-1, 1)
-        np.testing.assert_array_equal(np.clip(actions, low, high), done.reshape(actions.shape))
-        np.testing.assert_allclose(by_drone(rollout, weights), wanted, atol=1e-5)
+        clipped = np.clip(actions, low, high)
+        done = np.array([row.action for row in kept])
+        np.testing.assert_array_equal(clipped, done.reshape(actions.shape))
+        ours = by_drone(rollout, weights)
+        np.testing.assert_allclose(ours, wanted, atol=1e-5)
 
 
 @pytest.mark.parametrize("discrete", [False, True], ids=["continuous", "discrete"])
@@ -137,11 +140,15 @@ def test_a2c_learns_from_what_each_drone_flew(
     def estimates(rollout: Rollout) -> np.ndarray:
         for array in (rollout.observations, rollout.next_observations):
             for seen in array.reshape(-1, 3):
-                values[seen.tobytes()] = float(agent._critic.forward(seen[np.newaxis])[0, 0])
+                value = agent._critic.forward(seen[np.newaxis])
+                values[seen.tobytes()] = value.item()
         return agent.advantages(rollout)[0]
 
+    def value_of(seen: np.ndarray) -> float:
+        return values[seen.tobytes()]
+
     followed = Followed(agent, env, log, estimates)
-    followed.train(130, lambda flown: a2c_rows(flown, lambda s: values[s.tobytes()], gae_lambda))
+    followed.train(130, lambda flown: a2c_rows(flown, value_of, gae_lambda))
     assert followed.updates >= 3
 
 
@@ -150,7 +157,8 @@ def test_a2c_learns_from_what_each_drone_flew(
 def test_vpg_learns_from_the_episodes_that_each_drone_flew(episodes: int, script: Script) -> None:
     env = Scripted(script)
     log = log_of(env)
-    agent = VPG(log, VPGConfig(episodes_per_update=episodes, gamma=GAMMA), 3)
+    config = VPGConfig(episodes_per_update=episodes, gamma=GAMMA)
+    agent = VPG(log, config, 3)
 
     def returns(rollout: Rollout) -> np.ndarray:
         found = np.zeros(rollout.kept.shape)

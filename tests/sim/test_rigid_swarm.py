@@ -33,11 +33,12 @@ def tumbling(worlds: int, drones: int) -> dict[str, np.ndarray]:
     dice = np.random.default_rng(0)
     shape = (worlds, drones)
     turned = dice.normal(size=(*shape, 4))
+    turned /= np.linalg.norm(turned, axis=-1, keepdims=True)
     position = dice.uniform(1000.0, 1001.0, (*shape, 3))
     position[..., 0] += 50.0 * np.arange(drones)
     return {
         "position": position,
-        "quaternion": turned / np.linalg.norm(turned, axis=-1, keepdims=True),
+        "quaternion": turned,
         "velocity": dice.normal(size=(*shape, 3)),
         "body_rates": dice.normal(size=(*shape, 3)),
     }
@@ -45,7 +46,8 @@ def tumbling(worlds: int, drones: int) -> dict[str, np.ndarray]:
 
 def near_hover(vehicle: Vehicle, steps: int, *shape: int) -> np.ndarray:
     """Random thrusts, N, shape (steps, *shape, R)."""
-    share = np.random.default_rng(1).uniform(0.9, 1.1, (steps, *shape, vehicle.num_rotors))
+    dice = np.random.default_rng(1)
+    share = dice.uniform(0.9, 1.1, (steps, *shape, vehicle.num_rotors))
     return share * vehicle.hover_thrust
 
 
@@ -67,7 +69,8 @@ def test_drones_that_keep_apart_fly_bit_for_bit_as_alone(
     alone = make_world(vehicle, 6, **options)
     pose = tumbling(2, 3)
     begin(together, **pose)
-    begin(alone, **{name: values.reshape(6, 1, -1) for name, values in pose.items()})
+    apart = {name: values.reshape(6, 1, -1) for name, values in pose.items()}
+    begin(alone, **apart)
     for step, thrust in enumerate(near_hover(vehicle, 20, 2, 3)):
         some = np.array([[True] * 3, [step % 4 > 0] * 3])
         together.step(thrust, 2, some)
@@ -87,7 +90,8 @@ def test_every_drone_has_the_draws_that_it_has_on_mujoco() -> None:
     vehicle = Vehicle.load("crazyflie2")
     shape = (2, 3)
     effects = EffectOptions.from_options({**EFFECTS, "gusts": 6.0})
-    given: Any = {"drones": 3, "effects": effects, "randomize": Randomization(DRAWN, effects)}
+    drawing = Randomization(DRAWN, effects)
+    given: Any = {"drones": 3, "effects": effects, "randomize": drawing}
     ours = make_world(vehicle, 2, "rigid", dtype="float64", **given)
     theirs = make_world(vehicle, 2, **given)
 
@@ -105,15 +109,17 @@ def test_every_drone_has_the_draws_that_it_has_on_mujoco() -> None:
             mask = some if step == 5 else None
             world.step(thrust, 2, mask)
     for field in MOVED:
-        one, other = (np.asarray(getattr(world.state, field)) for world in (ours, theirs))
-        assert_allclose(one, other, atol=1e-9, rtol=0, err_msg=field)
+        found = getattr(ours.state, field)
+        expected = getattr(theirs.state, field)
+        assert_allclose(found, expected, atol=1e-9, rtol=0, err_msg=field)
 
 
 def test_downwash_is_that_of_mujoco_and_of_a_world_alone() -> None:
     """Nine drones one above the other, each in the jets of those above it."""
     vehicle = Vehicle.load("hummingbird")
     effects = EffectOptions.from_options({"body_drag": True, "downwash": True})
-    place = np.random.default_rng(0).uniform(-0.1, 0.1, (2, 9, 3))
+    dice = np.random.default_rng(0)
+    place = dice.uniform(-0.1, 0.1, (2, 9, 3))
     place[..., 2] += 20.0 + 1.0 * np.arange(9)
     thrust = np.broadcast_to(0.95 * vehicle.hover_thrust, (2, 9, 4))
     ours = arrays(vehicle, 2, 9, effects=effects)
@@ -151,9 +157,9 @@ def test_spheres_touch_at_two_radii_and_fly_on(name: str | None) -> None:
     position = np.zeros((2, 3, 3))
     velocity = np.zeros((2, 3, 3))
     position[..., 2] = 1000.0
-    position[0, :, 0] = np.array((-1.5, 1.5, 20.0)) * radius
-    position[1, :, 0] = np.array((-1.5, 1.5, 20.0)) * radius
-    velocity[0, :2, 0] = 10 * radius, -10 * radius
+    position[..., 0] = np.array((-1.5, 1.5, 20.0)) * radius
+    velocity[0, 0, 0] = 10 * radius
+    velocity[0, 1, 0] = -10 * radius
     none = np.zeros((2, 3, vehicle.num_rotors))
 
     pose = {"position": position, "velocity": velocity, "thrust": none}
@@ -179,8 +185,12 @@ def test_a_touch_is_told_of_all_looks_of_a_control_step() -> None:
     """They pass each other within one step: `again` adds to what was seen before."""
     vehicle = Vehicle.load(linear_drag=0.0)
     radius = vehicle.radius
-    position = np.array([[[-3 * radius, 0.0, 900.0], [3 * radius, 0.0, 900.0]]])
-    velocity = np.array([[[50 * radius, 0.0, 0.0], [-50 * radius, 0.0, 0.0]]])
+    sides = np.array((-1.0, 1.0))
+    position = np.zeros((1, 2, 3))
+    velocity = np.zeros((1, 2, 3))
+    position[0, :, 0] = 3 * radius * sides
+    position[..., 2] = 900.0
+    velocity[0, :, 0] = -50 * radius * sides
     none = np.zeros((1, 2, 4))
     for steps in ([20], [10, 10]):
         world = arrays(vehicle, 1, 2)
@@ -189,7 +199,8 @@ def test_a_touch_is_told_of_all_looks_of_a_control_step() -> None:
             world.step(none, count, again=i > 0)
         found = world.state.position[0, 0, 0]
         assert found > 5 * radius
-        world.step(none, 2, np.zeros((1, 2), bool))  # frozen: nothing is forgotten
+        frozen = np.zeros((1, 2), bool)
+        world.step(none, 2, frozen)  # nothing is forgotten
         assert world.state.colliding.all()
         world.step(none, 2)
         assert not world.state.touching.any()
@@ -205,10 +216,12 @@ def test_of_128_drones_those_that_overlap_are_told() -> None:
     position[0, 127, :2] = position[0, 40, 0], 1.999 * radius  # beside the 41st, and near two more
     position[1, 0, 2] = position[1, 1, 2] = 0.0  # on the ground, no drone among them
     begin(world, position=position)
-    found = np.flatnonzero(world.state.colliding[0]).tolist()
-    assert found == [40, 127]
-    assert np.flatnonzero(world.state.touching[0]).tolist() == [40, 127]
-    assert np.flatnonzero(world.state.touching[1]).tolist() == [0, 1]
+    colliding = np.flatnonzero(world.state.colliding[0])
+    assert colliding.tolist() == [40, 127]
+    touching = np.flatnonzero(world.state.touching[0])
+    assert touching.tolist() == [40, 127]
+    on_ground = np.flatnonzero(world.state.touching[1])
+    assert on_ground.tolist() == [0, 1]
     assert not world.state.colliding[1].any()
 
 
@@ -230,7 +243,8 @@ def test_a_mask_moves_and_tells_of_its_worlds_alone() -> None:
     place[..., 2] = 20.0  # both in one place
     begin(world, position=place)
     assert world.state.colliding.all()
-    apart = place + np.array((0.0, 50.0, 0.0)) * np.arange(2)[:, None]
+    apart = place.copy()
+    apart[:, 1, 1] = 50.0
     first = np.array([[True] * 2, [False] * 2])
     second = np.array([[False] * 2, [True] * 2])
     begin(world, second, position=apart)
@@ -266,21 +280,23 @@ def test_whole_episodes_agree_with_mujoco_until_a_touch(
     options: Any = {"drones": 4, "vehicle": vehicle, "autoreset_mode": "Disabled"}
     theirs = LocalVectorEnv(env_id, 8, radio_loss=0.2, **options)
     ours = LocalVectorEnv(env_id, 8, radio_loss=0.2, backend="rigid", dtype="float64", **options)
-    seen = [env.reset(seed=5)[0] for env in (ours, theirs)]
-    assert_array_equal(*seen)
+    first, _ = ours.reset(seed=5)
+    seen, _ = theirs.reset(seed=5)
+    assert_array_equal(first, seen)
     met = False
     flown = 0
     for _ in range(500):
         actions = np.zeros((8, 4), np.float32)
-        actions[:, :3] = np.clip(seen[1][:, :3], -fastest, fastest)
+        actions[:, :3] = np.clip(seen[:, :3], -fastest, fastest)
         for env in (ours, theirs):
             env.advance(actions)
-        if met := bool(ours.terminated.any()):
+        met = bool(ours.terminated.any())
+        if met:
             break
         flown += 1
-        seen = [env.observations for env in (ours, theirs)]
+        seen = theirs.observations
         assert_array_equal(ours.truncated, theirs.truncated)
-        assert_allclose(*seen, atol=1e-6, rtol=1e-6)
+        assert_allclose(ours.observations, seen, atol=1e-6, rtol=1e-6)
         assert_allclose(ours.rewards, theirs.rewards, atol=1e-9, rtol=0)
         if ours.done.any():
             break
@@ -302,7 +318,8 @@ def test_one_that_touches_leaves_and_the_others_fly_on() -> None:
     while len(left) < 2:
         actions = {name: np.zeros(4, np.float32) for name in env.agents}
         for name in ("drone_0", "drone_2"):
-            actions[name][:3] = np.clip(observations[name][:3], -0.1, 0.1)
+            way = observations[name][:3]
+            actions[name][:3] = np.clip(way, -0.1, 0.1)
         observations, _, terminated, _, _ = env.step(actions)
         left += [name for name, ends in terminated.items() if ends]
     assert left == ["drone_0", "drone_2"]

@@ -49,13 +49,15 @@ NAN = np.nan
 def runs_of(name: str, *steady: float, crashed: int = 0, env_steps: int = 2000) -> pd.DataFrame:
     """The runs of a row: a steady size for each seed, which holds below 0.1."""
     held = [int(one < 0.1) for one in steady]
-    return pd.DataFrame({
+    env_steps_to_hold = [1000.0 if one else NAN for one in held]
+    seconds_to_hold = [2.5 if one else NAN for one in held]
+    runs = pd.DataFrame({
         "row": name, "seed": range(len(steady)), "env_steps": env_steps, "seconds": 60.0,
         "steps_per_second": 3000.0, "steady": steady, "settling_time": 1.5, "overshoot": 0.2,
         "return": 200.0, "episodes": 20, "settled": 20, "crashed": crashed, "held": held,
-        "env_steps_to_hold": [1000.0 if one else NAN for one in held],
-        "seconds_to_hold": [2.5 if one else NAN for one in held],
-    })[list(COLUMNS["runs"])]  # fmt: skip
+        "env_steps_to_hold": env_steps_to_hold, "seconds_to_hold": seconds_to_hold,
+    })  # fmt: skip
+    return runs[list(COLUMNS["runs"])]
 
 
 def made_up(
@@ -70,11 +72,10 @@ def made_up(
 
 def test_measures_over_seeds(tmp_path: Path) -> None:
     study = study_of(("vpg", "a2c", "pid"), 4)
-    results = made_up(
-        tmp_path, study,
-        runs_of("vpg", 0.025, 0.025, 0.025, 0.9), runs_of("a2c", 0.02, 0.03, 0.04, 0.05, crashed=1),
-        runs_of("pid", 0.01, env_steps=0),
-    )  # fmt: skip
+    of_vpg = runs_of("vpg", 0.025, 0.025, 0.025, 0.9)
+    of_a2c = runs_of("a2c", 0.02, 0.03, 0.04, 0.05, crashed=1)
+    of_pid = runs_of("pid", 0.01, env_steps=0)
+    results = made_up(tmp_path, study, of_vpg, of_a2c, of_pid)
     table = results_table(results)
     assert table.index.tolist() == ["vpg", "a2c", "pid"]
     vpg, a2c, pid = (table.loc[name] for name in table.index)
@@ -285,10 +286,16 @@ def flown(episode: int, *xs: float) -> Trajectory:
     spec = replace(spec_of(), agents=("left", "right"))
     where = np.array([(x, 10.0, 1.0) for x in xs])
     steps = len(xs) - 1
+    rewards = np.zeros(steps)
+    actions = np.zeros((steps, 1))
     return Trajectory(
-        spec=spec, telemetry={"position": where}, rewards=np.zeros(steps),
-        actions=np.zeros((steps, 1)), ending="terminated", episode=episode,
-    )  # fmt: skip
+        spec=spec,
+        telemetry={"position": where},
+        rewards=rewards,
+        actions=actions,
+        ending="terminated",
+        episode=episode,
+    )
 
 
 def test_the_least_distance_is_that_of_all_episodes_while_both_fly() -> None:
