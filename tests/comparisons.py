@@ -27,13 +27,15 @@ def spec_of(metric: Metric = ERROR, low: float = -np.inf, length: int = 100) -> 
     metrics = ArraySpec(
         name="metrics", shape=(1,), dtype="float64", low=low, components=(metric.name,)
     )
+    observation = ArraySpec(name="observation", shape=(3,))
+    action = ArraySpec(name="action", shape=(1,), low=-1.0, high=1.0)
     return EnvSpec(
         env_id="rotorgram/Elevation-v0",
         options={"target": 10.0, "episode_length": length},
         control_period=PERIOD,
         vehicle="quad",
-        observation=(ArraySpec(name="observation", shape=(3,)),),
-        action=ArraySpec(name="action", shape=(1,), low=-1.0, high=1.0),
+        observation=(observation,),
+        action=action,
         telemetry=(metrics,),
         metrics=(metric,),
     )
@@ -105,11 +107,12 @@ def _trained(
     for number, begin in enumerate(range(0, env_steps - length + 1, length)):
         errors = flight(length, rng)
         steps.append(_steps("train", number, begin, errors))
+        sizes = np.abs(errors)
+        rewards = 1 - np.minimum(sizes, 3)
         episodes.append({
             "episode": number, "first_step": begin, "last_step": begin + length, "length": length,
-            "return": float(np.sum(1 - np.minimum(np.abs(errors), 3))), "truncated": True,
-            "mean_size": float(np.abs(errors).mean()), "terminated": False,
-            "seconds": begin / 2500,
+            "return": float(rewards.sum()), "truncated": True, "mean_size": float(sizes.mean()),
+            "terminated": False, "seconds": begin / 2500,
         })  # fmt: skip
     return pd.DataFrame(episodes), pd.concat(steps)
 
@@ -124,10 +127,12 @@ def _evaluated(
         for episode in range(3):
             errors = flight(length, rng)
             steps.append(_steps("evaluation", episode, 0, errors))
+            sizes = np.abs(errors)
+            rewards = 1 - sizes
             rows.append({
                 "env_steps": mark, "seconds": mark / 2500, "episode": episode, "length": length,
-                "return": float(np.sum(1 - np.abs(errors))), "start": float(errors[0]),
-                "steady": steady_state(np.abs(errors)), "overshoot": overshoot(errors),
+                "return": float(rewards.sum()), "start": float(errors[0]),
+                "steady": steady_state(sizes), "overshoot": overshoot(errors),
                 "settling_time": settling_time(errors, PERIOD, 0.05), "terminated": False,
             })  # fmt: skip
     return pd.DataFrame(rows), pd.concat(steps)

@@ -13,7 +13,8 @@ from rotorgram.sim.random import Random
 
 def task_of(env_id: str, **options: Any) -> Any:
     """A task for arrays of one drone in one world."""
-    return make_task(EnvConfig.from_keywords(env_id, **options))
+    config = EnvConfig.from_keywords(env_id, **options)
+    return make_task(config)
 
 
 def state_of(rotors: int = 4, time: float = 0.0, **arrays: Any) -> State:

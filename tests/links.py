@@ -40,12 +40,8 @@ SHARED = {Hello, Welcome, Refuse, Wait, Unknown}
 
 
 def layout(drones: int = 1, size: int = 1, telemetry: tuple[tuple[int, ...], ...] = ()) -> Layout:
-    return Layout(
-        drones=drones,
-        observation=(ArrayLayout(shape=(size,)),),
-        action=ArrayLayout(shape=(size,)),
-        telemetry=telemetry,
-    )
+    numbers = ArrayLayout(shape=(size,))
+    return Layout(drones=drones, observation=(numbers,), action=numbers, telemetry=telemetry)
 
 
 ONE = layout()
@@ -59,26 +55,25 @@ def state(
     sequence: int, session: int = SESSION, value: float = 0.0, of: Layout = ONE, nonce: int = NONCE
 ) -> State:
     n = of.drones
+    observations = [np.full((n, *a.shape), value).astype(a.dtype) for a in of.observation]
+    telemetry = [np.zeros((n, *shape)) for shape in of.telemetry]
     return State(
         session=session,
         sequence=sequence,
         time=0.0,
         nonce=nonce if sequence == 1 else 0,
-        observations=tuple(np.full((n, *a.shape), value).astype(a.dtype) for a in of.observation),
+        observations=tuple(observations),
         rewards=np.zeros(n),
         terminated=np.zeros(n, bool),
         truncated=np.zeros(n, bool),
-        telemetry=tuple(np.zeros((n, *shape)) for shape in of.telemetry),
+        telemetry=tuple(telemetry),
     )
 
 
 def command(sequence: int, session: int = SESSION, value: float = 0.0, of: Layout = ONE) -> Command:
-    return Command(
-        session=session,
-        sequence=sequence,
-        actions=np.full(of.actions.shape, value).astype(of.actions.dtype),
-        orders=np.full(of.drones, FLY, np.uint8),
-    )
+    actions = np.full(of.actions.shape, value).astype(of.actions.dtype)
+    orders = np.full(of.drones, FLY, np.uint8)
+    return Command(session=session, sequence=sequence, actions=actions, orders=orders)
 
 
 def close(sequence: int, session: int = SESSION, reason: str = "bye") -> Close:

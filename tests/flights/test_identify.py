@@ -172,11 +172,15 @@ def test_a_prediction_is_the_simulator_s(tmp_path: Path) -> None:
         "body_rates": np.array((0.5, -1.0, 2.0)),
     }
     thrust = 3e-6 * speeds**2
-    world = make_world(vehicle, 1, effects=EffectOptions(body_drag=True, rotor_drag=True))
-    world.reset(np.True_, InitialState(thrust=thrust, **start))
+    effects = EffectOptions(body_drag=True, rotor_drag=True)
+    world = make_world(vehicle, 1, effects=effects)
+    state = InitialState(thrust=thrust, **start)
+    world.reset(np.True_, state)
     world.step(thrust, 100)
-    states = np.tile(np.concatenate(list(start.values())), (101, 1))
-    flight = FlightLog(name="", period=0.005, speeds=np.tile(speeds, (101, 1)), states=states)
+    row = np.concatenate(list(start.values()))
+    states = np.tile(row, (101, 1))
+    constant = np.tile(speeds, (101, 1))
+    flight = FlightLog(name="", period=0.005, speeds=constant, states=states)
     windows = Windows.cut([flight], 100, 200)
     predicted = predict(vehicle, [numbers_of(vehicle)], windows)[0, 0]
     truth = np.concatenate([getattr(world.state, name) for name in start])

@@ -457,7 +457,8 @@ def test_realtime_sleeps_from_step_to_step() -> None:
 
 def status_and_error(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str]:
     status = main(list(words))
-    return status, capsys.readouterr().err.strip()
+    error = capsys.readouterr().err
+    return status, error.strip()
 
 
 @pytest.mark.parametrize("words", [("view", "pid"), ("sim", "--view", "--bind", "127.0.0.1:0")])
@@ -476,13 +477,13 @@ def test_no_display(
     assert "\n" not in error
 
 
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        (("--speed", "9"), "speed: expected a number from 0.0625 to 8, got 9.0"),
-        (("--episodes", "0"), "episodes: expected at least 1, got 0"),
-    ],
-)
+WRONG = [
+    (("--speed", "9"), "speed: expected a number from 0.0625 to 8, got 9.0"),
+    (("--episodes", "0"), "episodes: expected at least 1, got 0"),
+]
+
+
+@pytest.mark.parametrize(("words", "expected"), WRONG)
 def test_wrong_flags(
     words: tuple[str, ...], expected: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

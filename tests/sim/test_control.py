@@ -133,10 +133,11 @@ def test_mixing_keeps_roll_and_pitch_before_collective_and_that_before_yaw() -> 
 def random_states(vehicle: Vehicle, n: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
     dice = np.random.default_rng(7)
     quaternion = dice.normal(size=(n, 1, 4))
+    quaternion /= np.linalg.norm(quaternion, axis=-1, keepdims=True)
     span = vehicle.thrust_high - vehicle.thrust_low
     given = {
         "position": dice.normal(size=(n, 1, 3)),
-        "quaternion": quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True),
+        "quaternion": quaternion,
         "velocity": dice.normal(size=(n, 1, 3)),
         "body_rates": 3 * dice.normal(size=(n, 1, 3)),
         "command": np.zeros((n, 1, vehicle.num_rotors)),

@@ -134,16 +134,7 @@ def test_the_thrusts_vary_and_turn_the_smallest_as_fast_as_the_page_says() -> No
     assert 5 < np.linalg.norm(flight.rates, axis=1).max() < 35
 
 
-@pytest.mark.parametrize(
-    ("effects", "most_m", "most_deg"),
-    [
-        ("motor lag", 1e-4, 4e-3),
-        ("body drag", 1e-4, 4e-3),
-        ("rotor drag", 3e-3, 3e-2),
-        ("drag in wind", 1e-4, 4e-3),
-        ("all", 1e-3, 1e-2),
-    ],
-)
+@pytest.mark.parametrize(("effects", "most_m", "most_deg"), SIM["second_order"]["rows"])
 def test_effects_are_of_second_order(effects: str, most_m: float, most_deg: float) -> None:
     rows = compare("racer", RACER, [effects], [0.005, 0.0025], 2.0)
     assert [row.step_ms for row in rows] == [5.0, 2.5]

@@ -11,6 +11,7 @@ from accuracy import Accuracy, accuracy, markdown
 from measuring import read_rows, write_rows
 from numpy.testing import assert_allclose
 from rotorgram.models import Vehicle
+from tables import SIM
 
 approx = pytest.approx
 ROOT = Path(__file__).parents[2]
@@ -64,18 +65,19 @@ def test_forces_and_torques_meet_the_mass_and_the_inertia_of_the_paper() -> None
     expected = [0, 0, -GRAVITY, 0, 0, 0]
     assert fall == approx(expected, abs=1e-9)
     for axis, size in enumerate((MASS, MASS, MASS, IXX, IXX, IZZ)):
-        data.qfrc_applied[:] = np.eye(6)[axis]
+        push = np.eye(6)[axis]
+        data.qfrc_applied[:] = push
         answer = acceleration(vehicle, data) - fall
-        assert answer == approx(np.eye(6)[axis] / size, abs=1e-9)
+        assert answer == approx(push / size, abs=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("rotor", "torque"),
-    [(0, (1, -1, 0.05)), (1, (-1, -1, -0.05)), (2, (-1, 1, 0.05)), (3, (1, 1, -0.05))],
-)
-def test_a_rotor_pushes_up_and_turns(rotor: int, torque: tuple[float, ...]) -> None:
+@pytest.mark.parametrize(("rotor", "torque"), SIM["torques"]["rows"])
+def test_a_rotor_pushes_up_and_turns(rotor: int, torque: list[float]) -> None:
     vehicle = Vehicle.load()
-    answer = acceleration(vehicle, ready(vehicle, MAX_THRUST * np.eye(4)[rotor]))
+    thrusts = np.zeros(4)
+    thrusts[rotor] = MAX_THRUST
+    data = ready(vehicle, thrusts)
+    answer = acceleration(vehicle, data)
     assert answer[2] == approx(MAX_THRUST / MASS - GRAVITY, abs=1e-9)
     expected = MAX_THRUST * np.array(torque)
     found = answer[3:] * (IXX, IXX, IZZ)

@@ -429,10 +429,12 @@ STILL = (0.0, 0.0, 0.0, 0.0, 0.0, 10.0)
 @pytest.mark.parametrize("row", SIM["estimates"])
 def test_a_step_by_hand(row: dict[str, Any]) -> None:
     """At rest, unless the IMU reads otherwise; then half of the rest for each measurement."""
-    made = estimator(**row.get("state", {}))
+    state = row.get("state", {})
+    made = estimator(**state)
     others = row.keys() - {"state", "imu", "position", "velocity", "turned"}
     channels = {name: channel(*row[name]) for name in others}
-    channels["imu"] = channel(*row.get("imu", STILL))
+    imu = row.get("imu", STILL)
+    channels["imu"] = channel(*imu)
     made.update(np.True_, channels)
     if "turned" in row:
         assert angles_of(made.quaternion) == approx(row["turned"])
@@ -459,8 +461,10 @@ def test_a_gyroscopes_bias_tilts_the_estimate_by_so_much() -> None:
     made = estimator()
     bias = 0.5
     for _ in range(100):
-        made.update(np.True_, {"imu": channel(bias, 0, 0, 0, 0, 10)})
-    found = sin(angles_of(made.quaternion)[0])
+        imu = channel(bias, 0, 0, 0, 0, 10)
+        made.update(np.True_, {"imu": imu})
+    tilt = angles_of(made.quaternion)[0]
+    found = sin(tilt)
     assert found == approx(2 * bias * PERIOD)
 
 

@@ -2,6 +2,7 @@
 
 import base64
 import json
+import tomllib
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
@@ -39,6 +40,7 @@ from rotorgram.training.tables import (
     row_label,
     terminal_tables,
 )
+from tables import DATA
 
 NAN = np.nan
 
@@ -158,11 +160,10 @@ def test_rows_of_several_tasks_have_a_table_each(tmp_path: Path) -> None:
     assert page.count("| A2C tuned (4 seeds; 2,000 env steps) |") == 2
 
 
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [(0.0, "0"), (NAN, "–"), (0.01234, "0.012"), (3.14159, "3.14"), (1234.5, "1,234"),
-     (-0.5, "-0.50"), (12.34, "12.3"), (0.00001234, "1e-05")],
-)  # fmt: skip
+MEASURES = tomllib.loads((DATA / "measures.toml").read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize(("value", "text"), MEASURES["texts"])
 def test_numbers_in_words(value: float, text: str) -> None:
     assert number_text(value) == text
 

@@ -67,15 +67,17 @@ def assert_bad(relay: Relay, agent: Counter[str], simulator: Counter[str]) -> No
     got = relay.counters
     config = relay.config
     total = got["received"]
+    kept = 1 - config.drop
     for name, share in (
         ("dropped", config.drop),
-        ("duplicated", (1 - config.drop) * config.duplicate),
-        ("reordered", (1 - config.drop) * config.reorder),
-        ("truncated", (1 - config.drop) * config.truncate),
-        ("corrupted", (1 - config.drop) * config.corrupt),
+        ("duplicated", kept * config.duplicate),
+        ("reordered", kept * config.reorder),
+        ("truncated", kept * config.truncate),
+        ("corrupted", kept * config.corrupt),
     ):
-        spread = 5 * sqrt(total * share * (1 - share)) + 1
-        assert abs(got[name] - total * share) <= spread, (name, got)
+        expected = total * share
+        spread = 5 * sqrt(expected * (1 - share)) + 1
+        assert abs(got[name] - expected) <= spread, (name, got)
     for counters in (agent, simulator):
         assert counters["resent"] > 0.1 * counters["sent"]
         changed = counters["malformed"] + counters["forged"]

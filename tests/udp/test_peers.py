@@ -469,13 +469,14 @@ def junk(hand: Hand, sequence: int) -> list[bytes]:
     random = Random(0)
     good = command(session, sequence, 0.5)
     reason = text_field("no")
-    return [
-        b"",
-        b"1,reset",
-        *(random.randbytes(n) for n in (1, 23, 24, 49)),
-        *(good[:n] for n in range(len(good))),
-        *(bytes([*good[:i], good[i] ^ 1, *good[i + 1 :]]) for i in range(len(good))),
-        good + b"\x00",
+    noise = [random.randbytes(n) for n in (1, 23, 24, 49)]
+    cut = [good[:n] for n in range(len(good))]
+    flipped = []
+    for at in range(len(good)):
+        wrong = bytearray(good)
+        wrong[at] ^= 1
+        flipped.append(bytes(wrong))
+    commands = [
         command(session ^ 1, sequence, 0.5),
         command(0, sequence, 0.5),
         command(session, sequence - 1, 0.5),
@@ -484,19 +485,27 @@ def junk(hand: Hand, sequence: int) -> list[bytes]:
         command(session, sequence, -math.inf, 1),
         command(session, sequence, 0.5, 3),
         command(session, sequence, 0.5, 1, (1, 2)),
+    ]
+    bodies = [
         datagram(5, session, sequence, good[24:], version=3),
         datagram(5, session, sequence, struct.pack("<I4xf4xB", 1, 0, 0)),
         datagram(5, session, sequence, struct.pack("<I4xf4xB", 2**32 - 1, 0, 0)),
         datagram(5, session, sequence, struct.pack("<I4x2f2B", 0, 0, 0, 0, 0)),
+    ]
+    others = [
         datagram(1, session, 0, b"hello"),
         datagram(3, session, 0, reason),
         datagram(4, session, sequence, bytes(100)),
+    ]
+    closes = [
         datagram(6, session, sequence + 1, reason),
         datagram(6, session, sequence, reason + b"!"),
         datagram(6, session, sequence, b"\x01\x00\xff"),
         datagram(6, session, sequence, b"\x01\x00\n"),
         datagram(6, session, sequence),
         datagram(6, session ^ 1, sequence, reason),
+    ]
+    kinds = [
         datagram(7, session, 0),
         datagram(8, session, sequence + 1),
         datagram(8, session, sequence, b"\x00"),
@@ -505,6 +514,8 @@ def junk(hand: Hand, sequence: int) -> list[bytes]:
         datagram(11, session, sequence),
         welcome(session, 3),
     ]
+    plain = [b"", b"1,reset", *noise, *cut, *flipped, good + b"\x00"]
+    return [*plain, *commands, *bodies, *others, *closes, *kinds]
 
 
 def test_simulator_obeys_the_rules(simulator: list[str]) -> None:

@@ -164,6 +164,10 @@ def test_strangers_change_nothing_but_counters() -> None:
         pair.remote.reset(seed=4)
         local.reset(seed=4)
         hello = pair.simulator.link.hello
+        orders = np.ones(1, np.uint8)
+        actions = np.zeros((1, 1), np.float32)
+        reset = Command(session=hello.session, sequence=3, orders=orders, actions=actions)
+        closing = Close(session=hello.session, sequence=2, reason="forged")
         forged = [
             b"",
             b"1,0.5,0,0,1,1,1",
@@ -171,11 +175,9 @@ def test_strangers_change_nothing_but_counters() -> None:
             b"3,0.0,0,0,1,1,1," + b"0," * 9 + b"0",
             dice.bytes(65507),
             binary.encode(hello),
-            binary.encode(Close(session=hello.session, sequence=2, reason="forged")),
-            binary.encode(Command(session=hello.session, sequence=3, orders=np.ones(1, np.uint8),
-                                  actions=np.zeros((1, 1), np.float32)),
-                          pair.simulator.link.layout),
-        ]  # fmt: skip
+            binary.encode(closing),
+            binary.encode(reset, pair.simulator.link.layout),
+        ]
         for _ in range(50):
             for datagram in forged:
                 stranger.sendto(datagram, pair.remote.address)

@@ -100,11 +100,15 @@ def in_threads(flights: list[Callable[[], None]]) -> None:
 def action_of(drone: int, episode: int, step: int) -> np.ndarray:
     """The higher its number, the faster it climbs, and the sooner it is out."""
     dice = np.random.default_rng((drone, episode, step))
-    return (0.3 + 0.1 * drone) * dice.uniform(0.9, 1.0, 1).astype(np.float32)
+    level = 0.3 + 0.1 * drone
+    share = dice.uniform(0.9, 1.0, 1).astype(np.float32)
+    return level * share
 
 
 def calm(drone: int, episode: int, step: int) -> np.ndarray:
-    return np.random.default_rng((drone, episode, step)).uniform(-0.1, 0.1, 1).astype(np.float32)
+    dice = np.random.default_rng((drone, episode, step))
+    action = dice.uniform(-0.1, 0.1, 1)
+    return action.astype(np.float32)
 
 
 def fly_one(
