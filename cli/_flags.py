@@ -190,7 +190,7 @@ def _with_env(
     env_id = found.env or file.get("env", DEFAULT_ENV)
     listens = "listen" in given or getattr(kind, "listen", None) is not None
     if listens and ":" not in env_id and not registry.is_known(env_id):
-        own, words = _own_options(prog, words)
+        own, words = _own_options(words)
         command = tyro.cli(_for_tyro(kind), prog=prog, args=words)
         check_count("drones", command.drones)
         return _with_options(command, given, own, file)
@@ -302,14 +302,21 @@ def _given(words: Sequence[str]) -> frozenset[str]:
     return frozenset(names)
 
 
-def _own_options(prog: str, words: Sequence[str]) -> tuple[Options, list[str]]:
+def _own_options(words: Sequence[str]) -> tuple[Options, list[str]]:
     """JSON values of `--env.NAME VALUE` for a task that is not known here, and the other words."""
-    parser = ArgumentParser(prog, add_help=False, allow_abbrev=False)
-    for flag in {word.partition("=")[0] for word in words if word.startswith("--env.")}:
-        name = flag.removeprefix("--env.").replace("-", "_")
-        parser.add_argument(flag, dest=name, type=parse_value)
-    own, others = parser.parse_known_args(words)
-    return vars(own), others
+    own: Options = {}
+    others = []
+    rest = iter(words)
+    for word in rest:
+        flag, equals, text = word.partition("=")
+        if not flag.startswith("--env."):
+            others.append(word)
+            continue
+        value = text if equals else next(rest, None)  # which may begin with a minus
+        if value is None:
+            raise InputError(f"{flag}: expected a value, got none")
+        own[flag.removeprefix("--env.").replace("-", "_")] = parse_value(value)
+    return own, others
 
 
 def parse_address(text: str) -> tuple[str, int]:

@@ -151,7 +151,8 @@ def report(folder: Path, page: Path | None, film: bool) -> None:
     # Only now: if the film fails, there is a report.
     if film and results.study.kind in ("paper", "compare") and not video.exists():
         _film(results, video)
-        write_report(results, page)
+        if video.exists():
+            write_report(results, page)
     print(f"{len(results.runs)} of {len(results.study.runs())} runs done")
     if page:
         print(f"page: {page}")

@@ -22,9 +22,10 @@ class TrainingFlags(BackendFlags):
     preset: PresetName = "tuned"
     """Hyperparameters: the paper's (of vpg and a2c), or ours, which may depend on the task."""
     env_steps: int | None = None
-    """Env steps of each training, of all its drones together."""
+    """Env steps of each training, of all its drones together. Default of train: the preset's."""
     num_envs: int | None = None
-    """Drones that fly at the same time, in lock-step, in each training."""
+    """Drones that fly at the same time, in lock-step, in each training. Default of train: the
+    preset's, in whole worlds."""
     out: Path | None = None
     """Folder to write; it must not exist. Default: one in runs, named by the command and the time.
     """

@@ -99,9 +99,10 @@ class Train(AgentFlags, TrainingFlags):
             )
         config = preset(self.algorithm, self.preset, task, **changes)
         backend = self.backend if "backend" in self.given else base.backend
+        env_config = self.env_config(backend=backend)  # it refuses wrong drones
         whole_worlds = max(base.num_envs // self.drones, 1) * self.drones
         run = Run(
-            env=self.env_config(backend=backend),
+            env=env_config,
             algorithm=self.algorithm,
             config=config,
             seed=self.seed,

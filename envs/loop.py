@@ -259,7 +259,8 @@ class Loop:
     def _per_drone(self, arrays: Mapping[str, Array]) -> dict[str, Floats]:
         rows = {}
         for name, values in arrays.items():
-            row = np.broadcast_to(values, self.record.shape)
+            row = np.asarray(values, np.float64)
+            row = np.broadcast_to(row, self.record.shape or row.shape)
             rows[name] = np.array(row).reshape(self.num_envs)
         return rows
 

@@ -7,9 +7,9 @@ the env's code nor MuJoCo. This module imports the standard library and NumPy al
 import json
 import math
 import re
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields
+from numbers import Real
 from typing import Annotated, Any, ClassVar, Final, Literal, Self
 
 import numpy as np
@@ -359,9 +359,10 @@ def _checked_constants(constants: Any) -> dict[str, Bound]:
     for name, value in constants.items():
         check("constants", _CONSTANT, name, SpecError)
         several = isinstance(value, tuple | list)
-        _expect(not several or len(value) <= MAX_TOLD, name, f"at most {MAX_TOLD} numbers", value)
+        what = f"constants: {name}"
+        _expect(not several or len(value) <= MAX_TOLD, what, f"at most {MAX_TOLD} numbers", value)
         rule = Limits(count=None, least=0) if several else Limits()
-        checked[name] = check(f"constants: {name}", rule, value, SpecError)
+        checked[name] = check(what, rule, value, SpecError)
     return checked
 
 
@@ -372,9 +373,12 @@ def _expect(right: object, name: str, expected: str, got: object) -> None:
 
 def _is_number(value: object) -> bool:
     """Whether it is a number of float64, infinity among them."""
-    if not isinstance(value, int | float):
+    if not isinstance(value, Real) or isinstance(value, bool):
         return False
-    return abs(value) <= sys.float_info.max or abs(value) == math.inf
+    try:
+        return not math.isnan(value)
+    except OverflowError:
+        return False
 
 
 def _check_different(what: str, names: Sequence[str], most: int) -> None:

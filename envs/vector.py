@@ -143,11 +143,11 @@ class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Observation, ArrayLike, np.nd
     def _choice(self, name: str, value: object) -> np.ndarray:
         check_names([name], ("reset_mask", *self.loop.task.reset_options), "options")
         try:
-            values = np.full(self.num_envs, value, np.float64)
+            values = np.asarray(value, np.float64)
         except (TypeError, ValueError):
             values = np.array(np.nan)
-        if not np.isfinite(values).all():
+        if values.shape not in ((), (self.num_envs,)) or not np.isfinite(values).all():
             raise InputError(
                 f"{name}: expected a finite number, or shape ({self.num_envs},), got {value!r}"
             )
-        return values
+        return np.broadcast_to(values, self.num_envs).copy()

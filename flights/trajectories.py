@@ -190,7 +190,9 @@ def _fly_batch(
     all_actions = np.array(actions)
     episodes = list(seeds)
     flown: dict[int, list[Trajectory]] = {}
-    for drone in np.flatnonzero(~lost[:used]).tolist():
+    # A world that lost one of its drones is flown again.
+    spoiled = lost.reshape(-1, drones).any(axis=1).repeat(drones)
+    for drone in np.flatnonzero(~spoiled[:used]).tolist():
         episode = episodes[drone // drones]
         steps = lengths[drone]
         trajectory = Trajectory(

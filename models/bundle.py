@@ -78,6 +78,8 @@ def _checked(given: object) -> Bundle:
 
 def _is_file(pair: Any) -> bool:
     """Whether it is base64 behind a relative path that stays in its folder, on every system."""
+    if not isinstance(pair, list | tuple):
+        return False
     try:
         name, content = pair
         path = PurePosixPath(name)

@@ -345,7 +345,7 @@ def _listed(given: object, where: str) -> list[tuple[str, Any]]:
 
 
 def _model(path: Path, given: object) -> Path:
-    file = read_table(_Model, _mapping(given, "model"), "model").file
+    file = _table([], _Model, given, "model").file
     model = path.parent / file
     if model.suffix.lower() not in (".urdf", ".xml"):
         raise InputError(

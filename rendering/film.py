@@ -15,7 +15,7 @@ from ..models.errors import InputError, require
 
 Picture = NDArray[np.uint8]
 
-require("PIL", "render", "what is written on pictures and into films")
+require("PIL", "render", "writing pictures and films")
 
 from PIL import Image  # noqa: E402
 

@@ -31,7 +31,7 @@ MAX_SEEDS = 64
 
 def parse_scene(text: str) -> tuple[str, int]:
     """Name and seed of a scene: NAME, or NAME:SEED of one with a seed. Raises `InputError`."""
-    found = re.fullmatch(r"(\w+)(:[0-9]{1,9})?", str(text))
+    found = re.fullmatch(r"(\w+)(:[0-9]{1,9})?", text) if isinstance(text, str) else None
     name, seed = found.groups() if found else ("", None)
     if name not in SCENES or (seed and name not in SEEDED_SCENES):
         names = " or ".join(map(repr, SCENES))
@@ -47,7 +47,7 @@ def scenes_of(text: str) -> tuple[str, ...]:
 
     Raises `InputError`.
     """
-    if "-" not in str(text):
+    if not isinstance(text, str) or "-" not in text:
         parse_scene(text)
         return (text,)
     found = re.fullmatch(r"(\w+):([0-9]{1,9})-([0-9]{1,9})", text)

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..models import BACKENDS, MAX_DRONES, Backend
-from ..models.errors import InputError
+from ..models.errors import InputError, NotCopied
+from ..models.fields import Choice, Flag, Limits, OrNone, Rule, check
 from .effects import EffectOptions, Effects
 from .random import RANDOMIZATION, START, Draw, Random
 from .randomize import Randomization
@@ -19,8 +20,11 @@ if TYPE_CHECKING:
 
 _CLASSES = {"mujoco": "MujocoWorld", "rigid": "RigidWorld"}
 """Backends by name: a class in the module of that name in `backends`."""
-_SETTINGS = {"mujoco": ("num_threads",), "rigid": ("dtype", "compiled")}
-"""Names of each backend's own arguments of `make_world`."""
+_SETTINGS: Mapping[str, Mapping[str, Rule]] = {
+    "mujoco": {"num_threads": OrNone(Limits(0, whole=True))},
+    "rigid": {"dtype": Choice(("float32", "float64")), "compiled": OrNone(Flag())},
+}
+"""Rules of each backend's own arguments of `make_world`, by name."""
 
 MAX_WORLDS = 1 << 16  # Most worlds of a batch
 CONTACT_CHECK = 0.02
@@ -35,7 +39,7 @@ class PhysicsError(RuntimeError):
     """The physics reported a bad state; the numbers after it are meaningless."""
 
 
-class World:
+class World(NotCopied):
     """W worlds of A drones; a seed gives the same draws on each backend, which sets `state`.
 
     Attributes:
@@ -200,6 +204,7 @@ def check_world(
                 f"{name}: expected {' or '.join(known)}, the setting{several} of the backend "
                 f"{backend}, got {name}={value!r}"
             )
+        check(name, known[name], value)
 
 
 def make_world(

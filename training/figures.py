@@ -246,7 +246,7 @@ def _panels(count: int, name: str) -> tuple[Figure, Sequence[Axes]]:
     """A figure with panels side by side, and the paper's words below."""
     figure = Figure(figsize=(4.0 * count, 3.8), dpi=110)
     figure.supxlabel(PAPER[name], fontsize=8, wrap=True)
-    return figure, figure.subplots(1, count)
+    return figure, figure.subplots(1, count, squeeze=False)[0]
 
 
 def _plot(axis: Axes, spread: Spread, color: str, label: str, marker: str | None = None) -> None:

@@ -45,7 +45,10 @@ def write_report(results: Results, page: Path | None = None) -> pd.DataFrame:
         found = json.dumps([asdict(verdict) for verdict in verdicts], indent=2, ensure_ascii=False)
         (folder / "claims.json").write_text(found + "\n", encoding="utf-8")
     figures = draw_figures(results, table) if len(table) else []
-    content = "\n".join([*_page(results, table, figures), f"<pre>{html.escape(claims)}</pre>"])
+    parts = [*_page(results, table, figures)]
+    if claims:
+        parts.append(f"<pre>{html.escape(claims)}</pre>")
+    content = "\n".join(parts)
     page_text = Template(_PAGE.read_text(encoding="utf-8")).substitute(content=content)
     (folder / PAGE_FILE).write_text(page_text, encoding="utf-8")
     return table

@@ -269,7 +269,7 @@ class Study:
         content = read_keywords(path)
         if "row" not in content:
             content = {"row": [{"name": path.stem, **content}]}
-        env = content.pop("env", {})
+        env = _table(f"{path}: env", content.pop("env", {}))
         tables = content.pop("row")
         if "rows" in content:
             raise InputError(f"{path}: rows: expected [[row]] tables, got the name rows")

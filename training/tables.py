@@ -1,6 +1,6 @@
 """The table of a study: one line for each row, measures over its seeds, as text.
 
-Cells are made once; the terminal and Markdown show the same ones.
+Cells are made once; the terminal, Markdown and HTML show the same ones.
 """
 
 import math

@@ -256,19 +256,19 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Observation, ArrayL
         self.num_envs = 0
         self._arrays: Arrays = {}
         self.telemetry: Arrays = {}
-        self.num_simulators = num_simulators
         self._reasons: np.ndarray | None = None  # of simulators that were lost in this step
         self.metadata = {"render_modes": [], "autoreset_mode": checked_mode(autoreset_mode)}
-        check("num_simulators", Limits(1, MAX_DRONES, whole=True), num_simulators)
+        num_simulators = check("num_simulators", Limits(1, MAX_DRONES, whole=True), num_simulators)
+        self.num_simulators: int = num_simulators
         drones = None
         if num_envs is not None:
             most = num_simulators * MAX_DRONES
-            check("num_envs", Limits(1, most, whole=True), num_envs)
-            drones, left = divmod(num_envs, num_simulators)
+            whole: int = check("num_envs", Limits(1, most, whole=True), num_envs)
+            drones, left = divmod(whole, num_simulators)
             if left:
                 expected = f"a multiple of num_simulators = {num_simulators}"
                 raise InputError(f"num_envs: expected {expected}, got {num_envs}")
-            self.num_envs = num_envs
+            self.num_envs = whole
         config = AgentConfig(drones=drones, slots=num_simulators, **settings)
         self._open(address, config, connect)
         self.closed = False

@@ -89,7 +89,7 @@ class Judge(Stage):
             self._refuse(f"observe() to return a dict of {names}", given)
         count = prod(record.shape)
         for array in task.observation:
-            shape = np.shape(observations[array.name])
+            shape = tuple(getattr(observations[array.name], "shape", ()))
             if prod(shape) != count * array.size:
                 expected = f"{array.name} of shape {array.shape} for each of {count} drones"
                 self._refuse(f"observe() to return {expected}", f"an array of shape {shape}")
@@ -101,7 +101,8 @@ class Judge(Stage):
         if record.shape and not any(np.ndim(term) for term in outcome.reward.values()):
             got = f"{outcome.reward}: make an array of it, as 1.0 + 0.0 * state.position[..., 2]"
             self._refuse("a reward for each drone", got)
-        if np.asarray(outcome.terminated).dtype != np.bool_:
+        kind = getattr(outcome.terminated, "dtype", type(outcome.terminated))
+        if np.dtype(kind) != np.bool_:
             self._refuse("terminated as truth values", outcome.terminated)
 
     def _refuse(self, expected: str, got: object) -> NoReturn:

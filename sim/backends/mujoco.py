@@ -263,7 +263,7 @@ class MujocoWorld(World):
     def _hung(self, pose: InitialState, ids: np.ndarray) -> np.ndarray | None:
         """Where the payload of each world begins, shape (W, 3).
 
-        Refuses starts of some worlds at which it would hang in the ground.
+        Raises `InputError` if the payload of one of the worlds `ids` would hang in the ground.
         """
         if self._cable is None:
             return None

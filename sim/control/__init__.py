@@ -72,6 +72,8 @@ class MixedController:
         self._controllers = controllers
 
     def __getattr__(self, name: str) -> Any:
+        if name == "_controllers":  # which a copy does not have yet
+            raise AttributeError(name)
         return getattr(self._controllers[0][0], name)
 
     def thrust(self, action: Array, state: WorldState) -> Array:

@@ -28,7 +28,7 @@ class Setting(NamedTuple):
     default: float | tuple[float, ...] | None
     limits: Limits
     coefficient: str = ""
-    """Number of the vehicle's file that replaces the default; one of both has to be there."""
+    """The number of the vehicle's file that replaces the default; one of the two must be there."""
 
 
 SAMPLING = {

@@ -216,7 +216,7 @@ def test_a_journal_of_several_sessions_says_so(
     for simulator in simulators:
         simulator.join()
     log(path, tmp_path / "first.csv")
-    expected = "two.mcap: session 1 of 2 that flew; --session of log, plot and render takes another"
-    assert expected in capsys.readouterr().err
+    expected = "two.mcap: session 1, the first of 2 that flew; --session of log, plot and render"
+    assert f"{expected} takes another" in capsys.readouterr().err
     log(path, tmp_path / "second.csv", "--session", "2")
     assert capsys.readouterr().err == ""

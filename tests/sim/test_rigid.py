@@ -1,5 +1,6 @@
 """The backend rigid: MuJoCo's flights without contact, and the tasks on it."""
 
+import copy
 import re
 import shutil
 from pathlib import Path
@@ -410,3 +411,10 @@ def test_a_bad_state_raises_and_a_reset_mends_it() -> None:
     observations = loop.observations["observation"]
     found = abs(observations[:, 1:]).max()
     assert found < 1e-6
+
+
+def test_a_world_checks_its_settings_and_is_not_copied() -> None:
+    with pytest.raises(InputError, match=r"^dtype: expected 'float32'"):
+        make_world(Vehicle.load(), 2, "rigid", dtype="float16")
+    with pytest.raises(TypeError, match="cannot be copied"):
+        copy.copy(make_world(Vehicle.load(), 2, "rigid"))

@@ -1,7 +1,7 @@
 """States of both sides, and the messages that each state sends and receives.
 
 One table for each side says what a message does, sent or received; other messages cannot be
-sent, and are dropped when they come. A text simulator begins at READY, for it says no Hello.
+sent, and are dropped when they come. A text simulator begins at `ready`, for it says no Hello.
 """
 
 from typing import Final, Literal

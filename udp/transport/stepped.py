@@ -49,8 +49,8 @@ def make_stepped(
         return GymnasiumWorld(env, {})
     env = EnvConfig.from_keywords(env, **keywords)
     drones = env.drones
-    count = drones if num_envs is None else num_envs
-    check("num_envs", Limits(1, MAX_DRONES, whole=True), count)
+    whole = Limits(1, MAX_DRONES, whole=True)
+    count = check("num_envs", whole, drones if num_envs is None else num_envs)
     if count % drones:
         raise InputError(f"drones: expected a divisor of num_envs = {count}, got {drones}")
     if registry.is_known(env.env_id):
