@@ -46,20 +46,10 @@ class Cable(Swarm):
 
     ## Observation, `float32`, shape (24 + R + 7 k,), k = 7 (`neighbours`)
 
-    | index | quantity | unit | frame |
-    |---|---|---|---|
-    | 0-2 | own place minus position: where the payload would hang still at the goal | m | world |
-    | 3-5 | velocity | m/s | world |
-    | 6-8 | direction of body x, the nose | 1 | world |
-    | 9-11 | direction of body z, the thrust | 1 | world |
-    | 12-14 | body rates | rad/s | body |
-    | 15... | thrust of each rotor over its hover thrust, minus 1 | 1 | |
-    | 15 + R... | position of the payload minus the own: the direction of the cable | m | world |
-    | 18 + R... | velocity of the payload minus the own | m/s | world |
-    | 21 + R... | goal of the payload minus its position | m | world |
-    | then, of each neighbour, the nearest first: 3 | its position minus the own | m | world |
-    | 3 | its velocity minus the own | m/s | world |
-    | 1 | 1; 0, as the six before, where no further drone is heard | 1 | |
+    The place where the payload would hang still at the goal minus the own position, then as
+    `GoalTask`; position and velocity of the payload minus the own; goal of the payload minus its
+    position; then of each neighbour, the nearest first, position and velocity minus the own, and 1,
+    or seven zeros where no further drone is heard.
 
     The payload's numbers are exact, with sensors too: nothing measures them.
 

@@ -65,11 +65,8 @@ class Elevation(Task):
 
     ## Observation, `float32`
 
-    | index | quantity | unit | bounds |
-    |---|---|---|---|
-    | 0 | elevation error E = Y - Y', desired minus measured (world, up) | m | ±3.225 |
-    | 1 | rate of E: minus the climb rate | m/s | ±11.268 |
-    | 2 | thrust relative to hover: F / 49 N - 1 | 1 | -1 ... 1.041 |
+    Elevation error E = Y - Y', desired minus measured (world, up); its rate, minus the climb rate;
+    and the thrust relative to hover, F / 49 N - 1.
 
     `observation="error"` keeps index 0 alone, as in the paper. The bounds follow from vehicle and
     options and cannot be left; with effects, or with a vehicle that is drawn, numbers are clipped.

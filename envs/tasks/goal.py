@@ -96,14 +96,10 @@ def with_payload(config: EnvConfig, mass: float, cable: float) -> EnvConfig:
 class GoalTask(Task):
     """Base of tasks that are flown to a goal, with an observation of 15 + R numbers and more.
 
-    | index | quantity | unit | frame |
-    |---|---|---|---|
-    | 0-2 | goal minus position | m | world, turned by the wanted heading |
-    | 3-5 | velocity | m/s | the same |
-    | 6-8 | direction of body x, the nose | 1 | the same |
-    | 9-11 | direction of body z, the thrust | 1 | the same |
-    | 12-14 | body rates | rad/s | body |
-    | 15... | thrust of each rotor over its hover thrust, minus 1 | 1 | |
+    Goal minus position, m; velocity, m/s; the directions of body x, the nose, and of body z, the
+    thrust: all in the world, turned by the wanted heading. Then the body rates, rad/s, and the
+    thrust of each rotor over its hover thrust, minus 1. `docs/observations.md` lists the numbers of
+    every task by index.
 
     Numbers are clipped: positions at twice the flight band, speeds at 100 m/s, rates at 100 rad/s.
     A derived class calls `define_observation` in `setup`, and gives further numbers in `further`.

@@ -55,14 +55,8 @@ class Hover(GoalTask):
 
     ## Observation, `float32`, shape (15 + R,)
 
-    | index | quantity | unit | frame |
-    |---|---|---|---|
-    | 0-2 | goal minus position | m | world, turned by the wanted heading |
-    | 3-5 | velocity | m/s | the same |
-    | 6-8 | direction of body x, the nose | 1 | the same |
-    | 9-11 | direction of body z, the thrust | 1 | the same |
-    | 12-14 | body rates | rad/s | body |
-    | 15... | thrust of each rotor over its hover thrust, minus 1 | 1 | |
+    Goal minus position, velocity, directions of the nose and of the thrust, body rates, and thrust
+    of each rotor, as `GoalTask` has them.
 
     Numbers are clipped: positions at twice the flight band, speeds at 100 m/s, rates at 100 rad/s.
 

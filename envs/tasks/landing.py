@@ -82,15 +82,8 @@ class Landing(GoalTask):
 
     ## Observation, `float32`, shape (17 + R,)
 
-    | index | quantity | unit | frame |
-    |---|---|---|---|
-    | 0-2 | goal minus position: the pad, at the height of a craft that stands | m | world |
-    | 3-5 | velocity | m/s | world |
-    | 6-8 | direction of body x, the nose | 1 | world |
-    | 9-11 | direction of body z, the thrust | 1 | world |
-    | 12-14 | body rates | rad/s | body |
-    | 15... | thrust of each rotor over its hover thrust, minus 1 | 1 | |
-    | 15 + R... | velocity of the pad, x and y | m/s | world |
+    Those of `GoalTask`, whose goal is the pad at the height of a craft that stands; then the
+    velocity of the pad, x and y.
 
     Numbers are clipped: positions at twice the flight band, speeds at 100 m/s, rates at 100 rad/s.
 

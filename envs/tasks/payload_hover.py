@@ -74,16 +74,8 @@ class PayloadHover(GoalTask):
 
     ## Observation, `float32`, shape (21 + R,)
 
-    | index | quantity | unit | frame |
-    |---|---|---|---|
-    | 0-2 | goal minus position of the craft: above the payload's by the cable | m | world |
-    | 3-5 | velocity | m/s | world |
-    | 6-8 | direction of body x, the nose | 1 | world |
-    | 9-11 | direction of body z, the thrust | 1 | world |
-    | 12-14 | body rates | rad/s | body |
-    | 15... | thrust of each rotor over its hover thrust, minus 1 | 1 | |
-    | 15 + R... | position of the payload minus that of the craft | m | world |
-    | 18 + R... | velocity of the payload minus that of the craft | m/s | world |
+    Those of `GoalTask`, whose goal is above the payload's by the cable; then position and velocity
+    of the payload minus those of the craft.
 
     Numbers are clipped: positions at twice the flight band or the cable, speeds at 100 m/s, rates
     at 100 rad/s. The payload's are exact, with sensors too: nothing measures them.

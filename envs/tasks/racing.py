@@ -102,18 +102,9 @@ class Racing(GoalTask):
 
     ## Observation, `float32`, shape (23 + R,)
 
-    | index | quantity | unit | frame |
-    |---|---|---|---|
-    | 0-2 | centre of the next gate minus position | m | world |
-    | 3-5 | velocity | m/s | world |
-    | 6-8 | direction of body x, the nose | 1 | world |
-    | 9-11 | direction of body z, the thrust | 1 | world |
-    | 12-14 | body rates | rad/s | body |
-    | 15... | thrust of each rotor over its hover thrust, minus 1 | 1 | |
-    | 15 + R... | x and y of the direction in which the next gate is passed | 1 | world |
-    | 17 + R... | centre of the gate after it minus position | m | world |
-    | 20 + R... | x and y of the direction of that gate | 1 | world |
-    | 22 + R | half the size of the next gate | m | |
+    Those of `GoalTask`, whose goal is the centre of the next gate; then x and y of the direction in
+    which it is passed; the centre of the gate after it minus position; x and y of its direction;
+    and half the size of the next gate.
 
     Numbers are clipped: positions at the size of the track, speeds at 100 m/s, rates at 100 rad/s.
 

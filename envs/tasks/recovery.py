@@ -72,26 +72,9 @@ class Recovery(GoalTask):
     ## Observation, `float32`, shape (12 + R,) or (15 + R,)
 
     Which torque turns a craft upright follows from where up is in its body frame, whatever its
-    heading. With `frame="body"`:
-
-    | index | quantity | unit | frame |
-    |---|---|---|---|
-    | 0-2 | goal minus position | m | body |
-    | 3-5 | velocity | m/s | body |
-    | 6-8 | direction of world z, up | 1 | body |
-    | 9-11 | body rates | rad/s | body |
-    | 12... | thrust of each rotor over its hover thrust, minus 1 | 1 | |
-
-    With `frame="world"`:
-
-    | index | quantity | unit | frame |
-    |---|---|---|---|
-    | 0-2 | goal minus position | m | world |
-    | 3-5 | velocity | m/s | world |
-    | 6-8 | direction of body x, the nose | 1 | world |
-    | 9-11 | direction of body z, the thrust | 1 | world |
-    | 12-14 | body rates | rad/s | body |
-    | 15... | thrust of each rotor over its hover thrust, minus 1 | 1 | |
+    heading. With `frame="body"`: goal minus position, velocity, direction of world z, body rates,
+    and the thrust of each rotor over its hover thrust, minus 1, all in the body frame. With
+    `frame="world"`: those of `GoalTask`.
 
     Numbers are clipped: positions at twice the flight band, speeds at 100 m/s, rates at 100 rad/s.
 

@@ -231,17 +231,8 @@ class Formation(Swarm):
 
     ## Observation, `float32`, shape (15 + R + 7 k,), k = 7 (`neighbours`)
 
-    | index | quantity | unit | frame |
-    |---|---|---|---|
-    | 0-2 | own place minus position | m | world |
-    | 3-5 | velocity | m/s | world |
-    | 6-8 | direction of body x, the nose | 1 | world |
-    | 9-11 | direction of body z, the thrust | 1 | world |
-    | 12-14 | body rates | rad/s | body |
-    | 15... | thrust of each rotor over its hover thrust, minus 1 | 1 | |
-    | then, of each neighbour, the nearest first: 3 | its position minus the own | m | world |
-    | 3 | its velocity minus the own | m/s | world |
-    | 1 | 1; 0, as the six before, where no further drone is heard | 1 | |
+    Those of `GoalTask`, whose goal is the own place; then of each neighbour, the nearest first,
+    position and velocity minus the own, and 1, or seven zeros where no further drone is heard.
 
     ## Action, `Box(-1, 1, (4,), float32)`
 
@@ -281,17 +272,9 @@ class Crossing(Swarm):
 
     ## Observation, `float32`, shape (15 + R + 7 k,), k = 7 (`neighbours`)
 
-    | index | quantity | unit | frame |
-    |---|---|---|---|
-    | 0-2 | goal minus position | m | world |
-    | 3-5 | velocity | m/s | world |
-    | 6-8 | direction of body x, the nose | 1 | world |
-    | 9-11 | direction of body z, the thrust | 1 | world |
-    | 12-14 | body rates | rad/s | body |
-    | 15... | thrust of each rotor over its hover thrust, minus 1 | 1 | |
-    | then, of each neighbour, the nearest first: 3 | its position minus the own | m | world |
-    | 3 | its velocity minus the own | m/s | world |
-    | 1 | 1; 0, as the six before, where no further drone is heard | 1 | |
+    Those of `GoalTask`, whose goal is the opposite place; then of each neighbour, the nearest
+    first, position and velocity minus the own, and 1, or seven zeros where no further drone is
+    heard.
 
     ## Action, `Box(-1, 1, (4,), float32)`
 
@@ -370,18 +353,9 @@ class Escort(Swarm):
 
     ## Observation, `float32`, shape (18 + R + 7 k,), k = 7 (`neighbours`)
 
-    | index | quantity | unit | frame |
-    |---|---|---|---|
-    | 0-2 | own place minus position | m | world |
-    | 3-5 | velocity | m/s | world |
-    | 6-8 | direction of body x, the nose | 1 | world |
-    | 9-11 | direction of body z, the thrust | 1 | world |
-    | 12-14 | body rates | rad/s | body |
-    | 15... | thrust of each rotor over its hover thrust, minus 1 | 1 | |
-    | 15 + R... | velocity of the target | m/s | world |
-    | then, of each neighbour, the nearest first: 3 | its position minus the own | m | world |
-    | 3 | its velocity minus the own | m/s | world |
-    | 1 | 1; 0, as the six before, where no further drone is heard | 1 | |
+    Those of `GoalTask`, whose goal is the own place; the velocity of the target; then of each
+    neighbour, the nearest first, position and velocity minus the own, and 1, or seven zeros where
+    no further drone is heard.
 
     ## Action, `Box(-1, 1, (4,), float32)`
 

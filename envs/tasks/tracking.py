@@ -78,16 +78,8 @@ class Tracking(GoalTask):
 
     ## Observation, `float32`, shape (18 + R + 3 P,) with P = 3 later points (`preview`)
 
-    | index | quantity | unit | frame |
-    |---|---|---|---|
-    | 0-2 | where it should be minus position | m | world |
-    | 3-5 | velocity | m/s | world |
-    | 6-8 | direction of body x, the nose | 1 | world |
-    | 9-11 | direction of body z, the thrust | 1 | world |
-    | 12-14 | body rates | rad/s | body |
-    | 15... | thrust of each rotor over its hover thrust, minus 1 | 1 | |
-    | 15 + R... | velocity of the trajectory | m/s | world |
-    | 18 + R... | where it should be, every 0.2 s (`preview_time`), minus position | m | world |
+    Those of `GoalTask`, whose goal is where it should be; then the velocity of the trajectory, and
+    where it should be, every 0.2 s (`preview_time`), minus position.
 
     Numbers are clipped: positions at the size of the trajectory, speeds at 100 m/s, rates at
     100 rad/s.

@@ -53,15 +53,8 @@ class Waypoints(GoalTask):
 
     ## Observation, `float32`, shape (18 + R,)
 
-    | index | quantity | unit | frame |
-    |---|---|---|---|
-    | 0-2 | next point minus position | m | world |
-    | 3-5 | velocity | m/s | world |
-    | 6-8 | direction of body x, the nose | 1 | world |
-    | 9-11 | direction of body z, the thrust | 1 | world |
-    | 12-14 | body rates | rad/s | body |
-    | 15... | thrust of each rotor over its hover thrust, minus 1 | 1 | |
-    | 15 + R... | the point after the next minus position; of the last point the same | m | world |
+    Those of `GoalTask`, whose goal is the next point; then the point after it minus position, of
+    the last point the same.
 
     Numbers are clipped: positions at the diagonal of the box and its margin, speeds at 100 m/s,
     rates at 100 rad/s.

@@ -61,6 +61,12 @@ def test_the_navigation_has_every_page_once(stage: dict[str, Any]) -> None:
     assert sorted(listed) == sorted(pages - scripts - vehicles)
 
 
+def test_the_page_of_observations_is_that_of_the_specs() -> None:
+    script = runpy.run_path(str(ROOT / "docs" / "observations.py"))
+    written = (ROOT / "docs" / "observations.md").read_text(encoding="utf-8")
+    assert script["page"]() == written
+
+
 def test_the_readme_lists_what_the_navigation_has(stage: dict[str, Any]) -> None:
     text = (ROOT / "README.md").read_text(encoding="utf-8").split("## Where to go next")[1]
     places = stage["_places"]()
