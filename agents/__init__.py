@@ -3,15 +3,11 @@
 Only SB3's algorithms need torch.
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from itertools import zip_longest
-
-from ..envs.spec import Discrete, EnvSpec, component_names
+from ..envs.spec import EnvSpec
 from ..models.errors import InputError, one_line
 from .a2c import A2CConfig
 from .checkpoints import Checkpoint, CheckpointError, load, store
-from .config import NETWORK_FIELDS, Config, SACConfig
+from .config import Config, SACConfig
 from .episodes import Episode, EpisodeRecorder, ResumeError, episode_seed
 from .geometric import Geometric
 from .learner import Learner
@@ -32,7 +28,6 @@ from .vpg import VPGConfig
 __all__ = [
     "ALGORITHMS",
     "CONTROLLERS",
-    "NETWORK_FIELDS",
     "PID",
     "A2CConfig",
     "Agent",
@@ -57,7 +52,6 @@ __all__ = [
     "make_agent",
     "preset",
     "resume_agent",
-    "start_agent",
     "store",
 ]
 
@@ -83,62 +77,6 @@ def make_agent(algorithm: str, log: EpisodeRecorder, config: Config, seed: int) 
     return SB3Agent(log, config, seed)
 
 
-def start_agent(
-    kept: Checkpoint, algorithm: str, log: EpisodeRecorder, config: Config, seed: int
-) -> Agent:
-    """A new agent that begins with the policy of a checkpoint; all else of it is fresh.
-
-    It takes the critic too where that has the same shape. Task, vehicle and effects may be others,
-    observation and action may not. SB3's agents begin with no checkpoint, and none with theirs.
-
-    Raises:
-        InputError: The checkpoint has other networks, or is a policy alone.
-        CheckpointError: The parts of the checkpoint do not fit together.
-    """
-    names = [name for name, row in ALGORITHMS.items() if row.resumes]
-    for name in (algorithm, kept.algorithm):
-        if name not in names:
-            raise InputError(f"start-from: expected a training of {', '.join(names)}, got {name}")
-    if not kept.num_envs:
-        raise InputError("start-from: expected the checkpoint of a training, got a policy alone")
-    for wanted, got in zip_longest(_names(kept.spec), _names(log.spec), fillvalue="none"):
-        if wanted != got:
-            raise InputError(f"start-from: expected {wanted} of {kept.env_id}, got {got}")
-    begun_with = kept.hyperparameters
-    for name in NETWORK_FIELDS:
-        value = getattr(config, name)
-        own = getattr(begun_with, name)
-        if value != own:
-            raise InputError(f"{name}: expected {own} of the training to start from, got {value}")
-    agent = make_agent(algorithm, log, config, seed)
-    assert isinstance(agent, Learner)
-    with _fitting():
-        agent.start_from(kept)
-    return agent
-
-
-def _names(spec: EnvSpec) -> list[str]:
-    """Names of what an env's policy sees and sets."""
-    names: list[str] = []
-    for array in spec.observation:
-        names += [f"observation {name!r}" for name in component_names(array)]
-    if isinstance(spec.action, Discrete):
-        return [*names, f"{spec.action.n} choices"]
-    return names + [f"action {name!r}" for name in component_names(spec.action)]
-
-
-@contextmanager
-def _fitting() -> Iterator[None]:
-    """Errors of parts of a checkpoint that do not fit together become `CheckpointError`."""
-    try:
-        yield
-    except ResumeError:
-        raise
-    except (KeyError, TypeError, ValueError, RuntimeError, IndexError) as error:
-        reason = one_line(error)
-        raise CheckpointError(f"checkpoint: its parts do not fit together: {reason:.300}") from None
-
-
 def resume_agent(kept: Checkpoint, log: EpisodeRecorder) -> Agent:
     """The agent of a checkpoint; the log, a new one of as many drones, resumes where it was.
 
@@ -152,12 +90,17 @@ def resume_agent(kept: Checkpoint, log: EpisodeRecorder) -> Agent:
     """
     kept.check_resumable()
     _check_same_env(kept.spec, log.spec)
-    with _fitting():
+    try:
         kept.policy()  # its networks are those of the config
         agent = make_agent(kept.algorithm, log, kept.hyperparameters, kept.seed)
         if isinstance(agent, Learner):
             agent.set_state(kept.state)
             log.resume(kept.position)
+    except ResumeError:
+        raise
+    except (KeyError, TypeError, ValueError, RuntimeError, IndexError) as error:
+        reason = one_line(error)
+        raise CheckpointError(f"checkpoint: its parts do not fit together: {reason:.300}") from None
     return agent
 
 

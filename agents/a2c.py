@@ -47,7 +47,7 @@ class A2C(Learner):
     def gradient(self, rollout: Rollout) -> None:
         """Of minus the mean of A · log P, plus the weighted squared error of the value."""
         config = self.config
-        observations = self._actor.inputs(rollout.rows(rollout.observations))
+        observations = rollout.rows(rollout.observations)
         advantage = rollout.rows(self.advantages(rollout)[0]).astype(np.float32)
         values = self._critic.forward(observations)[:, 0]
         targets = values + advantage
@@ -91,7 +91,7 @@ class A2C(Learner):
 
         Of drones that are not `flying`, bool, shape (T, N), another drone may not learn.
         """
-        return self._actor.inputs(observations)
+        return observations
 
     def _values(self, seen: Floats) -> NDArray[np.float64]:
         """V(s), shape (...), of inputs of the critic, shape (..., m)."""

@@ -181,7 +181,7 @@ def _read(data: bytes, parse: Callable[[bytes], ByName]) -> Checkpoint:
         found_format = shortened(content["format"])
         raise InputError(f"expected a checkpoint of format {FORMAT}, got {found_format}")
     spec = EnvSpec.from_json(content["spec"])
-    env = EnvConfig.from_dict(content["env"]) if content.get("env") else None
+    env = EnvConfig.from_dict(content["env"]) if content["env"] else None
     if env and env.env_id != canonical_id(spec.env_id):
         raise InputError(f"expected the config of {spec.env_id}, got that of {env.env_id}")
     arrays = parse(data)
@@ -198,7 +198,6 @@ def _read(data: bytes, parse: Callable[[bytes], ByName]) -> Checkpoint:
     check_fields(checkpoint)
     if not isinstance(checkpoint.versions, dict):
         raise InputError(f"versions: expected values by name, got {checkpoint.versions!r:.80}")
-    checkpoint.config.setdefault("network", "mlp")
     complete = json.loads(json.dumps(vars(checkpoint.hyperparameters)))  # a tuple is a list there
     if complete != checkpoint.config:
         raise InputError(

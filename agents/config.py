@@ -4,11 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
-from ..models.errors import InputError
 from ..models.fields import Limits, PositiveInt, check_fields
-
-NETWORK_FIELDS = ("network", "hidden", "activation", "normalize_observations")
-"""Hyperparameters that say what networks there are."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,8 +25,6 @@ class Config:
     """Discount. The paper names none."""
     log_std: Annotated[float, Limits(-4.0, 1.0)] = -0.5
     """Initial logarithm of the policy's standard deviation, in units of the action."""
-    normalize_observations: bool = False
-    """Shift and scale observations to mean 0 and standard deviation 1 of all rollouts before."""
 
     squashed: ClassVar[bool] = False
     """Whether the policy bounds its output by tanh."""
@@ -84,13 +78,3 @@ class SACConfig(RolloutConfig):
     """Share of the critics that their targets take over in each update."""
     alpha: Annotated[float, Limits(0.0, 1e30, above=True)] = 1.0
     """Temperature at the beginning. Table 1 has none."""
-    target_entropy: float | None = None
-    """Entropy that the temperature aims at, nats; null: minus the number of actions."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.buffer_size < self.learning_starts:
-            raise InputError(
-                f"buffer_size: expected learning_starts ({self.learning_starts}) or more, "
-                f"got {self.buffer_size}"
-            )

@@ -3,7 +3,7 @@
 import json
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -13,9 +13,6 @@ from .networks import ByName, Floats, Module, Weights, bind_parts, make_network,
 from .optimizers import Adam
 from .policies import NetworkPolicy, flat_size
 from .rollouts import Collector, Diverged, Rollout
-
-if TYPE_CHECKING:
-    from .checkpoints import Checkpoint
 
 OnUpdate = Callable[[], bool]
 """Called after every rollout and its update; training stops where it returns False."""
@@ -83,17 +80,12 @@ class Learner:
                 self.rate = self.config.learning_rate * (1 - before / env_steps)
             if len(rollout):
                 with np.errstate(over="ignore", invalid="ignore"):  # Diverged is raised below
-                    self._learn(rollout)
+                    self.update(rollout)
+                self._actor.head.clamp()
                 if not np.isfinite(self.weights.values).all():
                     raise Diverged(f"weights are not finite after update {self.optimizer.steps}")
             if not on_update():
                 return
-
-    def _learn(self, rollout: Rollout) -> None:
-        self.update(rollout)
-        self._actor.head.clamp()
-        if self._actor.moments is not None:  # these observations have had no part in it
-            self._actor.moments.add(rollout.rows(rollout.observations))
 
     def actor(self) -> dict[str, Floats]:
         """Weights of the policy, as a checkpoint has them: copies."""
@@ -119,33 +111,11 @@ class Learner:
             raise ValueError(f"state: expected arrays of shapes {expected}, got {got}")
         for name, array in arrays.items():
             array[...] = state[name]
-        if self._actor.moments is not None:
-            self._actor.moments.refresh()
         self.terms = {}
 
     def _state(self) -> ByName:
         """The state without the generator: no copies."""
-        arrays = {"weights": self.weights.values, **named("optimizer.", self.optimizer.state)}
-        if self._actor.moments is not None:
-            arrays |= named("observations.", self._actor.moments.state)
-        return arrays
-
-    def start_from(self, kept: "Checkpoint") -> None:
-        """Take over the policy of another training with its normalisation, and a critic's weights.
-
-        The noise begins anew, at `log_std`. Raises `ValueError` or `KeyError` unless they fit.
-        """
-        for name, array in self.weights.part("actor.").arrays.items():
-            if name.startswith("layers."):
-                array[...] = kept.actor[name]
-        weights = kept.state["weights"]
-        if self.has_critic and weights.shape == self.weights.values.shape:
-            critic = self.weights.part("critic.").values
-            critic[...] = weights[-critic.size :]
-        if self._actor.moments is not None:
-            for name, number in self._actor.moments.state.items():
-                number[...] = kept.state[f"observations.{name}"]
-            self._actor.moments.refresh()
+        return {"weights": self.weights.values, **named("optimizer.", self.optimizer.state)}
 
     def scalars(self) -> dict[str, float]:
         """Numbers of the last update, as in `docs/algorithms/README.md`; none before the first."""

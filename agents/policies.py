@@ -9,8 +9,7 @@ from ..envs.spec import ArraySpec, Discrete, EnvSpec
 from ..models.errors import InputError
 from .config import Config
 from .heads import Categorical, Gaussian, Head
-from .networks import Floats, Layer, Shapes, Tanh, Weights, make_network
-from .normalization import Moments
+from .networks import Floats, Shapes, Tanh, Weights, make_network
 
 Observation = np.ndarray | Mapping[str, np.ndarray]
 """As an env gives it."""
@@ -96,14 +95,13 @@ class ActionMap:
 
 
 class NetworkPolicy:
-    """Normalised observations, a network and a head: what learns, draws actions and flies.
+    """A network and a head: what learns, draws actions and flies.
 
     Where the learner binds it to its weights, it is the policy that learns; a copy of it does not.
 
     Attributes:
-        network: From inputs to the mean of the action, or to the logits of the choices, k numbers.
+        network: From observations to the mean of the action, or to the logits of the choices.
         head: Distribution of the actions.
-        moments: Normalise the observations, if the config has it.
         actions: Map from outputs to actions of the env.
         shapes: Of its weights: those of the network and of the head.
     """
@@ -111,14 +109,12 @@ class NetworkPolicy:
     def __init__(self, spec: EnvSpec, config: Config) -> None:
         self.spec = spec
         self.actions = ActionMap(spec.action)
-        size = flat_size(spec)
         outputs = self.actions.outputs
-        self.network = make_network(size, outputs, config)
+        self.network = make_network(flat_size(spec), outputs, config)
         self.head: Head = Head() if config.squashed else Gaussian(outputs)
         if self.actions.discrete:
             self.head = Categorical(outputs)
         self.shapes: Shapes = {**self.network.shapes, **self.head.shapes}
-        self.moments = Moments(size) if config.normalize_observations else None
         if config.squashed:
             self.network.layers.append(Tanh())
 
@@ -130,9 +126,6 @@ class NetworkPolicy:
         """
         policy = cls(spec, config)
         expected = dict(policy.shapes)
-        if policy.moments is not None:
-            size = (flat_size(spec),)
-            expected |= {"observation.mean": size, "observation.scale": size}
         got = {name: array.shape for name, array in weights.items()}
         if got != expected:
             raise InputError(
@@ -143,9 +136,6 @@ class NetworkPolicy:
         policy.bind(Weights.zeros(policy.shapes))
         for name, array in policy.weights.arrays.items():
             array[...] = weights[name]
-        if policy.moments is not None:
-            policy.moments.mean = weights["observation.mean"]
-            policy.moments.scale = weights["observation.scale"]
         return policy
 
     def bind(self, weights: Weights) -> None:
@@ -161,32 +151,14 @@ class NetworkPolicy:
 
     def arrays(self) -> dict[str, Floats]:
         """Copies of all that `load` needs, by name."""
-        arrays = {name: array.copy() for name, array in self.weights.arrays.items()}
-        if self.moments is not None:
-            arrays["observation.mean"] = self.moments.mean
-            arrays["observation.scale"] = self.moments.scale
-        return arrays
-
-    @property
-    def layers(self) -> list[Layer | Moments]:
-        """All that happens between an observation and the output, in its order."""
-        first = [] if self.moments is None else [self.moments]
-        return [*first, *self.network.layers]
+        return {name: array.copy() for name, array in self.weights.arrays.items()}
 
     def reset(self) -> None:
         """Nothing of an episode is kept."""
 
-    def inputs(self, observations: Floats) -> Floats:
-        """Observations (..., n) as the network takes them: normalised, if the config has it."""
-        return observations if self.moments is None else self.moments.forward(observations)
-
-    def output(self, observations: Floats) -> Floats:
-        """Means, or logits, shape (N, k), of flat observations, shape (N, n)."""
-        return self.network.forward(self.inputs(observations))
-
     def act(self, observation: Observation) -> Action:
         """The most likely action, inside the bounds of the env."""
-        output = self.output(flat(observation, self.spec, 1))
+        output = self.network.forward(flat(observation, self.spec, 1))
         if isinstance(self.spec.action, Discrete):
             return int(output.argmax())
         return self.actions.to_envs(output).reshape(self.spec.action.shape)
@@ -197,14 +169,14 @@ class NetworkPolicy:
         Shape (N, 1), holding whole numbers, if they are discrete. Observations are flat, shape
         (N, n); noise is N rows of `head.noise`.
         """
-        return self.head.sample(self.output(observations), noise)
+        return self.head.sample(self.network.forward(observations), noise)
 
-    def score(self, inputs: Floats, actions: Floats) -> tuple[Floats, float]:
+    def score(self, observations: Floats, actions: Floats) -> tuple[Floats, float]:
         """Log-probabilities, shape (B,), and mean entropy of actions (B, k), or (B, 1) if discrete.
 
-        Inputs are those of `inputs`, shape (B, n).
+        Observations are flat, shape (B, n).
         """
-        return self.head.score(self.network.forward(inputs), actions)
+        return self.head.score(self.network.forward(observations), actions)
 
     def backward(self, by_log_probability: np.ndarray, by_entropy: float = 0.0) -> None:
         """Set the gradients of a loss, from its derivatives by what `score` gave last."""

@@ -119,7 +119,7 @@ class PPO(A2C):
 
     def _columns(self, rollout: Rollout) -> tuple[Floats, ...]:
         """Arguments of `minibatch` for all transitions of a rollout."""
-        observations = self._actor.inputs(rollout.rows(rollout.observations))
+        observations = rollout.rows(rollout.observations)
         actions = rollout.rows(rollout.actions)
         estimates, judged, seen = self.advantages(rollout)
         advantage, values = (

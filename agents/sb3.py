@@ -150,12 +150,10 @@ class SB3Agent:
         model: SB3's own.
 
     Raises:
-        InputError: Observations are to be normalised; or SAC is to make choices.
+        InputError: Another kind of network; or SAC is to make choices.
     """
 
     def __init__(self, log: EpisodeRecorder, config: A2CConfig | SACConfig, seed: int) -> None:
-        if config.normalize_observations:
-            raise InputError("normalize_observations: expected false with SB3, got true")
         if config.network != "mlp":
             raise InputError(f"network: expected mlp with SB3, got {config.network!r}")
         self.spec = log.spec
@@ -326,7 +324,6 @@ def _on_policy_settings(config: A2CConfig, steps: int, log: EpisodeRecorder) -> 
 def _sac_settings(config: SACConfig, steps: int, log: EpisodeRecorder) -> dict[str, object]:
     if log.actions.discrete:
         raise InputError("sb3-sac: expected an env of continuous actions, got one of choices")
-    aim = config.target_entropy
     return {
         "buffer_size": config.buffer_size,
         "learning_starts": config.learning_starts - 1,  # SB3 learns after more than so many
@@ -335,5 +332,4 @@ def _sac_settings(config: SACConfig, steps: int, log: EpisodeRecorder) -> dict[s
         "train_freq": steps,
         "gradient_steps": config.gradient_steps,
         "ent_coef": f"auto_{config.alpha}",
-        "target_entropy": "auto" if aim is None else aim,
     }

@@ -52,8 +52,8 @@ class VPG(Learner):
     def gradient(self, rollout: Rollout) -> None:
         """Of minus the mean of R_t · log P(a_t | s_t)."""
         weights = self.returns(rollout)
-        inputs = self._actor.inputs(rollout.rows(rollout.observations))
-        log_probability, entropy = self._actor.score(inputs, rollout.rows(rollout.actions))
+        observations = rollout.rows(rollout.observations)
+        log_probability, entropy = self._actor.score(observations, rollout.rows(rollout.actions))
         self._actor.backward(-weights / len(weights))
         self.terms = {"gain": (log_probability * weights).mean(), "entropy": entropy}
 

@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields, replace
-from hashlib import sha256
 from pathlib import Path
 from threading import Timer
 from typing import TYPE_CHECKING
@@ -18,7 +17,6 @@ from typing import TYPE_CHECKING
 from tyro.conf import Positional
 
 from ..agents import (
-    NETWORK_FIELDS,
     AlgorithmName,
     Episode,
     find_algorithm,
@@ -63,9 +61,6 @@ class Train(AgentFlags, TrainingFlags):
     """Seed of weights, actions and episodes."""
     num_simulators: int = 1
     """With --listen: simulators to wait for, each with its share of the drones."""
-    start_from: Path | None = None
-    """Checkpoint, or folder of a training, with whose networks to begin: the next stage of a
-    curriculum. Their sizes and the normalisation are the checkpoint's."""
     store_every: float = 10.0
     """Seconds between two checkpoints; a resumed training flies again from the last one."""
 
@@ -82,9 +77,6 @@ class Train(AgentFlags, TrainingFlags):
         from ..training.training import Training, config_of
         from ._env import remote_env
 
-        start, origin = self._start()
-        changes = {name: start.config[name] for name in NETWORK_FIELDS} if start else {}
-        changes |= self.changes()
         task = self.preset_of or self.env_id
         base = find_preset(self.algorithm, self.preset, task)
         if not base.fits:
@@ -97,7 +89,7 @@ class Train(AgentFlags, TrainingFlags):
                 f"derives from: it gets that of {base.env_id}; --preset-of ID names another",
                 flush=True,
             )
-        config = preset(self.algorithm, self.preset, task, **changes)
+        config = preset(self.algorithm, self.preset, task, **self.changes())
         backend = self.backend if "backend" in self.given else base.backend
         env_config = self.env_config(backend=backend)  # it refuses wrong drones
         whole_worlds = max(base.num_envs // self.drones, 1) * self.drones
@@ -121,22 +113,10 @@ class Train(AgentFlags, TrainingFlags):
             spec = env.env_spec  # of the simulator that came
             if self.listen is not None:
                 run = replace(run, env=config_of(spec, backend, self.vehicle))
-            training = Training(run, env, start=start)
+            training = Training(run, env)
             about = {"vehicle_hash": spec.vehicle_hash, "versions": software_versions()}
-            _write_json(folder / "config.json", {**run.to_dict(), **origin, **about})
+            _write_json(folder / "config.json", run.to_dict() | about)
             return self._train(training, folder)
-
-    def _start(self) -> tuple[Checkpoint | None, Options]:
-        """The checkpoint to start from, and what `config.json` has of it."""
-        from ._env import CHECKPOINT
-
-        path = self.start_from
-        if path is None:
-            return None, {}
-        file = path / CHECKPOINT if path.is_dir() else path
-        kept = load(file)
-        checksum = sha256(file.read_bytes()).hexdigest()
-        return kept, {"start_from": {"file": str(file), "sha256": checksum}}
 
     def _resume(self, folder: Path) -> int:
         from ..training.training import Training, is_finished

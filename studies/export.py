@@ -27,8 +27,8 @@ from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 
 POLICIES: Final = {
-    "16 relu, Elevation-v0": ("rotorgram/Elevation-v0", (16,), "relu", False),
-    "64 × 64 tanh, Hover-v0": ("rotorgram/Hover-v0", (64, 64), "tanh", True),
+    "16 relu, Elevation-v0": ("rotorgram/Elevation-v0", (16,), "relu"),
+    "64 × 64 tanh, Hover-v0": ("rotorgram/Hover-v0", (64, 64), "tanh"),
 }
 SEEN: Final = 256  # observations, over and over
 PYTHON_CALLS, COMPILED_WEIGHTS = 5_000, 4e8  # in a round
@@ -63,7 +63,7 @@ Clock = Callable[[], float]
 """Runs many calls; seconds of one."""
 
 
-def policy_of(env: str, hidden: tuple[int, ...], activation: str, normalise: bool) -> NetworkPolicy:
+def policy_of(env: str, hidden: tuple[int, ...], activation: str) -> NetworkPolicy:
     """With random weights: time and size do not depend on them."""
     spec = env_spec(EnvConfig(env_id=env))
     rng = np.random.default_rng(0)
@@ -73,9 +73,7 @@ def policy_of(env: str, hidden: tuple[int, ...], activation: str, normalise: boo
     for i, (inputs, units) in enumerate(pairwise(sizes)):
         weights[f"layers.{i}.weight"] = rng.normal(size=(units, inputs)) / np.sqrt(inputs)
         weights[f"layers.{i}.bias"] = np.zeros(units)
-    if normalise:
-        weights |= {"observation.mean": np.zeros(sizes[0]), "observation.scale": np.ones(sizes[0])}
-    config = Config(hidden=hidden, activation=activation, normalize_observations=normalise)  # type: ignore[arg-type]
+    config = Config(hidden=hidden, activation=activation)  # type: ignore[arg-type]
     return NetworkPolicy.load({n: w.astype(np.float32) for n, w in weights.items()}, spec, config)
 
 

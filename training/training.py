@@ -61,8 +61,7 @@ class Training:
     The env is a local or remote vector env, and not closed here.
     Besides the untrained policy, `snapshots` policies are kept in `taken` for later evaluation,
     evenly spread. With `keep_steps` every step is kept, for `log.steps()`. A run that goes on does
-    so from the checkpoint `kept`; a new one may begin with the networks of another training, those
-    of the checkpoint `start`.
+    so from the checkpoint `kept`.
     """
 
     run: Run
@@ -70,7 +69,6 @@ class Training:
     snapshots: int = 0
     keep_steps: bool = False
     kept: Checkpoint | None = None
-    start: Checkpoint | None = None
     taken: list[Snapshot] = field(default_factory=list, init=False)
 
     def __post_init__(self) -> None:
@@ -79,14 +77,11 @@ class Training:
             raise InputError(f"env: expected one of {wanted} drones, got {self.env.num_envs}")
         self.log = agents.EpisodeRecorder(self.env, self.run.seed, keep_steps=self.keep_steps)
         run = self.run
-        new = run.algorithm, self.log, run.config, run.seed
         self.agent: agents.Agent
         if self.kept:
             self.agent = agents.resume_agent(self.kept, self.log)
-        elif self.start:
-            self.agent = agents.start_agent(self.start, *new)
         else:
-            self.agent = agents.make_agent(*new)
+            self.agent = agents.make_agent(run.algorithm, self.log, run.config, run.seed)
 
     @classmethod
     def resume(cls, kept: Checkpoint, env: AdvancingVectorEnv) -> "Training":

@@ -1,8 +1,8 @@
 """A trained policy as one file that flies without rotorgram: ONNX or C.
 
-The file has the whole of `NetworkPolicy.act`: normalisation of the observation, layers, activation,
-squashing, mapping to the env's action, clipping to its bounds; or the choice of the largest output.
-The action is the deterministic one. Every number is float32.
+The file has the whole of `NetworkPolicy.act`: layers, activation, squashing, mapping to the env's
+action, clipping to its bounds; or the choice of the largest output. The action is the deterministic
+one. Every number is float32.
 """
 
 import json
@@ -14,7 +14,6 @@ from ...envs.spec import EnvSpec
 from ...models.errors import InputError, require
 from ..checkpoints import Checkpoint
 from ..networks import Affine, Relu, Tanh
-from ..normalization import Moments
 from ..policies import NetworkPolicy, flat_size
 
 FORMAT = 1
@@ -47,11 +46,10 @@ def export(checkpoint: Checkpoint, target: str) -> bytes:
         env_steps=checkpoint.position.env_steps,
     )
     policy = checkpoint.policy()
-    for layer in policy.layers:
-        if not isinstance(layer, Moments | Affine | Relu | Tanh):
+    for layer in policy.network.layers:
+        if not isinstance(layer, Affine | Relu | Tanh):
             raise InputError(
-                f"export: expected layers of normalise, affine, relu and tanh, "
-                f"got {type(layer).__name__}"
+                f"export: expected layers of affine, relu and tanh, got {type(layer).__name__}"
             )
     _check_finite(policy)
     content: bytes = module.write(policy, facts)
@@ -63,7 +61,7 @@ def _check_finite(policy: NetworkPolicy) -> None:
     largest = np.minimum(np.concatenate(bounds, axis=None), _FAR)
     shares = np.random.default_rng(0).uniform(-1.0, 1.0, (_TRIED, largest.size))
     with np.errstate(over="ignore", invalid="ignore"):
-        outputs = policy.output((shares * largest).astype(np.float32))
+        outputs = policy.network.forward((shares * largest).astype(np.float32))
     if not np.isfinite(outputs).all():
         raise InputError("policy: expected finite actions, got NaN or infinity: training diverged")
 

@@ -10,7 +10,6 @@ import numpy as np
 
 from ...envs.spec import BODY_TO_WORLD, ArraySpec, Discrete, EnvSpec, component_names
 from ..networks import Affine, Floats, Relu, Tanh
-from ..normalization import Moments
 from ..policies import NetworkPolicy, flat_size
 
 _LARGEST = float(np.finfo(np.float32).max)
@@ -59,7 +58,7 @@ def write(policy: NetworkPolicy, facts: Mapping[str, str]) -> bytes:
         numbers = _table(values)
         parts.append(f"static const float rotorgram_{name}[{values.size}] = {{\n{numbers}\n}};")
     parts.append(_LAYER)
-    if any(isinstance(layer, Tanh) for layer in policy.layers):
+    if any(isinstance(layer, Tanh) for layer in policy.network.layers):
         parts.append(_TANH)
     parts += [
         "\n/* The action for an observation. */",
@@ -87,10 +86,8 @@ class _Program:
         self.lines: list[str] = []
         self.at = "observation"
         self.size = flat_size(policy.spec)
-        for layer in policy.layers:
-            if isinstance(layer, Moments):
-                self._normalise(layer)
-            elif isinstance(layer, Affine):
+        for layer in policy.network.layers:
+            if isinstance(layer, Affine):
                 self._affine(layer)
             elif isinstance(layer, Relu):
                 self._each(f"{self.at}[i] = {self.at}[i] < 0.0f ? 0.0f : {self.at}[i];")
@@ -115,12 +112,6 @@ class _Program:
     def _each(self, statement: str) -> None:
         """A loop over the numbers so far."""
         self.lines += [f"for (int i = 0; i < {self.size}; i++)", f"    {statement}"]
-
-    def _normalise(self, layer: Moments) -> None:
-        mean = self._table("mean", layer.mean)
-        scale = self._table("scale", layer.scale)
-        inputs, outputs = self._move(self.size)
-        self._each(f"{outputs}[i] = ({inputs}[i] - {mean}[i]) * {scale}[i];")
 
     def _affine(self, layer: Affine) -> None:
         units, count = layer.weight.shape

@@ -1,4 +1,4 @@
-"""ONNX: a graph of Sub, Mul, Gemm, Relu or Tanh, Add, Max and Min, built node by node."""
+"""ONNX: a graph of Gemm, Relu or Tanh, Mul, Add, Max and Min, built node by node."""
 
 from collections.abc import Mapping
 
@@ -8,7 +8,6 @@ import onnx.checker
 from onnx import TensorProto, helper, numpy_helper
 
 from ..networks import Affine
-from ..normalization import Moments
 from ..policies import NetworkPolicy, flat_size
 
 OPSET = 13  # the first in which ArgMax, Max and Min are as they are today
@@ -40,11 +39,8 @@ def write(policy: NetworkPolicy, facts: Mapping[str, str]) -> bytes:
     """
     graph = _Graph()
     actions = policy.actions
-    for layer in policy.layers:
-        if isinstance(layer, Moments):
-            graph.then("Sub", layer.mean)
-            graph.then("Mul", layer.scale)
-        elif isinstance(layer, Affine):
+    for layer in policy.network.layers:
+        if isinstance(layer, Affine):
             graph.then("Gemm", layer.weight, layer.bias[0], transB=1)
         else:
             graph.then(type(layer).__name__)  # Relu or Tanh

@@ -9,12 +9,10 @@ from rotorgram.agents.policies import NetworkPolicy
 from rotorgram.envs.spec import EnvSpec
 
 
-def config_of(
-    hidden: tuple[int, ...], activation: str, *, normalise: bool = False, squash: bool = False
-) -> Config:
+def config_of(hidden: tuple[int, ...], activation: str, *, squash: bool = False) -> Config:
     """With any number of hidden layers, none too."""
     kind = SACConfig if squash else Config
-    config = kind(activation=activation, normalize_observations=normalise)  # type: ignore[arg-type]
+    config = kind(activation=activation)  # type: ignore[arg-type]
     object.__setattr__(config, "hidden", hidden)
     return config
 
@@ -46,8 +44,7 @@ def policy_of(
     """The policy of an MLP with as many layers and units as the weights have."""
     last = sum(name.startswith("layers.") for name in weights) // 2 - 1
     hidden = tuple(weights[f"layers.{i}.bias"].shape[0] for i in range(last))
-    normalise = "observation.mean" in weights
-    config = config_of(hidden, activation, normalise=normalise, squash=squash)
+    config = config_of(hidden, activation, squash=squash)
     return NetworkPolicy.load(weights, spec, config)
 
 

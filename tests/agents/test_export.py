@@ -51,12 +51,6 @@ def policy_of(
         if array.ndim == 2:
             numbers = rng.normal(size=array.shape)
             array[...] = numbers / np.sqrt(array.shape[1])
-    if policy.moments is not None:
-        size = flat_size(spec)
-        mean = rng.normal(size=size)
-        scale = np.exp(rng.normal(size=size))
-        policy.moments.mean = mean.astype(np.float32)
-        policy.moments.scale = scale.astype(np.float32)
     return policy
 
 
@@ -158,11 +152,11 @@ HALF = ArraySpec(name="a", shape=(3,), low=(0.0, -np.inf, -np.inf), high=(100.0,
 HALF_BOUNDED = spec_of(HALF)
 CASES: dict[str, Callable[[], NetworkPolicy]] = {
     "paper": lambda: policy_of(elevation()),
-    "tanh": lambda: policy_of(hover(), (64, 64), "tanh", normalise=True),
+    "tanh": lambda: policy_of(hover(), (64, 64), "tanh"),
     "squashed": lambda: policy_of(hover(vehicle="crazyflie2"), (32, 32), squash=True),
     "hexa": lambda: policy_of(hover(vehicle="heavy_hexa")),
-    "half bounded": lambda: policy_of(HALF_BOUNDED, (8,), normalise=True),
-    "choice": lambda: policy_of(CHOICE, (16, 8), "tanh", normalise=True),
+    "half bounded": lambda: policy_of(HALF_BOUNDED, (8,)),
+    "choice": lambda: policy_of(CHOICE, (16, 8), "tanh"),
     "linear": lambda: policy_of(spec_of(), ()),
 }
 RUNNERS = {"onnxruntime": by_onnxruntime, "gcc": by_gcc, "g++": by_gpp}

@@ -34,30 +34,25 @@ def test_a_loaded_policy_gives_what_the_learning_one_gives(
     numbers = np.random.default_rng(0).normal(size=(50, 3))
     observations = numbers.astype(np.float32)
     expected = learning.network.forward(observations)
-    found = policy.output(observations)
+    found = policy.network.forward(observations)
     np.testing.assert_array_equal(found, expected)
-    first = policy.output(observations[:1])
+    first = policy.network.forward(observations[:1])
     np.testing.assert_allclose(first, expected[:1], rtol=1e-5, atol=1e-5)
 
 
-def test_observations_are_normalised_and_outputs_squashed() -> None:
-    """Two layers of ones: 16 · sum of (o - mean) · scale, here 16 · (0.5 · 2 + 3 · 0.1)."""
+def test_outputs_are_squashed() -> None:
+    """Two layers of ones: 16 · sum of the observation, here 16 · 1.3."""
     shapes = random_policy(BOX).network.shapes
     layers = {name: np.ones(shape, np.float32) for name, shape in shapes.items()}
     layers["layers.0.bias"][:] = 0.0
     layers["layers.1.bias"][:] = 0.0, -20.3
-    mean = np.array([1, 2, 3], np.float32)
-    scale = np.array([2, 0.1, 1], np.float32)
+    seen = np.array([[1, 0.3, 0]], np.float32)
     noise = np.zeros(2, np.float32)
-    others = {"log_std": noise, "observation.mean": mean, "observation.scale": scale}
-    seen = np.array([[1.5, 5, 3]], np.float32)
-    policy = policy_of(layers | others, BOX)
-    found = policy.output(seen)
+    policy = policy_of(layers | {"log_std": noise}, BOX)
+    found = policy.network.forward(seen)
     np.testing.assert_allclose(found, [[20.8, 0.5]], rtol=1e-5)
-    assert seen.tolist() == [[1.5, 5, 3]]
     squashed = policy_of(layers, BOX, squash=True)
-    shifted = np.array([[1, 0.3, 0]], np.float32)
-    found = squashed.output(shifted)
+    found = squashed.network.forward(seen)
     np.testing.assert_allclose(found, [[1, np.tanh(0.5)]], rtol=1e-5)
 
 
@@ -76,7 +71,7 @@ def test_gaussian_sampling_has_the_mean_and_deviation_of_the_policy() -> None:
     observation = np.ones((1, 3), np.float32)
     drawn = drawn_of(policy, observation)
     std = np.exp(policy.arrays()["log_std"])
-    mean = policy.output(observation)[0]
+    mean = policy.network.forward(observation)[0]
     np.testing.assert_allclose(drawn.mean(0), mean, atol=5 * std.max() / 200)
     np.testing.assert_allclose(drawn.std(0), std, rtol=0.02)
     assert drawn.dtype == np.float32
@@ -87,7 +82,7 @@ def test_categorical_sampling_has_the_probabilities_of_the_policy() -> None:
     observation = np.zeros((1, 3), np.float32)
     drawn = drawn_of(policy, observation)
     counts = np.bincount(drawn[:, 0].astype(int), minlength=3)
-    shares = np.exp(policy.output(observation)[0])
+    shares = np.exp(policy.network.forward(observation)[0])
     expected = shares / shares.sum()
     np.testing.assert_allclose(counts / DRAWS, expected, atol=0.012)
     envs = policy.actions.to_envs(drawn)

@@ -106,7 +106,7 @@ def test_a_network_of_one_s_own_trains_resumes_and_loads(
 ) -> None:
     monkeypatch.setitem(NETWORKS, "wide", Wide)
     sizes = {"steps_per_update": 48, "learning_rate": 0.01}
-    config = PPOConfig(network="wide", normalize_observations=True, **sizes)  # type: ignore[arg-type]
+    config = PPOConfig(network="wide", **sizes)  # type: ignore[arg-type]
     whole, resumed = stopped_and_resumed(run_of("ppo", config), tmp_path / "c")
     for name, array in whole.agent.state().items():
         assert resumed.agent.state()[name].tobytes() == array.tobytes(), name
