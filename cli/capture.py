@@ -1,4 +1,4 @@
-"""`rotorgram capture`: labelled pictures of drones, as a data set."""
+"""`rotorgram capture`: labelled pictures of recorded flights, as a data set."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -6,39 +6,36 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from ..flights.executors import WorkersConfig
+from ..flights.viewpoints import CaptureConfig
 from ._flags import Command
 
 
 @dataclass(frozen=True, kw_only=True)
-class Capture(Command, WorkersConfig):
-    """Take the pictures of a plan, with depth, objects, boxes and poses, and write a data set.
+class Capture(Command, CaptureConfig, WorkersConfig):
+    """Take pictures of recorded flights, with depth, objects, boxes and poses, as a data set.
 
-    Interrupted by Ctrl-C, or by a disk that is full, it keeps what it has: the same line again goes
-    on. Exit status 2 where there is no OpenGL.
+    Interrupted by Ctrl-C, or by a disk that is full, it keeps the frames that it has. Exit status 2
+    where there is no OpenGL.
     """
 
-    plan: Positional[Path]
-    """TOML file: cameras, scene, where to take pictures from. docs/capture.md has its fields."""
+    journals: Positional[tuple[Path, ...]]
+    """MCAP files that --record wrote."""
     out: Path
-    """Folder to write to: a new one, or one of the same plan to go on with."""
+    """Folder to write to. It must not exist."""
 
     def run(self) -> int:
         """Take them; say where and how many."""
         from ..flights.capture import capture
-        from ..flights.viewpoints import Plan
         from ..models.errors import InputError
         from ..rendering.gl import offscreen_context
         from ._progress import bars
 
-        if not self.out.name:
-            raise InputError(f"out: expected the name of a folder, got '{self.out}'")
-        if self.out.exists() and not self.out.is_dir():
-            raise InputError(f"out: expected a folder, or a new name, got the file {self.out}")
-        plan = Plan.read(self.plan)
-        config = WorkersConfig(**self.settings(WorkersConfig))
+        if not self.journals:
+            raise InputError("journals: expected at least one file, got none")
+        config = CaptureConfig(**self.settings(CaptureConfig))
+        workers = WorkersConfig(**self.settings(WorkersConfig))
         offscreen_context(16, 16).free()
-        self.out.mkdir(parents=True, exist_ok=True)
         with bars() as progress:
-            frames = capture(plan, self.out, config, progress)
-        print(f"{self.out}: {frames} frames of {len(plan.views())} pictures a drone")
+            frames = capture(self.journals, self.out, config, workers, progress)
+        print(f"{self.out}: {frames} frames of {len(config.views())} pictures a drone")
         return 0

@@ -1,161 +1,113 @@
 """Labelled pictures: `rotorgram capture` takes them in workers, and writes them as a data set.
 
 Each frame is one pose of the drones of a world. Workers return its files as bytes; this process
-writes them, the labels last: a frame that has labels is whole, and is never taken again.
-`docs/capture.md` has the layout.
+writes them, the labels last. `docs/capture.md` has the layout.
 """
 
-import hashlib
 import io
 import json
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import closing
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from ..agents.checkpoints import write_whole
 from ..models.cameras import View
-from ..models.errors import InputError
 from ..models.swarm import drone_names
 from ..models.vehicle import Vehicle
 from .coco import Labels, write_coco
 from .executors import OnProgress, Tell, WorkersConfig, open_executor, run_jobs
-from .folders import locked
-from .viewpoints import Plan, PoseSequence
+from .folders import new_folder
+from .viewpoints import CaptureConfig, PoseSequence, sequences_of
 
 if TYPE_CHECKING:
     from ..rendering.cameras import Cameras
 
 _MOST_FRAMES = 64  # of a job
-_FARTHEST = 65.535  # m: the largest number of millimetres in 16 bits
 Picture = NDArray[np.generic]
 
 
 class _Job(NamedTuple):
-    """Some frames of a sequence."""
+    """Some frames of a sequence, one after the other."""
 
-    plan: Plan
+    config: CaptureConfig
     poses: PoseSequence
     """Those of the frames."""
     sequence: int
     """Number of the whole sequence."""
-    numbers: list[int]
-    """Of the frames."""
+    first: int
+    """Number of the first frame."""
 
 
-Frame = tuple[dict[str, bytes], Labels]
-"""Files of a pose by their paths in the folder, and its labels."""
+class _Taken(NamedTuple):
+    """Result of a job."""
+
+    objects: tuple[str, ...]
+    """Names of all objects of the scene, seen or not."""
+    frames: list[tuple[dict[str, bytes], Labels]]
+    """Of each frame its files, by their paths in the folder, and its labels."""
 
 
 def capture(
-    plan: Plan, folder: Path, config: WorkersConfig, on_progress: OnProgress = lambda *_: None
+    journals: Sequence[Path],
+    out: Path,
+    config: CaptureConfig,
+    workers: WorkersConfig,
+    on_progress: OnProgress = lambda *_: None,
 ) -> int:
-    """Take all pictures of a plan that the folder does not have yet; the number of its frames.
+    """Take pictures of recorded flights into a new folder; the number of frames.
 
     Pictures that are taken stay, also after an error.
 
     Raises:
-        InputError: The folder is of another plan, vehicle or version of MuJoCo.
+        InputError: `out` exists, or as of `sequences_of`.
         OSError: It cannot be written.
         RunsFailed: Workers fail.
     """
-    with locked(folder):
-        sequences = plan.sequences()
-        _claim(folder / "plan.toml", plan.text, "plan")
-        _claim(folder / "made_of.json", _made_of(plan, sequences), "vehicle, flights and MuJoCo")
-        for unfinished in folder.rglob(".*.tmp"):  # by a run that was killed
-            unfinished.unlink()
-        count = sum(map(len, sequences))
-        workers = config.jobs or os.cpu_count() or 1
-        longest = min(_MOST_FRAMES, -(-count // (2 * workers)))
-        jobs = {}
-        for job in _jobs(plan, sequences, folder, longest):
-            jobs[f"frames {job.numbers[0]} to {job.numbers[-1]}"] = job
+    sequences = sequences_of(journals, config)
+    folder = new_folder(out, "capture")
+    count = sum(map(len, sequences))
+    processes = workers.jobs or os.cpu_count() or 1
+    longest = min(_MOST_FRAMES, -(-count // (2 * processes)))
+    jobs = {f"frames from {job.first} on": job for job in _jobs(config, sequences, longest)}
+    objects = set[str]()
+    labels: list[Labels] = []
 
-        def keep(_: _Job, frames: list[Frame]) -> None:
-            for files, labels in frames:
-                for name, data in files.items():
-                    write_whole(folder / name, data)
-                text = json.dumps(labels, separators=(",", ":"))
-                write_whole(label_file(folder, labels["frame"]), text.encode())
+    def keep(_: _Job, taken: _Taken) -> None:
+        objects.update(taken.objects)
+        for files, own in taken.frames:
+            for name, data in files.items():
+                write_whole(folder / name, data)
+            text = json.dumps(own, separators=(",", ":"))
+            write_whole(folder / "labels" / f"{own['frame']:06}.json", text.encode())
+            labels.append(own)
 
-        if jobs:
-            with open_executor(config, len(jobs), on_progress) as executor:
-                run_jobs(executor, _take, jobs, keep, on_progress)
-        write_coco(plan, sequences, read_labels(folder, count), folder / "coco.json")
+    with open_executor(workers, len(jobs), on_progress) as executor:
+        run_jobs(executor, _take, jobs, keep, on_progress)
+    labels.sort(key=lambda own: own["frame"])
+    write_coco(labels, objects, asdict(config), folder / "coco.json")
     return count
 
 
-def label_file(folder: Path, number: int) -> Path:
-    """Path of a frame's labels."""
-    return folder / "labels" / f"{number:06}.json"
-
-
-def read_labels(folder: Path, count: int) -> list[Labels]:
-    """Labels of the first `count` frames; all of them have to be whole."""
-    return [json.loads(label_file(folder, number).read_bytes()) for number in range(count)]
-
-
-def _claim(file: Path, text: str, what: str) -> None:
-    """Write a file that identifies the folder, or raise `InputError` if it has another content."""
-    if not file.exists():
-        write_whole(file, text.encode())
-    elif file.read_bytes() != text.encode():
-        raise InputError(f"{file.parent}: expected a folder of the same {what}, got one of others")
-
-
-def _made_of(plan: Plan, sequences: Sequence[PoseSequence]) -> str:
-    """Hashes of what decides the pictures besides the plan, in JSON."""
-    digest = hashlib.blake2b(digest_size=16)
-    for sequence in sequences:
-        for name, value in vars(sequence).items():
-            digest.update(name.encode())
-            content = value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode()
-            digest.update(content)
-    made = {
-        "vehicle": Vehicle.load(plan.vehicle).hash,
-        "cameras": hashlib.blake2b(repr(plan.views()).encode(), digest_size=16).hexdigest(),
-        "poses": digest.hexdigest(),
-        "mujoco": mujoco.__version__,
-    }
-    return json.dumps(made, indent=2) + "\n"
-
-
-def _jobs(
-    plan: Plan, sequences: Sequence[PoseSequence], folder: Path, longest: int
-) -> Iterator[_Job]:
-    """Jobs of at most so many frames, for those that are not whole."""
+def _jobs(config: CaptureConfig, sequences: Sequence[PoseSequence], longest: int) -> Iterator[_Job]:
+    """Jobs of at most so many frames."""
     start = 0  # number of the first frame of the sequence
     for index, poses in enumerate(sequences):
-        for first in range(0, len(poses), longest):
-            rows = range(first, min(first + longest, len(poses)))
-            missing = [row for row in rows if not _is_whole(folder, start + row)]
-            if missing:
-                numbers = [start + row for row in missing]
-                yield _Job(plan, poses.at(missing), index, numbers)
+        for row in range(0, len(poses), longest):
+            part = poses.part(slice(row, row + longest))
+            yield _Job(config, part, index, start + row)
         start += len(poses)
-
-
-def _is_whole(folder: Path, number: int) -> bool:
-    """Whether a frame's labels are there, and all its files in their sizes."""
-    try:
-        labels = json.loads(label_file(folder, number).read_bytes())
-        sizes = [item for picture in labels["pictures"] for item in picture["files"].items()]
-        same = all((folder / file).stat().st_size == size for file, size in sizes)
-        return same and labels["frame"] == number and bool(labels["pose"])
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
-        return False
 
 
 # ---- in workers
 
 
-def _take(job: _Job, tell: Tell) -> list[Frame]:
+def _take(job: _Job, tell: Tell) -> _Taken:
     """The frames of a job."""
     from ..rendering.cameras import Cameras
 
@@ -163,13 +115,13 @@ def _take(job: _Job, tell: Tell) -> list[Frame]:
     everybody = np.ones(poses.drones, bool)
     frames = []
     opened = Cameras(
-        Vehicle.load(job.plan.vehicle),
-        job.plan.views(),
+        Vehicle.load(job.config.vehicle),
+        job.config.views(),
         (1, poses.drones),
-        scene=poses.scene,
+        scene=job.config.scene,
         marks=poses.marks,
-        payload=poses.payload is not None,
-        fine=job.plan.fine,
+        payload="payload" in poses.states,
+        fine=not job.config.fast,
     )
     with closing(opened) as cameras:
         due = dict.fromkeys(cameras.pictures, everybody)
@@ -177,13 +129,13 @@ def _take(job: _Job, tell: Tell) -> list[Frame]:
             cameras.take(due, poses.state(row))
             frames.append(_frame(job, row, cameras))
             tell(len(frames), len(poses), "frames")
-    return frames
+        return _Taken(cameras.objects[1:], frames)  # the first is no object
 
 
-def _frame(job: _Job, row: int, cameras: "Cameras") -> Frame:
+def _frame(job: _Job, row: int, cameras: "Cameras") -> tuple[dict[str, bytes], Labels]:
     """Files and labels of the pictures that the cameras have just taken."""
     poses = job.poses
-    number = job.numbers[row]
+    number = job.first + row
     state = poses.state(row)
     names = drone_names(poses.drones)
     files: dict[str, bytes] = {}
@@ -193,13 +145,14 @@ def _frame(job: _Job, row: int, cameras: "Cameras") -> Frame:
         drones = range(poses.drones if view.camera.carried else 1)
         for drone in drones:
             suffix = f"_{drone}" if len(drones) > 1 else ""
-            stem = f"{view.kind}/{view.camera.name}/{number:06}{suffix}"
             image = cameras.pictures[view.name][drone]
-            encoded = {f"{stem}.{ending}": data for ending, data in _encoded(view, image)}
-            files |= encoded
+            ending, data = _encoded(view, image)
+            file = f"{view.kind}/{view.camera.name}/{number:06}{suffix}.{ending}"
+            files[file] = data
             lens = cameras.lens(view.name, state, drone)
             height, width = view.shape[:2]
             picture: Labels = {
+                "file": file,
                 "camera": view.camera.name,
                 "kind": view.kind,
                 "drone": names[drone],
@@ -208,18 +161,14 @@ def _frame(job: _Job, row: int, cameras: "Cameras") -> Frame:
                 "matrix": lens.matrix.tolist(),
                 "rotation": lens.rotation.tolist(),
                 "translation": lens.translation.tolist(),
-                "files": {path: len(data) for path, data in encoded.items()},
             }
             if view.kind == "segmentation":
-                found = objects_in(image[..., 0], cameras.objects)
-                least = job.plan.least_area
-                picture["objects"] = [thing for thing in found if thing["area"] >= least]
+                picture["objects"] = list(objects_in(image[..., 0], cameras.objects))
             pictures.append(picture)
     labels = {
         "frame": number,
         "sequence": job.sequence,
-        "source": poses.name,
-        "scene": poses.scene,
+        "source": poses.source,
         "time": float(poses.times[row]),
         "pose": {name: values.tolist() for name, values in state.items()},
         "pictures": pictures,
@@ -227,19 +176,16 @@ def _frame(job: _Job, row: int, cameras: "Cameras") -> Frame:
     return files, labels
 
 
-def _encoded(view: View, image: Picture) -> Iterator[tuple[str, bytes]]:
-    """Ending and bytes of the files of a picture."""
+def _encoded(view: View, image: Picture) -> tuple[str, bytes]:
+    """Ending and bytes of the file of a picture."""
     if view.kind == "rgb":
-        yield "png", _png(image)
-    elif view.kind == "segmentation":
-        yield "png", _png(image[..., 0].astype(np.uint16))
-    else:
-        data = io.BytesIO()
-        np.save(data, image[..., 0])
-        yield "npy", data.getvalue()
-        depth = image[..., 0].astype(np.float64)
-        millimetres = np.where(depth <= _FARTHEST, np.rint(1000 * depth), 0)
-        yield "png", _png(millimetres.astype(np.uint16))
+        return "png", _png(image)
+    flat = image[..., 0]
+    if view.kind == "segmentation":
+        return "png", _png(flat.astype(np.uint16))
+    data = io.BytesIO()
+    np.save(data, flat)
+    return "npy", data.getvalue()
 
 
 def _png(array: Picture) -> bytes:

@@ -2,14 +2,11 @@
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from ..agents.checkpoints import write_whole
-from ..models.vehicle import Vehicle
-from ..rendering.camera_model import NOTHING, objects_of
-from .viewpoints import Plan, PoseSequence
 
 Labels = dict[str, Any]
 """The labels of one frame or picture: an object of JSON."""
@@ -17,35 +14,26 @@ _SAME_VIEW = ("camera", "drone", "width", "height")
 
 
 def write_coco(
-    plan: Plan, sequences: Sequence[PoseSequence], frames: Sequence[Labels], file: Path
+    frames: Sequence[Labels], objects: Iterable[str], settings: Mapping[str, object], file: Path
 ) -> None:
     """Write the objects of all segmentation pictures, with the labels of all frames.
 
     The categories are the kinds of all objects of the scenes, seen or not. Raises `OSError`.
     """
-    vehicle = Vehicle.load(plan.vehicle)
-    kinds = set[str]()
-    stages = {(one.drones, one.scene, one.marks, one.payload is not None) for one in sequences}
-    for drones, scene, marks, payload in stages:
-        names = objects_of(vehicle, drones, scene, marks, payload=payload)
-        kinds.update(map(category, names))
-    categories = {kind: number for number, kind in enumerate(sorted(kinds - {NOTHING}), 1)}
+    kinds = sorted(set(map(category, objects)))
+    categories = {kind: number for number, kind in enumerate(kinds, 1)}
     images: list[Labels] = []
     annotations: list[Labels] = []
     for frame in frames:
-        colors: dict[tuple[object, ...], str] = {}
-        for picture in frame["pictures"]:
-            if picture["kind"] == "rgb":
-                (file_name,) = picture["files"]
-                colors[_view(picture)] = file_name
-        for picture in frame["pictures"]:
+        pictures = frame["pictures"]
+        colors = {_view(one): one["file"] for one in pictures if one["kind"] == "rgb"}
+        for picture in pictures:
             if picture["kind"] != "segmentation":
                 continue
             # An image is named by the colours of its camera in the same size, if there are any.
-            (own,) = picture["files"]
             image = {
                 "id": len(images) + 1,
-                "file_name": colors.get(_view(picture), own),
+                "file_name": colors.get(_view(picture), picture["file"]),
                 "width": picture["width"],
                 "height": picture["height"],
                 "sequence": frame["sequence"],
@@ -66,6 +54,7 @@ def write_coco(
                 }
                 annotations.append(annotation)
     content = {
+        "info": settings,
         "images": images,
         "annotations": annotations,
         "categories": [{"id": number, "name": name} for name, number in categories.items()],

@@ -42,11 +42,13 @@ def test_the_text_agent_flies_a_simulator(tmp_path: Path) -> None:
 
 
 def test_the_detector_learns_from_pictures(opengl: None, tmp_path: Path) -> None:
-    plan = (EXAMPLES / "pad.toml").read_text("utf-8").replace("episodes = 100", "episodes = 5")
-    plan = plan.replace('"down", "down_segm', '"down@32x32", "down_segm')
-    plan = plan.replace("every = 5", "every = 9")
-    (tmp_path / "pad.toml").write_text(plan.replace('tation"]', 'tation@32x32"]'), "utf-8")
-    run(rotorgram("capture", "pad.toml", "--out", "pad", "--jobs", "1"), tmp_path)
+    craft = ("--vehicle", "crazyflie2")
+    flight = ("--env", "rotorgram/Landing-v0", *craft, "--episodes", "5", "--record", "pad.mcap")
+    run(rotorgram("evaluate", "geometric", *flight), tmp_path)
+    cameras = ("--cameras", "down@32x32", "down_segmentation@32x32")
+    moved = ("--every", "9", "--aside", "1", "--tilt", "0.4", "--fast")
+    words = ("capture", "pad.mcap", *craft, "--scene", "airport", *cameras, *moved)
+    run(rotorgram(*words, "--out", "pad", "--jobs", "1"), tmp_path)
     words = ("pad", "--epochs", "2", "--out", "result.json")
     told = run_script("pad_detector.py", tmp_path, *words)
     assert json.loads(told) == json.loads((tmp_path / "result.json").read_text())
