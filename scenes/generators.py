@@ -24,7 +24,7 @@ MATERIALS: Final[Mapping[str, Mapping[str, Mapping[str, Any]]]] = read_toml(
     Path(__file__).with_name("materials.toml"), "materials"
 )
 _FOREST = 60.0  # m: half the width of the wood
-_LENGTH, _WIDTH, _HEIGHT = 30.0, 20.0, 24.0  # m: half length, half width and height of the hall
+_HALL_XML = Path(__file__).with_name("hall.xml")  # its walls, windows, roof and lamps
 _GATES = 8
 _OPENING = 5.0  # m: the paper's craft is 2.8 m wide with its rotors
 
@@ -193,10 +193,8 @@ def warehouse(hall: Builder) -> None:
     """A hall of 60 m by 40 m, 24 m high. Racks, pallets and barrels stand along its walls."""
     hall.sky(hall.colour((0.55, 0.60, 0.66)), hall.colour((0.62, 0.64, 0.66)))
     hall.paint()
-    lamp = hall.spec.add_material(name="warehouse/lamp", specular=0.0, emission=0.9)
-    lamp.rgba = (1.0, 0.98, 0.90, 1.0)
-    hall.add("ground/floor", "plane", (_LENGTH, _WIDTH, 1), (0, 0, 0), "floor")
-    _add_hall(hall)
+    walls = mujoco.MjSpec.from_file(str(_HALL_XML))
+    hall.spec.attach(walls, prefix="warehouse/", frame=hall.spec.worldbody.add_frame())
     for i, x in enumerate((-15.0, 15.0)):
         bright = hall.uniform(0.28, 0.42)
         direction = (-x / 30, hall.uniform(-0.4, 0.4), -1.0)
@@ -206,28 +204,6 @@ def warehouse(hall: Builder) -> None:
         _add_rack(hall, f"rack_{i}", x, y)
     for i in range(20):
         _add_goods(hall, i)
-
-
-def _add_hall(hall: Builder) -> None:
-    """Walls with windows, and a roof with lamps."""
-    middle = _HEIGHT / 2
-    right = math.pi / 2
-    hall.add("roof/sheet", "plane", (_LENGTH, _WIDTH, 1), (0, 0, _HEIGHT), "roof", (math.pi, 0, 0))
-    for name, sign in (("west", -1), ("east", 1)):
-        position = (sign * _LENGTH, 0, middle)
-        turn = (0.0, -sign * right, 0.0)
-        hall.add(f"wall_{name}/sheet", "plane", (middle, _WIDTH, 1), position, "wall", turn)
-    for name, sign in (("south", -1), ("north", 1)):
-        place = (0, sign * _WIDTH, middle)
-        turn = (sign * right, 0.0, 0.0)
-        hall.add(f"wall_{name}/sheet", "plane", (_LENGTH, middle, 1), place, "wall", turn)
-        for i, x in enumerate(np.linspace(-24.0, 24.0, 7)):
-            window = (x, sign * (_WIDTH - 0.05), 19.0)
-            hall.add(f"wall_{name}/window_{i}", "box", (2.5, 0.04, 1.6), window, "glass")
-    for i, x in enumerate(np.linspace(-25.0, 25.0, 6)):
-        hall.add(f"truss_{i}/beam", "box", (0.15, _WIDTH, 0.3), (x, 0, 23.4), "steel")
-        for j, y in enumerate((-11.0, 0.0, 11.0)):
-            hall.add(f"lamp_{3 * i + j}/tube", "box", (0.2, 1.2, 0.08), (x, y, 22.9), "lamp")
 
 
 def _add_rack(hall: Builder, name: str, x: float, y: float) -> None:
@@ -247,7 +223,7 @@ def _add_rack(hall: Builder, name: str, x: float, y: float) -> None:
 def _add_goods(hall: Builder, number: int) -> None:
     """A barrel, or a box on a pallet; the first six stand in the middle."""
     if number < 6:
-        x, y = hall.around(1.0, _WIDTH - 6.5)
+        x, y = hall.around(1.0, 13.5)
     else:
         x = hall.uniform(-28, 28)
         y = float(hall.rng.choice((-13.7, 13.7))) + hall.uniform(-0.3, 0.3)
