@@ -13,7 +13,7 @@ class Config:
 
     network: str = "mlp"
     """Kind of the networks: see `networks.NETWORKS`."""
-    hidden: Annotated[tuple[int, ...], Limits(1, whole=True, count=None)] = (16,)
+    hidden: Annotated[tuple[int, ...], Limits(1, whole=True, count=0)] = (16,)
     """Units of each hidden layer of each network (paper: one of 16). A number is one layer."""
     activation: Literal["relu", "tanh"] = "relu"
     """Of the hidden units (paper: relu)."""

@@ -210,8 +210,8 @@ def _provenance(file: "VehicleFile") -> Iterator[str]:
         for words in (one.source, one.why and f"why: {one.why}"):
             if words:
                 yield f"    {words}"
-        for value, source in one.others:
-            yield f"    also {_listed(value)}{unit}: {source or 'no source'}"
+        for other in one.others:
+            yield f"    also {_listed(other.value)}{unit}: {other.source or 'no source'}"
 
 
 def _listed(values: float | Iterable[float]) -> str:

@@ -361,7 +361,7 @@ def _checked_constants(constants: Any) -> dict[str, Bound]:
         several = isinstance(value, tuple | list)
         what = f"constants: {name}"
         _expect(not several or len(value) <= MAX_TOLD, what, f"at most {MAX_TOLD} numbers", value)
-        rule = Limits(count=None, least=0) if several else Limits()
+        rule = Limits(count=0, least=0) if several else Limits()
         checked[name] = check(what, rule, value, SpecError)
     return checked
 

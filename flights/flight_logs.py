@@ -202,7 +202,7 @@ def _commanded_speeds(path: Path, throttle: Floats, vehicle: Vehicle) -> Floats:
 
 def _check_speeds(path: Path, vehicle: Vehicle, speeds: Floats) -> None:
     """Refuse speeds that no such rotor reaches."""
-    coefficient = vehicle.coefficients.rotors.thrust_coefficient
+    coefficient = vehicle.coefficients["rotors.thrust_coefficient"]
     if coefficient is None:
         return
     most = _FASTEST * float(np.sqrt(vehicle.thrust_high.max() / coefficient))

@@ -100,7 +100,7 @@ def identify(
         raise InputError("logs: expected commands in all of them or in none")
     base = numbers_of(vehicle)
     if logs[0].commands is not None:
-        base[LAG] = vehicle.coefficients.rotors.time_constant or 0.05
+        base[LAG] = vehicle.coefficients["rotors.time_constant"] or 0.05
     free = [name for name in names if name in base]
     windows = _cut(logs, base, _steps(window, logs[0].period))
     clusters = _clusters(windows)

@@ -16,7 +16,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from ..models.coefficients import Drag
+from ..models.coefficients import Coefficients
 from ..models.vehicle import Vehicle
 from ..sim.backends.rigid import RigidWorld
 from ..sim.effects import EffectOptions
@@ -27,7 +27,7 @@ from .flight_logs import FlightLog
 
 Floats = NDArray[np.float64]
 Numbers = Mapping[str, float]
-"""Numbers of a vehicle by the names of `NAMES`, in the units of `models/coefficients.py`."""
+"""Numbers of a vehicle by the names of `NAMES`, in the units of `models/coefficients.toml`."""
 
 NAMES = (
     "rotors.thrust_coefficient", "rotors.reaction", "rotors.drag", "rotors.inflow", "rotors.lift",
@@ -37,6 +37,7 @@ NAMES = (
 )  # fmt: skip
 """Numbers that move a vehicle and can be fitted."""
 _ON_ROTORS = ("rotors.drag", "rotors.inflow", "rotors.lift")
+_REPLACED = ("drag.angular", "drag.moment", "rotors.inflow", "rotors.lift")
 _MORE_THRUST = 100.0  # times the vehicle's limit: predictions never reach it
 _LOST = 1e6  # every number of a state after a prediction that diverged
 
@@ -174,16 +175,10 @@ def _world(vehicle: Vehicle, numbers: Mapping[str, Floats], period: float) -> Ri
     model.opt.timestep = period
     model.actuator_ctrlrange *= _MORE_THRUST
     rotors = [replace(rotor, high=_MORE_THRUST * rotor.high) for rotor in vehicle.rotors]
-    own = vehicle.coefficients
-    # The numbers take the place of these.
-    drag = Drag(linear=(0.0, 0.0, 0.0), quadratic=own.drag.quadratic)
-    of_rotors = replace(own.rotors, drag=0.0, inflow=None, lift=None)
-    free = replace(
-        vehicle,
-        model=model,
-        rotors=tuple(rotors),
-        coefficients=replace(own, drag=drag, rotors=of_rotors),
-    )
+    coefficients = Coefficients(vehicle.coefficients)
+    coefficients |= dict.fromkeys(_REPLACED)  # the numbers take their place
+    coefficients |= {"drag.linear": (0.0, 0.0, 0.0), "rotors.drag": 0.0}
+    free = replace(vehicle, model=model, rotors=tuple(rotors), coefficients=coefficients)
     has_rotor_drag = any(numbers[name].any() for name in _ON_ROTORS)
     effects = EffectOptions(body_drag=True, rotor_drag=has_rotor_drag)
     count = len(numbers["rotors.drag"])

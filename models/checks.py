@@ -248,14 +248,15 @@ def _units(craft: _Craft) -> Iterator[Check]:
     yield _judged("units: smallest moment / (mass arm²)", craft.moments[0] / inertia)
     yield _judged("units: largest moment / (mass arm²)", craft.moments[2] / inertia)
     yield _judged("units: reaction / arm", reaction / arm)
-    rotors = vehicle.coefficients.rotors
-    if rotors.radius is None:
+    radius = vehicle.coefficients["rotors.radius"]
+    if radius is None:
         return
-    yield _judged("units: reaction / rotor radius", reaction / rotors.radius)
-    yield _judged("units: rotor radius / arm", rotors.radius / arm)
-    if rotors.thrust_coefficient is not None:
-        fastest = math.sqrt(float(vehicle.thrust_high.max()) / rotors.thrust_coefficient)
-        yield _judged("units: tip speed", rotors.radius * fastest)
+    yield _judged("units: reaction / rotor radius", reaction / radius)
+    yield _judged("units: rotor radius / arm", radius / arm)
+    coefficient = vehicle.coefficients["rotors.thrust_coefficient"]
+    if coefficient is not None:
+        fastest = math.sqrt(float(vehicle.thrust_high.max()) / coefficient)
+        yield _judged("units: tip speed", radius * fastest)
 
 
 def _rotors(craft: _Craft) -> Iterator[Check]:
@@ -339,10 +340,10 @@ def _recommended_step(craft: _Craft) -> tuple[float, str]:
     times = model.geom_solref[(model.geom_contype | model.geom_conaffinity) != 0, 0]
     if (times > 0).any():
         bounds["half the time constant of contacts"] = float(times[times > 0].min()) / 2
-    rotors = craft.vehicle.coefficients.rotors
-    if rotors.time_constant:
-        falling = rotors.time_constant_down or math.inf
-        bounds["time constant of the motors"] = min(rotors.time_constant, falling)
+    rising = craft.vehicle.coefficients["rotors.time_constant"]
+    if rising:
+        falling = craft.vehicle.coefficients["rotors.time_constant_down"] or math.inf
+        bounds["time constant of the motors"] = min(rising, falling)
     why, most = min(bounds.items(), key=lambda bound: bound[1])
     most = min(max(most, 1e-9), 1.0) * (1 + _EXACT)
     power = 10.0 ** math.floor(math.log10(most))

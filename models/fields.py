@@ -51,8 +51,8 @@ class Limits:
     whole: bool = False
     above: bool = False
     """The number is larger than `low`."""
-    count: int | None = 1
-    """None: `least` numbers or more."""
+    count: int = 1
+    """0: `least` numbers or more."""
     least: int = 1
 
     @property
@@ -82,7 +82,7 @@ class Limits:
         if self.count == 1:
             return self._number(value)
         numbers = tuple(map(self._number, value))
-        if len(numbers) < self.least or self.count not in (None, len(numbers)):
+        if len(numbers) < self.least or self.count not in (0, len(numbers)):
             raise ValueError
         return numbers
 
@@ -244,7 +244,7 @@ def check_names(
             raise error(f"{where}: expected some of {', '.join(names)}, got {shortened(name)}")
 
 
-def optional(low: float, high: float, unit: str, count: int | None = 1) -> Any:
+def optional(low: float, high: float, unit: str, count: int = 1) -> Any:
     """A field of a dataclass that is None, or has a number or several within limits."""
     rule = OrNone(Limits(low, high, unit, count=count))
     return field(default=None, metadata={"rule": rule})

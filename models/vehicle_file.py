@@ -6,7 +6,7 @@ Each table is a dataclass whose fields are the keys. Body frame: x forward, y le
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, TypeVar
 
@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .cameras import FOVY, MAX_LETTERS, OUTPUTS, Camera, steps_of
-from .coefficients import COEFFICIENTS, Battery, Drag, Rotors, Sensors, as_tuple
+from .coefficients import COEFFICIENTS, as_tuple, limits_of_group
 from .errors import InputError, shortened
-from .fields import Limits, Text, check, limits_of, optional, read_table
+from .fields import Limits, Text, check, check_names, limits_of, optional, read_table
 from .files import read_toml
 
 T = TypeVar("T")
@@ -79,7 +79,7 @@ class Body:
     """Mass and inertia, or parts that have them; and the hub."""
 
     mass: float | None = optional(1e-6, 1e6, "kg")
-    inertia: tuple[float, ...] | None = optional(-1e9, 1e9, "kg m²", count=None)
+    inertia: tuple[float, ...] | None = optional(-1e9, 1e9, "kg m²", count=0)
     center_of_mass: _Place = ORIGIN
     size: tuple[float, float, float] | None = optional(1e-4, 100.0, "m", count=3)
     ground_clearance: float | None = optional(1e-4, 100.0, "m")
@@ -104,9 +104,11 @@ class PlacedRotor:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RotorTable(Rotors):
+class RotorTable:
     """Rotors, all alike, in a frame or in a list."""
 
+    radius: Annotated[float | None, COEFFICIENTS["rotors.radius"]] = None
+    thrust_coefficient: Annotated[float | None, COEFFICIENTS["rotors.thrust_coefficient"]] = None
     frame: Literal["plus", "cross", "hexa", "octo"] | None = None
     arm: float | None = optional(1e-3, 100.0, "m")
     height: float | None = optional(-100.0, 100.0, "m")
@@ -166,6 +168,11 @@ class _Model:
 
 
 @dataclass(frozen=True, kw_only=True)
+class _Coefficients:
+    """A table that has coefficients alone."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class _Sourced:
     """A number with its provenance."""
 
@@ -173,12 +180,6 @@ class _Sourced:
     source: str = ""
     why: str = ""
     others: object = ()
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Other:
-    value: object = None
-    source: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -219,8 +220,8 @@ class Number:
     source: str = ""
     why: str = ""
     """Why this value, if there are others."""
-    others: tuple[tuple[float | _Numbers, str], ...] = ()
-    """Values of other sources, each with its source."""
+    others: tuple["Number", ...] = ()
+    """Values of other sources."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -268,8 +269,9 @@ def read_vehicle_file(path: Path) -> VehicleFile:
     rotors = _rotors(numbers, file.rotors, model)
     cameras = [_camera(numbers, one, where) for where, one in _listed(file.cameras, "cameras")]
     _check_distinct("cameras", [camera.name for camera in cameras])
-    for group, kind in _GROUPS.items():
-        _table(numbers, kind, tree.get(group, {}), group)
+    for group in ("drag", "battery", "sensors"):
+        _table(numbers, _Coefficients, tree.get(group, {}), group)
+    _table(numbers, RealFlights, tree.get("real_flights", {}), "real_flights")
     physical = {key: value for key, value in tree.items() if key != "real_flights"}
     return VehicleFile(
         name=file.name,
@@ -291,42 +293,36 @@ def model_of(path: Path) -> Path:
     return read_vehicle_file(path).model or path
 
 
-_GROUPS: Final[Mapping[str, type]] = {
-    "drag": Drag,
-    "battery": Battery,
-    "sensors": Sensors,
-    "real_flights": RealFlights,
-}
-
-
 def _table(numbers: list[Number], kind: type[T], given: object, where: str) -> T:
     """A table as its dataclass; its numbers are added to those of the file."""
     table = _mapping(given, where)
     source = check(f"{where}.source", Text(empty=True), table.pop("source", ""))
     prefix = "" if where == "vehicle" else f"{where}."
-    for name, limits in limits_of(kind).items():
-        if name in table:
-            number = _number(prefix + name, limits, table[name], source)
+    limits = limits_of_group(where) | limits_of(kind, prefix)
+    keys = [one.name for one in fields(kind)]  # type: ignore[arg-type]
+    names = [*keys, *(name.removeprefix(prefix) for name in limits)]
+    check_names(table, dict.fromkeys(names), where)
+    for name, own in limits.items():
+        key = name.removeprefix(prefix)
+        if key in table:
+            number = _number(name, own, table[key], source)
             numbers.append(number)
-            table[name] = number.value
-    return read_table(kind, table, where)
+            table[key] = number.value
+    return read_table(kind, {key: table[key] for key in keys if key in table}, where)
 
 
 def _number(name: str, limits: Limits, given: object, source: str) -> Number:
     """A number that is given plainly or with its provenance."""
     table = given if isinstance(given, dict) else {"value": given}
     sourced = read_table(_Sourced, table, name)
-    others = []
-    for where, one in _listed(sourced.others, f"{name}.others"):
-        other = read_table(_Other, _mapping(one, where), where)
-        others.append((check(where, limits, other.value), other.source))
+    others = _listed(sourced.others, f"{name}.others")
     return Number(
         name=name,
         value=check(name, limits, sourced.value),
         unit=limits.unit,
         source=sourced.source or source,
         why=sourced.why,
-        others=tuple(others),
+        others=tuple(_number(where, limits, one, "") for where, one in others),
     )
 
 

@@ -43,8 +43,8 @@ PERIOD, SPEED = 2 * math.pi, 1.0  # of a circle with a radius of 1 m: s, m/s
 
 def lag_of(vehicle: Vehicle) -> float:
     """Time constant of the rotors, s; 0 where the file has none."""
-    told = vehicle.coefficients.rotors
-    return max((t for t in (told.time_constant, told.time_constant_down) if t), default=0.0)
+    names = ("rotors.time_constant", "rotors.time_constant_down")
+    return max(vehicle.coefficients[name] or 0.0 for name in names)
 
 
 def gains_of(name: str) -> dict[str, object]:

@@ -210,16 +210,16 @@ class Equations:
         self.reaction = np.array([r.reaction for r in rotors])
         self.wind = np.array(effects.get("wind", (0.0, 0.0, 0.0)))
         if "motor_lag" in effects:
-            self.rise = told.rotors.time_constant
-            self.fall = told.rotors.time_constant_down or self.rise
+            self.rise = told["rotors.time_constant"]
+            self.fall = told["rotors.time_constant_down"] or self.rise
         if "body_drag" in effects:
-            self.linear = np.array(told.drag.linear or (0.0, 0.0, 0.0))
-            self.quadratic = np.array(told.drag.quadratic or (0.0, 0.0, 0.0))
+            self.linear = np.array(told["drag.linear"] or (0.0, 0.0, 0.0))
+            self.quadratic = np.array(told["drag.quadratic"] or (0.0, 0.0, 0.0))
         if "rotor_drag" in effects:
-            self.k = told.rotors.thrust_coefficient
-            self.drag = told.rotors.drag or 0.0
-            self.inflow = told.rotors.inflow or 0.0
-            self.lift = told.rotors.lift or 0.0
+            self.k = told["rotors.thrust_coefficient"]
+            self.drag = told["rotors.drag"] or 0.0
+            self.inflow = told["rotors.inflow"] or 0.0
+            self.lift = told["rotors.lift"] or 0.0
 
     def derivative(self, _: float, y: Floats, command: Floats) -> Floats:
         """Of the position and velocity of the center of mass, quaternion, body rates, and roots."""

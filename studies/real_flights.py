@@ -172,8 +172,10 @@ def moving_numbers(vehicle: Vehicle) -> dict[str, object]:
 def simulated(vehicle: Vehicle, windows: Windows, *, rotors: bool = True) -> Floats:
     """States at each horizon, (M, H, 13), flown by the simulator."""
     told = vehicle.coefficients
-    body = any(x is not None for x in (told.drag.linear, told.drag.angular, told.drag.moment))
-    rotor = any(x is not None for x in (told.rotors.drag, told.rotors.inflow))
+    of_body = [told[f"drag.{name}"] for name in ("linear", "angular", "moment")]
+    of_rotors = [told[f"rotors.{name}"] for name in ("drag", "inflow")]
+    body = any(x is not None for x in of_body)
+    rotor = any(x is not None for x in of_rotors)
     effects = EffectOptions(body_drag=body, rotor_drag=rotor and rotors)
     (coefficient,) = told.need("rotors.thrust_coefficient", "a flight from rotor speeds")
     lift = np.array((0.0, 0.0, _UP))

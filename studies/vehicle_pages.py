@@ -136,12 +136,12 @@ def effects(vehicle: Vehicle) -> list[str]:
 
 def sensors(vehicle: Vehicle) -> list[str]:
     """Sensors whose coefficients a vehicle has."""
-    told = vehicle.coefficients.sensors
-    return [
-        name
-        for name, kind in SENSOR_TYPES.items()
-        if all(getattr(told, kind.prefix + one) is not None for one in kind.needs)
-    ]
+    able = []
+    for name, kind in SENSOR_TYPES.items():
+        needs = [vehicle.coefficients[f"sensors.{kind.prefix}{need}"] for need in kind.needs]
+        if None not in needs:
+            able.append(name)
+    return able
 
 
 def _no_noise(numbers: int, stream: int) -> Any:
@@ -150,7 +150,7 @@ def _no_noise(numbers: int, stream: int) -> Any:
 
 def sources(number: Number) -> list[str]:
     """That of its value, and those of the other values."""
-    return [number.source, *(source for _, source in number.others)]
+    return [number.source, *(other.source for other in number.others)]
 
 
 def works_of(source: str) -> list[str]:
@@ -222,7 +222,7 @@ def _choices(numbers: Iterable[Number]) -> str:
         unit = f", {number.unit}" if number.unit != "1" else ""
         name = f"`{number.name}`{unit}"
         rows.append((name, f"**{shown(number.value)}**", number.source, number.why))
-        rows += [("", shown(value), source, "") for value, source in number.others]
+        rows += [("", shown(other.value), other.source, "") for other in number.others]
     return table(("number", "value", "source", "remark"), rows)
 
 
@@ -249,7 +249,7 @@ def draw(name: str) -> Image.Image:
     model = build_scene(path_of(name)).compile()
     data = mujoco.MjData(model)
     reach = max(float(np.hypot(*rotor.position[:2])) for rotor in vehicle.rotors)
-    reach += vehicle.coefficients.rotors.radius or 0.4 * reach
+    reach += vehicle.coefficients["rotors.radius"] or 0.4 * reach
     model.stat.extent, model.stat.meansize = 4 * reach, 0.2 * reach  # near, far, shadows
     model.mat_texrepeat[:] *= 1.5 / reach
     height = vehicle.rest_height + 0.3 * reach

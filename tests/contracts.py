@@ -129,16 +129,15 @@ def _levels() -> dict[str, Case]:
 def effects_of(file: Path) -> dict[str, Any]:
     """All effects that a vehicle has coefficients for; in a storm, if it feels air."""
     vehicle = Vehicle.load(file)
-    rotors = vehicle.coefficients.rotors
-    drag = vehicle.coefficients.drag
-    battery = vehicle.coefficients.battery
+    own = vehicle.coefficients
+    on_rotors = own["rotors.drag"] or own["rotors.inflow"] or own["rotors.lift"]
     known = {
-        "motor_lag": rotors.time_constant,
-        "thrust_curve": rotors.curve,
-        "battery": battery.full and battery.capacity and rotors.power,
-        "body_drag": drag.linear or drag.quadratic,
-        "rotor_drag": rotors.thrust_coefficient and (rotors.drag or rotors.inflow or rotors.lift),
-        "ground_effect": rotors.radius,
+        "motor_lag": own["rotors.time_constant"],
+        "thrust_curve": own["rotors.curve"],
+        "battery": own["battery.full"] and own["battery.capacity"] and own["rotors.power"],
+        "body_drag": own["drag.linear"] or own["drag.quadratic"],
+        "rotor_drag": own["rotors.thrust_coefficient"] and on_rotors,
+        "ground_effect": own["rotors.radius"],
     }
     effects: dict[str, Any] = {name: True for name, value in known.items() if value}
     if effects.keys() & {"body_drag", "rotor_drag"}:

@@ -114,8 +114,8 @@ def make_controller(
 
 def _lag(vehicle: "Vehicle", effects: EffectOptions) -> float:
     """Longest time constant of the rotors, s; 0 where they follow at once."""
-    rotors = vehicle.coefficients.rotors
-    times = (rotors.time_constant or 0.0, rotors.time_constant_down or 0.0)
+    names = ("rotors.time_constant", "rotors.time_constant_down")
+    times = [vehicle.coefficients[name] or 0.0 for name in names]
     return max(times) if effects.motor_lag else 0.0
 
 

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...models.coefficients import Drag
 from ...models.errors import InputError
 from ..rotations import Parts, Rows, add, cross, dot, matrix, parts_of, product, times, transposed
 from ..snapshots import Kept
@@ -48,16 +47,16 @@ class AirEffects(Kept):
         self._geometry = np.array([(*rotor.position, *rotor.axis) for rotor in vehicle.rotors])
         self._rotors = self._geometry.tolist()
         if options.body_drag:
-            drag = coefficients.drag
-            if drag == Drag():
+            names = ("angular", "moment", "linear", "quadratic")
+            drag = [coefficients[f"drag.{name}"] for name in names]
+            if drag == [None] * 4:
                 raise InputError(
                     "vehicle: expected drag.linear or drag.quadratic in the vehicle's file, which "
                     "body_drag needs, got none"
                 )
-            self._angular = drag.angular
-            self._moment = drag.moment
-            self._linear = drag.linear or _NOTHING
-            self._quadratic = drag.quadratic or _NOTHING
+            self._angular, self._moment, linear, quadratic = drag
+            self._linear = linear or _NOTHING
+            self._quadratic = quadratic or _NOTHING
             # Of a fall at its terminal velocity, sqrt(weight / quadratic), the slope of the drag.
             weight = vehicle.mass * vehicle.gravity
             slope = max(self._linear) + 2 * math.sqrt(max(self._quadratic) * weight)
@@ -72,9 +71,8 @@ class AirEffects(Kept):
         if options.rotor_drag:
             (coefficient,) = coefficients.need("rotors.thrust_coefficient", "rotor_drag")
             self._slope = math.sqrt(coefficient)  # of the square root of a thrust over the speed
-            table = coefficients.rotors
-            three = (table.drag, table.inflow, table.lift)
-            if three == (None,) * 3:
+            three = [coefficients[f"rotors.{name}"] for name in ("drag", "inflow", "lift")]
+            if three == [None] * 3:
                 raise InputError(
                     "vehicle: expected rotors.drag, inflow or lift in the vehicle's file, which "
                     "rotor_drag needs, got none"

@@ -41,7 +41,7 @@ class EffectOptions:
     gusts: Annotated[float, Limits(0.0, MAX_WIND, "m/s")] = 0.0
     """Dryden turbulence for this wind speed at a height of 20 feet (6 m), m/s."""
     efficiency: Annotated[
-        tuple[float, ...], Limits(0.0, 1.0, "for each rotor", count=None, least=0)
+        tuple[float, ...], Limits(0.0, 1.0, "for each rotor", count=0, least=0)
     ] = ()
     """Share of its thrust that each rotor gives, 0 to 1; empty: all of it."""
     payload: Annotated[float, Limits(0.0, 1e4, "kg")] = 0.0

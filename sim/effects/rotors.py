@@ -40,7 +40,7 @@ class RotorEffects(Kept):
         self._limits = vehicle.thrust_low, vehicle.thrust_high
         if options.motor_lag:
             (rise,) = coefficients.need("rotors.time_constant", "motor_lag")
-            fall = coefficients.rotors.time_constant_down
+            fall = coefficients["rotors.time_constant_down"]
             self._times = [rise] if fall in (None, rise) else [rise, fall]
         if options.thrust_curve:
             (self._curve,) = coefficients.need("rotors.curve", "thrust_curve")

@@ -95,7 +95,7 @@ class Source(Kept):
         values = {}
         for name, (value, _, coefficient) in cls.settings().items():
             if coefficient:
-                own = getattr(vehicle.coefficients.sensors, coefficient)
+                own = vehicle.coefficients[f"sensors.{coefficient}"]
                 value = value if own is None else own
             value = given.get(name, value)
             if coefficient and value is None:

@@ -142,10 +142,10 @@ def test_the_command_writes_a_vehicle_that_loads(
     assert "95 % interval" in told
     assert "clustered over 15 segments of 2 s" in told
     vehicle = Vehicle.load(out)
-    rotors = vehicle.coefficients.rotors
+    own = vehicle.coefficients
     assert vehicle.mass == 0.5
-    assert rotors.thrust_coefficient == pytest.approx(3e-6, rel=0.02)
-    assert rotors.time_constant == pytest.approx(0.04, rel=0.05)
+    assert own["rotors.thrust_coefficient"] == pytest.approx(3e-6, rel=0.02)
+    assert own["rotors.time_constant"] == pytest.approx(0.04, rel=0.05)
     np.testing.assert_allclose(np.diag(vehicle.inertia)[:2], (2.0e-3, 2.5e-3), rtol=0.1)
     text = out.read_text()
     assert 'source = "identified from lively"' in text

@@ -85,8 +85,8 @@ def test_a_wrong_value_gives_one_sentence(name: str, value: Any, sentence: str) 
         (Limits(3, whole=True), "a whole number of at least 3"),
         (Limits(high=3), "a number of at most 3"),
         (Limits(unit="m"), "a number in m"),
-        (Limits(0, 1, "1", count=None), "1 or more numbers from 0 to 1"),
-        (Limits(0, 1, count=None, least=0), "numbers from 0 to 1"),
+        (Limits(0, 1, "1", count=0), "1 or more numbers from 0 to 1"),
+        (Limits(0, 1, count=0, least=0), "numbers from 0 to 1"),
         (Text(8, identifier=True), "up to 8 letters, digits and _"),
     ],
 )

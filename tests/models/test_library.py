@@ -50,8 +50,8 @@ def test_a_choice_between_sources_that_differ_by_5_percent_is_explained(name: st
         used = np.asarray(number.value)
         scale = np.abs(used).max()
         apart = 0.0
-        for value, _ in number.others:
-            difference = np.abs(used - np.asarray(value)).max()
+        for other in number.others:
+            difference = np.abs(used - np.asarray(other.value)).max()
             apart = max(apart, difference / scale)
         assert apart < 0.05 or number.why, number.name
 
@@ -134,6 +134,6 @@ def test_with_the_menagerie_s_turn_directions_the_skydio_x2_cannot_yaw(tmp_path:
 def test_the_crazyflies_rangefinder_has_the_noise_of_its_driver_at_its_limit() -> None:
     """zranger2.c: 2.5 mm · (1 + exp(k (d - 2.5 m))), which is 5 mm at d = 2.5 m."""
     for name in ("crazyflie2", "crazyflie_brushless"):
-        sensors = Vehicle.load(name).coefficients.sensors
-        assert sensors.range_noise == 0.005
-        assert sensors.range_limit == 2.5
+        own = Vehicle.load(name).coefficients
+        assert own["sensors.range_noise"] == 0.005
+        assert own["sensors.range_limit"] == 2.5

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import rotorgram.envs  # noqa: F401  registers the envs
 from rotorgram.models import InputError, Vehicle, library, vehicle_file
-from rotorgram.models.coefficients import Battery, Drag, Sensors
+from rotorgram.models.coefficients import COEFFICIENTS
 from rotorgram.models.export import export_mjcf
 from rotorgram.models.fields import Limits, limits_of
 from rotorgram.models.vehicle_file import FRAMES, read_vehicle_file
@@ -129,7 +129,7 @@ def test_thrust_and_reaction_from_speeds_and_coefficients(tmp_path: Path) -> Non
     assert vehicle.thrust_low == pytest.approx([0.08] * 4)
     assert vehicle.thrust_high == pytest.approx([8.0] * 4)
     assert vehicle.allocation[3] == pytest.approx([0.015, -0.015, 0.015, -0.015])
-    assert vehicle.coefficients.rotors.thrust_coefficient == 8e-6
+    assert vehicle.coefficients["rotors.thrust_coefficient"] == 8e-6
 
 
 # ---- bodies
@@ -231,7 +231,9 @@ def test_provenance(tmp_path: Path) -> None:
     assert mass.unit == "kg"
     assert mass.source == "scales"
     assert mass.why == "with battery"
-    assert mass.others == ((1.4, "datasheet"),)
+    (other,) = mass.others
+    assert other.value == 1.4
+    assert other.source == "datasheet"
     assert inertia.value == (0.02, 0.021, 0.035)
     assert inertia.source == "drawing"
     assert arm.value == 0.3
@@ -349,7 +351,7 @@ def test_urdf(tmp_path: Path) -> None:
     assert vehicle.timestep == 0.01
     assert vehicle.gravity == 9.81
     assert vehicle.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
-    assert vehicle.coefficients.rotors.radius == 0.1
+    assert vehicle.coefficients["rotors.radius"] == 0.1
     env = gym.make("rotorgram/Hover-v0", vehicle=vehicle.path)
     env.reset(seed=0)
     assert env.action_space.shape == (4,)
@@ -547,9 +549,6 @@ TABLES = {
     "body.parts.": vehicle_file.Box,
     "rotors.": vehicle_file.RotorTable,
     "rotors.list.": vehicle_file.PlacedRotor,
-    "drag.": Drag,
-    "battery.": Battery,
-    "sensors.": Sensors,
     "cameras.": vehicle_file.CameraTable,
     "real_flights.": vehicle_file.RealFlights,
 }
@@ -560,7 +559,7 @@ def limits_of_all() -> dict[str, Limits]:
     found = limits_of(vehicle_file.Cylinder, "body.parts.")
     for prefix, kind in TABLES.items():
         found |= limits_of(kind, prefix)
-    return found
+    return found | COEFFICIENTS
 
 
 def test_the_page_has_every_field_with_its_limits() -> None:
@@ -568,7 +567,7 @@ def test_the_page_has_every_field_with_its_limits() -> None:
     page = {name: (count, unit, limits) for name, count, unit, limits in rows}
     fields = {}
     for name, limits in limits_of_all().items():
-        count = {None: "1 or more"}.get(limits.count, str(limits.count))
+        count = {0: "1 or more"}.get(limits.count, str(limits.count))
         fields[name] = (count, limits.unit, f"{limits.low:g} to {limits.high:g}")
     fields["body.inertia"] = ("3 or 6", "kg m²", "-1e+09 to 1e+09")
     assert page == fields

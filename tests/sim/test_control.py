@@ -152,8 +152,8 @@ def random_states(vehicle: Vehicle, n: int) -> tuple[dict[str, np.ndarray], np.n
 def test_a_batch_has_the_bits_of_single_drones(name: str, level: str) -> None:
     vehicle = Vehicle.load(FILES[name])
     effects = EffectOptions(
-        motor_lag=vehicle.coefficients.rotors.time_constant is not None,
-        thrust_curve=vehicle.coefficients.rotors.curve is not None,
+        motor_lag=vehicle.coefficients["rotors.time_constant"] is not None,
+        thrust_curve=vehicle.coefficients["rotors.curve"] is not None,
     )
     controller = make_controller(level, vehicle, vehicle.timestep, effects)
     given, actions = random_states(vehicle, 50)
@@ -197,7 +197,7 @@ def flown(
 
 
 def check_flights(vehicle: Vehicle) -> None:
-    has_lag = vehicle.coefficients.rotors.time_constant is not None
+    has_lag = vehicle.coefficients["rotors.time_constant"] is not None
     for effects in [EffectOptions(), LAG][: 1 + has_lag]:
         tilted = (cos(0.2618), 0.6 * sin(0.2618), 0.8 * sin(0.2618), 0.0)  # by 30°
         seen = np.array(flown(vehicle, "position", effects, tilted, 4.0))

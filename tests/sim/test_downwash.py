@@ -53,7 +53,7 @@ def test_the_momentum_of_a_jet_is_the_thrust_but_for_a_third(name: str) -> None:
     it is the thrust; the paper fits no momentum, so that this tells whether numbers are misread.
     """
     vehicle = Vehicle.load(name)
-    if vehicle.coefficients.rotors.radius is None:
+    if vehicle.coefficients["rotors.radius"] is None:
         pytest.skip("no rotors.radius")
     downwash = Downwash(vehicle)
     weight = vehicle.mass * vehicle.gravity
@@ -63,7 +63,7 @@ def test_the_momentum_of_a_jet_is_the_thrust_but_for_a_third(name: str) -> None:
         speed = downwash.velocity(np.full_like(radius, weight), far, radius)
         rings = speed**2 * radius
         momentum = 1.225 * 2 * pi * np.trapezoid(rings, radius)
-        area = vehicle.num_rotors * pi * vehicle.coefficients.rotors.radius**2
+        area = vehicle.num_rotors * pi * vehicle.coefficients["rotors.radius"] ** 2
         shape = pi * (10.11 * 0.07668) ** 2 / (3 * (sqrt(2) - 1))
         expected = weight / (2 * area) * downwash.length**2 * shape
         assert momentum == approx(expected, rel=1e-3)
@@ -103,9 +103,9 @@ def test_the_lower_drone_is_pushed_down_by_its_drag_and_the_upper_is_not() -> No
 
 def test_rotors_in_the_jet_lose_thrust_by_their_inflow() -> None:
     world = birds(TOP, LOWER, rotor_drag=True, downwash=True)
-    rotors = world.vehicle.coefficients.rotors
-    speeds = np.sqrt(world.vehicle.hover_thrust / rotors.thrust_coefficient)
-    lost = rotors.inflow * speeds.sum() * jet(5.0)
+    own = world.vehicle.coefficients
+    speeds = np.sqrt(world.vehicle.hover_thrust / own["rotors.thrust_coefficient"])
+    lost = own["rotors.inflow"] * speeds.sum() * jet(5.0)
     expected = -lost / MASS * world.vehicle.timestep
     found = hover(world)[1, 2]
     assert found == approx(expected, rel=1e-3)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from rotorgram.models import Vehicle
-from rotorgram.models.coefficients import Coefficients, Drag
+from rotorgram.models.coefficients import Coefficients
 
 pytest.importorskip("scipy")
 
@@ -67,8 +67,8 @@ def test_without_thrust_it_falls_along_a_parabola_and_keeps_its_angular_momentum
 
 def test_linear_drag_alike_in_all_directions_gives_an_exponential() -> None:
     """v = v_end + (v_start - v_end) exp(-c t / m), the same while the craft tumbles."""
-    drag = Drag(linear=(0.3, 0.3, 0.3))
-    craft = replace(RACER, coefficients=Coefficients(drag=drag))
+    drag = Coefficients.read({"drag.linear": (0.3, 0.3, 0.3)})
+    craft = replace(RACER, coefficients=drag)
     flight = independent(craft, np.zeros((50, 4)), {"body_drag": True, "wind": (2.0, 0.0, 0.0)})
     center = craft.center_of_mass
     rate = 0.3 / 0.6
@@ -145,9 +145,9 @@ def test_effects_are_of_second_order(effects: str, most_m: float, most_deg: floa
 
 def test_rotors_that_lag_drag_with_their_mean_speed() -> None:
     """With the speed of the mean thrust, which is larger, the attitude is off by 0.04°."""
-    told = RACER.coefficients
-    quick = replace(told.rotors, time_constant=0.005, time_constant_down=None)
-    craft = replace(RACER, coefficients=replace(told, rotors=quick))
+    quick = Coefficients(RACER.coefficients)
+    quick |= {"rotors.time_constant": 0.005, "rotors.time_constant_down": None}
+    craft = replace(RACER, coefficients=quick)
     effects = {"motor_lag": True, "rotor_drag": True}
     commands = thrusts(craft, 2.0)
     flown = ours(at_step(craft, 0.005), commands, effects)
@@ -220,9 +220,9 @@ def test_rotorpys_parameters_become_our_vehicle(tmp_path: Path) -> None:
     signs = [(1, 1, 1, 1), (0.2, -0.2, -0.2, 0.2), (-0.1, -0.1, 0.1, 0.1)]
     expected = np.array((*signs, (0.02, -0.02, 0.02, -0.02)))
     assert vehicle.allocation == approx(expected, abs=1e-12)
-    assert told.rotors.thrust_coefficient == 2e-6
-    assert told.rotors.time_constant == 0.01
-    assert told.rotors.drag == 1e-4
-    assert told.rotors.inflow == 2e-4
-    assert told.rotors.lift == 3e-3
-    assert told.drag.quadratic == (0.01, 0.02, 0.03)
+    assert told["rotors.thrust_coefficient"] == 2e-6
+    assert told["rotors.time_constant"] == 0.01
+    assert told["rotors.drag"] == 1e-4
+    assert told["rotors.inflow"] == 2e-4
+    assert told["rotors.lift"] == 3e-3
+    assert told["drag.quadratic"] == (0.01, 0.02, 0.03)
