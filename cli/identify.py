@@ -26,8 +26,6 @@ class Identify(Command):
     """File of the vehicle, TOML or MJCF, with a thrust coefficient, or a name of the library."""
     out: Annotated[Path, arg(metavar="NEW.toml")]
     """File to write: the vehicle with what was identified, and intervals."""
-    columns: Words = ()
-    """Names in the logs, as OURS=THEIRS or OURS=THEIRS*FACTOR: m1_rads=rpm1*0.10472."""
     fit: Words = ()
     """What to identify. Default: the five of above; besides them there are rotors.drag,
     rotors.inflow, rotors.lift, drag.angular.x, y, z and drag.moment.x, y."""
@@ -51,14 +49,8 @@ class Identify(Command):
         check_new_file(self.out, ".toml")
         if not 1e-4 <= self.period <= 0.1:
             raise InputError(f"period: expected 0.0001 to 0.1 s, got {self.period:g}")
-        columns = {}
-        for text in self.columns:
-            ours, _, theirs = text.partition("=")
-            if not (ours and theirs):
-                raise InputError(f"columns: expected OURS=THEIRS, got {text!r}")
-            columns[ours] = theirs
         vehicle = Vehicle.load(self.vehicle)
-        logs = [read_log(path, vehicle, columns, self.period) for path in self.logs]
+        logs = [read_log(path, vehicle, self.period) for path in self.logs]
         for log in logs:
             if log.left_out:
                 print(

@@ -52,22 +52,16 @@ class FlightLog:
     """Samples that contradicted their neighbours and were left out."""
 
 
-def read_log(
-    path: Path | str,
-    vehicle: Vehicle,
-    columns: Mapping[str, str] | None = None,
-    period: float = 0.01,
-) -> FlightLog:
+def read_log(path: Path | str, vehicle: Vehicle, period: float = 0.01) -> FlightLog:
     """A log of a vehicle, resampled to `period`, s, by linear interpolation.
 
-    `columns` has the file's name for a column of ours: "pos_x", or with a factor "rpm1*0.10472".
     Single samples whose position or attitude contradicts the velocity or the rates are left out.
 
     Raises `InputError` for a file that lacks a column, has gaps, jumps or numbers that are not
     finite.
     """
     path = Path(path)
-    table = _our_columns(path, columns or {}, vehicle.num_rotors)
+    table = _our_columns(path, vehicle.num_rotors)
     states = np.stack([table[name] for name in MOTION], axis=1)
     states[:, 3:7] = _without_flips(states[:, 3:7])
     measured = _of_rotors(table, SPEED, vehicle)
@@ -126,23 +120,22 @@ def _refuse(path: Path, expected: str, got: str) -> NoReturn:
 # ---- columns
 
 
-def _our_columns(path: Path, given: Mapping[str, str], rotors: int) -> dict[str, Floats]:
-    """The columns of a file that we know, by our names. Raises `InputError`."""
+def _our_columns(path: Path, rotors: int) -> dict[str, Floats]:
+    """The columns of a file that we know. Raises `InputError`."""
     known = ["t", *MOTION]
     for kind in _KINDS:
         known += [kind.format(number) for number in range(1, rotors + 1)]
-    for name in given:
-        if name not in known:
-            raise InputError(f"columns: expected some of {', '.join(known)}, got {name!r}")
     table = _table(path)
     columns = {}
     for name in known:
-        theirs = given.get(name, name)
-        column = _column(path, table, theirs)
-        if column is not None:
-            columns[name] = column
-        elif name in ("t", *MOTION):
-            _refuse(path, f"a column {theirs}", ", ".join(table))
+        if name not in table:
+            if name in ("t", *MOTION):
+                _refuse(path, f"a column {name}", ", ".join(table))
+            continue
+        try:
+            columns[name] = np.array(table[name], np.float64)
+        except (TypeError, ValueError):
+            _refuse(path, f"numbers in {name}", "others")
     return columns
 
 
@@ -161,23 +154,6 @@ def _table(path: Path) -> Columns:
         reason = one_line(error)
         raise InputError(f"log: expected a {kind} file, got {path.name}: {reason:.80}") from None
     return {str(name): frame[name].to_numpy() for name in frame}
-
-
-def _column(path: Path, table: Columns, text: str) -> Floats | None:
-    """A column, times a factor that may follow its name; None: there is none."""
-    name = text
-    factor = "1"
-    if text not in table and "*" in text:
-        name, _, factor = text.rpartition("*")
-        name = name.strip()
-    if name not in table:
-        return None
-    try:
-        return np.array(table[name], np.float64) * float(factor)
-    except (TypeError, ValueError):
-        raise InputError(
-            f"columns: expected numbers in {name} of {path.name} and as its factor, got {text!r}"
-        ) from None
 
 
 def _of_rotors(table: Mapping[str, Floats], kind: str, vehicle: Vehicle) -> Floats | None:

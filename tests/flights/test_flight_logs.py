@@ -1,4 +1,4 @@
-"""Logs of real flights: columns, units, times; and impossible samples that are left out."""
+"""Logs of real flights: columns, times; and impossible samples that are left out."""
 
 import struct
 from collections.abc import Callable
@@ -40,10 +40,10 @@ def table() -> FRAME:
 
 @pytest.fixture
 def read(tmp_path: Path) -> Read:
-    def reading(table: FRAME, columns: dict[str, str] | None = None, **more: float) -> FlightLog:
+    def reading(table: FRAME, **more: float) -> FlightLog:
         file = tmp_path / "log.csv"
         table.to_csv(file, index=False)
-        return read_log(file, LIVELY, columns, **more)
+        return read_log(file, LIVELY, **more)
 
     return reading
 
@@ -56,14 +56,10 @@ def test_lag_is_the_closed_form(table: FRAME, read: Read) -> None:
     assert speeds[15, 2] == pytest.approx(600 - left)
 
 
-def test_columns_may_have_other_names_units_and_times(table: FRAME, read: Read) -> None:
-    speed = table.pop("m1_rads")
-    table["rpm"] = speed * 60 / (2 * np.pi)
-    table = table.rename(columns={"x": "pos_x"})
+def test_a_log_may_have_another_period_and_signs_of_quaternions(table: FRAME, read: Read) -> None:
     signs = np.where(np.arange(200) % 3, 1, -1)
     table[ATTITUDE] *= signs[:, None]
-    names = {"x": "pos_x", "m1_rads": "rpm*0.10471975511965977"}
-    log = read(table, names, period=0.005)
+    log = read(table, period=0.005)
     time = 0.005 * np.arange(399)
     np.testing.assert_allclose(log.states[:, 0], time, atol=1e-12)
     np.testing.assert_allclose(log.speeds, 600.0)
