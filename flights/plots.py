@@ -1,5 +1,6 @@
 """Plots of flights over time: their telemetry, several flights laid over each other."""
 
+import math
 from collections.abc import Mapping, Sequence
 from itertools import cycle
 from pathlib import Path
@@ -31,20 +32,16 @@ _FIRST = (
 _ON_POSITION = {"goal": "--", "payload": ":"}
 """Signals that are drawn beside the position, and their line style."""
 _HIDDEN = ("time", "drawn", "action", "reward", *_ON_POSITION)
-_STYLES = ("-", "--", ":", "-.")
-"""Line styles of the numbers in one panel."""
 _WIDTH = 11.0  # inches
 _ROW = 1.75  # inches
 
 
 class Panel(NamedTuple):
-    """One pair of axes: some numbers of a signal."""
+    """One pair of axes: a number of a signal."""
 
     signal: str
-    components: tuple[int, ...]
+    component: int
     label: str
-    wide: bool
-    """It takes a whole row."""
 
 
 def plot_flights(flights: Mapping[str, Trajectory], out: Path) -> None:
@@ -65,25 +62,20 @@ def plot_flights(flights: Mapping[str, Trajectory], out: Path) -> None:
 
 
 def panels_of(signals: Sequence[Mapping[str, Signal]]) -> list[Panel]:
-    """Panels of all signals that any of the flights has, row by row."""
+    """A panel for each number that any of the flights has, row by row."""
     kinds: dict[str, Signal] = {}
     for flight in signals:
         kinds = {**flight, **kinds}
     known = [name for name in _FIRST if name in kinds]
     others = [name for name in kinds if name not in known and name not in _HIDDEN]
-    vectors: list[Panel] = []
-    wides: list[Panel] = []
-    scalars: list[Panel] = []
+    vectors: list[Panel] = []  # each fills a row
+    rest: list[Panel] = []
     for name in known + others:
         signal = kinds[name]
-        count = len(signal.components)
-        if name == "thrust" or count > _COLUMNS:
-            wides.append(Panel(name, tuple(range(count)), _label(name, signal.units[0]), True))
-            continue
-        panels = vectors if count == _COLUMNS else scalars
+        panels = vectors if len(signal.components) == _COLUMNS else rest
         for i, component in enumerate(signal.components):
-            panels.append(Panel(name, (i,), _label(component, signal.units[i]), False))
-    return vectors + wides + scalars
+            panels.append(Panel(name, i, _label(component, signal.units[i])))
+    return vectors + rest
 
 
 def _shown(flight: Trajectory) -> dict[str, Signal]:
@@ -122,17 +114,14 @@ def _drawn(
     from matplotlib.lines import Line2D
 
     panels = panels_of(list(signals.values()))
-    places = _places(panels)
-    rows = places[-1][0] + 1
+    rows = math.ceil(len(panels) / _COLUMNS)
     figure = Figure(figsize=(_WIDTH, _ROW * rows + 0.6), layout="constrained")
-    grid = figure.add_gridspec(rows, _COLUMNS)
-    drawn: list[Axes] = []
-    for panel, (row, column) in zip(panels, places, strict=True):
-        cell = grid[row, :] if panel.wide else grid[row, column]
-        axes = figure.add_subplot(cell, sharex=drawn[0] if drawn else None)
-        drawn.append(axes)
+    first: Axes | None = None
+    for number, panel in enumerate(panels):
+        axes = figure.add_subplot(rows, _COLUMNS, number + 1, sharex=first)
+        first = first or axes
         _draw_panel(axes, panel, flights, signals)
-        if row == rows - 1:
+        if number >= len(panels) - _COLUMNS:
             axes.set_xlabel("time (s)")
     if len(flights) > 1:
         lines = [Line2D([], [], color=color) for color, _ in zip(cycle(FLIGHT_COLORS), flights)]
@@ -143,55 +132,30 @@ def _drawn(
     return figure
 
 
-def _places(panels: Sequence[Panel]) -> list[tuple[int, int]]:
-    """Row and column of each panel, side by side; a wide one has a row of its own."""
-    places = []
-    row = 0
-    column = 0
-    for panel in panels:
-        if column and (panel.wide or column == _COLUMNS):
-            row += 1
-            column = 0
-        places.append((row, column))
-        column += _COLUMNS if panel.wide else 1
-    return places
-
-
 def _draw_panel(
     axes: "Axes",
     panel: Panel,
     flights: Mapping[str, Trajectory],
     signals: Mapping[str, Mapping[str, Signal]],
 ) -> None:
-    several = len(flights) > 1
-    colors = cycle(FLIGHT_COLORS)
     keys: dict[str, Line2D] = {}  # of the panel's own legend
-    for (name, flight), color in zip(flights.items(), colors, strict=False):
+    for (name, flight), color in zip(flights.items(), cycle(FLIGHT_COLORS), strict=False):
         signal = signals[name].get(panel.signal)
-        if signal is None:
+        if signal is None or panel.component >= len(signal.components):
             continue
-        for number, component in enumerate(panel.components[: len(signal.components)]):
-            values = signal.values[:, component]
-            own = color if several else FLIGHT_COLORS[number % len(FLIGHT_COLORS)]
-            style = _STYLES[number % len(_STYLES)] if several else "-"
-            (line,) = axes.plot(flight.times, values, style, color=own, linewidth=1.2)
-            if len(panel.components) > 1:
-                keys.setdefault(signal.components[component], line)
+        values = signal.values[:, panel.component]
+        axes.plot(flight.times, values, color=color, linewidth=1.2)
         if flight.terminated:  # a cross
-            ends = signal.values[-1, list(panel.components)]
-            for end in ends:
-                axes.plot(flight.times[-1], end, "x", color=color, markersize=6)
-        if panel.signal == "position":
-            for other, style in _ON_POSITION.items():
-                if other in signals[name]:
-                    values = signals[name][other].values[:, panel.components[0]]
-                    own = color if several else "0.4"
-                    (line,) = axes.plot(flight.times, values, style, color=own, linewidth=1.0)
-                    keys.setdefault(other, line)
+            axes.plot(flight.times[-1], values[-1], "x", color=color, markersize=6)
+        for other, style in _ON_POSITION.items():
+            if panel.signal == "position" and other in signals[name]:
+                beside = signals[name][other].values[:, panel.component]
+                own = color if len(flights) > 1 else "0.4"
+                (line,) = axes.plot(flight.times, beside, style, color=own, linewidth=1.0)
+                keys.setdefault(other, line)
     axes.set_ylabel(panel.label)
     axes.grid(visible=True, color="0.9", linewidth=0.6)
     axes.spines[["top", "right"]].set_visible(False)
     axes.margins(x=0.01)
     if keys:
-        ncols = len(keys) if panel.wide else 1
-        axes.legend(keys.values(), keys.keys(), loc="best", ncols=ncols, fontsize=8)
+        axes.legend(keys.values(), keys.keys(), loc="best", fontsize=8)
