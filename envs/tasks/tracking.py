@@ -10,14 +10,7 @@ import numpy as np
 
 from ...models.errors import InputError, one_line, shortened
 from ...models.fields import Limits
-from ...sim import (
-    Array,
-    Draw,
-    InitialState,
-    clip,
-    component,
-    each,
-)
+from ...sim import Array, Draw, InitialState, clip
 from ..spec import Metric
 from ..state import State
 from .goal import (
@@ -36,8 +29,7 @@ from .goal import (
 from .task import Outcome, TaskOptions
 
 MAX_SAMPLES = 20_000  # Rows of a file
-MAX_POINTS = 16  # That a minimum-snap trajectory goes through
-_EXPECTED = "circle, lemniscate, snap, or a CSV file with columns t, x, y, z"
+_EXPECTED = "circle, lemniscate, or a CSV file with columns t, x, y, z"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,18 +37,15 @@ class TrackingOptions(TaskOptions):
     """Options of `rotorgram/Tracking-v0`."""
 
     trajectory: str = "circle"
-    """`circle` or `lemniscate`, level and without end; `snap`, a minimum-snap trajectory from rest
-    to rest through points; or a CSV file with columns t (s), x, y, z (m, world frame), straight
-    between its rows. The rows of a file are kept as JSON, so that they cross the wire."""
+    """`circle` or `lemniscate`, level and without end; or a CSV file with columns t (s), x, y, z
+    (m, world frame), straight between its rows. The rows of a file are kept as JSON, so that they
+    cross the wire."""
     center: Point = (0.0, 0.0, 5.0)
-    """Middle of a circle, a lemniscate, or the box of points: world frame, m."""
+    """Middle of a circle or a lemniscate: world frame, m."""
     radius: Distance = 2.0
-    """Of the circle, half the length of the lemniscate, or half the width of the box, which is half
-    as high, m."""
+    """Of the circle, or half the length of the lemniscate, m."""
     period: Annotated[float, Limits(0.1, 1e4, "s")] = 10.0
-    """Time of a round, or of all of a `snap`, s."""
-    points: Annotated[int, Limits(2, MAX_POINTS, whole=True)] = 5
-    """Points of a `snap`, 2 to 16, which are drawn in the box for each episode."""
+    """Time of a round, s."""
     preview: Annotated[int, Limits(0, 20, whole=True)] = 3
     """Later points of the trajectory in the observation, 0 to 20."""
     preview_time: Annotated[float, Limits(0.0, 100.0, "s")] = 0.2
@@ -68,7 +57,7 @@ class TrackingOptions(TaskOptions):
 
     def check(self) -> None:
         """Check the options of this task. Raises `InputError`."""
-        if self.trajectory != "snap" and self.trajectory not in _CURVES:
+        if self.trajectory not in _CURVES:
             rows = json.dumps(read_samples(self.trajectory).tolist(), separators=(",", ":"))
             object.__setattr__(self, "trajectory", rows)
 
@@ -96,10 +85,8 @@ class Tracking(GoalTask):
 
     ## Trajectories
 
-    A circle and a lemniscate of Bernoulli begin at a phase drawn uniformly. A `snap` has pieces of
-    seventh order of equal times with six continuous derivatives and no speed, acceleration or jerk
-    at its ends: of all curves through these points at these times it has the least integral of the
-    squared snap (Mellinger and Kumar, ICRA 2011). At its end it stays, and so does that of a file.
+    A circle and a lemniscate of Bernoulli begin at a phase drawn uniformly. That of a file begins
+    with its first row, and stays at its last.
 
     ## Start, termination, truncation
 
@@ -122,31 +109,19 @@ class Tracking(GoalTask):
         """See the class."""
         options = self.options
         step = self.control_period
-        middle = np.array(options.center)
         kind = options.trajectory
         self._closed = kind in _CURVES
-        self._drawn = kind == "snap"
-        box = options.radius * np.array((1.0, 1.0, 0.5))
-        if self._drawn:
-            times = np.arange(math.ceil(options.period / step) + 1) * step / options.period
-            times = np.minimum(times, 1.0)
-            self._table = snap_basis(options.points, times)
-            self._rates = snap_basis(options.points, times, 1) / options.period
-            low = middle - box
-            high = middle + box
+        if self._closed:
+            count = max(2, round(options.period / step))
+            phases = 2 * np.pi * np.arange(count) / count
+            rate = 2 * np.pi / (count * step)
+            places, self._rates = _CURVES[kind](phases, options.radius, rate)
+            self._table = places + np.array(options.center)
         else:
-            if self._closed:
-                count = max(2, round(options.period / step))
-                phases = 2 * np.pi * np.arange(count) / count
-                rate = 2 * np.pi / (count * step)
-                places, self._rates = _CURVES[kind](phases, options.radius, rate)
-                self._table = places + middle
-            else:
-                self._table, self._rates = _sampled(read_samples(kind), step)
-            low = self._table.min(axis=0)
-            high = self._table.max(axis=0)
+            self._table, self._rates = _sampled(read_samples(kind), step)
+        low = self._table.min(axis=0)
+        high = self._table.max(axis=0)
         check_height("trajectory", low[2], self.vehicle.rest_height + options.start_band)
-        self._box = middle, box
         reach = float(np.linalg.norm(high - low)) + 2 * options.flight_band
         numbers = along("reference velocity", "m/s", 100.0)
         self._ahead = []
@@ -161,10 +136,6 @@ class Tracking(GoalTask):
         band = self.options.start_band
         share = draw.uniform(0.0, 1.0)
         index = np.floor(share * len(self._table)) if self._closed else 0.0 * share
-        if self._drawn:
-            middle, half = self._box
-            places = [draw.uniform(-1.0, 1.0, (3,)) for _ in range(self.options.points)]
-            self.memory.points = np.stack([middle + half * place for place in places], axis=-2)
         self.memory.index = index  # row of the table
         offset = draw.uniform(-band, band, (3,))
         position = self._at(self._table, 0.0) + offset
@@ -194,18 +165,11 @@ class Tracking(GoalTask):
         return self._at(self._table, 0.0) + 0.0 * state.position
 
     def _at(self, table: np.ndarray, ahead: float) -> Array:
-        """Row of a table, `ahead` steps ahead; of a `snap` times its points: shape (..., 3)."""
+        """Row of a table, `ahead` steps ahead: shape (..., 3)."""
         index = self.memory.index + ahead
         last = float(len(table))
         index = index % last if self._closed else clip(index, 0.0, last - 1.0)
-        row = row_of(table, index)
-        if not self._drawn:
-            return row
-        total: Array = 0.0
-        for number in range(self.options.points):
-            point = self.memory.points[..., number, :]
-            total = total + each(component(row, number)) * point
-        return total
+        return row_of(table, index)
 
 
 def _circle(phase: np.ndarray, radius: float, rate: float) -> tuple[np.ndarray, np.ndarray]:
@@ -236,41 +200,6 @@ def _sampled(rows: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
     rates = np.gradient(places, step, axis=0)
     rates[-1] = 0.0  # it stays
     return places, rates
-
-
-def snap_basis(points: int, times: np.ndarray, derivative: int = 0) -> np.ndarray:
-    """Share of each point in a minimum-snap trajectory, or in its derivative: shape (L, K).
-
-    It is at the K points at equal times from 0 to 1. Its K - 1 pieces have 8 coefficients each: 2
-    ends, 6 continuous derivatives inside, and 3 that are 0 at each end of all.
-    """
-    pieces = points - 1
-
-    def row(piece: int, at: float, order: int) -> np.ndarray:
-        """Of the coefficients, for a derivative by the piece's own time from 0 to 1."""
-        values = np.zeros(8 * pieces)
-        for n in range(order, 8):
-            values[8 * piece + n] = math.perm(n, order) * at ** (n - order)
-        return values
-
-    rows = []
-    for piece in range(pieces):
-        rows += [row(piece, 0.0, 0), row(piece, 1.0, 0)]
-    for order in range(1, 7):
-        for piece in range(pieces - 1):
-            rows.append(row(piece, 1.0, order) - row(piece + 1, 0.0, order))
-        if order <= 3:
-            rows += [row(0, 0.0, order), row(pieces - 1, 1.0, order)]
-    ends = np.repeat(np.eye(points), 2, axis=0)[1:-1]  # of each piece
-    given = np.zeros((len(rows), points))
-    given[: len(ends)] = ends
-    coefficients = np.linalg.solve(np.array(rows), given)
-    found = []
-    for time in times.tolist():
-        piece = min(int(time * pieces), pieces - 1)
-        found.append(row(piece, time * pieces - piece, derivative) @ coefficients)
-    basis: np.ndarray = np.array(found) * float(pieces**derivative)
-    return basis
 
 
 def read_samples(given: str) -> np.ndarray:

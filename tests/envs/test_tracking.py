@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from contracts import GOAL_OFFSET, NOW, TABLES, observed, rows_of
 from pilot import Pilot, fly, limited
-from rotorgram.envs.tasks.tracking import snap_basis
 from rotorgram.models import Vehicle
 from rotorgram.models.errors import InputError
 
@@ -81,63 +80,6 @@ def test_ends(state: dict[str, Any], ends: bool) -> None:
     outcome = begun().outcome(state_of(**state))
     assert bool(outcome.terminated) == ends
     assert outcome.reward["termination"] == pytest.approx(-140.0 * ends)
-
-
-def test_minimum_snap_from_rest_to_rest() -> None:
-    """Between two points it is 35 τ⁴ - 84 τ⁵ + 70 τ⁶ - 20 τ⁷; half of the way at half the time."""
-    times = np.linspace(0.0, 1.0, 11)
-    share = 35 * times**4 - 84 * times**5 + 70 * times**6 - 20 * times**7
-    shares = np.column_stack((1 - share, share))
-    assert snap_basis(2, times) == pytest.approx(shares, abs=1e-9)
-    rate = 140 * times**3 - 420 * times**4 + 420 * times**5 - 140 * times**6
-    rates = snap_basis(2, times, 1)
-    assert rates[:, 1] == pytest.approx(rate, abs=1e-8)
-
-
-@pytest.mark.parametrize("points", [3, 5, 16])
-def test_minimum_snap_through_points(points: int) -> None:
-    knots = np.linspace(0.0, 1.0, points)
-    assert snap_basis(points, knots) == pytest.approx(np.eye(points), abs=1e-6)
-    ends = np.array([0.0, 1.0])
-    for order in (1, 2, 3):
-        at_ends = snap_basis(points, ends, order)
-        assert np.abs(at_ends).max() < 1e-4 * points**order
-    # Six derivatives are continuous, and points on a line of any place add up to 1.
-    inner = knots[1:-1]
-    little = 1e-9
-    for order in range(7):
-        before = snap_basis(points, inner - little, order)
-        after = snap_basis(points, inner + little, order)
-        assert before == pytest.approx(after, abs=1e-4 * points ** (order + 1))
-    times = np.linspace(0, 1, 37)
-    total = snap_basis(points, times).sum(axis=1)
-    assert total == pytest.approx(1.0, abs=1e-6)
-
-
-def test_nothing_snaps_less() -> None:
-    """The integral of the squared snap grows with any change that keeps points and ends."""
-    times = np.linspace(0.0, 1.0, 2001)
-    points = np.array([0.0, 1.0, -0.5])
-    snap = snap_basis(3, times, 4) @ points
-    # A bump that is 0 at 0, 1/2 and 1 with four derivatives at the ends: (τ (1 - τ))⁵ (τ - 1/2).
-    ends = np.polynomial.Polynomial([0, 1, -1])
-    middle = np.polynomial.Polynomial([-0.5, 1])
-    bump = ends**5 * middle
-    change = bump.deriv(4)(times)
-    snap_size = np.trapezoid(snap**2, times)
-    change_size = np.trapezoid(change**2, times)
-    product = np.trapezoid(snap * change, times)
-    assert abs(product) < 1e-4 * math.sqrt(snap_size * change_size)
-
-
-def test_a_snap_by_hand() -> None:
-    """Two points, 8 s: in the middle after 4 s; at its end it stays."""
-    task = task_of(ID, trajectory="snap", points=2, period=8.0)
-    pose = task.begin(NOW, Shares(0.0, (0.0, 0.5, 0.5), (1.0, 1.0, 1.0), HALF))
-    assert pose.position == pytest.approx([-2.0, 0.0, 5.0])
-    assert pose.velocity == pytest.approx([0.0, 0.0, 0.0], abs=1e-9)
-    for steps, place in TABLES["tracking: a snap by hand, steps and places"]:
-        assert goal_after(task, steps) == pytest.approx(place, abs=1e-6)
 
 
 def test_a_file_without_a_column_is_told_its_name(tmp_path: Path) -> None:
