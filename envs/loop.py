@@ -88,13 +88,11 @@ class Loop:
         resets: Array | None = None,
         seeds: Seeds | None = None,
         frozen: Array | None = None,
-        chosen: Arrays | None = None,
     ) -> None:
         """Reset some drones, freeze some, and fly the others for one control period.
 
-        As `AdvancingVectorEnv.advance`; `chosen`: values used in place of random draws, by the
-        names of `Task.reset_options`, shape (N,). If the task refuses such a start, the others have
-        flown; the drones to be reset have not moved, and their random numbers have moved on.
+        As `AdvancingVectorEnv.advance`. If the task refuses a start, the others have flown; the
+        drones to be reset have not moved, and their random numbers have moved on.
         """
         self._check_open()
         record = self.record
@@ -113,16 +111,15 @@ class Loop:
                 record.lose()
                 raise
         if record.begun is not None:
-            self._begin(record.begun, seeds, chosen or {})
+            self._begin(record.begun, seeds)
         self._observe()
         self._take()
 
-    def _begin(self, begun: Mask, seeds: Any, chosen: Arrays) -> None:
+    def _begin(self, begun: Mask, seeds: Any) -> None:
         """Begin episodes: the task sets the start, and the other stages follow from it."""
         record = self.record
         begin = self._pipeline.begin
         everybody = bool(begun.all())
-        record.chosen = {}
         if not record.has_begun and not everybody:  # the first time all of them
             record.begun = begun | True
             record.run(None, begin)
@@ -131,8 +128,6 @@ class Loop:
         if seeds is not None:
             for stage in self._pipeline.stages:
                 stage.seed(begun, seeds[:: len(self.spec.agents)])
-        lead = record.shape
-        record.chosen = {name: values.reshape(lead)[()] for name, values in chosen.items()}
         record.run(None if everybody else begun, begin)
         record.count()
 

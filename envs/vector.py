@@ -79,14 +79,11 @@ class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Observation, ArrayLike, np.nd
         Args:
             seed: Drone i gets seed + i, or the i-th of N seeds; None leaves its stream as it is.
             options: `reset_mask`: bool, shape (N,): which drones; the others stay where they are.
-                By the names of the task's `reset_options`: numbers, one or shape (N,), in place of
-                those that the seed gives.
         """
-        given = dict(options or {})
-        mask = checked_mask(given.pop("reset_mask", None), self.num_envs)
-        chosen = {name: self._choice(name, value) for name, value in given.items()}
-        seeds = checked_seeds(seed, self.num_envs)
-        self.advance(self._no_actions(), mask, seeds, ~mask, chosen)
+        given = options or {}
+        check_names(given, ("reset_mask",), "options")
+        mask = checked_mask(given.get("reset_mask"), self.num_envs)
+        self.advance(self._no_actions(), mask, checked_seeds(seed, self.num_envs), ~mask)
         return self.observations, self._info(mask)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
@@ -104,11 +101,10 @@ class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Observation, ArrayLike, np.nd
         resets: np.ndarray | None = None,
         seeds: Seeds | None = None,
         frozen: np.ndarray | None = None,
-        chosen: Arrays | None = None,
     ) -> None:
-        """As `AdvancingVectorEnv.advance`; `chosen` as of `Loop.advance`."""
+        """See the base."""
         loop = self.loop
-        loop.advance(actions, resets, seeds, frozen, chosen)
+        loop.advance(actions, resets, seeds, frozen)
         self._take_results()
         if self.render_mode is not None:
             self._episodes = self._episodes + (0 if resets is None else resets)
@@ -139,15 +135,3 @@ class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Observation, ArrayLike, np.nd
         self.observations = joined(loop.spec, loop.observations)
         for name in ("rewards", "terminated", "truncated", "done", "out"):
             setattr(self, name, getattr(loop, name))
-
-    def _choice(self, name: str, value: object) -> np.ndarray:
-        check_names([name], ("reset_mask", *self.loop.task.reset_options), "options")
-        try:
-            values = np.asarray(value, np.float64)
-        except (TypeError, ValueError):
-            values = np.array(np.nan)
-        if values.shape not in ((), (self.num_envs,)) or not np.isfinite(values).all():
-            raise InputError(
-                f"{name}: expected a finite number, or shape ({self.num_envs},), got {value!r}"
-            )
-        return np.broadcast_to(values, self.num_envs).copy()

@@ -6,7 +6,7 @@ the number of a use, which is made of its name: a use that is switched on later 
 numbers of another. A batch of W worlds has the numbers of W single ones.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from math import prod
 from secrets import randbits
 from typing import Any
@@ -136,11 +136,11 @@ class Random(Kept):
         for noise in self._noises.values():
             noise.forget(ids)
 
-    def start(self, use: int, ids: Ids, chosen: Mapping[str, Array] | None = None) -> "Draw":
+    def start(self, use: int, ids: Ids) -> "Draw":
         """Begin an episode of the worlds `ids` by drawing its start."""
         self.episode[ids] += np.uint32(1)
         self._is_drawn[ids] = True
-        return Draw(self, use, ids, chosen)
+        return Draw(self, use, ids)
 
     def begin(self, ids: Ids) -> None:
         """Reset the worlds `ids`: an episode begins, unless its start was drawn before."""
@@ -170,41 +170,28 @@ def _keys(seeds: NDArray[np.uint64]) -> Words:
 
 
 class Draw:
-    """Draws numbers for the worlds that begin an episode; for the others it gives zeros.
+    """Draws numbers for the worlds that begin an episode; for the others it gives zeros."""
 
-    `chosen` has by name what a reset's options give in place of draws, shape (W, A, *size).
-    """
-
-    def __init__(
-        self, random: Random, use: int, ids: Ids, chosen: Mapping[str, Array] | None = None
-    ) -> None:
+    def __init__(self, random: Random, use: int, ids: Ids) -> None:
         self._random = random
         self._use = use
         self._ids = ids
-        self._chosen = chosen or {}
         self._words = np.empty((len(ids), 0), np.uint32)
         self._first = 0  # block that comes next
 
-    def uniform(
-        self, low: float, high: float, size: tuple[int, ...] = (), *, name: str = ""
-    ) -> Array:
+    def uniform(self, low: float, high: float, size: tuple[int, ...] = ()) -> Array:
         """Uniform numbers, float64, shape (W, A, *size), with `size` that of one drone.
 
-        Equal ends give that number, and a number is drawn all the same. Under `name` a reset's
-        options may give values in place of the draw.
+        Equal ends give that number, and a number is drawn all the same.
         """
         drawn = low + (high - low) * uniform(self._next(size))
-        return self._chosen.get(name, self._spread(drawn, size))
+        return self._spread(drawn, size)
 
-    def normal(self, scale: float, size: tuple[int, ...] = (), *, name: str = "") -> Array:
+    def normal(self, scale: float, size: tuple[int, ...] = ()) -> Array:
         """Normal numbers, mean 0, standard deviation `scale`, shape (W, A, *size)."""
         count = self._random.drones * prod(size)
         drawn = scale * normal(self._next(size, count % 2))[:, :count]
-        return self._chosen.get(name, self._spread(drawn, size))
-
-    def chosen(self, name: str) -> Array | None:
-        """Values that a reset's options give under that name, shape (W, A); None if none."""
-        return self._chosen.get(name)
+        return self._spread(drawn, size)
 
     def _next(self, size: tuple[int, ...], more: int = 0) -> Words:
         """The next words of each world that begins, from a new block on."""

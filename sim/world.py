@@ -77,9 +77,9 @@ class World(NotCopied):
         ids = self._ids(mask).tolist()
         self.random.seed(ids, [seeds[i] for i in ids])
 
-    def draw(self, mask: Array, chosen: Mapping[str, Array] | None = None) -> Draw:
-        """Begin an episode of the worlds of a mask; `chosen` as of `random.Draw`."""
-        return self.random.start(START, self._ids(mask), chosen)
+    def draw(self, mask: Array) -> Draw:
+        """Begin an episode of the worlds of a mask."""
+        return self.random.start(START, self._ids(mask))
 
     def reset(self, mask: Array, pose: InitialState) -> None:
         """Reset the worlds of the mask, bool, shape (W, A), to their rows of `pose`.

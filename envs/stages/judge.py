@@ -24,7 +24,7 @@ class Starts(Stage):
 
     def begin(self, record: Record) -> None:
         """Other stages follow from the start."""
-        record.draw = self._world.draw(record.begun, record.chosen)
+        record.draw = self._world.draw(record.begun)
         with self._task.memory.open("begin"):
             start = self._task.begin(record.begun, record.draw)
         self._task.memory.expand(record.shape)

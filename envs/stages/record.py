@@ -38,7 +38,6 @@ class Record:
         action: The last action that was flown, (W, A, k).
         received: The action that arrives at the controller.
         thrust: Of each rotor, N, (W, A, R).
-        chosen: What a reset's options give in place of draws, by name, (W, A).
         draw: Draws the numbers of episodes that begin.
         start: Of the drones that begin.
         state: At the end of the step.
@@ -57,7 +56,6 @@ class Record:
         leaving: Drones that leave the episode in this step; None: none.
     """
 
-    chosen: Mapping[str, Array]
     sent: Floats
     action: Floats
     received: Floats

@@ -91,8 +91,7 @@ class Elevation(Task):
     ## Start, termination, truncation
 
     The craft starts level, at rest and at hover thrust, its elevation uniform in target ± 1 m
-    (`start_band`); with `target=(low, high)` the target is drawn first, uniformly. A reset's
-    options may choose `target` and `start`, m.
+    (`start_band`); with `target=(low, high)` the target is drawn first, uniformly.
 
     *Terminated*: |E| above 3 m (`flight_band`) or a tilt above 60° at the end of a step, or contact
     during it (looked for every 0.02 s).
@@ -106,7 +105,6 @@ class Elevation(Task):
     metrics = (
         Metric(name="elevation_error", unit="m", settled=0.05, held=0.1, symbol="E", signed=True),
     )
-    reset_options = ("target", "start")
 
     def setup(self) -> None:
         """See the class."""
@@ -144,12 +142,8 @@ class Elevation(Task):
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """Level, at rest, near the target."""
         band = self.options.start_band
-        target = draw.uniform(*ends_of(self.options.target), name="target")
+        target = draw.uniform(*ends_of(self.options.target))
         start = draw.uniform(-band, band) + target
-        chosen = draw.chosen("start")
-        if chosen is not None:
-            start = chosen
-        self._check(target, start, mask)
         self.memory.target = target
         return InitialState(position=stack((0.0, 0.0, start)))
 
@@ -217,16 +211,3 @@ class Elevation(Task):
             frame="world, up",
             components=("elevation error", "rate of the error", "thrust over hover")[:size],
         )
-
-    def _check(self, target: Array, start: Array, mask: Array) -> None:
-        """Raise `InputError` for a target or start that a reset chose and that cannot be."""
-        room = self.vehicle.rest_height + AIR
-        low = mask & ~((target >= room) & (target <= FURTHEST))
-        if low.any():
-            raise InputError(f"target: expected {room:g} to {FURTHEST:g} m, got {target[low][0]}")
-        far = mask & ~((start >= room) & (abs(start - target) <= self.options.flight_band))
-        if far.any():
-            raise InputError(
-                f"start: expected at least {room:g} m and at most flight_band = "
-                f"{self.options.flight_band:g} m from the target, got {start[far][0]}"
-            )

@@ -76,7 +76,6 @@ class Task:
     Class attributes:
         Options: Dataclass of the task's options.
         metrics: Measures of how well it is done. The first is the headline.
-        reset_options: Names of draws that a reset's options may choose.
         min_drones, max_drones: Drones of one world; the task separates their starts.
         actions: Action levels at which the task can be flown.
         action, control_period, episode_length: Defaults of an `EnvConfig`.
@@ -99,7 +98,6 @@ class Task:
 
     Options: ClassVar[type[TaskOptions]] = TaskOptions
     metrics: ClassVar[tuple[Metric, ...]] = ()
-    reset_options: ClassVar[tuple[str, ...]] = ()
     min_drones: ClassVar[int] = 1
     max_drones: ClassVar[int] = 1
     actions: ClassVar[tuple[str, ...]] = LEVELS

@@ -18,10 +18,10 @@ from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rotorgram.envs import SingleEnv
+from rotorgram.envs import SingleEnv, register
 from rotorgram.envs.tasks.elevation import Elevation
 from rotorgram.models.errors import InputError
-from rotorgram.sim import PhysicsError
+from rotorgram.sim import InitialState, PhysicsError, stack
 
 ID = "rotorgram/Elevation-v0"
 HOVER = "rotorgram/Hover-v0"
@@ -54,13 +54,18 @@ def _env(env_id: str = ID, **options: Any) -> SingleEnv:
 
 
 class Flight:
-    """A loop with one drone that begins where it is told; its state can be written."""
+    """A loop with one drone that begins at some height, m; its state can be written."""
 
     def __init__(self, start: float, target: float = 5.0, **options: Any) -> None:
-        self.loop = loop_of(ID, **{"target": target, **options})
-        chosen = {"start": np.array([start]), "target": np.array([target])}
+        class Placed(Elevation):
+            def begin(self, mask: Any, draw: Any) -> InitialState:
+                super().begin(mask, draw)
+                return InitialState(position=stack((0.0, 0.0, start)))
+
+        register("env/Placed-v0", Placed)
+        self.loop = loop_of("env/Placed-v0", **{"target": target, **options})
         every = everyone(1)
-        self.loop.advance(zero_actions(1), every, [0], chosen=chosen)
+        self.loop.advance(zero_actions(1), every, [0])
         self.state = self.loop.world.state
 
     def step(self, action: float) -> None:

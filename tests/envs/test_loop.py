@@ -53,11 +53,20 @@ def test_wrong_seeds_are_refused_before_the_others_fly() -> None:
 
 
 def test_a_first_reset_that_is_refused_begins_nothing() -> None:
-    loop = loop_of(ID, 2)
+    refusals = [InputError("start: expected another one")]
+
+    class Refusing(registry.task_type(ID)):  # type: ignore[misc]
+        def begin(self, mask: Any, draw: Any) -> Any:
+            if refusals:
+                raise refusals.pop()
+            return super().begin(mask, draw)
+
+    register("Refusing-v0", Refusing)
+    loop = loop_of("Refusing-v0", 2)
     still = zero_actions(2)
     some = np.array([True, False])
-    with pytest.raises(InputError, match=r"^start: expected at least"):
-        loop.advance(still, everyone(2), chosen={"start": np.full(2, 1e5)})
+    with pytest.raises(InputError, match=r"^start: expected another"):
+        loop.advance(still, everyone(2))
     loop.advance(still, some, frozen=~some)
     assert abs(loop.telemetry["position"][:, 2] - 5.0).max() <= 1.0
 
@@ -205,6 +214,10 @@ def test_what_a_step_gave_stays_as_it_was(careless: str, num_envs: int) -> None:
 @one_or_several
 def test_a_task_may_give_constants_and_float32(num_envs: int) -> None:
     class Plain(registry.task_type(ID)):  # type: ignore[misc]
+        def begin(self, mask: Any, draw: Any) -> InitialState:
+            super().begin(mask, draw)
+            return InitialState(position=stack((0.0, 0.0, 4.5 + 0.0 * self.memory.target)))
+
         def outcome(self, state: Any) -> Any:
             outcome = super().outcome(state)
             height = np.float32(1) * np.asarray(state.position[..., 2], np.float32)
@@ -215,7 +228,7 @@ def test_a_task_may_give_constants_and_float32(num_envs: int) -> None:
     register("Plain-v0", Plain)
     loop = loop_of("Plain-v0", num_envs)
     still = zero_actions(num_envs)
-    loop.advance(still, everyone(num_envs), chosen={"start": np.full(num_envs, 4.5)})
+    loop.advance(still, everyone(num_envs))
     loop.advance(still)
     assert loop.rewards.dtype == np.float64
     assert loop.rewards.tolist() == [5.5] * num_envs

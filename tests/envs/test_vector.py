@@ -142,24 +142,6 @@ def test_a_mask_resets_some_and_leaves_the_others(env_id: str) -> None:
     assert not truncated.any()
 
 
-def test_targets_and_starts_of_ones_own() -> None:
-    env = LocalVectorEnv(ID, 3)
-    targets = np.array([3.0, 5.0, 400.0])
-    starts = np.array([2.5, 7.0, 399.0])
-    observations, info = env.reset(options={"target": targets, "start": starts})
-    assert info["z"].tolist() == starts.tolist()
-    assert info["goal_z"].tolist() == targets.tolist()
-    errors = (targets - starts).astype(np.float32)
-    np.testing.assert_array_equal(observations[:, 0], errors)
-    _, _, terminated, *_ = env.step(zero_actions(3))
-    assert not terminated.any()
-    # Without a start, the seed gives how far from the target it is: as with the env's own target.
-    plain, _ = env.reset(seed=1)
-    observations, info = env.reset(seed=1, options={"target": 50.0})
-    np.testing.assert_allclose(observations, plain, atol=1e-6)
-    np.testing.assert_allclose(info["z"], 50.0 - plain[:, 0], atol=1e-5)
-
-
 NOBODY = ({"reset_mask": np.zeros(2, bool)}, "reset_mask: .* one of them True")
 
 

@@ -9,12 +9,14 @@ import mujoco
 import numpy as np
 import pytest
 from pictures import HEXA, at
-from rotorgram.envs import LocalVectorEnv, SingleEnv
+from rotorgram.envs import LocalVectorEnv, SingleEnv, register
 from rotorgram.envs.parallel import LocalParallelEnv
+from rotorgram.envs.tasks import Elevation
 from rotorgram.models import InputError
 from rotorgram.rendering import Moment, NoOpenGL, live, window
 from rotorgram.rendering.gl import offscreen_context
 from rotorgram.rendering.stage import Stage
+from rotorgram.sim import InitialState, stack
 from swarms import RISE
 
 try:
@@ -58,11 +60,16 @@ def test_a_picture_of_one_drone_and_the_same_bits(env_id: str, vehicle: Any) -> 
 
 
 def test_a_picture_of_each_of_many() -> None:
-    envs = gym.make_vec(ENV_ID, num_envs=3, render_mode="rgb_array")
+    class Stairs(Elevation):
+        def begin(self, mask: Any, draw: Any) -> InitialState:
+            super().begin(mask, draw)
+            return InitialState(position=stack((0.0, 0.0, np.array([[4.0], [5.0], [6.0]]))))
+
+    register("Stairs-v0", Stairs)
+    envs = gym.make_vec("Stairs-v0", num_envs=3, render_mode="rgb_array")
     with pytest.raises(gym.error.ResetNeeded, match="render: expected a call of reset"):
         envs.render()
-    start = np.array([4.0, 5.0, 6.0])
-    envs.reset(seed=0, options={"target": 5.0, "start": start})
+    envs.reset(seed=0)
     low, middle, high = pictures = envs.render()
     envs.close()
     assert {picture.shape for picture in pictures} == {(180, 240, 3)}

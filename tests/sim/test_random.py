@@ -172,16 +172,6 @@ def test_draws_follow_each_other_in_blocks() -> None:
     assert len(np.unique(many[1])) == 150
 
 
-def test_chosen_values_replace_a_draw_and_move_no_other() -> None:
-    given = np.full((2, 1), 7.0)
-    with_choice = Draw(random_of(2, 1), 1, [0, 1], {"target": given})
-    without = Draw(random_of(2, 1), 1, [0, 1])
-    assert with_choice.uniform(0.0, 1.0, name="target") is given
-    without.uniform(0.0, 1.0, name="target")
-    after = with_choice.uniform(0.0, 1.0)
-    assert after.tolist() == without.uniform(0.0, 1.0).tolist()
-
-
 def test_what_was_given_stays_as_it_was() -> None:
     for shape in ((), (2, 1)):
         noise = random_of(*shape).noise("wind", 2)
