@@ -1,6 +1,6 @@
-"""Cost of a drone in a world of 1, 8, 32 and 100: physics alone, with the task, and over UDP.
+"""Cost of a drone in a world of 2, 8, 32 and 100: physics alone, with the task, and over UDP.
 
-    python studies/swarm.py [--drones 1 8 32 100] [--seconds 0.5] [--repeats 9] [--out FILE.json]
+    python studies/swarm.py [--drones 2 8 32 100] [--seconds 0.5] [--repeats 9] [--out FILE.json]
 
 A step is one of 0.02 s of `rotorgram/Formation-v0` with the vehicle of the paper, two physics
 steps, at hover. `apart` are as many worlds of one drone in one batch. Cases take turns within a
@@ -29,8 +29,9 @@ Step = Callable[[], object]
 
 def physics(drones: int, *, together: bool) -> Step:
     """A control step of a world, or of as many worlds of one drone."""
+    env_id = ENV if together else "rotorgram/Hover-v0"
     kind = {"drones": drones} if together else {}
-    env = LocalVectorEnv(ENV, drones, episode_length=EPISODE, **kind)
+    env = LocalVectorEnv(env_id, drones, episode_length=EPISODE, **kind)
     env.reset(seed=0)
     world = env.loop.world
     substeps = env.loop.vehicle.substeps(env.control_period)
@@ -67,7 +68,7 @@ def measure(counts: list[int], seconds: float, repeats: int) -> dict[str, dict[s
 
 def main() -> None:
     """Measure, print and write."""
-    drones = (1, 8, 32, 100)
+    drones = (2, 8, 32, 100)
     args = options(__doc__, drones=drones, seconds=0.5, repeats=9, out=Path).parse_args()
     found = measure(args.drones, args.seconds, args.repeats)
     rows = [(name, *(f"{time:,.1f}" for time in row.values())) for name, row in found.items()]

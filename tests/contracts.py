@@ -149,7 +149,7 @@ def effects_of(file: Path) -> dict[str, Any]:
 def stormy(env_id: str, file: Path) -> Case:
     """A vehicle with all its effects and a mass that is drawn."""
     effects = effects_of(file)
-    if "Payload" in env_id:  # it hangs one itself
+    if "Payload" in env_id or registry.task_type(env_id).max_drones > 1:  # it hangs none, or itself
         del effects["payload"], effects["cable"]
     drawn = {"mass": "uniform(0.9, 1.1)"}
     return Case(env_id, {"vehicle": file, "effects": effects, "randomize": drawn})
@@ -157,13 +157,11 @@ def stormy(env_id: str, file: Path) -> Case:
 
 def _vehicles() -> dict[str, Case]:
     """Each task with a third of the vehicles, each vehicle with a third of the tasks."""
-    alone = [env_id for env_id in TASKS if registry.task_type(env_id).min_drones == 1]
     cases = {}
-    for row, env_id in enumerate(alone):
+    for row, env_id in enumerate(name for name in TASKS if "Cable" not in name):
         for column, (name, file) in enumerate(FILES.items()):
             if (row + column) % 3 == 0:
-                case = stormy(env_id, file)
-                cases[f"{short(env_id)}, {name}"] = Case(env_id, {**case.options, "drones": 1})
+                cases[f"{short(env_id)}, {name}"] = stormy(env_id, file)
     return cases
 
 

@@ -50,9 +50,7 @@ class Shares(Draw):
         super().__init__(Random(()), 0, [0])
         self._shares = iter(shares)
 
-    def uniform(
-        self, low: float, high: float, size: tuple[int, ...] = (), *, name: str = ""
-    ) -> Any:
+    def uniform(self, low: float, high: float, size: tuple[int, ...] = ()) -> Any:
         share = next(self._shares)
         if hasattr(share, "shape"):
             return low + (high - low) * share

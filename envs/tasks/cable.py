@@ -23,7 +23,7 @@ from .goal import (
     swing_cost,
     with_payload,
 )
-from .swarm import APPROACH_WEIGHT, TINY, Swarm, SwarmOptions, ring
+from .swarm import APPROACH_WEIGHT, TINY, Swarm, SwarmOptions, ring, shared
 from .task import Outcome
 
 
@@ -85,7 +85,6 @@ class Cable(Swarm):
         Metric(name="payload_error", unit="m", settled=0.1, held=0.1, symbol="e"),
         *Swarm.metrics[1:],
     )
-    min_drones = 2
     max_drones = 32
 
     def setup(self) -> None:
@@ -154,10 +153,8 @@ class Cable(Swarm):
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """At rest in equilibrium, the payload off its goal."""
         away = self.options.start_band * self.gap
-        turn = draw.uniform(-math.pi, math.pi)[:, :1]  # one for all drones, as what follows
-        offset = draw.uniform(-away, away, (3,))[:, :1]
-        self.memory.turn = turn + np.zeros(self.shape)
-        ball = np.array(self.options.center) + offset + np.zeros((*self.shape, 3))
+        self.memory.turn = turn = shared(draw.uniform(-math.pi, math.pi))
+        ball = np.array(self.options.center) + shared(draw.uniform(-away, away, (3,)))
         azimuth = turn + self._azimuths
         half = self._tilt / 2
         sine = math.sin(half)

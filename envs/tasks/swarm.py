@@ -75,7 +75,9 @@ class Swarm(GoalTask):
         Metric(name="position_error", unit="m", settled=0.1, held=0.1, symbol="e"),
         Metric(name="clearance", unit="m", goal="high"),
     )
+    min_drones = 2
     max_drones = MAX_DRONES
+    has_radio = True
     action = "velocity"
     episode_length = 500
     worst_step = -1.0 - 2 * ROOM_WEIGHT + WORST_RATES
@@ -98,7 +100,6 @@ class Swarm(GoalTask):
             numbers.append(Number(f"{name} is there", "1", -1.0, 1.0))
         self.define_observation(self.band, numbers)
         self._radii = np.array([one.radius for one in members_of(vehicle, self.count)])
-        self.has_radio = self.count > 1
 
     def prepare_slots(self, slots: np.ndarray, further: Sequence[Number] = ()) -> None:
         """Prepare for goals at such offsets from the center, (A, 3), over the gap between them, and
@@ -112,7 +113,7 @@ class Swarm(GoalTask):
     @property
     def count(self) -> int:
         """A."""
-        return self.shape[1] if self.shape else 1
+        return self.shape[1]
 
     @property
     def gap(self) -> float:
@@ -126,21 +127,13 @@ class Swarm(GoalTask):
         """
         jitter = draw.uniform(-JITTER, JITTER, (3,)) * self.gap
         lots = draw.uniform(0.0, 1.0)
-        start = jitter + np.array(self.options.center)
-        if self.count == 1:
-            return start
         places = np.argsort(lots, axis=-1, kind="stable")
-        return start + grid(self.count)[places] * self.gap
+        return jitter + np.array(self.options.center) + grid(self.count)[places] * self.gap
 
     def further(self, state: State) -> list[Array]:
         """The numbers of the neighbours, shape (W, A, 7 k) in all."""
-        k = self.options.neighbours
-        if not k:
-            return []
-        if state.neighbours is None:
-            nothing = 0.0 * state.position[..., :1]
-            return [np.concat([nothing] * (7 * k), axis=-1)]
-        return [state.neighbours.reshape(*self.shape, 7 * k)]
+        assert state.neighbours is not None
+        return [state.neighbours.reshape(*self.shape, 7 * self.options.neighbours)]
 
     def ended(self, state: State) -> Array:
         """Whether a drone has touched anything, flipped over, or left for good, bool, (W, A)."""
@@ -170,30 +163,29 @@ class Swarm(GoalTask):
     def clearance(self, state: State) -> Array:
         """Distance between a drone's sphere, of `Vehicle.radius`, and the nearest other, m, (W, A).
 
-        Below 0 spheres overlap. A drone alone has the range of its radio.
+        Below 0 spheres overlap.
         """
-        if self.count == 1:
-            return self.options.radio_range + 0.0 * length(state.velocity)
         apart = length(state.position[:, :, None] - state.position[:, None])
         apart[:, np.arange(self.count), np.arange(self.count)] = np.inf
         return (apart - (self._radii[:, None] + self._radii)).min(axis=-1)
 
     def proximity_penalty(self, room: Array) -> Array:
         """Reward for a clearance, (W, A): 0 from a diameter on, `-ROOM_WEIGHT` where it is 0."""
-        radius = self._radii if self.shape else self.vehicle.radius
-        narrow = clip(1.0 - room / (2 * radius), 0.0, 2.0)
+        narrow = clip(1.0 - room / (2 * self._radii), 0.0, 2.0)
         return -ROOM_WEIGHT * narrow
 
     def goal(self, state: State) -> Array:
         """The slot of each drone."""
-        slots = self._slots if self.shape else self._slots[0]
-        return np.array(self.options.center) + slots + 0.0 * state.position
+        return np.array(self.options.center) + self._slots + 0.0 * state.position
+
+
+def shared(drawn: Array) -> Array:
+    """Numbers that the drones of a world share, (W, A): those of the first."""
+    return drawn[:, :1] + 0.0 * drawn
 
 
 def ring(count: int) -> np.ndarray:
     """Places on a level ring, neighbours 1 apart, shape (A, 3); of two drones they are 1 apart."""
-    if count == 1:
-        return np.zeros((1, 3))
     angle = 2 * np.pi * np.arange(count) / count
     places = np.stack((np.cos(angle), np.sin(angle), 0.0 * angle), axis=-1)
     return np.asarray(places * (0.5 / np.sin(np.pi / count)))
@@ -305,19 +297,15 @@ class Crossing(Swarm):
     def setup(self) -> None:
         """See the class."""
         radius = max(float(np.linalg.norm(ring(self.count)[0])), 1.0)  # of six
-        angle = 2 * math.pi * np.arange(self.count) / self.count
-        self._angles = angle if self.shape else 0.0
+        self._angles = 2 * math.pi * np.arange(self.count) / self.count
         self._radius = radius * self.gap
         self.reach = 2 * self._radius + 2 * JITTER * self.gap
         self.prepare()
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """At rest, level, on the ring."""
-        turn = draw.uniform(-math.pi, math.pi)
+        self.memory.turn = turn = shared(draw.uniform(-math.pi, math.pi))
         jitter = draw.uniform(-JITTER, JITTER, (3,)) * self.gap
-        if self.count > 1:
-            turn = turn[:, :1]  # one for all
-        self.memory.turn = turn + 0.0 * jitter[..., 0]
         position = self._opposite(turn + math.pi) + jitter
         return InitialState(position=position)
 
@@ -393,15 +381,10 @@ class Escort(Swarm):
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """At rest, level, in the cells of a grid about the target, by lot."""
-        ratio = draw.uniform(0.5, 2.0)
-        alpha = draw.uniform(-math.pi, math.pi)
-        beta = draw.uniform(-math.pi, math.pi)
-        if self.count > 1:  # one for all
-            ratio, alpha, beta = (x[:, :1] + 0.0 * x for x in (ratio, alpha, beta))
         memory = self.memory
-        memory.ratio = ratio
-        memory.alpha = alpha
-        memory.beta = beta
+        memory.ratio = shared(draw.uniform(0.5, 2.0))
+        memory.alpha = shared(draw.uniform(-math.pi, math.pi))
+        memory.beta = shared(draw.uniform(-math.pi, math.pi))
         memory.time = 0.0
         position = self.cells(draw) + self.target()[0]
         return InitialState(position=position)

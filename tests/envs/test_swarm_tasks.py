@@ -65,7 +65,7 @@ class Lots(Draw):
     def __init__(self) -> None:
         """It draws the same numbers for every world."""
 
-    def uniform(self, low: Any, high: Any, size: Any = (), *, name: str = "") -> Any:
+    def uniform(self, low: Any, high: Any, size: Any = ()) -> Any:
         return LOTS
 
 
@@ -135,7 +135,6 @@ def test_places_by_hand() -> None:
     expected = TABLES["swarm tasks: places"]
     corners = np.array(expected["ring of 4, times root 2"])
     assert ring(4) == pytest.approx(corners / 2**0.5)
-    assert ring(1).tolist() == expected["ring of 1"]
     assert line(3).tolist() == expected["line of 3"]
     assert grid(4).tolist() == expected["grid of 4"]
     for count in range(2, 30):
@@ -287,11 +286,16 @@ def test_eight_drones_cross_without_touching(crossing: LocalVectorEnv) -> None:
     assert last_errors.max() < 0.01
 
 
+def test_one_drone_is_no_swarm() -> None:
+    with pytest.raises(InputError, match=r"drones: expected 2 to 128 with .*Formation-v0, got 1"):
+        LocalVectorEnv(TASKS[0], 4)
+
+
 def test_what_orca_cannot_fly_is_one_sentence() -> None:
     alone = spec_with("rotorgram/Hover-v0", action="velocity")
     with pytest.raises(InputError, match="orca: expected a task for several drones, got"):
         Orca(alone)
-    positions = spec_with(TASKS[0], action="position")
+    positions = spec_with(TASKS[0], action="position", drones=2)
     with pytest.raises(InputError, match=r"orca: expected actions of the level velocity"):
         Orca(positions)
 
