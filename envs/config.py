@@ -335,9 +335,10 @@ class EnvConfig:
         vehicle = whole.load_vehicle()
         vehicle.substeps(self.control_period or 0.0)
         several = len(self.vehicle) > 1
-        if several and self.sensors:
-            got = ", ".join(self.sensors)
-            raise InputError(f"sensors: expected none with several vehicles, got {got}")
+        for name in ("sensors", "cameras"):
+            used = ", ".join(getattr(self, name))
+            if several and used:
+                raise InputError(f"{name}: expected none with several vehicles, got {used}")
         randomize = Randomization(self.randomize, None)
         settings = self.backend.settings
         check_world(vehicle, self.backend.name, self.drones, self.effects, randomize, settings)
@@ -396,7 +397,7 @@ def source_hash(task: type) -> str:
     digest = blake2b(digest_size=16)
     found = False
     for base in task.__mro__:
-        if base.__module__.partition(".")[0] in ("rotorgram", "builtins"):
+        if base.__module__.partition(".")[0] in ("rotorgram", "abc", "builtins"):
             continue
         try:
             source = inspect.getsource(sys.modules[base.__module__])

@@ -4,8 +4,6 @@ import os
 import re
 import sys
 from importlib import import_module
-from importlib.machinery import PathFinder
-from importlib.util import module_from_spec
 from typing import TYPE_CHECKING, Final
 
 import gymnasium
@@ -62,22 +60,9 @@ def load(env_id: str) -> str:
 
 
 def _import_here(module: str) -> None:
-    """Import an installed module, or else this one from the working folder.
-
-    Nothing else of that folder is imported: `queue.py` there does not take the place of Python's.
-    """
-    top = module.partition(".")[0]
+    """Import an installed module, or else one from the working folder, which is searched last."""
+    sys.path.append(os.getcwd())
     try:
-        if top not in sys.modules and PathFinder.find_spec(top) is None:
-            spec = PathFinder.find_spec(top, [os.getcwd()])
-            if spec is None or spec.loader is None:
-                raise ModuleNotFoundError(name=module)
-            sys.modules[top] = loaded = module_from_spec(spec)
-            try:
-                spec.loader.exec_module(loaded)
-            except BaseException:
-                del sys.modules[top]
-                raise
         import_module(module)
     except ModuleNotFoundError as error:
         if not module.startswith(error.name or "?"):

@@ -16,18 +16,9 @@ from .telemetry import quantities_of
 
 def make_task(config: EnvConfig, shape: tuple[int, ...] = (1, 1)) -> Task:
     """The task of a config, for W worlds of A drones. Raises `InputError`."""
-    env_id = config.env_id
-    task_class = registry.task_type(env_id)
-    for name in ("setup", "begin", "observe", "outcome"):
-        if getattr(task_class, name) is getattr(Task, name):
-            raise InputError(
-                f"{env_id}: expected a task with a method {name}(), "
-                f"got {task_class.__name__} without one"
-            )
-    task = task_class(config, config.load_vehicle(), shape)
-    for name in ("controller", "observation"):
-        if not hasattr(task, name):
-            raise InputError(f"{env_id}: expected setup() to set self.{name}, it does not")
+    task = registry.task_type(config.env_id)(config, config.load_vehicle(), shape)
+    if not hasattr(task, "observation"):
+        raise InputError(f"{config.env_id}: expected setup() to set self.observation, it does not")
     if task.config is not config:
         _check_kept(config, task.config)
     return task
@@ -97,7 +88,7 @@ def _pictures(task: Task) -> tuple[ArraySpec, ...]:
     config = task.config
     if not config.cameras:
         return ()
-    views = views_of(task, config.drones)
+    views = views_of(task)
     if not any(view.kind == "segmentation" for view in views):
         return arrays_of(views, ())
     from ..rendering.camera_model import objects_of

@@ -10,8 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...models.cameras import FARTHEST, View, chosen_views
-from ...models.errors import InputError
-from ...models.fleet import members_of
 from ...scenes import scenes_of
 from ...sim.random import SCENES, Random
 from ...sim.snapshots import Arrays, Snapshot
@@ -26,31 +24,9 @@ _MAX_THREADS = 16
 _UNITS = {"depth": "m"}
 
 
-def views_of(task: Task, drones: int) -> tuple[View, ...]:
+def views_of(task: Task) -> tuple[View, ...]:
     """What the option `cameras` of a task chooses. Raises `InputError`."""
-    words = task.config.cameras
-    vehicles = dict.fromkeys(members_of(task.vehicle, drones))
-    chosen = [chosen_views(words, vehicle.cameras) for vehicle in vehicles]
-    first = chosen[0]
-    expected = [view.name for view in first]
-    for views in chosen[1:]:
-        names = [view.name for view in views]
-        if names != expected:
-            wanted = ", ".join(expected)
-            raise InputError(f"cameras: expected {wanted} of all vehicles, got {names}")
-        for ours, its in zip(first, views, strict=True):
-            if _as_arrays(ours) != _as_arrays(its):
-                raise InputError(
-                    f"camera {ours.name}: expected one of the same size and rate on all vehicles, "
-                    "or the same in their world, got others"
-                )
-    return first
-
-
-def _as_arrays(view: View) -> object:
-    """What two vehicles must have in common; of a world there is one camera for all."""
-    camera = view.camera
-    return view.shape, camera.every, camera if not camera.carried else None
+    return chosen_views(task.config.cameras, task.vehicle.cameras)
 
 
 def arrays_of(views: Sequence[View], objects: Sequence[str]) -> tuple[ArraySpec, ...]:
@@ -107,7 +83,7 @@ class Pictures(Stage):
         self._shape = shape
         self._rows = shape[0] * shape[1]
         self._random = random
-        self.views = views_of(task, shape[1])
+        self.views = views_of(task)
         self._scenes = scenes_of(str(task.config.scene))
         self._threads = min(os.cpu_count() or 1, shape[0], _MAX_THREADS)
         parts = np.arange(shape[0]) % -(-self._threads // len(self._scenes))

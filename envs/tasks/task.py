@@ -5,6 +5,7 @@ single drone. It counts axes from the last (`position[..., 2]`), uses operators,
 functions, and never changes an array in place.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, ClassVar, Self
@@ -70,7 +71,7 @@ class Outcome:
     """By the names of `Task.metrics`, each of shape (W, A) or one number for all."""
 
 
-class Task:
+class Task(ABC):
     """Base of all tasks: derive, as `examples/landing.py` does, and `register` it.
 
     Class attributes:
@@ -160,28 +161,29 @@ class Task:
         """
         return config
 
+    @abstractmethod
     def setup(self) -> None:
         """Set `observation`, from `options` and `vehicle`.
 
         Raise `InputError` for an option that does not fit the vehicle. Attributes that are set here
         are constants.
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """Begin episodes: draw their numbers, shape (W, A, ...), and return the drones' starts.
 
         The mask, bool, shape (W, A), has the drones that begin one. Give numbers for all: starts
         and memory of the others are kept.
         """
-        raise NotImplementedError
 
-    def update_memory(self, state: State) -> None:
+    def update_memory(self, state: State) -> None:  # noqa: B027  # optional
         """Change the memory of episodes, such as gates that were passed. Optional.
 
         Called after a step, before `observe`. The memory of drones that did not fly is kept.
         """
 
+    @abstractmethod
     def observe(self, state: State) -> dict[str, Array]:
         """Observations: an array (W, A, *shape) for each of `observation`, by its name.
 
@@ -189,14 +191,13 @@ class Task:
         `outcome`, which is called next. The loop copies the arrays and gives them their dtype; they
         have to lie within the bounds of their specs.
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def outcome(self, state: State) -> Outcome:
         """Reward, end and metrics, after every step and reset.
 
         After a reset the metrics count; reward and end of a drone that did not fly are left out.
         """
-        raise NotImplementedError
 
     def crash(self, crashed: Array) -> Array:
         """Reward of drones that crash, (W, A), and 0 of others: what the worst step would cost for

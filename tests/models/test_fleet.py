@@ -170,5 +170,7 @@ def test_what_a_fleet_cannot_have_is_one_sentence() -> None:
         make_world(fleet, 1, drones=2, effects=lag)
     with pytest.raises(InputError, match=r"sensors: expected none with several vehicles, got imu"):
         LocalVectorEnv(FORMATION, 2, drones=2, vehicle="crazyflie2,paper", sensors={"imu": True})
+    with pytest.raises(InputError, match=r"cameras: expected none with several vehicles, got down"):
+        LocalVectorEnv(FORMATION, 2, drones=2, vehicle="crazyflie2,paper", cameras="down")
     with pytest.raises(InputError, match=r"vehicle: expected one for all drones that carry"):
         LocalVectorEnv("rotorgram/Cable-v0", 2, drones=2, vehicle="crazyflie2,paper")
