@@ -12,8 +12,6 @@ if TYPE_CHECKING:
 
 _OF_ONE_AGENT = ("server", "num_envs", "codec", "record")
 """Flags that --agents excludes."""
-_OF_AGENTS = ("when_lost", "patience")
-"""Flags that need --agents."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,10 +31,6 @@ class Sim(BackendFlags, WireFlags):
     agents: Words = ()
     """Several agents in place of one --server: HOST:PORT of each. They fly one world, and share its
     drones evenly in their order."""
-    when_lost: Literal["hold", "land", "end"] = "hold"
-    """With --agents, what a lost agent's drones do: hold, land or end (rotors stand still)."""
-    patience: float = 10.0
-    """Seconds that the world waits for the command of one of --agents."""
     codec: Literal["binary", "text"] = "binary"
     """binary, or the paper's text."""
     timeout: float = 120.0
@@ -59,12 +53,10 @@ class Sim(BackendFlags, WireFlags):
         from ..udp import LinkConfig, Simulator
 
         several = "agents" in self.given
-        wrong = "with" if several else "without"
-        others = _OF_ONE_AGENT if several else _OF_AGENTS
-        for name in others:
-            if name in self.given:
+        for name in _OF_ONE_AGENT:
+            if several and name in self.given:
                 flag = f"--{name.replace('_', '-')}"
-                raise InputError(f"{flag}: cannot be used {wrong} --agents")
+                raise InputError(f"{flag}: cannot be used with --agents")
         agents = [parse_address(agent) for agent in self.agents] if several else None
         simulator = Simulator(
             self.env_config(backend=self.backend),
@@ -77,8 +69,6 @@ class Sim(BackendFlags, WireFlags):
             key_file=self.key_file,
             insecure=self.insecure,
             record=self.record,
-            when_lost=self.when_lost,
-            patience=self.patience,
         )
         links = simulator.rules.links
         there = f"{len(links)} agents" if several else f"the agent at {self.server}"

@@ -142,24 +142,6 @@ class Loop:
         if active is None or active.any():
             record.run(active, self._pipeline.observe)
 
-    def retire(self, drones: Array) -> None:
-        """Take drones out of the running episode, bool, shape (N,).
-
-        Their rotors stand still. They get no reward and no flag.
-        """
-        leaving = clock.drones_of(self.record, drones) & ~self.record.out
-        if leaving.any():
-            self.record.end(leaving)
-            self._take_ends()
-
-    def land(self, drones: Array) -> None:
-        """Bring drones down until they touch something, then retire them; bool, shape (N,).
-
-        From the next step on their actions are ignored. Raises `InputError` where the vehicle
-        cannot be flown at the level `velocity`.
-        """
-        self._pipeline.landing.prepare(self.record, clock.drones_of(self.record, drones))
-
     def snapshot(self) -> Snapshot:
         """Copies of all arrays that a later step depends on, by name.
 
@@ -216,11 +198,8 @@ class Loop:
         self.rewards = np.array(record.reward).reshape(count)
         self.terminated = np.array(record.terminated).reshape(count)
         self.truncated = np.array(record.truncated).reshape(count)
-        self._take_ends()
-
-    def _take_ends(self) -> None:
-        self.done = np.array(self.record.done).reshape(self.num_envs)
-        self.out = np.array(self.record.out).reshape(self.num_envs)
+        self.done = np.array(record.done).reshape(count)
+        self.out = np.array(record.out).reshape(count)
 
     @property
     def steps(self) -> NDArray[np.int64]:

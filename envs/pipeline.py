@@ -10,7 +10,6 @@ from .stages.ends import Ends
 from .stages.flight import Control, Flight, StandStill
 from .stages.history import History, ObservationDelay
 from .stages.judge import Judge, Remember, Starts
-from .stages.landing import Landed, Landing
 from .stages.measure import Measure, Readings, Sensing
 from .stages.pictures import Pictures
 from .stages.radio import Radio
@@ -31,7 +30,6 @@ class Pipeline:
         begin: What all of them do when an episode begins.
         observe: Steps from `Measure` on.
         pictures: Specs of pictures.
-        landing: The part of flight that brings drones down.
     """
 
     def __init__(
@@ -55,8 +53,7 @@ class Pipeline:
         # An estimate is computed once in a control step, and so is a thrust that follows from it.
         often = getattr(controller, "every_step", False) and not config.estimated
         held = 1 if often else substeps
-        self.landing = Landing(world, look, held * task.vehicle.timestep, config.effects)
-        parts: list[Stage] = [Control(controller, look), self.landing]
+        parts: list[Stage] = [Control(controller, look)]
         if shape[1] > 1:
             parts.append(StandStill(world))
 
@@ -74,7 +71,7 @@ class Pipeline:
         if config.history > 1:
             names = tuple(array.name for array in observed(task))
             observing.append(History(config.history, names, len(world.shape)))
-        observing += [Landed(), Ends(config.env_id, world.shape, task.episode_length)]
+        observing.append(Ends(config.env_id, world.shape, task.episode_length))
 
         self.stages = [Starts(task, world), *flying, *observing]
         self.fly = [stage.step for stage in flying]

@@ -5,7 +5,7 @@
 Eight drones fly in one world, each by an agent process of its own (`RemoteEnv`), through relays
 that lose 30 % of the datagrams, double 10 % and reorder 10 %. At random moments an agent is killed
 (SIGKILL) and started again, or stopped (SIGSTOP) for 2 s, which is longer than the world waits.
-The drone of an agent that is lost lands.
+The drone of an agent that is lost holds.
 
 An action is computed from every bit of the observation before it. A second world, in process, gets
 the seeds, the absences and the actions that the simulator took: every bit of every State has to be
@@ -40,7 +40,6 @@ from rotorgram.udp.protocol.messages import Command
 ENV_ID = "benchmark/Row-v0"
 FAULTS = {"drop": 0.3, "duplicate": 0.1, "reorder": 0.1}
 AGENTS, PATIENCE, STOPPED = 8, 1.0, 2.0  # drones and agents; s
-POLICY = "land"
 ANY = ("127.0.0.1", 0)
 
 RELAYS = (Path(__file__).parents[1] / "tests/relay.py").read_text()
@@ -118,8 +117,6 @@ class Twin:
             self.taken = sum(one.episode < rules.episodes for one in rules.absences)
         for absence in rules.absences[self.taken :]:
             self.absent = self.absent | (np.arange(AGENTS) == absence.agent)
-            mask = np.arange(AGENTS) == absence.agent
-            loop.land(mask)
             self.counts[f"absent_{absence.participation}"] += 1
         self.taken = len(rules.absences)
         if isinstance(cause, Command):
@@ -147,7 +144,7 @@ def fly_eight(kills: int, dice: random.Random) -> dict[str, object]:
     relays = launch(RELAYS, [[("127.0.0.1", port) for port in ports], FAULTS])
     addresses = [tuple(address) for address in json.loads(relays.stdout.readline())]
     simulator = Simulator(
-        ENV_ID, agents=addresses, drones=AGENTS, bind=ANY, patience=PATIENCE, when_lost=POLICY,
+        ENV_ID, agents=addresses, drones=AGENTS, bind=ANY, patience=PATIENCE,
         config=LinkConfig(timeout=600),
     )  # fmt: skip
     rules = simulator.rules

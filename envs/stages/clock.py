@@ -51,7 +51,12 @@ def mask_of(record: Record, given: object) -> Mask:
 
     Raises `InputError`.
     """
-    drones = drones_of(record, given)
+    expected = (record.out.size,)
+    if not isinstance(given, np.ndarray) or (given.dtype, given.shape) != (np.bool_, expected):
+        raise InputError(
+            f"resets, frozen: expected bool of shape {expected}, got {shortened(given)}"
+        )
+    drones: Mask = given.reshape(record.shape)[()]
     several = drones.ndim > 0 and drones.shape[1] > 1
     if several and not (drones == drones[:, :1]).all():
         raise InputError(
@@ -59,14 +64,3 @@ def mask_of(record: Record, given: object) -> Mask:
             "got some of them"
         )
     return drones
-
-
-def drones_of(record: Record, given: object) -> Mask:
-    """A mask of shape (N,) as one of shape (W, A). Raises `InputError`."""
-    expected = (record.out.size,)
-    if not isinstance(given, np.ndarray) or (given.dtype, given.shape) != (np.bool_, expected):
-        raise InputError(
-            f"resets, frozen: expected bool of shape {expected}, got {shortened(given)}"
-        )
-    mask: Mask = given.reshape(record.shape)[()]
-    return mask

@@ -35,8 +35,6 @@ class Ends(Stage):
         terminated = self._nobody | record.ended
         truncated = (record.steps >= self._length) > terminated
         self._check(record, reward)
-        if record.leaving is not None:
-            record.end(record.leaving)
         flying = record.flown
         if record.anyone_out:
             flying = ~record.out if flying is None else flying & ~record.out

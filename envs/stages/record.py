@@ -52,8 +52,6 @@ class Record:
         out: Drones whose own episode has ended, (W, A).
         done: Drones of worlds whose episodes have all ended, (W, A).
         waiting: Drones that must be reset before they fly, (W, A).
-        landing: Drones that land by themselves, (W, A).
-        leaving: Drones that leave the episode in this step; None: none.
     """
 
     sent: Floats
@@ -74,7 +72,6 @@ class Record:
     reward: Floats
     terminated: Mask
     truncated: Mask
-    landing: Mask
     scenes: NDArray[np.int64]
     said: Floats
     heard: Floats
@@ -89,7 +86,6 @@ class Record:
         nobody = np.zeros(shape, bool)[()]
         self.flown: Mask | None = None
         self.begun: Mask | None = None
-        self.leaving: Mask | None = None
         self.steps: NDArray[np.int64] = np.zeros(shape, np.int64)[()]
         self.out = self.done = self.terminated = self.truncated = nobody
         self.waiting = ~nobody
@@ -152,7 +148,7 @@ class Record:
                     known[name] = array.copy()[()]
                 else:
                     known.setdefault(part, {})[name] = array.copy()[()]
-        self.flown = self.begun = self.leaving = None
+        self.flown = self.begun = None
         self.count()
 
     @property
@@ -169,7 +165,6 @@ class Record:
         """A drone that does not fly gets no reward and no end."""
         self.reward = self._nothing
         self.terminated = self.truncated = self._nobody
-        self.leaving = None
 
     def lose(self) -> None:
         """The physics failed: the drones that flew must be reset."""

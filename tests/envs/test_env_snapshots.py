@@ -86,23 +86,6 @@ def test_results_of_the_snapshot_are_back() -> None:
     assert bits(dict(env.telemetry)) == telemetry
 
 
-def test_drones_that_land_go_on_landing() -> None:
-    env: Any = gym.make_vec(HOVER, num_envs=2).unwrapped
-    env.reset(seed=1)
-    env.loop.land(np.array([True, False]))
-    flight(env, 3)
-    snapshot = env.snapshot()
-    first = flight(env, 5)
-    other: Any = gym.make_vec(HOVER, num_envs=2).unwrapped
-    before = other.snapshot()
-    other.restore(snapshot)
-    assert flight(other, 5) == first
-    other.restore(before)
-    env.reset(seed=2)
-    other.reset(seed=2)
-    assert flight(other, 5) == flight(env, 5)
-
-
 def test_another_number_of_drones_is_refused() -> None:
     two: Any = gym.make_vec(HOVER, num_envs=2).unwrapped
     three: Any = gym.make_vec(HOVER, num_envs=3).unwrapped

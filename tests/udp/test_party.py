@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 import pytest
 from links import HERE, NONCE, hello, layout, outgoing
-from rotorgram.models.errors import InputError
 from rotorgram.udp.protocol import binary
 from rotorgram.udp.protocol.client import Client, LinkConfig
 from rotorgram.udp.protocol.errors import LinkError, PeerSilent, Refused
@@ -26,15 +25,13 @@ TIMEOUT = 60.0
 class World:
     """Two drones; it notes what is done to it."""
 
-    def __init__(self, can_land: bool = True) -> None:
+    def __init__(self) -> None:
         self.height = np.zeros((2, 1), np.float32)
         self.rewards = np.zeros(2)
         self.terminated = self.truncated = self.out = np.zeros(2, bool)
         self.telemetry: dict[str, Any] = {}
         self.flown: list[list[float]] = []
         self.seeds: list[list[int] | None] = []
-        self.can_land = can_land
-        self.landed = self.retired = np.zeros(2, bool)
 
     @property
     def observations(self) -> dict[str, Any]:
@@ -45,37 +42,24 @@ class World:
             assert resets.all()
             self.seeds.append(None if seeds is None else seeds.tolist())
             self.height = np.zeros((2, 1), np.float32)
-            self.landed = self.retired = np.zeros(2, bool)
             return
         self.flown.append(actions[:, 0].tolist())
         self.height = self.height + actions
-
-    def land(self, drones: Any) -> None:
-        if not self.can_land:
-            raise InputError("no rotors")
-        self.landed = self.landed | drones
-
-    def retire(self, drones: Any) -> None:
-        self.retired = self.retired | drones
 
 
 class Swarm:
     """Both sides of a world of two drones, each flown by an agent of its own."""
 
-    def __init__(
-        self, policy: str = "hold", shares: tuple[list[int], ...] = ([0], [1]), **world: bool
-    ) -> None:
+    def __init__(self, shares: tuple[list[int], ...] = ([0], [1])) -> None:
         self.now = 0.0
-        self.world = World(**world)
+        self.world = World()
         self.layout = layout(len(shares[0]))
         config = LinkConfig(timeout=TIMEOUT)
         links = []
         for i, rows in enumerate(shares):
             client = Client(hello(70 + i), self.layout, config, draw_session=lambda i=i: 80 + i)
             links.append(AgentLink(i, ("127.0.0.1", 1000 + i), client, np.array(rows)))
-        self.rules = SeveralAgents(
-            self.world, layout(2), 0.1, links, when_lost=policy, patience=PATIENCE
-        )
+        self.rules = SeveralAgents(self.world, layout(2), 0.1, links, patience=PATIENCE)
         self.agents = [self.agent() for _ in shares]
         self.states: list[list[State]] = [[], []]
         self.closed = ["", ""]
@@ -137,9 +121,9 @@ class Swarm:
         return [link.participation for link in self.rules.links]
 
 
-def begun(policy: str = "hold") -> Swarm:
+def begun() -> Swarm:
     """A world in which both have flown a step."""
-    swarm = Swarm(policy)
+    swarm = Swarm()
     swarm.pump()
     for number in (0, 1):
         swarm.say(number, FLY, number + 1.0)
@@ -173,9 +157,8 @@ def test_all_have_to_ask_for_a_reset() -> None:
     assert swarm.rules.absences == []
 
 
-@pytest.mark.parametrize("policy", ["hold", "land", "end"])
-def test_the_policy_flies_the_drones_of_a_silent_agent(policy: str) -> None:
-    swarm = begun(policy)
+def test_the_drones_of_a_silent_agent_hold() -> None:
+    swarm = begun()
     swarm.say(0, FLY, 1.0)
     swarm.pump()
     swarm.wait(PATIENCE - 0.1)
@@ -183,8 +166,6 @@ def test_the_policy_flies_the_drones_of_a_silent_agent(policy: str) -> None:
     swarm.wait(0.2)
     assert swarm.participations[1] == "ready"  # in a new session
     assert swarm.world.flown[1:] == [[1.0, 0.0]]
-    assert swarm.world.landed.tolist() == [False, policy == "land"]
-    assert swarm.world.retired.tolist() == [False, policy == "end"]
     (absence,) = swarm.rules.absences
     assert absence == (1, 1, 1, "coming")
     swarm.say(1, FLY, 7.0)  # it comes back, and gets State 1 of the next episode
@@ -214,12 +195,11 @@ def test_an_agent_that_is_started_anew_flies_from_the_next_episode_on() -> None:
 
 
 def test_an_agent_that_asks_for_a_reset_before_the_others_waits_for_them() -> None:
-    swarm = begun("end")
+    swarm = begun()
     swarm.say(1, RESET)
     swarm.say(0, FLY, 3.0)
     swarm.pump()
     assert swarm.world.flown[1:] == [[3.0, 0.0]]
-    assert swarm.world.retired.tolist() == [False, True]
     assert swarm.participations == ["flying", "waiting"]
     assert swarm.rules.absences == [(1, 1, 1, "waiting")]
     swarm.say(0, RESET, seed=4)
@@ -254,13 +234,8 @@ def test_an_agent_that_came_back_does_not_hide_the_seeds_of_the_others() -> None
     assert swarm.participations == ["flying"] * 2
 
 
-def test_a_vehicle_that_cannot_land_is_not_flown_with_that_policy() -> None:
-    with pytest.raises(InputError, match="no rotors"):
-        Swarm("land", can_land=False)
-
-
 def test_different_orders_of_one_agent_close_its_link() -> None:
-    swarm = Swarm("hold", ([0, 1],))
+    swarm = Swarm(([0, 1],))
     swarm.pump()
     orders = np.array([FLY, FREEZE], np.uint8)
     swarm.send(0, np.zeros((2, 1), np.float32), orders)

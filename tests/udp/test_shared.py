@@ -150,9 +150,9 @@ def fly_several(
 
 def in_process(
     drones: int, episodes: int, act: Callable[[int, int, int], np.ndarray] = action_of,
-    lost: tuple[int, int, str] | None = None, **options: Any,
+    lost: tuple[int, int] | None = None, **options: Any,
 ) -> dict[int, list[list[Step]]]:  # fmt: skip
-    """The same in one process; `lost`: a drone, a step of the first episode, and its policy."""
+    """The same in one process; `lost`: a drone, and a step of the first episode."""
     loop = Loop(EnvConfig.from_keywords(RISE, drones=drones, **options))
     seen: dict[int, list[list[Step]]] = {drone: [] for drone in range(drones)}
     for episode in range(episodes):
@@ -169,8 +169,6 @@ def in_process(
             if lost and episode == 0 and step >= lost[1]:
                 victim = np.arange(drones) == lost[0]
                 actions[victim] = 0.0
-                if step == lost[1] and lost[2] != "hold":
-                    (loop.land if lost[2] == "land" else loop.retire)(victim)
             loop.advance(actions)
             rows = loop.observations["observation"]
             step = step + 1
@@ -210,13 +208,12 @@ def heard(process: subprocess.Popen[str], word: str) -> None:
     raise AssertionError(f"never said {word}: {process.stderr.read()}")
 
 
-@pytest.mark.parametrize("policy", ["hold", "land", "end"])
-def test_one_that_is_killed_follows_its_policy_and_comes_back(policy: str) -> None:
+def test_drones_of_one_that_is_killed_hold_and_it_comes_back() -> None:
     agents = free_ports(3)
     seen = {}
     others = [threading.Thread(target=fly_one, args=(agents[i], i, 3, seen, calm)) for i in (0, 2)]
     victim = launch(VICTIM, agents[1][1])
-    with shared(agents, 3, episode_length=LONG, patience=1.0, when_lost=policy) as running:
+    with shared(agents, 3, episode_length=LONG, patience=1.0) as running:
         for thread in others:
             thread.start()
         heard(victim, "20")
@@ -233,7 +230,7 @@ def test_one_that_is_killed_follows_its_policy_and_comes_back(policy: str) -> No
     assert loss.episode == 1
     assert 20 <= loss.step < LONG - 1
     assert loss.participation == "coming"
-    expected = in_process(3, 3, calm, (1, loss.step, policy), episode_length=LONG)
+    expected = in_process(3, 3, calm, (1, loss.step), episode_length=LONG)
     assert [seen[i][0] for i in (0, 2)] == [expected[i][0] for i in (0, 2)]
     assert all(loss.agent != 1 or loss.participation != "left" for loss in later)
 
@@ -324,39 +321,3 @@ def test_this_side_is_no_agent() -> None:
     for several in ({"agents": [here]}, {"server": here}):
         with pytest.raises(InputError, match="server: expected the address of an agent, got that"):
             Simulator(RISE, bind=here, **several)
-
-
-def test_a_landing_drone_comes_down_at_its_speed_and_is_then_out(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    loop = Loop(EnvConfig.from_keywords(RISE, drones=2, episode_length=2000))
-    nothing = np.zeros((2, 1), np.float32)
-    loop.advance(nothing, np.ones(2, bool), [1, 1])
-    start = loop.world.state.position.copy()
-    outcome = type(loop.task).outcome
-    monkeypatch.setattr(
-        type(loop.task), "outcome", lambda task, state: flying_on(outcome(task, state))
-    )
-    loop.land(np.array([False, True]))
-    speeds = []
-    while not loop.out[1]:
-        loop.advance(nothing)
-        speeds.append(loop.world.state.velocity[0, 1, 2])
-        assert len(speeds) < 1500
-    assert min(speeds) == pytest.approx(-0.7, abs=0.01)
-    assert loop.world.state.position[0, 1, :2] == pytest.approx(start[0, 1, :2], abs=0.01)
-    assert loop.world.state.position[0, 1, 2] < 1.0
-    assert loop.out.tolist() == [False, True]
-    assert loop.world.state.position[0, 0] == pytest.approx(start[0, 0], abs=1e-9)
-    for _ in range(3):
-        loop.advance(nothing)
-    assert loop.telemetry["thrust"][1].tolist() == [0.0] * 4
-    loop.advance(nothing, np.ones(2, bool), [1, 1])
-    loop.advance(nothing)
-    assert loop.world.state.position[0] == pytest.approx(start[0], abs=1e-9)
-
-
-def flying_on(outcome: Any) -> Any:
-    """Without an end."""
-    object.__setattr__(outcome, "terminated", outcome.terminated & False)
-    return outcome

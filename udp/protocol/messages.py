@@ -18,10 +18,6 @@ MAX_UINT64 = (1 << 64) - 1  # largest session, sequence number, nonce and seed
 MAX_TEXT = 512  # longest reason, bytes of UTF-8
 MAX_SPEC = 1 << 22  # longest spec, bytes of UTF-8
 
-POLICIES = ("hold", "land", "end")
-"""What drones do whose agent is lost: they take the action that changes nothing, they descend
-until they touch something, or their rotors stand still."""
-
 FLY = 0
 RESET = 1
 FREEZE = 2  # order to a drone: fly its action, reset instead of it, or do nothing

@@ -51,9 +51,6 @@ class SwarmWorld(World, Protocol):
     def out(self) -> Mask:
         """Drones whose episode has ended while others fly on, shape (N,)."""
 
-    def land(self, drones: Mask) -> None: ...
-    def retire(self, drones: Mask) -> None: ...
-
 
 Participation = Literal["coming", "ready", "flying", "waiting", "left"]
 """What an agent does in the running episode.
@@ -67,7 +64,7 @@ Participation = Literal["coming", "ready", "flying", "waiting", "left"]
 
 
 class Absence(NamedTuple):
-    """An agent whose drones are flown by its policy until the end of an episode."""
+    """An agent whose drones hold until the end of an episode."""
 
     agent: int
     """Its number, from 0."""
@@ -286,9 +283,9 @@ class SeveralAgents(WorldRules):
 
     The world begins when all agents have come, and steps when all that fly have answered. It begins
     another episode when all that take part have asked for a reset. An agent that asks while others
-    fly waits, and its drones do meanwhile what its policy says; so do those of an agent that was
-    silent for `patience`, was started anew or closed. An agent that comes back takes part again
-    from the next episode on.
+    fly waits, and its drones hold meanwhile: they take the action that changes nothing. So do those
+    of an agent that was silent for `patience`, was started anew or closed. An agent that comes back
+    takes part again from the next episode on.
 
     Attributes:
         absences: Every `Absence`: with the seeds and the actions they determine each number.
@@ -298,7 +295,6 @@ class SeveralAgents(WorldRules):
     """
 
     world: SwarmWorld
-    when_lost: str
     patience: float
 
     def __post_init__(self) -> None:
@@ -307,8 +303,6 @@ class SeveralAgents(WorldRules):
         self.episodes = self.steps = 0
         self.seed: int | None = None
         self._due: list[AgentLink] = []  # of States
-        if self.when_lost == "land":  # raises where the vehicle cannot
-            self.world.land(np.zeros(self.layout.drones, bool))
 
     # ---- episodes and steps
 
@@ -401,7 +395,7 @@ class SeveralAgents(WorldRules):
         return True
 
     def _lose(self, link: AgentLink, participation: Participation, why: str = "") -> None:
-        """The policy of an agent flies its drones for the rest of the episode."""
+        """Let the drones of an agent hold for the rest of the episode."""
         flew = link.participation == "flying" and not self._is_out(link)
         link.participation = participation
         if participation != "waiting":
@@ -409,21 +403,13 @@ class SeveralAgents(WorldRules):
         if flew:
             self._let_go(link)
         if flew and why:
-            notice = f"{link.name} is lost ({why}): {self.when_lost}"
-            link.client.statistics.notice(notice)
+            link.client.statistics.notice(f"{link.name} is lost ({why}): its drones hold")
         if len(self._who("left")) == len(self.links):
             self.reason = why
 
     def _let_go(self, link: AgentLink) -> None:
-        """Leave its drones to its policy."""
         absence = Absence(link.number, self.episodes, self.steps, link.participation)
         self.absences.append(absence)
-        mask = np.zeros(self.layout.drones, bool)
-        mask[link.rows] = True
-        if self.when_lost == "land":
-            self.world.land(mask)
-        elif self.when_lost == "end":
-            self.world.retire(mask)
 
     def _is_out(self, link: AgentLink) -> bool:
         """Whether all of its drones are out."""

@@ -21,7 +21,7 @@ from ..protocol import binary
 from ..protocol.auth import Key, read_keys
 from ..protocol.client import Address, Client, LinkConfig, largest_datagram, new_session
 from ..protocol.errors import LinkError
-from ..protocol.messages import POLICIES, Command, Hello
+from ..protocol.messages import Command, Hello
 from ..protocol.party import (
     NO_RESET,
     AgentLink,
@@ -65,8 +65,6 @@ class Simulator(NotCopied):
         config: Times of the exchange. `timeout`: longest wait for an agent that is to come, or to
             come back, s.
         key_file: As `AgentSettings`, and so are `insecure` and `record`.
-        when_lost: What the drones of one of several agents do when it is lost: `hold` (the action
-            that changes nothing), `land` (`Loop.land`) or `end` (rotors stand still).
         patience: Longest wait for a Command of one of several agents, s.
         keywords: As of `EnvConfig.from_keywords`, with an id: `drones` of each world, `vehicle` …
 
@@ -100,13 +98,11 @@ class Simulator(NotCopied):
         key_file: Path | str | None = None,
         insecure: bool = False,
         record: Path | str | None = None,
-        when_lost: str = "hold",
         patience: float = 10.0,
         **keywords: object,
     ) -> None:
         check("codec", Choice(("binary", "text")), codec)
         check("patience", Limits(0, unit="s", above=True), patience)
-        check("when_lost", Choice(POLICIES), when_lost)
         by_text = codec == "text"
         if agents is not None:
             if not agents:
@@ -136,7 +132,7 @@ class Simulator(NotCopied):
                 raise InputError(f"env: expected a registered task for several drones, got {env!r}")
             else:
                 world = cast(SwarmWorld, stepped)
-                rules = SeveralAgents(world, layout, period, links, when_lost, patience)
+                rules = SeveralAgents(world, layout, period, links, patience)
             self.stepped = stepped
             self.spec = spec
             self.address: Address = port.address
