@@ -37,8 +37,6 @@ class Sim(BackendFlags, WireFlags):
     """Give up when the agent has been silent for so many seconds."""
     drop: float = 0.0
     """Lose each datagram, sent or received, with this probability: tries an agent under loss."""
-    drop_seed: int = 0
-    """The same seed loses the same datagrams."""
     view: bool = False
     """Show up to 16 drones in a window. Lock-step does not wait for it. Keys: docs/viewing.md."""
     realtime: bool = False
@@ -65,7 +63,7 @@ class Sim(BackendFlags, WireFlags):
             num_envs=self.num_envs,
             bind=parse_address(self.bind),
             codec=self.codec,
-            config=LinkConfig(timeout=self.timeout, drop=self.drop, drop_seed=self.drop_seed),
+            config=LinkConfig(timeout=self.timeout, drop=self.drop),
             key_file=self.key_file,
             insecure=self.insecure,
             record=self.record,

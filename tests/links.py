@@ -94,9 +94,9 @@ def simulator(
 def agent(
     refusal: str = "", *, of: Layout = ONE, sealed: bool = False, slots: int = 1, **rest: Any
 ) -> Server:
-    keys = [Key(SECRET, "agent")] if sealed else []
+    key = Key(SECRET, "agent") if sealed else None
     rest = {"draw_nonce": lambda: NONCE, "text_layout": lambda: ONE, **rest}
-    return Server(lambda _: refusal or of, slots=slots, keys=keys, **rest)
+    return Server(lambda _: refusal or of, slots=slots, key=key, **rest)
 
 
 def outgoing(side: Client | Server) -> Any:

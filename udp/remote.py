@@ -102,8 +102,6 @@ class RemoteEnv(_Remote, gym.Env[Observation, ArrayLike]):
             60.
         timeout: Longest wait for an answer from it, s, before another may take its slot; 30. While
             it computes, it says so.
-        max_datagram: Largest datagram, bytes, a seal not counted, at least 256. None: 65,483 on
-            loopback, 1,200 elsewhere.
         key_file: File with the key that the simulators have too (`rotorgram key`). With it any
             address is allowed, because only holders of the key can take part.
         insecure: Allow an address that is not loopback without a key.

@@ -698,7 +698,7 @@ def test_a_key_loss_and_a_journal(tmp_path: Path, capsys: Capsys) -> None:
     )  # fmt: skip
     simulator = start(
         "sim", "--server", f"127.0.0.1:{agent_port}", "--bind", "127.0.0.1:0", "--key-file", key,
-        "--drop", 0.2, "--drop-seed", 3,
+        "--drop", 0.2,
     )  # fmt: skip
     out, _ = agent.communicate(timeout=60)
     assert agent.returncode == 0

@@ -229,7 +229,7 @@ class Flight:
             accept,
             lambda: LAYOUT,
             slots=2,
-            keys=[Key(SECRET, "agent")] if self.sealed else [],
+            key=Key(SECRET, "agent") if self.sealed else None,
             draw_nonce=lambda: next(self.nonces),
         )
 

@@ -70,16 +70,18 @@ def test_the_relay_keeps_clients_apart_and_forwards_both_ways() -> None:
 
 
 @pytest.mark.parametrize("mtu", [1500, 576])
-def test_many_drones_fly_through_a_path_that_drops_fragments(mtu: int, tmp_path: Path) -> None:
+def test_many_drones_fly_through_a_path_that_drops_fragments(
+    mtu: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """64 drones have States of 12 kB: several packets, and every datagram has to fit into one."""
     key = tmp_path / "key"
     write_key(key)
     faults = FaultConfig(drop=0.02, largest=mtu - 28, seed=5)
-    largest = {"max_datagram": mtu - 28 - 24}  # less the headers of IP and UDP, and the seal
-    remote = RemoteVectorEnv(ANY, num_envs=64, key_file=key, connect=False, **largest)
+    # Less the headers of IP and UDP, and the seal.
+    monkeypatch.setattr("rotorgram.udp.protocol.client.NEAR", mtu - 28 - 24)
+    remote = RemoteVectorEnv(ANY, num_envs=64, key_file=key, connect=False)
     with relaying(remote.address, faults) as relay:
-        config = LinkConfig(timeout=20, **largest)
-        simulator = simulate(relay, num_envs=64, key_file=key, config=config)
+        simulator = simulate(relay, num_envs=64, key_file=key, config=LinkConfig(timeout=20))
         local = gym.make_vec(ENV_ID, num_envs=64)
         assert remote.reset(seed=1)[0].tobytes() == local.reset(seed=1)[0].tobytes()
         actions = np.random.default_rng(0).uniform(-1, 1, (20, 64, 1)).astype(np.float32)

@@ -1,7 +1,6 @@
 """Messages larger than a datagram: only what is missing is sent again."""
 
 import random
-import re
 import struct
 
 import numpy as np
@@ -23,8 +22,9 @@ from rotorgram.udp.protocol.fragments import (
     asks,
     is_fragment,
 )
-from rotorgram.udp.protocol.messages import MAX_SPEC, Missing, Refuse
+from rotorgram.udp.protocol.messages import Missing
 
+AWAY = ("10.0.0.1", 8000)
 QUAD = ((3,), (3,), (4,), (3,), (1,))
 """Telemetry of `Elevation-v0`."""
 
@@ -70,21 +70,6 @@ def test_any_message_comes_through(size: int, largest: int, seed: int, loss: flo
         missing = assembler.missing() if asked else None
         out = transfer.resend(missing) if missing else transfer.probe()
     pytest.fail("never whole")
-
-
-def test_messages_of_too_many_fragments_are_not_begun() -> None:
-    of = layout(1, 1_000_000)
-    sentence = r"max_datagram: expected at least 277 for messages of 40000\d\d bytes, got 256"
-    with pytest.raises(InputError, match=sentence):
-        simulator(of=of, largest=256)
-    server = agent(of=of, max_datagram=256)
-    server.receive(binary.encode(hello()), ("127.0.0.1", 1), 0.0)
-    ((refuse, _),) = outgoing(server)
-    assert isinstance(binary.decode(refuse), Refuse)
-    assert re.search(sentence, server.statistics.last_error)
-    simulator(of=of, largest=277)
-    with pytest.raises(InputError, match="at least 289 for messages of 41943"):
-        simulator(said=hello(spec=" " * MAX_SPEC), largest=256)
 
 
 def test_only_what_is_missing_is_sent_again() -> None:
@@ -165,8 +150,7 @@ def test_steps_a_second_where_datagrams_are_lost(
     """1 ms each way, datagrams of 1,200 bytes; the physics and the agent take no time."""
     of = layout(drones, 3, QUAD)
     client = simulator(of=of, sealed=sealed, largest=FAR)
-    server = agent(of=of, sealed=sealed, max_datagram=FAR)
-    pair = Pair(client, server, lossy(loss))
+    pair = Pair(client, agent(of=of, sealed=sealed), lossy(loss), AWAY)
     pair.run(200)
     assert pair.steps == [float(i + 1) for i in range(200)]
     assert pair.seen[:200] == [float(i) for i in range(200)]
@@ -216,7 +200,7 @@ def test_a_long_hello_is_cut_too() -> None:  # fault 3
         assert len(datagram) <= FAR
         return through(datagram)
 
-    pair = Pair(simulator(said=hello(spec=spec), largest=FAR), agent(max_datagram=FAR), fate)
+    pair = Pair(simulator(said=hello(spec=spec), largest=FAR), agent(), fate, AWAY)
     pair.run(3)
     session = pair.server.slots[0]
     assert session is not None

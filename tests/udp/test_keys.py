@@ -15,7 +15,7 @@ from rotorgram.udp.protocol.auth import (
     Key,
     is_sealed,
     message_of,
-    read_keys,
+    read_key,
     write_key,
 )
 from rotorgram.udp.protocol.messages import Unknown
@@ -120,10 +120,10 @@ def test_a_key_is_written_and_read(tmp_path: Path) -> None:
     second = tmp_path / "second"
     write_key(first)
     write_key(second)
-    (secret,) = read_keys(first)
+    secret = read_key(first)
     assert len(secret) == 32
     assert first.read_text() == secret.hex() + "\n"
-    assert (secret,) != read_keys(second)
+    assert secret != read_key(second)
 
 
 def test_only_its_owner_may_read_a_key(tmp_path: Path) -> None:
@@ -137,9 +137,9 @@ def test_only_its_owner_may_read_a_key(tmp_path: Path) -> None:
     for mode in (0o640, 0o604, 0o620, 0o601, 0o666):
         path.chmod(mode)
         with pytest.raises(ValueError, match=rf"\(chmod 600\), got mode {mode:o}"):
-            read_keys(path)
+            read_key(path)
     path.chmod(0o400)
-    assert len(read_keys(path)[0]) == 32
+    assert len(read_key(path)) == 32
 
 
 def test_a_key_is_never_replaced(tmp_path: Path) -> None:
@@ -158,9 +158,9 @@ def test_a_key_is_never_replaced(tmp_path: Path) -> None:
 
 def test_a_key_that_cannot_be_read_or_written(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"key file: cannot read .*nowhere: No such file"):
-        read_keys(tmp_path / "nowhere")
+        read_key(tmp_path / "nowhere")
     with pytest.raises(ValueError, match="key file"):
-        read_keys(tmp_path)
+        read_key(tmp_path)
     with pytest.raises(OSError):
         write_key(tmp_path / "no folder" / "key")
 
@@ -175,7 +175,7 @@ def test_a_file_that_holds_no_key(tmp_path: Path, text: bytes) -> None:
     path.touch(0o600)
     path.write_bytes(text)
     with pytest.raises(ValueError, match="key file: expected 64 hexadecimal digits in"):
-        read_keys(path)
+        read_key(path)
 
 
 @pytest.mark.parametrize("end", [b"", b"\n", b"\r\n"])
@@ -183,21 +183,14 @@ def test_a_key_that_somebody_else_wrote(tmp_path: Path, end: bytes) -> None:
     path = tmp_path / "key"
     path.touch(0o600)
     path.write_bytes(SECRET.hex().upper().encode() + end)
-    assert read_keys(path) == (SECRET,)
-
-
-def test_a_file_of_several_keys(tmp_path: Path) -> None:
-    path = tmp_path / "keys"
-    path.touch(0o600)
-    path.write_text(SECRET.hex() + "\n" + bytes(32).hex() + "\n")
-    assert read_keys(path) == (SECRET, bytes(32))
+    assert read_key(path) == SECRET
 
 
 def test_a_fifo_as_key_file_does_not_hang(tmp_path: Path) -> None:  # fault 37
     path = tmp_path / "fifo"
     os.mkfifo(path, 0o600)
     with pytest.raises(ValueError, match="expected 64 hexadecimal digits"):
-        read_keys(path)
+        read_key(path)
 
 
 def test_a_full_disk_leaves_no_empty_key(

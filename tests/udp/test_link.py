@@ -130,7 +130,7 @@ def test_a_simulator_takes_what_its_table_says(where: SimulatorState, sealed: bo
 
 
 @BOTH
-@pytest.mark.parametrize("where", [s for s in AGENT if s not in ("new", "queued")])
+@pytest.mark.parametrize("where", [s for s in AGENT if s != "new"])
 def test_an_agent_takes_what_its_table_says(where: AgentState, sealed: bool) -> None:
     wire = Wire("simulator", sealed)
     seated = where not in ("welcomed", "closed")
@@ -339,26 +339,13 @@ def test_while_wait_comes_there_is_no_silence() -> None:
 def test_wrong_numbers_of_the_config() -> None:
     nan = float("nan")
     for name, wrong in (
-        ("timeout", 0), ("timeout", nan), ("max_datagram", 100), ("drop", -0.1), ("drop", nan),
+        ("timeout", 0), ("timeout", nan), ("drop", -0.1), ("drop", nan),
     ):  # fmt: skip
         with pytest.raises(InputError, match=f"^{name}: expected a .*, got {wrong}$"):
             LinkConfig(**{name: wrong})
 
 
 # ---- slots
-
-
-def test_the_queue_is_refused_when_the_agent_closes() -> None:
-    server = agent_at("deciding", Wire("simulator", False))
-    server.receive(binary.encode(hello(session=OTHER)), STRANGER, 0.0)
-    ((reply, _),) = outgoing(server)
-    assert plain(reply) == Wait(session=OTHER)
-    server.close("over", 0.0)
-    told = {address: plain(d) for d, address in outgoing(server)}
-    assert isinstance(told[HERE], Close)
-    refuse = told[STRANGER]
-    assert isinstance(refuse, Refuse)
-    assert "over".startswith(refuse.reason[:4])
 
 
 def test_a_source_that_never_reads_takes_no_slot() -> None:  # fault 11
@@ -428,7 +415,8 @@ def test_an_old_hello_that_came_late_is_forgotten() -> None:
 def test_a_session_that_has_ended_is_not_taken_up() -> None:
     server = agent_at("closed", Wire("simulator", False))
     server.receive(binary.encode(hello()), HERE, 0.0)
-    assert outgoing(server) == []
+    server.receive(binary.encode(state(1, nonce=NONCE + 1), ONE), HERE, 0.0)
+    assert server.slots == [None]
 
 
 @BOTH
@@ -468,7 +456,7 @@ def test_the_longest_hello_comes_in_fragments() -> None:
 
 
 def test_what_is_remembered_of_strangers_is_bounded() -> None:
-    server = agent(max_datagram=1200)
+    server = agent()
     long = hello(spec='{"x":"' + "y" * 5000 + '"}')
     for number in range(1, 3001):
         server.receive(binary.encode(hello(session=number)), ("127.0.0.1", number), 0.0)
@@ -513,15 +501,8 @@ def test_versions_and_critical_extensions() -> None:  # fault 18
     assert link.receive(binary.encode(WELCOME), 0.0) == WELCOME
 
 
-def test_an_agent_takes_any_of_its_keys() -> None:  # fault 18: keys change while all fly
-    new = bytes(32)
-    keys = [Key(SECRET, "agent"), Key(new, "agent")]
-    server = Server(lambda _: ONE, slots=2, keys=keys, draw_nonce=lambda: NONCE)
-    for number, secret in enumerate((SECRET, new)):
-        key = Key(secret, "simulator")
-        client = Client(hello(session=number + 1), ONE, CONFIG, key=key)
-        Pair(client, server, lossy(0), ("127.0.0.1", 8000 + number)).run(5)
-    assert all(server.slots)
+def test_an_agent_drops_what_another_key_seals() -> None:
+    server = agent(sealed=True)
     stranger = Client(hello(session=9), ONE, CONFIG, key=Key(bytes([7]) * 32, "simulator"))
     stranger.connect(0.0)
     server.receive(outgoing(stranger)[0], STRANGER, 0.0)
@@ -625,9 +606,9 @@ def test_every_message_is_shown_once() -> None:
     assert here[:60] == there[:60]
 
 
-def test_a_simulator_loses_datagrams_on_purpose_the_same_for_a_seed() -> None:
-    def arrived(seed: int) -> list[bool]:
-        link = simulator(config=LinkConfig(timeout=1e6, drop=0.3, drop_seed=seed))
+def test_a_simulator_loses_the_same_datagrams_on_purpose_in_each_run() -> None:
+    def arrived() -> list[bool]:
+        link = simulator(config=LinkConfig(timeout=1e6, drop=0.3))
         link.connect(0.0)
         sent = []
         for number in range(1000):
@@ -640,6 +621,5 @@ def test_a_simulator_loses_datagrams_on_purpose_the_same_for_a_seed() -> None:
         assert link.statistics.counters["dropped"] == lost
         return sent
 
-    assert abs(sum(arrived(1)) - 700) < 75
-    assert arrived(1) == arrived(1)
-    assert arrived(1) != arrived(2)
+    assert abs(sum(arrived()) - 700) < 75
+    assert arrived() == arrived()

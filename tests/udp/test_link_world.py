@@ -101,8 +101,8 @@ class World(Network):
     # ---- who there is
 
     def new_agent(self) -> Server:
-        keys = [Key(SECRET, "agent")] if self.sealed else []
-        return Server(lambda _: ONE, lambda: ONE, slots=self.slots, keys=keys)
+        key = Key(SECRET, "agent") if self.sealed else None
+        return Server(lambda _: ONE, lambda: ONE, slots=self.slots, key=key)
 
     def start_agent(self) -> None:
         """A new one at the same address: it knows nothing of what was."""

@@ -1,8 +1,7 @@
 """A shared key: only its holders can make a valid datagram.
 
 A sealed datagram is an envelope of 24 bytes before the message: a magic number, the id of the key,
-so that an agent may hold several while they are changed, and the tag, a keyed BLAKE2b with the
-sender's side as `person` (docs/protocol.md has the offsets).
+and the tag, a keyed BLAKE2b with the sender's side as `person` (docs/protocol.md has the offsets).
 
 Messages that open a session are tagged with the shared key; later ones with a key derived from it
 and both sides' random numbers, so that no message of another session is accepted. Sealing
@@ -12,13 +11,13 @@ authenticates; it does not encrypt.
 import os
 import secrets
 import stat
-from contextlib import suppress
 from hashlib import blake2b
 from hmac import compare_digest
 from pathlib import Path
 from typing import Literal
 
 from ...models.errors import InputError
+from ...models.files import removed_on_error
 from .errors import Forged
 
 KEY_SIZE = 32  # bytes of a shared key
@@ -95,11 +94,8 @@ def message_of(datagram: bytes) -> bytes:
     return datagram[OVERHEAD:]
 
 
-def read_keys(path: Path | str) -> tuple[bytes, ...]:
-    """The shared keys of a file: one or more lines of 64 hexadecimal digits.
-
-    A simulator seals with the first. An agent takes what is sealed with any of them: to change a
-    key, add the new one to the agent's file, give it to the simulators, then remove the old one.
+def read_key(path: Path | str) -> bytes:
+    """The shared key of a file: a line of 64 hexadecimal digits.
 
     Raises `InputError` if the file cannot be read, holds something else, or others can read it.
     """
@@ -113,12 +109,12 @@ def read_keys(path: Path | str) -> tuple[bytes, ...]:
         expected = f"{path} to be readable by its owner alone (chmod 600)"
         raise InputError(f"key file: expected {expected}, got mode {mode & 0o777:o}")
     try:
-        keys = tuple(bytes.fromhex(line) for line in text.decode("ascii").split())
+        key = bytes.fromhex(text.decode("ascii"))
     except ValueError:
-        keys = ()
-    if {len(key) for key in keys} != {KEY_SIZE}:
+        key = b""
+    if len(key) != KEY_SIZE:
         raise InputError(f"key file: expected {2 * KEY_SIZE} hexadecimal digits in {path}")
-    return keys
+    return key
 
 
 def write_key(path: Path) -> None:
@@ -131,10 +127,5 @@ def write_key(path: Path) -> None:
     except FileExistsError as error:
         sentence = "expected a new file, got one that is there; a key is never replaced"
         raise FileExistsError(error.errno, sentence, str(path)) from None
-    try:
-        with open(descriptor, "w", encoding="ascii") as file:
-            file.write(secrets.token_hex(KEY_SIZE) + "\n")
-    except OSError as error:
-        with suppress(OSError):
-            os.unlink(path)
-        raise OSError(error.errno, error.strerror, str(path)) from None
+    with removed_on_error(path), open(descriptor, "w", encoding="ascii") as file:
+        file.write(secrets.token_hex(KEY_SIZE) + "\n")

@@ -21,7 +21,7 @@ from . import binary, text
 from . import messages as m
 from .auth import Key, is_sealed, message_of, sealed
 from .errors import DecodeError, Forged
-from .fragments import FAR, LEAST, NEAR, Assembler, Transfer, check_size, is_fragment
+from .fragments import FAR, NEAR, Assembler, Transfer, is_fragment
 from .layout import Layout
 from .messages import Command, Message, State, one_line
 from .statistics import Statistics
@@ -66,26 +66,21 @@ def critical_extension(message: m.Hello | m.Welcome) -> int | None:
     return next((each.number for each in message.extensions if each.critical), None)
 
 
-def largest_datagram(peer: Address, most: int | None = None) -> int:
+def largest_datagram(peer: Address) -> int:
     """Bytes of the largest datagram to a peer, a seal not counted: fewer off this machine."""
-    largest = NEAR if peer[0].startswith("127.") else FAR
-    return min(largest, most or largest)
+    return NEAR if peer[0].startswith("127.") else FAR
 
 
 @dataclass(frozen=True, kw_only=True)
 class LinkConfig:
-    """Times and sizes of a simulator's exchange."""
+    """Settings of a simulator's exchange."""
 
     timeout: Annotated[float, Limits(0, unit="s", above=True)] = 120.0
     """It gives up when nothing has answered for this long, s: longer than an agent waits for one
     to replace another that it has lost."""
-    max_datagram: Annotated[int | None, Limits(LEAST, whole=True)] = None
-    """Largest datagram, bytes, a seal not counted, at least 256. None: 65,483 on loopback, 1,200
-    elsewhere."""
     drop: Annotated[float, Limits(0, 1)] = 0.0
-    """Probability that a datagram is lost on purpose, sent or received, to try an agent: 0 to 1."""
-    drop_seed: int = 0
-    """The same seed loses the same datagrams, by their order."""
+    """Probability that a datagram is lost on purpose, sent or received, to try an agent: 0 to 1.
+    Each run loses the same datagrams, by their order."""
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -176,8 +171,7 @@ class Client:
         draw_session: Gives the number of the next session.
 
     Raises:
-        InputError: The layout is not of text, there is a key with text, or a message would take too
-            many datagrams.
+        InputError: The layout is not of text, or there is a key with text.
 
     Attributes:
         sequence: Number of the State sent last: they count from 1.
@@ -203,8 +197,6 @@ class Client:
             if self.key:
                 raise InputError("text codec: expected no key, got one: only binary can be sealed")
             text.check_layout(self.layout)
-        size = max(self.layout.state.size, len(binary.encode(self.hello)))
-        check_size(size, self.largest)
         self.state: SimulatorState = "ready" if self.by_text else "idle"
         self.sequence = 0
         self.sends = self._tries = 0
@@ -214,8 +206,7 @@ class Client:
         self._sealing = self.key  # from the Welcome on the key of the session
         self._nonce = 0
         self.tap: Tap | None = None
-        drop = self.config.drop
-        self._dice = Random(self.config.drop_seed) if drop else None
+        self._dice = Random(0) if self.config.drop else None
         self._is_queued = False
         self._assembler = Assembler(self.layout.seeded_command.size)
         self._transfer: Transfer | None = None  # of the outstanding message
@@ -432,9 +423,7 @@ class Client:
     def _open(self, datagram: bytes, key: Key) -> bytes:
         """A datagram without its seal: the session's key, or the shared one for what opens it."""
         if not is_sealed(datagram):
-            message = binary.decode(datagram, self.layout)
-            words = f" that says: {message.reason}" if isinstance(message, m.Refuse) else ""
-            raise Forged(f"not sealed, a {type(message).__name__}{words}")
+            raise Forged("key: the agent has none (--key-file), this simulator has one")
         kind, _, sequence = binary.peek(message_of(datagram))
         if kind == binary.UNKNOWN:  # answers this very State, not a forged one
             return key.open(datagram, self._asking)

@@ -14,7 +14,6 @@ from zlib import crc32
 
 import numpy as np
 
-from ...models.errors import InputError
 from . import binary
 from .binary import HEADER_SIZE
 from .errors import DecodeError
@@ -25,7 +24,6 @@ NEAR = 65_507 - 24
 """Largest datagram of the binary codec on loopback, bytes: UDP's over IPv4, less a seal."""
 FAR = 1_200
 """The same elsewhere: less than any network's, so that no datagram is cut on its way."""
-LEAST = 256  # the smallest that either side may be set to, bytes
 MAX_FRAGMENTS = 1 << 14
 
 _FRAGMENT = struct.Struct("<HHB3x")
@@ -33,14 +31,6 @@ _OVERHEAD = HEADER_SIZE + _FRAGMENT.size
 _ASKS_AT = 28
 _BURST = 3 << 16  # bytes: what the smallest buffer that systems give a socket holds
 _LARGEST_BITMAP = 128  # bytes of the bitmap of a Missing: it tells of 1,024 fragments
-
-
-def check_size(size: int, largest: int) -> None:
-    """Raise `InputError` if a message of so many bytes takes too many datagrams of the largest."""
-    least = ceil(size / MAX_FRAGMENTS) + _OVERHEAD
-    expected = f"at least {least} for messages of {size} bytes"
-    if largest < least:
-        raise InputError(f"max_datagram: expected {expected}, got {largest}")
 
 
 class Transfer:

@@ -8,22 +8,21 @@ read. Memory for simulators without a slot is bounded.
 
 import secrets
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from typing import NamedTuple, TypeVar
 
-from ...models.errors import InputError
 from . import binary, text
 from . import messages as m
 from .auth import OVERHEAD, Key, is_sealed, key_id, message_of
-from .client import CLOSE_INTERVAL, CLOSE_LINGER, Address, critical_extension, largest_datagram
+from .client import CLOSE_INTERVAL, CLOSE_LINGER, Address, critical_extension
 from .errors import DecodeError, Forged, VersionMismatch
-from .fragments import Assembler, asks, check_size, is_fragment
+from .fragments import Assembler, asks, is_fragment
 from .layout import Layout
 from .messages import State, one_line
 from .session import Event, NoSuchSession, Outbox, Session
 
-_MOST = 1024  # simulators remembered between Hello and State 1, in the queue, and after
+_MOST = 1024  # simulators remembered between Hello and State 1, and by text after their Close
 _LEAST_ASSEMBLING = 16
 """Simulators without a slot of which fragments are kept; more, if there are more slots: so many
 may come at the same moment."""
@@ -54,7 +53,7 @@ class Server:
         text_layout: A text simulator says no Hello: its first line opens the session, and this
             gives the layout to read it by. A result of None: text is not flown.
         slots: Simulators to fly at the same time. Others wait until a slot is free.
-        keys: Shared with the simulators, any of them. Then nothing unsealed is taken.
+        key: Shared with the simulators. Then nothing unsealed is taken.
         draw_nonce: Gives a random 64-bit number for each Welcome.
 
     Attributes:
@@ -71,11 +70,10 @@ class Server:
         text_layout: Callable[[], Layout | None] = lambda: None,
         *,
         slots: int = 1,
-        keys: Sequence[Key] = (),
-        max_datagram: int | None = None,
+        key: Key | None = None,
         draw_nonce: Callable[[], int] = lambda: secrets.randbits(64),
     ) -> None:
-        self.outbox = Outbox(max_datagram)
+        self.outbox = Outbox()
         self.statistics = self.outbox.statistics
         self.slots: list[Session | None] = [None] * slots
         self.takes_text = True
@@ -84,11 +82,9 @@ class Server:
         self._resend_at = self._deadline = 0.0
         self._accept = accept
         self._text_layout = text_layout
-        self._keys = {key.id: key for key in keys}
+        self._key = key
         self._draw_nonce = draw_nonce
         self._seated: dict[Address, Session] = {}
-        self._ended: OrderedDict[int, None] = OrderedDict()  # numbers of sessions that had a slot
-        self._queue: OrderedDict[Address, Session] = OrderedDict()
         self._assembling: OrderedDict[tuple[Address, int], Assembler] = OrderedDict()
         self._ended_text: OrderedDict[Address, tuple[bytes, int, float]] = OrderedDict()
 
@@ -113,8 +109,6 @@ class Server:
         if session:
             session.move("unsaid", m.Close)
             del self._seated[session.peer]
-            if not session.is_text:
-                _keep(self._ended, session.number, None)
 
     def close(self, reason: str, now: float) -> None:
         """End every exchange and tell the simulators, until they answer."""
@@ -124,9 +118,6 @@ class Server:
             if session:
                 session.send_close(reason)
         self._closed = True
-        for queued in self._queue.values():
-            self._refuse(queued.number, reason, queued.peer, queued.room, queued.key)
-            queued.move("sent", m.Refuse)
         self._resend_at = now + CLOSE_INTERVAL
         self._deadline = now + CLOSE_LINGER
 
@@ -160,7 +151,7 @@ class Server:
             return None
 
     def _receive_binary(self, session: Session | None, arrival: _Arrival) -> Event | None:
-        plain, key = self._open(arrival, session)
+        plain = self._open(arrival, session)
         kind, number, _ = binary.peek(plain)
         seated = session if session and session.number == number and not session.is_text else None
         opening = None if seated else self.openings.get((arrival.address, number))
@@ -168,7 +159,7 @@ class Server:
         if is_fragment(plain):
             kind = binary.check(plain)[0] & ~binary.FRAGMENT
             if kind == binary.HELLO and not seated:
-                whole = self._assemble(plain, opening, arrival, key)
+                whole = self._assemble(plain, opening, arrival)
             elif kind == binary.STATE and holder:
                 whole = holder.assemble(plain, arrival.now)
             elif kind == binary.STATE:
@@ -184,7 +175,7 @@ class Server:
             raise NoSuchSession
         message = binary.decode(plain, holder.layout if holder else None)
         if isinstance(message, m.Hello):
-            self._receive_hello(message, arrival, key)
+            self._receive_hello(message, arrival)
             return None
         if seated:
             return self._receive_seated(seated, message, plain, arrival)
@@ -202,39 +193,38 @@ class Server:
             self.free(session.slot)
         return event
 
-    def _open(self, arrival: _Arrival, session: Session | None) -> tuple[bytes, Key | None]:
-        """A binary datagram without its seal, and the shared key that it was sealed with.
+    def _open(self, arrival: _Arrival, session: Session | None) -> bytes:
+        """A binary datagram without its seal.
 
         Raises `_KeyMismatch`, `Forged`, or `NoSuchSession` where it has no key here.
         """
         datagram = arrival.datagram
+        shared = self._key
         if not is_sealed(datagram):
-            if self._keys:
+            if shared:
                 words = "key: this agent has one (--key-file), and the simulator has none"
                 raise _KeyMismatch(words)
-            return datagram, None
-        if not self._keys:
-            raise _KeyMismatch("key: this agent has none (--key-file), and the simulator has")
-        shared = self._keys.get(key_id(datagram))
+            return datagram
         if shared is None:
+            raise _KeyMismatch("key: this agent has none (--key-file), and the simulator has")
+        if key_id(datagram) != shared.id:
             raise Forged("key: the simulator has another one")
         kind, number, sequence = binary.peek(message_of(datagram))
         if not binary.is_of_session(kind, sequence):
-            return shared.open(datagram), shared
+            return shared.open(datagram)
         if session and session.number == number and session.key:
-            return session.key.open(datagram), shared
+            return session.key.open(datagram)
         opening = self.openings.get((arrival.address, number))
         if opening and (key := opening.session_key()):
             # If the Welcome was for an old copy of its Hello, it is as good as none.
             with suppress(Forged):
-                return key.open(datagram), shared
+                return key.open(datagram)
         raise NoSuchSession
 
     def _refuse_undecoded(self, error: DecodeError, arrival: _Arrival) -> None:
         """Count it, and answer a Hello if its sender must change its configuration."""
         datagram = arrival.datagram
-        under_seal = is_sealed(datagram)
-        plain = message_of(datagram) if under_seal else datagram
+        plain = message_of(datagram) if is_sealed(datagram) else datagram
         kind, number, _ = binary.peek(plain)
         if isinstance(error, NoSuchSession):
             if kind in (binary.STATE, binary.MISSING):
@@ -243,43 +233,37 @@ class Server:
                 self.statistics.counters["foreign"] += 1
             return
         if isinstance(error, _KeyMismatch | VersionMismatch) and kind == binary.HELLO:
-            trusted = under_seal and not isinstance(error, _KeyMismatch)
-            key = self._keys.get(key_id(datagram)) if trusted else None
-            self._refuse(number, str(error), arrival.address, len(datagram), key)
+            key = None if isinstance(error, _KeyMismatch) else self._key
+            self._refuse(number, str(error), arrival, key)
         self._drop(error.cause, str(error), arrival)
 
     # ---- Hello
 
-    def _receive_hello(self, hello: m.Hello, arrival: _Arrival, key: Key | None) -> None:
+    def _receive_hello(self, hello: m.Hello, arrival: _Arrival) -> None:
         """Welcome a simulator, refuse it, or let it wait."""
         address = arrival.address
-        size = len(arrival.datagram)
         place = address, hello.session
-        if hello.session in self._ended or self._has(hello.session):
+        if self._has(hello.session):
             self._drop("stale", "", arrival)
             return
         if place in self.openings and not self._closed:
             self.openings[place].repeat()
             self._drop("duplicate", "", arrival)
             return
-        layout = self._fit(hello, address)
+        layout = self._fit(hello)
         if isinstance(layout, str):
-            self._refuse(hello.session, layout, address, size, key)
+            self._refuse(hello.session, layout, arrival, self._key)
             self._drop("refused", layout, arrival)
             return
-        session = Session(self.outbox, address, hello.session, layout, hello, key=key)
-        if self._has_slot_for(address):
-            self._queue.pop(address, None)
-            session.send_welcome(m.Welcome(session=hello.session, nonce=self._draw_nonce()))
-            _keep(self.openings, place, session)
-        else:
-            wait = binary.encode(m.Wait(session=session.number))
-            self.outbox.put([wait], address, key)
-            session.move("sent", m.Wait)
-            session.room = size - len(wait)
-            _keep(self._queue, address, session)
+        if not self._has_slot_for(address):
+            wait = binary.encode(m.Wait(session=hello.session))
+            self.outbox.put([wait], address, self._key)
+            return
+        session = Session(self.outbox, address, hello.session, layout, hello, key=self._key)
+        session.send_welcome(m.Welcome(session=hello.session, nonce=self._draw_nonce()))
+        _keep(self.openings, place, session)
 
-    def _fit(self, hello: m.Hello, address: Address) -> Layout | str:
+    def _fit(self, hello: m.Hello) -> Layout | str:
         """The layout of a simulator that is accepted, or the reason to refuse it."""
         if self._closed:
             return "the agent has closed"
@@ -289,27 +273,17 @@ class Server:
         unknown = critical_extension(hello)
         if unknown is not None:
             return f"expected no critical extension of type {unknown}"
-        layout = self._accept(hello)
-        if isinstance(layout, str):
-            return layout
-        try:
-            largest = largest_datagram(address, self.outbox.max_datagram)
-            check_size(layout.seeded_command.size, largest)
-        except InputError as error:
-            return str(error)
-        return layout
+        return self._accept(hello)
 
-    def _refuse(
-        self, number: int, reason: str, address: Address, size: int, key: Key | None
-    ) -> None:
-        """Refuse a Hello that came in so many bytes, with no more than those."""
-        room = size - _REASON_AT - (OVERHEAD if key else 0)
+    def _refuse(self, number: int, reason: str, arrival: _Arrival, key: Key | None) -> None:
+        """Refuse a Hello, with no more bytes than those that came."""
+        room = len(arrival.datagram) - _REASON_AT - (OVERHEAD if key else 0)
         if room >= 0:
             refuse = m.Refuse(session=number, reason=_cut(reason, room))
-            self.outbox.put([binary.encode(refuse)], address, key)
+            self.outbox.put([binary.encode(refuse)], arrival.address, key)
 
     def _assemble(
-        self, fragment: bytes, opening: Session | None, arrival: _Arrival, key: Key | None
+        self, fragment: bytes, opening: Session | None, arrival: _Arrival
     ) -> bytes | None:
         """The Hello of a simulator without a slot, once all its fragments are there."""
         if opening:
@@ -324,7 +298,7 @@ class Server:
         if whole is not None:
             del self._assembling[place]
         elif answer := assembler.ask(fragment):
-            self.outbox.put(answer, arrival.address, key)
+            self.outbox.put(answer, arrival.address, self._key)
         return whole
 
     # ---- sessions that were welcomed, and slots
@@ -360,7 +334,7 @@ class Server:
         for address, number in list(self.openings):  # it, and what else the address began
             if address == peer:
                 del self.openings[address, number]
-        layout = self._fit(opening.hello, peer)  # another one may have come since its Hello
+        layout = self._fit(opening.hello)  # another one may have come since its Hello
         if isinstance(layout, str):
             reason = _cut(layout, len(plain) - _REASON_AT)
             close = m.Close(session=opening.number, sequence=1, reason=reason)
@@ -407,22 +381,19 @@ class Server:
             return
         self.statistics.counters["foreign"] += 1  # mostly after a restart: no notice
         reply = binary.encode(m.Unknown(session=number, sequence=sequence))
-        if self._keys:  # of use only to the simulator that has sent this State
-            key = self._keys.get(key_id(arrival.datagram))
-            if key is None:
-                return
-            reply = key.seal(reply, arrival.datagram)
+        if self._key:  # of use only to the simulator that has sent this State
+            reply = self._key.seal(reply, arrival.datagram)
         self.outbox.put([reply], arrival.address, None)
 
     # ---- text: the first line opens the session
 
     def _receive_text(self, session: Session | None, arrival: _Arrival) -> Event | None:
         datagram, address, now = arrival
-        layout = None if self._keys else self._text_layout()
+        layout = None if self._key else self._text_layout()
         if layout is None:
             cause = "refused"
             reason = "text is not flown here"
-            if self._keys:
+            if self._key:
                 cause = "forged"
                 reason = "key: this agent has one (--key-file), text has none"
             sequence, fields = text.split(datagram)

@@ -39,11 +39,10 @@ class Event(NamedTuple):
 class Outbox:
     """What the sessions of an agent share: datagrams to send, counts, and the tap."""
 
-    def __init__(self, max_datagram: int | None) -> None:
+    def __init__(self) -> None:
         self.datagrams: list[tuple[bytes, Address]] = []
         self.statistics = Statistics()
         self.tap: Tap | None = None
-        self.max_datagram = max_datagram
 
     def put(
         self, datagrams: list[bytes], address: Address, key: Key | None, count: str = "sent"
@@ -75,7 +74,6 @@ class Session:
     slot: int = -1  # its slot; -1 before it has one
     sequence: int = 0  # number of the State that came last
     reply: Transfer | None = None  # the answer to the last State, or the Welcome
-    room: int = 0  # bytes that a Refuse may have while it waits for a slot
     asked_at: float = 0.0
     # When it last said that it computes, or sent a fragment that was missing.
     heard_at: float = 0.0
@@ -84,7 +82,7 @@ class Session:
     def __post_init__(self) -> None:
         self.is_text = self.hello is None
         self._assembler = Assembler(self.layout.state.size)
-        self._largest = largest_datagram(self.peer, self.outbox.max_datagram)
+        self._largest = largest_datagram(self.peer)
 
     def move(self, way: Way, kind: type[Message]) -> None:
         """Be in the state that such a message leads to. Raises `KeyError` if it may not."""
@@ -168,8 +166,7 @@ class Session:
     def _record(self, message: Message, data: bytes) -> None:
         """Show a message to the tap."""
         if self.outbox.tap:
-            whole = binary.encode(message, self.layout) if self.is_text else data
-            self.outbox.tap(self.slot, message, whole)
+            self.outbox.tap(self.slot, message, data)
 
     def _send(self, data: bytes) -> None:
         """Send a message, and keep its bytes for a repeated State."""

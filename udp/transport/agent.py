@@ -21,10 +21,9 @@ from ...models.errors import InputError, shortened
 from ...models.fields import Limits, check_fields
 from ..layouts import layout_of
 from ..protocol import text
-from ..protocol.auth import Key, read_keys
+from ..protocol.auth import Key, read_key
 from ..protocol.client import Address, address_text
 from ..protocol.errors import PeerClosed, PeerSilent
-from ..protocol.fragments import LEAST
 from ..protocol.layout import Layout
 from ..protocol.messages import Close, Hello, State
 from ..protocol.server import Server
@@ -48,7 +47,6 @@ class AgentSettings(TypedDict, total=False):
     vehicle_hash: str | None
     connect_timeout: float
     timeout: float
-    max_datagram: int | None
     key_file: Path | str | None
     insecure: bool
     record: Path | str | None
@@ -66,7 +64,6 @@ class AgentConfig:
     vehicle_hash: str | None = None
     connect_timeout: Annotated[float, Limits(0, unit="s", above=True)] = 60.0
     timeout: Annotated[float, Limits(0, unit="s", above=True)] = 30.0
-    max_datagram: Annotated[int | None, Limits(LEAST, whole=True)] = None
     key_file: Path | str | None = None
     insecure: bool = False
     record: Path | str | None = None
@@ -157,18 +154,17 @@ class Agent:
 
     def __init__(self, address: Address, config: AgentConfig) -> None:
         self.config = config
-        keys = read_keys(config.key_file) if config.key_file else ()
+        key = Key(read_key(config.key_file), "agent") if config.key_file else None
         self.server = server = Server(
             config.accept,
             lambda: config.text_layout,
             slots=config.slots,
-            keys=[Key(key, "agent") for key in keys],
-            max_datagram=config.max_datagram,
+            key=key,
         )
         self.states: dict[int, State] = {}
         self.lost = [""] * config.slots
         self._deadlines = [0.0] * config.slots
-        self._port = Port(address, insecure=config.insecure or bool(keys))
+        self._port = Port(address, insecure=config.insecure or key is not None)
         self.address = self._port.address
         self._journal: Journal | None = None
         if config.record:

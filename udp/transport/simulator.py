@@ -18,7 +18,7 @@ from ...models.errors import InputError, NotCopied
 from ...models.fields import Choice, Limits, check
 from ..layouts import layout_of
 from ..protocol import binary
-from ..protocol.auth import Key, read_keys
+from ..protocol.auth import Key, read_key
 from ..protocol.client import Address, Client, LinkConfig, largest_datagram, new_session
 from ..protocol.errors import LinkError
 from ..protocol.messages import Command, Hello
@@ -109,7 +109,7 @@ class Simulator(NotCopied):
                 raise InputError("agents: expected one address or more, got none")
             if by_text or record or num_envs:
                 raise InputError("agents: expected neither text, record nor num_envs with several")
-        key = Key(read_keys(key_file)[0], "simulator") if key_file else None
+        key = Key(read_key(key_file), "simulator") if key_file else None
         insecure = insecure or key is not None
         with ExitStack() as failing:  # closes what is open if a later step fails
             stepped = make_stepped(env, num_envs, keywords)
@@ -329,8 +329,8 @@ def _links(
         client = Client(
             Hello(session=new_session(), spec=own.to_json(), worlds=worlds),
             layout_of(own, worlds),
-            replace(config, drop_seed=config.drop_seed + number),
-            largest=largest_datagram(there, config.max_datagram),
+            config,
+            largest=largest_datagram(there),
             by_text=by_text,
             key=key,
         )
