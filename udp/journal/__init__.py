@@ -6,7 +6,7 @@ require("mcap", "record", "the journal of a flight")
 require("zstandard", "record", "the journal of a flight")
 
 from .reader import Item, Recording, Session, Summary  # noqa: E402
-from .writer import Journal, software  # noqa: E402
+from .writer import Journal  # noqa: E402
 
 __all__ = [
     "Item",
@@ -14,5 +14,4 @@ __all__ = [
     "Recording",
     "Session",
     "Summary",
-    "software",
 ]

@@ -99,7 +99,6 @@ class Recording:
     Attributes:
         path: The file.
         about: Metadata of its head: side, versions; of a simulator also config, backend, models.
-        attachments: Files in its head, by name.
         complete: Whether the file was finished, and could be read as far as was tried.
         ending: How it ends, in words.
 
@@ -112,7 +111,6 @@ class Recording:
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
         self.about: dict[str, str] = {}
-        self.attachments: dict[str, bytes] = {}
         with self.path.open("rb") as file:
             head = file.read(len(MCAP0_MAGIC))
             if not MCAP0_MAGIC.startswith(head):
@@ -123,8 +121,6 @@ class Recording:
         for record in self._records():
             if isinstance(record, records.Metadata) and record.name == ABOUT:
                 self.about = record.metadata
-            elif isinstance(record, records.Attachment):
-                self.attachments[record.name] = record.data
             elif not isinstance(record, records.Header):
                 break
         if self.about.get("format", FORMAT) != FORMAT or (self.complete and not self.about):
@@ -263,38 +259,25 @@ class SessionSummary:
     last: int = 0
     """Time of its last message."""
     states: int = 0
-    steps: int = 0
-    """Of all drones together; resets do not count."""
-    episodes: int = 0
-    """Episodes that ended."""
-    returns: float = 0.0
-    """Sum of their returns."""
     ending: str = "not closed"
     """Reason of its Close or Refuse."""
-
-    def __post_init__(self) -> None:
-        self._walker = Walker(self.session)
-        self._returns = np.zeros(self.session.num_envs)
-        self._out = np.zeros(self.session.num_envs, bool)  # ended, while its world flies on
 
     def __str__(self) -> str:
         session = self.session
         began = datetime.fromtimestamp(self.first // 10**9, UTC)
         seconds = (self.last - self.first) / 1e9
-        mean = f", mean return {self.returns / self.episodes:.2f}" if self.episodes else ""
         return (
             f"{session}: {count_of(session.num_envs, 'drone')} of {session.spec.env_id}, "
             f"{session.codec}, {began:%Y-%m-%d %H:%M:%S} UTC, {seconds:.1f} s, "
-            f"{self.steps} steps, {self.episodes} episodes{mean}; {self.ending}"
+            f"{self.states} States; {self.ending}"
         )
 
     def take(self, item: Item) -> None:
         """Count a message of the session."""
         self.last = item.time
-        transition = self._walker.take(item.message)
-        if transition is not None:
-            self._count(transition)
         match item.message:
+            case State():
+                self.states += 1
             case Close(reason=reason) if reason:
                 self.ending = f"closed: {reason}"
             case Close() if not self.ending.startswith("closed"):
@@ -303,18 +286,6 @@ class SessionSummary:
                 self.ending = f"refused: {reason}"
             case Unknown():
                 self.ending = "the agent does not know this session"
-
-    def _count(self, transition: Transition) -> None:
-        state = transition.state
-        self.states += 1
-        stepped = transition.flown & ~self._out
-        self._returns[transition.resets] = 0.0
-        self._returns[stepped] += state.rewards[stepped]
-        self.steps += int(stepped.sum())
-        ended = (state.terminated | state.truncated) & stepped
-        self._out = (self._out | ended) & ~transition.resets
-        self.episodes += int(ended.sum())
-        self.returns += float(self._returns[ended].sum())
 
 
 class Summary(Recording):

@@ -1,7 +1,7 @@
 """Simulates a journal again, and compares every bit."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, cast
 
@@ -11,11 +11,13 @@ from ...envs.config import EnvConfig
 from ...envs.registry import is_known
 from ...envs.spec import component_names
 from ...models import Backend
-from ...models.errors import InputError
+from ...models.errors import InputError, shortened
 from ..protocol.messages import State
 from ..transport.stepped import Steppable, make_stepped
 from .reader import Item, Recording, Session, Transition, Walker, count_of, printable
-from .writer import software
+
+_SAME = ("agents", "observation", "action", "telemetry", "control_period", "vehicle_hash")
+"""Fields of the spec that have to be those of the recorded one."""
 
 
 class Difference(NamedTuple):
@@ -51,8 +53,6 @@ class SessionVerdict:
     """The first of all."""
     problem: str = ""
     """Reason if it cannot be repeated, or not to its end."""
-    notes: list[str] = field(default_factory=list)
-    """Other things that have changed."""
 
     def __post_init__(self) -> None:
         self._loop: Steppable | None = None
@@ -71,7 +71,7 @@ class SessionVerdict:
             lines.append(f"  first difference: {self.difference}")
         if self.problem:
             lines.append(f"  {self.problem}")
-        return lines + [f"  note: {note}" for note in self.notes]
+        return lines
 
     def take(self, item: Item) -> None:
         """Repeat a message."""
@@ -128,21 +128,14 @@ class SessionVerdict:
         keywords = {"vehicle": self.vehicle, "backend": self.backend, **spec.options}
         config = EnvConfig.from_keywords(spec.env_id, drones=len(spec.agents), **keywords)
         loop = make_stepped(config, self.session.num_envs, {})
-        recorded = spec.vehicle_hash
-        here = loop.spec.vehicle_hash
-        if recorded.strip("0") and recorded != here:
-            hint = "--vehicle names its file"
-            self.notes.append(f"the vehicle was {recorded}, and is {here} here: {hint}")
-        for name in ("agents", "observation", "action", "telemetry", "control_period"):
+        for name in _SAME:
             was = getattr(spec, name)
             now = getattr(loop.spec, name)
             if was != now:
                 loop.close()
-                same = [a == b for a, b in zip(str(was), str(now), strict=False)]
-                start = max(0, [*same, False].index(False) - 40)
-                shown = [str(one)[start : start + 80] for one in (was, now)]
-                words = "expected an env of the {} …{}…, got one of …{}…"
-                raise InputError(words.format(name, *shown))
+                hint = " (--vehicle names its file)" if name == "vehicle_hash" else ""
+                got = f"got {shortened(now)}{hint}"
+                raise InputError(f"expected an env of the {name} {shortened(was)}, {got}")
         return loop
 
 
@@ -157,7 +150,6 @@ class Verification(Recording):
         backend: What stepped the drones; None: what the journal says, else `mujoco`.
 
     Attributes:
-        notes: Versions that have changed.
         sessions: The verdict on each.
     """
 
@@ -171,7 +163,6 @@ class Verification(Recording):
         super().__init__(path)
         if backend is None:
             backend = cast(Backend, self.about.get("backend", "mujoco"))
-        self.notes = _other_versions(self.about)
         self.sessions: list[SessionVerdict] = []
         flying: dict[int, SessionVerdict] = {}  # the last of each slot
         try:
@@ -195,8 +186,7 @@ class Verification(Recording):
         return compared > 0 and all(session.identical for session in self.sessions)
 
     def __str__(self) -> str:
-        lines = [f"note: {note}" for note in self.notes]
-        lines += [line for session in self.sessions for line in session.lines()]
+        lines = [line for session in self.sessions for line in session.lines()]
         if not self.complete:
             lines.append(f"note: the file is {self.ending}")
         if self.identical:
@@ -242,15 +232,3 @@ def _arrays(recorded: State, loop: Steppable) -> Iterator[tuple[list[str], np.nd
 def _digits(number: np.generic) -> str:
     value: object = number.item()
     return f"{value.hex()} ({number!s})" if isinstance(value, float) else str(value)
-
-
-def _other_versions(about: dict[str, str]) -> list[str]:
-    """Versions that differ from those that wrote the journal, where it was the simulator's."""
-    if about.get("side") != "simulator":
-        return []
-    notes = []
-    for name, number in software().items():
-        recorded = about.get(f"version of {name}", number)
-        if name != "mcap" and recorded != number:
-            notes.append(f"recorded with {name} {recorded}, repeated with {number}")
-    return notes

@@ -288,12 +288,12 @@ class Simulator(NotCopied):
 
     def _record(self, path: Path | str) -> None:
         from ..journal import Journal
-        from ..journal.writer import models_of
+        from ..journal.writer import about_of
 
-        about, models = models_of(self.stepped)
         link = self.link
         codec = "text" if link.by_text else "binary"
-        self._journal = Journal(path, side="simulator", codec=codec, about=about, models=models)
+        about = about_of(self.stepped)
+        self._journal = Journal(path, side="simulator", codec=codec, about=about)
         link.tap = self._journal.tap
         if link.by_text:  # says no Hello
             link.tap(0, link.hello, binary.encode(link.hello))
