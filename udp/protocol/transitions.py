@@ -3,10 +3,10 @@
 One table for each side says what a message does, sent or received.
 """
 
+import tomllib
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from ...models.files import read_toml
 from . import messages
 from .messages import Message
 
@@ -20,9 +20,9 @@ Move = tuple[Way, type[Message]]
 
 
 def _read(side: str) -> dict[Any, dict[Move, Any]]:
-    file = Path(__file__).with_name("transitions.toml")
+    text = Path(__file__).with_name("transitions.toml").read_text("utf-8")
     table: dict[Any, dict[Move, Any]] = {}
-    for state, ways in read_toml(file, "transitions")[side].items():
+    for state, ways in tomllib.loads(text)[side].items():
         table[state] = {}
         for way, following in ways.items():
             for name, after in following.items():
