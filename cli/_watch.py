@@ -9,9 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..envs.rendering import moments
-from ..envs.spec import EnvSpec
-from ..rendering import window
-from ..rendering.live import MAX_SHOWN, LiveView, Pace
+from ..rendering.live import LiveView, Pace
 from ..rendering.stage import Stage
 from ..udp.protocol.messages import Command
 from ..udp.transport.simulator import Observer, Simulator
@@ -24,7 +22,7 @@ _log = logging.getLogger(__name__)
 
 
 class Watcher:
-    """Passes States of a simulator to a live view of its first drones, as often as it draws.
+    """Passes States of a simulator to a live view of its first world, as often as it draws.
 
     Lock-step never waits for it. A pause freezes the picture alone: an agent that got no answer
     would take the simulator for lost. If the view is closed or fails, the simulator goes on.
@@ -73,13 +71,9 @@ class Realtime:
         self._pace.stepped(time.monotonic())
 
 
-def open_view(
-    command: EnvFlags, spec: EnvSpec, shown: int, pace: Pace, of: int | None = None
-) -> LiveView:
-    """A window with the first drones of so many; it is open within a `with` block."""
-    names = spec.agents if shown == len(spec.agents) > 1 else ()
-    stage = Stage(command.shown_scene, shown, vehicle=command.vehicle, names=names)
-    return LiveView(stage, window.Window(stage, pace), pace, of=of or shown)
+def open_view(command: EnvFlags, drones: int, pace: Pace) -> LiveView:
+    """A window with the drones of a world; it is open within a `with` block."""
+    return LiveView(Stage(command.shown_scene, drones, vehicle=command.vehicle), pace)
 
 
 @contextmanager
@@ -88,10 +82,7 @@ def watched(simulator: Simulator, command: "Sim") -> Iterator[None]:
     observers: list[Observer] = []
     with ExitStack() as opened:
         if command.view:
-            drones = simulator.stepped.num_envs
-            several = len(simulator.spec.agents) > 1  # the first world is shown
-            shown = len(simulator.spec.agents) if several else min(drones, MAX_SHOWN)
-            view = open_view(command, simulator.spec, shown, Pace(0.0), drones)
+            view = open_view(command, len(simulator.spec.agents), Pace(0.0))
             observers.append(Watcher(opened.enter_context(view), simulator))
             print("shown in the window", flush=True)
         if command.realtime:

@@ -29,7 +29,7 @@ class Render(EnvFlags):
     """Checkpoint, folder of a training, pid, geometric, orca, random, or a journal (.mcap).
     Policies fly evaluation episodes without exploration."""
     out: Path
-    """film.mp4, film.gif, picture.png, or a folder for pictures 0001.png and so on. It must not
+    """film.mp4, picture.png, or a folder for pictures 0001.png and so on. It must not
     exist."""
     camera: Literal["chase", "front", "side", "top", "onboard"] = "chase"
     """Front and side stand still, the others follow."""

@@ -38,7 +38,7 @@ class Sim(BackendFlags, WireFlags):
     drop: float = 0.0
     """Lose each datagram, sent or received, with this probability: tries an agent under loss."""
     view: bool = False
-    """Show up to 16 drones in a window. Lock-step does not wait for it. Keys: docs/viewing.md."""
+    """Show the first world in a window. Lock-step does not wait for it. Keys: docs/viewing.md."""
     realtime: bool = False
     """Fly no faster than real time, for viewers."""
 

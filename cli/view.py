@@ -18,7 +18,7 @@ from ._flags import EnvFlags, check_count
 class View(EnvFlags):
     """Show flights, in real time or slower, in a window.
 
-    Keys: space pauses, the arrow to the right takes one step, - and + change the speed.
+    Keys: space pauses, the arrow to the right takes one step.
     """
 
     what: Positional[str]
@@ -51,7 +51,7 @@ class View(EnvFlags):
         spec = first[0].spec
         drones = len(first)
         names = spec.agents if drones > 1 else ("",)
-        with open_view(shown, spec, drones, Pace(spec.control_period, self.speed)) as live:
+        with open_view(shown, drones, Pace(spec.control_period, self.speed)) as live:
             print(f"showing {self.what} in the window (Ctrl-C ends)", flush=True)
             for flight in islice(chain((first,), flights), self.episodes):
                 shown_moments = [moments(one) for one in flight]

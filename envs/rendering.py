@@ -51,11 +51,10 @@ class Renderer:
             return None
         from ..rendering import Canvas, Stage
 
-        names = self._loop.spec.agents
-        drones = len(names)
+        drones = len(self._loop.spec.agents)
         if self._canvas is None:
             one = len(now) == drones
-            stage = Stage(drones=drones, vehicle=self._loop.vehicle.path, trail=one, names=names)
+            stage = Stage(drones=drones, vehicle=self._loop.vehicle.path, trail=one)
             size = (480, 360) if one else (240, 180)
             self._canvas = Canvas(stage, *size)
         canvas = self._canvas
@@ -66,16 +65,12 @@ class Renderer:
         return tuple(pictures)
 
     def _show(self, now: "list[Moment]") -> None:
-        from ..rendering import Stage, live, window
+        from ..rendering import Stage, live
 
-        names = self._loop.spec.agents if len(self._loop.spec.agents) > 1 else ()
-        shown = now[: len(names) or live.MAX_SHOWN]  # of the first world
+        shown = now[: len(self._loop.spec.agents)]  # of the first world
         if self._view is None:
-            path = self._loop.vehicle.path
-            stage = Stage(drones=len(shown), vehicle=path, names=names)
-            pace = live.Pace(self._loop.spec.control_period)
-            surface = window.Window(stage, pace)
-            self._view = live.LiveView(stage, surface, pace, of=len(now))
+            stage = Stage(drones=len(shown), vehicle=self._loop.vehicle.path)
+            self._view = live.LiveView(stage, live.Pace(self._loop.spec.control_period))
         if shown != self._shown:  # `step` shows by itself, and a script may ask once more
             self._shown = shown
             self._view.draw_in_time(*shown)

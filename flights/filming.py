@@ -126,7 +126,8 @@ def film(
     times = _times(tracks, config, still=path.suffix.lower() == ".png")
     # Whatever goes wrong, the OpenGL context is given back here.
     with closing(_frames(tracks, config, times, on_frame)) as frames:
-        return write_film(path, frames, config.fps, quality=config.quality)
+        write_film(path, frames, config.fps, quality=config.quality)
+    return len(times)
 
 
 def _times(tracks: Sequence[FilmTrack], config: Film, *, still: bool) -> list[tuple[int, float]]:
@@ -178,8 +179,7 @@ def _frames(
     width = (config.width - _SPACE * (columns - 1)) // columns
     height = (config.height - _SPACE * (rows - 1)) // rows
     drones = tracks[0].drones
-    names = tracks[0].trajectories[0].spec.agents if drones > 1 else ()
-    stage = Stage(config.scene, drones, vehicle=config.vehicle, names=names)
+    stage = Stage(config.scene, drones, vehicle=config.vehicle)
     with Canvas(stage, width, height, fast=config.fast) as canvas:
         named = len(tracks) > 1
         panes = [_Pane(track, config, canvas, stage.twin(), named) for track in tracks]

@@ -23,7 +23,6 @@ from .camera_model import GOAL, PAYLOAD, drawn_model, objects_in, own_discs
 from .gl import Offscreen
 
 Arrays = Mapping[str, np.ndarray]
-_ROOM = 1000  # geoms beyond those of the model
 _HIDDEN = 5  # a group of geoms that is not drawn
 _FLIP = np.array((1.0, -1.0, -1.0))  # from MuJoCo's camera frame to that of vision
 
@@ -37,22 +36,6 @@ class Lens(NamedTuple):
     """R, shape (3, 3), from the world's frame to the camera's."""
     translation: np.ndarray
     """t, shape (3,), m."""
-
-    def project(self, points: np.ndarray) -> np.ndarray:
-        """Columns and rows of points of the world, shape (..., 3), m: shape (..., 2), pixels; nan
-        of a point that is not ahead."""
-        seen = points @ self.rotation.T + self.translation
-        ahead = np.where(seen[..., 2:] > 0, seen[..., 2:], np.nan)
-        pixels: np.ndarray = (seen / ahead @ self.matrix.T)[..., :2]
-        return pixels
-
-    def points(self, depth: np.ndarray) -> np.ndarray:
-        """Points of the world that the pixels of a depth picture (H, W) see, (H, W, 3), m."""
-        rows, columns = np.indices(depth.shape) + 0.5
-        pixels = np.stack((columns, rows, np.ones(depth.shape)), axis=-1)
-        seen = pixels @ np.linalg.inv(self.matrix).T * depth[..., None]
-        points: np.ndarray = (seen - self.translation) @ self.rotation
-        return points
 
 
 class Cameras:
@@ -99,10 +82,7 @@ class Cameras:
             GOAL: self._mocap_ids([f"{name}/{GOAL}" for name in names]),
             PAYLOAD: self._mocap_ids([PAYLOAD]),
         }
-        self.model.vis.quality.offsamples = 4 if fine else 0
-        self._scene = mujoco.MjvScene(self.model, self.model.ngeom + _ROOM)
-        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW.value] = fine
-        self._option = mujoco.MjvOption()
+        self._fine = fine
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
 
@@ -124,7 +104,7 @@ class Cameras:
         """Opened with the first picture, so that a process may be forked before."""
         height = max(view.camera.height for view in self.views)
         width = max(view.camera.width for view in self.views)
-        return Offscreen(self.model, width, height)
+        return Offscreen(self.model, width, height, fine=self._fine)
 
     def open(self) -> None:
         """Open OpenGL, as `take` does in its thread. A second call does nothing."""
@@ -205,8 +185,7 @@ class Cameras:
         """Colours, uint8 (H, W, 3), or numbers of objects, int32 (H, W), and in this case their
         depth, float32 (H, W), m. The first row is on top.
         """
-        scene = self._scene
-        every = mujoco.mjtCatBit.mjCAT_ALL.value
+        scene = self._drawing.scene
         self._camera.fixedcamid = camera
         # MuJoCo centres infinite planes on the scene's camera, so update it first.
         mujoco.mjv_updateCamera(self.model, self.data, self._camera, scene)
@@ -214,15 +193,13 @@ class Cameras:
         groups = self.model.geom_group[discs]
         if objects:
             self.model.geom_group[discs] = _HIDDEN
-        mujoco.mjv_updateScene(
-            self.model, self.data, self._option, None, self._camera, every, scene
-        )
+        self._drawing.update(self.data, self._camera)
         self.model.geom_group[discs] = groups
         for flag in mujoco.mjtRndFlag.mjRND_SEGMENT, mujoco.mjtRndFlag.mjRND_IDCOLOR:
             scene.flags[flag.value] = objects
         colors = np.empty((height, width, 3), np.uint8)
         depth = np.empty((height, width), np.float32)
-        self._drawing.draw(scene, colors, depth if objects else None)
+        self._drawing.draw(colors, depth if objects else None)
         colors = colors[::-1]
         if not objects:
             return colors, depth
@@ -230,7 +207,7 @@ class Cameras:
 
     def _geom_numbers(self, camera: int, colors: np.ndarray) -> np.ndarray:
         """Number of the geom of each pixel of the last picture, from 1; 0: none."""
-        scene = self._scene
+        scene = self._drawing.scene
         if camera not in self._geoms:  # the same geoms in each picture, in one order
             geom = mujoco.mjtObj.mjOBJ_GEOM.value
             geoms = np.zeros(scene.ngeom + 1, np.int32)

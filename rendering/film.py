@@ -1,4 +1,4 @@
-"""Films of pictures: MP4, GIF or PNGs. A film is there whole or not at all."""
+"""Films of pictures: MP4 or PNGs. A film is there whole or not at all."""
 
 import tempfile
 from collections import deque
@@ -26,10 +26,10 @@ QUALITY = 20
 def check_film(path: Path, width: int, height: int, fps: float) -> None:
     """Check the arguments of `write_film` before anything is drawn. Raises `InputError`."""
     kind = path.suffix.lower()
-    if kind not in (".mp4", ".gif", ".png", ""):
+    if kind not in (".mp4", ".png", ""):
         raise InputError(
-            "film: expected a name that ends in .mp4, .gif or .png, or a folder's name without a "
-            f"dot, got {path}"
+            "film: expected a name that ends in .mp4 or .png, or a folder's name without a dot, "
+            f"got {path}"
         )
     if path.exists():
         raise InputError(f"film: {path} is there already; choose another name")
@@ -39,19 +39,15 @@ def check_film(path: Path, width: int, height: int, fps: float) -> None:
         raise InputError(
             f"film: expected an even width and an even height for MP4, got {width}x{height}"
         )
-    hundredths = 100 / fps
-    if kind == ".gif" and abs(hundredths - round(hundredths)) > 1e-6:
-        raise InputError(
-            "fps: expected 100 divided by a whole number (50, 25, 20, 10) for GIF, which counts "
-            f"hundredths of a second, got {fps:g}"
-        )
 
 
-def write_film(path: Path, frames: Iterable[Picture], fps: float, *, quality: int = QUALITY) -> int:
-    """Write a film, and return how many frames were taken. Ctrl-C leaves nothing behind.
+def write_film(
+    path: Path, frames: Iterable[Picture], fps: float, *, quality: int = QUALITY
+) -> None:
+    """Write a film. Ctrl-C leaves nothing behind.
 
-    `.mp4` is H.264 that every browser plays before it is loaded whole; `.gif` repeats for ever;
-    `.png` is the last frame alone; a name without a dot becomes a folder of `0001.png` and so on.
+    `.mp4` is H.264 that every browser plays before it is loaded whole; `.png` is the last frame
+    alone; a name without a dot becomes a folder of `0001.png` and so on.
 
     Args:
         path: Must not exist.
@@ -70,12 +66,9 @@ def write_film(path: Path, frames: Iterable[Picture], fps: float, *, quality: in
         raise InputError("film: expected at least one frame, got none")
     height, width = first.shape[:2]
     check_film(path, width, height, fps)
-    count = 0
 
-    def counted() -> Iterator[Picture]:
-        nonlocal count
+    def checked() -> Iterator[Picture]:
         for frame in chain((first,), taken):
-            count += 1
             if frame.dtype != np.uint8 or frame.shape != (height, width, 3):
                 raise ValueError(
                     f"film: expected frames of uint8, shape ({height}, {width}, 3), "
@@ -89,31 +82,19 @@ def write_film(path: Path, frames: Iterable[Picture], fps: float, *, quality: in
             unfinished = Path(folder) / path.name
             match path.suffix.lower():
                 case ".mp4":
-                    _write_mp4(unfinished, counted(), (width, height), fps, quality)
-                case ".gif":
-                    _write_gif(unfinished, counted(), fps)
+                    _write_mp4(unfinished, checked(), (width, height), fps, quality)
                 case ".png":
-                    last = deque(counted(), maxlen=1).pop()
+                    last = deque(checked(), maxlen=1).pop()
                     Image.fromarray(last).save(unfinished)
                 case _:
                     unfinished.mkdir()
-                    for number, frame in enumerate(counted(), 1):
+                    for number, frame in enumerate(checked(), 1):
                         Image.fromarray(frame).save(unfinished / f"{number:04}.png")
             unfinished.rename(path)
     except OSError as error:
         if error.errno is None:  # the encoder's words
             raise
         raise OSError(error.errno, error.strerror, str(path)) from None
-    return count
-
-
-def _write_gif(path: Path, frames: Iterator[Picture], fps: float) -> None:
-    # Without dithering: parts that stand still do not change, and cost nothing.
-    pictures = (Image.fromarray(f).quantize(256, dither=Image.Dither.NONE) for f in frames)
-    first = next(pictures)
-    duration = round(100 / fps) * 10
-    with path.open("wb") as file:  # Pillow's own stays open when it is interrupted
-        first.save(file, "GIF", save_all=True, append_images=pictures, duration=duration, loop=0)
 
 
 def _write_mp4(
@@ -151,6 +132,6 @@ def _ffmpeg() -> ModuleType:
     except RuntimeError:
         raise OSError(
             "ffmpeg: expected one that imageio-ffmpeg brings or finds, got none; "
-            "write a .gif or a folder of PNGs"
+            "write a folder of PNGs"
         ) from None
     return module

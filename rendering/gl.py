@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 Lines = Sequence[tuple[str, str]]
 """Names and values that are written on a picture."""
 
-_OFF = ("disable", "disabled", "off", "false", "0")
-_ON = ("enable", "enabled", "on", "true", "1", "glfw", "glx", "wgl")
 _LARGE = 480  # pixels: higher pictures have large letters
+_ROOM = 10_000  # geoms beyond those of the model
+_SAMPLES = 4  # of every pixel, for smooth edges; software has no more
 _LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa", "cgl": "OpenGL"}
 _HIDDEN = "ROTORGRAM_GL"
 """Keeps `MUJOCO_GL` as the user set it while `hidden_gl_setting` hides it from MuJoCo. An
@@ -42,7 +42,7 @@ def hidden_gl_setting() -> Iterator[None]:
     before = dict(os.environ)
     wanted = _wanted()
     library = _LIBRARIES.get(wanted, "")
-    if wanted in (*_OFF, *_ON) or (library and ctypes.util.find_library(library)):
+    if wanted in ("disable", "glfw") or (library and ctypes.util.find_library(library)):
         yield
         return
     os.environ[_HIDDEN] = wanted
@@ -58,13 +58,14 @@ def hidden_gl_setting() -> Iterator[None]:
 def offscreen_context(width: int, height: int) -> Any:
     """A context of MuJoCo's for pictures of so many pixels, not current yet. Raises `NoOpenGL`.
 
-    `MUJOCO_GL` decides if it is set (egl, osmesa, glfw). Otherwise it is EGL on Linux, or a hidden
-    window where there is a display and no EGL; elsewhere the system's own.
+    `MUJOCO_GL` decides if it is set (egl, osmesa, glfw). Otherwise it is EGL on Linux, and the
+    system's own elsewhere.
     """
     _refuse_forked()
     _state["used"] = True
-    reasons = []
-    for name in _candidates():
+    name = _library()
+    reason = "MUJOCO_GL switches it off"
+    if name != "disable":
         try:
             context = import_module(f"mujoco.{name}").GLContext(width, height)
             with context.as_current():
@@ -73,10 +74,10 @@ def offscreen_context(width: int, height: int) -> Any:
             words = one_line(error) or type(error).__name__
             if isinstance(error, AttributeError):  # PyOpenGL's way to say so
                 words = "its library is not installed"
-            reasons.append(f"{name}: {words:.200}")
+            reason = f"{name}: {words:.200}"
     raise NoOpenGL(
         "OpenGL: expected EGL (on Debian and Ubuntu: apt-get install libegl1 libgl1-mesa-dri), "
-        f"got none ({'; '.join(reasons) or 'MUJOCO_GL switches it off'})"
+        f"got none ({reason})"
     )
 
 
@@ -98,14 +99,22 @@ def columns(lines: Lines) -> tuple[str, str]:
 class Offscreen:
     """MuJoCo's drawing of a model without a window, from any thread, in pictures of up to a size.
 
-    Raises `NoOpenGL`.
+    `fine` draws smooth edges and shadows. Raises `NoOpenGL`.
+
+    Attributes:
+        scene: What `draw` draws.
     """
 
-    def __init__(self, model: "mujoco.MjModel", width: int, height: int) -> None:
+    def __init__(self, model: "mujoco.MjModel", width: int, height: int, *, fine: bool) -> None:
         import mujoco
 
+        self._model = model
         model.vis.global_.offwidth = width
         model.vis.global_.offheight = height
+        model.vis.quality.offsamples = _SAMPLES if fine else 0
+        self.scene = mujoco.MjvScene(model, model.ngeom + _ROOM)
+        self.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW.value] = fine
+        self._option = mujoco.MjvOption()
         font = mujoco.mjtFontScale.mjFONTSCALE_100
         buffer = mujoco.mjtFramebuffer.mjFB_OFFSCREEN
         self._gl: Any = offscreen_context(width, height)
@@ -126,22 +135,25 @@ class Offscreen:
         block: AbstractContextManager[object] = self._gl.as_current()
         return block
 
+    def update(self, data: "mujoco.MjData", camera: "mujoco.MjvCamera") -> None:
+        """Fill the scene with the model in a state, seen from a camera."""
+        import mujoco
+
+        every = mujoco.mjtCatBit.mjCAT_ALL.value
+        mujoco.mjv_updateScene(self._model, data, self._option, None, camera, every, self.scene)
+
     def draw(
-        self,
-        scene: "mujoco.MjvScene",
-        pixels: "np.ndarray",
-        depth: "np.ndarray | None" = None,
-        lines: Lines = (),
+        self, pixels: "np.ndarray", depth: "np.ndarray | None" = None, lines: Lines = ()
     ) -> None:
-        """Draw a scene into arrays of one size, the lowest row first: colours, uint8 (H, W, 3), and
-        OpenGL's depth, float32 (H, W), 1 near and 0 far. Lines are written over it.
+        """Draw the scene into arrays of one size, the lowest row first: colours, uint8 (H, W, 3),
+        and OpenGL's depth, float32 (H, W), 1 near and 0 far. Lines are written over it.
         """
         import mujoco
 
         rect = mujoco.MjrRect(0, 0, pixels.shape[1], pixels.shape[0])
         try:
             with self.current():
-                mujoco.mjr_render(rect, scene, self._context)
+                mujoco.mjr_render(rect, self.scene, self._context)
                 if lines:
                     is_large = rect.height > _LARGE
                     font = mujoco.mjtFont.mjFONT_BIG if is_large else mujoco.mjtFont.mjFONT_NORMAL
@@ -164,18 +176,10 @@ def _wanted() -> str:
     return os.environ.get(_HIDDEN, os.environ.get("MUJOCO_GL", "")).lower().strip()
 
 
-def _candidates() -> tuple[str, ...]:
+def _library() -> str:
     wanted = _wanted()
-    if wanted in _OFF:
-        return ()
-    if wanted in _LIBRARIES:
-        return (wanted,)
-    if wanted in _ON:
-        return ("glfw",)
-    if wanted:
+    if not wanted:
+        return {"linux": "egl", "darwin": "cgl"}.get(sys.platform, "glfw")
+    if wanted not in (*_LIBRARIES, "glfw", "disable"):
         raise NoOpenGL(f"MUJOCO_GL: expected egl, osmesa, glfw or disable, got {shortened(wanted)}")
-    if sys.platform != "linux":
-        return ("cgl", "glfw") if sys.platform == "darwin" else ("glfw",)
-    # Without a display GLFW writes warnings of its own; it has nothing to offer there.
-    display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    return ("egl", "glfw") if display else ("egl",)
+    return wanted

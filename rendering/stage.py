@@ -18,6 +18,7 @@ from ..models.errors import InputError, one_line, shortened
 from ..models.fields import Limits, check
 from ..models.fleet import load_vehicles, members_of
 from ..models.mjcf import attach_craft, free_body, level_data
+from ..models.swarm import drone_names
 from ..scenes.build import SCENE_PREFIX, build_scene
 from ..scenes.marks import Mark
 from .gl import Lines, Offscreen
@@ -26,7 +27,6 @@ Camera = Literal["chase", "front", "side", "top", "onboard"]
 CAMERAS: Final[tuple[Camera, ...]] = get_args(Camera)
 
 _MAX_METRICS = 4  # with a line of their own
-_MAX_THRUSTS = 4  # rotors with a number of their own
 _TRAIL = 150  # control steps of a path
 _EVERY = 3  # control steps of one piece of it
 _ORANGE = (0.96, 0.42, 0.08)
@@ -52,12 +52,10 @@ MARK_GEOMS = {
 """How parts of marks are drawn."""
 _CAPSULE = mujoco.mjtGeom.mjGEOM_CAPSULE
 _ONBOARD = "stage/onboard"
-_ROOM = 10_000  # geoms
 _SIDES = Limits(16, 8192, "pixels", whole=True)
-_SAMPLES = 4  # of every pixel, for smooth edges; software has no more
 
 # Lengths below are in radii of the craft.
-_SPACING = 2.2  # between craft that fly side by side
+_SPACING = 2.2  # between the craft of a world before their first moments
 _NEAR = 0.14  # at most: where drawing begins
 _LOWER = 0.06  # of their distance front and side look below the goal
 _VIEWS: Final[dict[str, tuple[float, float, float, float]]] = {
@@ -123,30 +121,25 @@ class Moment:
     episode: int = 0
     """Episodes before this one."""
 
-    def lines(self, thrust_high: float) -> list[tuple[str, str]]:
-        """Names and values for an overlay; a rotor's largest thrust, N, sets the digits."""
-        lines = [(metric.label, metric.text) for metric in self.metrics[:_MAX_METRICS]]
-        heights = {"elevation": self.position, "goal": self.goal}
-        lines += [(name, f"{point[2]:.2f} m") for name, point in heights.items() if point]
-        unit, scale = ("N", 1.0) if thrust_high >= 1 else ("mN", 1e3)
-        decimals = max(0, 2 - math.floor(math.log10(thrust_high * scale)))
-        shown = self.thrusts
-        rotors = len(self.thrusts)
-        name = f"F1 to F{rotors}" if rotors > 1 else "F1"
-        if rotors > _MAX_THRUSTS:
-            name = f"{name}, mean"
-            shown = (float(np.mean(shown)),)
-        thrusts = " ".join(f"{scale * thrust:.{decimals}f}" for thrust in shown)
-        lines += [(name, f"{thrusts} {unit}"), ("reward", f"{self.reward:+.3f}")]
-        return [*lines, ("step", str(self.step)), ("episode", str(self.episode))]
+    @property
+    def lines(self) -> list[tuple[str, str]]:
+        """Names and values for an overlay."""
+        thrusts = " ".join(f"{thrust:.3g}" for thrust in self.thrusts)
+        return [
+            *((metric.label, metric.text) for metric in self.metrics[:_MAX_METRICS]),
+            ("elevation", f"{self.position[2]:.2f} m"),
+            (f"F1 to F{len(self.thrusts)}", f"{thrusts} N"),
+            ("reward", f"{self.reward:+.3f}"),
+            ("step", str(self.step)),
+            ("episode", str(self.episode)),
+        ]
 
 
 class Stage:
-    """Craft over an airport or a plain floor, each with a goal and a path if wanted.
+    """The craft of one world over an airport or a plain floor, each with a goal and a path.
 
-    They are of different worlds and stand side by side. Those of one world have `names`, which the
-    pictures show; each is where it is, with path and goal in a colour of its own. It simulates
-    nothing: it shows moments. What is wrong raises `InputError`.
+    Several have names, which the pictures show, and paths and goals in a colour of their own. A
+    stage simulates nothing: it shows moments. What is wrong raises `InputError`.
 
     Attributes:
         radius: Of a sphere about the body's origin that holds the craft, m. Cameras, goals and
@@ -163,14 +156,10 @@ class Stage:
         *,
         vehicle: Path | str | None = None,
         trail: bool = True,
-        names: Sequence[str] = (),
     ) -> None:
         if not drones >= 1:
             raise InputError(f"drones: expected 1 or more, got {drones}")
-        if len(names) not in (0, drones):
-            raise InputError(f"names: expected one for each of {drones} drones, got {names}")
         self.drones = drones
-        self.names = tuple(names)
         self.vehicle = load_vehicles(vehicle, drones)
         crafts = members_of(self.vehicle, drones)
         try:
@@ -185,7 +174,6 @@ class Stage:
         self.radius = max(radius for radius, _ in sizes)
         top = sizes[0][1]
         grid = _grid(drones, _SPACING * self.radius)
-        self._offsets = 0.0 * grid if names else grid
         free_body(spec).add_camera(  # sees nose, front rotors and horizon
             name=_ONBOARD,
             pos=(0.03 * self.radius, 0.0, top + 0.154 * self.radius),
@@ -195,17 +183,19 @@ class Stage:
         for number, offset in enumerate(grid[1:], 1):
             attach_craft(spec, crafts[number].path, f"{number}/", offset)
         self.model = spec.compile()
-        apart = float(np.ptp(grid, axis=0).max())  # drones of one world fly further apart
-        scale_drawing(self.model, self.radius, 4.0 * apart if names else apart)
+        apart = float(np.ptp(grid, axis=0).max())
+        scale_drawing(self.model, self.radius, 4.0 * apart)  # in flight they are further apart
         self._length = _TRAIL // _EVERY if trail else 0
         self._clear()
 
     def _clear(self) -> None:
         self.data = mujoco.MjData(self.model)
         self.moments: tuple[Moment, ...] = ()
-        self._paths: list[deque[np.ndarray]] = [deque(maxlen=self._length) for _ in self._offsets]
+        drones = range(self.drones)
+        self._paths: list[deque[np.ndarray]] = [deque(maxlen=self._length) for _ in drones]
         # Distance between each craft and its goal for which a camera makes room, m.
         self._reach = np.zeros(self.drones)
+        self._focus: np.ndarray | None = None
         mujoco.mj_forward(self.model, self.data)
 
     def twin(self) -> "Stage":
@@ -227,20 +217,19 @@ class Stage:
             )
         before = self.moments or moments
         self.moments = moments
-        goals = self._places("goal")
         poses = self.data.qpos.reshape(self.drones, 7)
         for i, (moment, last) in enumerate(zip(moments, before, strict=True)):
             pose = poses[i]
             path = self._paths[i]
-            goal = goals[i]
-            pose[:3] = moment.position + self._offsets[i]
+            goal = moment.goal
+            pose[:3] = moment.position
             pose[3:] = moment.attitude
             if moment.step == 0 or moment.step < last.step or moment.episode != last.episode:
                 path.clear()
                 self._reach[i] = 0.0
             if moment.step // _EVERY != last.step // _EVERY or not path:  # steps may be left out
                 path.append(pose[:3].copy())
-            now = 0.0 if goal is None else float(np.linalg.norm(goal - pose[:3]))
+            now = 0.0 if goal is None else float(np.linalg.norm(np.subtract(goal, pose[:3])))
             if self._reach[i]:
                 now = min(now, _FAR * self.radius)
             self._reach[i] = max(self._reach[i], now)
@@ -261,12 +250,12 @@ class Stage:
         if name not in _VIEWS:
             raise InputError(f"camera: expected one of {', '.join(CAMERAS)}, got {shortened(name)}")
         camera.azimuth, camera.elevation, distance, holds = _VIEWS[name]
-        places = self._offsets
+        camera.distance = distance * self.radius
         reach = float(self._reach.max())
-        if len(self.names) > 1:  # the goals of one world lie apart, often far from their craft
+        if self.drones > 1:  # the goals of one world lie apart, often far from their craft
             places = np.array([*self._points, *self._goals])
+            camera.distance += float(np.ptp(places, axis=0).max())
             reach = 0.0
-        camera.distance = distance * self.radius + float(np.ptp(places, axis=0).max())
         if holds == math.inf:
             camera.lookat[:] = self._points.mean(axis=0)
         else:
@@ -275,6 +264,17 @@ class Stage:
         if name in ("front", "side"):  # above the ground
             camera.lookat[2] = max(camera.lookat[2] - _LOWER * camera.distance, 0.0)
         return camera
+
+    def follow(self, camera: mujoco.MjvCamera) -> None:
+        """Turn a viewer's camera towards the goal, or the craft; afterwards move it with that."""
+        focus = self.focus
+        if self._focus is None:
+            view = self.camera("free")
+            for name in ("azimuth", "elevation", "distance", "lookat"):
+                setattr(camera, name, getattr(view, name))
+        else:  # keep what the mouse has changed
+            camera.lookat[:] += focus - self._focus
+        self._focus = focus
 
     @property
     def focus(self) -> np.ndarray:
@@ -286,18 +286,14 @@ class Stage:
     def decorate(self, scene: mujoco.MjvScene, *, goals: bool = True) -> None:
         """Add marks, payloads and fading paths to a scene, and discs at the goals if wanted."""
         marked = any(moment.marks for moment in self.moments)
-        drawn: set[Mark] = set()  # those of a world that all its drones tell
-        labels = self.names if 1 < len(self.names) <= MAX_NAMES else ()
-        goals_at = self._places("goal")
-        payloads = self._places("payload")
+        labels = drone_names(self.drones) if 1 < self.drones <= MAX_NAMES else ()
         for drone, moment in enumerate(self.moments):
             here = self._points[drone]
-            goal = goals_at[drone]
-            payload = payloads[drone]
+            goal = moment.goal
+            payload = moment.payload
             for mark in moment.marks:
-                if mark.moves or not self.names or mark not in drawn:
-                    drawn.add(mark)
-                    _draw_mark(scene, mark, self._offsets[drone], goal)
+                if mark.moves or drone == 0:  # all drones of a world tell the same
+                    _draw_mark(scene, mark, goal)
             if payload is not None:
                 size = (0.12 * self.radius,) * 3
                 _decorate(scene, mujoco.mjtGeom.mjGEOM_SPHERE, size, payload, _PAYLOAD)
@@ -307,10 +303,10 @@ class Stage:
                 label = _decorate(scene, mujoco.mjtGeom.mjGEOM_LABEL, (0.1,) * 3, above, _CABLE)
                 if label is not None:
                     label.label = f"{labels[drone]}   "  # without the spaces its end is cut off
-            color = DRONE_COLORS[drone % len(DRONE_COLORS)] if self.names else _PATH
+            color = DRONE_COLORS[drone % len(DRONE_COLORS)]
             if goals and goal is not None and not marked:
                 size = (0.93 * self.radius, 0.0033 * self.radius, 0.0)  # radius, half of its height
-                own = color if len(self.names) > 1 else _GREEN
+                own = color if self.drones > 1 else _GREEN
                 _decorate(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, size, goal, (*own, 0.3))
             path = self._paths[drone]
             for number, (start, end) in enumerate(pairwise([*path, here]), 1):
@@ -318,21 +314,22 @@ class Stage:
                     rgba = (*color, 0.85 * number / len(path))
                     _connect(scene, _CAPSULE, 0.019 * self.radius, start, end, rgba)
 
+    def lines(self, paused: bool) -> list[tuple[str, str]]:
+        """Names and values for the overlay of a viewer: those of the first craft."""
+        lines = self.moments[0].lines
+        if self.least_distance is not None:
+            lines.insert(0, ("least distance", f"{self.least_distance:.2f} m"))
+            lines.insert(0, ("drones", f"{self.drones}, numbers of the first"))
+        return [*lines, ("paused", "")] if paused else lines
+
     @property
     def least_distance(self) -> float | None:
         """Least distance between the origins of two drones of the world now, m; None of one."""
-        return least_distance(self._points) if len(self.names) > 1 else None
-
-    def _places(self, what: Literal["goal", "payload"]) -> list[np.ndarray | None]:
-        """Where it is drawn for each craft; None where there is none."""
-        points = [getattr(moment, what) for moment in self.moments]
-        places = zip(points, self._offsets, strict=False)
-        return [None if point is None else point + offset for point, offset in places]
+        return least_distance(self._points) if self.drones > 1 else None
 
     @property
-    def _goals(self) -> list[np.ndarray]:
-        """Where goals are drawn."""
-        return [goal for goal in self._places("goal") if goal is not None]
+    def _goals(self) -> list[_Vector]:
+        return [moment.goal for moment in self.moments if moment.goal is not None]
 
     @property
     def _points(self) -> np.ndarray:
@@ -354,11 +351,7 @@ class Canvas(AbstractContextManager["Canvas"]):
         self.stage = stage
         self.width = width
         self.height = height
-        stage.model.vis.quality.offsamples = 0 if fast else _SAMPLES
-        self._drawing = Offscreen(stage.model, width, height)
-        self._scene = mujoco.MjvScene(stage.model, _ROOM)
-        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW.value] = not fast
-        self._option = mujoco.MjvOption()
+        self._drawing = Offscreen(stage.model, width, height, fine=not fast)
 
     def draw(
         self, camera: Camera = "chase", stage: Stage | None = None, lines: Lines = ()
@@ -367,19 +360,15 @@ class Canvas(AbstractContextManager["Canvas"]):
         (height, width, 3).
         """
         stage = stage or self.stage
-        if stage.model is not self.stage.model:
-            raise ValueError("stage: expected the canvas's own or a twin of it, got another")
-        scene = self._scene
-        view = stage.camera(camera)
-        every = mujoco.mjtCatBit.mjCAT_ALL.value
-        mujoco.mjv_updateScene(stage.model, stage.data, self._option, None, view, every, scene)
+        scene = self._drawing.scene
+        self._drawing.update(stage.data, stage.camera(camera))
         for light in scene.lights[: scene.nlight]:
             if light.headlight and camera == "top":  # it would add itself to the sun
                 light.diffuse[:] = 0.0
         # From on board, at the goal, its disc would fill the lower half.
         stage.decorate(scene, goals=camera != "onboard")
         pixels = np.empty((self.height, self.width, 3), np.uint8)
-        self._drawing.draw(scene, pixels, lines=lines)
+        self._drawing.draw(pixels, lines=lines)
         return np.ascontiguousarray(pixels[::-1])  # OpenGL's first row is the lowest
 
     def close(self) -> None:
@@ -434,14 +423,13 @@ def _grid(drones: int, spacing: float) -> np.ndarray:
     return -spacing * np.stack((rows, columns, np.zeros(drones)), axis=1)
 
 
-def _draw_mark(
-    scene: mujoco.MjvScene, mark: Mark, offset: np.ndarray, goal: np.ndarray | None
-) -> None:
+def _draw_mark(scene: mujoco.MjvScene, mark: Mark, goal: _Vector | None) -> None:
     """Add a mark; a gate that is the goal has the goal's colour."""
-    if mark.moves and goal is None:
-        return
-    origin = goal if mark.moves and goal is not None else offset
-    centre = origin + mark.position
+    centre = np.array(mark.position)
+    if mark.moves:
+        if goal is None:
+            return
+        centre += goal
     color = MARK_COLORS[mark.shape]
     if mark.shape == "gate" and goal is not None and np.abs(goal - centre).max() < 1e-3:
         color = _GREEN
@@ -460,21 +448,21 @@ def _connect(
     scene: mujoco.MjvScene,
     kind: mujoco.mjtGeom,
     radius: float,
-    start: np.ndarray,
-    end: np.ndarray,
+    start: Sequence[float] | np.ndarray,
+    end: Sequence[float] | np.ndarray,
     rgba: Sequence[float],
 ) -> None:
     """Add a cylinder or a capsule between two points."""
     geom = _decorate(scene, kind, (1.0, 1.0, 1.0), start, rgba)
     if geom is not None:
-        mujoco.mjv_connector(geom, kind, radius, start, end)
+        mujoco.mjv_connector(geom, kind, radius, np.asarray(start), np.asarray(end))
 
 
 def _decorate(
     scene: mujoco.MjvScene,
     kind: mujoco.mjtGeom,
     size: Sequence[float],
-    centre: np.ndarray,
+    centre: Sequence[float] | np.ndarray,
     rgba: Sequence[float],
 ) -> mujoco.MjvGeom | None:
     """Add a geom that casts no shadow; None if the scene is full."""
@@ -483,6 +471,6 @@ def _decorate(
     geom = scene.geoms[scene.ngeom]
     color = np.array(rgba, np.float32)
     scene.ngeom += 1
-    mujoco.mjv_initGeom(geom, kind, np.array(size), centre, np.eye(3).ravel(), color)
+    mujoco.mjv_initGeom(geom, kind, np.array(size), np.asarray(centre), np.eye(3).ravel(), color)
     geom.category = mujoco.mjtCatBit.mjCAT_DECOR
     return geom

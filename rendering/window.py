@@ -5,30 +5,25 @@ import os
 import sys
 import threading
 import warnings
-from contextlib import suppress
-from pathlib import Path
+from collections.abc import Callable
 from types import ModuleType
-from typing import Final
+from typing import Final, Literal
 
 import mujoco
 
 from ..models.errors import NoOpenGL
 from .gl import Lines, columns
-from .live import Aim, Pace, Press
 from .stage import Stage
 
+Press = Literal["pause", "step"]
+"""Effect of a key."""
 KEYS: Final[dict[int, Press]] = {
     32: "pause",  # space
     262: "step",  # arrow to the right
-    45: "slower",  # -
-    333: "slower",  # - of the number pad
-    61: "faster",  # = and +
-    334: "faster",  # + of the number pad
 }
 """GLFW's keys. MuJoCo's passive viewer uses none of them."""
-_HELP = [("space", "pause"), ("right arrow", "one step"), ("- and +", "slower, faster")]
+_HELP = [("space", "pause"), ("right arrow", "one step")]
 _INSTEAD = "make a film instead (rotorgram render)"
-_NICENESS = 10  # of the threads that draw: the simulation comes first
 
 
 class NoDisplay(NoOpenGL):
@@ -36,20 +31,18 @@ class NoDisplay(NoOpenGL):
 
 
 class Window:
-    """A stage in a window, whose keys change the pace: `Surface`. Raises `NoDisplay`."""
+    """A stage in a window; `press` gets the effects of keys. Raises `NoDisplay`."""
 
-    def __init__(self, stage: Stage, pace: Pace) -> None:
-        before = _tasks()
+    def __init__(self, stage: Stage, press: Callable[[Press], None]) -> None:
         viewer = _viewer()
         self._stage = stage
-        self._pace = pace
-        self._aim = Aim(stage)
+        self._press = press
         others = set(threading.enumerate())
         try:
             self._handle = viewer.launch_passive(
                 stage.model,
                 stage.data,
-                key_callback=self._press,
+                key_callback=self._on_key,
                 show_left_ui=False,
                 show_right_ui=False,
             )
@@ -61,22 +54,17 @@ class Window:
         self._threads = set(threading.enumerate()) - others
         # If it is never closed: MuJoCo's thread must have ended before GLFW does.
         atexit.register(self.close)
-        # Threads that began meanwhile draw, on the processor if there is no GPU.
-        for task in _tasks() - before:
-            with suppress(OSError):  # it has ended
-                os.setpriority(os.PRIO_PROCESS, task, _NICENESS)
 
     def show(self, lines: Lines) -> None:
         """Draw the stage as it is now, with these lines over it."""
         handle = self._handle
         with handle.lock():
-            self._aim.apply(handle.cam)
+            self._stage.follow(handle.cam)
             handle.user_scn.ngeom = 0
             self._stage.decorate(handle.user_scn)
-        keys = _HELP if self._pace.period else _HELP[:2]
         top = mujoco.mjtGridPos.mjGRID_TOPLEFT
         bottom = mujoco.mjtGridPos.mjGRID_BOTTOMLEFT
-        handle.set_texts([_text(top, lines), _text(bottom, keys)])
+        handle.set_texts([_text(top, lines), _text(bottom, _HELP)])
         handle.sync()
 
     def is_running(self) -> bool:
@@ -90,18 +78,13 @@ class Window:
             thread.join(timeout=10)
         atexit.unregister(self.close)
 
-    def _press(self, key: int) -> None:
+    def _on_key(self, key: int) -> None:
         if key in KEYS:
-            self._pace.press(KEYS[key])
+            self._press(KEYS[key])
 
 
 def _text(place: mujoco.mjtGridPos, lines: Lines) -> tuple[object, ...]:
     return mujoco.mjtFontScale.mjFONTSCALE_100, place, *columns(lines)
-
-
-def _tasks() -> set[int]:
-    """Numbers of this process's threads; empty on systems without /proc."""
-    return {int(task.name) for task in Path("/proc/self/task").glob("*")}
 
 
 def _viewer() -> ModuleType:

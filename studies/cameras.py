@@ -1,8 +1,6 @@
 """What a picture costs: by kind and size beside MuJoCo's own renderer, in an env, and over UDP.
 
     python studies/cameras.py [--seconds 1] [--repeats 7] [--out FILE.json]
-    python studies/cameras.py --sheet FILE.png    pictures of every kind, to look at
-    python studies/cameras.py --scenes FILE.png   scenes of two seeds each
 
 Unless told otherwise a case draws the plain world with a Crazyflie from its camera `front`.
 `mujoco.Renderer` draws the same model without shadows and smooth edges, and gives the same kind.
@@ -13,7 +11,6 @@ It takes about ten minutes on two cores.
 
 import os
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -122,20 +119,6 @@ def surroundings(seconds: float, repeats: int) -> dict[str, Times]:
     }
 
 
-def threads(seconds: float, repeats: int) -> dict[str, float]:
-    """Pictures per second of 64 x 64 by two pairs of cameras: in one thread, and in two."""
-    each = [ours("front_rgb") for _ in range(2)]
-    with ThreadPoolExecutor(2) as pool:
-        cases: dict[str, Step] = {
-            "one thread": lambda: [step() for step, _ in each],
-            "two threads": lambda: [*pool.map(lambda one: one[0](), each)],
-        }
-        taken = seconds_of(cases, repeats, seconds)
-    for _, cameras in each:
-        cameras.close()
-    return {name: round(2 / time, 1) for name, time in taken.items()}
-
-
 def steps(drones: int, seconds: float, repeats: int) -> dict[str, float]:
     """Milliseconds of a step of so many drones: without pictures, with one each, and over UDP."""
     blind = {"episode_length": EPISODE, "action": "velocity"}
@@ -174,58 +157,6 @@ def two_simulators(drones: int, settings: dict[str, Any]) -> Iterator[RemoteVect
         yield env
 
 
-def sheet(path: Path) -> None:
-    """A step of flights: a row for each, of every kind and of `down`."""
-    from matplotlib import colormaps, image
-
-    cases: list[tuple[str, str | None, str, dict[str, Any], int]] = [
-        ("rotorgram/Landing-v0", "crazyflie2", "front", {"scene": "airport"}, 1),
-        ("rotorgram/Racing-v0", "skydio_x2", "front", {}, 1),
-        ("rotorgram/Formation-v0", None, "chase", {}, 6),
-    ]
-    rows = []
-    for env_id, vehicle, eye, more, drones in cases:
-        kinds = ("down", eye, *(f"{eye}_{kind}" for kind in [*OUTPUTS][1:]))
-        words = [f"{name}@160x120" for name in kinds]
-        env = LocalVectorEnv(
-            env_id, drones, drones=drones, vehicle=vehicle, cameras=words, action="velocity", **more
-        )
-        env.reset(seed=1)
-        for _ in range(15):
-            env.step(np.tile(np.float32((0.3, 0.1, 0.0, 0.2)), (drones, 1)))
-        seen = {name: array[0] for name, array in env.observations.items()}
-        depth = np.log(seen[f"{eye}_depth"][..., 0])
-        shades = (
-            colormaps["viridis_r"]((depth - depth.min()) / np.ptp(depth)),
-            colormaps["tab20"](seen[f"{eye}_segmentation"][..., 0] % 20),
-        )
-        told = [(255 * shade[..., :3]).astype(np.uint8) for shade in shades]
-        rows.append(np.hstack([seen["down"], seen[eye], *told]))
-        env.close()
-    image.imsave(path, np.vstack(rows))
-
-
-def scenes(path: Path) -> None:
-    """Two seeds of each world that is made from one: from behind the paper's craft, and ahead."""
-    from PIL import Image
-
-    vehicle = Vehicle.load()
-    rows = []
-    views = chosen_views(["chase@320x240", "front@320x240"], vehicle.cameras)
-    state = {"position": np.array([[0.0, 0.0, 5.0]]), "quaternion": np.array([[0.9, 0, 0, 0.436]])}
-    everybody = np.ones(1, bool)
-    for name in SEEDED_SCENES:
-        row = []
-        for seed in range(2):
-            cameras = Cameras(vehicle, views, scene=f"{name}:{seed}", fine=True)
-            cameras.take({view.name: everybody for view in views}, state)
-            row += [cameras.pictures[view.name][0] for view in views]
-            cameras.close()
-        rows.append(np.hstack(row))
-    pictures = Image.fromarray(np.vstack(rows)).quantize(128, dither=Image.Dither.NONE)
-    pictures.save(path, optimize=True)
-
-
 def shown(row: dict[str, Any]) -> list[str]:
     """A row of the table of pictures."""
     size = f"{row['width']} × {row['height']}"
@@ -235,20 +166,13 @@ def shown(row: dict[str, Any]) -> list[str]:
 
 def main() -> None:
     """Measure, print and write."""
-    drawings = {"sheet": sheet, "scenes": scenes}
-    files = dict.fromkeys(drawings, Path)
-    args = options(__doc__, seconds=1.0, repeats=7, out=Path, **files).parse_args()
-    for name, draw in drawings.items():
-        if file := getattr(args, name):
-            draw(file)
-            return
+    args = options(__doc__, seconds=1.0, repeats=7, out=Path).parse_args()
     rows = pictures(args.seconds, args.repeats)
     head = ("kind", "pixels", "pictures/s", "of `mujoco.Renderer`", "ratio")
     print(table(head, map(shown, rows)))
     taken = {str(drones): steps(drones, args.seconds, args.repeats) for drones in (1, 16)}
     around = surroundings(args.seconds, args.repeats)
-    side_by_side = threads(args.seconds, args.repeats)
-    print(taken, around, side_by_side, sep="\n")
+    print(taken, around, sep="\n")
     if args.out:
         write(
             args.out,
@@ -256,7 +180,6 @@ def main() -> None:
                 "pictures": rows,
                 "milliseconds of a step": taken,
                 "milliseconds by world": around,
-                "pictures per second of two cameras": side_by_side,
             },
         )
 

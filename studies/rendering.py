@@ -1,4 +1,4 @@
-"""How fast pictures are drawn without a window, and how long a film takes.
+"""How fast pictures are drawn without a window.
 
     python studies/rendering.py [--rounds 5] [--frames 20] [--out FILE.json]
 
@@ -10,19 +10,16 @@ It takes about two minutes on two cores.
 
 import json
 import os
-import tempfile
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 from measuring import RESULTS, options, write
 from rotorgram.agents import PID
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
-from rotorgram.flights.filming import Film, FilmTrack, film, moments
-from rotorgram.flights.trajectories import Trajectory, flown_trajectories
+from rotorgram.flights.filming import moments
+from rotorgram.flights.trajectories import flown_trajectories
 from rotorgram.rendering import Canvas, Moment, Stage
-from rotorgram.rendering.gl import offscreen_context
 
 SIZES = ((640, 360), (1280, 720))
 ENV = "rotorgram/Elevation-v0"
@@ -37,15 +34,14 @@ def rate(draw: Callable[[int], object], frames: int) -> float:
     return frames / (time.perf_counter() - start)
 
 
-def pictures(flight: list[Moment], rounds: int, frames: int) -> tuple[dict[str, float], str]:
-    """Pictures per second by size and quality, and the name of the renderer."""
+def pictures(flight: list[Moment], rounds: int, frames: int) -> dict[str, float]:
+    """Pictures per second by size and quality."""
     rates: dict[str, float] = {}
     for _ in range(rounds):
         for width, height in SIZES:
             for fast in (False, True):
                 stage = Stage("airport")
                 with Canvas(stage, width, height, fast=fast) as canvas:
-                    renderer = driver()
 
                     def draw(number: int, stage: Stage = stage, canvas: Canvas = canvas) -> None:
                         stage.show(flight[number])
@@ -54,34 +50,7 @@ def pictures(flight: list[Moment], rounds: int, frames: int) -> tuple[dict[str, 
                     draw(0)
                     name = f"{width}x{height}{', fast' if fast else ''}"
                     rates[name] = max(rates.get(name, 0.0), round(rate(draw, frames), 1))
-    return rates, renderer
-
-
-def driver() -> str:
-    """Name of OpenGL's renderer."""
-    context = offscreen_context(16, 16)
-    from OpenGL.GL import GL_RENDERER, glGetString  # after the context has chosen its platform
-
-    with context.as_current():
-        name = str(glGetString(GL_RENDERER).decode())
-    context.free()
-    return name
-
-
-def whole_film(flown: Trajectory) -> dict[str, float]:
-    """Five seconds at 1280x720 as MP4, once."""
-    track = FilmTrack(name="PID", trajectories=[flown])
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "film.mp4"
-        start = time.perf_counter()
-        spent = time.process_time()
-        frames = film(path, [track], Film())
-        return {
-            "frames": frames,
-            "seconds": round(time.perf_counter() - start, 1),
-            "processor_seconds": round(time.process_time() - spent, 1),
-            "kilobytes": round(path.stat().st_size / 1000),
-        }
+    return rates
 
 
 def main() -> None:
@@ -90,13 +59,10 @@ def main() -> None:
     config = EnvConfig(env_id=ENV)
     (flown,) = flown_trajectories(PID(env_spec(config)), config, [EPISODE])
     flight = moments(flown)
-    rates, renderer = pictures(flight, args.rounds, args.frames)
     result = {
         "rounds": args.rounds,
         "frames": args.frames,
-        "pictures_per_second": rates,
-        "film": whole_film(flown),
-        "renderer": renderer,
+        "pictures_per_second": pictures(flight, args.rounds, args.frames),
         "load": [round(load, 1) for load in os.getloadavg()],
     }
     write(args.out, result)

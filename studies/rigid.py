@@ -1,7 +1,7 @@
 """Accuracy and speed of the backend `rigid`.
 
     python studies/rigid.py accuracy
-    python studies/rigid.py speed [--crazyflow PYTHON]
+    python studies/rigid.py speed
     python studies/rigid.py sizes
 
 Accuracy: the largest distance to `mujoco` after 5 s of tumbling flight at random thrusts, of every
@@ -10,10 +10,8 @@ nothing is touched, and at the origin for `rigid`, which has no contact: so the 
 of a flight near the origin.
 
 Speed: control steps of 4,096 drones, per second and per second of a processor (which a busy machine
-disturbs less), in turn, medians: of the world alone for `mujoco`
-and `rigid`; the same for one env, `Loop.advance` of Hover. With PYTHON of an
-environment that has Crazyflow (pip install crazyflow): its own step benchmark at the same rates, in
-a process of its own.
+disturbs less), in turn, medians: of the world alone for `mujoco` and `rigid`; the same for one env,
+`Loop.advance` of Hover.
 
 Sizes: the processor's time of `Loop.advance` of Hover with 64 to 4,096 drones.
 Writes docs/results/rigid/{accuracy,speed,sizes}.json.
@@ -21,9 +19,6 @@ Writes docs/results/rigid/{accuracy,speed,sizes}.json.
 It takes about two minutes each on two cores.
 """
 
-import json
-import statistics
-import subprocess
 import time
 from argparse import Namespace
 from collections.abc import Callable
@@ -36,7 +31,6 @@ from rotorgram.models import QUAD_XML, Backend, Vehicle
 from rotorgram.sim import InitialState, make_world
 
 OUT = RESULTS / "rigid"
-HERE = Path(__file__).parent
 FILES = [*sorted(Path("tests/data").glob("*.xml")), *sorted(Path("tests/data").glob("*.toml"))]
 FILES += sorted(QUAD_XML.parent.glob("vehicles/*/vehicle.toml"))
 FILES.remove(Path("tests/data/small.xml"))  # in a fluid
@@ -90,7 +84,7 @@ def distances(file: Path, dtype: str, drones: int = 32) -> dict[str, float]:
 def rate(fly: Callable[[], None], drones: int, seconds: float) -> tuple[float, float]:
     """Control steps of all drones per second, and per second of a processor."""
     wall, used = timed(fly, seconds)
-    return drones / wall, drones / used
+    return round(drones / wall), round(drones / used)
 
 
 def world(backend: Backend, drones: int, steps: int = 2, **settings: object) -> Callable[[], None]:
@@ -134,6 +128,7 @@ def sizes(args: Namespace) -> None:
 
 
 def speed(args: Namespace) -> None:
+    """Rates of the world alone and of `Loop.advance` of Hover, by backend."""
     ways: dict[str, Callable[[], None]] = {}
     firsts = {}
     for name, (make, backend, settings) in {
@@ -147,32 +142,19 @@ def speed(args: Namespace) -> None:
         ways[name] = make(backend, args.drones, **settings)
         ways[name]()
         firsts[name] = round(time.perf_counter() - start, 2)
-    rates: dict[str, list[tuple[float, float]]] = {name: [] for name in ways}
-    told = {}
-    for _ in range(args.repeats):
-        for name, fly in ways.items():
-            rates[name].append(rate(fly, args.drones, args.seconds))
-        if args.crazyflow:
-            words = [str(HERE / "rigid_crazyflow.py"), str(args.drones), str(args.seconds)]
-            said = subprocess.run([args.crazyflow, *words], capture_output=True, check=True).stdout
-            told = json.loads(said.splitlines()[-1])  # warnings come before
-            for kind, label in (("rate", "crazyflow"), ("own_rate", "crazyflow, one physics step")):
-                rates.setdefault(label, []).append(tuple(told[kind]))
-    clock, processor = (
-        {name: round(statistics.median(x[i] for x in values)) for name, values in rates.items()}
-        for i in (0, 1)
-    )
+    rates = in_turns(ways, args.repeats, lambda fly: rate(fly, args.drones, args.seconds))
+    clock = medians({name: [wall for wall, _ in pairs] for name, pairs in rates.items()})
+    processor = medians({name: [used for _, used in pairs] for name, pairs in rates.items()})
     for name, median in clock.items():
-        print(f"{name:32} {median:14,} control steps/s, {processor[name]:14,} of a processor's")
+        print(f"{name:32} {median:14,.0f} control steps/s, {processor[name]:14,.0f} of a processor")
     write(OUT / "speed.json", {
         "drones": args.drones, "repeats": args.repeats,
-        "medians": clock, "medians_per_processor_second": processor,
-        "first_step_s": firsts, "crazyflow": told.get("versions"),
+        "medians": clock, "medians_per_processor_second": processor, "first_step_s": firsts,
     })  # fmt: skip
 
 
 def main() -> None:
-    parser = options(__doc__, drones=4096, repeats=5, seconds=1.0, crazyflow=str)
+    parser = options(__doc__, drones=4096, repeats=5, seconds=1.0)
     parser.add_argument("what", choices=("accuracy", "speed", "sizes"))
     args = parser.parse_args()
     {"accuracy": lambda _: accuracy(), "speed": speed, "sizes": sizes}[args.what](args)

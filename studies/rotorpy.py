@@ -2,9 +2,9 @@
 
     python studies/rotorpy.py [--out FOLDER] [--python FILE]
 
-writes `hummingbird.json`, which `docs/independent.md` shows, and draws `docs/images/rotorpy.png`,
-in some minutes. RotorPy comes from PyPI into an environment that the script makes and removes; or
-FILE is the Python of one that has it.
+writes `hummingbird.json`, which `docs/independent.md` shows, in some minutes. RotorPy comes from
+PyPI into an environment that the script makes and removes; or FILE is the Python of one that has
+it.
 
 Both fly the parameters of RotorPy's own `hummingbird_params`, read when this runs: for ours they
 become an MJCF file. The motor speeds commanded, the starts and the flights are those of
@@ -37,11 +37,8 @@ from rotorgram.models import Vehicle
 
 HERE: Final = Path(__file__).parent
 RESULTS: Final = HERE.parent / "docs" / "results" / "rotorpy"
-PICTURE: Final = HERE.parent / "docs" / "images" / "rotorpy.png"
 VERSION: Final = "3.0.0"
 """Of RotorPy."""
-SHOWN: Final = 0.002  # s: the physics step of the figure
-_EVERY: Final = 5  # control steps between two points of the figure
 
 
 def mjcf(params: dict[str, Any]) -> str:
@@ -93,7 +90,6 @@ def compare(python: str) -> dict[str, Any]:
     commands = thrusts(vehicle)
     told = _theirs(python, EFFECTS, (commands / vehicle.hover_thrust).tolist())
     rows = []
-    curves = {}
     for name, effects in EFFECTS.items():
         tight, usual = (_flight(told["flights"][name][kind]) for kind in ("tight", "default"))
         row = {"effects": name, "metres": {}, "degrees": {}}
@@ -104,9 +100,7 @@ def compare(python: str) -> dict[str, Any]:
             apart = _level(flight).apart(tight)
             row["metres"][kind], row["degrees"][kind] = (float(f"{x:.3g}") for x in apart)
         rows.append(row)
-        shown = (_level(flown[f"{SHOWN * 1e3:g} ms"]), usual)
-        curves[name] = [_distances(flight, tight) for flight in shown]
-    return {"rotorpy": told["version"], "rows": rows, "curves": curves}
+    return {"rotorpy": told["version"], "rows": rows}
 
 
 def _theirs(python: str, cases: dict[str, Any], shares: list[object]) -> dict[str, Any]:
@@ -136,11 +130,6 @@ def _level(flight: Flight) -> Flight:
     return Flight(flight.position - flight.position[0], flight.quaternion, flight.rates)
 
 
-def _distances(flight: Flight, other: Flight) -> list[float]:
-    apart = np.linalg.norm(flight.position - other.position, axis=1)[::_EVERY]
-    return [float(f"{x:.3g}") for x in apart]
-
-
 def markdown(result: dict[str, Any]) -> str:
     """The table, in Markdown."""
     kinds = ["independent", "RotorPy", *(f"{step * 1e3:g} ms" for step in reversed(STEPS))]
@@ -150,29 +139,6 @@ def markdown(result: dict[str, Any]) -> str:
         cells = (f"{row['metres'][k]:.1e} m, {row['degrees'][k]:.1e}°" for k in kinds)
         rows.append((row["effects"], *cells))
     return table(("effects", *heads), rows)
-
-
-def draw(result: dict[str, Any], path: Path) -> None:
-    """Distances from RotorPy with tight tolerances over the flight, as PNG."""
-    import matplotlib.pyplot as plt
-
-    colors = ("#000000", "#0072B2", "#D55E00", "#009E73", "#E69F00", "#CC79A7")
-    figure, axes = plt.subplots(1, 2, figsize=(9, 3.6), sharey=True, layout="constrained")
-    titles = f"ours, physics step {SHOWN * 1e3:g} ms", "RotorPy, its own tolerances"
-    for index, (axis, title) in enumerate(zip(axes, titles, strict=True)):
-        for color, (name, curves) in zip(colors, result["curves"].items(), strict=True):
-            times = np.arange(len(curves[index])) * _EVERY * CONTROL
-            line = "--" if "wind" in name else "-"  # it lies on that of the same drag in still air
-            axis.semilogy(
-                times[1:], curves[index][1:], line, color=color, label=name, linewidth=1.4
-            )
-        axis.set(title=title, xlabel="time, s", xlim=(0, 10))
-        axis.grid(alpha=0.3)
-    axes[0].set_ylabel("distance from RotorPy\nwith tight tolerances, m")
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=6)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=100)
-    plt.close(figure)
 
 
 def _made(folder: str) -> str:
@@ -193,7 +159,6 @@ def _main() -> None:
     text = json.dumps(result, separators=(",", ":")).replace('{"effects"', '\n{"effects"')
     (args.out / "hummingbird.json").write_text(text + "\n", encoding="utf-8")
     print(markdown(result))
-    draw(result, PICTURE if args.out == RESULTS else args.out / PICTURE.name)
 
 
 if __name__ == "__main__":

@@ -203,22 +203,6 @@ def test_a_crash_does_not_move_the_camera_out_of_sight(stage: Stage) -> None:
     assert stage.camera("front").distance == near
 
 
-def test_craft_side_by_side_stand_as_far_apart_as_their_size_asks(opengl: None) -> None:
-    for vehicle, gap in ((None, 4.0), (HEXA, 1.37), (TINY, 0.153)):
-        stage = Stage("plain", 5, vehicle=vehicle)
-        moment = at(3 * stage.radius, thrusts=tuple(stage.vehicle.hover_thrust))
-        stage.show(*[moment] * 5)
-        places = stage.data.qpos.reshape(5, 7)[:, :2]
-        apart = np.linalg.norm(places[:, None] - places, axis=2)
-        others = apart[np.triu_indices(5, 1)]
-        assert others.min() == pytest.approx(gap, rel=0.01)
-        with Canvas(stage, WIDTH, HEIGHT, fast=True) as canvas:
-            for camera in ("chase", "front", "side", "top"):
-                rows, columns = np.nonzero(craft_in(canvas, camera))
-                assert 0 < columns.min() <= columns.max() < WIDTH - 1
-                assert 0 < rows.min() <= rows.max() < HEIGHT - 1
-
-
 def test_a_vehicle_without_its_texture_is_one_sentence(tmp_path: Path) -> None:
     file = tmp_path / "hexa.xml"
     texture = '<asset><texture name="t" type="2d" file="no.png"/><material name="m" texture="t"/>'
@@ -254,8 +238,6 @@ def test_twins_share_a_canvas_and_nothing_else(stage: Stage, canvas: Canvas) -> 
     other = canvas.draw("side", twin)
     assert not same(before, other)
     assert same(canvas.draw("side"), before)
-    with pytest.raises(ValueError, match="stage: expected the canvas's own or a twin"):
-        canvas.draw("side", Stage("plain"))
 
 
 def test_shadows_and_smooth_edges_are_there_unless_it_is_to_be_fast(opengl: None) -> None:
@@ -288,19 +270,17 @@ def test_lines_follow_the_task_and_the_vehicle() -> None:
     heading = MetricValue("heading_error", -12.345, "deg")
     gates = MetricValue("gates_passed", 3.0)
     hover = at(1.0, 0.25, metrics=(position, heading, gates))
-    assert hover.lines(100.0) == [
+    assert hover.lines == [
         ("e", "0.250 m"),
         ("heading error", "-12.35 deg"),
         ("gates passed", "3"),
         ("elevation", "1.00 m"),
-        ("goal", "1.25 m"),
         ("F1 to F4", "49 49 49 49 N"),
         ("reward", "+0.000"),
         ("step", "0"),
         ("episode", "0"),
     ]
-    free = at(1.0, goal=None, metrics=(), thrusts=(0.066,) * 4).lines(0.15)
-    assert free[:2] == [("elevation", "1.00 m"), ("F1 to F4", "66 66 66 66 mN")]
-    assert at(1.0, thrusts=(3.25,)).lines(13.0)[3] == ("F1", "3.2 N")
-    six = at(1.0, thrusts=(5.0, 7.0, 5.0, 7.0, 5.0, 7.0)).lines(30.0)
-    assert six[3] == ("F1 to F6, mean", "6.0 N")
+    free = at(1.0, goal=None, metrics=(), thrusts=(0.066,) * 4).lines
+    assert free[:2] == [("elevation", "1.00 m"), ("F1 to F4", "0.066 0.066 0.066 0.066 N")]
+    six = at(1.0, thrusts=(5.0, 7.25, 5.0, 7.0, 5.0, 7.0)).lines
+    assert six[2] == ("F1 to F6", "5 7.25 5 7 5 7 N")

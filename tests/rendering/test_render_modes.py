@@ -13,7 +13,7 @@ from rotorgram.envs import LocalVectorEnv, SingleEnv, register
 from rotorgram.envs.parallel import LocalParallelEnv
 from rotorgram.envs.tasks import Elevation
 from rotorgram.models import InputError
-from rotorgram.rendering import Moment, NoOpenGL, live, window
+from rotorgram.rendering import Moment, NoOpenGL, live
 from rotorgram.rendering.gl import offscreen_context
 from rotorgram.rendering.stage import Stage
 from rotorgram.sim import InitialState, stack
@@ -105,8 +105,8 @@ def test_a_window_shows_a_moment_once(monkeypatch: pytest.MonkeyPatch) -> None:
     drawn = []
 
     class View:
-        def __init__(self, stage: Stage, *_: object, of: int) -> None:
-            assert stage.drones == of == 1
+        def __init__(self, stage: Stage, _: object) -> None:
+            assert stage.drones == 1
 
         def draw_in_time(self, *moments: Moment) -> None:
             drawn.extend(moments)
@@ -115,7 +115,6 @@ def test_a_window_shows_a_moment_once(monkeypatch: pytest.MonkeyPatch) -> None:
             drawn.append(None)
 
     monkeypatch.setattr(live, "LiveView", View)
-    monkeypatch.setattr(window, "Window", lambda *_: None)
     env = gym.make(ENV_ID, render_mode="human")
     env.reset(seed=0)
     for _ in range(3):
@@ -175,16 +174,16 @@ def test_drones_of_one_world_are_in_one_picture_where_they_are() -> None:
     assert picture.shape == (360, 480, 3)
     assert picture.dtype == np.uint8
     env.close()
-    stage = Stage("plain", 2, names=("a", "b"))
+    stage = Stage("plain", 2)
     stage.show(*(at(9.0, position=(2.0 * x, -x, 9.0)) for x in (1.0, 4.0)))
     places = stage.data.qpos.reshape(2, 7)[:, :3]
     assert places == pytest.approx(np.array([[2.0, -1.0, 9.0], [8.0, -4.0, 9.0]]))
     assert stage.least_distance == pytest.approx(math.hypot(6.0, 3.0))
-    assert Stage("plain", 2).least_distance is None  # of different worlds
+    assert Stage("plain").least_distance is None
 
 
 def test_cameras_hold_every_craft_and_goal_of_one_world() -> None:
-    stage = Stage("plain", 2, names=("a", "b"))
+    stage = Stage("plain", 2)
     moments = []
     for y in ((-1.0, 5.0), (4.0, -20.0)):
         craft, goal = ((0.0, one, 9.0) for one in y)
@@ -199,7 +198,7 @@ def test_cameras_hold_every_craft_and_goal_of_one_world() -> None:
 
 
 def test_drones_of_one_world_are_named_and_have_paths_and_goals_of_their_own_colour() -> None:
-    stage = Stage("plain", 2, names=("a", "b"))
+    stage = Stage("plain", 2)
     for step in range(10):
         x = 0.1 * step
         both = (at(9.0, position=(x, y, 9.0), goal=(5.0, y, 9.0), step=step) for y in (-1.0, -4.0))
@@ -209,7 +208,7 @@ def test_drones_of_one_world_are_named_and_have_paths_and_goals_of_their_own_col
     geoms = scene.geoms[: scene.ngeom]
     kinds = mujoco.mjtGeom
     labels = [geom for geom in geoms if geom.type == kinds.mjGEOM_LABEL]
-    assert [geom.label.strip() for geom in labels] == ["a", "b"]
+    assert [geom.label.strip() for geom in labels] == ["drone_0", "drone_1"]
     assert [geom.pos[1] for geom in labels] == pytest.approx([-1.0, -4.0])  # over their crafts
     colors: dict[float, set[tuple[float, ...]]] = {-1.0: set(), -4.0: set()}
     for geom in geoms:
