@@ -66,7 +66,7 @@ def spec_of(
 def observed(task: Task) -> tuple[ArraySpec, ...]:
     """What is observed of one moment: by the task, and by sensors."""
     readings = readings_of(task.config.sensors, task.vehicle, task.control_period)
-    return task.observation + tuple(ArraySpec(**reading._asdict()) for reading in readings)
+    return task.observation + tuple(ArraySpec(**reading) for reading in readings)
 
 
 def _action(controller: Controller) -> ArraySpec | Discrete:

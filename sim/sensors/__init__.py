@@ -8,7 +8,7 @@ World frame: x east, y north, z up. Arrays have the leading axes of the world, n
 """
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final
 
 from ...models.errors import InputError, shortened
 from ...models.fields import Choice, check, check_names
@@ -17,7 +17,6 @@ from ..state import Array, ByName, WorldState, chosen
 from ..world import World
 from .barometer import Barometer
 from .base import Sensor, Source, Values
-from .channel import Channel
 from .estimator import Estimator
 from .gps import Gps
 from .imu import Imu
@@ -28,7 +27,7 @@ from .rangefinder import Rangefinder
 if TYPE_CHECKING:
     from ...models.vehicle import Vehicle
 
-__all__ = ["SENSOR_TYPES", "Estimator", "Reading", "Sensors", "checked_sensors", "readings_of"]
+__all__ = ["SENSOR_TYPES", "Estimator", "Sensors", "checked_sensors", "readings_of"]
 
 SENSOR_TYPES: Final[Mapping[str, type[Sensor]]] = {
     kind.name: kind for kind in (Imu, Magnetometer, Barometer, Rangefinder, Gps, MotionCapture)
@@ -38,18 +37,6 @@ SENSOR_TYPES: Final[Mapping[str, type[Sensor]]] = {
 _ESTIMATE = Estimator.name
 _OBSERVED = Choice(("added", _ESTIMATE))
 _SOURCES: Final[Mapping[str, type[Source]]] = {**SENSOR_TYPES, _ESTIMATE: Estimator}
-
-
-class Reading(NamedTuple):
-    """What a sensor adds to an observation; the names are those of an `ArraySpec`."""
-
-    name: str
-    shape: tuple[int, ...]
-    low: tuple[float, ...]
-    high: tuple[float, ...]
-    unit: tuple[str, ...]
-    frame: str
-    components: tuple[str, ...]
 
 
 def checked_sensors(given: object) -> dict[str, Any]:
@@ -63,8 +50,8 @@ def checked_sensors(given: object) -> dict[str, Any]:
     check_names(given, [*_SOURCES, "observe"], "sensors")
     sensors: dict[str, Any] = {}
     for name, kind in _SOURCES.items():
-        settings = given.get(name)
-        if settings is None or settings is False:
+        settings = given.get(name, False)
+        if settings is False:
             continue
         if settings is True:
             settings = {}
@@ -92,15 +79,18 @@ def _resolved(sensors: Values, vehicle: "Vehicle", period: float) -> dict[str, d
     }
 
 
-def readings_of(sensors: Values, vehicle: "Vehicle", period: float) -> list[Reading]:
-    """What sensors add to an observation, from `checked_sensors`. Raises `InputError`."""
-    readings = []
+def readings_of(sensors: Values, vehicle: "Vehicle", period: float) -> list[dict[str, Any]]:
+    """Fields of the `ArraySpec` of each array that sensors add to an observation.
+
+    From `checked_sensors`. Raises `InputError`.
+    """
+    readings: list[dict[str, Any]] = []
     for name, values in _resolved(sensors, vehicle, period).items():
         kind = _SOURCES[name]
-        source = kind(values, period)
-        shape = (len(kind.components),)
-        bounds = source.low(), source.high()
-        readings.append(Reading(name, shape, *bounds, kind.units, kind.frame, kind.components))
+        low, high = kind.bounds(values)
+        bounds = {"shape": (len(low),), "low": low, "high": high}
+        words = {"unit": kind.units, "frame": kind.frame, "components": kind.components}
+        readings.append({"name": name, **bounds, **words})
     return [] if "observe" in sensors else readings
 
 
@@ -122,9 +112,8 @@ class Sensors(Kept):
             gravity = world.vehicle.gravity
             values = settings.pop(_ESTIMATE)
             self._estimator = Estimator(values, period, gravity, altitude, field)
-        self._channels = {
-            name: Channel(SENSOR_TYPES[name], values, world, period)
-            for name, values in settings.items()
+        self._sensors = {
+            name: SENSOR_TYPES[name](values, period, world) for name, values in settings.items()
         }
         self._replaces = "observe" in sensors
         self._steps: Array = 0
@@ -132,24 +121,22 @@ class Sensors(Kept):
     def begin(self, mask: Array) -> None:
         """Begin episodes of the drones of a mask, bool, shape (W, A), after a reset of theirs."""
         self._steps = chosen(mask, 0 * mask, self._steps)
-        for channel in self._channels.values():
-            channel.begin(mask)
+        for sensor in self._sensors.values():
+            sensor.begin(mask)
         if self._estimator is not None:
-            self._estimator.begin(mask, self._world.state, self._channels["imu"].value)
+            self._estimator.begin(mask, self._world.state, self._sensors["imu"].value)
 
     def sample(self, mask: Array) -> None:
         """After a control step of the drones of a mask; the others keep their readings."""
         self._steps = self._steps + mask
-        for channel in self._channels.values():
-            channel.sample(mask, self._steps)
+        for sensor in self._sensors.values():
+            sensor.sample(mask, self._steps)
         if self._estimator is not None:
-            self._estimator.update(mask, self._channels)
+            self._estimator.update(mask, self._sensors)
 
     def parts(self) -> dict[str, Kept]:
-        """The channels, the sensors' errors and the estimator."""
-        parts: dict[str, Kept] = dict(self._channels)
-        for name, channel in self._channels.items():
-            parts[f"{name} errors"] = channel.sensor
+        """The sensors and the estimator."""
+        parts: dict[str, Kept] = dict(self._sensors)
         if self._estimator is not None:
             parts[_ESTIMATE] = self._estimator
         return parts
@@ -159,7 +146,7 @@ class Sensors(Kept):
         """What the observation gets, by name, shapes (W, A, k)."""
         if self._replaces:
             return {}
-        readings = {name: channel.value for name, channel in self._channels.items()}
+        readings = {name: sensor.value for name, sensor in self._sensors.items()}
         if self._estimator is not None:
             readings[_ESTIMATE] = self._estimator.estimate()
         return readings

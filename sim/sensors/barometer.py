@@ -6,7 +6,7 @@ from typing import ClassVar
 from ...models.fields import Limits
 from ..state import Array, chosen, clip
 from ..world import World
-from .base import Sensor, Setting, Values
+from .base import Bounds, Sensor, Setting, Values
 
 SEA_LEVEL_PRESSURE = 101_325.0  # Pa. These are those of ISO 2533:1975
 SEA_LEVEL_TEMPERATURE = 288.15  # K
@@ -43,29 +43,29 @@ class Barometer(Sensor):
     name = "barometer"
     prefix = "barometer_"
     columns = 2
-    arrays = ("_bias",)
+    arrays = (*Sensor.arrays, "_bias")
     defaults: ClassVar = {"walk": 0.0}
     own: ClassVar = {"altitude": Setting(0.0, Limits(-1e3, 9e3, "m"))}
     frame = "above sea level"
     components = ("pressure altitude",)
     units = ("m",)
-    top = (HIGHEST + 1,)
 
-    def __init__(self, values: Values, interval: float) -> None:
-        super().__init__(values, interval)
-        self._step = values["walk"] * math.sqrt(interval)
+    def __init__(self, values: Values, period: float, world: World) -> None:
+        super().__init__(values, period, world)
+        self._step = values["walk"] * math.sqrt(self.interval)
         self._bias: Array = 0.0
 
-    def low(self) -> tuple[float, ...]:
-        return (LOWEST - 1,)
+    @classmethod
+    def bounds(cls, values: Values) -> Bounds:
+        return (LOWEST - 1,), (HIGHEST + 1,)
 
-    def begin(self, mask: Array, normal: Array) -> None:
+    def draw(self, mask: Array, normal: Array) -> None:
         """No walk yet."""
         self._bias = chosen(mask, 0.0 * normal[..., :1], self._bias)
 
-    def measure(self, world: World, normal: Array) -> Array:
+    def measure(self, normal: Array) -> Array:
         # An array of a single drone too: a power of Python's numbers may differ by a bit.
-        height = world.state.position[..., 2:] + self.values["altitude"]
+        height = self.world.state.position[..., 2:] + self.values["altitude"]
         exact = isa_pressure(clip(height, LOWEST, HIGHEST))
         pressure = exact + self._bias + self.values["noise"] * normal[..., :1]
         self._bias = self._bias + self._step * normal[..., 1:]

@@ -1,13 +1,17 @@
-"""What all sensors share: their settings, the spec of their readings, white noise."""
+"""What all sensors share: settings, bounds of readings, and how they are sampled."""
 
+import math
 from collections.abc import Mapping
+from statistics import NormalDist
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+
+import numpy as np
 
 from ...models.coefficients import COEFFICIENTS
 from ...models.errors import InputError
 from ...models.fields import Limits, check, check_names
 from ..snapshots import Kept
-from ..state import Array
+from ..state import Array, chosen, clip, component, kept
 from ..world import World
 
 if TYPE_CHECKING:
@@ -20,6 +24,8 @@ UNIT = 1.001  # Bound of a unit quaternion's components
 
 Values = Mapping[str, Any]
 """Settings by name: numbers, tuples of numbers, None."""
+Bounds = tuple[tuple[float, ...], tuple[float, ...]]
+"""Least and largest value of each component."""
 
 
 class Setting(NamedTuple):
@@ -52,7 +58,7 @@ class Source(Kept):
         name: In the option `sensors`, and of the observation's array.
         own: Settings that are no coefficients of a vehicle.
         frame: Of the reading; so are `components` and `units`.
-        top: Upper bound of each component, unless `high` computes it.
+        top: Upper bound of each component, unless `bounds` computes it.
     """
 
     name: ClassVar[str]
@@ -66,12 +72,10 @@ class Source(Kept):
         self.values = values
         self.interval = interval
 
-    def high(self) -> tuple[float, ...]:
-        """Upper bound of each component."""
-        return self.top
-
-    def low(self) -> tuple[float, ...]:
-        return tuple(-bound for bound in self.high())
+    @classmethod
+    def bounds(cls, values: Values) -> Bounds:
+        """Bounds of a reading with these settings."""
+        return tuple(-bound for bound in cls.top), cls.top
 
     @classmethod
     def settings(cls) -> Mapping[str, Setting]:
@@ -108,7 +112,9 @@ class Source(Kept):
 
 
 class Sensor(Source):
-    """Base of sensors: exact values and white noise.
+    """Base of sensors, sampled at the end of control steps of `period` s.
+
+    A reading has one number more: 1 if it is new, 0 if the last reading was held.
 
     Class attributes:
         prefix: What its coefficients' names begin with in a vehicle's file.
@@ -121,6 +127,22 @@ class Sensor(Source):
     needs: ClassVar[tuple[str, ...]] = ("noise",)
     defaults: ClassVar[Mapping[str, float]] = {}
     columns: ClassVar[int]
+    arrays: ClassVar[tuple[str, ...]] = ("_now", "_held")
+    lists = ("_late",)
+
+    def __init__(self, values: Values, period: float, world: World) -> None:
+        self._every = values["every"]
+        self._lag = values["lag"]
+        super().__init__(values, self._every * period)
+        self.world = world
+        self._low, self._high = map(np.array, self.bounds(values))
+        # One number more than the sensor takes decides whether a reading is lost.
+        self._noise = world.random.noise(f"sensor {self.name}", self.columns + 1)
+        dropout = values["dropout"]
+        self._lost = NormalDist().inv_cdf(dropout) if dropout else -math.inf
+        self._now: Array = 0.0
+        self._held: Array = 0.0
+        self._late: list[Array] = []  # those on their way, the oldest first
 
     @classmethod
     def settings(cls) -> Mapping[str, Setting]:
@@ -151,16 +173,60 @@ class Sensor(Source):
             )
         return values | {"every": round(every), "lag": round(lag)}
 
-    def begin(self, mask: Array, normal: Array) -> None:
+    @property
+    def value(self) -> Array:
+        """What is observed now, shape (W, A, k)."""
+        return self._now[..., :-1]
+
+    @property
+    def fresh(self) -> Array:
+        """1 where it was not observed before, and 0 elsewhere, shape (W, A)."""
+        return component(self._now, -1)
+
+    def begin(self, mask: Array) -> None:
+        """First reading of the drones of a mask."""
+        self.draw(mask, self._noise.normal(mask)[..., :-1])
+        first = self._read(self._noise.normal(mask))
+        self._held = chosen(mask, first, self._held)
+        self._now = chosen(mask, _with(first, 1.0), self._now)
+        old = _with(first, 0.0)
+        self._late = [chosen(mask, old, late) for late in self._late or [old] * self._lag]
+
+    def sample(self, mask: Array, steps: Array) -> None:
+        """After a control step of the drones of a mask; `steps` counts those of each episode."""
+        due = mask & (steps % self._every == 0)
+        fresh = due
+        if np.any(due):
+            normal = self._noise.normal(due)
+            fresh = due & (component(normal, -1) >= self._lost)
+            self._held = chosen(fresh, self._read(normal), self._held)
+        first, *rest = [*self._late, _with(self._held, fresh)]
+        self._now = chosen(mask, first, self._now)
+        self._late = list(kept(mask, rest, self._late))
+
+    def draw(self, mask: Array, normal: Array) -> None:
         """Draw an episode's errors for the drones of a mask."""
 
-    def measure(self, world: World, normal: Array) -> Array:
-        """A reading, shape (W, A, k), which may leave the bounds.
+    def measure(self, normal: Array) -> Array:
+        """A reading of the present state, shape (W, A, k), which may leave the bounds.
 
         The normals of drones that are not read are 0.
         """
         raise NotImplementedError
 
+    def _read(self, normal: Array) -> Array:
+        """A reading within the sensor's bounds."""
+        return clip(self.measure(normal[..., :-1]), self._low, self._high)
+
 
 def _is_whole(steps: float) -> bool:
     return abs(steps - round(steps)) < 1e-6 * max(steps, 1.0)
+
+
+def _with(reading: Array, fresh: Array) -> Array:
+    """A reading with one more number for each drone."""
+    *lead, size = reading.shape
+    both = np.empty((*lead, size + 1))
+    both[..., :-1] = reading
+    both[..., -1] = fresh
+    return both

@@ -10,8 +10,7 @@ import numpy as np
 from ...models.fields import Limits
 from ..rotations import advanced, between, cross, parts_of, to_world, world_z
 from ..state import Array, WorldState, chosen, clip, component, each, stack
-from .base import FURTHEST, MAX_SPEED, UNIT, Setting, Source, Values
-from .channel import Channel
+from .base import FURTHEST, MAX_SPEED, UNIT, Sensor, Setting, Source, Values
 from .magnetometer import FIELD
 
 _TIME = Setting(1.0, Limits(1e-3, 1e4, "s"))
@@ -76,66 +75,66 @@ class Estimator(Source):
             setattr(self, name, chosen(mask, exact, getattr(self, name)))
         self.body_rates = imu[..., :3]
 
-    def update(self, mask: Array, channels: Mapping[str, Channel]) -> None:
+    def update(self, mask: Array, sensors: Mapping[str, Sensor]) -> None:
         """A control step of the drones of a mask."""
-        imu = channels["imu"].value
+        imu = sensors["imu"].value
         period = self.interval
         rates = imu[..., :3]
         force = imu[..., 3:]
-        turned = advanced(self.quaternion, rates * period + self._correction(force, channels))
+        turned = advanced(self.quaternion, rates * period + self._correction(force, sensors))
         acceleration = to_world(turned, force) - self._gravity * _UP
         position = self.position + period * self.velocity + 0.5 * period**2 * acceleration
         velocity = self.velocity + period * acceleration
-        position, velocity = self._followed(position, velocity, channels)
+        position, velocity = self._followed(position, velocity, sensors)
         self.quaternion = chosen(mask, turned, self.quaternion)
         self.position = chosen(mask, clip(position, -FURTHEST, FURTHEST), self.position)
         self.velocity = chosen(mask, clip(velocity, -MAX_SPEED, MAX_SPEED), self.velocity)
         self.body_rates = chosen(mask, rates, self.body_rates)
 
-    def _correction(self, force: Array, channels: Mapping[str, Channel]) -> Array:
+    def _correction(self, force: Array, sensors: Mapping[str, Sensor]) -> Array:
         """Rotation vector in the body frame that corrects the attitude, rad."""
         up = world_z(self.quaternion)
         share = 1 - math.exp(-self.interval / self.values["attitude_time"])
         angle = share / self._gravity * stack(cross(parts_of(force), parts_of(up)))
-        if channel := channels.get("magnetometer"):
-            field = to_world(self.quaternion, channel.value)
+        if sensor := sensors.get("magnetometer"):
+            field = to_world(self.quaternion, sensor.value)
             off = self._north - np.atan2(component(field, 1), component(field, 0))
-            off = np.atan2(np.sin(off), np.cos(off)) * self._gain(channel, "attitude_time")
+            off = np.atan2(np.sin(off), np.cos(off)) * self._gain(sensor, "attitude_time")
             angle = angle + each(off) * up
-        if channel := channels.get("motion_capture"):
-            error = between(self.quaternion, channel.value[..., 3:])
-            sign = 2.0 * self._gain(channel, "attitude_time") * np.sign(component(error, 0))
+        if sensor := sensors.get("motion_capture"):
+            error = between(self.quaternion, sensor.value[..., 3:])
+            sign = 2.0 * self._gain(sensor, "attitude_time") * np.sign(component(error, 0))
             angle = angle + each(sign) * error[..., 1:]
         return angle
 
     def _followed(
-        self, position: Array, velocity: Array, channels: Mapping[str, Channel]
+        self, position: Array, velocity: Array, sensors: Mapping[str, Sensor]
     ) -> tuple[Array, Array]:
         """Position and velocity, corrected by fresh readings."""
-        if channel := channels.get("barometer"):
-            off = component(channel.value, 0) - self._altitude - component(position, 2)
-            g, h = self._gains(channel, "height_time")
+        if sensor := sensors.get("barometer"):
+            off = component(sensor.value, 0) - self._altitude - component(position, 2)
+            g, h = self._gains(sensor, "height_time")
             position = position + each(g * off) * _UP
             velocity = velocity + each(h * off) * _UP
-        if channel := channels.get("motion_capture"):
-            g, h = self._gains(channel, "position_time")
-            off = channel.value[..., :3] - position
+        if sensor := sensors.get("motion_capture"):
+            g, h = self._gains(sensor, "position_time")
+            off = sensor.value[..., :3] - position
             position = position + each(g) * off
             velocity = velocity + each(h) * off
-        if channel := channels.get("gps"):
-            gain = each(self._gain(channel, "position_time"))
-            position = position + gain * (channel.value[..., :3] - position)
-            velocity = velocity + gain * (channel.value[..., 3:] - velocity)
+        if sensor := sensors.get("gps"):
+            gain = each(self._gain(sensor, "position_time"))
+            position = position + gain * (sensor.value[..., :3] - position)
+            velocity = velocity + gain * (sensor.value[..., 3:] - velocity)
         return position, velocity
 
-    def _gain(self, channel: Channel, time: str) -> Array:
+    def _gain(self, sensor: Sensor, time: str) -> Array:
         """Share of an error that a fresh reading removes; 0 without a fresh reading."""
-        return (1 - math.exp(-channel.interval / self.values[time])) * channel.fresh
+        return (1 - math.exp(-sensor.interval / self.values[time])) * sensor.fresh
 
-    def _gains(self, channel: Channel, time: str) -> tuple[Array, Array]:
+    def _gains(self, sensor: Sensor, time: str) -> tuple[Array, Array]:
         """g, and h over the interval: 1 - ξ² and (1 - ξ)² for two poles at ξ."""
-        pole = math.exp(-channel.interval / self.values[time])
-        return (1 - pole**2) * channel.fresh, (1 - pole) ** 2 / channel.interval * channel.fresh
+        pole = math.exp(-sensor.interval / self.values[time])
+        return (1 - pole**2) * sensor.fresh, (1 - pole) ** 2 / sensor.interval * sensor.fresh
 
     def estimate(self) -> Array:
         """Position, velocity, quaternion and rates, shape (W, A, 13)."""

@@ -3,7 +3,6 @@
 import numpy as np
 
 from ..state import Array
-from ..world import World
 from .base import FURTHEST, MAX_SPEED, Sensor
 
 
@@ -19,8 +18,9 @@ class Gps(Sensor):
     units = ("m",) * 3 + ("m/s",) * 3
     top = (FURTHEST,) * 3 + (MAX_SPEED,) * 3
 
-    def measure(self, world: World, normal: Array) -> Array:
+    def measure(self, normal: Array) -> Array:
         level, vertical, speed = (self.values[name] for name in self.needs)
         sigma = np.array((level, level, vertical, speed, speed, speed))
-        exact = np.concat((world.state.position, world.state.velocity), axis=-1)
+        state = self.world.state
+        exact = np.concat((state.position, state.velocity), axis=-1)
         return exact + sigma * normal

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ..rotations import to_body
 from ..state import Array, chosen
 from ..world import World
-from .base import Sensor, Values
+from .base import Bounds, Sensor, Values
 
 GYRO_RANGE = math.radians(2000.0)  # rad/s: the largest setting of the BMI088
 ACCELEROMETER_RANGE = 24 * 9.80665  # m/s²: the same
@@ -34,7 +34,7 @@ class Imu(Sensor):
 
     name = "imu"
     prefix = ""
-    arrays = ("_bias", "_scale")
+    arrays = (*Sensor.arrays, "_bias", "_scale")
     needs = ("gyro_noise", "accelerometer_noise")
     defaults: ClassVar = {
         "gyro_walk": 0.0,
@@ -51,26 +51,28 @@ class Imu(Sensor):
     components = tuple(f"{what} {axis}" for what in ("gyro", "accelerometer") for axis in "xyz")
     units = ("rad/s",) * 3 + ("m/s²",) * 3
 
-    def __init__(self, values: Values, interval: float) -> None:
-        super().__init__(values, interval)
-        self._white = self._both("noise") / math.sqrt(interval)
-        self._step = self._both("walk") * math.sqrt(interval)
+    def __init__(self, values: Values, period: float, world: World) -> None:
+        super().__init__(values, period, world)
+        self._white = self._both("noise") / math.sqrt(self.interval)
+        self._step = self._both("walk") * math.sqrt(self.interval)
         self._bias: Array = 0.0
         self._scale: Array = 0.0
 
     def _both(self, what: str) -> NDArray[np.float64]:
         return np.repeat([self.values[f"gyro_{what}"], self.values[f"accelerometer_{what}"]], 3)
 
-    def high(self) -> tuple[float, ...]:
-        return tuple(self._both("range").tolist())
+    @classmethod
+    def bounds(cls, values: Values) -> Bounds:
+        high = (values["gyro_range"],) * 3 + (values["accelerometer_range"],) * 3
+        return tuple(-bound for bound in high), high
 
-    def begin(self, mask: Array, normal: Array) -> None:
+    def draw(self, mask: Array, normal: Array) -> None:
         """Bias and error of scale."""
         self._bias = chosen(mask, self._both("bias") * normal[..., :6], self._bias)
         self._scale = chosen(mask, self._both("scale") * normal[..., 6:], self._scale)
 
-    def measure(self, world: World, normal: Array) -> Array:
-        exact = np.concat((world.state.body_rates, specific_force(world)), axis=-1)
+    def measure(self, normal: Array) -> Array:
+        exact = np.concat((self.world.state.body_rates, specific_force(self.world)), axis=-1)
         reading = (1 + self._scale) * exact + self._bias + self._white * normal[..., :6]
         self._bias = self._bias + self._step * normal[..., 6:]
         return reading

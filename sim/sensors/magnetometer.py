@@ -7,7 +7,6 @@ import numpy as np
 from ...models.fields import Limits
 from ..rotations import to_body
 from ..state import Array
-from ..world import World
 from .base import Sensor, Setting
 
 FIELD = (1.287, 21.532, -43.231)
@@ -27,6 +26,6 @@ class Magnetometer(Sensor):
     units = ("µT",) * 3
     top = (1e3,) * 3  # far from any reading but for a wrong noise
 
-    def measure(self, world: World, normal: Array) -> Array:
+    def measure(self, normal: Array) -> Array:
         field = np.array(self.values["field"]) + 0.0 * normal
-        return to_body(world.state.quaternion, field) + self.values["noise"] * normal
+        return to_body(self.world.state.quaternion, field) + self.values["noise"] * normal

@@ -4,7 +4,6 @@ import numpy as np
 
 from ..rotations import advanced
 from ..state import Array
-from ..world import World
 from .base import FURTHEST, UNIT, Sensor
 
 
@@ -20,8 +19,8 @@ class MotionCapture(Sensor):
     units = ("m",) * 3 + ("1",) * 4
     top = (FURTHEST,) * 3 + (UNIT,) * 4
 
-    def measure(self, world: World, normal: Array) -> Array:
-        state = world.state
+    def measure(self, normal: Array) -> Array:
+        state = self.world.state
         position = state.position + self.values["noise"] * normal[..., :3]
         turned = advanced(state.quaternion, self.values["angle_noise"] * normal[..., 3:])
         return np.concat((position, turned), axis=-1)

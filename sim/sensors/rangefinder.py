@@ -1,8 +1,7 @@
 """Rangefinder."""
 
 from ..state import Array, clip, stack
-from ..world import World
-from .base import Sensor
+from .base import Bounds, Sensor, Values
 
 
 class Rangefinder(Sensor):
@@ -19,12 +18,10 @@ class Rangefinder(Sensor):
     components = ("distance",)
     units = ("m",)
 
-    def high(self) -> tuple[float, ...]:
-        return (self.values["limit"],)
+    @classmethod
+    def bounds(cls, values: Values) -> Bounds:
+        return (0.0,), (values["limit"],)
 
-    def low(self) -> tuple[float, ...]:
-        return (0.0,)
-
-    def measure(self, world: World, normal: Array) -> Array:
-        distance = clip(world.below(), 0.0, self.values["limit"])
+    def measure(self, normal: Array) -> Array:
+        distance = clip(self.world.below(), 0.0, self.values["limit"])
         return stack((distance,)) + self.values["noise"] * normal
