@@ -5,7 +5,7 @@ Knows nothing of tasks, rewards or Gymnasium.
 
 from .control import LEVELS, CollectiveThrust, Controller, Gains, RotorThrust, make_controller
 from .effects import EffectOptions
-from .random import Draw, numbers_of
+from .random import Draw
 from .randomize import PARAMETERS, Randomization
 from .rotations import body_x, body_z, to_body, world_z
 from .sensors import checked_sensors
@@ -45,7 +45,6 @@ __all__ = [
     "each",
     "make_controller",
     "make_world",
-    "numbers_of",
     "plain",
     "square_root",
     "stack",

@@ -28,6 +28,7 @@ Ids = Any
 START = crc32(b"start")
 """The draws with which a task begins episodes."""
 RANDOMIZATION = crc32(b"randomization")
+RADIO = crc32(b"radio")
 SCENES = crc32(b"scenes")
 GUSTS = "gusts"
 
@@ -55,11 +56,6 @@ def philox(counter: Words, key: Words) -> Words:
     words[..., 0::2] = even
     words[..., 1::2] = odd
     return words
-
-
-def use_number(name: str) -> int:
-    """The number of a use."""
-    return crc32(name.encode())
 
 
 def words_of(
@@ -94,17 +90,6 @@ def normal(words: Words) -> Numbers:
     return np.concatenate(parts, axis=-1, dtype=np.float64)
 
 
-def normals_of(key: Words, use: int, episode: Array, step: Array, count: int) -> Numbers:
-    """Standard normal numbers of a use, shape (..., count); arguments as of `words_of`."""
-    return normal(words_of(key, use, episode, step, count + count % 2))[..., :count]
-
-
-def numbers_of(use: str, keys: Words, step: Words, count: int) -> Numbers:
-    """Numbers from 0 up to 1, shape (..., count), for keys of one word, uint32, and steps (...)."""
-    both = np.stack((keys, np.zeros_like(keys)), axis=-1)
-    return uniform(words_of(both, use_number(use), np.zeros_like(step), step, count))
-
-
 class Random(Kept):
     """The counters of W worlds. Until a world is seeded its seed is unpredictable.
 
@@ -114,7 +99,7 @@ class Random(Kept):
         episode: Number of the world's episode since it was seeded, shape (W,).
     """
 
-    arrays = ("keys", "episode", "_is_drawn")
+    arrays = ("keys", "episode")
 
     def __init__(self, shape: tuple[int, ...]) -> None:
         self.shape = shape
@@ -123,7 +108,6 @@ class Random(Kept):
         seeds = np.array([randbits(64) for _ in range(worlds)], np.uint64)
         self.keys = _keys(seeds)
         self.episode = np.zeros(worlds, np.uint32)
-        self._is_drawn = np.zeros(worlds, bool)  # whether the start of an episode was drawn
         self._noises: dict[str, Noise] = {}
 
     def seed(self, ids: Ids, seeds: Sequence[int | None]) -> None:
@@ -132,32 +116,19 @@ class Random(Kept):
             if seed is not None:
                 self.keys[world] = _keys(np.array(int(seed) % 2**64, np.uint64))
                 self.episode[world] = 0
-                self._is_drawn[world] = False
         for noise in self._noises.values():
             noise.forget(ids)
 
-    def start(self, use: int, ids: Ids) -> "Draw":
-        """Begin an episode of the worlds `ids` by drawing its start."""
-        self.episode[ids] += np.uint32(1)
-        self._is_drawn[ids] = True
-        return Draw(self, use, ids)
-
     def begin(self, ids: Ids) -> None:
-        """Reset the worlds `ids`: an episode begins, unless its start was drawn before."""
-        self.episode[ids] += (~self._is_drawn[ids]).astype(np.uint32)
-        self._is_drawn[ids] = False
+        """Begin an episode of the worlds `ids`."""
+        self.episode[ids] += np.uint32(1)
         for noise in self._noises.values():
             noise.begin(ids)
 
     def noise(self, name: str, size: int) -> "Noise":
         """A source of `size` normal numbers for each drone and step."""
-        self._noises[name] = noise = Noise(self, use_number(name), size)
+        self._noises[name] = noise = Noise(self, crc32(name.encode()), size)
         return noise
-
-    def shares(self, use: int, ids: Ids) -> Numbers:
-        """One number from 0 up to 1 for each of the worlds `ids` and their episode."""
-        words = words_of(self.keys[ids], use, self.episode[ids], np.zeros(len(ids)), 1)
-        return uniform(words[:, 0])
 
     def parts(self) -> dict[str, Kept]:
         """The noises."""
@@ -170,12 +141,16 @@ def _keys(seeds: NDArray[np.uint64]) -> Words:
 
 
 class Draw:
-    """Draws numbers for the worlds that begin an episode; for the others it gives zeros."""
+    """Draws numbers for the worlds that begin an episode; for the others it gives zeros.
 
-    def __init__(self, random: Random, use: int, ids: Ids) -> None:
+    `ahead` is 1 for draws before the `Random.begin` of their episode.
+    """
+
+    def __init__(self, random: Random, use: int, ids: Ids, ahead: int = 0) -> None:
         self._random = random
         self._use = use
         self._ids = ids
+        self._episode = random.episode[ids] + np.uint32(ahead)
         self._words = np.empty((len(ids), 0), np.uint32)
         self._first = 0  # block that comes next
 
@@ -197,17 +172,9 @@ class Draw:
         """The next words of each world that begins, from a new block on."""
         count = self._random.drones * prod(size) + more
         if count > self._words.shape[1]:
-            random = self._random
-            ids = self._ids
-            blocks = max(_BLOCKS, -(-count // 4))
-            self._words = words_of(
-                random.keys[ids],
-                self._use,
-                random.episode[ids],
-                np.zeros(len(ids), np.uint32),
-                4 * blocks,
-                self._first,
-            )
+            keys = self._random.keys[self._ids]
+            many = 4 * max(_BLOCKS, -(-count // 4))
+            self._words = words_of(keys, self._use, self._episode, 0, many, self._first)
         words = self._words[:, :count]
         used = -(-count // 4)
         self._words = self._words[:, 4 * used :]
@@ -294,6 +261,7 @@ class Noise(Kept):
         keys = np.repeat(random.keys[ids][:, None], ahead, axis=1)
         episodes = np.repeat(random.episode[ids][:, None], ahead, axis=1)
         count = random.drones * self._size
-        drawn = normals_of(keys, self._use, episodes, steps, count)
+        words = words_of(keys, self._use, episodes, steps, count + count % 2)
+        drawn = normal(words)[..., :count]
         self._rows[ids] = drawn.reshape(len(ids), ahead, random.drones, self._size)
         self._left[ids] = ahead

@@ -78,8 +78,8 @@ class World(NotCopied):
         self.random.seed(ids, [seeds[i] for i in ids])
 
     def draw(self, mask: Array) -> Draw:
-        """Begin an episode of the worlds of a mask."""
-        return self.random.start(START, self._ids(mask))
+        """Draws for the next start of the worlds of a mask, before their `reset`."""
+        return Draw(self.random, START, self._ids(mask), ahead=1)
 
     def reset(self, mask: Array, pose: InitialState) -> None:
         """Reset the worlds of the mask, bool, shape (W, A), to their rows of `pose`.

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ...models.cameras import FARTHEST, View, chosen_views
 from ...scenes import scenes_of
-from ...sim.random import SCENES, Random
+from ...sim.random import SCENES, Draw, Random
 from ...sim.snapshots import Arrays, Snapshot
 from ..spec import ArraySpec
 from ..tasks.task import Task
@@ -135,9 +135,8 @@ class Pictures(Stage):
         scenes = np.zeros(self._shape, int)
         count = len(self._scenes)
         if count > 1:
-            ids = np.flatnonzero(begun)
-            shares = self._random.shares(SCENES, ids)
-            scenes[ids] = (count * shares).astype(int)[:, None]
+            shares = Draw(self._random, SCENES, np.flatnonzero(begun)).uniform(0.0, 1.0)
+            scenes += (count * np.reshape(shares, self._shape)[:, :1]).astype(int)
         record.scenes = scenes.reshape(record.shape)[()]
 
     def step(self, record: Record) -> None:

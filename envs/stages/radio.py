@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ...sim import numbers_of
+from ...sim.random import RADIO, uniform, words_of
 from ..state import State
 from ..tasks.goal import length
 from ..tasks.swarm import SwarmOptions
@@ -50,7 +50,8 @@ class Radio(Stage):
         record.said = filled(message, self._options.radio_delay + 1, 2)
         record.heard = np.repeat(rest[:, None], self._own.shape[0], axis=1)
         record.age = np.where(self._in_range(position, position), 0.0, np.inf)
-        record.keys = (lots * 2.0**32).astype(np.uint32)
+        keys = (lots * 2.0**32).astype(np.uint32)
+        record.keys = np.stack((keys, 0 * keys), axis=-1)
         record.silent = np.zeros(record.shape, bool)
 
     def step(self, record: Record) -> None:
@@ -71,7 +72,7 @@ class Radio(Stage):
         arrives = self._in_range(state.position, said[..., :3]) & (said[:, None, :, 6] == 0)
         if options.radio_loss:
             steps = (record.steps - 1).astype(np.uint32)
-            chances = numbers_of("radio", record.keys, steps, self._own.shape[0])
+            chances = uniform(words_of(record.keys, RADIO, 0, steps, self._own.shape[0]))
             arrives &= chances >= options.radio_loss  # (W, receiver, sender)
         record.heard = np.where(arrives[..., None], said[:, None, :, :6], record.heard)
         record.age = np.where(arrives, float(options.radio_delay), record.age + 1.0)

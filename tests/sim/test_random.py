@@ -1,6 +1,7 @@
 """Philox 4x32-10 by its published answers; numbers as functions of seed, use, episode and step."""
 
 import math
+from zlib import crc32
 
 import numpy as np
 import pytest
@@ -12,13 +13,12 @@ from rotorgram.sim.random import (
     Draw,
     Random,
     normal,
-    normals_of,
     philox,
     uniform,
-    use_number,
     words_of,
 )
 from tables import SIM
+from worlds import begin
 
 
 @pytest.mark.parametrize(("counter", "key", "words"), SIM["philox"]["rows"])
@@ -51,7 +51,7 @@ def test_normal_numbers_are_normal() -> None:
     keys = np.zeros((1000, 2), np.uint32)
     keys[:, 0] = np.arange(1000)
     zeros = np.zeros(1000)
-    many = normals_of(keys, 1, zeros, zeros, 51).ravel()
+    many = normal(words_of(keys, 1, zeros, zeros, 52)).ravel()
     count = many.size
     assert abs(many.mean()) < 4 / math.sqrt(count)
     assert abs(many.std() - 1) < 4 / math.sqrt(2 * count)
@@ -89,7 +89,7 @@ def random_of(*shape: int, seed: int = 5) -> Random:
 def numbers(seed: int, step: int, count: int = 2, episode: int = 1) -> list[float]:
     """What a noise with the name "wind" gives to one world."""
     key = np.array((seed, 0), np.uint32)
-    found: list[float] = normals_of(key, use_number("wind"), episode, step, count).tolist()
+    found: list[float] = normal(words_of(key, crc32(b"wind"), episode, step, count)).tolist()
     return found
 
 
@@ -144,7 +144,7 @@ def test_a_draw_begins_the_episode_of_the_reset_that_follows() -> None:
     random.seed([0], [3])
     shares = []
     for episode in (1, 2):
-        shares.append(random.start(START, [0]).uniform(0.0, 1.0).item())
+        shares.append(Draw(random, START, [0], ahead=1).uniform(0.0, 1.0).item())
         random.begin([0])
         assert random.episode.tolist() == [episode]
     random.begin([0])  # without a draw
@@ -196,6 +196,7 @@ def test_a_seed_repeats_the_starts_of_a_world(worlds: int) -> None:
         world.seed(every, range(11, 11 + worlds))
         for _ in range(2):
             share = world.draw(every).uniform(0.0, 1.0)
+            begin(world, position=(0.0, 0.0, 5.0))
             starts.append(np.ravel(share).tolist())
     first, second, *again = starts
     assert again == [first, second]
