@@ -164,7 +164,7 @@ class EnvConfig:
             self._set(files=checked_bundles(self.files))
         self._set(sensors=checked_sensors(self.sensors))
         if not isinstance(self.effects, EffectOptions):
-            self._set(effects=EffectOptions.from_options(self.effects))
+            self._set(effects=read_table(EffectOptions, self.effects, "effects"))
         self._set(randomize=Randomization(self.randomize, None).to_options())
         if not isinstance(self.task, Mapping):
             raise InputError(f"task: expected options by name, got {shortened(self.task)}")

@@ -40,16 +40,16 @@ PARAMETERS = {name: Parameter(**table) for name, table in _TABLES.items()}
 CENTER = ("center_x", "center_y", "center_z")
 WHOLE = ("action_delay", "observation_delay")
 """Parameters that are whole numbers; a uniform draw gives each the same chance."""
-_FORMS = "uniform(low,high), loguniform(low,high), normal(mean,deviation), choice(a,b,...)"
+_FORMS = "uniform(low,high), loguniform(low,high), normal(mean,deviation)"
 _TEXT = re.compile(r"\s*([a-z]+)\s*\(([^()]*)\)\s*")
 
 
 class Randomization:
     """Distributions by the parameter's name, as texts: "uniform(0.8, 1.2)", or a number.
 
-    `uniform(low, high)`, `loguniform(low, high)`, `normal(mean, deviation)` and `choice(a, b, ...)`
-    with equal chances; a number stands for itself. Raises `InputError` for anything else, and for a
-    parameter whose effect is off. Effects None: this is not checked.
+    `uniform(low, high)`, `loguniform(low, high)` and `normal(mean, deviation)`; a number stands for
+    itself. Raises `InputError` for anything else, and for a parameter whose effect is off. Effects
+    None: this is not checked.
     """
 
     def __init__(self, texts: object, effects: EffectOptions | None) -> None:
@@ -78,8 +78,8 @@ class Randomization:
         options: dict[str, float | str] = {}
         for name, (kind, numbers) in self._kinds.items():
             inside = ", ".join(repr(number).removesuffix(".0") for number in numbers)
-            alone = kind == "choice" and len(numbers) == 1
-            options[name] = numbers[0] if alone else f"{kind}({inside})"
+            is_one = kind == "uniform" and numbers[0] == numbers[1]
+            options[name] = numbers[0] if is_one else f"{kind}({inside})"
         return options
 
     def most_steps(self, name: str) -> int:
@@ -95,17 +95,12 @@ class Randomization:
             limits = PARAMETERS[name]
             if kind == "normal":
                 values = numbers[0] + draw.normal(numbers[1])
-            elif kind == "uniform":
-                spare = 0.5 if name in WHOLE else 0.0  # what is rounded to the ends
-                values = clip(draw.uniform(numbers[0] - spare, numbers[1] + spare), *numbers)
             elif kind == "loguniform":
                 low, high = np.log(numbers)
                 values = np.exp(draw.uniform(float(low), float(high)))
             else:
-                count = len(numbers)
-                ends = [index / count for index in range(1, count)]
-                chosen = np.searchsorted(ends, draw.uniform(0.0, 1.0), side="right")
-                values = np.take(numbers, chosen)
+                spare = 0.5 if name in WHOLE else 0.0  # what is rounded to the ends
+                values = clip(draw.uniform(numbers[0] - spare, numbers[1] + spare), *numbers)
             values = clip(values, limits.low, limits.high)
             drawn[name] = np.round(values) if name in WHOLE else values
         return drawn
@@ -114,13 +109,12 @@ class Randomization:
 def _distribution(name: str, text: object) -> tuple[str, tuple[float, ...]]:
     limits = PARAMETERS[name]
     match = _TEXT.fullmatch(text) if isinstance(text, str) else None
-    kind, inside = match.groups() if match else ("choice", str(text))
+    kind, inside = match.groups() if match else ("uniform", f"{text},{text}")
     try:
         numbers = tuple(float(word) for word in inside.split(","))
     except ValueError:
         numbers = ()
-    is_one = match is not None or len(numbers) == 1
-    if not (is_one and _is_right(kind, numbers, limits)):
+    if not _is_right(kind, numbers, limits):
         within = f"numbers from {limits.low:g} to {limits.high:g} {limits.unit}".rstrip()
         raise InputError(
             f"randomize: {name}: expected {_FORMS} or a number, with low <= high and {within}, "
@@ -130,12 +124,10 @@ def _distribution(name: str, text: object) -> tuple[str, tuple[float, ...]]:
 
 
 def _is_right(kind: str, numbers: tuple[float, ...], limits: Parameter) -> bool:
-    within = [limits.low <= number <= limits.high for number in numbers]
-    if kind == "choice":
-        return bool(numbers) and all(within)
     if len(numbers) != 2:
         return False
     first, second = numbers
+    within = [limits.low <= number <= limits.high for number in numbers]
     if kind == "normal":
         return within[0] and 0 <= second < math.inf
     is_ordered = all(within) and first <= second

@@ -1,12 +1,10 @@
 """Which effects are on."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Annotated, Self
+from typing import Annotated
 
 from ...models import MAX_DRAG
-from ...models.errors import InputError, shortened
-from ...models.fields import Limits, check_fields, check_names
+from ...models.fields import Limits, check_fields
 
 MAX_WIND = 100.0  # m/s
 
@@ -54,20 +52,10 @@ class EffectOptions:
     force acts at the body's origin."""
 
     def __post_init__(self) -> None:
-        check_fields(self, "effects: ")
-
-    @classmethod
-    def from_options(cls, options: object) -> Self:
-        """Options by name. An unknown name raises `InputError`, which names the known ones."""
-        if not isinstance(options, Mapping):
-            raise InputError(
-                f"effects: expected a mapping from names to values, got {shortened(options)}"
-            )
-        check_names(options, [one.name for one in fields(cls)], "effects")
-        return cls(**options)
+        check_fields(self, "effects.")
 
     def to_options(self) -> dict[str, object]:
-        """The reverse of `from_options`: those that differ from their default."""
+        """Options by name that differ from their default."""
         changed = {}
         for one in fields(self):
             value = getattr(self, one.name)

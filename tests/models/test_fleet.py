@@ -165,7 +165,7 @@ def test_what_a_fleet_cannot_have_is_one_sentence() -> None:
     fleet = load_vehicles("crazyflie2,paper", 2)
     with pytest.raises(InputError, match=r"vehicle: expected one with the backend rigid, got"):
         make_world(fleet, 1, "rigid", drones=2)
-    lag = EffectOptions.from_options({"motor_lag": True})
+    lag = EffectOptions(motor_lag=True)
     with pytest.raises(InputError, match=r"expected none with several vehicles, got motor_lag"):
         make_world(fleet, 1, drones=2, effects=lag)
     with pytest.raises(InputError, match=r"sensors: expected none with several vehicles, got imu"):

@@ -151,5 +151,5 @@ def test_what_lacks_is_one_sentence() -> None:
         birds(TOP, LOWER, downwash=True)
     with pytest.raises(InputError, match=r"rotors\.radius in .*, which downwash needs"):
         Downwash(Vehicle.load())
-    with pytest.raises(InputError, match="effects: downwash: expected true or false, got 1"):
+    with pytest.raises(InputError, match=r"effects\.downwash: expected true or false, got 1"):
         EffectOptions(downwash=1)  # type: ignore[arg-type]

@@ -64,7 +64,7 @@ def test_drones_that_keep_apart_fly_bit_for_bit_as_alone(
     name: str | None, effects: dict[str, Any], backend: dict[str, Any]
 ) -> None:
     vehicle = Vehicle.load(name)
-    options: Any = {"effects": EffectOptions.from_options(effects), "backend": "rigid", **backend}
+    options: Any = {"effects": EffectOptions(**effects), "backend": "rigid", **backend}
     together = make_world(vehicle, 2, drones=3, **options)
     alone = make_world(vehicle, 6, **options)
     pose = tumbling(2, 3)
@@ -89,7 +89,7 @@ def test_every_drone_has_the_draws_that_it_has_on_mujoco() -> None:
     """Of mass and the like, and of gusts; float64."""
     vehicle = Vehicle.load("crazyflie2")
     shape = (2, 3)
-    effects = EffectOptions.from_options({**EFFECTS, "gusts": 6.0})
+    effects = EffectOptions(**EFFECTS, gusts=6.0)
     drawing = Randomization(DRAWN, effects)
     given: Any = {"drones": 3, "effects": effects, "randomize": drawing}
     ours = make_world(vehicle, 2, "rigid", dtype="float64", **given)
@@ -117,7 +117,7 @@ def test_every_drone_has_the_draws_that_it_has_on_mujoco() -> None:
 def test_downwash_is_that_of_mujoco_and_of_a_world_alone() -> None:
     """Nine drones one above the other, each in the jets of those above it."""
     vehicle = Vehicle.load("hummingbird")
-    effects = EffectOptions.from_options({"body_drag": True, "downwash": True})
+    effects = EffectOptions(body_drag=True, downwash=True)
     dice = np.random.default_rng(0)
     place = dice.uniform(-0.1, 0.1, (2, 9, 3))
     place[..., 2] += 20.0 + 1.0 * np.arange(9)
