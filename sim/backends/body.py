@@ -14,8 +14,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from ...models.mjcf import level_data
-from ...models.vehicle import Vehicle, craft_bodies
+from ...models.vehicle import Vehicle
 from .. import elementary
 from ..randomize import CENTER
 from ..rotations import matrix, product, transposed
@@ -107,7 +106,6 @@ class RigidBody:
         self._levers = _sparse(levers, size)
         self._reactions = _sparse(reactions, size)
         self._torques = _sparse(levers + reactions)
-        self._inertias = _own_and_far(vehicle)
         self._of_inertia = _euler(vehicle.inertia)
         self.vary({})
 
@@ -118,21 +116,14 @@ class RigidBody:
         vehicle's.
         """
         mass, center = self._least
-        own, far = self._inertias
         factor = parameters.get("mass", 1.0)
-        more = parameters.get("inertia", 1.0)
-        easier = 1.0 / factor
         turn, gyroscopic = self._of_inertia
         if inertia is not None:
             turn, gyroscopic = mapped(_euler_of_each(inertia), lambda x: x if x.any() else 0.0)
-        elif "inertia" in parameters and far.any():
-            turn, gyroscopic = _euler_of_each(own * more[:, None, None] + far)
-        else:
-            easier = easier / more
         shift: Vector = tuple(parameters.get(name, 0.0) for name in CENTER)
         self.varying = Varying(
             mass=mass * factor,
-            easier=easier,
+            easier=1.0 / factor / parameters.get("inertia", 1.0),
             turn=turn,
             gyroscopic=gyroscopic,
             reaction=parameters.get("reaction"),
@@ -237,19 +228,6 @@ def mapped(tree: Array, change: Callable[[Array], Array]) -> Array:
         parts = [mapped(one, change) for one in tree]
         return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
     return change(tree) if hasattr(tree, "shape") else tree
-
-
-def _own_and_far(vehicle: Vehicle) -> tuple[np.ndarray, np.ndarray]:
-    """The inertia as the sum of that of the bodies, and of their masses about the center."""
-    model = vehicle.model
-    data = level_data(model)
-    own = np.zeros((3, 3))
-    for i in craft_bodies(model).tolist():
-        axes = data.ximat[i].reshape(3, 3)
-        own += axes @ np.diag(model.body_inertia[i]) @ axes.T
-    far = vehicle.inertia - own
-    far[abs(far) < _NOTHING * abs(vehicle.inertia).max()] = 0.0
-    return vehicle.inertia - far, far
 
 
 def _euler(inertia: np.ndarray) -> tuple[Array, Array]:

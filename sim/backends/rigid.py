@@ -3,14 +3,13 @@
 It flies as `mujoco` does until a part touches the ground or another drone, and reports the contact.
 """
 
-import logging
 from collections.abc import Mapping
 
 import mujoco
 import numpy as np
 
 from ...models.errors import InputError
-from ...models.vehicle import Vehicle, craft_geoms
+from ...models.vehicle import Vehicle, craft_bodies, craft_geoms
 from ..effects import EffectOptions
 from ..randomize import Randomization
 from ..snapshots import Arrays
@@ -60,6 +59,11 @@ class RigidWorld(World):
         super().__init__(vehicle, shape, effects, randomize)
         _check_obstacles(vehicle)
         _check_forces(vehicle)
+        if "inertia" in self._drawn and len(craft_bodies(vehicle.model)) > 1:
+            raise InputError(
+                "randomize: inertia: expected a craft of one body with the backend rigid, got "
+                f"{vehicle.name}"
+            )
         self.dtype = np.dtype(dtype)
         self._body = RigidBody(vehicle)
         self._hull = Hull(vehicle)
@@ -84,13 +88,7 @@ class RigidWorld(World):
             return
         pushed = self.effects is not None and self.effects.on_body
         rotors = self.vehicle.num_rotors
-        try:
-            self._function = kernel.compiled(self._body, rotors, self.dtype, wrench=pushed)
-        except InputError as error:
-            if self._compiled:
-                raise
-            self._compiled = False
-            logging.getLogger(__name__).warning("rigid flies by NumPy: %s", error)
+        self._function = kernel.compiled(self._body, rotors, self.dtype, wrench=pushed)
 
     def vary(self, inertia: Array, reaction: Array, air: Mapping[str, Array]) -> None:
         """Set the numbers of every drone before the first reset; needs the effect `body_drag`.
@@ -270,16 +268,13 @@ def _check_obstacles(vehicle: Vehicle) -> None:
 
 def _check_forces(vehicle: Vehicle) -> None:
     """Refuse a vehicle that MuJoCo would move differently, by its joint or its integrator."""
-    model, data = vehicle.model, mujoco.MjData(vehicle.model)
-    data.qpos[2:7] = (vehicle.rest_height + 1e3, 0.8, 0.36, -0.36, 0.3168596)
+    model = vehicle.model
+    data = mujoco.MjData(model)
+    data.qpos[2:7] = (vehicle.rest_height + 1e3, 0.8, 0.36, -0.48, 0.0)
     data.qvel[:] = (1.0, -2.0, 0.5, 0.4, 0.7, -0.6)
-    # With thrusts far above hover, rounding would hide a difference.
-    moderate = vehicle.hover_thrust + abs(vehicle.hover_thrust).mean()
-    most = np.minimum(vehicle.thrust_high, moderate)
-    thrust = 0.6 * vehicle.hover_thrust + 0.4 * most
-    thrust[0] = 0.5 * (vehicle.thrust_low[0] + vehicle.hover_thrust[0])
+    thrust = np.maximum(0.8 * vehicle.hover_thrust, vehicle.thrust_low)
+    thrust[0] = vehicle.hover_thrust[0]
     data.ctrl[:] = thrust / [rotor.newtons for rotor in vehicle.rotors]
-    data.qpos[3:7] /= np.linalg.norm(data.qpos[3:7])
     rows = np.concatenate((data.qpos, data.qvel))
     ours = np.concatenate(RigidBody(vehicle).fly(rows[:, None], thrust[:, None])) - rows
     mujoco.mj_step(model, data)

@@ -16,7 +16,6 @@ from rotorgram.envs.config import EnvConfig
 from rotorgram.models import QUAD_XML, Vehicle
 from rotorgram.models.errors import InputError
 from rotorgram.sim import PhysicsError, Randomization, make_world
-from rotorgram.sim.backends import kernel
 from tables import SIM
 from worlds import begin
 
@@ -174,7 +173,6 @@ def test_arrays_have_the_same_bits_alone_and_in_a_batch() -> None:
 @pytest.mark.parametrize(
     ("script", "reason"),
     [
-        (b"#!/bin/sh\nexec sleep 30", "timed out after 0.2 seconds"),
         (b"#!/bin/sh\nfor f; do case $f in *.so) echo > $f;; esac; done", "file too short"),
         (b"#!/no/interpreter", "No such file"),
         (b"#!/bin/sh\nprintf '\\377 no' >&2; exit 1", "\ufffd no"),
@@ -182,26 +180,18 @@ def test_arrays_have_the_same_bits_alone_and_in_a_batch() -> None:
     ],
 )
 def test_a_compiler_that_misbehaves_is_told_in_one_sentence(
-    script: bytes,
-    reason: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
+    script: bytes, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tool = tmp_path / "cc"
     tool.write_bytes(script)
     tool.chmod(0o755)
     monkeypatch.setenv("CC", f"'{tool}' -O1")
-    seconds = 0.2 if b"sleep" in script else 60.0
-    monkeypatch.setattr(kernel, "COMPILE_SECONDS", seconds)
     vehicle = Vehicle.load(linear_drag=0.124)
-    with pytest.raises(InputError, match=rf"^compiled: expected [^\n]*{reason}"):
-        arrays(vehicle, compiled=True)
-    world = arrays(vehicle)
+    with pytest.raises(InputError, match=rf"^compiled: expected [^\n]*{reason}") as caught:
+        arrays(vehicle)
+    assert str(caught.value).isprintable()
+    world = arrays(vehicle, compiled=False)
     assert world.shape == (N, 1)  # by NumPy
-    (message,) = caplog.messages
-    assert message.startswith("rigid flies by NumPy: compiled: expected ")
-    assert message.isprintable()
 
 
 def test_without_a_compiler_numpy_flies(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -242,7 +232,9 @@ def test_a_free_fall_is_exact() -> None:
 )
 def test_effects_and_drawn_parameters(file: Path, effects: dict[str, Any]) -> None:
     """With float64 a seed draws what it draws on mujoco, gusts among it."""
-    drawn = SIM["rigid"]["drawn"]
+    drawn = dict(SIM["rigid"]["drawn"])
+    if file == HEXA:  # two bodies
+        del drawn["inertia"]
     options = {"vehicle": file, "effects": effects, "randomize": drawn}
     options |= {"flight_band": 10.0, "goal": (0, 0, 60)}
     rigid = EnvConfig.from_keywords(HOVER, backend="rigid", dtype="float64", **options)
@@ -353,6 +345,10 @@ def test_whole_episodes_agree_with_mujoco(env_id: str, size: float, file: Any) -
         ({"dtype": "float16"}, "dtype: expected 'float32' or 'float64', or none, got 'float16'"),
         ({"compiled": 1}, "compiled: expected true or false, or none, got 1"),
         ({"num_threads": 2}, "num_threads: expected dtype or compiled"),
+        (
+            {"vehicle": str(HEXA), "randomize": {"inertia": 1.1}},
+            "randomize: inertia: expected a craft of one body with the backend rigid, got hexa",
+        ),
     ],
 )
 def test_wrong_arguments(arguments: dict[str, Any], expected: str) -> None:
