@@ -24,7 +24,7 @@ SPEED = "m{}_rads"
 SPEED_COMMAND = "m{}_command_rads"
 THROTTLE = "m{}_throttle"
 """Columns of rotor 1, 2...: measured speed and commanded speed, rad/s, and throttle, 0 to 1, which
-is the share of the largest thrust. A log has measured speeds, or one of the commands, or both."""
+is the share of the largest thrust. A log has one of them; the first counts."""
 _KINDS = (SPEED, SPEED_COMMAND, THROTTLE)
 _LONGEST_GAP = 0.1  # s: longer gaps are not interpolated
 _POSITION_ERROR = 0.5  # m: between two samples, besides the distance by the velocity
@@ -46,8 +46,6 @@ class FlightLog:
     """Of the rotors in the vehicle's order, rad/s, shape (N, R): measured, or else commanded."""
     measured: bool = True
     """Whether the speeds were measured."""
-    commands: Floats | None = None
-    """Commanded speeds, rad/s, shape (N, R); None: the log has none."""
     left_out: int = 0
     """Samples that contradicted their neighbours and were left out."""
 
@@ -64,25 +62,24 @@ def read_log(path: Path | str, vehicle: Vehicle, period: float = 0.01) -> Flight
     table = _our_columns(path, vehicle.num_rotors)
     states = np.stack([table[name] for name in MOTION], axis=1)
     states[:, 3:7] = _without_flips(states[:, 3:7])
-    measured = _of_rotors(table, SPEED, vehicle)
-    commands = _of_rotors(table, SPEED_COMMAND, vehicle)
-    throttle = _of_rotors(table, THROTTLE, vehicle)
-    if commands is None and throttle is not None:
-        commands = _commanded_speeds(path, throttle, vehicle)
-    speeds = commands if measured is None else measured
+    speeds = _of_rotors(table, SPEED, vehicle)
+    measured = speeds is not None
     if speeds is None:
-        names = " or ".join(kind.format(f"1...{vehicle.num_rotors}") for kind in _KINDS)
-        _refuse(path, f"columns {names}", "none")
-    followed = speeds if commands is None else commands
-    samples = np.concatenate((states, speeds, followed), axis=1)
-    _check_speeds(path, vehicle, samples[:, len(MOTION) :])
+        speeds = _of_rotors(table, SPEED_COMMAND, vehicle)
+    if speeds is None:
+        throttle = _of_rotors(table, THROTTLE, vehicle)
+        if throttle is None:
+            names = " or ".join(kind.format(f"1...{vehicle.num_rotors}") for kind in _KINDS)
+            _refuse(path, f"columns {names}", "none")
+        speeds = _commanded_speeds(path, throttle, vehicle)
+    _check_speeds(path, vehicle, speeds)
+    samples = np.concatenate((states, speeds), axis=1)
     later = _later_rows(path, table["t"])
     rows = _consistent_rows(path, table["t"], samples, later)
     times = table["t"][rows]
     grid = _grid(path, times, period)
     uniform = np.stack([np.interp(grid, times, column) for column in samples[rows].T], axis=1)
-    ends = len(MOTION), len(MOTION) + vehicle.num_rotors
-    states, speeds, followed = np.split(uniform, ends, axis=1)
+    states, speeds = np.split(uniform, [len(MOTION)], axis=1)
     length = np.linalg.norm(states[:, 3:7], axis=1, keepdims=True)
     if not (length > 0.5).all():
         _refuse(path, "quaternions of length 1", f"{length.min():.3g}")
@@ -92,23 +89,21 @@ def read_log(path: Path | str, vehicle: Vehicle, period: float = 0.01) -> Flight
         period=period,
         states=states,
         speeds=speeds,
-        measured=measured is not None,
-        commands=None if commands is None else followed,
+        measured=measured,
         left_out=len(later) - len(rows),
     )
 
 
 def with_lag(log: FlightLog, time_constant: float) -> FlightLog:
-    """The flight with speeds that follow the commands with a first-order lag, s.
+    """The flight with speeds that follow its own, as commands, with a first-order lag, s.
 
     They begin at the first command; a command holds until the next sample.
     """
-    assert log.commands is not None
     from scipy.signal import lfilter
 
     decay = float(np.exp(-log.period / time_constant))
-    first = log.commands[:1]
-    held = np.concatenate((first, log.commands[:-1]))
+    first = log.speeds[:1]
+    held = np.concatenate((first, log.speeds[:-1]))
     speeds, _ = lfilter([1 - decay], [1, -decay], held, axis=0, zi=decay * first)
     return replace(log, speeds=speeds)
 

@@ -69,7 +69,7 @@ class Identified:
     """The vehicle's numbers that the logs determine."""
 
     numbers: Numbers
-    """All numbers that move the vehicle; the time constant among them if the logs have commands."""
+    """All numbers that move the vehicle; with the time constant, if it could be identified."""
     estimates: tuple[Estimate, ...]
     before: tuple[float, ...]
     """Mean errors over a window with the vehicle's numbers: position, m, attitude, rad, velocity,
@@ -90,16 +90,16 @@ def identify(
 ) -> Identified:
     """Identify numbers of a vehicle from logs with the same period; `window` in s.
 
-    The time constant of the rotors takes part if the logs have commands. Raises `InputError` for
-    an unknown name, or logs that are too short.
+    The time constant of the rotors takes part if the logs have commands alone. Raises `InputError`
+    for an unknown name, or logs that are too short.
     """
     for name in names:
         if name not in KNOWN:
             raise InputError(f"fit: expected some of {', '.join(KNOWN)}, got {name!r}")
-    if len({log.commands is None for log in logs}) > 1:
-        raise InputError("logs: expected commands in all of them or in none")
+    if len({log.measured for log in logs}) > 1:
+        raise InputError("logs: expected measured speeds in all of them or in none")
     base = numbers_of(vehicle)
-    if logs[0].commands is not None:
+    if not logs[0].measured:
         base[LAG] = vehicle.coefficients["rotors.time_constant"] or 0.05
     free = [name for name in names if name in base]
     windows = _cut(logs, base, _steps(window, logs[0].period))
@@ -216,8 +216,6 @@ class Fit:
         self._x = np.maximum(values / self._scales, self._lowest + 1e-6)
         self._spreads: Floats = np.ones((len(windows.horizons), 4, 1))
         self._whitener: Floats | None = None
-        self._speed_spread = 1.0
-        self._fits_speeds = LAG in numbers and bool(logs) and logs[0].measured
 
     def solve(self) -> dict[str, float]:
         """The numbers of least robust sum of squares; those of a group stay equal."""
@@ -312,9 +310,6 @@ class Fit:
         self._spreads = median / 0.6745 + 1e-12
         if not self._logs:
             return
-        if self._fits_speeds:
-            sizes = np.abs(self._speed_differences(numbers))
-            self._speed_spread = float(np.median(sizes)) / 0.6745 + 1e-12
         # At the first horizon differences have the noise of two measurements, at the start of one.
         noise = np.repeat(self._spreads[0], 3) / np.sqrt(2)
         start = _shifted(self._windows.start, noise)
@@ -329,21 +324,6 @@ class Fit:
         rows = self._weighed(candidates)
         if self._whitener is not None:
             rows = np.einsum("mij,pmj->pmi", self._whitener, rows)
-        if self._fits_speeds:
-            differences = [self._speed_differences(one) for one in candidates]
-            rows = np.concatenate((rows, np.stack(differences) / self._speed_spread), axis=-1)
-        return rows
-
-    def _speed_differences(self, numbers: Numbers) -> Floats:
-        """Speeds that follow the commands less those measured, in each window, (M, K)."""
-        flights = []
-        for log in self._logs:
-            late = with_lag(log, numbers[LAG]).speeds - log.speeds
-            flights.append(replace(log, speeds=late))
-        steps = self._windows.speeds.shape[1]
-        cut = Windows.cut(flights, steps, steps)
-        begun = cut.index > 0  # in the first window they come from where the command was
-        rows: Floats = (cut.speeds * begun[:, None, None]).reshape(len(begun), -1)
         return rows
 
 
