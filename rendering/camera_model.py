@@ -34,15 +34,15 @@ def objects_of(
     vehicle: Vehicle, drones: int, scene: str, marks: Sequence[Mark], *, payload: bool
 ) -> tuple[str, ...]:
     """`Cameras.objects` of such cameras, without an OpenGL."""
-    names = drone_names(drones)
-    return objects_in(drawn_model(vehicle, names, scene, marks, payload=payload), names)[0]
+    return objects_in(drawn_model(vehicle, drones, scene, marks, payload=payload))[0]
 
 
 def drawn_model(
-    vehicle: Vehicle, names: Sequence[str], scene: str, marks: Sequence[Mark], *, payload: bool
+    vehicle: Vehicle, drones: int, scene: str, marks: Sequence[Mark], *, payload: bool
 ) -> mujoco.MjModel:
     """What is drawn: craft with their cameras, what surrounds them, the task's marks."""
-    crafts = members_of(vehicle, len(names))
+    names = drone_names(drones)
+    crafts = members_of(vehicle, drones)
     spec = swarm_spec([craft.path for craft in crafts], names)
     add_scene(spec, scene)
     bodies = [body for body in spec.worldbody.bodies if body.name.partition("/")[0] in names]
@@ -113,7 +113,7 @@ def _add_mark(body: mujoco.MjsBody, name: str, mark: Mark, thickness: float) -> 
         _add(body, own, MARK_GEOMS[part.kind], size, rgba=rgba, **place)
 
 
-def objects_in(model: mujoco.MjModel, names: Sequence[str]) -> tuple[tuple[str, ...], np.ndarray]:
+def objects_in(model: mujoco.MjModel) -> tuple[tuple[str, ...], np.ndarray]:
     """Names of a model's objects, and the object number of each geom, after a leading 0.
 
     All geoms of a craft are one object. So are geoms of the world with names of two or more slashes
@@ -122,6 +122,7 @@ def objects_in(model: mujoco.MjModel, names: Sequence[str]) -> tuple[tuple[str, 
     known = {NOTHING: 0}
     numbers = [0]
     crafts = model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]
+    names = drone_names(len(crafts))
     roots = dict(zip(model.body_rootid[crafts].tolist(), names, strict=True))
     for number in range(model.ngeom):
         geom = model.geom(number)

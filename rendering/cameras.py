@@ -67,9 +67,9 @@ class Cameras:
         self.views = tuple(views)
         self._shape = shape
         names = drone_names(shape[1])
-        self.model = drawn_model(vehicle, names, scene, marks, payload=payload)
+        self.model = drawn_model(vehicle, shape[1], scene, marks, payload=payload)
         self.data = mujoco.MjData(self.model)
-        self.objects, self._object = objects_in(self.model, names)
+        self.objects, self._object = objects_in(self.model)
         rows = shape[0] * shape[1]
         self.pictures = {
             view.name: np.zeros((rows, *view.shape), view.dtype) for view in self.views

@@ -65,14 +65,13 @@ class Pace:
 class LiveView(AbstractContextManager["LiveView"]):
     """Draws the latest moments of a stage in a window, in a thread of its own.
 
-    Raises `NoDisplay`.
+    Raises `NoOpenGL`.
     """
 
     def __init__(self, stage: Stage, pace: Pace) -> None:
         self.stage = stage
         self.pace = pace
         self._window = window.Window(stage, pace.press)
-        self._was_paused = False
         self._latest: tuple[Moment, ...] = ()
         self._fresh = Event()
         self._closing = Event()
@@ -136,11 +135,7 @@ class LiveView(AbstractContextManager["LiveView"]):
             self._error = error
 
     def _paint_one(self) -> None:
-        fresh = self._fresh.is_set()
-        paused = self.pace.paused
-        if fresh:
+        if self._fresh.is_set():
             self._fresh.clear()  # before the moments are read: what comes meanwhile is drawn next
             self.stage.show(*self._latest)
-        if fresh or (self._latest and paused != self._was_paused):
-            self._was_paused = paused
-            self._window.show(self.stage.lines(paused))
+            self._window.show()

@@ -314,13 +314,14 @@ class Stage:
                     rgba = (*color, 0.85 * number / len(path))
                     _connect(scene, _CAPSULE, 0.019 * self.radius, start, end, rgba)
 
-    def lines(self, paused: bool) -> list[tuple[str, str]]:
+    @property
+    def lines(self) -> list[tuple[str, str]]:
         """Names and values for the overlay of a viewer: those of the first craft."""
         lines = self.moments[0].lines
         if self.least_distance is not None:
             lines.insert(0, ("least distance", f"{self.least_distance:.2f} m"))
             lines.insert(0, ("drones", f"{self.drones}, numbers of the first"))
-        return [*lines, ("paused", "")] if paused else lines
+        return lines
 
     @property
     def least_distance(self) -> float | None:

@@ -26,12 +26,8 @@ _HELP = [("space", "pause"), ("right arrow", "one step")]
 _INSTEAD = "make a film instead (rotorgram render)"
 
 
-class NoDisplay(NoOpenGL):
-    """There is no display for a window. The sentence names other ways to look."""
-
-
 class Window:
-    """A stage in a window; `press` gets the effects of keys. Raises `NoDisplay`."""
+    """A stage in a window; `press` gets the effects of keys. Raises `NoOpenGL`."""
 
     def __init__(self, stage: Stage, press: Callable[[Press], None]) -> None:
         viewer = _viewer()
@@ -47,7 +43,7 @@ class Window:
                 show_right_ui=False,
             )
         except RuntimeError as error:  # on macOS windows belong to the main thread
-            raise NoDisplay(
+            raise NoOpenGL(
                 f"window: expected mjpython -m rotorgram.cli in place of rotorgram, got {error}; "
                 f"or {_INSTEAD}"
             ) from None
@@ -55,8 +51,8 @@ class Window:
         # If it is never closed: MuJoCo's thread must have ended before GLFW does.
         atexit.register(self.close)
 
-    def show(self, lines: Lines) -> None:
-        """Draw the stage as it is now, with these lines over it."""
+    def show(self) -> None:
+        """Draw the stage as it is now, with its numbers over it."""
         handle = self._handle
         with handle.lock():
             self._stage.follow(handle.cam)
@@ -64,7 +60,7 @@ class Window:
             self._stage.decorate(handle.user_scn)
         top = mujoco.mjtGridPos.mjGRID_TOPLEFT
         bottom = mujoco.mjtGridPos.mjGRID_BOTTOMLEFT
-        handle.set_texts([_text(top, lines), _text(bottom, _HELP)])
+        handle.set_texts([_text(top, self._stage.lines), _text(bottom, _HELP)])
         handle.sync()
 
     def is_running(self) -> bool:
@@ -88,10 +84,10 @@ def _text(place: mujoco.mjtGridPos, lines: Lines) -> tuple[object, ...]:
 
 
 def _viewer() -> ModuleType:
-    """MuJoCo's module. Raises `NoDisplay` first: without a display MuJoCo would wait forever."""
+    """MuJoCo's module. Raises `NoOpenGL` first: without a display MuJoCo would wait forever."""
     on_x = sys.platform == "linux"
     if on_x and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise NoDisplay(f"window: expected a display, got none (DISPLAY is not set): {_INSTEAD}")
+        raise NoOpenGL(f"window: expected a display, got none (DISPLAY is not set): {_INSTEAD}")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # GLFW's; the sentence below says what is wrong
@@ -108,6 +104,6 @@ def _viewer() -> ModuleType:
                     raise RuntimeError("none that OpenGL can draw on")
                 glfw.destroy_window(window)
     except (ImportError, RuntimeError) as error:
-        raise NoDisplay(f"window: expected a display, got {error}: {_INSTEAD}") from None
+        raise NoOpenGL(f"window: expected a display, got {error}: {_INSTEAD}") from None
     module: ModuleType = viewer
     return module

@@ -17,15 +17,16 @@ It takes about three minutes on two cores.
 import json
 import random
 import signal
+import subprocess
 import sys
 import threading
 import time
 import zlib
 from collections import Counter
-from pathlib import Path
+from collections.abc import Callable
 
 import numpy as np
-from measuring import RESULTS, free_ports, launch, options, write
+from measuring import RESULTS, free_ports, launch, options, relay, write
 from rotorgram.envs import ArraySpec, Outcome, Task, register
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.loop import Loop
@@ -38,8 +39,6 @@ ENV_ID = "benchmark/Row-v0"
 FAULTS = {"drop": 0.3, "duplicate": 0.1, "reorder": 0.1}
 AGENTS, PATIENCE, STOPPED = 8, 1.0, 2.0  # drones and agents; s
 ANY = ("127.0.0.1", 0)
-
-RELAYS = (Path(__file__).parents[1] / "tests/relay.py").read_text()
 
 AGENT = """
 import json, sys, zlib
@@ -138,59 +137,67 @@ class Twin:
 def fly_eight(kills: int, dice: random.Random) -> dict[str, object]:
     ports = free_ports(AGENTS)
     agents = [launch(AGENT, port) for port in ports]
-    relays = launch(RELAYS, [[("127.0.0.1", port) for port in ports], FAULTS])
-    addresses = [tuple(address) for address in json.loads(relays.stdout.readline())]
-    simulator = Simulator(
-        ENV_ID, agents=addresses, drones=AGENTS, bind=ANY, patience=PATIENCE,
-        config=LinkConfig(timeout=600),
-    )  # fmt: skip
-    rules = simulator.rules
-    simulator.observer = twin = Twin(simulator)
-    thread = threading.Thread(target=simulator.run)
-    thread.start()
     done: Counter[str] = Counter()
     try:
-        for number in range(kills):
-            while rules.steps < 5 or not rules.episodes:
-                assert thread.is_alive(), "the simulator failed"
-                time.sleep(0.01)
-            time.sleep(dice.uniform(0.0, 1.5))
-            victim = dice.randrange(AGENTS)
-            killed = dice.random() < 0.6
-            if killed:
-                agents[victim].kill()
-                agents[victim].wait()
-                time.sleep(dice.choice((0.0, 2 * PATIENCE)))
-                agents[victim] = launch(AGENT, ports[victim])
-            else:
-                agents[victim].send_signal(signal.SIGSTOP)
-                time.sleep(STOPPED)
-                agents[victim].send_signal(signal.SIGCONT)
-            done["killed" if killed else "stopped"] += 1
-            print(f"{number + 1} of {kills}: agent {victim} {'killed' if killed else 'stopped'}, "
-                  f"episode {rules.episodes}, {dict(twin.counts)}", flush=True)  # fmt: skip
-        wanted = rules.episodes + 3  # all take part again
-        while rules.episodes < wanted:
-            assert thread.is_alive(), "the simulator failed"
-            time.sleep(0.01)
-        present = [link.participation for link in rules.links]
+        with relay([("127.0.0.1", port) for port in ports], FAULTS) as (addresses, counts):
+            simulator = Simulator(
+                ENV_ID, agents=addresses, drones=AGENTS, bind=ANY, patience=PATIENCE,
+                config=LinkConfig(timeout=600),
+            )  # fmt: skip
+            rules = simulator.rules
+            simulator.observer = twin = Twin(simulator)
+            thread = threading.Thread(target=simulator.run)
+            thread.start()
+            try:
+                for number in range(kills):
+                    wait_for(lambda: rules.steps >= 5 and rules.episodes, thread)
+                    time.sleep(dice.uniform(0.0, 1.5))
+                    victim = dice.randrange(AGENTS)
+                    done[disturb(agents, victim, ports[victim], dice)] += 1
+                    print(f"{number + 1} of {kills}: {dict(done)}, {dict(twin.counts)}", flush=True)
+                wanted = rules.episodes + 3  # all take part again
+                wait_for(lambda: rules.episodes >= wanted, thread)
+                present = [link.participation for link in rules.links]
+            finally:
+                simulator.stop()
+                thread.join(60)
+                simulator.close()
     finally:
-        simulator.stop()
-        thread.join(60)
-        simulator.close()
-        relays.stdin.close()
-        network: Counter[str] = Counter()
-        for counters in json.loads(relays.stdout.readline()):
-            network.update(counters)
         time.sleep(1.0)
         for agent in agents:
             agent.kill()
             agent.wait()
+    network: Counter[str] = Counter()
+    for counters in counts:
+        network.update(counters)
     return {
         "agents": AGENTS, "faults": FAULTS, "patience": PATIENCE, **done,
         "episodes": rules.episodes, **twin.counts,
         "agents_lost_for_good": present.count("left"), "network": dict(network),
     }  # fmt: skip
+
+
+def wait_for(condition: Callable[[], object], thread: threading.Thread) -> None:
+    """Wait until a condition holds, while the simulator's thread runs."""
+    while not condition():
+        assert thread.is_alive(), "the simulator failed"
+        time.sleep(0.01)
+
+
+def disturb(
+    agents: list[subprocess.Popen[str]], victim: int, port: int, dice: random.Random
+) -> str:
+    """Kill an agent and start it again, or stop it for a while: what was done."""
+    if dice.random() < 0.6:
+        agents[victim].kill()
+        agents[victim].wait()
+        time.sleep(dice.choice((0.0, 2 * PATIENCE)))
+        agents[victim] = launch(AGENT, port)
+        return "killed"
+    agents[victim].send_signal(signal.SIGSTOP)
+    time.sleep(STOPPED)
+    agents[victim].send_signal(signal.SIGCONT)
+    return "stopped"
 
 
 def main() -> None:

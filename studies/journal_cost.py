@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from measuring import RESULTS, medians, options, table, write
+from measuring import RESULTS, in_turns, medians, options, table, write
 from rotorgram.envs.config import EnvConfig
 from rotorgram.udp import RemoteEnv
 from rotorgram.udp.journal import Journal, Recording, Summary
@@ -97,17 +97,11 @@ def flight(name: str, folder: Path) -> Iterator[Flight]:
 
 
 def measure(rounds: int, seconds: float, folder: Path) -> dict[str, list[Slice]]:
-    names = list(SIDES)
-    slices: dict[str, list[Slice]] = {name: [] for name in names}
     with ExitStack() as stack:
-        flights = {name: stack.enter_context(flight(name, folder)) for name in names}
+        flights = {name: stack.enter_context(flight(name, folder)) for name in SIDES}
         for one in flights.values():
             one.fly(seconds)
-        for number in range(rounds):
-            turn = number % len(names)
-            for name in names[turn:] + names[:turn]:
-                slices[name].append(flights[name].fly(seconds))
-    return slices
+        return in_turns(flights, rounds, lambda one: one.fly(seconds))
 
 
 def compare(name: str, slices: dict[str, list[Slice]]) -> dict[str, object]:

@@ -8,13 +8,14 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final, TypeVar, get_type_hints
 
 RESULTS: Final = Path("docs/results")
+RELAY: Final = Path(__file__).parents[1] / "tests" / "relay.py"
 Name = TypeVar("Name")
 Way = TypeVar("Way")
 Value = TypeVar("Value")
@@ -49,6 +50,18 @@ def launch(code: str, settings: object, *before: str) -> subprocess.Popen[str]:
     words = [*before, sys.executable, "-c", code, json.dumps(settings)]
     pipe = subprocess.PIPE
     return subprocess.Popen(words, stdin=pipe, stdout=pipe, text=True)
+
+
+@contextmanager
+def relay(
+    servers: Sequence[tuple[str, int]], faults: Mapping[str, float]
+) -> Iterator[tuple[list[tuple[str, int]], list[dict[str, int]]]]:
+    """A relay before each server, in one process: (their addresses, afterwards their counts)."""
+    counts: list[dict[str, int]] = []
+    with launch(RELAY.read_text(), [servers, faults]) as process:
+        yield [tuple(address) for address in json.loads(process.stdout.readline())], counts
+        process.stdin.close()
+        counts += json.loads(process.stdout.readline())
 
 
 def free_ports(count: int) -> list[int]:

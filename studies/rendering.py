@@ -11,9 +11,8 @@ It takes about two minutes on two cores.
 import json
 import os
 import time
-from collections.abc import Callable
 
-from measuring import RESULTS, options, write
+from measuring import RESULTS, in_turns, options, write
 from rotorgram.agents import PID
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
@@ -26,31 +25,17 @@ ENV = "rotorgram/Elevation-v0"
 EPISODE = 1
 
 
-def rate(draw: Callable[[int], object], frames: int) -> float:
-    """Pictures per second."""
-    start = time.perf_counter()
-    for number in range(frames):
-        draw(number)
-    return frames / (time.perf_counter() - start)
-
-
-def pictures(flight: list[Moment], rounds: int, frames: int) -> dict[str, float]:
-    """Pictures per second by size and quality."""
-    rates: dict[str, float] = {}
-    for _ in range(rounds):
-        for width, height in SIZES:
-            for fast in (False, True):
-                stage = Stage("airport")
-                with Canvas(stage, width, height, fast=fast) as canvas:
-
-                    def draw(number: int, stage: Stage = stage, canvas: Canvas = canvas) -> None:
-                        stage.show(flight[number])
-                        canvas.draw("chase")
-
-                    draw(0)
-                    name = f"{width}x{height}{', fast' if fast else ''}"
-                    rates[name] = max(rates.get(name, 0.0), round(rate(draw, frames), 1))
-    return rates
+def rate(flight: list[Moment], width: int, height: int, fast: bool) -> float:
+    """Pictures per second of a flight."""
+    stage = Stage("airport")
+    with Canvas(stage, width, height, fast=fast) as canvas:
+        stage.show(flight[0])
+        canvas.draw("chase")
+        start = time.perf_counter()
+        for moment in flight:
+            stage.show(moment)
+            canvas.draw("chase")
+        return round(len(flight) / (time.perf_counter() - start), 1)
 
 
 def main() -> None:
@@ -58,11 +43,17 @@ def main() -> None:
     args = options(__doc__, rounds=5, frames=20, out=out).parse_args()
     config = EnvConfig(env_id=ENV)
     (flown,) = flown_trajectories(PID(env_spec(config)), config, [EPISODE])
-    flight = moments(flown)
+    flight = moments(flown)[: args.frames]
+    ways = {
+        f"{width}x{height}{words}": (width, height, fast)
+        for width, height in SIZES
+        for words, fast in (("", False), (", fast", True))
+    }
+    rates = in_turns(ways, args.rounds, lambda way: rate(flight, *way))
     result = {
         "rounds": args.rounds,
         "frames": args.frames,
-        "pictures_per_second": pictures(flight, args.rounds, args.frames),
+        "pictures_per_second": {name: max(found) for name, found in rates.items()},
         "load": [round(load, 1) for load in os.getloadavg()],
     }
     write(args.out, result)

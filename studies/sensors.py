@@ -18,7 +18,7 @@ import gymnasium as gym
 import numpy as np
 import rotorgram.envs  # noqa: F401
 from matplotlib.figure import Figure
-from measuring import RESULTS, options, write_rows
+from measuring import RESULTS, in_turns, options, write_rows
 from rotorgram.models import Vehicle
 from rotorgram.sim import InitialState, checked_sensors, make_world
 from rotorgram.sim.sensors import Sensors
@@ -121,11 +121,9 @@ def costs() -> dict[str, dict[str, float]]:
 
 def _costs(drones: int) -> dict[str, float]:
     envs = {name: _env(drones, sensors) for name, sensors in COSTS.items()}
-    least = dict.fromkeys(envs, math.inf)
-    for _ in range(_ROUNDS):  # by turns: a busy moment meets all of them
-        for name, env in envs.items():
-            least[name] = min(least[name], _time(env, 1000 if drones == 1 else 20))
-    return {name: round(seconds * 1e6, 1) for name, seconds in least.items()}
+    steps = 1000 if drones == 1 else 20
+    times = in_turns(envs, _ROUNDS, lambda env: _time(env, steps))
+    return {name: round(min(seconds) * 1e6, 1) for name, seconds in times.items()}
 
 
 def _env(drones: int, sensors: dict[str, Any]) -> Any:

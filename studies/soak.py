@@ -11,7 +11,6 @@ It takes about an hour and a half on two cores.
 """
 
 import json
-import subprocess
 import sys
 import tempfile
 import time
@@ -23,14 +22,12 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import rotorgram.envs  # noqa: F401
-from measuring import RESULTS, launch, options, write
+from measuring import RESULTS, launch, options, relay, write
 from rotorgram.udp import RemoteVectorEnv
 from rotorgram.udp.protocol.auth import write_key
 
 FAULTS = {"drop": 0.3, "duplicate": 0.1, "reorder": 0.2, "corrupt": 0.05, "truncate": 0.02}
 PERIOD = 0.01  # s: one physics step for each control step, so that the wire is what is soaked
-
-RELAY = (Path(__file__).parents[1] / "tests/relay.py").read_text()
 
 SIMULATE = """
 import json, sys
@@ -42,11 +39,6 @@ with Simulator(server=("127.0.0.1", settings["port"]), bind=("127.0.0.1", 0),
     simulator.run()
     print(json.dumps(simulator.link.statistics.numbers()), flush=True)
 """
-
-
-def said(process: subprocess.Popen[str]) -> Any:
-    assert process.stdout is not None
-    return json.loads(process.stdout.readline())
 
 
 def numbers(answer: tuple[Any, ...]) -> dict[str, bytes]:
@@ -69,35 +61,30 @@ def soak(job: int, steps: int, drones: int, keyed: bool) -> dict[str, Any]:
     remote = RemoteVectorEnv(
         ("127.0.0.1", 0), num_envs=drones, options=options, key_file=key, connect=False
     )
-    relay = launch(RELAY, [[remote.address], {**FAULTS, "seed": job}])
-    settings = {"port": said(relay)[0][1], "drones": drones, "key": key, "period": PERIOD}
-    simulator = launch(SIMULATE, settings)
-    local = gym.make_vec("rotorgram/Elevation-v0", num_envs=drones, **options)
-    dice = np.random.default_rng(job)
-    assert numbers(remote.reset(seed=job)) == numbers(local.reset(seed=job))
-    began = time.perf_counter()
-    different = None
-    ended = 0
-    for step in range(1, steps + 1):
-        actions = dice.uniform(-1.2, 1.2, (drones, 1)).astype(np.float32)
-        answer = remote.step(actions)
-        if numbers(answer) != numbers(local.step(actions)):
-            different = step
-            break
-        ended += int((answer[2] | answer[3]).sum())
-    seconds = time.perf_counter() - began
-    agent = remote.statistics.numbers()
-    remote.close()
-    there = said(simulator)
-    simulator.wait()
-    assert relay.stdin is not None
-    relay.stdin.close()
-    network = said(relay)[0]
-    relay.wait()
+    with relay([remote.address], {**FAULTS, "seed": job}) as (((_, port),), network):
+        settings = {"port": port, "drones": drones, "key": key, "period": PERIOD}
+        simulator = launch(SIMULATE, settings)
+        local = gym.make_vec("rotorgram/Elevation-v0", num_envs=drones, **options)
+        dice = np.random.default_rng(job)
+        assert numbers(remote.reset(seed=job)) == numbers(local.reset(seed=job))
+        began = time.perf_counter()
+        different = None
+        ended = 0
+        for step in range(1, steps + 1):
+            actions = dice.uniform(-1.2, 1.2, (drones, 1)).astype(np.float32)
+            answer = remote.step(actions)
+            if numbers(answer) != numbers(local.step(actions)):
+                different = step
+                break
+            ended += int((answer[2] | answer[3]).sum())
+        seconds = time.perf_counter() - began
+        agent = remote.statistics.numbers()
+        remote.close()
+        there = json.loads(simulator.communicate()[0])
     return {
         "drones": drones, "key": keyed, "steps": step, "seconds": round(seconds, 1),
         "episodes": ended, "first_step_that_differs": different,
-        "network": network, "agent": agent, "simulator": there,
+        "network": network[0], "agent": agent, "simulator": there,
     }  # fmt: skip
 
 

@@ -23,7 +23,6 @@ from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 from rotorgram.models import InputError
 from rotorgram.rendering import Moment, Stage, window
-from rotorgram.rendering.gl import Lines
 from rotorgram.rendering.live import LiveView, Pace
 from rotorgram.udp import RemoteEnv, Simulator
 from rotorgram.udp.protocol.messages import Command
@@ -42,13 +41,11 @@ class FakeSurface:
     stage: Stage
     gate: threading.Event = field(default_factory=threading.Event)
     shown: list[tuple[Moment, ...]] = field(default_factory=list)
-    lines: list[Lines] = field(default_factory=list)
     error: Exception | None = None
     open: bool = True
 
-    def show(self, lines: Lines) -> None:
+    def show(self) -> None:
         self.shown.append(self.stage.moments)
-        self.lines.append(lines)
         assert self.gate.wait(60)
         if self.error is not None:
             raise self.error
@@ -165,11 +162,10 @@ def test_lines_over_two_drones_are_those_of_the_first() -> None:
     both = (at(9.0, position=(0.0, y, 9.0), step=7) for y in (0.0, 1.234))
     stage.show(*both)
     own = stage.moments[0].lines
-    assert stage.lines(paused=True) == [
+    assert stage.lines == [
         ("drones", "2, numbers of the first"),
         ("least distance", "1.23 m"),
         *own,
-        ("paused", ""),
     ]
 
 
@@ -214,15 +210,6 @@ def test_a_busy_view_drops_all_but_the_latest(stage: Stage) -> None:
         surface.gate.set()
         wait_until(lambda: live.wants and len(surface.shown) == 2)
         assert [shown[0].step for shown in surface.shown] == [0, 99]
-
-
-def test_a_pause_is_told_without_a_new_moment(stage: Stage) -> None:
-    with fake_view(stage) as (live, surface):
-        live.draw(moment(5))
-        wait_until(lambda: surface.lines)
-        live.pace.press("pause")
-        wait_until(lambda: surface.lines[-1][-1] == ("paused", ""))
-        assert ("step", "5") in surface.lines[-1]
 
 
 def test_what_drawing_raises_is_raised_by_is_running(stage: Stage) -> None:
