@@ -237,14 +237,6 @@ class EnvConfig:
         other = EnvConfig.from_keywords(**given)
         return replace(other, files=self.files) if other.vehicle == self.vehicle else other
 
-    @classmethod
-    def from_toml(cls, path: Path | str, **keywords: Any) -> "EnvConfig":
-        """A config from a TOML file of keywords, `env_id` among them; keyword arguments win.
-
-        A relative path of a vehicle is looked for beside the file first. Raises `InputError`.
-        """
-        return cls.from_keywords(**read_keywords(path) | keywords)
-
     def to_dict(self) -> Values:
         """All fields as JSON values, with the version."""
         content = {one.name: getattr(self, one.name) for one in fields(self)}
@@ -377,7 +369,10 @@ KEYWORDS = (*_OPTIONS, "scene", "vehicle", "drones", "backend", *BACKEND_KEYWORD
 
 
 def read_keywords(path: Path | str) -> Values:
-    """Keywords of a config's file. Raises `InputError`."""
+    """Keywords of `EnvConfig.from_keywords` from a TOML file, `env_id` among them.
+
+    A relative path of a vehicle is looked for beside the file first. Raises `InputError`.
+    """
     file = Path(path)
     try:
         content = read_toml(file, "config")

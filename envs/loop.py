@@ -73,7 +73,7 @@ class Loop:
             **backend.settings,
         )
         self._pipeline = pipeline = Pipeline(task, world, shape, randomize)
-        self.spec = spec_of(config, task, pipeline.pictures)
+        self.spec = spec_of(config, task)
         kept = tuple(name for stage in pipeline.stages for name in stage.arrays)
         self.record = Record(world.shape, task.memory, kept)
         self.num_envs = num_worlds * config.drones
@@ -126,10 +126,8 @@ class Loop:
             record.begun = begun
             record.waiting = begun | True
         if seeds is not None:
-            for stage in self._pipeline.stages:
-                stage.seed(begun, seeds[:: len(self.spec.agents)])
+            self.world.seed(begun, seeds[:: len(self.spec.agents)])
         record.run(None if everybody else begun, begin)
-        record.count()
 
     def _observe(self) -> None:
         """Drones that flew, and those that begin, are measured, judged and observed."""

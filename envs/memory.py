@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
 
 import numpy as np
 
@@ -16,6 +15,7 @@ class Memory:
     """
 
     __slots__ = ("__dict__", "_phase")
+    _phase: str
 
     def __init__(self) -> None:
         object.__setattr__(self, "_phase", "begin")
@@ -36,11 +36,6 @@ class Memory:
         array = array.view()
         array.flags.writeable = False
         vars(self)[name] = array
-
-    def __getattr__(self, name: str) -> Any:
-        """Raises `AttributeError` for a name that is not known."""
-        known = ", ".join(vars(self)) or "none: begin() sets them"
-        raise AttributeError(f"memory.{name}: expected some of {known}")
 
     def expand(self, shape: tuple[int, ...]) -> None:
         """Make arrays of shape (W, A) of numbers that stand for all drones."""

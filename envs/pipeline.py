@@ -2,7 +2,6 @@
 
 from ..sim import Randomization, World
 from ..sim.sensors import Sensors
-from .spec import ArraySpec
 from .specification import observed
 from .stages.actions import ActionDelay, Actions, Receive
 from .stages.clock import Clock
@@ -29,7 +28,6 @@ class Pipeline:
         fly: Steps of the drones that fly.
         begin: What all of them do when an episode begins.
         observe: Steps from `Measure` on.
-        pictures: Specs of pictures.
     """
 
     def __init__(
@@ -63,7 +61,6 @@ class Pipeline:
         flying += [Flight(world, parts, substeps, held), Clock()]
 
         pictures = Pictures(task, world.random, shape) if config.cameras else None
-        self.pictures: tuple[ArraySpec, ...] = pictures.specs if pictures else ()
         observing = self._observing(task, world, sensors, pictures)
         if randomize is not None and "observation_delay" in drawn:
             longest = randomize.most_steps("observation_delay")

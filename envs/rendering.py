@@ -35,17 +35,18 @@ class Renderer:
         """Without what is open."""
         return vars(self) | {"_canvas": None, "_view": None, "_shown": []}
 
-    def render(self, episodes: Sequence[int]) -> tuple[np.ndarray, ...] | None:
+    def render(self) -> tuple[np.ndarray, ...] | None:
         """Pictures, uint8, shape (height, width, 3); None in other modes than `rgb_array`.
 
-        `episodes`: number of episodes that each drone has begun. Raises `ResetNeeded` if any is 0.
+        Raises `ResetNeeded` before the first episode.
         """
         if self._mode is None:
             gym.logger.warn("render: expected render_mode='rgb_array' or 'human', got None")
             return None
-        if not all(episodes):
+        record = self._loop.record
+        if not record.has_begun:
             raise gym.error.ResetNeeded("render: expected a call of reset() first")
-        now = moments(self._loop, [number - 1 for number in episodes])
+        now = moments(self._loop, np.ravel(record.episodes - 1).tolist())
         if self._mode == "human":
             self._show(now)
             return None

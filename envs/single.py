@@ -12,7 +12,7 @@ from .autoreset import Info, Observation
 from .config import EnvConfig
 from .loop import Loop
 from .rendering import RENDER_MODES, Renderer
-from .spaces import action_space, checked_action, observation_space, telemetry_names
+from .spaces import action_space, checked_action, joined, observation_space, telemetry_names
 
 
 class SingleEnv(gym.Env[Observation, ArrayLike]):
@@ -58,11 +58,8 @@ class SingleEnv(gym.Env[Observation, ArrayLike]):
         self.observation_space = observation_space(loop.spec)
         self.action_space = action_space(loop.spec)
         self._names = telemetry_names(loop.spec)
-        arrays = loop.spec.observation
-        self._only = arrays[0].name if len(arrays) == 1 else ""
         self._all = np.ones(1, bool)
         self._no_action = np.zeros((1, len(loop.task.controller.low)), np.float32)
-        self._episodes = 0
 
     def reset(
         self, *, seed: int | None = None, options: Info | None = None
@@ -72,7 +69,6 @@ class SingleEnv(gym.Env[Observation, ArrayLike]):
             raise InputError(f"reset: expected no options, got {options!r}")
         super().reset(seed=seed)
         self._loop.advance(self._no_action, self._all, None if seed is None else [seed])
-        self._episodes += 1
         if self.render_mode == "human":
             self.render()
         return self._observation(), self._info()
@@ -88,17 +84,16 @@ class SingleEnv(gym.Env[Observation, ArrayLike]):
 
     def render(self) -> np.ndarray | None:
         """A picture of now, uint8, shape (360, 480, 3), with `rgb_array`; None otherwise."""
-        pictures = self._renderer.render([self._episodes])
+        pictures = self._renderer.render()
         return pictures[0] if pictures else None
 
     def snapshot(self) -> Snapshot:
         """Copies of all arrays that a later step depends on, by name."""
-        return self._loop.snapshot() | {"episodes": np.array(self._episodes)}
+        return self._loop.snapshot()
 
     def restore(self, snapshot: Arrays) -> None:
         """Put back a snapshot of an env of the same config. No later bit differs."""
         self._loop.restore(snapshot)
-        self._episodes = int(snapshot["episodes"])
 
     def close(self) -> None:
         """Close the window, if there is one; release memory."""
@@ -106,10 +101,9 @@ class SingleEnv(gym.Env[Observation, ArrayLike]):
         self._loop.close()
 
     def _observation(self) -> Observation:
-        observations = self._loop.observations
-        if self._only:  # the loop makes new arrays with each step
-            return observations[self._only][0]
-        return {name: values[0] for name, values in observations.items()}
+        # The loop makes new arrays with each step.
+        seen = {name: values[0] for name, values in self._loop.observations.items()}
+        return joined(self.env_spec, seen)
 
     def _info(self) -> Info:
         loop = self._loop

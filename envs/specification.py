@@ -36,12 +36,10 @@ def _check_kept(config: EnvConfig, adjusted: EnvConfig) -> None:
             raise InputError(f"{config.env_id}: expected adjust() to keep {name}, got {other!r}")
 
 
-def spec_of(
-    config: EnvConfig, task: Task, pictures: tuple[ArraySpec, ...] | None = None
-) -> EnvSpec:
-    """The `EnvSpec` of a config's env, whose task is made, with these pictures."""
+def spec_of(config: EnvConfig, task: Task) -> EnvSpec:
+    """The `EnvSpec` of a config's env, whose task is made."""
     observation = [with_history(array, config.history) for array in observed(task)]
-    observation += _pictures(task) if pictures is None else pictures
+    observation += _pictures(task)
     return EnvSpec(
         env_id=config.env_id,
         options=config.flat_options(),

@@ -68,7 +68,6 @@ class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Observation, ArrayLike, np.nd
         self._take_spec(loop.spec, num_envs, autoreset_mode)
         self.metadata["render_modes"] = RENDER_MODES
         self._nobody = self.lost = self.done = self.out = loop.done
-        self._episodes = np.zeros(num_envs, int)
         self.closed = False
 
     def reset(
@@ -88,7 +87,7 @@ class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Observation, ArrayLike, np.nd
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """With `rgb_array` a picture of each drone, uint8, shape (180, 240, 3); otherwise None."""
-        return self._renderer.render(self._episodes.tolist())
+        return self._renderer.render()
 
     def close_extras(self, **kwargs: object) -> None:
         """Close the window, if there is one; release threads and memory."""
@@ -106,19 +105,16 @@ class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Observation, ArrayLike, np.nd
         loop = self.loop
         loop.advance(actions, resets, seeds, frozen)
         self._take_results()
-        if self.render_mode is not None:
-            self._episodes = self._episodes + (0 if resets is None else resets)
-            if self.render_mode == "human":
-                self.render()
+        if self.render_mode == "human":
+            self.render()
 
     def snapshot(self) -> Snapshot:
         """Copies of all arrays that a later step depends on, by name."""
-        return self.loop.snapshot() | {"episodes": self._episodes.copy()}
+        return self.loop.snapshot()
 
     def restore(self, snapshot: Arrays) -> None:
         """Put back a snapshot of an env of the same config and size. No later bit differs."""
         self.loop.restore(snapshot)
-        self._episodes = snapshot["episodes"].copy()
         self._take_results()
 
     @property

@@ -8,13 +8,14 @@ from .record import Mask, Record, Stage
 
 
 class Clock(Stage):
-    """Counts the control steps of episodes."""
+    """Counts episodes and their control steps."""
 
-    arrays = ("steps", "out", "done", "waiting")
+    arrays = ("steps", "episodes", "out", "done", "waiting")
 
     def begin(self, record: Record) -> None:
         """A new episode."""
         record.steps = 0 * record.steps
+        record.episodes = record.episodes + 1
         record.out = record.done = record.waiting = record.out & False
 
     def step(self, record: Record) -> None:
@@ -37,11 +38,10 @@ def take(record: Record, resets: object, frozen: object) -> None:
     flown = None
     if idle is not None and idle.any():
         flown = ~idle
-    if record.anyone_waits:
-        late = record.waiting if flown is None else record.waiting & flown
-        if late.any():
-            first = int(np.flatnonzero(late)[0])
-            raise gym.error.ResetNeeded(f"step: expected a call of reset() for env {first} first")
+    late = record.waiting if flown is None else record.waiting & flown
+    if late.any():
+        first = int(np.flatnonzero(late)[0])
+        raise gym.error.ResetNeeded(f"step: expected a call of reset() for env {first} first")
     record.flown = flown
     record.begun = begun if begun is not None and begun.any() else None
 

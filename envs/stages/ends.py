@@ -36,7 +36,7 @@ class Ends(Stage):
         truncated = (record.steps >= self._length) > terminated
         self._check(record, reward)
         flying = record.flown
-        if record.anyone_out:
+        if record.out.any():
             flying = ~record.out if flying is None else flying & ~record.out
         if flying is not None:
             reward = np.where(flying, reward, 0.0)[()]

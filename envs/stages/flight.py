@@ -6,7 +6,7 @@ import numpy as np
 
 from ...sim import Controller, World
 from ...sim.snapshots import Arrays
-from .record import Look, Mask, Record, Stage
+from .record import Look, Record, Stage
 
 
 class Flight(Stage):
@@ -27,10 +27,6 @@ class Flight(Stage):
         self._world = world
         self._starts = range(0, substeps, held)
         self._held = held
-
-    def seed(self, mask: Mask, seeds: Sequence[int | None] | np.ndarray) -> None:
-        """Seed the world: starts, gusts, parameters, sensors."""
-        self._world.seed(mask, seeds)
 
     def begin(self, record: Record) -> None:
         """The task has set the start."""
@@ -77,5 +73,5 @@ class StandStill(Stage):
 
     def step(self, record: Record) -> None:
         """The thrust next to 0."""
-        if record.anyone_out:
+        if record.out.any():
             record.thrust = np.where(record.out[..., None], self._rest, record.thrust)

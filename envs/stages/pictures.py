@@ -97,7 +97,6 @@ class Pictures(Stage):
                 self._painters.append(_Painter(cameras, number, parts == part))
         self._names = objects_of_all([painter.cameras.objects for painter in self._painters])
         self._goal_moves = any(mark.moves for mark in task.marks)
-        self.specs = arrays_of(self.views, self._names)
 
     @cached_property
     def _pool(self) -> ThreadPoolExecutor:

@@ -49,6 +49,7 @@ class Record:
         reward: float64, (W, A).
         terminated, truncated: (W, A).
         steps: Control steps of each episode, (W, A).
+        episodes: Number of episodes that each drone has begun, (W, A).
         out: Drones whose own episode has ended, (W, A).
         done: Drones of worlds whose episodes have all ended, (W, A).
         waiting: Drones that must be reset before they fly, (W, A).
@@ -87,13 +88,12 @@ class Record:
         self.flown: Mask | None = None
         self.begun: Mask | None = None
         self.steps: NDArray[np.int64] = np.zeros(shape, np.int64)[()]
+        self.episodes = self.steps
         self.out = self.done = self.terminated = self.truncated = nobody
         self.waiting = ~nobody
         self.reward = np.zeros(shape)[()]
         self._nothing = self.reward
         self._nobody = nobody
-        self.anyone_waits = True
-        self.anyone_out = False
 
     def run(self, mask: Mask | None, stages: Sequence[Callable[["Record"], None]]) -> None:
         """Run a region for the drones of a mask, None for all. An error leaves all as it was."""
@@ -149,17 +149,11 @@ class Record:
                 else:
                     known.setdefault(part, {})[name] = array.copy()[()]
         self.flown = self.begun = None
-        self.count()
 
     @property
     def has_begun(self) -> bool:
         """Whether there was an episode."""
         return "action" in vars(self)
-
-    def count(self) -> None:
-        """See again whether any drone waits or is out."""
-        self.anyone_waits = bool(self.waiting.any())
-        self.anyone_out = bool(self.out.any())
 
     def rest(self) -> None:
         """A drone that does not fly gets no reward and no end."""
@@ -170,7 +164,6 @@ class Record:
         """The physics failed: the drones that flew must be reset."""
         flown = self.flown
         self.waiting = self.waiting | (True if flown is None else flown)
-        self.anyone_waits = True
 
     def end(self, drones: Mask) -> None:
         """End the episodes of some drones; a world is done when all of its drones are out."""
@@ -178,10 +171,8 @@ class Record:
         done = self.out
         if done.ndim and done.shape[1] > 1:
             done = np.repeat(done.all(axis=1, keepdims=True), done.shape[1], axis=1)
-            self.anyone_out = True
         self.done = done
         self.waiting = self.waiting | done
-        self.anyone_waits = bool(self.waiting.any())
 
 
 class Stage:
@@ -193,9 +184,6 @@ class Stage:
     """
 
     arrays: ClassVar[tuple[str, ...]] = ()
-
-    def seed(self, mask: Mask, seeds: Sequence[int | None] | np.ndarray) -> None:
-        """Start new sequences of random numbers for the worlds of a mask; seeds (W,)."""
 
     def begin(self, record: Record) -> None:
         """Set the arrays of drones that begin an episode, those of `record.begun`."""

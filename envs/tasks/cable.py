@@ -23,7 +23,7 @@ from .goal import (
     swing_cost,
     with_payload,
 )
-from .swarm import APPROACH_WEIGHT, TINY, Swarm, SwarmOptions, ring, shared
+from .swarm import Swarm, SwarmOptions, approach, ring, shared
 from .task import Outcome
 
 
@@ -200,10 +200,9 @@ class Cable(Swarm):
         missing = self._missing(state)
         distance = length(missing)
         room = self.clearance(state)
-        closing = np.sum(missing * state.payload_velocity, axis=-1)
         terms = {
             "payload": nearness(distance, self.gap / 2),
-            "approach": APPROACH_WEIGHT * closing / (distance + TINY),
+            "approach": approach(missing, state.payload_velocity),
             "swing": swing_cost(state),
             "room": self.proximity_penalty(room),
         }

@@ -145,12 +145,10 @@ class Swarm(GoalTask):
         """
         to_goal = self.goal(state) - state.position
         distance = length(to_goal)
-        towards = to_goal * (state.velocity - self.goal_velocity())
-        closing = towards[..., 0] + towards[..., 1] + towards[..., 2]
         room = self.clearance(state)
         terms = {
             "position": nearness(distance, self.gap / 2),
-            "approach": APPROACH_WEIGHT * closing / (distance + TINY),
+            "approach": approach(to_goal, state.velocity - self.goal_velocity()),
             "room": self.proximity_penalty(room),
         }
         metrics = {"position_error": distance, "clearance": room}
@@ -177,6 +175,11 @@ class Swarm(GoalTask):
     def goal(self, state: State) -> Array:
         """The slot of each drone."""
         return np.array(self.options.center) + self._slots + 0.0 * state.position
+
+
+def approach(way: Array, velocity: Array) -> Array:
+    """Reward for a speed along a way to a goal, (W, A)."""
+    return APPROACH_WEIGHT * np.sum(way * velocity, axis=-1) / (length(way) + TINY)
 
 
 def shared(drawn: Array) -> Array:
