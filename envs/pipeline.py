@@ -13,6 +13,7 @@ from .stages.measure import Measure, Readings, Sensing
 from .stages.pictures import Pictures
 from .stages.radio import Radio
 from .stages.record import Stage
+from .tasks.swarm import Swarm
 from .tasks.task import Task
 
 
@@ -85,7 +86,7 @@ class Pipeline:
         if sensors is not None:
             stages.append(Sensing(sensors, replaces=config.estimated))
         stages.append(Remember(task))
-        if task.has_radio:
+        if isinstance(task, Swarm):
             stages.append(Radio(task.options, period, config.drones, task.ended))
         stages.append(Judge(task))
         if sensors is not None:
