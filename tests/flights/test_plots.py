@@ -12,9 +12,10 @@ from peers import ANY, Running
 from rotorgram.cli import main
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
-from rotorgram.flights.plots import panels_of, roll_pitch_yaw
-from rotorgram.flights.signals import Signal, columns_of
-from rotorgram.flights.trajectories import Trajectory
+from rotorgram.flights.plots import plot_flights, roll_pitch_yaw, shown_columns
+from rotorgram.flights.recorded import recorded_trajectories
+from rotorgram.flights.signals import columns_of
+from rotorgram.flights.trajectories import Trajectory, flown_trajectories
 from rotorgram.udp import RemoteVectorEnv, Simulator
 from rotorgram.udp.spawn import spawn_simulator
 
@@ -150,26 +151,30 @@ def test_a_yaw_of_two_turns_has_no_jump() -> None:
     np.testing.assert_allclose(roll_pitch_yaw(turns)[:, 2], 2 * half, atol=1e-9)
 
 
-def test_panels_are_of_what_any_flight_has() -> None:
-    case = CASES["panels"]
-    flights = []
-    for which in ("first", "second"):
-        flight = {}
-        for name, components in case[which].items():
-            units = (case["units"][name],) * len(components)
-            values = np.zeros((2, len(components)))
-            flight[name] = Signal(name, tuple(components), units, values)
-        flights.append(flight)
-    panels = panels_of(flights)
-    assert [panel.label for panel in panels] == case["labels"]
+def test_panels_are_in_one_order_and_of_what_any_flight_has(journal: Path, tmp_path: Path) -> None:
+    """A second flight with wind and another metric."""
+    (plain, _) = recorded_trajectories(journal)
+    assert list(shown_columns(plain))[:13] == CASES["panels"]["first"]
+    assert {"time", "reward"}.isdisjoint(shown_columns(plain))
+    effects = {"body_drag": True, "wind": [1.0, 0.0, 0.0]}
+    other = EnvConfig.from_keywords("rotorgram/Waypoints-v0", vehicle="crazyflie2", effects=effects)
+    windy = flown_trajectories(None, other, [0])[0]
+    out = tmp_path / "both.svg"
+    plot_flights({"plain": plain, "windy": windy}, out)
+    texts = texts_of(out)
+    assert {"x (m)", "wind x (m/s)", "position error (m)", "points left"} <= texts
+    assert "goal x (m)" not in texts
+
+
+def texts_of(file: Path) -> set[str | None]:
+    tree = ElementTree.parse(file)
+    return {element.text for element in tree.iter("{http://www.w3.org/2000/svg}text")}
 
 
 def test_a_plot_lays_flights_over_each_other(journal: Path, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     out = tmp_path / "two.svg"
     assert main(["plot", str(journal), str(journal), "--names", "A", "B", "--out", str(out)]) == 0
-    tree = ElementTree.parse(out)
-    texts = {element.text for element in tree.iter("{http://www.w3.org/2000/svg}text")}
     labels = [
         "x (m)",
         "roll (deg)",
@@ -179,7 +184,7 @@ def test_a_plot_lays_flights_over_each_other(journal: Path, tmp_path: Path) -> N
         "position error (m)",
         "time (s)",
     ]
-    assert {"A", "B", "goal", *labels} <= texts
+    assert {"A", "B", "goal", *labels} <= texts_of(out)
 
 
 @pytest.mark.parametrize(
