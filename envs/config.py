@@ -237,6 +237,11 @@ class EnvConfig:
         other = EnvConfig.from_keywords(**given)
         return replace(other, files=self.files) if other.vehicle == self.vehicle else other
 
+    @classmethod
+    def from_toml(cls, path: Path | str, **keywords: Any) -> "EnvConfig":
+        """A config from a file as `read_keywords` has it; keyword arguments win."""
+        return cls.from_keywords(**read_keywords(path) | keywords)
+
     def to_dict(self) -> Values:
         """All fields as JSON values, with the version."""
         content = {one.name: getattr(self, one.name) for one in fields(self)}

@@ -13,7 +13,6 @@ from .stages.measure import Measure, Readings, Sensing
 from .stages.pictures import Pictures
 from .stages.radio import Radio
 from .stages.record import Stage
-from .tasks.swarm import Swarm
 from .tasks.task import Task
 
 
@@ -86,7 +85,7 @@ class Pipeline:
         if sensors is not None:
             stages.append(Sensing(sensors, replaces=config.estimated))
         stages.append(Remember(task))
-        if isinstance(task, Swarm):
+        if task.has_radio:
             stages.append(Radio(task.options, period, config.drones, task.ended))
         stages.append(Judge(task))
         if sensors is not None:

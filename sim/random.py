@@ -28,6 +28,7 @@ Ids = Any
 START = crc32(b"start")
 """The draws with which a task begins episodes."""
 RANDOMIZATION = crc32(b"randomization")
+RADIO = crc32(b"radio")
 SCENES = crc32(b"scenes")
 GUSTS = "gusts"
 

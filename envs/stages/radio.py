@@ -4,9 +4,11 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ...sim.random import RADIO, uniform, words_of
 from ..state import State
 from ..tasks.goal import length
 from ..tasks.swarm import SwarmOptions
+from .history import filled, pushed
 from .record import Floats, Mask, Record, Stage
 
 FORGOTTEN = 1.0  # A drone that was not heard for so long is no neighbour any more, s
@@ -15,8 +17,9 @@ FORGOTTEN = 1.0  # A drone that was not heard for so long is no neighbour any mo
 class Radio(Stage):
     """Every drone sends its position and velocity in every step.
 
-    A message arrives at once at the drones within range. A receiver that hears no more assumes that
-    the sender flew on straight; after `FORGOTTEN` seconds it forgets the sender.
+    A message arrives after a delay, at the drones within range then, unless it is lost. The
+    receiver knows its age, and assumes that the sender flew on straight; after `FORGOTTEN` seconds
+    it forgets the sender.
 
     Sets `State.neighbours` of the measured state: relative position, relative velocity and 1 of the
     nearest known drones; zeros if there are fewer.
@@ -28,7 +31,7 @@ class Radio(Stage):
         ended: Gives the drones that have crashed: they are silent.
     """
 
-    arrays = ("heard", "age", "silent")
+    arrays = ("said", "heard", "age", "keys", "silent")
 
     def __init__(
         self, options: SwarmOptions, period: float, drones: int, ended: Callable[[State], Mask]
@@ -40,10 +43,15 @@ class Radio(Stage):
 
     def begin(self, record: Record) -> None:
         """Each drone has heard where those in range start, at rest."""
+        lots = record.draw.uniform(0.0, 1.0)
         position = np.broadcast_to(record.start.position, (*record.shape, 3))
         rest = np.concatenate((position, 0.0 * position), axis=-1)
+        message = np.concatenate((rest, np.zeros((*record.shape, 1))), axis=-1)
+        record.said = filled(message, self._options.radio_delay + 1, 2)
         record.heard = np.repeat(rest[:, None], self._own.shape[0], axis=1)
         record.age = np.where(self._in_range(position, position), 0.0, np.inf)
+        keys = (lots * 2.0**32).astype(np.uint32)
+        record.keys = np.stack((keys, 0 * keys), axis=-1)
         record.silent = np.zeros(record.shape, bool)
 
     def step(self, record: Record) -> None:
@@ -56,12 +64,18 @@ class Radio(Stage):
 
     def _exchange(self, record: Record) -> None:
         state = record.state
+        options = self._options
         record.silent = record.silent | self._ended(state)
-        said = np.concatenate((state.position, state.velocity), axis=-1)
-        in_range = self._in_range(state.position, state.position)
-        arrives = in_range & ~record.silent[:, None]  # (W, receiver, sender)
-        record.heard = np.where(arrives[..., None], said[:, None], record.heard)
-        record.age = np.where(arrives, 0.0, record.age + 1.0)
+        parts = (state.position, state.velocity, record.silent[..., None])
+        record.said = pushed(record.said, np.concatenate(parts, axis=-1), 2)
+        said = record.said[:, :, 0]
+        arrives = self._in_range(state.position, said[..., :3]) & (said[:, None, :, 6] == 0)
+        if options.radio_loss:
+            steps = (record.steps - 1).astype(np.uint32)
+            chances = uniform(words_of(record.keys, RADIO, 0, steps, self._own.shape[0]))
+            arrives &= chances >= options.radio_loss  # (W, receiver, sender)
+        record.heard = np.where(arrives[..., None], said[:, None, :, :6], record.heard)
+        record.age = np.where(arrives, float(options.radio_delay), record.age + 1.0)
 
     def _nearest(self, record: Record, position: Floats, velocity: Floats) -> Floats:
         time = record.age * self._period

@@ -74,8 +74,10 @@ class Record:
     terminated: Mask
     truncated: Mask
     scenes: NDArray[np.int64]
+    said: Floats
     heard: Floats
     age: Floats
+    keys: NDArray[np.uint32]
     silent: Mask
 
     def __init__(self, shape: tuple[int, ...], memory: Memory, kept: tuple[str, ...] = ()) -> None:

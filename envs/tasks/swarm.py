@@ -49,6 +49,10 @@ class SwarmOptions(TaskOptions):
     """Drones in the observation of each: the nearest that it hears."""
     radio_range: Distance = 100.0
     """Furthest distance at which a drone is heard, m."""
+    radio_delay: Annotated[int, Limits(0, 100, "control steps", whole=True)] = 0
+    """Control steps from what a drone says to where it is heard."""
+    radio_loss: Annotated[float, Limits(0.0, 1.0)] = 0.0
+    """Share of messages that are lost, each for itself: of one drone to another in one step."""
 
 
 class Swarm(GoalTask):
@@ -73,6 +77,7 @@ class Swarm(GoalTask):
     )
     min_drones = 2
     max_drones = MAX_DRONES
+    has_radio = True
     action = "velocity"
     episode_length = 500
     worst_step = -1.0 - 2 * ROOM_WEIGHT + WORST_RATES
@@ -131,10 +136,7 @@ class Swarm(GoalTask):
         return [state.neighbours.reshape(*self.shape, 7 * self.options.neighbours)]
 
     def ended(self, state: State) -> Array:
-        """Whether a drone has touched anything, flipped over, or left for good, bool, (W, A).
-
-        From then on its radio is silent.
-        """
+        """Whether a drone has touched anything, flipped over, or left for good, bool, (W, A)."""
         return self.crashed(state, length(self.goal(state) - state.position) > self.band)
 
     def outcome(self, state: State) -> Outcome:

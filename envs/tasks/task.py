@@ -80,6 +80,7 @@ class Task(ABC):
         min_drones, max_drones: Drones of one world; the task separates their starts.
         actions: Action levels at which the task can be flown.
         action, control_period, episode_length: Defaults of an `EnvConfig`.
+        has_radio: Whether drones hear each other: see `stages/radio.py`.
         worst_step: No step's reward is lower, but for terms that add up to a difference, as
             progress does.
 
@@ -101,6 +102,7 @@ class Task(ABC):
     min_drones: ClassVar[int] = 1
     max_drones: ClassVar[int] = 1
     actions: ClassVar[tuple[str, ...]] = LEVELS
+    has_radio: bool = False
     worst_step: ClassVar[float] = 0.0
 
     action: str = "rotors"
@@ -203,6 +205,10 @@ class Task(ABC):
         would learn to crash soon.
         """
         return crashed * (HORIZON * self.worst_step) + 0.0  # no negative zeros
+
+    def ended(self, state: State) -> Array:
+        """Which drones have crashed, bool, (W, A): their radio is silent. Only with a radio."""
+        raise NotImplementedError
 
     def goal(self, state: State) -> Array:
         """Positions of the goals, for pictures: world frame, m, shape (W, A, 3). Optional."""

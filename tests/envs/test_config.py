@@ -13,7 +13,7 @@ import gymnasium as gym
 import pytest
 from contracts import TABLES, rows_of
 from rotorgram.envs import ArraySpec, EnvConfig, Loop, Outcome, Task, register
-from rotorgram.envs.config import BackendConfig, SceneConfig, read_keywords, source_hash
+from rotorgram.envs.config import BackendConfig, SceneConfig, source_hash
 from rotorgram.envs.tasks import Hover
 from rotorgram.envs.tasks.racing import TRACKS
 from rotorgram.models import QUAD_XML
@@ -106,7 +106,7 @@ def test_a_file_and_keywords_that_win(tmp_path: Path) -> None:
         f'env_id = "{HOVER}"\nvehicle = "own.xml"\nstart_tilt = 5\nhistory = 2\n'
         '[backend]\nname = "rigid"\n[effects]\ngusts = 2\n'
     )
-    config = EnvConfig.from_keywords(**read_keywords(file) | {"history": 4})
+    config = EnvConfig.from_toml(file, history=4)
     assert config.vehicle == (str(tmp_path / "own.xml"),)  # beside the file
     assert config.task["start_tilt"] == 5.0
     assert config.history == 4
@@ -114,9 +114,9 @@ def test_a_file_and_keywords_that_win(tmp_path: Path) -> None:
     assert config.effects.gusts == 2.0
     file.write_text("env_id = ")
     with pytest.raises(InputError, match=r"^config: expected a TOML file, got "):
-        read_keywords(file)
+        EnvConfig.from_toml(file)
     with pytest.raises(InputError, match=r"^config: cannot read .*nowhere.toml: "):
-        read_keywords(tmp_path / "nowhere.toml")
+        EnvConfig.from_toml(tmp_path / "nowhere.toml")
 
 
 @rows_of("a wrong field is one sentence", "keywords, sentence")

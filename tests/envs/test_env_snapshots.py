@@ -64,7 +64,7 @@ def test_single_envs_are_copied(case: str, copied: str) -> None:
 
 
 @pytest.mark.parametrize("copied", COPIES)
-@pytest.mark.parametrize("case", ["Hover, rotors", "rich", "Formation, rotors"])
+@pytest.mark.parametrize("case", ["Hover, rotors", "rich", "lossy radio"])
 def test_vector_envs_are_copied(case: str, copied: str) -> None:
     env = vector_of(case)
     fresh = COPIES[copied](env)

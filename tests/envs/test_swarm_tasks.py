@@ -18,7 +18,7 @@ from rotorgram.envs.state import State
 from rotorgram.envs.tasks.swarm import SwarmOptions, grid, line, ring
 from rotorgram.flights.trajectories import fly_episodes
 from rotorgram.models import InputError, Vehicle
-from rotorgram.sim import InitialState
+from rotorgram.sim import Draw, InitialState
 
 TASKS = ("rotorgram/Formation-v0", "rotorgram/Crossing-v0", "rotorgram/Escort-v0")
 ALL_TASKS = (*TASKS, "rotorgram/Cable-v0")
@@ -36,6 +36,7 @@ class Heard:
     def begin(self, position: np.ndarray) -> None:
         record = self.record
         record.start = InitialState(position=position)
+        record.draw = Lots()
         self.stage.begin(record)
         record.flown = np.zeros((1, 3), bool)
         self._observe(position, STILL)
@@ -60,8 +61,17 @@ class Heard:
         return self.record.measured.neighbours[0]
 
 
+class Lots(Draw):
+    def __init__(self) -> None:
+        """It draws the same numbers for every world."""
+
+    def uniform(self, low: Any, high: Any, size: Any = ()) -> Any:
+        return LOTS
+
+
 PLACES = np.array([[[0.0, 0.0, 5.0], [3.0, 0.0, 5.0], [0.0, 40.0, 5.0]]])
 STILL = np.zeros((1, 3, 3))
+LOTS = np.array([[0.1, 0.2, 0.3]])
 SPEAKING = np.zeros((1, 3), bool)
 
 
@@ -80,13 +90,45 @@ def test_neighbours_are_the_nearest_in_range_by_hand() -> None:
     assert nobody.tolist() == [[0] * 7] * 2
 
 
-def test_one_that_is_silent_is_forgotten_after_a_second() -> None:
-    heard = Heard(radio_range=10.0)
+def test_what_is_heard_late_flies_on_straight() -> None:
+    heard = Heard(radio_range=10.0, radio_delay=2)
     heard.begin(PLACES)
-    heard.silent = np.full((1, 3), True)
+    moves = STILL.copy()
+    moves[0, 1] = along(1.0)
+    now = PLACES.copy()
+    for step in range(1, 5):
+        now = now + PERIOD * moves
+        heard.step(now, moves)
+        found = heard.neighbours[0, 0]
+        # Two steps late it hears of the start at rest, then of the flight.
+        velocity = 0.0 if step < 3 else 1.0
+        ahead = step * PERIOD if velocity else 0.0
+        assert found[:4] == pytest.approx([3.0 + ahead, 0, 0, velocity])
+
+
+@pytest.mark.parametrize(("loss", "silent"), [(1.0, False), (0.0, True)])
+def test_one_that_is_silent_or_lost_is_forgotten_after_a_second(loss: float, silent: bool) -> None:
+    heard = Heard(radio_range=10.0, radio_loss=loss)
+    heard.begin(PLACES)
+    heard.silent = np.full((1, 3), silent)
     for step in range(52):
         assert heard.neighbours[0, 0, 6] == (step <= 50)
         heard.step(PLACES, STILL)
+
+
+def test_so_many_messages_are_lost_and_each_for_itself() -> None:
+    heard = Heard(radio_range=100.0, radio_loss=0.3, neighbours=2)
+    heard.begin(PLACES)
+    arrived = np.zeros((3, 2, 2000))
+    for step in range(2000):  # positions tell which step a message is of
+        now = PLACES + np.array((0.0, 0.0, 0.01 * step))
+        heard.step(now, STILL)
+        above = heard.neighbours[..., 2]
+        arrived[..., step] = np.abs(above) < 1e-9
+    assert arrived.mean(axis=-1) == pytest.approx(0.7, abs=0.05)
+    pairs = arrived.reshape(6, -1)
+    others = np.corrcoef(pairs) - np.eye(6)
+    assert np.abs(others).max() < 0.1
 
 
 def test_places_by_hand() -> None:
@@ -118,6 +160,17 @@ def test_the_radius_holds_all_that_collides(vehicle: str | None) -> None:
     distance = np.linalg.norm(one - other)
     clearance = distance - 2 * radius
     assert env.loop.metrics["clearance"] == pytest.approx([clearance] * 2)
+
+
+def test_a_lossy_radio_moves_no_start() -> None:
+    starts = []
+    for loss in (0.0, 0.9):
+        env = LocalVectorEnv(TASKS[2], 4, drones=4, radio_loss=loss)
+        for seed in (1, None):  # the second episode goes on in the stream
+            env.reset(seed=seed)
+        position = env.loop.world.state.position
+        starts.append(position.tobytes())
+    assert starts[0] == starts[1]
 
 
 @pytest.mark.parametrize("env_id", ALL_TASKS)

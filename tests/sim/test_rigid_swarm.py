@@ -278,8 +278,8 @@ def test_whole_episodes_agree_with_mujoco_until_a_touch(
     Observations within a float32's rounding, rewards 1e-9; the end is that spheres overlap.
     """
     options: Any = {"drones": 4, "vehicle": vehicle, "autoreset_mode": "Disabled"}
-    theirs = LocalVectorEnv(env_id, 8, **options)
-    ours = LocalVectorEnv(env_id, 8, backend="rigid", dtype="float64", **options)
+    theirs = LocalVectorEnv(env_id, 8, radio_loss=0.2, **options)
+    ours = LocalVectorEnv(env_id, 8, radio_loss=0.2, backend="rigid", dtype="float64", **options)
     first, _ = ours.reset(seed=5)
     seen, _ = theirs.reset(seed=5)
     assert_array_equal(first, seen)
