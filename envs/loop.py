@@ -147,7 +147,8 @@ class Loop:
         """
         self._check_open()
         record = self.record
-        parts: dict[str, Arrays] = {"record": record.snapshot()}
+        config = np.array(self.spec.config_digest)
+        parts: dict[str, Arrays] = {"record": record.snapshot(), "loop": {"config": config}}
         for stage in self._pipeline.stages:
             parts[type(stage).__name__] = stage.snapshot(record)
         return joined(parts)
@@ -158,7 +159,7 @@ class Loop:
         No later bit differs from those that followed it.
 
         Raises:
-            InputError: It is of another number of drones; nothing has changed.
+            InputError: It is of another config or number of drones; nothing has changed.
             gymnasium.error.ClosedEnvironmentError: The loop is closed.
         """
         self._check_open()
@@ -167,6 +168,10 @@ class Loop:
         shape = getattr(kept.get("kept/steps"), "shape", None)
         if shape != record.shape:
             raise InputError(f"snapshot: expected one of drones {record.shape}, got {shape}")
+        config = self.spec.config_digest
+        got = part_of(snapshot, "loop")["config"]
+        if got != config:
+            raise InputError(f"snapshot: expected one of config {config}, got one of {got}")
         record.restore(kept)
         for stage in self._pipeline.stages:
             stage.restore(record, part_of(snapshot, type(stage).__name__))

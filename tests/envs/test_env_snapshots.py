@@ -93,6 +93,19 @@ def test_another_number_of_drones_is_refused() -> None:
         three.restore(two.snapshot())
 
 
+def test_a_snapshot_of_another_config_is_refused() -> None:
+    near: Any = gym.make(HOVER).unwrapped
+    far: Any = gym.make(HOVER, start_band=2.0).unwrapped
+    near.reset(seed=1)
+    far.reset(seed=2)
+    before = bits(near.snapshot())
+    with pytest.raises(
+        InputError, match=r"^snapshot: expected one of config \w{32}, got one of \w"
+    ):
+        near.restore(far.snapshot())
+    assert bits(near.snapshot()) == before
+
+
 def test_a_closed_env_has_no_snapshot() -> None:
     env: Any = gym.make(HOVER)
     env.close()
