@@ -5,7 +5,7 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
-from ._flags import Command, Words
+from ._flags import Command
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,7 +17,7 @@ class Plot(Command):
     """
 
     flights: Positional[tuple[Path, ...]]
-    """MCAP files that --record wrote."""
+    """MCAP files that --record wrote. Their names are those in the legend."""
     out: Path | None = None
     """PNG, PDF or SVG file to write. Default: the first journal's name with .png."""
     session: int | None = None
@@ -28,8 +28,6 @@ class Plot(Command):
     """The first episode, from 0."""
     episodes: int = 1
     """Number of episodes of each journal."""
-    names: Words = ()
-    """Names in the legend, one for each flight. Default: the journals' names."""
 
     def run(self) -> int:
         """Draw it; say where."""
@@ -54,11 +52,6 @@ class Plot(Command):
                 while name in found:
                     name += " (again)"
                 found[name] = flight
-        if self.names and len(self.names) != len(found):
-            raise InputError(
-                f"names: expected one for each of {len(found)} flights, got {len(self.names)}"
-            )
-        named = dict(zip(self.names or found, found.values(), strict=True))
-        plot_flights(named, out)
-        print(f"{out}: {len(named)} flights" if len(named) > 1 else out)
+        plot_flights(found, out)
+        print(f"{out}: {len(found)} flights" if len(found) > 1 else out)
         return 0

@@ -174,7 +174,7 @@ def texts_of(file: Path) -> set[str | None]:
 def test_a_plot_lays_flights_over_each_other(journal: Path, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     out = tmp_path / "two.svg"
-    assert main(["plot", str(journal), str(journal), "--names", "A", "B", "--out", str(out)]) == 0
+    assert main(["plot", str(journal), str(journal), "--out", str(out)]) == 0
     labels = [
         "x (m)",
         "roll (deg)",
@@ -184,7 +184,7 @@ def test_a_plot_lays_flights_over_each_other(journal: Path, tmp_path: Path) -> N
         "position error (m)",
         "time (s)",
     ]
-    assert {"A", "B", "goal", *labels} <= texts_of(out)
+    assert {"hover", "hover (again)", "goal", *labels} <= texts_of(out)
 
 
 @pytest.mark.parametrize(
