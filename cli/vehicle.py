@@ -238,11 +238,10 @@ def print_checks(checks: Sequence["Check"], *, as_json: bool = False) -> None:
     columns = ["", "check", "measured", "expected"] + ["equation", "source"] * wide
     table = Table(*columns, box=SIMPLE_HEAD, pad_edge=False)
     for check in checks:
-        note = f" ({check.note})" if check.note else ""
         cells = (
             "[green]ok" if check.passed else "[red]FAILED",
             escape(check.name),
-            escape(f"{check.measured:.4g} {check.unit}".strip() + note),
+            escape(f"{check.measured:.4g} {check.unit}".strip()),
             escape(expectation(check)),
             escape(check.equation),
             escape(check.source),

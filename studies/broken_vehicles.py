@@ -140,13 +140,14 @@ BROKEN: Final[dict[str, tuple[Edit, str]]] = {
         replace(('size="0.22 0.22 0.07" mass="12"',
                  'size="0.22 0.22 0.07" pos="1.8 0 0" mass="12"')),
         SHARE),
-    "Euler's integrator": (replace(('integrator="RK4"', "")), "integrator: observed order"),
-    "physics step of 50 ms": (replace(('timestep="0.01"', 'timestep="0.05"')), "physics step"),
+    "Euler's integrator": (
+        replace(('integrator="RK4"', "")), "physics step: error of attitude"),
+    "physics step of 50 ms": (
+        replace(('timestep="0.01"', 'timestep="0.05"')), "floor: height at rest"),
     "physics step too long for its inertia": (
         both(inertial('diaginertia="0.85 0.85 1.6"'),
-             replace(('ctrlrange="0 100"', 'ctrlrange="0 400"'))), "physics step"),
-    "motors faster than the physics step": (
-        numeric(rotors__time_constant=0.004), "physics step"),
+             replace(('ctrlrange="0 100"', 'ctrlrange="0 400"'))),
+        "physics step: error of attitude"),
     "nothing that collides": (
         replace(('contype="1" conaffinity="1"', 'contype="0" conaffinity="0"')),
         "floor: height at rest"),
@@ -157,7 +158,7 @@ BROKEN: Final[dict[str, tuple[Edit, str]]] = {
     "gravity in cm/s²": (
         replace(('gravity="0 0 -9.8"', 'gravity="0 0 -980"')), SHARE),
     "armature of the free joint": (
-        free('armature="0.5"'), "mass against a force of 1 N"),
+        free('armature="0.5"'), "free fall: depth"),
     "damping of the free joint": (
         free('damping="0.05"'), "free fall: depth"),
     "damping that the integrator cannot follow": (
