@@ -193,8 +193,8 @@ class Stage:
         self.moments: tuple[Moment, ...] = ()
         drones = range(self.drones)
         self._paths: list[deque[np.ndarray]] = [deque(maxlen=self._length) for _ in drones]
-        # Distance between each craft and its goal for which a camera makes room, m.
-        self._reach = np.zeros(self.drones)
+        # Distance between a single craft and its goal for which a camera makes room, m.
+        self._reach = 0.0
         self._focus: np.ndarray | None = None
         mujoco.mj_forward(self.model, self.data)
 
@@ -221,18 +221,18 @@ class Stage:
         for i, (moment, last) in enumerate(zip(moments, before, strict=True)):
             pose = poses[i]
             path = self._paths[i]
-            goal = moment.goal
             pose[:3] = moment.position
             pose[3:] = moment.attitude
             if moment.step == 0 or moment.step < last.step or moment.episode != last.episode:
                 path.clear()
-                self._reach[i] = 0.0
+                self._reach = 0.0
             if moment.step // _EVERY != last.step // _EVERY or not path:  # steps may be left out
                 path.append(pose[:3].copy())
-            now = 0.0 if goal is None else float(np.linalg.norm(np.subtract(goal, pose[:3])))
-            if self._reach[i]:
-                now = min(now, _FAR * self.radius)
-            self._reach[i] = max(self._reach[i], now)
+            if moment.goal is not None:
+                reach = float(np.linalg.norm(np.subtract(moment.goal, pose[:3])))
+                if self._reach:
+                    reach = min(reach, _FAR * self.radius)
+                self._reach = max(self._reach, reach)
         place_cameras(self.model, self.data)
 
     def camera(self, name: Camera | Literal["free"]) -> mujoco.MjvCamera:
@@ -251,16 +251,12 @@ class Stage:
             raise InputError(f"camera: expected one of {', '.join(CAMERAS)}, got {shortened(name)}")
         camera.azimuth, camera.elevation, distance, holds = _VIEWS[name]
         camera.distance = distance * self.radius
-        reach = float(self._reach.max())
         if self.drones > 1:  # the goals of one world lie apart, often far from their craft
             places = np.array([*self._points, *self._goals])
             camera.distance += float(np.ptp(places, axis=0).max())
-            reach = 0.0
-        if holds == math.inf:
-            camera.lookat[:] = self._points.mean(axis=0)
-        else:
-            camera.distance += _BACK * max(reach - holds * self.radius, 0.0)
-            camera.lookat[:] = self.focus
+        elif holds < math.inf:
+            camera.distance += _BACK * max(self._reach - holds * self.radius, 0.0)
+        camera.lookat[:] = self.focus if holds < math.inf else self._points.mean(axis=0)
         if name in ("front", "side"):  # above the ground
             camera.lookat[2] = max(camera.lookat[2] - _LOWER * camera.distance, 0.0)
         return camera
