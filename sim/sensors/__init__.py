@@ -11,18 +11,15 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Final
 
 from ...models.errors import InputError, shortened
-from ...models.fields import Choice, check, check_names
+from ...models.fields import Choice, Flag, check, check_names
 from ..snapshots import Kept
 from ..state import Array, ByName, WorldState, chosen
 from ..world import World
 from .barometer import Barometer
 from .base import Sensor, Source, Values
 from .estimator import Estimator
-from .gps import Gps
 from .imu import Imu
-from .magnetometer import FIELD, Magnetometer
-from .motion_capture import MotionCapture
-from .rangefinder import Rangefinder
+from .simple import FIELD, Gps, Magnetometer, MotionCapture, Rangefinder
 
 if TYPE_CHECKING:
     from ...models.vehicle import Vehicle
@@ -36,20 +33,19 @@ SENSOR_TYPES: Final[Mapping[str, type[Sensor]]] = {
 
 _ESTIMATE = Estimator.name
 _OBSERVED = Choice(("added", _ESTIMATE))
-_SOURCES: Final[Mapping[str, type[Source]]] = {**SENSOR_TYPES, _ESTIMATE: Estimator}
 
 
 def checked_sensors(given: object) -> dict[str, Any]:
     """The option `sensors` of a task as plain values in one order. Raises `InputError`.
 
-    By sensor its settings by name, or True for none; False leaves it out. `observe` is "added" or
-    "estimate".
+    By sensor its settings by name, or True for none; False leaves it out. `estimate` is True or
+    False, `observe` is "added" or "estimate".
     """
     if not isinstance(given, Mapping):
         raise InputError(f"sensors: expected settings by sensor, got {shortened(given)}")
-    check_names(given, [*_SOURCES, "observe"], "sensors")
+    check_names(given, [*SENSOR_TYPES, _ESTIMATE, "observe"], "sensors")
     sensors: dict[str, Any] = {}
-    for name, kind in _SOURCES.items():
+    for name, kind in SENSOR_TYPES.items():
         settings = given.get(name, False)
         if settings is False:
             continue
@@ -60,6 +56,8 @@ def checked_sensors(given: object) -> dict[str, Any]:
                 f"sensors.{name}: expected true, or settings by name, got {shortened(settings)}"
             )
         sensors[name] = kind.checked(settings)
+    if check("sensors.estimate", Flag(), given.get(_ESTIMATE, False)):
+        sensors[_ESTIMATE] = True
     observe = check("sensors.observe", _OBSERVED, given.get("observe", "added"))
     if observe == _ESTIMATE:
         if _ESTIMATE not in sensors:
@@ -73,9 +71,9 @@ def checked_sensors(given: object) -> dict[str, Any]:
 def _resolved(sensors: Values, vehicle: "Vehicle", period: float) -> dict[str, dict[str, Any]]:
     """All settings by sensor."""
     return {
-        name: _SOURCES[name].resolved(given, vehicle, period)
-        for name, given in sensors.items()
-        if name != "observe"
+        name: kind.resolved(sensors[name], vehicle, period)
+        for name, kind in SENSOR_TYPES.items()
+        if name in sensors
     }
 
 
@@ -85,12 +83,15 @@ def readings_of(sensors: Values, vehicle: "Vehicle", period: float) -> list[dict
     From `checked_sensors`. Raises `InputError`.
     """
     readings: list[dict[str, Any]] = []
-    for name, values in _resolved(sensors, vehicle, period).items():
-        kind = _SOURCES[name]
-        low, high = kind.bounds(values)
+    settings = _resolved(sensors, vehicle, period)
+    kinds: list[type[Source]] = [*SENSOR_TYPES.values(), Estimator]
+    for kind in kinds:
+        if kind.name not in sensors:
+            continue
+        low, high = kind.bounds(settings.get(kind.name, {}))
         bounds = {"shape": (len(low),), "low": low, "high": high}
         words = {"unit": kind.units, "frame": kind.frame, "components": kind.components}
-        readings.append({"name": name, **bounds, **words})
+        readings.append({"name": kind.name, **bounds, **words})
     return [] if "observe" in sensors else readings
 
 
@@ -106,12 +107,10 @@ class Sensors(Kept):
         self._world = world
         settings = _resolved(sensors, world.vehicle, period)
         self._estimator = None
-        if _ESTIMATE in settings:
+        if _ESTIMATE in sensors:
             altitude = settings.get("barometer", {}).get("altitude", 0.0)
             field = settings.get("magnetometer", {}).get("field", FIELD)
-            gravity = world.vehicle.gravity
-            values = settings.pop(_ESTIMATE)
-            self._estimator = Estimator(values, period, gravity, altitude, field)
+            self._estimator = Estimator(period, world.vehicle.gravity, altitude, field)
         self._sensors = {
             name: SENSOR_TYPES[name](values, period, world) for name, values in settings.items()
         }

@@ -29,7 +29,7 @@ Bounds = tuple[tuple[float, ...], tuple[float, ...]]
 
 
 class Setting(NamedTuple):
-    """A setting of a sensor or of the estimate."""
+    """A setting of a sensor."""
 
     default: float | tuple[float, ...] | None
     limits: Limits
@@ -50,65 +50,22 @@ SAMPLING = {
 class Source(Kept):
     """Base of sensors and of the estimate.
 
-    Args:
-        values: All settings.
-        interval: Time between two readings, s.
-
     Class attributes:
         name: In the option `sensors`, and of the observation's array.
-        own: Settings that are no coefficients of a vehicle.
         frame: Of the reading; so are `components` and `units`.
         top: Upper bound of each component, unless `bounds` computes it.
     """
 
     name: ClassVar[str]
-    own: ClassVar[Mapping[str, Setting]] = {}
     frame: ClassVar[str]
     components: ClassVar[tuple[str, ...]]
     units: ClassVar[tuple[str, ...]]
     top: ClassVar[tuple[float, ...]]
 
-    def __init__(self, values: Values, interval: float) -> None:
-        self.values = values
-        self.interval = interval
-
     @classmethod
     def bounds(cls, values: Values) -> Bounds:
         """Bounds of a reading with these settings."""
         return tuple(-bound for bound in cls.top), cls.top
-
-    @classmethod
-    def settings(cls) -> Mapping[str, Setting]:
-        """All settings by name."""
-        return cls.own
-
-    @classmethod
-    def checked(cls, given: Values) -> dict[str, Any]:
-        """Settings by name as plain values. Raises `InputError`."""
-        settings = cls.settings()
-        check_names(given, settings, f"sensors.{cls.name}")
-        values = {}
-        for name, value in given.items():
-            number = check(f"sensors.{cls.name}.{name}", settings[name].limits, value)
-            values[name] = list(number) if isinstance(number, tuple) else number
-        return values
-
-    @classmethod
-    def resolved(cls, given: Values, vehicle: "Vehicle", period: float) -> dict[str, Any]:
-        """All settings: those given, else those of the vehicle, else the defaults."""
-        values = {}
-        for name, (value, _, coefficient) in cls.settings().items():
-            if coefficient:
-                own = vehicle.coefficients[f"sensors.{coefficient}"]
-                value = value if own is None else own
-            value = given.get(name, value)
-            if coefficient and value is None:
-                raise InputError(
-                    f"sensors.{cls.name}: expected {name} here, or sensors.{coefficient} in the "
-                    "vehicle's file, got none"
-                )
-            values[name] = value
-        return values
 
 
 class Sensor(Source):
@@ -120,12 +77,18 @@ class Sensor(Source):
         prefix: What its coefficients' names begin with in a vehicle's file.
         needs: Coefficients that the vehicle or the option has to give.
         defaults: Coefficients that may be missing.
+        own: Settings that are no coefficients of a vehicle.
         columns: Normal numbers that a reading takes, and a reset.
+
+    Attributes:
+        values: All settings.
+        interval: Time between two readings, s.
     """
 
     prefix: ClassVar[str]
     needs: ClassVar[tuple[str, ...]] = ("noise",)
     defaults: ClassVar[Mapping[str, float]] = {}
+    own: ClassVar[Mapping[str, Setting]] = {}
     columns: ClassVar[int]
     arrays: ClassVar[tuple[str, ...]] = ("_now", "_held")
     lists = ("_late",)
@@ -133,7 +96,8 @@ class Sensor(Source):
     def __init__(self, values: Values, period: float, world: World) -> None:
         self._every = values["every"]
         self._lag = values["lag"]
-        super().__init__(values, self._every * period)
+        self.values = values
+        self.interval = self._every * period
         self.world = world
         self._low, self._high = map(np.array, self.bounds(values))
         # One number more than the sensor takes decides whether a reading is lost.
@@ -154,24 +118,50 @@ class Sensor(Source):
         return {**settings, **cls.own, **SAMPLING}
 
     @classmethod
+    def checked(cls, given: Values) -> dict[str, Any]:
+        """Settings by name as plain values. Raises `InputError`."""
+        settings = cls.settings()
+        check_names(given, settings, f"sensors.{cls.name}")
+        values = {}
+        for name, value in given.items():
+            number = check(f"sensors.{cls.name}.{name}", settings[name].limits, value)
+            values[name] = list(number) if isinstance(number, tuple) else number
+        return values
+
+    @classmethod
     def resolved(cls, given: Values, vehicle: "Vehicle", period: float) -> dict[str, Any]:
-        """With `every` and `lag`, control steps between readings and of the delay."""
-        values = super().resolved(given, vehicle, period)
+        """All settings: those given, else those of the vehicle, else the defaults.
+
+        With `every` and `lag`, control steps between readings and of the delay.
+        """
+        values = {}
+        for name, (value, _, coefficient) in cls.settings().items():
+            if coefficient:
+                own = vehicle.coefficients[f"sensors.{coefficient}"]
+                value = value if own is None else own
+            value = given.get(name, value)
+            if coefficient and value is None:
+                raise InputError(
+                    f"sensors.{cls.name}: expected {name} here, or sensors.{coefficient} in the "
+                    "vehicle's file, got none"
+                )
+            values[name] = value
         rate = values["rate"]
-        delay = values["delay"]
         every = 1.0 if rate is None else 1 / (rate * period)
-        if round(every) < 1 or not _is_whole(every):
+        values["every"] = round(every)
+        if values["every"] < 1 or not _is_whole(every):
             raise InputError(
                 f"sensors.{cls.name}.rate: expected the control rate of {1 / period:g} Hz over a "
                 f"whole number, got {rate:g} Hz"
             )
-        lag = delay / period
-        if round(lag) > MAX_DELAY or not _is_whole(lag):
+        delay = values["delay"]
+        values["lag"] = round(delay / period)
+        if values["lag"] > MAX_DELAY or not _is_whole(delay / period):
             raise InputError(
                 f"sensors.{cls.name}.delay: expected a whole number of control periods of "
                 f"{period:g} s, at most {MAX_DELAY}, got {delay:g} s"
             )
-        return values | {"every": round(every), "lag": round(lag)}
+        return values
 
     @property
     def value(self) -> Array:

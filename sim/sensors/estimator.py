@@ -3,17 +3,15 @@
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import ClassVar
 
 import numpy as np
 
-from ...models.fields import Limits
 from ..rotations import advanced, between, cross, parts_of, to_world, world_z
 from ..state import Array, WorldState, chosen, clip, component, each, stack
-from .base import FURTHEST, MAX_SPEED, UNIT, Sensor, Setting, Source, Values
-from .magnetometer import FIELD
+from .base import FURTHEST, MAX_SPEED, UNIT, Sensor, Source
 
-_TIME = Setting(1.0, Limits(1e-3, 1e4, "s"))
+TIME = 1.0
+"""Time constant of all corrections, s."""
 _UP = np.array((0.0, 0.0, 1.0))
 _PARTS = ("position", "velocity", "quaternion", "body_rates")
 
@@ -28,11 +26,7 @@ class Estimator(Source):
     Kalman Filtering Made Easy", 1998, section 1.2). The filter begins at the exact state, and
     treats delayed readings as current.
 
-    Settings are time constants: of the attitude; of height and climb rate, which follow the
-    barometer; of position and velocity, which follow motion capture and GPS.
-
     Args:
-        values: All settings.
         interval: Time of a step, s.
         gravity: m/s².
         altitude: Height of the ground above sea level, m.
@@ -41,25 +35,15 @@ class Estimator(Source):
 
     name = "estimate"
     arrays = _PARTS
-    own: ClassVar = {
-        "attitude_time": _TIME,
-        "height_time": _TIME,
-        "position_time": _TIME,
-    }
     frame = "world; body rates: body"
     components = ("x", "y", "z", "vx", "vy", "vz", "qw", "qx", "qy", "qz", "wx", "wy", "wz")
     units = ("m",) * 3 + ("m/s",) * 3 + ("1",) * 4 + ("rad/s",) * 3
     top = (FURTHEST,) * 3 + (MAX_SPEED,) * 3 + (UNIT,) * 4 + (2 * MAX_SPEED,) * 3
 
     def __init__(
-        self,
-        values: Values,
-        interval: float,
-        gravity: float = 0.0,
-        altitude: float = 0.0,
-        field: tuple[float, ...] = FIELD,
+        self, interval: float, gravity: float, altitude: float, field: tuple[float, ...]
     ) -> None:
-        super().__init__(values, interval)
+        self.interval = interval
         self._gravity = gravity
         self._altitude = altitude
         self._north = math.atan2(field[1], field[0])
@@ -94,16 +78,16 @@ class Estimator(Source):
     def _correction(self, force: Array, sensors: Mapping[str, Sensor]) -> Array:
         """Rotation vector in the body frame that corrects the attitude, rad."""
         up = world_z(self.quaternion)
-        share = 1 - math.exp(-self.interval / self.values["attitude_time"])
+        share = 1 - math.exp(-self.interval / TIME)
         angle = share / self._gravity * stack(cross(parts_of(force), parts_of(up)))
         if sensor := sensors.get("magnetometer"):
             field = to_world(self.quaternion, sensor.value)
             off = self._north - np.atan2(component(field, 1), component(field, 0))
-            off = np.atan2(np.sin(off), np.cos(off)) * self._gain(sensor, "attitude_time")
+            off = np.atan2(np.sin(off), np.cos(off)) * self._gain(sensor)
             angle = angle + each(off) * up
         if sensor := sensors.get("motion_capture"):
             error = between(self.quaternion, sensor.value[..., 3:])
-            sign = 2.0 * self._gain(sensor, "attitude_time") * np.sign(component(error, 0))
+            sign = 2.0 * self._gain(sensor) * np.sign(component(error, 0))
             angle = angle + each(sign) * error[..., 1:]
         return angle
 
@@ -113,27 +97,27 @@ class Estimator(Source):
         """Position and velocity, corrected by fresh readings."""
         if sensor := sensors.get("barometer"):
             off = component(sensor.value, 0) - self._altitude - component(position, 2)
-            g, h = self._gains(sensor, "height_time")
+            g, h = self._gains(sensor)
             position = position + each(g * off) * _UP
             velocity = velocity + each(h * off) * _UP
         if sensor := sensors.get("motion_capture"):
-            g, h = self._gains(sensor, "position_time")
+            g, h = self._gains(sensor)
             off = sensor.value[..., :3] - position
             position = position + each(g) * off
             velocity = velocity + each(h) * off
         if sensor := sensors.get("gps"):
-            gain = each(self._gain(sensor, "position_time"))
+            gain = each(self._gain(sensor))
             position = position + gain * (sensor.value[..., :3] - position)
             velocity = velocity + gain * (sensor.value[..., 3:] - velocity)
         return position, velocity
 
-    def _gain(self, sensor: Sensor, time: str) -> Array:
+    def _gain(self, sensor: Sensor) -> Array:
         """Share of an error that a fresh reading removes; 0 without a fresh reading."""
-        return (1 - math.exp(-sensor.interval / self.values[time])) * sensor.fresh
+        return (1 - math.exp(-sensor.interval / TIME)) * sensor.fresh
 
-    def _gains(self, sensor: Sensor, time: str) -> tuple[Array, Array]:
+    def _gains(self, sensor: Sensor) -> tuple[Array, Array]:
         """g, and h over the interval: 1 - ξ² and (1 - ξ)² for two poles at ξ."""
-        pole = math.exp(-sensor.interval / self.values[time])
+        pole = math.exp(-sensor.interval / TIME)
         return (1 - pole**2) * sensor.fresh, (1 - pole) ** 2 / sensor.interval * sensor.fresh
 
     def estimate(self) -> Array:

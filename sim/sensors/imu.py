@@ -15,21 +15,13 @@ GYRO_RANGE = math.radians(2000.0)  # rad/s: the largest setting of the BMI088
 ACCELEROMETER_RANGE = 24 * 9.80665  # m/s²: the same
 
 
-def specific_force(world: World) -> Array:
-    """Acceleration less that of gravity at the body's origin, body frame, m/s², shape (W, A, 3).
-
-    R^T (a - g), with the attitude R and the acceleration a at the end of the control step, under
-    the thrusts and the forces of the air of its last physics step.
-    """
-    gravity = np.array((0.0, 0.0, world.vehicle.gravity))
-    return to_body(world.state.quaternion, world.acceleration() + gravity)
-
-
 class Imu(Sensor):
     """Gyroscope and accelerometer at the body's origin.
 
     reading = (1 + scale) · exact + bias + white noise, for each axis. White noise of density N read
     every T has σ = N / √T; the bias walks by K √T between readings. (IEEE Std 952-1997, annex C.)
+    The exact specific force is R^T (a - g), with the attitude R and the acceleration a at the end
+    of the control step, under the thrusts and the forces of the air of its last physics step.
     """
 
     name = "imu"
@@ -72,7 +64,10 @@ class Imu(Sensor):
         self._scale = chosen(mask, self._both("scale") * normal[..., 6:], self._scale)
 
     def measure(self, normal: Array) -> Array:
-        exact = np.concat((self.world.state.body_rates, specific_force(self.world)), axis=-1)
+        state = self.world.state
+        gravity = np.array((0.0, 0.0, self.world.vehicle.gravity))
+        force = to_body(state.quaternion, self.world.acceleration() + gravity)
+        exact = np.concat((state.body_rates, force), axis=-1)
         reading = (1 + self._scale) * exact + self._bias + self._white * normal[..., :6]
         self._bias = self._bias + self._step * normal[..., 6:]
         return reading

@@ -404,9 +404,13 @@ def test_an_estimate_stays_within_the_bounds_of_a_task() -> None:
 HALF_LIFE = PERIOD / log(2)  # a time constant with which a step takes half of an error
 
 
+@pytest.fixture
+def half_life(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rotorgram.sim.sensors.estimator.TIME", HALF_LIFE)
+
+
 def estimator(**state: Any) -> Estimator:
-    times = dict.fromkeys(("attitude_time", "height_time", "position_time"), HALF_LIFE)
-    made = Estimator(times, PERIOD, 10.0, 100.0, (0.0, 20.0, -40.0))
+    made = Estimator(PERIOD, 10.0, 100.0, (0.0, 20.0, -40.0))
     start = {"position": (0, 0, 0), "velocity": (0, 0, 0), "quaternion": LEVEL, **state}
     exact: Any = SimpleNamespace(**{k: np.array(v, float) for k, v in start.items()})
     made.begin(np.True_, exact, np.zeros(6))
@@ -426,6 +430,7 @@ def angles_of(quaternion: np.ndarray) -> np.ndarray:
 STILL = (0.0, 0.0, 0.0, 0.0, 0.0, 10.0)
 
 
+@pytest.mark.usefixtures("half_life")
 @pytest.mark.parametrize("row", SIM["estimates"])
 def test_a_step_by_hand(row: dict[str, Any]) -> None:
     """At rest, unless the IMU reads otherwise; then half of the rest for each measurement."""
@@ -443,6 +448,7 @@ def test_a_step_by_hand(row: dict[str, Any]) -> None:
         assert made.velocity == approx(row["velocity"], abs=1e-12)
 
 
+@pytest.mark.usefixtures("half_life")
 def test_a_reading_counts_once() -> None:
     stale = {
         "barometer": channel(140.0, fresh=False), "gps": channel(9, 9, 9, 9, 9, 9, fresh=False),
@@ -456,6 +462,7 @@ def test_a_reading_counts_once() -> None:
     assert made.quaternion == approx(LEVEL)
 
 
+@pytest.mark.usefixtures("half_life")
 def test_a_gyroscopes_bias_tilts_the_estimate_by_so_much() -> None:
     """What the bias adds in a step is what the accelerometer takes away: b T = sin(tilt) / 2."""
     made = estimator()
