@@ -3,7 +3,7 @@
 Knows nothing of tasks, rewards or Gymnasium.
 """
 
-from .control import LEVELS, CollectiveThrust, Controller, Gains, RotorThrust, make_controller
+from .control import LEVELS, CollectiveThrust, Controller, Gains, make_controller
 from .effects import EffectOptions
 from .random import Draw
 from .randomize import PARAMETERS, Randomization
@@ -34,7 +34,6 @@ __all__ = [
     "InitialState",
     "PhysicsError",
     "Randomization",
-    "RotorThrust",
     "World",
     "WorldState",
     "body_x",

@@ -199,10 +199,9 @@ def check_world(
     known = _SETTINGS[backend]
     for name, value in settings.items():
         if name not in known:
-            several = "s" * (len(known) > 1)
             raise InputError(
-                f"{name}: expected {' or '.join(known)}, the setting{several} of the backend "
-                f"{backend}, got {name}={value!r}"
+                f"{name}: expected {' or '.join(known)} with the backend {backend}, "
+                f"got {name}={value!r}"
             )
         check(name, known[name], value)
 

@@ -177,7 +177,7 @@ class MujocoWorld(World):
 
     def _vary(self, ids: np.ndarray) -> None:
         """Give the models of some worlds their drawn parameters."""
-        if not self._varied.fields or not self.parameters:
+        if not self._varied.base or not self.parameters:
             return
         shape = self._touching.shape
         values = {name: np.reshape(x, shape)[ids] for name, x in self.parameters.items()}
@@ -251,8 +251,7 @@ class MujocoWorld(World):
         """As `World.close`."""
         if self._owner not in (None, os.getpid()):
             return  # a fork has none of the threads
-        state = {name: copy.copy(getattr(self.state, name)) for name in WorldState.__slots__}
-        self.state = WorldState(**state)
+        self.state = copy.deepcopy(self.state)
         for view in _VIEWS.split():
             vars(self).pop(view, None)
 

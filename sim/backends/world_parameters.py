@@ -22,17 +22,16 @@ class WorldParameters:
     """Fields of a model that differ between worlds.
 
     Attributes:
-        fields: Their names; empty if nothing that is drawn is of the model.
+        base: Their values in the model by name; empty if nothing that is drawn is of the model.
     """
 
     def __init__(self, model: mujoco.MjModel, drawn: Sequence[str]) -> None:
-        self._names = [name for name in drawn if name in _FIELDS]
-        self.fields = tuple(dict.fromkeys(f for name in self._names for f in _FIELDS[name]))
-        self._base = {name: getattr(model, name).copy() for name in self.fields}
+        fields = dict.fromkeys(field for name in drawn for field in _FIELDS.get(name, ()))
+        self.base = {field: getattr(model, field).copy() for field in fields}
         owner = owners(model)
         self._craft = owner >= 0
         self._hung = np.zeros(model.nbody, bool)
-        if "payload" in self._names:
+        if "payload" in drawn:
             self._hung[payload_body(model)] = True
         # Of each craft the first of six degrees of freedom are those of its translation.
         self._linear = self._craft[model.dof_bodyid] & (np.arange(model.nv) % 6 < 3)
@@ -46,13 +45,11 @@ class WorldParameters:
     def values(self, parameters: Mapping[str, Array]) -> ByName:
         """The fields by name, each (N, ...), of N worlds with these parameters, each (N, A)."""
         where = np.where
-        given = {name: parameters[name] for name in self._names}
-        like = next(iter(given.values()))
-        ones = 1.0 + 0.0 * like
-        mass, payload = (given.get(name, ones) for name in ("mass", "payload"))
-        inertia = mass * given.get("inertia", ones)
-        loads = where(self._hung, payload[:, :1], 1.0)
-        reaction = given.get("reaction", ones)[:, self._of_rotors, None]
+        ones = 1.0 + 0.0 * next(iter(parameters.values()))
+        mass = parameters.get("mass", ones)
+        inertia = mass * parameters.get("inertia", ones)
+        loads = where(self._hung, parameters.get("payload", ones)[:, :1], 1.0)
+        reaction = parameters.get("reaction", ones)[:, self._of_rotors, None]
         factors = {
             "body_mass": where(self._craft, mass[:, self._of_bodies], loads),
             "body_inertia": where(self._craft, inertia[:, self._of_bodies], loads)[..., None],
@@ -60,10 +57,10 @@ class WorldParameters:
             "actuator_gear": where(self._torque, reaction, 1.0),
         }
         values = {
-            name: factors[name] * base for name, base in self._base.items() if name in factors
+            field: factors[field] * base for field, base in self.base.items() if field in factors
         }
-        if "body_ipos" in self._base:
-            shift = stack([given.get(name, 0.0 * ones) for name in CENTER])[:, self._of_bodies]
-            moved = np.einsum("bji,wbj->wbi", self._axes, shift)
-            values["body_ipos"] = self._base["body_ipos"] + moved
+        if "body_ipos" in self.base:
+            shift = stack([parameters.get(name, 0.0 * ones) for name in CENTER])
+            moved = np.einsum("bji,wbj->wbi", self._axes, shift[:, self._of_bodies])
+            values["body_ipos"] = self.base["body_ipos"] + moved
         return values

@@ -25,7 +25,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...models.errors import InputError
 
@@ -88,7 +87,9 @@ class Gains:
         `period` is the time between two looks at the state, s, and `lag` the time constant of the
         rotors, s.
         """
-        rank = int(np.linalg.matrix_rank(vehicle.allocation / _rows(vehicle.allocation)))
+        # The rank does not depend on the craft's size.
+        largest = np.abs(vehicle.allocation).max(axis=1, keepdims=True)
+        rank = int(np.linalg.matrix_rank(vehicle.allocation / np.maximum(largest, 1e-12)))
         if rank != 4:
             raise InputError(
                 "vehicle: expected a vehicle whose rotors roll, pitch and yaw it, for this action, "
@@ -143,9 +144,3 @@ def shared_ranges(several: Sequence[Gains]) -> list[Gains]:
     least["most_tilt"] = min(one.most_tilt for one in several)
     least["position"] = min(one.position for one in several)
     return [replace(one, **least) for one in several]
-
-
-def _rows(allocation: np.ndarray) -> NDArray[np.float64]:
-    """Largest number of each row, so that the rank does not depend on the craft's size."""
-    largest: NDArray[np.float64] = np.abs(allocation).max(axis=1, keepdims=True)
-    return np.maximum(largest, 1e-12)

@@ -48,17 +48,16 @@ class Effects(Kept):
         drawn: tuple[str, ...] = (),
     ) -> None:
         """`noise`: that of the world. `drawn`: names of the randomised parameters in `factors`."""
-        count = vehicle.num_rotors
-        known = {f"thrust_{n}" for n in range(1, count + 1)} | {"thrust"}
+        self.rotors = RotorEffects(vehicle, options)
         scaled = [name for name in drawn if name.startswith("thrust")]
         for name in scaled:
-            if name not in known:
+            if name not in ("thrust", *self.rotors.names):
+                count = vehicle.num_rotors
                 raise InputError(f"randomize: expected one of the {count} rotors, got {name}")
         rotors = options.motor_lag or options.thrust_curve or options.battery
         self.on_rotors = bool(rotors or options.efficiency or scaled)
         moved = options.body_drag or options.rotor_drag
         self.on_body = moved or options.ground_effect
-        self.rotors = RotorEffects(vehicle, options)
         self.air = AirEffects(vehicle, options)
         self._mean_wind = options.wind
         blows = options.gusts or options.downwash or any(options.wind)

@@ -61,13 +61,9 @@ class AirEffects(Kept):
             weight = vehicle.mass * vehicle.gravity
             slope = max(self._linear) + 2 * math.sqrt(max(self._quadratic) * weight)
             _check_stiffness(vehicle, slope, "drag of the body")
-            most = 0.5 * _least_moment(vehicle) / vehicle.timestep
-            stiffest = max(self._angular or _NOTHING)
-            if not stiffest <= most:
-                raise InputError(
-                    f"drag.angular: expected at most {most:.4g} N m s, half the least inertia over "
-                    f"the physics step, got {stiffest:.4g}"
-                )
+            turning = vehicle.mass / _least_moment(vehicle)
+            slope = turning * max(self._angular or _NOTHING)
+            _check_stiffness(vehicle, slope, "drag.angular, times mass over inertia,")
         if options.rotor_drag:
             (coefficient,) = coefficients.need("rotors.thrust_coefficient", "rotor_drag")
             self._slope = math.sqrt(coefficient)  # of the square root of a thrust over the speed

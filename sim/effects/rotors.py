@@ -27,6 +27,7 @@ class RotorEffects(Kept):
     and V solves both equations. An empty battery stays at its empty voltage.
 
     Attributes:
+        names: Of the drawn factors of each rotor's thrust.
         charge: Of the battery, share, shape (W, A).
         voltage: At its terminals, V, shape (W, A).
     """
@@ -73,7 +74,7 @@ class RotorEffects(Kept):
             raise InputError(
                 f"effects: efficiency: expected {count} numbers, one for each rotor, got {share}"
             )
-        self._rotors = [f"thrust_{number}" for number in range(1, count + 1)]
+        self.names = [f"thrust_{number}" for number in range(1, count + 1)]
         self._roots: Array = None  # of the thrusts, proportional to the rotors' speeds
         self.charge: Array = None
         self.voltage: Array = None
@@ -98,8 +99,8 @@ class RotorEffects(Kept):
             self._scales.append(np.array(options.efficiency))
         if "thrust" in factors:
             self._scales.append(each(factors["thrust"]))
-        if factors.keys() & set(self._rotors):
-            self._scales.append(stack([factors.get(name, 1.0) for name in self._rotors]))
+        if factors.keys() & set(self.names):
+            self._scales.append(stack([factors.get(name, 1.0) for name in self.names]))
         if options.motor_lag:
             scale = each(factors.get("time_constant", 1.0))
             self._answers = [self._answer(time * scale) for time in self._times]
