@@ -2,10 +2,11 @@
 
 from collections.abc import Mapping, Sequence
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from .. import models
 from ..models import BACKENDS, MAX_DRONES, Backend
 from ..models.errors import InputError, NotCopied
 from ..models.fields import Choice, Flag, Limits, OrNone, Rule, check
@@ -14,9 +15,6 @@ from .random import RANDOMIZATION, START, Draw, Random
 from .randomize import Randomization
 from .snapshots import Arrays, Snapshot, joined, part_of
 from .state import Array, ByName, InitialState, WorldState, plain
-
-if TYPE_CHECKING:
-    from ..models.vehicle import Vehicle
 
 _CLASSES = {"mujoco": "MujocoWorld", "rigid": "RigidWorld"}
 """Backends by name: a class in the module of that name in `backends`."""
@@ -55,7 +53,7 @@ class World(NotCopied):
 
     def __init__(
         self,
-        vehicle: "Vehicle",
+        vehicle: "models.Vehicle",
         shape: tuple[int, ...],
         effects: EffectOptions | None,
         randomize: Randomization | None,
@@ -171,7 +169,7 @@ class World(NotCopied):
 
 
 def check_world(
-    vehicle: "Vehicle",
+    vehicle: "models.Vehicle",
     backend: Backend,
     drones: int,
     effects: EffectOptions | None,
@@ -207,7 +205,7 @@ def check_world(
 
 
 def make_world(
-    vehicle: "Vehicle",
+    vehicle: "models.Vehicle",
     num_worlds: int,
     backend: Backend = "mujoco",
     *,

@@ -6,6 +6,7 @@ of threads.
 
 import copy
 import os
+from collections.abc import Mapping, Sequence
 
 import mujoco
 import numpy as np
@@ -14,14 +15,20 @@ from mujoco.batch import Batch, SimulationError
 from ...models.errors import InputError
 from ...models.fleet import members_of
 from ...models.swarm import CONTACTS, GROUNDED, contact_columns, swarm_model
-from ...models.vehicle import SURROUNDINGS, Vehicle, payload_radius
+from ...models.vehicle import (
+    SURROUNDINGS,
+    Vehicle,
+    body_axes,
+    owners,
+    payload_body,
+    payload_radius,
+)
 from ..effects import EffectOptions, Effects
 from ..randomize import CENTER, Randomization
 from ..rotations import body_z
 from ..snapshots import Arrays
-from ..state import Array, ByName, InitialState, WorldState
+from ..state import Array, ByName, InitialState, WorldState, stack
 from ..world import PhysicsError, World
-from .world_parameters import WorldParameters
 
 _FEW = 8
 _SEEN = np.array(SURROUNDINGS, np.uint8)
@@ -29,6 +36,15 @@ _VIEWS = (
     "_batch _ctrl _command _thrust _applied _contacts _counts _warnings _varied _qacc _warmstart"
 )
 """Attributes that hold the simulator's memory."""
+
+_FIELDS = {
+    "mass": ("body_mass", "body_inertia", "dof_damping"),  # Unity's drag goes with the mass
+    "inertia": ("body_inertia",),
+    "payload": ("body_mass", "body_inertia"),
+    "reaction": ("actuator_gear",),
+    **dict.fromkeys(CENTER, ("body_ipos",)),
+}
+"""Fields of a model that a drawn parameter changes."""
 
 
 class MujocoWorld(World):
@@ -316,3 +332,51 @@ def _views(
     load = rows[:, None, crafts : crafts + 3]
     shared = np.broadcast_to(load, (len(rows), drones, load.shape[-1]))
     return rows[:, :crafts].reshape(*lead, size), shared.reshape(*lead, -1)
+
+
+class WorldParameters:
+    """Fields of a model that differ between worlds, for drawn parameters.
+
+    Attributes:
+        base: Their values in the model by name; empty if nothing that is drawn is of the model.
+    """
+
+    def __init__(self, model: mujoco.MjModel, drawn: Sequence[str]) -> None:
+        fields = dict.fromkeys(field for name in drawn for field in _FIELDS.get(name, ()))
+        self.base = {field: getattr(model, field).copy() for field in fields}
+        owner = owners(model)
+        self._craft = owner >= 0
+        self._hung = np.zeros(model.nbody, bool)
+        if "payload" in drawn:
+            self._hung[payload_body(model)] = True
+        # Of each craft the first of six degrees of freedom are those of its translation.
+        self._linear = self._craft[model.dof_bodyid] & (np.arange(model.nv) % 6 < 3)
+        self._torque = np.arange(6) >= 3  # of a gear
+        self._axes = body_axes(model) * self._craft[:, None, None]
+        of_sites = owner[model.site_bodyid[model.actuator_trnid[:, 0]]]
+        self._of_bodies, self._of_dofs, self._of_rotors = (
+            np.maximum(one, 0) for one in (owner, owner[model.dof_bodyid], of_sites)
+        )
+
+    def values(self, parameters: Mapping[str, Array]) -> ByName:
+        """The fields by name, each (N, ...), of N worlds with these parameters, each (N, A)."""
+        where = np.where
+        ones = 1.0 + 0.0 * next(iter(parameters.values()))
+        mass = parameters.get("mass", ones)
+        inertia = mass * parameters.get("inertia", ones)
+        loads = where(self._hung, parameters.get("payload", ones)[:, :1], 1.0)
+        reaction = parameters.get("reaction", ones)[:, self._of_rotors, None]
+        factors = {
+            "body_mass": where(self._craft, mass[:, self._of_bodies], loads),
+            "body_inertia": where(self._craft, inertia[:, self._of_bodies], loads)[..., None],
+            "dof_damping": where(self._linear, mass[:, self._of_dofs], 1.0),
+            "actuator_gear": where(self._torque, reaction, 1.0),
+        }
+        values = {
+            field: factors[field] * base for field, base in self.base.items() if field in factors
+        }
+        if "body_ipos" in self.base:
+            shift = stack([parameters.get(name, 0.0 * ones) for name in CENTER])
+            moved = np.einsum("bji,wbj->wbi", self._axes, shift[:, self._of_bodies])
+            values["body_ipos"] = self.base["body_ipos"] + moved
+        return values

@@ -5,19 +5,17 @@ within bounds, or is one of some choices.
 """
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Final, Protocol, cast
+from typing import Any, Final, Protocol, cast
 
 import numpy as np
 
+from ... import models
 from ...models.errors import InputError, shortened
 from ..effects import EffectOptions
 from ..state import Array, WorldState
 from .cascade import Attitude, Position, Rates, Velocity
 from .gains import Gains, shared_ranges
 from .thrusts import CollectiveThrust, RotorThrust
-
-if TYPE_CHECKING:
-    from ...models.vehicle import Vehicle
 
 __all__ = [
     "LEVELS", "SHARES", "CollectiveThrust", "Controller", "Gains", "RotorThrust", "make_controller",
@@ -85,7 +83,7 @@ class MixedController:
 
 
 def make_controller(
-    level: str, vehicle: "Vehicle", period: float, effects: EffectOptions | None = None
+    level: str, vehicle: "models.Vehicle", period: float, effects: EffectOptions | None = None
 ) -> Controller:
     """The controller of one of `LEVELS`.
 
@@ -112,14 +110,14 @@ def make_controller(
     return cast(Controller, mixed)
 
 
-def _lag(vehicle: "Vehicle", effects: EffectOptions) -> float:
+def _lag(vehicle: "models.Vehicle", effects: EffectOptions) -> float:
     """Longest time constant of the rotors, s; 0 where they follow at once."""
     names = ("rotors.time_constant", "rotors.time_constant_down")
     times = [vehicle.coefficients[name] or 0.0 for name in names]
     return max(times) if effects.motor_lag else 0.0
 
 
-def _of_thrusts(level: str, vehicle: "Vehicle") -> Controller:
+def _of_thrusts(level: str, vehicle: "models.Vehicle") -> Controller:
     if level == "rotors":
         return RotorThrust(vehicle)
     newtons = SHARES[level] * float(vehicle.thrust_high.max())

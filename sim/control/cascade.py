@@ -18,18 +18,15 @@ Array code with any leading axes; of a single drone the numbers are Python's.
 
 import math
 from functools import reduce
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ... import models
 from ..effects import EffectOptions
 from ..effects.rotors import polynomial
 from ..rotations import Parts, Rows, dot, matrix, parts_of, times, transposed
 from ..state import Array, WorldState, clip, plain, square_root, stack
-
-if TYPE_CHECKING:
-    from ...models.vehicle import Vehicle
-    from .gains import Gains
+from .gains import Gains
 
 _ASIDE = 1e-3  # Upside down every way to turn is as short: it is about x
 _TINY = 1e-12  # Added to squares under a root, whose slope at 0 is infinite
@@ -52,7 +49,7 @@ class Rates:
     units: tuple[str, ...] = ("1", "rad/s", "rad/s", "rad/s")
     frame = "body"
 
-    def __init__(self, vehicle: "Vehicle", gains: "Gains", effects: EffectOptions) -> None:
+    def __init__(self, vehicle: "models.Vehicle", gains: Gains, effects: EffectOptions) -> None:
         self.gains = gains
         self._sizes = self.sizes(gains)
         self.constants: dict[str, float | tuple[float, ...]] = {"action_scale": self._sizes}
@@ -71,7 +68,7 @@ class Rates:
             thrust = np.maximum.accumulate(polynomial(curve, throttle))
             self._throttle = thrust, throttle
 
-    def sizes(self, gains: "Gains") -> tuple[float, ...]:
+    def sizes(self, gains: Gains) -> tuple[float, ...]:
         """Values of actions of 1; that of a collective thrust is 1, which is its limit."""
         return (1.0, *gains.most_rate)
 
@@ -145,7 +142,7 @@ class Attitude(Rates):
     units = ("1", "rad", "rad", "rad/s")
     frame = "world turned by the heading"
 
-    def sizes(self, gains: "Gains") -> tuple[float, ...]:
+    def sizes(self, gains: Gains) -> tuple[float, ...]:
         return 1.0, gains.most_tilt, gains.most_tilt, gains.most_rate[2]
 
     def thrust(self, action: Array, state: WorldState) -> Array:
@@ -184,7 +181,7 @@ class Velocity(Attitude):
     components = ("velocity x", "velocity y", "velocity z", "yaw rate")
     units = ("m/s", "m/s", "m/s", "rad/s")
 
-    def sizes(self, gains: "Gains") -> tuple[float, ...]:
+    def sizes(self, gains: Gains) -> tuple[float, ...]:
         level, up = gains.most_velocity
         return level, level, up, gains.most_rate[2]
 
@@ -223,11 +220,11 @@ class Position(Velocity):
     components = ("offset x", "offset y", "offset z", "offset of the heading")
     units = ("m", "m", "m", "rad")
 
-    def __init__(self, vehicle: "Vehicle", gains: "Gains", effects: EffectOptions) -> None:
+    def __init__(self, vehicle: "models.Vehicle", gains: Gains, effects: EffectOptions) -> None:
         super().__init__(vehicle, gains, effects)
         self.constants["position_gain"] = gains.position
 
-    def sizes(self, gains: "Gains") -> tuple[float, ...]:
+    def sizes(self, gains: Gains) -> tuple[float, ...]:
         level, up = gains.most_offset
         return level, level, up, math.pi
 

@@ -22,14 +22,12 @@ Yaw has a p of its own, by the same rule from its own α.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
 
+from ... import models
 from ...models.errors import InputError
-
-if TYPE_CHECKING:
-    from ...models.vehicle import Vehicle
 
 LEAD = 3.0
 """Rotors are driven to follow this many times faster than their own lag."""
@@ -81,7 +79,7 @@ class Gains:
     """Of each rotor, of the collective thrust, at hover."""
 
     @classmethod
-    def of(cls, vehicle: "Vehicle", period: float, lag: float = 0.0) -> Self:
+    def of(cls, vehicle: "models.Vehicle", period: float, lag: float = 0.0) -> Self:
         """Gains of a vehicle. Raises `InputError` if its rotors cannot roll, pitch and yaw it.
 
         `period` is the time between two looks at the state, s, and `lag` the time constant of the

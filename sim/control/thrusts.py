@@ -1,11 +1,9 @@
 """Controllers whose actions are thrusts: of all rotors alike, or of each."""
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from ... import models
 from ..state import Array, WorldState, clip, component, stack
-
-if TYPE_CHECKING:
-    from ...models.vehicle import Vehicle
 
 
 class CollectiveThrust:
@@ -19,7 +17,7 @@ class CollectiveThrust:
     """
 
     def __init__(
-        self, vehicle: "Vehicle", newtons: float, *, increment: bool, discrete: bool = False
+        self, vehicle: "models.Vehicle", newtons: float, *, increment: bool, discrete: bool = False
     ) -> None:
         self.low: tuple[float, ...] = (-1.0,)
         self.high: tuple[float, ...] = (1.0,)
@@ -55,7 +53,7 @@ class CollectiveThrust:
 class RotorThrust:
     """One number for each rotor: 0 is its thrust at hover, -1 its least and 1 its largest."""
 
-    def __init__(self, vehicle: "Vehicle") -> None:
+    def __init__(self, vehicle: "models.Vehicle") -> None:
         self.low = (-1.0,) * vehicle.num_rotors
         self.high = (1.0,) * vehicle.num_rotors
         self.components = tuple(f"F{i + 1}" for i in range(vehicle.num_rotors))

@@ -11,8 +11,8 @@ the same bits alone and in a batch.
 """
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
+from ... import models
 from ...models.errors import InputError
 from ..random import GUSTS, Noise
 from ..rotations import Parts, add
@@ -23,9 +23,6 @@ from .downwash import Downwash
 from .gusts import NUMBERS, Gusts
 from .options import EffectOptions
 from .rotors import RotorEffects
-
-if TYPE_CHECKING:
-    from ...models.vehicle import Vehicle
 
 __all__ = ["EffectOptions", "Effects"]
 
@@ -42,7 +39,7 @@ class Effects(Kept):
 
     def __init__(
         self,
-        vehicle: "Vehicle",
+        vehicle: "models.Vehicle",
         options: EffectOptions,
         noise: Callable[[str, int], Noise],
         drawn: tuple[str, ...] = (),

@@ -2,19 +2,16 @@
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ... import models
 from ...models.errors import InputError
 from ..rotations import Parts, Rows, add, cross, dot, matrix, parts_of, product, times, transposed
 from ..snapshots import Kept
 from ..state import Array, ByName, WorldState, clip, component, each, kept, square_root, stack
 from .options import EffectOptions
 from .rotors import total
-
-if TYPE_CHECKING:
-    from ...models.vehicle import Vehicle
 
 LEAST_HEIGHT = 0.5
 """Height of a rotor over the ground, in radii, below which the ground effect grows no further: our
@@ -39,7 +36,7 @@ class AirEffects(Kept):
 
     lists = ("_before",)
 
-    def __init__(self, vehicle: "Vehicle", options: EffectOptions) -> None:
+    def __init__(self, vehicle: "models.Vehicle", options: EffectOptions) -> None:
         self._options = options
         self._half = 0.5 * vehicle.timestep
         coefficients = vehicle.coefficients
@@ -199,12 +196,12 @@ class AirEffects(Kept):
         return push[0] + up * axis[0], push[1] + up * axis[1], push[2] + up * axis[2]
 
 
-def _least_moment(vehicle: "Vehicle") -> float:
+def _least_moment(vehicle: "models.Vehicle") -> float:
     """Least principal moment of inertia, kg·m²."""
     return float(np.linalg.eigvalsh(vehicle.inertia)[0])
 
 
-def _check_stiffness(vehicle: "Vehicle", slope: float, what: str) -> None:
+def _check_stiffness(vehicle: "models.Vehicle", slope: float, what: str) -> None:
     """Refuse drag that the extrapolation over a physics step cannot follow."""
     most = 0.5 * vehicle.mass / vehicle.timestep
     if not slope <= most:

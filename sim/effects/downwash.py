@@ -6,16 +6,13 @@ Automation Letters 2025, arXiv 2403.13321, measured below hovering drones of sev
 """
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ... import models
 from ...models.errors import InputError
 from ..rotations import body_z
 from ..state import Array, WorldState
-
-if TYPE_CHECKING:
-    from ...models.vehicle import Vehicle
 
 DECAY = 10.11
 """B_d: velocity on the axis over that at the rotors in hover, times the distance from the jet's
@@ -46,7 +43,7 @@ class Downwash:
     a vehicle without `rotors.radius`, or with a single rotor, which has no length.
     """
 
-    def __init__(self, vehicle: "Vehicle") -> None:
+    def __init__(self, vehicle: "models.Vehicle") -> None:
         (radius,) = vehicle.coefficients.need("rotors.radius", "downwash")
         places = np.array([rotor.position for rotor in vehicle.rotors])
         self.length = float(np.linalg.norm(places[:, None] - places, axis=-1).max())

@@ -1,16 +1,12 @@
 """From the command of a rotor to its thrust: throttle, curve, battery, lag, efficiency."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
+from ... import models
 from ...models.errors import InputError
 from ..snapshots import Kept
 from ..state import Array, ByName, chosen, clip, component, each, plain, square_root, stack
 from .options import EffectOptions
-
-if TYPE_CHECKING:
-    from ...models.vehicle import Vehicle
 
 
 class RotorEffects(Kept):
@@ -34,7 +30,7 @@ class RotorEffects(Kept):
 
     arrays = ("charge", "voltage", "_roots")
 
-    def __init__(self, vehicle: "Vehicle", options: EffectOptions) -> None:
+    def __init__(self, vehicle: "models.Vehicle", options: EffectOptions) -> None:
         self._options = options
         self._step = vehicle.timestep
         coefficients = vehicle.coefficients

@@ -8,8 +8,9 @@ World frame: x east, y north, z up. Arrays have the leading axes of the world, n
 """
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
+from ... import models
 from ...models.errors import InputError, shortened
 from ...models.fields import Choice, Flag, check, check_names
 from ..snapshots import Kept
@@ -20,9 +21,6 @@ from .base import Sensor, Source, Values
 from .estimator import Estimator
 from .imu import Imu
 from .simple import FIELD, Gps, Magnetometer, MotionCapture, Rangefinder
-
-if TYPE_CHECKING:
-    from ...models.vehicle import Vehicle
 
 __all__ = ["SENSOR_TYPES", "Estimator", "Sensors", "checked_sensors", "readings_of"]
 
@@ -68,7 +66,9 @@ def checked_sensors(given: object) -> dict[str, Any]:
     return sensors
 
 
-def _resolved(sensors: Values, vehicle: "Vehicle", period: float) -> dict[str, dict[str, Any]]:
+def _resolved(
+    sensors: Values, vehicle: "models.Vehicle", period: float
+) -> dict[str, dict[str, Any]]:
     """All settings by sensor."""
     return {
         name: kind.resolved(sensors[name], vehicle, period)
@@ -77,7 +77,7 @@ def _resolved(sensors: Values, vehicle: "Vehicle", period: float) -> dict[str, d
     }
 
 
-def readings_of(sensors: Values, vehicle: "Vehicle", period: float) -> list[dict[str, Any]]:
+def readings_of(sensors: Values, vehicle: "models.Vehicle", period: float) -> list[dict[str, Any]]:
     """Fields of the `ArraySpec` of each array that sensors add to an observation.
 
     From `checked_sensors`. Raises `InputError`.

@@ -3,19 +3,17 @@
 import math
 from collections.abc import Mapping
 from statistics import NormalDist
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from ... import models
 from ...models.coefficients import COEFFICIENTS
 from ...models.errors import InputError
 from ...models.fields import Limits, check, check_names
 from ..snapshots import Kept
 from ..state import Array, chosen, clip, component, kept
 from ..world import World
-
-if TYPE_CHECKING:
-    from ...models.vehicle import Vehicle
 
 FURTHEST = 1e5  # Largest coordinate of a reading, m
 MAX_SPEED = 1e3  # Largest speed of a reading along an axis, m/s
@@ -129,7 +127,7 @@ class Sensor(Source):
         return values
 
     @classmethod
-    def resolved(cls, given: Values, vehicle: "Vehicle", period: float) -> dict[str, Any]:
+    def resolved(cls, given: Values, vehicle: "models.Vehicle", period: float) -> dict[str, Any]:
         """All settings: those given, else those of the vehicle, else the defaults.
 
         With `every` and `lag`, control steps between readings and of the delay.
