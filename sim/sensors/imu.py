@@ -18,7 +18,7 @@ ACCELEROMETER_RANGE = 24 * 9.80665  # m/s²: the same
 class Imu(Sensor):
     """Gyroscope and accelerometer at the body's origin.
 
-    reading = (1 + scale) · exact + bias + white noise, for each axis. White noise of density N read
+    reading = exact + bias + white noise, for each axis. White noise of density N read
     every T has σ = N / √T; the bias walks by K √T between readings. (IEEE Std 952-1997, annex C.)
     The exact specific force is R^T (a - g), with the attitude R and the acceleration a at the end
     of the control step, under the thrusts and the forces of the air of its last physics step.
@@ -26,16 +26,14 @@ class Imu(Sensor):
 
     name = "imu"
     prefix = ""
-    arrays = (*Sensor.arrays, "_bias", "_scale")
+    arrays = (*Sensor.arrays, "_bias")
     needs = ("gyro_noise", "accelerometer_noise")
     defaults: ClassVar = {
         "gyro_walk": 0.0,
         "gyro_bias": 0.0,
-        "gyro_scale": 0.0,
         "gyro_range": GYRO_RANGE,
         "accelerometer_walk": 0.0,
         "accelerometer_bias": 0.0,
-        "accelerometer_scale": 0.0,
         "accelerometer_range": ACCELEROMETER_RANGE,
     }
     columns = 12
@@ -48,7 +46,6 @@ class Imu(Sensor):
         self._white = self._both("noise") / math.sqrt(self.interval)
         self._step = self._both("walk") * math.sqrt(self.interval)
         self._bias: Array = 0.0
-        self._scale: Array = 0.0
 
     def _both(self, what: str) -> NDArray[np.float64]:
         return np.repeat([self.values[f"gyro_{what}"], self.values[f"accelerometer_{what}"]], 3)
@@ -59,15 +56,14 @@ class Imu(Sensor):
         return tuple(-bound for bound in high), high
 
     def draw(self, mask: Array, normal: Array) -> None:
-        """Bias and error of scale."""
+        """The bias."""
         self._bias = chosen(mask, self._both("bias") * normal[..., :6], self._bias)
-        self._scale = chosen(mask, self._both("scale") * normal[..., 6:], self._scale)
 
     def measure(self, normal: Array) -> Array:
         state = self.world.state
         gravity = np.array((0.0, 0.0, self.world.vehicle.gravity))
         force = to_body(state.quaternion, self.world.acceleration() + gravity)
         exact = np.concat((state.body_rates, force), axis=-1)
-        reading = (1 + self._scale) * exact + self._bias + self._white * normal[..., :6]
+        reading = exact + self._bias + self._white * normal[..., :6]
         self._bias = self._bias + self._step * normal[..., 6:]
         return reading

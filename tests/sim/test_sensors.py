@@ -141,12 +141,12 @@ def test_imu_within_its_range() -> None:
     assert observed.high == (2.0, 2.0, 2.0, 5.0, 5.0, 5.0)
 
 
-def test_imu_bias_and_scale() -> None:
+def test_imu_bias() -> None:
     """Drawn for each axis of each drone when an episode begins, and kept."""
-    settings = IMU | {"gyro_bias": 0.1, "accelerometer_scale": 0.02}
+    settings = IMU | {"gyro_bias": 0.1, "accelerometer_bias": 0.02}
     _, sensors, every = sensing({"imu": settings}, 3000)
-    bias, scale = np.split(sensors.readings["imu"].reshape(-1, 6), 2, axis=1)
-    off = scale[:, 2] / 9.8 - 1
+    bias, force = np.split(sensors.readings["imu"].reshape(-1, 6), 2, axis=1)
+    off = force[:, 2] - 9.8
     assert bias.std() == approx(0.1, abs=4 * 0.1 / sqrt(2 * 9000))
     assert off.std() == approx(0.02, abs=4 * 0.02 / sqrt(2 * 3000))
     assert abs(bias.mean()) < 4 * 0.1 / sqrt(9000)
