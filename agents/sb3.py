@@ -1,6 +1,5 @@
 """Stable-Baselines3: its A2C, PPO and SAC as references, and vector envs as it wants them."""
 
-from collections.abc import Callable
 from typing import Any, Final, NoReturn
 
 import numpy as np
@@ -21,7 +20,6 @@ from .rollouts import Diverged
 try:
     import stable_baselines3 as sb3
     import torch
-    from stable_baselines3.common import callbacks as sb3_callbacks
     from stable_baselines3.common import logger as sb3_logger
     from stable_baselines3.common import vec_env as sb3_vec
     from stable_baselines3.common.vec_env.base_vec_env import (
@@ -158,7 +156,7 @@ class SB3Agent:
             raise InputError(f"network: expected mlp with SB3, got {config.network!r}")
         self.spec = log.spec
         self._config = config
-        self._ahead = 0.0
+        self._rate = config.learning_rate
         self._rollout = config.rollout_size(log.num_envs)
         torch.set_num_threads(1)  # such small nets lose by a second thread
         steps = self._rollout // log.num_envs
@@ -172,51 +170,61 @@ class SB3Agent:
             settings = _on_policy_settings(config, steps, log)
             optimizer = {"eps": _EPSILONS[type(config)], "foreach": True}
             policy |= {"log_std_init": config.log_std, "optimizer_kwargs": optimizer}
+
+        def rate(_: float) -> float:
+            return self._rate
+
         self.model = _MODELS[type(config)](
             "MlpPolicy",
             SB3VecEnv(RecordedEnv(log)),
-            learning_rate=self._learning_rate,
+            learning_rate=rate,
             gamma=config.gamma,
             policy_kwargs=policy,
             seed=seeds_of(seed)[0] % 2**32,
             device="cpu",
             **settings,
         )
-        if isinstance(config, PPOConfig):
-            self.model.set_rates(config)
+        if isinstance(config, PPOConfig) and config.critic_learning_rate:
+            self._set_rate_of_critic(config.critic_learning_rate / config.learning_rate)
         # It keeps the numbers of the last update for us; SB3's own makes a folder in /tmp.
         self.model.set_logger(sb3_logger.Logger(folder=None, output_formats=[]))
 
     def train(self, log: EpisodeRecorder, env_steps: int, on_update: OnUpdate) -> None:
         """As `Learner.train`. SB3 flies whole rollouts only: a last part of one is not flown."""
         whole = env_steps // self._rollout * self._rollout
-        if not whole:
-            return
-        self._ahead = self._rollout / whole
-
-        def after_update() -> None:
-            self._check_finite()
+        for flown in range(self._rollout, whole + 1, self._rollout):
+            if self._config.anneal:
+                left = 1.0 - flown / whole + self._rollout / whole  # before the rollout
+                self._rate = self._config.learning_rate * min(left, 1.0)
+            try:
+                self.model.learn(self._rollout, reset_num_timesteps=False)
+            finally:  # a policy that gives NaN raises ValueError in torch
+                self._check_finite()
             if not on_update():
-                raise _Stopped
+                return
 
-        try:
-            self.model.learn(whole, callback=_AfterUpdates(after_update))
-        except _Stopped:
-            pass
-        except ValueError:  # torch's, of a policy that gives NaN
-            self._check_finite()
-            raise
+    def _set_rate_of_critic(self, share: float) -> None:
+        """Let the critic learn at so many times the rate of the actor."""
+        policy = self.model.policy
+        actor: list[torch.nn.Parameter] = []
+        critic: list[torch.nn.Parameter] = []
+        for name, parameter in policy.named_parameters():
+            group = critic if "value_net." in name else actor
+            group.append(parameter)
+        parts = [{"params": actor}, {"params": critic}]
+        policy.optimizer = torch.optim.Adam(parts, **policy.optimizer_kwargs)
+
+        def scale(optimizer: torch.optim.Optimizer, *_: object) -> None:
+            of_actor, of_critic = optimizer.param_groups
+            of_critic["lr"] = of_actor["lr"] * share
+
+        policy.optimizer.register_step_pre_hook(scale)
 
     def _check_finite(self) -> None:
         parameters = self.model.policy.parameters()
-        if not all(bool(torch.isfinite(parameter).all()) for parameter in parameters):
+        if not torch.nn.utils.parameters_to_vector(parameters).isfinite().all():
             updates = int(self.scalars().get("train/n_updates", 1))
             raise Diverged(f"weights are not finite after update {updates}")
-
-    def _learning_rate(self, left: float) -> float:
-        # SB3 counts what is left after the rollout; ours, and so here, before it.
-        share = min(left + self._ahead, 1.0) if self._config.anneal else 1.0
-        return self._config.learning_rate * share
 
     def actor(self) -> ByName:
         """Weights of the policy, under our names."""
@@ -251,53 +259,7 @@ class SB3Agent:
         return {name: float(value) for name, value in kept.items() if name.startswith("train/")}
 
 
-class _Stopped(Exception):
-    """Ends SB3's loop between an update and the next rollout."""
-
-
-class _AfterUpdates(sb3_callbacks.BaseCallback):
-    """Calls a function between an update and the next rollout."""
-
-    def __init__(self, after_update: Callable[[], None]) -> None:
-        super().__init__()
-        self._after_update = after_update
-
-    def _on_step(self) -> bool:
-        return True
-
-    def _on_rollout_start(self) -> None:
-        if self.num_timesteps:
-            self._after_update()
-
-    def _on_training_end(self) -> None:
-        self._after_update()
-
-
-class _PPO(sb3.PPO):
-    """With a learning rate of its own for the critic."""
-
-    critic_share = 1.0
-    """Learning rate of the critic over that of the actor."""
-
-    def set_rates(self, config: PPOConfig) -> None:
-        rate = config.learning_rate
-        self.critic_share = (config.critic_learning_rate or rate) / rate
-        actor: list[torch.nn.Parameter] = []
-        critic: list[torch.nn.Parameter] = []
-        for name, parameter in self.policy.named_parameters():
-            group = critic if "value_net." in name else actor
-            group.append(parameter)
-        settings = self.policy.optimizer_kwargs
-        parts = [{"params": actor}, {"params": critic}]
-        self.policy.optimizer = torch.optim.Adam(parts, **settings)
-
-    def _update_learning_rate(self, optimizers: Any) -> None:
-        super()._update_learning_rate(optimizers)
-        actor, critic = self.policy.optimizer.param_groups
-        critic["lr"] = actor["lr"] * self.critic_share
-
-
-_MODELS: Final[dict[type, Any]] = {A2CConfig: sb3.A2C, PPOConfig: _PPO, SACConfig: sb3.SAC}
+_MODELS: Final[dict[type, Any]] = {A2CConfig: sb3.A2C, PPOConfig: sb3.PPO, SACConfig: sb3.SAC}
 _EPSILONS: Final[dict[type, float]] = {A2CConfig: A2C.epsilon, PPOConfig: PPO.epsilon}
 
 
