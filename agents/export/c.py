@@ -51,8 +51,11 @@ def write(policy: NetworkPolicy, facts: Mapping[str, str]) -> bytes:
     parts = [
         "/* " + "\n * ".join(_about(policy.spec, facts)).replace(" * \n", " *\n") + "\n */",
         "#ifndef ROTORGRAM_POLICY_H\n#define ROTORGRAM_POLICY_H\n",
-        *_constants(policy, facts),
-        "",
+        "/* Lengths of the arrays below; numbers of the telemetry by the text codec. */",
+        f"#define ROTORGRAM_OBSERVATIONS {facts['inputs']}",
+        f"#define ROTORGRAM_ACTIONS {policy.actions.size}",
+        f"#define ROTORGRAM_TELEMETRY {sum(map(_text_size, policy.spec.telemetry))}",
+        f"#define ROTORGRAM_CONTROL_PERIOD {facts['control_period']}\n",
     ]
     for name, values in program.tables.items():
         numbers = _table(values)
@@ -65,7 +68,6 @@ def write(policy: NetworkPolicy, facts: Mapping[str, str]) -> bytes:
         f"static inline void rotorgram_policy(const float observation[{facts['inputs']}],",
         f"                                    float action[{policy.actions.size}])",
         "{",
-        *(f"    float {name}[{length}];" for name, length in sorted(program.buffers.items())),
         *(f"    {line}" for line in program.lines),
         "}\n",
         "#endif\n",
@@ -74,7 +76,7 @@ def write(policy: NetworkPolicy, facts: Mapping[str, str]) -> bytes:
 
 
 class _Program:
-    """Statements, and the tables and buffers that they use, of the layers of a policy.
+    """Statements, and the tables that they use, of the layers of a policy.
 
     Attributes:
         at: Name of the array with the numbers so far, `size` of them.
@@ -82,7 +84,6 @@ class _Program:
 
     def __init__(self, policy: NetworkPolicy) -> None:
         self.tables: dict[str, Floats] = {}
-        self.buffers: dict[str, int] = {}
         self.lines: list[str] = []
         self.at = "observation"
         self.size = flat_size(policy.spec)
@@ -102,25 +103,19 @@ class _Program:
         self.tables[name] = values
         return f"rotorgram_{name}"
 
-    def _move(self, size: int) -> tuple[str, str]:
-        """Names of the array so far and of the next one, of this size."""
-        before = self.at
-        self.at = "b" if before == "a" else "a"
-        self.buffers[self.at] = max(size, self.buffers.get(self.at, 0))
-        return before, self.at
-
     def _each(self, statement: str) -> None:
         """A loop over the numbers so far."""
         self.lines += [f"for (int i = 0; i < {self.size}; i++)", f"    {statement}"]
 
     def _affine(self, layer: Affine) -> None:
-        units, count = layer.weight.shape
-        number = sum(name.startswith("weight_") for name in self.tables)
+        units, inputs = layer.weight.shape
+        number = len(self.tables) // 2
         weight = self._table(f"weight_{number}", layer.weight)
         bias = self._table(f"bias_{number}", layer.bias)
-        inputs, outputs = self._move(units)
-        arguments = f"{weight}, {bias}, {inputs}, {count}, {outputs}, {units}"
-        self.lines.append(f"rotorgram_layer({arguments});")
+        outputs = f"x{number}"
+        arguments = f"{weight}, {bias}, {self.at}, {inputs}, {outputs}, {units}"
+        self.lines += [f"float {outputs}[{units}];", f"rotorgram_layer({arguments});"]
+        self.at = outputs
         self.size = units
 
     def _choose(self) -> None:
@@ -209,33 +204,6 @@ def _described(arrays: Iterable[ArraySpec], scale: np.ndarray) -> Iterator[str]:
             number += 1
 
 
-def _constants(policy: NetworkPolicy, facts: Mapping[str, str]) -> Iterator[str]:
-    """Macros: they take no memory where they are not used."""
-    spec, action = policy.spec, policy.spec.action
-    numbers = {
-        "format": facts["format"],
-        "observations": facts["inputs"],
-        "actions": policy.actions.size,
-        "telemetry": sum(map(_text_size, spec.telemetry)),
-        "control_period": f"{spec.control_period!r}",
-        "seed": facts["seed"],
-        "env_steps": facts["env_steps"],
-    } | ({"choices": action.n} if isinstance(action, Discrete) else {})
-    for name, number in numbers.items():
-        yield f"#define ROTORGRAM_{name.upper()} {number}"
-    for name in ("algorithm", "env_id", "options", "vehicle", "vehicle_hash"):
-        yield f"#define ROTORGRAM_{name.upper()} {_text(facts[name])}"
-    for name, value in spec.constants.items():
-        listed = "{ " + ", ".join(map(repr, value)) + " }" if isinstance(value, tuple) else value
-        yield f"#define ROTORGRAM_CONSTANT_{name.upper()} {listed}"
-
-
 def _text_size(array: ArraySpec) -> int:
     """Numbers of an array of telemetry by the text codec, which has three angles of a rotation."""
     return 3 if array.frame == BODY_TO_WORLD else array.size
-
-
-def _text(text: str) -> str:
-    """A literal, in UTF-8. `?` is escaped because of trigraphs; octal escapes have three digits."""
-    plain = {c: chr(c) for c in range(32, 127)} | {c: f"\\{chr(c)}" for c in b'"\\?'}
-    return '"' + "".join(plain.get(c, f"\\{c:03o}") for c in text.encode()) + '"'
