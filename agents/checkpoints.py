@@ -23,7 +23,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from ..envs.config import EnvConfig
-from ..envs.spec import EnvSpec, canonical_id
+from ..envs.spec import EnvSpec
 from ..models import Backend
 from ..models.errors import InputError, one_line, require, shortened
 from ..models.fields import Limits, check_fields
@@ -182,8 +182,6 @@ def _read(data: bytes, parse: Callable[[bytes], ByName]) -> Checkpoint:
         raise InputError(f"expected a checkpoint of format {FORMAT}, got {found_format}")
     spec = EnvSpec.from_json(content["spec"])
     env = EnvConfig.from_dict(content["env"]) if content["env"] else None
-    if env and env.env_id != canonical_id(spec.env_id):
-        raise InputError(f"expected the config of {spec.env_id}, got that of {env.env_id}")
     arrays = parse(data)
     for name in _not_finite(arrays):
         raise InputError(f"expected finite numbers, got NaN or infinity in {name}")

@@ -97,7 +97,6 @@ class EpisodeRecorder:
         out: Drones that wait for their next episode: bool, shape (N,).
         done: Drones whose whole world is out: these are to begin.
         episodes: Ended episodes, in the order of their ends.
-        drawn: For each that ended since the recorder was made, what was drawn for it, by name.
     """
 
     def __init__(self, env: AdvancingVectorEnv, seed: int, *, keep_steps: bool = False) -> None:
@@ -108,7 +107,6 @@ class EpisodeRecorder:
         self.run_seed = seed
         self.env_steps = 0
         self.episodes: list[Episode] = []
-        self.drawn: dict[int, dict[str, float]] = {}
         self.out: Mask = np.zeros(count, bool)
         self.done: Mask = self.out
         self._together = len(self.spec.agents)
@@ -321,19 +319,16 @@ class EpisodeRecorder:
     def _keep_episode(self, drone: int) -> None:
         env = self.env
         length = int(self._lengths[drone])
-        episode = Episode(
-            episode=int(self._numbers[drone]),
-            first_step=int(self._first_steps[drone]),
-            length=length,
-            total_reward=float(self._rewards[drone]),
-            mean_size=float(self._sizes[drone]) / length,
-            terminated=bool(env.terminated[drone]),
-            truncated=bool(env.truncated[drone]),
-            seconds=self.seconds,
-            simulator_lost=bool(env.lost[drone]),
+        self.episodes.append(
+            Episode(
+                episode=int(self._numbers[drone]),
+                first_step=int(self._first_steps[drone]),
+                length=length,
+                total_reward=float(self._rewards[drone]),
+                mean_size=float(self._sizes[drone]) / length,
+                terminated=bool(env.terminated[drone]),
+                truncated=bool(env.truncated[drone]),
+                seconds=self.seconds,
+                simulator_lost=bool(env.lost[drone]),
+            )
         )
-        self.episodes.append(episode)
-        for array in self.spec.telemetry:
-            if array.name == "drawn":
-                values = env.telemetry["drawn"][drone].tolist()
-                self.drawn[episode.episode] = dict(zip(array.components, values, strict=True))

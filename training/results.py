@@ -75,7 +75,7 @@ COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
 }  # fmt: skip
 """Columns of each table.
 
-`evaluations` and `episodes` may have more, of what was drawn, and `runs` has `least_distance`, m,
+`evaluations` may have more, of what was drawn, and `runs` has `least_distance`, m,
 where a world has several drones.
 """
 

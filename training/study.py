@@ -211,11 +211,8 @@ def _episodes(training: Training) -> pd.DataFrame:
         last = min(episode.first_step + episode.length * run.num_envs, log.env_steps)
         content = asdict(episode)
         content |= {"return": content.pop("total_reward"), "last_step": last}
-        rows.append(content | log.drawn.get(episode.episode, {}))
-    names = list(results.COLUMNS["episodes"][2:])
-    first = rows[0] if rows else {}
-    drawn = [name for name in first if name not in names]
-    return pd.DataFrame(rows, columns=[*names, *drawn])
+        rows.append(content)
+    return pd.DataFrame(rows, columns=list(results.COLUMNS["episodes"][2:]))
 
 
 def _steps(phase: str, **columns: Any) -> pd.DataFrame:
