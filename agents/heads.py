@@ -1,27 +1,20 @@
 """Heads: from the outputs of a network to distributions of actions, and their derivatives."""
 
 import math
-from types import MappingProxyType
 
 import numpy as np
 
-from .networks import Floats, Shapes, Weights
+from .networks import Floats, Module, Weights
 
 _LOG_STD = np.array([-4.0, 1.0], np.float32)
 """Least and greatest logarithm of a standard deviation."""
 
 
-class Head:
+class Head(Module):
     """A distribution of actions (B, k), or (B, 1) of choices, by a network's outputs.
 
     This one has none: its policy flies the most likely action alone.
     """
-
-    shapes: Shapes = MappingProxyType({})
-    """Of its own weights, by name."""
-
-    def bind(self, weights: Weights) -> None:
-        """Compute with these arrays from now on."""
 
     def initialise(self, log_std: float) -> None:
         """Set the weights."""

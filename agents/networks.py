@@ -8,7 +8,7 @@ from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Final, Protocol, TypeVar
+from typing import Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,8 +81,8 @@ class Weights:
         return {name: flat[span].reshape(self.shapes[name]) for name, span in self._spans().items()}
 
 
-class Layer:
-    """A step of a network, from inputs (B, n) to outputs (B, k).
+class Module:
+    """What computes with weights.
 
     Attributes:
         shapes: Of its weights, by name.
@@ -91,7 +91,11 @@ class Layer:
     shapes: Shapes = MappingProxyType({})
 
     def bind(self, weights: Weights) -> None:
-        """Compute with these arrays from now on."""
+        """Compute with these arrays from now on; they have the shapes of `shapes`."""
+
+
+class Layer(Module):
+    """A step of a network, from inputs (B, n) to outputs (B, k)."""
 
     def initialise(self, rng: np.random.Generator, gain: float) -> None:
         """Draw the weights."""
@@ -169,15 +173,6 @@ class Tanh(Layer):
         return slope
 
 
-class Module(Protocol):
-    """What computes with weights."""
-
-    shapes: Shapes
-
-    def bind(self, weights: Weights) -> None:
-        """Compute with these arrays from now on; they have the shapes of `shapes`."""
-
-
 def shapes_of(modules: Mapping[str, Module]) -> Shapes:
     """Shapes of the weights of modules, each with a prefix to its names."""
     shapes: dict[str, tuple[int, ...]] = {}
@@ -192,7 +187,7 @@ def bind_parts(modules: Mapping[str, Module], weights: Weights) -> None:
         module.bind(weights.part(prefix))
 
 
-class Network:
+class Network(Module):
     """Layers in a row, from inputs (B, n) to outputs (B, k). Subclasses build them.
 
     Attributes:
@@ -211,7 +206,6 @@ class Network:
         """The layers, which allocate nothing yet."""
 
     def bind(self, weights: Weights) -> None:
-        """Compute with these arrays from now on; they have the shapes of `shapes`."""
         bind_parts(self._named, weights)
 
     def initialise(self, rng: np.random.Generator, gain: float) -> None:

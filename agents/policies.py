@@ -9,7 +9,7 @@ from ..envs.spec import ArraySpec, Discrete, EnvSpec
 from ..models.errors import InputError
 from .config import Config
 from .heads import Categorical, Gaussian, Head
-from .networks import Floats, Shapes, Tanh, Weights, make_network
+from .networks import Floats, Module, Tanh, Weights, make_network
 
 Observation = np.ndarray | Mapping[str, np.ndarray]
 """As an env gives it."""
@@ -94,7 +94,7 @@ class ActionMap:
         return clipped
 
 
-class NetworkPolicy:
+class NetworkPolicy(Module):
     """A network and a head: what learns, draws actions and flies.
 
     Where the learner binds it to its weights, it is the policy that learns; a copy of it does not.
@@ -114,7 +114,7 @@ class NetworkPolicy:
         self.head: Head = Head() if config.squashed else Gaussian(outputs)
         if self.actions.discrete:
             self.head = Categorical(outputs)
-        self.shapes: Shapes = {**self.network.shapes, **self.head.shapes}
+        self.shapes = {**self.network.shapes, **self.head.shapes}
         if config.squashed:
             self.network.layers.append(Tanh())
 
@@ -139,7 +139,6 @@ class NetworkPolicy:
         return policy
 
     def bind(self, weights: Weights) -> None:
-        """Compute with these arrays from now on; they have the shapes of `shapes`."""
         self.weights = weights
         self.network.bind(weights)
         self.head.bind(weights)
