@@ -1,6 +1,5 @@
 """Hyperparameters that all algorithms have."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
@@ -14,7 +13,7 @@ class Config:
     network: str = "mlp"
     """Kind of the networks: see `networks.NETWORKS`."""
     hidden: Annotated[tuple[int, ...], Limits(1, whole=True, count=0)] = (16,)
-    """Units of each hidden layer of each network (paper: one of 16). A number is one layer."""
+    """Units of each hidden layer of each network (paper: one of 16)."""
     activation: Literal["relu", "tanh"] = "relu"
     """Of the hidden units (paper: relu)."""
     learning_rate: Annotated[float, Limits(0.0, 1e30, above=True)] = 0.001
@@ -30,8 +29,6 @@ class Config:
     """Whether the policy bounds its output by tanh."""
 
     def __post_init__(self) -> None:
-        if not isinstance(self.hidden, Sequence):
-            object.__setattr__(self, "hidden", (self.hidden,))
         check_fields(self)
 
     def least_steps(self, drones: int, episode_length: int) -> int:

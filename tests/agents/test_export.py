@@ -275,6 +275,7 @@ def test_every_file_tells_what_it_is(trained: Path, tmp_path: Path) -> None:
     kept = load(trained / "checkpoint.safetensors")
     files = {target: exported(trained, target, tmp_path) for target in TARGETS}
     model = onnx.load(files["onnx"])
+    onnx.checker.check_model(model, full_check=True)
     told = {entry.key: entry.value for entry in model.metadata_props}
     (operators,) = model.opset_import
     assert operators.domain == ""

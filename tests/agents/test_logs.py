@@ -145,7 +145,7 @@ def fill(weights: Weights, value: float) -> None:
 
 
 def test_the_terms_of_vpg_by_hand() -> None:
-    agent = VPG(log_of(), VPGConfig(hidden=1, log_std=0.0), 0)
+    agent = VPG(log_of(), VPGConfig(hidden=(1,), log_std=0.0), 0)
     fill(agent.weights.part("actor."), 0.0)
     agent.gradient(TWO_STEPS)
     logged = agent.scalars()

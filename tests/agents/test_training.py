@@ -95,7 +95,7 @@ def test_what_cannot_be_resumed_is_refused() -> None:
     with pytest.raises(ResumeError, match=vehicles):
         Training.resume(kept, env_of(run, vehicle="crazyflie2"))
     unfit = "its parts do not fit together"
-    hidden = {**kept.config, "hidden": 8}
+    hidden = {**kept.config, "hidden": [8]}
     with pytest.raises(CheckpointError, match=unfit):
         Training.resume(replace(kept, config=hidden), env_of(run))
     with pytest.raises(CheckpointError, match=f"{unfit}: seed: expected"):

@@ -441,7 +441,7 @@ def test_worlds_of_the_simulator_that_comes(tmp_path: Path, capsys: Capsys) -> N
     assert err == "rotorgram: drones: expected a simulator of 4 in each world, got one of 2\n"
     assert "the agent closed" in simulator.communicate(timeout=10)[0]
     simulator = start(*swarm)
-    settings = ("--num-envs", 4, "--env-steps", 64, "--set", "steps_per_update=32", "hidden=8")
+    settings = ("--num-envs", 4, "--env-steps", 64, "--set", "steps_per_update=32", "hidden=[8]")
     status, *_ = run(capsys, "train", "ippo", *flags, *settings, "--out", tmp_path / "run")
     simulator.communicate(timeout=10)
     assert status == 0
