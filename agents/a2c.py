@@ -4,13 +4,12 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..models.fields import Limits
 from .config import RolloutConfig
 from .learner import Learner
 from .networks import Floats
-from .rollouts import Collector, Rollout, advantages
+from .rollouts import Collector, Mask, Numbers, Rollout, advantages
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,9 +61,7 @@ class A2C(Learner):
         self.terms = {"gain": gain, "entropy": entropy, "value_loss": value_loss}
         self.terms |= {"values": values, "targets": targets}
 
-    def advantages(
-        self, rollout: Rollout
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], Floats]:
+    def advantages(self, rollout: Rollout) -> tuple[Numbers, Numbers, Floats]:
         """A_t and V(s_t) of every row, shape (T, N), and the inputs of the critic for them."""
         seen = self.seen(rollout.observations, rollout.kept)
         after = self.seen(rollout.next_observations, rollout.kept & ~rollout.terminated)
@@ -86,14 +83,14 @@ class A2C(Learner):
         )
         return estimates, values, seen
 
-    def seen(self, observations: Floats, flying: NDArray[np.bool_]) -> Floats:
+    def seen(self, observations: Floats, flying: Mask) -> Floats:
         """Inputs of the critic, shape (T, N, m), from observations (T, N, n): here the same.
 
         Of drones that are not `flying`, bool, shape (T, N), another drone may not learn.
         """
         return observations
 
-    def _values(self, seen: Floats) -> NDArray[np.float64]:
+    def _values(self, seen: Floats) -> Numbers:
         """V(s), shape (...), of inputs of the critic, shape (..., m)."""
         *lead, size = seen.shape
         values = self._critic.forward(seen.reshape(-1, size))

@@ -123,11 +123,6 @@ class EpisodeRecorder:
         self._steps: list[NDArray[np.float64]] = []
         self._still = self.actions.to_envs(np.zeros((count, self.actions.size), np.float32))
 
-    def start_clock(self) -> None:
-        """Training begins now; after `resume` it has begun before."""
-        if self._began is None:
-            self._began = time.perf_counter()
-
     @property
     def seconds(self) -> float:
         """Wall time since training began, s."""
@@ -139,12 +134,13 @@ class EpisodeRecorder:
         return flat(self.env.observations, self.spec, self.num_envs)
 
     def start(self) -> None:
-        """Begin the first episode of every drone, unless that was done before."""
+        """As `reset`, unless that was done before."""
         if self._numbers[0] < 0:
             self.reset()
 
     def reset(self) -> None:
-        """Begin an episode of every drone."""
+        """Begin the first episode of every drone; training begins now."""
+        self._began = time.perf_counter()
         self._number(np.ones(self.num_envs, bool))
         self.env.reset(seed=self._seeds.tolist())
 

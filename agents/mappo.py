@@ -1,10 +1,10 @@
 """PPO with a central critic: Yu et al. 2022, arXiv 2103.01955, with parameters shared by drones."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .networks import Floats
 from .ppo import PPO
+from .rollouts import Mask
 
 
 class MAPPO(PPO):
@@ -17,7 +17,7 @@ class MAPPO(PPO):
 
     central = True
 
-    def seen(self, observations: Floats, flying: NDArray[np.bool_]) -> Floats:
+    def seen(self, observations: Floats, flying: Mask) -> Floats:
         """Inputs of the critic, shape (T, N, A·n), as `A2C.seen`."""
         own = super().seen(observations, flying)
         count = len(self.spec.agents)

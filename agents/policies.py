@@ -125,13 +125,12 @@ class NetworkPolicy(Module):
         Raises `InputError` unless they are those that the env and the config need.
         """
         policy = cls(spec, config)
-        expected = dict(policy.shapes)
         got = {name: array.shape for name, array in weights.items()}
-        if got != expected:
+        if got != policy.shapes:
             raise InputError(
-                f"policy: expected weights of shapes {expected}, got {got}: it was trained for "
-                "other observations or actions; give the --vehicle and the --env options of its "
-                "training"
+                f"policy: expected weights of shapes {policy.shapes}, got {got}: it was trained "
+                "for other observations or actions; give the --vehicle and the --env options of "
+                "its training"
             )
         policy.bind(Weights.zeros(policy.shapes))
         for name, array in policy.weights.arrays.items():

@@ -168,7 +168,8 @@ class SB3Agent:
             settings = _sac_settings(config, steps, log)
         else:
             settings = _on_policy_settings(config, steps, log)
-            optimizer = {"eps": _EPSILONS[type(config)], "foreach": True}
+            ours = PPO if isinstance(config, PPOConfig) else A2C
+            optimizer = {"eps": ours.epsilon, "foreach": True}
             policy |= {"log_std_init": config.log_std, "optimizer_kwargs": optimizer}
 
         def rate(_: float) -> float:
@@ -260,7 +261,6 @@ class SB3Agent:
 
 
 _MODELS: Final[dict[type, Any]] = {A2CConfig: sb3.A2C, PPOConfig: sb3.PPO, SACConfig: sb3.SAC}
-_EPSILONS: Final[dict[type, float]] = {A2CConfig: A2C.epsilon, PPOConfig: PPO.epsilon}
 
 
 def _on_policy_settings(config: A2CConfig, steps: int, log: EpisodeRecorder) -> dict[str, object]:

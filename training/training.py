@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from .. import agents
-from ..agents import Checkpoint, CheckpointError
+from ..agents import Checkpoint
 from ..agents.config import RolloutConfig
 from ..envs.autoreset import AdvancingVectorEnv
 from ..envs.config import BackendConfig, EnvConfig
@@ -87,13 +87,10 @@ class Training:
     def resume(cls, kept: Checkpoint, env: AdvancingVectorEnv) -> "Training":
         """Go on from a checkpoint. Raises what `agents.resume_agent` raises."""
         kept.check_resumable()
-        try:
-            names = ("algorithm", "seed", "env_steps", "num_envs")
-            settings = {name: getattr(kept, name) for name in names}
-            config = kept.env or config_of(kept.spec, kept.backend)
-            run = Run(env=config, config=kept.hyperparameters, **settings)
-        except (InputError, TypeError, ValueError) as error:
-            raise CheckpointError(f"checkpoint: its parts do not fit together: {error}") from None
+        names = ("algorithm", "seed", "env_steps", "num_envs")
+        settings = {name: getattr(kept, name) for name in names}
+        config = kept.env or config_of(kept.spec, kept.backend)
+        run = Run(env=config, config=kept.hyperparameters, **settings)
         return cls(run, env, kept=kept)
 
     @cached_property
@@ -124,7 +121,6 @@ class Training:
         log = self.log
         total = self.run.env_steps
         told = 0.0
-        log.start_clock()
 
         def after_update() -> bool:
             nonlocal told
