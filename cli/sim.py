@@ -10,9 +10,6 @@ from ._flags import BackendFlags, WireFlags, Words, parse_address
 if TYPE_CHECKING:
     from ..udp import Simulator
 
-_OF_ONE_AGENT = ("server", "num_envs", "codec", "record")
-"""Flags that --agents excludes."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class Sim(BackendFlags, WireFlags):
@@ -51,10 +48,8 @@ class Sim(BackendFlags, WireFlags):
         from ..udp import LinkConfig, Simulator
 
         several = "agents" in self.given
-        for name in _OF_ONE_AGENT:
-            if several and name in self.given:
-                flag = f"--{name.replace('_', '-')}"
-                raise InputError(f"{flag}: cannot be used with --agents")
+        if several and "server" in self.given:
+            raise InputError("--server: cannot be used with --agents")
         agents = [parse_address(agent) for agent in self.agents] if several else None
         simulator = Simulator(
             self.env_config(backend=self.backend),

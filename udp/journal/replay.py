@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,7 +28,7 @@ class Difference(NamedTuple):
     field: str
     """`reward`, `terminated`, `truncated`, or the array and its component: `telemetry z`."""
     recorded: str
-    """A float in hexadecimal with all its bits, and in decimal."""
+    """With as many digits as tell it from every other number."""
     replayed: str
 
     def __str__(self) -> str:
@@ -41,10 +41,8 @@ class SessionVerdict:
     """Simulates one session again, and counts what is the same."""
 
     session: Session
-    vehicle: Path | str | None
-    """File or name of the vehicle that was flown; None: the paper's."""
-    backend: Backend
-    """What stepped the drones."""
+    flown: dict[str, object]
+    """Vehicle and backend, by the names of `EnvConfig.from_keywords`."""
     same: int = 0
     """States that are the same in every bit."""
     differing: int = 0
@@ -125,7 +123,7 @@ class SessionVerdict:
                 f"expected a registered env id, got {spec.env_id!r}: "
                 "--env MODULE:NAME names the module that registers it"
             )
-        keywords = {"vehicle": self.vehicle, "backend": self.backend, **spec.options}
+        keywords = {**self.flown, **spec.options}
         config = EnvConfig.from_keywords(spec.env_id, drones=len(spec.agents), **keywords)
         loop = make_stepped(config, self.session.num_envs, {})
         for name in _SAME:
@@ -161,8 +159,8 @@ class Verification(Recording):
         backend: Backend | None = None,
     ) -> None:
         super().__init__(path)
-        if backend is None:
-            backend = cast(Backend, self.about.get("backend", "mujoco"))
+        recorded = self.about.get("backend", "mujoco")
+        flown: dict[str, object] = {"vehicle": vehicle, "backend": backend or recorded}
         self.sessions: list[SessionVerdict] = []
         flying: dict[int, SessionVerdict] = {}  # the last of each slot
         try:
@@ -171,7 +169,7 @@ class Verification(Recording):
                 if verdict is None or verdict.session is not item.session:
                     if verdict:
                         verdict.close()
-                    verdict = SessionVerdict(session=item.session, vehicle=vehicle, backend=backend)
+                    verdict = SessionVerdict(session=item.session, flown=flown)
                     flying[item.session.slot] = verdict
                     self.sessions.append(verdict)
                 verdict.take(item)
@@ -190,10 +188,9 @@ class Verification(Recording):
         if not self.complete:
             lines.append(f"note: the file is {self.ending}")
         if self.identical:
-            read = "" if self.complete else " as far as it can be read"
             compared = sum(session.same for session in self.sessions)
             sessions = count_of(len(self.sessions), "session")
-            lines.append(f"identical{read}: {compared} States in {sessions}")
+            lines.append(f"identical: {compared} States in {sessions}")
         elif all(session.identical for session in self.sessions):
             lines.append("nothing to compare")
         else:
@@ -211,7 +208,7 @@ def _difference(recorded: State, loop: Steppable) -> Difference | None:
             if old.tobytes() != new.tobytes():
                 drone, component = divmod(at, len(names))
                 name = names[component]
-                return Difference(recorded.sequence, drone, name, _digits(old), _digits(new))
+                return Difference(recorded.sequence, drone, name, str(old), str(new))
     return None
 
 
@@ -227,8 +224,3 @@ def _arrays(recorded: State, loop: Steppable) -> Iterator[tuple[list[str], np.nd
         for spec, was in zip(specs, arrays, strict=True):
             names = [f"{what} {name}" for name in component_names(spec)]
             yield names, was, np.ascontiguousarray(here[spec.name], was.dtype)
-
-
-def _digits(number: np.generic) -> str:
-    value: object = number.item()
-    return f"{value.hex()} ({number!s})" if isinstance(value, float) else str(value)

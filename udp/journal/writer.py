@@ -101,8 +101,6 @@ class Journal:
             channel = self._channel(f"/slot{slot}/events", "json")
             self._pending.append((channel, now, 0, self._event(message, datagram)))
         self._size += len(datagram)
-        if self._size > 4 * _CHUNK:  # nobody calls `write`
-            self._flush()
 
     def write(self) -> None:
         """Write the messages. Call it when there is time: while the other side is at work."""

@@ -83,31 +83,28 @@ LONGEST_HELLO = (
 def encode(message: Message, layout: Layout | None = None) -> bytes:
     """The bytes of a message, whole; a State or a Command needs the layout of its Hello.
 
-    Raises `InputError` if a number, an array or the whole does not fit.
+    Raises `InputError` if an array is not of the layout, or not finite.
     """
     if isinstance(message, State | Command):
         assert layout is not None
         return encode_step(message, layout)
     body = b""
-    try:
-        match message:
-            case Hello():
-                spec = message.spec.encode()
-                body = _HELLO_BODY.pack(*message.versions, message.worlds, len(spec)) + spec
-                body += _extensions(message.extensions)
-            case Welcome(nonce=nonce, seed=seed):
-                body = _WELCOME_BODY.pack(nonce, seed or 0, seed is not None, message.version)
-                body += _extensions(message.extensions)
-            case Refuse() | Close():
-                reason = message.reason.encode()
-                body = _LENGTH.pack(len(reason)) + reason
-            case Missing():
-                body = _MISSING_BODY.pack(message.kind, message.count, message.first)
-                body += message.bitmap
-        kind = _MESSAGES.index(type(message)) + 1
-        return frame(kind, message.session, getattr(message, "sequence", 0), body)
-    except struct.error as error:
-        raise InputError(f"{type(message).__name__}: {error}") from None
+    match message:
+        case Hello():
+            spec = message.spec.encode()
+            body = _HELLO_BODY.pack(*message.versions, message.worlds, len(spec)) + spec
+            body += _extensions(message.extensions)
+        case Welcome(nonce=nonce, seed=seed):
+            body = _WELCOME_BODY.pack(nonce, seed or 0, seed is not None, message.version)
+            body += _extensions(message.extensions)
+        case Refuse() | Close():
+            reason = message.reason.encode()
+            body = _LENGTH.pack(len(reason)) + reason
+        case Missing():
+            body = _MISSING_BODY.pack(message.kind, message.count, message.first)
+            body += message.bitmap
+    kind = _MESSAGES.index(type(message)) + 1
+    return frame(kind, message.session, getattr(message, "sequence", 0), body)
 
 
 def frame(kind: int, session: int, sequence: int, body: bytes) -> bytes:
@@ -187,26 +184,23 @@ def is_of_session(kind: int, sequence: int) -> bool:
 
 def encode_step(m: State | Command, layout: Layout) -> bytes:
     """The bytes of a State or a Command, whole. Raises `InputError` as `encode`."""
-    try:
-        time = 0.0
-        if isinstance(m, State):
-            kind = STATE
-            record = layout.state
-            time = m.time
-            pieces = [_STATE_HEAD.pack(m.session, m.sequence, time, m.nonce)]
-            arrays = (*m.observations, m.rewards, m.terminated, m.truncated, *m.telemetry)
-        elif m.seeds is None:
-            kind = COMMAND
-            record = layout.command
-            pieces = [_COMMAND_HEAD.pack(m.session, m.sequence, 0)]
-            arrays = (m.actions, m.orders)
-        else:
-            kind = COMMAND
-            record = layout.seeded_command
-            pieces = [_COMMAND_HEAD.pack(m.session, m.sequence, layout.drones)]
-            arrays = (m.actions, m.orders, m.seeds)
-    except struct.error as error:
-        raise InputError(f"{type(m).__name__}: {error}") from None
+    time = 0.0
+    if isinstance(m, State):
+        kind = STATE
+        record = layout.state
+        time = m.time
+        pieces = [_STATE_HEAD.pack(m.session, m.sequence, time, m.nonce)]
+        arrays = (*m.observations, m.rewards, m.terminated, m.truncated, *m.telemetry)
+    elif m.seeds is None:
+        kind = COMMAND
+        record = layout.command
+        pieces = [_COMMAND_HEAD.pack(m.session, m.sequence, 0)]
+        arrays = (m.actions, m.orders)
+    else:
+        kind = COMMAND
+        record = layout.seeded_command
+        pieces = [_COMMAND_HEAD.pack(m.session, m.sequence, layout.drones)]
+        arrays = (m.actions, m.orders, m.seeds)
     for slot, array in zip(record.slots, arrays, strict=True):
         if array.shape != slot.shape or array.dtype != slot.dtype:  # numbers are never converted
             raise InputError(

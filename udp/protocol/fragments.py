@@ -39,8 +39,6 @@ class Transfer:
     `largest` are the bytes of the largest datagram, a seal not counted.
     """
 
-    __slots__ = ("_burst", "_crc", "_next", "_slice", "_start", "count", "message")
-
     def __init__(self, message: bytes, largest: int) -> None:
         self.message = message
         self.count = 1

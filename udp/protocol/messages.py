@@ -89,11 +89,6 @@ class Welcome:
     (mod 2^64). Otherwise the session's number is the seed."""
     extensions: tuple[Extension, ...] = ()
 
-    def __post_init__(self) -> None:
-        for name, number in (("nonce", self.nonce), ("seed", self.seed or 0)):
-            if not 0 <= number <= MAX_UINT64:
-                raise InputError(f"{name}: expected 0 to 2^64 - 1, got {number}")
-
     @property
     def first_seed(self) -> int:
         """Seed of the simulator's own first reset."""

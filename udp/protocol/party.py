@@ -30,6 +30,7 @@ class World(Protocol):
     rewards: NDArray[np.float64]
     terminated: Mask
     truncated: Mask
+    out: Mask
 
     @property
     def observations(self) -> Mapping[str, Array]: ...
@@ -42,14 +43,6 @@ class World(Protocol):
         seeds: NDArray[np.uint64] | None,
         frozen: Mask | None,
     ) -> None: ...
-
-
-class SwarmWorld(World, Protocol):
-    """One world whose drones can be lost."""
-
-    @property
-    def out(self) -> Mask:
-        """Drones whose episode has ended while others fly on, shape (N,)."""
 
 
 Participation = Literal["coming", "ready", "flying", "waiting", "left"]
@@ -294,7 +287,6 @@ class SeveralAgents(WorldRules):
         seed: Of the running episode; None: the streams of the episode before went on.
     """
 
-    world: SwarmWorld
     patience: float
 
     def __post_init__(self) -> None:

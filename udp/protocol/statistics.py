@@ -26,7 +26,6 @@ class Statistics:
         self.notices: list[str] = []
         """Sentences for the log, until `take_notices`."""
         self._next_notice: dict[str, float] = {}
-        self._unsaid: Counter[str] = Counter()
 
     def drop(self, cause: str, reason: str, now: float) -> None:
         """Count a datagram that changes nothing; say so if it is time to."""
@@ -35,11 +34,8 @@ class Statistics:
             return
         self.last_error = one_line(f"{cause} {reason}")
         if now >= self._next_notice.get(cause, now):
-            more = f" ({self._unsaid.pop(cause)} more before)" if self._unsaid[cause] else ""
-            self.notices.append(f"dropped a datagram: {self.last_error}{more}")
+            self.notices.append(f"dropped a datagram: {self.last_error}")
             self._next_notice[cause] = now + NOTICE_INTERVAL
-        else:
-            self._unsaid[cause] += 1
 
     def notice(self, sentence: str) -> None:
         """Keep a notice for the log."""

@@ -108,7 +108,7 @@ _FROM_PAPER: Final[_Conversions] = {
 def encode(message: State | Command | Close, layout: Layout | None = None) -> bytes:
     """One line, without its end; a State needs a layout.
 
-    Raises `InputError` if it is too long or cannot be written.
+    Raises `InputError` if it cannot be written.
     """
     match message:
         case State():
@@ -126,10 +126,7 @@ def encode(message: State | Command | Close, layout: Layout | None = None) -> by
             fields = _numbers([message.actions])
         case Close():
             fields = ["close"]
-    line = ",".join([str(message.sequence), *fields]).encode()
-    if len(line) > MAX_LINE:
-        raise InputError(f"text line: expected at most {MAX_LINE} bytes, got {len(line)}")
-    return line
+    return ",".join([str(message.sequence), *fields]).encode()
 
 
 def _numbers(arrays: Iterable[np.ndarray]) -> list[str]:

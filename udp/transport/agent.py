@@ -7,7 +7,7 @@ import weakref
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, fields
-from functools import cached_property, lru_cache
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypedDict
 
@@ -83,7 +83,7 @@ class AgentConfig:
     def accept(self, hello: Hello) -> Layout | str:
         """The layout of a simulator, or the reason to refuse it."""
         try:
-            spec = _spec(hello.spec)
+            spec = EnvSpec.from_json(hello.spec)
             drones = hello.worlds * len(spec.agents)
             return self._difference(spec, drones) or layout_of(spec, hello.worlds)
         except InputError as error:
@@ -277,7 +277,7 @@ class Agent:
             config = self.config
             if session.hello:
                 self.server.takes_text = False
-                config.spec = _spec(session.hello.spec)
+                config.spec = EnvSpec.from_json(session.hello.spec)
             else:
                 config.spec = config.text_spec
             config.drones = session.layout.drones
@@ -298,8 +298,6 @@ class Agent:
             dropped = f"; last datagram dropped: {last}" if last else ""
             if session is None:
                 lost = self.lost[slot]
-                if dropped in lost:
-                    dropped = ""
                 nobody = f"{lost}; no other" if lost else "no simulator"
                 seconds = f"{config.connect_timeout:g} s"
                 raise PeerSilent(f"{nobody} came to {here} for {seconds}{dropped}")
@@ -319,19 +317,11 @@ class Agent:
 
     def _lose(self, slot: int, reason: str) -> None:
         self.lost[slot] = reason
-        wait = self.config.connect_timeout
-        self._deadlines[slot] = time.monotonic() + wait
+        self._deadlines[slot] = time.monotonic() + self.config.connect_timeout
         self._keep_sockets()
         if self.server.slots[slot] is None:
-            long = f"{wait:g} s " if wait < 86_400 else ""  # commands wait without limit
-            reason += f"; waiting {long}for another at {address_text(self.address)}"
+            reason += f"; waiting for another at {address_text(self.address)}"
         _log.warning("%s", reason)
-
-
-@lru_cache(maxsize=4)
-def _spec(text: str) -> EnvSpec:
-    """Raises `SpecError`."""
-    return EnvSpec.from_json(text)
 
 
 def _options_difference(ours: Mapping[str, object], theirs: Mapping[str, object]) -> str:

@@ -7,7 +7,7 @@ from contextlib import ExitStack, suppress
 from dataclasses import replace
 from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, cast
+from typing import TYPE_CHECKING, Literal
 
 import gymnasium as gym
 import numpy as np
@@ -28,7 +28,6 @@ from ..protocol.party import (
     OneAgent,
     Rules,
     SeveralAgents,
-    SwarmWorld,
 )
 from .sockets import LONGEST_WAIT, PAUSE, TEXT_WAY_OUT, WAY_OUT, Port, log_notices, resolve
 from .stepped import GymEnv, GymnasiumWorld, make_stepped
@@ -131,8 +130,7 @@ class Simulator(NotCopied):
             elif isinstance(stepped, GymnasiumWorld):
                 raise InputError(f"env: expected a registered task for several drones, got {env!r}")
             else:
-                world = cast(SwarmWorld, stepped)
-                rules = SeveralAgents(world, layout, period, links, patience)
+                rules = SeveralAgents(stepped, layout, period, links, patience)
             self.stepped = stepped
             self.spec = spec
             self.address: Address = port.address

@@ -84,7 +84,7 @@ class GymnasiumWorld:
         self.terminated = np.zeros(1, bool)
         self.truncated = np.zeros(1, bool)
         self._env = env
-        self._is_waiting = True  # for a reset
+        self.out = np.ones(1, bool)  # it waits for a reset
 
     def advance(
         self,
@@ -95,19 +95,19 @@ class GymnasiumWorld:
     ) -> None:
         is_reset = resets is not None and resets.all()
         is_frozen = frozen is not None and frozen.all()
-        if self._is_waiting and not (is_reset or is_frozen):
+        if self.out.all() and not (is_reset or is_frozen):
             raise gym.error.ResetNeeded("step: expected a reset first")
         reward: SupportsFloat = 0.0
         terminated = truncated = False
         if is_reset:
             observation, info = self._env.reset(seed=None if seeds is None else int(seeds[0]))
             self._keep(observation, info)
-            self._is_waiting = False
+            self.out[:] = False
         elif not is_frozen:
             action = int(actions[0]) if isinstance(self.spec.action, Discrete) else actions[0]
             observation, reward, terminated, truncated, info = self._env.step(action)
             self._keep(observation, info)
-            self._is_waiting = bool(terminated or truncated)
+            self.out[:] = terminated or truncated
         self.rewards[:] = float(reward)
         self.terminated[:] = terminated
         self.truncated[:] = truncated
