@@ -193,9 +193,7 @@ def checked_seeds(seed: Any, num_envs: int, most: int | None = None) -> Seeds | 
         numbers = range(int(seed), int(seed) + num_envs)
     several = isinstance(numbers, Sequence | np.ndarray) and getattr(numbers, "ndim", 1) == 1
     right = several and len(numbers) == num_envs
-    if right and getattr(numbers, "dtype", None) != np.uint64:  # thousands, as a training has them
-        right = all(_is_seed(number, most) for number in numbers)
-    if not right:
+    if not (right and all(_is_seed(number, most) for number in numbers)):
         up_to = "from 0 on" if most is None else f"from 0 to 2^{most.bit_length()} - 1"
         raise InputError(
             f"seed: expected a whole number {up_to}, or {num_envs} of them, got {seed!r}"

@@ -135,15 +135,6 @@ class Cameras:
                 mine = {name: mask[world] for name, mask in of_world.items()}
                 self._draw_world(rows.start, mine)
 
-    def snapshot(self) -> dict[str, np.ndarray]:
-        """The last pictures, by name."""
-        return {name: taken.copy() for name, taken in self.pictures.items()}
-
-    def restore(self, arrays: Arrays) -> None:
-        """Put a snapshot back."""
-        for name, array in self.pictures.items():
-            array[:] = arrays[name]
-
     def lens(self, name: str, state: Arrays, drone: int = 0, world: int = 0) -> Lens:
         """The lens of a view's camera, of a drone of a world, in a state as of `take`."""
         self._pose(state, world)

@@ -1,7 +1,7 @@
 """Pictures as observations: which drones take which one when, of the state that a step ended in."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ...models.cameras import FARTHEST, View, chosen_views
 from ...scenes import scenes_of
 from ...sim.random import SCENES, Draw, Random
-from ...sim.snapshots import Arrays, Snapshot
+from ...sim.snapshots import Arrays
 from ..spec import ArraySpec
 from ..tasks.task import Task
 from .record import Record, Stage
@@ -74,7 +74,7 @@ class Pictures(Stage):
         shape: (W, A).
     """
 
-    arrays = ("scenes",)
+    arrays = ("scenes", "pictures")
 
     def __init__(self, task: Task, random: Random, shape: tuple[int, int]) -> None:
         from ...rendering.cameras import Cameras
@@ -110,24 +110,6 @@ class Pictures(Stage):
         for painter in self._painters:
             painter.cameras.close()
 
-    def snapshot(self, record: Record) -> Snapshot:
-        """What each drone's cameras took last."""
-        taken: Snapshot = {}
-        if "scenes" not in vars(record):
-            return taken
-        for painter in self._painters:
-            worlds = painter.worlds & (self._scenes_of(record) == painter.scene)
-            for name, array in painter.cameras.snapshot().items():
-                mask = np.repeat(worlds, len(array) // len(worlds))
-                taken.setdefault(name, np.zeros_like(array))[mask] = array[mask]
-        return taken
-
-    def restore(self, record: Record, arrays: Arrays) -> None:
-        """Put a snapshot back."""
-        if arrays:
-            for painter in self._painters:
-                painter.cameras.restore(arrays)
-
     def begin(self, record: Record) -> None:
         """Draw the scene of each world."""
         begun = self._per_drone(record.begun).reshape(self._shape).any(axis=1)
@@ -142,7 +124,7 @@ class Pictures(Stage):
         """Add all pictures to the observations, shape (W, A, height, width, channels).
 
         A drone takes one with the first state of an episode, and with every so many control steps
-        of it.
+        of it; until then it observes its last.
         """
         state = record.state
         nobody = np.zeros(self._rows, bool)
@@ -159,30 +141,36 @@ class Pictures(Stage):
             rows["payload"] = self._per_drone(state.payload)
         if self._goal_moves:
             rows["goal"] = self._per_drone(self._task.goal(state))
-        pictures = self._taken(due, rows, self._scenes_of(record))
-        for name, picture in pictures.items():
-            record.observations[name] = picture.reshape(*record.shape, *picture.shape[1:])
+        pictures = {}
+        for view in self.views:
+            shape = (self._rows, *view.shape)
+            last = vars(record).get("pictures", {}).get(view.name, np.zeros(shape, view.dtype))
+            pictures[view.name] = np.array(last).reshape(shape)
+        self._take(pictures, due, rows, np.reshape(record.scenes, self._shape)[:, 0])
+        lead = record.shape
+        record.pictures = {n: x.reshape(*lead, *x.shape[1:]) for n, x in pictures.items()}
+        record.observations = {**record.observations, **record.pictures}
 
-    def _taken(
+    def _take(
         self,
-        due: dict[str, NDArray[np.bool_]],
+        pictures: Arrays,
+        due: Mapping[str, NDArray[np.bool_]],
         rows: Arrays,
         scenes: NDArray[np.int64],
-    ) -> Arrays:
-        pictures: dict[str, np.ndarray] = {}
-        for view in self.views:
-            pictures[view.name] = np.empty((self._rows, *view.shape), view.dtype)
+    ) -> None:
+        """Replace the pictures that are due, in worlds of these scenes, (W,)."""
 
         def paint(painter: _Painter) -> None:
             worlds = painter.worlds & (scenes == painter.scene)
             painter.cameras.take(due, rows, worlds)
             drones = np.repeat(worlds, self._shape[1])
             for view in self.views:
-                picture = painter.cameras.pictures[view.name][drones]
+                taken = due[view.name] & drones
+                picture = painter.cameras.pictures[view.name][taken]
                 if view.kind == "segmentation":
                     numbers = [self._names.index(name) for name in painter.cameras.objects]
                     picture = np.array(numbers, np.int32)[picture]
-                pictures[view.name][drones] = picture
+                pictures[view.name][taken] = picture
 
         painters = []
         for painter in self._painters:
@@ -193,11 +181,6 @@ class Pictures(Stage):
             list(self._pool.map(paint, painters))
         else:
             paint(painters[0])
-        return pictures
-
-    def _scenes_of(self, record: Record) -> NDArray[np.int64]:
-        """Number of each world's scene, (W,)."""
-        return np.reshape(record.scenes, self._shape)[:, 0]
 
     def _per_drone(self, values: object) -> np.ndarray:
         """A row for each drone."""

@@ -74,6 +74,7 @@ class Record:
     terminated: Mask
     truncated: Mask
     scenes: NDArray[np.int64]
+    pictures: ByName
     said: Floats
     heard: Floats
     age: Floats

@@ -41,7 +41,7 @@ class TaskOptions:
 
     def to_options(self) -> dict[str, Any]:
         """Every option by its name."""
-        return {one.name: getattr(self, one.name) for one in fields(self)}
+        return {**vars(self)}
 
     @classmethod
     def from_options(cls, options: Mapping[str, Any], others: Sequence[str] = ()) -> Self:
