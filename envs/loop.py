@@ -108,7 +108,8 @@ class Loop:
             try:
                 record.run(record.flown, pipeline.fly)
             except PhysicsError:
-                record.lose()
+                flew = record.flown
+                record.waiting = record.waiting | (True if flew is None else flew)
                 raise
         if record.begun is not None:
             self._begin(record.begun, seeds)

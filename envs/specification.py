@@ -1,5 +1,6 @@
 """Tasks by env id with their options, and the spec of an env."""
 
+from ..models.cameras import chosen_views
 from ..models.errors import InputError
 from ..models.swarm import drone_names
 from ..scenes import scenes_of
@@ -9,7 +10,7 @@ from . import registry
 from .config import EnvConfig
 from .spec import ArraySpec, Discrete, EnvSpec
 from .stages.history import with_history
-from .stages.pictures import arrays_of, objects_of_all, views_of
+from .stages.pictures import arrays_of, objects_of_all
 from .tasks.task import Task
 from .telemetry import quantities_of
 
@@ -28,12 +29,11 @@ def _check_kept(config: EnvConfig, adjusted: EnvConfig) -> None:
     """Raise `InputError` if a task's `adjust` dropped or changed a setting of the user."""
     now = adjusted.keywords()
     for name, value in config.keywords().items():
-        other = now.get(name)
-        kept = other == value
-        if isinstance(value, dict) and isinstance(other, dict):
-            kept = value.items() <= other.items()
-        if not kept:
-            raise InputError(f"{config.env_id}: expected adjust() to keep {name}, got {other!r}")
+        if isinstance(value, dict):
+            value = {**now.get(name, {}), **value}
+        if now.get(name) != value:
+            got = f"got {now.get(name)!r}"
+            raise InputError(f"{config.env_id}: expected adjust() to keep {name}, {got}")
 
 
 def spec_of(config: EnvConfig, task: Task) -> EnvSpec:
@@ -86,7 +86,7 @@ def _pictures(task: Task) -> tuple[ArraySpec, ...]:
     config = task.config
     if not config.cameras:
         return ()
-    views = views_of(task)
+    views = chosen_views(config.cameras, task.vehicle.cameras)
     if not any(view.kind == "segmentation" for view in views):
         return arrays_of(views, ())
     from ..rendering.camera_model import objects_of

@@ -37,20 +37,17 @@ class History(Stage):
         """A drone that begins fills its history with the present."""
         past = vars(record).get("history", {})
         history = {}
-        rows = {}
+        seen = {}
         for name in self._names:
             values = record.observations[name]
             if values.ndim == self._axis:  # a number
                 values = values[..., None]
-            history[name] = later(past.get(name), values, self._steps, record)
-            rows[name] = self._side_by_side(history[name])
+            history[name] = rows = later(past.get(name), values, self._steps, record)
+            lead = rows.shape[: self._axis]
+            rest = rows.shape[self._axis + 2 :]
+            seen[name] = rows.reshape(*lead, -1, *rest)
         record.history = history
-        record.observations = {**record.observations, **rows}
-
-    def _side_by_side(self, history: Values) -> Values:
-        lead = history.shape[: self._axis]
-        rest = history.shape[self._axis + 2 :]
-        return history.reshape(*lead, -1, *rest)
+        record.observations = {**record.observations, **seen}
 
 
 class ObservationDelay(Stage):

@@ -3,7 +3,6 @@
 import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -22,11 +21,6 @@ if TYPE_CHECKING:
 
 _MAX_THREADS = 16
 _UNITS = {"depth": "m"}
-
-
-def views_of(task: Task) -> tuple[View, ...]:
-    """What the option `cameras` of a task chooses. Raises `InputError`."""
-    return chosen_views(task.config.cameras, task.vehicle.cameras)
 
 
 def arrays_of(views: Sequence[View], objects: Sequence[str]) -> tuple[ArraySpec, ...]:
@@ -83,10 +77,12 @@ class Pictures(Stage):
         self._shape = shape
         self._rows = shape[0] * shape[1]
         self._random = random
-        self.views = views_of(task)
+        self.views = chosen_views(task.config.cameras, task.vehicle.cameras)
         self._scenes = scenes_of(str(task.config.scene))
-        self._threads = min(os.cpu_count() or 1, shape[0], _MAX_THREADS)
-        parts = np.arange(shape[0]) % -(-self._threads // len(self._scenes))
+        threads = min(os.cpu_count() or 1, shape[0], _MAX_THREADS)
+        # It starts them with the first picture, so that a process may be forked before.
+        self._pool = ThreadPoolExecutor(threads, "cameras")
+        parts = np.arange(shape[0]) % -(-threads // len(self._scenes))
         payload = task.config.effects.payload > 0
         self._painters = []
         for number, scene in enumerate(self._scenes):
@@ -98,15 +94,9 @@ class Pictures(Stage):
         self._names = objects_of_all([painter.cameras.objects for painter in self._painters])
         self._goal_moves = any(mark.moves for mark in task.marks)
 
-    @cached_property
-    def _pool(self) -> ThreadPoolExecutor:
-        """Started with the first picture, so that a process may be forked before."""
-        return ThreadPoolExecutor(self._threads, "cameras")
-
     def close(self) -> None:
         """Free what draws. A second call does nothing."""
-        if "_pool" in vars(self):
-            self._pool.shutdown()
+        self._pool.shutdown()
         for painter in self._painters:
             painter.cameras.close()
 

@@ -1,6 +1,5 @@
 """The record that all stages share, and what a stage is."""
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
@@ -17,8 +16,6 @@ Mask = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 Look = Callable[[], WorldState]
 """Gives the state that a controller sees: the exact one, or the estimate."""
-
-_SMALL = 64  # Up to this many numbers Python's loop is faster than NumPy's call
 
 
 class Record:
@@ -161,11 +158,6 @@ class Record:
         self.reward = self._nothing
         self.terminated = self.truncated = self._nobody
 
-    def lose(self) -> None:
-        """The physics failed: the drones that flew must be reset."""
-        flown = self.flown
-        self.waiting = self.waiting | (True if flown is None else flown)
-
     def end(self, drones: Mask) -> None:
         """End the episodes of some drones; a world is done when all of its drones are out."""
         self.out = self.out | drones
@@ -223,6 +215,4 @@ def where(mask: Mask, new: Array, old: Array) -> Array:
 
 def is_finite(values: np.ndarray) -> bool:
     """Whether all numbers are finite."""
-    if values.size <= _SMALL and math.isfinite(sum(values.ravel().tolist())):
-        return True
     return values.dtype.kind != "f" or bool(np.isfinite(values).all())
