@@ -24,7 +24,6 @@ from .spec import Values, canonical_id, json_values
 
 if TYPE_CHECKING:
     from ..models.vehicle import Vehicle
-    from .tasks.task import TaskOptions
 
 Options = Mapping[str, Any]
 VERSION = 1
@@ -274,11 +273,6 @@ class EnvConfig:
     def own_task(self) -> str | None:
         """`module:id` of a user's task; None for ours."""
         return f"{self.module}:{self.env_id}" if self.module else None
-
-    @property
-    def task_options(self) -> "TaskOptions":
-        """The task's options as its own dataclass."""
-        return registry.task_type(self.env_id).Options.from_options(self.task)
 
     @property
     def estimated(self) -> bool:

@@ -60,8 +60,7 @@ class Pipeline:
             flying.append(ActionDelay(world, randomize.most_steps("action_delay"), neutral))
         flying += [Flight(world, parts, substeps, held), Clock()]
 
-        pictures = Pictures(task, world.random, shape) if config.cameras else None
-        observing = self._observing(task, world, sensors, pictures)
+        observing = self._observing(task, world, sensors, shape)
         if randomize is not None and "observation_delay" in drawn:
             longest = randomize.most_steps("observation_delay")
             observing.append(ObservationDelay(world, longest))
@@ -76,7 +75,7 @@ class Pipeline:
         self.observe = [stage.step for stage in observing]
 
     def _observing(
-        self, task: Task, world: World, sensors: Sensors | None, pictures: Pictures | None
+        self, task: Task, world: World, sensors: Sensors | None, shape: tuple[int, int]
     ) -> list[Stage]:
         """From the measurement to the observation of the present."""
         config = task.config
@@ -90,6 +89,6 @@ class Pipeline:
         stages.append(Judge(task))
         if sensors is not None:
             stages.append(Readings(sensors, observed(task) if config.estimated else ()))
-        if pictures is not None:
-            stages.append(pictures)
+        if config.cameras:
+            stages.append(Pictures(task, world.random, shape))
         return stages

@@ -21,6 +21,7 @@ from rotorgram.agents.pid import SHARES
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.loop import Loop
 from rotorgram.envs.spec import canonical_id
+from rotorgram.envs.tasks.elevation import ElevationOptions
 from rotorgram.envs.tasks.goal import ERROR_SCALE
 from rotorgram.envs.tasks.racing import RacingOptions, read_track
 from rotorgram.envs.tasks.recovery import Recovery, RecoveryOptions
@@ -50,7 +51,7 @@ def known_bounds(config: EnvConfig, episodes: int) -> dict[str, float]:
 
 def elevation_bounds(config: EnvConfig, vehicle: Vehicle, starts: Floats) -> dict[str, float]:
     """Mean returns of the two flights by name, over episodes that start at E in m, shape (n,)."""
-    options = config.task_options
+    options = ElevationOptions.from_options(config.task)
     steps = config.episode_length or 0
     period = config.control_period or 0.0
     # Largest accelerations up and down, m/s², and the largest change of one in a control step.

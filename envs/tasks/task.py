@@ -120,7 +120,7 @@ class Task(ABC):
         self.config = config
         self.vehicle = vehicle
         self.shape = shape
-        self.options: Any = config.task_options
+        self.options: Any = type(self).Options.from_options(config.task)
         assert config.action
         assert config.control_period
         assert config.episode_length
@@ -128,7 +128,9 @@ class Task(ABC):
         self.control_period = config.control_period
         self.episode_length = config.episode_length
         self.memory: Any = Memory()
-        self.controller = of_level = self._of_level()
+        period = self.control_period if config.estimated else vehicle.timestep
+        of_level = make_controller(self.action, vehicle, period, config.effects)
+        self.controller = of_level
         self.setup()
         self.config = self.adjust(config)
         vars(self)["_is_set_up"] = True
@@ -148,11 +150,6 @@ class Task(ABC):
                 f"got self.{name} = ... outside setup()"
             )
         super().__setattr__(name, value)
-
-    def _of_level(self) -> Controller:
-        """The controller of the action level."""
-        period = self.control_period if self.config.estimated else self.vehicle.timestep
-        return make_controller(self.action, self.vehicle, period, self.config.effects)
 
     def adjust(self, config: "EnvConfig") -> "EnvConfig":
         """The config with what the task adds to it, such as a payload; called after `setup`.
