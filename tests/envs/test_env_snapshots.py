@@ -95,7 +95,7 @@ def test_another_number_of_drones_is_refused() -> None:
 
 def test_a_snapshot_of_another_config_is_refused() -> None:
     near: Any = gym.make(HOVER).unwrapped
-    far: Any = gym.make(HOVER, start_band=2.0).unwrapped
+    far: Any = gym.make(HOVER, start_tilt=60).unwrapped
     near.reset(seed=1)
     far.reset(seed=2)
     before = bits(near.snapshot())
