@@ -34,9 +34,8 @@ _FASTEST_TURN = math.radians(2000)  # rad/s: the range of common gyroscopes (Bos
 _THRUSTS = mujoco.mjtDisableBit.mjDSBL_ACTUATION
 _CONTACTS = mujoco.mjtDisableBit.mjDSBL_CONTACT
 _EXACT = 1e-9  # tolerance where the integrator is exact: the rounding errors of a flight
-_RELATIVE = 1e-6  # tolerance of measured thrusts
+_RELATIVE = 1e-6  # of the torque of a thrust at the arm: less is none
 _TURN = 8.0  # rad: length of a tumbling flight
-_TINY = 1e-300  # divides where there is nothing to divide by
 
 
 @dataclass(frozen=True)
@@ -206,31 +205,14 @@ def _units(craft: _Craft) -> Iterator[Check]:
         yield _judged("units: tip speed", radius * fastest)
 
 
-def _rotors(craft: _Craft) -> Iterator[Check]:
-    model, data = craft.at_rest()
-    data.ctrl[:] = [rotor.high / rotor.newtons for rotor in craft.vehicle.rotors]
-    mujoco.mj_forward(model, data)
-    forces = data.actuator_force * np.linalg.norm(model.actuator_gear[:, :3], axis=1)
-    for rotor, newtons in zip(craft.vehicle.rotors, np.abs(forces), strict=True):
-        off = abs(newtons - rotor.high) / max(abs(rotor.high), _TINY)
-        key = "effect of {}: error per newton"
-        yield _judged(key, off, rotor.name, expected=0, tolerance=_RELATIVE)
-
-
 def _allocation(craft: _Craft) -> Iterator[Check]:
-    allocation = craft.vehicle.allocation
-    sizes = np.linalg.norm(allocation, axis=1)
-    least = _RELATIVE * sizes[0] * np.array((1, craft.arm, craft.arm, craft.arm))
-    rows = allocation / np.maximum(sizes, _TINY)[:, None]
-    rows[sizes < least] = 0.0
-    yield _judged("allocation: rank", np.linalg.matrix_rank(rows, tol=1e-6), expected=4)
-    apart = rows - np.outer(rows @ rows[0], rows[0])  # each torque without a change of thrust
-    lengths = np.linalg.norm(apart, axis=1)
-    names = ("thrust", "roll", "pitch", "yaw")
-    for one, other in ((3, 1), (3, 2), (1, 2)):
-        both = lengths[one] * lengths[other]
-        shared = abs(float(apart[one] @ apart[other])) / both if both > 1e-9 else math.nan
-        yield _judged("allocation: {} apart from {}", shared, names[one], names[other])
+    thrust, *torques = craft.vehicle.allocation
+    size = float(np.linalg.norm(thrust))
+    along = thrust / size
+    apart = [row - (row @ along) * along for row in torques]  # without a change of thrust
+    least = _RELATIVE * craft.arm * size
+    rows = np.array([row / max(float(np.linalg.norm(row)), least) for row in apart])
+    yield _judged("allocation: torques apart from each other", np.linalg.eigvalsh(rows @ rows.T)[0])
 
 
 def _turns(craft: _Craft) -> Iterator[Check]:
@@ -287,7 +269,6 @@ def _floor(craft: _Craft) -> Iterator[Check]:
 GROUPS: Final[Mapping[str, Callable[[_Craft], Iterator[Check]]]] = {
     "gravity": _gravity,
     "units": _units,
-    "rotors": _rotors,
     "allocation": _allocation,
     "turns": _turns,
     "hover": _hover,

@@ -387,6 +387,8 @@ def _read_rotor(model: mujoco.MjModel, data: mujoco.MjData, index: int) -> Rotor
         and model.actuator_biastype[index] == mujoco.mjtBias.mjBIAS_NONE
         and model.actuator_dyntype[index] == mujoco.mjtDyn.mjDYN_NONE
     )
+    forces = model.actuator_ctrlrange[index] * model.actuator_gainprm[index, 0]
+    limited = np.clip(forces, *model.actuator_forcerange[index])
     fault = ""
     if not at_site or model.body_rootid[model.site_bodyid[site]] != model.jnt_bodyid[0]:
         fault = f"rotor {name} to be an actuator at a site of the body, got another"
@@ -398,6 +400,8 @@ def _read_rotor(model: mujoco.MjModel, data: mujoco.MjData, index: int) -> Rotor
         fault = f"rotor {name} to have a force (gear times gain), got 0 N"
     elif not model.actuator_ctrllimited[index]:
         fault = f"rotor {name} to have a thrust with limits (ctrlrange), got none"
+    elif model.actuator_forcelimited[index] and (limited != forces).any():
+        fault = f"rotor {name} to have no forcerange within its ctrlrange, got one"
     if fault:
         raise InputError(f"vehicle: expected {fault}")
     turn = data.site_xmat[site].reshape(3, 3)

@@ -99,10 +99,10 @@ PAIR = '<contact><pair geom1="hub" geom2="arm1"/></contact></mujoco>'
 
 BROKEN: Final[dict[str, tuple[Edit, str]]] = {
     "yaw signs in the pattern of roll": (
-        reactions(0.05, -0.05, -0.05, 0.05), "allocation: yaw apart from roll"),
+        reactions(0.05, -0.05, -0.05, 0.05), "allocation: torques apart from each other"),
     "yaw signs in the pattern of pitch": (
-        reactions(0.05, 0.05, -0.05, -0.05), "allocation: yaw apart from pitch"),
-    "no reactions": (reactions(0, 0, 0, 0), "allocation: rank"),
+        reactions(0.05, 0.05, -0.05, -0.05), "allocation: torques apart from each other"),
+    "no reactions": (reactions(0, 0, 0, 0), "allocation: torques apart from each other"),
     "one reaction of the wrong sign": (
         reactions(0.05, -0.05, 0.05, 0.05), CARRY),
     "one reaction ten times too large": (
@@ -131,7 +131,7 @@ BROKEN: Final[dict[str, tuple[Edit, str]]] = {
         "rotor1 to have a thrust with limits"),
     "rotors that give less than they are asked for": (
         replace(('ctrlrange="0 100"', 'ctrlrange="0 100" forcelimited="true" forcerange="0 80"')),
-        "effect of rotor1: error per newton"),
+        "rotor1 to have no forcerange within its ctrlrange"),
     "too weak to hover": (
         replace(('ctrlrange="0 100"', 'ctrlrange="0 45"')), SHARE),
     "thrust in millinewtons": (
