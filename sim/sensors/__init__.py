@@ -20,7 +20,7 @@ from .barometer import Barometer
 from .base import Sensor, Source, Values
 from .estimator import Estimator
 from .imu import Imu
-from .simple import FIELD, Gps, Magnetometer, MotionCapture, Rangefinder
+from .simple import Gps, Magnetometer, MotionCapture, Rangefinder
 
 __all__ = ["SENSOR_TYPES", "Estimator", "Sensors", "checked_sensors", "readings_of"]
 
@@ -108,9 +108,7 @@ class Sensors(Kept):
         settings = _resolved(sensors, world.vehicle, period)
         self._estimator = None
         if _ESTIMATE in sensors:
-            altitude = settings.get("barometer", {}).get("altitude", 0.0)
-            field = settings.get("magnetometer", {}).get("field", FIELD)
-            self._estimator = Estimator(period, world.vehicle.gravity, altitude, field)
+            self._estimator = Estimator(period, world.vehicle.gravity)
         self._sensors = {
             name: SENSOR_TYPES[name](values, period, world) for name, values in settings.items()
         }

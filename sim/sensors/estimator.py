@@ -29,8 +29,6 @@ class Estimator(Source):
     Args:
         interval: Time of a step, s.
         gravity: m/s².
-        altitude: Height of the ground above sea level, m.
-        field: Earth's magnetic field, world frame, µT, shape (3,).
     """
 
     name = "estimate"
@@ -40,13 +38,9 @@ class Estimator(Source):
     units = ("m",) * 3 + ("m/s",) * 3 + ("1",) * 4 + ("rad/s",) * 3
     top = (FURTHEST,) * 3 + (MAX_SPEED,) * 3 + (UNIT,) * 4 + (2 * MAX_SPEED,) * 3
 
-    def __init__(
-        self, interval: float, gravity: float, altitude: float, field: tuple[float, ...]
-    ) -> None:
+    def __init__(self, interval: float, gravity: float) -> None:
         self.interval = interval
         self._gravity = gravity
-        self._altitude = altitude
-        self._north = math.atan2(field[1], field[0])
         self.position: Array = 0.0
         self.velocity: Array = 0.0
         self.quaternion: Array = 0.0
@@ -81,8 +75,9 @@ class Estimator(Source):
         share = 1 - math.exp(-self.interval / TIME)
         angle = share / self._gravity * stack(cross(parts_of(force), parts_of(up)))
         if sensor := sensors.get("magnetometer"):
+            east, north, _ = sensor.values["field"]
             field = to_world(self.quaternion, sensor.value)
-            off = self._north - np.atan2(component(field, 1), component(field, 0))
+            off = math.atan2(north, east) - np.atan2(component(field, 1), component(field, 0))
             off = np.atan2(np.sin(off), np.cos(off)) * self._gain(sensor)
             angle = angle + each(off) * up
         if sensor := sensors.get("motion_capture"):
@@ -96,7 +91,7 @@ class Estimator(Source):
     ) -> tuple[Array, Array]:
         """Position and velocity, corrected by fresh readings."""
         if sensor := sensors.get("barometer"):
-            off = component(sensor.value, 0) - self._altitude - component(position, 2)
+            off = component(sensor.value, 0) - sensor.values["altitude"] - component(position, 2)
             g, h = self._gains(sensor)
             position = position + each(g * off) * _UP
             velocity = velocity + each(h * off) * _UP

@@ -410,7 +410,7 @@ def half_life(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def estimator(**state: Any) -> Estimator:
-    made = Estimator(PERIOD, 10.0, 100.0, (0.0, 20.0, -40.0))
+    made = Estimator(PERIOD, 10.0)
     start = {"position": (0, 0, 0), "velocity": (0, 0, 0), "quaternion": LEVEL, **state}
     exact: Any = SimpleNamespace(**{k: np.array(v, float) for k, v in start.items()})
     made.begin(np.True_, exact, np.zeros(6))
@@ -418,7 +418,8 @@ def estimator(**state: Any) -> Estimator:
 
 
 def channel(*value: float, fresh: bool = True) -> Any:
-    return SimpleNamespace(value=np.array(value), fresh=fresh, interval=PERIOD)
+    values = {"altitude": 100.0, "field": (0.0, 20.0, -40.0)}
+    return SimpleNamespace(value=np.array(value), fresh=fresh, interval=PERIOD, values=values)
 
 
 def angles_of(quaternion: np.ndarray) -> np.ndarray:
