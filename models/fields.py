@@ -211,7 +211,7 @@ def check_fields(instance: object, where: str = "", error: type[InputError] = In
         object.__setattr__(instance, name, value)
 
 
-def read_table(kind: type[T], table: object, where: str, error: type[InputError] = InputError) -> T:
+def read_table(kind: type[T], table: object, where: str) -> T:
     """An instance of a dataclass from its fields by name, as TOML and JSON have them.
 
     Names of fields stand behind `where` and a dot. Unknown, missing and wrong fields raise.
@@ -219,29 +219,27 @@ def read_table(kind: type[T], table: object, where: str, error: type[InputError]
     known = {one.name: one for one in fields(kind) if one.init}  # type: ignore[arg-type]
     if not isinstance(table, Mapping):
         names = ", ".join(known)
-        raise error(f"{where}: expected values by name ({names}), got {shortened(table)}")
-    check_names(table, known, where, error)
+        raise InputError(f"{where}: expected values by name ({names}), got {shortened(table)}")
+    check_names(table, known, where)
     rules = rules_of(kind)
     values = {}
     for name, one in known.items():
         if name in table:
             value = table[name]
             if name in rules:
-                value = check(f"{where}.{name}", rules[name], value, error)
+                value = check(f"{where}.{name}", rules[name], value)
             values[name] = value
         elif one.default is MISSING and one.default_factory is MISSING:
-            raise error(f"{where}: expected {name}, got none")
+            raise InputError(f"{where}: expected {name}, got none")
     return kind(**values)
 
 
-def check_names(
-    table: Iterable[str], known: Iterable[str], where: str, error: type[InputError] = InputError
-) -> None:
-    """Raise the error for the first name that is not known."""
+def check_names(table: Iterable[str], known: Iterable[str], where: str) -> None:
+    """Raise `InputError` for the first name that is not known."""
     names = list(known)
     for name in table:
         if name not in names:
-            raise error(f"{where}: expected some of {', '.join(names)}, got {shortened(name)}")
+            raise InputError(f"{where}: expected some of {', '.join(names)}, got {shortened(name)}")
 
 
 def optional(low: float, high: float, unit: str, count: int = 1) -> Any:
