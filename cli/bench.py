@@ -24,7 +24,7 @@ class Bench(Command):
         from rich.console import Console
         from rich.table import Table
 
-        from ..training.bench import RATIOS, bench
+        from ..training.bench import LAYERS, bench
         from ._progress import bars
         from ._training import folder_to_write
 
@@ -34,14 +34,12 @@ class Bench(Command):
             def on_layer(name: str, turn: int, turns: int) -> None:
                 progress("bench", turn, turns, name)
 
-            layers = bench(self.rounds, self.seconds, folder, on_layer)
+            medians = bench(self.rounds, self.seconds, folder, on_layer)
             progress("bench", 1, 1, "done")
         rates = Table("layer", "what", "env steps/s", "µs per env step", box=SIMPLE_HEAD)
-        for one in layers:
-            rates.add_row(one.name, one.about, f"{one.rate:,.0f}", f"{1e6 / one.rate:.2f}")
-        ratios = Table("ratio", "median", "target", box=SIMPLE_HEAD)
-        for ratio in RATIOS:
-            ratios.add_row(ratio.name, f"{ratio.value(layers):.2f}", ratio.target)
-        Console().print(rates, ratios)
+        for layer in LAYERS:
+            rate = medians[layer.name]
+            rates.add_row(layer.name, layer.about, f"{rate:,.0f}", f"{1e6 / rate:.2f}")
+        Console().print(rates)
         print(f"written: {folder / 'bench.json'}")
         return 0
