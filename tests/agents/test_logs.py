@@ -263,7 +263,7 @@ def test_a_bar_tells_everything_on_80_columns() -> None:
     (line,) = drawn(bars, 80)
     assert len(line) <= 80
     assert re.fullmatch(
-        r"sb3-a2c seed 0 ━[━╸╺ ]{4,} 102\.4k/200k 5,120/s 0:20, 0:20 left "
+        r"sb3-a2c seed 0 ━[━╸╺ ]{4,} 102,400/200,000 0:00:20 0:00:20 "
         r"return 224, \|E\| 0\.02 m",
         line.rstrip(),
     )
@@ -284,40 +284,14 @@ def test_no_bar_is_wider_than_its_terminal(width: int) -> None:
     assert [line.split()[0][:2] for line in lines] == ["sb", "vp", "a2"]
 
 
-def test_lines_come_every_ten_seconds_with_the_same_figures(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_lines_come_every_ten_seconds(capsys: pytest.CaptureFixture[str]) -> None:
     clock = Clock()
     fly(Lines(clock), clock, "a2c seed 0", 25)
     assert capsys.readouterr().out.splitlines() == [
-        "a2c seed 0     0/200k 0:00 return 224, |E| 0.02 m",
-        "a2c seed 0     51,200/200k 5,120/s 0:10, 0:30 left return 224, |E| 0.02 m",
-        "a2c seed 0     102.4k/200k 5,120/s 0:20, 0:20 left return 224, |E| 0.02 m",
+        "a2c seed 0     0/200,000 return 224, |E| 0.02 m",
+        "a2c seed 0     51,200/200,000 return 224, |E| 0.02 m",
+        "a2c seed 0     102,400/200,000 return 224, |E| 0.02 m",
     ]
-
-
-def test_what_was_flown_before_a_resume_is_no_rate(capsys: pytest.CaptureFixture[str]) -> None:
-    clock = Clock()
-    lines = Lines(clock)
-    lines("a2c seed 0", 150_000, 200_000, "")
-    clock.now += 10.0
-    lines("a2c seed 0", 160_000, 200_000, "")
-    assert capsys.readouterr().out.splitlines()[1] == (
-        "a2c seed 0     160k/200k 1,000/s 0:10, 0:40 left"
-    )
-
-
-def test_the_rate_is_that_of_the_last_seconds(capsys: pytest.CaptureFixture[str]) -> None:
-    clock = Clock()
-    lines = Lines(clock)
-    done = 0
-    for second in range(4000):
-        lines("a2c seed 0", done, 10_000_000, "")
-        done += 1000 if second < 3970 else 500
-        clock.now += 1.0
-    lines("a2c seed 0", done, 10_000_000, "")
-    *_, last = capsys.readouterr().out.splitlines()
-    assert " 500/s 1h06m, 3h20m left" in last
 
 
 def test_a_run_that_is_done_says_so(capsys: pytest.CaptureFixture[str]) -> None:
@@ -326,7 +300,7 @@ def test_a_run_that_is_done_says_so(capsys: pytest.CaptureFixture[str]) -> None:
     lines("vpg seed 1", 0, 60, "simulate")
     clock.now += 2.0
     lines("vpg seed 1", 60, 60, "done")
-    assert capsys.readouterr().out.splitlines()[-1] == "vpg seed 1     60/60 0:02 done"
+    assert capsys.readouterr().out.splitlines()[-1] == "vpg seed 1     60/60 done"
     bars = Bars(Console(width=80, file=io.StringIO(), force_terminal=True), clock)
     bars("vpg seed 1", 60, 60, "done")
     assert drawn(bars, 80) == [], "it makes room"
