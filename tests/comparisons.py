@@ -14,7 +14,7 @@ from rotorgram.training.metrics import (
     settling_time,
     steady_state,
 )
-from rotorgram.training.results import join_parts, write_config, write_part
+from rotorgram.training.results import write_config, write_run
 from rotorgram.training.settings import Row, Study
 
 PERIOD = 0.05
@@ -83,8 +83,7 @@ def synthetic_folder(
         times = {"env_steps": marks[-1], "seconds": marks[-1] / 2500, "steps_per_second": rate}
         named = evaluations.assign(row=row.name, seed=seed)
         tables["runs"] = pd.DataFrame([times | measure_run(named, HEADLINE)])
-        write_part(folder, row, seed, tables)
-    join_parts(folder)
+        write_run(folder, row, seed, tables)
     return folder
 
 
@@ -131,7 +130,7 @@ def _evaluated(
             rewards = 1 - sizes
             rows.append({
                 "env_steps": mark, "seconds": mark / 2500, "episode": episode, "length": length,
-                "return": float(rewards.sum()), "start": float(errors[0]),
+                "return": float(rewards.sum()),
                 "steady": steady_state(sizes), "overshoot": overshoot(errors),
                 "settling_time": settling_time(errors, PERIOD, 0.05), "terminated": False,
             })  # fmt: skip

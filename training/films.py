@@ -9,7 +9,6 @@ from ..flights.filming import Film, FilmTrack, OnFrame, film
 from ..flights.trajectories import flown_trajectories
 from ..models.errors import InputError
 from ..rendering import Camera
-from .metrics import shown_runs
 from .results import Results, checkpoint_file
 from .settings import Row
 from .tables import row_label
@@ -18,7 +17,7 @@ from .tables import row_label
 def film_study(results: Results, out: Path, on_frame: OnFrame = lambda *_: None) -> None:
     """Film the rows of a study of one task: the same episode, side by side.
 
-    `metrics.shown_runs` says which seeds and which episode.
+    It shows the first seed of each row and the first episode: none is chosen.
 
     Raises:
         NoOpenGL: No OpenGL works here.
@@ -34,18 +33,20 @@ def film_study(results: Results, out: Path, on_frame: OnFrame = lambda *_: None)
     camera: Camera = "top" if env.drones > 1 else "front"  # no craft hides another
     vehicle = ",".join(env.vehicle) or None
     config = Film(height=400, camera=camera, fast=True, quality=27, vehicle=vehicle)
-    seeds, episode = shown_runs(results.runs, results.evaluations, results.headline(rows[0]))
-    tracks = [_track(results, row, seeds[row.name], episode) for row in rows if row.name in seeds]
+    runs = results.runs
+    done = set(runs["row"][runs["seed"] == results.study.first_seed])
+    tracks = [_track(results, row) for row in rows if row.name in done]
     film(out, tracks, config, on_frame)
 
 
-def _track(results: Results, row: Row, seed: int, episode: int) -> FilmTrack:
+def _track(results: Results, row: Row) -> FilmTrack:
     policy: Policy
     name = row_label(row)
+    seed = results.study.first_seed
     if row.controller:
         policy = CONTROLLERS[row.agent](results.specs[row.name])
     else:
         policy = load(checkpoint_file(results.folder, row, seed)).policy()
         name += f", seed {seed}"
-    flown = flown_trajectories(policy, row.env, [episode], results.study.evaluation, seed)
+    flown = flown_trajectories(policy, row.env, [0], results.study.evaluation, seed)
     return FilmTrack(name=name, trajectories=flown, drones=row.env.drones)

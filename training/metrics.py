@@ -165,7 +165,6 @@ def measure_episode(trajectory: Trajectory, headline: Headline) -> dict[str, flo
         "episode": trajectory.episode,
         "length": len(trajectory),
         "return": float(trajectory.rewards.sum()),
-        "start": float(values[0]),
         "steady": steady,
         "settling_time": settled,
         "overshoot": overshoot(values) if headline.signed else math.nan,
@@ -287,21 +286,3 @@ def spread_over_seeds(curves: Sequence[Curve], grid: Floats | None = None) -> Sp
     ends = (0.25, 0.75) if len(curves) >= 4 else (0.0, 1.0)
     low, high = np.quantile(values, ends, axis=0)
     return Spread(x, trimmed_mean(values, axis=0), low, high)
-
-
-def shown_runs(
-    runs: pd.DataFrame, evaluations: pd.DataFrame, headline: Headline
-) -> tuple[dict[str, int], int]:
-    """A seed of each row, and an episode.
-
-    Of a row's seeds the middle one, by the steady state in the final evaluation (of an even number
-    the better of the two in the middle); of the episodes of that evaluation the one that starts
-    furthest from its goal.
-    """
-    seeds = {}
-    for row, own in runs.groupby("row", sort=False):
-        order = own.sort_values("steady", ascending=not headline.high, kind="stable")
-        seeds[str(row)] = int(order["seed"].iloc[(len(order) - 1) // 2])
-    shown = final_evaluations(evaluations)
-    starts = headline.size(shown["start"].to_numpy())
-    return seeds, int(shown["episode"].iloc[int(np.argmax(starts))])

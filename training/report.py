@@ -1,4 +1,4 @@
-"""The report of a study: figures, a page, the table as CSV and Markdown, the verdicts as JSON.
+"""The report of a study: figures, a page, tables as CSV and Markdown, the verdicts as JSON.
 
 All of it is written from the study's files, into the study's folder; the page refers to nothing
 outside itself.
@@ -35,6 +35,7 @@ def write_report(results: Results, page: Path | None = None) -> pd.DataFrame:
     folder = results.folder
     table = results_table(results)
     table.to_csv(folder / "results.csv")
+    results.runs.to_csv(folder / "runs.csv", index=False)
     verdicts = judge(results)
     claims = _claims(verdicts)
     text = _head(results) + markdown(results, table) + claims

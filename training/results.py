@@ -1,23 +1,23 @@
 """The files of a study: their names and columns, writing and reading them.
 
 A study writes one folder. Everything that is drawn, tabulated or judged is read back from it.
+`config.json` has the study, the spec of each row's env, versions and machine. Each table is a
+folder with a Parquet file for each run, that is row and seed; `pandas.read_parquet` reads it whole.
 
-| file | one row per |
+| table | one row per |
 |---|---|
-| `config.json` | (the study, the spec of each row's env, versions and machine) |
-| `runs.csv` | run, that is row and seed: `metrics.measure_run` and the times of its training |
-| `evaluations.parquet` | deterministic evaluation episode of a policy snapshot |
-| `episodes.parquet` | training episode |
-| `steps.parquet` | env step of training and of the final evaluation, if the study keeps steps |
+| `runs` | run: `metrics.measure_run` and the times of its training |
+| `evaluations` | deterministic evaluation episode of a policy snapshot |
+| `episodes` | training episode |
+| `steps` | env step of training and of the final evaluation, if the study keeps steps |
 
-An unfinished study has a folder `parts` with a folder for each run that is done. All tables begin
-with the columns `row` and `seed`. A size or value is that of the row's headline metric.
+All tables begin with the columns `row` and `seed`. A size or value is that of the row's headline
+metric.
 """
 
 import json
 import os
 import platform
-import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -37,7 +37,6 @@ from .metrics import Headline
 from .settings import Row, Study
 
 CONFIG_FILE = "config.json"
-PARTS = "parts"
 CHECKPOINTS = "checkpoints"
 
 COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
@@ -50,7 +49,6 @@ COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
         "row", "seed",
         "env_steps", "seconds",  # of training behind the snapshot; s of wall time
         "episode", "length", "return",
-        "start",  # the metric before the first step
         "steady",  # mean size in the last quarter
         "settling_time",  # s; missing if the error never settled
         "overshoot",  # missing if the metric has no sign
@@ -78,8 +76,6 @@ COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
 `evaluations` may have more, of what was drawn, and `runs` has `least_distance`, m,
 where a world has several drones.
 """
-
-_COUNTS = ("seed", "env_steps", "episodes", "settled", "crashed", "held")
 
 Tables = Mapping[str, pd.DataFrame]
 """Tables by name."""
@@ -130,44 +126,21 @@ def checkpoint_file(folder: Path, row: Row, seed: int) -> Path:
     return folder / CHECKPOINTS / f"{part_name(row, seed)}.safetensors"
 
 
-def write_part(folder: Path, row: Row, seed: int, tables: Tables) -> None:
-    """Write what one run gave: a folder that is there whole or not at all."""
-    part = folder / PARTS / part_name(row, seed)
-    unfinished = part.with_name(f".{part.name}")
-    unfinished.mkdir(parents=True)
-    for name, table in tables.items():
-        named = table.drop(columns=["row", "seed"], errors="ignore")
-        named.insert(0, "row", row.name)
-        named.insert(1, "seed", seed)
-        named.to_parquet(unfinished / f"{name}.parquet", index=False, compression="zstd")
-    unfinished.rename(part)
+def run_file(folder: Path, row: Row, seed: int, table: str = "runs") -> Path:
+    """File of a run in a table. A run is done when the table `runs` has it."""
+    return folder / table / f"{part_name(row, seed)}.parquet"
 
 
-def join_parts(folder: Path) -> None:
-    """Make the tables of a study out of the parts of its runs, and remove these."""
-    parts = folder / PARTS
-    for name in COLUMNS:
-        files = _parts_of(folder, name)
-        if not files:
-            continue
-        if name == "runs":
-            write_whole(folder / "runs.csv", _concatenated(files).to_csv(index=False).encode())
-            continue
-        schema = pa.unify_schemas([pq.read_schema(file).remove_metadata() for file in files])
-        with pq.ParquetWriter(folder / f"{name}.parquet", schema, compression="zstd") as writer:
-            for file in files:
-                parted = [schema.empty_table(), pq.read_table(file)]  # it may lack columns
-                writer.write_table(pa.concat_tables(parted, promote_options="permissive"))
-    # Whole or not at all: a half-removed part would look like one to resume from.
-    shutil.rmtree(parts.rename(parts.with_name(f".{PARTS}")))
-
-
-def _parts_of(folder: Path, name: str) -> list[Path]:
-    return sorted((folder / PARTS).glob(f"[!.]*/{name}.parquet"))
-
-
-def _concatenated(files: list[Path]) -> pd.DataFrame:
-    return pd.concat([pd.read_parquet(file) for file in files], ignore_index=True)
+def write_run(folder: Path, row: Row, seed: int, tables: Tables) -> None:
+    """Write what one run gave; the table `runs` last."""
+    for name in reversed(COLUMNS):
+        if name in tables:
+            table = tables[name].drop(columns=["row", "seed"], errors="ignore")
+            table.insert(0, "row", row.name)
+            table.insert(1, "seed", seed)
+            file = run_file(folder, row, seed, name)
+            file.parent.mkdir(exist_ok=True)
+            write_whole(file, table.to_parquet(index=False, compression="zstd"))
 
 
 # ---- reading
@@ -213,15 +186,13 @@ class Results:
     @property
     def finished(self) -> bool:
         """Whether all runs are done."""
-        return not (self.folder / PARTS).exists() and (self.folder / "runs.csv").exists()
+        return len(self.runs) == len(self.study.runs())
 
     @cached_property
     def runs(self) -> pd.DataFrame:
         """Of the runs that are done, in the order of the rows and seeds."""
-        path = self.folder / "runs.csv"
-        runs = _read_csv(path) if path.exists() else self._table("runs")
         order = {row.name: place for place, row in enumerate(self.study.rows)}
-        return runs.sort_values(
+        return self._table("runs").sort_values(
             ["row", "seed"], key=lambda values: values.map(order).fillna(values), ignore_index=True
         )
 
@@ -254,37 +225,20 @@ class Results:
         return frame
 
     def _files(self, name: str) -> list[Path]:
-        path = self.folder / f"{name}.parquet"
-        return [path] if path.exists() else _parts_of(self.folder, name)
+        return sorted((self.folder / name).glob("*.parquet"))
 
     def _table(self, name: str) -> pd.DataFrame:
         files = self._files(name)
         if not files:
             return pd.DataFrame(columns=list(COLUMNS[name]))
         try:
-            table = _concatenated(files)
+            table = pd.concat(map(pd.read_parquet, files), ignore_index=True)
         except pa.ArrowInvalid as error:
-            raise ResultsError(f"{files[0]}: expected a Parquet file: {error}") from None
-        _check_columns(files[0], name, list(table.columns))
+            raise ResultsError(f"{files[0].parent}: expected Parquet files: {error}") from None
+        missing = [column for column in COLUMNS[name] if column not in table]
+        if missing:
+            raise ResultsError(
+                f"{files[0].parent}: expected the columns {', '.join(COLUMNS[name])}, "
+                f"got no {', '.join(missing)}"
+            )
         return table
-
-
-def _read_csv(path: Path) -> pd.DataFrame:
-    try:
-        text = pd.read_csv(path, dtype=str)
-        # By way of texts, so that every number keeps its bits.
-        types = {name: int if name in _COUNTS else float for name in text.columns[1:]}
-        runs = text.astype(types)
-    except ValueError as error:  # an empty file, or a value that is not of the column's type
-        raise ResultsError(f"{path}: expected the runs of a study: {error}") from None
-    _check_columns(path, "runs", list(runs.columns))
-    return runs
-
-
-def _check_columns(path: Path, name: str, present: list[str]) -> None:
-    missing = [column for column in COLUMNS[name] if column not in present]
-    if missing:
-        raise ResultsError(
-            f"{path}: expected the columns {', '.join(COLUMNS[name])}, got one without "
-            f"{', '.join(missing)}"
-        )

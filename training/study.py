@@ -1,7 +1,6 @@
 """A study: every row with every seed is trained and evaluated; what is done is kept."""
 
 import math
-import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict, replace
@@ -24,7 +23,7 @@ from ..flights.trajectories import Trajectory, fly_episodes
 from ..udp.spawn import cached_simulator
 from . import results
 from .metrics import Headline, measure_episode, measure_run
-from .results import CONFIG_FILE, PARTS
+from .results import CONFIG_FILE
 from .settings import Row, Study
 from .training import Snapshot, Training
 
@@ -51,8 +50,8 @@ def run_study(
 ) -> None:
     """Train and evaluate everything, and write the results into `folder`.
 
-    Each run leaves a part behind when it is done, so that a study that was interrupted, or of which
-    a run failed, goes on where it was: call it again with the same folder and study. `report` draws
+    Each run is written when it is done, so that a study that was interrupted, or of which a run
+    failed, goes on where it was: call it again with the same folder and study. `report` draws
     figures, table and verdicts.
 
     Args:
@@ -63,28 +62,23 @@ def run_study(
         workers: Kind and number of workers; by default one for each core.
 
     Raises:
-        RunsFailed: Some runs failed; the others are done, and their parts kept.
+        RunsFailed: Some runs failed; the others are done and kept.
         InputError: Another process writes to the folder, or there is no such Ray cluster; nothing
             is written.
     """
-    parts = folder / PARTS
     jobs = {
         name: (_with_files(row), seed)
         for name, (row, seed) in study.runs().items()
-        if not (parts / results.part_name(row, seed)).exists()
+        if not results.run_file(folder, row, seed).exists()
     }
     config = workers or WorkersConfig()
     with open_executor(config, len(jobs), on_progress) as executor, locked(folder):
-        parts.mkdir(exist_ok=True)
         if not (folder / CONFIG_FILE).exists():  # a resumed study keeps its settings
             specs = {row.name: env_spec(row.env) for row in study.rows}
             results.write_config(folder, command, study, specs)
-        for unfinished in parts.glob(".*"):
-            shutil.rmtree(unfinished)
         own_tasks = {row.env.own_task for row in study.rows if row.env.own_task}
         fly = partial(_fly, study, own_tasks)
         run_jobs(executor, fly, jobs, partial(_keep, study, folder), on_progress)
-        results.join_parts(folder)
 
 
 def _with_files(row: Row) -> Row:
@@ -94,14 +88,14 @@ def _with_files(row: Row) -> Row:
 
 
 def _keep(study: Study, folder: Path, job: Job, done: Done) -> None:
-    """Write checkpoint and part; the part last, for with it the run is done."""
+    """Write checkpoint and tables; these last, for with them the run is done."""
     row, seed = job
     checkpoint = done.checkpoint
     if study.kind == "benchmark" and checkpoint:  # none is chosen: the first seed's policy
         checkpoint = checkpoint.policy_alone() if seed == study.first_seed else None
     if checkpoint and study.kind != "sweep":
         store(checkpoint, results.checkpoint_file(folder, row, seed))
-    results.write_part(folder, row, seed, done.tables)
+    results.write_run(folder, row, seed, done.tables)
 
 
 # ---- in a worker

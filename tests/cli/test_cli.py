@@ -793,7 +793,7 @@ def test_an_interrupted_comparison_goes_on(tmp_path: Path, capsys: Capsys) -> No
         "--snapshots", 1, "--episodes", 1, "--jobs", 2,
     )  # fmt: skip
     deadline = time.monotonic() + 100
-    while not list((folder / "parts").glob("vpg-seed*")):
+    while not list((folder / "runs").glob("vpg-seed*")):
         assert time.monotonic() < deadline
         assert process.poll() is None
         time.sleep(0.05)
@@ -806,7 +806,7 @@ def test_an_interrupted_comparison_goes_on(tmp_path: Path, capsys: Capsys) -> No
     output(capsys, "compare", "--resume", folder, "--jobs", 1, "--no-film")
     runs = Results.read(folder).runs
     assert runs[runs.row == "vpg"].seed.tolist() == [0, 1, 2]
-    assert not (folder / "parts").exists()
+    assert len(list((folder / "runs").iterdir())) == len(runs)
     assert "is finished" in refused(capsys, "compare", "--resume", folder)
 
 

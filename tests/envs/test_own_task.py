@@ -164,7 +164,7 @@ def test_agents_are_compared_on_it(here: Path) -> None:
     words += ["--episodes", "1", "--snapshots", "1", "--no-film", "--out", "comparison"]
     rotorgram(here, "compare", *words)
     assert (here / "comparison" / "report.html").is_file()
-    evaluations = pd.read_parquet(here / "comparison" / "evaluations.parquet")
+    evaluations = pd.read_parquet(here / "comparison" / "evaluations")
     assert set(evaluations["env_steps"]) == {0, 2048}
     assert evaluations["steady"].notna().all()
     assert "| Steady h (m) |" in (here / "comparison" / "results.md").read_text()

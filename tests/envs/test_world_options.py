@@ -186,7 +186,7 @@ def test_evaluations_of_a_comparison_tell_what_was_drawn(tmp_path: Path) -> None
     words += ["--jobs", "1", "--episode-length", "50", "--no-film"]
     words += ["--randomize", "mass=uniform(0.9,1.1)", "--out", str(tmp_path / "c")]
     assert main(["compare", *words]) == 0
-    drawn = pd.read_parquet(tmp_path / "c" / "evaluations.parquet")["drawn_mass"]
+    drawn = pd.read_parquet(tmp_path / "c" / "evaluations")["drawn_mass"]
     assert len(drawn) > 3
     assert drawn.between(0.9, 1.1).all()
     assert drawn.nunique() > 1

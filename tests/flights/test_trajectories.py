@@ -104,7 +104,6 @@ def test_a_trajectory_is_what_the_env_tells() -> None:
     row = measure_episode(flown, Headline.of(SPEC))
     assert row["episode"] == 3
     assert row["length"] == 25
-    assert row["start"] == errors[0]
     # A quarter of 25 steps is 6.
     assert row["steady"] == pytest.approx(np.mean(np.abs(errors[-6:])), rel=1e-12)
     assert row["return"] == pytest.approx(sum(rewards), rel=1e-12)

@@ -26,7 +26,7 @@ from rotorgram.flights.recorded import recorded_trajectories
 from rotorgram.flights.trajectories import flown_trajectories
 from rotorgram.rendering import NoOpenGL
 from rotorgram.training.films import film_study
-from rotorgram.training.results import COLUMNS, Results, write_config, write_part
+from rotorgram.training.results import COLUMNS, Results, write_config, write_run
 from rotorgram.training.settings import Row, Study
 
 
@@ -284,7 +284,7 @@ def comparison(training: Path, tmp_path: Path) -> Results:
         for name in ("evaluations", "runs"):
             tables[name] = pd.DataFrame(0.0, index=[0], columns=list(COLUMNS[name][2:]))
         tables["evaluations"]["episode"] = 0
-        write_part(folder, row, 0, tables)
+        write_run(folder, row, 0, tables)
     return Results.read(folder)
 
 
@@ -297,7 +297,7 @@ def test_the_film_of_a_comparison_shows_its_agents(comparison: Results, opengl: 
     right = frames[0][:, 641:].astype(int)
     assert abs(left[100:300] - right[100:300]).mean() < 8  # they start alike
     names = sorted(path.name for path in comparison.folder.iterdir())
-    assert names == ["checkpoints", "config.json", "parts", "video.mp4"]
+    assert names == ["checkpoints", "config.json", "evaluations", "runs", "video.mp4"]
 
 
 def test_a_comparison_without_opengl_has_no_film(comparison: Results, no_egl: None) -> None:

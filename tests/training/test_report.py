@@ -26,7 +26,6 @@ from rotorgram.training.figures import (
     trajectories,
     value_fan,
 )
-from rotorgram.training.metrics import shown_runs
 from rotorgram.training.report import VIDEO_FILE, write_report
 from rotorgram.training.results import COLUMNS, Results, write_config
 from rotorgram.training.settings import Row, Study
@@ -68,7 +67,8 @@ def made_up(
     """The folder of a study with these runs."""
     specs = {row.name: spec or spec_of() for row in study.rows}
     write_config(folder, "rotorgram compare", study, specs)
-    pd.concat(runs).to_csv(folder / "runs.csv", index=False)
+    (folder / "runs").mkdir(exist_ok=True)
+    pd.concat(runs).to_parquet(folder / "runs" / "all.parquet")
     return Results.read(folder)
 
 
@@ -249,12 +249,11 @@ def test_verdicts_and_tables_are_files(comparison: Path) -> None:
     claims = json.loads((comparison / "claims.json").read_text())
     assert len(claims) == 5
     assert {claim["verdict"] for claim in claims} == {"undecided"}  # three seeds decide nothing
-    assert pd.read_csv(comparison / "results.csv")["row"].tolist() == [
-        "vpg",
-        "a2c",
-        "sb3-a2c",
-        "pid",
-    ]
+    rows = pd.read_csv(comparison / "results.csv")["row"].tolist()
+    assert rows == ["vpg", "a2c", "sb3-a2c", "pid"]
+    runs = pd.read_csv(comparison / "runs.csv")
+    assert runs["row"].unique().tolist() == rows
+    assert len(runs) == 12
     text = (comparison / "results.md").read_text(encoding="utf-8")
     assert text.startswith("# Results\n\n```sh\nrotorgram compare --seeds 3 <folder>\n```\n")
     assert "Seeds 0 to 2; 67 evaluation episodes each;" in text
@@ -306,13 +305,6 @@ def test_the_least_distance_is_that_of_all_episodes_while_both_fly() -> None:
     assert least_distance([*apart, *near]) == 2.0
 
 
-def test_the_middle_seed_and_the_furthest_start_are_shown() -> None:
-    runs = pd.concat([runs_of("ippo", 0.3, 0.1, 0.2), runs_of("orca", 0.0)])
-    starts = [("ippo", 0, 0, episode, start) for episode, start in enumerate((1.0, -4.0, 2.0))]
-    table = pd.DataFrame(starts, columns=["row", "seed", "env_steps", "episode", "start"])
-    assert shown_runs(runs, table, HEADLINE) == ({"ippo": 2, "orca": 0}, 1)
-
-
 @pytest.fixture(scope="module")
 def swarm(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Results of worlds of two drones, with agents that were compared."""
@@ -320,8 +312,9 @@ def swarm(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rows = tuple(Row(agent=agent, name=agent, env=env) for agent in ("ippo", "mappo"))
     study = Study(rows=rows, seeds=2)
     folder = synthetic_folder(tmp_path_factory.mktemp("swarm") / "results", study=study)
-    runs = pd.read_csv(folder / "runs.csv")
-    runs.assign(least_distance=[0.1, 0.3, 0.2, 0.2]).to_csv(folder / "runs.csv", index=False)
+    files = sorted((folder / "runs").iterdir())
+    for file, distance in zip(files, (0.1, 0.3, 0.2, 0.2), strict=True):
+        pd.read_parquet(file).assign(least_distance=distance).to_parquet(file)
     write_report(Results.read(folder))
     return folder
 
@@ -339,7 +332,7 @@ def test_a_swarm_has_the_least_distance_in_place_of_the_overshoot(swarm: Path) -
     assert [path.name for path in (swarm / "figures").glob("*.svg")] == ["comparison.svg"]
 
 
-def test_the_film_shows_the_middle_seed_of_each_row(
+def test_the_film_shows_the_first_seed_of_each_row(
     swarm: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     filmed: list[object] = []
@@ -353,11 +346,9 @@ def test_the_film_shows_the_middle_seed_of_each_row(
     monkeypatch.setattr(films, "load", lambda path: filmed.append(path.name) or FakePolicy)
     monkeypatch.setattr(films, "flown_trajectories", lambda *_, **__: [])
     results = Results.read(swarm)
-    seeds, _ = shown_runs(results.runs, results.evaluations, HEADLINE)
     films.film_study(results, tmp_path / "film.mp4")
-    files = [f"{row}-seed{seed}.safetensors" for row, seed in seeds.items()]
-    labels = [(f"{row.upper()}, seed {seed}", 2) for row, seed in seeds.items()]
-    assert filmed == [*files, *labels, "top"]
+    files = ["ippo-seed0.safetensors", "mappo-seed0.safetensors"]
+    assert filmed == [*files, ("IPPO, seed 0", 2), ("MAPPO, seed 0", 2), "top"]
 
 
 class FakePolicy:

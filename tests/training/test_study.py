@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from commands import WRONG, Capsys, output, refused, run, start, wait_until, words_of
-from comparisons import study_of, synthetic_folder
+from comparisons import synthetic_folder
 from rotorgram.agents import load, preset
 from rotorgram.cli._flags import parse
 from rotorgram.cli.compare import Compare
@@ -78,8 +78,7 @@ def test_tables_flies_two_hundred_times_or_more() -> None:  # fault 41
 
 def test_files_hold_settings_software_and_every_step(folder: Path) -> None:
     assert sorted(p.name for p in folder.iterdir()) == [
-        ".lock", "checkpoints", "config.json", "episodes.parquet", "evaluations.parquet",
-        "runs.csv", "steps.parquet",
+        ".lock", "checkpoints", "config.json", "episodes", "evaluations", "runs", "steps",
     ]  # fmt: skip
     content = json.loads((folder / "config.json").read_text())
     assert content["command"] == "rotorgram compare"
@@ -153,7 +152,7 @@ def test_ctrl_c_keeps_what_is_done(tmp_path: Path, capsys: Capsys) -> None:
     flags[flags.index("--env-steps") + 1] = "4000"
     process = start("sweep", "vpg", *flags, "--out", folder)
     try:
-        wait_until(lambda: list(folder.glob("parts/gamma*")), process)
+        wait_until(lambda: list(folder.glob("runs/gamma*")), process)
         os.killpg(process.pid, signal.SIGINT)
         out, err = process.communicate(timeout=20)
     finally:
@@ -346,28 +345,16 @@ def test_results_that_are_wrong_are_one_sentence(tmp_path: Path) -> None:
         Results.read(tmp_path)
 
 
-@pytest.mark.parametrize("change", ["text", "empty", "column"])
-def test_runs_that_are_no_runs_are_one_sentence(tmp_path: Path, change: str) -> None:
-    folder = synthetic_folder(tmp_path, study=study_of(("a2c",), 2))
-    text = (folder / "runs.csv").read_text()
-    content = {
-        "text": text.replace("a2c,0,", "a2c,x,"),
-        "empty": "",
-        "column": text.replace("steady", "error"),
-    }
-    (folder / "runs.csv").write_text(content[change])
-    with pytest.raises(ResultsError, match=r"runs\.csv: expected"):
-        _ = Results.read(folder).runs
-
-
 def test_a_table_that_is_no_table_is_one_sentence(tmp_path: Path) -> None:
     folder = synthetic_folder(tmp_path, ("a2c",), 1, 300)
-    (folder / "evaluations.parquet").write_text("nothing")
-    with pytest.raises(ResultsError, match=r"evaluations\.parquet: expected a Parquet file"):
-        _ = Results.read(folder).evaluations
-    pd.DataFrame({"row": ["a2c"]}).to_parquet(folder / "evaluations.parquet")
-    with pytest.raises(ResultsError, match=r"evaluations\.parquet: expected the columns"):
-        _ = Results.read(folder).evaluations
+    for name in ("runs", "evaluations"):
+        (file,) = (folder / name).iterdir()
+        file.write_text("nothing")
+        with pytest.raises(ResultsError, match=f"{name}: expected Parquet files"):
+            getattr(Results.read(folder), name)
+        pd.DataFrame({"row": ["a2c"]}).to_parquet(file)
+        with pytest.raises(ResultsError, match=rf"{name}: expected the columns .*, got no seed, "):
+            getattr(Results.read(folder), name)
 
 
 # ---- what is committed
