@@ -99,15 +99,13 @@ def policy_for(command: EnvFlags, checkpoint: Checkpoint | Controller, spec: Env
     return checkpoint.policy(spec)
 
 
-def pilot_of(command: F, what: str) -> tuple[F, Policy | None, str]:
-    """The command with the env of a policy, the policy (None for `random`) and the agent's name."""
+def pilot_of(command: F, what: str) -> tuple[F, Policy | None]:
+    """The command with the env of a policy, and the policy; None for `random`."""
     if what == "random":
-        return command, None, what
+        return command, None
     checkpoint = load_checkpoint(what)
     command = fitted(command, checkpoint)
-    policy = policy_for(command, checkpoint, env_spec(command.env_config()))
-    agent = what if isinstance(checkpoint, type) else checkpoint.algorithm
-    return command, policy, agent
+    return command, policy_for(command, checkpoint, env_spec(command.env_config()))
 
 
 def words_of(trajectory: Trajectory) -> str:

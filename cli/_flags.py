@@ -190,10 +190,9 @@ def _with_env(
     env_id = found.env or file.get("env", DEFAULT_ENV)
     listens = "listen" in given or getattr(kind, "listen", None) is not None
     if listens and ":" not in env_id and not registry.is_known(env_id):
-        own, words = _own_options(words)
         command = tyro.cli(_for_tyro(kind), prog=prog, args=words)
         check_count("drones", command.drones)
-        return _with_options(command, given, own, file)
+        return _with_options(command, given, {}, file)
     env_id = registry.load(env_id)
     options = _for_tyro(registry.task_type(env_id).Options, f"Options of {env_id}.")
     command = tyro.cli(_for_tyro(kind, options=options), prog=prog, args=words)
@@ -300,23 +299,6 @@ def _given(words: Sequence[str]) -> frozenset[str]:
             prefix, dot, name = flag.rpartition(".")
             names.add(prefix + dot + name.removeprefix("no_"))
     return frozenset(names)
-
-
-def _own_options(words: Sequence[str]) -> tuple[Options, list[str]]:
-    """JSON values of `--env.NAME VALUE` for a task that is not known here, and the other words."""
-    own: Options = {}
-    others = []
-    rest = iter(words)
-    for word in rest:
-        flag, equals, text = word.partition("=")
-        if not flag.startswith("--env."):
-            others.append(word)
-            continue
-        value = text if equals else next(rest, None)  # which may begin with a minus
-        if value is None:
-            raise InputError(f"{flag}: expected a value, got none")
-        own[flag.removeprefix("--env.").replace("-", "_")] = parse_value(value)
-    return own, others
 
 
 def parse_address(text: str) -> tuple[str, int]:

@@ -11,14 +11,14 @@ from ..flights.executors import RunsFailed, WorkersConfig
 from ..flights.folders import FolderBusy
 from ..models.errors import InputError, NoOpenGL, require
 from ._flags import Options, Words
-from ._training import TrainingFlags, folder_to_write
+from ._training import TrainingFlags, folder_to_write, go_on_with
 
 if TYPE_CHECKING:
     from ..envs.config import EnvConfig
     from ..training.results import Results
     from ..training.settings import Row, Study
 
-_RESUMED = ("jobs", "runner", "address", "film", "page")
+_RESUMED = ("jobs", "runner", "address", "film")
 """Flags that a resumed command may be given: they change no number."""
 _OF_ROWS = ("preset", "env_steps", "num_envs", "backend")
 _OF_STUDIES = ("seeds", "first_seed", "snapshots", "episodes")
@@ -41,8 +41,6 @@ class StudyFlags(TrainingFlags, WorkersConfig):
     """Evaluation episodes of each final policy. Default: 200 over all seeds, 20 at least."""
     film: bool = True
     """Whether the agents are filmed side by side for the report, where there is OpenGL."""
-    page: Path | None = None
-    """Markdown page to write besides the report."""
 
     @property
     def words(self) -> str:
@@ -73,11 +71,11 @@ class StudyFlags(TrainingFlags, WorkersConfig):
                 run_study(study, folder, command, progress, workers)
         except BaseException as error:
             if any(folder.iterdir()) and not isinstance(error, FolderBusy):
-                print(self.go_on_with(self.words, folder, "runner", "address"))
+                print(go_on_with(self.words, folder))
             if isinstance(error, RunsFailed):  # the others are reported all the same
-                report(folder, self.page, film=False)
+                report(folder, film=False)
             raise
-        report(folder, self.page, self.film)
+        report(folder, self.film)
         return 0
 
     def _resumed(self, folder: Path) -> "Study":
@@ -136,7 +134,7 @@ class StudyFlags(TrainingFlags, WorkersConfig):
         return replace(row, name=name, env=env, set=changes, **self.given_of_rows())
 
 
-def report(folder: Path, page: Path | None, film: bool) -> None:
+def report(folder: Path, film: bool) -> None:
     """Write figures, film and report from the folder's files, and print the tables."""
     from rich.console import Console
 
@@ -146,16 +144,14 @@ def report(folder: Path, page: Path | None, film: bool) -> None:
 
     results = Results.read(folder)
     video = folder / VIDEO_FILE
-    table = write_report(results, page)
+    table = write_report(results)
     Console(width=100).print(*terminal_tables(results, table))
     # Only now: if the film fails, there is a report.
     if film and results.study.kind in ("paper", "compare") and not video.exists():
         _film(results, video)
         if video.exists():
-            write_report(results, page)
+            write_report(results)
     print(f"{len(results.runs)} of {len(results.study.runs())} runs done")
-    if page:
-        print(f"page: {page}")
     print(f"report: {folder / PAGE_FILE}")
 
 

@@ -3,7 +3,7 @@
 import logging
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from ..envs.rendering import moments
 from ..rendering.live import LiveView, Pace
 from ..rendering.stage import Stage
 from ..udp.protocol.messages import Command
-from ..udp.transport.simulator import Observer, Simulator
+from ..udp.transport.simulator import Simulator
 from ._flags import EnvFlags
 
 if TYPE_CHECKING:
@@ -59,18 +59,6 @@ class Watcher:
         return False
 
 
-class Realtime:
-    """Holds lock-step to real time, by sleeping while the agent thinks: an observer."""
-
-    def __init__(self, control_period: float) -> None:
-        self._pace = Pace(control_period)
-
-    def __call__(self, cause: Command | None) -> None:
-        """Wait until the next step may be taken."""
-        time.sleep(self._pace.wait(time.monotonic()) or 0.0)
-        self._pace.stepped(time.monotonic())
-
-
 def open_view(command: EnvFlags, drones: int, pace: Pace) -> LiveView:
     """A window with the drones of a world; it is open within a `with` block."""
     return LiveView(Stage(command.shown_scene, drones, vehicle=command.vehicle), pace)
@@ -78,19 +66,8 @@ def open_view(command: EnvFlags, drones: int, pace: Pace) -> LiveView:
 
 @contextmanager
 def watched(simulator: Simulator, command: "Sim") -> Iterator[None]:
-    """Show a simulator, or hold it to real time, during the block, as the command says."""
-    observers: list[Observer] = []
-    with ExitStack() as opened:
-        if command.view:
-            view = open_view(command, len(simulator.spec.agents), Pace(0.0))
-            observers.append(Watcher(opened.enter_context(view), simulator))
-            print("shown in the window", flush=True)
-        if command.realtime:
-            observers.append(Realtime(simulator.spec.control_period))
-
-        def observe(cause: Command | None) -> None:
-            for observer in observers:
-                observer(cause)
-
-        simulator.observer = observe
+    """Show a simulator during the block."""
+    with open_view(command, len(simulator.spec.agents), Pace(0.0)) as view:
+        print("shown in the window", flush=True)
+        simulator.observer = Watcher(view, simulator)
         yield

@@ -1,4 +1,4 @@
-"""`rotorgram benchmark`: train and evaluate the rows of the baselines board, and write its page."""
+"""`rotorgram benchmark`: train and evaluate the rows of the baselines board."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Benchmark(StudyFlags):
-    """Train and evaluate agents on tasks with vehicles over the same seeds, and write the page.
+    """Train and evaluate agents on tasks with vehicles over the same seeds, and report them.
 
     Ctrl-C keeps the runs that are done; --resume flies the others.
     """

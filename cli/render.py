@@ -1,7 +1,6 @@
 """`rotorgram render`: flights as films and pictures."""
 
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -46,11 +45,10 @@ class Render(EnvFlags):
     at: float | None = None
     """With a .png: the time of the picture in the first episode, s. Default: its end."""
     overlay: bool = True
-    """Whether time and numbers are on the picture. Of several flights the names always are."""
+    """Whether time and numbers are on the picture. Of several flights the names of their files
+    always are."""
     fast: bool = False
     """Without shadows and smooth edges: several times as fast where software draws."""
-    names: Words = ()
-    """Titles, one for each flight. Default: the policies."""
     session: int | None = None
     """With a journal: which session, from 1, as rotorgram replay counts. Default: the first that
     flew."""
@@ -73,8 +71,7 @@ class Render(EnvFlags):
         found = [self._find(what) for what in self.what]
         vehicles = [vehicle for _, vehicle in found if vehicle]
         config = replace(config, vehicle=next(iter(vehicles), None))
-        names = self.names or _distinct([track.name for track, _ in found])
-        tracks = [replace(track, name=name) for (track, _), name in zip(found, names, strict=True)]
+        tracks = [track for track, _ in found]
         longest = max(track.trajectories[0].seconds for track in tracks)
         if self.at is not None and self.at > longest:
             raise InputError(f"at: expected 0 to {longest:g} s, the flight's end, got {self.at:g}")
@@ -92,10 +89,6 @@ class Render(EnvFlags):
             raise InputError(
                 "what: expected a checkpoint, pid, geometric, random or a journal, got nothing"
             )
-        if self.names and len(self.names) != len(self.what):
-            raise InputError(
-                f"names: expected one for each of {len(self.what)} flights, got {len(self.names)}"
-            )
         if self.episode < 0:
             raise InputError(f"episode: expected 0 or more, got {self.episode}")
         check_count("episodes", self.episodes)
@@ -112,12 +105,12 @@ class Render(EnvFlags):
 
         episodes = range(self.episode, self.episode + self.episodes)
         path = Path(what)
+        name = agent_label(path.stem)
         if path.suffix == ".mcap":
             recorded = recorded_trajectories(path, episodes, session=self.session, drone=self.drone)
-            return FilmTrack(name=path.stem, trajectories=recorded), self.vehicle
-        command, policy, agent = pilot_of(self, what)
+            return FilmTrack(name=name, trajectories=recorded), self.vehicle
+        command, policy = pilot_of(self, what)
         flown = flown_trajectories(policy, command.env_config(), episodes, "final")
-        name = what if what == "random" else agent_label(agent)
         track = FilmTrack(name=name, trajectories=flown, drones=command.drones)
         return track, command.vehicle
 
@@ -129,13 +122,3 @@ def parse_size(text: str) -> tuple[int, int]:
     if min(width, height) < 16 or max(width, height) > 8192:
         raise InputError(f"size: expected WIDTHxHEIGHT of 16 to 8192 pixels each, got {text!r}")
     return width, height
-
-
-def _distinct(names: Sequence[str]) -> list[str]:
-    """The names; equal names get a number."""
-    distinct = []
-    for place, name in enumerate(names):
-        number = names[: place + 1].count(name)
-        is_alone = names.count(name) == 1
-        distinct.append(name if is_alone else f"{name} {number}")
-    return distinct

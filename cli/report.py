@@ -14,8 +14,6 @@ class Report(Command):
 
     folder: Positional[Path]
     """Folder that `rotorgram compare`, `sweep` or `benchmark` wrote."""
-    page: Path | None = None
-    """Markdown page to write besides the report."""
     film: bool = True
     """Whether the agents are filmed, if there is no film yet, where there is OpenGL."""
 
@@ -23,5 +21,5 @@ class Report(Command):
         """Write figures and report from the files, and print the tables."""
         from ._study import report
 
-        report(self.folder, self.page, self.film)
+        report(self.folder, self.film)
         return 0

@@ -36,8 +36,6 @@ class Sim(BackendFlags, WireFlags):
     """Lose each datagram, sent or received, with this probability: tries an agent under loss."""
     view: bool = False
     """Show the first world in a window. Lock-step does not wait for it. Keys: docs/viewing.md."""
-    realtime: bool = False
-    """Fly no faster than real time, for viewers."""
 
     def run(self) -> int:
         """Simulate until the agent closes."""
@@ -77,7 +75,7 @@ class Sim(BackendFlags, WireFlags):
         return 0
 
     def _shown(self, simulator: "Simulator") -> AbstractContextManager[None]:
-        if not (self.view or self.realtime):  # nothing that draws is imported
+        if not self.view:  # nothing that draws is imported
             return nullcontext()
         from ._watch import watched
 

@@ -30,14 +30,14 @@ from ..flights.folders import locked
 from ..models.errors import InputError, require
 from ..training.settings import Run
 from ._flags import AgentFlags, BackendOfPreset, Options
-from ._training import TrainingFlags, folder_to_write
+from ._training import TrainingFlags, folder_to_write, go_on_with
 
 if TYPE_CHECKING:
     from ..training.training import Training
 
 EPISODES = "episodes.csv"
-_WIRE = ("env", "vehicle", "listen", "num_simulators", "key_file", "insecure")
-_FREE = (*_WIRE, "record", "store_every", "env_steps")
+_FREE = ("env", "vehicle", "listen", "num_simulators", "key_file", "insecure", "record",
+         "store_every", "env_steps")  # fmt: skip
 """Flags that a resumed training may be given."""
 _UPDATE_WITHIN = 2.0  # s
 
@@ -55,8 +55,6 @@ class Train(AgentFlags, TrainingFlags):
     """vpg, a2c, ppo, ippo, mappo, sb3-a2c, sb3-ppo or sb3-sac."""
     backend: BackendOfPreset = "mujoco"
     """What steps the drones: mujoco, or rigid (without contact, fast)."""
-    preset_of: str | None = None
-    """Id of the task with the preset. Default: the one that is trained, or that it derives from."""
     seed: int = 0
     """Seed of weights, actions and episodes."""
     num_simulators: int = 1
@@ -77,19 +75,14 @@ class Train(AgentFlags, TrainingFlags):
         from ..training.training import Training, config_of
         from ._env import remote_env
 
-        task = self.preset_of or self.env_id
-        base = find_preset(self.algorithm, self.preset, task)
+        base = find_preset(self.algorithm, self.preset, self.env_id)
         if not base.fits:
-            if self.preset_of:
-                raise InputError(
-                    f"preset-of: expected a task with a preset of {self.algorithm}, got {task}"
-                )
             print(
-                f"note: there is no preset of {self.algorithm} for {task}, nor for a task that it "
-                f"derives from: it gets that of {base.env_id}; --preset-of ID names another",
+                f"note: there is no preset of {self.algorithm} for {self.env_id}, nor for a task "
+                f"that it derives from: it gets that of {base.env_id}",
                 flush=True,
             )
-        config = preset(self.algorithm, self.preset, task, **self.changes())
+        config = preset(self.algorithm, self.preset, self.env_id, **self.changes())
         backend = self.backend if "backend" in self.given else base.backend
         env_config = self.env_config(backend=backend)  # it refuses wrong drones
         whole_worlds = max(base.num_envs // self.drones, 1) * self.drones
@@ -157,7 +150,7 @@ class Train(AgentFlags, TrainingFlags):
         if not find_algorithm(self.algorithm).resumes:
             stopped = "it starts anew" if self.resume else "--resume starts it anew"
             print(f"note: {self.algorithm} keeps no state of a training: {stopped}", flush=True)
-        go_on = self.go_on_with(f"train {self.algorithm}", folder, *_WIRE)
+        go_on = go_on_with(f"train {self.algorithm}", folder)
         keeper = _Keeper(training, folder, self.store_every)
         try:
             with _stop_at_update() as stop_is_asked, bars() as progress:

@@ -44,7 +44,7 @@ class View(EnvFlags):
                 raise InputError("env: expected no options with a journal, which has its own")
             flights = ([one] for one in recorded_trajectories(path))
         else:
-            shown, policy, _ = pilot_of(self, self.what)
+            shown, policy = pilot_of(self, self.what)
             config = shown.env_config()
             flights = (flown_trajectories(policy, config, [one], "final") for one in count())
         first = next(flights)

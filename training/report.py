@@ -1,4 +1,4 @@
-"""The report of a study: figures, a page, tables as CSV and Markdown, the verdicts as JSON.
+"""The report of a study: figures, a page, tables and verdicts as Markdown, tables as CSV.
 
 All of it is written from the study's files, into the study's folder; the page refers to nothing
 outside itself.
@@ -6,9 +6,7 @@ outside itself.
 
 import base64
 import html
-import json
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from string import Template
 
@@ -26,25 +24,16 @@ VIDEO_FILE = "video.mp4"
 _PAGE = Path(__file__).parent / "assets" / "report.html"
 
 
-def write_report(results: Results, page: Path | None = None) -> pd.DataFrame:
-    """Draw the figures and write page, tables and verdicts into the folder; the table.
-
-    `page` is a Markdown file that gets the tables too.
-    """
+def write_report(results: Results) -> pd.DataFrame:
+    """Draw the figures and write page, tables and verdicts into the folder; the table."""
     require("matplotlib", "report", "a report")
     folder = results.folder
     table = results_table(results)
     table.to_csv(folder / "results.csv")
     results.runs.to_csv(folder / "runs.csv", index=False)
-    verdicts = judge(results)
-    claims = _claims(verdicts)
+    claims = _claims(judge(results))
     text = _head(results) + markdown(results, table) + claims
     (folder / "results.md").write_text(text, encoding="utf-8")
-    if page:
-        page.write_text(text, encoding="utf-8")
-    if verdicts:
-        found = json.dumps([asdict(verdict) for verdict in verdicts], indent=2, ensure_ascii=False)
-        (folder / "claims.json").write_text(found + "\n", encoding="utf-8")
     figures = draw_figures(results, table) if len(table) else []
     parts = [*_page(results, table, figures)]
     if claims:

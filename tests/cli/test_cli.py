@@ -144,9 +144,9 @@ def test_a_bug_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_flags_that_are_set_to_their_default_are_set() -> None:
-    words = ["--env.target", "5", "--num-envs=1", "--no-realtime", "--action", "offset"]
+    words = ["--env.target", "5", "--num-envs=1", "--no-view", "--action", "offset"]
     command = parse(Sim, "rotorgram sim", words)
-    assert command.given == {"env.target", "num_envs", "realtime", "action"}
+    assert command.given == {"env.target", "num_envs", "view", "action"}
     assert command.options == {"target": 5.0, "action": "offset"}
     assert parse(Sim, "rotorgram sim", []).options == {}
 
@@ -157,14 +157,6 @@ def test_options_are_those_of_the_task(capsys: Capsys) -> None:
     assert "--env.target" not in out
     command = parse(Sim, "rotorgram sim", ["--env.target", "4", "6"])
     assert command.options == {"target": [4.0, 6.0]}, "as JSON gives it"
-
-
-def test_requirements_of_a_task_that_is_not_known_here() -> None:
-    words = ["pid", "--env", "other/Race-v3", "--env.num-gates=3", "--env.wind", "[0.5, 1]"]
-    command = parse(Serve, "rotorgram serve", [*words, "--env.track", "long", "--episodes", "2"])
-    assert command.env == "other/Race-v3"
-    assert command.episodes == 2
-    assert command.options == {"num_gates": 3, "wind": [0.5, 1], "track": "long"}
 
 
 TASK = """

@@ -11,7 +11,6 @@ from rotorgram.cli import main
 from rotorgram.cli._flags import parse
 from rotorgram.cli.compare import Compare
 from rotorgram.cli.evaluate import Evaluate
-from rotorgram.cli.train import Train
 from rotorgram.cli.view import View
 from rotorgram.envs import EnvConfig, LocalVectorEnv
 from rotorgram.models import QUAD_XML
@@ -102,9 +101,3 @@ def test_files_of_a_comparison_have_the_same_settings_or_are_refused(tmp_path: P
     both = parse(Compare, "rotorgram compare", [*files, "--seeds", "2"]).study()
     assert both.seeds == 2
     assert both.episodes == 100  # 200 flights of each row
-
-
-def test_options_of_a_task_that_is_not_known_may_be_negative() -> None:
-    words = ("--env", "foo/Bar-v0", "--listen", "127.0.0.1:0", "--env.x", "-1e-3")
-    command = parse(Train, "rotorgram train", ["ppo", *words])
-    assert command.options == {"x": -1e-3}

@@ -92,12 +92,10 @@ def test_a_checkpoint_on_film_flies_as_it_does_over_the_wire(
     assert abs(last - bare)[:60].mean() > 10  # what is written above
 
 
-def test_pictures_and_names(
-    opengl: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_pictures(opengl: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "film"
     settings = ("--episode-length", 10, *SMALL)
-    command = ("render", "pid", "random", "--out", out, "--names", "ours", "theirs", *settings)
+    command = ("render", "pid", "random", "--out", out, *settings)
     assert run(capsys, *command, "--episodes", 2)[0] == 0
     assert len(list(out.iterdir())) == 12  # 0.2 s at 25 a second with both ends, twice
     picture = tmp_path / "picture.png"
@@ -111,20 +109,19 @@ def any_opengl(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gl, "offscreen_context", lambda *_: SimpleNamespace(free=lambda: None))
 
 
-def test_panes_of_the_same_have_names_of_their_own(
+def test_panes_show_the_episodes_that_evaluate_flies(
     any_opengl: None,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """And show the episodes that `evaluate` flies."""
     shown: list[Any] = []
     monkeypatch.setattr(filming, "film", lambda out, tracks, *_: shown.extend(tracks) or 1)
     what = ("pid", "pid", "random", "pid", "random")
     settings = ("--episode-length", 10, "--episode", 1, "--out", tmp_path / "film.mp4")
     assert run(capsys, "render", *what, *settings)[0] == 0
     names = [track.name for track in shown]
-    assert names == ["PID 1", "PID 2", "random 1", "PID 3", "random 2"]
+    assert names == ["PID", "PID", "random", "PID", "random"]
     policy = PID(shown[0].trajectories[0].spec)
     config = EnvConfig.from_keywords("rotorgram/Elevation-v0", episode_length=10)
     evaluated = flown_trajectories(policy, config, [1], "final")

@@ -17,7 +17,7 @@ import pytest
 from peers import Running
 from pictures import HEXA, at
 from rotorgram.cli import main
-from rotorgram.cli._watch import Realtime, Watcher
+from rotorgram.cli._watch import Watcher
 from rotorgram.envs import SingleEnv
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
@@ -395,14 +395,6 @@ def test_a_view_that_fails_or_closes_stops_no_simulator(
         assert not view.drawn
     assert "the simulator goes on: the driver is gone" in caplog.text
     assert len(caplog.records) == 1 or "was closed" in caplog.text
-
-
-def test_realtime_sleeps_from_step_to_step() -> None:
-    hold = Realtime(0.05)
-    began = time.monotonic()
-    for _ in range(5):  # the first at once, the others 0.05 s apart
-        hold(None)
-    assert time.monotonic() - began >= 0.2
 
 
 # The command.

@@ -1,7 +1,6 @@
 """Tables, figures, page and film of a study, on small made-up folders and by hand."""
 
 import base64
-import json
 import tomllib
 from dataclasses import replace
 from io import StringIO
@@ -26,7 +25,7 @@ from rotorgram.training.figures import (
     trajectories,
     value_fan,
 )
-from rotorgram.training.report import VIDEO_FILE, write_report
+from rotorgram.training.report import VIDEO_FILE, judge, write_report
 from rotorgram.training.results import COLUMNS, Results, write_config
 from rotorgram.training.settings import Row, Study
 from rotorgram.training.statistics import share_interval
@@ -246,9 +245,9 @@ def test_figures_are_written_in_three_formats_and_always_the_same(comparison: Pa
 
 
 def test_verdicts_and_tables_are_files(comparison: Path) -> None:
-    claims = json.loads((comparison / "claims.json").read_text())
-    assert len(claims) == 5
-    assert {claim["verdict"] for claim in claims} == {"undecided"}  # three seeds decide nothing
+    verdicts = judge(Results.read(comparison))
+    assert len(verdicts) == 5
+    assert {one.verdict for one in verdicts} == {"undecided"}  # three seeds decide nothing
     rows = pd.read_csv(comparison / "results.csv")["row"].tolist()
     assert rows == ["vpg", "a2c", "sb3-a2c", "pid"]
     runs = pd.read_csv(comparison / "runs.csv")
@@ -328,7 +327,7 @@ def test_a_swarm_has_the_least_distance_in_place_of_the_overshoot(swarm: Path) -
     assert "| Least distance (m) |" in text
     assert "| 0.20 (0.20 to 0.20) |" in text
     assert "Overshoot" not in text
-    assert not (swarm / "claims.json").exists()
+    assert "Claims" not in text
     assert [path.name for path in (swarm / "figures").glob("*.svg")] == ["comparison.svg"]
 
 

@@ -229,12 +229,10 @@ def test_a_board_takes_own_tasks_and_changes(
         'env = { env_id = "near_task:Near-v0", episode_length = 20 }\n'
     )
     flags = ("--set", "steps_per_update=256", "--seeds", 2, "--episodes", 2, "--snapshots", 1)
-    status, out, err = run(
-        capsys, "benchmark", "rows.toml", *flags, "--jobs", 2, "--page", "page.md", "--out", "o"
-    )
+    status, out, err = run(capsys, "benchmark", "rows.toml", *flags, "--jobs", 2, "--out", "o")
     assert status == 0, err
     assert "4 of 4 runs done" in out
-    page = (tmp_path / "page.md").read_text()
+    page = (tmp_path / "o" / "results.md").read_text()
     assert "| PPO tuned steps_per_update=256 (2 seeds; 4,096 env steps) |" in page
     assert "| Geometric (2 seeds) |" in page
 
