@@ -137,15 +137,16 @@ class StudyFlags(TrainingFlags, WorkersConfig):
 def report(folder: Path, film: bool) -> None:
     """Write figures, film and report from the folder's files, and print the tables."""
     from rich.console import Console
+    from rich.markdown import Markdown
 
     from ..training.report import PAGE_FILE, VIDEO_FILE, write_report
     from ..training.results import Results
-    from ..training.tables import terminal_tables
+    from ..training.tables import markdown
 
     results = Results.read(folder)
     video = folder / VIDEO_FILE
     table = write_report(results)
-    Console(width=100).print(*terminal_tables(results, table))
+    Console(width=100).print(Markdown(markdown(results, table)))
     # Only now: if the film fails, there is a report.
     if film and results.study.kind in ("paper", "compare") and not video.exists():
         _film(results, video)

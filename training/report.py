@@ -5,18 +5,18 @@ outside itself.
 """
 
 import base64
-import html
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from string import Template
 
 import pandas as pd
+from markdown_it import MarkdownIt
 
 from ..models.errors import require
 from .claims import Verdict, judge_claims, judge_no_worse
 from .figures import PAPER, draw_figures
 from .results import Results
-from .tables import Cell, markdown, results_table, task_tables
+from .tables import markdown, results_table
 
 PAGE_FILE = "report.html"
 VIDEO_FILE = "video.mp4"
@@ -31,13 +31,17 @@ def write_report(results: Results) -> pd.DataFrame:
     table = results_table(results)
     table.to_csv(folder / "results.csv")
     results.runs.to_csv(folder / "runs.csv", index=False)
-    claims = _claims(judge(results))
-    text = _head(results) + markdown(results, table) + claims
+    text = _head(results) + markdown(results, table) + _claims(judge(results))
     (folder / "results.md").write_text(text, encoding="utf-8")
     figures = draw_figures(results, table) if len(table) else []
-    parts = [*_page(results, table, figures)]
-    if claims:
-        parts.append(f"<pre>{html.escape(claims)}</pre>")
+    parts = [MarkdownIt("js-default").render(text)]  # HTML in a name stays text
+    video = folder / VIDEO_FILE
+    if video.is_file():
+        parts.append(f'<video controls loop muted src="{_embedded(video, "video/mp4")}"></video>')
+    for name in figures:
+        source = _embedded(folder / "figures" / f"{name}.svg", "image/svg+xml")
+        parts.append(f'<figure><img alt="{name}" src="{source}">')
+        parts.append(f"<figcaption>{PAPER.get(name, name)}</figcaption></figure>")
     content = "\n".join(parts)
     page_text = Template(_PAGE.read_text(encoding="utf-8")).substitute(content=content)
     (folder / PAGE_FILE).write_text(page_text, encoding="utf-8")
@@ -88,28 +92,6 @@ def _claims(verdicts: Sequence[Verdict]) -> str:
         text += f"\n* {one.claim} ({one.source}; preset {one.preset}.)\n"
         text += f"  **{one.verdict}**: {one.evidence} {one.definition}\n"
     return text
-
-
-def _page(results: Results, table: pd.DataFrame, figures: Sequence[str]) -> Iterator[str]:
-    """Command, film, tables and figures in HTML."""
-    yield f"<pre>{html.escape(results.config['command'])}</pre>"
-    video = results.folder / VIDEO_FILE
-    if video.is_file():
-        yield f'<video controls loop muted src="{_embedded(video, "video/mp4")}"></video>'
-    for task in task_tables(results, table):
-        heads = map(html.escape, task.headings)
-        lines = [map(_cell, line) for line in task.lines]
-        yield f"<h2>{html.escape(task.task)}</h2>"
-        yield pd.DataFrame(lines, columns=heads).to_html(index=False, border=0, escape=False)
-    for name in figures:
-        source = _embedded(results.folder / "figures" / f"{name}.svg", "image/svg+xml")
-        caption = html.escape(PAPER.get(name, name))
-        yield f'<figure><img alt="{name}" src="{source}">'
-        yield f"<figcaption>{caption}</figcaption></figure>"
-
-
-def _cell(cell: Cell) -> str:
-    return "<br>".join(map(html.escape, [cell.value, *cell.details]))
 
 
 def _embedded(file: Path, kind: str) -> str:

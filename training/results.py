@@ -73,8 +73,7 @@ COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
 }  # fmt: skip
 """Columns of each table.
 
-`evaluations` may have more, of what was drawn, and `runs` has `least_distance`, m,
-where a world has several drones.
+`evaluations` may have more, of what was drawn.
 """
 
 Tables = Mapping[str, pd.DataFrame]

@@ -1,11 +1,9 @@
 """A study: every row with every seed is trained and evaluated; what is done is kept."""
 
-import math
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict, replace
 from functools import partial
-from itertools import combinations
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -166,8 +164,6 @@ def _evaluate(
             rows += [label | measure_episode(each, headline) for each in flown]
     evaluations = pd.DataFrame(rows)
     measures = {**times, **measure_run(evaluations, headline)}
-    if drones > 1:
-        measures["least_distance"] = least_distance(flown)
     tables = {"runs": pd.DataFrame([measures]), "evaluations": evaluations}
     if study.keep_steps:
         parts = []
@@ -177,23 +173,6 @@ def _evaluate(
             parts.append(steps)
         tables["steps"] = pd.concat(parts, ignore_index=True)
     return tables
-
-
-def least_distance(flown: Sequence[Trajectory]) -> float:
-    """Least distance between the origins of two drones that fly in a world, m.
-
-    The trajectories of an episode follow each other in the order of its drones.
-    """
-    drones = len(flown[0].spec.agents)
-    found = math.inf
-    for first in range(0, len(flown), drones):
-        world = flown[first : first + drones]
-        for one, other in combinations(world, 2):
-            both = min(len(one), len(other)) + 1  # rows in which both fly
-            positions = one.telemetry["position"][:both]
-            apart = np.linalg.norm(positions - other.telemetry["position"][:both], axis=1)
-            found = min(found, float(apart.min()))
-    return found
 
 
 def _episodes(training: Training) -> pd.DataFrame:

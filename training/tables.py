@@ -1,17 +1,13 @@
-"""The table of a study: one line for each row, measures over its seeds, as text.
+"""The table of a study: one line for each row, measures over its seeds, in Markdown.
 
-Cells are made once; the terminal, Markdown and HTML show the same ones.
+The terminal and the report's page show the same text.
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import groupby
-from typing import Literal, NamedTuple
 
 import pandas as pd
-from rich import box
-from rich.table import Table
-from rich.text import Text
 
 from ..flights.palette import agent_label
 from .metrics import Headline
@@ -19,26 +15,10 @@ from .results import Results
 from .settings import Row
 from .statistics import bootstrap_interval, iqm, share_interval
 
-_TERMINAL_COLUMNS = (0, 1, 2, 3, 6, 7, 8)  # those that fit 100 columns
 NOTHING = "–"
 """Shown where there is no value."""
-_MEASURES = ("steady", "settling_time", "overshoot", "return", "least_distance")
+_MEASURES = ("steady", "settling_time", "overshoot", "return")
 _COUNTS = ("episodes", "settled", "crashed")
-
-
-class Cell(NamedTuple):
-    """A cell of the table: its value, and the small print below it."""
-
-    value: str
-    details: tuple[str, ...] = ()
-
-
-class TaskTable(NamedTuple):
-    """The rows that fly one task."""
-
-    task: str
-    headings: tuple[str, ...]
-    lines: list[tuple[Cell, ...]]
 
 
 # ---- numbers
@@ -47,11 +27,11 @@ class TaskTable(NamedTuple):
 def results_table(results: Results) -> pd.DataFrame:
     """Measures over seeds of each row of which a run is done, indexed by `row`.
 
-    For each of steady, settling_time (s), overshoot and return, and for the least_distance (m) of
-    drones of one world: the interquartile mean over seeds, and `_low` and `_high` of its 95 %
-    interval. `held`: seeds that hold the goal; `worst`: the worst seed's steady state;
-    `most_crashed`: crashes of the seed that crashed most. Counts: seeds, episodes, settled,
-    crashed; `crash_rate` of a flight, and `_low` and `_high` of Wilson's interval.
+    For each of steady, settling_time (s), overshoot and return: the interquartile mean over seeds,
+    and `_low` and `_high` of its 95 % interval. `held`: seeds that hold the goal; `worst`: the
+    worst seed's steady state; `most_crashed`: crashes of the seed that crashed most. Counts: seeds,
+    episodes, settled, crashed; `crash_rate` of a flight, and `_low` and `_high` of Wilson's
+    interval.
     `env_steps_to_hold` and `seconds_to_hold`: interquartile means over the `reached` seeds.
     `env_steps` of a training and `steps_per_second`; missing for controllers.
 
@@ -74,7 +54,7 @@ def results_table(results: Results) -> pd.DataFrame:
 def _measures(own: pd.DataFrame, headline: Headline) -> dict[str, float]:
     trained = own["env_steps"].max() > 0
     line: dict[str, float] = {"seeds": len(own), **own[list(_COUNTS)].sum()}
-    for name in own.columns.intersection(_MEASURES):
+    for name in _MEASURES:
         values = own[name].to_numpy(float)
         line[name] = iqm(values)
         line[f"{name}_low"], line[f"{name}_high"] = bootstrap_interval(values)
@@ -111,18 +91,26 @@ def _share_interval(line: Mapping[str, float], headline: Headline) -> dict[str, 
 # ---- cells
 
 
-def task_tables(results: Results, table: pd.DataFrame) -> list[TaskTable]:
-    """A table of cells for each task, of `results_table`."""
+def markdown(results: Results, table: pd.DataFrame) -> str:
+    """The table of each task, of `results_table`, in Markdown, with a note."""
     rows = {row.name: row for row in results.study.rows}
     ordered = [rows[str(name)] for name in table.index]
-    sweep = results.study.kind == "sweep"
-    found = []
-    for task, own in by_task(ordered, together=sweep):
+    tasks = by_task(ordered, together=results.study.kind == "sweep")
+    parts = []
+    for task, own in tasks:
+        if len(tasks) > 1:
+            parts.append(f"## {task}")
         headline = results.headline(own[0])
-        swarm = own[0].env.drones > 1 and "least_distance" in table
-        lines = [_line(row, table.loc[row.name].to_dict(), headline, swarm) for row in own]
-        found.append(TaskTable(task, headings(headline, swarm), lines))
-    return found
+        names = headings(headline)
+        lines = [names, ["---"] + ["---:"] * (len(names) - 1)]
+        lines += [_line(row, table.loc[row.name].to_dict(), headline) for row in own]
+        parts.append("\n".join(map(_markdown_line, lines)))
+    return "\n\n".join([*parts, NOTE]) + "\n"
+
+
+def _markdown_line(cells: Sequence[str]) -> str:
+    escaped = [cell.replace("|", r"\|") for cell in cells]
+    return f"| {' | '.join(escaped)} |"
 
 
 def by_task(rows: Sequence[Row], *, together: bool = False) -> list[tuple[str, list[Row]]]:
@@ -133,29 +121,29 @@ def by_task(rows: Sequence[Row], *, together: bool = False) -> list[tuple[str, l
     return [(task, list(group)) for task, group in groupby(ordered, key=lambda row: row.task)]
 
 
-def headings(headline: Headline, swarm: bool = False) -> tuple[str, ...]:
-    """Headings of the columns; of a swarm the least distance is in the place of the overshoot."""
+def headings(headline: Headline) -> list[str]:
+    """Headings of the columns."""
     settled = headline.settled
     band = "" if settled is None else f" to {headline.amount(f'{settled:.2g}')}"
-    return (
+    return [
         "Agent",
         headline.labelled(f"Steady {headline.size_symbol}"),
         f"Seeds that hold {headline.held_text}".rstrip(),
         "Crashes per flight",
         f"Settling{band} (s)",
-        "Least distance (m)" if swarm else headline.labelled("Overshoot"),
+        headline.labelled("Overshoot"),
         "Return",
         "Env steps to hold",
         "Env steps per s",
-    )
+    ]
 
 
-def _line(row: Row, line: Mapping[str, float], headline: Headline, swarm: bool) -> tuple[Cell, ...]:
+def _line(row: Row, line: Mapping[str, float], headline: Headline) -> list[str]:
     seeds = int(line["seeds"])
     names = [seeds_text(seeds)]
     if not row.controller:
         names.append(f"{count_text(line['env_steps'])} env steps")
-    settling = Cell(NOTHING)
+    settling = NOTHING
     if headline.settles:
         settled = f"{int(line['settled'])} of {int(line['episodes'])}"
         settling = _measured(line, "settling_time", settled)
@@ -164,17 +152,21 @@ def _line(row: Row, line: Mapping[str, float], headline: Headline, swarm: bool) 
         reached.append(f"{int(line['reached'])} of {seeds}")
     if line["reached"] > 0:
         reached.append(f"{number_text(line['seconds_to_hold'])} s")
-    return (
-        Cell(row_label(row), tuple(names)),
+    return [
+        _cell(row_label(row), *names),
         _measured(line, "steady", f"worst {number_text(line['worst'])}"),
         _held(line, seeds),
         _crashes(line),
         settling,
-        _measured(line, "least_distance" if swarm else "overshoot"),
+        _measured(line, "overshoot"),
         _measured(line, "return"),
-        Cell(count_text(line["env_steps_to_hold"]), tuple(reached)),
-        Cell(count_text(line["steps_per_second"])),
-    )
+        _cell(count_text(line["env_steps_to_hold"]), *reached),
+        count_text(line["steps_per_second"]),
+    ]
+
+
+def _cell(value: str, *details: str) -> str:
+    return f"{value} ({'; '.join(details)})" if details else value
 
 
 def seeds_text(count: int) -> str:
@@ -193,27 +185,27 @@ def row_label(row: Row) -> str:
     return row.name
 
 
-def _held(line: Mapping[str, float], seeds: int) -> Cell:
+def _held(line: Mapping[str, float], seeds: int) -> str:
     if math.isnan(line["held"]):
-        return Cell(NOTHING)
+        return NOTHING
     held = int(line["held"])
     low, high = share_interval(held, seeds)
-    return Cell(f"{held} of {seeds}", (f"{low:.0%} to {high:.0%}".replace("%", " %"),))
+    return _cell(f"{held} of {seeds}", f"{low:.0%} to {high:.0%}".replace("%", " %"))
 
 
-def _crashes(line: Mapping[str, float]) -> Cell:
+def _crashes(line: Mapping[str, float]) -> str:
     low = 100 * line["crash_rate_low"]
     high = 100 * line["crash_rate_high"]
     rate = number_text(100 * line["crash_rate"])
     interval = f"{number_text(low)} to {number_text(high)} %"
-    return Cell(f"{rate} %", (interval, f"{int(line['crashed'])} of {int(line['episodes'])}"))
+    return _cell(f"{rate} %", interval, f"{int(line['crashed'])} of {int(line['episodes'])}")
 
 
-def _measured(line: Mapping[str, float], name: str, *details: str) -> Cell:
+def _measured(line: Mapping[str, float], name: str, *details: str) -> str:
     low = line[f"{name}_low"]
     high = line[f"{name}_high"]
     interval = () if math.isnan(low) else (f"{number_text(low)} to {number_text(high)}",)
-    return Cell(number_text(line[name]), interval + details)
+    return _cell(number_text(line[name]), *interval, *details)
 
 
 def number_text(value: float) -> str:
@@ -243,52 +235,3 @@ NOTE = (
     "in every snapshot's flights without a crash; env steps to hold: to the first snapshot from "
     "which on all hold. A crashed episode counts with what was flown of it and has not settled."
 )
-
-
-# ---- texts
-
-
-def markdown(results: Results, table: pd.DataFrame) -> str:
-    """All tables in Markdown, with a note."""
-    tables = task_tables(results, table)
-    parts = []
-    for task in tables:
-        if len(tables) > 1:
-            parts.append(f"## {task.task}")
-        lines = [list(task.headings), ["---"] + ["---:"] * (len(task.headings) - 1)]
-        for cells in task.lines:
-            lines.append([_in_parentheses(cell) for cell in cells])
-        rows = []
-        for line in lines:
-            escaped = [cell.replace("|", r"\|") for cell in line]
-            rows.append(f"| {' | '.join(escaped)} |")
-        parts.append("\n".join(rows))
-    return "\n\n".join([*parts, NOTE]) + "\n"
-
-
-def _in_parentheses(cell: Cell) -> str:
-    return f"{cell.value} ({'; '.join(cell.details)})" if cell.details else cell.value
-
-
-def terminal_tables(results: Results, table: pd.DataFrame) -> Iterator[Table]:
-    """The tables for a terminal of 100 columns."""
-    for task in task_tables(results, table):
-        shown = Table(
-            title=task.task,
-            title_justify="left",
-            box=box.SIMPLE_HEAD,
-            padding=(0, 1, 0, 0),
-            show_edge=False,
-            pad_edge=False,
-            caption="Below a value: its 95 % interval, and how many episodes (or seeds) got there.",
-            caption_justify="left",
-        )
-        for place in _TERMINAL_COLUMNS:
-            justify: Literal["left", "right"] = "right" if place else "left"
-            shown.add_column(task.headings[place], justify=justify, overflow="fold")
-        for line in task.lines:
-            cells = [line[place] for place in _TERMINAL_COLUMNS]
-            # Text, not markup: a name may hold brackets.
-            texts = [Text("\n".join([cell.value, *cell.details])) for cell in cells]
-            shown.add_row(*texts, end_section=True)
-        yield shown

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from comparisons import ERROR, GATES, HEADLINE, spec_of, study_of, synthetic_folder
+from comparisons import ERROR, GATES, spec_of, study_of, synthetic_folder
 from rich.console import Console
+from rich.markdown import Markdown
 from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.spec import EnvSpec
 from rotorgram.flights.filming import Film, FilmTrack
 from rotorgram.flights.palette import agent_label
-from rotorgram.flights.trajectories import Trajectory
 from rotorgram.models.errors import InputError
 from rotorgram.training import films
 from rotorgram.training.figures import (
@@ -29,14 +29,11 @@ from rotorgram.training.report import VIDEO_FILE, judge, write_report
 from rotorgram.training.results import COLUMNS, Results, write_config
 from rotorgram.training.settings import Row, Study
 from rotorgram.training.statistics import share_interval
-from rotorgram.training.study import least_distance
 from rotorgram.training.tables import (
-    headings,
     markdown,
     number_text,
     results_table,
     row_label,
-    terminal_tables,
 )
 from tables import DATA
 
@@ -231,7 +228,7 @@ def test_the_page_has_figures_tables_and_film_and_no_script(comparison: Path) ->
     assert "rotorgram compare --seeds 3 &lt;folder&gt;" in text
     assert text.count("<tr") == 5  # a head and four agents
     assert "It gives no numbers." in text
-    assert "<td>PID<br>3 seeds</td>" in text
+    assert "<td>PID (3 seeds)</td>" in text
 
 
 def test_figures_are_written_in_three_formats_and_always_the_same(comparison: Path) -> None:
@@ -262,12 +259,12 @@ def test_verdicts_and_tables_are_files(comparison: Path) -> None:
 
 def test_the_terminal_shows_the_table_in_a_hundred_columns(comparison: Path) -> None:
     results = Results.read(comparison)
-    (table,) = terminal_tables(results, results_table(results))
     stream = StringIO()
-    Console(file=stream, width=100).print(table)
+    text = markdown(results, results_table(results))
+    Console(file=stream, width=100).print(Markdown(text))
     lines = stream.getvalue().splitlines()
     assert max(map(len, lines)) <= 100
-    assert any(line.startswith("SB3 A2C ") for line in lines)
+    assert any(line.startswith(" SB3 A2C ") for line in lines)
 
 
 def test_a_study_of_which_nothing_is_done_has_an_empty_report(tmp_path: Path) -> None:
@@ -280,30 +277,6 @@ def test_a_study_of_which_nothing_is_done_has_an_empty_report(tmp_path: Path) ->
 # ---- several drones in a world
 
 
-def flown(episode: int, *xs: float) -> Trajectory:
-    """A drone of a world of two, at these X after each step."""
-    spec = replace(spec_of(), agents=("left", "right"))
-    where = np.array([(x, 10.0, 1.0) for x in xs])
-    steps = len(xs) - 1
-    rewards = np.zeros(steps)
-    actions = np.zeros((steps, 1))
-    return Trajectory(
-        spec=spec,
-        telemetry={"position": where},
-        rewards=rewards,
-        actions=actions,
-        ending="terminated",
-        episode=episode,
-    )
-
-
-def test_the_least_distance_is_that_of_all_episodes_while_both_fly() -> None:
-    apart = [flown(0, 0.0, 0.0, 0.0), flown(0, 4.0, 3.0, 3.5)]
-    near = [flown(1, 0.0, 0.0, 5.0), flown(1, 2.0, 5.0)]  # the second has ended where both are at 5
-    assert least_distance(apart) == 3.0
-    assert least_distance([*apart, *near]) == 2.0
-
-
 @pytest.fixture(scope="module")
 def swarm(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Results of worlds of two drones, with agents that were compared."""
@@ -311,22 +284,12 @@ def swarm(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rows = tuple(Row(agent=agent, name=agent, env=env) for agent in ("ippo", "mappo"))
     study = Study(rows=rows, seeds=2)
     folder = synthetic_folder(tmp_path_factory.mktemp("swarm") / "results", study=study)
-    files = sorted((folder / "runs").iterdir())
-    for file, distance in zip(files, (0.1, 0.3, 0.2, 0.2), strict=True):
-        pd.read_parquet(file).assign(least_distance=distance).to_parquet(file)
     write_report(Results.read(folder))
     return folder
 
 
-def test_a_swarm_has_the_least_distance_in_place_of_the_overshoot(swarm: Path) -> None:
-    table = results_table(Results.read(swarm))
-    assert table["least_distance"].to_dict() == pytest.approx({"ippo": 0.2, "mappo": 0.2})
-    assert table.loc["ippo", "least_distance_low"] == 0.1
-    assert headings(HEADLINE, swarm=True)[5] == "Least distance (m)"
+def test_only_the_papers_comparison_has_claims_and_its_figures(swarm: Path) -> None:
     text = (swarm / "results.md").read_text(encoding="utf-8")
-    assert "| Least distance (m) |" in text
-    assert "| 0.20 (0.20 to 0.20) |" in text
-    assert "Overshoot" not in text
     assert "Claims" not in text
     assert [path.name for path in (swarm / "figures").glob("*.svg")] == ["comparison.svg"]
 
