@@ -1,6 +1,5 @@
 """`rotorgram vehicle`: a vehicle's file, from a first one to MJCF for others."""
 
-import json
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -85,8 +84,6 @@ class Vehicle(Command):
     """MJCF file that `export` writes, a new one."""
     frame: Literal["plus", "cross", "hexa", "octo", "list"] = "cross"
     """Arrangement of the rotors of `new`."""
-    json: bool = False
-    """Print JSON in place of the table of `check`."""
 
     def run(self) -> int:
         """Do it."""
@@ -98,8 +95,6 @@ class Vehicle(Command):
             raise InputError(f"vehicle: expected one file for {self.action}, got {self.out} too")
         if "frame" in self.given and self.action != "new":
             raise InputError(f"frame: expected no --frame but with new, got {self.frame}")
-        if self.json and self.action != "check":
-            raise InputError(f"json: expected no --json but with check, got {self.action}")
         match self.action:
             case "new":
                 self._new()
@@ -119,7 +114,7 @@ class Vehicle(Command):
         except InputError as error:
             error.exit_status = 2  # type: ignore[attr-defined]
             raise
-        print_checks(checks, as_json=self.json)
+        print_checks(checks)
         return 0 if all(check.passed for check in checks) else 1
 
     def _new(self) -> None:
@@ -221,13 +216,9 @@ def _listed(values: float | Iterable[float]) -> str:
     return ", ".join(f"{0.0 if abs(one) <= 1e-12 * most else one:.6g}" for one in numbers)
 
 
-def print_checks(checks: Sequence["Check"], *, as_json: bool = False) -> None:
-    """Print an examination: a table and a sentence for each failed check, or JSON."""
+def print_checks(checks: Sequence["Check"]) -> None:
+    """Print an examination: a table, and a sentence for each failed check."""
     failed = [check for check in checks if not check.passed]
-    if as_json:
-        report = {"passed": not failed, "checks": [check.report() for check in checks]}
-        print(json.dumps(report, indent=1, ensure_ascii=False, allow_nan=False))
-        return
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.markup import escape

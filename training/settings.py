@@ -250,39 +250,38 @@ class Study:
 
     def to_dict(self) -> dict[str, object]:
         """JSON values that `from_dict` reads."""
-        content = {one.name: getattr(self, one.name) for one in fields(self)}
-        return {**content, "rows": [row.to_dict() for row in self.rows]}
+        content = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "rows"}
+        return {**content, "row": [row.to_dict() for row in self.rows]}
 
     @classmethod
     def from_dict(cls, where: str, content: object) -> "Study":
-        """Raises `InputError`, whose sentence begins with `where`."""
+        """A study from settings and a list `row` of tables; a table `env` is of all rows.
+
+        Raises `InputError`, whose sentence begins with `where`.
+        """
         given = _table(where, content)
-        given["rows"] = _rows(where, given.get("rows", []), {})
-        return read_table(cls, given, where)
+        env = _table(f"{where}: env", given.pop("env", {}))
+        tables = given.pop("row", [])
+        if "rows" in given:
+            raise InputError(f"{where}: rows: expected [[row]] tables, got the name rows")
+        if type(tables) is not list:
+            raise InputError(f"{where}: row: expected [[row]] tables, got {shortened(tables)}")
+        rows = [
+            Row.from_dict(f"{where}: row {place}", table, env)
+            for place, table in enumerate(tables, 1)
+        ]
+        return read_table(cls, {**given, "rows": tuple(rows)}, where)
 
     @classmethod
     def from_toml(cls, path: Path, defaults: Mapping[str, object] | None = None) -> "Study":
-        """A study from a TOML file of settings and `[[row]]` tables; an `[env]` is of all rows.
+        """A study from a TOML file, as of `from_dict`.
 
         A file without `[[row]]` is one row, named as the file. Raises `InputError`.
         """
         content = read_keywords(path)
         if "row" not in content:
             content = {"row": [{"name": path.stem, **content}]}
-        env = _table(f"{path}: env", content.pop("env", {}))
-        tables = content.pop("row")
-        if "rows" in content:
-            raise InputError(f"{path}: rows: expected [[row]] tables, got the name rows")
-        if type(tables) is not list:
-            raise InputError(f"{path}: row: expected [[row]] tables, got {shortened(tables)}")
-        rows = _rows(f"{path}", tables, env)
-        return read_table(cls, {**(defaults or {}), **content, "rows": rows}, f"{path}")
-
-
-def _rows(where: str, tables: list[object], env: Mapping[str, object]) -> tuple[Row, ...]:
-    return tuple(
-        Row.from_dict(f"{where}: row {place}", table, env) for place, table in enumerate(tables, 1)
-    )
+        return cls.from_dict(f"{path}", {**(defaults or {}), **content})
 
 
 def _table(where: str, table: object) -> dict[str, Any]:
