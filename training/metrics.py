@@ -1,7 +1,7 @@
 """Measures of a trajectory and of a run: pure functions of arrays and frames.
 
 Over an episode: `steady_state`, `settling_time`, `overshoot` of the headline metric. Over the
-episodes of a run's evaluation: `measure_run`. Over seeds: `results.summarize`.
+episodes of a run's evaluation: `measure_run`. Over seeds: `tables.results_table`.
 
 How episodes that end early (a crash) enter: the steady state, the overshoot and the return are
 those of the flown part; the settling time is missing, and the table says how many episodes settled

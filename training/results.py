@@ -132,14 +132,13 @@ def run_file(folder: Path, row: Row, seed: int, table: str = "runs") -> Path:
 
 def write_run(folder: Path, row: Row, seed: int, tables: Tables) -> None:
     """Write what one run gave; the table `runs` last."""
-    for name in reversed(COLUMNS):
+    for name in reversed(tuple(COLUMNS)):
         if name in tables:
             table = tables[name].drop(columns=["row", "seed"], errors="ignore")
             table.insert(0, "row", row.name)
             table.insert(1, "seed", seed)
-            file = run_file(folder, row, seed, name)
-            file.parent.mkdir(exist_ok=True)
-            write_whole(file, table.to_parquet(index=False, compression="zstd"))
+            data = table.to_parquet(index=False, compression="zstd")
+            write_whole(run_file(folder, row, seed, name), data)
 
 
 # ---- reading
