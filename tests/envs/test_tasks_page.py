@@ -32,7 +32,7 @@ def test_the_table_has_every_task() -> None:
 @pytest.mark.parametrize(("name", "headline", "size"), ROWS, ids=[row[0] for row in ROWS])
 @pytest.mark.parametrize("vehicle", [None, "heavy_hexa"])
 def test_headline_and_size(name: str, headline: str, size: str, vehicle: str | None) -> None:
-    drones = 2 if name == "Cable-v0" else 1
+    drones = task_type(f"rotorgram/{name}").min_drones
     spec = spec_with(f"rotorgram/{name}", vehicle=vehicle, drones=drones)
     assert spec.headline is not None
     assert spec.headline.name == headline
