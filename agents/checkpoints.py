@@ -33,7 +33,7 @@ from .networks import ByName, Floats, named, part_of
 from .policies import NetworkPolicy
 from .presets import preset
 
-FORMAT = 3
+FORMAT = 4
 _PLAIN = ("algorithm", "config", "backend", "seed", "env_steps", "versions")
 _POSITION = ("actions", "observations", "numbers", "lengths", "first_steps")
 _DTYPES: dict[Any, type[np.generic]] = {int: np.int64, float: np.float64, bool: np.bool_}
@@ -151,7 +151,7 @@ def store(checkpoint: Checkpoint, path: Path) -> None:
 
 
 def load(path: Path) -> Checkpoint:
-    """Read a checkpoint. Raises `CheckpointError` or `MissingPackage`."""
+    """Read a checkpoint. Raises `CheckpointError`, `MissingPackage`, or `OSError`: unreadable."""
     numpy = require("safetensors.numpy", "train", "reading checkpoints")
     damage = require("safetensors", "train", "reading checkpoints").SafetensorError
     if not path.is_file():
@@ -194,6 +194,10 @@ def _read(data: bytes, parse: Callable[[bytes], ByName]) -> Checkpoint:
     check_fields(checkpoint)
     if not isinstance(checkpoint.versions, dict):
         raise InputError(f"versions: expected values by name, got {checkpoint.versions!r:.80}")
+    needed = vars(checkpoint.hyperparameters)
+    if needed.keys() != checkpoint.config.keys():
+        got = shortened(checkpoint.config)
+        raise InputError(f"config: expected all of {', '.join(needed)}, got {got}")
     checkpoint.policy()  # raises if it does not fit
     return checkpoint
 

@@ -14,8 +14,8 @@ from ._flags import Command
 class Capture(Command, CaptureConfig, WorkersConfig):
     """Take pictures of recorded flights, with depth, objects, boxes and poses, as a data set.
 
-    Interrupted by Ctrl-C, or by a disk that is full, it keeps the frames that it has. Exit status 2
-    where there is no OpenGL.
+    Interrupted by Ctrl-C, or by a disk that is full, it keeps the frames that it has,
+    without coco.json. Exit status 2 where there is no OpenGL.
     """
 
     journals: Positional[tuple[Path, ...]]
@@ -26,10 +26,11 @@ class Capture(Command, CaptureConfig, WorkersConfig):
     def run(self) -> int:
         """Take them; say where and how many."""
         from ..flights.capture import capture
-        from ..models.errors import InputError
+        from ..models.errors import InputError, require
         from ..rendering.gl import offscreen_context
         from ._progress import bars
 
+        require("PIL", "render", "labelled pictures")
         if not self.journals:
             raise InputError("journals: expected at least one file, got none")
         config = CaptureConfig(**self.settings(CaptureConfig))

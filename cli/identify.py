@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 class Identify(Command):
     """Identify thrust coefficient, rotor lag, inertia, drag and reaction from logs of flights.
 
-    A number that the logs do not tell keeps the value of the vehicle's file, and is named. Exit
-    status 0 as well in that case.
+    The lag needs logs without measured speeds. Another number that the logs do not tell keeps the
+    value of the vehicle's file, and is named. Exit status 0 as well in that case.
     """
 
     logs: Positional[tuple[Path, ...]]
@@ -38,7 +38,7 @@ class Identify(Command):
         """Print every estimate, write the file."""
         from ..flights.flight_logs import read_log
         from ..flights.identified_vehicle import identified_toml
-        from ..flights.identify import DEFAULT, identify
+        from ..flights.identify import DEFAULT, LAG, identify
         from ..models.errors import InputError, require
         from ..models.files import check_new_file, write_new
         from ..models.vehicle import Vehicle
@@ -51,6 +51,8 @@ class Identify(Command):
             raise InputError(f"period: expected 0.0001 to 0.1 s, got {self.period:g}")
         vehicle = Vehicle.load(self.vehicle)
         logs = [read_log(path, vehicle, self.period) for path in self.logs]
+        if LAG in self.fit and any(log.measured for log in logs):
+            raise InputError(f"fit: expected logs without measured speeds for {LAG}, got measured")
         for log in logs:
             if log.left_out:
                 print(

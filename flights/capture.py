@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..agents.checkpoints import write_whole
+from ..agents.checkpoints import software_versions, write_whole
 from ..models.cameras import View
 from ..models.swarm import drone_names
 from ..models.vehicle import Vehicle
@@ -90,7 +90,9 @@ def capture(
     with open_executor(workers, len(jobs), on_progress) as executor:
         run_jobs(executor, _take, jobs, keep, on_progress)
     labels.sort(key=lambda own: own["frame"])
-    write_coco(labels, objects, asdict(config), folder / "coco.json")
+    vehicle_hash = Vehicle.load(config.vehicle).hash
+    made = {**asdict(config), "vehicle_hash": vehicle_hash, "versions": software_versions()}
+    write_coco(labels, objects, made, folder / "coco.json")
     return count
 
 

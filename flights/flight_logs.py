@@ -24,7 +24,8 @@ SPEED = "m{}_rads"
 SPEED_COMMAND = "m{}_command_rads"
 THROTTLE = "m{}_throttle"
 """Columns of rotor 1, 2...: measured speed and commanded speed, rad/s, and throttle, 0 to 1, which
-is the share of the largest thrust. A log has one of them; the first counts."""
+is the share of the largest thrust. A log has at least one of the three; the first of them
+counts."""
 _KINDS = (SPEED, SPEED_COMMAND, THROTTLE)
 _LONGEST_GAP = 0.1  # s: longer gaps are not interpolated
 _POSITION_ERROR = 0.5  # m: between two samples, besides the distance by the velocity

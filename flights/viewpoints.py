@@ -9,21 +9,23 @@ from dataclasses import dataclass, replace
 from itertools import groupby
 from operator import attrgetter
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .. import models
 from ..envs.config import words_of
 from ..envs.spec import Mark
-from ..models.cameras import View, chosen_views
 from ..models.errors import InputError
 from ..models.fields import Limits, NonNegativeInt, PositiveInt, check_fields
-from ..models.vehicle import Vehicle
 from ..scenes import parse_scene
 from ..sim.rotations import multiplied
 from .recorded import read_episodes
 from .trajectories import Trajectory
+
+if TYPE_CHECKING:
+    from ..models.cameras import View
 
 Floats = NDArray[np.float64]
 
@@ -54,10 +56,12 @@ class CaptureConfig:
         parse_scene(self.scene)
         self.views()
 
-    def views(self) -> tuple[View, ...]:
+    def views(self) -> "tuple[View, ...]":
         """The pictures of each frame. Raises `InputError`."""
+        from ..models.cameras import chosen_views  # it imports MuJoCo
+
         words = words_of("cameras", self.cameras)
-        return chosen_views(words, Vehicle.load(self.vehicle).cameras)
+        return chosen_views(words, models.Vehicle.load(self.vehicle).cameras)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -98,7 +102,7 @@ def sequences_of(journals: Sequence[Path], config: CaptureConfig) -> list[PoseSe
         InputError: A file is no journal, has no episode, or is of another vehicle.
         OSError: It cannot be read.
     """
-    own = Vehicle.load(config.vehicle).name
+    own = models.Vehicle.load(config.vehicle).name
     found = []
     for number, path in enumerate(journals, 1):
         rng = np.random.default_rng([config.seed, number])

@@ -152,4 +152,4 @@ def test_every_command_takes_the_file(tmp_path: Path, capsys: Capsys) -> None:
     output(capsys, "replay", journal, "--verify", *own)
     status, out, _ = run(capsys, "replay", journal, "--verify")
     assert status == 1  # the paper's has other rotors
-    assert re.search("the vehicle was .*: --vehicle names its file", out)
+    assert re.search(r"vehicle_hash .*\(--vehicle names its file\)", out)

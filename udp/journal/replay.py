@@ -16,7 +16,7 @@ from ..protocol.messages import State
 from ..transport.stepped import Steppable, make_stepped
 from .reader import Item, Recording, Session, Transition, Walker, count_of, printable
 
-_SAME = ("agents", "observation", "action", "telemetry", "control_period", "vehicle_hash")
+_SAME = ("vehicle_hash", "agents", "observation", "action", "telemetry", "control_period")
 """Fields of the spec that have to be those of the recorded one."""
 
 
