@@ -16,7 +16,7 @@ from ._flags import EnvFlags, check_count
 
 @dataclass(frozen=True, kw_only=True)
 class View(EnvFlags):
-    """Show flights, in real time or slower, in a window.
+    """Show flights in a window: in real time, slower or faster.
 
     Keys: space pauses, the arrow to the right takes one step.
     """

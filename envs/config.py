@@ -238,7 +238,7 @@ class EnvConfig:
 
     @classmethod
     def from_toml(cls, path: Path | str, **keywords: Any) -> "EnvConfig":
-        """A config from a file as `read_keywords` has it; keyword arguments win."""
+        """A config from a TOML file of keywords; keyword arguments win. See `read_keywords`."""
         return cls.from_keywords(**read_keywords(path) | keywords)
 
     def to_dict(self) -> Values:

@@ -126,6 +126,7 @@ class Loop:
             record.run(None, begin)
             record.begun = begun
             record.waiting = begun | True
+            record.episodes = 0 * record.episodes
         if seeds is not None:
             self.world.seed(begun, seeds[:: len(self.spec.agents)])
         record.run(None if everybody else begun, begin)
@@ -170,7 +171,7 @@ class Loop:
         if shape != record.shape:
             raise InputError(f"snapshot: expected one of drones {record.shape}, got {shape}")
         config = self.spec.config_digest
-        got = part_of(snapshot, "loop")["config"]
+        got = part_of(snapshot, "loop").get("config")
         if got != config:
             raise InputError(f"snapshot: expected one of config {config}, got one of {got}")
         record.restore(kept)

@@ -61,7 +61,9 @@ def load(env_id: str) -> str:
 
 def _import_here(module: str) -> None:
     """Import an installed module, or else one from the working folder, which is searched last."""
-    sys.path.append(os.getcwd())
+    here = os.getcwd()
+    if here not in sys.path:
+        sys.path.append(here)
     try:
         import_module(module)
     except ModuleNotFoundError as error:

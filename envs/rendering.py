@@ -18,7 +18,7 @@ RENDER_MODES = ["human", "rgb_array"]
 
 
 class Renderer:
-    """`render` of an env: a picture of each world, or a window that shows them in real time."""
+    """`render` of an env: a picture of each world, or a window with the first in real time."""
 
     def __init__(self, mode: str | None, loop: "Loop") -> None:
         if mode is not None and mode not in RENDER_MODES:
@@ -38,15 +38,15 @@ class Renderer:
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Pictures, uint8, shape (height, width, 3); None in other modes than `rgb_array`.
 
-        Raises `ResetNeeded` before the first episode.
+        Raises `ResetNeeded` if a drone has had no episode.
         """
         if self._mode is None:
             gym.logger.warn("render: expected render_mode='rgb_array' or 'human', got None")
             return None
-        record = self._loop.record
-        if not record.has_begun:
+        episodes = np.ravel(self._loop.record.episodes)
+        if not episodes.all():
             raise gym.error.ResetNeeded("render: expected a call of reset() first")
-        now = moments(self._loop, np.ravel(record.episodes - 1).tolist())
+        now = moments(self._loop, (episodes - 1).tolist())
         if self._mode == "human":
             self._show(now)
             return None

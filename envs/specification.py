@@ -17,7 +17,12 @@ from .telemetry import quantities_of
 
 def make_task(config: EnvConfig, shape: tuple[int, ...] = (1, 1)) -> Task:
     """The task of a config, for W worlds of A drones. Raises `InputError`."""
-    task = registry.task_type(config.env_id)(config, config.load_vehicle(), shape)
+    task_class = registry.task_type(config.env_id)
+    missing = ", ".join(sorted(task_class.__abstractmethods__))
+    if missing:
+        got = f"got {task_class.__name__} without them"
+        raise InputError(f"{config.env_id}: expected a task with the methods {missing}, {got}")
+    task = task_class(config, config.load_vehicle(), shape)
     if not hasattr(task, "observation"):
         raise InputError(f"{config.env_id}: expected setup() to set self.observation, it does not")
     if task.config is not config:

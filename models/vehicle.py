@@ -197,7 +197,7 @@ class Vehicle:
         model.geom_group[:] = craft_geoms(model)
         if payload and self._meets(model, payload_radius(payload), cable):
             clear = f"a payload with a radius of {payload_radius(payload):.3g} m hangs clear"
-            raise InputError(f"effects: cable: expected a length at which {clear}, got {cable:g} m")
+            raise InputError(f"effects.cable: expected a length at which {clear}, got {cable:g} m")
         return model
 
     def _meets(self, model: mujoco.MjModel, radius: float, cable: float) -> bool:
@@ -401,7 +401,7 @@ def _read_rotor(model: mujoco.MjModel, data: mujoco.MjData, index: int) -> Rotor
     elif not model.actuator_ctrllimited[index]:
         fault = f"rotor {name} to have a thrust with limits (ctrlrange), got none"
     elif model.actuator_forcelimited[index] and (limited != forces).any():
-        fault = f"rotor {name} to have no forcerange within its ctrlrange, got one"
+        fault = f"rotor {name} to have no forcerange narrower than its thrusts, got one"
     if fault:
         raise InputError(f"vehicle: expected {fault}")
     turn = data.site_xmat[site].reshape(3, 3)

@@ -315,14 +315,17 @@ def _number(name: str, limits: Limits, given: object, source: str) -> Number:
     """A number that is given plainly or with its provenance."""
     table = given if isinstance(given, dict) else {"value": given}
     sourced = read_table(_Sourced, table, name)
-    others = _listed(sourced.others, f"{name}.others")
+    others = []
+    for where, other in _listed(sourced.others, f"{name}.others"):
+        check_names(_mapping(other, where), ("value", "source"), where)
+        others.append(_number(where, limits, other, ""))
     return Number(
         name=name,
         value=check(name, limits, sourced.value),
         unit=limits.unit,
         source=sourced.source or source,
         why=sourced.why,
-        others=tuple(_number(where, limits, one, "") for where, one in others),
+        others=tuple(others),
     )
 
 

@@ -125,10 +125,11 @@ class Moment:
     def lines(self) -> list[tuple[str, str]]:
         """Names and values for an overlay."""
         thrusts = " ".join(f"{thrust:.3g}" for thrust in self.thrusts)
+        rotors = len(self.thrusts)
         return [
             *((metric.label, metric.text) for metric in self.metrics[:_MAX_METRICS]),
             ("elevation", f"{self.position[2]:.2f} m"),
-            (f"F1 to F{len(self.thrusts)}", f"{thrusts} N"),
+            (f"F1 to F{rotors}" if rotors > 1 else "F1", f"{thrusts} N"),
             ("reward", f"{self.reward:+.3f}"),
             ("step", str(self.step)),
             ("episode", str(self.episode)),
@@ -357,6 +358,8 @@ class Canvas(AbstractContextManager["Canvas"]):
         (height, width, 3).
         """
         stage = stage or self.stage
+        if stage.model is not self.stage.model:
+            raise ValueError("stage: expected the canvas's own or a twin of it, got another")
         scene = self._drawing.scene
         self._drawing.update(stage.data, stage.camera(camera))
         for light in scene.lights[: scene.nlight]:

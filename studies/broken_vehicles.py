@@ -131,7 +131,7 @@ BROKEN: Final[dict[str, tuple[Edit, str]]] = {
         "rotor1 to have a thrust with limits"),
     "rotors that give less than they are asked for": (
         replace(('ctrlrange="0 100"', 'ctrlrange="0 100" forcelimited="true" forcerange="0 80"')),
-        "rotor1 to have no forcerange within its ctrlrange"),
+        "rotor1 to have no forcerange narrower than its thrusts"),
     "too weak to hover": (
         replace(('ctrlrange="0 100"', 'ctrlrange="0 45"')), SHARE),
     "thrust in millinewtons": (

@@ -85,8 +85,7 @@ class Case:
     def drones(self) -> int:
         """Of one world."""
         task = registry.task_type(self.env_id)
-        usual = max(2, task.min_drones) if task.max_drones > 1 else 1
-        return int(self.options.get("drones", usual))
+        return int(self.options.get("drones", task.min_drones))
 
     def config(self, **more: Any) -> EnvConfig:
         """Of short episodes."""

@@ -50,6 +50,8 @@ class Record:
         out: Drones whose own episode has ended, (W, A).
         done: Drones of worlds whose episodes have all ended, (W, A).
         waiting: Drones that must be reset before they fly, (W, A).
+        scenes: Number of each world's scene, (W, A).
+        pictures: Last picture of each camera by name, (W, A, height, width, channels).
     """
 
     sent: Floats

@@ -287,7 +287,7 @@ class MujocoWorld(World):
         if hung is None:
             if drones != 1:
                 expected = "one drone in a world, or a task whose start places it"
-                raise InputError(f"effects: payload: expected {expected}, got {drones} drones")
+                raise InputError(f"effects.payload: expected {expected}, got {drones} drones")
             hung = pose.position - (0.0, 0.0, self._cable)
         hung = np.reshape(hung, (-1, drones, 3))[:, 0]
         height = hung[ids, 2].min(initial=np.inf) + self._cable

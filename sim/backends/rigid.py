@@ -54,7 +54,7 @@ class RigidWorld(World):
         payload = 0.0 if effects is None else effects.payload
         if payload:
             expected = "none with the backend rigid, which has no cable: fly it with mujoco"
-            raise InputError(f"effects: payload: expected {expected}, got {payload:g} kg")
+            raise InputError(f"effects.payload: expected {expected}, got {payload:g} kg")
         shape = (num_worlds, drones)
         super().__init__(vehicle, shape, effects, randomize)
         _check_obstacles(vehicle)

@@ -68,7 +68,7 @@ class RotorEffects(Kept):
         count = vehicle.num_rotors
         if share and len(share) != count:
             raise InputError(
-                f"effects: efficiency: expected {count} numbers, one for each rotor, got {share}"
+                f"effects.efficiency: expected {count} numbers, one for each rotor, got {share}"
             )
         self.names = [f"thrust_{number}" for number in range(1, count + 1)]
         self._roots: Array = None  # of the thrusts, proportional to the rotors' speeds

@@ -31,7 +31,7 @@ def test_the_horizon_is_that_of_the_largest_discount() -> None:
 @pytest.mark.parametrize("env_id", TASKS)
 def test_a_crash_costs_what_the_worst_step_would_cost_for_ever(env_id: str) -> None:
     task = registry.task_type(env_id)
-    drones = max(2, task.min_drones) if task.max_drones > 1 else 1
+    drones = task.min_drones
     env = LocalVectorEnv(env_id, 24 * drones, drones=drones, action="rotors")
     env.reset(seed=0)
     dice = np.random.default_rng(0)

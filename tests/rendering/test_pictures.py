@@ -238,6 +238,8 @@ def test_twins_share_a_canvas_and_nothing_else(stage: Stage, canvas: Canvas) -> 
     other = canvas.draw("side", twin)
     assert not same(before, other)
     assert same(canvas.draw("side"), before)
+    with pytest.raises(ValueError, match="stage: expected the canvas's own or a twin"):
+        canvas.draw("side", Stage("plain"))
 
 
 def test_shadows_and_smooth_edges_are_there_unless_it_is_to_be_fast(opengl: None) -> None:
@@ -283,4 +285,5 @@ def test_lines_follow_the_task_and_the_vehicle() -> None:
     free = at(1.0, goal=None, metrics=(), thrusts=(0.066,) * 4).lines
     assert free[:2] == [("elevation", "1.00 m"), ("F1 to F4", "0.066 0.066 0.066 0.066 N")]
     six = at(1.0, thrusts=(5.0, 7.25, 5.0, 7.0, 5.0, 7.0)).lines
+    assert at(1.0, metrics=(), thrusts=(3.25,)).lines[1] == ("F1", "3.25 N")
     assert six[2] == ("F1 to F6", "5 7.25 5 7 5 7 N")

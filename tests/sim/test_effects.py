@@ -751,7 +751,7 @@ def test_a_payload_touches_the_ground_before_the_craft_does() -> None:
 def test_a_payload_that_hangs_in_the_ground_or_in_the_craft_is_refused() -> None:
     world = world_of(payload=0.15, cable=2.0)
     refused(r"^start: expected a height over 2\.033 m, .*, got 1 m$", begin, world, 1.0)
-    short = r"^effects: cable: expected a length .*, got 0\.05 m$"
+    short = r"^effects\.cable: expected a length .*, got 0\.05 m$"
     refused(short, world_of, payload=10.0, cable=0.05)
 
 

@@ -341,7 +341,7 @@ def test_whole_episodes_agree_with_mujoco(env_id: str, size: float, file: Any) -
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        ({"effects": {"payload": 0.1}}, "effects: payload: expected none with the backend rigid"),
+        ({"effects": {"payload": 0.1}}, "effects.payload: expected none with the backend rigid"),
         ({"dtype": "float16"}, "dtype: expected 'float32' or 'float64', or none, got 'float16'"),
         ({"compiled": 1}, "compiled: expected true or false, or none, got 1"),
         ({"num_threads": 2}, "num_threads: expected dtype or compiled"),
