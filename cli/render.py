@@ -105,7 +105,8 @@ class Render(EnvFlags):
 
         episodes = range(self.episode, self.episode + self.episodes)
         path = Path(what)
-        name = agent_label(path.stem)
+        is_file = path.suffix in (".mcap", ".safetensors")
+        name = agent_label(path.stem if is_file else path.name)
         if path.suffix == ".mcap":
             recorded = recorded_trajectories(path, episodes, session=self.session, drone=self.drone)
             return FilmTrack(name=name, trajectories=recorded), self.vehicle

@@ -15,7 +15,7 @@ from markdown_it import MarkdownIt
 from ..models.errors import require
 from .claims import Verdict, judge_claims, judge_no_worse
 from .figures import PAPER, draw_figures
-from .results import Results
+from .results import Results, ResultsError
 from .tables import markdown, results_table
 
 PAGE_FILE = "report.html"
@@ -28,9 +28,13 @@ def write_report(results: Results) -> pd.DataFrame:
     """Draw the figures and write page, tables and verdicts into the folder; the table."""
     require("matplotlib", "report", "a report")
     folder = results.folder
+    if results.runs.empty and (folder / "runs.csv").exists():
+        expected = "the folder runs, with a file for each run"
+        raise ResultsError(f"{folder}: expected {expected}, got runs.csv alone")
     table = results_table(results)
     table.to_csv(folder / "results.csv")
-    results.runs.to_csv(folder / "runs.csv", index=False)
+    if len(results.runs):
+        results.runs.to_csv(folder / "runs.csv", index=False)
     text = _head(results) + markdown(results, table) + _claims(judge(results))
     (folder / "results.md").write_text(text, encoding="utf-8")
     figures = draw_figures(results, table) if len(table) else []

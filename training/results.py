@@ -2,7 +2,8 @@
 
 A study writes one folder. Everything that is drawn, tabulated or judged is read back from it.
 `config.json` has the study, the spec of each row's env, versions and machine. Each table is a
-folder with a Parquet file for each run, that is row and seed; `pandas.read_parquet` reads it whole.
+folder with a Parquet file for each run, that is row and seed. `Results` reads it whole; files of
+different rows may have different columns.
 
 | table | one row per |
 |---|---|
@@ -133,7 +134,7 @@ def run_file(folder: Path, row: Row, seed: int, table: str = "runs") -> Path:
 def write_run(folder: Path, row: Row, seed: int, tables: Tables) -> None:
     """Write what one run gave; the table `runs` last."""
     for name in reversed(tuple(COLUMNS)):
-        if name in tables:
+        if name in tables and len(tables[name]):  # columns of an empty table have no type
             table = tables[name].drop(columns=["row", "seed"], errors="ignore")
             table.insert(0, "row", row.name)
             table.insert(1, "seed", seed)

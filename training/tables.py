@@ -4,6 +4,7 @@ The terminal and the report's page show the same text.
 """
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from itertools import groupby
 
@@ -109,7 +110,7 @@ def markdown(results: Results, table: pd.DataFrame) -> str:
 
 
 def _markdown_line(cells: Sequence[str]) -> str:
-    escaped = [cell.replace("|", r"\|") for cell in cells]
+    escaped = [re.sub(r"[|*`\\]|\](?=\()", r"\\\g<0>", cell) for cell in cells]
     return f"| {' | '.join(escaped)} |"
 
 

@@ -168,6 +168,7 @@ def test_a_key_that_cannot_be_read_or_written(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "text",
     [b"", b"\n", b"00" * 31, b"00" * 33, b"0" * 63, b"zz" * 32, b"\xff" * 64, b"00" * 500,
+     b"00" * 16 + b"\n" + b"00" * 16, b"00 " * 32,
      "٠".encode() * 64],
 )  # fmt: skip
 def test_a_file_that_holds_no_key(tmp_path: Path, text: bytes) -> None:

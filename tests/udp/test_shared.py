@@ -273,7 +273,7 @@ def test_a_journal_of_a_part_of_a_world_cannot_be_simulated_and_says_so_briefly(
     verdict = Verification(journal)
     assert not verdict.identical
     told = str(verdict).splitlines()
-    assert told[1].startswith("  State 1 cannot be repeated: expected an env of the observation (")
+    assert told[1].startswith("  State 1 cannot be repeated: expected an env of the observation ")
     assert len(told[1]) < 300
 
 

@@ -98,7 +98,7 @@ class Recording:
 
     Attributes:
         path: The file.
-        about: Metadata of its head: side, versions; of a simulator also config, backend, models.
+        about: Metadata of its head: side, versions; of a simulator also config and backend.
         complete: Whether the file was finished, and could be read as far as was tried.
         ending: How it ends, in words.
 

@@ -109,7 +109,8 @@ def read_key(path: Path | str) -> bytes:
         expected = f"{path} to be readable by its owner alone (chmod 600)"
         raise InputError(f"key file: expected {expected}, got mode {mode & 0o777:o}")
     try:
-        key = bytes.fromhex(text.decode("ascii"))
+        (line,) = text.decode("ascii").split()
+        key = bytes.fromhex(line)
     except ValueError:
         key = b""
     if len(key) != KEY_SIZE:

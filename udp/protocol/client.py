@@ -206,7 +206,7 @@ class Client:
         self._sealing = self.key  # from the Welcome on the key of the session
         self._nonce = 0
         self.tap: Tap | None = None
-        self._dice = Random(0) if self.config.drop else None
+        self._dice = Random(self.hello.spec) if self.config.drop else None  # others for each agent
         self._is_queued = False
         self._assembler = Assembler(self.layout.seeded_command.size)
         self._transfer: Transfer | None = None  # of the outstanding message

@@ -400,6 +400,7 @@ class SeveralAgents(WorldRules):
             self.reason = why
 
     def _let_go(self, link: AgentLink) -> None:
+        """Note that its drones hold until the end of the episode."""
         absence = Absence(link.number, self.episodes, self.steps, link.participation)
         self.absences.append(absence)
 
