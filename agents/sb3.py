@@ -83,7 +83,7 @@ class SB3VecEnv(sb3_vec.VecEnv):
         return [getattr(self.env, attr_name)] * len(list(self._get_indices(indices)))
 
     def env_method(self, *_: object, **__: object) -> NoReturn:
-        """Not possible: the envs are one, without attributes to set and methods to call."""
+        """Not possible: no env is apart here."""
         raise NotImplementedError("the envs of a vector env are one")
 
     set_attr = env_method
@@ -122,18 +122,17 @@ class RecordedEnv(VectorEnv[Floats, Floats, np.ndarray]):
         recorder = self.recorder
         env = recorder.env
         recorder.fly(np.asarray(actions, np.float32).reshape(self.num_envs, -1))
-        last = recorder.observations
+        final = recorder.observations
         rewards = env.rewards
         terminated = env.terminated
         truncated = env.truncated
-        if recorder.done.any():
-            begun = recorder.done
-            truncated = truncated | recorder.begin(begun)
-            terminated = terminated | (begun & ~truncated)
+        starting = recorder.done
+        if starting.any():
+            truncated = truncated | recorder.begin(starting)
+            terminated = terminated | (starting & ~truncated)
         ended = terminated | truncated
-        info = {"final_obs": last, "_final_obs": ended} if ended.any() else {}
-        observations = recorder.observations
-        observations[recorder.out] = 0.0
+        info = {"final_obs": final, "_final_obs": ended} if ended.any() else {}
+        observations = np.where(recorder.out[:, None], np.float32(0), recorder.observations)
         return observations, rewards, terminated, truncated, info
 
 
@@ -148,7 +147,7 @@ class SB3Agent:
         model: SB3's own.
 
     Raises:
-        InputError: Another kind of network; or SAC is to make choices.
+        InputError: The network is no MLP, or SAC is given an env of choices.
     """
 
     def __init__(self, log: EpisodeRecorder, config: A2CConfig | SACConfig, seed: int) -> None:
@@ -158,7 +157,7 @@ class SB3Agent:
         self._config = config
         self._rate = config.learning_rate
         self._rollout = config.rollout_size(log.num_envs)
-        torch.set_num_threads(1)  # such small nets lose by a second thread
+        torch.set_num_threads(1)  # a second thread slows such small nets
         steps = self._rollout // log.num_envs
         policy: dict[str, object] = {
             "net_arch": list(config.hidden),
@@ -187,7 +186,7 @@ class SB3Agent:
         )
         if isinstance(config, PPOConfig) and config.critic_learning_rate:
             self._set_rate_of_critic(config.critic_learning_rate / config.learning_rate)
-        # It keeps the numbers of the last update for us; SB3's own makes a folder in /tmp.
+        # This logger keeps the last numbers for us; SB3's own makes a folder in /tmp.
         self.model.set_logger(sb3_logger.Logger(folder=None, output_formats=[]))
 
     def train(self, log: EpisodeRecorder, env_steps: int, on_update: OnUpdate) -> None:
@@ -288,7 +287,7 @@ def _sac_settings(config: SACConfig, steps: int, log: EpisodeRecorder) -> dict[s
         raise InputError("sb3-sac: expected an env of continuous actions, got one of choices")
     return {
         "buffer_size": config.buffer_size,
-        "learning_starts": config.learning_starts - 1,  # SB3 learns after more than so many
+        "learning_starts": config.learning_starts - 1,  # SB3 begins one step later
         "batch_size": config.batch_size,
         "tau": config.tau,
         "train_freq": steps,

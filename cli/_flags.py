@@ -48,7 +48,7 @@ else:  # tyro imports typeguard, slowly, for a tuple of a stated type
 
 DEFAULT_ENV = "rotorgram/Elevation-v0"
 _PLAIN_FLAGS = ("action", "control_period", "episode_length", "history", "scene", "cameras")
-_WORLD_FLAGS = ("effects", "randomize", "sensors")
+_NAMED_FLAGS = ("effects", "randomize", "sensors")
 Options = dict[str, Any]
 """Options of a task and its env by name, values as of JSON."""
 
@@ -58,8 +58,8 @@ class Command:
     """Base of all commands: the fields are the flags, their docstrings the help."""
 
     given: Suppress[Fixed[frozenset]] = frozenset()  # type: ignore[type-arg]
-    """Names of the fields that the user set, if only to their default; those of options of the
-    task begin with `env.`."""
+    """Names of the fields that flags or a config's file set, even to their default; those of a
+    task's flags begin with `env.`."""
 
     def run(self) -> int:
         """Do it; the exit status."""
@@ -173,26 +173,26 @@ def parse(kind: type[C], prog: str, words: Sequence[str]) -> C:
     given = _given(words)
     if not issubclass(kind, EnvFlags):
         return cast(C, replace(tyro.cli(_for_tyro(kind), prog=prog, args=words), given=given))
-    return cast(C, _with_env(kind, prog, words, given))
+    return cast(C, _parsed_env(kind, prog, words, given))
 
 
-def _with_env(
+def _parsed_env(
     kind: type["EnvFlags"], prog: str, words: Sequence[str], given: frozenset[str]
 ) -> "EnvFlags":
     from ..envs import registry
     from ..envs.config import KEYWORDS
 
-    early = ArgumentParser(prog, add_help=False, allow_abbrev=False)
-    early.add_argument("--env")
-    early.add_argument("--config")
-    found = early.parse_known_args(words)[0]
+    first_pass = ArgumentParser(prog, add_help=False, allow_abbrev=False)
+    first_pass.add_argument("--env")
+    first_pass.add_argument("--config")
+    found = first_pass.parse_known_args(words)[0]
     file = _file_values(kind, found.config, found.env) if found.config else {}
     env_id = found.env or file.get("env", DEFAULT_ENV)
     listens = "listen" in given or getattr(kind, "listen", None) is not None
     if listens and ":" not in env_id and not registry.is_known(env_id):
         command = tyro.cli(_for_tyro(kind), prog=prog, args=words)
         check_count("drones", command.drones)
-        return _with_options(command, given, {}, file)
+        return _merged(command, given, {}, file)
     env_id = registry.load(env_id)
     options = _for_tyro(registry.task_type(env_id).Options, f"Options of {env_id}.")
     command = tyro.cli(_for_tyro(kind, options=options), prog=prog, args=words)
@@ -201,7 +201,7 @@ def _with_env(
     clashing = {name: own.pop(name) for name in names if name in KEYWORDS}
     if clashing:
         own["task"] = clashing
-    command = _with_options(command, given, own, file)
+    command = _merged(command, given, own, file)
     checked = command.env_config().flat_options()
     chosen = {name: checked.get(name, value) for name, value in command.options.items()}
     return replace(command, options=chosen)
@@ -232,15 +232,13 @@ def _file_values(kind: type[EnvFlags], path: str, env: str | None) -> Options:
     return {**values, "options": {**backend.settings, **options}}
 
 
-def _with_options(
-    command: EnvFlags, given: frozenset[str], own: Options, file: Options
-) -> EnvFlags:
-    """The command with options of the task, of other flags, and what only the file says."""
+def _merged(command: EnvFlags, given: frozenset[str], own: Options, file: Options) -> EnvFlags:
+    """The command with its options: those of the file, then `own` and the other flags."""
     added = {name: value for name, value in file.items() if name not in {*given, "options"}}
     options = {**file.get("options", {}), **own}
     for name in given.intersection(_PLAIN_FLAGS):
         options[name] = getattr(command, name)
-    for name in given.intersection(_WORLD_FLAGS):
+    for name in given.intersection(_NAMED_FLAGS):
         options[name] = _named_values(name, getattr(command, name))
     return replace(command, given=given | added.keys(), options=options, **added)
 
@@ -263,10 +261,10 @@ def _named_values(flag: str, words: Words) -> Options:
 
 
 def _for_tyro(kind: type["DataclassInstance"], doc: str | None = None, options: Any = None) -> Any:
-    """A dataclass without checks: wrong values are refused later, as every other wrong input.
+    """A class of flags for tyro, whose checks run later.
 
-    `options` is the type of the field of that name. The class has `Union[X, Y]` for `X | Y`: before
-    Python 3.14 tyro imports typeguard for that, slowly.
+    `options` is the type of the field of that name. `X | Y` becomes `Union[X, Y]`: for the first,
+    tyro imports typeguard before Python 3.14, which is slow.
     """
     changed: dict[str, object] = {}
     for name, hint in get_type_hints(kind, include_extras=True).items():
@@ -283,7 +281,7 @@ def _for_tyro(kind: type["DataclassInstance"], doc: str | None = None, options: 
 
 
 def parse_value(text: str) -> Any:
-    """A value as JSON; other words are texts. Python's True and False are taken too."""
+    """A value as JSON, else the text itself. Python's True, False and None are taken too."""
     try:
         return json.loads({"True": "true", "False": "false", "None": "null"}.get(text, text))
     except (ValueError, RecursionError):

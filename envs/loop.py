@@ -28,8 +28,8 @@ class Loop:
 
     Drones of one world begin together. One whose episode ends before those of the others is *out*:
     its rotors stand still, it gets no reward and no second end, and the others fly on. The world is
-    done when all are out. Masks and seeds have an element for each drone, and those of one world
-    are alike; its first one's seed counts.
+    done when all are out. Masks and seeds have an element for each drone. Masks are alike
+    within a world; the seed of its first drone counts.
 
     Args:
         config: What is flown.
@@ -37,8 +37,8 @@ class Loop:
 
     Attributes:
         config: As given, resolved.
-        task, world: Their arrays have the leading axes of the world; all others here have one axis
-            of N drones, world by world, and are new after each `advance`.
+        task, world: Their arrays have the axes of `world.shape`. Those below have one axis of N
+            drones, world by world, and are new after each `advance`.
         num_envs: N.
         observations: By name, shape (N, *shape), of the declared dtypes.
         rewards: float64, shape (N,); 0 for a drone that did not fly.
@@ -91,8 +91,8 @@ class Loop:
     ) -> None:
         """Reset some drones, freeze some, and fly the others for one control period.
 
-        As `AdvancingVectorEnv.advance`. If the task refuses a start, the others have flown; the
-        drones to be reset have not moved, and their random numbers have moved on.
+        As `AdvancingVectorEnv.advance`. If the task refuses a start, the others have flown. The
+        drones to be reset have not moved, and their random numbers have been drawn.
         """
         self._check_open()
         record = self.record
@@ -120,8 +120,9 @@ class Loop:
         """Begin episodes: the task sets the start, and the other stages follow from it."""
         record = self.record
         begin = self._pipeline.begin
-        everybody = bool(begun.all())
-        if not record.has_begun and not everybody:  # the first time all of them
+        all_begin = bool(begun.all())
+        # A first reset of some begins all, so that every array exists. Then all but those wait.
+        if not record.has_begun and not all_begin:
             record.begun = begun | True
             record.run(None, begin)
             record.begun = begun
@@ -129,7 +130,7 @@ class Loop:
             record.episodes = 0 * record.episodes
         if seeds is not None:
             self.world.seed(begun, seeds[:: len(self.spec.agents)])
-        record.run(None if everybody else begun, begin)
+        record.run(None if all_begin else begun, begin)
 
     def _observe(self) -> None:
         """Drones that flew, and those that begin, are measured, judged and observed."""
@@ -158,7 +159,7 @@ class Loop:
     def restore(self, snapshot: Arrays) -> None:
         """Put back a snapshot of a loop of the same config and size; no step runs.
 
-        No later bit differs from those that followed it.
+        Later steps give the same bits as after the snapshot.
 
         Raises:
             InputError: It is of another config or number of drones; nothing has changed.
@@ -229,7 +230,7 @@ class Loop:
         return self._telemetry
 
     def row(self) -> list[float]:
-        """The telemetry of a single drone in a row."""
+        """All telemetry of a single drone as one list."""
         row: list[float] = []
         for quantity in self._quantities:
             row += quantity.read(self).ravel().tolist()

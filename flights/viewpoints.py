@@ -47,9 +47,9 @@ class CaptureConfig:
     tilt: Annotated[float, Limits(0, math.pi, "rad")] = 0.0
     """Drones are tilted at random by up to this angle, rad."""
     seed: NonNegativeInt = 0
-    """Of what is random."""
+    """Seed of the random moves and tilts."""
     fast: bool = False
-    """Without shadows and smooth edges."""
+    """Draw without shadows and without smooth edges."""
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -82,7 +82,7 @@ class PoseSequence:
 
     @property
     def drones(self) -> int:
-        """A."""
+        """Number of drones, A."""
         return int(self.states["position"].shape[1])
 
     def part(self, rows: slice) -> "PoseSequence":
@@ -102,42 +102,44 @@ def sequences_of(journals: Sequence[Path], config: CaptureConfig) -> list[PoseSe
         InputError: A file is no journal, has no episode, or is of another vehicle.
         OSError: It cannot be read.
     """
-    own = models.Vehicle.load(config.vehicle).name
+    given = models.Vehicle.load(config.vehicle).name
     found = []
     for number, path in enumerate(journals, 1):
         rng = np.random.default_rng([config.seed, number])
-        worlds = list(_worlds(path))
-        if not worlds:
+        episodes = list(_episodes(path))
+        if not episodes:
             raise InputError(f"{path}: expected an episode with a step in it, got none")
-        for world in worlds:
-            recorded = world[0].spec.vehicle
-            if recorded != own:
-                raise InputError(f"vehicle: expected {recorded}, which flies in {path}, got {own}")
-            found.append(_sequence(path.name, world, config, rng))
+        for episode in episodes:
+            recorded = episode[0].spec.vehicle
+            if recorded != given:
+                raise InputError(
+                    f"vehicle: expected {recorded}, which flies in {path}, got {given}"
+                )
+            found.append(_sequence(path.name, episode, config, rng))
     return found
 
 
-def _worlds(path: Path) -> Iterator[list[Trajectory]]:
-    """Episode after episode, the trajectories of the drones of its world."""
+def _episodes(path: Path) -> Iterator[list[Trajectory]]:
+    """For each episode of a world, the trajectories of its drones."""
     flown = [one for one in read_episodes(path) if isinstance(one, Trajectory)]
     flown.sort(key=attrgetter("drone"))
-    flown.sort(key=_world_of)
-    for _, world in groupby(flown, key=_world_of):
-        yield list(world)
+    flown.sort(key=_episode_of)
+    for _, episode in groupby(flown, key=_episode_of):
+        yield list(episode)
 
 
-def _world_of(one: Trajectory) -> tuple[int, int, int]:
+def _episode_of(one: Trajectory) -> tuple[int, int, int]:
     """Session, world and episode of a trajectory."""
     return one.session, one.drone // len(one.spec.agents), one.episode
 
 
 def _sequence(
-    source: str, world: Sequence[Trajectory], config: CaptureConfig, rng: np.random.Generator
+    source: str, episode: Sequence[Trajectory], config: CaptureConfig, rng: np.random.Generator
 ) -> PoseSequence:
     """Every so many steps of an episode; a drone whose flight has ended stays where it is."""
-    steps = np.arange(0, max(map(len, world)) + 1, config.every)
-    rows = [np.minimum(steps, len(one)) for one in world]
-    pose = np.stack([one.pose[own] for one, own in zip(world, rows, strict=True)], axis=1)
+    steps = np.arange(0, max(map(len, episode)) + 1, config.every)
+    rows = [np.minimum(steps, len(one)) for one in episode]
+    pose = np.stack([one.pose[kept] for one, kept in zip(episode, rows, strict=True)], axis=1)
     low = (-config.aside, -config.aside, 0.0)
     moved = rng.uniform(low, config.aside, pose[..., :3].shape)
     tilts = _tilts(pose.shape[:-1], config.tilt, rng)
@@ -146,10 +148,10 @@ def _sequence(
         "quaternion": multiplied(tilts, pose[..., 3:]),
     }
     for name in ("goal", "payload"):
-        if name in world[0].telemetry:
-            arrays = [one.telemetry[name][own] for one, own in zip(world, rows, strict=True)]
+        if name in episode[0].telemetry:
+            arrays = [one.telemetry[name][kept] for one, kept in zip(episode, rows, strict=True)]
             states[name] = np.stack(arrays, axis=1)
-    spec = world[0].spec
+    spec = episode[0].spec
     times = steps.astype(np.float64) * spec.control_period
     return PoseSequence(source=source, times=times, states=states, marks=spec.marks)
 

@@ -26,11 +26,13 @@ COEFFICIENTS: Final[Mapping[str, Limits]] = {
 class Coefficients(dict[str, Any]):
     """A number, a tuple of numbers or None for each of `COEFFICIENTS`.
 
-    None: the file does not say it, and what needs it cannot be switched on.
+    None: the file does not give it; then `need` refuses.
     """
 
     def need(self, names: str, what: str) -> tuple[Any, ...]:
-        """Values of "group.name" words. Raises `InputError` that names the first that is missing.
+        """Values of `names`: "group.name" words with spaces between.
+
+        Raises `InputError` that names the first that is missing.
 
         `what` needs them: the effect or sensor, by its name.
         """
@@ -59,7 +61,7 @@ class Coefficients(dict[str, Any]):
 
 def limits_of_group(group: str) -> dict[str, Limits]:
     """The limits of the coefficients of a group, by "group.name"."""
-    return {name: own for name, own in COEFFICIENTS.items() if name.startswith(f"{group}.")}
+    return {name: limits for name, limits in COEFFICIENTS.items() if name.startswith(f"{group}.")}
 
 
 def as_tuple(value: float | tuple[float, ...]) -> tuple[float, ...]:

@@ -102,7 +102,7 @@ def write_config(folder: Path, command: str, study: Study, specs: Mapping[str, E
 
 
 def machine() -> dict[str, object]:
-    """Machine on which times depend."""
+    """The machine, on which times depend."""
     return {
         "platform": platform.platform(),
         "processor": platform.machine(),
@@ -110,7 +110,7 @@ def machine() -> dict[str, object]:
     }
 
 
-def part_name(row: Row, seed: int) -> str:
+def run_name(row: Row, seed: int) -> str:
     """Name of the files of a run."""
     return f"{file_words(row.name)}-seed{seed}"
 
@@ -123,12 +123,12 @@ def file_words(text: str) -> str:
 
 def checkpoint_file(folder: Path, row: Row, seed: int) -> Path:
     """The checkpoint of a run."""
-    return folder / CHECKPOINTS / f"{part_name(row, seed)}.safetensors"
+    return folder / CHECKPOINTS / f"{run_name(row, seed)}.safetensors"
 
 
 def run_file(folder: Path, row: Row, seed: int, table: str = "runs") -> Path:
     """File of a run in a table. A run is done when the table `runs` has it."""
-    return folder / table / f"{part_name(row, seed)}.parquet"
+    return folder / table / f"{run_name(row, seed)}.parquet"
 
 
 def write_run(folder: Path, row: Row, seed: int, tables: Tables) -> None:
@@ -192,7 +192,9 @@ class Results:
         """Of the runs that are done, in the order of the rows and seeds."""
         order = {row.name: place for place, row in enumerate(self.study.rows)}
         return self._table("runs").sort_values(
-            ["row", "seed"], key=lambda values: values.map(order).fillna(values), ignore_index=True
+            ["row", "seed"],
+            key=lambda column: column.map(order) if column.name == "row" else column,
+            ignore_index=True,
         )
 
     @cached_property
@@ -208,8 +210,8 @@ class Results:
     def steps(self, phase: str, max_rows: int | None = None) -> pd.DataFrame:
         """Steps of one phase, "train" or "evaluation".
 
-        Of more rows than `max_rows` about `max_rows` are kept, at random but always the same: a
-        stride that divides the episode length would show the same moments of every episode.
+        Keeps about `max_rows` rows, drawn with a fixed seed: a stride that divides the episode
+        length would show the same moments of every episode.
         """
         files = self._files("steps")
         if not files:
@@ -233,7 +235,7 @@ class Results:
         try:
             table = pd.concat(map(pd.read_parquet, files), ignore_index=True)
         except pa.ArrowInvalid as error:
-            raise ResultsError(f"{files[0].parent}: expected Parquet files: {error}") from None
+            raise ResultsError(f"{files[0].parent}: expected Parquet files, got: {error}") from None
         missing = [column for column in COLUMNS[name] if column not in table]
         if missing:
             raise ResultsError(

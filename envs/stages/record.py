@@ -21,9 +21,8 @@ Look = Callable[[], WorldState]
 class Record:
     """Named arrays of W worlds of A drones, shape (W, A, ...); of a single drone (...).
 
-    Stages run in regions, each under a mask of shape (W, A). What a region assigns to names that
-    are kept is merged under its mask when it ends, so no stage writes for other drones. No array is
-    changed in place.
+    A region runs stages under a mask of shape (W, A). When it ends, kept names have their new
+    values under the mask and the old ones elsewhere. No array is changed in place.
 
     Attributes:
         shape: (W, A), or () for a single drone.
@@ -36,9 +35,9 @@ class Record:
         received: The action that arrives at the controller.
         thrust: Of each rotor, N, (W, A, R).
         draw: Draws the numbers of episodes that begin.
-        start: Of the drones that begin.
+        start: Initial state of the drones that begin.
         state: At the end of the step.
-        measured: The same, as sensors have it.
+        measured: The state, or the estimate that replaces it.
         observations: By name, (W, A, *shape).
         terms: Of the reward, by name, (W, A).
         metrics: By name, (W, A).
@@ -50,6 +49,8 @@ class Record:
         out: Drones whose own episode has ended, (W, A).
         done: Drones of worlds whose episodes have all ended, (W, A).
         waiting: Drones that must be reset before they fly, (W, A).
+        actions_sent, past_observations, history: Of the last steps, the oldest first.
+        said, heard, age, keys, silent: Of the radio; see `Radio`.
         scenes: Number of each world's scene, (W, A).
         pictures: Last picture of each camera by name, (W, A, height, width, channels).
     """
@@ -122,14 +123,14 @@ class Record:
     def snapshot(self) -> Snapshot:
         """Copies of what is kept and of the memory, by name."""
         known = vars(self)
-        alone: dict[str, Any] = {}
-        parts = {"memory": vars(self.memory), "kept": alone}
+        plain: dict[str, Any] = {}
+        parts = {"memory": vars(self.memory), "kept": plain}
         for name in self.kept:
             values = known.get(name)
             if isinstance(values, Mapping):
                 parts[name] = {**values}
             elif values is not None:
-                alone[name] = values
+                plain[name] = values
         return {name: np.array(values) for name, values in joined(parts).items()}
 
     def restore(self, arrays: Arrays) -> None:

@@ -32,7 +32,10 @@ class Setting(NamedTuple):
     default: float | tuple[float, ...] | None
     limits: Limits
     coefficient: str = ""
-    """The number of the vehicle's file that replaces the default; one of the two must be there."""
+    """The coefficient of the vehicle that replaces the default.
+
+    Without both, the option has to give the value.
+    """
 
 
 SAMPLING = {
@@ -69,14 +72,14 @@ class Source(Kept):
 class Sensor(Source):
     """Base of sensors, sampled at the end of control steps of `period` s.
 
-    A reading has one number more: 1 if it is new, 0 if the last reading was held.
+    Inside, a flag follows each reading: 1 if it is new, 0 if it was held.
 
     Class attributes:
         prefix: What its coefficients' names begin with in a vehicle's file.
         needs: Coefficients that the vehicle or the option has to give.
         defaults: Coefficients that may be missing.
         own: Settings that are no coefficients of a vehicle.
-        columns: Normal numbers that a reading takes, and a reset.
+        columns: Normal numbers that a reading takes; `draw` gets as many at a reset.
 
     Attributes:
         values: All settings.
@@ -102,8 +105,8 @@ class Sensor(Source):
         self._noise = world.random.noise(f"sensor {self.name}", self.columns + 1)
         dropout = values["dropout"]
         self._lost = NormalDist().inv_cdf(dropout) if dropout else -math.inf
-        self._now: Array = 0.0
-        self._held: Array = 0.0
+        self._now: Array = 0.0  # what is observed, with its flag
+        self._held: Array = 0.0  # the last reading that was taken
         self._late: list[Array] = []  # those on their way, the oldest first
 
     @classmethod
@@ -176,8 +179,8 @@ class Sensor(Source):
         self.draw(mask, self._noise.normal(mask)[..., :-1])
         first = self._read(self._noise.normal(mask))
         self._held = chosen(mask, first, self._held)
-        self._now = chosen(mask, _with(first, 1.0), self._now)
-        old = _with(first, 0.0)
+        self._now = chosen(mask, _flagged(first, 1.0), self._now)
+        old = _flagged(first, 0.0)
         self._late = [chosen(mask, old, late) for late in self._late or [old] * self._lag]
 
     def sample(self, mask: Array, steps: Array) -> None:
@@ -188,9 +191,9 @@ class Sensor(Source):
             normal = self._noise.normal(due)
             fresh = due & (component(normal, -1) >= self._lost)
             self._held = chosen(fresh, self._read(normal), self._held)
-        first, *rest = [*self._late, _with(self._held, fresh)]
-        self._now = chosen(mask, first, self._now)
-        self._late = list(kept(mask, rest, self._late))
+        arriving, *queued = [*self._late, _flagged(self._held, fresh)]
+        self._now = chosen(mask, arriving, self._now)
+        self._late = list(kept(mask, queued, self._late))
 
     def draw(self, mask: Array, normal: Array) -> None:
         """Draw an episode's errors for the drones of a mask."""
@@ -211,8 +214,8 @@ def _is_whole(steps: float) -> bool:
     return abs(steps - round(steps)) < 1e-6 * max(steps, 1.0)
 
 
-def _with(reading: Array, fresh: Array) -> Array:
-    """A reading with one more number for each drone."""
+def _flagged(reading: Array, fresh: Array) -> Array:
+    """A reading and its flag."""
     *lead, size = reading.shape
     both = np.empty((*lead, size + 1))
     both[..., :-1] = reading

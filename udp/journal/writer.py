@@ -40,8 +40,8 @@ class Journal:
 
     It appends whole chunks, so that a killed program leaves a readable file: at most one second of
     messages is in memory only. The file is complete after `close`. A write that fails or is
-    interrupted (a full device) may leave half a record, so it is the last. Ctrl-C and SIGTERM take
-    effect after the write.
+    interrupted (a full device) may leave half a record, so nothing follows it. Ctrl-C and SIGTERM
+    take effect after the write.
 
     Args:
         path: The file; it must not exist.
@@ -81,7 +81,7 @@ class Journal:
             raise FileExistsError(sentence) from None
         writer: Any = Writer(self._file, chunk_size=sys.maxsize, use_summary_offsets=False)
         self._writer = writer
-        with removed_on_error(self._path), self._whole():
+        with removed_on_error(self._path), self._writing():
             writer.start("", f"rotorgram {versions.get('rotorgram', '')}")
             self._event_schema = writer.register_schema(
                 "rotorgram.Event", "jsonschema", b'{"type": "object"}'
@@ -89,7 +89,7 @@ class Journal:
             writer.add_metadata(ABOUT, head)
 
     def tap(self, slot: int, message: Message, datagram: bytes) -> None:
-        """Take note of a message: a `Tap`. `write` pays for writing it."""
+        """Queue a message, as a `Tap`; `write` writes it."""
         if self._closed:
             return
         now = time.time_ns()
@@ -104,14 +104,14 @@ class Journal:
 
     def write(self) -> None:
         """Write the messages. Call it when there is time: while the other side is at work."""
-        # Clocks are set back at times.
+        # A negative time: the clock was set back.
         if self._size > _CHUNK or not 0 <= time.time_ns() - self._flushed < _SECOND:
             self._flush()
 
     def close(self) -> None:
         """Write all, and finish the file, or give it up where that fails. May be called again.
 
-        A fork leaves it to its parent.
+        In a forked child it does nothing.
         """
         if os.getpid() == self._pid:
             try:
@@ -133,7 +133,7 @@ class Journal:
         self._size = 0
         self._flushed = time.time_ns()
         try:
-            with self._whole():
+            with self._writing():
                 for channel, now, sequence, data in self._pending:
                     self._writer.add_message(channel, now, data, now, sequence & 0xFFFFFFFF)
                 self._pending.clear()
@@ -146,8 +146,8 @@ class Journal:
             _log.warning(sentence, self._path, error.strerror or error)
 
     @contextmanager
-    def _whole(self) -> Iterator[None]:
-        """Write what is added here, up to the device. If that is interrupted, it is the last."""
+    def _writing(self) -> Iterator[None]:
+        """Flush what the block writes to the device. If that fails, nothing more is written."""
         with _deferred_signals():
             try:
                 yield
@@ -180,7 +180,7 @@ def software() -> dict[str, str]:
 
 
 def about_of(stepped: Steppable) -> dict[str, str]:
-    """Metadata that describe what is flown, of a registered task; else empty."""
+    """Config and backend of a `Loop` as metadata; else empty."""
     from ...envs.loop import Loop
 
     if not isinstance(stepped, Loop):
@@ -191,7 +191,7 @@ def about_of(stepped: Steppable) -> dict[str, str]:
 
 @contextmanager
 def _deferred_signals() -> Iterator[None]:
-    """Call the handlers of Ctrl-C and SIGTERM after the block: they run in the main thread."""
+    """Delay the handlers of Ctrl-C and SIGTERM to the end of the block."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -20,7 +20,7 @@ from .messages import FLY, RESET, Close, Command, Refuse, Welcome
 Array = np.ndarray
 Mask = NDArray[np.bool_]
 
-_COMPLAIN_AFTER = 1.0  # silence of an agent before the log says so, once a message, s
+_COMPLAIN_AFTER = 1.0  # silence of an agent before it is logged, once for each message, s
 NO_RESET = "an action came after the end of an episode: expected a reset"
 
 
@@ -48,8 +48,8 @@ class World(Protocol):
 Participation = Literal["coming", "ready", "flying", "waiting", "left"]
 """What an agent does in the running episode.
 
-* `coming`: it has not welcomed this simulator yet, or not again since it was silent or started.
-* `ready`: it has, and gets its first State with the next episode.
+* `coming`: its Welcome is awaited, at first, or since it was silent or started anew.
+* `ready`: its Welcome has come; the next episode sends its first State.
 * `flying`: the world waits for its Commands.
 * `waiting`: it asked for a reset, and waits for it.
 * `left`: it closed, or was silent for too long.
@@ -84,12 +84,13 @@ class AgentLink:
     command: Command | None = None
     """The Command that the next step or reset takes."""
     patient_until: float = 0.0
+    """When it is lost if no Command has come, s."""
     seed: int = 0
     """Of the first episode, as of its Welcome."""
     trouble: str = ""
     """Why datagrams do not reach it, as far as the transport knows."""
-    complained: float = -inf
-    """When the message was sent whose missing answer is in the log."""
+    logged: float = -inf
+    """Send time of the last message whose silence was logged."""
 
     @property
     def name(self) -> str:
@@ -159,12 +160,12 @@ class WorldRules:
             if now < client.next_timer():
                 continue
             sends = client.sends
-            began = client.asked_at
-            is_new = now > began + _COMPLAIN_AFTER and link.complained != began
+            asked_at = client.asked_at
+            unlogged = now > asked_at + _COMPLAIN_AFTER and link.logged != asked_at
             if not client.handle_timer(now):
                 self._lose_silent(link, link.silence(client.config.timeout, sends))
-            elif is_new and (link.trouble or not client.sequence):
-                link.complained = began
+            elif unlogged and (link.trouble or not client.sequence):
+                link.logged = asked_at
                 words = link.silence(_COMPLAIN_AFTER, client.sends)
                 client.statistics.notice(f"{words}; asking for {client.config.timeout:g} s in all")
 
@@ -203,16 +204,16 @@ class OneAgent(WorldRules):
         super().__post_init__()
         (self._link,) = self.links
         self._client = self._link.client
-        self._message: Command | Welcome | None = None
-        self._answers = False
+        self._to_follow: Command | Welcome | None = None
+        self._answer_due = False
         self._all_fly = bytes(self.layout.drones)  # orders
 
     def start(self, now: float) -> None:
-        """Say Hello; by text, where the agent says nothing before it, send the first State."""
+        """Say Hello. An agent that flies text sends no Welcome: assume one."""
         super().start(now)
         if self._client.by_text:
             session = self._client.hello.session
-            self._message = Welcome(session=session, nonce=0)
+            self._to_follow = Welcome(session=session, nonce=0)
 
     def receive(self, link: AgentLink, datagram: bytes, now: float) -> None:
         """Take a datagram. Raises `Refused`."""
@@ -220,7 +221,7 @@ class OneAgent(WorldRules):
         if message is None or self.reason is not None:
             return
         if isinstance(message, Command | Welcome):
-            self._message = message
+            self._to_follow = message
         elif isinstance(message, Refuse):
             raise Refused(f"{link.name} refused: {message.reason}")
         elif isinstance(message, Close):
@@ -232,12 +233,12 @@ class OneAgent(WorldRules):
             self.reason = message.reason or "the agent closed"
 
     def step(self, now: float) -> bool:
-        """Follow the last message. Whether another call may move the world again at once."""
-        message = self._message
+        """Follow the last message. False: no further call can move the world."""
+        message = self._to_follow
         if message is None:
             return False
-        self._message = None
-        self._answers = True
+        self._to_follow = None
+        self._answer_due = True
         if isinstance(message, Welcome):
             self._reset_all(first_seeds(message.first_seed, self.layout.drones))
             return False
@@ -251,9 +252,9 @@ class OneAgent(WorldRules):
 
     def answer(self, now: float) -> None:
         """Send the State after a step. Raises `InputError` if it is not finite."""
-        if not self._answers:
+        if not self._answer_due:
             return
-        self._answers = False
+        self._answer_due = False
         world = self.world
         client = self._client
         client.send_state(
@@ -287,7 +288,7 @@ class SeveralAgents(WorldRules):
         seed: Of the running episode; None: the streams of the episode before went on.
     """
 
-    patience: float
+    patience: float  # longest wait for a Command, s
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -310,6 +311,7 @@ class SeveralAgents(WorldRules):
             return True
         if any(link.command is None for link in flying):
             return False
+        # Closes the first wrong link; the next call looks again.
         if not any(self._close_wrong(link, now) for link in flying):
             self._follow(flying)
         return True
@@ -344,9 +346,9 @@ class SeveralAgents(WorldRules):
                 self._let_go(link)
 
     def _seeds(self, joining: list[AgentLink]) -> NDArray[np.uint64] | None:
-        """As the agent of the first drone says, of those that begin; None if it gives none."""
+        """Seeds of the next episode, from the first Command of those that join; None: none came."""
         drones = self.layout.drones
-        if not self.episodes:  # as a simulator of one agent
+        if not self.episodes:  # from the Welcome, as `OneAgent` takes it
             return first_seeds(joining[0].seed, drones)
         commands = [link.command for link in joining if link.command]
         seeds = commands[0].seeds if commands else None
@@ -375,7 +377,7 @@ class SeveralAgents(WorldRules):
             self._queue(link)
 
     def _close_wrong(self, link: AgentLink, now: float) -> bool:
-        """Close the link to an agent whose Command the world cannot follow; whether it did."""
+        """Close a link whose Command the world cannot follow; True if it did."""
         if link.order not in (FLY, RESET):
             wrong = f"orders: expected to fly or to reset all {len(link.rows)} drones, got others"
         elif link.order == FLY and self._is_out(link):
