@@ -11,7 +11,7 @@ from ..flights.executors import RunsFailed, WorkersConfig
 from ..flights.folders import FolderBusy
 from ..models.errors import InputError, NoOpenGL, require
 from ._flags import Options, Words
-from ._training import TrainingFlags, folder_to_write, go_on_with
+from ._training import TrainingFlags, folder_to_write
 
 if TYPE_CHECKING:
     from ..envs.config import EnvConfig
@@ -71,7 +71,7 @@ class StudyFlags(TrainingFlags, WorkersConfig):
                 run_study(study, folder, command, progress, workers)
         except BaseException as error:
             if any(folder.iterdir()) and not isinstance(error, FolderBusy):
-                print(go_on_with(self.words, folder))
+                print(self.go_on_with(self.words, folder, "runner", "address"))
             if isinstance(error, RunsFailed):  # the others are reported all the same
                 report(folder, film=False)
             raise
@@ -123,7 +123,7 @@ class StudyFlags(TrainingFlags, WorkersConfig):
 
         changes = self.changes()
         env = row.env
-        if "env" in self.given:
+        if "env" in self.given and self.env_id != env.env_id:
             env = EnvConfig.from_keywords(self.env_id, vehicle=env.vehicle, drones=env.drones)
         named = {name: getattr(self, name) for name in ("vehicle", "drones") if name in self.given}
         env = env.changed(**named, **self.options)

@@ -55,10 +55,16 @@ class TrainingFlags(BackendFlags):
                 f"resume: expected the settings of {folder}, got others by {', '.join(flags)}"
             )
 
-
-def go_on_with(words: str, folder: Path) -> str:
-    """The line that tells how to resume."""
-    return f"go on with: rotorgram {words} --resume {shlex.quote(str(folder))}"
+    def go_on_with(self, words: str, folder: Path, *flags: str) -> str:
+        """The line that tells how to resume, with those of the flags that were given."""
+        line: list[object] = ["rotorgram", *words.split(), "--resume", folder]
+        for flag in flags:
+            if flag in self.given:
+                line.append(f"--{flag.replace('_', '-')}")
+                value = getattr(self, flag)
+                if value is not True:
+                    line.append(value)
+        return f"go on with: {shlex.join(map(str, line))}"
 
 
 @contextmanager

@@ -53,7 +53,8 @@ class Dataset(Command):
             print(f"left out: {count_of(episodes.left_out, 'episode')}, not recorded to the end")
         if self.to == "minari" and env_of(episodes.spec, self.vehicle) is None:
             print(
-                f"no env spec in it: {episodes.spec.env_id} with this vehicle and these options is "
-                "not known here; --env MODULE:NAME registers a task, --vehicle names the vehicle"
+                f"recover_environment cannot make its env: {episodes.spec.env_id} with this "
+                "vehicle and these options is not known here; --env MODULE:NAME registers a task, "
+                "--vehicle names the vehicle"
             )
         return 0

@@ -44,8 +44,8 @@ class Evaluate(AgentFlags, BackendFlags):
         if headline.settles:
             count = rows["settling_time"].count()
             when = f"{mean['settling_time']:.2f} s" if count else "never"
-            bound = headline.amount(f"{headline.settled:g}")
-            print(f"settling   to {bound}: {when} ({count} of {len(rows)} episodes)")
+            bound = f"{headline.size_symbol} to {headline.amount(f'{headline.settled:g}')}"
+            print(f"settling   {bound}: {when} ({count} of {len(rows)} episodes)")
         if headline.signed:
             print(f"overshoot  {overshoot}")
         return 0

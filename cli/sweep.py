@@ -42,7 +42,7 @@ class Sweep(StudyFlags):
 
         grid = parse_grid(chain.from_iterable(self.grid))
         if not grid:
-            raise InputError("grid: expected at least one hyperparameter, got none")
+            raise InputError("grid: expected a hyperparameter (--grid gamma=0.99,0.999), got none")
         rows = [
             self._row(dict(zip(grid, values, strict=True))) for values in product(*grid.values())
         ]

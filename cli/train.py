@@ -30,14 +30,14 @@ from ..flights.folders import locked
 from ..models.errors import InputError, require
 from ..training.settings import Run
 from ._flags import AgentFlags, BackendOfPreset, Options
-from ._training import TrainingFlags, folder_to_write, go_on_with
+from ._training import TrainingFlags, folder_to_write
 
 if TYPE_CHECKING:
     from ..training.training import Training
 
 EPISODES = "episodes.csv"
-_FREE = ("env", "vehicle", "listen", "num_simulators", "key_file", "insecure", "record",
-         "store_every", "env_steps")  # fmt: skip
+_WIRE = ("env", "vehicle", "listen", "num_simulators", "key_file", "insecure")
+_FREE = (*_WIRE, "record", "store_every", "env_steps")  # fmt: skip
 """Flags that a resumed training may be given."""
 _UPDATE_WITHIN = 2.0  # s
 
@@ -52,7 +52,7 @@ class Train(AgentFlags, TrainingFlags):
     """
 
     algorithm: Positional[AlgorithmName]
-    """vpg, a2c, ppo, ippo, mappo, sb3-a2c, sb3-ppo or sb3-sac."""
+    """What learns: docs/algorithms/ has a page on each."""
     backend: BackendOfPreset = "mujoco"
     """What steps the drones: mujoco, or rigid (without contact, fast)."""
     seed: int = 0
@@ -77,9 +77,11 @@ class Train(AgentFlags, TrainingFlags):
 
         base = find_preset(self.algorithm, self.preset, self.env_id)
         if not base.fits:
+            defaults = base.config == type(base.config)()
+            got = "the defaults of its config" if defaults else f"that of {base.env_id}"
             print(
                 f"note: there is no preset of {self.algorithm} for {self.env_id}, nor for a task "
-                f"that it derives from: it gets that of {base.env_id}",
+                f"that it derives from: it gets {got}",
                 flush=True,
             )
         config = preset(self.algorithm, self.preset, self.env_id, **self.changes())
@@ -150,7 +152,7 @@ class Train(AgentFlags, TrainingFlags):
         if not find_algorithm(self.algorithm).resumes:
             stopped = "it starts anew" if self.resume else "--resume starts it anew"
             print(f"note: {self.algorithm} keeps no state of a training: {stopped}", flush=True)
-        go_on = go_on_with(f"train {self.algorithm}", folder)
+        go_on = self.go_on_with(f"train {self.algorithm}", folder, *_WIRE)
         keeper = _Keeper(training, folder, self.store_every)
         try:
             with _stop_at_update() as stop_is_asked, bars() as progress:

@@ -154,7 +154,8 @@ class Loop:
         parts: dict[str, Arrays] = {"record": record.snapshot(), "loop": {"config": config}}
         for stage in self._pipeline.stages:
             parts[type(stage).__name__] = stage.snapshot(record)
-        return joined(parts)
+        arrays = joined(parts)
+        return {**arrays, "loop/arrays": np.array(list(arrays))}
 
     def restore(self, snapshot: Arrays) -> None:
         """Put back a snapshot of a loop of the same config and size; no step runs.
@@ -162,7 +163,8 @@ class Loop:
         Later steps give the same bits as after the snapshot.
 
         Raises:
-            InputError: It is of another config or number of drones; nothing has changed.
+            InputError: It is of another config or number of drones, or lacks an array; nothing has
+                changed.
             gymnasium.error.ClosedEnvironmentError: The loop is closed.
         """
         self._check_open()
@@ -175,6 +177,10 @@ class Loop:
         got = part_of(snapshot, "loop").get("config")
         if got != config:
             raise InputError(f"snapshot: expected one of config {config}, got one of {got}")
+        names = snapshot.get("loop/arrays", np.array(["loop/arrays"])).tolist()
+        missing = [name for name in names if name not in snapshot]
+        if missing:
+            raise InputError(f"snapshot: expected all of its arrays, got none of {missing[0]}")
         record.restore(kept)
         for stage in self._pipeline.stages:
             stage.restore(record, part_of(snapshot, type(stage).__name__))

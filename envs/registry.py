@@ -1,4 +1,7 @@
-"""Tasks by env id. An id from a file or a peer is looked up here; its module is never imported."""
+"""Tasks by env id.
+
+An id from a checkpoint, a journal or a peer is looked up here; its module is never imported.
+"""
 
 import os
 import re

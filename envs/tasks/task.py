@@ -138,8 +138,8 @@ class Task(ABC):
         ignored = self.controller is not of_level and task.actions is Task.actions
         if ignored and self.action != task.action:
             raise InputError(
-                f"action: expected {task.action!r}, for the task has a controller, "
-                f"got {self.action!r}"
+                f"action: expected {task.action!r}, for the task has a controller of its own, "
+                f"which no other flies, got {self.action!r}"
             )
 
     def __setattr__(self, name: str, value: object) -> None:

@@ -51,14 +51,12 @@ class Effects(Kept):
             if name not in ("thrust", *self.rotors.names):
                 count = vehicle.num_rotors
                 raise InputError(f"randomize: expected one of the {count} rotors, got {name}")
-        rotors = options.motor_lag or options.thrust_curve or options.battery
-        self.on_rotors = bool(rotors or options.efficiency or scaled)
-        moved = options.body_drag or options.rotor_drag
-        self.on_body = moved or options.ground_effect
+        self.on_rotors = self.rotors.acts or bool(scaled)
         self.air = AirEffects(vehicle, options)
+        self.on_body = self.air.acts
         self._mean_wind = options.wind
         blows = options.gusts or options.downwash or any(options.wind)
-        if blows and not moved:
+        if blows and not (options.body_drag or options.rotor_drag):
             raise InputError(
                 "effects: expected body_drag or rotor_drag, on which wind acts, got neither"
             )

@@ -32,12 +32,16 @@ class AirEffects(Kept):
       translational lift of RotorPy, arXiv 2306.04485, whose moment of flapping is left out);
     * each rotor at height z over the ground, with radius R: thrust / (1 - (R / 4z)²) in place of
       its thrust (Cheeseman and Bennett, ARC R&M 3021, 1955).
+
+    Attributes:
+        acts: Whether an effect is on.
     """
 
     lists = ("_before",)
 
     def __init__(self, vehicle: "models.Vehicle", options: EffectOptions) -> None:
         self._options = options
+        self.acts = options.body_drag or options.rotor_drag or options.ground_effect
         self._half = 0.5 * vehicle.timestep
         coefficients = vehicle.coefficients
         self._center: Parts = tuple(vehicle.center_of_mass.tolist())

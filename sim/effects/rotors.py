@@ -23,6 +23,7 @@ class RotorEffects(Kept):
     and V solves both equations. An empty battery stays at its empty voltage.
 
     Attributes:
+        acts: Whether an effect is on.
         names: Of the drawn factors of each rotor's thrust.
         charge: Of the battery, share, shape (W, A).
         voltage: At its terminals, V, shape (W, A).
@@ -32,6 +33,9 @@ class RotorEffects(Kept):
 
     def __init__(self, vehicle: "models.Vehicle", options: EffectOptions) -> None:
         self._options = options
+        self.acts = bool(
+            options.motor_lag or options.thrust_curve or options.battery or options.efficiency
+        )
         self._step = vehicle.timestep
         coefficients = vehicle.coefficients
         self._limits = vehicle.thrust_low, vehicle.thrust_high

@@ -383,7 +383,9 @@ def test_a_course_that_is_flown_to_its_end_is_no_crash(capsys: Capsys) -> None:
     out = output(capsys, "evaluate", "geometric", "--episodes", 1, *task)
     assert "episodes   1, 1 terminated, 0 crashed\n" in out
     assert "steady     points_left 0.0000\n" in out
-    assert re.search(r"^settling   to 0\.5: \d\.\d\d s \(1 of 1 episodes\)$", out, re.MULTILINE)
+    assert re.search(
+        r"^settling   points_left to 0\.5: \d\.\d\d s \(1 of 1 episodes\)$", out, re.MULTILINE
+    )
 
 
 def test_check_model(capsys: Capsys) -> None:

@@ -103,6 +103,10 @@ def test_a_snapshot_of_another_config_is_refused() -> None:
         InputError, match=r"^snapshot: expected one of config \w{32}, got one of \w"
     ):
         near.restore(far.snapshot())
+    partial = near.snapshot()
+    del partial["record/kept/done"]
+    with pytest.raises(InputError, match=r"^snapshot: expected all of its arrays, got none of rec"):
+        near.restore(partial)
     assert bits(near.snapshot()) == before
 
 

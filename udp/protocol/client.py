@@ -207,7 +207,7 @@ class Client:
         self._nonce = 0
         self.tap: Tap | None = None
         self._dice = Random(self.hello.spec) if self.config.drop else None  # others for each agent
-        self._is_queued = False
+        self.is_queued = False
         self._assembler = Assembler(self.layout.seeded_command.size)
         self._transfer: Transfer | None = None  # of the outstanding message
         self._asking = b""  # the datagram that was sent last and wants an answer
@@ -405,8 +405,8 @@ class Client:
             self._stretch *= _LATER
             wait = self._round_trips.wait(1) * self._stretch
             self.resend_at = now + min(wait, _LATEST, self.config.timeout / 4)
-        elif not self._is_queued:
-            self._is_queued = True
+        elif not self.is_queued:
+            self.is_queued = True
             self.statistics.notice("every slot of the agent is taken; waiting for a free one")
         self.deadline = now + self.config.timeout  # the agent is there: this is no silence
 
@@ -466,7 +466,7 @@ class Client:
         self.hello = replace(self.hello, session=self.draw_session())
         self.sequence = 0
         self._sealing = self.key
-        self._is_queued = False
+        self.is_queued = False
         self._assembler = Assembler(self.layout.seeded_command.size)
         self._send(self.hello, now)
 

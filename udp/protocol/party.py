@@ -164,7 +164,7 @@ class WorldRules:
             unlogged = now > asked_at + _COMPLAIN_AFTER and link.logged != asked_at
             if not client.handle_timer(now):
                 self._lose_silent(link, link.silence(client.config.timeout, sends))
-            elif unlogged and (link.trouble or not client.sequence):
+            elif unlogged and not client.is_queued and (link.trouble or not client.sequence):
                 link.logged = asked_at
                 words = link.silence(_COMPLAIN_AFTER, client.sends)
                 client.statistics.notice(f"{words}; asking for {client.config.timeout:g} s in all")
