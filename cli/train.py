@@ -55,6 +55,8 @@ class Train(AgentFlags, TrainingFlags):
     """What learns: docs/algorithms/ has a page on each."""
     backend: BackendOfPreset = "mujoco"
     """What steps the drones: mujoco, or rigid (without contact, fast)."""
+    preset_of: str | None = None
+    """Id of the task with the preset. Default: the one that is trained, or that it derives from."""
     seed: int = 0
     """Seed of weights, actions and episodes."""
     num_simulators: int = 1
@@ -75,16 +77,21 @@ class Train(AgentFlags, TrainingFlags):
         from ..training.training import Training, config_of
         from ._env import remote_env
 
-        base = find_preset(self.algorithm, self.preset, self.env_id)
+        task = self.preset_of or self.env_id
+        base = find_preset(self.algorithm, self.preset, task)
         if not base.fits:
+            if self.preset_of:
+                raise InputError(
+                    f"preset-of: expected a task with a preset of {self.algorithm}, got {task}"
+                )
             defaults = base.config == type(base.config)()
             got = "the defaults of its config" if defaults else f"that of {base.env_id}"
             print(
-                f"note: there is no preset of {self.algorithm} for {self.env_id}, nor for a task "
-                f"that it derives from: it gets {got}",
+                f"note: there is no preset of {self.algorithm} for {task}, nor for a task that it "
+                f"derives from: it gets {got}; --preset-of ID names another",
                 flush=True,
             )
-        config = preset(self.algorithm, self.preset, self.env_id, **self.changes())
+        config = preset(self.algorithm, self.preset, task, **self.changes())
         backend = self.backend if "backend" in self.given else base.backend
         env_config = self.env_config(backend=backend)  # it refuses wrong drones
         whole_worlds = max(base.num_envs // self.drones, 1) * self.drones

@@ -27,6 +27,8 @@ from .body import RigidBody, mapped
 
 Precision = np.dtype[np.floating]
 ROWS = 13
+COMPILE_SECONDS = 60.0
+"""Time limit of the compiler, s."""
 
 _FLAGS = (
     "-O3",
@@ -176,12 +178,14 @@ def _library(source: str) -> ctypes.CDLL:
             made = Path(folder) / "fly.so"
             given.write_text(source)
             words = [*command, *_FLAGS, "-shared", "-fPIC", "-o", str(made), str(given), "-lm"]
-            done = subprocess.run(words, capture_output=True, check=False, errors="replace")
+            done = subprocess.run(
+                words, capture_output=True, check=False, errors="replace", timeout=COMPILE_SECONDS
+            )
             first, *_ = done.stderr.strip().splitlines() or ["nothing"]
             said = "".join(letter for letter in first if letter.isprintable())
             if done.returncode != 0:
                 raise InputError(f"compiled: expected {tool} to compile the equations, got {said}")
             return ctypes.CDLL(str(made))
-    except OSError as error:
+    except (OSError, subprocess.TimeoutExpired) as error:
         expected = f"{tool} to make a library that loads from the folder for temporary files"
         raise InputError(f"compiled: expected {expected}, got {error}") from error

@@ -3,6 +3,7 @@
 It flies as `mujoco` does until a part touches the ground or another drone, and reports the contact.
 """
 
+import logging
 from collections.abc import Mapping
 
 import mujoco
@@ -88,7 +89,13 @@ class RigidWorld(World):
             return
         pushed = self.effects is not None and self.effects.on_body
         rotors = self.vehicle.num_rotors
-        self._function = kernel.compiled(self._body, rotors, self.dtype, wrench=pushed)
+        try:
+            self._function = kernel.compiled(self._body, rotors, self.dtype, wrench=pushed)
+        except InputError as error:
+            if self._compiled:
+                raise
+            self._compiled = False
+            logging.getLogger(__name__).warning("rigid flies by NumPy: %s", error)
 
     def vary(self, inertia: Array, reaction: Array, air: Mapping[str, Array]) -> None:
         """Set the numbers of every drone before the first reset; needs the effect `body_drag`.

@@ -148,4 +148,10 @@ def test_train_says_where_no_preset_fits(
     assert main([*words, "--out", str(tmp_path / "a")]) == 0
     out = capsys.readouterr().out
     assert "there is no preset of ippo for rotorgram/Hover-v0" in out
-    assert f"it gets that of {ENV}\n" in out
+    assert f"it gets that of {ENV}; --preset-of ID names another\n" in out
+    words += ["--preset-of", "rotorgram/Crossing-v0", "--set", "steps_per_update=1024"]
+    assert main([*words, "--out", str(tmp_path / "b")]) == 0
+    assert "note: there is no preset" not in capsys.readouterr().out
+    kept = load(tmp_path / "b" / "checkpoint.safetensors")
+    assert kept.config["hidden"] == [64, 64]
+    assert kept.num_envs == 32

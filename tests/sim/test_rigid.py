@@ -16,6 +16,7 @@ from rotorgram.envs.config import EnvConfig
 from rotorgram.models import QUAD_XML, Vehicle
 from rotorgram.models.errors import InputError
 from rotorgram.sim import PhysicsError, Randomization, make_world
+from rotorgram.sim.backends import kernel
 from tables import SIM
 from worlds import begin
 
@@ -173,6 +174,7 @@ def test_arrays_have_the_same_bits_alone_and_in_a_batch() -> None:
 @pytest.mark.parametrize(
     ("script", "reason"),
     [
+        (b"#!/bin/sh\nexec sleep 30", "timed out after 0.2 seconds"),
         (b"#!/bin/sh\nfor f; do case $f in *.so) echo > $f;; esac; done", "file too short"),
         (b"#!/no/interpreter", "No such file"),
         (b"#!/bin/sh\nprintf '\\377 no' >&2; exit 1", "\ufffd no"),
@@ -180,18 +182,26 @@ def test_arrays_have_the_same_bits_alone_and_in_a_batch() -> None:
     ],
 )
 def test_a_compiler_that_misbehaves_is_told_in_one_sentence(
-    script: bytes, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    script: bytes,
+    reason: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     tool = tmp_path / "cc"
     tool.write_bytes(script)
     tool.chmod(0o755)
     monkeypatch.setenv("CC", f"'{tool}' -O1")
+    seconds = 0.2 if b"sleep" in script else 60.0
+    monkeypatch.setattr(kernel, "COMPILE_SECONDS", seconds)
     vehicle = Vehicle.load(linear_drag=0.124)
-    with pytest.raises(InputError, match=rf"^compiled: expected [^\n]*{reason}") as caught:
-        arrays(vehicle)
-    assert str(caught.value).isprintable()
-    world = arrays(vehicle, compiled=False)
+    with pytest.raises(InputError, match=rf"^compiled: expected [^\n]*{reason}"):
+        arrays(vehicle, compiled=True)
+    world = arrays(vehicle)
     assert world.shape == (N, 1)  # by NumPy
+    (message,) = caplog.messages
+    assert message.startswith("rigid flies by NumPy: compiled: expected ")
+    assert message.isprintable()
 
 
 def test_without_a_compiler_numpy_flies(monkeypatch: pytest.MonkeyPatch) -> None:
