@@ -441,6 +441,11 @@ def _rotor(
     numbers: list[Number], given: object, where: str, number: int, model: Path | None
 ) -> PlacedRotor:
     table = {"name": f"rotor{number}", **_mapping(given, where)}
+    for name in table.keys() & RotorTable.__dataclass_fields__.keys():
+        raise InputError(
+            f"{where}: expected {name} in [rotors], for all rotors, got one of its own: "
+            "rotors that differ need an MJCF file"
+        )
     rotor = _table(numbers, PlacedRotor, table, where)
     places = [name for name in ("link", "body", "site") if getattr(rotor, name) is not None]
     if model is None:

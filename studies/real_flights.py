@@ -84,6 +84,7 @@ VARIANTS: Final = (
     Variant("+ thrust coefficient fitted", (K,), False),
     Variant("+ drag of the body", (K, *DRAG), False),
     Variant("or drag and inflow of the rotors instead", (K, *ROTOR_DRAG), False),
+    Variant("rates decay, no torques", (K, *DRAG, *DAMPING), False),
     Variant("rotors turn the craft, published inertia", (K, *DRAG)),
     Variant("+ inertia fitted", (K, *DRAG, *INERTIA)),
     Variant("+ moment of the air", (K, *DRAG, *INERTIA, *MOMENT)),
@@ -249,6 +250,9 @@ def _fitted(
     if not variant.groups:
         return held
     start = _flown(variant, {**held, **begun})
+    if not variant.turns:
+        decaying = [name for group in DAMPING if group in variant.groups for name in group]
+        start = {**start, **dict.fromkeys(decaying, _UNTURNED / 0.5)}  # time constant: 0.5 s
     found = Fit(base, windows, start, variant.groups).solve()
     if variant.turns:
         return found
@@ -256,7 +260,7 @@ def _fitted(
 
 
 def _flown(variant: Variant, numbers: Numbers) -> Numbers:
-    """Without torques of the rotors: an inertia that they cannot turn."""
+    """Without torques of the rotors: an inertia that they cannot turn, and damping in its ratio."""
     if variant.turns:
         return numbers
     return {**numbers, **{f"body.inertia.{axis}": _UNTURNED for axis in "xyz"}}

@@ -12,7 +12,9 @@ from pathlib import Path
 from tempfile import TemporaryFile
 from typing import IO, Any
 
+from ..envs import registry
 from ..envs.config import EnvConfig
+from ..models.errors import InputError
 from .protocol.client import Address
 from .protocol.errors import PeerClosed, PeerSilent
 from .remote import RemoteEnv, RemoteVectorEnv
@@ -91,6 +93,13 @@ def start_simulator(
 
     `settings` are keyword arguments of `Simulator`.
     """
+    if registry.is_known(config.env_id):
+        home = registry.task_type(config.env_id).__module__
+        if home == "__main__":
+            raise InputError(
+                f"env: expected a task of a module, for the simulator's process to import, got "
+                f"{config.env_id} of this program"
+            )
     content = config.embedded().to_dict()
     arguments: dict[str, object] = {"config": content, "module": config.module}
     arguments |= {"server": server, "bind": ("127.0.0.1", 0), **settings}

@@ -77,7 +77,10 @@ Fly = Callable[[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray | None, in
 def compiler() -> list[str] | None:
     """Path and flags of the C compiler: of the variable CC, or `cc`, `gcc` or `clang`; or None."""
     for words in (os.environ.get("CC", ""), "cc", "gcc", "clang"):
-        tool, *flags = shlex.split(words) or [""]
+        try:
+            tool, *flags = shlex.split(words) or [""]
+        except ValueError:  # a quotation without its end
+            continue
         if path := shutil.which(tool):
             return [path, *flags]
     return None

@@ -209,6 +209,9 @@ def test_without_a_compiler_numpy_flies(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setenv("CC", str(shutil.which("false")))
     with pytest.raises(InputError, match=r"^compiled: expected .*false to compile the equations"):
         arrays(vehicle, compiled=True)
+    monkeypatch.setenv("CC", "'gcc")  # a quotation without its end
+    arrays(vehicle)
+    monkeypatch.setenv("CC", str(shutil.which("false")))
     monkeypatch.setattr(shutil, "which", lambda _: None)
     with pytest.raises(InputError, match=r"^compiled: expected false where no C compiler is found"):
         arrays(vehicle, compiled=True)

@@ -2,12 +2,13 @@
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from rotorgram.flights.flight_logs import FlightLog
-from rotorgram.flights.prediction import Windows
+from rotorgram.flights.prediction import Windows, numbers_of, predict
 from rotorgram.models.vehicle import Vehicle
 from rotorgram.models.vehicle_file import read_vehicle_file
 
@@ -56,6 +57,29 @@ def test_the_simulator_falls_from_each_start() -> None:
     np.testing.assert_allclose(end[:, 3], 1.0)
     np.testing.assert_allclose(end[:, 9], -9.81 * 0.5, atol=1e-9)
     np.testing.assert_allclose(end[:, 10:], 0.0, atol=1e-12)
+
+
+def test_the_baseline_lets_the_rates_decay_whatever_the_rotors_do() -> None:
+    """Roll rates fall with a time constant of 0.25 s while one rotor is faster than the others."""
+    (baseline,) = [one for one in real_flights.VARIANTS if one.name == "rates decay, no torques"]
+    time = 0.01 * np.arange(120)
+    flights = []
+    for rate in (1.0, -2.0):
+        angle = 0.25 * rate * (1 - np.exp(-time / 0.25))
+        log = flight(120, 0.0)
+        log.states[:, 10] = rate * np.exp(-time / 0.25)
+        log.states[:, 3] = np.cos(angle / 2)
+        log.states[:, 4] = np.sin(angle / 2)
+        log.speeds[:] = (1750.0, 1720.0, 1720.0, 1690.0)
+        flights.append(log)
+    vehicle = Vehicle.load(ROOT / "studies" / "nanodrone.toml")
+    windows = Windows.cut(flights, 50, 10, (10, 25, 50))
+    damping = replace(baseline, groups=real_flights.DAMPING)
+    numbers = real_flights._fitted(damping, vehicle, numbers_of(vehicle), windows, flights)
+    predicted = predict(vehicle, [real_flights._flown(damping, numbers)], windows)
+    for place, horizon in ((1, 25), (2, 50)):
+        expected = windows.start[:, 10:] * np.exp(-horizon / 25)
+        np.testing.assert_allclose(predicted[:, place, 10:], expected, atol=0.02)
 
 
 def test_the_page_has_the_figures_of_the_benchmark() -> None:

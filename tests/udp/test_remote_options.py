@@ -18,12 +18,14 @@ from gymnasium import spaces
 from peers import ANY, ENV_ID, QUICK, TABLES, Running, launch, plain_socket, simulate
 from remotes import Broken, flying
 from rotorgram.envs.config import EnvConfig
-from rotorgram.envs.registry import env_spec
+from rotorgram.envs.registry import env_spec, register
+from rotorgram.envs.tasks import Hover
 from rotorgram.models import QUAD_XML
 from rotorgram.models.errors import InputError
 from rotorgram.udp import LinkError, PeerClosed, Refused, RemoteEnv, RemoteVectorEnv, Simulator
 from rotorgram.udp.__main__ import read_arguments
 from rotorgram.udp.protocol.messages import Hello
+from rotorgram.udp.spawn import spawn_simulator
 from rotorgram.udp.transport.agent import AgentConfig
 
 # ---- arguments
@@ -387,3 +389,16 @@ def test_the_advice_for_text_names_no_key() -> None:  # fault 57
         "or insecure=True (--insecure) where everybody who reaches this port may fly the drone: "
         "text cannot be sealed"
     )
+
+
+def test_a_task_of_the_running_program_is_in_no_module() -> None:
+    """Fault 61: the simulator's process cannot import it."""
+    register("own-v0", type("Own", (Hover,), {"__module__": "__main__"}))
+    try:
+        with (
+            pytest.raises(InputError, match=r"^env: expected a task of a module, .*got own-v0"),
+            spawn_simulator(EnvConfig(env_id="own-v0")),
+        ):
+            pass
+    finally:
+        gym.registry.pop("own-v0")
