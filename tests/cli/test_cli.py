@@ -785,7 +785,7 @@ def test_compare_writes_everything(tmp_path: Path, capsys: Capsys) -> None:
 def test_an_interrupted_comparison_goes_on(tmp_path: Path, capsys: Capsys) -> None:
     folder = tmp_path / "out"
     process = start(
-        "compare", "--out", folder, "--agents", "vpg", "--seeds", 3, "--env-steps", 20_000,
+        "compare", "--out", folder, "--agents", "vpg", "--seeds", 3, "--env-steps", 6_000,
         "--snapshots", 1, "--episodes", 1, "--jobs", 2,
     )  # fmt: skip
     deadline = time.monotonic() + 100
