@@ -28,8 +28,7 @@ class Loop:
 
     Drones of one world begin together. One whose episode ends before those of the others is *out*:
     its rotors stand still, it gets no reward and no second end, and the others fly on. The world is
-    done when all are out. Masks and seeds have an element for each drone. Masks are alike
-    within a world; the seed of its first drone counts.
+    done when all are out. Masks are alike within a world; the seed of its first drone counts.
 
     Args:
         config: What is flown.
@@ -47,8 +46,7 @@ class Loop:
         out: bool, shape (N,): its own has ended.
 
     Raises:
-        InputError: An argument, seed or action is not what it should be; nothing has changed,
-            unless the task refused a start: see `advance`.
+        InputError: An argument, seed or action is wrong; nothing has changed but as of `advance`.
         PhysicsError: A state is bad; reset the drones that flew.
         gymnasium.error.ResetNeeded: An action came before an episode's beginning or after its end.
         gymnasium.error.ClosedEnvironmentError: A step or a reset after `close`.
@@ -113,7 +111,9 @@ class Loop:
                 raise
         if record.begun is not None:
             self._begin(record.begun, seeds)
-        self._observe()
+        active = record.active
+        if active is None or active.any():
+            record.run(active, pipeline.observe)
         self._take()
 
     def _begin(self, begun: Mask, seeds: Any) -> None:
@@ -121,27 +121,11 @@ class Loop:
         record = self.record
         begin = self._pipeline.begin
         all_begin = bool(begun.all())
-        # A first reset of some begins all, so that every array exists. Then all but those wait.
         if not record.has_begun and not all_begin:
-            record.begun = begun | True
-            record.run(None, begin)
-            record.begun = begun
-            record.waiting = begun | True
-            record.episodes = 0 * record.episodes
+            record.begin_all(begin)
         if seeds is not None:
             self.world.seed(begun, seeds[:: len(self.spec.agents)])
         record.run(None if all_begin else begun, begin)
-
-    def _observe(self) -> None:
-        """Drones that flew, and those that begin, are measured, judged and observed."""
-        record = self.record
-        active = record.flown
-        if active is not None and record.begun is not None:
-            active = active | record.begun
-        if active is not None and active.all():
-            active = None
-        if active is None or active.any():
-            record.run(active, self._pipeline.observe)
 
     def snapshot(self) -> Snapshot:
         """Copies of all arrays that a later step depends on, by name.
@@ -169,19 +153,8 @@ class Loop:
         """
         self._check_open()
         record = self.record
-        kept = part_of(snapshot, "record")
-        shape = getattr(kept.get("kept/steps"), "shape", None)
-        if shape != record.shape:
-            raise InputError(f"snapshot: expected one of drones {record.shape}, got {shape}")
-        config = self.spec.config_digest
-        got = part_of(snapshot, "loop").get("config")
-        if got != config:
-            raise InputError(f"snapshot: expected one of config {config}, got one of {got}")
-        names = snapshot.get("loop/arrays", np.array(["loop/arrays"])).tolist()
-        missing = [name for name in names if name not in snapshot]
-        if missing:
-            raise InputError(f"snapshot: expected all of its arrays, got none of {missing[0]}")
-        record.restore(kept)
+        _check_snapshot(snapshot, record.shape, self.spec.config_digest)
+        record.restore(part_of(snapshot, "record"))
         for stage in self._pipeline.stages:
             stage.restore(record, part_of(snapshot, type(stage).__name__))
         self._take()
@@ -190,8 +163,7 @@ class Loop:
         worlds = self.num_envs // self.config.drones
         return type(self), (self.config, worlds), self.snapshot()
 
-    def __setstate__(self, snapshot: Arrays) -> None:
-        self.restore(snapshot)
+    __setstate__ = restore
 
     def _take(self) -> None:
         """New arrays of N drones, of the declared dtypes."""
@@ -221,12 +193,12 @@ class Loop:
     @property
     def reward_terms(self) -> dict[str, Floats]:
         """Terms of the last rewards by name, each of shape (N,)."""
-        return self._per_drone(self.record.terms)
+        return _per_drone(self.record, self.record.terms)
 
     @property
     def metrics(self) -> dict[str, Floats]:
         """Metrics of the task by name, each of shape (N,)."""
-        return self._per_drone(self.record.metrics)
+        return _per_drone(self.record, self.record.metrics)
 
     @property
     def telemetry(self) -> dict[str, Floats]:
@@ -242,14 +214,6 @@ class Loop:
             row += quantity.read(self).ravel().tolist()
         return row
 
-    def _per_drone(self, arrays: Mapping[str, Array]) -> dict[str, Floats]:
-        rows = {}
-        for name, values in arrays.items():
-            row = np.asarray(values, np.float64)
-            row = np.broadcast_to(row, self.record.shape or row.shape)
-            rows[name] = np.array(row).reshape(self.num_envs)
-        return rows
-
     def close(self) -> None:
         """Release threads and memory; what the last step gave can be read on."""
         for stage in self._pipeline.stages:
@@ -259,3 +223,26 @@ class Loop:
     def _check_open(self) -> None:
         if self._closed:
             raise gym.error.ClosedEnvironmentError("expected an open env, got a closed one")
+
+
+def _check_snapshot(snapshot: Arrays, shape: tuple[int, ...], config: str) -> None:
+    """Raise `InputError` for a snapshot of other drones, of another config, or without an array."""
+    given = getattr(snapshot.get("record/kept/steps"), "shape", None)
+    if given != shape:
+        raise InputError(f"snapshot: expected one of drones {shape}, got {given}")
+    digest = snapshot.get("loop/config")
+    if digest != config:
+        raise InputError(f"snapshot: expected one of config {config}, got one of {digest}")
+    names = snapshot.get("loop/arrays", np.array(["loop/arrays"])).tolist()
+    missing = [name for name in names if name not in snapshot]
+    if missing:
+        raise InputError(f"snapshot: expected all of its arrays, got none of {missing[0]}")
+
+
+def _per_drone(record: Record, arrays: Mapping[str, Array]) -> dict[str, Floats]:
+    """Arrays of a record with one axis of N drones, float64."""
+    rows = {}
+    for name, values in arrays.items():
+        row = np.asarray(values, np.float64)
+        rows[name] = np.array(np.broadcast_to(row, record.shape or row.shape)).reshape(-1)
+    return rows

@@ -156,6 +156,24 @@ class Record:
         """Whether there was an episode."""
         return "action" in vars(self)
 
+    @property
+    def active(self) -> Mask | None:
+        """Drones that flew and drones that begin; None: all."""
+        active = self.flown
+        if active is not None and self.begun is not None:
+            active = active | self.begun
+        return None if active is None or active.all() else active
+
+    def begin_all(self, stages: Sequence[Callable[["Record"], None]]) -> None:
+        """A first reset of some drones begins all, so that every array exists; then all wait."""
+        begun = self.begun
+        assert begun is not None
+        self.begun = begun | True
+        self.run(None, stages)
+        self.begun = begun
+        self.waiting = begun | True
+        self.episodes = 0 * self.episodes
+
     def rest(self) -> None:
         """A drone that does not fly gets no reward and no end."""
         self.reward = self._nothing
