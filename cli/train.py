@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 EPISODES = "episodes.csv"
 _WIRE = ("env", "vehicle", "listen", "num_simulators", "key_file", "insecure")
-_FREE = (*_WIRE, "record", "store_every", "env_steps")  # fmt: skip
+_FREE = (*_WIRE, "record", "store_every", "env_steps")
 """Flags that a resumed training may be given."""
 _UPDATE_WITHIN = 2.0  # s
 

@@ -3,10 +3,9 @@
     python studies/swarm.py [--drones 2 8 32 100] [--seconds 0.5] [--repeats 9] [--out FILE.json]
 
 A step is one of 0.02 s of `rotorgram/Formation-v0` with the vehicle of the paper, two physics
-steps, at hover. `apart` are as many worlds of one drone of `rotorgram/Hover-v0`
-in one batch. Cases take turns within a
-repeat, and the medians over the repeats are told, in microseconds for each drone and control step.
-Over UDP the simulator is a process of its own, and the agent asks for a standstill.
+steps, at hover. `apart` are as many worlds of one drone of `rotorgram/Hover-v0` in one batch. Cases
+take turns within a repeat. It prints medians over the repeats, in microseconds for each drone and
+control step. Over UDP the simulator is a process of its own, and the agent asks for a standstill.
 
 It takes about two minutes on two cores.
 """

@@ -110,6 +110,7 @@ def markdown(results: Results, table: pd.DataFrame) -> str:
 
 
 def _markdown_line(cells: Sequence[str]) -> str:
+    # What Markdown reads as markup, and a link's "](".
     escaped = [re.sub(r"[|*`\\]|\](?=\()", r"\\\g<0>", cell) for cell in cells]
     return f"| {' | '.join(escaped)} |"
 

@@ -93,13 +93,12 @@ def start_simulator(
 
     `settings` are keyword arguments of `Simulator`.
     """
-    if registry.is_known(config.env_id):
-        home = registry.task_type(config.env_id).__module__
-        if home == "__main__":
-            raise InputError(
-                f"env: expected a task of a module, for the simulator's process to import, got "
-                f"{config.env_id} of this program"
-            )
+    known = registry.is_known(config.env_id)
+    if known and registry.task_type(config.env_id).__module__ == "__main__":
+        raise InputError(
+            "env: expected a task of a module, for the simulator's process to import, got "
+            f"{config.env_id} of this program"
+        )
     content = config.embedded().to_dict()
     arguments: dict[str, object] = {"config": content, "module": config.module}
     arguments |= {"server": server, "bind": ("127.0.0.1", 0), **settings}

@@ -131,14 +131,17 @@ class Pictures(Stage):
             rows["payload"] = self._per_drone(state.payload)
         if self._goal_moves:
             rows["goal"] = self._per_drone(self._task.goal(state))
+        last = vars(record).get("pictures", {})
         pictures = {}
         for view in self.views:
             shape = (self._rows, *view.shape)
-            last = vars(record).get("pictures", {}).get(view.name, np.zeros(shape, view.dtype))
-            pictures[view.name] = np.array(last).reshape(shape)
+            blank = np.zeros(shape, view.dtype)
+            pictures[view.name] = np.array(last.get(view.name, blank)).reshape(shape)
         self._take(pictures, due, rows, np.reshape(record.scenes, self._shape)[:, 0])
         lead = record.shape
-        record.pictures = {n: x.reshape(*lead, *x.shape[1:]) for n, x in pictures.items()}
+        record.pictures = {
+            name: picture.reshape(*lead, *picture.shape[1:]) for name, picture in pictures.items()
+        }
         record.observations = {**record.observations, **record.pictures}
 
     def _take(
