@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from itertools import islice
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
-from multiprocessing.queues import SimpleQueue
+from multiprocessing.synchronize import Lock
 from threading import Thread
 from typing import Any, Literal, NamedTuple, TypeVar
 
@@ -29,7 +29,6 @@ Tell = Callable[[int, int, str], None]
 """The same for one job, without its name."""
 _Job = TypeVar("_Job")
 _Value = TypeVar("_Value")
-_Progress = SimpleQueue[tuple[str, int, int, str] | None]
 
 _CHILD_ENVIRONMENT = {
     "PYTHONSAFEPATH": "1",  # no file of the working directory takes the place of a package
@@ -171,16 +170,16 @@ class _Processes(ProcessPoolExecutor):
         context = get_context("spawn")
         # Nothing is sent through this pipe: its end says that the main process is gone.
         ends, self._alive = context.Pipe(duplex=False)
-        self._progress: _Progress = context.SimpleQueue()
+        progress, self._writer = context.Pipe(duplex=False)
         self._before = {name: os.environ.get(name) for name in _CHILD_ENVIRONMENT}
         os.environ.update(_CHILD_ENVIRONMENT)
-        arguments = (ends, self._progress)
+        arguments = (ends, self._writer, context.Lock())
         super().__init__(workers, context, initializer=_begin_worker, initargs=arguments)
-        Thread(target=_pass_on, args=(self._progress, on_progress), daemon=True).start()
+        Thread(target=_pass_on, args=(progress, on_progress), daemon=True).start()
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         self._alive.close()  # workers end, and with them their simulators
-        self._progress.put(None)
+        self._writer.close()  # with the last worker's, so `_pass_on` ends
         super().shutdown(wait=wait, cancel_futures=cancel_futures)
         for name, value in self._before.items():
             if value is None:
@@ -189,9 +188,15 @@ class _Processes(ProcessPoolExecutor):
                 os.environ[name] = value
 
 
-def _pass_on(progress: _Progress, on_progress: OnProgress) -> None:
-    while (item := progress.get()) is not None:
-        on_progress(*item)
+def _pass_on(progress: Connection, on_progress: OnProgress) -> None:
+    """Until nobody can write any more. A worker that ends may hold the lock for ever."""
+    with progress:
+        while True:
+            try:
+                item = progress.recv()
+            except (EOFError, OSError):  # the second: in the middle of an item
+                return
+            on_progress(*item)
 
 
 # ---- in a worker
@@ -206,12 +211,16 @@ class _Worker:
 _worker = _Worker()
 
 
-def _begin_worker(ends: Connection, progress: _Progress) -> None:
+def _begin_worker(ends: Connection, progress: Connection, lock: Lock) -> None:
     """Before the first job: from here on this process ends with the main process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the main process's affair
     Thread(target=_end_with, args=(ends,), daemon=True).start()
 
-    _worker.report = lambda *item: progress.put(item)
+    def report(*item: object) -> None:
+        with lock:
+            progress.send(item)
+
+    _worker.report = report
 
 
 def _end_with(ends: Connection) -> None:

@@ -35,6 +35,12 @@ def is_killed(job: int, tell: Tell) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
+def reports(seconds: float, tell: Tell) -> None:
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        tell(0, 1, "busy")
+
+
 def silent(*_: object) -> None:
     """Progress that nobody shows, results that nobody keeps."""
 
@@ -70,6 +76,17 @@ def test_a_worker_that_is_killed_is_one_sentence() -> None:
     sentence = pytest.raises(RunsFailed, match=r"^a worker was killed, .* before is kept$")
     with open_executor(WorkersConfig(jobs=2), 2) as executor, sentence:
         run_jobs(executor, is_killed, {"one": 1, "two": 2}, silent, silent)
+
+
+@pytest.mark.timeout(60)
+def test_a_worker_that_ends_while_it_reports_stops_nobody() -> None:
+    """It ends with the lock of what it writes to."""
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt), open_executor(WorkersConfig(jobs=2), 2) as executor:
+        run_jobs(executor, reports, {"one": 2.0, "two": 600.0}, interrupt, silent)
 
 
 def test_no_file_of_the_working_directory_is_run(
