@@ -1,12 +1,12 @@
 """An OpenGL context that needs no window."""
 
-import ctypes.util
 import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
+from weakref import finalize
 
 from ..models.errors import NoOpenGL, one_line, shortened
 
@@ -42,7 +42,7 @@ def hidden_gl_setting() -> Iterator[None]:
     before = dict(os.environ)
     wanted = _wanted()
     library = _LIBRARIES.get(wanted, "")
-    if wanted in ("disable", "glfw") or (library and ctypes.util.find_library(library)):
+    if wanted in ("disable", "glfw") or (library and _is_installed(library)):
         yield
         return
     os.environ[_HIDDEN] = wanted
@@ -53,6 +53,12 @@ def hidden_gl_setting() -> Iterator[None]:
         for name in (_HIDDEN, "MUJOCO_GL"):
             os.environ.pop(name)
             os.environ.update({name: before[name]} if name in before else {})
+
+
+def _is_installed(library: str) -> bool:
+    from ctypes.util import find_library  # it takes long to import, for the few who set MUJOCO_GL
+
+    return find_library(library) is not None
 
 
 def offscreen_context(width: int, height: int) -> Any:
@@ -119,17 +125,19 @@ class Offscreen:
         buffer = mujoco.mjtFramebuffer.mjFB_OFFSCREEN
         self._gl: Any = offscreen_context(width, height)
         try:
-            with self.current():
+            with self._gl.as_current():
                 self._context = mujoco.MjrContext(model, font.value)
                 mujoco.mjr_setBuffer(buffer.value, self._context)
         except mujoco.FatalError as error:  # an OpenGL that is too old
             self._gl.free()
             raise NoOpenGL(f"OpenGL: expected one that MuJoCo can draw with, got {error}") from None
         self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR.value
+        self._freed = finalize(self, _free, self._gl, self._context)
+        self._freed.atexit = False
 
     def current(self) -> AbstractContextManager[object]:
         """Keep OpenGL with this thread for a block: `draw` in it is faster."""
-        if self._gl is None:
+        if not self._freed.alive:
             raise NoOpenGL("OpenGL: expected cameras that are open, got closed ones")
         _refuse_forked()
         block: AbstractContextManager[object] = self._gl.as_current()
@@ -165,11 +173,18 @@ class Offscreen:
 
     def close(self) -> None:
         """Free it. A second call does nothing."""
-        if self._gl is not None:
-            with self.current():
-                self._context.free()
-            self._gl.free()
-            self._gl = None
+        self._freed()
+
+
+def _free(gl: Any, context: "mujoco.MjrContext") -> None:
+    """By itself MuJoCo's context frees the objects of those numbers in the OpenGL that is current,
+    which may be another one where Python collects garbage.
+    """
+    if _state["forked"]:  # it is the other process's
+        return
+    with gl.as_current():
+        context.free()
+    gl.free()
 
 
 def _wanted() -> str:

@@ -1,5 +1,6 @@
 """Pictures of cameras against rays, known points, known areas, MuJoCo's drawing."""
 
+import gc
 import math
 from collections.abc import Iterator
 from dataclasses import fields
@@ -416,6 +417,20 @@ def test_cameras_after_their_end(made: Any) -> None:
     cameras.close()
     with pytest.raises(NoOpenGL, match="expected cameras that are open, got closed ones"):
         take(cameras, **state((0.0, 0.0, 1.0)))
+
+
+def test_cameras_that_nobody_closes_free_their_own_objects_alone(made: Any) -> None:
+    """Also when garbage is collected while others draw; their objects have the same numbers."""
+    cameras = made("down", "crazyflie2")
+    pose = state((0.0, 0.0, 1.0))
+    before = take(cameras, **pose)["down"]
+    forgotten = [Cameras(Vehicle.load("crazyflie2"), cameras.views)]
+    take(forgotten[0], **pose)
+    forgotten.append(forgotten)  # a cycle
+    with cameras._drawing.current():
+        del forgotten
+        gc.collect()
+        assert (take(cameras, **pose)["down"] == before).all()
 
 
 def test_a_camera_can_be_told_apart_from_its_kind() -> None:
