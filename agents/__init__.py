@@ -1,125 +1,50 @@
 """Learning algorithms, their policies and files, and controllers: PID, geometric and ORCA.
 
-Only SB3's algorithms need torch.
+Only SB3's algorithms need torch. Each name is imported when it is first used.
 """
 
-from ..envs.spec import EnvSpec
-from ..models.errors import InputError, one_line
-from .a2c import A2CConfig
-from .checkpoints import Checkpoint, CheckpointError, load, store
-from .config import Config, SACConfig
-from .episodes import Episode, EpisodeRecorder, ResumeError, episode_seed
-from .geometric import Geometric
-from .learner import Learner
-from .orca import Orca
-from .pid import PID
-from .policies import NetworkPolicy, Policy
-from .ppo import PPOConfig
-from .presets import find_preset, preset
-from .registry import (
-    ALGORITHMS,
-    CONTROLLERS,
-    Agent,
-    AlgorithmName,
-    find_algorithm,
-)
-from .vpg import VPGConfig
+from typing import TYPE_CHECKING
+
+from .. import import_when_used
+
+if TYPE_CHECKING:
+    from .a2c import A2CConfig
+    from .checkpoints import Checkpoint, CheckpointError, load, store
+    from .config import Config, SACConfig
+    from .controllers import CONTROLLERS
+    from .episodes import Episode, EpisodeRecorder, ResumeError, episode_seed
+    from .geometric import Geometric
+    from .making import make_agent, resume_agent
+    from .orca import Orca
+    from .pid import PID
+    from .policies import NetworkPolicy, Policy
+    from .ppo import PPOConfig
+    from .presets import find_preset, preset
+    from .registry import ALGORITHMS, Agent, AlgorithmName, find_algorithm
+    from .vpg import VPGConfig
 
 __all__ = [
-    "ALGORITHMS",
-    "CONTROLLERS",
-    "PID",
-    "A2CConfig",
-    "Agent",
-    "AlgorithmName",
-    "Checkpoint",
-    "CheckpointError",
-    "Config",
-    "Episode",
-    "EpisodeRecorder",
-    "Geometric",
-    "NetworkPolicy",
-    "Orca",
-    "PPOConfig",
-    "Policy",
-    "ResumeError",
-    "SACConfig",
-    "VPGConfig",
-    "episode_seed",
-    "find_algorithm",
-    "find_preset",
-    "load",
-    "make_agent",
-    "preset",
-    "resume_agent",
-    "store",
-]
+    "ALGORITHMS", "CONTROLLERS", "PID", "A2CConfig", "Agent", "AlgorithmName", "Checkpoint",
+    "CheckpointError", "Config", "Episode", "EpisodeRecorder", "Geometric", "NetworkPolicy", "Orca",
+    "PPOConfig", "Policy", "ResumeError", "SACConfig", "VPGConfig", "episode_seed",
+    "find_algorithm", "find_preset", "load", "make_agent", "preset", "resume_agent", "store",
+]  # fmt: skip
 
-
-def make_agent(algorithm: str, log: EpisodeRecorder, config: Config, seed: int) -> Agent:
-    """A new agent of a name in `ALGORITHMS`, for the env of a log.
-
-    Raises:
-        InputError: No such algorithm, or a config of another one.
-        MissingPackage: SB3 is not installed.
-    """
-    row = find_algorithm(algorithm)
-    if type(config) is not row.config:
-        raise InputError(
-            f"algorithm: expected {algorithm} with its {row.config.__name__}, "
-            f"got {type(config).__name__}"
-        )
-    if row.agent is not None:
-        return row.agent(log, config, seed)
-    from .sb3 import SB3Agent
-
-    assert isinstance(config, A2CConfig | SACConfig)
-    return SB3Agent(log, config, seed)
-
-
-def resume_agent(kept: Checkpoint, log: EpisodeRecorder) -> Agent:
-    """The agent of a checkpoint; the log, a new one of as many drones, resumes where it was.
-
-    An agent that cannot resume starts anew, and the log with it.
-
-    Raises:
-        CheckpointError: The parts of the checkpoint do not fit together.
-        ResumeError: It has a policy alone, or the env is another one, or does not repeat the
-            interrupted episodes.
-        MissingPackage: SB3 is not installed.
-    """
-    kept.check_resumable()
-    _check_same_env(kept.spec, log.spec)
-    try:
-        kept.policy()  # its networks are those of the config
-        agent = make_agent(kept.algorithm, log, kept.hyperparameters, kept.seed)
-        if isinstance(agent, Learner):
-            agent.set_state(kept.state)
-            log.resume(kept.position)
-    except ResumeError:
-        raise
-    except (KeyError, TypeError, ValueError, RuntimeError, IndexError) as error:
-        reason = one_line(error)
-        raise CheckpointError(f"checkpoint: its parts do not fit together: {reason:.300}") from None
-    return agent
-
-
-def _check_same_env(then: EnvSpec, now: EnvSpec) -> None:
-    """Raises `ResumeError` unless a training can go on in this env."""
-    for name in ("env_id", "options", "agents", "vehicle_hash", "observation", "action"):
-        expected = getattr(then, name)
-        got = getattr(now, name)
-        if expected == got or got == "0" * 32:  # the hash of a peer that gives none
-            continue
-        if name == "vehicle_hash":
-            raise ResumeError(
-                f"resume: expected {then.vehicle_text}, got {now.vehicle_text}; "
-                "name the vehicle with --vehicle"
-            )
-        if name == "options":
-            different = [key for key in {**expected, **got} if expected.get(key) != got.get(key)]
-            expected = {key: expected[key] for key in different if key in expected}
-            got = {key: got[key] for key in different if key in got}
-        raise ResumeError(
-            f"resume: expected an env with {name} {expected!s:.300}, got {got!s:.300}"
-        )
+_names = {
+    ".a2c": ("A2CConfig",),
+    ".checkpoints": ("Checkpoint", "CheckpointError", "load", "store"),
+    ".config": ("Config", "SACConfig"),
+    ".controllers": ("CONTROLLERS",),
+    ".episodes": ("Episode", "EpisodeRecorder", "ResumeError", "episode_seed"),
+    ".geometric": ("Geometric",),
+    ".making": ("make_agent", "resume_agent"),
+    ".orca": ("Orca",),
+    ".pid": ("PID",),
+    ".policies": ("NetworkPolicy", "Policy"),
+    ".ppo": ("PPOConfig",),
+    ".presets": ("find_preset", "preset"),
+    ".registry": ("ALGORITHMS", "Agent", "AlgorithmName", "find_algorithm"),
+    ".vpg": ("VPGConfig",),
+}
+_modules = {name: module for module, names in _names.items() for name in names}
+__getattr__ = import_when_used(__name__, _modules)

@@ -1,23 +1,15 @@
-"""Every algorithm and every controller: one row each.
+"""Every algorithm: one row each.
 
-To add an algorithm, write its config and its class in a module of its own, and add a row here. Its
-presets, if it has any, are in `presets.toml`.
+To add one, write its config and its class in a module of its own, and add a row here. Its presets,
+if it has any, are in `presets.toml`.
 """
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
 
 from ..models.errors import InputError
-from .a2c import A2C, A2CConfig
-from .config import Config, SACConfig
-from .episodes import EpisodeRecorder
-from .geometric import Geometric
-from .mappo import MAPPO
-from .orca import Orca
-from .pid import PID
-from .ppo import PPO, PPOConfig
-from .vpg import VPG, VPGConfig
+from .config import Config
 
 if TYPE_CHECKING:
     from .learner import Learner
@@ -30,40 +22,48 @@ Agent: TypeAlias = "Learner | SB3Agent"
 
 @dataclass(frozen=True)
 class Algorithm:
-    """A row of the registry."""
+    """A row of the registry. Its classes, "module:Class", are imported when they are used."""
 
     label: str
     """Name in tables and figures."""
-    config: type[Config]
-    agent: "Callable[[EpisodeRecorder, Any, int], Learner] | None" = None
-    """Class; None: Stable-Baselines3's, which is imported when needed."""
+    config_name: str
+    agent_name: str
     color: str = ""
     """Of its curves in figures; empty: one of the palette."""
 
     @property
+    def config(self) -> type[Config]:
+        """Class of its hyperparameters."""
+        config: type[Config] = _find(self.config_name)
+        return config
+
+    @property
+    def agent(self) -> Any:
+        """Class of what learns. Raises `MissingPackage` where SB3 is not installed."""
+        return _find(self.agent_name)
+
+    @property
     def resumes(self) -> bool:
         """Whether a stopped training goes on, and another begins with its networks."""
-        return self.agent is not None
+        return self.agent_name != _SB3
 
 
+def _find(name: str) -> Any:
+    module, _, one = name.partition(":")
+    return getattr(import_module(module, __package__), one)
+
+
+_SB3 = ".sb3:SB3Agent"
 ALGORITHMS: Final[dict[str, Algorithm]] = {
-    "vpg": Algorithm("VPG", VPGConfig, VPG, "#D55E00"),
-    "a2c": Algorithm("A2C", A2CConfig, A2C, "#0072B2"),
-    "ppo": Algorithm("PPO", PPOConfig, PPO),
-    "ippo": Algorithm("IPPO", PPOConfig, PPO),
-    "mappo": Algorithm("MAPPO", PPOConfig, MAPPO),
-    "sb3-a2c": Algorithm("SB3 A2C", A2CConfig, color="#009E73"),
-    "sb3-ppo": Algorithm("SB3 PPO", PPOConfig),
-    "sb3-sac": Algorithm("SB3 SAC", SACConfig),
+    "vpg": Algorithm("VPG", ".vpg:VPGConfig", ".vpg:VPG", "#D55E00"),
+    "a2c": Algorithm("A2C", ".a2c:A2CConfig", ".a2c:A2C", "#0072B2"),
+    "ppo": Algorithm("PPO", ".ppo:PPOConfig", ".ppo:PPO"),
+    "ippo": Algorithm("IPPO", ".ppo:PPOConfig", ".ppo:PPO"),
+    "mappo": Algorithm("MAPPO", ".ppo:PPOConfig", ".mappo:MAPPO"),
+    "sb3-a2c": Algorithm("SB3 A2C", ".a2c:A2CConfig", _SB3, "#009E73"),
+    "sb3-ppo": Algorithm("SB3 PPO", ".ppo:PPOConfig", _SB3),
+    "sb3-sac": Algorithm("SB3 SAC", ".config:SACConfig", _SB3),
 }
-
-Controller = PID | Geometric | Orca
-CONTROLLERS: Final[Mapping[str, type[Controller]]] = {
-    "pid": PID,
-    "geometric": Geometric,
-    "orca": Orca,
-}
-"""Agents that need no training, made of an env's spec."""
 
 if TYPE_CHECKING:
     AlgorithmName = str

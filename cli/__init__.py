@@ -130,7 +130,7 @@ def _run(words: list[str]) -> int:
         print(f"rotorgram: expected a command of {known}, got {name}", file=sys.stderr)
         return 2
     from ..rendering.gl import hidden_gl_setting
-    from ._flags import parse
+    from ._parser import parse
 
     if get_terminal_size().columns < 40:  # tyro does not end on narrower terminals
         os.environ["COLUMNS"] = "40"

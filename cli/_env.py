@@ -6,7 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from ..agents import CONTROLLERS, PID, Checkpoint, Geometric, Orca, Policy, load
+from ..agents import CONTROLLERS, Checkpoint, Policy, load
+from ..agents.controllers import Controller
 from ..envs.config import BACKEND_KEYWORDS
 from ..envs.registry import env_spec, is_known, task_type
 from ..envs.spec import EnvSpec
@@ -19,7 +20,6 @@ from ._flags import AgentFlags, EnvFlags, check_count, parse_address
 
 CHECKPOINT = "checkpoint.safetensors"
 F = TypeVar("F", bound=EnvFlags)
-Controller = type[PID] | type[Geometric] | type[Orca]
 _CONNECT_TIMEOUT = 30 * 24 * 3600.0  # s: Ctrl-C ends the wait for a simulator
 
 

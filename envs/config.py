@@ -18,7 +18,7 @@ from ..models.fields import Choice, Limits, check, check_fields, check_names, re
 from ..models.files import read_toml
 from ..models.library import is_of_the_library, vehicle_words
 from ..scenes import scenes_of
-from ..sim import EffectOptions, Randomization, checked_sensors
+from ..sim import EffectOptions, Randomization
 from . import registry
 from .spec import Values, canonical_id, json_values
 
@@ -161,7 +161,10 @@ class EnvConfig:
             from ..models.bundle import checked_bundles
 
             self._set(files=checked_bundles(self.files))
-        self._set(sensors=checked_sensors(self.sensors))
+        if self.sensors != {}:
+            from ..sim.sensors import checked_sensors
+
+            self._set(sensors=checked_sensors(self.sensors))
         if not isinstance(self.effects, EffectOptions):
             self._set(effects=read_table(EffectOptions, self.effects, "effects"))
         self._set(randomize=Randomization(self.randomize, None).to_options())

@@ -8,7 +8,6 @@ from .effects import EffectOptions
 from .random import Draw
 from .randomize import PARAMETERS, Randomization
 from .rotations import body_x, body_z, to_body, world_z
-from .sensors import checked_sensors
 from .state import (
     Array,
     InitialState,
@@ -38,7 +37,6 @@ __all__ = [
     "WorldState",
     "body_x",
     "body_z",
-    "checked_sensors",
     "clip",
     "component",
     "each",

@@ -20,8 +20,8 @@ import rotorgram.envs  # noqa: F401
 from matplotlib.figure import Figure
 from measuring import RESULTS, in_turns, options, write_rows
 from rotorgram.models import Vehicle
-from rotorgram.sim import InitialState, checked_sensors, make_world
-from rotorgram.sim.sensors import Sensors
+from rotorgram.sim import InitialState, make_world
+from rotorgram.sim.sensors import Sensors, checked_sensors
 
 IRIS: Final = {
     "gyro_noise": 1.8665e-4, "gyro_walk": 3.8785e-5, "gyro_bias": 0.0087,

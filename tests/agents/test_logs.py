@@ -178,7 +178,7 @@ def test_the_curves_of_a_killed_training_go_on_as_if_it_had_not_been(
             shutil.copytree(folder, broken)
         store(checkpoint, path)
 
-    monkeypatch.setattr("rotorgram.cli.train.store", copy_before)
+    monkeypatch.setattr("rotorgram.cli._trainer.store", copy_before)
     settings = ("--env-steps", 2400, *sized(algorithm), "--store-every", 0.05)
     whole = train(algorithm, folder, *settings)
     behind = load(broken / "checkpoint.safetensors").position.env_steps

@@ -81,7 +81,8 @@ def stopped_and_resumed(run: Run, path: Path) -> tuple[Training, Training]:
 
 
 def test_a_new_algorithm_is_one_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(ALGORITHMS, "slow", Algorithm("Slow A2C", SlowConfig, Slow))
+    row = Algorithm("Slow A2C", f"{__name__}:SlowConfig", f"{__name__}:Slow")
+    monkeypatch.setitem(ALGORITHMS, "slow", row)
     assert agent_label("slow") == "Slow A2C"
     preset = find_preset("slow", "tuned")
     assert (preset.config, preset.fits) == (SlowConfig(), False)

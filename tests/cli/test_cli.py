@@ -31,9 +31,9 @@ from commands import (
 )
 from rotorgram.agents import load
 from rotorgram.agents.checkpoints import store
-from rotorgram.cli import COMMANDS, main, train
+from rotorgram.cli import COMMANDS, _trainer, main
 from rotorgram.cli._env import fitted
-from rotorgram.cli._flags import parse
+from rotorgram.cli._parser import parse
 from rotorgram.cli._scalars import ScalarWriter
 from rotorgram.cli.serve import Serve
 from rotorgram.cli.sim import Sim
@@ -304,7 +304,7 @@ def test_a_training_that_writes_nothing_leaves_the_name_of_its_folder_free(
     def full(path: Path, data: bytes) -> None:
         raise OSError(28, "No space left on device", str(path))
 
-    monkeypatch.setattr(train, "write_whole", full)
+    monkeypatch.setattr(_trainer, "write_whole", full)
     err = refused(capsys, "train", "a2c", "--out", tmp_path / "run")
     assert err == f"rotorgram: {tmp_path}/run/config.json: No space left on device\n"
     assert list(tmp_path.iterdir()) == []

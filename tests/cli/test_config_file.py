@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from rotorgram.agents import load
 from rotorgram.cli import main
-from rotorgram.cli._flags import parse
+from rotorgram.cli._parser import parse
 from rotorgram.cli.compare import Compare
 from rotorgram.cli.evaluate import Evaluate
 from rotorgram.cli.view import View

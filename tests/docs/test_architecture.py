@@ -117,12 +117,24 @@ def test_no_env_loads_what_draws() -> None:
 
 def test_an_agent_loads_neither_mujoco_nor_torch() -> None:
     program = (
-        "import sys; import rotorgram.agents; from rotorgram.udp import RemoteVectorEnv; "
+        "import sys; from rotorgram.agents import *; from rotorgram.udp import RemoteVectorEnv; "
         "print(sorted({'mujoco', 'torch', 'pandas', 'matplotlib'} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.stdout == "[]\n"
     assert done.stderr == ""
+
+
+def test_a_wrong_flag_of_train_loads_nothing_that_trains_or_flies() -> None:
+    program = (
+        "import sys; from rotorgram.cli import main\n"
+        "try: main(['train', 'ppo', '--wrong-flag'])\n"
+        "except SystemExit as end: print(end.code)\n"
+        "print(sorted(name for name in ('mujoco', 'rotorgram.agents.learner', 'rotorgram.udp', "
+        "'rotorgram.training', 'rotorgram.sim.sensors') if name in sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.stdout == "2\n[]\n"
 
 
 @pytest.mark.parametrize("package", PACKAGES)

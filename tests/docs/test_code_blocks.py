@@ -21,7 +21,7 @@ from typing import NamedTuple
 import pytest
 from programs import EXAMPLES, ROOT, free_port, rotorgram, run
 from rotorgram.cli import COMMANDS
-from rotorgram.cli._flags import parse
+from rotorgram.cli._parser import parse
 from rotorgram.training.settings import Study
 
 PAGES = [

@@ -18,8 +18,8 @@ from rotorgram.envs.config import EnvConfig
 from rotorgram.envs.registry import env_spec
 from rotorgram.models.errors import InputError
 from rotorgram.models.vehicle import Vehicle
-from rotorgram.sim import EffectOptions, World, checked_sensors, make_world
-from rotorgram.sim.sensors import Estimator, Sensors
+from rotorgram.sim import EffectOptions, World, make_world
+from rotorgram.sim.sensors import Estimator, Sensors, checked_sensors
 from rotorgram.sim.sensors.barometer import isa_height, isa_pressure
 from tables import SIM
 from worlds import begin

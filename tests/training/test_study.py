@@ -13,7 +13,7 @@ import pytest
 from commands import WRONG, Capsys, output, refused, run, start, wait_until, words_of
 from comparisons import synthetic_folder
 from rotorgram.agents import load, preset
-from rotorgram.cli._flags import parse
+from rotorgram.cli._parser import parse
 from rotorgram.cli.compare import Compare
 from rotorgram.cli.sweep import Sweep, parse_grid
 from rotorgram.envs import LocalVectorEnv

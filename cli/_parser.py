@@ -1,0 +1,157 @@
+"""The parser of a command's flags: tyro, plus the options of any task and a config's file."""
+
+import re
+from argparse import ArgumentParser
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from types import UnionType
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, Union, cast, get_args, get_type_hints
+
+import tyro
+from tyro.conf import arg
+
+from ..models.errors import InputError
+from ._flags import (
+    DEFAULT_ENV,
+    BackendFlags,
+    Command,
+    EnvFlags,
+    Options,
+    Words,
+    check_count,
+    parse_value,
+)
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+_PLAIN_FLAGS = ("action", "control_period", "episode_length", "history", "scene", "cameras")
+_NAMED_FLAGS = ("effects", "randomize", "sensors")
+C = TypeVar("C", bound=Command)
+
+
+def parse(kind: type[C], prog: str, words: Sequence[str]) -> C:
+    """A command from its words. A wrong flag exits with status 2, `--help` with 0.
+
+    Raises `InputError` if the task or one of its options is not what it should be.
+    """
+    given = _given(words)
+    if not issubclass(kind, EnvFlags):
+        return cast(C, replace(tyro.cli(_for_tyro(kind), prog=prog, args=words), given=given))
+    return cast(C, _parsed_env(kind, prog, words, given))
+
+
+def _parsed_env(
+    kind: type["EnvFlags"], prog: str, words: Sequence[str], given: frozenset[str]
+) -> "EnvFlags":
+    from ..envs import registry
+    from ..envs.config import KEYWORDS
+
+    first_pass = ArgumentParser(prog, add_help=False, allow_abbrev=False)
+    first_pass.add_argument("--env")
+    first_pass.add_argument("--config")
+    found = first_pass.parse_known_args(words)[0]
+    file = _file_values(kind, found.config, found.env) if found.config else {}
+    env_id = found.env or file.get("env", DEFAULT_ENV)
+    listens = "listen" in given or getattr(kind, "listen", None) is not None
+    if listens and ":" not in env_id and not registry.is_known(env_id):
+        command = tyro.cli(_for_tyro(kind), prog=prog, args=words)
+        check_count("drones", command.drones)
+        return _merged(command, given, {}, file)
+    env_id = registry.load(env_id)
+    options = _for_tyro(registry.task_type(env_id).Options, f"Options of {env_id}.")
+    command = tyro.cli(_for_tyro(kind, options=options), prog=prog, args=words)
+    names = [name.removeprefix("env.") for name in given if name.startswith("env.")]
+    own = {name: getattr(command.options, name) for name in sorted(names)}
+    clashing = {name: own.pop(name) for name in names if name in KEYWORDS}
+    if clashing:
+        own["task"] = clashing
+    command = _merged(command, given, own, file)
+    checked = command.env_config().flat_options()
+    chosen = {name: checked.get(name, value) for name, value in command.options.items()}
+    return replace(command, options=chosen)
+
+
+def _file_values(kind: type[EnvFlags], path: str, env: str | None) -> Options:
+    """Values of a config's file by the names of fields. Raises `InputError`."""
+    from ..envs.config import KEYWORDS, BackendConfig, read_keywords
+    from ..envs.spec import canonical_id
+
+    options = read_keywords(path)
+    values: Options = {}
+    for name, key in (("env", "env"), ("env_id", "env"), ("drones", "drones")):
+        if name in options:
+            values[key] = options.pop(name)
+    if "vehicle" in options:
+        values["vehicle"] = ",".join(options.pop("vehicle"))
+    backend = BackendConfig.parse(options.pop("backend", "mujoco"))
+    if issubclass(kind, BackendFlags):
+        values["backend"] = backend.name
+    elif backend.name != "mujoco":
+        raise InputError(f"backend: expected mujoco with this command, got {backend.name}")
+    env_id = values.get("env", DEFAULT_ENV)
+    own = [name for name in options if name not in KEYWORDS]
+    if own and env and canonical_id(env) != canonical_id(env_id):
+        got = ", ".join(own)
+        raise InputError(f"config: expected no options of {env_id} with --env {env}, got {got}")
+    return {**values, "options": {**backend.settings, **options}}
+
+
+def _merged(command: EnvFlags, given: frozenset[str], own: Options, file: Options) -> EnvFlags:
+    """The command with its options: those of the file, then `own` and the other flags."""
+    added = {name: value for name, value in file.items() if name not in {*given, "options"}}
+    options = {**file.get("options", {}), **own}
+    for name in given.intersection(_PLAIN_FLAGS):
+        options[name] = getattr(command, name)
+    for name in given.intersection(_NAMED_FLAGS):
+        options[name] = _named_values(name, getattr(command, name))
+    return replace(command, given=given | added.keys(), options=options, **added)
+
+
+def _named_values(flag: str, words: Words) -> Options:
+    """Values of words NAME or NAME=VALUE by name. Raises `InputError`."""
+    values: Options = {}
+    if words == ("none",):
+        return values
+    for word in words:
+        name, equals, text = word.partition("=")
+        several = re.fullmatch(r"[-+.\deE]+(,[-+.\deE]+)+", text)
+        key = name.replace("-", "_")
+        if key in values:
+            raise InputError(f"{flag}: expected each name once, got {key!r} twice")
+        values[key] = True
+        if equals:
+            values[key] = parse_value(f"[{text}]" if several else text)
+    return values
+
+
+def _for_tyro(kind: type["DataclassInstance"], doc: str | None = None, options: Any = None) -> Any:
+    """A class of flags for tyro, whose checks run later.
+
+    `options` is the type of the field of that name. `X | Y` becomes `Union[X, Y]`: for the first,
+    tyro imports typeguard before Python 3.14, which is slow.
+    """
+    changed: dict[str, object] = {}
+    for name, hint in get_type_hints(kind, include_extras=True).items():
+        extras = getattr(hint, "__metadata__", (None,))  # of Annotated
+        plain = getattr(hint, "__origin__", hint) if hasattr(hint, "__metadata__") else hint
+        if isinstance(plain, UnionType):
+            changed[name] = Annotated[Union[get_args(plain)], *extras]  # noqa: UP007
+    namespace: Options = {"__annotations__": changed, "__doc__": doc or kind.__doc__}
+    namespace["__post_init__"] = lambda self: None
+    namespace["__module__"] = "builtins"  # tyro looks for docstrings in `kind` alone
+    if options:
+        changed["options"] = Annotated[options, arg(name="env")]
+        namespace["options"] = field(default_factory=options)
+    return dataclass(frozen=True, kw_only=True)(type(kind.__name__, (kind,), namespace))
+
+
+def _given(words: Sequence[str]) -> frozenset[str]:
+    """Names of the flags among the words, as fields are named."""
+    names = set()
+    for word in words:
+        if word.startswith("--"):
+            flag = word.removeprefix("--").partition("=")[0].replace("-", "_")
+            prefix, dot, name = flag.rpartition(".")
+            names.add(prefix + dot + name.removeprefix("no_"))
+    return frozenset(names)

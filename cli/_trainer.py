@@ -1,0 +1,238 @@
+"""What `rotorgram train` does: a training, its folder, and Ctrl-C that loses nothing."""
+
+import csv
+import io
+import json
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import fields, replace
+from pathlib import Path
+from threading import Timer
+from typing import TYPE_CHECKING
+
+from ..agents import Checkpoint, Episode, find_algorithm, find_preset, load, preset, store
+from ..agents.checkpoints import software_versions, write_whole
+from ..flights.folders import locked
+from ..models.errors import InputError
+from ..training.settings import Run
+from ..training.training import Training, config_of, is_finished
+from ._env import CHECKPOINT, fitted, remote_env
+from ._flags import Options
+from ._progress import bars
+from ._scalars import ScalarWriter
+from ._training import folder_to_write
+
+if TYPE_CHECKING:
+    from .train import Train
+
+EPISODES = "episodes.csv"
+_WIRE = ("env", "vehicle", "listen", "num_simulators", "key_file", "insecure")
+_FREE = (*_WIRE, "record", "store_every", "env_steps")
+"""Flags that a resumed training may be given."""
+_UPDATE_WITHIN = 2.0  # s
+
+
+def begin(command: "Train") -> int:
+    """A new training; the exit status."""
+    task = command.preset_of or command.env_id
+    base = find_preset(command.algorithm, command.preset, task)
+    if not base.fits:
+        if command.preset_of:
+            raise InputError(
+                f"preset-of: expected a task with a preset of {command.algorithm}, got {task}"
+            )
+        defaults = base.config == type(base.config)()
+        got = "the defaults of its config" if defaults else f"that of {base.env_id}"
+        print(
+            f"note: there is no preset of {command.algorithm} for {task}, nor for a task that it "
+            f"derives from: it gets {got}; --preset-of ID names another",
+            flush=True,
+        )
+    config = preset(command.algorithm, command.preset, task, **command.changes())
+    backend = command.backend if "backend" in command.given else base.backend
+    env_config = command.env_config(backend=backend)  # it refuses wrong drones
+    whole_worlds = max(base.num_envs // command.drones, 1) * command.drones
+    run = Run(
+        env=env_config,
+        algorithm=command.algorithm,
+        config=config,
+        seed=command.seed,
+        env_steps=command.env_steps or base.env_steps,
+        num_envs=command.num_envs or whole_worlds,
+    )
+    opened = remote_env(
+        command,
+        required=bool(command.options) or "env" in command.given,
+        num_envs=run.num_envs,
+        num_simulators=command.num_simulators,
+        backend=backend,
+    )
+    name = f"{run.algorithm}-seed{run.seed}"
+    with folder_to_write(command.out, name) as folder, opened as env, locked(folder):
+        spec = env.env_spec  # of the simulator that came
+        if command.listen is not None:
+            run = replace(run, env=config_of(spec, backend, command.vehicle))
+        training = Training(run, env)
+        about = {"vehicle_hash": spec.vehicle_hash, "versions": software_versions()}
+        _write_json(folder / "config.json", run.to_dict() | about)
+        return _train(command, training, folder)
+
+
+def resume(command: "Train", folder: Path) -> int:
+    """The training of a folder; the exit status."""
+    with locked(folder):
+        kept = load(folder / CHECKPOINT)
+        if kept.algorithm != command.algorithm:
+            raise InputError(
+                f"resume: expected a training of {command.algorithm}, "
+                f"{folder} holds one of {kept.algorithm}"
+            )
+        command.refuse_settings(folder, _FREE)
+        if "env" in command.given and command.env_id != kept.env_id:
+            raise InputError(f"resume: expected --env {kept.env_id}, got {command.env}")
+        if command.env_steps is not None:
+            kept = _extended(kept, folder, command.env_steps)
+        if is_finished(kept):
+            flown = kept.position.env_steps
+            print(f"already trained {flown:,} of {kept.env_steps:,} env steps")
+            print(f"checkpoint: {folder / CHECKPOINT}")
+            return 0
+        for name, (then, now) in kept.other_versions().items():
+            print(f"note: {name} was {then} and is {now}: the numbers may differ", flush=True)
+        opened = remote_env(
+            fitted(command, kept),
+            num_envs=kept.num_envs,
+            num_simulators=command.num_simulators,
+            backend=kept.backend,
+        )
+        with opened as env:
+            return _train(command, Training.resume(kept, env), folder)
+
+
+def _train(command: "Train", training: Training, folder: Path) -> int:
+    if not find_algorithm(command.algorithm).resumes:
+        stopped = "it starts anew" if command.resume else "--resume starts it anew"
+        print(f"note: {command.algorithm} keeps no state of a training: {stopped}", flush=True)
+    go_on = command.go_on_with(f"train {command.algorithm}", folder, *_WIRE)
+    keeper = _Keeper(training, folder, command.store_every)
+    try:
+        with _stop_at_update() as stop_is_asked, bars() as progress:
+
+            def on_update() -> bool:
+                stopping = stop_is_asked()
+                keeper.keep(now=stopping)
+                return not stopping
+
+            name = f"{training.run.algorithm} seed {training.run.seed}"
+            finished = training.train(on_update, lambda *now: progress(name, *now))
+            if finished:
+                stop_is_asked()
+                keeper.keep(now=True, last=True)
+    except BaseException:  # a full disk and SIGTERM too
+        with suppress(OSError):
+            keeper.close()
+        if (folder / CHECKPOINT).exists():
+            print(go_on)
+        raise
+    keeper.close()
+    flown = training.log.env_steps
+    what = "trained" if finished else "stopped after"
+    print(f"{what} {flown:,} of {training.run.env_steps:,} env steps")
+    print(f"{flown / training.log.seconds:,.0f} env steps per second")
+    print(f"checkpoint: {folder / CHECKPOINT}" if finished else go_on)
+    return 0 if finished else 128 + signal.SIGINT
+
+
+def _extended(kept: Checkpoint, folder: Path, env_steps: int) -> Checkpoint:
+    """The checkpoint with more env steps to fly; `config.json` gets their number too."""
+    if env_steps < kept.env_steps:
+        raise InputError(
+            f"env_steps: expected {kept.env_steps} or more, to which {folder} is to be "
+            f"trained, got {env_steps}"
+        )
+    file = folder / "config.json"
+    content = json.loads(file.read_text(encoding="utf-8"))
+    _write_json(file, {**content, "env_steps": env_steps})
+    return replace(kept, env_steps=env_steps)
+
+
+def _write_json(file: Path, content: Options) -> None:
+    write_whole(file, (json.dumps(content, indent=2) + "\n").encode())
+
+
+class _Keeper:
+    """Stores a training at its first update, then every so many seconds, and when told to.
+
+    Numbers for TensorBoard are written by env steps, not by the clock: a training that was resumed
+    has them at the same steps as an unbroken one.
+    """
+
+    def __init__(self, training: Training, folder: Path, every: float) -> None:
+        self._training = training
+        self._folder = folder
+        self._every = every
+        self._due = 0.0
+        total = training.run.env_steps
+        behind = training.log.env_steps
+        self._scalars = ScalarWriter(folder / "tensorboard", total, behind=behind)
+
+    def keep(self, *, now: bool, last: bool = False) -> None:
+        at = self._training.log.env_steps
+        if self._scalars.due(at, last=last):
+            self._scalars.write(at, self._training.scalars())
+        if now or time.monotonic() >= self._due:
+            # First the rest: a checkpoint takes the curves that end before it.
+            self._write_episodes()
+            self._scalars.flush()
+            store(self._training.checkpoint(), self._folder / CHECKPOINT)
+            self._due = time.monotonic() + self._every
+
+    def close(self) -> None:
+        """Write logs; they may end between two updates."""
+        self._write_episodes()
+        self._scalars.close()
+
+    def _write_episodes(self) -> None:
+        text = io.StringIO()  # pandas would take longer to import than a short training takes
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow([field.name for field in fields(Episode)])
+        for episode in self._training.log.episodes:
+            writer.writerow("" if value != value else value for value in vars(episode).values())
+        write_whole(self._folder / EPISODES, text.getvalue().encode())
+
+
+@contextmanager
+def _stop_at_update() -> Iterator[Callable[[], bool]]:
+    """Ctrl-C and termination ask to stop at an update: a function that tells there whether to.
+
+    Asked again, or if no update comes soon (no simulator answers), it stops at once.
+    """
+    asked = False
+    # As another Ctrl-C would: it ends a wait for a simulator too.
+    timer = Timer(_UPDATE_WITHIN, os.kill, (os.getpid(), signal.SIGINT))
+    timer.daemon = True
+
+    def ask(*_: object) -> None:
+        nonlocal asked
+        if asked:
+            raise KeyboardInterrupt
+        asked = True
+        with suppress(OSError):  # standard output may take no more
+            print("stopping at the next update; Ctrl-C again stops now", flush=True)
+        timer.start()
+
+    def reached() -> bool:
+        if asked:  # there is time to write now
+            timer.cancel()
+        return asked
+
+    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield reached
+    finally:
+        timer.cancel()
+        for number, handler in before.items():
+            signal.signal(number, handler)
