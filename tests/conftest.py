@@ -1,5 +1,6 @@
 """What all tests share: a busy machine is no failure, and Ctrl-C reaches the programs of tests."""
 
+import os
 import signal
 
 import pytest
@@ -11,6 +12,11 @@ settings.load_profile("busy")
 # A shell that starts the tests in the background has Ctrl-C ignored, by their programs too.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_xdist_auto_num_workers() -> int:
+    """Of `-n auto`: one more than there are processors, for tests that wait for other programs."""
+    return (os.cpu_count() or 1) + 1
 
 
 @pytest.fixture(scope="session")

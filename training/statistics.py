@@ -3,6 +3,8 @@
 The definitions are those of Agarwal et al., "Deep Reinforcement Learning at the Edge of the
 Statistical Precipice" (NeurIPS 2021, arXiv 2108.13264), computed by SciPy. A bootstrap resamples
 the runs of an agent, always in the same way. Missing values (nan) are left out.
+
+SciPy is imported where it computes: its import takes longer than a short training.
 """
 
 import math
@@ -10,7 +12,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 _RESAMPLES = 2000
 
@@ -26,6 +27,8 @@ def finite(values: Values) -> Floats:
 
 def trimmed_mean(values: Values, axis: int = -1) -> Floats:
     """Mean along an axis without the lowest and the highest quarter; below four nothing is cut."""
+    from scipy import stats
+
     return np.asarray(stats.trim_mean(values, 0.25, axis=axis))
 
 
@@ -62,6 +65,8 @@ def share_interval(count: int, total: int, level: float = 0.95) -> tuple[float, 
     """Wilson's interval of a share, of `count` cases out of `total`; (nan, nan) of none."""
     if total == 0:
         return math.nan, math.nan
+    from scipy import stats
+
     interval = stats.binomtest(count, total).proportion_ci(level, method="wilson")
     return float(interval.low), float(interval.high)
 
@@ -76,6 +81,8 @@ def _bootstrap(
     known = [finite(values) for values in samples]
     if min(values.size for values in known) < 2:
         return math.nan, math.nan
+    from scipy import stats
+
     found = stats.bootstrap(
         known,
         statistic,

@@ -590,7 +590,7 @@ def test_text_of_others_holds_no_terminal_escapes(
 def test_ctrl_c_stops_a_training_that_resumes_to_the_numbers_of_an_unbroken_one(
     tmp_path: Path, capsys: Capsys
 ) -> None:
-    settings = ("--env-steps", 12_000, "--set", "steps_per_update=100")
+    settings = ("--env-steps", 6_000, "--set", "steps_per_update=100")
     process = start("train", "a2c", "--out", tmp_path / "broken", *settings)
     assert process.stdout is not None
     assert process.stdout.readline().startswith("a2c seed 0"), "the first update is reported"
@@ -601,7 +601,7 @@ def test_ctrl_c_stops_a_training_that_resumes_to_the_numbers_of_an_unbroken_one(
     assert f"go on with: rotorgram train a2c --resume {tmp_path / 'broken'}" in out
     assert err == ""
     stopped = load(tmp_path / "broken" / "checkpoint.safetensors").position.env_steps
-    assert 0 < stopped < 12_000
+    assert 0 < stopped < 6_000
     output(capsys, "train", "a2c", "--resume", tmp_path / "broken")
     output(capsys, "train", "a2c", "--out", tmp_path / "whole", *settings)
     broken, whole = (load(tmp_path / f / "checkpoint.safetensors") for f in ("broken", "whole"))
@@ -785,7 +785,7 @@ def test_compare_writes_everything(tmp_path: Path, capsys: Capsys) -> None:
 def test_an_interrupted_comparison_goes_on(tmp_path: Path, capsys: Capsys) -> None:
     folder = tmp_path / "out"
     process = start(
-        "compare", "--out", folder, "--agents", "vpg", "--seeds", 3, "--env-steps", 6_000,
+        "compare", "--out", folder, "--agents", "vpg", "--seeds", 3, "--env-steps", 4_000,
         "--snapshots", 1, "--episodes", 1, "--jobs", 2,
     )  # fmt: skip
     deadline = time.monotonic() + 100

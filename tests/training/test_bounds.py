@@ -57,8 +57,8 @@ def test_limited_changes_take_four_equal_parts() -> None:
 
 
 def test_drag_makes_way_and_braking_shorter() -> None:
-    slowed = flown(6.0, 3.0, 1.0, drag=1.0)
-    free = flown(6.0, 3.0, 1.0)
+    slowed = flown(2.0, 3.0, 1.0, drag=1.0)
+    free = flown(2.0, 3.0, 1.0)
     assert slowed[49] > free[49]
     short = flown(1.0, 3.0, 1.0, drag=1.0)
     assert abs(short[-1]) < 1e-4

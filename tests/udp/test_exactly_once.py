@@ -89,7 +89,7 @@ def assert_bad(relay: Relay, agent: Counter[str], simulator: Counter[str]) -> No
 # ---- one drone
 
 
-@pytest.mark.parametrize(("kind", "steps"), [("binary", 1000), ("text", 300), ("key", 300)])
+@pytest.mark.parametrize(("kind", "steps"), [("binary", 600), ("text", 300), ("key", 300)])
 def test_one_drone(kind: str, steps: int, tmp_path: Path) -> None:
     faults = BAD
     settings: dict[str, Any] = {}
@@ -120,7 +120,7 @@ def test_one_drone(kind: str, steps: int, tmp_path: Path) -> None:
 # ---- many
 
 
-@pytest.mark.parametrize(("simulators", "drones", "steps"), [(1, 64, 500), (3, 2, 200)])
+@pytest.mark.parametrize(("simulators", "drones", "steps"), [(1, 64, 250), (3, 2, 200)])
 def test_many_drones(simulators: int, drones: int, steps: int) -> None:
     count = simulators * drones
     seeds = list(range(1000, 1000 + count))
