@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from ..agents import CONTROLLERS, Checkpoint, Policy, load
 from ..agents.controllers import Controller
@@ -17,6 +17,9 @@ from ..models.errors import InputError
 from ..udp import RemoteVectorEnv
 from ..udp.spawn import spawn_simulator
 from ._flags import AgentFlags, EnvFlags, check_count, parse_address
+
+if TYPE_CHECKING:
+    from ..envs.vector import LocalVectorEnv
 
 CHECKPOINT = "checkpoint.safetensors"
 F = TypeVar("F", bound=EnvFlags)
@@ -116,6 +119,16 @@ def words_of(trajectory: Trajectory) -> str:
         return words
     value = f"{trajectory.headline[-1]:.3f} {metric.unit}".rstrip()
     return f"{words}, last {metric.symbol or metric.name} {value}"
+
+
+@contextmanager
+def local_env(command: EnvFlags, num_envs: int, backend: Backend) -> Iterator["LocalVectorEnv"]:
+    """A vector env in this process, without autoreset."""
+    from ..envs.vector import LocalVectorEnv  # what only speaks UDP needs no MuJoCo
+
+    config = command.env_config(backend=backend)
+    with closing(LocalVectorEnv(config, num_envs, autoreset_mode="Disabled")) as env:
+        yield env
 
 
 @contextmanager

@@ -7,7 +7,7 @@ import os
 import signal
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import fields, replace
 from pathlib import Path
 from threading import Timer
@@ -15,12 +15,14 @@ from typing import TYPE_CHECKING
 
 from ..agents import Checkpoint, Episode, find_algorithm, find_preset, load, preset, store
 from ..agents.checkpoints import software_versions, write_whole
+from ..envs.autoreset import AdvancingVectorEnv
 from ..flights.folders import locked
+from ..models import Backend
 from ..models.errors import InputError
 from ..training.settings import Run
 from ..training.training import Training, config_of, is_finished
-from ._env import CHECKPOINT, fitted, remote_env
-from ._flags import Options
+from ._env import CHECKPOINT, fitted, local_env, remote_env
+from ._flags import DEFAULT_ENV, Options
 from ._progress import bars
 from ._scalars import ScalarWriter
 from ._training import folder_to_write
@@ -29,9 +31,12 @@ if TYPE_CHECKING:
     from .train import Train
 
 EPISODES = "episodes.csv"
-_WIRE = ("env", "vehicle", "listen", "num_simulators", "key_file", "insecure")
+_WIRE = ("env", "vehicle", "udp", "listen", "num_simulators", "key_file", "insecure")
 _FREE = (*_WIRE, "record", "store_every", "env_steps")
 """Flags that a resumed training may be given."""
+_IMPLY_UDP = ("listen", "num_simulators", "key_file", "insecure", "record")
+_OF_THE_PAPER = ("vpg", "a2c", "sb3-a2c")
+"""Over UDP on the paper's task."""
 _UPDATE_WITHIN = 2.0  # s
 
 
@@ -63,13 +68,8 @@ def begin(command: "Train") -> int:
         env_steps=command.env_steps or base.env_steps,
         num_envs=command.num_envs or whole_worlds,
     )
-    opened = remote_env(
-        command,
-        required=bool(command.options) or "env" in command.given,
-        num_envs=run.num_envs,
-        num_simulators=command.num_simulators,
-        backend=backend,
-    )
+    required = bool(command.options) or "env" in command.given
+    opened = _opened(command, run.num_envs, backend, required=required)
     name = f"{run.algorithm}-seed{run.seed}"
     with folder_to_write(command.out, name) as folder, opened as env, locked(folder):
         spec = env.env_spec  # of the simulator that came
@@ -102,14 +102,26 @@ def resume(command: "Train", folder: Path) -> int:
             return 0
         for name, (then, now) in kept.other_versions().items():
             print(f"note: {name} was {then} and is {now}: the numbers may differ", flush=True)
-        opened = remote_env(
-            fitted(command, kept),
-            num_envs=kept.num_envs,
-            num_simulators=command.num_simulators,
-            backend=kept.backend,
-        )
-        with opened as env:
+        with _opened(fitted(command, kept), kept.num_envs, kept.backend) as env:
             return _train(command, Training.resume(kept, env), folder)
+
+
+def _opened(
+    command: "Train", num_envs: int, backend: Backend, *, required: bool = True
+) -> AbstractContextManager[AdvancingVectorEnv]:
+    """The env of a training, in this process or over UDP."""
+    by_paper = command.algorithm in _OF_THE_PAPER and command.env_id == DEFAULT_ENV
+    by_wire = command.udp if "udp" in command.given else by_paper
+    if by_wire or command.given.intersection(_IMPLY_UDP):
+        return remote_env(
+            command,
+            required=required,
+            num_envs=num_envs,
+            num_simulators=command.num_simulators,
+            backend=backend,
+        )
+    print("flying in this process (--udp: with a simulator, over UDP)", flush=True)
+    return local_env(command, num_envs, backend)
 
 
 def _train(command: "Train", training: Training, folder: Path) -> int:

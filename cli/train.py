@@ -13,11 +13,12 @@ from ._training import TrainingFlags
 
 @dataclass(frozen=True, kw_only=True)
 class Train(AgentFlags, TrainingFlags):
-    """Train an agent: the UDP server.
+    """Train an agent, in this process or over UDP.
 
-    Starts a simulator process of its own, or waits for one with --listen. Ctrl-C stops at the next
-    update with everything written; --resume goes on to the same numbers (sb3-… start anew), or to
-    more env steps, by --env-steps.
+    vpg, a2c and sb3-a2c learn over UDP on Elevation-v0, as in the paper. With --udp, --record or
+    --listen all do, with a simulator process of their own or those that come to --listen. The
+    numbers are the same. Ctrl-C stops at the next update with everything written; --resume goes on
+    to the same numbers (sb3-… start anew), or to more env steps, by --env-steps.
     """
 
     algorithm: Positional[AlgorithmName]
@@ -26,6 +27,8 @@ class Train(AgentFlags, TrainingFlags):
     """What steps the drones: mujoco, or rigid (without contact, fast)."""
     preset_of: str | None = None
     """Id of the task with the preset. Default: the one that is trained, or that it derives from."""
+    udp: bool = False
+    """Fly over UDP, with a simulator process."""
     seed: int = 0
     """Seed of weights, actions and episodes."""
     num_simulators: int = 1

@@ -1,0 +1,53 @@
+"""`rotorgram train` in this process and over UDP: the same numbers, and who flies which way."""
+
+from pathlib import Path
+
+import pytest
+from rotorgram.agents import load
+from rotorgram.cli import main
+
+Capsys = pytest.CaptureFixture[str]
+HERE = "flying in this process"
+LEAST = ("--env-steps", "200", "--set", "steps_per_update=100")
+
+
+def trained(capsys: Capsys, *words: object) -> str:
+    assert main(["train", *map(str, words)]) == 0
+    return capsys.readouterr().out
+
+
+def test_twenty_updates_have_the_same_weights_both_ways(tmp_path: Path, capsys: Capsys) -> None:
+    task = ("--env", "rotorgram/Hover-v0", "--num-envs", 8, "--env-steps", 2560)
+    words = ("ppo", *task, "--set", "steps_per_update=128")
+    assert HERE in trained(capsys, *words, "--out", tmp_path / "here")
+    over = trained(capsys, *words, "--udp", "--out", tmp_path / "over")
+    assert HERE not in over
+    assert "wire: " in over
+    here, there = (load(tmp_path / f / "checkpoint.safetensors") for f in ("here", "over"))
+    assert here.state.keys() == there.state.keys()
+    for name, array in here.state.items():
+        assert array.tobytes() == there.state[name].tobytes(), name
+    assert here.position.env_steps == there.position.env_steps >= 2560
+    assert here.spec == there.spec
+
+
+@pytest.mark.parametrize(
+    ("words", "here"),
+    [
+        (("a2c",), False),
+        (("a2c", "--no-udp"), True),
+        (("a2c", "--env", "rotorgram/Hover-v0"), True),
+        (("ppo",), True),
+        (("ppo", "--record", "flight.mcap"), False),
+    ],
+)
+def test_who_flies_in_this_process(
+    words: tuple[str, ...], here: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: Capsys,
+) -> None:  # fmt: skip
+    """The paper's agents on its task, and what only the wire gives, fly over UDP."""
+    monkeypatch.chdir(tmp_path)
+    out = trained(capsys, *words, *LEAST, "--out", "run")
+    assert (HERE in out) is here
+    assert ("wire: " in out) is not here
+    assert Path("flight.mcap").exists() == ("--record" in words)
