@@ -21,7 +21,7 @@ QUAD_XML = Path(__file__).parent / "quad.xml"
 """The paper's vehicle."""
 Backend = Literal["mujoco", "rigid"]
 """What steps vehicles. `mujoco`: threads of this machine, float64. `rigid`: the rigid body alone,
-no contact, in NumPy or in compiled C."""
+no contact, in NumPy or compiled."""
 BACKENDS: Final[tuple[Backend, ...]] = get_args(Backend)
 MAX_DRONES = 1024
 """Most drones of a world."""

@@ -115,7 +115,7 @@ def sizes(args: Namespace) -> None:
     ways: dict[str, tuple[Backend, dict[str, object]]] = {
         "mujoco": ("mujoco", {}),
         "rigid, arrays": ("rigid", {}),
-        "rigid, arrays without a compiler": ("rigid", {"compiled": False}),
+        "rigid, arrays by NumPy": ("rigid", {"compiled": False}),
     }
     table = {}
     for drones in (64, 128, 1024, 4096):

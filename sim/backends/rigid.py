@@ -5,12 +5,14 @@ It flies as `mujoco` does until a part touches the ground or another drone, and 
 
 import logging
 from collections.abc import Mapping
+from functools import cache
 
 import mujoco
 import numpy as np
 
 from ...models.errors import InputError
 from ...models.vehicle import Vehicle, craft_bodies, craft_geoms
+from ..compile import is_available
 from ..effects import EffectOptions
 from ..randomize import Randomization
 from ..snapshots import Arrays
@@ -34,7 +36,7 @@ class RigidWorld(World):
 
     Args:
         dtype: `float32` or `float64`.
-        compiled: Fly by a C function (`kernel.py`). None: where there is a C compiler.
+        compiled: Fly by machine code (`sim/compile`). None: where llvmlite is installed.
     """
 
     def __init__(
@@ -48,10 +50,8 @@ class RigidWorld(World):
         dtype: str = "float32",
         compiled: bool | None = None,
     ) -> None:
-        found = kernel.compiler()
-        if compiled and not found:
-            expected = "false where no C compiler is found (cc, gcc, clang or the variable CC)"
-            raise InputError(f"compiled: expected {expected}, got true")
+        if compiled and not is_available():
+            raise InputError("compiled: expected false where llvmlite is not installed, got true")
         payload = 0.0 if effects is None else effects.payload
         if payload:
             expected = "none with the backend rigid, which has no cable: fly it with mujoco"
@@ -79,23 +79,16 @@ class RigidWorld(World):
         self._show(np.repeat(_LEVEL.astype(self.dtype)[:, None], num_worlds * drones, axis=1))
         self._varying: np.ndarray | None = None
         self._function: kernel.Fly | None = None
-        self._compiled = compiled if found else False
+        self._compiled = compiled is not False and (is_available() or _without_llvm())
         self._vary(dict.fromkeys(self._drawn, np.ones(num_worlds * drones)))
         self._compile()
 
     def _compile(self) -> None:
         """Compile the body as it varies now, unless NumPy flies it."""
-        if self._compiled is False:
-            return
-        pushed = self.effects is not None and self.effects.on_body
-        rotors = self.vehicle.num_rotors
-        try:
-            self._function = kernel.compiled(self._body, rotors, self.dtype, wrench=pushed)
-        except InputError as error:
-            if self._compiled:
-                raise
-            self._compiled = False
-            logging.getLogger(__name__).warning("rigid flies by NumPy: %s", error)
+        if self._compiled:
+            pushed = self.effects is not None and self.effects.on_body
+            rotors = self.vehicle.num_rotors
+            self._function = kernel.flight(self._body, rotors, self.dtype, wrench=pushed)
 
     def vary(self, inertia: Array, reaction: Array, air: Mapping[str, Array]) -> None:
         """Set the numbers of every drone before the first reset; needs the effect `body_drag`.
@@ -258,6 +251,14 @@ class RigidWorld(World):
         bad = ~np.all(abs(self._rows) < mujoco.mjMAXVAL, axis=0)
         ids = np.flatnonzero(bad.reshape(self.shape).any(axis=1)).tolist()
         raise PhysicsError(f"the rigid body has bad states in envs {ids[:5]}: reset the env")
+
+
+@cache
+def _without_llvm() -> bool:
+    """Tell it once."""
+    words = "rigid flies by NumPy, which is slower: llvmlite is not installed"
+    logging.getLogger(__name__).warning(words)
+    return False
 
 
 def _check_obstacles(vehicle: Vehicle) -> None:

@@ -2,7 +2,7 @@
 
 import copy
 import re
-import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,8 @@ from rotorgram.envs.config import EnvConfig
 from rotorgram.models import QUAD_XML, Vehicle
 from rotorgram.models.errors import InputError
 from rotorgram.sim import PhysicsError, Randomization, make_world
-from rotorgram.sim.backends import kernel
+from rotorgram.sim.backends import rigid
+from rotorgram.sim.compile import llvm
 from tables import SIM
 from worlds import begin
 
@@ -171,50 +172,19 @@ def test_arrays_have_the_same_bits_alone_and_in_a_batch() -> None:
             assert found == all_[i].tobytes()
 
 
-@pytest.mark.parametrize(
-    ("script", "reason"),
-    [
-        (b"#!/bin/sh\nexec sleep 30", "timed out after 0.2 seconds"),
-        (b"#!/bin/sh\nfor f; do case $f in *.so) echo > $f;; esac; done", "file too short"),
-        (b"#!/no/interpreter", "No such file"),
-        (b"#!/bin/sh\nprintf '\\377 no' >&2; exit 1", "\ufffd no"),
-        (b"#!/bin/sh\nprintf '\\033[31mred' >&2; exit 1", r"\[31mred"),
-    ],
-)
-def test_a_compiler_that_misbehaves_is_told_in_one_sentence(
-    script: bytes,
-    reason: str,
-    tmp_path: Path,
+def test_without_llvmlite_numpy_flies(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
+    request: pytest.FixtureRequest,
 ) -> None:
-    tool = tmp_path / "cc"
-    tool.write_bytes(script)
-    tool.chmod(0o755)
-    monkeypatch.setenv("CC", f"'{tool}' -O1")
-    seconds = 0.2 if b"sleep" in script else 60.0
-    monkeypatch.setattr(kernel, "COMPILE_SECONDS", seconds)
-    vehicle = Vehicle.load(linear_drag=0.124)
-    with pytest.raises(InputError, match=rf"^compiled: expected [^\n]*{reason}"):
-        arrays(vehicle, compiled=True)
-    world = arrays(vehicle)
-    assert world.shape == (N, 1)  # by NumPy
-    (message,) = caplog.messages
-    assert message.startswith("rigid flies by NumPy: compiled: expected ")
-    assert message.isprintable()
-
-
-def test_without_a_compiler_numpy_flies(monkeypatch: pytest.MonkeyPatch) -> None:
     vehicle = Vehicle.load(linear_drag=0.123)
-    monkeypatch.setenv("CC", str(shutil.which("false")))
-    with pytest.raises(InputError, match=r"^compiled: expected .*false to compile the equations"):
+    monkeypatch.setitem(sys.modules, "llvmlite", None)
+    for function in (llvm._llvm, rigid._without_llvm):
+        function.cache_clear()
+        request.addfinalizer(function.cache_clear)
+    with pytest.raises(InputError, match=r"^compiled: expected false where llvmlite is not instal"):
         arrays(vehicle, compiled=True)
-    monkeypatch.setenv("CC", "'gcc")  # a quotation without its end
     arrays(vehicle)
-    monkeypatch.setenv("CC", str(shutil.which("false")))
-    monkeypatch.setattr(shutil, "which", lambda _: None)
-    with pytest.raises(InputError, match=r"^compiled: expected false where no C compiler is found"):
-        arrays(vehicle, compiled=True)
     world = arrays(vehicle)
     begin(world, position=(9.0, 9.0, 9.0), velocity=(1.0, 1.0, 1.0))
     world.step(np.zeros((N, 1, 4)), 1)
@@ -224,6 +194,9 @@ def test_without_a_compiler_numpy_flies(monkeypatch: pytest.MonkeyPatch) -> None
     expected = (left, left, left - fallen)
     found = world.state.velocity[0, 0]
     assert_allclose(found, expected, rtol=1e-9)
+    assert caplog.messages == [
+        "rigid flies by NumPy, which is slower: llvmlite is not installed"
+    ], "once, for two worlds"
 
 
 def test_a_free_fall_is_exact() -> None:
