@@ -24,7 +24,7 @@ Counts = NDArray[np.int64]
 
 
 class ResumeError(InputError):
-    """The simulator does not repeat the episodes that were interrupted."""
+    """The env does not repeat the episodes that were interrupted."""
 
 
 def episode_seed(run_seed: int, episode: int) -> int:
@@ -221,7 +221,7 @@ class EpisodeRecorder:
         got = self.observations
         if (self._lengths != position.lengths).any() or got.tobytes() != expected.tobytes():
             raise ResumeError(
-                "resume: the simulator does not repeat the episodes that were interrupted: "
+                "resume: the env does not repeat the episodes that were interrupted: "
                 f"expected the observations {expected.tolist()[:3]}, got {got.tolist()[:3]}"
             )
         self.env_steps = position.env_steps

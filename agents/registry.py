@@ -22,7 +22,10 @@ Agent: TypeAlias = "Learner | SB3Agent"
 
 @dataclass(frozen=True)
 class Algorithm:
-    """A row of the registry. Its classes, "module:Class", are imported when they are used."""
+    """A row of the registry. Its classes are imported when they are used.
+
+    They are named as "module:Class"; a module that begins with a dot is of this package.
+    """
 
     label: str
     """Name in tables and figures."""

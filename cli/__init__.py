@@ -63,7 +63,7 @@ EXTRAS = {
 }  # fmt: skip
 """Import names of the packages of each extra, as pyproject.toml lists them."""
 
-_ABOUT = "A MuJoCo drone simulator that reinforcement-learning agents fly over UDP."
+_ABOUT = "A MuJoCo drone simulator that reinforcement-learning agents fly, in process or over UDP."
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

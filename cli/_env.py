@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from ..agents import CONTROLLERS, Checkpoint, Policy, load
 from ..agents.controllers import Controller
-from ..envs.config import BACKEND_KEYWORDS
+from ..envs.config import BACKEND_KEYWORDS, BackendConfig
 from ..envs.registry import env_spec, is_known, task_type
 from ..envs.spec import EnvSpec
 from ..flights.trajectories import Trajectory
@@ -122,13 +122,25 @@ def words_of(trajectory: Trajectory) -> str:
 
 
 @contextmanager
-def local_env(command: EnvFlags, num_envs: int, backend: Backend) -> Iterator["LocalVectorEnv"]:
+def local_env(
+    command: EnvFlags, num_envs: int, backend: Backend | BackendConfig
+) -> Iterator["LocalVectorEnv"]:
     """A vector env in this process, without autoreset."""
     from ..envs.vector import LocalVectorEnv  # what only speaks UDP needs no MuJoCo
 
+    _check_known(command.env_id)
     config = command.env_config(backend=backend)
     with closing(LocalVectorEnv(config, num_envs, autoreset_mode="Disabled")) as env:
+        print("flying in this process (--udp: over UDP, with a simulator)", flush=True)
         yield env
+
+
+def _check_known(env_id: str) -> None:
+    if not is_known(env_id):
+        raise InputError(
+            f"env: expected --env MODULE:{env_id}, "
+            "for the task is not known here without the module that registers it"
+        )
 
 
 @contextmanager
@@ -138,7 +150,7 @@ def remote_env(
     required: bool = True,
     num_envs: int | None = 1,
     num_simulators: int = 1,
-    backend: Backend = "mujoco",
+    backend: Backend | BackendConfig = "mujoco",
 ) -> Iterator[RemoteVectorEnv]:
     """A remote env with a simulator of its own, on a backend, or those that come to
     `command.listen`; at the end the counters of the wire are printed.
@@ -165,11 +177,7 @@ def remote_env(
                 "key-file, insecure: expected them with --listen, "
                 "got them for a simulator of our own on this machine"
             )
-        if not is_known(env_id):
-            raise InputError(
-                f"env: expected --env MODULE:{env_id}, "
-                "for the task is not known here without the module that registers it"
-            )
+        _check_known(env_id)
         config = command.env_config(backend=backend)
         drones = num_envs or command.drones
         opened = spawn_simulator(config, num_envs=drones, record=command.record)

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 from ..agents import Checkpoint, Episode, find_algorithm, find_preset, load, preset, store
 from ..agents.checkpoints import software_versions, write_whole
 from ..envs.autoreset import AdvancingVectorEnv
+from ..envs.config import BackendConfig
 from ..flights.folders import locked
 from ..models import Backend
 from ..models.errors import InputError
@@ -102,17 +103,23 @@ def resume(command: "Train", folder: Path) -> int:
             return 0
         for name, (then, now) in kept.other_versions().items():
             print(f"note: {name} was {then} and is {now}: the numbers may differ", flush=True)
-        with _opened(fitted(command, kept), kept.num_envs, kept.backend) as env:
+        backend = kept.env.backend if kept.env else kept.backend
+        with _opened(fitted(command, kept), kept.num_envs, backend) as env:
             return _train(command, Training.resume(kept, env), folder)
 
 
 def _opened(
-    command: "Train", num_envs: int, backend: Backend, *, required: bool = True
+    command: "Train", num_envs: int, backend: Backend | BackendConfig, *, required: bool = True
 ) -> AbstractContextManager[AdvancingVectorEnv]:
     """The env of a training, in this process or over UDP."""
-    by_paper = command.algorithm in _OF_THE_PAPER and command.env_id == DEFAULT_ENV
-    by_wire = command.udp if "udp" in command.given else by_paper
-    if by_wire or command.given.intersection(_IMPLY_UDP):
+    by_wire = command.algorithm in _OF_THE_PAPER and command.env_id == DEFAULT_ENV
+    if "udp" in command.given:
+        by_wire = command.udp
+    implied = sorted(command.given.intersection(_IMPLY_UDP))
+    if implied and "udp" in command.given and not command.udp:
+        got = ", ".join("--" + name.replace("_", "-") for name in implied)
+        raise InputError(f"udp: expected --no-udp without flags of the wire, got {got}")
+    if by_wire or implied:
         return remote_env(
             command,
             required=required,
@@ -120,7 +127,6 @@ def _opened(
             num_simulators=command.num_simulators,
             backend=backend,
         )
-    print("flying in this process (--udp: with a simulator, over UDP)", flush=True)
     return local_env(command, num_envs, backend)
 
 

@@ -59,11 +59,14 @@ class TrainingFlags(BackendFlags):
         """The line that tells how to resume, with those of the flags that were given."""
         line: list[object] = ["rotorgram", *words.split(), "--resume", folder]
         for flag in flags:
-            if flag in self.given:
-                line.append(f"--{flag.replace('_', '-')}")
-                value = getattr(self, flag)
-                if value is not True:
-                    line.append(value)
+            if flag not in self.given:
+                continue
+            name = flag.replace("_", "-")
+            value = getattr(self, flag)
+            if isinstance(value, bool):
+                line.append(f"--{name}" if value else f"--no-{name}")
+            else:
+                line += [f"--{name}", value]
         return f"go on with: {shlex.join(map(str, line))}"
 
 

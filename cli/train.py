@@ -2,8 +2,9 @@
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from ..agents.registry import AlgorithmName
 from ..models.errors import InputError, require
@@ -15,10 +16,11 @@ from ._training import TrainingFlags
 class Train(AgentFlags, TrainingFlags):
     """Train an agent, in this process or over UDP.
 
-    vpg, a2c and sb3-a2c learn over UDP on Elevation-v0, as in the paper. With --udp, --record or
-    --listen all do, with a simulator process of their own or those that come to --listen. The
-    numbers are the same. Ctrl-C stops at the next update with everything written; --resume goes on
-    to the same numbers (sb3-… start anew), or to more env steps, by --env-steps.
+    vpg, a2c and sb3-a2c learn Elevation-v0 over UDP, as in the paper. With --udp, --record or
+    --listen all agents do, from a simulator process of their own or those that come to --listen.
+    The others, and all with --no-udp, fly in this process. The numbers are the same. Ctrl-C stops
+    at the next update with everything written; --resume goes on to the same numbers (sb3-… start
+    anew), or to more env steps, by --env-steps.
     """
 
     algorithm: Positional[AlgorithmName]
@@ -27,8 +29,8 @@ class Train(AgentFlags, TrainingFlags):
     """What steps the drones: mujoco, or rigid (without contact, fast)."""
     preset_of: str | None = None
     """Id of the task with the preset. Default: the one that is trained, or that it derives from."""
-    udp: bool = False
-    """Fly over UDP, with a simulator process."""
+    udp: Annotated[bool, arg(help_behavior_hint="(default: as above)")] = False
+    """Fly over UDP, or in this process."""
     seed: int = 0
     """Seed of weights, actions and episodes."""
     num_simulators: int = 1

@@ -7,6 +7,7 @@ job comes back as a value. A job that fails comes back as a sentence, and the ot
 A worker of this machine ends with the process that started it, however that process ends.
 """
 
+import logging
 import os
 import signal
 from collections.abc import Callable, Iterator, Mapping
@@ -30,6 +31,7 @@ Tell = Callable[[int, int, str], None]
 _Job = TypeVar("_Job")
 _Value = TypeVar("_Value")
 
+_log = logging.getLogger(__name__)
 _CHILD_ENVIRONMENT = {
     "PYTHONSAFEPATH": "1",  # no file of the working directory takes the place of a package
     "OMP_NUM_THREADS": "1",  # a second thread makes small tensors slower
@@ -196,7 +198,11 @@ def _pass_on(progress: Connection, on_progress: OnProgress) -> None:
                 item = progress.recv()
             except (EOFError, OSError):  # the second: in the middle of an item
                 return
-            on_progress(*item)
+            try:
+                on_progress(*item)
+            except Exception as error:  # no line is worth a run
+                _log.warning("progress is not shown: %s", error)
+                on_progress = lambda *_: None  # noqa: E731
 
 
 # ---- in a worker

@@ -2,7 +2,7 @@
 
 Every component is a vector of its own, shape (W,), or a number that counts for all worlds, and a
 number 0.0 costs nothing: a craft whose rotors are parallel and whose center of mass is its origin
-needs a third of the operations of any craft. Vectors are NumPy's, or the variables of a C function
+needs a third of the operations of any craft. Vectors are NumPy's, or the variables of a trace
 (`kernel.py`).
 
 Frames: world, z up, and the body's. Position and velocity are those of the body's origin.

@@ -24,11 +24,10 @@ def flight(body: RigidBody, rotors: int, dtype: np.dtype[np.floating], *, wrench
     numbers = count()
     traced = copy.copy(body)
     traced.varying = mapped(body.varying, lambda _: trace.read("varying", next(numbers)))
-    rows, thrust, push = (
-        [trace.read(name, row) for row in range(number)]
-        for name, number in zip(_ARRAYS, (ROWS, rotors, 6 if wrench else 0), strict=False)
-    )
-    flown = traced.fly(rows, thrust, push or None)
+    rows = [trace.read("rows", row) for row in range(ROWS)]
+    thrust = [trace.read("thrust", row) for row in range(rotors)]
+    push = [trace.read("wrench", row) for row in range(6)] if wrench else None
+    flown = traced.fly(rows, thrust, push)
     function = compiled(trace, "rows", flown, _ARRAYS)
 
     def fly(rows: Array, thrust: Array, wrench: Array, varying: Array, steps: int) -> np.ndarray:

@@ -12,7 +12,7 @@ import numpy as np
 
 from ...models.errors import InputError
 from ...models.vehicle import Vehicle, craft_bodies, craft_geoms
-from ..compile import is_available
+from ..compile import trouble
 from ..effects import EffectOptions
 from ..randomize import Randomization
 from ..snapshots import Arrays
@@ -36,7 +36,7 @@ class RigidWorld(World):
 
     Args:
         dtype: `float32` or `float64`.
-        compiled: Fly by machine code (`sim/compile`). None: where llvmlite is installed.
+        compiled: Fly by machine code (`sim/compile`). None: where llvmlite can make it.
     """
 
     def __init__(
@@ -50,8 +50,13 @@ class RigidWorld(World):
         dtype: str = "float32",
         compiled: bool | None = None,
     ) -> None:
-        if compiled and not is_available():
-            raise InputError("compiled: expected false where llvmlite is not installed, got true")
+        reason = "" if compiled is False else trouble()
+        if compiled and reason:
+            raise InputError(
+                f"compiled: expected false where nothing compiles ({reason}), got true"
+            )
+        if reason:
+            _tell_once(reason)
         payload = 0.0 if effects is None else effects.payload
         if payload:
             expected = "none with the backend rigid, which has no cable: fly it with mujoco"
@@ -79,7 +84,7 @@ class RigidWorld(World):
         self._show(np.repeat(_LEVEL.astype(self.dtype)[:, None], num_worlds * drones, axis=1))
         self._varying: np.ndarray | None = None
         self._function: kernel.Fly | None = None
-        self._compiled = compiled is not False and (is_available() or _without_llvm())
+        self._compiled = compiled is not False and not reason
         self._vary(dict.fromkeys(self._drawn, np.ones(num_worlds * drones)))
         self._compile()
 
@@ -254,11 +259,8 @@ class RigidWorld(World):
 
 
 @cache
-def _without_llvm() -> bool:
-    """Tell it once."""
-    words = "rigid flies by NumPy, which is slower: llvmlite is not installed"
-    logging.getLogger(__name__).warning(words)
-    return False
+def _tell_once(reason: str) -> None:
+    logging.getLogger(__name__).warning("rigid flies by NumPy, which is slower: %s", reason)
 
 
 def _check_obstacles(vehicle: Vehicle) -> None:

@@ -5,7 +5,7 @@ the list as vector instructions and compiles them by `llvmlite`. The results hav
 NumPy gives: the operations are the same, in the same order, and none is fused with another.
 """
 
-from .llvm import compiled, is_available
+from .llvm import compiled, trouble
 from .tracer import Trace, TracedArray
 
-__all__ = ["Trace", "TracedArray", "compiled", "is_available"]
+__all__ = ["Trace", "TracedArray", "compiled", "trouble"]

@@ -1,6 +1,6 @@
 """A trace as a function of LLVM's vector instructions, compiled in this process by llvmlite.
 
-The function runs a trace again and again on rows of numbers: `fly(rows, …, count, steps)`. One loop
+The function, `fly(…, out, count, steps)`, runs a trace step by step on rows of numbers. One loop
 goes over the lanes of the rows, as many at a time as the processor's widest vectors have, then one
 by one over those that are left; within it another goes over the steps, in registers.
 """
@@ -12,11 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from ...models.errors import one_line
 from .tracer import Operation, Trace, TracedArray
 
 Function = Callable[..., None]
-"""Takes an array, or None, for each name, each with rows of `count` lanes one after the other; the
-array of results, and the number of steps."""
+"""Takes an array, or None, for each name; `out` for the results; and `steps`, one or more. All
+arrays are C-contiguous, of the trace's dtype and with rows of equally many lanes: not checked."""
 
 _CALLS = ("sqrt", "fabs", "rint", "floor")
 _KINDS = {4: ("float", "f32"), 8: ("double", "f64")}
@@ -61,16 +62,17 @@ def _llvm() -> Any:
 
     binding.initialize_native_target()
     binding.initialize_native_asmprinter()
+    binding.check_jit_execution()
     return binding
 
 
-def is_available() -> bool:
-    """Whether llvmlite is installed, and knows this processor."""
+def trouble() -> str:
+    """Why nothing can be compiled here: no llvmlite, or no memory that may be executed; or ""."""
     try:
         _llvm()
-    except (ImportError, OSError, RuntimeError):
-        return False
-    return True
+    except (ImportError, OSError, RuntimeError) as error:
+        return one_line(error)
+    return ""
 
 
 def compiled(
@@ -86,7 +88,7 @@ def compiled(
     """
     names = [one.name for one in results]
     text = _module(trace, state, names, arrays, _width(trace.dtype.itemsize))
-    call = _machine_code(text)
+    call = _machine_code(text, len(arrays) + 1)
 
     def fly(*given: np.ndarray | None, out: np.ndarray, steps: int) -> None:
         places = [None if array is None else array.ctypes.data for array in given]
@@ -110,7 +112,7 @@ def _module(
     wide = _Printer(trace, state, results, "wide", width)
     narrow = _Printer(trace, state, results, "narrow", 1)
     text = _FUNCTION.format(
-        arrays=", ".join(f"ptr %{name}" for name in arrays),
+        arrays=", ".join(f"ptr %in.{name}" for name in arrays),
         lanes=width,
         wide=wide.loop("0, %entry", "%whole", "test.narrow"),
         narrow=narrow.loop("%whole, %test.wide", "%count", "end"),
@@ -205,26 +207,26 @@ class _Printer:
         return [
             f"  {name}.start = mul i64 %count, {row}",
             f"  {name}.at = add i64 {name}.start, %i.{loop}",
-            f"  {name}.place = getelementptr {self._kind}, ptr %{array}, i64 {name}.at",
+            f"  {name}.place = getelementptr {self._kind}, ptr {array}, i64 {name}.at",
         ]
 
     def _load(self, name: str, array: str, row: str) -> list[str]:
         align = self._trace.dtype.itemsize
         load = f"  {name} = load {self._type}, ptr {name}.place, align {align}"
-        return [*self._place(name, array, row), load]
+        return [*self._place(name, f"%in.{array}", row), load]
 
     def _store(self, name: str, row: str, value: str) -> list[str]:
         align = self._trace.dtype.itemsize
         store = f"  store {self._type} {self._named(value)}, ptr {name}.place, align {align}"
-        return [*self._place(name, "out", row), store]
+        return [*self._place(name, "%out", row), store]
 
 
 # ---- machine code
 
 
 @lru_cache
-def _machine_code(text: str) -> Any:
-    """The function of a module's text, for this processor."""
+def _machine_code(text: str, arrays: int) -> Any:
+    """The function of a module's text, of so many arrays, for this processor."""
     binding = _llvm()
     features = binding.get_host_cpu_features().flatten()
     machine = binding.Target.from_default_triple().create_target_machine(
@@ -238,7 +240,7 @@ def _machine_code(text: str) -> Any:
     builder.getModulePassManager().run(module, builder)
     engine = binding.create_mcjit_compiler(module, machine)
     engine.finalize_object()
-    pointers = [ctypes.c_void_p] * (text.partition("(")[2].partition(")")[0].count("ptr"))
+    pointers = [ctypes.c_void_p] * arrays
     kind = ctypes.CFUNCTYPE(None, *pointers, ctypes.c_int64, ctypes.c_int64)
     call = kind(engine.get_function_address("fly"))
     call.engine = engine  # type: ignore[attr-defined]  # it owns the machine code

@@ -51,3 +51,29 @@ def test_who_flies_in_this_process(
     assert (HERE in out) is here
     assert ("wire: " in out) is not here
     assert Path("flight.mcap").exists() == ("--record" in words)
+
+
+@pytest.mark.parametrize("flags", [("--record", "a.mcap"), ("--listen", "127.0.0.1:0")])
+def test_flags_of_the_wire_are_refused_in_this_process(
+    flags: tuple[str, str], tmp_path: Path, capsys: Capsys
+) -> None:
+    assert main(["train", "a2c", "--no-udp", *flags, "--out", str(tmp_path / "run")]) == 1
+    err = capsys.readouterr().err
+    assert err == f"rotorgram: udp: expected --no-udp without flags of the wire, got {flags[0]}\n"
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("way", ["--udp", "--no-udp"])
+def test_a_training_goes_on_with_the_settings_of_its_backend(
+    way: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capsys
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    content = 'backend = {name = "rigid", dtype = "float64"}\nepisode_length = 30\n'
+    Path("drone.toml").write_text(content)
+    words = ("a2c", "--config", "drone.toml", way, "--set", "steps_per_update=100", "--out", "run")
+    trained(capsys, *words, "--env-steps", 230)
+    trained(capsys, "a2c", "--resume", "run", "--env-steps", 400, way)
+    kept = load(Path("run/checkpoint.safetensors"))
+    assert kept.position.env_steps == 400
+    assert kept.env is not None
+    assert kept.env.backend.dtype == "float64"

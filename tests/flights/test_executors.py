@@ -85,8 +85,21 @@ def test_a_worker_that_ends_while_it_reports_stops_nobody() -> None:
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt), open_executor(WorkersConfig(jobs=2), 2) as executor:
-        run_jobs(executor, reports, {"one": 2.0, "two": 600.0}, interrupt, silent)
+    jobs = {"one": 2.0, "two": 600.0, "three": 600.0, "four": 600.0}
+    with pytest.raises(KeyboardInterrupt), open_executor(WorkersConfig(jobs=4), 4) as executor:
+        run_jobs(executor, reports, jobs, interrupt, silent)
+
+
+def test_progress_that_fails_costs_no_result(caplog: pytest.LogCaptureFixture) -> None:
+    kept: dict[int, float] = {}
+
+    def fail(*_: object) -> None:
+        raise ValueError("no room for a bar")
+
+    with open_executor(WorkersConfig(jobs=2), 2, fail) as executor:
+        run_jobs(executor, half, {"two": 2, "four": 4}, kept.__setitem__, silent)
+    assert kept == {2: 1.0, 4: 2.0}
+    assert caplog.messages[:1] == ["progress is not shown: no room for a bar"]
 
 
 def test_no_file_of_the_working_directory_is_run(

@@ -11,6 +11,8 @@ KINDS = (np.float32, np.float64)
 COUNTS = (1, 2, 15, 16, 17, 200)
 ODD = (0.0, -0.0, 0.5, -0.5, 1.5, 2.5, -2.5, np.inf, -np.inf, np.nan, 1e-40, 3e38, -7.0, 7.0)
 
+STATE = ("state", "given")
+
 Code = Callable[[Any, Any], Any]
 ONE: dict[str, Code] = {
     "add": lambda x, y: x + y,
@@ -23,6 +25,7 @@ ONE: dict[str, Code] = {
     "rint": lambda x, y: np.rint(x) * y,
     "floor": lambda x, y: np.floor(x),
     "minimum": lambda x, y: np.minimum(x, y),
+    "minimum of a number": lambda x, y: np.minimum(2.0, x),
     "where": lambda x, y: np.where((x == 0.5) | (x >= y), x, -1.0),
     "greater": lambda x, y: np.where(x > y, 2.0, y),
     "a sum of products is not fused": lambda x, y: x * y + x * 1.1 + y,
@@ -32,7 +35,7 @@ ONE: dict[str, Code] = {
 def traced(code: Code, dtype: Any) -> Any:
     trace = Trace(np.dtype(dtype))
     x, y = trace.read("state", 0), trace.read("given", 0)
-    return compiled(trace, "state", [code(x, y)], ("state", "given"))
+    return compiled(trace, "state", [code(x, y)], STATE)
 
 
 def same(found: np.ndarray, expected: np.ndarray) -> bool:
@@ -74,6 +77,36 @@ def test_steps_follow_each_other(dtype: Any) -> None:
     for _ in range(100):
         expected = swing(expected, y)
     assert out.tobytes() == expected.tobytes()
+
+
+def test_each_step_reads_all_rows_of_the_last_one() -> None:
+    trace = Trace(np.dtype(np.float32))
+    a, b, c = (trace.read("state", row) for row in range(3))
+    function = compiled(trace, "state", [b, a, trace.read("given", 0) * np.inf + c], STATE)
+    state = np.arange(60, dtype=np.float32).reshape(3, 20)
+    out = np.empty_like(state)
+    given = np.zeros((1, 20), np.float32)
+    function(state, given, out=out, steps=3)
+    assert out[:2].tobytes() == state[1::-1].tobytes()
+    assert np.isnan(out[2]).all()
+
+
+def test_what_has_no_code_is_refused() -> None:
+    trace = Trace(np.dtype(np.float64))
+    x, y = trace.read("state", 0), trace.read("given", 0)
+    other = Trace(np.dtype(np.float64)).read("state", 0)
+    attempts: list[tuple[Callable[[], object], str]] = [
+        (lambda: x if x > 2.0 else y, "expected np.where, got a branch"),
+        (lambda: np.add.outer(x, y), "got add.outer"),
+        (lambda: np.add.reduce(x), "got add.reduce"),
+        (lambda: x - (x > y), "expected a number, got a flag"),
+        (lambda: (x > y) | 1.0, "expected a number, got a flag, or the reverse"),
+        (lambda: np.where(x, x, y), "or the reverse"),
+        (lambda: x + other, "expected values of one trace"),
+    ]
+    for attempt, sentence in attempts:
+        with pytest.raises(TypeError, match=sentence):
+            attempt()
 
 
 def test_the_same_operation_is_there_once() -> None:
