@@ -98,7 +98,7 @@ def test_compiled_and_numpy_fly_the_same_bits(name: str, dtype: str) -> None:
     vehicle = Vehicle.load(FILES[name], linear_drag=0.2)
     drawn = {"mass": "uniform(0.8, 1.2)", "center_x": "uniform(0, 0.01)"}
     mass = Randomization(drawn, None)
-    compiled = arrays(vehicle, dtype=dtype, randomize=mass)
+    compiled = arrays(vehicle, dtype=dtype, randomize=mass, compiled=True)
     plain = arrays(vehicle, dtype=dtype, randomize=mass, compiled=False)
     dice = np.random.default_rng(0)
     pose = tumbling(dice)
