@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 PACKAGES := models scenes sim envs udp agents rendering flights training cli
-# Hundreds of short programs are started, each twice as fast with the byte code of the one before.
+# The tests start hundreds of short programs: byte code that is kept makes each start faster.
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: install demo test test-other-processor test-wheel test-libraries lint types links docs clean

@@ -112,14 +112,13 @@ def _opened(
     command: "Train", num_envs: int, backend: Backend | BackendConfig, *, required: bool = True
 ) -> AbstractContextManager[AdvancingVectorEnv]:
     """The env of a training, in this process or over UDP."""
-    by_wire = command.algorithm in _OF_THE_PAPER and command.env_id == DEFAULT_ENV
-    if "udp" in command.given:
-        by_wire = command.udp
+    of_paper = command.algorithm in _OF_THE_PAPER and command.env_id == DEFAULT_ENV
     implied = sorted(command.given.intersection(_IMPLY_UDP))
-    if implied and "udp" in command.given and not command.udp:
+    by_wire = command.udp if "udp" in command.given else of_paper or bool(implied)
+    if implied and not by_wire:
         got = ", ".join("--" + name.replace("_", "-") for name in implied)
         raise InputError(f"udp: expected --no-udp without flags of the wire, got {got}")
-    if by_wire or implied:
+    if by_wire:
         return remote_env(
             command,
             required=required,

@@ -177,8 +177,10 @@ class Offscreen:
 
 
 def _free(gl: Any, context: "mujoco.MjrContext") -> None:
-    """By itself MuJoCo's context frees the objects of those numbers in the OpenGL that is current,
-    which may be another one where Python collects garbage.
+    """Free both while this OpenGL is current.
+
+    MuJoCo's context frees objects by their numbers, in whatever OpenGL is current. Where Python
+    collects garbage, that may be another one.
     """
     if _state["forked"]:  # it is the other process's
         return

@@ -4,7 +4,7 @@ The definitions are those of Agarwal et al., "Deep Reinforcement Learning at the
 Statistical Precipice" (NeurIPS 2021, arXiv 2108.13264), computed by SciPy. A bootstrap resamples
 the runs of an agent, always in the same way. Missing values (nan) are left out.
 
-SciPy is imported where it computes: its import takes longer than a short training.
+SciPy is imported where it computes: workers, which fly and do not compare, start without it.
 """
 
 import math

@@ -310,8 +310,11 @@ def test_a_training_that_writes_nothing_leaves_the_name_of_its_folder_free(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_key_on_a_full_disk(capsys: Capsys) -> None:
-    refused(capsys, "key", "/dev/full")
+def test_a_key_replaces_no_device(capsys: Capsys) -> None:
+    err = refused(capsys, "key", "/dev/full")
+    assert err.endswith(
+        "/dev/full: expected a new file, got one that is there; a key is never replaced\n"
+    )
 
 
 def test_curves_go_on_after_the_clock_went_back(

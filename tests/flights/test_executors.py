@@ -98,6 +98,9 @@ def test_progress_that_fails_costs_no_result(caplog: pytest.LogCaptureFixture) -
 
     with open_executor(WorkersConfig(jobs=2), 2, fail) as executor:
         run_jobs(executor, half, {"two": 2, "four": 4}, kept.__setitem__, silent)
+        deadline = time.monotonic() + 5
+        while not caplog.messages and time.monotonic() < deadline:
+            time.sleep(0.01)
     assert kept == {2: 1.0, 4: 2.0}
     assert caplog.messages[:1] == ["progress is not shown: no room for a bar"]
 
