@@ -5,6 +5,7 @@ Knows nothing of tasks, rewards or Gymnasium.
 
 from .control import LEVELS, CollectiveThrust, Controller, Gains, make_controller
 from .effects import EffectOptions
+from .elementary import atan2, cos, exp, log, power, sin, wrapped
 from .random import Draw
 from .randomize import PARAMETERS, Randomization
 from .rotations import body_x, body_z, to_body, world_z
@@ -15,9 +16,14 @@ from .state import (
     clip,
     component,
     each,
+    floor,
+    length,
+    looked_up,
     plain,
+    remainder,
     square_root,
     stack,
+    total,
 )  # fmt: skip
 from .world import PhysicsError, World, make_world
 
@@ -35,16 +41,28 @@ __all__ = [
     "Randomization",
     "World",
     "WorldState",
+    "atan2",
     "body_x",
     "body_z",
     "clip",
     "component",
+    "cos",
     "each",
+    "exp",
+    "floor",
+    "length",
+    "log",
+    "looked_up",
     "make_controller",
     "make_world",
     "plain",
+    "power",
+    "remainder",
+    "sin",
     "square_root",
     "stack",
     "to_body",
+    "total",
     "world_z",
+    "wrapped",
 ]  # fmt: skip

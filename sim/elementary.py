@@ -1,83 +1,308 @@
-"""Elementary functions from + - * / rint floor frexp and where: the same bits on every processor.
+"""Elementary functions from + - * /, sqrt, rint, floor, frexp and where: the same bits everywhere.
 
-Each works in the precision of its argument, float32 or float64. Series are Taylor's where no source
-is named.
+NumPy's and C's differ in their last bits between processors. These work in the precision of their
+arguments, float32 or float64, and give numbers for numbers. Errors are in units in the last place
+(ulp) of the exact value; NaN gives NaN. Series are Taylor's where no source is named.
 """
 
+import math
+from collections.abc import Callable
 from math import factorial
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Real = NDArray[np.floating]
+from .state import Array, floor
 
 _TURN = 0.6366197723675814  # 2 / π
 _SQRT_HALF = 0.7071067811865476
-_SINGLE = np.dtype(np.float32)
-# By whether the precision is single, a number as a sum of floats: all but the last have few bits,
-# 10 and 32 of π / 2, 14 and 40 of log(2), so that their products with whole numbers are exact.
-_HALF_PI = {
-    True: (1.5703125, 0.00048351287841796875, 3.1385570764541626e-07, 6.077100506506192e-11),
-    False: (1.5707963267341256, 6.077100506303966e-11, 2.0222662487959506e-21),
-}
-_LOG2_PARTS = {
-    True: (0.693115234375, 3.1946184945309415e-05),
-    False: (0.6931471805592082, 7.371002565167799e-13),
-}
+_EIGHTH = 0.41421356237309503  # tan(π / 8)
+_INFINITY = math.inf
+_NAN = math.nan
+_ROUNDING = 2.0**52  # Added to a smaller number of float64, it leaves no bit for its fraction
 
 
-def polynomial(x: Real, coefficients: list[float]) -> Real:
+class _Functions(NamedTuple):
+    """What arrays and numbers need different functions for."""
+
+    rint: Callable[[Any], Any]
+    where: Callable[[Any, Any, Any], Any]
+    copysign: Callable[[Any, Any], Any]
+    split: Callable[[Any], tuple[Any, Any]]
+    """A fraction from 1/2 to 1 and a power of 2, whose product is the number."""
+    scaled: Callable[[Any, Any], Any]
+    """A number times a power of 2."""
+
+
+def _split(x: Array) -> tuple[Array, Array]:
+    fraction, power = np.frexp(x)
+    return fraction, power.astype(x.dtype)
+
+
+def _scaled(x: Array, power: Array) -> Array:
+    return np.ldexp(x, power.astype(np.int32))
+
+
+def _rint_of_number(x: float) -> float:
+    return math.copysign((abs(x) + _ROUNDING) - _ROUNDING, x)
+
+
+def _where_of_numbers(flag: bool, yes: float, no: float) -> float:
+    return yes if flag else no
+
+
+def _scaled_number(x: float, power: float) -> float:
+    return math.ldexp(x, int(power))
+
+
+_ARRAYS = _Functions(np.rint, np.where, np.copysign, _split, _scaled)
+_NUMBERS = _Functions(_rint_of_number, _where_of_numbers, math.copysign, math.frexp, _scaled_number)
+
+
+class _Precision(NamedTuple):
+    """Constants of a precision. Polynomials have the highest power first.
+
+    A number is a sum of floats: all but the last have few bits, 10 and 32 of π / 2, 14 and 40 of
+    log(2), so that their products with whole numbers are exact.
+    """
+
+    half_pi: tuple[float, ...]
+    furthest: float
+    """Largest angle of sines: up to here the products with π / 2 are exact."""
+    sine: tuple[float, ...]
+    cosine: tuple[float, ...]
+    log2: tuple[float, float]
+    low: float
+    """Bounds of the exponential function's argument."""
+    high: float
+    exponential: tuple[float, ...]
+    least: float
+    """Least normal number."""
+    logarithm: tuple[float, ...]
+    arc: tuple[float, ...]
+    """Of the arc tangent up to tan(π / 8): Cephes (S. Moshier), atan.c and atanf.c."""
+    arc_below: tuple[float, ...]
+    """Polynomial by which that one is divided, if any."""
+    half_turn: tuple[float, float]
+    """π as a sum."""
+
+
+def _precision(sines: int, powers: int, logs: int, **constants: Any) -> _Precision:
+    """With so many terms in each series."""
+    odd = [(-1) ** n / factorial(2 * n + 1) for n in range(1, sines)]
+    even = [(-1) ** n / factorial(2 * n) for n in range(2, sines + 1)]
+    return _Precision(
+        sine=tuple(odd[::-1]),
+        cosine=tuple(even[::-1]),
+        exponential=tuple([1.0 / factorial(n) for n in range(2, powers)][::-1]),
+        logarithm=tuple([2.0 / (2 * n + 1) for n in range(1, logs)][::-1]),
+        **constants,
+    )
+
+
+_SINGLE = _precision(
+    5,
+    8,
+    6,
+    half_pi=(1.5703125, 0.00048351287841796875, 3.1385570764541626e-07, 6.077100506506192e-11),
+    furthest=2e4,
+    log2=(0.693115234375, 3.1946184945309415e-05),
+    low=-87.0,
+    high=88.0,
+    least=2.0**-126,
+    arc=(8.05374449538e-2, -1.38776856032e-1, 1.99777106478e-1, -3.33329491539e-1),
+    arc_below=(),
+    half_turn=(3.1415927410125732, -8.742278000372485e-08),
+)
+_DOUBLE = _precision(
+    9,
+    14,
+    13,
+    half_pi=(1.5707963267341256, 6.077100506303966e-11, 2.0222662487959506e-21),
+    furthest=3e6,
+    log2=(0.6931471805592082, 7.371002565167799e-13),
+    low=-708.0,
+    high=709.0,
+    least=2.0**-1022,
+    arc=(
+        -8.750608600031904122785e-1,
+        -1.615753718733365076637e1,
+        -7.500855792314704667340e1,
+        -1.228866684490136173410e2,
+        -6.485021904942025371773e1,
+    ),
+    arc_below=(
+        1.0,
+        2.485846490142306297962e1,
+        1.650270098316988542046e2,
+        4.328810604912902668951e2,
+        4.853903996359136964868e2,
+        1.945506571482613964425e2,
+    ),
+    half_turn=(3.141592653589793, 1.2246467991473532e-16),
+)
+
+
+def _prepared(*values: Array) -> tuple[Any, ...]:
+    """Functions, constants, and the values: numbers as Python's."""
+    for value in values:
+        if not isinstance(value, float | int):
+            is_single = value.dtype == np.float32
+            return _ARRAYS, _SINGLE if is_single else _DOUBLE, *values
+    return _NUMBERS, _DOUBLE, *map(float, values)
+
+
+def polynomial(x: Array, coefficients: tuple[float, ...]) -> Array:
     """A polynomial by Horner's rule, the highest power of at least one first."""
-    highest, *rest = coefficients
-    result = x * highest + rest[0]
-    for coefficient in rest[1:]:
+    result = x * coefficients[0] + coefficients[1]
+    for coefficient in coefficients[2:]:
         result = result * x + coefficient
     return result
 
 
-def sin(x: Real) -> Real:
-    """Sine of an angle, rad; right for |x| up to 1e4."""
+# ---- of angles
+
+
+def sin(x: Array) -> Array:
+    """Sine of an angle, rad, within 2.5 ulp; NaN beyond 3e6, of float32 beyond 2e4."""
     return _wave(x, 0.0)
 
 
-def cos(x: Real) -> Real:
-    """Cosine of an angle, rad; right for |x| up to 1e4."""
+def cos(x: Array) -> Array:
+    """Cosine of an angle, as `sin`."""
     return _wave(x, 1.0)
 
 
-def _wave(x: Real, quarters: float) -> Real:
-    """Sine of x plus `quarters` quarter turns: reduction by Cody and Waite, then a series."""
-    is_single = x.dtype == _SINGLE
-    near = np.rint(x * _TURN)
-    rest = x
-    for part in _HALF_PI[is_single]:
-        rest = rest - near * part
+def _wave(x: Array, quarters: float) -> Array:
+    """Sine of x plus `quarters` quarter turns."""
+    f, p, x = _prepared(x)
+    near = f.rint(x * _TURN)
+    rest = _without(f, p, x, near)
     quarter = near + quarters
-    quarter = quarter - 4.0 * np.floor(quarter * 0.25)
+    quarter = quarter - 4.0 * floor(quarter * 0.25)
     square = rest * rest
-    terms = 5 if is_single else 9
-    odd = [(-1) ** n / factorial(2 * n + 1) for n in range(1, terms)]
-    even = [(-1) ** n / factorial(2 * n) for n in range(2, terms + 1)]
-    sine = rest + rest * (square * polynomial(square, odd[::-1]))
-    cosine = 1.0 - (0.5 * square - square * (square * polynomial(square, even[::-1])))
+    sine = rest + rest * (square * polynomial(square, p.sine))
+    cosine = 1.0 - (0.5 * square - square * (square * polynomial(square, p.cosine)))
     is_cosine = (quarter == 1.0) | (quarter == 3.0)
-    value = np.where(is_cosine, cosine, sine)
-    return np.where(quarter >= 2.0, -value, value)
+    value = f.where(is_cosine, cosine, sine)
+    return f.where(quarter >= 2.0, -value, value)
 
 
-def log(x: Real) -> Real:
-    """Natural logarithm of finite numbers above 0. As fdlibm's e_log.c."""
-    is_single = x.dtype == _SINGLE
-    fraction, exponent = np.frexp(x)
+def wrapped(x: Array) -> Array:
+    """The angle between -π and π, rad, that differs from x by whole turns; NaN as of `sin`."""
+    f, p, x = _prepared(x)
+    return _without(f, p, x, 4.0 * f.rint(x * (0.25 * _TURN)))
+
+
+def _without(f: _Functions, p: _Precision, x: Array, quarters: Array) -> Array:
+    """An angle less so many quarter turns: reduction by Cody and Waite."""
+    x = f.where(abs(x) < p.furthest, x, _NAN)
+    for part in p.half_pi:
+        x = x - quarters * part
+    return x
+
+
+def atan2(y: Array, x: Array) -> Array:
+    """Angle of the point (x, y), rad, within 2.5 ulp, for sizes below 1e37; zeros as in C."""
+    f, p, y, x = _prepared(y, x)
+    across = abs(x)
+    up = abs(y)
+    is_steep = up > across
+    large = f.where(is_steep, up, across)
+    small = f.where(is_steep, across, up)
+    large = f.where(large == 0.0, 1.0, large)
+    is_far = small > _EIGHTH * large
+    above = f.where(is_far, small - large, small)
+    ratio = above / f.where(is_far, small + large, large)
+    square = ratio * ratio
+    series = polynomial(square, p.arc)
+    if p.arc_below:
+        series = series / polynomial(square, p.arc_below)
+    angle = ratio + ratio * (square * series)
+    high, low = p.half_turn
+    angle = f.where(is_far, 0.25 * high + (angle + 0.25 * low), angle)
+    angle = f.where(is_steep, 0.5 * high + (0.5 * low - angle), angle)
+    is_behind = f.copysign(1.0, x) < 0.0
+    angle = f.where(is_behind, high + (low - angle), angle)
+    return f.copysign(angle, y)
+
+
+# ---- exponentials
+
+
+def exp(x: Array) -> Array:
+    """Exponential function, within 2.5 ulp.
+
+    0 below -708 and infinite above 709, of float32 below -87 and above 88.
+    """
+    f, p, x = _prepared(x)
+    rest, power = _reduced(f, p, x)
+    value = f.scaled(1.0 + rest, power)
+    value = f.where(x < p.low, 0.0, value)
+    return _ended(f, p, x, value)
+
+
+def expm1(x: Array) -> Array:
+    """exp(x) - 1, within 2.5 ulp; infinite where `exp` is."""
+    f, p, x = _prepared(x)
+    rest, power = _reduced(f, p, x)
+    scale = f.scaled(1.0 + 0.0 * rest, power)
+    return _ended(f, p, x, scale * rest + (scale - 1.0))
+
+
+def _reduced(f: _Functions, p: _Precision, x: Array) -> tuple[Array, Array]:
+    """A number r and a power n of 2: exp(x) = (1 + r) 2ⁿ."""
+    inside = f.where(x > p.low, x, p.low)
+    inside = f.where(inside < p.high, inside, p.high)
+    power = f.rint(inside * 1.4426950408889634)
+    high, low = p.log2
+    rest = (inside - power * high) - power * low
+    return rest + rest * rest * polynomial(rest, p.exponential), power
+
+
+def _ended(f: _Functions, p: _Precision, x: Array, value: Array) -> Array:
+    """A value that grows with x, beyond the range too."""
+    value = f.where(x > p.high, _INFINITY, value)
+    return f.where(x == x, value, x)
+
+
+def log(x: Array) -> Array:
+    """Natural logarithm, within 2.5 ulp, as fdlibm's e_log.c.
+
+    -infinity of 0 and of numbers below the normal ones, NaN of negative ones.
+    """
+    f, p, x = _prepared(x)
+    fraction, power = f.split(abs(x))
     is_low = fraction < _SQRT_HALF
-    fraction = np.where(is_low, fraction + fraction, fraction)
-    power = exponent.astype(x.dtype) - is_low
-    f = fraction - 1.0
-    s = f / (2.0 + f)
-    z = s * s
-    terms = 6 if is_single else 13
-    series = [2.0 / (2 * n + 1) for n in range(1, terms)]
-    rest = z * polynomial(z, series[::-1])
-    half = 0.5 * f * f
-    upper, lower = _LOG2_PARTS[is_single]
-    return power * upper - ((half - (s * (half + rest) + power * lower)) - f)
+    fraction = f.where(is_low, fraction + fraction, fraction)
+    power = f.where(is_low, power - 1.0, power)
+    above = fraction - 1.0
+    s = above / (2.0 + above)
+    square = s * s
+    rest = square * polynomial(square, p.logarithm)
+    half = 0.5 * above * above
+    high, low = p.log2
+    value = power * high - ((half - (s * (half + rest) + power * low)) - above)
+    value = f.where(x < p.least, -_INFINITY, value)
+    value = f.where(x < _INFINITY, value, x)
+    return f.where(x < 0.0, _NAN, value)
+
+
+def power(x: Array, y: Array) -> Array:
+    """x to the power y, for normal numbers x > 0, within 1 + 3 |y log x| ulp."""
+    return exp(y * log(x))
+
+
+# ---- of matrices
+
+
+def inverse(matrix: np.ndarray) -> np.ndarray:
+    """Inverse of positive definite matrices, shape (..., n, n), by Gauss and Jordan."""
+    count = matrix.shape[-1]
+    unit = np.broadcast_to(np.eye(count), matrix.shape)
+    rows = np.concat((matrix, unit), axis=-1)
+    for i in range(count):
+        row = rows[..., i, :] / rows[..., i, i, None]
+        rows = rows - rows[..., :, i, None] * row[..., None, :]
+        rows[..., i, :] = row
+    return rows[..., count:]

@@ -15,6 +15,7 @@ from ..models.errors import InputError, shortened
 from ..models.fields import check_names
 from ..models.files import read_toml
 from .effects import EffectOptions
+from .elementary import exp, log
 from .random import Draw
 from .state import ByName, clip
 
@@ -96,13 +97,12 @@ class Randomization:
             if kind == "normal":
                 values = numbers[0] + draw.normal(numbers[1])
             elif kind == "loguniform":
-                low, high = np.log(numbers)
-                values = np.exp(draw.uniform(float(low), float(high)))
+                values = exp(draw.uniform(log(numbers[0]), log(numbers[1])))
             else:
                 spare = 0.5 if name in WHOLE else 0.0  # what is rounded to the ends
                 values = clip(draw.uniform(numbers[0] - spare, numbers[1] + spare), *numbers)
             values = clip(values, limits.low, limits.high)
-            drawn[name] = np.round(values) if name in WHOLE else values
+            drawn[name] = np.rint(values) if name in WHOLE else values
         return drawn
 
 

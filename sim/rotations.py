@@ -6,9 +6,8 @@ take arrays with the components on their last axis, and any leading axes.
 
 from collections.abc import Sequence
 
-import numpy as np
-
-from .state import Array, stack
+from .elementary import atan2, cos, sin
+from .state import Array, square_root, stack
 
 Parts = Sequence[Array]
 Rows = tuple[Parts, Parts, Parts]
@@ -119,9 +118,10 @@ def world_z(quaternion: Array) -> Array:
 def euler(quaternion: Array) -> tuple[Array, Array, Array]:
     """Angles about x, y and z of R = Rz(yaw) Ry(pitch) Rx(roll), rad, shape (...)."""
     w, x, y, z = parts_of(quaternion)
-    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    pitch = np.arcsin(np.clip(2 * (w * y - x * z), -1.0, 1.0))
-    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    roll = atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    sine = 2 * (w * y - x * z)
+    pitch = atan2(sine, square_root((1 - sine) * (1 + sine)))
+    yaw = atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     return roll, pitch, yaw
 
 
@@ -139,9 +139,9 @@ def between(a: Array, b: Array) -> Array:
 def advanced(quaternion: Array, angle: Array) -> Array:
     """Attitudes turned by rotation vectors in the body frame, rad, shape (..., 3); normalised."""
     x, y, z = (0.5 * part for part in parts_of(angle))
-    half = np.sqrt(x * x + y * y + z * z)
-    share = np.sin(half) / (half + 1e-30)  # 1 or 0 where nothing turns: x, y, z are 0 then
-    turn = (np.cos(half), share * x, share * y, share * z)
+    half = square_root(x * x + y * y + z * z)
+    share = sin(half) / (half + 1e-30)  # 1 or 0 where nothing turns: x, y, z are 0 then
+    turn = (cos(half), share * x, share * y, share * z)
     w, x, y, z = product(parts_of(quaternion), turn)
-    size = np.sqrt(w * w + x * x + y * y + z * z)
+    size = square_root(w * w + x * x + y * y + z * z)
     return stack((w / size, x / size, y / size, z / size))

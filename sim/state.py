@@ -128,8 +128,48 @@ def plain(array: Array) -> Array:
 def square_root(array: Array) -> Array:
     """Square root; 0 of a number below 0, which rounding may leave."""
     if isinstance(array, float):
-        return math.sqrt(array) if array > 0.0 else 0.0
+        return 0.0 if array <= 0.0 else math.sqrt(array)
     return np.sqrt(np.maximum(array, 0.0))
+
+
+def floor(array: Array) -> Array:
+    """The next whole number below, a float."""
+    return array // 1.0 if isinstance(array, float) else np.floor(array)
+
+
+def remainder(index: Array, count: float) -> Array:
+    """What is left of whole numbers, floats, when they are divided by one."""
+    return index - count * floor(index / count)
+
+
+def total(values: Array) -> Array:
+    """Sum over the last axis, from its first number to its last: the same bits alone, in a batch
+    and compiled, which NumPy's sums do not have.
+    """
+    result = component(values, 0)
+    for index in range(1, values.shape[-1]):
+        result = result + component(values, index)
+    return result
+
+
+def length(vectors: Array) -> Array:
+    """Sizes of vectors, shape (..., k)."""
+    return square_root(total(vectors * vectors))
+
+
+def looked_up(table: np.ndarray, index: Array) -> Array:
+    """Rows of a constant table, (rows, ...), at whole numbers, floats; the last ones beyond it."""
+    index = clip(index, 0.0, len(table) - 1.0)
+    if isinstance(index, float):
+        return plain(table[int(index)])
+    return table[index.astype(int)]
+
+
+def interpolated(table: np.ndarray, index: Array) -> Array:
+    """Numbers of a constant table, (rows,), between whole numbers on straight lines."""
+    before = floor(index)
+    low = looked_up(table, before)
+    return low + (looked_up(table, before + 1.0) - low) * (index - before)
 
 
 def stack(parts: Sequence[Array]) -> Array:

@@ -4,9 +4,9 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ...sim import length
 from ...sim.random import RADIO, uniform, words_of
 from ..state import State
-from ..tasks.goal import length
 from ..tasks.swarm import SwarmOptions
 from .history import filled, pushed
 from .record import Floats, Mask, Record, Stage

@@ -8,7 +8,9 @@ import numpy as np
 
 from ...models.errors import InputError
 from ...models.fields import Limits
-from ...sim import Array, Draw, InitialState, stack
+from ...sim import Array, Draw, InitialState, atan2, cos, length, sin, stack, total
+from ...sim.control.gains import allocated
+from ...sim.rotations import cross
 from ..config import EnvConfig
 from ..spec import Metric
 from ..state import State
@@ -18,7 +20,6 @@ from .goal import (
     Share,
     along,
     check_height,
-    length,
     nearness,
     swing_cost,
     with_payload,
@@ -100,13 +101,15 @@ class Cable(Swarm):
                 f"vehicle: expected one for all drones that carry a payload, got {vehicle.name}"
             )
         self._slant = math.radians(options.angle)
-        self._ring = float(np.linalg.norm(ring(count)[0])) * self.gap
+        self._ring = length(ring(count)[0]) * self.gap
         self._azimuths = 2 * math.pi * np.arange(count) / count
-        self._height = self._ring / math.tan(self._slant)
-        self._cable = self._ring / math.sin(self._slant)
+        self._cable = self._ring / sin(self._slant)
+        self._height = self._cable * cos(self._slant)
         self._load = options.payload_share * vehicle.mass * vehicle.gravity
         lift = vehicle.mass * vehicle.gravity + self._load
-        self._tilt = math.atan2(self._load * math.tan(self._slant), lift)
+        self._inwards = self._load * sin(self._slant) / cos(self._slant)
+        self._tilt = atan2(self._inwards, lift)
+        self._allocated = allocated(vehicle)
         thrust = self.carrying(np.linspace(0.0, 2 * math.pi, 36))
         able = (vehicle.thrust_low <= thrust).all() and (thrust <= vehicle.thrust_high).all()
         if not able:
@@ -136,18 +139,19 @@ class Cable(Swarm):
         vehicle = self.vehicle
         load = self._load
         # The pull in the frame of a drone that is tilted outwards; its height and its way inwards.
-        inwards = load * math.tan(self._slant)
-        c = math.cos(self._tilt)
-        s = math.sin(self._tilt)
+        inwards = self._inwards
+        c = cos(self._tilt)
+        s = sin(self._tilt)
         along = s * load - c * inwards
         down = -s * inwards - c * load
-        pull = stack((along * np.cos(azimuth), along * np.sin(azimuth), down))
-        force = np.full(azimuth.shape, math.hypot(inwards, load + vehicle.mass * vehicle.gravity))
-        torque = np.cross(vehicle.center_of_mass, pull)
-        even = force[..., None] * (vehicle.hover_thrust / (vehicle.mass * vehicle.gravity))
-        wanted = np.concatenate((force[..., None], torque), axis=-1)
-        missing = wanted - even @ vehicle.allocation.T
-        thrust: np.ndarray = even + missing @ np.linalg.pinv(vehicle.allocation).T
+        pull = (along * cos(azimuth), along * sin(azimuth), down)
+        weight = vehicle.mass * vehicle.gravity
+        lift = load + weight
+        force = math.sqrt(inwards * inwards + lift * lift)
+        even = force * (vehicle.hover_thrust / weight)
+        wanted = stack((force, *cross(vehicle.center_of_mass.tolist(), pull)))
+        missing = wanted - total(vehicle.allocation * even)
+        thrust: np.ndarray = even + total(self._allocated * missing[..., None, :])
         return thrust
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:
@@ -157,12 +161,12 @@ class Cable(Swarm):
         ball = np.array(self.options.center) + shared(draw.uniform(-away, away, (3,)))
         azimuth = turn + self._azimuths
         half = self._tilt / 2
-        sine = math.sin(half)
+        sine = sin(half)
         zero = 0.0 * azimuth
-        cosine = math.cos(half) + zero
+        cosine = cos(half) + zero
         return InitialState(
             position=ball + self._around(turn),
-            quaternion=stack((cosine, -sine * np.sin(azimuth), sine * np.cos(azimuth), zero)),
+            quaternion=stack((cosine, -sine * sin(azimuth), sine * cos(azimuth), zero)),
             thrust=self.carrying(azimuth),
             payload=ball,
         )
@@ -170,8 +174,8 @@ class Cable(Swarm):
     def _around(self, turn: Array) -> Array:
         """Places of the drones from the payload, on the ring turned by an angle, (W, A, 3), m."""
         azimuth = turn + self._azimuths
-        x = self._ring * np.cos(azimuth)
-        y = self._ring * np.sin(azimuth)
+        x = self._ring * cos(azimuth)
+        y = self._ring * sin(azimuth)
         return stack((x, y, 0.0 * x + self._height))
 
     def goal(self, state: State) -> Array:

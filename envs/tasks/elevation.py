@@ -185,7 +185,8 @@ class Elevation(Task):
         a = self.vehicle.max_acceleration
         period = self.control_period
         out = math.sqrt(4 * a * self.options.flight_band)
-        return float(math.hypot(a * period / 2, out) + a * period)
+        change = a * period / 2
+        return math.sqrt(change * change + out * out) + a * period
 
     @property
     def error_bound(self) -> float:

@@ -15,6 +15,10 @@ from ...sim import (
     body_z,
     clip,
     component,
+    cos,
+    length,
+    looked_up,
+    sin,
     stack,
     to_body,
     world_z,
@@ -201,8 +205,8 @@ class GoalTask(Task):
         """World vectors in the world frame turned by the wanted heading, shape (..., 3)."""
         if self.wanted == 0.0:
             return vectors
-        c = math.cos(self.wanted)
-        s = math.sin(self.wanted)
+        c = cos(self.wanted)
+        s = sin(self.wanted)
         x = vectors[..., 0]
         y = vectors[..., 1]
         return stack((c * x + s * y, c * y - s * x, vectors[..., 2]))
@@ -210,9 +214,9 @@ class GoalTask(Task):
 
 def tilted(angle: Array, azimuth: Array) -> Array:
     """Quaternions, (W, A, 4), of tilts by an angle about the level axis at an azimuth, rad."""
-    sine = np.sin(angle / 2)
-    w = np.cos(angle / 2)
-    return stack((w, sine * np.cos(azimuth), sine * np.sin(azimuth), 0.0 * w))
+    sine = sin(angle / 2)
+    w = cos(angle / 2)
+    return stack((w, sine * cos(azimuth), sine * sin(azimuth), 0.0 * w))
 
 
 def at(point: Sequence[float], like: Array) -> Array:
@@ -258,17 +262,10 @@ def check_band(flight_band: float, start_band: float) -> None:
 
 def row_of(rows: Array, index: Array) -> Array:
     """A row for each drone, (W, A, k): of its own, (W, A, rows, k), or of a table, (rows, k)."""
-    if not np.ndim(index):
-        return rows[int(index)]
-    number = index.astype(int)
     if rows.ndim == 2:
-        return rows[number]
+        return looked_up(rows, index)
+    number = index.astype(int)
     return np.take_along_axis(rows, number[..., None, None], axis=-2)[..., 0, :]
-
-
-def length(vectors: Array) -> Array:
-    """Sizes of vectors, shape (..., 3)."""
-    return np.sqrt(np.sum(vectors * vectors, axis=-1))
 
 
 def rates_cost(state: State, weight: float) -> Array:

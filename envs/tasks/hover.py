@@ -4,10 +4,20 @@ import math
 from dataclasses import dataclass
 from typing import Annotated
 
-import numpy as np
-
 from ...models.fields import Limits
-from ...sim import Array, Draw, InitialState, body_x, component, stack
+from ...sim import (
+    Array,
+    Draw,
+    InitialState,
+    atan2,
+    body_x,
+    component,
+    cos,
+    length,
+    sin,
+    stack,
+    wrapped,
+)  # fmt: skip
 from ..spec import Metric
 from ..state import State
 from .goal import (
@@ -20,7 +30,6 @@ from .goal import (
     at,
     check_band,
     check_height,
-    length,
     nearness,
 )
 from .task import Outcome, TaskOptions
@@ -103,11 +112,11 @@ class Hover(GoalTask):
         off = math.radians(options.start_heading)
         heading = (self.wanted + draw.uniform(-off, off)) / 2
         # First tilted about a horizontal axis, then turned about the vertical.
-        w = np.cos(tilt)
-        x = np.sin(tilt) * np.cos(azimuth)
-        y = np.sin(tilt) * np.sin(azimuth)
-        c = np.cos(heading)
-        s = np.sin(heading)
+        w = cos(tilt)
+        x = sin(tilt) * cos(azimuth)
+        y = sin(tilt) * sin(azimuth)
+        c = cos(heading)
+        s = sin(heading)
         quaternion = stack((c * w, c * x - s * y, c * y + s * x, s * w))
         return InitialState(position=at(options.goal, tilt) + offset, quaternion=quaternion)
 
@@ -115,8 +124,8 @@ class Hover(GoalTask):
         """Nearness to goal and heading; the end at a crash, a flip-over, or outside the band."""
         distance = length(self.goal(state) - state.position)
         nose = body_x(state.quaternion)
-        off = np.atan2(component(nose, 1), component(nose, 0)) - self.wanted
-        heading = np.atan2(np.sin(off), np.cos(off)) * (180 / math.pi)
+        off = atan2(component(nose, 1), component(nose, 0)) - self.wanted
+        heading = wrapped(off) * (180 / math.pi)
         crashed = self.crashed(state, distance > self.options.flight_band)
         terms = {
             "position": nearness(distance),

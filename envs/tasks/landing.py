@@ -8,7 +8,7 @@ import numpy as np
 
 from ...models.errors import InputError, shortened
 from ...models.fields import Limits, NumberOrPair
-from ...sim import Array, Draw, InitialState, component, each, square_root, stack
+from ...sim import Array, Draw, InitialState, component, cos, each, length, sin, stack
 from ..spec import Mark, Metric
 from ..state import State
 from .goal import (
@@ -20,7 +20,6 @@ from .goal import (
     along,
     check_more,
     ends_of,
-    length,
     rates_cost,
 )
 from .task import Outcome, TaskOptions
@@ -70,7 +69,7 @@ class LandingOptions(TaskOptions):
                 f"got {shortened(self.start_band)}"
             )
         reach = self.pad_path + math.sqrt(2) * self.start_band
-        furthest = math.hypot(reach, self.start_height + self.start_band)
+        furthest = length(np.array((reach, self.start_height + self.start_band)))
         check_more("flight_band", self.flight_band, "the furthest start", furthest)
 
 
@@ -139,7 +138,7 @@ class Landing(GoalTask):
         fastest = ends_of(options.pad_speed)[1] + 0.001
         pad = along("velocity of the pad", "m/s", fastest, "xy")
         self.define_observation(options.flight_band, pad)
-        self._least_upright = math.cos(math.radians(options.tilt))
+        self._least_upright = cos(math.radians(options.tilt))
         self._height = self.vehicle.rest_height
         below = (0.0, 0.0, -self._height)
         self.marks = (Mark(shape="disc", size=options.pad_radius, position=below, moves=True),)
@@ -157,8 +156,8 @@ class Landing(GoalTask):
         memory = self.memory
         memory.phase = phase  # rad
         memory.rate = speed / options.pad_path  # rad/s
-        memory.cosine = np.cos(direction)  # of the line
-        memory.sine = np.sin(direction)
+        memory.cosine = cos(direction)  # of the line
+        memory.sine = sin(direction)
         memory.side = np.where(side < 0, zero - 1.0, zero + 1.0) if circle else zero
         position = stack((zero, zero, zero + self._height + options.start_height)) + offset
         rest = 0.0 * position
@@ -192,12 +191,12 @@ class Landing(GoalTask):
         touching = state.touching
         relative = self.memory.arrival - self._pad_velocity()
         away = self._goal() - state.position
-        distance = _level(away)
+        distance = length(away[..., :2])
         landed = (
             touching
             & (distance <= options.pad_radius)
             & (-component(relative, 2) <= options.sink)
-            & (_level(relative) <= options.drift)
+            & (length(relative[..., :2]) <= options.drift)
             & (self.memory.arrival_upright >= self._least_upright)
         )
         terminated = self.crashed(state, length(away) > options.flight_band)
@@ -224,14 +223,14 @@ class Landing(GoalTask):
     def _goal(self) -> Array:
         path = self.options.pad_path
         phase = self.memory.phase
-        return self._turned(path * np.cos(phase), path * np.sin(phase), self._height)
+        return self._turned(path * cos(phase), path * sin(phase), self._height)
 
     def _pad_velocity(self) -> Array:
         """World frame, m/s, (W, A, 3)."""
         path = self.options.pad_path
         memory = self.memory
-        ahead = -memory.rate * (path * np.sin(memory.phase))
-        return self._turned(ahead, memory.rate * (path * np.cos(memory.phase)), 0.0)
+        ahead = -memory.rate * (path * sin(memory.phase))
+        return self._turned(ahead, memory.rate * (path * cos(memory.phase)), 0.0)
 
     def _turned(self, along: Array, across: Array, height: float) -> Array:
         """A vector along and across the pad's line, or on its circle, in the world frame."""
@@ -245,10 +244,3 @@ class Landing(GoalTask):
         """Minus the distance to the goal, m, and what the relative speed counts."""
         speed = length(velocity - self._pad_velocity())
         return -(length(self._goal() - position) + MATCHING_TIME * speed)
-
-
-def _level(vectors: Array) -> Array:
-    """Horizontal sizes of vectors, (W, A)."""
-    x = component(vectors, 0)
-    y = component(vectors, 1)
-    return square_root(x * x + y * y)

@@ -4,16 +4,15 @@ import math
 from dataclasses import dataclass
 from typing import Annotated
 
-import numpy as np
-
 from ...models.fields import Limits
 from ...sim import (
     Array,
     Draw,
     InitialState,
+    atan2,
     component,
     each,
-    square_root,
+    length,
     stack,
 )
 from ..config import EnvConfig
@@ -33,7 +32,6 @@ from .goal import (
     at,
     check_band,
     check_height,
-    length,
     nearness,
     swing_cost,
     tilted,
@@ -161,8 +159,7 @@ class PayloadHover(GoalTask):
         """Nearness of the payload, its swing; the end at contact, a flip-over, or too far away."""
         distance = length(self.goal(state) - state.payload)
         hung = state.position - state.payload
-        x, y, z = (component(hung, i) for i in range(3))
-        swing = np.atan2(square_root(x * x + y * y), z) * (180 / math.pi)
+        swing = atan2(length(hung[..., :2]), component(hung, 2)) * (180 / math.pi)
         crashed = self.crashed(state, distance > self.options.flight_band)
         terms = {"payload": nearness(distance), "swing": swing_cost(state)}
         metrics = {"payload_error": distance, "swing": swing}

@@ -17,9 +17,14 @@ from ...sim import (
     InitialState,
     clip,
     component,
+    cos,
     each,
+    length,
     plain,
+    remainder,
+    sin,
     stack,
+    total,
 )
 from ..spec import Mark, Metric
 from ..state import State
@@ -37,7 +42,6 @@ from .goal import (
     along,
     at,
     check_height,
-    length,
     row_of,
 )
 from .task import Outcome, TaskOptions
@@ -161,9 +165,9 @@ class Racing(GoalTask):
         # Of each gate its centre, the x and y of its direction, and half its size.
         centers = np.array([gate.position for gate in gates])
         halves = np.array([gate.size / 2 for gate in gates])
-        self._gates = np.column_stack((centers, np.cos(turns), np.sin(turns), halves))
+        self._gates = np.column_stack((centers, cos(turns), sin(turns), halves))
         corners = np.vstack((centers, self._start.position))
-        reach = float(np.linalg.norm(np.ptp(corners, axis=0))) + 2 * self.options.margin
+        reach = length(np.ptp(corners, axis=0)) + 2 * self.options.margin
         numbers = along("direction of the gate", "1", 1.001, "xy")
         numbers += along("gate after - position", "m", reach)
         numbers += along("direction of the gate after", "1", 1.001, "xy")
@@ -183,7 +187,7 @@ class Racing(GoalTask):
         memory.behind = position  # where the way to the next gate began
         memory.passed = memory.passing = memory.progress = memory.off = 0.0
         memory.lap = memory.lap_began = 0.0
-        turn = stack((zero + math.cos(half), zero, zero, zero + math.sin(half)))
+        turn = stack((zero + cos(half), zero, zero, zero + sin(half)))
         return InitialState(position=position, quaternion=turn)
 
     def update_memory(self, state: State) -> None:
@@ -207,10 +211,10 @@ class Racing(GoalTask):
         left = memory.passed < self._total
         passing = plain(through & inside & left) * 1.0
         passed = memory.passed + passing
-        whole = (passing > 0.5) & (passed % self._count == 0.0)
+        whole = (passing > 0.5) & (remainder(passed, self._count) == 0.0)
         way = center - memory.behind
         come = state.position - memory.behind
-        along = plain(np.sum(come * way, axis=-1)) / (plain(np.sum(way * way, axis=-1)) + 1e-12)
+        along = total(come * way) / (total(way * way) + 1e-12)
         memory.off = length(come - each(clip(along, 0.0, 1.0)) * way)
         memory.progress = length(before) - length(now)
         memory.passed = passed
@@ -246,8 +250,8 @@ class Racing(GoalTask):
 
     def _gate(self, passed: Array) -> Array:
         """The next gate after `passed` gates, shape (..., 6); after the last gate, the last."""
-        number = np.minimum(passed, self._total - 1.0) % self._count
-        return row_of(self._gates, number)
+        number = np.minimum(passed, self._total - 1.0)
+        return row_of(self._gates, remainder(number, self._count))
 
 
 def read_track(given: str) -> tuple[list[Gate], Start]:

@@ -12,6 +12,9 @@ from ...sim import (
     Draw,
     InitialState,
     component,
+    cos,
+    length,
+    sin,
     square_root,
     stack,
 )
@@ -27,7 +30,6 @@ from .goal import (
     at,
     check_height,
     check_more,
-    length,
     nearness,
 )
 from .task import Outcome, TaskOptions
@@ -131,7 +133,7 @@ class Recovery(GoalTask):
         usual = "body" if self.action in ("rotors", "rates") else "world"
         self.body = (options.frame or usual) == "body"
         self.define_observation(options.flight_band)
-        self._least_upright = math.cos(math.radians(options.upright))
+        self._least_upright = cos(math.radians(options.upright))
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """At the goal, thrown."""
@@ -142,12 +144,12 @@ class Recovery(GoalTask):
         b = draw.uniform(-turn, turn)
         long = np.sqrt(share)
         short = np.sqrt(1.0 - share)
-        parts = (long * np.cos(b), short * np.sin(a), short * np.cos(a), long * np.sin(b))
+        parts = (long * cos(b), short * sin(a), short * cos(a), long * sin(b))
         speed = draw.uniform(0.0, options.start_speed)
         climb = draw.uniform(-1.0, 1.0)
         azimuth = draw.uniform(-turn, turn)
         level = square_root(1.0 - climb * climb) * speed
-        velocity = stack((level * np.cos(azimuth), level * np.sin(azimuth), climb * speed))
+        velocity = stack((level * cos(azimuth), level * sin(azimuth), climb * speed))
         rates = draw.uniform(-1.0, 1.0, (3,))
         self.memory.missed = 0.0  # time of the last step that was not recovered, s
         self.memory.lowest = options.goal[2]  # m

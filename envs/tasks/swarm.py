@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import numpy as np
 
 from ...models.fields import Limits
-from ...sim import Array, Draw, InitialState, clip, stack
+from ...sim import Array, Draw, InitialState, clip, cos, length, sin, stack, total
 from ..spec import Metric
 from ..state import State
 from .goal import (
@@ -23,7 +23,6 @@ from .goal import (
     Speed,
     along,
     check_height,
-    length,
     nearness,
 )
 from .task import Outcome, TaskOptions
@@ -107,7 +106,7 @@ class Swarm(GoalTask):
         """
         self._slots = slots * self.gap
         starts = np.abs(grid(self.count)).max(axis=0) * self.gap + JITTER * self.gap
-        self.reach = float(np.linalg.norm(np.abs(self._slots).max(axis=0) + starts))
+        self.reach = length(np.abs(self._slots).max(axis=0) + starts)
         self.prepare(further)
 
     @property
@@ -179,7 +178,7 @@ class Swarm(GoalTask):
 
 def approach(way: Array, velocity: Array) -> Array:
     """Reward for a speed along a way to a goal, (W, A)."""
-    return APPROACH_WEIGHT * np.sum(way * velocity, axis=-1) / (length(way) + TINY)
+    return APPROACH_WEIGHT * total(way * velocity) / (length(way) + TINY)
 
 
 def shared(drawn: Array) -> Array:
@@ -190,8 +189,8 @@ def shared(drawn: Array) -> Array:
 def ring(count: int) -> np.ndarray:
     """Places on a level ring, neighbours 1 apart, shape (A, 3); of two drones they are 1 apart."""
     angle = 2 * np.pi * np.arange(count) / count
-    places = np.stack((np.cos(angle), np.sin(angle), 0.0 * angle), axis=-1)
-    return np.asarray(places * (0.5 / np.sin(np.pi / count)))
+    places = np.stack((cos(angle), sin(angle), 0.0 * angle), axis=-1)
+    return np.asarray(places * (0.5 / sin(np.pi / count)))
 
 
 def line(count: int) -> np.ndarray:
@@ -299,7 +298,7 @@ class Crossing(Swarm):
 
     def setup(self) -> None:
         """See the class."""
-        radius = max(float(np.linalg.norm(ring(self.count)[0])), 1.0)  # of six
+        radius = max(length(ring(self.count)[0]), 1.0)  # of six
         self._angles = 2 * math.pi * np.arange(self.count) / self.count
         self._radius = radius * self.gap
         self.reach = 2 * self._radius + 2 * JITTER * self.gap
@@ -315,8 +314,8 @@ class Crossing(Swarm):
     def _opposite(self, turn: Array) -> Array:
         """Where drones fly to from a ring turned by an angle, rad: world frame, m, (W, A, 3)."""
         angle = turn + self._angles + math.pi
-        x = self._radius * np.cos(angle)
-        y = self._radius * np.sin(angle)
+        x = self._radius * cos(angle)
+        y = self._radius * sin(angle)
         cx, cy, cz = self.options.center
         return stack((x + cx, y + cy, 0.0 * x + cz))
 
@@ -401,8 +400,8 @@ class Escort(Swarm):
         first = slow * memory.time + memory.alpha
         second = fast * memory.time + memory.beta
         zero = 0.0 * first
-        place = stack((a * np.sin(first), a * np.sin(second), zero))
-        velocity = stack((a * slow * np.cos(first), a * fast * np.cos(second), zero))
+        place = stack((a * sin(first), a * sin(second), zero))
+        velocity = stack((a * slow * cos(first), a * fast * cos(second), zero))
         return place, velocity
 
     def update_memory(self, state: State) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ...models.errors import InputError, one_line, shortened
 from ...models.fields import Limits
-from ...sim import Array, Draw, InitialState, clip
+from ...sim import Array, Draw, InitialState, cos, length, looked_up, remainder, sin
 from ..spec import Metric
 from ..state import State
 from .goal import (
@@ -22,9 +22,7 @@ from .goal import (
     Size,
     along,
     check_height,
-    length,
     nearness,
-    row_of,
 )
 from .task import Outcome, TaskOptions
 
@@ -122,7 +120,7 @@ class Tracking(GoalTask):
         low = self._table.min(axis=0)
         high = self._table.max(axis=0)
         check_height("trajectory", low[2], self.vehicle.rest_height + options.start_band)
-        reach = float(np.linalg.norm(high - low)) + 2 * options.flight_band
+        reach = length(high - low) + 2 * options.flight_band
         numbers = along("reference velocity", "m/s", 100.0)
         self._ahead = []
         for number in range(1, options.preview + 1):
@@ -167,25 +165,25 @@ class Tracking(GoalTask):
     def _at(self, table: np.ndarray, ahead: float) -> Array:
         """Row of a table, `ahead` steps ahead: shape (..., 3)."""
         index = self.memory.index + ahead
-        last = float(len(table))
-        index = index % last if self._closed else clip(index, 0.0, last - 1.0)
-        return row_of(table, index)
+        if self._closed:
+            index = remainder(index, len(table))
+        return looked_up(table, index)
 
 
 def _circle(phase: np.ndarray, radius: float, rate: float) -> tuple[np.ndarray, np.ndarray]:
     """Positions from the middle, m, and velocities, m/s, shape (L, 3)."""
-    c, s, zero = np.cos(phase), np.sin(phase), 0.0 * phase
+    c, s, zero = cos(phase), sin(phase), 0.0 * phase
     place = np.column_stack((c, s, zero))
     return radius * place, radius * rate * np.column_stack((-s, c, zero))
 
 
 def _lemniscate(phase: np.ndarray, radius: float, rate: float) -> tuple[np.ndarray, np.ndarray]:
     """Bernoulli's: (cos φ, sin φ cos φ) / (1 + sin² φ)."""
-    c, s, zero = np.cos(phase), np.sin(phase), 0.0 * phase
+    c, s, zero = cos(phase), sin(phase), 0.0 * phase
     below = 1 + s * s
     place = np.column_stack((c / below, s * c / below, zero))
-    x = -s * (below + 2 * c * c) / below**2
-    y = ((c * c - s * s) * below - 2 * s * s * c * c) / below**2
+    x = -s * (below + 2 * c * c) / (below * below)
+    y = ((c * c - s * s) * below - 2 * s * s * c * c) / (below * below)
     return radius * place, radius * rate * np.column_stack((x, y, zero))
 
 
@@ -196,7 +194,11 @@ def _sampled(rows: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
     """Positions, m, and velocities, m/s, (L, 3), of each control step along the rows of a file."""
     given = rows[:, 0]
     times = given[0] + np.arange(math.ceil(np.ptp(given) / step) + 1) * step
-    places = np.column_stack([np.interp(times, given, along) for along in rows[:, 1:].T])
+    after = np.searchsorted(given[1:-1], times, side="right") + 1
+    before = after - 1
+    share = (times - given[before]) / (given[after] - given[before])
+    share = np.minimum(share, 1.0)[:, None]
+    places = rows[before, 1:] + share * (rows[after, 1:] - rows[before, 1:])
     rates = np.gradient(places, step, axis=0)
     rates[-1] = 0.0  # it stays
     return places, rates

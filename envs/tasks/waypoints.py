@@ -1,13 +1,12 @@
 """`rotorgram/Waypoints-v0`: fly to some points, one after the other."""
 
-import math
 from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
 
 from ...models.fields import Limits
-from ...sim import Array, Draw, InitialState, plain
+from ...sim import Array, Draw, InitialState, length, plain
 from ..spec import Mark, Metric
 from ..state import State
 from .goal import (
@@ -20,7 +19,6 @@ from .goal import (
     Point,
     along,
     check_height,
-    length,
     row_of,
 )
 from .task import Outcome, TaskOptions
@@ -98,7 +96,7 @@ class Waypoints(GoalTask):
         check_height("center", options.center[2], self.vehicle.rest_height + options.box[2])
         self.marks = (Mark(shape="ball", size=options.radius, moves=True),)
         self._sides = tuple(side + options.margin for side in options.box)
-        furthest = 2 * math.hypot(*self._sides)
+        furthest = 2 * length(np.array(self._sides))
         self.define_observation(furthest / 2, along("point after - position", "m", furthest))
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:

@@ -27,7 +27,7 @@ from ..effects import EffectOptions, Effects
 from ..randomize import CENTER, Randomization
 from ..rotations import body_z
 from ..snapshots import Arrays
-from ..state import Array, ByName, InitialState, WorldState, stack
+from ..state import Array, ByName, InitialState, WorldState, stack, total
 from ..world import PhysicsError, World
 
 _FEW = 8
@@ -377,6 +377,6 @@ class WorldParameters:
         }
         if "body_ipos" in self.base:
             shift = stack([parameters.get(name, 0.0 * ones) for name in CENTER])
-            moved = np.einsum("bji,wbj->wbi", self._axes, shift[:, self._of_bodies])
+            moved = total(self._axes.swapaxes(1, 2) * shift[:, self._of_bodies, None])
             values["body_ipos"] = self.base["body_ipos"] + moved
         return values

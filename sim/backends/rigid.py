@@ -16,7 +16,7 @@ from ..compile import trouble
 from ..effects import EffectOptions
 from ..randomize import Randomization
 from ..snapshots import Arrays
-from ..state import Array, ByName, InitialState, WorldState, chosen, clip
+from ..state import Array, ByName, InitialState, WorldState, chosen, clip, each, length
 from ..world import PhysicsError, World
 from . import kernel
 from .body import RigidBody, mapped, motion
@@ -113,7 +113,7 @@ class RigidWorld(World):
         self.random.begin(self._ids(mask))
         begun = self._begun(mask, pose)
         turn = begun["quaternion"]
-        unit = turn / np.sqrt(np.sum(turn * turn, axis=-1, keepdims=True))
+        unit = turn / each(length(turn))
         turn = np.where(rows, unit, turn)  # the others keep their bits
         parts = (begun["position"], turn, begun["velocity"], begun["body_rates"])
         self._show(self._as_rows(np.concat(parts, axis=-1)))

@@ -12,7 +12,7 @@ import numpy as np
 from ... import models
 from ...models.errors import InputError, shortened
 from ..effects import EffectOptions
-from ..state import Array, WorldState, clip, component, stack
+from ..state import Array, WorldState, clip, component, stack, total
 from .cascade import Attitude, Position, Rates, Velocity
 from .gains import Gains, shared_ranges
 
@@ -81,13 +81,14 @@ class CollectiveThrust:
         hover = vehicle.hover_thrust
         low = vehicle.thrust_low
         high = vehicle.thrust_high
+        mean = total(hover) / len(hover)
         alike = all((values == values[0]).all() for values in (hover, low, high))
         # Rotors that are alike need one number for all of them.
         self._alike = alike
         self._increment = increment
         self._hover, self._per_action, self._low, self._high = (
             values.item(0) if alike else values
-            for values in (hover, newtons * (hover / hover.mean()), low, high)
+            for values in (hover, newtons * (hover / mean), low, high)
         )
 
     def thrust(self, action: Array, state: WorldState) -> Array:

@@ -24,13 +24,15 @@ import numpy as np
 from ... import models
 from ..effects import EffectOptions
 from ..effects.rotors import polynomial
+from ..elementary import cos, sin
 from ..rotations import Parts, Rows, dot, matrix, parts_of, times, transposed
-from ..state import Array, WorldState, clip, plain, square_root, stack
+from ..state import Array, WorldState, clip, interpolated, square_root, stack
 from .gains import Gains
 
 _ASIDE = 1e-3  # Upside down every way to turn is as short: it is about x
 _TINY = 1e-12  # Added to squares under a root, whose slope at 0 is infinite
-_POINTS = 1025  # of the table that inverts a thrust curve: right to 1e-6
+_STEPS = 1024  # of the table that inverts a thrust curve: right to 1e-6
+_HALVINGS = 53
 
 
 class Rates:
@@ -61,12 +63,10 @@ class Rates:
         self._inertia = vehicle.inertia.tolist()
         self._low = vehicle.thrust_low.tolist()
         self._high = vehicle.thrust_high.tolist()
-        self._throttle: tuple[Array, Array] | None = None
+        self._throttle: np.ndarray | None = None
         if effects.thrust_curve:
             (curve,) = vehicle.coefficients.need("rotors.curve", "thrust_curve")
-            throttle = np.linspace(0.0, 1.0, _POINTS)
-            thrust = np.maximum.accumulate(polynomial(curve, throttle))
-            self._throttle = thrust, throttle
+            self._throttle = _throttle(curve)
 
     def sizes(self, gains: Gains) -> tuple[float, ...]:
         """Values of actions of 1; that of a collective thrust is 1, which is its limit."""
@@ -118,8 +118,13 @@ class Rates:
         commands = list(map(clip, wanted, self._low, self._high))
         if self._throttle is not None:
             both = zip(commands, self._high, strict=True)
-            commands = [high * np.interp(part / high, *self._throttle) for part, high in both]
+            commands = [high * self._throttle_of(part / high) for part, high in both]
         return stack(commands)
+
+    def _throttle_of(self, share: Array) -> Array:
+        """Throttle at which a rotor gives a share of its largest thrust."""
+        assert self._throttle is not None
+        return interpolated(self._throttle, _STEPS * square_root(share))
 
     def _scaled(self, action: Array) -> list[Array]:
         pairs = zip(parts_of(action), self._sizes, strict=True)
@@ -149,10 +154,9 @@ class Attitude(Rates):
         """As `Controller.thrust`."""
         share, roll, pitch, yaw_rate = self._scaled(action)
         axes = _axes(state.quaternion)
-        # Of numbers too by NumPy: a batch gets the bits of a single drone.
-        cosine = plain(np.cos(roll))
-        x, y = _turned(axes[0], cosine * plain(np.sin(pitch)), -plain(np.sin(roll)))
-        axis = x, y, cosine * plain(np.cos(pitch))
+        cosine = cos(roll)
+        x, y = _turned(axes[0], cosine * sin(pitch), -sin(roll))
+        axis = x, y, cosine * cos(pitch)
         return self.point(self._collective(share), axis, yaw_rate, axes, state)
 
     def point(
@@ -245,6 +249,21 @@ class Position(Velocity):
         """Velocity over offset, 1/s."""
         braked = square_root(0.5 * acceleration / distance)
         return clip(_least([braked, speed / distance]), 0.0, self.gains.position)
+
+
+def _throttle(curve: tuple[float, ...]) -> np.ndarray:
+    """Throttles of a thrust curve, over even steps of the square root of the thrust: its slope
+    there is finite for curves of u² too.
+    """
+    root = np.arange(_STEPS + 1) / _STEPS
+    low = np.zeros_like(root)
+    high = np.ones_like(root)
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        is_below = polynomial(curve, middle) < root * root
+        low = np.where(is_below, middle, low)
+        high = np.where(is_below, high, middle)
+    return low
 
 
 def _axes(quaternion: Array) -> Rows:

@@ -28,6 +28,8 @@ import numpy as np
 
 from ... import models
 from ...models.errors import InputError
+from ..elementary import atan2, cos, expm1, inverse, sin
+from ..state import total
 
 LEAD = 3.0
 """Rotors are driven to follow this many times faster than their own lag."""
@@ -96,20 +98,23 @@ class Gains:
         gravity = vehicle.gravity
         weight = vehicle.mass * gravity
         share = vehicle.hover_thrust / weight
-        mix = np.linalg.pinv(vehicle.allocation)[:, 1:] / share[:, np.newaxis]
+        mix = allocated(vehicle)[:, 1:] / share[:, np.newaxis]
         lowest = float((vehicle.thrust_low / share).max())
         highest = float((vehicle.thrust_high / share).min())
         room = max(min(highest - weight, weight - lowest), LEAST_ROOM * (highest - lowest))
-        alpha = room / np.abs(mix @ vehicle.inertia).max(axis=0)
+        torques = total(mix[:, np.newaxis] * vehicle.inertia)
+        alpha = room / np.abs(torques).max(axis=0)
         # With a lag the rotors follow in `answer`; a step of them is exact: 1 - exp(-t / time).
         answer = max(lag / LEAD, period) if lag > 0 else 0.0
-        lead = math.expm1(-period / answer) / math.expm1(-period / lag) if lag > 0 else 1.0
+        lead = expm1(-period / answer) / expm1(-period / lag) if lag > 0 else 1.0
         fastest = 1 / (5 * (answer + period))
         p = min(fastest, math.sqrt(min(alpha[0], alpha[1]) / 2))
         yaw = min(fastest, math.sqrt(alpha[2] / 2))
         surplus = highest - weight
-        tilt = min(math.acos(weight / (weight + SURPLUS * surplus)), MAX_TILT)
-        most = gravity * math.tan(tilt), min(SURPLUS * surplus / vehicle.mass, gravity / 2)
+        cosine = weight / (weight + SURPLUS * surplus)
+        tilt = min(atan2(math.sqrt(1 - cosine * cosine), cosine), MAX_TILT)
+        level = gravity * sin(tilt) / cos(tilt)
+        most = level, min(SURPLUS * surplus / vehicle.mass, gravity / 2)
         speeds = tuple(math.sqrt(a * BRAKING) for a in most)
         offsets = tuple(max(v / (p / 5), 2 * BRAKING) for v in speeds)
         return cls(
@@ -130,6 +135,18 @@ class Gains:
             mix=tuple(map(tuple, mix.tolist())),
             share=tuple(share.tolist()),
         )
+
+
+def allocated(vehicle: "models.Vehicle") -> np.ndarray:
+    """Thrusts for a collective thrust of 1 N and torques of 1 N·m about each axis, shape (R, 4).
+
+    Those of the least size, Aᵀ (A Aᵀ)⁻¹ for an allocation A of rank 4.
+    """
+    size = np.abs(vehicle.allocation).max(axis=1, keepdims=True)
+    rows = vehicle.allocation / size
+    square = total(rows[:, np.newaxis] * rows)
+    thrusts: np.ndarray = total(rows.T[:, np.newaxis] * inverse(square)) / size.T
+    return thrusts
 
 
 def shared_ranges(several: Sequence[Gains]) -> list[Gains]:

@@ -9,9 +9,19 @@ from ... import models
 from ...models.errors import InputError
 from ..rotations import Parts, Rows, add, cross, dot, matrix, parts_of, product, times, transposed
 from ..snapshots import Kept
-from ..state import Array, ByName, WorldState, clip, component, each, kept, square_root, stack
+from ..state import (
+    Array,
+    ByName,
+    WorldState,
+    clip,
+    component,
+    each,
+    kept,
+    square_root,
+    stack,
+    total,
+)  # fmt: skip
 from .options import EffectOptions
-from .rotors import total
 
 LEAST_HEIGHT = 0.5
 """Height of a rotor over the ground, in radii, below which the ground effect grows no further: our

@@ -12,7 +12,7 @@ import numpy as np
 from ... import models
 from ...models.errors import InputError
 from ..rotations import body_z
-from ..state import Array, WorldState
+from ..state import Array, WorldState, clip, length, square_root, total
 
 DECAY = 10.11
 """B_d: velocity on the axis over that at the rotors in hover, times the distance from the jet's
@@ -46,23 +46,24 @@ class Downwash:
     def __init__(self, vehicle: "models.Vehicle") -> None:
         (radius,) = vehicle.coefficients.need("rotors.radius", "downwash")
         places = np.array([rotor.position for rotor in vehicle.rotors])
-        self.length = float(np.linalg.norm(places[:, None] - places, axis=-1).max())
+        self.length = float(length(places[:, None] - places).max())
         if not self.length > 0:
             raise InputError("vehicle: expected two rotors or more, for downwash, got one")
-        self._area = vehicle.num_rotors * math.pi * radius**2
+        self._area = vehicle.num_rotors * math.pi * radius * radius
 
     def velocity(self, thrust: Array, below: Array, beside: Array) -> Array:
         """Speed of the air in a jet, m/s.
 
         Thrust of the craft, N; distances below it and from its axis, m; all of one shape.
         """
-        hover = (thrust.clip(0.0) / (2 * DENSITY * self._area)) ** 0.5
+        hover = square_root(thrust / (2 * DENSITY * self._area))
         depth = below / self.length
-        share = (depth / NEAR).clip(0.0, 1.0)
-        away = depth.clip(NEAR) - ORIGIN
+        share = clip(depth / NEAR, 0.0, 1.0)
+        away = clip(depth, NEAR, math.inf) - ORIGIN
         half = self.length * SPREAD * away
         ratio = beside / half
-        return share * hover * DECAY / away / (1 + (math.sqrt(2) - 1) * ratio * ratio) ** 2
+        spread = 1 + (math.sqrt(2) - 1) * ratio * ratio
+        return share * hover * DECAY / away / (spread * spread)
 
     def air(self, state: WorldState) -> list[Array]:
         """Velocity of the air at each drone by the jets of the others, world frame, m/s: three of
@@ -70,9 +71,9 @@ class Downwash:
         """
         down = -body_z(state.quaternion)  # of each jet
         offset = state.position[:, :, None] - state.position[:, None]  # to a drone, from a jet
-        below = (offset * down[:, None]).sum(-1)
-        square = (offset * offset).sum(-1) - below * below
-        thrust = state.thrust.sum(-1)[:, None] + 0.0 * below
-        speed = self.velocity(thrust, below, square.clip(0.0) ** 0.5)
-        air: Array = (speed[..., None] * down[:, None]).sum(2)  # a drone's own has the depth 0
-        return [air[..., axis] for axis in range(3)]
+        below = total(offset * down[:, None])
+        beside = square_root(total(offset * offset) - below * below)
+        thrust = total(state.thrust)[:, None] + 0.0 * below
+        speed = self.velocity(thrust, below, beside)
+        # A drone's own jet has the depth 0.
+        return [total(speed * down[:, None, :, axis]) for axis in range(3)]

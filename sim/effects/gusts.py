@@ -14,9 +14,10 @@ import math
 
 import numpy as np
 
+from ..elementary import exp, expm1, power
 from ..rotations import parts_of
 from ..snapshots import Kept
-from ..state import Array, kept
+from ..state import Array, kept, square_root
 
 FOOT = 0.3048  # m
 LOWEST, HIGHEST = 10 * FOOT, 1000 * FOOT  # m: where the low-altitude model is defined
@@ -41,9 +42,10 @@ class Gusts(Kept):
 
     def __init__(self, wind_speed: float, mean_wind: tuple[float, ...], timestep: float) -> None:
         self._sigma = 0.1 * wind_speed
-        across = math.hypot(mean_wind[0], mean_wind[1])
-        self._along = (1.0, 0.0) if across == 0 else (mean_wind[0] / across, mean_wind[1] / across)
-        self._speed = max(LEAST_SPEED, math.hypot(*mean_wind))
+        x, y, z = mean_wind
+        across = math.sqrt(x * x + y * y)
+        self._along = (1.0, 0.0) if across == 0 else (x / across, y / across)
+        self._speed = max(LEAST_SPEED, math.sqrt(x * x + y * y + z * z))
         self._step = timestep
         self._filters: Array = None
         self._state: Array = None
@@ -56,23 +58,23 @@ class Gusts(Kept):
         feet = np.clip(np.ravel(height).astype(np.float64), LOWEST, HIGHEST) / FOOT
         shape = 0.177 + 0.000823 * feet
         sigma = self._sigma * np.ravel(factor).astype(np.float64)
-        sigmas = sigma / shape**0.4, sigma + 0.0 * feet
-        lengths = FOOT * feet / shape**1.2, FOOT * feet
+        sigmas = sigma / power(shape, 0.4), sigma + 0.0 * feet
+        lengths = FOOT * feet / power(shape, 1.2), FOOT * feet
         r = self._step * self._speed / lengths[0]
-        filters = [np.exp(-r), sigmas[0] * np.sqrt(-np.expm1(-2 * r)), *sigmas]
+        filters = [exp(-r), sigmas[0] * np.sqrt(-expm1(-2 * r)), *sigmas]
         # Of a filter of second order, with z₁' = (noise - z₁) / T and z₂' = (z₁ - z₂) / T, the
         # stationary covariance is σ²/2 · ((1, 1/2), (1/2, 1/2)): v = √3 z₁ + (1 - √3) z₂ has σ².
         # The noise of a step has the covariance ((q11, q12), (q12, q22)).
         for sigma, length in zip(sigmas, lengths, strict=True):
             r = self._step * self._speed / length
-            e = np.exp(-r)
+            e = exp(-r)
             half = 0.5 * sigma * sigma
-            q11 = -half * np.expm1(-2 * r)
+            q11 = -half * expm1(-2 * r)
             q12 = half / 2 * (1 - e * e * (1 + 2 * r))
             q22 = half / 2 * (1 - e * e * (1 + 2 * r + 2 * r * r))
             a = np.sqrt(q11)
             # In a short step the last is less than what rounding leaves of the difference.
-            filters += [e, r, a, q12 / a, np.sqrt(np.maximum(q22 - q12 * q12 / q11, 0.0))]
+            filters += [e, r, a, q12 / a, square_root(q22 - q12 * q12 / q11)]
         self._filters = kept(mask, self._ours(filters, normal), self._filters)
         along, up = self._filters[2:4]
         n = parts_of(normal)

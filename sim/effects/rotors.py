@@ -4,8 +4,9 @@ import numpy as np
 
 from ... import models
 from ...models.errors import InputError
+from ..elementary import expm1
 from ..snapshots import Kept
-from ..state import Array, ByName, chosen, clip, component, each, plain, square_root, stack
+from ..state import Array, ByName, chosen, clip, component, each, square_root, stack, total
 from .options import EffectOptions
 
 
@@ -147,7 +148,7 @@ class RotorEffects(Kept):
     def _answer(self, time: Array) -> tuple[Array, Array, Array]:
         """Of exp(-t / time) over a physics step: 1 - its end, its mean, the mean of its square."""
         ratio = self._step / time
-        gone = -plain(np.expm1(-ratio))
+        gone = -expm1(-ratio)
         return gone, gone / ratio, gone * (2 - gone) / (2 * ratio)
 
     def _follow(self, wanted: Array) -> tuple[Array, Array, Array]:
@@ -168,7 +169,7 @@ class RotorEffects(Kept):
     def _loaded(self, target: Array) -> Array:
         """Voltage where the rotors give `target` · (voltage / full)² at once."""
         opened = self._open_voltage()
-        drop = self._resistance * self._power(target) / self._full**3
+        drop = self._resistance * self._power(target) / (self._full * self._full * self._full)
         return 2 * opened / (1 + square_root(1 + 4 * drop * opened))
 
     def _terminal(self) -> Array:
@@ -181,14 +182,6 @@ class RotorEffects(Kept):
     def _power(self, thrust: Array) -> Array:
         """Electrical power of all rotors, W, shape (W, A)."""
         return self._watts * total(thrust * square_root(thrust))
-
-
-def total(values: Array) -> Array:
-    """Sum over the rotors, one after the other: the same bits alone and in a batch."""
-    result = component(values, 0)
-    for rotor in range(1, values.shape[-1]):
-        result = result + component(values, rotor)
-    return result
 
 
 def polynomial(coefficients: tuple[float, ...], x: Array) -> Array:

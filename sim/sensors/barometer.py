@@ -4,6 +4,7 @@ import math
 from typing import ClassVar
 
 from ...models.fields import Limits
+from ..elementary import power
 from ..state import Array, chosen, clip
 from ..world import World
 from .base import Bounds, Sensor, Setting, Values
@@ -21,12 +22,13 @@ def isa_pressure(height: Array) -> Array:
 
     p = p₀ (1 - L h / T₀)^(g₀ / R L), ISO 2533:1975, in the troposphere: up to 11 km.
     """
-    return SEA_LEVEL_PRESSURE * (1 - LAPSE_RATE / SEA_LEVEL_TEMPERATURE * height) ** _EXPONENT
+    share = 1 - LAPSE_RATE / SEA_LEVEL_TEMPERATURE * height
+    return SEA_LEVEL_PRESSURE * power(share, _EXPONENT)
 
 
 def isa_height(pressure: Array) -> Array:
     """The reverse of `isa_pressure`: the pressure altitude, m."""
-    share = (pressure / SEA_LEVEL_PRESSURE) ** (1 / _EXPONENT)
+    share = power(pressure / SEA_LEVEL_PRESSURE, 1 / _EXPONENT)
     return SEA_LEVEL_TEMPERATURE / LAPSE_RATE * (1 - share)
 
 
@@ -64,7 +66,6 @@ class Barometer(Sensor):
         self._bias = chosen(mask, 0.0 * normal[..., :1], self._bias)
 
     def measure(self, normal: Array) -> Array:
-        # An array of a single drone too: a power of Python's numbers may differ by a bit.
         height = self.world.state.position[..., 2:] + self.values["altitude"]
         exact = isa_pressure(clip(height, LOWEST, HIGHEST))
         pressure = exact + self._bias + self.values["noise"] * normal[..., :1]

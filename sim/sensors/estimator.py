@@ -1,11 +1,11 @@
 """The onboard estimate of position, velocity, attitude and body rates."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
+from ..elementary import atan2, exp, expm1, wrapped
 from ..rotations import advanced, between, cross, parts_of, to_world, world_z
 from ..state import Array, WorldState, chosen, clip, component, each, stack
 from .base import FURTHEST, MAX_SPEED, UNIT, Sensor, Source
@@ -61,7 +61,7 @@ class Estimator(Source):
         force = imu[..., 3:]
         turned = advanced(self.quaternion, rates * period + self._correction(force, sensors))
         acceleration = to_world(turned, force) - self._gravity * _UP
-        position = self.position + period * self.velocity + 0.5 * period**2 * acceleration
+        position = self.position + period * self.velocity + 0.5 * period * period * acceleration
         velocity = self.velocity + period * acceleration
         position, velocity = self._followed(position, velocity, sensors)
         self.quaternion = chosen(mask, turned, self.quaternion)
@@ -72,17 +72,17 @@ class Estimator(Source):
     def _correction(self, force: Array, sensors: Mapping[str, Sensor]) -> Array:
         """Rotation vector in the body frame that corrects the attitude, rad."""
         up = world_z(self.quaternion)
-        share = 1 - math.exp(-self.interval / TIME)
+        share = -expm1(-self.interval / TIME)
         angle = share / self._gravity * stack(cross(parts_of(force), parts_of(up)))
         if sensor := sensors.get("magnetometer"):
             east, north, _ = sensor.values["field"]
             field = to_world(self.quaternion, sensor.value)
-            off = math.atan2(north, east) - np.atan2(component(field, 1), component(field, 0))
-            off = np.atan2(np.sin(off), np.cos(off)) * self._gain(sensor)
+            off = atan2(north, east) - atan2(component(field, 1), component(field, 0))
+            off = wrapped(off) * self._gain(sensor)
             angle = angle + each(off) * up
         if sensor := sensors.get("motion_capture"):
             error = between(self.quaternion, sensor.value[..., 3:])
-            sign = 2.0 * self._gain(sensor) * np.sign(component(error, 0))
+            sign = np.copysign(2.0 * self._gain(sensor), component(error, 0))
             angle = angle + each(sign) * error[..., 1:]
         return angle
 
@@ -108,12 +108,13 @@ class Estimator(Source):
 
     def _gain(self, sensor: Sensor) -> Array:
         """Share of an error that a fresh reading removes; 0 without a fresh reading."""
-        return (1 - math.exp(-sensor.interval / TIME)) * sensor.fresh
+        return -expm1(-sensor.interval / TIME) * sensor.fresh
 
     def _gains(self, sensor: Sensor) -> tuple[Array, Array]:
         """g, and h over the interval: 1 - ξ² and (1 - ξ)² for two poles at ξ."""
-        pole = math.exp(-sensor.interval / TIME)
-        return (1 - pole**2) * sensor.fresh, (1 - pole) ** 2 / sensor.interval * sensor.fresh
+        pole = exp(-sensor.interval / TIME)
+        off = 1 - pole
+        return (1 - pole * pole) * sensor.fresh, off * off / sensor.interval * sensor.fresh
 
     def estimate(self) -> Array:
         """Position, velocity, quaternion and rates, shape (W, A, 13)."""

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from rotorgram.models.vehicle import Vehicle
-from rotorgram.sim import elementary, make_world
+from rotorgram.sim import make_world
 from rotorgram.sim.random import (
     START,
     Draw,
@@ -58,20 +58,6 @@ def test_normal_numbers_are_normal() -> None:
     found = abs((many < -1).mean() - 0.158655)
     assert found < 4 * math.sqrt(0.1335 / count)
     assert len(np.unique(many)) == count
-
-
-@pytest.mark.parametrize(("kind", "most"), [(np.float32, 2e-7), (np.float64, 4e-16)])
-def test_elementary_functions(kind: type, most: float) -> None:
-    angles = np.linspace(-1e4, 1e4, 100_001).astype(kind)
-    exact = angles.astype(np.longdouble)
-    found = abs(elementary.sin(angles) - np.sin(exact)).max()
-    assert found < most
-    assert abs(elementary.cos(angles) - np.cos(exact)).max() < most
-    numbers = np.exp(np.linspace(-80, 80, 100_001)).astype(kind)
-    exact = np.log(numbers.astype(np.longdouble))
-    error = abs(elementary.log(numbers) - exact)
-    assert (error / (abs(exact) + 1e-2)).max() < 2 * most
-    assert elementary.log(np.ones(1, kind)).tolist() == [0.0]
 
 
 # --- the counters of worlds -----------------------------------------------------------------------
