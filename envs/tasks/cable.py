@@ -8,9 +8,7 @@ import numpy as np
 
 from ...models.errors import InputError
 from ...models.fields import Limits
-from ...sim import Array, Draw, InitialState, atan2, cos, length, sin, stack, total
-from ...sim.control.gains import allocated
-from ...sim.rotations import cross
+from ...sim import Array, Draw, InitialState, allocated, atan2, cos, length, sin, stack, total
 from ..config import EnvConfig
 from ..spec import Metric
 from ..state import State
@@ -144,12 +142,13 @@ class Cable(Swarm):
         s = sin(self._tilt)
         along = s * load - c * inwards
         down = -s * inwards - c * load
-        pull = (along * cos(azimuth), along * sin(azimuth), down)
+        pull = stack((along * cos(azimuth), along * sin(azimuth), down))
         weight = vehicle.mass * vehicle.gravity
         lift = load + weight
         force = math.sqrt(inwards * inwards + lift * lift)
         even = force * (vehicle.hover_thrust / weight)
-        wanted = stack((force, *cross(vehicle.center_of_mass.tolist(), pull)))
+        torque = np.cross(vehicle.center_of_mass, pull)
+        wanted = np.concatenate((force + 0.0 * azimuth[..., None], torque), axis=-1)
         missing = wanted - total(vehicle.allocation * even)
         thrust: np.ndarray = even + total(self._allocated * missing[..., None, :])
         return thrust

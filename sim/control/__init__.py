@@ -14,10 +14,11 @@ from ...models.errors import InputError, shortened
 from ..effects import EffectOptions
 from ..state import Array, WorldState, clip, component, stack, total
 from .cascade import Attitude, Position, Rates, Velocity
-from .gains import Gains, shared_ranges
+from .gains import Gains, allocated, shared_ranges
 
 __all__ = [
-    "LEVELS", "SHARES", "CollectiveThrust", "Controller", "Gains", "RotorThrust", "make_controller",
+    "LEVELS", "SHARES", "CollectiveThrust", "Controller", "Gains", "RotorThrust", "allocated",
+    "make_controller",
 ]  # fmt: skip
 
 _CASCADE: Final[dict[str, type[Rates]]] = {

@@ -88,8 +88,7 @@ class Gains:
         rotors, s.
         """
         # The rank does not depend on the craft's size.
-        largest = np.abs(vehicle.allocation).max(axis=1, keepdims=True)
-        rank = int(np.linalg.matrix_rank(vehicle.allocation / np.maximum(largest, 1e-12)))
+        rank = int(np.linalg.matrix_rank(vehicle.allocation / _largest(vehicle)))
         if rank != 4:
             raise InputError(
                 "vehicle: expected a vehicle whose rotors roll, pitch and yaw it, for this action, "
@@ -137,12 +136,18 @@ class Gains:
         )
 
 
+def _largest(vehicle: "models.Vehicle") -> np.ndarray:
+    """Of each row of the allocation, shape (4, 1)."""
+    largest: np.ndarray = np.abs(vehicle.allocation).max(axis=1, keepdims=True).clip(1e-12)
+    return largest
+
+
 def allocated(vehicle: "models.Vehicle") -> np.ndarray:
     """Thrusts for a collective thrust of 1 N and torques of 1 N·m about each axis, shape (R, 4).
 
-    Those of the least size, Aᵀ (A Aᵀ)⁻¹ for an allocation A of rank 4.
+    Those of the least size, Aᵀ (A Aᵀ)⁻¹ for an allocation A.
     """
-    size = np.abs(vehicle.allocation).max(axis=1, keepdims=True)
+    size = _largest(vehicle)
     rows = vehicle.allocation / size
     square = total(rows[:, np.newaxis] * rows)
     thrusts: np.ndarray = total(rows.T[:, np.newaxis] * inverse(square)) / size.T

@@ -159,6 +159,9 @@ def test_inverse() -> None:
     found = elementary.inverse(matrices)
     assert_allclose(found, np.linalg.inv(matrices), rtol=1e-10, atol=1e-12)
     assert elementary.inverse(matrices[2]).tobytes() == found[2].tobytes()
+    # The second row is three times the first.
+    found = elementary.inverse(np.array(((2.0, 6.0, 0.0), (6.0, 18.0, 0.0), (0.0, 0.0, 4.0))))
+    assert found.tolist() == [[0.5, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.25]]
 
 
 # --- sums, whole numbers and tables of sim/state.py -----------------------------------------------
