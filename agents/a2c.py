@@ -1,5 +1,6 @@
 """Advantage Actor-Critic: the paper's Algorithm 2, Equation 3."""
 
+import math
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -45,21 +46,49 @@ class A2C(Learner):
 
     def gradient(self, rollout: Rollout) -> None:
         """Of minus the mean of A · log P, plus the weighted squared error of the value."""
-        config = self.config
-        observations = rollout.rows(rollout.observations)
-        advantage = rollout.rows(self.advantages(rollout)[0]).astype(np.float32)
-        values = self._critic.forward(observations)[:, 0]
+        gain, entropy, value_loss = self.minibatch(*self.columns(rollout))
+        self.terms |= {"gain": gain, "entropy": entropy, "value_loss": value_loss}
+
+    def columns(self, rollout: Rollout) -> list[Floats]:
+        """Arguments of `minibatch` for all transitions of a rollout. Begins the `terms`."""
+        estimates, judged, seen = self.advantages(rollout)
+        advantage = rollout.rows(estimates).astype(np.float32)
+        values = rollout.rows(judged).astype(np.float32)
         targets = values + advantage
-        if config.normalize and len(advantage) > 1:
-            advantage = (advantage - advantage.mean()) / (advantage.std(ddof=1) + 1e-8)
-        log_probability, entropy = self._actor.score(observations, rollout.rows(rollout.actions))
-        self._actor.backward(-advantage / len(advantage), -config.ent_coef)
-        errors = values - targets
-        self._critic.backward((2 * config.vf_coef / len(errors) * errors)[:, np.newaxis])
-        gain = (log_probability * advantage).mean()
-        value_loss = (errors * errors).mean()
-        self.terms = {"gain": gain, "entropy": entropy, "value_loss": value_loss}
-        self.terms |= {"values": values, "targets": targets}
+        self.terms = {"values": values, "targets": targets}
+        inputs = rollout.rows(self.inputs(rollout.observations, seen))
+        return [inputs, rollout.rows(rollout.actions), advantage, targets]
+
+    def minibatch(
+        self, inputs: Floats, actions: Floats, advantage: Floats, targets: Floats, *before: Floats
+    ) -> tuple[float, float, float]:
+        """Set the gradients of the loss of B transitions; its gain, entropy and value loss.
+
+        Rows of `inputs` and (B, k) of actions, and shape (B,): advantages, `targets` of V(s), and
+        what else `objective` takes.
+        """
+        config = self.config
+        count = len(targets)
+        if config.normalize and count > 1:
+            advantage = advantage - advantage.sum() / count
+            advantage /= math.sqrt(advantage.dot(advantage) / (count - 1)) + 1e-8
+        outputs = self._both.forward(inputs.T)
+        log_probability, entropy = self._actor.head.score(outputs[0], actions.T)
+        gains, weights = self.objective(log_probability, advantage, *before)
+        errors = outputs[1, 0] - targets
+        slopes = outputs  # the derivatives take the place of the outputs; others of them are 0
+        slopes[0] = self._actor.head.back(weights * (-1 / count), -config.ent_coef)
+        np.multiply(errors, 2 * config.vf_coef / count, out=slopes[1, 0])
+        self._both.backward(slopes)
+        return float(gains.sum()) / count, entropy, float(errors.dot(errors)) / count
+
+    def objective(self, log_probability: Floats, advantage: Floats) -> tuple[Floats, Floats]:
+        """The gain of each transition, and its derivative by log P, all of shape (B,)."""
+        return log_probability * advantage, advantage
+
+    def inputs(self, observations: Floats, seen: Floats) -> Floats:
+        """Inputs of actor and critic, (T, N, n), the same for both; or of each, (T, N, m, 2)."""
+        return observations
 
     def advantages(self, rollout: Rollout) -> tuple[Numbers, Numbers, Floats]:
         """A_t and V(s_t) of every row, shape (T, N), and the inputs of the critic for them."""
@@ -93,5 +122,5 @@ class A2C(Learner):
     def _values(self, seen: Floats) -> Numbers:
         """V(s), shape (...), of inputs of the critic, shape (..., m)."""
         *lead, size = seen.shape
-        values = self._critic.forward(seen.reshape(-1, size))
+        values = self._critic.forward(seen.reshape(-1, size).T)
         return values.reshape(lead).astype(np.float64)

@@ -178,6 +178,8 @@ def _read(data: bytes, parse: Callable[[bytes], ByName]) -> Checkpoint:
     if content["format"] != FORMAT:
         found_format = shortened(content["format"])
         raise InputError(f"expected a checkpoint of format {FORMAT}, got {found_format}")
+    if isinstance(content["config"], dict):  # older files have no scale
+        content["config"].setdefault("reward_scale", 1.0)
     spec = EnvSpec.from_json(content["spec"])
     env = EnvConfig.from_dict(content["env"]) if content["env"] else None
     arrays = parse(data)

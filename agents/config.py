@@ -22,6 +22,8 @@ class Config:
     """Lower the learning rate linearly to zero over the run."""
     gamma: Annotated[float, Limits(0.0, 1.0)] = 0.99
     """Discount. The paper names none."""
+    reward_scale: Annotated[float, Limits(0.0, 1e30, above=True)] = 1.0
+    """Factor of the rewards that it learns from; returns are shown without it."""
     log_std: Annotated[float, Limits(-4.0, 1.0)] = -0.5
     """Initial logarithm of the policy's standard deviation, in units of the action."""
 

@@ -6,12 +6,12 @@ import numpy as np
 
 from .networks import Floats, Module, Weights
 
-_LOG_STD = np.array([-4.0, 1.0], np.float32)
+_LOG_STD = (np.float32(-4.0), np.float32(1.0))
 """Least and greatest logarithm of a standard deviation."""
 
 
 class Head(Module):
-    """A distribution of actions (B, k), or (B, 1) of choices, by a network's outputs.
+    """A distribution of actions by a network's outputs.
 
     This one has none: its policy flies the most likely action alone.
     """
@@ -24,11 +24,11 @@ class Head(Module):
         raise NotImplementedError
 
     def sample(self, output: Floats, noise: Floats) -> Floats:
-        """Actions, not clipped, from outputs and rows of `noise`; in the memory of the outputs."""
+        """Actions, not clipped, from outputs and rows of `noise`, all (B, k); choices (B, 1)."""
         raise NotImplementedError
 
     def score(self, output: Floats, actions: Floats) -> tuple[Floats, float]:
-        """Log-probabilities, shape (B,), and the mean entropy."""
+        """Log-probabilities, shape (B,), of actions (k, B), and the mean entropy."""
         raise NotImplementedError
 
     def back(self, by_log_probability: Floats, by_entropy: float) -> Floats:
@@ -51,6 +51,9 @@ class Gaussian(Head):
     def bind(self, weights: Weights) -> None:
         self.log_std = weights.arrays["log_std"]
         self._by_log_std = weights.gradients["log_std"]
+        size = self.log_std.size
+        self._halves = np.full(size, 0.5, np.float32)
+        self._constant = 0.5 * size * math.log(2 * math.pi)
 
     def initialise(self, log_std: float) -> None:
         self.log_std[...] = log_std
@@ -61,22 +64,22 @@ class Gaussian(Head):
         return noise
 
     def sample(self, output: Floats, noise: Floats) -> Floats:
-        output += noise
-        return output
+        return np.add(output, noise, order="C")
 
     def score(self, output: Floats, actions: Floats) -> tuple[Floats, float]:
-        self._inverse = np.exp(-self.log_std)
-        self._noise = (actions - output) * self._inverse
-        self._squares = self._noise * self._noise
-        size = self.log_std.size
-        constant = 0.5 * size * math.log(2 * math.pi) + float(self.log_std.sum())
-        halves = np.full(size, -0.5, np.float32)
-        return self._squares.dot(halves) - constant, constant + 0.5 * size
+        errors = np.subtract(actions, output, order="C")
+        self._by_output = errors * np.exp(-2 * self.log_std)[:, np.newaxis]
+        self._squares = np.multiply(errors, self._by_output, out=errors)
+        constant = self._constant + float(self.log_std.sum())
+        entropy = constant + 0.5 * self.log_std.size
+        return -constant - self._halves.dot(self._squares), entropy
 
     def back(self, by_log_probability: Floats, by_entropy: float) -> Floats:
-        self._by_log_std[...] = by_log_probability.dot(self._squares - 1) + by_entropy
-        slope: Floats = by_log_probability[:, np.newaxis] * (self._noise * self._inverse)
-        return slope
+        self._squares -= 1.0
+        np.dot(self._squares, by_log_probability, out=self._by_log_std)
+        self._by_log_std += by_entropy
+        self._by_output *= by_log_probability
+        return self._by_output
 
     def clamp(self) -> None:
         """Keep the standard deviation between e^-4 and e."""
@@ -94,23 +97,21 @@ class Categorical(Head):
         return rng.gumbel(size=(steps, self._size)).astype(np.float32)
 
     def sample(self, output: Floats, noise: Floats) -> Floats:
-        output += noise
-        chosen: Floats = output.argmax(axis=1)[:, np.newaxis].astype(np.float32)
+        chosen: Floats = (output + noise).argmax(axis=1)[:, np.newaxis].astype(np.float32)
         return chosen
 
     def score(self, output: Floats, actions: Floats) -> tuple[Floats, float]:
-        output -= output.max(axis=1, keepdims=True)
-        self._shares = np.exp(output)
-        total = self._shares.sum(axis=1, keepdims=True)
-        output -= np.log(total)
+        self._logs = output - output.max(axis=0)
+        self._shares = np.exp(self._logs)
+        total = self._shares.sum(axis=0)
+        self._logs -= np.log(total)
         self._shares /= total
-        self._logs = output
-        self._entropy = -(self._shares * output).sum(axis=1, keepdims=True)
-        self._chosen = np.arange(len(output)), actions[:, 0].astype(int)
-        return output[self._chosen], float(self._entropy.mean())
+        self._entropy = -(self._shares * self._logs).sum(axis=0)
+        self._chosen = actions[0].astype(int), np.arange(output.shape[1])
+        return self._logs[self._chosen], float(self._entropy.mean())
 
     def back(self, by_log_probability: Floats, by_entropy: float) -> Floats:
-        slope: Floats = -by_log_probability[:, np.newaxis] * self._shares
+        slope: Floats = -by_log_probability * self._shares
         slope[self._chosen] += by_log_probability
-        slope -= by_entropy / len(slope) * self._shares * (self._logs + self._entropy)
+        slope -= by_entropy / slope.shape[1] * self._shares * (self._logs + self._entropy)
         return slope

@@ -3,13 +3,14 @@
 import json
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
 
 from .config import Config
 from .episodes import EpisodeRecorder
-from .networks import ByName, Floats, Module, Weights, bind_parts, make_network, named, shapes_of
+from .networks import ByName, Floats, Weights, make_network, named
 from .optimizers import Adam
 from .policies import NetworkPolicy, flat_size
 from .rollouts import Collector, Diverged, Rollout
@@ -21,8 +22,12 @@ OnUpdate = Callable[[], bool]
 class Learner:
     """Base of our own algorithms, which learn from what the current policy has just flown.
 
+    Actor and critic compute together in an update, as one network: in each of its arrays the first
+    row is the actor's, the second the critic's, with zeros for what only the other one has. While
+    drones fly, and for values, each computes alone on the same weights.
+
     Attributes:
-        weights: Of all networks: `actor.…`, and of a critic `critic.…`.
+        weights: Of both: arrays of shape (2, ...), or (1, ...) without a critic.
         optimizer: Adam of all weights.
         rate: Learning rate of the next update.
         terms: Of the loss of the last update: `gain`, the mean of weight · log P, which the actor
@@ -43,17 +48,19 @@ class Learner:
         self.rate = config.learning_rate
         self.terms: dict[str, Any] = {}
         weights_seed, self._rng = seeds_of(seed)
-        self._actor = NetworkPolicy(log.spec, config)
-        modules: dict[str, Module] = {"actor.": self._actor}
-        if self.has_critic:
-            drones = len(log.spec.agents) if self.central else 1
-            self._critic = make_network(flat_size(log.spec) * drones, 1, config)
-            modules["critic."] = self._critic
-        self.weights = Weights.zeros(shapes_of(modules))
-        bind_parts(modules, self.weights)
+        self._actor = actor = NetworkPolicy(log.spec, config)
+        inputs = flat_size(log.spec) * (len(log.spec.agents) if self.central else 1)
+        self._both = make_network(inputs, actor.actions.outputs, config)
+        count = 2 if self.has_critic else 1
+        shapes = {**self._both.shapes, **actor.head.shapes}
+        self.weights = Weights.zeros({name: (count, *shape) for name, shape in shapes.items()})
+        self._both.bind(self.weights)
+        actor.bind(self.weights.of_one(0, actor.shapes))
         rng = np.random.default_rng(weights_seed)
-        self._actor.initialise(rng, config.log_std)
+        actor.initialise(rng, config.log_std)
         if self.has_critic:
+            self._critic = make_network(inputs, 1, config)
+            self._critic.bind(self.weights.of_one(1, self._critic.shapes))
             self._critic.initialise(rng, 1.0)
         self.optimizer = Adam(self.weights, self.epsilon)
 
@@ -76,6 +83,7 @@ class Learner:
         while log.env_steps < env_steps:
             before = log.env_steps
             rollout = self.collect(collector, env_steps - before)
+            rollout = replace(rollout, rewards=self.config.reward_scale * rollout.rewards)
             if self.config.anneal:
                 self.rate = self.config.learning_rate * (1 - before / env_steps)
             if len(rollout):
@@ -128,7 +136,7 @@ class Learner:
             spread = np.var(targets)
             left = np.var(targets - terms.pop("values"))
             numbers["explained_variance"] = 1 - float(left) / float(spread) if spread else np.nan
-        deviations = self.weights.arrays.get("actor.log_std")
+        deviations = self._actor.weights.arrays.get("log_std")
         if deviations is not None:
             numbers["std"] = np.exp(deviations).mean()
         numbers |= {"learning_rate": self.rate, "n_updates": self.optimizer.steps, **terms}

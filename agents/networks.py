@@ -1,12 +1,15 @@
 """Networks in NumPy: a sequence of layers with gradients by hand, and the kinds of networks.
 
-Small networks are faster here than in torch, and torch is not imported.
+Small networks are faster here than in torch, and torch is not imported. Arrays are feature-major:
+shape (..., n, B) for a batch of B. A leading axis counts networks of the same layers that compute
+together, as an actor and its critic. Layers keep their arrays from batch to batch: what they return
+holds until their next call.
 """
 
 import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Final, TypeVar
 
@@ -32,6 +35,14 @@ def part_of(items: Mapping[str, Item], prefix: str) -> dict[str, Item]:
     return {k.removeprefix(prefix): item for k, item in items.items() if k.startswith(prefix)}
 
 
+def views(flat: Floats, shapes: Shapes) -> dict[str, Floats]:
+    """Arrays by name, one after the other, in a flat array."""
+    ends = np.cumsum([math.prod(shape) for shape in shapes.values()])[:-1]
+    parts = np.split(flat, ends)
+    named_parts = zip(shapes.items(), parts, strict=True)
+    return {name: part.reshape(shape) for (name, shape), part in named_parts}
+
+
 @dataclass(frozen=True)
 class Weights:
     """Arrays by name and their gradients, all of them views of two flat arrays.
@@ -39,46 +50,32 @@ class Weights:
     So Adam, the norm of a gradient and a copy are one call for all networks of an agent.
     """
 
-    shapes: Shapes
-    """Of every array, in the order of the flat array."""
     values: Floats
     """Shape (P,)."""
     slopes: Floats
     """Derivatives of the loss by `values`, shape (P,)."""
+    arrays: dict[str, Floats]
+    gradients: dict[str, Floats]
 
     @classmethod
     def zeros(cls, shapes: Shapes) -> "Weights":
         """Arrays of these shapes."""
         size = sum(map(math.prod, shapes.values()))
-        return cls(shapes, np.zeros(size, np.float32), np.zeros(size, np.float32))
-
-    @property
-    def arrays(self) -> dict[str, Floats]:
-        """The weights by name: views."""
-        return self._views(self.values)
-
-    @property
-    def gradients(self) -> dict[str, Floats]:
-        """Their gradients by name: views."""
-        return self._views(self.slopes)
+        values, slopes = np.zeros((2, size), np.float32)
+        return cls(values, slopes, views(values, shapes), views(slopes, shapes))
 
     def part(self, prefix: str) -> "Weights":
-        """The arrays with names that begin so, which are neighbours, without this prefix."""
-        spans = list(part_of(self._spans(), prefix).values())
-        some = slice(spans[0].start, spans[-1].stop)
-        return Weights(part_of(self.shapes, prefix), self.values[some], self.slopes[some])
+        """The arrays with names that begin so, without this prefix."""
+        arrays = part_of(self.arrays, prefix)
+        return replace(self, arrays=arrays, gradients=part_of(self.gradients, prefix))
 
-    def _spans(self) -> dict[str, slice]:
-        spans = {}
-        first = 0
-        for name, shape in self.shapes.items():
-            last = first + math.prod(shape)
-            spans[name] = slice(first, last)
-            first = last
-        return spans
+    def of_one(self, number: int, shapes: Shapes) -> "Weights":
+        """The arrays of one of the networks that compute together; it may be smaller."""
 
-    def _views(self, flat: Floats) -> dict[str, Floats]:
-        return {name: flat[span].reshape(self.shapes[name]) for name, span in self._spans().items()}
+        def own(arrays: dict[str, Floats]) -> dict[str, Floats]:
+            return {k: arrays[k][number][tuple(map(slice, shape))] for k, shape in shapes.items()}
+
+        return replace(self, arrays=own(self.arrays), gradients=own(self.gradients))
 
 
 class Module:
@@ -95,7 +92,7 @@ class Module:
 
 
 class Layer(Module):
-    """A step of a network, from inputs (B, n) to outputs (B, k)."""
+    """A step of a network, from inputs (..., n, B) to outputs (..., k, B)."""
 
     def initialise(self, rng: np.random.Generator, gain: float) -> None:
         """Draw the weights."""
@@ -109,9 +106,9 @@ class Layer(Module):
 
     @abstractmethod
     def back(self, slope: Floats) -> Floats:
-        """Derivatives by the last inputs, from those by the outputs, which it may overwrite.
+        """Derivatives by the last inputs, from those by the outputs.
 
-        It is called after `learn`, which may not.
+        It is called once, after `learn`, and may overwrite the slope and the outputs.
         """
 
 
@@ -120,14 +117,16 @@ class Affine(Layer):
 
     def __init__(self, inputs: int, outputs: int) -> None:
         self.shapes = {"weight": (outputs, inputs), "bias": (outputs,)}
+        self._outputs = self._by_inputs = np.zeros((0, 0), np.float32)
 
     def bind(self, weights: Weights) -> None:
-        arrays = weights.arrays
-        slopes = weights.gradients
-        self.weight = arrays["weight"]
-        self.bias = arrays["bias"][np.newaxis]
-        self._by_weight = slopes["weight"]
-        self._by_bias = slopes["bias"]
+        self.weight = weights.arrays["weight"]
+        self.bias = weights.arrays["bias"]
+        self._column = self.bias[..., np.newaxis]
+        self._multiply = np.dot if self.weight.ndim == 2 else np.matmul  # `dot` begins faster
+        self._transposed = self.weight.swapaxes(-1, -2)
+        self._by_weight = weights.gradients["weight"]
+        self._by_bias = weights.gradients["bias"]
 
     def initialise(self, rng: np.random.Generator, gain: float) -> None:
         self.weight[...] = orthogonal(rng, self.weight.shape, gain)
@@ -135,26 +134,30 @@ class Affine(Layer):
 
     def forward(self, inputs: Floats) -> Floats:
         self._inputs = inputs
-        outputs: Floats = inputs.dot(self.weight.T)
-        outputs += self.bias
-        return outputs
+        if self._outputs.shape[-1] != inputs.shape[-1]:
+            self._outputs = np.empty((*self.bias.shape, inputs.shape[-1]), np.float32)
+        self._multiply(self.weight, inputs, out=self._outputs)
+        self._outputs += self._column
+        return self._outputs
 
     def learn(self, slope: Floats) -> None:
-        ones = np.ones(len(slope), np.float32)
-        np.dot(slope.T, self._inputs, out=self._by_weight)
-        np.dot(ones, slope, out=self._by_bias)
+        ones = np.ones(slope.shape[-1], np.float32)
+        np.matmul(slope, self._inputs.swapaxes(-1, -2), out=self._by_weight)
+        np.matmul(slope, ones, out=self._by_bias)
 
     def back(self, slope: Floats) -> Floats:
-        by_inputs: Floats = slope.dot(self.weight)
-        return by_inputs
+        if self._by_inputs.shape[-1] != slope.shape[-1]:
+            shape = (*self._transposed.shape[:-1], slope.shape[-1])
+            self._by_inputs = np.empty(shape, np.float32)
+        return np.matmul(self._transposed, slope, out=self._by_inputs)
 
 
 class Relu(Layer):
-    """max(x, 0)."""
+    """max(x, 0), in the place of x."""
 
     def forward(self, inputs: Floats) -> Floats:
-        self._outputs = np.maximum(inputs, np.float32(0.0))
-        return self._outputs
+        self._outputs = np.maximum(inputs, np.float32(0.0), out=inputs)
+        return inputs
 
     def back(self, slope: Floats) -> Floats:
         slope *= self._outputs > 0
@@ -162,33 +165,22 @@ class Relu(Layer):
 
 
 class Tanh(Layer):
-    """The hyperbolic tangent."""
+    """The hyperbolic tangent, in the place of x."""
 
     def forward(self, inputs: Floats) -> Floats:
-        self._outputs: Floats = np.tanh(inputs)
-        return self._outputs
+        self._outputs = np.tanh(inputs, out=inputs)
+        return inputs
 
     def back(self, slope: Floats) -> Floats:
-        slope *= 1 - self._outputs * self._outputs
+        outputs = self._outputs
+        outputs *= outputs
+        np.subtract(np.float32(1.0), outputs, out=outputs)
+        slope *= outputs
         return slope
 
 
-def shapes_of(modules: Mapping[str, Module]) -> Shapes:
-    """Shapes of the weights of modules, each with a prefix to its names."""
-    shapes: dict[str, tuple[int, ...]] = {}
-    for prefix, module in modules.items():
-        shapes |= named(prefix, module.shapes)
-    return shapes
-
-
-def bind_parts(modules: Mapping[str, Module], weights: Weights) -> None:
-    """Let each module compute with the weights of its prefix."""
-    for prefix, module in modules.items():
-        module.bind(weights.part(prefix))
-
-
 class Network(Module):
-    """Layers in a row, from inputs (B, n) to outputs (B, k). Subclasses build them.
+    """Layers in a row, from inputs (..., n, B) to outputs (..., k, B). Subclasses build them.
 
     Attributes:
         layers: In the order of evaluation.
@@ -199,14 +191,18 @@ class Network(Module):
         self.layers = list(self.build(inputs, outputs, config))
         with_weights = [layer for layer in self.layers if layer.shapes]
         self._named = {f"layers.{i}.": layer for i, layer in enumerate(with_weights)}
-        self.shapes = shapes_of(self._named)
+        shapes: dict[str, tuple[int, ...]] = {}
+        for prefix, layer in self._named.items():
+            shapes |= named(prefix, layer.shapes)
+        self.shapes = shapes
 
     @abstractmethod
     def build(self, inputs: int, outputs: int, config: Config) -> Sequence[Layer]:
         """The layers, which allocate nothing yet."""
 
     def bind(self, weights: Weights) -> None:
-        bind_parts(self._named, weights)
+        for prefix, layer in self._named.items():
+            layer.bind(weights.part(prefix))
 
     def initialise(self, rng: np.random.Generator, gain: float) -> None:
         """Draw the weights, with the gain sqrt(2) but for the last layer that has weights."""
@@ -217,12 +213,16 @@ class Network(Module):
 
     def forward(self, inputs: Floats) -> Floats:
         """The outputs; the inputs stay as they are."""
+        outputs = inputs if isinstance(self.layers[0], Affine) else inputs.copy()
         for layer in self.layers:
-            inputs = layer.forward(inputs)
-        return inputs
+            outputs = layer.forward(outputs)
+        return outputs
 
-    def backward(self, slope: np.ndarray) -> None:
-        """Set the gradients of a loss, from its derivatives by the last outputs, shape (B, k)."""
+    def backward(self, slope: Floats) -> None:
+        """Set the gradients of a loss, from its derivatives by the last outputs, (..., k, B).
+
+        Once after a `forward`; the slope and what that returned are overwritten.
+        """
         first = self.layers[0]
         for layer in reversed(self.layers):
             layer.learn(slope)

@@ -8,42 +8,49 @@ from .networks import ByName, Floats, Weights
 
 
 class Adam:
-    """Kingma and Ba 2015, Algorithm 1, with their constants and torch's order of operations.
+    """Kingma and Ba 2015, Algorithm 1, with their constants.
 
     Attributes:
-        state: All that it keeps between two steps, by name: a checkpoint writes it in place.
+        state: All that it keeps between two steps, by name: a checkpoint writes it in place. The
+            sums of the gradients and of their squares, weighted by powers of the constants, are
+            the article's moments without the factors 0.1 and 0.001, which the step takes on.
     """
 
     def __init__(self, weights: Weights, epsilon: float = 1e-8) -> None:
         self._weights = weights
         self._epsilon = epsilon
-        self._first = np.zeros_like(weights.values)
-        self._second = np.zeros_like(weights.values)
+        self._sums = np.zeros_like(weights.values)
+        self._squares = np.zeros_like(weights.values)
+        self._scratch = np.empty_like(weights.values)
         self._count = np.zeros((), np.int64)
-        self.state: ByName = {
-            "first": self._first,
-            "second": self._second,
-            "steps": self._count,
-        }
+        self.state: ByName = {"sums": self._sums, "squares": self._squares, "steps": self._count}
 
     @property
     def steps(self) -> int:
         """Steps so far."""
         return int(self._count)
 
-    def step(self, rate: float | Floats) -> None:
-        """Move the weights against their gradients; rates may differ, float32, shape (P,)."""
+    def step(self, rate: float, scales: Floats | None = None) -> None:
+        """Move the weights against their gradients, each times its scale, float32, shape (P,)."""
         self._count += 1
+        steps = self.steps
         slopes = self._weights.slopes
-        self._first += 0.1 * (slopes - self._first)
-        self._second *= 0.999
-        self._second += (0.001 * slopes) * slopes
-        scale = np.sqrt(self._second)
-        scale /= math.sqrt(1 - 0.999**self.steps)
-        scale += self._epsilon
-        np.divide(self._first, scale, out=scale)
-        scale *= rate / (1 - 0.9**self.steps)
-        self._weights.values[...] -= scale
+        change = self._scratch
+        self._sums *= 0.9
+        self._sums += slopes
+        self._squares *= 0.999
+        np.multiply(slopes, slopes, out=change)
+        self._squares += change
+        of_sums = 0.1 / (1 - 0.9**steps)
+        of_roots = math.sqrt(0.001 / (1 - 0.999**steps))
+        np.sqrt(self._squares, out=change)
+        change += self._epsilon / of_roots
+        np.divide(self._sums, change, out=change)
+        change *= rate * of_sums / of_roots
+        if scales is not None:
+            change *= scales
+        values = self._weights.values
+        values -= change
 
 
 def clip_norm(slopes: Floats, most: float) -> float:

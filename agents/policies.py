@@ -156,10 +156,17 @@ class NetworkPolicy(Module):
 
     def act(self, observation: Observation) -> Action:
         """The most likely action, inside the bounds of the env."""
-        output = self.network.forward(flat(observation, self.spec, 1))
+        output = self.outputs(flat(observation, self.spec, 1))
         if isinstance(self.spec.action, Discrete):
             return int(output.argmax())
         return self.actions.to_envs(output).reshape(self.spec.action.shape)
+
+    def outputs(self, observations: Floats) -> Floats:
+        """Outputs of the network, shape (B, k), for flat observations, shape (B, n).
+
+        They hold until the next call.
+        """
+        return self.network.forward(observations.T).T
 
     def sample(self, observations: Floats, noise: Floats) -> Floats:
         """Actions drawn from the policy, float32, shape (N, k), not clipped.
@@ -167,15 +174,4 @@ class NetworkPolicy(Module):
         Shape (N, 1), holding whole numbers, if they are discrete. Observations are flat, shape
         (N, n); noise is N rows of `head.noise`.
         """
-        return self.head.sample(self.network.forward(observations), noise)
-
-    def score(self, observations: Floats, actions: Floats) -> tuple[Floats, float]:
-        """Log-probabilities, shape (B,), and mean entropy of actions (B, k), or (B, 1) if discrete.
-
-        Observations are flat, shape (B, n).
-        """
-        return self.head.score(self.network.forward(observations), actions)
-
-    def backward(self, by_log_probability: np.ndarray, by_entropy: float = 0.0) -> None:
-        """Set the gradients of a loss, from its derivatives by what `score` gave last."""
-        self.network.backward(self.head.back(by_log_probability, by_entropy))
+        return self.head.sample(self.outputs(observations), noise)

@@ -8,11 +8,9 @@ import numpy as np
 
 from ..models.fields import Limits, PositiveInt
 from .a2c import A2C, A2CConfig
-from .networks import Floats
+from .networks import Floats, views
 from .optimizers import clip_norm
 from .rollouts import Rollout
-
-_TERMS = ("gain", "entropy", "value_loss", "approx_kl", "clip_fraction")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,80 +51,60 @@ class PPO(A2C):
     epsilon = 1e-5  # as in Stable-Baselines3 and in Schulman's code
 
     @property
-    def rates(self) -> Floats:
-        """Learning rate of every weight in the next update, float32."""
-        rates = np.full_like(self.weights.values, self.rate)
+    def scales(self) -> Floats | None:
+        """Factor of the learning rate of every weight; None: 1."""
         critic_rate = self.config.critic_learning_rate
-        if critic_rate is not None:
-            critic = self.weights.part("critic.").values.size
-            rates[-critic:] *= critic_rate / self.config.learning_rate
-        return rates
+        if critic_rate is None:
+            return None
+        scales = np.ones_like(self.weights.values)
+        shapes = {name: array.shape for name, array in self.weights.arrays.items()}
+        for array in views(scales, shapes).values():
+            array[1] = critic_rate / self.config.learning_rate
+        return scales
 
     def update(self, rollout: Rollout) -> None:
         """Learn from a rollout: by `epochs` times `minibatches` steps of Adam."""
         config = self.config
-        columns = self._columns(rollout)
-        rates = self.rates
+        columns = self.columns(rollout)
+        scales = self.scales
         count = len(rollout)
         cuts = np.linspace(0, count, min(config.minibatches, count) + 1).astype(int).tolist()
+        self._changes: list[Floats] = []
         terms: list[tuple[float, ...]] = []
         for _ in range(config.epochs):
             order = self._rng.permutation(count)
-            shuffled = [column[order] for column in columns]
             for first, last in pairwise(cuts):
-                terms.append(self.minibatch(*(column[first:last] for column in shuffled)))
+                rows = order[first:last]
+                terms.append(self.minibatch(*(column.take(rows, axis=0) for column in columns)))
                 clip_norm(self.weights.slopes, config.max_grad_norm)
-                self.optimizer.step(rates)
-        self.terms |= dict(zip(_TERMS, np.mean(terms, axis=0).tolist(), strict=True))
-        last_epoch = terms[1 - len(cuts) :]
-        self.terms["approx_kl"] = np.mean([one[3] for one in last_epoch])
+                self.optimizer.step(self.rate, scales)
+        means = np.mean(terms, axis=0).tolist()
+        self.terms |= dict(zip(("gain", "entropy", "value_loss"), means, strict=True))
+        changes = np.concatenate(self._changes)
+        growth = np.expm1(changes)
+        self.terms["clip_fraction"] = np.mean(np.abs(growth) > config.clip)
+        distances = (growth - changes)[-count:]  # of KL in the last epoch, as SB3 estimates it
+        self.terms["approx_kl"] = distances.mean()
 
-    def minibatch(
-        self,
-        observations: Floats,
-        actions: Floats,
-        before: Floats,
-        advantage: Floats,
-        targets: Floats,
-        seen: Floats | None = None,
-    ) -> tuple[float, ...]:
-        """Set the gradients of the loss of B transitions; its terms, by the names of `terms`.
+    def columns(self, rollout: Rollout) -> list[Floats]:
+        """As of A2C, and log-probabilities by the policy that flew."""
+        columns = super().columns(rollout)
+        observations = rollout.rows(rollout.observations)
+        outputs = self._actor.outputs(observations)
+        return [*columns, self._actor.head.score(outputs.T, columns[1].T)[0]]
 
-        A central critic has `seen` more than the observations.
+    def objective(  # type: ignore[override]
+        self, log_probability: Floats, advantage: Floats, before: Floats
+    ) -> tuple[Floats, Floats]:
+        """min(r A, clip(r, 1 - c, 1 + c) A) for the ratio r of the probabilities now and before.
 
-        Log-probabilities `before`, shape (B,), are those of the policy that flew, as `advantage`,
-        and `targets` of V(s). The objective is the mean of min(r A, clip(r, 1 - c, 1 + c) A) for
-        the ratio r of the probabilities. Its derivative by log P is r A, or 0 where it is clipped.
+        Its derivative by log P is r A, or 0 where it is clipped.
         """
-        config = self.config
-        count = len(before)
-        if config.normalize and count > 1:
-            advantage = advantage - advantage.mean()
-            advantage /= np.sqrt(advantage.dot(advantage) / (count - 1)) + 1e-8
-        log_probability, entropy = self._actor.score(observations, actions)
+        clip = self.config.clip
         change = log_probability - before
+        self._changes.append(change)
         ratio = np.exp(change)
         gains = ratio * advantage
-        bounded = np.minimum(np.maximum(ratio, 1 - config.clip), 1 + config.clip) * advantage
-        self._actor.backward(gains * (gains <= bounded) / -count, -config.ent_coef)
-        inputs = observations if seen is None else seen
-        errors = self._critic.forward(inputs)[:, 0] - targets
-        self._critic.backward((2 * config.vf_coef / count * errors)[:, np.newaxis])
-        clipped = np.count_nonzero(np.abs(ratio - 1) > config.clip) / count
-        distance = float((ratio - 1 - change).mean())  # of KL, as SB3 estimates it
-        gain = float(np.minimum(gains, bounded).mean())
-        return gain, entropy, float(errors.dot(errors)) / count, distance, clipped
-
-    def _columns(self, rollout: Rollout) -> tuple[Floats, ...]:
-        """Arguments of `minibatch` for all transitions of a rollout."""
-        observations = rollout.rows(rollout.observations)
-        actions = rollout.rows(rollout.actions)
-        estimates, judged, seen = self.advantages(rollout)
-        advantage, values = (
-            rollout.rows(array).astype(np.float32) for array in (estimates, judged)
-        )
-        targets = values + advantage
-        before, _ = self._actor.score(observations, actions)
-        self.terms = {"values": values, "targets": targets}
-        more = (rollout.rows(seen),) if self.central else ()
-        return observations, actions, before, advantage, targets, *more
+        np.minimum(np.maximum(ratio, 1 - clip, out=ratio), 1 + clip, out=ratio)
+        ratio *= advantage
+        return np.minimum(gains, ratio), gains * (gains <= ratio)

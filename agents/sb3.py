@@ -101,8 +101,9 @@ class RecordedEnv(VectorEnv[Floats, Floats, np.ndarray]):
     once more with its world.
     """
 
-    def __init__(self, recorder: EpisodeRecorder) -> None:
+    def __init__(self, recorder: EpisodeRecorder, reward_scale: float = 1.0) -> None:
         self.recorder = recorder
+        self._reward_scale = reward_scale
         self.num_envs = recorder.num_envs
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
         bounds = [np.reshape(array.bounds(), (2, -1)) for array in recorder.spec.observation]
@@ -123,7 +124,7 @@ class RecordedEnv(VectorEnv[Floats, Floats, np.ndarray]):
         env = recorder.env
         recorder.fly(np.asarray(actions, np.float32).reshape(self.num_envs, -1))
         final = recorder.observations
-        rewards = env.rewards
+        rewards = self._reward_scale * env.rewards
         terminated = env.terminated
         truncated = env.truncated
         starting = recorder.done
@@ -176,7 +177,7 @@ class SB3Agent:
 
         self.model = _MODELS[type(config)](
             "MlpPolicy",
-            SB3VecEnv(RecordedEnv(log)),
+            SB3VecEnv(RecordedEnv(log, config.reward_scale)),
             learning_rate=rate,
             gamma=config.gamma,
             policy_kwargs=policy,

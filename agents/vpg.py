@@ -53,8 +53,11 @@ class VPG(Learner):
         """Of minus the mean of R_t · log P(a_t | s_t)."""
         weights = self.returns(rollout)
         observations = rollout.rows(rollout.observations)
-        log_probability, entropy = self._actor.score(observations, rollout.rows(rollout.actions))
-        self._actor.backward(-weights / len(weights))
+        actions = rollout.rows(rollout.actions)
+        (output,) = outputs = self._both.forward(observations.T)
+        log_probability, entropy = self._actor.head.score(output, actions.T)
+        output[...] = self._actor.head.back(weights * np.float32(-1 / len(weights)), 0.0)
+        self._both.backward(outputs)
         self.terms = {"gain": (log_probability * weights).mean(), "entropy": entropy}
 
     def returns(self, rollout: Rollout) -> Floats:

@@ -44,7 +44,7 @@ def crashed(policy: NetworkPolicy) -> np.ndarray:
     observations, _ = envs.reset(seed=0)
     ended = np.zeros(len(ERRORS), bool)
     for _ in range(250):
-        actions = policy.actions.to_envs(policy.network.forward(observations))
+        actions = policy.actions.to_envs(policy.outputs(observations))
         observations, _, terminated, _, _ = envs.step(actions)
         ended |= terminated
     return ended
@@ -52,7 +52,7 @@ def crashed(policy: NetworkPolicy) -> np.ndarray:
 
 def slope(policy: NetworkPolicy, start: list[float], end: list[float]) -> float:
     """Change of the action from one observation to another, over the change of what differs."""
-    low, high = policy.network.forward(np.array((start, end), np.float32))[:, 0]
+    low, high = policy.outputs(np.array((start, end), np.float32))[:, 0]
     return round(float(high - low) / (sum(end) - sum(start)), 2)
 
 

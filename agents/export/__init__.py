@@ -61,7 +61,7 @@ def _check_finite(policy: NetworkPolicy) -> None:
     largest = np.minimum(np.concatenate(bounds, axis=None), _FAR)
     shares = np.random.default_rng(0).uniform(-1.0, 1.0, (_TRIED, largest.size))
     with np.errstate(over="ignore", invalid="ignore"):
-        outputs = policy.network.forward((shares * largest).astype(np.float32))
+        outputs = policy.outputs((shares * largest).astype(np.float32))
     if not np.isfinite(outputs).all():
         raise InputError("policy: expected finite actions, got NaN or infinity: training diverged")
 

@@ -1,10 +1,11 @@
 """Networks and policies of chosen numbers."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from rotorgram.agents.config import Config, SACConfig
-from rotorgram.agents.networks import MLP, Network, Weights
+from rotorgram.agents.networks import MLP, Network, Weights, named
 from rotorgram.agents.policies import NetworkPolicy
 from rotorgram.envs.spec import EnvSpec
 
@@ -23,6 +24,19 @@ def bound(network: Network, values: np.ndarray | float = 0.0) -> Weights:
     weights.values[:] = values
     network.bind(weights)
     return weights
+
+
+def arrays_of(agent: Any) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Weights of a learner by name, as `critic.layers.0.bias`, and their gradients: views."""
+    arrays: dict[str, np.ndarray] = {}
+    gradients: dict[str, np.ndarray] = {}
+    parts = {"actor.": agent._actor.weights}
+    if agent.has_critic:
+        parts["critic."] = agent.weights.of_one(1, agent._critic.shapes)
+    for prefix, weights in parts.items():
+        arrays |= named(prefix, weights.arrays)
+        gradients |= named(prefix, weights.gradients)
+    return arrays, gradients
 
 
 def mlp_of(

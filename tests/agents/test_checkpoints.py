@@ -265,7 +265,7 @@ def test_parts_that_do_not_fit_are_refused(
         resume_agent(wrong, log)
 
 
-@pytest.mark.parametrize("name", ["optimizer.first", "weights", "rng"])
+@pytest.mark.parametrize("name", ["optimizer.sums", "weights", "rng"])
 def test_a_missing_part_is_refused(name: str, ppo_kept: Checkpoint) -> None:
     state = dict(ppo_kept.state)
     del state[name]

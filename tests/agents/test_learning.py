@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from drones import LINE, ONE, Constant, Kept, cases, log_of, rollout, vector
+from nets import arrays_of
 from rotorgram.agents import (
     ALGORITHMS,
     A2CConfig,
@@ -33,16 +34,16 @@ def slopes_of(agent: VPG | A2C, data: Rollout) -> dict[str, Any]:
     """Derivatives of the loss by log P, shape (T,), by the entropy, and by V, shape (T,)."""
     slopes: dict[str, Any] = {}
 
-    def actor(by_log_probability: np.ndarray, by_entropy: float = 0.0) -> None:
+    def head(by_log_probability: np.ndarray, by_entropy: float) -> np.ndarray:
         slopes["actor"] = by_log_probability
         slopes["entropy"] = by_entropy
+        return np.zeros((1, len(by_log_probability)), np.float32)
 
-    def critic(slope: np.ndarray) -> None:
-        slopes["critic"] = slope[:, 0]
+    def both(slope: np.ndarray) -> None:
+        slopes["critic"] = slope[-1, 0]
 
-    agent._actor.backward = actor  # type: ignore[method-assign]
-    if agent.has_critic:
-        agent._critic.backward = critic  # type: ignore[method-assign]
+    agent._actor.head.back = head  # type: ignore[method-assign]
+    agent._both.backward = both  # type: ignore[method-assign]
     agent.gradient(data)
     return slopes
 
@@ -54,7 +55,7 @@ def a2c(**changes: Any) -> A2C:
 
 def advantage_of(agent: A2C) -> np.ndarray:
     """Equation 3 for `rollout`, whose last step terminates."""
-    first, second, third = agent._critic.forward(rollout().observations[:, 0])[:, 0]
+    first, second, third = agent._critic.forward(rollout().observations[:, 0].T)[0]
     return np.array([1 + 0.5 * second - first, 2 + 0.5 * third - second, 4 - third])
 
 
@@ -150,7 +151,7 @@ def train_both(
 ) -> list[tuple[dict[str, float], dict[str, float]]]:
     """SB3 flies; ours, from the same weights, is given what it flew: scalars of both by update."""
     weights = weights_of_sb3(theirs)
-    for name, array in ours.weights.arrays.items():
+    for name, array in arrays_of(ours)[0].items():
         array[...] = weights[name]
     buffer = theirs.model.rollout_buffer
     seen: dict[str, np.ndarray] = {}
@@ -269,6 +270,24 @@ def test_what_is_stored_is_not_clipped_and_what_is_flown_is_in_the_units_of_the_
     np.testing.assert_allclose(env.flown, expected, rtol=1e-6)
 
 
+@pytest.mark.parametrize("algorithm", SMALL)
+def test_rewards_are_scaled_for_the_learner_alone(algorithm: str) -> None:
+    """Rewards of 1 in episodes of 8 steps, and 0 where an episode begins."""
+    log = log_of("end")
+    config = preset(algorithm, "tuned", reward_scale=0.25, **SMALL[algorithm])
+    agent: Any = make_agent(algorithm, log, config, 0)
+    learned: list[np.ndarray] = []
+    if isinstance(agent, SB3Agent):
+        agent.train(log, 64, lambda: True)
+        learned.append(agent.model.rollout_buffer.rewards)
+    else:
+        agent.update = lambda data: learned.append(data.rewards)
+        agent.train(log, 64, lambda: True)
+    assert set(np.concatenate(learned).ravel()) <= {0.0, 0.25}
+    assert np.concatenate(learned).max() == 0.25
+    assert log.episodes[0].total_reward == 8.0
+
+
 def overwrite(agent: Any, fill: Callable[[np.ndarray], None]) -> None:
     """After each step of its optimizer, fill every array of weights."""
     if isinstance(agent, SB3Agent):
@@ -276,7 +295,7 @@ def overwrite(agent: Any, fill: Callable[[np.ndarray], None]) -> None:
         arrays = [p.detach().numpy() for p in agent.model.policy.parameters()]
     else:
         optimizer = agent.optimizer
-        arrays = list(agent.weights.arrays.values())
+        arrays = list(arrays_of(agent)[0].values())
     step = optimizer.step
 
     def then_fill(*arguments: Any) -> None:

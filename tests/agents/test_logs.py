@@ -15,7 +15,6 @@ from drones import log_of, rollout, vector
 from rich.console import Console
 from rotorgram.agents import VPGConfig, preset
 from rotorgram.agents.checkpoints import Checkpoint, load, store
-from rotorgram.agents.networks import Weights
 from rotorgram.agents.vpg import VPG
 from rotorgram.cli import main
 from rotorgram.cli._progress import Bars, Lines
@@ -139,14 +138,9 @@ TWO_STEPS = rollout("two episodes")
 LOG_P = [-0.045 - 0.9189385, -2.0 - 0.9189385]  # of the actions, of mean 0 and deviation 1
 
 
-def fill(weights: Weights, value: float) -> None:
-    for name, array in weights.arrays.items():
-        array[...] = value if name.endswith("weight") else 0.0
-
-
 def test_the_terms_of_vpg_by_hand() -> None:
     agent = VPG(log_of(), VPGConfig(hidden=(1,), log_std=0.0), 0)
-    fill(agent.weights.part("actor."), 0.0)
+    agent.weights.values[:] = 0.0
     agent.gradient(TWO_STEPS)
     logged = agent.scalars()
     assert logged["train/policy_loss"] == pytest.approx(-(1 * LOG_P[0] + 2 * LOG_P[1]) / 2)

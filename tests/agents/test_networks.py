@@ -75,9 +75,9 @@ def test_gradients_are_those_of_torch(hidden: tuple[int, ...], activation: str) 
     output = torch_mlp(theirs, torch.from_numpy(seen), activation)
     weighted = output * torch.from_numpy(slope)
     weighted.sum().backward()
-    found = net.forward(seen)
+    found = net.forward(seen.T).T
     np.testing.assert_allclose(found, output.detach(), rtol=1e-5, atol=1e-5)
-    net.backward(slope)
+    net.backward(slope.T)
     agree(weights, theirs)
 
 
@@ -99,14 +99,14 @@ def test_log_probability_entropy_and_their_gradients_are_those_of_torch(discrete
         choices = torch.distributions.Normal(output, theirs["log_std"].exp())
         expected = choices.log_prob(given).sum(1)
         entropy = choices.entropy().sum(1).mean()
-    got, mean = ours.score(seen, actions)
+    got, mean = ours.head.score(ours.network.forward(seen.T), actions.T)
     np.testing.assert_allclose(got, expected.detach(), rtol=1e-5, atol=1e-5)
     assert mean == pytest.approx(entropy.item(), rel=1e-5)
     slope = normal(BATCH)
     weighted = expected * torch.from_numpy(slope)
     loss = weighted.sum() - 0.7 * entropy
     loss.backward()
-    ours.backward(slope, -0.7)
+    ours.network.backward(ours.head.back(slope, -0.7))
     agree(ours.weights, theirs)
 
 
@@ -166,8 +166,8 @@ def test_activations_may_come_first_and_last() -> None:
     network = Squashed(2, 3, VPGConfig())
     weights = bound(network)
     network.initialise(np.random.default_rng(0), 0.01)
-    inputs = np.array([[0.5, -2.0]], np.float32)
+    inputs = np.array([[0.5], [-2.0]], np.float32)
     network.forward(inputs)
-    assert inputs.tolist() == [[0.5, -2.0]]
+    assert inputs.tolist() == [[0.5], [-2.0]]
     columns = np.linalg.norm(weights.arrays["layers.0.weight"], axis=0)
     np.testing.assert_allclose(columns, 0.01, rtol=1e-5)

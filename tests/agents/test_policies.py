@@ -33,10 +33,10 @@ def test_a_loaded_policy_gives_what_the_learning_one_gives(
     policy = policy_of(learning.arrays(), spec, activation)
     numbers = np.random.default_rng(0).normal(size=(50, 3))
     observations = numbers.astype(np.float32)
-    expected = learning.network.forward(observations)
-    found = policy.network.forward(observations)
+    expected = learning.outputs(observations)
+    found = policy.outputs(observations)
     np.testing.assert_array_equal(found, expected)
-    first = policy.network.forward(observations[:1])
+    first = policy.outputs(observations[:1])
     np.testing.assert_allclose(first, expected[:1], rtol=1e-5, atol=1e-5)
 
 
@@ -49,10 +49,10 @@ def test_outputs_are_squashed() -> None:
     seen = np.array([[1, 0.3, 0]], np.float32)
     noise = np.zeros(2, np.float32)
     policy = policy_of(layers | {"log_std": noise}, BOX)
-    found = policy.network.forward(seen)
+    found = policy.outputs(seen)
     np.testing.assert_allclose(found, [[20.8, 0.5]], rtol=1e-5)
     squashed = policy_of(layers, BOX, squash=True)
-    found = squashed.network.forward(seen)
+    found = squashed.outputs(seen)
     np.testing.assert_allclose(found, [[1, np.tanh(0.5)]], rtol=1e-5)
 
 
@@ -71,7 +71,7 @@ def test_gaussian_sampling_has_the_mean_and_deviation_of_the_policy() -> None:
     observation = np.ones((1, 3), np.float32)
     drawn = drawn_of(policy, observation)
     std = np.exp(policy.arrays()["log_std"])
-    mean = policy.network.forward(observation)[0]
+    mean = policy.outputs(observation)[0]
     np.testing.assert_allclose(drawn.mean(0), mean, atol=5 * std.max() / 200)
     np.testing.assert_allclose(drawn.std(0), std, rtol=0.02)
     assert drawn.dtype == np.float32
@@ -82,7 +82,7 @@ def test_categorical_sampling_has_the_probabilities_of_the_policy() -> None:
     observation = np.zeros((1, 3), np.float32)
     drawn = drawn_of(policy, observation)
     counts = np.bincount(drawn[:, 0].astype(int), minlength=3)
-    shares = np.exp(policy.network.forward(observation)[0])
+    shares = np.exp(policy.outputs(observation)[0])
     expected = shares / shares.sum()
     np.testing.assert_allclose(counts / DRAWS, expected, atol=0.012)
     envs = policy.actions.to_envs(drawn)

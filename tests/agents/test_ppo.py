@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from drones import log_of, rollout
+from nets import arrays_of
 from rotorgram.agents import PPOConfig, find_preset, load
 from rotorgram.agents.ppo import PPO
 from rotorgram.models.errors import InputError
@@ -18,10 +19,11 @@ SMALL = PPOConfig(gamma=0.5, gae_lambda=0.5, steps_per_update=3, epochs=1, minib
 def test_rates_of_actor_and_critic() -> None:
     """Adam's first step is the rate, whatever the gradient."""
     agent = PPO(log_of(), replace(SMALL, learning_rate=0.01, critic_learning_rate=0.03), 0)
-    before = {name: array.copy() for name, array in agent.weights.arrays.items()}
+    arrays, gradients = arrays_of(agent)
+    before = {name: array.copy() for name, array in arrays.items()}
     agent.update(rollout())
-    for name, array in agent.weights.arrays.items():
-        moved = np.abs(array - before[name])[np.abs(agent.weights.gradients[name]) > 1e-3]
+    for name, array in arrays.items():
+        moved = np.abs(array - before[name])[np.abs(gradients[name]) > 1e-3]
         rate = 0.03 if name.startswith("critic.") else 0.01
         np.testing.assert_allclose(moved, rate, rtol=0.01, err_msg=name)
 
@@ -93,3 +95,14 @@ def test_training_by_the_command_takes_the_preset_s_drones_and_loads_no_torch(
     assert kept.num_envs == 32
     assert kept.algorithm == "ppo"
     assert 2100 <= kept.position.env_steps < 2132
+
+
+@pytest.mark.parametrize("algorithm", ["vpg", "a2c"])
+def test_the_other_learners_load_no_torch(algorithm: str, tmp_path: Path) -> None:
+    words = ["train", algorithm, "--no-udp", "--env-steps", "600", "--out", str(tmp_path / "run")]
+    code = f"import sys; from rotorgram.cli import main; assert main({words}) == 0; " + (
+        "print(sorted({'torch', 'tensorflow', 'stable_baselines3'} & set(sys.modules)))"
+    )
+    told = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert told.stdout.splitlines()[-1] == "[]"
+    assert list((tmp_path / "run").rglob("events.out.tfevents.*"))

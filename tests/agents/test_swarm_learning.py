@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 from drones import cases
+from nets import arrays_of
 from rotorgram.agents import EpisodeRecorder, ResumeError, make_agent, preset
 from rotorgram.agents.rollouts import Collector, Rollout
 from rotorgram.agents.sb3 import RecordedEnv
@@ -91,8 +92,8 @@ def test_a_world_begins_as_a_whole_and_spends_a_row_while_another_flies_on() -> 
 def test_returns_of_a_drone_that_is_out_stop_at_its_end() -> None:
     log = log_of()
     agent: Any = make_agent("ippo", log, preset("ippo", "tuned", gamma=1.0, gae_lambda=1.0), 0)
-    for name, array in agent.weights.part("critic.").arrays.items():
-        array[...] = 0.0 if name != "layers.1.bias" else 5.0  # V(s) = 5
+    agent.weights.values[:] = 0.0
+    arrays_of(agent)[0]["critic.layers.1.bias"][:] = 5.0  # V(s) = 5
     rollout = flown(log, 60)
     estimates = agent.advantages(rollout)[0]
     length = log.episodes[0].length

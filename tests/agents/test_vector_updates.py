@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from nets import arrays_of
 from rotorgram.agents import A2CConfig, VPGConfig, make_agent
 from rotorgram.agents.a2c import A2C
 from rotorgram.agents.rollouts import Collector, Rollout
@@ -140,7 +141,7 @@ def test_a2c_learns_from_what_each_drone_flew(
     def estimates(rollout: Rollout) -> np.ndarray:
         for array in (rollout.observations, rollout.next_observations):
             for seen in array.reshape(-1, 3):
-                value = agent._critic.forward(seen[np.newaxis])
+                value = agent._critic.forward(seen[:, np.newaxis])
                 values[seen.tobytes()] = value.item()
         return agent.advantages(rollout)[0]
 
@@ -192,8 +193,9 @@ def test_a_lost_simulator_teaches_nothing(script: Script) -> None:
 
     log, collector = collector_of(script)
     agent: Any = A2C(log, A2CConfig(gamma=0.98, gae_lambda=0.98), 0)
-    agent.weights.arrays["critic.layers.1.weight"][:] = 0
-    agent.weights.arrays["critic.layers.1.bias"][:] = 50
+    arrays, _ = arrays_of(agent)
+    arrays["critic.layers.1.weight"][:] = 0
+    arrays["critic.layers.1.bias"][:] = 50
     rollout = collector.steps(10 * len(script))
     left = rollout.rows(agent.advantages(rollout)[0])
     np.testing.assert_allclose(left, 0, atol=1e-4)
