@@ -1,7 +1,7 @@
 """Base of local and remote vector envs: Gymnasium's autoreset over a single method."""
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,16 +10,18 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike
 
 from ..models.errors import InputError
+from ..sim.state import some
+from .info import Info, LazyInfo
 from .spaces import action_space, info_columns, observation_space
 from .spec import EnvSpec
 
 LOST = "simulator_lost"
 """Key in the `info` of a step that a lost simulator truncated: why it was lost."""
 
-Info = dict[str, Any]
 Observation = Any
 """An array, or a dict of arrays."""
 Step = tuple[Observation, np.ndarray, np.ndarray, np.ndarray, Info]
+Told = Callable[[], tuple[Mapping[str, np.ndarray], Mapping[str, np.ndarray]]]
 Seeds = Sequence[int | None] | np.ndarray
 
 
@@ -85,10 +87,10 @@ class AdvancingVectorEnv(VectorEnv[Observation, ArrayLike, np.ndarray]):
     def step(self, actions: ArrayLike) -> Step:
         """Fly every drone for one control period; after an episode the autoreset mode decides."""
         mode = self.autoreset_mode
-        resets = self.done if mode == AutoresetMode.NEXT_STEP and self.done.any() else None
+        resets = self.done if mode == AutoresetMode.NEXT_STEP and some(self.done) else None
         self.advance(self._shaped(actions), resets)
-        step = (self.rewards, self.terminated, self.truncated, self._info(~self._nobody))
-        if mode == AutoresetMode.SAME_STEP and self.done.any():
+        step = (self.rewards, self.terminated, self.truncated, self._info(self._everybody))
+        if mode == AutoresetMode.SAME_STEP and some(self.done):
             step = self._begin_next(*step)
         return self.observations, *step
 
@@ -106,6 +108,7 @@ class AdvancingVectorEnv(VectorEnv[Observation, ArrayLike, np.ndarray]):
         self.env_spec = spec
         self.num_envs = num_envs
         self._nobody = np.zeros(num_envs, bool)
+        self._everybody = np.ones(num_envs, bool)
         self.control_period = spec.control_period
         fps = max(1, round(1 / spec.control_period))
         self.metadata = {"render_modes": [], "render_fps": fps, "autoreset_mode": mode}
@@ -131,12 +134,12 @@ class AdvancingVectorEnv(VectorEnv[Observation, ArrayLike, np.ndarray]):
         """
         observations = self.observations
         ended = self._nobody
-        while self.done.any():
+        while some(self.done):
             truncated = truncated | self.lost
             ended = ended | self.done
             self.advance(self._no_actions(), self.done, None, ~self.done)
         masks = {name: mask & ended for name, mask in last.items() if name.startswith("_")}
-        info = self._info(~self._nobody)
+        info = self._info(self._everybody)
         info |= {"final_obs": observations, "_final_obs": ended}
         info |= {"final_info": last | masks | self._losses(), "_final_info": ended.copy()}
         return rewards, terminated, truncated, info
@@ -147,9 +150,23 @@ class AdvancingVectorEnv(VectorEnv[Observation, ArrayLike, np.ndarray]):
 
     def _info(self, mask: np.ndarray) -> Info:
         """The telemetry of the drones by its components, each name with its mask."""
-        columns = info_columns(self.env_spec, self.telemetry)
-        info: Info = {name: column.copy() for name, column in columns.items()}
-        return info | {f"_{name}": mask for name in info} | self._losses()
+        told = self._told()
+        spec = self.env_spec
+        losses = self._losses()
+
+        def made() -> Info:
+            telemetry, terms = told()
+            columns = info_columns(spec, telemetry)
+            info: Info = {name: column.copy() for name, column in columns.items()}
+            info |= {f"reward_{name}": term for name, term in terms.items()}
+            return info | {f"_{name}": mask.copy() for name in info} | losses
+
+        return LazyInfo(made)
+
+    def _told(self) -> Told:
+        """Gives telemetry and terms of the reward as they are now, also later."""
+        telemetry = self.telemetry
+        return lambda: (telemetry, {})
 
 
 def worlds_done(out: Any, drones: int) -> Any:

@@ -12,14 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..models.errors import InputError
-from ..sim import Array, PhysicsError, Randomization, make_world
+from ..sim import Array, PhysicsError, Randomization, World, make_world
 from ..sim.snapshots import Arrays, Snapshot, joined, part_of
-from .autoreset import Seeds, checked_seeds
+from ..sim.state import some
+from .autoreset import Seeds, Told, checked_seeds
 from .config import EnvConfig
 from .pipeline import Pipeline
 from .specification import make_task, spec_of
 from .stages import clock
 from .stages.record import Floats, Mask, Record
+from .tasks.task import Task
 from .telemetry import quantities_of
 
 
@@ -36,9 +38,10 @@ class Loop:
 
     Attributes:
         config: As given, resolved.
-        task, world: Their arrays have the axes of `world.shape`. Those below have one axis of N
-            drones, world by world, and are new after each `advance`.
-        num_envs: N.
+        pipeline: Its stages.
+        quantities: Of the telemetry.
+        num_envs: N. Arrays below have one axis of N drones, world by world, and are new after each
+            `advance`; those of record, world and task have the axes of `world.shape`.
         observations: By name, shape (N, *shape), of the declared dtypes.
         rewards: float64, shape (N,); 0 for a drone that did not fly.
         terminated, truncated: bool, shape (N,).
@@ -57,11 +60,11 @@ class Loop:
         backend = config.backend
         shape = (num_worlds, config.drones)
         alone = shape == (1, 1) and backend.name == "mujoco"
-        self.task = task = make_task(config, () if alone else shape)
+        self._task = task = make_task(config, () if alone else shape)
         self.vehicle = task.vehicle
         flown = task.config
         randomize = Randomization(flown.randomize, flown.effects) if flown.randomize else None
-        self.world = world = make_world(
+        self._world = world = make_world(
             self.vehicle,
             num_worlds,
             backend.name,
@@ -70,15 +73,18 @@ class Loop:
             randomize=randomize,
             **backend.settings,
         )
-        self._pipeline = pipeline = Pipeline(task, world, shape, randomize)
+        self.pipeline = pipeline = Pipeline(task, world, shape, randomize)
         self.spec = spec_of(config, task)
         kept = tuple(name for stage in pipeline.stages for name in stage.arrays)
-        self.record = Record(world.shape, task.memory, kept)
+        self._record = Record(world.shape, task.memory, kept)
         self.num_envs = num_worlds * config.drones
-        self._quantities = quantities_of(task)
+        self.quantities = quantities_of(task)
         self._telemetry: dict[str, Floats] | None = None
         self._closed = False
         self._take()
+
+    def prepare(self) -> None:
+        """Do now what the first step would do once."""
 
     def advance(
         self,
@@ -93,38 +99,42 @@ class Loop:
         drones to be reset have not moved, and their random numbers have been drawn.
         """
         self._check_open()
-        record = self.record
-        pipeline = self._pipeline
+        record = self._record
         clock.take(record, resets, frozen)
-        flies = record.flown is None or bool(record.flown.any())
+        flies = some(record.flown)
         if record.begun is not None:
             seeds = checked_seeds(seeds, self.num_envs)
         if flies:
-            record.sent = pipeline.actions.checked(actions, record.flown)
+            record.sent = self.pipeline.actions.checked(actions, record.flown)
+        self._step(seeds, flies=flies)
+
+    def _step(self, seeds: Any, *, flies: bool) -> None:
+        """Run the regions for the masks of the record."""
+        record = self._record
+        pipeline = self.pipeline
         record.rest()
         if flies:
             try:
                 record.run(record.flown, pipeline.fly)
             except PhysicsError:
-                flew = record.flown
-                record.waiting = record.waiting | (True if flew is None else flew)
+                record.wait(record.flown)
                 raise
         if record.begun is not None:
             self._begin(record.begun, seeds)
         active = record.active
-        if active is None or active.any():
+        if some(active):
             record.run(active, pipeline.observe)
         self._take()
 
     def _begin(self, begun: Mask, seeds: Any) -> None:
         """Begin episodes: the task sets the start, and the other stages follow from it."""
-        record = self.record
-        begin = self._pipeline.begin
+        record = self._record
+        begin = self.pipeline.begin
         all_begin = bool(begun.all())
         if not record.has_begun and not all_begin:
             record.begin_all(begin)
         if seeds is not None:
-            self.world.seed(begun, seeds[:: len(self.spec.agents)])
+            self._world.seed(begun, seeds[:: len(self.spec.agents)])
         record.run(None if all_begin else begun, begin)
 
     def snapshot(self) -> Snapshot:
@@ -133,13 +143,17 @@ class Loop:
         Raises `gymnasium.error.ClosedEnvironmentError` after `close`.
         """
         self._check_open()
-        record = self.record
-        config = np.array(self.spec.config_digest)
-        parts: dict[str, Arrays] = {"record": record.snapshot(), "loop": {"config": config}}
-        for stage in self._pipeline.stages:
-            parts[type(stage).__name__] = stage.snapshot(record)
-        arrays = joined(parts)
+        arrays = self.state()
+        arrays["loop/config"] = np.array(self.spec.config_digest)
         return {**arrays, "loop/arrays": np.array(list(arrays))}
+
+    def state(self) -> Snapshot:
+        """The arrays of a snapshot, without what tells it from others."""
+        record = self._record
+        parts: dict[str, Arrays] = {"record": record.snapshot()}
+        for stage in self.pipeline.stages:
+            parts[type(stage).__name__] = stage.snapshot(record)
+        return joined(parts)
 
     def restore(self, snapshot: Arrays) -> None:
         """Put back a snapshot of a loop of the same config and size; no step runs.
@@ -152,12 +166,16 @@ class Loop:
             gymnasium.error.ClosedEnvironmentError: The loop is closed.
         """
         self._check_open()
-        record = self.record
-        _check_snapshot(snapshot, record.shape, self.spec.config_digest)
-        record.restore(part_of(snapshot, "record"))
-        for stage in self._pipeline.stages:
-            stage.restore(record, part_of(snapshot, type(stage).__name__))
+        _check_snapshot(snapshot, self._record.shape, self.spec.config_digest)
+        self.put(snapshot)
         self._take()
+
+    def put(self, state: Arrays) -> None:
+        """Put back what `state` gave."""
+        record = self._record
+        record.restore(part_of(state, "record"))
+        for stage in self.pipeline.stages:
+            stage.restore(record, part_of(state, type(stage).__name__))
 
     def __reduce__(self) -> Any:
         worlds = self.num_envs // self.config.drones
@@ -167,7 +185,7 @@ class Loop:
 
     def _take(self) -> None:
         """New arrays of N drones, of the declared dtypes."""
-        record = self.record
+        record = self._record
         count = self.num_envs
         self._telemetry = None
         known = vars(record).get("observations")
@@ -184,6 +202,27 @@ class Loop:
         self.truncated = np.array(record.truncated).reshape(count)
         self.done = np.array(record.done).reshape(count)
         self.out = np.array(record.out).reshape(count)
+
+    @property
+    def record(self) -> Record:
+        """What the stages share."""
+        self._settle()
+        return self._record
+
+    @property
+    def world(self) -> World:
+        """What flies."""
+        self._settle()
+        return self._world
+
+    @property
+    def task(self) -> Task:
+        """The task, with its memory."""
+        self._settle()
+        return self._task
+
+    def _settle(self) -> None:
+        """See to it that record, world and task have the state, and the next step begins there."""
 
     @property
     def steps(self) -> NDArray[np.int64]:
@@ -204,19 +243,24 @@ class Loop:
     def telemetry(self) -> dict[str, Floats]:
         """By the names of `spec.telemetry`, float64, shape (N, *shape)."""
         if self._telemetry is None:
-            self._telemetry = {one.name: one.values(self) for one in self._quantities}
+            self._telemetry = {one.name: one.values(self) for one in self.quantities}
         return self._telemetry
+
+    def told(self) -> Told:
+        """Gives telemetry and terms of the reward as they are now, also later."""
+        telemetry, terms = self.telemetry, self.reward_terms
+        return lambda: (telemetry, terms)
 
     def row(self) -> list[float]:
         """All telemetry of a single drone as one list."""
         row: list[float] = []
-        for quantity in self._quantities:
+        for quantity in self.quantities:
             row += quantity.read(self).ravel().tolist()
         return row
 
     def close(self) -> None:
         """Release threads and memory; what the last step gave can be read on."""
-        for stage in self._pipeline.stages:
+        for stage in self.pipeline.stages:
             stage.close()
         self._closed = True
 

@@ -2,16 +2,20 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
+
+from ..sim.compile import TracedArray
 
 
 class Memory:
     """What a task remembers of its episodes: arrays by name, shape (W, A, ...).
 
     `Task.begin` makes the names, and `Task.update_memory` changes their values; elsewhere they are
-    read alone. A number stands for all drones. The loop keeps the values of drones that do not
-    fly. Of a single drone, (W, A) is () and numbers are Python's.
+    read alone. A number stands for all drones. Numbers become float64, truth values stay. The loop
+    keeps the values of drones that do not fly. Of a single drone, (W, A) is () and numbers are
+    Python's.
     """
 
     __slots__ = ("__dict__", "_phase")
@@ -29,12 +33,14 @@ class Memory:
             )
         if self._phase == "update" and name not in vars(self):
             raise AttributeError(f"memory.{name}: expected a value from begin() first, got none")
-        array = np.asarray(value)
+        array: Any = value if isinstance(value, TracedArray) else np.asarray(value)
+        if array.dtype.kind != "b":
+            array = array.astype(np.float64, copy=False)
         if not array.ndim:
             vars(self)[name] = array.item()
             return
         array = array.view()
-        array.flags.writeable = False
+        array.setflags(write=False)
         vars(self)[name] = array
 
     def expand(self, shape: tuple[int, ...]) -> None:

@@ -6,7 +6,8 @@ import numpy as np
 
 from ..models.errors import InputError, require
 from ..sim.snapshots import Arrays, Snapshot
-from .autoreset import AdvancingVectorEnv, Info, Observation
+from .autoreset import AdvancingVectorEnv, Observation
+from .info import Info
 from .rendering import RENDER_MODES
 from .spaces import action_space, checked_action, observation_space
 from .vector import LocalVectorEnv

@@ -8,9 +8,10 @@ from numpy.typing import ArrayLike
 
 from ..models.errors import InputError
 from ..sim.snapshots import Arrays, Snapshot
-from .autoreset import Info, Observation
+from .autoreset import Observation
+from .compiled import make_loop
 from .config import EnvConfig
-from .loop import Loop
+from .info import Info
 from .rendering import RENDER_MODES, Renderer
 from .spaces import action_space, checked_action, joined, observation_space, telemetry_names
 
@@ -49,7 +50,7 @@ class SingleEnv(gym.Env[Observation, ArrayLike]):
         self.config = config = EnvConfig.from_keywords(env_id, **keywords)
         if config.drones > 1:
             raise InputError(f"drones: expected 1 in a single env, got {config.drones}")
-        self._loop = loop = Loop(config)
+        self._loop = loop = make_loop(config)
         self.render_mode = render_mode
         self._renderer = Renderer(render_mode, loop)
         self.env_spec = loop.spec

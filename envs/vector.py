@@ -9,9 +9,17 @@ from numpy.typing import ArrayLike
 from ..models.errors import InputError
 from ..models.fields import check_names
 from ..sim.snapshots import Arrays, Snapshot
-from .autoreset import AdvancingVectorEnv, Info, Observation, Seeds, checked_mask, checked_seeds
+from .autoreset import (
+    AdvancingVectorEnv,
+    Observation,
+    Seeds,
+    Told,
+    checked_mask,
+    checked_seeds,
+)
+from .compiled import make_loop
 from .config import EnvConfig
-from .loop import Loop
+from .info import Info
 from .rendering import RENDER_MODES, Renderer
 from .spaces import joined
 
@@ -62,7 +70,7 @@ class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Observation, ArrayLike, np.nd
         if type(num_envs) is not int or num_envs % config.drones != 0:
             expected = f"a multiple of drones = {config.drones}"
             raise InputError(f"num_envs: expected {expected}, got {num_envs!r}")
-        self.loop = loop = Loop(config, num_envs // config.drones)
+        self.loop = loop = make_loop(config, num_envs // config.drones)
         self.render_mode = render_mode
         self._renderer = Renderer(render_mode, loop)
         self._take_spec(loop.spec, num_envs, autoreset_mode)
@@ -122,9 +130,8 @@ class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Observation, ArrayLike, np.nd
         """By name, float64, shape (N, *shape)."""
         return self.loop.telemetry
 
-    def _info(self, mask: np.ndarray) -> Info:
-        terms = {f"reward_{name}": term for name, term in self.loop.reward_terms.items()}
-        return super()._info(mask) | terms | {f"_{name}": mask for name in terms}
+    def _told(self) -> Told:
+        return self.loop.told()
 
     def _take_results(self) -> None:
         loop = self.loop

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import elementary
+from .compile import TracedArray
 from .snapshots import Arrays, Kept
 from .state import Array
 
@@ -23,6 +24,8 @@ Words = NDArray[np.uint32]
 Numbers = NDArray[np.float64]
 Ids = Any
 """Numbers of worlds, or `...` for all."""
+Mask = Any
+"""Of drones, bool, shape (W, A), the same for those of a world; of a single drone (). None: all."""
 
 # Numbers of uses, and the name of the noise of gusts.
 START = crc32(b"start")
@@ -52,7 +55,8 @@ def philox(counter: Words, key: Words) -> Words:
         mixed = high[..., ::-1] ^ odd ^ (key + weyl)
         odd = product.astype(np.uint32)[..., ::-1]
         even = mixed.astype(np.uint64)
-    words = np.empty((*np.broadcast_shapes(counter.shape[:-1], key.shape[:-1]), 4), np.uint32)
+    shape = np.broadcast_shapes(counter.shape[:-1], key.shape[:-1])
+    words = np.empty_like(key, np.uint32, shape=(*shape, 4))
     words[..., 0::2] = even
     words[..., 1::2] = odd
     return words
@@ -66,10 +70,10 @@ def words_of(
     They begin at the block `first`, of four words.
     """
     blocks = -(-count // 4)
-    counter = np.empty((*key.shape[:-1], blocks, 4), np.uint32)
+    counter = np.empty_like(key, np.uint32, shape=(*key.shape[:-1], blocks, 4))
     counter[..., 0] = np.arange(first, first + blocks)
-    counter[..., 1] = np.asarray(step)[..., None]
-    counter[..., 2] = np.asarray(episode)[..., None]
+    counter[..., 1] = np.expand_dims(step, -1)
+    counter[..., 2] = np.expand_dims(episode, -1)
     counter[..., 3] = use
     words = philox(counter, key[..., None, :])
     return words.reshape(*key.shape[:-1], 4 * blocks)[..., :count]
@@ -87,7 +91,7 @@ def normal(words: Words) -> Numbers:
     angle = _TURN * uniform(words[..., half:])
     radius = np.sqrt(-2.0 * elementary.log(1.0 - distance))
     parts = (radius * elementary.cos(angle), radius * elementary.sin(angle))
-    return np.concatenate(parts, axis=-1, dtype=np.float64)
+    return np.concatenate(parts, axis=-1)
 
 
 class Random(Kept):
@@ -119,11 +123,23 @@ class Random(Kept):
         for noise in self._noises.values():
             noise.forget(ids)
 
-    def begin(self, ids: Ids) -> None:
-        """Begin an episode of the worlds `ids`."""
-        self.episode[ids] += np.uint32(1)
+    def begin(self, mask: Mask) -> None:
+        """Begin an episode of the worlds of a mask."""
+        begun = self.worlds(mask)
+        self.episode = np.where(begun, self.episode + np.uint32(1), self.episode)
         for noise in self._noises.values():
-            noise.begin(ids)
+            noise.begin(begun)
+
+    def worlds(self, mask: Mask) -> Any:
+        """The worlds of a mask, bool, shape (W,)."""
+        if mask is None or not self.shape:
+            return np.full(len(self.episode), mask is None or bool(mask))
+        return mask[:, 0]
+
+    def ids(self, mask: Mask) -> Ids:
+        """The numbers of the worlds of a mask; traced code has one world."""
+        worlds = self.worlds(mask)
+        return ... if isinstance(worlds, TracedArray) else np.flatnonzero(worlds)
 
     def noise(self, name: str, size: int) -> "Noise":
         """A source of `size` normal numbers for each drone and step."""
@@ -146,12 +162,13 @@ class Draw:
     `ahead` is 1 for draws before the `Random.begin` of their episode.
     """
 
-    def __init__(self, random: Random, use: int, ids: Ids, ahead: int = 0) -> None:
+    def __init__(self, random: Random, use: int, mask: Mask, ahead: int = 0) -> None:
         self._random = random
         self._use = use
-        self._ids = ids
+        self._ids = ids = random.ids(mask)
+        self._key = random.keys[ids]
         self._episode = random.episode[ids] + np.uint32(ahead)
-        self._words = np.empty((len(ids), 0), np.uint32)
+        self._words: Words = self._key[:, :0]
         self._first = 0  # block that comes next
 
     def uniform(self, low: float, high: float, size: tuple[int, ...] = ()) -> Array:
@@ -172,9 +189,9 @@ class Draw:
         """The next words of each world that begins, from a new block on."""
         count = self._random.drones * prod(size) + more
         if count > self._words.shape[1]:
-            keys = self._random.keys[self._ids]
             many = 4 * max(_BLOCKS, -(-count // 4))
-            self._words = words_of(keys, self._use, self._episode, 0, many, self._first)
+            step = 0 * self._episode
+            self._words = words_of(self._key, self._use, self._episode, step, many, self._first)
         words = self._words[:, :count]
         used = -(-count // 4)
         self._words = self._words[:, 4 * used :]
@@ -183,7 +200,7 @@ class Draw:
 
     def _spread(self, drawn: Numbers, size: tuple[int, ...]) -> Array:
         random = self._random
-        numbers = np.zeros((len(random.keys), random.drones, *size))
+        numbers = np.zeros_like(drawn, shape=(len(random.keys), random.drones, *size))
         numbers[self._ids] = drawn.reshape(-1, random.drones, *size)
         return numbers.reshape((*random.shape, *size))[()]
 
@@ -210,10 +227,11 @@ class Noise(Kept):
         self._left = np.zeros(worlds, int)  # rows that are drawn ahead
         self._worlds = np.arange(worlds)
 
-    def begin(self, ids: Ids) -> None:
-        """An episode of some worlds begins."""
-        self.step[ids] = 0
-        self.forget(ids)
+    def begin(self, begun: Any) -> None:
+        """An episode of some worlds begins, bool, (W,)."""
+        self.step = np.where(begun, np.uint32(0), self.step)
+        if not isinstance(begun, TracedArray):
+            self.forget(begun)
 
     def forget(self, ids: Ids) -> None:
         """Seed, episode or step of some worlds have changed."""
@@ -232,6 +250,10 @@ class Noise(Kept):
         random = self._random
         if not random.shape:
             return self._single() if mask is None or mask else np.zeros(self._size)
+        if isinstance(mask, TracedArray):
+            drawn = self._drawn(random.keys, random.episode, self.step)
+            self.step = np.where(mask[:, 0], self.step + np.uint32(1), self.step)
+            return np.where(mask[..., None], drawn, 0.0)
         ids = self._worlds if mask is None else np.flatnonzero(mask[:, 0])
         missing = ids[self._left[ids] == 0]
         if missing.size:
@@ -260,8 +282,12 @@ class Noise(Kept):
         steps = self.step[ids, None] + np.arange(ahead, dtype=np.uint32)
         keys = np.repeat(random.keys[ids][:, None], ahead, axis=1)
         episodes = np.repeat(random.episode[ids][:, None], ahead, axis=1)
-        count = random.drones * self._size
-        words = words_of(keys, self._use, episodes, steps, count + count % 2)
-        drawn = normal(words)[..., :count]
-        self._rows[ids] = drawn.reshape(len(ids), ahead, random.drones, self._size)
+        self._rows[ids] = self._drawn(keys, episodes, steps)
         self._left[ids] = ahead
+
+    def _drawn(self, keys: Array, episodes: Array, steps: Array) -> Numbers:
+        """Numbers of steps (...), shape (..., A, size)."""
+        drones = self._random.drones
+        count = drones * self._size
+        words = words_of(keys, self._use, episodes, steps, count + count % 2)
+        return normal(words)[..., :count].reshape(*steps.shape, drones, self._size)

@@ -1,9 +1,11 @@
 """State as named arrays, so that it can be copied, put back, and stored."""
 
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
+
+from .compile import TracedArray
 
 Snapshot = dict[str, np.ndarray]
 Arrays = Mapping[str, np.ndarray]
@@ -26,8 +28,15 @@ class Kept:
 
     def snapshot(self) -> Snapshot:
         """Copies by name; attributes without a value yet are left out."""
-        values = {name: getattr(self, name) for name in (*self.arrays, *self.lists)}
-        own = {name: np.array(value) for name, value in values.items() if value is not None}
+        own = {}
+        for name in self.arrays:
+            value = getattr(self, name)
+            if value is not None:
+                own[name] = copied(value)
+        for name in self.lists:
+            values = getattr(self, name)
+            if values:
+                own[name] = np.stack(values, axis=-1)
         return own | joined({name: part.snapshot() for name, part in self.parts().items()})
 
     def restore(self, arrays: Arrays) -> None:
@@ -37,12 +46,22 @@ class Kept:
             setattr(self, name, None if array is None else array.copy()[()])
         for name in self.lists:
             array = arrays.get(name)
-            if array is None:
-                setattr(self, name, None)
-            else:
-                setattr(self, name, array.tolist() if array.ndim == 1 else list(array.copy()))
+            setattr(self, name, [] if array is None else _listed(array))
         for name, part in self.parts().items():
             part.restore(part_of(arrays, name))
+
+
+def copied(value: Any) -> Any:
+    """A copy of an array, or of a single drone's number as one."""
+    return value.copy() if isinstance(value, TracedArray) else np.array(value)
+
+
+def _listed(array: Any) -> list[Any]:
+    """The arrays of a stack of them; of a single drone Python's numbers."""
+    if array.ndim == 1:
+        numbers: list[float] = array.tolist()
+        return numbers
+    return [array[..., index].copy() for index in range(array.shape[-1])]
 
 
 def joined(parts: Mapping[str, Arrays]) -> Snapshot:

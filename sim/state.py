@@ -14,6 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from .compile import TracedArray
+
 _NUMBERS = (float, int)
 
 Array = Any
@@ -113,9 +115,9 @@ def chosen(mask: Array, new: Array, old: Array) -> Array:
     return np.where(mask, new, old)
 
 
-def kept(mask: Array, new: Sequence[Array], old: Sequence[Array] | None) -> Sequence[Array]:
-    """`chosen` for lists of arrays."""
-    if old is None:
+def kept(mask: Array, new: list[Array], old: list[Array]) -> list[Array]:
+    """`chosen` for lists of arrays; an empty one has none yet."""
+    if not old:
         return new
     return [chosen(mask, a, b) for a, b in zip(new, old, strict=True)]
 
@@ -162,6 +164,8 @@ def looked_up(table: np.ndarray, index: Array) -> Array:
     index = clip(index, 0.0, len(table) - 1.0)
     if isinstance(index, float):
         return plain(table[int(index)])
+    if isinstance(index, TracedArray):
+        return index.rows_of(table)
     return table[index.astype(int)]
 
 
@@ -170,6 +174,16 @@ def interpolated(table: np.ndarray, index: Array) -> Array:
     before = floor(index)
     low = looked_up(table, before)
     return low + (looked_up(table, before + 1.0) - low) * (index - before)
+
+
+def some(mask: Array) -> bool:
+    """Whether a mask has a drone, None being all: what follows is for its drones alone.
+
+    Traced code does what follows; that it is for none costs the time alone.
+    """
+    if mask is None or isinstance(mask, TracedArray):
+        return True
+    return b"\1" in mask.tobytes()  # a fifth of the time of NumPy's any
 
 
 def stack(parts: Sequence[Array]) -> Array:
@@ -182,7 +196,8 @@ def stack(parts: Sequence[Array]) -> Array:
             break
     else:
         return np.array(parts)  # an eighth of the time of NumPy's stack
-    array = np.empty((*like.shape, len(parts)), np.result_type(*parts))
+    shape = (*like.shape, len(parts))
+    array = np.empty_like(like, np.result_type(*parts), shape=shape)
     for index, part in enumerate(parts):  # a third of the time of NumPy's stack
         array[..., index] = part
     return array

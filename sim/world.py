@@ -13,7 +13,7 @@ from ..models.fields import Choice, Flag, Limits, OrNone, Rule, check
 from .effects import EffectOptions, Effects
 from .random import RANDOMIZATION, START, Draw, Random
 from .randomize import Randomization
-from .snapshots import Arrays, Snapshot, joined, part_of
+from .snapshots import Arrays, Snapshot, copied, joined, part_of
 from .state import Array, ByName, InitialState, WorldState, plain
 
 _CLASSES = {"mujoco": "MujocoWorld", "rigid": "RigidWorld"}
@@ -29,7 +29,6 @@ CONTACT_CHECK = 0.02
 """Longest time between two checks for contact, s. A bounce of the paper's craft at full thrust
 lasts longer, unless its skids dip less than half a millimetre."""
 
-_ONLY = np.zeros(1, int)
 _LEVEL = np.array((1.0, 0.0, 0.0, 0.0))
 
 
@@ -72,12 +71,12 @@ class World(NotCopied):
 
     def seed(self, mask: Array, seeds: Sequence[int | None] | Array) -> None:
         """Seed the worlds of a mask, seeds (W,); where it is None the random numbers go on."""
-        ids = self._ids(mask).tolist()
+        ids = self.random.ids(mask).tolist()
         self.random.seed(ids, [seeds[i] for i in ids])
 
     def draw(self, mask: Array) -> Draw:
         """Draws for the next start of the worlds of a mask, before their `reset`."""
-        return Draw(self.random, START, self._ids(mask), ahead=1)
+        return Draw(self.random, START, mask, ahead=1)
 
     def reset(self, mask: Array, pose: InitialState) -> None:
         """Reset the worlds of the mask, bool, shape (W, A), to their rows of `pose`.
@@ -116,7 +115,7 @@ class World(NotCopied):
         """Copies of all arrays that a later step depends on, by name."""
         state = {name: array.copy() for name, array in self._kept().items()}
         parts = {"random": self.random.snapshot(), "state": state}
-        parts["parameters"] = {name: np.array(x) for name, x in self.parameters.items()}
+        parts["parameters"] = {name: copied(x) for name, x in self.parameters.items()}
         if self.effects is not None:
             parts["effects"] = self.effects.snapshot()
         return joined(parts)
@@ -139,14 +138,10 @@ class World(NotCopied):
         """Put copies of those back; the parameters are as they were."""
         raise NotImplementedError
 
-    def _ids(self, mask: Array) -> np.ndarray:
-        """The worlds of a mask; of a single one it is always true."""
-        return np.flatnonzero(mask[:, 0]) if self.shape else _ONLY
-
     def _draw_parameters(self, mask: Array) -> None:
         """Draw the parameters of the worlds of a mask."""
         if self._randomize is not None:
-            draw = Draw(self.random, RANDOMIZATION, self._ids(mask))
+            draw = Draw(self.random, RANDOMIZATION, mask)
             for name, new in self._randomize.draw(draw).items():
                 old = self.parameters.get(name)
                 self.parameters[name] = plain(new if old is None else np.where(mask, new, old))

@@ -25,10 +25,10 @@ class Actions:
         self._choices = choices
         self._count = math.prod(shape)
 
-    def checked(self, given: object, flown: Mask | None) -> Floats:
-        """Actions as controllers take them: shape (W, A, k), finite. Raises `InputError`.
+    def checked(self, given: object, flown: Mask | None) -> np.ndarray:
+        """Actions, float32, shape (W, A, k), finite. Raises `InputError`.
 
-        Numbers are rounded to float32. Actions of drones that do not fly are ignored.
+        Actions of drones that do not fly are ignored.
         """
         actions = np.asarray(given)
         if actions.dtype.kind not in "iuf":
@@ -45,7 +45,7 @@ class Actions:
             with np.errstate(over="ignore"):  # an overflow is infinite, and refused as such
                 values = values.astype(np.float32)
         if is_finite(values):
-            return values.astype(np.float64)
+            return np.ascontiguousarray(values)
         return self._refused(values, np.isfinite(values), "finite numbers", flown)
 
     def neutral(self) -> Floats:
@@ -55,14 +55,14 @@ class Actions:
 
     def _refused(
         self, values: np.ndarray, right: np.ndarray, expected: str, flown: Mask | None
-    ) -> Floats:
+    ) -> np.ndarray:
         wrong = ~right.all(axis=-1)
         refused = wrong if flown is None else wrong & flown
         if refused.any():
             first = int(np.flatnonzero(refused)[0])
             got = values.reshape(self._count, -1)[first].tolist()
             raise InputError(f"actions: expected {expected}, got {got} for env {first}")
-        return np.where(right, values, 0).astype(np.float64)
+        return np.where(right, values, 0).astype(np.float32)
 
 
 class Receive(Stage):
@@ -79,7 +79,7 @@ class Receive(Stage):
 
     def step(self, record: Record) -> None:
         """At once, unless a later stage delays it."""
-        record.action = record.received = record.sent
+        record.action = record.received = record.sent.astype(np.float64)
 
 
 class ActionDelay(Stage):

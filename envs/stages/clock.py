@@ -4,6 +4,7 @@ import gymnasium as gym
 import numpy as np
 
 from ...models.errors import InputError, shortened
+from ...sim.state import some
 from .record import Mask, Record, Stage
 
 
@@ -36,14 +37,14 @@ def take(record: Record, resets: object, frozen: object) -> None:
         held = mask_of(record, frozen)
         idle = held if begun is None else begun | held
     flown = None
-    if idle is not None and idle.any():
+    if idle is not None and some(idle):
         flown = ~idle
     late = record.waiting if flown is None else record.waiting & flown
-    if late.any():
+    if some(late):
         first = int(np.flatnonzero(late)[0])
         raise gym.error.ResetNeeded(f"step: expected a call of reset() for env {first} first")
     record.flown = flown
-    record.begun = begun if begun is not None and begun.any() else None
+    record.begun = begun if begun is not None and some(begun) else None
 
 
 def mask_of(record: Record, given: object) -> Mask:

@@ -3,8 +3,9 @@
 import numpy as np
 
 from ...models.errors import InputError
-from ...sim.state import Array
-from .record import Floats, Record, Stage, is_finite
+from ...sim.compile import TracedArray
+from ...sim.state import Array, some
+from .record import Floats, Mask, Record, Stage
 
 
 class Ends(Stage):
@@ -18,7 +19,7 @@ class Ends(Stage):
         episode_length: Control steps after which an episode is truncated.
     """
 
-    arrays = ("reward", "terminated", "truncated")
+    arrays = ("reward", "terminated", "truncated", "unfit")
 
     def __init__(self, env_id: str, shape: tuple[int, ...], episode_length: int) -> None:
         self._env_id = env_id
@@ -27,35 +28,50 @@ class Ends(Stage):
         self._zeros = np.zeros(shape)[()]
 
     def step(self, record: Record) -> None:
-        """Raises `InputError` for a reward or an observation that is not finite."""
+        """Raises `InputError` as `refuse_unfit`."""
         total: Array = 0.0
         for term in record.terms.values():
             total = total + term
         reward = total + self._zeros
         terminated = self._nobody | record.ended
         truncated = (record.steps >= self._length) > terminated
-        self._check(record, reward)
+        record.unfit = _unfit(record, reward)
         flying = record.flown
-        if record.out.any():
+        if some(record.out):
             flying = ~record.out if flying is None else flying & ~record.out
         if flying is not None:
-            reward = np.where(flying, reward, 0.0)[()]
+            reward = np.where(flying | record.unfit, reward, 0.0)[()]
             terminated = terminated & flying
             truncated = truncated & flying
         record.reward = reward
+        if not isinstance(record.unfit, TracedArray):
+            refuse_unfit(record, self._env_id)
         record.terminated = terminated
         record.truncated = truncated
         ends = terminated | truncated
-        if ends.any():
+        if some(ends):
             record.end(ends)
 
-    def _check(self, record: Record, reward: Floats) -> None:
-        for name, values in (*record.observations.items(), ("reward", reward)):
-            if is_finite(values):
-                continue
-            rows = np.reshape(values, (self._nobody.size, -1))
-            first = int(np.argmin(np.isfinite(rows).all(axis=1)))
+
+def refuse_unfit(record: Record, env_id: str) -> None:
+    """Raise `InputError` for a reward or an observation that is not finite."""
+    if not record.unfit.any():
+        return
+    first = int(np.flatnonzero(record.unfit)[0])
+    for name, values in (*record.observations.items(), ("reward", record.reward)):
+        numbers = np.reshape(values, (record.unfit.size, -1))[first]
+        if not np.isfinite(numbers).all():
             raise InputError(
-                f"{self._env_id}: expected finite numbers for {name}, got "
-                f"{rows[first].tolist()} for env {first}"
+                f"{env_id}: expected finite numbers for {name}, got {numbers.tolist()} "
+                f"for env {first}"
             )
+
+
+def _unfit(record: Record, reward: Floats) -> Mask:
+    """Drones with a reward or an observation that is not finite, (W, A)."""
+    unfit: Mask = ~np.isfinite(reward)
+    for values in record.observations.values():
+        if values.dtype.kind == "f":
+            numbers = values.reshape(*record.shape, -1)
+            unfit = unfit | ~np.isfinite(numbers).all(axis=-1)
+    return unfit

@@ -6,6 +6,7 @@ import numpy as np
 
 from ...sim import Controller, World
 from ...sim.snapshots import Arrays
+from ...sim.state import some
 from .record import Look, Record, Stage
 
 
@@ -73,5 +74,5 @@ class StandStill(Stage):
 
     def step(self, record: Record) -> None:
         """The thrust next to 0."""
-        if record.out.any():
+        if some(record.out):
             record.thrust = np.where(record.out[..., None], self._rest, record.thrust)

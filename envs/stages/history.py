@@ -125,10 +125,10 @@ def later(past: Values | None, values: Values, steps: int, record: Record) -> Va
 
 def taken(past: Values, age: Array, axis: int) -> Values:
     """Values of `age` steps ago; the age has the shape (W, A), whole numbers."""
-    index = past.shape[axis] - 1 - np.asarray(age).astype(int)
     if not axis:
-        present: Values = past[int(index)]
+        present: Values = past[past.shape[axis] - 1 - int(age)]
         return present
+    index = past.shape[axis] - 1 - age.astype(int)
     index = index.reshape(index.shape + (1,) * (past.ndim - axis))
     chosen: Values = np.take_along_axis(past, index, axis).squeeze(axis)
     return chosen

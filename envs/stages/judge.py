@@ -8,6 +8,7 @@ import numpy as np
 
 from ...models.errors import InputError, shortened
 from ...sim import InitialState, World
+from ...sim.state import ByName, some
 from ..tasks.task import Outcome, Task
 from .record import Record, Stage
 
@@ -49,7 +50,7 @@ class Remember(Stage):
 
     def step(self, record: Record) -> None:
         """Before it observes."""
-        if record.flown is None or record.flown.any():
+        if some(record.flown):
             record.run(record.flown, [self._update])
 
     def _update(self, record: Record) -> None:
@@ -74,11 +75,13 @@ class Judge(Stage):
             self._check(observations, outcome, record)
             self._checked = True
         record.observations = {
-            array.name: np.asarray(observations[array.name]).reshape(*record.shape, *array.shape)
+            array.name: observations[array.name]
+            .reshape(*record.shape, *array.shape)
+            .astype(array.dtype)
             for array in self._task.observation
         }
-        record.terms = outcome.reward
-        record.metrics = outcome.metrics
+        record.terms = _of_each(outcome.reward, record)
+        record.metrics = _of_each(outcome.metrics, record)
         record.ended = outcome.terminated
 
     def _check(self, observations: object, outcome: object, record: Record) -> None:
@@ -108,3 +111,10 @@ class Judge(Stage):
     def _refuse(self, expected: str, got: object) -> NoReturn:
         said = got if isinstance(got, str) else shortened(got)
         raise InputError(f"{self._task.config.env_id}: expected {expected}, got {said}")
+
+
+def _of_each(numbers: ByName, record: Record) -> ByName:
+    """Numbers of each drone, (W, A), where one stands for all."""
+    if not record.shape:
+        return numbers
+    return {name: np.broadcast_to(one, record.shape) for name, one in numbers.items()}

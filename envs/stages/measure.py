@@ -7,6 +7,7 @@ import numpy as np
 from ...sim import World
 from ...sim.sensors import Sensors
 from ...sim.snapshots import Arrays
+from ...sim.state import some
 from ..spec import ArraySpec
 from ..state import kept_state, read_only
 from .record import Record, Stage
@@ -69,7 +70,7 @@ class Sensing(Stage):
         flown = record.flown
         if flown is None:
             flown = np.ones(record.shape, bool)[()]
-        if flown.any():
+        if some(flown):
             self._sensors.sample(flown)
         if self._replaces:
             seen = self._sensors.seen()

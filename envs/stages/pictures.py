@@ -102,11 +102,10 @@ class Pictures(Stage):
 
     def begin(self, record: Record) -> None:
         """Draw the scene of each world."""
-        begun = self._per_drone(record.begun).reshape(self._shape).any(axis=1)
         scenes = np.zeros(self._shape, int)
         count = len(self._scenes)
         if count > 1:
-            shares = Draw(self._random, SCENES, np.flatnonzero(begun)).uniform(0.0, 1.0)
+            shares = Draw(self._random, SCENES, record.begun).uniform(0.0, 1.0)
             scenes += (count * np.reshape(shares, self._shape)[:, :1]).astype(int)
         record.scenes = scenes.reshape(record.shape)[()]
 

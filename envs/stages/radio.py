@@ -6,6 +6,7 @@ import numpy as np
 
 from ...sim import length
 from ...sim.random import RADIO, uniform, words_of
+from ...sim.state import some
 from ..state import State
 from ..tasks.swarm import SwarmOptions
 from .history import filled, pushed
@@ -57,7 +58,7 @@ class Radio(Stage):
     def step(self, record: Record) -> None:
         """Send and receive, then observe."""
         flown = record.flown
-        if flown is None or flown.any():
+        if some(flown):
             record.run(flown, [self._exchange])
         measured = record.measured
         measured.neighbours = self._nearest(record, measured.position, measured.velocity)
@@ -73,7 +74,7 @@ class Radio(Stage):
         if options.radio_loss:
             steps = (record.steps - 1).astype(np.uint32)
             chances = uniform(words_of(record.keys, RADIO, 0, steps, self._own.shape[0]))
-            arrives &= chances >= options.radio_loss  # (W, receiver, sender)
+            arrives = arrives & (chances >= options.radio_loss)  # (W, receiver, sender)
         record.heard = np.where(arrives[..., None], said[:, None, :, :6], record.heard)
         record.age = np.where(arrives, float(options.radio_delay), record.age + 1.0)
 
@@ -90,10 +91,11 @@ class Radio(Stage):
         count = self._options.neighbours
         order = np.argsort(distance, axis=-1, kind="stable")[..., :count, None]
         nearest = np.take_along_axis(numbers, order, axis=2)
-        neighbours = np.zeros((*record.shape, count, 7))
+        neighbours = np.zeros_like(nearest, shape=(*record.shape, count, 7))
         neighbours[:, :, : nearest.shape[2]] = nearest
         return neighbours
 
     def _in_range(self, receivers: Floats, senders: Floats) -> Mask:
         apart = length(senders[:, None] - receivers[:, :, None])
-        return np.asarray(apart <= self._options.radio_range)
+        near: Mask = apart <= self._options.radio_range
+        return near

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...sim import Draw, InitialState
-from ...sim.snapshots import Arrays, Snapshot, joined
+from ...sim.snapshots import Arrays, Snapshot, copied, joined
 from ...sim.state import Array, ByName, WorldState
 from ..memory import Memory
 from ..state import State
@@ -30,7 +30,7 @@ class Record:
         kept: Names of arrays that keep their values between steps.
         flown: Drones that fly in this step; None: all.
         begun: Drones that begin an episode in this step; None: none.
-        sent: Actions of the agent, float64, (W, A, k).
+        sent: Actions of the agent, float32, (W, A, k).
         action: The last action that was flown, (W, A, k).
         received: The action that arrives at the controller.
         thrust: Of each rotor, N, (W, A, R).
@@ -44,6 +44,7 @@ class Record:
         ended: Whether the task ends the episode, (W, A).
         reward: float64, (W, A).
         terminated, truncated: (W, A).
+        unfit: Drones with numbers that are not finite, (W, A).
         steps: Control steps of each episode, (W, A).
         episodes: Number of episodes that each drone has begun, (W, A).
         out: Drones whose own episode has ended, (W, A).
@@ -55,7 +56,7 @@ class Record:
         pictures: Last picture of each camera by name, (W, A, height, width, channels).
     """
 
-    sent: Floats
+    sent: NDArray[np.float32]
     action: Floats
     received: Floats
     actions_sent: Floats
@@ -90,7 +91,7 @@ class Record:
         self.begun: Mask | None = None
         self.steps: NDArray[np.int64] = np.zeros(shape, np.int64)[()]
         self.episodes = self.steps
-        self.out = self.done = self.terminated = self.truncated = nobody
+        self.out = self.done = self.terminated = self.truncated = self.unfit = nobody
         self.waiting = ~nobody
         self.reward = np.zeros(shape)[()]
         self._nothing = self.reward
@@ -131,7 +132,7 @@ class Record:
                 parts[name] = {**values}
             elif values is not None:
                 plain[name] = values
-        return {name: np.array(values) for name, values in joined(parts).items()}
+        return {name: copied(values) for name, values in joined(parts).items()}
 
     def restore(self, arrays: Arrays) -> None:
         """Put a snapshot back."""
@@ -177,7 +178,11 @@ class Record:
     def rest(self) -> None:
         """A drone that does not fly gets no reward and no end."""
         self.reward = self._nothing
-        self.terminated = self.truncated = self._nobody
+        self.terminated = self.truncated = self.unfit = self._nobody
+
+    def wait(self, flown: Mask | None) -> None:
+        """Drones that flew into a bad state must be reset, and those that flew beside them."""
+        self.waiting = self.waiting | (True if flown is None else flown)
 
     def end(self, drones: Mask) -> None:
         """End the episodes of some drones; a world is done when all of its drones are out."""
@@ -231,7 +236,8 @@ def where(mask: Mask, new: Array, old: Array) -> Array:
     if not mask.ndim:
         return new if mask else old
     axes = max(np.ndim(new), np.ndim(old)) - mask.ndim
-    return np.where(mask.reshape(mask.shape + (1,) * axes), new, old)
+    chosen: Array = np.where(mask.reshape(mask.shape + (1,) * axes), new, old)
+    return chosen.astype(old.dtype, copy=False)
 
 
 def is_finite(values: np.ndarray) -> bool:

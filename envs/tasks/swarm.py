@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import numpy as np
 
 from ...models.fields import Limits
-from ...sim import Array, Draw, InitialState, clip, cos, length, sin, stack, total
+from ...sim import Array, Draw, InitialState, clip, cos, length, looked_up, sin, stack, total
 from ..spec import Metric
 from ..state import State
 from .goal import (
@@ -126,8 +126,9 @@ class Swarm(GoalTask):
         """
         jitter = draw.uniform(-JITTER, JITTER, (3,)) * self.gap
         lots = draw.uniform(0.0, 1.0)
-        places = np.argsort(lots, axis=-1, kind="stable")
-        return jitter + np.array(self.options.center) + grid(self.count)[places] * self.gap
+        places = np.argsort(lots, axis=-1, kind="stable").astype(float)
+        cells = looked_up(grid(self.count), places) * self.gap
+        return jitter + np.array(self.options.center) + cells
 
     def further(self, state: State) -> list[Array]:
         """The numbers of the neighbours, shape (W, A, 7 k) in all."""
@@ -163,7 +164,7 @@ class Swarm(GoalTask):
         Below 0 spheres overlap.
         """
         apart = length(state.position[:, :, None] - state.position[:, None])
-        apart[:, np.arange(self.count), np.arange(self.count)] = np.inf
+        apart = np.where(np.eye(self.count, dtype=bool), np.inf, apart)
         return (apart - (self._radii[:, None] + self._radii)).min(axis=-1)
 
     def proximity_penalty(self, room: Array) -> Array:

@@ -146,12 +146,12 @@ class RigidBody:
         """Of thrusts, and a force and a torque, as of `fly`."""
         rotors = list(thrust)
         varying = self.varying
-        force = _forth(self._axes, rotors)
+        force = forth(self._axes, rotors)
         if varying.reaction is None:
-            torque = _forth(self._torques, rotors)
+            torque = forth(self._torques, rotors)
         else:
-            both = zip(_forth(self._levers, rotors), _forth(self._reactions, rotors), strict=True)
-            torque = tuple(_sum(a, (b, varying.reaction)) for a, b in both)
+            both = zip(forth(self._levers, rotors), forth(self._reactions, rotors), strict=True)
+            torque = tuple(added(a, (b, varying.reaction)) for a, b in both)
         torque = _plus(torque, _cross(force, varying.shift))
         outer = _ZERO
         if wrench is not None:
@@ -171,18 +171,18 @@ class RigidBody:
             outer = _plus(outer, velocity, -self._drag)
         if off and _is_there(outer):
             # The force at the origin has the torque -c × F about the center of mass.
-            inside = _forth(transposed(matrix(quaternion)), outer)
+            inside = forth(transposed(matrix(quaternion)), outer)
             lever = _cross(_scaled(inside, varying.mass), center)
             turning = _plus(turning, self._turned(lever))
         turning = tuple(
-            _sum(start, *((k, rates[i], rates[j]) for i, j, k in terms))
+            added(start, *((k, rates[i], rates[j]) for i, j, k in terms))
             for start, terms in zip(turning, varying.gyroscopic, strict=True)
         )
         if off:
             inner = _plus(inner, _cross(center, turning))
             inner = _plus(inner, _cross(_cross(rates, center), rates))
         x, y, z = _plus(_to_world(quaternion, inner), outer)
-        return (x, y, _sum(z, (-self._gravity,))), turning
+        return (x, y, added(z, (-self._gravity,))), turning
 
     def advance(self, now: Motion, push: Push) -> Motion:
         """The motion after a physics step."""
@@ -213,7 +213,7 @@ class RigidBody:
 
     def _turned(self, torque: Vector) -> Vector:
         """Angular acceleration by a torque about the center of mass, N·m."""
-        return _scaled(_forth(self.varying.turn, torque), self.varying.easier)
+        return _scaled(forth(self.varying.turn, torque), self.varying.easier)
 
 
 def motion(rows: Array) -> Motion:
@@ -262,7 +262,7 @@ def _sparse(matrix: np.ndarray, size: float | None = None) -> list[list[float]]:
     return rows
 
 
-def _sum(total: Array, *products: tuple[Array, ...]) -> Array:
+def added(total: Array, *products: tuple[Array, ...]) -> Array:
     """The total and the products of some vectors and numbers, in the fewest operations."""
     for factors in products:
         share = math.prod(one for one in factors if isinstance(one, float))
@@ -285,32 +285,32 @@ def _is_there(vector: Array) -> bool:
 
 
 def _plus(a: Array, b: Array, share: float = 1.0) -> Vector:
-    return tuple(_sum(x, (share, y)) for x, y in zip(a, b, strict=True))
+    return tuple(added(x, (share, y)) for x, y in zip(a, b, strict=True))
 
 
 def _scaled(vector: Array, share: Array) -> Vector:
-    return tuple(_sum(0.0, (share, x)) for x in vector)
+    return tuple(added(0.0, (share, x)) for x in vector)
 
 
 def _cross(a: Array, b: Array) -> Vector:
     (p, q, r) = a
     (x, y, z) = b
     return (
-        _sum(0.0, (q, z), (-1.0, r, y)),
-        _sum(0.0, (r, x), (-1.0, p, z)),
-        _sum(0.0, (p, y), (-1.0, q, x)),
+        added(0.0, (q, z), (-1.0, r, y)),
+        added(0.0, (r, x), (-1.0, p, z)),
+        added(0.0, (p, y), (-1.0, q, x)),
     )
 
 
-def _forth(matrix: Array, vector: Array) -> Vector:
+def forth(matrix: Array, vector: Array) -> Vector:
     """Product of a matrix of three rows and a vector, or the thrusts of rotors."""
-    return tuple(_sum(0.0, *zip(row, vector, strict=True)) for row in matrix)
+    return tuple(added(0.0, *zip(row, vector, strict=True)) for row in matrix)
 
 
 def _to_world(quaternion: Array, vector: Vector) -> Vector:
     """A body vector in the world frame."""
     if _is_there(vector[:2]):
-        return _forth(matrix(quaternion), vector)
+        return forth(matrix(quaternion), vector)
     w, x, y, z = quaternion
     up = vector[2]
     twice = up + up
@@ -341,7 +341,7 @@ def _of_rotation_vector(spin: Vector, time: float, square: Array, rates: Vector)
     once = _cross(spin, rates)
     twice = _cross(spin, once)
     return tuple(
-        _sum(w, (0.5 * time, a), (series, b)) for w, a, b in zip(rates, once, twice, strict=True)
+        added(w, (0.5 * time, a), (series, b)) for w, a, b in zip(rates, once, twice, strict=True)
     )
 
 

@@ -1,11 +1,15 @@
 """Which crafts of W worlds reach level ground, by their solid geoms, or each other, by spheres."""
 
+from functools import reduce
+
 import mujoco
 import numpy as np
 
 from ...models.mjcf import level_data
 from ...models.vehicle import Vehicle, craft_geoms
-from ..state import Array, clip
+from ..rotations import Parts
+from ..state import Array, clip, some
+from .body import added, forth
 
 _ROUNDED = 1e-6  # m: what is no margin of a contact
 
@@ -29,22 +33,22 @@ class Hull:
         if not shapes:
             return
         centers, radii, axes, flat, rounded = map(np.array, zip(*shapes, strict=True))
-        columns = axes.transpose(0, 2, 1).reshape(-1, 3)
-        self._shapes = centers, radii[:, None], columns, flat[..., None], rounded[..., None]
+        numbers = (centers, radii, axes.transpose(0, 2, 1), flat, rounded)
+        self._shapes = list(zip(*[array.tolist() for array in numbers], strict=True))
         sizes = np.linalg.norm(flat, axis=1) + np.linalg.norm(rounded, axis=1)
         self._reach = float((np.linalg.norm(centers, axis=1) + radii + sizes).max())
-        margin = vehicle.rest_height - float(self._depth(np.array([[0.0], [0.0], [-1.0]]))[0])
+        margin = vehicle.rest_height - float(self._depth((0.0, 0.0, -1.0)))
         self.ground = margin if abs(margin) > _ROUNDED else 0.0
 
     def touches(self, height: Array, quaternion: Array) -> Array:
         """Whether crafts at such heights and attitudes (four vectors) touch the ground, (W,)."""
         height = height - self.ground
         near = height < self._reach
-        if not near.any():
+        if not some(near):
             return near
         w, x, y, z = quaternion
         down = (2 * (w * y - x * z), -2 * (y * z + w * x), 2 * (x * x + y * y) - 1)
-        depth: Array = self._depth(np.stack(down))
+        depth: Array = self._depth(down)
         return height < depth
 
     def collides(self, position: Array) -> Array:
@@ -56,17 +60,23 @@ class Hull:
         for x in clip(position, -mujoco.mjMAXVAL, mujoco.mjMAXVAL):  # a bad state overflows
             apart = x[:, :, None] - x[:, None]
             square = square + apart * apart
-        overlaps: Array = (square < self._apart**2).sum(-1) > 1  # with itself too
+        others = ~np.eye(square.shape[-1], dtype=bool)
+        overlaps: Array = ((square < self._apart**2) & others).any(axis=-1)
         return overlaps
 
-    def _depth(self, down: Array) -> Array:
-        """How far the craft reaches along unit vectors, body frame, (3, W): m, (W,)."""
-        centers, radii, axes, flat, rounded = self._shapes
-        along = (axes @ down).reshape(-1, 3, down.shape[1])
-        straight = flat * abs(along)
-        round_ = rounded * along
-        sizes = np.sum(straight, axis=1) + np.sqrt(np.sum(round_ * round_, axis=1))
-        return np.max(centers @ down + radii + sizes, axis=0)
+    def _depth(self, down: Parts) -> Array:
+        """How far the craft reaches along unit vectors, body frame, three of (W,): m, (W,)."""
+        depths = []
+        for center, radius, axes, flat, rounded in self._shapes:
+            terms = list(zip(center, down, strict=True))
+            along = forth(axes, down)
+            terms += [(side, abs(one)) for side, one in zip(flat, along, strict=True) if side]
+            depth = added(radius, *terms)
+            if any(rounded):
+                pairs = zip(rounded, along, strict=True)
+                depth = depth + np.sqrt(added(0.0, *((size * size, a, a) for size, a in pairs)))
+            depths.append(depth)
+        return reduce(np.maximum, depths)
 
 
 def can_touch(model: mujoco.MjModel, geom: int, others: np.ndarray) -> bool:

@@ -135,9 +135,9 @@ class MujocoWorld(World):
     def reset(self, mask: Array, pose: InitialState) -> None:
         """As `World.reset`. Raises `InputError` for a payload that would hang in the ground."""
         self._check_process()
-        ids = self._ids(mask)
+        ids = self.random.ids(mask)
         hung = self._hung(pose, ids)
-        self.random.begin(ids)
+        self.random.begin(mask)
         self._batch.state[ids] = self._initial
         self._warnings[ids] = 0
         for name, begun in self._begun(mask, pose).items():
@@ -163,7 +163,7 @@ class MujocoWorld(World):
     ) -> None:
         """As `World.step`."""
         self._check_process()
-        ids = None if mask is None else self._ids(mask)
+        ids = None if mask is None else self.random.ids(mask)
         some = ... if ids is None else ids
         if some is ... or not self.shape:
             self.state.command[...] = thrust

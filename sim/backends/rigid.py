@@ -12,7 +12,7 @@ import numpy as np
 
 from ...models.errors import InputError
 from ...models.vehicle import Vehicle, craft_bodies, craft_geoms
-from ..compile import trouble
+from ..compile import TracedArray, trouble
 from ..effects import EffectOptions
 from ..randomize import Randomization
 from ..snapshots import Arrays
@@ -22,7 +22,6 @@ from . import kernel
 from .body import RigidBody, mapped, motion
 from .hull import Hull, can_touch
 
-_OWN = ("_rows", "_acting", "_wrench")
 _OF_STATE = ("command", "thrust", "touching", "colliding")
 _LEVEL = np.array((0.0, 0.0, 0.0, 1.0, *[0.0] * 9))  # rows of a craft at rest
 
@@ -75,8 +74,10 @@ class RigidWorld(World):
         self._hull = Hull(vehicle)
         thrust = np.zeros((*shape, vehicle.num_rotors), self.dtype)
         self._nothing = self._acting = thrust  # mean over the last physics step
-        self._wrench: Array = None  # force and torque of effects over it, (6, W A)
-        nobody = thrust[..., 0] > 0
+        # Mean force and torque of the air over it.
+        pushed = self.effects is not None and self.effects.on_body
+        self._wrench: Array = np.zeros((*shape, 6), self.dtype) if pushed else None
+        self.bad = nobody = thrust[..., 0] > 0
         moved = dict.fromkeys(("position", "quaternion", "velocity", "body_rates"))
         self.state = WorldState(**moved, command=thrust, thrust=thrust, touching=nobody)
         if drones > 1:
@@ -91,9 +92,9 @@ class RigidWorld(World):
     def _compile(self) -> None:
         """Compile the body as it varies now, unless NumPy flies it."""
         if self._compiled:
-            pushed = self.effects is not None and self.effects.on_body
+            worlds, drones = self.shape
             rotors = self.vehicle.num_rotors
-            self._function = kernel.flight(self._body, rotors, self.dtype, wrench=pushed)
+            self._function = kernel.flight(self._body, worlds * drones, self.dtype, rotors)
 
     def vary(self, inertia: Array, reaction: Array, air: Mapping[str, Array]) -> None:
         """Set the numbers of every drone before the first reset; needs the effect `body_drag`.
@@ -110,7 +111,7 @@ class RigidWorld(World):
         """As `World.reset`."""
         state = self.state
         rows = mask[..., None]
-        self.random.begin(self._ids(mask))
+        self.random.begin(mask)
         begun = self._begun(mask, pose)
         turn = begun["quaternion"]
         unit = turn / each(length(turn))
@@ -125,8 +126,7 @@ class RigidWorld(World):
             thrust = self.effects.begin(mask, state, self.parameters)
             state.thrust = self._typed(np.where(rows, thrust, state.thrust))
         self._acting = np.where(rows, state.thrust, self._acting)
-        if self._wrench is not None:
-            self._wrench = np.where(mask.reshape(-1), 0.0 * self._wrench, self._wrench)
+        self._wrench = None if self._wrench is None else np.where(rows, 0.0, self._wrench)
         self._tell(mask, self._contacts())
 
     def step(
@@ -144,7 +144,10 @@ class RigidWorld(World):
             found = [now | old for now, old in zip(self._contacts(), found, strict=False)]
             substeps -= self._check
         self._tell(mask, found)
-        self._refuse_bad()
+        bad = ~(abs(self._rows) < mujoco.mjMAXVAL).all(axis=0)
+        self.bad = chosen(mask, bad.reshape(self.shape), self.bad)
+        if not isinstance(self.bad, TracedArray):
+            self.refuse_bad(mask)
 
     def _fly(self, steps: int, mask: Array | None) -> None:
         """Fly physics steps without a contact check in between."""
@@ -159,33 +162,36 @@ class RigidWorld(World):
                 acting, end, push = effects.step(state, mask)
                 if self._on_rotors:
                     state.thrust = chosen(mask, self._typed(end), state.thrust)
-                wrench = None if push is None else self._as_rows(push)
+                wrench = None if push is None else self._typed(push)
             if not self._on_rotors:  # as MuJoCo clamps controls
                 acting = clip(acting, self.vehicle.thrust_low, self.vehicle.thrust_high)
-            new = self._flown(self._as_rows(acting), wrench, at_once)
+            push = None if wrench is None else self._as_rows(wrench)
+            new = self._flown(self._as_rows(acting), push, at_once)
             self._show(chosen(some, new, self._rows))
-        self._acting = chosen(mask, acting, self._acting)
+        self._acting = chosen(mask, self._typed(acting), self._acting)
         if wrench is not None:
-            old = 0.0 * wrench if self._wrench is None else self._wrench
-            self._wrench = chosen(some, wrench, old)
+            self._wrench = chosen(mask, wrench, self._wrench)
 
     def _kept(self) -> ByName:
-        arrays = {name: getattr(self, name) for name in _OWN}
-        arrays |= {name: getattr(self.state, name) for name in _OF_STATE}
+        arrays = {name: getattr(self.state, name) for name in _OF_STATE}
+        arrays |= {"motion": self._as_vectors(self._rows), "acting": self._acting}
+        arrays |= {"wrench": self._wrench, "bad": self.bad}
         return {name: array for name, array in arrays.items() if array is not None}
 
     def _restore(self, arrays: Arrays) -> None:
         copies = {name: array.copy() for name, array in arrays.items()}
-        for name in _OWN:
-            setattr(self, name, copies.get(name))
         for name in _OF_STATE:
             setattr(self.state, name, copies.get(name))
-        self._show(self._rows)
+        self._acting = copies["acting"]
+        self._wrench = copies.get("wrench")
+        self.bad = copies["bad"]
+        self._show(self._as_rows(copies["motion"]))
         self._vary_drawn()
 
     def acceleration(self) -> Array:
         """As `World.acceleration`."""
-        push = self._body.push(self._as_rows(self._acting), self._wrench)
+        wrench = None if self._wrench is None else self._as_rows(self._wrench)
+        push = self._body.push(self._as_rows(self._acting), wrench)
         linear, _ = self._body.acceleration(motion(self._rows), push)
         return np.stack(linear, axis=-1).reshape(*self.shape, 3)
 
@@ -214,25 +220,32 @@ class RigidWorld(World):
     def _flown(self, thrust: Array, wrench: Array, steps: int) -> np.ndarray:
         """New rows after physics steps: see `RigidBody.fly`."""
         if self._function is None:
-            return np.array(self._body.fly(self._rows, thrust, wrench, steps), self.dtype)
+            flown: np.ndarray = self._typed(
+                np.stack(self._body.fly(self._rows, thrust, wrench, steps))
+            )
+            return flown
         return self._function(self._rows, thrust, wrench, self._varying, steps)
 
     def _show(self, rows: np.ndarray) -> None:
         """Take these rows, and set the state's arrays, views of them."""
         self._rows = rows
         state = self.state
-        columns = rows.T.reshape(*self.shape, 13)
+        columns = self._as_vectors(rows)
         state.position = columns[..., :3]
         state.quaternion = columns[..., 3:7]
         state.velocity = columns[..., 7:10]
         state.body_rates = columns[..., 10:]
 
     def _typed(self, values: Array) -> Array:
-        return np.astype(values, self.dtype, copy=False)
+        return values.astype(self.dtype, copy=False)
 
     def _as_rows(self, values: Array) -> Array:
-        """Vectors (W, A, k) as rows (k, W A) of this dtype, one after the other in memory."""
-        return np.asarray(self._typed(values).reshape(-1, values.shape[-1]).T, order="C")
+        """Vectors (W, A, k) as rows (k, W A) of this dtype."""
+        return self._typed(values).reshape(-1, values.shape[-1]).T
+
+    def _as_vectors(self, rows: Array) -> Array:
+        """Rows (k, W A) as vectors (W, A, k)."""
+        return rows.T.reshape(*self.shape, -1)
 
     def _contacts(self) -> list[Array]:
         """Which crafts touch anything and, of several, which another, bool, (W, A)."""
@@ -250,12 +263,12 @@ class RigidWorld(World):
             old = getattr(self.state, name)
             setattr(self.state, name, chosen(mask, new, old))
 
-    def _refuse_bad(self) -> None:
-        if abs(self._rows).max() < mujoco.mjMAXVAL:  # not of NaN
-            return
-        bad = ~np.all(abs(self._rows) < mujoco.mjMAXVAL, axis=0)
-        ids = np.flatnonzero(bad.reshape(self.shape).any(axis=1)).tolist()
-        raise PhysicsError(f"the rigid body has bad states in envs {ids[:5]}: reset the env")
+    def refuse_bad(self, mask: Array | None) -> None:
+        """Raise `PhysicsError` if the state of a drone that flew is bad."""
+        bad = self.bad if mask is None else self.bad & mask
+        ids = np.flatnonzero(bad.any(axis=1)).tolist()
+        if ids:
+            raise PhysicsError(f"the rigid body has bad states in envs {ids[:5]}: reset the env")
 
 
 @cache

@@ -1,11 +1,29 @@
 """Array code as machine code: traced once, printed for LLVM, compiled in this process.
 
-`tracer` runs the code on variables and keeps what it does as a list of operations. `llvm` prints
-the list as vector instructions and compiles them by `llvmlite`. The results have the bits that
-NumPy gives: the operations are the same, in the same order, and none is fused with another.
+`tracer` runs the code on variables and keeps what it does in a `program`. `llvm` prints programs as
+vector instructions, over arrays as `layout` lays them, and compiles them by `llvmlite`. The results
+have the bits that NumPy gives: the operations are the same, in the same order, and none is fused
+with another.
 """
 
-from .llvm import compiled, trouble
-from .tracer import Trace, TracedArray
+from .layout import Fields, Layout, Memory
+from .llvm import Function, Region, compiled, trouble, widest
+from .program import Program, Value
+from .tracer import TracedArray, Untraceable, lift, read
 
-__all__ = ["Trace", "TracedArray", "compiled", "trouble"]
+__all__ = [
+    "Fields",
+    "Function",
+    "Layout",
+    "Memory",
+    "Program",
+    "Region",
+    "TracedArray",
+    "Untraceable",
+    "Value",
+    "compiled",
+    "lift",
+    "read",
+    "trouble",
+    "widest",
+]

@@ -1,58 +1,125 @@
-"""A trace as a function of LLVM's vector instructions, compiled in this process by llvmlite.
+"""Programs as a function of LLVM's vector instructions, compiled in this process by llvmlite.
 
-The function, `fly(…, out, count, steps)`, runs a trace step by step on rows of numbers. One loop
-goes over the lanes of the rows, as many at a time as the processor's widest vectors have, then one
-by one over those that are left; within it another goes over the steps, in registers.
+The function goes over the blocks of a `Memory`, and over the lanes of each, as many at a time as
+the processor's widest vectors have. For these it runs regions: a region is a program that is left
+out where none of the lanes is in its mask.
 """
 
 import ctypes
 from collections.abc import Callable, Sequence
 from functools import cache, lru_cache
-from typing import Any
+from math import prod
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ...models.errors import one_line
-from .tracer import Operation, Trace, TracedArray
+from .layout import Fields, Layout
+from .program import DType, Program, Value
 
 Function = Callable[..., None]
-"""Takes an array, or None, for each name; `out` for the results; and `steps`, one or more. All
-arrays are C-contiguous, of the trace's dtype and with rows of equally many lanes: not checked."""
+"""Takes the number of blocks, the address of each memory, and those of arrays outside."""
 
-_CALLS = ("sqrt", "fabs", "rint", "floor")
-_KINDS = {4: ("float", "f32"), 8: ("double", "f64")}
+_KINDS = {
+    "float32": "float",
+    "float64": "double",
+    "bool": "i1",
+    "int32": "i32",
+    "uint32": "i32",
+    "int64": "i64",
+    "uint64": "i64",
+}
+_FLOATS = {
+    "add": "fadd",
+    "subtract": "fsub",
+    "multiply": "fmul",
+    "divide": "fdiv",
+    "remainder": "frem",
+    "less": "fcmp olt",
+    "less_equal": "fcmp ole",
+    "greater": "fcmp ogt",
+    "greater_equal": "fcmp oge",
+    "equal": "fcmp oeq",
+    "not_equal": "fcmp une",
+}
+_WHOLES = {
+    "add": "add",
+    "subtract": "sub",
+    "multiply": "mul",
+    "and": "and",
+    "or": "or",
+    "xor": "xor",
+    "left_shift": "shl",
+    "equal": "icmp eq",
+    "not_equal": "icmp ne",
+}
+_SIGNED = {
+    "less": "icmp slt",
+    "less_equal": "icmp sle",
+    "greater": "icmp sgt",
+    "greater_equal": "icmp sge",
+    "right_shift": "ashr",
+    "remainder": "srem",
+}
+_UNSIGNED = {
+    "less": "icmp ult",
+    "less_equal": "icmp ule",
+    "greater": "icmp ugt",
+    "greater_equal": "icmp uge",
+    "right_shift": "lshr",
+    "remainder": "urem",
+}
+_CALLS = {
+    "sqrt": "sqrt",
+    "absolute": "fabs",
+    "rint": "rint",
+    "floor": "floor",
+    "copysign": "copysign",
+}
+_SHORT = {"float": "f32", "double": "f64", "i8": "i8", "i32": "i32", "i64": "i64"}
+_BITS = {"float32": (32, 23, 127), "float64": (64, 52, 1023)}
+"""Of a float: all bits, those of the fraction, and what is added to the exponent."""
 _ATTRIBUTES = (
     'attributes #0 = { nounwind "min-legal-vector-width"="512" "prefer-vector-width"="512" }'
 )
-_FUNCTION = """define void @fly({arrays}, ptr noalias %out, i64 %count, i64 %steps) #0 {{
+_FUNCTION = """define void @run(i64 %blocks{arguments}) #0 {{
 entry:
-  %left = urem i64 %count, {lanes}
-  %whole = sub i64 %count, %left
-  br label %test.wide
-{wide}
-{narrow}
+  br label %block
+block:
+  %b = phi i64 [0, %entry], [%b.next, %block.end]
+{bases}
+  br label %lane
+lane:
+  %i = phi i64 [0, %block], [%i.next, %lane.end]
+  %first = mul i64 %b, {lanes}
+  %world = add i64 %first, %i
+{worlds}
+  br label %region.0
+{regions}
+region.{count}:
+  br label %lane.end
+lane.end:
+  %i.next = add i64 %i, {width}
+  %more.lanes = icmp slt i64 %i.next, {lanes}
+  br i1 %more.lanes, label %lane, label %block.end
+block.end:
+  %b.next = add i64 %b, 1
+  %more.blocks = icmp slt i64 %b.next, %blocks
+  br i1 %more.blocks, label %block, label %end
 end:
   ret void
 }}
 """
-_LOOP = """test.{loop}:
-  %i.{loop} = phi i64 [{start}], [%next.{loop}, %done.{loop}]
-  %more.{loop} = icmp slt i64 %i.{loop}, {stop}
-  br i1 %more.{loop}, label %lanes.{loop}, label %{after}
-lanes.{loop}:
-{loads}
-  br label %step.{loop}
-step.{loop}:
-  %s.{loop} = phi i64 [0, %lanes.{loop}], [%s.next.{loop}, %step.{loop}]
-{carried}
-{lines}
-  %s.next.{loop} = add i64 %s.{loop}, 1
-  %again.{loop} = icmp slt i64 %s.next.{loop}, %steps
-  br i1 %again.{loop}, label %step.{loop}, label %done.{loop}
-done.{loop}:
-{stores}
-  %next.{loop} = add i64 %i.{loop}, {lanes}
-  br label %test.{loop}"""
+
+
+class Region(NamedTuple):
+    """A program, and what it writes where a mask is true."""
+
+    mask: str
+    """Name of an array of truth values, alike for the drones of a world; empty: all worlds."""
+    program: Program
+    stores: list[tuple[str, int, Value]]
+    """Array, component, and new value, which is that of all lanes: the mask is in the program."""
 
 
 @cache
@@ -75,158 +142,348 @@ def trouble() -> str:
     return ""
 
 
+def widest() -> int:
+    """Lanes of a vector: what 64 bytes hold of float32 where registers are wide, otherwise 4."""
+    return 16 if _llvm().get_host_cpu_features().get("avx2", False) else 4
+
+
 def compiled(
-    trace: Trace, state: str, results: Sequence[TracedArray], arrays: Sequence[str]
+    regions: Sequence[Region], layouts: Sequence[Layout], outside: Fields, width: int
 ) -> Function:
-    """The function of a trace. Takes a tenth of a second.
+    """The function of some regions. Takes a fifth of a second.
 
     Args:
-        trace: Of one step.
-        state: The array of which each step reads the rows that the one before it gave.
-        results: The new rows of that array.
-        arrays: Names of all arrays that the trace reads, in the order of the arguments.
+        regions: In their order.
+        layouts: Of memories, all with as many lanes.
+        outside: Arrays of the caller's, shape (worlds of all blocks, *shape), C-contiguous.
+        width: Lanes of a vector.
     """
-    names = [one.name for one in results]
-    text = _module(trace, state, names, arrays, _width(trace.dtype.itemsize))
-    call = _machine_code(text, len(arrays) + 1)
-
-    def fly(*given: np.ndarray | None, out: np.ndarray, steps: int) -> None:
-        places = [None if array is None else array.ctypes.data for array in given]
-        call(*places, out.ctypes.data, out.shape[-1], steps)
-
-    return fly
-
-
-def _width(itemsize: int) -> int:
-    """Lanes of a vector: 64 bytes where there are registers of 32 or more, otherwise 16."""
-    is_wide = _llvm().get_host_cpu_features().get("avx2", False)
-    return (64 if is_wide else 16) // itemsize
-
-
-# ---- text
-
-
-def _module(
-    trace: Trace, state: str, results: Sequence[str], arrays: Sequence[str], width: int
-) -> str:
-    wide = _Printer(trace, state, results, "wide", width)
-    narrow = _Printer(trace, state, results, "narrow", 1)
-    text = _FUNCTION.format(
-        arrays=", ".join(f"ptr %in.{name}" for name in arrays),
-        lanes=width,
-        wide=wide.loop("0, %entry", "%whole", "test.narrow"),
-        narrow=narrow.loop("%whole, %test.wide", "%count", "end"),
-    )
-    return "\n".join([text, *wide.declared(), *narrow.declared(), _ATTRIBUTES])
+    text = _Printer(layouts, outside, width).text(regions)
+    return _machine_code(text, len(layouts) + len(outside))
 
 
 class _Printer:
-    """One loop over lanes, so many at a time."""
+    """The text of a module."""
 
-    def __init__(
-        self, trace: Trace, state: str, results: Sequence[str], loop: str, width: int
-    ) -> None:
-        self._trace = trace
-        self._state = state
-        self._results = results
-        self._loop = loop
+    def __init__(self, layouts: Sequence[Layout], outside: Fields, width: int) -> None:
+        self._layouts = layouts
+        self._outside = outside
         self._width = width
-        self._kind, self._suffix = _KINDS[trace.dtype.itemsize]
-        self._type = self._lanes(self._kind)
+        self._bases = {name: i for i, one in enumerate(layouts) for name in one.fields}
+        self._lines: list[str] = []
+        self._declared: dict[str, str] = {}
+        self._names: dict[int, str] = {}
+        self._tables: list[np.ndarray] = []
+        self._count = 0
 
-    def loop(self, start: str, stop: str, after: str) -> str:
-        """Its text."""
-        loads: list[str] = []
-        carried: list[str] = []
-        lines: list[str] = []
-        for operation, value in self._trace.operations.items():
-            name = self._named(value)
-            if operation.function != "load":
-                lines.append(f"  {name} = {self._instruction(operation)}")
-                continue
-            array, row = operation.inputs
-            if array == self._state:
-                first = f"{name}.first"
-                later = self._named(self._results[int(row)])
-                ways = f"[{first}, %lanes.{self._loop}], [{later}, %step.{self._loop}]"
-                carried.append(f"  {name} = phi {self._type} {ways}")
-                name = first
-            loads += self._load(name, array, row)
-        stores: list[str] = []
-        for place, value in enumerate(self._results):
-            stores += self._store(f"%out.{place}.{self._loop}", str(place), value)
-        return _LOOP.format(
-            loop=self._loop,
-            start=start,
-            stop=stop,
-            after=after,
-            lanes=self._width,
-            loads="\n".join(loads),
-            carried="\n".join(carried),
-            lines="\n".join(lines),
-            stores="\n".join(stores),
+    def text(self, regions: Sequence[Region]) -> str:
+        """All of it."""
+        for number, region in enumerate(regions):
+            self._region(number, region)
+        names = [f"memory.{i}" for i in range(len(self._layouts))]
+        names += [f"out.{name}" for name in self._outside]
+        function = _FUNCTION.format(
+            arguments="".join(f', ptr noalias %"{name}"' for name in names),
+            bases="\n".join(self._base(i, one.size) for i, one in enumerate(self._layouts)),
+            lanes=self._layouts[0].lanes,
+            width=self._width,
+            worlds=self._worlds(),
+            regions="\n".join(self._lines),
+            count=len(regions),
         )
+        return "\n".join((function, *self._declared.values(), _ATTRIBUTES))
 
-    def declared(self) -> list[str]:
-        """Declarations of LLVM's own functions."""
-        return [f"declare {self._type} {self._function(name)}({self._type})" for name in _CALLS]
+    def _region(self, number: int, region: Region) -> None:
+        after = f"%region.{number + 1}"
+        self._names = {}
+        self._tables = region.program.tables
+        self._lines.append(f"region.{number}:")
+        if not region.mask:
+            self._lines.append(f"  br label %body.{number}")
+        else:
+            some = self._some(self._load(region.mask, 0))
+            self._lines.append(f"  br i1 {some}, label %body.{number}, label {after}")
+        self._lines.append(f"body.{number}:")
+        for value in region.program.needed(value for _, _, value in region.stores):
+            self._names[value.number] = self._printed(value)
+        for array, row, value in region.stores:
+            self._store(array, row, self._names[value.number])
+        self._lines.append(f"  br label {after}")
+
+    def _printed(self, value: Value) -> str:
+        """The name of a value, after its instructions."""
+        operation = value.operation
+        if operation == "constant":
+            return self._number(value)
+        if operation == "load":
+            return self._load(*value.inputs)
+        if operation == "gather":
+            return self._gather(value)
+        inputs = [self._names[one.number] for one in value.inputs]
+        dtype = value.inputs[0].dtype
+        if operation == "cast":
+            return self._cast(inputs[0], dtype, value.dtype)
+        if operation == "select":
+            kind = self._type(value.dtype)
+            flags, first, second = inputs
+            return self._new(f"select {self._lanes('i1')} {flags}, {kind} {first}, {kind} {second}")
+        if operation in ("fraction", "exponent", "ldexp"):
+            convert: Callable[..., str] = getattr(self, f"_{operation}")
+            return convert(dtype, *inputs)
+        if operation in _CALLS and dtype.kind == "f":
+            return self._call(_CALLS[operation], dtype, *inputs)
+        kind = self._type(dtype)
+        if operation == "negative":
+            if dtype.kind == "f":
+                return self._new(f"fneg {kind} {inputs[0]}")
+            return self._new(f"sub {kind} {self._splat(0, _KINDS[dtype.name])}, {inputs[0]}")
+        if operation == "not":
+            return self._new(f"xor {kind} {inputs[0]}, {self._splat(-1, _KINDS[dtype.name])}")
+        names = _FLOATS
+        if dtype.kind != "f":
+            names = _WHOLES | (_SIGNED if dtype.kind == "i" else _UNSIGNED)
+        return self._new(f"{names[operation]} {kind} {inputs[0]}, {inputs[1]}")
+
+    # ---- types, numbers, memory
 
     def _lanes(self, kind: str) -> str:
         return kind if self._width == 1 else f"<{self._width} x {kind}>"
 
-    def _named(self, value: str) -> str:
-        return f"{value}.{self._loop}"
+    def _type(self, dtype: DType) -> str:
+        return self._lanes(_KINDS[dtype.name])
 
-    def _function(self, name: str) -> str:
+    def _new(self, instruction: str) -> str:
+        self._count += 1
+        self._lines.append(f"  %v{self._count} = {instruction}")
+        return f"%v{self._count}"
+
+    def _splat(self, number: object, kind: str) -> str:
+        """A number of all lanes."""
+        return f"{number}" if self._width == 1 else f"splat ({kind} {number})"
+
+    def _number(self, value: Value) -> str:
+        """A constant: LLVM reads floats as the bits of a double."""
+        number = np.frombuffer(value.inputs[0], value.dtype)[0]
+        kind = _KINDS[value.dtype.name]
+        if value.dtype.kind != "f":
+            return self._splat(int(number), kind)
+        bits = int(np.float64(number).view(np.uint64))
+        return self._splat(f"0x{bits:016X}", kind)
+
+    def _call(self, name: str, dtype: DType, *inputs: str) -> str:
+        """One of LLVM's own functions, of inputs of one type."""
+        kind = self._type(dtype)
         lanes = "" if self._width == 1 else f"v{self._width}"
-        return f"@llvm.{name}.{lanes}{self._suffix}"
+        function = f"@llvm.{name}.{lanes}f{8 * dtype.itemsize}"
+        self._declared[function] = f"declare {kind} {function}({', '.join([kind] * len(inputs))})"
+        return self._new(f"call {kind} {function}({', '.join(f'{kind} {one}' for one in inputs)})")
 
-    def _instruction(self, operation: Operation) -> str:
-        function = operation.function
-        inputs = [self._input(word) for word in operation.inputs]
-        flags = self._lanes("i1")
-        if function in _CALLS:
-            return f"call {self._type} {self._function(function)}({self._type} {inputs[0]})"
-        if function == "select":
-            flag, first, second = inputs
-            return f"select {flags} {flag}, {self._type} {first}, {self._type} {second}"
-        kind = flags if function == "or" else self._type
-        return f"{function} {kind} {', '.join(inputs)}"
+    def _some(self, flags: str) -> str:
+        """Whether a lane is true."""
+        if self._width == 1:
+            return flags
+        kind = self._lanes("i1")
+        function = f"@llvm.vector.reduce.or.v{self._width}i1"
+        self._declared[function] = f"declare i1 {function}({kind})"
+        return self._new(f"call i1 {function}({kind} {flags})")
 
-    def _input(self, word: str) -> str:
-        """A value, or a number: LLVM reads floats as the bits of a double."""
-        if word.startswith("%"):
-            return self._named(word)
-        bits = np.float64(self._trace.dtype.type(float(word))).view(np.uint64)
-        number = f"0x{int(bits):016X}"
-        return number if self._width == 1 else f"splat ({self._kind} {number})"
+    def _address(self, array: str, row: int) -> tuple[str, str, int]:
+        """Pointer to a row at these lanes, its type in memory, and its alignment."""
+        number = self._bases[array]
+        layout = self._layouts[number]
+        dtype, _ = layout.fields[array]
+        kind = _in_memory(dtype)
+        place = layout.place(array, row)
+        start = self._new(f"getelementptr i8, ptr %base.{number}, i64 {place}")
+        align = dtype.itemsize
+        return self._new(f"getelementptr {kind}, ptr {start}, i64 %i"), kind, align
 
-    def _place(self, name: str, array: str, row: str) -> list[str]:
-        """The address of a row at these lanes."""
-        loop = self._loop
-        return [
-            f"  {name}.start = mul i64 %count, {row}",
-            f"  {name}.at = add i64 {name}.start, %i.{loop}",
-            f"  {name}.place = getelementptr {self._kind}, ptr {array}, i64 {name}.at",
-        ]
+    def _load(self, array: str, row: int) -> str:
+        """A row at these lanes; a truth value is a byte in memory."""
+        if array in self._outside:
+            return self._gathered(*self._places(array, row))
+        place, kind, align = self._address(array, row)
+        value = self._new(f"load {self._lanes(kind)}, ptr {place}, align {align}")
+        if kind == "i8":
+            return self._new(f"trunc {self._lanes(kind)} {value} to {self._lanes('i1')}")
+        return value
 
-    def _load(self, name: str, array: str, row: str) -> list[str]:
-        align = self._trace.dtype.itemsize
-        load = f"  {name} = load {self._type}, ptr {name}.place, align {align}"
-        return [*self._place(name, f"%in.{array}", row), load]
+    def _store(self, array: str, row: int, value: str) -> None:
+        if array in self._outside:
+            place, kind = self._places(array, row)
+            self._scattered(self._in_memory(value, kind), place, kind)
+            return
+        place, kind, align = self._address(array, row)
+        value = self._in_memory(value, kind)
+        self._lines.append(f"  store {self._lanes(kind)} {value}, ptr {place}, align {align}")
 
-    def _store(self, name: str, row: str, value: str) -> list[str]:
-        align = self._trace.dtype.itemsize
-        store = f"  store {self._type} {self._named(value)}, ptr {name}.place, align {align}"
-        return [*self._place(name, "%out", row), store]
+    def _in_memory(self, value: str, kind: str) -> str:
+        """A value as it is stored: a truth value as a byte."""
+        if kind != "i8":
+            return value
+        return self._new(f"zext {self._lanes('i1')} {value} to {self._lanes(kind)}")
+
+    def _base(self, number: int, size: int) -> str:
+        """Lines that give the address of a block of a memory."""
+        return (
+            f"  %start.{number} = mul i64 %b, {size}\n"
+            f'  %base.{number} = getelementptr i8, ptr %"memory.{number}", i64 %start.{number}'
+        )
+
+    def _worlds(self) -> str:
+        """Lines that number the worlds of these lanes."""
+        if self._width == 1:
+            return "  %worlds = add i64 %world, 0"
+        lanes = self._lanes("i64")
+        numbers = ", ".join(f"i64 {lane}" for lane in range(self._width))
+        mask = f"<{self._width} x i32> zeroinitializer"
+        return (
+            f"  %one = insertelement {lanes} poison, i64 %world, i64 0\n"
+            f"  %all = shufflevector {lanes} %one, {lanes} poison, {mask}\n"
+            f"  %worlds = add {lanes} %all, <{numbers}>"
+        )
+
+    def _places(self, array: str, row: int) -> tuple[str, str]:
+        """Pointers to a component of an array outside, and its type in memory."""
+        dtype, shape = self._outside[array]
+        kind = _in_memory(dtype)
+        wholes = self._lanes("i64")
+        place = self._new(f"mul {wholes} %worlds, {self._splat(prod(shape), 'i64')}")
+        place = self._new(f"add {wholes} {place}, {self._splat(row, 'i64')}")
+        pointers = self._new(f'getelementptr {kind}, ptr %"out.{array}", {wholes} {place}')
+        return pointers, kind
+
+    def _gathered(self, pointers: str, kind: str) -> str:
+        """What lies at some places, a place for each lane."""
+        if self._width == 1:
+            return self._new(f"load {kind}, ptr {pointers}, align 1")
+        lanes, places, flags = map(self._lanes, (kind, "ptr", "i1"))
+        function = f"@llvm.masked.gather.v{self._width}{_SHORT[kind]}.v{self._width}p0"
+        self._declared[function] = f"declare {lanes} {function}({places}, i32, {flags}, {lanes})"
+        always = self._splat("true", "i1")
+        return self._new(
+            f"call {lanes} {function}({places} {pointers}, i32 1, {flags} {always}, {lanes} poison)"
+        )
+
+    def _scattered(self, value: str, pointers: str, kind: str) -> None:
+        """Write to some places."""
+        lanes, places, flags = map(self._lanes, (kind, "ptr", "i1"))
+        if self._width == 1:
+            self._lines.append(f"  store {kind} {value}, ptr {pointers}, align 1")
+            return
+        function = f"@llvm.masked.scatter.v{self._width}{_SHORT[kind]}.v{self._width}p0"
+        self._declared[function] = f"declare void {function}({lanes}, {places}, i32, {flags})"
+        always = self._splat("true", "i1")
+        self._lines.append(
+            f"  call void {function}({lanes} {value}, {places} {pointers}, i32 1, {flags} {always})"
+        )
+
+    def _gather(self, value: Value) -> str:
+        """A column of a table, at rows that lie within it."""
+        number, column, row = value.inputs
+        table = _kept_table(self._tables[number])
+        kind = _KINDS[value.dtype.name]
+        base = f"inttoptr (i64 {table.ctypes.data + column * table.itemsize} to ptr)"
+        wholes = self._lanes("i64")
+        place = self._new(
+            f"mul {wholes} {self._names[row.number]}, {self._splat(table.shape[1], 'i64')}"
+        )
+        pointers = self._new(f"getelementptr {kind}, ptr {base}, {wholes} {place}")
+        return self._gathered(pointers, kind)
+
+    # ---- conversions
+
+    def _cast(self, value: str, before: DType, after: DType) -> str:
+        """As NumPy's `astype`; a float beyond the whole numbers gives the nearest of them."""
+        first, second = self._type(before), self._type(after)
+        if after.kind == "b":
+            zero = self._splat("0.0" if before.kind == "f" else 0, _KINDS[before.name])
+            compare = "fcmp une" if before.kind == "f" else "icmp ne"
+            return self._new(f"{compare} {first} {value}, {zero}")
+        if before.kind == "f" and after.kind != "f":
+            lanes = "" if self._width == 1 else f"v{self._width}"
+            way = f"{lanes}i{8 * after.itemsize}.{lanes}f{8 * before.itemsize}"
+            function = f"@llvm.fpto{'u' if after.kind == 'u' else 's'}i.sat.{way}"
+            self._declared[function] = f"declare {second} {function}({first})"
+            return self._new(f"call {second} {function}({first} {value})")
+        if after.kind == "f" and before.kind == "f":
+            word = "fpext" if before.itemsize < after.itemsize else "fptrunc"
+        elif after.kind == "f":
+            word = "sitofp" if before.kind == "i" else "uitofp"
+        elif before.itemsize == after.itemsize and before.kind != "b":
+            return value
+        elif before.kind == "b" or before.itemsize < after.itemsize:
+            word = "sext" if before.kind == "i" else "zext"
+        else:
+            word = "trunc"
+        return self._new(f"{word} {first} {value} to {second}")
+
+    def _as_bits(self, dtype: DType, value: str) -> tuple[str, str]:
+        """A float's bits, and their type."""
+        kind = f"i{8 * dtype.itemsize}"
+        bits = self._new(f"bitcast {self._type(dtype)} {value} to {self._lanes(kind)}")
+        return bits, kind
+
+    def _fraction(self, dtype: DType, value: str) -> str:
+        """That of `frexp` of a normal number: the bits of the exponent become those of 1/2."""
+        size, fraction, bias = _BITS[dtype.name]
+        bits, kind = self._as_bits(dtype, value)
+        lanes = self._lanes(kind)
+        rest = (1 << (size - 1)) | ((1 << fraction) - 1)
+        bits = self._new(f"and {lanes} {bits}, {self._splat(rest, kind)}")
+        bits = self._new(f"or {lanes} {bits}, {self._splat((bias - 1) << fraction, kind)}")
+        return self._new(f"bitcast {lanes} {bits} to {self._type(dtype)}")
+
+    def _exponent(self, dtype: DType, value: str) -> str:
+        """That of `frexp` of a normal number, int32."""
+        size, fraction, bias = _BITS[dtype.name]
+        bits, kind = self._as_bits(dtype, value)
+        lanes = self._lanes(kind)
+        bits = self._new(f"lshr {lanes} {bits}, {self._splat(fraction, kind)}")
+        bits = self._new(
+            f"and {lanes} {bits}, {self._splat((1 << (size - fraction - 1)) - 1, kind)}"
+        )
+        bits = self._new(f"sub {lanes} {bits}, {self._splat(bias - 1, kind)}")
+        narrow = self._lanes("i32")
+        return bits if size == 32 else self._new(f"trunc {lanes} {bits} to {narrow}")
+
+    def _ldexp(self, dtype: DType, value: str, power: str) -> str:
+        """A number near 1 times 2^power, in two steps, of which only the last one can round."""
+        narrow = self._lanes("i32")
+        half = self._new(f"ashr {narrow} {power}, {self._splat(1, 'i32')}")
+        rest = self._new(f"sub {narrow} {power}, {half}")
+        for part in (half, rest):
+            value = self._new(f"fmul {self._type(dtype)} {value}, {self._power(dtype, part)}")
+        return value
+
+    def _power(self, dtype: DType, power: str) -> str:
+        """2^power of a power, int32, in the range of normal numbers."""
+        size, fraction, bias = _BITS[dtype.name]
+        kind = f"i{size}"
+        lanes = self._lanes(kind)
+        if size == 64:
+            power = self._new(f"sext {self._lanes('i32')} {power} to {lanes}")
+        bits = self._new(f"add {lanes} {power}, {self._splat(bias, kind)}")
+        bits = self._new(f"shl {lanes} {bits}, {self._splat(fraction, kind)}")
+        return self._new(f"bitcast {lanes} {bits} to {self._type(dtype)}")
 
 
-# ---- machine code
+def _in_memory(dtype: DType) -> str:
+    return "i8" if dtype.kind == "b" else _KINDS[dtype.name]
+
+
+_TABLES: dict[tuple[object, ...], np.ndarray] = {}
+"""Tables that machine code reads, by their content."""
+
+
+def _kept_table(table: np.ndarray) -> np.ndarray:
+    """A table at an address that lasts; equal ones have one."""
+    return _TABLES.setdefault((table.dtype, table.shape, table.tobytes()), table)
 
 
 @lru_cache
-def _machine_code(text: str, arrays: int) -> Any:
-    """The function of a module's text, of so many arrays, for this processor."""
+def _machine_code(text: str, addresses: int) -> Function:
+    """The function of a module's text, of so many addresses, for this processor."""
     binding = _llvm()
     features = binding.get_host_cpu_features().flatten()
     machine = binding.Target.from_default_triple().create_target_machine(
@@ -234,14 +491,9 @@ def _machine_code(text: str, arrays: int) -> Any:
     )
     module = binding.parse_assembly(text)
     module.verify()
-    options = binding.create_pipeline_tuning_options(speed_level=2)
-    options.loop_vectorization = options.slp_vectorization = False  # the text is vectors already
-    builder = binding.create_pass_builder(machine, options)
-    builder.getModulePassManager().run(module, builder)
     engine = binding.create_mcjit_compiler(module, machine)
     engine.finalize_object()
-    pointers = [ctypes.c_void_p] * arrays
-    kind = ctypes.CFUNCTYPE(None, *pointers, ctypes.c_int64, ctypes.c_int64)
-    call = kind(engine.get_function_address("fly"))
+    kind = ctypes.CFUNCTYPE(None, ctypes.c_int64, *[ctypes.c_void_p] * addresses)
+    call = kind(engine.get_function_address("run"))
     call.engine = engine  # type: ignore[attr-defined]  # it owns the machine code
     return call

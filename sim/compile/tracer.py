@@ -1,120 +1,404 @@
-"""Array code run once on variables: its operations, in their order.
+"""Array code run once on variables: NumPy's functions of a `TracedArray` extend its program.
 
-    trace = Trace(np.dtype(np.float32))
-    position = trace.read("position", 0)
-    velocity = trace.read("velocity", 0)
+    program = Program()
+    position = read(program, "position", np.dtype(np.float32), (3,))
+    velocity = read(program, "velocity", np.dtype(np.float32), (3,))
     later = position + velocity * 0.01
 
-`trace.operations` then has four: two loads, a product and a sum.
+The program then has six loads, a constant, three products and three sums. Dtypes follow NumPy's
+rules. An array has the shape that it has for one world: axes of worlds have the length 1.
 """
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from functools import reduce
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
-_NAMES: dict[Callable[..., Any], str] = {
-    np.add: "fadd",
-    np.subtract: "fsub",
-    np.multiply: "fmul",
-    np.true_divide: "fdiv",
-    np.negative: "fneg",
-    np.absolute: "fabs",
+from .. import elementary
+from .program import DType, Program, Value
+
+Traced = Any
+"""A traced array, which the types of NumPy's functions do not know."""
+
+_FLAG = np.dtype(bool)
+_WHOLE = np.dtype(np.int64)
+_OPERATIONS: dict[Callable[..., Any], str] = {
+    np.add: "add",
+    np.subtract: "subtract",
+    np.multiply: "multiply",
+    np.true_divide: "divide",
+    np.negative: "negative",
     np.sqrt: "sqrt",
     np.rint: "rint",
     np.floor: "floor",
-    np.equal: "fcmp oeq",
-    np.not_equal: "fcmp une",
-    np.less: "fcmp olt",
-    np.greater: "fcmp ogt",
-    np.greater_equal: "fcmp oge",
+    np.copysign: "copysign",
+    np.ldexp: "ldexp",
+    np.less: "less",
+    np.less_equal: "less_equal",
+    np.greater: "greater",
+    np.greater_equal: "greater_equal",
+    np.equal: "equal",
+    np.not_equal: "not_equal",
+    np.bitwise_and: "and",
     np.bitwise_or: "or",
-    np.where: "select",
+    np.bitwise_xor: "xor",
+    np.invert: "not",
+    np.left_shift: "left_shift",
+    np.right_shift: "right_shift",
 }
-"""NumPy's functions, and their operations by LLVM's names."""
-_FLAGS = {"or": [True, True], "select": [True, False, False]}
-"""Which inputs are flags; of all others none is."""
+"""Functions whose bits IEEE 754, or the arithmetic of whole numbers, fixes."""
+_MOVES = (
+    np.broadcast_to,
+    np.expand_dims,
+    np.moveaxis,
+    np.repeat,
+    np.reshape,
+    np.squeeze,
+    np.swapaxes,
+    np.transpose,
+    np.flip,
+)
+"""Functions that move components, and compute nothing."""
+_JOINS = (np.stack, np.concatenate, np.column_stack, np.vstack, np.hstack)
+_METHODS = ("reshape", "ravel", "squeeze", "transpose", "swapaxes", "copy", "view")
+_REDUCTIONS = {
+    "sum": np.add,
+    "any": np.logical_or,
+    "all": np.logical_and,
+    "min": np.minimum,
+    "max": np.maximum,
+}
 
 
-class Operation(NamedTuple):
-    """A function and its inputs: names of values, which begin with %, and numbers as text.
-
-    `load` reads a row of an array: its inputs are the array's name and the row.
-    """
-
-    function: str
-    inputs: tuple[str, ...]
-
-
-class Trace:
-    """The operations of a piece of array code.
-
-    Attributes:
-        dtype: Of all numbers.
-        operations: With the names of their values. The same one on the same values is there once.
-    """
-
-    def __init__(self, dtype: np.dtype[np.floating]) -> None:
-        self.dtype = dtype
-        self.operations = dict[Operation, str]()
-
-    def read(self, array: str, row: int) -> "TracedArray":
-        """The variable of a row of an array."""
-        return self._add(Operation("load", (array, str(row))))
-
-    def call(self, function: Callable[..., Any], *inputs: Any) -> "TracedArray":
-        """The value of a function of NumPy's. Raises `TypeError` for one that is not known, and for
-        flags where numbers are wanted, or numbers where flags are.
-        """
-        if function is np.minimum:  # NaN stays NaN, and of 0 and -0 it is the second
-            first, second = inputs
-            less = self.call(np.less, first, second)
-            chosen = self.call(np.bitwise_or, less, self.call(np.not_equal, first, first))
-            return self.call(np.where, chosen, first, second)
-        if function not in _NAMES:
-            known = ", ".join(one.__name__ for one in _NAMES)
-            raise TypeError(f"compiled code: expected {known} or minimum, got {function.__name__}")
-        name = _NAMES[function]
-        flags = []
-        words = []
-        for one in inputs:
-            is_traced = isinstance(one, TracedArray)
-            if is_traced and one.trace is not self:
-                raise TypeError("compiled code: expected values of one trace, got another's")
-            flags.append(is_traced and one.is_flag)
-            words.append(one.name if is_traced else repr(float(one)))
-        if flags != _FLAGS.get(name, [False] * len(flags)):
-            what = f"{function.__name__} of {len(flags)}"
-            raise TypeError(f"compiled code: {what}: expected a number, got a flag, or the reverse")
-        is_flag = name == "or" or name.startswith("fcmp")
-        return self._add(Operation(name, tuple(words)), is_flag=is_flag)
-
-    def _add(self, operation: Operation, *, is_flag: bool = False) -> "TracedArray":
-        name = self.operations.setdefault(operation, f"%v{len(self.operations)}")
-        return TracedArray(self, name, is_flag=is_flag)
+class Untraceable(TypeError):
+    """The code does what cannot be compiled. A class of its own: other errors are the code's."""
 
 
 class TracedArray(NDArrayOperatorsMixin):
-    """A variable, or a flag: NumPy's functions of it become operations of its trace."""
+    """An array of values of a program, all of one dtype, with the methods of NumPy's arrays.
 
-    shape = ()
+    Attributes:
+        program: What operations extend.
+        values: Of each component its `Value`, dtype object.
+    """
 
-    def __init__(self, trace: Trace, name: str, *, is_flag: bool) -> None:
-        self.trace = trace
-        self.name = name
-        self.dtype = trace.dtype
-        self.is_flag = is_flag
+    __hash__ = None  # type: ignore[assignment]  # as NumPy's
+
+    def __init__(self, program: Program, values: Any, dtype: DType) -> None:
+        self.program = program
+        self.values = np.asarray(values, object)
+        self.dtype = dtype
+
+    def __getattr__(self, name: str) -> Any:
+        if name in ("shape", "ndim", "size", "setflags"):
+            return getattr(self.values, name)
+        if name in _METHODS:
+            move = getattr(self.values, name)
+            return lambda *args, **options: self._like(move(*args, **options))
+        if name in _REDUCTIONS:
+            return lambda axis=None, keepdims=False: self._reduced(name, axis, keepdims=keepdims)
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return _refuse(f"array.{name}")
+
+    @property
+    def T(self) -> "TracedArray":  # NumPy's name
+        """Its axes in the reverse order."""
+        return self._like(self.values.T)
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def __getitem__(self, index: Any) -> "TracedArray":
+        if isinstance(index, TracedArray):
+            _refuse("an index that is computed: use looked_up() or np.take_along_axis()")
+        return self._like(self.values[index])
+
+    def __setitem__(self, index: Any, value: Any) -> None:
+        self.values[index] = self.lifted(value, self.dtype).values
 
     def __bool__(self) -> bool:
-        raise TypeError("compiled code: expected np.where, got a branch on a traced value")
+        _refuse("a branch on an array: use np.where()")
 
-    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any) -> "TracedArray":
-        if method != "__call__":
-            raise TypeError(f"compiled code: expected a function, got {ufunc.__name__}.{method}")
-        return self.trace.call(ufunc, *inputs)
+    def __index__(self) -> int:
+        _refuse("a single number of an array, which differs from world to world")
+
+    __float__ = __int__ = __index__
+
+    def __array__(self, *_: object, **__: object) -> np.ndarray:
+        _refuse("a new array of this one: use stack() or np.concatenate()")
+
+    def astype(self, dtype: Any, *, copy: bool = True) -> "TracedArray":
+        """As another dtype."""
+        dtype = np.dtype(dtype)
+        if dtype == self.dtype:
+            return self.copy() if copy else self
+        return self._each(lambda value: self.program.cast(value, dtype), dtype, self)
+
+    def clip(self, low: Any = None, high: Any = None) -> Traced:
+        """Within bounds; None is no bound."""
+        above: Traced = self if low is None else np.maximum(self, low)
+        return above if high is None else np.minimum(above, high)
+
+    def rows_of(self, table: np.ndarray) -> Traced:
+        """Rows of a table of constants, by their numbers, which lie within it."""
+        rows = len(table)
+        flat = table.reshape(rows, -1).copy()
+        self.program.tables.append(flat)
+        name = len(self.program.tables) - 1
+        numbers = self.astype(_WHOLE).clip(0, rows - 1)
+        parts = []
+        for column in range(flat.shape[1]):
+            look = lambda row, at=column: self.program.value("gather", flat.dtype, name, at, row)  # noqa: E731
+            parts.append(self._each(look, flat.dtype, numbers))
+        stacked: Traced = np.stack(parts, axis=-1)
+        return stacked.reshape(*self.shape, *table.shape[1:])
+
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **options: Any) -> Traced:
+        if method == "reduce" and ufunc in _REDUCTIONS.values():
+            return self._reduced(ufunc, options.get("axis", 0))
+        if method != "__call__" or options:
+            _refuse(f"np.{ufunc.__name__} with {method} or {', '.join(options) or 'no options'}")
+        if ufunc in _FUNCTIONS:
+            return _FUNCTIONS[ufunc](self, *inputs)
+        kinds = ufunc.resolve_dtypes((*map(_kind, inputs), *[None] * ufunc.nout))
+        arrays = [self.lifted(one, kind) for one, kind in zip(inputs, kinds, strict=False)]
+        results = kinds[ufunc.nin :]
+        if ufunc is np.frexp:
+            return (
+                self._applied("fraction", results[0], *arrays),
+                self._applied("exponent", results[1], *arrays),
+            )
+        if ufunc not in _OPERATIONS:
+            _refuse(f"np.{ufunc.__name__}")
+        operation = _OPERATIONS[ufunc]
+        if kinds[0] == _FLAG:
+            operation = {"add": "or", "multiply": "and"}.get(operation, operation)
+        return self._applied(operation, results[0], *arrays)
 
     def __array_function__(
-        self, function: Callable[..., Any], types: object, inputs: Any, options: object
+        self, function: Callable[..., Any], types: object, inputs: Any, options: Any
+    ) -> Any:
+        if function in _MOVES:
+            array, *rest = inputs
+            return self._like(function(array.values, *rest, **options))
+        if function in _JOINS:
+            parts, *rest = inputs
+            arrays = self._alike(parts)
+            joined = function([one.values for one in arrays], *rest, **options)
+            return TracedArray(self.program, joined, arrays[0].dtype)
+        if function not in _FUNCTIONS:
+            _refuse(f"np.{function.__name__}")
+        return _FUNCTIONS[function](self, *inputs, **options)
+
+    def _like(self, values: Any) -> "TracedArray":
+        return TracedArray(self.program, values, self.dtype)
+
+    def lifted(self, given: Any, dtype: DType) -> "TracedArray":
+        """Anything as a traced array of this dtype."""
+        if isinstance(given, TracedArray):
+            if given.program is not self.program:
+                raise ValueError("compiled code: expected values of one program, got another's")
+            return given.astype(dtype, copy=False)
+        constant = np.frompyfunc(lambda number: self.program.constant(number, dtype), 1, 1)
+        return TracedArray(self.program, constant(np.asarray(given, dtype)), dtype)
+
+    def _alike(self, given: Sequence[Any]) -> "list[TracedArray]":
+        """Arrays and numbers as arrays of the dtype that NumPy gives them together."""
+        dtype = _result_type(self, *given)
+        return [self.lifted(one, dtype) for one in given]
+
+    def _each(
+        self, function: Callable[..., Value], dtype: DType, *arrays: "TracedArray"
     ) -> "TracedArray":
-        return self.trace.call(function, *inputs)
+        """A function of the values of some arrays, one after the other."""
+        made = np.frompyfunc(function, len(arrays), 1)
+        return TracedArray(self.program, made(*[one.values for one in arrays]), dtype)
+
+    def _applied(self, operation: str, dtype: DType, *arrays: "TracedArray") -> "TracedArray":
+        def one(*values: Value) -> Value:
+            return self.program.value(operation, dtype, *values)
+
+        return self._each(one, dtype, *arrays)
+
+    def _reduced(self, name: Any, axis: Any = None, *, keepdims: bool = False) -> Traced:
+        """A sum and the like, from the first to the last."""
+        function = _REDUCTIONS.get(name, name)
+        if axis is None and self.ndim > 1:
+            _refuse(f"{function.__name__} over all worlds: give an axis; it")
+        axis = 0 if axis is None else axis
+        axes = sorted(np.atleast_1d(axis) % self.ndim, reverse=True)
+        array: Traced = self
+        if function in (np.logical_or, np.logical_and):
+            array = self.astype(bool)
+        elif function is np.add and self.dtype == _FLAG:
+            array = self.astype(_WHOLE)
+        for one in axes:
+            parts = [np.moveaxis(array, one, 0)[index] for index in range(array.shape[one])]
+            array = reduce(function, parts)
+            array = np.expand_dims(array, one) if keepdims else array
+        return array
+
+
+def read(program: Program, name: str, dtype: DType, shape: tuple[int, ...]) -> TracedArray:
+    """The variables of an array of a program, of such a shape for one world."""
+    size = int(np.prod(shape))
+    values = [program.value("load", dtype, name, number) for number in range(size)]
+    array = np.empty(size, object)
+    array[:] = values
+    return TracedArray(program, array.reshape(shape), dtype)
+
+
+def lift(program: Program, values: Any, dtype: DType) -> list[Value]:
+    """The values of an array, traced or of constants, as this dtype."""
+    like = values if isinstance(values, TracedArray) else TracedArray(program, [], dtype)
+    found: list[Value] = like.lifted(values, dtype).values.reshape(-1).tolist()
+    return found
+
+
+def _refuse(what: str) -> NoReturn:
+    raise Untraceable(f"{what} cannot be compiled")
+
+
+def _kind(given: Any) -> Any:
+    """The dtype of an array, or the type of one of Python's numbers, which adapt to arrays."""
+    if hasattr(given, "dtype"):
+        return given.dtype
+    return type(given) if type(given) in (int, float) else np.asarray(given).dtype
+
+
+def _result_type(_: TracedArray, *given: Any) -> DType:
+    dtypes = [one.dtype if isinstance(one, TracedArray) else one for one in given]
+    return np.result_type(*dtypes)
+
+
+# ---- functions that are made of others
+
+
+def _where(like: TracedArray, flag: Any, first: Any, second: Any) -> Traced:
+    first, second = like._alike((first, second))
+    if not isinstance(flag, TracedArray):
+        flag = like.lifted(flag, _FLAG)
+
+    def select(chosen: Value, a: Value, b: Value) -> Value:
+        return a if a is b else like.program.value("select", first.dtype, chosen, a, b)
+
+    return like._each(select, first.dtype, flag.astype(_FLAG), first, second)
+
+
+def _minimum(like: TracedArray, a: Any, b: Any) -> Traced:
+    """A NaN stays, and of 0 and -0 it is the second."""
+    a, b = like._alike((a, b))
+    return _where(like, (a < b) | (a != a), a, b)
+
+
+def _maximum(like: TracedArray, a: Any, b: Any) -> Traced:
+    a, b = like._alike((a, b))
+    return _where(like, (a > b) | (a != a), a, b)
+
+
+def _absolute(like: TracedArray, x: Traced) -> Traced:
+    if x.dtype.kind == "f":
+        return like._applied("absolute", x.dtype, x)
+    return _where(like, x < 0, 0 - x, x).astype(x.dtype)
+
+
+def _sign(like: TracedArray, x: Traced) -> Traced:
+    return _where(like, x > 0, 1.0, _where(like, x < 0, -1.0, x + 0.0)).astype(x.dtype)
+
+
+def _remainder(like: TracedArray, x: Any, by: Any) -> Traced:
+    """With the sign of the divisor; of a whole number and 0 it is 0."""
+    x, by = like._alike((x, by))
+    if x.dtype.kind == "i":  # By 0, and the least number by -1, processors stop the program.
+        by = _where(like, by == -1, 1, by)
+    if x.dtype.kind != "f":
+        by = _where(like, by == 0, 1, by)
+    rest = like._applied("remainder", x.dtype, x, by)
+    whole = np.copysign(0.0 * rest, by) if x.dtype.kind == "f" else rest
+    return _where(like, rest == 0, whole, _where(like, (rest < 0) != (by < 0), rest + by, rest))
+
+
+def _power(like: TracedArray, x: Any, exponent: Any) -> Traced:
+    if exponent in (2, 2.0):
+        return x * x
+    return np.sqrt(x) if exponent == 0.5 else elementary.power(x, exponent)
+
+
+def _take_along_axis(like: TracedArray, array: Any, indices: Traced, axis: int) -> Traced:
+    """By comparing the index with each that there is."""
+    count = array.shape[axis]
+    parts = [np.expand_dims(np.moveaxis(array, axis, 0)[i], axis) for i in range(count)]
+    chosen = parts[0]
+    for index in range(count):
+        chosen = _where(like, indices == index, parts[index], chosen)
+    return chosen
+
+
+def _argsort(like: TracedArray, array: Traced, axis: int = -1, **_: object) -> Traced:
+    """Places by their ranks, the number of those that come before; of equal ones the first does."""
+    values = np.moveaxis(array, axis, -1)
+    count = values.shape[-1]
+    numbers = np.arange(count)
+    a, b = values[..., :, None], values[..., None, :]
+    earlier = numbers[:, None] > numbers
+    ranks = ((b < a) | ((b == a) & earlier)).astype(_WHOLE).sum(axis=-1)
+    places = (ranks[..., None, :] == numbers[:, None]).astype(_WHOLE) * numbers
+    return np.moveaxis(places.sum(axis=-1), -1, axis)
+
+
+def _filled(number: float) -> Callable[..., Traced]:
+    def filled(like: TracedArray, array: Traced, dtype: Any = None, shape: Any = None) -> Traced:
+        numbers = np.full(array.shape if shape is None else shape, number, dtype or array.dtype)
+        return like.lifted(numbers, numbers.dtype)
+
+    return filled
+
+
+def _of_method(name: str) -> Callable[..., Traced]:
+    def call(like: TracedArray, array: Traced, *args: Any, **options: Any) -> Traced:
+        return getattr(array, name)(*args, **options)
+
+    return call
+
+
+_FUNCTIONS: dict[Callable[..., Any], Callable[..., Any]] = {
+    np.where: _where,
+    np.minimum: _minimum,
+    np.maximum: _maximum,
+    np.absolute: _absolute,
+    np.sign: _sign,
+    np.power: _power,
+    np.remainder: _remainder,
+    np.square: lambda like, x: x * x,
+    np.logical_and: lambda like, a, b: like.lifted(a, _FLAG) & like.lifted(b, _FLAG),
+    np.logical_or: lambda like, a, b: like.lifted(a, _FLAG) | like.lifted(b, _FLAG),
+    np.logical_not: lambda like, x: ~like.lifted(x, _FLAG),
+    np.isnan: lambda like, x: x != x,
+    np.isfinite: lambda like, x: abs(x) < np.inf,
+    np.take_along_axis: _take_along_axis,
+    np.argsort: _argsort,
+    np.zeros_like: _filled(0.0),
+    np.ones_like: _filled(1.0),
+    np.empty_like: _filled(0.0),
+    np.result_type: _result_type,
+    np.ndim: lambda like, x: x.ndim,
+    np.shape: lambda like, x: x.shape,
+    np.astype: _of_method("astype"),
+    np.copy: lambda like, x: x.copy(),
+    np.clip: _of_method("clip"),
+    np.sum: _of_method("sum"),
+    np.any: _of_method("any"),
+    np.all: _of_method("all"),
+    np.min: _of_method("min"),
+    np.max: _of_method("max"),
+    np.ravel: _of_method("ravel"),
+    np.sin: lambda like, x: elementary.sin(x),
+    np.cos: lambda like, x: elementary.cos(x),
+    np.arctan2: lambda like, y, x: elementary.atan2(y, x),
+    np.exp: lambda like, x: elementary.exp(x),
+    np.expm1: lambda like, x: elementary.expm1(x),
+    np.log: lambda like, x: elementary.log(x),
+}

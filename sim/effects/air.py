@@ -93,7 +93,7 @@ class AirEffects(Kept):
             _check_stiffness(vehicle, slope * max(1.0, turning), "drag of the rotors")
         if options.ground_effect:
             (self._radius,) = coefficients.need("rotors.radius", "ground_effect")
-        self._before: Array = None
+        self._before: list[Array] = []
 
     def vary(self, numbers: Mapping[str, Array]) -> None:
         """Take other coefficients for each drone, (W, A), by their names in a vehicle's file.

@@ -47,8 +47,8 @@ class Gusts(Kept):
         self._along = (1.0, 0.0) if across == 0 else (x / across, y / across)
         self._speed = max(LEAST_SPEED, math.sqrt(x * x + y * y + z * z))
         self._step = timestep
-        self._filters: Array = None
-        self._state: Array = None
+        self._filters: list[Array] = []
+        self._state: list[Array] = []
 
     def begin(self, mask: Array, height: Array, normal: Array, factor: Array = 1.0) -> None:
         """Begin in the stationary state; height in m, shape (W, A), normal (W, A, 5).

@@ -85,6 +85,7 @@ class RotorEffects(Kept):
 
         Returns the thrusts that they give, (W, A, R), N.
         """
+        thrust = thrust.astype(np.float64)
         self._roots = chosen(mask, square_root(thrust), self._roots)
         if self._options.battery:
             charge = factors.get("battery_charge", 1.0) + 0.0 * component(thrust, 0)

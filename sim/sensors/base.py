@@ -12,7 +12,7 @@ from ...models.coefficients import COEFFICIENTS
 from ...models.errors import InputError
 from ...models.fields import Limits, check, check_names
 from ..snapshots import Kept
-from ..state import Array, chosen, clip, component, kept
+from ..state import Array, chosen, clip, component, kept, some
 from ..world import World
 
 FURTHEST = 1e5  # Largest coordinate of a reading, m
@@ -187,7 +187,7 @@ class Sensor(Source):
         """After a control step of the drones of a mask; `steps` counts those of each episode."""
         due = mask & (steps % self._every == 0)
         fresh = due
-        if np.any(due):
+        if some(due):
             normal = self._noise.normal(due)
             fresh = due & (component(normal, -1) >= self._lost)
             self._held = chosen(fresh, self._read(normal), self._held)
@@ -217,7 +217,7 @@ def _is_whole(steps: float) -> bool:
 def _flagged(reading: Array, fresh: Array) -> Array:
     """A reading and its flag."""
     *lead, size = reading.shape
-    both = np.empty((*lead, size + 1))
+    both = np.empty_like(reading, np.float64, shape=(*lead, size + 1))
     both[..., :-1] = reading
     both[..., -1] = fresh
     return both

@@ -49,7 +49,7 @@ class Estimator(Source):
     def begin(self, mask: Array, state: WorldState, imu: Array) -> None:
         """Take over the exact state of the drones of a mask."""
         for name in ("position", "velocity", "quaternion"):
-            exact = getattr(state, name) + 0.0  # its own memory
+            exact = getattr(state, name).astype(np.float64)  # its own memory
             setattr(self, name, chosen(mask, exact, getattr(self, name)))
         self.body_rates = imu[..., :3]
 

@@ -68,7 +68,7 @@ def random_of(*shape: int, seed: int = 5) -> Random:
     random = Random(shape)
     worlds = shape[0] if shape else 1
     random.seed(range(worlds), [seed + i for i in range(worlds)])
-    random.begin(range(worlds))
+    random.begin(None)
     return random
 
 
@@ -114,12 +114,12 @@ def test_an_episode_begins_with_other_numbers_and_a_seed_repeats_them() -> None:
     random = random_of(2, 1)
     noise = random.noise("wind", 2)
     noise.normal()
-    random.begin([1])
+    random.begin(np.array([[False], [True]]))
     first, second = noise.normal()[:, 0].tolist()
     assert first == numbers(5, 1)
     assert second == numbers(6, 0, episode=2)
     random.seed([0, 1], [9, None])
-    random.begin([0])
+    random.begin(np.array([[True], [False]]))
     first, second = noise.normal()[:, 0].tolist()
     assert first == numbers(9, 0)
     assert second == numbers(6, 1, episode=2)
@@ -130,10 +130,10 @@ def test_a_draw_begins_the_episode_of_the_reset_that_follows() -> None:
     random.seed([0], [3])
     shares = []
     for episode in (1, 2):
-        shares.append(Draw(random, START, [0], ahead=1).uniform(0.0, 1.0).item())
-        random.begin([0])
+        shares.append(Draw(random, START, None, ahead=1).uniform(0.0, 1.0).item())
+        random.begin(None)
         assert random.episode.tolist() == [episode]
-    random.begin([0])  # without a draw
+    random.begin(None)  # without a draw
     assert random.episode.tolist() == [3]
     key = np.array((3, 0), np.uint32)
     for share, episode in zip(shares, (1, 2), strict=True):
@@ -143,7 +143,7 @@ def test_a_draw_begins_the_episode_of_the_reset_that_follows() -> None:
 
 def test_draws_follow_each_other_in_blocks() -> None:
     random = random_of(2, 3)
-    draw = Draw(random, START, [1])
+    draw = Draw(random, START, np.repeat([[False], [True]], 3, axis=1))
     first = draw.uniform(2.0, 4.0)
     second = draw.normal(3.0, (2,))
     assert first[0].tolist() == [0.0] * 3

@@ -54,9 +54,11 @@ def make_stepped(
     if count % drones:
         raise InputError(f"drones: expected a divisor of num_envs = {count}, got {drones}")
     if registry.is_known(env.env_id):
-        from ...envs.loop import Loop
+        from ...envs.compiled import make_loop
 
-        return Loop(env, count // drones)
+        loop = make_loop(env, count // drones)
+        loop.prepare()
+        return loop
     if count > 1 or env != EnvConfig(env_id=env.env_id, task=env.task):
         raise InputError(
             f"vehicle, backend, drones, num_envs: expected none for {env.env_id!r}, which is no "

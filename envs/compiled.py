@@ -1,0 +1,182 @@
+"""A loop whose steps are machine code."""
+
+import logging
+import re
+import traceback
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from ..models.errors import InputError, one_line
+from ..sim import PhysicsError
+from ..sim.compile import trouble
+from ..sim.snapshots import Arrays, Snapshot
+from ..sim.state import some
+from .autoreset import Told
+from .config import EnvConfig
+from .loop import Loop
+from .machine import Machine
+from .stages.ends import refuse_unfit
+from .stages.record import Floats
+
+_MACHINERY = re.compile(r"numpy|compile.[a-z]+\.py$")  # files that are not to blame
+
+
+def make_loop(config: EnvConfig, num_worlds: int = 1) -> Loop:
+    """The loop of a config: compiled where it can be."""
+    config = config.resolve()
+    backend = config.backend
+    compiles = backend.name == "rigid" and backend.compiled is not False
+    if compiles and not config.cameras and not trouble():
+        return CompiledLoop(config, num_worlds)
+    return Loop(config, num_worlds)
+
+
+class CompiledLoop(Loop):
+    """A loop that a machine steps, with the same bits; what cannot be compiled NumPy runs.
+
+    The state is in the machine, until somebody asks for the record, the world or the task.
+    """
+
+    _machine: Machine | None = None
+    _is_inside = False  # whether the machine has the state
+    _fails = False  # to compile
+    _now: Told
+    _content: Any = None
+
+    def _step(self, seeds: Any, *, flies: bool) -> None:
+        machine = self._entered()
+        if machine is None:
+            super()._step(seeds, flies=flies)
+            return
+        record = self._record
+        begun = record.begun
+        if begun is not None:
+            if not record.has_begun and not begun.all():
+                machine.begin_all()
+            if seeds is not None:
+                machine.seed(self._world, begun, seeds[:: len(self.spec.agents)])
+        sent = record.sent if flies else None
+        results, self._now = machine.step(sent, record.flown, begun, record.active)
+        record.action = self.pipeline.actions.neutral()  # an episode has begun
+        record.waiting = results["waiting"]
+        self._give(results)
+        self._check(results)
+
+    @property
+    def is_compiled(self) -> bool:
+        """Whether a machine steps it; before its first step or `prepare`, no."""
+        return self._machine is not None
+
+    def prepare(self) -> None:
+        """Compile."""
+        self._entered()
+
+    def _entered(self) -> Machine | None:
+        """The machine, which has the state from now on; None where NumPy flies."""
+        if self._machine is None and not self._fails:
+            self._machine = self._made()
+            self._fails = self._machine is None
+        if self._machine is not None and not self._is_inside:
+            self._machine.restore(self.state())
+            self._is_inside = True
+        return self._machine
+
+    def _made(self) -> Machine | None:
+        config = self.config
+        loop = Loop(replace(config, backend=replace(config.backend, compiled=False)))
+        neutral = loop.pipeline.actions.neutral()
+        try:
+            loop.advance(neutral, np.ones(config.drones, bool))
+            loop.advance(neutral)
+            return Machine(loop, self.num_envs // config.drones)
+        except InputError:  # which NumPy will raise
+            return None
+        except Exception as error:  # of an own task, any
+            _tell(config.env_id, f"{one_line(error)} ({_place(error)})")
+            return None
+
+    def _settle(self) -> None:
+        if self._is_inside:
+            assert self._machine is not None
+            self._is_inside = False
+            super().put(self._machine.state())
+
+    def state(self) -> Snapshot:
+        """As `Loop.state`."""
+        if self._is_inside:
+            assert self._machine is not None
+            return self._machine.state()
+        return super().state()
+
+    def put(self, state: Arrays) -> None:
+        """As `Loop.put`."""
+        self._is_inside = False
+        super().put(state)
+
+    def _give(self, results: dict[str, np.ndarray]) -> None:
+        count = self.num_envs
+        self._telemetry = self._content = None
+        self.observations = {}
+        for array in self.spec.observation:
+            self.observations[array.name] = results[array.name].reshape(count, *array.shape)
+        self.rewards = results["reward"].reshape(count)
+        self.terminated = results["terminated"].reshape(count)
+        self.truncated = results["truncated"].reshape(count)
+        self.done = results["done"].reshape(count)
+        self.out = results["out"].reshape(count)
+
+    @property
+    def reward_terms(self) -> dict[str, Floats]:
+        """As `Loop.reward_terms`."""
+        return self._read()[1] if self._is_inside else super().reward_terms
+
+    @property
+    def telemetry(self) -> dict[str, Floats]:
+        """As `Loop.telemetry`."""
+        return self._read()[0] if self._is_inside else super().telemetry
+
+    def told(self) -> Told:
+        """As `Loop.told`."""
+        return self._now if self._is_inside else super().told()
+
+    def row(self) -> list[float]:
+        """As `Loop.row`."""
+        if not self._is_inside:
+            return super().row()
+        numbers: list[float] = np.concat([*self._read()[0].values()], axis=1).ravel().tolist()
+        return numbers
+
+    def _read(self) -> Any:
+        """Telemetry and terms of the last step."""
+        if self._content is None:
+            self._content = self._now()
+        return self._content
+
+    def _check(self, results: dict[str, np.ndarray]) -> None:
+        """Raise for bad states, and for numbers that are not finite."""
+        if some(results["bad"]):
+            flew = self._record.flown
+            record = self.record
+            world: Any = self._world
+            try:
+                world.refuse_bad(flew)
+            except PhysicsError:
+                record.wait(flew)
+                raise
+        if some(results["unfit"]):
+            refuse_unfit(self.record, self.config.env_id)
+
+
+def _place(error: Exception) -> str:
+    """The function and the line of the code that cannot be compiled."""
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [one for one in frames if not _MACHINERY.search(one.filename)]
+    return f"`{own[-1].name}`, line {own[-1].lineno}"
+
+
+@cache
+def _tell(env_id: str, reason: str) -> None:
+    logging.getLogger(__name__).warning("%s: not compiled, NumPy flies it: %s", env_id, reason)

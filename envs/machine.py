@@ -1,0 +1,229 @@
+"""A loop as machine code: its step is a function from a snapshot to the next one.
+
+The list of stages runs once on variables, region by region: a loop of one world gets a snapshot of
+variables and runs a region, and its next snapshot says what the region computes. So nothing that a
+step depends on can be forgotten that a snapshot has.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from math import prod
+from typing import Any
+
+import numpy as np
+
+from ..sim import World
+from ..sim.compile import (
+    Layout,
+    Memory,
+    Program,
+    Region,
+    Untraceable,
+    compiled,
+    lift,
+    read,
+    widest,
+)
+from ..sim.snapshots import Arrays, Snapshot
+from .autoreset import Told
+from .loop import Loop
+from .stages.record import Mask, Record
+
+LANES = 64  # Worlds of a block: their numbers fit into the nearest cache
+MOST = 30_000  # Operations of a step: a few seconds to compile
+_MASKS = ("flown", "begun", "active")
+_RESULTS = ("reward", "terminated", "truncated", "done", "out", "waiting", "unfit")
+_TOLD = "told/"
+_TERM = "told/reward_"
+_KEYS = "Flight/random/keys"
+_EPISODE = "Flight/random/episode"
+_FLAG = np.dtype(bool)
+
+Named = dict[str, Any]
+Step = Sequence[Callable[[Record], None]]
+
+
+class Machine:
+    """The memory of W worlds, and the code that steps them.
+
+    Args:
+        loop: A loop of one world that flies by NumPy, whose episode has begun.
+        worlds: W.
+
+    Raises:
+        Untraceable: A stage cannot be compiled.
+    """
+
+    def __init__(self, loop: Loop, worlds: int) -> None:
+        self._loop = loop
+        self._worlds = worlds
+        state = loop.state()
+        sent = loop.record.sent
+        width = min(widest(), 1 << (worlds - 1).bit_length())
+        lanes = width * min(LANES // width, -(-worlds // width))
+        self._names = tuple(state)
+        self._masks = sent.shape[1:-1]
+        fields = _fields(state) | dict.fromkeys(_MASKS, (_FLAG, self._masks))
+        layout = Layout(fields, lanes)
+        self._told = Layout(_fields(self._telemetry()), lanes)
+        self._outside = {"sent": (sent.dtype, sent.shape[1:])} | _fields(self._seen())
+        self._layouts = layout, self._told
+        regions = [
+            self._traced("", [Record.rest]),
+            self._traced("flown", loop.pipeline.fly),
+            self._traced("begun", loop.pipeline.begin),
+            self._traced("active", loop.pipeline.observe),
+            self._looked(),
+        ]
+        size = sum(len(region.program.values) for region in regions)
+        if size > MOST:
+            raise Untraceable(f"a step of {size:,} operations, more than {MOST:,}, takes long:")
+        self._run = compiled(regions, self._layouts, self._outside, width)
+        self.memory = Memory(layout, worlds)
+        self._results = []
+        self._size = 0  # of all results, in bytes
+        for name, (dtype, shape) in list(self._outside.items())[1:]:
+            self._results.append((name, (worlds, *shape), dtype, self._size))
+            self._size += -(-self.memory.size * prod(shape) * dtype.itemsize // 8) * 8
+        self._all_fly = False
+
+    def step(
+        self, sent: np.ndarray | None, flown: Mask | None, begun: Mask | None, active: Mask | None
+    ) -> tuple[Named, Told]:
+        """Run all regions. Returns what leaves the loop, by name, (W, A, ...), and `Loop.told`.
+
+        Actions (W, A, k), None if nobody flies; masks as of a `Record`.
+        """
+        memory = self.memory
+        all_fly = flown is None and begun is None
+        if not (all_fly and self._all_fly):
+            nobody = np.zeros((self._worlds, *self._masks), bool)
+            memory.put("flown", ~nobody if flown is None else flown)
+            memory.put("begun", nobody if begun is None else begun)
+            memory.put("active", ~nobody if active is None else active)
+        self._all_fly = all_fly
+        if sent is None or len(sent) < self.memory.size:
+            dtype, shape = self._outside["sent"]
+            given = np.zeros((self.memory.size, *shape), dtype)
+            if sent is not None:
+                given[: self._worlds] = sent
+            sent = given
+        told = Memory(self._told, self._worlds, clear=False)
+        new = np.empty(self._size, np.uint8)  # of all results
+        first = new.ctypes.data
+        places = [first + start for *_, start in self._results]
+        self._run(memory.blocks, memory.address, told.address, sent.ctypes.data, *places)
+        results = {
+            name: np.ndarray(shape, dtype, new, start)
+            for name, shape, dtype, start in self._results
+        }
+        return results, lambda: self._read(told)
+
+    def begin_all(self) -> None:
+        """As `Record.begin_all`."""
+        memory = self.memory
+        nobody = np.zeros((self._worlds, *self._masks), bool)
+        self.step(None, nobody, ~nobody, ~nobody)
+        memory.put("record/kept/waiting", ~nobody)
+        memory.put("record/kept/episodes", 0 * memory.get("record/kept/episodes"))
+
+    def seed(self, world: World, begun: Mask, seeds: Any) -> None:
+        """As `World.seed`."""
+        random = world.random
+        random.keys = self.memory.get(_KEYS)
+        random.episode = self.memory.get(_EPISODE)
+        world.seed(begun, seeds)
+        self.memory.put(_KEYS, random.keys)
+        self.memory.put(_EPISODE, random.episode)
+
+    def state(self) -> Snapshot:
+        """As `Loop.state`."""
+        return {name: self.memory.get(name) for name in self._names}
+
+    def restore(self, state: Arrays) -> None:
+        """Put a state back; one from before an episode has a part of the arrays."""
+        for name in self._names:
+            values = state.get(name)
+            if values is not None and values.ndim:
+                self.memory.put(name, values)
+
+    def _read(self, told: Memory) -> tuple[Named, Named]:
+        """Telemetry and terms of the reward, float64, shape (N, n) and (N,)."""
+        telemetry = {}
+        terms = {}
+        for name in self._told.fields:
+            values = told.get(name).astype(np.float64)
+            flat = values.reshape(self._worlds * values.shape[1], -1)
+            if name.startswith(_TERM):
+                terms[name.removeprefix(_TERM)] = flat[:, 0]
+            else:
+                telemetry[name.removeprefix(_TOLD)] = flat
+        return telemetry, terms
+
+    def _telemetry(self) -> Named:
+        """What is told of the loop's step."""
+        loop = self._loop
+        record = loop.record
+        told = {_TERM + name: term for name, term in record.terms.items()}
+        for one in loop.quantities:
+            shape = (*record.shape, len(one.components))
+            told[_TOLD + one.name] = np.broadcast_to(one.read(loop), shape)
+        return told
+
+    def _seen(self) -> Named:
+        """What leaves the loop."""
+        record = self._loop.record
+        seen = {name: getattr(record, name) for name in _RESULTS}
+        world: Any = self._loop.world
+        seen["bad"] = world.bad
+        for array in self._loop.spec.observation:
+            seen[array.name] = record.observations[array.name].astype(array.dtype)
+        return seen
+
+    def _variables(self, program: Program) -> Named:
+        """Variables of all arrays; those of the state become the loop's."""
+        given = {"sent": self._outside["sent"], **self._layouts[0].fields}
+        arrays: Named = {
+            name: read(program, name, dtype, (1, *shape)) for name, (dtype, shape) in given.items()
+        }
+        self._loop.put({name: arrays[name] for name in self._names})
+        return arrays
+
+    def _traced(self, mask: str, stages: Step) -> Region:
+        """What a region changes of a snapshot."""
+        program = Program()
+        before = self._variables(program)
+        record = self._loop.record
+        record.flown = before["flown"]
+        record.begun = before["begun"]
+        record.sent = before["sent"]
+        record.run(before.get(mask), stages)
+        after = self._loop.state()
+        return Region(mask, program, _stores(program, after, before))
+
+    def _looked(self) -> Region:
+        """What leaves the loop, and what is told of it."""
+        program = Program()
+        self._variables(program)
+        fields = {**self._outside, **self._told.fields}
+        stores = []
+        for name, values in (self._seen() | self._telemetry()).items():
+            lifted = lift(program, values, fields[name][0])
+            stores += [(name, row, value) for row, value in enumerate(lifted)]
+        return Region("", program, stores)
+
+
+def _fields(arrays: Mapping[str, Any]) -> dict[str, tuple[np.dtype[Any], tuple[int, ...]]]:
+    """Dtype and shape of arrays of one world, (1, ...)."""
+    return {name: (array.dtype, array.shape[1:]) for name, array in arrays.items()}
+
+
+def _stores(program: Program, after: Named, before: Named) -> Any:
+    """Array, component and new value of what differs."""
+    stores = []
+    for name, values in after.items():
+        old = before[name]
+        new = lift(program, values, old.dtype)
+        for row, (value, known) in enumerate(zip(new, old.values.reshape(-1), strict=True)):
+            if value is not known:
+                stores.append((name, row, value))
+    return stores

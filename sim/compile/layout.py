@@ -1,0 +1,88 @@
+"""Arrays of many worlds in one piece of memory, so that a vector instruction reads neighbours.
+
+Worlds lie in blocks of lanes. A block holds row after row: a component of an array for its lanes.
+"""
+
+from collections.abc import Mapping
+from math import prod
+
+import numpy as np
+
+from .program import DType
+
+LINE = 64  # bytes of the cache, and of the widest vector of AVX-512
+
+Fields = Mapping[str, tuple[DType, tuple[int, ...]]]
+"""Dtype and shape of arrays for one world, by name."""
+
+
+class Layout:
+    """Where each array lies within a block of so many lanes.
+
+    Attributes:
+        offsets: Of each array, in bytes.
+        size: Of a block, in bytes.
+    """
+
+    def __init__(self, fields: Fields, lanes: int) -> None:
+        self.fields = fields
+        self.lanes = lanes
+        self.offsets: dict[str, int] = {}
+        self.size = 0
+        for name, (dtype, shape) in fields.items():
+            self.offsets[name] = self.size
+            bytes_ = prod(shape) * lanes * dtype.itemsize
+            self.size += -(-bytes_ // LINE) * LINE
+
+    def place(self, name: str, row: int) -> int:
+        """Where a row of an array begins, in bytes."""
+        return self.offsets[name] + row * self.lanes * self.fields[name][0].itemsize
+
+
+class Memory:
+    """The arrays of a layout for W worlds; the last block is filled up with worlds nobody sees.
+
+    Attributes:
+        address: What code gets.
+        blocks: How many.
+        size: Worlds of all blocks.
+    """
+
+    def __init__(self, layout: Layout, worlds: int, *, clear: bool = True) -> None:
+        """All is 0, or with `clear` false anything."""
+        self._layout = layout
+        self._worlds = worlds
+        self.blocks = -(-worlds // layout.lanes)
+        self.size = self.blocks * layout.lanes
+        make = np.zeros if clear else np.empty
+        raw = make(self.blocks * layout.size + LINE, np.uint8)
+        first = raw.ctypes.data
+        start = -first % LINE
+        self._content = raw[start:][: raw.size - LINE].reshape(self.blocks, layout.size)
+        self.address = first + start
+
+    def get(self, name: str) -> np.ndarray:
+        """A copy of an array, shape (W, *shape)."""
+        view = self._view(name)
+        if self.blocks == 1:
+            return view[0, : self._worlds].copy()
+        return view.copy().reshape(-1, *view.shape[2:])[: self._worlds]
+
+    def put(self, name: str, values: np.ndarray) -> None:
+        """Set an array from one of shape (W, *shape)."""
+        view = self._view(name)
+        lanes = self._layout.lanes
+        whole = self._worlds // lanes
+        if whole:
+            view[:whole] = values[: whole * lanes].reshape(whole, lanes, *view.shape[2:])
+        if whole < self.blocks:
+            view[whole, : self._worlds - whole * lanes] = values[whole * lanes :]
+
+    def _view(self, name: str) -> np.ndarray:
+        """The array itself, shape (blocks, lanes, *shape)."""
+        layout = self._layout
+        dtype, shape = layout.fields[name]
+        first = layout.offsets[name]
+        size = prod(shape) * layout.lanes * dtype.itemsize
+        rows = self._content[:, first : first + size].view(dtype)
+        return np.moveaxis(rows.reshape(self.blocks, *shape, layout.lanes), -1, 1)

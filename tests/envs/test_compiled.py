@@ -1,0 +1,170 @@
+"""The loop as machine code: the same bits as NumPy, in whatever way it is used; and what fails."""
+
+import builtins
+import logging
+import pickle
+from dataclasses import replace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from contracts import CASES, HOVER, STEPS, WORLDS, Case, bits
+from rotorgram.envs import Loop, registry
+from rotorgram.envs.compiled import CompiledLoop, make_loop
+from rotorgram.envs.config import EnvConfig
+from rotorgram.envs.registry import register
+from rotorgram.envs.vector import LocalVectorEnv
+from rotorgram.models import InputError
+from rotorgram.sim import PhysicsError
+from rotorgram.sim.compile import llvm
+from test_contract import flight
+
+RIGID = {
+    name: case
+    for name, case in CASES.items()
+    if case.options.get("backend") == "rigid" and name not in ("all, NumPy", "swarm, rigid")
+}
+"""But one in which nothing is to be compiled, and one with too many drones."""
+MANY = 150  # worlds: two blocks, and a part of one
+
+
+def both(case: Case, worlds: int = WORLDS, **more: Any) -> tuple[CompiledLoop, Loop]:
+    config = case.config(**more)
+    compiled = make_loop(config, worlds)
+    assert isinstance(compiled, CompiledLoop)
+    plain = Loop(config, worlds)
+    plain.world.random.keys = compiled.world.random.keys  # until they are seeded
+    return compiled, plain
+
+
+def check_same(ours: CompiledLoop, theirs: Loop) -> None:
+    """All arrays that a later step depends on, and what the last step gave."""
+    assert ours.is_compiled
+    for name in ("observations", "rewards", "terminated", "truncated", "done", "out"):
+        assert bits(getattr(ours, name)) == bits(getattr(theirs, name)), name
+    assert bits(ours.telemetry) == bits(theirs.telemetry)
+    assert bits(ours.reward_terms) == bits(theirs.reward_terms)
+    found = ours.snapshot()
+    for name, expected in theirs.snapshot().items():
+        assert bits(found[name]) == bits(expected), name
+
+
+@pytest.mark.parametrize("case", RIGID.values(), ids=RIGID)
+def test_the_bits_of_numpy(case: Case) -> None:
+    """With worlds that are reset in mid-flight, that rest, and whose episodes end."""
+    ours, theirs = both(case)
+    for step in range(STEPS):
+        flight(ours, range(step, step + 1))
+        flight(theirs, range(step, step + 1))
+        check_same(ours, theirs)
+
+
+@pytest.mark.parametrize("name", ["Hover, rotors, rigid", "Tracking, rotors, rigid", "rich, rigid"])
+def test_the_bits_of_numpy_in_float64_and_many_blocks(name: str) -> None:
+    ours, theirs = both(CASES[name], MANY, dtype="float64")
+    draw = np.random.default_rng(0)
+    seeds = np.arange(MANY)
+    resets = seeds >= 0
+    width = len(theirs.task.controller.low)
+    for _ in range(STEPS):
+        frozen = draw.random(MANY) < 0.1
+        actions = draw.uniform(-1.0, 1.0, (MANY, width)).astype(np.float32)
+        for loop in (ours, theirs):
+            loop.advance(actions, resets & ~frozen, seeds, frozen)
+        check_same(ours, theirs)
+        resets = theirs.record.waiting[:, 0] | (draw.random(MANY) < 0.1)
+
+
+def test_a_first_reset_of_some_worlds() -> None:
+    ours, theirs = both(CASES["Hover, rotors, rigid"])
+    some = np.array([False, True, False])
+    for loop in (ours, theirs):
+        loop.advance(np.zeros((WORLDS, 4), np.float32), some, [5, 6, 7], ~some)
+    check_same(ours, theirs)
+    with pytest.raises(gym.error.ResetNeeded):
+        ours.advance(np.zeros((WORLDS, 4), np.float32))
+
+
+def test_numpy_and_machine_take_turns() -> None:
+    """Who reads the world gets the state, and the next step begins there."""
+    ours, theirs = both(CASES["rich, rigid"])
+    flight(ours, range(6))
+    flight(theirs, range(6))
+    assert bits(ours.world.state.position) == bits(theirs.world.state.position)
+    other = Loop(theirs.config, WORLDS)
+    other.restore(ours.snapshot())
+    for loop in (ours, theirs, other):
+        flight(loop, range(6, 12))
+    check_same(ours, theirs)
+    assert bits(other.snapshot()) == bits(theirs.snapshot())
+    ours.restore(other.snapshot())
+    copied = pickle.loads(pickle.dumps(ours))  # of our own making
+    for loop in (ours, theirs, copied):
+        flight(loop, range(12, STEPS))
+    check_same(ours, theirs)
+    check_same(copied, theirs)
+
+
+def test_bad_states_and_numbers_are_told_of() -> None:
+    env = LocalVectorEnv(HOVER, 3, backend="rigid")
+    env.reset(seed=1)
+    env.loop.world.state.velocity[1, 0, 2] = 1e12
+    with pytest.raises(PhysicsError, match=r"bad states in envs \[1\]"):
+        env.step(np.zeros((3, 4), np.float32))
+    with pytest.raises(gym.error.ResetNeeded):
+        env.step(np.zeros((3, 4), np.float32))
+    env.reset()
+    env.step(np.zeros((3, 4), np.float32))
+
+
+class Branching(registry.task_type(HOVER)):  # type: ignore[misc]
+    """A task with a branch on an array."""
+
+    def outcome(self, state: Any) -> Any:
+        """As of Hover."""
+        if state.position[0, 0, 2] > 0:
+            return super().outcome(state)
+        return None
+
+
+def test_what_cannot_be_compiled_flies_by_numpy_and_is_said(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    register("Branching-v0", Branching)
+    loop = make_loop(EnvConfig.from_keywords("Branching-v0", backend="rigid"), WORLDS)
+    with caplog.at_level(logging.WARNING):
+        flight(loop, range(3))
+    (line,) = [record.getMessage() for record in caplog.records]
+    assert line.startswith("Branching-v0: not compiled, NumPy flies it: a branch on an array")
+    assert "`outcome`, line " in line
+    theirs = Loop(loop.config, WORLDS)
+    flight(theirs, range(3))
+    assert bits(loop.snapshot()) == bits(theirs.snapshot())
+
+
+def test_numpy_flies_where_it_is_asked_for_or_nothing_compiles(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    config = EnvConfig.from_keywords(HOVER, backend="rigid")
+    plain = make_loop(replace(config, backend=replace(config.backend, compiled=False)))
+    assert type(plain) is Loop
+    imported = builtins.__import__
+
+    def without(name: str, *args: Any, **options: Any) -> Any:
+        if name.startswith("llvmlite"):
+            raise ImportError("no llvmlite")
+        return imported(name, *args, **options)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    llvm._llvm.cache_clear()
+    try:
+        loop = make_loop(config)
+        assert type(loop) is Loop
+        flight(make_loop(config, WORLDS), range(3))
+        asked = replace(config, backend=replace(config.backend, compiled=True))
+        with pytest.raises(InputError, match=r"compiled: expected false .*no llvmlite"):
+            make_loop(asked)
+    finally:
+        monkeypatch.undo()
+        llvm._llvm.cache_clear()
