@@ -61,11 +61,11 @@ class Machine:
         width = min(widest(), 1 << (worlds - 1).bit_length())
         lanes = width * min(LANES // width, -(-worlds // width))
         self._names = tuple(state)
-        self._masks = sent.shape[1:-1]
-        fields = _fields(state) | dict.fromkeys(_MASKS, (_FLAG, self._masks))
-        layout = Layout(fields, lanes)
+        layout = Layout(_fields(state), lanes)
         self._told = Layout(_fields(self._telemetry()), lanes)
-        self._outside = {"sent": (sent.dtype, sent.shape[1:])} | _fields(self._seen())
+        given = {name: (_FLAG, sent.shape[1:-1]) for name in _MASKS}
+        given["sent"] = (sent.dtype, sent.shape[1:])
+        self._outside = given | _fields(self._seen())
         self._layouts = layout, self._told
         regions = [
             self._traced("", [Record.rest]),
@@ -81,10 +81,15 @@ class Machine:
         self.memory = Memory(layout, worlds)
         self._results = []
         self._size = 0  # of all results, in bytes
-        for name, (dtype, shape) in list(self._outside.items())[1:]:
+        for name, (dtype, shape) in self._outside.items():
+            if name in given:
+                continue
             self._results.append((name, (worlds, *shape), dtype, self._size))
             self._size += -(-self.memory.size * prod(shape) * dtype.itemsize // 8) * 8
-        self._all_fly = False
+        size = self.memory.size
+        self._nobody = np.zeros((size, *sent.shape[1:-1]), bool)
+        self._everybody = ~self._nobody
+        self._nothing = np.zeros((size, *sent.shape[1:]), sent.dtype)
 
     def step(
         self, sent: np.ndarray | None, flown: Mask | None, begun: Mask | None, active: Mask | None
@@ -94,36 +99,37 @@ class Machine:
         Actions (W, A, k), None if nobody flies; masks as of a `Record`.
         """
         memory = self.memory
-        all_fly = flown is None and begun is None
-        if not (all_fly and self._all_fly):
-            nobody = np.zeros((self._worlds, *self._masks), bool)
-            memory.put("flown", ~nobody if flown is None else flown)
-            memory.put("begun", nobody if begun is None else begun)
-            memory.put("active", ~nobody if active is None else active)
-        self._all_fly = all_fly
-        if sent is None or len(sent) < self.memory.size:
-            dtype, shape = self._outside["sent"]
-            given = np.zeros((self.memory.size, *shape), dtype)
-            if sent is not None:
-                given[: self._worlds] = sent
-            sent = given
+        given = (
+            self._everybody if flown is None else self._padded(flown),
+            self._nobody if begun is None else self._padded(begun),
+            self._everybody if active is None else self._padded(active),
+            self._nothing if sent is None else self._padded(sent),
+        )
         told = Memory(self._told, self._worlds, clear=False)
         new = np.empty(self._size, np.uint8)  # of all results
         first = new.ctypes.data
-        places = [first + start for *_, start in self._results]
-        self._run(memory.blocks, memory.address, told.address, sent.ctypes.data, *places)
+        places = [array.ctypes.data for array in given]
+        places += [first + start for *_, start in self._results]
+        self._run(memory.blocks, memory.address, told.address, *places)
         results = {
             name: np.ndarray(shape, dtype, new, start)
             for name, shape, dtype, start in self._results
         }
         return results, lambda: self._read(told)
 
+    def _padded(self, array: np.ndarray) -> np.ndarray:
+        """An array (W, ...) as one of the worlds of all blocks, C-contiguous."""
+        if len(array) == self.memory.size:
+            return np.ascontiguousarray(array)
+        padded = np.zeros((self.memory.size, *array.shape[1:]), array.dtype)
+        padded[: self._worlds] = array
+        return padded
+
     def begin_all(self) -> None:
         """As `Record.begin_all`."""
         memory = self.memory
-        nobody = np.zeros((self._worlds, *self._masks), bool)
-        self.step(None, nobody, ~nobody, ~nobody)
-        memory.put("record/kept/waiting", ~nobody)
+        self.step(None, self._nobody, self._everybody, self._everybody)
+        memory.put("record/kept/waiting", self._everybody[: self._worlds])
         memory.put("record/kept/episodes", 0 * memory.get("record/kept/episodes"))
 
     def seed(self, world: World, begun: Mask, seeds: Any) -> None:
@@ -181,7 +187,7 @@ class Machine:
 
     def _variables(self, program: Program) -> Named:
         """Variables of all arrays; those of the state become the loop's."""
-        given = {"sent": self._outside["sent"], **self._layouts[0].fields}
+        given = {**self._layouts[0].fields, **self._outside}
         arrays: Named = {
             name: read(program, name, dtype, (1, *shape)) for name, (dtype, shape) in given.items()
         }

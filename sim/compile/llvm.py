@@ -289,6 +289,9 @@ class _Printer:
 
     def _address(self, array: str, row: int) -> tuple[str, str, int]:
         """Pointer to a row at these lanes, its type in memory, and its alignment."""
+        if array in self._outside:
+            kind = _in_memory(self._outside[array][0])
+            return self._new(f'getelementptr {kind}, ptr %"out.{array}", i64 %world'), kind, 1
         number = self._bases[array]
         layout = self._layouts[number]
         dtype, _ = layout.fields[array]
@@ -300,7 +303,7 @@ class _Printer:
 
     def _load(self, array: str, row: int) -> str:
         """A row at these lanes; a truth value is a byte in memory."""
-        if array in self._outside:
+        if self._is_spread(array):
             return self._gathered(*self._places(array, row))
         place, kind, align = self._address(array, row)
         value = self._new(f"load {self._lanes(kind)}, ptr {place}, align {align}")
@@ -309,7 +312,7 @@ class _Printer:
         return value
 
     def _store(self, array: str, row: int, value: str) -> None:
-        if array in self._outside:
+        if self._is_spread(array):
             place, kind = self._places(array, row)
             self._scattered(self._in_memory(value, kind), place, kind)
             return
@@ -342,6 +345,10 @@ class _Printer:
             f"  %all = shufflevector {lanes} %one, {lanes} poison, {mask}\n"
             f"  %worlds = add {lanes} %all, <{numbers}>"
         )
+
+    def _is_spread(self, array: str) -> bool:
+        """Whether components of neighbours lie apart: of an array outside, but for one component."""
+        return array in self._outside and prod(self._outside[array][1]) > 1
 
     def _places(self, array: str, row: int) -> tuple[str, str]:
         """Pointers to a component of an array outside, and its type in memory."""
