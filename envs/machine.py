@@ -63,7 +63,7 @@ class Machine:
         self._names = tuple(state)
         layout = Layout(_fields(state), lanes)
         self._told = Layout(_fields(self._telemetry()), lanes)
-        given = {name: (_FLAG, sent.shape[1:-1]) for name in _MASKS}
+        given: Named = dict.fromkeys(_MASKS, (_FLAG, sent.shape[1:-1]))
         given["sent"] = (sent.dtype, sent.shape[1:])
         self._outside = given | _fields(self._seen())
         self._layouts = layout, self._told
@@ -74,7 +74,7 @@ class Machine:
             self._traced("active", loop.pipeline.observe),
             self._looked(),
         ]
-        size = sum(len(region.program.values) for region in regions)
+        size = sum(len(region.operations()) for region in regions)
         if size > MOST:
             raise Untraceable(f"a step of {size:,} operations, more than {MOST:,}, takes long:")
         self._run = compiled(regions, self._layouts, self._outside, width)

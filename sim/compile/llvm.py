@@ -121,6 +121,10 @@ class Region(NamedTuple):
     stores: list[tuple[str, int, Value]]
     """Array, component, and new value, which is that of all lanes: the mask is in the program."""
 
+    def operations(self) -> list[Value]:
+        """What the stores need, in order."""
+        return self.program.needed(value for _, _, value in self.stores)
+
 
 @cache
 def _llvm() -> Any:
@@ -204,7 +208,7 @@ class _Printer:
             some = self._some(self._load(region.mask, 0))
             self._lines.append(f"  br i1 {some}, label %body.{number}, label {after}")
         self._lines.append(f"body.{number}:")
-        for value in region.program.needed(value for _, _, value in region.stores):
+        for value in region.operations():
             self._names[value.number] = self._printed(value)
         for array, row, value in region.stores:
             self._store(array, row, self._names[value.number])
@@ -304,9 +308,11 @@ class _Printer:
     def _load(self, array: str, row: int) -> str:
         """A row at these lanes; a truth value is a byte in memory."""
         if self._is_spread(array):
-            return self._gathered(*self._places(array, row))
-        place, kind, align = self._address(array, row)
-        value = self._new(f"load {self._lanes(kind)}, ptr {place}, align {align}")
+            place, kind = self._places(array, row)
+            value = self._gathered(place, kind)
+        else:
+            place, kind, align = self._address(array, row)
+            value = self._new(f"load {self._lanes(kind)}, ptr {place}, align {align}")
         if kind == "i8":
             return self._new(f"trunc {self._lanes(kind)} {value} to {self._lanes('i1')}")
         return value
@@ -347,7 +353,7 @@ class _Printer:
         )
 
     def _is_spread(self, array: str) -> bool:
-        """Whether components of neighbours lie apart: of an array outside, but for one component."""
+        """Whether a component of neighbours lies apart, as of an array outside with several."""
         return array in self._outside and prod(self._outside[array][1]) > 1
 
     def _places(self, array: str, row: int) -> tuple[str, str]:
