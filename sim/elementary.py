@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from .compile import once
+from .compile.tracer import add_function
 from .state import Array, floor
 
 _TURN = 0.6366197723675814  # 2 / π
@@ -164,11 +166,13 @@ def polynomial(x: Array, coefficients: tuple[float, ...]) -> Array:
 # ---- of angles
 
 
+@once()
 def sin(x: Array) -> Array:
     """Sine of an angle, rad, within 2.5 ulp; NaN beyond 3e6, of float32 beyond 2e4."""
     return _wave(x, 0.0)
 
 
+@once()
 def cos(x: Array) -> Array:
     """Cosine of an angle, as `sin`."""
     return _wave(x, 1.0)
@@ -189,6 +193,7 @@ def _wave(x: Array, quarters: float) -> Array:
     return f.where(quarter >= 2.0, -value, value)
 
 
+@once()
 def wrapped(x: Array) -> Array:
     """The angle between -π and π, rad, that differs from x by whole turns; NaN as of `sin`."""
     f, p, x = _prepared(x)
@@ -203,6 +208,7 @@ def _without(f: _Functions, p: _Precision, x: Array, quarters: Array) -> Array:
     return x
 
 
+@once()
 def atan2(y: Array, x: Array) -> Array:
     """Angle of the point (x, y), rad, within 2.5 ulp, for sizes below 1e37; zeros as in C."""
     f, p, y, x = _prepared(y, x)
@@ -231,6 +237,7 @@ def atan2(y: Array, x: Array) -> Array:
 # ---- exponentials
 
 
+@once()
 def exp(x: Array) -> Array:
     """Exponential function, within 2.5 ulp.
 
@@ -243,6 +250,7 @@ def exp(x: Array) -> Array:
     return _ended(f, p, x, value)
 
 
+@once()
 def expm1(x: Array) -> Array:
     """exp(x) - 1, within 2.5 ulp; infinite where `exp` is."""
     f, p, x = _prepared(x)
@@ -267,6 +275,7 @@ def _ended(f: _Functions, p: _Precision, x: Array, value: Array) -> Array:
     return f.where(x == x, value, x)
 
 
+@once()
 def log(x: Array) -> Array:
     """Natural logarithm, within 2.5 ulp, as fdlibm's e_log.c.
 
@@ -312,3 +321,14 @@ def inverse(matrix: np.ndarray) -> np.ndarray:
         rows = rows - rows[..., :, i, None] * row[..., None, :]
         rows[..., i, :] = row
     return rows[..., count:]
+
+
+for _ufunc, _ours in (
+    (np.sin, sin),
+    (np.cos, cos),
+    (np.arctan2, atan2),
+    (np.exp, exp),
+    (np.expm1, expm1),
+    (np.log, log),
+):
+    add_function(_ufunc, _ours)  # of traced code

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import elementary
-from .compile import TracedArray
+from .compile import TracedArray, once
 from .snapshots import Arrays, Kept
 from .state import Array
 
@@ -44,6 +44,7 @@ _AHEAD = 256  # Most rows of numbers that are drawn ahead, over all worlds
 _BLOCKS = 16  # Least blocks that a `Draw` computes at once for a world
 
 
+@once(vectors=1)
 def philox(counter: Words, key: Words) -> Words:
     """Four random words of a counter, shape (..., 4), and a key, shape (..., 2)."""
     even = counter[..., 0::2].astype(np.uint64)
@@ -75,7 +76,7 @@ def words_of(
     counter[..., 1] = np.expand_dims(step, -1)
     counter[..., 2] = np.expand_dims(episode, -1)
     counter[..., 3] = use
-    words = philox(counter, key[..., None, :])
+    words: Words = philox(counter, key[..., None, :])
     return words.reshape(*key.shape[:-1], 4 * blocks)[..., :count]
 
 

@@ -7,13 +7,13 @@ with another.
 """
 
 from .layout import Fields, Layout, Memory
-from .llvm import Function, Region, compiled, trouble, widest
+from .llvm import Code, Region, compiled, trouble, widest
 from .program import Program, Value
-from .tracer import TracedArray, Untraceable, lift, read
+from .tracer import TracedArray, Untraceable, lift, once, read
 
 __all__ = [
+    "Code",
     "Fields",
-    "Function",
     "Layout",
     "Memory",
     "Program",
@@ -23,6 +23,7 @@ __all__ = [
     "Value",
     "compiled",
     "lift",
+    "once",
     "read",
     "trouble",
     "widest",

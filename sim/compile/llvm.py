@@ -15,9 +15,9 @@ import numpy as np
 
 from ...models.errors import one_line
 from .layout import Fields, Layout
-from .program import DType, Program, Value
+from .program import DType, Function, Program, Value
 
-Function = Callable[..., None]
+Code = Callable[..., None]
 """Takes the number of blocks, the address of each memory, and those of arrays outside."""
 
 _KINDS = {
@@ -153,7 +153,7 @@ def widest() -> int:
 
 def compiled(
     regions: Sequence[Region], layouts: Sequence[Layout], outside: Fields, width: int
-) -> Function:
+) -> Code:
     """The function of some regions. Takes a fifth of a second.
 
     Args:
@@ -177,6 +177,8 @@ class _Printer:
         self._lines: list[str] = []
         self._declared: dict[str, str] = {}
         self._names: dict[int, str] = {}
+        self._calls: dict[str, str] = {}
+        self._functions: dict[str, str] = {}
         self._tables: list[np.ndarray] = []
         self._count = 0
 
@@ -195,11 +197,13 @@ class _Printer:
             regions="\n".join(self._lines),
             count=len(regions),
         )
-        return "\n".join((function, *self._declared.values(), _ATTRIBUTES))
+        functions = self._functions.values()
+        return "\n".join((function, *functions, *self._declared.values(), _ATTRIBUTES))
 
     def _region(self, number: int, region: Region) -> None:
         after = f"%region.{number + 1}"
         self._names = {}
+        self._calls = {}
         self._tables = region.program.tables
         self._lines.append(f"region.{number}:")
         if not region.mask:
@@ -221,8 +225,12 @@ class _Printer:
             return self._number(value)
         if operation == "load":
             return self._load(*value.inputs)
+        if operation == "parameter":
+            return f"%p{value.inputs[0]}"
         if operation == "gather":
             return self._gather(value)
+        if operation == "call":
+            return self._result(*value.inputs)
         inputs = [self._names[one.number] for one in value.inputs]
         dtype = value.inputs[0].dtype
         if operation == "cast":
@@ -247,6 +255,45 @@ class _Printer:
         if dtype.kind != "f":
             names = _WHOLES | (_SIGNED if dtype.kind == "i" else _UNSIGNED)
         return self._new(f"{names[operation]} {kind} {inputs[0]}, {inputs[1]}")
+
+    # ---- functions of the programs
+
+    def _result(self, function: Function, number: int, *inputs: Value) -> str:
+        """A result of a call, which is there once for all its results."""
+        pairs = [f"{self._type(one.dtype)} {self._names[one.number]}" for one in inputs]
+        arguments = ", ".join(pairs)
+        kind = self._returned(function)
+        call = f'call {kind} @"{function.name}"({arguments})'
+        if call not in self._calls:
+            self._calls[call] = self._new(call)
+        if function.name not in self._functions:
+            self._functions[function.name] = self._definition(function, inputs)
+        if len(function.results) == 1:
+            return self._calls[call]
+        return self._new(f"extractvalue {kind} {self._calls[call]}, {number}")
+
+    def _returned(self, function: Function) -> str:
+        """Type of what a function returns."""
+        kinds = [self._type(one.dtype) for one in function.results]
+        return kinds[0] if len(kinds) == 1 else f"{{{', '.join(kinds)}}}"
+
+    def _definition(self, function: Function, inputs: Sequence[Value]) -> str:
+        """The text of a function."""
+        outer = self._lines, self._names, self._calls
+        self._lines, self._names, self._calls = [], {}, {}
+        for value in function.program.needed(function.results):
+            self._names[value.number] = self._printed(value)
+        kind = self._returned(function)
+        out = self._names[function.results[0].number]
+        if len(function.results) > 1:
+            out = "poison"
+            for number, one in enumerate(function.results):
+                part = f"{self._type(one.dtype)} {self._names[one.number]}"
+                out = self._new(f"insertvalue {kind} {out}, {part}, {number}")
+        body = "\n".join((*self._lines, f"  ret {kind} {out}"))
+        self._lines, self._names, self._calls = outer
+        parameters = ", ".join(f"{self._type(one.dtype)} %p{i}" for i, one in enumerate(inputs))
+        return f'define internal {kind} @"{function.name}"({parameters}) #0 {{\n{body}\n}}'
 
     # ---- types, numbers, memory
 
@@ -495,7 +542,7 @@ def _kept_table(table: np.ndarray) -> np.ndarray:
 
 
 @lru_cache
-def _machine_code(text: str, addresses: int) -> Function:
+def _machine_code(text: str, addresses: int) -> Code:
     """The function of a module's text, of so many addresses, for this processor."""
     binding = _llvm()
     features = binding.get_host_cpu_features().flatten()

@@ -19,7 +19,8 @@ class Value:
 
     `load` reads a component of an array: its inputs are the array's name and the component's
     number. `constant` has the bytes of a number. `gather` reads a table of the program: it has the
-    table's number, the component's, and a value, the row. All others have values.
+    table's number, the component's, and a value, the row. `call` has a `Function`, the number of
+    its result, and values; `parameter` is one of a function, by its number. All others have values.
     """
 
     operation: str
@@ -27,6 +28,17 @@ class Value:
     inputs: tuple[Any, ...]
     number: int
     """Its place in the program."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Function:
+    """A program of its own, for what is computed often: its code is there once."""
+
+    name: str
+    program: "Program"
+    results: list[Value]
+    shape: tuple[int, ...]
+    """Of the results."""
 
 
 class Program:

@@ -10,14 +10,15 @@ rules. An array has the shape that it has for one world: axes of worlds have the
 """
 
 from collections.abc import Callable, Sequence
-from functools import reduce
+from functools import reduce, wraps
+from itertools import count
+from math import prod
 from typing import Any, NoReturn
 
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
-from .. import elementary
-from .program import DType, Program, Value
+from .program import DType, Function, Program, Value
 
 Traced = Any
 """A traced array, which the types of NumPy's functions do not know."""
@@ -217,6 +218,34 @@ class TracedArray(NDArrayOperatorsMixin):
         made = np.frompyfunc(function, len(arrays), 1)
         return TracedArray(self.program, made(*[one.values for one in arrays]), dtype)
 
+    def _called(
+        self,
+        function: Callable[..., Any],
+        made: dict[object, Function],
+        given: Sequence[Any],
+        vectors: int,
+    ) -> "TracedArray":
+        """A call for each number or vector."""
+        arrays = list(given) if vectors else self._alike(given)
+        parts = [one.shape[one.ndim - vectors :] for one in arrays]
+        lead = np.broadcast_shapes(*[one.shape[: one.ndim - vectors] for one in arrays])
+        kinds = tuple((one.dtype, part) for one, part in zip(arrays, parts, strict=True))
+        if kinds not in made:
+            made[kinds] = _function(function, kinds)
+        callee = made[kinds]
+        dtype = callee.results[0].dtype
+        rows = [
+            np.broadcast_to(one.values, (*lead, *part)).reshape(prod(lead), -1)
+            for one, part in zip(arrays, parts, strict=True)
+        ]
+        results = []
+        for inputs in np.concatenate(rows, axis=1).tolist():
+            for number in range(len(callee.results)):
+                results.append(self.program.value("call", dtype, callee, number, *inputs))
+        values = np.empty(len(results), object)
+        values[:] = results
+        return TracedArray(self.program, values.reshape((*lead, *callee.shape)), dtype)
+
     def _applied(self, operation: str, dtype: DType, *arrays: "TracedArray") -> "TracedArray":
         def one(*values: Value) -> Value:
             return self.program.value(operation, dtype, *values)
@@ -242,6 +271,27 @@ class TracedArray(NDArrayOperatorsMixin):
         return array
 
 
+def once(vectors: int = 0) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Makes a function of arrays one whose traced code is there once, and is called.
+
+    It has no state, and computes each number, or with `vectors` 1 each vector of last axes, alone.
+    """
+
+    def wrap(function: Callable[..., Any]) -> Callable[..., Any]:
+        made: dict[object, Function] = {}
+
+        @wraps(function)
+        def call(*arrays: Any) -> Any:
+            for one in arrays:
+                if isinstance(one, TracedArray):
+                    return one._called(function, made, arrays, vectors)
+            return function(*arrays)
+
+        return call
+
+    return wrap
+
+
 def read(program: Program, name: str, dtype: DType, shape: tuple[int, ...]) -> TracedArray:
     """The variables of an array of a program, of such a shape for one world."""
     size = int(np.prod(shape))
@@ -249,6 +299,22 @@ def read(program: Program, name: str, dtype: DType, shape: tuple[int, ...]) -> T
     array = np.empty(size, object)
     array[:] = values
     return TracedArray(program, array.reshape(shape), dtype)
+
+
+def _function(function: Callable[..., Any], kinds: Sequence[tuple[DType, Any]]) -> Function:
+    """A function traced on its parameters, of such dtypes and shapes."""
+    program = Program()
+    numbers = count()
+    arrays = []
+    for dtype, shape in kinds:
+        values = np.empty(prod(shape), object)
+        for place in range(values.size):
+            values[place] = program.value("parameter", dtype, next(numbers))
+        arrays.append(TracedArray(program, values.reshape(shape), dtype))
+    out = function(*arrays)
+    dtypes = ".".join(dtype.name for dtype, _ in kinds)
+    name = f"{function.__name__}.{dtypes}"
+    return Function(name, program, out.values.ravel().tolist(), out.shape)
 
 
 def lift(program: Program, values: Any, dtype: DType) -> list[Value]:
@@ -324,7 +390,11 @@ def _remainder(like: TracedArray, x: Any, by: Any) -> Traced:
 def _power(like: TracedArray, x: Any, exponent: Any) -> Traced:
     if exponent in (2, 2.0):
         return x * x
-    return np.sqrt(x) if exponent == 0.5 else elementary.power(x, exponent)
+    if exponent == 0.5:
+        return np.sqrt(x)
+    from ..elementary import power  # which is made of traced functions
+
+    return power(x, exponent)
 
 
 def _take_along_axis(like: TracedArray, array: Any, indices: Traced, axis: int) -> Traced:
@@ -395,10 +465,9 @@ _FUNCTIONS: dict[Callable[..., Any], Callable[..., Any]] = {
     np.min: _of_method("min"),
     np.max: _of_method("max"),
     np.ravel: _of_method("ravel"),
-    np.sin: lambda like, x: elementary.sin(x),
-    np.cos: lambda like, x: elementary.cos(x),
-    np.arctan2: lambda like, y, x: elementary.atan2(y, x),
-    np.exp: lambda like, x: elementary.exp(x),
-    np.expm1: lambda like, x: elementary.expm1(x),
-    np.log: lambda like, x: elementary.log(x),
 }
+
+
+def add_function(function: Callable[..., Any], ours: Callable[..., Any]) -> None:
+    """Trace one of NumPy's functions as another."""
+    _FUNCTIONS[function] = lambda _, *arrays: ours(*arrays)

@@ -19,6 +19,7 @@ from rotorgram.sim.compile import (
     TracedArray,
     Untraceable,
     compiled,
+    once,
     read,
     widest,
 )
@@ -442,6 +443,28 @@ def test_memory_of_one_array_gives_copies() -> None:
     before = memory.get("x")
     memory.put("x", np.ones(32, np.float32))
     assert not before.any()
+
+
+def test_a_function_that_is_used_often_is_there_once() -> None:
+    """With several results, of another function, and with a number for an array."""
+
+    @once()
+    def half(x: Any, y: Any) -> Any:
+        return 0.5 * x + y
+
+    @once(vectors=1)
+    def turned(x: Any) -> Any:
+        return np.stack((x[..., 1], half(x[..., 0], 1.0)), axis=-1)
+
+    rows = np.arange(12.0).reshape(2, 3, 2)
+    program = Program()
+    x = read(program, "x", rows.dtype, (1, 3, 2))
+    values = turned(turned(x)).values.ravel()
+    operations = [one.operation for one in program.needed(values)]
+    assert sorted(set(operations)) == ["call", "load"]
+    assert operations.count("call") == 12
+    found = outputs(lambda x: turned(turned(x)), {"x": rows})
+    assert same(found, turned(turned(rows)))
 
 
 # ---- programs, and what is refused
