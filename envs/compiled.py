@@ -142,6 +142,12 @@ class CompiledLoop(Loop):
         """As `Loop.told`."""
         return self._now if self._is_inside else super().told()
 
+    def terms(self) -> dict[str, float]:
+        """As `Loop.terms`."""
+        if not self._is_inside:
+            return super().terms()
+        return {name: term.item() for name, term in self._read()[1].items()}
+
     def row(self) -> list[float]:
         """As `Loop.row`."""
         if not self._is_inside:

@@ -251,6 +251,10 @@ class Loop:
         telemetry, terms = self.telemetry, self.reward_terms
         return lambda: (telemetry, terms)
 
+    def terms(self) -> dict[str, float]:
+        """Terms of the last reward of a single drone."""
+        return {name: float(np.asarray(term).item()) for name, term in self._record.terms.items()}
+
     def row(self) -> list[float]:
         """All telemetry of a single drone as one list."""
         row: list[float] = []

@@ -109,6 +109,6 @@ class SingleEnv(gym.Env[Observation, ArrayLike]):
     def _info(self) -> Info:
         loop = self._loop
         info = dict(zip(self._names, loop.row(), strict=True))
-        for name, term in loop.record.terms.items():
-            info["reward_" + name] = term.item() if isinstance(term, np.ndarray) else float(term)
+        for name, term in loop.terms().items():
+            info["reward_" + name] = term
         return info
