@@ -152,7 +152,8 @@ class CompiledLoop(Loop):
         """As `Loop.row`."""
         if not self._is_inside:
             return super().row()
-        numbers: list[float] = np.concat([*self._read()[0].values()], axis=1).ravel().tolist()
+        telemetry, _ = self._read()
+        numbers: list[float] = np.concat(list(telemetry.values()), axis=1)[0].tolist()
         return numbers
 
     def _read(self) -> Any:

@@ -29,7 +29,7 @@ from .loop import Loop
 from .stages.record import Mask, Record
 
 LANES = 64  # Worlds of a block: their numbers fit into the nearest cache
-MOST = 30_000  # Operations of a step: a few seconds to compile
+MOST = 30_000  # Operations of a step: more take too long to compile
 _MASKS = ("flown", "begun", "active")
 _RESULTS = ("reward", "terminated", "truncated", "done", "out", "waiting", "unfit")
 _TOLD = "told/"
@@ -76,7 +76,8 @@ class Machine:
         ]
         size = sum(len(region.operations()) for region in regions)
         if size > MOST:
-            raise Untraceable(f"a step of {size:,} operations, more than {MOST:,}, takes long:")
+            most = f"expected at most {MOST:,}"
+            raise Untraceable(f"a step of {size:,} operations is not compiled: {most}")
         self._run = compiled(regions, self._layouts, self._outside, width)
         self.memory = Memory(layout, worlds)
         self._results = []

@@ -10,6 +10,7 @@ Frames: world, z up, and the body's. Position and velocity are those of the body
 
 import math
 from collections.abc import Callable, Mapping
+from functools import cache
 from math import factorial
 from typing import Any, Final, NamedTuple
 
@@ -318,8 +319,11 @@ def _to_world(quaternion: Array, vector: Vector) -> Vector:
     return (x * z + w * y) * twice, (y * z - w * x) * twice, up - (x * x + y * y) * twice
 
 
+@cache
 def _series(dtype: np.dtype[Any]) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Taylor's series of cos(x) and sin(x) / x in x², to the last bit for x up to π / 2."""
+    """Taylor's series of cos(x) and sin(x) / x in x²: up to x = π / 2 the next terms are below the
+    rounding.
+    """
     terms = 8 if dtype == np.float32 else 13
     signs = [(-1) ** n for n in reversed(range(terms))]
     powers = [2 * n for n in reversed(range(terms))]

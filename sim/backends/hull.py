@@ -34,7 +34,8 @@ class Hull:
             return
         centers, radii, axes, flat, rounded = map(np.array, zip(*shapes, strict=True))
         numbers = (centers, radii, axes.transpose(0, 2, 1), flat, rounded)
-        self._shapes = list(zip(*[array.tolist() for array in numbers], strict=True))
+        lists = [array.tolist() for array in numbers]
+        self._shapes = list(zip(*lists, strict=True))
         sizes = np.linalg.norm(flat, axis=1) + np.linalg.norm(rounded, axis=1)
         self._reach = float((np.linalg.norm(centers, axis=1) + radii + sizes).max())
         margin = vehicle.rest_height - float(self._depth((0.0, 0.0, -1.0)))

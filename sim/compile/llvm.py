@@ -154,7 +154,7 @@ def widest() -> int:
 def compiled(
     regions: Sequence[Region], layouts: Sequence[Layout], outside: Fields, width: int
 ) -> Code:
-    """The function of some regions. Takes a fifth of a second.
+    """The function of some regions. Many operations take seconds.
 
     Args:
         regions: In their order.

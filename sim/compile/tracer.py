@@ -114,22 +114,22 @@ class TracedArray(NDArrayOperatorsMixin):
 
     def __getitem__(self, index: Any) -> "TracedArray":
         if isinstance(index, TracedArray):
-            _refuse("an index that is computed: use looked_up() or np.take_along_axis()")
+            _refuse("an index that is computed", "use looked_up() or np.take_along_axis()")
         return self._like(self.values[index])
 
     def __setitem__(self, index: Any, value: Any) -> None:
         self.values[index] = self.lifted(value, self.dtype).values
 
     def __bool__(self) -> bool:
-        _refuse("a branch on an array: use np.where()")
+        _refuse("a branch on an array", "use np.where()")
 
     def __index__(self) -> int:
-        _refuse("a single number of an array, which differs from world to world")
+        _refuse("a single number of an array", "it differs from world to world")
 
     __float__ = __int__ = __index__
 
     def __array__(self, *_: object, **__: object) -> np.ndarray:
-        _refuse("a new array of this one: use stack() or np.concatenate()")
+        _refuse("a new array of this one", "use stack() or np.concatenate()")
 
     def astype(self, dtype: Any, *, copy: bool = True) -> "TracedArray":
         """As another dtype."""
@@ -256,7 +256,7 @@ class TracedArray(NDArrayOperatorsMixin):
         """A sum and the like, from the first to the last."""
         function = _REDUCTIONS.get(name, name)
         if axis is None and self.ndim > 1:
-            _refuse(f"{function.__name__} over all worlds: give an axis; it")
+            _refuse(f"np.{function.__name__} over all worlds", "give an axis")
         axis = 0 if axis is None else axis
         axes = sorted(np.atleast_1d(axis) % self.ndim, reverse=True)
         array: Traced = self
@@ -324,8 +324,8 @@ def lift(program: Program, values: Any, dtype: DType) -> list[Value]:
     return found
 
 
-def _refuse(what: str) -> NoReturn:
-    raise Untraceable(f"{what} cannot be compiled")
+def _refuse(what: str, advice: str = "") -> NoReturn:
+    raise Untraceable(f"{what} cannot be compiled" + (f": {advice}" if advice else ""))
 
 
 def _kind(given: Any) -> Any:
