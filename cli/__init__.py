@@ -83,6 +83,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os.environ.setdefault("PYTHONSAFEPATH", "1")
     # A second thread of NumPy's products loses on small networks, and takes the simulator's core.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # Imports make many objects and no garbage: to look for it takes a tenth of a short command.
+    gc.set_threshold(50_000)
     # At exit Python collects garbage: with torch half a second for nothing.
     atexit.register(gc.freeze)
     try:

@@ -99,7 +99,7 @@ class EnvFlags(Command):
     drones: int = 1
     """Drones of each world, for a task of several."""
     options: Suppress[Fixed[dict]] = field(default_factory=dict)  # type: ignore[type-arg]
-    """Options of the task that --env names. A checkpoint brings those that it was trained with."""
+    """Options of the task that --env names."""
 
     @property
     def env_id(self) -> str:

@@ -4,6 +4,7 @@ import re
 from argparse import ArgumentParser
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from inspect import cleandoc
 from types import UnionType
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, Union, cast, get_args, get_type_hints
 
@@ -27,6 +28,9 @@ if TYPE_CHECKING:
 
 _PLAIN_FLAGS = ("action", "control_period", "episode_length", "history", "scene", "cameras")
 _NAMED_FLAGS = ("effects", "randomize", "sensors")
+_OPTIONS = (
+    "Options of the task that --env names. A checkpoint brings those that it was trained with."
+)
 C = TypeVar("C", bound=Command)
 
 
@@ -37,7 +41,7 @@ def parse(kind: type[C], prog: str, words: Sequence[str]) -> C:
     """
     given = _given(words)
     if not issubclass(kind, EnvFlags):
-        return cast(C, replace(tyro.cli(_for_tyro(kind), prog=prog, args=words), given=given))
+        return cast(C, replace(_run_tyro(_for_tyro(kind), prog, words), given=given))
     return cast(C, _parsed_env(kind, prog, words, given))
 
 
@@ -55,12 +59,12 @@ def _parsed_env(
     env_id = found.env or file.get("env", DEFAULT_ENV)
     listens = "listen" in given or getattr(kind, "listen", None) is not None
     if listens and ":" not in env_id and not registry.is_known(env_id):
-        command = tyro.cli(_for_tyro(kind), prog=prog, args=words)
+        command = _run_tyro(_for_tyro(kind), prog, words)
         check_count("drones", command.drones)
         return _merged(command, given, {}, file)
     env_id = registry.load(env_id)
-    options = _for_tyro(registry.task_type(env_id).Options, f"Options of {env_id}.")
-    command = tyro.cli(_for_tyro(kind, options=options), prog=prog, args=words)
+    options = _for_tyro(registry.task_type(env_id).Options)
+    command = _run_tyro(_for_tyro(kind, options), prog, words)
     names = [name.removeprefix("env.") for name in given if name.startswith("env.")]
     own = {name: getattr(command.options, name) for name in sorted(names)}
     clashing = {name: own.pop(name) for name in names if name in KEYWORDS}
@@ -125,7 +129,12 @@ def _named_values(flag: str, words: Words) -> Options:
     return values
 
 
-def _for_tyro(kind: type["DataclassInstance"], doc: str | None = None, options: Any = None) -> Any:
+def _run_tyro(kind: Any, prog: str, words: Sequence[str]) -> Any:
+    """With what it says at once: to find a text, tyro reads source files, slowly."""
+    return tyro.cli(kind, prog=prog, args=words, description=cleandoc(kind.__doc__))
+
+
+def _for_tyro(kind: type["DataclassInstance"], options: Any = None) -> Any:
     """A class of flags for tyro, whose checks run later.
 
     `options` is the type of the field of that name. `X | Y` becomes `Union[X, Y]`: for the first,
@@ -137,11 +146,11 @@ def _for_tyro(kind: type["DataclassInstance"], doc: str | None = None, options: 
         plain = getattr(hint, "__origin__", hint) if hasattr(hint, "__metadata__") else hint
         if isinstance(plain, UnionType):
             changed[name] = Annotated[Union[get_args(plain)], *extras]  # noqa: UP007
-    namespace: Options = {"__annotations__": changed, "__doc__": doc or kind.__doc__}
+    namespace: Options = {"__annotations__": changed, "__doc__": kind.__doc__}
     namespace["__post_init__"] = lambda self: None
     namespace["__module__"] = "builtins"  # tyro looks for docstrings in `kind` alone
     if options:
-        changed["options"] = Annotated[options, arg(name="env")]
+        changed["options"] = Annotated[options, arg(name="env", help=_OPTIONS)]
         namespace["options"] = field(default_factory=options)
     return dataclass(frozen=True, kw_only=True)(type(kind.__name__, (kind,), namespace))
 

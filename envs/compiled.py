@@ -5,21 +5,22 @@ import re
 import traceback
 from dataclasses import replace
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..models.errors import InputError, one_line
 from ..sim import PhysicsError
-from ..sim.compile import trouble
 from ..sim.snapshots import Arrays, Snapshot
 from ..sim.state import some
 from .autoreset import Told
 from .config import EnvConfig
 from .loop import Loop
-from .machine import Machine
 from .stages.ends import refuse_unfit
 from .stages.record import Floats
+
+if TYPE_CHECKING:
+    from .machine import Machine
 
 _MACHINERY = re.compile(r"numpy|compile.[a-z]+\.py$")  # files that are not to blame
 
@@ -28,9 +29,11 @@ def make_loop(config: EnvConfig, num_worlds: int = 1) -> Loop:
     """The loop of a config: compiled where it can be."""
     config = config.resolve()
     backend = config.backend
-    compiles = backend.name == "rigid" and backend.compiled is not False
-    if compiles and not config.cameras and not trouble():
-        return CompiledLoop(config, num_worlds)
+    if backend.name == "rigid" and backend.compiled is not False and not config.cameras:
+        from ..sim.compile.llvm import trouble
+
+        if not trouble():
+            return CompiledLoop(config, num_worlds)
     return Loop(config, num_worlds)
 
 
@@ -40,7 +43,7 @@ class CompiledLoop(Loop):
     The state is in the machine, until somebody asks for the record, the world or the task.
     """
 
-    _machine: Machine | None = None
+    _machine: "Machine | None" = None
     _is_inside = False  # whether the machine has the state
     _fails = False  # to compile
     _now: Told
@@ -74,7 +77,7 @@ class CompiledLoop(Loop):
         """Compile."""
         self._entered()
 
-    def _entered(self) -> Machine | None:
+    def _entered(self) -> "Machine | None":
         """The machine, which has the state from now on; None where NumPy flies."""
         if self._machine is None and not self._fails:
             self._machine = self._made()
@@ -84,7 +87,9 @@ class CompiledLoop(Loop):
             self._is_inside = True
         return self._machine
 
-    def _made(self) -> Machine | None:
+    def _made(self) -> "Machine | None":
+        from .machine import Machine
+
         config = self.config
         loop = Loop(replace(config, backend=replace(config.backend, compiled=False)))
         neutral = loop.pipeline.actions.neutral()

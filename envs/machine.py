@@ -12,17 +12,9 @@ from typing import Any
 import numpy as np
 
 from ..sim import World
-from ..sim.compile import (
-    Layout,
-    Memory,
-    Program,
-    Region,
-    Untraceable,
-    compiled,
-    lift,
-    read,
-    widest,
-)
+from ..sim.compile import Program, Untraceable, lift, read
+from ..sim.compile.layout import Layout, Memory
+from ..sim.compile.llvm import Region, compiled, widest
 from ..sim.snapshots import Arrays, Snapshot
 from .autoreset import Told
 from .loop import Loop

@@ -1,6 +1,7 @@
 """The radio between the drones of a world: what each has heard last of each other."""
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -8,9 +9,11 @@ from ...sim import length
 from ...sim.random import RADIO, uniform, words_of
 from ...sim.state import some
 from ..state import State
-from ..tasks.swarm import SwarmOptions
 from .history import filled, pushed
 from .record import Floats, Mask, Record, Stage
+
+if TYPE_CHECKING:
+    from ..tasks.swarm import SwarmOptions
 
 FORGOTTEN = 1.0  # A drone that was not heard for so long is no neighbour any more, s
 
@@ -35,7 +38,7 @@ class Radio(Stage):
     arrays = ("said", "heard", "age", "keys", "silent")
 
     def __init__(
-        self, options: SwarmOptions, period: float, drones: int, ended: Callable[[State], Mask]
+        self, options: "SwarmOptions", period: float, drones: int, ended: Callable[[State], Mask]
     ) -> None:
         self._options = options
         self._period = period

@@ -7,7 +7,9 @@ from itertools import count
 import numpy as np
 from numpy.typing import DTypeLike
 
-from ..compile import Layout, Memory, Program, Region, compiled, read, widest
+from ..compile import Program, read
+from ..compile.layout import Layout, Memory
+from ..compile.llvm import Region, compiled, widest
 from ..state import Array
 from .body import RigidBody, mapped
 

@@ -12,7 +12,8 @@ import numpy as np
 
 from ...models.errors import InputError
 from ...models.vehicle import Vehicle, craft_bodies, craft_geoms
-from ..compile import TracedArray, trouble
+from ..compile import TracedArray
+from ..compile.llvm import trouble
 from ..effects import EffectOptions
 from ..randomize import Randomization
 from ..snapshots import Arrays

@@ -6,25 +6,7 @@ have the bits that NumPy gives: the operations are the same, in the same order, 
 with another.
 """
 
-from .layout import Fields, Layout, Memory
-from .llvm import Code, Region, compiled, trouble, widest
 from .program import Program, Value
 from .tracer import TracedArray, Untraceable, lift, once, read
 
-__all__ = [
-    "Code",
-    "Fields",
-    "Layout",
-    "Memory",
-    "Program",
-    "Region",
-    "TracedArray",
-    "Untraceable",
-    "Value",
-    "compiled",
-    "lift",
-    "once",
-    "read",
-    "trouble",
-    "widest",
-]
+__all__ = ["Program", "TracedArray", "Untraceable", "Value", "lift", "once", "read"]

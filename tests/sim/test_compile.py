@@ -11,18 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 from rotorgram.sim import elementary
-from rotorgram.sim.compile import (
-    Layout,
-    Memory,
-    Program,
-    Region,
-    TracedArray,
-    Untraceable,
-    compiled,
-    once,
-    read,
-    widest,
-)
+from rotorgram.sim.compile import Program, TracedArray, Untraceable, once, read
+from rotorgram.sim.compile.layout import Layout, Memory
+from rotorgram.sim.compile.llvm import Region, compiled, widest
 from rotorgram.sim.random import philox
 from rotorgram.sim.state import looked_up, stack
 
