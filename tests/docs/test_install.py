@@ -7,6 +7,7 @@ import sys
 import time
 import tomllib
 import zipfile
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -147,10 +148,15 @@ def test_a_command_starts_in_time(words: str) -> None:
         return time.perf_counter() - begin
 
     arguments = words.split()
-    taken = min(seconds("-m", "rotorgram.cli", *arguments) for _ in range(5))
-    # 0.6 s is promised for a machine on which the libraries of `sim` take 0.46 s by themselves.
-    libraries = min(seconds("-c", "import gymnasium, mujoco, tyro") for _ in range(5))
-    assert taken < max(0.6, 0.6 / 0.46 * libraries)
+    taken = libraries = inf
+    for turn in range(25):  # others may use the machine: the fastest of some turns counts
+        taken = min(taken, seconds("-m", "rotorgram.cli", *arguments))
+        libraries = min(libraries, seconds("-c", "import gymnasium, mujoco, tyro"))
+        # 0.6 s is promised for a machine on which the libraries of `sim` take 0.46 s by themselves.
+        promised = max(0.6, 0.6 / 0.46 * libraries)
+        if turn >= 2 and taken < promised:
+            break
+    assert taken < promised
 
 
 @pytest.fixture(scope="module")
