@@ -7,6 +7,7 @@ keeps no simulator's state: it resets to the same seed and repeats the same acti
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Annotated, Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from ..models.fields import Limits
 from .networks import Floats
 from .policies import ActionMap, flat
 
+_BLOCK = 256  # episodes
 Mask = NDArray[np.bool_]
 Counts = NDArray[np.int64]
 
@@ -29,8 +31,16 @@ class ResumeError(InputError):
 
 def episode_seed(run_seed: int, episode: int) -> int:
     """Seed of an episode, 64 bits: independent across runs and episodes."""
-    sequence = np.random.SeedSequence(run_seed, spawn_key=(2, episode))
-    return int(sequence.generate_state(1, np.uint64)[0])
+    block, number = divmod(episode, _BLOCK)
+    return _seeds(run_seed, block)[number]
+
+
+@lru_cache
+def _seeds(run_seed: int, block: int) -> list[int]:
+    """Seeds of a block of episodes, which are drawn together."""
+    sequence = np.random.SeedSequence(run_seed, spawn_key=(2, block))
+    seeds: list[int] = sequence.generate_state(_BLOCK, np.uint64).tolist()
+    return seeds
 
 
 @dataclass(frozen=True)
@@ -292,15 +302,13 @@ class EpisodeRecorder:
             self._seeds[drone] = episode_seed(self.run_seed, int(self._numbers[drone]))
 
     def _keep_step(self, idle: Mask | None) -> None:
-        telemetry = self.env.telemetry
-        metrics = telemetry.get("metrics", self._nothing)
-        values = metrics[:, 0]
+        values = self.env.headline
         sizes = np.abs(values)
         self._lengths += 1 if idle is None else ~idle
         self._rewards += self.env.rewards  # 0 of those that did not fly
         self._sizes += sizes if idle is None else np.where(idle, 0.0, sizes)
         if self._keep_steps:
-            thrust = telemetry.get("thrust", self._nothing).mean(axis=1)
+            thrust = self.env.telemetry.get("thrust", self._nothing).mean(axis=1)
             table = np.stack((self._numbers, values, self.env.rewards, thrust), axis=1)
             self._steps.append(table if idle is None else table[~idle])
 

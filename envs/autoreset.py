@@ -55,6 +55,12 @@ class AdvancingVectorEnv(VectorEnv[Observation, ArrayLike, np.ndarray]):
     telemetry: Mapping[str, np.ndarray]
 
     @property
+    def headline(self) -> np.ndarray:
+        """The metric that decides, float64, shape (N,); NaN where the env tells none."""
+        unknown = np.full((self.num_envs, 1), np.nan)
+        return self.telemetry.get("metrics", unknown)[:, 0]
+
+    @property
     def autoreset_mode(self) -> AutoresetMode:
         """What follows the end of an episode."""
         mode: AutoresetMode = self.metadata["autoreset_mode"]
@@ -205,6 +211,8 @@ def checked_seeds(seed: Any, num_envs: int, most: int | None = None) -> Seeds | 
     """
     if seed is None:
         return None
+    if isinstance(seed, np.ndarray) and (seed.dtype, seed.shape) == (np.uint64, (num_envs,)):
+        return seed
     numbers: Seeds = seed
     if isinstance(seed, int | np.integer):
         numbers = range(int(seed), int(seed) + num_envs)

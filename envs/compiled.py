@@ -48,6 +48,7 @@ class CompiledLoop(Loop):
     _fails = False  # to compile
     _now: Told
     _content: Any = None
+    _headline: Floats
 
     def _step(self, seeds: Any, *, flies: bool) -> None:
         machine = self._entered()
@@ -128,6 +129,7 @@ class CompiledLoop(Loop):
         for array in self.spec.observation:
             self.observations[array.name] = results[array.name].reshape(count, *array.shape)
         self.rewards = results["reward"].reshape(count)
+        self._headline = results["headline"].reshape(count)
         self.terminated = results["terminated"].reshape(count)
         self.truncated = results["truncated"].reshape(count)
         self.done = results["done"].reshape(count)
@@ -137,6 +139,11 @@ class CompiledLoop(Loop):
     def reward_terms(self) -> dict[str, Floats]:
         """As `Loop.reward_terms`."""
         return self._read()[1] if self._is_inside else super().reward_terms
+
+    @property
+    def headline(self) -> Floats:
+        """As `Loop.headline`."""
+        return self._headline if self._is_inside else super().headline
 
     @property
     def telemetry(self) -> dict[str, Floats]:

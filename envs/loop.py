@@ -240,6 +240,14 @@ class Loop:
         return _per_drone(self.record, self.record.metrics)
 
     @property
+    def headline(self) -> Floats:
+        """The metric that decides, shape (N,); NaN where the task has none."""
+        metric = self.spec.headline
+        if metric is None:
+            return np.full(self.num_envs, np.nan)
+        return _per_drone(self.record, {"": self.record.metrics[metric.name]})[""]
+
+    @property
     def telemetry(self) -> dict[str, Floats]:
         """By the names of `spec.telemetry`, float64, shape (N, *shape)."""
         if self._telemetry is None:

@@ -174,6 +174,9 @@ class Machine:
         seen = {name: getattr(record, name) for name in _RESULTS}
         world: Any = self._loop.world
         seen["bad"] = world.bad
+        metric = self._loop.spec.headline
+        headline = record.metrics[metric.name] if metric else np.nan + record.reward
+        seen["headline"] = headline.astype(np.float64)
         for array in self._loop.spec.observation:
             seen[array.name] = record.observations[array.name].astype(array.dtype)
         return seen

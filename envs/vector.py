@@ -126,6 +126,11 @@ class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Observation, ArrayLike, np.nd
         self._take_results()
 
     @property
+    def headline(self) -> np.ndarray:
+        """The metric that decides, float64, shape (N,); NaN where the task has none."""
+        return self.loop.headline
+
+    @property
     def telemetry(self) -> Arrays:  # type: ignore[override]  # made when it is asked for
         """By name, float64, shape (N, *shape)."""
         return self.loop.telemetry
