@@ -14,12 +14,11 @@ from ..envs.spec import EnvSpec
 from ..flights.trajectories import Trajectory
 from ..models import Backend
 from ..models.errors import InputError
-from ..udp import RemoteVectorEnv
-from ..udp.spawn import spawn_simulator
 from ._flags import AgentFlags, EnvFlags, check_count, parse_address
 
 if TYPE_CHECKING:
     from ..envs.vector import LocalVectorEnv
+    from ..udp import RemoteVectorEnv
 
 CHECKPOINT = "checkpoint.safetensors"
 F = TypeVar("F", bound=EnvFlags)
@@ -151,7 +150,7 @@ def remote_env(
     num_envs: int | None = 1,
     num_simulators: int = 1,
     backend: Backend | BackendConfig = "mujoco",
-) -> Iterator[RemoteVectorEnv]:
+) -> Iterator["RemoteVectorEnv"]:
     """A remote env with a simulator of its own, on a backend, or those that come to
     `command.listen`; at the end the counters of the wire are printed.
 
@@ -160,6 +159,8 @@ def remote_env(
     ones) if there are any; otherwise the first that comes decides. Raises `InputError` for flags
     that contradict each other.
     """
+    from ..udp.spawn import spawn_simulator  # a flight in this process needs no wire
+
     env_id = command.env_id
     options = command.options
     if command.listen is not None:
@@ -191,7 +192,9 @@ def remote_env(
 @contextmanager
 def _waiting(
     command: AgentFlags, listen: str, num_envs: int | None, num_simulators: int, **settings: Any
-) -> Iterator[RemoteVectorEnv]:
+) -> Iterator["RemoteVectorEnv"]:
+    from ..udp import RemoteVectorEnv
+
     check_count("drones", command.drones)
     if command.vehicle is not None:
         from ..models.fleet import load_vehicles  # an agent needs no MuJoCo otherwise

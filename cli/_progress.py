@@ -7,19 +7,13 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
-from rich.table import Column
+from typing import TYPE_CHECKING
 
 from ..flights.executors import OnProgress
+
+if TYPE_CHECKING:  # importing rich takes time, also where no bar is shown
+    from rich.console import Console
+    from rich.progress import TaskID
 
 _LINE_EVERY = 10.0  # s
 
@@ -27,8 +21,13 @@ _LINE_EVERY = 10.0  # s
 @contextmanager
 def bars() -> Iterator[OnProgress]:
     """A function that shows how far the named run is: (name, done, total, words)."""
+    if not sys.stdout.isatty():
+        yield Lines()
+        return
+    from rich.console import Console
+
     console = Console()
-    if not sys.stdout.isatty() or console.is_dumb_terminal:
+    if console.is_dumb_terminal:
         yield Lines()
         return
     shown = Bars(console)
@@ -51,7 +50,16 @@ def frame_bar(name: str) -> Iterator[Callable[[int, int], None]]:
 class Bars:
     """Shows each run by a bar, with its amounts, times and words. The clock tells seconds."""
 
-    def __init__(self, console: Console, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, console: "Console", clock: Callable[[], float] = time.monotonic) -> None:
+        from rich.progress import (
+            BarColumn,
+            Progress,
+            TextColumn,
+            TimeElapsedColumn,
+            TimeRemainingColumn,
+        )
+        from rich.table import Column
+
         self.progress = Progress(
             TextColumn("{task.description}", markup=False),
             BarColumn(bar_width=None),

@@ -3,14 +3,27 @@
 import math
 import time
 from pathlib import Path
+from struct import pack
 
 from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 from tensorboard.compat.proto.summary_pb2 import Summary
-from tensorboard.summary.writer.record_writer import RecordWriter
 
 _POINTS = 200  # of each curve: the width of a chart, and less than 1 MB for all
 _LEAST = 100  # env steps between two points: in short runs more would cost time
 _PREFIX = "events.out.tfevents."
+
+
+def _table() -> list[int]:
+    """CRC-32C of each byte."""
+    table = []
+    for crc in range(256):
+        for _ in range(8):
+            crc = crc >> 1 ^ (0x82F63B78 if crc & 1 else 0)
+        table.append(crc)
+    return table
+
+
+_CRC = _table()
 
 
 class ScalarWriter:
@@ -32,7 +45,6 @@ class ScalarWriter:
         number = len(list(folder.glob(f"{_PREFIX}*")))
         name = f"{_PREFIX}{number:010}.rotorgram"
         self._file = open(folder / name, "xb")  # noqa: SIM115  until `close`
-        self._records = RecordWriter(self._file)
         self._add(Event(file_version="brain.Event:2"), 0)
         # TensorBoard drops what it has read from this step on. One of its two readers skips the
         # first such mark of a folder: so a fresh training has one too.
@@ -62,4 +74,16 @@ class ScalarWriter:
     def _add(self, event: Event, step: int) -> None:
         event.step = step
         event.wall_time = time.time()
-        self._records.write(event.SerializeToString())
+        data = event.SerializeToString()
+        size = pack("<Q", len(data))
+        self._file.write(size + _checksum(size) + data + _checksum(data))
+
+
+def _checksum(data: bytes) -> bytes:
+    """CRC-32C, masked as TensorFlow's records have it: its own writer takes 0.1 s to import."""
+    crc = 0xFFFFFFFF
+    for byte in data:
+        crc = crc >> 8 ^ _CRC[(crc ^ byte) & 0xFF]
+    crc ^= 0xFFFFFFFF
+    turned = crc >> 15 | crc << 17
+    return pack("<I", turned + 0xA282EAD8 & 0xFFFFFFFF)
