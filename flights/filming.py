@@ -15,7 +15,7 @@ from ..envs.rendering import moment
 from ..models.errors import InputError
 from ..models.fields import Limits, check_fields
 from ..rendering import Camera, Canvas, Moment, Stage
-from ..rendering.film import QUALITY, check_film, write_film
+from ..rendering.film import write_film
 from ..rendering.gl import Lines
 from ..scenes import parse_scene
 from .trajectories import Trajectory
@@ -100,8 +100,6 @@ class Film:
     """Only the picture at this time of the first episode, s."""
     fast: bool = False
     """Without shadows and smooth edges."""
-    quality: int = QUALITY
-    """As of `write_film`."""
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -122,11 +120,10 @@ def film(
         InputError: A wrong name, size or rate, or a film that is too long.
         OSError: It cannot be written.
     """
-    check_film(path, config.width, config.height, config.fps)
     times = _times(tracks, config, still=path.suffix.lower() == ".png")
     # Whatever goes wrong, the OpenGL context is given back here.
     with closing(_frames(tracks, config, times, on_frame)) as frames:
-        write_film(path, frames, config.fps, quality=config.quality)
+        write_film(path, frames, config.fps)
     return len(times)
 
 
@@ -182,7 +179,7 @@ def _frames(
     stage = Stage(config.scene, drones, vehicle=config.vehicle)
     with Canvas(stage, width, height, fast=config.fast) as canvas:
         named = len(tracks) > 1
-        panes = [_Pane(track, config, canvas, stage.twin(), named) for track in tracks]
+        panes = [_Pane(track, stage.twin(), canvas, config, named) for track in tracks]
         for number, (episode, seconds) in enumerate(times, 1):
             frame = np.full((config.height, config.width, 3), _DARK, np.uint8)
             for place, pane in enumerate(panes):
@@ -194,54 +191,46 @@ def _frames(
             on_frame(number, len(times))
 
 
+@dataclass
 class _Pane:
     """Pictures of one track, drawn where they change."""
 
-    def __init__(
-        self,
-        track: FilmTrack,
-        config: Film,
-        canvas: Canvas,
-        stage: Stage,
-        named: bool,
-    ) -> None:
-        self._track = track
-        self._config = config
-        self._canvas = canvas
-        self._stage = stage
-        self._named = named
-        self._picture: Picture = np.empty(0, np.uint8)
-        self._shown = (-1, -1)  # episode and step
+    track: FilmTrack
+    stage: Stage
+    canvas: Canvas
+    config: Film
+    named: bool
+    """Whether the name is written in any case."""
+    picture: Picture | None = None
+    shown: tuple[int, int] = (-1, -1)
+    """Episode and step of the picture."""
 
     def draw(self, episode: int, seconds: float) -> Picture:
         """The picture at a time of an episode."""
-        track = self._track
-        config = self._config
-        longest = max(track.episodes[episode], key=len)
+        longest = max(self.track.episodes[episode], key=len)
         step = longest.step_at(seconds)
-        if (episode, step) == self._shown:
-            return self._picture
-        flown = track.moments[episode]
-        first = self._shown[1] + 1 if episode == self._shown[0] else 0
+        if self.picture is not None and self.shown == (episode, step):
+            return self.picture
+        flown = self.track.moments[episode]
+        first = self.shown[1] + 1 if episode == self.shown[0] else 0
         for now in range(first, step + 1):  # paths have no gaps
-            self._stage.show(*(own[min(now, len(own) - 1)] for own in flown))
-        self._shown = episode, step
-        lines = self._lines(episode, step)
-        self._picture = self._canvas.draw(config.camera, self._stage, lines)
-        return self._picture
+            self.stage.show(*(own[min(now, len(own) - 1)] for own in flown))
+        self.shown = episode, step
+        self.picture = self.canvas.draw(self.config.camera, self.stage, self._lines(episode, step))
+        return self.picture
 
     def _lines(self, episode: int, step: int) -> Lines:
         """Name and time; the first metric, of several drones the least distance; early ends."""
-        track = self._track
-        if not self._config.overlay:
-            return [(track.name, "")] if self._named else []
+        track = self.track
+        if not self.config.overlay:
+            return [(track.name, "")] if self.named else []
         seconds = step * track.trajectories[0].spec.control_period
         lines = [(track.name, f"{seconds:.2f} s")]
-        distance = self._stage.least_distance
+        distance = self.stage.least_distance
         if distance is not None:
             lines.append(("least distance", f"{distance:.2f} m"))
         else:
-            metrics = self._stage.moments[0].metrics[:1]
+            metrics = self.stage.moments[0].metrics[:1]
             lines += [(metric.label, metric.text) for metric in metrics]
         note = track.note(episode, step)
         return [*lines, (note, "")] if note else lines

@@ -60,24 +60,17 @@ def read_log(path: Path | str, vehicle: Vehicle, period: float = 0.01) -> Flight
     finite.
     """
     path = Path(path)
-    table = _our_columns(path, vehicle.num_rotors)
-    states = np.stack([table[name] for name in MOTION], axis=1)
+    kind, samples = _samples(path, vehicle.num_rotors)
+    times, states, speeds = np.split(samples, (1, 1 + len(MOTION)), axis=1)
+    times = times[:, 0]
     states[:, 3:7] = _without_flips(states[:, 3:7])
-    speeds = _of_rotors(table, SPEED, vehicle)
-    measured = speeds is not None
-    if speeds is None:
-        speeds = _of_rotors(table, SPEED_COMMAND, vehicle)
-    if speeds is None:
-        throttle = _of_rotors(table, THROTTLE, vehicle)
-        if throttle is None:
-            names = " or ".join(kind.format(f"1...{vehicle.num_rotors}") for kind in _KINDS)
-            _refuse(path, f"columns {names}", "none")
-        speeds = _commanded_speeds(path, throttle, vehicle)
+    if kind == THROTTLE:
+        speeds = _commanded_speeds(path, speeds, vehicle)
     _check_speeds(path, vehicle, speeds)
     samples = np.concatenate((states, speeds), axis=1)
-    later = _later_rows(path, table["t"])
-    rows = _consistent_rows(path, table["t"], samples, later)
-    times = table["t"][rows]
+    later = _later_rows(path, times)
+    rows = _consistent_rows(path, times, samples, later)
+    times = times[rows]
     grid = _grid(path, times, period)
     uniform = np.stack([np.interp(grid, times, column) for column in samples[rows].T], axis=1)
     states, speeds = np.split(uniform, [len(MOTION)], axis=1)
@@ -90,7 +83,7 @@ def read_log(path: Path | str, vehicle: Vehicle, period: float = 0.01) -> Flight
         period=period,
         states=states,
         speeds=speeds,
-        measured=measured,
+        measured=kind == SPEED,
         left_out=len(later) - len(rows),
     )
 
@@ -116,23 +109,23 @@ def _refuse(path: Path, expected: str, got: str) -> NoReturn:
 # ---- columns
 
 
-def _our_columns(path: Path, rotors: int) -> dict[str, Floats]:
-    """The columns of a file that we know. Raises `InputError`."""
-    known = ["t", *MOTION]
-    for kind in _KINDS:
-        known += [kind.format(number) for number in range(1, rotors + 1)]
+def _samples(path: Path, rotors: int) -> tuple[str, Floats]:
+    """The kind of the rotors' columns, and the columns of t, of `MOTION` and of the rotors."""
     table = _table(path)
-    columns = {}
-    for name in known:
+    kinds = {kind: [kind.format(number) for number in range(1, rotors + 1)] for kind in _KINDS}
+    complete = [kind for kind, names in kinds.items() if all(name in table for name in names)]
+    columns = []
+    for name in ("t", *MOTION, *(kinds[complete[0]] if complete else ())):
         if name not in table:
-            if name in ("t", *MOTION):
-                _refuse(path, f"a column {name}", ", ".join(table))
-            continue
+            _refuse(path, f"a column {name}", ", ".join(table))
         try:
-            columns[name] = np.array(table[name], np.float64)
+            columns.append(np.array(table[name], np.float64))
         except (TypeError, ValueError):
             _refuse(path, f"numbers in {name}", "others")
-    return columns
+    if not complete:
+        names = " or ".join(kind.format(f"1...{rotors}") for kind in _KINDS)
+        _refuse(path, f"columns {names}", "none")
+    return complete[0], np.stack(columns, axis=1)
 
 
 def _table(path: Path) -> Columns:
@@ -150,14 +143,6 @@ def _table(path: Path) -> Columns:
         reason = one_line(error)
         raise InputError(f"log: expected a {kind} file, got {path.name}: {reason:.80}") from None
     return {str(name): frame[name].to_numpy() for name in frame}
-
-
-def _of_rotors(table: Mapping[str, Floats], kind: str, vehicle: Vehicle) -> Floats | None:
-    """Columns of all rotors, shape (N, R); None: some are missing."""
-    names = [kind.format(number) for number in range(1, vehicle.num_rotors + 1)]
-    if not all(name in table for name in names):
-        return None
-    return np.stack([table[name] for name in names], axis=1)
 
 
 def _commanded_speeds(path: Path, throttle: Floats, vehicle: Vehicle) -> Floats:

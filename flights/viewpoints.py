@@ -6,7 +6,6 @@ The same journals and the same seed give the same poses on every machine.
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby
 from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -121,16 +120,13 @@ def sequences_of(journals: Sequence[Path], config: CaptureConfig) -> list[PoseSe
 
 def _episodes(path: Path) -> Iterator[list[Trajectory]]:
     """For each episode of a world, the trajectories of its drones."""
-    flown = [one for one in read_episodes(path) if isinstance(one, Trajectory)]
-    flown.sort(key=attrgetter("drone"))
-    flown.sort(key=_episode_of)
-    for _, episode in groupby(flown, key=_episode_of):
-        yield list(episode)
-
-
-def _episode_of(one: Trajectory) -> tuple[int, int, int]:
-    """Session, world and episode of a trajectory."""
-    return one.session, one.drone // len(one.spec.agents), one.episode
+    flown: dict[tuple[int, int, int], list[Trajectory]] = {}
+    for one in read_episodes(path):
+        if isinstance(one, Trajectory):
+            world = one.drone // len(one.spec.agents)
+            flown.setdefault((one.session, world, one.episode), []).append(one)
+    for _, episode in sorted(flown.items()):
+        yield sorted(episode, key=attrgetter("drone"))
 
 
 def _sequence(
@@ -139,21 +135,26 @@ def _sequence(
     """Every so many steps of an episode; a drone whose flight has ended stays where it is."""
     steps = np.arange(0, max(map(len, episode)) + 1, config.every)
     rows = [np.minimum(steps, len(one)) for one in episode]
-    pose = np.stack([one.pose[kept] for one, kept in zip(episode, rows, strict=True)], axis=1)
+    poses = _stacked([one.pose for one in episode], rows)
     low = (-config.aside, -config.aside, 0.0)
-    moved = rng.uniform(low, config.aside, pose[..., :3].shape)
-    tilts = _tilts(pose.shape[:-1], config.tilt, rng)
+    moved = rng.uniform(low, config.aside, poses[..., :3].shape)
+    tilts = _tilts(poses.shape[:-1], config.tilt, rng)
     states = {
-        "position": pose[..., :3] + moved,
-        "quaternion": multiplied(tilts, pose[..., 3:]),
+        "position": poses[..., :3] + moved,
+        "quaternion": multiplied(tilts, poses[..., 3:]),
     }
     for name in ("goal", "payload"):
         if name in episode[0].telemetry:
-            arrays = [one.telemetry[name][kept] for one, kept in zip(episode, rows, strict=True)]
-            states[name] = np.stack(arrays, axis=1)
+            states[name] = _stacked([one.telemetry[name] for one in episode], rows)
     spec = episode[0].spec
     times = steps.astype(np.float64) * spec.control_period
     return PoseSequence(source=source, times=times, states=states, marks=spec.marks)
+
+
+def _stacked(arrays: Sequence[Floats], rows: Sequence[NDArray[np.int_]]) -> Floats:
+    """Some rows of the array of each drone, (T, A, n)."""
+    chosen = [array[own] for array, own in zip(arrays, rows, strict=True)]
+    return np.stack(chosen, axis=1)
 
 
 def _tilts(shape: tuple[int, ...], largest: float, rng: np.random.Generator) -> Floats:

@@ -2,11 +2,13 @@
 
 import base64
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 from typing import Any
+
+import mujoco
 
 from .errors import InputError, shortened
 from .files import find_in_package
@@ -16,7 +18,6 @@ from .vehicle_file import model_of
 
 MAX_BYTES = 1 << 26
 """Largest size of all files of a vehicle."""
-_DIRECTORIES = ("meshdir", "texturedir", "assetdir")
 
 Bundle = tuple[tuple[str, str], ...]
 """Pairs of a relative path with slashes and a file's bytes in base64; the vehicle's own first."""
@@ -91,38 +92,31 @@ def _is_file(pair: Any) -> bool:
 
 
 def _with_assets(model: Path) -> list[Path]:
-    """An MJCF or URDF file, what it includes, and its meshes, height fields and textures.
+    """An MJCF or URDF file, and the files that it names and that are there.
 
     Absolute paths are left out: they are the same elsewhere, or MuJoCo names them there.
     """
-    folder = model.parent
-    parts = [model]
-    elements = list(read_xml(model).iter())
-    for element in elements:
-        inner = _normal(folder / element.get("file", ""))
-        if element.tag in ("include", "model") and inner.is_file() and inner not in parts:
-            parts.append(inner)
-            elements += read_xml(inner).iter()
-    folders = [folder]
-    for element in elements:
-        folders += [folder / element.get(name, "") for name in _DIRECTORIES]
-    for element in elements:
-        for name, text in element.items():
-            if name.startswith("file") and text and not Path(text).is_absolute():
-                parts += _found(text, folders)
-    return parts
+    if model.suffix.lower() == ".urdf":
+        return [model, *_meshes(model)]
+    try:
+        names = mujoco.mju_getXMLDependencies(os.path.relpath(model))
+    except mujoco.FatalError:  # MuJoCo says what is wrong when it reads the model
+        return [model]
+    # Without `..`, and with links as they are: the files keep their places to each other.
+    files = [Path(os.path.abspath(name)) for name in sorted(names) if not os.path.isabs(name)]
+    return [file for file in files if file.is_file()]
 
 
-def _found(text: str, folders: Sequence[Path]) -> list[Path]:
-    """The file of an asset, by the rules of MuJoCo and of URDF's packages; or none."""
-    if text.startswith("package://"):
-        file = find_in_package(text, folders[0])
-        return [] if file is None else [_normal(file)]
-    ways = [text, Path(text).name]  # MuJoCo strips the folders of a URDF file
-    candidates = [_normal(folder / way) for folder in folders for way in ways]
-    return [path for path in candidates if path.is_file()][:1]
-
-
-def _normal(path: Path) -> Path:
-    """Without `..`, and with links as they are: the files keep their places to each other."""
-    return Path(os.path.normpath(path))
+def _meshes(urdf: Path) -> Iterator[Path]:
+    """The meshes of a URDF file, by the rules of MuJoCo and of URDF's packages."""
+    elements = list(read_xml(urdf).iter())
+    folders = [urdf.parent / element.get("meshdir", "") for element in elements]
+    for name in filter(None, (element.get("filename") for element in elements)):
+        if name.startswith("package://"):
+            found = [find_in_package(name, urdf.parent)]
+        else:  # MuJoCo strips the folders
+            found = [folder / way for folder in folders for way in (name, Path(name).name)]
+        for file in found:
+            if file is not None and file.is_file() and not os.path.isabs(name):
+                yield Path(os.path.abspath(file))
+                break

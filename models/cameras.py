@@ -9,13 +9,14 @@ import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import mujoco
 import numpy as np
 
 from .coefficients import PREFIX
 from .errors import InputError, shortened
-from .fields import Limits, check
+from .fields import Direction, Limits, Text, check
 
 OUTPUTS = {
     "rgb": mujoco.mjtCamOutBit.mjCAMOUT_RGB,
@@ -29,38 +30,62 @@ FARTHEST = 1000.0
 """Where drawing ends, and the depth where nothing is seen, m."""
 MAX_PIXELS = 4096  # of a side
 _TEXTS = PREFIX + "cameras."
-_SIDE = 64  # Pixels of a side, if the file gives none
-MAX_LETTERS = 64  # of a name
-FOVY = (1e-3, 3.0)  # rad
-_DEGREES = Limits(math.degrees(FOVY[0]), math.degrees(FOVY[1]), "degrees")
-_SIDES = Limits(1, MAX_PIXELS, "pixels", whole=True)
-MAX_STEPS = 1000  # from picture to picture
+_MAX_LETTERS = 64  # of a name
+_FOVY = Limits(1e-3, 3.0, "rad")
+_DEGREES = Limits(math.degrees(_FOVY.low), math.degrees(_FOVY.high), "degrees")
+_RESOLUTION = Limits(1, MAX_PIXELS, "pixel", whole=True, count=2)
+_DEFAULT_RESOLUTION = (64, 64)
+_MAX_STEPS = 1000  # from picture to picture
+
+ORIGIN = (0.0, 0.0, 0.0)
+AHEAD = (1.0, 0.0, 0.0)
+UP = (0.0, 0.0, 1.0)
 _Vector = tuple[float, float, float]
+Place = Annotated[_Vector, Limits(-100.0, 100.0, "m", count=3)]
+Axis = Annotated[_Vector, Direction(-1e3, 1e3, "1", count=3)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Camera:
-    """A camera of a vehicle, or of its world."""
+    """A camera of a vehicle, or of its world: a table of a TOML file."""
 
-    name: str
-    width: int = _SIDE
-    """Pixels."""
-    height: int = _SIDE
-    """Pixels."""
-    fovy: float = math.pi / 2
+    name: Annotated[str, Text(_MAX_LETTERS, identifier=True)]
+    position: Place = ORIGIN
+    """In the body frame, or the world's if it stands there, m."""
+    look: Axis = AHEAD
+    """Direction in which it looks, in the same frame."""
+    up: Axis = UP
+    """Direction of the picture's upper edge, in the same frame."""
+    fovy: Annotated[float, _FOVY] = math.pi / 2
     """Vertical field of view, rad."""
+    resolution: Annotated[tuple[int, int], _RESOLUTION] = _DEFAULT_RESOLUTION
+    """Width and height, pixels."""
+    rate: Annotated[float, Limits(1e-3, 1.0, "1")] = 1.0
+    """Pictures per control step, 1 over a whole number."""
     kinds: tuple[str, ...] = ("rgb",)
     """What it takes: some of `OUTPUTS`."""
-    every: int = 1
-    """Control steps from one picture to the next."""
-    carried: bool = True
-    """Whether a drone carries it; else it stands in the world."""
-    position: _Vector = (0.0, 0.0, 0.0)
-    """In the body frame, or the world's if it is not carried, m."""
-    look: _Vector = (1.0, 0.0, 0.0)
-    """Direction in which it looks, in the same frame."""
-    up: _Vector = (0.0, 0.0, 1.0)
-    """Direction of the picture's upper edge, in the same frame."""
+    stands: bool = False
+    """Whether it stands in the world; else a drone carries it."""
+
+    @property
+    def width(self) -> int:
+        """Pixels."""
+        return self.resolution[0]
+
+    @property
+    def height(self) -> int:
+        """Pixels."""
+        return self.resolution[1]
+
+    @property
+    def every(self) -> int:
+        """Control steps from one picture to the next."""
+        return round(1 / self.rate)
+
+    @property
+    def carried(self) -> bool:
+        """Whether a drone carries it."""
+        return not self.stands
 
     @property
     def words(self) -> str:
@@ -118,8 +143,7 @@ def chosen_views(words: Sequence[str], cameras: Iterable[Camera]) -> tuple[View,
                 f"_{', _'.join(OUTPUTS)} behind it or not, got {shortened(word)}"
             )
         if at:
-            width, height = _size(word, size)
-            camera = replace(camera, width=width, height=height)
+            camera = replace(camera, resolution=_size(word, size))
         for one in kinds:
             view = View(camera=camera, kind=one)
             if views.setdefault(view.name, view) != view:
@@ -158,16 +182,14 @@ def read_cameras(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[Camera, ..
     targets = modes.mjCAMLIGHT_TARGETBODY.value, modes.mjCAMLIGHT_TARGETBODYCOM.value
     for number in range(model.ncam):
         one = model.camera(number)
-        usable = one.name.isidentifier() and len(one.name) <= MAX_LETTERS
+        usable = one.name.isidentifier() and len(one.name) <= _MAX_LETTERS
         usable = usable and model.cam_projection[number] == perspective.value
         if not usable or model.cam_mode[number] in targets:
             continue
         _check_numbers(f"camera {one.name}", model, number)
-        width, height = (int(side) for side in model.cam_resolution[number])
-        if (width, height) == (1, 1):  # MJCF's default
-            width = height = _SIDE
-        for side in (width, height):
-            check(f"camera {one.name}.resolution", _SIDES, side)
+        resolution = model.cam_resolution[number].tolist()
+        if resolution == [1, 1]:  # MJCF's default
+            resolution = _DEFAULT_RESOLUTION
         rate = texts.pop(f"{_TEXTS}{one.name}.rate", "1")
         output = int(model.cam_output[number])
         axes = data.cam_xmat[number].reshape(3, 3)
@@ -175,15 +197,14 @@ def read_cameras(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[Camera, ..
         found.append(
             Camera(
                 name=one.name,
-                width=width,
-                height=height,
-                fovy=math.radians(float(model.cam_fovy[number])),
-                kinds=tuple(kind for kind, bit in OUTPUTS.items() if output & bit) or ("rgb",),
-                every=steps_of(f"camera {one.name}", rate),
-                carried=bool(mine and model.cam_mode[number] == modes.mjCAMLIGHT_FIXED.value),
                 position=_vector(data.cam_xpos[number]),
                 look=_vector(-axes[:, 2]),
                 up=_vector(axes[:, 1]),
+                fovy=math.radians(float(model.cam_fovy[number])),
+                resolution=check(f"camera {one.name}.resolution", _RESOLUTION, resolution),
+                rate=1 / steps_of(f"camera {one.name}", rate),
+                kinds=tuple(kind for kind, bit in OUTPUTS.items() if output & bit) or ("rgb",),
+                stands=not mine or model.cam_mode[number] != modes.mjCAMLIGHT_FIXED.value,
             )
         )
     for name in texts:
@@ -216,9 +237,9 @@ def steps_of(name: str, rate: str | float) -> int:
         steps = 1 / float(rate)
     except (ValueError, ZeroDivisionError):
         steps = math.nan
-    right = 1 <= steps <= MAX_STEPS and abs(steps - round(steps)) < 1e-6 * steps
+    right = 1 <= steps <= _MAX_STEPS and abs(steps - round(steps)) < 1e-6 * steps
     if not right:
-        expected = f"1 over a whole number of control steps up to {MAX_STEPS}"
+        expected = f"1 over a whole number of control steps up to {_MAX_STEPS}"
         raise InputError(f"{name}.rate: expected {expected}, got {rate}")
     return round(steps)
 
@@ -253,7 +274,7 @@ def place_camera(spec: mujoco.MjSpec, body: mujoco.MjsBody, camera: Camera) -> N
         pos=camera.position,
         xyaxes=np.concatenate((right, np.cross(right, camera.look))),
         fovy=math.degrees(camera.fovy),
-        resolution=(camera.width, camera.height),
+        resolution=camera.resolution,
         output=sum(int(OUTPUTS[kind]) for kind in camera.kinds),
     )
     if camera.every > 1:

@@ -5,12 +5,13 @@ numerics named "rotorgram/GROUP.NAME" (`rotorgram/rotors.radius`), and a vehicle
 in the table GROUP. SI units; body axes x forward, y left, z up.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import make_dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 from .errors import InputError
-from .fields import Limits, check, check_names
+from .fields import Limits, OrNone, check, check_names
 from .files import read_toml
 
 PREFIX = "rotorgram/"
@@ -50,7 +51,8 @@ class Coefficients(dict[str, Any]):
         values = cls(dict.fromkeys(COEFFICIENTS))
         for name, value in numbers.items():
             group = name.partition(".")[0]
-            check_names([name], limits_of_group(group) or COEFFICIENTS, "vehicle")
+            known = [one for one in COEFFICIENTS if one.startswith(f"{group}.")]
+            check_names([name], known or COEFFICIENTS, "vehicle")
             values[name] = check(name, COEFFICIENTS[name], value)
         return values
 
@@ -59,9 +61,16 @@ class Coefficients(dict[str, Any]):
         return {name: as_tuple(value) for name, value in self.items() if value is not None}
 
 
-def limits_of_group(group: str) -> dict[str, Limits]:
-    """The limits of the coefficients of a group, by "group.name"."""
-    return {name: limits for name, limits in COEFFICIENTS.items() if name.startswith(f"{group}.")}
+def _table(group: str, names: Iterable[str]) -> type:
+    fields = []
+    for name in names:
+        rule = OrNone(COEFFICIENTS[f"{group}.{name}"])
+        fields.append((name, Annotated[Any, rule], None))
+    return make_dataclass(group, fields, frozen=True, kw_only=True)
+
+
+TABLES: Final[Mapping[str, type]] = {group: _table(group, rows) for group, rows in _GROUPS.items()}
+"""A dataclass for each group, with its coefficients as fields; None: the file does not give it."""
 
 
 def as_tuple(value: float | tuple[float, ...]) -> tuple[float, ...]:

@@ -10,11 +10,11 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from .cameras import place_camera
+from .cameras import ORIGIN, UP, place_camera
 from .coefficients import PREFIX
 from .errors import InputError
 from .files import find_in_package
-from .vehicle_file import ORIGIN, UP, Box, Cylinder, PlacedRotor, VehicleFile
+from .vehicle_file import Box, Cylinder, PlacedRotor, VehicleFile
 
 Vector = Sequence[float] | np.ndarray
 Colour = tuple[float, float, float, float]
@@ -72,14 +72,14 @@ def _add_actuator(
 ) -> None:
     """A motor at a site: thrust along the rotor's axis, and a reaction about it."""
     axis = _scaled(rotor.axis, 1 / math.hypot(*rotor.axis))
-    torque = file.rotors.torque
+    torque = file.rotors.reaction or 0.0
     spec.add_actuator(
         name=rotor.name,
         target=site.name,
         trntype=mujoco.mjtTrn.mjTRN_SITE,
         gear=(*axis, *_scaled(axis, torque if rotor.turn == "cw" else -torque)),
         ctrllimited=True,
-        ctrlrange=file.rotors.limits,
+        ctrlrange=file.rotors.thrust,
     )
 
 

@@ -99,6 +99,21 @@ class Limits:
         return int(value)
 
 
+@dataclass(frozen=True)
+class Direction(Limits):
+    """Three numbers that are not all 0."""
+
+    @property
+    def expected(self) -> str:
+        return f"{super().expected}, not all 0"
+
+    def read(self, value: object) -> Any:
+        numbers: Any = super().read(value)
+        if math.hypot(*numbers) <= 1e-6:
+            raise ValueError
+        return numbers
+
+
 PositiveInt = Annotated[int, Limits(1, whole=True)]
 NonNegativeInt = Annotated[int, Limits(0, whole=True)]
 

@@ -6,48 +6,25 @@ Each table is a dataclass whose fields are the keys. Body frame: x forward, y le
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .cameras import FOVY, MAX_LETTERS, OUTPUTS, Camera, steps_of
-from .coefficients import COEFFICIENTS, as_tuple, limits_of_group
+from .cameras import AHEAD, ORIGIN, OUTPUTS, UP, Axis, Camera, Place, steps_of
+from .coefficients import COEFFICIENTS, TABLES, as_tuple
 from .errors import InputError, shortened
-from .fields import Limits, Text, check, check_names, limits_of, optional, read_table
+from .fields import Choice, Limits, Text, check, limits_of, optional, read_table
 from .files import read_toml
 
 T = TypeVar("T")
-_Vector = tuple[float, float, float]
+_Coefficients: Any = TABLES["rotors"]
 _Numbers = tuple[float, ...]
-_Place = Annotated[_Vector, Limits(-100.0, 100.0, "m", count=3)]
 _Mass = Annotated[float, Limits(1e-6, 1e6, "kg")]
 _Length = Annotated[float, Limits(1e-5, 100.0, "m")]
-
-ORIGIN = (0.0, 0.0, 0.0)
-AHEAD = (1.0, 0.0, 0.0)
-UP = (0.0, 0.0, 1.0)
 _LEAST_MOMENT = 1e-15  # kg m²: MuJoCo's mjMINVAL
-
-
-@dataclass(frozen=True)
-class _Direction(Limits):
-    """Three numbers that are not all 0."""
-
-    @property
-    def expected(self) -> str:
-        return f"{super().expected}, not all 0"
-
-    def read(self, value: object) -> Any:
-        numbers: Any = super().read(value)
-        if math.hypot(*numbers) <= 1e-6:
-            raise ValueError
-        return numbers
-
-
-_Axis = Annotated[_Vector, _Direction(-1e3, 1e3, "1", count=3)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,8 +33,8 @@ class Box:
 
     shape: str
     mass: _Mass
-    position: _Place = ORIGIN
-    size: Annotated[_Vector, Limits(1e-5, 100.0, "m", count=3)]
+    position: Place = ORIGIN
+    size: Annotated[tuple[float, float, float], Limits(1e-5, 100.0, "m", count=3)]
     """Sides along x, y and z."""
     yaw: Annotated[float, Limits(-2 * math.pi, 2 * math.pi, "rad")] = 0.0
 
@@ -68,10 +45,13 @@ class Cylinder:
 
     shape: str
     mass: _Mass
-    position: _Place = ORIGIN
+    position: Place = ORIGIN
     radius: _Length
     length: _Length
-    axis: _Axis = UP
+    axis: Axis = UP
+
+
+_SHAPES: Final[Mapping[str, type[Box | Cylinder]]] = {"box": Box, "cylinder": Cylinder}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +60,7 @@ class Body:
 
     mass: float | None = optional(1e-6, 1e6, "kg")
     inertia: tuple[float, ...] | None = optional(-1e9, 1e9, "kg m²", count=0)
-    center_of_mass: _Place = ORIGIN
+    center_of_mass: Place = ORIGIN
     size: tuple[float, float, float] | None = optional(1e-4, 100.0, "m", count=3)
     ground_clearance: float | None = optional(1e-4, 100.0, "m")
     parts: tuple[Box | Cylinder, ...] = ()
@@ -93,9 +73,9 @@ class PlacedRotor:
     name: Annotated[str, Text(100)]
     turn: Literal["cw", "ccw"]
     """Seen from where its thrust points to."""
-    position: _Place | None = None
+    position: Place | None = None
     """In the body frame, or in that of the link or body."""
-    axis: _Axis = UP
+    axis: Axis = UP
     """Direction of its thrust, of any length, in the same frame."""
     link: str | None = None
     """Of the model's file; so are body and site."""
@@ -104,11 +84,9 @@ class PlacedRotor:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RotorTable:
+class RotorTable(_Coefficients):  # type: ignore[misc]
     """Rotors, all alike, in a frame or in a list."""
 
-    radius: Annotated[float | None, COEFFICIENTS["rotors.radius"]] = None
-    thrust_coefficient: Annotated[float | None, COEFFICIENTS["rotors.thrust_coefficient"]] = None
     frame: Literal["plus", "cross", "hexa", "octo"] | None = None
     arm: float | None = optional(1e-3, 100.0, "m")
     height: float | None = optional(-100.0, 100.0, "m")
@@ -117,40 +95,6 @@ class RotorTable:
     reaction: float | None = optional(0.0, 10.0, "N m/N")
     torque_coefficient: float | None = optional(0.0, 1.0, "N m s²/rad²")
     list: tuple[PlacedRotor, ...] = ()
-
-    @property
-    def limits(self) -> tuple[float, float]:
-        """Least and largest thrust of a rotor, N."""
-        if self.thrust is not None:
-            return self.thrust
-        assert self.speed
-        assert self.thrust_coefficient
-        low, high = self.speed
-        return self.thrust_coefficient * low**2, self.thrust_coefficient * high**2
-
-    @property
-    def torque(self) -> float:
-        """Torque about its axis per thrust of a rotor, N·m/N."""
-        if self.reaction is not None:
-            return self.reaction
-        assert self.torque_coefficient is not None
-        assert self.thrust_coefficient is not None
-        return self.torque_coefficient / self.thrust_coefficient
-
-
-@dataclass(frozen=True, kw_only=True)
-class CameraTable:
-    """A camera."""
-
-    name: Annotated[str, Text(MAX_LETTERS, identifier=True)]
-    position: _Place = ORIGIN
-    look: _Axis = AHEAD
-    up: _Axis | None = None
-    fovy: Annotated[float, Limits(*FOVY, "rad")] = math.pi / 2
-    resolution: Annotated[tuple[int, int], Limits(1, 4096, "pixel", whole=True, count=2)] = (64, 64)
-    rate: Annotated[float, Limits(1e-3, 1.0, "1")] = 1.0
-    kinds: Sequence[str] = ("rgb",)
-    stands: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -165,11 +109,6 @@ class RealFlights:
 @dataclass(frozen=True, kw_only=True)
 class _Model:
     file: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Coefficients:
-    """A table that has coefficients alone."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -240,7 +179,7 @@ class VehicleFile:
     """Downward acceleration, m/s²."""
     body: Body
     rotors: RotorTable
-    """With its list filled; an MJCF file's own rotors are not in it."""
+    """With list, thrust and reaction filled; an MJCF file's own rotors are not in it."""
     cameras: tuple[Camera, ...]
 
     @property
@@ -269,9 +208,9 @@ def read_vehicle_file(path: Path) -> VehicleFile:
     rotors = _rotors(numbers, file.rotors, model)
     cameras = [_camera(numbers, one, where) for where, one in _listed(file.cameras, "cameras")]
     _check_distinct("cameras", [camera.name for camera in cameras])
-    for group in ("drag", "battery", "sensors"):
-        _table(numbers, _Coefficients, tree.get(group, {}), group)
-    _table(numbers, RealFlights, tree.get("real_flights", {}), "real_flights")
+    for group, kind in {**TABLES, "real_flights": RealFlights}.items():
+        if group != "rotors":
+            _table(numbers, kind, tree.get(group, {}), group)
     physical = {key: value for key, value in tree.items() if key != "real_flights"}
     return VehicleFile(
         name=file.name,
@@ -298,17 +237,12 @@ def _table(numbers: list[Number], kind: type[T], given: object, where: str) -> T
     table = _mapping(given, where)
     source = check(f"{where}.source", Text(empty=True), table.pop("source", ""))
     prefix = "" if where == "vehicle" else f"{where}."
-    limits = limits_of_group(where) | limits_of(kind, prefix)
-    keys = [one.name for one in fields(kind)]  # type: ignore[arg-type]
-    names = [*keys, *(name.removeprefix(prefix) for name in limits)]
-    check_names(table, dict.fromkeys(names), where)
-    for name, own in limits.items():
-        key = name.removeprefix(prefix)
+    for key, limits in limits_of(kind).items():
         if key in table:
-            number = _number(name, own, table[key], source)
+            number = _number(prefix + key, limits, table[key], source)
             numbers.append(number)
             table[key] = number.value
-    return read_table(kind, {key: table[key] for key in keys if key in table}, where)
+    return read_table(kind, table, where)
 
 
 def _number(name: str, limits: Limits, given: object, source: str) -> Number:
@@ -317,8 +251,7 @@ def _number(name: str, limits: Limits, given: object, source: str) -> Number:
     sourced = read_table(_Sourced, table, name)
     others = []
     for where, other in _listed(sourced.others, f"{name}.others"):
-        check_names(_mapping(other, where), ("value", "source"), where)
-        others.append(_number(where, limits, other, ""))
+        others.append(_number(where, limits, _mapping(other, where), ""))
     return Number(
         name=name,
         value=check(name, limits, sourced.value),
@@ -381,11 +314,8 @@ def _body(numbers: list[Number], given: object, model: Path | None) -> Body:
 
 def _part(numbers: list[Number], given: object, where: str) -> Box | Cylinder:
     shape = _mapping(given, where).get("shape")
-    if shape == "box":
-        return _table(numbers, Box, given, where)
-    if shape != "cylinder":
-        raise InputError(f"{where}.shape: expected 'box' or 'cylinder', got {shortened(shape)}")
-    return _table(numbers, Cylinder, given, where)
+    kind = check(f"{where}.shape", Choice(tuple(_SHAPES)), shape)
+    return _table(numbers, _SHAPES[kind], given, where)
 
 
 def _rotors(numbers: list[Number], given: object, model: Path | None) -> RotorTable:
@@ -405,7 +335,7 @@ def _rotors(numbers: list[Number], given: object, model: Path | None) -> RotorTa
                     f"rotors: expected no {key} for rotors of the model's file, got {got}"
                 )
         return rotors
-    _check_thrust(rotors)
+    rotors = _with_thrust(rotors)
     if rotors.frame is not None and model is None:
         return _framed(rotors, rotors.frame)
     if rotors.frame is not None or not placed:
@@ -419,8 +349,8 @@ def _rotors(numbers: list[Number], given: object, model: Path | None) -> RotorTa
     return rotors
 
 
-def _check_thrust(rotors: RotorTable) -> None:
-    """Thrust and reaction are given once each."""
+def _with_thrust(rotors: RotorTable) -> RotorTable:
+    """Thrust and reaction, which are given once each: as they are, or by coefficients."""
     for one, other in (("thrust", "speed"), ("reaction", "torque_coefficient")):
         given = [key for key in (one, other) if getattr(rotors, key) is not None]
         if len(given) != 1:
@@ -430,11 +360,18 @@ def _check_thrust(rotors: RotorTable) -> None:
             )
         if given == [other] and rotors.thrust_coefficient is None:
             raise InputError(f"rotors: expected thrust_coefficient with {other}, got none")
-    low, high = rotors.limits
+    coefficient = rotors.thrust_coefficient
+    if rotors.speed is not None:
+        low, high = rotors.speed
+        rotors = replace(rotors, thrust=(coefficient * low**2, coefficient * high**2))
+    if rotors.torque_coefficient is not None:
+        rotors = replace(rotors, reaction=rotors.torque_coefficient / coefficient)
+    low, high = rotors.thrust or ORIGIN[:2]
     if not low < high:
         raise InputError(
             f"rotors: expected a lower and a higher thrust, got {low:g} and {high:g} N"
         )
+    return rotors
 
 
 def _rotor(
@@ -484,35 +421,26 @@ def _framed(rotors: RotorTable, frame: str) -> RotorTable:
 
 
 def _camera(numbers: list[Number], given: object, where: str) -> Camera:
-    table = _table(numbers, CameraTable, given, where)
-    kinds = table.kinds
+    has_up = "up" in _mapping(given, where)
+    camera = _table(numbers, Camera, given, where)
+    kinds = camera.kinds
     right = isinstance(kinds, Sequence) and kinds and all(kind in [*OUTPUTS] for kind in kinds)
     if not right:
         words = ", ".join(OUTPUTS)
         raise InputError(f"{where}.kinds: expected some of {words}, got {shortened(kinds)}")
-    look = table.look
-    up = table.up
-    if up is None:
-        upright = math.hypot(*look[:2]) > 1e-6 * math.hypot(*look)
-        up = UP if upright else AHEAD
+    look = camera.look
+    up = camera.up
+    upright = math.hypot(*look[:2]) > 1e-6 * math.hypot(*look)
+    if not has_up and not upright:
+        up = AHEAD
     across = math.hypot(*np.cross(look, up))
     if not across > 1e-6 * math.hypot(*look) * math.hypot(*up):
         raise InputError(f"{where}.up: expected another direction than look, got {list(up)}")
-    if table.resolution == (1, 1):
+    if camera.resolution == (1, 1):
         raise InputError(f"{where}.resolution: expected more than one pixel, got one")
-    width, height = table.resolution
-    return Camera(
-        name=table.name,
-        width=width,
-        height=height,
-        fovy=table.fovy,
-        kinds=tuple(kind for kind in OUTPUTS if kind in kinds),
-        every=steps_of(where, table.rate),
-        carried=not table.stands,
-        position=table.position,
-        look=look,
-        up=up,
-    )
+    steps_of(where, camera.rate)
+    ordered = tuple(kind for kind in OUTPUTS if kind in kinds)
+    return replace(camera, kinds=ordered, up=up)
 
 
 def _check_distinct(where: str, names: Sequence[str]) -> None:

@@ -135,9 +135,9 @@ class Cameras:
                 mine = {name: mask[world] for name, mask in of_world.items()}
                 self._draw_world(rows.start, mine)
 
-    def lens(self, name: str, state: Arrays, drone: int = 0, world: int = 0) -> Lens:
-        """The lens of a view's camera, of a drone of a world, in a state as of `take`."""
-        self._pose(state, world)
+    def lens(self, name: str, state: Arrays, drone: int = 0) -> Lens:
+        """The lens of a view's camera, of a drone of the first world, in a state as of `take`."""
+        self._pose(state, 0)
         camera = self._cameras[name][drone]
         rotation = (self.data.cam_xmat[camera].reshape(3, 3) * _FLIP).T
         translation = -rotation @ self.data.cam_xpos[camera]

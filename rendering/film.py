@@ -19,8 +19,7 @@ require("PIL", "render", "writing pictures and films")
 
 from PIL import Image  # noqa: E402
 
-QUALITY = 20
-"""x264's constant rate factor: less is better and larger."""
+_QUALITY = "20"  # x264's constant rate factor: less is better and larger
 
 
 def check_film(path: Path, width: int, height: int, fps: float) -> None:
@@ -41,9 +40,7 @@ def check_film(path: Path, width: int, height: int, fps: float) -> None:
         )
 
 
-def write_film(
-    path: Path, frames: Iterable[Picture], fps: float, *, quality: int = QUALITY
-) -> None:
+def write_film(path: Path, frames: Iterable[Picture], fps: float) -> None:
     """Write a film. Ctrl-C leaves nothing behind.
 
     `.mp4` is H.264 that every browser plays before it is loaded whole; `.png` is the last frame
@@ -53,7 +50,6 @@ def write_film(
         path: Must not exist.
         frames: uint8, shape (height, width, 3), all of one size; taken one by one.
         fps: Frames per second.
-        quality: Of `.mp4`, x264's constant rate factor: 0 (every bit) to 51.
 
     Raises:
         InputError: The name, the size or the rate is wrong; there are no frames.
@@ -82,7 +78,7 @@ def write_film(
             unfinished = Path(folder) / path.name
             match path.suffix.lower():
                 case ".mp4":
-                    _write_mp4(unfinished, checked(), (width, height), fps, quality)
+                    _write_mp4(unfinished, checked(), (width, height), fps)
                 case ".png":
                     last = deque(checked(), maxlen=1).pop()
                     Image.fromarray(last).save(unfinished)
@@ -97,11 +93,9 @@ def write_film(
         raise OSError(error.errno, error.strerror, str(path)) from None
 
 
-def _write_mp4(
-    path: Path, frames: Iterator[Picture], size: tuple[int, int], fps: float, quality: int
-) -> None:
+def _write_mp4(path: Path, frames: Iterator[Picture], size: tuple[int, int], fps: float) -> None:
     ffmpeg = _ffmpeg()
-    options = ["-preset", "slow", "-crf", str(quality), "-movflags", "+faststart"]
+    options = ["-preset", "slow", "-crf", _QUALITY, "-movflags", "+faststart"]
     rate = Fraction(fps).limit_denominator(1001)
     writer = ffmpeg.write_frames(
         str(path), size, fps=rate, codec="libx264", quality=None, macro_block_size=1,

@@ -549,7 +549,7 @@ TABLES = {
     "body.parts.": vehicle_file.Box,
     "rotors.": vehicle_file.RotorTable,
     "rotors.list.": vehicle_file.PlacedRotor,
-    "cameras.": vehicle_file.CameraTable,
+    "cameras.": vehicle_file.Camera,
     "real_flights.": vehicle_file.RealFlights,
 }
 
