@@ -15,7 +15,7 @@ from ..envs.rendering import moment
 from ..models.errors import InputError
 from ..models.fields import Limits, check_fields
 from ..rendering import Camera, Canvas, Moment, Stage
-from ..rendering.film import write_film
+from ..rendering.film import QUALITY, write_film
 from ..rendering.gl import Lines
 from ..scenes import parse_scene
 from .trajectories import Trajectory
@@ -100,6 +100,8 @@ class Film:
     """Only the picture at this time of the first episode, s."""
     fast: bool = False
     """Without shadows and smooth edges."""
+    quality: int = QUALITY
+    """As of `write_film`."""
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -123,7 +125,7 @@ def film(
     times = _times(tracks, config, still=path.suffix.lower() == ".png")
     # Whatever goes wrong, the OpenGL context is given back here.
     with closing(_frames(tracks, config, times, on_frame)) as frames:
-        write_film(path, frames, config.fps)
+        write_film(path, frames, config.fps, quality=config.quality)
     return len(times)
 
 

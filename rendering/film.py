@@ -19,7 +19,8 @@ require("PIL", "render", "writing pictures and films")
 
 from PIL import Image  # noqa: E402
 
-_QUALITY = "20"  # x264's constant rate factor: less is better and larger
+QUALITY = 20
+"""x264's constant rate factor: less is better and larger."""
 
 
 def check_film(path: Path, width: int, height: int, fps: float) -> None:
@@ -40,7 +41,9 @@ def check_film(path: Path, width: int, height: int, fps: float) -> None:
         )
 
 
-def write_film(path: Path, frames: Iterable[Picture], fps: float) -> None:
+def write_film(
+    path: Path, frames: Iterable[Picture], fps: float, *, quality: int = QUALITY
+) -> None:
     """Write a film. Ctrl-C leaves nothing behind.
 
     `.mp4` is H.264 that every browser plays before it is loaded whole; `.png` is the last frame
@@ -50,6 +53,7 @@ def write_film(path: Path, frames: Iterable[Picture], fps: float) -> None:
         path: Must not exist.
         frames: uint8, shape (height, width, 3), all of one size; taken one by one.
         fps: Frames per second.
+        quality: Of `.mp4`, x264's constant rate factor: 0 (every bit) to 51.
 
     Raises:
         InputError: The name, the size or the rate is wrong; there are no frames.
@@ -78,7 +82,7 @@ def write_film(path: Path, frames: Iterable[Picture], fps: float) -> None:
             unfinished = Path(folder) / path.name
             match path.suffix.lower():
                 case ".mp4":
-                    _write_mp4(unfinished, checked(), (width, height), fps)
+                    _write_mp4(unfinished, checked(), (width, height), fps, quality)
                 case ".png":
                     last = deque(checked(), maxlen=1).pop()
                     Image.fromarray(last).save(unfinished)
@@ -93,9 +97,11 @@ def write_film(path: Path, frames: Iterable[Picture], fps: float) -> None:
         raise OSError(error.errno, error.strerror, str(path)) from None
 
 
-def _write_mp4(path: Path, frames: Iterator[Picture], size: tuple[int, int], fps: float) -> None:
+def _write_mp4(
+    path: Path, frames: Iterator[Picture], size: tuple[int, int], fps: float, quality: int
+) -> None:
     ffmpeg = _ffmpeg()
-    options = ["-preset", "slow", "-crf", _QUALITY, "-movflags", "+faststart"]
+    options = ["-preset", "slow", "-crf", str(quality), "-movflags", "+faststart"]
     rate = Fraction(fps).limit_denominator(1001)
     writer = ffmpeg.write_frames(
         str(path), size, fps=rate, codec="libx264", quality=None, macro_block_size=1,
