@@ -13,6 +13,7 @@ from typing import Annotated
 
 import mujoco
 import numpy as np
+from mujoco import MjData, MjModel, MjSpec
 
 from .coefficients import PREFIX
 from .errors import InputError, shortened
@@ -165,7 +166,7 @@ def _size(word: str, text: str) -> tuple[int, int]:
 # ---- of a file
 
 
-def read_cameras(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[Camera, ...]:
+def read_cameras(spec: MjSpec, model: MjModel) -> tuple[Camera, ...]:
     """Cameras of a vehicle's spec and of the model that it gave. Raises `InputError`.
 
     One that follows the craft but does not turn with it, as MuJoCo's mode `trackcom`, counts as
@@ -174,7 +175,7 @@ def read_cameras(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[Camera, ..
     """
     texts = {text.name: text.data for text in spec.texts if text.name.startswith(_TEXTS)}
     found = []
-    data = mujoco.MjData(model)
+    data = MjData(model)
     data.qpos[:7] = (0, 0, 0, 1, 0, 0, 0)
     place_cameras(model, data)
     modes = mujoco.mjtCamLight
@@ -212,14 +213,14 @@ def read_cameras(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[Camera, ..
     return tuple(found)
 
 
-def place_cameras(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+def place_cameras(model: MjModel, data: MjData) -> None:
     """Put bodies, cameras and lights where the positions of the joints have them."""
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)  # the body that cameras and lights follow
     mujoco.mj_camlight(model, data)
 
 
-def _check_numbers(name: str, model: mujoco.MjModel, number: int) -> None:
+def _check_numbers(name: str, model: MjModel, number: int) -> None:
     """Raise `InputError` unless a camera of a model can see something."""
     focal = model.cam_intrinsic[number, :2].tolist()
     sensor = model.cam_sensorsize[number]
@@ -266,7 +267,7 @@ def own_cameras(radius: float, rest_height: float) -> tuple[Camera, ...]:
     )
 
 
-def place_camera(spec: mujoco.MjSpec, body: mujoco.MjsBody, camera: Camera) -> None:
+def place_camera(spec: MjSpec, body: mujoco.MjsBody, camera: Camera) -> None:
     """Add a camera to a body of a spec; its rate is a custom text."""
     right = np.cross(camera.look, camera.up)
     body.add_camera(

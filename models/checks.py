@@ -17,6 +17,7 @@ from typing import Final
 
 import mujoco
 import numpy as np
+from mujoco import MjData, MjModel
 from numpy.typing import NDArray
 
 from .fields import check_names
@@ -130,7 +131,7 @@ class _Craft:
         apart = places - self.vehicle.center_of_mass
         self.arm = max(float(np.linalg.norm(apart[:, :2], axis=1).mean()), 1e-12)
 
-    def at_rest(self, *disabled: mujoco.mjtDisableBit) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    def at_rest(self, *disabled: mujoco.mjtDisableBit) -> tuple[MjModel, MjData]:
         """A copy of the model with some features off, and the craft level, at rest, at `_HEIGHT`.
 
         Without actuation there is no thrust, not even the least.
@@ -138,7 +139,7 @@ class _Craft:
         model = copy.copy(self.model)
         for bit in disabled:
             model.opt.disableflags |= bit
-        data = mujoco.MjData(model)
+        data = MjData(model)
         data.qpos[:] = (0.0, 0.0, _HEIGHT, 1.0, 0.0, 0.0, 0.0)
         return model, data
 
@@ -163,7 +164,7 @@ class _Warned(Exception):
     """MuJoCo warned of something in a flight."""
 
 
-def _fly(model: mujoco.MjModel, data: mujoco.MjData, seconds: float) -> float:
+def _fly(model: MjModel, data: MjData, seconds: float) -> float:
     """Step for `seconds`, a whole number of steps, `_MAX_STEPS` at most; the time flown, s.
 
     Raises `_Warned`: MuJoCo resets bad states silently otherwise.

@@ -9,6 +9,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from mujoco import MjsBody, MjSpec, mjtGeom
 
 from .cameras import ORIGIN, UP, place_camera
 from .coefficients import PREFIX
@@ -29,15 +30,15 @@ _SILVER = (0.62, 0.65, 0.69, 1.0)
 _ORANGE = (0.96, 0.42, 0.08, 1.0)
 _FRONT_DISC = (0.98, 0.50, 0.12, 0.42)
 _DISC = (0.20, 0.46, 0.78, 0.42)
-_BOX = mujoco.mjtGeom.mjGEOM_BOX
-_CAPSULE = mujoco.mjtGeom.mjGEOM_CAPSULE
-_CYLINDER = mujoco.mjtGeom.mjGEOM_CYLINDER
-_ELLIPSOID = mujoco.mjtGeom.mjGEOM_ELLIPSOID
+_BOX = mjtGeom.mjGEOM_BOX
+_CAPSULE = mjtGeom.mjGEOM_CAPSULE
+_CYLINDER = mjtGeom.mjGEOM_CYLINDER
+_ELLIPSOID = mjtGeom.mjGEOM_ELLIPSOID
 
 
-def craft_spec(file: VehicleFile, base: mujoco.MjSpec | None = None) -> mujoco.MjSpec:
+def craft_spec(file: VehicleFile, base: MjSpec | None = None) -> MjSpec:
     """The vehicle alone, without ground; `base` is the spec of its model, changed in place."""
-    spec = base or mujoco.MjSpec()
+    spec = base or MjSpec()
     spec.modelname = file.name
     urdf = file.model is not None and file.model.suffix.lower() == ".urdf"
     if urdf or file.model is None:
@@ -68,7 +69,7 @@ def craft_spec(file: VehicleFile, base: mujoco.MjSpec | None = None) -> mujoco.M
 
 
 def _add_actuator(
-    spec: mujoco.MjSpec, file: VehicleFile, rotor: PlacedRotor, site: mujoco.MjsSite
+    spec: MjSpec, file: VehicleFile, rotor: PlacedRotor, site: mujoco.MjsSite
 ) -> None:
     """A motor at a site: thrust along the rotor's axis, and a reaction about it."""
     axis = _scaled(rotor.axis, 1 / math.hypot(*rotor.axis))
@@ -84,9 +85,9 @@ def _add_actuator(
 
 
 def _add_geom(
-    body: mujoco.MjsBody,
+    body: MjsBody,
     name: str,
-    kind: mujoco.mjtGeom,
+    kind: mjtGeom,
     rgba: Colour,
     size: Vector,
     *,
@@ -116,7 +117,7 @@ def _scaled(vector: Vector, factor: float) -> tuple[float, ...]:
 # ---- from the tables
 
 
-def _build(spec: mujoco.MjSpec, file: VehicleFile) -> None:
+def _build(spec: MjSpec, file: VehicleFile) -> None:
     """Masses, geoms that collide, geoms that are drawn, and the rotors.
 
     Missing lengths are those of quad.xml, in the proportion of the spans.
@@ -169,7 +170,7 @@ def _along(axis: Vector) -> dict[str, Any]:
 
 
 def _add_disc(
-    body: mujoco.MjsBody, name: str, rotor: PlacedRotor, radius: float, place: Vector, rgba: Colour
+    body: MjsBody, name: str, rotor: PlacedRotor, radius: float, place: Vector, rgba: Colour
 ) -> None:
     size = (radius, 0.01 * radius)
     _add_geom(body, name, _CYLINDER, rgba, size, pos=place, **_along(rotor.axis))
@@ -183,7 +184,7 @@ def _sides(parts: Sequence[Box | Cylinder], unit: float) -> Vector:
     return max(boxes, key=lambda box: box.mass).size
 
 
-def _add_mass(body: mujoco.MjsBody, file: VehicleFile) -> None:
+def _add_mass(body: MjsBody, file: VehicleFile) -> None:
     """Mass and inertia as given, or parts that have them."""
     table = file.body
     for number, part in enumerate(table.parts, 1):
@@ -211,7 +212,7 @@ def _add_mass(body: mujoco.MjsBody, file: VehicleFile) -> None:
         body.fullinertia = table.inertia
 
 
-def _add_skids(body: mujoco.MjsBody, half: Vector, unit: float, clearance: float) -> None:
+def _add_skids(body: MjsBody, half: Vector, unit: float, clearance: float) -> None:
     """Two skids that collide, each on two struts."""
     thick = min(0.03 * unit, (clearance - half[2]) / 2)
     low = thick - clearance
@@ -225,7 +226,7 @@ def _add_skids(body: mujoco.MjsBody, half: Vector, unit: float, clearance: float
             _add_geom(body, "", _CAPSULE, _SILVER, (0.7 * thick,), fromto=(*top, x, y, low))
 
 
-def _add_looks(body: mujoco.MjsBody, half: Vector) -> None:
+def _add_looks(body: MjsBody, half: Vector) -> None:
     x, y, z = half
     shell = (1.2 * x, 0.9 * y, 1.7 * z)
     mark = (0.6 * x, 0.55 * y, 1.1 * z)
@@ -242,7 +243,7 @@ def _nearest(places: Sequence[Vector], reach: float) -> float:
 # ---- from a model's file
 
 
-def _free_root(spec: mujoco.MjSpec, folder: Path) -> None:
+def _free_root(spec: MjSpec, folder: Path) -> None:
     """Find the meshes of a URDF file's packages, and free its first link."""
     for mesh in spec.meshes:
         if mesh.file.startswith("package:"):
@@ -261,7 +262,7 @@ def _free_root(spec: mujoco.MjSpec, folder: Path) -> None:
         root.add_freejoint()
 
 
-def _add_rotors(spec: mujoco.MjSpec, file: VehicleFile) -> None:
+def _add_rotors(spec: MjSpec, file: VehicleFile) -> None:
     """Add the rotors of the list to a model without actuators."""
     rotors = file.rotors.list
     if rotors and list(spec.actuators):
@@ -274,9 +275,7 @@ def _add_rotors(spec: mujoco.MjSpec, file: VehicleFile) -> None:
         _add_actuator(spec, file, rotor, site)
 
 
-def _rotor_site(
-    spec: mujoco.MjSpec, file: VehicleFile, rotor: PlacedRotor, where: str
-) -> mujoco.MjsSite:
+def _rotor_site(spec: MjSpec, file: VehicleFile, rotor: PlacedRotor, where: str) -> mujoco.MjsSite:
     """The site of a rotor: one of the model, or a new one on one of its bodies."""
     if rotor.site is None:
         kind = "body"

@@ -6,6 +6,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import mujoco
+from mujoco import MjData, MjSpec, mjtGeom
 
 from .craft import craft_spec
 from .errors import InputError
@@ -32,20 +33,20 @@ _ARRAYS = {
 """Largest attributes of the elements whose product is a number of numbers."""
 _REPEATED = ("replicate", "composite", "flexcomp")
 _UNITS = "KMGTPE"  # each is 1024 times the one before
-_GROUNDS = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
+_GROUNDS = (mjtGeom.mjGEOM_PLANE, mjtGeom.mjGEOM_HFIELD)
 
 
-def read_spec(path: Path) -> mujoco.MjSpec:
+def read_spec(path: Path) -> MjSpec:
     """The spec of a vehicle's file alone. Raises `InputError`, or `ValueError` if it is no MJCF."""
     if path.suffix.lower() == ".toml":
         file = read_vehicle_file(path)
         return craft_spec(file, None if file.model is None else read_spec(file.model))
     _check_sizes(path)
     switch_off_log_file()
-    return mujoco.MjSpec.from_file(str(path))
+    return MjSpec.from_file(str(path))
 
 
-def vehicle_spec(path: Path) -> mujoco.MjSpec:
+def vehicle_spec(path: Path) -> MjSpec:
     """A vehicle's file over level ground, without visual elements."""
     spec = read_spec(path)
     add_ground(spec)
@@ -53,22 +54,22 @@ def vehicle_spec(path: Path) -> mujoco.MjSpec:
     return spec
 
 
-def has_ground(spec: mujoco.MjSpec) -> bool:
+def has_ground(spec: MjSpec) -> bool:
     return any(geom.type in _GROUNDS for geom in spec.worldbody.geoms)
 
 
-def add_ground(spec: mujoco.MjSpec) -> None:
+def add_ground(spec: MjSpec) -> None:
     """Add a plane at z = 0 to a spec without a plane or a height field."""
     if has_ground(spec):
         return
-    ground = mujoco.MjSpec()  # of its own: the defaults of the vehicle's file are not the ground's
-    plane = mujoco.mjtGeom.mjGEOM_PLANE
+    ground = MjSpec()  # of its own: the defaults of the vehicle's file are not the ground's
+    plane = mjtGeom.mjGEOM_PLANE
     ground.worldbody.add_geom(name="ground", type=plane, size=(0.0, 0.0, 0.5))
     ground.visual, ground.stat = spec.visual, spec.stat  # MuJoCo warns if they differ
     spec.attach(ground, prefix="rotorgram/", frame=spec.worldbody.add_frame())
 
 
-def swarm_spec(vehicles: Sequence[Path], names: Sequence[str]) -> mujoco.MjSpec:
+def swarm_spec(vehicles: Sequence[Path], names: Sequence[str]) -> MjSpec:
     """One spec with a craft of each vehicle's file, whose parts have its name and a slash before
     theirs. Options and all else are those of the first vehicle.
     """
@@ -81,7 +82,7 @@ def swarm_spec(vehicles: Sequence[Path], names: Sequence[str]) -> mujoco.MjSpec:
 
 
 def attach_craft(
-    spec: mujoco.MjSpec, vehicle: Path, prefix: str, place: Sequence[float] = (0, 0, 0)
+    spec: MjSpec, vehicle: Path, prefix: str, place: Sequence[float] = (0, 0, 0)
 ) -> None:
     """Add a file's craft, its names with a prefix; step and gravity are those of the spec."""
     own = read_spec(vehicle)  # it must outlive the call: its craft is a part of it
@@ -91,7 +92,7 @@ def attach_craft(
     spec.worldbody.add_frame(pos=place).attach_body(free_body(own), prefix, "")
 
 
-def _delete_targeting_cameras(spec: mujoco.MjSpec) -> None:
+def _delete_targeting_cameras(spec: MjSpec) -> None:
     """Delete the cameras that turn to a body: bodies have other names in a swarm."""
     modes = mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODY, mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODYCOM
     for camera in list(spec.cameras):
@@ -99,15 +100,15 @@ def _delete_targeting_cameras(spec: mujoco.MjSpec) -> None:
             spec.delete(camera)
 
 
-def free_body(spec: mujoco.MjSpec) -> mujoco.MjsBody:
+def free_body(spec: MjSpec) -> mujoco.MjsBody:
     """The first body with a free joint: the craft of a vehicle's spec."""
     free = mujoco.mjtJoint.mjJNT_FREE
     return next(body for body in spec.bodies if any(joint.type == free for joint in body.joints))
 
 
-def level_data(model: mujoco.MjModel) -> mujoco.MjData:
+def level_data(model: mujoco.MjModel) -> MjData:
     """All free bodies of a model level at the origin, and where that places the others."""
-    data = mujoco.MjData(model)
+    data = MjData(model)
     data.qpos.reshape(-1, 7)[:] = (0, 0, 0, 1, 0, 0, 0)
     mujoco.mj_kinematics(model, data)
     return data

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import mujoco
 import numpy as np
+from mujoco import MjModel
 
 from .errors import InputError
 from .mjcf import add_ground, swarm_spec
@@ -23,7 +24,7 @@ def drone_names(count: int) -> tuple[str, ...]:
 
 def swarm_model(
     vehicles: Sequence[Vehicle], *, movable: bool = False, payload: float = 0.0, cable: float = 0.0
-) -> mujoco.MjModel:
+) -> MjModel:
     """A world with a craft of each vehicle, without visual elements.
 
     Free joints and rotors come craft by craft, and two sensors of each count its contacts. With
@@ -76,7 +77,7 @@ def _count_contacts(spec: mujoco.MjSpec, name: str, craft: str, other: str = "")
     )  # fmt: skip
 
 
-def contact_columns(model: mujoco.MjModel, sensor: str) -> np.ndarray:
+def contact_columns(model: MjModel, sensor: str) -> np.ndarray:
     """Where `sensordata` has a sensor of each craft, shape (A,)."""
     names = drone_names(int(owners(model).max()) + 1)
     return np.array([model.sensor(f"{name}/{sensor}").adr[0] for name in names])

@@ -15,6 +15,7 @@ from typing import Self
 
 import mujoco
 import numpy as np
+from mujoco import MjData, MjModel, MjSpec
 
 from . import MAX_DRAG
 from .cameras import Camera, own_cameras, read_cameras
@@ -24,6 +25,8 @@ from .fields import Limits, check
 from .library import find_vehicle
 from .mjcf import free_body, level_data, vehicle_spec
 from .vehicle_file import inertia_matrix, model_of, read_vehicle_file
+
+Array = np.ndarray
 
 _LEAST_TIMESTEP = 1e-5  # s: a control step of 0.02 s then takes a hundredth of a second
 _MAX_TIMESTEP = 1.0  # s: that of the longest control step
@@ -67,7 +70,7 @@ class Vehicle:
     """Name of the model."""
     hash: str
     """32 hexadecimal characters: the same file and drag, the same hash. See `Vehicle.load`."""
-    model: mujoco.MjModel
+    model: MjModel
     """Vehicle and ground, compiled without visual elements. Do not change it."""
     linear_drag: float
     """Acceleration of -linear_drag · velocity, 1/s, by a force at the body's origin."""
@@ -75,15 +78,15 @@ class Vehicle:
     """kg."""
     gravity: float
     """Downward acceleration of a free fall, m/s²."""
-    center_of_mass: np.ndarray
+    center_of_mass: Array
     """Body frame, shape (3,), m."""
-    inertia: np.ndarray
+    inertia: Array
     """About the center of mass, body axes, shape (3, 3), kg·m²."""
     rotors: tuple[Rotor, ...]
-    allocation: np.ndarray
+    allocation: Array
     """Effect of one newton of each rotor, shape (4, R): thrust along body z (N), and torque about
     body x, y and z at the center of mass (N·m)."""
-    hover_thrust: np.ndarray
+    hover_thrust: Array
     """Thrusts at which the level craft neither moves nor turns, all above 0, shape (R,), N."""
     rest_height: float
     """Height of the body's origin when it touches level ground, m."""
@@ -119,12 +122,12 @@ class Vehicle:
         return len(self.rotors)
 
     @cached_property
-    def thrust_low(self) -> np.ndarray:
+    def thrust_low(self) -> Array:
         """Least thrust of each rotor, shape (R,), N."""
         return np.array([rotor.low for rotor in self.rotors])
 
     @cached_property
-    def thrust_high(self) -> np.ndarray:
+    def thrust_high(self) -> Array:
         """Largest thrust of each rotor, shape (R,), N."""
         return np.array([rotor.high for rotor in self.rotors])
 
@@ -158,7 +161,7 @@ class Vehicle:
         least = ends.min(axis=0).sum()
         return float(max(most / self.mass - self.gravity, self.gravity - least / self.mass))
 
-    def turning(self, axis: Sequence[float] | np.ndarray) -> float:
+    def turning(self, axis: Sequence[float] | Array) -> float:
         """Largest angular acceleration about an axis through the center of mass, rad/s².
 
         The axis is a unit vector in the body frame, shape (3,), and its sign matters. The craft is
@@ -178,7 +181,7 @@ class Vehicle:
             )
         return round(ratio)
 
-    def movable(self, payload: float = 0.0, cable: float = 0.0) -> mujoco.MjModel:
+    def movable(self, payload: float = 0.0, cable: float = 0.0) -> MjModel:
         """The model, compiled so that centers of mass may be moved: MuJoCo spares work where one
         is the body's origin.
 
@@ -200,9 +203,9 @@ class Vehicle:
             raise InputError(f"effects.cable: expected a length at which {clear}, got {cable:g} m")
         return model
 
-    def _meets(self, model: mujoco.MjModel, radius: float, cable: float) -> bool:
+    def _meets(self, model: MjModel, radius: float, cable: float) -> bool:
         """Whether a payload touches the craft when it hangs straight below."""
-        data = mujoco.MjData(model)
+        data = MjData(model)
         high = self.rest_height + 2 * (cable + radius)
         data.qpos[7:10] = (0.0, 0.0, high - cable)
         return _touches(model, data, high)
@@ -216,7 +219,7 @@ class Vehicle:
         return partial(Vehicle.load, linear_drag=self.linear_drag), (str(self.path),)
 
 
-def _compile(path: Path) -> tuple[mujoco.MjSpec, str, mujoco.MjModel, mujoco.MjData]:
+def _compile(path: Path) -> tuple[MjSpec, str, MjModel, MjData]:
     """A file's spec, its text, its model, and the vehicle level at the origin. Raises
     `InputError`.
     """
@@ -243,7 +246,7 @@ def payload_radius(mass: float) -> float:
 
 
 def hang_payload(
-    spec: mujoco.MjSpec, crafts: Mapping[str, mujoco.MjsBody], mass: float, cable: float
+    spec: MjSpec, crafts: Mapping[str, mujoco.MjsBody], mass: float, cable: float
 ) -> None:
     """Add a ball of a mass, kg, and a cable of a length, m, to it from each craft's origin.
 
@@ -262,12 +265,12 @@ def hang_payload(
         tendon.wrap_site(end.name)
 
 
-def craft_bodies(model: mujoco.MjModel) -> np.ndarray:
+def craft_bodies(model: MjModel) -> Array:
     """Ids of the first free body, and of what is welded to it."""
     return np.flatnonzero(owners(model) == 0)
 
 
-def owners(model: mujoco.MjModel) -> np.ndarray:
+def owners(model: MjModel) -> Array:
     """Number of the craft to which each body belongs, -1 if none, shape (B,)."""
     owner = np.full(model.nbody, -1)
     for body in model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE].tolist():
@@ -276,28 +279,28 @@ def owners(model: mujoco.MjModel) -> np.ndarray:
     return owner
 
 
-def craft_geoms(model: mujoco.MjModel) -> np.ndarray:
+def craft_geoms(model: MjModel) -> Array:
     """Which geoms are those of the first free body, and of what is welded to it."""
     return np.isin(model.geom_bodyid, craft_bodies(model))
 
 
-def payload_body(model: mujoco.MjModel) -> int:
+def payload_body(model: MjModel) -> int:
     """Id of the payload of a model from `Vehicle.movable`."""
     return int(model.body(_PAYLOAD).id)
 
 
-def body_axes(model: mujoco.MjModel) -> np.ndarray:
+def body_axes(model: MjModel) -> Array:
     """Axes of each body in the frame of its craft's free body, as columns, (B, 3, 3)."""
-    axes: np.ndarray = level_data(model).xmat.reshape(-1, 3, 3).copy()
+    axes: Array = level_data(model).xmat.reshape(-1, 3, 3).copy()
     return axes
 
 
-def _check_flyable(model: mujoco.MjModel) -> None:
+def _check_flyable(model: MjModel) -> None:
     """Raise `InputError` unless a model is one free body with actuators that can be stepped."""
     for owner in (model, model.opt):
         for name in dir(owner):
             value = getattr(owner, name)
-            if isinstance(value, float | np.ndarray) and not np.isfinite(value).all():
+            if isinstance(value, float | Array) and not np.isfinite(value).all():
                 raise InputError(f"vehicle: expected finite numbers, got others in {name}")
     heaviest = float(model.body_mass.max())
     if heaviest > _MAX_MASS:
@@ -351,7 +354,7 @@ def _load(path: Path, drag: float, changed: tuple[int, ...]) -> Vehicle:
     )
 
 
-def _allocate(rotors: Sequence[Rotor], center: np.ndarray) -> np.ndarray:
+def _allocate(rotors: Sequence[Rotor], center: Array) -> Array:
     """`Vehicle.allocation`, shape (4, R), of rotors about a center of mass, body frame, m."""
     columns = []
     for rotor in rotors:
@@ -361,7 +364,7 @@ def _allocate(rotors: Sequence[Rotor], center: np.ndarray) -> np.ndarray:
     return np.array(columns).T
 
 
-def _read_coefficients(model: mujoco.MjModel) -> Coefficients:
+def _read_coefficients(model: MjModel) -> Coefficients:
     """Those among the custom numerics of a model. Raises `InputError` for a wrong one."""
     numbers = {}
     for index in range(model.nnumeric):
@@ -373,7 +376,7 @@ def _read_coefficients(model: mujoco.MjModel) -> Coefficients:
     return Coefficients.read(numbers)
 
 
-def _read_rotor(model: mujoco.MjModel, data: mujoco.MjData, index: int) -> Rotor:
+def _read_rotor(model: MjModel, data: MjData, index: int) -> Rotor:
     """The rotor of an actuator; `data` is at the origin and level. Raises `InputError`."""
     name = model.actuator(index).name or f"rotor{index + 1}"
     site, reference = model.actuator_trnid[index].tolist()
@@ -418,7 +421,7 @@ def _read_rotor(model: mujoco.MjModel, data: mujoco.MjData, index: int) -> Rotor
     )
 
 
-def _hover(rotors: tuple[Rotor, ...], allocation: np.ndarray, weight: float) -> np.ndarray:
+def _hover(rotors: tuple[Rotor, ...], allocation: Array, weight: float) -> Array:
     """Thrusts that carry the weight without a torque or a sideways force, shape (R,), N.
 
     Equal, or the least that do. Raises `InputError` if there are none above 0 and within the
@@ -452,7 +455,7 @@ def _hover(rotors: tuple[Rotor, ...], allocation: np.ndarray, weight: float) -> 
     return thrust
 
 
-def _find_rest_height(model: mujoco.MjModel, data: mujoco.MjData) -> float:
+def _find_rest_height(model: MjModel, data: MjData) -> float:
     """Height at which the level body first touches anything, by bisection; 0 if it never does.
 
     Raises `InputError` if it touches something at any height, like a wall.
@@ -475,13 +478,13 @@ def _find_rest_height(model: mujoco.MjModel, data: mujoco.MjData) -> float:
     return round(high, 9)
 
 
-def _touches(model: mujoco.MjModel, data: mujoco.MjData, height: float) -> bool:
+def _touches(model: MjModel, data: MjData, height: float) -> bool:
     data.qpos[2] = height
     mujoco.mj_fwdPosition(model, data)
     return bool(data.ncon > 0)
 
 
-def _hash(spec: mujoco.MjSpec, text: str, path: Path, drag: float) -> str:
+def _hash(spec: MjSpec, text: str, path: Path, drag: float) -> str:
     digest = blake2b(text.encode() + b"\0" + struct.pack("<d", drag), digest_size=16)
     folder = model_of(path).parent
     if path.suffix.lower() == ".toml":

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import mujoco
 import numpy as np
+from mujoco import MjModel, MjsBody, mjtGeom
 
 from ..models.cameras import FARTHEST, place_camera
 from ..models.fleet import members_of
@@ -39,7 +40,7 @@ def objects_of(
 
 def drawn_model(
     vehicle: Vehicle, drones: int, scene: str, marks: Sequence[Mark], *, payload: bool
-) -> mujoco.MjModel:
+) -> MjModel:
     """What is drawn: craft with their cameras, what surrounds them, the task's marks."""
     names = drone_names(drones)
     crafts = members_of(vehicle, drones)
@@ -52,7 +53,7 @@ def drawn_model(
                 place_camera(spec, body, replace(camera, name=f"{name}/{camera.name}"))
     if payload:
         hung = spec.worldbody.add_body(name=PAYLOAD, mocap=True)
-        _add(hung, PAYLOAD, mujoco.mjtGeom.mjGEOM_SPHERE, (0.12 * crafts[0].radius,) * 3)
+        _add(hung, PAYLOAD, mjtGeom.mjGEOM_SPHERE, (0.12 * crafts[0].radius,) * 3)
     thinnest = _THINNEST * min(craft.rest_height for craft in crafts)
     for number, mark in enumerate(marks):
         if not mark.moves:
@@ -71,7 +72,7 @@ def drawn_model(
     return model
 
 
-def own_discs(model: mujoco.MjModel, camera: int) -> np.ndarray:
+def own_discs(model: MjModel, camera: int) -> np.ndarray:
     """Numbers of the geoms of a camera's craft that are seen through, as its rotors' discs are.
 
     None of a camera that no craft carries.
@@ -88,9 +89,7 @@ def own_discs(model: mujoco.MjModel, camera: int) -> np.ndarray:
     return discs
 
 
-def _add(
-    body: mujoco.MjsBody, name: str, kind: mujoco.mjtGeom, size: Sequence[float], **more: object
-) -> None:
+def _add(body: MjsBody, name: str, kind: mjtGeom, size: Sequence[float], **more: object) -> None:
     """A geom that is only drawn."""
     geom = body.add_geom(name=name, type=kind, size=size, **more)
     geom.contype = geom.conaffinity = 0
@@ -98,7 +97,7 @@ def _add(
     geom.group = 1
 
 
-def _add_mark(body: mujoco.MjsBody, name: str, mark: Mark, thickness: float) -> None:
+def _add_mark(body: MjsBody, name: str, mark: Mark, thickness: float) -> None:
     """A mark of a task, as viewers show it; discs have a thickness, m."""
     rgba = (*MARK_COLORS[mark.shape], 1.0)
     parts = mark.parts(thickness)
@@ -113,7 +112,7 @@ def _add_mark(body: mujoco.MjsBody, name: str, mark: Mark, thickness: float) -> 
         _add(body, own, MARK_GEOMS[part.kind], size, rgba=rgba, **place)
 
 
-def objects_in(model: mujoco.MjModel) -> tuple[tuple[str, ...], np.ndarray]:
+def objects_in(model: MjModel) -> tuple[tuple[str, ...], np.ndarray]:
     """Names of a model's objects, and the object number of each geom, after a leading 0.
 
     All geoms of a craft are one object. So are geoms of the world with names of two or more slashes

@@ -22,7 +22,8 @@ from ..scenes.marks import Mark
 from .camera_model import GOAL, PAYLOAD, drawn_model, objects_in, own_discs
 from .gl import Offscreen
 
-Arrays = Mapping[str, np.ndarray]
+Array = np.ndarray
+Arrays = Mapping[str, Array]
 _HIDDEN = 5  # a group of geoms that is not drawn
 _FLIP = np.array((1.0, -1.0, -1.0))  # from MuJoCo's camera frame to that of vision
 
@@ -30,11 +31,11 @@ _FLIP = np.array((1.0, -1.0, -1.0))  # from MuJoCo's camera frame to that of vis
 class Lens(NamedTuple):
     """How points of the world come to pixels: p = K (R x + t), then over its third number."""
 
-    matrix: np.ndarray
+    matrix: Array
     """K, shape (3, 3), pixels."""
-    rotation: np.ndarray
+    rotation: Array
     """R, shape (3, 3), from the world's frame to the camera's."""
-    translation: np.ndarray
+    translation: Array
     """t, shape (3,), m."""
 
 
@@ -75,7 +76,7 @@ class Cameras:
             view.name: np.zeros((rows, *view.shape), view.dtype) for view in self.views
         }
         self._cameras = {view.name: self._camera_ids(view, names) for view in self.views}
-        self._geoms: dict[int, np.ndarray] = {}
+        self._geoms: dict[int, Array] = {}
         free = self.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE
         self._poses = self.model.jnt_qposadr[free][:, None] + np.arange(7)
         self._moved = {
@@ -115,7 +116,7 @@ class Cameras:
         self,
         due: Arrays,
         state: Arrays,
-        of: np.ndarray | None = None,
+        of: Array | None = None,
     ) -> None:
         """Take pictures of the worlds as they are.
 
@@ -158,7 +159,7 @@ class Cameras:
 
     def _draw_world(self, first: int, due: Arrays) -> None:
         """Pictures of the world that `data` is in. Views of one camera share its drawings."""
-        drawn: dict[tuple[int, int, int, bool], tuple[np.ndarray, np.ndarray]] = {}
+        drawn: dict[tuple[int, int, int, bool], tuple[Array, Array]] = {}
         for view in self.views:
             height, width, _ = view.shape
             for drone in np.flatnonzero(due[view.name]).tolist():
@@ -170,9 +171,7 @@ class Cameras:
                     picture = depth
                 self.pictures[view.name][first + drone] = picture.reshape(view.shape)
 
-    def _draw(
-        self, camera: int, width: int, height: int, objects: bool
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _draw(self, camera: int, width: int, height: int, objects: bool) -> tuple[Array, Array]:
         """Colours, uint8 (H, W, 3), or numbers of objects, int32 (H, W), and in this case their
         depth, float32 (H, W), m. The first row is on top.
         """
@@ -196,7 +195,7 @@ class Cameras:
             return colors, depth
         return self._object[self._geom_numbers(camera, colors)], self._meters(depth[::-1])
 
-    def _geom_numbers(self, camera: int, colors: np.ndarray) -> np.ndarray:
+    def _geom_numbers(self, camera: int, colors: Array) -> Array:
         """Number of the geom of each pixel of the last picture, from 1; 0: none."""
         scene = self._drawing.scene
         if camera not in self._geoms:  # the same geoms in each picture, in one order
@@ -207,18 +206,16 @@ class Cameras:
                     geoms[drawn.segid + 1] = drawn.objid + 1
             self._geoms[camera] = geoms
         code = colors.astype(np.uint32)
-        numbers: np.ndarray = self._geoms[camera][
-            code[..., 0] | code[..., 1] << 8 | code[..., 2] << 16
-        ]
+        numbers: Array = self._geoms[camera][code[..., 0] | code[..., 1] << 8 | code[..., 2] << 16]
         return numbers
 
-    def _meters(self, depth: np.ndarray) -> np.ndarray:
+    def _meters(self, depth: Array) -> Array:
         """Depth along the camera's axis, float32, m, from OpenGL's depth: 1 near, 0 far."""
         extent = self.model.stat.extent
         near = float(np.float32(self.model.vis.map.znear * extent))
         far = float(np.float32(self.model.vis.map.zfar * extent))
         meters = near * far / (near + depth.astype(np.float64) * (far - near))
-        limited: np.ndarray = np.minimum(meters, FARTHEST).astype(np.float32)
+        limited: Array = np.minimum(meters, FARTHEST).astype(np.float32)
         return limited
 
     def close(self) -> None:
@@ -227,7 +224,7 @@ class Cameras:
             self._drawing.close()
 
 
-def _matrix(model: mujoco.MjModel, camera: int, width: int, height: int) -> np.ndarray:
+def _matrix(model: mujoco.MjModel, camera: int, width: int, height: int) -> Array:
     """K of a camera of a model, shape (3, 3), pixels."""
     if model.cam_sensorsize[camera].any():
         focal = model.cam_intrinsic[camera]

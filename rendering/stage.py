@@ -12,6 +12,7 @@ from typing import Final, Literal, NamedTuple, get_args
 
 import mujoco
 import numpy as np
+from mujoco import MjModel, MjvScene, mjtGeom
 
 from ..models.cameras import place_cameras
 from ..models.errors import InputError, one_line, shortened
@@ -22,6 +23,8 @@ from ..models.swarm import drone_names
 from ..scenes.build import SCENE_PREFIX, build_scene
 from ..scenes.marks import Mark
 from .gl import Lines, Offscreen
+
+Array = np.ndarray
 
 Camera = Literal["chase", "front", "side", "top", "onboard"]
 CAMERAS: Final[tuple[Camera, ...]] = get_args(Camera)
@@ -45,12 +48,12 @@ first: Okabe and Ito's, told apart with colour-blindness."""
 MAX_NAMES = 16
 """Drones of one world whose names are shown; more would hide them."""
 MARK_GEOMS = {
-    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
-    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
-    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
+    "sphere": mjtGeom.mjGEOM_SPHERE,
+    "cylinder": mjtGeom.mjGEOM_CYLINDER,
+    "capsule": mjtGeom.mjGEOM_CAPSULE,
 }
 """How parts of marks are drawn."""
-_CAPSULE = mujoco.mjtGeom.mjGEOM_CAPSULE
+_CAPSULE = mjtGeom.mjGEOM_CAPSULE
 _ONBOARD = "stage/onboard"
 _SIDES = Limits(16, 8192, "pixels", whole=True)
 
@@ -193,10 +196,10 @@ class Stage:
         self.data = mujoco.MjData(self.model)
         self.moments: tuple[Moment, ...] = ()
         drones = range(self.drones)
-        self._paths: list[deque[np.ndarray]] = [deque(maxlen=self._length) for _ in drones]
+        self._paths: list[deque[Array]] = [deque(maxlen=self._length) for _ in drones]
         # Distance between a single craft and its goal for which a camera makes room, m.
         self._reach = 0.0
-        self._focus: np.ndarray | None = None
+        self._focus: Array | None = None
         mujoco.mj_forward(self.model, self.data)
 
     def twin(self) -> "Stage":
@@ -274,13 +277,13 @@ class Stage:
         self._focus = focus
 
     @property
-    def focus(self) -> np.ndarray:
+    def focus(self) -> Array:
         """Mean of the goals, or of the craft if there are none, MuJoCo's frame, shape (3,), m."""
         goals = self._goals
         points = np.array(goals) if goals else self._points
         return np.asarray(points.mean(axis=0))
 
-    def decorate(self, scene: mujoco.MjvScene, *, goals: bool = True) -> None:
+    def decorate(self, scene: MjvScene, *, goals: bool = True) -> None:
         """Add marks, payloads and fading paths to a scene, and discs at the goals if wanted."""
         marked = any(moment.marks for moment in self.moments)
         labels = drone_names(self.drones) if 1 < self.drones <= MAX_NAMES else ()
@@ -293,18 +296,18 @@ class Stage:
                     _draw_mark(scene, mark, goal)
             if payload is not None:
                 size = (0.12 * self.radius,) * 3
-                _decorate(scene, mujoco.mjtGeom.mjGEOM_SPHERE, size, payload, _PAYLOAD)
+                _decorate(scene, mjtGeom.mjGEOM_SPHERE, size, payload, _PAYLOAD)
                 _connect(scene, _CAPSULE, 0.012 * self.radius, here, payload, _CABLE)
             if labels:
                 above = here + np.array((0.0, 0.0, 0.9 * self.radius))
-                label = _decorate(scene, mujoco.mjtGeom.mjGEOM_LABEL, (0.1,) * 3, above, _CABLE)
+                label = _decorate(scene, mjtGeom.mjGEOM_LABEL, (0.1,) * 3, above, _CABLE)
                 if label is not None:
                     label.label = f"{labels[drone]}   "  # without the spaces its end is cut off
             color = DRONE_COLORS[drone % len(DRONE_COLORS)]
             if goals and goal is not None and not marked:
                 size = (0.93 * self.radius, 0.0033 * self.radius, 0.0)  # radius, half of its height
                 own = color if self.drones > 1 else _GREEN
-                _decorate(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, size, goal, (*own, 0.3))
+                _decorate(scene, mjtGeom.mjGEOM_CYLINDER, size, goal, (*own, 0.3))
             path = self._paths[drone]
             for number, (start, end) in enumerate(pairwise([*path, here]), 1):
                 if not np.array_equal(start, end):
@@ -330,7 +333,7 @@ class Stage:
         return [moment.goal for moment in self.moments if moment.goal is not None]
 
     @property
-    def _points(self) -> np.ndarray:
+    def _points(self) -> Array:
         """Positions of the craft, MuJoCo's frame, shape (drones, 3), m."""
         return np.asarray(self.data.qpos.reshape(self.drones, 7)[:, :3])
 
@@ -353,7 +356,7 @@ class Canvas(AbstractContextManager["Canvas"]):
 
     def draw(
         self, camera: Camera = "chase", stage: Stage | None = None, lines: Lines = ()
-    ) -> np.ndarray:
+    ) -> Array:
         """The stage, or a twin of it, as it is now, with lines of text over it: a new array, uint8,
         (height, width, 3).
         """
@@ -379,13 +382,13 @@ class Canvas(AbstractContextManager["Canvas"]):
         self.close()
 
 
-def least_distance(positions: np.ndarray) -> float:
+def least_distance(positions: Array) -> float:
     """Least distance between two of some points, shape (A, 3), at least two."""
     apart = np.linalg.norm(positions[:, None] - positions, axis=-1)
     return float(apart[np.triu_indices(len(positions), 1)].min())
 
 
-def _size(model: mujoco.MjModel) -> tuple[float, float]:
+def _size(model: MjModel) -> tuple[float, float]:
     """Radius of the craft about its body's origin, and height of its top above it, m."""
     data = level_data(model)
     craft = model.body_rootid[model.geom_bodyid] == model.jnt_bodyid[0]
@@ -402,7 +405,7 @@ def _size(model: mujoco.MjModel) -> tuple[float, float]:
     return max(radius, 1e-3), float(tops.max())
 
 
-def scale_drawing(model: mujoco.MjModel, radius: float, spread: float) -> None:
+def scale_drawing(model: MjModel, radius: float, spread: float) -> None:
     """Set the near end of drawing, the shadow's fineness and our floor's squares for the craft."""
     visual = model.vis
     extent = model.stat.extent
@@ -417,13 +420,13 @@ def scale_drawing(model: mujoco.MjModel, radius: float, spread: float) -> None:
         visual.map.shadowclip = min(visual.map.shadowclip, (2.0 * radius + spread) / extent)
 
 
-def _grid(drones: int, spacing: float) -> np.ndarray:
+def _grid(drones: int, spacing: float) -> Array:
     """Places of the craft, shape (drones, 3), m: nearly a square, the first at the origin."""
     rows, columns = np.divmod(np.arange(drones), math.isqrt(drones - 1) + 1)
     return -spacing * np.stack((rows, columns, np.zeros(drones)), axis=1)
 
 
-def _draw_mark(scene: mujoco.MjvScene, mark: Mark, goal: _Vector | None) -> None:
+def _draw_mark(scene: MjvScene, mark: Mark, goal: _Vector | None) -> None:
     """Add a mark; a gate that is the goal has the goal's colour."""
     centre = np.array(mark.position)
     if mark.moves:
@@ -445,11 +448,11 @@ def _draw_mark(scene: mujoco.MjvScene, mark: Mark, goal: _Vector | None) -> None
 
 
 def _connect(
-    scene: mujoco.MjvScene,
-    kind: mujoco.mjtGeom,
+    scene: MjvScene,
+    kind: mjtGeom,
     radius: float,
-    start: Sequence[float] | np.ndarray,
-    end: Sequence[float] | np.ndarray,
+    start: Sequence[float] | Array,
+    end: Sequence[float] | Array,
     rgba: Sequence[float],
 ) -> None:
     """Add a cylinder or a capsule between two points."""
@@ -459,10 +462,10 @@ def _connect(
 
 
 def _decorate(
-    scene: mujoco.MjvScene,
-    kind: mujoco.mjtGeom,
+    scene: MjvScene,
+    kind: mjtGeom,
     size: Sequence[float],
-    centre: Sequence[float] | np.ndarray,
+    centre: Sequence[float] | Array,
     rgba: Sequence[float],
 ) -> mujoco.MjvGeom | None:
     """Add a geom that casts no shadow; None if the scene is full."""

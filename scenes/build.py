@@ -4,6 +4,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+from mujoco import MjSpec
 
 from ..models import QUAD_XML
 from ..models.mjcf import has_ground, read_spec
@@ -23,7 +24,7 @@ _HAZE = 0.1  # of the distance to the horizon
 _HAZE_COLOUR = (0.80, 0.88, 0.96, 1.0)  # the sky's colour where it meets the ground
 
 
-def build_scene(vehicle: Path | str | None = None, scene: str = "plain") -> mujoco.MjSpec:
+def build_scene(vehicle: Path | str | None = None, scene: str = "plain") -> MjSpec:
     """A vehicle's file, None for the paper's, in one of `SCENES`, to be compiled.
 
     Raises `InputError` if there is no such scene or the file is wrong, `ValueError` if MuJoCo
@@ -35,7 +36,7 @@ def build_scene(vehicle: Path | str | None = None, scene: str = "plain") -> mujo
     return spec
 
 
-def add_scene(spec: mujoco.MjSpec, scene: str = "plain") -> None:
+def add_scene(spec: MjSpec, scene: str = "plain") -> None:
     """Add a scene to the spec of one or several craft, in place: NAME, or NAME:SEED.
 
     The craft move bit for bit as without it. Raises `InputError`.
@@ -49,9 +50,9 @@ def add_scene(spec: mujoco.MjSpec, scene: str = "plain") -> None:
     spec.compiler.discardvisual = False
 
 
-def _add_plain(spec: mujoco.MjSpec) -> None:
+def _add_plain(spec: MjSpec) -> None:
     """Add ground, sky and sun of `SCENE_XML`, each unless the spec has its own."""
-    scene = mujoco.MjSpec.from_file(str(SCENE_XML))
+    scene = MjSpec.from_file(str(SCENE_XML))
     if has_ground(spec):
         scene.delete(scene.geom("floor"))
         scene.visual, scene.stat = spec.visual, spec.stat  # MuJoCo warns if they differ
@@ -65,7 +66,7 @@ def _add_plain(spec: mujoco.MjSpec) -> None:
     spec.attach(scene, prefix=SCENE_PREFIX, frame=spec.worldbody.add_frame())
 
 
-def _add_airport(spec: mujoco.MjSpec) -> None:
+def _add_airport(spec: MjSpec) -> None:
     """Put the airport of `AIRPORT_XML` around a scene.
 
     The origin of the world becomes the centre of a pad on the apron; +x points along runway 09.
@@ -77,11 +78,11 @@ def _add_airport(spec: mujoco.MjSpec) -> None:
     visual.map.haze = _HAZE
     visual.rgba.haze = _HAZE_COLOUR
     visual.quality.shadowsize = min(visual.quality.shadowsize, _SHADOW_PIXELS)
-    airport = mujoco.MjSpec.from_file(str(AIRPORT_XML))
+    airport = MjSpec.from_file(str(AIRPORT_XML))
     spec.attach(airport, prefix="airport/", frame=spec.worldbody.add_frame())
 
 
-def _add_seeded(spec: mujoco.MjSpec, name: str, seed: int) -> None:
+def _add_seeded(spec: MjSpec, name: str, seed: int) -> None:
     """Put a scene of a seed in place of a spec's sky, lights and the look of its level ground."""
     _clear(spec, _SEEDED_FAR, 20)
     for light in spec.worldbody.lights:
@@ -89,7 +90,7 @@ def _add_seeded(spec: mujoco.MjSpec, name: str, seed: int) -> None:
     GENERATORS[name](Builder(spec, name, seed))
 
 
-def _clear(spec: mujoco.MjSpec, far: float, slices: int) -> None:
+def _clear(spec: MjSpec, far: float, slices: int) -> None:
     """Hide level ground, delete the sky, set the furthest distance that is drawn, m, and into how
     many slices cylinders are cut.
 

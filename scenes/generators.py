@@ -10,6 +10,7 @@ from typing import Any, Final
 
 import mujoco
 import numpy as np
+from mujoco import MjSpec, mjtGeom
 from numpy.typing import ArrayLike as Vector
 
 from ..models.files import read_toml
@@ -28,10 +29,10 @@ _HALL_XML = Path(__file__).with_name("hall.xml")  # its walls, windows, roof and
 _GATES = 8
 _OPENING = 5.0  # m: the paper's craft is 2.8 m wide with its rotors
 
-_PLANE = mujoco.mjtGeom.mjGEOM_PLANE
-_BOX = mujoco.mjtGeom.mjGEOM_BOX
-_CYLINDER = mujoco.mjtGeom.mjGEOM_CYLINDER
-_ELLIPSOID = mujoco.mjtGeom.mjGEOM_ELLIPSOID
+_PLANE = mjtGeom.mjGEOM_PLANE
+_BOX = mjtGeom.mjGEOM_BOX
+_CYLINDER = mjtGeom.mjGEOM_CYLINDER
+_ELLIPSOID = mjtGeom.mjGEOM_ELLIPSOID
 _FLAT = mujoco.mjtBuiltin.mjBUILTIN_FLAT
 _PATTERNS = {
     "checker": (mujoco.mjtBuiltin.mjBUILTIN_CHECKER, mujoco.mjtMark.mjMARK_NONE),
@@ -44,7 +45,7 @@ class Builder:
     """Adds the parts of a scene to a spec, and draws its numbers. Nothing of it touches or weighs
     anything."""
 
-    def __init__(self, spec: mujoco.MjSpec, scene: str, seed: int) -> None:
+    def __init__(self, spec: MjSpec, scene: str, seed: int) -> None:
         self.spec = spec
         self.scene = scene
         self.rng = np.random.Generator(np.random.PCG64(seed))
@@ -100,7 +101,7 @@ class Builder:
     def add(
         self,
         name: str,
-        kind: mujoco.mjtGeom,
+        kind: mjtGeom,
         size: Vector,
         position: Vector,
         material: str,
@@ -189,7 +190,7 @@ def warehouse(hall: Builder) -> None:
     """A hall of 60 m by 40 m, 24 m high. Racks, pallets and barrels stand along its walls."""
     hall.sky(hall.colour((0.55, 0.60, 0.66)), hall.colour((0.62, 0.64, 0.66)))
     hall.paint()
-    walls = mujoco.MjSpec.from_file(str(_HALL_XML))
+    walls = MjSpec.from_file(str(_HALL_XML))
     hall.spec.attach(walls, prefix="warehouse/", frame=hall.spec.worldbody.add_frame())
     for i, x in enumerate((-15.0, 15.0)):
         bright = hall.uniform(0.28, 0.42)
