@@ -25,7 +25,7 @@ MATERIALS: Final[Mapping[str, Mapping[str, Mapping[str, Any]]]] = read_toml(
     Path(__file__).with_name("materials.toml"), "materials"
 )
 _FOREST = 60.0  # m: half the width of the wood
-_HALL_XML = Path(__file__).with_name("hall.xml")  # its walls, windows, roof and lamps
+_HALL_XML = Path(__file__).with_name("hall.xml")  # its walls, windows, roof, lamps and racks
 _GATES = 8
 _OPENING = 5.0  # m: the paper's craft is 2.8 m wide with its rotors
 
@@ -105,11 +105,10 @@ class Builder:
         size: Vector,
         position: Vector,
         material: str,
-        turn: Vector = (0.0, 0.0, 0.0),
+        heading: float = 0.0,
     ) -> None:
-        """Add a geom that is turned about x, y and z, one after the other."""
-        quaternion = np.empty(4)
-        mujoco.mju_euler2Quat(quaternion, np.array(turn, float), "XYZ")
+        """Add a geom that is turned about z, rad."""
+        quaternion = (math.cos(heading / 2), 0.0, 0.0, math.sin(heading / 2))
         self.spec.worldbody.add_geom(
             name=f"{self.scene}/{name}", type=kind, size=size, pos=position,
             quat=quaternion, material=f"{self.scene}/{material}", contype=0, conaffinity=0,
@@ -160,7 +159,7 @@ def forest(wood: Builder) -> None:
     for i in range(40):
         sides = wood.rng.uniform(0.3, 1.0, 3)
         x, y = wood.around(1.0, _FOREST)
-        turn = (0.0, 0.0, wood.uniform(0, math.pi))
+        turn = wood.uniform(0, math.pi)
         wood.add(f"rock_{i}/stone", _ELLIPSOID, sides, (x, y, 0.2 * sides[2]), "stone", turn)
 
 
@@ -198,17 +197,15 @@ def warehouse(hall: Builder) -> None:
         hall.light(f"light_{i}", (x, 0.0, 22.0), direction, (bright,) * 3, 0.15)
     racks = [(x, y) for y in (-16.5, -11.0, 11.0, 16.5) for x in (-20.0, -7.0, 7.0, 20.0)]
     for i, (x, y) in enumerate(racks):
-        _add_rack(hall, f"rack_{i}", x, y)
+        _fill_rack(hall, f"rack_{i}", x, y)
     for i in range(20):
         _add_goods(hall, i)
 
 
-def _add_rack(hall: Builder, name: str, x: float, y: float) -> None:
-    for j, (dx, dy) in enumerate(((-4.0, -0.6), (-4.0, 0.6), (4.0, -0.6), (4.0, 0.6))):
-        hall.add(f"{name}/post_{j}", _BOX, (0.07, 0.07, 3.6), (x + dx, y + dy, 3.6), "steel")
+def _fill_rack(hall: Builder, name: str, x: float, y: float) -> None:
+    """Boxes on the three shelves of a rack."""
     for level in range(3):
         deck = 0.3 + 2.3 * level
-        hall.add(f"{name}/shelf_{level}", _BOX, (4.0, 0.7, 0.05), (x, y, deck), "steel")
         for slot, dx in enumerate((-3.0, -1.0, 1.0, 3.0)):
             half = hall.rng.uniform((0.5, 0.4, 0.4), (0.9, 0.6, 0.9))
             tint = hall.choose("box")
@@ -243,7 +240,7 @@ def gates(track: Builder) -> None:
     for i in range(40):
         x, y = track.around(1.5, 40.0)
         tint = track.choose("paint")
-        turn = (0.0, 0.0, track.uniform(0, math.pi))
+        turn = track.uniform(0, math.pi)
         if i % 2:
             track.add(f"barrier_{i}/block", _BOX, (1.2, 0.25, 0.45), (x, y, 0.45), tint, turn)
         else:
@@ -256,8 +253,7 @@ def gates(track: Builder) -> None:
             height = 0.4 * (row + 1)
             position = (distance * math.cos(angle), distance * math.sin(angle), height)
             size = (0.75, 9.0, height)
-            turn = (0.0, 0.0, angle)
-            track.add(f"stand_{i}/row_{row}", _BOX, size, position, "stand", turn)
+            track.add(f"stand_{i}/row_{row}", _BOX, size, position, "stand", angle)
 
 
 def _add_gate(track: Builder, number: int) -> None:
@@ -268,7 +264,6 @@ def _add_gate(track: Builder, number: int) -> None:
     height = track.uniform(5.0, 12.0)
     heading = angle + math.pi / 2 + track.uniform(-0.3, 0.3)  # anticlockwise round the ring
     tint = track.choose("paint")
-    turn = (0.0, 0.0, heading)
     x = radius * math.cos(angle)
     y = radius * math.sin(angle)
     foot = (height - half - 2 * bar) / 2
@@ -278,13 +273,13 @@ def _add_gate(track: Builder, number: int) -> None:
         side_y = y + aside * math.cos(heading)
         name = f"gate_{number}/frame_{part}"
         size = (0.15, bar, half + 2 * bar)
-        track.add(name, _BOX, size, (side_x, side_y, height), tint, turn)
+        track.add(name, _BOX, size, (side_x, side_y, height), tint, heading)
         name = f"gate_{number}/post_{part}"
         size = (0.1, foot, 0)
         track.add(name, _CYLINDER, size, (side_x, side_y, foot), "steel")
     for part, sign in (("top", 1), ("bottom", -1)):
         position = (x, y, height + sign * (half + bar))
-        track.add(f"gate_{number}/frame_{part}", _BOX, (0.15, half, bar), position, tint, turn)
+        track.add(f"gate_{number}/frame_{part}", _BOX, (0.15, half, bar), position, tint, heading)
 
 
 GENERATORS: Final[dict[str, Callable[[Builder], None]]] = {
