@@ -10,9 +10,8 @@ from numpy.typing import ArrayLike
 from ..models.vehicle import Vehicle
 from ..models.vehicle_file import read_vehicle_file
 from .identify import LAG, Identified
-from .prediction import Numbers, inertia_of
+from .prediction import Numbers, entry_of, inertia_of
 
-_AXES = ("x", "y", "z")
 _OF_FILE = ("body.size", "body.ground_clearance", "rotors.speed")
 """Entries of a file that the vehicle itself no longer has."""
 
@@ -33,7 +32,7 @@ def identified_toml(vehicle: Vehicle, found: Identified) -> str:
     source = f"identified from {', '.join(found.logs)}"
     origins: dict[str, Origin] = {}
     for estimate in found.estimates:
-        entry, axis = _entry(estimate.name)
+        entry, axis = entry_of(estimate.name)
         sentence = f"95 % interval {estimate.low:.4g} to {estimate.high:.4g}"
         if estimate.kept:
             sentence = f"the vehicle's own value, {estimate.kept}"
@@ -79,12 +78,6 @@ def vehicle_toml(vehicle: Vehicle, numbers: Numbers, origins: Mapping[str, Origi
     return "\n".join([*lines, ""])
 
 
-def _entry(name: str) -> tuple[str, str]:
-    """Entry of the file, and the axis of a number in it: drag.linear and x of drag.linear.x."""
-    entry, _, axis = name.rpartition(".")
-    return (entry, axis) if axis in _AXES else (name, "")
-
-
 def _values(vehicle: Vehicle, numbers: Numbers) -> dict[str, ArrayLike]:
     """Values of the file's entries, but for those that a model lacks."""
     inertia = inertia_of(vehicle, numbers)
@@ -96,18 +89,14 @@ def _values(vehicle: Vehicle, numbers: Numbers) -> dict[str, ArrayLike]:
     }
     if vehicle.center_of_mass.any():
         values["body.center_of_mass"] = vehicle.center_of_mass
-    for name, own in vehicle.coefficients.numbers().items():
-        values[name] = own[0] if len(own) == 1 and name != "rotors.curve" else own
-    vectors: dict[str, list[float]] = {}
+    given = vehicle.coefficients.numbers()
+    changed: dict[str, list[float]] = {}
     for name, number in numbers.items():
-        entry, axis = _entry(name)
-        if axis:
-            vectors.setdefault(entry, []).append(number)
-        elif number or name in values:
-            values[name] = number
-    for entry, vector in vectors.items():
-        if entry != "body.inertia" and (any(vector) or entry in values):
-            values[entry] = vector
+        changed.setdefault(entry_of(name)[0], []).append(number)
+    del changed["body.inertia"]
+    for entry, own in {**given, **changed}.items():
+        if entry in given or any(own):
+            values[entry] = own[0] if len(own) == 1 and entry != "rotors.curve" else own
     if LAG in numbers:
         values.pop("rotors.time_constant_down", None)
     return values

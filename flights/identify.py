@@ -26,6 +26,7 @@ from .prediction import (
     Numbers,
     Windows,
     differences,
+    entry_of,
     inertia_of,
     numbers_of,
     predict,
@@ -330,15 +331,10 @@ class Fit:
 def _shifted(start: Floats, sizes: Floats) -> Floats:
     """Start states (M, 13), and the same with each of 12 errors: shape (13, M, 13)."""
     shifted = np.tile(start, (13, 1, 1))
-    for i, size in enumerate(sizes):
-        kind, axis = divmod(i, 3)
-        if kind == 1:
-            turn = np.zeros(3)
-            turn[axis] = size
-            shifted[i + 1, :, 3:7] = advanced(start[:, 3:7], turn)
-        else:
-            first = (0, 3, 7, 10)[kind]
-            shifted[i + 1, :, first + axis] += size
+    shifted[1:4, :, :3] += np.diag(sizes[:3])[:, None]
+    for state, turn in zip(shifted[4:7], np.diag(sizes[3:6]), strict=True):
+        state[:, 3:7] = advanced(start[:, 3:7], turn)
+    shifted[7:, :, 7:] += np.diag(sizes[6:])[:, None]
     return shifted
 
 
@@ -370,8 +366,7 @@ def _scale(vehicle: Vehicle, numbers: Numbers, name: str) -> float:
         "drag.angular": inertia,
         "drag.moment": 10 * inertia,
     }
-    kind = name if name in typical else name.rpartition(".")[0]
-    return abs(numbers[name]) or typical[kind]
+    return abs(numbers[name]) or typical[entry_of(name)[0]]
 
 
 def _lowest(name: str) -> float:

@@ -52,13 +52,20 @@ def numbers_of(vehicle: Vehicle) -> dict[str, float]:
     own: dict[str, Sequence[float]] = dict(vehicle.coefficients.numbers())
     own["body.inertia"] = np.diag(vehicle.inertia).tolist()
     own["rotors.reaction"] = [float(np.mean(reactions))]
-    numbers = dict.fromkeys(NAMES, 0.0)
-    for entry, values in own.items():
-        names = [entry] if entry in numbers else [f"{entry}.{axis}" for axis in "xyz"]
-        for name, value in zip(names, values, strict=False):
-            if name in numbers:
-                numbers[name] = value
+    numbers = {}
+    for name in NAMES:
+        entry, axis = entry_of(name)
+        values = own.get(entry, (0.0, 0.0, 0.0))
+        numbers[name] = values["xyz".index(axis)]
     return numbers
+
+
+def entry_of(name: str) -> tuple[str, str]:
+    """Entry of a vehicle's file that has a number, and its axis in it: "drag.linear" and "x" for
+    "drag.linear.x"; no axis, if the entry is one number.
+    """
+    entry, _, axis = name.rpartition(".")
+    return (entry, axis) if axis in ("x", "y", "z") else (name, "")
 
 
 def inertia_of(vehicle: Vehicle, numbers: Numbers) -> Floats:
