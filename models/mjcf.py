@@ -6,7 +6,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import mujoco
-from mujoco import MjData, MjSpec, mjtGeom
+from mujoco import MjData, MjsBody, MjSpec, mjtGeom
 
 from .craft import craft_spec
 from .errors import InputError
@@ -69,27 +69,24 @@ def add_ground(spec: MjSpec) -> None:
     spec.attach(ground, prefix="rotorgram/", frame=spec.worldbody.add_frame())
 
 
-def swarm_spec(vehicles: Sequence[Path], names: Sequence[str]) -> MjSpec:
-    """One spec with a craft of each vehicle's file, whose parts have its name and a slash before
-    theirs. Options and all else are those of the first vehicle.
+def swarm_spec(vehicles: Sequence[Path], names: Sequence[str]) -> tuple[MjSpec, list[MjsBody]]:
+    """One spec with a craft of each vehicle's file, and the free bodies of the craft.
+
+    Parts have the name of their craft and a slash before theirs. Options and all else are those of
+    the first vehicle.
     """
     spec = read_spec(vehicles[0])
     spec.delete(free_body(spec))
     _delete_targeting_cameras(spec)
+    crafts = []
     for path, name in zip(vehicles, names, strict=True):
-        attach_craft(spec, path, f"{name}/")
-    return spec
-
-
-def attach_craft(
-    spec: MjSpec, vehicle: Path, prefix: str, place: Sequence[float] = (0, 0, 0)
-) -> None:
-    """Add a file's craft, its names with a prefix; step and gravity are those of the spec."""
-    own = read_spec(vehicle)  # it must outlive the call: its craft is a part of it
-    own.option.timestep = spec.option.timestep
-    own.option.gravity = spec.option.gravity
-    _delete_targeting_cameras(own)
-    spec.worldbody.add_frame(pos=place).attach_body(free_body(own), prefix, "")
+        own = read_spec(path)  # it must outlive the attachment: its craft is a part of it
+        own.option.timestep = spec.option.timestep
+        own.option.gravity = spec.option.gravity
+        _delete_targeting_cameras(own)
+        craft = spec.worldbody.add_frame().attach_body(free_body(own), f"{name}/", "")
+        crafts.append(craft)
+    return spec, crafts
 
 
 def _delete_targeting_cameras(spec: MjSpec) -> None:
@@ -100,7 +97,7 @@ def _delete_targeting_cameras(spec: MjSpec) -> None:
             spec.delete(camera)
 
 
-def free_body(spec: MjSpec) -> mujoco.MjsBody:
+def free_body(spec: MjSpec) -> MjsBody:
     """The first body with a free joint: the craft of a vehicle's spec."""
     free = mujoco.mjtJoint.mjJNT_FREE
     return next(body for body in spec.bodies if any(joint.type == free for joint in body.joints))

@@ -43,10 +43,9 @@ def swarm_model(
                 raise InputError(
                     f"vehicle: expected a {name} of {ours} as of {first.name}, got {got}"
                 )
-    spec = swarm_spec([vehicle.path for vehicle in vehicles], names)
+    spec, crafts = swarm_spec([vehicle.path for vehicle in vehicles], names)
     add_ground(spec)
     spec.compiler.discardvisual = True
-    crafts = [body for body in spec.worldbody.bodies if body.name.partition("/")[0] in names]
     for name, craft in zip(names, crafts, strict=True):
         if movable or payload:
             craft.simple = False

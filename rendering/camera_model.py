@@ -44,9 +44,8 @@ def drawn_model(
     """What is drawn: craft with their cameras, what surrounds them, the task's marks."""
     names = drone_names(drones)
     crafts = members_of(vehicle, drones)
-    spec = swarm_spec([craft.path for craft in crafts], names)
+    spec, bodies = swarm_spec([craft.path for craft in crafts], names)
     add_scene(spec, scene)
-    bodies = [body for body in spec.worldbody.bodies if body.name.partition("/")[0] in names]
     for name, body, craft in zip(names, bodies, crafts, strict=True):
         for camera in craft.cameras:
             if camera not in craft.file_cameras:

@@ -18,9 +18,10 @@ from ..models.cameras import place_cameras
 from ..models.errors import InputError, one_line, shortened
 from ..models.fields import Limits, check
 from ..models.fleet import load_vehicles, members_of
-from ..models.mjcf import attach_craft, free_body, level_data
+from ..models.mjcf import level_data, swarm_spec
 from ..models.swarm import drone_names
-from ..scenes.build import SCENE_PREFIX, build_scene
+from ..models.vehicle import owners
+from ..scenes.build import SCENE_PREFIX, add_scene
 from ..scenes.marks import Mark
 from .gl import Lines, Offscreen
 
@@ -165,35 +166,30 @@ class Stage:
             raise InputError(f"drones: expected 1 or more, got {drones}")
         self.drones = drones
         self.vehicle = load_vehicles(vehicle, drones)
-        crafts = members_of(self.vehicle, drones)
+        paths = [craft.path for craft in members_of(self.vehicle, drones)]
         try:
-            scenes = [build_scene(path, scene) for path in dict.fromkeys(c.path for c in crafts)]
-            spec = scenes[0]
-            sizes = [_size(scene.compile()) for scene in scenes]
+            spec, crafts = swarm_spec(paths, drone_names(drones))
+            add_scene(spec, scene)
+            # It sees nose, front rotors and horizon.
+            crafts[0].add_camera(name=_ONBOARD, xyaxes=(0, -1, 0, 0.30, 0, 0.954), fovy=70)
+            self.model = spec.compile()
         except InputError:
             raise
         except ValueError as error:  # a texture is missing, which the physics does not need
             reason = one_line(error)
             raise InputError(f"vehicle: expected a file that can be drawn, got: {reason}") from None
-        self.radius = max(radius for radius, _ in sizes)
-        top = sizes[0][1]
-        grid = _grid(drones, _SPACING * self.radius)
-        free_body(spec).add_camera(  # sees nose, front rotors and horizon
-            name=_ONBOARD,
-            pos=(0.03 * self.radius, 0.0, top + 0.154 * self.radius),
-            xyaxes=(0, -1, 0, 0.30, 0, 0.954),
-            fovy=70,
-        )
-        for number, offset in enumerate(grid[1:], 1):
-            attach_craft(spec, crafts[number].path, f"{number}/", offset)
-        self.model = spec.compile()
-        apart = float(np.ptp(grid, axis=0).max())
+        self.radius, top = _size(self.model)
+        onboard = (0.03 * self.radius, 0.0, top + 0.154 * self.radius)
+        self.model.camera(_ONBOARD).pos = onboard
+        self._grid = _grid(drones, _SPACING * self.radius)
+        apart = float(np.ptp(self._grid, axis=0).max())
         scale_drawing(self.model, self.radius, 4.0 * apart)  # in flight they are further apart
         self._length = _TRAIL // _EVERY if trail else 0
         self._clear()
 
     def _clear(self) -> None:
         self.data = mujoco.MjData(self.model)
+        self._points[:] += self._grid
         self.moments: tuple[Moment, ...] = ()
         drones = range(self.drones)
         self._paths: list[deque[Array]] = [deque(maxlen=self._length) for _ in drones]
@@ -389,9 +385,9 @@ def least_distance(positions: Array) -> float:
 
 
 def _size(model: MjModel) -> tuple[float, float]:
-    """Radius of the craft about its body's origin, and height of its top above it, m."""
+    """Radius of the largest craft about its body's origin, and height of the tops above it, m."""
     data = level_data(model)
-    craft = model.body_rootid[model.geom_bodyid] == model.jnt_bodyid[0]
+    craft = owners(model)[model.geom_bodyid] >= 0
     drawn = craft & (model.geom_group <= 2)
     chosen = drawn if drawn.any() else craft
     if not chosen.any():
