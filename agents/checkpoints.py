@@ -9,14 +9,9 @@ over all bytes of the file detects any damage.
 
 import hashlib
 import json
-import os
-import platform
 import re
-import secrets
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -27,6 +22,7 @@ from ..envs.spec import EnvSpec
 from ..models import Backend
 from ..models.errors import InputError, one_line, require, shortened
 from ..models.fields import Limits, check_fields
+from ..models.files import software_versions, write_whole
 from .config import Config
 from .episodes import Episode, Position, ResumeError
 from .networks import ByName, Floats, named, part_of
@@ -68,7 +64,7 @@ class Checkpoint:
     state: Mapping[str, np.ndarray]
     """State of the agent."""
     position: Position
-    versions: dict[str, str] = field(default_factory=lambda: software_versions())
+    versions: dict[str, str] = field(default_factory=software_versions)
 
     @property
     def env_id(self) -> str:
@@ -110,15 +106,6 @@ class Checkpoint:
         names = sorted({*self.versions, *now})
         pairs = {name: (self.versions.get(name, "none"), now.get(name, "none")) for name in names}
         return {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
-
-
-def software_versions() -> dict[str, str]:
-    """Versions of the installed packages that the numbers depend on."""
-    versions = {"python": platform.python_version()}
-    for name in ("rotorgram", "mujoco", "gymnasium", "numpy", "torch", "stable-baselines3"):
-        with suppress(PackageNotFoundError):
-            versions[name] = version(name)
-    return versions
 
 
 def store(checkpoint: Checkpoint, path: Path) -> None:
@@ -178,8 +165,6 @@ def _read(data: bytes, parse: Callable[[bytes], ByName]) -> Checkpoint:
     if content["format"] != FORMAT:
         found_format = shortened(content["format"])
         raise InputError(f"expected a checkpoint of format {FORMAT}, got {found_format}")
-    if isinstance(content["config"], dict):  # older files have no scale
-        content["config"].setdefault("reward_scale", 1.0)
     spec = EnvSpec.from_json(content["spec"])
     env = EnvConfig.from_dict(content["env"]) if content["env"] else None
     arrays = parse(data)
@@ -227,24 +212,3 @@ def _not_finite(arrays: Mapping[str, np.ndarray]) -> Iterator[str]:
         # Without metrics the error of an episode is NaN, which is no divergence.
         if name != "episodes/mean_size" and not np.isfinite(array).all():
             yield name
-
-
-def write_whole(path: Path, data: bytes) -> None:
-    """Write a file: after a crash at any moment, `path` holds the old one or the new one.
-
-    Two processes may write it at the same time. `OSError` names the file.
-    """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.tmp")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with open(temporary, "xb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException as error:
-        with suppress(OSError):
-            temporary.unlink()
-        if isinstance(error, OSError):
-            raise OSError(error.errno, error.strerror, str(path)) from None
-        raise

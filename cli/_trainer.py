@@ -14,12 +14,12 @@ from threading import Timer
 from typing import TYPE_CHECKING
 
 from ..agents import Checkpoint, Episode, find_algorithm, find_preset, load, preset, store
-from ..agents.checkpoints import software_versions, write_whole
 from ..envs.autoreset import AdvancingVectorEnv
 from ..envs.config import BackendConfig
 from ..flights.folders import locked
 from ..models import Backend
 from ..models.errors import InputError
+from ..models.files import software_versions, write_whole
 from ..training.settings import Run
 from ..training.training import Training, config_of, is_finished
 from ._env import CHECKPOINT, fitted, local_env, remote_env

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from ..models.errors import InputError
+from ..models.files import write_whole
 from ._flags import Command
 
 
@@ -24,7 +25,6 @@ class Export(Command):
 
     def run(self) -> int:
         """Write it."""
-        from ..agents.checkpoints import write_whole
         from ..agents.export import TARGETS, export
         from ._env import trained
 

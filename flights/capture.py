@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..agents.checkpoints import software_versions, write_whole
 from ..models.cameras import View
+from ..models.files import software_versions, write_whole
 from ..models.swarm import drone_names
 from ..models.vehicle import Vehicle
 from .coco import Labels, write_coco

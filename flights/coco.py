@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..agents.checkpoints import write_whole
+from ..models.files import write_whole
 
 Labels = dict[str, Any]
 """The labels of one frame or picture: an object of JSON."""

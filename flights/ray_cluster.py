@@ -6,8 +6,8 @@ from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from typing import Any
 
-from ..agents.checkpoints import software_versions
 from ..models.errors import InputError, one_line, require
+from ..models.files import software_versions
 from .executors import Result
 
 _LISTENING_TIMEOUT = 5.0  # s

@@ -1,9 +1,16 @@
-"""TOML files, new files, and files of packages. Imports the standard library alone."""
+"""TOML files, new files, files of packages, and the versions of software that files note.
 
+Imports the standard library alone.
+"""
+
+import os
+import platform
+import secrets
 import shutil
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +59,27 @@ def write_new(path: Path, content: str | bytes) -> None:
         file.write(content.encode() if isinstance(content, str) else content)
 
 
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a file: after a crash at any moment, `path` holds the old one or the new one.
+
+    Two processes may write it at the same time. `OSError` names the file.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.tmp")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open(temporary, "xb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException as error:
+        with suppress(OSError):
+            temporary.unlink()
+        if isinstance(error, OSError):
+            raise OSError(error.errno, error.strerror, str(path)) from None
+        raise
+
+
 def check_new_file(out: Path, *endings: str) -> None:
     """Raises `InputError` unless it is the name of a new file with one of these endings."""
     if out.suffix.lower() not in endings:
@@ -68,3 +96,12 @@ def find_in_package(name: str, folder: Path) -> Path | None:
     ways = (inside, Path(*inside.parts[1:]))
     places = (up / way for up in (folder, *folder.parents) for way in ways)
     return next((place for place in places if place.is_file()), None)
+
+
+def software_versions() -> dict[str, str]:
+    """Versions of the installed packages that the numbers depend on."""
+    versions = {"python": platform.python_version()}
+    for name in ("rotorgram", "mujoco", "gymnasium", "numpy", "torch", "stable-baselines3"):
+        with suppress(PackageNotFoundError):
+            versions[name] = version(name)
+    return versions

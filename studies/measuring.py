@@ -145,7 +145,7 @@ def read_rows(path: Path, kind: type[Value]) -> list[Value]:
 
 def write(path: Path, result: Mapping[str, object]) -> None:
     """Write a result as JSON, with the software and the machine on which it depends."""
-    from rotorgram.agents.checkpoints import software_versions
+    from rotorgram.models.files import software_versions
     from rotorgram.training.results import machine
 
     path.parent.mkdir(parents=True, exist_ok=True)

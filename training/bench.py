@@ -20,11 +20,11 @@ import numpy as np
 from mujoco.batch import Batch
 from numpy.typing import NDArray
 
-from ..agents.checkpoints import software_versions, write_whole
 from ..envs.autoreset import AdvancingVectorEnv
 from ..envs.config import EnvConfig
 from ..envs.vector import LocalVectorEnv
 from ..models.fields import Limits, check
+from ..models.files import software_versions, write_whole
 from ..models.vehicle import Vehicle
 from ..udp.spawn import spawn_simulator
 from .results import machine

@@ -31,9 +31,9 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from ..agents.checkpoints import software_versions, write_whole
 from ..envs.spec import EnvSpec, SpecError
 from ..models.errors import InputError
+from ..models.files import software_versions, write_whole
 from .metrics import Headline
 from .settings import Row, Study
 

@@ -25,9 +25,9 @@ from rotorgram.agents import (
     resume_agent,
     store,
 )
-from rotorgram.agents.checkpoints import software_versions, write_whole
 from rotorgram.agents.learner import Learner
 from rotorgram.models.errors import InputError
+from rotorgram.models.files import software_versions, write_whole
 
 SMALL: dict[str, dict[str, Any]] = {
     "vpg": {"episodes_per_update": 3},

@@ -12,13 +12,14 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from rotorgram.agents.checkpoints import load, software_versions
+from rotorgram.agents.checkpoints import load
 from rotorgram.envs.config import EnvConfig
 from rotorgram.flights import ray_cluster as module
 from rotorgram.flights.capture import capture
 from rotorgram.flights.executors import RunsFailed, WorkersConfig, open_executor, run_jobs
 from rotorgram.flights.folders import new_folder
 from rotorgram.flights.viewpoints import CaptureConfig
+from rotorgram.models.files import software_versions
 from rotorgram.training.results import Results
 from rotorgram.training.settings import Row, Study
 from rotorgram.training.study import run_study

@@ -14,13 +14,12 @@ import threading
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from mcap.writer import Writer
 
-from ...models.files import removed_on_error
+from ...models.files import removed_on_error, software_versions
 from ..protocol.messages import Command, Hello, Message, State
 from ..transport.stepped import Steppable
 
@@ -30,7 +29,6 @@ FORMAT = "4"  # version of the file's content, beside the protocol's in each dat
 _CHUNK = 1 << 16  # bytes; 2 ms to write
 _SECOND = 10**9
 _BUFFER = 1 << 20  # bytes; more than a chunk, so that its records reach the file at once
-_PACKAGES = ("rotorgram", "mujoco", "gymnasium", "numpy", "mcap")
 
 _log = logging.getLogger("rotorgram.udp")
 
@@ -71,7 +69,7 @@ class Journal:
         self._size = 0  # bytes of these
         self._flushed = time.time_ns()
         self._channels: dict[str, int] = {}  # ids by topic
-        versions = software()
+        versions = software_versions() | {"machine": platform.machine()}
         head = {f"version of {name}": number for name, number in versions.items()}
         head |= {"format": FORMAT, "side": side, **(about or {})}
         try:
@@ -168,15 +166,6 @@ class Journal:
                 words[name] = getattr(message, name)
         words["datagram"] = datagram.hex()
         return json.dumps(words).encode()
-
-
-def software() -> dict[str, str]:
-    """Versions of the software that the numbers depend on, and the machine."""
-    versions = {"python": platform.python_version(), "machine": platform.machine()}
-    for name in _PACKAGES:
-        with suppress(PackageNotFoundError):
-            versions[name] = version(name)
-    return versions
 
 
 def about_of(stepped: Steppable) -> dict[str, str]:
