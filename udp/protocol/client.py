@@ -53,7 +53,6 @@ _LATEST = 10.0
 for again before an agent takes the simulator for lost (30 s)."""
 _TOO_EARLY = 1.5  # factor of the estimated round trip when answers come twice
 _SOON = 0.25  # an agent that has waited for a State for less needs no Alive, s
-_AFTER_COMMAND = SIMULATOR["waiting"]["received", Command]
 
 
 def new_session() -> int:
@@ -411,12 +410,11 @@ class Client:
         self.deadline = now + self.config.timeout  # the agent is there: this is no silence
 
     def _take_command(self, command: Command, plain: bytes, now: float) -> None:
-        self.state = _AFTER_COMMAND
+        self.state = SIMULATOR["waiting"]["received", Command]
         self._transfer = None
         self.resend_at = self.deadline = inf
         self._answered_at = now
-        if self.tap:
-            self._record(command, plain)
+        self._record(command, plain)
         self.statistics.round_trips.append(now - self.asked_at)
         self._round_trips.answered(now)
 
@@ -464,7 +462,6 @@ class Client:
     def begin_again(self, now: float) -> None:
         """Say Hello in a new session to an agent that knows nothing of this one, or is silent."""
         self.hello = replace(self.hello, session=self.draw_session())
-        self.sequence = 0
         self._sealing = self.key
         self.is_queued = False
         self._assembler = Assembler(self.layout.seeded_command.size)
@@ -476,22 +473,15 @@ class Client:
         """Send a message and repeat it until it is answered."""
         kind = type(message)
         after = SIMULATOR[self.state]["sent", kind]
-        if isinstance(message, State) and not self.by_text:
-            data = binary.encode_step(message, self.layout)
-        else:
-            data = self._encode(message)
-        if self.tap:
-            self._record(message, data)
-        self._transfer = transfer = Transfer(data, self.largest)
+        data = self._encode(message)
+        self._record(message, data)
+        self._transfer = Transfer(data, self.largest)
         self.state = after
         self.sequence = 0 if isinstance(message, m.Hello) else message.sequence
         self.sends = self._tries = 1
         self._stretch = 1.0
         self._round_trips.sent(now, first=True)
-        if transfer.count == 1 and self._is_plain and not self._dice:
-            self.outgoing.append(data)
-        else:
-            self._put(transfer.start())
+        self._put(self._transfer.start())
         self.asked_at = now
         if kind is m.Close:
             self.resend_at = now + CLOSE_INTERVAL

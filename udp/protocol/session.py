@@ -20,8 +20,6 @@ from .messages import Command, Message, State, one_line
 from .statistics import Statistics
 from .transitions import AGENT, AgentState, Way
 
-_AFTER_STATE = AGENT["expecting"]["received", State]
-
 
 class NoSuchSession(DecodeError):
     """A message of a session that is not here, or went on with another agent."""
@@ -123,24 +121,16 @@ class Session:
             orders=orders,
             seeds=seeds,
         )
-        layout = self.layout
-        data = text.encode(command) if self.is_text else binary.encode_step(command, layout)
+        data = self._encode(command)
         self.state = after
         self.asked_at = self.heard_at = now
-        self.reply = reply = Transfer(data, self._largest)
-        outbox = self.outbox
-        if reply.count == 1 and self.key is None:  # as `put`
-            outbox.datagrams.append((data, self.peer))
-            outbox.statistics.counters["sent"] += 1
-        else:
-            outbox.put(reply.start(), self.peer, self.key)
-        if outbox.tap:
-            self._record(command, data)
+        self._send(data)
+        self._record(command, data)
 
     def send_close(self, reason: str) -> None:
         """End the exchange."""
         close = self.goodbye(reason)
-        data = text.encode(close) if self.is_text else binary.encode(close)
+        data = self._encode(close)
         self.move("sent", m.Close)
         self._send(data)
         self._record(close, data)
@@ -168,6 +158,9 @@ class Session:
         if self.outbox.tap:
             self.outbox.tap(self.slot, message, data)
 
+    def _encode(self, message: Command | m.Close) -> bytes:
+        return text.encode(message) if self.is_text else binary.encode(message, self.layout)
+
     def _send(self, data: bytes) -> None:
         """Send a message, and keep its bytes for a repeated State."""
         self.reply = Transfer(data, self._largest)
@@ -192,10 +185,9 @@ class Session:
     def take_state(self, state: State, plain: bytes, now: float) -> Event:
         """The next State, which is expected."""
         self.sequence = state.sequence
-        self.state = _AFTER_STATE
+        self.move("received", State)
         self.outbox.statistics.round_trips.append(now - self.asked_at)
-        if self.outbox.tap:
-            self._record(state, plain)
+        self._record(state, plain)
         return Event(self.slot, state)
 
     def receive(self, message: Message, plain: bytes, now: float) -> Event | None:
