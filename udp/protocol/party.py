@@ -78,8 +78,8 @@ class AgentLink:
     address: Address
     client: Client
     """The exchange with it, with its statistics."""
-    rows: Array
-    """Rows of its drones in the arrays of a world, shape (n,): the first agent has the first."""
+    rows: slice | Array
+    """Rows of its drones in the arrays of a world: the first agent has the first."""
     participation: Participation = "coming"
     command: Command | None = None
     """The Command that the next step or reset takes."""
@@ -140,6 +140,7 @@ class WorldRules:
         self.reason: str | None = None
         self.cause: Command | None = None
         self.moved = False
+        self._due: list[AgentLink] = []  # of States
 
     def start(self, now: float) -> None:
         """Say Hello to every agent."""
@@ -180,6 +181,23 @@ class WorldRules:
         for link in self.links:
             link.client.close(reason, now)
 
+    def answer(self, now: float) -> None:
+        """Send the States that are due. Raises `InputError` if one is not finite."""
+        due = self._due
+        self._due = []
+        world = self.world
+        for link in due:
+            rows = link.rows
+            link.client.send_state(
+                link.client.sequence * self.period,
+                tuple([array[rows] for array in world.observations.values()]),
+                world.rewards[rows],
+                world.terminated[rows],
+                world.truncated[rows],
+                tuple([array[rows] for array in world.telemetry.values()]),
+                now,
+            )
+
     def _reset_all(self, seeds: NDArray[np.uint64] | None) -> None:
         actions = self.layout.actions
         nothing = np.zeros(actions.shape, actions.dtype)
@@ -205,7 +223,6 @@ class OneAgent(WorldRules):
         (self._link,) = self.links
         self._client = self._link.client
         self._to_follow: Command | Welcome | None = None
-        self._answer_due = False
         self._all_fly = bytes(self.layout.drones)  # orders
 
     def start(self, now: float) -> None:
@@ -238,7 +255,7 @@ class OneAgent(WorldRules):
         if message is None:
             return False
         self._to_follow = None
-        self._answer_due = True
+        self._due.append(self._link)
         if isinstance(message, Welcome):
             self._reset_all(first_seeds(message.first_seed, self.layout.drones))
             return False
@@ -249,23 +266,6 @@ class OneAgent(WorldRules):
         self.cause = message
         self.moved = True
         return False
-
-    def answer(self, now: float) -> None:
-        """Send the State after a step. Raises `InputError` if it is not finite."""
-        if not self._answer_due:
-            return
-        self._answer_due = False
-        world = self.world
-        client = self._client
-        client.send_state(
-            client.sequence * self.period,
-            tuple(world.observations.values()),
-            world.rewards,
-            world.terminated,
-            world.truncated,
-            tuple(world.telemetry.values()),
-            now,
-        )
 
     def _lose_silent(self, link: AgentLink, why: str) -> None:
         raise PeerSilent(why)
@@ -295,7 +295,6 @@ class SeveralAgents(WorldRules):
         self.absences: list[Absence] = []
         self.episodes = self.steps = 0
         self.seed: int | None = None
-        self._due: list[AgentLink] = []  # of States
 
     # ---- episodes and steps
 
@@ -379,7 +378,8 @@ class SeveralAgents(WorldRules):
     def _close_wrong(self, link: AgentLink, now: float) -> bool:
         """Close a link whose Command the world cannot follow; True if it did."""
         if link.order not in (FLY, RESET):
-            wrong = f"orders: expected to fly or to reset all {len(link.rows)} drones, got others"
+            drones = link.client.layout.drones
+            wrong = f"orders: expected to fly or to reset all {drones} drones, got others"
         elif link.order == FLY and self._is_out(link):
             wrong = NO_RESET
         else:
@@ -422,21 +422,9 @@ class SeveralAgents(WorldRules):
 
     def answer(self, now: float) -> None:
         """Send the States that are due."""
-        due = self._due
-        self._due = []
-        world = self.world
-        for link in due:
-            rows = link.rows
+        for link in self._due:
             link.patient_until = now + self.patience
-            link.client.send_state(
-                link.client.sequence * self.period,
-                tuple(array[rows] for array in world.observations.values()),
-                world.rewards[rows],
-                world.terminated[rows],
-                world.truncated[rows],
-                tuple(array[rows] for array in world.telemetry.values()),
-                now,
-            )
+        super().answer(now)
 
     # ---- timers and messages
 

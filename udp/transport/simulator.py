@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import gymnasium as gym
-import numpy as np
 
 from ...envs.config import DEFAULT_ENV, EnvConfig
 from ...envs.spec import EnvSpec
@@ -136,7 +135,6 @@ class Simulator(NotCopied):
             self.address: Address = port.address
             self.rules = rules
             self._port = port
-            self._receive = port.receiver()
             self._by_address = {link.address: link for link in links}
             if record:
                 self._record(record)
@@ -223,7 +221,7 @@ class Simulator(NotCopied):
                 rules.handle_timers(before)
                 continue
             try:
-                datagram, address = self._receive(left)
+                datagram, address = self._port.receive(left, strangers=False)
             except OSError as error:
                 self._note(error, time.monotonic() - before - left)
                 continue
@@ -243,7 +241,7 @@ class Simulator(NotCopied):
                 break
             left = timer - time.monotonic()
             with suppress(OSError):  # nothing came, or an earlier datagram found nobody
-                datagram, address = self._receive(max(left, 0.0))
+                datagram, address = self._port.receive(max(left, 0.0), strangers=False)
                 if link := self._by_address.get(address):
                     link.client.receive(datagram, time.monotonic())
             for each in rules.links:
@@ -297,14 +295,6 @@ class Simulator(NotCopied):
             link.tap(0, link.hello, binary.encode(link.hello))
 
 
-def _share(drones: int, number: int, agents: int) -> np.ndarray:
-    """The drones of one of several agents, which have the same number each."""
-    if drones % agents:
-        raise InputError(f"agents: expected a divisor of {drones} drones, got {agents} agents")
-    share = drones // agents
-    return number * share + np.arange(share)
-
-
 def _links(
     spec: EnvSpec,
     worlds: int,
@@ -315,15 +305,21 @@ def _links(
     by_text: bool,
     key: Key | None,
 ) -> list[AgentLink]:
-    """A client for each agent, with a session of its own."""
+    """A client for each agent, with a session of its own. They share the drones evenly."""
     way_out = TEXT_WAY_OUT if by_text else WAY_OUT
+    drones = worlds * len(spec.agents)
+    share, left = divmod(drones, len(servers))
+    if left:
+        raise InputError(
+            f"agents: expected a divisor of {drones} drones, got {len(servers)} agents"
+        )
     links = []
     for number, address in enumerate(servers):
         there = resolve(address, insecure=insecure, way_out=way_out)
         if not there[1]:
             raise InputError("server: expected the port of the agent, 1 to 65535, got 0")
-        rows = _share(len(spec.agents), number, len(servers))
-        own = replace(spec, agents=spec.agents[rows[0] : rows[-1] + 1])
+        rows = slice(number * share, (number + 1) * share)
+        own = replace(spec, agents=spec.agents[rows])
         client = Client(
             Hello(session=new_session(), spec=own.to_json(), worlds=worlds),
             layout_of(own, worlds),

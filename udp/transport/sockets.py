@@ -15,9 +15,8 @@ import selectors
 import socket
 import sys
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from contextlib import suppress
-from functools import partial
 from math import ceil
 
 from ...models.errors import InputError
@@ -204,6 +203,8 @@ class Port:
         Raises:
             TimeoutError, OSError: As `Socket.receive`; a wait may end early.
         """
+        if self._only:
+            return self._everybody.receive(timeout)
         if strangers or self._missing or not self._own:
             return _receive_any(self._all, timeout)
         now = time.monotonic()
@@ -217,12 +218,6 @@ class Port:
             return _receive_any(self._simulators, timeout)
         (only,) = self._own.values()
         return only.receive(timeout)
-
-    def receiver(self) -> Callable[[float], tuple[bytes, Address]]:
-        """A function that waits for the next datagram of the peers for so many seconds."""
-        if self._only:
-            return self._everybody.receive
-        return partial(self.receive, strangers=False)
 
     def send(self, datagram: bytes, address: Address) -> None:
         """Send a datagram. Raises `OSError`."""
