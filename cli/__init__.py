@@ -21,6 +21,8 @@ from pathlib import Path
 from shutil import get_terminal_size
 from typing import TYPE_CHECKING, TypeGuard
 
+from ..models.errors import printable
+
 if TYPE_CHECKING:
     from ._flags import Command
 
@@ -102,7 +104,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sentence = _sentence(error)
         if sentence is None or "ROTORGRAM_TRACEBACK" in os.environ:
             raise
-        print(f"rotorgram: {_printable(sentence)}", file=sys.stderr)
+        print(f"rotorgram: {printable(sentence)}", file=sys.stderr)
         return getattr(error, "exit_status", 1)
     return status
 
@@ -177,7 +179,7 @@ def _is_of_stdout(error: Exception) -> TypeGuard[OSError]:
 
 class _ToStandardError(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
-        print(f"rotorgram: {_printable(record.getMessage())}", file=sys.stderr, flush=True)
+        print(f"rotorgram: {printable(record.getMessage())}", file=sys.stderr, flush=True)
 
 
 def _show_log() -> None:
@@ -185,11 +187,6 @@ def _show_log() -> None:
     log = logging.getLogger("rotorgram")
     log.setLevel(logging.INFO)
     log.handlers = [_ToStandardError()]
-
-
-def _printable(text: str) -> str:
-    """Text without control characters: a peer or a file may have sent it to the terminal."""
-    return "".join(c if c.isprintable() or c == "\n" else "\N{REPLACEMENT CHARACTER}" for c in text)
 
 
 def _sentence(error: Exception) -> str | None:

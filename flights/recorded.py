@@ -9,7 +9,7 @@ import numpy as np
 
 from ..envs.spec import ArraySpec
 from ..models.errors import InputError
-from ..udp.journal.reader import Recording, Session, Walker
+from ..udp.journal.reader import Recording, Session, Transition
 from ..udp.protocol.messages import State
 from .trajectories import Ending, Trajectory
 
@@ -84,12 +84,13 @@ def read_episodes(
     flying: dict[int, _SessionReader] = {}  # the last session of each slot
     for item in Recording(path):
         slot = item.session.slot
-        if slot not in flying or flying[slot].session is not item.session:
+        if item.begins:
             if slot in flying:
                 yield from flying[slot].finish()
             yield item.session
             flying[slot] = _SessionReader(item.session, drone, observations)
-        yield from flying[slot].take(item.message)
+        if item.transition:
+            yield from flying[slot].take(item.transition)
     for reader in flying.values():
         yield from reader.finish()
 
@@ -112,16 +113,12 @@ class _SessionReader:
         self._drones = len(session.spec.agents)
         count = session.num_envs
         self._chosen = np.ones(count, bool) if drone is None else np.arange(count) == drone
-        self._walker = Walker(session)
         self._rows: list[list[_Row]] = [[] for _ in range(count)]
         self._seeds: list[int | None] = [None] * count
         self._episodes = [0] * count
 
-    def take(self, message: object) -> Iterator[Trajectory]:
-        """The next message of the session: the episodes that it ends, one after the other."""
-        transition = self._walker.take(message)
-        if transition is None:
-            return
+    def take(self, transition: Transition) -> Iterator[Trajectory]:
+        """The next transition of the session: the episodes that it ends, one after the other."""
         state = transition.state
         command = transition.command
         if transition.is_gap:

@@ -39,6 +39,11 @@ def one_line(text: object) -> str:
     return " ".join(str(text).split())
 
 
+def printable(text: str) -> str:
+    """Text without control characters: a peer or a file may have sent it to the terminal."""
+    return "".join(c if c.isprintable() or c == "\n" else "\N{REPLACEMENT CHARACTER}" for c in text)
+
+
 def shortened(value: object) -> str:
     """The value's `repr` for an error, of at most 80 characters."""
     text = repr(value)

@@ -17,7 +17,7 @@ from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
 from ...envs.spec import EnvSpec
-from ...models.errors import InputError, shortened
+from ...models.errors import InputError, printable, shortened
 from ..layouts import layout_of
 from ..protocol import binary
 from ..protocol.errors import DecodeError
@@ -42,6 +42,25 @@ message and 256 KiB where that is longer."""
 _TOPIC = re.compile(r"/slot([0-9]{1,9})/(state|command|events)")
 
 
+class Transition(NamedTuple):
+    """A State, and the Command or reset before it."""
+
+    state: State
+    command: Command | None
+    """None: the first State of its session, or one whose Command is missing in the journal."""
+    flown: Mask
+    """Drones that took a step, shape (N,)."""
+    resets: Mask
+    """Drones that were reset, shape (N,)."""
+    seeds: NDArray[np.uint64] | None
+    """Of the drones that were reset, shape (N,). None: their generators went on."""
+
+    @property
+    def is_gap(self) -> bool:
+        """Whether the Command before the State is missing."""
+        return self.command is None and not self.resets.any()
+
+
 @dataclass(eq=False)
 class Session:
     """One simulator at one slot of an agent, from its Hello on."""
@@ -54,6 +73,8 @@ class Session:
     codec: str
     """`binary` or `text`."""
     welcome: Welcome | None = None
+    _command: Command | None = None
+    _sequence: int | None = None  # of the last State
 
     @cached_property
     def spec(self) -> EnvSpec:
@@ -75,6 +96,26 @@ class Session:
         """Of the reset before the first State."""
         return self.welcome.first_seed if self.welcome else self.hello.session
 
+    def take(self, message: Message) -> Transition | None:
+        """Take the next message: the transition that a State completes; None for any other."""
+        if isinstance(message, Welcome):
+            self.welcome = message
+        elif isinstance(message, Command):
+            self._command = message
+        if not isinstance(message, State):
+            return None
+        before = self._sequence
+        self._sequence = message.sequence
+        nobody = np.zeros(self.num_envs, bool)
+        if before is None:
+            seeds = first_seeds(self.seed, self.num_envs)
+            return Transition(message, None, nobody, ~nobody, seeds)
+        command = self._command
+        if command is None or not before == command.sequence == message.sequence - 1:
+            return Transition(message, None, nobody, nobody, None)
+        flown = np.asarray(command.orders == FLY)
+        return Transition(message, command, flown, command.resets, command.seeds)
+
     def __str__(self) -> str:
         return f"session {self.index} (slot {self.slot}, {self.hello.session:016x})"
 
@@ -88,6 +129,13 @@ class Item(NamedTuple):
     message: Message
     datagram: bytes
     """Its binary datagram, not sealed and not cut into fragments."""
+    transition: Transition | None
+    """What a State completes; None of any other message."""
+
+    @property
+    def begins(self) -> bool:
+        """Whether it is the first message of its session."""
+        return isinstance(self.message, Hello)
 
 
 class Recording:
@@ -162,9 +210,8 @@ class Recording:
                         f"{self.path}: expected a message of the session of the last Hello, "
                         f"got a {type(message).__name__} of {message.session:016x}"
                     )
-                if isinstance(message, Welcome):
-                    session.welcome = message
-                yield Item(session, record.log_time, message, datagram)
+                transition = session.take(message)
+                yield Item(session, record.log_time, message, datagram, transition)
 
     def _records(self) -> Iterator[records.McapRecord]:
         with self.path.open("rb") as file:
@@ -200,53 +247,6 @@ def _read_records(file: BinaryIO) -> Iterator[records.McapRecord]:
 
 
 # ---- what is in it
-
-
-class Transition(NamedTuple):
-    """A State, and the Command or reset before it."""
-
-    state: State
-    command: Command | None
-    """None: the first State of its session, or one whose Command is missing in the journal."""
-    flown: Mask
-    """Drones that took a step, shape (N,)."""
-    resets: Mask
-    """Drones that were reset, shape (N,)."""
-    seeds: NDArray[np.uint64] | None
-    """Of the drones that were reset, shape (N,). None: their generators went on."""
-
-    @property
-    def is_gap(self) -> bool:
-        """Whether the Command before the State is missing."""
-        return self.command is None and not self.resets.any()
-
-
-class Walker:
-    """Takes the messages of one session, and gives its transitions."""
-
-    def __init__(self, session: Session) -> None:
-        self.session = session
-        self._command: Command | None = None
-        self._sequence: int | None = None
-
-    def take(self, message: object) -> Transition | None:
-        """The transition that a State completes; None for any other message."""
-        if isinstance(message, Command):
-            self._command = message
-        if not isinstance(message, State):
-            return None
-        before = self._sequence
-        self._sequence = message.sequence
-        drones = self.session.num_envs
-        nobody = np.zeros(drones, bool)
-        if before is None:
-            seeds = first_seeds(self.session.seed, drones)
-            return Transition(message, None, nobody, ~nobody, seeds)
-        command = self._command
-        if command is None or not before == command.sequence == message.sequence - 1:
-            return Transition(message, None, nobody, nobody, None)
-        flown = np.asarray(command.orders == FLY)
-        return Transition(message, command, flown, command.resets, command.seeds)
 
 
 @dataclass(kw_only=True)
@@ -299,7 +299,7 @@ class Summary(Recording):
         super().__init__(path)
         of: dict[int, SessionSummary] = {}
         for item in self:
-            if item.session.index not in of:
+            if item.begins:
                 of[item.session.index] = SessionSummary(session=item.session, first=item.time)
             of[item.session.index].take(item)
         self.sessions = list(of.values())
@@ -307,15 +307,9 @@ class Summary(Recording):
     def __str__(self) -> str:
         side = f"written by the {self.about['side']}, " if "side" in self.about else ""
         head = f"{self.path}: {side}{self.ending}, {count_of(len(self.sessions), 'session')}"
-        return printable([head, *map(str, self.sessions)])
+        return printable("\n".join([head, *map(str, self.sessions)]))
 
 
 def count_of(count: int, what: str) -> str:
     """A number and a noun: 1 session, 2 sessions."""
     return f"1 {what}" if count == 1 else f"{count} {what}s"
-
-
-def printable(lines: list[str]) -> str:
-    """Lines for a terminal. A journal can hold any text: no control character of it is shown."""
-    text = "\n".join(lines)
-    return "".join(c if c.isprintable() or c == "\n" else "\N{REPLACEMENT CHARACTER}" for c in text)

@@ -11,10 +11,10 @@ from ...envs.config import EnvConfig
 from ...envs.registry import is_known
 from ...envs.spec import component_names
 from ...models import Backend
-from ...models.errors import InputError
+from ...models.errors import InputError, printable
 from ..protocol.messages import State
 from ..transport.stepped import Steppable, make_stepped
-from .reader import Item, Recording, Session, Transition, Walker, count_of, printable
+from .reader import Item, Recording, Session, Transition, count_of
 
 _SAME = ("vehicle_hash", "agents", "observation", "action", "telemetry", "control_period")
 """Fields of the spec that have to be those of the recorded one."""
@@ -54,7 +54,6 @@ class SessionVerdict:
 
     def __post_init__(self) -> None:
         self._loop: Steppable | None = None
-        self._walker = Walker(self.session)
 
     @property
     def identical(self) -> bool:
@@ -73,7 +72,7 @@ class SessionVerdict:
 
     def take(self, item: Item) -> None:
         """Repeat a message."""
-        transition = self._walker.take(item.message)
+        transition = item.transition
         if self.problem or transition is None:
             return
         state = transition.state
@@ -169,14 +168,13 @@ class Verification(Recording):
         flying: dict[int, SessionVerdict] = {}  # the last of each slot
         try:
             for item in self:
-                verdict = flying.get(item.session.slot)
-                if verdict is None or verdict.session is not item.session:
-                    if verdict:
-                        verdict.close()
-                    verdict = SessionVerdict(session=item.session, flown=flown)
-                    flying[item.session.slot] = verdict
-                    self.sessions.append(verdict)
-                verdict.take(item)
+                slot = item.session.slot
+                if item.begins:
+                    if slot in flying:
+                        flying[slot].close()
+                    flying[slot] = SessionVerdict(session=item.session, flown=flown)
+                    self.sessions.append(flying[slot])
+                flying[slot].take(item)
         finally:
             for verdict in self.sessions:
                 verdict.close()
@@ -199,7 +197,7 @@ class Verification(Recording):
             lines.append("nothing to compare")
         else:
             lines.append("not identical")
-        return printable(lines)
+        return printable("\n".join(lines))
 
 
 def _difference(recorded: State, loop: Steppable) -> Difference | None:
