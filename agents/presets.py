@@ -37,6 +37,10 @@ class Preset:
     """Of all drones together."""
     backend: Backend = "mujoco"
 
+    def whole_worlds(self, drones: int) -> int:
+        """`num_envs` in whole worlds of so many drones, one at least."""
+        return max(self.num_envs // drones, 1) * drones
+
 
 @cache
 def _tables(algorithm: str) -> dict[str, dict[str, dict[str, Any]]]:

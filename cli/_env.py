@@ -110,14 +110,17 @@ def pilot_of(command: F, what: str) -> tuple[F, Policy | None]:
     return command, policy_for(command, checkpoint, env_spec(command.env_config()))
 
 
-def words_of(trajectory: Trajectory) -> str:
-    """Return of an episode, and the headline metric at its end."""
-    words = f"return {trajectory.rewards.sum():.1f}"
-    metric = trajectory.spec.headline
-    if metric is None:
-        return words
-    value = f"{trajectory.headline[-1]:.3f} {metric.unit}".rstrip()
-    return f"{words}, last {metric.symbol or metric.name} {value}"
+def print_episode(trajectory: Trajectory) -> None:
+    """Print the return of an episode, and the headline metric at its end."""
+    spec = trajectory.spec
+    words = f"episode {trajectory.episode}"
+    if len(spec.agents) > 1:
+        words += f" of {spec.agents[trajectory.drone]}"
+    words += f": return {trajectory.rewards.sum():.1f}"
+    if metric := spec.headline:
+        value = f"{trajectory.headline[-1]:.3f} {metric.unit}".rstrip()
+        words += f", last {metric.symbol or metric.name} {value}"
+    print(words, flush=True)
 
 
 @contextmanager

@@ -19,11 +19,11 @@ from ..envs.config import BackendConfig
 from ..flights.folders import locked
 from ..models import Backend
 from ..models.errors import InputError
-from ..models.files import software_versions, write_whole
+from ..models.files import software_versions, write_json, write_whole
 from ..training.settings import Run
 from ..training.training import Training, config_of, is_finished
 from ._env import CHECKPOINT, fitted, local_env, remote_env
-from ._flags import DEFAULT_ENV, Options
+from ._flags import DEFAULT_ENV
 from ._progress import bars
 from ._scalars import ScalarWriter
 from ._training import folder_to_write
@@ -60,14 +60,13 @@ def begin(command: "Train") -> int:
     config = preset(command.algorithm, command.preset, task, **command.changes())
     backend = command.backend if "backend" in command.given else base.backend
     env_config = command.env_config(backend=backend)  # it refuses wrong drones
-    whole_worlds = max(base.num_envs // command.drones, 1) * command.drones
     run = Run(
         env=env_config,
         algorithm=command.algorithm,
         config=config,
         seed=command.seed,
         env_steps=command.env_steps or base.env_steps,
-        num_envs=command.num_envs or whole_worlds,
+        num_envs=command.num_envs or base.whole_worlds(command.drones),
     )
     required = bool(command.options) or "env" in command.given
     opened = _opened(command, run.num_envs, backend, required=required)
@@ -78,7 +77,7 @@ def begin(command: "Train") -> int:
             run = replace(run, env=config_of(spec, backend, command.vehicle))
         training = Training(run, env)
         about = {"vehicle_hash": spec.vehicle_hash, "versions": software_versions()}
-        _write_json(folder / "config.json", run.to_dict() | about)
+        write_json(folder / "config.json", run.to_dict() | about)
         return _train(command, training, folder)
 
 
@@ -172,12 +171,8 @@ def _extended(kept: Checkpoint, folder: Path, env_steps: int) -> Checkpoint:
         )
     file = folder / "config.json"
     content = json.loads(file.read_text(encoding="utf-8"))
-    _write_json(file, {**content, "env_steps": env_steps})
+    write_json(file, {**content, "env_steps": env_steps})
     return replace(kept, env_steps=env_steps)
-
-
-def _write_json(file: Path, content: Options) -> None:
-    write_whole(file, (json.dumps(content, indent=2) + "\n").encode())
 
 
 class _Keeper:

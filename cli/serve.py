@@ -27,22 +27,19 @@ class Serve(AgentFlags):
         """Fly episode after episode."""
         from ..flights.trajectories import fly_episodes
         from ..udp import LinkError
-        from ._env import fitted, load_checkpoint, policy_for, remote_env, words_of
+        from ._env import fitted, load_checkpoint, policy_for, print_episode, remote_env
 
         check_count("episodes", self.episodes)
         checkpoint = load_checkpoint(self.policy)
         episode = 0
         with remote_env(fitted(self, checkpoint), num_envs=None) as env:
             policy = policy_for(self, checkpoint, env.env_spec)
-            names = env.env_spec.agents
-            worlds = env.num_envs // len(names)
+            worlds = env.num_envs // len(env.env_spec.agents)
             while self.episodes is None or episode < self.episodes:
                 count = int(min(worlds, (self.episodes or math.inf) - episode))
                 try:
-                    found = fly_episodes(env, policy, count, first=episode)
-                    for number, flown in enumerate(found):
-                        of = f" of {names[number % len(names)]}" if len(names) > 1 else ""
-                        print(f"episode {flown.episode}{of}: {words_of(flown)}", flush=True)
+                    for flown in fly_episodes(env, policy, count, first=episode):
+                        print_episode(flown)
                     episode += count
                 except LinkError as error:  # one that leaves is no error: another may come
                     print(error, flush=True)

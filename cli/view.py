@@ -32,7 +32,7 @@ class View(EnvFlags):
         """Fly and show, episode after episode."""
         from ..flights.filming import moments
         from ..rendering.live import Pace
-        from ._env import pilot_of, words_of
+        from ._env import pilot_of, print_episode
         from ._watch import open_view
 
         check_count("episodes", self.episodes)
@@ -48,10 +48,8 @@ class View(EnvFlags):
             config = shown.env_config()
             flights = (flown_trajectories(policy, config, [one], "final") for one in count())
         first = next(flights)
-        spec = first[0].spec
-        drones = len(first)
-        names = spec.agents if drones > 1 else ("",)
-        with open_view(shown, drones, Pace(spec.control_period, self.speed)) as live:
+        pace = Pace(first[0].spec.control_period, self.speed)
+        with open_view(shown, len(first), pace) as live:
             print(f"showing {self.what} in the window (Ctrl-C ends)", flush=True)
             for flight in islice(chain((first,), flights), self.episodes):
                 shown_moments = [moments(one) for one in flight]
@@ -61,9 +59,8 @@ class View(EnvFlags):
                 frames = zip(*padded, strict=True)
                 if not all(live.draw_in_time(*frame) for frame in frames):
                     break
-                for one, name in zip(flight, names, strict=True):
-                    of = f" of {name}" if name else ""
-                    print(f"episode {one.episode}{of}: {words_of(one)}", flush=True)
+                for one in flight:
+                    print_episode(one)
             while live.is_running and not live.wants:  # the last picture is still to come
                 time.sleep(0.02)
         return 0

@@ -3,6 +3,7 @@
 Imports the standard library alone.
 """
 
+import json
 import os
 import platform
 import secrets
@@ -78,6 +79,11 @@ def write_whole(path: Path, data: bytes) -> None:
         if isinstance(error, OSError):
             raise OSError(error.errno, error.strerror, str(path)) from None
         raise
+
+
+def write_json(path: Path, content: object) -> None:
+    """Write a value as JSON, as `write_whole`."""
+    write_whole(path, (json.dumps(content, indent=2) + "\n").encode())
 
 
 def check_new_file(out: Path, *endings: str) -> None:

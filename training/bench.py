@@ -4,7 +4,6 @@ All layers are open at the same time and take turns to run for a moment; the med
 counts, so that a machine that slows down for a while slows all alike.
 """
 
-import json
 import statistics
 import time
 from collections.abc import Callable, Iterator
@@ -24,7 +23,7 @@ from ..envs.autoreset import AdvancingVectorEnv
 from ..envs.config import EnvConfig
 from ..envs.vector import LocalVectorEnv
 from ..models.fields import Limits, check
-from ..models.files import software_versions, write_whole
+from ..models.files import software_versions, write_json
 from ..models.vehicle import Vehicle
 from ..udp.spawn import spawn_simulator
 from .results import machine
@@ -84,7 +83,7 @@ def bench(
         "machine": machine(),
         "versions": software_versions(),
     }
-    write_whole(folder / "bench.json", (json.dumps(content, indent=2) + "\n").encode())
+    write_json(folder / "bench.json", content)
     return medians
 
 

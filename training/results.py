@@ -33,7 +33,7 @@ import pyarrow.parquet as pq
 
 from ..envs.spec import EnvSpec, SpecError
 from ..models.errors import InputError
-from ..models.files import software_versions, write_whole
+from ..models.files import software_versions, write_json, write_whole
 from .metrics import Headline
 from .settings import Row, Study
 
@@ -98,7 +98,7 @@ def write_config(folder: Path, command: str, study: Study, specs: Mapping[str, E
         "versions": software_versions(),
         "machine": machine(),
     }
-    write_whole(folder / CONFIG_FILE, (json.dumps(content, indent=2) + "\n").encode())
+    write_json(folder / CONFIG_FILE, content)
 
 
 def machine() -> dict[str, object]:

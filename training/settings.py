@@ -5,7 +5,7 @@ Imports neither torch nor pandas.
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any, Literal
@@ -55,8 +55,7 @@ class Run:
 
     def to_dict(self) -> dict[str, Any]:
         """All settings as JSON values."""
-        content = {one.name: getattr(self, one.name) for one in fields(self)}
-        return {**content, "env": self.env.to_dict(), "config": asdict(self.config)}
+        return {**vars(self), "env": self.env.to_dict(), "config": asdict(self.config)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,11 +98,9 @@ class Row:
         if self.controller:
             return
         found = find_preset(self.agent, self.preset, self.env.env_id)
-        drones = self.env.drones
-        whole_worlds = max(found.num_envs // drones, 1) * drones
         self._set(
             env_steps=self.env_steps or found.env_steps,
-            num_envs=self.num_envs or whole_worlds,
+            num_envs=self.num_envs or found.whole_worlds(self.env.drones),
             backend=self.backend or found.backend,
             set=json.loads(json.dumps(dict(self.set))),
         )
@@ -171,8 +168,7 @@ class Row:
 
     def to_dict(self) -> dict[str, object]:
         """JSON values that `from_dict` reads."""
-        content = {one.name: getattr(self, one.name) for one in fields(self)}
-        return {**content, "set": dict(self.set), "env": self.env.keywords()}
+        return {**vars(self), "set": dict(self.set), "env": self.env.keywords()}
 
     @classmethod
     def from_dict(cls, where: str, table: object, env: Mapping[str, object] | None = None) -> "Row":
@@ -250,8 +246,9 @@ class Study:
 
     def to_dict(self) -> dict[str, object]:
         """JSON values that `from_dict` reads."""
-        content = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "rows"}
-        return {**content, "row": [row.to_dict() for row in self.rows]}
+        settings = dict(vars(self))
+        del settings["rows"]
+        return {**settings, "row": [row.to_dict() for row in self.rows]}
 
     @classmethod
     def from_dict(cls, where: str, content: object) -> "Study":

@@ -1,7 +1,7 @@
 """A study: every row with every seed is trained and evaluated; what is done is kept."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, closing
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -124,19 +124,17 @@ def _fly(study: Study, own_tasks: set[str], job: Job, tell: Tell) -> Done:
     return Done(tables, training.checkpoint())
 
 
-@contextmanager
-def open_env(wire: bool, config: EnvConfig, num_envs: int) -> Iterator[AdvancingVectorEnv]:
+def open_env(
+    wire: bool, config: EnvConfig, num_envs: int
+) -> AbstractContextManager[AdvancingVectorEnv]:
     """An env of `num_envs` drones without autoreset: over UDP with a simulator process, which the
     next run of this process uses again, or in process.
     """
     if wire:
-        with cached_simulator(config, num_envs=num_envs) as env:
-            yield env
-        return
+        return cached_simulator(config, num_envs=num_envs)
     from ..envs.vector import LocalVectorEnv
 
-    with closing(LocalVectorEnv(config, num_envs, autoreset_mode="Disabled")) as local:
-        yield local
+    return closing(LocalVectorEnv(config, num_envs, autoreset_mode="Disabled"))
 
 
 def _evaluate(
