@@ -26,13 +26,13 @@ from ..models.errors import InputError, NotCopied
 from ..models.fields import Limits, OrNone, check
 from .layouts import layout_of
 from .protocol.client import Address
-from .protocol.layout import MAX_DRONES
+from .protocol.layout import MAX_DRONES, Array
 from .protocol.messages import FLY, FREEZE, MAX_UINT64, RESET, State
 from .protocol.statistics import Statistics
 from .transport.agent import Agent, AgentConfig, AgentSettings
 from .transport.simulator import DEFAULT_AGENT
 
-Arrays = dict[str, np.ndarray]
+Arrays = dict[str, Array]
 Info = dict[str, Any]
 _FLY = np.array([FLY], np.uint8)
 _RESET = np.array([RESET], np.uint8)
@@ -73,7 +73,7 @@ class _Remote(NotCopied):
         slot = layout_of(spec).actions
         self._row = slot.shape[1:]
         self._dtype = slot.dtype
-        self._nothing: np.ndarray = np.zeros((count, *self._row), self._dtype)
+        self._nothing: Array = np.zeros((count, *self._row), self._dtype)
 
 
 class RemoteEnv(_Remote, gym.Env[Observation, ArrayLike]):
@@ -209,7 +209,7 @@ class RemoteEnv(_Remote, gym.Env[Observation, ArrayLike]):
         return dict(zip(self._names, numbers, strict=True))
 
 
-class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Observation, ArrayLike, np.ndarray]):
+class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Observation, ArrayLike, Array]):
     """The M · N drones of M simulators with N drones each, in lock-step over one socket.
 
     The simulators may be on any machines, and come in any order: each takes the first slot that is
@@ -254,7 +254,7 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Observation, ArrayL
         self.num_envs = 0
         self._arrays: Arrays = {}
         self.telemetry: Arrays = {}
-        self._reasons: np.ndarray | None = None  # of simulators that were lost in this step
+        self._reasons: Array | None = None  # of simulators that were lost in this step
         self.metadata = {"render_modes": [], "autoreset_mode": checked_mode(autoreset_mode)}
         num_simulators = check("num_simulators", Limits(1, MAX_DRONES, whole=True), num_simulators)
         self.num_simulators: int = num_simulators
@@ -316,10 +316,10 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Observation, ArrayL
 
     def advance(
         self,
-        actions: np.ndarray,
-        resets: np.ndarray | None = None,
+        actions: Array,
+        resets: Array | None = None,
         seeds: Seeds | None = None,
-        frozen: np.ndarray | None = None,
+        frozen: Array | None = None,
     ) -> None:
         """Reset some drones, freeze some, and fly the others: see `AdvancingVectorEnv`.
 
@@ -349,13 +349,13 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Observation, ArrayL
 
     def _exchange(
         self,
-        actions: np.ndarray,
-        resets: np.ndarray,
-        seeds: np.ndarray | None,
-        frozen: np.ndarray,
-    ) -> np.ndarray:
+        actions: Array,
+        resets: Array,
+        seeds: Array | None,
+        frozen: Array,
+    ) -> Array:
         """One exchange with each simulator; why that of each drone was lost, or "", shape (N,)."""
-        asleep: np.ndarray = np.all(self._by_slot(frozen), axis=1)
+        asleep: Array = np.all(self._by_slot(frozen), axis=1)
         pending = np.flatnonzero(~asleep).tolist()
         reasons = [""] * self.num_simulators
         self._flying = False  # until the answers are there
@@ -369,17 +369,17 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Observation, ArrayL
             if seeds is None:
                 break
             # A simulator in place of a lost one knows no seeds.
-            starting: np.ndarray = np.any(self._by_slot(resets), axis=1)
+            starting: Array = np.any(self._by_slot(resets), axis=1)
             pending = [slot for slot, reason in enumerate(lost) if reason and starting[slot]]
             actions = self._nothing
             frozen = ~resets
         return np.repeat(np.array(reasons, object), self._shape[1])
 
-    def _by_slot(self, array: np.ndarray) -> np.ndarray:
+    def _by_slot(self, array: Array) -> Array:
         """An array of all drones as rows of each simulator, shape (M, N / M, ...)."""
         return array.reshape(*self._shape, *array.shape[1:])
 
-    def _break_off(self, before: tuple[Arrays, Arrays], reasons: np.ndarray) -> None:
+    def _break_off(self, before: tuple[Arrays, Arrays], reasons: Array) -> None:
         """Truncate the episodes of lost drones: these States are the start of the next ones."""
         for now, then in zip((self._arrays, self.telemetry), before, strict=True):
             for name, array in now.items():
@@ -395,12 +395,12 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Observation, ArrayL
         self._agent.close()
         self._flying = False
 
-    def _seeds(self, seed: int | Seeds | None) -> np.ndarray | None:
+    def _seeds(self, seed: int | Seeds | None) -> Array | None:
         """Seeds as they cross the wire. Raises `InputError`."""
         seeds = checked_seeds(seed, self.num_envs, MAX_UINT64)
         return None if seeds is None else np.array(seeds, np.uint64)
 
-    def _take_states(self, still: np.ndarray) -> None:
+    def _take_states(self, still: Array) -> None:
         """Take over the States; rewards and flags are 0 for the drones that did not fly."""
         states = [self._agent.states[slot] for slot in range(self.num_simulators)]
         spec = self.env_spec
@@ -412,7 +412,7 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Observation, ArrayL
         self.truncated = np.concatenate([s.truncated for s in states]) & ~still
         self.lost = np.zeros(self.num_envs, bool)
 
-    def _sent(self, actions: np.ndarray, idle: np.ndarray) -> np.ndarray:
+    def _sent(self, actions: Array, idle: Array) -> Array:
         """Actions as they cross the wire; those of drones that do not fly are 0."""
         shape = (self.num_envs, *self._row)
         action = self.env_spec.action
@@ -431,7 +431,7 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Observation, ArrayL
             raise InputError(f"action: expected {expected}, got {sent[~right][0]}")
         return sent
 
-    def _no_actions(self) -> np.ndarray:
+    def _no_actions(self) -> Array:
         return self._nothing
 
     def _losses(self) -> Info:
@@ -439,13 +439,13 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Observation, ArrayL
         return {} if reasons is None else {LOST: reasons, f"_{LOST}": reasons != None}  # noqa: E711
 
 
-def _by_name(specs: Sequence[ArraySpec], states: Sequence[Sequence[np.ndarray]]) -> Arrays:
+def _by_name(specs: Sequence[ArraySpec], states: Sequence[Sequence[Array]]) -> Arrays:
     """The arrays of several simulators, one after the other."""
     parts = zip(*states, strict=True)
     return {spec.name: np.concatenate(part) for spec, part in zip(specs, parts, strict=True)}
 
 
-def _checked_actions(action: ArrayLike, dtype: np.dtype, shape: tuple[int, ...]) -> np.ndarray:
+def _checked_actions(action: ArrayLike, dtype: np.dtype, shape: tuple[int, ...]) -> Array:
     """Actions as they cross the wire; the env checks bounds.
 
     Raises `InputError` for another shape, and what is not real or cannot be of that dtype.

@@ -14,7 +14,6 @@ import zstandard
 from mcap import records
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
-from numpy.typing import NDArray
 
 from ...envs.spec import EnvSpec
 from ...models.errors import InputError, printable, shortened
@@ -33,7 +32,7 @@ from ..protocol.messages import (
     Unknown,
     Welcome,
 )
-from ..protocol.party import Mask, first_seeds
+from ..protocol.party import Mask, Seeds, first_seeds
 from .writer import ABOUT, FORMAT
 
 MAX_CHUNK = 2 * MAX_MESSAGE
@@ -52,7 +51,7 @@ class Transition(NamedTuple):
     """Drones that took a step, shape (N,)."""
     resets: Mask
     """Drones that were reset, shape (N,)."""
-    seeds: NDArray[np.uint64] | None
+    seeds: Seeds | None
     """Of the drones that were reset, shape (N,). None: their generators went on."""
 
     @property

@@ -12,6 +12,7 @@ from ...envs.registry import is_known
 from ...envs.spec import component_names
 from ...models import Backend
 from ...models.errors import InputError, printable
+from ..protocol.layout import Array
 from ..protocol.messages import State
 from ..transport.stepped import Steppable, make_stepped
 from .reader import Item, Recording, Session, Transition, count_of
@@ -214,7 +215,7 @@ def _difference(recorded: State, loop: Steppable) -> Difference | None:
     return None
 
 
-def _arrays(recorded: State, loop: Steppable) -> Iterator[tuple[list[str], np.ndarray, np.ndarray]]:
+def _arrays(recorded: State, loop: Steppable) -> Iterator[tuple[list[str], Array, Array]]:
     """Names of the numbers of one drone, the recorded array and the replayed one."""
     yield ["reward"], recorded.rewards, loop.rewards
     yield ["terminated"], recorded.terminated, loop.terminated

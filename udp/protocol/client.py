@@ -13,8 +13,6 @@ from math import inf
 from random import Random
 from typing import Annotated
 
-import numpy as np
-
 from ...models.errors import InputError
 from ...models.fields import Limits, check_fields
 from . import binary, text
@@ -22,7 +20,7 @@ from . import messages as m
 from .auth import Key, is_sealed, message_of, sealed
 from .errors import DecodeError, Forged
 from .fragments import FAR, NEAR, Assembler, Transfer, is_fragment
-from .layout import Layout
+from .layout import Array, Layout
 from .messages import Command, Message, State, one_line
 from .statistics import Statistics
 from .transitions import SIMULATOR, SimulatorState
@@ -223,11 +221,11 @@ class Client:
     def send_state(
         self,
         time: float,
-        observations: tuple[np.ndarray, ...],
-        rewards: np.ndarray,
-        terminated: np.ndarray,
-        truncated: np.ndarray,
-        telemetry: tuple[np.ndarray, ...],
+        observations: tuple[Array, ...],
+        rewards: Array,
+        terminated: Array,
+        truncated: Array,
+        telemetry: tuple[Array, ...],
         now: float,
     ) -> State:
         """Send the next State, and return it: see `messages.State`.

@@ -15,6 +15,8 @@ import numpy as np
 from ...models.errors import InputError
 from ...models.fields import Limits, check
 
+Array = np.ndarray
+
 MAX_DRONES = 1 << 16  # most drones of one simulator
 MAX_MESSAGE = 1 << 24  # largest message in all its fragments, bytes
 STATE_ARRAYS_AT = 40
@@ -41,7 +43,7 @@ class Slot(NamedTuple):
     dtype: np.dtype  # little-endian
     pad: bytes  # the zeros before it
 
-    def view(self, data: bytes) -> np.ndarray:
+    def view(self, data: bytes) -> Array:
         """The array in a message, not copied, read-only."""
         return np.ndarray(self.shape, self.dtype, data, self.at)
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...models.errors import InputError, shortened
-from .layout import MAX_DRONES
+from .layout import MAX_DRONES, Array
 
 MAX_UINT64 = (1 << 64) - 1  # largest session, sequence number, nonce and seed
 MAX_TEXT = 512  # longest reason, bytes of UTF-8
@@ -177,15 +177,15 @@ class State:
     """Simulated since the session began, s."""
     nonce: int = 0
     """That of the Welcome in State 1, 0 in all others."""
-    observations: tuple[np.ndarray, ...]
+    observations: tuple[Array, ...]
     """Each array of the layout, shape (N, *shape)."""
-    rewards: np.ndarray
+    rewards: Array
     """float64, shape (N,)."""
-    terminated: np.ndarray
+    terminated: Array
     """bool, shape (N,)."""
-    truncated: np.ndarray
+    truncated: Array
     """bool, shape (N,)."""
-    telemetry: tuple[np.ndarray, ...] = ()
+    telemetry: tuple[Array, ...] = ()
     """Each array of the layout, float64, shape (N, *shape)."""
 
 
@@ -198,22 +198,22 @@ class Command:
 
     session: int
     sequence: int
-    actions: np.ndarray
+    actions: Array
     """Dtype of the layout, shape (N, *shape); int64, shape (N,), if discrete. Checked for every
     drone, and then ignored for those that do not fly."""
-    orders: np.ndarray
+    orders: Array
     """uint8, shape (N,): `FLY`, `RESET` or `FREEZE`."""
-    seeds: np.ndarray | None = None
+    seeds: Array | None = None
     """uint64, shape (N,): seeds of the resets in this command; a drone that is not reset ignores
     its own. None leaves the generators as they are."""
 
     @property
-    def resets(self) -> np.ndarray:
+    def resets(self) -> Array:
         """bool, shape (N,): reset instead of flown."""
         return np.asarray(self.orders == RESET)
 
     @property
-    def frozen(self) -> np.ndarray:
+    def frozen(self) -> Array:
         """bool, shape (N,): neither reset nor flown."""
         return np.asarray(self.orders == FREEZE)
 

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from .client import Address, Client, address_text
 from .errors import LinkError, PeerSilent, Refused
-from .layout import Layout
+from .layout import Array, Layout
 from .messages import FLY, RESET, Close, Command, Refuse, Welcome
 
-Array = np.ndarray
 Mask = NDArray[np.bool_]
+Seeds = NDArray[np.uint64]
 
 _COMPLAIN_AFTER = 1.0  # silence of an agent before it is logged, once for each message, s
 NO_RESET = "an action came after the end of an episode: expected a reset"
@@ -40,7 +40,7 @@ class World(Protocol):
         self,
         actions: Array,
         resets: Mask | None,
-        seeds: NDArray[np.uint64] | None,
+        seeds: Seeds | None,
         frozen: Mask | None,
     ) -> None: ...
 
@@ -198,7 +198,7 @@ class WorldRules:
                 now,
             )
 
-    def _reset_all(self, seeds: NDArray[np.uint64] | None) -> None:
+    def _reset_all(self, seeds: Seeds | None) -> None:
         actions = self.layout.actions
         nothing = np.zeros(actions.shape, actions.dtype)
         self.world.advance(nothing, np.ones(self.layout.drones, bool), seeds, None)
@@ -209,7 +209,7 @@ class WorldRules:
         raise NotImplementedError
 
 
-def first_seeds(seed: int, drones: int) -> NDArray[np.uint64]:
+def first_seeds(seed: int, drones: int) -> Seeds:
     """Seeds of a simulator's own first reset: drone i takes seed + i, modulo 2^64."""
     return np.uint64(seed) + np.arange(drones, dtype=np.uint64)
 
@@ -344,7 +344,7 @@ class SeveralAgents(WorldRules):
             else:
                 self._let_go(link)
 
-    def _seeds(self, joining: list[AgentLink]) -> NDArray[np.uint64] | None:
+    def _seeds(self, joining: list[AgentLink]) -> Seeds | None:
         """Seeds of the next episode, from the first Command of those that join; None: none came."""
         drones = self.layout.drones
         if not self.episodes:  # from the Welcome, as `OneAgent` takes it

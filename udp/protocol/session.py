@@ -7,15 +7,13 @@ of a datagram; `Outbox` takes what they send.
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numpy as np
-
 from . import binary, text
 from . import messages as m
 from .auth import Key, sealed
 from .client import Address, Tap, largest_datagram
 from .errors import DecodeError
 from .fragments import Assembler, Transfer, asks
-from .layout import Layout
+from .layout import Array, Layout
 from .messages import Command, Message, State, one_line
 from .statistics import Statistics
 from .transitions import AGENT, AgentState, Way
@@ -103,9 +101,9 @@ class Session:
 
     def send_command(
         self,
-        actions: np.ndarray,
-        orders: np.ndarray,
-        seeds: np.ndarray | None,
+        actions: Array,
+        orders: Array,
+        seeds: Array | None,
         now: float,
     ) -> None:
         """Answer the last State.

@@ -22,7 +22,7 @@ from ...models.frames import (
     quaternions_in_world_frame,
 )
 from .errors import DecodeError
-from .layout import ArrayLayout, Layout
+from .layout import Array, ArrayLayout, Layout
 from .messages import FLY, MAX_UINT64, RESET, Close, Command, State
 
 MAX_LINE = 1200
@@ -71,8 +71,8 @@ def telemetry_sizes(layout: Layout) -> list[int]:
 
 
 def _converted(
-    telemetry: Iterable[np.ndarray], layout: Layout, conversions: "_Conversions"
-) -> list[np.ndarray]:
+    telemetry: Iterable[Array], layout: Layout, conversions: "_Conversions"
+) -> list[Array]:
     """The telemetry of one drone in the other frames."""
     converted = []
     for array, shape, frame in zip(telemetry, layout.telemetry, layout.frames, strict=True):
@@ -81,16 +81,16 @@ def _converted(
     return converted
 
 
-def _rates_in_paper_frame(rates: np.ndarray) -> np.ndarray:
+def _rates_in_paper_frame(rates: Array) -> Array:
     """The paper's axes are left-handed: rotations about them have the other sign."""
     return 0.0 - positions_in_paper_frame(rates)
 
 
-def _rates_in_body_frame(rates: np.ndarray) -> np.ndarray:
+def _rates_in_body_frame(rates: Array) -> Array:
     return 0.0 - positions_in_world_frame(rates)
 
 
-_Conversions = dict[tuple[tuple[int, ...], str], Callable[[np.ndarray], np.ndarray]]
+_Conversions = dict[tuple[tuple[int, ...], str], Callable[[Array], Array]]
 
 _TO_PAPER: Final[_Conversions] = {
     ((3,), "world"): positions_in_paper_frame,
@@ -129,7 +129,7 @@ def encode(message: State | Command | Close, layout: Layout | None = None) -> by
     return ",".join([str(message.sequence), *fields]).encode()
 
 
-def _numbers(arrays: Iterable[np.ndarray]) -> list[str]:
+def _numbers(arrays: Iterable[Array]) -> list[str]:
     numbers = [number for array in arrays for number in array.ravel().tolist()]
     if not all(map(isfinite, numbers)):
         raise InputError(f"expected finite numbers, got {numbers}")
@@ -193,7 +193,7 @@ def decode_command(datagram: bytes, layout: Layout, session: int) -> Command | C
     return command
 
 
-def _action(fields: list[str], layout: Layout) -> np.ndarray:
+def _action(fields: list[str], layout: Layout) -> Array:
     if not layout.choices:
         return _float32("command: action", fields)
     choice = _whole("command: action", fields[0])
@@ -236,10 +236,10 @@ def _floats(name: str, fields: list[str]) -> list[float]:
     return _finite(name, [float(field) for field in fields])
 
 
-def _float32(name: str, fields: list[str]) -> np.ndarray:
+def _float32(name: str, fields: list[str]) -> Array:
     """Numbers of one drone, float32, shape (1, len(fields))."""
     with np.errstate(over="ignore", under="ignore"):  # independent of the program's settings
-        array: np.ndarray = np.array([_floats(name, fields)]).astype(np.float32)
+        array: Array = np.array([_floats(name, fields)]).astype(np.float32)
     _finite(name, array[0].tolist())
     return array
 

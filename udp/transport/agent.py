@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypedDict
 
 import gymnasium as gym
-import numpy as np
 
 from ...envs import registry
 from ...envs.config import EnvConfig
@@ -24,7 +23,7 @@ from ..protocol import text
 from ..protocol.auth import Key, read_key
 from ..protocol.client import Address, address_text
 from ..protocol.errors import PeerClosed, PeerSilent
-from ..protocol.layout import Layout
+from ..protocol.layout import Array, Layout
 from ..protocol.messages import Close, Hello, State
 from ..protocol.server import Server
 from ..protocol.session import Event
@@ -35,7 +34,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger("rotorgram.udp")
 
-Order = tuple[np.ndarray, np.ndarray, np.ndarray | None]
+Order = tuple[Array, Array, Array | None]
 """Actions, orders and seeds of the drones of one simulator: see `messages.Command`."""
 
 

@@ -6,7 +6,6 @@ from typing import Any, Protocol, SupportsFloat
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
 
 from ...envs import registry
 from ...envs.config import EnvConfig
@@ -14,8 +13,8 @@ from ...envs.spaces import action_space, observation_space
 from ...envs.spec import ArraySpec, Discrete, EnvSpec, canonical_id, component_names
 from ...models.errors import InputError
 from ...models.fields import Limits, check
-from ..protocol.layout import MAX_DRONES
-from ..protocol.party import Mask, World
+from ..protocol.layout import MAX_DRONES, Array
+from ..protocol.party import Mask, Seeds, World
 
 GymEnv = gym.Env[Any, Any]
 
@@ -90,9 +89,9 @@ class GymnasiumWorld:
 
     def advance(
         self,
-        actions: np.ndarray,
+        actions: Array,
         resets: Mask | None,
-        seeds: NDArray[np.uint64] | None,
+        seeds: Seeds | None,
         frozen: Mask | None,
     ) -> None:
         is_reset = resets is not None and resets.all()
