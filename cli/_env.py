@@ -14,7 +14,7 @@ from ..envs.spec import EnvSpec
 from ..flights.trajectories import Trajectory
 from ..models import Backend
 from ..models.errors import InputError
-from ._flags import AgentFlags, EnvFlags, check_count, parse_address
+from ._flags import AgentFlags, EnvFlags, parse_address
 
 if TYPE_CHECKING:
     from ..envs.vector import LocalVectorEnv
@@ -195,10 +195,7 @@ def remote_env(
 @contextmanager
 def _waiting(
     command: AgentFlags, listen: str, num_envs: int | None, num_simulators: int, **settings: Any
-) -> Iterator["RemoteVectorEnv"]:
-    from ..udp import RemoteVectorEnv
-
-    check_count("drones", command.drones)
+from ._flags import AgentFlags, EnvFlags, parse_address
     if command.vehicle is not None:
         from ..models.fleet import load_vehicles  # an agent needs no MuJoCo otherwise
 

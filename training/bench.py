@@ -8,10 +8,9 @@ import statistics
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
 from itertools import cycle
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import mujoco
@@ -37,8 +36,7 @@ Step = Callable[[], int]
 """Flies a step of all drones; the number of env steps that it made."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Layer:
+class Layer(NamedTuple):
     """What is measured."""
 
     name: str
@@ -183,15 +181,10 @@ def _remote_vector(stack: ExitStack) -> Step:
 
 
 LAYERS = (
-    Layer(name="mj_step", about="substeps of one control step", drones=1, start=_mj_step),
-    Layer(name="env", about="the single env's step", drones=1, start=local_env),
-    Layer(name="UDP, 1", about="RemoteEnv and a simulator", drones=1, start=_remote),
-    Layer(
-        name="Batch.step, 1024",
-        about="mujoco.batch, the same substeps",
-        drones=_DRONES,
-        start=_batch_step,
-    ),
-    Layer(name="vector env, 1024", about="the vector env", drones=_DRONES, start=_vector),
-    Layer(name="UDP, 1024", about="RemoteVectorEnv", drones=_DRONES, start=_remote_vector),
+    Layer("mj_step", "substeps of one control step", 1, _mj_step),
+    Layer("env", "the single env's step", 1, local_env),
+    Layer("UDP, 1", "RemoteEnv and a simulator", 1, _remote),
+    Layer("Batch.step, 1024", "mujoco.batch, the same substeps", _DRONES, _batch_step),
+    Layer("vector env, 1024", "the vector env", _DRONES, _vector),
+    Layer("UDP, 1024", "RemoteVectorEnv", _DRONES, _remote_vector),
 )

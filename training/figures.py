@@ -93,20 +93,19 @@ def draw_comparison(results: Results, table: pd.DataFrame, rows: Sequence[Row]) 
     curves = learning_curves(results.evaluations, [row.name for row in rows])
     figure = Figure(figsize=(10.5, max(3.4, 1.4 + 0.35 * len(rows))), dpi=110)
     left, right = figure.subplots(1, 2, width_ratios=[1.5, 1])
-    for place, row in enumerate(reversed(rows)):
+    for place, row in enumerate(rows):
         color = row_color(row)
         line = table.loc[row.name]
         ends = [line["steady_low"], line["steady_high"]]
         right.plot(line["steady"], place, "o", color=color)
         right.plot(ends, [place, place], color=color, lw=2.5, alpha=0.6)
-    for row in rows:
         if row.name in curves:
-            _plot(left, curves[row.name], row_color(row), row_label(row), marker="o")
+            _plot(left, curves[row.name], color, row_label(row), marker="o")
     _env_steps_axis(left)
     steady = f"steady {headline.size_symbol}"
     left.set_ylabel(headline.labelled(f"{steady} in evaluation"))
-    right.set_yticks(range(len(rows)), [row_label(row) for row in reversed(rows)])
-    right.set_ylim(-0.7, len(rows) - 0.3)
+    right.set_yticks(range(len(rows)), [row_label(row) for row in rows])
+    right.set_ylim(len(rows) - 0.3, -0.7)
     right.set_xlabel(headline.labelled(f"{steady}, 95 % interval"))
     if headline.held is not None:
         left.axhline(headline.held, color=_GREY, lw=0.9, ls=":")

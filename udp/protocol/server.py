@@ -152,12 +152,12 @@ class Server:
 
     def _receive_binary(self, session: Session | None, arrival: _Arrival) -> Event | None:
         plain = self._open(arrival, session)
-        kind, number, _ = binary.peek(plain)
+        kind, number, _ = binary.check(plain)
+        kind &= ~binary.FRAGMENT
         seated = session if session and session.number == number and not session.is_text else None
         opening = None if seated else self.openings.get((arrival.address, number))
         holder = seated or opening
         if is_fragment(plain):
-            kind = binary.check(plain)[0] & ~binary.FRAGMENT
             if kind == binary.HELLO and not seated:
                 whole = self._assemble(plain, opening, arrival)
             elif kind == binary.STATE and holder:
@@ -171,7 +171,6 @@ class Server:
                 return None
             plain = whole
         if holder is None and kind != binary.HELLO:
-            binary.check(plain)
             raise NoSuchSession
         message = binary.decode(plain, holder.layout if holder else None)
         if isinstance(message, m.Hello):

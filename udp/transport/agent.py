@@ -253,11 +253,8 @@ class Agent:
 
     def _pending(self) -> list[int]:
         """Slots at which it is not the agent's turn."""
-        pending = []
-        for slot, session in enumerate(self.server.slots):
-            if session is None or session.state != "deciding":
-                pending.append(slot)  # a comprehension is one more call
-        return pending
+        sessions = enumerate(self.server.slots)
+        return [slot for slot, one in sessions if one is None or one.state != "deciding"]
 
     def _handle(self, event: Event, address: Address) -> None:
         slot = event.slot

@@ -110,9 +110,9 @@ class Simulator(NotCopied):
         key = Key(read_key(key_file), "simulator") if key_file else None
         insecure = insecure or key is not None
         with ExitStack() as failing:  # closes what is open if a later step fails
-            stepped = make_stepped(env, num_envs, keywords)
+            self.stepped = stepped = make_stepped(env, num_envs, keywords)
             failing.callback(stepped.close)
-            spec = stepped.spec
+            self.spec = spec = stepped.spec
             worlds = stepped.num_envs // len(spec.agents)
             layout = layout_of(spec, worlds)
             servers = [server] if agents is None else list(agents)
@@ -120,21 +120,17 @@ class Simulator(NotCopied):
             links = _links(
                 spec, worlds, servers, times, insecure=insecure, by_text=by_text, key=key
             )
-            port = _open_port(bind, [link.address for link in links], insecure=insecure)
-            failing.callback(port.close)
-            rules: Rules
+            self._port = _open_port(bind, [link.address for link in links], insecure=insecure)
+            failing.callback(self._port.close)
+            self.address: Address = self._port.address
+            self.rules: Rules
             period = spec.control_period
             if agents is None:
-                rules = OneAgent(stepped, layout, period, links)
+                self.rules = OneAgent(stepped, layout, period, links)
             elif isinstance(stepped, GymnasiumWorld):
                 raise InputError(f"env: expected a registered task for several drones, got {env!r}")
             else:
-                rules = SeveralAgents(stepped, layout, period, links, patience)
-            self.stepped = stepped
-            self.spec = spec
-            self.address: Address = port.address
-            self.rules = rules
-            self._port = port
+                self.rules = SeveralAgents(stepped, layout, period, links, patience)
             self._by_address = {link.address: link for link in links}
             if record:
                 self._record(record)
