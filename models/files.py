@@ -6,12 +6,10 @@ Imports the standard library alone.
 import json
 import os
 import platform
-import secrets
 import shutil
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -65,7 +63,7 @@ def write_whole(path: Path, data: bytes) -> None:
 
     Two processes may write it at the same time. `OSError` names the file.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.tmp")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.{os.urandom(4).hex()}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with open(temporary, "xb") as file:
@@ -106,6 +104,8 @@ def find_in_package(name: str, folder: Path) -> Path | None:
 
 def software_versions() -> dict[str, str]:
     """Versions of the installed packages that the numbers depend on."""
+    from importlib.metadata import PackageNotFoundError, version  # slow to import
+
     versions = {"python": platform.python_version()}
     for name in ("rotorgram", "mujoco", "gymnasium", "numpy", "torch", "stable-baselines3"):
         with suppress(PackageNotFoundError):
