@@ -195,7 +195,9 @@ def remote_env(
 @contextmanager
 def _waiting(
     command: AgentFlags, listen: str, num_envs: int | None, num_simulators: int, **settings: Any
-from ._flags import AgentFlags, EnvFlags, parse_address
+) -> Iterator["RemoteVectorEnv"]:
+    from ..udp import RemoteVectorEnv
+
     if command.vehicle is not None:
         from ..models.fleet import load_vehicles  # an agent needs no MuJoCo otherwise
 
