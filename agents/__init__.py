@@ -1,22 +1,27 @@
 """Learning algorithms, their policies and files, and controllers: PID, geometric and ORCA.
 
-Only SB3's algorithms need torch, and import it when they are used.
+Only SB3's algorithms need torch. Each name is imported when it is first used.
 """
 
-from .a2c import A2CConfig
-from .checkpoints import Checkpoint, CheckpointError, load, store
-from .config import Config, SACConfig
-from .controllers import CONTROLLERS
-from .episodes import Episode, EpisodeRecorder, ResumeError, episode_seed
-from .geometric import Geometric
-from .making import make_agent, resume_agent
-from .orca import Orca
-from .pid import PID
-from .policies import NetworkPolicy, Policy
-from .ppo import PPOConfig
-from .presets import find_preset, preset
-from .registry import ALGORITHMS, Agent, AlgorithmName, find_algorithm
-from .vpg import VPGConfig
+from typing import TYPE_CHECKING
+
+from .. import import_when_used
+
+if TYPE_CHECKING:
+    from .a2c import A2CConfig
+    from .checkpoints import Checkpoint, CheckpointError, load, store
+    from .config import Config, SACConfig
+    from .controllers import CONTROLLERS
+    from .episodes import Episode, EpisodeRecorder, ResumeError, episode_seed
+    from .geometric import Geometric
+    from .making import make_agent, resume_agent
+    from .orca import Orca
+    from .pid import PID
+    from .policies import NetworkPolicy, Policy
+    from .ppo import PPOConfig
+    from .presets import find_preset, preset
+    from .registry import ALGORITHMS, Agent, AlgorithmName, find_algorithm
+    from .vpg import VPGConfig
 
 __all__ = [
     "ALGORITHMS", "CONTROLLERS", "PID", "A2CConfig", "Agent", "AlgorithmName", "Checkpoint",
@@ -24,3 +29,22 @@ __all__ = [
     "PPOConfig", "Policy", "ResumeError", "SACConfig", "VPGConfig", "episode_seed",
     "find_algorithm", "find_preset", "load", "make_agent", "preset", "resume_agent", "store",
 ]  # fmt: skip
+
+_names = {
+    ".a2c": ("A2CConfig",),
+    ".checkpoints": ("Checkpoint", "CheckpointError", "load", "store"),
+    ".config": ("Config", "SACConfig"),
+    ".controllers": ("CONTROLLERS",),
+    ".episodes": ("Episode", "EpisodeRecorder", "ResumeError", "episode_seed"),
+    ".geometric": ("Geometric",),
+    ".making": ("make_agent", "resume_agent"),
+    ".orca": ("Orca",),
+    ".pid": ("PID",),
+    ".policies": ("NetworkPolicy", "Policy"),
+    ".ppo": ("PPOConfig",),
+    ".presets": ("find_preset", "preset"),
+    ".registry": ("ALGORITHMS", "Agent", "AlgorithmName", "find_algorithm"),
+    ".vpg": ("VPGConfig",),
+}
+_modules = {name: module for module, names in _names.items() for name in names}
+__getattr__ = import_when_used(__name__, _modules)
