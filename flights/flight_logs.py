@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..models.errors import InputError, one_line, require
+from ..models.files import read_toml
 from ..models.vehicle import Vehicle
 
 Floats = NDArray[np.float64]
@@ -239,29 +240,25 @@ def _grid(path: Path, times: Floats, period: float) -> Floats:
 
 # ---- PX4
 
-_POSITION = "vehicle_local_position"
+_PX4 = read_toml(Path(__file__).with_name("px4.toml"), "px4")
+"""Topic, field and factor of each of our columns, in our frames."""
 _ATTITUDE = "vehicle_attitude"
 _RATES = "vehicle_angular_velocity"
-_ESC = "esc_status"
-_MOTORS = "actuator_motors"
-_MOST_ROTORS = 12
+_TOPICS = ("vehicle_local_position", _ATTITUDE, _RATES)
 
 
 def _ulog(path: Path) -> Columns:
-    """Columns of a PX4 log in our frames: world north, west, up; body forward, left, up.
-
-    Topics are interpolated at the times of the body rates.
-    """
+    """Columns of a PX4 log in our frames: world north, west, up; body forward, left, up."""
     pyulog = require("pyulog", "identify", "reading a ULog file")
     try:
         log = pyulog.ULog(str(path))
     except (TypeError, ValueError, IndexError, KeyError) as error:
         raise InputError(f"log: expected a ULog file, got {path.name}: {error}") from None
     topics = {topic.name: topic.data for topic in reversed(log.data_list)}
-    for topic in (_POSITION, _ATTITUDE, _RATES):
+    for topic in _TOPICS:
         if topic not in topics:
             _refuse(path, f"the topic {topic}", ", ".join(sorted(topics)))
-    used = topics.keys() & {_POSITION, _ATTITUDE, _RATES, _ESC, _MOTORS}
+    used = topics.keys() & {topic for topic, _, _ in _PX4.values()}
     times = {topic: topics[topic]["timestamp"].astype(np.float64) for topic in used}
     first = max(own[0] for own in times.values())
     last = min(own[-1] for own in times.values())
@@ -272,20 +269,8 @@ def _ulog(path: Path) -> Columns:
     smooth = _without_flips(np.stack([attitude[name] for name in names], axis=1))
     attitude |= zip(names, smooth.T, strict=True)
     columns = {"t": (base - base[:1]) * 1e-6}
-
-    def take(ours: str, topic: str, field: str, factor: float = 1.0) -> None:
+    for name, (topic, field, factor) in _PX4.items():
         if topic in used and field in topics[topic]:
             values = topics[topic][field].astype(np.float64)
-            columns[ours] = factor * np.interp(base, times[topic], values)
-
-    take("qw", _ATTITUDE, "q[0]")
-    # Theirs are north east down and forward right down.
-    for i, (axis, sign) in enumerate((("x", 1.0), ("y", -1.0), ("z", -1.0))):
-        take(axis, _POSITION, axis, sign)
-        take(f"v{axis}", _POSITION, f"v{axis}", sign)
-        take(f"w{axis}", _RATES, f"xyz[{i}]", sign)
-        take(f"q{axis}", _ATTITUDE, f"q[{i + 1}]", sign)
-    for i in range(_MOST_ROTORS):
-        take(SPEED.format(i + 1), _ESC, f"esc[{i}].esc_rpm", 2 * np.pi / 60)
-        take(THROTTLE.format(i + 1), _MOTORS, f"control[{i}]")
+            columns[name] = factor * np.interp(base, times[topic], values)
     return columns
