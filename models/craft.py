@@ -14,26 +14,16 @@ from mujoco import MjsBody, MjSpec, mjtGeom
 from .cameras import ORIGIN, UP, place_camera
 from .coefficients import PREFIX
 from .errors import InputError
-from .files import find_in_package
+from .files import find_in_package, read_toml
 from .vehicle_file import Box, Cylinder, PlacedRotor, VehicleFile
 
 Vector = Sequence[float] | np.ndarray
-Colour = tuple[float, float, float, float]
 
 DEFAULT_TIMESTEP = 0.01
 """Physics step of a file without one, s."""
 DEFAULT_GRAVITY = 9.81
 """Downward acceleration of a file without one, m/s²."""
-_CARBON = (0.13, 0.14, 0.16, 1.0)
-_SHELL = (0.93, 0.94, 0.95, 1.0)
-_SILVER = (0.62, 0.65, 0.69, 1.0)
-_ORANGE = (0.96, 0.42, 0.08, 1.0)
-_FRONT_DISC = (0.98, 0.50, 0.12, 0.42)
-_DISC = (0.20, 0.46, 0.78, 0.42)
-_BOX = mjtGeom.mjGEOM_BOX
-_CAPSULE = mjtGeom.mjGEOM_CAPSULE
-_CYLINDER = mjtGeom.mjGEOM_CYLINDER
-_ELLIPSOID = mjtGeom.mjGEOM_ELLIPSOID
+_COLOURS = read_toml(Path(__file__).with_name("craft.toml"), "craft")["colours"]
 
 
 def craft_spec(file: VehicleFile, base: MjSpec | None = None) -> MjSpec:
@@ -87,8 +77,8 @@ def _add_actuator(
 def _add_geom(
     body: MjsBody,
     name: str,
-    kind: mjtGeom,
-    rgba: Colour,
+    kind: str,
+    colour: str,
     size: Vector,
     *,
     group: int = 2,
@@ -99,8 +89,8 @@ def _add_geom(
     """A geom that is drawn; a solid one collides."""
     body.add_geom(
         name=name,
-        type=kind,
-        rgba=rgba,
+        type=getattr(mjtGeom, f"mjGEOM_{kind.upper()}"),
+        rgba=_COLOURS[colour],
         size=(*size, 0.0, 0.0)[:3],
         group=group,
         mass=mass,
@@ -140,26 +130,26 @@ def _build(spec: MjSpec, file: VehicleFile) -> None:
     body.add_freejoint(name="free")
     _add_mass(body, file)
     seen = 3 if file.body.parts else 1  # if parts are drawn, hub and motors are not
-    _add_geom(body, "hub", _BOX, _CARBON, half, group=seen, solid=True)
+    _add_geom(body, "hub", "box", "carbon", half, group=seen, solid=True)
     for rotor, place in rotors:
         size = (0.09 * unit, motor)
         turn = _along(rotor.axis)
         name = f"motor {rotor.name}"
-        _add_geom(body, name, _CYLINDER, _SILVER, size, pos=place, group=seen, solid=True, **turn)
+        _add_geom(body, name, "cylinder", "silver", size, pos=place, group=seen, solid=True, **turn)
     _add_skids(body, half, unit, clearance)
     _add_looks(body, half)
     radius = file.rotors.radius or 0.4 * _nearest([place for _, place in rotors], reach)
     for number, (rotor, place) in enumerate(rotors, 1):
         if not file.body.parts and math.hypot(*place[:2]) > half[0]:
             ends = (*ORIGIN, *place)
-            _add_geom(body, f"arm{number}", _CYLINDER, _CARBON, (0.035 * unit,), fromto=ends)
+            _add_geom(body, f"arm{number}", "cylinder", "carbon", (0.035 * unit,), fromto=ends)
         up = _scaled(rotor.axis, 0.09 * unit / math.hypot(*rotor.axis))
         above = np.add(place, up)
-        rgba = _FRONT_DISC if place[0] > 1e-6 * reach else _DISC
-        _add_disc(body, f"disc{number}", rotor, radius, above, rgba)
+        colour = "front_disc" if place[0] > 1e-6 * reach else "disc"
+        _add_disc(body, f"disc{number}", rotor, radius, above, colour)
         blade = _scaled((0.97, 0.09, 0.018), radius)
         turn = _along(rotor.axis) or {"euler": (0.0, 0.0, 0.4 + 1.5 * number)}
-        _add_geom(body, "", _ELLIPSOID, _CARBON, blade, pos=above, **turn)
+        _add_geom(body, "", "ellipsoid", "carbon", blade, pos=above, **turn)
         site = body.add_site(name=rotor.name, pos=place, group=4, size=(0.02 * unit, 0.005, 0.005))
         _add_actuator(spec, file, rotor, site)
 
@@ -170,10 +160,10 @@ def _along(axis: Vector) -> dict[str, Any]:
 
 
 def _add_disc(
-    body: MjsBody, name: str, rotor: PlacedRotor, radius: float, place: Vector, rgba: Colour
+    body: MjsBody, name: str, rotor: PlacedRotor, radius: float, place: Vector, colour: str
 ) -> None:
     size = (radius, 0.01 * radius)
-    _add_geom(body, name, _CYLINDER, rgba, size, pos=place, **_along(rotor.axis))
+    _add_geom(body, name, "cylinder", colour, size, pos=place, **_along(rotor.axis))
 
 
 def _sides(parts: Sequence[Box | Cylinder], unit: float) -> Vector:
@@ -189,16 +179,16 @@ def _add_mass(body: MjsBody, file: VehicleFile) -> None:
     table = file.body
     for number, part in enumerate(table.parts, 1):
         if isinstance(part, Box):
-            kind = _BOX
+            kind = "box"
             size = _scaled(part.size, 0.5)
             turn: dict[str, Any] = {"euler": (0.0, 0.0, part.yaw)}
         else:
-            kind = _CYLINDER
+            kind = "cylinder"
             size = (part.radius, part.length / 2)
             turn = _along(part.axis)
         name = f"part{number}"
         place = part.position
-        _add_geom(body, name, kind, _CARBON, size, pos=place, mass=part.mass, group=1, **turn)
+        _add_geom(body, name, kind, "carbon", size, pos=place, mass=part.mass, group=1, **turn)
     if table.parts:
         return
     assert table.mass is not None
@@ -220,18 +210,18 @@ def _add_skids(body: MjsBody, half: Vector, unit: float, clearance: float) -> No
     for side, y in (("left", 0.45 * unit), ("right", -0.45 * unit)):
         ends = (-long, y, low, long, y, low)
         name = f"skid {side}"
-        _add_geom(body, name, _CAPSULE, _SILVER, (thick,), fromto=ends, group=1, solid=True)
+        _add_geom(body, name, "capsule", "silver", (thick,), fromto=ends, group=1, solid=True)
         for x in (-0.6 * long, 0.6 * long):
             top = (math.copysign(0.7 * half[0], x), math.copysign(0.8 * half[1], y), -half[2] / 2)
-            _add_geom(body, "", _CAPSULE, _SILVER, (0.7 * thick,), fromto=(*top, x, y, low))
+            _add_geom(body, "", "capsule", "silver", (0.7 * thick,), fromto=(*top, x, y, low))
 
 
 def _add_looks(body: MjsBody, half: Vector) -> None:
     x, y, z = half
     shell = (1.2 * x, 0.9 * y, 1.7 * z)
     mark = (0.6 * x, 0.55 * y, 1.1 * z)
-    _add_geom(body, "canopy", _ELLIPSOID, _SHELL, shell, pos=(0.0, 0.0, 0.7 * z))
-    _add_geom(body, "front mark", _ELLIPSOID, _ORANGE, mark, pos=(0.9 * x, 0.0, 0.6 * z))
+    _add_geom(body, "canopy", "ellipsoid", "shell", shell, pos=(0.0, 0.0, 0.7 * z))
+    _add_geom(body, "front mark", "ellipsoid", "orange", mark, pos=(0.9 * x, 0.0, 0.6 * z))
 
 
 def _nearest(places: Sequence[Vector], reach: float) -> float:
@@ -296,5 +286,5 @@ def _rotor_site(spec: MjSpec, file: VehicleFile, rotor: PlacedRotor, where: str)
             spec.delete(joint)
     place = rotor.position or ORIGIN
     if file.rotors.radius is not None:
-        _add_disc(body, "", rotor, file.rotors.radius, place, _DISC)
+        _add_disc(body, "", rotor, file.rotors.radius, place, "disc")
     return body.add_site(name=f"rotor/{rotor.name}", pos=place, group=4)

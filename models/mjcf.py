@@ -10,27 +10,14 @@ from mujoco import MjData, MjsBody, MjSpec, mjtGeom
 
 from .craft import craft_spec
 from .errors import InputError
+from .files import read_toml
 from .vehicle_file import read_vehicle_file
 
 MAX_ELEMENTS = 10_000  # of a file, each as often as it is repeated: seconds to compile
 MAX_MEMORY = 1 << 30  # bytes of MJCF's attribute `memory`
 MAX_NUMBERS = 1 << 26  # of all height fields, textures, numerics and sensors: 0.5 GB
-_USER = ("body", "jnt", "geom", "site", "cam", "tendon", "actuator", "sensor")
-_SIZES = {
-    **{f"nuser_{kind}": 100 for kind in _USER},
-    "nkey": 100,
-    "njmax": 4000,
-    "nconmax": 100_000,
-    "nuserdata": 1_000_000,
-    "nstack": 10_000_000,
-}
-_SIDES = dict.fromkeys(("nrow", "ncol", "width", "height"), 4096)
-_LENGTHS = dict.fromkeys(("size", "dim", "num", "nsample", "actdim"), 10_000)
-_ARRAYS = {
-    **dict.fromkeys(("hfield", "texture"), _SIDES),
-    **dict.fromkeys(("numeric", "user", "contact", "general", "plugin"), _LENGTHS),
-}
-"""Largest attributes of the elements whose product is a number of numbers."""
+_LARGEST = read_toml(Path(__file__).with_name("mjcf.toml"), "mjcf")
+"""Largest attributes of elements. But for `size`, their product is a number of numbers."""
 _REPEATED = ("replicate", "composite", "flexcomp")
 _UNITS = "KMGTPE"  # each is 1024 times the one before
 _GROUNDS = (mjtGeom.mjGEOM_PLANE, mjtGeom.mjGEOM_HFIELD)
@@ -152,8 +139,7 @@ def _check_sizes(path: Path) -> None:
 
 
 def _check_element(element: ElementTree.Element) -> None:
-    largest = _SIZES if element.tag == "size" else _ARRAYS.get(element.tag, {})
-    for name, most in largest.items():
+    for name, most in _LARGEST.get(element.tag, {}).items():
         text = element.get(name, "0")
         if _whole(text) > most:
             _refuse(f"a {name} of at most {most} in <{element.tag}>", text)
@@ -165,9 +151,9 @@ def _check_element(element: ElementTree.Element) -> None:
 
 def _numbers(element: ElementTree.Element) -> int:
     """How many numbers MuJoCo allocates for an asset, a custom numeric or a sensor."""
-    if element.tag not in _ARRAYS:
+    if element.tag == "size" or element.tag not in _LARGEST:
         return 0
-    return math.prod(max(1, _whole(element.get(name, "1"))) for name in _ARRAYS[element.tag])
+    return math.prod(max(1, _whole(element.get(name, "1"))) for name in _LARGEST[element.tag])
 
 
 def _whole(text: str) -> int:

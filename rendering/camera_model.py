@@ -17,7 +17,7 @@ from ..models.swarm import drone_names
 from ..models.vehicle import Vehicle
 from ..scenes import add_scene
 from ..scenes.marks import Mark
-from .stage import MARK_COLORS, MARK_GEOMS, scale_drawing
+from .stage import MARK_COLORS, scale_drawing
 
 NOTHING = "nothing"
 """Name of what a segmentation picture has where it sees no object: number 0."""
@@ -90,7 +90,8 @@ def own_discs(model: MjModel, camera: int) -> np.ndarray:
 
 def _add(body: MjsBody, name: str, kind: mjtGeom, size: Sequence[float], **more: object) -> None:
     """A geom that is only drawn."""
-    geom = body.add_geom(name=name, type=kind, size=size, **more)
+    shape = getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")
+    geom = body.add_geom(name=name, type=shape, size=size, **more)
     geom.contype = geom.conaffinity = 0
     geom.mass = 0.0
     geom.group = 1
@@ -108,7 +109,7 @@ def _add_mark(body: MjsBody, name: str, mark: Mark, thickness: float) -> None:
         if part.kind != "sphere":
             place = {"fromto": np.concatenate((start, end))}
         size = (part.radius, 0.0, 0.0)
-        _add(body, own, MARK_GEOMS[part.kind], size, rgba=rgba, **place)
+        _add(body, own, part.kind, size, rgba=rgba, **place)
 
 
 def objects_in(model: MjModel) -> tuple[tuple[str, ...], np.ndarray]:

@@ -48,13 +48,6 @@ DRONE_COLORS = (
 first: Okabe and Ito's, told apart with colour-blindness."""
 MAX_NAMES = 16
 """Drones of one world whose names are shown; more would hide them."""
-MARK_GEOMS = {
-    "sphere": mjtGeom.mjGEOM_SPHERE,
-    "cylinder": mjtGeom.mjGEOM_CYLINDER,
-    "capsule": mjtGeom.mjGEOM_CAPSULE,
-}
-"""How parts of marks are drawn."""
-_CAPSULE = mjtGeom.mjGEOM_CAPSULE
 _ONBOARD = "stage/onboard"
 _SIDES = Limits(16, 8192, "pixels", whole=True)
 
@@ -292,23 +285,23 @@ class Stage:
                     _draw_mark(scene, mark, goal)
             if payload is not None:
                 size = (0.12 * self.radius,) * 3
-                _decorate(scene, mjtGeom.mjGEOM_SPHERE, size, payload, _PAYLOAD)
-                _connect(scene, _CAPSULE, 0.012 * self.radius, here, payload, _CABLE)
+                _decorate(scene, "sphere", size, payload, _PAYLOAD)
+                _connect(scene, "capsule", 0.012 * self.radius, here, payload, _CABLE)
             if labels:
                 above = here + np.array((0.0, 0.0, 0.9 * self.radius))
-                label = _decorate(scene, mjtGeom.mjGEOM_LABEL, (0.1,) * 3, above, _CABLE)
+                label = _decorate(scene, "label", (0.1,) * 3, above, _CABLE)
                 if label is not None:
                     label.label = f"{labels[drone]}   "  # without the spaces its end is cut off
             color = DRONE_COLORS[drone % len(DRONE_COLORS)]
             if goals and goal is not None and not marked:
                 size = (0.93 * self.radius, 0.0033 * self.radius, 0.0)  # radius, half of its height
                 own = color if self.drones > 1 else _GREEN
-                _decorate(scene, mjtGeom.mjGEOM_CYLINDER, size, goal, (*own, 0.3))
+                _decorate(scene, "cylinder", size, goal, (*own, 0.3))
             path = self._paths[drone]
             for number, (start, end) in enumerate(pairwise([*path, here]), 1):
                 if not np.array_equal(start, end):
                     rgba = (*color, 0.85 * number / len(path))
-                    _connect(scene, _CAPSULE, 0.019 * self.radius, start, end, rgba)
+                    _connect(scene, "capsule", 0.019 * self.radius, start, end, rgba)
 
     @property
     def lines(self) -> list[tuple[str, str]]:
@@ -436,16 +429,15 @@ def _draw_mark(scene: MjvScene, mark: Mark, goal: _Vector | None) -> None:
     for part in mark.parts(0.04 * mark.size):
         start = centre + part.start
         end = centre + part.end
-        kind = MARK_GEOMS[part.kind]
         if part.kind == "sphere":
-            _decorate(scene, kind, (part.radius,) * 3, start, rgba)
+            _decorate(scene, part.kind, (part.radius,) * 3, start, rgba)
         else:
-            _connect(scene, kind, part.radius, start, end, rgba)
+            _connect(scene, part.kind, part.radius, start, end, rgba)
 
 
 def _connect(
     scene: MjvScene,
-    kind: mjtGeom,
+    kind: str,
     radius: float,
     start: Sequence[float] | Array,
     end: Sequence[float] | Array,
@@ -454,12 +446,12 @@ def _connect(
     """Add a cylinder or a capsule between two points."""
     geom = _decorate(scene, kind, (1.0, 1.0, 1.0), start, rgba)
     if geom is not None:
-        mujoco.mjv_connector(geom, kind, radius, np.asarray(start), np.asarray(end))
+        mujoco.mjv_connector(geom, geom.type, radius, np.asarray(start), np.asarray(end))
 
 
 def _decorate(
     scene: MjvScene,
-    kind: mjtGeom,
+    kind: str,
     size: Sequence[float],
     centre: Sequence[float] | Array,
     rgba: Sequence[float],
@@ -469,7 +461,8 @@ def _decorate(
         return None
     geom = scene.geoms[scene.ngeom]
     color = np.array(rgba, np.float32)
+    shape = getattr(mjtGeom, f"mjGEOM_{kind.upper()}")
     scene.ngeom += 1
-    mujoco.mjv_initGeom(geom, kind, np.array(size), np.asarray(centre), np.eye(3).ravel(), color)
+    mujoco.mjv_initGeom(geom, shape, np.array(size), np.asarray(centre), np.eye(3).ravel(), color)
     geom.category = mujoco.mjtCatBit.mjCAT_DECOR
     return geom

@@ -29,10 +29,6 @@ _HALL_XML = Path(__file__).with_name("hall.xml")  # its walls, windows, roof, la
 _GATES = 8
 _OPENING = 5.0  # m: the paper's craft is 2.8 m wide with its rotors
 
-_PLANE = mjtGeom.mjGEOM_PLANE
-_BOX = mjtGeom.mjGEOM_BOX
-_CYLINDER = mjtGeom.mjGEOM_CYLINDER
-_ELLIPSOID = mjtGeom.mjGEOM_ELLIPSOID
 _FLAT = mujoco.mjtBuiltin.mjBUILTIN_FLAT
 _PATTERNS = {
     "checker": (mujoco.mjtBuiltin.mjBUILTIN_CHECKER, mujoco.mjtMark.mjMARK_NONE),
@@ -101,7 +97,7 @@ class Builder:
     def add(
         self,
         name: str,
-        kind: mjtGeom,
+        kind: str,
         size: Vector,
         position: Vector,
         material: str,
@@ -110,7 +106,8 @@ class Builder:
         """Add a geom that is turned about z, rad."""
         quaternion = (math.cos(heading / 2), 0.0, 0.0, math.sin(heading / 2))
         self.spec.worldbody.add_geom(
-            name=f"{self.scene}/{name}", type=kind, size=size, pos=position,
+            name=f"{self.scene}/{name}", type=getattr(mjtGeom, f"mjGEOM_{kind.upper()}"),
+            size=size, pos=position,
             quat=quaternion, material=f"{self.scene}/{material}", contype=0, conaffinity=0,
             group=GROUP, mass=0.0, density=0.0,
         )  # fmt: skip
@@ -146,7 +143,7 @@ def forest(wood: Builder) -> None:
     """A wood of 120 m by 120 m: trees, shrubs and rocks."""
     wood.sun()
     wood.paint()
-    wood.add("ground/floor", _PLANE, (150, 150, 1), (0, 0, 0), "ground")
+    wood.add("ground/floor", "plane", (150, 150, 1), (0, 0, 0), "ground")
     for i in range(110):
         _add_tree(wood, f"tree_{i}")
     for i in range(60):
@@ -155,12 +152,12 @@ def forest(wood: Builder) -> None:
         leaf = wood.choose("leaves")
         size = (wide, wide, 0.7 * wide)
         position = (x, y, 0.4 * wide)
-        wood.add(f"shrub_{i}/crown", _ELLIPSOID, size, position, leaf)
+        wood.add(f"shrub_{i}/crown", "ellipsoid", size, position, leaf)
     for i in range(40):
         sides = wood.rng.uniform(0.3, 1.0, 3)
         x, y = wood.around(1.0, _FOREST)
         turn = wood.uniform(0, math.pi)
-        wood.add(f"rock_{i}/stone", _ELLIPSOID, sides, (x, y, 0.2 * sides[2]), "stone", turn)
+        wood.add(f"rock_{i}/stone", "ellipsoid", sides, (x, y, 0.2 * sides[2]), "stone", turn)
 
 
 def _add_tree(wood: Builder, name: str) -> None:
@@ -170,19 +167,19 @@ def _add_tree(wood: Builder, name: str) -> None:
     kind = int(wood.rng.integers(3))
     leaf = wood.choose("leaves")
     trunk = (0.13 + 0.012 * tall, 0.3 * tall, 0)
-    wood.add(f"{name}/trunk", _CYLINDER, trunk, (x, y, 0.3 * tall), f"bark_{kind % 2}")
+    wood.add(f"{name}/trunk", "cylinder", trunk, (x, y, 0.3 * tall), f"bark_{kind % 2}")
     if kind == 0:  # a fir: three storeys, each narrower
         for storey, (height, width) in enumerate(((0.40, 1.0), (0.62, 0.72), (0.84, 0.42))):
             size = (wide * width, wide * width, 0.18 * tall)
-            wood.add(f"{name}/crown_{storey}", _ELLIPSOID, size, (x, y, height * tall), leaf)
+            wood.add(f"{name}/crown_{storey}", "ellipsoid", size, (x, y, height * tall), leaf)
     elif kind == 1:  # round
         size = (wide, wide, 0.3 * tall)
-        wood.add(f"{name}/crown", _ELLIPSOID, size, (x, y, 0.72 * tall), leaf)
+        wood.add(f"{name}/crown", "ellipsoid", size, (x, y, 0.72 * tall), leaf)
     else:  # two balls side by side
         dx, dy = wood.rng.uniform(-0.3, 0.3, 2) * wide
         for part, (side, height) in enumerate(((1, 0.62), (-1, 0.80))):
             position = (x + side * dx, y + side * dy, height * tall)
-            wood.add(f"{name}/crown_{part}", _ELLIPSOID, (0.7 * wide,) * 3, position, leaf)
+            wood.add(f"{name}/crown_{part}", "ellipsoid", (0.7 * wide,) * 3, position, leaf)
 
 
 def warehouse(hall: Builder) -> None:
@@ -211,7 +208,7 @@ def _fill_rack(hall: Builder, name: str, x: float, y: float) -> None:
             tint = hall.choose("box")
             if hall.rng.random() < 0.85:  # else the slot is empty
                 position = (x + dx, y, deck + 0.06 + half[2])
-                hall.add(f"{name}/box_{4 * level + slot}", _BOX, half, position, tint)
+                hall.add(f"{name}/box_{4 * level + slot}", "box", half, position, tint)
 
 
 def _add_goods(hall: Builder, number: int) -> None:
@@ -223,18 +220,18 @@ def _add_goods(hall: Builder, number: int) -> None:
         y = float(hall.rng.choice((-13.7, 13.7))) + hall.uniform(-0.3, 0.3)
     tint = hall.choose("box")
     if number % 2:
-        hall.add(f"barrel_{number}/drum", _CYLINDER, (0.4, 0.6, 0), (x, y, 0.6), tint)
+        hall.add(f"barrel_{number}/drum", "cylinder", (0.4, 0.6, 0), (x, y, 0.6), tint)
         return
     half = hall.rng.uniform((0.3, 0.3, 0.2), (0.6, 0.6, 0.6))
-    hall.add(f"pallet_{number}/deck", _BOX, (0.6, 0.6, 0.07), (x, y, 0.08), "pallet")
-    hall.add(f"pallet_{number}/box", _BOX, half, (x, y, 0.16 + half[2]), tint)
+    hall.add(f"pallet_{number}/deck", "box", (0.6, 0.6, 0.07), (x, y, 0.08), "pallet")
+    hall.add(f"pallet_{number}/box", "box", half, (x, y, 0.16 + half[2]), tint)
 
 
 def gates(track: Builder) -> None:
     """A ring of 8 gates, 5 m wide inside, with barriers, cones and stands around it."""
     track.sun()
     track.paint()
-    track.add("ground/floor", _PLANE, (150, 150, 1), (0, 0, 0), "grass")
+    track.add("ground/floor", "plane", (150, 150, 1), (0, 0, 0), "grass")
     for i in range(_GATES):
         _add_gate(track, i)
     for i in range(40):
@@ -242,9 +239,9 @@ def gates(track: Builder) -> None:
         tint = track.choose("paint")
         turn = track.uniform(0, math.pi)
         if i % 2:
-            track.add(f"barrier_{i}/block", _BOX, (1.2, 0.25, 0.45), (x, y, 0.45), tint, turn)
+            track.add(f"barrier_{i}/block", "box", (1.2, 0.25, 0.45), (x, y, 0.45), tint, turn)
         else:
-            track.add(f"cone_{i}/body", _ELLIPSOID, (0.3, 0.3, 0.8), (x, y, 0.1), tint)
+            track.add(f"cone_{i}/body", "ellipsoid", (0.3, 0.3, 0.8), (x, y, 0.1), tint)
     for i in range(4):
         away = track.uniform(34.0, 44.0)
         angle = math.pi * (i / 2 + 0.25)
@@ -253,7 +250,7 @@ def gates(track: Builder) -> None:
             height = 0.4 * (row + 1)
             position = (distance * math.cos(angle), distance * math.sin(angle), height)
             size = (0.75, 9.0, height)
-            track.add(f"stand_{i}/row_{row}", _BOX, size, position, "stand", angle)
+            track.add(f"stand_{i}/row_{row}", "box", size, position, "stand", angle)
 
 
 def _add_gate(track: Builder, number: int) -> None:
@@ -273,13 +270,13 @@ def _add_gate(track: Builder, number: int) -> None:
         side_y = y + aside * math.cos(heading)
         name = f"gate_{number}/frame_{part}"
         size = (0.15, bar, half + 2 * bar)
-        track.add(name, _BOX, size, (side_x, side_y, height), tint, heading)
+        track.add(name, "box", size, (side_x, side_y, height), tint, heading)
         name = f"gate_{number}/post_{part}"
         size = (0.1, foot, 0)
-        track.add(name, _CYLINDER, size, (side_x, side_y, foot), "steel")
+        track.add(name, "cylinder", size, (side_x, side_y, foot), "steel")
     for part, sign in (("top", 1), ("bottom", -1)):
         position = (x, y, height + sign * (half + bar))
-        track.add(f"gate_{number}/frame_{part}", _BOX, (0.15, half, bar), position, tint, heading)
+        track.add(f"gate_{number}/frame_{part}", "box", (0.15, half, bar), position, tint, heading)
 
 
 GENERATORS: Final[dict[str, Callable[[Builder], None]]] = {
