@@ -17,7 +17,7 @@ from ..models.swarm import drone_names
 from ..models.vehicle import Vehicle
 from ..scenes import add_scene
 from ..scenes.marks import Mark
-from .stage import MARK_COLORS, scale_drawing
+from .stage import LOOKS, scale_drawing
 
 NOTHING = "nothing"
 """Name of what a segmentation picture has where it sees no object: number 0."""
@@ -99,7 +99,7 @@ def _add(body: MjsBody, name: str, kind: mjtGeom, size: Sequence[float], **more:
 
 def _add_mark(body: MjsBody, name: str, mark: Mark, thickness: float) -> None:
     """A mark of a task, as viewers show it; discs have a thickness, m."""
-    rgba = (*MARK_COLORS[mark.shape], 1.0)
+    rgba = (*LOOKS["marks"][mark.shape], 1.0)
     parts = mark.parts(thickness)
     for number, part in enumerate(parts):
         own = f"{name}/{number}" if len(parts) > 1 else name

@@ -17,6 +17,7 @@ from mujoco import MjModel, MjvScene, mjtGeom
 from ..models.cameras import place_cameras
 from ..models.errors import InputError, one_line, shortened
 from ..models.fields import Limits, check
+from ..models.files import read_toml
 from ..models.fleet import load_vehicles, members_of
 from ..models.mjcf import level_data, swarm_spec
 from ..models.swarm import drone_names
@@ -33,19 +34,8 @@ CAMERAS: Final[tuple[Camera, ...]] = get_args(Camera)
 _MAX_METRICS = 4  # with a line of their own
 _TRAIL = 150  # control steps of a path
 _EVERY = 3  # control steps of one piece of it
-_ORANGE = (0.96, 0.42, 0.08)
-_GREEN = (0.13, 0.78, 0.52)
-MARK_COLORS = {"gate": _ORANGE, "disc": _GREEN, "ball": _GREEN}
-"""Red, green and blue, 0 to 1, of marks."""
-_PAYLOAD = (*_ORANGE, 1.0)
-_CABLE = (0.13, 0.14, 0.16, 1.0)
-_PATH = (1.0, 0.85, 0.25)
-DRONE_COLORS = (
-    _PATH, (0.34, 0.71, 0.91), (0.90, 0.62, 0.0), (0.0, 0.62, 0.45), (0.80, 0.47, 0.65),
-    (0.0, 0.45, 0.70), (0.84, 0.37, 0.0), (0.55, 0.34, 0.29),
-)  # fmt: skip
-"""Red, green and blue, 0 to 1, of the drones of one world, their paths and goals, again from the
-first: Okabe and Ito's, told apart with colour-blindness."""
+LOOKS = read_toml(Path(__file__).with_name("looks.toml"), "looks")
+"""Colours and views of a stage."""
 MAX_NAMES = 16
 """Drones of one world whose names are shown; more would hide them."""
 _ONBOARD = "stage/onboard"
@@ -55,15 +45,6 @@ _SIDES = Limits(16, 8192, "pixels", whole=True)
 _SPACING = 2.2  # between the craft of a world before their first moments
 _NEAR = 0.14  # at most: where drawing begins
 _LOWER = 0.06  # of their distance front and side look below the goal
-_VIEWS: Final[dict[str, tuple[float, float, float, float]]] = {
-    "chase": (0.0, -17.0, 3.85, math.inf),
-    "front": (180.0, -7.0, 6.9, 1.65),  # from a little above the goal: its disc is seen
-    "side": (90.0, -7.0, 6.9, 1.65),
-    "top": (0.0, -89.9, 5.5, math.inf),
-    "free": (0.0, -17.0, 3.85, 0.8),
-}
-"""Azimuth and elevation in degrees, distance, and the distance between craft and goal that the
-picture holds: if they are further apart, the camera is further away."""
 _BACK = 2.6  # distance of a camera per distance between craft and goal
 _FOVY = 50.0  # vertical field of view of every camera but `onboard`, degrees
 _FAR = 10.0  # Cameras move back until craft and goal are as far apart, or as at the start
@@ -240,9 +221,10 @@ class Stage:
             camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
             camera.fixedcamid = self.model.camera(_ONBOARD).id
             return camera
-        if name not in _VIEWS:
+        views = LOOKS["views"]
+        if name not in views:
             raise InputError(f"camera: expected one of {', '.join(CAMERAS)}, got {shortened(name)}")
-        camera.azimuth, camera.elevation, distance, holds = _VIEWS[name]
+        camera.azimuth, camera.elevation, distance, holds = views[name]
         camera.distance = distance * self.radius
         if self.drones > 1:  # the goals of one world lie apart, often far from their craft
             places = np.array([*self._points, *self._goals])
@@ -276,6 +258,7 @@ class Stage:
         """Add marks, payloads and fading paths to a scene, and discs at the goals if wanted."""
         marked = any(moment.marks for moment in self.moments)
         labels = drone_names(self.drones) if 1 < self.drones <= MAX_NAMES else ()
+        cable = (*LOOKS["cable"], 1.0)
         for drone, moment in enumerate(self.moments):
             here = self._points[drone]
             goal = moment.goal
@@ -285,17 +268,17 @@ class Stage:
                     _draw_mark(scene, mark, goal)
             if payload is not None:
                 size = (0.12 * self.radius,) * 3
-                _decorate(scene, "sphere", size, payload, _PAYLOAD)
-                _connect(scene, "capsule", 0.012 * self.radius, here, payload, _CABLE)
+                _decorate(scene, "sphere", size, payload, (*LOOKS["payload"], 1.0))
+                _connect(scene, "capsule", 0.012 * self.radius, here, payload, cable)
             if labels:
                 above = here + np.array((0.0, 0.0, 0.9 * self.radius))
-                label = _decorate(scene, "label", (0.1,) * 3, above, _CABLE)
+                label = _decorate(scene, "label", (0.1,) * 3, above, cable)
                 if label is not None:
                     label.label = f"{labels[drone]}   "  # without the spaces its end is cut off
-            color = DRONE_COLORS[drone % len(DRONE_COLORS)]
+            color = LOOKS["drones"][drone % len(LOOKS["drones"])]
             if goals and goal is not None and not marked:
                 size = (0.93 * self.radius, 0.0033 * self.radius, 0.0)  # radius, half of its height
-                own = color if self.drones > 1 else _GREEN
+                own = color if self.drones > 1 else LOOKS["goal"]
                 _decorate(scene, "cylinder", size, goal, (*own, 0.3))
             path = self._paths[drone]
             for number, (start, end) in enumerate(pairwise([*path, here]), 1):
@@ -422,9 +405,9 @@ def _draw_mark(scene: MjvScene, mark: Mark, goal: _Vector | None) -> None:
         if goal is None:
             return
         centre += goal
-    color = MARK_COLORS[mark.shape]
+    color = LOOKS["marks"][mark.shape]
     if mark.shape == "gate" and goal is not None and np.abs(goal - centre).max() < 1e-3:
-        color = _GREEN
+        color = LOOKS["goal"]
     rgba = (*color, 0.3 if mark.shape == "ball" else 0.9)
     for part in mark.parts(0.04 * mark.size):
         start = centre + part.start
