@@ -24,6 +24,7 @@ SKY = mujoco.mjtTexture.mjTEXTURE_SKYBOX
 MATERIALS: Final[Mapping[str, Mapping[str, Mapping[str, Any]]]] = read_toml(
     Path(__file__).with_name("materials.toml"), "materials"
 )
+_TREES = read_toml(Path(__file__).with_name("trees.toml"), "trees")["kind"]
 _FOREST = 60.0  # m: half the width of the wood
 _HALL_XML = Path(__file__).with_name("hall.xml")  # its walls, windows, roof, lamps and racks
 _GATES = 8
@@ -168,18 +169,14 @@ def _add_tree(wood: Builder, name: str) -> None:
     leaf = wood.choose("leaves")
     trunk = (0.13 + 0.012 * tall, 0.3 * tall, 0)
     wood.add(f"{name}/trunk", "cylinder", trunk, (x, y, 0.3 * tall), f"bark_{kind % 2}")
-    if kind == 0:  # a fir: three storeys, each narrower
-        for storey, (height, width) in enumerate(((0.40, 1.0), (0.62, 0.72), (0.84, 0.42))):
-            size = (wide * width, wide * width, 0.18 * tall)
-            wood.add(f"{name}/crown_{storey}", "ellipsoid", size, (x, y, height * tall), leaf)
-    elif kind == 1:  # round
-        size = (wide, wide, 0.3 * tall)
-        wood.add(f"{name}/crown", "ellipsoid", size, (x, y, 0.72 * tall), leaf)
-    else:  # two balls side by side
-        dx, dy = wood.rng.uniform(-0.3, 0.3, 2) * wide
-        for part, (side, height) in enumerate(((1, 0.62), (-1, 0.80))):
-            position = (x + side * dx, y + side * dy, height * tall)
-            wood.add(f"{name}/crown_{part}", "ellipsoid", (0.7 * wide,) * 3, position, leaf)
+    crowns = _TREES[kind]["crowns"]
+    aside = (0.0, 0.0)
+    if any(side for _, side, *_ in crowns):
+        aside = wood.rng.uniform(-0.3, 0.3, 2) * wide
+    for part, side, height, half_width, by_width, by_height in crowns:
+        size = (half_width * wide, half_width * wide, by_width * wide + by_height * tall)
+        position = (x + side * aside[0], y + side * aside[1], height * tall)
+        wood.add(f"{name}/{part}", "ellipsoid", size, position, leaf)
 
 
 def warehouse(hall: Builder) -> None:
@@ -266,14 +263,10 @@ def _add_gate(track: Builder, number: int) -> None:
     foot = (height - half - 2 * bar) / 2
     for part, sign in (("left", 1), ("right", -1)):
         aside = sign * (half + bar)
-        side_x = x - aside * math.sin(heading)
-        side_y = y + aside * math.cos(heading)
-        name = f"gate_{number}/frame_{part}"
+        side = (x - aside * math.sin(heading), y + aside * math.cos(heading))
         size = (0.15, bar, half + 2 * bar)
-        track.add(name, "box", size, (side_x, side_y, height), tint, heading)
-        name = f"gate_{number}/post_{part}"
-        size = (0.1, foot, 0)
-        track.add(name, "cylinder", size, (side_x, side_y, foot), "steel")
+        track.add(f"gate_{number}/frame_{part}", "box", size, (*side, height), tint, heading)
+        track.add(f"gate_{number}/post_{part}", "cylinder", (0.1, foot, 0), (*side, foot), "steel")
     for part, sign in (("top", 1), ("bottom", -1)):
         position = (x, y, height + sign * (half + bar))
         track.add(f"gate_{number}/frame_{part}", "box", (0.15, half, bar), position, tint, heading)
