@@ -5,7 +5,6 @@ import copy
 import re
 import warnings
 from collections.abc import Iterable, Iterator, Sequence, Sized
-from contextlib import ExitStack
 from dataclasses import fields
 from itertools import chain
 from pathlib import Path
@@ -126,14 +125,12 @@ def write_parquet(episodes: RecordedEpisodes, out: Path) -> tuple[int, int]:
     check_new_file(out, ".parquet")
     metadata = {"env_spec": episodes.spec.to_json()}
     tables = (_table(episodes.spec, i, episodes.journal, one) for i, one in enumerate(episodes))
-    with removed_on_error(out), ExitStack() as opened:
-        writer: pq.ParquetWriter | None = None
-        for batch in _batches(tables, _ROW_GROUP):
-            table = pa.concat_tables(batch).replace_schema_metadata(metadata)
-            if writer is None:
-                made = pq.ParquetWriter(out, table.schema, compression="zstd")
-                writer = opened.enter_context(made)
-            writer.write_table(table)
+    batches = map(pa.concat_tables, _batches(tables, _ROW_GROUP))
+    first = next(batches)
+    schema = first.schema.with_metadata(metadata)
+    with removed_on_error(out), pq.ParquetWriter(out, schema, compression="zstd") as writer:
+        for table in chain([first], batches):
+            writer.write_table(table.cast(schema))
     return episodes.count, episodes.steps
 
 

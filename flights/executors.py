@@ -110,14 +110,15 @@ def _results(
     """Results in the order in which they come; at most `executor.workers` jobs are submitted."""
     waiting = iter(jobs.items())
     workers: int = getattr(executor, "workers", 1)
-    submitted: set[Future[Result]] = set()
+    submitted: dict[Future[Result], str] = {}
     while True:
         for name, job in islice(waiting, workers - len(submitted)):
-            submitted.add(executor.submit(_do, function, name, job))
+            submitted[executor.submit(_do, function, name, job)] = name
         if not submitted:
             return
-        done, submitted = wait(submitted, return_when=FIRST_COMPLETED)
+        done, _ = wait(submitted, return_when=FIRST_COMPLETED)
         for future in done:
+            name = submitted.pop(future)
             try:
                 yield future.result()
             except BrokenProcessPool:
@@ -125,6 +126,10 @@ def _results(
                     "a worker was killed, perhaps for want of memory (try fewer --jobs); "
                     "what was done before is kept"
                 ) from None
+            except Exception as error:  # a cluster's machine is lost, or lacks our software
+                cause = getattr(error, "cause", None) or error
+                reason = str(cause).strip().splitlines()[-1]
+                yield Result(name, f"{name}: {reason}", None)
 
 
 @contextmanager
@@ -136,14 +141,15 @@ def open_executor(
     Progress is reported for jobs of this machine. One job at a time runs in this process. Raises
     `InputError` if there is no such Ray cluster.
     """
+    workers = min(config.jobs or os.cpu_count() or 1, jobs)
     if config.runner == "ray":
         from .ray_cluster import RayExecutor
 
         executor: Executor = RayExecutor(config.address, config.jobs)
-    elif min(config.jobs or os.cpu_count() or 1, jobs) <= 1:
+    elif workers <= 1:
         executor = _ThisProcess(on_progress)
     else:
-        executor = _Processes(min(config.jobs or os.cpu_count() or 1, jobs), on_progress)
+        executor = _Processes(workers, on_progress)
     try:
         yield executor
     finally:

@@ -189,6 +189,7 @@ def _undetermined(estimates: Sequence[Estimate], correlation: Floats) -> dict[st
     return reasons
 
 
+@dataclass(eq=False)
 class Fit:
     """Least squares of the errors of predictions, over numbers of a vehicle.
 
@@ -198,24 +199,21 @@ class Fit:
     starts, and not the true ones.
     """
 
-    def __init__(
-        self,
-        vehicle: Vehicle,
-        windows: Windows,
-        numbers: Numbers,
-        groups: Sequence[Group],
-        logs: Sequence[FlightLog] = (),
-    ) -> None:
-        self._vehicle = vehicle
-        self._windows = windows
-        self._logs = logs
-        self._start = numbers
-        self._groups = groups
-        self._scales = np.array([_scale(vehicle, numbers, group[0]) for group in groups])
-        self._lowest = np.array([_lowest(group[0]) for group in groups])
-        values = np.array([numbers[group[0]] for group in groups])
+    vehicle: Vehicle
+    windows: Windows
+    numbers: Numbers
+    """To begin with."""
+    groups: Sequence[Group]
+    logs: Sequence[FlightLog] = ()
+
+    def __post_init__(self) -> None:
+        names = [group[0] for group in self.groups]
+        self._scales = np.array([_scale(self.vehicle, self.numbers, name) for name in names])
+        self._lowest = np.array([_lowest(name) for name in names])
+        values = np.array([self.numbers[name] for name in names])
         self._x = np.maximum(values / self._scales, self._lowest + 1e-6)
-        self._spreads: Floats = np.ones((len(windows.horizons), 4, 1))
+        self._is_drag = np.array([name.startswith("drag.linear") for name in names], bool)
+        self._spreads: Floats = np.ones((len(self.windows.horizons), 4, 1))
         self._whitener: Floats | None = None
 
     def solve(self) -> dict[str, float]:
@@ -238,7 +236,7 @@ class Fit:
             )
             self._x = solution.x
         self._weigh()
-        return _flattened(self._vehicle, self._numbers(self._x))
+        return _flattened(self.vehicle, self._numbers(self._x))
 
     def mean_errors(self, numbers: Numbers) -> tuple[float, ...]:
         """Mean sizes of the four errors at the end of a window."""
@@ -266,9 +264,8 @@ class Fit:
         half = np.where(felt, deviation * t.ppf(0.975, count - 1), np.inf) * self._scales
         root = np.where(felt, np.sqrt(np.diag(inverse)), 1.0)
         # More drag than a physics step can follow is no estimate.
-        stiffest = 0.5 * self._vehicle.mass / self._windows.period
-        is_drag = np.array([group[0].startswith("drag.linear") for group in self._groups], bool)
-        half[is_drag & (self._x * self._scales > stiffest)] = np.inf
+        stiffest = 0.5 * self.vehicle.mass / self.windows.period
+        half[self._is_drag & (self._x * self._scales > stiffest)] = np.inf
         return half, inverse / np.outer(root, root)
 
     def _jacobian(self, x: Floats, step: float) -> tuple[Floats, Floats]:
@@ -278,22 +275,22 @@ class Fit:
         return rows[0], (rows[1:] - rows[0]) / steps[:, None, None]
 
     def _numbers(self, x: Floats) -> dict[str, float]:
-        numbers = dict(self._start)
-        for group, value in zip(self._groups, (x * self._scales).tolist(), strict=True):
+        numbers = dict(self.numbers)
+        for group, value in zip(self.groups, (x * self._scales).tolist(), strict=True):
             numbers.update(dict.fromkeys(group, value))
         return numbers
 
     def _errors(self, candidates: Sequence[Numbers], start: Floats | None = None) -> Floats:
         """Differences, (P, M, H, 4, 3), of P candidates; of those with starts (P, M, 13) too."""
-        windows = self._windows.repeated(len(candidates))
+        windows = self.windows.repeated(len(candidates))
         if start is not None:
             windows = replace(windows, start=start.reshape(-1, 13))
-        if self._logs and not self._logs[0].measured:
+        if self.logs and not self.logs[0].measured:
             steps = windows.speeds.shape[1]
-            speeds = [_cut(self._logs, one, steps).speeds for one in candidates]
+            speeds = [_cut(self.logs, one, steps).speeds for one in candidates]
             windows = replace(windows, speeds=np.concatenate(speeds))
         with np.errstate(all="ignore"):
-            errors = differences(predict(self._vehicle, candidates, windows), windows.truth)
+            errors = differences(predict(self.vehicle, candidates, windows), windows.truth)
         errors = np.clip(np.nan_to_num(errors, nan=1e6), -1e6, 1e6)
         return errors.reshape(len(candidates), -1, *errors.shape[1:])
 
@@ -309,11 +306,11 @@ class Fit:
         # Of normal numbers with this median size; never 0.
         median = np.median(errors, axis=(0, 3))[..., None]
         self._spreads = median / 0.6745 + 1e-12
-        if not self._logs:
+        if not self.logs:
             return
         # At the first horizon differences have the noise of two measurements, at the start of one.
         noise = np.repeat(self._spreads[0], 3) / np.sqrt(2)
-        start = _shifted(self._windows.start, noise)
+        start = _shifted(self.windows.start, noise)
         rows = self._weighed([numbers] * len(start), start)
         effects = np.moveaxis(rows[1:] - rows[0], 0, -1)
         covariance = np.eye(rows.shape[-1]) + effects @ np.swapaxes(effects, 1, 2)

@@ -8,7 +8,6 @@ from typing import Any
 
 from ..models.errors import InputError, one_line, require
 from ..models.files import software_versions
-from .executors import Result
 
 _LISTENING_TIMEOUT = 5.0  # s
 
@@ -21,7 +20,7 @@ class RayExecutor(Executor):
         self._connect(address or "auto")
         cores = int(self._ray.cluster_resources().get("CPU", 0))  # 0: machines start on demand
         self.workers = jobs or max(cores, 1)
-        self._submitted: dict[Future[Result], object] = {}
+        self._submitted: dict[Future[Any], object] = {}
 
     def _connect(self, address: str) -> None:
         host, _, port = address.removeprefix("ray://").rpartition(":")
@@ -38,43 +37,24 @@ class RayExecutor(Executor):
             ) from None
 
     def submit(self, function: Callable[..., Any], /, *args: Any, **_: object) -> Future[Any]:
-        """Submit a function of `executors`, whose second argument is the job's name."""
+        """Submit a function; a lost machine, or other software there, is its future's error."""
         remote = self._ray.remote(num_cpus=1)(_with_same_software)
         reference = remote.remote(software_versions(), function, *args)
-        future: Future[Result] = Future()
+        future: Future[Any] = reference.future()
         self._submitted[future] = reference
-
-        def finish(done: Future[Result]) -> None:
-            if self._submitted.pop(future, None) is None:  # cancelled
-                return
-            error = done.exception()
-            if error is None:
-                future.set_result(done.result())
-            else:
-                future.set_result(_failure(args[1], error))
-
-        reference.future().add_done_callback(finish)
+        future.add_done_callback(self._submitted.pop)
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Cancel what still runs, whose simulators end with it, and leave the cluster."""
-        running = list(self._submitted.values())
-        self._submitted.clear()
-        for reference in running:
+        for reference in list(self._submitted.values()):
             self._ray.cancel(reference, force=True)
         self._ray.shutdown()
 
 
-def _failure(name: str, error: BaseException) -> Result:
-    """A job whose machine is lost, or lacks rotorgram or the versions of this machine."""
-    cause = getattr(error, "cause", None) or error
-    reason = str(cause).strip().splitlines()[-1]
-    return Result(name, f"{name}: {reason}", None)
-
-
 def _with_same_software(
-    versions: dict[str, str], function: Callable[..., Result], *args: object
-) -> Result:
+    versions: dict[str, str], function: Callable[..., Any], *args: object
+) -> Any:
     """Call a function; `config.json` names one version of each package. (In a worker.)"""
     for package, here in software_versions().items():
         if here != versions[package]:
