@@ -94,7 +94,7 @@ def _pictures(task: Task) -> tuple[ArraySpec, ...]:
     views = chosen_views(config.cameras, task.vehicle.cameras)
     if not any(view.kind == "segmentation" for view in views):
         return arrays_of(views, ())
-    from ..rendering.camera_model import objects_of
+    from ..rendering.cameras import objects_of
 
     payload = config.effects.payload > 0
     objects = []

@@ -7,11 +7,12 @@ writes them, the labels last. `docs/capture.md` has the layout.
 import io
 import json
 import os
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,6 @@ from ..models.cameras import View
 from ..models.files import software_versions, write_whole
 from ..models.swarm import drone_names
 from ..models.vehicle import Vehicle
-from .coco import Labels, write_coco
 from .executors import OnProgress, Tell, WorkersConfig, open_executor, run_jobs
 from .folders import new_folder
 from .viewpoints import CaptureConfig, PoseSequence, sequences_of
@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 
 _MOST_FRAMES = 64  # of a job
 Picture = NDArray[np.generic]
+Labels = dict[str, Any]
+"""The labels of one frame or picture: an object of JSON."""
+_SAME_VIEW = ("camera", "drone", "width", "height")
 
 
 class _Job(NamedTuple):
@@ -219,3 +222,65 @@ def objects_in(numbers: Picture, names: Sequence[str]) -> Iterator[Labels]:
             "area": len(rows),
             "runs": runs.tolist(),
         }
+
+
+# ---- COCO's format of object detection
+
+
+def write_coco(
+    frames: Sequence[Labels], objects: Iterable[str], settings: Mapping[str, object], file: Path
+) -> None:
+    """Write the objects of all segmentation pictures, with the labels of all frames.
+
+    The categories are the kinds of all objects of the scenes, seen or not. Raises `OSError`.
+    """
+    kinds = sorted(set(map(category, objects)))
+    categories = {kind: number for number, kind in enumerate(kinds, 1)}
+    images: list[Labels] = []
+    annotations: list[Labels] = []
+    for frame in frames:
+        pictures = frame["pictures"]
+        colors = {_view(one): one["file"] for one in pictures if one["kind"] == "rgb"}
+        for picture in pictures:
+            if picture["kind"] != "segmentation":
+                continue
+            # An image is named by the colours of its camera in the same size, if there are any.
+            image = {
+                "id": len(images) + 1,
+                "file_name": colors.get(_view(picture), picture["file"]),
+                "width": picture["width"],
+                "height": picture["height"],
+                "sequence": frame["sequence"],
+                "time": frame["time"],
+            }
+            images.append(image)
+            for thing in picture["objects"]:
+                size = [picture["height"], picture["width"]]
+                annotation = {
+                    "id": len(annotations) + 1,
+                    "image_id": image["id"],
+                    "category_id": categories[category(thing["name"])],
+                    "bbox": thing["box"],
+                    "area": thing["area"],
+                    "iscrowd": 0,
+                    "segmentation": {"size": size, "counts": thing["runs"]},
+                    "object": thing["name"],
+                }
+                annotations.append(annotation)
+    content = {
+        "info": settings,
+        "images": images,
+        "annotations": annotations,
+        "categories": [{"id": number, "name": name} for name, number in categories.items()],
+    }
+    write_whole(file, json.dumps(content, separators=(",", ":")).encode() + b"\n")
+
+
+def category(name: str) -> str:
+    """Kind of an object: its name without numbers, as forest/tree of forest/tree_12."""
+    return re.sub(r"_\d+\b", "", name)
+
+
+def _view(picture: Labels) -> tuple[object, ...]:
+    """Camera, drone and size, which the pictures of one view share."""
+    return tuple(picture[key] for key in _SAME_VIEW)

@@ -170,7 +170,7 @@ def _add_tree(wood: Builder, name: str) -> None:
     trunk = (0.13 + 0.012 * tall, 0.3 * tall, 0)
     wood.add(f"{name}/trunk", "cylinder", trunk, (x, y, 0.3 * tall), f"bark_{kind % 2}")
     crowns = _TREES[kind]["crowns"]
-    aside = (0.0, 0.0)
+    aside = np.zeros(2)
     if any(side for _, side, *_ in crowns):
         aside = wood.rng.uniform(-0.3, 0.3, 2) * wide
     for part, side, height, half_width, by_width, by_height in crowns:

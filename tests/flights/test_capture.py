@@ -13,8 +13,7 @@ import pytest
 from cases import each
 from rotorgram.cli import main
 from rotorgram.flights import capture as capturing
-from rotorgram.flights.capture import capture, objects_in
-from rotorgram.flights.coco import category
+from rotorgram.flights.capture import capture, category, objects_in
 from rotorgram.flights.executors import WorkersConfig
 from rotorgram.flights.viewpoints import CaptureConfig, PoseSequence, sequences_of
 from rotorgram.models import InputError

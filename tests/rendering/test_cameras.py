@@ -19,8 +19,7 @@ from rotorgram.models.export import export_mjcf
 from rotorgram.models.fleet import load_vehicles
 from rotorgram.models.library import vehicle_names
 from rotorgram.models.vehicle import Vehicle
-from rotorgram.rendering.camera_model import objects_of
-from rotorgram.rendering.cameras import Cameras, Lens
+from rotorgram.rendering.cameras import Cameras, Lens, objects_of
 from rotorgram.rendering.gl import offscreen_context
 from rotorgram.sim.rotations import to_world
 
