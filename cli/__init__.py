@@ -155,13 +155,14 @@ def _help() -> str:
 
 
 def _prepare_streams() -> None:
-    """Printing never fails for a stream that is closed or knows ASCII alone."""
+    """Printing shows each line at once, and never fails for a stream that is closed or knows ASCII
+    alone."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115  for as long as we run
         elif isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")
+            stream.reconfigure(errors="replace", line_buffering=True)
 
 
 def _is_of_stdout(error: Exception) -> TypeGuard[OSError]:

@@ -120,7 +120,7 @@ def print_episode(trajectory: Trajectory) -> None:
     if metric := spec.headline:
         value = f"{trajectory.headline[-1]:.3f} {metric.unit}".rstrip()
         words += f", last {metric.symbol or metric.name} {value}"
-    print(words, flush=True)
+    print(words)
 
 
 @contextmanager
@@ -133,7 +133,7 @@ def local_env(
     _check_known(command.env_id)
     config = command.env_config(backend=backend)
     with closing(LocalVectorEnv(config, num_envs, autoreset_mode="Disabled")) as env:
-        print("flying in this process (--udp: over UDP, with a simulator)", flush=True)
+        print("flying in this process (--udp: over UDP, with a simulator)")
         yield env
 
 
@@ -189,7 +189,7 @@ def remote_env(
         try:
             yield env
         finally:
-            print(f"wire: {env.statistics}", flush=True)
+            print(f"wire: {env.statistics}")
 
 
 @contextmanager
@@ -220,7 +220,7 @@ def _waiting(
         if share > 1:
             waited += f" of {share} drones"
         here = "{}:{}".format(*remote.address)
-        print(f"waiting for {waited} at {here} (Ctrl-C ends)", flush=True)
+        print(f"waiting for {waited} at {here} (Ctrl-C ends)")
         remote.connect()
         came = len(remote.env_spec.agents)
         if "drones" in command.given and came != command.drones:

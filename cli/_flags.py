@@ -8,6 +8,7 @@ from typing import (
     TYPE_CHECKING,
     Annotated,
     Any,
+    dataclass_transform,
 )
 
 from tyro.conf import Fixed, Suppress, arg
@@ -42,13 +43,20 @@ Options = dict[str, Any]
 """Options of a task and its env by name, values as of JSON."""
 
 
+@dataclass_transform(kw_only_default=True, frozen_default=True, field_specifiers=(field,))
 @dataclass(frozen=True, kw_only=True)
 class Command:
-    """Base of all commands: the fields are the flags, their docstrings the help."""
+    """Base of all commands: the fields are the flags, their docstrings the help.
+
+    Every class derived from it is a dataclass, as this one.
+    """
 
     given: Suppress[Fixed[frozenset]] = frozenset()  # type: ignore[type-arg]
     """Names of the fields that flags or a config's file set, even to their default; those of a
     task's flags begin with `env.`."""
+
+    def __init_subclass__(cls) -> None:
+        dataclass(frozen=True, kw_only=True)(cls)
 
     def run(self) -> int:
         """Do it; the exit status."""
@@ -59,7 +67,6 @@ class Command:
         return {f.name: getattr(self, f.name) for f in fields(kind) if hasattr(self, f.name)}
 
 
-@dataclass(frozen=True, kw_only=True)
 class EnvFlags(Command):
     """A command that takes any task."""
 
@@ -119,7 +126,6 @@ class EnvFlags(Command):
         return str(self.options.get("scene", "airport"))
 
 
-@dataclass(frozen=True, kw_only=True)
 class BackendFlags(EnvFlags):
     """A command that chooses what steps the drones."""
 
@@ -131,7 +137,6 @@ BackendOfPreset = Annotated[Backend, arg(help_behavior_hint="(default: the prese
 """Type of the flag where a preset names the default."""
 
 
-@dataclass(frozen=True, kw_only=True)
 class WireFlags(EnvFlags):
     """One side of the wire."""
 
@@ -143,7 +148,6 @@ class WireFlags(EnvFlags):
     """MCAP file to write every message to."""
 
 
-@dataclass(frozen=True, kw_only=True)
 class AgentFlags(WireFlags):
     """A command that flies over the wire: the UDP server."""
 

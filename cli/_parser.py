@@ -154,7 +154,8 @@ def _for_tyro(kind: type["DataclassInstance"], options: Any = None) -> Any:
     if options:
         changed["options"] = Annotated[options, arg(name="env", help=_OPTIONS)]
         namespace["options"] = field(default_factory=options)
-    return dataclass(frozen=True, kw_only=True)(type(kind.__name__, (kind,), namespace))
+    made = type(kind.__name__, (kind,), namespace)
+    return made if issubclass(kind, Command) else dataclass(frozen=True, kw_only=True)(made)
 
 
 def _given(words: Sequence[str]) -> frozenset[str]:

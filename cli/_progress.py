@@ -96,4 +96,4 @@ class Lines:
         if words == "done" or now - self._last.get(name, now - _LINE_EVERY) >= _LINE_EVERY:
             self._last[name] = now
             with suppress(OSError):  # no line is worth a run
-                print(f"{name:14} {done:,}/{total:,} {words}".rstrip(), flush=True)
+                print(f"{name:14} {done:,}/{total:,} {words}".rstrip())

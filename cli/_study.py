@@ -3,7 +3,7 @@
 import logging
 import shlex
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -24,7 +24,6 @@ _OF_ROWS = ("preset", "env_steps", "num_envs", "backend")
 _OF_STUDIES = ("seeds", "first_seed", "snapshots", "episodes")
 
 
-@dataclass(frozen=True, kw_only=True)
 class StudyFlags(TrainingFlags, WorkersConfig):
     """A command that trains and evaluates many runs, and reports them."""
 

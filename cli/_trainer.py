@@ -54,8 +54,7 @@ def begin(command: "Train") -> int:
         got = "the defaults of its config" if defaults else f"that of {base.env_id}"
         print(
             f"note: there is no preset of {command.algorithm} for {task}, nor for a task that it "
-            f"derives from: it gets {got}; --preset-of ID names another",
-            flush=True,
+            f"derives from: it gets {got}; --preset-of ID names another"
         )
     config = preset(command.algorithm, command.preset, task, **command.changes())
     backend = command.backend if "backend" in command.given else base.backend
@@ -101,7 +100,7 @@ def resume(command: "Train", folder: Path) -> int:
             print(f"checkpoint: {folder / CHECKPOINT}")
             return 0
         for name, (then, now) in kept.other_versions().items():
-            print(f"note: {name} was {then} and is {now}: the numbers may differ", flush=True)
+            print(f"note: {name} was {then} and is {now}: the numbers may differ")
         backend = kept.env.backend if kept.env else kept.backend
         with _opened(fitted(command, kept), kept.num_envs, backend) as env:
             return _train(command, Training.resume(kept, env), folder)
@@ -131,7 +130,7 @@ def _opened(
 def _train(command: "Train", training: Training, folder: Path) -> int:
     if not find_algorithm(command.algorithm).resumes:
         stopped = "it starts anew" if command.resume else "--resume starts it anew"
-        print(f"note: {command.algorithm} keeps no state of a training: {stopped}", flush=True)
+        print(f"note: {command.algorithm} keeps no state of a training: {stopped}")
     go_on = command.go_on_with(f"train {command.algorithm}", folder, *_WIRE)
     keeper = _Keeper(training, folder, command.store_every)
     try:
@@ -233,7 +232,7 @@ def _stop_at_update() -> Iterator[Callable[[], bool]]:
             raise KeyboardInterrupt
         asked = True
         with suppress(OSError):  # standard output may take no more
-            print("stopping at the next update; Ctrl-C again stops now", flush=True)
+            print("stopping at the next update; Ctrl-C again stops now")
         timer.start()
 
     def reached() -> bool:

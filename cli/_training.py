@@ -3,7 +3,6 @@
 import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 
@@ -13,7 +12,6 @@ from ..models.errors import InputError
 from ._flags import BackendFlags, NamedValues, Options, Words, check_count, parse_value
 
 
-@dataclass(frozen=True, kw_only=True)
 class TrainingFlags(BackendFlags):
     """A command that trains."""
 

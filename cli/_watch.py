@@ -68,6 +68,6 @@ def open_view(command: EnvFlags, drones: int, pace: Pace) -> LiveView:
 def watched(simulator: Simulator, command: "Sim") -> Iterator[None]:
     """Show a simulator during the block."""
     with open_view(command, len(simulator.spec.agents), Pace(0.0)) as view:
-        print("shown in the window", flush=True)
+        print("shown in the window")
         simulator.observer = Watcher(view, simulator)
         yield

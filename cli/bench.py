@@ -1,13 +1,11 @@
 """`rotorgram bench`: env steps per second on this machine."""
 
 import logging
-from dataclasses import dataclass
 from pathlib import Path
 
 from ._flags import Command
 
 
-@dataclass(frozen=True, kw_only=True)
 class Bench(Command):
     """Measure env steps per second on this machine, from raw physics to a simulator over UDP."""
 

@@ -1,6 +1,6 @@
 """`rotorgram benchmark`: train and evaluate the rows of the baselines board."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from ..training.settings import Study
 
 
-@dataclass(frozen=True, kw_only=True)
 class Benchmark(StudyFlags):
     """Train and evaluate agents on tasks with vehicles over the same seeds, and report them.
 

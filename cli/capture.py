@@ -1,6 +1,5 @@
 """`rotorgram capture`: labelled pictures of recorded flights, as a data set."""
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from tyro.conf import Positional
@@ -10,7 +9,6 @@ from ..flights.viewpoints import CaptureConfig
 from ._flags import Command
 
 
-@dataclass(frozen=True, kw_only=True)
 class Capture(Command, CaptureConfig, WorkersConfig):
     """Take pictures of recorded flights, with depth, objects, boxes and poses, as a data set.
 

@@ -1,7 +1,7 @@
 """`rotorgram compare`: the paper's comparison over UDP, or rows of TOML files."""
 
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
@@ -22,7 +22,6 @@ _OF_FILES = ("seeds", "first_seed", "snapshots", "curve_episodes", "episodes", "
 """Settings of a study that all files share."""
 
 
-@dataclass(frozen=True, kw_only=True)
 class Compare(StudyFlags):
     """Train several agents over the same seeds, and report: VPG, A2C and SB3's A2C, or your files.
 

@@ -1,6 +1,5 @@
 """`rotorgram dataset`: journals as a data set for offline reinforcement learning."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -9,7 +8,6 @@ from tyro.conf import Positional
 from ._flags import Command
 
 
-@dataclass(frozen=True, kw_only=True)
 class Dataset(Command):
     """Write the whole episodes of journals as a data set, for Minari or as Parquet.
 

@@ -1,6 +1,5 @@
 """`rotorgram evaluate`: fly episodes without exploration, print the means."""
 
-from dataclasses import dataclass
 from typing import Annotated
 
 from tyro.conf import Positional, arg
@@ -8,7 +7,6 @@ from tyro.conf import Positional, arg
 from ._flags import AgentFlags, BackendFlags, check_count
 
 
-@dataclass(frozen=True, kw_only=True)
 class Evaluate(AgentFlags, BackendFlags):
     """Measure a trained policy or a controller over episodes without exploration."""
 

@@ -1,6 +1,5 @@
 """`rotorgram export`: a trained policy as a file that flies without rotorgram."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -11,7 +10,6 @@ from ..models.files import write_whole
 from ._flags import Command
 
 
-@dataclass(frozen=True, kw_only=True)
 class Export(Command):
     """Write a trained policy as one file that flies without rotorgram."""
 

@@ -1,6 +1,5 @@
 """`rotorgram identify`: numbers of a vehicle from logs of its flights, as a vehicle file."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,7 +11,6 @@ if TYPE_CHECKING:
     from ..flights.identify import Identified
 
 
-@dataclass(frozen=True, kw_only=True)
 class Identify(Command):
     """Identify thrust coefficient, rotor lag, inertia, drag and reaction from logs of flights.
 

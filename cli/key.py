@@ -1,6 +1,5 @@
 """`rotorgram key`: a key for both sides of the wire."""
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from tyro.conf import Positional
@@ -8,7 +7,6 @@ from tyro.conf import Positional
 from ._flags import Command
 
 
-@dataclass(frozen=True, kw_only=True)
 class Key(Command):
     """Write a new key for both sides of the wire. Copy it over a secure channel."""
 

@@ -1,6 +1,5 @@
 """`rotorgram log`: a flight's numbers over time, as CSV or Parquet."""
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from tyro.conf import Positional
@@ -8,7 +7,6 @@ from tyro.conf import Positional
 from ._flags import Command
 
 
-@dataclass(frozen=True, kw_only=True)
 class Log(Command):
     """Write the telemetry, actions and rewards of a journal as a table, the time first.
 

@@ -1,6 +1,5 @@
 """`rotorgram plot`: flights over time, laid over each other, as a figure."""
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from tyro.conf import Positional
@@ -8,7 +7,6 @@ from tyro.conf import Positional
 from ._flags import Command
 
 
-@dataclass(frozen=True, kw_only=True)
 class Plot(Command):
     """Draw what flights have over time: position, attitude, rates, rotors, battery, wind, metrics.
 

@@ -1,7 +1,7 @@
 """`rotorgram render`: flights as films and pictures."""
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from ..flights.filming import FilmTrack
 
 
-@dataclass(frozen=True, kw_only=True)
 class Render(EnvFlags):
     """Film flights: a policy's, or those of a journal; several side by side.
 

@@ -1,6 +1,5 @@
 """`rotorgram replay`: contents of a journal, and whether it simulates to the same bits."""
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from tyro.conf import Positional
@@ -9,7 +8,6 @@ from ..models import Backend
 from ._flags import Command
 
 
-@dataclass(frozen=True, kw_only=True)
 class Replay(Command):
     """Summarize a journal, and simulate it again."""
 

@@ -1,6 +1,5 @@
 """`rotorgram report`: draw the results in a folder."""
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from tyro.conf import Positional
@@ -8,7 +7,6 @@ from tyro.conf import Positional
 from ._flags import Command
 
 
-@dataclass(frozen=True, kw_only=True)
 class Report(Command):
     """Draw figures, tables and page of a study again from its files."""
 

@@ -1,7 +1,6 @@
 """`rotorgram serve`: a policy as a UDP server, for simulators that come."""
 
 import math
-from dataclasses import dataclass
 from typing import Annotated
 
 from tyro.conf import Positional, arg
@@ -9,7 +8,6 @@ from tyro.conf import Positional, arg
 from ._flags import AgentFlags, check_count
 
 
-@dataclass(frozen=True, kw_only=True)
 class Serve(AgentFlags):
     """Fly each simulator that connects, one after the other, with a trained policy or a controller.
 
@@ -42,5 +40,5 @@ class Serve(AgentFlags):
                         print_episode(flown)
                     episode += count
                 except LinkError as error:  # one that leaves is no error: another may come
-                    print(error, flush=True)
+                    print(error)
         return 0

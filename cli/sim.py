@@ -1,7 +1,6 @@
 """`rotorgram sim`: the simulator, a UDP client."""
 
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 from ..models.errors import InputError
@@ -11,7 +10,6 @@ if TYPE_CHECKING:
     from ..udp import Simulator
 
 
-@dataclass(frozen=True, kw_only=True)
 class Sim(BackendFlags, WireFlags):
     """Simulate drones for an agent: the UDP client.
 
@@ -65,13 +63,13 @@ class Sim(BackendFlags, WireFlags):
         there = f"{len(links)} agents" if several else f"the agent at {self.server}"
         with simulator, self._shown(simulator):
             here = "{}:{}".format(*simulator.address)
-            print(f"simulating at {here} for {there} (Ctrl-C ends)", flush=True)
+            print(f"simulating at {here} for {there} (Ctrl-C ends)")
             try:
                 print(simulator.run())
             finally:
                 for link in links:
                     where = " to {}:{}".format(*link.address) if several else ""
-                    print(f"wire{where}: {link.client.statistics}", flush=True)
+                    print(f"wire{where}: {link.client.statistics}")
         return 0
 
     def _shown(self, simulator: "Simulator") -> AbstractContextManager[None]:

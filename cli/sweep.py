@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from itertools import chain, product
 from typing import TYPE_CHECKING, ClassVar
 
@@ -17,7 +16,6 @@ if TYPE_CHECKING:
     from ..training.settings import Row, Study
 
 
-@dataclass(frozen=True, kw_only=True)
 class Sweep(StudyFlags):
     """Train an algorithm over a grid of hyperparameters, every point on the same seeds.
 

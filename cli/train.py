@@ -1,7 +1,6 @@
 """`rotorgram train`: one run with a progress bar, checkpoints, and Ctrl-C that loses nothing."""
 
 import math
-from dataclasses import dataclass
 from typing import Annotated
 
 from tyro.conf import Positional, arg
@@ -12,7 +11,6 @@ from ._flags import AgentFlags, BackendOfPreset
 from ._training import TrainingFlags
 
 
-@dataclass(frozen=True, kw_only=True)
 class Train(AgentFlags, TrainingFlags):
     """Train an agent, in this process or over UDP.
 

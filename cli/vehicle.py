@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -66,7 +65,6 @@ reaction = 0.016                  # N m of torque per N of thrust
 """
 
 
-@dataclass(frozen=True, kw_only=True)
 class Vehicle(Command):
     """Write, show, examine or export the file of a vehicle.
 

@@ -1,7 +1,6 @@
 """`rotorgram view`: flights live, flown in process or read from a journal."""
 
 import time
-from dataclasses import dataclass
 from itertools import chain, count, islice
 from pathlib import Path
 
@@ -14,7 +13,6 @@ from ..scenes import parse_scene
 from ._flags import EnvFlags, check_count
 
 
-@dataclass(frozen=True, kw_only=True)
 class View(EnvFlags):
     """Show flights in a window: in real time, slower or faster.
 
@@ -50,7 +48,7 @@ class View(EnvFlags):
         first = next(flights)
         pace = Pace(first[0].spec.control_period, self.speed)
         with open_view(shown, len(first), pace) as live:
-            print(f"showing {self.what} in the window (Ctrl-C ends)", flush=True)
+            print(f"showing {self.what} in the window (Ctrl-C ends)")
             for flight in islice(chain((first,), flights), self.episodes):
                 shown_moments = [moments(one) for one in flight]
                 longest = max(map(len, shown_moments))
