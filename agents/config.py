@@ -5,6 +5,9 @@ from typing import Annotated, ClassVar, Literal
 
 from ..models.fields import Limits, PositiveInt, check_fields
 
+Positive = Annotated[float, Limits(0.0, 1e30, above=True)]
+"""A number above 0 that float32 holds."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Config:
@@ -16,13 +19,13 @@ class Config:
     """Units of each hidden layer of each network (paper: one of 16)."""
     activation: Literal["relu", "tanh"] = "relu"
     """Of the hidden units (paper: relu)."""
-    learning_rate: Annotated[float, Limits(0.0, 1e30, above=True)] = 0.001
+    learning_rate: Positive = 0.001
     """Of Adam (paper)."""
     anneal: bool = False
     """Lower the learning rate linearly to zero over the run."""
     gamma: Annotated[float, Limits(0.0, 1.0)] = 0.99
     """Discount. The paper names none."""
-    reward_scale: Annotated[float, Limits(0.0, 1e30, above=True)] = 1.0
+    reward_scale: Positive = 1.0
     """Factor of the rewards that it learns from; returns are shown without it."""
     log_std: Annotated[float, Limits(-4.0, 1.0)] = -0.5
     """Initial logarithm of the policy's standard deviation, in units of the action."""
@@ -75,5 +78,5 @@ class SACConfig(RolloutConfig):
     """Transitions of uniform actions before the first update. Table 1 has none."""
     tau: Annotated[float, Limits(0.0, 1.0, above=True)] = 0.005
     """Share of the critics that their targets take over in each update."""
-    alpha: Annotated[float, Limits(0.0, 1e30, above=True)] = 1.0
+    alpha: Positive = 1.0
     """Temperature at the beginning. Table 1 has none."""

@@ -33,6 +33,8 @@ def address_text(address: Address) -> str:
     return f"{address[0]}:{address[1]}"
 
 
+Seconds = Annotated[float, Limits(0, unit="s", above=True)]
+
 Tap = Callable[[int, Message, bytes], None]
 """Sees every message once, when it is first sent or taken: the number of its slot (0 at the
 simulator), the message, and its bytes in the binary codec, whole and not sealed."""
@@ -72,7 +74,7 @@ def largest_datagram(peer: Address) -> int:
 class LinkConfig:
     """Settings of a simulator's exchange."""
 
-    timeout: Annotated[float, Limits(0, unit="s", above=True)] = 120.0
+    timeout: Seconds = 120.0
     """It gives up when nothing has answered for this long, s: longer than an agent waits for one
     to replace another that it has lost."""
     drop: Annotated[float, Limits(0, 1)] = 0.0

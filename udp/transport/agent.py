@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypedDict
+from typing import TYPE_CHECKING, TypedDict
 
 import gymnasium as gym
 
@@ -17,11 +17,11 @@ from ...envs import registry
 from ...envs.config import EnvConfig
 from ...envs.spec import EnvSpec, canonical_id, json_values
 from ...models.errors import InputError, shortened
-from ...models.fields import Limits, check_fields
+from ...models.fields import check_fields
 from ..layouts import layout_of
 from ..protocol import text
 from ..protocol.auth import Key, read_key
-from ..protocol.client import Address, address_text
+from ..protocol.client import Address, Seconds, address_text
 from ..protocol.errors import PeerClosed, PeerSilent
 from ..protocol.layout import Array, Layout
 from ..protocol.messages import Close, Hello, State
@@ -61,8 +61,8 @@ class AgentConfig:
     env_id: str | None = None
     options: Mapping[str, object] | None = None
     vehicle_hash: str | None = None
-    connect_timeout: Annotated[float, Limits(0, unit="s", above=True)] = 60.0
-    timeout: Annotated[float, Limits(0, unit="s", above=True)] = 30.0
+    connect_timeout: Seconds = 60.0
+    timeout: Seconds = 30.0
     key_file: Path | str | None = None
     insecure: bool = False
     record: Path | str | None = None
