@@ -16,12 +16,23 @@ from typing import Annotated
 from ...models.errors import InputError
 from ...models.fields import Limits, check_fields
 from . import binary, text
-from . import messages as m
 from .auth import Key, is_sealed, message_of, sealed
 from .errors import DecodeError, Forged
 from .fragments import FAR, NEAR, Assembler, Transfer, is_fragment
 from .layout import Array, Layout
-from .messages import Command, Message, State, one_line
+from .messages import (
+    Alive,
+    Close,
+    Command,
+    Hello,
+    Message,
+    Missing,
+    State,
+    Unknown,
+    Wait,
+    Welcome,
+    one_line,
+)
 from .statistics import Statistics
 from .transitions import SIMULATOR, SimulatorState
 
@@ -60,7 +71,7 @@ def new_session() -> int:
     return secrets.randbits(64) or 1
 
 
-def critical_extension(message: m.Hello | m.Welcome) -> int | None:
+def critical_extension(message: Hello | Welcome) -> int | None:
     """Number of the first critical extension: we know none."""
     return next((each.number for each in message.extensions if each.critical), None)
 
@@ -182,7 +193,7 @@ class Client:
         outgoing: Datagrams to send to the agent: the caller takes them.
     """
 
-    hello: m.Hello
+    hello: Hello
     layout: Layout
     config: LinkConfig
     _: KW_ONLY
@@ -257,15 +268,15 @@ class Client:
         waits = self.state == "ready" and now > self._answered_at + _SOON
         if self.by_text or not waits or not self.sequence:
             return []
-        alive = binary.encode(m.Alive(session=self.hello.session, sequence=self.sequence))
+        alive = binary.encode(Alive(session=self.hello.session, sequence=self.sequence))
         return sealed([alive], self._sealing)
 
     def close(self, reason: str, now: float) -> None:
         """End the exchange. An agent that has welcomed this simulator is told, until it answers."""
-        if ("sent", m.Close) in SIMULATOR[self.state]:
+        if ("sent", Close) in SIMULATOR[self.state]:
             session = self.hello.session
             number = self.sequence
-            self._send(m.Close(session=session, sequence=number, reason=one_line(reason)), now)
+            self._send(Close(session=session, sequence=number, reason=one_line(reason)), now)
         elif self.state != "closing":
             self._give_up()  # a Hello that was not answered is not repeated
 
@@ -307,7 +318,7 @@ class Client:
         then = SIMULATOR[self.state].get(("received", type(message)))
         number = getattr(message, "sequence", self.sequence)
         # There is one Close in a session, so its number does not matter.
-        if then is None or (number != self.sequence and not isinstance(message, m.Close)):
+        if then is None or (number != self.sequence and not isinstance(message, Close)):
             if isinstance(message, Command) and self.sequence - message.sequence <= 1:
                 self._round_trips.answered_again()
             self._drop("stale", "", now)
@@ -355,38 +366,38 @@ class Client:
         if isinstance(message, Command):
             self._take_command(message, plain, now)
             return message
-        if isinstance(message, m.Missing | m.Wait | m.Alive):
+        if isinstance(message, Missing | Wait | Alive):
             self._wait_on(message, now)
             return None
-        if isinstance(message, m.Welcome) and (reason := self._unfit(message)):
+        if isinstance(message, Welcome) and (reason := self._unfit(message)):
             self._drop("malformed", reason, now)
             return None
         was_closing = self.state == "closing"
         self.state = then
         self._record(message, plain)
-        if isinstance(message, m.Unknown):
+        if isinstance(message, Unknown):
             self.statistics.notice(
                 "the agent does not know this session (any more); beginning a new one"
             )
             self.begin_again(now)
             return None
         self._forget_transfer()
-        if isinstance(message, m.Welcome):
+        if isinstance(message, Welcome):
             self.statistics.counters["sessions"] += 1
             self._nonce = message.nonce
             if self.key:
                 self._sealing = self.key.for_session(message.session, message.nonce)
-        elif isinstance(message, m.Close) and not was_closing:
-            close = m.Close(session=message.session, sequence=self.sequence, reason="")
+        elif isinstance(message, Close) and not was_closing:
+            close = Close(session=message.session, sequence=self.sequence, reason="")
             data = self._encode(close)
             self._put([data])
             self.statistics.counters["sent"] += 1
             self._record(close, data)
         return message
 
-    def _wait_on(self, message: m.Missing | m.Wait | m.Alive, now: float) -> None:
+    def _wait_on(self, message: Missing | Wait | Alive, now: float) -> None:
         """The agent is there, and has no answer yet."""
-        if isinstance(message, m.Missing):
+        if isinstance(message, Missing):
             transfer = self._transfer
             assert transfer is not None
             is_ours = message.kind == binary.peek(transfer.message)[0]
@@ -398,7 +409,7 @@ class Client:
             self._round_trips.sent(now)
             self._put(fragments)
             self._progress(now)
-        elif isinstance(message, m.Alive):  # others are late
+        elif isinstance(message, Alive):  # others are late
             self._round_trips.answered(now, alive=True)
             self._tries = 1
             self._stretch *= _LATER
@@ -451,7 +462,7 @@ class Client:
         self._tries = 1
         self.resend_at = now + self._round_trips.wait(1)
 
-    def _unfit(self, welcome: m.Welcome) -> str:
+    def _unfit(self, welcome: Welcome) -> str:
         """The reason to refuse a Welcome, or ""."""
         low, high = self.hello.versions
         if not low <= welcome.version <= high:
@@ -469,7 +480,7 @@ class Client:
 
     # ---- what is sent
 
-    def _send(self, message: m.Hello | State | m.Close, now: float) -> None:
+    def _send(self, message: Hello | State | Close, now: float) -> None:
         """Send a message and repeat it until it is answered."""
         kind = type(message)
         after = SIMULATOR[self.state]["sent", kind]
@@ -477,13 +488,13 @@ class Client:
         self._record(message, data)
         self._transfer = Transfer(data, self.largest)
         self.state = after
-        self.sequence = 0 if isinstance(message, m.Hello) else message.sequence
+        self.sequence = 0 if isinstance(message, Hello) else message.sequence
         self.sends = self._tries = 1
         self._stretch = 1.0
         self._round_trips.sent(now, first=True)
         self._put(self._transfer.start())
         self.asked_at = now
-        if kind is m.Close:
+        if kind is Close:
             self.resend_at = now + CLOSE_INTERVAL
             self.deadline = now + CLOSE_LINGER
         else:
@@ -504,8 +515,8 @@ class Client:
             self.statistics.counters["dropped"] += 1
         return lost
 
-    def _encode(self, message: m.Hello | State | m.Close) -> bytes:
-        if self.by_text and isinstance(message, State | m.Close):
+    def _encode(self, message: Hello | State | Close) -> bytes:
+        if self.by_text and isinstance(message, State | Close):
             return text.encode(message, self.layout)
         return binary.encode(message, self.layout)
 
@@ -514,7 +525,7 @@ class Client:
             self.tap(0, message, binary.encode(message, self.layout) if self.by_text else data)
 
     def _give_up(self) -> None:
-        self.state = SIMULATOR[self.state]["unsaid", m.Close]
+        self.state = SIMULATOR[self.state]["unsaid", Close]
         self._forget_transfer()
 
     def _forget_transfer(self) -> None:

@@ -13,13 +13,12 @@ from contextlib import suppress
 from typing import NamedTuple, TypeVar
 
 from . import binary, text
-from . import messages as m
 from .auth import OVERHEAD, Key, is_sealed, key_id, message_of
 from .client import CLOSE_INTERVAL, CLOSE_LINGER, Address, critical_extension
 from .errors import DecodeError, Forged, VersionMismatch
 from .fragments import Assembler, asks, is_fragment
 from .layout import Layout
-from .messages import State, one_line
+from .messages import Close, Hello, Message, Refuse, State, Unknown, Wait, Welcome, one_line
 from .session import Event, NoSuchSession, Outbox, Session
 
 _MOST = 1024  # simulators remembered between Hello and State 1, and by text after their Close
@@ -66,7 +65,7 @@ class Server:
 
     def __init__(
         self,
-        accept: Callable[[m.Hello], Layout | str],
+        accept: Callable[[Hello], Layout | str],
         text_layout: Callable[[], Layout | None] = lambda: None,
         *,
         slots: int = 1,
@@ -107,7 +106,7 @@ class Server:
         session = self.slots[slot]
         self.slots[slot] = None
         if session:
-            session.move("unsaid", m.Close)
+            session.move("unsaid", Close)
             del self._seated[session.peer]
 
     def close(self, reason: str, now: float) -> None:
@@ -173,7 +172,7 @@ class Server:
         if holder is None and kind != binary.HELLO:
             raise NoSuchSession
         message = binary.decode(plain, holder.layout if holder else None)
-        if isinstance(message, m.Hello):
+        if isinstance(message, Hello):
             self._receive_hello(message, arrival)
             return None
         if seated:
@@ -182,10 +181,10 @@ class Server:
         return self._receive_opening(opening, message, plain, arrival)
 
     def _receive_seated(
-        self, session: Session, message: m.Message, plain: bytes, arrival: _Arrival
+        self, session: Session, message: Message, plain: bytes, arrival: _Arrival
     ) -> Event | None:
         event = session.receive(message, plain, arrival.now)
-        if event and isinstance(message, m.Close):
+        if event and isinstance(message, Close):
             if session.is_text:
                 last = session.line, message.sequence, arrival.now + _TEXT_REMEMBERED
                 _keep(self._ended_text, session.peer, last)
@@ -238,7 +237,7 @@ class Server:
 
     # ---- Hello
 
-    def _receive_hello(self, hello: m.Hello, arrival: _Arrival) -> None:
+    def _receive_hello(self, hello: Hello, arrival: _Arrival) -> None:
         """Welcome a simulator, refuse it, or let it wait."""
         address = arrival.address
         place = address, hello.session
@@ -255,14 +254,14 @@ class Server:
             self._drop("refused", layout, arrival)
             return
         if not self._has_slot_for(address):
-            wait = binary.encode(m.Wait(session=hello.session))
+            wait = binary.encode(Wait(session=hello.session))
             self.outbox.put([wait], address, self._key)
             return
         session = Session(self.outbox, address, hello.session, layout, hello, key=self._key)
-        session.send_welcome(m.Welcome(session=hello.session, nonce=self._draw_nonce()))
+        session.send_welcome(Welcome(session=hello.session, nonce=self._draw_nonce()))
         _keep(self.openings, place, session)
 
-    def _fit(self, hello: m.Hello) -> Layout | str:
+    def _fit(self, hello: Hello) -> Layout | str:
         """The layout of a simulator that is accepted, or the reason to refuse it."""
         if self._closed:
             return "the agent has closed"
@@ -278,7 +277,7 @@ class Server:
         """Refuse a Hello, with no more bytes than those that came."""
         room = len(arrival.datagram) - _REASON_AT - (OVERHEAD if key else 0)
         if room >= 0:
-            refuse = m.Refuse(session=number, reason=_cut(reason, room))
+            refuse = Refuse(session=number, reason=_cut(reason, room))
             self.outbox.put([binary.encode(refuse)], arrival.address, key)
 
     def _assemble(
@@ -303,14 +302,14 @@ class Server:
     # ---- sessions that were welcomed, and slots
 
     def _receive_opening(
-        self, opening: Session, message: m.Message, plain: bytes, arrival: _Arrival
+        self, opening: Session, message: Message, plain: bytes, arrival: _Arrival
     ) -> Event | None:
         """Take a message of a session that was welcomed."""
         if isinstance(message, State):
             return self._join(opening, message, plain, arrival)
-        if isinstance(message, m.Close):
+        if isinstance(message, Close):
             del self.openings[opening.peer, opening.number]
-            opening.move("received", m.Close)
+            opening.move("received", Close)
             goodbye = binary.encode(opening.goodbye(""))
             self.outbox.put([goodbye], arrival.address, opening.session_key())
         else:
@@ -336,9 +335,9 @@ class Server:
         layout = self._fit(opening.hello)  # another one may have come since its Hello
         if isinstance(layout, str):
             reason = _cut(layout, len(plain) - _REASON_AT)
-            close = m.Close(session=opening.number, sequence=1, reason=reason)
+            close = Close(session=opening.number, sequence=1, reason=reason)
             self.outbox.put([binary.encode(close)], peer, opening.session_key())
-            opening.move("sent", m.Close)
+            opening.move("sent", Close)
             self._drop("refused", layout, arrival)
             return None
         if not self._has_slot_for(peer) or self._has(opening.number, elsewhere=peer):
@@ -379,7 +378,7 @@ class Server:
             self._drop("foreign", f"session {number:016x}", arrival)
             return
         self.statistics.counters["foreign"] += 1  # mostly after a restart: no notice
-        reply = binary.encode(m.Unknown(session=number, sequence=sequence))
+        reply = binary.encode(Unknown(session=number, sequence=sequence))
         if self._key:  # of use only to the simulator that has sent this State
             reply = self._key.seal(reply, arrival.datagram)
         self.outbox.put([reply], arrival.address, None)
@@ -404,7 +403,7 @@ class Server:
             if event and isinstance(message, State):
                 session.line = datagram
             return event
-        if isinstance(message, m.Close):
+        if isinstance(message, Close):
             self.statistics.counters["foreign"] += 1
             return None
         last, number, until = self._ended_text.get(address, (b"", 0, 0.0))
@@ -427,7 +426,7 @@ class Server:
         self, sequence: int, cause: str, reason: str, arrival: _Arrival, is_close: bool = False
     ) -> None:
         """Answer a line that is not flown, with no more bytes than it has."""
-        line = text.encode(m.Close(session=0, sequence=sequence, reason=""))
+        line = text.encode(Close(session=0, sequence=sequence, reason=""))
         # Two agents would answer each other's Closes for ever.
         if not is_close and len(line) <= len(arrival.datagram):
             self.outbox.put([line], arrival.address, None)

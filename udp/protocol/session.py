@@ -8,13 +8,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from . import binary, text
-from . import messages as m
 from .auth import Key, sealed
 from .client import Address, Tap, largest_datagram
 from .errors import DecodeError
 from .fragments import Assembler, Transfer, asks
 from .layout import Array, Layout
-from .messages import Command, Message, State, one_line
+from .messages import Alive, Close, Command, Hello, Message, Missing, State, Welcome, one_line
 from .statistics import Statistics
 from .transitions import AGENT, AgentState, Way
 
@@ -27,7 +26,7 @@ class Event(NamedTuple):
     """The effect of a datagram."""
 
     slot: int
-    message: State | m.Close
+    message: State | Close
     joined: bool = False
     """The State is the first of a new session, which may have taken the slot of another."""
 
@@ -61,12 +60,12 @@ class Session:
     peer: Address  # address of the simulator
     number: int  # session number; 0 with the text codec
     layout: Layout
-    hello: m.Hello | None  # none with the text codec, and so is `welcome`
+    hello: Hello | None  # none with the text codec, and so is `welcome`
     # The shared key, and that of the session once it has a slot; None without keys.
     key: Key | None = None
     line: bytes = b""  # its last line, by text
     state: AgentState = "new"
-    welcome: m.Welcome | None = None
+    welcome: Welcome | None = None
     slot: int = -1  # its slot; -1 before it has one
     sequence: int = 0  # number of the State that came last
     reply: Transfer | None = None  # the answer to the last State, or the Welcome
@@ -93,10 +92,10 @@ class Session:
 
     # ---- what is sent
 
-    def send_welcome(self, welcome: m.Welcome) -> None:
+    def send_welcome(self, welcome: Welcome) -> None:
         """Open the session for its State 1."""
         self.welcome = welcome
-        self.move("sent", m.Welcome)
+        self.move("sent", Welcome)
         self._send(binary.encode(welcome))
 
     def send_command(
@@ -129,13 +128,13 @@ class Session:
         """End the exchange."""
         close = self.goodbye(reason)
         data = self._encode(close)
-        self.move("sent", m.Close)
+        self.move("sent", Close)
         self._send(data)
         self._record(close, data)
 
-    def goodbye(self, reason: str) -> m.Close:
+    def goodbye(self, reason: str) -> Close:
         """A Close of this session."""
-        return m.Close(session=self.number, sequence=self.sequence, reason=one_line(reason))
+        return Close(session=self.number, sequence=self.sequence, reason=one_line(reason))
 
     def repeat(self) -> None:
         """Send the last answer again, the same bytes."""
@@ -147,8 +146,8 @@ class Session:
         if self.state != "deciding":
             self.repeat()
         elif not self.is_text:
-            alive = m.Alive(session=self.number, sequence=self.sequence)
-            self.move("sent", m.Alive)
+            alive = Alive(session=self.number, sequence=self.sequence)
+            self.move("sent", Alive)
             self.outbox.put([binary.encode(alive)], self.peer, self.key)
 
     def _record(self, message: Message, data: bytes) -> None:
@@ -156,7 +155,7 @@ class Session:
         if self.outbox.tap:
             self.outbox.tap(self.slot, message, data)
 
-    def _encode(self, message: Command | m.Close) -> bytes:
+    def _encode(self, message: Command | Close) -> bytes:
         return text.encode(message) if self.is_text else binary.encode(message, self.layout)
 
     def _send(self, data: bytes) -> None:
@@ -202,22 +201,22 @@ class Session:
             return None
         if is_state and number > self.sequence + 1 and not self.is_text:
             raise NoSuchSession
-        is_due = number == self.sequence + is_state or isinstance(message, m.Close)
+        is_due = number == self.sequence + is_state or isinstance(message, Close)
         if not is_due or ("received", type(message)) not in AGENT[self.state]:
             self._drop("stale", now)
             return None
         if isinstance(message, State):
             return self.take_state(message, plain, now)
-        if isinstance(message, m.Close):
+        if isinstance(message, Close):
             self._record(message, plain)
             if self.state != "closing":
                 self.send_close("")
-            self.move("received", m.Close)
+            self.move("received", Close)
             return Event(self.slot, message)
         self.move("received", type(message))
-        if isinstance(message, m.Alive):
+        if isinstance(message, Alive):
             self.heard_at = now
-        elif isinstance(message, m.Missing) and self.reply and message.kind == binary.COMMAND:
+        elif isinstance(message, Missing) and self.reply and message.kind == binary.COMMAND:
             self.outbox.put(self.reply.resend(message), self.peer, self.key, "resent")
         else:
             self._drop("stale", now)
