@@ -11,13 +11,15 @@ from ..models.errors import InputError
 from .networks import ByName, Floats
 from .policies import Observation, flat
 
+Array = np.ndarray
+
 DAMPING = 0.5  # Damping ratio of a payload's swing
 FILTER = 20.0  # Rate of the filters over that of the position loop
 OVER = 2.5  # Gain of the velocity loop over the position loop's: `sim/control/gains.py`
 JUMP = 4.0  # Speed of a goal, over the craft's largest, from which on it has jumped
 _ACTION = ("offset x", "offset y", "offset z", "offset of the heading")
 _PAYLOAD = ("payload - position", "payload velocity - velocity")
-_VECTORS = ("goal - position", "velocity", "thrust axis")
+_VECTORS = ("goal - position", "velocity", "thrust axis", "nose")
 
 
 class Geometric:
@@ -51,15 +53,15 @@ class Geometric:
         self._scale = spec.action_scale
         seen = [name for array in spec.observation for name in component_names(array)]
         places = {name: place for place, name in enumerate(seen)}
-        self._at = {v: _vector(places, v) for v in (*_VECTORS, "nose", *_PAYLOAD)}
-        for vector in (*_VECTORS, "nose"):
+        self._at = {v: _vector(places, v) for v in (*_VECTORS, *_PAYLOAD)}
+        for vector in _VECTORS:
             if not self._at[vector]:
                 raise InputError(
                     f"geometric: expected the observation '{vector} x', "
                     f"got {spec.env_id} without it"
                 )
         self._rotors = [place for name, place in places.items() if name.endswith(" over hover")]
-        self._swing: np.ndarray | None = None
+        self._swing: Array | None = None
         self._pull = 0.0  # of the payload on the craft, m/s² per m that it hangs aside
         share = spec.options.get("payload_share")
         cable = spec.options.get("cable")
@@ -103,7 +105,7 @@ class Geometric:
         clipped: Floats = np.clip(action, -1.0, 1.0).astype(np.float32)
         return clipped
 
-    def _steadied(self, now: ByName, before: ByName, goes: np.ndarray) -> np.ndarray:
+    def _steadied(self, now: ByName, before: ByName, goes: Array) -> Array:
         """The offset at which the loops ask for the acceleration of `swing_gains`, m."""
         assert self._swing is not None
         faster = (now["force"] - before["force"]) / self._period
@@ -112,10 +114,10 @@ class Geometric:
         seen = (from_goal, moves, *(now[name] for name in _PAYLOAD), now["force"], faster)
         wanted = goes - self._pushed - self._swing @ np.array(seen)
         k = self._gain
-        offset: np.ndarray = wanted / (OVER * k * k) + now["velocity"] / k
+        offset: Array = wanted / (OVER * k * k) + now["velocity"] / k
         return offset
 
-    def _follow(self, now: ByName) -> np.ndarray:
+    def _follow(self, now: ByName) -> Array:
         """Filter the goal's velocity and what pushes; return the goal's acceleration, m/s²."""
         before = self._before
         period = self._period
@@ -131,7 +133,7 @@ class Geometric:
         if np.abs(moving).max() > JUMP * self._scale[0] * self._gain:
             self._moving = np.zeros(3)
             return np.zeros(3)
-        change: np.ndarray = self._share * (moving - self._moving)
+        change: Array = self._share * (moving - self._moving)
         self._moving = self._moving + change
         return change / period
 
@@ -142,7 +144,7 @@ def _vector(places: Mapping[str, int], name: str) -> list[int]:
     return [places[one] for one in names] if places.keys() >= {*names} else []
 
 
-def swing_gains(position: float, frequency: float, share: float) -> np.ndarray:
+def swing_gains(position: float, frequency: float, share: float) -> Array:
     """Gains K of the acceleration -K s that a craft with a payload asks for, shape (6,).
 
     The feedback of F. Goodarzi, D. Lee and T. Lee, "Geometric Stabilization of a Quadrotor UAV with
@@ -176,5 +178,5 @@ def swing_gains(position: float, frequency: float, share: float) -> np.ndarray:
     polynomial = np.polymul(np.polymul(craft, thrust), damped)
     reached = 2 * p * p * np.column_stack([power[:, 5] for power in powers[:6]])
     wanted = sum(c * power for c, power in zip(polynomial, reversed(powers), strict=True))
-    gains: np.ndarray = np.linalg.solve(reached.T, np.eye(6)[5]) @ wanted
+    gains: Array = np.linalg.solve(reached.T, np.eye(6)[5]) @ wanted
     return gains

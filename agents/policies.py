@@ -11,9 +11,10 @@ from .config import Config
 from .heads import Categorical, Gaussian, Head
 from .networks import Floats, Module, Tanh, Weights, make_network
 
-Observation = np.ndarray | Mapping[str, np.ndarray]
+Array = np.ndarray
+Observation = Array | Mapping[str, Array]
 """As an env gives it."""
-Action = np.ndarray | int
+Action = Array | int
 """As an env takes it."""
 
 
@@ -27,7 +28,7 @@ class Policy(Protocol):
         """The action for an observation, both as the env has them."""
 
 
-def flat(observations: Observation, spec: EnvSpec, *lead: int) -> np.ndarray:
+def flat(observations: Observation, spec: EnvSpec, *lead: int) -> Array:
     """Observations as networks take them: float32, shape (*lead, n).
 
     Given is an array of shape (*lead, ...), or a mapping with one for each array of the spec.
@@ -84,13 +85,13 @@ class ActionMap:
         self.high = high.astype(np.float32)
         self._plain = bool((self.middle == 0).all() and (self.half == 1).all())
 
-    def to_envs(self, actions: np.ndarray) -> np.ndarray:
+    def to_envs(self, actions: Array) -> Array:
         """Drawn actions (N, k) as the env's: float32, (N, k), inside the bounds; or int64, (N,)."""
         if self.discrete:
             return actions[:, 0].astype(np.int64)
         if not self._plain:
             actions = self.middle + self.half * actions
-        clipped: np.ndarray = np.minimum(np.maximum(actions, self.low), self.high)
+        clipped: Array = np.minimum(np.maximum(actions, self.low), self.high)
         return clipped
 
 

@@ -27,7 +27,7 @@ from ..models.fields import Limits, OrNone, check
 from .layouts import layout_of
 from .protocol.client import Address
 from .protocol.layout import MAX_DRONES, Array
-from .protocol.messages import FLY, FREEZE, MAX_UINT64, RESET, State
+from .protocol.messages import FLY, FREEZE, MAX_UINT64, RESET
 from .protocol.statistics import Statistics
 from .transport.agent import Agent, AgentConfig, AgentSettings
 from .transport.simulator import DEFAULT_AGENT
@@ -150,16 +150,13 @@ class RemoteEnv(_Remote, gym.Env[Observation, ArrayLike]):
             was_reset = not self._agent.lost[0]
         self._flying = True
         self._state = self._agent.states[0]
-        return self._observation(self._state), self._info(self._state)
+        return self._observation(), self._info()
 
     def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, Info]:
         """Fly for one control period. The action is sent in the dtype of its space."""
         if not self._flying:
             raise gym.error.ResetNeeded("step: expected a call of reset() first")
-        actions = np.asarray(action)
-        if actions.dtype != self._dtype or actions.shape != self._row:
-            actions = _checked_actions(actions, self._dtype, self._row)
-        actions = actions[np.newaxis]
+        actions = _checked_actions(action, self._dtype, self._row)[np.newaxis]
         self._flying = False  # until the answer is there
         try:
             self._agent.exchange({0: (actions, _FLY, None)})
@@ -167,14 +164,12 @@ class RemoteEnv(_Remote, gym.Env[Observation, ArrayLike]):
             self._flying = True
             raise
         if reason := self._agent.lost[0]:
-            info = {**self._info(self._state), LOST: reason}
-            return self._observation(self._state), 0.0, False, True, info
+            return self._observation(), 0.0, False, True, {**self._info(), LOST: reason}
         self._state = state = self._agent.states[0]
         terminated = state.terminated.item()
         truncated = state.truncated.item()
         self._flying = not (terminated or truncated)
-        observation = self._observation(state)
-        return observation, state.rewards.item(), terminated, truncated, self._info(state)
+        return self._observation(), state.rewards.item(), terminated, truncated, self._info()
 
     def close(self) -> None:
         """Tell the simulator and close the socket. May be called again."""
@@ -195,16 +190,16 @@ class RemoteEnv(_Remote, gym.Env[Observation, ArrayLike]):
         self._names = telemetry_names(spec)
         self._take_actions(spec, 1)
 
-    def _observation(self, state: State) -> Observation:
+    def _observation(self) -> Observation:
         """As the space has it, a copy."""
-        arrays = state.observations
+        arrays = self._state.observations
         if len(arrays) == 1:
             return np.array(arrays[0][0])
         return {name: np.array(a[0]) for name, a in zip(self._arrays, arrays, strict=True)}
 
-    def _info(self, state: State) -> Info:
+    def _info(self) -> Info:
         numbers: list[float] = []
-        for array in state.telemetry:
+        for array in self._state.telemetry:
             numbers += array.ravel().tolist()
         return dict(zip(self._names, numbers, strict=True))
 

@@ -304,7 +304,7 @@ def test_a_training_that_writes_nothing_leaves_the_name_of_its_folder_free(
     def full(path: Path, data: bytes) -> None:
         raise OSError(28, "No space left on device", str(path))
 
-    monkeypatch.setattr(_trainer, "write_whole", full)
+    monkeypatch.setattr(_trainer, "write_json", full)
     err = refused(capsys, "train", "a2c", "--out", tmp_path / "run")
     assert err == f"rotorgram: {tmp_path}/run/config.json: No space left on device\n"
     assert list(tmp_path.iterdir()) == []
