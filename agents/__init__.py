@@ -30,21 +30,4 @@ __all__ = [
     "find_algorithm", "find_preset", "load", "make_agent", "preset", "resume_agent", "store",
 ]  # fmt: skip
 
-_names = {
-    ".a2c": ("A2CConfig",),
-    ".checkpoints": ("Checkpoint", "CheckpointError", "load", "store"),
-    ".config": ("Config", "SACConfig"),
-    ".controllers": ("CONTROLLERS",),
-    ".episodes": ("Episode", "EpisodeRecorder", "ResumeError", "episode_seed"),
-    ".geometric": ("Geometric",),
-    ".making": ("make_agent", "resume_agent"),
-    ".orca": ("Orca",),
-    ".pid": ("PID",),
-    ".policies": ("NetworkPolicy", "Policy"),
-    ".ppo": ("PPOConfig",),
-    ".presets": ("find_preset", "preset"),
-    ".registry": ("ALGORITHMS", "Agent", "AlgorithmName", "find_algorithm"),
-    ".vpg": ("VPGConfig",),
-}
-_modules = {name: module for module, names in _names.items() for name in names}
-__getattr__ = import_when_used(__name__, _modules)
+__getattr__ = import_when_used(__name__)

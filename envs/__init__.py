@@ -30,10 +30,7 @@ __all__ = [
     "Metric", "Outcome", "SingleEnv", "Task", "TaskOptions", "make", "make_vec", "register",
 ]  # fmt: skip
 
-_modules = dict.fromkeys(("Outcome", "Task", "TaskOptions"), ".tasks.task")  # they need MuJoCo
-_modules |= {"EnvConfig": ".config", "Loop": ".loop"}
-_modules |= {"LocalVectorEnv": ".vector", "SingleEnv": ".single"}
-__getattr__ = import_when_used(__name__, _modules)
+__getattr__ = import_when_used(__name__)
 
 for _module, _name in (
     ("elevation", "Elevation"),

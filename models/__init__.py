@@ -3,10 +3,10 @@
 Importing this package does not import MuJoCo: `Vehicle` does so on first use.
 """
 
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal, get_args
 
+from .. import import_when_used
 from .errors import InputError, MissingPackage
 
 if TYPE_CHECKING:
@@ -28,9 +28,4 @@ MAX_DRONES = 1024
 MAX_DRAG = 100.0
 """Largest linear drag, 1/s. RK4 at 10 ms is within 0.1 % there, and unstable above 278 /s."""
 
-
-def __getattr__(name: str) -> object:
-    """Import on first use the names that need MuJoCo (PEP 562)."""
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(".vehicle", __name__), name)
+__getattr__ = import_when_used(__name__)

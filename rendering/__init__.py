@@ -3,9 +3,9 @@
 Importing this package imports none of its modules and no OpenGL: training never draws.
 """
 
-from importlib import import_module
 from typing import TYPE_CHECKING
 
+from .. import import_when_used
 from ..models.errors import NoOpenGL
 
 if TYPE_CHECKING:
@@ -15,9 +15,4 @@ __all__ = [
     "CAMERAS", "Camera", "Canvas", "MetricValue", "Moment", "NoOpenGL", "Stage",
 ]  # fmt: skip
 
-
-def __getattr__(name: str) -> object:
-    """Import names on first use (PEP 562)."""
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(".stage", __name__), name)
+__getattr__ = import_when_used(__name__)

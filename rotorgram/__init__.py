@@ -7,7 +7,8 @@
 """
 
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from functools import cache
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -17,10 +18,18 @@ if _runs_ours and not sys.flags.safe_path:
     del sys.path[0]
 
 if TYPE_CHECKING:
-    from gymnasium import make, make_vec
-
     from .agents import load
-    from .envs import EnvConfig, LocalVectorEnv, Loop, Outcome, Task, TaskOptions, register
+    from .envs import (
+        EnvConfig,
+        LocalVectorEnv,
+        Loop,
+        Outcome,
+        Task,
+        TaskOptions,
+        make,
+        make_vec,
+        register,
+    )
     from .models import Vehicle
     from .udp import RemoteEnv, RemoteVectorEnv
 
@@ -30,18 +39,30 @@ __all__ = [
 ]  # fmt: skip
 
 
-def import_when_used(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
-    """`__getattr__` of a package (PEP 562) that imports each name from its module on first use."""
+def import_when_used(package: str) -> Callable[[str], Any]:
+    """`__getattr__` of a package (PEP 562) that imports each name when it is first used.
+
+    The package's own imports under `if TYPE_CHECKING` say from where.
+    """
+
+    @cache
+    def modules() -> dict[str, str]:
+        import ast
+        from pkgutil import get_data
+
+        found: dict[str, str] = {}
+        for node in ast.walk(ast.parse(get_data(package, "__init__.py") or "")):
+            if isinstance(node, ast.ImportFrom):
+                module = "." * node.level + (node.module or "")
+                found |= {one.name: module for one in node.names}
+        return found
 
     def find(name: str) -> object:
-        if name not in modules:
+        if name not in modules():
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        return getattr(import_module(modules[name], package), name)
+        return getattr(import_module(modules()[name], package), name)
 
     return find
 
 
-_modules = dict.fromkeys(__all__, ".envs")
-_modules |= {"RemoteEnv": ".udp", "RemoteVectorEnv": ".udp", "Vehicle": ".models"}
-_modules |= {"load": ".agents"}
-__getattr__ = import_when_used(__name__, _modules)
+__getattr__ = import_when_used(__name__)

@@ -4,10 +4,10 @@ Pictures show them; physics does not know them. Importing this package does not 
 """
 
 import re
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from .. import import_when_used
 from ..models.errors import InputError, shortened
 
 if TYPE_CHECKING:
@@ -62,8 +62,4 @@ def scenes_of(text: str) -> tuple[str, ...]:
     return tuple(f"{name}:{seed}" for seed in seeds)
 
 
-def __getattr__(name: str) -> object:
-    """Import on first use the names that need MuJoCo (PEP 562)."""
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(".build", __name__), name)
+__getattr__ = import_when_used(__name__)

@@ -4,9 +4,9 @@
 envs of it, and `journal` files. The protocol needs no Gymnasium.
 """
 
-from importlib import import_module
 from typing import TYPE_CHECKING
 
+from .. import import_when_used
 from .protocol.client import Address, LinkConfig
 from .protocol.errors import DecodeError, LinkError, PeerClosed, PeerSilent, Refused
 
@@ -31,11 +31,4 @@ __all__ = [
     "Simulator",
 ]
 
-
-def __getattr__(name: str) -> object:
-    """Import what needs Gymnasium on first use (PEP 562)."""
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    is_remote = name == "LOST" or name.startswith("Remote")
-    module = import_module(".remote" if is_remote else ".transport.simulator", __name__)
-    return getattr(module, name)
+__getattr__ = import_when_used(__name__)
