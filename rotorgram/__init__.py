@@ -7,9 +7,10 @@
 """
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache
 from importlib import import_module
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 # `python -m rotorgram.cli`: no file of the working directory takes the place of a package.
@@ -39,10 +40,12 @@ __all__ = [
 ]  # fmt: skip
 
 
-def import_when_used(package: str) -> Callable[[str], Any]:
+def import_when_used(
+    package: str, others: Mapping[str, str] = MappingProxyType({})
+) -> Callable[[str], Any]:
     """`__getattr__` of a package (PEP 562) that imports each name when it is first used.
 
-    The package's own imports under `if TYPE_CHECKING` say from where.
+    The package's own imports under `if TYPE_CHECKING` say from where, and `others` by name.
     """
 
     @cache
@@ -50,7 +53,7 @@ def import_when_used(package: str) -> Callable[[str], Any]:
         import ast
         from pkgutil import get_data
 
-        found: dict[str, str] = {}
+        found = dict(others)
         for node in ast.walk(ast.parse(get_data(package, "__init__.py") or "")):
             if isinstance(node, ast.ImportFrom):
                 module = "." * node.level + (node.module or "")
