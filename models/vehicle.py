@@ -23,6 +23,7 @@ from .coefficients import PREFIX, Coefficients
 from .errors import InputError, one_line
 from .fields import Limits, check
 from .library import find_vehicle
+from .matrices import inverse, product, right_inverse, settled
 from .mjcf import free_body, level_data, vehicle_spec
 from .vehicle_file import inertia_matrix, model_of, read_vehicle_file
 
@@ -139,7 +140,7 @@ class Vehicle:
         solid = craft_geoms(model)
         solid &= (model.geom_contype | model.geom_conaffinity) > 0
         reach = np.linalg.norm(data.geom_xpos, axis=1) + model.geom_rbound
-        return float(reach[solid].max(initial=0.0))
+        return float(settled(reach[solid].max(initial=0.0)))
 
     @cached_property
     def cameras(self) -> tuple[Camera, ...]:
@@ -167,7 +168,8 @@ class Vehicle:
         The axis is a unit vector in the body frame, shape (3,), and its sign matters. The craft is
         at rest, and what its rotors do to the other axes and to its height does not count.
         """
-        per_newton = np.asarray(axis) @ np.linalg.solve(self.inertia, self.allocation[1:])
+        turned = product(inverse(self.inertia), self.allocation[1:])
+        per_newton = product(np.array([axis]), turned)
         return float((per_newton * (self.thrust_low, self.thrust_high)).max(axis=0).sum())
 
     def substeps(self, period: float) -> int:
@@ -330,7 +332,8 @@ def _load(path: Path, drag: float, changed: tuple[int, ...]) -> Vehicle:
     gravity = -float(model.opt.gravity[2])
     body = int(model.jnt_bodyid[0])
     mass = float(model.body_subtreemass[body])
-    center = data.subtree_com[body].copy()
+    center = settled(data.subtree_com[body])
+    inertia = inertia_matrix(data.crb[body, :6])
     rotors = tuple(_read_rotor(model, data, index) for index in range(model.nu))
     allocation = _allocate(rotors, center)
     model.dof_damping[0:3] = drag * mass
@@ -344,7 +347,7 @@ def _load(path: Path, drag: float, changed: tuple[int, ...]) -> Vehicle:
         mass=mass,
         gravity=gravity,
         center_of_mass=center,
-        inertia=inertia_matrix(data.crb[body, :6]),
+        inertia=settled(inertia, inertia.max()),
         rotors=rotors,
         allocation=allocation,
         hover_thrust=_hover(rotors, allocation, mass * gravity),
@@ -408,13 +411,14 @@ def _read_rotor(model: MjModel, data: MjData, index: int) -> Rotor:
     if fault:
         raise InputError(f"vehicle: expected {fault}")
     turn = data.site_xmat[site].reshape(3, 3)
+    turned = product(np.array((force, torque)), turn.T) * math.copysign(1 / size, newtons)
+    axis, reaction = settled(turned).tolist()
     low, high = sorted((model.actuator_ctrlrange[index] * abs(newtons)).tolist())
-    sign = math.copysign(1.0, newtons)
     return Rotor(
         name=name,
-        position=tuple(data.site_xpos[site].tolist()),
-        axis=tuple((turn @ force * (sign / size)).tolist()),
-        reaction=tuple((turn @ torque * (sign / size)).tolist()),
+        position=tuple(settled(data.site_xpos[site]).tolist()),
+        axis=tuple(axis),
+        reaction=tuple(reaction),
         low=low,
         high=high,
         newtons=abs(newtons),
@@ -433,10 +437,9 @@ def _hover(rotors: tuple[Rotor, ...], allocation: Array, weight: float) -> Array
     total = float(allocation[0].sum())
     thrust = np.full(len(rotors), weight / total if total > 0 else 0.0)
     if np.abs(allocation @ thrust - wanted).max() > _RELATIVE * scale:
-        thrust = np.linalg.lstsq(allocation, wanted, rcond=None)[0]
+        thrust = weight * right_inverse(allocation)[:, 0]
     if np.abs(sideways @ thrust).max() > _ROUNDED * weight:
-        every = np.vstack((allocation, sideways))
-        thrust = np.linalg.lstsq(every, np.append(wanted, (0.0, 0.0)), rcond=None)[0]
+        thrust = weight * right_inverse(np.vstack((allocation, sideways)))[:, 0]
     turns = np.abs(allocation @ thrust - wanted).max() > 1e-6 * scale
     if turns or np.abs(sideways @ thrust).max() > _ROUNDED * weight:
         raise InputError(

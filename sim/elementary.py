@@ -19,7 +19,6 @@ from .state import Array, floor
 _TURN = 0.6366197723675814  # 2 / π
 _SQRT_HALF = 0.7071067811865476
 _EIGHTH = 0.41421356237309503  # tan(π / 8)
-_NOTHING = 1e-13  # of a number: what rounding leaves
 _INFINITY = math.inf
 _NAN = math.nan
 _ROUNDING = 2.0**52  # Added to a smaller number of float64, it leaves no bit for its fraction
@@ -301,26 +300,6 @@ def log(x: Array) -> Array:
 def power(x: Array, y: Array) -> Array:
     """x to the power y, for normal numbers x > 0, within 1 + 3 |y log x| ulp."""
     return exp(y * log(x))
-
-
-# ---- of matrices
-
-
-def inverse(matrix: np.ndarray) -> np.ndarray:
-    """Inverse of positive definite matrices, shape (..., n, n), by Gauss and Jordan.
-
-    A row that depends on those before it is left out, with its column.
-    """
-    count = matrix.shape[-1]
-    unit = np.broadcast_to(np.eye(count), matrix.shape)
-    rows = np.concat((matrix, unit), axis=-1)
-    for i in range(count):
-        pivot = rows[..., i, i, None]
-        is_nothing = pivot < _NOTHING * matrix[..., i, i, None]
-        row = rows[..., i, :] / np.where(is_nothing, _INFINITY, pivot)
-        rows = rows - rows[..., :, i, None] * row[..., None, :]
-        rows[..., i, :] = row
-    return rows[..., count:]
 
 
 for _ufunc, _ours in (

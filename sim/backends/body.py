@@ -16,6 +16,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from ...models import matrices
 from ...models.vehicle import Vehicle
 from .. import elementary
 from ..randomize import CENTER
@@ -237,24 +238,31 @@ def _euler(inertia: np.ndarray) -> tuple[Array, Array]:
 
     Each axis has its list of terms: k times component i times component j of the rates.
     """
-    inverse = np.linalg.inv(inertia)
-    terms = -np.einsum("il,ljm,mk->ijk", inverse, _CROSS, inertia)
+    turn, terms = _turning(inertia)
     least = _NOTHING * abs(terms).max()
     found = []
     for axis in terms:
         folded = np.triu(axis + axis.T) - np.diag(np.diag(axis))
         places = np.argwhere(abs(folded) > least).tolist()
         found.append([(j, k, float(folded[j, k])) for j, k in places])
-    return _sparse(inverse), found
+    return _sparse(turn), found
 
 
 def _euler_of_each(inertia: Array) -> tuple[Array, Array]:
     """The same of inertias (W, 3, 3): vectors."""
-    turn = np.linalg.inv(inertia)
-    products = -np.einsum("wil,ljm,wmk->ijkw", turn, _CROSS, inertia)
+    turn, terms = _turning(inertia)
+    products = np.moveaxis(terms, 0, -1)
     pairs = [(j, k) for j in range(3) for k in range(3)]
     rows = [[turn[:, i, j] for j in range(3)] for i in range(3)]
     return rows, [[(j, k, axis[j, k]) for j, k in pairs] for axis in products]
+
+
+def _turning(inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Inverses of inertias (..., 3, 3), and -I⁻¹ (ω × I ω) as factors of ω ωᵀ, (..., 3, 3, 3)."""
+    turn = matrices.inverse(inertia)
+    torques = matrices.product(_CROSS, inertia[..., None, :, :])
+    turned = matrices.product(turn, torques.reshape(*inertia.shape[:-1], 9))
+    return turn, -turned.reshape(torques.shape)
 
 
 def _sparse(matrix: np.ndarray, size: float | None = None) -> list[list[float]]:

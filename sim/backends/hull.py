@@ -5,6 +5,7 @@ from functools import reduce
 import mujoco
 import numpy as np
 
+from ...models.matrices import settled
 from ...models.mjcf import level_data
 from ...models.vehicle import Vehicle, craft_geoms
 from ..rotations import Parts
@@ -32,7 +33,7 @@ class Hull:
         self._apart = 2 * vehicle.radius
         if not shapes:
             return
-        centers, radii, axes, flat, rounded = map(np.array, zip(*shapes, strict=True))
+        centers, radii, axes, flat, rounded = map(settled, zip(*shapes, strict=True))
         numbers = (centers, radii, axes.transpose(0, 2, 1), flat, rounded)
         lists = [array.tolist() for array in numbers]
         self._shapes = list(zip(*lists, strict=True))

@@ -28,7 +28,8 @@ import numpy as np
 
 from ... import models
 from ...models.errors import InputError
-from ..elementary import atan2, cos, expm1, inverse, sin
+from ...models.matrices import right_inverse
+from ..elementary import atan2, cos, expm1, sin
 from ..state import total
 
 LEAD = 3.0
@@ -147,11 +148,7 @@ def allocated(vehicle: "models.Vehicle") -> np.ndarray:
 
     Those of the least size, Aᵀ (A Aᵀ)⁻¹ for an allocation A.
     """
-    size = _largest(vehicle)
-    rows = vehicle.allocation / size
-    square = total(rows[:, np.newaxis] * rows)
-    thrusts: np.ndarray = total(rows.T[:, np.newaxis] * inverse(square)) / size.T
-    return thrusts
+    return right_inverse(vehicle.allocation)
 
 
 def shared_ranges(several: Sequence[Gains]) -> list[Gains]:

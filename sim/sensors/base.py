@@ -104,7 +104,7 @@ class Sensor(Source):
         # One number more than the sensor takes decides whether a reading is lost.
         self._noise = world.random.noise(f"sensor {self.name}", self.columns + 1)
         dropout = values["dropout"]
-        self._lost = NormalDist().inv_cdf(dropout) if dropout else -math.inf
+        self._lost = round(NormalDist().inv_cdf(dropout), 12) if dropout else -math.inf
         self._now: Array = 0.0  # what is observed, with its flag
         self._held: Array = 0.0  # the last reading that was taken
         self._late: list[Array] = []  # those on their way, the oldest first

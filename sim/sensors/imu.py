@@ -56,8 +56,9 @@ class Imu(Sensor):
         return tuple(-bound for bound in high), high
 
     def draw(self, mask: Array, normal: Array) -> None:
-        """The bias."""
-        self._bias = chosen(mask, self._both("bias") * normal[..., :6], self._bias)
+        """The bias, without negative zeros: what adds 0 to them changes them."""
+        bias = self._both("bias") * normal[..., :6] + 0.0
+        self._bias = chosen(mask, bias, self._bias)
 
     def measure(self, normal: Array) -> Array:
         state = self.world.state

@@ -152,18 +152,6 @@ def test_a_wrapped_angle_differs_by_whole_turns() -> None:
     assert elementary.wrapped(3.0) == 3.0
 
 
-def test_inverse() -> None:
-    dice = np.random.default_rng(4)
-    factors = dice.normal(size=(5, 4, 4))
-    matrices = factors @ factors.swapaxes(1, 2) + np.eye(4)
-    found = elementary.inverse(matrices)
-    assert_allclose(found, np.linalg.inv(matrices), rtol=1e-10, atol=1e-12)
-    assert elementary.inverse(matrices[2]).tobytes() == found[2].tobytes()
-    # The second row is three times the first.
-    found = elementary.inverse(np.array(((2.0, 6.0, 0.0), (6.0, 18.0, 0.0), (0.0, 0.0, 4.0))))
-    assert found.tolist() == [[0.5, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.25]]
-
-
 # --- sums, whole numbers and tables of sim/state.py -----------------------------------------------
 
 

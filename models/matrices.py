@@ -1,0 +1,53 @@
+"""Matrices in a stated order of operations: their bits do not depend on the processor.
+
+Those of NumPy's `@` and `linalg` do, as BLAS and LAPACK have other code for each.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+_NOTHING = 1e-13  # of a number: what rounding leaves
+
+
+def settled(values: ArrayLike, size: float = 1.0) -> np.ndarray:
+    """Rounded to about 1e-12 of a size, with no negative zero.
+
+    The last bits of what MuJoCo's compiler computes differ between processors.
+    """
+    rounded: np.ndarray = np.round(np.asarray(values), 12 - round(math.log10(size))) + 0.0
+    return rounded
+
+
+def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """a @ b of shapes (..., n, k) and (..., k, m), summed from the first product to the last."""
+    total = a[..., :, 0, None] * b[..., 0, None, :]
+    for k in range(1, a.shape[-1]):
+        total = total + a[..., :, k, None] * b[..., k, None, :]
+    return np.asarray(total)
+
+
+def inverse(matrix: np.ndarray) -> np.ndarray:
+    """Inverse of positive definite matrices, shape (..., n, n), by Gauss and Jordan.
+
+    A row that depends on those before it is left out, with its column.
+    """
+    count = matrix.shape[-1]
+    unit = np.broadcast_to(np.eye(count), matrix.shape)
+    rows = np.concat((matrix, unit), axis=-1)
+    for i in range(count):
+        pivot = rows[..., i, i, None]
+        is_nothing = pivot <= _NOTHING * matrix[..., i, i, None]
+        row = rows[..., i, :] / np.where(is_nothing, np.inf, pivot)
+        rows = rows - rows[..., :, i, None] * row[..., None, :]
+        rows[..., i, :] = row
+    return rows[..., count:]
+
+
+def right_inverse(matrix: np.ndarray) -> np.ndarray:
+    """Aᵀ (A Aᵀ)⁻¹ of A, shape (n, m): what gives the least x with A x = b."""
+    size = np.abs(matrix).max(axis=1, keepdims=True).clip(1e-12)
+    rows = matrix / size
+    least: np.ndarray = product(rows.T, inverse(product(rows, rows.T))) / size.T
+    return least
