@@ -1,13 +1,15 @@
 """Envs of every task at every level, on every backend and with every feature, and a flight of them.
 
-`python tests/contracts.py` writes `data/oracle.json` anew, after a change of numbers that is meant.
+`python tests/contracts.py` writes `data/oracle.json` and `data/hashes.json` anew, after a change of
+numbers that is meant: the commit says why.
 """
 
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from hashlib import blake2b
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -22,6 +24,8 @@ from rotorgram.models import QUAD_XML, Vehicle
 
 DATA = Path(__file__).parent / "data"
 ORACLE = DATA / "oracle.json"
+HASHES = DATA / "hashes.json"
+"""Of flights on `rigid`, which have the same bits on every processor."""
 TABLES: dict[str, Any] = json.loads((DATA / "envs.json").read_text())
 """Rows of the parametrized tests of envs/, by the tests' names."""
 TASKS = sorted(name for name in gym.registry if name.startswith("rotorgram/"))
@@ -38,6 +42,10 @@ WORLDS = 3
 STEPS = 24
 LENGTH = 9
 """Control steps of an episode."""
+RESET = {(7, 1), (8, 2), (16, 0)}
+"""Steps at which a world is reset in mid-flight."""
+FROZEN = {(3, 2), (4, 2), (8, 0), (11, 0), (12, 1)}
+"""Steps at which a world rests; at one of them its episode is over."""
 
 
 def rows_of(table: str, names: str, **options: Any) -> pytest.MarkDecorator:
@@ -92,6 +100,10 @@ class Case:
         options = {"episode_length": LENGTH, "drones": self.drones, **self.options, **more}
         return EnvConfig.from_keywords(self.env_id, **options)
 
+    def on_rigid(self, **more: Any) -> "Case":
+        """The same on the backend `rigid`."""
+        return replace(self, options={**self.options, "backend": "rigid", **more})
+
 
 def _features() -> dict[str, Case]:
     """Cases of a file; a vehicle's file is beside it."""
@@ -145,10 +157,11 @@ def effects_of(file: Path) -> dict[str, Any]:
     return {**effects, "efficiency": share, "payload": 0.1 * vehicle.mass, "cable": 0.5}
 
 
-def stormy(env_id: str, file: Path) -> Case:
+def stormy(env_id: str, file: Path, *, hangs: bool = True) -> Case:
     """A vehicle with all its effects and a mass that is drawn."""
     effects = effects_of(file)
-    if "Payload" in env_id or registry.task_type(env_id).max_drones > 1:  # it hangs none, or itself
+    own = "Payload" in env_id or registry.task_type(env_id).max_drones > 1
+    if own or not hangs:
         del effects["payload"], effects["cable"]
     drawn = {"mass": "uniform(0.9, 1.1)"}
     return Case(env_id, {"vehicle": file, "effects": effects, "randomize": drawn})
@@ -168,6 +181,27 @@ LEVELS = _levels()
 VEHICLES = _vehicles()
 FEATURES = _features()
 CASES = LEVELS | FEATURES | VEHICLES
+
+
+def _rigid() -> dict[str, Case]:
+    """Tasks, levels, features that `rigid` flies, a part of them in float64; vehicles by NumPy."""
+    cases = {}
+    for name, case in CASES.items():
+        if case.options.get("backend") == "rigid" and "dtype" not in case.options:
+            cases[name] = case
+    for name in ("all, attitude", "estimate", "discrete", "late", "line", "two laps"):
+        cases[f"{name}, rigid"] = FEATURES[name].on_rigid()
+    for name, case in [*cases.items()]:
+        if any(kind in name for kind in ("rotors", "increment", "rich", "all")):
+            cases[name.replace("rigid", "float64")] = case.on_rigid(dtype="float64")
+    for name, file in FILES.items():
+        if name != "small":  # in a fluid
+            case = stormy(HOVER, file, hangs=False)
+            cases[f"{name}, float64"] = case.on_rigid(dtype="float64", compiled=False)
+    return cases
+
+
+RIGID = _rigid()
 
 
 def actions_of(loop: Loop, seed: int = 7) -> Iterator[NDArray[np.float32]]:
@@ -199,6 +233,42 @@ def results(loop: Loop, rows: Any = ...) -> dict[str, Any]:
     return {f"{i} {name}": x[rows] for i, group in enumerate(groups) for name, x in group.items()}
 
 
+class Step(NamedTuple):
+    """What a step got and what it gave, a row for each drone."""
+
+    actions: Any
+    resets: Any
+    seeds: Any
+    frozen: Any
+    results: dict[str, Any]
+    done: Any
+    steps: Any
+
+
+def flight(loop: Loop, steps: range = range(STEPS)) -> list[Step]:
+    """Worlds whose episode has ended begin the next; others are reset in mid-flight, or rest."""
+    rows = loop.num_envs // WORLDS
+    actions = actions_of(loop)
+    sent = [next(actions) for _ in range(STEPS)]
+    flown = []
+    for step in steps:
+        begins = [step == 0 or (step, world) in RESET for world in range(WORLDS)]
+        rests = [(step, world) in FROZEN for world in range(WORLDS)]
+        frozen = np.repeat(rests, rows)
+        resets = (loop.done | np.repeat(begins, rows)) & ~frozen
+        sent[step][resets | frozen] = np.nan  # ignored
+        seeds = np.arange(loop.num_envs) + 100 * step
+        loop.advance(sent[step], resets, seeds, frozen)
+        flown.append(Step(sent[step], resets, seeds, frozen, results(loop), loop.done, loop.steps))
+    return flown
+
+
+def hash_of(steps: list[Step]) -> str:
+    """Of all bits of the results of a flight."""
+    flown = repr([bits(step.results) for step in steps])
+    return blake2b(flown.encode(), digest_size=8).hexdigest()
+
+
 def measured(case: Case) -> dict[str, float]:
     """A few numbers of a flight: sums of observations and rewards."""
     loop = Loop(case.config(cameras=()), WORLDS)  # no driver's pictures
@@ -214,7 +284,13 @@ def measured(case: Case) -> dict[str, float]:
     return {"observations": float(f"{seen:.4g}"), "rewards": float(f"{total:.4g}")}
 
 
+def write(path: Path, rows: dict[str, Any]) -> None:
+    """A line for each case."""
+    lines = [f"{json.dumps(name)}: {json.dumps(row)}" for name, row in rows.items()]
+    path.write_text("{\n" + ",\n".join(lines) + "\n}\n")
+
+
 if __name__ == "__main__":
-    numbers = {name: measured(case) for name, case in CASES.items()}
-    rows = [f"{json.dumps(name)}: {json.dumps(row)}" for name, row in numbers.items()]
-    ORACLE.write_text("{\n" + ",\n".join(rows) + "\n}\n")
+    write(ORACLE, {name: measured(case) for name, case in CASES.items()})
+    flights = {name: flight(Loop(case.config(), WORLDS)) for name, case in RIGID.items()}
+    write(HASHES, {name: hash_of(steps) for name, steps in flights.items()})

@@ -1,6 +1,7 @@
 """The loop as machine code: the same bits as NumPy, in whatever way it is used; and what fails."""
 
 import builtins
+import json
 import logging
 import pickle
 from dataclasses import replace
@@ -9,7 +10,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from contracts import CASES, HOVER, STEPS, WORLDS, Case, bits
+from contracts import CASES, HASHES, HOVER, RIGID, STEPS, WORLDS, Case, bits, flight, hash_of
 from rotorgram.envs import Loop, registry
 from rotorgram.envs.compiled import CompiledLoop, make_loop
 from rotorgram.envs.config import EnvConfig
@@ -18,14 +19,9 @@ from rotorgram.envs.vector import LocalVectorEnv
 from rotorgram.models import InputError
 from rotorgram.sim import PhysicsError
 from rotorgram.sim.compile import llvm
-from test_contract import flight
 
-RIGID = {
-    name: case
-    for name, case in CASES.items()
-    if case.options.get("backend") == "rigid" and name not in ("all, NumPy", "swarm, rigid")
-}
-"""But one in which nothing is to be compiled, and one with too many drones."""
+EXPECTED = json.loads(HASHES.read_text())
+BY_NUMPY = [name for name, case in RIGID.items() if case.options.get("compiled") is False]
 MANY = 150  # worlds: two blocks, and a part of one
 
 
@@ -50,14 +46,29 @@ def check_same(ours: CompiledLoop, theirs: Loop) -> None:
         assert bits(found[name]) == bits(expected), name
 
 
-@pytest.mark.parametrize("case", RIGID.values(), ids=RIGID)
-def test_the_bits_of_numpy(case: Case) -> None:
-    """With worlds that are reset in mid-flight, that rest, and whose episodes end."""
-    ours, theirs = both(case)
+@pytest.mark.parametrize("name", [name for name in RIGID if name not in BY_NUMPY])
+def test_the_bits_of_numpy_and_of_every_processor(name: str) -> None:
+    """With worlds that are reset in mid-flight, that rest, and whose episodes end.
+
+    `python tests/contracts.py` writes the hashes anew.
+    """
+    ours, theirs = both(RIGID[name])
+    flown = []
     for step in range(STEPS):
-        flight(ours, range(step, step + 1))
+        flown += flight(ours, range(step, step + 1))
         flight(theirs, range(step, step + 1))
         check_same(ours, theirs)
+    assert hash_of(flown) == EXPECTED[name]
+
+
+@pytest.mark.parametrize("name", BY_NUMPY)
+def test_a_vehicle_has_the_bits_of_every_processor(name: str) -> None:
+    """Also its numbers are derived alike."""
+    assert hash_of(flight(Loop(RIGID[name].config(), WORLDS))) == EXPECTED[name]
+
+
+def test_every_flight_has_a_hash() -> None:
+    assert EXPECTED.keys() == RIGID.keys()
 
 
 @pytest.mark.parametrize("name", ["Hover, rotors, rigid", "Tracking, rotors, rigid", "rich, rigid"])

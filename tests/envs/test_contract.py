@@ -6,7 +6,7 @@ What a task or a backend promises beyond this has tests of its own.
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import contracts
 import gymnasium as gym
@@ -24,6 +24,7 @@ from contracts import (
     WORLDS,
     Case,
     bits,
+    flight,
     results,
 )
 from gymnasium.utils.env_checker import check_env
@@ -32,43 +33,7 @@ from rotorgram.agents import PID
 from rotorgram.envs import Loop, SingleEnv
 from rotorgram.models import InputError, Vehicle
 
-RESET = {(7, 1), (8, 2), (16, 0)}
-"""Steps at which a world is reset in mid-flight."""
-FROZEN = {(3, 2), (4, 2), (8, 0), (11, 0), (12, 1)}
-"""Steps at which a world rests; at one of them its episode is over."""
-
-
 every_case = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-
-
-class Step(NamedTuple):
-    """What a step got and what it gave, a row for each drone."""
-
-    actions: Any
-    resets: Any
-    seeds: Any
-    frozen: Any
-    results: dict[str, Any]
-    done: Any
-    steps: Any
-
-
-def flight(loop: Loop, steps: range) -> list[Step]:
-    """Worlds whose episode has ended begin the next; others are reset in mid-flight, or rest."""
-    rows = loop.num_envs // WORLDS
-    actions = contracts.actions_of(loop)
-    sent = [next(actions) for _ in range(STEPS)]
-    flown = []
-    for step in steps:
-        begins = [step == 0 or (step, world) in RESET for world in range(WORLDS)]
-        rests = [(step, world) in FROZEN for world in range(WORLDS)]
-        frozen = np.repeat(rests, rows)
-        resets = (loop.done | np.repeat(begins, rows)) & ~frozen
-        sent[step][resets | frozen] = np.nan  # ignored
-        seeds = np.arange(loop.num_envs) + 100 * step
-        loop.advance(sent[step], resets, seeds, frozen)
-        flown.append(Step(sent[step], resets, seeds, frozen, results(loop), loop.done, loop.steps))
-    return flown
 
 
 @every_case
