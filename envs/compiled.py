@@ -13,11 +13,9 @@ from ..models.errors import InputError, one_line
 from ..sim import PhysicsError
 from ..sim.snapshots import Arrays, Snapshot
 from ..sim.state import some
-from .autoreset import Told
 from .config import EnvConfig
 from .loop import Loop
 from .stages.ends import refuse_unfit
-from .stages.record import Floats
 
 if TYPE_CHECKING:
     from .machine import Machine
@@ -46,9 +44,6 @@ class CompiledLoop(Loop):
     _machine: "Machine | None" = None
     _is_inside = False  # whether the machine has the state
     _fails = False  # to compile
-    _now: Told
-    _content: Any = None
-    _headline: Floats
 
     def _step(self, seeds: Any, *, flies: bool) -> None:
         machine = self._entered()
@@ -63,11 +58,14 @@ class CompiledLoop(Loop):
             if seeds is not None:
                 machine.seed(self._world, begun, seeds[:: len(self.spec.agents)])
         sent = record.sent if flies else None
-        results, self._now = machine.step(sent, record.flown, begun, record.active)
-        record.action = self.pipeline.actions.neutral()  # an episode has begun
-        record.waiting = results["waiting"]
+        results, told = machine.step(sent, record.flown, begun, record.active)
+        if not record.has_begun:
+            record.action = self.pipeline.actions.neutral()
+        record.waiting = results["waiting"].reshape(record.shape)
         self._give(results)
-        self._check(results)
+        self._tells(told)
+        if some(results["wrong"]):
+            self._check()
 
     @property
     def is_compiled(self) -> bool:
@@ -123,70 +121,25 @@ class CompiledLoop(Loop):
         super().put(state)
 
     def _give(self, results: dict[str, np.ndarray]) -> None:
-        count = self.num_envs
-        self._telemetry = self._content = None
-        self.observations = {}
-        for array in self.spec.observation:
-            self.observations[array.name] = results[array.name].reshape(count, *array.shape)
-        self.rewards = results["reward"].reshape(count)
-        self._headline = results["headline"].reshape(count)
-        self.terminated = results["terminated"].reshape(count)
-        self.truncated = results["truncated"].reshape(count)
-        self.done = results["done"].reshape(count)
-        self.out = results["out"].reshape(count)
+        self.observations = {array.name: results[array.name] for array in self.spec.observation}
+        self.rewards = results["reward"]
+        self._headline = results["headline"]
+        self.terminated = results["terminated"]
+        self.truncated = results["truncated"]
+        self.done = results["done"]
+        self.out = results["out"]
 
-    @property
-    def reward_terms(self) -> dict[str, Floats]:
-        """As `Loop.reward_terms`."""
-        return self._read()[1] if self._is_inside else super().reward_terms
-
-    @property
-    def headline(self) -> Floats:
-        """As `Loop.headline`."""
-        return self._headline if self._is_inside else super().headline
-
-    @property
-    def telemetry(self) -> dict[str, Floats]:
-        """As `Loop.telemetry`."""
-        return self._read()[0] if self._is_inside else super().telemetry
-
-    def told(self) -> Told:
-        """As `Loop.told`."""
-        return self._now if self._is_inside else super().told()
-
-    def terms(self) -> dict[str, float]:
-        """As `Loop.terms`."""
-        if not self._is_inside:
-            return super().terms()
-        return {name: term.item() for name, term in self._read()[1].items()}
-
-    def row(self) -> list[float]:
-        """As `Loop.row`."""
-        if not self._is_inside:
-            return super().row()
-        telemetry, _ = self._read()
-        numbers: list[float] = np.concat(list(telemetry.values()), axis=1)[0].tolist()
-        return numbers
-
-    def _read(self) -> Any:
-        """Telemetry and terms of the last step."""
-        if self._content is None:
-            self._content = self._now()
-        return self._content
-
-    def _check(self, results: dict[str, np.ndarray]) -> None:
+    def _check(self) -> None:
         """Raise for bad states, and for numbers that are not finite."""
-        if some(results["bad"]):
-            flew = self._record.flown
-            record = self.record
-            world: Any = self._world
-            try:
-                world.refuse_bad(flew)
-            except PhysicsError:
-                record.wait(flew)
-                raise
-        if some(results["unfit"]):
-            refuse_unfit(self.record, self.config.env_id)
+        flew = self._record.flown
+        record = self.record
+        world: Any = self._world
+        try:
+            world.refuse_bad(flew)
+        except PhysicsError:
+            record.wait(flew)
+            raise
+        refuse_unfit(record, self.config.env_id)
 
 
 def _place(error: Exception) -> str:

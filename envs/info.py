@@ -16,13 +16,15 @@ class LazyInfo(Info):
     _make: Callable[[], Mapping[str, Any]] | None
 
     def __init__(self, make: Callable[[], Mapping[str, Any]]) -> None:
-        super().__init__()
+        super().__init__({"": None})  # json asks no dict that is empty
         self._make = make
 
     def _fill(self) -> None:
         make = self._make
         if make is not None:
-            super().update(make())
+            content = make()
+            super().clear()
+            super().update(content)
             self._make = None
 
     def __reduce__(self) -> Any:
@@ -34,7 +36,9 @@ def _filled(name: str) -> Callable[..., Any]:
     method = getattr(dict, name)
 
     def call(self: LazyInfo, *args: Any, **options: Any) -> Any:
-        self._fill()
+        for info in (self, *args):  # those that are compared with it too
+            if isinstance(info, LazyInfo):
+                info._fill()
         return method(self, *args, **options)
 
     call.__name__ = name

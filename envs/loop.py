@@ -79,7 +79,6 @@ class Loop:
         self._record = Record(world.shape, task.memory, kept)
         self.num_envs = num_worlds * config.drones
         self.quantities = quantities_of(task)
-        self._telemetry: dict[str, Floats] | None = None
         self._closed = False
         self._take()
 
@@ -187,7 +186,8 @@ class Loop:
         """New arrays of N drones, of the declared dtypes."""
         record = self._record
         count = self.num_envs
-        self._telemetry = None
+        self._tells(None)
+        self._headline = None
         known = vars(record).get("observations")
         self.observations = {}
         for array in self.spec.observation:
@@ -230,45 +230,54 @@ class Loop:
         return np.array(self.record.steps).reshape(self.num_envs)
 
     @property
-    def reward_terms(self) -> dict[str, Floats]:
-        """Terms of the last rewards by name, each of shape (N,)."""
-        return _per_drone(self.record, self.record.terms)
-
-    @property
     def metrics(self) -> dict[str, Floats]:
         """Metrics of the task by name, each of shape (N,)."""
-        return _per_drone(self.record, self.record.metrics)
+        return _per_drone(self.record.shape, self.record.metrics)
 
     @property
     def headline(self) -> Floats:
         """The metric that decides, shape (N,); NaN where the task has none."""
-        metric = self.spec.headline
-        if metric is None:
-            return np.full(self.num_envs, np.nan)
-        return _per_drone(self.record, {"": self.record.metrics[metric.name]})[""]
+        if self._headline is None:
+            metric = self.spec.headline
+            found = self.record.metrics[metric.name] if metric else np.array(np.nan)
+            shape = self.record.shape if metric else (self.num_envs,)
+            self._headline = _per_drone(shape, {"": found})[""]
+        return self._headline
 
     @property
-    def telemetry(self) -> dict[str, Floats]:
+    def reward_terms(self) -> Mapping[str, Floats]:
+        """Terms of the last rewards by name, each of shape (N,)."""
+        return self._read()[1]
+
+    @property
+    def telemetry(self) -> Mapping[str, Floats]:
         """By the names of `spec.telemetry`, float64, shape (N, *shape)."""
-        if self._telemetry is None:
-            self._telemetry = {one.name: one.values(self) for one in self.quantities}
-        return self._telemetry
+        return self._read()[0]
 
     def told(self) -> Told:
         """Gives telemetry and terms of the reward as they are now, also later."""
-        telemetry, terms = self.telemetry, self.reward_terms
-        return lambda: (telemetry, terms)
+        if self._told is None:
+            record = self.record
+            terms = record.terms
+            reads = {one.name: one.read(self) for one in self.quantities}
 
-    def terms(self) -> dict[str, float]:
-        """Terms of the last reward of a single drone."""
-        return {name: float(np.asarray(term).item()) for name, term in self._record.terms.items()}
+            def told() -> tuple[Mapping[str, Floats], Mapping[str, Floats]]:
+                telemetry = {name: _rows(record.shape, values) for name, values in reads.items()}
+                return telemetry, _per_drone(record.shape, terms)
 
-    def row(self) -> list[float]:
-        """All telemetry of a single drone as one list."""
-        row: list[float] = []
-        for quantity in self.quantities:
-            row += quantity.read(self).ravel().tolist()
-        return row
+            self._told = told
+        return self._told
+
+    def _tells(self, told: Told | None) -> None:
+        """Take what is told of a step; None: what record, world and task say when asked."""
+        self._told = told
+        self._content: Any = None
+
+    def _read(self) -> tuple[Mapping[str, Floats], Mapping[str, Floats]]:
+        if self._content is None:
+            self._content = self.told()()
+        content: tuple[Mapping[str, Floats], Mapping[str, Floats]] = self._content
+        return content
 
     def close(self) -> None:
         """Release threads and memory; what the last step gave can be read on."""
@@ -295,10 +304,16 @@ def _check_snapshot(snapshot: Arrays, shape: tuple[int, ...], config: str) -> No
         raise InputError(f"snapshot: expected all of its arrays, got none of {missing[0]}")
 
 
-def _per_drone(record: Record, arrays: Mapping[str, Array]) -> dict[str, Floats]:
-    """Arrays of a record with one axis of N drones, float64."""
+def _rows(shape: tuple[int, ...], values: Array) -> Floats:
+    """Vectors of all drones, shape (*shape, n) or (n,), as new ones, float64, shape (N, n)."""
+    width = values.shape[-1]
+    rows = np.array(np.broadcast_to(values, (*shape, width)), np.float64)
+    return rows.reshape(-1, width)
+
+
+def _per_drone(shape: tuple[int, ...], arrays: Mapping[str, Array]) -> dict[str, Floats]:
+    """Numbers of all drones, by name, as new arrays, float64, shape (N,)."""
     rows = {}
     for name, values in arrays.items():
-        row = np.asarray(values, np.float64)
-        rows[name] = np.array(np.broadcast_to(row, record.shape or row.shape)).reshape(-1)
+        rows[name] = np.array(np.broadcast_to(values, shape), np.float64).reshape(-1)
     return rows

@@ -23,7 +23,7 @@ from .stages.record import Mask, Record
 LANES = 64  # Worlds of a block: their numbers fit into the nearest cache
 MOST = 30_000  # Operations of a step: more take too long to compile
 _MASKS = ("flown", "begun", "active")
-_RESULTS = ("reward", "terminated", "truncated", "done", "out", "waiting", "unfit")
+_RESULTS = ("reward", "terminated", "truncated", "done", "out", "waiting")
 _TOLD = "told/"
 _TERM = "told/reward_"
 _KEYS = "Flight/random/keys"
@@ -73,56 +73,48 @@ class Machine:
         self._run = compiled(regions, self._layouts, self._outside, width)
         self.memory = Memory(layout, worlds)
         self._results = []
-        self._size = 0  # of all results, in bytes
-        for name, (dtype, shape) in self._outside.items():
+        self._size = self.memory.blocks * self._told.size  # of what a step tells, then of all
+        for name, (dtype, (drones, *shape)) in self._outside.items():
             if name in given:
                 continue
-            self._results.append((name, (worlds, *shape), dtype, self._size))
-            self._size += -(-self.memory.size * prod(shape) * dtype.itemsize // 8) * 8
-        size = self.memory.size
-        self._nobody = np.zeros((size, *sent.shape[1:-1]), bool)
-        self._everybody = ~self._nobody
-        self._nothing = np.zeros((size, *sent.shape[1:]), sent.dtype)
+            self._results.append((name, (worlds * drones, *shape), dtype, self._size))
+            bytes_ = self.memory.size * drones * prod(shape) * dtype.itemsize
+            self._size += -(-bytes_ // 8) * 8
+        self._given: dict[str, np.ndarray] = {}
+        for name, (dtype, shape) in given.items():
+            self._given[name] = np.zeros((self.memory.size, *shape), dtype)
+        self._places = [array.ctypes.data for array in self._given.values()]
 
     def step(
         self, sent: np.ndarray | None, flown: Mask | None, begun: Mask | None, active: Mask | None
     ) -> tuple[Named, Told]:
-        """Run all regions. Returns what leaves the loop, by name, (W, A, ...), and `Loop.told`.
+        """Run all regions. Returns what leaves the loop, by name, (N, ...), and `Loop.told`.
 
         Actions (W, A, k), None if nobody flies; masks as of a `Record`.
         """
-        memory = self.memory
-        given = (
-            self._everybody if flown is None else self._padded(flown),
-            self._nobody if begun is None else self._padded(begun),
-            self._everybody if active is None else self._padded(active),
-            self._nothing if sent is None else self._padded(sent),
-        )
-        told = Memory(self._told, self._worlds, clear=False)
-        new = np.empty(self._size, np.uint8)  # of all results
+        worlds = self._worlds
+        given = self._given
+        given["flown"][:worlds] = True if flown is None else flown
+        given["begun"][:worlds] = False if begun is None else begun
+        given["active"][:worlds] = True if active is None else active
+        if sent is not None:
+            given["sent"][:worlds] = sent
+        new = np.empty(self._size, np.uint8)
         first = new.ctypes.data
-        places = [array.ctypes.data for array in given]
-        places += [first + start for *_, start in self._results]
-        self._run(memory.blocks, memory.address, told.address, *places)
-        results = {
-            name: np.ndarray(shape, dtype, new, start)
-            for name, shape, dtype, start in self._results
-        }
-        return results, lambda: self._read(told)
-
-    def _padded(self, array: np.ndarray) -> np.ndarray:
-        """An array (W, ...) as one of the worlds of all blocks, C-contiguous."""
-        if len(array) == self.memory.size:
-            return np.ascontiguousarray(array)
-        padded = np.zeros((self.memory.size, *array.shape[1:]), array.dtype)
-        padded[: self._worlds] = array
-        return padded
+        places = [first, *self._places]
+        results = {}
+        for name, shape, dtype, start in self._results:
+            results[name] = np.ndarray(shape, dtype, new, start)
+            places.append(first + start)
+        self._run(self.memory.blocks, self.memory.address, *places)
+        return results, lambda: self._read(new)
 
     def begin_all(self) -> None:
         """As `Record.begin_all`."""
         memory = self.memory
-        self.step(None, self._nobody, self._everybody, self._everybody)
-        memory.put("record/kept/waiting", self._everybody[: self._worlds])
+        everybody = np.ones_like(memory.get("record/kept/waiting"))
+        self.step(None, ~everybody, everybody, everybody)
+        memory.put("record/kept/waiting", everybody)
         memory.put("record/kept/episodes", 0 * memory.get("record/kept/episodes"))
 
     def seed(self, world: World, begun: Mask, seeds: Any) -> None:
@@ -145,12 +137,12 @@ class Machine:
             if values is not None and values.ndim:
                 self.memory.put(name, values)
 
-    def _read(self, told: Memory) -> tuple[Named, Named]:
-        """Telemetry and terms of the reward, float64, shape (N, n) and (N,)."""
+    def _read(self, content: np.ndarray) -> tuple[Named, Named]:
+        """Telemetry and terms of the reward, float64, shape (N, n) and (N,), of a step."""
         telemetry = {}
         terms = {}
         for name in self._told.fields:
-            values = told.get(name).astype(np.float64)
+            values = self._told.read(name, content, self._worlds).astype(np.float64)
             flat = values.reshape(self._worlds * values.shape[1], -1)
             if name.startswith(_TERM):
                 terms[name.removeprefix(_TERM)] = flat[:, 0]
@@ -173,10 +165,10 @@ class Machine:
         record = self._loop.record
         seen = {name: getattr(record, name) for name in _RESULTS}
         world: Any = self._loop.world
-        seen["bad"] = world.bad
         metric = self._loop.spec.headline
         headline = record.metrics[metric.name] if metric else np.nan + record.reward
         seen["headline"] = headline.astype(np.float64)
+        seen["wrong"] = record.unfit | world.bad
         for array in self._loop.spec.observation:
             seen[array.name] = record.observations[array.name].astype(array.dtype)
         return seen

@@ -11,7 +11,7 @@ from ..sim.snapshots import Arrays, Snapshot
 from .autoreset import Observation
 from .compiled import make_loop
 from .config import EnvConfig
-from .info import Info
+from .info import Info, LazyInfo
 from .rendering import RENDER_MODES, Renderer
 from .spaces import action_space, checked_action, joined, observation_space, telemetry_names
 
@@ -107,8 +107,12 @@ class SingleEnv(gym.Env[Observation, ArrayLike]):
         return joined(self.env_spec, seen)
 
     def _info(self) -> Info:
-        loop = self._loop
-        info = dict(zip(self._names, loop.row(), strict=True))
-        for name, term in loop.terms().items():
-            info["reward_" + name] = term
-        return info
+        told = self._loop.told()
+
+        def made() -> Info:
+            telemetry, terms = told()
+            numbers = np.concat([*telemetry.values()], axis=1)[0].tolist()
+            info = dict(zip(self._names, numbers, strict=True))
+            return info | {f"reward_{name}": term.item() for name, term in terms.items()}
+
+        return LazyInfo(made)

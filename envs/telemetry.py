@@ -9,7 +9,6 @@ from operator import attrgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..sim import PARAMETERS, Randomization
 from ..sim.state import Array, stack
@@ -48,12 +47,6 @@ class Quantity:
             frame=self.frame,
             components=self.components,
         )
-
-    def values(self, loop: "Loop") -> NDArray[np.float64]:
-        """A new array, float64, shape (N, n)."""
-        read = np.asarray(self.read(loop), np.float64)
-        rows = np.broadcast_to(read, (*loop.record.shape, read.shape[-1]))
-        return np.array(rows).reshape(loop.num_envs, -1)
 
 
 def _of_state(name: str, components: Names, unit: str, frame: str) -> Quantity:

@@ -242,4 +242,4 @@ def where(mask: Mask, new: Array, old: Array) -> Array:
 
 def is_finite(values: np.ndarray) -> bool:
     """Whether all numbers are finite."""
-    return values.dtype.kind != "f" or bool(np.isfinite(values).all())
+    return values.dtype.kind != "f" or np.count_nonzero(np.isfinite(values)) == values.size

@@ -38,6 +38,23 @@ class Layout:
         """Where a row of an array begins, in bytes."""
         return self.offsets[name] + row * self.lanes * self.fields[name][0].itemsize
 
+    def view(self, name: str, content: np.ndarray, blocks: int) -> np.ndarray:
+        """An array within the bytes of some blocks, shape (blocks, lanes, *shape)."""
+        dtype, shape = self.fields[name]
+        strides: list[int] = []
+        step = dtype.itemsize * self.lanes
+        for length in reversed(shape):
+            strides.insert(0, step)
+            step *= length
+        whole = (blocks, self.lanes, *shape)
+        steps = (self.size, dtype.itemsize, *strides)
+        return np.ndarray(whole, dtype, content, self.offsets[name], steps)
+
+    def read(self, name: str, content: np.ndarray, worlds: int) -> np.ndarray:
+        """A copy of an array within the bytes of the blocks of W worlds, shape (W, *shape)."""
+        view = self.view(name, content, -(-worlds // self.lanes))
+        return view.copy().reshape(-1, *view.shape[2:])[:worlds]
+
 
 class Memory:
     """The arrays of a layout for W worlds; the last block is filled up with worlds nobody sees.
@@ -48,41 +65,28 @@ class Memory:
         size: Worlds of all blocks.
     """
 
-    def __init__(self, layout: Layout, worlds: int, *, clear: bool = True) -> None:
-        """All is 0, or with `clear` false anything."""
+    def __init__(self, layout: Layout, worlds: int) -> None:
+        """All is 0."""
         self._layout = layout
         self._worlds = worlds
         self.blocks = -(-worlds // layout.lanes)
         self.size = self.blocks * layout.lanes
-        make = np.zeros if clear else np.empty
-        raw = make(self.blocks * layout.size + LINE, np.uint8)
+        raw = np.zeros(self.blocks * layout.size + LINE, np.uint8)
         first = raw.ctypes.data
         start = -first % LINE
-        self._content = raw[start:][: raw.size - LINE].reshape(self.blocks, layout.size)
+        self._content = raw[start:]
         self.address = first + start
 
     def get(self, name: str) -> np.ndarray:
         """A copy of an array, shape (W, *shape)."""
-        view = self._view(name)
-        if self.blocks == 1:
-            return view[0, : self._worlds].copy()
-        return view.copy().reshape(-1, *view.shape[2:])[: self._worlds]
+        return self._layout.read(name, self._content, self._worlds)
 
     def put(self, name: str, values: np.ndarray) -> None:
         """Set an array from one of shape (W, *shape)."""
-        view = self._view(name)
+        view = self._layout.view(name, self._content, self.blocks)
         lanes = self._layout.lanes
         whole = self._worlds // lanes
         if whole:
             view[:whole] = values[: whole * lanes].reshape(whole, lanes, *view.shape[2:])
         if whole < self.blocks:
             view[whole, : self._worlds - whole * lanes] = values[whole * lanes :]
-
-    def _view(self, name: str) -> np.ndarray:
-        """The array itself, shape (blocks, lanes, *shape)."""
-        layout = self._layout
-        dtype, shape = layout.fields[name]
-        first = layout.offsets[name]
-        size = prod(shape) * layout.lanes * dtype.itemsize
-        rows = self._content[:, first : first + size].view(dtype)
-        return np.moveaxis(rows.reshape(self.blocks, *shape, layout.lanes), -1, 1)

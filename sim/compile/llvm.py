@@ -84,6 +84,7 @@ _ATTRIBUTES = (
 )
 _FUNCTION = """define void @run(i64 %blocks{arguments}) #0 {{
 entry:
+{rows}
   br label %block
 block:
   %b = phi i64 [0, %entry], [%b.next, %block.end]
@@ -188,8 +189,10 @@ class _Printer:
             self._region(number, region)
         names = [f"memory.{i}" for i in range(len(self._layouts))]
         names += [f"out.{name}" for name in self._outside]
+        spread = [name for name in self._outside if self._is_spread(name)]
         function = _FUNCTION.format(
             arguments="".join(f', ptr noalias %"{name}"' for name in names),
+            rows="\n".join(f"  {self._rows(name)} = alloca {self._size(name)}" for name in spread),
             bases="\n".join(self._base(i, one.size) for i, one in enumerate(self._layouts)),
             lanes=self._layouts[0].lanes,
             width=self._width,
@@ -214,8 +217,13 @@ class _Printer:
         self._lines.append(f"body.{number}:")
         for value in region.operations():
             self._names[value.number] = self._printed(value)
+        spread: dict[str, list[int]] = {}
         for array, row, value in region.stores:
             self._store(array, row, self._names[value.number])
+            if self._is_spread(array):
+                spread.setdefault(array, []).append(row)
+        for array, rows in spread.items():
+            self._turn(array, rows)
         self._lines.append(f"  br label {after}")
 
     def _printed(self, value: Value) -> str:
@@ -342,7 +350,10 @@ class _Printer:
         """Pointer to a row at these lanes, its type in memory, and its alignment."""
         if array in self._outside:
             kind = _in_memory(self._outside[array][0])
-            return self._new(f'getelementptr {kind}, ptr %"out.{array}", i64 %world'), kind, 1
+            start, index = f'%"out.{array}"', "%world"
+            if self._is_spread(array):
+                start, index = self._rows(array), str(row * self._width)
+            return self._new(f"getelementptr {kind}, ptr {start}, i64 {index}"), kind, 1
         number = self._bases[array]
         layout = self._layouts[number]
         dtype, _ = layout.fields[array]
@@ -365,10 +376,6 @@ class _Printer:
         return value
 
     def _store(self, array: str, row: int, value: str) -> None:
-        if self._is_spread(array):
-            place, kind = self._places(array, row)
-            self._scattered(self._in_memory(value, kind), place, kind)
-            return
         place, kind, align = self._address(array, row)
         value = self._in_memory(value, kind)
         self._lines.append(f"  store {self._lanes(kind)} {value}, ptr {place}, align {align}")
@@ -403,6 +410,44 @@ class _Printer:
         """Whether a component of neighbours lies apart, as of an array outside with several."""
         return array in self._outside and prod(self._outside[array][1]) > 1
 
+    def _rows(self, array: str) -> str:
+        """Pointer to the components of an array that is spread, each for all lanes."""
+        return f'%"rows.{array}"'
+
+    def _size(self, array: str) -> str:
+        """The type of all of these components."""
+        dtype, shape = self._outside[array]
+        return f"[{prod(shape) * self._width} x {_in_memory(dtype)}], align 64"
+
+    def _turn(self, array: str, rows: Sequence[int]) -> None:
+        """Write the components lane by lane, as they lie outside: faster than a scatter."""
+        dtype, shape = self._outside[array]
+        kind = _in_memory(dtype)
+        self._count += 1
+        number = self._count
+        self._lines += [
+            f"  br label %before.{number}",
+            f"before.{number}:",
+            f"  br label %turn.{number}",
+            f"turn.{number}:",
+            f"  %l.{number} = phi i64 [0, %before.{number}], [%n.{number}, %turn.{number}]",
+        ]
+        source = self._new(f"getelementptr {kind}, ptr {self._rows(array)}, i64 %l.{number}")
+        world = self._new(f"add i64 %world, %l.{number}")
+        first = self._new(f"mul i64 {world}, {prod(shape)}")
+        target = self._new(f'getelementptr {kind}, ptr %"out.{array}", i64 {first}')
+        for row in rows:
+            place = self._new(f"getelementptr {kind}, ptr {source}, i64 {row * self._width}")
+            one = self._new(f"load {kind}, ptr {place}")
+            place = self._new(f"getelementptr {kind}, ptr {target}, i64 {row}")
+            self._lines.append(f"  store {kind} {one}, ptr {place}, align 1")
+        self._lines.append(f"  %n.{number} = add i64 %l.{number}, 1")
+        more = self._new(f"icmp slt i64 %n.{number}, {self._width}")
+        self._lines += [
+            f"  br i1 {more}, label %turn.{number}, label %turned.{number}",
+            f"turned.{number}:",
+        ]
+
     def _places(self, array: str, row: int) -> tuple[str, str]:
         """Pointers to a component of an array outside, and its type in memory."""
         dtype, shape = self._outside[array]
@@ -423,19 +468,6 @@ class _Printer:
         always = self._splat("true", "i1")
         return self._new(
             f"call {lanes} {function}({places} {pointers}, i32 1, {flags} {always}, {lanes} poison)"
-        )
-
-    def _scattered(self, value: str, pointers: str, kind: str) -> None:
-        """Write to some places."""
-        lanes, places, flags = map(self._lanes, (kind, "ptr", "i1"))
-        if self._width == 1:
-            self._lines.append(f"  store {kind} {value}, ptr {pointers}, align 1")
-            return
-        function = f"@llvm.masked.scatter.v{self._width}{_SHORT[kind]}.v{self._width}p0"
-        self._declared[function] = f"declare void {function}({lanes}, {places}, i32, {flags})"
-        always = self._splat("true", "i1")
-        self._lines.append(
-            f"  call void {function}({lanes} {value}, {places} {pointers}, i32 1, {flags} {always})"
         )
 
     def _gather(self, value: Value) -> str:

@@ -37,6 +37,9 @@ USES = [
     "[*info.values()]",
     "[*info.items()]",
     "json.dumps(dict(info))",
+    "json.dumps(info)",
+    "json.dumps([info], indent=1)",
+    "LazyInfo(lambda: CONTENT) == info",
     "['a' in info, 'z' in info, 'z' not in info]",
     "info['b']",
     "[info.get('a'), info.get('z', 3)]",
@@ -65,7 +68,8 @@ def test_it_behaves_as_a_dict_and_is_made_once(text: str) -> None:
     info = LazyInfo(made)
     assert isinstance(info, dict)
     assert made.count == 0
-    names = {"CONTENT": dict(CONTENT), "copy": copy, "json": json, "pickle": pickle}
+    names: dict[str, Any] = {"CONTENT": dict(CONTENT), "copy": copy, "json": json, "pickle": pickle}
+    names["LazyInfo"] = LazyInfo
     expected = eval(text, names | {"info": dict(CONTENT)})
     found = eval(text, names | {"info": info})
     assert repr(found) == repr(expected)
