@@ -21,7 +21,9 @@ LOST = "simulator_lost"
 Observation = Any
 """An array, or a dict of arrays."""
 Step = tuple[Observation, np.ndarray, np.ndarray, np.ndarray, Info]
-Told = Callable[[], tuple[Mapping[str, np.ndarray], Mapping[str, np.ndarray]]]
+Content = tuple[Mapping[str, np.ndarray], Mapping[str, np.ndarray]]
+"""Telemetry and terms of the reward by name, float64, shape (N, n) and (N,)."""
+Told = Callable[[], Content]
 Seeds = Sequence[int | None] | np.ndarray
 
 

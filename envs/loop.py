@@ -15,7 +15,7 @@ from ..models.errors import InputError
 from ..sim import Array, PhysicsError, Randomization, World, make_world
 from ..sim.snapshots import Arrays, Snapshot, joined, part_of
 from ..sim.state import some
-from .autoreset import Seeds, Told, checked_seeds
+from .autoreset import Content, Seeds, Told, checked_seeds
 from .config import EnvConfig
 from .pipeline import Pipeline
 from .specification import make_task, spec_of
@@ -80,6 +80,8 @@ class Loop:
         self.num_envs = num_worlds * config.drones
         self.quantities = quantities_of(task)
         self._closed = False
+        self._told: Told | None = None
+        self._content: Any = None
         self._take()
 
     def prepare(self) -> None:
@@ -261,7 +263,7 @@ class Loop:
             terms = record.terms
             reads = {one.name: one.read(self) for one in self.quantities}
 
-            def told() -> tuple[Mapping[str, Floats], Mapping[str, Floats]]:
+            def told() -> Content:
                 telemetry = {name: _rows(record.shape, values) for name, values in reads.items()}
                 return telemetry, _per_drone(record.shape, terms)
 
@@ -271,12 +273,12 @@ class Loop:
     def _tells(self, told: Told | None) -> None:
         """Take what is told of a step; None: what record, world and task say when asked."""
         self._told = told
-        self._content: Any = None
+        self._content = None
 
-    def _read(self) -> tuple[Mapping[str, Floats], Mapping[str, Floats]]:
+    def _read(self) -> Content:
         if self._content is None:
             self._content = self.told()()
-        content: tuple[Mapping[str, Floats], Mapping[str, Floats]] = self._content
+        content: Content = self._content
         return content
 
     def close(self) -> None:

@@ -183,7 +183,7 @@ def some(mask: Array) -> bool:
     """
     if mask is None or isinstance(mask, TracedArray):
         return True
-    return np.count_nonzero(mask) > 0 if mask.ndim else bool(mask)  # faster than NumPy's any
+    return bool(np.count_nonzero(mask) if mask.ndim else mask)  # faster than NumPy's any
 
 
 def stack(parts: Sequence[Array]) -> Array:
