@@ -23,7 +23,8 @@ from .stages.record import Mask, Record
 LANES = 64  # Worlds of a block: their numbers fit into the nearest cache
 MOST = 30_000  # Operations of a step: more take too long to compile
 _MASKS = ("flown", "begun", "active")
-_RESULTS = ("reward", "terminated", "truncated", "done", "out", "waiting")
+_ENDS = ("terminated", "truncated", "done", "out", "waiting")
+_FLAGS = (*_ENDS, "wrong")
 _TOLD = "told/"
 _TERM = "told/reward_"
 _KEYS = "Flight/random/keys"
@@ -74,16 +75,23 @@ class Machine:
         self.memory = Memory(layout, worlds)
         self._results = []
         self._size = self.memory.blocks * self._told.size  # of what a step tells, then of all
+        self._starts = []
         for name, (dtype, (drones, *shape)) in self._outside.items():
             if name in given:
                 continue
-            self._results.append((name, (worlds * drones, *shape), dtype, self._size))
+            self._starts.append(self._size)
+            if name not in _FLAGS:
+                self._results.append((name, (worlds * drones, *shape), dtype, self._size))
             bytes_ = self.memory.size * drones * prod(shape) * dtype.itemsize
             self._size += -(-bytes_ // 8) * 8
+        *_, first, second = self._starts
+        flags = (len(_FLAGS), worlds * drones)
+        self._flags = flags, _FLAG, self._starts[-len(_FLAGS)], (second - first, 1)
         self._given: dict[str, np.ndarray] = {}
         for name, (dtype, shape) in given.items():
             self._given[name] = np.zeros((self.memory.size, *shape), dtype)
         self._places = [array.ctypes.data for array in self._given.values()]
+        self._all_fly = False  # in the last step
 
     def step(
         self, sent: np.ndarray | None, flown: Mask | None, begun: Mask | None, active: Mask | None
@@ -94,19 +102,22 @@ class Machine:
         """
         worlds = self._worlds
         given = self._given
-        given["flown"][:worlds] = True if flown is None else flown
-        given["begun"][:worlds] = False if begun is None else begun
-        given["active"][:worlds] = True if active is None else active
+        all_fly = flown is None and begun is None and active is None
+        if not (all_fly and self._all_fly):
+            given["flown"][:worlds] = True if flown is None else flown
+            given["begun"][:worlds] = False if begun is None else begun
+            given["active"][:worlds] = True if active is None else active
+        self._all_fly = all_fly
         if sent is not None:
             given["sent"][:worlds] = sent
         new = np.empty(self._size, np.uint8)
         first = new.ctypes.data
-        places = [first, *self._places]
-        results = {}
+        places = [first + start for start in self._starts]
+        self._run(self.memory.blocks, self.memory.address, first, *self._places, *places)
+        shape, dtype, start, strides = self._flags
+        results = dict(zip(_FLAGS, np.ndarray(shape, dtype, new, start, strides), strict=True))
         for name, shape, dtype, start in self._results:
             results[name] = np.ndarray(shape, dtype, new, start)
-            places.append(first + start)
-        self._run(self.memory.blocks, self.memory.address, *places)
         return results, lambda: self._read(new)
 
     def begin_all(self) -> None:
@@ -163,15 +174,14 @@ class Machine:
     def _seen(self) -> Named:
         """What leaves the loop."""
         record = self._loop.record
-        seen = {name: getattr(record, name) for name in _RESULTS}
-        world: Any = self._loop.world
         metric = self._loop.spec.headline
         headline = record.metrics[metric.name] if metric else np.nan + record.reward
-        seen["headline"] = headline.astype(np.float64)
-        seen["wrong"] = record.unfit | world.bad
+        seen = {"reward": record.reward, "headline": headline.astype(np.float64)}
         for array in self._loop.spec.observation:
             seen[array.name] = record.observations[array.name].astype(array.dtype)
-        return seen
+        world: Any = self._loop.world
+        seen |= {name: getattr(record, name) for name in _ENDS}
+        return seen | {"wrong": record.unfit | world.bad}
 
     def _variables(self, program: Program) -> Named:
         """Variables of all arrays; those of the state become the loop's."""
