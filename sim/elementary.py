@@ -36,13 +36,26 @@ class _Functions(NamedTuple):
     """A number times a power of 2."""
 
 
+_LAYOUTS = {"float32": (np.int32, 23, 127), "float64": (np.int64, 52, 1023)}
+"""Whole numbers with the bits of a float, bits of its fraction, and its exponent of 1."""
+
+
 def _split(x: Array) -> tuple[Array, Array]:
-    fraction, power = np.frexp(x)
-    return fraction, power.astype(x.dtype)
+    """Of normal numbers above 0."""
+    whole, digits, one = _LAYOUTS[x.dtype.name]
+    bits = x.view(whole)
+    fraction = (bits & ((1 << digits) - 1)) | ((one - 1) << digits)
+    return fraction.view(x.dtype), ((bits >> digits) - (one - 1)).astype(x.dtype)
 
 
 def _scaled(x: Array, power: Array) -> Array:
-    return np.ldexp(x, power.astype(np.int32))
+    """Of numbers near 1, in two steps, of which only the last one can round."""
+    whole, digits, one = _LAYOUTS[x.dtype.name]
+    power = power.astype(whole)
+    half = power >> 1
+    for part in (half, power - half):
+        x = x * ((part + one) << digits).view(x.dtype)
+    return x
 
 
 def _rint_of_number(x: float) -> float:

@@ -77,8 +77,6 @@ _CALLS = {
     "copysign": "copysign",
 }
 _SHORT = {"float": "f32", "double": "f64", "i8": "i8", "i32": "i32", "i64": "i64"}
-_BITS = {"float32": (32, 23, 127), "float64": (64, 52, 1023)}
-"""Of a float: all bits, those of the fraction, and what is added to the exponent."""
 _ATTRIBUTES = (
     'attributes #0 = { nounwind "min-legal-vector-width"="512" "prefer-vector-width"="512" }'
 )
@@ -247,9 +245,9 @@ class _Printer:
             kind = self._type(value.dtype)
             flags, first, second = inputs
             return self._new(f"select {self._lanes('i1')} {flags}, {kind} {first}, {kind} {second}")
-        if operation in ("fraction", "exponent", "ldexp"):
-            convert: Callable[..., str] = getattr(self, f"_{operation}")
-            return convert(dtype, *inputs)
+        if operation == "bits":
+            kinds = self._type(dtype), self._type(value.dtype)
+            return self._new(f"bitcast {kinds[0]} {inputs[0]} to {kinds[1]}")
         if operation in _CALLS and dtype.kind == "f":
             return self._call(_CALLS[operation], dtype, *inputs)
         kind = self._type(dtype)
@@ -509,55 +507,6 @@ class _Printer:
         else:
             word = "trunc"
         return self._new(f"{word} {first} {value} to {second}")
-
-    def _as_bits(self, dtype: DType, value: str) -> tuple[str, str]:
-        """A float's bits, and their type."""
-        kind = f"i{8 * dtype.itemsize}"
-        bits = self._new(f"bitcast {self._type(dtype)} {value} to {self._lanes(kind)}")
-        return bits, kind
-
-    def _fraction(self, dtype: DType, value: str) -> str:
-        """That of `frexp` of a normal number: the bits of the exponent become those of 1/2."""
-        size, fraction, bias = _BITS[dtype.name]
-        bits, kind = self._as_bits(dtype, value)
-        lanes = self._lanes(kind)
-        rest = (1 << (size - 1)) | ((1 << fraction) - 1)
-        bits = self._new(f"and {lanes} {bits}, {self._splat(rest, kind)}")
-        bits = self._new(f"or {lanes} {bits}, {self._splat((bias - 1) << fraction, kind)}")
-        return self._new(f"bitcast {lanes} {bits} to {self._type(dtype)}")
-
-    def _exponent(self, dtype: DType, value: str) -> str:
-        """That of `frexp` of a normal number, int32."""
-        size, fraction, bias = _BITS[dtype.name]
-        bits, kind = self._as_bits(dtype, value)
-        lanes = self._lanes(kind)
-        bits = self._new(f"lshr {lanes} {bits}, {self._splat(fraction, kind)}")
-        bits = self._new(
-            f"and {lanes} {bits}, {self._splat((1 << (size - fraction - 1)) - 1, kind)}"
-        )
-        bits = self._new(f"sub {lanes} {bits}, {self._splat(bias - 1, kind)}")
-        narrow = self._lanes("i32")
-        return bits if size == 32 else self._new(f"trunc {lanes} {bits} to {narrow}")
-
-    def _ldexp(self, dtype: DType, value: str, power: str) -> str:
-        """A number near 1 times 2^power, in two steps, of which only the last one can round."""
-        narrow = self._lanes("i32")
-        half = self._new(f"ashr {narrow} {power}, {self._splat(1, 'i32')}")
-        rest = self._new(f"sub {narrow} {power}, {half}")
-        for part in (half, rest):
-            value = self._new(f"fmul {self._type(dtype)} {value}, {self._power(dtype, part)}")
-        return value
-
-    def _power(self, dtype: DType, power: str) -> str:
-        """2^power of a power, int32, in the range of normal numbers."""
-        size, fraction, bias = _BITS[dtype.name]
-        kind = f"i{size}"
-        lanes = self._lanes(kind)
-        if size == 64:
-            power = self._new(f"sext {self._lanes('i32')} {power} to {lanes}")
-        bits = self._new(f"add {lanes} {power}, {self._splat(bias, kind)}")
-        bits = self._new(f"shl {lanes} {bits}, {self._splat(fraction, kind)}")
-        return self._new(f"bitcast {lanes} {bits} to {self._type(dtype)}")
 
 
 def _in_memory(dtype: DType) -> str:

@@ -35,7 +35,6 @@ _OPERATIONS: dict[Callable[..., Any], str] = {
     np.rint: "rint",
     np.floor: "floor",
     np.copysign: "copysign",
-    np.ldexp: "ldexp",
     np.less: "less",
     np.less_equal: "less_equal",
     np.greater: "greater",
@@ -63,7 +62,7 @@ _MOVES = (
 )
 """Functions that move components, and compute nothing."""
 _JOINS = (np.stack, np.concatenate, np.column_stack, np.vstack, np.hstack)
-_METHODS = ("reshape", "ravel", "squeeze", "transpose", "swapaxes", "copy", "view")
+_METHODS = ("reshape", "ravel", "squeeze", "transpose", "swapaxes", "copy")
 _REDUCTIONS = {
     "sum": np.add,
     "any": np.logical_or,
@@ -138,6 +137,10 @@ class TracedArray(NDArrayOperatorsMixin):
             return self.copy() if copy else self
         return self._each(lambda value: self.program.cast(value, dtype), dtype, self)
 
+    def view(self, dtype: Any) -> "TracedArray":
+        """The bits of its numbers as another dtype of as many bits."""
+        return self._applied("bits", np.dtype(dtype), self)
+
     def clip(self, low: Any = None, high: Any = None) -> Traced:
         """Within bounds; None is no bound."""
         above: Traced = self if low is None else np.maximum(self, low)
@@ -166,18 +169,12 @@ class TracedArray(NDArrayOperatorsMixin):
             return _FUNCTIONS[ufunc](self, *inputs)
         kinds = ufunc.resolve_dtypes((*map(_kind, inputs), *[None] * ufunc.nout))
         arrays = [self.lifted(one, kind) for one, kind in zip(inputs, kinds, strict=False)]
-        results = kinds[ufunc.nin :]
-        if ufunc is np.frexp:
-            return (
-                self._applied("fraction", results[0], *arrays),
-                self._applied("exponent", results[1], *arrays),
-            )
         if ufunc not in _OPERATIONS:
             _refuse(f"np.{ufunc.__name__}")
         operation = _OPERATIONS[ufunc]
         if kinds[0] == _FLAG:
             operation = {"add": "or", "multiply": "and"}.get(operation, operation)
-        return self._applied(operation, results[0], *arrays)
+        return self._applied(operation, kinds[ufunc.nin], *arrays)
 
     def __array_function__(
         self, function: Callable[..., Any], types: object, inputs: Any, options: Any
