@@ -189,7 +189,7 @@ class Loop:
         record = self._record
         count = self.num_envs
         self._tells(None)
-        self._headline = None
+        self._headline: Floats | None = None
         known = vars(record).get("observations")
         self.observations = {}
         for array in self.spec.observation:

@@ -137,8 +137,10 @@ class TracedArray(NDArrayOperatorsMixin):
             return self.copy() if copy else self
         return self._each(lambda value: self.program.cast(value, dtype), dtype, self)
 
-    def view(self, dtype: Any) -> "TracedArray":
+    def view(self, dtype: Any = None) -> "TracedArray":
         """The bits of its numbers as another dtype of as many bits."""
+        if dtype is None:
+            return self._like(self.values)
         return self._applied("bits", np.dtype(dtype), self)
 
     def clip(self, low: Any = None, high: Any = None) -> Traced:
