@@ -3,6 +3,9 @@
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ..models.fields import Limits, PositiveInt, check_fields
 
 Positive = Annotated[float, Limits(0.0, 1e30, above=True)]
@@ -27,6 +30,8 @@ class Config:
     """Discount. The paper names none."""
     reward_scale: Positive = 1.0
     """Factor of the rewards that it learns from; returns are shown without it."""
+    reward_clip: Annotated[float | None, Limits(0.0, 1e30, above=True)] = None
+    """Largest size of a reward that it learns from, after `reward_scale`; null: any."""
     log_std: Annotated[float, Limits(-4.0, 1.0)] = -0.5
     """Initial logarithm of the policy's standard deviation, in units of the action."""
 
@@ -35,6 +40,12 @@ class Config:
 
     def __post_init__(self) -> None:
         check_fields(self)
+
+    def scaled(self, rewards: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The rewards that it learns from."""
+        scaled = self.reward_scale * rewards
+        most = self.reward_clip
+        return scaled if most is None else np.clip(scaled, -most, most)
 
     def least_steps(self, drones: int, episode_length: int) -> int:
         """Env steps that a training needs for one update, with all drones together."""

@@ -7,7 +7,6 @@ keeps no simulator's state: it resets to the same seed and repeats the same acti
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from functools import lru_cache
 from typing import Annotated, Any
 
 import numpy as np
@@ -20,7 +19,6 @@ from ..models.fields import Limits
 from .networks import Floats
 from .policies import ActionMap, flat
 
-_BLOCK = 256  # episodes
 Mask = NDArray[np.bool_]
 Counts = NDArray[np.int64]
 
@@ -31,16 +29,8 @@ class ResumeError(InputError):
 
 def episode_seed(run_seed: int, episode: int) -> int:
     """Seed of an episode, 64 bits: independent across runs and episodes."""
-    block, number = divmod(episode, _BLOCK)
-    return _seeds(run_seed, block)[number]
-
-
-@lru_cache
-def _seeds(run_seed: int, block: int) -> list[int]:
-    """Seeds of a block of episodes, which are drawn together."""
-    sequence = np.random.SeedSequence(run_seed, spawn_key=(2, block))
-    seeds: list[int] = sequence.generate_state(_BLOCK, np.uint64).tolist()
-    return seeds
+    sequence = np.random.SeedSequence(run_seed, spawn_key=(2, episode))
+    return int(sequence.generate_state(1, np.uint64)[0])
 
 
 @dataclass(frozen=True)
@@ -255,7 +245,7 @@ class EpisodeRecorder:
     def _repeat(self, position: Position) -> bool:
         """Fly the actions of a position; whether a simulator was lost."""
         env = self.env
-        self._forget(np.ones(self.num_envs, bool))
+        self._forget(np.arange(self.num_envs))
         self._flown = []
         self._steps = []
         env.reset(seed=self._seeds.tolist())
@@ -281,17 +271,19 @@ class EpisodeRecorder:
 
     def _number(self, drones: Mask) -> None:
         """Give these drones their next episodes."""
-        self._numbers[drones] = self._numbers.max() + 1 + np.arange(drones.sum())
-        self._first_steps[drones] = self.env_steps
-        self._draw_seeds(np.flatnonzero(drones).tolist())
-        self._forget(drones)
+        chosen = np.flatnonzero(drones)
+        first = self._numbers.max() + 1
+        self._numbers[chosen] = np.arange(first, first + len(chosen))
+        self._first_steps[chosen] = self.env_steps
+        self._draw_seeds(chosen.tolist())
+        self._forget(chosen)
 
-    def _forget(self, drones: Mask) -> None:
-        self._lengths[drones] = 0
-        self._rewards[drones] = 0.0
-        self._sizes[drones] = 0.0
-        self.out = self.out & ~drones
-        self.done = self.done & ~drones
+    def _forget(self, drones: Counts) -> None:
+        for numbers in (self._lengths, self._rewards, self._sizes):
+            numbers[drones] = 0
+        self.out = self.out.copy()
+        self.out[drones] = False
+        self.done = worlds_done(self.out, self._together)
 
     def _take_out(self, ended: Mask) -> None:
         self.out = self.out | ended

@@ -83,7 +83,7 @@ class Learner:
         while log.env_steps < env_steps:
             before = log.env_steps
             rollout = self.collect(collector, env_steps - before)
-            rollout = replace(rollout, rewards=self.config.reward_scale * rollout.rewards)
+            rollout = replace(rollout, rewards=self.config.scaled(rollout.rewards))
             if self.config.anneal:
                 self.rate = self.config.learning_rate * (1 - before / env_steps)
             if len(rollout):

@@ -118,6 +118,7 @@ class Affine(Layer):
     def __init__(self, inputs: int, outputs: int) -> None:
         self.shapes = {"weight": (outputs, inputs), "bias": (outputs,)}
         self._outputs = self._by_inputs = np.zeros((0, 0), np.float32)
+        self._ones = np.zeros(0, np.float32)
 
     def bind(self, weights: Weights) -> None:
         self.weight = weights.arrays["weight"]
@@ -141,9 +142,10 @@ class Affine(Layer):
         return self._outputs
 
     def learn(self, slope: Floats) -> None:
-        ones = np.ones(slope.shape[-1], np.float32)
+        if self._ones.size != slope.shape[-1]:
+            self._ones = np.ones(slope.shape[-1], np.float32)
         np.matmul(slope, self._inputs.swapaxes(-1, -2), out=self._by_weight)
-        np.matmul(slope, ones, out=self._by_bias)
+        np.matmul(slope, self._ones, out=self._by_bias)
 
     def back(self, slope: Floats) -> Floats:
         if self._by_inputs.shape[-1] != slope.shape[-1]:

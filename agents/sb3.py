@@ -9,7 +9,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from ..envs.autoreset import Step
 from ..models.errors import InputError, require
 from .a2c import A2C, A2CConfig
-from .config import SACConfig
+from .config import Config, SACConfig
 from .episodes import EpisodeRecorder
 from .learner import OnUpdate, seeds_of
 from .networks import ByName, Floats
@@ -101,9 +101,9 @@ class RecordedEnv(VectorEnv[Floats, Floats, np.ndarray]):
     once more with its world.
     """
 
-    def __init__(self, recorder: EpisodeRecorder, reward_scale: float = 1.0) -> None:
+    def __init__(self, recorder: EpisodeRecorder, config: Config) -> None:
         self.recorder = recorder
-        self._reward_scale = reward_scale
+        self._config = config
         self.num_envs = recorder.num_envs
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
         bounds = [np.reshape(array.bounds(), (2, -1)) for array in recorder.spec.observation]
@@ -124,7 +124,7 @@ class RecordedEnv(VectorEnv[Floats, Floats, np.ndarray]):
         env = recorder.env
         recorder.fly(np.asarray(actions, np.float32).reshape(self.num_envs, -1))
         final = recorder.observations
-        rewards = self._reward_scale * env.rewards
+        rewards = self._config.scaled(env.rewards)
         terminated = env.terminated
         truncated = env.truncated
         starting = recorder.done
@@ -177,7 +177,7 @@ class SB3Agent:
 
         self.model = _MODELS[type(config)](
             "MlpPolicy",
-            SB3VecEnv(RecordedEnv(log, config.reward_scale)),
+            SB3VecEnv(RecordedEnv(log, config)),
             learning_rate=rate,
             gamma=config.gamma,
             policy_kwargs=policy,

@@ -270,11 +270,14 @@ def test_what_is_stored_is_not_clipped_and_what_is_flown_is_in_the_units_of_the_
     np.testing.assert_allclose(env.flown, expected, rtol=1e-6)
 
 
+@pytest.mark.parametrize("clip", [None, 0.125])
 @pytest.mark.parametrize("algorithm", SMALL)
-def test_rewards_are_scaled_for_the_learner_alone(algorithm: str) -> None:
+def test_rewards_are_scaled_for_the_learner_alone(algorithm: str, clip: float | None) -> None:
     """Rewards of 1 in episodes of 8 steps, and 0 where an episode begins."""
     log = log_of("end")
-    config = preset(algorithm, "tuned", reward_scale=0.25, **SMALL[algorithm])
+    expected = clip or 0.25
+    changes = {"reward_scale": 0.25, "reward_clip": clip, **SMALL[algorithm]}
+    config = preset(algorithm, "tuned", **changes)
     agent: Any = make_agent(algorithm, log, config, 0)
     learned: list[np.ndarray] = []
     if isinstance(agent, SB3Agent):
@@ -283,8 +286,8 @@ def test_rewards_are_scaled_for_the_learner_alone(algorithm: str) -> None:
     else:
         agent.update = lambda data: learned.append(data.rewards)
         agent.train(log, 64, lambda: True)
-    assert set(np.concatenate(learned).ravel()) <= {0.0, 0.25}
-    assert np.concatenate(learned).max() == 0.25
+    assert set(np.concatenate(learned).ravel()) <= {0.0, expected}
+    assert np.concatenate(learned).max() == expected
     assert log.episodes[0].total_reward == 8.0
 
 

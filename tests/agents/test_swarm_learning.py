@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from drones import cases
 from nets import arrays_of
-from rotorgram.agents import EpisodeRecorder, ResumeError, make_agent, preset
+from rotorgram.agents import Config, EpisodeRecorder, ResumeError, make_agent, preset
 from rotorgram.agents.rollouts import Collector, Rollout
 from rotorgram.agents.sb3 import RecordedEnv
 from rotorgram.envs import LocalVectorEnv
@@ -164,7 +164,7 @@ def test_a_training_of_other_worlds_is_not_resumed(case: Any) -> None:
 
 def test_sb3_sees_zeros_of_one_that_is_out_until_its_world_ends() -> None:
     log = log_of()
-    env = RecordedEnv(log)
+    env = RecordedEnv(log, Config())
     env.reset()
     ends = []
     for _ in range(30):

@@ -9,7 +9,7 @@ import pytest
 from drones import ENV, OPTIONS
 from drones import vector as drones_of
 from nets import random_policy
-from rotorgram.agents import EpisodeRecorder, ResumeError, episode_seed, make_agent, preset
+from rotorgram.agents import Config, EpisodeRecorder, ResumeError, episode_seed, make_agent, preset
 from rotorgram.agents.rollouts import Collector
 from rotorgram.agents.sb3 import RecordedEnv, SB3VecEnv
 from rotorgram.envs import LocalVectorEnv
@@ -53,7 +53,7 @@ def test_no_two_episodes_have_the_same_seed() -> None:
 def test_every_episode_has_the_seed_of_its_number() -> None:
     """All drones do the same, so that any of them may have flown an episode."""
     log = EpisodeRecorder(vector(), seed=3)
-    env = RecordedEnv(log)
+    env = RecordedEnv(log, Config())
     env.reset()
     for _ in range(100):
         env.step(np.full((N, 1), 0.3))
@@ -100,7 +100,7 @@ def test_kept_steps_are_those_of_the_episodes() -> None:
 
 def test_a_step_for_sb3_is_gymnasiums_same_step() -> None:
     log = EpisodeRecorder(vector(), seed=0)
-    env = RecordedEnv(log)
+    env = RecordedEnv(log, Config())
     env.reset()
     dice = np.random.default_rng(0)
     ended = 0
@@ -123,7 +123,7 @@ def test_a_step_for_sb3_is_gymnasiums_same_step() -> None:
 @pytest.mark.parametrize("drones", [1, 4])
 def test_resuming_brings_every_drone_to_where_it_was(drones: int, steps: int) -> None:
     logs = [EpisodeRecorder(vector(drones), 1) for _ in range(2)]
-    first, second = map(RecordedEnv, logs)
+    first, second = (RecordedEnv(log, Config()) for log in logs)
     dice = np.random.default_rng(7)
     first.reset()
     for _ in range(steps):
@@ -168,7 +168,7 @@ def test_a_simulator_lost_while_others_begin() -> None:
     env = Losing(ENV, 4, autoreset_mode="Disabled", **OPTIONS)
     # With this seed the first drone's episode ends alone, while both drones of the second half fly.
     log = EpisodeRecorder(env, 3)
-    same_step = RecordedEnv(log)
+    same_step = RecordedEnv(log, Config())
     same_step.reset()
     dice = np.random.default_rng(0)
     seen = False
