@@ -54,6 +54,10 @@ class _Remote(NotCopied):
                 self._agent.close()
                 raise
 
+    def _check_flying(self) -> None:
+        if not self._flying:
+            raise gym.error.ResetNeeded("step: expected a call of reset() first")
+
     @abstractmethod
     def connect(self) -> None:
         """Wait until it is the agent's turn: for the simulators' first States, if none has come."""
@@ -154,8 +158,7 @@ class RemoteEnv(_Remote, gym.Env[Observation, ArrayLike]):
 
     def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, Info]:
         """Fly for one control period. The action is sent in the dtype of its space."""
-        if not self._flying:
-            raise gym.error.ResetNeeded("step: expected a call of reset() first")
+        self._check_flying()
         actions = _checked_actions(action, self._dtype, self._row)[np.newaxis]
         self._flying = False  # until the answer is there
         try:
@@ -304,8 +307,7 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Observation, ArrayL
 
     def step(self, actions: ArrayLike) -> Step:
         """Fly every drone for one control period. The autoreset says what follows an episode."""
-        if not self._flying:
-            raise gym.error.ResetNeeded("step: expected a call of reset() first")
+        self._check_flying()
         self._reasons = None
         return super().step(actions)
 
@@ -320,8 +322,7 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Observation, ArrayL
 
         With seeds every drone has one, also where it is ignored.
         """
-        if not self._flying:
-            raise gym.error.ResetNeeded("step: expected a call of reset() first")
+        self._check_flying()
         resets = self._nobody if resets is None else resets
         frozen = self._nobody if frozen is None else frozen & ~resets
         still = resets | frozen

@@ -108,9 +108,7 @@ class SessionVerdict:
             number = transition.state.sequence - 1
             raise InputError(f"expected Command {number} before it, got none of that number")
         if command is None:
-            actions = self.session.layout.actions
-            nothing = np.zeros(actions.shape, actions.dtype)
-            loop.advance(nothing, resets, seeds, None)
+            loop.advance(self.session.layout.actions.zeros(), resets, seeds, None)
         else:
             loop.advance(command.actions, resets, seeds, command.frozen)
         return loop

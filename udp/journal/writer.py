@@ -92,8 +92,7 @@ class Journal:
             return
         now = time.time_ns()
         if isinstance(message, State | Command):
-            topic = "state" if isinstance(message, State) else "command"
-            channel = self._channel(f"/slot{slot}/{topic}", "rotorgram")
+            channel = self._channel(f"/slot{slot}/{type(message).__name__.lower()}", "rotorgram")
             self._pending.append((channel, now, message.sequence, datagram))
         else:
             channel = self._channel(f"/slot{slot}/events", "json")

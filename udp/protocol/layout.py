@@ -47,6 +47,10 @@ class Slot(NamedTuple):
         """The array in a message, not copied, read-only."""
         return np.ndarray(self.shape, self.dtype, data, self.at)
 
+    def zeros(self) -> Array:
+        """An array of zeros."""
+        return np.zeros(self.shape, self.dtype)
+
 
 class Record(NamedTuple):
     """The arrays of a State or a Command."""

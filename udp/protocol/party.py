@@ -196,9 +196,8 @@ class WorldRules:
             )
 
     def _reset_all(self, seeds: Seeds | None) -> None:
-        actions = self.layout.actions
-        nothing = np.zeros(actions.shape, actions.dtype)
-        self.world.advance(nothing, np.ones(self.layout.drones, bool), seeds, None)
+        everybody = np.ones(self.layout.drones, bool)
+        self.world.advance(self.layout.actions.zeros(), everybody, seeds, None)
         self.cause = None
         self.moved = True
 
@@ -353,7 +352,7 @@ class SeveralAgents(WorldRules):
     def _fly(self, flying: list[AgentLink]) -> None:
         """Fly the world for one control period."""
         layout = self.layout
-        actions = np.zeros(layout.actions.shape, layout.actions.dtype)
+        actions = layout.actions.zeros()
         if layout.choices:
             actions += (layout.choices - 1) // 2  # hold
         staying = []

@@ -182,7 +182,7 @@ def decode_command(datagram: bytes, layout: Layout, session: int) -> Command | C
         raise DecodeError(f"command: expected {expected}, got {datagram[:80]!r}")
     if reset:
         order = RESET
-        action = np.zeros(actions.shape, actions.dtype)
+        action = actions.zeros()
     else:
         order = FLY
         action = _action(fields, layout)

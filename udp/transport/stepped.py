@@ -102,11 +102,10 @@ class GymnasiumWorld:
         terminated = truncated = False
         if is_reset:
             observation, info = self._env.reset(seed=None if seeds is None else int(seeds[0]))
-            self._keep(observation, info)
-            self.out[:] = False
         elif not is_frozen:
             action = int(actions[0]) if isinstance(self.spec.action, Discrete) else actions[0]
             observation, reward, terminated, truncated, info = self._env.step(action)
+        if is_reset or not is_frozen:
             self._keep(observation, info)
             self.out[:] = terminated or truncated
         self.rewards[:] = float(reward)
