@@ -230,21 +230,14 @@ class SB3Agent:
     def actor(self) -> ByName:
         """Weights of the policy, under our names."""
         parameters = self.model.policy.state_dict()
-        weights = {name: values.numpy().copy() for name, values in parameters.items()}
-        hidden = "mlp_extractor.policy_net"
-        output = "action_net"
+        network = ("mlp_extractor.policy_net.", "action_net.")
         if isinstance(self._config, SACConfig):
-            hidden = "actor.latent_pi"
-            output = "actor.mu"
-        layers = [f"{hidden}.{2 * i}" for i in range(len(self._config.hidden))]
-        actor = {
-            f"layers.{i}.{kind}": weights[f"{name}.{kind}"]
-            for i, name in enumerate([*layers, output])
-            for kind in ("weight", "bias")
-        }
-        if "log_std" in weights:
-            actor["log_std"] = weights["log_std"]
-        return actor
+            network = ("actor.latent_pi.", "actor.mu.")
+        weights = [values for name, values in parameters.items() if name.startswith(network)]
+        if "log_std" in parameters:
+            weights.append(parameters["log_std"])
+        ours = NetworkPolicy(self.spec, self._config).shapes
+        return {name: w.numpy().copy() for name, w in zip(ours, weights, strict=True)}
 
     def policy(self) -> NetworkPolicy:
         """The current policy, without exploration: a copy."""
