@@ -141,7 +141,7 @@ def _run(words: list[str]) -> int:
     with hidden_gl_setting():  # importing OpenGL takes time, also for a command that draws nothing
         module = import_module(f".{name}", __name__)
         kind: type[Command] = getattr(module, name.title())
-        return parse(kind, f"rotorgram {name}", words[1:]).run()
+        return parse(kind, f"rotorgram {name}", words[1:]).run() or 0
 
 
 def _help() -> str:

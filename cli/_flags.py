@@ -58,8 +58,8 @@ class Command:
     def __init_subclass__(cls) -> None:
         dataclass(frozen=True, kw_only=True)(cls)
 
-    def run(self) -> int:
-        """Do it; the exit status."""
+    def run(self) -> int | None:
+        """Do it; the exit status, where it is not 0."""
         raise NotImplementedError
 
     def settings(self, kind: type["DataclassInstance"]) -> Options:

@@ -50,17 +50,18 @@ class StudyFlags(TrainingFlags, WorkersConfig):
         """The study that the flags describe. Raises `InputError`."""
         raise NotImplementedError
 
-    def run(self) -> int:
+    def run(self) -> None:
         """Fly the study, or what is missing of one; report."""
         require("matplotlib", "report", "a report")  # before hours of training
         workers = WorkersConfig(**self.settings(WorkersConfig))
         if self.resume:
-            return self._fly(self._resumed(self.resume), self.resume, workers)
+            self._fly(self._resumed(self.resume), self.resume, workers)
+            return
         study = self.study()
         with folder_to_write(self.out, self.words.replace(" ", "-")) as folder:
-            return self._fly(study, folder, workers)
+            self._fly(study, folder, workers)
 
-    def _fly(self, study: "Study", folder: Path, workers: WorkersConfig) -> int:
+    def _fly(self, study: "Study", folder: Path, workers: WorkersConfig) -> None:
         from ..training.study import run_study
         from ._progress import bars
 
@@ -75,7 +76,6 @@ class StudyFlags(TrainingFlags, WorkersConfig):
                 report(folder, film=False)
             raise
         report(folder, self.film)
-        return 0
 
     def _resumed(self, folder: Path) -> "Study":
         from ..training.results import Results

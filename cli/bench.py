@@ -16,7 +16,7 @@ class Bench(Command):
     out: Path | None = None
     """Folder to write to. Default: runs/bench-TIME."""
 
-    def run(self) -> int:
+    def run(self) -> None:
         """Measure and print."""
         from rich.box import SIMPLE_HEAD
         from rich.console import Console
@@ -40,4 +40,3 @@ class Bench(Command):
             rates.add_row(layer.name, layer.about, f"{rate:,.0f}", f"{1e6 / rate:.2f}")
         Console().print(rates)
         print(f"written: {folder / 'bench.json'}")
-        return 0

@@ -21,7 +21,7 @@ class Capture(Command, CaptureConfig, WorkersConfig):
     out: Path
     """Folder to write to. It must not exist."""
 
-    def run(self) -> int:
+    def run(self) -> None:
         """Take them; say where and how many."""
         from ..flights.capture import capture
         from ..models.errors import InputError, require
@@ -37,4 +37,3 @@ class Capture(Command, CaptureConfig, WorkersConfig):
         with bars() as progress:
             frames = capture(self.journals, self.out, config, workers, progress)
         print(f"{self.out}: {frames} frames of {len(config.views())} pictures a drone")
-        return 0

@@ -27,7 +27,7 @@ class Dataset(Command):
     vehicle: str | None = None
     """TOML or MJCF file that was flown, or its name. Default: the paper's quadcopter."""
 
-    def run(self) -> int:
+    def run(self) -> None:
         """Write it; print what it holds."""
         from ..flights.datasets import RecordedEpisodes, env_of, write_minari, write_parquet
         from ..models import MAX_DRONES
@@ -55,4 +55,3 @@ class Dataset(Command):
                 "vehicle and these options is not known here; --env MODULE:NAME registers a task, "
                 "--vehicle names the vehicle"
             )
-        return 0

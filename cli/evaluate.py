@@ -15,7 +15,7 @@ class Evaluate(AgentFlags, BackendFlags):
     episodes: int = 20
     """Episodes to fly, from seeds that no training uses."""
 
-    def run(self) -> int:
+    def run(self) -> None:
         """Fly and print the means."""
         import pandas as pd
 
@@ -46,4 +46,3 @@ class Evaluate(AgentFlags, BackendFlags):
             print(f"settling   {bound}: {when} ({count} of {len(rows)} episodes)")
         if headline.signed:
             print(f"overshoot  {overshoot}")
-        return 0

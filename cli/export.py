@@ -21,7 +21,7 @@ class Export(Command):
     """File to write, a new one. Default: policy.onnx or rotorgram_policy.h in the working
     directory."""
 
-    def run(self) -> int:
+    def run(self) -> None:
         """Write it."""
         from ..agents.export import TARGETS, export
         from ._env import trained
@@ -32,4 +32,3 @@ class Export(Command):
         content = export(trained(self.policy), self.to)
         write_whole(out, content)
         print(f"policy: {out} ({len(content):,} bytes)")
-        return 0

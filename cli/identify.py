@@ -32,7 +32,7 @@ class Identify(Command):
     period: float = 0.01
     """Logs are resampled to this period, s."""
 
-    def run(self) -> int:
+    def run(self) -> None:
         """Print every estimate, write the file."""
         from ..flights.flight_logs import read_log
         from ..flights.identified_vehicle import identified_toml
@@ -61,7 +61,6 @@ class Identify(Command):
         self._show(found)
         write_new(self.out, identified_toml(vehicle, found))
         print(self.out)
-        return 0
 
     def _show(self, found: "Identified") -> None:
         from rich.console import Console

@@ -13,10 +13,9 @@ class Key(Command):
     file: Positional[Path]
     """File to write; it must not exist."""
 
-    def run(self) -> int:
+    def run(self) -> None:
         """Write it."""
         from ..udp.protocol.auth import write_key
 
         write_key(self.file)
         print(f"key: {self.file} (give it to both sides with --key-file)")
-        return 0

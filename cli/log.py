@@ -28,7 +28,7 @@ class Log(Command):
     episode: int | None = None
     """Episode of each drone, from 0. Default: all."""
 
-    def run(self) -> int:
+    def run(self) -> None:
         """Write it; say where."""
         from ..flights.recorded import recorded_trajectories
         from ..flights.signals import write_csv, write_parquet_log
@@ -45,4 +45,3 @@ class Log(Command):
         flights = recorded_trajectories(self.flight, chosen, session=self.session, drone=self.drone)
         rows = write_csv(flights, out) if self.csv else write_parquet_log(flights, out)
         print(f"{out}: {count_of(len(flights), 'episode')}, {count_of(rows, 'row')}")
-        return 0

@@ -27,7 +27,7 @@ class Plot(Command):
     episodes: int = 1
     """Number of episodes of each journal."""
 
-    def run(self) -> int:
+    def run(self) -> None:
         """Draw it; say where."""
         from ..flights.plots import FORMATS, plot_flights
         from ..flights.recorded import recorded_trajectories
@@ -52,4 +52,3 @@ class Plot(Command):
                 found[name] = flight
         plot_flights(found, out)
         print(f"{out}: {len(found)} flights" if len(found) > 1 else out)
-        return 0

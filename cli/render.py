@@ -54,7 +54,7 @@ class Render(EnvFlags):
     drone: int = 0
     """With a journal: which drone of the session, from 0."""
 
-    def run(self) -> int:
+    def run(self) -> None:
         """Fly or read, draw, and say where."""
         from ..flights.filming import Film, film
         from ..rendering.film import check_film
@@ -78,7 +78,6 @@ class Render(EnvFlags):
             frames = film(self.out, tracks, config, on_frame)
         pictures = "1 picture" if frames == 1 else f"{frames} pictures"
         print(f"film: {self.out} ({pictures} of {width}x{height})")
-        return 0
 
     def _check(self) -> None:
         """Refuse flags that contradict each other."""

@@ -15,9 +15,8 @@ class Report(Command):
     film: bool = True
     """Whether the agents are filmed, if there is no film yet, where there is OpenGL."""
 
-    def run(self) -> int:
+    def run(self) -> None:
         """Write figures and report from the files, and print the tables."""
         from ._study import report
 
         report(self.folder, self.film)
-        return 0

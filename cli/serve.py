@@ -21,7 +21,7 @@ class Serve(AgentFlags):
     episodes: int | None = None
     """End after so many episodes. Default: go on until Ctrl-C."""
 
-    def run(self) -> int:
+    def run(self) -> None:
         """Fly episode after episode."""
         from ..flights.trajectories import fly_episodes
         from ..udp import LinkError
@@ -41,4 +41,3 @@ class Serve(AgentFlags):
                     episode += count
                 except LinkError as error:  # one that leaves is no error: another may come
                     print(error)
-        return 0

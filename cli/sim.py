@@ -35,7 +35,7 @@ class Sim(BackendFlags, WireFlags):
     view: bool = False
     """Show the first world in a window. Lock-step does not wait for it. Keys: docs/viewing.md."""
 
-    def run(self) -> int:
+    def run(self) -> None:
         """Simulate until the agent closes."""
         if self.options.get("cameras"):  # an agent that was greeted would wait for pictures
             from ..rendering.gl import offscreen_context
@@ -70,7 +70,6 @@ class Sim(BackendFlags, WireFlags):
                 for link in links:
                     where = " to {}:{}".format(*link.address) if several else ""
                     print(f"wire{where}: {link.client.statistics}")
-        return 0
 
     def _shown(self, simulator: "Simulator") -> AbstractContextManager[None]:
         if not self.view:  # nothing that draws is imported

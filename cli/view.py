@@ -26,7 +26,7 @@ class View(EnvFlags):
     episodes: int | None = None
     """End after so many episodes. Default: go on until it is closed."""
 
-    def run(self) -> int:
+    def run(self) -> None:
         """Fly and show, episode after episode."""
         from ..flights.filming import moments
         from ..rendering.live import Pace
@@ -61,4 +61,3 @@ class View(EnvFlags):
                     print_episode(one)
             while live.is_running and not live.wants:  # the last picture is still to come
                 time.sleep(0.02)
-        return 0
