@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,12 +21,10 @@ from ..models.cameras import View
 from ..models.files import software_versions, write_whole
 from ..models.swarm import drone_names
 from ..models.vehicle import Vehicle
+from ..rendering.cameras import Cameras
 from .executors import OnProgress, Tell, WorkersConfig, open_executor, run_jobs
 from .folders import new_folder
 from .viewpoints import CaptureConfig, PoseSequence, sequences_of
-
-if TYPE_CHECKING:
-    from ..rendering.cameras import Cameras
 
 _MOST_FRAMES = 64  # of a job
 Picture = NDArray[np.generic]
@@ -114,8 +112,6 @@ def _jobs(config: CaptureConfig, sequences: Sequence[PoseSequence], longest: int
 
 def _take(job: _Job, tell: Tell) -> _Taken:
     """The frames of a job."""
-    from ..rendering.cameras import Cameras
-
     poses = job.poses
     everybody = np.ones(poses.drones, bool)
     frames = []
@@ -137,7 +133,7 @@ def _take(job: _Job, tell: Tell) -> _Taken:
         return _Taken(cameras.objects[1:], frames)  # the first is no object
 
 
-def _frame(job: _Job, row: int, cameras: "Cameras") -> tuple[dict[str, bytes], Labels]:
+def _frame(job: _Job, row: int, cameras: Cameras) -> tuple[dict[str, bytes], Labels]:
     """Files and labels of the pictures that the cameras have just taken."""
     poses = job.poses
     number = job.first + row

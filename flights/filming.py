@@ -9,18 +9,16 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..envs.rendering import moment
 from ..models.errors import InputError
 from ..models.fields import Limits, check_fields
 from ..rendering import Camera, Canvas, Moment, Stage
-from ..rendering.film import QUALITY, write_film
+from ..rendering.film import QUALITY, Picture, write_film
 from ..rendering.gl import Lines
 from ..scenes import parse_scene
 from .trajectories import Trajectory
 
-Picture = NDArray[np.uint8]
 OnFrame = Callable[[int, int], object]
 """Called with frames drawn, and frames in all."""
 

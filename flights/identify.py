@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 from ..models.errors import InputError
 from ..models.vehicle import Vehicle
 from ..sim.rotations import advanced
-from .flight_logs import FlightLog, with_lag
+from .flight_logs import FlightLog, Floats, with_lag
 from .prediction import (
     NAMES,
-    Floats,
     Numbers,
     Windows,
     differences,

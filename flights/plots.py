@@ -7,20 +7,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..models.errors import InputError, require
 from ..sim.rotations import euler
 from .palette import FLIGHT_COLORS
 from .signals import QUATERNION, Column, Signal, signals_of
-from .trajectories import Trajectory
+from .trajectories import Floats, Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
-Floats = NDArray[np.float64]
 Columns = dict[str, Column]
 
 FORMATS = (".png", ".pdf", ".svg")

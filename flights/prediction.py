@@ -23,9 +23,8 @@ from ..sim.effects import EffectOptions
 from ..sim.rotations import between
 from ..sim.state import InitialState
 from ..sim.world import PhysicsError
-from .flight_logs import FlightLog
+from .flight_logs import FlightLog, Floats
 
-Floats = NDArray[np.float64]
 Numbers = Mapping[str, float]
 """Numbers of a vehicle by the names of `NAMES`, in the units of `models/coefficients.toml`."""
 

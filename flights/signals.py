@@ -8,14 +8,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..envs.spec import ArraySpec, Discrete, component_names
 from ..models.errors import require
 from ..models.files import write_new
-from .trajectories import Trajectory
-
-Floats = NDArray[np.float64]
+from .trajectories import Floats, Trajectory
 
 QUATERNION = ("qw", "qx", "qy", "qz")
 

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Final, Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,7 @@ EpisodeSet = Literal["final", "curve", "tuning"]
 """Evaluation episodes that share no start: `final` for the figures that are reported, `curve` for
 snapshots during training and all other looks at a policy, `tuning` for choosing settings."""
 
-_SETS: Final[tuple[EpisodeSet, ...]] = ("final", "curve", "tuning")
+_SETS = get_args(EpisodeSet)
 
 Ending = Literal["terminated", "truncated", "cut off"]
 """`cut off`: the episode was given up, its simulator was lost, or the journal ends before it."""

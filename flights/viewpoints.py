@@ -21,12 +21,10 @@ from ..models.fields import Limits, NonNegativeInt, PositiveInt, check_fields
 from ..scenes import parse_scene
 from ..sim.rotations import multiplied
 from .recorded import read_episodes
-from .trajectories import Trajectory
+from .trajectories import Floats, Trajectory
 
 if TYPE_CHECKING:
     from ..models.cameras import View
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)

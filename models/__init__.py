@@ -4,7 +4,7 @@ Importing this package does not import MuJoCo: `Vehicle` does so on first use.
 """
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 from .. import import_when_used
 from .errors import InputError, MissingPackage
@@ -22,7 +22,7 @@ QUAD_XML = Path(__file__).parent / "quad.xml"
 Backend = Literal["mujoco", "rigid"]
 """What steps vehicles. `mujoco`: threads of this machine, float64. `rigid`: the rigid body alone,
 no contact, in NumPy or compiled."""
-BACKENDS: Final[tuple[Backend, ...]] = get_args(Backend)
+BACKENDS = get_args(Backend)
 MAX_DRONES = 1024
 """Most drones of a world."""
 MAX_DRAG = 100.0

@@ -8,7 +8,7 @@ in the table GROUP. SI units; body axes x forward, y left, z up.
 from collections.abc import Iterable, Mapping
 from dataclasses import make_dataclass
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any
 
 from .errors import InputError
 from .fields import Limits, OrNone, check, check_names
@@ -16,7 +16,7 @@ from .files import read_toml
 
 PREFIX = "rotorgram/"
 _GROUPS = read_toml(Path(__file__).with_name("coefficients.toml"), "coefficients")
-COEFFICIENTS: Final[Mapping[str, Limits]] = {
+COEFFICIENTS = {
     f"{group}.{name}": Limits(**row)
     for group, rows in _GROUPS.items()
     for name, row in rows.items()
@@ -69,7 +69,7 @@ def _table(group: str, names: Iterable[str]) -> type:
     return make_dataclass(group, fields, frozen=True, kw_only=True)
 
 
-TABLES: Final[Mapping[str, type]] = {group: _table(group, rows) for group, rows in _GROUPS.items()}
+TABLES = {group: _table(group, rows) for group, rows in _GROUPS.items()}
 """A dataclass for each group, with its coefficients as fields; None: the file does not give it."""
 
 

@@ -8,7 +8,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, TypeVar
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from .cameras import AHEAD, ORIGIN, OUTPUTS, UP, Axis, Camera, Place, steps_of
 from .coefficients import COEFFICIENTS, TABLES, as_tuple
 from .errors import InputError, shortened
-from .fields import Choice, Limits, Text, check, limits_of, optional, read_table
+from .fields import Choice, Limits, T, Text, check, limits_of, optional, read_table
 from .files import read_toml
 
-T = TypeVar("T")
 _Coefficients: Any = TABLES["rotors"]
 _Numbers = tuple[float, ...]
 _Mass = Annotated[float, Limits(1e-6, 1e6, "kg")]
@@ -138,7 +137,7 @@ class Tables:
     real_flights: object = None
 
 
-FRAMES: Final[Mapping[str, tuple[int, float]]] = {
+FRAMES = {
     "plus": (4, 0.0),
     "cross": (4, math.pi / 4),
     "hexa": (6, math.pi / 6),

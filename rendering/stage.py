@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Final, Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple, get_args
 
 import mujoco
 import numpy as np
@@ -23,13 +23,13 @@ from ..models.mjcf import level_data, swarm_spec
 from ..models.swarm import drone_names
 from ..models.vehicle import owners
 from ..scenes.build import SCENE_PREFIX, add_scene
-from ..scenes.marks import Mark
+from ..scenes.marks import Mark, Point
 from .gl import Lines, Offscreen
 
 Array = np.ndarray
 
 Camera = Literal["chase", "front", "side", "top", "onboard"]
-CAMERAS: Final[tuple[Camera, ...]] = get_args(Camera)
+CAMERAS = get_args(Camera)
 
 _MAX_METRICS = 4  # with a line of their own
 _TRAIL = 150  # control steps of a path
@@ -48,8 +48,6 @@ _LOWER = 0.06  # of their distance front and side look below the goal
 _BACK = 2.6  # distance of a camera per distance between craft and goal
 _FOVY = 50.0  # vertical field of view of every camera but `onboard`, degrees
 _FAR = 10.0  # Cameras move back until craft and goal are as far apart, or as at the start
-
-_Vector = tuple[float, float, float]
 
 
 class MetricValue(NamedTuple):
@@ -78,15 +76,15 @@ class MetricValue(NamedTuple):
 class Moment:
     """One craft after one control step. Positions are in the world frame, m."""
 
-    position: _Vector
+    position: Point
     """x, y, z."""
     attitude: tuple[float, ...]
     """Quaternion from body to world: w, x, y, z."""
     thrusts: tuple[float, ...]
     """F1 to FR, N."""
-    goal: _Vector | None = None
+    goal: Point | None = None
     """Position to reach or hold; None if the task has no goal."""
-    payload: _Vector | None = None
+    payload: Point | None = None
     """Position of what hangs below it on a cable; None if nothing does."""
     metrics: tuple[MetricValue, ...] = ()
     """The headline first."""
@@ -301,7 +299,7 @@ class Stage:
         return least_distance(self._points) if self.drones > 1 else None
 
     @property
-    def _goals(self) -> list[_Vector]:
+    def _goals(self) -> list[Point]:
         return [moment.goal for moment in self.moments if moment.goal is not None]
 
     @property
@@ -398,7 +396,7 @@ def _grid(drones: int, spacing: float) -> Array:
     return -spacing * np.stack((rows, columns, np.zeros(drones)), axis=1)
 
 
-def _draw_mark(scene: MjvScene, mark: Mark, goal: _Vector | None) -> None:
+def _draw_mark(scene: MjvScene, mark: Mark, goal: Point | None) -> None:
     """Add a mark; a gate that is the goal has the goal's colour."""
     centre = np.array(mark.position)
     if mark.moves:

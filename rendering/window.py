@@ -7,7 +7,7 @@ import threading
 import warnings
 from collections.abc import Callable
 from types import ModuleType
-from typing import Final, Literal
+from typing import Literal
 
 import mujoco
 
@@ -17,7 +17,7 @@ from .stage import Stage
 
 Press = Literal["pause", "step"]
 """Effect of a key."""
-KEYS: Final[dict[int, Press]] = {
+KEYS: dict[int, Press] = {
     32: "pause",  # space
     262: "step",  # arrow to the right
 }

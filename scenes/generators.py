@@ -4,9 +4,9 @@ World frame: z up, m. A generator draws all numbers of a scene from one stream, 
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -21,9 +21,7 @@ GROUP = 2
 """Group of the geoms of a scene."""
 SKY = mujoco.mjtTexture.mjTEXTURE_SKYBOX
 
-MATERIALS: Final[Mapping[str, Mapping[str, Mapping[str, Any]]]] = read_toml(
-    Path(__file__).with_name("materials.toml"), "materials"
-)
+MATERIALS = read_toml(Path(__file__).with_name("materials.toml"), "materials")
 _TREES = read_toml(Path(__file__).with_name("trees.toml"), "trees")["kind"]
 _FOREST = 60.0  # m: half the width of the wood
 _HALL_XML = Path(__file__).with_name("hall.xml")  # its walls, windows, roof, lamps and racks
@@ -272,7 +270,7 @@ def _add_gate(track: Builder, number: int) -> None:
         track.add(f"gate_{number}/frame_{part}", "box", (0.15, half, bar), position, tint, heading)
 
 
-GENERATORS: Final[dict[str, Callable[[Builder], None]]] = {
+GENERATORS = {
     "warehouse": warehouse,
     "forest": forest,
     "gates": gates,
