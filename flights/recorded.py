@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..envs.spec import ArraySpec
 from ..models.errors import InputError
 from ..udp.journal.reader import Recording, Session, Transition
 from ..udp.protocol.messages import State
@@ -95,26 +94,25 @@ def read_episodes(
         yield from reader.finish()
 
 
-class _Row(NamedTuple):
-    """One drone after a State, and the action that led there; None at the start."""
+class _Flight(NamedTuple):
+    """An episode of one drone, as far as it is read."""
 
-    telemetry: list[Array]
-    observations: list[Array]
-    reward: float
-    action: Array | None
+    seed: int | None
+    arrays: list[list[Array]]
+    """Of each row the telemetry, then the observations that are wanted."""
+    rewards: list[float]
+    actions: list[Array]
 
 
 class _SessionReader:
-    """Makes trajectories from the messages of one session."""
+    """Makes trajectories from the transitions of one session."""
 
     def __init__(self, session: Session, drone: int | None, observations: bool) -> None:
         self.session = session
         self._observations = observations
-        self._drones = len(session.spec.agents)
         count = session.num_envs
         self._chosen = np.ones(count, bool) if drone is None else np.arange(count) == drone
-        self._rows: list[list[_Row]] = [[] for _ in range(count)]
-        self._seeds: list[int | None] = [None] * count
+        self._flights: dict[int, _Flight] = {}
         self._episodes = [0] * count
 
     def take(self, transition: Transition) -> Iterator[Trajectory]:
@@ -124,57 +122,55 @@ class _SessionReader:
         if transition.is_gap:
             yield from self.finish()
         for drone in np.flatnonzero(transition.flown & self._chosen).tolist():
-            if command is None or not self._rows[drone]:
+            if command is None or drone not in self._flights:
                 continue  # its episode has ended
-            self._rows[drone].append(self._row(state, drone, command.actions[drone]))
+            flight = self._flights[drone]
+            flight.arrays.append(self._arrays(state, drone))
+            flight.rewards.append(float(state.rewards[drone]))
+            flight.actions.append(np.array(command.actions[drone]))
             if state.terminated[drone]:
                 yield from self._end(drone, "terminated")
             elif state.truncated[drone]:
                 yield from self._end(drone, "truncated")
         for drone in np.flatnonzero(transition.resets & self._chosen).tolist():
             yield from self._end(drone, "cut off")
-            self._rows[drone] = [self._row(state, drone, None)]
-            first = drone - drone % self._drones  # the first drone's seed counts for its world
+            # The first drone's seed counts for its world.
+            first = drone - drone % len(self.session.spec.agents)
             seeds = transition.seeds
-            self._seeds[drone] = None if seeds is None else int(seeds[first])
+            seed = None if seeds is None else int(seeds[first])
+            self._flights[drone] = _Flight(seed, [self._arrays(state, drone)], [], [])
 
     def finish(self) -> Iterator[Trajectory]:
         """The episodes that the journal's end cuts off."""
-        for drone in range(len(self._rows)):
+        for drone in sorted(self._flights):
             yield from self._end(drone, "cut off")
 
-    def _row(self, state: State, drone: int, action: Array | None) -> _Row:
-        observations = state.observations if self._observations else ()
-        return _Row(
-            telemetry=[np.array(values[drone]) for values in state.telemetry],
-            observations=[np.array(values[drone]) for values in observations],
-            reward=float(state.rewards[drone]),
-            action=None if action is None else np.array(action),
-        )
+    def _arrays(self, state: State, drone: int) -> list[Array]:
+        wanted = [*state.telemetry]
+        if self._observations:
+            wanted += state.observations
+        return [np.array(values[drone]) for values in wanted]
 
     def _end(self, drone: int, ending: Ending) -> Iterator[Trajectory]:
-        """The episode of a drone, if it has a step; a new one has not begun."""
-        rows = self._rows[drone]
-        self._rows[drone] = []
-        if len(rows) < 2:
+        """The episode of a drone, if it has a step."""
+        flight = self._flights.pop(drone, None)
+        if flight is None or not flight.actions:
             return
         spec = self.session.spec
+        columns = iter([np.stack(column) for column in zip(*flight.arrays, strict=True)])
+        telemetry = {array.name: next(columns) for array in spec.telemetry}
+        # None, if they are not wanted.
+        observations = dict(zip((array.name for array in spec.observation), columns, strict=False))
         yield Trajectory(
             spec=spec,
-            telemetry=_stacked(spec.telemetry, [row.telemetry for row in rows]),
-            rewards=np.array([row.reward for row in rows[1:]]),
-            actions=np.stack([row.action for row in rows if row.action is not None]),
+            telemetry=telemetry,
+            rewards=np.array(flight.rewards),
+            actions=np.stack(flight.actions),
             ending=ending,
             episode=self._episodes[drone],
-            observations=_stacked(spec.observation, [row.observations for row in rows]),
+            observations=observations,
             session=self.session.index,
             drone=drone,
-            seed=self._seeds[drone],
+            seed=flight.seed,
         )
         self._episodes[drone] += 1
-
-
-def _stacked(specs: Sequence[ArraySpec], rows: Sequence[Sequence[Array]]) -> dict[str, Array]:
-    """Arrays by name, over time; nothing, if the rows are empty."""
-    columns = zip(*rows, strict=True)
-    return {spec.name: np.stack(column) for spec, column in zip(specs, columns, strict=False)}

@@ -23,7 +23,7 @@ DEFAULT_TIMESTEP = 0.01
 """Physics step of a file without one, s."""
 DEFAULT_GRAVITY = 9.81
 """Downward acceleration of a file without one, m/s²."""
-_COLOURS = read_toml(Path(__file__).with_name("craft.toml"), "craft")["colours"]
+_LOOKS = read_toml(Path(__file__).with_name("craft.toml"), "craft")
 
 
 def craft_spec(file: VehicleFile, base: MjSpec | None = None) -> MjSpec:
@@ -49,13 +49,17 @@ def craft_spec(file: VehicleFile, base: MjSpec | None = None) -> MjSpec:
         numeric = spec.numeric(PREFIX + name) or spec.add_numeric(name=PREFIX + name)
         numeric.size = len(values)
         numeric.data = values
-    free = mujoco.mjtJoint.mjJNT_FREE
-    crafts = [body for body in spec.bodies if any(j.type == free for j in body.joints)]
-    if crafts:
+    for craft in free_bodies(spec)[:1]:
         for camera in file.cameras:
-            body = crafts[0] if camera.carried else spec.worldbody
+            body = craft if camera.carried else spec.worldbody
             place_camera(spec, body, camera)
     return spec
+
+
+def free_bodies(spec: MjSpec) -> list[MjsBody]:
+    """The bodies with a free joint: the craft of a spec."""
+    free = mujoco.mjtJoint.mjJNT_FREE
+    return [body for body in spec.bodies if any(joint.type == free for joint in body.joints)]
 
 
 def _add_actuator(
@@ -90,7 +94,7 @@ def _add_geom(
     body.add_geom(
         name=name,
         type=getattr(mjtGeom, f"mjGEOM_{kind.upper()}"),
-        rgba=_COLOURS[colour],
+        rgba=_LOOKS["colours"][colour],
         size=(*size, 0.0, 0.0)[:3],
         group=group,
         mass=mass,
@@ -217,11 +221,9 @@ def _add_skids(body: MjsBody, half: Vector, unit: float, clearance: float) -> No
 
 
 def _add_looks(body: MjsBody, half: Vector) -> None:
-    x, y, z = half
-    shell = (1.2 * x, 0.9 * y, 1.7 * z)
-    mark = (0.6 * x, 0.55 * y, 1.1 * z)
-    _add_geom(body, "canopy", "ellipsoid", "shell", shell, pos=(0.0, 0.0, 0.7 * z))
-    _add_geom(body, "front mark", "ellipsoid", "orange", mark, pos=(0.9 * x, 0.0, 0.6 * z))
+    for name, (colour, sides, place) in _LOOKS["on_hub"].items():
+        size = np.multiply(half, sides)
+        _add_geom(body, name, "ellipsoid", colour, size, pos=np.multiply(half, place))
 
 
 def _nearest(places: Sequence[Vector], reach: float) -> float:

@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 import mujoco
 from mujoco import MjData, MjsBody, MjSpec, mjtGeom
 
-from .craft import craft_spec
+from .craft import craft_spec, free_bodies
 from .errors import InputError
 from .files import read_toml
 from .vehicle_file import read_vehicle_file
@@ -86,8 +86,7 @@ def _delete_targeting_cameras(spec: MjSpec) -> None:
 
 def free_body(spec: MjSpec) -> MjsBody:
     """The first body with a free joint: the craft of a vehicle's spec."""
-    free = mujoco.mjtJoint.mjJNT_FREE
-    return next(body for body in spec.bodies if any(joint.type == free for joint in body.joints))
+    return free_bodies(spec)[0]
 
 
 def level_data(model: mujoco.MjModel) -> MjData:

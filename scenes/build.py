@@ -30,7 +30,6 @@ def build_scene(vehicle: Path | str | None = None, scene: str = "plain") -> MjSp
     Raises `InputError` if there is no such scene or the file is wrong, `ValueError` if MuJoCo
     cannot read it.
     """
-    parse_scene(scene)
     spec = read_spec(Path(vehicle if vehicle is not None else QUAD_XML))
     add_scene(spec, scene)
     return spec
@@ -120,6 +119,5 @@ def _is_ground(model: mujoco.MjModel, geom: int) -> bool:
     """Whether a geom is a plane of the world body at z = 0 that faces up."""
     if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_PLANE or model.geom_bodyid[geom] != 0:
         return False
-    rotation = np.empty(9)
-    mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
-    return bool(np.isclose(rotation[8], 1.0) and model.geom_pos[geom, 2] == 0.0)
+    is_level = np.abs(model.geom_quat[geom, 1:3]).max() < 1e-3
+    return bool(is_level and model.geom_pos[geom, 2] == 0.0)
