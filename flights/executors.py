@@ -103,9 +103,7 @@ def run_jobs(
 
 
 def _results(
-    executor: Executor,
-    function: Callable[[_Job, Tell], _Value],
-    jobs: Mapping[str, _Job],
+    executor: Executor, function: Callable[[_Job, Tell], _Value], jobs: Mapping[str, _Job]
 ) -> Iterator[Result]:
     """Results in the order in which they come; at most `executor.workers` jobs are submitted."""
     waiting = iter(jobs.items())

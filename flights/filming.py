@@ -166,10 +166,7 @@ def grid(count: int, width: int, height: int) -> tuple[int, int]:
 
 
 def _frames(
-    tracks: Sequence[FilmTrack],
-    config: Film,
-    times: Sequence[tuple[int, float]],
-    on_frame: OnFrame,
+    tracks: Sequence[FilmTrack], config: Film, times: Sequence[tuple[int, float]], on_frame: OnFrame
 ) -> Generator[Picture, None, None]:
     """Frames, shape (height, width, 3). One canvas of a pane's size serves every pane."""
     columns, rows = grid(len(tracks), config.width, config.height)

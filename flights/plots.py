@@ -105,10 +105,7 @@ def _drawn(flights: Mapping[str, Trajectory], columns: Mapping[str, Columns]) ->
 
 
 def _draw_panel(
-    axes: "Axes",
-    panel: Column,
-    flights: Mapping[str, Trajectory],
-    columns: Mapping[str, Columns],
+    axes: "Axes", panel: Column, flights: Mapping[str, Trajectory], columns: Mapping[str, Columns]
 ) -> None:
     keys: dict[str, Line2D] = {}  # of the panel's own legend
     for (name, flight), color in zip(flights.items(), cycle(FLIGHT_COLORS), strict=False):

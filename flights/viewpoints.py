@@ -137,10 +137,7 @@ def _sequence(
     low = (-config.aside, -config.aside, 0.0)
     moved = rng.uniform(low, config.aside, poses[..., :3].shape)
     tilts = _tilts(poses.shape[:-1], config.tilt, rng)
-    states = {
-        "position": poses[..., :3] + moved,
-        "quaternion": multiplied(tilts, poses[..., 3:]),
-    }
+    states = {"position": poses[..., :3] + moved, "quaternion": multiplied(tilts, poses[..., 3:])}
     for name in ("goal", "payload"):
         if name in episode[0].telemetry:
             states[name] = _stacked([one.telemetry[name] for one in episode], rows)

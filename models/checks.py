@@ -91,11 +91,7 @@ RULES = {name: Rule(**row) for name, row in _RULES.items()}
 
 
 def _judged(
-    key: str,
-    measured: float,
-    *of: str,
-    expected: float | None = None,
-    tolerance: float = 0.0,
+    key: str, measured: float, *of: str, expected: float | None = None, tolerance: float = 0.0
 ) -> Check:
     """A check by its row of `RULES`; limits around `expected` replace those of the row."""
     values = dict(vars(RULES[key]))

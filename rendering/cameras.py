@@ -127,12 +127,7 @@ class Cameras:
         with self._drawing.current():
             pass
 
-    def take(
-        self,
-        due: Arrays,
-        state: Arrays,
-        of: Array | None = None,
-    ) -> None:
+    def take(self, due: Arrays, state: Arrays, of: Array | None = None) -> None:
         """Take pictures of the worlds as they are.
 
         `due` has, by view name, the drones that take a picture, bool, shape (N,).

@@ -270,9 +270,5 @@ def _add_gate(track: Builder, number: int) -> None:
         track.add(f"gate_{number}/frame_{part}", "box", (0.15, half, bar), position, tint, heading)
 
 
-GENERATORS = {
-    "warehouse": warehouse,
-    "forest": forest,
-    "gates": gates,
-}
+GENERATORS = {"warehouse": warehouse, "forest": forest, "gates": gates}
 """The function that builds each scene."""
