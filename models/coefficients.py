@@ -5,17 +5,18 @@ numerics named "rotorgram/GROUP.NAME" (`rotorgram/rotors.radius`), and a vehicle
 in the table GROUP. SI units; body axes x forward, y left, z up.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import make_dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 from .errors import InputError
-from .fields import Limits, OrNone, check, check_names
+from .fields import Limits, check, check_names, optional
 from .files import read_toml
 
 PREFIX = "rotorgram/"
 _GROUPS = read_toml(Path(__file__).with_name("coefficients.toml"), "coefficients")
+_NUMBERS = read_toml(Path(__file__).with_name("numbers.toml"), "numbers")
 COEFFICIENTS = {
     f"{group}.{name}": Limits(**row)
     for group, rows in _GROUPS.items()
@@ -61,16 +62,17 @@ class Coefficients(dict[str, Any]):
         return {name: as_tuple(value) for name, value in self.items() if value is not None}
 
 
-def _table(group: str, names: Iterable[str]) -> type:
-    fields = []
-    for name in names:
-        rule = OrNone(COEFFICIENTS[f"{group}.{name}"])
-        fields.append((name, Annotated[Any, rule], None))
-    return make_dataclass(group, fields, frozen=True, kw_only=True)
+def _tables() -> dict[str, type]:
+    tables = {}
+    for group in {**_NUMBERS, **_GROUPS}:
+        rows = {**_GROUPS.get(group, {}), **_NUMBERS.get(group, {})}
+        fields = [(name, Any, optional(**row)) for name, row in rows.items()]
+        tables[group] = make_dataclass(group, fields, frozen=True, kw_only=True)
+    return tables
 
 
-TABLES = {group: _table(group, rows) for group, rows in _GROUPS.items()}
-"""A dataclass for each group, with its coefficients as fields; None: the file does not give it."""
+TABLES = _tables()
+"""A dataclass for the numbers of each group of a vehicle's TOML file; None: it does not give it."""
 
 
 def as_tuple(value: float | tuple[float, ...]) -> tuple[float, ...]:

@@ -195,11 +195,9 @@ def _add_mass(body: MjsBody, file: VehicleFile) -> None:
         _add_geom(body, name, kind, "carbon", size, pos=place, mass=part.mass, group=1, **turn)
     if table.parts:
         return
-    assert table.mass is not None
-    assert table.inertia is not None
     body.explicitinertial = True
     body.mass = table.mass
-    body.ipos = table.center_of_mass
+    body.ipos = table.center_of_mass or ORIGIN
     if len(table.inertia) == 3:
         body.inertia = table.inertia
     else:

@@ -16,10 +16,12 @@ from numpy.typing import NDArray
 from .cameras import AHEAD, ORIGIN, OUTPUTS, UP, Axis, Camera, Place, steps_of
 from .coefficients import COEFFICIENTS, TABLES, as_tuple
 from .errors import InputError, shortened
-from .fields import Choice, Limits, T, Text, check, limits_of, optional, read_table
+from .fields import Choice, Limits, T, Text, check, limits_of, read_table
 from .files import read_toml
 
-_Coefficients: Any = TABLES["rotors"]
+_Vehicle: Any = TABLES["vehicle"]
+_Body: Any = TABLES["body"]
+_Rotors: Any = TABLES["rotors"]
 _Numbers = tuple[float, ...]
 _Mass = Annotated[float, Limits(1e-6, 1e6, "kg")]
 _Length = Annotated[float, Limits(1e-5, 100.0, "m")]
@@ -54,14 +56,9 @@ _SHAPES: Final[Mapping[str, type[Box | Cylinder]]] = {"box": Box, "cylinder": Cy
 
 
 @dataclass(frozen=True, kw_only=True)
-class Body:
+class Body(_Body):  # type: ignore[misc]
     """Mass and inertia, or parts that have them; and the hub."""
 
-    mass: float | None = optional(1e-6, 1e6, "kg")
-    inertia: tuple[float, ...] | None = optional(-1e9, 1e9, "kg m²", count=0)
-    center_of_mass: Place = ORIGIN
-    size: tuple[float, float, float] | None = optional(1e-4, 100.0, "m", count=3)
-    ground_clearance: float | None = optional(1e-4, 100.0, "m")
     parts: tuple[Box | Cylinder, ...] = ()
 
 
@@ -83,26 +80,11 @@ class PlacedRotor:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RotorTable(_Coefficients):  # type: ignore[misc]
+class RotorTable(_Rotors):  # type: ignore[misc]
     """Rotors, all alike, in a frame or in a list."""
 
     frame: Literal["plus", "cross", "hexa", "octo"] | None = None
-    arm: float | None = optional(1e-3, 100.0, "m")
-    height: float | None = optional(-100.0, 100.0, "m")
-    thrust: tuple[float, float] | None = optional(-1e6, 1e6, "N", count=2)
-    speed: tuple[float, float] | None = optional(0.0, 1e6, "rad/s", count=2)
-    reaction: float | None = optional(0.0, 10.0, "N m/N")
-    torque_coefficient: float | None = optional(0.0, 1.0, "N m s²/rad²")
     list: tuple[PlacedRotor, ...] = ()
-
-
-@dataclass(frozen=True, kw_only=True)
-class RealFlights:
-    """Mean errors of its simulation after half a second of recorded flights."""
-
-    position: float | None = optional(0.0, 1e4, "m")
-    velocity: float | None = optional(0.0, 1e4, "m/s")
-    attitude: float | None = optional(0.0, 3.15, "rad")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,12 +103,10 @@ class _Sourced:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Tables:
+class Tables(_Vehicle):  # type: ignore[misc]
     """A whole file, its tables not read yet."""
 
     name: Annotated[str, Text(100)]
-    timestep: float | None = optional(1e-5, 1.0, "s")
-    gravity: float | None = optional(1e-3, 1e3, "m/s²")
     model: object = None
     body: object = None
     rotors: object = None
@@ -207,9 +187,8 @@ def read_vehicle_file(path: Path) -> VehicleFile:
     rotors = _rotors(numbers, file.rotors, model)
     cameras = [_camera(numbers, one, where) for where, one in _listed(file.cameras, "cameras")]
     _check_distinct("cameras", [camera.name for camera in cameras])
-    for group, kind in {**TABLES, "real_flights": RealFlights}.items():
-        if group != "rotors":
-            _table(numbers, kind, tree.get(group, {}), group)
+    for group in ("drag", "battery", "sensors", "real_flights"):
+        _table(numbers, TABLES[group], tree.get(group, {}), group)
     physical = {key: value for key, value in tree.items() if key != "real_flights"}
     return VehicleFile(
         name=file.name,
@@ -360,12 +339,13 @@ def _with_thrust(rotors: RotorTable) -> RotorTable:
         if given == [other] and rotors.thrust_coefficient is None:
             raise InputError(f"rotors: expected thrust_coefficient with {other}, got none")
     coefficient = rotors.thrust_coefficient
+    derived: dict[str, Any] = {}
     if rotors.speed is not None:
-        low, high = rotors.speed
-        rotors = replace(rotors, thrust=(coefficient * low**2, coefficient * high**2))
+        derived["thrust"] = tuple(coefficient * speed**2 for speed in rotors.speed)
     if rotors.torque_coefficient is not None:
-        rotors = replace(rotors, reaction=rotors.torque_coefficient / coefficient)
-    low, high = rotors.thrust or ORIGIN[:2]
+        derived["reaction"] = rotors.torque_coefficient / coefficient
+    rotors = replace(rotors, **derived)
+    low, high = rotors.thrust
     if not low < high:
         raise InputError(
             f"rotors: expected a lower and a higher thrust, got {low:g} and {high:g} N"

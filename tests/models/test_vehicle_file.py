@@ -550,7 +550,7 @@ TABLES = {
     "rotors.": vehicle_file.RotorTable,
     "rotors.list.": vehicle_file.PlacedRotor,
     "cameras.": vehicle_file.Camera,
-    "real_flights.": vehicle_file.RealFlights,
+    "real_flights.": vehicle_file.TABLES["real_flights"],
 }
 
 
