@@ -42,6 +42,7 @@ COMMANDS = (
     "render",
     "bench",
     "vehicle",
+    "check-task",
     "identify",
     "key",
     "replay",
@@ -50,7 +51,7 @@ COMMANDS = (
     "dataset",
     "capture",
 )
-"""Each is a class in the module of its name: `Sim` in `sim`."""
+"""Each is a class in the module of its name: `Sim` in `sim`, `CheckTask` in `check_task`."""
 
 EXTRAS = {
     "train": ("torch", "stable_baselines3", "tensorboard", "safetensors", "pandas",
@@ -139,16 +140,21 @@ def _run(words: list[str]) -> int:
     if get_terminal_size().columns < 40:  # tyro does not end on narrower terminals
         os.environ["COLUMNS"] = "40"
     with hidden_gl_setting():  # importing OpenGL takes time, also for a command that draws nothing
-        module = import_module(f".{name}", __name__)
-        kind: type[Command] = getattr(module, name.title())
+        module = import_module(f".{name.replace('-', '_')}", __name__)
+        kind: type[Command] = getattr(module, _class_of(name))
         return parse(kind, f"rotorgram {name}", words[1:]).run() or 0
+
+
+def _class_of(name: str) -> str:
+    return name.title().replace("-", "")
 
 
 def _help() -> str:
     lines = ["usage: rotorgram [-h] [--version] COMMAND ...", "", _ABOUT, "", "commands:"]
     for name in COMMANDS:
-        text = Path(__file__).with_name(f"{name}.py").read_text("utf-8")  # for speed, not imported
-        summary = re.search(rf'class {name.title()}\(.*\n    """([^"\n]*)', text)
+        file = Path(__file__).with_name(f"{name.replace('-', '_')}.py")
+        text = file.read_text("utf-8")  # for speed, not imported
+        summary = re.search(rf'class {_class_of(name)}\(.*\n    """([^"\n]*)', text)
         assert summary
         lines.append(f"  {name:12} {summary[1]}")
     return "\n".join([*lines, "", "rotorgram COMMAND --help lists the flags of a command."])

@@ -1,7 +1,6 @@
 """A loop whose steps are machine code."""
 
 import logging
-import re
 import traceback
 from dataclasses import replace
 from functools import cache
@@ -20,7 +19,8 @@ from .stages.ends import refuse_unfit
 if TYPE_CHECKING:
     from .machine import Machine
 
-_MACHINERY = re.compile(r"numpy|compile.[a-z]+\.py$")  # files that are not to blame
+_TRACER = ("numpy", "rotorgram.sim.compile")  # modules that are not to blame
+_OURS = ("numpy", "rotorgram")
 
 
 def make_loop(config: EnvConfig, num_worlds: int = 1) -> Loop:
@@ -43,7 +43,8 @@ class CompiledLoop(Loop):
 
     _machine: "Machine | None" = None
     _is_inside = False  # whether the machine has the state
-    _fails = False  # to compile
+    refusal = ""
+    """Why it is not compiled, once that was tried."""
 
     def _step(self, seeds: Any, *, flies: bool) -> None:
         machine = self._entered()
@@ -78,9 +79,8 @@ class CompiledLoop(Loop):
 
     def _entered(self) -> "Machine | None":
         """The machine, which has the state from now on; None where NumPy flies."""
-        if self._machine is None and not self._fails:
+        if self._machine is None and not self.refusal:
             self._machine = self._made()
-            self._fails = self._machine is None
         if self._machine is not None and not self._is_inside:
             self._machine.restore(self.state())
             self._is_inside = True
@@ -96,11 +96,12 @@ class CompiledLoop(Loop):
             loop.advance(neutral, np.ones(config.drones, bool))
             loop.advance(neutral)
             return Machine(loop, self.num_envs // config.drones)
-        except InputError:  # which NumPy will raise
-            return None
+        except InputError as error:  # which NumPy will raise
+            self.refusal = str(error)
         except Exception as error:  # of an own task, any
-            _tell(config.env_id, f"{one_line(error)} ({_place(error)})")
-            return None
+            self.refusal = f"{one_line(error)} ({place_of(error)})"
+            _tell(config.env_id, self.refusal)
+        return None
 
     def _settle(self) -> None:
         if self._is_inside:
@@ -142,11 +143,17 @@ class CompiledLoop(Loop):
         refuse_unfit(record, self.config.env_id)
 
 
-def _place(error: Exception) -> str:
-    """The function and the line of the code that cannot be compiled."""
-    frames = traceback.extract_tb(error.__traceback__)
-    own = [one for one in frames if not _MACHINERY.search(one.filename)]
-    return f"`{own[-1].name}`, line {own[-1].lineno}"
+def place_of(error: Exception) -> str:
+    """The function and the line to blame: the last that is not of ours, or not of the tracer."""
+    frames = [
+        (frame.f_globals["__name__"], f"`{frame.f_code.co_name}`, line {line}")
+        for frame, line in traceback.walk_tb(error.__traceback__)
+    ]
+    for machinery in (_OURS, _TRACER):
+        own = [place for module, place in frames if not module.startswith(machinery)]
+        if own:
+            break
+    return own[-1]
 
 
 @cache

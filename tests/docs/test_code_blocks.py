@@ -175,7 +175,8 @@ def test_rows_of_a_study_are_ones_that_there_are(block: Block, tmp_path: Path) -
 def parse_command(arguments: list[str]) -> None:
     """By the real parser. Raises `SystemExit` for what it does not know."""
     name, *flags = arguments
-    kind = getattr(import_module(f"rotorgram.cli.{name}"), name.title())
+    module = import_module(f"rotorgram.cli.{name.replace('-', '_')}")
+    kind = getattr(module, name.title().replace("-", ""))
     parse(kind, f"rotorgram {name}", flags)
 
 
