@@ -54,10 +54,6 @@ class _Remote(NotCopied):
                 self._agent.close()
                 raise
 
-    def _check_flying(self) -> None:
-        if not self._flying:
-            raise gym.error.ResetNeeded("step: expected a call of reset() first")
-
     @abstractmethod
     def connect(self) -> None:
         """Wait until it is the agent's turn: for the simulators' first States, if none has come."""
@@ -158,8 +154,12 @@ class RemoteEnv(_Remote, gym.Env[Observation, ArrayLike]):
 
     def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, Info]:
         """Fly for one control period. The action is sent in the dtype of its space."""
-        self._check_flying()
-        actions = _checked_actions(action, self._dtype, self._row)[np.newaxis]
+        if not self._flying:
+            raise gym.error.ResetNeeded("step: expected a call of reset() first")
+        actions = np.asarray(action)
+        if actions.dtype != self._dtype or actions.shape != self._row:
+            actions = _checked_actions(actions, self._dtype, self._row)
+        actions = actions[np.newaxis]
         self._flying = False  # until the answer is there
         try:
             self._agent.exchange({0: (actions, _FLY, None)})
@@ -307,7 +307,8 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Observation, ArrayL
 
     def step(self, actions: ArrayLike) -> Step:
         """Fly every drone for one control period. The autoreset says what follows an episode."""
-        self._check_flying()
+        if not self._flying:
+            raise gym.error.ResetNeeded("step: expected a call of reset() first")
         self._reasons = None
         return super().step(actions)
 
@@ -322,7 +323,8 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Observation, ArrayL
 
         With seeds every drone has one, also where it is ignored.
         """
-        self._check_flying()
+        if not self._flying:
+            raise gym.error.ResetNeeded("step: expected a call of reset() first")
         resets = self._nobody if resets is None else resets
         frozen = self._nobody if frozen is None else frozen & ~resets
         still = resets | frozen

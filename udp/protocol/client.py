@@ -144,7 +144,8 @@ class RoundTrips:
             seconds = min(seconds, 2 * self.interval)
             self._variation += (abs(smoothed - seconds) - self._variation) / 4
             self._smoothed = smoothed + (seconds - smoothed) / 8
-        self._set_interval(self._smoothed)
+        margin = max(_GRANULARITY, 4 * self._variation)
+        self.interval = min(self._smoothed + margin, _LONGEST_RESEND)
 
     def answered_again(self) -> None:
         """The answer to the last message came a second time.
@@ -158,11 +159,8 @@ class RoundTrips:
         self._in_a_row += 1
         if self._in_a_row > 1:
             self._smoothed = min(_TOO_EARLY * self._smoothed, _LONGEST_RESEND)
-            self._set_interval(self._smoothed)
-
-    def _set_interval(self, smoothed: float) -> None:
-        margin = max(_GRANULARITY, 4 * self._variation)
-        self.interval = min(smoothed + margin, _LONGEST_RESEND)
+            margin = max(_GRANULARITY, 4 * self._variation)
+            self.interval = min(self._smoothed + margin, _LONGEST_RESEND)
 
     def wait(self, tries: int) -> float:
         """Wait for an answer before the next resend, s, after so many tries without any."""
@@ -427,7 +425,8 @@ class Client:
         self._transfer = None
         self.resend_at = self.deadline = inf
         self._answered_at = now
-        self._record(command, plain)
+        if self.tap:
+            self._record(command, plain)
         self.statistics.round_trips.append(now - self.asked_at)
         self._round_trips.answered(now)
 
@@ -486,15 +485,22 @@ class Client:
         """Send a message and repeat it until it is answered."""
         kind = type(message)
         after = SIMULATOR[self.state]["sent", kind]
-        data = self._encode(message)
-        self._record(message, data)
-        self._transfer = Transfer(data, self.largest)
+        if isinstance(message, State) and not self.by_text:
+            data = binary.encode_step(message, self.layout)
+        else:
+            data = self._encode(message)
+        if self.tap:
+            self._record(message, data)
+        self._transfer = transfer = Transfer(data, self.largest)
         self.state = after
         self.sequence = 0 if isinstance(message, Hello) else message.sequence
         self.sends = self._tries = 1
         self._stretch = 1.0
         self._round_trips.sent(now, first=True)
-        self._put(self._transfer.start())
+        if transfer.count == 1 and self._is_plain and not self._dice:
+            self.outgoing.append(data)
+        else:
+            self._put(transfer.start())
         self.asked_at = now
         if kind is Close:
             self.resend_at = now + CLOSE_INTERVAL

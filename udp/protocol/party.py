@@ -7,6 +7,7 @@ Free of sockets and clocks, as `client`: a driver hands in datagrams and the tim
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import inf
+from operator import itemgetter
 from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
@@ -149,7 +150,10 @@ class WorldRules:
 
     def next_timer(self) -> float:
         """When `handle_timers` wants to be called; infinite if never."""
-        return min(link.client.next_timer() for link in self.links)
+        timer = inf
+        for link in self.links:
+            timer = min(timer, link.client.resend_at, link.client.deadline)
+        return timer
 
     def handle_timers(self, now: float) -> None:
         """Resend what is due. Raises `PeerSilent` where the flight cannot go on."""
@@ -185,13 +189,14 @@ class WorldRules:
         world = self.world
         for link in due:
             rows = link.rows
+            own = itemgetter(rows)
             link.client.send_state(
                 link.client.sequence * self.period,
-                tuple([array[rows] for array in world.observations.values()]),
+                tuple(map(own, world.observations.values())),
                 world.rewards[rows],
                 world.terminated[rows],
                 world.truncated[rows],
-                tuple([array[rows] for array in world.telemetry.values()]),
+                tuple(map(own, world.telemetry.values())),
                 now,
             )
 

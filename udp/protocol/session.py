@@ -118,16 +118,24 @@ class Session:
             orders=orders,
             seeds=seeds,
         )
-        data = self._encode(command)
+        layout = self.layout
+        data = text.encode(command) if self.is_text else binary.encode_step(command, layout)
         self.state = after
         self.asked_at = self.heard_at = now
-        self._send(data)
-        self._record(command, data)
+        self.reply = reply = Transfer(data, self._largest)
+        outbox = self.outbox
+        if reply.count == 1 and self.key is None:  # as `put`
+            outbox.datagrams.append((data, self.peer))
+            outbox.statistics.counters["sent"] += 1
+        else:
+            outbox.put(reply.start(), self.peer, self.key)
+        if outbox.tap:
+            self._record(command, data)
 
     def send_close(self, reason: str) -> None:
         """End the exchange."""
         close = self.goodbye(reason)
-        data = self._encode(close)
+        data = text.encode(close) if self.is_text else binary.encode(close)
         self.move("sent", Close)
         self._send(data)
         self._record(close, data)
@@ -155,9 +163,6 @@ class Session:
         if self.outbox.tap:
             self.outbox.tap(self.slot, message, data)
 
-    def _encode(self, message: Command | Close) -> bytes:
-        return text.encode(message) if self.is_text else binary.encode(message, self.layout)
-
     def _send(self, data: bytes) -> None:
         """Send a message, and keep its bytes for a repeated State."""
         self.reply = Transfer(data, self._largest)
@@ -182,9 +187,10 @@ class Session:
     def take_state(self, state: State, plain: bytes, now: float) -> Event:
         """The next State, which is expected."""
         self.sequence = state.sequence
-        self.move("received", State)
+        self.state = AGENT["expecting"]["received", State]
         self.outbox.statistics.round_trips.append(now - self.asked_at)
-        self._record(state, plain)
+        if self.outbox.tap:
+            self._record(state, plain)
         return Event(self.slot, state)
 
     def receive(self, message: Message, plain: bytes, now: float) -> Event | None:
