@@ -158,12 +158,14 @@ class GoalTask(Task):
         else:
             seen = (to_place, state.velocity, body_x(quaternion), body_z(quaternion))
             vectors = [self.turned(vector) for vector in seen]
-        thrust = state.thrust / self.vehicle.hover_thrust - 1.0
+        dtype = state.thrust.dtype
+        hover = np.asarray(self.vehicle.hover_thrust, dtype)
+        thrust = state.thrust / hover - 1.0
         parts = [*vectors, state.body_rates, thrust]
         for values in self.further(state):
             is_number = np.ndim(values) < position.ndim
             parts.append(stack((values,)) if is_number else values)
-        return {"observation": clip(np.concat(parts, axis=-1), *self._bounds)}
+        return {"observation": clip(np.concat(parts, axis=-1), *[b.astype(dtype) for b in self._bounds])}
 
     def further(self, state: State) -> Sequence[Array]:
         """Numbers, (W, A), and vectors, (W, A, k), of the observation, as they were defined."""

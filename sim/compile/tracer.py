@@ -356,12 +356,12 @@ def _where(like: TracedArray, flag: Any, first: Any, second: Any) -> Traced:
 def _minimum(like: TracedArray, a: Any, b: Any) -> Traced:
     """A NaN stays, and of 0 and -0 it is the second."""
     a, b = like._alike((a, b))
-    return _where(like, (a < b) | (a != a), a, b)
+    return _where(like, a != a, a, _where(like, a < b, a, b))
 
 
 def _maximum(like: TracedArray, a: Any, b: Any) -> Traced:
     a, b = like._alike((a, b))
-    return _where(like, (a > b) | (a != a), a, b)
+    return _where(like, a != a, a, _where(like, a > b, a, b))
 
 
 def _absolute(like: TracedArray, x: Traced) -> Traced:
