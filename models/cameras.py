@@ -166,8 +166,10 @@ def _size(word: str, text: str) -> tuple[int, int]:
 # ---- of a file
 
 
-def read_cameras(spec: MjSpec, model: MjModel) -> tuple[Camera, ...]:
-    """Cameras of a vehicle's spec and of the model that it gave. Raises `InputError`.
+def read_cameras(spec: MjSpec, model: MjModel, data: MjData) -> tuple[Camera, ...]:
+    """Cameras of a vehicle's spec, the model that it gave, and the level craft at the origin.
+
+    Raises `InputError`.
 
     One that follows the craft but does not turn with it, as MuJoCo's mode `trackcom`, counts as
     standing in the world. Left out: those without a name of letters, digits and _, those that turn
@@ -175,9 +177,6 @@ def read_cameras(spec: MjSpec, model: MjModel) -> tuple[Camera, ...]:
     """
     texts = {text.name: text.data for text in spec.texts if text.name.startswith(_TEXTS)}
     found = []
-    data = MjData(model)
-    data.qpos[:7] = (0, 0, 0, 1, 0, 0, 0)
-    place_cameras(model, data)
     modes = mujoco.mjtCamLight
     perspective = mujoco.mjtProjection.mjPROJ_PERSPECTIVE
     targets = modes.mjCAMLIGHT_TARGETBODY.value, modes.mjCAMLIGHT_TARGETBODYCOM.value

@@ -334,6 +334,7 @@ def _load(path: Path, drag: float, changed: tuple[int, ...]) -> Vehicle:
     mass = float(model.body_subtreemass[body])
     center = settled(data.subtree_com[body])
     inertia = inertia_matrix(data.crb[body, :6])
+    cameras = read_cameras(spec, model, data)
     rotors = tuple(_read_rotor(model, data, index) for index in range(model.nu))
     allocation = _allocate(rotors, center)
     model.dof_damping[0:3] = drag * mass
@@ -353,7 +354,7 @@ def _load(path: Path, drag: float, changed: tuple[int, ...]) -> Vehicle:
         hover_thrust=_hover(rotors, allocation, mass * gravity),
         rest_height=_find_rest_height(model, data),
         coefficients=_read_coefficients(model),
-        file_cameras=read_cameras(spec, model),
+        file_cameras=cameras,
     )
 
 

@@ -190,9 +190,8 @@ class Stage:
         before = self.moments or moments
         self.moments = moments
         poses = self.data.qpos.reshape(self.drones, 7)
-        for i, (moment, last) in enumerate(zip(moments, before, strict=True)):
-            pose = poses[i]
-            path = self._paths[i]
+        drones = zip(moments, before, poses, self._paths, strict=True)
+        for moment, last, pose, path in drones:
             pose[:3] = moment.position
             pose[3:] = moment.attitude
             if moment.step == 0 or moment.step < last.step or moment.episode != last.episode:
@@ -288,10 +287,10 @@ class Stage:
     def lines(self) -> list[tuple[str, str]]:
         """Names and values for the overlay of a viewer: those of the first craft."""
         lines = self.moments[0].lines
-        if self.least_distance is not None:
-            lines.insert(0, ("least distance", f"{self.least_distance:.2f} m"))
-            lines.insert(0, ("drones", f"{self.drones}, numbers of the first"))
-        return lines
+        if self.least_distance is None:
+            return lines
+        drones = ("drones", f"{self.drones}, numbers of the first")
+        return [drones, ("least distance", f"{self.least_distance:.2f} m"), *lines]
 
     @property
     def least_distance(self) -> float | None:
