@@ -35,8 +35,7 @@ class Identify(Command):
     def run(self) -> None:
         """Print every estimate, write the file."""
         from ..flights.flight_logs import read_log
-        from ..flights.identified_vehicle import identified_toml
-        from ..flights.identify import DEFAULT, LAG, identify
+        from ..flights.identify import DEFAULT, LAG, identified_toml, identify
         from ..models.errors import InputError, require
         from ..models.files import check_new_file, write_new
         from ..models.vehicle import Vehicle

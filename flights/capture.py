@@ -206,9 +206,8 @@ def objects_in(numbers: Picture, names: Sequence[str]) -> Iterator[Labels]:
     for number in np.unique(numbers[numbers != 0]).tolist():
         mask = numbers == number
         rows, columns = np.nonzero(mask)
-        flat = np.concatenate(([False], mask.ravel(order="F")))
-        edges = np.flatnonzero(flat[1:] != flat[:-1])
-        runs = np.diff(np.concatenate(([0], edges, [mask.size])))
+        edges = np.flatnonzero(np.diff(mask.ravel(order="F"), prepend=False))
+        runs = np.diff(edges, prepend=0, append=mask.size)
         left = int(columns.min())
         top = int(rows.min())
         yield {

@@ -215,8 +215,8 @@ class Cameras:
                 if drawn.segid >= 0 and drawn.objtype == geom:
                     geoms[drawn.segid + 1] = drawn.objid + 1
             self._geoms[camera] = geoms
-        code = colors.astype(np.uint32)
-        numbers: Array = self._geoms[camera][code[..., 0] | code[..., 1] << 8 | code[..., 2] << 16]
+        codes = colors @ np.array((1, 1 << 8, 1 << 16))
+        numbers: Array = self._geoms[camera][codes]
         return numbers
 
     def _meters(self, depth: Array) -> Array:

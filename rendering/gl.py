@@ -39,20 +39,20 @@ def hidden_gl_setting() -> Iterator[None]:
 
     Otherwise MuJoCo imports one, which takes a tenth of a second, and raises where that fails.
     """
-    before = dict(os.environ)
     wanted = _wanted()
     library = _LIBRARIES.get(wanted, "")
     if wanted in ("disable", "glfw") or (library and _is_installed(library)):
         yield
         return
-    os.environ[_HIDDEN] = wanted
-    os.environ["MUJOCO_GL"] = "disable"
+    hidden = {_HIDDEN: wanted, "MUJOCO_GL": "disable"}
+    before = {name: os.environ[name] for name in hidden if name in os.environ}
+    os.environ |= hidden
     try:
         yield
     finally:
-        for name in (_HIDDEN, "MUJOCO_GL"):
-            os.environ.pop(name)
-            os.environ.update({name: before[name]} if name in before else {})
+        for name in hidden:
+            del os.environ[name]
+        os.environ |= before
 
 
 def _is_installed(library: str) -> bool:

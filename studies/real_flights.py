@@ -24,8 +24,7 @@ from typing import Final
 import numpy as np
 from measuring import RESULTS, options
 from rotorgram.flights.flight_logs import FlightLog, read_log
-from rotorgram.flights.identified_vehicle import Origin, vehicle_toml
-from rotorgram.flights.identify import Fit, Group
+from rotorgram.flights.identify import Fit, Group, Origin, vehicle_toml
 from rotorgram.flights.prediction import (
     Floats,
     Numbers,
