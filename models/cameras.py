@@ -184,7 +184,7 @@ def read_cameras(spec: MjSpec, model: MjModel, data: MjData) -> tuple[Camera, ..
         one = model.camera(number)
         usable = one.name.isidentifier() and len(one.name) <= _MAX_LETTERS
         usable = usable and model.cam_projection[number] == perspective.value
-        if not usable or model.cam_mode[number] in targets:
+        if not usable or one.mode in targets:
             continue
         _check_numbers(f"camera {one.name}", model, number)
         resolution = model.cam_resolution[number].tolist()
@@ -193,18 +193,18 @@ def read_cameras(spec: MjSpec, model: MjModel, data: MjData) -> tuple[Camera, ..
         rate = texts.pop(f"{_TEXTS}{one.name}.rate", "1")
         output = int(model.cam_output[number])
         axes = data.cam_xmat[number].reshape(3, 3)
-        mine = model.body_rootid[model.cam_bodyid[number]] == model.jnt_bodyid[0]
+        mine = model.body_rootid[one.bodyid[0]] == model.jnt_bodyid[0]
         found.append(
             Camera(
                 name=one.name,
                 position=_vector(data.cam_xpos[number]),
                 look=_vector(-axes[:, 2]),
                 up=_vector(axes[:, 1]),
-                fovy=math.radians(float(model.cam_fovy[number])),
+                fovy=math.radians(one.fovy[0]),
                 resolution=check(f"camera {one.name}.resolution", _RESOLUTION, resolution),
                 rate=1 / steps_of(f"camera {one.name}", rate),
                 kinds=tuple(kind for kind, bit in OUTPUTS.items() if output & bit) or ("rgb",),
-                stands=not mine or model.cam_mode[number] != modes.mjCAMLIGHT_FIXED.value,
+                stands=bool(not mine or one.mode != modes.mjCAMLIGHT_FIXED.value),
             )
         )
     for name in texts:

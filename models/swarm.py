@@ -57,11 +57,9 @@ def swarm_model(
     model = spec.compile()
     for name in SHARED:  # they may be others than those of the first file
         setattr(model.opt, name, getattr(first.model.opt, name))
-    owner = owners(model)
-    model.geom_group[:] = owner[model.geom_bodyid] >= 0
-    dofs = owner[model.dof_bodyid]
+    model.geom_group[:] = owners(model)[model.geom_bodyid] >= 0
     for drone, vehicle in enumerate(vehicles):
-        model.dof_damping[np.flatnonzero(dofs == drone)[:3]] = vehicle.model.dof_damping[:3]
+        model.dof_damping[6 * drone : 6 * drone + 3] = vehicle.model.dof_damping[:3]
     return model
 
 

@@ -283,7 +283,8 @@ def owners(model: MjModel) -> Array:
 
 def craft_geoms(model: MjModel) -> Array:
     """Which geoms are those of the first free body, and of what is welded to it."""
-    return np.isin(model.geom_bodyid, craft_bodies(model))
+    geoms: Array = owners(model)[model.geom_bodyid] == 0
+    return geoms
 
 
 def payload_body(model: MjModel) -> int:
@@ -382,20 +383,17 @@ def _read_coefficients(model: MjModel) -> Coefficients:
 
 def _read_rotor(model: MjModel, data: MjData, index: int) -> Rotor:
     """The rotor of an actuator; `data` is at the origin and level. Raises `InputError`."""
-    name = model.actuator(index).name or f"rotor{index + 1}"
-    site, reference = model.actuator_trnid[index].tolist()
-    force = model.actuator_gear[index, :3]
-    torque = model.actuator_gear[index, 3:]
+    one = model.actuator(index)
+    name = one.name or f"rotor{index + 1}"
+    site, reference = one.trnid.tolist()
+    force = one.gear[:3]
+    torque = one.gear[3:]
     size = math.hypot(*force)
-    newtons = size * float(model.actuator_gainprm[index, 0])
-    at_site = model.actuator_trntype[index] == mujoco.mjtTrn.mjTRN_SITE
-    is_plain = (
-        model.actuator_gaintype[index] == mujoco.mjtGain.mjGAIN_FIXED
-        and model.actuator_biastype[index] == mujoco.mjtBias.mjBIAS_NONE
-        and model.actuator_dyntype[index] == mujoco.mjtDyn.mjDYN_NONE
-    )
-    forces = model.actuator_ctrlrange[index] * model.actuator_gainprm[index, 0]
-    limited = np.clip(forces, *model.actuator_forcerange[index])
+    newtons = size * float(one.gainprm[0])
+    at_site = one.trntype == mujoco.mjtTrn.mjTRN_SITE
+    is_plain = not (one.gaintype or one.biastype or one.dyntype)  # fixed, none and none are 0
+    forces = one.ctrlrange * one.gainprm[0]
+    limited = np.clip(forces, *one.forcerange)
     fault = ""
     if not at_site or model.body_rootid[model.site_bodyid[site]] != model.jnt_bodyid[0]:
         fault = f"rotor {name} to be an actuator at a site of the body, got another"
@@ -405,16 +403,16 @@ def _read_rotor(model: MjModel, data: MjData, index: int) -> Rotor:
         fault = f"the thrust of rotor {name} to be gain times control, got another law"
     elif newtons == 0.0:
         fault = f"rotor {name} to have a force (gear times gain), got 0 N"
-    elif not model.actuator_ctrllimited[index]:
+    elif not one.ctrllimited:
         fault = f"rotor {name} to have a thrust with limits (ctrlrange), got none"
-    elif model.actuator_forcelimited[index] and (limited != forces).any():
+    elif one.forcelimited and (limited != forces).any():
         fault = f"rotor {name} to have no forcerange narrower than its thrusts, got one"
     if fault:
         raise InputError(f"vehicle: expected {fault}")
     turn = data.site_xmat[site].reshape(3, 3)
     turned = product(np.array((force, torque)), turn.T) * math.copysign(1 / size, newtons)
     axis, reaction = settled(turned).tolist()
-    low, high = sorted((model.actuator_ctrlrange[index] * abs(newtons)).tolist())
+    low, high = sorted((one.ctrlrange * abs(newtons)).tolist())
     return Rotor(
         name=name,
         position=tuple(settled(data.site_xpos[site]).tolist()),

@@ -21,7 +21,7 @@ from ..models.errors import InputError
 from ..models.fleet import members_of
 from ..models.mjcf import swarm_spec
 from ..models.swarm import drone_names
-from ..models.vehicle import Vehicle
+from ..models.vehicle import Vehicle, owners
 from ..scenes import add_scene
 from ..scenes.marks import Mark
 from .gl import Offscreen
@@ -341,15 +341,16 @@ def objects_in(model: MjModel) -> tuple[tuple[str, ...], Array]:
     """
     known = {NOTHING: 0}
     numbers = [0]
-    crafts = model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]
-    names = drone_names(len(crafts))
-    roots = dict(zip(model.body_rootid[crafts].tolist(), names, strict=True))
+    owner = owners(model)
+    names = drone_names(int(owner.max()) + 1)
     for number in range(model.ngeom):
         geom = model.geom(number)
         material = int(geom.matid[0])
         name = geom.name or (model.material(material).name if material >= 0 else _UNNAMED)
         head, _, _ = name.rpartition("/")
         label = head if "/" in head else name
-        root = int(model.body_rootid[geom.bodyid[0]])
-        numbers.append(known.setdefault(roots.get(root, label), len(known)))
+        drone = owner[geom.bodyid[0]]
+        if drone >= 0:
+            label = names[drone]
+        numbers.append(known.setdefault(label, len(known)))
     return tuple(known), np.array(numbers, np.int32)
