@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..models.errors import InputError
+from ..models.fields import check_names
 from ..models.vehicle import Vehicle
 from ..models.vehicle_file import read_vehicle_file
 from ..sim.rotations import advanced
@@ -95,9 +96,7 @@ def identify(
     The time constant of the rotors takes part if the logs have commands alone. Raises `InputError`
     for an unknown name, or logs that are too short.
     """
-    for name in names:
-        if name not in KNOWN:
-            raise InputError(f"fit: expected some of {', '.join(KNOWN)}, got {name!r}")
+    check_names(names, KNOWN, "fit")
     if len({log.measured for log in logs}) > 1:
         raise InputError("logs: expected measured speeds in all of them or in none")
     base = numbers_of(vehicle)
