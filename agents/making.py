@@ -1,6 +1,6 @@
 """An agent of an algorithm's name, new or from a checkpoint."""
 
-from ..envs.spec import EnvSpec
+from ..envs.spec import EnvSpec, options_difference
 from ..models.errors import InputError, one_line
 from .checkpoints import Checkpoint, CheckpointError
 from .config import Config
@@ -66,9 +66,10 @@ def _check_same_env(then: EnvSpec, now: EnvSpec) -> None:
                 "name the vehicle with --vehicle"
             )
         if name == "options":
-            different = [key for key in {**expected, **got} if expected.get(key) != got.get(key)]
-            expected = {key: expected[key] for key in different if key in expected}
-            got = {key: got[key] for key in different if key in got}
+            reason = options_difference(expected, got)
+            raise ResumeError(
+                f"resume: expected an env with options of the training: {reason:.600}"
+            )
         raise ResumeError(
             f"resume: expected an env with {name} {expected!s:.300}, got {got!s:.300}"
         )

@@ -430,3 +430,15 @@ def json_values(options: Any) -> Values:
     for name in plain:
         check("options", _TEXT, name, SpecError)
     return plain
+
+
+def options_difference(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> str:
+    """In which options two envs differ, in words; "" if in none."""
+    differing = []
+    for name in {**ours, **theirs}:
+        pair = []
+        for options in (ours, theirs):
+            pair.append(repr(options[name]) if name in options else "not to be there")
+        if ours.get(name, pair) != theirs.get(name, pair):
+            differing.append(f"expected {name} {pair[0]}, got {pair[1]}")
+    return "; ".join(differing)

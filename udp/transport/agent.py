@@ -15,7 +15,7 @@ import gymnasium as gym
 
 from ...envs import registry
 from ...envs.config import EnvConfig
-from ...envs.spec import EnvSpec, canonical_id, json_values
+from ...envs.spec import EnvSpec, canonical_id, json_values, options_difference
 from ...models.errors import InputError, shortened
 from ...models.fields import check_fields
 from ..layouts import layout_of
@@ -103,8 +103,8 @@ class AgentConfig:
             got_options = dict(spec.options)
             if not registry.is_known(env_id):  # others have any value
                 got_options = {n: v for n, v in got_options.items() if n in expected}
-            if reason := _options_difference(expected, got_options):
-                return reason
+            if reason := options_difference(expected, got_options):
+                return f"options: {reason}"
         return _spec_difference(self.spec, spec) if self.spec else ""
 
     def _expected_options(self, env_id: str) -> dict[str, object]:
@@ -320,22 +320,10 @@ class Agent:
         _log.warning("%s", reason)
 
 
-def _options_difference(ours: Mapping[str, object], theirs: Mapping[str, object]) -> str:
-    """In which options two envs differ, in a sentence; "" if in none."""
-    differing = []
-    for name in {**ours, **theirs}:
-        pair = []
-        for options in (ours, theirs):
-            pair.append(repr(options[name]) if name in options else "not to be there")
-        if ours.get(name, pair) != theirs.get(name, pair):
-            differing.append(f"expected {name} {pair[0]}, got {pair[1]}")
-    return f"options: {'; '.join(differing)}" if differing else ""
-
-
 def _spec_difference(ours: EnvSpec, theirs: EnvSpec) -> str:
     """Difference between a simulator and earlier ones, in a sentence; "" if there is none."""
     if ours.options != theirs.options:
-        return _options_difference(ours.options, theirs.options)
+        return f"options: {options_difference(ours.options, theirs.options)}"
     for name in (field.name for field in fields(EnvSpec)):
         expected = getattr(ours, name)
         got = getattr(theirs, name)
