@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import replace
+from functools import partial
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -122,6 +123,7 @@ class Simulator(NotCopied):
             )
             self._port = _open_port(bind, [link.address for link in links], insecure=insecure)
             failing.callback(self._port.close)
+            self._receive = partial(self._port.receive, strangers=False)
             self.address: Address = self._port.address
             self.rules: Rules
             period = spec.control_period
@@ -217,7 +219,7 @@ class Simulator(NotCopied):
                 rules.handle_timers(before)
                 continue
             try:
-                datagram, address = self._port.receive(left, strangers=False)
+                datagram, address = self._receive(left)
             except OSError as error:
                 self._note(error, time.monotonic() - before - left)
                 continue
@@ -237,7 +239,7 @@ class Simulator(NotCopied):
                 break
             left = timer - time.monotonic()
             with suppress(OSError):  # nothing came, or an earlier datagram found nobody
-                datagram, address = self._port.receive(max(left, 0.0), strangers=False)
+                datagram, address = self._receive(max(left, 0.0))
                 if link := self._by_address.get(address):
                     link.client.receive(datagram, time.monotonic())
             for each in rules.links:
