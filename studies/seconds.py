@@ -7,8 +7,8 @@ After `--` are the words of `rotorgram train`; without any, PPO on the paper's t
 preset. The clock runs from before the process starts to after it has ended, with its checkpoint
 written. Processor seconds are of all its processes: on a busy machine compare these. Each policy
 then flies 20 `--episodes` on `mujoco`, of starts that no training has seen. A seed holds if the
-mean of the steady headline metric over the episodes is on the good side of `--within`, and none of
-them crashes; for a metric whose last value counts, as `landed`, the mean alone decides.
+mean of the steady headline metric over the episodes is on the good side of `--within`, and at most
+0.5 % of them crash; for a metric whose last value counts, as `landed`, the mean alone decides.
 
 It takes about two minutes on two cores.
 """
@@ -71,7 +71,7 @@ def evaluate(
         "return": round(float(np.mean([one.rewards.sum() for one in flown])), 2),
         "flight_seconds": round(float(np.mean([one.seconds for one in flown])), 2),
         "crashes": crashes,
-        "holds": bool(headline.holds(np.mean(sizes))) and not crashes,
+        "holds": bool(headline.holds(np.mean(sizes))) and crashes <= 0.005 * episodes,
     }
 
 

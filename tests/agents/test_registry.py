@@ -137,7 +137,7 @@ def test_a_task_has_the_preset_of_the_task_that_it_derives_from() -> None:
         find_preset("ppo", "tuned", f"{task}-v0") for task in ("test/Higher", "rotorgram/Hover")
     )
     assert own == hover
-    assert (own.env_id, own.fits, own.config.hidden) == ("rotorgram/Hover-v0", True, (64, 64))
+    assert (own.env_id, own.fits, own.config.hidden) == ("rotorgram/Hover-v0", True, (32, 32))
     other = find_preset("ippo", "tuned", "test/Higher-v0")
     assert (other.env_id, other.fits) == (ENV, False)
 
