@@ -7,7 +7,7 @@
 The step of each compiled flight of tests/contracts.py is compiled for arm64, four worlds in a
 vector, and linked to a program that runs it under qemu on memories that come through a pipe. All
 else runs here. Prints whether each flight has its hash of tests/data/hashes.json; exit status 1 if
-one has not. It takes about three minutes.
+one has not. It takes a few minutes.
 """
 
 import ctypes

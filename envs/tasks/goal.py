@@ -165,7 +165,8 @@ class GoalTask(Task):
         for values in self.further(state):
             is_number = np.ndim(values) < position.ndim
             parts.append(stack((values,)) if is_number else values)
-        return {"observation": clip(np.concat(parts, axis=-1), *[b.astype(dtype) for b in self._bounds])}
+        bounds = [bound.astype(dtype) for bound in self._bounds]
+        return {"observation": clip(np.concat(parts, axis=-1), *bounds)}
 
     def further(self, state: State) -> Sequence[Array]:
         """Numbers, (W, A), and vectors, (W, A, k), of the observation, as they were defined."""
