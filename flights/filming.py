@@ -132,10 +132,9 @@ def _times(tracks: Sequence[FilmTrack], config: Film, *, still: bool) -> list[tu
     counts = {(len(track.episodes), track.drones) for track in tracks}
     if len(counts) != 1 or not tracks[0].episodes:
         raise InputError("tracks: expected one or more, with as many episodes and drones each")
-    lengths = [0.0] * len(tracks[0].episodes)
-    for track in tracks:
-        for episode, world in enumerate(track.episodes):
-            lengths[episode] = max(lengths[episode], *(one.seconds for one in world))
+    lengths = []
+    for worlds in zip(*(track.episodes for track in tracks), strict=True):
+        lengths.append(max(one.seconds for world in worlds for one in world))
     if config.at is not None:
         return [(0, config.at)]
     if still:

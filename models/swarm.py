@@ -52,8 +52,7 @@ def swarm_model(
         _count_contacts(spec, f"{name}/{CONTACTS}", craft.name)
         _count_contacts(spec, f"{name}/{GROUNDED}", craft.name, spec.worldbody.name)
     if payload:
-        prefixed = {f"{name}/": craft for name, craft in zip(names, crafts, strict=True)}
-        hang_payload(spec, prefixed, payload, cable)
+        hang_payload(spec, crafts, payload, cable)
     model = spec.compile()
     for name in SHARED:  # they may be others than those of the first file
         setattr(model.opt, name, getattr(first.model.opt, name))

@@ -6,7 +6,7 @@ Body frame: that of the free body, x forward, y left, z up; SI units.
 
 import math
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from hashlib import blake2b
@@ -196,7 +196,7 @@ class Vehicle:
         craft = free_body(spec)
         craft.simple = False  # its inertia is no diagonal matrix once its center has moved
         if payload:
-            hang_payload(spec, {"": craft}, payload, cable)
+            hang_payload(spec, [craft], payload, cable)
         model = spec.compile()
         model.dof_damping[0:3] = self.model.dof_damping[0:3]
         model.geom_group[:] = craft_geoms(model)
@@ -247,22 +247,21 @@ def payload_radius(mass: float) -> float:
     return float((3 * mass / (4 * math.pi * 1000.0)) ** (1 / 3))
 
 
-def hang_payload(
-    spec: MjSpec, crafts: Mapping[str, mujoco.MjsBody], mass: float, cable: float
-) -> None:
+def hang_payload(spec: MjSpec, crafts: Sequence[mujoco.MjsBody], mass: float, cable: float) -> None:
     """Add a ball of a mass, kg, and a cable of a length, m, to it from each craft's origin.
 
-    The crafts have the prefixes of their names as keys. See `Vehicle.movable`.
+    See `Vehicle.movable`.
     """
     ball = spec.worldbody.add_body(name=_PAYLOAD)
-    ball.pos = next(iter(crafts.values())).pos - (0.0, 0.0, cable)
+    ball.pos = crafts[0].pos - (0.0, 0.0, cable)
     ball.add_freejoint()
     radius = payload_radius(mass)
     ball.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0], mass=mass)
     end = ball.add_site(name=_PAYLOAD)
-    for prefix, craft in crafts.items():
-        hook = craft.add_site(name=f"{prefix}rotorgram/hook")
-        tendon = spec.add_tendon(name=f"{prefix}rotorgram/cable", limited=True, range=[0.0, cable])
+    for number, craft in enumerate(crafts):
+        hook = craft.add_site(name=f"rotorgram/hook_{number}")
+        name = f"rotorgram/cable_{number}"
+        tendon = spec.add_tendon(name=name, limited=True, range=[0.0, cable])
         tendon.wrap_site(hook.name)
         tendon.wrap_site(end.name)
 
