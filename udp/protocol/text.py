@@ -66,18 +66,16 @@ def telemetry_sizes(layout: Layout) -> list[int]:
     """Numbers of each array of telemetry in a line."""
     sizes = []
     for shape, frame in zip(layout.telemetry, layout.frames, strict=True):
-        sizes.append(3 if (shape, frame) in _TO_PAPER else prod(shape))
+        sizes.append(3 if (shape, frame) in _CONVERSIONS else prod(shape))
     return sizes
 
 
-def _converted(
-    telemetry: Iterable[Array], layout: Layout, conversions: "_Conversions"
-) -> list[Array]:
-    """The telemetry of one drone in the other frames."""
+def _converted(telemetry: Iterable[Array], layout: Layout, *, to_paper: bool) -> list[Array]:
+    """The telemetry of one drone in the paper's frames, or from them."""
     converted = []
     for array, shape, frame in zip(telemetry, layout.telemetry, layout.frames, strict=True):
-        convert = conversions.get((shape, frame), np.asarray)
-        converted.append(convert(array))
+        into, back = _CONVERSIONS.get((shape, frame), (np.asarray, np.asarray))
+        converted.append(into(array) if to_paper else back(array))
     return converted
 
 
@@ -90,19 +88,15 @@ def _rates_in_body_frame(rates: Array) -> Array:
     return 0.0 - positions_in_world_frame(rates)
 
 
-_Conversions = dict[tuple[tuple[int, ...], str], Callable[[Array], Array]]
+_Conversion = Callable[[Array], Array]
 
-_TO_PAPER: Final[_Conversions] = {
-    ((3,), "world"): positions_in_paper_frame,
-    ((4,), "body to world"): attitudes_in_paper_frame,
-    ((3,), "body"): _rates_in_paper_frame,
+_CONVERSIONS: Final[dict[tuple[tuple[int, ...], str], tuple[_Conversion, _Conversion]]] = {
+    ((3,), "world"): (positions_in_paper_frame, positions_in_world_frame),
+    ((4,), "body to world"): (attitudes_in_paper_frame, quaternions_in_world_frame),
+    ((3,), "body"): (_rates_in_paper_frame, _rates_in_body_frame),
 }
-"""Conversions of telemetry by shape and frame; other telemetry stays as it is."""
-_FROM_PAPER: Final[_Conversions] = {
-    ((3,), "world"): positions_in_world_frame,
-    ((4,), "body to world"): quaternions_in_world_frame,
-    ((3,), "body"): _rates_in_body_frame,
-}
+"""Telemetry by shape and frame: into the paper's frame, and back. Other telemetry stays as it is.
+"""
 
 
 def encode(message: State | Command | Close, layout: Layout | None = None) -> bytes:
@@ -114,7 +108,7 @@ def encode(message: State | Command | Close, layout: Layout | None = None) -> by
         case State():
             flags = ["01"[message.terminated.item()], "01"[message.truncated.item()]]
             assert layout is not None
-            telemetry = _converted(message.telemetry, layout, _TO_PAPER)
+            telemetry = _converted(message.telemetry, layout, to_paper=True)
             arrays = (message.rewards, *message.observations, *telemetry)
             reward, *others = _numbers(arrays)
             fields = [reward, *flags, *others]
@@ -153,7 +147,7 @@ def decode_state(datagram: bytes, layout: Layout) -> State | Close:
     numbers = np.array([_floats("state: telemetry", fields[3 + size :])])
     telemetry = np.split(numbers, np.cumsum(sizes)[:-1], axis=1) if sizes else []
     shaped = []
-    converted = _converted(telemetry, layout, _FROM_PAPER)
+    converted = _converted(telemetry, layout, to_paper=False)
     for array, slot in zip(converted, layout.telemetry_slots, strict=True):
         shaped.append(array.reshape(slot.shape))
     return State(
