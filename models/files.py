@@ -10,6 +10,7 @@ import shutil
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -102,6 +103,7 @@ def find_in_package(name: str, folder: Path) -> Path | None:
     return next((place for place in places if place.is_file()), None)
 
 
+@cache
 def software_versions() -> dict[str, str]:
     """Versions of the installed packages that the numbers depend on."""
     from importlib.metadata import PackageNotFoundError, version  # slow to import
