@@ -63,6 +63,7 @@ ALGORITHMS: Final[dict[str, Algorithm]] = {
     "ppo": Algorithm("PPO", ".ppo:PPOConfig", ".ppo:PPO"),
     "ippo": Algorithm("IPPO", ".ppo:PPOConfig", ".ppo:PPO"),
     "mappo": Algorithm("MAPPO", ".ppo:PPOConfig", ".mappo:MAPPO"),
+    "apg": Algorithm("APG", ".apg:APGConfig", ".apg:APG"),
     "sb3-a2c": Algorithm("SB3 A2C", ".a2c:A2CConfig", _SB3, "#009E73"),
     "sb3-ppo": Algorithm("SB3 PPO", ".ppo:PPOConfig", _SB3),
     "sb3-sac": Algorithm("SB3 SAC", ".config:SACConfig", _SB3),

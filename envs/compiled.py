@@ -47,7 +47,7 @@ class CompiledLoop(Loop):
     """Why it is not compiled, once that was tried."""
 
     def _step(self, seeds: Any, *, flies: bool) -> None:
-        machine = self._entered()
+        machine = self.machine()
         if machine is None:
             super()._step(seeds, flies=flies)
             return
@@ -75,9 +75,9 @@ class CompiledLoop(Loop):
 
     def prepare(self) -> None:
         """Compile."""
-        self._entered()
+        self.machine()
 
-    def _entered(self) -> "Machine | None":
+    def machine(self) -> "Machine | None":
         """The machine, which has the state from now on; None where NumPy flies."""
         if self._machine is None and not self.refusal:
             self._machine = self._made()

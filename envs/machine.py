@@ -17,6 +17,7 @@ from ..sim.compile.layout import Layout, Memory
 from ..sim.compile.llvm import Region, compiled, widest
 from ..sim.snapshots import Arrays, Snapshot
 from .autoreset import Told
+from .derivative import Derivative
 from .loop import Loop
 from .stages.record import Mask, Record
 
@@ -42,6 +43,9 @@ class Machine:
         loop: A loop of one world that flies by NumPy, whose episode has begun.
         worlds: W.
 
+    Attributes:
+        tape: Unless it is None, gets the memory from before each flown step.
+
     Raises:
         Untraceable: A stage cannot be compiled.
     """
@@ -49,6 +53,7 @@ class Machine:
     def __init__(self, loop: Loop, worlds: int) -> None:
         self._loop = loop
         self._worlds = worlds
+        self.tape: list[Memory] | None = None
         state = loop.state()
         sent = loop.record.sent
         width = min(widest(), 1 << (worlds - 1).bit_length())
@@ -72,6 +77,7 @@ class Machine:
             most = f"expected at most {MOST:,}"
             raise Untraceable(f"a step of {size:,} operations is not compiled: {most}")
         self._run = compiled(regions, self._layouts, self._outside, width)
+        self._width = width
         self.memory = Memory(layout, worlds)
         self._results = []
         self._size = self.memory.blocks * self._told.size  # of what a step tells, then of all
@@ -100,6 +106,8 @@ class Machine:
 
         Actions (W, A, k), None if nobody flies; masks as of a `Record`.
         """
+        if self.tape is not None and sent is not None:
+            self.tape.append(self.memory.copy())
         worlds = self._worlds
         given = self._given
         all_fly = flown is None and begun is None and active is None

@@ -77,13 +77,21 @@ class Memory:
         self._content = raw[start:]
         self.address = first + start
 
+    def copy(self) -> "Memory":
+        """Another one of the same content."""
+        copy = Memory(self._layout, self._worlds)
+        size = self.blocks * self._layout.size
+        copy._content[:size] = self._content[:size]
+        return copy
+
     def get(self, name: str) -> np.ndarray:
         """A copy of an array, shape (W, *shape)."""
         return self._layout.read(name, self._content, self._worlds)
 
     def put(self, name: str, values: np.ndarray) -> None:
-        """Set an array from one of shape (W, *shape)."""
+        """Set an array from one of shape (W, *shape), or of as many numbers."""
         view = self._layout.view(name, self._content, self.blocks)
+        values = values.reshape(self._worlds, *view.shape[2:])
         lanes = self._layout.lanes
         whole = self._worlds // lanes
         if whole:

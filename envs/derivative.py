@@ -1,0 +1,127 @@
+"""Derivatives of a compiled step: from those by its results to those by what it began with."""
+
+from typing import Any
+
+import numpy as np
+
+from ..sim.compile import Program, lift, read
+from ..sim.compile.adjoint import adjoints
+from ..sim.compile.layout import Layout, Memory
+from ..sim.compile.llvm import Region, compiled
+from .loop import Loop
+
+_SINGLE = np.dtype(np.float32)
+_FLAG = np.dtype(bool)
+
+Named = dict[str, Any]
+
+
+class Derivative:
+    """The adjoint of a step that all drones fly, as machine code.
+
+    A loss depends on the rewards and observations of a flight. `back` takes its derivatives from
+    the end of a step to its beginning: call it for each step, the last one first. The derivatives
+    by the state stay here from call to call.
+
+    Args:
+        loop: A loop of one world whose episode has begun.
+        state: Layout of its snapshots in a memory.
+        width: Lanes of a vector.
+        worlds: W.
+    """
+
+    def __init__(self, loop: Loop, state: Layout, width: int, worlds: int) -> None:
+        program = Program()
+        before = _variables(program, loop, state)
+        after = _flown(loop, before)
+        ended = read(program, "ended", _FLAG, (1,))
+        used = _read_floats(program, after)
+        arrays: Named = {"sent": before["sent"], "ended": ended}
+        outputs: list[Any] = []
+        inputs: list[Any] = []
+        places = []
+        for name, array in after.items():
+            if name in before and name not in used:
+                continue
+            slope: Any = read(program, f"by/{name}", array.dtype, array.shape)
+            arrays[f"by/{name}"] = slope
+            if name != "reward":
+                slope = np.where(ended, 0.0, slope)
+            values = lift(program, array, array.dtype)
+            outputs += zip(values, slope.values.flat, strict=True)
+        for name in used:
+            array = before[name]
+            arrays[f"by/{name}"] = array
+            inputs += array.values.flat
+            places += [(f"by/{name}", row) for row in range(array.size)]
+        found = adjoints(program, outputs, inputs)
+        stores = [(*place, value) for place, value in zip(places, found, strict=True)]
+        layout = Layout({name: (x.dtype, x.shape[1:]) for name, x in arrays.items()}, state.lanes)
+        self._run = compiled([Region("", program, stores)], [state, layout], {}, width)
+        self._memory = Memory(layout, worlds)
+
+    def back(
+        self,
+        before: Memory,
+        sent: np.ndarray,
+        by_reward: np.ndarray,
+        by_observation: np.ndarray,
+        ended: np.ndarray,
+    ) -> np.ndarray:
+        """Derivatives by the actions of a step, float32, shape (W A, k).
+
+        Args:
+            before: The machine's memory before the step.
+            sent: The actions, shape (W A, k).
+            by_reward: Derivatives by the rewards, shape (W A,).
+            by_observation: Those by the observations after the step, flat, shape (W A, n).
+            ended: Whether the loss depends on nothing after the step, bool, shape (W,). Then the
+                derivatives by state and observations do not count.
+        """
+        memory = self._memory
+        memory.put("sent", sent)
+        memory.put("ended", ended)
+        memory.put("by/reward", by_reward)
+        memory.put("by/observation", by_observation)
+        self._run(memory.blocks, before.address, memory.address)
+        return memory.get("by/sent").reshape(sent.shape)
+
+
+def _variables(program: Program, loop: Loop, state: Layout) -> Named:
+    """Variables of a state, which becomes the loop's, and of actions."""
+    arrays: Named = {}
+    for name, (dtype, shape) in state.fields.items():
+        arrays[name] = read(program, name, dtype, (1, *shape))
+    shape = loop.record.sent.shape
+    loop.put(arrays)
+    return arrays | {"sent": read(program, "sent", _SINGLE, shape)}
+
+
+def _flown(loop: Loop, before: Named) -> Named:
+    """State, rewards and flat observations after a step that all drones fly."""
+    record = loop.record
+    record.flown = record.begun = None
+    record.sent = before["sent"]
+    record.rest()
+    record.run(None, loop.pipeline.fly)
+    record.run(None, loop.pipeline.observe)
+    after: Named = loop.state()
+    after["reward"] = record.reward
+    parts = []
+    for array in loop.spec.observation:
+        values = record.observations[array.name]
+        parts.append(values.reshape(*record.shape, -1).astype(_SINGLE))
+    after["observation"] = np.concatenate(parts, axis=-1)
+    return after
+
+
+def _read_floats(program: Program, after: Named) -> list[str]:
+    """Names of the floats that a step depends on."""
+    results = []
+    for array in after.values():
+        results += lift(program, array, array.dtype)
+    names = []
+    for value in program.needed(results):
+        if value.operation == "load" and value.dtype.kind == "f":
+            names.append(value.inputs[0])
+    return list(dict.fromkeys(names))

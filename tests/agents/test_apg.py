@@ -1,0 +1,177 @@
+"""Analytic policy gradients: the derivative, and that it learns, stops and resumes."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from nets import arrays_of
+from rotorgram.agents import EpisodeRecorder, find_preset, load, make_agent, store
+from rotorgram.agents.apg import APG, APGConfig
+from rotorgram.agents.rollouts import Collector, Rollout
+from rotorgram.cli import main
+from rotorgram.envs import LocalVectorEnv, Outcome, register
+from rotorgram.envs.config import EnvConfig
+from rotorgram.envs.state import State
+from rotorgram.envs.tasks.hover import Hover
+from rotorgram.models.errors import InputError
+from rotorgram.training.settings import Run
+from rotorgram.training.training import Training
+
+HOVER = "rotorgram/Hover-v0"
+CLIMB = "test/Climb-v0"
+DOUBLE = {"name": "rigid", "dtype": "float64"}
+LEAST = -4.0  # of the logarithm of the noise's size
+
+
+class Climb(Hover):
+    """Its reward is the speed upwards, m/s."""
+
+    def outcome(self, state: State) -> Outcome:
+        return replace(super().outcome(state), reward={"climb": state.velocity[..., 2]})
+
+
+def agent_of(
+    env_id: str = HOVER, drones: int = 8, config: APGConfig | None = None, **options: Any
+) -> tuple[APG, EpisodeRecorder]:
+    settings = {"backend": DOUBLE, "autoreset_mode": "Disabled", **options}
+    log = EpisodeRecorder(LocalVectorEnv(env_id, drones, **settings), 3)
+    agent = make_agent("apg", log, config or APGConfig(), 3)
+    assert isinstance(agent, APG)
+    return agent, log
+
+
+def flown(agent: APG, log: EpisodeRecorder, steps: int) -> Rollout:
+    collector = Collector(log, np.random.default_rng(0), agent._actor)
+    return agent.collect(collector, steps * log.num_envs)
+
+
+def after(changes: dict[str, tuple[int, float]]) -> APG:
+    """An agent and its gradient after 12 steps, with some numbers of its weights changed."""
+    config = APGConfig(gamma=1.0, renewed=0.0, max_grad_norm=1e9, activation="tanh", hidden=(8, 8))
+    agent, log = agent_of(config=config, start_band=0.2)
+    arrays, _ = arrays_of(agent)
+    # Rotors far from alike: body rates of 0 have no derivative of their size.
+    arrays["actor.layers.2.bias"][...] = (0.3, -0.1, 0.2, 0.1)
+    for name, (place, change) in changes.items():
+        arrays[name].flat[place] += change
+    agent.gradient(flown(agent, log, 12))
+    return agent
+
+
+@pytest.mark.parametrize(
+    ("name", "place"), [("layers.2.bias", 0), ("layers.2.weight", 7), ("layers.0.weight", 9)]
+)
+def test_the_gradient_is_the_derivative_of_the_mean_reward(name: str, place: int) -> None:
+    """Against a difference: of 12 steps of 8 drones, through the policy's later actions too."""
+    name = f"actor.{name}"
+    _, gradients = arrays_of(after({}))
+    size = 0.02
+    high = after({name: (place, size)}).terms["gain"]
+    low = after({name: (place, -size)}).terms["gain"]
+    slope = gradients[name].flat[place]
+    assert abs(slope) > 1e-6
+    assert slope == pytest.approx((low - high) / (2 * size), rel=0.02)
+
+
+def climbing(steps: int, **options: Any) -> tuple[APG, Rollout]:
+    """An agent that gives 0.1 whatever it sees, with as little noise as there may be."""
+    register(CLIMB, Climb)
+    config = APGConfig(gamma=0.5, renewed=0.0, log_std=LEAST)
+    level = {"start_tilt": 0.0, "start_heading": 0.0}
+    agent, log = agent_of(CLIMB, 3, config, **level, **options)
+    arrays, _ = arrays_of(agent)
+    for array in arrays.values():
+        array[...] = 0.0
+    arrays["actor.layers.1.bias"][...] = 0.1
+    arrays["actor.log_std"][...] = LEAST
+    return agent, flown(agent, log, steps)
+
+
+def test_an_action_counts_with_all_that_follows() -> None:
+    """A rotor's output of 1 is 51 N more than hover, on 20 kg for 0.02 s: 0.051 m/s from then on.
+
+    Of 3 drones and 4 steps, discounted from the first step of the flight on.
+    """
+    agent, rollout = climbing(4)
+    shares = np.array([1 + 0.5 + 0.25 + 0.125, 0.5 + 0.25 + 0.125, 0.25 + 0.125, 0.125])
+    expected = -0.051 / 12 * shares[:, None, None] * np.ones((4, 3, 4))
+    assert agent.slopes(rollout) == pytest.approx(expected, rel=1e-2)
+
+
+def test_nothing_counts_after_the_end_of_an_episode() -> None:
+    """Episodes of 2 steps, then a reset, which is no transition, then 1 step."""
+    agent, rollout = climbing(4, episode_length=2)
+    assert rollout.kept.tolist() == [[True] * 3, [True] * 3, [True] * 3, [True] * 3]
+    shares = np.array([1 + 0.5, 0.5, 0.25 + 0.125, 0.125])
+    expected = -0.051 / 12 * shares[:, None, None] * np.ones((4, 3, 4))
+    assert agent.slopes(rollout) == pytest.approx(expected, rel=1e-2)
+
+
+def test_beyond_a_bound_an_action_only_comes_back() -> None:
+    """Outputs of 3 are clipped to 1. To climb more does not move them; to climb less would."""
+    agent, rollout = climbing(2)
+    beyond = replace(rollout, actions=rollout.actions + 3.0)
+    assert not agent.slopes(beyond).any()
+    less = APGConfig(gamma=0.5)
+    object.__setattr__(less, "reward_scale", -1.0)
+    agent.config = less
+    assert (agent.slopes(beyond) > 0.0).all()
+
+
+def test_it_learns() -> None:
+    gains = []
+    config = APGConfig(horizon=32, hidden=(16,), activation="tanh", learning_rate=0.02)
+    agent, log = agent_of(drones=16, config=config)
+
+    def keep() -> bool:
+        gains.append(agent.terms["gain"])
+        return True
+
+    agent.train(log, 32 * 16 * 20, keep)
+    assert np.mean(gains[-4:]) > np.mean(gains[:4]) + 0.2
+
+
+def test_it_resumes_to_the_bit(tmp_path: Path) -> None:
+    config = APGConfig(horizon=10, hidden=(8,), renewed=0.5)
+    options: dict[str, Any] = {"backend": "rigid", "episode_length": 25}
+    env = EnvConfig.from_keywords(HOVER, **options)
+    run = Run(env=env, algorithm="apg", config=config, seed=1, env_steps=320, num_envs=8)
+
+    def vector() -> LocalVectorEnv:
+        return LocalVectorEnv(HOVER, 8, autoreset_mode="Disabled", **options)
+
+    whole = Training(run, vector())
+    assert whole.train()
+    part = Training(run, vector())
+    updates = iter([True])
+    assert not part.train(lambda: next(updates, False))
+    store(part.checkpoint(), tmp_path / "kept")
+    rest = Training.resume(load(tmp_path / "kept"), vector())
+    assert rest.train()
+    for name, array in whole.agent.state().items():
+        assert rest.agent.state()[name].tobytes() == array.tobytes(), name
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"backend": "mujoco"},
+        {"backend": {"name": "rigid", "compiled": False}},
+        {"env_id": "rotorgram/Elevation-v0", "action": "choices"},
+    ],
+)
+def test_what_it_cannot_learn_in(options: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match="apg: expected continuous actions and an env that is"):
+        agent_of(**options)
+
+
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["train", "apg", "--env", HOVER, "--num-envs", "4", "--env-steps", "160"]
+    words += ["--set", "horizon=20"]
+    assert main([*words, "--out", str(tmp_path / "run")]) == 0
+    assert "trained 160 of 160 env steps" in capsys.readouterr().out
+    assert main([*words, "--out", str(tmp_path / "other"), "--udp"]) == 1
+    assert "in this process (--backend rigid --no-udp)" in capsys.readouterr().err
+    assert find_preset("apg", "tuned", HOVER).backend == "rigid"
