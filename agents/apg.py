@@ -24,10 +24,8 @@ from .rollouts import Collector, Rollout
 class APGConfig(Config):
     """Analytic policy gradients. Defaults are ours."""
 
-    horizon: PositiveInt = 64
+    horizon: PositiveInt = 80
     """Steps of each drone in an update, through which it differentiates."""
-    renewed: Annotated[float, Limits(0.0, 1.0)] = 0.2
-    """Share of the worlds that begin an episode before each update, in the middle of another."""
     max_grad_norm: Annotated[float, Limits(0.0, above=True)] = 1.0
     """The gradient, as one vector, is scaled down to this length."""
 
@@ -50,29 +48,24 @@ class APG(Learner):
                 "apg: expected continuous actions and an env that is compiled, in this process "
                 "(--backend rigid --no-udp), got another one"
             )
-        self._log = log
+        self._drones = log.num_envs
         self._machine = machine
         self._derivative = machine.derivative()
 
     def collect(self, collector: Collector, most: int) -> Rollout:
         """Fly `horizon` steps of all drones, and keep what derivatives need."""
-        log = self._log
-        together = len(self.spec.agents)
-        worlds = self._rng.random(log.num_envs // together) < self.config.renewed
-        log.start()
-        log.begin(worlds.repeat(together) | log.done)
-        self._machine.tape = []
-        rollout = collector.steps(min(most, self.config.horizon * log.num_envs))
-        self._tape = self._machine.tape
-        self._machine.tape = None
+        machine = self._machine
+        machine.tape = []
+        rollout = collector.steps(min(most, self.config.horizon * self._drones))
+        self._tape = machine.tape
+        machine.tape = None
         return rollout
 
     def gradient(self, rollout: Rollout) -> None:
         """Of minus the mean of the discounted rewards."""
-        slopes = rollout.rows(self.slopes(rollout))
         (output,) = outputs = self._both.forward(rollout.rows(rollout.observations).T)
         _, entropy = self._actor.head.score(output, rollout.rows(rollout.actions).T)
-        output[...] = slopes.T
+        output[...] = rollout.rows(self.slopes(rollout)).T
         self._both.backward(outputs)
         clip_norm(self.weights.slopes, self.config.max_grad_norm)
         self.terms = {"gain": rollout.rows(rollout.rewards).mean(), "entropy": entropy}
@@ -97,9 +90,11 @@ class APG(Learner):
                 self._tape[step], sent, by_rewards[step], by_observations, ended[step]
             )
             slope *= actions.half
-            beyond = actions.middle + actions.half * drawn - sent
-            slope[beyond * slope < 0.0] = 0.0  # it would go on beyond the bound
+            slope[sent != actions.middle + actions.half * drawn] = 0.0  # it was clipped
             slopes[step] = slope
             network.forward(rollout.observations[step].T)
-            by_observations = network.back(slope.T).T
+            back = slope.T
+            for layer in reversed(network.layers):
+                back = layer.back(back)
+            by_observations = back.T
         return slopes

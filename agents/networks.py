@@ -220,15 +220,6 @@ class Network(Module):
             outputs = layer.forward(outputs)
         return outputs
 
-    def back(self, slope: Floats) -> Floats:
-        """Derivatives by the last inputs, from those by the outputs, without gradients.
-
-        It overwrites what `backward` does.
-        """
-        for layer in reversed(self.layers):
-            slope = layer.back(slope)
-        return slope
-
     def backward(self, slope: Floats) -> None:
         """Set the gradients of a loss, from its derivatives by the last outputs, (..., k, B).
 

@@ -8,12 +8,8 @@ from ..sim.compile import Program, lift, read
 from ..sim.compile.adjoint import adjoints
 from ..sim.compile.layout import Layout, Memory
 from ..sim.compile.llvm import Region, compiled
+from ..sim.state import Array, ByName
 from .loop import Loop
-
-_SINGLE = np.dtype(np.float32)
-_FLAG = np.dtype(bool)
-
-Named = dict[str, Any]
 
 
 class Derivative:
@@ -34,14 +30,13 @@ class Derivative:
         program = Program()
         before = _variables(program, loop, state)
         after = _flown(loop, before)
-        ended = read(program, "ended", _FLAG, (1,))
-        used = _read_floats(program, after)
-        arrays: Named = {"sent": before["sent"], "ended": ended}
+        ended = read(program, "ended", np.dtype(bool), (1,))
+        arrays: ByName = {"sent": before["sent"], "ended": ended}
         outputs: list[Any] = []
         inputs: list[Any] = []
         places = []
         for name, array in after.items():
-            if name in before and name not in used:
+            if array.dtype.kind != "f":
                 continue
             slope: Any = read(program, f"by/{name}", array.dtype, array.shape)
             arrays[f"by/{name}"] = slope
@@ -49,11 +44,11 @@ class Derivative:
                 slope = np.where(ended, 0.0, slope)
             values = lift(program, array, array.dtype)
             outputs += zip(values, slope.values.flat, strict=True)
-        for name in used:
-            array = before[name]
-            arrays[f"by/{name}"] = array
-            inputs += array.values.flat
-            places += [(f"by/{name}", row) for row in range(array.size)]
+        for name, array in before.items():
+            if array.dtype.kind == "f":
+                arrays[f"by/{name}"] = array
+                inputs += array.values.flat
+                places += [(f"by/{name}", row) for row in range(array.size)]
         found = adjoints(program, outputs, inputs)
         stores = [(*place, value) for place, value in zip(places, found, strict=True)]
         layout = Layout({name: (x.dtype, x.shape[1:]) for name, x in arrays.items()}, state.lanes)
@@ -63,11 +58,11 @@ class Derivative:
     def back(
         self,
         before: Memory,
-        sent: np.ndarray,
-        by_reward: np.ndarray,
-        by_observation: np.ndarray,
-        ended: np.ndarray,
-    ) -> np.ndarray:
+        sent: Array,
+        by_reward: Array,
+        by_observation: Array,
+        ended: Array,
+    ) -> Array:
         """Derivatives by the actions of a step, float32, shape (W A, k).
 
         Args:
@@ -87,17 +82,18 @@ class Derivative:
         return memory.get("by/sent").reshape(sent.shape)
 
 
-def _variables(program: Program, loop: Loop, state: Layout) -> Named:
+def _variables(program: Program, loop: Loop, state: Layout) -> ByName:
     """Variables of a state, which becomes the loop's, and of actions."""
-    arrays: Named = {}
+    arrays: ByName = {}
     for name, (dtype, shape) in state.fields.items():
         arrays[name] = read(program, name, dtype, (1, *shape))
-    shape = loop.record.sent.shape
+    sent = loop.record.sent
     loop.put(arrays)
-    return arrays | {"sent": read(program, "sent", _SINGLE, shape)}
+    arrays["sent"] = read(program, "sent", sent.dtype, sent.shape)
+    return arrays
 
 
-def _flown(loop: Loop, before: Named) -> Named:
+def _flown(loop: Loop, before: ByName) -> ByName:
     """State, rewards and flat observations after a step that all drones fly."""
     record = loop.record
     record.flown = record.begun = None
@@ -105,23 +101,11 @@ def _flown(loop: Loop, before: Named) -> Named:
     record.rest()
     record.run(None, loop.pipeline.fly)
     record.run(None, loop.pipeline.observe)
-    after: Named = loop.state()
+    after: ByName = loop.state()
     after["reward"] = record.reward
     parts = []
     for array in loop.spec.observation:
         values = record.observations[array.name]
-        parts.append(values.reshape(*record.shape, -1).astype(_SINGLE))
+        parts.append(values.reshape(*record.shape, -1).astype(np.float32))
     after["observation"] = np.concatenate(parts, axis=-1)
     return after
-
-
-def _read_floats(program: Program, after: Named) -> list[str]:
-    """Names of the floats that a step depends on."""
-    results = []
-    for array in after.values():
-        results += lift(program, array, array.dtype)
-    names = []
-    for value in program.needed(results):
-        if value.operation == "load" and value.dtype.kind == "f":
-            names.append(value.inputs[0])
-    return list(dict.fromkeys(names))

@@ -7,7 +7,6 @@ those of all values between the inputs and the outputs follow, from the last val
 
 from collections.abc import Sequence
 from functools import cache
-from typing import Any
 
 import numpy as np
 
@@ -16,6 +15,8 @@ from .tracer import Traced, TracedArray
 
 Pairs = Sequence[tuple[Value, Value]]
 """Values, each with an adjoint, or with a part of it."""
+Found = dict[Value, Value]
+"""Adjoints by their values."""
 
 
 def adjoints(program: Program, outputs: Pairs, inputs: Sequence[Value]) -> list[Value]:
@@ -25,7 +26,7 @@ def adjoints(program: Program, outputs: Pairs, inputs: Sequence[Value]) -> list[
     value that it takes. The branch that it leaves gets zeros, which stay zeros through a quotient
     or a root, so that branch may divide by 0. The root of 0 has the derivative 0, and so has |0|.
     """
-    found: dict[Value, Value] = {}
+    found: Found = {}
     _add(program, found, outputs)
     for value in reversed(_between(program, list(found), inputs)):
         if value not in found:
@@ -35,11 +36,10 @@ def adjoints(program: Program, outputs: Pairs, inputs: Sequence[Value]) -> list[
     return [found.get(one) or program.constant(0.0, one.dtype) for one in inputs]
 
 
-def _add(program: Program, found: dict[Value, Value], parts: Pairs) -> None:
+def _add(program: Program, found: Found, parts: Pairs) -> None:
     for value, part in parts:
-        known = found.get(value)
-        if known is not None:
-            part = program.value("add", value.dtype, known, part)
+        if value in found:
+            part = program.value("add", value.dtype, found[value], part)
         found[value] = part
 
 
@@ -54,11 +54,10 @@ def _between(program: Program, outputs: Sequence[Value], inputs: Sequence[Value]
     return between
 
 
-def _through_operation(program: Program, value: Value, found: dict[Value, Value]) -> Pairs:
+def _through_operation(program: Program, value: Value, found: Found) -> Pairs:
     """Inputs of an operation, with what it adds to their adjoints."""
-    arrays = []
-    for one in (found[value], value, *value.inputs):
-        arrays.append(TracedArray(program, one, one.dtype))
+    values = (found[value], value, *value.inputs)
+    arrays = [TracedArray(program, one, one.dtype) for one in values]
     parts = _parts(value.operation, *arrays)
     pairs = zip(_floats(value.inputs), parts, strict=False)
     return [(one, part.values.item()) for one, part in pairs]
@@ -101,7 +100,7 @@ def _parts(operation: str, adjoint: Traced, result: Traced, *inputs: Traced) -> 
     raise NotImplementedError(f"{operation}: expected an operation with a derivative")
 
 
-def _through_call(program: Program, value: Value, found: dict[Value, Value]) -> Pairs:
+def _through_call(program: Program, value: Value, found: Found) -> Pairs:
     """As `_through_operation`, of all results of a call at once: nothing lies between them."""
     function, _, *inputs = value.inputs
     given = list(inputs)
@@ -130,5 +129,5 @@ def _backward(function: Function) -> Function:
     return Function(f"{function.name}.adjoint", program, results, (len(results),))
 
 
-def _floats(values: Sequence[Any]) -> list[Value]:
+def _floats(values: Sequence[Value]) -> list[Value]:
     return [one for one in values if one.dtype.kind == "f"]

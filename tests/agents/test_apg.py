@@ -49,7 +49,7 @@ def flown(agent: APG, log: EpisodeRecorder, steps: int) -> Rollout:
 
 def after(changes: dict[str, tuple[int, float]]) -> APG:
     """An agent and its gradient after 12 steps, with some numbers of its weights changed."""
-    config = APGConfig(gamma=1.0, renewed=0.0, max_grad_norm=1e9, activation="tanh", hidden=(8, 8))
+    config = APGConfig(gamma=1.0, max_grad_norm=1e9, activation="tanh", hidden=(8, 8))
     agent, log = agent_of(config=config, start_band=0.2)
     arrays, _ = arrays_of(agent)
     # Rotors far from alike: body rates of 0 have no derivative of their size.
@@ -78,7 +78,7 @@ def test_the_gradient_is_the_derivative_of_the_mean_reward(name: str, place: int
 def climbing(steps: int, **options: Any) -> tuple[APG, Rollout]:
     """An agent that gives 0.1 whatever it sees, with as little noise as there may be."""
     register(CLIMB, Climb)
-    config = APGConfig(gamma=0.5, renewed=0.0, log_std=LEAST)
+    config = APGConfig(gamma=0.5, log_std=LEAST)
     level = {"start_tilt": 0.0, "start_heading": 0.0}
     agent, log = agent_of(CLIMB, 3, config, **level, **options)
     arrays, _ = arrays_of(agent)
@@ -101,23 +101,21 @@ def test_an_action_counts_with_all_that_follows() -> None:
 
 
 def test_nothing_counts_after_the_end_of_an_episode() -> None:
-    """Episodes of 2 steps, then a reset, which is no transition, then 1 step."""
+    """Two episodes of 2 steps: those of the second change nothing of the first."""
     agent, rollout = climbing(4, episode_length=2)
-    assert rollout.kept.tolist() == [[True] * 3, [True] * 3, [True] * 3, [True] * 3]
+    assert rollout.truncated.tolist() == [[False] * 3, [True] * 3] * 2
     shares = np.array([1 + 0.5, 0.5, 0.25 + 0.125, 0.125])
     expected = -0.051 / 12 * shares[:, None, None] * np.ones((4, 3, 4))
     assert agent.slopes(rollout) == pytest.approx(expected, rel=1e-2)
 
 
-def test_beyond_a_bound_an_action_only_comes_back() -> None:
-    """Outputs of 3 are clipped to 1. To climb more does not move them; to climb less would."""
+def test_a_clipped_action_has_no_derivative() -> None:
+    """An output of 1.1 is one of 1 to the env, and so is one of 1.2."""
     agent, rollout = climbing(2)
-    beyond = replace(rollout, actions=rollout.actions + 3.0)
-    assert not agent.slopes(beyond).any()
-    less = APGConfig(gamma=0.5)
-    object.__setattr__(less, "reward_scale", -1.0)
-    agent.config = less
-    assert (agent.slopes(beyond) > 0.0).all()
+    actions = rollout.actions.copy()
+    actions[1, 0, 2] = 1.1
+    slopes = agent.slopes(replace(rollout, actions=actions))
+    assert slopes[1, 0].tolist() == pytest.approx([-0.051 / 12] * 2 + [0.0, -0.051 / 12], rel=1e-2)
 
 
 def test_it_learns() -> None:
@@ -134,7 +132,7 @@ def test_it_learns() -> None:
 
 
 def test_it_resumes_to_the_bit(tmp_path: Path) -> None:
-    config = APGConfig(horizon=10, hidden=(8,), renewed=0.5)
+    config = APGConfig(horizon=10, hidden=(8,))
     options: dict[str, Any] = {"backend": "rigid", "episode_length": 25}
     env = EnvConfig.from_keywords(HOVER, **options)
     run = Run(env=env, algorithm="apg", config=config, seed=1, env_steps=320, num_envs=8)
@@ -159,7 +157,7 @@ def test_it_resumes_to_the_bit(tmp_path: Path) -> None:
     [
         {"backend": "mujoco"},
         {"backend": {"name": "rigid", "compiled": False}},
-        {"env_id": "rotorgram/Elevation-v0", "action": "choices"},
+        {"env_id": "rotorgram/Elevation-v0", "action_type": "discrete"},
     ],
 )
 def test_what_it_cannot_learn_in(options: dict[str, Any]) -> None:
