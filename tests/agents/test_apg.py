@@ -120,15 +120,15 @@ def test_a_clipped_action_has_no_derivative() -> None:
 
 def test_it_learns() -> None:
     gains = []
-    config = APGConfig(horizon=32, hidden=(16,), activation="tanh", learning_rate=0.02)
+    config = APGConfig(hidden=(16,), activation="tanh", learning_rate=0.02)
     agent, log = agent_of(drones=16, config=config)
 
     def keep() -> bool:
         gains.append(agent.terms["gain"])
         return True
 
-    agent.train(log, 32 * 16 * 20, keep)
-    assert np.mean(gains[-4:]) > np.mean(gains[:4]) + 0.2
+    agent.train(log, 80 * 16 * 20, keep)
+    assert np.mean(gains[-4:]) > np.mean(gains[:4]) + 1.0
 
 
 def test_it_resumes_to_the_bit(tmp_path: Path) -> None:
