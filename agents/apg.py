@@ -78,6 +78,8 @@ class APG(Learner):
         steps = len(rollout.actions)
         weights = config.gamma ** np.arange(steps) * (-config.reward_scale / len(rollout))
         by_rewards = weights[:, np.newaxis] * rollout.kept
+        if config.reward_clip is not None:
+            by_rewards *= np.abs(rollout.rewards) < config.reward_clip
         worlds = rollout.ends.reshape(steps, -1, len(self.spec.agents))
         ended = np.asarray(worlds.all(axis=2))
         ended[-1] = True

@@ -128,6 +128,10 @@ class Machine:
             results[name] = np.ndarray(shape, dtype, new, start)
         return results, lambda: self._read(new)
 
+    def derivative(self) -> Derivative:
+        """That of a step."""
+        return Derivative(self._loop, self._layouts[0], self._width, self._worlds)
+
     def begin_all(self) -> None:
         """As `Record.begin_all`."""
         memory = self.memory

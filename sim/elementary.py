@@ -41,15 +41,14 @@ _LAYOUTS = {"float32": (np.int32, 23, 127), "float64": (np.int64, 52, 1023)}
 
 
 def _split(x: Array) -> tuple[Array, Array]:
-    """Of normal numbers above 0."""
+    """Of normal numbers above 0: a product, so that the fraction has a derivative."""
     whole, digits, one = _LAYOUTS[x.dtype.name]
-    bits = x.view(whole)
-    fraction = (bits & ((1 << digits) - 1)) | ((one - 1) << digits)
-    return fraction.view(x.dtype), ((bits >> digits) - (one - 1)).astype(x.dtype)
+    power = ((x.view(whole) >> digits) - (one - 1)).astype(x.dtype)
+    return _scaled(x, -power), power
 
 
 def _scaled(x: Array, power: Array) -> Array:
-    """Of numbers near 1, in two steps, of which only the last one can round."""
+    """In two steps, of which only the last one can round."""
     whole, digits, one = _LAYOUTS[x.dtype.name]
     power = power.astype(whole)
     half = power >> 1

@@ -22,9 +22,10 @@ Found = dict[Value, Value]
 def adjoints(program: Program, outputs: Pairs, inputs: Sequence[Value]) -> list[Value]:
     """Adjoints of the inputs, from outputs with theirs; a value may be an output twice.
 
-    Roundings and comparisons are steps: their derivative is 0. A `select` passes an adjoint to the
-    value that it takes. The branch that it leaves gets zeros, which stay zeros through a quotient
-    or a root, so that branch may divide by 0. The root of 0 has the derivative 0, and so has |0|.
+    Roundings and comparisons are steps: their derivative is 0, as that of whole numbers. A `select`
+    passes an adjoint to the value that it takes. The branch that it leaves gets zeros, which stay
+    zeros through a quotient or a root, so that branch may divide by 0. The root of 0 has the
+    derivative 0, and so has |0|.
     """
     found: Found = {}
     _add(program, found, outputs)
@@ -90,11 +91,6 @@ def _parts(operation: str, adjoint: Traced, result: Traced, *inputs: Traced) -> 
         return (np.where(x == 0.0, 0.0, signed),)
     if operation == "sqrt":
         return (0.5 * adjoint / np.where(result > 0.0, result, np.inf),)
-    if operation == "ldexp":
-        return (np.ldexp(adjoint, y),)
-    if operation == "fraction":
-        _, power = np.frexp(x)
-        return (np.ldexp(adjoint, -power),)
     if operation == "cast":
         return (adjoint.astype(x.dtype),)
     raise NotImplementedError(f"{operation}: expected an operation with a derivative")
