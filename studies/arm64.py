@@ -90,23 +90,22 @@ def compiled(regions: Any, layouts: Sequence[Any], outside: Any, width: int) -> 
         sizes.append(layouts[0].lanes * prod(shape) * dtype.itemsize)
     text = llvm._Printer(layouts, outside, width).text(regions)
     words = ["qemu-aarch64", program(text, len(sizes))]
-    process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-    to: Any = process.stdin
-    back: Any = process.stdout
+    pipe: Any = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
 
     def run(blocks: int, *addresses: int) -> None:
         places = [(a, blocks * size) for a, size in zip(addresses, sizes, strict=True)]
-        to.write(np.array([blocks, *(size for _, size in places)]).tobytes())
+        head = np.array([blocks, *(size for _, size in places)])
+        pipe.stdin.write(head.tobytes())
         for address, size in places:
-            to.write(ctypes.string_at(address, size))
-        to.flush()
+            pipe.stdin.write(ctypes.string_at(address, size))
+        pipe.stdin.flush()
         for address, size in places:
-            ctypes.memmove(address, back.read(size), size)
+            ctypes.memmove(address, pipe.stdout.read(size), size)
 
     return run
 
 
-def main() -> int:
+def main() -> None:
     args = options(__doc__, only="").parse_args()
     binding.initialize_all_targets()
     binding.initialize_all_asmprinters()
@@ -126,8 +125,8 @@ def main() -> int:
     print(
         f"{sum(flown)} of {len(flown)} flights have their hash by code for arm64, {seconds:.0f} s"
     )
-    return 0 if all(flown) else 1
+    sys.exit(not all(flown))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()
