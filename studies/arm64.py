@@ -56,22 +56,10 @@ int main(void) {{
 """
 
 
-def with_tables(text: str) -> str:
-    """A module's text with tables of its own, in place of addresses in this process."""
-    for number, table in enumerate(llvm._TABLES.values()):
-        for column in range(table.shape[1]):
-            offset = column * table.itemsize
-            here = f"inttoptr (i64 {table.ctypes.data + offset} to ptr)"
-            text = text.replace(here, f"getelementptr (i8, ptr @table{number}, i64 {offset})")
-        content = "".join(f"\\{byte:02x}" for byte in table.tobytes())
-        text += f'\n@table{number} = constant [{table.nbytes} x i8] c"{content}", align 64'
-    return text
-
-
 def program(text: str, count: int) -> Path:
     """A program that runs a module's function of so many memories."""
     target = binding.Target.from_triple(TRIPLE)
-    module = binding.parse_assembly(with_tables(text))
+    module = binding.parse_assembly(text)
     made = target.create_target_machine(cpu="generic", opt=2, reloc="static")
     folder = Path(FOLDER.name)
     (folder / "run.o").write_bytes(made.emit_object(module))

@@ -179,6 +179,7 @@ class _Printer:
         self._calls: dict[str, str] = {}
         self._functions: dict[str, str] = {}
         self._tables: list[np.ndarray] = []
+        self._constants: dict[str, str] = {}
         self._count = 0
 
     def text(self, regions: Sequence[Region]) -> str:
@@ -198,8 +199,9 @@ class _Printer:
             regions="\n".join(self._lines),
             count=len(regions),
         )
-        functions = self._functions.values()
-        return "\n".join((function, *functions, *self._declared.values(), _ATTRIBUTES))
+        parts = [function, *self._functions.values(), *self._declared.values(), _ATTRIBUTES]
+        parts += [f"{name} = internal {kept}" for kept, name in self._constants.items()]
+        return "\n".join(parts)
 
     def _region(self, number: int, region: Region) -> None:
         after = f"%region.{number + 1}"
@@ -468,12 +470,19 @@ class _Printer:
             f"call {lanes} {function}({places} {pointers}, i32 1, {flags} {always}, {lanes} poison)"
         )
 
+    def _constant(self, table: np.ndarray) -> str:
+        """The name of a table in the module, where equal ones are there once."""
+        content = "".join(f"\\{byte:02x}" for byte in table.tobytes())
+        kept = f'constant [{table.nbytes} x i8] c"{content}", align 64'
+        return self._constants.setdefault(kept, f"@table.{len(self._constants)}")
+
     def _gather(self, value: Value) -> str:
         """A column of a table, at rows that lie within it."""
         number, column, row = value.inputs
-        table = _kept_table(self._tables[number])
+        table = self._tables[number]
         kind = _KINDS[value.dtype.name]
-        base = f"inttoptr (i64 {table.ctypes.data + column * table.itemsize} to ptr)"
+        start = column * table.itemsize
+        base = f"getelementptr (i8, ptr {self._constant(table)}, i64 {start})"
         wholes = self._lanes("i64")
         place = self._new(
             f"mul {wholes} {self._names[row.number]}, {self._splat(table.shape[1], 'i64')}"
@@ -511,15 +520,6 @@ class _Printer:
 
 def _in_memory(dtype: DType) -> str:
     return "i8" if dtype.kind == "b" else _KINDS[dtype.name]
-
-
-_TABLES: dict[tuple[object, ...], np.ndarray] = {}
-"""Tables that machine code reads, by their content."""
-
-
-def _kept_table(table: np.ndarray) -> np.ndarray:
-    """A table at an address that lasts; equal ones have one."""
-    return _TABLES.setdefault((table.dtype, table.shape, table.tobytes()), table)
 
 
 @lru_cache
