@@ -22,7 +22,7 @@ class Bench(Command):
         from rich.console import Console
         from rich.table import Table
 
-        from ..training.bench import LAYERS, bench
+        from ..training.bench import HOVER, bench, layers
         from ._progress import bars
         from ._training import folder_to_write
 
@@ -32,11 +32,14 @@ class Bench(Command):
             def on_layer(name: str, turn: int, turns: int) -> None:
                 progress("bench", turn, turns, name)
 
-            medians = bench(self.rounds, self.seconds, folder, on_layer)
+            measured = bench(self.rounds, self.seconds, folder, on_layer)
             progress("bench", 1, 1, "done")
         rates = Table("layer", "what", "env steps/s", "µs per env step", box=SIMPLE_HEAD)
-        for layer in LAYERS:
-            rate = medians[layer.name]
+        for layer in layers():
+            rate = measured["medians"][layer.name]
             rates.add_row(layer.name, layer.about, f"{rate:,.0f}", f"{1e6 / rate:.2f}")
         Console().print(rates)
+        if measured["policy_seconds"]:
+            seconds = measured["policy_seconds"]
+            print(f"rotorgram train ppo --env {HOVER}: {seconds:.2f} s of one core")
         print(f"written: {folder / 'bench.json'}")

@@ -1,15 +1,22 @@
 """Env steps per second on this machine, from raw physics to a simulator over UDP.
 
-All layers are open at the same time and take turns to run for a moment; the median over the turns
-counts, so that a machine that slows down for a while slows all alike.
+Other simulators of drones stand beside ours where they are installed. `rigid` and they count
+seconds of the processor, so that threads bring nothing: steps per second of one core. All layers
+are open at the same time and take turns to run for a moment; the median over the turns counts, so
+that a machine that slows down for a while slows all alike.
 """
 
+import os
 import statistics
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
+from importlib.util import find_spec
 from itertools import cycle
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -28,6 +35,7 @@ from ..udp.spawn import spawn_simulator
 from .results import machine
 
 ENV_ID = "rotorgram/Elevation-v0"
+HOVER = "rotorgram/Hover-v0"
 _PERIOD = 0.02  # s, of a control step
 _STEPS_AT_ONCE = 64  # of one drone between two looks at the clock
 _DRONES = 1024
@@ -44,32 +52,42 @@ class Layer(NamedTuple):
     drones: int
     start: Callable[[ExitStack], Step]
     """Opens it for as long as the stack is."""
+    clock: Callable[[], float] = time.perf_counter
+    package: str = "rotorgram"
+    """What must be installed."""
+
+
+def layers() -> list[Layer]:
+    """Those that this machine can run."""
+    return [layer for layer in LAYERS if find_spec(layer.package)]
 
 
 def bench(
     rounds: int, seconds: float, folder: Path, on_layer: Callable[[str, int, int], None]
-) -> dict[str, float]:
+) -> dict[str, Any]:
     """Measure every layer in turns of `seconds`, and write `bench.json` into `folder`.
 
-    `on_layer` is called before each turn: name of the layer, turns done, turns in all. Returns the
-    median rate of each layer, env steps per second. Raises `InputError`.
+    `on_layer` is called before each turn: name of the layer, turns done, turns in all. Returns what
+    is written: `medians` has env steps per second of each layer, `policy_seconds` those of a
+    training, or None where its packages are missing. Raises `InputError`.
     """
     check("rounds", Limits(1, whole=True), rounds)
     check("seconds", Limits(0, 60, "s", above=True), seconds)
-    turns = (rounds + 1) * len(LAYERS)
+    found = layers()
+    turns = (rounds + 1) * len(found)
     done = 0
-    rates: dict[str, list[float]] = {layer.name: [] for layer in LAYERS}
+    rates: dict[str, list[float]] = {layer.name: [] for layer in found}
     with ExitStack() as stack:
         steps = {}
-        for layer in LAYERS:
+        for layer in found:
             on_layer(f"opening {layer.name}", done, turns)
             steps[layer.name] = layer.start(stack)
         for number in range(rounds + 1):
-            for layer in LAYERS:
+            for layer in found:
                 on_layer(layer.name, done, turns)
                 done += 1
                 at_once = _STEPS_AT_ONCE if layer.drones == 1 else 1
-                rate = rate_of(steps[layer.name], seconds, at_once)
+                rate = rate_of(steps[layer.name], seconds, at_once, layer.clock)
                 if number:  # the first round warms up
                     rates[layer.name].append(round(rate, 1))
     medians = {name: statistics.median(values) for name, values in rates.items()}
@@ -78,22 +96,40 @@ def bench(
         "seconds": seconds,
         "rates": rates,
         "medians": medians,
+        "policy_seconds": policy_seconds() if find_spec("tensorboard") else None,
         "machine": machine(),
         "versions": software_versions(),
     }
     write_json(folder / "bench.json", content)
-    return medians
+    return content
 
 
-def rate_of(step: Step, seconds: float, at_once: int = _STEPS_AT_ONCE) -> float:
+def policy_seconds() -> float:
+    """Processor time of `rotorgram train ppo` on Hover-v0, from its start to its end, s."""
+    with TemporaryDirectory() as folder:
+        out = str(Path(folder) / "policy")
+        command = (sys.executable, "-m", "rotorgram.cli", "train", "ppo", "--env", HOVER)
+        before = os.times()
+        subprocess.run([*command, "--out", out], check=True, stdout=subprocess.DEVNULL)
+        after = os.times()
+    used = after.children_user - before.children_user
+    return used + after.children_system - before.children_system
+
+
+def rate_of(
+    step: Step,
+    seconds: float,
+    at_once: int = _STEPS_AT_ONCE,
+    clock: Callable[[], float] = time.perf_counter,
+) -> float:
     """Env steps per second over `seconds`, with `at_once` steps between looks at the clock."""
-    start = time.perf_counter()
+    start = clock()
     now = start
     steps = 0
     while now < start + seconds:
         for _ in range(at_once):
             steps += step()
-        now = time.perf_counter()
+        now = clock()
     return steps / (now - start)
 
 
@@ -140,9 +176,9 @@ def local_env(stack: ExitStack) -> Step:
     return single_step(env)
 
 
-def single_step(env: gym.Env[Any, Any]) -> Step:
+def single_step(env: gym.Env[Any, Any], width: int = 1) -> Step:
     """Steps of a single env with random actions; after an episode it is reset."""
-    actions = _actions(4096, 1)
+    actions = _actions(4096, width)
     env.reset(seed=0)
 
     def step() -> int:
@@ -180,6 +216,86 @@ def _remote_vector(stack: ExitStack) -> Step:
     return _vector_step(stack.enter_context(opened))
 
 
+# ---- `rigid`, and other simulators on one core
+
+
+def _rigid_env(stack: ExitStack) -> Step:
+    env = gym.make(HOVER, backend="rigid", disable_env_checker=True)
+    return single_step(stack.enter_context(closing(env)), 4)
+
+
+def _rigid(drones: int) -> Callable[[ExitStack], Step]:
+    def start(stack: ExitStack) -> Step:
+        env = gym.make_vec(HOVER, num_envs=drones, backend="rigid")
+        env = stack.enter_context(closing(env))
+        actions = _actions(16, drones, 4)
+        env.reset(seed=0)
+
+        def step() -> int:
+            env.step(next(actions))
+            return drones
+
+        return step
+
+    return start
+
+
+def _l2f(_: ExitStack) -> Step:
+    import l2f
+
+    vector = l2f.vector_selector[_DRONES]
+    device = l2f.Device()
+    env = vector.VectorEnvironment()
+    rng = vector.VectorRng()
+    parameters = vector.VectorParameters()
+    state, later = vector.VectorState(), vector.VectorState()
+    vector.initialize_rng(device, rng, 0)
+    vector.initialize_environment(device, env)
+    vector.initial_parameters(device, env, parameters)
+    vector.sample_initial_state(device, env, parameters, state, rng)
+    seen = np.zeros((_DRONES, env.OBSERVATION_DIM), np.float32)
+    actions = _actions(16, _DRONES, env.ACTION_DIM)
+
+    def step() -> int:
+        vector.step(device, env, parameters, state, next(actions), later, rng)
+        state.assign(later)
+        vector.observe(device, env, parameters, state, seen, rng)
+        return _DRONES
+
+    return step
+
+
+def _hyperdrone(_: ExitStack) -> Step:
+    from hyperdrone.dynamics import Sim
+
+    sim = Sim(_DRONES)
+    sim.reset(sample_states=True)
+    actions = _actions(16, _DRONES, sim.action_dim)
+
+    def step() -> int:
+        sim.step(next(actions))
+        sim.observe()
+        return _DRONES
+
+    return step
+
+
+def _crazyflow(stack: ExitStack) -> Step:
+    import crazyflow.envs  # noqa: F401  # it registers them
+    import jax
+
+    made = gym.make_vec("DroneReachPos-v0", num_envs=_DRONES, device="cpu", freq=50)
+    env = stack.enter_context(closing(made))
+    env.reset(seed=0)
+    actions = _actions(16, *(env.action_space.shape or ()))
+
+    def step() -> int:
+        jax.block_until_ready(env.step(next(actions))[0])
+        return _DRONES
+
+    return step
+
+
 LAYERS = (
     Layer("mj_step", "substeps of one control step", 1, _mj_step),
     Layer("env", "the single env's step", 1, local_env),
@@ -187,4 +303,11 @@ LAYERS = (
     Layer("Batch.step, 1024", "mujoco.batch, the same substeps", _DRONES, _batch_step),
     Layer("vector env, 1024", "the vector env", _DRONES, _vector),
     Layer("UDP, 1024", "RemoteVectorEnv", _DRONES, _remote_vector),
+    Layer("rigid, 1", "Hover-v0, two steps of RK4", 1, _rigid_env, time.process_time),
+    Layer("rigid, 64", "the same", 64, _rigid(64), time.process_time),
+    Layer("rigid, 1024", "the same", _DRONES, _rigid(_DRONES), time.process_time),
+    Layer("rigid, 4096", "the same", 4096, _rigid(4096), time.process_time),
+    Layer("L2F, 1024", "one step of RK4", _DRONES, _l2f, time.process_time, "l2f"),
+    Layer("HyperDrone, 1024", "one step", _DRONES, _hyperdrone, time.process_time, "hyperdrone"),
+    Layer("Crazyflow, 1024", "ten steps", _DRONES, _crazyflow, time.process_time, "crazyflow"),
 )

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from rotorgram.cli import main
-from rotorgram.training.bench import LAYERS, bench
+from rotorgram.training.bench import bench, layers
 from step_over_udp import multiple, one_core
 
 
@@ -33,7 +33,7 @@ def test_every_layer_is_measured(tmp_path: Path, capsys: pytest.CaptureFixture[s
     folder = tmp_path / "bench"
     assert main(["bench", "--rounds", "3", "--seconds", "0.01", "--out", str(folder)]) == 0
     written = json.loads((folder / "bench.json").read_text())
-    names = [layer.name for layer in LAYERS]
+    names = [layer.name for layer in layers()]
     assert list(written["rates"]) == names
     for name, rates in written["rates"].items():
         assert len(rates) == 3
@@ -41,6 +41,7 @@ def test_every_layer_is_measured(tmp_path: Path, capsys: pytest.CaptureFixture[s
         assert written["medians"][name] == statistics.median(rates)
     shown = capsys.readouterr().out
     assert all(name in shown for name in names)
+    assert f"{written['policy_seconds']:.2f} s of one core" in shown
 
 
 def test_wrong_times(tmp_path: Path) -> None:
