@@ -32,18 +32,8 @@ __all__ = [
 
 __getattr__ = import_when_used(__name__)
 
-for _module, _name in (
-    ("elevation", "Elevation"),
-    ("hover", "Hover"),
-    ("waypoints", "Waypoints"),
-    ("tracking", "Tracking"),
-    ("racing", "Racing"),
-    ("landing", "Landing"),
-    ("recovery", "Recovery"),
-    ("payload_hover", "PayloadHover"),
-    ("swarm", "Formation"),
-    ("swarm", "Crossing"),
-    ("swarm", "Escort"),
-    ("cable", "Cable"),
-):
-    register(f"rotorgram/{_name}-v0", f"rotorgram.envs.tasks.{_module}:{_name}")
+for _name in (
+    "Elevation", "Hover", "Waypoints", "Tracking", "Racing", "Landing", "Recovery", "PayloadHover",
+    "Formation", "Crossing", "Escort", "Cable",
+):  # fmt: skip
+    register(f"rotorgram/{_name}-v0", f"rotorgram.envs.tasks:{_name}")

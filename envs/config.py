@@ -19,6 +19,7 @@ from ..models.files import read_toml
 from ..models.library import is_of_the_library, vehicle_words
 from ..scenes import scenes_of
 from ..sim import EffectOptions, Randomization
+from ..sim.effects import NO_EFFECTS
 from . import registry
 from .spec import Values, canonical_id, json_values
 
@@ -32,7 +33,6 @@ DEFAULT_ENV = "rotorgram/Elevation-v0"
 MAX_CONTROL_PERIOD = 1.0  # s
 MAX_EPISODE_LENGTH = 1 << 31  # control steps
 MAX_HISTORY = 1000  # observations side by side
-_NO_EFFECTS = EffectOptions()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,7 +135,7 @@ class EnvConfig:
     history: Annotated[int, Limits(1, MAX_HISTORY, "observations", whole=True)] = 1
     """Number of the last observations that are observed side by side, the oldest first. A reset
     fills them with the first observation."""
-    effects: EffectOptions = _NO_EFFECTS
+    effects: EffectOptions = NO_EFFECTS
     randomize: Options = field(default_factory=dict, hash=False)
     """Distributions of what is drawn for each episode: names of `sim.PARAMETERS` to texts."""
     sensors: Options = field(default_factory=dict, hash=False)

@@ -63,17 +63,16 @@ class Loop:
         self._task = task = make_task(config, () if alone else shape)
         self.vehicle = task.vehicle
         flown = task.config
-        randomize = Randomization(flown.randomize, flown.effects) if flown.randomize else None
         self._world = world = make_world(
             self.vehicle,
             num_worlds,
             backend.name,
             drones=config.drones,
             effects=flown.effects,
-            randomize=randomize,
+            randomize=Randomization(flown.randomize, flown.effects),
             **backend.settings,
         )
-        self.pipeline = pipeline = Pipeline(task, world, shape, randomize)
+        self.pipeline = pipeline = Pipeline(task, world, shape)
         self.spec = spec_of(config, task)
         kept = tuple(name for stage in pipeline.stages for name in stage.arrays)
         self._record = Record(world.shape, task.memory, kept)
@@ -153,7 +152,7 @@ class Loop:
         record = self._record
         parts: dict[str, Arrays] = {"record": record.snapshot()}
         for stage in self.pipeline.stages:
-            parts[type(stage).__name__] = stage.snapshot(record)
+            parts[type(stage).__name__] = stage.snapshot()
         return joined(parts)
 
     def restore(self, snapshot: Arrays) -> None:

@@ -6,8 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from ..sim.compile import TracedArray
-
 
 class Memory:
     """What a task remembers of its episodes: arrays by name, shape (W, A, ...).
@@ -33,7 +31,7 @@ class Memory:
             )
         if self._phase == "update" and name not in vars(self):
             raise AttributeError(f"memory.{name}: expected a value from begin() first, got none")
-        array: Any = value if isinstance(value, TracedArray) else np.asarray(value)
+        array: Any = value if hasattr(value, "dtype") else np.asarray(value)
         if array.dtype.kind != "b":
             array = array.astype(np.float64, copy=False)
         if not array.ndim:

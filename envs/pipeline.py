@@ -1,6 +1,8 @@
 """The list of a loop's stages, in its order; a feature that is off is not in it."""
 
-from ..sim import Randomization, World
+import numpy as np
+
+from ..sim import World
 from ..sim.sensors import Sensors
 from .specification import observed
 from .stages.actions import ActionDelay, Actions, Receive
@@ -35,12 +37,11 @@ class Pipeline:
         task: Task,
         world: World,
         shape: tuple[int, int],
-        randomize: Randomization | None,
     ) -> None:
         config = task.config
         controller = task.controller
         period = task.control_period
-        drawn = () if randomize is None else randomize.names
+        randomize = world.randomize
         look = lambda: world.state  # noqa: E731
         sensors = Sensors(config.sensors, world, period) if config.sensors else None
         if sensors is not None and config.estimated:
@@ -53,20 +54,21 @@ class Pipeline:
         held = 1 if often else substeps
         parts: list[Stage] = [Control(controller, look)]
         if shape[1] > 1:
-            parts.append(StandStill(world))
+            vehicle = task.vehicle
+            parts.append(StandStill(np.clip(0.0, vehicle.thrust_low, vehicle.thrust_high)))
 
         flying: list[Stage] = [Receive(neutral)]
-        if randomize is not None and "action_delay" in drawn:
+        if "action_delay" in randomize.names:
             flying.append(ActionDelay(world, randomize.most_steps("action_delay"), neutral))
         flying += [Flight(world, parts, substeps, held), Clock()]
 
         observing = self._observing(task, world, sensors, shape)
-        if randomize is not None and "observation_delay" in drawn:
+        if "observation_delay" in randomize.names:
             longest = randomize.most_steps("observation_delay")
             observing.append(ObservationDelay(world, longest))
         if config.history > 1:
-            names = tuple(array.name for array in observed(task))
-            observing.append(History(config.history, names, len(world.shape)))
+            names = [array.name for array in observed(task)]
+            observing.append(History(config.history, names))
         observing.append(Ends(config.env_id, world.shape, task.episode_length))
 
         self.stages = [Starts(task, world), *flying, *observing]

@@ -148,13 +148,14 @@ def predict(vehicle: Vehicle, candidates: Sequence[Numbers], windows: Windows) -
     starts = len(windows.start)
     share = starts // len(candidates)
     numbers = {name: np.repeat([one[name] for one in candidates], share) for name in NAMES}
+    each = {name: values[:, None] for name, values in numbers.items()}
     world = _world(vehicle, numbers, windows.period)
     inertias = np.stack([inertia_of(vehicle, one) for one in candidates])
     own = numbers_of(vehicle)["rotors.reaction"] or 1.0
     world.vary(
-        inertia=np.repeat(inertias, share, axis=0),
-        reaction=numbers["rotors.reaction"] / own,
-        air={name: values[:, None] for name, values in numbers.items()},
+        inertia=np.repeat(inertias, share, axis=0)[:, None],
+        reaction=each["rotors.reaction"] / own,
+        air=each,
     )
     position, quaternion, velocity, rates = np.split(windows.start[:, None], (3, 7, 10), axis=-1)
     start = InitialState(
@@ -162,7 +163,7 @@ def predict(vehicle: Vehicle, candidates: Sequence[Numbers], windows: Windows) -
     )
     world.reset(np.ones((starts, 1), bool), start)
     states = np.full((starts, len(windows.horizons), 13), _LOST)
-    coefficient = numbers["rotors.thrust_coefficient"][:, None]
+    coefficient = each["rotors.thrust_coefficient"]
     state = world.state
     with suppress(PhysicsError):  # of numbers far off, which a fit tries
         for step in range(windows.speeds.shape[1]):

@@ -6,7 +6,6 @@ arguments, float32 or float64, and give numbers for numbers. Errors are in units
 """
 
 import math
-from collections.abc import Callable
 from math import factorial
 from typing import Any, NamedTuple
 
@@ -24,53 +23,8 @@ _NAN = math.nan
 _ROUNDING = 2.0**52  # Added to a smaller number of float64, it leaves no bit for its fraction
 
 
-class _Functions(NamedTuple):
-    """What arrays and numbers need different functions for."""
-
-    rint: Callable[[Any], Any]
-    where: Callable[[Any, Any, Any], Any]
-    copysign: Callable[[Any, Any], Any]
-    split: Callable[[Any], tuple[Any, Any]]
-    """A fraction from 1/2 to 1 and a power of 2, whose product is the number."""
-    scaled: Callable[[Any, Any], Any]
-    """A number times a power of 2."""
-
-
 _LAYOUTS = {"float32": (np.int32, 23, 127), "float64": (np.int64, 52, 1023)}
 """Whole numbers with the bits of a float, bits of its fraction, and its exponent of 1."""
-
-
-def _split(x: Array) -> tuple[Array, Array]:
-    """Of normal numbers above 0: a product, so that the fraction has a derivative."""
-    whole, digits, one = _LAYOUTS[x.dtype.name]
-    power = ((x.view(whole) >> digits) - (one - 1)).astype(x.dtype)
-    return _scaled(x, -power), power
-
-
-def _scaled(x: Array, power: Array) -> Array:
-    """In two steps, of which only the last one can round."""
-    whole, digits, one = _LAYOUTS[x.dtype.name]
-    power = power.astype(whole)
-    half = power >> 1
-    for part in (half, power - half):
-        x = x * ((part + one) << digits).view(x.dtype)
-    return x
-
-
-def _rint_of_number(x: float) -> float:
-    return math.copysign((abs(x) + _ROUNDING) - _ROUNDING, x)
-
-
-def _where_of_numbers(flag: bool, yes: float, no: float) -> float:
-    return yes if flag else no
-
-
-def _scaled_number(x: float, power: float) -> float:
-    return math.ldexp(x, int(power))
-
-
-_ARRAYS = _Functions(np.rint, np.where, np.copysign, _split, _scaled)
-_NUMBERS = _Functions(_rint_of_number, _where_of_numbers, math.copysign, math.frexp, _scaled_number)
 
 
 class _Precision(NamedTuple):
@@ -157,13 +111,59 @@ _DOUBLE = _precision(
 )
 
 
+# ---- of arrays, and of numbers, which are Python's
+
+
 def _prepared(*values: Array) -> tuple[Any, ...]:
-    """Functions, constants, and the values: numbers as Python's."""
+    """Constants, and the values: numbers as Python's."""
     for value in values:
         if not isinstance(value, float | int):
             is_single = value.dtype == np.float32
-            return _ARRAYS, _SINGLE if is_single else _DOUBLE, *values
-    return _NUMBERS, _DOUBLE, *map(float, values)
+            return _SINGLE if is_single else _DOUBLE, *values
+    return _DOUBLE, *map(float, values)
+
+
+def _where(flag: Array, yes: Array, no: Array) -> Array:
+    if isinstance(flag, bool):
+        return yes if flag else no
+    return np.where(flag, yes, no)
+
+
+def _rint(x: Array) -> Array:
+    if isinstance(x, float):
+        return math.copysign((abs(x) + _ROUNDING) - _ROUNDING, x)
+    return np.rint(x)
+
+
+def _signed(x: Array, sign: Array) -> Array:
+    """x with another sign."""
+    if isinstance(sign, float):
+        return math.copysign(x, sign)
+    return np.copysign(x, sign)
+
+
+def _split(x: Array) -> tuple[Array, Array]:
+    """A fraction from 1/2 to 1 and a power of 2, whose product is a normal number above 0.
+
+    The fraction is a product too, so that it has a derivative.
+    """
+    if isinstance(x, float):
+        return math.frexp(x)
+    whole, digits, one = _LAYOUTS[x.dtype.name]
+    power = ((x.view(whole) >> digits) - (one - 1)).astype(x.dtype)
+    return _scaled(x, -power), power
+
+
+def _scaled(x: Array, power: Array) -> Array:
+    """A number times a power of 2, in two steps, of which only the last one can round."""
+    if isinstance(x, float):
+        return math.ldexp(x, int(power))
+    whole, digits, one = _LAYOUTS[x.dtype.name]
+    power = power.astype(whole)
+    half = power >> 1
+    for part in (half, power - half):
+        x = x * ((part + one) << digits).view(x.dtype)
+    return x
 
 
 def polynomial(x: Array, coefficients: tuple[float, ...]) -> Array:
@@ -191,29 +191,29 @@ def cos(x: Array) -> Array:
 
 def _wave(x: Array, quarters: float) -> Array:
     """Sine of x plus `quarters` quarter turns."""
-    f, p, x = _prepared(x)
-    near = f.rint(x * _TURN)
-    rest = _without(f, p, x, near)
+    p, x = _prepared(x)
+    near = _rint(x * _TURN)
+    rest = _without(p, x, near)
     quarter = near + quarters
     quarter = quarter - 4.0 * floor(quarter * 0.25)
     square = rest * rest
     sine = rest + rest * (square * polynomial(square, p.sine))
     cosine = 1.0 - (0.5 * square - square * (square * polynomial(square, p.cosine)))
     is_cosine = (quarter == 1.0) | (quarter == 3.0)
-    value = f.where(is_cosine, cosine, sine)
-    return f.where(quarter >= 2.0, -value, value)
+    value = _where(is_cosine, cosine, sine)
+    return _where(quarter >= 2.0, -value, value)
 
 
 @once()
 def wrapped(x: Array) -> Array:
     """The angle between -π and π, rad, that differs from x by whole turns; NaN as of `sin`."""
-    f, p, x = _prepared(x)
-    return _without(f, p, x, 4.0 * f.rint(x * (0.25 * _TURN)))
+    p, x = _prepared(x)
+    return _without(p, x, 4.0 * _rint(x * (0.25 * _TURN)))
 
 
-def _without(f: _Functions, p: _Precision, x: Array, quarters: Array) -> Array:
+def _without(p: _Precision, x: Array, quarters: Array) -> Array:
     """An angle less so many quarter turns: reduction by Cody and Waite."""
-    x = f.where(abs(x) < p.furthest, x, _NAN)
+    x = _where(abs(x) < p.furthest, x, _NAN)
     for part in p.half_pi:
         x = x - quarters * part
     return x
@@ -222,27 +222,27 @@ def _without(f: _Functions, p: _Precision, x: Array, quarters: Array) -> Array:
 @once()
 def atan2(y: Array, x: Array) -> Array:
     """Angle of the point (x, y), rad, within 2.5 ulp, for sizes below 1e37; zeros as in C."""
-    f, p, y, x = _prepared(y, x)
+    p, y, x = _prepared(y, x)
     across = abs(x)
     up = abs(y)
     is_steep = up > across
-    large = f.where(is_steep, up, across)
-    small = f.where(is_steep, across, up)
-    large = f.where(large == 0.0, 1.0, large)
+    large = _where(is_steep, up, across)
+    small = _where(is_steep, across, up)
+    large = _where(large == 0.0, 1.0, large)
     is_far = small > _EIGHTH * large
-    above = f.where(is_far, small - large, small)
-    ratio = above / f.where(is_far, small + large, large)
+    above = _where(is_far, small - large, small)
+    ratio = above / _where(is_far, small + large, large)
     square = ratio * ratio
     series = polynomial(square, p.arc)
     if p.arc_below:
         series = series / polynomial(square, p.arc_below)
     angle = ratio + ratio * (square * series)
     high, low = p.half_turn
-    angle = f.where(is_far, 0.25 * high + (angle + 0.25 * low), angle)
-    angle = f.where(is_steep, 0.5 * high + (0.5 * low - angle), angle)
-    is_behind = f.copysign(1.0, x) < 0.0
-    angle = f.where(is_behind, high + (low - angle), angle)
-    return f.copysign(angle, y)
+    angle = _where(is_far, 0.25 * high + (angle + 0.25 * low), angle)
+    angle = _where(is_steep, 0.5 * high + (0.5 * low - angle), angle)
+    is_behind = _signed(1.0, x) < 0.0
+    angle = _where(is_behind, high + (low - angle), angle)
+    return _signed(angle, y)
 
 
 # ---- exponentials
@@ -254,36 +254,36 @@ def exp(x: Array) -> Array:
 
     0 below -708 and infinite above 709, of float32 below -87 and above 88.
     """
-    f, p, x = _prepared(x)
-    rest, power = _reduced(f, p, x)
-    value = f.scaled(1.0 + rest, power)
-    value = f.where(x < p.low, 0.0, value)
-    return _ended(f, p, x, value)
+    p, x = _prepared(x)
+    rest, power = _reduced(p, x)
+    value = _scaled(1.0 + rest, power)
+    value = _where(x < p.low, 0.0, value)
+    return _ended(p, x, value)
 
 
 @once()
 def expm1(x: Array) -> Array:
     """exp(x) - 1, within 2.5 ulp; infinite where `exp` is."""
-    f, p, x = _prepared(x)
-    rest, power = _reduced(f, p, x)
-    scale = f.scaled(1.0 + 0.0 * rest, power)
-    return _ended(f, p, x, scale * rest + (scale - 1.0))
+    p, x = _prepared(x)
+    rest, power = _reduced(p, x)
+    scale = _scaled(1.0 + 0.0 * rest, power)
+    return _ended(p, x, scale * rest + (scale - 1.0))
 
 
-def _reduced(f: _Functions, p: _Precision, x: Array) -> tuple[Array, Array]:
+def _reduced(p: _Precision, x: Array) -> tuple[Array, Array]:
     """A number r and a power n of 2: exp(x) = (1 + r) 2ⁿ."""
-    inside = f.where(x > p.low, x, p.low)
-    inside = f.where(inside < p.high, inside, p.high)
-    power = f.rint(inside * 1.4426950408889634)
+    inside = _where(x > p.low, x, p.low)
+    inside = _where(inside < p.high, inside, p.high)
+    power = _rint(inside * 1.4426950408889634)
     high, low = p.log2
     rest = (inside - power * high) - power * low
     return rest + rest * rest * polynomial(rest, p.exponential), power
 
 
-def _ended(f: _Functions, p: _Precision, x: Array, value: Array) -> Array:
+def _ended(p: _Precision, x: Array, value: Array) -> Array:
     """A value that grows with x, beyond the range too."""
-    value = f.where(x > p.high, _INFINITY, value)
-    return f.where(x == x, value, x)
+    value = _where(x > p.high, _INFINITY, value)
+    return _where(x == x, value, x)
 
 
 @once()
@@ -292,11 +292,11 @@ def log(x: Array) -> Array:
 
     -infinity of 0 and of numbers below the normal ones, NaN of negative ones.
     """
-    f, p, x = _prepared(x)
-    fraction, power = f.split(abs(x))
+    p, x = _prepared(x)
+    fraction, power = _split(abs(x))
     is_low = fraction < _SQRT_HALF
-    fraction = f.where(is_low, fraction + fraction, fraction)
-    power = f.where(is_low, power - 1.0, power)
+    fraction = _where(is_low, fraction + fraction, fraction)
+    power = _where(is_low, power - 1.0, power)
     above = fraction - 1.0
     s = above / (2.0 + above)
     square = s * s
@@ -304,9 +304,9 @@ def log(x: Array) -> Array:
     half = 0.5 * above * above
     high, low = p.log2
     value = power * high - ((half - (s * (half + rest) + power * low)) - above)
-    value = f.where(x < p.least, -_INFINITY, value)
-    value = f.where(x < _INFINITY, value, x)
-    return f.where(x < 0.0, _NAN, value)
+    value = _where(x < p.least, -_INFINITY, value)
+    value = _where(x < _INFINITY, value, x)
+    return _where(x < 0.0, _NAN, value)
 
 
 def power(x: Array, y: Array) -> Array:

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import elementary
-from .compile import TracedArray, once
+from .compile import once
 from .snapshots import Arrays, Kept
-from .state import Array
+from .state import Array, is_traced
 
 Words = NDArray[np.uint32]
 Numbers = NDArray[np.float64]
@@ -140,7 +140,7 @@ class Random(Kept):
     def ids(self, mask: Mask) -> Ids:
         """The numbers of the worlds of a mask; traced code has one world."""
         worlds = self.worlds(mask)
-        return ... if isinstance(worlds, TracedArray) else np.flatnonzero(worlds)
+        return ... if is_traced(worlds) else np.flatnonzero(worlds)
 
     def noise(self, name: str, size: int) -> "Noise":
         """A source of `size` normal numbers for each drone and step."""
@@ -231,7 +231,7 @@ class Noise(Kept):
     def begin(self, begun: Any) -> None:
         """An episode of some worlds begins, bool, (W,)."""
         self.step = np.where(begun, np.uint32(0), self.step)
-        if not isinstance(begun, TracedArray):
+        if not is_traced(begun):
             self.forget(begun)
 
     def forget(self, ids: Ids) -> None:
@@ -243,7 +243,7 @@ class Noise(Kept):
         super().restore(arrays)
         self.forget(...)
 
-    def normal(self, mask: Array | None = None) -> Array:
+    def normal(self, mask: Mask = None) -> Array:
         """The next numbers of the worlds of a mask, bool, shape (W, A), None for all.
 
         Shape (W, A, size). The other worlds get zeros, and their steps do not advance.
@@ -251,7 +251,7 @@ class Noise(Kept):
         random = self._random
         if not random.shape:
             return self._single() if mask is None or mask else np.zeros(self._size)
-        if isinstance(mask, TracedArray):
+        if is_traced(mask):
             drawn = self._drawn(random.keys, random.episode, self.step)
             self.step = np.where(mask[:, 0], self.step + np.uint32(1), self.step)
             return np.where(mask[..., None], drawn, 0.0)

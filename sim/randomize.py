@@ -106,6 +106,10 @@ class Randomization:
         return drawn
 
 
+FIXED = Randomization({}, None)
+"""Nothing is drawn."""
+
+
 def _distribution(name: str, text: object) -> tuple[str, tuple[float, ...]]:
     limits = PARAMETERS[name]
     match = _TEXT.fullmatch(text) if isinstance(text, str) else None

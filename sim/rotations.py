@@ -7,18 +7,10 @@ take arrays with the components on their last axis, and any leading axes.
 from collections.abc import Sequence
 
 from .elementary import atan2, cos, sin
-from .state import Array, square_root, stack
+from .state import Array, parts_of, square_root, stack
 
 Parts = Sequence[Array]
 Rows = tuple[Parts, Parts, Parts]
-
-
-def parts_of(array: Array) -> list[Array]:
-    """Components of the last axis; of a single drone Python's numbers."""
-    if array.ndim == 1:
-        numbers: list[Array] = array.tolist()
-        return numbers
-    return [array[..., index] for index in range(array.shape[-1])]
 
 
 # ---- of components

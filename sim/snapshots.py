@@ -1,11 +1,9 @@
 """State as named arrays, so that it can be copied, put back, and stored."""
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
-
-from .compile import TracedArray
 
 Snapshot = dict[str, np.ndarray]
 Arrays = Mapping[str, np.ndarray]
@@ -16,11 +14,9 @@ class Kept:
 
     Class attributes:
         arrays: Names of attributes that are arrays, or a single drone's numbers.
-        lists: Names of attributes that are lists of those.
     """
 
     arrays: ClassVar[tuple[str, ...]] = ()
-    lists: ClassVar[tuple[str, ...]] = ()
 
     def parts(self) -> "dict[str, Kept]":
         """Parts that keep a state of their own, by name."""
@@ -32,11 +28,7 @@ class Kept:
         for name in self.arrays:
             value = getattr(self, name)
             if value is not None:
-                own[name] = copied(value)
-        for name in self.lists:
-            values = getattr(self, name)
-            if values:
-                own[name] = np.stack(values, axis=-1)
+                own[name] = np.copy(value)
         return own | joined({name: part.snapshot() for name, part in self.parts().items()})
 
     def restore(self, arrays: Arrays) -> None:
@@ -44,24 +36,8 @@ class Kept:
         for name in self.arrays:
             array = arrays.get(name)
             setattr(self, name, None if array is None else array.copy()[()])
-        for name in self.lists:
-            array = arrays.get(name)
-            setattr(self, name, [] if array is None else _listed(array))
         for name, part in self.parts().items():
             part.restore(part_of(arrays, name))
-
-
-def copied(value: Any) -> Any:
-    """A copy of an array, or of a single drone's number as one."""
-    return value.copy() if isinstance(value, TracedArray) else np.array(value)
-
-
-def _listed(array: Any) -> list[Any]:
-    """The arrays of a stack of them; of a single drone Python's numbers."""
-    if array.ndim == 1:
-        numbers: list[float] = array.tolist()
-        return numbers
-    return [array[..., index].copy() for index in range(array.shape[-1])]
 
 
 def joined(parts: Mapping[str, Arrays]) -> Snapshot:

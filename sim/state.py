@@ -61,8 +61,7 @@ class WorldState:
     @property
     def tilt_cosine(self) -> Array:
         """Cosine of the angle between each body's z axis and the vertical, shape (W, A)."""
-        x = component(self.quaternion, 1)
-        y = component(self.quaternion, 2)
+        _, x, y, _ = parts_of(self.quaternion)
         return 1 - 2 * (x * x + y * y)
 
 
@@ -99,27 +98,27 @@ def component(array: Array, index: int) -> Array:
     return array.item(index) if array.ndim == 1 else array[..., index]
 
 
+def parts_of(array: Array) -> list[Array]:
+    """Components of the last axis; of a single drone Python's numbers."""
+    if array.ndim == 1:
+        numbers: list[Array] = array.tolist()
+        return numbers
+    return [array[..., index] for index in range(array.shape[-1])]
+
+
 def each(values: Array) -> Array:
     """Numbers of drones with a last axis of length 1; a single drone's number as it is."""
     return values if isinstance(values, _NUMBERS) else values[..., None]
 
 
 def chosen(mask: Array, new: Array, old: Array) -> Array:
-    """`new`, (W, A) or (W, A, k), where the mask is true, elsewhere `old`; None stands for all."""
+    """`new`, (W, A, ...), where the mask, (W, A), is true, elsewhere `old`; None stands for all."""
     if mask is None or old is None:
         return new
     if not getattr(mask, "ndim", 0):  # a single drone's
         return new if mask else old
-    if getattr(new, "ndim", 0) > mask.ndim:
-        mask = mask[..., None]
-    return np.where(mask, new, old)
-
-
-def kept(mask: Array, new: list[Array], old: list[Array]) -> list[Array]:
-    """`chosen` for lists of arrays; an empty one has none yet."""
-    if not old:
-        return new
-    return [chosen(mask, a, b) for a, b in zip(new, old, strict=True)]
+    more = max(np.ndim(new), np.ndim(old)) - mask.ndim
+    return np.where(mask.reshape(mask.shape + (1,) * more), new, old)
 
 
 def plain(array: Array) -> Array:
@@ -164,7 +163,7 @@ def looked_up(table: np.ndarray, index: Array) -> Array:
     index = clip(index, 0.0, len(table) - 1.0)
     if isinstance(index, float):
         return plain(table[int(index)])
-    if isinstance(index, TracedArray):
+    if is_traced(index):
         return index.rows_of(table)
     return table[index.astype(int)]
 
@@ -176,14 +175,30 @@ def interpolated(table: np.ndarray, index: Array) -> Array:
     return low + (looked_up(table, before + 1.0) - low) * (index - before)
 
 
+# ---- of masks; code that is compiled has no truth values yet
+
+
+def is_traced(array: Array) -> bool:
+    """Whether this code is being compiled: then it runs once, for worlds whose numbers come later.
+
+    The only function of `sim` outside `compile` that tells such an array from NumPy's.
+    """
+    return isinstance(array, TracedArray)
+
+
 def some(mask: Array) -> bool:
     """Whether a mask has a drone, None being all: what follows is for its drones alone.
 
-    Traced code does what follows; that it is for none costs the time alone.
+    Compiled code does what follows; that it is for none costs the time alone.
     """
-    if mask is None or isinstance(mask, TracedArray):
+    if mask is None or is_traced(mask):
         return True
     return bool(np.count_nonzero(mask) if mask.ndim else mask)  # faster than NumPy's any
+
+
+def found(mask: Array) -> bool:
+    """Whether a mask has a drone of which Python is told: in compiled code its caller looks."""
+    return not is_traced(mask) and some(mask)
 
 
 def stack(parts: Sequence[Array]) -> Array:

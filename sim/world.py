@@ -10,10 +10,10 @@ from .. import models
 from ..models import BACKENDS, MAX_DRONES, Backend
 from ..models.errors import InputError, NotCopied
 from ..models.fields import Choice, Flag, Limits, OrNone, Rule, check
-from .effects import EffectOptions, Effects
+from .effects import NO_EFFECTS, EffectOptions, Effects
 from .random import RANDOMIZATION, START, Draw, Random
-from .randomize import Randomization
-from .snapshots import Arrays, Snapshot, copied, joined, part_of
+from .randomize import FIXED, Randomization
+from .snapshots import Arrays, Snapshot, joined, part_of
 from .state import Array, ByName, InitialState, WorldState, plain
 
 _CLASSES = {"mujoco": "MujocoWorld", "rigid": "RigidWorld"}
@@ -43,6 +43,7 @@ class World(NotCopied):
         vehicle: The vehicle of every drone.
         shape: (W, A), the leading axes of all arrays; () for a single drone.
         state: As the last step or reset left it.
+        randomize: What is drawn for each episode.
         random: The counters of all random numbers; `seed` seeds them.
         parameters: What was drawn for each drone's episode, by name, shape (W, A).
         effects: What acts on drones besides gravity, contact and ideal rotors; None: nothing.
@@ -54,17 +55,17 @@ class World(NotCopied):
         self,
         vehicle: "models.Vehicle",
         shape: tuple[int, ...],
-        effects: EffectOptions | None,
-        randomize: Randomization | None,
+        effects: EffectOptions,
+        randomize: Randomization,
     ) -> None:
         self.vehicle = vehicle
         self.shape = shape
         self.parameters: ByName = {}
-        self._options = effects or EffectOptions()
-        self._randomize = randomize
-        self._drawn = () if randomize is None else randomize.names
+        self._options = effects
+        self.randomize = randomize
+        self._drawn = randomize.names
         self.random = Random(shape)
-        acting = Effects(vehicle, self._options, self.random.noise, self._drawn)
+        acting = Effects(vehicle, effects, self.random.noise, self._drawn)
         self.effects = acting if acting.on_rotors or acting.on_body else None
         self._on_rotors = acting.on_rotors
         self._check = max(1, round(CONTACT_CHECK / vehicle.timestep))  # physics steps
@@ -115,7 +116,7 @@ class World(NotCopied):
         """Copies of all arrays that a later step depends on, by name."""
         state = {name: array.copy() for name, array in self._kept().items()}
         parts = {"random": self.random.snapshot(), "state": state}
-        parts["parameters"] = {name: copied(x) for name, x in self.parameters.items()}
+        parts["parameters"] = {name: np.copy(x) for name, x in self.parameters.items()}
         if self.effects is not None:
             parts["effects"] = self.effects.snapshot()
         return joined(parts)
@@ -140,9 +141,9 @@ class World(NotCopied):
 
     def _draw_parameters(self, mask: Array) -> None:
         """Draw the parameters of the worlds of a mask."""
-        if self._randomize is not None:
+        if self._drawn:
             draw = Draw(self.random, RANDOMIZATION, mask)
-            for name, new in self._randomize.draw(draw).items():
+            for name, new in self.randomize.draw(draw).items():
                 old = self.parameters.get(name)
                 self.parameters[name] = plain(new if old is None else np.where(mask, new, old))
 
@@ -167,8 +168,8 @@ def check_world(
     vehicle: "models.Vehicle",
     backend: Backend,
     drones: int,
-    effects: EffectOptions | None,
-    randomize: Randomization | None,
+    effects: EffectOptions,
+    randomize: Randomization,
     settings: Mapping[str, Any],
 ) -> None:
     """Refuse by name what the backend cannot honour. Raises `InputError`."""
@@ -181,8 +182,7 @@ def check_world(
             raise InputError(
                 f"vehicle: expected one with the backend {backend}, got {vehicle.name}"
             )
-        acting = list((effects or EffectOptions()).to_options())
-        acting += randomize.names if randomize else ()
+        acting = (*effects.to_options(), *randomize.names)
         refused = [name for name in acting if name != "linear_drag"]
         if refused:
             raise InputError(
@@ -215,6 +215,8 @@ def make_world(
     """
     if not (type(num_worlds) is int and 1 <= num_worlds <= MAX_WORLDS):
         raise InputError(f"num_envs: expected 1 to {MAX_WORLDS}, got {num_worlds!r}")
+    effects = effects or NO_EFFECTS
+    randomize = randomize or FIXED
     check_world(vehicle, backend, drones, effects, randomize, settings)
     module = import_module(f".backends.{backend}", __package__)
     world: World = getattr(module, _CLASSES[backend])(

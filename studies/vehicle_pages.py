@@ -138,7 +138,8 @@ def sensors(vehicle: Vehicle) -> list[str]:
     """Sensors whose coefficients a vehicle has."""
     able = []
     for name, kind in SENSOR_TYPES.items():
-        needs = [vehicle.coefficients[f"sensors.{kind.prefix}{need}"] for need in kind.needs]
+        settings = [one for one in kind.settings.values() if one.default is None]
+        needs = [vehicle.coefficients[one.coefficient] for one in settings]
         if None not in needs:
             able.append(name)
     return able

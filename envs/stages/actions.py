@@ -1,6 +1,7 @@
 """What an agent sends, checked; and actions that are late."""
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -65,45 +66,44 @@ class Actions:
         return np.where(right, values, 0).astype(np.float32)
 
 
+@dataclass
 class Receive(Stage):
-    """The action of an agent arrives; of a drone that begins it is neutral, (W, A, k)."""
+    """The action of an agent arrives."""
 
     arrays = ("action",)
 
-    def __init__(self, neutral: Floats) -> None:
-        self._neutral = neutral
+    neutral: Floats
+    """Of a drone that begins, (W, A, k)."""
 
     def begin(self, record: Record) -> None:
         """No action yet."""
-        record.action = self._neutral
+        record.action = self.neutral
 
     def step(self, record: Record) -> None:
         """At once, unless a later stage delays it."""
         record.action = record.received = record.sent.astype(np.float64)
 
 
+@dataclass
 class ActionDelay(Stage):
-    """An action takes effect late by a number of control steps that each episode draws.
-
-    Args:
-        world: Its parameter `action_delay`, control steps.
-        longest: No delay is longer.
-        neutral: Actions that are on their way when an episode begins, (W, A, k).
-    """
+    """An action takes effect late by a number of control steps that each episode draws."""
 
     arrays = ("actions_sent",)
 
-    def __init__(self, world: World, longest: int, neutral: Floats) -> None:
-        self._world = world
-        self._axis = neutral.ndim - 1
-        self._start = filled(neutral, longest + 1, self._axis)
+    world: World
+    """Its parameter `action_delay`, control steps."""
+    longest: int
+    """No delay is longer."""
+    neutral: Floats
+    """Actions that are on their way when an episode begins, (W, A, k)."""
 
     def begin(self, record: Record) -> None:
         """Actions on their way change nothing."""
-        record.actions_sent = self._start
+        record.actions_sent = filled(self.neutral, self.longest + 1, self.neutral.ndim - 1)
 
     def step(self, record: Record) -> None:
         """The action that was sent as long ago as the delay."""
-        sent = pushed(record.actions_sent, record.received, self._axis)
+        axis = self.neutral.ndim - 1
+        sent = pushed(record.actions_sent, record.received, axis)
         record.actions_sent = sent
-        record.received = taken(sent, self._world.parameters["action_delay"], self._axis)
+        record.received = taken(sent, self.world.parameters["action_delay"], axis)

@@ -3,8 +3,7 @@
 import numpy as np
 
 from ...models.errors import InputError
-from ...sim.compile import TracedArray
-from ...sim.state import Array, some
+from ...sim.state import Array, found, some
 from .record import Floats, Mask, Record, Stage
 
 
@@ -44,7 +43,7 @@ class Ends(Stage):
             terminated = terminated & flying
             truncated = truncated & flying
         record.reward = reward
-        if not isinstance(record.unfit, TracedArray):
+        if found(record.unfit):
             refuse_unfit(record, self._env_id)
         record.terminated = terminated
         record.truncated = truncated
@@ -55,8 +54,6 @@ class Ends(Stage):
 
 def refuse_unfit(record: Record, env_id: str) -> None:
     """Raise `InputError` for a reward or an observation that is not finite."""
-    if not record.unfit.any():
-        return
     first = int(np.flatnonzero(record.unfit)[0])
     for name, values in (*record.observations.items(), ("reward", record.reward)):
         numbers = np.reshape(values, (record.unfit.size, -1))[first]

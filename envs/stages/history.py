@@ -3,79 +3,72 @@
 They have the shape (W, A, steps, *shape), the oldest step first.
 """
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ...sim import World
-from ...sim.state import Array
+from ...sim.state import Array, chosen
 from ..spec import ArraySpec
-from .record import Record, Stage, where
+from .record import Record, Stage
 
 Values = np.ndarray
 
 
+@dataclass
 class History(Stage):
     """The last observations side by side, the oldest first.
 
     At the start of an episode all of them are the first one.
-
-    Args:
-        steps: How many.
-        names: Of the arrays that have a history.
-        axis: First axis of an array of one drone.
     """
 
     arrays = ("history",)
 
-    def __init__(self, steps: int, names: tuple[str, ...], axis: int) -> None:
-        self._steps = steps
-        self._names = names
-        self._axis = axis
+    steps: int
+    """How many."""
+    names: Sequence[str]
+    """Of the arrays that have a history."""
 
     def step(self, record: Record) -> None:
         """A drone that begins fills its history with the present."""
         past = vars(record).get("history", {})
         history = {}
         seen = {}
-        for name in self._names:
+        axis = len(record.shape)  # first one of a drone
+        for name in self.names:
             values = record.observations[name]
-            if values.ndim == self._axis:  # a number
+            if values.ndim == axis:  # a number
                 values = values[..., None]
-            history[name] = rows = later(past.get(name), values, self._steps, record)
-            lead = rows.shape[: self._axis]
-            rest = rows.shape[self._axis + 2 :]
-            seen[name] = rows.reshape(*lead, -1, *rest)
+            history[name] = rows = later(past.get(name), values, self.steps, record)
+            seen[name] = rows.reshape(*record.shape, -1, *rows.shape[axis + 2 :])
         record.history = history
         record.observations = {**record.observations, **seen}
 
 
+@dataclass
 class ObservationDelay(Stage):
     """An observation arrives late by a number of control steps that each episode draws.
 
     The first one of an episode arrives at once, and again until another one does.
-
-    Args:
-        world: Its parameter `observation_delay`, control steps.
-        longest: No delay is longer.
     """
 
     arrays = ("past_observations",)
 
-    def __init__(self, world: World, longest: int) -> None:
-        self._world = world
-        self._steps = longest + 1
-        self._axis = len(world.shape)
+    world: World
+    """Its parameter `observation_delay`, control steps."""
+    longest: int
+    """No delay is longer."""
 
     def step(self, record: Record) -> None:
         """A drone that begins fills its past with the present."""
         past = vars(record).get("past_observations", {})
-        age = self._world.parameters["observation_delay"]
+        age = self.world.parameters["observation_delay"]
         sent = {}
         arrived = {}
         for name, values in record.observations.items():
-            sent[name] = later(past.get(name), values, self._steps, record)
-            arrived[name] = taken(sent[name], age, self._axis)
+            sent[name] = later(past.get(name), values, self.longest + 1, record)
+            arrived[name] = taken(sent[name], age, len(record.shape))
         record.past_observations = sent
         record.observations = arrived
 
@@ -111,7 +104,7 @@ def pushed(past: Values, values: Values, axis: int) -> Values:
     return np.concatenate((kept, np.expand_dims(values, axis)), axis)
 
 
-def later(past: Values | None, values: Values, steps: int, record: Record) -> Values:
+def later(past: Values | None, values: Values, steps: int, record: Record) -> Array:
     """The past of `steps` steps, one step later; of drones that begin it is the present."""
     axis = len(record.shape)
     if past is None:
@@ -119,16 +112,13 @@ def later(past: Values | None, values: Values, steps: int, record: Record) -> Va
     new = pushed(past, values, axis)
     if record.begun is None:
         return new
-    merged: Values = where(record.begun, filled(values, steps, axis), new)
-    return merged
+    return chosen(record.begun, filled(values, steps, axis), new)
 
 
-def taken(past: Values, age: Array, axis: int) -> Values:
+def taken(past: Values, age: Array, axis: int) -> Array:
     """Values of `age` steps ago; the age has the shape (W, A), whole numbers."""
     if not axis:
-        present: Values = past[past.shape[axis] - 1 - int(age)]
-        return present
+        return past[past.shape[axis] - 1 - int(age)]
     index = past.shape[axis] - 1 - age.astype(int)
     index = index.reshape(index.shape + (1,) * (past.ndim - axis))
-    chosen: Values = np.take_along_axis(past, index, axis).squeeze(axis)
-    return chosen
+    return np.take_along_axis(past, index, axis).squeeze(axis)

@@ -1,6 +1,7 @@
 """The task: the starts of episodes, its memory, observations, rewards and ends."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from math import prod
 from typing import NoReturn
 
@@ -13,28 +14,29 @@ from ..tasks.task import Outcome, Task
 from .record import Record, Stage
 
 
+@dataclass
 class Starts(Stage):
     """The task begins episodes: it draws their numbers and sets `record.start`.
 
     Raises `InputError` if it gives another thing.
     """
 
-    def __init__(self, task: Task, world: World) -> None:
-        self._task = task
-        self._world = world
+    task: Task
+    world: World
 
     def begin(self, record: Record) -> None:
         """Other stages follow from the start."""
-        record.draw = self._world.draw(record.begun)
-        with self._task.memory.open("begin"):
-            start = self._task.begin(record.begun, record.draw)
-        self._task.memory.expand(record.shape)
+        record.draw = self.world.draw(record.begun)
+        memory = self.task.memory
+        with memory.open("begin"):
+            start = self.task.begin(record.begun, record.draw)
+        memory.expand(record.shape)
         expected = (*record.shape, 3)
         got: object = type(start).__name__
         if isinstance(start, InitialState):
             got = tuple(getattr(start.position, "shape", ()))
         if got != expected:
-            env_id = self._task.config.env_id
+            env_id = self.task.config.env_id
             raise InputError(
                 f"{env_id}: expected begin() to return an InitialState with a position of shape "
                 f"{expected}, got {got}"
@@ -42,11 +44,11 @@ class Starts(Stage):
         record.start = start
 
 
+@dataclass
 class Remember(Stage):
     """The task changes its memory of the drones that flew."""
 
-    def __init__(self, task: Task) -> None:
-        self._task = task
+    task: Task
 
     def step(self, record: Record) -> None:
         """Before it observes."""
@@ -54,23 +56,23 @@ class Remember(Stage):
             record.run(record.flown, [self._update])
 
     def _update(self, record: Record) -> None:
-        with self._task.memory.open("update"):
-            self._task.update_memory(record.state)
+        with self.task.memory.open("update"):
+            self.task.update_memory(record.state)
 
 
+@dataclass
 class Judge(Stage):
     """Observations, terms of the reward, metrics and ends by the task."""
 
     arrays = ("observations", "terms", "metrics")
 
-    def __init__(self, task: Task) -> None:
-        self._task = task
-        self._checked = False
+    task: Task
+    _checked = False
 
     def step(self, record: Record) -> None:
         """Raises `InputError` if the task gives another thing than its specs say."""
-        observations = self._task.observe(record.measured)
-        outcome = self._task.outcome(record.state)
+        observations = self.task.observe(record.measured)
+        outcome = self.task.outcome(record.state)
         if not self._checked:
             self._check(observations, outcome, record)
             self._checked = True
@@ -78,14 +80,14 @@ class Judge(Stage):
             array.name: observations[array.name]
             .reshape(*record.shape, *array.shape)
             .astype(array.dtype)
-            for array in self._task.observation
+            for array in self.task.observation
         }
         record.terms = _of_each(outcome.reward, record)
         record.metrics = _of_each(outcome.metrics, record)
         record.ended = outcome.terminated
 
     def _check(self, observations: object, outcome: object, record: Record) -> None:
-        task = self._task
+        task = self.task
         names = [array.name for array in task.observation]
         given = list(observations) if isinstance(observations, Mapping) else observations
         if not isinstance(observations, Mapping) or not observations.keys() >= set(names):
@@ -110,7 +112,7 @@ class Judge(Stage):
 
     def _refuse(self, expected: str, got: object) -> NoReturn:
         said = got if isinstance(got, str) else shortened(got)
-        raise InputError(f"{self._task.config.env_id}: expected {expected}, got {said}")
+        raise InputError(f"{self.task.config.env_id}: expected {expected}, got {said}")
 
 
 def _of_each(numbers: ByName, record: Record) -> ByName:

@@ -1,6 +1,6 @@
 """What is measured of the state: the state itself, or what sensors and the estimate say of it."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,17 +15,14 @@ from .record import Record, Stage
 _ESTIMATED = ("position", "quaternion", "velocity", "body_rates")
 
 
+@dataclass
 class Measure(Stage):
-    """Sets `record.state`, the exact state, and `record.measured`, which a task observes.
+    """Sets `record.state`, the exact state, and `record.measured`, which a task observes."""
 
-    Args:
-        world: What flies.
-        period: Time of a control step, s.
-    """
-
-    def __init__(self, world: World, period: float) -> None:
-        self._world = world
-        self._period = period
+    world: World
+    """What flies."""
+    period: float
+    """Time of a control step, s."""
 
     def restore(self, record: Record, arrays: Arrays) -> None:
         """Measure the state that was put back."""
@@ -36,34 +33,25 @@ class Measure(Stage):
         """Measures without errors; sensors change it."""
         steps = record.steps
         record.state = kept_state(
-            self._world.state, action=record.action, steps=steps, time=steps * self._period
+            self.world.state, action=record.action, steps=steps, time=steps * self.period
         )
         record.measured = record.state
 
 
+@dataclass
 class Sensing(Stage):
-    """Samples sensors after each control step.
+    """Samples sensors after each control step."""
 
-    Args:
-        sensors: Of the world's drones.
-        replaces: Whether task and controller see the estimate in place of the exact state.
-    """
+    keeps = "sensors"
 
-    def __init__(self, sensors: Sensors, *, replaces: bool) -> None:
-        self._sensors = sensors
-        self._replaces = replaces
+    sensors: Sensors
+    """Of the world's drones."""
+    replaces: bool
+    """Whether task and controller see the estimate in place of the exact state."""
 
     def begin(self, record: Record) -> None:
         """First readings."""
-        self._sensors.begin(record.begun)
-
-    def snapshot(self, record: Record) -> Arrays:
-        """State of the sensors."""
-        return self._sensors.snapshot()
-
-    def restore(self, record: Record, arrays: Arrays) -> None:
-        """Put them back."""
-        self._sensors.restore(arrays)
+        self.sensors.begin(record.begun)
 
     def step(self, record: Record) -> None:
         """Readings of the drones that flew; the others keep theirs."""
@@ -71,9 +59,9 @@ class Sensing(Stage):
         if flown is None:
             flown = np.ones(record.shape, bool)[()]
         if some(flown):
-            self._sensors.sample(flown)
-        if self._replaces:
-            seen = self._sensors.seen()
+            self.sensors.sample(flown)
+        if self.replaces:
+            seen = self.sensors.seen()
             values = {name: read_only(getattr(seen, name)) for name in _ESTIMATED}
             record.measured = replace(record.state, **values)
 

@@ -12,6 +12,7 @@ from ...models.cameras import FARTHEST, View, chosen_views
 from ...scenes import scenes_of
 from ...sim.random import SCENES, Draw, Random
 from ...sim.snapshots import Arrays
+from ...sim.state import Array
 from ..spec import ArraySpec
 from ..tasks.task import Task
 from .record import Record, Stage
@@ -93,6 +94,9 @@ class Pictures(Stage):
                 self._painters.append(_Painter(cameras, number, parts == part))
         self._names = objects_of_all([painter.cameras.objects for painter in self._painters])
         self._goal_moves = any(mark.moves for mark in task.marks)
+        self._blank = {
+            view.name: np.zeros((self._rows, *view.shape), view.dtype) for view in self.views
+        }
 
     def close(self) -> None:
         """Free what draws. A second call does nothing."""
@@ -102,11 +106,9 @@ class Pictures(Stage):
 
     def begin(self, record: Record) -> None:
         """Draw the scene of each world."""
-        scenes = np.zeros(self._shape, int)
-        count = len(self._scenes)
-        if count > 1:
-            shares = Draw(self._random, SCENES, record.begun).uniform(0.0, 1.0)
-            scenes += (count * np.reshape(shares, self._shape)[:, :1]).astype(int)
+        shares = Draw(self._random, SCENES, record.begun).uniform(0.0, 1.0)
+        of_worlds = np.reshape(shares, self._shape)[:, :1] * len(self._scenes)
+        scenes = np.repeat(of_worlds.astype(int), self._shape[1], axis=1)
         record.scenes = scenes.reshape(record.shape)[()]
 
     def step(self, record: Record) -> None:
@@ -116,30 +118,26 @@ class Pictures(Stage):
         of it; until then it observes its last.
         """
         state = record.state
-        nobody = np.zeros(self._rows, bool)
-        fresh = nobody if record.begun is None else self._per_drone(record.begun)
-        flown = ~nobody if record.flown is None else self._per_drone(record.flown)
+        begun = self._per_drone(False if record.begun is None else record.begun)
+        flown = self._per_drone(True if record.flown is None else record.flown)
         steps = self._per_drone(record.steps)
         due = {}
         for view in self.views:
-            due[view.name] = fresh | (flown & (steps % view.camera.every == 0))
-        rows = {}
-        for name in ("position", "quaternion"):
-            rows[name] = self._per_drone(getattr(state, name))
+            due[view.name] = begun | (flown & (steps % view.camera.every == 0))
+        seen = {"position": state.position, "quaternion": state.quaternion}
         if state.payload is not None:
-            rows["payload"] = self._per_drone(state.payload)
+            seen["payload"] = state.payload
         if self._goal_moves:
-            rows["goal"] = self._per_drone(self._task.goal(state))
-        last = vars(record).get("pictures", {})
+            seen["goal"] = self._task.goal(state)
+        rows = {name: np.reshape(values, (self._rows, -1)) for name, values in seen.items()}
+        last = vars(record).get("pictures", self._blank)
         pictures = {}
-        for view in self.views:
-            shape = (self._rows, *view.shape)
-            blank = np.zeros(shape, view.dtype)
-            pictures[view.name] = np.array(last.get(view.name, blank)).reshape(shape)
+        for name, picture in last.items():
+            pictures[name] = np.array(picture).reshape(self._rows, *picture.shape[-3:])
         self._take(pictures, due, rows, np.reshape(record.scenes, self._shape)[:, 0])
-        lead = record.shape
         record.pictures = {
-            name: picture.reshape(*lead, *picture.shape[1:]) for name, picture in pictures.items()
+            name: picture.reshape(*record.shape, *picture.shape[1:])
+            for name, picture in pictures.items()
         }
         record.observations = {**record.observations, **record.pictures}
 
@@ -174,8 +172,6 @@ class Pictures(Stage):
         else:
             paint(painters[0])
 
-    def _per_drone(self, values: object) -> np.ndarray:
-        """A row for each drone."""
-        array = np.asarray(values)
-        width = array.size // self._rows
-        return array.reshape((self._rows, width) if width > 1 else (self._rows,))
+    def _per_drone(self, values: Array) -> np.ndarray:
+        """A number of each drone, shape (N,)."""
+        return np.broadcast_to(np.ravel(values), self._rows)

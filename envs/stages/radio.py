@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...sim import length
+from ...sim import Array, length
 from ...sim.random import RADIO, uniform, words_of
 from ...sim.state import some
 from ..state import State
@@ -48,9 +48,9 @@ class Radio(Stage):
     def begin(self, record: Record) -> None:
         """Each drone has heard where those in range start, at rest."""
         lots = record.draw.uniform(0.0, 1.0)
-        position = np.broadcast_to(record.start.position, (*record.shape, 3))
+        position = record.start.position
         rest = np.concatenate((position, 0.0 * position), axis=-1)
-        message = np.concatenate((rest, np.zeros((*record.shape, 1))), axis=-1)
+        message = np.concatenate((rest, 0.0 * rest[..., :1]), axis=-1)
         record.said = filled(message, self._options.radio_delay + 1, 2)
         record.heard = np.repeat(rest[:, None], self._own.shape[0], axis=1)
         record.age = np.where(self._in_range(position, position), 0.0, np.inf)
@@ -98,7 +98,6 @@ class Radio(Stage):
         neighbours[:, :, : nearest.shape[2]] = nearest
         return neighbours
 
-    def _in_range(self, receivers: Floats, senders: Floats) -> Mask:
+    def _in_range(self, receivers: Floats, senders: Floats) -> Array:
         apart = length(senders[:, None] - receivers[:, :, None])
-        near: Mask = apart <= self._options.radio_range
-        return near
+        return apart <= self._options.radio_range

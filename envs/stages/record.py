@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...sim import Draw, InitialState
-from ...sim.snapshots import Arrays, Snapshot, copied, joined
-from ...sim.state import Array, ByName, WorldState
+from ...sim.snapshots import Arrays, Snapshot, joined
+from ...sim.state import Array, ByName, WorldState, chosen
 from ..memory import Memory
 from ..state import State
 
@@ -119,7 +119,7 @@ class Record:
                 arrays[name] = merged(mask, arrays[name], before[name])
         for name, old in remembered.items():
             if memory[name] is not old:
-                memory[name] = where(mask, memory[name], old)
+                memory[name] = chosen(mask, memory[name], old)
 
     def snapshot(self) -> Snapshot:
         """Copies of what is kept and of the memory, by name."""
@@ -132,7 +132,7 @@ class Record:
                 parts[name] = {**values}
             elif values is not None:
                 plain[name] = values
-        return {name: copied(values) for name, values in joined(parts).items()}
+        return {name: np.copy(values) for name, values in joined(parts).items()}
 
     def restore(self, arrays: Arrays) -> None:
         """Put a snapshot back."""
@@ -200,9 +200,11 @@ class Stage:
     Class attributes:
         arrays: Names of the record that keep their values between steps. Other names that a stage
             assigns live until the end of the step.
+        keeps: Name of an attribute with arrays of its own that a later step depends on.
     """
 
     arrays: ClassVar[tuple[str, ...]] = ()
+    keeps: ClassVar[str] = ""
 
     def begin(self, record: Record) -> None:
         """Set the arrays of drones that begin an episode, those of `record.begun`."""
@@ -213,12 +215,15 @@ class Stage:
         Stages from `Measure` on run for drones that fly and for drones that begin.
         """
 
-    def snapshot(self, record: Record) -> Arrays:
+    def snapshot(self) -> Arrays:
         """What a later step depends on besides the record."""
-        return {}
+        arrays: Arrays = getattr(self, self.keeps).snapshot() if self.keeps else {}
+        return arrays
 
     def restore(self, record: Record, arrays: Arrays) -> None:
         """Put a snapshot back; the record has been restored, and so have stages before this."""
+        if self.keeps:
+            getattr(self, self.keeps).restore(arrays)
 
     def close(self) -> None:
         """Release threads and memory."""
@@ -228,16 +233,7 @@ def merged(mask: Mask, new: Any, old: Any) -> Any:
     """Arrays, or mappings of arrays: the new for the drones of a mask, the old for the others."""
     if isinstance(new, Mapping):
         return {name: merged(mask, value, old[name]) for name, value in new.items()}
-    return where(mask, new, old)
-
-
-def where(mask: Mask, new: Array, old: Array) -> Array:
-    """The new values for the drones of a mask, and the old ones for the others."""
-    if not mask.ndim:
-        return new if mask else old
-    axes = max(np.ndim(new), np.ndim(old)) - mask.ndim
-    chosen: Array = np.where(mask.reshape(mask.shape + (1,) * axes), new, old)
-    return chosen.astype(old.dtype, copy=False)
+    return chosen(mask, new, old)
 
 
 def is_finite(values: np.ndarray) -> bool:

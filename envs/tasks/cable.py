@@ -22,7 +22,7 @@ from .goal import (
     swing_cost,
     with_payload,
 )
-from .swarm import Swarm, SwarmOptions, approach, ring, shared
+from .swarm import Swarm, SwarmOptions, angles, approach, on_circle, ring, shared
 from .task import Outcome
 
 
@@ -100,7 +100,7 @@ class Cable(Swarm):
             )
         self._slant = math.radians(options.angle)
         self._ring = length(ring(count)[0]) * self.gap
-        self._azimuths = 2 * math.pi * np.arange(count) / count
+        self._azimuths = angles(count)
         self._cable = self._ring / sin(self._slant)
         self._height = self._cable * cos(self._slant)
         self._load = options.payload_share * vehicle.mass * vehicle.gravity
@@ -128,7 +128,7 @@ class Cable(Swarm):
         """The payload's share of each drone, on its cable."""
         return with_payload(config, self.options.payload_share * self.vehicle.mass, self._cable)
 
-    def carrying(self, azimuth: np.ndarray) -> np.ndarray:
+    def carrying(self, azimuth: Array) -> Array:
         """Thrusts that hold drones at such azimuths from the payload, N, (..., R): rad, (...).
 
         Each cable pulls at the body's origin, which may be off the center of mass: the rotors turn
@@ -150,8 +150,7 @@ class Cable(Swarm):
         torque = np.cross(vehicle.center_of_mass, pull)
         wanted = np.concatenate((force + 0.0 * azimuth[..., None], torque), axis=-1)
         missing = wanted - total(vehicle.allocation * even)
-        thrust: np.ndarray = even + total(self._allocated * missing[..., None, :])
-        return thrust
+        return even + total(self._allocated * missing[..., None, :])
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """At rest in equilibrium, the payload off its goal."""
@@ -172,10 +171,7 @@ class Cable(Swarm):
 
     def _around(self, turn: Array) -> Array:
         """Places of the drones from the payload, on the ring turned by an angle, (W, A, 3), m."""
-        azimuth = turn + self._azimuths
-        x = self._ring * cos(azimuth)
-        y = self._ring * sin(azimuth)
-        return stack((x, y, 0.0 * x + self._height))
+        return on_circle(turn + self._azimuths, self._ring, self._height)
 
     def goal(self, state: State) -> Array:
         """The place of each drone where the payload hangs still at its goal."""

@@ -18,6 +18,7 @@ from ...sim import (
     cos,
     length,
     looked_up,
+    parts_of,
     sin,
     stack,
     to_body,
@@ -176,6 +177,10 @@ class GoalTask(Task):
         """The option `goal`, the same for every drone."""
         return at(self.options.goal, component(state.position, 0))
 
+    def distance(self, state: State) -> Array:
+        """From each drone to its goal, m, shape (W, A)."""
+        return length(self.goal(state) - state.position)
+
     def place(self, state: State) -> Array:
         """Where each drone should be, world frame, m, shape (W, A, 3)."""
         return self.goal(state)
@@ -210,9 +215,8 @@ class GoalTask(Task):
             return vectors
         c = cos(self.wanted)
         s = sin(self.wanted)
-        x = vectors[..., 0]
-        y = vectors[..., 1]
-        return stack((c * x + s * y, c * y - s * x, vectors[..., 2]))
+        x, y, z = parts_of(vectors)
+        return stack((c * x + s * y, c * y - s * x, z))
 
 
 def tilted(angle: Array, azimuth: Array) -> Array:

@@ -11,9 +11,8 @@ from ...sim import (
     InitialState,
     atan2,
     body_x,
-    component,
     cos,
-    length,
+    parts_of,
     sin,
     stack,
     wrapped,
@@ -31,6 +30,7 @@ from .goal import (
     check_band,
     check_height,
     nearness,
+    tilted,
 )
 from .task import Outcome, TaskOptions
 
@@ -107,14 +107,12 @@ class Hover(GoalTask):
         options = self.options
         band = options.start_band
         offset = draw.uniform(-band, band, (3,))
-        tilt = draw.uniform(0.0, math.radians(options.start_tilt)) / 2
+        tilt = draw.uniform(0.0, math.radians(options.start_tilt))
         azimuth = draw.uniform(-math.pi, math.pi)
         off = math.radians(options.start_heading)
         heading = (self.wanted + draw.uniform(-off, off)) / 2
         # First tilted about a horizontal axis, then turned about the vertical.
-        w = cos(tilt)
-        x = sin(tilt) * cos(azimuth)
-        y = sin(tilt) * sin(azimuth)
+        w, x, y, _ = parts_of(tilted(tilt, azimuth))
         c = cos(heading)
         s = sin(heading)
         quaternion = stack((c * w, c * x - s * y, c * y + s * x, s * w))
@@ -122,9 +120,9 @@ class Hover(GoalTask):
 
     def outcome(self, state: State) -> Outcome:
         """Nearness to goal and heading; the end at a crash, a flip-over, or outside the band."""
-        distance = length(self.goal(state) - state.position)
-        nose = body_x(state.quaternion)
-        off = atan2(component(nose, 1), component(nose, 0)) - self.wanted
+        distance = self.distance(state)
+        x, y, _ = parts_of(body_x(state.quaternion))
+        off = atan2(y, x) - self.wanted
         heading = wrapped(off) * (180 / math.pi)
         crashed = self.crashed(state, distance > self.options.flight_band)
         terms = {

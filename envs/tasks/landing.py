@@ -151,15 +151,14 @@ class Landing(GoalTask):
         direction = draw.uniform(-math.pi, math.pi)
         phase = draw.uniform(-math.pi, math.pi)
         side = draw.uniform(-1.0, 1.0)
-        zero = 0.0 * phase
         circle = options.motion == "circle"
         memory = self.memory
         memory.phase = phase  # rad
         memory.rate = speed / options.pad_path  # rad/s
         memory.cosine = cos(direction)  # of the line
         memory.sine = sin(direction)
-        memory.side = np.where(side < 0, zero - 1.0, zero + 1.0) if circle else zero
-        position = stack((zero, zero, zero + self._height + options.start_height)) + offset
+        memory.side = np.where(side < 0, -1.0, 1.0) if circle else 0.0 * phase
+        position = np.array((0.0, 0.0, self._height + options.start_height)) + offset
         rest = 0.0 * position
         # Velocity and cosine of the tilt after the last step, and before contact.
         memory.velocity = memory.arrival = rest

@@ -133,13 +133,12 @@ class PayloadHover(GoalTask):
         azimuth = draw.uniform(-math.pi, math.pi)
         along = draw.uniform(-fastest, fastest)
         across = draw.uniform(-fastest, fastest)
-        zero = 0.0 * tilt
         carrying = (1.0 + options.payload_share) * self.vehicle.hover_thrust
         return InitialState(
-            position=self._above(zero) + offset,
+            position=self._above(tilt) + offset,
             quaternion=tilted(tilt, azimuth),
-            velocity=stack((along, across, zero)),
-            thrust=carrying + each(zero),
+            velocity=stack((along, across, 0.0)),
+            thrust=carrying + each(0.0 * tilt),
         )
 
     def _above(self, like: Array) -> Array:

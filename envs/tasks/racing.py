@@ -20,6 +20,7 @@ from ...sim import (
     cos,
     each,
     length,
+    parts_of,
     plain,
     remainder,
     sin,
@@ -40,7 +41,6 @@ from .goal import (
     Point,
     Size,
     along,
-    at,
     check_height,
     row_of,
 )
@@ -179,14 +179,14 @@ class Racing(GoalTask):
         """At rest near the start, the nose along the track."""
         band = self.options.start_band
         offset = draw.uniform(-band, band, (3,))
-        zero = 0.0 * plain(offset[..., 0])
-        position = at(self._start.position, zero) + offset
+        position = np.array(self._start.position) + offset
         half = math.radians(self._start.heading) / 2
         memory = self.memory
         memory.position = position  # before the last step
         memory.behind = position  # where the way to the next gate began
         memory.passed = memory.passing = memory.progress = memory.off = 0.0
         memory.lap = memory.lap_began = 0.0
+        zero = 0.0 * plain(offset[..., 0])
         turn = stack((zero + cos(half), zero, zero, zero + sin(half)))
         return InitialState(position=position, quaternion=turn)
 
@@ -203,9 +203,7 @@ class Racing(GoalTask):
         through = (behind < 0.0) & (ahead >= 0.0)
         share = each(plain(behind / np.where(through, behind - ahead, -1.0)))
         crossing = before + share * (now - before)
-        x = component(crossing, 0)
-        y = component(crossing, 1)
-        z = component(crossing, 2)
+        x, y, z = parts_of(crossing)
         aside = y * component(gate, 3) - x * component(gate, 4)
         inside = (abs(aside) <= half) & (abs(z) <= half)
         left = memory.passed < self._total

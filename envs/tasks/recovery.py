@@ -169,7 +169,7 @@ class Recovery(GoalTask):
 
     def outcome(self, state: State) -> Outcome:
         """Nearness to the goal, tilt and spin; the end at a crash or outside the band."""
-        distance = length(self.goal(state) - state.position)
+        distance = self.distance(state)
         terminated = (distance > self.options.flight_band) | state.touching
         terms = {
             "position": nearness(distance, ERROR_SCALE),
@@ -186,6 +186,6 @@ class Recovery(GoalTask):
     def _recovered(self, state: State) -> Array:
         """Whether it is near, slow and upright, bool, shape (W, A)."""
         options = self.options
-        near = length(self.goal(state) - state.position) < options.near
+        near = self.distance(state) < options.near
         slow = length(state.velocity) < options.slow
         return near & slow & (state.tilt_cosine > self._least_upright)

@@ -137,7 +137,7 @@ class Swarm(GoalTask):
 
     def ended(self, state: State) -> Array:
         """Whether a drone has touched anything, flipped over, or left for good, bool, (W, A)."""
-        return self.crashed(state, length(self.goal(state) - state.position) > self.band)
+        return self.crashed(state, self.distance(state) > self.band)
 
     def outcome(self, state: State) -> Outcome:
         """Nearness to the goal, approach and room; the end at a crash, a flip-over, or outside the
@@ -187,11 +187,20 @@ def shared(drawn: Array) -> Array:
     return drawn[:, :1] + 0.0 * drawn
 
 
-def ring(count: int) -> np.ndarray:
+def ring(count: int) -> Array:
     """Places on a level ring, neighbours 1 apart, shape (A, 3); of two drones they are 1 apart."""
-    angle = 2 * np.pi * np.arange(count) / count
-    places = np.stack((cos(angle), sin(angle), 0.0 * angle), axis=-1)
-    return np.asarray(places * (0.5 / sin(np.pi / count)))
+    return on_circle(angles(count), 1.0) * (0.5 / sin(np.pi / count))
+
+
+def angles(count: int) -> np.ndarray:
+    """Directions of places on a ring, rad, shape (A,)."""
+    return 2 * np.pi * np.arange(count) / count
+
+
+def on_circle(angle: Array, radius: float, height: float = 0.0) -> Array:
+    """Places on a level circle, shape (..., 3), from a point below its middle."""
+    x = radius * cos(angle)
+    return stack((x, radius * sin(angle), 0.0 * x + height))
 
 
 def line(count: int) -> np.ndarray:
@@ -200,13 +209,12 @@ def line(count: int) -> np.ndarray:
     return np.stack((zero, np.arange(count) - (count - 1) / 2, zero), axis=-1)
 
 
-def grid(count: int) -> np.ndarray:
+def grid(count: int) -> Array:
     """Places of a level grid, nearly a square, 1 apart, shape (A, 3)."""
     side = int(np.ceil(np.sqrt(count)))
     rows, columns = np.divmod(np.arange(count), side)
     places = np.stack((rows, columns, 0 * rows), axis=-1).astype(float)
-    middle: np.ndarray = places - (places.min(axis=0) + places.max(axis=0)) / 2
-    return middle
+    return places - (places.min(axis=0) + places.max(axis=0)) / 2
 
 
 Formed = Literal["ring", "line", "grid"]
@@ -300,7 +308,7 @@ class Crossing(Swarm):
     def setup(self) -> None:
         """See the class."""
         radius = max(length(ring(self.count)[0]), 1.0)  # of six
-        self._angles = 2 * math.pi * np.arange(self.count) / self.count
+        self._angles = angles(self.count)
         self._radius = radius * self.gap
         self.reach = 2 * self._radius + 2 * JITTER * self.gap
         self.prepare()
@@ -315,10 +323,7 @@ class Crossing(Swarm):
     def _opposite(self, turn: Array) -> Array:
         """Where drones fly to from a ring turned by an angle, rad: world frame, m, (W, A, 3)."""
         angle = turn + self._angles + math.pi
-        x = self._radius * cos(angle)
-        y = self._radius * sin(angle)
-        cx, cy, cz = self.options.center
-        return stack((x + cx, y + cy, 0.0 * x + cz))
+        return np.array(self.options.center) + on_circle(angle, self._radius)
 
     def goal(self, state: State) -> Array:
         """The place opposite to the start of each drone."""

@@ -152,7 +152,7 @@ class Tracking(GoalTask):
 
     def outcome(self, state: State) -> Outcome:
         """Nearness to where it should be; the end at contact, a flip-over, or too far away."""
-        distance = length(self.goal(state) - state.position)
+        distance = self.distance(state)
         crashed = self.crashed(state, distance > self.options.flight_band)
         speed = length(self._at(self._rates, 0.0))
         metrics = {"tracking_error": distance, "reference_speed": speed}

@@ -114,13 +114,13 @@ class Waypoints(GoalTask):
     def update_memory(self, state: State) -> None:
         """Count the point that was reached, and how much nearer the craft came."""
         memory = self.memory
-        distance = length(self.goal(state) - state.position)
+        distance = self.distance(state)
         left = memory.reached < self.options.points
         passed = (distance < self.options.radius) & left
         memory.progress = memory.distance - distance
         memory.passed = passed * 1.0
         memory.reached = memory.reached + passed
-        memory.distance = length(self.goal(state) - state.position)
+        memory.distance = self.distance(state)
 
     def further(self, state: State) -> tuple[Array]:
         """The way to the point after the next."""

@@ -1,9 +1,9 @@
-"""Motion of one rigid body in free flight, as arithmetic on vectors of W worlds.
+"""Motion of rigid bodies in free flight, as arithmetic on vectors.
 
-Every component is a vector of its own, shape (W,), or a number that counts for all worlds, and a
-number 0.0 costs nothing: a craft whose rotors are parallel and whose center of mass is its origin
-needs a third of the operations of any craft. Vectors are NumPy's, or the variables of a trace
-(`kernel.py`).
+Every component is a vector of its own, a number for each body, of any shape, or a number that
+counts for all, and a number 0.0 costs nothing: a craft whose rotors are parallel and whose center
+of mass is its origin needs a third of the operations of any craft. Vectors are NumPy's, or the
+variables of a trace (`kernel.py`).
 
 Frames: world, z up, and the body's. Position and velocity are those of the body's origin.
 """
@@ -21,7 +21,7 @@ from ...models.vehicle import Vehicle
 from .. import elementary
 from ..randomize import CENTER
 from ..rotations import matrix, product, transposed
-from ..state import Array
+from ..state import Array, plain
 
 Vector = tuple[Array, Array, Array]
 Push = tuple[Vector, Vector, Vector]
@@ -43,10 +43,11 @@ _BORTZ = (
 2 (ζ(2 n) - 1) / (2 π)^(2 n), n = 1 to 5, with Riemann's ζ."""
 _CROSS = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(2, 0, 1)
 """Of a cross product: (a × b)ᵢ = Σ _CROSS[i, j, k] aⱼ bₖ."""
+_PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 class Motion(NamedTuple):
-    """State of W bodies, each component a vector, SI units."""
+    """State of bodies, each component a vector, SI units."""
 
     position: Array
     """World frame, three."""
@@ -68,7 +69,7 @@ class Varying(NamedTuple):
     turn: Array
     """Inverse of the inertia without that factor, three rows."""
     gyroscopic: Array
-    """Terms of `_euler`."""
+    """Factors of `_euler`."""
     reaction: Array
     """Factor of the rotors' torque about their axes, or None."""
     shift: Vector
@@ -113,16 +114,14 @@ class RigidBody:
         self.vary({})
 
     def vary(self, parameters: Mapping[str, Array], inertia: np.ndarray | None = None) -> None:
-        """Take drawn parameters by their names, each of shape (W,).
+        """Take drawn parameters by their names, vectors.
 
-        An inertia about the center of mass for each world, kg·m², (W, 3, 3), may replace the
+        An inertia about the center of mass for each body, kg·m², (..., 3, 3), may replace the
         vehicle's.
         """
         mass, center = self._least
         factor = parameters.get("mass", 1.0)
-        turn, gyroscopic = self._of_inertia
-        if inertia is not None:
-            turn, gyroscopic = mapped(_euler_of_each(inertia), lambda x: x if x.any() else 0.0)
+        turn, gyroscopic = self._of_inertia if inertia is None else _euler(inertia)
         shift: Vector = tuple(parameters.get(name, 0.0) for name in CENTER)
         self.varying = Varying(
             mass=mass * factor,
@@ -134,13 +133,13 @@ class RigidBody:
             center=tuple(a + b for a, b in zip(shift, center, strict=True)),
         )
 
-    def fly(self, rows: Array, thrust: Array, wrench: Array = None, steps: int = 1) -> list[Array]:
-        """The 13 rows of a state after physics steps, (W,) each, from those of `motion`.
+    def fly(self, state: Array, thrust: Array, wrench: Array = None, steps: int = 1) -> list[Array]:
+        """The 13 vectors of a state after physics steps, from those of `motion`.
 
-        With thrusts (R, W), N, and None, or a force and a torque as of `Effects.step`, (6, W).
+        With R thrusts, N, and None, or a force and a torque as of `Effects.step`, six vectors.
         """
         push = self.push(thrust, wrench)
-        now = motion(rows)
+        now = motion(state)
         for _ in range(steps):
             now = self.advance(now, push)
         return [*now.position, *now.quaternion, *now.velocity, *now.rates]
@@ -178,8 +177,8 @@ class RigidBody:
             lever = _cross(_scaled(inside, varying.mass), center)
             turning = _plus(turning, self._turned(lever))
         turning = tuple(
-            added(start, *((k, rates[i], rates[j]) for i, j, k in terms))
-            for start, terms in zip(turning, varying.gyroscopic, strict=True)
+            added(start, *((factors[i][j], rates[i], rates[j]) for i, j in _PAIRS))
+            for start, factors in zip(turning, varying.gyroscopic, strict=True)
         )
         if off:
             inner = _plus(inner, _cross(center, turning))
@@ -219,9 +218,9 @@ class RigidBody:
         return _scaled(forth(self.varying.turn, torque), self.varying.easier)
 
 
-def motion(rows: Array) -> Motion:
-    """The motion of states (13, W)."""
-    x = list(rows)
+def motion(state: Array) -> Motion:
+    """The motion of a state, 13 vectors."""
+    x = list(state)
     return Motion(x[:3], x[3:7], x[7:10], x[10:])
 
 
@@ -234,42 +233,27 @@ def mapped(tree: Array, change: Callable[[Array], Array]) -> Array:
 
 
 def _euler(inertia: np.ndarray) -> tuple[Array, Array]:
-    """Of an inertia: its inverse, and -I⁻¹ (ω × I ω) as terms (i, j, k).
+    """Of inertias (..., 3, 3): their inverse, and of -I⁻¹ (ω × I ω) the factors of two rates.
 
-    Each axis has its list of terms: k times component i times component j of the rates.
+    Each axis has a matrix of these factors, of which the upper half counts.
     """
-    turn, terms = _turning(inertia)
-    least = _NOTHING * abs(terms).max()
-    found = []
-    for axis in terms:
-        folded = np.triu(axis + axis.T) - np.diag(np.diag(axis))
-        places = np.argwhere(abs(folded) > least).tolist()
-        found.append([(j, k, float(folded[j, k])) for j, k in places])
-    return _sparse(turn), found
-
-
-def _euler_of_each(inertia: Array) -> tuple[Array, Array]:
-    """The same of inertias (W, 3, 3): vectors."""
-    turn, terms = _turning(inertia)
-    products = np.moveaxis(terms, 0, -1)
-    pairs = [(j, k) for j in range(3) for k in range(3)]
-    rows = [[turn[:, i, j] for j in range(3)] for i in range(3)]
-    return rows, [[(j, k, axis[j, k]) for j, k in pairs] for axis in products]
-
-
-def _turning(inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Inverses of inertias (..., 3, 3), and -I⁻¹ (ω × I ω) as factors of ω ωᵀ, (..., 3, 3, 3)."""
     turn = matrices.inverse(inertia)
     torques = matrices.product(_CROSS, inertia[..., None, :, :])
     turned = matrices.product(turn, torques.reshape(*inertia.shape[:-1], 9))
-    return turn, -turned.reshape(torques.shape)
+    terms = -turned.reshape(torques.shape)
+    folded = np.triu(terms) + np.triu(terms.swapaxes(-1, -2), 1)
+    size = abs(terms).max()
+    return _sparse(turn), [_sparse(folded[..., axis, :, :], size) for axis in range(3)]
 
 
-def _sparse(matrix: np.ndarray, size: float | None = None) -> list[list[float]]:
-    """A matrix as lists, without what is nothing beside its largest number, or `size`."""
-    largest = abs(matrix).max() if size is None else size
-    rows: list[list[float]] = np.where(abs(matrix) > _NOTHING * largest, matrix, 0.0).tolist()
-    return rows
+def _sparse(matrix: np.ndarray, size: float | None = None) -> list[list[Array]]:
+    """A matrix of vectors, or of numbers that count for all bodies, (..., n, m), as lists.
+
+    What is nothing beside its largest number, or `size`, is the number 0.0.
+    """
+    least = _NOTHING * (abs(matrix).max() if size is None else size)
+    rows = np.moveaxis(matrix, (-2, -1), (0, 1))
+    return [[plain(one) if (abs(one) > least).any() else 0.0 for one in row] for row in rows]
 
 
 def added(total: Array, *products: tuple[Array, ...]) -> Array:

@@ -42,8 +42,8 @@ class Hull:
         margin = vehicle.rest_height - float(self._depth((0.0, 0.0, -1.0)))
         self.ground = margin if abs(margin) > _ROUNDED else 0.0
 
-    def touches(self, height: Array, quaternion: Array) -> Array:
-        """Whether crafts at such heights and attitudes (four vectors) touch the ground, (W,)."""
+    def touches(self, height: Array, quaternion: Parts) -> Array:
+        """Whether crafts at such heights and attitudes (four vectors) touch the ground."""
         height = height - self.ground
         near = height < self._reach
         if not some(near):
@@ -53,21 +53,21 @@ class Hull:
         depth: Array = self._depth(down)
         return height < depth
 
-    def collides(self, position: Array) -> Array:
+    def collides(self, position: Parts) -> Array:
         """Whether a craft's sphere overlaps another of its world, bool, shape (W, A).
 
-        Of `Vehicle.radius` about the body's origin, at positions (3, W, A), m.
+        Of `Vehicle.radius` about the body's origin, at positions, three of (W, A), m.
         """
         square: Array = 0.0
-        for x in clip(position, -mujoco.mjMAXVAL, mujoco.mjMAXVAL):  # a bad state overflows
+        for x in position:
+            x = clip(x, -mujoco.mjMAXVAL, mujoco.mjMAXVAL)  # a bad state overflows
             apart = x[:, :, None] - x[:, None]
             square = square + apart * apart
         others = ~np.eye(square.shape[-1], dtype=bool)
-        overlaps: Array = ((square < self._apart**2) & others).any(axis=-1)
-        return overlaps
+        return ((square < self._apart**2) & others).any(axis=-1)
 
     def _depth(self, down: Parts) -> Array:
-        """How far the craft reaches along unit vectors, body frame, three of (W,): m, (W,)."""
+        """How far the craft reaches along unit vectors, body frame, three vectors: m."""
         depths = []
         for center, radius, axes, flat, rounded in self._shapes:
             terms = list(zip(center, down, strict=True))

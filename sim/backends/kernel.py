@@ -1,64 +1,63 @@
-"""The motion of `body.py` as machine code: its equations run once on variables."""
+"""A function of arrays of worlds as machine code: it runs once on variables."""
 
-import copy
 from collections.abc import Callable
-from itertools import count
+from math import prod
+from typing import Any
 
 import numpy as np
-from numpy.typing import DTypeLike
 
 from ..compile import Program, read
 from ..compile.layout import Layout, Memory
 from ..compile.llvm import Region, compiled, widest
 from ..state import Array
-from .body import RigidBody, mapped
 
-ROWS = 13
-
-Fly = Callable[[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray | None, int], np.ndarray]
-"""New rows (13, W) from rows, thrusts (R, W), a wrench (6, W), what varies, and physics steps."""
+_RESULT = "result"
 
 
-def flight(body: RigidBody, worlds: int, dtype: np.dtype[np.floating], rotors: int) -> Fly:
-    """The flight of a body whose `varying` has the vectors that it will have."""
-    varying: list[Array] = []
-    mapped(body.varying, varying.append)
-    sizes = {"rows": ROWS, "thrust": rotors, "wrench": 6, "varying": len(varying)}
-    lanes = -(-worlds // widest()) * widest()
-    layout = Layout({name: (dtype, (size,)) for name, size in sizes.items()}, lanes)
-    memory = Memory(layout, worlds)
-    functions = {}
+class Kernel:
+    """A function that is compiled when it is first called with arguments of such kinds.
 
-    def fly(rows: Array, thrust: Array, wrench: Array, varying: Array, steps: int) -> np.ndarray:
-        given = {"rows": rows, "thrust": thrust, "wrench": wrench, "varying": varying}
-        for name, values in given.items():
-            if values is not None:
-                memory.put(name, values.T)
-        kind = (steps, wrench is None)
-        if kind not in functions:
-            functions[kind] = compiled([_traced(body, layout, *kind)], [layout], {}, widest())
-        functions[kind](1, memory.address)
-        return memory.get("rows").T
+    The function gives an array (W, A, k). Its arguments are arrays (W, A, ...); any others, as a
+    number of steps, are constants of the machine code.
+    """
 
-    return fly
+    def __init__(self, function: Callable[..., Array], shape: tuple[int, ...]) -> None:
+        """`shape` is (W, A)."""
+        self._function = function
+        self._shape = shape
+        self._made: dict[object, tuple[Memory, Callable[..., None]]] = {}
+
+    def __call__(self, *given: Any) -> np.ndarray:
+        """The function's result, the same bits."""
+        kinds = tuple((x.dtype, x.shape) if _is_array(x) else x for x in given)
+        if kinds not in self._made:
+            self._made[kinds] = self._compiled(given)
+        memory, code = self._made[kinds]
+        for number, values in enumerate(given):
+            if _is_array(values):
+                memory.put(str(number), values.reshape(-1, *values.shape[2:]))
+        code(memory.blocks, memory.address)
+        return memory.get(_RESULT).reshape(*self._shape, -1)
+
+    def _compiled(self, given: tuple[Any, ...]) -> tuple[Memory, Callable[..., None]]:
+        program = Program()
+        fields = {}
+        variables = list(given)
+        for number, values in enumerate(given):
+            if _is_array(values):
+                name = str(number)
+                shape = values.shape[2:]
+                fields[name] = values.dtype, shape
+                variables[number] = read(program, name, values.dtype, (1, 1, *shape))
+        result = self._function(*variables)
+        fields[_RESULT] = result.dtype, result.shape[2:]
+        stores = [(_RESULT, row, value) for row, value in enumerate(result.values.ravel())]
+        drones = prod(self._shape)
+        width = widest()
+        layout = Layout(fields, lanes=-(-drones // width) * width)
+        code = compiled([Region("", program, stores)], [layout], {}, width)
+        return Memory(layout, drones), code
 
 
-def _traced(body: RigidBody, layout: Layout, steps: int, is_calm: bool) -> Region:
-    program = Program()
-    arrays = {
-        name: read(program, name, dtype, shape) for name, (dtype, shape) in layout.fields.items()
-    }
-    numbers = count()
-    traced = copy.copy(body)
-    traced.varying = mapped(body.varying, lambda _: arrays["varying"][next(numbers)])
-    wrench = None if is_calm else arrays["wrench"]
-    flown = traced.fly(arrays["rows"], arrays["thrust"], wrench, steps)
-    stores = [("rows", row, value.values.item()) for row, value in enumerate(flown)]
-    return Region("", program, stores)
-
-
-def packed(body: RigidBody, dtype: DTypeLike) -> np.ndarray | None:
-    """The vectors of `varying` as the compiled function takes them, (L, W); None if none vary."""
-    found: list[np.ndarray] = []
-    mapped(body.varying, found.append)
-    return np.stack(found).astype(dtype).view(np.ndarray) if found else None
+def _is_array(value: object) -> bool:
+    return isinstance(value, np.ndarray)

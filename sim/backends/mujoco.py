@@ -23,8 +23,8 @@ from ...models.vehicle import (
     payload_body,
     payload_radius,
 )
-from ..effects import EffectOptions, Effects
-from ..randomize import CENTER, Randomization
+from ..effects import NO_EFFECTS, EffectOptions, Effects
+from ..randomize import CENTER, FIXED, Randomization
 from ..rotations import body_z
 from ..snapshots import Arrays
 from ..state import Array, ByName, InitialState, WorldState, stack, total
@@ -36,15 +36,6 @@ _VIEWS = (
     "_batch _ctrl _command _thrust _applied _contacts _counts _warnings _varied _qacc _warmstart"
 )
 """Attributes that hold the simulator's memory."""
-
-_FIELDS = {
-    "mass": ("body_mass", "body_inertia", "dof_damping"),  # Unity's drag goes with the mass
-    "inertia": ("body_inertia",),
-    "payload": ("body_mass", "body_inertia"),
-    "reaction": ("actuator_gear",),
-    **dict.fromkeys(CENTER, ("body_ipos",)),
-}
-"""Fields of a model that a drawn parameter changes."""
 
 
 class MujocoWorld(World):
@@ -64,8 +55,8 @@ class MujocoWorld(World):
         num_worlds: int,
         *,
         drones: int = 1,
-        effects: EffectOptions | None = None,
-        randomize: Randomization | None = None,
+        effects: EffectOptions = NO_EFFECTS,
+        randomize: Randomization = FIXED,
         num_threads: int = 0,
     ) -> None:
         lead = (num_worlds, drones) if num_worlds * drones > 1 else ()
@@ -342,41 +333,49 @@ class WorldParameters:
     """
 
     def __init__(self, model: mujoco.MjModel, drawn: Sequence[str]) -> None:
-        fields = dict.fromkeys(field for name in drawn for field in _FIELDS.get(name, ()))
-        self.base = {field: getattr(model, field).copy() for field in fields}
         owner = owners(model)
-        self._craft = owner >= 0
-        self._hung = np.zeros(model.nbody, bool)
+        craft = owner >= 0
+        hung = np.zeros(model.nbody, bool)
         if "payload" in drawn:
-            self._hung[payload_body(model)] = True
+            hung[payload_body(model)] = True
         # Of each craft the first of six degrees of freedom are those of its translation.
-        self._linear = self._craft[model.dof_bodyid] & (np.arange(model.nv) % 6 < 3)
-        self._torque = np.arange(6) >= 3  # of a gear
-        self._axes = body_axes(model) * self._craft[:, None, None]
-        of_sites = owner[model.site_bodyid[model.actuator_trnid[:, 0]]]
-        self._of_bodies, self._of_dofs, self._of_rotors = (
-            np.maximum(one, 0) for one in (owner, owner[model.dof_bodyid], of_sites)
-        )
+        linear = craft[model.dof_bodyid] & (np.arange(model.nv) % 6 < 3)
+        torque = np.arange(6)[None] >= 3  # of a gear
+        self._scaled = {
+            # Unity's drag goes with the mass.
+            "mass": {"body_mass": craft, "body_inertia": craft[:, None], "dof_damping": linear},
+            "inertia": {"body_inertia": craft[:, None]},
+            "payload": {"body_mass": hung, "body_inertia": hung[:, None]},
+            "reaction": {"actuator_gear": torque},
+        }
+        """Of each factor, the fields that it scales, and where."""
+        bodies = np.maximum(owner, 0)
+        rotors = bodies[model.site_bodyid[model.actuator_trnid[:, 0]]]
+        self._drones = {
+            "body_mass": bodies,
+            "body_inertia": bodies,
+            "dof_damping": bodies[model.dof_bodyid],
+            "actuator_gear": rotors,
+        }
+        """Of each field, the drone that has a row."""
+        self._axes = body_axes(model) * craft[:, None, None]
+        fields = [field for name in drawn for field in self._scaled.get(name, ())]
+        if set(drawn) & set(CENTER):
+            fields.append("body_ipos")
+        self.base = {field: getattr(model, field).copy() for field in fields}
 
     def values(self, parameters: Mapping[str, Array]) -> ByName:
         """The fields by name, each (N, ...), of N worlds with these parameters, each (N, A)."""
-        where = np.where
-        ones = 1.0 + 0.0 * next(iter(parameters.values()))
-        mass = parameters.get("mass", ones)
-        inertia = mass * parameters.get("inertia", ones)
-        loads = where(self._hung, parameters.get("payload", ones)[:, :1], 1.0)
-        reaction = parameters.get("reaction", ones)[:, self._of_rotors, None]
-        factors = {
-            "body_mass": where(self._craft, mass[:, self._of_bodies], loads),
-            "body_inertia": where(self._craft, inertia[:, self._of_bodies], loads)[..., None],
-            "dof_damping": where(self._linear, mass[:, self._of_dofs], 1.0),
-            "actuator_gear": where(self._torque, reaction, 1.0),
-        }
-        values = {
-            field: factors[field] * base for field, base in self.base.items() if field in factors
-        }
+        factors: ByName = {}
+        for name, drawn in parameters.items():
+            for field, scaled in self._scaled.get(name, {}).items():
+                factor = drawn[:, self._drones[field]]
+                if scaled.ndim > 1:
+                    factor = factor[..., None]
+                factors[field] = factors.get(field, 1.0) * np.where(scaled, factor, 1.0)
+        values = {field: factor * self.base[field] for field, factor in factors.items()}
         if "body_ipos" in self.base:
-            shift = stack([parameters.get(name, 0.0 * ones) for name in CENTER])
-            moved = total(self._axes.swapaxes(1, 2) * shift[:, self._of_bodies, None])
+            shift = stack([parameters.get(name, 0.0) for name in CENTER])
+            moved = total(self._axes.swapaxes(1, 2) * shift[:, self._drones["body_mass"], None])
             values["body_ipos"] = self.base["body_ipos"] + moved
         return values

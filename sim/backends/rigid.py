@@ -3,6 +3,7 @@
 It flies as `mujoco` does until a part touches the ground or another drone, and reports the contact.
 """
 
+import copy
 import logging
 from collections.abc import Mapping
 from functools import cache
@@ -12,19 +13,30 @@ import numpy as np
 
 from ...models.errors import InputError
 from ...models.vehicle import Vehicle, craft_bodies, craft_geoms
-from ..compile import TracedArray
 from ..compile.llvm import trouble
-from ..effects import EffectOptions
-from ..randomize import Randomization
+from ..effects import NO_EFFECTS, EffectOptions
+from ..randomize import FIXED, Randomization
 from ..snapshots import Arrays
-from ..state import Array, ByName, InitialState, WorldState, chosen, clip, each, length
+from ..state import (
+    Array,
+    ByName,
+    InitialState,
+    WorldState,
+    chosen,
+    clip,
+    each,
+    found,
+    length,
+    parts_of,
+    stack,
+)
 from ..world import PhysicsError, World
-from . import kernel
 from .body import RigidBody, mapped, motion
 from .hull import Hull, can_touch
+from .kernel import Kernel
 
 _OF_STATE = ("command", "thrust", "touching", "colliding")
-_LEVEL = np.array((0.0, 0.0, 0.0, 1.0, *[0.0] * 9))  # rows of a craft at rest
+_LEVEL = np.array((0.0, 0.0, 0.0, 1.0, *[0.0] * 9))  # motion of a craft at rest
 
 
 class RigidWorld(World):
@@ -45,8 +57,8 @@ class RigidWorld(World):
         num_worlds: int,
         *,
         drones: int = 1,
-        effects: EffectOptions | None = None,
-        randomize: Randomization | None = None,
+        effects: EffectOptions = NO_EFFECTS,
+        randomize: Randomization = FIXED,
         dtype: str = "float32",
         compiled: bool | None = None,
     ) -> None:
@@ -57,10 +69,11 @@ class RigidWorld(World):
             )
         if reason:
             _tell_once(reason)
-        payload = 0.0 if effects is None else effects.payload
-        if payload:
-            expected = "none with the backend rigid, which has no cable: fly it with mujoco"
-            raise InputError(f"effects.payload: expected {expected}, got {payload:g} kg")
+        if effects.payload:
+            raise InputError(
+                "effects.payload: expected none with the backend rigid, which has no cable: fly it "
+                f"with mujoco, got {effects.payload:g} kg"
+            )
         shape = (num_worlds, drones)
         super().__init__(vehicle, shape, effects, randomize)
         _check_obstacles(vehicle)
@@ -83,30 +96,19 @@ class RigidWorld(World):
         self.state = WorldState(**moved, command=thrust, thrust=thrust, touching=nobody)
         if drones > 1:
             self.state.colliding = nobody
-        self._show(np.repeat(_LEVEL.astype(self.dtype)[:, None], num_worlds * drones, axis=1))
-        self._varying: np.ndarray | None = None
-        self._function: kernel.Fly | None = None
-        self._compiled = compiled is not False and not reason
-        self._vary(dict.fromkeys(self._drawn, np.ones(num_worlds * drones)))
-        self._compile()
-
-    def _compile(self) -> None:
-        """Compile the body as it varies now, unless NumPy flies it."""
-        if self._compiled:
-            worlds, drones = self.shape
-            rotors = self.vehicle.num_rotors
-            self._function = kernel.flight(self._body, worlds * drones, self.dtype, rotors)
+        self._show(np.tile(_LEVEL.astype(self.dtype), (*shape, 1)))
+        is_compiled = compiled is not False and not reason
+        self._advance = Kernel(self._advanced, shape) if is_compiled else self._advanced
 
     def vary(self, inertia: Array, reaction: Array, air: Mapping[str, Array]) -> None:
         """Set the numbers of every drone before the first reset; needs the effect `body_drag`.
 
-        Inertia, kg·m², (W A, 3, 3); a factor of the rotors' reactions, (W A,); and coefficients of
+        Inertia, kg·m², (W, A, 3, 3); a factor of the rotors' reactions, (W, A); and coefficients of
         the air by their names in a vehicle's file, (W, A) each.
         """
         self._vary({"reaction": reaction}, inertia)
         assert self.effects is not None
         self.effects.air.vary(air)
-        self._compile()
 
     def reset(self, mask: Array, pose: InitialState) -> None:
         """As `World.reset`."""
@@ -118,11 +120,11 @@ class RigidWorld(World):
         unit = turn / each(length(turn))
         turn = np.where(rows, unit, turn)  # the others keep their bits
         parts = (begun["position"], turn, begun["velocity"], begun["body_rates"])
-        self._show(self._as_rows(np.concat(parts, axis=-1)))
+        self._show(self._typed(np.concat(parts, axis=-1)))
         state.thrust = self._typed(begun["thrust"])
         state.command = np.where(rows, state.thrust, state.command)
         self._draw_parameters(mask)
-        self._vary_drawn()
+        self._vary(self.parameters)
         if self.effects is not None:
             thrust = self.effects.begin(mask, state, self.parameters)
             state.thrust = self._typed(np.where(rows, thrust, state.thrust))
@@ -139,15 +141,15 @@ class RigidWorld(World):
         state.command = chosen(mask, self._typed(thrust + self._nothing), state.command)
         if not self._on_rotors:
             state.thrust = state.command
-        found = [state.touching, state.colliding] if again else [False, False]
+        touched = [state.touching, state.colliding] if again else [False, False]
         while substeps > 0:
             self._fly(min(substeps, self._check), mask)
-            found = [now | old for now, old in zip(self._contacts(), found, strict=False)]
+            touched = [now | old for now, old in zip(self._contacts(), touched, strict=False)]
             substeps -= self._check
-        self._tell(mask, found)
-        bad = ~(abs(self._rows) < mujoco.mjMAXVAL).all(axis=0)
-        self.bad = chosen(mask, bad.reshape(self.shape), self.bad)
-        if not isinstance(self.bad, TracedArray):
+        self._tell(mask, touched)
+        bad = ~(abs(self._motion) < mujoco.mjMAXVAL).all(axis=-1)
+        self.bad = chosen(mask, bad, self.bad)
+        if found(self.bad):
             self.refuse_bad(mask)
 
     def _fly(self, steps: int, mask: Array | None) -> None:
@@ -157,7 +159,6 @@ class RigidWorld(World):
         acting = state.command
         wrench = None
         at_once = steps if effects is None else 1  # physics steps of a call
-        some = None if mask is None else mask.reshape(1, -1)  # of rows
         for _ in range(steps // at_once):
             if effects is not None:
                 acting, end, push = effects.step(state, mask)
@@ -166,16 +167,17 @@ class RigidWorld(World):
                 wrench = None if push is None else self._typed(push)
             if not self._on_rotors:  # as MuJoCo clamps controls
                 acting = clip(acting, self.vehicle.thrust_low, self.vehicle.thrust_high)
-            push = None if wrench is None else self._as_rows(wrench)
-            new = self._flown(self._as_rows(acting), push, at_once)
-            self._show(chosen(some, new, self._rows))
+            varying: list[Array] = []
+            mapped(self._body.varying, varying.append)
+            new = self._advance(at_once, self._motion, self._typed(acting), wrench, *varying)
+            self._show(chosen(mask, new, self._motion))
         self._acting = chosen(mask, self._typed(acting), self._acting)
         if wrench is not None:
             self._wrench = chosen(mask, wrench, self._wrench)
 
     def _kept(self) -> ByName:
         arrays = {name: getattr(self.state, name) for name in _OF_STATE}
-        arrays |= {"motion": self._as_vectors(self._rows), "acting": self._acting}
+        arrays |= {"motion": self._motion, "acting": self._acting}
         arrays |= {"wrench": self._wrench, "bad": self.bad}
         return {name: array for name, array in arrays.items() if array is not None}
 
@@ -186,15 +188,14 @@ class RigidWorld(World):
         self._acting = copies["acting"]
         self._wrench = copies.get("wrench")
         self.bad = copies["bad"]
-        self._show(self._as_rows(copies["motion"]))
-        self._vary_drawn()
+        self._show(copies["motion"])
+        self._vary(self.parameters)
 
     def acceleration(self) -> Array:
         """As `World.acceleration`."""
-        wrench = None if self._wrench is None else self._as_rows(self._wrench)
-        push = self._body.push(self._as_rows(self._acting), wrench)
-        linear, _ = self._body.acceleration(motion(self._rows), push)
-        return np.stack(linear, axis=-1).reshape(*self.shape, 3)
+        push = self._body.push(parts_of(self._acting), _parts(self._wrench))
+        linear, _ = self._body.acceleration(motion(parts_of(self._motion)), push)
+        return stack(linear)
 
     def below(self) -> Array:
         """As `World.below`: the ground is the only surface."""
@@ -206,61 +207,47 @@ class RigidWorld(World):
     def close(self) -> None:
         """Nothing is to be released."""
 
-    def _vary_drawn(self) -> None:
-        """Give the bodies what was drawn for them."""
-        self._vary({name: values.reshape(-1) for name, values in self.parameters.items()})
-
     def _vary(self, parameters: Mapping[str, Array], inertia: Array = None) -> None:
-        """As `RigidBody.vary`, with the same numbers for NumPy and compiled code."""
+        """As `RigidBody.vary`, with numbers of this dtype."""
         body = self._body
         if parameters:
             body.vary(parameters, inertia)
-            body.varying = mapped(body.varying, lambda numbers: numbers.astype(self.dtype))
-            self._varying = kernel.packed(body, self.dtype)
+            body.varying = mapped(body.varying, self._typed)
 
-    def _flown(self, thrust: Array, wrench: Array, steps: int) -> np.ndarray:
-        """New rows after physics steps: see `RigidBody.fly`."""
-        if self._function is None:
-            flown: np.ndarray = self._typed(
-                np.stack(self._body.fly(self._rows, thrust, wrench, steps))
-            )
-            return flown
-        return self._function(self._rows, thrust, wrench, self._varying, steps)
+    def _advanced(
+        self, steps: int, now: Array, thrust: Array, wrench: Array, *varying: Array
+    ) -> Array:
+        """The motion after physics steps, as of `RigidBody.fly`, of a body that varies so."""
+        body = copy.copy(self._body)
+        vectors = iter(varying)
+        body.varying = mapped(body.varying, lambda _: next(vectors))
+        later = body.fly(parts_of(now), parts_of(thrust), _parts(wrench), steps)
+        return self._typed(stack(later))
 
-    def _show(self, rows: np.ndarray) -> None:
-        """Take these rows, and set the state's arrays, views of them."""
-        self._rows = rows
+    def _show(self, now: Array) -> None:
+        """Take this motion, (W, A, 13), and set the state's arrays, views of it."""
+        self._motion = now
         state = self.state
-        columns = self._as_vectors(rows)
-        state.position = columns[..., :3]
-        state.quaternion = columns[..., 3:7]
-        state.velocity = columns[..., 7:10]
-        state.body_rates = columns[..., 10:]
+        state.position = now[..., :3]
+        state.quaternion = now[..., 3:7]
+        state.velocity = now[..., 7:10]
+        state.body_rates = now[..., 10:]
 
     def _typed(self, values: Array) -> Array:
         return values.astype(self.dtype, copy=False)
 
-    def _as_rows(self, values: Array) -> Array:
-        """Vectors (W, A, k) as rows (k, W A) of this dtype."""
-        return self._typed(values).reshape(-1, values.shape[-1]).T
-
-    def _as_vectors(self, rows: Array) -> Array:
-        """Rows (k, W A) as vectors (W, A, k)."""
-        return rows.T.reshape(*self.shape, -1)
-
     def _contacts(self) -> list[Array]:
         """Which crafts touch anything and, of several, which another, bool, (W, A)."""
-        rows = self._rows
-        shape = self.shape
-        touching = self._hull.touches(rows[2], rows[3:7]).reshape(shape)
-        if shape[1] == 1:
+        state = self.state
+        touching = self._hull.touches(state.position[..., 2], parts_of(state.quaternion))
+        if self.shape[1] == 1:
             return [touching]
-        colliding = self._hull.collides(rows[:3].reshape(3, *shape))
+        colliding = self._hull.collides(parts_of(state.position))
         return [touching | colliding, colliding]
 
-    def _tell(self, mask: Array | None, found: list[Array]) -> None:
-        """Set what `_contacts` found, for the worlds of a mask."""
-        for name, new in zip(("touching", "colliding"), found, strict=False):
+    def _tell(self, mask: Array | None, touched: list[Array]) -> None:
+        """Set what `_contacts` gave, for the worlds of a mask."""
+        for name, new in zip(("touching", "colliding"), touched, strict=False):
             old = getattr(self.state, name)
             setattr(self.state, name, chosen(mask, new, old))
 
@@ -270,6 +257,10 @@ class RigidWorld(World):
         ids = np.flatnonzero(bad.any(axis=1)).tolist()
         if ids:
             raise PhysicsError(f"the rigid body has bad states in envs {ids[:5]}: reset the env")
+
+
+def _parts(wrench: Array) -> Array:
+    return None if wrench is None else parts_of(wrench)
 
 
 @cache

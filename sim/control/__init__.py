@@ -11,7 +11,7 @@ import numpy as np
 
 from ... import models
 from ...models.errors import InputError, shortened
-from ..effects import EffectOptions
+from ..effects import NO_EFFECTS, EffectOptions
 from ..state import Array, WorldState, clip, component, stack, total
 from .cascade import Attitude, Position, Rates, Velocity
 from .gains import Gains, allocated, shared_ranges
@@ -147,7 +147,7 @@ class MixedController:
 
 
 def make_controller(
-    level: str, vehicle: "models.Vehicle", period: float, effects: EffectOptions | None = None
+    level: str, vehicle: "models.Vehicle", period: float, effects: EffectOptions = NO_EFFECTS
 ) -> Controller:
     """The controller of one of `LEVELS`.
 
@@ -157,7 +157,6 @@ def make_controller(
     """
     if level not in LEVELS:
         raise InputError(f"action: expected one of {', '.join(LEVELS)}, got {shortened(level)}")
-    effects = effects or EffectOptions()
     members = getattr(vehicle, "members", (vehicle,))
     kinds = list(dict.fromkeys(members))
     controllers: list[Controller]

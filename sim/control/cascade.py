@@ -25,8 +25,8 @@ from ... import models
 from ..effects import EffectOptions
 from ..effects.rotors import polynomial
 from ..elementary import cos, sin
-from ..rotations import Parts, Rows, dot, matrix, parts_of, times, transposed
-from ..state import Array, WorldState, clip, interpolated, square_root, stack
+from ..rotations import Parts, Rows, dot, matrix, times, transposed
+from ..state import Array, WorldState, clip, interpolated, parts_of, square_root, stack
 from .gains import Gains
 
 _ASIDE = 1e-3  # Upside down every way to turn is as short: it is about x

@@ -30,7 +30,7 @@ from ... import models
 from ...models.errors import InputError
 from ...models.matrices import right_inverse
 from ..elementary import atan2, cos, expm1, sin
-from ..state import total
+from ..state import Array, total
 
 LEAD = 3.0
 """Rotors are driven to follow this many times faster than their own lag."""
@@ -137,13 +137,12 @@ class Gains:
         )
 
 
-def _largest(vehicle: "models.Vehicle") -> np.ndarray:
+def _largest(vehicle: "models.Vehicle") -> Array:
     """Of each row of the allocation, shape (4, 1)."""
-    largest: np.ndarray = np.abs(vehicle.allocation).max(axis=1, keepdims=True).clip(1e-12)
-    return largest
+    return np.abs(vehicle.allocation).max(axis=1, keepdims=True).clip(1e-12)
 
 
-def allocated(vehicle: "models.Vehicle") -> np.ndarray:
+def allocated(vehicle: "models.Vehicle") -> Array:
     """Thrusts for a collective thrust of 1 N and torques of 1 N·m about each axis, shape (R, 4).
 
     Those of the least size, Aᵀ (A Aᵀ)⁻¹ for an allocation A.

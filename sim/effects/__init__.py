@@ -21,10 +21,10 @@ from ..state import Array, ByName, WorldState, component
 from .air import AirEffects
 from .downwash import Downwash
 from .gusts import NUMBERS, Gusts
-from .options import EffectOptions
+from .options import NO_EFFECTS, EffectOptions
 from .rotors import RotorEffects
 
-__all__ = ["EffectOptions", "Effects"]
+__all__ = ["NO_EFFECTS", "EffectOptions", "Effects"]
 
 
 class Effects(Kept):

@@ -7,16 +7,17 @@ import numpy as np
 
 from ... import models
 from ...models.errors import InputError
-from ..rotations import Parts, Rows, add, cross, dot, matrix, parts_of, product, times, transposed
+from ..rotations import Parts, Rows, add, cross, dot, matrix, product, times, transposed
 from ..snapshots import Kept
 from ..state import (
     Array,
     ByName,
     WorldState,
+    chosen,
     clip,
     component,
     each,
-    kept,
+    parts_of,
     square_root,
     stack,
     total,
@@ -47,7 +48,7 @@ class AirEffects(Kept):
         acts: Whether an effect is on.
     """
 
-    lists = ("_before",)
+    arrays = ("_before",)
 
     def __init__(self, vehicle: "models.Vehicle", options: EffectOptions) -> None:
         self._options = options
@@ -93,7 +94,7 @@ class AirEffects(Kept):
             _check_stiffness(vehicle, slope * max(1.0, turning), "drag of the rotors")
         if options.ground_effect:
             (self._radius,) = coefficients.need("rotors.radius", "ground_effect")
-        self._before: list[Array] = []
+        self._before: Array = None  # the last motion
 
     def vary(self, numbers: Mapping[str, Array]) -> None:
         """Take other coefficients for each drone, (W, A), by their names in a vehicle's file.
@@ -110,7 +111,7 @@ class AirEffects(Kept):
 
     def begin(self, mask: Array, state: WorldState) -> None:
         """Begin at the motion of a state."""
-        self._before = kept(mask, _motion(state), self._before)
+        self._before = chosen(mask, _motion(state), self._before)
 
     def take(self, factors: ByName) -> None:
         """Take the factors of drawn parameters, (W, A), by name."""
@@ -132,8 +133,8 @@ class AirEffects(Kept):
         """
         now = _motion(state)
         # The middle of the step: half of the last step's change further.
-        ahead = [1.5 * new - 0.5 * old for new, old in zip(now, self._before, strict=True)]
-        self._before = kept(mask, now, self._before)
+        ahead = parts_of(1.5 * now - 0.5 * self._before)
+        self._before = chosen(mask, now, self._before)
         w = ahead[3:]
         turn = _turned(state.quaternion, w, self._half)
         through = (ahead[0] - wind[0], ahead[1] - wind[1], ahead[2] - wind[2])
@@ -225,9 +226,9 @@ def _check_stiffness(vehicle: "models.Vehicle", slope: float, what: str) -> None
         )
 
 
-def _motion(state: WorldState) -> list[Array]:
-    """Velocity and body rates, of a batch copies: six of shape (W, A)."""
-    return [part + 0.0 for part in (*parts_of(state.velocity), *parts_of(state.body_rates))]
+def _motion(state: WorldState) -> Array:
+    """Velocity and body rates, a copy, shape (W, A, 6)."""
+    return np.concat((state.velocity, state.body_rates), axis=-1)
 
 
 def _turned(quaternion: Array, rates: Parts, time: float) -> Rows:

@@ -12,12 +12,9 @@ h / (0.177 + 0.000823 h)^1.2, σ_w = 0.1 W20 and σ_u = σ_v = σ_w / (0.177 + 0
 
 import math
 
-import numpy as np
-
 from ..elementary import exp, expm1, power
-from ..rotations import parts_of
 from ..snapshots import Kept
-from ..state import Array, kept, square_root
+from ..state import Array, chosen, clip, parts_of, square_root, stack
 
 FOOT = 0.3048  # m
 LOWEST, HIGHEST = 10 * FOOT, 1000 * FOOT  # m: where the low-altitude model is defined
@@ -38,7 +35,7 @@ class Gusts(Kept):
         timestep: Physics step, s.
     """
 
-    lists = ("_filters", "_state")
+    arrays = ("_filters", "_state")
 
     def __init__(self, wind_speed: float, mean_wind: tuple[float, ...], timestep: float) -> None:
         self._sigma = 0.1 * wind_speed
@@ -47,21 +44,22 @@ class Gusts(Kept):
         self._along = (1.0, 0.0) if across == 0 else (x / across, y / across)
         self._speed = max(LEAST_SPEED, math.sqrt(x * x + y * y + z * z))
         self._step = timestep
-        self._filters: list[Array] = []
-        self._state: list[Array] = []
+        self._filters: Array = None
+        self._state: Array = None
 
     def begin(self, mask: Array, height: Array, normal: Array, factor: Array = 1.0) -> None:
         """Begin in the stationary state; height in m, shape (W, A), normal (W, A, 5).
 
         The factor scales the gusts, one for all or (W, A).
         """
-        feet = np.clip(np.ravel(height).astype(np.float64), LOWEST, HIGHEST) / FOOT
+        n = parts_of(normal)
+        feet = clip(height + 0.0 * n[0], LOWEST, HIGHEST) / FOOT  # float64, as the normals
         shape = 0.177 + 0.000823 * feet
-        sigma = self._sigma * np.ravel(factor).astype(np.float64)
+        sigma = self._sigma * factor
         sigmas = sigma / power(shape, 0.4), sigma + 0.0 * feet
         lengths = FOOT * feet / power(shape, 1.2), FOOT * feet
         r = self._step * self._speed / lengths[0]
-        filters = [exp(-r), sigmas[0] * np.sqrt(-expm1(-2 * r)), *sigmas]
+        filters = [exp(-r), sigmas[0] * square_root(-expm1(-2 * r)), *sigmas]
         # Of a filter of second order, with z₁' = (noise - z₁) / T and z₂' = (z₁ - z₂) / T, the
         # stationary covariance is σ²/2 · ((1, 1/2), (1/2, 1/2)): v = √3 z₁ + (1 - √3) z₂ has σ².
         # The noise of a step has the covariance ((q11, q12), (q12, q22)).
@@ -72,23 +70,22 @@ class Gusts(Kept):
             q11 = -half * expm1(-2 * r)
             q12 = half / 2 * (1 - e * e * (1 + 2 * r))
             q22 = half / 2 * (1 - e * e * (1 + 2 * r + 2 * r * r))
-            a = np.sqrt(q11)
+            a = square_root(q11)
             # In a short step the last is less than what rounding leaves of the difference.
             filters += [e, r, a, q12 / a, square_root(q22 - q12 * q12 / q11)]
-        self._filters = kept(mask, self._ours(filters, normal), self._filters)
-        along, up = self._filters[2:4]
-        n = parts_of(normal)
+        self._filters = chosen(mask, stack(filters), self._filters)
+        _, _, along, up, *_ = parts_of(self._filters)
         start = [along * n[0]]
         for index, sigma in ((1, along), (3, up)):
             z1 = n[index]
             z2 = n[index + 1]
             start += [math.sqrt(0.5) * sigma * z1, math.sqrt(0.125) * sigma * (z1 + z2)]
-        self._state = kept(mask, start, self._state)
+        self._state = chosen(mask, stack(start), self._state)
 
     def step(self, mask: Array | None, normal: Array) -> None:
         """Advance by a physics step; normal (W, A, 5)."""
-        f = self._filters
-        z = self._state
+        f = parts_of(self._filters)
+        z = parts_of(self._state)
         n = parts_of(normal)
         new = [f[0] * z[0] + f[1] * n[0]]
         for i, (e, r, a, b, c) in ((1, f[4:9]), (3, f[9:])):
@@ -96,21 +93,14 @@ class Gusts(Kept):
                 e * z[i] + a * n[i],
                 e * (z[i + 1] + r * z[i]) + b * n[i] + c * n[i + 1],
             ]
-        self._state = kept(mask, new, z)
+        self._state = chosen(mask, stack(new), self._state)
 
     @property
     def velocity(self) -> Vector:
         """Of the gust, world frame, m/s, three of shape (W, A)."""
-        z = self._state
+        z = parts_of(self._state)
         (x, y) = self._along
         root = math.sqrt(3)
         u = z[0]
         v, w = (root * z[i] + (1 - root) * z[i + 1] for i in (1, 3))
         return x * u - y * v, y * u + x * v, w
-
-    def _ours(self, values: list[np.ndarray], like: Array) -> list[Array]:
-        """Numbers of each drone, as arrays of the same kind as `like`."""
-        if like.ndim == 1:
-            return [value.item() for value in values]
-        lead = like.shape[:-1]
-        return [value.reshape(lead) for value in values]

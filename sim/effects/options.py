@@ -62,3 +62,6 @@ class EffectOptions:
             if value != one.default:
                 changed[one.name] = value
         return changed
+
+
+NO_EFFECTS = EffectOptions()

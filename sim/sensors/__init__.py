@@ -89,9 +89,16 @@ def readings_of(sensors: Values, vehicle: "models.Vehicle", period: float) -> li
         if kind.name not in sensors:
             continue
         low, high = kind.bounds(settings.get(kind.name, {}))
-        bounds = {"shape": (len(low),), "low": low, "high": high}
-        words = {"unit": kind.units, "frame": kind.frame, "components": kind.components}
-        readings.append({"name": kind.name, **bounds, **words})
+        reading = {
+            "name": kind.name,
+            "shape": (len(low),),
+            "low": low,
+            "high": high,
+            "unit": kind.units,
+            "frame": kind.frame,
+            "components": kind.components,
+        }
+        readings.append(reading)
     return [] if "observe" in sensors else readings
 
 

@@ -7,7 +7,7 @@ from ...models.fields import Limits
 from ..elementary import power
 from ..state import Array, chosen, clip
 from ..world import World
-from .base import Bounds, Sensor, Setting, Values
+from .base import Bounds, Sensor, Setting, Values, coefficients
 
 SEA_LEVEL_PRESSURE = 101_325.0  # Pa. These are those of ISO 2533:1975
 SEA_LEVEL_TEMPERATURE = 288.15  # K
@@ -43,11 +43,12 @@ class Barometer(Sensor):
     """
 
     name = "barometer"
-    prefix = "barometer_"
     columns = 2
     arrays = (*Sensor.arrays, "_bias")
-    defaults: ClassVar = {"walk": 0.0}
-    own: ClassVar = {"altitude": Setting(0.0, Limits(-1e3, 9e3, "m"))}
+    settings: ClassVar = {
+        **coefficients("barometer_", "noise", walk=0.0),
+        "altitude": Setting(0.0, Limits(-1e3, 9e3, "m")),
+    }
     frame = "above sea level"
     components = ("pressure altitude",)
     units = ("m",)

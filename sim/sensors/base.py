@@ -12,7 +12,7 @@ from ...models.coefficients import COEFFICIENTS
 from ...models.errors import InputError
 from ...models.fields import Limits, check, check_names
 from ..snapshots import Kept
-from ..state import Array, chosen, clip, component, kept, some
+from ..state import Array, chosen, clip, component, plain, some
 from ..world import World
 
 FURTHEST = 1e5  # Largest coordinate of a reading, m
@@ -36,6 +36,18 @@ class Setting(NamedTuple):
 
     Without both, the option has to give the value.
     """
+
+
+def coefficients(prefix: str, *needs: str, **defaults: float) -> dict[str, Setting]:
+    """Settings that a vehicle's file may give, by the prefix and their names.
+
+    Those of `needs` have no default: the vehicle or the option has to give them.
+    """
+    settings = {}
+    for name in (*needs, *defaults):
+        coefficient = f"sensors.{prefix}{name}"
+        settings[name] = Setting(defaults.get(name), COEFFICIENTS[coefficient], coefficient)
+    return settings
 
 
 SAMPLING = {
@@ -75,10 +87,7 @@ class Sensor(Source):
     Inside, a flag follows each reading: 1 if it is new, 0 if it was held.
 
     Class attributes:
-        prefix: What its coefficients' names begin with in a vehicle's file.
-        needs: Coefficients that the vehicle or the option has to give.
-        defaults: Coefficients that may be missing.
-        own: Settings that are no coefficients of a vehicle.
+        settings: By name, without those of the sampling.
         columns: Normal numbers that a reading takes; `draw` gets as many at a reset.
 
     Attributes:
@@ -86,13 +95,9 @@ class Sensor(Source):
         interval: Time between two readings, s.
     """
 
-    prefix: ClassVar[str]
-    needs: ClassVar[tuple[str, ...]] = ("noise",)
-    defaults: ClassVar[Mapping[str, float]] = {}
-    own: ClassVar[Mapping[str, Setting]] = {}
+    settings: ClassVar[dict[str, Setting]]
     columns: ClassVar[int]
-    arrays: ClassVar[tuple[str, ...]] = ("_now", "_held")
-    lists = ("_late",)
+    arrays: ClassVar[tuple[str, ...]] = ("_held", "_readings")
 
     def __init__(self, values: Values, period: float, world: World) -> None:
         self._every = values["every"]
@@ -105,23 +110,14 @@ class Sensor(Source):
         self._noise = world.random.noise(f"sensor {self.name}", self.columns + 1)
         dropout = values["dropout"]
         self._lost = round(NormalDist().inv_cdf(dropout), 12) if dropout else -math.inf
-        self._now: Array = 0.0  # what is observed, with its flag
-        self._held: Array = 0.0  # the last reading that was taken
-        self._late: list[Array] = []  # those on their way, the oldest first
-
-    @classmethod
-    def settings(cls) -> Mapping[str, Setting]:
-        settings: dict[str, Setting] = {}
-        for name in (*cls.needs, *cls.defaults):
-            coefficient = cls.prefix + name
-            limits = COEFFICIENTS[f"sensors.{coefficient}"]
-            settings[name] = Setting(cls.defaults.get(name), limits, coefficient)
-        return {**settings, **cls.own, **SAMPLING}
+        self._held: Array = None  # the last reading that was taken
+        # What is observed, with its flag, and those on their way: (W, A, k + 1, lag + 1).
+        self._readings: Array = None
 
     @classmethod
     def checked(cls, given: Values) -> dict[str, Any]:
         """Settings by name as plain values. Raises `InputError`."""
-        settings = cls.settings()
+        settings = cls.settings | SAMPLING
         check_names(given, settings, f"sensors.{cls.name}")
         values = {}
         for name, value in given.items():
@@ -136,15 +132,15 @@ class Sensor(Source):
         With `every` and `lag`, control steps between readings and of the delay.
         """
         values = {}
-        for name, (value, _, coefficient) in cls.settings().items():
+        for name, (value, _, coefficient) in (cls.settings | SAMPLING).items():
             if coefficient:
-                own = vehicle.coefficients[f"sensors.{coefficient}"]
+                own = vehicle.coefficients[coefficient]
                 value = value if own is None else own
             value = given.get(name, value)
             if coefficient and value is None:
                 raise InputError(
-                    f"sensors.{cls.name}: expected {name} here, or sensors.{coefficient} in the "
-                    "vehicle's file, got none"
+                    f"sensors.{cls.name}: expected {name} here, or {coefficient} in the vehicle's "
+                    "file, got none"
                 )
             values[name] = value
         rate = values["rate"]
@@ -167,21 +163,21 @@ class Sensor(Source):
     @property
     def value(self) -> Array:
         """What is observed now, shape (W, A, k)."""
-        return self._now[..., :-1]
+        return self._readings[..., :-1, 0]
 
     @property
     def fresh(self) -> Array:
         """1 where it was not observed before, and 0 elsewhere, shape (W, A)."""
-        return component(self._now, -1)
+        return plain(self._readings[..., -1, 0])
 
     def begin(self, mask: Array) -> None:
         """First reading of the drones of a mask."""
         self.draw(mask, self._noise.normal(mask)[..., :-1])
         first = self._read(self._noise.normal(mask))
         self._held = chosen(mask, first, self._held)
-        self._now = chosen(mask, _flagged(first, 1.0), self._now)
-        old = _flagged(first, 0.0)
-        self._late = [chosen(mask, old, late) for late in self._late or [old] * self._lag]
+        old = np.repeat(_flagged(first, 0.0), self._lag, axis=-1)
+        readings = np.concat((_flagged(first, 1.0), old), axis=-1)
+        self._readings = chosen(mask, readings, self._readings)
 
     def sample(self, mask: Array, steps: Array) -> None:
         """After a control step of the drones of a mask; `steps` counts those of each episode."""
@@ -191,9 +187,8 @@ class Sensor(Source):
             normal = self._noise.normal(due)
             fresh = due & (component(normal, -1) >= self._lost)
             self._held = chosen(fresh, self._read(normal), self._held)
-        arriving, *queued = [*self._late, _flagged(self._held, fresh)]
-        self._now = chosen(mask, arriving, self._now)
-        self._late = list(kept(mask, queued, self._late))
+        readings = np.concat((self._readings[..., 1:], _flagged(self._held, fresh)), axis=-1)
+        self._readings = chosen(mask, readings, self._readings)
 
     def draw(self, mask: Array, normal: Array) -> None:
         """Draw an episode's errors for the drones of a mask."""
@@ -215,9 +210,9 @@ def _is_whole(steps: float) -> bool:
 
 
 def _flagged(reading: Array, fresh: Array) -> Array:
-    """A reading and its flag."""
+    """A reading and its flag, shape (W, A, k + 1, 1)."""
     *lead, size = reading.shape
-    both = np.empty_like(reading, np.float64, shape=(*lead, size + 1))
-    both[..., :-1] = reading
-    both[..., -1] = fresh
+    both = np.empty_like(reading, np.float64, shape=(*lead, size + 1, 1))
+    both[..., :-1, 0] = reading
+    both[..., -1, 0] = fresh
     return both

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 from ..elementary import atan2, exp, expm1, wrapped
-from ..rotations import advanced, between, cross, parts_of, to_world, world_z
-from ..state import Array, WorldState, chosen, clip, component, each, stack
+from ..rotations import advanced, between, cross, to_world, world_z
+from ..state import Array, WorldState, chosen, clip, component, each, parts_of, stack
 from .base import FURTHEST, MAX_SPEED, UNIT, Sensor, Source
 
 TIME = 1.0

@@ -1,7 +1,6 @@
 """Gyroscope and accelerometer."""
 
 import math
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +8,7 @@ from numpy.typing import NDArray
 from ..rotations import to_body
 from ..state import Array, chosen
 from ..world import World
-from .base import Bounds, Sensor, Values
+from .base import Bounds, Sensor, Values, coefficients
 
 GYRO_RANGE = math.radians(2000.0)  # rad/s: the largest setting of the BMI088
 ACCELEROMETER_RANGE = 24 * 9.80665  # m/s²: the same
@@ -25,17 +24,18 @@ class Imu(Sensor):
     """
 
     name = "imu"
-    prefix = ""
     arrays = (*Sensor.arrays, "_bias")
-    needs = ("gyro_noise", "accelerometer_noise")
-    defaults: ClassVar = {
-        "gyro_walk": 0.0,
-        "gyro_bias": 0.0,
-        "gyro_range": GYRO_RANGE,
-        "accelerometer_walk": 0.0,
-        "accelerometer_bias": 0.0,
-        "accelerometer_range": ACCELEROMETER_RANGE,
-    }
+    settings = coefficients(
+        "",
+        "gyro_noise",
+        "accelerometer_noise",
+        gyro_walk=0.0,
+        gyro_bias=0.0,
+        gyro_range=GYRO_RANGE,
+        accelerometer_walk=0.0,
+        accelerometer_bias=0.0,
+        accelerometer_range=ACCELEROMETER_RANGE,
+    )
     columns = 12
     frame = "body"
     components = tuple(f"{what} {axis}" for what in ("gyro", "accelerometer") for axis in "xyz")

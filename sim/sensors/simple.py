@@ -7,7 +7,7 @@ import numpy as np
 from ...models.fields import Limits
 from ..rotations import advanced, to_body
 from ..state import Array, clip, stack
-from .base import FURTHEST, MAX_SPEED, UNIT, Bounds, Sensor, Setting, Values
+from .base import FURTHEST, MAX_SPEED, UNIT, Bounds, Sensor, Setting, Values, coefficients
 
 FIELD = (1.287, 21.532, -43.231)
 """Earth's magnetic field at Zurich (47.377° N, 8.542° E, 408 m) on 2025-01-01: east, north and up,
@@ -18,9 +18,11 @@ class Magnetometer(Sensor):
     """Earth's field in the body frame; white noise. Setting: the field in the world frame."""
 
     name = "magnetometer"
-    prefix = "magnetometer_"
     columns = 3
-    own: ClassVar = {"field": Setting(FIELD, Limits(-100.0, 100.0, "µT", count=3))}
+    settings: ClassVar = {
+        **coefficients("magnetometer_", "noise"),
+        "field": Setting(FIELD, Limits(-100.0, 100.0, "µT", count=3)),
+    }
     frame = "body"
     components = ("field x", "field y", "field z")
     units = ("µT",) * 3
@@ -38,9 +40,8 @@ class Rangefinder(Sensor):
     """
 
     name = "rangefinder"
-    prefix = "range_"
     columns = 1
-    needs = ("noise", "limit")
+    settings = coefficients("range_", "noise", "limit")
     frame = "body, along -z"
     components = ("distance",)
     units = ("m",)
@@ -58,16 +59,15 @@ class Gps(Sensor):
     """Position and velocity of the body's origin; white noise."""
 
     name = "gps"
-    prefix = "gps_"
     columns = 6
-    needs = ("noise", "vertical_noise", "velocity_noise")
+    settings = coefficients("gps_", "noise", "vertical_noise", "velocity_noise")
     frame = "world"
     components = ("x", "y", "z", "vx", "vy", "vz")
     units = ("m",) * 3 + ("m/s",) * 3
     top = (FURTHEST,) * 3 + (MAX_SPEED,) * 3
 
     def measure(self, normal: Array) -> Array:
-        level, vertical, speed = (self.values[name] for name in self.needs)
+        level, vertical, speed = (self.values[name] for name in self.settings)
         sigma = np.array((level, level, vertical, speed, speed, speed))
         state = self.world.state
         exact = np.concat((state.position, state.velocity), axis=-1)
@@ -78,9 +78,8 @@ class MotionCapture(Sensor):
     """Position and attitude; white noise, of the attitude about the body's axes."""
 
     name = "motion_capture"
-    prefix = "mocap_"
     columns = 6
-    needs = ("noise", "angle_noise")
+    settings = coefficients("mocap_", "noise", "angle_noise")
     frame = "world; quaternion: body to world"
     components = ("x", "y", "z", "qw", "qx", "qy", "qz")
     units = ("m",) * 3 + ("1",) * 4
