@@ -69,7 +69,7 @@ class Pipeline:
         if config.history > 1:
             names = [array.name for array in observed(task)]
             observing.append(History(config.history, names))
-        observing.append(Ends(config.env_id, world.shape, task.episode_length))
+        observing.append(Ends(config.env_id, task.episode_length))
 
         self.stages = [Starts(task, world), *flying, *observing]
         self.fly = [stage.step for stage in flying]

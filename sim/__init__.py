@@ -3,7 +3,7 @@
 Knows nothing of tasks, rewards or Gymnasium.
 """
 
-from .control import LEVELS, CollectiveThrust, Controller, Gains, allocated, make_controller
+from .control import LEVELS, CollectiveThrust, Controller, Gains, make_controller
 from .effects import EffectOptions
 from .elementary import atan2, cos, exp, log, power, sin, wrapped
 from .random import Draw
@@ -42,7 +42,6 @@ __all__ = [
     "Randomization",
     "World",
     "WorldState",
-    "allocated",
     "atan2",
     "body_x",
     "body_z",

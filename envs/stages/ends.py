@@ -1,5 +1,7 @@
 """Rewards and ends of a step."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from ...models.errors import InputError
@@ -7,33 +9,28 @@ from ...sim.state import Array, found, some
 from .record import Floats, Mask, Record, Stage
 
 
+@dataclass
 class Ends(Stage):
     """Sums the terms of a reward. An episode ends by its task, or else by its length.
 
     A drone that does not fly, or whose own episode has ended, gets no reward and no end.
-
-    Args:
-        env_id: For errors.
-        shape: (W, A), or () for a single drone.
-        episode_length: Control steps after which an episode is truncated.
     """
 
     arrays = ("reward", "terminated", "truncated", "unfit")
 
-    def __init__(self, env_id: str, shape: tuple[int, ...], episode_length: int) -> None:
-        self._env_id = env_id
-        self._length = episode_length
-        self._nobody = np.zeros(shape, bool)[()]
-        self._zeros = np.zeros(shape)[()]
+    env_id: str
+    """For errors."""
+    episode_length: int
+    """Control steps after which an episode is truncated."""
 
     def step(self, record: Record) -> None:
         """Raises `InputError` as `refuse_unfit`."""
         total: Array = 0.0
         for term in record.terms.values():
             total = total + term
-        reward = total + self._zeros
-        terminated = self._nobody | record.ended
-        truncated = (record.steps >= self._length) > terminated
+        reward = total + np.zeros(record.shape)[()]
+        terminated = np.zeros(record.shape, bool)[()] | record.ended
+        truncated = (record.steps >= self.episode_length) > terminated
         record.unfit = _unfit(record, reward)
         flying = record.flown
         if some(record.out):
@@ -44,7 +41,7 @@ class Ends(Stage):
             truncated = truncated & flying
         record.reward = reward
         if found(record.unfit):
-            refuse_unfit(record, self._env_id)
+            refuse_unfit(record, self.env_id)
         record.terminated = terminated
         record.truncated = truncated
         ends = terminated | truncated

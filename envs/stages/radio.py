@@ -1,6 +1,7 @@
 """The radio between the drones of a world: what each has heard last of each other."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 FORGOTTEN = 1.0  # A drone that was not heard for so long is no neighbour any more, s
 
 
+@dataclass
 class Radio(Stage):
     """Every drone sends its position and velocity in every step.
 
@@ -27,32 +29,27 @@ class Radio(Stage):
 
     Sets `State.neighbours` of the measured state: relative position, relative velocity and 1 of the
     nearest known drones; zeros if there are fewer.
-
-    Args:
-        options: Of the task.
-        period: Time of a control step, s.
-        drones: Of a world.
-        ended: Gives the drones that have crashed: they are silent.
     """
 
     arrays = ("said", "heard", "age", "keys", "silent")
 
-    def __init__(
-        self, options: "SwarmOptions", period: float, drones: int, ended: Callable[[State], Mask]
-    ) -> None:
-        self._options = options
-        self._period = period
-        self._ended = ended
-        self._own = np.eye(drones, dtype=bool)
+    options: "SwarmOptions"
+    """Of the task."""
+    period: float
+    """Time of a control step, s."""
+    drones: int
+    """Of a world."""
+    ended: Callable[[State], Mask]
+    """Gives the drones that have crashed: they are silent."""
 
     def begin(self, record: Record) -> None:
         """Each drone has heard where those in range start, at rest."""
         lots = record.draw.uniform(0.0, 1.0)
         position = record.start.position
         rest = np.concatenate((position, 0.0 * position), axis=-1)
-        message = np.concatenate((rest, 0.0 * rest[..., :1]), axis=-1)
-        record.said = filled(message, self._options.radio_delay + 1, 2)
-        record.heard = np.repeat(rest[:, None], self._own.shape[0], axis=1)
+        message = np.concatenate((rest, np.zeros_like(rest[..., :1])), axis=-1)
+        record.said = filled(message, self.options.radio_delay + 1, 2)
+        record.heard = np.repeat(rest[:, None], self.drones, axis=1)
         record.age = np.where(self._in_range(position, position), 0.0, np.inf)
         keys = (lots * 2.0**32).astype(np.uint32)
         record.keys = np.stack((keys, 0 * keys), axis=-1)
@@ -68,22 +65,22 @@ class Radio(Stage):
 
     def _exchange(self, record: Record) -> None:
         state = record.state
-        options = self._options
-        record.silent = record.silent | self._ended(state)
+        options = self.options
+        record.silent = record.silent | self.ended(state)
         parts = (state.position, state.velocity, record.silent[..., None])
         record.said = pushed(record.said, np.concatenate(parts, axis=-1), 2)
         said = record.said[:, :, 0]
         arrives = self._in_range(state.position, said[..., :3]) & (said[:, None, :, 6] == 0)
         if options.radio_loss:
             steps = (record.steps - 1).astype(np.uint32)
-            chances = uniform(words_of(record.keys, RADIO, 0, steps, self._own.shape[0]))
+            chances = uniform(words_of(record.keys, RADIO, 0, steps, self.drones))
             arrives = arrives & (chances >= options.radio_loss)  # (W, receiver, sender)
         record.heard = np.where(arrives[..., None], said[:, None, :, :6], record.heard)
         record.age = np.where(arrives, float(options.radio_delay), record.age + 1.0)
 
     def _nearest(self, record: Record, position: Floats, velocity: Floats) -> Floats:
-        time = record.age * self._period
-        known = (time <= FORGOTTEN) & ~self._own
+        time = record.age * self.period
+        known = (time <= FORGOTTEN) & ~np.eye(self.drones, dtype=bool)
         passed = np.where(known, time, 0.0)[..., None]
         heard = record.heard
         there = heard[..., :3] + heard[..., 3:] * passed - position[:, :, None]
@@ -91,7 +88,7 @@ class Radio(Stage):
         numbers = np.concatenate((there, moves, np.ones_like(passed)), axis=-1)
         numbers = np.where(known[..., None], numbers, 0.0)
         distance = np.where(known, length(there), np.inf)
-        count = self._options.neighbours
+        count = self.options.neighbours
         order = np.argsort(distance, axis=-1, kind="stable")[..., :count, None]
         nearest = np.take_along_axis(numbers, order, axis=2)
         neighbours = np.zeros_like(nearest, shape=(*record.shape, count, 7))
@@ -100,4 +97,4 @@ class Radio(Stage):
 
     def _in_range(self, receivers: Floats, senders: Floats) -> Array:
         apart = length(senders[:, None] - receivers[:, :, None])
-        return apart <= self._options.radio_range
+        return apart <= self.options.radio_range

@@ -8,7 +8,8 @@ import numpy as np
 
 from ...models.errors import InputError
 from ...models.fields import Limits
-from ...sim import Array, Draw, InitialState, allocated, atan2, cos, length, sin, stack, total
+from ...models.matrices import right_inverse
+from ...sim import Array, Draw, InitialState, atan2, cos, length, sin, stack, total
 from ..config import EnvConfig
 from ..spec import Metric
 from ..state import State
@@ -107,7 +108,7 @@ class Cable(Swarm):
         lift = vehicle.mass * vehicle.gravity + self._load
         self._inwards = self._load * sin(self._slant) / cos(self._slant)
         self._tilt = atan2(self._inwards, lift)
-        self._allocated = allocated(vehicle)
+        self._allocated = right_inverse(vehicle.allocation)
         thrust = self.carrying(np.linspace(0.0, 2 * math.pi, 36))
         able = (vehicle.thrust_low <= thrust).all() and (thrust <= vehicle.thrust_high).all()
         if not able:

@@ -14,10 +14,10 @@ from ...models.errors import InputError, shortened
 from ..effects import NO_EFFECTS, EffectOptions
 from ..state import Array, WorldState, clip, component, stack, total
 from .cascade import Attitude, Position, Rates, Velocity
-from .gains import Gains, allocated, shared_ranges
+from .gains import Gains, shared_ranges
 
 __all__ = [
-    "LEVELS", "SHARES", "CollectiveThrust", "Controller", "Gains", "RotorThrust", "allocated",
+    "LEVELS", "SHARES", "CollectiveThrust", "Controller", "Gains", "RotorThrust",
     "make_controller",
 ]  # fmt: skip
 

@@ -98,7 +98,7 @@ class Gains:
         gravity = vehicle.gravity
         weight = vehicle.mass * gravity
         share = vehicle.hover_thrust / weight
-        mix = allocated(vehicle)[:, 1:] / share[:, np.newaxis]
+        mix = right_inverse(vehicle.allocation)[:, 1:] / share[:, np.newaxis]
         lowest = float((vehicle.thrust_low / share).max())
         highest = float((vehicle.thrust_high / share).min())
         room = max(min(highest - weight, weight - lowest), LEAST_ROOM * (highest - lowest))
@@ -140,14 +140,6 @@ class Gains:
 def _largest(vehicle: "models.Vehicle") -> Array:
     """Of each row of the allocation, shape (4, 1)."""
     return np.abs(vehicle.allocation).max(axis=1, keepdims=True).clip(1e-12)
-
-
-def allocated(vehicle: "models.Vehicle") -> Array:
-    """Thrusts for a collective thrust of 1 N and torques of 1 N·m about each axis, shape (R, 4).
-
-    Those of the least size, Aᵀ (A Aᵀ)⁻¹ for an allocation A.
-    """
-    return right_inverse(vehicle.allocation)
 
 
 def shared_ranges(several: Sequence[Gains]) -> list[Gains]:

@@ -49,6 +49,8 @@ class AirEffects(Kept):
     """
 
     arrays = ("_before",)
+    _before: Array = None
+    """The last motion."""
 
     def __init__(self, vehicle: "models.Vehicle", options: EffectOptions) -> None:
         self._options = options
@@ -94,7 +96,6 @@ class AirEffects(Kept):
             _check_stiffness(vehicle, slope * max(1.0, turning), "drag of the rotors")
         if options.ground_effect:
             (self._radius,) = coefficients.need("rotors.radius", "ground_effect")
-        self._before: Array = None  # the last motion
 
     def vary(self, numbers: Mapping[str, Array]) -> None:
         """Take other coefficients for each drone, (W, A), by their names in a vehicle's file.

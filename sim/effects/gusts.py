@@ -36,6 +36,8 @@ class Gusts(Kept):
     """
 
     arrays = ("_filters", "_state")
+    _filters: Array = None
+    _state: Array = None
 
     def __init__(self, wind_speed: float, mean_wind: tuple[float, ...], timestep: float) -> None:
         self._sigma = 0.1 * wind_speed
@@ -44,8 +46,6 @@ class Gusts(Kept):
         self._along = (1.0, 0.0) if across == 0 else (x / across, y / across)
         self._speed = max(LEAST_SPEED, math.sqrt(x * x + y * y + z * z))
         self._step = timestep
-        self._filters: Array = None
-        self._state: Array = None
 
     def begin(self, mask: Array, height: Array, normal: Array, factor: Array = 1.0) -> None:
         """Begin in the stationary state; height in m, shape (W, A), normal (W, A, 5).

@@ -31,6 +31,10 @@ class RotorEffects(Kept):
     """
 
     arrays = ("charge", "voltage", "_roots")
+    charge: Array = None
+    voltage: Array = None
+    _roots: Array = None
+    """Of the thrusts, proportional to the rotors' speeds."""
 
     def __init__(self, vehicle: "models.Vehicle", options: EffectOptions) -> None:
         self._options = options
@@ -76,9 +80,6 @@ class RotorEffects(Kept):
                 f"effects.efficiency: expected {count} numbers, one for each rotor, got {share}"
             )
         self.names = [f"thrust_{number}" for number in range(1, count + 1)]
-        self._roots: Array = None  # of the thrusts, proportional to the rotors' speeds
-        self.charge: Array = None
-        self.voltage: Array = None
 
     def begin(self, mask: Array, thrust: Array, factors: ByName) -> Array:
         """Start the rotors at the speeds that these thrusts need; factors as of `take`.

@@ -6,7 +6,6 @@ from typing import ClassVar
 from ...models.fields import Limits
 from ..elementary import power
 from ..state import Array, chosen, clip
-from ..world import World
 from .base import Bounds, Sensor, Setting, Values, coefficients
 
 SEA_LEVEL_PRESSURE = 101_325.0  # Pa. These are those of ISO 2533:1975
@@ -53,10 +52,7 @@ class Barometer(Sensor):
     components = ("pressure altitude",)
     units = ("m",)
 
-    def __init__(self, values: Values, period: float, world: World) -> None:
-        super().__init__(values, period, world)
-        self._step = values["walk"] * math.sqrt(self.interval)
-        self._bias: Array = 0.0
+    _bias: Array = None
 
     @classmethod
     def bounds(cls, values: Values) -> Bounds:
@@ -70,5 +66,6 @@ class Barometer(Sensor):
         height = self.world.state.position[..., 2:] + self.values["altitude"]
         exact = isa_pressure(clip(height, LOWEST, HIGHEST))
         pressure = exact + self._bias + self.values["noise"] * normal[..., :1]
-        self._bias = self._bias + self._step * normal[..., 1:]
+        step = self.values["walk"] * math.sqrt(self.interval)
+        self._bias = self._bias + step * normal[..., 1:]
         return isa_height(clip(pressure, *_PRESSURES))

@@ -98,21 +98,20 @@ class Sensor(Source):
     settings: ClassVar[dict[str, Setting]]
     columns: ClassVar[int]
     arrays: ClassVar[tuple[str, ...]] = ("_held", "_readings")
+    _held: Array = None
+    """The last reading that was taken."""
+    _readings: Array = None
+    """What is observed, with its flag, and those on their way: (W, A, k + 1, lag + 1)."""
 
     def __init__(self, values: Values, period: float, world: World) -> None:
-        self._every = values["every"]
-        self._lag = values["lag"]
         self.values = values
-        self.interval = self._every * period
+        self.interval = values["every"] * period
         self.world = world
         self._low, self._high = map(np.array, self.bounds(values))
         # One number more than the sensor takes decides whether a reading is lost.
         self._noise = world.random.noise(f"sensor {self.name}", self.columns + 1)
         dropout = values["dropout"]
         self._lost = round(NormalDist().inv_cdf(dropout), 12) if dropout else -math.inf
-        self._held: Array = None  # the last reading that was taken
-        # What is observed, with its flag, and those on their way: (W, A, k + 1, lag + 1).
-        self._readings: Array = None
 
     @classmethod
     def checked(cls, given: Values) -> dict[str, Any]:
@@ -175,13 +174,13 @@ class Sensor(Source):
         self.draw(mask, self._noise.normal(mask)[..., :-1])
         first = self._read(self._noise.normal(mask))
         self._held = chosen(mask, first, self._held)
-        old = np.repeat(_flagged(first, 0.0), self._lag, axis=-1)
+        old = np.repeat(_flagged(first, 0.0), self.values["lag"], axis=-1)
         readings = np.concat((_flagged(first, 1.0), old), axis=-1)
         self._readings = chosen(mask, readings, self._readings)
 
     def sample(self, mask: Array, steps: Array) -> None:
         """After a control step of the drones of a mask; `steps` counts those of each episode."""
-        due = mask & (steps % self._every == 0)
+        due = mask & (steps % self.values["every"] == 0)
         fresh = due
         if some(due):
             normal = self._noise.normal(due)

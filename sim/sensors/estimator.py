@@ -38,13 +38,14 @@ class Estimator(Source):
     units = ("m",) * 3 + ("m/s",) * 3 + ("1",) * 4 + ("rad/s",) * 3
     top = (FURTHEST,) * 3 + (MAX_SPEED,) * 3 + (UNIT,) * 4 + (2 * MAX_SPEED,) * 3
 
+    position: Array = None
+    velocity: Array = None
+    quaternion: Array = None
+    body_rates: Array = None
+
     def __init__(self, interval: float, gravity: float) -> None:
         self.interval = interval
         self._gravity = gravity
-        self.position: Array = 0.0
-        self.velocity: Array = 0.0
-        self.quaternion: Array = 0.0
-        self.body_rates: Array = 0.0
 
     def begin(self, mask: Array, state: WorldState, imu: Array) -> None:
         """Take over the exact state of the drones of a mask."""

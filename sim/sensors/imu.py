@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from ..rotations import to_body
 from ..state import Array, chosen
-from ..world import World
 from .base import Bounds, Sensor, Values, coefficients
 
 GYRO_RANGE = math.radians(2000.0)  # rad/s: the largest setting of the BMI088
@@ -41,11 +40,7 @@ class Imu(Sensor):
     components = tuple(f"{what} {axis}" for what in ("gyro", "accelerometer") for axis in "xyz")
     units = ("rad/s",) * 3 + ("m/s²",) * 3
 
-    def __init__(self, values: Values, period: float, world: World) -> None:
-        super().__init__(values, period, world)
-        self._white = self._both("noise") / math.sqrt(self.interval)
-        self._step = self._both("walk") * math.sqrt(self.interval)
-        self._bias: Array = 0.0
+    _bias: Array = None
 
     def _both(self, what: str) -> NDArray[np.float64]:
         return np.repeat([self.values[f"gyro_{what}"], self.values[f"accelerometer_{what}"]], 3)
@@ -65,6 +60,7 @@ class Imu(Sensor):
         gravity = np.array((0.0, 0.0, self.world.vehicle.gravity))
         force = to_body(state.quaternion, self.world.acceleration() + gravity)
         exact = np.concat((state.body_rates, force), axis=-1)
-        reading = exact + self._bias + self._white * normal[..., :6]
-        self._bias = self._bias + self._step * normal[..., 6:]
+        root = math.sqrt(self.interval)
+        reading = exact + self._bias + self._both("noise") / root * normal[..., :6]
+        self._bias = self._bias + self._both("walk") * root * normal[..., 6:]
         return reading
