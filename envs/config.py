@@ -154,9 +154,14 @@ class EnvConfig:
 
     def __post_init__(self) -> None:
         check_fields(self)
-        self._set(env_id=canonical_id(self.env_id))
-        self._set(scene=SceneConfig.parse(self.scene), backend=BackendConfig.parse(self.backend))
-        self._set(vehicle=vehicle_words(self.vehicle), cameras=words_of("cameras", self.cameras))
+        self._set(
+            env_id=canonical_id(self.env_id),
+            scene=SceneConfig.parse(self.scene),
+            backend=BackendConfig.parse(self.backend),
+            vehicle=vehicle_words(self.vehicle),
+            cameras=words_of("cameras", self.cameras),
+            randomize=Randomization(self.randomize, None).to_options(),
+        )
         if self.files:
             from ..models.bundle import checked_bundles
 
@@ -167,7 +172,6 @@ class EnvConfig:
             self._set(sensors=checked_sensors(self.sensors))
         if not isinstance(self.effects, EffectOptions):
             self._set(effects=read_table(EffectOptions, self.effects, "effects"))
-        self._set(randomize=Randomization(self.randomize, None).to_options())
         if not isinstance(self.task, Mapping):
             raise InputError(f"task: expected options by name, got {shortened(self.task)}")
         options: Options = self.task

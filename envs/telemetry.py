@@ -49,19 +49,13 @@ class Quantity:
         )
 
 
-def _of_state(name: str, components: Names, unit: str, frame: str) -> Quantity:
-    return Quantity(name, components, unit, attrgetter(f"record.state.{name}"), frame)
+def _of_state(name: str, components: Names, unit: str, frame: str, field: str = "") -> Quantity:
+    return Quantity(name, components, unit, attrgetter(f"record.state.{field or name}"), frame)
 
 
 POSE = (
     _of_state("position", ("x", "y", "z"), "m", WORLD),
-    Quantity(
-        "attitude",
-        ("qw", "qx", "qy", "qz"),
-        "",
-        attrgetter("record.state.quaternion"),
-        BODY_TO_WORLD,
-    ),
+    _of_state("attitude", ("qw", "qx", "qy", "qz"), "", BODY_TO_WORLD, "quaternion"),
     _of_state("velocity", ("vx", "vy", "vz"), "m/s", WORLD),
     _of_state("body_rates", ("rate_x", "rate_y", "rate_z"), "rad/s", BODY),
 )

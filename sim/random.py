@@ -226,7 +226,6 @@ class Noise(Kept):
         self._ahead = max(1, _AHEAD // worlds)
         self._rows = np.zeros((worlds, self._ahead, random.drones, size))
         self._left = np.zeros(worlds, int)  # rows that are drawn ahead
-        self._worlds = np.arange(worlds)
 
     def begin(self, begun: Any) -> None:
         """An episode of some worlds begins, bool, (W,)."""
@@ -255,7 +254,7 @@ class Noise(Kept):
             drawn = self._drawn(random.keys, random.episode, self.step)
             self.step = np.where(mask[:, 0], self.step + np.uint32(1), self.step)
             return np.where(mask[..., None], drawn, 0.0)
-        ids = self._worlds if mask is None else np.flatnonzero(mask[:, 0])
+        ids = random.ids(mask)
         missing = ids[self._left[ids] == 0]
         if missing.size:
             self._fill(missing)
@@ -270,7 +269,7 @@ class Noise(Kept):
         """Those of a single drone, faster."""
         left = self._left.item()
         if left == 0:
-            self._fill(self._worlds)
+            self._fill(np.zeros(1, int))
             left = self._ahead
         self._left[0] = left - 1
         self.step[0] += 1

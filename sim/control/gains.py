@@ -30,7 +30,7 @@ from ... import models
 from ...models.errors import InputError
 from ...models.matrices import right_inverse
 from ..elementary import atan2, cos, expm1, sin
-from ..state import Array, total
+from ..state import total
 
 LEAD = 3.0
 """Rotors are driven to follow this many times faster than their own lag."""
@@ -89,7 +89,8 @@ class Gains:
         rotors, s.
         """
         # The rank does not depend on the craft's size.
-        rank = int(np.linalg.matrix_rank(vehicle.allocation / _largest(vehicle)))
+        size = np.abs(vehicle.allocation).max(axis=1, keepdims=True).clip(1e-12)
+        rank = int(np.linalg.matrix_rank(vehicle.allocation / size))
         if rank != 4:
             raise InputError(
                 "vehicle: expected a vehicle whose rotors roll, pitch and yaw it, for this action, "
@@ -135,11 +136,6 @@ class Gains:
             mix=tuple(map(tuple, mix.tolist())),
             share=tuple(share.tolist()),
         )
-
-
-def _largest(vehicle: "models.Vehicle") -> Array:
-    """Of each row of the allocation, shape (4, 1)."""
-    return np.abs(vehicle.allocation).max(axis=1, keepdims=True).clip(1e-12)
 
 
 def shared_ranges(several: Sequence[Gains]) -> list[Gains]:

@@ -140,7 +140,7 @@ class Sensors(Kept):
 
     def parts(self) -> dict[str, Kept]:
         """The sensors and the estimator."""
-        parts: dict[str, Kept] = dict(self._sensors)
+        parts: dict[str, Kept] = {**self._sensors}
         if self._estimator is not None:
             parts[_ESTIMATE] = self._estimator
         return parts
