@@ -80,7 +80,10 @@ class MujocoWorld(World):
         self._warnings = batch.warning  # of each kind the last info, and how many
         self._no_warnings = self._warnings.tobytes()
         self._no_contacts = self._contacts.tobytes()
-        self._bind_thrusts(members_of(vehicle, drones))
+        rotors = [rotor for craft in members_of(vehicle, drones) for rotor in craft.rotors]
+        self._newtons = np.array([rotor.newtons for rotor in rotors])  # of a control of 1
+        self._command = np.zeros_like(self._ctrl)
+        self._thrust = np.zeros_like(self._ctrl) if self._on_rotors else self._command
         self._touching = np.zeros((num_worlds, drones), bool)
         self._colliding: np.ndarray | None = None
         if drones > 1:
@@ -101,14 +104,6 @@ class MujocoWorld(World):
             payload_velocity=None if self._cable is None else moves,
         )
         assert np.shares_memory(self.state.position, batch.state)
-
-    def _bind_thrusts(self, crafts: tuple[Vehicle, ...]) -> None:
-        """Controls in newtons are the thrusts, and without effects the commands too."""
-        newtons = np.array([rotor.newtons for craft in crafts for rotor in craft.rotors])
-        self._newtons = None if (newtons == 1.0).all() else newtons
-        alike = self._newtons is None and self.effects is None
-        self._command = self._ctrl if alike else np.zeros_like(self._ctrl)
-        self._thrust = np.zeros_like(self._ctrl) if self._on_rotors else self._command
 
     def _flown_model(self, drones: int) -> mujoco.MjModel:
         """The vehicle's, or one with more crafts, with a payload or for a drawn center of mass."""
@@ -141,7 +136,7 @@ class MujocoWorld(World):
             self._thrust[ids] = np.reshape(thrust, self._ctrl.shape)[ids]
         if hung is not None:
             self._place_payload(ids, hung)
-        self._apply_thrust(self._thrust, ids)
+        self._ctrl[ids] = self._thrust[ids] / self._newtons
         # To wake the threads takes longer than a few worlds.
         groups = ids[None] if len(ids) > _FEW else ids[:, None]
         for some in groups:
@@ -161,7 +156,7 @@ class MujocoWorld(World):
         else:
             self.state.command[some] = thrust[some]
         if self.effects is None:
-            self._apply_thrust(self._command, ...)
+            self._ctrl[...] = self._command / self._newtons
         if not again:
             self._clear_contacts(some)
         while substeps > 0:
@@ -216,7 +211,7 @@ class MujocoWorld(World):
         mean, end, wrench = effects.step(self.state, mask)
         if self._on_rotors:
             self._thrust[some] = np.reshape(end, self._ctrl.shape)[some]
-        self._apply_thrust(np.reshape(mean, self._ctrl.shape), some)
+        self._ctrl[some] = np.reshape(mean, self._ctrl.shape)[some] / self._newtons
         if wrench is not None:
             self._applied[some] = np.reshape(wrench, self._applied.shape)[some]
 
@@ -296,12 +291,6 @@ class MujocoWorld(World):
         qpos[ids, -4:] = (1.0, 0.0, 0.0, 0.0)
         qvel[ids, -6:-3] = qvel[ids, :3]
         qvel[ids, -3:] = 0.0
-
-    def _apply_thrust(self, thrust: np.ndarray, some: Array) -> None:
-        if self._newtons is not None:
-            self._ctrl[some] = thrust[some] / self._newtons
-        elif thrust is not self._ctrl:
-            self._ctrl[some] = thrust[some]
 
     def _describe_warnings(self) -> str:
         counts = self._warnings[:, :, 1]
