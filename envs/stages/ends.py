@@ -40,8 +40,7 @@ class Ends(Stage):
             terminated = terminated & flying
             truncated = truncated & flying
         record.reward = reward
-        if found(record.unfit):
-            refuse_unfit(record, self.env_id)
+        refuse_unfit(record, self.env_id)
         record.terminated = terminated
         record.truncated = truncated
         ends = terminated | truncated
@@ -51,6 +50,8 @@ class Ends(Stage):
 
 def refuse_unfit(record: Record, env_id: str) -> None:
     """Raise `InputError` for a reward or an observation that is not finite."""
+    if not found(record.unfit):
+        return
     first = int(np.flatnonzero(record.unfit)[0])
     for name, values in (*record.observations.items(), ("reward", record.reward)):
         numbers = np.reshape(values, (record.unfit.size, -1))[first]
