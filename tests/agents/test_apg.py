@@ -118,6 +118,17 @@ def test_a_clipped_action_has_no_derivative() -> None:
     assert slopes[1, 0].tolist() == pytest.approx([-0.051 / 12] * 2 + [0.0, -0.051 / 12], rel=1e-2)
 
 
+def test_a_clipped_reward_has_no_derivative() -> None:
+    """Of two steps the first one's reward is cut: the second action counts as before."""
+    agent, rollout = climbing(2)
+    before = agent.slopes(rollout)
+    agent.config = replace(agent.config, reward_clip=0.5)
+    rewards = np.array([[0.5] * 3, [0.1] * 3])
+    after = agent.slopes(replace(rollout, rewards=rewards))
+    assert after[1].tolist() == before[1].tolist()
+    assert after[0] == pytest.approx(before[1], rel=1e-2)  # by the second reward alone
+
+
 def test_it_learns() -> None:
     gains = []
     config = APGConfig(hidden=(16,), activation="tanh", learning_rate=0.02)

@@ -145,6 +145,29 @@ def test_three_steps_against_differences_of_numpy(
     assert abs(found).max() > 0.01
 
 
+def test_two_drones_of_a_world_against_differences_of_numpy() -> None:
+    """What one does changes the rewards of both."""
+    options: dict[str, Any] = {"drones": 2, "vehicle": "crazyflie2", "action": "rates"}
+    env = env_of("rotorgram/Formation-v0", 2, **options)
+    theirs = env_of("rotorgram/Formation-v0", 2, compiled=False, **options)
+    start = env.snapshot()
+    actions = np.full((2, 2, 4), 0.1, np.float32)
+    nothing = np.zeros_like(flat(env.observations, env.env_spec, 2))
+    by_reward = np.array([[1.0, -2.0], [3.0, 0.5]])
+    found = derivatives(env, actions, by_reward, nothing)
+    size = 2.0**-10
+    for place in np.ndindex(actions.shape):
+        ends = []
+        for move in (size, -size):
+            moved = actions.copy()
+            moved[place] += move
+            theirs.restore(start)
+            ends.append(flown(theirs, moved, by_reward, nothing).sum())
+        expected = (ends[0] - ends[1]) / (2 * size)
+        assert found[place] == pytest.approx(expected, rel=1e-3, abs=1e-4), place
+    assert abs(found).max() > 0.01
+
+
 def test_after_an_end_nothing_counts() -> None:
     """Three steps of which the loss has the first two: as two steps alone."""
     draw = np.random.default_rng(5)
