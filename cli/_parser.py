@@ -63,10 +63,11 @@ def _parsed_env(
         check_count("drones", command.drones)
         return _merged(command, given, {}, file)
     env_id = registry.load(env_id)
+    task = registry.task_type(env_id)
     names = [name.removeprefix("env.") for name in given if name.startswith("env.")]
     options = None
     if names or "help" in given or "-h" in words:  # tyro imports typeguard for some of them, slowly
-        options = _for_tyro(registry.task_type(env_id).Options)
+        options = _for_tyro(task.Options)
     command = _run_tyro(_for_tyro(kind, options), prog, words)
     own = {name: getattr(command.options, name) for name in sorted(names)}
     clashing = {name: own.pop(name) for name in names if name in KEYWORDS}
