@@ -64,8 +64,8 @@ def test_the_tuned_preset_depends_on_the_task() -> None:
     assert ours.env_steps == 41_000
     assert ours.config.hidden == (16,)
     hover = find_preset("ppo", "tuned", "rotorgram/Hover-v0")
-    assert hover.num_envs == 128
-    assert hover.config.hidden == (64, 64)
+    assert hover.num_envs == 64
+    assert hover.config.hidden == (32, 32)
     assert find_preset("sb3-ppo", "tuned", "rotorgram/Hover-v0") == hover
     racing = find_preset("ppo", "tuned", "rotorgram/Racing-v0")
     assert racing.num_envs == 512
