@@ -122,7 +122,9 @@ class CompiledLoop(Loop):
         super().put(state)
 
     def _give(self, results: dict[str, np.ndarray]) -> None:
-        self.observations = {array.name: results[array.name] for array in self.spec.observation}
+        self.observations = {}
+        for number, array in enumerate(self.spec.observation):
+            self.observations[array.name] = results[f"observation/{number}"]
         self.rewards = results["reward"]
         self._headline = results["headline"]
         self.terminated = results["terminated"]

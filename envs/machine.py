@@ -189,8 +189,8 @@ class Machine:
         metric = self._loop.spec.headline
         headline = record.metrics[metric.name] if metric else np.nan + record.reward
         seen = {"reward": record.reward, "headline": headline.astype(np.float64)}
-        for array in self._loop.spec.observation:
-            seen[array.name] = record.observations[array.name].astype(array.dtype)
+        for number, array in enumerate(self._loop.spec.observation):  # their names are the task's
+            seen[f"observation/{number}"] = record.observations[array.name].astype(array.dtype)
         world: Any = self._loop.world
         seen |= {name: getattr(record, name) for name in _ENDS}
         return seen | {"wrong": record.unfit | world.bad}

@@ -139,6 +139,30 @@ class Branching(registry.task_type(HOVER)):  # type: ignore[misc]
         return None
 
 
+class Named(registry.task_type(HOVER)):  # type: ignore[misc]
+    """Its arrays have names of the loop's, and one that LLVM would not take."""
+
+    names = ("reward", "done", "sent", "record/kept/steps", 'a"b')
+
+    def setup(self) -> None:
+        """As of Hover."""
+        super().setup()
+        self.observation = tuple(replace(self.observation[0], name=name) for name in self.names)
+
+    def observe(self, state: Any) -> Any:
+        """As of Hover."""
+        (values,) = super().observe(state).values()
+        return dict.fromkeys(self.names, values)
+
+
+def test_a_task_names_its_arrays() -> None:
+    register("Named-v0", Named)
+    ours, theirs = both(Case("Named-v0").on_rigid())
+    for loop in (ours, theirs):
+        flight(loop, range(STEPS))
+    check_same(ours, theirs)
+
+
 def test_what_cannot_be_compiled_flies_by_numpy_and_is_said(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
