@@ -44,7 +44,7 @@ class CheckTask(Command):
         for finding in found:
             print(f"{env_id}: {finding.removeprefix(f'{env_id}: ')}")
         if not found:
-            flown = f"{WORLDS} drones flew {STEPS} steps with the bits of NumPy"
+            flown = f"{WORLDS} worlds flew {STEPS} steps with the bits of NumPy"
             print(f"{env_id}: compiled; {flown}, within the bounds")
         return 1 if found else 0
 
@@ -75,10 +75,11 @@ def findings(env_id: str) -> Iterator[str]:
     """A sentence for each thing that is wrong with a task."""
     from dataclasses import replace
 
-    from ..envs import EnvConfig, Loop
+    from ..envs import EnvConfig, Loop, registry
     from ..envs.compiled import make_loop, place_of
 
-    config = EnvConfig.from_keywords(env_id, backend="rigid")
+    drones = registry.task_type(env_id).min_drones
+    config = EnvConfig.from_keywords(env_id, drones=drones, backend="rigid")
     plain = replace(config, backend=replace(config.backend, compiled=False))
     try:
         loop = Loop(plain, WORLDS)
@@ -120,7 +121,7 @@ def _flight(loop: "Loop") -> list[Step]:
             sent = dice.integers(0, controller.choices, sent.shape).astype(np.float64)
         loop.advance(sent.astype(np.float32), resets, np.arange(drones) + step * drones)
         resets = loop.done
-        steps.append({**loop.observations, "reward": loop.rewards, "end": loop.terminated})
+        steps.append({"reward": loop.rewards, "end": loop.terminated, **loop.observations})
     return steps
 
 

@@ -48,9 +48,11 @@ def test_observations_and_their_bounds(tmp_path: Path, capsys: Capsys) -> None:
     assert out.startswith(expected)
 
 
-@pytest.mark.parametrize("task", [f"{LANDING}:Landing", "rotorgram/Elevation-v0"])
+@pytest.mark.parametrize(
+    "task", [f"{LANDING}:Landing", "rotorgram/Elevation-v0", "rotorgram/Crossing-v0"]
+)
 def test_a_right_task(task: str, capsys: Capsys) -> None:
-    assert "-v0: compiled; 8 drones flew 50 steps" in output(capsys, "check-task", task)
+    assert "-v0: compiled; 8 worlds flew 50 steps" in output(capsys, "check-task", task)
 
 
 def test_what_is_no_task(tmp_path: Path, capsys: Capsys) -> None:
