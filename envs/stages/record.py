@@ -140,7 +140,6 @@ class Record:
         for name in self.kept:
             known.pop(name, None)
         vars(self.memory).clear()
-        self.metrics = {}
         with self.memory.open("begin"):
             for key, array in arrays.items():
                 part, _, name = key.partition("/")
@@ -150,6 +149,8 @@ class Record:
                     known[name] = array.copy()[()]
                 else:
                     known.setdefault(part, {})[name] = array.copy()[()]
+        if self.has_begun:
+            known.setdefault("metrics", {})  # of a task that has none
         self.flown = self.begun = None
 
     @property

@@ -74,6 +74,16 @@ def test_vector_envs_are_copied(case: str, copied: str) -> None:
     assert flight(twin, 12) == flight(env, 12)
 
 
+@pytest.mark.parametrize("backend", ["mujoco", "rigid"])
+def test_the_first_reset_of_a_copy_may_be_of_some(backend: str) -> None:
+    env = gym.make_vec(HOVER, num_envs=2, backend=backend)
+    mask = np.array([True, False])
+    ours, theirs = (
+        one.reset(seed=1, options={"reset_mask": mask})[0] for one in (copy.deepcopy(env), env)
+    )
+    assert bits(ours[0]) == bits(theirs[0])
+
+
 def test_results_of_the_snapshot_are_back() -> None:
     env: Any = gym.make_vec(HOVER, num_envs=3).unwrapped
     env.reset(seed=1)
