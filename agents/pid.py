@@ -37,7 +37,8 @@ class PID:
         options = spec.options
         if spec.env_id != ENV_ID:
             raise InputError(
-                f"pid: expected the env {ENV_ID}, got {spec.env_id}, which geometric flies"
+                f"pid: expected the env {ENV_ID}, got {spec.env_id}: "
+                "geometric flies tasks with a goal"
             )
         modes = f"{options['observation']!r} and {options['action_type']!r}"
         expected = "observation='full' and action_type='continuous'"

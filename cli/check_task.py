@@ -56,12 +56,14 @@ def _env_id(task: str) -> str:
     from ..envs import Task, registry
 
     file, _, name = task.rpartition(":")
+    if name.endswith(".py"):
+        raise InputError(f"task: expected FILE.py:CLASS, got {task}")
     if not file.endswith(".py"):
         return registry.load(task)
     path = Path(file)
     spec = spec_from_file_location(path.stem, path)
     if spec is None or spec.loader is None or not path.is_file():
-        raise InputError(f"task: expected a file of Python, got {file}")
+        raise InputError(f"task: expected a file of Python, there is none: {file}")
     module = sys.modules[path.stem] = module_from_spec(spec)
     spec.loader.exec_module(module)
     kind = getattr(module, name, None)

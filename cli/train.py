@@ -14,8 +14,8 @@ from ._training import TrainingFlags
 class Train(AgentFlags, TrainingFlags):
     """Train an agent, in this process or over UDP.
 
-    vpg, a2c and sb3-a2c learn Elevation-v0 over UDP, as in the paper. With --udp, --record or
-    --listen all agents do, from a simulator process of their own or those that come to --listen.
+    vpg, a2c and sb3-a2c learn Elevation-v0 over UDP, as in the paper. All agents do with --udp,
+    with --record or --listen: from a simulator process of their own or those that come to --listen.
     The others, and all with --no-udp, fly in this process. The numbers are the same. Ctrl-C stops
     at the next update with everything written; --resume goes on to the same numbers (sb3-… start
     anew), or to more env steps, by --env-steps.

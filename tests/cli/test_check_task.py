@@ -56,6 +56,7 @@ def test_a_right_task(task: str, capsys: Capsys) -> None:
 
 
 def test_what_is_no_task(tmp_path: Path, capsys: Capsys) -> None:
+    assert "expected FILE.py:CLASS, got mine.py" in refused(capsys, "check-task", "mine.py")
     assert "expected a file of Python" in refused(capsys, "check-task", "nowhere.py:Mine")
     (tmp_path / "mine.py").write_text(HEAD)
     told = refused(capsys, "check-task", f"{tmp_path / 'mine.py'}:Other")
