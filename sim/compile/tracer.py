@@ -25,6 +25,7 @@ Traced = Any
 
 _FLAG = np.dtype(bool)
 _WHOLE = np.dtype(np.int64)
+_EXPONENTS = (*range(-8, 0), *range(1, 9))
 _OPERATIONS: dict[Callable[..., Any], str] = {
     np.add: "add",
     np.subtract: "subtract",
@@ -387,10 +388,11 @@ def _remainder(like: TracedArray, x: Any, by: Any) -> Traced:
 
 
 def _power(like: TracedArray, x: Any, exponent: Any) -> Traced:
-    if exponent in (2, 2.0):
-        return x * x
     if exponent == 0.5:
         return np.sqrt(x)
+    if exponent in _EXPONENTS:  # of numbers below 0 too, which have no logarithm
+        product = reduce(np.multiply, [x] * abs(int(exponent)))
+        return product if exponent > 0 else 1.0 / product
     from ..elementary import power  # which is made of traced functions
 
     return power(x, exponent)
