@@ -19,7 +19,7 @@ WORLDS = 8
 STEPS = 50
 _OWN = re.compile(
     r"\b(?:np|numpy|math)\.(?:sin|cos|tan|arctan2|atan2|exp|expm1|log|power|pow|sum)\b"
-    r"|\b(?:(?:np|numpy)\.)?random\.\w+"
+    r"|\b(?:(?:np|numpy)\.)?random\.\w+|\*\* ?[3-9]"
 )
 _ADVICE = "take sin, exp, power, total … from rotorgram.sim, and random numbers from `draw` alone"
 Step = dict[str, Any]
