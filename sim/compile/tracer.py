@@ -25,6 +25,7 @@ Traced = Any
 
 _FLAG = np.dtype(bool)
 _WHOLE = np.dtype(np.int64)
+_DTYPES = ("bool", "int32", "uint32", "int64", "uint64", "float32", "float64")
 _EXPONENTS = (*range(-8, 0), *range(1, 9))
 _OPERATIONS: dict[Callable[..., Any], str] = {
     np.add: "add",
@@ -136,6 +137,8 @@ class TracedArray(NDArrayOperatorsMixin):
         dtype = np.dtype(dtype)
         if dtype == self.dtype:
             return self.copy() if copy else self
+        if dtype.name not in _DTYPES:
+            _refuse(f"an array of {dtype}", f"take one of {', '.join(_DTYPES)}")
         return self._each(lambda value: self.program.cast(value, dtype), dtype, self)
 
     def view(self, dtype: Any = None) -> "TracedArray":
