@@ -241,6 +241,7 @@ def _rigid(drones: int) -> Callable[[ExitStack], Step]:
 
 
 def _l2f(_: ExitStack) -> Step:
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # it counts seconds of all threads
     import l2f
 
     vector = l2f.vector_selector[_DRONES]
@@ -260,21 +261,6 @@ def _l2f(_: ExitStack) -> Step:
         vector.step(device, env, parameters, state, next(actions), later, rng)
         state.assign(later)
         vector.observe(device, env, parameters, state, seen, rng)
-        return _DRONES
-
-    return step
-
-
-def _hyperdrone(_: ExitStack) -> Step:
-    from hyperdrone.dynamics import Sim
-
-    sim = Sim(_DRONES)
-    sim.reset(sample_states=True)
-    actions = _actions(16, _DRONES, sim.action_dim)
-
-    def step() -> int:
-        sim.step(next(actions))
-        sim.observe()
         return _DRONES
 
     return step
@@ -308,6 +294,5 @@ LAYERS = (
     Layer("rigid, 1024", "the same", _DRONES, _rigid(_DRONES), time.process_time),
     Layer("rigid, 4096", "the same", 4096, _rigid(4096), time.process_time),
     Layer("L2F, 1024", "one step of RK4", _DRONES, _l2f, time.process_time, "l2f"),
-    Layer("HyperDrone, 1024", "one step", _DRONES, _hyperdrone, time.process_time, "hyperdrone"),
     Layer("Crazyflow, 1024", "ten steps", _DRONES, _crazyflow, time.process_time, "crazyflow"),
 )
