@@ -67,7 +67,9 @@ def _check_same_env(then: EnvSpec, now: EnvSpec) -> None:
             )
         if name == "options":
             reason = options_difference(expected, got)
-            raise ResumeError(f"resume: options of the env: {reason:.600}")
+            raise ResumeError(
+                f"resume: expected an env with options of the training: {reason:.600}"
+            )
         raise ResumeError(
             f"resume: expected an env with {name} {expected!s:.300}, got {got!s:.300}"
         )

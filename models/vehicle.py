@@ -410,7 +410,7 @@ def _read_rotor(model: MjModel, data: MjData, index: int) -> Rotor:
         raise InputError(f"vehicle: expected {fault}")
     turn = data.site_xmat[site].reshape(3, 3)
     turned = product(np.array((force, torque)), turn.T) * math.copysign(1 / size, newtons)
-    axis, reaction = settled(turned).tolist()
+    axis, reaction = (settled(one, float(abs(one).max()) or 1.0).tolist() for one in turned)
     low, high = sorted((one.ctrlrange * abs(newtons)).tolist())
     return Rotor(
         name=name,
