@@ -64,7 +64,7 @@ class CompiledLoop(Loop):
             record.action = self.pipeline.actions.neutral()
         record.waiting = results["waiting"].reshape(record.shape)
         self._give(results)
-        self._tells(told)
+        self._take_told(told)
         if some(results["wrong"]):
             self._check()
 

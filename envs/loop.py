@@ -187,7 +187,7 @@ class Loop:
         """New arrays of N drones, of the declared dtypes."""
         record = self._record
         count = self.num_envs
-        self._tells(None)
+        self._take_told(None)
         self._headline: Floats | None = None
         known = vars(record).get("observations")
         self.observations = {}
@@ -269,7 +269,7 @@ class Loop:
             self._told = told
         return self._told
 
-    def _tells(self, told: Told | None) -> None:
+    def _take_told(self, told: Told | None) -> None:
         """Take what is told of a step; None: what record, world and task say when asked."""
         self._told = told
         self._content = None

@@ -30,7 +30,7 @@ _TOLD = "told/"
 _TERM = "told/reward_"
 _KEYS = "Flight/random/keys"
 _EPISODE = "Flight/random/episode"
-_FLAG = np.dtype(bool)
+_BOOL = np.dtype(bool)
 
 Named = dict[str, Any]
 Step = Sequence[Callable[[Record], None]]
@@ -61,7 +61,7 @@ class Machine:
         self._names = tuple(state)
         layout = Layout(_fields(state), lanes)
         self._told = Layout(_fields(self._telemetry()), lanes)
-        given: Named = dict.fromkeys(_MASKS, (_FLAG, sent.shape[1:-1]))
+        given: Named = dict.fromkeys(_MASKS, (_BOOL, sent.shape[1:-1]))
         given["sent"] = (sent.dtype, sent.shape[1:])
         self._outside = given | _fields(self._seen())
         self._layouts = layout, self._told
@@ -79,25 +79,29 @@ class Machine:
         self._run = compiled(regions, self._layouts, self._outside, width)
         self._width = width
         self.memory = Memory(layout, worlds)
-        self._results = []
-        self._size = self.memory.blocks * self._told.size  # of what a step tells, then of all
-        self._starts = []
-        for name, (dtype, (drones, *shape)) in self._outside.items():
-            if name in given:
-                continue
-            self._starts.append(self._size)
-            if name not in _FLAGS:
-                self._results.append((name, (worlds * drones, *shape), dtype, self._size))
-            bytes_ = self.memory.size * drones * prod(shape) * dtype.itemsize
-            self._size += -(-bytes_ // 8) * 8
-        *_, first, second = self._starts
-        flags = (len(_FLAGS), worlds * drones)
-        self._flags = flags, _FLAG, self._starts[-len(_FLAGS)], (second - first, 1)
+        self._plan(given)
         self._given: dict[str, np.ndarray] = {}
         for name, (dtype, shape) in given.items():
             self._given[name] = np.zeros((self.memory.size, *shape), dtype)
         self._places = [array.ctypes.data for array in self._given.values()]
         self._all_fly = False  # in the last step
+
+    def _plan(self, given: Named) -> None:
+        """Where everything that leaves lies in the bytes of a step, behind what is told."""
+        self._results = []
+        self._starts = []
+        self._size = self.memory.blocks * self._told.size
+        for name, (dtype, (drones, *shape)) in self._outside.items():
+            if name in given:
+                continue
+            self._starts.append(self._size)
+            if name not in _FLAGS:
+                self._results.append((name, (self._worlds * drones, *shape), dtype, self._size))
+            size = self.memory.size * drones * prod(shape) * dtype.itemsize
+            self._size += -(-size // 8) * 8
+        start, second, *_ = self._starts[-len(_FLAGS) :]
+        flags = (len(_FLAGS), self._worlds * drones)
+        self._flags = flags, _BOOL, start, (second - start, 1)
 
     def step(
         self, sent: np.ndarray | None, flown: Mask | None, begun: Mask | None, active: Mask | None

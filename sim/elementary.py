@@ -1,4 +1,4 @@
-"""Elementary functions from + - * /, sqrt, rint, floor, frexp and where: the same bits everywhere.
+"""Elementary functions from + - * /, sqrt, rint, floor, bits and where: the same bits everywhere.
 
 NumPy's and C's differ in their last bits between processors. These work in the precision of their
 arguments, float32 or float64, and give numbers for numbers. Errors are in units in the last place
@@ -21,8 +21,6 @@ _EIGHTH = 0.41421356237309503  # tan(π / 8)
 _INFINITY = math.inf
 _NAN = math.nan
 _ROUNDING = 2.0**52  # Added to a smaller number of float64, it leaves no bit for its fraction
-
-
 _LAYOUTS = {"float32": (np.int32, 23, 127), "float64": (np.int64, 52, 1023)}
 """Whole numbers with the bits of a float, bits of its fraction, and its exponent of 1."""
 
