@@ -1,20 +1,15 @@
 """`rotorgram/Tracking-v0`: follow a trajectory in time."""
 
-import csv
-import json
-import math
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 
-from ...models.errors import InputError, one_line, shortened
 from ...models.fields import Limits
 from ...sim import Array, Draw, InitialState, cos, length, looked_up, remainder, sin
 from ..spec import Metric
 from ..state import State
 from .goal import (
-    FURTHEST,
     WORST_RATES,
     Distance,
     GoalTask,
@@ -26,20 +21,17 @@ from .goal import (
 )
 from .task import Outcome, TaskOptions
 
-MAX_SAMPLES = 20_000  # Rows of a file
-_EXPECTED = "circle, lemniscate, or a CSV file with columns t, x, y, z"
+Curve = Literal["circle", "lemniscate"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrackingOptions(TaskOptions):
     """Options of `rotorgram/Tracking-v0`."""
 
-    trajectory: str = "circle"
-    """`circle` or `lemniscate`, level and without end; or a CSV file with columns t (s), x, y, z
-    (m, world frame), straight between its rows. The rows of a file are kept as JSON, so that they
-    cross the wire."""
+    trajectory: Curve = "circle"
+    """`circle` or `lemniscate`, level and without end."""
     center: Point = (0.0, 0.0, 5.0)
-    """Middle of a circle or a lemniscate: world frame, m."""
+    """Middle of the curve: world frame, m."""
     radius: Distance = 2.0
     """Of the circle, or half the length of the lemniscate, m."""
     period: Annotated[float, Limits(0.1, 1e4, "s")] = 10.0
@@ -52,12 +44,6 @@ class TrackingOptions(TaskOptions):
     """Largest distance of the start from the trajectory along each axis, m."""
     flight_band: Size = 3.0
     """An episode terminates when the craft is further than this from where it should be, m."""
-
-    def check(self) -> None:
-        """Check the options of this task. Raises `InputError`."""
-        if self.trajectory not in _CURVES:
-            rows = json.dumps(read_samples(self.trajectory).tolist(), separators=(",", ":"))
-            object.__setattr__(self, "trajectory", rows)
 
 
 class Tracking(GoalTask):
@@ -83,8 +69,7 @@ class Tracking(GoalTask):
 
     ## Trajectories
 
-    A circle and a lemniscate of Bernoulli begin at a phase drawn uniformly. That of a file begins
-    with its first row, and stays at its last.
+    A circle and a lemniscate of Bernoulli, begun at a phase drawn uniformly.
 
     ## Start, termination, truncation
 
@@ -107,16 +92,11 @@ class Tracking(GoalTask):
         """See the class."""
         options = self.options
         step = self.control_period
-        kind = options.trajectory
-        self._closed = kind in _CURVES
-        if self._closed:
-            count = max(2, round(options.period / step))
-            phases = 2 * np.pi * np.arange(count) / count
-            rate = 2 * np.pi / (count * step)
-            places, self._rates = _CURVES[kind](phases, options.radius, rate)
-            self._table = places + np.array(options.center)
-        else:
-            self._table, self._rates = _sampled(read_samples(kind), step)
+        count = max(2, round(options.period / step))
+        phases = 2 * np.pi * np.arange(count) / count
+        rate = 2 * np.pi / (count * step)
+        places, self._rates = _CURVES[options.trajectory](phases, options.radius, rate)
+        self._table = places + np.array(options.center)
         low = self._table.min(axis=0)
         high = self._table.max(axis=0)
         check_height("trajectory", low[2], self.vehicle.rest_height + options.start_band)
@@ -130,11 +110,10 @@ class Tracking(GoalTask):
         self.define_observation(reach / 2, numbers)
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:
-        """Near the beginning of the trajectory, or anywhere on a closed one, at its velocity."""
+        """Near any point of the trajectory, at its velocity."""
         band = self.options.start_band
         share = draw.uniform(0.0, 1.0)
-        index = np.floor(share * len(self._table)) if self._closed else 0.0 * share
-        self.memory.index = index  # row of the table
+        self.memory.index = np.floor(share * len(self._table))  # row of the table
         offset = draw.uniform(-band, band, (3,))
         position = self._at(self._table, 0.0) + offset
         velocity = self._at(self._rates, 0.0) + 0.0 * offset
@@ -164,10 +143,7 @@ class Tracking(GoalTask):
 
     def _at(self, table: np.ndarray, ahead: float) -> Array:
         """Row of a table, `ahead` steps ahead: shape (..., 3)."""
-        index = self.memory.index + ahead
-        if self._closed:
-            index = remainder(index, len(table))
-        return looked_up(table, index)
+        return looked_up(table, remainder(self.memory.index + ahead, len(table)))
 
 
 def _circle(phase: np.ndarray, radius: float, rate: float) -> tuple[np.ndarray, np.ndarray]:
@@ -188,51 +164,3 @@ def _lemniscate(phase: np.ndarray, radius: float, rate: float) -> tuple[np.ndarr
 
 
 _CURVES = {"circle": _circle, "lemniscate": _lemniscate}
-
-
-def _sampled(rows: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
-    """Positions, m, and velocities, m/s, (L, 3), of each control step along the rows of a file."""
-    given = rows[:, 0]
-    times = given[0] + np.arange(math.ceil(np.ptp(given) / step) + 1) * step
-    after = np.searchsorted(given[1:-1], times, side="right") + 1
-    before = after - 1
-    share = (times - given[before]) / (given[after] - given[before])
-    share = np.minimum(share, 1.0)[:, None]
-    places = rows[before, 1:] + share * (rows[after, 1:] - rows[before, 1:])
-    rates = np.gradient(places, step, axis=0)
-    rates[-1] = 0.0  # it stays
-    return places, rates
-
-
-def read_samples(given: str) -> np.ndarray:
-    """Times and places of a CSV file, or of its content as JSON: shape (rows, 4).
-
-    Raises `InputError`.
-    """
-    try:
-        if given.lstrip().startswith("["):
-            rows = json.loads(given)
-        else:
-            with open(given, encoding="utf-8", newline="") as file:
-                reader = csv.DictReader(file)
-                rows = [[float(row[name]) for name in ("t", "x", "y", "z")] for row in reader]
-        samples: np.ndarray = np.array(rows, np.float64)
-    except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
-        reason = getattr(error, "strerror", None) or str(error)  # without the file's name
-        if isinstance(error, KeyError):
-            reason = f"no column {error}"
-        got = f"{shortened(given)}: {one_line(reason):.120}"
-        raise InputError(f"trajectory: expected {_EXPECTED}, got {got}") from None
-    shape = samples.shape
-    if shape[1:] != (4,) or not 2 <= len(samples) <= MAX_SAMPLES:
-        raise InputError(
-            f"trajectory: expected 2 to {MAX_SAMPLES} rows of t, x, y, z, got shape {shape}"
-        )
-    if not np.isfinite(samples).all():
-        raise InputError("trajectory: expected finite numbers, got others")
-    far = float(np.abs(samples[:, 1:]).max())
-    if far > FURTHEST:
-        raise InputError(f"trajectory: expected coordinates up to {FURTHEST:g} m, got {far:g}")
-    if not (np.diff(samples[:, 0]) > 0).all():
-        raise InputError("trajectory: expected times that rise, got others")
-    return samples

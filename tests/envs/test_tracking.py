@@ -1,7 +1,6 @@
 """The tracking task against values worked out by hand; a pilot flies every trajectory."""
 
 import math
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -10,7 +9,6 @@ import pytest
 from contracts import GOAL_OFFSET, NOW, TABLES, observed, rows_of
 from pilot import Pilot, fly, limited
 from rotorgram.models import Vehicle
-from rotorgram.models.errors import InputError
 
 from flights import Shares, state_of, task_of
 
@@ -80,28 +78,6 @@ def test_ends(state: dict[str, Any], ends: bool) -> None:
     outcome = begun().outcome(state_of(**state))
     assert bool(outcome.terminated) == ends
     assert outcome.reward["termination"] == pytest.approx(-140.0 * ends)
-
-
-def test_a_file_without_a_column_is_told_its_name(tmp_path: Path) -> None:
-    file = tmp_path / "mine.csv"
-    file.write_text("0,0,0,5\n1,1,0,5\n")
-    with pytest.raises(InputError, match=r"with columns t, x, y, z, got .*: no column 't'$"):
-        task_of(ID, trajectory=str(file))
-
-
-def test_a_file_crosses_the_wire(tmp_path: Path) -> None:
-    file = tmp_path / "mine.csv"
-    file.write_text("t,x,y,z\n1.0,0,0,5\n2.0,1,0,5\n4.0,1,2,6\n")
-    task = task_of(ID, trajectory=str(file))
-    told = task.options.to_options()["trajectory"]
-    file.unlink()
-    task = task_of(ID, trajectory=told)
-    assert task.options.trajectory == told
-    pose = task.begin(NOW, Shares(0.0, HALF))
-    assert pose.position.tolist() == [0.0, 0.0, 5.0]
-    assert pose.velocity == pytest.approx([1.0, 0.0, 0.0])
-    for steps, place in TABLES["tracking: a file, steps and places"]:
-        assert goal_after(task, steps) == pytest.approx(place)
 
 
 @rows_of("tracking: a pilot flies it", "trajectory, name")
