@@ -1,4 +1,4 @@
-"""`rotorgram log`: a flight's numbers over time, as CSV or Parquet."""
+"""`rotorgram log`: a flight's numbers over time, as CSV."""
 
 from pathlib import Path
 
@@ -8,19 +8,15 @@ from ._flags import Command
 
 
 class Log(Command):
-    """Write the telemetry, actions and rewards of a journal as a table, the time first.
+    """Write the telemetry, actions and rewards of a journal as CSV, the time first.
 
-    z points up, units are SI; a row is a control step of one drone.
+    z points up, the head has the units, which are SI; a row is a control step of one drone.
     """
 
     flight: Positional[Path]
     """MCAP file that --record wrote."""
-    csv: bool = False
-    """Write CSV: names with units in its head."""
-    parquet: bool = False
-    """Write Parquet: a column's metadata has its unit."""
     out: Path | None = None
-    """File to write. Default: the journal's name with .csv or .parquet, in this folder."""
+    """File to write. Default: the journal's name with .csv, in this folder."""
     session: int | None = None
     """Session of the journal, from 1, as rotorgram replay counts. Default: the first that flew."""
     drone: int | None = None
@@ -31,17 +27,13 @@ class Log(Command):
     def run(self) -> None:
         """Write it; say where."""
         from ..flights.recorded import recorded_trajectories
-        from ..flights.signals import write_csv, write_parquet_log
-        from ..models.errors import InputError
+        from ..flights.signals import write_csv
         from ..models.files import check_new_file
         from ..udp.journal.reader import count_of
 
-        if self.csv == self.parquet:
-            raise InputError("log: expected either --csv or --parquet")
-        ending = ".csv" if self.csv else ".parquet"
-        out = self.out or Path(self.flight.stem + ending)
-        check_new_file(out, ending)
+        out = self.out or Path(self.flight.stem + ".csv")
+        check_new_file(out, ".csv")
         chosen = None if self.episode is None else [self.episode]
         flights = recorded_trajectories(self.flight, chosen, session=self.session, drone=self.drone)
-        rows = write_csv(flights, out) if self.csv else write_parquet_log(flights, out)
+        rows = write_csv(flights, out)
         print(f"{out}: {count_of(len(flights), 'episode')}, {count_of(rows, 'row')}")

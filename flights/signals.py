@@ -1,4 +1,4 @@
-"""Signals of a flight over time, z up and in SI units, and their table as CSV or Parquet."""
+"""Signals of a flight over time, z up and in SI units, and their table as CSV."""
 
 import csv
 import io
@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 
 from ..envs.spec import ArraySpec, Discrete, component_names
-from ..models.errors import require
 from ..models.files import write_new
 from .trajectories import Floats, Trajectory
 
@@ -23,7 +22,7 @@ class Column(NamedTuple):
     name: str
     unit: str
     values: np.ndarray
-    """Shape (T + 1,), of several flights below each other."""
+    """Shape (T + 1,)."""
 
 
 class Signal(NamedTuple):
@@ -75,26 +74,17 @@ def _units(array: ArraySpec) -> tuple[str, ...]:
     return tuple("" if unit == "1" else unit for unit in units)
 
 
-def columns_of(*flights: Trajectory) -> list[Column]:
-    """The time, the numbers of episode and drone, and every number of the signals; flights of one
-    spec below each other.
-    """
-    tables = []
-    for flight in flights:
-        rows = len(flight) + 1
-        columns = [
-            Column("time", "s", flight.times),
-            Column("episode", "", np.full(rows, flight.episode)),
-            Column("drone", "", np.full(rows, flight.drone)),
-        ]
-        for signal in signals_of(flight):
-            columns += signal.columns()
-        tables.append(columns)
-    joined = []
-    for parts in zip(*tables, strict=True):
-        values = np.concatenate([part.values for part in parts])
-        joined.append(parts[0]._replace(values=values))
-    return joined
+def columns_of(flight: Trajectory) -> list[Column]:
+    """The time, the numbers of episode and drone, and every number of the signals."""
+    rows = len(flight) + 1
+    columns = [
+        Column("time", "s", flight.times),
+        Column("episode", "", np.full(rows, flight.episode)),
+        Column("drone", "", np.full(rows, flight.drone)),
+    ]
+    for signal in signals_of(flight):
+        columns += signal.columns()
+    return columns
 
 
 def write_csv(flights: Sequence[Trajectory], out: Path) -> int:
@@ -102,33 +92,15 @@ def write_csv(flights: Sequence[Trajectory], out: Path) -> int:
 
     The head has names and units, as `x [m]`. Numbers have all their digits; a missing one is empty.
     """
-    columns = columns_of(*flights)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([f"{c.name} [{c.unit}]" if c.unit else c.name for c in columns])
-    for row in zip(*(column.values.tolist() for column in columns), strict=True):
-        writer.writerow(["" if math.isnan(value) else value for value in row])
+    count = 0
+    for flight in flights:
+        columns = columns_of(flight)
+        if not count:
+            writer.writerow([f"{c.name} [{c.unit}]" if c.unit else c.name for c in columns])
+        for row in zip(*(column.values.tolist() for column in columns), strict=True):
+            writer.writerow(["" if math.isnan(value) else value for value in row])
+        count += len(flight) + 1
     write_new(out, text.getvalue())
-    return len(columns[0].values)
-
-
-def write_parquet_log(flights: Sequence[Trajectory], out: Path) -> int:
-    """Write flights of one spec below each other; the number of rows.
-
-    A column's metadata has its `unit`.
-    """
-    require("pyarrow", "dataset", "a log as Parquet")
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    arrays = []
-    fields = []
-    for column in columns_of(*flights):
-        array = pa.array(column.values, from_pandas=True)
-        arrays.append(array)
-        fields.append(pa.field(column.name, array.type, metadata={"unit": column.unit}))
-    table = pa.Table.from_arrays(arrays, schema=pa.schema(fields))
-    file = pa.BufferOutputStream()
-    pq.write_table(table, file)
-    write_new(out, file.getvalue().to_pybytes())
-    return int(table.num_rows)
+    return count

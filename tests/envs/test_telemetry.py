@@ -87,7 +87,7 @@ def test_a_number_is_added_in_one_place(
         pair.remote.reset(seed=1)
         *_, there = pair.remote.step(action)
     assert there["speed"] == here["speed"]
-    assert main(["log", "flight.mcap", "--csv"]) == 0
+    assert main(["log", "flight.mcap"]) == 0
     head, _, last = Path("flight.csv").read_text().splitlines()
     assert float(last.split(",")[head.split(",").index("speed [m/s]")]) == here["speed"]
     assert main(["plot", "flight.mcap", "--out", "flight.svg"]) == 0

@@ -37,8 +37,7 @@ def journal(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def log(journal: Path, out: Path, *words: str) -> None:
-    kind = f"--{out.suffix[1:]}"
-    assert main(["log", str(journal), kind, "--out", str(out), *words]) == 0
+    assert main(["log", str(journal), "--out", str(out), *words]) == 0
 
 
 def table(file: Path) -> tuple[list[str], list[list[str]]]:
@@ -51,7 +50,7 @@ def test_a_log_has_the_time_first_and_units(
     journal: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert main(["log", str(journal), "--csv"]) == 0
+    assert main(["log", str(journal)]) == 0
     head, rows = table(tmp_path / "hover.csv")
     width = len(HEAD)
     actions = head[width:-1]
@@ -77,22 +76,6 @@ def test_positions_of_a_log_have_z_up(journal: Path, tmp_path: Path) -> None:
     first = head.index("qw")
     quaternion = np.array(rows[2][first : first + 4], float)
     assert np.linalg.norm(quaternion) == pytest.approx(1.0)
-
-
-def test_parquet_has_the_same_numbers_and_units_in_metadata(journal: Path, tmp_path: Path) -> None:
-    parquet = pytest.importorskip("pyarrow.parquet")
-    out = tmp_path / "log.parquet"
-    text = tmp_path / "log.csv"
-    log(journal, out)
-    log(journal, text)
-    read = parquet.read_table(out)
-    assert read.column_names[:4] == ["time", "episode", "drone", "x"]
-    assert read.schema.field("x").metadata == {b"unit": b"m"}
-    assert read["reward"].null_count == 2
-    _, rows = table(text)
-    for i, name in enumerate(read.column_names):
-        column = ["" if value is None else str(value) for value in read[name].to_pylist()]
-        assert column == [row[i] for row in rows], name
 
 
 @each("words, sentence", "log")
