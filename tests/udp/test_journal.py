@@ -173,8 +173,8 @@ def test_both_sides_can_be_repeated_bit_for_bit(
         assert steps_of(path) == [seen.steps]
         (session,) = summary.sessions
         assert session.states == 501 + seen.resets
-        assert session.session.num_envs == arrangement.get("drones", 1)
-        assert session.session.codec == arrangement.get("codec", "binary")
+        assert session.num_envs == arrangement.get("drones", 1)
+        assert session.codec == arrangement.get("codec", "binary")
         assert session.ending.startswith("closed: the ")
         assert 0 < session.last - session.first < 60e9
         (compared,) = verdict.sessions
@@ -252,7 +252,7 @@ def test_nothing_that_a_journal_names_is_imported(
         assert session.problem.startswith(
             f"State 1 cannot be repeated: expected a registered env id, got {env_id!r}"
         )
-        assert Summary(path).sessions[0].session.spec.env_id == env_id
+        assert Summary(path).sessions[0].spec.env_id == env_id
     path = tmp_path / "named.mcap"  # a module before an id that is registered changes nothing
     name = f"evil:{ENV_ID}"
     rewrite(flight.simulator, path, changed_spec(env_id=name))
@@ -401,7 +401,7 @@ def test_several_simulators_at_once(tmp_path: Path) -> None:
     for one in running:
         one.join()
     summary = Summary(path)
-    assert [s.session.slot for s in summary.sessions] == [0, 1]
+    assert [s.slot for s in summary.sessions] == [0, 1]
     assert sum(steps_of(path)) == seen.steps
     assert Verification(path).identical
     with path.open("rb") as file:

@@ -71,6 +71,14 @@ class Session:
     """By text a simulator says none, and records one of its own."""
     codec: str
     """`binary` or `text`."""
+    first: int
+    """Time of its first message, nanoseconds since 1970."""
+    last: int = 0
+    """Time of its last message so far; `states` and `ending` are so far too."""
+    states: int = 0
+    """Number of them."""
+    ending: str = "not closed"
+    """Reason of its Close or Refuse."""
     welcome: Welcome | None = None
     _command: Command | None = None
     _sequence: int | None = None  # of the last State
@@ -95,14 +103,28 @@ class Session:
         """Of the reset before the first State."""
         return self.welcome.first_seed if self.welcome else self.hello.session
 
-    def take(self, message: Message) -> Transition | None:
+    def take(self, message: Message, time: int) -> Transition | None:
         """Take the next message: the transition that a State completes; None for any other."""
-        if isinstance(message, Welcome):
-            self.welcome = message
-        elif isinstance(message, Command):
-            self._command = message
-        if not isinstance(message, State):
-            return None
+        self.last = time
+        match message:
+            case State():
+                return self._take_state(message)
+            case Command():
+                self._command = message
+            case Welcome():
+                self.welcome = message
+            case Close(reason=reason) if reason:
+                self.ending = f"closed: {reason}"
+            case Close() if not self.ending.startswith("closed"):
+                self.ending = "closed"
+            case Refuse(reason=reason):
+                self.ending = f"refused: {reason}"
+            case Unknown():
+                self.ending = "the agent does not know this session"
+        return None
+
+    def _take_state(self, message: State) -> Transition:
+        self.states += 1
         before = self._sequence
         self._sequence = message.sequence
         nobody = np.zeros(self.num_envs, bool)
@@ -117,6 +139,16 @@ class Session:
 
     def __str__(self) -> str:
         return f"session {self.index} (slot {self.slot}, {self.hello.session:016x})"
+
+    @property
+    def summary(self) -> str:
+        """What it is, and its counts."""
+        began = datetime.fromtimestamp(self.first // 10**9, UTC)
+        seconds = (self.last - self.first) / 1e9
+        return (
+            f"{self}: {count_of(self.num_envs, 'drone')} of {self.spec.env_id}, {self.codec}, "
+            f"{began:%Y-%m-%d %H:%M:%S} UTC, {seconds:.1f} s, {self.states} States; {self.ending}"
+        )
 
 
 class Item(NamedTuple):
@@ -203,13 +235,14 @@ class Recording:
                 if isinstance(message, Hello):
                     count += 1
                     codec = str(words.get("codec", ""))
-                    session = sessions[slot] = Session(count, slot, message, codec)
+                    session = Session(count, slot, message, codec, record.log_time)
+                    sessions[slot] = session
                 elif session is None or message.session != session.hello.session:
                     raise InputError(
                         f"{self.path}: expected a message of the session of the last Hello, "
                         f"got a {type(message).__name__} of {message.session:016x}"
                     )
-                transition = session.take(message)
+                transition = session.take(message, record.log_time)
                 yield Item(session, record.log_time, message, datagram, transition)
 
     def _records(self) -> Iterator[records.McapRecord]:
@@ -245,68 +278,21 @@ def _read_records(file: BinaryIO) -> Iterator[records.McapRecord]:
         yield from breakup_chunk(record, validate_crc=True)
 
 
-# ---- what is in it
-
-
-@dataclass(kw_only=True)
-class SessionSummary:
-    """Counts of one session."""
-
-    session: Session
-    first: int
-    """Time of its first message, nanoseconds since 1970."""
-    last: int = 0
-    """Time of its last message."""
-    states: int = 0
-    ending: str = "not closed"
-    """Reason of its Close or Refuse."""
-
-    def __str__(self) -> str:
-        session = self.session
-        began = datetime.fromtimestamp(self.first // 10**9, UTC)
-        seconds = (self.last - self.first) / 1e9
-        return (
-            f"{session}: {count_of(session.num_envs, 'drone')} of {session.spec.env_id}, "
-            f"{session.codec}, {began:%Y-%m-%d %H:%M:%S} UTC, {seconds:.1f} s, "
-            f"{self.states} States; {self.ending}"
-        )
-
-    def take(self, item: Item) -> None:
-        """Count a message of the session."""
-        self.last = item.time
-        match item.message:
-            case State():
-                self.states += 1
-            case Close(reason=reason) if reason:
-                self.ending = f"closed: {reason}"
-            case Close() if not self.ending.startswith("closed"):
-                self.ending = "closed"
-            case Refuse(reason=reason):
-                self.ending = f"refused: {reason}"
-            case Unknown():
-                self.ending = "the agent does not know this session"
-
-
 class Summary(Recording):
     """Counts of a journal.
 
     Attributes:
-        sessions: Counts of each session.
+        sessions: All of them, as they ended.
     """
 
     def __init__(self, path: Path | str) -> None:
         super().__init__(path)
-        of: dict[int, SessionSummary] = {}
-        for item in self:
-            if item.begins:
-                of[item.session.index] = SessionSummary(session=item.session, first=item.time)
-            of[item.session.index].take(item)
-        self.sessions = list(of.values())
+        self.sessions = [item.session for item in self if item.begins]
 
     def __str__(self) -> str:
         side = f"written by the {self.about['side']}, " if "side" in self.about else ""
         head = f"{self.path}: {side}{self.ending}, {count_of(len(self.sessions), 'session')}"
-        return printable("\n".join([head, *map(str, self.sessions)]))
+        return printable("\n".join([head, *(session.summary for session in self.sessions)]))
 
 
 def count_of(count: int, what: str) -> str:
