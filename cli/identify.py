@@ -27,8 +27,6 @@ class Identify(Command):
     fit: Words = ()
     """What to identify. Default: the five of above; besides them there are rotors.drag,
     rotors.inflow, rotors.lift, drag.angular.x, y, z and drag.moment.x, y."""
-    window: float = 0.5
-    """Length of a prediction, s."""
     period: float = 0.01
     """Logs are resampled to this period, s."""
 
@@ -56,7 +54,7 @@ class Identify(Command):
                     f"{log.name}: {log.left_out} samples left out, whose position or attitude "
                     "contradicts velocity and rates"
                 )
-        found = identify(vehicle, logs, window=self.window, names=self.fit or DEFAULT)
+        found = identify(vehicle, logs, self.fit or DEFAULT)
         self._show(found)
         write_new(self.out, identified_toml(vehicle, found))
         print(self.out)
@@ -65,7 +63,7 @@ class Identify(Command):
         from rich.console import Console
         from rich.table import Table
 
-        from ..flights.identify import SEGMENT
+        from ..flights.identify import SEGMENT, WINDOW
 
         table = Table("number", "value", "95 % interval", "")
         for one in found.estimates:
@@ -78,6 +76,6 @@ class Identify(Command):
             f"{name} {before:.3g} -> {after:.3g} {unit}"
             for (name, unit), before, after in zip(names, found.before, found.after, strict=True)
         ]
-        window = f"{found.windows} predictions over {self.window:g} s"
+        window = f"{found.windows} predictions over {WINDOW:g} s"
         print(f"mean error of {window}: {', '.join(errors)}")
         print(f"intervals: sandwich, clustered over {found.segments} segments of {SEGMENT:g} s")

@@ -46,13 +46,12 @@ WIDEST = 0.5
 """A number is not excited if its 95 % interval reaches further than this share, either way."""
 ALIKE = 0.98
 """Two numbers cannot be distinguished if their estimates correlate more than this."""
+WINDOW = 0.5
+"""Length of a prediction, s."""
 SEGMENT = 2.0
-"""Length of a cluster, s: four of the default windows."""
+"""Length of a cluster, s: four windows."""
 _LEAST_SEGMENTS = 5
 _ROUNDS = 2  # of estimating the spreads anew
-
-Group = tuple[str, ...]
-"""Names of numbers that stay equal."""
 
 
 class Estimate(NamedTuple):
@@ -87,11 +86,9 @@ class Identified:
 def identify(
     vehicle: Vehicle,
     logs: Sequence[FlightLog],
-    *,
-    window: float = 0.5,
     names: Sequence[str] = DEFAULT,
 ) -> Identified:
-    """Identify numbers of a vehicle from logs with the same period; `window` in s.
+    """Identify numbers of a vehicle from logs with the same period.
 
     The time constant of the rotors takes part if the logs have commands alone. Raises `InputError`
     for an unknown name, or logs that are too short.
@@ -103,7 +100,7 @@ def identify(
     if not logs[0].measured:
         base[LAG] = vehicle.coefficients["rotors.time_constant"] or 0.05
     free = [name for name in names if name in base]
-    windows = _cut(logs, base, _steps(window, logs[0].period))
+    windows = _cut(logs, base, round(WINDOW / logs[0].period))
     clusters = _clusters(windows)
     segments = int(clusters.max()) + 1
     if segments < _LEAST_SEGMENTS:
@@ -114,7 +111,7 @@ def identify(
     point = dict(base)
     kept: dict[str, Estimate] = {}
     while True:
-        fit = Fit(vehicle, windows, point, [(name,) for name in free], logs=logs)
+        fit = Fit(vehicle, windows, point, free, logs=logs)
         point = fit.solve()
         half, correlation = fit.half_widths(clusters)
         estimates = {}
@@ -138,16 +135,6 @@ def identify(
         segments=segments,
         logs=tuple(log.name for log in logs),
     )
-
-
-def _steps(window: float, period: float) -> int:
-    """Samples of a window. Raises `InputError`."""
-    steps = round(window / period)
-    if not 4 <= steps <= 1000 or abs(steps * period - window) > 1e-9:
-        raise InputError(
-            f"window: expected a multiple of {period:g} s, 4 to 1000 of them, got {window:g} s"
-        )
-    return steps
 
 
 def _cut(logs: Sequence[FlightLog], numbers: Numbers, steps: int) -> Windows:
@@ -203,11 +190,12 @@ class Fit:
     windows: Windows
     numbers: Numbers
     """To begin with."""
-    groups: Sequence[Group]
+    names: Sequence[str]
+    """Those that are fitted."""
     logs: Sequence[FlightLog] = ()
 
     def __post_init__(self) -> None:
-        names = [group[0] for group in self.groups]
+        names = self.names
         self._scales = np.array([_scale(self.vehicle, self.numbers, name) for name in names])
         self._lowest = np.array([_lowest(name) for name in names])
         values = np.array([self.numbers[name] for name in names])
@@ -217,7 +205,7 @@ class Fit:
         self._whitener: Floats | None = None
 
     def solve(self) -> dict[str, float]:
-        """The numbers of least robust sum of squares; those of a group stay equal."""
+        """The numbers of least robust sum of squares."""
         from scipy.optimize import least_squares
 
         for _ in range(_ROUNDS if len(self._x) else 0):
@@ -236,7 +224,7 @@ class Fit:
             )
             self._x = solution.x
         self._weigh()
-        return _flattened(self.vehicle, self._numbers(self._x))
+        return _flattened(self.vehicle, self.numbers_at(self._x))
 
     def mean_errors(self, numbers: Numbers) -> tuple[float, ...]:
         """Mean sizes of the four errors at the end of a window."""
@@ -274,11 +262,10 @@ class Fit:
         rows = self._rows(np.concatenate((x[None], x + np.diag(steps))))
         return rows[0], (rows[1:] - rows[0]) / steps[:, None, None]
 
-    def _numbers(self, x: Floats) -> dict[str, float]:
-        numbers = dict(self.numbers)
-        for group, value in zip(self.groups, (x * self._scales).tolist(), strict=True):
-            numbers.update(dict.fromkeys(group, value))
-        return numbers
+    def numbers_at(self, x: Floats) -> dict[str, float]:
+        """All numbers at a point; a derived class may tie others to those that are fitted."""
+        fitted = zip(self.names, (x * self._scales).tolist(), strict=True)
+        return {**self.numbers, **dict(fitted)}
 
     def _errors(self, candidates: Sequence[Numbers], start: Floats | None = None) -> Floats:
         """Differences, (P, M, H, 4, 3), of P candidates; of those with starts (P, M, 13) too."""
@@ -301,7 +288,7 @@ class Fit:
 
     def _weigh(self) -> None:
         """Set the spreads, and the effects of errors of the starts, as they are now."""
-        numbers = self._numbers(self._x)
+        numbers = self.numbers_at(self._x)
         errors = np.abs(self._errors([numbers])[0])
         # Of normal numbers with this median size; never 0.
         median = np.median(errors, axis=(0, 3))[..., None]
@@ -318,7 +305,7 @@ class Fit:
 
     def _rows(self, points: Floats) -> Floats:
         """Residuals at points (P, n): shape (P, M, K)."""
-        candidates = [self._numbers(x) for x in points]
+        candidates = [self.numbers_at(x) for x in points]
         rows = self._weighed(candidates)
         if self._whitener is not None:
             rows = np.einsum("mij,pmj->pmi", self._whitener, rows)

@@ -24,7 +24,7 @@ from typing import Final
 import numpy as np
 from measuring import RESULTS, options
 from rotorgram.flights.flight_logs import FlightLog, read_log
-from rotorgram.flights.identify import Fit, Group, Origin, vehicle_toml
+from rotorgram.flights.identify import Fit, Origin, vehicle_toml
 from rotorgram.flights.prediction import (
     Floats,
     Numbers,
@@ -66,7 +66,7 @@ class Variant:
     """A model: which numbers are fitted, and whether rotors turn the craft."""
 
     name: str
-    groups: tuple[Group, ...] = ()
+    groups: tuple[tuple[str, ...], ...] = ()
     turns: bool = True
     regressed: bool = False
     """Whether thrust and drag are those of a regression of accelerations, and not fitted too."""
@@ -237,6 +237,20 @@ def _flights(folder: Path, vehicle: Vehicle) -> list[FlightLog]:
     return [read_log(file, vehicle) for file in files]
 
 
+@dataclass(eq=False)
+class TiedFit(Fit):
+    """A fit in which the numbers of a group stay equal to its first, which is fitted."""
+
+    groups: Sequence[tuple[str, ...]] = ()
+
+    def numbers_at(self, x: Floats) -> dict[str, float]:
+        """All numbers at a point."""
+        numbers = super().numbers_at(x)
+        for first, *others in self.groups:
+            numbers |= dict.fromkeys(others, numbers[first])
+        return numbers
+
+
 def _fitted(
     variant: Variant,
     base: Vehicle,
@@ -252,7 +266,8 @@ def _fitted(
     if not variant.turns:
         decaying = [name for group in DAMPING if group in variant.groups for name in group]
         start = {**start, **dict.fromkeys(decaying, _UNTURNED / 0.5)}  # time constant: 0.5 s
-    found = Fit(base, windows, start, variant.groups).solve()
+    names = [group[0] for group in variant.groups]
+    found = TiedFit(base, windows, start, names, groups=variant.groups).solve()
     if variant.turns:
         return found
     return found | {name: held[name] for name in held if name.startswith("body.inertia")}

@@ -98,7 +98,7 @@ def test_known_values_come_back(log: Path, commands: Path, wrong: Path, measured
         del expected["rotors.time_constant"]
     vehicle = Vehicle.load(wrong)
     logs = [read_log(log if measured else commands, vehicle, period=0.005)]
-    found = identify(vehicle, logs, names=tuple(TRUE))
+    found = identify(vehicle, logs, tuple(TRUE))
     assert {one.name for one in found.estimates} == set(expected)
     missed = []
     for one in found.estimates:
@@ -117,7 +117,7 @@ def test_known_values_come_back(log: Path, commands: Path, wrong: Path, measured
 def test_a_hover_tells_the_thrust_alone(wrong: Path, tmp_path: Path) -> None:
     vehicle = Vehicle.load(wrong)
     log = read_log(flown(tmp_path / "hover.csv", 20.0, (0.0,) * 4), vehicle)
-    found = {one.name: one for one in identify(vehicle, [log], names=tuple(TRUE)).estimates}
+    found = {one.name: one for one in identify(vehicle, [log], tuple(TRUE)).estimates}
     thrust = found.pop("rotors.thrust_coefficient")
     assert not thrust.kept
     assert thrust.value == pytest.approx(3e-6, rel=0.01)
@@ -131,7 +131,7 @@ def test_a_yawing_craft_does_not_tell_reaction_and_inertia_apart(tmp_path: Path)
     vehicle = Vehicle.load(LIVELY)
     log = read_log(flown(tmp_path / "yaw.csv", 20.0, (0.0, 0.0, 0.0, 1.0)), vehicle)
     names = ("body.inertia.z", "rotors.reaction")
-    inertia, reaction = identify(vehicle, [log], names=names).estimates
+    inertia, reaction = identify(vehicle, [log], names).estimates
     assert not inertia.kept
     assert inertia.value == pytest.approx(4.0e-3, rel=0.03)
     assert "not told apart from body.inertia.z" in reaction.kept
@@ -216,7 +216,7 @@ def test_a_short_log_and_an_unknown_number_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"at least 5 segments of 2 s in the logs, got 3"):
         identify(vehicle, [log])
     with pytest.raises(InputError, match=r"^fit: expected some of rotors\.thrust_coefficient"):
-        identify(vehicle, [log], names=["mass"])
+        identify(vehicle, [log], ["mass"])
 
 
 def test_a_folder_that_is_not_there_is_told_before_anything_is_flown(
