@@ -16,6 +16,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from ..models import Backend
 from ..models.errors import InputError, shortened
+from ..models.fields import PositiveInt
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -38,6 +39,7 @@ else:  # tyro imports typeguard, slowly, for a tuple of a stated type
         ),
     ]
 
+Count = PositiveInt
 DEFAULT_ENV = "rotorgram/Elevation-v0"
 Options = dict[str, Any]
 """Options of a task and its env by name, values as of JSON."""
@@ -65,6 +67,21 @@ class Command:
     def settings(self, kind: type["DataclassInstance"]) -> Options:
         """Values of the flags that are fields of a class of settings."""
         return {f.name: getattr(self, f.name) for f in fields(kind) if hasattr(self, f.name)}
+
+
+@dataclass(frozen=True)
+class OneOrMore:
+    """A rule for words and files."""
+
+    expected = "one or more"
+
+    def read(self, value: object) -> object:
+        if not value:
+            raise ValueError
+        return value
+
+
+Files = Annotated[tuple[Path, ...], OneOrMore()]
 
 
 class EnvFlags(Command):
@@ -103,7 +120,7 @@ class EnvFlags(Command):
     sensors: Words = ()
     """Sensors whose readings are observed, each NAME or NAME=SETTINGS: imu gps={"rate":10}, and
     observe=estimate. docs/sensors.md lists them."""
-    drones: int = 1
+    drones: Count = 1
     """Drones of each world, for a task of several."""
     options: Suppress[Fixed[dict]] = field(default_factory=dict)  # type: ignore[type-arg]
     """Options of the task that --env names."""
@@ -172,9 +189,3 @@ def parse_address(text: str) -> tuple[str, int]:
             f"address: expected HOST:PORT with a port up to 65535, got {shortened(text)}"
         )
     return host, int(port)
-
-
-def check_count(name: str, value: int | None) -> None:
-    """Raises `InputError` for a number that is given and less than 1."""
-    if value is not None and value < 1:
-        raise InputError(f"{name}: expected at least 1, got {value}")

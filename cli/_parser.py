@@ -12,6 +12,7 @@ import tyro
 from tyro.conf import arg
 
 from ..models.errors import InputError
+from ..models.fields import check_fields
 from ._flags import (
     DEFAULT_ENV,
     BackendFlags,
@@ -19,7 +20,6 @@ from ._flags import (
     EnvFlags,
     Options,
     Words,
-    check_count,
     parse_value,
 )
 
@@ -37,12 +37,15 @@ C = TypeVar("C", bound=Command)
 def parse(kind: type[C], prog: str, words: Sequence[str]) -> C:
     """A command from its words. A wrong flag exits with status 2, `--help` with 0.
 
-    Raises `InputError` if the task or one of its options is not what it should be.
+    Raises `InputError` if the task, one of its options or a number is not what it should be.
     """
     given = _given(words)
-    if not issubclass(kind, EnvFlags):
-        return cast(C, replace(_run_tyro(_for_tyro(kind), prog, words), given=given))
-    return cast(C, _parsed_env(kind, prog, words, given))
+    if issubclass(kind, EnvFlags):
+        command = _parsed_env(kind, prog, words, given)
+    else:
+        command = replace(_run_tyro(_for_tyro(kind), prog, words), given=given)
+    check_fields(command)
+    return cast(C, command)
 
 
 def _parsed_env(
@@ -59,9 +62,7 @@ def _parsed_env(
     env_id = found.env or file.get("env", DEFAULT_ENV)
     listens = "listen" in given or getattr(kind, "listen", None) is not None
     if listens and ":" not in env_id and not registry.is_known(env_id):
-        command = _run_tyro(_for_tyro(kind), prog, words)
-        check_count("drones", command.drones)
-        return _merged(command, given, {}, file)
+        return _merged(_run_tyro(_for_tyro(kind), prog, words), given, {}, file)
     env_id = registry.load(env_id)
     task = registry.task_type(env_id)
     names = [name.removeprefix("env.") for name in given if name.startswith("env.")]

@@ -9,7 +9,7 @@ from pathlib import Path
 from ..agents.presets import PresetName
 from ..flights.folders import LOCK, new_folder
 from ..models.errors import InputError
-from ._flags import BackendFlags, NamedValues, Options, Words, check_count, parse_value
+from ._flags import BackendFlags, Count, NamedValues, Options, Words, parse_value
 
 
 class TrainingFlags(BackendFlags):
@@ -19,9 +19,9 @@ class TrainingFlags(BackendFlags):
     """Changes to the preset of every agent: gamma=0.99 hidden=[64,64]."""
     preset: PresetName = "tuned"
     """Hyperparameters: the paper's (of vpg and a2c), or ours, which may depend on the task."""
-    env_steps: int | None = None
+    env_steps: Count | None = None
     """Env steps of each training, of all its drones together. Default of train: the preset's."""
-    num_envs: int | None = None
+    num_envs: Count | None = None
     """Drones that fly at the same time, in lock-step, in each training. Default of train: the
     preset's, in whole worlds."""
     out: Path | None = None
@@ -32,8 +32,6 @@ class TrainingFlags(BackendFlags):
 
     def changes(self) -> Options:
         """Changes to the preset by name, of `--set`. Raises `InputError`."""
-        check_count("env_steps", self.env_steps)
-        check_count("num_envs", self.num_envs)
         changes = {}
         for word in chain.from_iterable(self.set):
             name, equals, value = word.partition("=")

@@ -6,7 +6,7 @@ from tyro.conf import Positional
 
 from ..flights.executors import WorkersConfig
 from ..flights.viewpoints import CaptureConfig
-from ._flags import Command
+from ._flags import Command, Files
 
 
 class Capture(Command, CaptureConfig, WorkersConfig):
@@ -16,7 +16,7 @@ class Capture(Command, CaptureConfig, WorkersConfig):
     without coco.json. Exit status 2 where there is no OpenGL.
     """
 
-    journals: Positional[tuple[Path, ...]]
+    journals: Positional[Files]
     """MCAP files that --record wrote."""
     out: Path
     """Folder to write to. It must not exist."""
@@ -24,13 +24,11 @@ class Capture(Command, CaptureConfig, WorkersConfig):
     def run(self) -> None:
         """Take them; say where and how many."""
         from ..flights.capture import capture
-        from ..models.errors import InputError, require
+        from ..models.errors import require
         from ..rendering.gl import offscreen_context
         from ._progress import bars
 
         require("PIL", "render", "labelled pictures")
-        if not self.journals:
-            raise InputError("journals: expected at least one file, got none")
         config = CaptureConfig(**self.settings(CaptureConfig))
         workers = WorkersConfig(**self.settings(WorkersConfig))
         offscreen_context(16, 16).free()

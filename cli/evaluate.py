@@ -4,7 +4,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from ._flags import AgentFlags, BackendFlags, check_count
+from ._flags import AgentFlags, BackendFlags, Count
 
 
 class Evaluate(AgentFlags, BackendFlags):
@@ -12,7 +12,7 @@ class Evaluate(AgentFlags, BackendFlags):
 
     policy: Positional[Annotated[str, arg(metavar="POLICY")]]
     """Checkpoint, folder of a training, pid, geometric or orca."""
-    episodes: int = 20
+    episodes: Count = 20
     """Episodes to fly, from seeds that no training uses."""
 
     def run(self) -> None:
@@ -23,7 +23,6 @@ class Evaluate(AgentFlags, BackendFlags):
         from ..training.metrics import Headline, measure_episode
         from ._env import fitted, load_checkpoint, policy_for, remote_env
 
-        check_count("episodes", self.episodes)
         checkpoint = load_checkpoint(self.policy)
         command = fitted(self, checkpoint)
         with remote_env(command, num_envs=command.drones, backend=self.backend) as env:

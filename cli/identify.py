@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from ._flags import Command, Words
+from ..models.fields import Limits
+from ._flags import Command, Files, Words
 
 if TYPE_CHECKING:
     from ..flights.identify import Identified
@@ -18,7 +19,7 @@ class Identify(Command):
     value of the vehicle's file, and is named. Exit status 0 as well in that case.
     """
 
-    logs: Positional[tuple[Path, ...]]
+    logs: Positional[Files]
     """CSV, Parquet or ULog files of the same vehicle."""
     vehicle: Annotated[str, arg(metavar="FILE")]
     """File of the vehicle, TOML or MJCF, with a thrust coefficient, or a name of the library."""
@@ -27,7 +28,7 @@ class Identify(Command):
     fit: Words = ()
     """What to identify. Default: the five of above; besides them there are rotors.drag,
     rotors.inflow, rotors.lift, drag.angular.x, y, z and drag.moment.x, y."""
-    period: float = 0.01
+    period: Annotated[float, Limits(1e-4, 0.1, "s")] = 0.01
     """Logs are resampled to this period, s."""
 
     def run(self) -> None:
@@ -39,11 +40,7 @@ class Identify(Command):
         from ..models.vehicle import Vehicle
 
         require("scipy", "identify", "system identification")
-        if not self.logs:
-            raise InputError("logs: expected at least one file, got none")
         check_new_file(self.out, ".toml")
-        if not 1e-4 <= self.period <= 0.1:
-            raise InputError(f"period: expected 0.0001 to 0.1 s, got {self.period:g}")
         vehicle = Vehicle.load(self.vehicle)
         logs = [read_log(path, vehicle, self.period) for path in self.logs]
         if LAG in self.fit and any(log.measured for log in logs):

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
-from ._flags import Command
+from ._flags import Command, Count, Files
 
 
 class Plot(Command):
@@ -14,7 +14,7 @@ class Plot(Command):
     terminated.
     """
 
-    flights: Positional[tuple[Path, ...]]
+    flights: Positional[Files]
     """MCAP files that --record wrote. Their names are those in the legend."""
     out: Path | None = None
     """PNG, PDF or SVG file to write. Default: the first journal's name with .png."""
@@ -24,20 +24,15 @@ class Plot(Command):
     """Drone of each session, from 0."""
     episode: int = 0
     """The first episode, from 0."""
-    episodes: int = 1
+    episodes: Count = 1
     """Number of episodes of each journal."""
 
     def run(self) -> None:
         """Draw it; say where."""
         from ..flights.plots import FORMATS, plot_flights
         from ..flights.recorded import recorded_trajectories
-        from ..models.errors import InputError
         from ..models.files import check_new_file
-        from ._flags import check_count
 
-        if not self.flights:
-            raise InputError("flights: expected at least one journal, got none")
-        check_count("episodes", self.episodes)
         out = self.out or Path(self.flights[0].stem + ".png")
         check_new_file(out, *FORMATS)
         found = {}

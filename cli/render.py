@@ -3,7 +3,7 @@
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional
 
@@ -11,7 +11,8 @@ from ..flights.palette import agent_label
 from ..flights.recorded import recorded_trajectories
 from ..flights.trajectories import flown_trajectories
 from ..models.errors import InputError
-from ._flags import EnvFlags, Words, check_count
+from ..models.fields import NonNegativeInt
+from ._flags import Count, EnvFlags, OneOrMore, Words
 
 if TYPE_CHECKING:
     from ..flights.filming import FilmTrack
@@ -23,7 +24,7 @@ class Render(EnvFlags):
     Needs no display. Exit status 2 where there is no OpenGL.
     """
 
-    what: Positional[Words]
+    what: Positional[Annotated[Words, OneOrMore()]]
     """Checkpoint, folder of a training, pid, geometric, orca, random, or a journal (.mcap).
     Policies fly evaluation episodes without exploration."""
     out: Path
@@ -31,9 +32,9 @@ class Render(EnvFlags):
     exist."""
     camera: Literal["chase", "front", "side", "top", "onboard"] = "chase"
     """Front and side stand still, the others follow."""
-    episode: int = 0
+    episode: NonNegativeInt = 0
     """The first episode, from 0: of an evaluation, or of those in the journal."""
-    episodes: int = 1
+    episodes: Count = 1
     """Number of episodes."""
     size: str = "1280x720"
     """WIDTHxHEIGHT of the picture with all its panes, pixels."""
@@ -83,13 +84,6 @@ class Render(EnvFlags):
         """Refuse flags that contradict each other."""
         if self.at is not None and self.out.suffix.lower() != ".png":
             raise InputError(f"at: expected it with a picture, --out NAME.png, got {self.out}")
-        if not self.what:
-            raise InputError(
-                "what: expected a checkpoint, pid, geometric, random or a journal, got nothing"
-            )
-        if self.episode < 0:
-            raise InputError(f"episode: expected 0 or more, got {self.episode}")
-        check_count("episodes", self.episodes)
         journals = [Path(words).suffix == ".mcap" for words in self.what]
         if not any(journals) and (self.session is not None or self.drone):
             raise InputError("session, drone: expected them with a journal (.mcap), got none")

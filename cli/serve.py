@@ -5,7 +5,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from ._flags import AgentFlags, check_count
+from ._flags import AgentFlags, Count
 
 
 class Serve(AgentFlags):
@@ -18,7 +18,7 @@ class Serve(AgentFlags):
     """Checkpoint, folder of a training, pid, geometric or orca."""
     listen: Annotated[str | None, arg(metavar="HOST:PORT")] = "127.0.0.1:8001"
     """Address to wait at."""
-    episodes: int | None = None
+    episodes: Count | None = None
     """End after so many episodes. Default: go on until Ctrl-C."""
 
     def run(self) -> None:
@@ -27,7 +27,6 @@ class Serve(AgentFlags):
         from ..udp import LinkError
         from ._env import fitted, load_checkpoint, policy_for, print_episode, remote_env
 
-        check_count("episodes", self.episodes)
         checkpoint = load_checkpoint(self.policy)
         episode = 0
         with remote_env(fitted(self, checkpoint), num_envs=None) as env:

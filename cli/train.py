@@ -1,12 +1,12 @@
 """`rotorgram train`: one run with a progress bar, checkpoints, and Ctrl-C that loses nothing."""
 
-import math
 from typing import Annotated
 
 from tyro.conf import Positional, arg
 
 from ..agents.registry import AlgorithmName
-from ..models.errors import InputError, require
+from ..models.errors import require
+from ..models.fields import Limits
 from ._flags import AgentFlags, BackendOfPreset
 from ._training import TrainingFlags
 
@@ -33,7 +33,7 @@ class Train(AgentFlags, TrainingFlags):
     """Seed of weights, actions and episodes."""
     num_simulators: int = 1
     """With --listen: simulators to wait for, each with its share of the drones."""
-    store_every: float = 10.0
+    store_every: Annotated[float, Limits(0, unit="s", above=True)] = 10.0
     """Seconds between two checkpoints; a resumed training flies again from the last one."""
 
     def run(self) -> int:
@@ -41,8 +41,6 @@ class Train(AgentFlags, TrainingFlags):
         require("tensorboard", "train", "training")
         if self.algorithm.startswith("sb3-"):
             require("torch", "train", self.algorithm)
-        if not 0 < self.store_every < math.inf:
-            raise InputError(f"store-every: expected seconds > 0, got {self.store_every}")
         from . import _trainer
 
         return _trainer.resume(self, self.resume) if self.resume else _trainer.begin(self)

@@ -10,7 +10,7 @@ from ..flights.recorded import recorded_trajectories
 from ..flights.trajectories import flown_trajectories
 from ..models.errors import InputError
 from ..scenes import parse_scene
-from ._flags import EnvFlags, check_count
+from ._flags import Count, EnvFlags
 
 
 class View(EnvFlags):
@@ -23,7 +23,7 @@ class View(EnvFlags):
     """Checkpoint, folder of a training, pid, geometric, orca, random, or a journal (.mcap)."""
     speed: float = 1.0
     """1 is real time, from 1/16 to 8."""
-    episodes: int | None = None
+    episodes: Count | None = None
     """End after so many episodes. Default: go on until it is closed."""
 
     def run(self) -> None:
@@ -33,7 +33,6 @@ class View(EnvFlags):
         from ._env import pilot_of, print_episode
         from ._watch import open_view
 
-        check_count("episodes", self.episodes)
         parse_scene(self.shown_scene)
         path = Path(self.what)
         shown = self

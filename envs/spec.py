@@ -6,7 +6,6 @@ the env's code nor MuJoCo. This module imports the standard library and NumPy al
 
 import json
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields
 from numbers import Real
@@ -15,7 +14,7 @@ from typing import Annotated, Any, ClassVar, Final, Literal, Self
 import numpy as np
 
 from ..models.errors import InputError, shortened
-from ..models.fields import Choice, Limits, Text, check, check_fields
+from ..models.fields import Choice, Limits, Text, check, check_fields, printable
 from ..scenes import marks
 
 MAX_ELEMENTS = 1 << 22  # numbers of all observations of one drone
@@ -44,31 +43,12 @@ class SpecError(InputError):
     """A spec is wrong: nothing of that kind can cross the wire."""
 
 
-@dataclass(frozen=True)
-class _Pattern:
-    """A text that matches a pattern, or a tuple of such texts."""
-
-    pattern: str
-    expected: str
-    several: bool = False
-
-    def read(self, value: Any) -> object:
-        words = value if self.several else (value,)
-        if not isinstance(words, tuple):
-            raise TypeError
-        if not all(re.fullmatch(self.pattern, word) for word in words):
-            raise ValueError
-        return value
-
-
-_VISIBLE = r"[^\x00-\x1f\x7f-\x9f\ud800-\udfff]"  # nor halves of surrogate pairs
-_SHORT = f"of at most {MAX_NAME} characters without control characters"
-_NAME = _Pattern(f"{_VISIBLE}{{1,{MAX_NAME}}}", f"a name {_SHORT}")
-_TEXT = _Pattern(f"{_VISIBLE}{{0,{MAX_NAME}}}", f"a text {_SHORT}")
-_TEXTS = _Pattern(_TEXT.pattern, f"a tuple of texts {_SHORT}", several=True)
-_HASH = _Pattern("[0-9a-f]{32}", "32 hex digits")
-_DIGEST = _Pattern("([0-9a-f]{32})?", "32 hex digits")
-_CONSTANT = _Pattern("[a-z][a-z0-9_]{0,63}", "a name of a to z, 0 to 9 and _")
+_NAME = printable(MAX_NAME)
+_TEXT = printable(MAX_NAME, 0)
+_TEXTS = printable(MAX_NAME, 0, several=True)
+_HASH = Text("[0-9a-f]{32}", "32 hex digits")
+_DIGEST = Text("([0-9a-f]{32})?", "32 hex digits")
+_CONSTANT = Text("[a-z][a-z0-9_]{0,63}", "a name of a to z, 0 to 9 and _")
 _DTYPE = Choice(("float32", "float64", "uint8", "int32", "int64"))
 _SIZE = Limits(0.0, above=True)
 
@@ -200,15 +180,15 @@ class Metric(_Part):
 
     _optional = ("settled", "held", "symbol", "signed", "final")
 
-    name: Annotated[str, Text(MAX_NAME)]
-    unit: Annotated[str, Text(MAX_NAME, empty=True)]
+    name: Annotated[str, _NAME]
+    unit: Annotated[str, _TEXT]
     goal: Literal["zero", "high"] = "zero"
     """`zero`: an error, signed or not; 0 is best. `high`: larger is better."""
     settled: Annotated[float | None, _SIZE] = None
     """Size of the error below which an episode counts as settled; None if undefined."""
     held: Annotated[float | None, _SIZE] = None
     """Mean size of the error at the end of an episode below which its goal counts as held."""
-    symbol: Annotated[str, Text(MAX_NAME, empty=True)] = ""
+    symbol: Annotated[str, _TEXT] = ""
     """Short symbol for figures and overlays, as E; empty: the name."""
     signed: bool = False
     """Whether it changes sign where it passes its best: then there is an overshoot."""

@@ -23,6 +23,7 @@ from threading import Thread
 from typing import Any, Literal, NamedTuple, TypeVar
 
 from ..models.errors import InputError
+from ..models.fields import PositiveInt, check_fields
 
 OnProgress = Callable[[str, int, int, str], None]
 """Called with a job's name, the amounts done and in total, and a status text."""
@@ -42,7 +43,7 @@ _CHILD_ENVIRONMENT = {
 class WorkersConfig:
     """Kind and number of workers."""
 
-    jobs: int | None = None
+    jobs: PositiveInt | None = None
     """Jobs at a time. Default: one for each core of this machine, or of the cluster."""
     runner: Literal["processes", "ray"] = "processes"
     """processes: of this machine. ray: a Ray cluster (pip install 'rotorgram[ray]')."""
@@ -51,8 +52,7 @@ class WorkersConfig:
     or None on one of its machines."""
 
     def __post_init__(self) -> None:
-        if self.jobs is not None and self.jobs < 1:
-            raise InputError(f"jobs: expected at least 1, got {self.jobs}")
+        check_fields(self)
         if self.address is not None and self.runner != "ray":
             raise InputError(f"address: expected it with runner ray, got it with {self.runner}")
 

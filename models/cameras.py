@@ -32,6 +32,7 @@ FARTHEST = 1000.0
 MAX_PIXELS = 4096  # of a side
 _TEXTS = PREFIX + "cameras."
 _MAX_LETTERS = 64  # of a name
+_NAME = Text(rf"[^\W\d]\w{{,{_MAX_LETTERS - 1}}}", f"up to {_MAX_LETTERS} letters, digits and _")
 _FOVY = Limits(1e-3, 3.0, "rad")
 _DEGREES = Limits(math.degrees(_FOVY.low), math.degrees(_FOVY.high), "degrees")
 _RESOLUTION = Limits(1, MAX_PIXELS, "pixel", whole=True, count=2)
@@ -50,7 +51,7 @@ Axis = Annotated[_Vector, Direction(-1e3, 1e3, "1", count=3)]
 class Camera:
     """A camera of a vehicle, or of its world: a table of a TOML file."""
 
-    name: Annotated[str, Text(_MAX_LETTERS, identifier=True)]
+    name: Annotated[str, _NAME]
     position: Place = ORIGIN
     """In the body frame, or the world's if it stands there, m."""
     look: Axis = AHEAD

@@ -17,6 +17,7 @@ Imports the standard library alone.
 
 import inspect
 import math
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import KW_ONLY, MISSING, dataclass, field, fields
 from numbers import Real
@@ -155,31 +156,26 @@ class Choice:
 
 @dataclass(frozen=True)
 class Text:
-    """A text; where a largest length is given, of printable characters."""
+    """A text that a regular expression matches, or a tuple of such texts."""
 
-    longest: int | None = None
-    _: KW_ONLY
-    identifier: bool = False
-    """Letters, digits and _ alone, the first no digit."""
-    empty: bool = False
-    """It may have no character."""
+    pattern: str = "(?s).*"
+    expected: str = "a text"
+    several: bool = False
 
-    @property
-    def expected(self) -> str:
-        if self.longest is None:
-            return "a text"
-        if self.identifier:
-            return f"up to {self.longest} letters, digits and _"
-        return f"a text of {int(not self.empty)} to {self.longest} printable characters"
-
-    def read(self, value: object) -> str:
-        if not isinstance(value, str) or not (value or self.empty):
-            raise ValueError
-        if self.longest is not None and not (len(value) <= self.longest and value.isprintable()):
-            raise ValueError
-        if self.identifier and not value.isidentifier():
+    def read(self, value: Any) -> object:
+        words = value if self.several else (value,)
+        if not isinstance(words, tuple):
+            raise TypeError
+        if not all(re.fullmatch(self.pattern, word) for word in words):
             raise ValueError
         return value
+
+
+def printable(longest: int, least: int = 1, *, several: bool = False) -> Text:
+    """Texts of so many characters, none of which is a control or half of a surrogate pair."""
+    visible = r"[^\x00-\x1f\x7f-\x9f\ud800-\udfff]"
+    words = f"a text of {least} to {longest} characters without control characters"
+    return Text(f"{visible}{{{least},{longest}}}", words, several)
 
 
 @dataclass(frozen=True)
@@ -300,7 +296,7 @@ _PLAIN: Mapping[object, Rule] = {
     bool: Flag(),
     int: Limits(whole=True),
     float: Limits(),
-    str: Text(empty=True),
+    str: Text(),
 }
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from .cameras import AHEAD, ORIGIN, OUTPUTS, UP, Axis, Camera, Place, steps_of
 from .coefficients import COEFFICIENTS, TABLES, as_tuple
 from .errors import InputError, shortened
-from .fields import Choice, Limits, T, Text, check, limits_of, read_table
+from .fields import Choice, Limits, T, Text, check, limits_of, printable, read_table
 from .files import read_toml
 
 _Vehicle: Any = TABLES["vehicle"]
@@ -66,7 +66,7 @@ class Body(_Body):  # type: ignore[misc]
 class PlacedRotor:
     """Where a rotor is and how it turns."""
 
-    name: Annotated[str, Text(100)]
+    name: Annotated[str, printable(100)]
     turn: Literal["cw", "ccw"]
     """Seen from where its thrust points to."""
     position: Place | None = None
@@ -106,7 +106,7 @@ class _Sourced:
 class Tables(_Vehicle):  # type: ignore[misc]
     """A whole file, its tables not read yet."""
 
-    name: Annotated[str, Text(100)]
+    name: Annotated[str, printable(100)]
     model: object = None
     body: object = None
     rotors: object = None
@@ -213,7 +213,7 @@ def model_of(path: Path) -> Path:
 def _table(numbers: list[Number], kind: type[T], given: object, where: str) -> T:
     """A table as its dataclass; its numbers are added to those of the file."""
     table = _mapping(given, where)
-    source = check(f"{where}.source", Text(empty=True), table.pop("source", ""))
+    source = check(f"{where}.source", Text(), table.pop("source", ""))
     prefix = "" if where == "vehicle" else f"{where}."
     for key, limits in limits_of(kind).items():
         if key in table:

@@ -473,7 +473,7 @@ def test_train_with_many_drones(tmp_path: Path, capsys: Capsys) -> None:
     err = refused(capsys, "train", "a2c", "--num-simulators", 2)
     assert "num-simulators: expected 1 without --listen" in err
     err = refused(capsys, "train", "a2c", *settings[:2], "--num-envs", 0)
-    assert "num_envs: expected at least 1, got 0" in err
+    assert "num_envs: expected a whole number of at least 1, or none, got 0" in err
 
 
 def test_train_evaluate_and_resume(tmp_path: Path, capsys: Capsys) -> None:

@@ -11,11 +11,11 @@ from rotorgram.models.errors import InputError
 from rotorgram.models.fields import (
     Limits,
     NumberOrPair,
-    Text,
     check,
     check_fields,
     limits_of,
     optional,
+    printable,
     read_table,
     rules_of,
 )
@@ -32,7 +32,7 @@ class Options:
     length: float | None = optional(0.0, 2.0, "m")
     speed: Annotated[float | tuple[float, float], NumberOrPair(Limits(0, 5, "m/s"))] = 1.0
     frame: Literal["body", "world"] = "body"
-    name: Annotated[str, Text(5)] = "quad"
+    name: Annotated[str, printable(5)] = "quad"
     shadows: bool = False
     scale: float = 1.0
     data: Any = None
@@ -87,7 +87,7 @@ def test_a_wrong_value_gives_one_sentence(name: str, value: Any, sentence: str) 
         (Limits(unit="m"), "a number in m"),
         (Limits(0, 1, "1", count=0), "1 or more numbers from 0 to 1"),
         (Limits(0, 1, count=0, least=0), "numbers from 0 to 1"),
-        (Text(8, identifier=True), "up to 8 letters, digits and _"),
+        (printable(8), "a text of 1 to 8 characters without control characters"),
     ],
 )
 def test_words(rule: Any, words: str) -> None:
