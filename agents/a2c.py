@@ -1,19 +1,18 @@
 """Advantage Actor-Critic: the paper's Algorithm 2, Equation 3."""
 
 import math
-from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
 
-from ..models.fields import Limits
+from ..models.fields import Limits, immutable
 from .config import RolloutConfig
 from .learner import Learner
 from .networks import Floats
 from .rollouts import Collector, Mask, Numbers, Rollout, advantages
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class A2CConfig(RolloutConfig):
     """Advantage Actor-Critic (paper, section 2.3, Algorithm 2). Defaults: the paper's setting.
 

@@ -4,14 +4,13 @@ Back-propagation through time, as in Wiedemann et al., ICRA 2023, arXiv 2209.130
 function. It needs the derivative of the env's step, which compiled code in this process has.
 """
 
-from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
 
 from ..envs.compiled import CompiledLoop
 from ..models.errors import InputError
-from ..models.fields import Limits, PositiveInt
+from ..models.fields import Limits, PositiveInt, immutable
 from .config import Config
 from .episodes import EpisodeRecorder
 from .learner import Learner
@@ -20,7 +19,7 @@ from .optimizers import clip_norm
 from .rollouts import Collector, Rollout
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class APGConfig(Config):
     """Analytic policy gradients. Defaults are ours."""
 

@@ -11,7 +11,7 @@ import hashlib
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,7 +21,7 @@ from ..envs.config import EnvConfig
 from ..envs.spec import EnvSpec
 from ..models import Backend
 from ..models.errors import InputError, one_line, require, shortened
-from ..models.fields import Limits, check_fields
+from ..models.fields import Limits, check_fields, immutable
 from ..models.files import software_versions, write_whole
 from .config import Config
 from .episodes import Episode, Position, ResumeError
@@ -43,7 +43,7 @@ class CheckpointError(InputError):
     """A file is missing, is not a checkpoint of ours, or its parts do not fit together."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class Checkpoint:
     """A training at an update boundary."""
 

@@ -1,18 +1,17 @@
 """Hyperparameters that all algorithms have."""
 
-from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..models.fields import Limits, PositiveInt, check_fields
+from ..models.fields import Limits, PositiveInt, check_fields, immutable
 
 Positive = Annotated[float, Limits(0.0, 1e30, above=True)]
 """A number above 0 that float32 holds."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class Config:
     """Base of the hyperparameters of every algorithm. Raises `InputError` for a wrong one."""
 
@@ -52,7 +51,7 @@ class Config:
         return 1
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class RolloutConfig(Config):
     """Hyperparameters of an algorithm with rollouts of a fixed size."""
 
@@ -67,7 +66,7 @@ class RolloutConfig(Config):
         return self.rollout_size(drones)
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class SACConfig(RolloutConfig):
     """Stable-Baselines3's Soft Actor-Critic (Haarnoja et al. 2018, arXiv 1812.05905).
 

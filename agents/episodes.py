@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..envs.autoreset import AdvancingVectorEnv, worlds_done
 from ..envs.spec import EnvSpec
 from ..models.errors import InputError
-from ..models.fields import Limits
+from ..models.fields import Limits, immutable
 from .networks import Floats
 from .policies import ActionMap, flat
 
@@ -58,7 +58,7 @@ def _none() -> Any:
     return np.zeros(0, np.int64)
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class Position:
     """Position of a run of N drones; N is 0 of a policy alone, which has no arrays."""
 

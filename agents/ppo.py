@@ -1,19 +1,18 @@
 """Proximal Policy Optimisation: Schulman et al. 2017, arXiv 1707.06347, Equations 7 and 9."""
 
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Annotated
 
 import numpy as np
 
-from ..models.fields import Limits, PositiveInt
+from ..models.fields import Limits, PositiveInt, immutable
 from .a2c import A2C, A2CConfig
 from .networks import Floats, views
 from .optimizers import clip_norm
 from .rollouts import Rollout
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class PPOConfig(A2CConfig):
     """Proximal Policy Optimisation (Schulman et al. 2017). Defaults: where it says so, the paper's.
 

@@ -1,7 +1,7 @@
 """Presets: hyperparameters of an algorithm for a task, from `presets.toml`."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal
@@ -9,7 +9,7 @@ from typing import Any, Literal
 from ..envs.registry import is_known, task_type
 from ..models import Backend
 from ..models.errors import InputError
-from ..models.fields import check_names
+from ..models.fields import check_names, immutable
 from ..models.files import read_toml
 from .config import Config
 from .registry import find_algorithm
@@ -22,7 +22,7 @@ _FILE = Path(__file__).with_name("presets.toml")
 _FLIGHT = ("num_envs", "env_steps", "backend")
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class Preset:
     """Hyperparameters, and what they were found with."""
 

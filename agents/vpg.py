@@ -1,19 +1,18 @@
 """Vanilla Policy Gradient: the paper's Algorithm 1, Equations 1 and 2."""
 
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from ..models.errors import InputError
-from ..models.fields import PositiveInt
+from ..models.fields import PositiveInt, immutable
 from .config import Config
 from .learner import Learner
 from .networks import Floats
 from .rollouts import Collector, Rollout, rewards_to_go, step_of_episode
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class VPGConfig(Config):
     """Vanilla Policy Gradient (paper, section 2.3, Algorithm 1). Defaults: the paper's setting."""
 

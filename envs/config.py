@@ -7,14 +7,14 @@ import inspect
 import json
 import sys
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, field, fields, replace
 from hashlib import blake2b
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from ..models import BACKENDS, MAX_DRONES, Backend
 from ..models.errors import InputError, shortened
-from ..models.fields import Choice, Limits, check, check_fields, check_names, read_table
+from ..models.fields import Choice, Limits, check, check_fields, check_names, immutable, read_table
 from ..models.files import read_toml
 from ..models.library import is_of_the_library, vehicle_words
 from ..scenes import scenes_of
@@ -35,7 +35,7 @@ MAX_EPISODE_LENGTH = 1 << 31  # control steps
 MAX_HISTORY = 1000  # observations side by side
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class SceneConfig:
     """Ground and obstacles around the drones."""
 
@@ -71,7 +71,7 @@ class SceneConfig:
         return cls(name=parts[0][0], seeds=seeds)
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class BackendConfig:
     """What steps the drones."""
 
@@ -104,7 +104,7 @@ class BackendConfig:
         return values
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class EnvConfig:
     """The task, and everything that it is flown with.
 

@@ -7,14 +7,14 @@ the env's code nor MuJoCo. This module imports the standard library and NumPy al
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import MISSING, field, fields
 from numbers import Real
 from typing import Annotated, Any, ClassVar, Final, Literal, Self
 
 import numpy as np
 
 from ..models.errors import InputError, shortened
-from ..models.fields import Choice, Limits, Text, check, check_fields, printable
+from ..models.fields import Choice, Limits, Text, check, check_fields, immutable, printable
 from ..scenes import marks
 
 MAX_ELEMENTS = 1 << 22  # numbers of all observations of one drone
@@ -90,7 +90,7 @@ class _Part:
         return cls(**cls._fields(content))
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class ArraySpec(_Part):
     """An array of one drone. Bounds of the same value are kept as one number."""
 
@@ -156,7 +156,7 @@ class ArraySpec(_Part):
         return low.reshape(self.shape), high.reshape(self.shape)
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class Discrete(_Part):
     """An action that is one choice out of 0 ... n - 1."""
 
@@ -174,7 +174,7 @@ class Discrete(_Part):
         _check_components("action", self.components, self.n)
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class Metric(_Part):
     """A measure of how well a task is done. The first metric of a task is its headline."""
 
@@ -200,7 +200,7 @@ class Metric(_Part):
         check_fields(self, "metric: ", SpecError)
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class Mark(marks.Mark, _Part):
     """Something of a task that pictures show and physics does not know."""
 
@@ -210,7 +210,7 @@ class Mark(marks.Mark, _Part):
         check_fields(self, "mark: ", SpecError)
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class EnvSpec(_Part):
     """Everything that an agent must know of an env. Arrays are those of one drone."""
 

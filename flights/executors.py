@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import dataclass
 from itertools import islice
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
@@ -23,7 +22,7 @@ from threading import Thread
 from typing import Any, Literal, NamedTuple, TypeVar
 
 from ..models.errors import InputError
-from ..models.fields import PositiveInt, check_fields
+from ..models.fields import PositiveInt, check_fields, immutable
 
 OnProgress = Callable[[str, int, int, str], None]
 """Called with a job's name, the amounts done and in total, and a status text."""
@@ -39,7 +38,7 @@ _CHILD_ENVIRONMENT = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class WorkersConfig:
     """Kind and number of workers."""
 

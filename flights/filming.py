@@ -12,7 +12,7 @@ import numpy as np
 
 from ..envs.rendering import moment
 from ..models.errors import InputError
-from ..models.fields import Limits, check_fields
+from ..models.fields import Limits, check_fields, immutable
 from ..rendering import Camera, Canvas, Moment, Stage
 from ..rendering.film import QUALITY, Picture, write_film
 from ..rendering.gl import Lines
@@ -47,7 +47,7 @@ def moments(trajectory: Trajectory) -> list[Moment]:
     return found
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class FilmTrack:
     """One pane of a film: a name and its trajectories."""
 
@@ -78,7 +78,7 @@ class FilmTrack:
         return f"{len(early)} of {self.drones} ended" if early else ""
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class Film:
     """Settings of a film."""
 

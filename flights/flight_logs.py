@@ -1,7 +1,7 @@
 """Logs of real flights: CSV, Parquet and ULog files on a uniform grid of times."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import NoReturn
 
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..models.errors import InputError, one_line, require
+from ..models.fields import immutable
 from ..models.files import read_toml
 from ..models.vehicle import Vehicle
 
@@ -35,7 +36,7 @@ _MOST_LEFT_OUT = 0.01  # share of the samples
 _FASTEST = 5.0  # rotor speed, as a multiple of that at the largest thrust
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class FlightLog:
     """A recorded flight on a uniform grid of N times."""
 

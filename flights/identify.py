@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..models.errors import InputError
-from ..models.fields import check_names
+from ..models.fields import check_names, immutable
 from ..models.vehicle import Vehicle
 from ..models.vehicle_file import read_vehicle_file
 from ..sim.rotations import advanced
@@ -66,7 +66,7 @@ class Estimate(NamedTuple):
     """Why the vehicle's own value was kept; empty: the value is identified."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class Identified:
     """The vehicle's numbers that the logs determine."""
 

@@ -10,13 +10,14 @@ and body rates, body frame; SI.
 import copy
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..models.coefficients import Coefficients
+from ..models.fields import immutable
 from ..models.vehicle import Vehicle
 from ..sim.backends.rigid import RigidWorld
 from ..sim.effects import EffectOptions
@@ -74,7 +75,7 @@ def inertia_of(vehicle: Vehicle, numbers: Numbers) -> Floats:
     return inertia
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class Windows:
     """M starts of flights, the rotor speeds from there on, and the measured motion."""
 

@@ -17,7 +17,7 @@ from .. import models
 from ..envs.config import words_of
 from ..envs.spec import Mark
 from ..models.errors import InputError
-from ..models.fields import Limits, NonNegativeInt, PositiveInt, check_fields
+from ..models.fields import Limits, NonNegativeInt, PositiveInt, check_fields, immutable
 from ..scenes import parse_scene
 from ..sim.rotations import multiplied
 from .recorded import read_episodes
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from ..models.cameras import View
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class CaptureConfig:
     """Which pictures are taken of recorded flights."""
 

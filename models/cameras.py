@@ -8,7 +8,7 @@ MJCF has no word, is a custom text: "rotorgram/cameras.NAME.rate". A TOML file h
 import math
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Annotated
 
 import mujoco
@@ -17,7 +17,7 @@ from mujoco import MjData, MjModel, MjSpec
 
 from .coefficients import PREFIX
 from .errors import InputError, shortened
-from .fields import Direction, Limits, Text, check
+from .fields import Direction, Limits, Text, check, immutable
 
 OUTPUTS = {
     "rgb": mujoco.mjtCamOutBit.mjCAMOUT_RGB,
@@ -47,7 +47,7 @@ Place = Annotated[_Vector, Limits(-100.0, 100.0, "m", count=3)]
 Axis = Annotated[_Vector, Direction(-1e3, 1e3, "1", count=3)]
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class Camera:
     """A camera of a vehicle, or of its world: a table of a TOML file."""
 
@@ -100,7 +100,7 @@ class Camera:
         return words + (f", every {self.every} steps" if self.every > 1 else "")
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class View:
     """Pictures of one kind by one camera: an array of an observation."""
 

@@ -19,7 +19,7 @@ import numpy as np
 from mujoco import MjData, MjModel
 from numpy.typing import NDArray
 
-from .fields import check_names
+from .fields import check_names, immutable
 from .files import read_toml
 from .mjcf import vehicle_spec
 from .vehicle import Vehicle
@@ -56,7 +56,7 @@ class Rule:
     """Of the numbers; empty for pure numbers."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class Check(Rule):
     """One line of the examination; its limits may be those of the craft."""
 

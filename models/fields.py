@@ -1,6 +1,6 @@
 """Rules of the fields of a dataclass, and the check of every range in the project.
 
-    @dataclass(frozen=True, kw_only=True)
+    @immutable
     class Options:
         control_period: Annotated[float, Limits(1e-6, 1.0, "s")] = 0.02
         laps: Annotated[int, Limits(1, 1000, whole=True)] = 1
@@ -22,11 +22,27 @@ from collections.abc import Iterable, Mapping
 from dataclasses import KW_ONLY, MISSING, dataclass, field, fields
 from numbers import Real
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, Protocol, TypeVar, Union, get_args, get_origin
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    Protocol,
+    TypeVar,
+    Union,
+    dataclass_transform,
+    get_args,
+    get_origin,
+)
 
 from .errors import InputError, shortened
 
 T = TypeVar("T")
+
+
+@dataclass_transform(kw_only_default=True, frozen_default=True, field_specifiers=(field,))
+def immutable(kind: type[T]) -> type[T]:
+    """A frozen dataclass, whose fields are given by name."""
+    return dataclass(frozen=True, kw_only=True)(kind)
 
 
 class Rule(Protocol):

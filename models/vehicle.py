@@ -21,7 +21,7 @@ from . import MAX_DRAG
 from .cameras import Camera, own_cameras, read_cameras
 from .coefficients import PREFIX, Coefficients
 from .errors import InputError, one_line
-from .fields import Limits, check
+from .fields import Limits, check, immutable
 from .library import find_vehicle
 from .matrices import inverse, product, right_inverse, settled
 from .mjcf import free_body, level_data, vehicle_spec
@@ -43,7 +43,7 @@ SURROUNDINGS = (True, False, False, False, False, False)
 """Of a vehicle's model the groups of geoms that are not the craft's, for rays."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class Rotor:
     """One rotor of a vehicle."""
 

@@ -6,7 +6,7 @@ Each table is a dataclass whose fields are the keys. Body frame: x forward, y le
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from .cameras import AHEAD, ORIGIN, OUTPUTS, UP, Axis, Camera, Place, steps_of
 from .coefficients import COEFFICIENTS, TABLES, as_tuple
 from .errors import InputError, shortened
-from .fields import Choice, Limits, T, Text, check, limits_of, printable, read_table
+from .fields import Choice, Limits, T, Text, check, immutable, limits_of, printable, read_table
 from .files import read_toml
 
 _Vehicle: Any = TABLES["vehicle"]
@@ -28,7 +28,7 @@ _Length = Annotated[float, Limits(1e-5, 100.0, "m")]
 _LEAST_MOMENT = 1e-15  # kg m²: MuJoCo's mjMINVAL
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class Box:
     """A part of a body, at its center."""
 
@@ -40,7 +40,7 @@ class Box:
     yaw: Annotated[float, Limits(-2 * math.pi, 2 * math.pi, "rad")] = 0.0
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class Cylinder:
     """A part of a body, at its center."""
 
@@ -55,14 +55,14 @@ class Cylinder:
 _SHAPES: Final[Mapping[str, type[Box | Cylinder]]] = {"box": Box, "cylinder": Cylinder}
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class Body(_Body):  # type: ignore[misc]
     """Mass and inertia, or parts that have them; and the hub."""
 
     parts: tuple[Box | Cylinder, ...] = ()
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class PlacedRotor:
     """Where a rotor is and how it turns."""
 
@@ -79,7 +79,7 @@ class PlacedRotor:
     site: str | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class RotorTable(_Rotors):  # type: ignore[misc]
     """Rotors, all alike, in a frame or in a list."""
 
@@ -87,12 +87,12 @@ class RotorTable(_Rotors):  # type: ignore[misc]
     list: tuple[PlacedRotor, ...] = ()
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class _Model:
     file: str
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class _Sourced:
     """A number with its provenance."""
 
@@ -102,7 +102,7 @@ class _Sourced:
     others: object = ()
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class Tables(_Vehicle):  # type: ignore[misc]
     """A whole file, its tables not read yet."""
 
@@ -127,7 +127,7 @@ FRAMES = {
 clockwise seen from above. The first turns clockwise, the next counterclockwise, and so on."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class Number:
     """A number of a vehicle's file, and where it comes from."""
 
@@ -142,7 +142,7 @@ class Number:
     """Values of other sources."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class VehicleFile:
     """A vehicle's TOML file, read and checked by `read_vehicle_file`."""
 

@@ -5,7 +5,6 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Literal, NamedTuple, get_args
@@ -16,7 +15,7 @@ from mujoco import MjModel, MjvScene, mjtGeom
 
 from ..models.cameras import place_cameras
 from ..models.errors import InputError, one_line, shortened
-from ..models.fields import Limits, check
+from ..models.fields import Limits, check, immutable
 from ..models.files import read_toml
 from ..models.fleet import load_vehicles, members_of
 from ..models.mjcf import level_data, swarm_spec
@@ -72,7 +71,7 @@ class MetricValue(NamedTuple):
         return f"{number} {self.unit}".strip()
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class Moment:
     """One craft after one control step. Positions are in the world frame, m."""
 

@@ -4,10 +4,9 @@ Imports the standard library and models/fields.py alone.
 """
 
 import math
-from dataclasses import dataclass
 from typing import Annotated, Literal, NamedTuple
 
-from ..models.fields import Limits
+from ..models.fields import Limits, immutable
 
 Point = tuple[float, float, float]
 
@@ -15,7 +14,7 @@ _BAR = 0.025  # radius of a gate's bars, over the gate's width
 _CORNERS = ((-1, -1), (1, -1), (1, 1), (-1, 1))
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class Mark:
     """Something of a task that pictures show."""
 

@@ -11,7 +11,6 @@ of its metric counts crashes already, as the share of landings does.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 from ..envs.spec import EnvSpec, Metric
 from ..flights.trajectories import Trajectory
 from ..models.errors import InputError
+from ..models.fields import immutable
 from .statistics import Floats, Values, trimmed_mean
 
 Places = NDArray[np.int64]
@@ -44,7 +44,7 @@ class Spread(NamedTuple):
     high: Floats
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class Headline(Metric):
     """The metric that decides, and how its numbers are read. The *size* of an error (goal `zero`)
     is its magnitude; of a metric that is to be high, its value.

@@ -5,7 +5,7 @@ Imports neither torch nor pandas.
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, field, replace
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any, Literal
@@ -17,7 +17,7 @@ from ..envs.registry import env_spec, load
 from ..flights.trajectories import EpisodeSet
 from ..models import Backend
 from ..models.errors import InputError, shortened
-from ..models.fields import NonNegativeInt, PositiveInt, check_fields, read_table
+from ..models.fields import NonNegativeInt, PositiveInt, check_fields, immutable, read_table
 
 MIN_FLIGHTS = 200
 """Evaluation flights of each row of a study, over all its seeds."""
@@ -26,7 +26,7 @@ BOARD = Path(__file__).parent / "assets" / "baselines.toml"
 _LONGEST_WORD = 60  # characters of an option's value in a name
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class Run:
     """Settings of one training: all that its numbers depend on but the software."""
 
@@ -58,7 +58,7 @@ class Run:
         return {**vars(self), "env": self.env.to_dict(), "config": asdict(self.config)}
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class Row:
     """A row of a study: an agent on an env. A row of an algorithm has a training for each seed."""
 
@@ -203,7 +203,7 @@ def env_from(keywords: Mapping[str, Any]) -> EnvConfig:
 Kind = Literal["paper", "compare", "sweep", "benchmark"]
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class Study:
     """Many runs: every row with every seed."""
 

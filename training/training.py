@@ -18,6 +18,7 @@ from ..envs.spec import EnvSpec
 from ..flights.executors import Tell
 from ..models import BACKENDS, Backend
 from ..models.errors import InputError
+from ..models.fields import immutable
 from .settings import Run
 
 _TELL_EVERY = 0.2  # s
@@ -31,7 +32,7 @@ def config_of(spec: EnvSpec, backend: Backend, vehicle: str | None = None) -> En
     )
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class Snapshot:
     """The policy after part of the training."""
 

@@ -1,13 +1,12 @@
 """`rotorgram/Cable-v0`: drones carry one payload together, each on a cable, to a point."""
 
 import math
-from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
 
 from ...models.errors import InputError
-from ...models.fields import Limits
+from ...models.fields import Limits, immutable
 from ...models.matrices import right_inverse
 from ...sim import Array, Draw, InitialState, atan2, cos, length, sin, stack, total
 from ..config import EnvConfig
@@ -27,7 +26,7 @@ from .swarm import Swarm, SwarmOptions, angles, approach, on_circle, ring, share
 from .task import Outcome
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class CableOptions(SwarmOptions):
     """Options of `rotorgram/Cable-v0`. `center` is the point for the payload."""
 

@@ -1,13 +1,12 @@
 """`rotorgram/Elevation-v0`: hold an elevation, the paper's task."""
 
 import math
-from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
 
 from ...models.errors import InputError, shortened
-from ...models.fields import Limits, NumberOrPair
+from ...models.fields import Limits, NumberOrPair, immutable
 from ...sim import (
     Array,
     CollectiveThrust,
@@ -32,7 +31,7 @@ ActionType = Literal["continuous", "discrete"]
 Observed = Literal["full", "error"]
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class ElevationOptions(TaskOptions):
     """Options of `rotorgram/Elevation-v0`."""
 

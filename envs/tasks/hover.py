@@ -1,10 +1,9 @@
 """`rotorgram/Hover-v0`: hold a position and a heading with independent rotors."""
 
 import math
-from dataclasses import dataclass
 from typing import Annotated
 
-from ...models.fields import Limits
+from ...models.fields import Limits, immutable
 from ...sim import (
     Array,
     Draw,
@@ -37,7 +36,7 @@ from .task import Outcome, TaskOptions
 HEADING_WEIGHT = 0.2  # Cost of a heading half a turn off
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class HoverOptions(TaskOptions):
     """Options of `rotorgram/Hover-v0`."""
 

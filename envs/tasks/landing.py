@@ -1,13 +1,12 @@
 """`rotorgram/Landing-v0`: touch down softly on a pad that moves over the ground."""
 
 import math
-from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
 
 from ...models.errors import InputError, shortened
-from ...models.fields import Limits, NumberOrPair
+from ...models.fields import Limits, NumberOrPair, immutable
 from ...sim import Array, Draw, InitialState, component, cos, each, length, sin, stack
 from ..spec import Mark, Metric
 from ..state import State
@@ -33,7 +32,7 @@ FURTHEST = 1e3  # m
 Motion = Literal["circle", "line"]
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class LandingOptions(TaskOptions):
     """Options of `rotorgram/Landing-v0`."""
 

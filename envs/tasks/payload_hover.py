@@ -1,10 +1,9 @@
 """`rotorgram/PayloadHover-v0`: hold a payload on a cable at a point, and damp its swing."""
 
 import math
-from dataclasses import dataclass
 from typing import Annotated
 
-from ...models.fields import Limits
+from ...models.fields import Limits, immutable
 from ...sim import (
     Array,
     Draw,
@@ -40,7 +39,7 @@ from .goal import (
 from .task import Outcome, TaskOptions
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class PayloadHoverOptions(TaskOptions):
     """Options of `rotorgram/PayloadHover-v0`."""
 

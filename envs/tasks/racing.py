@@ -3,14 +3,14 @@
 import json
 import math
 import tomllib
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 
 from ...models.errors import InputError, one_line, shortened
-from ...models.fields import Limits, read_table
+from ...models.fields import Limits, immutable, read_table
 from ...sim import (
     Array,
     Draw,
@@ -52,7 +52,7 @@ MAX_LAPS = 1000
 _WAY = "a track of ours, a TOML file of gates, or its content as JSON"
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class Start:
     """Where a race starts."""
 
@@ -61,7 +61,7 @@ class Start:
     """Direction of the nose about z, anticlockwise from x."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class Gate(Start):
     """A square opening that stands upright: its centre, and the direction in which it is passed."""
 
@@ -69,7 +69,7 @@ class Gate(Start):
     """Width and height."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class _Track:
     """Content of a track's file."""
 
@@ -77,7 +77,7 @@ class _Track:
     start: object
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class RacingOptions(TaskOptions):
     """Options of `rotorgram/Racing-v0`."""
 

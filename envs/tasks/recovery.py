@@ -1,12 +1,11 @@
 """`rotorgram/Recovery-v0`: thrown at any attitude and spinning, come to rest where it began."""
 
 import math
-from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
 
-from ...models.fields import Limits
+from ...models.fields import Limits, immutable
 from ...sim import (
     Array,
     Draw,
@@ -40,7 +39,7 @@ STOP_TIME = 0.5  # Longest time to stop the spin about an axis by all torque abo
 Frame = Literal["body", "world"]
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class RecoveryOptions(TaskOptions):
     """Options of `rotorgram/Recovery-v0`."""
 

@@ -2,12 +2,11 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
 
-from ...models.fields import Limits
+from ...models.fields import Limits, immutable
 from ...sim import Array, Draw, InitialState, clip, cos, length, looked_up, sin, stack, total
 from ..spec import Metric
 from ..state import State
@@ -34,7 +33,7 @@ TINY = 1e-9  # m
 JITTER = 0.2  # Of a start, in each axis, over the distance between starts
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class SwarmOptions(TaskOptions):
     """Options that the tasks for several drones share."""
 
@@ -221,7 +220,7 @@ Formed = Literal["ring", "line", "grid"]
 _PLACES = {"ring": ring, "line": line, "grid": grid}
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class FormationOptions(SwarmOptions):
     """Options of `rotorgram/Formation-v0`."""
 
@@ -330,7 +329,7 @@ class Crossing(Swarm):
         return self._opposite(self.memory.turn)
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class EscortOptions(SwarmOptions):
     """Options of `rotorgram/Escort-v0`."""
 

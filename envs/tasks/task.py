@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from ...models.errors import InputError, UnknownOption
-from ...models.fields import check_fields
+from ...models.fields import check_fields, immutable
 from ...sim import LEVELS, Array, Controller, Draw, InitialState, make_controller
 from ..memory import Memory
 from ..spec import ArraySpec, Mark, Metric
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 HORIZON = 100  # 1 / (1 - γ) of the largest discount, γ = 0.99: see `Task.crash`
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class TaskOptions:
     """Base of the options of a task: derive, add fields, and check them in `check`.
 

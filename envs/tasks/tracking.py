@@ -1,11 +1,10 @@
 """`rotorgram/Tracking-v0`: follow a trajectory in time."""
 
-from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
 
-from ...models.fields import Limits
+from ...models.fields import Limits, immutable
 from ...sim import Array, Draw, InitialState, cos, length, looked_up, remainder, sin
 from ..spec import Metric
 from ..state import State
@@ -24,7 +23,7 @@ from .task import Outcome, TaskOptions
 Curve = Literal["circle", "lemniscate"]
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class TrackingOptions(TaskOptions):
     """Options of `rotorgram/Tracking-v0`."""
 

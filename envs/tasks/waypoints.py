@@ -1,11 +1,10 @@
 """`rotorgram/Waypoints-v0`: fly to some points, one after the other."""
 
-from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
 
-from ...models.fields import Limits
+from ...models.fields import Limits, immutable
 from ...sim import Array, Draw, InitialState, length, plain
 from ..spec import Mark, Metric
 from ..state import State
@@ -26,7 +25,7 @@ from .task import Outcome, TaskOptions
 MAX_POINTS = 64
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class WaypointsOptions(TaskOptions):
     """Options of `rotorgram/Waypoints-v0`."""
 

@@ -21,13 +21,14 @@ Yaw has a p of its own, by the same rule from its own α.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Self
 
 import numpy as np
 
 from ... import models
 from ...models.errors import InputError
+from ...models.fields import immutable
 from ...models.matrices import right_inverse
 from ..elementary import atan2, cos, expm1, sin
 from ..state import total
@@ -43,7 +44,7 @@ LEAST_ROOM = 0.05
 """Least room for torques around hover, of the range of thrust: a craft may hover at its least."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class Gains:
     """What the loops need to know of a vehicle. Axes are x, y, z of the body."""
 

@@ -1,15 +1,15 @@
 """Which effects are on."""
 
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from typing import Annotated
 
 from ...models import MAX_DRAG
-from ...models.fields import Limits, check_fields
+from ...models.fields import Limits, check_fields, immutable
 
 MAX_WIND = 100.0  # m/s
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class EffectOptions:
     """Which effects are on. A wrong option raises `InputError` with one sentence.
 

@@ -14,7 +14,7 @@ from random import Random
 from typing import Annotated
 
 from ...models.errors import InputError
-from ...models.fields import Limits, check_fields
+from ...models.fields import Limits, check_fields, immutable
 from . import binary, text
 from .auth import Key, is_sealed, message_of, sealed
 from .errors import DecodeError, Forged
@@ -81,7 +81,7 @@ def largest_datagram(peer: Address) -> int:
     return NEAR if peer[0].startswith("127.") else FAR
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class LinkConfig:
     """Settings of a simulator's exchange."""
 

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...models.errors import InputError, shortened
+from ...models.fields import immutable
 from .layout import MAX_DRONES, Array
 
 MAX_UINT64 = (1 << 64) - 1  # largest session, sequence number, nonce and seed
@@ -49,7 +50,7 @@ class Extension(NamedTuple):
     """Whether a side that does not know it must not go on."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@immutable
 class Hello:
     """Simulator to agent, first: its env and its worlds."""
 
@@ -75,7 +76,7 @@ class Hello:
             raise InputError(f"spec: expected 2 to {MAX_SPEC} bytes of UTF-8, got {size}")
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@immutable
 class Welcome:
     """Agent to simulator: the session is open."""
 
@@ -95,7 +96,7 @@ class Welcome:
         return self.session if self.seed is None else self.seed
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@immutable
 class Refuse:
     """Agent to simulator: the session is not opened."""
 
@@ -106,14 +107,14 @@ class Refuse:
         _check_text("reason", self.reason)
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@immutable
 class Wait:
     """Agent to simulator: every slot is taken; go on saying Hello."""
 
     session: int
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@immutable
 class Unknown:
     """Agent to simulator: the session of this State is not known here; say Hello again."""
 
@@ -122,7 +123,7 @@ class Unknown:
     """Number of that State."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@immutable
 class Alive:
     """Simulator to agent: the Command of this number came, and is still being computed. Agent to
     simulator, that has asked again: the State of this number came, and is not yet answered."""
@@ -131,7 +132,7 @@ class Alive:
     sequence: int
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@immutable
 class Missing:
     """Either side: some fragments of a message have come, and these have not."""
 
@@ -218,7 +219,7 @@ class Command:
         return np.asarray(self.orders == FREEZE)
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@immutable
 class Close:
     """Either side: the exchange ends here."""
 
