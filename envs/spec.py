@@ -43,9 +43,11 @@ class SpecError(InputError):
     """A spec is wrong: nothing of that kind can cross the wire."""
 
 
-_NAME = printable(MAX_NAME)
-_TEXT = printable(MAX_NAME, 0)
-_TEXTS = printable(MAX_NAME, 0, several=True)
+Name = Annotated[str, printable(MAX_NAME)]
+_WORD = printable(MAX_NAME, 0)
+Word = Annotated[str, _WORD]
+_WORDS = printable(MAX_NAME, 0, several=True)
+Words = Annotated[tuple[str, ...], _WORDS]
 _HASH = Text("[0-9a-f]{32}", "32 hex digits")
 _DIGEST = Text("([0-9a-f]{32})?", "32 hex digits")
 _CONSTANT = Text("[a-z][a-z0-9_]{0,63}", "a name of a to z, 0 to 9 and _")
@@ -96,7 +98,7 @@ class ArraySpec(_Part):
 
     _optional = ("low", "high", "unit", "frame", "components", "categories")
 
-    name: Annotated[str, _NAME]
+    name: Name
     shape: tuple[int, ...]
     dtype: Annotated[str, _DTYPE] = "float32"
     """`float32`, `float64`, `uint8`, `int32` or `int64`."""
@@ -104,11 +106,11 @@ class ArraySpec(_Part):
     high: Bound = math.inf
     unit: str | tuple[str, ...] = ""
     """One for all elements, or one for each."""
-    frame: Annotated[str, _TEXT] = ""
+    frame: Word = ""
     """Frame of reference; empty where there is none."""
-    components: Annotated[tuple[str, ...], _TEXTS] = ()
+    components: Words = ()
     """A name for each element, or none."""
-    categories: Annotated[tuple[str, ...], _TEXTS] = ()
+    categories: Words = ()
     """What the values 0, 1, 2... stand for, where they are numbers of something; or none."""
 
     def __post_init__(self) -> None:
@@ -129,7 +131,7 @@ class ArraySpec(_Part):
             raise SpecError(f"{name}: expected low <= high, got {got} at element {first}")
         one_unit = isinstance(self.unit, str)
         units = (self.unit,) if one_unit else self.unit
-        check(f"{name}: unit", _TEXTS, units, SpecError)
+        check(f"{name}: unit", _WORDS, units, SpecError)
         _expect(one_unit or len(units) == self.size, name, f"{self.size} units", len(units))
         _check_components(name, self.components, self.size)
 
@@ -162,11 +164,11 @@ class Discrete(_Part):
 
     _optional = ("components",)
 
-    name: Annotated[str, _TEXT] = "action"
+    name: Word = "action"
     n: Annotated[int, Limits(1, 1 << 24, "choices", whole=True)] = field(
         metadata={"json": "choices"}
     )
-    components: Annotated[tuple[str, ...], _TEXTS] = ()
+    components: Words = ()
     """A name for each choice, or none."""
 
     def __post_init__(self) -> None:
@@ -180,15 +182,15 @@ class Metric(_Part):
 
     _optional = ("settled", "held", "symbol", "signed", "final")
 
-    name: Annotated[str, _NAME]
-    unit: Annotated[str, _TEXT]
+    name: Name
+    unit: Word
     goal: Literal["zero", "high"] = "zero"
     """`zero`: an error, signed or not; 0 is best. `high`: larger is better."""
     settled: Annotated[float | None, _SIZE] = None
     """Size of the error below which an episode counts as settled; None if undefined."""
     held: Annotated[float | None, _SIZE] = None
     """Mean size of the error at the end of an episode below which its goal counts as held."""
-    symbol: Annotated[str, _TEXT] = ""
+    symbol: Word = ""
     """Short symbol for figures and overlays, as E; empty: the name."""
     signed: bool = False
     """Whether it changes sign where it passes its best: then there is an overshoot."""
@@ -216,19 +218,19 @@ class EnvSpec(_Part):
 
     _optional = ("config_digest", "constants", "marks")
 
-    env_id: Annotated[str, _TEXT]
+    env_id: Word
     options: Mapping[str, Any] = field(default_factory=dict)
     """Every option of the env, as JSON values."""
     control_period: Annotated[float, Limits(1e-6, 1e3, "s")]
     """Time that one step simulates, s."""
-    vehicle: Annotated[str, _TEXT] = ""
+    vehicle: Word = ""
     """Name of the vehicle's model."""
     vehicle_hash: Annotated[str, _HASH] = "0" * 32
     """32 hexadecimal digits: the same model, the same hash; zeros where there is none."""
     config_digest: Annotated[str, _DIGEST] = ""
     """32 hexadecimal digits of the resolved `EnvConfig`, or empty. The same digest, the same
     numbers."""
-    agents: Annotated[tuple[str, ...], _TEXTS] = ("drone_0",)
+    agents: Words = ("drone_0",)
     """One name for each drone of a world."""
     observation: tuple[ArraySpec, ...]
     action: ArraySpec | Discrete
@@ -408,7 +410,7 @@ def json_values(options: Any) -> Values:
             f"options: expected JSON values, got {shortened(options)}: {error}"
         ) from None
     for name in plain:
-        check("options", _TEXT, name, SpecError)
+        check("options", _WORD, name, SpecError)
     return plain
 
 

@@ -127,6 +127,9 @@ class Trajectory:
 
 # ---- flown
 
+Flights = list[Trajectory]
+ByEpisode = dict[int, Flights]
+
 
 def fly_episodes(
     env: AdvancingVectorEnv,
@@ -135,7 +138,7 @@ def fly_episodes(
     of: EpisodeSet = "curve",
     first: int = 0,
     training_seed: int | None = None,
-) -> list[Trajectory]:
+) -> Flights:
     """Evaluation episodes of a set, from the number `first` on, in their order.
 
     The env, without autoreset, flies as many at a time as it has worlds, each drone with a copy of
@@ -145,7 +148,7 @@ def fly_episodes(
     """
     numbers = range(first, first + episodes)
     seeds = {number: evaluation_seed(number, of, training_seed) for number in numbers}
-    flown: dict[int, list[Trajectory]] = {}
+    flown: ByEpisode = {}
     worlds = env.num_envs // len(env.env_spec.agents)
     while missing := [episode for episode in seeds if episode not in flown]:
         batch = {episode: seeds[episode] for episode in missing[:worlds]}
@@ -155,7 +158,7 @@ def fly_episodes(
 
 def _fly_batch(
     env: AdvancingVectorEnv, policy: Policy | None, seeds: Mapping[int, int]
-) -> dict[int, list[Trajectory]]:
+) -> ByEpisode:
     """At most W episodes, one in each world, by number; those of a lost simulator are missing."""
     drones = len(env.env_spec.agents)
     used = len(seeds) * drones
@@ -189,7 +192,7 @@ def _fly_batch(
     all_rewards = np.array(rewards)
     all_actions = np.array(actions)
     episodes = list(seeds)
-    flown: dict[int, list[Trajectory]] = {}
+    flown: ByEpisode = {}
     # A world that lost one of its drones is flown again.
     spoiled = lost.reshape(-1, drones).any(axis=1).repeat(drones)
     for drone in np.flatnonzero(~spoiled[:used]).tolist():
@@ -234,11 +237,11 @@ def flown_trajectories(
     episodes: Sequence[int],
     of: EpisodeSet = "curve",
     training_seed: int | None = None,
-) -> list[Trajectory]:
+) -> Flights:
     """Evaluation episodes of a set by number, flown in process as by `fly_episodes`."""
     from ..envs.vector import LocalVectorEnv  # which imports MuJoCo
 
-    found: list[Trajectory] = []
+    found: Flights = []
     with closing(LocalVectorEnv(config, config.drones, autoreset_mode="Disabled")) as world:
         for episode in episodes:
             found += fly_episodes(world, policy, 1, of, episode, training_seed)

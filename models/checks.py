@@ -111,6 +111,9 @@ def failed(checks: Iterable[Check]) -> list[Check]:
 # ---- flights -------------------------------------------------------------------------------------
 
 
+Checks = Iterator[Check]
+
+
 class _Craft:
     """A vehicle, and the model of its file in vacuum, which has no drag but the file's own."""
 
@@ -176,11 +179,11 @@ def _fly(model: MjModel, data: MjData, seconds: float) -> float:
 # ---- the groups of checks ------------------------------------------------------------------------
 
 
-def _gravity(craft: _Craft) -> Iterator[Check]:
+def _gravity(craft: _Craft) -> Checks:
     yield _judged("gravity: size", craft.vehicle.gravity)
 
 
-def _units(craft: _Craft) -> Iterator[Check]:
+def _units(craft: _Craft) -> Checks:
     arm = craft.arm
     vehicle = craft.vehicle
     inertia = vehicle.mass * arm**2
@@ -201,7 +204,7 @@ def _units(craft: _Craft) -> Iterator[Check]:
         yield _judged("units: tip speed", radius * fastest)
 
 
-def _allocation(craft: _Craft) -> Iterator[Check]:
+def _allocation(craft: _Craft) -> Checks:
     thrust, *torques = craft.vehicle.allocation
     size = float(np.linalg.norm(thrust))
     along = thrust / size
@@ -211,7 +214,7 @@ def _allocation(craft: _Craft) -> Iterator[Check]:
     yield _judged("allocation: torques apart from each other", np.linalg.eigvalsh(rows @ rows.T)[0])
 
 
-def _turns(craft: _Craft) -> Iterator[Check]:
+def _turns(craft: _Craft) -> Checks:
     rotors = craft.vehicle.rotors
     reactions = np.array([np.dot(rotor.reaction, rotor.axis) for rotor in rotors])
     sizes = np.abs(reactions)
@@ -226,7 +229,7 @@ def _turns(craft: _Craft) -> Iterator[Check]:
         yield _judged("turns: reaction of {} / median", size / median, rotor.name)
 
 
-def _hover(craft: _Craft) -> Iterator[Check]:
+def _hover(craft: _Craft) -> Checks:
     vehicle = craft.vehicle
     most = float(vehicle.allocation[0] @ vehicle.thrust_high)
     yield _judged("hover: thrust to weight", most / (vehicle.mass * vehicle.gravity))
@@ -234,7 +237,7 @@ def _hover(craft: _Craft) -> Iterator[Check]:
     yield _judged("hover: margin of the tightest rotor", margin)
 
 
-def _free_fall(craft: _Craft) -> Iterator[Check]:
+def _free_fall(craft: _Craft) -> Checks:
     model, data = craft.at_rest(_THRUSTS, _CONTACTS)
     seconds = _fly(model, data, 2.0)
     depth = craft.vehicle.gravity * seconds**2 / 2
@@ -243,7 +246,7 @@ def _free_fall(craft: _Craft) -> Iterator[Check]:
     yield _judged("free fall: depth", fallen, expected=depth, tolerance=tolerance)
 
 
-def _physics_step(craft: _Craft) -> Iterator[Check]:
+def _physics_step(craft: _Craft) -> Checks:
     """Attitudes after tumbling as fast as full torque turns the craft in 0.1 s."""
     vehicle = craft.vehicle
     fastest = max(vehicle.turning((1.0, 0.0, 0.0)), vehicle.turning((0.0, 1.0, 0.0)))
@@ -254,7 +257,7 @@ def _physics_step(craft: _Craft) -> Iterator[Check]:
     yield _judged("physics step: error of attitude", math.degrees(apart) / (steps * step))
 
 
-def _floor(craft: _Craft) -> Iterator[Check]:
+def _floor(craft: _Craft) -> Checks:
     rest = craft.vehicle.rest_height
     model, data = craft.at_rest(_THRUSTS)
     data.qpos[2] = rest + 0.05

@@ -8,19 +8,20 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
+Array = np.ndarray
 _NOTHING = 1e-13  # of a number: what rounding leaves
 
 
-def settled(values: ArrayLike, size: float = 1.0) -> np.ndarray:
+def settled(values: ArrayLike, size: float = 1.0) -> Array:
     """Rounded to about 1e-12 of a size, with no negative zero.
 
     The last bits of what MuJoCo's compiler computes differ between processors.
     """
-    rounded: np.ndarray = np.round(np.asarray(values), 12 - round(math.log10(size))) + 0.0
+    rounded: Array = np.round(np.asarray(values), 12 - round(math.log10(size))) + 0.0
     return rounded
 
 
-def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def product(a: Array, b: Array) -> Array:
     """a @ b of shapes (..., n, k) and (..., k, m), summed from the first product to the last."""
     total = a[..., :, 0, None] * b[..., 0, None, :]
     for k in range(1, a.shape[-1]):
@@ -28,7 +29,7 @@ def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.asarray(total)
 
 
-def inverse(matrix: np.ndarray) -> np.ndarray:
+def inverse(matrix: Array) -> Array:
     """Inverse of positive definite matrices, shape (..., n, n), by Gauss and Jordan.
 
     A row that depends on those before it is left out, with its column.
@@ -45,9 +46,9 @@ def inverse(matrix: np.ndarray) -> np.ndarray:
     return rows[..., count:]
 
 
-def right_inverse(matrix: np.ndarray) -> np.ndarray:
+def right_inverse(matrix: Array) -> Array:
     """Aᵀ (A Aᵀ)⁻¹ of A, shape (n, m): what gives the least x with A x = b."""
     size = np.abs(matrix).max(axis=1, keepdims=True).clip(1e-12)
     rows = matrix / size
-    least: np.ndarray = product(rows.T, inverse(product(rows, rows.T))) / size.T
+    least: Array = product(rows.T, inverse(product(rows, rows.T))) / size.T
     return least

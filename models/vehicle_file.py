@@ -174,11 +174,15 @@ class VehicleFile:
         return ", ".join(f"{one.value:.3g} {one.unit}" for one in errors)
 
 
+_Found = list[Number]
+"""The numbers of a file, as far as it is read."""
+
+
 def read_vehicle_file(path: Path) -> VehicleFile:
     """Read a TOML file. Raises `InputError` with the name and the range of the first wrong field,
     `OSError` if the file cannot be read.
     """
-    numbers: list[Number] = []
+    numbers: _Found = []
     name = path.parent.name if path.stem == "vehicle" else path.stem
     tree = {"name": name, **read_toml(path, "vehicle")}
     file = _table(numbers, Tables, tree, "vehicle")
@@ -210,7 +214,7 @@ def model_of(path: Path) -> Path:
     return read_vehicle_file(path).model or path
 
 
-def _table(numbers: list[Number], kind: type[T], given: object, where: str) -> T:
+def _table(numbers: _Found, kind: type[T], given: object, where: str) -> T:
     """A table as its dataclass; its numbers are added to those of the file."""
     table = _mapping(given, where)
     source = check(f"{where}.source", Text(), table.pop("source", ""))
@@ -267,7 +271,7 @@ def _model(path: Path, given: object) -> Path:
     return model
 
 
-def _body(numbers: list[Number], given: object, model: Path | None) -> Body:
+def _body(numbers: _Found, given: object, model: Path | None) -> Body:
     if model is not None:
         if given is not None:
             raise InputError("body: expected none beside a model's file, which has it, got a table")
@@ -290,13 +294,13 @@ def _body(numbers: list[Number], given: object, model: Path | None) -> Body:
     return replace(body, parts=parts)
 
 
-def _part(numbers: list[Number], given: object, where: str) -> Box | Cylinder:
+def _part(numbers: _Found, given: object, where: str) -> Box | Cylinder:
     shape = _mapping(given, where).get("shape")
     kind = check(f"{where}.shape", Choice(tuple(_SHAPES)), shape)
     return _table(numbers, _SHAPES[kind], given, where)
 
 
-def _rotors(numbers: list[Number], given: object, model: Path | None) -> RotorTable:
+def _rotors(numbers: _Found, given: object, model: Path | None) -> RotorTable:
     mjcf = model is not None and model.suffix.lower() == ".xml"
     if given is None and not mjcf:
         raise InputError("vehicle: expected a table [rotors], got none")
@@ -354,7 +358,7 @@ def _with_thrust(rotors: RotorTable) -> RotorTable:
 
 
 def _rotor(
-    numbers: list[Number], given: object, where: str, number: int, model: Path | None
+    numbers: _Found, given: object, where: str, number: int, model: Path | None
 ) -> PlacedRotor:
     table = {"name": f"rotor{number}", **_mapping(given, where)}
     for name in table.keys() & RotorTable.__dataclass_fields__.keys():
@@ -399,7 +403,7 @@ def _framed(rotors: RotorTable, frame: str) -> RotorTable:
     return replace(rotors, list=tuple(placed))
 
 
-def _camera(numbers: list[Number], given: object, where: str) -> Camera:
+def _camera(numbers: _Found, given: object, where: str) -> Camera:
     has_up = "up" in _mapping(given, where)
     camera = _table(numbers, Camera, given, where)
     kinds = camera.kinds

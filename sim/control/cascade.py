@@ -29,6 +29,7 @@ from ..rotations import Parts, Rows, dot, matrix, times, transposed
 from ..state import Array, WorldState, clip, interpolated, parts_of, square_root, stack
 from .gains import Gains
 
+Numbers = tuple[float, ...]
 _ASIDE = 1e-3  # Upside down every way to turn is as short: it is about x
 _TINY = 1e-12  # Added to squares under a root, whose slope at 0 is infinite
 _STEPS = 1024  # of the table that inverts a thrust curve: right to 1e-6
@@ -45,8 +46,8 @@ class Rates:
 
     every_step = True
     choices = 0
-    low: tuple[float, ...] = (-1.0,) * 4
-    high: tuple[float, ...] = (1.0,) * 4
+    low: Numbers = (-1.0,) * 4
+    high: Numbers = (1.0,) * 4
     components: tuple[str, ...] = ("collective thrust", "roll rate", "pitch rate", "yaw rate")
     units: tuple[str, ...] = ("1", "rad/s", "rad/s", "rad/s")
     frame = "body"
@@ -54,7 +55,7 @@ class Rates:
     def __init__(self, vehicle: "models.Vehicle", gains: Gains, effects: EffectOptions) -> None:
         self.gains = gains
         self._sizes = self.sizes(gains)
-        self.constants: dict[str, float | tuple[float, ...]] = {"action_scale": self._sizes}
+        self.constants: dict[str, float | Numbers] = {"action_scale": self._sizes}
         self._mass = vehicle.mass
         self._gravity = vehicle.gravity
         self._hover = vehicle.mass * vehicle.gravity
@@ -68,7 +69,7 @@ class Rates:
             (curve,) = vehicle.coefficients.need("rotors.curve", "thrust_curve")
             self._throttle = _throttle(curve)
 
-    def sizes(self, gains: Gains) -> tuple[float, ...]:
+    def sizes(self, gains: Gains) -> Numbers:
         """Values of actions of 1; that of a collective thrust is 1, which is its limit."""
         return (1.0, *gains.most_rate)
 
@@ -147,7 +148,7 @@ class Attitude(Rates):
     units = ("1", "rad", "rad", "rad/s")
     frame = "world turned by the heading"
 
-    def sizes(self, gains: Gains) -> tuple[float, ...]:
+    def sizes(self, gains: Gains) -> Numbers:
         return 1.0, gains.most_tilt, gains.most_tilt, gains.most_rate[2]
 
     def thrust(self, action: Array, state: WorldState) -> Array:
@@ -185,7 +186,7 @@ class Velocity(Attitude):
     components = ("velocity x", "velocity y", "velocity z", "yaw rate")
     units = ("m/s", "m/s", "m/s", "rad/s")
 
-    def sizes(self, gains: Gains) -> tuple[float, ...]:
+    def sizes(self, gains: Gains) -> Numbers:
         level, up = gains.most_velocity
         return level, level, up, gains.most_rate[2]
 
@@ -228,7 +229,7 @@ class Position(Velocity):
         super().__init__(vehicle, gains, effects)
         self.constants["position_gain"] = gains.position
 
-    def sizes(self, gains: Gains) -> tuple[float, ...]:
+    def sizes(self, gains: Gains) -> Numbers:
         level, up = gains.most_offset
         return level, level, up, math.pi
 
@@ -251,7 +252,7 @@ class Position(Velocity):
         return clip(_least([braked, speed / distance]), 0.0, self.gains.position)
 
 
-def _throttle(curve: tuple[float, ...]) -> np.ndarray:
+def _throttle(curve: Numbers) -> np.ndarray:
     """Throttles of a thrust curve, over even steps of the square root of the thrust: its slope
     there is finite for curves of u² too.
     """

@@ -119,6 +119,9 @@ class AgentLink:
         return words
 
 
+Links = list[AgentLink]
+
+
 @dataclass(eq=False)
 class WorldRules:
     """Base of the rules: the links, their timers and their ends.
@@ -135,13 +138,13 @@ class WorldRules:
     world: World
     layout: Layout
     period: float  # of a control step, s
-    links: list[AgentLink]
+    links: Links
 
     def __post_init__(self) -> None:
         self.reason: str | None = None
         self.cause: Command | None = None
         self.moved = False
-        self._due: list[AgentLink] = []  # of States
+        self._due: Links = []  # of States
 
     def start(self, now: float) -> None:
         """Say Hello to every agent."""
@@ -316,7 +319,7 @@ class SeveralAgents(WorldRules):
             self._follow(flying)
         return True
 
-    def _follow(self, flying: list[AgentLink]) -> None:
+    def _follow(self, flying: Links) -> None:
         """Do what the Commands of all flying agents say."""
         resetting = [link for link in flying if link.order == RESET]
         if len(resetting) == len(flying):
@@ -345,7 +348,7 @@ class SeveralAgents(WorldRules):
             else:
                 self._let_go(link)
 
-    def _seeds(self, joining: list[AgentLink]) -> Seeds | None:
+    def _seeds(self, joining: Links) -> Seeds | None:
         """Seeds of the next episode, from the first Command of those that join; None: none came."""
         drones = self.layout.drones
         if not self.episodes:  # from the Welcome, as `OneAgent` takes it
@@ -354,7 +357,7 @@ class SeveralAgents(WorldRules):
         seeds = commands[0].seeds if commands else None
         return None if seeds is None else np.full(drones, seeds[0], np.uint64)
 
-    def _fly(self, flying: list[AgentLink]) -> None:
+    def _fly(self, flying: Links) -> None:
         """Fly the world for one control period."""
         layout = self.layout
         actions = layout.actions.zeros()
@@ -411,7 +414,7 @@ class SeveralAgents(WorldRules):
         """Whether all of its drones are out."""
         return bool(self.world.out[link.rows].all())
 
-    def _who(self, *wanted: Participation) -> list[AgentLink]:
+    def _who(self, *wanted: Participation) -> Links:
         return [link for link in self.links if link.participation in wanted]
 
     # ---- States
