@@ -424,7 +424,7 @@ def test_no_display(
 
 WRONG = [
     (("--speed", "9"), "speed: expected a number from 0.0625 to 8, got 9.0"),
-    (("--episodes", "0"), "episodes: expected a whole number of at least 1"),
+    (("--episodes", "0"), "episodes: expected a whole number of at least 1, or none, got 0"),
 ]
 
 
