@@ -26,8 +26,6 @@ from ..models.errors import printable
 if TYPE_CHECKING:
     from ._flags import Command
 
-__all__ = ["COMMANDS", "EXTRAS", "main"]
-
 COMMANDS = (
     "sim",
     "train",

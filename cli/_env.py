@@ -12,8 +12,7 @@ from ..envs.config import BACKEND_KEYWORDS, BackendConfig
 from ..envs.registry import env_spec, is_known, task_type
 from ..envs.spec import EnvSpec
 from ..flights.trajectories import Trajectory
-from ..models import Backend
-from ..models.errors import InputError
+from ..models import Backend, InputError
 from ._flags import AgentFlags, EnvFlags, parse_address
 
 if TYPE_CHECKING:

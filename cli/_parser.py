@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar, Union, cast, get_args
 import tyro
 from tyro.conf import arg
 
-from ..models.errors import InputError
+from ..models import InputError
 from ..models.fields import check_fields
 from ._flags import (
     DEFAULT_ENV,

@@ -17,8 +17,7 @@ from ..agents import Checkpoint, Episode, find_algorithm, find_preset, load, pre
 from ..envs.autoreset import AdvancingVectorEnv
 from ..envs.config import BackendConfig
 from ..flights.folders import locked
-from ..models import Backend
-from ..models.errors import InputError
+from ..models import Backend, InputError
 from ..models.files import software_versions, write_json, write_whole
 from ..training.settings import Run
 from ..training.training import Training, config_of, is_finished

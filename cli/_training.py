@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ..agents.presets import PresetName
 from ..flights.folders import LOCK, new_folder
-from ..models.errors import InputError
+from ..models import InputError
 from ._flags import BackendFlags, Count, NamedValues, Options, Words, parse_value
 
 

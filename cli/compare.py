@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 from tyro.conf import Positional, arg
 
 from ..agents.registry import AlgorithmName
-from ..models.errors import InputError
+from ..models import InputError
 from ._flags import DEFAULT_ENV, Words
 from ._study import StudyFlags
 

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from ..models.errors import InputError
+from ..models import InputError
 from ..models.files import write_whole
 from ._flags import Command
 

@@ -10,7 +10,7 @@ from tyro.conf import Positional
 from ..flights.palette import agent_label
 from ..flights.recorded import recorded_trajectories
 from ..flights.trajectories import flown_trajectories
-from ..models.errors import InputError
+from ..models import InputError
 from ..models.fields import NonNegativeInt
 from ._flags import Count, EnvFlags, OneOrMore, Words
 

@@ -3,7 +3,7 @@
 from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Literal
 
-from ..models.errors import InputError
+from ..models import InputError
 from ._flags import BackendFlags, WireFlags, Words, parse_address
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 from tyro.conf import Positional
 
 from ..agents.registry import AlgorithmName
-from ..models.errors import InputError
+from ..models import InputError
 from ._flags import NamedValues, Options, Words, parse_value
 from ._study import StudyFlags
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from ..models.errors import InputError
+from ..models import InputError
 from ..models.files import check_new_file, write_new
 from ._flags import Command
 

@@ -8,7 +8,7 @@ from tyro.conf import Positional
 
 from ..flights.recorded import recorded_trajectories
 from ..flights.trajectories import flown_trajectories
-from ..models.errors import InputError
+from ..models import InputError
 from ..scenes import parse_scene
 from ._flags import Count, EnvFlags
 

@@ -21,7 +21,7 @@ from multiprocessing.synchronize import Lock
 from threading import Thread
 from typing import Any, Literal, NamedTuple, TypeVar
 
-from ..models.errors import InputError
+from ..models import InputError
 from ..models.fields import PositiveInt, check_fields, immutable
 
 OnProgress = Callable[[str, int, int, str], None]

@@ -11,7 +11,7 @@ from typing import Annotated
 import numpy as np
 
 from ..envs.rendering import moment
-from ..models.errors import InputError
+from ..models import InputError
 from ..models.fields import Limits, check_fields, immutable
 from ..rendering import Camera, Canvas, Moment, Stage
 from ..rendering.film import QUALITY, Picture, write_film

@@ -7,7 +7,7 @@ from datetime import datetime
 from itertools import count
 from pathlib import Path
 
-from ..models.errors import InputError
+from ..models import InputError
 
 LOCK = ".lock"
 """File in a folder that its writer holds locked."""

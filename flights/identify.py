@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..models.errors import InputError
+from ..models import InputError
 from ..models.fields import check_names, immutable
 from ..models.vehicle import Vehicle
 from ..models.vehicle_file import read_vehicle_file

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..models.errors import InputError
+from ..models import InputError
 from ..udp.journal.reader import Recording, Session, Transition
 from ..udp.protocol.messages import State
 from .trajectories import Ending, Trajectory

@@ -18,7 +18,7 @@ from ..agents.policies import Policy
 from ..envs.autoreset import AdvancingVectorEnv, worlds_done
 from ..envs.config import EnvConfig
 from ..envs.spec import EnvSpec
-from ..models.errors import InputError
+from ..models import InputError
 
 Floats = NDArray[np.float64]
 

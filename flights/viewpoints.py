@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from .. import models
 from ..envs.config import words_of
 from ..envs.spec import Mark
-from ..models.errors import InputError
+from ..models import InputError
 from ..models.fields import Limits, NonNegativeInt, PositiveInt, check_fields, immutable
 from ..scenes import parse_scene
 from ..sim.rotations import multiplied

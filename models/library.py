@@ -6,8 +6,6 @@ from pathlib import Path
 from . import QUAD_XML
 from .errors import InputError, shortened
 
-__all__ = ["LIBRARY", "find_vehicle", "is_of_the_library", "vehicle_names", "vehicle_words"]
-
 LIBRARY = Path(__file__).parent / "vehicles"
 """One folder for each vehicle: `NAME/vehicle.toml`."""
 

@@ -16,8 +16,8 @@ import mujoco
 import numpy as np
 from mujoco import MjModel, MjsBody
 
+from ..models import InputError
 from ..models.cameras import FARTHEST, View, place_camera, place_cameras
-from ..models.errors import InputError
 from ..models.fleet import members_of
 from ..models.mjcf import swarm_spec
 from ..models.swarm import drone_names

@@ -14,7 +14,7 @@ from typing import IO, Any
 
 from ..envs import registry
 from ..envs.config import EnvConfig
-from ..models.errors import InputError
+from ..models import InputError
 from .protocol.client import Address
 from .protocol.errors import PeerClosed, PeerSilent
 from .remote import RemoteEnv, RemoteVectorEnv

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import numpy as np
 
-from ...models.errors import InputError
+from ...models import InputError
 from ...models.fields import Limits, immutable
 from ...models.matrices import right_inverse
 from ...sim import Array, Draw, InitialState, atan2, cos, length, sin, stack, total

@@ -7,7 +7,7 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from ...models.errors import InputError
+from ...models import InputError
 from ...models.fields import Limits
 from ...sim import (
     Array,

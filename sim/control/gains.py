@@ -27,7 +27,7 @@ from typing import Any, Self
 import numpy as np
 
 from ... import models
-from ...models.errors import InputError
+from ...models import InputError
 from ...models.fields import immutable
 from ...models.matrices import right_inverse
 from ..elementary import atan2, cos, expm1, sin

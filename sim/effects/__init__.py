@@ -13,7 +13,7 @@ the same bits alone and in a batch.
 from collections.abc import Callable
 
 from ... import models
-from ...models.errors import InputError
+from ...models import InputError
 from ..random import GUSTS, Noise
 from ..rotations import Parts, add
 from ..snapshots import Kept

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ... import models
-from ...models.errors import InputError
+from ...models import InputError
 from ..rotations import Parts, Rows, add, cross, dot, matrix, product, times, transposed
 from ..snapshots import Kept
 from ..state import (

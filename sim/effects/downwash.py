@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from ... import models
-from ...models.errors import InputError
+from ...models import InputError
 from ..rotations import body_z
 from ..state import Array, WorldState, clip, length, square_root, total
 

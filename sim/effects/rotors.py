@@ -3,7 +3,7 @@
 import numpy as np
 
 from ... import models
-from ...models.errors import InputError
+from ...models import InputError
 from ..elementary import expm1
 from ..snapshots import Kept
 from ..state import Array, ByName, chosen, clip, component, each, square_root, stack, total

@@ -8,8 +8,8 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from ... import models
+from ...models import InputError
 from ...models.coefficients import COEFFICIENTS
-from ...models.errors import InputError
 from ...models.fields import Limits, check, check_names
 from ..snapshots import Kept
 from ..state import Array, chosen, clip, component, plain, some

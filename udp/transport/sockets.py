@@ -19,7 +19,7 @@ from collections.abc import Collection, Sequence
 from contextlib import suppress
 from math import ceil
 
-from ...models.errors import InputError
+from ...models import InputError
 from ..protocol.client import Address, address_text
 from ..protocol.statistics import Statistics
 

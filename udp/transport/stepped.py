@@ -11,7 +11,7 @@ from ...envs import registry
 from ...envs.config import EnvConfig
 from ...envs.spaces import action_space, observation_space
 from ...envs.spec import ArraySpec, Discrete, EnvSpec, canonical_id, component_names
-from ...models.errors import InputError
+from ...models import InputError
 from ...models.fields import Limits, check
 from ..protocol.layout import MAX_DRONES, Array
 from ..protocol.party import Mask, Seeds, World
