@@ -1,6 +1,5 @@
 """`rotorgram render`: flights as films and pictures."""
 
-import re
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -58,11 +57,12 @@ class Render(EnvFlags):
     def run(self) -> None:
         """Fly or read, draw, and say where."""
         from ..flights.filming import Film, film
+        from ..models.cameras import read_size
         from ..rendering.film import check_film
         from ..rendering.gl import offscreen_context
         from ._progress import frame_bar
 
-        width, height = parse_size(self.size)
+        width, height = read_size("size", self.size, 16, 8192)
         settings = self.settings(Film) | {"scene": self.shown_scene}
         config = Film(width=width, height=height, **settings)
         check_film(self.out, width, height, self.fps)
@@ -106,12 +106,3 @@ class Render(EnvFlags):
         flown = flown_trajectories(policy, command.env_config(), episodes, "final")
         track = FilmTrack(name=name, trajectories=flown, drones=command.drones)
         return track, command.vehicle
-
-
-def parse_size(text: str) -> tuple[int, int]:
-    """WIDTHxHEIGHT as a pair. Raises `InputError`."""
-    match = re.fullmatch(r"([0-9]{2,4})x([0-9]{2,4})", text)
-    width, height = map(int, match.groups()) if match else (0, 0)
-    if min(width, height) < 16 or max(width, height) > 8192:
-        raise InputError(f"size: expected WIDTHxHEIGHT of 16 to 8192 pixels each, got {text!r}")
-    return width, height

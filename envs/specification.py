@@ -94,10 +94,11 @@ def _pictures(task: Task) -> tuple[ArraySpec, ...]:
     views = chosen_views(config.cameras, task.vehicle.cameras)
     if not any(view.kind == "segmentation" for view in views):
         return arrays_of(views, ())
-    from ..rendering.cameras import objects_of
+    from ..rendering.cameras import drawn_model, objects_in
 
     payload = config.effects.payload > 0
     objects = []
     for scene in scenes_of(str(config.scene)):
-        objects.append(objects_of(task.vehicle, config.drones, scene, task.marks, payload=payload))
+        model = drawn_model(task.vehicle, config.drones, scene, task.marks, payload=payload)
+        objects.append(objects_in(model)[0])
     return arrays_of(views, objects_of_all(objects))

@@ -145,7 +145,8 @@ def chosen_views(words: Sequence[str], cameras: Iterable[Camera]) -> tuple[View,
                 f"_{', _'.join(OUTPUTS)} behind it or not, got {shortened(word)}"
             )
         if at:
-            camera = replace(camera, resolution=_size(word, size))
+            resolution = read_size(f"cameras: {text}@", size, 1, MAX_PIXELS)
+            camera = replace(camera, resolution=resolution)
         for one in kinds:
             view = View(camera=camera, kind=one)
             if views.setdefault(view.name, view) != view:
@@ -155,12 +156,13 @@ def chosen_views(words: Sequence[str], cameras: Iterable[Camera]) -> tuple[View,
     return tuple(views.values())
 
 
-def _size(word: str, text: str) -> tuple[int, int]:
+def read_size(name: str, text: str, least: int, most: int) -> tuple[int, int]:
+    """Width and height of a text WIDTHxHEIGHT, pixels. Raises `InputError`."""
     match = re.fullmatch(r"([0-9]{1,4})x([0-9]{1,4})", text)
     width, height = map(int, match.groups()) if match else (0, 0)
-    if min(width, height) < 1 or max(width, height) > MAX_PIXELS:
-        expected = f"NAME@WIDTHxHEIGHT of 1 to {MAX_PIXELS} pixels each"
-        raise InputError(f"cameras: expected {expected}, got {shortened(word)}")
+    if min(width, height) < least or max(width, height) > most:
+        expected = f"WIDTHxHEIGHT of {least} to {most} pixels each"
+        raise InputError(f"{name}: expected {expected}, got {shortened(text)}")
     return width, height
 
 

@@ -76,14 +76,6 @@ class Check(Rule):
         """Whether the measured value is within its limits; NaN never is."""
         return self.low <= self.measured <= self.high
 
-    def report(self) -> dict[str, str | float | None]:
-        """For JSON: the fields by name, `tolerance` and `passed`; None for infinity and NaN."""
-        values = vars(self) | {"tolerance": self.tolerance, "passed": self.passed}
-        for name, value in values.items():
-            if isinstance(value, float) and not math.isfinite(value):
-                values[name] = None
-        return values
-
 
 _RULES = read_toml(Path(__file__).with_name("rules.toml"), "rules")
 RULES = {name: Rule(**row) for name, row in _RULES.items()}

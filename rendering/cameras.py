@@ -252,13 +252,6 @@ def _matrix(model: MjModel, camera: int, width: int, height: int) -> Array:
 # ---- the model that is drawn
 
 
-def objects_of(
-    vehicle: Vehicle, drones: int, scene: str, marks: Sequence[Mark], *, payload: bool
-) -> tuple[str, ...]:
-    """`Cameras.objects` of such cameras, without an OpenGL."""
-    return objects_in(drawn_model(vehicle, drones, scene, marks, payload=payload))[0]
-
-
 def drawn_model(
     vehicle: Vehicle, drones: int, scene: str, marks: Sequence[Mark], *, payload: bool
 ) -> MjModel:

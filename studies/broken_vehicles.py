@@ -267,9 +267,18 @@ def _main() -> None:
     checks = examine()
     seconds = round(time.perf_counter() - begun, 3)
     print(markdown(found), examination(checks), sep="\n\n")
-    report = {"seconds": seconds, "checks": [check.report() for check in checks]}
+    report = {"seconds": seconds, "checks": list(map(report_of, checks))}
     text = json.dumps(report, indent=1, ensure_ascii=False, allow_nan=False)
     path.with_suffix(".json").write_text(text + "\n", "utf-8")
+
+
+def report_of(check: Check) -> dict[str, object]:
+    """For JSON: the fields by name, `tolerance` and `passed`; None for infinity and NaN."""
+    values = vars(check) | {"tolerance": check.tolerance, "passed": check.passed}
+    for name, value in values.items():
+        if isinstance(value, float) and not math.isfinite(value):
+            values[name] = None
+    return values
 
 
 if __name__ == "__main__":

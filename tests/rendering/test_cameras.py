@@ -19,7 +19,7 @@ from rotorgram.models.export import export_mjcf
 from rotorgram.models.fleet import load_vehicles
 from rotorgram.models.library import vehicle_names
 from rotorgram.models.vehicle import Vehicle
-from rotorgram.rendering.cameras import Cameras, Lens, objects_of
+from rotorgram.rendering.cameras import Cameras, Lens, drawn_model, objects_in
 from rotorgram.rendering.gl import offscreen_context
 from rotorgram.sim.rotations import to_world
 
@@ -300,7 +300,7 @@ def test_segmentation_knows_the_pad_by_its_area(made: Any) -> None:
     pad = Mark(shape="disc", size=0.5, moves=True)
     cameras = made("down_segmentation@128x128", craft, marks=[pad])
     assert cameras.objects == ("nothing", "scene/floor", "drone_0", "task/disc_0 of drone_0")
-    assert objects_of(craft, 1, "plain", [pad], payload=False) == cameras.objects
+    assert objects_in(drawn_model(craft, 1, "plain", [pad], payload=False))[0] == cameras.objects
     told = state((0.0, 0.0, 2.0), goal=np.array([[0.1, 0.2, 0.0]]))
     picture = take(cameras, **told)["down_segmentation"][0, ..., 0]
     assert set(np.unique(picture)) <= {1, 2, 3}

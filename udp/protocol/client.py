@@ -144,8 +144,7 @@ class RoundTrips:
             seconds = min(seconds, 2 * self.interval)
             self._variation += (abs(smoothed - seconds) - self._variation) / 4
             self._smoothed = smoothed + (seconds - smoothed) / 8
-        margin = max(_GRANULARITY, 4 * self._variation)
-        self.interval = min(self._smoothed + margin, _LONGEST_RESEND)
+        self._set_interval(self._smoothed)
 
     def answered_again(self) -> None:
         """The answer to the last message came a second time.
@@ -159,8 +158,11 @@ class RoundTrips:
         self._in_a_row += 1
         if self._in_a_row > 1:
             self._smoothed = min(_TOO_EARLY * self._smoothed, _LONGEST_RESEND)
-            margin = max(_GRANULARITY, 4 * self._variation)
-            self.interval = min(self._smoothed + margin, _LONGEST_RESEND)
+            self._set_interval(self._smoothed)
+
+    def _set_interval(self, smoothed: float) -> None:
+        margin = max(_GRANULARITY, 4 * self._variation)
+        self.interval = min(smoothed + margin, _LONGEST_RESEND)
 
     def wait(self, tries: int) -> float:
         """Wait for an answer before the next resend, s, after so many tries without any."""
