@@ -69,7 +69,6 @@ class Command:
         return {f.name: getattr(self, f.name) for f in fields(kind) if hasattr(self, f.name)}
 
 
-@dataclass(frozen=True)
 class OneOrMore:
     """A rule for words and files."""
 

@@ -116,7 +116,6 @@ class Limits:
         return int(value)
 
 
-@dataclass(frozen=True)
 class Direction(Limits):
     """Three numbers that are not all 0."""
 
@@ -194,7 +193,6 @@ def printable(longest: int, least: int = 1, *, several: bool = False) -> Text:
     return Text(f"{visible}{{{least},{longest}}}", words, several)
 
 
-@dataclass(frozen=True)
 class Flag:
     """True or false."""
 

@@ -218,7 +218,6 @@ def first_seeds(seed: int, drones: int) -> Seeds:
     return np.uint64(seed) + np.arange(drones, dtype=np.uint64)
 
 
-@dataclass(eq=False)
 class OneAgent(WorldRules):
     """One agent commands every drone, each by its own order."""
 
