@@ -38,11 +38,12 @@ class _Job(NamedTuple):
 
     config: CaptureConfig
     poses: PoseSequence
-    """Those of the frames."""
     sequence: int
-    """Number of the whole sequence."""
-    first: int
-    """Number of the first frame."""
+    """Number of the sequence."""
+    start: int
+    """Number of its first frame."""
+    rows: range
+    """Poses of the frames."""
 
 
 class _Taken(NamedTuple):
@@ -75,7 +76,14 @@ def capture(
     count = sum(map(len, sequences))
     processes = workers.jobs or os.cpu_count() or 1
     longest = min(_MOST_FRAMES, -(-count // (2 * processes)))
-    jobs = {f"frames from {job.first} on": job for job in _jobs(config, sequences, longest)}
+    jobs: dict[str, _Job] = {}
+    start = 0
+    for number, poses in enumerate(sequences):
+        for first in range(0, len(poses), longest):
+            rows = range(first, min(first + longest, len(poses)))
+            job = _Job(config, poses, number, start, rows)
+            jobs[f"frames from {start + first} on"] = job
+        start += len(poses)
     objects = set[str]()
     labels: list[Labels] = []
 
@@ -97,16 +105,6 @@ def capture(
     return count
 
 
-def _jobs(config: CaptureConfig, sequences: Sequence[PoseSequence], longest: int) -> Iterator[_Job]:
-    """Jobs of at most so many frames."""
-    start = 0  # number of the first frame of the sequence
-    for index, poses in enumerate(sequences):
-        for row in range(0, len(poses), longest):
-            part = poses.part(slice(row, row + longest))
-            yield _Job(config, part, index, start + row)
-        start += len(poses)
-
-
 # ---- in workers
 
 
@@ -126,17 +124,17 @@ def _take(job: _Job, tell: Tell) -> _Taken:
     )
     with closing(opened) as cameras:
         due = dict.fromkeys(cameras.pictures, everybody)
-        for row in range(len(poses)):
+        for row in job.rows:
             cameras.take(due, poses.state(row))
             frames.append(_frame(job, row, cameras))
-            tell(len(frames), len(poses), "frames")
+            tell(len(frames), len(job.rows), "frames")
         return _Taken(cameras.objects[1:], frames)  # the first is no object
 
 
 def _frame(job: _Job, row: int, cameras: Cameras) -> tuple[dict[str, bytes], Labels]:
     """Files and labels of the pictures that the cameras have just taken."""
     poses = job.poses
-    number = job.first + row
+    number = job.start + row
     state = poses.state(row)
     names = drone_names(poses.drones)
     files: dict[str, bytes] = {}

@@ -5,7 +5,7 @@ The same journals and the same seed give the same poses on every machine.
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -81,11 +81,6 @@ class PoseSequence:
     def drones(self) -> int:
         """Number of drones, A."""
         return int(self.states["position"].shape[1])
-
-    def part(self, rows: slice) -> "PoseSequence":
-        """Some of the poses."""
-        states = {name: values[rows] for name, values in self.states.items()}
-        return replace(self, times=self.times[rows], states=states)
 
     def state(self, row: int) -> dict[str, Floats]:
         """One pose of all drones."""
