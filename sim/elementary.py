@@ -25,6 +25,9 @@ _LAYOUTS = {"float32": (np.int32, 23, 127), "float64": (np.int64, 52, 1023)}
 """Whole numbers with the bits of a float, bits of its fraction, and its exponent of 1."""
 
 
+Numbers = tuple[float, ...]
+
+
 class _Precision(NamedTuple):
     """Constants of a precision. Polynomials have the highest power first.
 
@@ -32,22 +35,22 @@ class _Precision(NamedTuple):
     log(2), so that their products with whole numbers are exact.
     """
 
-    half_pi: tuple[float, ...]
+    half_pi: Numbers
     furthest: float
     """Largest angle of sines: up to here the products with π / 2 are exact."""
-    sine: tuple[float, ...]
-    cosine: tuple[float, ...]
+    sine: Numbers
+    cosine: Numbers
     log2: tuple[float, float]
     low: float
     """Bounds of the exponential function's argument."""
     high: float
-    exponential: tuple[float, ...]
+    exponential: Numbers
     least: float
     """Least normal number."""
-    logarithm: tuple[float, ...]
-    arc: tuple[float, ...]
+    logarithm: Numbers
+    arc: Numbers
     """Of the arc tangent up to tan(π / 8): Cephes (S. Moshier), atan.c and atanf.c."""
-    arc_below: tuple[float, ...]
+    arc_below: Numbers
     """Polynomial by which that one is divided, if any."""
     half_turn: tuple[float, float]
     """π as a sum."""
@@ -164,7 +167,7 @@ def _scaled(x: Array, power: Array) -> Array:
     return x
 
 
-def polynomial(x: Array, coefficients: tuple[float, ...]) -> Array:
+def polynomial(x: Array, coefficients: Numbers) -> Array:
     """A polynomial by Horner's rule, the highest power of at least one first."""
     result = x * coefficients[0] + coefficients[1]
     for coefficient in coefficients[2:]:

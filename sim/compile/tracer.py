@@ -20,6 +20,7 @@ from numpy.lib.mixins import NDArrayOperatorsMixin
 
 from .program import DType, Function, Program, Value
 
+Call = Callable[..., Any]
 Traced = Any
 """A traced array, which the types of NumPy's functions do not know."""
 
@@ -27,7 +28,7 @@ _FLAG = np.dtype(bool)
 _WHOLE = np.dtype(np.int64)
 _DTYPES = ("bool", "int32", "uint32", "int64", "uint64", "float32", "float64")
 _EXPONENTS = (*range(-8, 0), *range(1, 9))
-_OPERATIONS: dict[Callable[..., Any], str] = {
+_OPERATIONS: dict[Call, str] = {
     np.add: "add",
     np.subtract: "subtract",
     np.multiply: "multiply",
@@ -182,9 +183,7 @@ class TracedArray(NDArrayOperatorsMixin):
             operation = {"add": "or", "multiply": "and"}.get(operation, operation)
         return self._applied(operation, kinds[ufunc.nin], *arrays)
 
-    def __array_function__(
-        self, function: Callable[..., Any], types: object, inputs: Any, options: Any
-    ) -> Any:
+    def __array_function__(self, function: Call, types: object, inputs: Any, options: Any) -> Any:
         if function in _MOVES:
             array, *rest = inputs
             return self._like(function(array.values, *rest, **options))
@@ -223,7 +222,7 @@ class TracedArray(NDArrayOperatorsMixin):
 
     def _called(
         self,
-        function: Callable[..., Any],
+        function: Call,
         made: dict[object, Function],
         given: Sequence[Any],
         vectors: int,
@@ -274,13 +273,13 @@ class TracedArray(NDArrayOperatorsMixin):
         return array
 
 
-def once(vectors: int = 0) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+def once(vectors: int = 0) -> Callable[[Call], Call]:
     """Makes a function of arrays one whose traced code is there once, and is called.
 
     It has no state, and computes each number, or with `vectors` 1 each vector of last axes, alone.
     """
 
-    def wrap(function: Callable[..., Any]) -> Callable[..., Any]:
+    def wrap(function: Call) -> Call:
         made: dict[object, Function] = {}
 
         @wraps(function)
@@ -304,7 +303,7 @@ def read(program: Program, name: str, dtype: DType, shape: tuple[int, ...]) -> T
     return TracedArray(program, array.reshape(shape), dtype)
 
 
-def _function(function: Callable[..., Any], kinds: Sequence[tuple[DType, Any]]) -> Function:
+def _function(function: Call, kinds: Sequence[tuple[DType, Any]]) -> Function:
     """A function traced on its parameters, of such dtypes and shapes."""
     program = Program()
     numbers = count()
@@ -438,7 +437,7 @@ def _of_method(name: str) -> Callable[..., Traced]:
     return call
 
 
-_FUNCTIONS: dict[Callable[..., Any], Callable[..., Any]] = {
+_FUNCTIONS: dict[Call, Call] = {
     np.where: _where,
     np.minimum: _minimum,
     np.maximum: _maximum,
@@ -472,6 +471,6 @@ _FUNCTIONS: dict[Callable[..., Any], Callable[..., Any]] = {
 }
 
 
-def add_function(function: Callable[..., Any], ours: Callable[..., Any]) -> None:
+def add_function(function: Call, ours: Call) -> None:
     """Trace one of NumPy's functions as another."""
     _FUNCTIONS[function] = lambda _, *arrays: ours(*arrays)

@@ -29,11 +29,12 @@ SENSOR_TYPES: Final[Mapping[str, type[Sensor]]] = {
 }
 """In this order they are observed."""
 
+Settings = dict[str, Any]
 _ESTIMATE = Estimator.name
 _OBSERVED = Choice(("added", _ESTIMATE))
 
 
-def checked_sensors(given: object) -> dict[str, Any]:
+def checked_sensors(given: object) -> Settings:
     """The option `sensors` of a task as plain values in one order. Raises `InputError`.
 
     By sensor its settings by name, or True for none; False leaves it out. `estimate` is True or
@@ -42,7 +43,7 @@ def checked_sensors(given: object) -> dict[str, Any]:
     if not isinstance(given, Mapping):
         raise InputError(f"sensors: expected settings by sensor, got {shortened(given)}")
     check_names(given, [*SENSOR_TYPES, _ESTIMATE, "observe"], "sensors")
-    sensors: dict[str, Any] = {}
+    sensors: Settings = {}
     for name, kind in SENSOR_TYPES.items():
         settings = given.get(name, False)
         if settings is False:
@@ -66,9 +67,7 @@ def checked_sensors(given: object) -> dict[str, Any]:
     return sensors
 
 
-def _resolved(
-    sensors: Values, vehicle: "models.Vehicle", period: float
-) -> dict[str, dict[str, Any]]:
+def _resolved(sensors: Values, vehicle: "models.Vehicle", period: float) -> dict[str, Settings]:
     """All settings by sensor."""
     return {
         name: kind.resolved(sensors[name], vehicle, period)
@@ -77,12 +76,12 @@ def _resolved(
     }
 
 
-def readings_of(sensors: Values, vehicle: "models.Vehicle", period: float) -> list[dict[str, Any]]:
+def readings_of(sensors: Values, vehicle: "models.Vehicle", period: float) -> list[Settings]:
     """Fields of the `ArraySpec` of each array that sensors add to an observation.
 
     From `checked_sensors`. Raises `InputError`.
     """
-    readings: list[dict[str, Any]] = []
+    readings: list[Settings] = []
     settings = _resolved(sensors, vehicle, period)
     kinds: list[type[Source]] = [*SENSOR_TYPES.values(), Estimator]
     for kind in kinds:
