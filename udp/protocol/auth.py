@@ -17,7 +17,7 @@ from hmac import compare_digest
 from pathlib import Path
 from typing import Literal
 
-from ...models import InputError
+from ...models.errors import InputError
 from .errors import Forged
 
 KEY_SIZE = 32  # bytes of a shared key

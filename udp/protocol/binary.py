@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ...models import InputError
+from ...models.errors import InputError
 from .errors import DecodeError, VersionMismatch
 from .layout import Layout, Record
 from .messages import (

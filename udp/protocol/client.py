@@ -13,7 +13,7 @@ from math import inf
 from random import Random
 from typing import Annotated
 
-from ...models import InputError
+from ...models.errors import InputError
 from ...models.fields import Limits, check_fields, immutable
 from . import binary, text
 from .auth import Key, is_sealed, message_of, sealed

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...models import InputError
+from ...models.errors import InputError
 from ...models.fields import Limits, check
 
 Array = np.ndarray

@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from ...models import InputError
+from ...models.errors import InputError
 from ...models.frames import (
     attitudes_in_paper_frame,
     positions_in_paper_frame,
