@@ -6,9 +6,10 @@
 After `--` are the words of `rotorgram train`; without any, PPO on the paper's task, with its tuned
 preset. The clock runs from before the process starts to after it has ended, with its checkpoint
 written. Processor seconds are of all its processes: on a busy machine compare these. Each policy
-then flies 20 `--episodes` on `mujoco`, of starts that no training has seen. A seed holds if the
-mean of the steady headline metric over the episodes is on the good side of `--within`, and at most
-0.5 % of them crash; for a metric whose last value counts, as `landed`, the mean alone decides.
+then flies 20 `--episodes` on `mujoco`, from starts of its own that no training has seen. A seed
+holds if the mean of the steady headline metric over the episodes is on the good side of `--within`,
+and at most 0.5 % of them crash; for a metric whose last value counts, as `landed`, the mean alone
+decides.
 
 It takes about two minutes on two cores.
 """
@@ -30,6 +31,7 @@ from rotorgram.agents import CONTROLLERS, load
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.flights.trajectories import fly_episodes
 from rotorgram.training.metrics import Headline, steady_state
+from rotorgram.training.statistics import share_interval
 
 
 def train(words: list[str], seed: int, folder: Path) -> dict[str, float]:
@@ -50,17 +52,17 @@ def processor_seconds() -> float:
 
 
 def evaluate(
-    agent: Any, env_id: str, within: float, vehicle: str | None, episodes: int
+    agent: Any, env_id: str, within: float, vehicle: str | None, episodes: int, seed: int
 ) -> dict[str, object]:
     """Of a `Checkpoint`, or of a controller by its name: steady size of the headline metric and
-    return, means over episodes; crashes; the verdict.
+    return, means over episodes; crashes; the verdict. The starts are those of the training's seed.
     """
     options = CONTROLLERS[agent].options if isinstance(agent, str) else agent.options
     env = LocalVectorEnv(env_id, episodes, autoreset_mode="Disabled", vehicle=vehicle,
                               **options)  # fmt: skip
     spec = env.env_spec
     policy = CONTROLLERS[agent](spec) if isinstance(agent, str) else agent.policy(spec)
-    flown = fly_episodes(env, policy, episodes, "final")
+    flown = fly_episodes(env, policy, episodes, "final", training_seed=seed)
     env.close()
     headline = replace(Headline.of(spec), held=within)
     sizes = [steady_state(headline.size(one.headline[1:]), final=headline.final) for one in flown]
@@ -90,15 +92,15 @@ def main() -> None:
             row = {"seed": seed, **train(words, seed, Path(folder) / "run")}
             kept = load(Path(folder) / "run" / "checkpoint.safetensors")
         row["env_steps"] = kept.position.env_steps
-        row |= evaluate(kept, kept.env_id, args.within, args.vehicle, args.episodes)
+        row |= evaluate(kept, kept.env_id, args.within, args.vehicle, args.episodes, seed)
         row["load_average"] = round(os.getloadavg()[0], 1)
         rows.append(row)
         print(row, flush=True)
         beside = beside or {
-            name: evaluate(name, kept.env_id, args.within, args.vehicle, args.episodes)
+            name: evaluate(name, kept.env_id, args.within, args.vehicle, args.episodes, seed)
             for name in args.beside
         }
-        note(args.out, words, args.within, rows, beside)
+        note(args.out, words, args.within, args.episodes, rows, beside)
     print(f"{sum(row['holds'] for row in rows)} of {len(rows)} hold {args.within}")
 
 
@@ -106,15 +108,24 @@ def note(
     path: Path,
     words: list[str],
     within: float,
+    episodes: int,
     rows: list[dict[str, object]],
     beside: dict[str, object],
 ) -> None:
-    """After every seed, so that an interrupted measurement has those that were flown."""
+    """After every seed, so that an interrupted measurement has those that were flown.
+
+    `low` and `high` are the ends of Wilson's 95 % interval of the share of flights that crash.
+    """
+    flights = episodes * len(rows)
+    crashes = sum(row["crashes"] for row in rows)
+    low, high = share_interval(crashes, flights)
     result = {
         "command": f"rotorgram train {' '.join(words)}",
         "within": within,
         "hold": sum(row["holds"] for row in rows),
         "of": len(rows),
+        "crashes": {"flights": flights, "crashes": crashes,
+                    "low": round(low, 5), "high": round(high, 5)},
         **{name: {"median": round(statistics.median(row[name] for row in rows), 2),
                   "most": max(row[name] for row in rows)}
            for name in ("seconds", "processor_seconds")},

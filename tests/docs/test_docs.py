@@ -220,9 +220,19 @@ def test_the_seeds_of_ppo_are_those_that_were_flown(task: str) -> None:
 )
 def test_the_page_of_ppo_says_how_long_a_training_took(task: str) -> None:
     found = result(f"seconds_{task.lower()}")
-    cells = f" | {found['hold']} of {found['of']} | {found['seconds']['median']:.3g} s |"
+    spent = found.get("processor_seconds", found["seconds"])["median"]
+    cells = f" | {found['hold']} of {found['of']} | {crashes_of(found)} | {spent:.3g} s |"
     rows = page("algorithms/ppo").split("## Results")[1].splitlines()
     assert any(row.startswith(f"| `{task}-v0`") and row.endswith(cells) for row in rows)
+
+
+def crashes_of(found: dict[str, Any]) -> str:
+    """Crashes of all flights, and Wilson's interval of their share, in a cell."""
+    counted = found.get("crashes")
+    if counted is None:
+        return "–"
+    low, high = 100 * counted["low"], 100 * counted["high"]
+    return f"{counted['crashes']:,} of {counted['flights']:,} ({low:.2g} to {high:.2g} %)"
 
 
 def test_the_shifts_are_those_that_were_measured() -> None:
