@@ -59,8 +59,7 @@ class Loop:
         self.config = config = config.resolve()
         backend = config.backend
         shape = (num_worlds, config.drones)
-        alone = shape == (1, 1) and backend.name == "mujoco"
-        self._task = task = make_task(config, () if alone else shape)
+        self._task = task = make_task(config, shape)
         self.vehicle = task.vehicle
         flown = task.config
         self._world = world = make_world(

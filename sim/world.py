@@ -1,8 +1,9 @@
 """Worlds: what all backends have in common, and how they are made."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from importlib import import_module
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from .effects import NO_EFFECTS, EffectOptions, Effects
 from .random import RANDOMIZATION, START, Draw, Random
 from .randomize import FIXED, Randomization
 from .snapshots import Arrays, Snapshot, joined, part_of
-from .state import Array, ByName, InitialState, WorldState, plain
+from .state import Array, ByName, InitialState, WorldState, chosen, plain
 
 _CLASSES = {"mujoco": "MujocoWorld", "rigid": "RigidWorld"}
 """Backends by name: a class in the module of that name in `backends`."""
@@ -36,6 +37,20 @@ class PhysicsError(RuntimeError):
     """The physics reported a bad state; the numbers after it are meaningless."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Call:
+    """A call of the physics within a step."""
+
+    steps: int
+    """Physics steps."""
+    pushes: bool
+    """Whether thrusts or effects change before it."""
+    clears: bool
+    """Whether it forgets earlier contacts."""
+    looks: bool
+    """Whether it looks for contacts at its end."""
+
+
 class World(NotCopied):
     """W worlds of A drones; a seed gives the same draws on each backend, which sets `state`.
 
@@ -47,9 +62,16 @@ class World(NotCopied):
         random: The counters of all random numbers; `seed` seeds them.
         parameters: What was drawn for each drone's episode, by name, shape (W, A).
         effects: What acts on drones besides gravity, contact and ideal rotors; None: nothing.
+        acting: Mean thrust of each rotor over the last physics step, N, shape (W, A, R).
+        wrench: Mean force and torque of the air over it, as of `Effects.step`; None: no air.
     """
 
+    is_apart: ClassVar[bool] = False
+    """Whether the physics is no array code."""
+
     state: WorldState
+    acting: Array
+    wrench: Array
 
     def __init__(
         self,
@@ -57,6 +79,7 @@ class World(NotCopied):
         shape: tuple[int, ...],
         effects: EffectOptions,
         randomize: Randomization,
+        dtype: str = "float64",
     ) -> None:
         self.vehicle = vehicle
         self.shape = shape
@@ -69,6 +92,9 @@ class World(NotCopied):
         self.effects = acting if acting.on_rotors or acting.on_body else None
         self._on_rotors = acting.on_rotors
         self._check = max(1, round(CONTACT_CHECK / vehicle.timestep))  # physics steps
+        self.dtype = np.dtype(dtype)
+        self.acting = self._nothing = np.zeros((*shape, vehicle.num_rotors), self.dtype)
+        self.wrench = np.zeros((*shape, 6), self.dtype) if acting.on_body else None
 
     def seed(self, mask: Array, seeds: Sequence[int | None] | Array) -> None:
         """Seed the worlds of a mask, seeds (W,); where it is None the random numbers go on."""
@@ -84,7 +110,8 @@ class World(NotCopied):
 
         Here and in all masks the drones of a world have the same truth value.
         """
-        raise NotImplementedError
+        self.begin(mask, pose)
+        self.place(mask)
 
     def step(
         self, thrust: Array, substeps: int, mask: Array | None = None, *, again: bool = False
@@ -95,7 +122,65 @@ class World(NotCopied):
         the state's `touching` keeps the contacts of that step. A bad state raises `PhysicsError`,
         which names the worlds to be reset.
         """
-        raise NotImplementedError
+        self.command(thrust, mask)
+        for call in self.calls(substeps, again=again):
+            if call.pushes:
+                self.push(mask)
+            self.fly(call, mask)
+
+    def calls(self, substeps: int, *, again: bool = False) -> list[Call]:
+        """The calls of `fly` in a step, as of `step`."""
+        at_once = self._check if self.effects is None else 1
+        calls = []
+        for first in range(0, substeps, at_once):
+            done = min(first + at_once, substeps)
+            calls.append(
+                Call(
+                    steps=done - first,
+                    pushes=first == 0 or self.effects is not None,
+                    clears=first == 0 and not again,
+                    looks=done % self._check == 0 or done == substeps,
+                )
+            )
+        return calls
+
+    def begin(self, mask: Array, pose: InitialState) -> None:
+        """The part of `reset` that is array code: what is drawn, and the state."""
+        state = self.state
+        rows = mask[..., None]
+        self.random.begin(mask)
+        begun = self._begun(mask, pose)
+        self._move(begun, mask)
+        state.thrust = self._typed(begun["thrust"])
+        state.command = np.where(rows, state.thrust, state.command)
+        self._draw_parameters(mask)
+        self._vary(self.parameters)
+        if self.effects is not None:
+            thrust = self.effects.begin(mask, state, self.parameters)
+            state.thrust = self._typed(np.where(rows, thrust, state.thrust))
+        self.acting = np.where(rows, state.thrust, self.acting)
+        self.wrench = None if self.wrench is None else np.where(rows, 0.0, self.wrench)
+
+    def command(self, thrust: Array, mask: Array | None) -> None:
+        """Take thrusts as of `step`."""
+        state = self.state
+        # One number for all rotors counts for each.
+        state.command = chosen(mask, self._typed(thrust + self._nothing), state.command)
+
+    def push(self, mask: Array | None) -> None:
+        """Let effects act for the next physics step: sets the state's `thrust`, `acting`, `wrench`."""
+        state = self.state
+        acting = state.command
+        if self.effects is not None:
+            acting, end, wrench = self.effects.step(state, mask)
+            if wrench is not None:
+                self.wrench = chosen(mask, self._typed(wrench), self.wrench)
+        if self._on_rotors:
+            state.thrust = chosen(mask, self._typed(end), state.thrust)
+        else:
+            state.thrust = state.command
+            acting = self._limited(acting)
+        self.acting = chosen(mask, self._typed(acting), self.acting)
 
     def acceleration(self) -> Array:
         """Of each body's origin at the present state and thrusts, world frame, m/s², (W, A, 3)."""
@@ -130,6 +215,28 @@ class World(NotCopied):
         if self.effects is not None:
             self.effects.restore(part_of(arrays, "effects"))
             self.effects.take(self.parameters)
+
+    def place(self, mask: Array) -> None:
+        """The part of `reset` that is physics: take the state of the worlds of a mask."""
+        raise NotImplementedError
+
+    def fly(self, call: Call, mask: Array | None) -> None:
+        """Physics steps of `step`, under `acting` and `wrench`."""
+        raise NotImplementedError
+
+    def _move(self, begun: ByName, mask: Array) -> None:
+        """Set the state's motion, of which the worlds of the mask are new."""
+        raise NotImplementedError
+
+    def _vary(self, parameters: ByName) -> None:
+        """Take drawn parameters that array code needs."""
+
+    def _limited(self, thrust: Array) -> Array:
+        """Thrusts within their limits, where the physics does not see to it."""
+        return thrust
+
+    def _typed(self, values: Array) -> Array:
+        return values.astype(self.dtype, copy=False)
 
     def _kept(self) -> Arrays:
         """The backend's own arrays."""

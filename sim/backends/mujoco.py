@@ -28,13 +28,11 @@ from ..randomize import CENTER, FIXED, Randomization
 from ..rotations import body_z
 from ..snapshots import Arrays
 from ..state import Array, ByName, InitialState, WorldState, stack, total
-from ..world import PhysicsError, World
+from ..world import Call, PhysicsError, World
 
 _FEW = 8
 _SEEN = np.array(SURROUNDINGS, np.uint8)
-_VIEWS = (
-    "_batch _ctrl _command _thrust _applied _contacts _counts _warnings _varied _qacc _warmstart"
-)
+_VIEWS = "_batch _live _ctrl _applied _contacts _counts _warnings _varied _qacc _warmstart"
 """Attributes that hold the simulator's memory."""
 
 
@@ -45,9 +43,14 @@ class MujocoWorld(World):
     `PhysicsError`, because an agent would learn from a silent reset, and switches that file off for
     the whole process; a log file of another name stays on.
 
-    A single world has no leading axes: NumPy's scalars are ten times faster than its arrays of one.
     `num_threads` threads step the worlds; 0: one for each processor.
+
+    Attributes:
+        outer: What the physics says, in code that is compiled: its variables by name.
+        asked: Names of what a step asked besides the motion.
     """
+
+    is_apart = True
 
     def __init__(
         self,
@@ -59,8 +62,10 @@ class MujocoWorld(World):
         randomize: Randomization = FIXED,
         num_threads: int = 0,
     ) -> None:
-        lead = (num_worlds, drones) if num_worlds * drones > 1 else ()
-        super().__init__(vehicle, lead, effects, randomize)
+        shape = (num_worlds, drones)
+        super().__init__(vehicle, shape, effects, randomize)
+        self.outer: ByName = {}
+        self.asked: set[str] = set()
         threads = 1 if num_worlds == 1 else num_threads
         model = self._flown_model(drones)
         if self._on_rotors:  # commands are within their limits; thrusts need not be
@@ -71,9 +76,16 @@ class MujocoWorld(World):
         self._varied = WorldParameters(batch.model, self._drawn)
         self._owner = None if threads == 1 else os.getpid()
         self._initial = batch.state[0].copy()
-        # Live views of simulator memory, made once.
-        qpos, ball = _views(batch.bind("qpos"), drones, 7, lead)
-        qvel, moves = _views(batch.bind("qvel"), drones, 6, lead)
+        # Views of simulator memory, made once.
+        qpos, ball = _views(batch.bind("qpos"), drones, 7)
+        qvel, moves = _views(batch.bind("qvel"), drones, 6)
+        self._live: ByName = {"qpos": qpos, "qvel": qvel, "touching": np.zeros(shape, bool)}
+        if drones > 1:
+            self._live["colliding"] = np.zeros(shape, bool)
+            self._counts = batch.bind("sensordata")
+            self._columns = [contact_columns(model, name) for name in (CONTACTS, GROUNDED)]
+        if self._cable is not None:
+            self._live |= {"payload": ball, "payload_velocity": moves}
         self._applied = batch.bind("qfrc_applied")[:, : 6 * drones]
         self._ctrl: np.ndarray = batch.bind("ctrl")
         self._contacts: np.ndarray = batch.bind("ncon")
@@ -82,27 +94,10 @@ class MujocoWorld(World):
         self._no_contacts = self._contacts.tobytes()
         rotors = [rotor for craft in members_of(vehicle, drones) for rotor in craft.rotors]
         self._newtons = np.array([rotor.newtons for rotor in rotors])  # of a control of 1
-        self._command = np.zeros_like(self._ctrl)
-        self._thrust = np.zeros_like(self._ctrl) if self._on_rotors else self._command
-        self._touching = np.zeros((num_worlds, drones), bool)
-        self._colliding: np.ndarray | None = None
-        if drones > 1:
-            self._colliding = self._touching.copy()
-            self._counts = batch.bind("sensordata")
-            self._columns = [contact_columns(model, name) for name in (CONTACTS, GROUNDED)]
         self._qacc: np.ndarray | None = None  # bound by what first asks for it
-        self.state = WorldState(
-            position=qpos[..., :3],
-            quaternion=qpos[..., 3:7],
-            velocity=qvel[..., :3],
-            body_rates=qvel[..., 3:6],
-            command=self._command.reshape(*lead, -1),
-            thrust=self._thrust.reshape(*lead, -1),
-            touching=self._touching.reshape(lead),
-            colliding=self._colliding,
-            payload=None if self._cable is None else ball,
-            payload_velocity=None if self._cable is None else moves,
-        )
+        unknown = dict.fromkeys(("position", "quaternion", "velocity", "body_rates", "touching"))
+        self.state = WorldState(command=self.acting, thrust=self.acting, **unknown)
+        self.take()
         assert np.shares_memory(self.state.position, batch.state)
 
     def _flown_model(self, drones: int) -> mujoco.MjModel:
@@ -118,136 +113,152 @@ class MujocoWorld(World):
             return vehicle.movable(payload, cable)
         return vehicle.model
 
-    def reset(self, mask: Array, pose: InitialState) -> None:
-        """As `World.reset`. Raises `InputError` for a payload that would hang in the ground."""
+    def take(self) -> None:
+        """Set the state's arrays that the physics changes."""
+        seen = self.outer or self._live
+        state = self.state
+        state.position = seen["qpos"][..., :3]
+        state.quaternion = seen["qpos"][..., 3:]
+        state.velocity = seen["qvel"][..., :3]
+        state.body_rates = seen["qvel"][..., 3:]
+        for name in ("touching", "colliding", "payload", "payload_velocity"):
+            setattr(state, name, seen.get(name))
+
+    def told(self) -> ByName:
+        """What the physics says now, by name, (W, A, ...), with what is asked of it."""
+        return self._live | {name: getattr(self, name)() for name in sorted(self.asked)}
+
+    def begin(self, mask: Array, pose: InitialState) -> None:
+        """As `World.begin`. Raises `InputError` for a payload that would hang in the ground."""
+        hung = self._hung(mask, pose)
+        super().begin(mask, pose)
+        if hung is not None:
+            state = self.state
+            rows = mask[..., None]
+            state.payload = np.where(rows, hung, state.payload)
+            moves = state.velocity[:, :1]  # along with the first craft
+            state.payload_velocity = np.where(rows, moves, state.payload_velocity)
+
+    def place(self, mask: Array) -> None:
+        """As `World.place`."""
         self._check_process()
         ids = self.random.ids(mask)
-        hung = self._hung(pose, ids)
-        self.random.begin(mask)
+        state = self.state
+        live = self._live
         self._batch.state[ids] = self._initial
         self._warnings[ids] = 0
-        for name, begun in self._begun(mask, pose).items():
-            getattr(self.state, name)[...] = begun
-        self._command[ids] = self._thrust[ids]
-        self._draw_parameters(mask)
-        self._vary(ids)
-        if self.effects is not None:
-            thrust = self.effects.begin(mask, self.state, self.parameters)
-            self._thrust[ids] = np.reshape(thrust, self._ctrl.shape)[ids]
-        if hung is not None:
-            self._place_payload(ids, hung)
-        self._ctrl[ids] = self._thrust[ids] / self._newtons
+        live["qpos"][ids] = np.concat((state.position, state.quaternion), axis=-1)[ids]
+        live["qvel"][ids] = np.concat((state.velocity, state.body_rates), axis=-1)[ids]
+        if self._cable is not None:
+            self._batch.bind("qpos")[ids, -7:-4] = state.payload[ids, 0]
+            self._batch.bind("qvel")[ids, -6:-3] = state.payload_velocity[ids, 0]
+        self._vary_models(ids)
+        self._ctrl[ids] = np.reshape(self.acting, self._ctrl.shape)[ids] / self._newtons
         # To wake the threads takes longer than a few worlds.
         groups = ids[None] if len(ids) > _FEW else ids[:, None]
         for some in groups:
-            self._batch.forward(some if self.shape else None)
+            self._batch.forward(some)
+        self.take()
         self._clear_contacts(ids)
         self._add_contacts(ids)
 
-    def step(
-        self, thrust: Array, substeps: int, mask: Array | None = None, *, again: bool = False
-    ) -> None:
-        """As `World.step`."""
+    def fly(self, call: Call, mask: Array | None) -> None:
+        """As `World.fly`."""
         self._check_process()
         ids = None if mask is None else self.random.ids(mask)
         some = ... if ids is None else ids
-        if some is ... or not self.shape:
-            self.state.command[...] = thrust
-        else:
-            self.state.command[some] = thrust[some]
-        if self.effects is None:
-            self._ctrl[...] = self._command / self._newtons
-        if not again:
+        if call.pushes:
+            self._ctrl[some] = np.reshape(self.acting, self._ctrl.shape)[some] / self._newtons
+            if self.wrench is not None:
+                self._applied[some] = np.reshape(self.wrench, self._applied.shape)[some]
+        if call.clears:
             self._clear_contacts(some)
-        while substeps > 0:
-            steps = min(substeps, self._check)
-            try:
-                if self.effects is None:
-                    self._batch.step(ids, nstep=steps)
-                else:
-                    for _ in range(steps):
-                        self._act(self.effects, mask, some)
-                        self._batch.step(ids)
-            except SimulationError as error:
-                self._warnings.fill(0)  # of the other worlds: a reset is due all the same
-                raise PhysicsError(f"{error}: reset the env") from None
-            if self._contacts.tobytes() != self._no_contacts:  # faster than to count
-                self._add_contacts(some)
-            substeps -= self._check
+        try:
+            self._batch.step(ids, nstep=call.steps)
+        except SimulationError as error:
+            self._warnings.fill(0)  # of the other worlds: a reset is due all the same
+            raise PhysicsError(f"{error}: reset the env") from None
+        if call.looks and self._contacts.tobytes() != self._no_contacts:  # faster than to count
+            self._add_contacts(some)
         if self._warnings.tobytes() != self._no_warnings:
             raise PhysicsError(self._describe_warnings())
 
-    def _vary(self, ids: np.ndarray) -> None:
+    def _move(self, begun: ByName, mask: Array) -> None:
+        for name in ("position", "quaternion", "velocity", "body_rates"):
+            setattr(self.state, name, begun[name])
+
+    def _vary_models(self, ids: np.ndarray) -> None:
         """Give the models of some worlds their drawn parameters."""
         if not self._varied.base or not self.parameters:
             return
-        shape = self._touching.shape
-        values = {name: np.reshape(x, shape)[ids] for name, x in self.parameters.items()}
+        values = {name: x[ids] for name, x in self.parameters.items()}
         for field, rows in self._varied.values(values).items():
             self._batch.expand(field)[ids] = rows
         self._batch.set_const(ids)
 
     def _kept(self) -> ByName:
         """All that a later step depends on; `mjSTATE_INTEGRATION` has the warm start too."""
-        arrays = {
-            "integration": self._batch.state,
-            "command": self._command,
-            "thrust": self._thrust,
-            "touching": self._touching,
-        }
-        if self._colliding is not None:
-            arrays["colliding"] = self._colliding
-        return arrays
+        names = WorldState.__slots__
+        arrays = {name: getattr(self.state, name) for name in names}
+        arrays |= {"acting": self.acting, "wrench": self.wrench}
+        if not self.outer:
+            arrays["integration"] = self._batch.state
+        return {name: array for name, array in arrays.items() if array is not None}
 
     def _restore(self, arrays: Arrays) -> None:
-        self._check_process()
-        self._vary(np.arange(len(self._touching)))
-        for name, array in self._kept().items():
-            array[...] = arrays[name]
-        self._warnings.fill(0)
-
-    def _act(self, effects: Effects, mask: Array | None, some: Array) -> None:
-        """Let the effects act on some worlds before a physics step."""
-        mean, end, wrench = effects.step(self.state, mask)
-        if self._on_rotors:
-            self._thrust[some] = np.reshape(end, self._ctrl.shape)[some]
-        self._ctrl[some] = np.reshape(mean, self._ctrl.shape)[some] / self._newtons
-        if wrench is not None:
-            self._applied[some] = np.reshape(wrench, self._applied.shape)[some]
+        for name in WorldState.__slots__:
+            setattr(self.state, name, arrays.get(name))
+        self.acting = arrays["acting"]
+        self.wrench = arrays.get("wrench")
+        if "integration" in arrays:
+            self._check_process()
+            self._vary_models(np.arange(len(self._ctrl)))
+            self._batch.state[...] = arrays["integration"]
+            self._warnings.fill(0)
+            for name in ("touching", "colliding"):
+                if name in arrays:
+                    self._live[name][...] = arrays[name]
+            self.take()
 
     def _clear_contacts(self, some: Array) -> None:
         """No contact of some worlds yet."""
-        self._touching[some] = False
-        if self._colliding is not None:
-            self._colliding[some] = False
+        for name in ("touching", "colliding"):
+            if name in self._live:
+                self._live[name][some] = False
 
     def _add_contacts(self, some: Array) -> None:
         """Add the contacts of some worlds to those that they had."""
-        if self._colliding is None:
-            self._touching[some] |= self._contacts[some, None] > 0
+        live = self._live
+        if "colliding" not in live:
+            live["touching"][some] |= self._contacts[some, None] > 0
         else:
             of_all, of_ground = (self._counts[some][..., columns] for columns in self._columns)
-            self._touching[some] |= of_all > 0
-            self._colliding[some] |= of_all > of_ground
+            live["touching"][some] |= of_all > 0
+            live["colliding"][some] |= of_all > of_ground
 
     def acceleration(self) -> Array:
         """As `World.acceleration`: of a `mj_forward` that leaves the state as it was."""
+        self.asked.add("acceleration")
+        if self.outer:
+            return self.outer["acceleration"]
         if self._qacc is None:
             self._qacc = self._batch.bind("qacc")
             self._warmstart = self._batch.bind("qacc_warmstart")
         before = self._warmstart.copy()
         self._batch.forward()
         self._warmstart[:] = before
-        own, _ = _views(self._qacc, self._touching.shape[1], 6, self.shape)
+        own, _ = _views(self._qacc, self.shape[1], 6)
         return own[..., :3].copy()
 
     def below(self) -> Array:
         """As `World.below`, by `mj_ray`."""
-        shape = (*self._touching.shape, 3)
-        origin = self.state.position.reshape(shape)
-        down = -body_z(self.state.quaternion).reshape(shape)
+        self.asked.add("below")
+        if self.outer:
+            return self.outer["below"]
+        origin = self.state.position
+        down = -body_z(self.state.quaternion)
         distance = self._batch.ray(origin, down, geomgroup=_SEEN)[0]
-        return np.where(distance < 0, np.inf, distance).reshape(self.shape)[()]
+        return np.where(distance < 0, np.inf, distance).reshape(self.shape)
 
     def close(self) -> None:
         """As `World.close`."""
@@ -261,36 +272,26 @@ class MujocoWorld(World):
         if self._owner is not None and os.getpid() != self._owner:  # it would wait for ever
             raise RuntimeError("the threads of an env do not follow into a fork: make another env")
 
-    def _hung(self, pose: InitialState, ids: np.ndarray) -> np.ndarray | None:
-        """Where the payload of each world begins, shape (W, 3).
+    def _hung(self, mask: Array, pose: InitialState) -> Array:
+        """Where the payload of each world begins, shape (W, A, 3), or None without one.
 
-        Raises `InputError` if the payload of one of the worlds `ids` would hang in the ground.
+        Raises `InputError` if the payload of one of the worlds of the mask would hang in the ground.
         """
         if self._cable is None:
             return None
-        drones = self._touching.shape[1]
+        drones = self.shape[1]
         hung = pose.payload
         if hung is None:
             if drones != 1:
                 expected = "one drone in a world, or a task whose start places it"
                 raise InputError(f"effects.payload: expected {expected}, got {drones} drones")
             hung = pose.position - (0.0, 0.0, self._cable)
-        hung = np.reshape(hung, (-1, drones, 3))[:, 0]
-        height = hung[ids, 2].min(initial=np.inf) + self._cable
+        height = hung[mask][:, 2].min(initial=np.inf) + self._cable
         least = self._cable + payload_radius(self._options.payload)
         if not height > least:
             expected = f"a height over {least:.4g} m, for the payload on its cable"
             raise InputError(f"start: expected {expected}, got {height:.4g} m")
         return hung
-
-    def _place_payload(self, ids: np.ndarray, hung: np.ndarray) -> None:
-        """Put payloads there, moving along with the first craft."""
-        qpos = self._batch.bind("qpos")
-        qvel = self._batch.bind("qvel")
-        qpos[ids, -7:-4] = hung[ids]
-        qpos[ids, -4:] = (1.0, 0.0, 0.0, 0.0)
-        qvel[ids, -6:-3] = qvel[ids, :3]
-        qvel[ids, -3:] = 0.0
 
     def _describe_warnings(self) -> str:
         counts = self._warnings[:, :, 1]
@@ -301,9 +302,7 @@ class MujocoWorld(World):
         return f"MuJoCo warned of {names} in envs {ids[:5]}: reset the env"
 
 
-def _views(
-    rows: np.ndarray, drones: int, size: int, lead: tuple[int, ...]
-) -> tuple[np.ndarray, np.ndarray]:
+def _views(rows: np.ndarray, drones: int, size: int) -> tuple[np.ndarray, np.ndarray]:
     """Views of rows (W, n): `size` numbers of each craft, and the payload's position or velocity.
 
     The latter comes after the crafts, and is the same for all crafts of a world.
@@ -311,7 +310,7 @@ def _views(
     crafts = drones * size
     load = rows[:, None, crafts : crafts + 3]
     shared = np.broadcast_to(load, (len(rows), drones, load.shape[-1]))
-    return rows[:, :crafts].reshape(*lead, size), shared.reshape(*lead, -1)
+    return rows[:, :crafts].reshape(-1, drones, size), shared
 
 
 class WorldParameters:

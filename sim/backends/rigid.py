@@ -30,7 +30,7 @@ from ..state import (
     parts_of,
     stack,
 )
-from ..world import PhysicsError, World
+from ..world import Call, PhysicsError, World
 from .body import RigidBody, mapped, motion
 from .hull import Hull, can_touch
 from .kernel import Kernel
@@ -75,7 +75,7 @@ class RigidWorld(World):
                 f"with mujoco, got {effects.payload:g} kg"
             )
         shape = (num_worlds, drones)
-        super().__init__(vehicle, shape, effects, randomize)
+        super().__init__(vehicle, shape, effects, randomize, dtype)
         _check_obstacles(vehicle)
         _check_forces(vehicle)
         if "inertia" in self._drawn and len(craft_bodies(vehicle.model)) > 1:
@@ -83,15 +83,10 @@ class RigidWorld(World):
                 "randomize: inertia: expected a craft of one body with the backend rigid, got "
                 f"{vehicle.name}"
             )
-        self.dtype = np.dtype(dtype)
         self._body = RigidBody(vehicle)
         self._hull = Hull(vehicle)
-        thrust = np.zeros((*shape, vehicle.num_rotors), self.dtype)
-        self._nothing = self._acting = thrust  # mean over the last physics step
-        # Mean force and torque of the air over it.
-        pushed = self.effects is not None and self.effects.on_body
-        self._wrench: Array = np.zeros((*shape, 6), self.dtype) if pushed else None
-        self.bad = nobody = thrust[..., 0] > 0
+        thrust = self.acting
+        self.bad = self._nobody = nobody = thrust[..., 0] > 0
         moved = dict.fromkeys(("position", "quaternion", "velocity", "body_rates"))
         self.state = WorldState(**moved, command=thrust, thrust=thrust, touching=nobody)
         if drones > 1:
@@ -110,90 +105,59 @@ class RigidWorld(World):
         assert self.effects is not None
         self.effects.air.vary(air)
 
-    def reset(self, mask: Array, pose: InitialState) -> None:
-        """As `World.reset`."""
-        state = self.state
-        rows = mask[..., None]
-        self.random.begin(mask)
-        begun = self._begun(mask, pose)
-        turn = begun["quaternion"]
-        unit = turn / each(length(turn))
-        turn = np.where(rows, unit, turn)  # the others keep their bits
-        parts = (begun["position"], turn, begun["velocity"], begun["body_rates"])
-        self._show(self._typed(np.concat(parts, axis=-1)))
-        state.thrust = self._typed(begun["thrust"])
-        state.command = np.where(rows, state.thrust, state.command)
-        self._draw_parameters(mask)
-        self._vary(self.parameters)
-        if self.effects is not None:
-            thrust = self.effects.begin(mask, state, self.parameters)
-            state.thrust = self._typed(np.where(rows, thrust, state.thrust))
-        self._acting = np.where(rows, state.thrust, self._acting)
-        self._wrench = None if self._wrench is None else np.where(rows, 0.0, self._wrench)
+    def place(self, mask: Array) -> None:
+        """As `World.place`."""
         self._tell(mask, self._contacts())
 
-    def step(
-        self, thrust: Array, substeps: int, mask: Array | None = None, *, again: bool = False
-    ) -> None:
-        """As `World.step`."""
+    def fly(self, call: Call, mask: Array | None) -> None:
+        """As `World.fly`."""
+        varying: list[Array] = []
+        mapped(self._body.varying, varying.append)
+        new = self._advance(call.steps, self._motion, self.acting, self.wrench, *varying)
+        self._show(chosen(mask, new, self._motion))
         state = self.state
-        # One number for all rotors counts for each.
-        state.command = chosen(mask, self._typed(thrust + self._nothing), state.command)
-        if not self._on_rotors:
-            state.thrust = state.command
-        touched = [state.touching, state.colliding] if again else [False, False]
-        while substeps > 0:
-            self._fly(min(substeps, self._check), mask)
-            touched = [now | old for now, old in zip(self._contacts(), touched, strict=False)]
-            substeps -= self._check
+        if call.clears:
+            self._tell(mask, [self._nobody, self._nobody])
+        if not call.looks:
+            return
+        before = (state.touching, state.colliding)
+        touched = [now | old for now, old in zip(self._contacts(), before, strict=False)]
         self._tell(mask, touched)
         bad = ~(abs(self._motion) < mujoco.mjMAXVAL).all(axis=-1)
         self.bad = chosen(mask, bad, self.bad)
         if found(self.bad):
             self.refuse_bad(mask)
 
-    def _fly(self, steps: int, mask: Array | None) -> None:
-        """Fly physics steps without a contact check in between."""
-        state = self.state
-        effects = self.effects
-        acting = state.command
-        wrench = None
-        at_once = steps if effects is None else 1  # physics steps of a call
-        for _ in range(steps // at_once):
-            if effects is not None:
-                acting, end, push = effects.step(state, mask)
-                if self._on_rotors:
-                    state.thrust = chosen(mask, self._typed(end), state.thrust)
-                wrench = None if push is None else self._typed(push)
-            if not self._on_rotors:  # as MuJoCo clamps controls
-                acting = clip(acting, self.vehicle.thrust_low, self.vehicle.thrust_high)
-            varying: list[Array] = []
-            mapped(self._body.varying, varying.append)
-            new = self._advance(at_once, self._motion, self._typed(acting), wrench, *varying)
-            self._show(chosen(mask, new, self._motion))
-        self._acting = chosen(mask, self._typed(acting), self._acting)
-        if wrench is not None:
-            self._wrench = chosen(mask, wrench, self._wrench)
+    def _move(self, begun: ByName, mask: Array) -> None:
+        turn = begun["quaternion"]
+        unit = turn / each(length(turn))
+        turn = np.where(mask[..., None], unit, turn)  # the others keep their bits
+        parts = (begun["position"], turn, begun["velocity"], begun["body_rates"])
+        self._show(self._typed(np.concat(parts, axis=-1)))
+
+    def _limited(self, thrust: Array) -> Array:
+        """As MuJoCo limits controls."""
+        return clip(thrust, self.vehicle.thrust_low, self.vehicle.thrust_high)
 
     def _kept(self) -> ByName:
         arrays = {name: getattr(self.state, name) for name in _OF_STATE}
-        arrays |= {"motion": self._motion, "acting": self._acting}
-        arrays |= {"wrench": self._wrench, "bad": self.bad}
+        arrays |= {"motion": self._motion, "acting": self.acting}
+        arrays |= {"wrench": self.wrench, "bad": self.bad}
         return {name: array for name, array in arrays.items() if array is not None}
 
     def _restore(self, arrays: Arrays) -> None:
         copies = {name: array.copy() for name, array in arrays.items()}
         for name in _OF_STATE:
             setattr(self.state, name, copies.get(name))
-        self._acting = copies["acting"]
-        self._wrench = copies.get("wrench")
+        self.acting = copies["acting"]
+        self.wrench = copies.get("wrench")
         self.bad = copies["bad"]
         self._show(copies["motion"])
         self._vary(self.parameters)
 
     def acceleration(self) -> Array:
         """As `World.acceleration`."""
-        push = self._body.push(parts_of(self._acting), _parts(self._wrench))
+        push = self._body.push(parts_of(self.acting), _parts(self.wrench))
         linear, _ = self._body.acceleration(motion(parts_of(self._motion)), push)
         return stack(linear)
 
@@ -232,9 +196,6 @@ class RigidWorld(World):
         state.quaternion = now[..., 3:7]
         state.velocity = now[..., 7:10]
         state.body_rates = now[..., 10:]
-
-    def _typed(self, values: Array) -> Array:
-        return values.astype(self.dtype, copy=False)
 
     def _contacts(self) -> list[Array]:
         """Which crafts touch anything and, of several, which another, bool, (W, A)."""
