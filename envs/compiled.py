@@ -27,7 +27,7 @@ def make_loop(config: EnvConfig, num_worlds: int = 1) -> Loop:
     """The loop of a config: compiled where it can be."""
     config = config.resolve()
     backend = config.backend
-    if backend.name == "rigid" and backend.compiled is not False and not config.cameras:
+    if backend.compiled is not False and not config.cameras:
         from ..sim.compile.llvm import trouble
 
         if not trouble():
@@ -59,7 +59,12 @@ class CompiledLoop(Loop):
             if seeds is not None:
                 machine.seed(self._world, begun, seeds[:: len(self.spec.agents)])
         sent = record.sent if flies else None
-        results, told = machine.step(sent, record.flown, begun, record.active)
+        flew = record.flown
+        try:
+            results, told = machine.step(sent, flew, begun, record.active)
+        except PhysicsError:
+            self.record.wait(flew)
+            raise
         if not record.has_begun:
             record.action = self.pipeline.actions.neutral()
         record.waiting = results["waiting"].reshape(record.shape)
@@ -95,7 +100,7 @@ class CompiledLoop(Loop):
         try:
             loop.advance(neutral, np.ones(config.drones, bool))
             loop.advance(neutral)
-            return Machine(loop, self.num_envs // config.drones)
+            return Machine(loop, self._world)
         except InputError as error:  # which NumPy will raise
             self.refusal = str(error)
         except Exception as error:  # of an own task, any
@@ -136,9 +141,8 @@ class CompiledLoop(Loop):
         """Raise for bad states, and for numbers that are not finite."""
         flew = self._record.flown
         record = self.record
-        world: Any = self._world
         try:
-            world.refuse_bad(flew)
+            self._world.refuse_bad(flew)
         except PhysicsError:
             record.wait(flew)
             raise

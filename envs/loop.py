@@ -144,7 +144,7 @@ class Loop:
         self._check_open()
         arrays = self.state()
         arrays["loop/config"] = np.array(self.spec.config_digest)
-        return {**arrays, "loop/arrays": np.array(list(arrays))}
+        return {**arrays, "loop/arrays": np.array(sorted(arrays))}
 
     def state(self) -> Snapshot:
         """The arrays of a snapshot, without what tells it from others."""

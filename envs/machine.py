@@ -11,11 +11,13 @@ from typing import Any
 
 import numpy as np
 
+from ..models.errors import InputError
 from ..sim import World
 from ..sim.compile import Program, Untraceable, lift, read
 from ..sim.compile.layout import Layout, Memory
 from ..sim.compile.llvm import Region, compiled, widest
-from ..sim.snapshots import Arrays, Snapshot
+from ..sim.snapshots import Arrays, Snapshot, part_of
+from ..sim.world import Call
 from .autoreset import Told
 from .derivative import Derivative
 from .loop import Loop
@@ -23,6 +25,10 @@ from .stages.record import Mask, Record
 
 LANES = 64  # Worlds of a block: their numbers fit into the nearest cache
 MOST = 30_000  # Operations of a step: more take too long to compile
+_FIRST, _CONTROL, _PUSH, _BEGIN, _LAST = "first", "control", "push", "begin", "last"
+"""Code before the physics of a step, between two of its calls, for episodes that begin, and after.
+A step whose physics is array code is the last alone."""
+_PHYSICS = "physics/"
 _MASKS = ("flown", "begun", "active")
 _ENDS = ("terminated", "truncated", "done", "out", "waiting")
 _FLAGS = (*_ENDS, "wrong")
@@ -41,7 +47,7 @@ class Machine:
 
     Args:
         loop: A loop of one world that flies by NumPy, whose episode has begun.
-        worlds: W.
+        world: W worlds, whose physics flies where it is no array code.
 
     Attributes:
         tape: Unless it is None, gets the memory from before each flown step.
@@ -50,9 +56,13 @@ class Machine:
         Untraceable: A stage cannot be compiled.
     """
 
-    def __init__(self, loop: Loop, worlds: int) -> None:
+    def __init__(self, loop: Loop, world: World) -> None:
         self._loop = loop
-        self._worlds = worlds
+        self._world = world
+        self._worlds = worlds = world.shape[0]
+        ours = loop.world
+        ours.outer = seen = ours.told()
+        world.asked = ours.asked
         self.tape: list[Memory] | None = None
         state = loop.state()
         sent = loop.record.sent
@@ -63,20 +73,20 @@ class Machine:
         self._told = Layout(_fields(self._telemetry()), lanes)
         given: Named = dict.fromkeys(_MASKS, (_BOOL, sent.shape[1:-1]))
         given["sent"] = (sent.dtype, sent.shape[1:])
+        given |= _fields(self._pushed()) | _fields({_PHYSICS + name: x for name, x in seen.items()})
         self._outside = given | _fields(self._seen())
         self._layouts = layout, self._told
-        regions = [
-            self._traced("", [Record.rest]),
-            self._traced("flown", loop.pipeline.fly),
-            self._traced("begun", loop.pipeline.begin),
-            self._traced("active", loop.pipeline.observe),
-            self._looked(),
-        ]
-        size = sum(len(region.operations()) for region in regions)
+        self._calls = [(_code(call), call) for call in loop.pipeline.flight.calls()]
+        self._calls[0] = _FIRST, self._calls[0][1]
+        steps = self._regions()
+        size = sum(len(one.operations()) for regions in steps.values() for one in regions)
         if size > MOST:
             most = f"expected at most {MOST:,}"
             raise Untraceable(f"a step of {size:,} operations is not compiled: {most}")
-        self._run = compiled(regions, self._layouts, self._outside, width)
+        self._codes = {
+            name: compiled(regions, self._layouts, self._outside, width)
+            for name, regions in steps.items()
+        }
         self._width = width
         self.memory = Memory(layout, worlds)
         self._plan(given)
@@ -85,6 +95,32 @@ class Machine:
             self._given[name] = np.zeros((self.memory.size, *shape), dtype)
         self._places = [array.ctypes.data for array in self._given.values()]
         self._all_fly = False  # in the last step
+
+    def _regions(self) -> dict[str, list[Region]]:
+        """What is compiled, by name: a whole step, or what comes before and after physics."""
+        loop = self._loop
+        pipeline = loop.pipeline
+        last = [self._traced("active", pipeline.observe), self._looked()]
+        if not self._world.is_apart:
+            first = [self._traced("", [Record.rest]), self._traced("flown", pipeline.fly)]
+            return {_LAST: [*first, self._traced("begun", pipeline.begin), *last]}
+        flight = pipeline.flight
+        take = self._traced("", [Record.rest, flight.take])
+        regions = {
+            _FIRST: [self._traced("flown", pipeline.before), self._pushing()],
+            _BEGIN: [self._traced("begun", pipeline.set_out)],
+            _LAST: [
+                take,
+                self._traced("flown", pipeline.after),
+                self._traced("begun", pipeline.look),
+                *last,
+            ],
+        }
+        for code, call in self._calls:
+            if code and code not in regions:
+                stage = flight.control if call.commands else flight.push
+                regions[code] = [take, self._traced("flown", [stage]), self._pushing()]
+        return regions
 
     def _plan(self, given: Named) -> None:
         """Where everything that leaves lies in the bytes of a step, behind what is told."""
@@ -124,13 +160,56 @@ class Machine:
             given["sent"][:worlds] = sent
         new = np.empty(self._size, np.uint8)
         first = new.ctypes.data
-        places = [first + start for start in self._starts]
-        self._run(self.memory.blocks, self.memory.address, first, *self._places, *places)
+        places = [first, *self._places, *[first + start for start in self._starts]]
+        if self._world.is_apart:
+            if sent is not None:
+                self._fly(flown, places)
+            if begun is not None:
+                self._begin(begun, places)
+            self._take(self._world.told())
+        self._code(_LAST, places)
         shape, dtype, start, strides = self._flags
         results = dict(zip(_FLAGS, np.ndarray(shape, dtype, new, start, strides), strict=True))
         for name, shape, dtype, start in self._results:
             results[name] = np.ndarray(shape, dtype, new, start)
         return results, lambda: self._read(new)
+
+    def _code(self, name: str, places: list[int]) -> None:
+        self._codes[name](self.memory.blocks, self.memory.address, *places)
+
+    def _fly(self, flown: Mask | None, places: list[int]) -> None:
+        """Fly by physics that is no array code."""
+        world = self._world
+        worlds = self._worlds
+        acting = self._given["acting"][:worlds]
+        wrench = self._given.get("wrench")
+        for code, call in self._calls:
+            if code:
+                if code != _FIRST:
+                    self._take(world.told(asked=False))
+                self._code(code, places)
+                world.acting = acting
+                world.wrench = None if wrench is None else wrench[:worlds]
+            world.fly(call, flown)
+
+    def _begin(self, begun: Mask, places: list[int]) -> None:
+        """Begin with such physics. Raises `InputError` for a start that it refuses."""
+        before = self.memory.copy()
+        world = self._world
+        try:
+            self._code(_BEGIN, places)
+            world.restore(part_of(self._kept(), "Flight"))
+            world.place(begun)
+        except InputError:
+            self.memory = before
+            world.restore(part_of(self._kept(), "Flight"))
+            raise
+
+    def _take(self, told: Named) -> None:
+        """Give the code what physics says."""
+        worlds = self._worlds
+        for name, values in told.items():
+            self._given[_PHYSICS + name][:worlds] = values
 
     def derivative(self) -> Derivative:
         """That of a step."""
@@ -155,6 +234,10 @@ class Machine:
 
     def state(self) -> Snapshot:
         """As `Loop.state`."""
+        hidden = self._world.hidden()
+        return self._kept() | {f"Flight/state/{name}": array for name, array in hidden.items()}
+
+    def _kept(self) -> Snapshot:
         return {name: self.memory.get(name) for name in self._names}
 
     def restore(self, state: Arrays) -> None:
@@ -195,9 +278,20 @@ class Machine:
         seen = {"reward": record.reward, "headline": headline.astype(np.float64)}
         for number, array in enumerate(self._loop.spec.observation):  # their names are the task's
             seen[f"observation/{number}"] = record.observations[array.name].astype(array.dtype)
-        world: Any = self._loop.world
         seen |= {name: getattr(record, name) for name in _ENDS}
-        return seen | {"wrong": record.unfit | world.bad}
+        return seen | {"wrong": record.unfit | self._loop.world.bad}
+
+    def _pushed(self) -> Named:
+        """What physics flies under that is no array code."""
+        world = self._loop.world
+        if not world.is_apart:
+            return {}
+        pushed = {"acting": world.acting, "wrench": world.wrench}
+        return {name: array for name, array in pushed.items() if array is not None}
+
+    def _pushing(self) -> Region:
+        """What the physics gets."""
+        return self._gives(self._pushed)
 
     def _variables(self, program: Program) -> Named:
         """Variables of all arrays; those of the state become the loop's."""
@@ -205,6 +299,13 @@ class Machine:
         arrays: Named = {
             name: read(program, name, dtype, (1, *shape)) for name, (dtype, shape) in given.items()
         }
+        world: Any = self._loop.world
+        if world.is_apart:
+            world.outer = {
+                name.removeprefix(_PHYSICS): values
+                for name, values in arrays.items()
+                if name.startswith(_PHYSICS)
+            }
         self._loop.put({name: arrays[name] for name in self._names})
         return arrays
 
@@ -222,14 +323,25 @@ class Machine:
 
     def _looked(self) -> Region:
         """What leaves the loop, and what is told of it."""
+        return self._gives(lambda: self._seen() | self._telemetry())
+
+    def _gives(self, named: Callable[[], Named]) -> Region:
+        """A region that writes arrays."""
         program = Program()
         self._variables(program)
         fields = {**self._outside, **self._told.fields}
         stores = []
-        for name, values in (self._seen() | self._telemetry()).items():
+        for name, values in named().items():
             lifted = lift(program, values, fields[name][0])
             stores += [(name, row, value) for row, value in enumerate(lifted)]
         return Region("", program, stores)
+
+
+def _code(call: Call) -> str:
+    """The code before a call of the physics that is not the first, if there is any."""
+    if call.commands:
+        return _CONTROL
+    return _PUSH if call.pushes else ""
 
 
 def _fields(arrays: Mapping[str, Any]) -> dict[str, tuple[np.dtype[Any], tuple[int, ...]]]:

@@ -30,6 +30,9 @@ class Pipeline:
         fly: Steps of the drones that fly.
         begin: What all of them do when an episode begins.
         observe: Steps from `Measure` on.
+        flight: One of the stages; of worlds whose physics is apart it has the parts that follow.
+        before, after: `fly` before the physics, and after it.
+        set_out, look: `begin` before the physics, and after it.
     """
 
     def __init__(
@@ -60,7 +63,8 @@ class Pipeline:
         flying: list[Stage] = [Receive(neutral)]
         if "action_delay" in randomize.names:
             flying.append(ActionDelay(world, randomize.most_steps("action_delay"), neutral))
-        flying += [Flight(world, parts, substeps, held), Clock()]
+        self.flight = flight = Flight(world, parts, substeps, held)
+        flying += [flight, Clock()]
 
         observing = self._observing(task, world, sensors, shape)
         if "observation_delay" in randomize.names:
@@ -75,6 +79,16 @@ class Pipeline:
         self.fly = [stage.step for stage in flying]
         self.begin = [stage.begin for stage in self.stages]
         self.observe = [stage.step for stage in observing]
+        number = flying.index(flight)
+        self.before = [*self.fly[:number], flight.control]
+        self.after = self.fly[number + 1 :]
+        self.set_out = []
+        self.look = []
+        for stage in self.stages:
+            if isinstance(stage, Sensing):
+                self.look.append(stage.begin)
+            else:
+                self.set_out.append(flight.set_out if stage is flight else stage.begin)
 
     def _observing(
         self, task: Task, world: World, sensors: Sensors | None, shape: tuple[int, int]

@@ -1,7 +1,9 @@
 """Worlds: what all backends have in common, and how they are made."""
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from importlib import import_module
 from typing import Any, ClassVar
 
@@ -11,6 +13,7 @@ from .. import models
 from ..models import BACKENDS, MAX_DRONES, Backend
 from ..models.errors import InputError, NotCopied
 from ..models.fields import Choice, Flag, Limits, OrNone, Rule, check
+from .compile.llvm import trouble
 from .effects import NO_EFFECTS, EffectOptions, Effects
 from .random import RANDOMIZATION, START, Draw, Random
 from .randomize import FIXED, Randomization
@@ -20,7 +23,7 @@ from .state import Array, ByName, InitialState, WorldState, chosen, plain
 _CLASSES = {"mujoco": "MujocoWorld", "rigid": "RigidWorld"}
 """Backends by name: a class in the module of that name in `backends`."""
 _SETTINGS: Mapping[str, Mapping[str, Rule]] = {
-    "mujoco": {"num_threads": OrNone(Limits(0, whole=True))},
+    "mujoco": {"num_threads": OrNone(Limits(0, whole=True)), "compiled": OrNone(Flag())},
     "rigid": {"dtype": Choice(("float32", "float64")), "compiled": OrNone(Flag())},
 }
 """Rules of each backend's own arguments of `make_world`, by name."""
@@ -43,8 +46,10 @@ class Call:
 
     steps: int
     """Physics steps."""
+    commands: bool
+    """Whether thrusts are new before it."""
     pushes: bool
-    """Whether thrusts or effects change before it."""
+    """Whether they or effects are."""
     clears: bool
     """Whether it forgets earlier contacts."""
     looks: bool
@@ -64,6 +69,7 @@ class World(NotCopied):
         effects: What acts on drones besides gravity, contact and ideal rotors; None: nothing.
         acting: Mean thrust of each rotor over the last physics step, N, shape (W, A, R).
         wrench: Mean force and torque of the air over it, as of `Effects.step`; None: no air.
+        bad: Drones with a state that is bad, where the physics is array code, bool, (W, A).
     """
 
     is_apart: ClassVar[bool] = False
@@ -95,6 +101,7 @@ class World(NotCopied):
         self.dtype = np.dtype(dtype)
         self.acting = self._nothing = np.zeros((*shape, vehicle.num_rotors), self.dtype)
         self.wrench = np.zeros((*shape, 6), self.dtype) if acting.on_body else None
+        self.bad = self.acting[..., 0] > 0
 
     def seed(self, mask: Array, seeds: Sequence[int | None] | Array) -> None:
         """Seed the worlds of a mask, seeds (W,); where it is None the random numbers go on."""
@@ -137,6 +144,7 @@ class World(NotCopied):
             calls.append(
                 Call(
                     steps=done - first,
+                    commands=first == 0,
                     pushes=first == 0 or self.effects is not None,
                     clears=first == 0 and not again,
                     looks=done % self._check == 0 or done == substeps,
@@ -168,7 +176,7 @@ class World(NotCopied):
         state.command = chosen(mask, self._typed(thrust + self._nothing), state.command)
 
     def push(self, mask: Array | None) -> None:
-        """Let effects act for the next physics step: sets the state's `thrust`, `acting`, `wrench`."""
+        """Let effects act: sets `acting`, `wrench` and the state's thrust for a physics step."""
         state = self.state
         acting = state.command
         if self.effects is not None:
@@ -223,6 +231,20 @@ class World(NotCopied):
     def fly(self, call: Call, mask: Array | None) -> None:
         """Physics steps of `step`, under `acting` and `wrench`."""
         raise NotImplementedError
+
+    def refuse_bad(self, mask: Array | None) -> None:
+        """Raise `PhysicsError` for drones of a mask that are `bad`."""
+
+    def take(self) -> None:
+        """Set the state's arrays that the physics changes, where it is no array code."""
+
+    def told(self, *, asked: bool = True) -> ByName:
+        """What such physics says now, by name, (W, A, ...), also of what a sensor asks."""
+        return {}
+
+    def hidden(self) -> ByName:
+        """Arrays of such physics that a later step depends on and array code does not see."""
+        return {}
 
     def _move(self, begun: ByName, mask: Array) -> None:
         """Set the state's motion, of which the worlds of the mask are new."""
@@ -318,15 +340,29 @@ def make_world(
 ) -> World:
     """W worlds of `drones` drones each.
 
-    Settings are `num_threads` of `mujoco`, `dtype` and `compiled` of `rigid`. Raises `InputError`.
+    Settings are `num_threads` of `mujoco`, `dtype` of `rigid`, and `compiled` of both: false for
+    NumPy, None for compiled code where llvmlite can make it. Raises `InputError`.
     """
     if not (type(num_worlds) is int and 1 <= num_worlds <= MAX_WORLDS):
         raise InputError(f"num_envs: expected 1 to {MAX_WORLDS}, got {num_worlds!r}")
     effects = effects or NO_EFFECTS
     randomize = randomize or FIXED
     check_world(vehicle, backend, drones, effects, randomize, settings)
+    wanted = settings.pop("compiled", None)
+    reason = "" if wanted is False else trouble()
+    if wanted and reason:
+        raise InputError(f"compiled: expected false where nothing compiles ({reason}), got true")
+    if reason:
+        _tell_once(reason)
+    if backend == "rigid":
+        settings["compiled"] = wanted is not False and not reason
     module = import_module(f".backends.{backend}", __package__)
     world: World = getattr(module, _CLASSES[backend])(
         vehicle, num_worlds, drones=drones, effects=effects, randomize=randomize, **settings
     )
     return world
+
+
+@cache
+def _tell_once(reason: str) -> None:
+    logging.getLogger(__name__).warning("NumPy flies, which is slower: %s", reason)

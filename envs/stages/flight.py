@@ -7,6 +7,7 @@ import numpy as np
 
 from ...sim import Controller, World
 from ...sim.state import some
+from ...sim.world import Call
 from .record import Look, Record, Stage
 
 
@@ -29,6 +30,10 @@ class Flight(Stage):
     held: int
     """Physics steps for which a thrust is held."""
 
+    def __post_init__(self) -> None:
+        if self.world.is_apart and self.held < self.substeps:
+            self.arrays = ("received",)  # a later control of the step needs it
+
     def begin(self, record: Record) -> None:
         """The task has set the start."""
         self.world.reset(record.begun, record.start)
@@ -36,9 +41,38 @@ class Flight(Stage):
     def step(self, record: Record) -> None:
         """One control step."""
         for first in range(0, self.substeps, self.held):
-            for part in self.parts:
-                part.step(record)
+            self._ask(record)
             self.world.step(record.thrust, self.held, record.flown, again=first > 0)
+
+    def _ask(self, record: Record) -> None:
+        for part in self.parts:
+            part.step(record)
+
+    # ---- the same in parts: all but the physics is array code
+
+    def set_out(self, record: Record) -> None:
+        """`begin` without the physics."""
+        self.world.begin(record.begun, record.start)
+
+    def control(self, record: Record) -> None:
+        """What the physics flies under from now on."""
+        self._ask(record)
+        self.world.command(record.thrust, record.flown)
+        self.push(record)
+
+    def push(self, record: Record) -> None:
+        """The same for a later physics step of the same thrust."""
+        self.world.push(record.flown)
+
+    def take(self, record: Record) -> None:
+        """What the physics has done."""
+        self.world.take()
+
+    def calls(self) -> list[Call]:
+        """Calls of the physics in a step."""
+        world = self.world
+        firsts = range(0, self.substeps, self.held)
+        return [call for first in firsts for call in world.calls(self.held, again=first > 0)]
 
     def close(self) -> None:
         """Close the world."""

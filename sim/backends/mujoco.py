@@ -23,11 +23,11 @@ from ...models.vehicle import (
     payload_body,
     payload_radius,
 )
-from ..effects import NO_EFFECTS, EffectOptions, Effects
+from ..effects import NO_EFFECTS, EffectOptions
 from ..randomize import CENTER, FIXED, Randomization
 from ..rotations import body_z
 from ..snapshots import Arrays
-from ..state import Array, ByName, InitialState, WorldState, stack, total
+from ..state import Array, ByName, InitialState, WorldState, found, stack, total
 from ..world import Call, PhysicsError, World
 
 _FEW = 8
@@ -124,15 +124,22 @@ class MujocoWorld(World):
         for name in ("touching", "colliding", "payload", "payload_velocity"):
             setattr(state, name, seen.get(name))
 
-    def told(self) -> ByName:
-        """What the physics says now, by name, (W, A, ...), with what is asked of it."""
-        return self._live | {name: getattr(self, name)() for name in sorted(self.asked)}
+    def told(self, *, asked: bool = True) -> ByName:
+        """As `World.told`."""
+        if not asked or not self.asked:
+            return self._live
+        return self._live | {name: getattr(self, name)() for name in self.asked}
+
+    def hidden(self) -> ByName:
+        """As `World.hidden`; `mjSTATE_INTEGRATION` has the warm start too."""
+        return {} if self.outer else {"integration": self._batch.state.copy()}
 
     def begin(self, mask: Array, pose: InitialState) -> None:
         """As `World.begin`. Raises `InputError` for a payload that would hang in the ground."""
-        hung = self._hung(mask, pose)
+        hung = self._hung(pose)
+        self._check_payload(mask, hung)
         super().begin(mask, pose)
-        if hung is not None:
+        if self._cable is not None:
             state = self.state
             rows = mask[..., None]
             state.payload = np.where(rows, hung, state.payload)
@@ -140,8 +147,9 @@ class MujocoWorld(World):
             state.payload_velocity = np.where(rows, moves, state.payload_velocity)
 
     def place(self, mask: Array) -> None:
-        """As `World.place`."""
+        """As `World.place`. Raises `InputError` as `begin`."""
         self._check_process()
+        self._check_payload(mask, self.state.payload)
         ids = self.random.ids(mask)
         state = self.state
         live = self._live
@@ -197,12 +205,8 @@ class MujocoWorld(World):
         self._batch.set_const(ids)
 
     def _kept(self) -> ByName:
-        """All that a later step depends on; `mjSTATE_INTEGRATION` has the warm start too."""
-        names = WorldState.__slots__
-        arrays = {name: getattr(self.state, name) for name in names}
-        arrays |= {"acting": self.acting, "wrench": self.wrench}
-        if not self.outer:
-            arrays["integration"] = self._batch.state
+        arrays = {name: getattr(self.state, name) for name in WorldState.__slots__}
+        arrays |= {"acting": self.acting, "wrench": self.wrench, **self.hidden()}
         return {name: array for name, array in arrays.items() if array is not None}
 
     def _restore(self, arrays: Arrays) -> None:
@@ -272,26 +276,26 @@ class MujocoWorld(World):
         if self._owner is not None and os.getpid() != self._owner:  # it would wait for ever
             raise RuntimeError("the threads of an env do not follow into a fork: make another env")
 
-    def _hung(self, mask: Array, pose: InitialState) -> Array:
-        """Where the payload of each world begins, shape (W, A, 3), or None without one.
-
-        Raises `InputError` if the payload of one of the worlds of the mask would hang in the ground.
-        """
-        if self._cable is None:
-            return None
+    def _hung(self, pose: InitialState) -> Array:
+        """Where the payload of each world begins, shape (W, A, 3), or None without one."""
+        if self._cable is None or pose.payload is not None:
+            return pose.payload
         drones = self.shape[1]
-        hung = pose.payload
-        if hung is None:
-            if drones != 1:
-                expected = "one drone in a world, or a task whose start places it"
-                raise InputError(f"effects.payload: expected {expected}, got {drones} drones")
-            hung = pose.position - (0.0, 0.0, self._cable)
-        height = hung[mask][:, 2].min(initial=np.inf) + self._cable
+        if drones != 1:
+            expected = "one drone in a world, or a task whose start places it"
+            raise InputError(f"effects.payload: expected {expected}, got {drones} drones")
+        return pose.position - (0.0, 0.0, self._cable)
+
+    def _check_payload(self, mask: Array, hung: Array) -> None:
+        """Raise `InputError` if that of a world of the mask would hang in the ground."""
+        if self._cable is None:
+            return
+        height = hung[..., 2] + self._cable
         least = self._cable + payload_radius(self._options.payload)
-        if not height > least:
+        low = mask & ~(height > least)
+        if found(low):
             expected = f"a height over {least:.4g} m, for the payload on its cable"
-            raise InputError(f"start: expected {expected}, got {height:.4g} m")
-        return hung
+            raise InputError(f"start: expected {expected}, got {height[low].min():.4g} m")
 
     def _describe_warnings(self) -> str:
         counts = self._warnings[:, :, 1]

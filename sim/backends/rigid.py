@@ -4,23 +4,19 @@ It flies as `mujoco` does until a part touches the ground or another drone, and 
 """
 
 import copy
-import logging
 from collections.abc import Mapping
-from functools import cache
 
 import mujoco
 import numpy as np
 
 from ...models.errors import InputError
 from ...models.vehicle import Vehicle, craft_bodies, craft_geoms
-from ..compile.llvm import trouble
 from ..effects import NO_EFFECTS, EffectOptions
 from ..randomize import FIXED, Randomization
 from ..snapshots import Arrays
 from ..state import (
     Array,
     ByName,
-    InitialState,
     WorldState,
     chosen,
     clip,
@@ -48,7 +44,7 @@ class RigidWorld(World):
 
     Args:
         dtype: `float32` or `float64`.
-        compiled: Fly by machine code (`sim/compile`). None: where llvmlite can make it.
+        compiled: Fly by machine code (`sim/compile`).
     """
 
     def __init__(
@@ -60,15 +56,8 @@ class RigidWorld(World):
         effects: EffectOptions = NO_EFFECTS,
         randomize: Randomization = FIXED,
         dtype: str = "float32",
-        compiled: bool | None = None,
+        compiled: bool = True,
     ) -> None:
-        reason = "" if compiled is False else trouble()
-        if compiled and reason:
-            raise InputError(
-                f"compiled: expected false where nothing compiles ({reason}), got true"
-            )
-        if reason:
-            _tell_once(reason)
         if effects.payload:
             raise InputError(
                 "effects.payload: expected none with the backend rigid, which has no cable: fly it "
@@ -86,14 +75,13 @@ class RigidWorld(World):
         self._body = RigidBody(vehicle)
         self._hull = Hull(vehicle)
         thrust = self.acting
-        self.bad = self._nobody = nobody = thrust[..., 0] > 0
+        self._nobody = nobody = self.bad
         moved = dict.fromkeys(("position", "quaternion", "velocity", "body_rates"))
         self.state = WorldState(**moved, command=thrust, thrust=thrust, touching=nobody)
         if drones > 1:
             self.state.colliding = nobody
         self._show(np.tile(_LEVEL.astype(self.dtype), (*shape, 1)))
-        is_compiled = compiled is not False and not reason
-        self._advance = Kernel(self._advanced, shape) if is_compiled else self._advanced
+        self._advance = Kernel(self._advanced, shape) if compiled else self._advanced
 
     def vary(self, inertia: Array, reaction: Array, air: Mapping[str, Array]) -> None:
         """Set the numbers of every drone before the first reset; needs the effect `body_drag`.
@@ -213,7 +201,7 @@ class RigidWorld(World):
             setattr(self.state, name, chosen(mask, new, old))
 
     def refuse_bad(self, mask: Array | None) -> None:
-        """Raise `PhysicsError` if the state of a drone that flew is bad."""
+        """As `World.refuse_bad`."""
         bad = self.bad if mask is None else self.bad & mask
         ids = np.flatnonzero(bad.any(axis=1)).tolist()
         if ids:
@@ -222,11 +210,6 @@ class RigidWorld(World):
 
 def _parts(wrench: Array) -> Array:
     return None if wrench is None else parts_of(wrench)
-
-
-@cache
-def _tell_once(reason: str) -> None:
-    logging.getLogger(__name__).warning("rigid flies by NumPy, which is slower: %s", reason)
 
 
 def _check_obstacles(vehicle: Vehicle) -> None:
