@@ -31,8 +31,11 @@ from rotorgram.sim import (
     Gains,
     InitialState,
     WorldState,
+    cos,
     make_controller,
     make_world,
+    sin,
+    stack,
 )
 
 HOVER = "rotorgram/Hover-v0"
@@ -60,7 +63,7 @@ def gains_of(name: str) -> dict[str, object]:
 
 def roll(state: WorldState) -> float:
     """Of a craft that has neither pitch nor heading, rad."""
-    w, x, _, _ = state.quaternion.tolist()
+    w, x, _, _ = state.quaternion.ravel().tolist()
     return 2 * math.atan2(x, w)
 
 
@@ -80,7 +83,8 @@ def response(name: str, level: str) -> dict[str, float]:
     effects = EffectOptions(motor_lag=lag_of(vehicle) > 0)
     world = make_world(vehicle, 1, effects=effects)
     controller: Any = make_controller(level, vehicle, vehicle.timestep, effects)
-    world.reset(np.True_, InitialState(position=np.array((0.0, 0.0, 1000.0))))
+    start = InitialState(position=np.array([[(0.0, 0.0, 1000.0)]]))
+    world.reset(np.ones((1, 1), bool), start)
     unit = controller.constants["action_scale"][index]
     action = np.zeros(4)
     seen = []
@@ -106,7 +110,7 @@ class Circle(Hover):
     def goal(self, state: State) -> np.ndarray:
         """On the circle, at the time of the step."""
         angle = SPEED * state.time
-        return np.array((math.cos(angle), math.sin(angle), 5.0))
+        return stack((cos(angle), sin(angle), 5.0))
 
 
 def tracking(name: str) -> float:

@@ -36,7 +36,7 @@ EPISODE = 50  # control steps between two resets
 
 def steps_per_second(world: World, seconds: float) -> float:
     """Control steps of all drones per second."""
-    every = np.ones(world.shape, bool)[()]
+    every = np.ones(world.shape, bool)
     pose = InitialState(position=np.broadcast_to((0.0, 0.0, 30.0), (*world.shape, 3)))
     commands = np.broadcast_to(world.vehicle.hover_thrust, (*world.shape, world.vehicle.num_rotors))
     substeps = world.vehicle.substeps(0.02)

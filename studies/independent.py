@@ -146,16 +146,18 @@ def ours(vehicle: Vehicle, commands: Floats, effects: Mapping[str, object]) -> F
     world = make_world(vehicle, 1, effects=EffectOptions(**effects))
     state = world.state
     start = InitialState(
-        position=np.array((0.0, 0.0, _HEIGHT)),
-        velocity=np.array(VELOCITY),
-        body_rates=np.array(SPIN),
+        position=np.array([[(0.0, 0.0, _HEIGHT)]]),
+        velocity=np.array([[VELOCITY]]),
+        body_rates=np.array([[SPIN]]),
     )
-    world.reset(np.True_, start)
-    flown = [[x.copy() for x in (state.position, state.quaternion, state.body_rates)]]
-    for command in commands:
-        world.step(command, vehicle.substeps(CONTROL))
-        assert not state.touching
-        flown.append([x.copy() for x in (state.position, state.quaternion, state.body_rates)])
+    world.reset(np.ones((1, 1), bool), start)
+    flown = []
+    for command in (None, *commands):
+        if command is not None:
+            world.step(command, vehicle.substeps(CONTROL))
+            assert not state.touching
+        now = (state.position, state.quaternion, state.body_rates)
+        flown.append([x[0, 0].copy() for x in now])
     world.close()
     return Flight(*(np.array(part) for part in zip(*flown, strict=True)))
 

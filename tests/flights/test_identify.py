@@ -12,8 +12,8 @@ from rotorgram.flights.prediction import Windows, differences, numbers_of, predi
 from rotorgram.models.errors import InputError
 from rotorgram.models.vehicle import Vehicle
 from rotorgram.sim.effects import EffectOptions
-from rotorgram.sim.state import InitialState
 from rotorgram.sim.world import make_world
+from worlds import alone, begin
 
 pytest.importorskip("scipy")
 pandas = pytest.importorskip("pandas")
@@ -32,15 +32,15 @@ def flown(
     vehicle = Vehicle.load(LIVELY)
     effects = EffectOptions(motor_lag=True, body_drag=True)
     world = make_world(vehicle, 1, effects=effects)
-    world.reset(np.True_, InitialState(position=np.array((0.0, 0.0, 50.0))))
+    begin(world, position=(0.0, 0.0, 50.0))
     rng = np.random.default_rng(3)
     mix = np.linalg.pinv(vehicle.allocation)
-    state = world.state
     wanted = np.zeros(4)
     rows = []
     for step in range(round(seconds / every)):
         if step % round(0.25 / every) == 0:
             wanted = shake * rng.normal(size=4) * (1.0, 0.12, 0.12, 1.0)
+        state = alone(world)
         q = state.quaternion
         w = state.body_rates
         tilt = 2 * q[0] * q[1:3]
@@ -59,7 +59,7 @@ def flown(
         row = ([every * step], position, turned, velocity, rates, speeds, commands)
         rows.append(np.concatenate(row))
         world.step(thrust, round(every / 0.005))
-    assert state.position[2] > 10.0
+    assert alone(world).position[2] > 10.0
     world.close()
     commanded = [f"m{i}_command_rads" for i in range(1, 5)]
     table = pandas.DataFrame(rows, columns=["t", *MOTION, *SPEEDS, *commanded])
@@ -180,8 +180,7 @@ def test_a_prediction_is_the_simulator_s(tmp_path: Path) -> None:
     thrust = 3e-6 * speeds**2
     effects = EffectOptions(body_drag=True, rotor_drag=True)
     world = make_world(vehicle, 1, effects=effects)
-    state = InitialState(thrust=thrust, **start)
-    world.reset(np.True_, state)
+    begin(world, thrust=thrust, **start)
     world.step(thrust, 100)
     row = np.concatenate(list(start.values()))
     states = np.tile(row, (101, 1))
@@ -189,7 +188,7 @@ def test_a_prediction_is_the_simulator_s(tmp_path: Path) -> None:
     flight = FlightLog(name="", period=0.005, speeds=constant, states=states)
     windows = Windows.cut([flight], 100, 200)
     predicted = predict(vehicle, [numbers_of(vehicle)], windows)[0, 0]
-    truth = np.concatenate([getattr(world.state, name) for name in start])
+    truth = np.concatenate([getattr(alone(world), name) for name in start])
     errors = np.abs(differences(predicted, truth))
     assert errors[:2].max() < 2e-4  # position and attitude
     assert errors[2:].max() < 1e-3

@@ -27,7 +27,7 @@ from rotorgram.sim.control import MixedController
 from rotorgram.sim.control.cascade import Position
 from rotorgram.sim.control.gains import shared_ranges
 from tables import SIM
-from worlds import begin
+from worlds import alone, begin
 
 approx = pytest.approx
 DATA = Path(__file__).parents[1] / "data"
@@ -180,8 +180,8 @@ def flown(
     start = np.array((0.8, -0.6, 0.5)) if level == "position" else np.zeros(3)
     begin(world, position=goal + start, quaternion=quaternion)
     seen = []
-    state = world.state
     for _ in range(round(time / vehicle.timestep)):
+        state = alone(world)
         w, x, y, z = state.quaternion
         heading = atan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))
         action = np.zeros(4)
@@ -192,6 +192,7 @@ def flown(
             turned = c * offset[0] + s * offset[1], c * offset[1] - s * offset[0], offset[2]
             action = np.array((*turned, -heading)) / controller.constants["action_scale"]
         world.step(controller.thrust(action, state), 1)
+        state = alone(world)
         seen.append((np.linalg.norm(goal - state.position), state.tilt_cosine, heading))
     return seen
 
@@ -250,7 +251,7 @@ def test_loops_invert_the_thrust_curve() -> None:
     world = make_world(vehicle, 1, effects=effects)
     begin(world, position=(0.0, 0.0, 50.0))
     world.step(command, 1)
-    assert world.state.thrust == approx(vehicle.hover_thrust, abs=1e-5)
+    assert alone(world).thrust == approx(vehicle.hover_thrust, abs=1e-5)
     found = hover_error(vehicle=FILES["racer"], effects={"thrust_curve": True})
     assert found < 0.01
 

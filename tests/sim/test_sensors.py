@@ -22,7 +22,7 @@ from rotorgram.sim import EffectOptions, World, make_world
 from rotorgram.sim.sensors import Estimator, Sensors, checked_sensors
 from rotorgram.sim.sensors.barometer import isa_height, isa_pressure
 from tables import SIM
-from worlds import begin
+from worlds import EVERY, alone, begin
 
 approx = pytest.approx
 ELEVATION = "rotorgram/Elevation-v0"
@@ -40,7 +40,7 @@ def sensing(
 ) -> tuple[World, Sensors, Any]:
     """A world that has just begun at a pose, its sensors, and the mask of all its drones."""
     world = make_world(Vehicle.load(file), worlds, num_threads=1)
-    every: Any = np.ones(world.shape, bool)[()]
+    every = np.ones(world.shape, bool)
     start = {"position": (0.0, 0.0, 5.0), **pose}
     made = Sensors(checked_sensors(sensors), world, PERIOD)
     world.seed(every, [100 + i for i in range(worlds)])
@@ -58,7 +58,7 @@ def edited(folder: Path, old: str, new: str) -> Path:
 
 def first(name: str, settings: Mapping[str, Any], **rest: Any) -> list[float]:
     """First reading of a sensor of a single drone."""
-    return sensing({name: settings}, **rest)[1].readings[name].tolist()
+    return sensing({name: settings}, **rest)[1].readings[name][0, 0].tolist()
 
 
 def readings(name: str, settings: Mapping[str, Any], worlds: int, **pose: Any) -> np.ndarray:
@@ -94,7 +94,7 @@ def test_imu_of_a_craft_that_stands() -> None:
         world.step(np.zeros(4), 2)
     sensors.sample(every)
     expected = (0, 0, 0, 0, 0, 9.8)
-    assert sensors.readings["imu"] == approx(expected, abs=1e-3)
+    assert sensors.readings["imu"][0, 0] == approx(expected, abs=1e-3)
 
 
 def test_imu_at_the_end_of_a_step() -> None:
@@ -102,10 +102,10 @@ def test_imu_at_the_end_of_a_step() -> None:
     world, sensors, every = sensing({"imu": IMU}, body_rates=(1.0, 2.0, 0.5))
     world.step(np.array((60.0, 50.0, 40.0, 30.0)), 2)
     sensors.sample(every)
-    reading = sensors.readings["imu"]
+    reading = sensors.readings["imu"][0, 0]
     expected = (0.0, 0.0, 180.0 / 20.0)
     assert reading[3:] == approx(expected, abs=1e-9)
-    assert_array_equal(reading[:3], world.state.body_rates)
+    assert_array_equal(reading[:3], alone(world).body_rates)
 
 
 def test_imu_off_the_center_of_mass(tmp_path: Path) -> None:
@@ -121,15 +121,14 @@ def test_imu_feels_the_air(tmp_path: Path) -> None:
     """Drag of 2 N s/m in a wind of 5 m/s from behind: 10 N on 20 kg, as long as it stands still."""
     drag = '<custom><numeric name="rotorgram/drag.linear" data="2 2 2"/></custom>'
     vehicle = Vehicle.load(edited(tmp_path, "<worldbody>", f"{drag}<worldbody>"))
-    every = np.True_
     world = make_world(vehicle, 1, effects=EffectOptions(body_drag=True, wind=(5.0, 0.0, 0.0)))
     sensors = Sensors(checked_sensors({"imu": IMU}), world, PERIOD)
     begin(world, position=(0.0, 0.0, 5.0))
-    sensors.begin(every)
+    sensors.begin(EVERY)
     world.step(vehicle.hover_thrust, 1)
-    sensors.sample(every)
+    sensors.sample(EVERY)
     expected = (0.5, 0.0, 9.8)
-    found = sensors.readings["imu"][3:]
+    found = sensors.readings["imu"][0, 0, 3:]
     assert found == approx(expected, abs=1e-3)
 
 
@@ -321,7 +320,7 @@ def test_a_vehicles_numbers_and_the_settings_that_replace_them(tmp_path: Path) -
     )
     file = edited(tmp_path, "<worldbody>", f"<custom>{told}</custom><worldbody>")
     fast = {"body_rates": (5.0, 0.0, 0.0)}
-    found = sensing({"imu": True}, file=file, **fast)[1].readings["imu"][0]
+    found = sensing({"imu": True}, file=file, **fast)[1].readings["imu"][0, 0, 0]
     assert found == 2.0
     assert first("imu", {"gyro_range": 4.0}, file=file, **fast)[0] == 4.0
 
@@ -507,10 +506,10 @@ def test_an_exact_estimate_of_a_steady_climb() -> None:
     for _ in range(100):
         world.step(np.full(4, 55.0), 2)
         made.sample(every)
-    estimate = made.readings["estimate"]
-    expected = world.state.position.tolist()
+    estimate = made.readings["estimate"][0, 0]
+    expected = alone(world).position.tolist()
     assert estimate[:3] == approx(expected, abs=1e-9)
-    expected = world.state.velocity.tolist()
+    expected = alone(world).velocity.tolist()
     assert estimate[3:6] == approx(expected, abs=1e-9)
     assert estimate[6:10] == approx(LEVEL, abs=1e-12)
     # 55 N · 4 / 20 kg - 9.8 = 1.2 m/s² for 2 s
