@@ -60,7 +60,7 @@ class Flight:
         class Placed(Elevation):
             def begin(self, mask: Any, draw: Any) -> InitialState:
                 super().begin(mask, draw)
-                return InitialState(position=stack((0.0, 0.0, start)))
+                return InitialState(position=stack((0.0, 0.0, np.array([[start]]))))
 
         register("env/Placed-v0", Placed)
         self.loop = loop_of("env/Placed-v0", **{"target": target, **options})
@@ -416,8 +416,8 @@ def test_terminated_by_the_floor() -> None:
 
 def test_a_bounce_within_a_long_control_period_is_a_crash() -> None:
     flight = Flight(1.5, target=2.0, flight_band=50.0, control_period=1.0, thrust_scale=51.0)
-    flight.state.position[2] = 0.5
-    flight.state.velocity[2] = -3.0  # to the floor, and up again
+    flight.state.position[..., 2] = 0.5
+    flight.state.velocity[..., 2] = -3.0  # to the floor, and up again
     flight.step(1.0)
     assert flight.height > 1.0
     assert flight.ends == (True, False)
@@ -428,8 +428,8 @@ def test_a_bounce_within_a_long_control_period_is_a_crash() -> None:
 def test_terminated_by_tilt(degrees: float, over: bool, axis: int) -> None:
     flight = Flight(5.0)
     half = math.radians(degrees) / 2
-    flight.state.quaternion[0] = math.cos(half)
-    flight.state.quaternion[axis] = math.sin(half)
+    flight.state.quaternion[..., 0] = math.cos(half)
+    flight.state.quaternion[..., axis] = math.sin(half)
     flight.step(0.0)
     assert flight.ends == (over, False)
     cost = flight.loop.reward_terms["termination"]
@@ -443,7 +443,7 @@ def test_a_bad_state_raises_and_leaves_no_log(
     monkeypatch.chdir(tmp_path)
     flight = Flight(5.0)
     twin = Flight(5.0)
-    getattr(flight.state, field)[2] = math.nan
+    getattr(flight.state, field)[..., 2] = math.nan
     with pytest.raises(PhysicsError, match=f"MuJoCo warned of mjWARN_BAD{warning} .*reset"):
         flight.step(0.0)
     assert list(tmp_path.iterdir()) == []
@@ -464,7 +464,7 @@ def test_a_log_file_that_the_user_named_stays_on(tmp_path: Path) -> None:
         mine.set()
         flight = Flight(5.0)
         assert mujoco.MjLogConfig.get().logto_file
-        flight.state.velocity[0] = math.nan
+        flight.state.velocity[..., 0] = math.nan
         with pytest.raises(PhysicsError):
             flight.step(0.0)
         text = (tmp_path / "mine.txt").read_text()

@@ -20,6 +20,7 @@ from contracts import (
 )
 from pilot import Pilot, fly, limited
 from rotorgram.models import Vehicle
+from worlds import alone
 
 from flights import Shares, about, state_of, task_of
 
@@ -49,7 +50,7 @@ def test_the_task_hangs_the_payload_itself(vehicle: str) -> None:
     assert spec_with(ID, **told.options, vehicle=vehicle) == told
     loop = loop_of(ID, vehicle=vehicle, **options)
     loop.advance(zero_actions(1, 4), everyone(1), [0])
-    state = loop.world.state
+    state = alone(loop.world)
     assert state.position - state.payload == pytest.approx([0.0, 0.0, 0.7])
     assert state.payload_velocity.tolist() == state.velocity.tolist()
     seen = loop.observations["observation"]

@@ -15,6 +15,7 @@ from rotorgram.models.fleet import Fleet, load_vehicles, members_of
 from rotorgram.sim import LEVELS, EffectOptions, InitialState, make_controller, make_world
 from rotorgram.sim.control import Gains
 from rotorgram.udp.spawn import spawn_simulator
+from worlds import alone, begin
 
 MIX = "crazyflie2,hummingbird,paper"
 FORMATION = "rotorgram/Formation-v0"
@@ -69,14 +70,13 @@ def test_drones_far_apart_fly_as_each_vehicle_alone() -> None:
     assert together.state.thrust[0] == pytest.approx(fleet.hover_thrust)
     together.step(1.05 * fleet.hover_thrust[None], steps)
     for i, craft in enumerate(fleet.members):
-        alone = make_world(craft, 1)
-        start = InitialState(position=places[0, i], body_rates=rates[0, i])
-        alone.reset(np.ones((), bool), start)
-        alone.step(1.05 * craft.hover_thrust, steps)
+        single = make_world(craft, 1)
+        begin(single, position=places[0, i], body_rates=rates[0, i])
+        single.step(1.05 * craft.hover_thrust, steps)
         place = together.state.position[0, i]
         attitude = together.state.quaternion[0, i]
-        assert place == pytest.approx(alone.state.position, abs=1e-9)
-        assert attitude == pytest.approx(alone.state.quaternion, abs=1e-9)
+        assert place == pytest.approx(alone(single).position, abs=1e-9)
+        assert attitude == pytest.approx(alone(single).quaternion, abs=1e-9)
 
 
 @pytest.mark.parametrize("level", LEVELS)
