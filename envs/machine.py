@@ -299,13 +299,11 @@ class Machine:
         arrays: Named = {
             name: read(program, name, dtype, (1, *shape)) for name, (dtype, shape) in given.items()
         }
-        world: Any = self._loop.world
-        if world.is_apart:
-            world.outer = {
-                name.removeprefix(_PHYSICS): values
-                for name, values in arrays.items()
-                if name.startswith(_PHYSICS)
-            }
+        self._loop.world.outer = {
+            name.removeprefix(_PHYSICS): values
+            for name, values in arrays.items()
+            if name.startswith(_PHYSICS)
+        }
         self._loop.put({name: arrays[name] for name in self._names})
         return arrays
 

@@ -70,6 +70,8 @@ class World(NotCopied):
         acting: Mean thrust of each rotor over the last physics step, N, shape (W, A, R).
         wrench: Mean force and torque of the air over it, as of `Effects.step`; None: no air.
         bad: Drones with a state that is bad, where the physics is array code, bool, (W, A).
+        outer: What other physics says, by name, in code that is being compiled; otherwise empty.
+        asked: Names of what sensors asked of it.
     """
 
     is_apart: ClassVar[bool] = False
@@ -102,6 +104,8 @@ class World(NotCopied):
         self.acting = self._nothing = np.zeros((*shape, vehicle.num_rotors), self.dtype)
         self.wrench = np.zeros((*shape, 6), self.dtype) if acting.on_body else None
         self.bad = self.acting[..., 0] > 0
+        self.outer: ByName = {}
+        self.asked: set[str] = set()
 
     def seed(self, mask: Array, seeds: Sequence[int | None] | Array) -> None:
         """Seed the worlds of a mask, seeds (W,); where it is None the random numbers go on."""

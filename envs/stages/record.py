@@ -204,7 +204,7 @@ class Stage:
         keeps: Name of an attribute with arrays of its own that a later step depends on.
     """
 
-    arrays: ClassVar[tuple[str, ...]] = ()
+    arrays: tuple[str, ...] = ()
     keeps: ClassVar[str] = ""
 
     def begin(self, record: Record) -> None:

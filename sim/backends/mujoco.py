@@ -44,10 +44,6 @@ class MujocoWorld(World):
     the whole process; a log file of another name stays on.
 
     `num_threads` threads step the worlds; 0: one for each processor.
-
-    Attributes:
-        outer: What the physics says, in code that is compiled: its variables by name.
-        asked: Names of what a step asked besides the motion.
     """
 
     is_apart = True
@@ -64,8 +60,6 @@ class MujocoWorld(World):
     ) -> None:
         shape = (num_worlds, drones)
         super().__init__(vehicle, shape, effects, randomize)
-        self.outer: ByName = {}
-        self.asked: set[str] = set()
         threads = 1 if num_worlds == 1 else num_threads
         model = self._flown_model(drones)
         if self._on_rotors:  # commands are within their limits; thrusts need not be
