@@ -198,7 +198,8 @@ class RigidWorld(World):
         """Set what `_contacts` gave, for the worlds of a mask."""
         for name, new in zip(("touching", "colliding"), touched, strict=False):
             old = getattr(self.state, name)
-            setattr(self.state, name, chosen(mask, new, old))
+            if old is not None:
+                setattr(self.state, name, chosen(mask, new, old))
 
     def refuse_bad(self, mask: Array | None) -> None:
         """As `World.refuse_bad`."""
