@@ -8,7 +8,8 @@ import numpy as np
 from ...models import InputError
 from ...models.fields import Limits, immutable
 from ...models.matrices import right_inverse
-from ...sim import Array, Draw, InitialState, atan2, cos, length, sin, stack, total
+from ...sim import Array, Draw, InitialState, atan2, cos, length, parts_of, sin, stack, total
+from ...sim.rotations import cross
 from ..config import EnvConfig
 from ..spec import Metric
 from ..state import State
@@ -147,7 +148,7 @@ class Cable(Swarm):
         lift = load + weight
         force = math.sqrt(inwards * inwards + lift * lift)
         even = force * (vehicle.hover_thrust / weight)
-        torque = np.cross(vehicle.center_of_mass, pull)
+        torque = stack(cross(vehicle.center_of_mass.tolist(), parts_of(pull)))
         wanted = np.concatenate((force + 0.0 * azimuth[..., None], torque), axis=-1)
         missing = wanted - total(vehicle.allocation * even)
         return even + total(self._allocated * missing[..., None, :])

@@ -22,6 +22,11 @@ from rotorgram.sim.compile import llvm
 
 EXPECTED = json.loads(HASHES.read_text())
 BY_NUMPY = [name for name, case in RIGID.items() if case.options.get("compiled") is False]
+MUJOCO = [
+    name
+    for name, case in CASES.items()
+    if case.config().backend.name == "mujoco" and case.drones < 4 and "cameras" not in case.options
+]
 MANY = 150  # worlds: two blocks, and a part of one
 
 
@@ -59,6 +64,17 @@ def test_the_bits_of_numpy_and_of_every_processor(name: str) -> None:
         flight(theirs, range(step, step + 1))
         check_same(ours, theirs)
     assert hash_of(flown) == EXPECTED[name]
+
+
+@pytest.mark.parametrize("name", MUJOCO)
+def test_the_bits_of_numpy_on_mujoco(name: str) -> None:
+    """Code before and after the physics, and where it is split."""
+    ours, theirs = both(CASES[name])
+    for step in range(STEPS):
+        for loop in (ours, theirs):
+            flight(loop, range(step, step + 1))
+        if step % 4 == 3:
+            check_same(ours, theirs)
 
 
 @pytest.mark.parametrize("name", BY_NUMPY)
@@ -127,6 +143,26 @@ def test_bad_states_and_numbers_are_told_of() -> None:
         env.step(np.zeros((3, 4), np.float32))
     env.reset()
     env.step(np.zeros((3, 4), np.float32))
+
+
+def test_a_start_that_is_refused_changes_nothing() -> None:
+    """A payload would hang in the ground: physics says so after the code has drawn the start."""
+    options = {"effects": {"payload": 1.0, "cable": 4.8}, "start_band": 1.0}
+    ours, theirs = both(Case(HOVER, options))
+    actions = np.zeros((WORLDS, 4), np.float32)
+    everybody = np.ones(WORLDS, bool)
+    refused = []
+    for seed in range(20):
+        for loop in (ours, theirs):
+            try:
+                loop.advance(actions, everybody, [seed] * WORLDS)
+            except InputError as error:
+                refused.append((seed, str(error)))
+        if ours.is_compiled and theirs.record.has_begun:
+            check_same(ours, theirs)
+    assert len(refused) == 2 * len(set(refused))
+    assert 5 < len(set(refused)) < 20
+    assert all(told.startswith("start: expected a height over") for _, told in refused)
 
 
 class Branching(registry.task_type(HOVER)):  # type: ignore[misc]

@@ -201,13 +201,17 @@ def test_a_crash_ends_the_episode_of_those_that_touch_and_they_fall_silent() -> 
 def test_the_target_moves_no_faster_than_it_may_and_its_velocity_is_told() -> None:
     env = LocalVectorEnv(TASKS[2], 2, drones=2, target_speed=3.0, target_path=4.0)
     env.reset(seed=1)
-    task: Any = env.loop.task
-    before, _ = task.target()
+
+    def target() -> Any:
+        task: Any = env.loop.task
+        return task.target()
+
+    before, _ = target()
     actions = zero_actions(2, 4)
     speeds = []
     for _ in range(400):
         seen, *_ = env.step(actions)
-        now, velocity = task.target()
+        now, velocity = target()
         speed = np.linalg.norm(velocity, axis=-1)
         speeds.append(speed.max())
         mean = (now - before) / PERIOD

@@ -16,7 +16,7 @@ from rotorgram.envs.config import EnvConfig
 from rotorgram.models import QUAD_XML, Vehicle
 from rotorgram.models.errors import InputError
 from rotorgram.sim import PhysicsError, Randomization, make_world
-from rotorgram.sim.backends import rigid
+from rotorgram.sim import world as sim_world
 from rotorgram.sim.compile import llvm
 from tables import SIM
 from worlds import begin
@@ -179,7 +179,7 @@ def test_without_llvmlite_numpy_flies(
 ) -> None:
     vehicle = Vehicle.load(linear_drag=0.123)
     monkeypatch.setitem(sys.modules, "llvmlite", None)
-    for function in (llvm._llvm, rigid._tell_once):
+    for function in (llvm._llvm, sim_world._tell_once):
         function.cache_clear()
         request.addfinalizer(function.cache_clear)
     with pytest.raises(
@@ -197,7 +197,7 @@ def test_without_llvmlite_numpy_flies(
     found = world.state.velocity[0, 0]
     assert_allclose(found, expected, rtol=1e-9)
     (told,) = caplog.messages  # once, for two worlds
-    assert told.startswith("rigid flies by NumPy, which is slower: import of llvmlite")
+    assert told.startswith("NumPy flies, which is slower: import of llvmlite")
 
 
 def test_a_free_fall_is_exact() -> None:
