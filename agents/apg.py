@@ -42,7 +42,7 @@ class APG(Learner):
         super().__init__(log, config, seed)
         loop = getattr(log.env, "loop", None)
         machine = loop.machine() if isinstance(loop, CompiledLoop) else None
-        if machine is None or log.actions.discrete:
+        if machine is None or not machine.is_whole or log.actions.discrete:
             raise InputError(
                 "apg: expected continuous actions and an env that is compiled, in this process "
                 "(--backend rigid --no-udp), got another one"

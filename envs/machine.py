@@ -50,6 +50,7 @@ class Machine:
         world: W worlds, whose physics flies where it is no array code.
 
     Attributes:
+        is_whole: Whether a step is code as a whole, and has a derivative.
         tape: Unless it is None, gets the memory from before each flown step.
 
     Raises:
@@ -60,6 +61,7 @@ class Machine:
         self._loop = loop
         self._world = world
         self._worlds = worlds = world.shape[0]
+        self.is_whole = not world.is_apart
         ours = loop.world
         ours.outer = seen = ours.told()
         world.asked = ours.asked
@@ -101,7 +103,7 @@ class Machine:
         loop = self._loop
         pipeline = loop.pipeline
         last = [self._traced("active", pipeline.observe), self._looked()]
-        if not self._world.is_apart:
+        if self.is_whole:
             first = [self._traced("", [Record.rest]), self._traced("flown", pipeline.fly)]
             return {_LAST: [*first, self._traced("begun", pipeline.begin), *last]}
         flight = pipeline.flight
@@ -161,7 +163,7 @@ class Machine:
         new = np.empty(self._size, np.uint8)
         first = new.ctypes.data
         places = [first, *self._places, *[first + start for start in self._starts]]
-        if self._world.is_apart:
+        if not self.is_whole:
             if sent is not None:
                 self._fly(flown, places)
             if begun is not None:
