@@ -9,7 +9,6 @@ from ...models import InputError
 from ...models.fields import Limits, immutable
 from ...models.matrices import right_inverse
 from ...sim import Array, Draw, InitialState, atan2, cos, length, parts_of, sin, stack, total
-from ...sim.rotations import cross
 from ..config import EnvConfig
 from ..spec import Metric
 from ..state import State
@@ -148,7 +147,9 @@ class Cable(Swarm):
         lift = load + weight
         force = math.sqrt(inwards * inwards + lift * lift)
         even = force * (vehicle.hover_thrust / weight)
-        torque = stack(cross(vehicle.center_of_mass.tolist(), parts_of(pull)))
+        a, b, c = vehicle.center_of_mass.tolist()
+        x, y, z = parts_of(pull)
+        torque = stack((b * z - c * y, c * x - a * z, a * y - b * x))
         wanted = np.concatenate((force + 0.0 * azimuth[..., None], torque), axis=-1)
         missing = wanted - total(vehicle.allocation * even)
         return even + total(self._allocated * missing[..., None, :])
