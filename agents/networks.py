@@ -2,8 +2,9 @@
 
 Small networks are faster here than in torch, and torch is not imported. Arrays are feature-major:
 shape (..., n, B) for a batch of B. A leading axis counts networks of the same layers that compute
-together, as an actor and its critic. Layers keep their arrays from batch to batch: what they return
-holds until their next call.
+together, as an actor and its critic. Between layers a first row of ones stands before the others, so
+that the first column of the weights is the bias. Layers keep their arrays from batch to batch: what
+they return holds until their next call.
 """
 
 import math
@@ -78,6 +79,11 @@ class Weights:
         return replace(self, arrays=own(self.arrays), gradients=own(self.gradients))
 
 
+def sized(array: Floats, *shape: int) -> Floats:
+    """The array if it has this shape, or new ones."""
+    return array if array.shape == shape else np.ones(shape, np.float32)
+
+
 class Module:
     """What computes with weights.
 
@@ -92,7 +98,7 @@ class Module:
 
 
 class Layer(Module):
-    """A step of a network, from inputs (..., n, B) to outputs (..., k, B)."""
+    """A step of a network, from inputs (..., 1 + n, B) to outputs (..., 1 + k, B)."""
 
     def initialise(self, rng: np.random.Generator, gain: float) -> None:
         """Draw the weights."""
@@ -102,55 +108,49 @@ class Layer(Module):
         """The outputs. Keeps what the derivatives need."""
 
     def learn(self, slope: Floats) -> None:
-        """Set the gradients of a loss, from its derivatives by the last outputs."""
+        """Set the gradients of a loss, from its derivatives by the last outputs, (..., k, B)."""
 
     @abstractmethod
     def back(self, slope: Floats) -> Floats:
-        """Derivatives by the last inputs, from those by the outputs.
+        """Derivatives by the last inputs, (..., n, B), from those by the outputs.
 
         It is called once, after `learn`, and may overwrite the slope and the outputs.
         """
 
 
 class Affine(Layer):
-    """Sums of the inputs by weights, and a bias. The weights are orthogonal at the beginning."""
+    """Sums of the inputs by weights, which are orthogonal at the beginning.
+
+    The first input is 1, and its weight the bias.
+    """
 
     def __init__(self, inputs: int, outputs: int) -> None:
-        self.shapes = {"weight": (outputs, inputs), "bias": (outputs,)}
-        self._outputs = self._by_inputs = np.zeros((0, 0), np.float32)
-        self._ones = np.zeros(0, np.float32)
+        self.shapes = {"weight": (outputs, 1 + inputs)}
 
     def bind(self, weights: Weights) -> None:
         self.weight = weights.arrays["weight"]
-        self.bias = weights.arrays["bias"]
-        self._column = self.bias[..., np.newaxis]
-        self._multiply = np.dot if self.weight.ndim == 2 else np.matmul  # `dot` begins faster
-        self._transposed = self.weight.swapaxes(-1, -2)
         self._by_weight = weights.gradients["weight"]
-        self._by_bias = weights.gradients["bias"]
+        self._transposed = self.weight[..., 1:].swapaxes(-1, -2)
+        self._outputs = self._by_inputs = self.weight[..., :0]
 
     def initialise(self, rng: np.random.Generator, gain: float) -> None:
-        self.weight[...] = orthogonal(rng, self.weight.shape, gain)
-        self.bias[...] = 0.0
+        units, inputs = self.weight.shape
+        self.weight[:, 0] = 0.0
+        self.weight[:, 1:] = orthogonal(rng, (units, inputs - 1), gain)
 
     def forward(self, inputs: Floats) -> Floats:
         self._inputs = inputs
-        if self._outputs.shape[-1] != inputs.shape[-1]:
-            self._outputs = np.empty((*self.bias.shape, inputs.shape[-1]), np.float32)
-        self._multiply(self.weight, inputs, out=self._outputs)
-        self._outputs += self._column
+        *lead, units, _ = self.weight.shape
+        self._outputs = sized(self._outputs, *lead, 1 + units, inputs.shape[-1])
+        np.matmul(self.weight, inputs, out=self._outputs[..., 1:, :])
         return self._outputs
 
     def learn(self, slope: Floats) -> None:
-        if self._ones.size != slope.shape[-1]:
-            self._ones = np.ones(slope.shape[-1], np.float32)
         np.matmul(slope, self._inputs.swapaxes(-1, -2), out=self._by_weight)
-        np.matmul(slope, self._ones, out=self._by_bias)
 
     def back(self, slope: Floats) -> Floats:
-        if self._by_inputs.shape[-1] != slope.shape[-1]:
-            shape = (*self._transposed.shape[:-1], slope.shape[-1])
-            self._by_inputs = np.empty(shape, np.float32)
+        *shape, _ = self._transposed.shape
+        self._by_inputs = sized(self._by_inputs, *shape, slope.shape[-1])
         return np.matmul(self._transposed, slope, out=self._by_inputs)
 
 
@@ -158,7 +158,8 @@ class Relu(Layer):
     """max(x, 0), in the place of x."""
 
     def forward(self, inputs: Floats) -> Floats:
-        self._outputs = np.maximum(inputs, np.float32(0.0), out=inputs)
+        self._outputs = inputs[..., 1:, :]
+        np.maximum(self._outputs, np.float32(0.0), out=self._outputs)
         return inputs
 
     def back(self, slope: Floats) -> Floats:
@@ -170,12 +171,13 @@ class Tanh(Layer):
     """The hyperbolic tangent, in the place of x."""
 
     def forward(self, inputs: Floats) -> Floats:
-        self._outputs = np.tanh(inputs, out=inputs)
+        self._outputs = inputs[..., 1:, :]
+        np.tanh(self._outputs, out=self._outputs)
         return inputs
 
     def back(self, slope: Floats) -> Floats:
         outputs = self._outputs
-        outputs *= outputs
+        np.square(outputs, out=outputs)
         np.subtract(np.float32(1.0), outputs, out=outputs)
         slope *= outputs
         return slope
@@ -197,6 +199,7 @@ class Network(Module):
         for prefix, layer in self._named.items():
             shapes |= named(prefix, layer.shapes)
         self.shapes = shapes
+        self._inputs = np.ones(0, np.float32)
 
     @abstractmethod
     def build(self, inputs: int, outputs: int, config: Config) -> Sequence[Layer]:
@@ -215,10 +218,12 @@ class Network(Module):
 
     def forward(self, inputs: Floats) -> Floats:
         """The outputs; the inputs stay as they are."""
-        outputs = inputs if isinstance(self.layers[0], Affine) else inputs.copy()
+        *lead, rows, count = inputs.shape
+        self._inputs = outputs = sized(self._inputs, *lead, 1 + rows, count)
+        outputs[..., 1:, :] = inputs
         for layer in self.layers:
             outputs = layer.forward(outputs)
-        return outputs
+        return outputs[..., 1:, :]
 
     def backward(self, slope: Floats) -> None:
         """Set the gradients of a loss, from its derivatives by the last outputs, (..., k, B).

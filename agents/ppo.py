@@ -1,6 +1,5 @@
 """Proximal Policy Optimisation: Schulman et al. 2017, arXiv 1707.06347, Equations 7 and 9."""
 
-from itertools import pairwise
 from typing import Annotated
 
 import numpy as np
@@ -67,13 +66,12 @@ class PPO(A2C):
         columns = self.columns(rollout)
         scales = self.scales
         count = len(rollout)
-        cuts = np.linspace(0, count, min(config.minibatches, count) + 1).astype(int).tolist()
+        minibatches = min(config.minibatches, count)
         self._changes: list[Floats] = []
         terms: list[tuple[float, ...]] = []
         for _ in range(config.epochs):
             order = self._rng.permutation(count)
-            for first, last in pairwise(cuts):
-                rows = order[first:last]
+            for rows in np.array_split(order, minibatches):
                 terms.append(self.minibatch(*(column.take(rows, axis=0) for column in columns)))
                 clip_norm(self.weights.slopes, config.max_grad_norm)
                 self.optimizer.step(self.rate, scales)

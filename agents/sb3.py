@@ -233,11 +233,13 @@ class SB3Agent:
         network = ("mlp_extractor.policy_net.", "action_net.")
         if isinstance(self._config, SACConfig):
             network = ("actor.latent_pi.", "actor.mu.")
-        weights = [values for name, values in parameters.items() if name.startswith(network)]
+        layers = [values.numpy() for name, values in parameters.items() if name.startswith(network)]
+        pairs = zip(layers[0::2], layers[1::2], strict=True)
+        weights = [np.column_stack((bias, weight)) for weight, bias in pairs]
         if "log_std" in parameters:
-            weights.append(parameters["log_std"])
+            weights.append(parameters["log_std"].numpy().copy())
         ours = NetworkPolicy(self.spec, self._config).shapes
-        return {name: w.numpy().copy() for name, w in zip(ours, weights, strict=True)}
+        return dict(zip(ours, weights, strict=True))
 
     def policy(self) -> NetworkPolicy:
         """The current policy, without exploration: a copy."""

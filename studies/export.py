@@ -71,8 +71,9 @@ def policy_of(env: str, hidden: tuple[int, ...], activation: str) -> NetworkPoli
     sizes = [flat_size(spec), *hidden, k]
     weights = {"log_std": np.zeros(k)}
     for i, (inputs, units) in enumerate(pairwise(sizes)):
-        weights[f"layers.{i}.weight"] = rng.normal(size=(units, inputs)) / np.sqrt(inputs)
-        weights[f"layers.{i}.bias"] = np.zeros(units)
+        weight = np.zeros((units, 1 + inputs))
+        weight[:, 1:] = rng.normal(size=(units, inputs)) / np.sqrt(inputs)
+        weights[f"layers.{i}.weight"] = weight
     config = Config(hidden=hidden, activation=activation)  # type: ignore[arg-type]
     return NetworkPolicy.load({n: w.astype(np.float32) for n, w in weights.items()}, spec, config)
 

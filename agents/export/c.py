@@ -15,15 +15,15 @@ from ..policies import NetworkPolicy, flat_size
 _LARGEST = float(np.finfo(np.float32).max)
 _PAIRS = re.compile(r"(?<=\*)(?=/)|(?<=/)(?=\*)|(?<=\?)(?=\?)")
 _LAYER = """
-/* out = weight . in + bias */
-static inline void rotorgram_layer(const float *weight, const float *bias, const float *in,
-                                   int inputs, float *out, int outputs)
+/* Each output has a row of weights: the bias, then one for each input. */
+static inline void rotorgram_layer(const float *weight, const float *in, int inputs,
+                                   float *out, int outputs)
 {
     for (int i = 0; i < outputs; i++) {
-        float sum = 0.0f;
+        float sum = *weight++;
         for (int j = 0; j < inputs; j++)
-            sum += weight[i * inputs + j] * in[j];
-        out[i] = sum + bias[i];
+            sum += *weight++ * in[j];
+        out[i] = sum;
     }
 }"""
 _TANH = """
@@ -108,12 +108,11 @@ class _Program:
         self.lines += [f"for (int i = 0; i < {self.size}; i++)", f"    {statement}"]
 
     def _affine(self, layer: Affine) -> None:
-        units, inputs = layer.weight.shape
-        number = len(self.tables) // 2
+        units = len(layer.weight)
+        number = len(self.tables)
         weight = self._table(f"weight_{number}", layer.weight)
-        bias = self._table(f"bias_{number}", layer.bias)
         outputs = f"x{number}"
-        arguments = f"{weight}, {bias}, {self.at}, {inputs}, {outputs}, {units}"
+        arguments = f"{weight}, {self.at}, {self.size}, {outputs}, {units}"
         self.lines += [f"float {outputs}[{units}];", f"rotorgram_layer({arguments});"]
         self.at = outputs
         self.size = units

@@ -40,7 +40,7 @@ def write(policy: NetworkPolicy, facts: Mapping[str, str]) -> bytes:
     actions = policy.actions
     for layer in policy.network.layers:
         if isinstance(layer, Affine):
-            graph.then("Gemm", layer.weight, layer.bias, transB=1)
+            graph.then("Gemm", layer.weight[:, 1:], layer.weight[:, 0], transB=1)
         else:
             graph.then(type(layer).__name__)  # Relu or Tanh
     kind: int = TensorProto.INT64

@@ -27,7 +27,7 @@ def bound(network: Network, values: np.ndarray | float = 0.0) -> Weights:
 
 
 def arrays_of(agent: Any) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Weights of a learner by name, as `critic.layers.0.bias`, and their gradients: views."""
+    """Weights of a learner by name, as `critic.layers.0.weight`, and their gradients: views."""
     arrays: dict[str, np.ndarray] = {}
     gradients: dict[str, np.ndarray] = {}
     parts = {"actor.": agent._actor.weights}
@@ -56,8 +56,8 @@ def policy_of(
     squash: bool = False,
 ) -> NetworkPolicy:
     """The policy of an MLP with as many layers and units as the weights have."""
-    last = sum(name.startswith("layers.") for name in weights) // 2 - 1
-    hidden = tuple(weights[f"layers.{i}.bias"].shape[0] for i in range(last))
+    last = sum(name.startswith("layers.") for name in weights) - 1
+    hidden = tuple(len(weights[f"layers.{i}.weight"]) for i in range(last))
     config = config_of(hidden, activation, squash=squash)
     return NetworkPolicy.load(weights, spec, config)
 

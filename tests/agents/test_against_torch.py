@@ -76,9 +76,9 @@ class Reference:
 
     def network(self, prefix: str, inputs: Tensor) -> Tensor:
         for i in count():
-            inputs = inputs @ self.tensors[f"{prefix}layers.{i}.weight"].T
-            inputs = inputs + self.tensors[f"{prefix}layers.{i}.bias"]
-            if f"{prefix}layers.{i + 1}.bias" not in self.tensors:
+            weight = self.tensors[f"{prefix}layers.{i}.weight"]
+            inputs = weight[:, 0] + inputs @ weight[:, 1:].T
+            if f"{prefix}layers.{i + 1}.weight" not in self.tensors:
                 return inputs
             inputs = torch.tanh(inputs)
         raise AssertionError

@@ -53,7 +53,7 @@ def after(changes: dict[str, tuple[int, float]]) -> APG:
     agent, log = agent_of(config=config, start_band=0.2)
     arrays, _ = arrays_of(agent)
     # Rotors far from alike: body rates of 0 have no derivative of their size.
-    arrays["actor.layers.2.bias"][...] = (0.3, -0.1, 0.2, 0.1)
+    arrays["actor.layers.2.weight"][:, 0] = (0.3, -0.1, 0.2, 0.1)
     for name, (place, change) in changes.items():
         arrays[name].flat[place] += change
     agent.gradient(flown(agent, log, 12))
@@ -61,7 +61,7 @@ def after(changes: dict[str, tuple[int, float]]) -> APG:
 
 
 @pytest.mark.parametrize(
-    ("name", "place"), [("layers.2.bias", 0), ("layers.2.weight", 7), ("layers.0.weight", 9)]
+    ("name", "place"), [("layers.2.weight", 0), ("layers.2.weight", 7), ("layers.0.weight", 9)]
 )
 def test_the_gradient_is_the_derivative_of_the_mean_reward(name: str, place: int) -> None:
     """Against a difference: of 12 steps of 8 drones, through the policy's later actions too."""
@@ -84,7 +84,7 @@ def climbing(steps: int, **options: Any) -> tuple[APG, Rollout]:
     arrays, _ = arrays_of(agent)
     for array in arrays.values():
         array[...] = 0.0
-    arrays["actor.layers.1.bias"][...] = 0.1
+    arrays["actor.layers.1.weight"][:, 0] = 0.1
     arrays["actor.log_std"][...] = LEAST
     return agent, flown(agent, log, steps)
 

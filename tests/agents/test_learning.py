@@ -140,9 +140,8 @@ def weights_of_sb3(theirs: Any) -> dict[str, np.ndarray]:
     weights = {f"actor.{name}": array for name, array in theirs.actor().items()}
     tensors = theirs.model.policy.state_dict()
     for number, name in enumerate(("mlp_extractor.value_net.0", "value_net")):
-        for kind in ("weight", "bias"):
-            tensor = tensors[f"{name}.{kind}"]
-            weights[f"critic.layers.{number}.{kind}"] = tensor.numpy()
+        columns = tensors[f"{name}.bias"], tensors[f"{name}.weight"]
+        weights[f"critic.layers.{number}.weight"] = np.column_stack(columns)
     return weights
 
 

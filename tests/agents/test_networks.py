@@ -41,9 +41,10 @@ def tensors(weights: Weights) -> dict[str, torch.Tensor]:
 
 
 def torch_mlp(arrays: dict[str, torch.Tensor], inputs: torch.Tensor, activation: str) -> Any:
-    count = sum(name.startswith("layers.") for name in arrays) // 2
+    count = sum(name.startswith("layers.") for name in arrays)
     for i in range(count):
-        inputs = inputs @ arrays[f"layers.{i}.weight"].T + arrays[f"layers.{i}.bias"]
+        weight = arrays[f"layers.{i}.weight"]
+        inputs = weight[:, 0] + inputs @ weight[:, 1:].T
         if i < count - 1:
             inputs = torch.relu(inputs) if activation == "relu" else torch.tanh(inputs)
     return inputs
@@ -147,12 +148,13 @@ def test_an_actor_begins_near_zero_and_a_net_with_gains() -> None:
     ours = actor(discrete=False)
     ours.initialise(np.random.default_rng(0), -0.5)
     arrays = ours.weights.arrays
-    columns = np.linalg.norm(arrays["layers.0.weight"], axis=0)
+    first = arrays["layers.0.weight"]
+    columns = np.linalg.norm(first[:, 1:], axis=0)
     rows = np.linalg.norm(arrays["layers.1.weight"], axis=1)
     np.testing.assert_allclose(columns, 2**0.5, rtol=1e-5)
     np.testing.assert_allclose(rows, 0.01, rtol=1e-5)
     assert arrays["log_std"].tolist() == [-0.5] * 3
-    assert not arrays["layers.0.bias"].any()
+    assert not first[:, 0].any()
 
 
 class Squashed(Network):
@@ -169,5 +171,5 @@ def test_activations_may_come_first_and_last() -> None:
     inputs = np.array([[0.5], [-2.0]], np.float32)
     network.forward(inputs)
     assert inputs.tolist() == [[0.5], [-2.0]]
-    columns = np.linalg.norm(weights.arrays["layers.0.weight"], axis=0)
+    columns = np.linalg.norm(weights.arrays["layers.0.weight"][:, 1:], axis=0)
     np.testing.assert_allclose(columns, 0.01, rtol=1e-5)

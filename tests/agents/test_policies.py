@@ -20,7 +20,7 @@ CHOICE = spec_of(Discrete(n=3))
 def constant(spec: Any, *outputs: float) -> NetworkPolicy:
     """A policy that gives the same for every observation of three numbers."""
     policy = random_policy(spec, size=0.0)
-    policy.weights.arrays["layers.1.bias"][:] = outputs
+    policy.weights.arrays["layers.1.weight"][:, 0] = outputs
     return policy
 
 
@@ -44,8 +44,8 @@ def test_outputs_are_squashed() -> None:
     """Two layers of ones: 16 · sum of the observation, here 16 · 1.3."""
     shapes = random_policy(BOX).network.shapes
     layers = {name: np.ones(shape, np.float32) for name, shape in shapes.items()}
-    layers["layers.0.bias"][:] = 0.0
-    layers["layers.1.bias"][:] = 0.0, -20.3
+    layers["layers.0.weight"][:, 0] = 0.0
+    layers["layers.1.weight"][:, 0] = 0.0, -20.3
     seen = np.array([[1, 0.3, 0]], np.float32)
     noise = np.zeros(2, np.float32)
     policy = policy_of(layers | {"log_std": noise}, BOX)

@@ -93,7 +93,7 @@ def test_returns_of_a_drone_that_is_out_stop_at_its_end() -> None:
     log = log_of()
     agent: Any = make_agent("ippo", log, preset("ippo", "tuned", gamma=1.0, gae_lambda=1.0), 0)
     agent.weights.values[:] = 0.0
-    arrays_of(agent)[0]["critic.layers.1.bias"][:] = 5.0  # V(s) = 5
+    arrays_of(agent)[0]["critic.layers.1.weight"][:, 0] = 5.0  # V(s) = 5
     rollout = flown(log, 60)
     estimates = agent.advantages(rollout)[0]
     length = log.episodes[0].length

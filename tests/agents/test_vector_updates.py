@@ -195,7 +195,7 @@ def test_a_lost_simulator_teaches_nothing(script: Script) -> None:
     agent: Any = A2C(log, A2CConfig(gamma=0.98, gae_lambda=0.98), 0)
     arrays, _ = arrays_of(agent)
     arrays["critic.layers.1.weight"][:] = 0
-    arrays["critic.layers.1.bias"][:] = 50
+    arrays["critic.layers.1.weight"][:, 0] = 50
     rollout = collector.steps(10 * len(script))
     left = rollout.rows(agent.advantages(rollout)[0])
     np.testing.assert_allclose(left, 0, atol=1e-4)
