@@ -7,6 +7,7 @@ keeps no simulator's state: it resets to the same seed and repeats the same acti
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Annotated, Any
 
 import numpy as np
@@ -19,6 +20,8 @@ from ..models.fields import Limits, immutable
 from .networks import Floats
 from .policies import ActionMap, flat
 
+_BLOCK = 256  # Episodes
+
 Mask = NDArray[np.bool_]
 Counts = NDArray[np.int64]
 
@@ -29,8 +32,15 @@ class ResumeError(InputError):
 
 def episode_seed(run_seed: int, episode: int) -> int:
     """Seed of an episode, 64 bits: independent across runs and episodes."""
-    sequence = np.random.SeedSequence(run_seed, spawn_key=(2, episode))
-    return int(sequence.generate_state(1, np.uint64)[0])
+    block, place = divmod(episode, _BLOCK)
+    return int(_seeds(run_seed, block)[place])
+
+
+@lru_cache
+def _seeds(run_seed: int, block: int) -> NDArray[np.uint64]:
+    """Seeds of `_BLOCK` episodes: to begin a sequence takes as long as all of them."""
+    sequence = np.random.SeedSequence(run_seed, spawn_key=(2, block))
+    return sequence.generate_state(_BLOCK, np.uint64)
 
 
 @dataclass(frozen=True)

@@ -2,9 +2,9 @@
 
 Small networks are faster here than in torch, and torch is not imported. Arrays are feature-major:
 shape (..., n, B) for a batch of B. A leading axis counts networks of the same layers that compute
-together, as an actor and its critic. Between layers a first row of ones stands before the others, so
-that the first column of the weights is the bias. Layers keep their arrays from batch to batch: what
-they return holds until their next call.
+together, as an actor and its critic. Between layers a row of ones comes first, so that the first
+column of the weights is the bias. Layers keep their arrays from batch to batch: what they return
+holds until their next call.
 """
 
 import math

@@ -117,10 +117,10 @@ class Random(Kept):
 
     def seed(self, ids: Ids, seeds: Sequence[int | None]) -> None:
         """Seed the worlds `ids`; where the seed is None their numbers go on."""
-        for world, seed in zip(ids, seeds, strict=True):
-            if seed is not None:
-                self.keys[world] = _keys(np.array(int(seed) % 2**64, np.uint64))
-                self.episode[world] = 0
+        given = [world for world, seed in zip(ids, seeds, strict=True) if seed is not None]
+        numbers = [int(seed) % 2**64 for seed in seeds if seed is not None]
+        self.keys[given] = _keys(np.array(numbers, np.uint64))
+        self.episode[given] = 0
         for noise in self._noises.values():
             noise.forget(ids)
 
@@ -153,8 +153,7 @@ class Random(Kept):
 
 
 def _keys(seeds: NDArray[np.uint64]) -> Words:
-    words = (seeds & np.uint64(0xFFFFFFFF), seeds >> np.uint64(32))
-    return np.stack(words, axis=-1).astype(np.uint32)
+    return seeds.astype("<u8").view("<u4").reshape(-1, 2)
 
 
 class Draw:
