@@ -9,17 +9,17 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
-from ..flights.executors import OnProgress
-
 if TYPE_CHECKING:  # importing rich takes time, also where no bar is shown
     from rich.console import Console
     from rich.progress import TaskID
+
+    from ..flights.executors import OnProgress
 
 _LINE_EVERY = 10.0  # s
 
 
 @contextmanager
-def bars() -> Iterator[OnProgress]:
+def bars() -> Iterator["OnProgress"]:
     """A function that shows how far the named run is: (name, done, total, words)."""
     if not sys.stdout.isatty():
         yield Lines()

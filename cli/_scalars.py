@@ -5,12 +5,10 @@ import time
 from pathlib import Path
 from struct import pack
 
-from tensorboard.compat.proto.event_pb2 import Event, SessionLog
-from tensorboard.compat.proto.summary_pb2 import Summary
-
 _POINTS = 200  # of each curve: the width of a chart, and less than 1 MB for all
 _LEAST = 100  # env steps between two points: in short runs more would cost time
 _PREFIX = "events.out.tfevents."
+_START = b"\x3a\x02\x08\x01"  # a SessionLog with the status START
 
 
 def _table() -> list[int]:
@@ -45,10 +43,10 @@ class ScalarWriter:
         number = len(list(folder.glob(f"{_PREFIX}*")))
         name = f"{_PREFIX}{number:010}.rotorgram"
         self._file = open(folder / name, "xb")  # noqa: SIM115  until `close`
-        self._add(Event(file_version="brain.Event:2"), 0)
+        self._add(0, _field(3, b"brain.Event:2"))
         # TensorBoard drops what it has read from this step on. One of its two readers skips the
         # first such mark of a folder: so a fresh training has one too.
-        self._add(Event(session_log=SessionLog(status=SessionLog.START)), behind + 1)
+        self._add(behind + 1, _START)
 
     def due(self, env_steps: int, *, last: bool = False) -> bool:
         """Asked at every update: whether to write at it; at the last, if it is not written yet."""
@@ -59,8 +57,11 @@ class ScalarWriter:
 
     def write(self, env_steps: int, numbers: dict[str, float]) -> None:
         """Write finite numbers as one event: a sixth of what so many `add_scalar` take."""
-        values = [Summary.Value(tag=tag, simple_value=value) for tag, value in numbers.items()]
-        self._add(Event(summary=Summary(value=values)), env_steps)
+        values = [
+            _field(1, _field(1, tag.encode()) + b"\x15" + pack("<f", value))
+            for tag, value in numbers.items()
+        ]
+        self._add(env_steps, _field(5, b"".join(values)))
         self._written = env_steps
 
     def flush(self) -> None:
@@ -71,12 +72,25 @@ class ScalarWriter:
         """Have it in the file, and close it."""
         self._file.close()
 
-    def _add(self, event: Event, step: int) -> None:
-        event.step = step
-        event.wall_time = time.time()
-        data = event.SerializeToString()
+    def _add(self, step: int, content: bytes) -> None:
+        """Append an Event of TensorFlow's `event.proto`: time, step, and a field with the rest."""
+        data = b"\x09" + pack("<d", time.time()) + b"\x10" + _varint(step) + content
         size = pack("<Q", len(data))
         self._file.write(size + _checksum(size) + data + _checksum(data))
+
+
+def _field(number: int, content: bytes) -> bytes:
+    """A field of a Protocol Buffers message: bytes, a text or a message."""
+    return bytes((8 * number + 2,)) + _varint(len(content)) + content
+
+
+def _varint(number: int) -> bytes:
+    """Seven bits in each byte, the lowest first; the highest bit says that another follows."""
+    parts = bytearray()
+    while number > 127:
+        parts.append(number & 127 | 128)
+        number >>= 7
+    return bytes((*parts, number))
 
 
 def _checksum(data: bytes) -> bytes:

@@ -147,6 +147,7 @@ def _train(command: "Train", training: Training, folder: Path) -> int:
                 keeper.keep(now=True, last=True)
     except BaseException:  # a full disk and SIGTERM too
         with suppress(OSError):
+            keeper.write_episodes()
             keeper.close()
         if (folder / CHECKPOINT).exists():
             print(go_on)
@@ -195,17 +196,17 @@ class _Keeper:
             self._scalars.write(at, self._training.scalars())
         if now or time.monotonic() >= self._due:
             # First the rest: a checkpoint takes the curves that end before it.
-            self._write_episodes()
+            self.write_episodes()
             self._scalars.flush()
             store(self._training.checkpoint(), self._folder / CHECKPOINT)
             self._due = time.monotonic() + self._every
 
     def close(self) -> None:
-        """Write logs; they may end between two updates."""
-        self._write_episodes()
+        """Write the rest of the curves."""
         self._scalars.close()
 
-    def _write_episodes(self) -> None:
+    def write_episodes(self) -> None:
+        """Write all episodes that have ended; the last may end between two updates."""
         text = io.StringIO()  # pandas would take longer to import than a short training takes
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow([field.name for field in fields(Episode)])

@@ -38,7 +38,6 @@ class Train(AgentFlags, TrainingFlags):
 
     def run(self) -> int:
         """Train by these settings, or by those of the folder to resume."""
-        require("tensorboard", "train", "training")
         if self.algorithm.startswith("sb3-"):
             require("torch", "train", self.algorithm)
         from . import _trainer

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,11 +16,13 @@ from ..envs.autoreset import AdvancingVectorEnv
 from ..envs.config import BackendConfig, EnvConfig
 from ..envs.registry import is_known
 from ..envs.spec import EnvSpec
-from ..flights.executors import Tell
 from ..models import BACKENDS, Backend
 from ..models.errors import InputError
 from ..models.fields import immutable
 from .settings import Run
+
+if TYPE_CHECKING:
+    from ..flights.executors import Tell
 
 _TELL_EVERY = 0.2  # s
 
@@ -113,7 +116,7 @@ class Training:
         return None
 
     def train(
-        self, on_update: Callable[[], bool] = lambda: True, tell: Tell = lambda *_: None
+        self, on_update: Callable[[], bool] = lambda: True, tell: "Tell" = lambda *_: None
     ) -> bool:
         """Train to the end, or until `on_update` returns False. Whether the end was reached.
 
