@@ -21,13 +21,13 @@ Code = Callable[..., None]
 """Takes the number of blocks, the address of each memory, and those of arrays outside."""
 
 _KINDS = {
-    "float32": "float",
-    "float64": "double",
-    "bool": "i1",
-    "int32": "i32",
-    "uint32": "i32",
-    "int64": "i64",
-    "uint64": "i64",
+    np.dtype(np.float32): "float",
+    np.dtype(np.float64): "double",
+    np.dtype(bool): "i1",
+    np.dtype(np.int32): "i32",
+    np.dtype(np.uint32): "i32",
+    np.dtype(np.int64): "i64",
+    np.dtype(np.uint64): "i64",
 }
 _FLOATS = {
     "add": "fadd",
@@ -256,9 +256,9 @@ class _Printer:
         if operation == "negative":
             if dtype.kind == "f":
                 return self._new(f"fneg {kind} {inputs[0]}")
-            return self._new(f"sub {kind} {self._splat(0, _KINDS[dtype.name])}, {inputs[0]}")
+            return self._new(f"sub {kind} {self._splat(0, _KINDS[dtype])}, {inputs[0]}")
         if operation == "not":
-            return self._new(f"xor {kind} {inputs[0]}, {self._splat(-1, _KINDS[dtype.name])}")
+            return self._new(f"xor {kind} {inputs[0]}, {self._splat(-1, _KINDS[dtype])}")
         names = _FLOATS
         if dtype.kind != "f":
             names = _WHOLES | (_SIGNED if dtype.kind == "i" else _UNSIGNED)
@@ -309,7 +309,7 @@ class _Printer:
         return kind if self._width == 1 else f"<{self._width} x {kind}>"
 
     def _type(self, dtype: DType) -> str:
-        return self._lanes(_KINDS[dtype.name])
+        return self._lanes(_KINDS[dtype])
 
     def _new(self, instruction: str) -> str:
         self._count += 1
@@ -323,7 +323,7 @@ class _Printer:
     def _number(self, value: Value) -> str:
         """A constant: LLVM reads floats as the bits of a double."""
         number = np.frombuffer(value.inputs[0], value.dtype)[0]
-        kind = _KINDS[value.dtype.name]
+        kind = _KINDS[value.dtype]
         if value.dtype.kind != "f":
             return self._splat(int(number), kind)
         bits = int(np.float64(number).view(np.uint64))
@@ -480,7 +480,7 @@ class _Printer:
         """A column of a table, at rows that lie within it."""
         number, column, row = value.inputs
         table = self._tables[number]
-        kind = _KINDS[value.dtype.name]
+        kind = _KINDS[value.dtype]
         start = column * table.itemsize
         base = f"getelementptr (i8, ptr {self._constant(table)}, i64 {start})"
         wholes = self._lanes("i64")
@@ -496,7 +496,7 @@ class _Printer:
         """As NumPy's `astype`; a float beyond the whole numbers gives the nearest of them."""
         first, second = self._type(before), self._type(after)
         if after.kind == "b":
-            zero = self._splat("0.0" if before.kind == "f" else 0, _KINDS[before.name])
+            zero = self._splat("0.0" if before.kind == "f" else 0, _KINDS[before])
             compare = "fcmp une" if before.kind == "f" else "icmp ne"
             return self._new(f"{compare} {first} {value}, {zero}")
         if before.kind == "f" and after.kind != "f":
@@ -519,7 +519,7 @@ class _Printer:
 
 
 def _in_memory(dtype: DType) -> str:
-    return "i8" if dtype.kind == "b" else _KINDS[dtype.name]
+    return "i8" if dtype.kind == "b" else _KINDS[dtype]
 
 
 @lru_cache
