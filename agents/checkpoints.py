@@ -29,7 +29,7 @@ from .networks import ByName, Floats, named, part_of
 from .policies import NetworkPolicy
 from .presets import preset
 
-FORMAT = 4
+FORMAT = 5
 _PLAIN = ("algorithm", "config", "backend", "seed", "env_steps", "versions")
 _POSITION = ("actions", "observations", "numbers", "lengths", "first_steps")
 _DTYPES: dict[Any, type[np.generic]] = {int: np.int64, float: np.float64, bool: np.bool_}
