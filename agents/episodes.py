@@ -37,7 +37,7 @@ def episode_seed(run_seed: int, episode: int) -> int:
 
 
 @lru_cache
-def _seeds(run_seed: int, block: int) -> NDArray[np.uint64]:
+def _seeds(run_seed: int, block: int) -> np.ndarray:
     """Seeds of `_BLOCK` episodes: to begin a sequence takes as long as all of them."""
     sequence = np.random.SeedSequence(run_seed, spawn_key=(2, block))
     return sequence.generate_state(_BLOCK, np.uint64)
