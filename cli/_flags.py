@@ -2,7 +2,7 @@
 
 import json
 import re
-from dataclasses import dataclass, field, fields
+from dataclasses import field, fields
 from pathlib import Path
 from typing import (
     TYPE_CHECKING,
@@ -16,7 +16,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from ..models import Backend
 from ..models.errors import InputError, shortened
-from ..models.fields import PositiveInt
+from ..models.fields import PositiveInt, immutable
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -46,7 +46,7 @@ Options = dict[str, Any]
 
 
 @dataclass_transform(kw_only_default=True, frozen_default=True, field_specifiers=(field,))
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class Command:
     """Base of all commands: the fields are the flags, their docstrings the help.
 
@@ -58,7 +58,7 @@ class Command:
     task's flags begin with `env.`."""
 
     def __init_subclass__(cls) -> None:
-        dataclass(frozen=True, kw_only=True)(cls)
+        immutable(cls)
 
     def run(self) -> int | None:
         """Do it; the exit status, where it is not 0."""

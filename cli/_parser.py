@@ -3,7 +3,7 @@
 import re
 from argparse import ArgumentParser
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from inspect import cleandoc
 from types import UnionType
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, Union, cast, get_args, get_type_hints
@@ -12,7 +12,7 @@ import tyro
 from tyro.conf import arg
 
 from ..models import InputError
-from ..models.fields import check_fields
+from ..models.fields import check_fields, immutable
 from ._flags import (
     DEFAULT_ENV,
     BackendFlags,
@@ -157,7 +157,7 @@ def _for_tyro(kind: type["DataclassInstance"], options: Any = None) -> Any:
         changed["options"] = Annotated[options, arg(name="env", help=_OPTIONS)]
         namespace["options"] = field(default_factory=options)
     made = type(kind.__name__, (kind,), namespace)
-    return made if issubclass(kind, Command) else dataclass(frozen=True, kw_only=True)(made)
+    return made if issubclass(kind, Command) else immutable(made)
 
 
 def _given(words: Sequence[str]) -> frozenset[str]:

@@ -5,8 +5,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from ..models import InputError
-from ..models.files import write_whole
+from ..models.files import check_new_file, write_whole
 from ._flags import Command
 
 
@@ -27,8 +26,7 @@ class Export(Command):
         from ._env import trained
 
         out = self.out or Path(TARGETS[self.to])
-        if out.exists():
-            raise InputError(f"out: expected the name of a new file, got {out}, which is there")
+        check_new_file(out, out.suffix)
         content = export(trained(self.policy), self.to)
         write_whole(out, content)
         print(f"policy: {out} ({len(content):,} bytes)")

@@ -17,7 +17,7 @@ from ..models.errors import InputError, shortened
 from ..models.fields import Choice, Limits, check, check_fields, check_names, immutable, read_table
 from ..models.files import read_toml
 from ..models.library import is_of_the_library, vehicle_words
-from ..scenes import scenes_of
+from ..scenes import seeds_of
 from ..sim import EffectOptions, Randomization
 from ..sim.effects import NO_EFFECTS
 from . import registry
@@ -46,9 +46,8 @@ class SceneConfig:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "seeds", tuple(self.seeds))
-        texts = scenes_of(str(self))
-        seeds = [f"{self.name}:{seed}" for seed in self.seeds]
-        if seeds and list(texts) != seeds:
+        _, seeds = seeds_of(str(self))
+        if tuple(seeds) != self.seeds:
             raise InputError(f"scene: expected consecutive seeds, got {shortened(self.seeds)}")
 
     def __str__(self) -> str:
@@ -66,9 +65,8 @@ class SceneConfig:
             return scene
         if isinstance(scene, Mapping):
             return read_table(cls, scene, "scene")
-        parts = [text.partition(":") for text in scenes_of(scene)]
-        seeds = tuple(int(seed) for _, _, seed in parts if seed)
-        return cls(name=parts[0][0], seeds=seeds)
+        name, seeds = seeds_of(scene)
+        return cls(name=name, seeds=tuple(seeds))
 
 
 @immutable

@@ -29,37 +29,37 @@ MAX_SEEDS = 64
 """Seeds of a scene among which episodes choose."""
 
 
-def parse_scene(text: str) -> tuple[str, int]:
-    """Name and seed of a scene: NAME, or NAME:SEED of one with a seed. Raises `InputError`."""
-    found = re.fullmatch(r"(\w+)(:[0-9]{1,9})?", text) if isinstance(text, str) else None
-    name, seed = found.groups() if found else ("", None)
-    if name not in SCENES or (seed and name not in SEEDED_SCENES):
+def seeds_of(text: str) -> tuple[str, range]:
+    """Name of a scene, and the seeds of which each episode has one; none: it has no seed.
+
+    Of NAME, NAME:SEED or NAME:FIRST-LAST. Raises `InputError`.
+    """
+    pattern = r"(\w+)(?::([0-9]{1,9})(?:-([0-9]{1,9}))?)?"
+    found = re.fullmatch(pattern, text) if isinstance(text, str) else None
+    name, first, last = found.groups() if found else ("", None, None)
+    seeds = range(int(first), int(last or first) + 1) if first else range(0)
+    several = name in SEEDED_SCENES and 1 <= len(seeds) <= MAX_SEEDS
+    if name not in SCENES or (first and not several):
         names = " or ".join(map(repr, SCENES))
         raise InputError(
-            f"scene: expected {names}, the last three with a seed or not, as 'forest:3', "
-            f"got {shortened(text)}"
+            f"scene: expected {names}, the last three with up to {MAX_SEEDS} seeds or none, as "
+            f"'forest:3' or 'forest:0-7', got {shortened(text)}"
         )
-    return name, int(seed[1:]) if seed else 0
+    return name, seeds
 
 
 def scenes_of(text: str) -> tuple[str, ...]:
-    """The scenes of which each episode has one: those of NAME:FIRST-LAST, or the one of the text.
+    """The scenes of which each episode has one. Raises `InputError`."""
+    name, seeds = seeds_of(text)
+    return tuple(f"{name}:{seed}" for seed in seeds) or (name,)
 
-    Raises `InputError`.
-    """
-    if not isinstance(text, str) or "-" not in text:
-        parse_scene(text)
-        return (text,)
-    found = re.fullmatch(r"(\w+):([0-9]{1,9})-([0-9]{1,9})", text)
-    name, first, last = found.groups() if found else ("", 0, 0)
-    seeds = range(int(first), int(last) + 1)
-    if name not in SEEDED_SCENES or not 1 <= len(seeds) <= MAX_SEEDS:
-        names = ", ".join(map(repr, SEEDED_SCENES))
-        raise InputError(
-            f"scene: expected one of {names} with up to {MAX_SEEDS} seeds, as 'forest:0-7', "
-            f"got {shortened(text)}"
-        )
-    return tuple(f"{name}:{seed}" for seed in seeds)
+
+def parse_scene(text: str) -> tuple[str, int]:
+    """Name and seed of a single scene: NAME, or NAME:SEED. Raises `InputError`."""
+    name, seeds = seeds_of(text)
+    if len(seeds) > 1:
+        raise InputError(f"scene: expected one, got {text}")
+    return name, max(seeds, default=0)
 
 
 __getattr__ = import_when_used(__name__)
