@@ -21,6 +21,7 @@ from ..models.errors import InputError
 from .config import Config
 
 Floats = NDArray[np.float32]
+Parts = dict[str, Floats]
 ByName = dict[str, np.ndarray]
 Shapes = Mapping[str, tuple[int, ...]]
 Item = TypeVar("Item")
@@ -36,7 +37,7 @@ def part_of(items: Mapping[str, Item], prefix: str) -> dict[str, Item]:
     return {k.removeprefix(prefix): item for k, item in items.items() if k.startswith(prefix)}
 
 
-def views(flat: Floats, shapes: Shapes) -> dict[str, Floats]:
+def views(flat: Floats, shapes: Shapes) -> Parts:
     """Arrays by name, one after the other, in a flat array."""
     ends = np.cumsum([math.prod(shape) for shape in shapes.values()])[:-1]
     parts = np.split(flat, ends)
@@ -55,8 +56,8 @@ class Weights:
     """Shape (P,)."""
     slopes: Floats
     """Derivatives of the loss by `values`, shape (P,)."""
-    arrays: dict[str, Floats]
-    gradients: dict[str, Floats]
+    arrays: Parts
+    gradients: Parts
 
     @classmethod
     def zeros(cls, shapes: Shapes) -> "Weights":
@@ -73,7 +74,7 @@ class Weights:
     def of_one(self, number: int, shapes: Shapes) -> "Weights":
         """The arrays of one of the networks that compute together; it may be smaller."""
 
-        def own(arrays: dict[str, Floats]) -> dict[str, Floats]:
+        def own(arrays: Parts) -> Parts:
             return {k: arrays[k][number][tuple(map(slice, shape))] for k, shape in shapes.items()}
 
         return replace(self, arrays=own(self.arrays), gradients=own(self.gradients))

@@ -18,16 +18,17 @@ from .spec import EnvSpec
 LOST = "simulator_lost"
 """Key in the `info` of a step that a lost simulator truncated: why it was lost."""
 
+Array = np.ndarray
 Observation = Any
 """An array, or a dict of arrays."""
-Step = tuple[Observation, np.ndarray, np.ndarray, np.ndarray, Info]
-Content = tuple[Mapping[str, np.ndarray], Mapping[str, np.ndarray]]
+Step = tuple[Observation, Array, Array, Array, Info]
+Content = tuple[Mapping[str, Array], Mapping[str, Array]]
 """Telemetry and terms of the reward by name, float64, shape (N, n) and (N,)."""
 Told = Callable[[], Content]
-Seeds = Sequence[int | None] | np.ndarray
+Seeds = Sequence[int | None] | Array
 
 
-class AdvancingVectorEnv(VectorEnv[Observation, ArrayLike, np.ndarray]):
+class AdvancingVectorEnv(VectorEnv[Observation, ArrayLike, Array]):
     """A vector env that is stepped by `advance`, the step of the wire.
 
     `advance` sets the arrays below to new ones; those of earlier steps do not change.
@@ -48,16 +49,16 @@ class AdvancingVectorEnv(VectorEnv[Observation, ArrayLike, np.ndarray]):
     env_spec: EnvSpec
     control_period: float
     observations: Observation
-    rewards: np.ndarray
-    terminated: np.ndarray
-    truncated: np.ndarray
-    done: np.ndarray
-    out: np.ndarray
-    lost: np.ndarray
-    telemetry: Mapping[str, np.ndarray]
+    rewards: Array
+    terminated: Array
+    truncated: Array
+    done: Array
+    out: Array
+    lost: Array
+    telemetry: Mapping[str, Array]
 
     @property
-    def headline(self) -> np.ndarray:
+    def headline(self) -> Array:
         """The metric that decides, float64, shape (N,); NaN where the env tells none."""
         unknown = np.full((self.num_envs, 1), np.nan)
         return self.telemetry.get("metrics", unknown)[:, 0]
@@ -77,10 +78,10 @@ class AdvancingVectorEnv(VectorEnv[Observation, ArrayLike, np.ndarray]):
     @abstractmethod
     def advance(
         self,
-        actions: np.ndarray,
-        resets: np.ndarray | None = None,
+        actions: Array,
+        resets: Array | None = None,
         seeds: Seeds | None = None,
-        frozen: np.ndarray | None = None,
+        frozen: Array | None = None,
     ) -> None:
         """Reset some drones, freeze some, and fly the others for one control period.
 
@@ -121,7 +122,7 @@ class AdvancingVectorEnv(VectorEnv[Observation, ArrayLike, np.ndarray]):
         fps = max(1, round(1 / spec.control_period))
         self.metadata = {"render_modes": [], "render_fps": fps, "autoreset_mode": mode}
 
-    def _shaped(self, actions: ArrayLike) -> np.ndarray:
+    def _shaped(self, actions: ArrayLike) -> Array:
         array = np.asarray(actions)
         expected = self.action_space.shape
         if array.shape != expected:
@@ -129,12 +130,12 @@ class AdvancingVectorEnv(VectorEnv[Observation, ArrayLike, np.ndarray]):
             raise InputError(f"actions: expected an array of shape {expected}, {got}")
         return array
 
-    def _no_actions(self) -> np.ndarray:
+    def _no_actions(self) -> Array:
         return np.zeros(self.action_space.shape or (), np.float32)
 
     def _begin_next(
-        self, rewards: np.ndarray, terminated: np.ndarray, truncated: np.ndarray, last: Info
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Info]:
+        self, rewards: Array, terminated: Array, truncated: Array, last: Info
+    ) -> tuple[Array, Array, Array, Info]:
         """SAME_STEP: reset those whose episode ended; the info gets that of their last step.
 
         A simulator that is lost meanwhile truncates the episodes of its frozen drones: they begin
@@ -156,7 +157,7 @@ class AdvancingVectorEnv(VectorEnv[Observation, ArrayLike, np.ndarray]):
         """What the info of this step says of simulators that were lost, in any round trip."""
         return {}
 
-    def _info(self, mask: np.ndarray) -> Info:
+    def _info(self, mask: Array) -> Info:
         """The telemetry of the drones by its components, each name with its mask."""
         told = self._told()
         spec = self.env_spec
@@ -194,11 +195,11 @@ def checked_mode(mode: AutoresetMode | str) -> AutoresetMode:
         raise InputError(f"autoreset_mode: expected {expected}, got {mode!r}") from None
 
 
-def checked_mask(mask: Any, num_envs: int) -> np.ndarray:
+def checked_mask(mask: Any, num_envs: int) -> Array:
     """The `reset_mask` of a reset's options, bool, shape (N,); None is all. Raises `InputError`."""
     if mask is None:
         return np.ones(num_envs, bool)
-    right = isinstance(mask, np.ndarray) and (mask.dtype, mask.shape) == (bool, (num_envs,))
+    right = isinstance(mask, Array) and (mask.dtype, mask.shape) == (bool, (num_envs,))
     if not (right and mask.any()):
         raise InputError(
             f"reset_mask: expected an array of {num_envs} bool, one of them True, got {mask!r}"
@@ -213,12 +214,12 @@ def checked_seeds(seed: Any, num_envs: int, most: int | None = None) -> Seeds | 
     """
     if seed is None:
         return None
-    if isinstance(seed, np.ndarray) and (seed.dtype, seed.shape) == (np.uint64, (num_envs,)):
+    if isinstance(seed, Array) and (seed.dtype, seed.shape) == (np.uint64, (num_envs,)):
         return seed
     numbers: Seeds = seed
     if isinstance(seed, int | np.integer):
         numbers = range(int(seed), int(seed) + num_envs)
-    several = isinstance(numbers, Sequence | np.ndarray) and getattr(numbers, "ndim", 1) == 1
+    several = isinstance(numbers, Sequence | Array) and getattr(numbers, "ndim", 1) == 1
     right = several and len(numbers) == num_envs
     if not (right and all(_is_seed(number, most) for number in numbers)):
         up_to = "from 0 on" if most is None else f"from 0 to 2^{most.bit_length()} - 1"

@@ -68,6 +68,7 @@ _TOO_FEW = f"fewer than {MIN_SEEDS} seeds with a value decide nothing"
 _Claim = tuple[str, str, str]
 """A claim, its place in the paper, and the definition of its measure."""
 Outcome = Literal["borne out", "not borne out", "undecided", "not tested"]
+_Judged = tuple[Outcome, str]
 
 
 @dataclass(frozen=True)
@@ -183,7 +184,7 @@ def _holding_claim(headline: Headline) -> _Claim:
     )
 
 
-def _verdict(claim: _Claim, preset: str, judged: tuple[Outcome, str]) -> Verdict:
+def _verdict(claim: _Claim, preset: str, judged: _Judged) -> Verdict:
     words, source, definition = claim
     outcome, evidence = judged
     return Verdict(words, source, preset, outcome, definition, evidence)
@@ -194,7 +195,7 @@ def _compare(
     measure: Callable[[pd.DataFrame], float],
     larger: bool,
     words: tuple[str, str] = ("", ""),
-) -> tuple[Outcome, str]:
+) -> _Judged:
     """Judge a claim that A2C's measure of a run is larger (or smaller) than VPG's; the numbers.
 
     The words are the unit, after a space, and why a run that is long enough has no number.
@@ -229,7 +230,7 @@ def _measured(name: str, numbers: Floats, runs: list[pd.DataFrame], words: tuple
     return f"{name} {_number(iqm(numbers))}{unit if known.any() else ''} ({text})"
 
 
-def _both_hold(runs: pd.DataFrame, headline: Headline) -> tuple[Outcome, str]:
+def _both_hold(runs: pd.DataFrame, headline: Headline) -> _Judged:
     outcomes: list[Outcome] = []
     texts = []
     for name in ("a2c", "vpg"):
@@ -241,7 +242,7 @@ def _both_hold(runs: pd.DataFrame, headline: Headline) -> tuple[Outcome, str]:
     return min(outcomes, key=order.index), "; ".join(texts) + "."
 
 
-def _holds(runs: pd.DataFrame, headline: Headline) -> tuple[Outcome, str]:
+def _holds(runs: pd.DataFrame, headline: Headline) -> _Judged:
     """Whether one agent holds its goal in its final evaluations, and the numbers."""
     if runs.empty:
         return "not tested", "not trained"
@@ -279,7 +280,7 @@ def judge_no_worse(runs: pd.DataFrame, preset: str, headline: Headline) -> Verdi
     return _verdict(claim, preset, _no_worse(runs, margin, headline))
 
 
-def _no_worse(runs: pd.DataFrame, margin: float, headline: Headline) -> tuple[Outcome, str]:
+def _no_worse(runs: pd.DataFrame, margin: float, headline: Headline) -> _Judged:
     names = ("a2c", "sb3-a2c")
     ours = runs[runs["row"] == "a2c"]
     theirs = runs[runs["row"] == "sb3-a2c"]

@@ -16,6 +16,7 @@ from .results import Results
 from .settings import Row
 from .statistics import bootstrap_interval, iqm, share_interval
 
+Line = Mapping[str, float]
 NOTHING = "–"
 """Shown where there is no value."""
 _MEASURES = ("steady", "settling_time", "overshoot", "return")
@@ -74,7 +75,7 @@ def _measures(own: pd.DataFrame, headline: Headline) -> dict[str, float]:
     return line
 
 
-def _share_interval(line: Mapping[str, float], headline: Headline) -> dict[str, float]:
+def _share_interval(line: Line, headline: Headline) -> dict[str, float]:
     """Wilson's interval for a steady state that is a share of all flights, or is 0 or 1 in all
     seeds: resampling shows no spread there.
     """
@@ -140,7 +141,7 @@ def headings(headline: Headline) -> list[str]:
     ]
 
 
-def _line(row: Row, line: Mapping[str, float], headline: Headline) -> list[str]:
+def _line(row: Row, line: Line, headline: Headline) -> list[str]:
     seeds = int(line["seeds"])
     names = [seeds_text(seeds)]
     if not row.controller:
@@ -187,7 +188,7 @@ def row_label(row: Row) -> str:
     return row.name
 
 
-def _held(line: Mapping[str, float], seeds: int) -> str:
+def _held(line: Line, seeds: int) -> str:
     if math.isnan(line["held"]):
         return NOTHING
     held = int(line["held"])
@@ -195,7 +196,7 @@ def _held(line: Mapping[str, float], seeds: int) -> str:
     return _cell(f"{held} of {seeds}", f"{low:.0%} to {high:.0%}".replace("%", " %"))
 
 
-def _crashes(line: Mapping[str, float]) -> str:
+def _crashes(line: Line) -> str:
     low = 100 * line["crash_rate_low"]
     high = 100 * line["crash_rate_high"]
     rate = number_text(100 * line["crash_rate"])
@@ -203,7 +204,7 @@ def _crashes(line: Mapping[str, float]) -> str:
     return _cell(f"{rate} %", interval, f"{int(line['crashed'])} of {int(line['episodes'])}")
 
 
-def _measured(line: Mapping[str, float], name: str, *details: str) -> str:
+def _measured(line: Line, name: str, *details: str) -> str:
     low = line[f"{name}_low"]
     high = line[f"{name}_high"]
     interval = () if math.isnan(low) else (f"{number_text(low)} to {number_text(high)}",)
