@@ -2,7 +2,6 @@
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from typing import Any, ClassVar
@@ -12,7 +11,7 @@ import numpy as np
 from .. import models
 from ..models import BACKENDS, MAX_DRONES, Backend
 from ..models.errors import InputError, NotCopied
-from ..models.fields import Choice, Flag, Limits, OrNone, Rule, check
+from ..models.fields import Choice, Flag, Limits, OrNone, Rule, check, immutable
 from .compile.llvm import trouble
 from .effects import NO_EFFECTS, EffectOptions, Effects
 from .random import RANDOMIZATION, START, Draw, Random
@@ -40,7 +39,7 @@ class PhysicsError(RuntimeError):
     """The physics reported a bad state; the numbers after it are meaningless."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@immutable
 class Call:
     """A call of the physics within a step."""
 
