@@ -12,8 +12,7 @@ class Memory:
 
     `Task.begin` makes the names, and `Task.update_memory` changes their values; elsewhere they are
     read alone. A number stands for all drones. Numbers become float64, truth values stay. The loop
-    keeps the values of drones that do not fly. Of a single drone, (W, A) is () and numbers are
-    Python's.
+    keeps the values of drones that do not fly.
     """
 
     __slots__ = ("__dict__", "_phase")
@@ -43,8 +42,6 @@ class Memory:
 
     def expand(self, shape: tuple[int, ...]) -> None:
         """Make arrays of shape (W, A) of numbers that stand for all drones."""
-        if not shape:
-            return
         arrays = vars(self)
         for name, value in arrays.items():
             if not np.ndim(value):

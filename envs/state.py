@@ -34,9 +34,7 @@ def kept_state(state: WorldState, **others: Any) -> State:
 
 
 def read_only(values: Array) -> Array:
-    """A copy that cannot be written; a number or a truth value of a single drone as such."""
-    if not values.ndim:
-        return values[()]
+    """A copy that cannot be written."""
     copied = values.copy()
     copied.setflags(write=False)
     return copied

@@ -29,7 +29,7 @@ class Quantity:
     components: Names
     unit: str | Names
     read: Callable[["Loop"], Array]
-    """Gives an array of shape (W, A, n), or one that broadcasts to it; (n,) of a single drone."""
+    """Gives an array of shape (W, A, n), or one that broadcasts to it."""
     frame: str = ""
     low: Bound = -np.inf
     high: Bound = np.inf

@@ -25,7 +25,7 @@ Numbers = NDArray[np.float64]
 Ids = Any
 """Numbers of worlds, or `...` for all."""
 Mask = Any
-"""Of drones, bool, shape (W, A), the same for those of a world; of a single drone (). None: all."""
+"""Of drones, bool, shape (W, A), the same for those of a world. None: all."""
 
 # Numbers of uses, and the name of the noise of gusts.
 START = crc32(b"start")
@@ -99,7 +99,7 @@ class Random(Kept):
     """The counters of W worlds. Until a world is seeded its seed is unpredictable.
 
     Attributes:
-        shape: (W, A), or () for a single drone.
+        shape: (W, A).
         keys: Of each world the low and the high word of its seed, shape (W, 2).
         episode: Number of the world's episode since it was seeded, shape (W,).
     """
@@ -108,7 +108,7 @@ class Random(Kept):
 
     def __init__(self, shape: tuple[int, ...]) -> None:
         self.shape = shape
-        worlds, drones = shape or (1, 1)
+        worlds, drones = shape
         self.drones = drones
         seeds = np.array([randbits(64) for _ in range(worlds)], np.uint64)
         self.keys = _keys(seeds)
@@ -133,9 +133,7 @@ class Random(Kept):
 
     def worlds(self, mask: Mask) -> Any:
         """The worlds of a mask, bool, shape (W,)."""
-        if mask is None or not self.shape:
-            return np.full(len(self.episode), mask is None or bool(mask))
-        return mask[:, 0]
+        return np.ones(len(self.episode), bool) if mask is None else mask[:, 0]
 
     def ids(self, mask: Mask) -> Ids:
         """The numbers of the worlds of a mask; traced code has one world."""
@@ -202,7 +200,7 @@ class Draw:
         random = self._random
         numbers = np.zeros_like(drawn, shape=(len(random.keys), random.drones, *size))
         numbers[self._ids] = drawn.reshape(-1, random.drones, *size)
-        return numbers.reshape((*random.shape, *size))[()]
+        return numbers
 
 
 class Noise(Kept):
@@ -247,8 +245,6 @@ class Noise(Kept):
         Shape (W, A, size). The other worlds get zeros, and their steps do not advance.
         """
         random = self._random
-        if not random.shape:
-            return self._single() if mask is None or mask else np.zeros(self._size)
         if is_traced(mask):
             drawn = self._drawn(random.keys, random.episode, self.step)
             self.step = np.where(mask[:, 0], self.step + np.uint32(1), self.step)
@@ -263,17 +259,6 @@ class Noise(Kept):
         numbers = np.zeros((*random.shape, self._size))
         numbers[ids] = self._rows[ids, self._ahead - left]
         return numbers
-
-    def _single(self) -> Numbers:
-        """Those of a single drone, faster."""
-        left = self._left.item()
-        if left == 0:
-            self._fill(np.zeros(1, int))
-            left = self._ahead
-        self._left[0] = left - 1
-        self.step[0] += 1
-        row: Numbers = self._rows[0, self._ahead - left, 0]
-        return row.copy()
 
     def _fill(self, ids: NDArray[np.int64]) -> None:
         random = self._random

@@ -13,7 +13,7 @@ class Kept:
     """Base of what keeps a state between steps.
 
     Class attributes:
-        arrays: Names of attributes that are arrays, or a single drone's numbers.
+        arrays: Names of attributes that are arrays.
     """
 
     arrays: ClassVar[tuple[str, ...]] = ()
@@ -35,7 +35,7 @@ class Kept:
         """Put a snapshot back."""
         for name in self.arrays:
             array = arrays.get(name)
-            setattr(self, name, None if array is None else array.copy()[()])
+            setattr(self, name, None if array is None else array.copy())
         for name, part in self.parts().items():
             part.restore(part_of(arrays, name))
 

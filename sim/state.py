@@ -1,13 +1,9 @@
 """State of worlds: arrays whose first two axes are W worlds and the A drones of each.
 
-A single drone has neither axis: code that counts axes from the last, as `position[..., 2]`, serves
-both.
-
 Frames: world x, y, z with z up, right-handed; body x forward, y left, z up. SI units, quaternions
 scalar first.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -19,7 +15,7 @@ from .compile import TracedArray
 _NUMBERS = (float, int)
 
 Array = Any
-"""A NumPy array; of a single drone also a number."""
+"""A NumPy array, or one of code that is compiled."""
 ByName = dict[str, Array]
 
 
@@ -85,51 +81,25 @@ class InitialState:
 
 
 def clip(array: Array, low: Array, high: Array) -> Array:
-    """The nearest numbers within bounds: numbers, or arrays of the same kind."""
-    if isinstance(array, float):  # a single drone's number, NumPy's among them
-        if array < low:
-            return low
-        return high if array > high else array
+    """The nearest numbers within bounds."""
     return np.minimum(np.maximum(array, low), high)  # a third of the time of NumPy's clip
 
 
-def component(array: Array, index: int) -> Array:
-    """`array[..., index]`; of a single drone a Python number, twenty times faster than an array."""
-    return array.item(index) if array.ndim == 1 else array[..., index]
-
-
 def parts_of(array: Array) -> list[Array]:
-    """Components of the last axis; of a single drone Python's numbers."""
-    if array.ndim == 1:
-        numbers: list[Array] = array.tolist()
-        return numbers
+    """Components of the last axis."""
     return [array[..., index] for index in range(array.shape[-1])]
-
-
-def each(values: Array) -> Array:
-    """Numbers of drones with a last axis of length 1; a single drone's number as it is."""
-    return values if isinstance(values, _NUMBERS) else values[..., None]
 
 
 def chosen(mask: Array, new: Array, old: Array) -> Array:
     """`new`, (W, A, ...), where the mask, (W, A), is true, elsewhere `old`; None stands for all."""
     if mask is None or old is None:
         return new
-    if not getattr(mask, "ndim", 0):  # a single drone's
-        return new if mask else old
     more = max(np.ndim(new), np.ndim(old)) - mask.ndim
     return np.where(mask.reshape(mask.shape + (1,) * more), new, old)
 
 
-def plain(array: Array) -> Array:
-    """A single drone's number as Python's own; other arrays as they are."""
-    return array.item() if getattr(array, "ndim", 1) == 0 else array
-
-
 def square_root(array: Array) -> Array:
     """Square root; 0 of a number below 0, which rounding may leave."""
-    if isinstance(array, float):
-        return 0.0 if array <= 0.0 else math.sqrt(array)
     return np.sqrt(np.maximum(array, 0.0))
 
 
@@ -147,9 +117,9 @@ def total(values: Array) -> Array:
     """Sum over the last axis, from its first number to its last: the same bits alone, in a batch
     and compiled, which NumPy's sums do not have.
     """
-    result = component(values, 0)
+    result = values[..., 0]
     for index in range(1, values.shape[-1]):
-        result = result + component(values, index)
+        result = result + values[..., index]
     return result
 
 
@@ -161,8 +131,6 @@ def length(vectors: Array) -> Array:
 def looked_up(table: np.ndarray, index: Array) -> Array:
     """Rows of a constant table, (rows, ...), at whole numbers, floats; the last ones beyond it."""
     index = clip(index, 0.0, len(table) - 1.0)
-    if isinstance(index, float):
-        return plain(table[int(index)])
     if is_traced(index):
         return index.rows_of(table)
     return table[index.astype(int)]
@@ -193,7 +161,7 @@ def some(mask: Array) -> bool:
     """
     if mask is None or is_traced(mask):
         return True
-    return bool(np.count_nonzero(mask) if mask.ndim else mask)  # faster than NumPy's any
+    return bool(np.count_nonzero(mask))  # faster than NumPy's any
 
 
 def found(mask: Array) -> bool:
@@ -202,12 +170,9 @@ def found(mask: Array) -> bool:
 
 
 def stack(parts: Sequence[Array]) -> Array:
-    """Arrays along a new last axis; a number among them counts for all drones.
-
-    Of a single drone they are numbers.
-    """
+    """Arrays along a new last axis; a number among them counts for all drones."""
     for like in parts:
-        if not isinstance(like, _NUMBERS) and like.ndim:
+        if not isinstance(like, _NUMBERS):
             break
     else:
         return np.array(parts)  # an eighth of the time of NumPy's stack

@@ -17,7 +17,7 @@ from .effects import NO_EFFECTS, EffectOptions, Effects
 from .random import RANDOMIZATION, START, Draw, Random
 from .randomize import FIXED, Randomization
 from .snapshots import Arrays, Snapshot, joined, part_of
-from .state import Array, ByName, InitialState, WorldState, chosen, plain
+from .state import Array, ByName, InitialState, WorldState, chosen
 
 _CLASSES = {"mujoco": "MujocoWorld", "rigid": "RigidWorld"}
 """Backends by name: a class in the module of that name in `backends`."""
@@ -60,7 +60,7 @@ class World(NotCopied):
 
     Attributes:
         vehicle: The vehicle of every drone.
-        shape: (W, A), the leading axes of all arrays; () for a single drone.
+        shape: (W, A), the leading axes of all arrays.
         state: As the last step or reset left it.
         randomize: What is drawn for each episode.
         random: The counters of all random numbers; `seed` seeds them.
@@ -221,7 +221,7 @@ class World(NotCopied):
         """Put a snapshot back; no step runs. No later bit differs from those that followed it."""
         self.random.restore(part_of(arrays, "random"))
         parameters = part_of(arrays, "parameters")
-        self.parameters = {name: plain(array.copy()) for name, array in parameters.items()}
+        self.parameters = {name: array.copy() for name, array in parameters.items()}
         self._restore(part_of(arrays, "state"))
         if self.effects is not None:
             self.effects.restore(part_of(arrays, "effects"))
@@ -277,7 +277,7 @@ class World(NotCopied):
             draw = Draw(self.random, RANDOMIZATION, mask)
             for name, new in self.randomize.draw(draw).items():
                 old = self.parameters.get(name)
-                self.parameters[name] = plain(new if old is None else np.where(mask, new, old))
+                self.parameters[name] = new if old is None else np.where(mask, new, old)
 
     def _begun(self, mask: Array, pose: InitialState) -> ByName:
         """The pose's arrays by their names; those of the state for worlds out of the mask."""

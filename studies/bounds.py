@@ -212,7 +212,8 @@ def recovery_bounds(
     angles = np.radians(np.arange(360.0))
     axes = np.stack((np.cos(angles), np.sin(angles), 0.0 * angles), axis=1)
     turn = max(map(vehicle.turning, axes)) / float(np.cos(np.radians(0.5)))  # between the axes
-    most = Recovery(EnvConfig.from_keywords(RECOVERY, **options.to_options()), vehicle).spin
+    config = EnvConfig.from_keywords(RECOVERY, **options.to_options())
+    most = Recovery(config, vehicle, (1, 1)).spin
     rates = dice.uniform(-most, most, (count, 3))
     tilt = np.arccos(dice.uniform(-1.0, 1.0, count))
     climb = dice.uniform(0.0, options.start_speed, count) * dice.uniform(-1.0, 1.0, count)

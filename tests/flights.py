@@ -47,7 +47,7 @@ class Shares(Draw):
     """Gives, one after another, these shares of the way from the low end of a draw to the high."""
 
     def __init__(self, *shares: Any) -> None:
-        super().__init__(Random(()), 0, [0])
+        super().__init__(Random((1, 1)), 0, None)
         self._shares = iter(shares)
 
     def uniform(self, low: float, high: float, size: tuple[int, ...] = ()) -> Any:

@@ -15,7 +15,7 @@ class Actions:
     """Checks actions of k numbers, or of one choice out of 0 to `choices` - 1.
 
     Args:
-        shape: (W, A), or () for a single drone.
+        shape: (W, A).
         width: k.
         choices: 0 where an action is k numbers.
     """
@@ -99,11 +99,9 @@ class ActionDelay(Stage):
 
     def begin(self, record: Record) -> None:
         """Actions on their way change nothing."""
-        record.actions_sent = filled(self.neutral, self.longest + 1, self.neutral.ndim - 1)
+        record.actions_sent = filled(self.neutral, self.longest + 1)
 
     def step(self, record: Record) -> None:
         """The action that was sent as long ago as the delay."""
-        axis = self.neutral.ndim - 1
-        sent = pushed(record.actions_sent, record.received, axis)
-        record.actions_sent = sent
-        record.received = taken(sent, self.world.parameters["action_delay"], axis)
+        record.actions_sent = sent = pushed(record.actions_sent, record.received)
+        record.received = taken(sent, self.world.parameters["action_delay"])

@@ -57,9 +57,8 @@ def mask_of(record: Record, given: object) -> Mask:
         raise InputError(
             f"resets, frozen: expected bool of shape {expected}, got {shortened(given)}"
         )
-    drones: Mask = given.reshape(record.shape)[()]
-    several = drones.ndim > 0 and drones.shape[1] > 1
-    if several and not (drones == drones[:, :1]).all():
+    drones: Mask = given.reshape(record.shape)
+    if not (drones == drones[:, :1]).all():
         raise InputError(
             f"resets, frozen: expected all {drones.shape[1]} drones of a world or none, "
             "got some of them"

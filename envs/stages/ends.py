@@ -28,15 +28,15 @@ class Ends(Stage):
         total: Array = 0.0
         for term in record.terms.values():
             total = total + term
-        reward = total + np.zeros(record.shape)[()]
-        terminated = np.zeros(record.shape, bool)[()] | record.ended
+        reward = total + np.zeros(record.shape)
+        terminated = np.zeros(record.shape, bool) | record.ended
         truncated = (record.steps >= self.episode_length) > terminated
         record.unfit = _unfit(record, reward)
         flying = record.flown
         if some(record.out):
             flying = ~record.out if flying is None else flying & ~record.out
         if flying is not None:
-            reward = np.where(flying | record.unfit, reward, 0.0)[()]
+            reward = np.where(flying | record.unfit, reward, 0.0)
             terminated = terminated & flying
             truncated = truncated & flying
         record.reward = reward

@@ -35,13 +35,12 @@ class History(Stage):
         past = vars(record).get("history", {})
         history = {}
         seen = {}
-        axis = len(record.shape)  # first one of a drone
         for name in self.names:
             values = record.observations[name]
-            if values.ndim == axis:  # a number
+            if values.ndim == 2:  # a number
                 values = values[..., None]
             history[name] = rows = later(past.get(name), values, self.steps, record)
-            seen[name] = rows.reshape(*record.shape, -1, *rows.shape[axis + 2 :])
+            seen[name] = rows.reshape(*record.shape, -1, *rows.shape[4:])
         record.history = history
         record.observations = {**record.observations, **seen}
 
@@ -68,7 +67,7 @@ class ObservationDelay(Stage):
         arrived = {}
         for name, values in record.observations.items():
             sent[name] = later(past.get(name), values, self.longest + 1, record)
-            arrived[name] = taken(sent[name], age, len(record.shape))
+            arrived[name] = taken(sent[name], age)
         record.past_observations = sent
         record.observations = arrived
 
@@ -93,32 +92,28 @@ def with_history(array: ArraySpec, steps: int) -> ArraySpec:
     )
 
 
-def filled(values: Values, steps: int, axis: int) -> Values:
+def filled(values: Values, steps: int) -> Values:
     """Values (W, A, *shape), repeated for `steps` steps along a new axis."""
-    return np.repeat(np.expand_dims(values, axis), steps, axis)
+    return np.repeat(values[:, :, None], steps, 2)
 
 
-def pushed(past: Values, values: Values, axis: int) -> Values:
+def pushed(past: Values, values: Values) -> Values:
     """The past one step later: without its oldest values, and with new ones."""
-    kept = past[(slice(None),) * axis + (slice(1, None),)]
-    return np.concatenate((kept, np.expand_dims(values, axis)), axis)
+    return np.concatenate((past[:, :, 1:], values[:, :, None]), 2)
 
 
 def later(past: Values | None, values: Values, steps: int, record: Record) -> Array:
     """The past of `steps` steps, one step later; of drones that begin it is the present."""
-    axis = len(record.shape)
     if past is None:
-        return filled(values, steps, axis)
-    new = pushed(past, values, axis)
+        return filled(values, steps)
+    new = pushed(past, values)
     if record.begun is None:
         return new
-    return chosen(record.begun, filled(values, steps, axis), new)
+    return chosen(record.begun, filled(values, steps), new)
 
 
-def taken(past: Values, age: Array, axis: int) -> Array:
+def taken(past: Values, age: Array) -> Array:
     """Values of `age` steps ago; the age has the shape (W, A), whole numbers."""
-    if not axis:
-        return past[past.shape[axis] - 1 - int(age)]
-    index = past.shape[axis] - 1 - age.astype(int)
-    index = index.reshape(index.shape + (1,) * (past.ndim - axis))
-    return np.take_along_axis(past, index, axis).squeeze(axis)
+    index = past.shape[2] - 1 - age.astype(int)
+    index = index.reshape(index.shape + (1,) * (past.ndim - 2))
+    return np.take_along_axis(past, index, 2).squeeze(2)

@@ -103,7 +103,7 @@ class Judge(Stage):
         for metric in task.metrics:
             if metric.name not in outcome.metrics:
                 self._refuse(f"the metric {metric.name!r}", list(outcome.metrics))
-        if record.shape and not any(np.ndim(term) for term in outcome.reward.values()):
+        if not any(np.ndim(term) for term in outcome.reward.values()):
             got = f"{outcome.reward}: make an array of it, as 1.0 + 0.0 * state.position[..., 2]"
             self._refuse("a reward for each drone", got)
         kind = getattr(outcome.terminated, "dtype", type(outcome.terminated))
@@ -117,6 +117,4 @@ class Judge(Stage):
 
 def _of_each(numbers: ByName, record: Record) -> ByName:
     """Numbers of each drone, (W, A), where one stands for all."""
-    if not record.shape:
-        return numbers
     return {name: np.broadcast_to(one, record.shape) for name, one in numbers.items()}

@@ -57,7 +57,7 @@ class Sensing(Stage):
         """Readings of the drones that flew; the others keep theirs."""
         flown = record.flown
         if flown is None:
-            flown = np.ones(record.shape, bool)[()]
+            flown = np.ones(record.shape, bool)
         if some(flown):
             self.sensors.sample(flown)
         if self.replaces:

@@ -109,7 +109,7 @@ class Pictures(Stage):
         shares = Draw(self._random, SCENES, record.begun).uniform(0.0, 1.0)
         of_worlds = np.reshape(shares, self._shape)[:, :1] * len(self._scenes)
         scenes = np.repeat(of_worlds.astype(int), self._shape[1], axis=1)
-        record.scenes = scenes.reshape(record.shape)[()]
+        record.scenes = scenes.reshape(record.shape)
 
     def step(self, record: Record) -> None:
         """Add all pictures to the observations, shape (W, A, height, width, channels).

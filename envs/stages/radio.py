@@ -48,7 +48,7 @@ class Radio(Stage):
         position = record.start.position
         rest = np.concatenate((position, 0.0 * position), axis=-1)
         message = np.concatenate((rest, np.zeros_like(rest[..., :1])), axis=-1)
-        record.said = filled(message, self.options.radio_delay + 1, 2)
+        record.said = filled(message, self.options.radio_delay + 1)
         record.heard = np.repeat(rest[:, None], self.drones, axis=1)
         record.age = np.where(self._in_range(position, position), 0.0, np.inf)
         keys = (lots * 2.0**32).astype(np.uint32)
@@ -68,7 +68,7 @@ class Radio(Stage):
         options = self.options
         record.silent = record.silent | self.ended(state)
         parts = (state.position, state.velocity, record.silent[..., None])
-        record.said = pushed(record.said, np.concatenate(parts, axis=-1), 2)
+        record.said = pushed(record.said, np.concatenate(parts, axis=-1))
         said = record.said[:, :, 0]
         arrives = self._in_range(state.position, said[..., :3]) & (said[:, None, :, 6] == 0)
         if options.radio_loss:

@@ -19,13 +19,13 @@ Look = Callable[[], WorldState]
 
 
 class Record:
-    """Named arrays of W worlds of A drones, shape (W, A, ...); of a single drone (...).
+    """Named arrays of W worlds of A drones, shape (W, A, ...).
 
     A region runs stages under a mask of shape (W, A). When it ends, kept names have their new
     values under the mask and the old ones elsewhere. No array is changed in place.
 
     Attributes:
-        shape: (W, A), or () for a single drone.
+        shape: (W, A).
         memory: Of the task.
         kept: Names of arrays that keep their values between steps.
         flown: Drones that fly in this step; None: all.
@@ -86,14 +86,14 @@ class Record:
         self.shape = shape
         self.memory = memory
         self.kept = kept
-        nobody = np.zeros(shape, bool)[()]
+        nobody = np.zeros(shape, bool)
         self.flown: Mask | None = None
         self.begun: Mask | None = None
-        self.steps: NDArray[np.int64] = np.zeros(shape, np.int64)[()]
+        self.steps: NDArray[np.int64] = np.zeros(shape, np.int64)
         self.episodes = self.steps
         self.out = self.done = self.terminated = self.truncated = self.unfit = nobody
         self.waiting = ~nobody
-        self.reward = np.zeros(shape)[()]
+        self.reward = np.zeros(shape)
         self._nothing = self.reward
         self._nobody = nobody
 
@@ -146,9 +146,9 @@ class Record:
                 if part == "memory":
                     setattr(self.memory, name, array.copy())
                 elif part == "kept":
-                    known[name] = array.copy()[()]
+                    known[name] = array.copy()
                 else:
-                    known.setdefault(part, {})[name] = array.copy()[()]
+                    known.setdefault(part, {})[name] = array.copy()
         if self.has_begun:
             known.setdefault("metrics", {})  # of a task that has none
         self.flown = self.begun = None
@@ -189,7 +189,7 @@ class Record:
         """End the episodes of some drones; a world is done when all of its drones are out."""
         self.out = self.out | drones
         done = self.out
-        if done.ndim and done.shape[1] > 1:
+        if done.shape[1] > 1:
             done = np.repeat(done.all(axis=1, keepdims=True), done.shape[1], axis=1)
         self.done = done
         self.waiting = self.waiting | done

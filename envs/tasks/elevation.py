@@ -13,7 +13,6 @@ from ...sim import (
     Draw,
     InitialState,
     clip,
-    component,
     stack,
 )  # fmt: skip
 from ..spec import ArraySpec, Metric
@@ -148,17 +147,17 @@ class Elevation(Task):
 
     def observe(self, state: State) -> dict[str, Array]:
         """E, its rate and the thrust; or E alone."""
-        error = self.memory.target - component(state.position, 2)
+        error = self.memory.target - state.position[..., 2]
         numbers = [error]
         if self.options.observation == "full":
-            rate = 0.0 - component(state.velocity, 2)
-            numbers += [rate, component(state.thrust, 0) / self._hover - 1.0]
+            rate = 0.0 - state.velocity[..., 2]
+            numbers += [rate, state.thrust[..., 0] / self._hover - 1.0]
         # Only effects, or a vehicle that was drawn, could leave the bounds.
         return {"observation": clip(stack(numbers), *self._bounds)}
 
     def outcome(self, state: State) -> Outcome:
         """Nearness to the target; the end at a crash, a flip-over, or outside the band."""
-        error = self.memory.target - component(state.position, 2)
+        error = self.memory.target - state.position[..., 2]
         distance = abs(error)
         outside = distance > self.options.flight_band
         terminated = outside | state.touching | (state.tilt_cosine < MAX_TILT_COSINE)

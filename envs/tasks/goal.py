@@ -14,7 +14,6 @@ from ...sim import (
     body_x,
     body_z,
     clip,
-    component,
     cos,
     length,
     looked_up,
@@ -175,7 +174,7 @@ class GoalTask(Task):
 
     def goal(self, state: State) -> Array:
         """The option `goal`, the same for every drone."""
-        return at(self.options.goal, component(state.position, 0))
+        return at(self.options.goal, state.position[..., 0])
 
     def distance(self, state: State) -> Array:
         """From each drone to its goal, m, shape (W, A)."""

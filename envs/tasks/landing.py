@@ -7,7 +7,7 @@ import numpy as np
 
 from ...models.errors import InputError, shortened
 from ...models.fields import Limits, NumberOrPair, immutable
-from ...sim import Array, Draw, InitialState, component, cos, each, length, sin, stack
+from ...sim import Array, Draw, InitialState, cos, length, sin, stack
 from ..spec import Mark, Metric
 from ..state import State
 from .goal import (
@@ -171,7 +171,7 @@ class Landing(GoalTask):
         memory = self.memory
         touching = state.touching
         memory.phase = memory.phase + memory.rate * self.control_period
-        memory.arrival = np.where(each(touching), memory.velocity, state.velocity)
+        memory.arrival = np.where(touching[..., None], memory.velocity, state.velocity)
         memory.arrival_upright = np.where(touching, memory.upright, state.tilt_cosine)
         potential = self._potential_of(state.position, memory.arrival)
         memory.progress = potential - memory.potential
@@ -193,7 +193,7 @@ class Landing(GoalTask):
         landed = (
             touching
             & (distance <= options.pad_radius)
-            & (-component(relative, 2) <= options.sink)
+            & (-relative[..., 2] <= options.sink)
             & (length(relative[..., :2]) <= options.drift)
             & (self.memory.arrival_upright >= self._least_upright)
         )

@@ -9,8 +9,6 @@ from ...sim import (
     Draw,
     InitialState,
     atan2,
-    component,
-    each,
     length,
     stack,
 )
@@ -137,7 +135,7 @@ class PayloadHover(GoalTask):
             position=self._above(tilt) + offset,
             quaternion=tilted(tilt, azimuth),
             velocity=stack((along, across, 0.0)),
-            thrust=carrying + each(0.0 * tilt),
+            thrust=carrying + (0.0 * tilt)[..., None],
         )
 
     def _above(self, like: Array) -> Array:
@@ -147,7 +145,7 @@ class PayloadHover(GoalTask):
 
     def place(self, state: State) -> Array:
         """Where the craft holds the payload at its goal."""
-        return self._above(component(state.position, 0))
+        return self._above(state.position[..., 0])
 
     def further(self, state: State) -> tuple[Array, Array]:
         """Position and velocity of the payload relative to the craft."""
@@ -157,7 +155,7 @@ class PayloadHover(GoalTask):
         """Nearness of the payload, its swing; the end at contact, a flip-over, or too far away."""
         distance = length(self.goal(state) - state.payload)
         hung = state.position - state.payload
-        swing = atan2(length(hung[..., :2]), component(hung, 2)) * (180 / math.pi)
+        swing = atan2(length(hung[..., :2]), hung[..., 2]) * (180 / math.pi)
         crashed = self.crashed(state, distance > self.options.flight_band)
         terms = {"payload": nearness(distance), "swing": swing_cost(state)}
         metrics = {"payload_error": distance, "swing": swing}

@@ -16,12 +16,9 @@ from ...sim import (
     Draw,
     InitialState,
     clip,
-    component,
     cos,
-    each,
     length,
     parts_of,
-    plain,
     remainder,
     sin,
     stack,
@@ -186,7 +183,7 @@ class Racing(GoalTask):
         memory.behind = position  # where the way to the next gate began
         memory.passed = memory.passing = memory.progress = memory.off = 0.0
         memory.lap = memory.lap_began = 0.0
-        zero = 0.0 * plain(offset[..., 0])
+        zero = 0.0 * offset[..., 0]
         turn = stack((zero + cos(half), zero, zero, zero + sin(half)))
         return InitialState(position=position, quaternion=turn)
 
@@ -195,43 +192,43 @@ class Racing(GoalTask):
         memory = self.memory
         gate = self._gate(memory.passed)
         center = gate[..., :3]
-        half = component(gate, 5)
+        half = gate[..., 5]
         before = memory.position - center
         now = state.position - center
         behind = self._ahead(gate, before)
         ahead = self._ahead(gate, now)
         through = (behind < 0.0) & (ahead >= 0.0)
-        share = each(plain(behind / np.where(through, behind - ahead, -1.0)))
+        share = (behind / np.where(through, behind - ahead, -1.0))[..., None]
         crossing = before + share * (now - before)
         x, y, z = parts_of(crossing)
-        aside = y * component(gate, 3) - x * component(gate, 4)
+        aside = y * gate[..., 3] - x * gate[..., 4]
         inside = (abs(aside) <= half) & (abs(z) <= half)
         left = memory.passed < self._total
-        passing = plain(through & inside & left) * 1.0
+        passing = (through & inside & left) * 1.0
         passed = memory.passed + passing
         whole = (passing > 0.5) & (remainder(passed, self._count) == 0.0)
         way = center - memory.behind
         come = state.position - memory.behind
         along = total(come * way) / (total(way * way) + 1e-12)
-        memory.off = length(come - each(clip(along, 0.0, 1.0)) * way)
+        memory.off = length(come - clip(along, 0.0, 1.0)[..., None] * way)
         memory.progress = length(before) - length(now)
         memory.passed = passed
         memory.passing = passing
         memory.lap = np.where(whole, state.time - memory.lap_began, memory.lap)
         memory.lap_began = np.where(whole, state.time, memory.lap_began)
         memory.position = state.position
-        memory.behind = np.where(each(passing > 0.5), center, memory.behind)
+        memory.behind = np.where((passing > 0.5)[..., None], center, memory.behind)
 
     def _ahead(self, gate: Array, way: Array) -> Array:
         """How far a way from the centre of a gate leads in its direction, m, (W, A)."""
-        return component(way, 0) * component(gate, 3) + component(way, 1) * component(gate, 4)
+        return way[..., 0] * gate[..., 3] + way[..., 1] * gate[..., 4]
 
     def further(self, state: State) -> tuple[Array, ...]:
         """The direction of the next gate, the gate after it, and the size of the next."""
         gate = self._gate(self.memory.passed)
         after = self._gate(self.memory.passed + 1.0)
         way = after[..., :3] - state.position
-        return gate[..., 3:5], way, after[..., 3:5], plain(gate[..., 5])
+        return gate[..., 3:5], way, after[..., 3:5], gate[..., 5]
 
     def outcome(self, state: State) -> Outcome:
         """Progress to the next gate; the end at the last one, or off the track."""

@@ -10,7 +10,6 @@ from ...sim import (
     Array,
     Draw,
     InitialState,
-    component,
     cos,
     length,
     sin,
@@ -162,7 +161,7 @@ class Recovery(GoalTask):
     def update_memory(self, state: State) -> None:
         """The last step that was not recovered, and the lowest point."""
         memory = self.memory
-        height = component(state.position, 2)
+        height = state.position[..., 2]
         memory.missed = np.where(self._recovered(state), memory.missed, state.time)
         memory.lowest = np.minimum(height, memory.lowest)
 

@@ -1,8 +1,8 @@
 """Base of tasks. One class serves every backend, one drone or thousands, in process or over UDP.
 
-A task is written for arrays with any leading axes: W worlds and the A drones of each, or none for a
-single drone. It counts axes from the last (`position[..., 2]`), uses operators, `stack` and NumPy's
-functions, and never changes an array in place.
+A task is written for arrays of W worlds and the A drones of each. It counts axes from the last
+(`position[..., 2]`), uses operators, `stack` and NumPy's functions, and never changes an array in
+place.
 """
 
 from abc import ABC, abstractmethod
@@ -89,7 +89,7 @@ class Task(ABC):
         options: The task's own options.
         action, control_period, episode_length: Those of the config.
         vehicle: The vehicle of all drones, or a `Fleet`.
-        shape: (W, A), or () for a single drone.
+        shape: (W, A).
         memory: What lasts from step to step of an episode; nothing else does.
         controller: Turns actions into thrusts: that of the option `action`, unless `setup` sets
             another.
@@ -114,9 +114,7 @@ class Task(ABC):
     observation: tuple[ArraySpec, ...]
     marks: tuple[Mark, ...] = ()
 
-    def __init__(
-        self, config: "EnvConfig", vehicle: "Vehicle", shape: tuple[int, ...] = ()
-    ) -> None:
+    def __init__(self, config: "EnvConfig", vehicle: "Vehicle", shape: tuple[int, int]) -> None:
         self.config = config
         self.vehicle = vehicle
         self.shape = shape

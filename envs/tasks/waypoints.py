@@ -5,7 +5,7 @@ from typing import Annotated
 import numpy as np
 
 from ...models.fields import Limits, immutable
-from ...sim import Array, Draw, InitialState, length, plain
+from ...sim import Array, Draw, InitialState, length
 from ..spec import Mark, Metric
 from ..state import State
 from .goal import (
@@ -131,7 +131,7 @@ class Waypoints(GoalTask):
         memory = self.memory
         left = options.points - memory.reached
         off = abs(state.position - np.array(options.center))
-        crashed = self.crashed(state, plain((off > self._sides).any(axis=-1)))
+        crashed = self.crashed(state, (off > self._sides).any(axis=-1))
         terms = {"progress": memory.progress, "passing": PASSING_REWARD * memory.passed}
         metrics = {"points_left": left, "flight_time": state.time}
         return self.judged(state, terms, crashed, metrics, left < 0.5, COURSE_RATE_WEIGHT)

@@ -21,7 +21,7 @@ from ...models.vehicle import Vehicle
 from .. import elementary
 from ..randomize import CENTER
 from ..rotations import matrix, product, transposed
-from ..state import Array, plain
+from ..state import Array
 
 Vector = tuple[Array, Array, Array]
 Push = tuple[Vector, Vector, Vector]
@@ -253,7 +253,9 @@ def _sparse(matrix: np.ndarray, size: float | None = None) -> list[list[Array]]:
     """
     least = _NOTHING * (abs(matrix).max() if size is None else size)
     rows = np.moveaxis(matrix, (-2, -1), (0, 1))
-    return [[plain(one) if (abs(one) > least).any() else 0.0 for one in row] for row in rows]
+    if matrix.ndim == 2:
+        rows = rows.astype(object)  # Python's numbers, which take the dtype of arrays
+    return [[one if (abs(one) > least).any() else 0.0 for one in row] for row in rows]
 
 
 def added(total: Array, *products: tuple[Array, ...]) -> Array:

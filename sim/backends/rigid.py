@@ -20,7 +20,6 @@ from ..state import (
     WorldState,
     chosen,
     clip,
-    each,
     found,
     length,
     parts_of,
@@ -118,7 +117,7 @@ class RigidWorld(World):
 
     def _move(self, begun: ByName, mask: Array) -> None:
         turn = begun["quaternion"]
-        unit = turn / each(length(turn))
+        unit = turn / length(turn)[..., None]
         turn = np.where(mask[..., None], unit, turn)  # the others keep their bits
         parts = (begun["position"], turn, begun["velocity"], begun["body_rates"])
         self._show(self._typed(np.concat(parts, axis=-1)))

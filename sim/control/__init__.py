@@ -12,7 +12,7 @@ import numpy as np
 from ... import models
 from ...models.errors import InputError, shortened
 from ..effects import NO_EFFECTS, EffectOptions
-from ..state import Array, WorldState, clip, component, stack, total
+from ..state import Array, WorldState, clip, total
 from .cascade import Attitude, Position, Rates, Velocity
 from .gains import Gains, shared_ranges
 
@@ -94,14 +94,12 @@ class CollectiveThrust:
 
     def thrust(self, action: Array, state: WorldState) -> Array:
         """As `Controller.thrust`."""
-        share = component(action, 0)
+        share = action[..., :1]
         share = share - 1.0 if self.choices else clip(share, -1.0, 1.0)
-        if self._alike:
-            present = component(state.command, 0) if self._increment else self._hover
-            thrust = clip(present + self._per_action * share, self._low, self._high)
-            return thrust if isinstance(thrust, float) else stack((thrust,))
-        present = state.command if self._increment else self._hover
-        return clip(present + self._per_action * stack((share,)), self._low, self._high)
+        present = self._hover
+        if self._increment:
+            present = state.command[..., :1] if self._alike else state.command
+        return clip(present + self._per_action * share, self._low, self._high)
 
 
 class RotorThrust:

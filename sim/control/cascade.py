@@ -13,7 +13,7 @@ shortest turn of the thrust axis to the wanted one. Of that turn, by an angle θ
 for large-angle rotational maneuvers", Systems & Control Letters 61, 2012; the sin θ of 2010
 vanishes upside down. Wanted angular accelerations are left out.
 
-Array code with any leading axes; of a single drone the numbers are Python's.
+Array code with any leading axes.
 """
 
 import math
@@ -95,18 +95,18 @@ class Rates:
         low = gains.lowest
         high = gains.highest
         added = [a * roll + b * pitch for a, b, _ in gains.mix]
-        lower = _least(added)
-        upper = _most(added)
+        lower = reduce(np.minimum, added)
+        upper = reduce(np.maximum, added)
         scale = clip((high - low) / clip(upper - lower, 1e-9 * high, math.inf), 0.0, 1.0)
         least = low - scale * lower
         most = high - scale * upper
-        middle = _least([_most([collective + 0.0 * least, least]), most])
+        middle = reduce(np.minimum, [reduce(np.maximum, [collective + 0.0 * least, least]), most])
         parts = [middle + scale * part for part in added]
         yaws = [(part, c) for part, (*_, c) in zip(parts, gains.mix, strict=True) if c]
         ends = [((low - part) / c, (high - part) / c)[:: 1 if c > 0 else -1] for part, c in yaws]
         # Where there is no room, the upper end holds.
-        yaw = _most([yaw, *(end for end, _ in ends)])
-        yaw = _least([yaw, *(end for _, end in ends)])
+        yaw = reduce(np.maximum, [yaw, *(end for end, _ in ends)])
+        yaw = reduce(np.minimum, [yaw, *(end for _, end in ends)])
         rotors = zip(gains.share, parts, gains.mix, strict=True)
         return [share * (part + c * yaw) for share, part, (*_, c) in rotors]
 
@@ -249,7 +249,7 @@ class Position(Velocity):
     def _gain(self, distance: Array, acceleration: float, speed: float) -> Array:
         """Velocity over offset, 1/s."""
         braked = square_root(0.5 * acceleration / distance)
-        return clip(_least([braked, speed / distance]), 0.0, self.gains.position)
+        return clip(reduce(np.minimum, [braked, speed / distance]), 0.0, self.gains.position)
 
 
 def _throttle(curve: Numbers) -> np.ndarray:
@@ -285,11 +285,3 @@ def _turned(nose: Parts, x: Array, y: Array) -> tuple[Array, Array]:
 
 def _length(x: Array, y: Array = 0.0) -> Array:
     return square_root(x * x + y * y + _TINY)
-
-
-def _most(parts: list[Array]) -> Array:
-    return max(parts) if isinstance(parts[0], float) else reduce(np.maximum, parts)
-
-
-def _least(parts: list[Array]) -> Array:
-    return min(parts) if isinstance(parts[0], float) else reduce(np.minimum, parts)

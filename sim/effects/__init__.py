@@ -17,7 +17,7 @@ from ...models import InputError
 from ..random import GUSTS, Noise
 from ..rotations import Parts, add
 from ..snapshots import Kept
-from ..state import Array, ByName, WorldState, component
+from ..state import Array, ByName, WorldState
 from .air import AirEffects
 from .downwash import Downwash
 from .gusts import NUMBERS, Gusts
@@ -79,7 +79,7 @@ class Effects(Kept):
         if self.on_body:
             self.air.begin(mask, state)
         if self._gusts is not None:
-            height = component(state.position, 2)
+            height = state.position[..., 2]
             normal = self._noise.normal(mask)
             self._gusts.begin(mask, height, normal, factors.get("gusts", 1.0))
         return thrust
@@ -126,6 +126,6 @@ class Effects(Kept):
         if self._gusts is not None:
             self._gusts.step(mask, self._noise.normal(mask))
         wind = self.wind
-        if self._downwash is not None and state.position.ndim > 2 and state.position.shape[1] > 1:
+        if self._downwash is not None and state.position.shape[1] > 1:
             wind = add(wind, self._downwash.air(state))
         return mean, end, self.air.step(state, mean, root, wind, mask)

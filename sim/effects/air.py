@@ -15,8 +15,6 @@ from ..state import (
     WorldState,
     chosen,
     clip,
-    component,
-    each,
     parts_of,
     square_root,
     stack,
@@ -58,8 +56,8 @@ class AirEffects(Kept):
         self._half = 0.5 * vehicle.timestep
         coefficients = vehicle.coefficients
         self._center: Parts = tuple(vehicle.center_of_mass.tolist())
-        self._geometry = np.array([(*rotor.position, *rotor.axis) for rotor in vehicle.rotors])
-        self._rotors = self._geometry.tolist()
+        geometry = np.array([(*rotor.position, *rotor.axis) for rotor in vehicle.rotors])
+        self._rotors = list(geometry.T)  # positions and axes: six of shape (R,)
         if options.body_drag:
             names = ("angular", "moment", "linear", "quadratic")
             drag = [coefficients[f"drag.{name}"] for name in names]
@@ -91,7 +89,7 @@ class AirEffects(Kept):
             speeds = np.sqrt(np.maximum(vehicle.thrust_high, 0.0)) / self._slope
             slope = max(self._drag, self._inflow) * float(speeds.sum())
             # Of a turn: about the least moment of inertia, at the longest arm.
-            arm = float(((self._geometry[:, :3] - vehicle.center_of_mass) ** 2).sum(axis=1).max())
+            arm = float(((geometry[:, :3] - vehicle.center_of_mass) ** 2).sum(axis=1).max())
             turning = vehicle.mass * arm / _least_moment(vehicle)
             _check_stiffness(vehicle, slope * max(1.0, turning), "drag of the rotors")
         if options.ground_effect:
@@ -105,10 +103,10 @@ class AirEffects(Kept):
         self._linear = tuple(numbers[f"drag.linear.{axis}"] for axis in "xyz")
         self._angular = tuple(numbers[f"drag.angular.{axis}"] for axis in "xyz")
         self._moment = tuple(numbers[f"drag.moment.{axis}"] for axis in "xy")
-        self._slope = each(np.sqrt(numbers["rotors.thrust_coefficient"]))
-        self._drag = each(numbers["rotors.drag"])
-        self._inflow = each(numbers["rotors.inflow"])
-        self._lift = each(numbers["rotors.lift"])
+        self._slope = np.sqrt(numbers["rotors.thrust_coefficient"])[..., None]
+        self._drag = numbers["rotors.drag"][..., None]
+        self._inflow = numbers["rotors.inflow"][..., None]
+        self._lift = numbers["rotors.lift"][..., None]
 
     def begin(self, mask: Array, state: WorldState) -> None:
         """Begin at the motion of a state."""
@@ -145,23 +143,11 @@ class AirEffects(Kept):
         if self._options.body_drag:
             force, torque = self._body(v, w)
         if self._options.rotor_drag or self._options.ground_effect:
-            height = component(state.position, 2) + self._half * ahead[2]
-            around = [each(number) for number in (*v, *w, *turn[2], height)]
-            if thrust.ndim > 1:
-                push: Parts = self._push(self._geometry.T, thrust, root, around)
-                force = add(force, list(map(total, push)))
-                torque = add(torque, list(map(total, cross(list(self._geometry.T), push))))
-            else:  # numbers are faster than arrays of a few rotors
-                push = _NOTHING
-                twist: Parts = _NOTHING
-                parts = thrust.tolist()
-                roots = [None] * len(parts) if root is None else root.tolist()
-                for rotor, part, mean_root in zip(self._rotors, parts, roots, strict=True):
-                    one = self._push(rotor, part, mean_root, around)
-                    push = add(push, one)
-                    twist = add(twist, cross(rotor, one))
-                force = add(force, push)
-                torque = add(torque, twist)
+            height = state.position[..., 2] + self._half * ahead[2]
+            around = [number[..., None] for number in (*v, *w, *turn[2], height)]
+            push = self._push(thrust, root, around)
+            force = add(force, list(map(total, push)))
+            torque = add(torque, list(map(total, cross(self._rotors, push))))
         return stack((*times(turn, force), *torque))
 
     def _body(self, v: Parts, w: Parts) -> tuple[Parts, Parts]:
@@ -181,14 +167,14 @@ class AirEffects(Kept):
             torque = torque[0] + roll * v[1], torque[1] - pitch * v[0], torque[2]
         return (x, y, z), torque
 
-    def _push(self, rotor: Array, thrust: Array, root: Array | None, around: list[Array]) -> Parts:
+    def _push(self, thrust: Array, root: Array | None, around: list[Array]) -> Parts:
         """Forces of rotors besides their thrusts, body axes; thrust and root as of `step`.
 
         `around`: velocity, body rates, the upward component of each body axis, and the height of
         the body's origin.
         """
-        place = rotor[:3]
-        axis = rotor[3:]
+        place = self._rotors[:3]
+        axis = self._rotors[3:]
         thrust = clip(thrust, 0.0, math.inf)
         up = 0.0
         push: Parts = _NOTHING
@@ -199,7 +185,7 @@ class AirEffects(Kept):
             root = square_root(thrust) if root is None else root
             speed = root / self._slope
             if "rotor_drag" in self._factors:
-                speed = speed * each(self._factors["rotor_drag"])
+                speed = speed * self._factors["rotor_drag"][..., None]
             up = self._lift * dot(plane, plane) - self._inflow * speed * along
             drag = -self._drag * speed
             push = (drag * plane[0], drag * plane[1], drag * plane[2])

@@ -6,7 +6,7 @@ from ... import models
 from ...models import InputError
 from ..elementary import expm1
 from ..snapshots import Kept
-from ..state import Array, ByName, chosen, clip, component, each, square_root, stack, total
+from ..state import Array, ByName, chosen, clip, square_root, stack, total
 from .options import EffectOptions
 
 
@@ -89,7 +89,7 @@ class RotorEffects(Kept):
         thrust = thrust.astype(np.float64)
         self._roots = chosen(mask, square_root(thrust), self._roots)
         if self._options.battery:
-            charge = factors.get("battery_charge", 1.0) + 0.0 * component(thrust, 0)
+            charge = factors.get("battery_charge", 1.0) + 0.0 * thrust[..., 0]
             self.charge = chosen(mask, charge, self.charge)
             self.voltage = chosen(mask, self._terminal(), self.voltage)
         return self._scaled(thrust)
@@ -101,12 +101,14 @@ class RotorEffects(Kept):
         if options.efficiency:
             self._scales.append(np.array(options.efficiency))
         if "thrust" in factors:
-            self._scales.append(each(factors["thrust"]))
+            self._scales.append(factors["thrust"][..., None])
         if factors.keys() & set(self.names):
             self._scales.append(stack([factors.get(name, 1.0) for name in self.names]))
         if options.motor_lag:
-            scale = each(factors.get("time_constant", 1.0))
-            self._answers = [self._answer(time * scale) for time in self._times]
+            times = self._times
+            if "time_constant" in factors:
+                times = [time * factors["time_constant"][..., None] for time in times]
+            self._answers = [self._answer(time) for time in times]
 
     def step(self, command: Array, mask: Array | None) -> tuple[Array, Array, Array | None]:
         """Advance by a physics step: mean thrusts over it, and those at its end, (W, A, R), N.
@@ -123,7 +125,7 @@ class RotorEffects(Kept):
             if not options.motor_lag:
                 self.voltage = chosen(mask, self._loaded(target), self.voltage)
             share = self.voltage / self._full
-            target = target * each(share * share)
+            target = target * (share * share)[..., None]
         mean = end = target
         middle = None
         if options.motor_lag:

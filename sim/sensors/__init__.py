@@ -4,7 +4,7 @@ A sensor is sampled at the end of a control step, from the exact state there: on
 the control rate holds its last reading in between. A reset gives a first reading, which a delay
 holds too. Each sensor has random numbers of its own, so that none moves those of another.
 
-World frame: x east, y north, z up. Arrays have the leading axes of the world, none for one drone.
+World frame: x east, y north, z up. Arrays have the leading axes of the world.
 """
 
 from collections.abc import Mapping

@@ -12,7 +12,7 @@ from ...models import InputError
 from ...models.coefficients import COEFFICIENTS
 from ...models.fields import Limits, check, check_names
 from ..snapshots import Kept
-from ..state import Array, chosen, clip, component, plain, some
+from ..state import Array, chosen, clip, some
 from ..world import World
 
 FURTHEST = 1e5  # Largest coordinate of a reading, m
@@ -167,7 +167,7 @@ class Sensor(Source):
     @property
     def fresh(self) -> Array:
         """1 where it was not observed before, and 0 elsewhere, shape (W, A)."""
-        return plain(self._readings[..., -1, 0])
+        return self._readings[..., -1, 0]
 
     def begin(self, mask: Array) -> None:
         """First reading of the drones of a mask."""
@@ -184,7 +184,7 @@ class Sensor(Source):
         fresh = due
         if some(due):
             normal = self._noise.normal(due)
-            fresh = due & (component(normal, -1) >= self._lost)
+            fresh = due & (normal[..., -1] >= self._lost)
             self._held = chosen(fresh, self._read(normal), self._held)
         readings = np.concat((self._readings[..., 1:], _flagged(self._held, fresh)), axis=-1)
         self._readings = chosen(mask, readings, self._readings)

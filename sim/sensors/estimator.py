@@ -7,7 +7,7 @@ import numpy as np
 
 from ..elementary import atan2, exp, expm1, wrapped
 from ..rotations import advanced, between, cross, to_world, world_z
-from ..state import Array, WorldState, chosen, clip, component, each, parts_of, stack
+from ..state import Array, WorldState, chosen, clip, parts_of, stack
 from .base import FURTHEST, MAX_SPEED, UNIT, Sensor, Source
 
 TIME = 1.0
@@ -78,13 +78,13 @@ class Estimator(Source):
         if sensor := sensors.get("magnetometer"):
             east, north, _ = sensor.values["field"]
             field = to_world(self.quaternion, sensor.value)
-            off = atan2(north, east) - atan2(component(field, 1), component(field, 0))
+            off = atan2(north, east) - atan2(field[..., 1], field[..., 0])
             off = wrapped(off) * self._gain(sensor)
-            angle = angle + each(off) * up
+            angle = angle + off[..., None] * up
         if sensor := sensors.get("motion_capture"):
             error = between(self.quaternion, sensor.value[..., 3:])
-            sign = np.copysign(2.0 * self._gain(sensor), component(error, 0))
-            angle = angle + each(sign) * error[..., 1:]
+            sign = np.copysign(2.0 * self._gain(sensor), error[..., 0])
+            angle = angle + sign[..., None] * error[..., 1:]
         return angle
 
     def _followed(
@@ -92,17 +92,17 @@ class Estimator(Source):
     ) -> tuple[Array, Array]:
         """Position and velocity, corrected by fresh readings."""
         if sensor := sensors.get("barometer"):
-            off = component(sensor.value, 0) - sensor.values["altitude"] - component(position, 2)
+            off = sensor.value[..., 0] - sensor.values["altitude"] - position[..., 2]
             g, h = self._gains(sensor)
-            position = position + each(g * off) * _UP
-            velocity = velocity + each(h * off) * _UP
+            position = position + (g * off)[..., None] * _UP
+            velocity = velocity + (h * off)[..., None] * _UP
         if sensor := sensors.get("motion_capture"):
             g, h = self._gains(sensor)
             off = sensor.value[..., :3] - position
-            position = position + each(g) * off
-            velocity = velocity + each(h) * off
+            position = position + g[..., None] * off
+            velocity = velocity + h[..., None] * off
         if sensor := sensors.get("gps"):
-            gain = each(self._gain(sensor))
+            gain = self._gain(sensor)[..., None]
             position = position + gain * (sensor.value[..., :3] - position)
             velocity = velocity + gain * (sensor.value[..., 3:] - velocity)
         return position, velocity

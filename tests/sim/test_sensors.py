@@ -418,7 +418,8 @@ def estimator(**state: Any) -> Estimator:
 
 def channel(*value: float, fresh: bool = True) -> Any:
     values = {"altitude": 100.0, "field": (0.0, 20.0, -40.0)}
-    return SimpleNamespace(value=np.array(value), fresh=fresh, interval=PERIOD, values=values)
+    is_fresh = np.array(fresh)
+    return SimpleNamespace(value=np.array(value), fresh=is_fresh, interval=PERIOD, values=values)
 
 
 def angles_of(quaternion: np.ndarray) -> np.ndarray:
