@@ -114,7 +114,7 @@ class Task(ABC):
     observation: tuple[ArraySpec, ...]
     marks: tuple[Mark, ...] = ()
 
-    def __init__(self, config: "EnvConfig", vehicle: "Vehicle", shape: tuple[int, int]) -> None:
+    def __init__(self, config: "EnvConfig", vehicle: "Vehicle", shape: tuple[int, ...]) -> None:
         self.config = config
         self.vehicle = vehicle
         self.shape = shape
