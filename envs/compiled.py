@@ -53,17 +53,18 @@ class CompiledLoop(Loop):
             return
         record = self._record
         begun = record.begun
-        if begun is not None:
-            if not record.has_begun and not begun.all():
-                machine.begin_all()
-            if seeds is not None:
-                machine.seed(self._world, begun, seeds[:: len(self.spec.agents)])
         sent = record.sent if flies else None
         flew = record.flown
+        if seeds is not None:
+            seeds = seeds[:: len(self.spec.agents)]
         try:
-            results, told = machine.step(sent, flew, begun, record.active)
-        except PhysicsError:
-            self.record.wait(flew)
+            if begun is not None and not record.has_begun and not begun.all():
+                machine.begin_all()
+            results, told = machine.step(sent, flew, begun, record.active, seeds)
+        except BaseException as error:
+            self._settle()  # the physics has gone on
+            if isinstance(error, PhysicsError):
+                record.wait(flew)
             raise
         if not record.has_begun:
             record.action = self.pipeline.actions.neutral()
@@ -112,11 +113,13 @@ class CompiledLoop(Loop):
         if self._is_inside:
             assert self._machine is not None
             self._is_inside = False
-            super().put(self._machine.state())
+            if self._record.has_begun:
+                super().put(self._machine.kept())
+                self._world.take()
 
     def state(self) -> Snapshot:
         """As `Loop.state`."""
-        if self._is_inside:
+        if self._is_inside and self._record.has_begun:
             assert self._machine is not None
             return self._machine.state()
         return super().state()

@@ -113,7 +113,6 @@ class Machine:
             _BEGIN: [self._traced("begun", pipeline.set_out)],
             _LAST: [
                 take,
-                self._traced("flown", pipeline.after),
                 self._traced("begun", pipeline.look),
                 *last,
             ],
@@ -142,11 +141,16 @@ class Machine:
         self._flags = flags, _BOOL, start, (second - start, 1)
 
     def step(
-        self, sent: np.ndarray | None, flown: Mask | None, begun: Mask | None, active: Mask | None
+        self,
+        sent: np.ndarray | None,
+        flown: Mask | None,
+        begun: Mask | None,
+        active: Mask | None,
+        seeds: Any = None,
     ) -> tuple[Named, Told]:
         """Run all regions. Returns what leaves the loop, by name, (N, ...), and `Loop.told`.
 
-        Actions (W, A, k), None if nobody flies; masks as of a `Record`.
+        Actions (W, A, k), None if nobody flies; masks as of a `Record`; seeds of worlds, (W,).
         """
         if self.tape is not None and sent is not None:
             self.tape.append(self.memory.copy())
@@ -163,9 +167,11 @@ class Machine:
         new = np.empty(self._size, np.uint8)
         first = new.ctypes.data
         places = [first, *self._places, *[first + start for start in self._starts]]
+        if sent is not None and not self.is_whole:
+            self._fly(flown, places)
+        if begun is not None and seeds is not None:
+            self._seed(begun, seeds)
         if not self.is_whole:
-            if sent is not None:
-                self._fly(flown, places)
             if begun is not None:
                 self._begin(begun, places)
             self._take(self._world.told())
@@ -200,11 +206,11 @@ class Machine:
         world = self._world
         try:
             self._code(_BEGIN, places)
-            world.restore(part_of(self._kept(), "Flight"))
+            world.restore(part_of(self.kept(), "Flight"))
             world.place(begun)
         except InputError:
             self.memory = before
-            world.restore(part_of(self._kept(), "Flight"))
+            world.restore(part_of(self.kept(), "Flight"))
             raise
 
     def _take(self, told: Named) -> None:
@@ -225,8 +231,9 @@ class Machine:
         memory.put("record/kept/waiting", everybody)
         memory.put("record/kept/episodes", 0 * memory.get("record/kept/episodes"))
 
-    def seed(self, world: World, begun: Mask, seeds: Any) -> None:
+    def _seed(self, begun: Mask, seeds: Any) -> None:
         """As `World.seed`."""
+        world = self._world
         random = world.random
         random.keys = self.memory.get(_KEYS)
         random.episode = self.memory.get(_EPISODE)
@@ -237,9 +244,10 @@ class Machine:
     def state(self) -> Snapshot:
         """As `Loop.state`."""
         hidden = self._world.hidden()
-        return self._kept() | {f"Flight/state/{name}": array for name, array in hidden.items()}
+        return self.kept() | {f"Flight/state/{name}": array for name, array in hidden.items()}
 
-    def _kept(self) -> Snapshot:
+    def kept(self) -> Snapshot:
+        """The part of `state` that is array code."""
         return {name: self.memory.get(name) for name in self._names}
 
     def restore(self, state: Arrays) -> None:

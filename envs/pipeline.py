@@ -31,7 +31,7 @@ class Pipeline:
         begin: What all of them do when an episode begins.
         observe: Steps from `Measure` on.
         flight: One of the stages; of worlds whose physics is apart it has the parts that follow.
-        before, after: `fly` before the physics, and after it.
+        before: `fly` before the physics.
         set_out, look: `begin` before the physics, and after it.
     """
 
@@ -64,7 +64,7 @@ class Pipeline:
         if "action_delay" in randomize.names:
             flying.append(ActionDelay(world, randomize.most_steps("action_delay"), neutral))
         self.flight = flight = Flight(world, parts, substeps, held)
-        flying += [flight, Clock()]
+        flying += [Clock(), flight]
 
         observing = self._observing(task, world, sensors, shape)
         if "observation_delay" in randomize.names:
@@ -79,9 +79,7 @@ class Pipeline:
         self.fly = [stage.step for stage in flying]
         self.begin = [stage.begin for stage in self.stages]
         self.observe = [stage.step for stage in observing]
-        number = flying.index(flight)
-        self.before = [*self.fly[:number], flight.control]
-        self.after = self.fly[number + 1 :]
+        self.before = [*self.fly[:-1], flight.control]
         self.set_out = []
         self.look = []
         for stage in self.stages:

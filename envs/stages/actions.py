@@ -77,7 +77,7 @@ class Receive(Stage):
 
     def begin(self, record: Record) -> None:
         """No action yet."""
-        record.action = self.neutral
+        record.action = record.received = self.neutral
 
     def step(self, record: Record) -> None:
         """At once, unless a later stage delays it."""

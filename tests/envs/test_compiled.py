@@ -165,6 +165,79 @@ def test_a_start_that_is_refused_changes_nothing() -> None:
     assert all(told.startswith("start: expected a height over") for _, told in refused)
 
 
+def test_a_start_that_is_refused_lets_the_others_fly() -> None:
+    """Their next action meets the state that they have then, and their step is counted."""
+    options = {"effects": {"payload": 1.0, "cable": 4.8}, "start_band": 1.0, "action": "attitude"}
+    ours, theirs = both(Case(HOVER, options))
+    actions = np.zeros((WORLDS, 4), np.float32)
+    first = np.arange(WORLDS) == 0
+    refused = 0
+    for loop in (ours, theirs):
+        loop.advance(actions, first | True, [8, 9, 10])
+        refused = 0
+        for seed in range(6):
+            try:
+                loop.advance(actions, first, [seed] * WORLDS)
+            except InputError:
+                refused += 1
+    assert 0 < refused < 6
+    check_same(ours, theirs)
+    assert ours.steps[1] == 6
+
+
+def test_an_error_in_the_middle_of_a_step_leaves_the_state_of_the_physics(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Also the seeds of worlds that did not begin for it."""
+    ours, theirs = both(Case(HOVER, {"action": "attitude"}))
+    actions = np.full((WORLDS, 4), 0.1, np.float32)
+    last = np.arange(WORLDS) == 2
+    for loop in (ours, theirs):
+        loop.advance(actions, last | True, [1, 2, 3])
+        loop.advance(actions)
+        world = loop.world
+        fly = world.fly
+
+        def interrupted(*given: Any, fly: Any = fly) -> None:
+            fly(*given)
+            raise KeyboardInterrupt
+
+        with monkeypatch.context() as patch:
+            patch.setattr(world, "fly", interrupted)
+            with pytest.raises(KeyboardInterrupt):
+                loop.advance(actions)
+        loop.advance(actions)
+    assert bits(ours.observations) == bits(theirs.observations)
+    for loop in (ours, theirs):
+        loop.world.state.velocity[0] = np.nan
+        with pytest.raises(PhysicsError):
+            loop.advance(actions, last, [7, 7, 7])
+        loop.advance(actions, last | True)
+    check_same(ours, theirs)
+
+
+@pytest.mark.parametrize("backend", ["mujoco", "rigid"])
+def test_a_loop_that_is_prepared_has_no_episode_yet(backend: str) -> None:
+    ours, theirs = both(Case(HOVER, {"backend": backend}))
+    ours.prepare()
+    assert not ours.record.has_begun
+    ours.prepare()
+    assert ours.snapshot().keys() == theirs.snapshot().keys()
+    first = np.arange(WORLDS) == 0
+    for loop in (ours, theirs):
+        with pytest.raises(gym.error.ResetNeeded, match=r"expected a call of reset\(\) first"):
+            _ = loop.telemetry
+        loop.advance(np.zeros((WORLDS, 4), np.float32), first, None, ~first)
+    check_same(ours, theirs)
+    before = ours.snapshot()
+    ours.restore(before)
+    before["Flight/state/thrust"] += 1.0
+    check_same(ours, theirs)
+    ours.advance(np.zeros((WORLDS, 4), np.float32), ~first, None, first)
+    ours.close()
+    assert np.array_equal(ours.steps, [0, 0, 0])
+
+
 class Branching(registry.task_type(HOVER)):  # type: ignore[misc]
     """A task with a branch on an array."""
 
