@@ -222,7 +222,8 @@ class World(NotCopied):
         self.random.restore(part_of(arrays, "random"))
         parameters = part_of(arrays, "parameters")
         self.parameters = {name: array.copy() for name, array in parameters.items()}
-        self._restore(part_of(arrays, "state"))
+        state = part_of(arrays, "state")
+        self._restore({name: array.copy() for name, array in state.items()})
         if self.effects is not None:
             self.effects.restore(part_of(arrays, "effects"))
             self.effects.take(self.parameters)
@@ -268,7 +269,7 @@ class World(NotCopied):
         raise NotImplementedError
 
     def _restore(self, arrays: Arrays) -> None:
-        """Put copies of those back; the parameters are as they were."""
+        """Put those back, which are copies; the parameters are as they were."""
         raise NotImplementedError
 
     def _draw_parameters(self, mask: Array) -> None:

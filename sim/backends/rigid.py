@@ -133,13 +133,12 @@ class RigidWorld(World):
         return {name: array for name, array in arrays.items() if array is not None}
 
     def _restore(self, arrays: Arrays) -> None:
-        copies = {name: array.copy() for name, array in arrays.items()}
         for name in _OF_STATE:
-            setattr(self.state, name, copies.get(name))
-        self.acting = copies["acting"]
-        self.wrench = copies.get("wrench")
-        self.bad = copies["bad"]
-        self._show(copies["motion"])
+            setattr(self.state, name, arrays.get(name))
+        self.acting = arrays["acting"]
+        self.wrench = arrays.get("wrench")
+        self.bad = arrays["bad"]
+        self._show(arrays["motion"])
         self._vary(self.parameters)
 
     def acceleration(self) -> Array:
