@@ -232,14 +232,15 @@ class Loop:
     @property
     def metrics(self) -> dict[str, Floats]:
         """Metrics of the task by name, each of shape (N,)."""
-        return _per_drone(self.record.shape, self.record.metrics)
+        record = self._begun()
+        return _per_drone(record.shape, record.metrics)
 
     @property
     def headline(self) -> Floats:
         """The metric that decides, shape (N,); NaN where the task has none."""
         if self._headline is None:
             metric = self.spec.headline
-            found = self.record.metrics[metric.name] if metric else np.array(np.nan)
+            found = self._begun().metrics[metric.name] if metric else np.array(np.nan)
             shape = self.record.shape if metric else (self.num_envs,)
             self._headline = _per_drone(shape, {"": found})[""]
         return self._headline
@@ -257,7 +258,7 @@ class Loop:
     def told(self) -> Told:
         """Gives telemetry and terms of the reward as they are now, also later."""
         if self._told is None:
-            record = self.record
+            record = self._begun()
             terms = record.terms
             reads = {one.name: one.read(self) for one in self.quantities}
 
@@ -267,6 +268,13 @@ class Loop:
 
             self._told = told
         return self._told
+
+    def _begun(self) -> Record:
+        """The record. Raises `ResetNeeded` before the first episode."""
+        record = self.record
+        if not record.has_begun:
+            raise gym.error.ResetNeeded("telemetry: expected a call of reset() first")
+        return record
 
     def _take_told(self, told: Told | None) -> None:
         """Take what is told of a step; None: what record, world and task say when asked."""
@@ -281,6 +289,7 @@ class Loop:
 
     def close(self) -> None:
         """Release threads and memory; what the last step gave can be read on."""
+        self._settle()
         for stage in self.pipeline.stages:
             stage.close()
         self._closed = True

@@ -132,7 +132,7 @@ class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Observation, ArrayLike, np.nd
 
     @property
     def telemetry(self) -> Arrays:  # type: ignore[override]  # made when it is asked for
-        """By name, float64, shape (N, *shape)."""
+        """By name, float64, shape (N, *shape). Raises `ResetNeeded` before the first reset."""
         return self.loop.telemetry
 
     def _told(self) -> Told:
