@@ -18,6 +18,7 @@ from ..envs.autoreset import AdvancingVectorEnv
 from ..envs.config import BackendConfig
 from ..flights.folders import locked
 from ..models import Backend, InputError
+from ..models.errors import require
 from ..models.files import software_versions, write_json, write_whole
 from ..training.settings import Run
 from ..training.training import Training, config_of, is_finished
@@ -42,6 +43,7 @@ _UPDATE_WITHIN = 2.0  # s
 
 def begin(command: "Train") -> int:
     """A new training; the exit status."""
+    require("safetensors", "train", "writing checkpoints")  # before it trains
     task = command.preset_of or command.env_id
     base = find_preset(command.algorithm, command.preset, task)
     if not base.fits:

@@ -106,11 +106,10 @@ def find_in_package(name: str, folder: Path) -> Path | None:
 @cache
 def software_versions() -> dict[str, str]:
     """Versions of the installed packages that the numbers depend on."""
-    from importlib.metadata import PackageNotFoundError, distribution  # slow to import
+    from importlib.metadata import PackageNotFoundError, version  # slow to import
 
     versions = {"python": platform.python_version()}
     for name in ("rotorgram", "mujoco", "gymnasium", "numpy", "torch", "stable-baselines3"):
         with suppress(PackageNotFoundError):
-            about = distribution(name).read_text("METADATA") or ""  # `version` parses all of it
-            versions[name] = about.partition("\nVersion: ")[2].partition("\n")[0]
+            versions[name] = version(name)
     return versions

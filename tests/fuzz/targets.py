@@ -10,6 +10,7 @@ exception but `DecodeError` from a codec, any from a link, and any promise of do
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from dataclasses import fields
 from itertools import count, product
 from typing import Any, Final
 
@@ -55,7 +56,7 @@ LAYOUT: Final = LAYOUTS["one"]
 
 def content(message: Message) -> list[object]:
     """Every field, arrays as shape, kind and bits."""
-    return [type(message)] + [_content(getattr(message, n)) for n in type(message).__slots__]
+    return [type(message)] + [_content(getattr(message, one.name)) for one in fields(message)]
 
 
 def _content(value: Any) -> object:

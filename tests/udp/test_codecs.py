@@ -2,7 +2,7 @@
 
 import math
 import struct
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -92,9 +92,9 @@ def assert_comes_back(message: State | Command, of: Layout, size: int) -> None:
     back = binary.decode(data, of)
     assert len(data) == size
     assert type(back) is type(message)
-    for name in type(message).__slots__:
-        there = getattr(message, name)
-        here = getattr(back, name)
+    for field in fields(message):
+        there = getattr(message, field.name)
+        here = getattr(back, field.name)
         if isinstance(there, np.ndarray):
             assert not here.flags.writeable
         np.testing.assert_equal(here, there)
