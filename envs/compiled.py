@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..models.errors import InputError, one_line
-from ..sim import PhysicsError
+from ..sim import Array, PhysicsError
 from ..sim.snapshots import Arrays, Snapshot
 from ..sim.state import some
 from .config import EnvConfig
@@ -19,6 +19,7 @@ from .stages.ends import refuse_unfit
 if TYPE_CHECKING:
     from .machine import Machine
 
+_STARTS = 16
 _TRACER = ("numpy", "rotorgram.sim.compile")  # modules that are not to blame
 _OURS = ("numpy", "rotorgram")
 
@@ -99,7 +100,7 @@ class CompiledLoop(Loop):
         loop = Loop(replace(config, backend=replace(config.backend, compiled=False)))
         neutral = loop.pipeline.actions.neutral()
         try:
-            loop.advance(neutral, np.ones(config.drones, bool))
+            _begin(loop, neutral)
             loop.advance(neutral)
             return Machine(loop, self._world)
         except InputError as error:  # which NumPy will raise
@@ -150,6 +151,17 @@ class CompiledLoop(Loop):
             record.wait(flew)
             raise
         refuse_unfit(record, self.config.env_id)
+
+
+def _begin(loop: Loop, actions: Array) -> None:
+    """Begin an episode. Raises `InputError` if many starts are refused."""
+    everybody = np.ones(loop.num_envs, bool)
+    for seed in range(_STARTS):
+        try:
+            return loop.advance(actions, everybody, [seed] * loop.num_envs)
+        except InputError as error:
+            refused = error
+    raise refused
 
 
 def place_of(error: Exception) -> str:
