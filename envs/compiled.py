@@ -158,9 +158,11 @@ def _begin(loop: Loop, actions: Array) -> None:
     everybody = np.ones(loop.num_envs, bool)
     for seed in range(_STARTS):
         try:
-            return loop.advance(actions, everybody, [seed] * loop.num_envs)
+            loop.advance(actions, everybody, [seed] * loop.num_envs)
         except InputError as error:
             refused = error
+        else:
+            return
     raise refused
 
 

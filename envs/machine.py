@@ -78,7 +78,7 @@ class Machine:
         given |= _fields(self._pushed()) | _fields({_PHYSICS + name: x for name, x in seen.items()})
         self._outside = given | _fields(self._seen())
         self._layouts = layout, self._told
-        self._calls = [(_code(call), call) for call in loop.pipeline.flight.calls()]
+        self._calls = [(_before(call), call) for call in loop.pipeline.flight.calls()]
         self._calls[0] = _FIRST, self._calls[0][1]
         steps = self._regions()
         size = sum(len(one.operations()) for regions in steps.values() for one in regions)
@@ -111,11 +111,7 @@ class Machine:
         regions = {
             _FIRST: [self._traced("flown", pipeline.before), self._pushing()],
             _BEGIN: [self._traced("begun", pipeline.set_out)],
-            _LAST: [
-                take,
-                self._traced("begun", pipeline.look),
-                *last,
-            ],
+            _LAST: [take, self._traced("begun", pipeline.sense), *last],
         }
         for code, call in self._calls:
             if code and code not in regions:
@@ -175,14 +171,14 @@ class Machine:
             if begun is not None:
                 self._begin(begun, places)
             self._take(self._world.told())
-        self._code(_LAST, places)
+        self._call(_LAST, places)
         shape, dtype, start, strides = self._flags
         results = dict(zip(_FLAGS, np.ndarray(shape, dtype, new, start, strides), strict=True))
         for name, shape, dtype, start in self._results:
             results[name] = np.ndarray(shape, dtype, new, start)
         return results, lambda: self._read(new)
 
-    def _code(self, name: str, places: list[int]) -> None:
+    def _call(self, name: str, places: list[int]) -> None:
         self._codes[name](self.memory.blocks, self.memory.address, *places)
 
     def _fly(self, flown: Mask | None, places: list[int]) -> None:
@@ -195,7 +191,7 @@ class Machine:
             if code:
                 if code != _FIRST:
                     self._take(world.told(asked=False))
-                self._code(code, places)
+                self._call(code, places)
                 world.acting = acting
                 world.wrench = None if wrench is None else wrench[:worlds]
             world.fly(call, flown)
@@ -205,7 +201,7 @@ class Machine:
         before = self.memory.copy()
         world = self._world
         try:
-            self._code(_BEGIN, places)
+            self._call(_BEGIN, places)
             world.restore(part_of(self.kept(), "Flight"))
             world.place(begun)
         except InputError:
@@ -345,7 +341,7 @@ class Machine:
         return Region("", program, stores)
 
 
-def _code(call: Call) -> str:
+def _before(call: Call) -> str:
     """The code before a call of the physics that is not the first, if there is any."""
     if call.commands:
         return _CONTROL

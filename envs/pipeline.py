@@ -32,7 +32,7 @@ class Pipeline:
         observe: Steps from `Measure` on.
         flight: One of the stages; of worlds whose physics is apart it has the parts that follow.
         before: `fly` before the physics.
-        set_out, look: `begin` before the physics, and after it.
+        set_out, sense: `begin` before the physics, and after it.
     """
 
     def __init__(
@@ -81,10 +81,10 @@ class Pipeline:
         self.observe = [stage.step for stage in observing]
         self.before = [*self.fly[:-1], flight.control]
         self.set_out = []
-        self.look = []
+        self.sense = []
         for stage in self.stages:
             if isinstance(stage, Sensing):
-                self.look.append(stage.begin)
+                self.sense.append(stage.begin)
             else:
                 self.set_out.append(flight.set_out if stage is flight else stage.begin)
 

@@ -74,7 +74,7 @@ class World(NotCopied):
     """
 
     is_apart: ClassVar[bool] = False
-    """Whether the physics is no array code."""
+    """Whether the physics is code of its own, which cannot be compiled with the stages."""
 
     state: WorldState
     acting: Array
