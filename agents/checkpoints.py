@@ -24,14 +24,14 @@ from ..models.errors import InputError, one_line, require, shortened
 from ..models.fields import Limits, check_fields, immutable
 from ..models.files import software_versions, write_whole
 from .config import Config
-from .episodes import Episode, Position, ResumeError
+from .episodes import Episode, Flown, Position, ResumeError
 from .networks import ByName, Floats, named, part_of
 from .policies import NetworkPolicy
 from .presets import preset
 
 FORMAT = 5
 _PLAIN = ("algorithm", "config", "backend", "seed", "env_steps", "versions")
-_POSITION = ("actions", "observations", "numbers", "lengths", "first_steps")
+
 _DTYPES: dict[Any, type[np.generic]] = {int: np.int64, float: np.float64, bool: np.bool_}
 _COLUMNS = {one.name: _DTYPES[one.type] for one in fields(Episode)}
 _CHECKSUM = re.compile(rb'"sha256":"([0-9a-f]{64})"')
@@ -79,7 +79,7 @@ class Checkpoint:
     @property
     def num_envs(self) -> int:
         """Drones that it trains with; 0 of a policy alone."""
-        return len(self.position.numbers)
+        return len(self.position.flown.numbers) if self.position.flown else 0
 
     @property
     def hyperparameters(self) -> Config:
@@ -88,8 +88,8 @@ class Checkpoint:
 
     def policy_alone(self) -> "Checkpoint":
         """Without the state and the position, which only a training needs."""
-        flown = Position(env_steps=self.position.env_steps, seconds=self.position.seconds)
-        return replace(self, state={}, position=flown)
+        position = replace(self.position, flown=None, episodes=())
+        return replace(self, state={}, position=position)
 
     def check_resumable(self) -> None:
         """Raises `ResumeError` for a policy alone."""
@@ -115,9 +115,9 @@ def store(checkpoint: Checkpoint, path: Path) -> None:
     """
     where = checkpoint.position
     arrays = named("policy/", dict(checkpoint.actor))
-    if checkpoint.num_envs:
+    if where.flown:
         arrays |= named("state/", checkpoint.state)
-        arrays |= named("position/", {name: getattr(where, name) for name in _POSITION})
+        arrays |= named("position/", where.flown._asdict())
         for name, dtype in _COLUMNS.items():
             column = [getattr(episode, name) for episode in where.episodes]
             arrays[f"episodes/{name}"] = np.array(column, dtype)
@@ -140,14 +140,15 @@ def store(checkpoint: Checkpoint, path: Path) -> None:
 def load(path: Path) -> Checkpoint:
     """Read a checkpoint. Raises `CheckpointError`, `MissingPackage`, or `OSError`: unreadable."""
     numpy = require("safetensors.numpy", "train", "reading checkpoints")
-    damage = require("safetensors", "train", "reading checkpoints").SafetensorError
+    from safetensors import SafetensorError
+
     if not path.is_file():
         raise CheckpointError(f"checkpoint: expected a file, got {path}, where there is none")
     try:
         return _read(path.read_bytes(), numpy.load)
     except InputError as error:
         raise CheckpointError(f"{path}: {error}") from None
-    except (damage, *_MALFORMED) as error:
+    except (SafetensorError, *_MALFORMED) as error:
         reason = one_line(error)
         raise CheckpointError(
             f"{path}: expected a rotorgram checkpoint, got one with a wrong part ({reason:.200})"
@@ -198,8 +199,8 @@ def _position(progress: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> 
         return position
     rows = zip(*(columns[name].tolist() for name in _COLUMNS), strict=True)
     episodes = [Episode(*row) for row in rows]
-    flown: dict[str, Any] = part_of(arrays, "position/")
-    return replace(position, episodes=tuple(episodes), **flown)
+    flown = Flown(**part_of(arrays, "position/"))
+    return replace(position, episodes=tuple(episodes), flown=flown)
 
 
 def _with_checksum(data: bytes, checksum: bytes) -> bytes:

@@ -6,9 +6,9 @@ keeps no simulator's state: it resets to the same seed and repeats the same acti
 
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import Annotated, Any
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,27 +64,30 @@ class Episode:
     """Whether it was truncated because its simulator was lost, not by its time limit."""
 
 
-def _none() -> Any:
-    return np.zeros(0, np.int64)
+class Flown(NamedTuple):
+    """What N drones have flown of their running episodes."""
+
+    actions: np.ndarray
+    """Actions of the env: float32, shape (t, N, k), or int64, shape (t, N), for the t steps of the
+    longest episode."""
+    observations: Floats
+    """Observations after the last of them, flat: float32, shape (N, n)."""
+    numbers: Counts
+    """Of the episodes: int64, shape (N,), as their steps in `lengths`, and the env steps of the run
+    before each in `first_steps`."""
+    lengths: Counts
+    first_steps: Counts
 
 
 @immutable
 class Position:
-    """Position of a run of N drones; N is 0 of a policy alone, which has no arrays."""
+    """Position of a run."""
 
     env_steps: Annotated[int, Limits(0, 2**62, whole=True)]
     seconds: Annotated[float, Limits(0.0)]
     """Wall time since training began, s."""
-    actions: np.ndarray = field(default_factory=_none)
-    """Actions of the env: float32, shape (t, N, k), or int64, shape (t, N), for the t steps of the
-    longest running episode."""
-    observations: Floats = field(default_factory=_none)
-    """Observations after the last of them, flat: float32, shape (N, n)."""
-    numbers: Counts = field(default_factory=_none)
-    """Of the running episodes: int64, shape (N,), as their steps in `lengths`, and the env steps of
-    the run before each in `first_steps`."""
-    lengths: Counts = field(default_factory=_none)
-    first_steps: Counts = field(default_factory=_none)
+    flown: Flown | None = None
+    """None of a policy alone."""
     episodes: tuple[Episode, ...] = ()
     """Ended episodes, in the order of their ends."""
 
@@ -196,14 +199,17 @@ class EpisodeRecorder:
         """The current position of the run."""
         longest = int(self._lengths.max())
         recent = self._flown[len(self._flown) - longest :]
-        return Position(
-            env_steps=self.env_steps,
-            seconds=self.seconds,
+        flown = Flown(
             actions=np.array(recent or [self._still])[: len(recent)],
             observations=self.observations,
             numbers=self._numbers.copy(),
             lengths=self._lengths.copy(),
             first_steps=self._first_steps.copy(),
+        )
+        return Position(
+            env_steps=self.env_steps,
+            seconds=self.seconds,
+            flown=flown,
             episodes=tuple(self.episodes),
         )
 
@@ -214,22 +220,23 @@ class EpisodeRecorder:
         than the longest is frozen until its turn. `steps` begins with these steps. Raises
         `ResumeError` if the env does not repeat what it did then.
         """
-        if len(position.numbers) != self.num_envs:
+        flown = position.flown
+        drones = len(flown.numbers) if flown else 0
+        if flown is None or drones != self.num_envs:
             raise ResumeError(
-                f"resume: expected a training with {self.num_envs} drones, "
-                f"got one with {len(position.numbers)}"
+                f"resume: expected a training with {self.num_envs} drones, got one with {drones}"
             )
-        if position.numbers[0] < 0:  # it had not begun
+        if flown.numbers[0] < 0:  # it had not begun
             return
         self.episodes = list(position.episodes)
-        self._numbers[:] = position.numbers
-        self._first_steps[:] = position.first_steps
+        self._numbers[:] = flown.numbers
+        self._first_steps[:] = flown.first_steps
         self._draw_seeds(range(self.num_envs))
-        while self._repeat(position):  # a simulator was lost: once more, with the next
+        while self._repeat(flown):  # a simulator was lost: once more, with the next
             pass
-        expected = position.observations
+        expected = flown.observations
         got = self.observations
-        if (self._lengths != position.lengths).any() or got.tobytes() != expected.tobytes():
+        if (self._lengths != flown.lengths).any() or got.tobytes() != expected.tobytes():
             raise ResumeError(
                 "resume: the env does not repeat the episodes that were interrupted: "
                 f"expected the observations {expected.tolist()[:3]}, got {got.tolist()[:3]}"
@@ -252,16 +259,16 @@ class EpisodeRecorder:
             "thrust": thrust,
         }
 
-    def _repeat(self, position: Position) -> bool:
+    def _repeat(self, flown: Flown) -> bool:
         """Fly the actions of a position; whether a simulator was lost."""
         env = self.env
         self._forget(np.arange(self.num_envs))
         self._flown = []
         self._steps = []
         env.reset(seed=self._seeds.tolist())
-        lengths = position.lengths.reshape(-1, self._together).max(1).repeat(self._together)
-        for step, actions in enumerate(position.actions):
-            frozen = lengths < len(position.actions) - step
+        lengths = flown.lengths.reshape(-1, self._together).max(1).repeat(self._together)
+        for step, actions in enumerate(flown.actions):
+            frozen = lengths < len(flown.actions) - step
             idle = self._idle(frozen)
             env.advance(actions, None, None, frozen)
             if env.lost.any():
@@ -317,16 +324,10 @@ class EpisodeRecorder:
     def _keep_episodes(self, ended: Mask) -> None:
         self._take_out(ended)
         flown = ended & (self._lengths > 0)  # others were lost before their first step
-        for drone in np.flatnonzero(flown).tolist():
-            self._keep_episode(drone)
-        keep = int(np.max(self._lengths, where=~ended, initial=0))
-        self._flown = self._flown[len(self._flown) - keep :]
-
-    def _keep_episode(self, drone: int) -> None:
         env = self.env
-        length = int(self._lengths[drone])
-        self.episodes.append(
-            Episode(
+        for drone in np.flatnonzero(flown).tolist():
+            length = int(self._lengths[drone])
+            episode = Episode(
                 episode=int(self._numbers[drone]),
                 first_step=int(self._first_steps[drone]),
                 length=length,
@@ -337,4 +338,6 @@ class EpisodeRecorder:
                 seconds=self.seconds,
                 simulator_lost=bool(env.lost[drone]),
             )
-        )
+            self.episodes.append(episode)
+        keep = int(np.max(self._lengths, where=~ended, initial=0))
+        self._flown = self._flown[len(self._flown) - keep :]

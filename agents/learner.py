@@ -10,7 +10,7 @@ import numpy as np
 
 from .config import Config
 from .episodes import EpisodeRecorder
-from .networks import ByName, Floats, Weights, make_network, named
+from .networks import ByName, Weights, make_network, named
 from .optimizers import Adam
 from .policies import NetworkPolicy, flat_size
 from .rollouts import Collector, Diverged, Rollout
@@ -95,13 +95,9 @@ class Learner:
             if not on_update():
                 return
 
-    def actor(self) -> dict[str, Floats]:
-        """Weights of the policy, as a checkpoint has them: copies."""
-        return self._actor.arrays()
-
     def policy(self) -> NetworkPolicy:
-        """The current policy, without exploration: a copy."""
-        return NetworkPolicy.load(self.actor(), self.spec, self.config)
+        """The current policy: a copy."""
+        return NetworkPolicy.load(self._actor.weights.arrays, self.spec, self.config)
 
     def state(self) -> ByName:
         """All that the next update depends on: copies."""

@@ -121,7 +121,7 @@ class NetworkPolicy(Module):
 
     @classmethod
     def load(cls, weights: Mapping[str, Floats], spec: EnvSpec, config: Config) -> "NetworkPolicy":
-        """The policy of some weights, as `arrays` gives them.
+        """The policy of some weights, `weights.arrays` of another: copies.
 
         Raises `InputError` unless they are those that the env and the config need.
         """
@@ -147,10 +147,6 @@ class NetworkPolicy(Module):
         """Last layer near zero: the first policy gives the middle of the action space."""
         self.network.initialise(rng, 0.01)
         self.head.initialise(log_std)
-
-    def arrays(self) -> dict[str, Floats]:
-        """Copies of all that `load` needs, by name."""
-        return {name: array.copy() for name, array in self.weights.arrays.items()}
 
     def reset(self) -> None:
         """Nothing of an episode is kept."""

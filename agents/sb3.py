@@ -227,8 +227,8 @@ class SB3Agent:
             updates = int(self.scalars().get("train/n_updates", 1))
             raise Diverged(f"weights are not finite after update {updates}")
 
-    def actor(self) -> ByName:
-        """Weights of the policy, under our names."""
+    def policy(self) -> NetworkPolicy:
+        """The current policy, without exploration: a copy."""
         parameters = self.model.policy.state_dict()
         network = ("mlp_extractor.policy_net.", "action_net.")
         if isinstance(self._config, SACConfig):
@@ -237,13 +237,10 @@ class SB3Agent:
         pairs = zip(layers[0::2], layers[1::2], strict=True)
         weights = [np.column_stack((bias, weight)) for weight, bias in pairs]
         if "log_std" in parameters:
-            weights.append(parameters["log_std"].numpy().copy())
-        ours = NetworkPolicy(self.spec, self._config).shapes
-        return dict(zip(ours, weights, strict=True))
-
-    def policy(self) -> NetworkPolicy:
-        """The current policy, without exploration: a copy."""
-        return NetworkPolicy.load(self.actor(), self.spec, self._config)
+            weights.append(parameters["log_std"].numpy())
+        names = NetworkPolicy(self.spec, self._config).shapes
+        ours = dict(zip(names, weights, strict=True))
+        return NetworkPolicy.load(ours, self.spec, self._config)
 
     def state(self) -> ByName:
         """Nothing: no training goes on from it."""

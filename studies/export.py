@@ -20,7 +20,8 @@ from typing import Final
 import numpy as np
 import onnxruntime
 from measuring import RESULTS, in_turns, options, write
-from rotorgram.agents import Config
+from rotorgram.agents import Checkpoint, Config
+from rotorgram.agents.episodes import Position
 from rotorgram.agents.export import TARGETS, c, metadata, onnx
 from rotorgram.agents.policies import NetworkPolicy, flat_size
 from rotorgram.envs.config import EnvConfig
@@ -95,7 +96,9 @@ def compiled(*words: object) -> None:
 
 def clocks(policy: NetworkPolicy, folder: Path) -> tuple[dict[str, Clock], dict[str, int]]:
     """Of each target, and the bytes of its file."""
-    told = metadata(policy.spec, algorithm="a2c", seed=0, env_steps=0)
+    position = Position(env_steps=0, seconds=0.0)
+    about = {"algorithm": "a2c", "config": {}, "seed": 0, "env_steps": 0, "position": position}
+    told = metadata(Checkpoint(spec=policy.spec, actor={}, state={}, **about))
     files = {}
     for target, module in {"onnx": onnx, "c": c}.items():
         files[target] = folder / TARGETS[target]

@@ -182,7 +182,7 @@ class Training:
             backend=(self.env_config or self.run.env).backend.name,
             seed=self.run.seed,
             env_steps=self.run.env_steps,
-            actor=self.agent.actor(),
+            actor=self.agent.policy().weights.arrays,
             state=self.agent.state(),
             position=self.log.position(),
         )

@@ -10,7 +10,6 @@ from importlib import import_module
 
 import numpy as np
 
-from ...envs.spec import EnvSpec
 from ...models.errors import InputError, require
 from ..checkpoints import Checkpoint
 from ..networks import Affine, Relu, Tanh
@@ -27,7 +26,7 @@ _FAR = 100.0
 """Observations that a policy is tried with, and their largest numbers where they have no bound."""
 
 
-_SPEC = ("env_id", "options", "control_period", "vehicle", "vehicle_hash", "observation")
+_SPEC = ("env_id", "options", "control_period", "vehicle", "vehicle_hash", "observation", "action")
 
 
 def export(checkpoint: Checkpoint, target: str) -> bytes:
@@ -39,12 +38,6 @@ def export(checkpoint: Checkpoint, target: str) -> bytes:
     if target == "onnx":
         require("onnx", "export", "--to onnx")
     module = import_module(f"{__name__}.{target}")
-    facts = metadata(
-        checkpoint.spec,
-        algorithm=checkpoint.algorithm,
-        seed=checkpoint.seed,
-        env_steps=checkpoint.position.env_steps,
-    )
     policy = checkpoint.policy()
     for layer in policy.network.layers:
         if not isinstance(layer, Affine | Relu | Tanh):
@@ -52,7 +45,7 @@ def export(checkpoint: Checkpoint, target: str) -> bytes:
                 f"export: expected layers of affine, relu and tanh, got {type(layer).__name__}"
             )
     _check_finite(policy)
-    content: bytes = module.write(policy, facts)
+    content: bytes = module.write(policy, metadata(checkpoint))
     return content
 
 
@@ -66,7 +59,7 @@ def _check_finite(policy: NetworkPolicy) -> None:
         raise InputError("policy: expected finite actions, got NaN or infinity: training diverged")
 
 
-def metadata(spec: EnvSpec, *, algorithm: str, seed: int, env_steps: int) -> dict[str, str]:
+def metadata(checkpoint: Checkpoint) -> dict[str, str]:
     """What a reader of the file must know, by name.
 
     `format`, `algorithm`, `seed`, `env_steps` (trained so far), and of the spec `env_id`,
@@ -74,14 +67,15 @@ def metadata(spec: EnvSpec, *, algorithm: str, seed: int, env_steps: int) -> dic
     the length of the observation as the file takes it: all arrays of the spec, one after the other.
     A value that is not a text is JSON.
     """
+    spec = checkpoint.spec
     fields = json.loads(spec.to_json())
     facts = {
         "format": FORMAT,
-        "algorithm": algorithm,
-        "seed": seed,
-        "env_steps": env_steps,
+        "algorithm": checkpoint.algorithm,
+        "seed": checkpoint.seed,
+        "env_steps": checkpoint.position.env_steps,
         "inputs": flat_size(spec),
-        **{name: fields[name] for name in (*_SPEC, "action")},
+        **{name: fields[name] for name in _SPEC},
     }
     return {
         name: value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)

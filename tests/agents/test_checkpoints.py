@@ -53,7 +53,7 @@ def checkpoint_of(algorithm: str, log: EpisodeRecorder, agent: Learner) -> Check
         spec=log.spec,
         seed=log.run_seed,
         env_steps=TOTAL,
-        actor=agent.actor(),
+        actor=agent.policy().weights.arrays,
         state=agent.state(),
         position=log.position(),
     )
@@ -143,9 +143,10 @@ def test_an_env_that_does_not_repeat_is_refused(kept: Checkpoint) -> None:
     log = log_of(3)
     with pytest.raises(ResumeError, match="expected a training with 3 drones, got one with 2"):
         resume_agent(kept, log)
-    actions = kept.position.actions * 0.5
-    position = replace(kept.position, actions=actions)
-    crafted = replace(kept, position=position)
+    flown = kept.position.flown
+    assert flown
+    flown = flown._replace(actions=flown.actions * 0.5)
+    crafted = replace(kept, position=replace(kept.position, flown=flown))
     log = log_of(2)
     with pytest.raises(ResumeError, match="does not repeat the episodes"):
         resume_agent(crafted, log)
@@ -288,7 +289,10 @@ def test_a_config_that_does_not_fit_is_refused(config: Any, ppo_kept: Checkpoint
 def test_a_position_that_does_not_fit_is_refused(
     name: str, shape: tuple[int, ...], kept: Checkpoint
 ) -> None:
-    position = replace(kept.position, **{name: np.zeros(shape, np.float32)})
+    flown = kept.position.flown
+    assert flown
+    flown = flown._replace(**{name: np.zeros(shape, np.float32)})
+    position = replace(kept.position, flown=flown)
     with pytest.raises(InputError):
         resume_agent(replace(kept, position=position), log_of(2))
 

@@ -16,7 +16,8 @@ from drones import cases
 from nets import policy_of as loaded
 from nets import random_policy
 from peers import ANY, Running
-from rotorgram.agents import load, store
+from rotorgram.agents import Checkpoint, load, store
+from rotorgram.agents.episodes import Position
 from rotorgram.agents.export import TARGETS, export, metadata
 from rotorgram.agents.export import c as c_target
 from rotorgram.agents.export import onnx as onnx_target
@@ -72,7 +73,9 @@ def hover(**keywords: str) -> EnvSpec:
 
 
 def told_of(spec: EnvSpec) -> dict[str, str]:
-    return metadata(spec, algorithm="a2c", seed=7, env_steps=4096)
+    position = Position(env_steps=4096, seconds=0.0)
+    about = {"algorithm": "a2c", "config": {}, "seed": 7, "env_steps": 4096, "position": position}
+    return metadata(Checkpoint(spec=spec, actor={}, state={}, **about))  # type: ignore[arg-type]
 
 
 def observations_of(spec: EnvSpec, rows: int = ROWS) -> np.ndarray:
@@ -330,7 +333,7 @@ def evil(trained: Path, tmp_path: Path) -> dict[str, Path]:
     action = ArraySpec(name="??/", shape=(2,), unit="*/", components=("\\", "/*"))
     named = {"env_id": WICKED, "vehicle": WICKED[::-1], "options": OPTIONS}
     spec = replace(kept.spec, **named, observation=(seen,), action=action)
-    crafted = replace(kept, spec=spec, actor=policy_of(spec).arrays())
+    crafted = replace(kept, spec=spec, actor=policy_of(spec).weights.arrays)
     files = {target: tmp_path / TARGETS[target] for target in TARGETS}
     for target, path in files.items():
         path.write_bytes(export(crafted, target))

@@ -137,7 +137,7 @@ def test_learning_rate_falls_from_its_full_value_linearly(algorithm: str, anneal
 
 def weights_of_sb3(theirs: Any) -> dict[str, np.ndarray]:
     """The weights of SB3's agent by our names."""
-    weights = {f"actor.{name}": array for name, array in theirs.actor().items()}
+    weights = {f"actor.{name}": array for name, array in theirs.policy().weights.arrays.items()}
     tensors = theirs.model.policy.state_dict()
     for number, name in enumerate(("mlp_extractor.value_net.0", "value_net")):
         columns = tensors[f"{name}.bias"], tensors[f"{name}.weight"]
@@ -217,8 +217,8 @@ def test_sb3_and_ours_make_the_same_updates_of_the_same_experience(algorithm: st
         assert max(fractions) > 0.1
     assert any(e.truncated for e in log.episodes)
     assert any(e.terminated for e in log.episodes)
-    actor = ours.actor()
-    for name, expected in theirs.actor().items():
+    actor = ours.policy().weights.arrays
+    for name, expected in theirs.policy().weights.arrays.items():
         np.testing.assert_allclose(actor[name], expected, atol=2e-4, err_msg=name)
 
 
@@ -342,11 +342,13 @@ def test_every_agent_trains_with_every_preset_and_kind_of_action(
     config = preset(algorithm, name)
     agent = make_agent(algorithm, log, config, 0)
     rollouts = 1024 if "ppo" in algorithm else 512
-    before = agent.actor()
+    before = agent.policy().weights.arrays
     steps = 150 if name == "paper" else rollouts
     agent.train(log, steps, lambda: True)
     assert log.env_steps == steps
-    changed = [not np.array_equal(before[k], array) for k, array in agent.actor().items()]
+    changed = [
+        not np.array_equal(before[k], array) for k, array in agent.policy().weights.arrays.items()
+    ]
     assert any(changed)
 
 

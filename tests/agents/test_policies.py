@@ -30,7 +30,7 @@ def test_a_loaded_policy_gives_what_the_learning_one_gives(
     spec: Any, hidden: tuple[int, ...], activation: str
 ) -> None:
     learning = random_policy(spec, hidden, activation)
-    policy = policy_of(learning.arrays(), spec, activation)
+    policy = policy_of(learning.weights.arrays, spec, activation)
     numbers = np.random.default_rng(0).normal(size=(50, 3))
     observations = numbers.astype(np.float32)
     expected = learning.outputs(observations)
@@ -70,7 +70,7 @@ def test_gaussian_sampling_has_the_mean_and_deviation_of_the_policy() -> None:
     policy = random_policy(BOX)
     observation = np.ones((1, 3), np.float32)
     drawn = drawn_of(policy, observation)
-    std = np.exp(policy.arrays()["log_std"])
+    std = np.exp(policy.weights.arrays["log_std"])
     mean = policy.outputs(observation)[0]
     np.testing.assert_allclose(drawn.mean(0), mean, atol=5 * std.max() / 200)
     np.testing.assert_allclose(drawn.std(0), std, rtol=0.02)
@@ -122,14 +122,14 @@ def test_observations_of_many_arrays_are_joined_in_the_order_of_the_spec() -> No
 
 @pytest.mark.parametrize(("name", "shape"), cases("wrong_weights"))
 def test_weights_that_do_not_fit_are_refused(name: str, shape: tuple[int, ...]) -> None:
-    weights = random_policy(BOX).arrays()
+    weights = random_policy(BOX).weights.arrays
     weights[name] = np.zeros(shape, np.float32)
     with pytest.raises(InputError, match="policy: expected weights of shapes"):
         NetworkPolicy.load(weights, BOX, Config())
 
 
 def test_a_missing_weight_is_refused() -> None:
-    weights = random_policy(BOX).arrays()
+    weights = random_policy(BOX).weights.arrays
     del weights["log_std"]
     with pytest.raises(InputError, match="policy: expected weights of shapes"):
         NetworkPolicy.load(weights, BOX, Config())

@@ -111,8 +111,8 @@ def test_a_network_of_one_s_own_trains_resumes_and_loads(
     whole, resumed = stopped_and_resumed(run_of("ppo", config), tmp_path / "c")
     for name, array in whole.agent.state().items():
         assert resumed.agent.state()[name].tobytes() == array.tobytes(), name
-    begun = Training(whole.run, vector()).agent.actor()["layers.0.weight"]
-    assert (resumed.agent.actor()["layers.0.weight"] != begun).any()
+    begun = Training(whole.run, vector()).agent.policy().weights.arrays["layers.0.weight"]
+    assert (resumed.agent.policy().weights.arrays["layers.0.weight"] != begun).any()
 
     monkeypatch.delitem(NETWORKS, "wide")
     with pytest.raises(InputError, match=r"network: expected one of mlp.*, got 'wide'; import"):

@@ -273,7 +273,7 @@ def test_over_udp_the_training_is_the_same_and_goes_on() -> None:
         log = EpisodeRecorder(env, 1)
         agent = make_agent("a2c", log, config, 1)
         agent.train(log, 512, lambda: True)
-        return log, agent.actor()
+        return log, agent.policy().weights.arrays
 
     here, expected = trained(vector(4))
     with open_env(True, flown, 4) as env:
