@@ -216,5 +216,4 @@ def step_of_episode(ends: Mask) -> NDArray[np.int64]:
     index = np.arange(len(ends)).reshape(-1, *others)
     starts = np.zeros(ends.shape, int)
     starts[1:] = np.where(ends[:-1], index[1:], 0)
-    result: NDArray[np.int64] = index - np.maximum.accumulate(starts)
-    return result
+    return index - np.maximum.accumulate(starts)

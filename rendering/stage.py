@@ -3,7 +3,6 @@
 import copy
 import math
 from collections import deque
-from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from itertools import pairwise
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Literal, NamedTuple, get_args
 import mujoco
 import numpy as np
 from mujoco import MjModel, MjvScene, mjtGeom
+from numpy.typing import ArrayLike
 
 from ..models.cameras import place_cameras
 from ..models.errors import InputError, one_line, shortened
@@ -286,7 +286,7 @@ class Stage:
     def lines(self) -> list[tuple[str, str]]:
         """Names and values for the overlay of a viewer: those of the first craft."""
         lines = self.moments[0].lines
-        if self.least_distance is None:
+        if self.drones == 1:
             return lines
         drones = ("drones", f"{self.drones}, numbers of the first")
         return [drones, ("least distance", f"{self.least_distance:.2f} m"), *lines]
@@ -294,7 +294,11 @@ class Stage:
     @property
     def least_distance(self) -> float | None:
         """Least distance between the origins of two drones of the world now, m; None of one."""
-        return least_distance(self._points) if self.drones > 1 else None
+        if self.drones == 1:
+            return None
+        points = self._points
+        apart = np.linalg.norm(points[:, None] - points, axis=-1)
+        return float(apart[np.triu_indices(self.drones, 1)].min())
 
     @property
     def _goals(self) -> list[Point]:
@@ -348,12 +352,6 @@ class Canvas(AbstractContextManager["Canvas"]):
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def least_distance(positions: Array) -> float:
-    """Least distance between two of some points, shape (A, 3), at least two."""
-    apart = np.linalg.norm(positions[:, None] - positions, axis=-1)
-    return float(apart[np.triu_indices(len(positions), 1)].min())
 
 
 def _size(model: MjModel) -> tuple[float, float]:
@@ -418,9 +416,9 @@ def _connect(
     scene: MjvScene,
     kind: str,
     radius: float,
-    start: Sequence[float] | Array,
-    end: Sequence[float] | Array,
-    rgba: Sequence[float],
+    start: ArrayLike,
+    end: ArrayLike,
+    rgba: ArrayLike,
 ) -> None:
     """Add a cylinder or a capsule between two points."""
     geom = _decorate(scene, kind, (1.0, 1.0, 1.0), start, rgba)
@@ -431,9 +429,9 @@ def _connect(
 def _decorate(
     scene: MjvScene,
     kind: str,
-    size: Sequence[float],
-    centre: Sequence[float] | Array,
-    rgba: Sequence[float],
+    size: ArrayLike,
+    centre: ArrayLike,
+    rgba: ArrayLike,
 ) -> mujoco.MjvGeom | None:
     """Add a geom that casts no shadow; None if the scene is full."""
     if scene.ngeom == scene.maxgeom:

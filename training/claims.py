@@ -24,6 +24,7 @@ import pandas as pd
 from . import metrics
 from .metrics import Headline
 from .statistics import Floats, bootstrap_difference, iqm, share_interval
+from .tables import seeds_text
 
 MIN_SEEDS = 30
 """Seeds with a value that each agent needs before a claim is decided.
@@ -32,12 +33,8 @@ Fewer are too few for what differs between seeds: one seed in ten on which an ag
 from ten seeds in a third of the cases, from thirty in a twenty-fifth; and a claim decided on ten
 seeds became undecided on ten fresh ones.
 """
-CLAIMS = 4
-"""Claims of the paper that are judged."""
-COMPARISONS = 3
-"""Comparisons of `docs/results.md` that judge them."""
-LEVEL = 1 - 0.05 / (CLAIMS * COMPARISONS)
-"""Level of the interval of each verdict."""
+LEVEL = 1 - 0.05 / 12
+"""Level of the interval of each verdict: of four claims in three comparisons."""
 _INTERVAL = f"{100 * LEVEL:.2f} % interval"
 HOLDING_SHARE = 0.9
 """Share of its seeds that an agent holds the target in, for the paper's claim. Ours: 74 seeds that
@@ -79,11 +76,11 @@ class Verdict:
     """With the paper's words."""
     source: str
     """Place in the paper."""
+    definition: str
+    """Of its measure and of the decision."""
     preset: str
     """Hyperparameters with which the agents were trained."""
     verdict: Outcome
-    definition: str
-    """Of its measure and of the decision."""
     evidence: str
     """The numbers."""
 
@@ -141,10 +138,10 @@ def judge_claims(
     verdict states the preset with which the agents were trained.
     """
     return [
-        _verdict(_CONVERGES, preset, _compare(episodes, convergence_step, True, _LATER)),
-        _verdict(_REWARD, preset, _compare(episodes, long_run_return, True)),
-        _verdict(_FLUCTUATES, preset, _compare(episodes, fluctuation, False)),
-        _verdict(_holding_claim(headline), preset, _both_hold(runs, headline)),
+        Verdict(*_CONVERGES, preset, *_compare(episodes, convergence_step, True, _LATER)),
+        Verdict(*_REWARD, preset, *_compare(episodes, long_run_return, True)),
+        Verdict(*_FLUCTUATES, preset, *_compare(episodes, fluctuation, False)),
+        Verdict(*_holding_claim(headline), preset, *_both_hold(runs, headline)),
     ]
 
 
@@ -182,12 +179,6 @@ def _holding_claim(headline: Headline) -> _Claim:
         f"episode of it crashes. Each agent holds in at least {HOLDING_SHARE:.0%} of its seeds, by "
         f"Wilson's {_INTERVAL} of the share. Fewer than {MIN_SEEDS} seeds decide nothing.",
     )
-
-
-def _verdict(claim: _Claim, preset: str, judged: _Judged) -> Verdict:
-    words, source, definition = claim
-    outcome, evidence = judged
-    return Verdict(words, source, preset, outcome, definition, evidence)
 
 
 def _compare(
@@ -277,16 +268,15 @@ def judge_no_worse(runs: pd.DataFrame, preset: str, headline: Headline) -> Verdi
         f"its whole 95 % interval, and no smaller share of its seeds holds. The margin is ours: "
         f"{MARGIN_SHARE:.0%} of the bound for holding the goal. It says nothing of other measures.",
     )
-    return _verdict(claim, preset, _no_worse(runs, margin, headline))
+    return Verdict(*claim, preset, *_no_worse(runs, margin, headline))
 
 
 def _no_worse(runs: pd.DataFrame, margin: float, headline: Headline) -> _Judged:
-    names = ("a2c", "sb3-a2c")
-    ours = runs[runs["row"] == "a2c"]
-    theirs = runs[runs["row"] == "sb3-a2c"]
-    missing = [name for name in names if name not in set(runs["row"])]
+    both = {name: runs[runs["row"] == name] for name in ("a2c", "sb3-a2c")}
+    missing = [name for name, own in both.items() if own.empty]
     if missing:
         return "not tested", _untrained(missing)
+    ours, theirs = both.values()
     pair = ours["steady"].to_numpy(), theirs["steady"].to_numpy()
     difference, low, high = bootstrap_difference(*pair)
     evidence = (
@@ -318,7 +308,7 @@ def _range(low: float, high: float) -> str:
 
 
 def _seeds(count: int, total: int) -> str:
-    return f"{count} of {total} seeds" if count < total else f"{total} seed{'s' * (total != 1)}"
+    return f"{count} of {total} seeds" if count < total else seeds_text(total)
 
 
 def _untrained(names: list[str]) -> str:

@@ -68,7 +68,7 @@ def draw_figures(results: Results, table: pd.DataFrame) -> list[str]:
 
 def _figures(results: Results, table: pd.DataFrame) -> Iterator[tuple[str, Figure]]:
     rows = [row for row in results.study.rows if row.name in table.index]
-    tasks = by_task(rows, together=results.study.kind == "sweep")
+    tasks = by_task(results, rows)
     for task, own in tasks:
         name = "comparison" if len(tasks) == 1 else f"comparison_{file_words(task)}"
         yield name, draw_comparison(results, table, own)

@@ -5,8 +5,7 @@ The terminal and the report's page show the same text.
 
 import math
 import re
-from collections.abc import Mapping, Sequence
-from itertools import groupby
+from collections.abc import Iterable, Mapping, Sequence
 
 import pandas as pd
 
@@ -97,7 +96,7 @@ def markdown(results: Results, table: pd.DataFrame) -> str:
     """The table of each task, of `results_table`, in Markdown, with a note."""
     rows = {row.name: row for row in results.study.rows}
     ordered = [rows[str(name)] for name in table.index]
-    tasks = by_task(ordered, together=results.study.kind == "sweep")
+    tasks = by_task(results, ordered)
     parts = []
     for task, own in tasks:
         if len(tasks) > 1:
@@ -116,12 +115,14 @@ def _markdown_line(cells: Sequence[str]) -> str:
     return f"| {' | '.join(escaped)} |"
 
 
-def by_task(rows: Sequence[Row], *, together: bool = False) -> list[tuple[str, list[Row]]]:
+def by_task(results: Results, rows: Iterable[Row]) -> list[tuple[str, list[Row]]]:
     """Rows by their task; those of a sweep are kept together, whatever options it sweeps."""
-    if together:
-        return [(rows[0].env.env_id.rpartition("/")[2], list(rows))] if rows else []
-    ordered = sorted(rows, key=lambda row: row.task)
-    return [(task, list(group)) for task, group in groupby(ordered, key=lambda row: row.task)]
+    is_sweep = results.study.kind == "sweep"
+    found: dict[str, list[Row]] = {}
+    for row in rows:
+        task = row.env.env_id.rpartition("/")[2] if is_sweep else row.task
+        found.setdefault(task, []).append(row)
+    return sorted(found.items())
 
 
 def headings(headline: Headline) -> list[str]:
