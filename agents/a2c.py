@@ -6,7 +6,7 @@ from typing import Annotated
 import numpy as np
 
 from ..models.fields import Limits, immutable
-from .config import RolloutConfig
+from .config import RolloutConfig, Share
 from .learner import Learner
 from .networks import Floats
 from .rollouts import Collector, Mask, Numbers, Rollout, advantages
@@ -19,7 +19,7 @@ class A2CConfig(RolloutConfig):
     Serves our A2C and Stable-Baselines3's.
     """
 
-    gae_lambda: Annotated[float, Limits(0.0, 1.0)] = 0.0
+    gae_lambda: Share = 0.0
     """Lambda of generalised advantage estimation; 0 is the paper's Equation 3."""
     normalize: bool = False
     """Shift and scale the advantages of an update to mean 0 and standard deviation 1."""

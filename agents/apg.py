@@ -4,14 +4,12 @@ Back-propagation through time, as in Wiedemann et al., ICRA 2023, arXiv 2209.130
 function. It needs the derivative of the env's step, which compiled code in this process has.
 """
 
-from typing import Annotated
-
 import numpy as np
 
 from ..envs.compiled import CompiledLoop
 from ..models.errors import InputError
-from ..models.fields import Limits, PositiveInt, immutable
-from .config import Config
+from ..models.fields import PositiveInt, immutable
+from .config import Config, Positive
 from .episodes import EpisodeRecorder
 from .learner import Learner
 from .networks import Floats
@@ -25,7 +23,7 @@ class APGConfig(Config):
 
     horizon: PositiveInt = 80
     """Steps of each drone in an update, through which it differentiates."""
-    max_grad_norm: Annotated[float, Limits(0.0, above=True)] = 1.0
+    max_grad_norm: Positive = 1.0
     """The gradient, as one vector, is scaled down to this length."""
 
 

@@ -13,7 +13,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import field, fields, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 
@@ -21,10 +21,10 @@ from ..envs.config import EnvConfig
 from ..envs.spec import EnvSpec
 from ..models import Backend
 from ..models.errors import InputError, one_line, require, shortened
-from ..models.fields import Limits, check_fields, immutable
+from ..models.fields import check_fields, immutable
 from ..models.files import software_versions, write_whole
 from .config import Config
-from .episodes import Episode, Flown, Position, ResumeError
+from .episodes import Episode, Flown, Long, Position, ResumeError
 from .networks import ByName, Floats, named, part_of
 from .policies import NetworkPolicy
 from .presets import preset
@@ -56,8 +56,8 @@ class Checkpoint:
     """The resolved config of the env; None where only its simulator has it."""
     backend: Backend = "mujoco"
     """What stepped the env in training."""
-    seed: Annotated[int, Limits(0, 2**62, whole=True)]
-    env_steps: Annotated[int, Limits(0, 2**62, whole=True)]
+    seed: Long
+    env_steps: Long
     """Env steps that the whole training is to have."""
     actor: Mapping[str, Floats]
     """Weights for `NetworkPolicy`."""

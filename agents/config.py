@@ -9,6 +9,7 @@ from ..models.fields import Limits, PositiveInt, check_fields, immutable
 
 Positive = Annotated[float, Limits(0.0, 1e30, above=True)]
 """A number above 0 that float32 holds."""
+Share = Annotated[float, Limits(0.0, 1.0)]
 
 
 @immutable
@@ -25,11 +26,11 @@ class Config:
     """Of Adam (paper)."""
     anneal: bool = False
     """Lower the learning rate linearly to zero over the run."""
-    gamma: Annotated[float, Limits(0.0, 1.0)] = 0.99
+    gamma: Share = 0.99
     """Discount. The paper names none."""
     reward_scale: Positive = 1.0
     """Factor of the rewards that it learns from; returns are shown without it."""
-    reward_clip: Annotated[float | None, Limits(0.0, 1e30, above=True)] = None
+    reward_clip: Positive | None = None
     """Largest size of a reward that it learns from, after `reward_scale`; null: any."""
     log_std: Annotated[float, Limits(-4.0, 1.0)] = -0.5
     """Initial logarithm of the policy's standard deviation, in units of the action."""

@@ -24,6 +24,8 @@ _BLOCK = 256  # Episodes
 
 Mask = NDArray[np.bool_]
 Counts = NDArray[np.int64]
+Long = Annotated[int, Limits(0, 2**62, whole=True)]
+"""A whole number that 64 bits hold."""
 
 
 class ResumeError(InputError):
@@ -83,7 +85,7 @@ class Flown(NamedTuple):
 class Position:
     """Position of a run."""
 
-    env_steps: Annotated[int, Limits(0, 2**62, whole=True)]
+    env_steps: Long
     seconds: Annotated[float, Limits(0.0)]
     """Wall time since training began, s."""
     flown: Flown | None = None

@@ -1,7 +1,7 @@
 """The controllers of the level `position`, flown to the goal of any task that tells where it is."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import ClassVar
 
 import numpy as np
@@ -96,14 +96,7 @@ class Geometric:
             offset[:2] = self._steadied(now, before, goes)[:2]
         nose = now["nose"][:2]
         c, s = nose / max(math.hypot(*nose), 1e-6)
-        x, y, z = offset
-        turn = -math.atan2(s, c)
-        forward = c * x + s * y
-        left = c * y - s * x
-        action = np.array((forward, left, z, turn)) / self._scale
-        action[:2] /= max(1.0, math.hypot(*action[:2]))
-        clipped: Floats = np.clip(action, -1.0, 1.0).astype(np.float32)
-        return clipped
+        return level_action(offset, c, s, -math.atan2(s, c), self._scale)
 
     def _steadied(self, now: ByName, before: ByName, goes: Array) -> Array:
         """The offset at which the loops ask for the acceleration of `swing_gains`, m."""
@@ -136,6 +129,19 @@ class Geometric:
         change: Array = self._share * (moving - self._moving)
         self._moving = self._moving + change
         return change / period
+
+
+def level_action(vector: Iterable[float], c: float, s: float, turn: float, scale: Array) -> Floats:
+    """The action of a level that takes a vector and a number, float32, shape (4,).
+
+    The vector is of the world frame; the action has it forward, to the left and up, by the cosine
+    and the sine of the heading.
+    """
+    x, y, z = vector
+    action = np.array((c * x + s * y, c * y - s * x, z, turn)) / scale
+    action[:2] /= max(1.0, math.hypot(*action[:2]))
+    clipped: Floats = np.clip(action, -1.0, 1.0).astype(np.float32)
+    return clipped
 
 
 def _vector(places: Mapping[str, int], name: str) -> list[int]:

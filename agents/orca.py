@@ -11,6 +11,7 @@ import numpy as np
 
 from ..envs.spec import EnvSpec
 from ..models.errors import InputError
+from .geometric import level_action
 from .networks import Floats
 from .policies import Observation, flat
 
@@ -84,16 +85,10 @@ class Orca:
             for at in self._others
             if numbers[at + 6]
         ]
-        x, y, z = nearest(wanted, planes, most)
+        velocity = nearest(wanted, planes, most)
         c, s, _ = vector(self._nose)
         size = math.hypot(c, s) or 1.0
-        c = c / size
-        s = s / size
-        forward = c * x + s * y
-        left = c * y - s * x
-        action = np.array((forward, left, z, 0.0)) / self._scale
-        clipped: Floats = np.clip(action, -1.0, 1.0).astype(np.float32)
-        return clipped
+        return level_action(velocity, c / size, s / size, 0.0, self._scale)
 
 
 def avoiding(there: Vector, moves: Vector, own: Vector, radius: float, period: float) -> Plane:

@@ -6,6 +6,7 @@ import numpy as np
 
 from ..models.fields import Limits, PositiveInt, immutable
 from .a2c import A2C, A2CConfig
+from .config import Positive
 from .networks import Floats, views
 from .optimizers import clip_norm
 from .rollouts import Rollout
@@ -20,7 +21,7 @@ class PPOConfig(A2CConfig):
 
     learning_rate: float = 0.0003
     """Of Adam (Schulman et al., table 3)."""
-    critic_learning_rate: Annotated[float | None, Limits(0.0, 1e30, above=True)] = None
+    critic_learning_rate: Positive | None = None
     """Of the critic's weights; null: the same."""
     steps_per_update: int = 2048
     """Env steps of a rollout, of all drones together (table 3)."""
@@ -34,7 +35,7 @@ class PPOConfig(A2CConfig):
     """Parts of a rollout, each for one step of Adam (table 3: of 64 transitions)."""
     clip: Annotated[float, Limits(0.0, above=True)] = 0.2
     """Change of an action's probability that the objective rewards (table 3)."""
-    max_grad_norm: Annotated[float, Limits(0.0, above=True)] = 0.5
+    max_grad_norm: Positive = 0.5
     """The gradient, as one vector, is scaled down to this length."""
 
 

@@ -43,8 +43,8 @@ class Preset:
 
 
 @cache
-def _tables(algorithm: str) -> dict[str, dict[str, dict[str, Any]]]:
-    """An algorithm's tables of the file by preset and task."""
+def presets_of(algorithm: str) -> dict[str, dict[str, dict[str, Any]]]:
+    """An algorithm's tables by preset and task; one without any has an empty `tuned`."""
     content = read_toml(_FILE, "presets")
     found: dict[str, dict[str, dict[str, Any]]] = {}
     for table in content["preset"]:
@@ -67,11 +67,6 @@ def _lineage(env_id: str, tasks: list[str]) -> Iterator[str]:
         yield from (by_class[base] for base in bases if base in by_class)
 
 
-def preset_names(algorithm: str) -> list[str]:
-    """Names of an algorithm's presets. One without any has `tuned`, its config's defaults."""
-    return sorted(_tables(algorithm))
-
-
 def find_preset(algorithm: str, name: str, env_id: str = DEFAULT_TASK) -> Preset:
     """The preset of an algorithm for a task.
 
@@ -80,20 +75,21 @@ def find_preset(algorithm: str, name: str, env_id: str = DEFAULT_TASK) -> Preset
     algorithm or name.
     """
     row = find_algorithm(algorithm)
-    names = preset_names(algorithm)
-    if name not in names:
-        raise InputError(f"preset: expected {' or '.join(names)} for {algorithm}, got {name!r}")
-    tables = _tables(algorithm)[name]
+    presets = presets_of(algorithm)
+    if name not in presets:
+        names = " or ".join(sorted(presets))
+        raise InputError(f"preset: expected {names} for {algorithm}, got {name!r}")
+    tables = presets[name]
     found = next(_lineage(env_id, list(tables)), None)
     task = found or DEFAULT_TASK
-    table = tables.get(task, {})
-    config = row.config(**{key: value for key, value in table.items() if key not in _FLIGHT})
-    flight = {key: value for key, value in table.items() if key in _FLIGHT}
+    settings = dict(tables.get(task, {}))
+    flight = {name: settings.pop(name) for name in _FLIGHT if name in settings}
+    config = row.config(**settings)
     return Preset(config=config, env_id=task, fits=found is not None, **flight)
 
 
 def preset(algorithm: str, name: str, env_id: str = DEFAULT_TASK, **changes: Any) -> Config:
     """Hyperparameters of a preset, with some of them changed. Raises `InputError`."""
-    base = find_preset(algorithm, name, env_id or DEFAULT_TASK).config
+    base = find_preset(algorithm, name, env_id).config
     check_names(changes, (field.name for field in fields(base)), "hyperparameters")
     return replace(base, **changes)

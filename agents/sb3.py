@@ -164,10 +164,7 @@ class SB3Agent:
             "net_arch": list(config.hidden),
             "activation_fn": {"relu": torch.nn.ReLU, "tanh": torch.nn.Tanh}[config.activation],
         }
-        if isinstance(config, SACConfig):
-            settings = _sac_settings(config, steps, log)
-        else:
-            settings = _on_policy_settings(config, steps, log)
+        if not isinstance(config, SACConfig):
             ours = PPO if isinstance(config, PPOConfig) else A2C
             optimizer = {"eps": ours.epsilon, "foreach": True}
             policy |= {"log_std_init": config.log_std, "optimizer_kwargs": optimizer}
@@ -183,7 +180,7 @@ class SB3Agent:
             policy_kwargs=policy,
             seed=seeds_of(seed)[0] % 2**32,
             device="cpu",
-            **settings,
+            **_settings(config, steps, log),
         )
         if isinstance(config, PPOConfig) and config.critic_learning_rate:
             self._set_rate_of_critic(config.critic_learning_rate / config.learning_rate)
@@ -255,7 +252,20 @@ class SB3Agent:
 _MODELS: Final[dict[type, Any]] = {A2CConfig: sb3.A2C, PPOConfig: sb3.PPO, SACConfig: sb3.SAC}
 
 
-def _on_policy_settings(config: A2CConfig, steps: int, log: EpisodeRecorder) -> dict[str, object]:
+def _settings(config: A2CConfig | SACConfig, steps: int, log: EpisodeRecorder) -> dict[str, object]:
+    """Settings of SB3's that not all of its algorithms have."""
+    if isinstance(config, SACConfig):
+        if log.actions.discrete:
+            raise InputError("sb3-sac: expected an env of continuous actions, got one of choices")
+        return {
+            "buffer_size": config.buffer_size,
+            "learning_starts": config.learning_starts - 1,  # SB3 begins one step later
+            "batch_size": config.batch_size,
+            "tau": config.tau,
+            "train_freq": steps,
+            "gradient_steps": config.gradient_steps,
+            "ent_coef": f"auto_{config.alpha}",
+        }
     rollout = steps * log.num_envs
     settings: dict[str, object] = {
         "n_steps": steps,
@@ -272,18 +282,4 @@ def _on_policy_settings(config: A2CConfig, steps: int, log: EpisodeRecorder) -> 
         "batch_size": -(-rollout // config.minibatches),
         "n_epochs": config.epochs,
         "clip_range": config.clip,
-    }
-
-
-def _sac_settings(config: SACConfig, steps: int, log: EpisodeRecorder) -> dict[str, object]:
-    if log.actions.discrete:
-        raise InputError("sb3-sac: expected an env of continuous actions, got one of choices")
-    return {
-        "buffer_size": config.buffer_size,
-        "learning_starts": config.learning_starts - 1,  # SB3 begins one step later
-        "batch_size": config.batch_size,
-        "tau": config.tau,
-        "train_freq": steps,
-        "gradient_steps": config.gradient_steps,
-        "ent_coef": f"auto_{config.alpha}",
     }

@@ -20,7 +20,7 @@ from rotorgram.agents import (
     preset,
 )
 from rotorgram.agents.a2c import A2C
-from rotorgram.agents.presets import preset_names
+from rotorgram.agents.presets import presets_of
 from rotorgram.agents.rollouts import Collector, Diverged, Rollout
 from rotorgram.agents.sb3 import SB3Agent
 from rotorgram.agents.vpg import VPG
@@ -331,7 +331,7 @@ def test_huge_weights_of_a_training_that_diverges_are_no_error_of_the_env(algori
 
 @pytest.mark.parametrize(
     ("algorithm", "name"),
-    [(algorithm, name) for algorithm in SMALL for name in preset_names(algorithm)],
+    [(algorithm, name) for algorithm in SMALL for name in presets_of(algorithm)],
 )
 @pytest.mark.parametrize("action_type", ["continuous", "discrete"])
 def test_every_agent_trains_with_every_preset_and_kind_of_action(
