@@ -3,7 +3,7 @@
 import logging
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -59,9 +59,9 @@ class Watcher:
         return False
 
 
-def open_view(command: EnvFlags, drones: int, pace: Pace) -> LiveView:
+def open_view(command: EnvFlags, drones: int, pace: Pace) -> closing[LiveView]:
     """A window with the drones of a world; it is open within a `with` block."""
-    return LiveView(Stage(command.shown_scene, drones, vehicle=command.vehicle), pace)
+    return closing(LiveView(Stage(command.shown_scene, drones, vehicle=command.vehicle), pace))
 
 
 @contextmanager

@@ -43,10 +43,11 @@ class Dataset(Command):
             registry.load(self.env)
         episodes = RecordedEpisodes(self.journals)
         if self.to == "minari":
-            count, steps = write_minari(episodes, self.out, self.vehicle)
+            write_minari(episodes, self.out, self.vehicle)
         else:
-            count, steps = write_parquet(episodes, Path(self.out))
-        print(f"{self.out}: {count_of(count, 'episode')}, {count_of(steps, 'step')}")
+            write_parquet(episodes, Path(self.out))
+        steps = count_of(episodes.steps, "step")
+        print(f"{self.out}: {count_of(episodes.count, 'episode')}, {steps}")
         if episodes.left_out:
             print(f"left out: {count_of(episodes.left_out, 'episode')}, not recorded to the end")
         if self.to == "minari" and env_of(episodes.spec, self.vehicle) is None:

@@ -110,8 +110,8 @@ class RecordedEpisodes:
 # ---- Parquet
 
 
-def write_parquet(episodes: RecordedEpisodes, out: Path) -> tuple[int, int]:
-    """Write one row for each of the T + 1 observations of an episode; episodes and steps written.
+def write_parquet(episodes: RecordedEpisodes, out: Path) -> None:
+    """Write one row for each of the T + 1 observations of an episode.
 
     A row has an observation, the action that follows and what this gives; action, reward and flags
     of the last row are null. The metadata of the schema has the spec: `env_spec`, JSON.
@@ -131,7 +131,6 @@ def write_parquet(episodes: RecordedEpisodes, out: Path) -> tuple[int, int]:
     with removed_on_error(out), pq.ParquetWriter(out, schema, compression="zstd") as writer:
         for table in chain([first], batches):
             writer.write_table(table.cast(schema))
-    return episodes.count, episodes.steps
 
 
 def _batches(items: Iterable[Rows], most: int) -> Iterator[list[Rows]]:
@@ -207,8 +206,8 @@ def _columns(stem: str, array: ArraySpec, values: NDArray[np.generic]) -> "dict[
 
 def write_minari(
     episodes: RecordedEpisodes, dataset_id: str, vehicle: Path | str | None = None
-) -> tuple[int, int]:
-    """Write a data set that `minari.load_dataset` finds by its id; episodes and steps written.
+) -> None:
+    """Write a data set that `minari.load_dataset` finds by its id.
 
     Its `infos` have the telemetry by its components, as `info` of the env has it. Its env spec
     makes `recover_environment` work, where `env_of` finds the env. Its metadata has the spec of the
@@ -242,7 +241,6 @@ def write_minari(
         data.storage.update_metadata({"rotorgram_env_spec": spec.to_json()})
         for batch in _batches((_buffer(spec, episode) for episode in episodes), _ROW_GROUP):
             data.update_dataset_from_buffer(batch)
-    return episodes.count, episodes.steps
 
 
 def env_of(spec: EnvSpec, vehicle: Path | str | None = None) -> Any:

@@ -408,7 +408,7 @@ def vehicle_toml(vehicle: Vehicle, numbers: Numbers, origins: Mapping[str, Origi
     if "rotors.speed" in values:  # the file has it in place of the thrust
         del values["rotors.thrust"]
     lines = [
-        f"name = {_quoted(vehicle.name)}",
+        f"name = {_written(vehicle.name)}",
         f"timestep = {vehicle.timestep!r}",
         f"gravity = {vehicle.gravity!r}",
     ]
@@ -416,9 +416,9 @@ def vehicle_toml(vehicle: Vehicle, numbers: Numbers, origins: Mapping[str, Origi
     for name, value in values.items():
         origin = origins.get(name, Origin(""))
         known = given[name].source if name in given else f"as in {own}"
-        text = f"value = {_plain(value)}, source = {_quoted(origin.source or known)}"
+        text = f"value = {_written(value)}, source = {_written(origin.source or known)}"
         if origin.why:
-            text += f", why = {_quoted(origin.why)}"
+            text += f", why = {_written(origin.why)}"
         group, _, key = name.partition(".")
         tables.setdefault(group, []).append(f"{key} = {{ {text} }}")
     for group, rows in tables.items():
@@ -458,17 +458,14 @@ def _rotors(vehicle: Vehicle) -> Iterator[str]:
         yield from (
             "",
             "[[rotors.list]]",
-            f"name = {_quoted(rotor.name)}",
-            f"position = {_plain(rotor.position)}",
-            f"axis = {_plain(rotor.axis)}",
+            f"name = {_written(rotor.name)}",
+            f"position = {_written(rotor.position)}",
+            f"axis = {_written(rotor.axis)}",
             f'turn = "{"cw" if clockwise else "ccw"}"',
         )
 
 
-def _plain(value: ArrayLike) -> str:
-    """A number or a list of numbers in TOML, with all digits."""
-    return str(np.asarray(value, np.float64).tolist())
-
-
-def _quoted(text: str) -> str:
-    return json.dumps(text, ensure_ascii=False)
+def _written(value: ArrayLike) -> str:
+    """A text, a number or a list of numbers in TOML, with all digits."""
+    plain = value if isinstance(value, str) else np.asarray(value, np.float64).tolist()
+    return json.dumps(plain, ensure_ascii=False)

@@ -5,7 +5,6 @@ share.
 """
 
 import time
-from contextlib import AbstractContextManager
 from threading import Event, Thread
 
 from ..models.fields import Limits, check
@@ -62,7 +61,7 @@ class Pace:
         self._since = min(max(due, now - _CATCH_UP), now)
 
 
-class LiveView(AbstractContextManager["LiveView"]):
+class LiveView:
     """Draws the latest moments of a stage in a window, in a thread of its own.
 
     Raises `NoOpenGL`.
@@ -116,9 +115,6 @@ class LiveView(AbstractContextManager["LiveView"]):
                 self._thread.join()
             finally:  # Ctrl-C twice too
                 self._window.close()
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _paint(self) -> None:
         try:

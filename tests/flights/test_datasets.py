@@ -116,7 +116,9 @@ def test_what_is_read_flies_again_to_the_same_bits(
             fly_fleet(remote, 120)
     episodes = RecordedEpisodes([path])
     table = tmp_path / "flight.parquet"
-    count, steps = write_parquet(episodes, table)
+    write_parquet(episodes, table)
+    count = episodes.count
+    steps = episodes.steps
     read = pq.read_table(table)
     frame = {name: read[name].to_numpy() for name in read.column_names if name != "journal"}
     assert read.num_rows == steps + count
@@ -159,7 +161,9 @@ def test_minari_reads_it_and_its_env_flies_it_again(
     with recording(path, faults=LOSSY, **options) as remote:
         fly_one(remote, [5, 2**64 - 1, None])
         spaces = remote.observation_space, remote.action_space
-    assert write_minari(RecordedEpisodes([path]), "rotorgram/flight-v0")[0] == 3
+    episodes = RecordedEpisodes([path])
+    write_minari(episodes, "rotorgram/flight-v0")
+    assert episodes.count == 3
     data = minari.load_dataset("rotorgram/flight-v0")
     assert (data.observation_space, data.action_space) == spaces
     assert data.total_episodes == 3
