@@ -76,7 +76,8 @@ def _figures(results: Results, table: pd.DataFrame) -> Iterator[tuple[str, Figur
         trained = [row for row in rows if not row.controller]
         yield "fig6_reward", draw_reward(results, trained)
         yield "fig7_cumulative_reward", draw_cumulative(results, trained)
-        yield "fig8_error", draw_error(results, rows)
+        if results.has_steps:
+            yield "fig8_error", draw_error(results, rows)
 
 
 def row_color(row: Row) -> str:

@@ -209,6 +209,11 @@ class Results:
         """Training episodes; one that the end of training cut is not there."""
         return self._table("episodes")
 
+    @property
+    def has_steps(self) -> bool:
+        """Whether the table `steps` was kept."""
+        return bool(self._files("steps"))
+
     def steps(self, phase: str, max_rows: int | None = None) -> pd.DataFrame:
         """Steps of one phase, "train" or "evaluation".
 

@@ -1,6 +1,7 @@
 """Tables, figures, page and film of a study, on small made-up folders and by hand."""
 
 import base64
+import shutil
 import tomllib
 from dataclasses import replace
 from io import StringIO
@@ -239,6 +240,14 @@ def test_figures_are_written_in_three_formats_and_always_the_same(comparison: Pa
             content = (comparison / "figures" / f"{name}.{kind}").read_bytes()
             assert content.startswith(magic)
             assert len(content) < 1_000_000
+
+
+def test_a_study_without_its_steps_has_no_figure_of_them(comparison: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(comparison, tmp_path / "small")  # as docs/results has them
+    shutil.rmtree(folder / "steps")
+    results = Results.read(folder)
+    drawn = draw_figures(results, results_table(results))
+    assert drawn == ["comparison", "fig6_reward", "fig7_cumulative_reward"]
 
 
 def test_verdicts_and_tables_are_files(comparison: Path) -> None:
