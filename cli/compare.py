@@ -25,17 +25,21 @@ _OF_FILES = ("seeds", "first_seed", "snapshots", "curve_episodes", "episodes", "
 class Compare(StudyFlags):
     """Train several agents over the same seeds, and report: VPG, A2C and SB3's A2C, or your files.
 
-    Without files it is the paper's comparison: each agent flies over its own pair of sockets.
+    Without files it is the paper's comparison: each agent flies over its own pair of sockets, or
+    with --no-udp in this process.
     """
 
     kinds: ClassVar[Words] = ("paper", "compare")
 
     files: Positional[Annotated[tuple[Path, ...], arg(metavar="FILE")]] = ()
     """TOML files: of one row (agent, env, set, …), named by its file, or of [[row]] tables. They
-    train in process."""
+    train in this process, unless --udp is given."""
     agents: tuple[AlgorithmName, ...] = ("vpg", "a2c", "sb3-a2c")
     """Algorithms to train without files; the PID, or ORCA where a world has several drones, flies
     beside them."""
+    udp: bool = True
+    """Whether each of them trains over UDP, with a simulator process of its own. The numbers are
+    the same without, but for the times."""
 
     def study(self) -> "Study":
         """The study of the files, or of the agents."""
@@ -47,6 +51,8 @@ class Compare(StudyFlags):
         studies = [Study.from_toml(path) for path in self.files]
         rows = [self.changed(row) for study in studies for row in study.rows]
         settings = self.given_of_study()
+        if "udp" in self.given:
+            settings["wire"] = self.udp
         for name in _OF_FILES:
             values = {getattr(study, name): None for study in studies}
             if len(values) > 1 and name not in settings:
@@ -66,7 +72,7 @@ class Compare(StudyFlags):
         paper = env.env_id == DEFAULT_ENV
         kind: Kind = "paper" if paper else "compare"
         return Study(
-            rows=tuple(rows), kind=kind, wire=True, keep_steps=paper, **self.given_of_study()
+            rows=tuple(rows), kind=kind, wire=self.udp, keep_steps=paper, **self.given_of_study()
         )
 
 

@@ -282,6 +282,8 @@ def test_without_files_it_is_the_papers_comparison_over_udp() -> None:
     assert (study.kind, study.wire, study.keep_steps, study.seeds) == ("paper", True, True, 5)
     assert {row.env_steps for row in study.rows[:3]} == {200_000}
     assert study.rows[0].config == preset("vpg", "tuned", hidden=(32, 32))
+    here = parse(Compare, "rotorgram compare", ["--no-udp"]).study()
+    assert (here.kind, here.wire) == ("paper", False)
 
 
 # ---- the grid
