@@ -68,7 +68,7 @@ class Machine:
         self.tape: list[Memory] | None = None
         state = loop.state()
         sent = loop.record.sent
-        width = min(widest(), 1 << (worlds - 1).bit_length())
+        width = min(widest(), max(2, 1 << (worlds - 1).bit_length()))
         lanes = width * min(LANES // width, -(-worlds // width))
         self._names = tuple(state)
         layout = Layout(_fields(state), lanes)

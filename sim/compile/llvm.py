@@ -9,11 +9,13 @@ import ctypes
 from collections.abc import Callable, Sequence
 from functools import cache, lru_cache
 from math import prod
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ...models.errors import one_line
+from ...models.files import read_toml
 from .layout import Fields, Layout
 from .program import DType, Function, Program, Value
 
@@ -29,58 +31,9 @@ _KINDS = {
     np.dtype(np.int64): "i64",
     np.dtype(np.uint64): "i64",
 }
-_FLOATS = {
-    "add": "fadd",
-    "subtract": "fsub",
-    "multiply": "fmul",
-    "divide": "fdiv",
-    "remainder": "frem",
-    "less": "fcmp olt",
-    "less_equal": "fcmp ole",
-    "greater": "fcmp ogt",
-    "greater_equal": "fcmp oge",
-    "equal": "fcmp oeq",
-    "not_equal": "fcmp une",
-}
-_WHOLES = {
-    "add": "add",
-    "subtract": "sub",
-    "multiply": "mul",
-    "and": "and",
-    "or": "or",
-    "xor": "xor",
-    "left_shift": "shl",
-    "equal": "icmp eq",
-    "not_equal": "icmp ne",
-}
-_SIGNED = {
-    "less": "icmp slt",
-    "less_equal": "icmp sle",
-    "greater": "icmp sgt",
-    "greater_equal": "icmp sge",
-    "right_shift": "ashr",
-    "remainder": "srem",
-}
-_UNSIGNED = {
-    "less": "icmp ult",
-    "less_equal": "icmp ule",
-    "greater": "icmp ugt",
-    "greater_equal": "icmp uge",
-    "right_shift": "lshr",
-    "remainder": "urem",
-}
-_CALLS = {
-    "sqrt": "sqrt",
-    "absolute": "fabs",
-    "rint": "rint",
-    "floor": "floor",
-    "copysign": "copysign",
-}
-_SHORT = {"float": "f32", "double": "f64", "i8": "i8", "i32": "i32", "i64": "i64"}
-_ATTRIBUTES = (
-    'attributes #0 = { nounwind "min-legal-vector-width"="512" "prefer-vector-width"="512" }'
-)
-_FUNCTION = """define void @run(i64 %blocks{arguments}) #0 {{
+_SHORT = {"float": "f32", "double": "f64"}
+_OPERATIONS = read_toml(Path(__file__).with_name("operations.toml"), "operations")
+_MODULE = """define void @run(i64 %blocks{arguments}) #0 {{
 entry:
 {rows}
   br label %block
@@ -108,6 +61,8 @@ block.end:
 end:
   ret void
 }}
+{further}
+attributes #0 = {{ nounwind "min-legal-vector-width"="512" "prefer-vector-width"="512" }}
 """
 
 
@@ -174,7 +129,6 @@ class _Printer:
         self._width = width
         self._bases = {name: i for i, one in enumerate(layouts) for name in one.fields}
         self._lines: list[str] = []
-        self._declared: dict[str, str] = {}
         self._names: dict[int, str] = {}
         self._calls: dict[str, str] = {}
         self._functions: dict[str, str] = {}
@@ -189,7 +143,9 @@ class _Printer:
         names = [f"memory.{i}" for i in range(len(self._layouts))]
         names += [f"out.{name}" for name in self._outside]
         spread = [name for name in self._outside if self._is_spread(name)]
-        function = _FUNCTION.format(
+        further = [*self._functions.values()]
+        further += [f"{name} = internal {kept}" for kept, name in self._constants.items()]
+        return _MODULE.format(
             arguments="".join(f', ptr noalias %"{name}"' for name in names),
             rows="\n".join(f"  {self._rows(name)} = alloca {self._size(name)}" for name in spread),
             bases="\n".join(self._base(i, one.size) for i, one in enumerate(self._layouts)),
@@ -198,10 +154,8 @@ class _Printer:
             worlds=self._worlds(),
             regions="\n".join(self._lines),
             count=len(regions),
+            further="\n".join(further),
         )
-        parts = [function, *self._functions.values(), *self._declared.values(), _ATTRIBUTES]
-        parts += [f"{name} = internal {kept}" for kept, name in self._constants.items()]
-        return "\n".join(parts)
 
     def _region(self, number: int, region: Region) -> None:
         after = f"%region.{number + 1}"
@@ -212,7 +166,8 @@ class _Printer:
         if not region.mask:
             self._lines.append(f"  br label %body.{number}")
         else:
-            some = self._some(self._load(region.mask, 0))
+            flags = f"{self._lanes('i1')} {self._load(region.mask, 0)}"
+            some = self._new(f"call i1 @llvm.vector.reduce.or.{self._suffix('i1')}({flags})")
             self._lines.append(f"  br i1 {some}, label %body.{number}, label {after}")
         self._lines.append(f"body.{number}:")
         for value in region.operations():
@@ -240,29 +195,18 @@ class _Printer:
         if operation == "call":
             return self._result(*value.inputs)
         inputs = [self._names[one.number] for one in value.inputs]
-        dtype = value.inputs[0].dtype
+        before = value.inputs[0].dtype
         if operation == "cast":
-            return self._cast(inputs[0], dtype, value.dtype)
-        if operation == "select":
-            kind = self._type(value.dtype)
-            flags, first, second = inputs
-            return self._new(f"select {self._lanes('i1')} {flags}, {kind} {first}, {kind} {second}")
-        if operation == "bits":
-            kinds = self._type(dtype), self._type(value.dtype)
-            return self._new(f"bitcast {kinds[0]} {inputs[0]} to {kinds[1]}")
-        if operation in _CALLS and dtype.kind == "f":
-            return self._call(_CALLS[operation], dtype, *inputs)
-        kind = self._type(dtype)
-        if operation == "negative":
-            if dtype.kind == "f":
-                return self._new(f"fneg {kind} {inputs[0]}")
-            return self._new(f"sub {kind} {self._splat(0, _KINDS[dtype])}, {inputs[0]}")
-        if operation == "not":
-            return self._new(f"xor {kind} {inputs[0]}, {self._splat(-1, _KINDS[dtype])}")
-        names = _FLOATS
-        if dtype.kind != "f":
-            names = _WHOLES | (_SIGNED if dtype.kind == "i" else _UNSIGNED)
-        return self._new(f"{names[operation]} {kind} {inputs[0]}, {inputs[1]}")
+            operation = _cast(before, value.dtype)
+        instruction: str = _OPERATIONS[before.kind][operation].format(
+            *inputs,
+            kind=self._type(before),
+            lane=_KINDS[before],
+            lanes=self._suffix(_KINDS[before]),
+            result=self._type(value.dtype),
+            to=self._suffix(_KINDS[value.dtype]),
+        )
+        return self._new(instruction)
 
     # ---- functions of the programs
 
@@ -276,14 +220,12 @@ class _Printer:
             self._calls[call] = self._new(call)
         if function.name not in self._functions:
             self._functions[function.name] = self._definition(function, inputs)
-        if len(function.results) == 1:
-            return self._calls[call]
         return self._new(f"extractvalue {kind} {self._calls[call]}, {number}")
 
     def _returned(self, function: Function) -> str:
         """Type of what a function returns."""
-        kinds = [self._type(one.dtype) for one in function.results]
-        return kinds[0] if len(kinds) == 1 else f"{{{', '.join(kinds)}}}"
+        kinds = ", ".join(self._type(one.dtype) for one in function.results)
+        return f"{{{kinds}}}"
 
     def _definition(self, function: Function, inputs: Sequence[Value]) -> str:
         """The text of a function."""
@@ -292,12 +234,10 @@ class _Printer:
         for value in function.program.needed(function.results):
             self._names[value.number] = self._printed(value)
         kind = self._returned(function)
-        out = self._names[function.results[0].number]
-        if len(function.results) > 1:
-            out = "poison"
-            for number, one in enumerate(function.results):
-                part = f"{self._type(one.dtype)} {self._names[one.number]}"
-                out = self._new(f"insertvalue {kind} {out}, {part}, {number}")
+        out = "poison"
+        for number, one in enumerate(function.results):
+            part = f"{self._type(one.dtype)} {self._names[one.number]}"
+            out = self._new(f"insertvalue {kind} {out}, {part}, {number}")
         body = "\n".join((*self._lines, f"  ret {kind} {out}"))
         self._lines, self._names, self._calls = outer
         parameters = ", ".join(f"{self._type(one.dtype)} %p{i}" for i, one in enumerate(inputs))
@@ -306,7 +246,7 @@ class _Printer:
     # ---- types, numbers, memory
 
     def _lanes(self, kind: str) -> str:
-        return kind if self._width == 1 else f"<{self._width} x {kind}>"
+        return f"<{self._width} x {kind}>"
 
     def _type(self, dtype: DType) -> str:
         return self._lanes(_KINDS[dtype])
@@ -316,35 +256,18 @@ class _Printer:
         self._lines.append(f"  %v{self._count} = {instruction}")
         return f"%v{self._count}"
 
-    def _splat(self, number: object, kind: str) -> str:
-        """A number of all lanes."""
-        return f"{number}" if self._width == 1 else f"splat ({kind} {number})"
-
     def _number(self, value: Value) -> str:
         """A constant: LLVM reads floats as the bits of a double."""
         number = np.frombuffer(value.inputs[0], value.dtype)[0]
         kind = _KINDS[value.dtype]
         if value.dtype.kind != "f":
-            return self._splat(int(number), kind)
+            return f"splat ({kind} {int(number)})"
         bits = int(np.float64(number).view(np.uint64))
-        return self._splat(f"0x{bits:016X}", kind)
+        return f"splat ({kind} 0x{bits:016X})"
 
-    def _call(self, name: str, dtype: DType, *inputs: str) -> str:
-        """One of LLVM's own functions, of inputs of one type."""
-        kind = self._type(dtype)
-        lanes = "" if self._width == 1 else f"v{self._width}"
-        function = f"@llvm.{name}.{lanes}f{8 * dtype.itemsize}"
-        self._declared[function] = f"declare {kind} {function}({', '.join([kind] * len(inputs))})"
-        return self._new(f"call {kind} {function}({', '.join(f'{kind} {one}' for one in inputs)})")
-
-    def _some(self, flags: str) -> str:
-        """Whether a lane is true."""
-        if self._width == 1:
-            return flags
-        kind = self._lanes("i1")
-        function = f"@llvm.vector.reduce.or.v{self._width}i1"
-        self._declared[function] = f"declare i1 {function}({kind})"
-        return self._new(f"call i1 {function}({kind} {flags})")
+    def _suffix(self, kind: str) -> str:
+        """Of the names of LLVM's own functions: their lanes."""
+        return f"v{self._width}{_SHORT.get(kind, kind)}"
 
     def _address(self, array: str, row: int) -> tuple[str, str, int]:
         """Pointer to a row at these lanes, its type in memory, and its alignment."""
@@ -366,8 +289,10 @@ class _Printer:
     def _load(self, array: str, row: int) -> str:
         """A row at these lanes; a truth value is a byte in memory."""
         if self._is_spread(array):
-            place, kind = self._places(array, row)
-            value = self._gathered(place, kind)
+            dtype, shape = self._outside[array]
+            kind = _in_memory(dtype)
+            components = f'[{prod(shape)} x {kind}], ptr %"out.{array}"'
+            value = self._gathered(components, kind, "%worlds", row)
         else:
             place, kind, align = self._address(array, row)
             value = self._new(f"load {self._lanes(kind)}, ptr {place}, align {align}")
@@ -377,14 +302,9 @@ class _Printer:
 
     def _store(self, array: str, row: int, value: str) -> None:
         place, kind, align = self._address(array, row)
-        value = self._in_memory(value, kind)
+        if kind == "i8":
+            value = self._new(f"zext {self._lanes('i1')} {value} to {self._lanes(kind)}")
         self._lines.append(f"  store {self._lanes(kind)} {value}, ptr {place}, align {align}")
-
-    def _in_memory(self, value: str, kind: str) -> str:
-        """A value as it is stored: a truth value as a byte."""
-        if kind != "i8":
-            return value
-        return self._new(f"zext {self._lanes('i1')} {value} to {self._lanes(kind)}")
 
     def _base(self, number: int, size: int) -> str:
         """Lines that give the address of a block of a memory."""
@@ -395,8 +315,6 @@ class _Printer:
 
     def _worlds(self) -> str:
         """Lines that number the worlds of these lanes."""
-        if self._width == 1:
-            return "  %worlds = add i64 %world, 0"
         lanes = self._lanes("i64")
         numbers = ", ".join(f"i64 {lane}" for lane in range(self._width))
         mask = f"<{self._width} x i32> zeroinitializer"
@@ -432,15 +350,14 @@ class _Printer:
             f"turn.{number}:",
             f"  %l.{number} = phi i64 [0, %before.{number}], [%n.{number}, %turn.{number}]",
         ]
-        source = self._new(f"getelementptr {kind}, ptr {self._rows(array)}, i64 %l.{number}")
         world = self._new(f"add i64 %world, %l.{number}")
-        first = self._new(f"mul i64 {world}, {prod(shape)}")
-        target = self._new(f'getelementptr {kind}, ptr %"out.{array}", i64 {first}')
+        lanes = f"[{self._width} x {kind}], ptr {self._rows(array)}"
+        components = f'[{prod(shape)} x {kind}], ptr %"out.{array}"'
         for row in rows:
-            place = self._new(f"getelementptr {kind}, ptr {source}, i64 {row * self._width}")
-            one = self._new(f"load {kind}, ptr {place}")
-            place = self._new(f"getelementptr {kind}, ptr {target}, i64 {row}")
-            self._lines.append(f"  store {kind} {one}, ptr {place}, align 1")
+            source = self._new(f"getelementptr {lanes}, i64 {row}, i64 %l.{number}")
+            target = self._new(f"getelementptr {components}, i64 {world}, i64 {row}")
+            one = self._new(f"load {kind}, ptr {source}")
+            self._lines.append(f"  store {kind} {one}, ptr {target}, align 1")
         self._lines.append(f"  %n.{number} = add i64 %l.{number}, 1")
         more = self._new(f"icmp slt i64 %n.{number}, {self._width}")
         self._lines += [
@@ -448,27 +365,14 @@ class _Printer:
             f"turned.{number}:",
         ]
 
-    def _places(self, array: str, row: int) -> tuple[str, str]:
-        """Pointers to a component of an array outside, and its type in memory."""
-        dtype, shape = self._outside[array]
-        kind = _in_memory(dtype)
-        wholes = self._lanes("i64")
-        place = self._new(f"mul {wholes} %worlds, {self._splat(prod(shape), 'i64')}")
-        place = self._new(f"add {wholes} {place}, {self._splat(row, 'i64')}")
-        pointers = self._new(f'getelementptr {kind}, ptr %"out.{array}", {wholes} {place}')
-        return pointers, kind
-
-    def _gathered(self, pointers: str, kind: str) -> str:
-        """What lies at some places, a place for each lane."""
-        if self._width == 1:
-            return self._new(f"load {kind}, ptr {pointers}, align 1")
-        lanes, places, flags = map(self._lanes, (kind, "ptr", "i1"))
-        function = f"@llvm.masked.gather.v{self._width}{_SHORT[kind]}.v{self._width}p0"
-        self._declared[function] = f"declare {lanes} {function}({places}, i32, {flags}, {lanes})"
-        always = self._splat("true", "i1")
-        return self._new(
-            f"call {lanes} {function}({places} {pointers}, i32 1, {flags} {always}, {lanes} poison)"
-        )
+    def _gathered(self, array: str, kind: str, rows: str, column: int) -> str:
+        """A column of an array outside, or of a table, at a row for each lane."""
+        rows = f"{self._lanes('i64')} {rows}"
+        places = self._new(f"getelementptr {array}, {rows}, i64 {column}")
+        function = f"@llvm.masked.gather.{self._suffix(kind)}.{self._suffix('p0')}"
+        arguments = f"{self._lanes('ptr')} {places}, i32 1, {self._lanes('i1')} splat (i1 true)"
+        lanes = self._lanes(kind)
+        return self._new(f"call {lanes} {function}({arguments}, {lanes} poison)")
 
     def _constant(self, table: np.ndarray) -> str:
         """The name of a table in the module, where equal ones are there once."""
@@ -481,41 +385,20 @@ class _Printer:
         number, column, row = value.inputs
         table = self._tables[number]
         kind = _KINDS[value.dtype]
-        start = column * table.itemsize
-        base = f"getelementptr (i8, ptr {self._constant(table)}, i64 {start})"
-        wholes = self._lanes("i64")
-        place = self._new(
-            f"mul {wholes} {self._names[row.number]}, {self._splat(table.shape[1], 'i64')}"
-        )
-        pointers = self._new(f"getelementptr {kind}, ptr {base}, {wholes} {place}")
-        return self._gathered(pointers, kind)
+        array = f"[{table.shape[1]} x {kind}], ptr {self._constant(table)}"
+        return self._gathered(array, kind, self._names[row.number], column)
 
-    # ---- conversions
 
-    def _cast(self, value: str, before: DType, after: DType) -> str:
-        """As NumPy's `astype`; a float beyond the whole numbers gives the nearest of them."""
-        first, second = self._type(before), self._type(after)
-        if after.kind == "b":
-            zero = self._splat("0.0" if before.kind == "f" else 0, _KINDS[before])
-            compare = "fcmp une" if before.kind == "f" else "icmp ne"
-            return self._new(f"{compare} {first} {value}, {zero}")
-        if before.kind == "f" and after.kind != "f":
-            lanes = "" if self._width == 1 else f"v{self._width}"
-            way = f"{lanes}i{8 * after.itemsize}.{lanes}f{8 * before.itemsize}"
-            function = f"@llvm.fpto{'u' if after.kind == 'u' else 's'}i.sat.{way}"
-            self._declared[function] = f"declare {second} {function}({first})"
-            return self._new(f"call {second} {function}({first} {value})")
-        if after.kind == "f" and before.kind == "f":
-            word = "fpext" if before.itemsize < after.itemsize else "fptrunc"
-        elif after.kind == "f":
-            word = "sitofp" if before.kind == "i" else "uitofp"
-        elif before.itemsize == after.itemsize and before.kind != "b":
-            return value
-        elif before.kind == "b" or before.itemsize < after.itemsize:
-            word = "sext" if before.kind == "i" else "zext"
-        else:
-            word = "trunc"
-        return self._new(f"{word} {first} {value} to {second}")
+def _cast(before: DType, after: DType) -> str:
+    """The operation of a cast, as NumPy's `astype`; a float beyond the whole numbers gives the
+    nearest of them.
+    """
+    name = f"to_{after.kind}"
+    if name in _OPERATIONS[before.kind]:
+        return name
+    if before.itemsize == after.itemsize:
+        return "bits"
+    return "wider" if before.itemsize < after.itemsize else "narrower"
 
 
 def _in_memory(dtype: DType) -> str:

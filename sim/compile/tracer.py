@@ -28,29 +28,11 @@ _FLAG = np.dtype(bool)
 _WHOLE = np.dtype(np.int64)
 _DTYPES = ("bool", "int32", "uint32", "int64", "uint64", "float32", "float64")
 _EXPONENTS = (*range(-8, 0), *range(1, 9))
-_OPERATIONS: dict[Call, str] = {
-    np.add: "add",
-    np.subtract: "subtract",
-    np.multiply: "multiply",
-    np.true_divide: "divide",
-    np.negative: "negative",
-    np.sqrt: "sqrt",
-    np.rint: "rint",
-    np.floor: "floor",
-    np.copysign: "copysign",
-    np.less: "less",
-    np.less_equal: "less_equal",
-    np.greater: "greater",
-    np.greater_equal: "greater_equal",
-    np.equal: "equal",
-    np.not_equal: "not_equal",
-    np.bitwise_and: "and",
-    np.bitwise_or: "or",
-    np.bitwise_xor: "xor",
-    np.invert: "not",
-    np.left_shift: "left_shift",
-    np.right_shift: "right_shift",
-}
+_OPERATIONS = (
+    "add", "subtract", "multiply", "divide", "negative", "sqrt", "rint", "floor", "copysign",
+    "less", "less_equal", "greater", "greater_equal", "equal", "not_equal", "bitwise_and",
+    "bitwise_or", "bitwise_xor", "invert", "left_shift", "right_shift",
+)  # fmt: skip
 """Functions whose bits IEEE 754, or the arithmetic of whole numbers, fixes."""
 _MOVES = (
     np.broadcast_to,
@@ -176,12 +158,9 @@ class TracedArray(NDArrayOperatorsMixin):
             return _FUNCTIONS[ufunc](self, *inputs)
         kinds = ufunc.resolve_dtypes((*map(_kind, inputs), *[None] * ufunc.nout))
         arrays = [self.lifted(one, kind) for one, kind in zip(inputs, kinds, strict=False)]
-        if ufunc not in _OPERATIONS:
+        if ufunc.__name__ not in _OPERATIONS:
             _refuse(f"np.{ufunc.__name__}")
-        operation = _OPERATIONS[ufunc]
-        if kinds[0] == _FLAG:
-            operation = {"add": "or", "multiply": "and"}.get(operation, operation)
-        return self._applied(operation, kinds[ufunc.nin], *arrays)
+        return self._applied(ufunc.__name__, kinds[ufunc.nin], *arrays)
 
     def __array_function__(self, function: Call, types: object, inputs: Any, options: Any) -> Any:
         if function in _MOVES:
