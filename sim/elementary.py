@@ -6,11 +6,15 @@ arguments, float32 or float64, and give numbers for numbers. Errors are in units
 """
 
 import math
+from collections.abc import Sequence
 from math import factorial
-from typing import Any, NamedTuple
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
+from ..models.files import read_toml
 from .compile import once
 from .compile.tracer import add_function
 from .state import Array, floor
@@ -25,91 +29,22 @@ _LAYOUTS = {"float32": (np.int32, 23, 127), "float64": (np.int64, 52, 1023)}
 """Whole numbers with the bits of a float, bits of its fraction, and its exponent of 1."""
 
 
-Numbers = tuple[float, ...]
-
-
-class _Precision(NamedTuple):
-    """Constants of a precision. Polynomials have the highest power first.
-
-    A number is a sum of floats: all but the last have few bits, 10 and 32 of π / 2, 14 and 40 of
-    log(2), so that their products with whole numbers are exact.
-    """
-
-    half_pi: Numbers
-    furthest: float
-    """Largest angle of sines: up to here the products with π / 2 are exact."""
-    sine: Numbers
-    cosine: Numbers
-    log2: tuple[float, float]
-    low: float
-    """Bounds of the exponential function's argument."""
-    high: float
-    exponential: Numbers
-    least: float
-    """Least normal number."""
-    logarithm: Numbers
-    arc: Numbers
-    """Of the arc tangent up to tan(π / 8): Cephes (S. Moshier), atan.c and atanf.c."""
-    arc_below: Numbers
-    """Polynomial by which that one is divided, if any."""
-    half_turn: tuple[float, float]
-    """π as a sum."""
-
-
-def _precision(sines: int, powers: int, logs: int, **constants: Any) -> _Precision:
-    """With so many terms in each series."""
+def _precision(sines: int, powers: int, logs: int, **constants: Any) -> SimpleNamespace:
+    """Constants of a precision, and series of so many terms, the highest power first."""
     odd = [(-1) ** n / factorial(2 * n + 1) for n in range(1, sines)]
     even = [(-1) ** n / factorial(2 * n) for n in range(2, sines + 1)]
-    return _Precision(
-        sine=tuple(odd[::-1]),
-        cosine=tuple(even[::-1]),
-        exponential=tuple([1.0 / factorial(n) for n in range(2, powers)][::-1]),
-        logarithm=tuple([2.0 / (2 * n + 1) for n in range(1, logs)][::-1]),
+    return SimpleNamespace(
+        sine=odd[::-1],
+        cosine=even[::-1],
+        exponential=[1.0 / factorial(n) for n in range(2, powers)][::-1],
+        logarithm=[2.0 / (2 * n + 1) for n in range(1, logs)][::-1],
         **constants,
     )
 
 
-_SINGLE = _precision(
-    5,
-    8,
-    6,
-    half_pi=(1.5703125, 0.00048351287841796875, 3.1385570764541626e-07, 6.077100506506192e-11),
-    furthest=2e4,
-    log2=(0.693115234375, 3.1946184945309415e-05),
-    low=-87.0,
-    high=88.0,
-    least=2.0**-126,
-    arc=(8.05374449538e-2, -1.38776856032e-1, 1.99777106478e-1, -3.33329491539e-1),
-    arc_below=(),
-    half_turn=(3.1415927410125732, -8.742278000372485e-08),
-)
-_DOUBLE = _precision(
-    9,
-    14,
-    13,
-    half_pi=(1.5707963267341256, 6.077100506303966e-11, 2.0222662487959506e-21),
-    furthest=3e6,
-    log2=(0.6931471805592082, 7.371002565167799e-13),
-    low=-708.0,
-    high=709.0,
-    least=2.0**-1022,
-    arc=(
-        -8.750608600031904122785e-1,
-        -1.615753718733365076637e1,
-        -7.500855792314704667340e1,
-        -1.228866684490136173410e2,
-        -6.485021904942025371773e1,
-    ),
-    arc_below=(
-        1.0,
-        2.485846490142306297962e1,
-        1.650270098316988542046e2,
-        4.328810604912902668951e2,
-        4.853903996359136964868e2,
-        1.945506571482613964425e2,
-    ),
-    half_turn=(3.141592653589793, 1.2246467991473532e-16),
-)
+_TABLES = read_toml(Path(__file__).with_name("elementary.toml"), "elementary")
+_SINGLE = _precision(**_TABLES["float32"])
+_DOUBLE = _precision(**_TABLES["float64"])
 
 
 # ---- of arrays, and of numbers, which are Python's
@@ -167,7 +102,7 @@ def _scaled(x: Array, power: Array) -> Array:
     return x
 
 
-def polynomial(x: Array, coefficients: Numbers) -> Array:
+def polynomial(x: Array, coefficients: Sequence[float]) -> Array:
     """A polynomial by Horner's rule, the highest power of at least one first."""
     result = x * coefficients[0] + coefficients[1]
     for coefficient in coefficients[2:]:
@@ -212,7 +147,7 @@ def wrapped(x: Array) -> Array:
     return _without(p, x, 4.0 * _rint(x * (0.25 * _TURN)))
 
 
-def _without(p: _Precision, x: Array, quarters: Array) -> Array:
+def _without(p: SimpleNamespace, x: Array, quarters: Array) -> Array:
     """An angle less so many quarter turns: reduction by Cody and Waite."""
     x = _where(abs(x) < p.furthest, x, _NAN)
     for part in p.half_pi:
@@ -271,7 +206,7 @@ def expm1(x: Array) -> Array:
     return _ended(p, x, scale * rest + (scale - 1.0))
 
 
-def _reduced(p: _Precision, x: Array) -> tuple[Array, Array]:
+def _reduced(p: SimpleNamespace, x: Array) -> tuple[Array, Array]:
     """A number r and a power n of 2: exp(x) = (1 + r) 2ⁿ."""
     inside = _where(x > p.low, x, p.low)
     inside = _where(inside < p.high, inside, p.high)
@@ -281,7 +216,7 @@ def _reduced(p: _Precision, x: Array) -> tuple[Array, Array]:
     return rest + rest * rest * polynomial(rest, p.exponential), power
 
 
-def _ended(p: _Precision, x: Array, value: Array) -> Array:
+def _ended(p: SimpleNamespace, x: Array, value: Array) -> Array:
     """A value that grows with x, beyond the range too."""
     value = _where(x > p.high, _INFINITY, value)
     return _where(x == x, value, x)

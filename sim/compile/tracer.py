@@ -34,17 +34,7 @@ _OPERATIONS = (
     "bitwise_or", "bitwise_xor", "invert", "left_shift", "right_shift",
 )  # fmt: skip
 """Functions whose bits IEEE 754, or the arithmetic of whole numbers, fixes."""
-_MOVES = (
-    np.broadcast_to,
-    np.expand_dims,
-    np.moveaxis,
-    np.repeat,
-    np.reshape,
-    np.squeeze,
-    np.swapaxes,
-    np.transpose,
-    np.flip,
-)
+_MOVES = (np.broadcast_to, np.expand_dims, np.moveaxis, np.repeat, np.flip)
 """Functions that move components, and compute nothing."""
 _JOINS = (np.stack, np.concatenate, np.column_stack, np.vstack, np.hstack)
 _METHODS = ("reshape", "ravel", "squeeze", "transpose", "swapaxes", "copy")
@@ -55,6 +45,8 @@ _REDUCTIONS = {
     "min": np.minimum,
     "max": np.maximum,
 }
+_AS_METHODS = (*_METHODS, *_REDUCTIONS, "astype", "clip")
+"""Functions that call an array's method of their name."""
 
 
 class Untraceable(TypeError):
@@ -142,12 +134,12 @@ class TracedArray(NDArrayOperatorsMixin):
         self.program.tables.append(flat)
         name = len(self.program.tables) - 1
         numbers = self.astype(_WHOLE).clip(0, rows - 1)
-        parts = []
-        for column in range(flat.shape[1]):
-            look = lambda row, at=column: self.program.value("gather", flat.dtype, name, at, row)  # noqa: E731
-            parts.append(self._each(look, flat.dtype, numbers))
-        stacked: Traced = np.stack(parts, axis=-1)
-        return stacked.reshape(*self.shape, *table.shape[1:])
+        found = []
+        for row in numbers.values.ravel().tolist():
+            for column in range(flat.shape[1]):
+                found.append(self.program.value("gather", flat.dtype, name, column, row))
+        shape = (*self.shape, *table.shape[1:])
+        return TracedArray(self.program, np.reshape(found, shape), flat.dtype)
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **options: Any) -> Traced:
         if method == "reduce" and ufunc in _REDUCTIONS.values():
@@ -171,8 +163,12 @@ class TracedArray(NDArrayOperatorsMixin):
             arrays = self._alike(parts)
             joined = function([one.values for one in arrays], *rest, **options)
             return TracedArray(self.program, joined, arrays[0].dtype)
+        name = function.__name__
+        if name in _AS_METHODS:
+            array, *rest = inputs
+            return getattr(array, name)(*rest, **options)
         if function not in _FUNCTIONS:
-            _refuse(f"np.{function.__name__}")
+            _refuse(f"np.{name}")
         return _FUNCTIONS[function](self, *inputs, **options)
 
     def _like(self, values: Any) -> "TracedArray":
@@ -223,9 +219,8 @@ class TracedArray(NDArrayOperatorsMixin):
         for inputs in np.concatenate(rows, axis=1).tolist():
             for number in range(len(callee.results)):
                 results.append(self.program.value("call", dtype, callee, number, *inputs))
-        values = np.empty(len(results), object)
-        values[:] = results
-        return TracedArray(self.program, values.reshape((*lead, *callee.shape)), dtype)
+        values = np.reshape(results, (*lead, *callee.shape))
+        return TracedArray(self.program, values, dtype)
 
     def _applied(self, operation: str, dtype: DType, *arrays: "TracedArray") -> "TracedArray":
         def one(*values: Value) -> Value:
@@ -275,11 +270,8 @@ def once(vectors: int = 0) -> Callable[[Call], Call]:
 
 def read(program: Program, name: str, dtype: DType, shape: tuple[int, ...]) -> TracedArray:
     """The variables of an array of a program, of such a shape for one world."""
-    size = int(np.prod(shape))
-    values = [program.value("load", dtype, name, number) for number in range(size)]
-    array = np.empty(size, object)
-    array[:] = values
-    return TracedArray(program, array.reshape(shape), dtype)
+    values = [program.value("load", dtype, name, number) for number in range(prod(shape))]
+    return TracedArray(program, np.reshape(values, shape), dtype)
 
 
 def _function(function: Call, kinds: Sequence[tuple[DType, Any]]) -> Function:
@@ -288,10 +280,8 @@ def _function(function: Call, kinds: Sequence[tuple[DType, Any]]) -> Function:
     numbers = count()
     arrays = []
     for dtype, shape in kinds:
-        values = np.empty(prod(shape), object)
-        for place in range(values.size):
-            values[place] = program.value("parameter", dtype, next(numbers))
-        arrays.append(TracedArray(program, values.reshape(shape), dtype))
+        values = [program.value("parameter", dtype, next(numbers)) for _ in range(prod(shape))]
+        arrays.append(TracedArray(program, np.reshape(values, shape), dtype))
     out = function(*arrays)
     dtypes = ".".join(dtype.name for dtype, _ in kinds)
     name = f"{function.__name__}.{dtypes}"
@@ -409,13 +399,6 @@ def _filled(number: float) -> Callable[..., Traced]:
     return filled
 
 
-def _of_method(name: str) -> Callable[..., Traced]:
-    def call(like: TracedArray, array: Traced, *args: Any, **options: Any) -> Traced:
-        return getattr(array, name)(*args, **options)
-
-    return call
-
-
 _FUNCTIONS: dict[Call, Call] = {
     np.where: _where,
     np.minimum: _minimum,
@@ -438,15 +421,6 @@ _FUNCTIONS: dict[Call, Call] = {
     np.result_type: _result_type,
     np.ndim: lambda like, x: x.ndim,
     np.shape: lambda like, x: x.shape,
-    np.astype: _of_method("astype"),
-    np.copy: lambda like, x: x.copy(),
-    np.clip: _of_method("clip"),
-    np.sum: _of_method("sum"),
-    np.any: _of_method("any"),
-    np.all: _of_method("all"),
-    np.min: _of_method("min"),
-    np.max: _of_method("max"),
-    np.ravel: _of_method("ravel"),
 }
 
 
