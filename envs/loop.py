@@ -22,7 +22,7 @@ from .specification import make_task, spec_of
 from .stages import clock
 from .stages.record import Floats, Mask, Record
 from .tasks.task import Task
-from .telemetry import quantities_of
+from .telemetry import quantities_of, telemetry_of
 
 
 class Loop:
@@ -232,17 +232,15 @@ class Loop:
     @property
     def metrics(self) -> dict[str, Floats]:
         """Metrics of the task by name, each of shape (N,)."""
-        record = self._begun()
-        return _per_drone(record.shape, record.metrics)
+        return _per_drone(self._begun().metrics, self.num_envs)
 
     @property
     def headline(self) -> Floats:
         """The metric that decides, shape (N,); NaN where the task has none."""
         if self._headline is None:
             metric = self.spec.headline
-            found = self._begun().metrics[metric.name] if metric else np.array(np.nan)
-            shape = self.record.shape if metric else (self.num_envs,)
-            self._headline = _per_drone(shape, {"": found})[""]
+            unknown = np.full(self.num_envs, np.nan)
+            self._headline = self.metrics[metric.name] if metric else unknown
         return self._headline
 
     @property
@@ -258,13 +256,12 @@ class Loop:
     def told(self) -> Told:
         """Gives telemetry and terms of the reward as they are now, also later."""
         if self._told is None:
-            record = self._begun()
-            terms = record.terms
-            reads = {one.name: one.read(self) for one in self.quantities}
+            terms = self._begun().terms
+            quantities = telemetry_of(self)
+            count = self.num_envs
 
             def told() -> Content:
-                telemetry = {name: _rows(record.shape, values) for name, values in reads.items()}
-                return telemetry, _per_drone(record.shape, terms)
+                return _per_drone(quantities, count, -1), _per_drone(terms, count)
 
             self._told = told
         return self._told
@@ -313,16 +310,6 @@ def _check_snapshot(snapshot: Arrays, shape: tuple[int, ...], config: str) -> No
         raise InputError(f"snapshot: expected all of its arrays, got none of {missing[0]}")
 
 
-def _rows(shape: tuple[int, ...], values: Array) -> Floats:
-    """Vectors of all drones, shape (*shape, n) or (n,), as new ones, float64, shape (N, n)."""
-    width = values.shape[-1]
-    rows = np.array(np.broadcast_to(values, (*shape, width)), np.float64)
-    return rows.reshape(-1, width)
-
-
-def _per_drone(shape: tuple[int, ...], arrays: Mapping[str, Array]) -> dict[str, Floats]:
-    """Numbers of all drones, by name, as new arrays, float64, shape (N,)."""
-    rows = {}
-    for name, values in arrays.items():
-        rows[name] = np.array(np.broadcast_to(values, shape), np.float64).reshape(-1)
-    return rows
+def _per_drone(arrays: Mapping[str, Array], *shape: int) -> dict[str, Floats]:
+    """New arrays of N drones, float64, of another shape."""
+    return {name: np.array(x, np.float64).reshape(shape) for name, x in arrays.items()}

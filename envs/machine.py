@@ -22,6 +22,7 @@ from .autoreset import Told
 from .derivative import Derivative
 from .loop import Loop
 from .stages.record import Mask, Record
+from .telemetry import telemetry_of
 
 LANES = 64  # Worlds of a block: their numbers fit into the nearest cache
 MOST = 30_000  # Operations of a step: more take too long to compile
@@ -269,12 +270,8 @@ class Machine:
     def _telemetry(self) -> Named:
         """What is told of the loop's step."""
         loop = self._loop
-        record = loop.record
-        told = {_TERM + name: term for name, term in record.terms.items()}
-        for one in loop.quantities:
-            shape = (*record.shape, len(one.components))
-            told[_TOLD + one.name] = np.broadcast_to(one.read(loop), shape)
-        return told
+        told = {_TERM + name: term for name, term in loop.record.terms.items()}
+        return told | {_TOLD + name: array for name, array in telemetry_of(loop).items()}
 
     def _seen(self) -> Named:
         """What leaves the loop."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..sim import PARAMETERS, Randomization
-from ..sim.state import Array, stack
+from ..sim.state import Array, ByName, stack
 from .spec import BODY, BODY_TO_WORLD, WORLD, ArraySpec, Bound
 from .tasks.task import Task
 
@@ -89,6 +89,15 @@ def quantities_of(task: Task) -> list[Quantity]:
     return quantities
 
 
+def telemetry_of(loop: "Loop") -> ByName:
+    """What a loop's quantities are now, by name, (W, A, n)."""
+    arrays = {}
+    for one in loop.quantities:
+        shape = (*loop.record.shape, len(one.components))
+        arrays[one.name] = np.broadcast_to(one.read(loop), shape)
+    return arrays
+
+
 def _thrust(task: Task) -> Quantity:
     """Its bounds are those of the commands: a rotor whose efficiency is drawn may leave them."""
     vehicle = task.vehicle
@@ -103,15 +112,12 @@ def _thrust(task: Task) -> Quantity:
 
 
 def _battery(loop: "Loop") -> Array:
-    effects = loop.world.effects
-    assert effects is not None
-    return stack([effects.rotors.charge, effects.rotors.voltage])
+    rotors = loop.world.effects.rotors
+    return stack([rotors.charge, rotors.voltage])
 
 
 def _wind(loop: "Loop") -> Array:
-    effects = loop.world.effects
-    assert effects is not None
-    return stack(effects.wind)
+    return stack(loop.world.effects.wind)
 
 
 def _drawn(loop: "Loop") -> Array:

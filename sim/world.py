@@ -65,7 +65,7 @@ class World(NotCopied):
         randomize: What is drawn for each episode.
         random: The counters of all random numbers; `seed` seeds them.
         parameters: What was drawn for each drone's episode, by name, shape (W, A).
-        effects: What acts on drones besides gravity, contact and ideal rotors; None: nothing.
+        effects: What acts on drones besides gravity, contact and ideal rotors.
         acting: Mean thrust of each rotor over the last physics step, N, shape (W, A, R).
         wrench: Mean force and torque of the air over it, as of `Effects.step`; None: no air.
         bad: Drones with a state that is bad, where the physics is array code, bool, (W, A).
@@ -75,6 +75,10 @@ class World(NotCopied):
 
     is_apart: ClassVar[bool] = False
     """Whether the physics is code of its own, which cannot be compiled with the stages."""
+    of_state: ClassVar[Sequence[str]] = WorldState.__slots__
+    """Names of the state's arrays that a snapshot has."""
+    arrays: ClassVar[Sequence[str]] = ("acting", "wrench")
+    """Names of further arrays of it, which are attributes."""
 
     state: WorldState
     acting: Array
@@ -95,13 +99,12 @@ class World(NotCopied):
         self.randomize = randomize
         self._drawn = randomize.names
         self.random = Random(shape)
-        acting = Effects(vehicle, effects, self.random.noise, self._drawn)
-        self.effects = acting if acting.on_rotors or acting.on_body else None
-        self._on_rotors = acting.on_rotors
+        self.effects = Effects(vehicle, effects, self.random.noise, self._drawn)
+        self._acts = self.effects.on_rotors or self.effects.on_body
         self._check = max(1, round(CONTACT_CHECK / vehicle.timestep))  # physics steps
         self.dtype = np.dtype(dtype)
         self.acting = self._nothing = np.zeros((*shape, vehicle.num_rotors), self.dtype)
-        self.wrench = np.zeros((*shape, 6), self.dtype) if acting.on_body else None
+        self.wrench = np.zeros((*shape, 6), self.dtype) if self.effects.on_body else None
         self.bad = self.acting[..., 0] > 0
         self.outer: ByName = {}
         self.asked: set[str] = set()
@@ -140,7 +143,7 @@ class World(NotCopied):
 
     def calls(self, substeps: int, *, again: bool = False) -> list[Call]:
         """The calls of `fly` in a step, as of `step`."""
-        at_once = self._check if self.effects is None else 1
+        at_once = 1 if self._acts else self._check
         calls = []
         for first in range(0, substeps, at_once):
             done = min(first + at_once, substeps)
@@ -148,7 +151,7 @@ class World(NotCopied):
                 Call(
                     steps=done - first,
                     commands=first == 0,
-                    pushes=first == 0 or self.effects is not None,
+                    pushes=first == 0 or self._acts,
                     clears=first == 0 and not again,
                     looks=done % self._check == 0 or done == substeps,
                 )
@@ -166,9 +169,8 @@ class World(NotCopied):
         state.command = np.where(rows, state.thrust, state.command)
         self._draw_parameters(mask)
         self._vary(self.parameters)
-        if self.effects is not None:
-            thrust = self.effects.begin(mask, state, self.parameters)
-            state.thrust = self._typed(np.where(rows, thrust, state.thrust))
+        thrust = self.effects.begin(mask, state, self.parameters)
+        state.thrust = self._typed(np.where(rows, thrust, state.thrust))
         self.acting = np.where(rows, state.thrust, self.acting)
         self.wrench = None if self.wrench is None else np.where(rows, 0.0, self.wrench)
 
@@ -181,12 +183,10 @@ class World(NotCopied):
     def push(self, mask: Array | None) -> None:
         """Let effects act: sets `acting`, `wrench` and the state's thrust for a physics step."""
         state = self.state
-        acting = state.command
-        if self.effects is not None:
-            acting, end, wrench = self.effects.step(state, mask)
-            if wrench is not None:
-                self.wrench = chosen(mask, self._typed(wrench), self.wrench)
-        if self._on_rotors:
+        acting, end, wrench = self.effects.step(state, mask)
+        if wrench is not None:
+            self.wrench = chosen(mask, self._typed(wrench), self.wrench)
+        if self.effects.on_rotors:
             state.thrust = chosen(mask, self._typed(end), state.thrust)
         else:
             state.thrust = state.command
@@ -206,27 +206,29 @@ class World(NotCopied):
 
     def close(self) -> None:
         """Release threads and memory. The state keeps its numbers; nothing else can be called."""
-        raise NotImplementedError
 
     def snapshot(self) -> Snapshot:
         """Copies of all arrays that a later step depends on, by name."""
-        state = {name: array.copy() for name, array in self._kept().items()}
-        parts = {"random": self.random.snapshot(), "state": state}
-        parts["parameters"] = {name: np.copy(x) for name, x in self.parameters.items()}
-        if self.effects is not None:
-            parts["effects"] = self.effects.snapshot()
-        return joined(parts)
+        state = {name: getattr(self.state, name) for name in self.of_state}
+        state |= {name: getattr(self, name) for name in self.arrays}
+        parts: dict[str, Arrays] = {"state": state | self.hidden(), "parameters": self.parameters}
+        parts |= {"random": self.random.snapshot(), "effects": self.effects.snapshot()}
+        return {name: np.copy(x) for name, x in joined(parts).items() if x is not None}
 
     def restore(self, arrays: Arrays) -> None:
         """Put a snapshot back; no step runs. No later bit differs from those that followed it."""
+        arrays = {name: array.copy() for name, array in arrays.items()}
         self.random.restore(part_of(arrays, "random"))
-        parameters = part_of(arrays, "parameters")
-        self.parameters = {name: array.copy() for name, array in parameters.items()}
+        self.effects.restore(part_of(arrays, "effects"))
+        self.parameters = part_of(arrays, "parameters")
+        self.effects.take(self.parameters)
+        self._vary(self.parameters)
         state = part_of(arrays, "state")
-        self._restore({name: array.copy() for name, array in state.items()})
-        if self.effects is not None:
-            self.effects.restore(part_of(arrays, "effects"))
-            self.effects.take(self.parameters)
+        for name in self.of_state:
+            setattr(self.state, name, state.get(name))
+        for name in self.arrays:
+            setattr(self, name, state.get(name))
+        self._put(state)
 
     def place(self, mask: Array) -> None:
         """The part of `reset` that is physics: take the state of the worlds of a mask."""
@@ -264,12 +266,8 @@ class World(NotCopied):
     def _typed(self, values: Array) -> Array:
         return values.astype(self.dtype, copy=False)
 
-    def _kept(self) -> Arrays:
-        """The backend's own arrays."""
-        raise NotImplementedError
-
-    def _restore(self, arrays: Arrays) -> None:
-        """Put those back, which are copies; the parameters are as they were."""
+    def _put(self, arrays: Arrays) -> None:
+        """Follow the state and the attributes that were put back, and put back what is hidden."""
         raise NotImplementedError
 
     def _draw_parameters(self, mask: Array) -> None:

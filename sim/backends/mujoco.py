@@ -62,7 +62,7 @@ class MujocoWorld(World):
         super().__init__(vehicle, shape, effects, randomize)
         threads = 1 if num_worlds == 1 else num_threads
         model = self._flown_model(drones)
-        if self._on_rotors:  # commands are within their limits; thrusts need not be
+        if self.effects.on_rotors:  # commands are within their limits; thrusts need not be
             model = copy.copy(model)
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
         self._batch = batch = Batch(model, num_worlds, threads)
@@ -198,16 +198,7 @@ class MujocoWorld(World):
             self._batch.expand(field)[ids] = rows
         self._batch.set_const(ids)
 
-    def _kept(self) -> ByName:
-        arrays = {name: getattr(self.state, name) for name in WorldState.__slots__}
-        arrays |= {"acting": self.acting, "wrench": self.wrench, **self.hidden()}
-        return {name: array for name, array in arrays.items() if array is not None}
-
-    def _restore(self, arrays: Arrays) -> None:
-        for name in WorldState.__slots__:
-            setattr(self.state, name, arrays.get(name))
-        self.acting = arrays["acting"]
-        self.wrench = arrays.get("wrench")
+    def _put(self, arrays: Arrays) -> None:
         if "integration" in arrays:
             self._check_process()
             self._vary_models(np.arange(len(self._ctrl)))

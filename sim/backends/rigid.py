@@ -30,7 +30,6 @@ from .body import RigidBody, mapped, motion
 from .hull import Hull, can_touch
 from .kernel import Kernel
 
-_OF_STATE = ("command", "thrust", "touching", "colliding")
 _LEVEL = np.array((0.0, 0.0, 0.0, 1.0, *[0.0] * 9))  # motion of a craft at rest
 
 
@@ -44,7 +43,13 @@ class RigidWorld(World):
     Args:
         dtype: `float32` or `float64`.
         compiled: Fly by machine code (`sim/compile`).
+
+    Attributes:
+        motion: Position, quaternion, velocity and body rates, (W, A, 13).
     """
+
+    of_state = ("command", "thrust", "touching", "colliding")
+    arrays = (*World.arrays, "bad", "motion")
 
     def __init__(
         self,
@@ -89,7 +94,6 @@ class RigidWorld(World):
         the air by their names in a vehicle's file, (W, A) each.
         """
         self._vary({"reaction": reaction}, inertia)
-        assert self.effects is not None
         self.effects.air.vary(air)
 
     def place(self, mask: Array) -> None:
@@ -100,8 +104,8 @@ class RigidWorld(World):
         """As `World.fly`."""
         varying: list[Array] = []
         mapped(self._body.varying, varying.append)
-        new = self._advance(call.steps, self._motion, self.acting, self.wrench, *varying)
-        self._show(chosen(mask, new, self._motion))
+        new = self._advance(call.steps, self.motion, self.acting, self.wrench, *varying)
+        self._show(chosen(mask, new, self.motion))
         state = self.state
         if call.clears:
             self._tell(mask, [self._nobody, self._nobody])
@@ -110,7 +114,7 @@ class RigidWorld(World):
         before = (state.touching, state.colliding)
         touched = [now | old for now, old in zip(self._contacts(), before, strict=False)]
         self._tell(mask, touched)
-        bad = ~(abs(self._motion) < mujoco.mjMAXVAL).all(axis=-1)
+        bad = ~(abs(self.motion) < mujoco.mjMAXVAL).all(axis=-1)
         self.bad = chosen(mask, bad, self.bad)
         if found(self.bad):
             self.refuse_bad(mask)
@@ -126,25 +130,13 @@ class RigidWorld(World):
         """As MuJoCo limits controls."""
         return clip(thrust, self.vehicle.thrust_low, self.vehicle.thrust_high)
 
-    def _kept(self) -> ByName:
-        arrays = {name: getattr(self.state, name) for name in _OF_STATE}
-        arrays |= {"motion": self._motion, "acting": self.acting}
-        arrays |= {"wrench": self.wrench, "bad": self.bad}
-        return {name: array for name, array in arrays.items() if array is not None}
-
-    def _restore(self, arrays: Arrays) -> None:
-        for name in _OF_STATE:
-            setattr(self.state, name, arrays.get(name))
-        self.acting = arrays["acting"]
-        self.wrench = arrays.get("wrench")
-        self.bad = arrays["bad"]
-        self._show(arrays["motion"])
-        self._vary(self.parameters)
+    def _put(self, arrays: Arrays) -> None:
+        self._show(self.motion)
 
     def acceleration(self) -> Array:
         """As `World.acceleration`."""
         push = self._body.push(parts_of(self.acting), _parts(self.wrench))
-        linear, _ = self._body.acceleration(motion(parts_of(self._motion)), push)
+        linear, _ = self._body.acceleration(motion(parts_of(self.motion)), push)
         return stack(linear)
 
     def below(self) -> Array:
@@ -153,9 +145,6 @@ class RigidWorld(World):
         cosine = self.state.tilt_cosine
         seen = (cosine > 0) & (height >= 0)
         return np.where(seen, height / np.where(seen, cosine, 1.0), np.inf)
-
-    def close(self) -> None:
-        """Nothing is to be released."""
 
     def _vary(self, parameters: Mapping[str, Array], inertia: Array = None) -> None:
         """As `RigidBody.vary`, with numbers of this dtype."""
@@ -176,7 +165,7 @@ class RigidWorld(World):
 
     def _show(self, now: Array) -> None:
         """Take this motion, (W, A, 13), and set the state's arrays, views of it."""
-        self._motion = now
+        self.motion = now
         state = self.state
         state.position = now[..., :3]
         state.quaternion = now[..., 3:7]

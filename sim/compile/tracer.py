@@ -134,7 +134,7 @@ class TracedArray(NDArrayOperatorsMixin):
         self.program.tables.append(flat)
         name = len(self.program.tables) - 1
         numbers = self.astype(_WHOLE).clip(0, rows - 1)
-        found = []
+        found: Any = []
         for row in numbers.values.ravel().tolist():
             for column in range(flat.shape[1]):
                 found.append(self.program.value("gather", flat.dtype, name, column, row))
@@ -215,7 +215,7 @@ class TracedArray(NDArrayOperatorsMixin):
             np.broadcast_to(one.values, (*lead, *part)).reshape(prod(lead), -1)
             for one, part in zip(arrays, parts, strict=True)
         ]
-        results = []
+        results: Any = []
         for inputs in np.concatenate(rows, axis=1).tolist():
             for number in range(len(callee.results)):
                 results.append(self.program.value("call", dtype, callee, number, *inputs))
@@ -270,7 +270,7 @@ def once(vectors: int = 0) -> Callable[[Call], Call]:
 
 def read(program: Program, name: str, dtype: DType, shape: tuple[int, ...]) -> TracedArray:
     """The variables of an array of a program, of such a shape for one world."""
-    values = [program.value("load", dtype, name, number) for number in range(prod(shape))]
+    values: Any = [program.value("load", dtype, name, number) for number in range(prod(shape))]
     return TracedArray(program, np.reshape(values, shape), dtype)
 
 
@@ -280,7 +280,7 @@ def _function(function: Call, kinds: Sequence[tuple[DType, Any]]) -> Function:
     numbers = count()
     arrays = []
     for dtype, shape in kinds:
-        values = [program.value("parameter", dtype, next(numbers)) for _ in range(prod(shape))]
+        values: Any = [program.value("parameter", dtype, next(numbers)) for _ in range(prod(shape))]
         arrays.append(TracedArray(program, np.reshape(values, shape), dtype))
     out = function(*arrays)
     dtypes = ".".join(dtype.name for dtype, _ in kinds)
