@@ -12,7 +12,6 @@ from ...models.cameras import FARTHEST, View, chosen_views
 from ...scenes import scenes_of
 from ...sim.random import SCENES, Draw, Random
 from ...sim.snapshots import Arrays
-from ...sim.state import Array
 from ..spec import ArraySpec
 from ..tasks.task import Task
 from .record import Record, Stage
@@ -76,7 +75,6 @@ class Pictures(Stage):
 
         self._task = task
         self._shape = shape
-        self._rows = shape[0] * shape[1]
         self._random = random
         self.views = chosen_views(task.config.cameras, task.vehicle.cameras)
         self._scenes = scenes_of(str(task.config.scene))
@@ -95,7 +93,7 @@ class Pictures(Stage):
         self._names = objects_of_all([painter.cameras.objects for painter in self._painters])
         self._goal_moves = any(mark.moves for mark in task.marks)
         self._blank = {
-            view.name: np.zeros((self._rows, *view.shape), view.dtype) for view in self.views
+            view.name: np.zeros((*shape, *view.shape), view.dtype) for view in self.views
         }
 
     def close(self) -> None:
@@ -107,9 +105,8 @@ class Pictures(Stage):
     def begin(self, record: Record) -> None:
         """Draw the scene of each world."""
         shares = Draw(self._random, SCENES, record.begun).uniform(0.0, 1.0)
-        of_worlds = np.reshape(shares, self._shape)[:, :1] * len(self._scenes)
-        scenes = np.repeat(of_worlds.astype(int), self._shape[1], axis=1)
-        record.scenes = scenes.reshape(record.shape)
+        of_worlds = (shares[:, :1] * len(self._scenes)).astype(int)
+        record.scenes = np.repeat(of_worlds, self._shape[1], axis=1)
 
     def step(self, record: Record) -> None:
         """Add all pictures to the observations, shape (W, A, height, width, channels).
@@ -118,27 +115,22 @@ class Pictures(Stage):
         of it; until then it observes its last.
         """
         state = record.state
-        begun = self._per_drone(False if record.begun is None else record.begun)
-        flown = self._per_drone(True if record.flown is None else record.flown)
-        steps = self._per_drone(record.steps)
+        begun = False if record.begun is None else record.begun
+        flown = True if record.flown is None else record.flown
         due = {}
         for view in self.views:
-            due[view.name] = begun | (flown & (steps % view.camera.every == 0))
+            again = flown & (record.steps % view.camera.every == 0)
+            due[view.name] = np.ravel(begun | again)
         seen = {"position": state.position, "quaternion": state.quaternion}
         if state.payload is not None:
             seen["payload"] = state.payload
         if self._goal_moves:
             seen["goal"] = self._task.goal(state)
-        rows = {name: np.reshape(values, (self._rows, -1)) for name, values in seen.items()}
+        count = record.steps.size
+        rows = {name: np.reshape(values, (count, -1)) for name, values in seen.items()}
         last = vars(record).get("pictures", self._blank)
-        pictures = {}
-        for name, picture in last.items():
-            pictures[name] = np.array(picture).reshape(self._rows, *picture.shape[-3:])
-        self._take(pictures, due, rows, np.reshape(record.scenes, self._shape)[:, 0])
-        record.pictures = {
-            name: picture.reshape(*record.shape, *picture.shape[1:])
-            for name, picture in pictures.items()
-        }
+        record.pictures = {name: np.array(picture) for name, picture in last.items()}
+        self._take(record.pictures, due, rows, record.scenes[:, 0])
         record.observations = {**record.observations, **record.pictures}
 
     def _take(
@@ -160,7 +152,7 @@ class Pictures(Stage):
                 if view.kind == "segmentation":
                     numbers = [self._names.index(name) for name in painter.cameras.objects]
                     picture = np.array(numbers, np.int32)[picture]
-                pictures[view.name][taken] = picture
+                pictures[view.name].reshape(-1, *view.shape)[taken] = picture
 
         painters = []
         for painter in self._painters:
@@ -171,7 +163,3 @@ class Pictures(Stage):
             list(self._pool.map(paint, painters))
         else:
             paint(painters[0])
-
-    def _per_drone(self, values: Array) -> np.ndarray:
-        """A number of each drone, shape (N,)."""
-        return np.broadcast_to(np.ravel(values), self._rows)
