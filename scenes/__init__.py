@@ -13,10 +13,7 @@ from ..models.errors import InputError, shortened
 if TYPE_CHECKING:
     from .build import add_scene, build_scene
 
-__all__ = [
-    "AIRPORT_XML", "MAX_SEEDS", "SCENES", "SCENE_XML", "SEEDED_SCENES", "add_scene",
-    "build_scene", "parse_scene", "scenes_of",
-]  # fmt: skip
+__all__ = ["add_scene", "build_scene"]
 
 SCENE_XML = Path(__file__).parent / "scene.xml"
 """Ground, sky and light of the scene `plain`."""

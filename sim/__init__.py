@@ -3,7 +3,7 @@
 Knows nothing of tasks, rewards or Gymnasium.
 """
 
-from .control import LEVELS, CollectiveThrust, Controller, Gains, make_controller
+from .control import LEVELS, CollectiveThrust, Controller, make_controller
 from .effects import EffectOptions
 from .elementary import atan2, cos, exp, log, power, sin, wrapped
 from .random import Draw
@@ -14,7 +14,6 @@ from .state import (
     InitialState,
     WorldState,
     clip,
-    floor,
     length,
     looked_up,
     parts_of,
@@ -33,7 +32,6 @@ __all__ = [
     "Controller",
     "Draw",
     "EffectOptions",
-    "Gains",
     "InitialState",
     "PhysicsError",
     "Randomization",
@@ -45,7 +43,6 @@ __all__ = [
     "clip",
     "cos",
     "exp",
-    "floor",
     "length",
     "log",
     "looked_up",

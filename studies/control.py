@@ -28,7 +28,6 @@ from rotorgram.models import QUAD_XML, Vehicle
 from rotorgram.sim import (
     LEVELS,
     EffectOptions,
-    Gains,
     InitialState,
     WorldState,
     cos,
@@ -37,6 +36,7 @@ from rotorgram.sim import (
     sin,
     stack,
 )
+from rotorgram.sim.control.gains import Gains
 
 HOVER = "rotorgram/Hover-v0"
 CIRCLE = "Circle-v0"

@@ -16,11 +16,6 @@ from ..state import Array, WorldState, clip, total
 from .cascade import Attitude, Position, Rates, Velocity
 from .gains import Gains, shared_ranges
 
-__all__ = [
-    "LEVELS", "SHARES", "CollectiveThrust", "Controller", "Gains", "RotorThrust",
-    "make_controller",
-]  # fmt: skip
-
 _CASCADE: Final[dict[str, type[Rates]]] = {
     "rates": Rates,
     "attitude": Attitude,

@@ -22,8 +22,6 @@ from .estimator import Estimator
 from .imu import Imu
 from .simple import Gps, Magnetometer, MotionCapture, Rangefinder
 
-__all__ = ["SENSOR_TYPES", "Estimator", "Sensors", "checked_sensors", "readings_of"]
-
 SENSOR_TYPES: Final[Mapping[str, type[Sensor]]] = {
     kind.name: kind for kind in (Imu, Magnetometer, Barometer, Rangefinder, Gps, MotionCapture)
 }

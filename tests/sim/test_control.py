@@ -18,14 +18,13 @@ from rotorgram.models.library import vehicle_names
 from rotorgram.sim import (
     LEVELS,
     EffectOptions,
-    Gains,
     WorldState,
     make_controller,
     make_world,
 )
 from rotorgram.sim.control import MixedController
 from rotorgram.sim.control.cascade import Position
-from rotorgram.sim.control.gains import shared_ranges
+from rotorgram.sim.control.gains import Gains, shared_ranges
 from tables import SIM
 from worlds import alone, begin
 
