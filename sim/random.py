@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from . import elementary
 from .compile import once
-from .snapshots import Arrays, Kept
+from .snapshots import Kept
 from .state import Array, is_traced
 
 Words = NDArray[np.uint32]
@@ -121,8 +121,6 @@ class Random(Kept):
         numbers = [int(seed) % 2**64 for seed in seeds if seed is not None]
         self.keys[given] = _keys(np.array(numbers, np.uint64))
         self.episode[given] = 0
-        for noise in self._noises.values():
-            noise.forget(ids)
 
     def begin(self, mask: Mask) -> None:
         """Begin an episode of the worlds of a mask."""
@@ -221,23 +219,11 @@ class Noise(Kept):
         self._use = use
         self._size = size
         self._ahead = max(1, _AHEAD // worlds)
-        self._rows = np.zeros((worlds, self._ahead, random.drones, size))
-        self._left = np.zeros(worlds, int)  # rows that are drawn ahead
+        self._of: Any = None  # the key of each row, its episode and its steps
 
     def begin(self, begun: Any) -> None:
         """An episode of some worlds begins, bool, (W,)."""
         self.step = np.where(begun, np.uint32(0), self.step)
-        if not is_traced(begun):
-            self.forget(begun)
-
-    def forget(self, ids: Ids) -> None:
-        """Seed, episode or step of some worlds have changed."""
-        self._left[ids] = 0
-
-    def restore(self, arrays: Arrays) -> None:
-        """As `Kept.restore`."""
-        super().restore(arrays)
-        self.forget(...)
 
     def normal(self, mask: Mask = None) -> Array:
         """The next numbers of the worlds of a mask, bool, shape (W, A), None for all.
@@ -245,29 +231,28 @@ class Noise(Kept):
         Shape (W, A, size). The other worlds get zeros, and their steps do not advance.
         """
         random = self._random
-        if is_traced(mask):
+        worlds = random.worlds(mask)
+        if is_traced(worlds):
             drawn = self._drawn(random.keys, random.episode, self.step)
-            self.step = np.where(mask[:, 0], self.step + np.uint32(1), self.step)
-            return np.where(mask[..., None], drawn, 0.0)
-        ids = random.ids(mask)
-        missing = ids[self._left[ids] == 0]
-        if missing.size:
-            self._fill(missing)
-        left = self._left[ids]
-        self._left[ids] = left - 1
-        self.step[ids] += np.uint32(1)
-        numbers = np.zeros((*random.shape, self._size))
-        numbers[ids] = self._rows[ids, self._ahead - left]
-        return numbers
+        else:
+            drawn = self._drawn_ahead()
+        self.step = np.where(worlds, self.step + np.uint32(1), self.step)
+        return np.where(worlds[:, None, None], drawn, 0.0)
 
-    def _fill(self, ids: NDArray[np.int64]) -> None:
+    def _drawn_ahead(self) -> Numbers:
+        """As `_drawn`, of the present step."""
         random = self._random
         ahead = self._ahead
-        steps = self.step[ids, None] + np.arange(ahead, dtype=np.uint32)
-        keys = np.repeat(random.keys[ids][:, None], ahead, axis=1)
-        episodes = np.repeat(random.episode[ids][:, None], ahead, axis=1)
-        self._rows[ids] = self._drawn(keys, episodes, steps)
-        self._left[ids] = ahead
+        row = self.step % np.uint32(ahead)
+        first = self.step - row
+        now = np.stack((*random.keys.T, random.episode, first))
+        if not np.array_equal(now, self._of):
+            self._of = now
+            steps = first[:, None] + np.arange(ahead, dtype=np.uint32)
+            keys = np.repeat(random.keys[:, None], ahead, axis=1)
+            episodes = np.repeat(random.episode[:, None], ahead, axis=1)
+            self._rows = self._drawn(keys, episodes, steps)
+        return self._rows[np.arange(len(row)), row]
 
     def _drawn(self, keys: Array, episodes: Array, steps: Array) -> Numbers:
         """Numbers of steps (...), shape (..., A, size)."""

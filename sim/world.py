@@ -336,8 +336,8 @@ def make_world(
     backend: Backend = "mujoco",
     *,
     drones: int = 1,
-    effects: EffectOptions | None = None,
-    randomize: Randomization | None = None,
+    effects: EffectOptions = NO_EFFECTS,
+    randomize: Randomization = FIXED,
     **settings: Any,
 ) -> World:
     """W worlds of `drones` drones each.
@@ -347,8 +347,6 @@ def make_world(
     """
     if not (type(num_worlds) is int and 1 <= num_worlds <= MAX_WORLDS):
         raise InputError(f"num_envs: expected 1 to {MAX_WORLDS}, got {num_worlds!r}")
-    effects = effects or NO_EFFECTS
-    randomize = randomize or FIXED
     check_world(vehicle, backend, drones, effects, randomize, settings)
     wanted = settings.pop("compiled", None)
     reason = "" if wanted is False else trouble()

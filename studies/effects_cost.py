@@ -56,7 +56,7 @@ def measure(num_drones: int, seconds: float, repeats: int) -> dict[str, object]:
     worlds = {}
     for name, case in [*CASES.items(), ("randomize", {})]:
         effects = EffectOptions(**case)
-        drawn = Randomization(DRAWN, effects) if name == "randomize" else None
+        drawn = Randomization(DRAWN if name == "randomize" else {}, effects)
         worlds[name] = make_world(vehicle, num_drones, effects=effects, randomize=drawn)
     rates = in_turns(worlds, repeats, lambda world: steps_per_second(world, seconds))
     middle = medians(rates)

@@ -23,8 +23,8 @@ from ...models.vehicle import (
     payload_body,
     payload_radius,
 )
-from ..effects import NO_EFFECTS, EffectOptions
-from ..randomize import CENTER, FIXED, Randomization
+from ..effects import EffectOptions
+from ..randomize import CENTER, Randomization
 from ..rotations import body_z
 from ..snapshots import Arrays
 from ..state import Array, ByName, InitialState, WorldState, found, stack, total
@@ -53,9 +53,9 @@ class MujocoWorld(World):
         vehicle: Vehicle,
         num_worlds: int,
         *,
-        drones: int = 1,
-        effects: EffectOptions = NO_EFFECTS,
-        randomize: Randomization = FIXED,
+        drones: int,
+        effects: EffectOptions,
+        randomize: Randomization,
         num_threads: int = 0,
     ) -> None:
         shape = (num_worlds, drones)

@@ -102,7 +102,7 @@ def world_of(
     **effects: Any,
 ) -> World:
     options = EffectOptions(**effects)
-    drawn = Randomization(randomize, options) if randomize else None
+    drawn = Randomization(randomize or {}, options)
     vehicle = vehicle or Vehicle.load(RACER)
     return make_world(vehicle, num_worlds, backend, effects=options, randomize=drawn)
 
@@ -763,8 +763,8 @@ def test_off_is_bit_for_bit_absence(num_worlds: int) -> None:
     vehicle = Vehicle.load(RACER)
     off = EffectOptions(motor_lag=False, wind=(0, 0, 0), efficiency=(), gusts=0)
     flown = []
-    for effects in (None, EffectOptions(), off):
-        world = make_world(vehicle, num_worlds, effects=effects)
+    for given in ({}, {"effects": EffectOptions()}, {"effects": off}):
+        world = make_world(vehicle, num_worlds, **given)
         begin(world, 0.5, velocity=[1, 2, 0])
         fly(world, (1.4, 1.5, 1.3, 1.4), 50, 4)
         arrays = [array.tobytes() for array in states(world)]
