@@ -133,7 +133,7 @@ class Loop:
         if not record.has_begun and not all_begin:
             record.begin_all(begin)
         if seeds is not None:
-            self._world.seed(begun, seeds[:: len(self.spec.agents)])
+            self._world.random.seed(begun, seeds[:: len(self.spec.agents)])
         record.run(None if all_begin else begun, begin)
 
     def snapshot(self) -> Snapshot:

@@ -229,12 +229,11 @@ class Machine:
         memory.put("record/kept/episodes", 0 * memory.get("record/kept/episodes"))
 
     def _seed(self, begun: Mask, seeds: Any) -> None:
-        """As `World.seed`."""
-        world = self._world
-        random = world.random
+        """As `Random.seed`."""
+        random = self._world.random
         random.keys = self.memory.get(_KEYS)
         random.episode = self.memory.get(_EPISODE)
-        world.seed(begun, seeds)
+        random.seed(begun, seeds)
         self.memory.put(_KEYS, random.keys)
         self.memory.put(_EPISODE, random.episode)
 

@@ -22,8 +22,6 @@ from .state import Array, is_traced
 
 Words = NDArray[np.uint32]
 Numbers = NDArray[np.float64]
-Ids = Any
-"""Numbers of worlds, or `...` for all."""
 Mask = Any
 """Of drones, bool, shape (W, A), the same for those of a world. None: all."""
 
@@ -115,10 +113,10 @@ class Random(Kept):
         self.episode = np.zeros(worlds, np.uint32)
         self._noises: dict[str, Noise] = {}
 
-    def seed(self, ids: Ids, seeds: Sequence[int | None]) -> None:
-        """Seed the worlds `ids`; where the seed is None their numbers go on."""
-        given = [world for world, seed in zip(ids, seeds, strict=True) if seed is not None]
-        numbers = [int(seed) % 2**64 for seed in seeds if seed is not None]
+    def seed(self, mask: Mask, seeds: Sequence[int | None] | Array) -> None:
+        """Seed the worlds of a mask, seeds (W,); where it is None their numbers go on."""
+        given = [world for world in self.ids(mask).tolist() if seeds[world] is not None]
+        numbers = [int(seeds[world]) % 2**64 for world in given]
         self.keys[given] = _keys(np.array(numbers, np.uint64))
         self.episode[given] = 0
 
@@ -133,8 +131,8 @@ class Random(Kept):
         """The worlds of a mask, bool, shape (W,)."""
         return np.ones(len(self.episode), bool) if mask is None else mask[:, 0]
 
-    def ids(self, mask: Mask) -> Ids:
-        """The numbers of the worlds of a mask; traced code has one world."""
+    def ids(self, mask: Mask) -> Any:
+        """The numbers of the worlds of a mask; `...` of traced code, which has one world."""
         worlds = self.worlds(mask)
         return ... if is_traced(worlds) else np.flatnonzero(worlds)
 

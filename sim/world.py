@@ -109,11 +109,6 @@ class World(NotCopied):
         self.outer: ByName = {}
         self.asked: set[str] = set()
 
-    def seed(self, mask: Array, seeds: Sequence[int | None] | Array) -> None:
-        """Seed the worlds of a mask, seeds (W,); where it is None the random numbers go on."""
-        ids = self.random.ids(mask).tolist()
-        self.random.seed(ids, [seeds[i] for i in ids])
-
     def draw(self, mask: Array) -> Draw:
         """Draws for the next start of the worlds of a mask, before their `reset`."""
         return Draw(self.random, START, mask, ahead=1)

@@ -57,7 +57,7 @@ def gyroscope() -> np.ndarray:
     world = make_world(Vehicle.load(), _WORLDS, num_threads=1)
     every = np.ones((_WORLDS, 1), bool)
     sensors = Sensors(checked_sensors({"imu": IRIS | {"gyro_bias": 0.0}}), world, _PERIOD)
-    world.seed(every, range(_WORLDS))
+    world.random.seed(every, range(_WORLDS))
     world.reset(every, InitialState(position=np.tile((0.0, 0.0, 5.0), (_WORLDS, 1, 1))))
     sensors.begin(every)
     readings = np.empty((_SAMPLES, _WORLDS * 3))

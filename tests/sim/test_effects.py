@@ -888,7 +888,7 @@ def test_a_drawn_strength_of_gusts() -> None:
     theirs = world_of(gusts=4.0, body_drag=True)
     begin(theirs)
     for world in (ours, theirs):
-        world.seed(EVERY, [3])
+        world.random.seed(EVERY, [3])
         fly(begin(world), HOVER, 20)
     assert alone(ours).velocity.tolist() == alone(theirs).velocity.tolist() != [0.0, 0.0, 0.0]
 
@@ -928,7 +928,7 @@ def check_distribution(
     num = 5000
     world = world_of(None, num, randomize={"mass": text})
     everybody = np.ones((num, 1), bool)
-    world.seed(everybody, list(range(num)))
+    world.random.seed(everybody, list(range(num)))
     begin(world)
     values = world.parameters["mass"]
     error = 5 / sqrt(num)
@@ -955,7 +955,7 @@ def test_distributions() -> None:
 
 def test_a_single_drone_draws_beyond_its_bounds() -> None:
     world = world_of(randomize={"mass": "normal(1, 1e3)"})
-    world.seed(EVERY, [0])
+    world.random.seed(EVERY, [0])
     seen = []
     for _ in range(20):
         begin(world)

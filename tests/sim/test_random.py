@@ -66,8 +66,7 @@ def test_normal_numbers_are_normal() -> None:
 def random_of(*shape: int, seed: int = 5) -> Random:
     """Worlds with the seeds seed, seed + 1..., in their first episode."""
     random = Random(shape)
-    worlds = range(shape[0])
-    random.seed(worlds, [seed + i for i in worlds])
+    random.seed(None, [seed + i for i in range(shape[0])])
     random.begin(None)
     return random
 
@@ -118,7 +117,7 @@ def test_an_episode_begins_with_other_numbers_and_a_seed_repeats_them() -> None:
     first, second = noise.normal()[:, 0].tolist()
     assert first == numbers(5, 1)
     assert second == numbers(6, 0, episode=2)
-    random.seed([0, 1], [9, None])
+    random.seed(None, [9, None])
     random.begin(np.array([[True], [False]]))
     first, second = noise.normal()[:, 0].tolist()
     assert first == numbers(9, 0)
@@ -127,7 +126,7 @@ def test_an_episode_begins_with_other_numbers_and_a_seed_repeats_them() -> None:
 
 def test_a_draw_begins_the_episode_of_the_reset_that_follows() -> None:
     random = Random((1, 1))
-    random.seed([0], [3])
+    random.seed(None, [3])
     shares = []
     for episode in (1, 2):
         shares.append(Draw(random, START, None, ahead=1).uniform(0.0, 1.0).item())
@@ -179,7 +178,7 @@ def test_a_seed_repeats_the_starts_of_a_world(worlds: int) -> None:
     every = np.ones((worlds, 1), bool)
     starts = []
     for _ in range(2):
-        world.seed(every, range(11, 11 + worlds))
+        world.random.seed(every, range(11, 11 + worlds))
         for _ in range(2):
             share = world.draw(every).uniform(0.0, 1.0)
             begin(world, position=(0.0, 0.0, 5.0))

@@ -103,7 +103,7 @@ def test_compiled_and_numpy_fly_the_same_bits(name: str, dtype: str) -> None:
     dice = np.random.default_rng(0)
     pose = tumbling(dice)
     for world in (compiled, plain):
-        world.seed(EVERY, range(N))
+        world.random.seed(EVERY, range(N))
         begin(world, **pose)
     for _ in range(20):
         share = dice.uniform(0.5, 1.5, (N, 1, vehicle.num_rotors))

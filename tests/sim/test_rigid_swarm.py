@@ -97,7 +97,7 @@ def test_every_drone_has_the_draws_that_it_has_on_mujoco() -> None:
 
     for world in (ours, theirs):
         every = np.ones(shape, bool)
-        world.seed(every, [7, 8])
+        world.random.seed(every, [7, 8])
         begin(world, every, **tumbling(*shape))
     for name in DRAWN:
         drawn = np.asarray(ours.parameters[name])

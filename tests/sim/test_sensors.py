@@ -43,7 +43,7 @@ def sensing(
     every = np.ones(world.shape, bool)
     start = {"position": (0.0, 0.0, 5.0), **pose}
     made = Sensors(checked_sensors(sensors), world, PERIOD)
-    world.seed(every, [100 + i for i in range(worlds)])
+    world.random.seed(every, [100 + i for i in range(worlds)])
     begin(world, **start)
     made.begin(every)
     return world, made, every
