@@ -248,9 +248,9 @@ class Noise(Kept):
             self._of = now
             steps = first[:, None] + np.arange(ahead, dtype=np.uint32)
             keys = np.repeat(random.keys[:, None], ahead, axis=1)
-            episodes = np.repeat(random.episode[:, None], ahead, axis=1)
-            self._rows = self._drawn(keys, episodes, steps)
-        return self._rows[np.arange(len(row)), row]
+            self._rows = self._drawn(keys, random.episode[:, None], steps)
+        numbers: Numbers = self._rows[np.arange(len(row)), row]
+        return numbers
 
     def _drawn(self, keys: Array, episodes: Array, steps: Array) -> Numbers:
         """Numbers of steps (...), shape (..., A, size)."""
