@@ -75,11 +75,6 @@ class CompiledLoop(Loop):
         if some(results["wrong"]):
             self._check()
 
-    @property
-    def is_compiled(self) -> bool:
-        """Whether a machine steps it; before its first step or `prepare`, no."""
-        return self._machine is not None
-
     def prepare(self) -> None:
         """Compile."""
         self.machine()

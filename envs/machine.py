@@ -16,7 +16,7 @@ from ..sim import World
 from ..sim.compile import Program, Untraceable, lift, read
 from ..sim.compile.layout import Layout, Memory
 from ..sim.compile.llvm import Region, compiled, widest
-from ..sim.snapshots import Arrays, Snapshot, part_of
+from ..sim.snapshots import Arrays, Snapshot, joined, part_of
 from ..sim.world import Call
 from .autoreset import Told
 from .derivative import Derivative
@@ -239,8 +239,7 @@ class Machine:
 
     def state(self) -> Snapshot:
         """As `Loop.state`."""
-        hidden = self._world.hidden()
-        return self.kept() | {f"Flight/state/{name}": array for name, array in hidden.items()}
+        return self.kept() | joined({"Flight/state": self._world.hidden()})
 
     def kept(self) -> Snapshot:
         """The part of `state` that is array code."""

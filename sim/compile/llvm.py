@@ -7,6 +7,7 @@ out where none of the lanes is in its mask.
 
 import ctypes
 from collections.abc import Callable, Sequence
+from copy import copy
 from functools import cache, lru_cache
 from math import prod
 from pathlib import Path
@@ -163,12 +164,11 @@ class _Printer:
         self._calls = {}
         self._tables = region.program.tables
         self._lines.append(f"region.{number}:")
-        if not region.mask:
-            self._lines.append(f"  br label %body.{number}")
-        else:
+        some = "true"
+        if region.mask:
             flags = f"{self._lanes('i1')} {self._load(region.mask, 0)}"
             some = self._new(f"call i1 @llvm.vector.reduce.or.{self._suffix('i1')}({flags})")
-            self._lines.append(f"  br i1 {some}, label %body.{number}, label {after}")
+        self._lines.append(f"  br i1 {some}, label %body.{number}, label {after}")
         self._lines.append(f"body.{number}:")
         for value in region.operations():
             self._names[value.number] = self._printed(value)
@@ -229,17 +229,18 @@ class _Printer:
 
     def _definition(self, function: Function, inputs: Sequence[Value]) -> str:
         """The text of a function."""
-        outer = self._lines, self._names, self._calls
-        self._lines, self._names, self._calls = [], {}, {}
+        inner = copy(self)
+        inner._lines = []
+        inner._names = {}
+        inner._calls = {}
         for value in function.program.needed(function.results):
-            self._names[value.number] = self._printed(value)
+            inner._names[value.number] = inner._printed(value)
         kind = self._returned(function)
         out = "poison"
         for number, one in enumerate(function.results):
-            part = f"{self._type(one.dtype)} {self._names[one.number]}"
-            out = self._new(f"insertvalue {kind} {out}, {part}, {number}")
-        body = "\n".join((*self._lines, f"  ret {kind} {out}"))
-        self._lines, self._names, self._calls = outer
+            part = f"{self._type(one.dtype)} {inner._names[one.number]}"
+            out = inner._new(f"insertvalue {kind} {out}, {part}, {number}")
+        body = "\n".join((*inner._lines, f"  ret {kind} {out}"))
         parameters = ", ".join(f"{self._type(one.dtype)} %p{i}" for i, one in enumerate(inputs))
         return f'define internal {kind} @"{function.name}"({parameters}) #0 {{\n{body}\n}}'
 

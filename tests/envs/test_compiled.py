@@ -41,7 +41,7 @@ def both(case: Case, worlds: int = WORLDS, **more: Any) -> tuple[CompiledLoop, L
 
 def check_same(ours: CompiledLoop, theirs: Loop) -> None:
     """All arrays that a later step depends on, and what the last step gave."""
-    assert ours.is_compiled
+    assert ours.machine()
     for name in ("observations", "rewards", "terminated", "truncated", "done", "out"):
         assert bits(getattr(ours, name)) == bits(getattr(theirs, name)), name
     assert bits(ours.telemetry) == bits(theirs.telemetry)
