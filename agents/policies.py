@@ -67,7 +67,7 @@ class ActionMap:
     def __init__(self, action: ArraySpec | Discrete) -> None:
         self.discrete = isinstance(action, Discrete)
         if isinstance(action, Discrete):
-            self.outputs = action.n
+            self.outputs = action.choices
             self.size = 1
             return
         if not action.dtype.startswith("float"):

@@ -32,7 +32,7 @@ def observation_space(spec: EnvSpec) -> spaces.Space[Any]:
 def action_space(spec: EnvSpec) -> spaces.Space[Any]:
     """A Box, or Discrete."""
     if isinstance(spec.action, Discrete):
-        return spaces.Discrete(spec.action.n)
+        return spaces.Discrete(spec.action.choices)
     return box(spec.action)
 
 

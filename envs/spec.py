@@ -67,7 +67,7 @@ class _Part:
             value = getattr(self, f.name)
             default = f.default if f.default_factory is MISSING else f.default_factory()
             if value != default or f.name not in self._optional:
-                content[f.metadata.get("json", f.name)] = _plain(value)
+                content[f.name] = _plain(value)
         return content
 
     @classmethod
@@ -79,10 +79,10 @@ class _Part:
             )
         given = {}
         for f in fields(cls):  # type: ignore[arg-type]
-            name = f.metadata.get("json", f.name)
+            name = f.name
             if name in content:
                 value = content[name]
-                given[f.name] = tuple(value) if isinstance(value, list) else value
+                given[name] = tuple(value) if isinstance(value, list) else value
             elif f.default is MISSING and f.default_factory is MISSING:
                 raise SpecError(f"spec: expected {name} in {cls.__name__}, got {list(content)}")
         return given
@@ -160,20 +160,18 @@ class ArraySpec(_Part):
 
 @immutable
 class Discrete(_Part):
-    """An action that is one choice out of 0 ... n - 1."""
+    """An action that is one choice out of 0 ... choices - 1."""
 
     _optional = ("components",)
 
     name: Word = "action"
-    n: Annotated[int, Limits(1, 1 << 24, "choices", whole=True)] = field(
-        metadata={"json": "choices"}
-    )
+    choices: Annotated[int, Limits(1, 1 << 24, "choices", whole=True)]
     components: Words = ()
     """A name for each choice, or none."""
 
     def __post_init__(self) -> None:
         check_fields(self, "action: ", SpecError)
-        _check_components("action", self.components, self.n)
+        _check_components("action", self.components, self.choices)
 
 
 @immutable

@@ -74,7 +74,7 @@ def observed(task: Task) -> tuple[ArraySpec, ...]:
 
 def _action(controller: Controller) -> ArraySpec | Discrete:
     if controller.choices:
-        return Discrete(n=controller.choices, components=controller.components)
+        return Discrete(choices=controller.choices, components=controller.components)
     return ArraySpec(
         name="action",
         shape=(len(controller.low),),

@@ -67,7 +67,7 @@ class Scripted(AdvancingVectorEnv):
         self._script = script
         self._reward = reward
         self._take_spec(
-            spec_of(Discrete(n=3) if discrete else None), len(script), AutoresetMode.DISABLED
+            spec_of(Discrete(choices=3) if discrete else None), len(script), AutoresetMode.DISABLED
         )
         self.flown: list[list[Row]] = [[] for _ in script]
         self._episodes = [-1] * len(script)

@@ -423,8 +423,8 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Observation, ArrayL
         right = np.isfinite(sent)
         expected = "finite numbers"
         if isinstance(action, Discrete):
-            right = (sent >= 0) & (sent < action.n)
-            expected = f"0 to {action.n - 1}"
+            right = (sent >= 0) & (sent < action.choices)
+            expected = f"0 to {action.choices - 1}"
         if not right.all():
             raise InputError(f"action: expected {expected}, got {sent[~right][0]}")
         return sent

@@ -180,7 +180,7 @@ def _about(spec: EnvSpec, facts: Mapping[str, str]) -> list[str]:
     ]
     if isinstance(action, Discrete):
         lines.append("action, the number of a choice:")
-        choices = action.components or range(action.n)
+        choices = action.components or range(action.choices)
         lines += [f"  {i}: {name}" for i, name in enumerate(choices)]
     else:
         lines += ["action:", *_described([action], spec.action_scale)]

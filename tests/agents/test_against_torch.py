@@ -37,7 +37,7 @@ SETTINGS["mappo"] = SETTINGS["ppo"]
 
 def agent_of(algorithm: str, *, discrete: bool) -> Any:
     """A learner that nothing has flown for: its spec has two drones in a world."""
-    action = Discrete(n=3) if discrete else ArraySpec(name="action", shape=(3,))
+    action = Discrete(choices=3) if discrete else ArraySpec(name="action", shape=(3,))
     spec = replace(spec_of(action), agents=("one", "two"))
     row = ALGORITHMS[algorithm]
     return row.agent(SimpleNamespace(spec=spec), row.config(**SETTINGS[algorithm]), 3)

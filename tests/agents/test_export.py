@@ -150,7 +150,7 @@ def by_gpp(policy: NetworkPolicy, observations: np.ndarray, folder: Path) -> np.
     return by_gcc(policy, observations, folder, "g++")
 
 
-CHOICE = spec_of(Discrete(n=5, components=("a", "b", "c", "d", "e")))
+CHOICE = spec_of(Discrete(choices=5, components=("a", "b", "c", "d", "e")))
 HALF = ArraySpec(name="a", shape=(3,), low=(0.0, -np.inf, -np.inf), high=(100.0, 0.5, np.inf))
 HALF_BOUNDED = spec_of(HALF)
 CASES: dict[str, Callable[[], NetworkPolicy]] = {

@@ -32,7 +32,7 @@ def normal(*shape: int) -> np.ndarray:
 
 
 def actor(*, discrete: bool) -> NetworkPolicy:
-    action = Discrete(n=3) if discrete else ArraySpec(name="action", shape=(3,))
+    action = Discrete(choices=3) if discrete else ArraySpec(name="action", shape=(3,))
     return random_policy(spec_of(action, [ArraySpec(name="seen", shape=(INPUTS,))]), size=0.5)
 
 

@@ -14,7 +14,7 @@ from rotorgram.models.errors import InputError
 from scripted import spec_of
 
 BOX = spec_of()
-CHOICE = spec_of(Discrete(n=3))
+CHOICE = spec_of(Discrete(choices=3))
 
 
 def constant(spec: Any, *outputs: float) -> NetworkPolicy:

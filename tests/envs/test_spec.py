@@ -34,7 +34,7 @@ def spec_of(**rest: Any) -> EnvSpec:
         "env_id": "my/Env-v0",
         "control_period": 0.02,
         "observation": (PICTURE,),
-        "action": Discrete(n=3),
+        "action": Discrete(choices=3),
     }
     return EnvSpec(**{**fields, **rest})
 
@@ -127,7 +127,7 @@ def specs(draw: st.DrawFn) -> EnvSpec:
         told = (ArraySpec(name="metrics", shape=(1,), dtype="float64", components=names),)
     options = st.dictionaries(WORDS, st.one_of(NUMBERS, WORDS, st.lists(NUMBERS)))
     agents = draw(st.lists(WORDS, min_size=1, max_size=3, unique=True))
-    choices = st.builds(Discrete, n=st.integers(1, 1 << 24))
+    choices = st.builds(Discrete, choices=st.integers(1, 1 << 24))
     action = draw(st.one_of(arrays(), choices))
     return spec_of(
         options=draw(options),

@@ -138,7 +138,7 @@ def spec_of_gymnasium(env: GymEnv, options: Mapping[str, object]) -> EnvSpec:
     arrays = tuple(_array(name or "observation", box) for name, box in boxes.items())
     action: ArraySpec | Discrete
     if isinstance(env.action_space, spaces.Discrete) and env.action_space.start == 0:
-        action = Discrete(n=int(env.action_space.n))
+        action = Discrete(choices=int(env.action_space.n))
     else:
         action = _array("action", env.action_space)
     spec = getattr(base, "env_spec", None)
