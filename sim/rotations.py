@@ -89,22 +89,24 @@ def _turned(quaternion: Array, vector: Array, sign: float) -> Array:
     ))  # fmt: skip
 
 
+def axes_of(quaternion: Array) -> Rows:
+    """The components of body x, y and z in the world frame, shape (...)."""
+    return transposed(matrix(parts_of(quaternion)))
+
+
 def body_x(quaternion: Array) -> Array:
     """Direction of body x in the world frame, shape (..., 3)."""
-    w, x, y, z = parts_of(quaternion)
-    return stack((1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)))
+    return stack(axes_of(quaternion)[0])
 
 
 def body_z(quaternion: Array) -> Array:
     """Direction of body z in the world frame, shape (..., 3)."""
-    w, x, y, z = parts_of(quaternion)
-    return stack((2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)))
+    return stack(axes_of(quaternion)[2])
 
 
 def world_z(quaternion: Array) -> Array:
     """Direction of world z in the body frame, shape (..., 3)."""
-    w, x, y, z = parts_of(quaternion)
-    return stack((2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)))
+    return stack(matrix(parts_of(quaternion))[2])
 
 
 def euler(quaternion: Array) -> tuple[Array, Array, Array]:

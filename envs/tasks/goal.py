@@ -11,6 +11,7 @@ from ...models import InputError
 from ...models.fields import Limits
 from ...sim import (
     Array,
+    Draw,
     body_x,
     body_z,
     clip,
@@ -176,6 +177,19 @@ class GoalTask(Task):
         """The option `goal`, the same for every drone."""
         return at(self.options.goal, state.position[..., 0])
 
+    def offset(self, draw: Draw) -> Array:
+        """Of a start, within the option `start_band` along each axis, m, (W, A, 3)."""
+        band = self.options.start_band
+        return draw.uniform(-band, band, (3,))
+
+    def tilted(self, draw: Draw) -> Array:
+        """Quaternions, (W, A, 4), within the option `start_tilt` about any level axis."""
+        tilt = draw.uniform(0.0, math.radians(self.options.start_tilt))
+        azimuth = draw.uniform(-math.pi, math.pi)
+        sine = sin(tilt / 2)
+        w = cos(tilt / 2)
+        return stack((w, sine * cos(azimuth), sine * sin(azimuth), 0.0 * w))
+
     def distance(self, state: State) -> Array:
         """From each drone to its goal, m, shape (W, A)."""
         return length(self.goal(state) - state.position)
@@ -216,13 +230,6 @@ class GoalTask(Task):
         s = sin(self.wanted)
         x, y, z = parts_of(vectors)
         return stack((c * x + s * y, c * y - s * x, z))
-
-
-def tilted(angle: Array, azimuth: Array) -> Array:
-    """Quaternions, (W, A, 4), of tilts by an angle about the level axis at an azimuth, rad."""
-    sine = sin(angle / 2)
-    w = cos(angle / 2)
-    return stack((w, sine * cos(azimuth), sine * sin(azimuth), 0.0 * w))
 
 
 def at(point: Sequence[float], like: Array) -> Array:

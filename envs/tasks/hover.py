@@ -29,7 +29,6 @@ from .goal import (
     check_band,
     check_height,
     nearness,
-    tilted,
 )
 from .task import Outcome, TaskOptions
 
@@ -104,18 +103,15 @@ class Hover(GoalTask):
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """At rest near the goal, tilted and turned."""
         options = self.options
-        band = options.start_band
-        offset = draw.uniform(-band, band, (3,))
-        tilt = draw.uniform(0.0, math.radians(options.start_tilt))
-        azimuth = draw.uniform(-math.pi, math.pi)
+        offset = self.offset(draw)
+        w, x, y, _ = parts_of(self.tilted(draw))
         off = math.radians(options.start_heading)
         heading = (self.wanted + draw.uniform(-off, off)) / 2
         # First tilted about a horizontal axis, then turned about the vertical.
-        w, x, y, _ = parts_of(tilted(tilt, azimuth))
         c = cos(heading)
         s = sin(heading)
         quaternion = stack((c * w, c * x - s * y, c * y + s * x, s * w))
-        return InitialState(position=at(options.goal, tilt) + offset, quaternion=quaternion)
+        return InitialState(position=at(options.goal, w) + offset, quaternion=quaternion)
 
     def outcome(self, state: State) -> Outcome:
         """Nearness to goal and heading; the end at a crash, a flip-over, or outside the band."""

@@ -145,7 +145,7 @@ class Landing(GoalTask):
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """Level and at rest above the pad's path."""
         options = self.options
-        offset = draw.uniform(-options.start_band, options.start_band, (3,))
+        offset = self.offset(draw)
         speed = draw.uniform(*ends_of(options.pad_speed))
         direction = draw.uniform(-math.pi, math.pi)
         phase = draw.uniform(-math.pi, math.pi)
@@ -188,7 +188,7 @@ class Landing(GoalTask):
         options = self.options
         touching = state.touching
         relative = self.memory.arrival - self._pad_velocity()
-        away = self._goal() - state.position
+        away = self.goal() - state.position
         distance = length(away[..., :2])
         landed = (
             touching
@@ -214,11 +214,8 @@ class Landing(GoalTask):
             },
         )
 
-    def goal(self, state: State) -> Array:
+    def goal(self, state: State | None = None) -> Array:
         """The pad's centre, at the height of a craft that stands on it."""
-        return self._goal()
-
-    def _goal(self) -> Array:
         path = self.options.pad_path
         phase = self.memory.phase
         return self._turned(path * cos(phase), path * sin(phase), self._height)
@@ -241,4 +238,4 @@ class Landing(GoalTask):
     def _potential_of(self, position: Array, velocity: Array) -> Array:
         """Minus the distance to the goal, m, and what the relative speed counts."""
         speed = length(velocity - self._pad_velocity())
-        return -(length(self._goal() - position) + MATCHING_TIME * speed)
+        return -(length(self.goal() - position) + MATCHING_TIME * speed)

@@ -31,7 +31,6 @@ from .goal import (
     check_height,
     nearness,
     swing_cost,
-    tilted,
     with_payload,
 )
 from .task import Outcome, TaskOptions
@@ -123,19 +122,17 @@ class PayloadHover(GoalTask):
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """The payload near its goal, hanging still below a craft that moves and tilts."""
         options = self.options
-        band = options.start_band
         fastest = options.start_speed
-        offset = draw.uniform(-band, band, (3,))
-        tilt = draw.uniform(0.0, math.radians(options.start_tilt))
-        azimuth = draw.uniform(-math.pi, math.pi)
+        offset = self.offset(draw)
+        tilted = self.tilted(draw)
         along = draw.uniform(-fastest, fastest)
         across = draw.uniform(-fastest, fastest)
         carrying = (1.0 + options.payload_share) * self.vehicle.hover_thrust
         return InitialState(
-            position=self._above(tilt) + offset,
-            quaternion=tilted(tilt, azimuth),
+            position=self._above(along) + offset,
+            quaternion=tilted,
             velocity=stack((along, across, 0.0)),
-            thrust=carrying + (0.0 * tilt)[..., None],
+            thrust=carrying + (0.0 * along)[..., None],
         )
 
     def _above(self, like: Array) -> Array:

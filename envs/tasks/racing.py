@@ -174,8 +174,7 @@ class Racing(GoalTask):
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """At rest near the start, the nose along the track."""
-        band = self.options.start_band
-        offset = draw.uniform(-band, band, (3,))
+        offset = self.offset(draw)
         position = np.array(self._start.position) + offset
         half = math.radians(self._start.heading) / 2
         memory = self.memory

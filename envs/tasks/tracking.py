@@ -110,10 +110,9 @@ class Tracking(GoalTask):
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """Near any point of the trajectory, at its velocity."""
-        band = self.options.start_band
         share = draw.uniform(0.0, 1.0)
         self.memory.index = np.floor(share * len(self._table))  # row of the table
-        offset = draw.uniform(-band, band, (3,))
+        offset = self.offset(draw)
         position = self._at(self._table, 0.0) + offset
         velocity = self._at(self._rates, 0.0) + 0.0 * offset
         return InitialState(position=position, velocity=velocity)

@@ -25,7 +25,7 @@ from ... import models
 from ..effects import EffectOptions
 from ..effects.rotors import polynomial
 from ..elementary import cos, sin
-from ..rotations import Parts, Rows, dot, matrix, times, transposed
+from ..rotations import Parts, Rows, axes_of, dot, times
 from ..state import Array, WorldState, clip, interpolated, parts_of, square_root, stack
 from .gains import Gains
 
@@ -154,7 +154,7 @@ class Attitude(Rates):
     def thrust(self, action: Array, state: WorldState) -> Array:
         """As `Controller.thrust`."""
         share, roll, pitch, yaw_rate = self._scaled(action)
-        axes = _axes(state.quaternion)
+        axes = axes_of(state.quaternion)
         cosine = cos(roll)
         x, y = _turned(axes[0], cosine * sin(pitch), -sin(roll))
         axis = x, y, cosine * cos(pitch)
@@ -193,7 +193,7 @@ class Velocity(Attitude):
     def thrust(self, action: Array, state: WorldState) -> Array:
         """As `Controller.thrust`."""
         x, y, z, yaw_rate = self._scaled(action)
-        axes = _axes(state.quaternion)
+        axes = axes_of(state.quaternion)
         return self.fly((*_turned(axes[0], x, y), z), yaw_rate, axes, state)
 
     def fly(self, velocity: Parts, yaw_rate: Array, axes: Rows, state: WorldState) -> Array:
@@ -236,7 +236,7 @@ class Position(Velocity):
     def thrust(self, action: Array, state: WorldState) -> Array:
         """As `Controller.thrust`."""
         x, y, z, heading = self._scaled(action)
-        axes = _axes(state.quaternion)
+        axes = axes_of(state.quaternion)
         gains = self.gains
         level, up = gains.most_acceleration
         fast, climb = gains.most_velocity
@@ -265,11 +265,6 @@ def _throttle(curve: Numbers) -> np.ndarray:
         low = np.where(is_below, middle, low)
         high = np.where(is_below, high, middle)
     return low
-
-
-def _axes(quaternion: Array) -> Rows:
-    """Body x, y and z in the world frame."""
-    return transposed(matrix(parts_of(quaternion)))
 
 
 def _turned(nose: Parts, x: Array, y: Array) -> tuple[Array, Array]:
