@@ -1,9 +1,7 @@
 """A loop whose steps are machine code."""
 
-import logging
 import traceback
 from dataclasses import replace
-from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,6 +10,7 @@ from ..models.errors import InputError, one_line
 from ..sim import Array, PhysicsError
 from ..sim.snapshots import Arrays, Snapshot
 from ..sim.state import some
+from ..sim.world import tell_once
 from .config import EnvConfig
 from .loop import Loop
 from .stages.ends import refuse_unfit
@@ -43,7 +42,7 @@ class CompiledLoop(Loop):
     """
 
     _machine: "Machine | None" = None
-    _is_inside = False  # whether the machine has the state
+    _inside: "Machine | None" = None  # while it has the state
     refusal = ""
     """Why it is not compiled, once that was tried."""
 
@@ -83,9 +82,9 @@ class CompiledLoop(Loop):
         """The machine, which has the state from now on; None where NumPy flies."""
         if self._machine is None and not self.refusal:
             self._machine = self._made()
-        if self._machine is not None and not self._is_inside:
+        if self._machine is not None and self._inside is None:
             self._machine.restore(self.state())
-            self._is_inside = True
+            self._inside = self._machine
         return self._machine
 
     def _made(self) -> "Machine | None":
@@ -102,27 +101,25 @@ class CompiledLoop(Loop):
             self.refusal = str(error)
         except Exception as error:  # of an own task, any
             self.refusal = f"{one_line(error)} ({place_of(error)})"
-            _tell(config.env_id, self.refusal)
+            tell_once(f"{config.env_id}: not compiled, NumPy flies it: {self.refusal}")
         return None
 
     def _settle(self) -> None:
-        if self._is_inside:
-            assert self._machine is not None
-            self._is_inside = False
-            if self._record.has_begun:
-                super().put(self._machine.kept())
-                self._world.take()
+        machine = self._inside
+        self._inside = None
+        if machine is not None and self._record.has_begun:
+            super().put(machine.kept())
+            self._world.take()
 
     def state(self) -> Snapshot:
         """As `Loop.state`."""
-        if self._is_inside and self._record.has_begun:
-            assert self._machine is not None
-            return self._machine.state()
+        if self._inside is not None and self._record.has_begun:
+            return self._inside.state()
         return super().state()
 
     def put(self, state: Arrays) -> None:
         """As `Loop.put`."""
-        self._is_inside = False
+        self._inside = None
         super().put(state)
 
     def _give(self, results: dict[str, np.ndarray]) -> None:
@@ -172,8 +169,3 @@ def place_of(error: Exception) -> str:
         if own:
             break
     return own[-1]
-
-
-@cache
-def _tell(env_id: str, reason: str) -> None:
-    logging.getLogger(__name__).warning("%s: not compiled, NumPy flies it: %s", env_id, reason)

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..sim.compile import Program, lift, read
 from ..sim.compile.adjoint import adjoints
-from ..sim.compile.layout import Layout, Memory
+from ..sim.compile.layout import Layout, Memory, fields_of
 from ..sim.compile.llvm import Region, compiled
 from ..sim.state import Array, ByName
 from .loop import Loop
@@ -51,7 +51,7 @@ class Derivative:
                 places += [(f"by/{name}", row) for row in range(array.size)]
         found = adjoints(program, outputs, inputs)
         stores = [(*place, value) for place, value in zip(places, found, strict=True)]
-        layout = Layout({name: (x.dtype, x.shape[1:]) for name, x in arrays.items()}, state.lanes)
+        layout = Layout(fields_of(arrays), state.lanes)
         self._run = compiled([Region("", program, stores)], [state, layout], {}, width)
         self._memory = Memory(layout, worlds)
 

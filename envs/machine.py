@@ -5,7 +5,7 @@ variables and runs a region, and its next snapshot says what the region computes
 step depends on can be forgotten that a snapshot has.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from math import prod
 from typing import Any
 
@@ -14,7 +14,7 @@ import numpy as np
 from ..models.errors import InputError
 from ..sim import World
 from ..sim.compile import Program, Untraceable, lift, read
-from ..sim.compile.layout import Layout, Memory
+from ..sim.compile.layout import Layout, Memory, fields_of
 from ..sim.compile.llvm import Region, compiled, widest
 from ..sim.snapshots import Arrays, Snapshot, joined, part_of
 from ..sim.world import Call
@@ -72,12 +72,14 @@ class Machine:
         width = min(widest(), max(2, 1 << (worlds - 1).bit_length()))
         lanes = width * min(LANES // width, -(-worlds // width))
         self._names = tuple(state)
-        layout = Layout(_fields(state), lanes)
-        self._told = Layout(_fields(self._telemetry()), lanes)
+        layout = Layout(fields_of(state), lanes)
+        self._told = Layout(fields_of(self._telemetry()), lanes)
         given: Named = dict.fromkeys(_MASKS, (_BOOL, sent.shape[1:-1]))
         given["sent"] = (sent.dtype, sent.shape[1:])
-        given |= _fields(self._pushed()) | _fields({_PHYSICS + name: x for name, x in seen.items()})
-        self._outside = given | _fields(self._seen())
+        given |= fields_of(self._pushed()) | fields_of(
+            {_PHYSICS + name: x for name, x in seen.items()}
+        )
+        self._outside = given | fields_of(self._seen())
         self._layouts = layout, self._told
         self._calls = [(_before(call), call) for call in loop.pipeline.flight.calls()]
         self._calls[0] = _FIRST, self._calls[0][1]
@@ -341,11 +343,6 @@ def _before(call: Call) -> str:
     if call.commands:
         return _CONTROL
     return _PUSH if call.pushes else ""
-
-
-def _fields(arrays: Mapping[str, Any]) -> dict[str, tuple[np.dtype[Any], tuple[int, ...]]]:
-    """Dtype and shape of arrays of one world, (1, ...)."""
-    return {name: (array.dtype, array.shape[1:]) for name, array in arrays.items()}
 
 
 def _stores(program: Program, after: Named, before: Named) -> Any:

@@ -6,7 +6,7 @@ the number of a use, which is made of its name: a use that is switched on later 
 numbers of another. A batch of W worlds has the numbers of W single ones.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from math import prod
 from secrets import randbits
 from typing import Any
@@ -141,9 +141,9 @@ class Random(Kept):
         self._noises[name] = noise = Noise(self, crc32(name.encode()), size)
         return noise
 
-    def parts(self) -> dict[str, Kept]:
+    def parts(self) -> Mapping[str, Kept]:
         """The noises."""
-        return dict(self._noises)
+        return self._noises
 
 
 def _keys(seeds: NDArray[np.uint64]) -> Words:

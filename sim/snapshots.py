@@ -18,8 +18,8 @@ class Kept:
 
     arrays: ClassVar[tuple[str, ...]] = ()
 
-    def parts(self) -> "dict[str, Kept]":
-        """Parts that keep a state of their own, by name."""
+    def parts(self) -> "Mapping[str, Kept | None]":
+        """Parts that keep a state of their own, by name; None: there is none."""
         return {}
 
     def snapshot(self) -> Snapshot:
@@ -29,7 +29,8 @@ class Kept:
             value = getattr(self, name)
             if value is not None:
                 own[name] = np.copy(value)
-        return own | joined({name: part.snapshot() for name, part in self.parts().items()})
+        parts = {name: part.snapshot() for name, part in self.parts().items() if part}
+        return own | joined(parts)
 
     def restore(self, arrays: Arrays) -> None:
         """Put a snapshot back."""
@@ -37,7 +38,8 @@ class Kept:
             array = arrays.get(name)
             setattr(self, name, None if array is None else array.copy())
         for name, part in self.parts().items():
-            part.restore(part_of(arrays, name))
+            if part:
+                part.restore(part_of(arrays, name))
 
 
 def joined(parts: Mapping[str, Arrays]) -> Snapshot:

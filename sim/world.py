@@ -348,7 +348,7 @@ def make_world(
     if wanted and reason:
         raise InputError(f"compiled: expected false where nothing compiles ({reason}), got true")
     if reason:
-        _tell_once(reason)
+        tell_once(f"NumPy flies, which is slower: {reason}")
     if backend == "rigid":
         settings["compiled"] = wanted is not False and not reason
     module = import_module(f".backends.{backend}", __package__)
@@ -359,5 +359,6 @@ def make_world(
 
 
 @cache
-def _tell_once(reason: str) -> None:
-    logging.getLogger(__name__).warning("NumPy flies, which is slower: %s", reason)
+def tell_once(warning: str) -> None:
+    """Log a warning, once in a process."""
+    logging.getLogger(__name__).warning(warning)

@@ -98,7 +98,7 @@ class RigidWorld(World):
 
     def place(self, mask: Array) -> None:
         """As `World.place`."""
-        self._tell(mask, self._contacts())
+        self._look(mask, looks=True, clears=True)
 
     def fly(self, call: Call, mask: Array | None) -> None:
         """As `World.fly`."""
@@ -106,14 +106,9 @@ class RigidWorld(World):
         mapped(self._body.varying, varying.append)
         new = self._advance(call.steps, self.motion, self.acting, self.wrench, *varying)
         self._show(chosen(mask, new, self.motion))
-        state = self.state
-        if call.clears:
-            self._tell(mask, [self._nobody, self._nobody])
+        self._look(mask, looks=call.looks, clears=call.clears)
         if not call.looks:
             return
-        before = (state.touching, state.colliding)
-        touched = [now | old for now, old in zip(self._contacts(), before, strict=False)]
-        self._tell(mask, touched)
         bad = ~(abs(self.motion) < mujoco.mjMAXVAL).all(axis=-1)
         self.bad = chosen(mask, bad, self.bad)
         if found(self.bad):
@@ -181,12 +176,13 @@ class RigidWorld(World):
         colliding = self._hull.collides(parts_of(state.position))
         return [touching | colliding, colliding]
 
-    def _tell(self, mask: Array | None, touched: list[Array]) -> None:
-        """Set what `_contacts` gave, for the worlds of a mask."""
+    def _look(self, mask: Array | None, *, looks: bool, clears: bool) -> None:
+        """Set which crafts touch, those of a mask: with what was before, unless it `clears`."""
+        touched = self._contacts() if looks else [self._nobody, self._nobody]
         for name, new in zip(("touching", "colliding"), touched, strict=False):
             old = getattr(self.state, name)
             if old is not None:
-                setattr(self.state, name, chosen(mask, new, old))
+                setattr(self.state, name, chosen(mask, new if clears else new | old, old))
 
     def refuse_bad(self, mask: Array | None) -> None:
         """As `World.refuse_bad`."""

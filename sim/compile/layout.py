@@ -16,6 +16,11 @@ Fields = Mapping[str, tuple[DType, tuple[int, ...]]]
 """Dtype and shape of arrays for one world, by name."""
 
 
+def fields_of(arrays: Mapping[str, np.ndarray]) -> dict[str, tuple[DType, tuple[int, ...]]]:
+    """Those of arrays of one world, shape (1, ...)."""
+    return {name: (array.dtype, array.shape[1:]) for name, array in arrays.items()}
+
+
 class Layout:
     """Where each array lies within a block of so many lanes.
 

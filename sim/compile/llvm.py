@@ -10,15 +10,13 @@ from collections.abc import Callable, Sequence
 from copy import copy
 from functools import cache, lru_cache
 from math import prod
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ...models.errors import one_line
-from ...models.files import read_toml
 from .layout import Fields, Layout
-from .program import DType, Function, Program, Value
+from .program import OPERATIONS, DType, Function, Program, Value
 
 Code = Callable[..., None]
 """Takes the number of blocks, the address of each memory, and those of arrays outside."""
@@ -33,7 +31,6 @@ _KINDS = {
     np.dtype(np.uint64): "i64",
 }
 _SHORT = {"float": "f32", "double": "f64"}
-_OPERATIONS = read_toml(Path(__file__).with_name("operations.toml"), "operations")
 _MODULE = """define void @run(i64 %blocks{arguments}) #0 {{
 entry:
 {rows}
@@ -198,7 +195,7 @@ class _Printer:
         before = value.inputs[0].dtype
         if operation == "cast":
             operation = _cast(before, value.dtype)
-        instruction: str = _OPERATIONS[before.kind][operation].format(
+        instruction: str = OPERATIONS[before.kind][operation].format(
             *inputs,
             kind=self._type(before),
             lane=_KINDS[before],
@@ -395,7 +392,7 @@ def _cast(before: DType, after: DType) -> str:
     nearest of them.
     """
     name = f"to_{after.kind}"
-    if name in _OPERATIONS[before.kind]:
+    if name in OPERATIONS[before.kind]:
         return name
     if before.itemsize == after.itemsize:
         return "bits"

@@ -6,11 +6,16 @@ that: `llvm.py` prints its operations for as many lanes as the processor has.
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ...models.files import read_toml
+
 DType = np.dtype[Any]
+OPERATIONS = read_toml(Path(__file__).with_name("operations.toml"), "operations")
+"""LLVM's instruction of each operation, by the kind of its first input, and its name."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,7 +18,7 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
-from .program import DType, Function, Program, Value
+from .program import OPERATIONS, DType, Function, Program, Value
 
 Call = Callable[..., Any]
 Traced = Any
@@ -28,11 +28,7 @@ _FLAG = np.dtype(bool)
 _WHOLE = np.dtype(np.int64)
 _DTYPES = ("bool", "int32", "uint32", "int64", "uint64", "float32", "float64")
 _EXPONENTS = (*range(-8, 0), *range(1, 9))
-_OPERATIONS = (
-    "add", "subtract", "multiply", "divide", "negative", "sqrt", "rint", "floor", "copysign",
-    "less", "less_equal", "greater", "greater_equal", "equal", "not_equal", "bitwise_and",
-    "bitwise_or", "bitwise_xor", "invert", "left_shift", "right_shift",
-)  # fmt: skip
+_OPERATIONS = set[str]().union(*OPERATIONS.values())
 """Functions whose bits IEEE 754, or the arithmetic of whole numbers, fixes."""
 _MOVES = (np.broadcast_to, np.expand_dims, np.moveaxis, np.repeat, np.flip)
 """Functions that move components, and compute nothing."""
@@ -325,15 +321,14 @@ def _where(like: TracedArray, flag: Any, first: Any, second: Any) -> Traced:
     return like._each(select, first.dtype, flag.astype(_FLAG), first, second)
 
 
-def _minimum(like: TracedArray, a: Any, b: Any) -> Traced:
+def _extreme(is_before: Call) -> Call:
     """A NaN stays, and of 0 and -0 it is the second."""
-    a, b = like._alike((a, b))
-    return _where(like, a != a, a, _where(like, a < b, a, b))
 
+    def extreme(like: TracedArray, a: Any, b: Any) -> Traced:
+        a, b = like._alike((a, b))
+        return _where(like, a != a, a, _where(like, is_before(a, b), a, b))
 
-def _maximum(like: TracedArray, a: Any, b: Any) -> Traced:
-    a, b = like._alike((a, b))
-    return _where(like, a != a, a, _where(like, a > b, a, b))
+    return extreme
 
 
 def _absolute(like: TracedArray, x: Traced) -> Traced:
@@ -401,8 +396,8 @@ def _filled(number: float) -> Callable[..., Traced]:
 
 _FUNCTIONS: dict[Call, Call] = {
     np.where: _where,
-    np.minimum: _minimum,
-    np.maximum: _maximum,
+    np.minimum: _extreme(np.less),
+    np.maximum: _extreme(np.greater),
     np.absolute: _absolute,
     np.sign: _sign,
     np.power: _power,

@@ -10,7 +10,7 @@ is of second order in the step. Sums over rotors and axes are written out, since
 the same bits alone and in a batch.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from ... import models
 from ...models import InputError
@@ -103,12 +103,9 @@ class Effects(Kept):
         both = zip(self._mean_wind, "xyz", strict=True)
         self._wind = [mean + factors.get(f"wind_{axis}", 0.0) for mean, axis in both]
 
-    def parts(self) -> dict[str, Kept]:
+    def parts(self) -> Mapping[str, Kept | None]:
         """Rotors, air, and gusts."""
-        parts: dict[str, Kept] = {"rotors": self.rotors, "air": self.air}
-        if self._gusts is not None:
-            parts["gusts"] = self._gusts
-        return parts
+        return {"rotors": self.rotors, "air": self.air, "gusts": self._gusts}
 
     def step(self, state: WorldState, mask: Array | None) -> tuple[Array, Array, Array | None]:
         """Advance the worlds of a mask, None for all, by a physics step, from `state` on.

@@ -135,12 +135,9 @@ class Sensors(Kept):
         if self._estimator is not None:
             self._estimator.update(mask, self._sensors)
 
-    def parts(self) -> dict[str, Kept]:
+    def parts(self) -> Mapping[str, Kept | None]:
         """The sensors and the estimator."""
-        parts: dict[str, Kept] = {**self._sensors}
-        if self._estimator is not None:
-            parts[_ESTIMATE] = self._estimator
-        return parts
+        return {**self._sensors, _ESTIMATE: self._estimator}
 
     @property
     def readings(self) -> ByName:

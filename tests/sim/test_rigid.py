@@ -179,7 +179,7 @@ def test_without_llvmlite_numpy_flies(
 ) -> None:
     vehicle = Vehicle.load(linear_drag=0.123)
     monkeypatch.setitem(sys.modules, "llvmlite", None)
-    for function in (llvm._llvm, sim_world._tell_once):
+    for function in (llvm._llvm, sim_world.tell_once):
         function.cache_clear()
         request.addfinalizer(function.cache_clear)
     with pytest.raises(
