@@ -149,9 +149,9 @@ def load(path: Path) -> Checkpoint:
     except InputError as error:
         raise CheckpointError(f"{path}: {error}") from None
     except (SafetensorError, *_MALFORMED) as error:
-        reason = one_line(error)
         raise CheckpointError(
-            f"{path}: expected a rotorgram checkpoint, got one with a wrong part ({reason:.200})"
+            f"{path}: expected a rotorgram checkpoint, got one with a wrong part "
+            f"({one_line(error):.200})"
         ) from None
 
 
@@ -164,8 +164,9 @@ def _read(data: bytes, parse: Callable[[bytes], ByName]) -> Checkpoint:
     header = json.loads(data[8 : 8 + size])
     content = json.loads(header["__metadata__"]["rotorgram"])
     if content["format"] != FORMAT:
-        found_format = shortened(content["format"])
-        raise InputError(f"expected a checkpoint of format {FORMAT}, got {found_format}")
+        raise InputError(
+            f"expected a checkpoint of format {FORMAT}, got {shortened(content['format'])}"
+        )
     spec = EnvSpec.from_json(content["spec"])
     env = EnvConfig.from_dict(content["env"]) if content["env"] else None
     arrays = parse(data)
@@ -184,8 +185,9 @@ def _read(data: bytes, parse: Callable[[bytes], ByName]) -> Checkpoint:
         raise InputError(f"versions: expected values by name, got {checkpoint.versions!r:.80}")
     needed = vars(checkpoint.hyperparameters)
     if needed.keys() != checkpoint.config.keys():
-        got = shortened(checkpoint.config)
-        raise InputError(f"config: expected all of {', '.join(needed)}, got {got}")
+        raise InputError(
+            f"config: expected all of {', '.join(needed)}, got {shortened(checkpoint.config)}"
+        )
     checkpoint.policy()  # raises if it does not fit
     return checkpoint
 

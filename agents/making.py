@@ -48,8 +48,9 @@ def resume_agent(kept: Checkpoint, log: EpisodeRecorder) -> Agent:
     except ResumeError:
         raise
     except (KeyError, TypeError, ValueError, RuntimeError, IndexError) as error:
-        reason = one_line(error)
-        raise CheckpointError(f"checkpoint: its parts do not fit together: {reason:.300}") from None
+        raise CheckpointError(
+            f"checkpoint: its parts do not fit together: {one_line(error):.300}"
+        ) from None
     return agent
 
 
@@ -66,9 +67,9 @@ def _check_same_env(then: EnvSpec, now: EnvSpec) -> None:
                 "name the vehicle with --vehicle"
             )
         if name == "options":
-            reason = options_difference(expected, got)
             raise ResumeError(
-                f"resume: expected an env with options of the training: {reason:.600}"
+                "resume: expected an env with options of the training: "
+                f"{options_difference(expected, got):.600}"
             )
         raise ResumeError(
             f"resume: expected an env with {name} {expected!s:.300}, got {got!s:.300}"

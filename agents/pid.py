@@ -41,9 +41,10 @@ class PID:
                 "geometric flies tasks with a goal"
             )
         modes = f"{options['observation']!r} and {options['action_type']!r}"
-        expected = "observation='full' and action_type='continuous'"
         if modes != "'full' and 'continuous'":
-            raise InputError(f"pid: expected {expected}, got {modes}")
+            raise InputError(
+                f"pid: expected observation='full' and action_type='continuous', got {modes}"
+            )
         telemetry = {array.name: array for array in spec.telemetry}
         if "thrust" not in telemetry:
             raise InputError(f"pid: expected the telemetry thrust, got {sorted(telemetry)}")

@@ -77,8 +77,9 @@ def find_preset(algorithm: str, name: str, env_id: str = DEFAULT_TASK) -> Preset
     row = find_algorithm(algorithm)
     presets = presets_of(algorithm)
     if name not in presets:
-        names = " or ".join(sorted(presets))
-        raise InputError(f"preset: expected {names} for {algorithm}, got {name!r}")
+        raise InputError(
+            f"preset: expected {' or '.join(sorted(presets))} for {algorithm}, got {name!r}"
+        )
     tables = presets[name]
     found = next(_lineage(env_id, list(tables)), None)
     task = found or DEFAULT_TASK

@@ -129,8 +129,9 @@ def _run(words: list[str]) -> int:
         print(f"rotorgram {version('rotorgram')}")
         return 0
     if name not in COMMANDS:
-        known = ", ".join(COMMANDS)
-        print(f"rotorgram: expected a command of {known}, got {name}", file=sys.stderr)
+        print(
+            f"rotorgram: expected a command of {', '.join(COMMANDS)}, got {name}", file=sys.stderr
+        )
         return 2
     from ..rendering.gl import hidden_gl_setting
     from ._parser import parse

@@ -168,8 +168,9 @@ def remote_env(
     if command.listen is not None:
         for name in ("backend", *BACKEND_KEYWORDS):
             if name in {*command.given, *options}:
-                theirs = "it of the simulator that comes: rotorgram sim --backend"
-                raise InputError(f"{name}: expected {theirs}")
+                raise InputError(
+                    f"{name}: expected it of the simulator that comes: rotorgram sim --backend"
+                )
         settings = {"env_id": env_id, "options": options or None} if required else {}
         opened = _waiting(command, command.listen, num_envs, num_simulators, **settings)
     else:

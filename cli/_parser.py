@@ -100,8 +100,9 @@ def _file_values(kind: type[EnvFlags], path: str, env: str | None) -> Options:
     env_id = values.get("env", DEFAULT_ENV)
     own = [name for name in options if name not in KEYWORDS]
     if own and env and canonical_id(env) != canonical_id(env_id):
-        got = ", ".join(own)
-        raise InputError(f"config: expected no options of {env_id} with --env {env}, got {got}")
+        raise InputError(
+            f"config: expected no options of {env_id} with --env {env}, got {', '.join(own)}"
+        )
     return {**values, "options": {**backend.settings, **options}}
 
 

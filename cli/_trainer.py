@@ -26,7 +26,7 @@ from ._env import CHECKPOINT, fitted, local_env, remote_env
 from ._flags import DEFAULT_ENV
 from ._progress import bars
 from ._scalars import ScalarWriter
-from ._training import folder_to_write
+from ._training import flags_of, folder_to_write
 
 if TYPE_CHECKING:
     from .train import Train
@@ -96,8 +96,7 @@ def resume(command: "Train", folder: Path) -> int:
         if command.env_steps is not None:
             kept = _extended(kept, folder, command.env_steps)
         if is_finished(kept):
-            flown = kept.position.env_steps
-            print(f"already trained {flown:,} of {kept.env_steps:,} env steps")
+            print(f"already trained {kept.position.env_steps:,} of {kept.env_steps:,} env steps")
             print(f"checkpoint: {folder / CHECKPOINT}")
             return 0
         for name, (then, now) in kept.other_versions().items():
@@ -115,8 +114,9 @@ def _opened(
     implied = sorted(command.given.intersection(_IMPLY_UDP))
     by_wire = command.udp if "udp" in command.given else of_paper or bool(implied)
     if implied and not by_wire:
-        got = ", ".join("--" + name.replace("_", "-") for name in implied)
-        raise InputError(f"udp: expected --no-udp without flags of the wire, got {got}")
+        raise InputError(
+            f"udp: expected --no-udp without flags of the wire, got {flags_of(implied)}"
+        )
     if by_wire:
         return remote_env(
             command,

@@ -1,7 +1,7 @@
 """Flags of commands that train, the folder that they write, and resuming."""
 
 import shlex
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from itertools import chain
 from pathlib import Path
@@ -45,10 +45,9 @@ class TrainingFlags(BackendFlags):
         own.
         """
         names = sorted(self.given.difference(free, ("algorithm", "resume")))
-        flags = ["--" + name.replace("_", "-") for name in names]
-        if flags:
+        if names:
             raise InputError(
-                f"resume: expected the settings of {folder}, got others by {', '.join(flags)}"
+                f"resume: expected the settings of {folder}, got others by {flags_of(names)}"
             )
 
     def go_on_with(self, words: str, folder: Path, *flags: str) -> str:
@@ -64,6 +63,11 @@ class TrainingFlags(BackendFlags):
             else:
                 line += [f"--{name}", value]
         return f"go on with: {shlex.join(map(str, line))}"
+
+
+def flags_of(names: Iterable[str]) -> str:
+    """The flags of some fields, as they are typed."""
+    return ", ".join(f"--{name.replace('_', '-')}" for name in names)
 
 
 @contextmanager

@@ -56,8 +56,9 @@ class Compare(StudyFlags):
         for name in _OF_FILES:
             values = {getattr(study, name): None for study in studies}
             if len(values) > 1 and name not in settings:
-                got = " and ".join(map(str, values))
-                raise InputError(f"{name}: expected the same in all files, got {got}")
+                raise InputError(
+                    f"{name}: expected the same in all files, got {' and '.join(map(str, values))}"
+                )
         return replace(studies[0], rows=tuple(rows), kind="compare", **settings)
 
     def _of_agents(self) -> "Study":

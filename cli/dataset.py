@@ -46,8 +46,9 @@ class Dataset(Command):
             write_minari(episodes, self.out, self.vehicle)
         else:
             write_parquet(episodes, Path(self.out))
-        steps = count_of(episodes.steps, "step")
-        print(f"{self.out}: {count_of(episodes.count, 'episode')}, {steps}")
+        print(
+            f"{self.out}: {count_of(episodes.count, 'episode')}, {count_of(episodes.steps, 'step')}"
+        )
         if episodes.left_out:
             print(f"left out: {count_of(episodes.left_out, 'episode')}, not recorded to the end")
         if self.to == "minari" and env_of(episodes.spec, self.vehicle) is None:

@@ -31,7 +31,7 @@ class Log(Command):
         from ..models.files import check_new_file
         from ..udp.journal.reader import count_of
 
-        out = self.out or Path(self.flight.stem + ".csv")
+        out = self.out or Path(f"{self.flight.stem}.csv")
         check_new_file(out, ".csv")
         chosen = None if self.episode is None else [self.episode]
         flights = recorded_trajectories(self.flight, chosen, session=self.session, drone=self.drone)

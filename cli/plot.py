@@ -33,7 +33,7 @@ class Plot(Command):
         from ..flights.recorded import recorded_trajectories
         from ..models.files import check_new_file
 
-        out = self.out or Path(self.flights[0].stem + ".png")
+        out = self.out or Path(f"{self.flights[0].stem}.png")
         check_new_file(out, *FORMATS)
         found = {}
         for path in self.flights:

@@ -1,7 +1,7 @@
 """`rotorgram vehicle`: a vehicle's file, from a first one to MJCF for others."""
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -12,7 +12,6 @@ from ..models.files import check_new_file, write_new
 from ._flags import Command
 
 if TYPE_CHECKING:
-    from ..models import Rotor
     from ..models import Vehicle as Craft
     from ..models.checks import Check
     from ..models.vehicle_file import VehicleFile
@@ -83,7 +82,7 @@ class Vehicle(Command):
     frame: Literal["plus", "cross", "hexa", "octo", "list"] = "cross"
     """Arrangement of the rotors of `new`."""
 
-    def run(self) -> int:
+    def run(self) -> int | None:
         """Do it."""
         if self.action == "export" and self.out is None:
             raise InputError(
@@ -93,16 +92,8 @@ class Vehicle(Command):
             raise InputError(f"vehicle: expected one file for {self.action}, got {self.out} too")
         if "frame" in self.given and self.action != "new":
             raise InputError(f"frame: expected no --frame but with new, got {self.frame}")
-        match self.action:
-            case "new":
-                self._new()
-            case "show":
-                self._show()
-            case "export":
-                self._export()
-            case "check":
-                return self._check()
-        return 0
+        act: Callable[[], int | None] = getattr(self, f"_{self.action}")
+        return act()
 
     def _check(self) -> int:
         from ..models.checks import examine
@@ -143,7 +134,9 @@ class Vehicle(Command):
             print(f"{name:17} {value}")
         print("\nrotors: position, direction, torque besides that of the position per thrust")
         for rotor in craft.rotors:
-            print(f"{rotor.name:17} {_rotor_words(rotor)}")
+            place = f"{_listed(rotor.position)} m; {_listed(rotor.axis)}"
+            torque = f"{_listed(rotor.reaction)} N m/N"
+            print(f"{rotor.name:17} {place}; {torque}; {rotor.low:.6g} to {rotor.high:.6g} N")
         print("\ncameras: pictures, place")
         for camera in craft.cameras:
             size = f"{camera.width} × {camera.height}"
@@ -188,11 +181,6 @@ def _derived(craft: "Craft") -> Iterator[tuple[str, str]]:
     yield "hover throttle", f"{_listed((100 * shares).round(2))} %"
     yield "thrust to weight", f"{most / weight:.4g}"
     yield "hash", craft.hash
-
-
-def _rotor_words(rotor: "Rotor") -> str:
-    words = f"{_listed(rotor.position)} m; {_listed(rotor.axis)}; {_listed(rotor.reaction)} N m/N"
-    return f"{words}; {rotor.low:.6g} to {rotor.high:.6g} N"
 
 
 def _provenance(file: "VehicleFile") -> Iterator[str]:

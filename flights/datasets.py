@@ -66,9 +66,8 @@ class RecordedEpisodes:
         episodes = self._whole(paths)
         first = next(episodes, None)
         if first is None:
-            names = ", ".join(map(str, paths))
             got = f"none of {self.left_out}" if self.left_out else "no step of a flight"
-            raise InputError(f"{names}: expected a whole episode, got {got}")
+            raise InputError(f"{', '.join(map(str, paths))}: expected a whole episode, got {got}")
         self._episodes = chain([first], episodes)
 
     def __iter__(self) -> Iterator[Trajectory]:

@@ -38,8 +38,9 @@ def moments(trajectory: Trajectory) -> list[Moment]:
     spec = trajectory.spec
     missing = {"position", "attitude", "thrust"} - set(telemetry)
     if missing:
-        names = ", ".join(sorted(missing))
-        raise InputError(f"pictures: expected telemetry of {names}, {spec.env_id} has none")
+        raise InputError(
+            f"pictures: expected telemetry of {', '.join(sorted(missing))}, {spec.env_id} has none"
+        )
     found = []
     for step, reward in enumerate([0.0, *trajectory.rewards.tolist()]):
         row = {name: array[step] for name, array in telemetry.items()}

@@ -142,8 +142,9 @@ def _table(path: Path) -> Columns:
     try:
         frame = pandas.read_csv(path) if kind == ".csv" else pandas.read_parquet(path)
     except ValueError as error:  # of pandas and pyarrow
-        reason = one_line(error)
-        raise InputError(f"log: expected a {kind} file, got {path.name}: {reason:.80}") from None
+        raise InputError(
+            f"log: expected a {kind} file, got {path.name}: {one_line(error):.80}"
+        ) from None
     return {str(name): frame[name].to_numpy() for name in frame}
 
 

@@ -147,8 +147,9 @@ class Stage:
         except InputError:
             raise
         except ValueError as error:  # a texture is missing, which the physics does not need
-            reason = one_line(error)
-            raise InputError(f"vehicle: expected a file that can be drawn, got: {reason}") from None
+            raise InputError(
+                f"vehicle: expected a file that can be drawn, got: {one_line(error)}"
+            ) from None
         self.radius, top = _size(self.model)
         onboard = (0.03 * self.radius, 0.0, top + 0.154 * self.radius)
         self.model.camera(_ONBOARD).pos = onboard

@@ -197,7 +197,7 @@ def _compare(
         return "not tested", _untrained(missing)
     values = {name: np.array([measure(run) for run in own]) for name, own in runs.items()}
     parts = [_measured(name, values[name], own, words) for name, own in runs.items()]
-    evidence = ", ".join(parts) + "; "
+    evidence = f"{', '.join(parts)}; "
     if min(np.isfinite(numbers).sum() for numbers in values.values()) < MIN_SEEDS:
         return "undecided", f"{evidence}{_TOO_FEW}."
     pair = values["A2C"], values["VPG"]
@@ -230,7 +230,7 @@ def _both_hold(runs: pd.DataFrame, headline: Headline) -> _Judged:
         texts.append(f"{name.upper()} {text}")
     # One agent that fails, fails the claim about both, whatever the other does.
     order: tuple[Outcome, ...] = ("not borne out", "not tested", "undecided", "borne out")
-    return min(outcomes, key=order.index), "; ".join(texts) + "."
+    return min(outcomes, key=order.index), f"{'; '.join(texts)}."
 
 
 def _holds(runs: pd.DataFrame, headline: Headline) -> _Judged:

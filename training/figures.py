@@ -147,7 +147,12 @@ def draw_reward(results: Results, rows: Sequence[Row]) -> Figure:
                 [metrics.average_return(run, AVERAGING_SHARE) for run in runs]
             )
             color = row_color(row)
-            _scatter_episodes(axis, pd.concat(runs), color)
+            dots = pd.concat(runs)
+            dots = dots.sample(min(len(dots), _MAX_POINTS), random_state=0)  # few enough to draw
+            axis.plot(
+                metrics.episode_ends(dots), dots["return"].to_numpy(), "o", color=color,
+                markersize=2.5, alpha=0.3, markeredgewidth=0, label="total reward", rasterized=True,
+            )  # fmt: skip
             _plot(axis, average, color, "average reward")
             _plot(together, average, color, row_label(row))
             axis.set_title(f"{row_label(row)} ({seeds_text(len(runs))})")
@@ -207,8 +212,8 @@ def draw_error(results: Results, rows: Sequence[Row]) -> Figure:
         below.set_xlabel("time in the episode (s)")
     axes[0, 0].set_ylabel(f"training: {headline.labelled(headline.symbol)}")
     axes[1, 0].set_ylabel(f"final evaluation: {headline.labelled(headline.symbol)}")
-    bands = "Above: median, 25–75 % and 5–95 % of the steps of all seeds. "
-    figure.supxlabel(f"{bands}{PAPER['fig8_error']}", fontsize=8, wrap=True)
+    bands = "Above: median, 25–75 % and 5–95 % of the steps of all seeds."
+    figure.supxlabel(f"{bands} {PAPER['fig8_error']}", fontsize=8, wrap=True)
     return figure
 
 
@@ -256,15 +261,6 @@ def _plot(axis: Axes, spread: Spread, color: str, label: str, marker: str | None
     axis.fill_between(spread.x, spread.low, spread.high, color=color, alpha=0.2, lw=0)
     axis.plot(spread.x, spread.middle, color=color, label=label, marker=marker, markersize=3.5)
     axis.legend(fontsize=8.5)
-
-
-def _scatter_episodes(axis: Axes, episodes: pd.DataFrame, color: str) -> None:
-    """Draw each episode's total reward as a dot, thinned at random where there are very many."""
-    shown = episodes.sample(min(len(episodes), _MAX_POINTS), random_state=0)
-    axis.plot(
-        metrics.episode_ends(shown), shown["return"].to_numpy(), "o", color=color,
-        markersize=2.5, alpha=0.3, markeredgewidth=0, label="total reward", rasterized=True,
-    )  # fmt: skip
 
 
 def _env_steps_axis(axis: Axes) -> None:
