@@ -7,9 +7,10 @@ import numpy as np
 
 from ..models.fields import Limits, immutable
 from .config import RolloutConfig, Share
+from .episodes import Mask
 from .learner import Learner
 from .networks import Floats
-from .rollouts import Collector, Mask, Numbers, Rollout, advantages
+from .rollouts import Collector, Numbers, Rollout, advantages
 
 
 @immutable

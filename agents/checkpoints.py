@@ -12,6 +12,7 @@ import json
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import field, fields, replace
+from itertools import starmap
 from pathlib import Path
 from typing import Any
 
@@ -172,12 +173,19 @@ def _read(data: bytes, parse: Callable[[bytes], ByName]) -> Checkpoint:
     arrays = parse(data)
     for name in _not_finite(arrays):
         raise InputError(f"expected finite numbers, got NaN or infinity in {name}")
+    position = Position(**content["position"])
+    check_fields(position, "position.")
+    columns = part_of(arrays, "episodes/")
+    if columns:  # a training, and no policy alone
+        rows = zip(*(columns[name].tolist() for name in _COLUMNS), strict=True)
+        flown = Flown(**part_of(arrays, "position/"))
+        position = replace(position, episodes=tuple(starmap(Episode, rows)), flown=flown)
     checkpoint = Checkpoint(
         spec=spec,
         env=env,
         actor=part_of(arrays, "policy/"),
         state=part_of(arrays, "state/"),
-        position=_position(content["position"], arrays),
+        position=position,
         **{name: content[name] for name in _PLAIN},
     )
     check_fields(checkpoint)
@@ -190,19 +198,6 @@ def _read(data: bytes, parse: Callable[[bytes], ByName]) -> Checkpoint:
         )
     checkpoint.policy()  # raises if it does not fit
     return checkpoint
-
-
-def _position(progress: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Position:
-    """The position of a training, or of a policy alone."""
-    position = Position(**progress)
-    check_fields(position, "position.")
-    columns = part_of(arrays, "episodes/")
-    if not columns:
-        return position
-    rows = zip(*(columns[name].tolist() for name in _COLUMNS), strict=True)
-    episodes = [Episode(*row) for row in rows]
-    flown = Flown(**part_of(arrays, "position/"))
-    return replace(position, episodes=tuple(episodes), flown=flown)
 
 
 def _with_checksum(data: bytes, checksum: bytes) -> bytes:

@@ -9,9 +9,7 @@ import numpy as np
 from ..envs.spec import EnvSpec, component_names
 from ..models.errors import InputError
 from .networks import ByName, Floats
-from .policies import Observation, flat
-
-Array = np.ndarray
+from .policies import Array, Observation, flat
 
 DAMPING = 0.5  # Damping ratio of a payload's swing
 FILTER = 20.0  # Rate of the filters over that of the position loop

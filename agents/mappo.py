@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from .episodes import Mask
 from .networks import Floats
 from .ppo import PPO
-from .rollouts import Mask
 
 
 class MAPPO(PPO):

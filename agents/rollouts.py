@@ -11,12 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..models.errors import InputError
-from .episodes import EpisodeRecorder
+from .episodes import EpisodeRecorder, Mask
 from .networks import Floats
-from .policies import NetworkPolicy
+from .policies import Array, NetworkPolicy
 
 Numbers = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 
 class Diverged(InputError):
@@ -54,7 +53,7 @@ class Rollout:
         """After which rows another episode begins, or may: bool, shape (T, N)."""
         return np.asarray(self.terminated | self.truncated | ~self.kept)
 
-    def rows(self, array: np.ndarray) -> np.ndarray:
+    def rows(self, array: Array) -> Array:
         """The kept rows of an array of shape (T, N, ...): one for each transition."""
         if self.kept.all():
             return array.reshape(-1, *array.shape[2:])
@@ -130,7 +129,7 @@ class Collector:
         log.start()
         stop = None if most_steps is None else log.env_steps + most_steps
         block = length or max(256 // count, 1)
-        rows: list[tuple[np.ndarray, ...]] = []
+        rows: list[tuple[Array, ...]] = []
         observations = log.observations
         waiting = int(np.count_nonzero(log.done))
         while len(rows) != length and (stop is None or log.env_steps < stop):
@@ -163,7 +162,7 @@ class Collector:
         return Rollout(*columns), lost, waiting == count
 
 
-def discounted_sums(values: np.ndarray, factors: np.ndarray) -> Numbers:
+def discounted_sums(values: Array, factors: Array) -> Numbers:
     """S_t = v_t + f_t · S_t+1, where S is 0 after the last row: float64, shape of `values`.
 
     A factor is 0 where a sum stops. The rows are combined in pairs, pairs of pairs and so on:
@@ -180,7 +179,7 @@ def discounted_sums(values: np.ndarray, factors: np.ndarray) -> Numbers:
     return sums
 
 
-def rewards_to_go(rewards: np.ndarray, ends: Mask, gamma: float) -> Numbers:
+def rewards_to_go(rewards: Array, ends: Mask, gamma: float) -> Numbers:
     """R_t = sum of gamma^(t' - t) · r_t' to the episode's end (paper, Algorithm 1, step 2).
 
     Arrays have shape (T, N), as the result; `ends` is bool.

@@ -34,8 +34,7 @@ class ScalarWriter:
 
     def __init__(self, folder: Path, env_steps: int, *, behind: int = 0) -> None:
         self._every = max(math.ceil(env_steps / _POINTS), _LEAST)
-        self._last = behind
-        self._begins = not behind
+        self._last = behind or -1
         self._written: int | None = None
         folder.mkdir(parents=True, exist_ok=True)
         # Not TensorFlow's or torch's writer: they name a file by the clock, and TensorBoard reads
@@ -50,8 +49,7 @@ class ScalarWriter:
 
     def due(self, env_steps: int, *, last: bool = False) -> bool:
         """Asked at every update: whether to write at it; at the last, if it is not written yet."""
-        due = self._begins or env_steps // self._every > self._last // self._every
-        self._begins = False
+        due = env_steps // self._every > self._last // self._every
         self._last = env_steps
         return due or (last and self._written != env_steps)
 

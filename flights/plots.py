@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..models.errors import InputError, require
+from ..models.errors import require
 from ..sim.rotations import euler
 from .palette import FLIGHT_COLORS
 from .signals import QUATERNION, Column, Signal, signals_of
@@ -38,11 +38,9 @@ _ROW = 1.75  # inches
 def plot_flights(flights: Mapping[str, Trajectory], out: Path) -> None:
     """Draw flights, by the names in the legend, into a file of one of the `FORMATS`.
 
-    A flight without a signal that another one has is not in its panels. Raises `InputError`:
+    A flight without a signal that another one has is not in its panels. Raises `ValueError`:
     another ending; `MissingPackage`: there is no matplotlib; `OSError`: it cannot be written.
     """
-    if out.suffix.lower() not in FORMATS:
-        raise InputError(f"out: expected a file that ends in {', '.join(FORMATS)}, got {out.name}")
     require("matplotlib", "report", "a plot")
     from matplotlib import rc_context
 

@@ -7,18 +7,19 @@ journals.
 import copy
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import cached_property
 from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..agents.policies import Policy
+from ..agents.policies import Array, Policy
 from ..envs.autoreset import AdvancingVectorEnv, worlds_done
 from ..envs.config import EnvConfig
 from ..envs.spec import EnvSpec
 from ..models import InputError
+from ..models.fields import immutable
 
 Floats = NDArray[np.float64]
 
@@ -48,7 +49,7 @@ def evaluation_seed(
     return int(sequence.generate_state(1, np.uint64)[0])
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@immutable
 class Trajectory:
     """One episode of one drone, T control steps. Row k of T + 1 rows is after k steps."""
 
@@ -57,12 +58,12 @@ class Trajectory:
     """Every telemetry array by name, float64, shape (T + 1, *shape), in the spec's units."""
     rewards: Floats
     """float64, shape (T,)."""
-    actions: NDArray[np.generic]
+    actions: Array
     """Shape (T, *shape), of the action's dtype; row k is flown from row k of the telemetry."""
     ending: Ending
     episode: int = 0
     """Its number."""
-    observations: Mapping[str, NDArray[np.generic]] = field(default_factory=dict)
+    observations: Mapping[str, Array] = field(default_factory=dict)
     """By name, shape (T + 1, *shape), of the spec's dtypes; empty where they were not asked for."""
     session: int = 1
     """Session of the journal, from 1, as `rotorgram replay` counts."""
@@ -214,7 +215,7 @@ def _fly_batch(
 
 def _act(
     env: AdvancingVectorEnv, policies: Sequence[Policy | None], done: NDArray[np.bool_]
-) -> NDArray[np.generic]:
+) -> Array:
     """Actions of the drones that fly; 0 for the others."""
     space = env.single_action_space
     actions = np.zeros((env.num_envs, *(space.shape or ())), space.dtype)

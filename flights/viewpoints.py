@@ -5,7 +5,6 @@ The same journals and the same seed give the same poses on every machine.
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -61,7 +60,7 @@ class CaptureConfig:
         return chosen_views(words, models.Vehicle.load(self.vehicle).cameras)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@immutable
 class PoseSequence:
     """T poses of the A drones of a world, in one episode."""
 

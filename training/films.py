@@ -10,7 +10,6 @@ from ..flights.trajectories import flown_trajectories
 from ..models.errors import InputError
 from ..rendering import Camera
 from .results import Results, checkpoint_file
-from .settings import Row
 from .tables import row_label
 
 
@@ -34,19 +33,19 @@ def film_study(results: Results, out: Path, on_frame: OnFrame = lambda *_: None)
     vehicle = ",".join(env.vehicle) or None
     config = Film(height=400, camera=camera, fast=True, quality=27, vehicle=vehicle)
     runs = results.runs
-    done = set(runs["row"][runs["seed"] == results.study.first_seed])
-    tracks = [_track(results, row) for row in rows if row.name in done]
-    film(out, tracks, config, on_frame)
-
-
-def _track(results: Results, row: Row) -> FilmTrack:
-    policy: Policy
-    name = row_label(row)
     seed = results.study.first_seed
-    if row.controller:
-        policy = CONTROLLERS[row.agent](results.specs[row.name])
-    else:
-        policy = load(checkpoint_file(results.folder, row, seed)).policy()
-        name += f", seed {seed}"
-    flown = flown_trajectories(policy, row.env, [0], results.study.evaluation, seed)
-    return FilmTrack(name=name, trajectories=flown, drones=row.env.drones)
+    done = set(runs["row"][runs["seed"] == seed])
+    tracks = []
+    for row in rows:
+        if row.name not in done:
+            continue
+        policy: Policy
+        name = row_label(row)
+        if row.controller:
+            policy = CONTROLLERS[row.agent](results.specs[row.name])
+        else:
+            policy = load(checkpoint_file(results.folder, row, seed)).policy()
+            name += f", seed {seed}"
+        flown = flown_trajectories(policy, row.env, [0], results.study.evaluation, seed)
+        tracks.append(FilmTrack(name=name, trajectories=flown, drones=env.drones))
+    film(out, tracks, config, on_frame)

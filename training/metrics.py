@@ -25,7 +25,7 @@ from .statistics import Floats, Values, trimmed_mean
 
 Places = NDArray[np.int64]
 
-_MEANS = ("steady", "settling_time", "overshoot", "return")
+MEANS = ("steady", "settling_time", "overshoot", "return")
 
 
 class Curve(NamedTuple):
@@ -197,7 +197,7 @@ def measure_run(evaluations: pd.DataFrame, headline: Headline) -> dict[str, floa
     final = final_evaluations(evaluations)
     crashed = headline.crashed(final)
     final = final.assign(settling_time=final["settling_time"].mask(crashed))
-    means = {name: float(final[name].mean()) for name in _MEANS}
+    means = {name: float(final[name].mean()) for name in MEANS}
     safe = headline.counts_crashes or not crashed.any()
     whole = bool(final["steady"].notna().all())
     steps = math.nan

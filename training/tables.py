@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import pandas as pd
 
 from ..flights.palette import agent_label
-from .metrics import Headline
+from .metrics import MEANS, Headline
 from .results import Results
 from .settings import Row
 from .statistics import bootstrap_interval, iqm, share_interval
@@ -18,7 +18,6 @@ from .statistics import bootstrap_interval, iqm, share_interval
 Line = Mapping[str, float]
 NOTHING = "–"
 """Shown where there is no value."""
-_MEASURES = ("steady", "settling_time", "overshoot", "return")
 _COUNTS = ("episodes", "settled", "crashed")
 
 
@@ -55,7 +54,7 @@ def results_table(results: Results) -> pd.DataFrame:
 def _measures(own: pd.DataFrame, headline: Headline) -> dict[str, float]:
     trained = own["env_steps"].max() > 0
     line: dict[str, float] = {"seeds": len(own), **own[list(_COUNTS)].sum()}
-    for name in _MEASURES:
+    for name in MEANS:
         values = own[name].to_numpy(float)
         line[name] = iqm(values)
         line[f"{name}_low"], line[f"{name}_high"] = bootstrap_interval(values)
