@@ -19,8 +19,6 @@ from ..models.errors import InputError, shortened
 from ..models.fields import PositiveInt, immutable
 
 if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
-
     from ..envs.config import EnvConfig
 
     Words = tuple[str, ...]
@@ -64,7 +62,7 @@ class Command:
         """Do it; the exit status, where it is not 0."""
         raise NotImplementedError
 
-    def settings(self, kind: type["DataclassInstance"]) -> Options:
+    def settings(self, kind: type[Any]) -> Options:
         """Values of the flags that are fields of a class of settings."""
         return {f.name: getattr(self, f.name) for f in fields(kind) if hasattr(self, f.name)}
 

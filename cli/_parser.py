@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import field, replace
 from inspect import cleandoc
 from types import UnionType
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar, Union, cast, get_args, get_type_hints
+from typing import Annotated, Any, Union, get_args, get_type_hints
 
 import tyro
 from tyro.conf import arg
@@ -23,29 +23,26 @@ from ._flags import (
     parse_value,
 )
 
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
-
 _PLAIN_FLAGS = ("action", "control_period", "episode_length", "history", "scene", "cameras")
 _NAMED_FLAGS = ("effects", "randomize", "sensors")
 _OPTIONS = (
     "Options of the task that --env names. A checkpoint brings those that it was trained with."
 )
-C = TypeVar("C", bound=Command)
 
 
-def parse(kind: type[C], prog: str, words: Sequence[str]) -> C:
+def parse(kind: type[Command], prog: str, words: Sequence[str]) -> Command:
     """A command from its words. A wrong flag exits with status 2, `--help` with 0.
 
     Raises `InputError` if the task, one of its options or a number is not what it should be.
     """
     given = _given(words)
+    command: Command
     if issubclass(kind, EnvFlags):
         command = _parsed_env(kind, prog, words, given)
     else:
         command = replace(_run_tyro(_for_tyro(kind), prog, words), given=given)
     check_fields(command)
-    return cast(C, command)
+    return command
 
 
 def _parsed_env(
@@ -139,7 +136,7 @@ def _run_tyro(kind: Any, prog: str, words: Sequence[str]) -> Any:
     return tyro.cli(kind, prog=prog, args=words, description=cleandoc(kind.__doc__))
 
 
-def _for_tyro(kind: type["DataclassInstance"], options: Any = None) -> Any:
+def _for_tyro(kind: type, options: type | None = None) -> Any:
     """A class of flags for tyro, whose checks run later.
 
     `options` is the type of the field of that name. `X | Y` becomes `Union[X, Y]`: for the first,

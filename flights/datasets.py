@@ -4,11 +4,11 @@ Parquet. See `docs/datasets.md`."""
 import copy
 import re
 import warnings
-from collections.abc import Iterable, Iterator, Sequence, Sized
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import fields
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -30,8 +30,6 @@ if TYPE_CHECKING:
 
 _ROW_GROUP = 1 << 17  # steps that are written together
 _MINARI_ID = re.compile(r"([\w-]{2,}/)*[\w-]+-v\d+", re.ASCII)
-
-Rows = TypeVar("Rows", bound=Sized)
 
 
 class RecordedEpisodes:
@@ -132,9 +130,9 @@ def write_parquet(episodes: RecordedEpisodes, out: Path) -> None:
             writer.write_table(table.cast(schema))
 
 
-def _batches(items: Iterable[Rows], most: int) -> Iterator[list[Rows]]:
+def _batches(items: Iterable[Any], most: int) -> Iterator[list[Any]]:
     """All items, together as soon as they have so many rows."""
-    batch: list[Rows] = []
+    batch: list[Any] = []
     for item in items:
         batch.append(item)
         if sum(map(len, batch)) > most:

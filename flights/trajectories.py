@@ -12,6 +12,7 @@ from functools import cached_property
 from typing import Literal, get_args
 
 import numpy as np
+from gymnasium.vector.utils import iterate
 from numpy.typing import NDArray
 
 from ..agents.policies import Array, Policy
@@ -219,16 +220,10 @@ def _act(
     """Actions of the drones that fly; 0 for the others."""
     space = env.single_action_space
     actions = np.zeros((env.num_envs, *(space.shape or ())), space.dtype)
-    observations = env.observations
+    observations = list(iterate(env.observation_space, env.observations))
     for drone in np.flatnonzero(~done).tolist():
         policy = policies[drone]
-        if policy is None:
-            actions[drone] = space.sample()
-        elif isinstance(observations, dict):
-            own = {name: values[drone] for name, values in observations.items()}
-            actions[drone] = policy.act(own)
-        else:
-            actions[drone] = policy.act(observations[drone])
+        actions[drone] = space.sample() if policy is None else policy.act(observations[drone])
     return actions
 
 
