@@ -75,15 +75,13 @@ class Rollout:
         return replace(self, kept=self.kept & (rewards_to_go(lost, self.ends, 1.0) == 0))
 
 
+@dataclass
 class Collector:
     """Flies a policy, episode after episode, across calls; `rng` draws the actions."""
 
-    def __init__(
-        self, log: EpisodeRecorder, rng: np.random.Generator, policy: NetworkPolicy
-    ) -> None:
-        self._log = log
-        self._rng = rng
-        self._policy = policy
+    log: EpisodeRecorder
+    rng: np.random.Generator
+    policy: NetworkPolicy
 
     def steps(self, count: int) -> Rollout:
         """Whole steps of all drones: the fewest for `count` transitions, without the lost steps.
@@ -91,7 +89,7 @@ class Collector:
         Running episodes go on in the next call. After an episode ends, that drone's next step
         begins the next episode and is no transition; if all have ended, no step is spent.
         """
-        length = -(-count // self._log.num_envs)
+        length = -(-count // self.log.num_envs)
         rollout, lost, _ = self._fly(length, None)
         return rollout.without_steps(lost)
 
@@ -102,7 +100,7 @@ class Collector:
         cuts off is left out, but for a single drone's last fragment. Episodes with a lost simulator
         are left out, and a round of nothing else does not count.
         """
-        log = self._log
+        log = self.log
         rounds = -(-count // log.num_envs)
         last = log.env_steps + most_steps
         flown: list[Rollout] = []
@@ -123,7 +121,7 @@ class Collector:
         Returns the rollout; the steps in which a simulator was lost, bool, shape (T, N); and
         whether all drones are at the end of an episode.
         """
-        log = self._log
+        log = self.log
         env = log.env
         count = log.num_envs
         log.start()
@@ -134,9 +132,9 @@ class Collector:
         waiting = int(np.count_nonzero(log.done))
         while len(rows) != length and (stop is None or log.env_steps < stop):
             if not len(rows) % block:
-                drawn = self._policy.head.noise(self._rng, block * count)
+                drawn = self.policy.head.noise(self.rng, block * count)
                 noise = drawn.reshape(block, count, -1)
-            actions = self._policy.sample(observations, noise[len(rows) % block])
+            actions = self.policy.sample(observations, noise[len(rows) % block])
             if not np.isfinite(actions).all():
                 raise Diverged("actions are not finite")
             flying = ~log.out

@@ -8,7 +8,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from threading import Timer
 from typing import TYPE_CHECKING
@@ -150,11 +150,11 @@ def _train(command: "Train", training: Training, folder: Path) -> int:
     except BaseException:  # a full disk and SIGTERM too
         with suppress(OSError):
             keeper.write_episodes()
-            keeper.close()
+            keeper.scalars.close()
         if (folder / CHECKPOINT).exists():
             print(go_on)
         raise
-    keeper.close()
+    keeper.scalars.close()
     flown = training.log.env_steps
     what = "trained" if finished else "stopped after"
     print(f"{what} {flown:,} of {training.run.env_steps:,} env steps")
@@ -176,6 +176,7 @@ def _extended(kept: Checkpoint, folder: Path, env_steps: int) -> Checkpoint:
     return replace(kept, env_steps=env_steps)
 
 
+@dataclass
 class _Keeper:
     """Stores a training at its first update, then every so many seconds, and when told to.
 
@@ -183,38 +184,36 @@ class _Keeper:
     has them at the same steps as an unbroken one.
     """
 
-    def __init__(self, training: Training, folder: Path, every: float) -> None:
-        self._training = training
-        self._folder = folder
-        self._every = every
-        self._due = 0.0
-        total = training.run.env_steps
-        behind = training.log.env_steps
-        self._scalars = ScalarWriter(folder / "tensorboard", total, behind=behind)
+    training: Training
+    folder: Path
+    every: float
+    due: float = 0.0
+    """When it is stored next, by the monotonic clock, s."""
+
+    def __post_init__(self) -> None:
+        total = self.training.run.env_steps
+        behind = self.training.log.env_steps
+        self.scalars = ScalarWriter(self.folder / "tensorboard", total, behind=behind)
 
     def keep(self, *, now: bool, last: bool = False) -> None:
-        at = self._training.log.env_steps
-        if self._scalars.due(at, last=last):
-            self._scalars.write(at, self._training.scalars())
-        if now or time.monotonic() >= self._due:
+        at = self.training.log.env_steps
+        if self.scalars.due(at, last=last):
+            self.scalars.write(at, self.training.scalars())
+        if now or time.monotonic() >= self.due:
             # First the rest: a checkpoint takes the curves that end before it.
             self.write_episodes()
-            self._scalars.flush()
-            store(self._training.checkpoint(), self._folder / CHECKPOINT)
-            self._due = time.monotonic() + self._every
-
-    def close(self) -> None:
-        """Write the rest of the curves."""
-        self._scalars.close()
+            self.scalars.flush()
+            store(self.training.checkpoint(), self.folder / CHECKPOINT)
+            self.due = time.monotonic() + self.every
 
     def write_episodes(self) -> None:
         """Write all episodes that have ended; the last may end between two updates."""
         text = io.StringIO()  # pandas would take longer to import than a short training takes
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow([field.name for field in fields(Episode)])
-        for episode in self._training.log.episodes:
+        for episode in self.training.log.episodes:
             writer.writerow("" if value != value else value for value in vars(episode).values())
-        write_whole(self._folder / EPISODES, text.getvalue().encode())
+        write_whole(self.folder / EPISODES, text.getvalue().encode())
 
 
 @contextmanager

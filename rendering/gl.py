@@ -3,7 +3,7 @@
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 from weakref import finalize
@@ -135,13 +135,12 @@ class Offscreen:
         self._freed = finalize(self, _free, self._gl, self._context)
         self._freed.atexit = False
 
-    def current(self) -> AbstractContextManager[object]:
+    def current(self) -> Any:
         """Keep OpenGL with this thread for a block: `draw` in it is faster."""
         if not self._freed.alive:
             raise NoOpenGL("OpenGL: expected cameras that are open, got closed ones")
         _refuse_forked()
-        block: AbstractContextManager[object] = self._gl.as_current()
-        return block
+        return self._gl.as_current()
 
     def update(self, data: "mujoco.MjData", camera: "mujoco.MjvCamera") -> None:
         """Fill the scene with the model in a state, seen from a camera."""

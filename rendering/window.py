@@ -6,8 +6,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable
-from types import ModuleType
-from typing import Literal
+from typing import Any, Literal
 
 import mujoco
 
@@ -83,7 +82,7 @@ def _text(place: mujoco.mjtGridPos, lines: Lines) -> tuple[object, ...]:
     return mujoco.mjtFontScale.mjFONTSCALE_100, place, *columns(lines)
 
 
-def _viewer() -> ModuleType:
+def _viewer() -> Any:
     """MuJoCo's module. Raises `NoOpenGL` first: without a display MuJoCo would wait forever."""
     on_x = sys.platform == "linux"
     if on_x and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
@@ -105,5 +104,4 @@ def _viewer() -> ModuleType:
                 glfw.destroy_window(window)
     except (ImportError, RuntimeError) as error:
         raise NoOpenGL(f"window: expected a display, got {error}: {_INSTEAD}") from None
-    module: ModuleType = viewer
-    return module
+    return viewer
