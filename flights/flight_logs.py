@@ -62,26 +62,34 @@ def read_log(path: Path | str, vehicle: Vehicle, period: float = 0.01) -> Flight
     finite.
     """
     path = Path(path)
-    kind, samples = _samples(path, vehicle.num_rotors)
+    table = _table(path)
+    try:
+        return _flight(path.stem, table, vehicle, period)
+    except InputError as error:
+        raise InputError(f"{path.name}: {error}") from None
+
+
+def _flight(name: str, table: Columns, vehicle: Vehicle, period: float) -> FlightLog:
+    kind, samples = _samples(table, vehicle.num_rotors)
     times, states, speeds = np.split(samples, (1, 1 + len(MOTION)), axis=1)
     times = times[:, 0]
     states[:, 3:7] = _without_flips(states[:, 3:7])
     if kind == THROTTLE:
-        speeds = _commanded_speeds(path, speeds, vehicle)
-    _check_speeds(path, vehicle, speeds)
+        speeds = _commanded_speeds(speeds, vehicle)
+    _check_speeds(vehicle, speeds)
     samples = np.concatenate((states, speeds), axis=1)
-    later = _later_rows(path, times)
-    rows = _consistent_rows(path, times, samples, later)
+    later = _later_rows(times)
+    rows = _consistent_rows(times, samples, later)
     times = times[rows]
-    grid = _grid(path, times, period)
+    grid = _grid(times, period)
     uniform = np.stack([np.interp(grid, times, column) for column in samples[rows].T], axis=1)
     states, speeds = np.split(uniform, [len(MOTION)], axis=1)
     length = np.linalg.norm(states[:, 3:7], axis=1, keepdims=True)
     if not (length > 0.5).all():
-        _refuse(path, "quaternions of length 1", f"{length.min():.3g}")
+        _refuse("quaternions of length 1", f"{length.min():.3g}")
     states[:, 3:7] /= length
     return FlightLog(
-        name=path.stem,
+        name=name,
         period=period,
         states=states,
         speeds=speeds,
@@ -104,29 +112,28 @@ def with_lag(log: FlightLog, time_constant: float) -> FlightLog:
     return replace(log, speeds=speeds)
 
 
-def _refuse(path: Path, expected: str, got: str) -> NoReturn:
-    raise InputError(f"{path.name}: expected {expected}, got {got}")
+def _refuse(expected: str, got: str) -> NoReturn:
+    raise InputError(f"expected {expected}, got {got}")
 
 
 # ---- columns
 
 
-def _samples(path: Path, rotors: int) -> tuple[str, Floats]:
+def _samples(table: Columns, rotors: int) -> tuple[str, Floats]:
     """The kind of the rotors' columns, and the columns of t, of `MOTION` and of the rotors."""
-    table = _table(path)
     kinds = {kind: [kind.format(number) for number in range(1, rotors + 1)] for kind in _KINDS}
     complete = [kind for kind, names in kinds.items() if all(name in table for name in names)]
     columns = []
     for name in ("t", *MOTION, *(kinds[complete[0]] if complete else ())):
         if name not in table:
-            _refuse(path, f"a column {name}", ", ".join(table))
+            _refuse(f"a column {name}", ", ".join(table))
         try:
             columns.append(np.array(table[name], np.float64))
         except (TypeError, ValueError):
-            _refuse(path, f"numbers in {name}", "others")
+            _refuse(f"numbers in {name}", "others")
     if not complete:
         names = " or ".join(kind.format(f"1...{rotors}") for kind in _KINDS)
-        _refuse(path, f"columns {names}", "none")
+        _refuse(f"columns {names}", "none")
     return complete[0], np.stack(columns, axis=1)
 
 
@@ -148,19 +155,19 @@ def _table(path: Path) -> Columns:
     return {str(name): frame[name].to_numpy() for name in frame}
 
 
-def _commanded_speeds(path: Path, throttle: Floats, vehicle: Vehicle) -> Floats:
+def _commanded_speeds(throttle: Floats, vehicle: Vehicle) -> Floats:
     """Speeds at which the vehicle as it is gives the commanded share of its largest thrust."""
     low = throttle.min(initial=0.0)
     high = throttle.max(initial=0.0)
     if low <= -0.01 or high >= 1.01:
-        _refuse(path, "throttle from 0 to 1", f"{low:.3g} to {high:.3g}")
+        _refuse("throttle from 0 to 1", f"{low:.3g} to {high:.3g}")
     (coefficient,) = vehicle.coefficients.need("rotors.thrust_coefficient", "a log of commands")
     thrust = np.clip(throttle, 0.0, 1.0) * vehicle.thrust_high
     speeds: Floats = np.sqrt(thrust / coefficient)
     return speeds
 
 
-def _check_speeds(path: Path, vehicle: Vehicle, speeds: Floats) -> None:
+def _check_speeds(vehicle: Vehicle, speeds: Floats) -> None:
     """Refuse speeds that no such rotor reaches."""
     coefficient = vehicle.coefficients["rotors.thrust_coefficient"]
     if coefficient is None:
@@ -168,7 +175,7 @@ def _check_speeds(path: Path, vehicle: Vehicle, speeds: Floats) -> None:
     most = _FASTEST * float(np.sqrt(vehicle.thrust_high.max() / coefficient))
     fastest = float(np.abs(speeds).max(initial=0.0))
     if fastest > most:
-        _refuse(path, f"rotor speeds of at most {most:.4g} rad/s", f"{fastest:.4g}")
+        _refuse(f"rotor speeds of at most {most:.4g} rad/s", f"{fastest:.4g}")
 
 
 def _without_flips(quaternions: Floats) -> Floats:
@@ -181,18 +188,18 @@ def _without_flips(quaternions: Floats) -> Floats:
 # ---- samples
 
 
-def _later_rows(path: Path, times: Floats) -> Rows:
+def _later_rows(times: Floats) -> Rows:
     """Samples with a later time than all before."""
     if not np.isfinite(times).all():
-        _refuse(path, "finite times", "others")
+        _refuse("finite times", "others")
     latest = np.maximum.accumulate(times)
     return np.flatnonzero(np.diff(latest, prepend=-np.inf) > 0)
 
 
-def _consistent_rows(path: Path, times: Floats, samples: Floats, rows: Rows) -> Rows:
+def _consistent_rows(times: Floats, samples: Floats, rows: Rows) -> Rows:
     """The rows without single impossible samples."""
     if not np.isfinite(samples[rows]).all():
-        _refuse(path, "finite numbers", "others")
+        _refuse("finite numbers", "others")
     most = max(1, int(_MOST_LEFT_OUT * len(rows)))
     least = len(rows) - most
     rule = "positions and attitudes that agree with velocities and rates"
@@ -204,10 +211,10 @@ def _consistent_rows(path: Path, times: Floats, samples: Floats, rows: Rows) -> 
             if _agree(times, samples, around).all():
                 break
         else:
-            _refuse(path, rule, f"a jump at {times[rows[step + 1]]:.6g} s")
+            _refuse(rule, f"a jump at {times[rows[step + 1]]:.6g} s")
         rows = rest
         if len(rows) < least:
-            _refuse(path, rule, f"more than {most} samples that do not")
+            _refuse(rule, f"more than {most} samples that do not")
     return rows
 
 
@@ -228,13 +235,13 @@ def _agree(times: Floats, states: Floats, rows: Rows) -> NDArray[np.bool_]:
     return agree
 
 
-def _grid(path: Path, times: Floats, period: float) -> Floats:
+def _grid(times: Floats, period: float) -> Floats:
     """Uniform times from the first sample on. Raises `InputError` for a gap."""
     if len(times) < 2:
-        _refuse(path, "two or more samples", str(len(times)))
+        _refuse("two or more samples", str(len(times)))
     gap = float(np.diff(times).max())
     if gap > _LONGEST_GAP:
-        _refuse(path, f"no gap of more than {_LONGEST_GAP:g} s", f"{gap:.3g} s")
+        _refuse(f"no gap of more than {_LONGEST_GAP:g} s", f"{gap:.3g} s")
     steps = int(np.floor((times[-1] - times[0]) / period + 1e-6))
     uniform: Floats = times[0] + period * np.arange(steps + 1)
     return uniform
@@ -259,7 +266,8 @@ def _ulog(path: Path) -> Columns:
     topics = {topic.name: topic.data for topic in reversed(log.data_list)}
     for topic in _TOPICS:
         if topic not in topics:
-            _refuse(path, f"the topic {topic}", ", ".join(sorted(topics)))
+            got = ", ".join(sorted(topics))
+            raise InputError(f"{path.name}: expected the topic {topic}, got {got}")
     used = topics.keys() & {topic for topic, _, _ in _PX4.values()}
     times = {topic: topics[topic]["timestamp"].astype(np.float64) for topic in used}
     first = max(own[0] for own in times.values())
