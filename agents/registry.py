@@ -1,14 +1,16 @@
-"""Every algorithm: one row each.
+"""Every algorithm: one row each, of `algorithms.toml`.
 
-To add one, write its config and its class in a module of its own, and add a row here. Its presets,
+To add one, write its config and its class in a module of its own, and add a row there. Its presets,
 if it has any, are in `presets.toml`.
 """
 
 from dataclasses import dataclass
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
 
 from ..models.errors import InputError
+from ..models.files import read_toml
 from .config import Config
 
 if TYPE_CHECKING:
@@ -33,6 +35,8 @@ class Algorithm:
     agent_name: str
     color: str = ""
     """Of its curves in figures; empty: one of the palette."""
+    resumes: bool = True
+    """Whether a stopped training goes on, and another begins with its networks."""
 
     @property
     def config(self) -> type[Config]:
@@ -45,28 +49,15 @@ class Algorithm:
         """Class of what learns. Raises `MissingPackage` where SB3 is not installed."""
         return _find(self.agent_name)
 
-    @property
-    def resumes(self) -> bool:
-        """Whether a stopped training goes on, and another begins with its networks."""
-        return self.agent_name != _SB3
-
 
 def _find(name: str) -> Any:
     module, _, one = name.partition(":")
     return getattr(import_module(module, __package__), one)
 
 
-_SB3 = ".sb3:SB3Agent"
 ALGORITHMS: Final[dict[str, Algorithm]] = {
-    "vpg": Algorithm("VPG", ".vpg:VPGConfig", ".vpg:VPG", "#D55E00"),
-    "a2c": Algorithm("A2C", ".a2c:A2CConfig", ".a2c:A2C", "#0072B2"),
-    "ppo": Algorithm("PPO", ".ppo:PPOConfig", ".ppo:PPO"),
-    "ippo": Algorithm("IPPO", ".ppo:PPOConfig", ".ppo:PPO"),
-    "mappo": Algorithm("MAPPO", ".ppo:PPOConfig", ".mappo:MAPPO"),
-    "apg": Algorithm("APG", ".apg:APGConfig", ".apg:APG"),
-    "sb3-a2c": Algorithm("SB3 A2C", ".a2c:A2CConfig", _SB3, "#009E73"),
-    "sb3-ppo": Algorithm("SB3 PPO", ".ppo:PPOConfig", _SB3),
-    "sb3-sac": Algorithm("SB3 SAC", ".config:SACConfig", _SB3),
+    name: Algorithm(**row)
+    for name, row in read_toml(Path(__file__).with_name("algorithms.toml"), "algorithms").items()
 }
 
 if TYPE_CHECKING:

@@ -22,46 +22,16 @@ from shutil import get_terminal_size
 from typing import TYPE_CHECKING, TypeGuard
 
 from ..models.errors import printable
+from ..models.files import read_toml
 
 if TYPE_CHECKING:
     from ._flags import Command
 
-COMMANDS = (
-    "sim",
-    "train",
-    "serve",
-    "evaluate",
-    "export",
-    "view",
-    "compare",
-    "sweep",
-    "benchmark",
-    "report",
-    "render",
-    "bench",
-    "vehicle",
-    "check-task",
-    "identify",
-    "key",
-    "replay",
-    "log",
-    "plot",
-    "dataset",
-    "capture",
-)
+_NAMES = read_toml(Path(__file__).with_name("commands.toml"), "commands")
+COMMANDS: tuple[str, ...] = tuple(_NAMES["commands"])
 """Each is a class in the module of its name: `Sim` in `sim`, `CheckTask` in `check_task`."""
 
-EXTRAS = {
-    "train": ("torch", "stable_baselines3", "tensorboard", "safetensors", "pandas",
-              "pyarrow", "scipy"),
-    "record": ("mcap",),
-    "render": ("PIL", "imageio_ffmpeg"),
-    "report": ("matplotlib",),
-    "ray": ("ray",),
-    "dataset": ("mcap", "pyarrow", "minari", "h5py", "PIL"),
-    "identify": ("pyulog", "pandas", "pyarrow", "scipy"),
-    "export": ("onnx", "onnxruntime"),
-}  # fmt: skip
+EXTRAS: dict[str, list[str]] = _NAMES["extras"]
 """Import names of the packages of each extra, as pyproject.toml lists them."""
 
 _ABOUT = "A MuJoCo drone simulator that reinforcement-learning agents fly, in process or over UDP."
