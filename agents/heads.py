@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+from numpy.random import Generator
 
 from .networks import Floats, Module, Weights
 
@@ -19,7 +20,7 @@ class Head(Module):
     def initialise(self, log_std: float) -> None:
         """Set the weights."""
 
-    def noise(self, rng: np.random.Generator, steps: int) -> Floats:
+    def noise(self, rng: Generator, steps: int) -> Floats:
         """Randomness for `steps` rows of `sample`, drawn at once: shape (steps, k)."""
         raise NotImplementedError
 
@@ -58,7 +59,7 @@ class Gaussian(Head):
     def initialise(self, log_std: float) -> None:
         self.log_std[...] = log_std
 
-    def noise(self, rng: np.random.Generator, steps: int) -> Floats:
+    def noise(self, rng: Generator, steps: int) -> Floats:
         noise = rng.standard_normal((steps, self.log_std.size), dtype=np.float32)
         noise *= np.exp(self.log_std)
         return noise
@@ -92,7 +93,7 @@ class Categorical(Head):
     def __init__(self, size: int) -> None:
         self._size = size
 
-    def noise(self, rng: np.random.Generator, steps: int) -> Floats:
+    def noise(self, rng: Generator, steps: int) -> Floats:
         # The Gumbel trick: the largest of logits plus Gumbel noise is a categorical draw.
         return rng.gumbel(size=(steps, self._size)).astype(np.float32)
 

@@ -15,6 +15,7 @@ from types import MappingProxyType
 from typing import Final, TypeVar
 
 import numpy as np
+from numpy.random import Generator
 from numpy.typing import NDArray
 
 from ..models.errors import InputError
@@ -101,7 +102,7 @@ class Module:
 class Layer(Module):
     """A step of a network, from inputs (..., 1 + n, B) to outputs (..., 1 + k, B)."""
 
-    def initialise(self, rng: np.random.Generator, gain: float) -> None:
+    def initialise(self, rng: Generator, gain: float) -> None:
         """Draw the weights."""
 
     @abstractmethod
@@ -134,7 +135,7 @@ class Affine(Layer):
         self._transposed = self.weight[..., 1:].swapaxes(-1, -2)
         self._outputs = self._by_inputs = self.weight[..., :0]
 
-    def initialise(self, rng: np.random.Generator, gain: float) -> None:
+    def initialise(self, rng: Generator, gain: float) -> None:
         units, inputs = self.weight.shape
         self.weight[:, 0] = 0.0
         self.weight[:, 1:] = orthogonal(rng, (units, inputs - 1), gain)
@@ -210,7 +211,7 @@ class Network(Module):
         for prefix, layer in self._named.items():
             layer.bind(weights.part(prefix))
 
-    def initialise(self, rng: np.random.Generator, gain: float) -> None:
+    def initialise(self, rng: Generator, gain: float) -> None:
         """Draw the weights, with the gain sqrt(2) but for the last layer that has weights."""
         *others, last = self._named.values()
         for layer in others:
@@ -267,9 +268,7 @@ def make_network(inputs: int, outputs: int, config: Config) -> Network:
     return NETWORKS[config.network](inputs, outputs, config)
 
 
-def orthogonal(
-    rng: np.random.Generator, shape: tuple[int, ...], gain: float
-) -> NDArray[np.float64]:
+def orthogonal(rng: Generator, shape: tuple[int, ...], gain: float) -> NDArray[np.float64]:
     """Rows, or columns if they are fewer, that are orthogonal and of the length `gain`."""
     rows, columns = shape
     q, r = np.linalg.qr(rng.standard_normal((max(shape), min(shape))))

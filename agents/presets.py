@@ -21,6 +21,8 @@ DEFAULT_TASK = "rotorgram/Elevation-v0"
 _FILE = Path(__file__).with_name("presets.toml")
 _FLIGHT = ("num_envs", "env_steps", "backend")
 
+Tables = dict[str, dict[str, dict[str, Any]]]
+
 
 @immutable
 class Preset:
@@ -43,10 +45,10 @@ class Preset:
 
 
 @cache
-def presets_of(algorithm: str) -> dict[str, dict[str, dict[str, Any]]]:
+def presets_of(algorithm: str) -> Tables:
     """An algorithm's tables by preset and task; one without any has an empty `tuned`."""
     content = read_toml(_FILE, "presets")
-    found: dict[str, dict[str, dict[str, Any]]] = {}
+    found: Tables = {}
     for table in content["preset"]:
         algorithms = table.pop("algorithms")
         tasks = table.pop("tasks")

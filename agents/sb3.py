@@ -32,6 +32,8 @@ except ModuleNotFoundError:
         require(_package, "train", "sb3-a2c")
     raise
 
+Settings = dict[str, object]
+
 
 class SB3VecEnv(sb3_vec.VecEnv):
     """A SAME_STEP vector env, such as `RemoteVectorEnv(autoreset_mode="SameStep")`, for SB3.
@@ -65,7 +67,7 @@ class SB3VecEnv(sb3_vec.VecEnv):
         """Fly every env for one step."""
         observations, rewards, terminated, truncated, info = self.env.step(self._actions)
         ended = terminated | truncated
-        infos: list[dict[str, object]] = [{} for _ in range(self.num_envs)]
+        infos: list[Settings] = [{} for _ in range(self.num_envs)]
         for i in np.flatnonzero(ended).tolist():
             last = info["final_obs"]
             infos[i]["terminal_observation"] = (
@@ -160,7 +162,7 @@ class SB3Agent:
         self._rollout = config.rollout_size(log.num_envs)
         torch.set_num_threads(1)  # a second thread slows such small nets
         steps = self._rollout // log.num_envs
-        policy: dict[str, object] = {
+        policy: Settings = {
             "net_arch": list(config.hidden),
             "activation_fn": {"relu": torch.nn.ReLU, "tanh": torch.nn.Tanh}[config.activation],
         }
@@ -252,7 +254,7 @@ class SB3Agent:
 _MODELS: Final[dict[type, Any]] = {A2CConfig: sb3.A2C, PPOConfig: sb3.PPO, SACConfig: sb3.SAC}
 
 
-def _settings(config: A2CConfig | SACConfig, steps: int, log: EpisodeRecorder) -> dict[str, object]:
+def _settings(config: A2CConfig | SACConfig, steps: int, log: EpisodeRecorder) -> Settings:
     """Settings of SB3's that not all of its algorithms have."""
     if isinstance(config, SACConfig):
         if log.actions.discrete:
@@ -267,7 +269,7 @@ def _settings(config: A2CConfig | SACConfig, steps: int, log: EpisodeRecorder) -
             "ent_coef": f"auto_{config.alpha}",
         }
     rollout = steps * log.num_envs
-    settings: dict[str, object] = {
+    settings: Settings = {
         "n_steps": steps,
         "gae_lambda": config.gae_lambda,
         "ent_coef": config.ent_coef,

@@ -15,6 +15,8 @@ from ._study import StudyFlags
 if TYPE_CHECKING:
     from ..training.settings import Row, Study
 
+Values = tuple[object, ...]
+
 
 class Sweep(StudyFlags):
     """Train an algorithm over a grid of hyperparameters, every point on the same seeds.
@@ -61,9 +63,9 @@ class Sweep(StudyFlags):
         return self.new_row(self.algorithm, name, changes, self.env_config().changed(**options))
 
 
-def parse_grid(words: Iterable[str]) -> dict[str, tuple[object, ...]]:
+def parse_grid(words: Iterable[str]) -> dict[str, Values]:
     """Values by the name of their hyperparameter, each in JSON. Raises `InputError`."""
-    grid: dict[str, tuple[object, ...]] = {}
+    grid: dict[str, Values] = {}
     for word in words:
         name, equals, text = word.partition("=")
         if not equals:
@@ -78,7 +80,7 @@ def parse_grid(words: Iterable[str]) -> dict[str, tuple[object, ...]]:
     return grid
 
 
-def _values(text: str) -> tuple[object, ...]:
+def _values(text: str) -> Values:
     """JSON values with commas between them; without brackets, words are texts."""
     try:
         return tuple(json.loads(f"[{text}]"))

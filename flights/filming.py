@@ -17,7 +17,7 @@ from ..rendering import Camera, Canvas, Moment, Stage
 from ..rendering.film import QUALITY, Picture, write_film
 from ..rendering.gl import Lines
 from ..scenes import parse_scene
-from .trajectories import Trajectory
+from .trajectories import Flights, Trajectory
 
 OnFrame = Callable[[int, int], object]
 """Called with frames drawn, and frames in all."""
@@ -53,14 +53,14 @@ class FilmTrack:
     """One pane of a film: a name and its trajectories."""
 
     name: str
-    trajectories: list[Trajectory]
+    trajectories: Flights
     """Episode after episode; with several drones those of each episode in the order of the drones.
     """
     drones: int = 1
     """Drones of the world of each episode."""
 
     @cached_property
-    def episodes(self) -> list[list[Trajectory]]:
+    def episodes(self) -> list[Flights]:
         """The trajectories of each episode, one of each drone."""
         firsts = range(0, len(self.trajectories), self.drones)
         return [self.trajectories[first : first + self.drones] for first in firsts]

@@ -14,7 +14,7 @@ from ..models.files import read_toml
 from ..models.vehicle import Vehicle
 
 Floats = NDArray[np.float64]
-Rows = NDArray[np.int_]
+Ints = NDArray[np.int_]
 Columns = Mapping[str, NDArray[np.generic]]
 """Columns of a file by name, each of shape (N,)."""
 
@@ -188,7 +188,7 @@ def _without_flips(quaternions: Floats) -> Floats:
 # ---- samples
 
 
-def _later_rows(times: Floats) -> Rows:
+def _later_rows(times: Floats) -> Ints:
     """Samples with a later time than all before."""
     if not np.isfinite(times).all():
         _refuse("finite times", "others")
@@ -196,7 +196,7 @@ def _later_rows(times: Floats) -> Rows:
     return np.flatnonzero(np.diff(latest, prepend=-np.inf) > 0)
 
 
-def _consistent_rows(times: Floats, samples: Floats, rows: Rows) -> Rows:
+def _consistent_rows(times: Floats, samples: Floats, rows: Ints) -> Ints:
     """The rows without single impossible samples."""
     if not np.isfinite(samples[rows]).all():
         _refuse("finite numbers", "others")
@@ -218,7 +218,7 @@ def _consistent_rows(times: Floats, samples: Floats, rows: Rows) -> Rows:
     return rows
 
 
-def _agree(times: Floats, states: Floats, rows: Rows) -> NDArray[np.bool_]:
+def _agree(times: Floats, states: Floats, rows: Ints) -> NDArray[np.bool_]:
     """Whether each sample follows from the one before by the mean rates of both."""
     first = states[rows[:-1]]
     second = states[rows[1:]]

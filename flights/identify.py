@@ -15,14 +15,14 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..models import InputError
 from ..models.fields import check_names, immutable
 from ..models.vehicle import Vehicle
 from ..models.vehicle_file import read_vehicle_file
 from ..sim.rotations import advanced
-from .flight_logs import FlightLog, Floats, with_lag
+from .flight_logs import FlightLog, Floats, Ints, with_lag
 from .prediction import (
     NAMES,
     Numbers,
@@ -147,7 +147,7 @@ def _cut(logs: Sequence[FlightLog], numbers: Numbers, steps: int) -> Windows:
     return Windows.cut(flights, steps, steps, horizons)
 
 
-def _clusters(windows: Windows) -> NDArray[np.int_]:
+def _clusters(windows: Windows) -> Ints:
     """The number of the segment of each window."""
     segment = (windows.index * windows.period / SEGMENT).astype(int)
     pairs = np.stack((windows.flight, segment))
@@ -231,7 +231,7 @@ class Fit:
         errors = self._errors([numbers])[0, :, -1]
         return tuple(np.linalg.norm(errors, axis=-1).mean(axis=0).tolist())
 
-    def half_widths(self, clusters: NDArray[np.int_]) -> tuple[Floats, Floats]:
+    def half_widths(self, clusters: Ints) -> tuple[Floats, Floats]:
         """Of the 95 % intervals, infinite where nothing depends on a number; correlations."""
         from scipy.stats import t
 

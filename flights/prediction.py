@@ -14,7 +14,6 @@ from dataclasses import replace
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..models.coefficients import Coefficients
 from ..models.fields import immutable
@@ -24,7 +23,7 @@ from ..sim.effects import EffectOptions
 from ..sim.rotations import between
 from ..sim.state import InitialState
 from ..sim.world import PhysicsError
-from .flight_logs import FlightLog, Floats
+from .flight_logs import FlightLog, Floats, Ints
 
 Numbers = Mapping[str, float]
 """Numbers of a vehicle by the names of `NAMES`, in the units of `models/coefficients.toml`."""
@@ -89,9 +88,9 @@ class Windows:
     """Measured states at the horizons, shape (M, H, 13)."""
     speeds: Floats
     """Of the rotors at each step, rad/s, shape (M, steps, R)."""
-    flight: NDArray[np.int_]
+    flight: Ints
     """Index of the flight of each start, shape (M,)."""
-    index: NDArray[np.int_]
+    index: Ints
     """Sample of the flight at which it starts, shape (M,)."""
 
     def repeated(self, times: int) -> Self:

@@ -10,7 +10,7 @@ import numpy as np
 from ..models import InputError
 from ..udp.journal.reader import Recording, Session, Transition
 from ..udp.protocol.messages import State
-from .trajectories import Ending, Trajectory
+from .trajectories import Ending, Flights, Trajectory
 
 Array = np.ndarray
 
@@ -21,7 +21,7 @@ def recorded_trajectories(
     *,
     session: int | None = None,
     drone: int | None = 0,
-) -> list[Trajectory]:
+) -> Flights:
     """Episodes of one drone (of the session, from 0) of one session of a journal; with None those
     of all drones, one drone after the other.
 
@@ -36,7 +36,7 @@ def recorded_trajectories(
     if not path.is_file():
         raise InputError(f"{path}: expected a journal (.mcap), got no such file")
     sessions: list[Session] = []
-    found: list[Trajectory] = []
+    found: Flights = []
     for one in read_episodes(path, drone):
         if isinstance(one, Session):
             sessions.append(one)

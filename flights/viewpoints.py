@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
+from numpy.random import Generator
 from numpy.typing import NDArray
 
 from .. import models
@@ -20,7 +21,7 @@ from ..models.fields import Limits, NonNegativeInt, PositiveInt, check_fields, i
 from ..scenes import parse_scene
 from ..sim.rotations import multiplied
 from .recorded import read_episodes
-from .trajectories import Floats, Trajectory
+from .trajectories import Flights, Floats, Trajectory
 
 if TYPE_CHECKING:
     from ..models.cameras import View
@@ -110,9 +111,9 @@ def sequences_of(journals: Sequence[Path], config: CaptureConfig) -> list[PoseSe
     return found
 
 
-def _episodes(path: Path) -> Iterator[list[Trajectory]]:
+def _episodes(path: Path) -> Iterator[Flights]:
     """For each episode of a world, the trajectories of its drones."""
-    flown: dict[tuple[int, int, int], list[Trajectory]] = {}
+    flown: dict[tuple[int, int, int], Flights] = {}
     for one in read_episodes(path):
         if isinstance(one, Trajectory):
             world = one.drone // len(one.spec.agents)
@@ -122,7 +123,7 @@ def _episodes(path: Path) -> Iterator[list[Trajectory]]:
 
 
 def _sequence(
-    source: str, episode: Sequence[Trajectory], config: CaptureConfig, rng: np.random.Generator
+    source: str, episode: Sequence[Trajectory], config: CaptureConfig, rng: Generator
 ) -> PoseSequence:
     """Every so many steps of an episode; a drone whose flight has ended stays where it is."""
     steps = np.arange(0, max(map(len, episode)) + 1, config.every)
@@ -146,7 +147,7 @@ def _stacked(arrays: Sequence[Floats], rows: Sequence[NDArray[np.int_]]) -> Floa
     return np.stack(chosen, axis=1)
 
 
-def _tilts(shape: tuple[int, ...], largest: float, rng: np.random.Generator) -> Floats:
+def _tilts(shape: tuple[int, ...], largest: float, rng: Generator) -> Floats:
     """Rotations by up to an angle, rad, about any level axis, quaternions, (*shape, 4)."""
     axis = rng.uniform(-np.pi, np.pi, shape)
     half = largest * np.sqrt(rng.uniform(0, 1, shape)) / 2

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import pandas as pd
+from pandas import DataFrame, Series
 
 from . import metrics
 from .metrics import Headline
@@ -85,13 +85,13 @@ class Verdict:
     """The numbers."""
 
 
-def _late_returns(run: pd.DataFrame, returns: pd.Series) -> pd.Series:
+def _late_returns(run: DataFrame, returns: Series) -> Series:
     """Returns of the episodes that ended in the last quarter; none of a run of too few episodes."""
     ends = metrics.episode_ends(run)
     return returns[(ends > 0.75 * ends.max(initial=0.0)) & (len(run) >= MIN_EPISODES)]
 
 
-def convergence_step(run: pd.DataFrame) -> float:
+def convergence_step(run: DataFrame) -> float:
     """Env step from which one run's smoothed training return stays near its final level.
 
     The band around the final level is a share of the curve's own range, so a curve that only
@@ -118,12 +118,12 @@ def convergence_step(run: pd.DataFrame) -> float:
     return float(steps[start])
 
 
-def long_run_return(run: pd.DataFrame) -> float:
+def long_run_return(run: DataFrame) -> float:
     """Mean return of one run's episodes in the last quarter of training; nan if too few."""
     return float(_late_returns(run, run["return"]).mean())
 
 
-def fluctuation(run: pd.DataFrame) -> float:
+def fluctuation(run: DataFrame) -> float:
     """Standard deviation of one run's episode returns around their moving average, over the last
     quarter of training; nan if it has fewer than `MIN_EPISODES` episodes, or two in that quarter.
     """
@@ -132,7 +132,7 @@ def fluctuation(run: pd.DataFrame) -> float:
 
 
 def judge_claims(
-    episodes: pd.DataFrame, runs: pd.DataFrame, preset: str, headline: Headline
+    episodes: DataFrame, runs: DataFrame, preset: str, headline: Headline
 ) -> list[Verdict]:
     """Judge the paper's four claims from the tables `episodes` and `runs` of `results`. Every
     verdict states the preset with which the agents were trained.
@@ -182,8 +182,8 @@ def _holding_claim(headline: Headline) -> _Claim:
 
 
 def _compare(
-    episodes: pd.DataFrame,
-    measure: Callable[[pd.DataFrame], float],
+    episodes: DataFrame,
+    measure: Callable[[DataFrame], float],
     larger: bool,
     words: tuple[str, str] = ("", ""),
 ) -> _Judged:
@@ -210,7 +210,7 @@ def _compare(
     return outcome, f"{evidence}."
 
 
-def _measured(name: str, numbers: Floats, runs: list[pd.DataFrame], words: tuple[str, str]) -> str:
+def _measured(name: str, numbers: Floats, runs: list[DataFrame], words: tuple[str, str]) -> str:
     unit, without = words
     known = np.isfinite(numbers)
     long = np.array([len(run) >= MIN_EPISODES for run in runs])
@@ -221,7 +221,7 @@ def _measured(name: str, numbers: Floats, runs: list[pd.DataFrame], words: tuple
     return f"{name} {_number(iqm(numbers))}{unit if known.any() else ''} ({text})"
 
 
-def _both_hold(runs: pd.DataFrame, headline: Headline) -> _Judged:
+def _both_hold(runs: DataFrame, headline: Headline) -> _Judged:
     outcomes: list[Outcome] = []
     texts = []
     for name in ("a2c", "vpg"):
@@ -233,7 +233,7 @@ def _both_hold(runs: pd.DataFrame, headline: Headline) -> _Judged:
     return min(outcomes, key=order.index), f"{'; '.join(texts)}."
 
 
-def _holds(runs: pd.DataFrame, headline: Headline) -> _Judged:
+def _holds(runs: DataFrame, headline: Headline) -> _Judged:
     """Whether one agent holds its goal in its final evaluations, and the numbers."""
     if runs.empty:
         return "not tested", "not trained"
@@ -254,7 +254,7 @@ def _holds(runs: pd.DataFrame, headline: Headline) -> _Judged:
     return "undecided", text
 
 
-def judge_no_worse(runs: pd.DataFrame, preset: str, headline: Headline) -> Verdict:
+def judge_no_worse(runs: DataFrame, preset: str, headline: Headline) -> Verdict:
     """Judge whether our A2C is no worse than SB3's after as many env steps, from the table `runs`.
     The headline metric has a bound of its goal.
     """
@@ -271,7 +271,7 @@ def judge_no_worse(runs: pd.DataFrame, preset: str, headline: Headline) -> Verdi
     return Verdict(*claim, preset, *_no_worse(runs, margin, headline))
 
 
-def _no_worse(runs: pd.DataFrame, margin: float, headline: Headline) -> _Judged:
+def _no_worse(runs: DataFrame, margin: float, headline: Headline) -> _Judged:
     both = {name: runs[runs["row"] == name] for name in ("a2c", "sb3-a2c")}
     missing = [name for name, own in both.items() if own.empty]
     if missing:

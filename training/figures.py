@@ -9,11 +9,11 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
+from pandas import DataFrame, concat
 
 from ..flights.palette import agent_color
 from . import metrics
@@ -48,7 +48,7 @@ _STYLE = Path(__file__).parent / "assets" / "figures.mplstyle"
 _GREY = "#333333"
 
 
-def draw_figures(results: Results, table: pd.DataFrame) -> list[str]:
+def draw_figures(results: Results, table: DataFrame) -> list[str]:
     """Draw all figures into `figures/`, in all `FORMATS`; their names.
 
     Args:
@@ -66,7 +66,7 @@ def draw_figures(results: Results, table: pd.DataFrame) -> list[str]:
     return names
 
 
-def _figures(results: Results, table: pd.DataFrame) -> Iterator[tuple[str, Figure]]:
+def _figures(results: Results, table: DataFrame) -> Iterator[tuple[str, Figure]]:
     rows = [row for row in results.study.rows if row.name in table.index]
     tasks = by_task(results, rows)
     for task, own in tasks:
@@ -88,7 +88,7 @@ def row_color(row: Row) -> str:
 # ---- rows beside each other
 
 
-def draw_comparison(results: Results, table: pd.DataFrame, rows: Sequence[Row]) -> Figure:
+def draw_comparison(results: Results, table: DataFrame, rows: Sequence[Row]) -> Figure:
     """Rows of one task: the steady state over training, and at its end with 95 % intervals."""
     headline = results.headline(rows[0])
     curves = learning_curves(results.evaluations, [row.name for row in rows])
@@ -117,7 +117,7 @@ def draw_comparison(results: Results, table: pd.DataFrame, rows: Sequence[Row]) 
     return figure
 
 
-def learning_curves(evaluations: pd.DataFrame, names: Sequence[str]) -> dict[str, Spread]:
+def learning_curves(evaluations: DataFrame, names: Sequence[str]) -> dict[str, Spread]:
     """Steady state of the snapshots of each row over env steps; rows without training are not
     there.
     """
@@ -147,7 +147,7 @@ def draw_reward(results: Results, rows: Sequence[Row]) -> Figure:
                 [metrics.average_return(run, AVERAGING_SHARE) for run in runs]
             )
             color = row_color(row)
-            dots = pd.concat(runs)
+            dots = concat(runs)
             dots = dots.sample(min(len(dots), _MAX_POINTS), random_state=0)  # few enough to draw
             axis.plot(
                 metrics.episode_ends(dots), dots["return"].to_numpy(), "o", color=color,
@@ -217,7 +217,7 @@ def draw_error(results: Results, rows: Sequence[Row]) -> Figure:
     return figure
 
 
-def value_fan(steps: pd.DataFrame) -> pd.DataFrame:
+def value_fan(steps: DataFrame) -> DataFrame:
     """Quantiles of the metric over at most 100 windows of an agent's training steps.
 
     The index is the env step in the middle of a window, the columns are 0.05, 0.25, 0.5, 0.75 and
@@ -231,7 +231,7 @@ def value_fan(steps: pd.DataFrame) -> pd.DataFrame:
     return quantiles.set_index((quantiles.index + 0.5) * width)
 
 
-def trajectories(steps: pd.DataFrame, control_period: float) -> list[Curve]:
+def trajectories(steps: DataFrame, control_period: float) -> list[Curve]:
     """At most 40 trajectories of an agent's evaluation, at random but always the same ones: the
     metric over the time in the episode (s).
     """

@@ -14,8 +14,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
+from pandas import DataFrame, Series
 
 from ..envs.spec import EnvSpec, Metric
 from ..flights.trajectories import Trajectory
@@ -24,6 +24,8 @@ from ..models.fields import immutable
 from .statistics import Floats, Values, trimmed_mean
 
 Places = NDArray[np.int64]
+Measures = dict[str, float]
+"""Numbers by the names of their columns."""
 
 MEANS = ("steady", "settling_time", "overshoot", "return")
 
@@ -105,7 +107,7 @@ class Headline(Metric):
         """Whether the mean over the episodes says how many crashed, as the share of landings."""
         return self.final and self.high
 
-    def crashed(self, evaluations: pd.DataFrame) -> "pd.Series[bool]":
+    def crashed(self, evaluations: DataFrame) -> "Series[bool]":
         """Which episodes terminated; of a `final` metric those that did not hold its goal."""
         ended = evaluations["terminated"].astype(bool)
         return ended & ~self.holds(evaluations["steady"]) if self.final else ended
@@ -150,7 +152,7 @@ def overshoot(errors: Values) -> float:
     return max(0.0, float(passed.max()))
 
 
-def measure_episode(trajectory: Trajectory, headline: Headline) -> dict[str, float]:
+def measure_episode(trajectory: Trajectory, headline: Headline) -> Measures:
     """A trajectory as a row of the table `evaluations`, but for the columns that name the run.
 
     What was drawn for the episode follows in columns of its own.
@@ -173,7 +175,7 @@ def measure_episode(trajectory: Trajectory, headline: Headline) -> dict[str, flo
     }
 
 
-def _drawn(trajectory: Trajectory) -> dict[str, float]:
+def _drawn(trajectory: Trajectory) -> Measures:
     for array in trajectory.spec.telemetry:
         if array.name == "drawn":
             values = trajectory.telemetry[array.name][0].tolist()
@@ -184,7 +186,7 @@ def _drawn(trajectory: Trajectory) -> dict[str, float]:
 # ---- over the episodes of a run's evaluation
 
 
-def measure_run(evaluations: pd.DataFrame, headline: Headline) -> dict[str, float]:
+def measure_run(evaluations: DataFrame, headline: Headline) -> Measures:
     """Measures of one run from the evaluations of all its snapshots.
 
     Returns:
@@ -215,13 +217,13 @@ def measure_run(evaluations: pd.DataFrame, headline: Headline) -> dict[str, floa
     }
 
 
-def final_evaluations(evaluations: pd.DataFrame) -> pd.DataFrame:
+def final_evaluations(evaluations: DataFrame) -> DataFrame:
     """The evaluation episodes of each run's last snapshot (the largest `env_steps`)."""
     last = evaluations.groupby(["row", "seed"])["env_steps"].transform("max")
     return evaluations[evaluations["env_steps"] == last]
 
 
-def first_lasting_snapshot(evaluations: pd.DataFrame, headline: Headline) -> tuple[float, float]:
+def first_lasting_snapshot(evaluations: DataFrame, headline: Headline) -> tuple[float, float]:
     """Env steps and seconds of training after which one run holds its goal for good; nan if never.
 
     They are those of the first snapshot from which on every snapshot holds its goal. Few
@@ -243,24 +245,24 @@ def first_lasting_snapshot(evaluations: pd.DataFrame, headline: Headline) -> tup
 # ---- curves
 
 
-def training_runs(episodes: pd.DataFrame, row: str) -> list[pd.DataFrame]:
+def training_runs(episodes: DataFrame, row: str) -> list[DataFrame]:
     """Training episodes of a row: one frame per seed, in the order of their ends."""
     own = episodes[episodes["row"] == row].sort_values(["seed", "last_step"], kind="stable")
     return [run for _, run in own.groupby("seed")]
 
 
-def episode_ends(episodes: pd.DataFrame) -> Floats:
+def episode_ends(episodes: DataFrame) -> Floats:
     """Env step of the run at which each training episode ended, shape (episodes,)."""
     return np.asarray(episodes["last_step"], float)
 
 
-def mean_returns(run: pd.DataFrame, first: Places, last: Places) -> Floats:
+def mean_returns(run: DataFrame, first: Places, last: Places) -> Floats:
     """Mean return of one run's episodes from each of the first places to before the last ones."""
     total = np.concatenate([[0.0], np.cumsum(run["return"].to_numpy())])
     return np.asarray((total[last] - total[first]) / (last - first))
 
 
-def average_return(run: pd.DataFrame, share: float) -> Curve:
+def average_return(run: DataFrame, share: float) -> Curve:
     """Running mean of one run's return, over the episodes that ended in the last `share` of it: a
     point at the end of every episode, which is always in its mean.
     """

@@ -17,6 +17,7 @@ _RESAMPLES = 2000
 
 Floats = NDArray[np.float64]
 Values = Sequence[float] | NDArray[np.floating]
+Interval = tuple[float, float]
 
 
 def finite(values: Values) -> Floats:
@@ -38,7 +39,7 @@ def iqm(values: Values) -> float:
     return float(trimmed_mean(known)) if known.size else math.nan
 
 
-def bootstrap_interval(values: Values, level: float = 0.95) -> tuple[float, float]:
+def bootstrap_interval(values: Values, level: float = 0.95) -> Interval:
     """Percentile-bootstrap interval of `iqm`.
 
     Fewer than two values give (nan, nan): one seed shows no spread. With few seeds the
@@ -61,7 +62,7 @@ def bootstrap_difference(
     return iqm(first) - iqm(second), low, high
 
 
-def share_interval(count: int, total: int, level: float = 0.95) -> tuple[float, float]:
+def share_interval(count: int, total: int, level: float = 0.95) -> Interval:
     """Wilson's interval of a share, of `count` cases out of `total`; (nan, nan) of none."""
     if total == 0:
         return math.nan, math.nan
@@ -76,7 +77,7 @@ def share_interval(count: int, total: int, level: float = 0.95) -> tuple[float, 
 
 def _bootstrap(
     samples: Sequence[Values], statistic: Callable[..., Floats], level: float
-) -> tuple[float, float]:
+) -> Interval:
     """Ends of the interval; nan if a sample has fewer than two values."""
     known = [finite(values) for values in samples]
     if min(values.size for values in known) < 2:

@@ -7,10 +7,10 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 
-import pandas as pd
+from pandas import DataFrame
 
 from ..flights.palette import agent_label
-from .metrics import MEANS, Headline
+from .metrics import MEANS, Headline, Measures
 from .results import Results
 from .settings import Row
 from .statistics import bootstrap_interval, iqm, share_interval
@@ -24,7 +24,7 @@ _COUNTS = ("episodes", "settled", "crashed")
 # ---- numbers
 
 
-def results_table(results: Results) -> pd.DataFrame:
+def results_table(results: Results) -> DataFrame:
     """Measures over seeds of each row of which a run is done, indexed by `row`.
 
     For each of steady, settling_time (s), overshoot and return: the interquartile mean over seeds,
@@ -38,12 +38,12 @@ def results_table(results: Results) -> pd.DataFrame:
     The rows of a sweep are ranked: whole rows first, then by the crashes of the worst seed, then by
     its steady state. Other rows keep their order.
     """
-    lines: dict[str, dict[str, float]] = {}
+    lines: dict[str, Measures] = {}
     for row in results.study.rows:
         own = results.runs[results.runs["row"] == row.name]
         if len(own):
             lines[row.name] = _measures(own, results.headline(row))
-    table = pd.DataFrame.from_dict(lines, orient="index").rename_axis("row")
+    table = DataFrame.from_dict(lines, orient="index").rename_axis("row")
     if results.study.kind != "sweep" or table.empty:
         return table
     high = results.headline(results.study.rows[0]).high
@@ -51,9 +51,9 @@ def results_table(results: Results) -> pd.DataFrame:
     return table.sort_values(list(order), ascending=list(order.values()), kind="stable")
 
 
-def _measures(own: pd.DataFrame, headline: Headline) -> dict[str, float]:
+def _measures(own: DataFrame, headline: Headline) -> Measures:
     trained = own["env_steps"].max() > 0
-    line: dict[str, float] = {"seeds": len(own), **own[list(_COUNTS)].sum()}
+    line: Measures = {"seeds": len(own), **own[list(_COUNTS)].sum()}
     for name in MEANS:
         values = own[name].to_numpy(float)
         line[name] = iqm(values)
@@ -73,7 +73,7 @@ def _measures(own: pd.DataFrame, headline: Headline) -> dict[str, float]:
     return line
 
 
-def _share_interval(line: Line, headline: Headline) -> dict[str, float]:
+def _share_interval(line: Line, headline: Headline) -> Measures:
     """Wilson's interval for a steady state that is a share of all flights, or is 0 or 1 in all
     seeds: resampling shows no spread there.
     """
@@ -91,7 +91,7 @@ def _share_interval(line: Line, headline: Headline) -> dict[str, float]:
 # ---- cells
 
 
-def markdown(results: Results, table: pd.DataFrame) -> str:
+def markdown(results: Results, table: DataFrame) -> str:
     """The table of each task, of `results_table`, in Markdown, with a note."""
     rows = {row.name: row for row in results.study.rows}
     ordered = [rows[str(name)] for name in table.index]
