@@ -4,7 +4,7 @@ J. van den Berg, S. J. Guy, M. Lin and D. Manocha, "Reciprocal n-Body Collision 
 Robotics Research, STAR 70, Springer 2011, in three dimensions.
 """
 
-import math
+from math import hypot, sqrt
 from typing import ClassVar
 
 import numpy as np
@@ -87,7 +87,7 @@ class Orca:
         ]
         velocity = nearest(wanted, planes, most)
         c, s, _ = vector(self._nose)
-        size = math.hypot(c, s) or 1.0
+        size = hypot(c, s) or 1.0
         return level_action(velocity, c / size, s / size, 0.0, self._scale)
 
 
@@ -107,7 +107,7 @@ def avoiding(there: Vector, moves: Vector, own: Vector, radius: float, period: f
     horizon = HORIZON if apart else period
     # The obstacle is a cone along `there`, cut off by a sphere about `there` / horizon.
     to_cap = _sum(approach, there, -1.0 / horizon)
-    size = math.sqrt(_dot(to_cap, to_cap))
+    size = sqrt(_dot(to_cap, to_cap))
     along = _dot(to_cap, there)
     if not apart or (along < 0.0 and along * along > radius * radius * size * size):
         away = to_cap
@@ -116,14 +116,14 @@ def avoiding(there: Vector, moves: Vector, own: Vector, radius: float, period: f
         # The point t · `there` of the axis whose sphere, of radius t R, is nearest on its side.
         leg = square - radius * radius
         cross = square * _dot(approach, approach) - _dot(there, approach) ** 2
-        share = (_dot(there, approach) + radius * math.sqrt(max(cross, 0.0) / leg)) / square
+        share = (_dot(there, approach) + radius * sqrt(max(cross, 0.0) / leg)) / square
         away = _sum(approach, there, -share)
-        size = math.sqrt(_dot(away, away))
+        size = sqrt(_dot(away, away))
         change = radius * share - size
     if size < 1e-9:  # straight at the middle: to the right, as at sea
         x, y, z = there
-        away = (y, -x, 0.0) if math.hypot(x, y) > 1e-9 else (z or 1.0, 0.0, 0.0)
-        size = math.hypot(*away)
+        away = (y, -x, 0.0) if hypot(x, y) > 1e-9 else (z or 1.0, 0.0, 0.0)
+        size = hypot(*away)
     normal = (away[0] / size, away[1] / size, away[2] / size)
     return normal, _dot(normal, own) + 0.5 * change
 
@@ -152,7 +152,7 @@ def nearest(wanted: Vector, planes: list[Plane], most: float) -> Vector:
 
 
 def _within(velocity: Vector, most: float) -> Vector:
-    size = math.sqrt(_dot(velocity, velocity))
+    size = sqrt(_dot(velocity, velocity))
     return velocity if size <= most else _sum((0.0, 0.0, 0.0), velocity, most / size)
 
 

@@ -10,13 +10,13 @@ import os
 import statistics
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from importlib.util import find_spec
 from itertools import cycle
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from time import perf_counter, process_time
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -52,7 +52,7 @@ class Layer(NamedTuple):
     drones: int
     start: Callable[[ExitStack], Step]
     """Opens it for as long as the stack is."""
-    clock: Callable[[], float] = time.perf_counter
+    clock: Callable[[], float] = perf_counter
     package: str = "rotorgram"
     """What must be installed."""
 
@@ -120,7 +120,7 @@ def rate_of(
     step: Step,
     seconds: float,
     at_once: int = _STEPS_AT_ONCE,
-    clock: Callable[[], float] = time.perf_counter,
+    clock: Callable[[], float] = perf_counter,
 ) -> float:
     """Env steps per second over `seconds`, with `at_once` steps between looks at the clock."""
     start = clock()
@@ -289,10 +289,10 @@ LAYERS = (
     Layer("Batch.step, 1024", "mujoco.batch, the same substeps", _DRONES, _batch_step),
     Layer("vector env, 1024", "the vector env", _DRONES, _vector),
     Layer("UDP, 1024", "RemoteVectorEnv", _DRONES, _remote_vector),
-    Layer("rigid, 1", "Hover-v0, two steps of RK4", 1, _rigid_env, time.process_time),
-    Layer("rigid, 64", "the same", 64, _rigid(64), time.process_time),
-    Layer("rigid, 1024", "the same", _DRONES, _rigid(_DRONES), time.process_time),
-    Layer("rigid, 4096", "the same", 4096, _rigid(4096), time.process_time),
-    Layer("L2F, 1024", "one step of RK4", _DRONES, _l2f, time.process_time, "l2f"),
-    Layer("Crazyflow, 1024", "ten steps", _DRONES, _crazyflow, time.process_time, "crazyflow"),
+    Layer("rigid, 1", "Hover-v0, two steps of RK4", 1, _rigid_env, process_time),
+    Layer("rigid, 64", "the same", 64, _rigid(64), process_time),
+    Layer("rigid, 1024", "the same", _DRONES, _rigid(_DRONES), process_time),
+    Layer("rigid, 4096", "the same", 4096, _rigid(4096), process_time),
+    Layer("L2F, 1024", "one step of RK4", _DRONES, _l2f, process_time, "l2f"),
+    Layer("Crazyflow, 1024", "ten steps", _DRONES, _crazyflow, process_time, "crazyflow"),
 )

@@ -16,8 +16,14 @@ from matplotlib.ticker import EngFormatter
 from pandas import DataFrame, concat
 
 from ..flights.palette import agent_color
-from . import metrics
-from .metrics import Curve, Spread
+from .metrics import (
+    Curve,
+    Spread,
+    average_return,
+    episode_ends,
+    spread_over_seeds,
+    training_runs,
+)
 from .results import Results, file_words
 from .settings import Row
 from .tables import by_task, row_label, seeds_text
@@ -129,7 +135,7 @@ def learning_curves(evaluations: DataFrame, names: Sequence[str]) -> dict[str, S
             means = own.groupby(["seed", "env_steps"])["steady"].mean()
             runs = [run.droplevel("seed") for _, run in means.groupby("seed")]
             points = [Curve(run.index.to_numpy(float), run.to_numpy(float)) for run in runs]
-            curves[name] = metrics.spread_over_seeds(points, np.unique(own["env_steps"]))
+            curves[name] = spread_over_seeds(points, np.unique(own["env_steps"]))
     return curves
 
 
@@ -141,16 +147,14 @@ def draw_reward(results: Results, rows: Sequence[Row]) -> Figure:
     figure, axes = _panels(len(rows) + 1, "fig6_reward")
     together = axes[-1]
     for axis, row in zip(axes, rows, strict=False):
-        runs = metrics.training_runs(results.episodes, row.name)
+        runs = training_runs(results.episodes, row.name)
         if runs:
-            average = metrics.spread_over_seeds(
-                [metrics.average_return(run, AVERAGING_SHARE) for run in runs]
-            )
+            average = spread_over_seeds([average_return(run, AVERAGING_SHARE) for run in runs])
             color = row_color(row)
             dots = concat(runs)
             dots = dots.sample(min(len(dots), _MAX_POINTS), random_state=0)  # few enough to draw
             axis.plot(
-                metrics.episode_ends(dots), dots["return"].to_numpy(), "o", color=color,
+                episode_ends(dots), dots["return"].to_numpy(), "o", color=color,
                 markersize=2.5, alpha=0.3, markeredgewidth=0, label="total reward", rasterized=True,
             )  # fmt: skip
             _plot(axis, average, color, "average reward")
@@ -171,13 +175,13 @@ def draw_cumulative(results: Results, rows: Sequence[Row]) -> Figure:
     for row in rows:
         over_steps = []
         over_episodes = []
-        for run in metrics.training_runs(results.episodes, row.name):
+        for run in training_runs(results.episodes, row.name):
             total = run["return"].cumsum().to_numpy()
-            over_steps.append(Curve(metrics.episode_ends(run), total))
+            over_steps.append(Curve(episode_ends(run), total))
             over_episodes.append(Curve(np.arange(1.0, len(total) + 1), total))
         if over_steps:
             for axis, curves in ((left, over_steps), (right, over_episodes)):
-                _plot(axis, metrics.spread_over_seeds(curves), row_color(row), row_label(row))
+                _plot(axis, spread_over_seeds(curves), row_color(row), row_label(row))
     _env_steps_axis(left)
     right.set_xlabel("training episodes")
     left.set_ylabel("cumulative reward")

@@ -9,8 +9,8 @@ and how many crashed; a run with a crash in its evaluation does not hold its goa
 of its metric counts crashes already, as the share of landings does.
 """
 
-import math
 from collections.abc import Sequence
+from math import nan
 from typing import NamedTuple
 
 import numpy as np
@@ -123,7 +123,7 @@ def steady_state(sizes: Values, *, final: bool = False) -> float:
     """
     count = 1 if final else max(1, len(sizes) // 4)
     last = np.asarray(sizes, float)[-count:]
-    return float(last.mean()) if last.size else math.nan
+    return float(last.mean()) if last.size else nan
 
 
 def settling_time(errors: Values, control_period: float, tolerance: float) -> float:
@@ -134,7 +134,7 @@ def settling_time(errors: Values, control_period: float, tolerance: float) -> fl
     """
     outside = ~(np.abs(np.asarray(errors, float)) < tolerance)
     if outside.size == 0 or outside[-1]:
-        return math.nan
+        return nan
     if not outside.any():
         return 0.0
     return float(outside.nonzero()[0][-1] + 1) * control_period
@@ -147,7 +147,7 @@ def overshoot(errors: Values) -> float:
     """
     values = np.asarray(errors, float)
     if not values.size:
-        return math.nan
+        return nan
     passed = -np.sign(values[0]) * values if values[0] else np.abs(values)
     return max(0.0, float(passed.max()))
 
@@ -160,7 +160,7 @@ def measure_episode(trajectory: Trajectory, headline: Headline) -> Measures:
     values = trajectory.headline
     steady = steady_state(headline.size(values[1:]), final=headline.final)
     reached = headline.final and bool(headline.holds([steady])[0])
-    settled = math.nan
+    settled = nan
     if headline.settles and (reached or not trajectory.terminated):
         settled = settling_time(values, trajectory.spec.control_period, headline.settled or 0.0)
     return {
@@ -169,7 +169,7 @@ def measure_episode(trajectory: Trajectory, headline: Headline) -> Measures:
         "return": float(trajectory.rewards.sum()),
         "steady": steady,
         "settling_time": settled,
-        "overshoot": overshoot(values) if headline.signed else math.nan,
+        "overshoot": overshoot(values) if headline.signed else nan,
         "terminated": trajectory.terminated,
         **_drawn(trajectory),
     }
@@ -202,8 +202,8 @@ def measure_run(evaluations: DataFrame, headline: Headline) -> Measures:
     means = {name: float(final[name].mean()) for name in MEANS}
     safe = headline.counts_crashes or not crashed.any()
     whole = bool(final["steady"].notna().all())
-    steps = math.nan
-    seconds = math.nan
+    steps = nan
+    seconds = nan
     if evaluations["env_steps"].max() > 0 and headline.held is not None:
         steps, seconds = first_lasting_snapshot(evaluations, headline)
     return {
@@ -238,7 +238,7 @@ def first_lasting_snapshot(evaluations: DataFrame, headline: Headline) -> tuple[
     later = np.logical_and.accumulate(holds[::-1])[::-1]
     lasting = snapshots["seconds"].max()[later]
     if lasting.empty:
-        return math.nan, math.nan
+        return nan, nan
     return float(lasting.index[0]), float(lasting.iloc[0])
 
 

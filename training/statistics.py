@@ -7,8 +7,8 @@ the runs of an agent, always in the same way. Missing values (nan) are left out.
 SciPy is imported where it computes: workers, which fly and do not compare, start without it.
 """
 
-import math
 from collections.abc import Callable, Sequence
+from math import nan
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +36,7 @@ def trimmed_mean(values: Values, axis: int = -1) -> Floats:
 def iqm(values: Values) -> float:
     """Interquartile mean: `trimmed_mean`; nan if there is no value."""
     known = finite(values)
-    return float(trimmed_mean(known)) if known.size else math.nan
+    return float(trimmed_mean(known)) if known.size else nan
 
 
 def bootstrap_interval(values: Values, level: float = 0.95) -> Interval:
@@ -65,7 +65,7 @@ def bootstrap_difference(
 def share_interval(count: int, total: int, level: float = 0.95) -> Interval:
     """Wilson's interval of a share, of `count` cases out of `total`; (nan, nan) of none."""
     if total == 0:
-        return math.nan, math.nan
+        return nan, nan
     from scipy import stats
 
     interval = stats.binomtest(count, total).proportion_ci(level, method="wilson")
@@ -81,7 +81,7 @@ def _bootstrap(
     """Ends of the interval; nan if a sample has fewer than two values."""
     known = [finite(values) for values in samples]
     if min(values.size for values in known) < 2:
-        return math.nan, math.nan
+        return nan, nan
     from scipy import stats
 
     found = stats.bootstrap(

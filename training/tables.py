@@ -3,9 +3,9 @@
 The terminal and the report's page show the same text.
 """
 
-import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from math import floor, isnan, log10, nan
 
 from pandas import DataFrame
 
@@ -59,17 +59,17 @@ def _measures(own: DataFrame, headline: Headline) -> Measures:
         line[name] = iqm(values)
         line[f"{name}_low"], line[f"{name}_high"] = bootstrap_interval(values)
     line |= _share_interval(line, headline)
-    line["held"] = math.nan if headline.held is None else int(own["held"].sum())
+    line["held"] = nan if headline.held is None else int(own["held"].sum())
     line["worst"] = own["steady"].agg("min" if headline.high else "max")
     line["most_crashed"] = int(own["crashed"].max())
     low, high = share_interval(int(line["crashed"]), int(line["episodes"]))
     line["crash_rate"] = line["crashed"] / line["episodes"]
     line |= {"crash_rate_low": low, "crash_rate_high": high}
-    reached = own["env_steps_to_hold"].notna().sum() if trained else math.nan
-    line["reached"] = math.nan if headline.held is None else reached
+    reached = own["env_steps_to_hold"].notna().sum() if trained else nan
+    line["reached"] = nan if headline.held is None else reached
     for name in ("env_steps_to_hold", "seconds_to_hold", "steps_per_second"):
         line[name] = iqm(own[name].to_numpy(float))
-    line["env_steps"] = own["env_steps"].max() if trained else math.nan
+    line["env_steps"] = own["env_steps"].max() if trained else nan
     return line
 
 
@@ -151,7 +151,7 @@ def _line(row: Row, line: Line, headline: Headline) -> list[str]:
         settled = f"{int(line['settled'])} of {int(line['episodes'])}"
         settling = _measured(line, "settling_time", settled)
     reached = []
-    if not math.isnan(line["reached"]):
+    if not isnan(line["reached"]):
         reached.append(f"{int(line['reached'])} of {seeds}")
     if line["reached"] > 0:
         reached.append(f"{number_text(line['seconds_to_hold'])} s")
@@ -189,7 +189,7 @@ def row_label(row: Row) -> str:
 
 
 def _held(line: Line, seeds: int) -> str:
-    if math.isnan(line["held"]):
+    if isnan(line["held"]):
         return NOTHING
     held = int(line["held"])
     low, high = share_interval(held, seeds)
@@ -207,13 +207,13 @@ def _crashes(line: Line) -> str:
 def _measured(line: Line, name: str, *details: str) -> str:
     low = line[f"{name}_low"]
     high = line[f"{name}_high"]
-    interval = () if math.isnan(low) else (f"{number_text(low)} to {number_text(high)}",)
+    interval = () if isnan(low) else (f"{number_text(low)} to {number_text(high)}",)
     return _cell(number_text(line[name]), *interval, *details)
 
 
 def number_text(value: float) -> str:
     """Write a number with about three digits, and fewer below 1."""
-    if math.isnan(value):
+    if isnan(value):
         return NOTHING
     size = abs(value)
     if size == 0.0:
@@ -221,13 +221,13 @@ def number_text(value: float) -> str:
     if size < 1e-4:
         return f"{value:.0e}"
     if size < 1.0:
-        return f"{value:.{1 - math.floor(math.log10(size))}f}"
-    return f"{value:,.{max(0, 2 - math.floor(math.log10(size)))}f}"
+        return f"{value:.{1 - floor(log10(size))}f}"
+    return f"{value:,.{max(0, 2 - floor(log10(size)))}f}"
 
 
 def count_text(value: float) -> str:
     """Write a number without decimals."""
-    return NOTHING if math.isnan(value) else f"{value:,.0f}"
+    return NOTHING if isnan(value) else f"{value:,.0f}"
 
 
 NOTE = (
