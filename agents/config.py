@@ -74,7 +74,7 @@ class SACConfig(RolloutConfig):
     Defaults: its Table 1.
     """
 
-    squashed: ClassVar[bool] = True
+    squashed = True
     hidden: tuple[int, ...] = (256, 256)
     """Units of each hidden layer of each network."""
     learning_rate: float = 0.0003

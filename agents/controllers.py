@@ -1,14 +1,11 @@
 """Every controller: an agent that needs no training, made of an env's spec."""
 
-from collections.abc import Mapping
-from typing import Final
-
 from .geometric import Geometric
 from .orca import Orca
 from .pid import PID
 
 Controller = type[PID] | type[Geometric] | type[Orca]
-CONTROLLERS: Final[Mapping[str, Controller]] = {
+CONTROLLERS: dict[str, Controller] = {
     "pid": PID,
     "geometric": Geometric,
     "orca": Orca,

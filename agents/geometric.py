@@ -35,7 +35,7 @@ class Geometric:
     Raises `InputError` for an env that lacks what it needs.
     """
 
-    label: ClassVar[str] = "Geometric"
+    label = "Geometric"
     options: ClassVar[dict[str, str]] = {"action": "position"}
     """Options of the env that it flies."""
 

@@ -4,7 +4,7 @@ import json
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -36,10 +36,10 @@ class Learner:
             shape (T,). Other terms are logged under their names.
     """
 
-    epsilon: ClassVar[float] = 1e-8
+    epsilon = 1e-8
     """Added by Adam to the root of the squares."""
-    has_critic: ClassVar[bool] = False
-    central: ClassVar[bool] = False
+    has_critic = False
+    central = False
     """Whether the critic sees the observations of all drones of a world."""
 
     def __init__(self, log: EpisodeRecorder, config: Config, seed: int) -> None:

@@ -12,7 +12,7 @@ from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Final, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.random import Generator
@@ -239,7 +239,7 @@ class Network(Module):
                 slope = layer.back(slope)
 
 
-_ACTIVATIONS: Final = {"relu": Relu, "tanh": Tanh}
+_ACTIVATIONS = {"relu": Relu, "tanh": Tanh}
 
 
 class MLP(Network):
@@ -254,7 +254,7 @@ class MLP(Network):
         return [*layers, Affine(inputs, outputs)]
 
 
-NETWORKS: Final[dict[str, type[Network]]] = {"mlp": MLP}
+NETWORKS: dict[str, type[Network]] = {"mlp": MLP}
 """Kinds of networks by the name in a config. A kind of your own is a new entry."""
 
 

@@ -39,7 +39,7 @@ class Orca:
     `InputError` for an env that lacks what it needs.
     """
 
-    label: ClassVar[str] = "ORCA"
+    label = "ORCA"
     options: ClassVar[dict[str, str]] = {"action": "velocity"}
     """Options of the env that it flies."""
 

@@ -29,7 +29,7 @@ class PID:
     Raises `InputError` for another env, or where options or telemetry lack what it needs.
     """
 
-    label: ClassVar[str] = "PID"
+    label = "PID"
     options: ClassVar[dict[str, str]] = {}
     """Options of the env that it needs."""
 

@@ -7,7 +7,7 @@ if it has any, are in `presets.toml`.
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from ..models.errors import InputError
 from ..models.files import read_toml
@@ -55,7 +55,7 @@ def _find(name: str) -> Any:
     return getattr(import_module(module, __package__), one)
 
 
-ALGORITHMS: Final[dict[str, Algorithm]] = {
+ALGORITHMS = {
     name: Algorithm(**row)
     for name, row in read_toml(Path(__file__).with_name("algorithms.toml"), "algorithms").items()
 }

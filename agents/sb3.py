@@ -1,6 +1,6 @@
 """Stable-Baselines3: its A2C, PPO and SAC as references, and vector envs as it wants them."""
 
-from typing import Any, Final, NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 from gymnasium import spaces
@@ -251,7 +251,7 @@ class SB3Agent:
         return {name: float(value) for name, value in kept.items() if name.startswith("train/")}
 
 
-_MODELS: Final[dict[type, Any]] = {A2CConfig: sb3.A2C, PPOConfig: sb3.PPO, SACConfig: sb3.SAC}
+_MODELS: dict[type, Any] = {A2CConfig: sb3.A2C, PPOConfig: sb3.PPO, SACConfig: sb3.SAC}
 
 
 def _settings(config: A2CConfig | SACConfig, steps: int, log: EpisodeRecorder) -> Settings:

@@ -2,11 +2,11 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from ._flags import BackendOfPreset, Words
+from ._flags import BackendOfPreset
 from ._study import StudyFlags
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ class Benchmark(StudyFlags):
     Ctrl-C keeps the runs that are done; --resume flies the others.
     """
 
-    kinds: ClassVar[Words] = ("benchmark",)
+    kinds = ("benchmark",)
 
     rows: Positional[Annotated[Path | None, arg(metavar="FILE")]] = None
     """TOML file of rows. Default: those of docs/baselines.md."""

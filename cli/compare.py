@@ -3,13 +3,13 @@
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
 from ..agents.registry import AlgorithmName
 from ..models import InputError
-from ._flags import DEFAULT_ENV, Words
+from ._flags import DEFAULT_ENV
 from ._study import StudyFlags
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ class Compare(StudyFlags):
     with --no-udp in this process.
     """
 
-    kinds: ClassVar[Words] = ("paper", "compare")
+    kinds = ("paper", "compare")
 
     files: Positional[Annotated[tuple[Path, ...], arg(metavar="FILE")]] = ()
     """TOML files: of one row (agent, env, set, …), named by its file, or of [[row]] tables. They

@@ -3,13 +3,13 @@
 import json
 from collections.abc import Iterable, Mapping
 from itertools import chain, product
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
 from ..agents.registry import AlgorithmName
 from ..models import InputError
-from ._flags import NamedValues, Options, Words, parse_value
+from ._flags import NamedValues, Options, parse_value
 from ._study import StudyFlags
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ class Sweep(StudyFlags):
     Ctrl-C keeps the runs that are done; --resume flies the others.
     """
 
-    kinds: ClassVar[Words] = ("sweep",)
+    kinds = ("sweep",)
 
     algorithm: Positional[AlgorithmName]
     """The algorithm."""

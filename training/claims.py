@@ -21,8 +21,7 @@ from typing import Literal
 import numpy as np
 from pandas import DataFrame, Series
 
-from . import metrics
-from .metrics import Headline
+from .metrics import Headline, episode_ends, mean_returns, training_runs
 from .statistics import Floats, bootstrap_difference, iqm, share_interval
 from .tables import seeds_text
 
@@ -87,7 +86,7 @@ class Verdict:
 
 def _late_returns(run: DataFrame, returns: Series) -> Series:
     """Returns of the episodes that ended in the last quarter; none of a run of too few episodes."""
-    ends = metrics.episode_ends(run)
+    ends = episode_ends(run)
     return returns[(ends > 0.75 * ends.max(initial=0.0)) & (len(run) >= MIN_EPISODES)]
 
 
@@ -102,13 +101,13 @@ def convergence_step(run: DataFrame) -> float:
     """
     if len(run) < MIN_EPISODES:
         return np.nan
-    ends = metrics.episode_ends(run)
+    ends = episode_ends(run)
     grid = ends[-1] * np.arange(1, _GRID + 1) / _GRID
     # Episodes first..last-1 ended within the window behind each grid point.
     last = np.searchsorted(ends, grid, side="right")
     first = np.searchsorted(ends, grid - SMOOTHING_SHARE * ends[-1], side="right")
     filled = last > first  # no episode ended in the window: the level is unknown there
-    level = metrics.mean_returns(run, first[filled], last[filled])
+    level = mean_returns(run, first[filled], last[filled])
     steps = grid[filled]
     begin = int(np.searchsorted(steps, grid[round(SMOOTHING_SHARE * _GRID) - 1]))
     if level[-1] - level[begin] <= LEARNING_RISE * level[steps > 0.75 * ends[-1]].std():
@@ -191,7 +190,7 @@ def _compare(
 
     The words are the unit, after a space, and why a run that is long enough has no number.
     """
-    runs = {name: metrics.training_runs(episodes, name.lower()) for name in ("A2C", "VPG")}
+    runs = {name: training_runs(episodes, name.lower()) for name in ("A2C", "VPG")}
     missing = [name for name, own in runs.items() if not own]
     if missing:
         return "not tested", _untrained(missing)
