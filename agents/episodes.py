@@ -18,7 +18,7 @@ from ..envs.spec import EnvSpec
 from ..models.errors import InputError
 from ..models.fields import Limits, immutable
 from .networks import Floats
-from .policies import ActionMap, flat
+from .policies import ActionMap, Array, flat
 
 _BLOCK = 256  # Episodes
 
@@ -39,7 +39,7 @@ def episode_seed(run_seed: int, episode: int) -> int:
 
 
 @lru_cache
-def _seeds(run_seed: int, block: int) -> np.ndarray:
+def _seeds(run_seed: int, block: int) -> Array:
     """Seeds of `_BLOCK` episodes: to begin a sequence takes as long as all of them."""
     sequence = np.random.SeedSequence(run_seed, spawn_key=(2, block))
     return sequence.generate_state(_BLOCK, np.uint64)
@@ -69,7 +69,7 @@ class Episode:
 class Flown(NamedTuple):
     """What N drones have flown of their running episodes."""
 
-    actions: np.ndarray
+    actions: Array
     """Actions of the env: float32, shape (t, N, k), or int64, shape (t, N), for the t steps of the
     longest episode."""
     observations: Floats
@@ -133,7 +133,7 @@ class EpisodeRecorder:
         self._sizes = np.zeros(count)
         self._seeds = np.zeros(count, np.uint64)
         self._nothing = np.full((count, 1), np.nan)
-        self._flown: list[np.ndarray] = []  # actions; at least those of the running episodes
+        self._flown: list[Array] = []  # actions; at least those of the running episodes
         self._keep_steps = keep_steps
         self._steps: list[NDArray[np.float64]] = []
         self._still = self.actions.to_envs(np.zeros((count, self.actions.size), np.float32))
@@ -246,7 +246,7 @@ class EpisodeRecorder:
         self.env_steps = position.env_steps
         self._began = time.perf_counter() - position.seconds
 
-    def steps(self) -> dict[str, np.ndarray]:
+    def steps(self) -> dict[str, Array]:
         """Every step that was flown, in the order of flight, those of one moment drone by drone.
 
         `episode` (int64), and float32 of the shape (T,): `value` of the headline metric, `reward`,

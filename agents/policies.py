@@ -35,11 +35,8 @@ def flat(observations: Observation, spec: EnvSpec, *lead: int) -> Array:
     """
     if not isinstance(observations, Mapping):
         return np.asarray(observations, np.float32).reshape(*lead, -1)
-    parts = []
-    for array in spec.observation:
-        part = np.asarray(observations[array.name], np.float32)
-        parts.append(part.reshape(*lead, -1))
-    return np.concatenate(parts, axis=-1)
+    arrays = [np.asarray(observations[array.name], np.float32) for array in spec.observation]
+    return np.concatenate([array.reshape(*lead, -1) for array in arrays], axis=-1)
 
 
 def flat_size(spec: EnvSpec) -> int:

@@ -191,13 +191,14 @@ class SB3Agent:
 
     def train(self, log: EpisodeRecorder, env_steps: int, on_update: OnUpdate) -> None:
         """As `Learner.train`. SB3 flies whole rollouts only: a last part of one is not flown."""
-        whole = env_steps // self._rollout * self._rollout
-        for flown in range(self._rollout, whole + 1, self._rollout):
+        rollout = self._rollout
+        whole = env_steps // rollout * rollout
+        for flown in range(rollout, whole + 1, rollout):
             if self._config.anneal:
-                left = 1.0 - flown / whole + self._rollout / whole  # before the rollout
+                left = 1.0 - flown / whole + rollout / whole  # before the rollout
                 self._rate = self._config.learning_rate * min(left, 1.0)
             try:
-                self.model.learn(self._rollout, reset_num_timesteps=False)
+                self.model.learn(rollout, reset_num_timesteps=False)
             finally:  # a policy that gives NaN raises ValueError in torch
                 self._check_finite()
             if not on_update():

@@ -332,6 +332,12 @@ def component_names(array: ArraySpec) -> tuple[str, ...]:
     return tuple(f"{array.name}[{index}]" for index in range(array.size))
 
 
+def component_units(array: ArraySpec) -> tuple[str, ...]:
+    """A unit for each element of an array; empty for pure numbers."""
+    units = array.unit if isinstance(array.unit, tuple) else (array.unit,) * array.size
+    return tuple("" if unit == "1" else unit for unit in units)
+
+
 def _checked_constants(constants: Any) -> dict[str, Bound]:
     _expect(isinstance(constants, Mapping), "constants", "an object", constants)
     _expect(len(constants) <= MAX_ARRAYS, "constants", f"at most {MAX_ARRAYS}", len(constants))

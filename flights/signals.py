@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..envs.spec import ArraySpec, Discrete, component_names
+from ..envs.spec import Discrete, component_names, component_units
 from ..models.files import write_new
 from .trajectories import Floats, Trajectory
 
@@ -46,7 +46,7 @@ def telemetry_of(flight: Trajectory) -> list[Signal]:
     signals = []
     for array in flight.spec.telemetry:
         values = flight.telemetry[array.name].reshape(len(flight) + 1, -1)
-        signals.append(Signal(array.name, component_names(array), _units(array), values))
+        signals.append(Signal(array.name, component_names(array), component_units(array), values))
     return signals
 
 
@@ -59,7 +59,7 @@ def signals_of(flight: Trajectory) -> list[Signal]:
     actions = np.asarray(flight.actions, np.float64).reshape(len(flight), -1)
     missing = np.full((1, actions.shape[1]), np.nan)
     names = ("choice",) if isinstance(action, Discrete) else component_names(action)
-    units = ("",) if isinstance(action, Discrete) else _units(action)
+    units = ("",) if isinstance(action, Discrete) else component_units(action)
     components = tuple(f"action_{name}" for name in names)
     rewards = np.concatenate(([np.nan], flight.rewards))
     return [
@@ -67,11 +67,6 @@ def signals_of(flight: Trajectory) -> list[Signal]:
         Signal("action", components, units, np.concatenate((actions, missing))),
         Signal("reward", ("reward",), ("",), rewards[:, None]),
     ]
-
-
-def _units(array: ArraySpec) -> tuple[str, ...]:
-    units = array.unit if isinstance(array.unit, tuple) else (array.unit,) * array.size
-    return tuple("" if unit == "1" else unit for unit in units)
 
 
 def columns_of(flight: Trajectory) -> list[Column]:

@@ -253,6 +253,7 @@ class Stage:
 
     def decorate(self, scene: MjvScene, *, goals: bool = True) -> None:
         """Add marks, payloads and fading paths to a scene, and discs at the goals if wanted."""
+        radius = self.radius
         marked = any(moment.marks for moment in self.moments)
         labels = drone_names(self.drones) if 1 < self.drones <= MAX_NAMES else ()
         cable = (*LOOKS["cable"], 1.0)
@@ -264,24 +265,24 @@ class Stage:
                 if mark.moves or drone == 0:  # all drones of a world tell the same
                     _draw_mark(scene, mark, goal)
             if payload is not None:
-                size = (0.12 * self.radius,) * 3
+                size = (0.12 * radius,) * 3
                 _decorate(scene, "sphere", size, payload, (*LOOKS["payload"], 1.0))
-                _connect(scene, "capsule", 0.012 * self.radius, here, payload, cable)
+                _connect(scene, "capsule", 0.012 * radius, here, payload, cable)
             if labels:
-                above = here + np.array((0.0, 0.0, 0.9 * self.radius))
+                above = here + np.array((0.0, 0.0, 0.9 * radius))
                 label = _decorate(scene, "label", (0.1,) * 3, above, cable)
                 if label is not None:
                     label.label = f"{labels[drone]}   "  # without the spaces its end is cut off
             color = LOOKS["drones"][drone % len(LOOKS["drones"])]
             if goals and goal is not None and not marked:
-                size = (0.93 * self.radius, 0.0033 * self.radius, 0.0)  # radius, half of its height
+                size = (0.93 * radius, 0.0033 * radius, 0.0)  # radius, half of its height
                 own = color if self.drones > 1 else LOOKS["goal"]
                 _decorate(scene, "cylinder", size, goal, (*own, 0.3))
             path = self._paths[drone]
             for number, (start, end) in enumerate(pairwise([*path, here]), 1):
                 if not np.array_equal(start, end):
                     rgba = (*color, 0.85 * number / len(path))
-                    _connect(scene, "capsule", 0.019 * self.radius, start, end, rgba)
+                    _connect(scene, "capsule", 0.019 * radius, start, end, rgba)
 
     @property
     def lines(self) -> list[tuple[str, str]]:

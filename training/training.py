@@ -174,14 +174,15 @@ class Training:
 
     def checkpoint(self) -> Checkpoint:
         """Everything that resuming needs. To be taken at an update."""
+        run = self.run
         return Checkpoint(
-            algorithm=self.run.algorithm,
-            config=asdict(self.run.config),
+            algorithm=run.algorithm,
+            config=asdict(run.config),
             spec=self.log.spec,
             env=self.env_config,
-            backend=(self.env_config or self.run.env).backend.name,
-            seed=self.run.seed,
-            env_steps=self.run.env_steps,
+            backend=(self.env_config or run.env).backend.name,
+            seed=run.seed,
+            env_steps=run.env_steps,
             actor=self.agent.policy().weights.arrays,
             state=self.agent.state(),
             position=self.log.position(),

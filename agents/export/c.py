@@ -8,7 +8,14 @@ from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 
-from ...envs.spec import BODY_TO_WORLD, ArraySpec, Discrete, EnvSpec, component_names
+from ...envs.spec import (
+    BODY_TO_WORLD,
+    ArraySpec,
+    Discrete,
+    EnvSpec,
+    component_names,
+    component_units,
+)
 from ..networks import Affine, Floats, Relu, Tanh
 from ..policies import NetworkPolicy, flat_size
 
@@ -191,13 +198,12 @@ def _described(arrays: Iterable[ArraySpec], scale: np.ndarray) -> Iterator[str]:
     """A line for every element of some arrays, one after the other, as a policy takes them."""
     number = 0
     for array in arrays:
-        units = (array.unit,) * array.size if isinstance(array.unit, str) else array.unit
         low, high = (bound.ravel().tolist() for bound in array.bounds())
         scales = np.broadcast_to(scale, array.size).tolist()
+        units = component_units(array)
         for place, name in enumerate(component_names(array)):
-            unit = "" if units[place] == "1" else units[place]
             scaled = "" if scales[place] == 1 else f"of {scales[place]:.7g} "
-            bounds = f"{low[place]:g} to {high[place]:g} {scaled}{unit}".rstrip()
+            bounds = f"{low[place]:g} to {high[place]:g} {scaled}{units[place]}".rstrip()
             frame = f", {array.frame}" if array.frame else ""
             yield f"  {number}: {name}: {bounds}{frame}"
             number += 1
