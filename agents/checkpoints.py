@@ -10,7 +10,7 @@ over all bytes of the file detects any damage.
 import hashlib
 import json
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import field, fields, replace
 from itertools import starmap
 from pathlib import Path
@@ -26,7 +26,7 @@ from ..models.fields import check_fields, immutable
 from ..models.files import software_versions, write_whole
 from .config import Config
 from .episodes import Episode, Flown, Long, Position, ResumeError
-from .networks import ByName, Floats, named, part_of
+from .networks import ByName, Parts, named, part_of
 from .policies import NetworkPolicy
 from .presets import preset
 
@@ -60,9 +60,9 @@ class Checkpoint:
     seed: Long
     env_steps: Long
     """Env steps that the whole training is to have."""
-    actor: Mapping[str, Floats]
+    actor: Parts
     """Weights for `NetworkPolicy`."""
-    state: Mapping[str, np.ndarray]
+    state: ByName
     """State of the agent."""
     position: Position
     versions: dict[str, str] = field(default_factory=software_versions)
@@ -110,7 +110,7 @@ def store(checkpoint: Checkpoint, path: Path) -> None:
     Raises `CheckpointError` where a number is not finite: training diverged. The old file stays.
     """
     where = checkpoint.position
-    arrays = named("policy/", dict(checkpoint.actor))
+    arrays = named("policy/", checkpoint.actor)
     if where.flown:
         arrays |= named("state/", checkpoint.state)
         arrays |= named("position/", where.flown._asdict())
@@ -199,7 +199,7 @@ def _with_checksum(data: bytes, checksum: bytes) -> bytes:
     return _CHECKSUM.sub(b'"sha256":"%s"' % checksum, data, count=1)
 
 
-def _not_finite(arrays: Mapping[str, np.ndarray]) -> Iterator[str]:
+def _not_finite(arrays: ByName) -> Iterator[str]:
     """Names of arrays that hold NaN or infinity."""
     for name, array in arrays.items():
         # Without metrics the error of an episode is NaN, which is no divergence.

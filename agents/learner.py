@@ -2,7 +2,7 @@
 
 import json
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -105,7 +105,7 @@ class Learner:
         generator = json.dumps(self._rng.bit_generator.state).encode()
         return arrays | {"rng": np.frombuffer(generator, np.uint8)}
 
-    def set_state(self, state: Mapping[str, np.ndarray]) -> None:
+    def set_state(self, state: ByName) -> None:
         """Take over a state. Raises `ValueError`, `TypeError` or `KeyError` unless it is whole."""
         self._rng.bit_generator.state = json.loads(state["rng"].tobytes())
         arrays = self._state()

@@ -9,7 +9,7 @@ from ..envs.spec import ArraySpec, Discrete, EnvSpec
 from ..models.errors import InputError
 from .config import Config
 from .heads import Categorical, Gaussian, Head
-from .networks import Floats, Module, Tanh, Weights, make_network
+from .networks import Floats, Module, Parts, Tanh, Weights, make_network
 
 Array = np.ndarray
 Observation = Array | Mapping[str, Array]
@@ -117,7 +117,7 @@ class NetworkPolicy(Module):
             self.network.layers.append(Tanh())
 
     @classmethod
-    def load(cls, weights: Mapping[str, Floats], spec: EnvSpec, config: Config) -> "NetworkPolicy":
+    def load(cls, weights: Parts, spec: EnvSpec, config: Config) -> "NetworkPolicy":
         """The policy of some weights, `weights.arrays` of another: copies.
 
         Raises `InputError` unless they are those that the env and the config need.

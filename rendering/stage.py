@@ -4,9 +4,10 @@ import copy
 import math
 from collections import deque
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal, NamedTuple, get_args
+from typing import Annotated, Literal, NamedTuple, get_args
 
 import mujoco
 import numpy as np
@@ -15,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from ..models.cameras import place_cameras
 from ..models.errors import InputError, one_line, shortened
-from ..models.fields import Limits, check, immutable
+from ..models.fields import Limits, check_fields, immutable
 from ..models.files import read_toml
 from ..models.fleet import load_vehicles, members_of
 from ..models.mjcf import level_data, swarm_spec
@@ -97,7 +98,7 @@ class Moment:
     """Episodes before this one."""
 
     @property
-    def lines(self) -> list[tuple[str, str]]:
+    def lines(self) -> Lines:
         """Names and values for an overlay."""
         thrusts = " ".join(f"{thrust:.3g}" for thrust in self.thrusts)
         rotors = len(self.thrusts)
@@ -285,7 +286,7 @@ class Stage:
                     _connect(scene, "capsule", 0.019 * radius, start, end, rgba)
 
     @property
-    def lines(self) -> list[tuple[str, str]]:
+    def lines(self) -> Lines:
         """Names and values for the overlay of a viewer: those of the first craft."""
         lines = self.moments[0].lines
         if self.drones == 1:
@@ -312,21 +313,21 @@ class Stage:
         return np.asarray(self.data.qpos.reshape(self.drones, 7)[:, :3])
 
 
+@dataclass
 class Canvas(AbstractContextManager["Canvas"]):
     """Pictures of a stage, all of one size in pixels. Raises `NoOpenGL` or `InputError`.
 
     `fast` is without shadows and smooth edges, which take most of the time where software draws.
     """
 
-    def __init__(
-        self, stage: Stage, width: int = 640, height: int = 480, *, fast: bool = False
-    ) -> None:
-        for name, pixels in (("width", width), ("height", height)):
-            check(name, _SIDES, pixels)
-        self.stage = stage
-        self.width = width
-        self.height = height
-        self._drawing = Offscreen(stage.model, width, height, fine=not fast)
+    stage: Stage
+    width: Annotated[int, _SIDES] = 640
+    height: Annotated[int, _SIDES] = 480
+    fast: bool = False
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        self._drawing = Offscreen(self.stage.model, self.width, self.height, fine=not self.fast)
 
     def draw(
         self, camera: Camera = "chase", stage: Stage | None = None, lines: Lines = ()
