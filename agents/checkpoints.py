@@ -36,7 +36,7 @@ _PLAIN = ("algorithm", "config", "backend", "seed", "env_steps", "versions")
 _DTYPES: dict[Any, type[np.generic]] = {int: np.int64, float: np.float64, bool: np.bool_}
 _COLUMNS = {one.name: _DTYPES[one.type] for one in fields(Episode)}
 _CHECKSUM = re.compile(rb'"sha256":"([0-9a-f]{64})"')
-_MALFORMED = (KeyError, TypeError, ValueError, AttributeError, IndexError, RecursionError)
+_MALFORMED = (LookupError, TypeError, ValueError, AttributeError, RecursionError)
 """Errors that reading a crafted file can raise."""
 
 

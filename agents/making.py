@@ -47,7 +47,7 @@ def resume_agent(kept: Checkpoint, log: EpisodeRecorder) -> Agent:
             log.resume(kept.position)
     except ResumeError:
         raise
-    except (KeyError, TypeError, ValueError, RuntimeError, IndexError) as error:
+    except (LookupError, TypeError, ValueError, RuntimeError) as error:
         raise CheckpointError(
             f"checkpoint: its parts do not fit together: {one_line(error):.300}"
         ) from None

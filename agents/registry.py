@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from ..models.errors import InputError
 from ..models.files import read_toml
-from .config import Config
 
 if TYPE_CHECKING:
     from .learner import Learner
@@ -39,10 +38,9 @@ class Algorithm:
     """Whether a stopped training goes on, and another begins with its networks."""
 
     @property
-    def config(self) -> type[Config]:
+    def config(self) -> Any:
         """Class of its hyperparameters."""
-        config: type[Config] = _find(self.config_name)
-        return config
+        return _find(self.config_name)
 
     @property
     def agent(self) -> Any:

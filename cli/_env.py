@@ -38,11 +38,7 @@ def trained(name: str, *others: str) -> Checkpoint:
     file = path / CHECKPOINT if path.is_dir() else path
     if not file.is_file():
         expected = ", ".join([*others, "a checkpoint or the folder of a training"])
-        got = f"{name}, where there is no file {file}"
-        several = path / "checkpoints"
-        if several.is_dir():
-            got += f": look into {several}"
-        raise InputError(f"policy: expected {expected}, got {got}")
+        raise InputError(f"policy: expected {expected}, got {name}, where there is no file {file}")
     return load(file)
 
 

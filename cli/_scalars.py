@@ -42,6 +42,8 @@ class ScalarWriter:
         number = len(list(folder.glob(f"{_PREFIX}*")))
         name = f"{_PREFIX}{number:010}.rotorgram"
         self._file = open(folder / name, "xb")  # noqa: SIM115  until `close`
+        self.flush = self._file.flush
+        self.close = self._file.close
         self._add(0, _field(3, b"brain.Event:2"))
         # TensorBoard drops what it has read from this step on. One of its two readers skips the
         # first such mark of a folder: so a fresh training has one too.
@@ -61,14 +63,6 @@ class ScalarWriter:
         ]
         self._add(env_steps, _field(5, b"".join(values)))
         self._written = env_steps
-
-    def flush(self) -> None:
-        """Have all that was written in the file."""
-        self._file.flush()
-
-    def close(self) -> None:
-        """Have it in the file, and close it."""
-        self._file.close()
 
     def _add(self, step: int, content: bytes) -> None:
         """Append an Event of TensorFlow's `event.proto`: time, step, and a field with the rest."""

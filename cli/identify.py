@@ -1,15 +1,12 @@
 """`rotorgram identify`: numbers of a vehicle from logs of its flights, as a vehicle file."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from tyro.conf import Positional, arg
 
 from ..models.fields import Limits
 from ._flags import Command, Files, Words
-
-if TYPE_CHECKING:
-    from ..flights.identify import Identified
 
 
 class Identify(Command):
@@ -33,8 +30,11 @@ class Identify(Command):
 
     def run(self) -> None:
         """Print every estimate, write the file."""
+        from rich.console import Console
+        from rich.table import Table
+
         from ..flights.flight_logs import read_log
-        from ..flights.identify import DEFAULT, LAG, identified_toml, identify
+        from ..flights.identify import DEFAULT, LAG, SEGMENT, WINDOW, identified_toml, identify
         from ..models.errors import InputError, require
         from ..models.files import check_new_file, write_new
         from ..models.vehicle import Vehicle
@@ -52,16 +52,6 @@ class Identify(Command):
                     "contradicts velocity and rates"
                 )
         found = identify(vehicle, logs, self.fit or DEFAULT)
-        self._show(found)
-        write_new(self.out, identified_toml(vehicle, found))
-        print(self.out)
-
-    def _show(self, found: "Identified") -> None:
-        from rich.console import Console
-        from rich.table import Table
-
-        from ..flights.identify import SEGMENT, WINDOW
-
         table = Table("number", "value", "95 % interval", "")
         for one in found.estimates:
             note = f"[yellow]kept: {one.kept}" if one.kept else ""
@@ -76,3 +66,5 @@ class Identify(Command):
         window = f"{found.windows} predictions over {WINDOW:g} s"
         print(f"mean error of {window}: {', '.join(errors)}")
         print(f"intervals: sandwich, clustered over {found.segments} segments of {SEGMENT:g} s")
+        write_new(self.out, identified_toml(vehicle, found))
+        print(self.out)

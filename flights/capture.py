@@ -177,22 +177,16 @@ def _frame(job: _Job, row: int, cameras: Cameras) -> tuple[dict[str, bytes], Lab
 
 def _encoded(view: View, image: Picture) -> tuple[str, bytes]:
     """Ending and bytes of the file of a picture."""
-    if view.kind == "rgb":
-        return "png", _png(image)
-    flat = image[..., 0]
-    if view.kind == "segmentation":
-        return "png", _png(flat.astype(np.uint16))
-    data = io.BytesIO()
-    np.save(data, flat)
-    return "npy", data.getvalue()
-
-
-def _png(array: Picture) -> bytes:
     from PIL import Image
 
     data = io.BytesIO()
-    Image.fromarray(array).save(data, "PNG")
-    return data.getvalue()
+    if view.kind == "depth":
+        np.save(data, image[..., 0])
+        return "npy", data.getvalue()
+    if view.kind == "segmentation":
+        image = image[..., 0].astype(np.uint16)
+    Image.fromarray(image).save(data, "PNG")
+    return "png", data.getvalue()
 
 
 def objects_in(numbers: Picture, names: Sequence[str]) -> Iterator[Labels]:

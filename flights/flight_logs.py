@@ -261,7 +261,7 @@ def _ulog(path: Path) -> Columns:
     pyulog = require("pyulog", "identify", "reading a ULog file")
     try:
         log = pyulog.ULog(str(path))
-    except (TypeError, ValueError, IndexError, KeyError) as error:
+    except (TypeError, ValueError, LookupError) as error:
         raise InputError(f"log: expected a ULog file, got {path.name}: {error}") from None
     topics = {topic.name: topic.data for topic in reversed(log.data_list)}
     for topic in _TOPICS:

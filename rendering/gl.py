@@ -40,8 +40,13 @@ def hidden_gl_setting() -> Iterator[None]:
     Otherwise MuJoCo imports one, which takes a tenth of a second, and raises where that fails.
     """
     wanted = _wanted()
-    library = _LIBRARIES.get(wanted, "")
-    if wanted in ("disable", "glfw") or (library and _is_installed(library)):
+    library = _LIBRARIES.get(wanted)
+    is_there = wanted in ("disable", "glfw")
+    if library:
+        from ctypes.util import find_library  # slow to import, for the few who set MUJOCO_GL
+
+        is_there = find_library(library) is not None
+    if is_there:
         yield
         return
     hidden = {_HIDDEN: wanted, "MUJOCO_GL": "disable"}
@@ -53,12 +58,6 @@ def hidden_gl_setting() -> Iterator[None]:
         for name in hidden:
             del os.environ[name]
         os.environ |= before
-
-
-def _is_installed(library: str) -> bool:
-    from ctypes.util import find_library  # it takes long to import, for the few who set MUJOCO_GL
-
-    return find_library(library) is not None
 
 
 def offscreen_context(width: int, height: int) -> Any:

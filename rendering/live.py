@@ -121,7 +121,11 @@ class LiveView:
             while self._window.is_running() and not self._closing.is_set():
                 began = time.monotonic()
                 try:
-                    self._paint_one()
+                    if self._fresh.is_set():
+                        # Before the moments are read: what comes meanwhile is drawn next.
+                        self._fresh.clear()
+                        self.stage.show(*self._latest)
+                        self._window.show()
                 except Exception:
                     if self._window.is_running():  # otherwise it was closed meanwhile
                         raise
@@ -129,9 +133,3 @@ class LiveView:
                 self._closing.wait(max(0.0, 1 / _PICTURES - (time.monotonic() - began)))
         except Exception as error:
             self._error = error
-
-    def _paint_one(self) -> None:
-        if self._fresh.is_set():
-            self._fresh.clear()  # before the moments are read: what comes meanwhile is drawn next
-            self.stage.show(*self._latest)
-            self._window.show()
