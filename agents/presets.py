@@ -18,7 +18,6 @@ PresetName = Literal["paper", "tuned"]
 DEFAULT_TASK = "rotorgram/Elevation-v0"
 """Its presets serve tasks for which there is no other."""
 
-_FILE = Path(__file__).with_name("presets.toml")
 _FLIGHT = ("num_envs", "env_steps", "backend")
 
 Tables = dict[str, dict[str, dict[str, Any]]]
@@ -47,7 +46,7 @@ class Preset:
 @cache
 def presets_of(algorithm: str) -> Tables:
     """An algorithm's tables by preset and task; one without any has an empty `tuned`."""
-    content = read_toml(_FILE, "presets")
+    content = read_toml(Path(__file__).with_name("presets.toml"), "presets")
     found: Tables = {}
     for table in content["preset"]:
         algorithms = table.pop("algorithms")

@@ -200,7 +200,10 @@ class SB3Agent:
             try:
                 self.model.learn(rollout, reset_num_timesteps=False)
             finally:  # a policy that gives NaN raises ValueError in torch
-                self._check_finite()
+                parameters = self.model.policy.parameters()
+                if not torch.nn.utils.parameters_to_vector(parameters).isfinite().all():
+                    updates = int(self.scalars().get("train/n_updates", 1))
+                    raise Diverged(f"weights are not finite after update {updates}")
             if not on_update():
                 return
 
@@ -220,12 +223,6 @@ class SB3Agent:
             of_critic["lr"] = of_actor["lr"] * share
 
         policy.optimizer.register_step_pre_hook(scale)
-
-    def _check_finite(self) -> None:
-        parameters = self.model.policy.parameters()
-        if not torch.nn.utils.parameters_to_vector(parameters).isfinite().all():
-            updates = int(self.scalars().get("train/n_updates", 1))
-            raise Diverged(f"weights are not finite after update {updates}")
 
     def policy(self) -> NetworkPolicy:
         """The current policy, without exploration: a copy."""

@@ -94,7 +94,11 @@ def findings(env_id: str) -> Iterator[str]:
         yield f"{type(error).__name__}: {one_line(error)} ({place_of(error)})"
         return
     yield from _out_of_bounds(loop, first)
-    advice = f"{_ADVICE}{_suspects(type(loop.task))}"
+    lines = inspect.getsourcelines(sys.modules[type(loop.task).__module__])[0]
+    suspects = []
+    for number, line in enumerate(lines, 1):
+        suspects += [f"{name}, line {number}" for name in _OWN.findall(line)]
+    advice = f"{_ADVICE} ({'; '.join(suspects)})" if suspects else _ADVICE
     drawn = _difference(first, second)
     if drawn:
         yield f"two flights of one seed differ in {drawn}: {advice}"
@@ -147,12 +151,3 @@ def _difference(ours: list[Step], theirs: list[Step]) -> str:
                 most = abs(1.0 * values - other[name]).max()
                 return f"{name} of step {number}, by up to {most:.1g}"
     return ""
-
-
-def _suspects(task: type) -> str:
-    """Lines of the task's file with functions of others."""
-    lines = inspect.getsourcelines(sys.modules[task.__module__])[0]
-    found = []
-    for number, line in enumerate(lines, 1):
-        found += [f"{name}, line {number}" for name in _OWN.findall(line)]
-    return f" ({'; '.join(found)})" if found else ""

@@ -122,7 +122,7 @@ def write_parquet(episodes: RecordedEpisodes, out: Path) -> None:
     check_new_file(out, ".parquet")
     metadata = {"env_spec": episodes.spec.to_json()}
     tables = (_table(episodes.spec, i, episodes.journal, one) for i, one in enumerate(episodes))
-    batches = map(pa.concat_tables, _batches(tables, _ROW_GROUP))
+    batches = map(pa.concat_tables, _batches(tables))
     first = next(batches)
     schema = first.schema.with_metadata(metadata)
     with removed_on_error(out), pq.ParquetWriter(out, schema, compression="zstd") as writer:
@@ -130,12 +130,12 @@ def write_parquet(episodes: RecordedEpisodes, out: Path) -> None:
             writer.write_table(table.cast(schema))
 
 
-def _batches(items: Iterable[Any], most: int) -> Iterator[list[Any]]:
-    """All items, together as soon as they have so many rows."""
+def _batches(items: Iterable[Any]) -> Iterator[list[Any]]:
+    """All items, together as soon as they have more than `_ROW_GROUP` rows."""
     batch: list[Any] = []
     for item in items:
         batch.append(item)
-        if sum(map(len, batch)) > most:
+        if sum(map(len, batch)) > _ROW_GROUP:
             yield batch
             batch = []
     if batch:
@@ -236,7 +236,7 @@ def write_minari(
             jpeg_encoding=False,
         )
         data.storage.update_metadata({"rotorgram_env_spec": spec.to_json()})
-        for batch in _batches((_buffer(spec, episode) for episode in episodes), _ROW_GROUP):
+        for batch in _batches(_buffer(spec, episode) for episode in episodes):
             data.update_dataset_from_buffer(batch)
 
 

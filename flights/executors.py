@@ -19,7 +19,7 @@ from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from multiprocessing.synchronize import Lock
 from threading import Thread
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, Literal, TypeVar
 
 from ..models import InputError
 from ..models.fields import PositiveInt, check_fields, immutable
@@ -60,12 +60,8 @@ class RunsFailed(RuntimeError):
     """Some jobs failed; the message names each with its reason. The others are kept."""
 
 
-class Result(NamedTuple):
-    """The end of a job: its name, why it failed (empty if it did not), its value."""
-
-    name: str
-    failure: str
-    value: Any
+Result = tuple[str, str, Any]
+"""The end of a job: its name, why it failed (empty if it did not), its value."""
 
 
 # ---- in the main process
@@ -89,13 +85,14 @@ def run_jobs(
     """
     failures = []
     on_progress("all runs", 0, len(jobs), "")
-    for number, result in enumerate(_results(executor, function, jobs), 1):
-        if result.failure:
-            failures.append(result.failure)
-            on_progress(result.name, 0, 1, "failed")
+    results = _results(executor, function, jobs)
+    for number, (name, failure, value) in enumerate(results, 1):
+        if failure:
+            failures.append(failure)
+            on_progress(name, 0, 1, "failed")
         else:
-            keep(jobs[result.name], result.value)
-            on_progress(result.name, 1, 1, "done")
+            keep(jobs[name], value)
+            on_progress(name, 1, 1, "done")
         on_progress("all runs", number, len(jobs), "")
     if failures:
         raise RunsFailed(f"{len(failures)} of {len(jobs)} runs failed: {'; '.join(failures)}")
@@ -126,7 +123,7 @@ def _results(
             except Exception as error:  # a cluster's machine is lost, or lacks our software
                 cause = getattr(error, "cause", None) or error
                 reason = str(cause).strip().splitlines()[-1]
-                yield Result(name, f"{name}: {reason}", None)
+                yield name, f"{name}: {reason}", None
 
 
 @contextmanager
@@ -241,7 +238,6 @@ def _do(function: Callable[[_Job, Tell], _Value], name: str, job: _Job) -> Resul
     """Do a job (in a worker)."""
     report = _worker.report
     try:
-        value = function(job, lambda done, total, words: report(name, done, total, words))
-        return Result(name, "", value)
+        return name, "", function(job, lambda *progress: report(name, *progress))
     except Exception as error:
-        return Result(name, f"{name}: {type(error).__name__}: {error}", None)
+        return name, f"{name}: {type(error).__name__}: {error}", None

@@ -30,8 +30,6 @@ EpisodeSet = Literal["final", "curve", "tuning"]
 """Evaluation episodes that share no start: `final` for the figures that are reported, `curve` for
 snapshots during training and all other looks at a policy, `tuning` for choosing settings."""
 
-_SETS = get_args(EpisodeSet)
-
 Ending = Literal["terminated", "truncated", "cut off"]
 """`cut off`: the episode was given up, its simulator was lost, or the journal ends before it."""
 
@@ -43,7 +41,7 @@ def evaluation_seed(
 
     Policies of different training seeds fly from different starts if their seed is given.
     """
-    key = [_SETS.index(of), episode]
+    key = [get_args(EpisodeSet).index(of), episode]
     if training_seed is not None:
         key.append(training_seed)
     sequence = np.random.SeedSequence(_EVALUATION, spawn_key=key)

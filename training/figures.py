@@ -5,7 +5,7 @@ the range from the lowest to the highest seed. Curves of one row's seeds end whe
 them ends. Drawn with matplotlib's object interface, so that no display or global state is involved.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -63,27 +63,23 @@ def draw_figures(results: Results, table: DataFrame) -> list[str]:
     """
     target = results.folder / "figures"
     target.mkdir(exist_ok=True)
-    names = []
-    with style.context(_STYLE):
-        for name, figure in _figures(results, table):
-            names.append(name)
-            for kind in FORMATS:
-                figure.savefig(target / f"{name}.{kind}")
-    return names
-
-
-def _figures(results: Results, table: DataFrame) -> Iterator[tuple[str, Figure]]:
     rows = [row for row in results.study.rows if row.name in table.index]
     tasks = by_task(results, rows)
-    for task, own in tasks:
-        name = "comparison" if len(tasks) == 1 else f"comparison_{file_words(task)}"
-        yield name, draw_comparison(results, table, own)
-    if results.study.kind == "paper":
-        trained = [row for row in rows if not row.controller]
-        yield "fig6_reward", draw_reward(results, trained)
-        yield "fig7_cumulative_reward", draw_cumulative(results, trained)
-        if results.has_steps:
-            yield "fig8_error", draw_error(results, rows)
+    figures: dict[str, Figure] = {}
+    with style.context(_STYLE):
+        for task, own in tasks:
+            name = "comparison" if len(tasks) == 1 else f"comparison_{file_words(task)}"
+            figures[name] = draw_comparison(results, table, own)
+        if results.study.kind == "paper":
+            trained = [row for row in rows if not row.controller]
+            figures["fig6_reward"] = draw_reward(results, trained)
+            figures["fig7_cumulative_reward"] = draw_cumulative(results, trained)
+            if results.has_steps:
+                figures["fig8_error"] = draw_error(results, rows)
+        for name, figure in figures.items():
+            for kind in FORMATS:
+                figure.savefig(target / f"{name}.{kind}")
+    return list(figures)
 
 
 def row_color(row: Row) -> str:

@@ -150,6 +150,10 @@ def _line(row: Row, line: Line, headline: Headline) -> list[str]:
     if headline.settles:
         settled = f"{int(line['settled'])} of {int(line['episodes'])}"
         settling = _measured(line, "settling_time", settled)
+    rate = number_text(100 * line["crash_rate"])
+    low = 100 * line["crash_rate_low"]
+    high = 100 * line["crash_rate_high"]
+    crashed = f"{int(line['crashed'])} of {int(line['episodes'])}"
     reached = []
     if not isnan(line["reached"]):
         reached.append(f"{int(line['reached'])} of {seeds}")
@@ -159,7 +163,7 @@ def _line(row: Row, line: Line, headline: Headline) -> list[str]:
         _cell(row_label(row), *names),
         _measured(line, "steady", f"worst {number_text(line['worst'])}"),
         _held(line, seeds),
-        _crashes(line),
+        _cell(f"{rate} %", f"{number_text(low)} to {number_text(high)} %", crashed),
         settling,
         _measured(line, "overshoot"),
         _measured(line, "return"),
@@ -194,14 +198,6 @@ def _held(line: Line, seeds: int) -> str:
     held = int(line["held"])
     low, high = share_interval(held, seeds)
     return _cell(f"{held} of {seeds}", f"{low:.0%} to {high:.0%}".replace("%", " %"))
-
-
-def _crashes(line: Line) -> str:
-    low = 100 * line["crash_rate_low"]
-    high = 100 * line["crash_rate_high"]
-    rate = number_text(100 * line["crash_rate"])
-    interval = f"{number_text(low)} to {number_text(high)} %"
-    return _cell(f"{rate} %", interval, f"{int(line['crashed'])} of {int(line['episodes'])}")
 
 
 def _measured(line: Line, name: str, *details: str) -> str:

@@ -132,10 +132,9 @@ class _Program:
     def _act(self, policy: NetworkPolicy) -> None:
         """Map the outputs to the range of the action, and clip them to its bounds."""
         actions = policy.actions
-        middle = self._table("action_middle", actions.middle)
-        half = self._table("action_half", actions.half)
-        low = self._table("action_low", actions.low)
-        high = self._table("action_high", actions.high)
+        names = ("middle", "half", "low", "high")
+        tables = (self._table(f"action_{name}", getattr(actions, name)) for name in names)
+        middle, half, low, high = tables
         self.lines += [
             f"for (int i = 0; i < {self.size}; i++) {{",
             f"    float y = {middle}[i] + {half}[i] * {self.at}[i];",
