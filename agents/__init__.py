@@ -9,10 +9,10 @@ from .. import import_when_used
 
 if TYPE_CHECKING:
     from .a2c import A2CConfig
-    from .checkpoints import Checkpoint, CheckpointError, load, store
-    from .config import Config, SACConfig
+    from .checkpoints import Checkpoint, load, store
+    from .config import Config
     from .controllers import CONTROLLERS
-    from .episodes import Episode, EpisodeRecorder, ResumeError, episode_seed
+    from .episodes import Episode, EpisodeRecorder, ResumeError
     from .geometric import Geometric
     from .making import make_agent, resume_agent
     from .orca import Orca
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
     from .policies import NetworkPolicy, Policy
     from .ppo import PPOConfig
     from .presets import find_preset, preset
-    from .registry import ALGORITHMS, Agent, AlgorithmName, find_algorithm
+    from .registry import ALGORITHMS, Agent, find_algorithm
     from .vpg import VPGConfig
 
 __all__ = [
-    "ALGORITHMS", "CONTROLLERS", "PID", "A2CConfig", "Agent", "AlgorithmName", "Checkpoint",
-    "CheckpointError", "Config", "Episode", "EpisodeRecorder", "Geometric", "NetworkPolicy", "Orca",
-    "PPOConfig", "Policy", "ResumeError", "SACConfig", "VPGConfig", "episode_seed",
-    "find_algorithm", "find_preset", "load", "make_agent", "preset", "resume_agent", "store",
+    "ALGORITHMS", "CONTROLLERS", "PID", "A2CConfig", "Agent", "Checkpoint", "Config", "Episode",
+    "EpisodeRecorder", "Geometric", "NetworkPolicy", "Orca", "PPOConfig", "Policy", "ResumeError",
+    "VPGConfig", "find_algorithm", "find_preset", "load", "make_agent", "preset", "resume_agent",
+    "store",
 ]  # fmt: skip
 
 __getattr__ = import_when_used(__name__)

@@ -3,7 +3,6 @@
 from ..agents import ALGORITHMS, CONTROLLERS
 
 # Okabe and Ito's palette: told apart by readers with colour-blindness.
-_CONTROLLER = "#555555"
 FLIGHT_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8C564B")
 """Colours of flights and rotors on a light ground, the same palette."""
 _SPARE = FLIGHT_COLORS[3:]
@@ -18,7 +17,7 @@ def agent_label(agent: str) -> str:
 def agent_color(agent: str) -> str:
     """An agent's colour, the same in every figure and report."""
     if agent in CONTROLLERS:
-        return _CONTROLLER
+        return "#555555"
     known = ALGORITHMS.get(agent)
     if known and known.color:
         return known.color

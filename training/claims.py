@@ -61,8 +61,6 @@ _GRID = 100
 
 _TOO_FEW = f"fewer than {MIN_SEEDS} seeds with a value decide nothing"
 
-_Claim = tuple[str, str, str]
-"""A claim, its place in the paper, and the definition of its measure."""
 Outcome = Literal["borne out", "not borne out", "undecided", "not tested"]
 _Judged = tuple[Outcome, str]
 
@@ -168,7 +166,7 @@ _FLUCTUATES = (
 _LATER = (" env steps", "did not converge")
 
 
-def _holding_claim(headline: Headline) -> _Claim:
+def _holding_claim(headline: Headline) -> tuple[str, str, str]:
     return (
         "Both agents hold the target: “both implemented algorithms achieve high stability, by "
         "achieving convergence to the required performance”.",

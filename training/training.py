@@ -151,8 +151,8 @@ class Training:
         headline = self.log.spec.headline
         if headline is None:
             return text
-        symbol = headline.symbol or headline.name
-        return f"{text}, |{symbol}| {recent['error']:.2f} {headline.unit}".rstrip()
+        text += f", |{headline.symbol or headline.name}| {recent['error']:.2f} {headline.unit}"
+        return text.rstrip()
 
     def scalars(self) -> dict[str, float]:
         """Progress of the training, in numbers for TensorBoard, under SB3's names.

@@ -45,8 +45,7 @@ def export(checkpoint: Checkpoint, target: str) -> bytes:
                 f"export: expected layers of affine, relu and tanh, got {type(layer).__name__}"
             )
     _check_finite(policy)
-    content: bytes = module.write(policy, metadata(checkpoint))
-    return content
+    return bytes(module.write(policy, metadata(checkpoint)))
 
 
 def _check_finite(policy: NetworkPolicy) -> None:

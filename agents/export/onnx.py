@@ -67,5 +67,4 @@ def write(policy: NetworkPolicy, facts: Mapping[str, str]) -> bytes:
     model = helper.make_model(made, producer_name="rotorgram", opset_imports=[opset])
     model.ir_version = _IR
     helper.set_model_props(model, dict(facts))
-    content: bytes = model.SerializeToString(deterministic=True)
-    return content
+    return bytes(model.SerializeToString(deterministic=True))

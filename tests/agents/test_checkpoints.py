@@ -14,7 +14,6 @@ import torch
 from drones import ENV, OPTIONS, cases, vector
 from rotorgram.agents import (
     Checkpoint,
-    CheckpointError,
     Config,
     EpisodeRecorder,
     ResumeError,
@@ -25,6 +24,7 @@ from rotorgram.agents import (
     resume_agent,
     store,
 )
+from rotorgram.agents.checkpoints import CheckpointError
 from rotorgram.agents.learner import Learner
 from rotorgram.models.errors import InputError
 from rotorgram.models.files import software_versions, write_whole

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 from drones import OPTIONS, vector
-from rotorgram.agents import EpisodeRecorder, SACConfig, make_agent, preset
+from rotorgram.agents import EpisodeRecorder, make_agent, preset
+from rotorgram.agents.config import SACConfig
 from rotorgram.models.errors import InputError
 from scripted import CALM, Scripted, log_of
 

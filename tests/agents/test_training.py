@@ -7,13 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 from drones import OPTIONS, cases, vector
-from rotorgram.agents import (
-    CheckpointError,
-    ResumeError,
-    load,
-    preset,
-    store,
-)
+from rotorgram.agents import ResumeError, load, preset, store
+from rotorgram.agents.checkpoints import CheckpointError
 from rotorgram.cli import main
 from rotorgram.envs.config import BackendConfig, EnvConfig
 from rotorgram.envs.vector import LocalVectorEnv

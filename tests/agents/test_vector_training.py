@@ -9,7 +9,8 @@ import pytest
 from drones import ENV, OPTIONS
 from drones import vector as drones_of
 from nets import random_policy
-from rotorgram.agents import Config, EpisodeRecorder, ResumeError, episode_seed, make_agent, preset
+from rotorgram.agents import Config, EpisodeRecorder, ResumeError, make_agent, preset
+from rotorgram.agents.episodes import episode_seed
 from rotorgram.agents.rollouts import Collector
 from rotorgram.agents.sb3 import RecordedEnv, SB3VecEnv
 from rotorgram.envs import LocalVectorEnv
