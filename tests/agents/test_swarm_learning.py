@@ -71,8 +71,10 @@ def test_one_that_is_out_flies_no_env_step() -> None:
     assert (rollout.rewards[~rollout.kept] == 0).all()
     assert np.bincount(log.steps()["episode"]).tolist() == [climb.length, 30]
     # All were out: the world has begun anew, both drones with it.
-    assert log.position().numbers.tolist() == [2, 3]
-    assert log.position().lengths.tolist() == [0, 0]
+    running = log.position().flown
+    assert running
+    assert running.numbers.tolist() == [2, 3]
+    assert running.lengths.tolist() == [0, 0]
 
 
 def test_a_world_begins_as_a_whole_and_spends_a_row_while_another_flies_on() -> None:
