@@ -73,6 +73,11 @@ class Checkpoint:
         return self.spec.env_id
 
     @property
+    def options(self) -> dict[str, object]:
+        """Every option of the env."""
+        return dict(self.spec.options)
+
+    @property
     def num_envs(self) -> int:
         """Drones that it trains with; 0 of a policy alone."""
         return len(self.position.flown.numbers) if self.position.flown else 0

@@ -69,7 +69,7 @@ def fitted(command: F, checkpoint: Checkpoint | Controller) -> F:
                 f"policy was trained on, got options of {env_id}"
             )
     changes: dict[str, Any] = {"env": checkpoint.env_id}
-    changes["options"] = {**checkpoint.spec.options, **options}
+    changes["options"] = {**checkpoint.options, **options}
     if "drones" not in command.given:
         changes["drones"] = len(checkpoint.spec.agents)
     listens = getattr(command, "listen", None) is not None
