@@ -96,7 +96,7 @@ def bench(
         "seconds": seconds,
         "rates": rates,
         "medians": medians,
-        "policy_seconds": policy_seconds() if find_spec("tensorboard") else None,
+        "policy_seconds": policy_seconds() if find_spec("safetensors") else None,
         "machine": machine(),
         "versions": software_versions(),
     }
