@@ -32,11 +32,9 @@ def one(env_id, action):
 OURS = """
 import rotorgram.envs
 def make(n):
-    if n == 1:
-        return one("rotorgram/Elevation-v0", np.zeros(1, np.float32))
-    env = gymnasium.make_vec("rotorgram/Elevation-v0", num_envs=n)
+    env = gymnasium.make_vec("rotorgram/Hover-v0", num_envs=n, backend="{}")
     env.reset(seed=0)
-    action = np.zeros((n, 1), np.float32)
+    action = np.zeros((n, 4), np.float32)
     return lambda: env.step(action)
 """
 PYFLYT = """
@@ -74,7 +72,8 @@ def main() -> None:
         __doc__, pyflyt=Path, crazyflow=Path, seconds=2.0, rounds=5, out=out
     ).parse_args()
     peers = {
-        "rotorgram": (sys.executable, OURS, (1, 64, 1024, 4096)),
+        "rotorgram `mujoco`": (sys.executable, OURS.format("mujoco"), (1, 64, 1024, 4096)),
+        "rotorgram `rigid`": (sys.executable, OURS.format("rigid"), (1, 64, 1024, 4096)),
         "PyFlyt QuadX-Hover-v4": (args.pyflyt, PYFLYT, (1,)),
         "Crazyflow DroneReachPos-v0": (args.crazyflow, CRAZYFLOW, (1, 64, 1024, 4096)),
     }
