@@ -2,7 +2,7 @@
 
     python studies/packed.py FOLDER OUT
 
-OUT gets the settings, the report, and of each run, evaluation flight and training episode its
+OUT gets the settings, the table, and of each run, evaluation flight and training episode its
 numbers: one Parquet file for each table, numbers as float32. Tables of steps stay behind, they have
 hundreds of megabytes. `rotorgram report OUT` makes tables, figures and verdicts anew from them.
 
@@ -17,7 +17,7 @@ import pandas as pd
 from measuring import options
 from rotorgram.training.results import CONFIG_FILE, Results
 
-COPIED = (CONFIG_FILE, "results.csv", "results.md", "runs.csv")
+COPIED = (CONFIG_FILE, "results.csv", "runs.csv")
 LEVEL = 19  # of zstd
 
 
@@ -44,7 +44,13 @@ def main() -> None:
     for name, table in tables.items():
         file = args.out / name / "all.parquet"
         file.parent.mkdir(exist_ok=True)
-        small(table).to_parquet(file, index=False, compression="zstd", compression_level=LEVEL)
+        table = small(table)
+        numbers = list(table.columns[table.dtypes == "float32"])
+        # Bytes of the same place side by side: of floats the first ones repeat.
+        table.to_parquet(
+            file, index=False, compression="zstd", compression_level=LEVEL,
+            use_dictionary=["row"], use_byte_stream_split=numbers,
+        )  # fmt: skip
         print(f"{file}: {len(table):,} rows, {file.stat().st_size / 1024:,.0f} KiB")
 
 

@@ -97,8 +97,9 @@ def test_the_protocol_says_where_the_numbers_of_a_state_are() -> None:
 
 
 def test_committed_results_are_small() -> None:
+    most = {".parquet": 1_000_000}  # each flight and training episode of a comparison
     files = [path for path in RESULTS.rglob("*") if path.is_file()]
-    assert [path for path in files if path.stat().st_size > 300_000] == []
+    assert [path for path in files if path.stat().st_size > most.get(path.suffix, 300_000)] == []
 
 
 def test_the_reliability_page_tells_what_was_measured() -> None:
