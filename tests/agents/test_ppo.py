@@ -70,7 +70,7 @@ def test_the_tuned_preset_depends_on_the_task() -> None:
     racing = find_preset("ppo", "tuned", "rotorgram/Racing-v0")
     assert racing.num_envs == 512
     assert racing.backend == "rigid"
-    assert racing.config.hidden == (64, 64)
+    assert racing.config.hidden == (48, 48)
     assert find_preset("ppo", "tuned", "other/Task-v0") == replace(ours, fits=False)
     swarm = find_preset("ippo", "tuned", "rotorgram/Formation-v0")
     assert swarm.config.rollout_size(swarm.num_envs) == swarm.num_envs * 512  # a whole episode
