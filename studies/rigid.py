@@ -26,7 +26,8 @@ from pathlib import Path
 
 import numpy as np
 from measuring import RESULTS, in_turns, medians, options, timed, write
-from rotorgram.envs import EnvConfig, Loop
+from rotorgram.envs import EnvConfig
+from rotorgram.envs.compiled import make_loop
 from rotorgram.models import QUAD_XML, Backend, Vehicle
 from rotorgram.sim import InitialState, make_world
 
@@ -100,7 +101,7 @@ def world(backend: Backend, drones: int, steps: int = 2, **settings: object) -> 
 
 def env(backend: Backend, drones: int, **settings: object) -> Callable[[], None]:
     """A step of Hover: controller, world, observation, reward, ends and resets."""
-    loop = Loop(EnvConfig.from_keywords(HOVER, backend=backend, **settings), drones)
+    loop = make_loop(EnvConfig.from_keywords(HOVER, backend=backend, **settings), drones)
     actions = np.random.default_rng(0).uniform(-0.1, 0.1, (drones, 4)).astype(np.float32)
     loop.advance(actions, np.ones(drones, bool), range(drones))
 
