@@ -76,9 +76,8 @@ class Machine:
         self._told = Layout(fields_of(self._telemetry()), lanes)
         given: Named = dict.fromkeys(_MASKS, (_BOOL, sent.shape[1:-1]))
         given["sent"] = (sent.dtype, sent.shape[1:])
-        given |= fields_of(self._pushed()) | fields_of(
-            {_PHYSICS + name: x for name, x in seen.items()}
-        )
+        given |= fields_of(self._pushed())
+        given |= fields_of({_PHYSICS + name: x for name, x in seen.items()})
         self._outside = given | fields_of(self._seen())
         self._layouts = layout, self._told
         self._calls = [(_before(call), call) for call in loop.pipeline.flight.calls()]

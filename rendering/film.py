@@ -66,20 +66,29 @@ def write_film(
         raise InputError("film: expected at least one frame, got none")
     height, width = first.shape[:2]
     check_film(path, width, height, fps)
-    pictures = chain((first,), taken)
+
+    def checked() -> Iterator[Picture]:
+        for frame in chain((first,), taken):
+            if frame.dtype != np.uint8 or frame.shape != (height, width, 3):
+                raise ValueError(
+                    f"film: expected frames of uint8, shape ({height}, {width}, 3), "
+                    f"got {frame.dtype}, shape {frame.shape}"
+                )
+            yield frame
+
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
             unfinished = Path(folder) / path.name
             match path.suffix.lower():
                 case ".mp4":
-                    _write_mp4(unfinished, pictures, (width, height), fps, quality)
+                    _write_mp4(unfinished, checked(), (width, height), fps, quality)
                 case ".png":
-                    last = deque(pictures, maxlen=1).pop()
+                    last = deque(checked(), maxlen=1).pop()
                     Image.fromarray(last).save(unfinished)
                 case _:
                     unfinished.mkdir()
-                    for number, frame in enumerate(pictures, 1):
+                    for number, frame in enumerate(checked(), 1):
                         Image.fromarray(frame).save(unfinished / f"{number:04}.png")
             unfinished.rename(path)
     except OSError as error:

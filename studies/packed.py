@@ -3,7 +3,7 @@
     python studies/packed.py FOLDER OUT
 
 OUT gets the settings, the table, and of each run, evaluation flight and training episode its
-numbers: one Parquet file for each table, numbers as float32. Tables of steps stay behind, they have
+numbers: one Parquet file for each table, numbers as float32. Tables of steps stay behind: they have
 hundreds of megabytes. `rotorgram report OUT` makes tables, figures and verdicts anew from them.
 
 It takes a few seconds on two cores.

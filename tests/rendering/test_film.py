@@ -147,6 +147,16 @@ def test_what_is_no_film_is_one_sentence(
     assert left == [there]
 
 
+def test_a_frame_of_another_size_or_kind_is_our_fault(tmp_path: Path) -> None:
+    sizes = [*greys(1), *greys(1, 32)]
+    kind = [np.zeros((48, 64))]
+    for frames in (sizes, kind):
+        with pytest.raises(ValueError, match="film: expected frames of uint8") as raised:
+            write_film(tmp_path / "film", iter(frames), 25.0)
+        assert not isinstance(raised.value, InputError)
+        assert list(tmp_path.iterdir()) == []
+
+
 def test_a_picture_on_a_full_disk_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")

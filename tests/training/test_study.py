@@ -196,6 +196,8 @@ def test_two_files_are_rows_of_their_names(tmp_path: Path, capsys: Capsys) -> No
         assert row.env.task["flight_band"] == 1.5
         assert row.env.episode_length == 40
     assert not results.study.wire
+    words = ["--udp", *map(str, files)]
+    assert parse(Compare, "rotorgram compare", words).study().wire
     figures = {path.name for path in (tmp_path / "out" / "figures").iterdir()}
     assert figures == {"comparison.png", "comparison.pdf", "comparison.svg"}
 
