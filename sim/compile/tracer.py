@@ -321,12 +321,16 @@ def _where(like: TracedArray, flag: Any, first: Any, second: Any) -> Traced:
     return like._each(select, first.dtype, flag.astype(_FLAG), first, second)
 
 
-def _extreme(is_before: Call) -> Call:
+def _extreme(is_before: Call, is_not_after: Call) -> Call:
     """A NaN stays, and of 0 and -0 it is the second."""
 
     def extreme(like: TracedArray, a: Any, b: Any) -> Traced:
+        known = [not isinstance(one, TracedArray) and np.all(one == one) for one in (a, b)]
         a, b = like._alike((a, b))
-        return _where(like, a != a, a, _where(like, is_before(a, b), a, b))
+        if known[1]:
+            return _where(like, is_not_after(a, b), b, a)
+        larger = _where(like, is_before(a, b), a, b)
+        return larger if known[0] else _where(like, a != a, a, larger)
 
     return extreme
 
@@ -396,8 +400,8 @@ def _filled(number: float) -> Callable[..., Traced]:
 
 _FUNCTIONS: dict[Call, Call] = {
     np.where: _where,
-    np.minimum: _extreme(np.less),
-    np.maximum: _extreme(np.greater),
+    np.minimum: _extreme(np.less, np.greater_equal),
+    np.maximum: _extreme(np.greater, np.less_equal),
     np.absolute: _absolute,
     np.sign: _sign,
     np.power: _power,
