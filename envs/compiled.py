@@ -122,7 +122,7 @@ class CompiledLoop(Loop):
         self._inside = None
         super().put(state)
 
-    def _give(self, results: dict[str, np.ndarray]) -> None:
+    def _give(self, results: np.ndarray) -> None:
         self.observations = {}
         for number, array in enumerate(self.spec.observation):
             self.observations[array.name] = results[f"observation/{number}"]

@@ -78,7 +78,7 @@ class Derivative:
         memory.put("ended", ended)
         memory.put("by/reward", by_reward)
         memory.put("by/observation", by_observation)
-        self._run(memory.blocks, before.address, memory.address)
+        self._run(memory.blocks, before.address, memory.address, None)
         return memory.get("by/sent").reshape(sent.shape)
 
 

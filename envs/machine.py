@@ -5,6 +5,7 @@ variables and runs a region, and its next snapshot says what the region computes
 step depends on can be forgotten that a snapshot has.
 """
 
+import ctypes
 from collections.abc import Callable, Sequence
 from math import prod
 from typing import Any
@@ -14,6 +15,7 @@ import numpy as np
 from ..models.errors import InputError
 from ..sim import World
 from ..sim.compile import Program, Untraceable, lift, read
+from ..sim.compile.alike import called
 from ..sim.compile.layout import Layout, Memory, fields_of
 from ..sim.compile.llvm import Region, compiled, widest
 from ..sim.snapshots import Arrays, Snapshot, joined, part_of
@@ -32,7 +34,6 @@ A step whose physics is array code is the last alone."""
 _PHYSICS = "physics/"
 _MASKS = ("flown", "begun", "active")
 _ENDS = ("terminated", "truncated", "done", "out", "waiting")
-_FLAGS = (*_ENDS, "wrong")
 _TOLD = "told/"
 _TERM = "told/reward_"
 _KEYS = "Flight/random/keys"
@@ -83,7 +84,10 @@ class Machine:
         self._calls = [(_before(call), call) for call in loop.pipeline.flight.calls()]
         self._calls[0] = _FIRST, self._calls[0][1]
         steps = self._regions()
-        size = sum(len(one.operations()) for regions in steps.values() for one in regions)
+        size = 0
+        for name, regions in steps.items():
+            steps[name] = [self._shared(f"{name}.{i}", one) for i, one in enumerate(regions)]
+            size += sum(one.size() for one in steps[name])
         if size > MOST:
             most = f"expected at most {MOST:,}"
             raise Untraceable(f"a step of {size:,} operations is not compiled: {most}")
@@ -94,10 +98,6 @@ class Machine:
         self._width = width
         self.memory = Memory(layout, worlds)
         self._plan(given)
-        self._given: dict[str, np.ndarray] = {}
-        for name, (dtype, shape) in given.items():
-            self._given[name] = np.zeros((self.memory.size, *shape), dtype)
-        self._places = [array.ctypes.data for array in self._given.values()]
         self._all_fly = False  # in the last step
 
     def _regions(self) -> dict[str, list[Region]]:
@@ -123,20 +123,26 @@ class Machine:
 
     def _plan(self, given: Named) -> None:
         """Where everything that leaves lies in the bytes of a step, behind what is told."""
-        self._results = []
-        self._starts = []
-        self._size = self.memory.blocks * self._told.size
+        kinds = {}
+        starts = []
+        end = self.memory.blocks * self._told.size
         for name, (dtype, (drones, *shape)) in self._outside.items():
-            if name in given:
-                continue
-            self._starts.append(self._size)
-            if name not in _FLAGS:
-                self._results.append((name, (self._worlds * drones, *shape), dtype, self._size))
-            size = self.memory.size * drones * prod(shape) * dtype.itemsize
-            self._size += -(-size // 8) * 8
-        start, second, *_ = self._starts[-len(_FLAGS) :]
-        flags = (len(_FLAGS), self._worlds * drones)
-        self._flags = flags, _BOOL, start, (second - start, 1)
+            if name not in given:
+                kinds[name] = (dtype, (self._worlds * drones, *shape))
+                starts.append(end)
+                size = self.memory.size * drones * prod(shape) * dtype.itemsize
+                end += -(-size // 8) * 8
+        fields: Any = {"names": [*kinds], "formats": [*kinds.values()], "offsets": starts}
+        self._results = np.dtype(fields | {"itemsize": end})
+        self._given = {
+            name: np.zeros((self.memory.size, *shape), dtype)
+            for name, (dtype, shape) in given.items()
+        }
+        places = [array.ctypes.data for array in self._given.values()]
+        self._places = np.array([*places, *starts])
+        self._table = self._places.ctypes.data
+        self._leaving = self._places[len(places) :]
+        self._starts = self._leaving.copy()
 
     def step(
         self,
@@ -145,7 +151,7 @@ class Machine:
         begun: Mask | None,
         active: Mask | None,
         seeds: Any = None,
-    ) -> tuple[Named, Told]:
+    ) -> tuple[np.ndarray, Told]:
         """Run all regions. Returns what leaves the loop, by name, (N, ...), and `Loop.told`.
 
         Actions (W, A, k), None if nobody flies; masks as of a `Record`; seeds of worlds, (W,).
@@ -162,28 +168,25 @@ class Machine:
         self._all_fly = all_fly
         if sent is not None:
             given["sent"][:worlds] = sent
-        new = np.empty(self._size, np.uint8)
-        first = new.ctypes.data
-        places = [first, *self._places, *[first + start for start in self._starts]]
+        new: Any = np.empty(self._results.itemsize, np.uint8)
+        self._address = ctypes.addressof(ctypes.c_char.from_buffer(new))
+        np.add(self._starts, self._address, out=self._leaving)
         if sent is not None and not self.is_whole:
-            self._fly(flown, places)
+            self._fly(flown)
         if begun is not None and seeds is not None:
             self._seed(begun, seeds)
         if not self.is_whole:
             if begun is not None:
-                self._begin(begun, places)
+                self._begin(begun)
             self._take(self._world.told())
-        self._call(_LAST, places)
-        shape, dtype, start, strides = self._flags
-        results = dict(zip(_FLAGS, np.ndarray(shape, dtype, new, start, strides), strict=True))
-        for name, shape, dtype, start in self._results:
-            results[name] = np.ndarray(shape, dtype, new, start)
-        return results, lambda: self._read(new)
+        self._call(_LAST)
+        return np.ndarray((), self._results, new), lambda: self._read(new)
 
-    def _call(self, name: str, places: list[int]) -> None:
-        self._codes[name](self.memory.blocks, self.memory.address, *places)
+    def _call(self, name: str) -> None:
+        memory = self.memory
+        self._codes[name](memory.blocks, memory.address, self._address, self._table)
 
-    def _fly(self, flown: Mask | None, places: list[int]) -> None:
+    def _fly(self, flown: Mask | None) -> None:
         """Fly by physics that is no array code."""
         world = self._world
         worlds = self._worlds
@@ -193,17 +196,17 @@ class Machine:
             if code:
                 if code != _FIRST:
                     self._take(world.told(asked=False))
-                self._call(code, places)
+                self._call(code)
                 world.acting = acting
                 world.wrench = None if wrench is None else wrench[:worlds]
             world.fly(call, flown)
 
-    def _begin(self, begun: Mask, places: list[int]) -> None:
+    def _begin(self, begun: Mask) -> None:
         """Begin with such physics. Raises `InputError` for a start that it refuses."""
         before = self.memory.copy()
         world = self._world
         try:
-            self._call(_BEGIN, places)
+            self._call(_BEGIN)
             world.restore(part_of(self.kept(), "Flight"))
             world.place(begun)
         except InputError:
@@ -301,6 +304,9 @@ class Machine:
         arrays: Named = {
             name: read(program, name, dtype, (1, *shape)) for name, (dtype, shape) in given.items()
         }
+        for name in _MASKS:  # alike for the drones of a world
+            first = arrays[name][:, :1]
+            arrays[name] = np.repeat(first, self._world.shape[1], axis=1)
         self._loop.world.outer = {
             name.removeprefix(_PHYSICS): values
             for name, values in arrays.items()
@@ -320,6 +326,19 @@ class Machine:
         record.run(before.get(mask), stages)
         after = self._loop.state()
         return Region(mask, program, _stores(program, after, before))
+
+    def _shared(self, name: str, region: Region) -> Region:
+        """A region where the drones of a world share code."""
+        drones = self._world.shape[1]
+        if drones == 1:
+            return region
+        fields = {**self._layouts[0].fields, **self._outside}
+        for of_world in (*_MASKS, _KEYS):
+            del fields[of_world]
+        results = [value for _, _, value in region.stores]
+        program, results = called(name, region.program, results, fields, drones)
+        stores = [(*of[:2], value) for of, value in zip(region.stores, results, strict=True)]
+        return Region(region.mask, program, stores)
 
     def _looked(self) -> Region:
         """What leaves the loop, and what is told of it."""

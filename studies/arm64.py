@@ -36,7 +36,7 @@ FOLDER = TemporaryDirectory()
 DRIVER = """
 #include <stdio.h>
 #include <stdlib.h>
-void run(long{types});
+void run(long{types}, char **);
 int main(void) {{
     long head[{count} + 1];
     char *a[{count}];
@@ -45,7 +45,7 @@ int main(void) {{
             a[i] = aligned_alloc(64, (head[i + 1] + 63) / 64 * 64);
             if (fread(a[i], 1, head[i + 1], stdin) != head[i + 1]) return 1;
         }}
-        run(head[0]{values});
+        run(head[0]{values}, a + {memories});
         for (int i = 0; i < {count}; i++) {{
             fwrite(a[i], 1, head[i + 1], stdout);
             free(a[i]);
@@ -56,16 +56,17 @@ int main(void) {{
 """
 
 
-def program(text: str, count: int) -> Path:
-    """A program that runs a module's function of so many memories."""
+def program(text: str, memories: int, count: int) -> Path:
+    """A program that runs a module's function of so many memories, and of arrays outside."""
     target = binding.Target.from_triple(TRIPLE)
     module = binding.parse_assembly(text)
     made = target.create_target_machine(cpu="generic", opt=2, reloc="static")
     folder = Path(FOLDER.name)
     (folder / "run.o").write_bytes(made.emit_object(module))
-    types = ", char *" * count
-    values = "".join(f", a[{number}]" for number in range(count))
-    (folder / "main.c").write_text(DRIVER.format(types=types, values=values, count=count))
+    types = ", char *" * memories
+    values = "".join(f", a[{number}]" for number in range(memories))
+    driver = DRIVER.format(types=types, values=values, memories=memories, count=count)
+    (folder / "main.c").write_text(driver)
     words = [f"{TRIPLE}-gcc", "-static", "-o", "main", "main.c", "run.o", "-lm"]
     subprocess.run(words, cwd=folder, check=True)
     return folder / "main"
@@ -77,11 +78,13 @@ def compiled(regions: Any, layouts: Sequence[Any], outside: Any, width: int) -> 
     for dtype, shape in outside.values():
         sizes.append(layouts[0].lanes * prod(shape) * dtype.itemsize)
     text = llvm._Printer(layouts, outside, width).text(regions)
-    words = ["qemu-aarch64", program(text, len(sizes))]
+    words = ["qemu-aarch64", program(text, len(layouts), len(sizes))]
     pipe: Any = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
 
     def run(blocks: int, *addresses: int) -> None:
-        places = [(a, blocks * size) for a, size in zip(addresses, sizes, strict=True)]
+        *memories, table = addresses
+        others = (ctypes.c_int64 * len(outside)).from_address(table)
+        places = [(a, blocks * x) for a, x in zip([*memories, *others], sizes, strict=True)]
         head = np.array([blocks, *(size for _, size in places)])
         pipe.stdin.write(head.tobytes())
         for address, size in places:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...sim import Array, length
+from ...sim.compile import once
 from ...sim.random import RADIO, uniform, words_of
 from ...sim.state import some
 from ..state import State
@@ -88,13 +89,20 @@ class Radio(Stage):
         numbers = np.concatenate((there, moves, np.ones_like(passed)), axis=-1)
         numbers = np.where(known[..., None], numbers, 0.0)
         distance = np.where(known, length(there), np.inf)
-        count = self.options.neighbours
-        order = np.argsort(distance, axis=-1, kind="stable")[..., :count, None]
-        nearest = np.take_along_axis(numbers, order, axis=2)
-        neighbours = np.zeros_like(nearest, shape=(*record.shape, count, 7))
+        rows = nearest_first(distance, numbers.reshape(*record.shape, -1))
+        nearest = rows.reshape(numbers.shape)[:, :, : self.options.neighbours]
+        neighbours = np.zeros_like(nearest, shape=(*record.shape, self.options.neighbours, 7))
         neighbours[:, :, : nearest.shape[2]] = nearest
         return neighbours
 
     def _in_range(self, receivers: Floats, senders: Floats) -> Array:
         apart = length(senders[:, None] - receivers[:, :, None])
         return apart <= self.options.radio_range
+
+
+@once(vectors=1)
+def nearest_first(distance: Floats, numbers: Floats) -> Floats:
+    """Of distances (..., A) and A rows of numbers (..., 7 A), the rows of the nearest first."""
+    rows = numbers.reshape(*distance.shape, 7)
+    order = np.argsort(distance, axis=-1, kind="stable")[..., None]
+    return np.take_along_axis(rows, order, axis=-2).reshape(numbers.shape)

@@ -36,7 +36,7 @@ class Kernel:
         for number, values in enumerate(given):
             if _is_array(values):
                 memory.put(str(number), values.reshape(-1, *values.shape[2:]))
-        code(memory.blocks, memory.address)
+        code(memory.blocks, memory.address, None)
         return memory.get(_RESULT).reshape(*self._shape, -1)
 
     def _compiled(self, given: tuple[Any, ...]) -> tuple[Memory, Callable[..., None]]:

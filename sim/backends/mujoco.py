@@ -170,9 +170,9 @@ class MujocoWorld(World):
         ids = None if mask is None else self.random.ids(mask)
         some = ... if ids is None else ids
         if call.pushes:
-            self._ctrl[some] = np.reshape(self.acting, self._ctrl.shape)[some] / self._newtons
+            self._ctrl[some] = self.acting.reshape(self._ctrl.shape)[some] / self._newtons
             if self.wrench is not None:
-                self._applied[some] = np.reshape(self.wrench, self._applied.shape)[some]
+                self._applied[some] = self.wrench.reshape(self._applied.shape)[some]
         if call.clears:
             self._clear_contacts(some)
         try:

@@ -19,7 +19,8 @@ from .layout import Fields, Layout
 from .program import OPERATIONS, DType, Function, Program, Value
 
 Code = Callable[..., None]
-"""Takes the number of blocks, the address of each memory, and those of arrays outside."""
+"""Takes the number of blocks, the address of each memory, and that of the addresses of arrays
+outside, or None without any."""
 
 _KINDS = {
     np.dtype(np.float32): "float",
@@ -31,7 +32,12 @@ _KINDS = {
     np.dtype(np.uint64): "i64",
 }
 _SHORT = {"float": "f32", "double": "f64"}
-_MODULE = """define void @run(i64 %blocks{arguments}) #0 {{
+_MODULE = """define void @run(i64 %blocks{memories}, ptr %table) #0 {{
+{addresses}
+  call void @step(i64 %blocks{memories}{outside})
+  ret void
+}}
+define internal void @step(i64 %blocks{memories}{outside}) #0 {{
 entry:
 {rows}
   br label %block
@@ -77,6 +83,12 @@ class Region(NamedTuple):
         """What the stores need, in order."""
         return self.program.needed(value for _, _, value in self.stores)
 
+    def size(self) -> int:
+        """How many operations are code."""
+        own = self.operations()
+        functions = {value.inputs[0] for value in own if value.operation == "call"}
+        return len(own) + sum(len(one.program.values) for one in functions)
+
 
 @cache
 def _llvm() -> Any:
@@ -115,7 +127,7 @@ def compiled(
         width: Lanes of a vector.
     """
     text = _Printer(layouts, outside, width).text(regions)
-    return _machine_code(text, len(layouts) + len(outside))
+    return _machine_code(text, len(layouts))
 
 
 class _Printer:
@@ -138,13 +150,13 @@ class _Printer:
         """All of it."""
         for number, region in enumerate(regions):
             self._region(number, region)
-        names = [f"memory.{i}" for i in range(len(self._layouts))]
-        names += [f"out.{name}" for name in self._outside]
         spread = [name for name in self._outside if self._is_spread(name)]
         further = [*self._functions.values()]
         further += [f"{name} = internal {kept}" for kept, name in self._constants.items()]
         return _MODULE.format(
-            arguments="".join(f', ptr noalias %"{name}"' for name in names),
+            memories="".join(f", ptr noalias %memory.{i}" for i in range(len(self._layouts))),
+            outside="".join(f', ptr noalias %"out.{name}"' for name in self._outside),
+            addresses="\n".join(self._looked_up(i, one) for i, one in enumerate(self._outside)),
             rows="\n".join(f"  {self._rows(name)} = alloca {self._size(name)}" for name in spread),
             bases="\n".join(self._base(i, one.size) for i, one in enumerate(self._layouts)),
             lanes=self._layouts[0].lanes,
@@ -311,6 +323,13 @@ class _Printer:
             f'  %base.{number} = getelementptr i8, ptr %"memory.{number}", i64 %start.{number}'
         )
 
+    def _looked_up(self, number: int, array: str) -> str:
+        """Lines that read the address of an array outside."""
+        return (
+            f"  %place.{number} = getelementptr ptr, ptr %table, i64 {number}\n"
+            f'  %"out.{array}" = load ptr, ptr %place.{number}'
+        )
+
     def _worlds(self) -> str:
         """Lines that number the worlds of these lanes."""
         lanes = self._lanes("i64")
@@ -404,8 +423,8 @@ def _in_memory(dtype: DType) -> str:
 
 
 @lru_cache
-def _machine_code(text: str, addresses: int) -> Code:
-    """The function of a module's text, of so many addresses, for this processor."""
+def _machine_code(text: str, memories: int) -> Code:
+    """The function of a module's text, of so many memories, for this processor."""
     binding = _llvm()
     features = binding.get_host_cpu_features().flatten()
     machine = binding.Target.from_default_triple().create_target_machine(
@@ -415,7 +434,7 @@ def _machine_code(text: str, addresses: int) -> Code:
     module.verify()
     engine = binding.create_mcjit_compiler(module, machine)
     engine.finalize_object()
-    kind = ctypes.CFUNCTYPE(None, ctypes.c_int64, *[ctypes.c_void_p] * addresses)
+    kind = ctypes.CFUNCTYPE(None, ctypes.c_int64, *[ctypes.c_void_p] * (memories + 1))
     call = kind(engine.get_function_address("run"))
     call.engine = engine  # type: ignore[attr-defined]  # it owns the machine code
     return call

@@ -25,7 +25,7 @@ BY_NUMPY = [name for name, case in RIGID.items() if case.options.get("compiled")
 MUJOCO = [
     name
     for name, case in CASES.items()
-    if case.config().backend.name == "mujoco" and case.drones < 4 and "cameras" not in case.options
+    if case.config().backend.name == "mujoco" and "cameras" not in case.options
 ]
 MANY = 150  # worlds: two blocks, and a part of one
 

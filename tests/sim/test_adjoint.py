@@ -62,7 +62,7 @@ def derivatives(code: Code, arrays: Arrays, by_output: np.ndarray) -> Arrays:
     for name, array in known.items():
         memory.put(name, array)
     run = compiled([Region("", program, stores)], [layout], {}, 8)
-    run(memory.blocks, memory.address)
+    run(memory.blocks, memory.address, None)
     return {name: memory.get(f"by {name}") for name in arrays}
 
 
