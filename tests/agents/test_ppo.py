@@ -73,7 +73,8 @@ def test_the_tuned_preset_depends_on_the_task() -> None:
     assert racing.config.hidden == (48, 48)
     assert find_preset("ppo", "tuned", "other/Task-v0") == replace(ours, fits=False)
     swarm = find_preset("ippo", "tuned", "rotorgram/Formation-v0")
-    assert swarm.config.rollout_size(swarm.num_envs) == swarm.num_envs * 512  # a whole episode
+    assert (swarm.num_envs, swarm.env_steps, swarm.backend) == (160, 2_000_000, "rigid")
+    assert swarm.config.reward_clip == 2.0
     for algorithm in ("ppo", "mappo", "sb3-ppo"):
         crossing = find_preset(algorithm, "tuned", "rotorgram/Crossing-v0")
         assert crossing == replace(swarm, env_id="rotorgram/Crossing-v0")
