@@ -266,6 +266,21 @@ def _l2f(_: ExitStack) -> Step:
     return step
 
 
+def _hyperdrone(_: ExitStack) -> Step:
+    from hyperdrone.dynamics import Sim
+
+    sim = Sim(_DRONES)
+    sim.reset(sample_states=True)
+    actions = _actions(16, _DRONES, sim.action_dim)
+
+    def step() -> int:
+        sim.step(next(actions))
+        sim.observe()
+        return _DRONES
+
+    return step
+
+
 def _crazyflow(stack: ExitStack) -> Step:
     import crazyflow.envs  # noqa: F401  # it registers them
     import jax
@@ -294,5 +309,6 @@ LAYERS = (
     Layer("rigid, 1024", "the same", _DRONES, _rigid(_DRONES), process_time),
     Layer("rigid, 4096", "the same", 4096, _rigid(4096), process_time),
     Layer("L2F, 1024", "one step of RK4", _DRONES, _l2f, process_time, "l2f"),
+    Layer("HyperDrone, 1024", "the same", _DRONES, _hyperdrone, process_time, "hyperdrone"),
     Layer("Crazyflow, 1024", "ten steps", _DRONES, _crazyflow, process_time, "crazyflow"),
 )
