@@ -1,5 +1,6 @@
 """What a program does alike for each drone of a world, as a function: its code is there once."""
 
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from math import prod
 from typing import Any
@@ -13,7 +14,7 @@ Each = tuple[Value, ...]
 """A value of each drone."""
 
 
-def called(
+def with_calls(
     name: str, program: Program, results: Sequence[Value], fields: Fields, drones: int
 ) -> tuple[Program, list[Value]]:
     """A program with the same results, where drones call a function for what they do alike.
@@ -25,7 +26,8 @@ def called(
         program: Of one world.
         results: Of the program.
         fields: Of arrays by name: a first axis of `drones` is that of the drones. Others are of
-            the world.
+            the world. A wrong one costs speed, and no bit.
+        drones: Of a world.
     """
     values = program.needed(results)
     of_drones, alike = _alike(values, fields, drones)
@@ -74,8 +76,9 @@ def _alike(values: Sequence[Value], fields: Fields, drones: int) -> tuple[set[Va
     Inputs of the latter are of that kind too, or a drone loads them, or they depend on no drone.
     """
     owners: dict[Value, int | None] = {}  # None: several
-    kinds: dict[Any, dict[int, Value]] = {}
-    keys: dict[Value, Any] = {}
+    kinds = defaultdict[Any, dict[int, Value]](dict)  # by key, and how often the drone had it
+    times = Counter[Any]()
+    keys: dict[Value, int] = {}
     for value in values:
         if value.operation == "load":
             array, row = value.inputs
@@ -93,10 +96,10 @@ def _alike(values: Sequence[Value], fields: Fields, drones: int) -> tuple[set[Va
             key = value.operation, value.dtype, *inputs
         owners[value] = owner
         if owner is not None:
-            while owner in kinds.setdefault(key, {}):
-                key = key, "another"
-            kinds[key][owner] = value
-            keys[value] = id(kinds[key])
+            times[key, owner] += 1
+            kind = kinds[key, times[key, owner]]
+            kind[owner] = value
+            keys[value] = id(kind)
     found = [tuple(of[i] for i in range(drones)) for of in kinds.values() if len(of) == drones]
     return {*owners}, [each for each in found if each[0].operation != "load"]
 

@@ -84,10 +84,10 @@ class Region(NamedTuple):
         return self.program.needed(value for _, _, value in self.stores)
 
     def size(self) -> int:
-        """How many operations are code."""
+        """How many operations are printed, those of its functions once."""
         own = self.operations()
         functions = {value.inputs[0] for value in own if value.operation == "call"}
-        return len(own) + sum(len(one.program.values) for one in functions)
+        return len(own) + sum(len(one.program.needed(one.results)) for one in functions)
 
 
 @cache

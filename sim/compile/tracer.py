@@ -321,16 +321,16 @@ def _where(like: TracedArray, flag: Any, first: Any, second: Any) -> Traced:
     return like._each(select, first.dtype, flag.astype(_FLAG), first, second)
 
 
-def _extreme(is_before: Call, is_not_after: Call) -> Call:
-    """A NaN stays, and of 0 and -0 it is the second."""
+def _extreme(is_before: Call, is_not_before: Call) -> Call:
+    """A NaN stays, and of 0 and -0 it is the second. Of a constant that is no NaN less is asked."""
 
     def extreme(like: TracedArray, a: Any, b: Any) -> Traced:
-        known = [not isinstance(one, TracedArray) and np.all(one == one) for one in (a, b)]
+        plain = [not isinstance(one, TracedArray) and np.all(one == one) for one in (a, b)]
         a, b = like._alike((a, b))
-        if known[1]:
-            return _where(like, is_not_after(a, b), b, a)
-        larger = _where(like, is_before(a, b), a, b)
-        return larger if known[0] else _where(like, a != a, a, larger)
+        if plain[1]:
+            return _where(like, is_not_before(a, b), b, a)
+        chosen = _where(like, is_before(a, b), a, b)
+        return chosen if plain[0] else _where(like, a != a, a, chosen)
 
     return extreme
 

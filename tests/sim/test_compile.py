@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from rotorgram.sim import elementary
 from rotorgram.sim.compile import Program, TracedArray, Untraceable, once, read
-from rotorgram.sim.compile.alike import called
+from rotorgram.sim.compile.alike import with_calls
 from rotorgram.sim.compile.layout import Layout, Memory
 from rotorgram.sim.compile.llvm import Region, compiled, widest
 from rotorgram.sim.random import philox
@@ -410,7 +410,7 @@ def test_what_many_drones_do_alike_is_a_function(drones: int, steps: int) -> Non
     x, y = (read(program, name, single, (1, drones)) for name in "xy")
     lots = np.linspace(0.5, 1.5, drones, dtype=np.float32)
     values = flown(x, y, lots, steps).values.ravel().tolist()
-    caller, results = called("fly", program, values, fields, drones)
+    caller, results = with_calls("fly", program, values, fields, drones)
     calls = {value.inputs[0] for value in caller.needed(results) if value.operation == "call"}
     assert len(calls) == (steps == 300)
     assert all(len(callee.program.values) < 1000 for callee in calls)
@@ -423,6 +423,19 @@ def test_what_many_drones_do_alike_is_a_function(drones: int, steps: int) -> Non
     function = compiled([Region("", caller, stores)], [Layout(fields, 16)], {}, 16)
     function(memory.blocks, memory.address, None)
     assert same(memory.get("out"), flown(*given, lots, steps))
+
+
+def test_drones_may_do_the_same_operation_often() -> None:
+    """As to look at each row of a table."""
+    single = np.dtype(np.float32)
+    program = Program()
+    x = read(program, "x", single, (1, 2))
+    nearest = (x[..., None] - np.arange(1200.0, dtype=single)).min(axis=-1)
+    caller, results = with_calls(
+        "look", program, nearest.values.ravel().tolist(), {"x": (single, (2,))}, 2
+    )
+    assert [value.operation for value in results] == ["call", "call"]
+    assert len(caller.needed(results)) == 4
 
 
 # ---- memory
