@@ -84,10 +84,7 @@ class Machine:
         self._calls = [(_before(call), call) for call in loop.pipeline.flight.calls()]
         self._calls[0] = _FIRST, self._calls[0][1]
         steps = self._regions()
-        size = 0
-        for name, regions in steps.items():
-            steps[name] = [self._shared(f"{name}.{i}", one) for i, one in enumerate(regions)]
-            size += sum(one.size() for one in steps[name])
+        size = sum(one.size() for regions in steps.values() for one in regions)
         if size > MOST:
             most = f"expected at most {MOST:,}"
             raise Untraceable(f"a step of {size:,} operations is not compiled: {most}")
@@ -327,21 +324,14 @@ class Machine:
         record.begun = before["begun"]
         record.sent = before["sent"]
         record.run(before.get(mask), stages)
-        after = self._loop.state()
-        return Region(mask, program, _stores(program, after, before))
-
-    def _shared(self, name: str, region: Region) -> Region:
-        """A region where the drones of a world share code."""
+        stores = _stores(program, self._loop.state(), before)
         drones = self._world.shape[1]
-        if drones == 1:
-            return region
-        fields = {**self._layouts[0].fields, **self._outside}
-        for of_world in (*_MASKS, _KEYS):
-            del fields[of_world]
-        results = [value for _, _, value in region.stores]
-        program, results = with_calls(name, region.program, results, fields, drones)
-        stores = [(*of[:2], value) for of, value in zip(region.stores, results, strict=True)]
-        return Region(region.mask, program, stores)
+        if drones > 1:
+            fields = {**self._layouts[0].fields, **self._outside}
+            for of_world in (*_MASKS, _KEYS):
+                del fields[of_world]
+            program, stores = with_calls(mask, program, stores, fields, drones)
+        return Region(mask, program, stores)
 
     def _looked(self) -> Region:
         """What leaves the loop, and what is told of it."""

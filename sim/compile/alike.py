@@ -10,29 +10,31 @@ from .program import Function, Program, Value
 
 _LEAST = 500  # Operations of a drone for which a function pays
 
+Stores = list[tuple[str, int, Value]]
 Each = tuple[Value, ...]
 """A value of each drone."""
 
 
 def with_calls(
-    name: str, program: Program, results: Sequence[Value], fields: Fields, drones: int
-) -> tuple[Program, list[Value]]:
-    """A program with the same results, where drones call a function for what they do alike.
+    name: str, program: Program, stores: Stores, fields: Fields, drones: int
+) -> tuple[Program, Stores]:
+    """A program and its stores, where drones call a function for what they do alike.
 
     A drone's own values depend on what it loads, and on nothing of another drone.
 
     Args:
         name: Of the function.
         program: Of one world.
-        results: Of the program.
+        stores: What it writes: array, component, and value.
         fields: Of arrays by name: a first axis of `drones` is that of the drones. Others are of
             the world. A wrong one costs speed, and no bit.
         drones: Of a world.
     """
+    results = [value for _, _, value in stores]
     values = program.needed(results)
     of_drones, alike = _alike(values, fields, drones)
     if len(alike) < _LEAST:
-        return program, list(results)
+        return program, stores
     given: list[Each] = []
     body = Program()
     inner: dict[Each, Value] = {}
@@ -67,7 +69,7 @@ def with_calls(
             dtype = each[drone].dtype
             copies[each[drone]] = caller.value("call", dtype, function, number, *arguments)
     _copy([value for value in values if value not in inside], caller, copies)
-    return caller, [copies[value] for value in results]
+    return caller, [(array, row, copies[value]) for array, row, value in stores]
 
 
 def _alike(values: Sequence[Value], fields: Fields, drones: int) -> tuple[set[Value], list[Each]]:

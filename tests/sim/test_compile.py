@@ -410,8 +410,9 @@ def test_what_many_drones_do_alike_is_a_function(drones: int, steps: int) -> Non
     x, y = (read(program, name, single, (1, drones)) for name in "xy")
     lots = np.linspace(0.5, 1.5, drones, dtype=np.float32)
     values = flown(x, y, lots, steps).values.ravel().tolist()
-    caller, results = with_calls("fly", program, values, fields, drones)
-    calls = {value.inputs[0] for value in caller.needed(results) if value.operation == "call"}
+    stores = [("out", row, value) for row, value in enumerate(values)]
+    region = Region("", *with_calls("fly", program, stores, fields, drones))
+    calls = {value.inputs[0] for value in region.operations() if value.operation == "call"}
     assert len(calls) == (steps == 300)
     assert all(len(callee.program.values) < 1000 for callee in calls)
 
@@ -419,8 +420,7 @@ def test_what_many_drones_do_alike_is_a_function(drones: int, steps: int) -> Non
     given = np.random.default_rng(0).normal(size=(2, 20, drones)).astype(np.float32)
     for name, numbers in zip("xy", given, strict=True):
         memory.put(name, numbers)
-    stores = [("out", row, value) for row, value in enumerate(results)]
-    function = compiled([Region("", caller, stores)], [Layout(fields, 16)], {}, 16)
+    function = compiled([region], [Layout(fields, 16)], {}, 16)
     function(memory.blocks, memory.address, None)
     assert same(memory.get("out"), flown(*given, lots, steps))
 
@@ -431,11 +431,10 @@ def test_drones_may_do_the_same_operation_often() -> None:
     program = Program()
     x = read(program, "x", single, (1, 2))
     nearest = (x[..., None] - np.arange(1200.0, dtype=single)).min(axis=-1)
-    caller, results = with_calls(
-        "look", program, nearest.values.ravel().tolist(), {"x": (single, (2,))}, 2
-    )
-    assert [value.operation for value in results] == ["call", "call"]
-    assert len(caller.needed(results)) == 4
+    stores = [("out", row, value) for row, value in enumerate(nearest.values.ravel())]
+    region = Region("", *with_calls("look", program, stores, {"x": (single, (2,))}, 2))
+    assert [value.operation for _, _, value in region.stores] == ["call", "call"]
+    assert len(region.operations()) == 4
 
 
 # ---- memory
