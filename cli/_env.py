@@ -68,8 +68,8 @@ def fitted(command: F, checkpoint: Checkpoint | Controller) -> F:
                 f"env: expected --env {checkpoint.env_id} with options of the task that the "
                 f"policy was trained on, got options of {env_id}"
             )
-    changes: dict[str, Any] = {"env": checkpoint.env_id}
-    changes["options"] = {**checkpoint.options, **options}
+    options = {**checkpoint.options, **options}
+    changes: dict[str, Any] = {"env": checkpoint.env_id, "options": options}
     if "drones" not in command.given:
         changes["drones"] = len(checkpoint.spec.agents)
     listens = getattr(command, "listen", None) is not None

@@ -120,7 +120,7 @@ class StudyFlags(TrainingFlags, WorkersConfig):
         """A row of a file with what the flags change: of all rows."""
         from ..envs.config import EnvConfig
 
-        changes = self.changes()
+        changes = {**row.set, **self.changes()}
         env = row.env
         if "env" in self.given and self.env_id != env.env_id:
             env = EnvConfig.from_keywords(self.env_id, vehicle=env.vehicle, drones=env.drones)
@@ -129,7 +129,6 @@ class StudyFlags(TrainingFlags, WorkersConfig):
         name = "" if row.name == row.default_name else row.name
         if row.controller:
             return replace(row, name=name, env=env)
-        changes = {**row.set, **changes}
         return replace(row, name=name, env=env, set=changes, **self.given_of_rows())
 
 

@@ -39,7 +39,6 @@ class Bench(Command):
             rate = measured["medians"][layer.name]
             rates.add_row(layer.name, layer.about, f"{rate:,.0f}", f"{1e6 / rate:.2f}")
         Console().print(rates)
-        if measured["policy_seconds"]:
-            seconds = measured["policy_seconds"]
+        if seconds := measured["policy_seconds"]:
             print(f"rotorgram train ppo --env {HOVER}: {seconds:.2f} s of one core")
         print(f"written: {folder / 'bench.json'}")

@@ -62,9 +62,9 @@ def _measures(own: DataFrame, headline: Headline) -> Measures:
     line["held"] = nan if headline.held is None else int(own["held"].sum())
     line["worst"] = own["steady"].agg("min" if headline.high else "max")
     line["most_crashed"] = int(own["crashed"].max())
-    low, high = share_interval(int(line["crashed"]), int(line["episodes"]))
     line["crash_rate"] = line["crashed"] / line["episodes"]
-    line |= {"crash_rate_low": low, "crash_rate_high": high}
+    interval = share_interval(int(line["crashed"]), int(line["episodes"]))
+    line["crash_rate_low"], line["crash_rate_high"] = interval
     reached = own["env_steps_to_hold"].notna().sum() if trained else nan
     line["reached"] = nan if headline.held is None else reached
     for name in ("env_steps_to_hold", "seconds_to_hold", "steps_per_second"):

@@ -254,8 +254,8 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Observation, ArrayL
         self.telemetry: Arrays = {}
         self._reasons: Array | None = None  # of simulators that were lost in this step
         self.metadata = {"render_modes": [], "autoreset_mode": checked_mode(autoreset_mode)}
-        num_simulators = check("num_simulators", Limits(1, MAX_DRONES, whole=True), num_simulators)
-        self.num_simulators: int = num_simulators
+        limits = Limits(1, MAX_DRONES, whole=True)
+        self.num_simulators: int = check("num_simulators", limits, num_simulators)
         drones = None
         if num_envs is not None:
             most = num_simulators * MAX_DRONES
@@ -408,7 +408,6 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Observation, ArrayL
         self.rewards = np.where(still, 0.0, np.concatenate([s.rewards for s in states]))
         self.terminated = np.concatenate([s.terminated for s in states]) & ~still
         self.truncated = np.concatenate([s.truncated for s in states]) & ~still
-        self.lost = np.zeros(self.num_envs, bool)
 
     def _sent(self, actions: Array, idle: Array) -> Array:
         """Actions as they cross the wire; those of drones that do not fly are 0."""

@@ -239,6 +239,8 @@ class TracedArray(NDArrayOperatorsMixin):
         for one in axes:
             parts = [np.moveaxis(array, one, 0)[index] for index in range(array.shape[one])]
             array = reduce(function, parts)
+            if function is np.add:
+                array = array + array.dtype.type(0)  # NumPy begins at 0, which is not -0
             array = np.expand_dims(array, one) if keepdims else array
         return array
 

@@ -53,8 +53,7 @@ class SessionVerdict:
     problem: str = ""
     """Reason if it cannot be repeated, or not to its end."""
 
-    def __post_init__(self) -> None:
-        self._loop: Steppable | None = None
+    _loop: Steppable | None = None
 
     @property
     def identical(self) -> bool:
@@ -84,8 +83,8 @@ class SessionVerdict:
             self.problem = f"State {state.sequence} cannot be repeated: {what}"
             return
         difference = _difference(state, loop)
-        self.difference = self.difference or difference
         if difference:
+            self.difference = self.difference or difference
             self.differing += 1
         else:
             self.same += 1

@@ -424,8 +424,7 @@ class Client:
 
     def _take_command(self, command: Command, plain: bytes, now: float) -> None:
         self.state = SIMULATOR["waiting"]["received", Command]
-        self._transfer = None
-        self.resend_at = self.deadline = inf
+        self._forget_transfer()
         self._answered_at = now
         if self.tap:
             self._record(command, plain)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from . import binary, text
 from .auth import Key, sealed
-from .client import Address, Tap, largest_datagram
+from .client import Address, Tap, address_text, largest_datagram
 from .errors import DecodeError
 from .fragments import Assembler, Transfer, asks
 from .layout import Array, Layout
@@ -48,8 +48,7 @@ class Outbox:
 
     def drop(self, cause: str, reason: str, address: Address, now: float) -> None:
         """Count a datagram that changes nothing."""
-        host, port = address
-        self.statistics.drop(cause, f"from {host}:{port}: {reason}", now)
+        self.statistics.drop(cause, f"from {address_text(address)}: {reason}", now)
 
 
 @dataclass(eq=False)

@@ -121,10 +121,17 @@ class Simulator(NotCopied):
             links = _links(
                 spec, worlds, servers, times, insecure=insecure, by_text=by_text, key=key
             )
-            self._port = _open_port(bind, [link.address for link in links], insecure=insecure)
-            failing.callback(self._port.close)
-            self._receive = partial(self._port.receive, strangers=False)
-            self.address: Address = self._port.address
+            addresses = [link.address for link in links]
+            if len(set(addresses)) < len(addresses):
+                raise InputError(f"agents: expected a different address of each, got {addresses}")
+            self._port = port = Port(bind, insecure=insecure, peers=addresses)
+            failing.callback(port.close)
+            self._receive = partial(port.receive, strangers=False)
+            self.address: Address = port.address
+            if self.address in addresses:
+                raise InputError(
+                    f"server: expected the address of an agent, got that of this side, {bind}"
+                )
             self.rules: Rules
             period = spec.control_period
             if agents is None:
@@ -221,7 +228,13 @@ class Simulator(NotCopied):
             try:
                 datagram, address = self._receive(left)
             except OSError as error:
-                self._note(error, time.monotonic() - before - left)
+                if self._port.closed:
+                    raise
+                pause = time.monotonic() - before - left
+                if pause > PAUSE:  # this process was stopped
+                    rules.pardon(pause)
+                if len(rules.links) == 1 and not isinstance(error, TimeoutError):
+                    rules.links[0].trouble = _words(error, "receiving")
                 continue
             if link := self._by_address.get(address):
                 link.trouble = ""
@@ -262,15 +275,6 @@ class Simulator(NotCopied):
                     link.trouble = _words(error, "sending")
             if client.statistics.notices:
                 log_notices(client.statistics)
-
-    def _note(self, error: OSError, pause: float) -> None:
-        """Nothing came, and the wait was too long by `pause`, s. Raises `OSError` if closed."""
-        if self._port.closed:
-            raise error
-        if pause > PAUSE:  # this process was stopped
-            self.rules.pardon(pause)
-        if len(self.rules.links) == 1 and not isinstance(error, TimeoutError):
-            self.rules.links[0].trouble = _words(error, "receiving")
 
     def _say_alive(self, finished: threading.Event) -> None:
         """In a thread: tell agents that wait for a State that it will come."""
@@ -328,16 +332,6 @@ def _links(
         )
         links.append(AgentLink(number, there, client, rows))
     return links
-
-
-def _open_port(bind: Address, agents: list[Address], *, insecure: bool) -> Port:
-    if len(set(agents)) < len(agents):
-        raise InputError(f"agents: expected a different address of each, got {agents}")
-    port = Port(bind, insecure=insecure, peers=agents)
-    if port.address in agents:
-        port.close()
-        raise InputError(f"server: expected the address of an agent, got that of this side, {bind}")
-    return port
 
 
 def _words(error: OSError, what: str) -> str:
