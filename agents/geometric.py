@@ -90,23 +90,17 @@ class Geometric:
         k = self._gain
         ahead = (goes - self._pushed) / (OVER * k * k)
         offset = now["goal - position"] + self._moving / k + ahead
-        if self._swing is not None:
-            offset[:2] = self._steadied(now, before, goes)[:2]
+        if self._swing is not None:  # the loops ask for the acceleration of `swing_gains`
+            faster = (now["force"] - before["force"]) / self._period
+            from_goal = -now["goal - position"]
+            moves = now["velocity"] - self._moving
+            seen = (from_goal, moves, *(now[name] for name in _PAYLOAD), now["force"], faster)
+            wanted = goes - self._pushed - self._swing @ np.array(seen)
+            steadied = wanted / (OVER * k * k) + now["velocity"] / k
+            offset[:2] = steadied[:2]
         nose = now["nose"][:2]
         c, s = nose / max(math.hypot(*nose), 1e-6)
         return level_action(offset, c, s, -math.atan2(s, c), self._scale)
-
-    def _steadied(self, now: ByName, before: ByName, goes: Array) -> Array:
-        """The offset at which the loops ask for the acceleration of `swing_gains`, m."""
-        assert self._swing is not None
-        faster = (now["force"] - before["force"]) / self._period
-        from_goal = -now["goal - position"]
-        moves = now["velocity"] - self._moving
-        seen = (from_goal, moves, *(now[name] for name in _PAYLOAD), now["force"], faster)
-        wanted = goes - self._pushed - self._swing @ np.array(seen)
-        k = self._gain
-        offset: Array = wanted / (OVER * k * k) + now["velocity"] / k
-        return offset
 
     def _follow(self, now: ByName) -> Array:
         """Filter the goal's velocity and what pushes; return the goal's acceleration, m/s²."""

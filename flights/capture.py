@@ -11,6 +11,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,7 +31,8 @@ _MOST_FRAMES = 64  # of a job
 Picture = NDArray[np.generic]
 Labels = dict[str, Any]
 """The labels of one frame or picture: an object of JSON."""
-_SAME_VIEW = ("camera", "drone", "width", "height")
+_view = itemgetter("camera", "drone", "width", "height")
+"""What the pictures of one view share."""
 
 
 class _Job(NamedTuple):
@@ -266,8 +268,3 @@ def write_coco(
 def category(name: str) -> str:
     """Kind of an object: its name without numbers, as forest/tree of forest/tree_12."""
     return re.sub(r"_\d+\b", "", name)
-
-
-def _view(picture: Labels) -> tuple[object, ...]:
-    """Camera, drone and size, which the pictures of one view share."""
-    return tuple(picture[key] for key in _SAME_VIEW)

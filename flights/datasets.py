@@ -120,11 +120,10 @@ def write_parquet(episodes: RecordedEpisodes, out: Path) -> None:
     import pyarrow.parquet as pq
 
     check_new_file(out, ".parquet")
-    metadata = {"env_spec": episodes.spec.to_json()}
     tables = (_table(episodes.spec, i, episodes.journal, one) for i, one in enumerate(episodes))
     batches = map(pa.concat_tables, _batches(tables))
     first = next(batches)
-    schema = first.schema.with_metadata(metadata)
+    schema = first.schema.with_metadata({"env_spec": episodes.spec.to_json()})
     with removed_on_error(out), pq.ParquetWriter(out, schema, compression="zstd") as writer:
         for table in chain([first], batches):
             writer.write_table(table.cast(schema))

@@ -156,7 +156,7 @@ class _ThisProcess(Executor):
     workers = 1
 
     def __init__(self, on_progress: OnProgress) -> None:
-        _worker.report = on_progress
+        _Worker.report = on_progress
 
     def submit(self, function: Callable[..., Any], /, *args: Any, **_: object) -> Future[Any]:
         future: Future[Any] = Future()
@@ -211,10 +211,7 @@ def _pass_on(progress: Connection, on_progress: OnProgress) -> None:
 class _Worker:
     """State of this process, if it is a worker."""
 
-    report: OnProgress = staticmethod(lambda *_: None)
-
-
-_worker = _Worker()
+    report: OnProgress = lambda *_: None
 
 
 def _begin_worker(ends: Connection, progress: Connection, lock: Lock) -> None:
@@ -226,7 +223,7 @@ def _begin_worker(ends: Connection, progress: Connection, lock: Lock) -> None:
         with lock:
             progress.send(item)
 
-    _worker.report = report
+    _Worker.report = report
 
 
 def _end_with(ends: Connection) -> None:
@@ -236,7 +233,7 @@ def _end_with(ends: Connection) -> None:
 
 def _do(function: Callable[[_Job, Tell], _Value], name: str, job: _Job) -> Result:
     """Do a job (in a worker)."""
-    report = _worker.report
+    report = _Worker.report
     try:
         return name, "", function(job, lambda *progress: report(name, *progress))
     except Exception as error:

@@ -227,7 +227,7 @@ class _Pane:
         if distance is not None:
             lines.append(("least distance", f"{distance:.2f} m"))
         else:
-            metrics = self.stage.moments[0].metrics[:1]
-            lines += [(metric.label, metric.text) for metric in metrics]
+            for metric in self.stage.moments[0].metrics[:1]:
+                lines.append((metric.label, metric.text))
         note = track.note(episode, step)
         return [*lines, (note, "")] if note else lines

@@ -101,7 +101,10 @@ def identify(
         base[LAG] = vehicle.coefficients["rotors.time_constant"] or 0.05
     free = [name for name in names if name in base]
     windows = _cut(logs, base, round(WINDOW / logs[0].period))
-    clusters = _clusters(windows)
+    segment = (windows.index * windows.period / SEGMENT).astype(int)
+    pairs = np.stack((windows.flight, segment))
+    # The number of the segment of each window.
+    clusters = np.unique(pairs, axis=1, return_inverse=True)[1].ravel()
     segments = int(clusters.max()) + 1
     if segments < _LEAST_SEGMENTS:
         raise InputError(
@@ -145,13 +148,6 @@ def _cut(logs: Sequence[FlightLog], numbers: Numbers, steps: int) -> Windows:
     if not logs[0].measured:
         flights = [with_lag(log, numbers[LAG]) for log in logs]
     return Windows.cut(flights, steps, steps, horizons)
-
-
-def _clusters(windows: Windows) -> Ints:
-    """The number of the segment of each window."""
-    segment = (windows.index * windows.period / SEGMENT).astype(int)
-    pairs = np.stack((windows.flight, segment))
-    return np.unique(pairs, axis=1, return_inverse=True)[1].ravel()
 
 
 def _undetermined(estimates: Sequence[Estimate], correlation: Floats) -> dict[str, str]:

@@ -44,10 +44,8 @@ def plot_flights(flights: Mapping[str, Trajectory], out: Path) -> None:
     require("matplotlib", "report", "a plot")
     from matplotlib import rc_context
 
-    columns = {name: shown_columns(flight) for name, flight in flights.items()}
     with rc_context({"font.size": 9, "svg.fonttype": "none", "pdf.fonttype": 42}):
-        figure = _drawn(flights, columns)
-        figure.savefig(out, dpi=150)
+        _drawn(flights).savefig(out, dpi=150)
 
 
 def shown_columns(flight: Trajectory) -> Columns:
@@ -74,11 +72,12 @@ def roll_pitch_yaw(quaternion: Floats) -> Floats:
     return np.stack((np.unwrap(roll), pitch, np.unwrap(yaw)), axis=-1)
 
 
-def _drawn(flights: Mapping[str, Trajectory], columns: Mapping[str, Columns]) -> "Figure":
+def _drawn(flights: Mapping[str, Trajectory]) -> "Figure":
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
-    panels: dict[str, Column] = {}
+    columns = {name: shown_columns(flight) for name, flight in flights.items()}
+    panels: Columns = {}
     for own in columns.values():
         panels = own | panels
     for other in _ON_POSITION:

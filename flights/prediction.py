@@ -135,8 +135,7 @@ def mean_speeds(speeds: Floats, step: int) -> Floats:
     After the last sample that a prediction may know, those of that one.
     """
     following = min(step + 1, speeds.shape[1] - 1)
-    mean: Floats = 0.5 * (speeds[:, step] + speeds[:, following])
-    return mean
+    return 0.5 * (speeds[:, step] + speeds[:, following])
 
 
 def predict(vehicle: Vehicle, candidates: Sequence[Numbers], windows: Windows) -> Floats:

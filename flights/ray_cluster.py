@@ -17,12 +17,7 @@ class RayExecutor(Executor):
 
     def __init__(self, address: str | None, jobs: int | None) -> None:
         self._ray = require("ray", "ray", "the runner ray")
-        self._connect(address or "auto")
-        cores = int(self._ray.cluster_resources().get("CPU", 0))  # 0: machines start on demand
-        self.workers = jobs or max(cores, 1)
-        self._submitted: dict[Future[Any], object] = {}
-
-    def _connect(self, address: str) -> None:
+        address = address or "auto"
         host, _, port = address.removeprefix("ray://").rpartition(":")
         try:
             if host and port.isdecimal():  # Ray takes minutes to find out that nothing listens
@@ -35,6 +30,9 @@ class RayExecutor(Executor):
             raise InputError(
                 f"address: expected a Ray cluster at {address}, got: {reason}"
             ) from None
+        cores = int(self._ray.cluster_resources().get("CPU", 0))  # 0: machines start on demand
+        self.workers = jobs or max(cores, 1)
+        self._submitted: dict[Future[Any], object] = {}
 
     def submit(self, function: Callable[..., Any], /, *args: Any, **_: object) -> Future[Any]:
         """Submit a function; a lost machine, or other software there, is its future's error."""

@@ -53,11 +53,13 @@ def recorded_trajectories(
     flew = sorted({one.session for one in found})
     if len(flew) > 1:
         found = [one for one in found if one.session == flew[0]]
-        words = (
+        logging.getLogger(__name__).info(
             "%s: session %d, the first of %d that flew; "
-            "--session of log, plot and render takes another"
+            "--session of log, plot and render takes another",
+            path.name,
+            flew[0],
+            len(flew),
         )
-        logging.getLogger(__name__).info(words, path.name, flew[0], len(flew))
     found.sort(key=lambda one: (one.drone, one.episode))
     if episodes is None:
         return found

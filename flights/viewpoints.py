@@ -131,7 +131,13 @@ def _sequence(
     poses = _stacked([one.pose for one in episode], rows)
     low = (-config.aside, -config.aside, 0.0)
     moved = rng.uniform(low, config.aside, poses[..., :3].shape)
-    tilts = _tilts(poses.shape[:-1], config.tilt, rng)
+    # Rotations about any level axis.
+    shape = poses.shape[:-1]
+    axis = rng.uniform(-np.pi, np.pi, shape)
+    half = config.tilt * np.sqrt(rng.uniform(0, 1, shape)) / 2
+    x = np.sin(half) * np.cos(axis)
+    y = np.sin(half) * np.sin(axis)
+    tilts = np.stack((np.cos(half), x, y, np.zeros(shape)), axis=-1)
     states = {"position": poses[..., :3] + moved, "quaternion": multiplied(tilts, poses[..., 3:])}
     for name in ("goal", "payload"):
         if name in episode[0].telemetry:
@@ -145,12 +151,3 @@ def _stacked(arrays: Sequence[Floats], rows: Sequence[NDArray[np.int_]]) -> Floa
     """Some rows of the array of each drone, (T, A, n)."""
     chosen = [array[own] for array, own in zip(arrays, rows, strict=True)]
     return np.stack(chosen, axis=1)
-
-
-def _tilts(shape: tuple[int, ...], largest: float, rng: Generator) -> Floats:
-    """Rotations by up to an angle, rad, about any level axis, quaternions, (*shape, 4)."""
-    axis = rng.uniform(-np.pi, np.pi, shape)
-    half = largest * np.sqrt(rng.uniform(0, 1, shape)) / 2
-    x = np.sin(half) * np.cos(axis)
-    y = np.sin(half) * np.sin(axis)
-    return np.stack((np.cos(half), x, y, np.zeros(shape)), axis=-1)

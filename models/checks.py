@@ -144,12 +144,6 @@ class _Craft:
         return np.array(data.qpos[3:])
 
 
-def _angle(one: Array, other: Array) -> float:
-    """Angle between two attitudes, rad."""
-    apart = min(math.dist(one, other), math.dist(one, -other), 2.0)
-    return 4 * math.asin(apart / 2)
-
-
 class _Warned(Exception):
     """MuJoCo warned of something in a flight."""
 
@@ -245,8 +239,11 @@ def _physics_step(craft: _Craft) -> Checks:
     turn = min(max(0.1 * fastest, 1.0), _FASTEST_TURN)
     step = vehicle.timestep
     steps = round(min(max(_TURN / turn / step, 1), _MAX_STEPS / 2))
-    apart = _angle(craft.tumbled(turn, step, steps), craft.tumbled(turn, step / 2, 2 * steps))
-    yield _judged("physics step: error of attitude", math.degrees(apart) / (steps * step))
+    one = craft.tumbled(turn, step, steps)
+    other = craft.tumbled(turn, step / 2, 2 * steps)
+    apart = min(math.dist(one, other), math.dist(one, -other), 2.0)
+    angle = 4 * math.asin(apart / 2)
+    yield _judged("physics step: error of attitude", math.degrees(angle) / (steps * step))
 
 
 def _floor(craft: _Craft) -> Checks:

@@ -141,7 +141,9 @@ def _build(spec: MjSpec, file: VehicleFile) -> None:
         name = f"motor {rotor.name}"
         _add_geom(body, name, "cylinder", "silver", size, pos=place, group=seen, solid=True, **turn)
     _add_skids(body, half, unit, clearance)
-    _add_looks(body, half)
+    for name, (colour, sides, place) in _LOOKS["on_hub"].items():
+        size = np.multiply(half, sides)
+        _add_geom(body, name, "ellipsoid", colour, size, pos=np.multiply(half, place))
     radius = file.rotors.radius or 0.4 * _nearest([place for _, place in rotors], reach)
     for number, (rotor, place) in enumerate(rotors, 1):
         if not file.body.parts and math.hypot(*place[:2]) > half[0]:
@@ -218,12 +220,6 @@ def _add_skids(body: MjsBody, half: Vector, unit: float, clearance: float) -> No
             _add_geom(body, "", "capsule", "silver", (0.7 * thick,), fromto=(*top, x, y, low))
 
 
-def _add_looks(body: MjsBody, half: Vector) -> None:
-    for name, (colour, sides, place) in _LOOKS["on_hub"].items():
-        size = np.multiply(half, sides)
-        _add_geom(body, name, "ellipsoid", colour, size, pos=np.multiply(half, place))
-
-
 def _nearest(places: Sequence[Vector], reach: float) -> float:
     """Shortest distance between two rotors that are not above each other, m."""
     distances = [math.dist(a[:2], b[:2]) for a, b in combinations(places, 2)]
@@ -274,9 +270,9 @@ def _rotor_site(spec: MjSpec, file: VehicleFile, rotor: PlacedRotor, where: str)
         kind = "site"
         parts = spec.sites
     name = rotor.site or rotor.link or rotor.body
-    known = [part.name for part in parts]
-    if name not in known or name == "world":
-        words = ", ".join(one for one in known if one != "world")
+    known = [part.name for part in parts if part.name != "world"]
+    if name not in known:
+        words = ", ".join(known)
         raise InputError(f"{where}: expected a {kind} of the model's file: {words}, got {name!r}")
     if rotor.site is not None:
         return spec.site(name)

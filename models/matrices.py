@@ -17,8 +17,7 @@ def settled(values: ArrayLike, size: float = 1.0) -> Array:
 
     The last bits of what MuJoCo's compiler computes differ between processors.
     """
-    rounded: Array = np.round(np.asarray(values), 12 - round(math.log10(size))) + 0.0
-    return rounded
+    return np.round(np.asarray(values), 12 - round(math.log10(size))) + 0.0
 
 
 def product(a: Array, b: Array) -> Array:

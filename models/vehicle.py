@@ -200,17 +200,16 @@ class Vehicle:
         model = spec.compile()
         model.dof_damping[0:3] = self.model.dof_damping[0:3]
         model.geom_group[:] = craft_geoms(model)
-        if payload and self._meets(model, payload_radius(payload), cable):
-            clear = f"a payload with a radius of {payload_radius(payload):.3g} m hangs clear"
-            raise InputError(f"effects.cable: expected a length at which {clear}, got {cable:g} m")
+        if payload:
+            radius = payload_radius(payload)
+            data = MjData(model)
+            high = self.rest_height + 2 * (cable + radius)
+            data.qpos[7:10] = (0.0, 0.0, high - cable)
+            if _touches(model, data, high):
+                clear = f"a payload with a radius of {radius:.3g} m hangs clear"
+                expected = f"expected a length at which {clear}"
+                raise InputError(f"effects.cable: {expected}, got {cable:g} m")
         return model
-
-    def _meets(self, model: MjModel, radius: float, cable: float) -> bool:
-        """Whether a payload touches the craft when it hangs straight below."""
-        data = MjData(model)
-        high = self.rest_height + 2 * (cable + radius)
-        data.qpos[7:10] = (0.0, 0.0, high - cable)
-        return _touches(model, data, high)
 
     def __deepcopy__(self, memo: object) -> Self:
         """Itself: it never changes."""
@@ -336,7 +335,12 @@ def _load(path: Path, drag: float, changed: tuple[int, ...]) -> Vehicle:
     inertia = inertia_matrix(data.crb[body, :6])
     cameras = read_cameras(spec, model, data)
     rotors = tuple(_read_rotor(model, data, index) for index in range(model.nu))
-    allocation = _allocate(rotors, center)
+    columns = []
+    for rotor in rotors:
+        arm = np.array(rotor.position) - center
+        torque = np.cross(arm, rotor.axis) + rotor.reaction
+        columns.append((rotor.axis[2], *torque))
+    allocation = np.array(columns).T
     model.dof_damping[0:3] = drag * mass
     model.geom_group[:] = craft_geoms(model)  # see `SURROUNDINGS`
     return Vehicle(
@@ -356,16 +360,6 @@ def _load(path: Path, drag: float, changed: tuple[int, ...]) -> Vehicle:
         coefficients=_read_coefficients(model),
         file_cameras=cameras,
     )
-
-
-def _allocate(rotors: Sequence[Rotor], center: Array) -> Array:
-    """`Vehicle.allocation`, shape (4, R), of rotors about a center of mass, body frame, m."""
-    columns = []
-    for rotor in rotors:
-        arm = np.array(rotor.position) - center
-        torque = np.cross(arm, rotor.axis) + rotor.reaction
-        columns.append((rotor.axis[2], *torque))
-    return np.array(columns).T
 
 
 def _read_coefficients(model: MjModel) -> Coefficients:

@@ -409,8 +409,9 @@ def _camera(numbers: _Found, given: object, where: str) -> Camera:
     kinds = camera.kinds
     right = isinstance(kinds, Sequence) and kinds and all(kind in [*OUTPUTS] for kind in kinds)
     if not right:
-        words = ", ".join(OUTPUTS)
-        raise InputError(f"{where}.kinds: expected some of {words}, got {shortened(kinds)}")
+        raise InputError(
+            f"{where}.kinds: expected some of {', '.join(OUTPUTS)}, got {shortened(kinds)}"
+        )
     look = camera.look
     up = camera.up
     upright = math.hypot(*look[:2]) > 1e-6 * math.hypot(*look)

@@ -225,8 +225,7 @@ class Cameras:
         near = float(np.float32(self.model.vis.map.znear * extent))
         far = float(np.float32(self.model.vis.map.zfar * extent))
         meters = near * far / (near + depth.astype(np.float64) * (far - near))
-        limited: Array = np.minimum(meters, FARTHEST).astype(np.float32)
-        return limited
+        return np.minimum(meters, FARTHEST).astype(np.float32)
 
     def close(self) -> None:
         """Free the context. A second call does nothing."""
@@ -298,8 +297,7 @@ def own_discs(model: MjModel, camera: int) -> Array:
     materials = np.append(model.mat_rgba[:, 3], 1.0)[model.geom_matid]
     alpha = np.where(plain, materials, model.geom_rgba[:, 3])
     own = model.body_rootid[model.geom_bodyid] == root
-    discs: Array = np.flatnonzero(own & (alpha < 1))
-    return discs
+    return np.flatnonzero(own & (alpha < 1))
 
 
 def _add(body: MjsBody, name: str, kind: str, size: Sequence[float], **more: object) -> None:

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Iterator
 from fractions import Fraction
 from itertools import chain
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,7 +99,14 @@ def write_film(
 def _write_mp4(
     path: Path, frames: Iterator[Picture], size: tuple[int, int], fps: float, quality: int
 ) -> None:
-    ffmpeg = _ffmpeg()
+    ffmpeg = require("imageio_ffmpeg", "render", "an MP4 film")
+    try:
+        ffmpeg.get_ffmpeg_exe()
+    except RuntimeError:
+        raise OSError(
+            "ffmpeg: expected one that imageio-ffmpeg brings or finds, got none; "
+            "write a folder of PNGs"
+        ) from None
     options = ["-preset", "slow", "-crf", str(quality), "-movflags", "+faststart"]
     rate = Fraction(fps).limit_denominator(1001)
     writer = ffmpeg.write_frames(
@@ -108,7 +114,6 @@ def _write_mp4(
         ffmpeg_log_level="fatal", output_params=options,
     )  # fmt: skip
     sent = 0
-    written = -1
     try:
         writer.send(None)
         for frame in frames:
@@ -122,16 +127,3 @@ def _write_mp4(
         writer.close()
     if written != sent:
         raise OSError("ffmpeg: the film could not be written: is the disk full?")
-
-
-def _ffmpeg() -> ModuleType:
-    """The module. Raises `OSError` if it finds no program."""
-    module = require("imageio_ffmpeg", "render", "an MP4 film")
-    try:
-        module.get_ffmpeg_exe()
-    except RuntimeError:
-        raise OSError(
-            "ffmpeg: expected one that imageio-ffmpeg brings or finds, got none; "
-            "write a folder of PNGs"
-        ) from None
-    return module

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import mujoco
 
 from ..models.errors import NoOpenGL
-from .gl import Lines, columns
+from .gl import columns
 from .stage import Stage
 
 Press = Literal["pause", "step"]
@@ -59,7 +59,9 @@ class Window:
             self._stage.decorate(handle.user_scn)
         top = mujoco.mjtGridPos.mjGRID_TOPLEFT
         bottom = mujoco.mjtGridPos.mjGRID_BOTTOMLEFT
-        handle.set_texts([_text(top, self._stage.lines), _text(bottom, _HELP)])
+        font = mujoco.mjtFontScale.mjFONTSCALE_100
+        texts = [(font, top, *columns(self._stage.lines)), (font, bottom, *columns(_HELP))]
+        handle.set_texts(texts)
         handle.sync()
 
     def is_running(self) -> bool:
@@ -76,10 +78,6 @@ class Window:
     def _on_key(self, key: int) -> None:
         if key in KEYS:
             self._press(KEYS[key])
-
-
-def _text(place: mujoco.mjtGridPos, lines: Lines) -> tuple[object, ...]:
-    return mujoco.mjtFontScale.mjFONTSCALE_100, place, *columns(lines)
 
 
 def _viewer() -> Any:

@@ -45,7 +45,11 @@ def add_scene(spec: MjSpec, scene: str = "plain") -> None:
     if name == "airport":
         _add_airport(spec)
     elif name in GENERATORS:
-        _add_seeded(spec, name, seed)
+        # In place of the spec's sky, lights and the look of its level ground.
+        _clear(spec, _SEEDED_FAR, 20)
+        for light in spec.worldbody.lights:
+            light.active = False
+        GENERATORS[name](Builder(spec, name, seed))
     spec.compiler.discardvisual = False
 
 
@@ -79,14 +83,6 @@ def _add_airport(spec: MjSpec) -> None:
     visual.quality.shadowsize = min(visual.quality.shadowsize, _SHADOW_PIXELS)
     airport = MjSpec.from_file(str(AIRPORT_XML))
     spec.attach(airport, prefix="airport/", frame=spec.worldbody.add_frame())
-
-
-def _add_seeded(spec: MjSpec, name: str, seed: int) -> None:
-    """Put a scene of a seed in place of a spec's sky, lights and the look of its level ground."""
-    _clear(spec, _SEEDED_FAR, 20)
-    for light in spec.worldbody.lights:
-        light.active = False
-    GENERATORS[name](Builder(spec, name, seed))
 
 
 def _clear(spec: MjSpec, far: float, slices: int) -> None:

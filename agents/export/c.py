@@ -96,13 +96,22 @@ class _Program:
         self.size = flat_size(policy.spec)
         for layer in policy.network.layers:
             if isinstance(layer, Affine):
-                self._affine(layer)
+                units = len(layer.weight)
+                number = len(self.tables)
+                weight = self._table(f"weight_{number}", layer.weight)
+                outputs = f"x{number}"
+                arguments = f"{weight}, {self.at}, {self.size}, {outputs}, {units}"
+                self.lines += [f"float {outputs}[{units}];", f"rotorgram_layer({arguments});"]
+                self.at = outputs
+                self.size = units
             elif isinstance(layer, Relu):
                 self._each(f"{self.at}[i] = {self.at}[i] < 0.0f ? 0.0f : {self.at}[i];")
             else:
                 self._each(f"{self.at}[i] = rotorgram_tanh({self.at}[i]);")
         if policy.actions.discrete:
-            self._choose()
+            self.lines.append("action[0] = 0.0f;")
+            largest = f"{self.at}[(int)action[0]]"
+            self._each(f"action[0] = {self.at}[i] > {largest} ? (float)i : action[0];")
         else:
             self._act(policy)
 
@@ -113,21 +122,6 @@ class _Program:
     def _each(self, statement: str) -> None:
         """A loop over the numbers so far."""
         self.lines += [f"for (int i = 0; i < {self.size}; i++)", f"    {statement}"]
-
-    def _affine(self, layer: Affine) -> None:
-        units = len(layer.weight)
-        number = len(self.tables)
-        weight = self._table(f"weight_{number}", layer.weight)
-        outputs = f"x{number}"
-        arguments = f"{weight}, {self.at}, {self.size}, {outputs}, {units}"
-        self.lines += [f"float {outputs}[{units}];", f"rotorgram_layer({arguments});"]
-        self.at = outputs
-        self.size = units
-
-    def _choose(self) -> None:
-        self.lines.append("action[0] = 0.0f;")
-        largest = f"{self.at}[(int)action[0]]"
-        self._each(f"action[0] = {self.at}[i] > {largest} ? (float)i : action[0];")
 
     def _act(self, policy: NetworkPolicy) -> None:
         """Map the outputs to the range of the action, and clip them to its bounds."""
