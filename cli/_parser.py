@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import field, replace
 from inspect import cleandoc
 from types import UnionType
-from typing import Annotated, Any, Union, get_args, get_type_hints
+from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 import tyro
 from tyro.conf import arg
@@ -144,8 +144,7 @@ def _for_tyro(kind: type, options: type | None = None) -> Any:
     """
     changed: dict[str, object] = {}
     for name, hint in get_type_hints(kind, include_extras=True).items():
-        extras = getattr(hint, "__metadata__", (None,))  # of Annotated
-        plain = getattr(hint, "__origin__", hint) if hasattr(hint, "__metadata__") else hint
+        plain, *extras = get_args(hint) if get_origin(hint) is Annotated else (hint, None)
         if isinstance(plain, UnionType):
             changed[name] = Annotated[Union[get_args(plain)], *extras]  # noqa: UP007
     namespace: Options = {"__annotations__": changed, "__doc__": kind.__doc__}

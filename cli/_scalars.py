@@ -11,17 +11,11 @@ _PREFIX = "events.out.tfevents."
 _START = b"\x3a\x02\x08\x01"  # a SessionLog with the status START
 
 
-def _table() -> list[int]:
-    """CRC-32C of each byte."""
-    table = []
-    for crc in range(256):
-        for _ in range(8):
-            crc = crc >> 1 ^ (0x82F63B78 if crc & 1 else 0)
-        table.append(crc)
-    return table
-
-
-_CRC = _table()
+_CRC = []  # CRC-32C of each byte
+for _crc in range(256):
+    for _ in range(8):
+        _crc = _crc >> 1 ^ (0x82F63B78 if _crc & 1 else 0)
+    _CRC.append(_crc)
 
 
 class ScalarWriter:

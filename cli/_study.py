@@ -98,8 +98,10 @@ class StudyFlags(TrainingFlags, WorkersConfig):
 
     def given_of_study(self) -> Options:
         """Settings of the study that were given."""
-        values = {name: getattr(self, name) for name in _OF_STUDIES}
-        values = {name: value for name, value in values.items() if value is not None}
+        values = {}
+        for name in _OF_STUDIES:
+            if (value := getattr(self, name)) is not None:
+                values[name] = value
         if "seeds" in values:
             values.setdefault("episodes", 0)  # as many as the seeds need
         return values

@@ -59,9 +59,8 @@ def begin(command: "Train") -> int:
         )
     config = preset(command.algorithm, command.preset, task, **command.changes())
     backend = command.backend if "backend" in command.given else base.backend
-    env_config = command.env_config(backend=backend)  # it refuses wrong drones
     run = Run(
-        env=env_config,
+        env=command.env_config(backend=backend),  # it refuses wrong drones
         algorithm=command.algorithm,
         config=config,
         seed=command.seed,
@@ -191,9 +190,10 @@ class _Keeper:
     """When it is stored next, by the monotonic clock, s."""
 
     def __post_init__(self) -> None:
-        total = self.training.run.env_steps
-        behind = self.training.log.env_steps
-        self.scalars = ScalarWriter(self.folder / "tensorboard", total, behind=behind)
+        training = self.training
+        self.scalars = ScalarWriter(
+            self.folder / "tensorboard", training.run.env_steps, behind=training.log.env_steps
+        )
 
     def keep(self, *, now: bool, last: bool = False) -> None:
         at = self.training.log.env_steps

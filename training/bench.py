@@ -107,10 +107,10 @@ def bench(
 def policy_seconds() -> float:
     """Processor time of `rotorgram train ppo` on Hover-v0, from its start to its end, s."""
     with TemporaryDirectory() as folder:
-        out = str(Path(folder) / "policy")
-        command = (sys.executable, "-m", "rotorgram.cli", "train", "ppo", "--env", HOVER)
+        command = [sys.executable, "-m", "rotorgram.cli", "train", "ppo", "--env", HOVER]
+        command += ["--out", f"{folder}/policy"]
         before = os.times()
-        subprocess.run([*command, "--out", out], check=True, stdout=subprocess.DEVNULL)
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
         after = os.times()
     used = after.children_user - before.children_user
     return used + after.children_system - before.children_system

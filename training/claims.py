@@ -197,8 +197,7 @@ def _compare(
     evidence = f"{', '.join(parts)}; "
     if min(np.isfinite(numbers).sum() for numbers in values.values()) < MIN_SEEDS:
         return "undecided", f"{evidence}{_TOO_FEW}."
-    pair = values["A2C"], values["VPG"]
-    difference, low, high = bootstrap_difference(*pair, level=LEVEL)
+    difference, low, high = bootstrap_difference(values["A2C"], values["VPG"], level=LEVEL)
     evidence += f"difference {_number(difference)}, {_INTERVAL} {_range(low, high)}"
     if low <= 0.0 <= high:
         return "undecided", f"{evidence}."

@@ -202,8 +202,7 @@ def measure_run(evaluations: DataFrame, headline: Headline) -> Measures:
     means = {name: float(final[name].mean()) for name in MEANS}
     safe = headline.counts_crashes or not crashed.any()
     whole = bool(final["steady"].notna().all())
-    steps = nan
-    seconds = nan
+    steps = seconds = nan
     if evaluations["env_steps"].max() > 0 and headline.held is not None:
         steps, seconds = first_lasting_snapshot(evaluations, headline)
     return {

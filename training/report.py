@@ -29,8 +29,9 @@ def write_report(results: Results) -> pd.DataFrame:
     require("matplotlib", "report", "a report")
     folder = results.folder
     if results.runs.empty and (folder / "runs.csv").exists():
-        expected = "the folder runs, with a file for each run"
-        raise ResultsError(f"{folder}: expected {expected}, got runs.csv alone")
+        raise ResultsError(
+            f"{folder}: expected the folder runs, with a file for each run, got runs.csv alone"
+        )
     table = results_table(results)
     table.to_csv(folder / "results.csv")
     if len(results.runs):

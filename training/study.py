@@ -65,7 +65,8 @@ def run_study(
             is written.
     """
     jobs = {
-        name: (_with_files(row), seed)
+        # A worker may not have the files of the vehicle.
+        name: (replace(row, env=row.env.embedded()), seed)
         for name, (row, seed) in study.runs().items()
         if not results.run_file(folder, row, seed).exists()
     }
@@ -77,12 +78,6 @@ def run_study(
         own_tasks = {row.env.own_task for row in study.rows if row.env.own_task}
         fly = partial(_fly, study, own_tasks)
         run_jobs(executor, fly, jobs, partial(_keep, study, folder), on_progress)
-
-
-def _with_files(row: Row) -> Row:
-    """A row for a worker that may not have the files of its vehicle."""
-    env = row.env.embedded()
-    return row if env is row.env else replace(row, env=env)
 
 
 def _keep(study: Study, folder: Path, job: Job, done: Done) -> None:
@@ -167,8 +162,7 @@ def _evaluate(
         parts = []
         for each in flown:
             values = {"value": each.headline[1:], "thrust": each.mean_thrust[1:]}
-            steps = _steps("evaluation", episode=each.episode, reward=each.rewards, **values)
-            parts.append(steps)
+            parts.append(_steps("evaluation", episode=each.episode, reward=each.rewards, **values))
         tables["steps"] = pd.concat(parts, ignore_index=True)
     return tables
 

@@ -262,8 +262,10 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Observation, ArrayL
             whole: int = check("num_envs", Limits(1, most, whole=True), num_envs)
             drones, left = divmod(whole, num_simulators)
             if left:
-                expected = f"a multiple of num_simulators = {num_simulators}"
-                raise InputError(f"num_envs: expected {expected}, got {num_envs}")
+                raise InputError(
+                    f"num_envs: expected a multiple of num_simulators = {num_simulators}, "
+                    f"got {num_envs}"
+                )
             self.num_envs = whole
         config = AgentConfig(drones=drones, slots=num_simulators, **settings)
         self._open(address, config, connect)
@@ -452,8 +454,10 @@ def _checked_actions(action: ArrayLike, dtype: np.dtype, shape: tuple[int, ...])
     kinds = "iuf" if is_real else "iu"
     if array.shape != shape or array.dtype.kind not in kinds:
         numbers = "real" if is_real else "whole"
-        got = f"{array.dtype} of shape {array.shape}"
-        raise InputError(f"action: expected {numbers} numbers of shape {shape}, got {got}")
+        raise InputError(
+            f"action: expected {numbers} numbers of shape {shape}, "
+            f"got {array.dtype} of shape {array.shape}"
+        )
     with np.errstate(over="ignore", under="ignore"):  # independent of the program's settings
         sent = array.astype(dtype)  # an overflow is infinite, and refused as such
     if not is_real and (sent != array).any():

@@ -122,8 +122,9 @@ def _connect(env: Remote, process: subprocess.Popen[bytes]) -> None:
             if process.poll() is not None:
                 raise
             if time.monotonic() > deadline:
-                said = f"the simulator runs, and did not connect in {_START_TIMEOUT:g} s"
-                raise PeerSilent(said) from error
+                raise PeerSilent(
+                    f"the simulator runs, and did not connect in {_START_TIMEOUT:g} s"
+                ) from error
 
 
 _cached: dict[str, tuple[Remote, ExitStack]] = {}

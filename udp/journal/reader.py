@@ -230,8 +230,9 @@ class Recording:
                     if isinstance(message, Hello):
                         layout_of(EnvSpec.from_json(message.spec), message.worlds)
                 except (ValueError, KeyError, TypeError, RecursionError, DecodeError) as error:
-                    wrong = "a message that cannot be read"
-                    raise InputError(f"{self.path}: {wrong}: {error}") from None
+                    raise InputError(
+                        f"{self.path}: a message that cannot be read: {error}"
+                    ) from None
                 if isinstance(message, Hello):
                     count += 1
                     codec = str(words.get("codec", ""))

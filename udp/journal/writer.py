@@ -75,8 +75,9 @@ class Journal:
         try:
             self._file: Any = self._path.open("xb", buffering=_BUFFER)
         except FileExistsError:
-            sentence = f"record: expected a file that does not exist yet, got {path}"
-            raise FileExistsError(sentence) from None
+            raise FileExistsError(
+                f"record: expected a file that does not exist yet, got {path}"
+            ) from None
         writer: Any = Writer(self._file, chunk_size=sys.maxsize, use_summary_offsets=False)
         self._writer = writer
         with removed_on_error(self._path), self._writing():

@@ -106,8 +106,10 @@ def read_key(path: Path | str) -> bytes:
     except OSError as error:
         raise InputError(f"key file: cannot read {path}: {error.strerror}") from None
     if is_file and mode & 0o077:
-        expected = f"{path} to be readable by its owner alone (chmod 600)"
-        raise InputError(f"key file: expected {expected}, got mode {mode & 0o777:o}")
+        raise InputError(
+            f"key file: expected {path} to be readable by its owner alone (chmod 600), "
+            f"got mode {mode & 0o777:o}"
+        )
     try:
         (line,) = text.decode("ascii").split()
         key = bytes.fromhex(line)

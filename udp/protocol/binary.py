@@ -241,9 +241,7 @@ def _decode_step(
     at = record.slots[0].at
     if numbers is None or not isfinite(sum(numbers.unpack_from(data, at), time)):
         _check_numbers(data, time, record, layout)
-    arrays = []
-    for slot in record.slots:
-        arrays.append(np.ndarray(slot.shape, slot.dtype, data, slot.at))
+    arrays = [np.ndarray(slot.shape, slot.dtype, data, slot.at) for slot in record.slots]
     if kind == COMMAND:
         actions, orders, *seeds = arrays
         return Command(
@@ -346,8 +344,10 @@ def _take_extensions(data: bytes, at: int) -> tuple[Extension, ...]:
         at += _EXTENSION.size
         value = data[at : at + size]
         if len(value) < size or size > MAX_TEXT:
-            expected = f"at most {MAX_TEXT} bytes, all {size} of them"
-            raise InputError(f"extension: expected {expected}, got {len(value)}")
+            raise InputError(
+                f"extension: expected at most {MAX_TEXT} bytes, all {size} of them, "
+                f"got {len(value)}"
+            )
         extensions.append(Extension(number & ~_CRITICAL, value, bool(number & _CRITICAL)))
         at += size
     return tuple(extensions)

@@ -276,15 +276,15 @@ class Client:
     def close(self, reason: str, now: float) -> None:
         """End the exchange. An agent that has welcomed this simulator is told, until it answers."""
         if ("sent", Close) in SIMULATOR[self.state]:
-            session = self.hello.session
             number = self.sequence
-            self._send(Close(session=session, sequence=number, reason=one_line(reason)), now)
+            close = Close(session=self.hello.session, sequence=number, reason=one_line(reason))
+            self._send(close, now)
         elif self.state != "closing":
             self._give_up()  # a Hello that was not answered is not repeated
 
     def receive(self, datagram: bytes, now: float) -> Message | None:
         """Take a datagram from the agent; the message, if it moves the exchange on."""
-        if self._dice and self._is_lost():
+        if self._is_lost():
             return None
         self.statistics.counters["received"] += 1
         if self.state == "waiting" and self._is_plain:
@@ -426,8 +426,7 @@ class Client:
         self.state = SIMULATOR["waiting"]["received", Command]
         self._forget_transfer()
         self._answered_at = now
-        if self.tap:
-            self._record(command, plain)
+        self._record(command, plain)
         self.statistics.round_trips.append(now - self.asked_at)
         self._round_trips.answered(now)
 
@@ -486,12 +485,8 @@ class Client:
         """Send a message and repeat it until it is answered."""
         kind = type(message)
         after = SIMULATOR[self.state]["sent", kind]
-        if isinstance(message, State) and not self.by_text:
-            data = binary.encode_step(message, self.layout)
-        else:
-            data = self._encode(message)
-        if self.tap:
-            self._record(message, data)
+        data = self._encode(message)
+        self._record(message, data)
         self._transfer = transfer = Transfer(data, self.largest)
         self.state = after
         self.sequence = 0 if isinstance(message, Hello) else message.sequence

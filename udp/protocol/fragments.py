@@ -69,8 +69,6 @@ class Transfer:
 
     def probe(self) -> list[bytes]:
         """The datagrams that ask for an answer when none has come in time."""
-        if self.count == 1:
-            return [self.message]
         return self._send(self._burst[-1:]) if self._burst else self.start()
 
     def _send(self, numbers: list[int]) -> list[bytes]:

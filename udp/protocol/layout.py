@@ -115,8 +115,9 @@ class Layout:
         self.seeded_command = self.command._replace(slots=slots, size=slots[-1].end)
         size = max(self.state.size, self.seeded_command.size)
         if size > MAX_MESSAGE:
-            most = f"States and Commands of at most {MAX_MESSAGE} bytes"
-            raise InputError(f"expected {most}, got {size}")
+            raise InputError(
+                f"expected States and Commands of at most {MAX_MESSAGE} bytes, got {size}"
+            )
 
 
 def _slots(at: int, drones: int, arrays: Sequence[ArrayLayout]) -> tuple[Slot, ...]:

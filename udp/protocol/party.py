@@ -403,8 +403,7 @@ class SeveralAgents(WorldRules):
 
     def _let_go(self, link: AgentLink) -> None:
         """Note that its drones hold until the end of the episode."""
-        absence = Absence(link.number, self.episodes, self.steps, link.participation)
-        self.absences.append(absence)
+        self.absences.append(Absence(link.number, self.episodes, self.steps, link.participation))
 
     def _is_out(self, link: AgentLink) -> bool:
         """Whether all of its drones are out."""

@@ -200,8 +200,9 @@ class Server:
         shared = self._key
         if not is_sealed(datagram):
             if shared:
-                words = "key: this agent has one (--key-file), and the simulator has none"
-                raise _KeyMismatch(words)
+                raise _KeyMismatch(
+                    "key: this agent has one (--key-file), and the simulator has none"
+                )
             return datagram
         if shared is None:
             raise _KeyMismatch("key: this agent has none (--key-file), and the simulator has")

@@ -117,8 +117,7 @@ class Session:
             orders=orders,
             seeds=seeds,
         )
-        layout = self.layout
-        data = text.encode(command) if self.is_text else binary.encode_step(command, layout)
+        data = text.encode(command) if self.is_text else binary.encode_step(command, self.layout)
         self.state = after
         self.asked_at = self.heard_at = now
         self.reply = reply = Transfer(data, self._largest)
@@ -128,8 +127,7 @@ class Session:
             outbox.statistics.counters["sent"] += 1
         else:
             outbox.put(reply.start(), self.peer, self.key)
-        if outbox.tap:
-            self._record(command, data)
+        self._record(command, data)
 
     def send_close(self, reason: str) -> None:
         """End the exchange."""
@@ -188,8 +186,7 @@ class Session:
         self.sequence = state.sequence
         self.state = AGENT["expecting"]["received", State]
         self.outbox.statistics.round_trips.append(now - self.asked_at)
-        if self.outbox.tap:
-            self._record(state, plain)
+        self._record(state, plain)
         return Event(self.slot, state)
 
     def receive(self, message: Message, plain: bytes, now: float) -> Event | None:

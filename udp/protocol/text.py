@@ -45,8 +45,9 @@ def check_layout(layout: Layout) -> None:
         raise InputError(f"text codec: expected one drone, got {layout.drones}: use binary")
     if [_is_flat(array) for array in arrays] != [True]:
         got = ", ".join(f"{array.dtype} of shape {array.shape}" for array in arrays)
-        expected = "one flat array of float32 as observation"
-        raise InputError(f"text codec: expected {expected}, got {got}: use binary")
+        raise InputError(
+            f"text codec: expected one flat array of float32 as observation, got {got}: use binary"
+        )
     if not (action is None or _is_flat(action)):
         raise InputError(f"text codec: expected flat actions of float32, got {action}: use binary")
     state = 1 + arrays[0].shape[0] + sum(telemetry_sizes(layout))  # the reward is a number too
@@ -146,10 +147,9 @@ def decode_state(datagram: bytes, layout: Layout) -> State | Close:
         )
     numbers = np.array([_floats("state: telemetry", fields[3 + size :])])
     telemetry = np.split(numbers, np.cumsum(sizes)[:-1], axis=1) if sizes else []
-    shaped = []
     converted = _converted(telemetry, layout, to_paper=False)
-    for array, slot in zip(converted, layout.telemetry_slots, strict=True):
-        shaped.append(array.reshape(slot.shape))
+    slots = layout.telemetry_slots
+    shaped = [array.reshape(slot.shape) for array, slot in zip(converted, slots, strict=True)]
     return State(
         session=0,
         sequence=sequence,
@@ -170,10 +170,12 @@ def decode_command(datagram: bytes, layout: Layout, session: int) -> Command | C
     actions = layout.actions
     size = prod(actions.shape)
     reset = fields[0] == "reset"
-    expected = f"sequence,reset[,seed] or sequence and {size} of action"
     fits = len(fields) <= 2 if reset else len(fields) == size
     if not fits:
-        raise DecodeError(f"command: expected {expected}, got {datagram[:80]!r}")
+        raise DecodeError(
+            f"command: expected sequence,reset[,seed] or sequence and {size} of action, "
+            f"got {datagram[:80]!r}"
+        )
     if reset:
         order = RESET
         action = actions.zeros()

@@ -96,8 +96,10 @@ class AgentConfig:
             wanted = "one drone" if self.drones == 1 else f"{self.drones} drones"
             return f"expected a simulator of {wanted}, got one of {drones}"
         if self.vehicle_hash is not None and spec.vehicle_hash != self.vehicle_hash:
-            got = f"{spec.vehicle} of {spec.vehicle_hash}"
-            return f"expected a vehicle of hash {self.vehicle_hash}, got {got}"
+            return (
+                f"expected a vehicle of hash {self.vehicle_hash}, "
+                f"got {spec.vehicle} of {spec.vehicle_hash}"
+            )
         if self.options is not None:
             expected = self._expected_options(env_id)
             got_options = dict(spec.options)
@@ -295,8 +297,9 @@ class Agent:
             if session is None:
                 lost = self.lost[slot]
                 nobody = f"{lost}; no other" if lost else "no simulator"
-                seconds = f"{config.connect_timeout:g} s"
-                raise PeerSilent(f"{nobody} came to {here} for {seconds}{dropped}")
+                raise PeerSilent(
+                    f"{nobody} came to {here} for {config.connect_timeout:g} s{dropped}"
+                )
             if now < session.heard_at + config.timeout:  # it computes
                 self._deadlines[slot] = session.heard_at + config.timeout
                 continue
@@ -324,7 +327,8 @@ def _spec_difference(ours: EnvSpec, theirs: EnvSpec) -> str:
     """Difference between a simulator and earlier ones, in a sentence; "" if there is none."""
     if ours.options != theirs.options:
         return f"options: {options_difference(ours.options, theirs.options)}"
-    for name in (field.name for field in fields(EnvSpec)):
+    for field in fields(EnvSpec):
+        name = field.name
         expected = getattr(ours, name)
         got = getattr(theirs, name)
         if expected != got and name not in ("vehicle", "marks"):
@@ -359,5 +363,4 @@ def _flush(server: Server, port: Port) -> None:
             port.send(datagram, address)
         except OSError:  # as good as lost: the simulator asks again, or the wait ends in time
             outbox.statistics.counters["unsent"] += 1
-    if outbox.statistics.notices:
-        log_notices(outbox.statistics)
+    log_notices(outbox.statistics)

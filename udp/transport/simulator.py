@@ -163,8 +163,7 @@ class Simulator(NotCopied):
             KeyboardInterrupt: Ctrl-C.
         """
         if self._ran:
-            name = type(self).__name__
-            raise ValueError(f"run: expected one call for each {name}, got another")
+            raise ValueError(f"run: expected one call for each {type(self).__name__}, got another")
         self._ran = True
         reason = "the simulator was stopped"
         finished = threading.Event()
@@ -273,8 +272,7 @@ class Simulator(NotCopied):
                 except OSError as error:  # a full buffer or no network: as good as lost
                     client.statistics.counters["unsent"] += 1
                     link.trouble = _words(error, "sending")
-            if client.statistics.notices:
-                log_notices(client.statistics)
+            log_notices(client.statistics)
 
     def _say_alive(self, finished: threading.Event) -> None:
         """In a thread: tell agents that wait for a State that it will come."""
@@ -290,8 +288,7 @@ class Simulator(NotCopied):
 
         link = self.link
         codec = "text" if link.by_text else "binary"
-        about = about_of(self.stepped)
-        self._journal = Journal(path, side="simulator", codec=codec, about=about)
+        self._journal = Journal(path, side="simulator", codec=codec, about=about_of(self.stepped))
         link.tap = self._journal.tap
         if link.by_text:  # says no Hello
             link.tap(0, link.hello, binary.encode(link.hello))

@@ -121,9 +121,10 @@ class GymnasiumWorld:
                 observation[array.name] if isinstance(observation, dict) else observation
             )
             if value.shape != array.shape or value.dtype != array.dtype:
-                expected = f"{array.dtype} of shape {array.shape}"
-                got = f"{value.dtype} of shape {value.shape}"
-                raise InputError(f"observation {array.name}: expected {expected}, got {got}")
+                raise InputError(
+                    f"observation {array.name}: expected {array.dtype} of shape {array.shape}, "
+                    f"got {value.dtype} of shape {value.shape}"
+                )
             self.observations[array.name][0] = value
         for array in self.spec.telemetry:
             numbers = [info[name] for name in component_names(array)]
