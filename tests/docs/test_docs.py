@@ -42,6 +42,15 @@ def test_the_page_of_results_has_what_committed_flights_say(name: str) -> None: 
     check("results", command, *rows)
 
 
+def test_the_page_of_swarms_has_what_committed_flights_say() -> None:  # fault 67
+    results = Results.read(RESULTS / "swarms")
+    lines = markdown(results, results_table(results)).splitlines()
+    check("swarm_baselines", results.config["command"], *[x for x in lines if x.startswith("|")])
+    named = list((RESULTS / "swarms" / "checkpoints").iterdir())
+    trained = [row for row in results.config["study"]["row"] if row["agent"] != "orca"]
+    assert len(named) == len(trained)
+
+
 def test_the_page_of_results_has_the_comparison_of_three_agents() -> None:
     table = (RESULTS / "tuned" / "results.md").read_text().split("\n\n")[0]
     assert table in page("results")
