@@ -27,7 +27,7 @@ from .stages.record import Mask, Record
 from .telemetry import telemetry_of
 
 LANES = 64  # Worlds of a block: their numbers fit into the nearest cache
-MOST = 36_000  # Operations of a step: more take too long to compile
+MOST = 30_000  # Operations of a step but those of functions: more take too long to compile
 _FIRST, _CONTROL, _PUSH, _BEGIN, _LAST = "first", "control", "push", "begin", "last"
 """Code before the physics of a step, between two of its calls, for episodes that begin, and after.
 A step whose physics is array code is the last alone."""
@@ -84,7 +84,7 @@ class Machine:
         self._calls = [(_before(call), call) for call in loop.pipeline.flight.calls()]
         self._calls[0] = _FIRST, self._calls[0][1]
         steps = self._regions()
-        size = sum(one.size() for regions in steps.values() for one in regions)
+        size = sum(len(one.operations()) for regions in steps.values() for one in regions)
         if size > MOST:
             most = f"expected at most {MOST:,}"
             raise Untraceable(f"a step of {size:,} operations is not compiled: {most}")

@@ -83,12 +83,6 @@ class Region(NamedTuple):
         """What the stores need, in order."""
         return self.program.needed(value for _, _, value in self.stores)
 
-    def size(self) -> int:
-        """How many operations are printed, those of its functions once."""
-        own = self.operations()
-        functions = {value.inputs[0] for value in own if value.operation == "call"}
-        return len(own) + sum(len(one.program.needed(one.results)) for one in functions)
-
 
 @cache
 def _llvm() -> Any:

@@ -324,15 +324,14 @@ def _where(like: TracedArray, flag: Any, first: Any, second: Any) -> Traced:
 
 
 def _extreme(is_before: Call, is_not_before: Call) -> Call:
-    """A NaN stays, and of 0 and -0 it is the second. Of a constant that is no NaN less is asked."""
+    """A NaN stays, and of 0 and -0 it is the second. Of a second constant less is asked."""
 
     def extreme(like: TracedArray, a: Any, b: Any) -> Traced:
-        plain = [not isinstance(one, TracedArray) and np.all(one == one) for one in (a, b)]
+        is_plain = not isinstance(b, TracedArray) and np.all(b == b)
         a, b = like._alike((a, b))
-        if plain[1]:
+        if is_plain:
             return _where(like, is_not_before(a, b), b, a)
-        chosen = _where(like, is_before(a, b), a, b)
-        return chosen if plain[0] else _where(like, a != a, a, chosen)
+        return _where(like, a != a, a, _where(like, is_before(a, b), a, b))
 
     return extreme
 

@@ -145,7 +145,7 @@ def test_a_task_has_the_preset_of_the_task_that_it_derives_from() -> None:
 def test_train_says_where_no_preset_fits(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["train", "ippo", "--env", "rotorgram/Hover-v0", "--env-steps", "1024"]
+    words = ["train", "ippo", "--env", "rotorgram/Hover-v0", "--env-steps", "1280"]
     assert main([*words, "--out", str(tmp_path / "a")]) == 0
     out = capsys.readouterr().out
     assert "there is no preset of ippo for rotorgram/Hover-v0" in out
@@ -155,4 +155,4 @@ def test_train_says_where_no_preset_fits(
     assert "note: there is no preset" not in capsys.readouterr().out
     kept = load(tmp_path / "b" / "checkpoint.safetensors")
     assert kept.config["hidden"] == [64, 64]
-    assert kept.num_envs == 32
+    assert kept.num_envs == 160

@@ -241,7 +241,9 @@ def _decode_step(
     at = record.slots[0].at
     if numbers is None or not isfinite(sum(numbers.unpack_from(data, at), time)):
         _check_numbers(data, time, record, layout)
-    arrays = [np.ndarray(slot.shape, slot.dtype, data, slot.at) for slot in record.slots]
+    arrays = []
+    for slot in record.slots:
+        arrays.append(np.ndarray(slot.shape, slot.dtype, data, slot.at))
     if kind == COMMAND:
         actions, orders, *seeds = arrays
         return Command(

@@ -127,7 +127,8 @@ class Session:
             outbox.statistics.counters["sent"] += 1
         else:
             outbox.put(reply.start(), self.peer, self.key)
-        self._record(command, data)
+        if outbox.tap:
+            self._record(command, data)
 
     def send_close(self, reason: str) -> None:
         """End the exchange."""
@@ -186,7 +187,8 @@ class Session:
         self.sequence = state.sequence
         self.state = AGENT["expecting"]["received", State]
         self.outbox.statistics.round_trips.append(now - self.asked_at)
-        self._record(state, plain)
+        if self.outbox.tap:
+            self._record(state, plain)
         return Event(self.slot, state)
 
     def receive(self, message: Message, plain: bytes, now: float) -> Event | None:

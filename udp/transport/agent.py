@@ -363,4 +363,5 @@ def _flush(server: Server, port: Port) -> None:
             port.send(datagram, address)
         except OSError:  # as good as lost: the simulator asks again, or the wait ends in time
             outbox.statistics.counters["unsent"] += 1
-    log_notices(outbox.statistics)
+    if outbox.statistics.notices:
+        log_notices(outbox.statistics)

@@ -272,7 +272,8 @@ class Simulator(NotCopied):
                 except OSError as error:  # a full buffer or no network: as good as lost
                     client.statistics.counters["unsent"] += 1
                     link.trouble = _words(error, "sending")
-            log_notices(client.statistics)
+            if client.statistics.notices:
+                log_notices(client.statistics)
 
     def _say_alive(self, finished: threading.Event) -> None:
         """In a thread: tell agents that wait for a State that it will come."""
