@@ -324,7 +324,7 @@ def _where(like: TracedArray, flag: Any, first: Any, second: Any) -> Traced:
 
 
 def _extreme(is_before: Call, is_not_before: Call) -> Call:
-    """A NaN stays, and of 0 and -0 it is the second. Of a second constant less is asked."""
+    """A NaN stays, and of 0 and -0 it is the second. A constant as the second needs less."""
 
     def extreme(like: TracedArray, a: Any, b: Any) -> Traced:
         is_plain = not isinstance(b, TracedArray) and np.all(b == b)
