@@ -1,7 +1,7 @@
 """Presets: hyperparameters of an algorithm for a task, from `presets.toml`."""
 
 from collections.abc import Iterator
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal
@@ -86,6 +86,8 @@ def find_preset(algorithm: str, name: str, env_id: str = DEFAULT_TASK) -> Preset
     task = found or DEFAULT_TASK
     settings = dict(tables.get(task, {}))
     flight = {name: settings.pop(name) for name in _FLIGHT if name in settings}
+    if not found:  # no other task was flown without contact
+        flight.pop("backend", None)
     config = row.config(**settings)
     return Preset(config=config, env_id=task, fits=found is not None, **flight)
 
@@ -93,5 +95,5 @@ def find_preset(algorithm: str, name: str, env_id: str = DEFAULT_TASK) -> Preset
 def preset(algorithm: str, name: str, env_id: str = DEFAULT_TASK, **changes: Any) -> Config:
     """Hyperparameters of a preset, with some of them changed. Raises `InputError`."""
     base = find_preset(algorithm, name, env_id).config
-    check_names(changes, (field.name for field in fields(base)), "hyperparameters")
+    check_names(changes, vars(base), "hyperparameters")
     return replace(base, **changes)

@@ -15,6 +15,7 @@ from typing import IO, Any
 from ..envs import registry
 from ..envs.config import EnvConfig
 from ..models import InputError
+from ..rendering.gl import hidden_gl_setting
 from .protocol.client import Address
 from .protocol.errors import PeerClosed, PeerSilent
 from .remote import RemoteEnv, RemoteVectorEnv
@@ -99,11 +100,16 @@ def start_simulator(
             "env: expected a task of a module, for the simulator's process to import, got "
             f"{config.env_id} of this program"
         )
-    content = config.embedded().to_dict()
-    arguments: dict[str, object] = {"config": content, "module": config.module}
-    arguments |= {"server": server, "bind": ("127.0.0.1", 0), **settings}
-    # A second thread of torch makes small tensors slower, and takes the agent's core.
-    around = {"OMP_NUM_THREADS": "1", **os.environ, "PYTHONSAFEPATH": "1"}
+    arguments = {
+        "config": config.embedded().to_dict(),
+        "module": config.module,
+        "server": server,
+        "bind": ("127.0.0.1", 0),
+        **settings,
+    }
+    with hidden_gl_setting():  # a simulator without cameras starts sooner
+        # A second thread of torch makes small tensors slower, and takes the agent's core.
+        around = {"OMP_NUM_THREADS": "1", **os.environ, "PYTHONSAFEPATH": "1"}
     process = subprocess.Popen(_COMMAND, stdin=subprocess.PIPE, stderr=stderr, env=around)
     assert process.stdin is not None
     with suppress(BrokenPipeError):  # it has ended: its exit status says so

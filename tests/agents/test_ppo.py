@@ -60,8 +60,7 @@ def test_every_epoch_takes_every_transition_once() -> None:
 
 def test_the_tuned_preset_depends_on_the_task() -> None:
     ours = find_preset("ppo", "tuned", "rotorgram/Elevation-v0")
-    assert ours.num_envs == 32
-    assert ours.env_steps == 41_000
+    assert (ours.num_envs, ours.env_steps, ours.backend) == (64, 36_000, "rigid")
     assert ours.config.hidden == (16,)
     hover = find_preset("ppo", "tuned", "rotorgram/Hover-v0")
     assert hover.num_envs == 64
@@ -71,7 +70,8 @@ def test_the_tuned_preset_depends_on_the_task() -> None:
     assert racing.num_envs == 512
     assert racing.backend == "rigid"
     assert racing.config.hidden == (48, 48)
-    assert find_preset("ppo", "tuned", "other/Task-v0") == replace(ours, fits=False)
+    other = find_preset("ppo", "tuned", "other/Task-v0")
+    assert other == replace(ours, fits=False, backend="mujoco")  # it may need contact
     swarm = find_preset("ippo", "tuned", "rotorgram/Formation-v0")
     assert (swarm.num_envs, swarm.env_steps, swarm.backend) == (160, 2_000_000, "rigid")
     assert swarm.config.reward_clip == 2.0
@@ -97,9 +97,9 @@ def test_training_by_the_command_takes_the_preset_s_drones_and_loads_nothing_slo
     told = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     assert told.stdout.splitlines()[-1] == "[]"
     kept = load(folder / "checkpoint.safetensors")
-    assert kept.num_envs == 32
+    assert kept.num_envs == 64
     assert kept.algorithm == "ppo"
-    assert 2100 <= kept.position.env_steps < 2132
+    assert 2100 <= kept.position.env_steps < 2164
 
 
 @pytest.mark.parametrize("algorithm", ["vpg", "a2c"])
