@@ -156,8 +156,8 @@ def test_the_reliability_page_tells_what_links_carried() -> None:
 
 
 def test_the_performance_page_tells_what_was_measured() -> None:
-    bench, hover, peers, waiting = (
-        result(f"performance/{name}") for name in ("bench", "time_to_hover", "peers", "waiting")
+    bench, peers, waiting = (
+        result(f"performance/{name}") for name in ("bench", "peers", "waiting")
     )
     rates = bench["medians"]
     rows = [f"{rate:,.0f} | {1e6 / rate:.2f}" for rate in rates.values()]
@@ -170,13 +170,14 @@ def test_the_performance_page_tells_what_was_measured() -> None:
     for row in waiting["rows"]:
         looks = row["medians"]["looks"]
         rows.append(f"{row['neighbours']} | {looks:.0f} | {row['medians']['sleeps']:.0f}")
-    settings = hover["settings"]
-    rows += [f"{one['wall_seconds']:.1f} | {one['worst_error']:.3f}" for one in settings]
+    for name in ("seconds_elevation", "performance/seconds_a2c", "performance/seconds_sb3_a2c"):
+        found = result(name)
+        worst = max(seed["steady"] for seed in found["seeds"])
+        held = f"{found['hold']} of {found['of']}"
+        rows.append(f"{found['seconds']['median']:.3g} | {worst:.2g} | {held}")
     rows += [f"{rate:,.0f}" for rate in peers["env_steps_per_second"].values()]
     trained = f"`rotorgram train ppo --env rotorgram/Hover-v0` | {bench['policy_seconds']:.2f} s"
     check("performance", trained, *(f"| {row} |" for row in rows))
-    assert settings[0]["wall_seconds"] <= 20
-    assert settings[0]["reached"]
 
 
 def test_the_scaling_page_tells_what_was_measured() -> None:
