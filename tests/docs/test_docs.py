@@ -89,10 +89,16 @@ def test_the_seeds_of_vpg_that_do_not_hold_are_those_that_were_measured() -> Non
         assert f"| {row.seed} | {row[2]} | {slopes} |" in text
 
 
-def test_the_speeds_are_those_of_the_benchmark() -> None:
-    speed = result("training_speed")
+@pytest.mark.parametrize(
+    "name",
+    ["training_speed", "performance/training_speed_64", "performance/training_speed_64_in_process"],
+)
+def test_the_speeds_are_those_of_the_benchmark(name: str) -> None:
+    speed = result(name)
     for agent, median in speed["medians"].items():
-        check("results", f"| `{agent}` | {median:,.0f} | {speed['ratio_to_sb3'][agent]:.2f} |")
+        ratio = f"{median:,.0f} | {speed['ratio_to_sb3'][agent]:.2f}"
+        start = rf"\| `{agent}` \| .*\(results/{name}\.json\)\)"
+        assert re.search(rf"{start} \| {re.escape(ratio)} \|", page("results"))
 
 
 def test_the_protocol_says_where_the_numbers_of_a_state_are() -> None:
