@@ -195,9 +195,7 @@ def _waiting(
     from ..udp import RemoteVectorEnv
 
     if command.vehicle is not None:
-        from ..models.fleet import load_vehicles  # an agent needs no MuJoCo otherwise
-
-        settings["vehicle_hash"] = load_vehicles(command.vehicle, command.drones).hash
+        settings["vehicle_hash"] = command.env_config().load_vehicle().hash
     remote = RemoteVectorEnv(
         parse_address(listen),
         num_envs=num_envs,

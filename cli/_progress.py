@@ -35,18 +35,6 @@ def bars() -> Iterator["OnProgress"]:
         yield shown
 
 
-@contextmanager
-def frame_bar(name: str) -> Iterator[Callable[[int, int], None]]:
-    """A function that shows how many frames of a film are drawn: (done, total)."""
-    with bars() as show:
-
-        def show_frame(done: int, total: int) -> None:
-            words = "done" if done == total else "frames"
-            show(name, done, total, words)
-
-        yield show_frame
-
-
 class Bars:
     """Shows each run by a bar, with its amounts, times and words. The clock tells seconds."""
 

@@ -4,6 +4,7 @@ import logging
 import shlex
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -68,7 +69,7 @@ class StudyFlags(TrainingFlags, WorkersConfig):
         command = shlex.join(["rotorgram", *sys.argv[1:]])
         try:
             with bars() as progress:
-                run_study(study, folder, command, progress, workers)
+                run_study(study, folder, workers, command, progress)
         except BaseException as error:
             if any(folder.iterdir()) and not isinstance(error, FolderBusy):
                 print(self.go_on_with(self.words, folder, "runner", "address"))
@@ -98,17 +99,17 @@ class StudyFlags(TrainingFlags, WorkersConfig):
 
     def given_of_study(self) -> Options:
         """Settings of the study that were given."""
-        values = {}
-        for name in _OF_STUDIES:
-            if (value := getattr(self, name)) is not None:
-                values[name] = value
+        values = self._given(_OF_STUDIES)
         if "seeds" in values:
             values.setdefault("episodes", 0)  # as many as the seeds need
         return values
 
     def given_of_rows(self) -> Options:
         """Settings of rows that were given, but for the env and the changes."""
-        return {name: getattr(self, name) for name in _OF_ROWS if name in self.given}
+        return self._given(_OF_ROWS)
+
+    def _given(self, names: Words) -> Options:
+        return {name: getattr(self, name) for name in names if name in self.given}
 
     def new_row(self, agent: str, name: str, changes: Options, env: "EnvConfig") -> "Row":
         """A row of an algorithm, with the settings that were given."""
@@ -126,8 +127,7 @@ class StudyFlags(TrainingFlags, WorkersConfig):
         env = row.env
         if "env" in self.given and self.env_id != env.env_id:
             env = EnvConfig.from_keywords(self.env_id, vehicle=env.vehicle, drones=env.drones)
-        named = {name: getattr(self, name) for name in ("vehicle", "drones") if name in self.given}
-        env = env.changed(**named, **self.options)
+        env = env.changed(**self._given(("vehicle", "drones")), **self.options)
         name = "" if row.name == row.default_name else row.name
         if row.controller:
             return replace(row, name=name, env=env)
@@ -160,9 +160,9 @@ def _film(results: "Results", out: Path) -> None:
     """Film a study; where that cannot be, such as without OpenGL, the log says why."""
     try:
         from ..training.films import film_study
-        from ._progress import frame_bar
+        from ._progress import bars
 
-        with frame_bar(out.name) as on_frame:
-            film_study(results, out, on_frame)
+        with bars() as progress:
+            film_study(results, out, partial(progress, out.name))
     except (OSError, InputError, ImportError, NoOpenGL) as error:
         logging.getLogger(__name__).info("no film of the agents: %s", error)

@@ -138,7 +138,7 @@ def _train(command: "Train", training: Training, folder: Path) -> int:
 
             def on_update() -> bool:
                 stopping = stop_is_asked()
-                keeper.keep(now=stopping)
+                keeper.keep(now=bool(stopping))
                 return not stopping
 
             name = f"{training.run.algorithm} seed {training.run.seed}"
@@ -159,7 +159,7 @@ def _train(command: "Train", training: Training, folder: Path) -> int:
     print(f"{what} {flown:,} of {training.run.env_steps:,} env steps")
     print(f"{flown / training.log.seconds:,.0f} env steps per second")
     print(f"checkpoint: {folder / CHECKPOINT}" if finished else go_on)
-    return 0 if finished else 128 + signal.SIGINT
+    return 0 if finished else 128 + stop_is_asked()
 
 
 def _extended(kept: Checkpoint, folder: Path, env_steps: int) -> Checkpoint:
@@ -217,26 +217,26 @@ class _Keeper:
 
 
 @contextmanager
-def _stop_at_update() -> Iterator[Callable[[], bool]]:
-    """Ctrl-C and termination ask to stop at an update: a function that tells there whether to.
+def _stop_at_update() -> Iterator[Callable[[], int]]:
+    """Ctrl-C and termination ask to stop at an update: a function that tells there by which signal.
 
     Asked again, or if no update comes soon (no simulator answers), it stops at once.
     """
-    asked = False
+    asked = 0
     # As another Ctrl-C would: it ends a wait for a simulator too.
     timer = Timer(_UPDATE_WITHIN, os.kill, (os.getpid(), signal.SIGINT))
     timer.daemon = True
 
-    def ask(*_: object) -> None:
+    def ask(number: int, _: object) -> None:
         nonlocal asked
         if asked:
             raise KeyboardInterrupt
-        asked = True
+        asked = number
         with suppress(OSError):  # standard output may take no more
             print("stopping at the next update; Ctrl-C again stops now")
         timer.start()
 
-    def reached() -> bool:
+    def reached() -> int:
         if asked:  # there is time to write now
             timer.cancel()
         return asked

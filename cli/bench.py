@@ -28,11 +28,7 @@ class Bench(Command):
 
         logging.getLogger("rotorgram").setLevel(logging.WARNING)  # no counters of every wire
         with folder_to_write(self.out, "bench") as folder, bars() as progress:
-
-            def on_layer(name: str, turn: int, turns: int) -> None:
-                progress("bench", turn, turns, name)
-
-            measured = bench(self.rounds, self.seconds, folder, on_layer)
+            measured = bench(self.rounds, self.seconds, folder, progress)
             progress("bench", 1, 1, "done")
         rates = Table("layer", "what", "env steps/s", "µs per env step", box=SIMPLE_HEAD)
         for layer in layers():

@@ -1,6 +1,7 @@
 """`rotorgram render`: flights as films and pictures."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -60,7 +61,7 @@ class Render(EnvFlags):
         from ..models.cameras import read_size
         from ..rendering.film import check_film
         from ..rendering.gl import offscreen_context
-        from ._progress import frame_bar
+        from ._progress import bars
 
         width, height = read_size("size", self.size, 16, 8192)
         settings = self.settings(Film) | {"scene": self.shown_scene}
@@ -75,8 +76,8 @@ class Render(EnvFlags):
         longest = max(track.trajectories[0].seconds for track in tracks)
         if self.at is not None and self.at > longest:
             raise InputError(f"at: expected 0 to {longest:g} s, the flight's end, got {self.at:g}")
-        with frame_bar(self.out.name) as on_frame:
-            frames = film(self.out, tracks, config, on_frame)
+        with bars() as progress:
+            frames = film(self.out, tracks, config, partial(progress, self.out.name))
         pictures = "1 picture" if frames == 1 else f"{frames} pictures"
         print(f"film: {self.out} ({pictures} of {width}x{height})")
 

@@ -14,7 +14,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from ..models import BACKENDS, MAX_DRONES, Backend
 from ..models.errors import InputError, shortened
-from ..models.fields import Choice, Limits, check, check_fields, check_names, immutable, read_table
+from ..models.fields import (
+    Choice,
+    Limits,
+    check,
+    check_fields,
+    check_names,
+    immutable,
+    read_table,
+    set_fields,
+)
 from ..models.files import read_toml
 from ..models.library import is_of_the_library, vehicle_words
 from ..scenes import seeds_of
@@ -45,7 +54,7 @@ class SceneConfig:
     """Seeds of a generated scene. Of several seeds, each episode draws one."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "seeds", tuple(self.seeds))
+        set_fields(self, seeds=tuple(self.seeds))
         _, seeds = seeds_of(str(self))
         if tuple(seeds) != self.seeds:
             raise InputError(f"scene: expected consecutive seeds, got {shortened(self.seeds)}")
@@ -152,7 +161,8 @@ class EnvConfig:
 
     def __post_init__(self) -> None:
         check_fields(self)
-        self._set(
+        set_fields(
+            self,
             env_id=canonical_id(self.env_id),
             scene=SceneConfig.parse(self.scene),
             backend=BackendConfig.parse(self.backend),
@@ -163,27 +173,23 @@ class EnvConfig:
         if self.files:
             from ..models.bundle import checked_bundles
 
-            self._set(files=checked_bundles(self.files))
+            set_fields(self, files=checked_bundles(self.files))
         if self.sensors != {}:
             from ..sim.sensors import checked_sensors
 
-            self._set(sensors=checked_sensors(self.sensors))
+            set_fields(self, sensors=checked_sensors(self.sensors))
         if not isinstance(self.effects, EffectOptions):
-            self._set(effects=read_table(EffectOptions, self.effects, "effects"))
+            set_fields(self, effects=read_table(EffectOptions, self.effects, "effects"))
         if not isinstance(self.task, Mapping):
             raise InputError(f"task: expected options by name, got {shortened(self.task)}")
         options: Options = self.task
         if registry.is_known(self.env_id):
             task = registry.task_type(self.env_id)
             defaults = {name: getattr(task, name) for name in _FROM_TASK}
-            self._set(**{k: v for k, v in defaults.items() if getattr(self, k) is None})
+            set_fields(self, **{k: v for k, v in defaults.items() if getattr(self, k) is None})
             check("action", Choice(task.actions), self.action)
             options = task.Options.from_options(options, KEYWORDS).to_options()
-        self._set(task=json_values(options))
-
-    def _set(self, **values: Any) -> None:
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
+        set_fields(self, task=json_values(options))
 
     # ---- other forms
 

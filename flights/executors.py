@@ -111,7 +111,8 @@ def _results(
         if not submitted:
             return
         done, _ = wait(submitted, return_when=FIRST_COMPLETED)
-        for future in done:
+        # Before a worker that was killed ends all, what others have done.
+        for future in sorted(done, key=lambda one: one.exception() is not None):
             name = submitted.pop(future)
             try:
                 yield future.result()
@@ -122,7 +123,7 @@ def _results(
                 ) from None
             except Exception as error:  # a cluster's machine is lost, or lacks our software
                 cause = getattr(error, "cause", None) or error
-                reason = str(cause).strip().splitlines()[-1]
+                reason = (str(cause).strip() or repr(cause)).splitlines()[-1]
                 yield name, f"{name}: {reason}", None
 
 

@@ -1,7 +1,7 @@
 """Films of trajectories: a frame shows the control step of its time; several side by side."""
 
 import math
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Generator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,10 +17,8 @@ from ..rendering import Camera, Canvas, Moment, Stage
 from ..rendering.film import QUALITY, Picture, write_film
 from ..rendering.gl import Lines
 from ..scenes import parse_scene
+from .executors import Tell
 from .trajectories import Flights, Trajectory
-
-OnFrame = Callable[[int, int], object]
-"""Called with frames drawn, and frames in all."""
 
 MAX_FRAMES = 1_000_000
 """Largest number of frames of a film: 11 hours of it."""
@@ -108,7 +106,7 @@ class Film:
 
 
 def film(
-    path: Path, tracks: Sequence[FilmTrack], config: Film, on_frame: OnFrame = lambda *_: None
+    path: Path, tracks: Sequence[FilmTrack], config: Film, tell: Tell = lambda *_: None
 ) -> int:
     """Film trajectories side by side, into a path as of `write_film`; the number of frames written.
 
@@ -123,7 +121,7 @@ def film(
     """
     times = _times(tracks, config, still=path.suffix.lower() == ".png")
     # Whatever goes wrong, the OpenGL context is given back here.
-    with closing(_frames(tracks, config, times, on_frame)) as frames:
+    with closing(_frames(tracks, config, times, tell)) as frames:
         write_film(path, frames, config.fps, quality=config.quality)
     return len(times)
 
@@ -166,7 +164,7 @@ def grid(count: int, width: int, height: int) -> tuple[int, int]:
 
 
 def _frames(
-    tracks: Sequence[FilmTrack], config: Film, times: Sequence[tuple[int, float]], on_frame: OnFrame
+    tracks: Sequence[FilmTrack], config: Film, times: Sequence[tuple[int, float]], tell: Tell
 ) -> Generator[Picture, None, None]:
     """Frames, shape (height, width, 3). One canvas of a pane's size serves every pane."""
     columns, rows = grid(len(tracks), config.width, config.height)
@@ -185,7 +183,7 @@ def _frames(
                 y = (height + _SPACE) * row
                 frame[y : y + height, x : x + width] = pane.draw(episode, seconds)
             yield frame
-            on_frame(number, len(times))
+            tell(number, len(times), "done" if number == len(times) else "frames")
 
 
 @dataclass

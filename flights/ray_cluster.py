@@ -54,10 +54,12 @@ def _with_same_software(
     versions: dict[str, str], function: Callable[..., Any], *args: object
 ) -> Any:
     """Call a function; `config.json` names one version of each package. (In a worker.)"""
-    for package, here in software_versions().items():
-        if here != versions[package]:
+    own = software_versions()
+    for package in {**versions, **own}:
+        there, here = versions.get(package, "none"), own.get(package, "none")
+        if here != there:
             raise InputError(
-                f"{package}: expected version {versions[package]} as on the machine of the "
+                f"{package}: expected version {there} as on the machine of the "
                 f"command, got {here} on {socket.gethostname()}"
             )
     return function(*args)

@@ -183,7 +183,7 @@ def _fly_batch(
         env.advance(chosen, nobody, None, worlds_done(done, drones))
         telemetry.append(env.telemetry)
         rewards.append(env.rewards)
-        actions.append(chosen.astype(np.float64))
+        actions.append(chosen)
         lengths += ~done
         terminated = terminated | (env.terminated & ~done)
         lost = lost | (env.lost & ~done)

@@ -232,7 +232,12 @@ def check_fields(instance: object, where: str = "", error: type[InputError] = In
     For `__post_init__`, also of a frozen class. `where` stands before the field's name.
     """
     for name, rule in rules_of(type(instance)).items():
-        value = check(where + name, rule, getattr(instance, name), error)
+        set_fields(instance, **{name: check(where + name, rule, getattr(instance, name), error)})
+
+
+def set_fields(instance: object, **values: object) -> None:
+    """Set fields of a frozen dataclass, in its `__post_init__`."""
+    for name, value in values.items():
         object.__setattr__(instance, name, value)
 
 

@@ -39,9 +39,10 @@ SHARED = {Hello, Welcome, Refuse, Wait, Unknown}
 """Sealed with the shared key; all else with that of the session."""
 
 
-def layout(drones: int = 1, size: int = 1, telemetry: tuple[tuple[int, ...], ...] = ()) -> Layout:
+def layout(drones: int = 1, size: int = 1, shapes: tuple[tuple[int, ...], ...] = ()) -> Layout:
     numbers = ArrayLayout(shape=(size,))
-    return Layout(drones=drones, observation=(numbers,), action=numbers, telemetry=telemetry)
+    told = tuple((shape, "") for shape in shapes)
+    return Layout(drones=drones, observation=(numbers,), action=numbers, telemetry=told)
 
 
 ONE = layout()
@@ -56,7 +57,7 @@ def state(
 ) -> State:
     n = of.drones
     observations = [np.full((n, *a.shape), value).astype(a.dtype) for a in of.observation]
-    telemetry = [np.zeros((n, *shape)) for shape in of.telemetry]
+    telemetry = [np.zeros((n, *shape)) for shape, _ in of.telemetry]
     return State(
         session=session,
         sequence=sequence,

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from ..envs.autoreset import AdvancingVectorEnv
 from ..envs.config import EnvConfig
 from ..envs.vector import LocalVectorEnv
+from ..flights.executors import OnProgress
 from ..models.fields import Limits, check
 from ..models.files import software_versions, write_json
 from ..models.vehicle import Vehicle
@@ -62,9 +63,7 @@ def layers() -> list[Layer]:
     return [layer for layer in LAYERS if find_spec(layer.package)]
 
 
-def bench(
-    rounds: int, seconds: float, folder: Path, on_layer: Callable[[str, int, int], None]
-) -> dict[str, Any]:
+def bench(rounds: int, seconds: float, folder: Path, on_progress: OnProgress) -> dict[str, Any]:
     """Measure every layer in turns of `seconds`, and write `bench.json` into `folder`.
 
     `on_layer` is called before each turn: name of the layer, turns done, turns in all. Returns what
@@ -80,11 +79,11 @@ def bench(
     with ExitStack() as stack:
         steps = {}
         for layer in found:
-            on_layer(f"opening {layer.name}", done, turns)
+            on_progress("bench", done, turns, f"opening {layer.name}")
             steps[layer.name] = layer.start(stack)
         for number in range(rounds + 1):
             for layer in found:
-                on_layer(layer.name, done, turns)
+                on_progress("bench", done, turns, layer.name)
                 done += 1
                 at_once = _STEPS_AT_ONCE if layer.drones == 1 else 1
                 rate = rate_of(steps[layer.name], seconds, at_once, layer.clock)

@@ -24,8 +24,8 @@ from .metrics import (
     spread_over_seeds,
     training_runs,
 )
-from .results import Results, file_words
-from .settings import Row
+from .results import Results
+from .settings import Row, file_words
 from .tables import by_task, row_label, seeds_text
 
 AVERAGING_SHARE = 0.05
@@ -93,7 +93,8 @@ def row_color(row: Row) -> str:
 def draw_comparison(results: Results, table: DataFrame, rows: Sequence[Row]) -> Figure:
     """Rows of one task: the steady state over training, and at its end with 95 % intervals."""
     headline = results.headline(rows[0])
-    curves = learning_curves(results.evaluations, [row.name for row in rows])
+    names = [row.name for row in rows]
+    curves = learning_curves(results.evaluations, names)
     figure = Figure(figsize=(10.5, max(3.4, 1.4 + 0.35 * len(rows))), dpi=110)
     left, right = figure.subplots(1, 2, width_ratios=[1.5, 1])
     for place, row in enumerate(rows):
@@ -113,7 +114,7 @@ def draw_comparison(results: Results, table: DataFrame, rows: Sequence[Row]) -> 
     if headline.held is not None:
         left.axhline(headline.held, color=_GREY, lw=0.9, ls=":")
         right.axvline(headline.held, color=_GREY, lw=0.9, ls=":")
-    if not headline.high and np.nanmin(table["steady"]) > 0:
+    if not headline.high and np.nanmin(table.loc[names, "steady"]) > 0:
         left.set_yscale("log")
         right.set_xscale("log")
     return figure

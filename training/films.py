@@ -5,7 +5,8 @@ from pathlib import Path
 from ..agents import CONTROLLERS
 from ..agents.checkpoints import load
 from ..agents.policies import Policy
-from ..flights.filming import Film, FilmTrack, OnFrame, film
+from ..flights.executors import Tell
+from ..flights.filming import Film, FilmTrack, film
 from ..flights.trajectories import flown_trajectories
 from ..models.errors import InputError
 from ..rendering import Camera
@@ -13,7 +14,7 @@ from .results import Results, checkpoint_file
 from .tables import row_label
 
 
-def film_study(results: Results, out: Path, on_frame: OnFrame = lambda *_: None) -> None:
+def film_study(results: Results, out: Path, tell: Tell = lambda *_: None) -> None:
     """Film the rows of a study of one task: the same episode, side by side.
 
     It shows the first seed of each row and the first episode: none is chosen.
@@ -48,4 +49,4 @@ def film_study(results: Results, out: Path, on_frame: OnFrame = lambda *_: None)
             name += f", seed {seed}"
         flown = flown_trajectories(policy, row.env, [0], results.study.evaluation, seed)
         tracks.append(FilmTrack(name=name, trajectories=flown, drones=env.drones))
-    film(out, tracks, config, on_frame)
+    film(out, tracks, config, tell)

@@ -196,14 +196,15 @@ def measure_run(evaluations: DataFrame, headline: Headline) -> Measures:
         a crash that it does not count. `env_steps_to_hold`, `seconds_to_hold`: see
         `first_lasting_snapshot`; nan for an agent that is not trained.
     """
-    final = final_evaluations(evaluations)
+    last = evaluations["env_steps"].max()
+    final = evaluations[evaluations["env_steps"] == last]
     crashed = headline.crashed(final)
     final = final.assign(settling_time=final["settling_time"].mask(crashed))
     means = {name: float(final[name].mean()) for name in MEANS}
     safe = headline.counts_crashes or not crashed.any()
     whole = bool(final["steady"].notna().all())
     steps = seconds = nan
-    if evaluations["env_steps"].max() > 0 and headline.held is not None:
+    if last > 0 and headline.held is not None:
         steps, seconds = first_lasting_snapshot(evaluations, headline)
     return {
         **means,
@@ -214,12 +215,6 @@ def measure_run(evaluations: DataFrame, headline: Headline) -> Measures:
         "env_steps_to_hold": steps,
         "seconds_to_hold": seconds,
     }
-
-
-def final_evaluations(evaluations: DataFrame) -> DataFrame:
-    """The evaluation episodes of each run's last snapshot (the largest `env_steps`)."""
-    last = evaluations.groupby(["row", "seed"])["env_steps"].transform("max")
-    return evaluations[evaluations["env_steps"] == last]
 
 
 def first_lasting_snapshot(evaluations: DataFrame, headline: Headline) -> tuple[float, float]:

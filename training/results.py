@@ -35,7 +35,7 @@ from ..envs.spec import EnvSpec, SpecError
 from ..models.errors import InputError
 from ..models.files import software_versions, write_json, write_whole
 from .metrics import Headline
-from .settings import Row, Study
+from .settings import Row, Study, file_words
 
 CONFIG_FILE = "config.json"
 CHECKPOINTS = "checkpoints"
@@ -113,12 +113,6 @@ def machine() -> dict[str, object]:
 def run_name(row: Row, seed: int) -> str:
     """Name of the files of a run."""
     return f"{file_words(row.name)}-seed{seed}"
-
-
-def file_words(text: str) -> str:
-    """A text as part of a file's name."""
-    letters = (letter if letter.isalnum() or letter in ".=+_" else "-" for letter in text)
-    return "".join(letters).strip("-").lower()
 
 
 def checkpoint_file(folder: Path, row: Row, seed: int) -> Path:
@@ -220,12 +214,7 @@ class Results:
         Keeps about `max_rows` rows, drawn with a fixed seed: a stride that divides the episode
         length would show the same moments of every episode.
         """
-        files = self._files("steps")
-        if not files:
-            return pd.DataFrame(columns=list(COLUMNS["steps"]))
-        table = pa.concat_tables(
-            pq.read_table(file, filters=[("phase", "==", phase)]) for file in files
-        )
+        table = pq.read_table(self.folder / "steps", filters=[("phase", "==", phase)])
         if max_rows is not None and max_rows < len(table):
             kept = np.random.default_rng(0).random(len(table)) < max_rows / len(table)
             table = table.filter(kept)

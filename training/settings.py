@@ -17,7 +17,14 @@ from ..envs.registry import env_spec, load
 from ..flights.trajectories import EpisodeSet
 from ..models import Backend
 from ..models.errors import InputError, shortened
-from ..models.fields import NonNegativeInt, PositiveInt, check_fields, immutable, read_table
+from ..models.fields import (
+    NonNegativeInt,
+    PositiveInt,
+    check_fields,
+    immutable,
+    read_table,
+    set_fields,
+)
 
 MIN_FLIGHTS = 200
 """Evaluation flights of each row of a study, over all its seeds."""
@@ -91,14 +98,15 @@ class Row:
         given = self.env.flat_options()
         brought = {k: v for k, v in self.brought.items() if given.get(k) == usual.get(k)}
         if brought:
-            self._set(env=self.env.changed(**brought))
-        self._set(name=self.name or self.default_name)
+            set_fields(self, env=self.env.changed(**brought))
+        set_fields(self, name=self.name or self.default_name)
         if env_spec(self.env).headline is None:
             raise InputError(f"env_id: expected one that names a metric, got {self.env.env_id}")
         if self.controller:
             return
         found = find_preset(self.agent, self.preset, self.env.env_id)
-        self._set(
+        set_fields(
+            self,
             env_steps=self.env_steps or found.env_steps,
             num_envs=self.num_envs or found.whole_worlds(self.env.drones),
             backend=self.backend or found.backend,
@@ -108,10 +116,6 @@ class Row:
             self.run(0)
         except InputError as error:
             raise InputError(f"{self.name}: {error}") from None
-
-    def _set(self, **values: object) -> None:
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
 
     @property
     def default_name(self) -> str:
@@ -180,10 +184,18 @@ class Row:
             given = _table("row", table)
             given["set"] = _table("set", given.get("set", {}))
             own = _table("env", given.get("env", {}))
-            given["env"] = env_from({**(env or {}), **own})
+            keywords = {"env_id": DEFAULT_ENV, **(env or {}), **own}
+            env_id = load(keywords.pop("env_id"))
+            given["env"] = EnvConfig.from_keywords(env_id, **keywords)
             return read_table(cls, given, "row")
         except InputError as error:
             raise InputError(f"{where}: {error}") from None
+
+
+def file_words(text: str) -> str:
+    """A text as part of a file's name."""
+    letters = (letter if letter.isalnum() or letter in ".=+_" else "-" for letter in text)
+    return "".join(letters).strip("-").lower()
 
 
 def _word(value: object) -> str:
@@ -192,12 +204,6 @@ def _word(value: object) -> str:
     if len(text) > _LONGEST_WORD:
         return blake2b(text.encode(), digest_size=4).hexdigest()
     return text.replace('"', "")
-
-
-def env_from(keywords: Mapping[str, Any]) -> EnvConfig:
-    """An env from keywords. The module of an id `module:Name-v0` is imported."""
-    env_id = load(keywords.get("env_id", DEFAULT_ENV))
-    return EnvConfig.from_keywords(**{**keywords, "env_id": env_id})
 
 
 Kind = Literal["paper", "compare", "sweep", "benchmark"]
@@ -229,12 +235,12 @@ class Study:
         if not self.rows:
             raise InputError("row: expected at least one, got none")
         check_fields(self)
-        names = [row.name for row in self.rows]
-        for name in names:
-            if names.count(name) > 1:
-                raise InputError(f"row: expected each row once, got {name} twice")
+        files = [file_words(row.name) for row in self.rows]
+        for row, file in zip(self.rows, files, strict=True):
+            if files.count(file) > 1:
+                raise InputError(f"row: expected each row once, got {row.name} twice")
         if not self.episodes:
-            object.__setattr__(self, "episodes", max(20, -(-MIN_FLIGHTS // self.seeds)))
+            set_fields(self, episodes=max(20, -(-MIN_FLIGHTS // self.seeds)))
 
     def runs(self) -> dict[str, tuple[Row, int]]:
         """Every run by name, a row and a seed: all rows with one seed, then with the next.

@@ -42,9 +42,9 @@ class Done(NamedTuple):
 def run_study(
     study: Study,
     folder: Path,
+    workers: WorkersConfig,
     command: str = "",
     on_progress: OnProgress = lambda *_: None,
-    workers: WorkersConfig | None = None,
 ) -> None:
     """Train and evaluate everything, and write the results into `folder`.
 
@@ -70,8 +70,7 @@ def run_study(
         for name, (row, seed) in study.runs().items()
         if not results.run_file(folder, row, seed).exists()
     }
-    config = workers or WorkersConfig()
-    with open_executor(config, len(jobs), on_progress) as executor, locked(folder):
+    with open_executor(workers, len(jobs), on_progress) as executor, locked(folder):
         if not (folder / CONFIG_FILE).exists():  # a resumed study keeps its settings
             specs = {row.name: env_spec(row.env) for row in study.rows}
             results.write_config(folder, command, study, specs)

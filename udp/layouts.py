@@ -12,6 +12,5 @@ def layout_of(spec: EnvSpec, worlds: int = 1) -> Layout:
         observation=tuple(ArrayLayout(a.shape, a.dtype) for a in spec.observation),
         action=None if isinstance(action, Discrete) else ArrayLayout(action.shape, action.dtype),
         choices=action.choices if isinstance(action, Discrete) else 0,
-        telemetry=tuple(a.shape for a in spec.telemetry),
-        frames=tuple(a.frame for a in spec.telemetry),
+        telemetry=tuple((a.shape, a.frame) for a in spec.telemetry),
     )

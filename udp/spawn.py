@@ -48,6 +48,7 @@ def spawn_simulator(
         PeerClosed: The simulator did not start, or ended: its own sentence, or its last words.
         PeerSilent: The simulator runs and does not answer.
     """
+    config = config.embedded()  # before a record is begun
     count = config.drones if num_envs is None else num_envs
     settings: AgentSettings = {
         "env_id": config.env_id,

@@ -590,9 +590,12 @@ def test_text_of_others_holds_no_terminal_escapes(
     assert err == "rotorgram: said \ufffd[2J\nrotorgram: refused: \ufffd]0;title\ufffd\n"
 
 
-@pytest.mark.parametrize("way", ["--udp", "--no-udp"])
+@pytest.mark.parametrize(
+    ("way", "signalled"),
+    [("--udp", signal.SIGINT), ("--no-udp", signal.SIGINT), ("--no-udp", signal.SIGTERM)],
+)
 def test_ctrl_c_stops_a_training_that_resumes_to_the_numbers_of_an_unbroken_one(
-    way: str, tmp_path: Path, capsys: Capsys
+    way: str, signalled: int, tmp_path: Path, capsys: Capsys
 ) -> None:
     settings = (way, "--env-steps", 6_000, "--set", "steps_per_update=100")
     process = start("train", "a2c", "--out", tmp_path / "broken", *settings)
@@ -602,9 +605,9 @@ def test_ctrl_c_stops_a_training_that_resumes_to_the_numbers_of_an_unbroken_one(
     if first.startswith(here):
         first = process.stdout.readline()
     assert first.startswith("a2c seed 0"), "the first update is reported"
-    os.killpg(process.pid, signal.SIGINT)
+    os.killpg(process.pid, signalled)
     out, err = process.communicate(timeout=20)
-    assert process.returncode == 130
+    assert process.returncode == 128 + signalled
     assert "stopped after" in out
     line = f"rotorgram train a2c --resume {tmp_path / 'broken'} {way}"
     assert f"go on with: {line}\n" in out
@@ -717,6 +720,17 @@ def test_a_key_loss_and_a_journal(tmp_path: Path, capsys: Capsys) -> None:
     data = bytearray(journal.read_bytes())
     journal.write_bytes(data[: len(data) // 2])
     output(capsys, "replay", journal)
+
+
+def test_an_agent_that_listens_knows_a_vehicle_with_drag() -> None:
+    address = f"127.0.0.1:{free_port()}"
+    flown = ["--env", "rotorgram/Hover-v0", "--action", "position", "--vehicle", "crazyflie2"]
+    flown += ["--effects", "linear_drag=0.2"]
+    agent = start("serve", "geometric", *flown, "--listen", address, "--episodes", 1)
+    start("sim", "--server", address, "--bind", "127.0.0.1:0", *flown)
+    out, err = agent.communicate(timeout=60)
+    assert agent.returncode == 0, err
+    assert "episode 0: return" in out
 
 
 @pytest.mark.quiet

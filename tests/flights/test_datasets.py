@@ -14,6 +14,8 @@ from cases import each
 from peers import ANY, Running
 from relay import FaultConfig, relaying
 from rotorgram.cli import main
+from rotorgram.envs.config import EnvConfig
+from rotorgram.envs.registry import env_spec
 from rotorgram.envs.spec import EnvSpec
 from rotorgram.flights.datasets import (
     RecordedEpisodes,
@@ -179,6 +181,12 @@ def test_minari_reads_it_and_its_env_flies_it_again(
             assert_flies_again(env, seed, episode.actions, recorded, *told)
             assert len(episode.infos["z"]) == len(episode.actions) + 1
             assert episode.infos["elevation_error"].dtype == np.float64
+
+
+def test_flights_on_rigid_have_an_env_too() -> None:
+    flown = env_spec(EnvConfig(backend="rigid"))
+    assert flown.config_digest != env_spec(EnvConfig()).config_digest
+    assert env_of(flown).id == flown.env_id
 
 
 def test_episodes_that_are_not_whole_are_left_out(tmp_path: Path) -> None:

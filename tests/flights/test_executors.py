@@ -5,6 +5,8 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import Future
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +78,37 @@ def test_a_worker_that_is_killed_is_one_sentence() -> None:
     sentence = pytest.raises(RunsFailed, match=r"^a worker was killed, .* before is kept$")
     with open_executor(WorkersConfig(jobs=2), 2) as executor, sentence:
         run_jobs(executor, is_killed, {"one": 1, "two": 2}, silent, silent)
+
+
+def test_a_worker_that_is_killed_costs_no_result_of_others() -> None:
+    class Over:
+        """Each job has ended before anyone waits for it."""
+
+        workers = 9
+
+        def submit(self, function: Any, of: Any, name: str, job: int) -> Future[Any]:
+            future: Future[Any] = Future()
+            if job:
+                future.set_result((name, "", job))
+            else:
+                future.set_exception(BrokenProcessPool("killed"))
+            return future
+
+    kept: dict[int, int] = {}
+    jobs = {str(job): job for job in range(9)}
+    with pytest.raises(RunsFailed, match=r"^a worker was killed"):
+        run_jobs(Over(), half, jobs, kept.__setitem__, silent)  # type: ignore[arg-type]
+    assert kept == {job: job for job in range(1, 9)}
+
+
+def no_memory(job: int, tell: Tell) -> None:
+    raise MemoryError
+
+
+def test_an_error_without_words_is_named() -> None:
+    sentence = pytest.raises(RunsFailed, match=r"^1 of 1 runs failed: one: MemoryError")
+    with open_executor(WorkersConfig(jobs=1), 1) as executor, sentence:
+        run_jobs(executor, no_memory, {"one": 1}, silent, silent)
 
 
 @pytest.mark.timeout(60)

@@ -15,7 +15,6 @@ from rotorgram.training.metrics import (
     Curve,
     Headline,
     average_return,
-    final_evaluations,
     first_lasting_snapshot,
     measure_run,
     overshoot,
@@ -134,7 +133,6 @@ def test_a_run_holds_without_a_crash_and_without_a_gap():
 
 def test_the_final_evaluation_is_each_runs_own_last_snapshot():
     frame = evaluations("last_snapshots")
-    assert final_evaluations(frame)["env_steps"].tolist() == [200, 200, 150, 0]
     a2c = frame[frame["row"] == "a2c"]
     first = measure_run(a2c[a2c["seed"] == 0], HEADLINE)
     assert first["steady"] == pytest.approx(0.2)

@@ -75,7 +75,7 @@ def test_the_numbers_are_those_of_this_machine(tmp_path: Path, address: str) -> 
     shown = []
     on_ray, here = (new_folder(tmp_path / name, "compare") for name in ("ray", "here"))
     workers = WorkersConfig(runner="ray", address=address)
-    run_study(STUDY, on_ray, "", lambda name, _, __, words: shown.append((name, words)), workers)
+    run_study(STUDY, on_ray, workers, "", lambda name, _, __, words: shown.append((name, words)))
     run_study(STUDY, here, workers=WorkersConfig(jobs=1))
     assert {("a2c seed 0", "done"), ("pid seed 0", "done")} <= {*shown}
     a, b = Results.read(on_ray), Results.read(here)
@@ -129,13 +129,15 @@ def test_pictures_are_taken_on_a_cluster(opengl: None, tmp_path: Path, address: 
     assert found[0] == found[1]
 
 
+@pytest.mark.parametrize("package", ["numpy", "one-that-it-lacks"])
 def test_a_worker_with_other_software_is_refused(
-    tmp_path: Path, address: str, monkeypatch: pytest.MonkeyPatch
+    package: str, tmp_path: Path, address: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     here = software_versions()
-    monkeypatch.setattr(module, "software_versions", lambda: {**here, "numpy": "0.1"})
+    monkeypatch.setattr(module, "software_versions", lambda: {**here, package: "0.1"})
     workers = WorkersConfig(runner="ray", address=address)
-    sentence = f"numpy: expected version 0.1 .*, got {here['numpy']} on {socket.gethostname()}"
+    got = here.get(package, "none")
+    sentence = f"{package}: expected version 0.1 .*, got {got} on {socket.gethostname()}"
     with pytest.raises(RunsFailed, match=f"2 of 2 runs failed: .*{sentence}"):
         run_study(STUDY, tmp_path, workers=workers)
 

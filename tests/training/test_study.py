@@ -43,7 +43,7 @@ FLAGS = ("--env-steps", "300", "--episodes", "1", "--episode-length", "40", "--n
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("study")
-    run_study(STUDY, path, "rotorgram compare", workers=ONE)
+    run_study(STUDY, path, ONE, "rotorgram compare")
     return path
 
 
@@ -95,6 +95,12 @@ def test_files_hold_settings_software_and_every_step(folder: Path) -> None:
     flown = results.evaluations[results.evaluations["row"] == "pid"]
     steps = results.steps("evaluation")
     assert (steps["row"] == "pid").sum() == flown["length"].sum()
+
+
+def test_two_rows_with_the_same_files_are_refused() -> None:
+    rows = Row(agent="pid", name="x 1/2"), Row(agent="pid", name="X 1:2")
+    with pytest.raises(InputError, match=r"^row: expected each row once, got x 1/2 twice$"):
+        Study(rows=rows)
 
 
 def test_over_the_wire_the_numbers_are_those_in_process(folder: Path, tmp_path: Path) -> None:

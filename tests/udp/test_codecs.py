@@ -48,7 +48,7 @@ def layouts(draw: st.DrawFn) -> Layout:
         observation=tuple(observation),
         action=action,
         choices=choices,
-        telemetry=tuple(telemetry),
+        telemetry=tuple((shape, "") for shape in telemetry),
     )
 
 
@@ -277,7 +277,8 @@ def test_layouts_that_text_cannot_tell(of: Any) -> None:
 def test_text_is_in_the_paper_s_frame() -> None:
     """A craft at x 3 m, y -1 m, z 2 m; its nose points right, it climbs and turns to the left."""
     frames = ("world", "body to world", "world", "body", "world")
-    of = replace(ONE, telemetry=((3,), (4,), (3,), (3,), (2,)), frames=frames)
+    shapes = ((3,), (4,), (3,), (3,), (2,))
+    of = replace(ONE, telemetry=tuple(zip(shapes, frames, strict=True)))
     half = math.sqrt(0.5)
     sent = state(1, of=of)
     position, attitude, velocity, rates, other = sent.telemetry
@@ -304,7 +305,7 @@ def test_text_is_in_the_paper_s_frame() -> None:
 def of_numbers(count: int) -> Layout:
     """One drone whose line has so many numbers: the reward, three of observation, the telemetry."""
     observation = ArrayLayout(shape=(3,))
-    return replace(ONE, observation=(observation,), telemetry=((count - 4,),))
+    return replace(ONE, observation=(observation,), telemetry=(((count - 4,), ""),))
 
 
 def test_the_longest_line_is_known_at_the_start() -> None:  # fault 57

@@ -324,6 +324,29 @@ def test_a_simulator_that_was_never_welcomed_closes_without_a_word() -> None:  #
     assert not outgoing(link)
 
 
+def test_a_close_is_repeated_while_a_part_of_the_command_is_there() -> None:
+    many = layout(1000)
+    link = simulator(of=many, largest=1200)
+    link.connect(0.0)
+    link.receive(binary.encode(WELCOME), 0.0)
+    send_state(link, 0.0, 0.0)
+    parts = Transfer(binary.encode(command(1, of=many), many), 1200).start()
+    link.receive(parts[0], 0.1)
+    outgoing(link)
+    link.close("over", 0.2)
+    link.handle_timer(link.next_timer())
+    assert [plain(one) for one in outgoing(link)] == [close(1, reason="over")] * 2
+
+
+def test_a_simulator_that_has_been_welcomed_waits_for_no_slot() -> None:
+    link = simulator()
+    link.connect(0.0)
+    link.receive(binary.encode(Wait(session=SESSION)), 0.1)
+    assert link.is_queued
+    link.receive(binary.encode(Welcome(session=SESSION, nonce=NONCE)), 0.2)
+    assert not link.is_queued
+
+
 def test_while_wait_comes_there_is_no_silence() -> None:
     link = simulator()
     wire = Wire("agent", False)

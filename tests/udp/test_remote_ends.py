@@ -11,6 +11,7 @@ import socket
 import sys
 import threading
 import time
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -21,6 +22,7 @@ import rotorgram.envs  # noqa: F401
 from peers import ANY, ENV_ID, QUICK, plain_socket, simulate
 from remotes import Broken
 from rotorgram.envs.config import EnvConfig
+from rotorgram.models.errors import InputError
 from rotorgram.udp import (
     LinkConfig,
     PeerClosed,
@@ -31,9 +33,18 @@ from rotorgram.udp import (
 from rotorgram.udp import __main__ as udp_main
 from rotorgram.udp.protocol import binary
 from rotorgram.udp.protocol.messages import Hello
-from rotorgram.udp.spawn import start_simulator
+from rotorgram.udp.spawn import spawn_simulator, start_simulator
 from rotorgram.udp.transport import simulator as driver
 from rotorgram.udp.transport import sockets
+
+
+def test_a_vehicle_that_is_not_there_leaves_no_record(tmp_path: Path) -> None:
+    record = tmp_path / "flight.mcap"
+    config = EnvConfig(vehicle="missing.toml")
+    with pytest.raises(InputError, match=r"missing\.toml"), spawn_simulator(config, record=record):
+        pass
+    assert not record.exists()
+
 
 # ---- silence and ends
 

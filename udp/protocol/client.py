@@ -347,10 +347,10 @@ class Client:
         self._tries += 1
         self._round_trips.sent(now)
         assert self._transfer is not None
-        missing = self._assembler.missing()  # of the answer
+        closing = self.state == "closing"
+        missing = None if closing else self._assembler.missing()  # of the answer
         datagrams = [binary.encode(missing)] if missing else self._transfer.probe()
         self._put(datagrams)
-        closing = self.state == "closing"
         wait = CLOSE_INTERVAL if closing else self._round_trips.wait(self._tries)
         self.resend_at = now + wait
         return True
@@ -385,6 +385,7 @@ class Client:
             return None
         self._forget_transfer()
         if isinstance(message, Welcome):
+            self.is_queued = False
             self.statistics.counters["sessions"] += 1
             self._nonce = message.nonce
             if self.key:
@@ -477,7 +478,6 @@ class Client:
         """Say Hello in a new session to an agent that knows nothing of this one, or is silent."""
         self.hello = replace(self.hello, session=self.draw_session())
         self._sealing = self.key
-        self.is_queued = False
         self._assembler = Assembler(self.layout.seeded_command.size)
         self._send(self.hello, now)
 

@@ -84,19 +84,16 @@ class Layout:
     """None if actions are discrete."""
     choices: int = 0
     """Discrete actions are 0 ... choices - 1; 0 if actions are an array."""
-    telemetry: tuple[tuple[int, ...], ...] = ()
-    """Shape of each telemetry array of one drone."""
-    frames: tuple[str, ...] = ()
-    """Frame of each, as of an `ArraySpec`; the text codec converts by it."""
+    telemetry: tuple[tuple[tuple[int, ...], str], ...] = ()
+    """Shape and frame of each telemetry array of one drone; the text codec converts by them."""
 
     def __post_init__(self) -> None:
         drones = self.drones
         check("drones", Limits(1, MAX_DRONES, whole=True), drones)
-        self.frames = self.frames or ("",) * len(self.telemetry)
 
         reward = ArrayLayout((), "float64")
         flag = ArrayLayout((), "bool")
-        numbers = [ArrayLayout(shape, "float64") for shape in self.telemetry]
+        numbers = [ArrayLayout(shape, "float64") for shape, _ in self.telemetry]
         arrays = [*self.observation, reward, flag, flag, *numbers]
         slots = _slots(STATE_ARRAYS_AT, drones, arrays)
         first = len(self.observation)

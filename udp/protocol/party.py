@@ -153,10 +153,7 @@ class WorldRules:
 
     def next_timer(self) -> float:
         """When `handle_timers` wants to be called; infinite if never."""
-        timer = inf
-        for link in self.links:
-            timer = min(timer, link.client.resend_at, link.client.deadline)
-        return timer
+        return min([link.client.next_timer() for link in self.links])
 
     def handle_timers(self, now: float) -> None:
         """Resend what is due. Raises `PeerSilent` where the flight cannot go on."""

@@ -65,17 +65,14 @@ def _is_flat(array: ArrayLayout) -> bool:
 
 def telemetry_sizes(layout: Layout) -> list[int]:
     """Numbers of each array of telemetry in a line."""
-    sizes = []
-    for shape, frame in zip(layout.telemetry, layout.frames, strict=True):
-        sizes.append(3 if (shape, frame) in _CONVERSIONS else prod(shape))
-    return sizes
+    return [3 if one in _CONVERSIONS else prod(one[0]) for one in layout.telemetry]
 
 
 def _converted(telemetry: Iterable[Array], layout: Layout, *, to_paper: bool) -> list[Array]:
     """The telemetry of one drone in the paper's frames, or from them."""
     converted = []
-    for array, shape, frame in zip(telemetry, layout.telemetry, layout.frames, strict=True):
-        into, back = _CONVERSIONS.get((shape, frame), (np.asarray, np.asarray))
+    for array, kind in zip(telemetry, layout.telemetry, strict=True):
+        into, back = _CONVERSIONS.get(kind, (np.asarray, np.asarray))
         converted.append(into(array) if to_paper else back(array))
     return converted
 
