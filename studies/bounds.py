@@ -19,34 +19,17 @@ import numpy as np
 import numpy.typing as npt
 from rotorgram.agents.pid import SHARES
 from rotorgram.envs.config import EnvConfig
-from rotorgram.envs.loop import Loop
-from rotorgram.envs.spec import canonical_id
 from rotorgram.envs.tasks.elevation import ElevationOptions
 from rotorgram.envs.tasks.goal import ERROR_SCALE
 from rotorgram.envs.tasks.racing import RacingOptions, read_track
 from rotorgram.envs.tasks.recovery import Recovery, RecoveryOptions
 from rotorgram.envs.tasks.waypoints import WaypointsOptions
-from rotorgram.flights.trajectories import evaluation_seed
 from rotorgram.models.vehicle import Vehicle
 
 _HALVINGS: Final = 24
 RECOVERY: Final = "rotorgram/Recovery-v0"
 
 Floats = npt.NDArray[np.float64]
-
-
-def known_bounds(config: EnvConfig, episodes: int) -> dict[str, float]:
-    """Mean returns over so many final evaluation episodes of the flights of `elevation_bounds`;
-    empty for another task.
-    """
-    if canonical_id(config.env_id) != "rotorgram/Elevation-v0":
-        return {}
-    loop = Loop(config, episodes)
-    seeds = [evaluation_seed(episode, "final") for episode in range(episodes)]
-    loop.advance(np.zeros((episodes, 1), np.float32), np.ones(episodes, bool), seeds)
-    starts = np.array(loop.telemetry["metrics"][:, 0])
-    loop.close()
-    return elevation_bounds(config, config.load_vehicle(), starts)
 
 
 def elevation_bounds(config: EnvConfig, vehicle: Vehicle, starts: Floats) -> dict[str, float]:

@@ -15,7 +15,6 @@ from typing import IO, Any
 from ..envs import registry
 from ..envs.config import EnvConfig
 from ..models import InputError
-from ..rendering.gl import hidden_gl_setting
 from .protocol.client import Address
 from .protocol.errors import PeerClosed, PeerSilent
 from .remote import RemoteEnv, RemoteVectorEnv
@@ -108,9 +107,8 @@ def start_simulator(
         "bind": ("127.0.0.1", 0),
         **settings,
     }
-    with hidden_gl_setting():  # a simulator without cameras starts sooner
-        # A second thread of torch makes small tensors slower, and takes the agent's core.
-        around = {"OMP_NUM_THREADS": "1", **os.environ, "PYTHONSAFEPATH": "1"}
+    # A second thread of torch makes small tensors slower, and takes the agent's core.
+    around = {"OMP_NUM_THREADS": "1", **os.environ, "PYTHONSAFEPATH": "1"}
     process = subprocess.Popen(_COMMAND, stdin=subprocess.PIPE, stderr=stderr, env=around)
     assert process.stdin is not None
     with suppress(BrokenPipeError):  # it has ended: its exit status says so

