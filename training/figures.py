@@ -205,6 +205,8 @@ def draw_error(results: Results, rows: Sequence[Row]) -> Figure:
             for low, high, alpha in _BANDS:
                 above.fill_between(fan.index, fan[low], fan[high], color=color, alpha=alpha, lw=0)
             above.plot(fan.index, fan[0.5], color=color, lw=1.2)
+        else:  # a controller is not trained
+            above.xaxis.set_visible(False)
         for time, value in trajectories(flown[flown["row"] == row.name], period):
             below.plot(time, value, color=color, lw=0.8, alpha=0.45)
         if headline.held is not None and not headline.high:

@@ -41,13 +41,14 @@ def test_the_page_of_results_has_what_committed_flights_say(name: str) -> None: 
     check("results", results.config["command"], *rows)
 
 
-def test_the_page_of_swarms_has_what_committed_flights_say() -> None:  # fault 67
-    results = Results.read(RESULTS / "swarms")
+@pytest.mark.parametrize("name", ["baselines", "swarms"])
+def test_the_pages_of_boards_have_what_committed_flights_say(name: str) -> None:  # fault 67
+    results = Results.read(RESULTS / name)
     lines = markdown(results, results_table(results)).splitlines()
-    check("swarm_baselines", results.config["command"], *[x for x in lines if x.startswith("|")])
-    named = list((RESULTS / "swarms" / "checkpoints").iterdir())
-    trained = [row for row in results.config["study"]["row"] if row["agent"] != "orca"]
-    assert len(named) == len(trained)
+    rows = [x for x in lines if x.startswith("|")]
+    check("swarm_baselines" if name == "swarms" else name, results.config["command"], *rows)
+    named = list((RESULTS / name / "checkpoints").iterdir())
+    assert len(named) == sum(not row.controller for row in results.study.rows)
 
 
 @pytest.mark.parametrize("file", sorted(RESULTS.glob("*/mujoco.csv")), ids=lambda f: f.parent.name)
