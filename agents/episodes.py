@@ -249,11 +249,17 @@ class EpisodeRecorder:
     def steps(self) -> dict[str, Array]:
         """Every step that was flown, in the order of flight, those of one moment drone by drone.
 
-        float64 of the shape (T,): `episode`, `value` of the headline metric, `reward`,
+        `episode` (int64), and float32 of the shape (T,): `value` of the headline metric, `reward`,
         and `thrust`, the mean over the rotors in N. NaN where the env does not tell it.
         """
-        columns = np.concatenate([np.zeros((0, 4)), *self._steps]).T
-        return dict(zip(("episode", "value", "reward", "thrust"), columns, strict=True))
+        episode, *others = np.concatenate([np.zeros((0, 4)), *self._steps]).T
+        value, reward, thrust = np.array(others, np.float32)
+        return {
+            "episode": episode.astype(np.int64),
+            "value": value,
+            "reward": reward,
+            "thrust": thrust,
+        }
 
     def _repeat(self, flown: Flown) -> bool:
         """Fly the actions of a position; whether a simulator was lost."""

@@ -88,7 +88,7 @@ class BackendConfig:
     dtype: Literal["float32", "float64"] | None = None
     """Of `rigid`: `float32`, the default, or `float64`."""
     compiled: bool | None = None
-    """Of `rigid`: None compiles where llvmlite is installed. It changes no number."""
+    """None compiles where llvmlite is installed. It changes no number."""
 
     def __post_init__(self) -> None:
         check("backend", Choice(BACKENDS), self.name)

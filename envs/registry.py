@@ -70,7 +70,7 @@ def _import_here(module: str) -> None:
     try:
         import_module(module)
     except ModuleNotFoundError as error:
-        if not module.startswith(error.name or "?"):
+        if not f"{module}.".startswith(f"{error.name}."):
             raise
         raise InputError(f"env: expected a module {module} here, got none") from None
 

@@ -15,10 +15,9 @@ def box(array: ArraySpec) -> spaces.Box:
     low, high = array.bounds()
     dtype: Any = np.dtype(array.dtype)
     if dtype.kind in "iu":
-        least = np.iinfo(dtype).min
-        most = np.iinfo(dtype).max
-        low = np.clip(low, least, most)
-        high = np.clip(high, least, most)
+        limits = np.iinfo(dtype)
+        # As Python's numbers: float64 lacks the largest of int64.
+        low, high = (np.clip(one.astype(object), limits.min, limits.max) for one in (low, high))
     return spaces.Box(low.astype(dtype), high.astype(dtype), dtype=dtype)
 
 

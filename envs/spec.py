@@ -1,7 +1,7 @@
 """Specs: names, shapes, dtypes, bounds, units, frames and constants of what crosses the wire.
 
 A simulator sends its `EnvSpec` in Hello, and an agent builds its spaces from it: it needs neither
-the env's code nor MuJoCo. This module imports the standard library and NumPy alone.
+the env's code nor MuJoCo. This module imports neither.
 """
 
 import json

@@ -41,7 +41,7 @@ class LocalVectorEnv(AdvancingVectorEnv, VectorEnv[Observation, ArrayLike, np.nd
     Args:
         env_id: Of a registered task, or the config of an env.
         num_envs: N.
-        render_mode: None, `rgb_array` (N pictures) or `human` (a window shows sixteen of them).
+        render_mode: None, `rgb_array` (N pictures) or `human` (a window shows the first world).
         autoreset_mode: `AutoresetMode`, or its value.
         keywords: As of `EnvConfig.from_keywords`: `drones` of each world, `vehicle`, `backend` …
 

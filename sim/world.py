@@ -22,7 +22,7 @@ from .state import Array, ByName, InitialState, WorldState, chosen
 _CLASSES = {"mujoco": "MujocoWorld", "rigid": "RigidWorld"}
 """Backends by name: a class in the module of that name in `backends`."""
 _SETTINGS: Mapping[str, Mapping[str, Rule]] = {
-    "mujoco": {"num_threads": OrNone(Limits(0, whole=True)), "compiled": OrNone(Flag())},
+    "mujoco": {"num_threads": Limits(0, whole=True), "compiled": OrNone(Flag())},
     "rigid": {"dtype": Choice(("float32", "float64")), "compiled": OrNone(Flag())},
 }
 """Rules of each backend's own arguments of `make_world`, by name."""

@@ -23,7 +23,7 @@ from ..envs.autoreset import (
 from ..envs.spaces import action_space, joined, observation_space, telemetry_names
 from ..envs.spec import ArraySpec, Discrete, EnvSpec
 from ..models.errors import InputError, NotCopied
-from ..models.fields import Limits, OrNone, check, check_names
+from ..models.fields import Limits, OrNone, check
 from .layouts import layout_of
 from .protocol.client import Address
 from .protocol.layout import MAX_DRONES, Array
@@ -291,7 +291,9 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Observation, ArrayL
             options: `reset_mask`: bool, shape (N,): which drones; the others are frozen.
         """
         options = options or {}
-        check_names(options, ("reset_mask",), "options")
+        for name in options:
+            if name != "reset_mask":
+                raise InputError(f"options: expected reset_mask or none over UDP, got {name!r}")
         in_flight = "reset_mask" in options and self._flying
         if not in_flight:
             self.connect()

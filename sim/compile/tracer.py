@@ -27,7 +27,7 @@ Traced = Any
 _FLAG = np.dtype(bool)
 _WHOLE = np.dtype(np.int64)
 _DTYPES = ("bool", "int32", "uint32", "int64", "uint64", "float32", "float64")
-_EXPONENTS = (*range(-8, 0), *range(1, 9))
+_EXPONENTS = (*range(-32, 0), *range(1, 33))
 _OPERATIONS = set[str]().union(*OPERATIONS.values())
 """Functions whose bits IEEE 754, or the arithmetic of whole numbers, fixes."""
 _MOVES = (np.broadcast_to, np.expand_dims, np.moveaxis, np.repeat, np.flip)
@@ -359,6 +359,8 @@ def _remainder(like: TracedArray, x: Any, by: Any) -> Traced:
 
 
 def _power(like: TracedArray, x: Any, exponent: Any) -> Traced:
+    if exponent == 0:
+        return np.ones_like(x)
     if exponent == 0.5:
         return np.sqrt(x)
     if exponent in _EXPONENTS:  # of numbers below 0 too, which have no logarithm
@@ -375,7 +377,8 @@ def _take_along_axis(like: TracedArray, array: Any, indices: Traced, axis: int) 
     parts = [np.expand_dims(np.moveaxis(array, axis, 0)[i], axis) for i in range(count)]
     chosen = parts[0]
     for index in range(count):
-        chosen = _where(like, indices == index, parts[index], chosen)
+        is_it = (indices == index) | (indices == index - count)  # counted from the end too
+        chosen = _where(like, is_it, parts[index], chosen)
     return chosen
 
 

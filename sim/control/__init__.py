@@ -119,8 +119,8 @@ class RotorThrust:
 class MixedController:
     """Controllers of drones of one world whose vehicles are not all alike: each flies its drones.
 
-    Actions mean the same to all; the other attributes are those of the first. Arrays are NumPy's,
-    of shape (W, A, ...).
+    Actions mean the same to all; the other attributes are those of the first. Arrays have the shape
+    (W, A, ...).
     """
 
     def __init__(self, controllers: Sequence[tuple[Controller, Sequence[int]]]) -> None:
@@ -133,7 +133,7 @@ class MixedController:
 
     def thrust(self, action: Array, state: WorldState) -> Array:
         """As `Controller.thrust`."""
-        thrusts = np.empty(state.thrust.shape)
+        thrusts = np.empty_like(state.thrust)
         for controller, drones in self._controllers:
             thrusts[:, drones] = controller.thrust(action[:, drones], state.of(drones))
         return thrusts

@@ -66,6 +66,17 @@ def test_the_bits_of_numpy_and_of_every_processor(name: str) -> None:
     assert hash_of(flown) == EXPECTED[name]
 
 
+def test_drones_of_different_vehicles_are_compiled() -> None:
+    config = EnvConfig(
+        env_id="rotorgram/Formation-v0", vehicle=("crazyflie2", "skydio_x2"), drones=2
+    )
+    ours, theirs = make_loop(config, WORLDS), Loop(config, WORLDS)
+    for step in range(STEPS):
+        for loop in (ours, theirs):
+            flight(loop, range(step, step + 1))
+        check_same(ours, theirs)
+
+
 @pytest.mark.parametrize("name", MUJOCO)
 def test_the_bits_of_numpy_on_mujoco(name: str) -> None:
     """Code before and after the physics, and where it is split."""

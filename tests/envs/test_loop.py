@@ -282,6 +282,9 @@ def test_what_a_user_typed_is_imported_and_nothing_else(
         registry.load("typed_here:Other-v0")
     with pytest.raises(InputError, match=r"^env: expected a module nowhere here, got none"):
         registry.load("nowhere:Typed-v0")
+    (tmp_path / "lacking_task.py").write_text("import lacking\n")
+    with pytest.raises(ModuleNotFoundError, match=r"^No module named 'lacking'$"):
+        registry.load("lacking_task:Typed-v0")
     gym.registry.pop("Typed-v0")
 
 

@@ -10,7 +10,7 @@ from contracts import TABLES, on_both_tasks, rows_of, spec_with
 from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rotorgram.envs.spaces import action_space, info_columns, observation_space
+from rotorgram.envs.spaces import action_space, box, info_columns, observation_space
 from rotorgram.envs.spec import (
     ArraySpec,
     Discrete,
@@ -314,3 +314,11 @@ def test_a_control_period_and_what_follows_that_is_no_spec(period: str) -> None:
     wrong = text.replace(PERIOD, f'"control_period":{period}')
     with pytest.raises(SpecError):
         EnvSpec.from_json(wrong)
+
+
+@pytest.mark.parametrize("low", [None, 0.0])
+def test_whole_numbers_without_bounds_have_those_of_their_dtype(low: float | None) -> None:
+    space = box(ArraySpec(name="n", shape=(1,), dtype="int64", low=low))
+    limits = np.iinfo(np.int64)
+    assert space.high.tolist() == [limits.max]
+    assert space.low.tolist() == [limits.min if low is None else 0]

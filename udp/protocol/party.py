@@ -153,7 +153,10 @@ class WorldRules:
 
     def next_timer(self) -> float:
         """When `handle_timers` wants to be called; infinite if never."""
-        return min([link.client.next_timer() for link in self.links])
+        timer = inf
+        for link in self.links:
+            timer = min(timer, link.client.resend_at, link.client.deadline)
+        return timer
 
     def handle_timers(self, now: float) -> None:
         """Resend what is due. Raises `PeerSilent` where the flight cannot go on."""
