@@ -17,7 +17,8 @@ def box(array: ArraySpec) -> spaces.Box:
     if dtype.kind in "iu":
         limits = np.iinfo(dtype)
         # As Python's numbers: float64 lacks the largest of int64.
-        low, high = (np.clip(one.astype(object), limits.min, limits.max) for one in (low, high))
+        low = np.clip(low.astype(object), limits.min, limits.max)
+        high = np.clip(high.astype(object), limits.min, limits.max)
     return spaces.Box(low.astype(dtype), high.astype(dtype), dtype=dtype)
 
 
