@@ -236,9 +236,9 @@ class Study:
             raise InputError("row: expected at least one, got none")
         check_fields(self)
         files = [file_words(row.name) for row in self.rows]
-        for row, file in zip(self.rows, files, strict=True):
+        for file in files:
             if files.count(file) > 1:
-                raise InputError(f"row: expected each row once, got {row.name} twice")
+                raise InputError(f"row: expected each row once, got {file} twice as a file's name")
         if not self.episodes:
             set_fields(self, episodes=max(20, -(-MIN_FLIGHTS // self.seeds)))
 

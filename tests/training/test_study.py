@@ -99,7 +99,7 @@ def test_files_hold_settings_software_and_every_step(folder: Path) -> None:
 
 def test_two_rows_with_the_same_files_are_refused() -> None:
     rows = Row(agent="pid", name="x 1/2"), Row(agent="pid", name="X 1:2")
-    with pytest.raises(InputError, match=r"^row: expected each row once, got x 1/2 twice$"):
+    with pytest.raises(InputError, match=r"^row: expected each row once, got x-1-2 twice as a"):
         Study(rows=rows)
 
 
