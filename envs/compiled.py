@@ -140,6 +140,7 @@ class CompiledLoop(Loop):
         try:
             self._world.refuse_bad(flew)
         except PhysicsError:
+            record.steps = record.steps - (1 if flew is None else flew)
             record.wait(flew)
             raise
         refuse_unfit(record, self.config.env_id)

@@ -7,10 +7,11 @@ import gymnasium as gym
 import numpy as np
 
 from ..models.errors import InputError, shortened
+from ..models.fleet import members_of
 from .spec import EnvSpec
 
 if TYPE_CHECKING:
-    from ..rendering import Canvas, Moment
+    from ..rendering import Canvas, Moment, Stage
     from ..rendering.live import LiveView
     from .loop import Loop
 
@@ -50,14 +51,13 @@ class Renderer:
         if self._mode == "human":
             self._show(now)
             return None
-        from ..rendering import Canvas, Stage
+        from ..rendering import Canvas
 
         drones = len(self._loop.spec.agents)
         if self._canvas is None:
             one = len(now) == drones
-            stage = Stage(drones=drones, vehicle=self._loop.vehicle.path, trail=one)
             size = (480, 360) if one else (240, 180)
-            self._canvas = Canvas(stage, *size)
+            self._canvas = Canvas(self._stage(trail=one), *size)
         canvas = self._canvas
         pictures = []
         for first in range(0, len(now), drones):
@@ -66,15 +66,23 @@ class Renderer:
         return tuple(pictures)
 
     def _show(self, now: "list[Moment]") -> None:
-        from ..rendering import Stage, live
+        from ..rendering import live
 
         shown = now[: len(self._loop.spec.agents)]  # of the first world
         if self._view is None:
-            stage = Stage(drones=len(shown), vehicle=self._loop.vehicle.path)
-            self._view = live.LiveView(stage, live.Pace(self._loop.spec.control_period))
+            pace = live.Pace(self._loop.spec.control_period)
+            self._view = live.LiveView(self._stage(trail=True), pace)
         if shown != self._shown:  # `step` shows by itself, and a script may ask once more
             self._shown = shown
             self._view.draw_in_time(*shown)
+
+    def _stage(self, *, trail: bool) -> "Stage":
+        """Of a world."""
+        from ..rendering import Stage
+
+        drones = len(self._loop.spec.agents)
+        crafts = members_of(self._loop.vehicle, drones)
+        return Stage(drones=drones, vehicle=[str(one.path) for one in crafts], trail=trail)
 
     def close(self) -> None:
         """Close the canvas or the window."""

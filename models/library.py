@@ -1,5 +1,6 @@
 """Where a vehicle's file is: a path, or the bare name of a vehicle that comes with the package."""
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -23,7 +24,7 @@ def vehicle_words(given: object) -> tuple[str, ...]:
     if given is None:
         return ()
     words: Sequence[object] = given if isinstance(given, list | tuple) else (given,)
-    if isinstance(given, str) and "," in given and not Path(given).exists():
+    if isinstance(given, str) and "," in given and not os.path.exists(given):
         words = [word.strip() for word in given.split(",")]
     if not all(isinstance(word, str | Path) for word in words):
         raise InputError(f"vehicle: expected names or files, got {shortened(given)}")
@@ -32,26 +33,26 @@ def vehicle_words(given: object) -> tuple[str, ...]:
 
 def is_of_the_library(vehicle: str) -> bool:
     """Whether a word is the bare name of a vehicle of the library, and no file has that name."""
-    return vehicle in vehicle_names() and not Path(vehicle).is_file()
+    return vehicle in vehicle_names() and not os.path.isfile(vehicle)
 
 
 def find_vehicle(vehicle: Path | str | None) -> Path:
     """The absolute path of a vehicle's file; None is the paper's. Raises `InputError`."""
     if vehicle is None:
         return QUAD_XML.resolve()
-    if not (isinstance(vehicle, str | Path) and 0 < len(str(vehicle)) <= 1000):
+    word = str(vehicle)
+    if not (isinstance(vehicle, str | Path) and 0 < len(word) <= 1000 and "\0" not in word):
         raise InputError(
             "vehicle: expected the path of a file, of 1 to 1000 characters, "
             f"got {shortened(vehicle)}"
         )
     path = Path(vehicle)
-    word = str(vehicle)
     if is_of_the_library(word):
         return (LIBRARY / word / "vehicle.toml").resolve()
-    if path.suffix == "" and path.name == word and not path.exists():
+    if path.suffix == "" and path.name == word and not os.path.exists(path):
         known = ", ".join(vehicle_names())
         raise InputError(f"vehicle: expected a file, or one of {known}, got {word!r}")
-    if not path.is_file() and (path.exists() or path.is_symlink()):
+    if not os.path.isfile(path) and os.path.lexists(path):
         raise InputError(
             "vehicle: expected a file, "
             f"got {word}, which is a folder, a device or a link to nothing"

@@ -130,15 +130,15 @@ def _check_sizes(path: Path) -> None:
                 waiting.append((read_xml(inner), times))
         total += times
         numbers += times * _numbers(element)
-        if numbers > MAX_NUMBERS:
-            _refuse(f"at most {MAX_NUMBERS} numbers of assets and sensors", f"{numbers} or more")
         if total > MAX_ELEMENTS:
             _refuse(f"at most {MAX_ELEMENTS} elements", f"{total} or more")
+        if numbers > MAX_NUMBERS:
+            _refuse(f"at most {MAX_NUMBERS} numbers of assets and sensors", f"{numbers} or more")
         waiting += [(child, times) for child in element]
 
 
 def _check_element(element: ElementTree.Element) -> None:
-    for name, most in _LARGEST.get(element.tag, {}).items():
+    for name, most in (_LARGEST.get(element.tag, {}) | _LARGEST["any"]).items():
         text = element.get(name, "0")
         if _whole(text) > most:
             _refuse(f"a {name} of at most {most} in <{element.tag}>", text)
@@ -149,10 +149,11 @@ def _check_element(element: ElementTree.Element) -> None:
 
 
 def _numbers(element: ElementTree.Element) -> int:
-    """How many numbers MuJoCo allocates for an asset, a custom numeric or a sensor."""
-    if element.tag == "size" or element.tag not in _LARGEST:
-        return 0
-    return math.prod(max(1, _whole(element.get(name, "1"))) for name in _LARGEST[element.tag])
+    """How many numbers MuJoCo allocates for an asset, an actuator or a sensor, at least 1."""
+    names = dict(_LARGEST["any"])
+    if element.tag != "size":
+        names |= _LARGEST.get(element.tag, {})
+    return math.prod(max(1, _whole(element.get(name, "1"))) for name in names)
 
 
 def _whole(text: str) -> int:

@@ -140,7 +140,7 @@ class Vehicle:
         solid = craft_geoms(model)
         solid &= (model.geom_contype | model.geom_conaffinity) > 0
         reach = np.linalg.norm(data.geom_xpos, axis=1) + model.geom_rbound
-        return float(settled(reach[solid].max(initial=0.0)))
+        return float(settled(reach[solid].max(initial=1e-3)))
 
     @cached_property
     def cameras(self) -> tuple[Camera, ...]:
@@ -392,7 +392,7 @@ def _read_rotor(model: MjModel, data: MjData, index: int) -> Rotor:
         fault = f"rotor {name} to be an actuator at a site of the body, got another"
     elif reference >= 0:
         fault = f"rotor {name} to act without a reference site, got one"
-    elif not is_plain:
+    elif not is_plain or model.actuator_delay[index] > 0:
         fault = f"the thrust of rotor {name} to be gain times control, got another law"
     elif newtons == 0.0:
         fault = f"rotor {name} to have a force (gear times gain), got 0 N"

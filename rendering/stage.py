@@ -3,6 +3,7 @@
 import copy
 import math
 from collections import deque
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from itertools import pairwise
@@ -131,7 +132,7 @@ class Stage:
         scene: str = "airport",
         drones: int = 1,
         *,
-        vehicle: Path | str | None = None,
+        vehicle: Path | str | Sequence[str] | None = None,
         trail: bool = True,
     ) -> None:
         if not drones >= 1:

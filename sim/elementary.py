@@ -6,7 +6,8 @@ arguments, float32 or float64, and give numbers for numbers. Errors are in units
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import wraps
 from math import factorial
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,14 +18,13 @@ import numpy as np
 from ..models.files import read_toml
 from .compile import once
 from .compile.tracer import add_function
-from .state import Array, floor
+from .state import Array
 
 _TURN = 0.6366197723675814  # 2 / π
 _SQRT_HALF = 0.7071067811865476
 _EIGHTH = 0.41421356237309503  # tan(π / 8)
 _INFINITY = math.inf
 _NAN = math.nan
-_ROUNDING = 2.0**52  # Added to a smaller number of float64, it leaves no bit for its fraction
 _LAYOUTS = {"float32": (np.int32, 23, 127), "float64": (np.int64, 52, 1023)}
 """Whole numbers with the bits of a float, bits of its fraction, and its exponent of 1."""
 
@@ -50,32 +50,24 @@ _DOUBLE = _precision(**_TABLES["float64"])
 # ---- of arrays, and of numbers, which are Python's
 
 
-def _prepared(*values: Array) -> tuple[Any, ...]:
-    """Constants, and the values: numbers as Python's."""
-    for value in values:
-        if not isinstance(value, float | int):
-            is_single = value.dtype == np.float32
-            return _SINGLE if is_single else _DOUBLE, *values
-    return _DOUBLE, *map(float, values)
+def _of_numbers(function: Callable[..., Array]) -> Callable[..., Array]:
+    """Python's numbers, alone, give one of them: computed in float64."""
+
+    @wraps(function)
+    def call(*values: Array) -> Array:
+        for value in values:
+            if not isinstance(value, float | int):
+                return function(*values)
+        with np.errstate(all="ignore"):
+            return function(*map(np.float64, values)).item()
+
+    return call
 
 
-def _where(flag: Array, yes: Array, no: Array) -> Array:
-    if isinstance(flag, bool):
-        return yes if flag else no
-    return np.where(flag, yes, no)
-
-
-def _rint(x: Array) -> Array:
-    if isinstance(x, float):
-        return math.copysign((abs(x) + _ROUNDING) - _ROUNDING, x)
-    return np.rint(x)
-
-
-def _signed(x: Array, sign: Array) -> Array:
-    """x with another sign."""
-    if isinstance(sign, float):
-        return math.copysign(x, sign)
-    return np.copysign(x, sign)
+def _constants(*values: Array) -> SimpleNamespace:
+    """Of the precision of the first array."""
+    array = next(value for value in values if hasattr(value, "dtype"))
+    return _SINGLE if array.dtype == np.float32 else _DOUBLE
 
 
 def _split(x: Array) -> tuple[Array, Array]:
@@ -83,8 +75,6 @@ def _split(x: Array) -> tuple[Array, Array]:
 
     The fraction is a product too, so that it has a derivative.
     """
-    if isinstance(x, float):
-        return math.frexp(x)
     whole, digits, one = _LAYOUTS[x.dtype.name]
     power = ((x.view(whole) >> digits) - (one - 1)).astype(x.dtype)
     return _scaled(x, -power), power
@@ -92,8 +82,6 @@ def _split(x: Array) -> tuple[Array, Array]:
 
 def _scaled(x: Array, power: Array) -> Array:
     """A number times a power of 2, in two steps, of which only the last one can round."""
-    if isinstance(x, float):
-        return math.ldexp(x, int(power))
     whole, digits, one = _LAYOUTS[x.dtype.name]
     power = power.astype(whole)
     half = power >> 1
@@ -113,12 +101,14 @@ def polynomial(x: Array, coefficients: Sequence[float]) -> Array:
 # ---- of angles
 
 
+@_of_numbers
 @once()
 def sin(x: Array) -> Array:
     """Sine of an angle, rad, within 2.5 ulp; NaN beyond 3e6, of float32 beyond 2e4."""
     return _wave(x, 0.0)
 
 
+@_of_numbers
 @once()
 def cos(x: Array) -> Array:
     """Cosine of an angle, as `sin`."""
@@ -127,80 +117,84 @@ def cos(x: Array) -> Array:
 
 def _wave(x: Array, quarters: float) -> Array:
     """Sine of x plus `quarters` quarter turns."""
-    p, x = _prepared(x)
-    near = _rint(x * _TURN)
+    p = _constants(x)
+    near = np.rint(x * _TURN)
     rest = _without(p, x, near)
     quarter = near + quarters
-    quarter = quarter - 4.0 * floor(quarter * 0.25)
+    quarter = quarter - 4.0 * np.floor(quarter * 0.25)
     square = rest * rest
     sine = rest + rest * (square * polynomial(square, p.sine))
     cosine = 1.0 - (0.5 * square - square * (square * polynomial(square, p.cosine)))
     is_cosine = (quarter == 1.0) | (quarter == 3.0)
-    value = _where(is_cosine, cosine, sine)
-    return _where(quarter >= 2.0, -value, value)
+    value = np.where(is_cosine, cosine, sine)
+    return np.where(quarter >= 2.0, -value, value)
 
 
+@_of_numbers
 @once()
 def wrapped(x: Array) -> Array:
     """The angle between -π and π, rad, that differs from x by whole turns; NaN as of `sin`."""
-    p, x = _prepared(x)
-    return _without(p, x, 4.0 * _rint(x * (0.25 * _TURN)))
+    p = _constants(x)
+    return _without(p, x, 4.0 * np.rint(x * (0.25 * _TURN)))
 
 
 def _without(p: SimpleNamespace, x: Array, quarters: Array) -> Array:
     """An angle less so many quarter turns: reduction by Cody and Waite."""
-    x = _where(abs(x) < p.furthest, x, _NAN)
+    x = np.where(abs(x) < p.furthest, x, _NAN)
     for part in p.half_pi:
         x = x - quarters * part
     return x
 
 
+@_of_numbers
 @once()
 def atan2(y: Array, x: Array) -> Array:
     """Angle of the point (x, y), rad, within 2.5 ulp, for sizes below 1e37; zeros as in C."""
-    p, y, x = _prepared(y, x)
+    p = _constants(y, x)
     across = abs(x)
     up = abs(y)
     is_steep = up > across
-    large = _where(is_steep, up, across)
-    small = _where(is_steep, across, up)
-    large = _where(large == 0.0, 1.0, large)
+    large = np.where(is_steep, up, across)
+    small = np.where(is_steep, across, up)
+    large = np.where(large == 0.0, 1.0, large)
     is_far = small > _EIGHTH * large
-    above = _where(is_far, small - large, small)
-    ratio = above / _where(is_far, small + large, large)
+    above = np.where(is_far, small - large, small)
+    ratio = above / np.where(is_far, small + large, large)
     square = ratio * ratio
     series = polynomial(square, p.arc)
     if p.arc_below:
         series = series / polynomial(square, p.arc_below)
     angle = ratio + ratio * (square * series)
     high, low = p.half_turn
-    angle = _where(is_far, 0.25 * high + (angle + 0.25 * low), angle)
-    angle = _where(is_steep, 0.5 * high + (0.5 * low - angle), angle)
-    is_behind = _signed(1.0, x) < 0.0
-    angle = _where(is_behind, high + (low - angle), angle)
-    return _signed(angle, y)
+    angle = np.where(is_far, 0.25 * high + (angle + 0.25 * low), angle)
+    angle = np.where(is_steep, 0.5 * high + (0.5 * low - angle), angle)
+    is_behind = np.copysign(1.0, x) < 0.0
+    angle = np.where(is_behind, high + (low - angle), angle)
+    return np.copysign(angle, y)
 
 
 # ---- exponentials
 
 
+@_of_numbers
 @once()
 def exp(x: Array) -> Array:
     """Exponential function, within 2.5 ulp.
 
     0 below -708 and infinite above 709, of float32 below -87 and above 88.
     """
-    p, x = _prepared(x)
+    p = _constants(x)
     rest, power = _reduced(p, x)
     value = _scaled(1.0 + rest, power)
-    value = _where(x < p.low, 0.0, value)
+    value = np.where(x < p.low, 0.0, value)
     return _ended(p, x, value)
 
 
+@_of_numbers
 @once()
 def expm1(x: Array) -> Array:
     """exp(x) - 1, within 2.5 ulp; infinite where `exp` is."""
-    p, x = _prepared(x)
+    p = _constants(x)
     rest, power = _reduced(p, x)
     scale = _scaled(1.0 + 0.0 * rest, power)
     return _ended(p, x, scale * rest + (scale - 1.0))
@@ -208,9 +202,9 @@ def expm1(x: Array) -> Array:
 
 def _reduced(p: SimpleNamespace, x: Array) -> tuple[Array, Array]:
     """A number r and a power n of 2: exp(x) = (1 + r) 2ⁿ."""
-    inside = _where(x > p.low, x, p.low)
-    inside = _where(inside < p.high, inside, p.high)
-    power = _rint(inside * 1.4426950408889634)
+    inside = np.where(x > p.low, x, p.low)
+    inside = np.where(inside < p.high, inside, p.high)
+    power = np.rint(inside * 1.4426950408889634)
     high, low = p.log2
     rest = (inside - power * high) - power * low
     return rest + rest * rest * polynomial(rest, p.exponential), power
@@ -218,21 +212,22 @@ def _reduced(p: SimpleNamespace, x: Array) -> tuple[Array, Array]:
 
 def _ended(p: SimpleNamespace, x: Array, value: Array) -> Array:
     """A value that grows with x, beyond the range too."""
-    value = _where(x > p.high, _INFINITY, value)
-    return _where(x == x, value, x)
+    value = np.where(x > p.high, _INFINITY, value)
+    return np.where(x == x, value, x)
 
 
+@_of_numbers
 @once()
 def log(x: Array) -> Array:
     """Natural logarithm, within 2.5 ulp, as fdlibm's e_log.c.
 
     -infinity of 0 and of numbers below the normal ones, NaN of negative ones.
     """
-    p, x = _prepared(x)
+    p = _constants(x)
     fraction, power = _split(abs(x))
     is_low = fraction < _SQRT_HALF
-    fraction = _where(is_low, fraction + fraction, fraction)
-    power = _where(is_low, power - 1.0, power)
+    fraction = np.where(is_low, fraction + fraction, fraction)
+    power = np.where(is_low, power - 1.0, power)
     above = fraction - 1.0
     s = above / (2.0 + above)
     square = s * s
@@ -240,9 +235,9 @@ def log(x: Array) -> Array:
     half = 0.5 * above * above
     high, low = p.log2
     value = power * high - ((half - (s * (half + rest) + power * low)) - above)
-    value = _where(x < p.least, -_INFINITY, value)
-    value = _where(x < _INFINITY, value, x)
-    return _where(x < 0.0, _NAN, value)
+    value = np.where(x < p.least, -_INFINITY, value)
+    value = np.where(x < _INFINITY, value, x)
+    return np.where(x < 0.0, _NAN, value)
 
 
 def power(x: Array, y: Array) -> Array:

@@ -103,14 +103,9 @@ def square_root(array: Array) -> Array:
     return np.sqrt(np.maximum(array, 0.0))
 
 
-def floor(array: Array) -> Array:
-    """The next whole number below, a float."""
-    return array // 1.0 if isinstance(array, float) else np.floor(array)
-
-
 def remainder(index: Array, count: float) -> Array:
     """What is left of whole numbers, floats, when they are divided by one."""
-    return index - count * floor(index / count)
+    return index - count * np.floor(index / count)
 
 
 def total(values: Array) -> Array:
@@ -138,7 +133,7 @@ def looked_up(table: np.ndarray, index: Array) -> Array:
 
 def interpolated(table: np.ndarray, index: Array) -> Array:
     """Numbers of a constant table, (rows,), between whole numbers on straight lines."""
-    before = floor(index)
+    before = np.floor(index)
     low = looked_up(table, before)
     return low + (looked_up(table, before + 1.0) - low) * (index - before)
 

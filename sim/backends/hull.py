@@ -27,7 +27,7 @@ class Hull:
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
-        shapes = _shapes(vehicle.model)
+        self._shapes = shapes = _shapes(vehicle.model)
         self._reach = -np.inf
         self.ground = 0.0
         self._apart = 2 * vehicle.radius
@@ -46,7 +46,7 @@ class Hull:
         """Whether crafts at such heights and attitudes (four vectors) touch the ground."""
         height = height - self.ground
         near = height < self._reach
-        if not some(near):
+        if not (self._shapes and some(near)):
             return near
         w, x, y, z = quaternion
         down = (2 * (w * y - x * z), -2 * (y * z + w * x), 2 * (x * x + y * y) - 1)

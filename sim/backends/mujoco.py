@@ -230,6 +230,7 @@ class MujocoWorld(World):
         self.asked.add("acceleration")
         if self.outer:
             return self.outer["acceleration"]
+        self._check_process()
         if self._qacc is None:
             self._qacc = self._batch.bind("qacc")
             self._warmstart = self._batch.bind("qacc_warmstart")
@@ -244,6 +245,7 @@ class MujocoWorld(World):
         self.asked.add("below")
         if self.outer:
             return self.outer["below"]
+        self._check_process()
         origin = self.state.position
         down = -body_z(self.state.quaternion)
         distance = self._batch.ray(origin, down, geomgroup=_SEEN)[0]

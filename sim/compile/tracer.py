@@ -28,8 +28,6 @@ _FLAG = np.dtype(bool)
 _WHOLE = np.dtype(np.int64)
 _DTYPES = ("bool", "int32", "uint32", "int64", "uint64", "float32", "float64")
 _EXPONENTS = (*range(-32, 0), *range(1, 33))
-_OPERATIONS = set[str]().union(*OPERATIONS.values())
-"""Functions whose bits IEEE 754, or the arithmetic of whole numbers, fixes."""
 _MOVES = (np.broadcast_to, np.expand_dims, np.moveaxis, np.repeat, np.flip)
 """Functions that move components, and compute nothing."""
 _JOINS = (np.stack, np.concatenate, np.column_stack, np.vstack, np.hstack)
@@ -146,8 +144,8 @@ class TracedArray(NDArrayOperatorsMixin):
             return _FUNCTIONS[ufunc](self, *inputs)
         kinds = ufunc.resolve_dtypes((*map(_kind, inputs), *[None] * ufunc.nout))
         arrays = [self.lifted(one, kind) for one, kind in zip(inputs, kinds, strict=False)]
-        if ufunc.__name__ not in _OPERATIONS:
-            _refuse(f"np.{ufunc.__name__}")
+        if ufunc.__name__ not in OPERATIONS[arrays[0].dtype.kind]:
+            _refuse(f"np.{ufunc.__name__} of {arrays[0].dtype}")
         return self._applied(ufunc.__name__, kinds[ufunc.nin], *arrays)
 
     def __array_function__(self, function: Call, types: object, inputs: Any, options: Any) -> Any:
@@ -305,8 +303,11 @@ def _kind(given: Any) -> Any:
 
 
 def _result_type(_: TracedArray, *given: Any) -> DType:
-    dtypes = [one.dtype if isinstance(one, TracedArray) else one for one in given]
-    return np.result_type(*dtypes)
+    """Python's numbers adapt to arrays, and lists do not, as in NumPy."""
+    listed = [np.asarray(one) if isinstance(one, list | tuple) else one for one in given]
+    return np.result_type(
+        *[one.dtype if isinstance(one, TracedArray) else one for one in listed]
+    )
 
 
 # ---- functions that are made of others

@@ -156,6 +156,17 @@ def test_bad_states_and_numbers_are_told_of() -> None:
     env.step(np.zeros((3, 4), np.float32))
 
 
+def test_a_bad_step_is_not_counted() -> None:
+    ours, theirs = both(Case(HOVER, {"backend": "rigid"}))
+    for loop in (ours, theirs):
+        loop.advance(None, np.ones(WORLDS, bool), range(WORLDS))
+        loop.advance(np.zeros((WORLDS, 4), np.float32))
+        loop.world.state.velocity[1, 0, 2] = 1e12
+        with pytest.raises(PhysicsError):
+            loop.advance(np.zeros((WORLDS, 4), np.float32))
+    assert ours.steps.tolist() == theirs.steps.tolist() == [1] * WORLDS
+
+
 def test_a_start_that_is_refused_changes_nothing() -> None:
     """A payload would hang in the ground: physics says so after the code has drawn the start."""
     options = {"effects": {"payload": 1.0, "cable": 4.8}, "start_band": 1.0}

@@ -15,8 +15,8 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-import rotorgram.envs  # noqa: F401  registers the envs
-from rotorgram.models import InputError, Vehicle, library, vehicle_file
+from rotorgram.envs import LocalVectorEnv
+from rotorgram.models import QUAD_XML, InputError, Vehicle, library, vehicle_file
 from rotorgram.models.coefficients import COEFFICIENTS
 from rotorgram.models.export import export_mjcf
 from rotorgram.models.fields import Limits, limits_of
@@ -185,6 +185,21 @@ def test_the_hull_stands_where_the_file_says(tmp_path: Path) -> None:
     mujoco.mj_step(vehicle.model, data, nstep=300)
     assert data.qpos[2] == pytest.approx(0.11, abs=1e-3)  # soft contact lets it sink in
     assert data.qpos[3] == pytest.approx(1.0, abs=1e-6)  # upright
+
+
+def test_a_craft_that_can_touch_nothing_flies(tmp_path: Path) -> None:
+    """Neither contact nor touch: both backends fly it through the ground."""
+    path = tmp_path / "quad.xml"
+    path.write_text(QUAD_XML.read_text().replace('contype="1" conaffinity="1"', 'contype="0"'))
+    for backend in ("mujoco", "rigid"):
+        env = LocalVectorEnv("rotorgram/Elevation-v0", 2, backend=backend, vehicle=str(path))
+        env.reset(seed=1)
+        for _ in range(150):
+            _, _, terminated, _, _ = env.step(env.action_space.low)
+            assert not env.loop.world.state.touching.any()
+            if terminated.any():
+                break
+        assert terminated.any()  # too far from the target
 
 
 def test_the_papers_vehicle_as_toml_is_the_same_craft() -> None:
@@ -480,7 +495,7 @@ def test_export_keeps_six_digits(text: str, tmp_path: Path) -> None:
         export_mjcf(out, out)
 
 
-@pytest.mark.parametrize("given", [3, "", b"craft.toml", ["craft.toml"], "x" * 1001])
+@pytest.mark.parametrize("given", [3, "", b"craft.toml", ["craft.toml"], "x" * 1001, "a\0b"])
 def test_no_path_is_one_sentence(given: Any) -> None:
     with pytest.raises(InputError, match=r"^vehicle: expected the path of a file, of 1 to 1000 "):
         Vehicle.load(given)

@@ -11,8 +11,10 @@ import pytest
 from pictures import HEXA, at
 from rotorgram.envs import LocalVectorEnv, SingleEnv, register
 from rotorgram.envs.parallel import LocalParallelEnv
+from rotorgram.envs.rendering import Renderer
 from rotorgram.envs.tasks import Elevation
 from rotorgram.models import InputError
+from rotorgram.models.vehicle import Vehicle
 from rotorgram.rendering import Moment, NoOpenGL, live
 from rotorgram.rendering.gl import offscreen_context
 from rotorgram.rendering.stage import Stage
@@ -78,6 +80,19 @@ def test_a_picture_of_each_of_many() -> None:
     assert rows[0] < rows[1] < rows[2]
     assert (low != middle).any()
     assert (middle != high).any()
+
+
+def test_each_drone_is_drawn_as_its_own_vehicle() -> None:
+    names = ("crazyflie2", "hummingbird")
+    env = LocalVectorEnv("rotorgram/Formation-v0", 2, drones=2, vehicle=",".join(names))
+    env.reset(seed=1)
+    renderer = Renderer("rgb_array", env.loop)
+    assert renderer.render()
+    assert renderer._canvas
+    model = renderer._canvas.stage.model
+    renderer.close()
+    roots = model.body_subtreemass[model.body_parentid == 0]
+    assert sorted(roots[roots > 0])[:2] == pytest.approx([Vehicle.load(n).mass for n in names])
 
 
 def _green(picture: np.ndarray) -> np.ndarray:

@@ -10,15 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from rotorgram.sim import elementary
-from rotorgram.sim.state import (
-    floor,
-    interpolated,
-    length,
-    looked_up,
-    remainder,
-    square_root,
-    total,
-)
+from rotorgram.sim.state import interpolated, length, looked_up, remainder, square_root, total
 
 KINDS = (np.float32, np.float64)
 COUNT = 2000
@@ -152,6 +144,17 @@ def test_a_wrapped_angle_differs_by_whole_turns() -> None:
     assert elementary.wrapped(3.0) == 3.0
 
 
+def test_a_number_beside_an_array() -> None:
+    many = np.array((0.5, -2.0), np.float32)
+    for found, expected in (
+        (elementary.atan2(1.0, many), elementary.atan2(np.ones_like(many), many)),
+        (elementary.atan2(many, 1.0), elementary.atan2(many, np.ones_like(many))),
+        (elementary.power(2.0, many), elementary.power(np.full_like(many, 2.0), many)),
+    ):
+        assert found.dtype == np.float32
+        assert_allclose(found, expected, rtol=1e-6)
+
+
 # --- sums, whole numbers and tables of sim/state.py -----------------------------------------------
 
 
@@ -173,9 +176,6 @@ def test_roots_of_rounded_numbers() -> None:
 
 
 def test_whole_numbers() -> None:
-    numbers = (-0.5, 2.0, 2.9)
-    assert [floor(x) for x in numbers] == [-1.0, 2.0, 2.0]
-    assert floor(np.array(numbers)).tolist() == [-1.0, 2.0, 2.0]
     index = np.arange(5000.0)
     for count in (1, 3, 7, 49, 500):
         assert remainder(index, count).tolist() == (index % count).tolist()
