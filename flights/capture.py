@@ -143,7 +143,7 @@ def _frame(job: _Job, row: int, cameras: Cameras) -> tuple[dict[str, bytes], Lab
     pictures = []
     for view in cameras.views:
         # A camera that stands takes one picture for all drones.
-        drones = range(poses.drones if view.camera.carried else 1)
+        drones = range(1 if view.camera.stands else poses.drones)
         for drone in drones:
             suffix = f"_{drone}" if len(drones) > 1 else ""
             image = cameras.pictures[view.name][drone]

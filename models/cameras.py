@@ -85,16 +85,11 @@ class Camera:
         return round(1 / self.rate)
 
     @property
-    def carried(self) -> bool:
-        """Whether a drone carries it."""
-        return not self.stands
-
-    @property
     def words(self) -> str:
         """Where it is, where it looks and how it sees."""
         place = " ".join(f"{one:.4g}" for one in self.position)
         look = " ".join(f"{one:.4g}" for one in self.look)
-        where = "the body" if self.carried else "the world"
+        where = "the world" if self.stands else "the body"
         angle = f"{math.degrees(self.fovy):.4g} degrees high"
         words = f"at ({place}) m in {where}, looks along ({look}), {angle}"
         return words + (f", every {self.every} steps" if self.every > 1 else "")

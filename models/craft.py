@@ -51,7 +51,7 @@ def craft_spec(file: VehicleFile, base: MjSpec | None = None) -> MjSpec:
         numeric.data = values
     for craft in free_bodies(spec)[:1]:
         for camera in file.cameras:
-            body = craft if camera.carried else spec.worldbody
+            body = spec.worldbody if camera.stands else craft
             place_camera(spec, body, camera)
     return spec
 

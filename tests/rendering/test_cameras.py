@@ -103,8 +103,8 @@ def test_cameras_of_a_toml_file(tmp_path: Path) -> None:
     assert belly.fovy == pytest.approx(1.0, rel=1e-6)
     assert belly.position == (0.0, 0.0, -0.02)
     assert belly.look == pytest.approx((0.5 / math.sqrt(1.25), 0.0, -1 / math.sqrt(1.25)))
-    assert belly.carried
-    assert not tower.carried
+    assert not belly.stands
+    assert tower.stands
     assert tower.position == (0.3, -0.4, 1.2)
     assert Vehicle.load("crazyflie2").hash != vehicle.hash
 
