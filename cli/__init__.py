@@ -103,6 +103,10 @@ def _run(words: list[str]) -> int:
             f"rotorgram: expected a command of {', '.join(COMMANDS)}, got {name}", file=sys.stderr
         )
         return 2
+    if name == "train" and "--udp" in words:
+        from ..udp.process import begin_early
+
+        begin_early()
     from ..rendering.gl import hidden_gl_setting
     from ._parser import parse
 

@@ -7,11 +7,11 @@ envs of it, and `journal` files. The protocol needs no Gymnasium.
 from typing import TYPE_CHECKING
 
 from .. import import_when_used
-from .protocol.client import Address, LinkConfig
-from .protocol.errors import DecodeError, LinkError, PeerClosed, PeerSilent, Refused
 
 if TYPE_CHECKING:
     from ..envs.autoreset import LOST
+    from .protocol.client import Address, LinkConfig
+    from .protocol.errors import DecodeError, LinkError, PeerClosed, PeerSilent, Refused
     from .remote import RemoteEnv, RemoteVectorEnv
     from .transport.simulator import DEFAULT_AGENT, DEFAULT_SIMULATOR, Simulator
 

@@ -2,19 +2,17 @@
 
 import atexit
 import json
-import os
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from tempfile import TemporaryFile
-from typing import IO, Any
+from typing import Any
 
 from ..envs import registry
 from ..envs.config import EnvConfig
 from ..models import InputError
+from .process import begin, started
 from .protocol.client import Address
 from .protocol.errors import PeerClosed, PeerSilent
 from .remote import RemoteEnv, RemoteVectorEnv
@@ -25,8 +23,6 @@ _START_TIMEOUT = 60.0
 _ANSWER_TIMEOUT = 10.0
 _STOP_TIMEOUT = 5.0
 _POLL = 0.5
-# -P: no file of the working directory takes the place of a package.
-_COMMAND = (sys.executable, "-P", "-m", "rotorgram.udp")
 
 
 @contextmanager
@@ -64,9 +60,10 @@ def spawn_simulator(
         env = RemoteVectorEnv(
             here, num_envs=count, autoreset_mode="Disabled", connect=False, **settings
         )
-    with TemporaryFile("w+") as said:
-        process = start_simulator(config, env.address, num_envs=count, stderr=said)
+    process, said = started()
+    with said:
         try:
+            _tell(process, config, env.address, num_envs=count)
             _connect(env, process)
             yield env
         except PeerSilent as error:
@@ -88,12 +85,20 @@ def spawn_simulator(
 
 
 def start_simulator(
-    config: EnvConfig, server: Address, *, stderr: IO[str] | None = None, **settings: object
+    config: EnvConfig, server: Address, **settings: object
 ) -> subprocess.Popen[bytes]:
     """A simulator in a process of its own, on a free port; it ends when its stdin is closed.
 
     `settings` are keyword arguments of `Simulator`.
     """
+    process = begin()
+    _tell(process, config, server, **settings)
+    return process
+
+
+def _tell(
+    process: subprocess.Popen[bytes], config: EnvConfig, server: Address, **settings: object
+) -> None:
     known = registry.is_known(config.env_id)
     if known and registry.task_type(config.env_id).__module__ == "__main__":
         raise InputError(
@@ -107,14 +112,10 @@ def start_simulator(
         "bind": ("127.0.0.1", 0),
         **settings,
     }
-    # A second thread of torch makes small tensors slower, and takes the agent's core.
-    around = {"OMP_NUM_THREADS": "1", **os.environ, "PYTHONSAFEPATH": "1"}
-    process = subprocess.Popen(_COMMAND, stdin=subprocess.PIPE, stderr=stderr, env=around)
     assert process.stdin is not None
     with suppress(BrokenPipeError):  # it has ended: its exit status says so
         process.stdin.write(json.dumps(arguments).encode() + b"\n")
         process.stdin.flush()
-    return process
 
 
 def _connect(env: Remote, process: subprocess.Popen[bytes]) -> None:

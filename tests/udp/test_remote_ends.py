@@ -8,6 +8,7 @@ import os
 import re
 import signal
 import socket
+import subprocess
 import sys
 import threading
 import time
@@ -31,6 +32,7 @@ from rotorgram.udp import (
     Simulator,
 )
 from rotorgram.udp import __main__ as udp_main
+from rotorgram.udp import process as processes
 from rotorgram.udp.protocol import binary
 from rotorgram.udp.protocol.messages import Hello
 from rotorgram.udp.spawn import spawn_simulator, start_simulator
@@ -229,6 +231,30 @@ def test_the_simulator_program_ends_on_sigterm_and_tells_the_agent() -> None:
         assert process.wait(10) == 128 + signal.SIGTERM
         assert process.stdin is not None
         process.stdin.close()
+
+
+def test_a_process_that_began_early_flies_for_the_first_that_asks() -> None:
+    processes.begin_early()
+    early, _ = processes._waiting[0]
+    with spawn_simulator(EnvConfig()) as remote:
+        assert not processes._waiting
+        assert remote.reset(seed=3)[0].tobytes() == gym.make(ENV_ID).reset(seed=3)[0].tobytes()
+    assert early.returncode == 0
+
+
+def test_a_process_that_began_early_ends_with_a_command_that_fails() -> None:
+    script = (
+        "import sys\nfrom rotorgram.cli import main\nfrom rotorgram.udp import process\n"
+        "main(['train', 'ppo', '--udp', '--num-envs', '7000000'])\n"
+        "print(process._waiting[0][0].pid)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.stderr.startswith("rotorgram: env_steps: expected at least 7000000")
+    assert done.stderr.count("\n") == 1
+    deadline = time.monotonic() + 20
+    while Path(f"/proc/{int(done.stdout)}").exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
 
 
 def test_a_forgotten_env_tells_the_simulator() -> None:
