@@ -35,6 +35,15 @@ def make_loop(config: EnvConfig, num_worlds: int = 1) -> Loop:
     return Loop(config, num_worlds)
 
 
+def import_ahead() -> None:
+    """Import what most loops need, before it is known what flies."""
+    from ..sim.backends import rigid  # noqa: F401
+    from ..sim.compile.llvm import trouble
+    from . import machine  # noqa: F401
+
+    trouble()
+
+
 class CompiledLoop(Loop):
     """A loop that a machine steps, with the same bits; what cannot be compiled NumPy runs.
 

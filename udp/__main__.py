@@ -13,12 +13,11 @@ import sys
 from threading import Thread
 from typing import Any
 
-from ..envs import machine, registry  # noqa: F401
+from ..envs import registry
+from ..envs.compiled import import_ahead
 from ..envs.config import EnvConfig
 from ..models.errors import InputError, MissingPackage, NoOpenGL, shortened
 from ..models.fields import check_names
-from ..sim.backends import rigid  # noqa: F401  as `machine`, before it is known what flies
-from ..sim.compile.llvm import trouble
 from .protocol.client import LinkConfig
 from .protocol.errors import LinkError
 from .transport.simulator import Simulator
@@ -33,7 +32,7 @@ def main() -> int:
     """Fly until the agent closes. Exit status 1 and one sentence if it fell silent."""
     # The agent closes the exchange; Ctrl-C in a terminal is meant for it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    trouble()  # which imports LLVM, while the agent imports what it needs
+    import_ahead()  # beside the agent, which imports what it needs
     try:
         env, settings = read_arguments(sys.stdin.buffer.readline())
         with Simulator(env, config=LinkConfig(timeout=_FOR_EVER), **settings) as simulator:
