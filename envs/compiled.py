@@ -25,9 +25,7 @@ _OURS = ("numpy", "rotorgram")
 
 def make_loop(config: EnvConfig, num_worlds: int = 1) -> Loop:
     """The loop of a config: compiled where it can be."""
-    config = config.resolve()
-    backend = config.backend
-    if backend.compiled is not False and not config.cameras:
+    if config.backend.compiled is not False and not config.cameras:
         from ..sim.compile.llvm import trouble
 
         if not trouble():

@@ -79,7 +79,7 @@ class Loop:
         self.quantities = quantities_of(task)
         self._closed = False
         self._told: Told | None = None
-        self._content: Any = None
+        self._content: Content | None = None
         self._take()
 
     def prepare(self) -> None:
@@ -244,14 +244,11 @@ class Loop:
         return self._headline
 
     @property
-    def reward_terms(self) -> Mapping[str, Floats]:
-        """Terms of the last rewards by name, each of shape (N,)."""
-        return self._read()[1]
-
-    @property
     def telemetry(self) -> Mapping[str, Floats]:
         """By the names of `spec.telemetry`, float64, shape (N, *shape)."""
-        return self._read()[0]
+        if self._content is None:
+            self._content = self.told()()
+        return self._content[0]
 
     def told(self) -> Told:
         """Gives telemetry and terms of the reward as they are now, also later."""
@@ -277,12 +274,6 @@ class Loop:
         """Take what is told of a step; None: what record, world and task say when asked."""
         self._told = told
         self._content = None
-
-    def _read(self) -> Content:
-        if self._content is None:
-            self._content = self.told()()
-        content: Content = self._content
-        return content
 
     def close(self) -> None:
         """Release threads and memory; what the last step gave can be read on."""

@@ -229,7 +229,7 @@ def bits(values: Any) -> Any:
 def results(loop: Loop, rows: Any = ...) -> dict[str, Any]:
     """What a step gave to some drones."""
     flags = {name: getattr(loop, name) for name in ("rewards", "terminated", "truncated", "out")}
-    groups = (flags, loop.observations, loop.telemetry, loop.metrics, loop.reward_terms)
+    groups = (flags, loop.observations, loop.telemetry, loop.metrics, loop.told()()[1])
     return {f"{i} {name}": x[rows] for i, group in enumerate(groups) for name, x in group.items()}
 
 

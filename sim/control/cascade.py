@@ -23,8 +23,7 @@ import numpy as np
 
 from ... import models
 from ..effects import EffectOptions
-from ..effects.rotors import polynomial
-from ..elementary import cos, sin
+from ..elementary import cos, polynomial, sin
 from ..rotations import Parts, Rows, axes_of, dot, times
 from ..state import Array, WorldState, clip, interpolated, parts_of, square_root, stack
 from .gains import Gains
@@ -261,7 +260,7 @@ def _throttle(curve: Numbers) -> np.ndarray:
     high = np.ones_like(root)
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
-        is_below = polynomial(curve, middle) < root * root
+        is_below = polynomial(middle, (0.0, *curve[::-1])) < root * root
         low = np.where(is_below, middle, low)
         high = np.where(is_below, high, middle)
     return low

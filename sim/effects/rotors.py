@@ -4,7 +4,7 @@ import numpy as np
 
 from ... import models
 from ...models import InputError
-from ..elementary import expm1
+from ..elementary import expm1, polynomial
 from ..snapshots import Kept
 from ..state import Array, ByName, chosen, clip, square_root, stack, total
 from .options import EffectOptions
@@ -49,9 +49,10 @@ class RotorEffects(Kept):
             fall = coefficients["rotors.time_constant_down"]
             self._times = [rise] if fall in (None, rise) else [rise, fall]
         if options.thrust_curve:
-            (self._curve,) = coefficients.need("rotors.curve", "thrust_curve")
-            most = max(polynomial(self._curve, i / 100) for i in range(101))
-            ends = sum(self._curve)
+            (curve,) = coefficients.need("rotors.curve", "thrust_curve")
+            self._curve = (0.0, *curve[::-1])
+            most = max(polynomial(i / 100, self._curve) for i in range(101))
+            ends = sum(curve)
             if not (abs(ends - 1) < 1e-3 and most < 1 + 1e-3):
                 raise InputError(
                     "rotors.curve: expected a curve that ends at the largest thrust, c₀ + c₁ + ... "
@@ -120,7 +121,7 @@ class RotorEffects(Kept):
         low, high = self._limits
         target = clip(command, low, high)
         if options.thrust_curve:
-            target = high * clip(polynomial(self._curve, target / high), 0.0, 1.0)
+            target = high * clip(polynomial(target / high, self._curve), 0.0, 1.0)
         if options.battery:
             if not options.motor_lag:
                 self.voltage = chosen(mask, self._loaded(target), self.voltage)
@@ -186,10 +187,3 @@ class RotorEffects(Kept):
     def _power(self, thrust: Array) -> Array:
         """Electrical power of all rotors, W, shape (W, A)."""
         return self._watts * total(thrust * square_root(thrust))
-
-
-def polynomial(coefficients: tuple[float, ...], x: Array) -> Array:
-    result = coefficients[-1] + 0.0 * x
-    for c in coefficients[-2::-1]:
-        result = result * x + c
-    return result

@@ -313,7 +313,7 @@ def test_reward_and_observation_of_a_step_by_hand() -> None:
     loop = flight.loop
     assert flight.observation == pytest.approx([-1.0, 0.0, 0.0], abs=1e-6)
     assert loop.rewards.tolist() == pytest.approx([-1 / 3])
-    terms = {name: values.tolist() for name, values in loop.reward_terms.items()}
+    terms = {name: values.tolist() for name, values in loop.told()()[1].items()}
     assert terms == {"elevation": loop.rewards.tolist(), "termination": [0.0]}
     assert flight.ends == (False, False)
     assert loop.telemetry["thrust"].tolist() == [[49.0] * 4]
@@ -432,7 +432,7 @@ def test_terminated_by_tilt(degrees: float, over: bool, axis: int) -> None:
     flight.state.quaternion[..., axis] = math.sin(half)
     flight.step(0.0)
     assert flight.ends == (over, False)
-    cost = flight.loop.reward_terms["termination"]
+    cost = flight.loop.told()()[1]["termination"]
     assert cost.tolist() == [-20.0 * over]
 
 

@@ -196,7 +196,7 @@ def test_what_a_step_gave_stays_as_it_was(careless: str, num_envs: int) -> None:
     actions = np.ones((num_envs, 1), np.float32)
     loop.advance(actions, everyone(num_envs), range(num_envs))
     loop.advance(actions)
-    given = [*loop.observations.values(), *loop.metrics.values(), *loop.reward_terms.values()]
+    given = [*loop.observations.values(), *loop.metrics.values(), *loop.told()()[1].values()]
     given += [loop.rewards, loop.terminated, loop.truncated, *loop.telemetry.values()]
     kept = [array.copy() for array in given]
     loop.advance(actions)
@@ -233,7 +233,7 @@ def test_a_task_may_give_constants_and_float32(num_envs: int) -> None:
     loop.advance(still)
     assert loop.rewards.dtype == np.float64
     assert loop.rewards.tolist() == [5.5] * num_envs
-    assert loop.reward_terms["alive"].tolist() == [1.0] * num_envs
+    assert loop.told()()[1]["alive"].tolist() == [1.0] * num_envs
     assert loop.metrics["elevation_error"].tolist() == [0.25] * num_envs
     assert loop.telemetry["metrics"].tolist() == [[0.25]] * num_envs
 
