@@ -12,8 +12,10 @@ from ..models.errors import InputError, shortened
 
 if TYPE_CHECKING:
     from .build import add_scene, build_scene
+    from .rays import Rays
+    from .solids import Layouts, Solids
 
-__all__ = ["add_scene", "build_scene"]
+__all__ = ["Layouts", "Rays", "Solids", "add_scene", "build_scene"]
 
 SCENE_XML = Path(__file__).parent / "scene.xml"
 """Ground, sky and light of the scene `plain`."""

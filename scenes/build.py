@@ -15,7 +15,7 @@ SCENE_PREFIX = "scene/"  # of all names that `add_scene` adds for the plain scen
 _NEAR = 0.25  # m: nearest distance that is drawn
 _FAR = 1200.0  # m: furthest distance at the airport; the hills lie within
 _SEEDED_FAR = 400.0  # m: that of the scenes of a seed
-_HIDDEN_GROUP = 3  # viewers draw groups 0 to 2 unless the user asks for others
+HIDDEN_GROUP = 3  # viewers draw groups 0 to 2 unless the user asks for others
 
 # The depth of a directional light's shadow map spans the whole of _FAR, and a map of finer pixels
 # than 12 mm (1024 over the 12 m around the craft) speckles flat ground at this span.
@@ -96,8 +96,8 @@ def _clear(spec: MjSpec, far: float, slices: int) -> None:
     scene.compiler.discardvisual = False
     model = scene.compile()
     for geom, compiled in zip(spec.geoms, scene.geoms, strict=True):
-        if _is_ground(model, compiled.id):
-            geom.group = _HIDDEN_GROUP
+        if is_ground(model, compiled.id):
+            geom.group = HIDDEN_GROUP
     for texture in list(spec.textures):
         if texture.type == SKY:
             spec.delete(texture)
@@ -111,7 +111,7 @@ def _clear(spec: MjSpec, far: float, slices: int) -> None:
     visual.quality.numslices = max(visual.quality.numslices, slices)
 
 
-def _is_ground(model: mujoco.MjModel, geom: int) -> bool:
+def is_ground(model: mujoco.MjModel, geom: int) -> bool:
     """Whether a geom is a plane of the world body at z = 0 that faces up."""
     if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_PLANE or model.geom_bodyid[geom] != 0:
         return False

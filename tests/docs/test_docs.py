@@ -168,6 +168,19 @@ def test_the_performance_page_tells_what_was_measured() -> None:
     check("performance", trained, *(f"| {row} |" for row in rows))
 
 
+def test_the_page_of_solids_tells_what_was_measured() -> None:
+    found = result("performance/sight")
+    errors = found["errors"]
+    assert errors["off"] == errors["grazing"]
+    rays = f"Of {errors['rays']:,} rays in random scenes (`python studies/sight.py`) all but"
+    rows = [
+        f"| {row['solids']} | {row['sensor']} | {row['scans']:,.0f} | {row['mj_multiRay']:,.0f} | "
+        f"{row['ratio']:.0f} |"
+        for row in found["speeds"]
+    ]
+    check("solids", rays, f"all but {errors['off']} are within 0.2 mm", *rows)
+
+
 def test_the_scaling_page_tells_what_was_measured() -> None:
     scaling = result("performance/scaling")
     extrapolated = scaling["extrapolated"]

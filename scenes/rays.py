@@ -1,0 +1,175 @@
+"""Rays of a sensor, which look for the first solid.
+
+Frame of a sensor: x forward, y left, z up.
+"""
+
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..models.errors import InputError, shortened
+from ..models.fields import Limits, check
+from .kernels import LANES, packets
+from .solids import Layouts
+
+Array = NDArray[np.float32]
+
+MAX_RAYS = 1 << 20
+_COUNT = Limits(1, 4096, whole=True)
+_DEGREES = "degrees"
+
+
+class Rays:
+    """Rays from one point, of R rows and C columns.
+
+    Attributes:
+        directions: Unit vectors, shape (R, C, 3).
+    """
+
+    def __init__(self, directions: ArrayLike) -> None:
+        given = np.asarray(directions, float)
+        if given.ndim != 3 or given.shape[2] != 3 or not 0 < given.size <= 3 * MAX_RAYS:
+            raise InputError(f"directions: expected shape (rows, columns, 3), got {given.shape}")
+        sizes = np.sqrt((given * given).sum(axis=-1, keepdims=True))
+        if not (np.isfinite(sizes) & (sizes > 0)).all():
+            raise InputError("directions: expected finite vectors that are not 0, got others")
+        self.directions = given / sizes
+
+    @classmethod
+    def pinhole(cls, rows: int, columns: int, fov: float) -> Self:
+        """Through the centers of pixels: top row first, from left to right.
+
+        `fov` is the angle between the outer edges of the first and the last column, degrees.
+        """
+        _check_counts(rows, columns)
+        check("fov", Limits(0.1, 179.0, _DEGREES), fov)
+        width = 2 * np.tan(np.radians(fov) / 2) / columns
+        left = (columns / 2 - (np.arange(columns) + 0.5)) * width
+        up = (rows / 2 - (np.arange(rows) + 0.5)) * width
+        return cls(np.stack(np.broadcast_arrays(1.0, left, up[:, None]), axis=-1))
+
+    @classmethod
+    def rings(cls, rows: int, columns: int, low: float, high: float) -> Self:
+        """Rings of a lidar, at elevations from `high` to `low`, degrees, the highest first.
+
+        Each begins ahead and turns to the left.
+        """
+        _check_counts(rows, columns)
+        for name, value in (("low", low), ("high", high)):
+            check(name, Limits(-90.0, 90.0, _DEGREES), value)
+        elevation = np.radians(np.linspace(high, low, rows))[:, None]
+        azimuth = 2 * np.pi * np.arange(columns) / columns
+        ahead = np.cos(elevation) * np.cos(azimuth)
+        left = np.cos(elevation) * np.sin(azimuth)
+        return cls(np.stack(np.broadcast_arrays(ahead, left, np.sin(elevation)), axis=-1))
+
+    def cast(
+        self,
+        layouts: Layouts,
+        position: ArrayLike,
+        attitude: ArrayLike,
+        *,
+        reach: float = 20.0,
+        which: ArrayLike = 0,
+    ) -> Array:
+        """Distances to the first solid, m, float32, shape (W, R, C); `reach` if it is further.
+
+        The same bits alone and among others, with Numba and without.
+
+        Args:
+            layouts: Of which each sensor is in one, `Layouts.of(scene, …)`.
+            position: Of each sensor, world frame, m, shape (W, 3).
+            attitude: Quaternions from its frame to the world's, scalar first, shape (W, 4).
+            reach: m.
+            which: Number of its layout, shape (W,).
+        """
+        check("reach", Limits(1e-3, 1e4, "m"), reach)
+        place = np.array(position, np.float32, ndmin=2)
+        turn = np.array(attitude, float, ndmin=2)
+        chosen = np.broadcast_to(np.asarray(which, np.int64), len(place)).copy()
+        if place.shape[1:] != (3,) or turn.shape != (len(place), 4):
+            expected = "positions (W, 3) and quaternions (W, 4)"
+            raise InputError(f"rays: expected {expected}, got {place.shape} and {turn.shape}")
+        if not (np.isfinite(place).all() and np.isfinite(turn).all() and turn.any(axis=1).all()):
+            raise InputError("rays: expected finite positions, and quaternions but 0, got others")
+        kinds, tables = layouts
+        if not ((chosen >= 0) & (chosen < len(kinds))).all():
+            raise InputError(f"which: expected 0 to {len(kinds) - 1}, got {shortened(which)}")
+        lanes, planes, whole = self._packets
+        rows, columns = self.directions.shape[:2]
+        out = np.empty((len(place), rows * columns), np.float32)
+        packets(
+            kinds, tables, chosen, place, _matrices(turn), lanes, planes, whole,
+            self._slots, np.float32(reach), out,
+        )  # fmt: skip
+        return out.reshape(-1, rows, columns)
+
+    @cached_property
+    def _tiles(self) -> NDArray[np.int64]:
+        """Numbers of the rays of each packet, (K, 16): tiles of a grid whose last rows and columns
+        are repeated."""
+        rows, columns = self.directions.shape[:2]
+        high = 4 if rows > 3 else min(rows, 2)
+        wide = LANES // high
+        numbers = np.arange(rows * columns).reshape(rows, columns)
+        numbers = np.pad(numbers, ((0, -rows % high), (0, -columns % wide)), mode="edge")
+        tiles = numbers.reshape(numbers.shape[0] // high, high, -1, wide)
+        return tiles.transpose(0, 2, 1, 3).reshape(-1, LANES)
+
+    @cached_property
+    def _slots(self) -> NDArray[np.uint64]:
+        """Where each ray is among those of the packets."""
+        slots = np.empty(self.directions[..., 0].size, np.uint64)  # unsigned: none is from the end
+        slots[self._tiles.ravel()] = np.arange(self._tiles.size)
+        return slots
+
+    @cached_property
+    def _packets(self) -> tuple[Array, Array, Array]:
+        """Directions, planes about packets and planes about all rays, as `kernels.packets`."""
+        rays = self.directions.reshape(-1, 3)
+        tiles = rays[self._tiles]
+        lanes = tiles.transpose(0, 2, 1).reshape(-1, 3 * LANES)
+        planes = np.array([_around(tile) for tile in tiles])  # (K, 5, 3)
+        planes = np.pad(planes, ((0, -len(planes) % LANES), (0, 0), (0, 0)))
+        blocks = planes.reshape(-1, LANES, 15).transpose(0, 2, 1).reshape(-1, 15 * LANES)
+        whole = _around(rays)
+        kept = whole if whole.any() else whole[:0]
+        return lanes.astype(np.float32), blocks.astype(np.float32), kept.astype(np.float32)
+
+
+def _around(rays: np.ndarray) -> np.ndarray:
+    """Five planes that hold rays, by normals that point inwards; of rays too far apart, zeros."""
+    middle = rays.mean(axis=0)
+    length = np.sqrt(middle @ middle)
+    if length < 0.5 or (rays @ middle).min() < 0.2 * length:
+        return np.zeros((5, 3))
+    middle /= length
+    up = (0.0, 0.0, 1.0) if abs(middle[2]) < 0.9 else (1.0, 0.0, 0.0)
+    right = np.cross(up, middle)
+    right /= np.sqrt(right @ right)
+    above = np.cross(middle, right)
+    planes = []
+    for side in (right, -right, above, -above):
+        angle = np.arctan2(-(rays @ side), rays @ middle).max() + 1e-6
+        planes.append(side * np.cos(angle) + middle * np.sin(angle))
+    return np.array([*planes, middle])
+
+
+def _matrices(quaternions: np.ndarray) -> Array:
+    """Rows of rotation matrices, (W, 9)."""
+    unit = quaternions / np.sqrt((quaternions * quaternions).sum(axis=-1, keepdims=True))
+    w, x, y, z = unit.T
+    rows = (
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    )  # fmt: skip
+    return np.column_stack(rows).astype(np.float32)
+
+
+def _check_counts(rows: int, columns: int) -> None:
+    check("rows", _COUNT, rows)
+    check("columns", _COUNT, columns)
+    check("rays", Limits(1, MAX_RAYS, whole=True), rows * columns)

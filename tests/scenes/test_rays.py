@@ -1,0 +1,153 @@
+"""Rays: the same bits by NumPy and by Numba, against mj_ray, and by hand."""
+
+import hashlib
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rotorgram.models import InputError
+from rotorgram.scenes import Layouts, Rays, Solids, kernels
+from sight import OFF, REACH, SENSORS, SIDES, by_mujoco, random_model, random_poses
+
+LEVEL = (1.0, 0.0, 0.0, 0.0)
+PATTERNS = {
+    **SENSORS,
+    "depth of 6 x 32": Rays.pinhole(6, 32, 120.0),
+    "one ring": Rays.rings(1, 360, 0.0, 0.0),
+    "8 x 8": Rays.pinhole(8, 8, 45.0),
+    "five": Rays([[(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1)]]),
+    "one down": Rays([[(0, 0, -1)]]),
+    "down, one below another": Rays([[(0.0, 0.1, -1)], [(0, 0, -1)], [(0.1, 0, -1)]]),
+}
+
+
+@pytest.fixture
+def by_numpy(monkeypatch: pytest.MonkeyPatch) -> Any:
+    def cast(rays: Rays, *given: Any, **more: Any) -> np.ndarray:
+        with monkeypatch.context() as patch:
+            patch.setattr(kernels, "compiled", lambda: None)
+            return rays.cast(*given, **more)
+
+    return cast
+
+
+@pytest.mark.parametrize("name", PATTERNS)
+def test_numba_has_the_bits_of_numpy(name: str, by_numpy: Any) -> None:
+    """In several scenes of different sizes; a sensor alone has the bits of all together."""
+    assert kernels.compiled()
+    dice = np.random.default_rng(5)
+    models = [random_model(dice, count) for count in (20, 60, 200)]
+    scenes = [Solids.of_model(model) for model in models]
+    scenes.append(Solids.of_scene("forest:2"))
+    layouts = Layouts.of(*scenes)
+    place, turn = random_poses(dice, 12, SIDES[60])
+    which = np.arange(12) % 4
+    rays = PATTERNS[name]
+    fast = rays.cast(layouts, place, turn, which=which, reach=REACH)
+    slow = by_numpy(rays, layouts, place, turn, which=which, reach=REACH)
+    assert fast.dtype == np.float32
+    assert fast.shape == (12, *rays.directions.shape[:2])
+    assert fast.tobytes() == slow.tobytes()
+    assert (fast < REACH).any()
+    for world in (0, 5):
+        alone = rays.cast(Layouts.of(scenes[which[world]]), place[world], turn[world], reach=REACH)
+        assert alone.tobytes() == fast[world].tobytes()
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_rays_are_mujocos(name: str) -> None:
+    dice = np.random.default_rng(11)
+    rays = SENSORS[name]
+    for _ in range(4):
+        model = random_model(dice, 60)
+        place, turn = random_poses(dice, 1, SIDES[60])
+        ours = rays.cast(Layouts.of(Solids.of_model(model)), place, turn, reach=REACH).ravel()
+        theirs = by_mujoco(model, place[0], turn[0], rays.directions.reshape(-1, 3))
+        assert (abs(ours - theirs) < OFF).all()
+        assert (ours < REACH).mean() > 0.1
+
+
+def test_a_ray_from_within_meets_what_it_leaves() -> None:
+    model = random_model(np.random.default_rng(0), 20)
+    scene = Solids.of_model(model)
+    rays = Rays([[(1.0, 0.0, 0.0), (0.0, 0.0, -1.0)]])
+    ours = rays.cast(Layouts.of(scene), scene.centers[1:], [LEVEL] * 19, reach=REACH)
+    for number in range(19):
+        start = scene.centers[number + 1].astype(np.float32)
+        theirs = by_mujoco(model, start, np.array(LEVEL), rays.directions[0])
+        assert ours[number, 0] == pytest.approx(theirs, abs=1e-4)
+
+
+def test_directions() -> None:
+    picture = Rays.pinhole(2, 4, 90.0).directions
+    assert picture.shape == (2, 4, 3)
+    assert picture[0, 0] / picture[0, 0, 0] == pytest.approx((1.0, 0.75, 0.25))  # left, above
+    assert picture[1, 3] / picture[1, 3, 0] == pytest.approx((1.0, -0.75, -0.25))
+    ring = Rays.rings(2, 4, -30.0, 0.0).directions
+    assert ring[0] == pytest.approx(
+        np.array(((1, 0, 0), (0, 1, 0), (-1, 0, 0), (0, -1, 0))), abs=1e-15
+    )
+    assert ring[1, 1] == pytest.approx((0.0, 0.75**0.5, -0.5), abs=1e-15)
+
+
+def test_the_ground_below_a_sensor() -> None:
+    layouts = Layouts.of(Solids.of_scene("plain"))
+    rays = Rays([[(0.0, 0.0, -1.0), (1.0, 0.0, -1.0), (1.0, 0.0, 0.0)]])
+    found = rays.cast(layouts, (3.0, -2.0, 2.0), LEVEL, reach=5.0)
+    assert found.ravel() == pytest.approx((2.0, 2.0 * 2**0.5, 5.0))
+    nose_down = (0.5**0.5, 0.0, 0.5**0.5, 0.0)
+    found = rays.cast(layouts, [(0.0, 0.0, 2.0)], [nose_down], reach=5.0)
+    assert found.ravel() == pytest.approx((5.0, 2.0 * 2**0.5, 2.0), abs=1e-6)
+
+
+CODE = """
+import hashlib, sys
+import numpy as np
+from rotorgram.scenes import Layouts, Rays, Solids, kernels
+assert kernels.compiled()
+dice = np.random.default_rng(3)
+place = dice.uniform((-30, -30, 1), (30, 30, 8), (50, 3))
+turn = dice.normal(size=(50, 4))
+found = Rays.pinhole(24, 32, 90).cast(Layouts.of(Solids.of_scene("forest:1")), place, turn)
+print(hashlib.sha256(found.tobytes()).hexdigest())
+"""
+
+
+def test_cold_and_cached_code_have_the_same_bits(tmp_path: Path, by_numpy: Any) -> None:
+    around = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    older = {**around, "NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": "+avx2"}
+    found = {
+        subprocess.check_output([sys.executable, "-c", CODE], env=env, text=True)
+        for env in (around, around, older)
+    }
+    assert any(tmp_path.rglob("*.nbc"))
+    dice = np.random.default_rng(3)
+    place = dice.uniform((-30, -30, 1), (30, 30, 8), (50, 3))
+    turn = dice.normal(size=(50, 4))
+    layouts = Layouts.of(Solids.of_scene("forest:1"))
+    slow = by_numpy(Rays.pinhole(24, 32, 90), layouts, place, turn)
+    assert found == {hashlib.sha256(slow.tobytes()).hexdigest() + "\n"}
+
+
+def test_what_is_refused() -> None:
+    layouts = Layouts.of(Solids.of_scene("plain"))
+    rays = Rays.pinhole(2, 2, 90.0)
+    for call, sentence in (
+        (lambda: Rays.pinhole(0, 2, 90.0), "rows: expected a whole number from 1 to 4096, got 0"),
+        (lambda: Rays.pinhole(4096, 4096, 90.0), "rays: expected a whole number from 1 to 1048576"),
+        (lambda: Rays.pinhole(2, 2, 180.0), "fov: expected a number from 0.1 to 179 degrees"),
+        (lambda: Rays.rings(2, 2, -91.0, 0.0), "low: expected a number from -90 to 90 degrees"),
+        (lambda: Rays([(1.0, 0.0, 0.0)]), r"directions: expected shape \(rows, columns, 3\)"),
+        (lambda: Rays([[(0.0, 0.0, 0.0)]]), "directions: expected finite vectors that are not 0"),
+        (lambda: rays.cast(layouts, (0, 0, 1), LEVEL, reach=0), "reach: expected a number from"),
+        (lambda: rays.cast(layouts, (0, 0, np.nan), LEVEL), "rays: expected finite positions"),
+        (lambda: rays.cast(layouts, (0, 1), LEVEL), r"rays: expected positions \(W, 3\) and quat"),
+        (lambda: rays.cast(layouts, (0, 0, 1), LEVEL, which=1), "which: expected 0 to 0, got 1"),
+        (lambda: rays.cast(layouts, (0, 0, 1), (0, 0, 0, 0)), "rays: expected finite positions"),
+    ):
+        with pytest.raises(InputError, match=f"^{sentence}"):
+            call()
