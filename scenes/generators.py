@@ -149,14 +149,12 @@ def forest(wood: Builder) -> None:
         wide = wood.uniform(0.4, 1.2)
         x, y = wood.around(wide, _FOREST)
         leaf = wood.choose("leaves")
-        size = (wide, wide, 0.7 * wide)
-        position = (x, y, 0.4 * wide)
-        wood.add(f"shrub_{i}/crown", "ellipsoid", size, position, leaf)
+        wood.add(f"shrub_{i}/crown", "sphere", (wide, 0, 0), (x, y, 0.1 * wide), leaf)
     for i in range(40):
         sides = wood.rng.uniform(0.3, 1.0, 3)
         x, y = wood.around(1.0, _FOREST)
         turn = wood.uniform(0, math.pi)
-        wood.add(f"rock_{i}/stone", "ellipsoid", sides, (x, y, 0.2 * sides[2]), "stone", turn)
+        wood.add(f"rock_{i}/stone", "box", 0.8 * sides, (x, y, 0.2 * sides[2]), "stone", turn)
 
 
 def _add_tree(wood: Builder, name: str) -> None:
@@ -168,13 +166,17 @@ def _add_tree(wood: Builder, name: str) -> None:
     trunk = (0.13 + 0.012 * tall, 0.3 * tall, 0)
     wood.add(f"{name}/trunk", "cylinder", trunk, (x, y, 0.3 * tall), f"bark_{kind % 2}")
     crowns = _TREES[kind]["crowns"]
+    shape = _TREES[kind]["shape"]
     aside = np.zeros(2)
     if any(side for _, side, *_ in crowns):
         aside = wood.rng.uniform(-0.3, 0.3, 2) * wide
     for part, side, height, half_width, by_width, by_height in crowns:
-        size = (half_width * wide, half_width * wide, by_width * wide + by_height * tall)
+        radius = half_width * wide
+        half = by_width * wide + by_height * tall
         position = (x + side * aside[0], y + side * aside[1], height * tall)
-        wood.add(f"{name}/{part}", "ellipsoid", size, position, leaf)
+        if shape == "capsule":
+            half = max(1e-3, half - radius)  # of the part between its balls
+        wood.add(f"{name}/{part}", shape, (radius, half, 0), position, leaf)
 
 
 def warehouse(hall: Builder) -> None:
@@ -236,7 +238,7 @@ def gates(track: Builder) -> None:
         if i % 2:
             track.add(f"barrier_{i}/block", "box", (1.2, 0.25, 0.45), (x, y, 0.45), tint, turn)
         else:
-            track.add(f"cone_{i}/body", "ellipsoid", (0.3, 0.3, 0.8), (x, y, 0.1), tint)
+            track.add(f"cone_{i}/body", "capsule", (0.25, 0.5, 0), (x, y, 0.2), tint)
     for i in range(4):
         away = track.uniform(34.0, 44.0)
         angle = math.pi * (i / 2 + 0.25)

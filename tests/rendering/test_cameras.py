@@ -21,6 +21,7 @@ from rotorgram.models.library import vehicle_names
 from rotorgram.models.vehicle import Vehicle
 from rotorgram.rendering.cameras import Cameras, Lens, drawn_model, objects_in
 from rotorgram.rendering.gl import offscreen_context
+from rotorgram.scenes import SEEDED_SCENES, Layouts, Rays, Solids
 from rotorgram.sim.rotations import to_world
 
 BELLY = """
@@ -280,6 +281,27 @@ def test_known_points_come_to_their_pixels(made: Any, tmp_path: Path, lens: str)
         near = np.linalg.norm(places - pixel, axis=1) < 8
         assert near.sum() > 6
         assert np.abs(places[near].mean(axis=0) - pixel).max() < 0.5
+
+
+@pytest.mark.parametrize("scene", SEEDED_SCENES)
+def test_depth_is_that_of_rays_among_solids(made: Any, scene: str) -> None:
+    """Without MuJoCo's rays: what is seen is what is solid, but in pixels on edges."""
+    cameras = made("front_depth@96x72", "crazyflie2", scene=f"{scene}:3")
+    told = state((3.0, -2.0, 4.0), quaternion=TILTED)
+    depth = take(cameras, **told)["front_depth"][0, ..., 0]
+    lens = cameras.lens("front_depth", told)
+    rows, columns = np.mgrid[:72, :96] + 0.5
+    pixels = np.stack((columns, rows, np.ones_like(rows)), axis=-1)
+    ahead = pixels @ np.linalg.inv(lens.matrix).T @ lens.rotation  # 1 m of depth each
+    eye = -lens.rotation.T @ lens.translation
+    scenery = Layouts.of(Solids.of_scene(f"{scene}:3"))
+    found = Rays(ahead).cast(scenery, eye, (1.0, 0.0, 0.0, 0.0), reach=100.0)[0]
+    found = found / np.linalg.norm(ahead, axis=-1)
+    near = found < 30.0
+    errors = abs(found / depth - 1.0)[near]
+    assert near.mean() > 0.3
+    assert np.median(errors) < 3e-4
+    assert (errors < 5e-3).mean() > 0.97  # balls are drawn with corners
 
 
 def test_points_of_a_depth_picture_lie_on_the_ground(made: Any) -> None:
