@@ -12,11 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 from ..models.errors import InputError, shortened
 from ..models.fields import Limits, check
 from .kernels import LANES, packets
-from .solids import Layouts
+from .solids import Layouts, numbers
 
 Array = NDArray[np.float32]
 
 MAX_RAYS = 1 << 20
+MAX_PLACE = 2e4  # m: further away, numbers of float32 are too coarse
 _COUNT = Limits(1, 4096, whole=True)
 _DEGREES = "degrees"
 
@@ -29,12 +30,12 @@ class Rays:
     """
 
     def __init__(self, directions: ArrayLike) -> None:
-        given = np.asarray(directions, float)
+        given = numbers("directions", directions)
         if given.ndim != 3 or given.shape[2] != 3 or not 0 < given.size <= 3 * MAX_RAYS:
             raise InputError(f"directions: expected shape (rows, columns, 3), got {given.shape}")
         sizes = np.sqrt((given * given).sum(axis=-1, keepdims=True))
         if not (np.isfinite(sizes) & (sizes > 0)).all():
-            raise InputError("directions: expected finite vectors that are not 0, got others")
+            raise InputError("directions: expected vectors that are not 0, got one")
         self.directions = given / sizes
 
     @classmethod
@@ -86,22 +87,25 @@ class Rays:
             which: Number of its layout, shape (W,).
         """
         check("reach", Limits(1e-3, 1e4, "m"), reach)
-        place = np.array(position, np.float32, ndmin=2)
-        turn = np.array(attitude, float, ndmin=2)
-        chosen = np.broadcast_to(np.asarray(which, np.int64), len(place)).copy()
+        place = np.atleast_2d(numbers("position", position))
+        turn = np.atleast_2d(numbers("attitude", attitude))
         if place.shape[1:] != (3,) or turn.shape != (len(place), 4):
             expected = "positions (W, 3) and quaternions (W, 4)"
             raise InputError(f"rays: expected {expected}, got {place.shape} and {turn.shape}")
-        if not (np.isfinite(place).all() and np.isfinite(turn).all() and turn.any(axis=1).all()):
-            raise InputError("rays: expected finite positions, and quaternions but 0, got others")
+        if not (abs(place).max(initial=0.0) <= MAX_PLACE and (abs(turn).max(axis=1) > 1e-6).all()):
+            expected = f"positions within {MAX_PLACE:g} m, and quaternions that are not 0"
+            raise InputError(f"rays: expected {expected}, got others")
         kinds, tables = layouts
-        if not ((chosen >= 0) & (chosen < len(kinds))).all():
-            raise InputError(f"which: expected 0 to {len(kinds) - 1}, got {shortened(which)}")
+        chosen = numbers("which", which)
+        if chosen.shape not in ((), (len(place),)) or not np.isin(chosen, range(len(kinds))).all():
+            expected = f"numbers of {len(kinds)} layouts, one or {len(place)}"
+            raise InputError(f"which: expected {expected}, got {shortened(which)}")
+        scenes = np.full(len(place), chosen, np.int64)
         lanes, planes, whole = self._packets
         rows, columns = self.directions.shape[:2]
         out = np.empty((len(place), rows * columns), np.float32)
         packets(
-            kinds, tables, chosen, place, _matrices(turn), lanes, planes, whole,
+            kinds, tables, scenes, place.astype(np.float32), _matrices(turn), lanes, planes, whole,
             self._slots, np.float32(reach), out,
         )  # fmt: skip
         return out.reshape(-1, rows, columns)

@@ -106,7 +106,7 @@ class Solids:
 
         Within a solid it is at least the distance to its surface. Infinite in an empty scene.
         """
-        given = np.asarray(points, float)
+        given = numbers("points", points)
         if given.shape[-1:] != (3,):
             raise InputError(f"points: expected shape (..., 3), got {given.shape}")
         rows = given.reshape(-1, 3)
@@ -125,7 +125,7 @@ class Solids:
         `InputError`.
         """
         check("cell", Limits(1e-3, 1e3, "m"), cell)
-        start, end = (np.asarray(corner, float) for corner in (low, high))
+        start, end = numbers("low", low), numbers("high", high)
         if not (start.shape == end.shape == (3,) and (start < end).all()):
             got = f"{shortened(low)} and {shortened(high)}"
             raise InputError(f"low, high: expected two corners, each below the other, got {got}")
@@ -134,6 +134,17 @@ class Solids:
             raise InputError(f"cell: expected at most {MAX_CELLS} cells, got {counts.prod():.0f}")
         ticks = [low + cell * (np.arange(n) + 0.5) for low, n in zip(start, counts, strict=True)]
         return self.distance(np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1))
+
+
+def numbers(name: str, given: ArrayLike) -> Array:
+    """An array of finite numbers. Raises `InputError`."""
+    try:
+        array = np.asarray(given, float)
+    except (TypeError, ValueError):
+        array = np.array(np.nan)
+    if not np.isfinite(array).all():
+        raise InputError(f"{name}: expected finite numbers, got {shortened(given)}")
+    return array
 
 
 class Layouts(NamedTuple):

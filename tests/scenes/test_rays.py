@@ -142,12 +142,22 @@ def test_what_is_refused() -> None:
         (lambda: Rays.pinhole(2, 2, 180.0), "fov: expected a number from 0.1 to 179 degrees"),
         (lambda: Rays.rings(2, 2, -91.0, 0.0), "low: expected a number from -90 to 90 degrees"),
         (lambda: Rays([(1.0, 0.0, 0.0)]), r"directions: expected shape \(rows, columns, 3\)"),
-        (lambda: Rays([[(0.0, 0.0, 0.0)]]), "directions: expected finite vectors that are not 0"),
+        (lambda: Rays([[(0.0, 0.0, 0.0)]]), "directions: expected vectors that are not 0"),
         (lambda: rays.cast(layouts, (0, 0, 1), LEVEL, reach=0), "reach: expected a number from"),
-        (lambda: rays.cast(layouts, (0, 0, np.nan), LEVEL), "rays: expected finite positions"),
+        (
+            lambda: rays.cast(layouts, (0, 0, np.nan), LEVEL),
+            "position: expected finite numbers, got",
+        ),
         (lambda: rays.cast(layouts, (0, 1), LEVEL), r"rays: expected positions \(W, 3\) and quat"),
-        (lambda: rays.cast(layouts, (0, 0, 1), LEVEL, which=1), "which: expected 0 to 0, got 1"),
-        (lambda: rays.cast(layouts, (0, 0, 1), (0, 0, 0, 0)), "rays: expected finite positions"),
+        (lambda: rays.cast(layouts, (0, 0, 1), LEVEL, which=1), "which: expected numbers of 1 lay"),
+        (lambda: rays.cast(layouts, (0, 0, 1), LEVEL, which=0.5), "which: expected numbers of 1"),
+        (lambda: rays.cast(layouts, (0, 0, 1), LEVEL, which=[0, 0]), "which: expected numbers of"),
+        (
+            lambda: rays.cast(layouts, "here", LEVEL),
+            "position: expected finite numbers, got 'here'",
+        ),
+        (lambda: rays.cast(layouts, (0, 0, 1e6), LEVEL), "rays: expected positions within 20000"),
+        (lambda: rays.cast(layouts, (0, 0, 1), (0, 0, 0, 0)), "rays: expected positions within"),
     ):
         with pytest.raises(InputError, match=f"^{sentence}"):
             call()

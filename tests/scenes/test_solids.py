@@ -138,6 +138,8 @@ def test_what_is_refused() -> None:
     scene = Solids.of_scene("plain")
     with pytest.raises(InputError, match=r"^points: expected shape \(\.\.\., 3\), got \(2,\)"):
         scene.distance((1.0, 2.0))
+    with pytest.raises(InputError, match=r"^points: expected finite numbers, got \[nan"):
+        scene.distance([math.nan, 0.0, 0.0])
     with pytest.raises(InputError, match=r"^cell: expected a number from 0.001 to 1000 m, got 0"):
         scene.field((0, 0, 0), (1, 1, 1), 0)
     with pytest.raises(InputError, match=r"^cell: expected at most 67108864 cells, got 1000000000"):
