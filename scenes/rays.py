@@ -104,8 +104,9 @@ class Rays:
         lanes, planes, whole = self._packets
         rows, columns = self.directions.shape[:2]
         out = np.empty((len(place), rows * columns), np.float32)
+        near = np.array(place, np.float32, order="C")
         packets(
-            kinds, tables, scenes, place.astype(np.float32), _matrices(turn), lanes, planes, whole,
+            kinds, tables, scenes, near, _matrices(turn), lanes, planes, whole,
             self._slots, np.float32(reach), out,
         )  # fmt: skip
         return out.reshape(-1, rows, columns)

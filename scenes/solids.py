@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple, Self
 
+import mujoco
 import numpy as np
-from mujoco import MjModel, MjSpec, mjtGeom
+from mujoco import MjData, MjModel, MjSpec, mjtGeom
 from numpy.typing import ArrayLike, NDArray
 
 from ..models.errors import InputError, shortened
 from ..models.fields import Limits, check
-from ..models.mjcf import level_data
 from . import kernels
 from .build import HIDDEN_GROUP, add_scene, is_ground
 
@@ -27,6 +27,7 @@ MAX_CELLS = 1 << 26
 _SIZE = Limits(1e-4, 1e4, "m")
 _ENDLESS = 1e6  # m: half the width of a plane
 _SHEET = 5e-4  # m: half the thickness of a plane of a size, which lies below its face
+_MARK = 10.0  # m: half the width of level ground; what is smaller is a mark on it
 _CHUNK = 1 << 22  # numbers that a step of `distance` has at once
 
 
@@ -38,7 +39,7 @@ class Solids:
     """
 
     names: tuple[str, ...]
-    """As pictures and segmentation have them."""
+    """Of the geoms."""
     kinds: NDArray[np.int8]
     """Places in `kernels.KINDS`, shape (N,)."""
     centers: Array
@@ -60,28 +61,30 @@ class Solids:
     def of_model(cls, model: MjModel, which: ArrayLike | None = None) -> Self:
         """Geoms of a model that stand still: those of `which`, bool, or those that can touch.
 
-        An ellipsoid is the capsule about it. Level ground has no end; another plane of a size is a
-        sheet. Raises `InputError` for meshes and height fields.
+        An ellipsoid is the capsule about it, or the box about a flat one. Level ground has no end;
+        another plane of a size is a sheet. Raises `InputError` for meshes and height fields.
         """
         if which is None:
             which = (model.geom_contype | model.geom_conaffinity) != 0
         stands = model.body_weldid[model.geom_bodyid] == 0
         chosen = np.flatnonzero(stands & which).tolist()
-        for geom in chosen:
-            if not abs(model.geom_pos[geom]).max() <= _SIZE.high:
-                raise InputError(
-                    f"scene: expected solids within {_SIZE.high:g} m of the origin, "
-                    f"got {model.geom(geom).name or f'geom {geom}'}"
-                )
         if len(chosen) > MAX_SOLIDS:
             raise InputError(f"scene: expected at most {MAX_SOLIDS} solids, got {len(chosen)}")
         found = [_primitive(model, geom) for geom in chosen]
         kinds, halves, orders = zip(*found, strict=True) if found else ((), (), ())
         half = np.array(halves, float).reshape(-1, 3)
-        data = level_data(model)
+        data = MjData(model)
+        mujoco.mj_kinematics(model, data)
+        for geom in chosen:
+            if not abs(data.geom_xpos[geom]).max() <= _SIZE.high:
+                raise InputError(
+                    f"scene: expected solids within {_SIZE.high:g} m of the origin, "
+                    f"got {model.geom(geom).name or f'geom {geom}'}"
+                )
         axes = data.geom_xmat[chosen].reshape(-1, 3, 3)
         axes = np.take_along_axis(axes, np.array(orders, int).reshape(-1, 1, 3), axis=2)
-        is_sheet = (half[:, 2] == _SHEET)[:, None]
+        is_plane = model.geom_type[chosen] == mjtGeom.mjGEOM_PLANE
+        is_sheet = (is_plane & (half[:, 2] == _SHEET))[:, None]
         return cls(
             names=tuple(model.geom(geom).name or f"geom {geom}" for geom in chosen),
             kinds=np.array([kernels.KINDS.index(kind) for kind in kinds], np.int8),
@@ -104,7 +107,7 @@ class Solids:
     def distance(self, points: ArrayLike) -> Array:
         """From points, (..., 3), m, to the nearest solid, m, (...); below 0 within one.
 
-        Within a solid it is at least the distance to its surface. Infinite in an empty scene.
+        Infinite in an empty scene. Where solids overlap, the way out of them may be longer.
         """
         given = numbers("points", points)
         if given.shape[-1:] != (3,):
@@ -140,7 +143,7 @@ def numbers(name: str, given: ArrayLike) -> Array:
     """An array of finite numbers. Raises `InputError`."""
     try:
         array = np.asarray(given, float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         array = np.array(np.nan)
     if not np.isfinite(array).all():
         raise InputError(f"{name}: expected finite numbers, got {shortened(given)}")
@@ -161,7 +164,8 @@ class Layouts(NamedTuple):
         most = max(map(len, scenes), default=0)
         kinds = np.zeros((len(scenes), most), np.int8)
         tables = np.zeros((len(scenes), kernels.ROWS, most), np.float32)
-        tables[:, 0] = _ENDLESS  # what is left over is out of reach
+        tables[:, 0] = _ENDLESS  # what is left over is out of reach:
+        tables[:, 3] = 1.0  # its center is far along its first axis
         for scene, kind, table in zip(scenes, kinds, tables, strict=True):
             kind[: len(scene)] = scene.kinds
             table[:, : len(scene)] = scene.table
@@ -173,7 +177,9 @@ def _primitive(model: MjModel, geom: int) -> tuple[str, Sequence[float], Sequenc
     a, b, c = model.geom_size[geom].tolist()
     kind = mjtGeom(model.geom_type[geom])
     name = model.geom(geom).name or f"geom {geom}"
-    if kind == mjtGeom.mjGEOM_PLANE and (is_ground(model, geom) or not a * b):
+    if kind == mjtGeom.mjGEOM_PLANE and (
+        not a * b or (is_ground(model, geom) and min(a, b) > _MARK)
+    ):
         return "plane", (_ENDLESS, _ENDLESS, 0.0), (0, 1, 2)
     long = int(np.argmax((a, b, c)))
     shapes: dict[mjtGeom, tuple[str, Sequence[float]]] = {
@@ -191,7 +197,10 @@ def _primitive(model: MjModel, geom: int) -> tuple[str, Sequence[float], Sequenc
     shape, half = shapes[kind]
     for one in half:
         check(f"scene: half a side of {name}", _SIZE, one)
-    order = (
-        [(long + 1) % 3, (long + 2) % 3, long] if kind == mjtGeom.mjGEOM_ELLIPSOID else [0, 1, 2]
-    )
+    order = [0, 1, 2]
+    if kind == mjtGeom.mjGEOM_ELLIPSOID:
+        least, middle, _ = sorted((a, b, c))
+        if least < middle / 2:
+            return "box", (a, b, c), order
+        order = [(long + 1) % 3, (long + 2) % 3, long]
     return shape, half, order

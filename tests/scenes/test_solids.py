@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from mujoco import MjSpec, mjtGeom
 from rotorgram.models import InputError
-from rotorgram.scenes import SCENES, Layouts, Solids
+from rotorgram.scenes import SCENES, Layouts, Rays, Solids
 from sight import random_model
 
 TURN = (0.6, 0.2, -0.3, 0.7)
@@ -37,9 +37,11 @@ def solids(kind: str, size: tuple[float, ...], **more: object) -> Solids:
         ("box", (1.0, 2.0, 3.0), (0.9, 0.0, 0.0), -0.1),
         ("plane", (), (7.0, 8.0, 2.0), 2.0),
         ("plane", (), (7.0, 8.0, -2.0), -2.0),
-        ("plane", (2.0, 1.0, 1.0), (400.0, 0.0, 2.0), 2.0),  # level ground has no end
+        ("plane", (20.0, 11.0, 1.0), (400.0, 0.0, 2.0), 2.0),  # level ground has no end
         ("ellipsoid", (0.5, 0.4, 1.5), (0.0, 0.0, 3.5), 2.0),
-        ("ellipsoid", (0.2, 1.5, 0.5), (0.0, 3.5, 0.0), 2.0),
+        ("ellipsoid", (0.3, 1.5, 0.5), (0.0, 3.5, 0.0), 2.0),
+        ("ellipsoid", (1.8, 7.6, 0.2), (0.0, 0.0, 1.2), 1.0),  # flat
+        ("box", (1.0, 1.0, 5e-4), (0.0, 0.0, 1.0), 0.9995),
     ],
 )
 def test_distances(
@@ -132,6 +134,21 @@ def test_what_moves_and_what_nothing_touches_is_left_out() -> None:
     scene = Solids.of_model(spec.compile())
     assert scene.names == ("stands",)
     assert scene.centers.tolist() == [[2.0, 0.0, 0.0]]
+
+
+def test_models_with_joints_and_layouts_of_other_sizes() -> None:
+    spec = MjSpec()
+    spec.worldbody.add_geom(name="wall", type=mjtGeom.mjGEOM_BOX, size=(1, 1, 1), pos=(4, 0, 0))
+    body = spec.worldbody.add_body()
+    body.add_joint()
+    body.add_geom(type=mjtGeom.mjGEOM_SPHERE, size=(0.1, 0, 0))
+    scene = Solids.of_model(spec.compile())
+    assert scene.names == ("wall",)
+    layouts = Layouts.of(scene, Solids.of_scene("gates"))
+    rays = Rays.pinhole(4, 4, 60.0)
+    rows = np.ones((3, 5)).T  # columns one after another
+    found = rays.cast(layouts, rows, [(1.0, 0.0, 0.0, 0.0)] * 5)
+    assert (found[:, 1:3, 1:3] < 20.0).any()
 
 
 def test_what_is_refused() -> None:
