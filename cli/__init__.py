@@ -34,6 +34,7 @@ COMMANDS: tuple[str, ...] = tuple(_NAMES["commands"])
 EXTRAS: dict[str, list[str]] = _NAMES["extras"]
 """Import names of the packages of each extra, as pyproject.toml lists them."""
 
+_WITHOUT_EARLY = {"--listen", "--no-udp", "--help", "-h"}
 _ABOUT = "A MuJoCo drone simulator that reinforcement-learning agents fly, in process or over UDP."
 
 
@@ -103,16 +104,16 @@ def _run(words: list[str]) -> int:
             f"rotorgram: expected a command of {', '.join(COMMANDS)}, got {name}", file=sys.stderr
         )
         return 2
-    if name == "train" and "--udp" in words:
-        from ..udp.process import begin_early
-
-        begin_early()
     from ..rendering.gl import hidden_gl_setting
     from ._parser import parse
 
     if get_terminal_size().columns < 40:  # tyro does not end on narrower terminals
         os.environ["COLUMNS"] = "40"
     with hidden_gl_setting():  # importing OpenGL takes time, also for a command that draws nothing
+        if name == "train" and "--udp" in words and not _WITHOUT_EARLY & {*words}:
+            from ..udp.process import begin_early
+
+            begin_early()
         module = import_module(f".{name.replace('-', '_')}", __name__)
         kind: type[Command] = getattr(module, _class_of(name))
         return parse(kind, f"rotorgram {name}", words[1:]).run() or 0

@@ -71,6 +71,7 @@ class CompiledLoop(Loop):
         except BaseException as error:
             self._settle()  # the physics has gone on
             if isinstance(error, PhysicsError):
+                record.steps = record.steps - (1 if flew is None else flew)
                 record.wait(flew)
             raise
         if not record.has_begun:

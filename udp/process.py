@@ -1,5 +1,6 @@
 """Simulator processes, which may begin before it is known what they fly."""
 
+import atexit
 import os
 import subprocess
 import sys
@@ -25,6 +26,16 @@ def begin(stderr: IO[str] | None = None) -> subprocess.Popen[bytes]:
 def begin_early() -> None:
     """Begin one that `started` gives: its imports, a third of a second, run beside ours."""
     _waiting.append(started())
+    atexit.register(_end)
+
+
+def _end() -> None:
+    """End what no simulator was made of."""
+    while _waiting:
+        process, said = _waiting.pop()
+        process.kill()
+        process.communicate()
+        said.close()
 
 
 def started() -> Started:

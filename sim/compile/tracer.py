@@ -305,7 +305,7 @@ def _kind(given: Any) -> Any:
 def _result_type(_: TracedArray, *given: Any) -> DType:
     """Python's numbers adapt to arrays, and lists do not, as in NumPy."""
     arrays = [np.asarray(one) if isinstance(one, list | tuple) else one for one in given]
-    return np.result_type(*[getattr(one, "dtype", one) for one in arrays])
+    return np.result_type(*[one.dtype if isinstance(one, TracedArray) else one for one in arrays])
 
 
 # ---- functions that are made of others
