@@ -15,6 +15,7 @@ import re
 import signal
 import sys
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from errno import ENOSPC, EPIPE
 from importlib import import_module
 from pathlib import Path
@@ -34,7 +35,6 @@ COMMANDS: tuple[str, ...] = tuple(_NAMES["commands"])
 EXTRAS: dict[str, list[str]] = _NAMES["extras"]
 """Import names of the packages of each extra, as pyproject.toml lists them."""
 
-_WITHOUT_EARLY = {"--listen", "--no-udp", "--help", "-h"}
 _ABOUT = "A MuJoCo drone simulator that reinforcement-learning agents fly, in process or over UDP."
 
 
@@ -109,14 +109,25 @@ def _run(words: list[str]) -> int:
 
     if get_terminal_size().columns < 40:  # tyro does not end on narrower terminals
         os.environ["COLUMNS"] = "40"
-    with hidden_gl_setting():  # importing OpenGL takes time, also for a command that draws nothing
-        if name == "train" and "--udp" in words and not _WITHOUT_EARLY & {*words}:
-            from ..udp.process import begin_early
-
-            begin_early()
+    early = _simulator(name, words)
+    with (
+        hidden_gl_setting(),
+        early,
+    ):  # importing OpenGL takes time, also for a command that draws nothing
         module = import_module(f".{name.replace('-', '_')}", __name__)
         kind: type[Command] = getattr(module, _class_of(name))
         return parse(kind, f"rotorgram {name}", words[1:]).run() or 0
+
+
+def _simulator(name: str, words: list[str]) -> AbstractContextManager[None]:
+    """The process of a simulator that a command will need: both import at the same time."""
+    if name != "train" or "--udp" not in words:
+        return nullcontext()
+    if not {"--listen", "--no-udp", "--help", "-h"}.isdisjoint(words):
+        return nullcontext()
+    from ..udp.process import begun_early
+
+    return begun_early()
 
 
 def _class_of(name: str) -> str:

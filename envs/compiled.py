@@ -71,8 +71,7 @@ class CompiledLoop(Loop):
         except BaseException as error:
             self._settle()  # the physics has gone on
             if isinstance(error, PhysicsError):
-                record.steps = record.steps - (1 if flew is None else flew)
-                record.wait(flew)
+                self._undo(flew)
             raise
         if not record.has_begun:
             record.action = self.pipeline.actions.neutral()
@@ -141,6 +140,12 @@ class CompiledLoop(Loop):
         self.done = results["done"]
         self.out = results["out"]
 
+    def _undo(self, flew: Array) -> None:
+        """Do not count a step that broke; its drones wait for a reset."""
+        record = self.record
+        record.steps = record.steps - (1 if flew is None else flew)
+        record.wait(flew)
+
     def _check(self) -> None:
         """Raise for bad states, and for numbers that are not finite."""
         flew = self._record.flown
@@ -148,8 +153,7 @@ class CompiledLoop(Loop):
         try:
             self._world.refuse_bad(flew)
         except PhysicsError:
-            record.steps = record.steps - (1 if flew is None else flew)
-            record.wait(flew)
+            self._undo(flew)
             raise
         refuse_unfit(record, self.config.env_id)
 

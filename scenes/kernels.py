@@ -30,7 +30,7 @@ _ONE = np.float32(1.0)
 _TINY = np.float32(1e-12)
 _NUDGE = np.float32(1e-9)
 _BIG = np.float32(1e30)
-_MARGIN = np.float32(0.01)  # m: numbers of these sizes are rounded by far less
+_MARGIN = np.float32(0.01)  # m: at tens of metres, float32 rounds by far less
 
 Array = Any
 Vector = Any
@@ -38,7 +38,7 @@ Vector = Any
 Function = Callable[..., Any]
 
 
-# ---- what formulas are made of: here for arrays, in `_compiled` for numbers
+# ---- what formulas are made of: here for arrays, in `compiled` for numbers
 
 
 def _least(a: Array, b: Array) -> Array:
@@ -67,14 +67,11 @@ def _nonzero(x: Array) -> Array:
 
 # ---- where a ray enters and leaves a primitive, and whether it meets it
 #
-# By its direction, the primitive's center, axes and size in the sensor's frame, and its center
-# along the axes.
+# By the ray's direction and the primitive, as `_seen` gives it.
 
 
-def _sphere(
-    ray: Vector, center: Vector, u: Vector, v: Vector, axis: Vector, middle: Vector, size: Vector
-) -> Array:
-    return _ball(ray, center, size[0])
+def _sphere(ray: Vector, solid: Array) -> Array:
+    return _ball(ray, solid[0], solid[5][0])
 
 
 def _ball(ray: Vector, center: Vector, radius: Array) -> Array:
@@ -100,9 +97,8 @@ def _side(ray: Vector, middle: Vector, radius: Array) -> Array:
     return along - half, along + half, square >= _ZERO
 
 
-def _cylinder(
-    ray: Vector, center: Vector, u: Vector, v: Vector, axis: Vector, middle: Vector, size: Vector
-) -> Array:
+def _cylinder(ray: Vector, solid: Array) -> Array:
+    _, u, v, axis, middle, size = solid
     local = (_dot(ray, u) + _NUDGE, _dot(ray, v), _dot(ray, axis))
     enters, leaves, meets = _side(local, middle, size[0])
     steep = _ONE / _nonzero(local[2])
@@ -113,10 +109,9 @@ def _cylinder(
     return enters, leaves, meets & (enters <= leaves)
 
 
-def _capsule(
-    ray: Vector, center: Vector, u: Vector, v: Vector, axis: Vector, middle: Vector, size: Vector
-) -> Array:
+def _capsule(ray: Vector, solid: Array) -> Array:
     """Where the ray crosses the side beyond an end, the ball there decides."""
+    _, u, v, axis, middle, size = solid
     radius = size[0]
     height = size[3]
     local = (_dot(ray, u) + _NUDGE, _dot(ray, v), _dot(ray, axis))
@@ -133,10 +128,9 @@ def _capsule(
     return _pick(is_side, enters, into), _pick(was_side, leaves, out), meets
 
 
-def _box(
-    ray: Vector, center: Vector, u: Vector, v: Vector, axis: Vector, middle: Vector, size: Vector
-) -> Array:
+def _box(ray: Vector, solid: Array) -> Array:
     """By slabs: Kay and Kajiya, Ray tracing complex scenes, SIGGRAPH 1986."""
+    _, u, v, axis, middle, size = solid
     x = _ONE / _nonzero(_dot(ray, u))
     y = _ONE / _nonzero(_dot(ray, v))
     z = _ONE / _nonzero(_dot(ray, axis))
@@ -147,10 +141,9 @@ def _box(
     return enters, leaves, enters <= leaves
 
 
-def _plane(
-    ray: Vector, center: Vector, u: Vector, v: Vector, axis: Vector, middle: Vector, size: Vector
-) -> Array:
+def _plane(ray: Vector, solid: Array) -> Array:
     """From above alone."""
+    _, _, _, axis, middle, _ = solid
     down = _dot(ray, axis)
     met = middle[2] / _least(down, -_TINY)
     return met, met, down < -_TINY
@@ -184,7 +177,9 @@ def _turned(m: Array, vector: Vector) -> Vector:
 
 
 def _seen(table: Array, j: Array, place: Array, attitude: Array) -> Array:
-    """A primitive as the formulas have it."""
+    """Center, three axes and size of a primitive in the frame of a sensor, and between them its
+    center along the axes. Its size is half its sides, and half of the third without its rounding.
+    """
     x, y, z = _three(table, _CENTER, j)
     center = _turned(attitude, (x - place[0], y - place[1], z - place[2]))
     u = _turned(attitude, _three(table, _U, j))
@@ -196,7 +191,7 @@ def _seen(table: Array, j: Array, place: Array, attitude: Array) -> Array:
 
 
 def _gap(kind: Array, table: Array, j: Array, point: Vector) -> Array:
-    """From a point to a primitive, m; below 0 within it: to its nearest side, or nearer."""
+    """From a point to a primitive, m; below 0 within it."""
     x, y, z = _three(table, _CENTER, j)
     away = (point[0] - x, point[1] - y, point[2] - z)
     a, b, c = _three(table, _SIZE, j)
@@ -224,7 +219,7 @@ def distances(kinds: Array, table: Array, points: Array) -> Array:
 # ---- all rays of a sensor
 
 
-def packets(
+def _packets(
     kinds: Array, tables: Array, which: Array, place: Array, attitude: Array,
     directions: Array, planes: Array, whole: Array, slots: Array, reach: Array, out: Array,
 ) -> None:  # fmt: skip
@@ -243,14 +238,6 @@ def packets(
         reach: float32, m.
         out: (W, N).
     """
-    run = compiled() or _by_numpy
-    run(kinds, tables, which, place, attitude, directions, planes, whole, slots, reach, out)
-
-
-def _packets(
-    kinds: Array, tables: Array, which: Array, place: Array, attitude: Array,
-    directions: Array, planes: Array, whole: Array, slots: Array, reach: Array, out: Array,
-) -> None:  # fmt: skip
     far = np.empty(kinds.shape[1], np.float32)
     hits = np.empty((planes.shape[0], LANES), np.int32)
     hit = hits.reshape(-1)
@@ -334,14 +321,13 @@ def _meet(formula: Function, solid: Array, hit: Array, directions: Array, found:
 
 
 def _shorten(formula: Function, solid: Array, d: Array, t: Array) -> None:
-    center, u, v, axis, middle, size = solid
     for i in range(LANES):
         ray = (d[i], d[LANES + i], d[2 * LANES + i])
-        enters, leaves, meets = formula(ray, center, u, v, axis, middle, size)
+        enters, leaves, meets = formula(ray, solid)
         t[i] = _nearer(t[i], enters, leaves, meets)
 
 
-def _by_numpy(
+def by_numpy(
     kinds: Array, tables: Array, which: Array, place: Array, attitude: Array,
     directions: Array, planes: Array, whole: Array, slots: Array, reach: Array, out: Array,
 ) -> None:  # fmt: skip
@@ -352,7 +338,7 @@ def _by_numpy(
         found = np.full(ray[0].shape, reach)
         for j in range(kind.size):
             solid = _seen(tables[which[w]], j, place[w], attitude[w])
-            found = _nearer(found, *_MEETINGS[kind[j]](ray, *solid))
+            found = _nearer(found, *_MEETINGS[kind[j]](ray, solid))
         out[w] = found.ravel()[slots]
 
 
@@ -361,7 +347,7 @@ def _by_numpy(
 
 @cache
 def compiled() -> Function | None:
-    """`packets` of Numba, or None where it is not installed: the extra `fast` brings it."""
+    """`_packets` by Numba, or None where it is not installed: the extra `fast` brings it."""
     try:
         from llvmlite import ir
         from numba import njit

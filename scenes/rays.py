@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..models.errors import InputError, shortened
 from ..models.fields import Limits, check
-from .kernels import LANES, packets
+from . import kernels
+from .kernels import LANES
 from .solids import Layouts, numbers
 
 Array = NDArray[np.float32]
@@ -37,6 +38,7 @@ class Rays:
         if not (np.isfinite(sizes) & (sizes > 0)).all():
             raise InputError("directions: expected vectors that are not 0, got one")
         self.directions = given / sizes
+        self.directions.flags.writeable = False  # packets are made of them once
 
     @classmethod
     def pinhole(cls, rows: int, columns: int, fov: float) -> Self:
@@ -105,7 +107,8 @@ class Rays:
         rows, columns = self.directions.shape[:2]
         out = np.empty((len(place), rows * columns), np.float32)
         near = np.array(place, np.float32, order="C")
-        packets(
+        run = kernels.compiled() or kernels.by_numpy
+        run(
             kinds, tables, scenes, near, _matrices(turn), lanes, planes, whole,
             self._slots, np.float32(reach), out,
         )  # fmt: skip
@@ -132,7 +135,7 @@ class Rays:
 
     @cached_property
     def _packets(self) -> tuple[Array, Array, Array]:
-        """Directions, planes about packets and planes about all rays, as `kernels.packets`."""
+        """Directions, planes about packets and planes about all rays, as `kernels` has them."""
         rays = self.directions.reshape(-1, 3)
         tiles = rays[self._tiles]
         lanes = tiles.transpose(0, 2, 1).reshape(-1, 3 * LANES)
@@ -164,7 +167,8 @@ def _around(rays: np.ndarray) -> np.ndarray:
 
 def _matrices(quaternions: np.ndarray) -> Array:
     """Rows of rotation matrices, (W, 9)."""
-    unit = quaternions / np.sqrt((quaternions * quaternions).sum(axis=-1, keepdims=True))
+    scaled = quaternions / abs(quaternions).max(axis=-1, keepdims=True)
+    unit = scaled / np.sqrt((scaled * scaled).sum(axis=-1, keepdims=True))
     w, x, y, z = unit.T
     rows = (
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),

@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 MAX_SOLIDS = 10_000
 """Most primitives of a scene."""
 MAX_CELLS = 1 << 26
-"""Most cells of a grid: 0.5 GB."""
+"""Most cells of a grid, which takes 0.5 GB then."""
 _SIZE = Limits(1e-4, 1e4, "m")
 _ENDLESS = 1e6  # m: half the width of a plane
 _SHEET = 5e-4  # m: half the thickness of a plane of a size, which lies below its face
@@ -61,8 +61,9 @@ class Solids:
     def of_model(cls, model: MjModel, which: ArrayLike | None = None) -> Self:
         """Geoms of a model that stand still: those of `which`, bool, or those that can touch.
 
-        An ellipsoid is the capsule about it, or the box about a flat one. Level ground has no end;
-        another plane of a size is a sheet. Raises `InputError` for meshes and height fields.
+        An ellipsoid is the capsule about it, or the box about a flat one. Level ground, and a plane
+        without a size, have no end; another plane is a sheet. Raises `InputError` for meshes and
+        height fields.
         """
         if which is None:
             which = (model.geom_contype | model.geom_conaffinity) != 0
@@ -79,14 +80,14 @@ class Solids:
             if not abs(data.geom_xpos[geom]).max() <= _SIZE.high:
                 raise InputError(
                     f"scene: expected solids within {_SIZE.high:g} m of the origin, "
-                    f"got {model.geom(geom).name or f'geom {geom}'}"
+                    f"got {_name(model, geom)}"
                 )
         axes = data.geom_xmat[chosen].reshape(-1, 3, 3)
         axes = np.take_along_axis(axes, np.array(orders, int).reshape(-1, 1, 3), axis=2)
         is_plane = model.geom_type[chosen] == mjtGeom.mjGEOM_PLANE
         is_sheet = (is_plane & (half[:, 2] == _SHEET))[:, None]
         return cls(
-            names=tuple(model.geom(geom).name or f"geom {geom}" for geom in chosen),
+            names=tuple(_name(model, geom) for geom in chosen),
             kinds=np.array([kernels.KINDS.index(kind) for kind in kinds], np.int8),
             centers=data.geom_xpos[chosen] - np.where(is_sheet, _SHEET * axes[:, :, 2], 0.0),
             axes=axes,
@@ -136,7 +137,10 @@ class Solids:
         if not counts.prod() <= MAX_CELLS:
             raise InputError(f"cell: expected at most {MAX_CELLS} cells, got {counts.prod():.0f}")
         ticks = [low + cell * (np.arange(n) + 0.5) for low, n in zip(start, counts, strict=True)]
-        return self.distance(np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1))
+        found = np.empty(counts.astype(int))
+        for row, x in zip(found, ticks[0], strict=True):  # a slab at a time
+            row[:] = self.distance(np.stack(np.meshgrid(x, *ticks[1:], indexing="ij"), axis=-1)[0])
+        return found
 
 
 def numbers(name: str, given: ArrayLike) -> Array:
@@ -151,7 +155,7 @@ def numbers(name: str, given: ArrayLike) -> Array:
 
 
 class Layouts(NamedTuple):
-    """Solids of S scenes, as `kernels.packets` has them; P is the most that one has."""
+    """Solids of S scenes, as `kernels` has them; P is the most that one has."""
 
     kinds: NDArray[np.int8]
     """Shape (S, P)."""
@@ -172,11 +176,15 @@ class Layouts(NamedTuple):
         return cls(kinds, tables)
 
 
+def _name(model: MjModel, geom: int) -> str:
+    return model.geom(geom).name or f"geom {geom}"
+
+
 def _primitive(model: MjModel, geom: int) -> tuple[str, Sequence[float], Sequence[int]]:
     """Kind of a geom, half the sides of the box about it, and which axis each of them is along."""
     a, b, c = model.geom_size[geom].tolist()
     kind = mjtGeom(model.geom_type[geom])
-    name = model.geom(geom).name or f"geom {geom}"
+    name = _name(model, geom)
     if kind == mjtGeom.mjGEOM_PLANE and (
         not a * b or (is_ground(model, geom) and min(a, b) > _MARK)
     ):

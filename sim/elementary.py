@@ -66,8 +66,8 @@ def _of_numbers(function: Callable[..., Array]) -> Callable[..., Array]:
 
 def _constants(*values: Array) -> SimpleNamespace:
     """Of the precision of the first array."""
-    array = next(value for value in values if hasattr(value, "dtype"))
-    return _SINGLE if array.dtype == np.float32 else _DOUBLE
+    dtypes = [value.dtype for value in values if hasattr(value, "dtype")]
+    return _SINGLE if dtypes[:1] == [np.float32] else _DOUBLE
 
 
 def _split(x: Array) -> tuple[Array, Array]:

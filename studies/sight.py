@@ -23,9 +23,8 @@ SIDES = {20: 24.0, 60: 40.0, 200: 72.0}
 WORLDS = 256
 FEW = 32  # of them for MuJoCo
 OFF = 2e-4  # m: a ray that is further off is counted
-GRAZING = (
-    1e-4  # rad: a ray grazes a solid if, turned by so much, it meets nearer and further points
-)
+GRAZING = 1e-4
+"""rad: a ray grazes a solid if, turned by so much, it meets nearer points and further ones."""
 
 
 def random_model(dice: Generator, count: int) -> MjModel:

@@ -1,9 +1,10 @@
 """Simulator processes, which may begin before it is known what they fly."""
 
-import atexit
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from tempfile import TemporaryFile
 from typing import IO
 
@@ -20,22 +21,24 @@ def begin(stderr: IO[str] | None = None) -> subprocess.Popen[bytes]:
     """A process that waits for the first line of its standard input, and ends with that."""
     # A second thread of torch makes small tensors slower, and takes the agent's core.
     around = {"OMP_NUM_THREADS": "1", **os.environ, "PYTHONSAFEPATH": "1"}
-    return subprocess.Popen(_COMMAND, stdin=subprocess.PIPE, stderr=stderr, env=around)
+    # In a group of its own: a signal to ours is for the agent, which closes the exchange.
+    return subprocess.Popen(
+        _COMMAND, stdin=subprocess.PIPE, stderr=stderr, env=around, process_group=0
+    )
 
 
-def begin_early() -> None:
-    """Begin one that `started` gives: its imports, a third of a second, run beside ours."""
+@contextmanager
+def begun_early() -> Iterator[None]:
+    """Within it a process waits that `started` gives: its imports run beside ours."""
     _waiting.append(started())
-    atexit.register(_end)
-
-
-def _end() -> None:
-    """End what no simulator was made of."""
-    while _waiting:
-        process, said = _waiting.pop()
-        process.kill()
-        process.communicate()
-        said.close()
+    try:
+        yield
+    finally:
+        while _waiting:  # no simulator was made of it
+            process, said = _waiting.pop()
+            process.kill()
+            process.communicate()
+            said.close()
 
 
 def started() -> Started:

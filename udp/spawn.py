@@ -43,6 +43,7 @@ def spawn_simulator(
         PeerClosed: The simulator did not start, or ended: its own sentence, or its last words.
         PeerSilent: The simulator runs and does not answer.
     """
+    _check_importable(config)
     config = config.embedded()  # before a record is begun
     count = config.drones if num_envs is None else num_envs
     settings: AgentSettings = {
@@ -91,6 +92,7 @@ def start_simulator(
 
     `settings` are keyword arguments of `Simulator`.
     """
+    _check_importable(config)
     process = begin()
     _tell(process, config, server, **settings)
     return process
@@ -99,12 +101,6 @@ def start_simulator(
 def _tell(
     process: subprocess.Popen[bytes], config: EnvConfig, server: Address, **settings: object
 ) -> None:
-    known = registry.is_known(config.env_id)
-    if known and registry.task_type(config.env_id).__module__ == "__main__":
-        raise InputError(
-            "env: expected a task of a module, for the simulator's process to import, got "
-            f"{config.env_id} of this program"
-        )
     arguments = {
         "config": config.embedded().to_dict(),
         "module": config.module,
@@ -116,6 +112,16 @@ def _tell(
     with suppress(BrokenPipeError):  # it has ended: its exit status says so
         process.stdin.write(json.dumps(arguments).encode() + b"\n")
         process.stdin.flush()
+
+
+def _check_importable(config: EnvConfig) -> None:
+    """Refuse a task that the simulator's process cannot import. Raises `InputError`."""
+    known = registry.is_known(config.env_id)
+    if known and registry.task_type(config.env_id).__module__ == "__main__":
+        raise InputError(
+            "env: expected a task of a module, for the simulator's process to import, got "
+            f"{config.env_id} of this program"
+        )
 
 
 def _connect(env: Remote, process: subprocess.Popen[bytes]) -> None:

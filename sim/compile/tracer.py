@@ -358,6 +358,8 @@ def _remainder(like: TracedArray, x: Any, by: Any) -> Traced:
 
 
 def _power(like: TracedArray, x: Any, exponent: Any) -> Traced:
+    if isinstance(exponent, list | tuple):
+        _refuse("np.power with several exponents")
     if exponent == 0:
         return np.ones_like(x)
     if exponent == 0.5:

@@ -234,27 +234,47 @@ def test_the_simulator_program_ends_on_sigterm_and_tells_the_agent() -> None:
 
 
 def test_a_process_that_began_early_flies_for_the_first_that_asks() -> None:
-    processes.begin_early()
-    early, _ = processes._waiting[0]
-    with spawn_simulator(EnvConfig()) as remote:
-        assert not processes._waiting
-        assert remote.reset(seed=3)[0].tobytes() == gym.make(ENV_ID).reset(seed=3)[0].tobytes()
-    assert early.returncode == 0
+    with processes.begun_early():
+        early, _ = processes._waiting[0]
+        with spawn_simulator(EnvConfig()) as remote:
+            assert not processes._waiting
+            assert remote.reset(seed=3)[0].tobytes() == gym.make(ENV_ID).reset(seed=3)[0].tobytes()
+        assert early.returncode == 0
 
 
-def test_a_process_that_began_early_ends_with_a_command_that_fails() -> None:
+@pytest.mark.parametrize("words", ["--num-envs 7000000", "--bogus", "--env nobodys-v0"])
+def test_a_process_that_began_early_ends_with_a_command_that_fails(words: str) -> None:
     script = (
-        "import sys\nfrom rotorgram.cli import main\nfrom rotorgram.udp import process\n"
-        "main(['train', 'ppo', '--udp', '--num-envs', '7000000'])\n"
-        "print(process._waiting[0][0].pid)\n"
+        "import os, sys\nfrom rotorgram.cli import main\nfrom rotorgram.udp import process\n"
+        "begun = []\nbegin = process.begin\n"
+        "process.begin = lambda *given: begun.append(begin(*given)) or begun[-1]\n"
+        f"try: status = main(['train', 'ppo', '--udp', *'{words}'.split()])\n"
+        "except SystemExit as error: status = error.code\n"
+        "print(status, begun[0].returncode, process._waiting)\n"
     )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    assert done.stderr.startswith("rotorgram: env_steps: expected at least 7000000")
-    assert done.stderr.count("\n") == 1
-    deadline = time.monotonic() + 20
-    while Path(f"/proc/{int(done.stdout)}").exists():
+    command = [sys.executable, "-X", "dev", "-W", "error", "-c", script]
+    around = {**os.environ, "MUJOCO_GL": "no such library"}  # which a simulator does not import
+    done = subprocess.run(command, capture_output=True, text=True, env=around)
+    assert done.stdout in ("1 -9 []\n", "2 -9 []\n")
+    assert done.stderr
+    assert "Warning" not in done.stderr
+    assert "Traceback" not in done.stderr
+    if words.startswith("--num-envs"):
+        assert done.stderr.startswith("rotorgram: env_steps: expected at least 7000000")
+        assert done.stderr.count("\n") == 1
+
+
+def test_sigterm_for_a_group_is_for_the_agent(tmp_path: Path) -> None:
+    words = [sys.executable, "-m", "rotorgram.cli", "train", "ppo", "--udp", "--out", "run"]
+    words += ["--env-steps", "9000000"]
+    training = subprocess.Popen(words, cwd=tmp_path, start_new_session=True, stderr=-1, stdout=-1)
+    deadline = time.monotonic() + 30
+    while not (tmp_path / "run" / "checkpoint.safetensors").exists():
         assert time.monotonic() < deadline
         time.sleep(0.01)
+    os.killpg(training.pid, signal.SIGTERM)
+    _, said = training.communicate(timeout=30)
+    assert (training.returncode, said) == (128 + signal.SIGTERM, b"")
 
 
 def test_a_forgotten_env_tells_the_simulator() -> None:
