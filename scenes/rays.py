@@ -99,10 +99,12 @@ class Rays:
             raise InputError(f"rays: expected {expected}, got others")
         kinds, tables = layouts
         chosen = numbers("which", which)
-        if chosen.shape not in ((), (len(place),)) or not np.isin(chosen, range(len(kinds))).all():
-            expected = f"numbers of {len(kinds)} layouts, one or {len(place)}"
+        scenes = chosen.astype(np.int64)
+        is_right = (scenes == chosen) & (scenes >= 0) & (scenes < len(kinds))
+        if chosen.shape not in ((), (len(place),)) or not is_right.all():
+            expected = f"whole numbers from 0 to {len(kinds) - 1}, one or {len(place)} of them"
             raise InputError(f"which: expected {expected}, got {shortened(which)}")
-        scenes = np.full(len(place), chosen, np.int64)
+        scenes = np.full(len(place), scenes)
         lanes, planes, whole = self._packets
         rows, columns = self.directions.shape[:2]
         out = np.empty((len(place), rows * columns), np.float32)

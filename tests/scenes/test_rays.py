@@ -149,9 +149,18 @@ def test_what_is_refused() -> None:
             "position: expected finite numbers, got",
         ),
         (lambda: rays.cast(layouts, (0, 1), LEVEL), r"rays: expected positions \(W, 3\) and quat"),
-        (lambda: rays.cast(layouts, (0, 0, 1), LEVEL, which=1), "which: expected numbers of 1 lay"),
-        (lambda: rays.cast(layouts, (0, 0, 1), LEVEL, which=0.5), "which: expected numbers of 1"),
-        (lambda: rays.cast(layouts, (0, 0, 1), LEVEL, which=[0, 0]), "which: expected numbers of"),
+        (
+            lambda: rays.cast(layouts, (0, 0, 1), LEVEL, which=1),
+            "which: expected whole numbers from",
+        ),
+        (
+            lambda: rays.cast(layouts, (0, 0, 1), LEVEL, which=0.5),
+            "which: expected whole numbers from",
+        ),
+        (
+            lambda: rays.cast(layouts, (0, 0, 1), LEVEL, which=[0, 0]),
+            "which: expected whole numbers from",
+        ),
         (
             lambda: rays.cast(layouts, "here", LEVEL),
             "position: expected finite numbers, got 'here'",
