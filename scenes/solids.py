@@ -189,15 +189,19 @@ def _primitive(model: MjModel, geom: int) -> tuple[str, Sequence[float], Sequenc
         not a * b or (is_ground(model, geom) and min(a, b) > _MARK)
     ):
         return "plane", (_ENDLESS, _ENDLESS, 0.0), (0, 1, 2)
-    long = int(np.argmax((a, b, c)))
+    order = [0, 1, 2]
     shapes: dict[mjtGeom, tuple[str, Sequence[float]]] = {
         mjtGeom.mjGEOM_SPHERE: ("sphere", (a, a, a)),
         mjtGeom.mjGEOM_CAPSULE: ("capsule", (a, a, a + b)),
         mjtGeom.mjGEOM_CYLINDER: ("cylinder", (a, a, b)),
         mjtGeom.mjGEOM_BOX: ("box", (a, b, c)),
         mjtGeom.mjGEOM_PLANE: ("box", (a, b, _SHEET)),
-        mjtGeom.mjGEOM_ELLIPSOID: ("capsule", (*[sorted((a, b, c))[1]] * 2, max(a, b, c))),
     }
+    if kind == mjtGeom.mjGEOM_ELLIPSOID:
+        order = np.argsort((a, b, c)).tolist()
+        thin, wide, long = sorted((a, b, c))
+        is_flat = thin < wide / 2
+        shapes[kind] = ("box", (thin, wide, long)) if is_flat else ("capsule", (wide, wide, long))
     if kind not in shapes:
         expected = ", ".join(kernels.KINDS)
         got = kind.name.removeprefix("mjGEOM_").lower()
@@ -205,10 +209,4 @@ def _primitive(model: MjModel, geom: int) -> tuple[str, Sequence[float], Sequenc
     shape, half = shapes[kind]
     for one in half:
         check(f"scene: half a side of {name}", _SIZE, one)
-    order = [0, 1, 2]
-    if kind == mjtGeom.mjGEOM_ELLIPSOID:
-        least, middle, _ = sorted((a, b, c))
-        if least < middle / 2:
-            return "box", (a, b, c), order
-        order = [(long + 1) % 3, (long + 2) % 3, long]
     return shape, half, order
