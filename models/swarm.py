@@ -1,6 +1,6 @@
 """Several crafts in one world: its compiled model, and which parts belong to which craft."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import mujoco
 import numpy as np
@@ -23,14 +23,19 @@ def drone_names(count: int) -> tuple[str, ...]:
 
 
 def swarm_model(
-    vehicles: Sequence[Vehicle], *, movable: bool = False, payload: float = 0.0, cable: float = 0.0
+    vehicles: Sequence[Vehicle],
+    *,
+    movable: bool = False,
+    payload: float = 0.0,
+    cable: float = 0.0,
+    surround: Callable[[mujoco.MjSpec], None] = add_ground,
 ) -> MjModel:
     """A world with a craft of each vehicle, without visual elements.
 
     Free joints and rotors come craft by craft, and two sensors of each count its contacts. With
     `movable`, centers of mass may be moved. A payload, kg, is a ball on a cable, m, from each
-    craft: its free joint comes last, and centers of mass may be moved too. Raises `InputError`
-    where vehicles do not agree in `SHARED`.
+    craft: its free joint comes last, and centers of mass may be moved too. `surround` adds what
+    stands around the crafts. Raises `InputError` where vehicles do not agree in `SHARED`.
     """
     first = vehicles[0]
     names = drone_names(len(vehicles))
@@ -44,7 +49,7 @@ def swarm_model(
                     f"vehicle: expected a {name} of {ours} as of {first.name}, got {got}"
                 )
     spec, crafts = swarm_spec([vehicle.path for vehicle in vehicles], names)
-    add_ground(spec)
+    surround(spec)
     spec.compiler.discardvisual = True
     for name, craft in zip(names, crafts, strict=True):
         if movable or payload:

@@ -285,6 +285,14 @@ def craft_geoms(model: MjModel) -> Array:
     return geoms
 
 
+def can_touch(model: MjModel, geom: int, others: Array) -> bool:
+    """Whether a geom may collide with one of others, bool, (geoms,)."""
+    types = model.geom_contype
+    affinities = model.geom_conaffinity
+    pairs = (types[geom] & affinities[others]) | (affinities[geom] & types[others])
+    return bool(pairs.any())
+
+
 def payload_body(model: MjModel) -> int:
     """Id of the payload of a model from `Vehicle.movable`."""
     return int(model.body(_PAYLOAD).id)

@@ -8,8 +8,9 @@ from mujoco import MjSpec
 
 from ..models import QUAD_XML
 from ..models.mjcf import has_ground, read_spec
-from . import AIRPORT_XML, SCENE_XML, parse_scene
-from .generators import GENERATORS, SKY, Builder
+from . import AIRPORT_XML, SCENE_XML
+from .config import SceneConfig, parse_scene
+from .looks import SKY, add_parts
 
 SCENE_PREFIX = "scene/"  # of all names that `add_scene` adds for the plain scene
 _NEAR = 0.25  # m: nearest distance that is drawn
@@ -24,7 +25,7 @@ _HAZE = 0.1  # of the distance to the horizon
 _HAZE_COLOUR = (0.80, 0.88, 0.96, 1.0)  # the sky's colour where it meets the ground
 
 
-def build_scene(vehicle: Path | str | None = None, scene: str = "plain") -> MjSpec:
+def build_scene(vehicle: Path | str | None = None, scene: str | SceneConfig = "plain") -> MjSpec:
     """A vehicle's file, None for the paper's, in one of `SCENES`, to be compiled.
 
     Raises `InputError` if there is no such scene or the file is wrong, `ValueError` if MuJoCo
@@ -35,21 +36,21 @@ def build_scene(vehicle: Path | str | None = None, scene: str = "plain") -> MjSp
     return spec
 
 
-def add_scene(spec: MjSpec, scene: str = "plain") -> None:
-    """Add a scene to the spec of one or several craft, in place: NAME, or NAME:SEED.
+def add_scene(spec: MjSpec, scene: str | SceneConfig = "plain") -> None:
+    """Add a single scene to the spec of one or several craft, in place, for pictures.
 
     The craft move bit for bit as without it. Raises `InputError`.
     """
-    name, seed = parse_scene(scene)
+    chosen = parse_scene(scene)
     _add_plain(spec)
-    if name == "airport":
+    if chosen.name == "airport":
         _add_airport(spec)
-    elif name in GENERATORS:
+    elif chosen.is_seeded:
         # In place of the spec's sky, lights and the look of its level ground.
         _clear(spec, _SEEDED_FAR, 20)
         for light in spec.worldbody.lights:
             light.active = False
-        GENERATORS[name](Builder(spec, name, seed))
+        add_parts(spec, chosen)
     spec.compiler.discardvisual = False
 
 

@@ -1,48 +1,70 @@
 """Scenes from a seed: a forest, a warehouse, a track of gates.
 
-World frame: z up, m. A generator draws all numbers of a scene from one stream, in one order.
+World frame: z up, m. A generator draws what stands in a scene from one stream, in one order.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-import mujoco
 import numpy as np
-from mujoco import MjSpec, mjtGeom
 from numpy.typing import ArrayLike as Vector
+from numpy.typing import NDArray
 
 from ..models.files import read_toml
+from .config import FOREST_SIZE, SceneConfig
+from .kernels import KINDS
+
+Array = NDArray[np.float64]
+
+SPHERE, CAPSULE, CYLINDER, BOX, _ = range(len(KINDS))
 
 CLEARANCE = 8.0
 """Half the width of the space about the z axis, 20 m high, that nothing but a gate enters, m."""
-GROUP = 2
-"""Group of the geoms of a scene."""
-SKY = mujoco.mjtTexture.mjTEXTURE_SKYBOX
-
 MATERIALS = read_toml(Path(__file__).with_name("materials.toml"), "materials")
+"""By scene and name."""
+
 _TREES = read_toml(Path(__file__).with_name("trees.toml"), "trees")["kind"]
-_FOREST = 60.0  # m: half the width of the wood
-_HALL_XML = Path(__file__).with_name("hall.xml")  # its walls, windows, roof, lamps and racks
+_COUNTS = np.array([len(tree["crowns"]) for tree in _TREES])  # crowns of each kind of tree
+_FIRSTS = np.cumsum(_COUNTS) - _COUNTS
+_PARTS = [name for tree in _TREES for name, *_ in tree["crowns"]]
+_CROWNS = np.array(
+    [[KINDS.index(tree["shape"]), *crown[1:]] for tree in _TREES for crown in tree["crowns"]]
+)
+"""Kind and numbers of each crown."""
+_SHRUB_DENSITY = 1 / 240
+_ROCK_DENSITY = 1 / 360
+_ROCK_REACH = 1.2  # m
+_ENDS = 2.0  # m: radius of the clear spaces at the ends of a forest
 _GATES = 8
 _OPENING = 5.0  # m: the paper's craft is 2.8 m wide with its rotors
 
-_FLAT = mujoco.mjtBuiltin.mjBUILTIN_FLAT
-_PATTERNS = {
-    "checker": (mujoco.mjtBuiltin.mjBUILTIN_CHECKER, mujoco.mjtMark.mjMARK_NONE),
-    "edge": (_FLAT, mujoco.mjtMark.mjMARK_EDGE),
-    "random": (_FLAT, mujoco.mjtMark.mjMARK_RANDOM),
-}
+
+Names = Callable[[], Sequence[str]]
 
 
-class Builder:
-    """Adds the parts of a scene to a spec, and draws its numbers. Nothing of it touches or weighs
-    anything."""
+class Parts(NamedTuple):
+    """Primitives, as geoms of MuJoCo, turned about z."""
 
-    def __init__(self, spec: MjSpec, scene: str, seed: int) -> None:
-        self.spec = spec
+    names: Names
+    kinds: NDArray[np.int8]
+    """Places in `kernels.KINDS`, shape (n,)."""
+    sizes: Array
+    """m, as MuJoCo has them, shape (n, 3)."""
+    positions: Array
+    """Of their centers, m, shape (n, 3)."""
+    materials: Names
+    headings: Array
+    """rad, shape (n,)."""
+
+
+class Draft:
+    """Draws the parts of a scene."""
+
+    def __init__(self, scene: SceneConfig, seed: int) -> None:
         self.scene = scene
+        self.parts: list[Parts] = []
         self.rng = np.random.Generator(np.random.PCG64(seed))
 
     def uniform(self, low: float, high: float) -> float:
@@ -50,12 +72,12 @@ class Builder:
 
     def choose(self, name: str) -> str:
         """One of the materials of several colours."""
-        count = len(MATERIALS[self.scene][name]["colours"])
-        return f"{name}_{self.rng.integers(count)}"
+        return self.choices(name, 1)[0]
 
-    def colour(self, base: Vector, by: float = 0.06) -> np.ndarray:
-        """A colour near `base`."""
-        return np.clip(np.array(base) + self.rng.uniform(-by, by, 3), 0.02, 1.0)
+    def choices(self, name: str, count: int) -> list[str]:
+        """As many such materials."""
+        colours = len(MATERIALS[self.scene.name][name]["colours"])
+        return [f"{name}_{one}" for one in self.rng.integers(colours, size=count).tolist()]
 
     def around(self, reach: float, far: float) -> tuple[float, float]:
         """A place up to `far` from which `reach` does not lead into the clear space."""
@@ -63,35 +85,6 @@ class Builder:
             x, y = self.rng.uniform(-far, far, 2).tolist()
             if max(abs(x), abs(y)) > CLEARANCE + reach:
                 return x, y
-
-    def paint(self) -> None:
-        """Add the materials of the scene, in colours near those of the table."""
-        for name, look in MATERIALS[self.scene].items():
-            colours = look["colours"]
-            for number, base in enumerate(colours):
-                colour = self.colour(base, look.get("by", 0.06))
-                own = f"{self.scene}/{name}"
-                if len(colours) > 1:
-                    own += f"_{number}"
-                material = self.spec.add_material(name=own, specular=look.get("gloss", 0.0))
-                if "pattern" in look:
-                    self._add_pattern(material, colour, look)
-                else:
-                    material.rgba = (*colour, 1.0)
-
-    def _add_pattern(
-        self, material: mujoco.MjsMaterial, colour: np.ndarray, look: Mapping[str, Any]
-    ) -> None:
-        second = colour * self.rng.uniform(0.82, 0.94)
-        repeat = look.get("repeat", 0.5)
-        builtin, mark = _PATTERNS[look["pattern"]]
-        self.spec.add_texture(
-            name=material.name, type=mujoco.mjtTexture.mjTEXTURE_2D, width=128, height=128,
-            builtin=builtin, rgb1=colour, rgb2=second, markrgb=second, random=0.2, mark=mark,
-        )  # fmt: skip
-        material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = material.name
-        material.texuniform = True
-        material.texrepeat = (repeat, repeat)
 
     def add(
         self,
@@ -102,93 +95,107 @@ class Builder:
         material: str,
         heading: float = 0.0,
     ) -> None:
-        """Add a geom that is turned about z, rad."""
-        quaternion = (math.cos(heading / 2), 0.0, 0.0, math.sin(heading / 2))
-        self.spec.worldbody.add_geom(
-            name=f"{self.scene}/{name}", type=getattr(mjtGeom, f"mjGEOM_{kind.upper()}"),
-            size=size, pos=position,
-            quat=quaternion, material=f"{self.scene}/{material}", contype=0, conaffinity=0,
-            group=GROUP, mass=0.0, density=0.0,
-        )  # fmt: skip
+        """Add a part that is turned about z, rad."""
+        kinds = [KINDS.index(kind)]
+        sizes, places = np.array([size], float), np.array([position], float)
+        self.add_all(lambda: [name], kinds, sizes, places, lambda: [material], heading)
 
-    def light(
-        self, name: str, position: Vector, direction: Vector, diffuse: Vector, ambient: float
+    def add_all(
+        self,
+        names: Names,
+        kinds: Vector,
+        sizes: Vector,
+        positions: Vector,
+        materials: Names,
+        headings: Vector = 0.0,
     ) -> None:
-        """Add a light from one direction. A shadow of a slanted one would speckle the ground."""
-        self.spec.worldbody.add_light(
-            name=f"{self.scene}/{name}", type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
-            castshadow=False, pos=position, dir=direction, diffuse=diffuse,
-            ambient=(ambient,) * 3, specular=(0, 0, 0),
-        )  # fmt: skip
-
-    def sky(self, top: Vector, horizon: Vector) -> None:
-        """Add a sky of two colours."""
-        self.spec.add_texture(
-            name=f"{self.scene}/sky", type=SKY, builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
-            rgb1=top, rgb2=horizon, width=128, height=768,
-        )  # fmt: skip
-
-    def sun(self) -> None:
-        """Add a sun from a side of its own, and its sky."""
-        azimuth = self.uniform(0.0, 2 * math.pi)
-        down = self.uniform(1.0, 2.5)
-        bright = self.uniform(0.6, 0.8)
-        direction = (math.cos(azimuth), math.sin(azimuth), -down)
-        self.light("sun", (0.0, 0.0, 60.0), direction, (bright, bright, 0.95 * bright), 0.2)
-        self.sky(self.colour((0.40, 0.60, 0.86)), (0.93, 0.95, 0.97))
+        """Add parts; one heading may be that of all."""
+        rows = np.array(positions, float)
+        turns = np.full(len(rows), headings, float)
+        own = np.array(kinds, np.int8), np.array(sizes, float)
+        self.parts.append(Parts(names, *own, rows, materials, turns))
 
 
-def forest(wood: Builder) -> None:
-    """A wood of 120 m by 120 m: trees, shrubs and rocks."""
-    wood.sun()
-    wood.paint()
-    wood.add("ground/floor", "plane", (150, 150, 1), (0, 0, 0), "ground")
-    for i in range(110):
-        _add_tree(wood, f"tree_{i}")
-    for i in range(60):
-        wide = wood.uniform(0.4, 1.2)
-        x, y = wood.around(wide, _FOREST)
-        leaf = wood.choose("leaves")
-        wood.add(f"shrub_{i}/crown", "sphere", (wide, 0, 0), (x, y, 0.1 * wide), leaf)
-    for i in range(40):
-        sides = wood.rng.uniform(0.3, 1.0, 3)
-        x, y = wood.around(1.0, _FOREST)
-        turn = wood.uniform(0, math.pi)
-        wood.add(f"rock_{i}/stone", "box", 0.8 * sides, (x, y, 0.2 * sides[2]), "stone", turn)
+def forest(wood: Draft) -> None:
+    """A wood: trees, shrubs and rocks. Its crowns are over 4 m high."""
+    wide, deep = wood.scene.size or FOREST_SIZE
+    area = wide * deep
+    trees = wood.scene.trees
+    shrubs = round(area * _SHRUB_DENSITY)
+    rocks = round(area * _ROCK_DENSITY)
+    green = trees + shrubs
+    edge = max(150.0, wide, deep)
+    wood.add("ground/floor", "plane", (edge, edge, 1), (0, 0, 0), "ground")
+    drawn = wood.rng.random((green + rocks, 6))
+    leaves = wood.choices("leaves", green)
+    kinds = (drawn[:trees, 3] * len(_TREES)).astype(int)
+    room = min(1.0, 0.16 * math.sqrt(area / max(1, trees)))  # crowns of a dense wood are narrow
+    tall = 9.5 + 6.5 * drawn[:trees, 0]
+    spread = room * (1.4 + 1.6 * drawn[:trees, 1])
+    trunk = 0.2 + 0.3 * drawn[:trees, 2]
+    aside = (0.6 * drawn[:trees, 4:] - 0.3) * spread[:, None]
+    radii = 0.4 + 0.8 * drawn[trees:green, 0]
+    sides = 0.3 + 0.7 * drawn[green:, :3]
+    narrow = trunk if wood.scene.clear == "ends" else 1.1 * spread
+    places = _places(wood, np.concatenate((narrow, radii, np.full(rocks, _ROCK_REACH))))
+
+    def add(what: str, kind: int, sizes: Any, heights: Array, first: int, **more: Any) -> None:
+        count = len(heights)
+        centers = np.column_stack((places[first : first + count], heights))
+        names = lambda: [what.format(i) for i in range(count)]  # noqa: E731
+        wood.add_all(names, np.full(count, kind), np.column_stack(sizes), centers, **more)
+
+    bark = lambda: [f"bark_{kind % 2}" for kind in kinds.tolist()]  # noqa: E731
+    add("tree_{}/trunk", CYLINDER, (trunk, 0.3 * tall, trunk), 0.3 * tall, 0, materials=bark)
+    _add_crowns(wood, kinds, tall, spread, places[:trees], aside, leaves)
+    add(
+        "shrub_{}/crown", SPHERE, (radii,) * 3, 0.1 * radii, trees, materials=lambda: leaves[trees:]
+    )
+    add(
+        "rock_{}/stone", BOX, 0.8 * sides.T, 0.2 * sides[:, 2], green,
+        materials=lambda: ["stone"] * rocks, headings=math.pi * drawn[green:, 3],
+    )  # fmt: skip
 
 
-def _add_tree(wood: Builder, name: str) -> None:
-    x, y = wood.around(3.2, _FOREST)
-    tall = wood.uniform(6.0, 15.0)
-    wide = wood.uniform(1.4, 3.0)
-    kind = int(wood.rng.integers(3))
-    leaf = wood.choose("leaves")
-    trunk = (0.13 + 0.012 * tall, 0.3 * tall, 0)
-    wood.add(f"{name}/trunk", "cylinder", trunk, (x, y, 0.3 * tall), f"bark_{kind % 2}")
-    crowns = _TREES[kind]["crowns"]
-    shape = _TREES[kind]["shape"]
-    aside = np.zeros(2)
-    if any(side for _, side, *_ in crowns):
-        aside = wood.rng.uniform(-0.3, 0.3, 2) * wide
-    for part, side, height, half_width, by_width, by_height in crowns:
-        radius = half_width * wide
-        half = by_width * wide + by_height * tall
-        position = (x + side * aside[0], y + side * aside[1], height * tall)
-        if shape == "capsule":
-            half = max(1e-3, half - radius)  # of the part between its balls
-        wood.add(f"{name}/{part}", shape, (radius, half, 0), position, leaf)
+def _add_crowns(
+    wood: Draft, kinds: Array, tall: Array, spread: Array, places: Array, aside: Array,
+    leaves: Sequence[str],
+) -> None:  # fmt: skip
+    """Add the crowns of all trees; the kind of a tree says how many it has."""
+    counts = _COUNTS[kinds]
+    tree = np.repeat(np.arange(len(kinds)), counts)
+    first = np.repeat(np.cumsum(counts) - counts, counts)
+    row = np.repeat(_FIRSTS[kinds], counts) + np.arange(len(tree)) - first
+    shape, side, height, half_width, by_width, by_height = _CROWNS[row].T
+    radius = half_width * spread[tree]
+    half = by_width * spread[tree] + by_height * tall[tree]
+    half = np.where(shape == CAPSULE, np.maximum(1e-3, half - radius), half)
+    centers = np.column_stack((places[tree] + side[:, None] * aside[tree], height * tall[tree]))
+    wood.add_all(
+        lambda: [f"tree_{i}/{_PARTS[k]}" for i, k in zip(tree.tolist(), row.tolist(), strict=True)],
+        shape, np.column_stack((radius, half, half)), centers,
+        lambda: [leaves[i] for i in tree.tolist()],
+    )  # fmt: skip
 
 
-def warehouse(hall: Builder) -> None:
-    """A hall of 60 m by 40 m, 24 m high. Racks, pallets and barrels stand along its walls."""
-    hall.sky(hall.colour((0.55, 0.60, 0.66)), hall.colour((0.62, 0.64, 0.66)))
-    hall.paint()
-    walls = MjSpec.from_file(str(_HALL_XML))
-    hall.spec.attach(walls, prefix="warehouse/", frame=hall.spec.worldbody.add_frame())
-    for i, x in enumerate((-15.0, 15.0)):
-        bright = hall.uniform(0.28, 0.42)
-        direction = (-x / 30, hall.uniform(-0.4, 0.4), -1.0)
-        hall.light(f"light_{i}", (x, 0.0, 22.0), direction, (bright,) * 3, 0.15)
+def _places(wood: Draft, reach: Array) -> Array:
+    """Places in the wood from which `reach` does not lead into its clear spaces, (n, 2)."""
+    half = np.array(wood.scene.size or FOREST_SIZE) / 2
+    places = np.empty((len(reach), 2))
+    left = np.arange(len(reach))
+    while left.size:
+        places[left] = drawn = half * (2.0 * wood.rng.random((left.size, 2)) - 1.0)
+        x, y = abs(drawn.T)
+        room = CLEARANCE - np.maximum(x, y)
+        if wood.scene.clear == "ends":
+            x = x - (half[0] - _ENDS)
+            room = _ENDS - np.sqrt(x * x + y * y)
+        left = left[room > -reach[left]]
+    return places
+
+
+def warehouse(hall: Draft) -> None:
+    """Racks, pallets and barrels along the walls of a hall of 60 m by 40 m, 24 m high."""
     racks = [(x, y) for y in (-16.5, -11.0, 11.0, 16.5) for x in (-20.0, -7.0, 7.0, 20.0)]
     for i, (x, y) in enumerate(racks):
         _fill_rack(hall, f"rack_{i}", x, y)
@@ -196,7 +203,7 @@ def warehouse(hall: Builder) -> None:
         _add_goods(hall, i)
 
 
-def _fill_rack(hall: Builder, name: str, x: float, y: float) -> None:
+def _fill_rack(hall: Draft, name: str, x: float, y: float) -> None:
     """Boxes on the three shelves of a rack."""
     for level in range(3):
         deck = 0.3 + 2.3 * level
@@ -208,7 +215,7 @@ def _fill_rack(hall: Builder, name: str, x: float, y: float) -> None:
                 hall.add(f"{name}/box_{4 * level + slot}", "box", half, position, tint)
 
 
-def _add_goods(hall: Builder, number: int) -> None:
+def _add_goods(hall: Draft, number: int) -> None:
     """A barrel, or a box on a pallet; the first six stand in the middle."""
     if number < 6:
         x, y = hall.around(1.0, 13.5)
@@ -224,10 +231,8 @@ def _add_goods(hall: Builder, number: int) -> None:
     hall.add(f"pallet_{number}/box", "box", half, (x, y, 0.16 + half[2]), tint)
 
 
-def gates(track: Builder) -> None:
+def gates(track: Draft) -> None:
     """A ring of 8 gates, 5 m wide inside, with barriers, cones and stands around it."""
-    track.sun()
-    track.paint()
     track.add("ground/floor", "plane", (150, 150, 1), (0, 0, 0), "grass")
     for i in range(_GATES):
         _add_gate(track, i)
@@ -250,7 +255,7 @@ def gates(track: Builder) -> None:
             track.add(f"stand_{i}/row_{row}", "box", size, position, "stand", angle)
 
 
-def _add_gate(track: Builder, number: int) -> None:
+def _add_gate(track: Draft, number: int) -> None:
     half = _OPENING / 2
     bar = 0.25
     angle = 2 * math.pi * number / _GATES + track.uniform(-0.15, 0.15)
@@ -273,4 +278,20 @@ def _add_gate(track: Builder, number: int) -> None:
 
 
 GENERATORS = {"warehouse": warehouse, "forest": forest, "gates": gates}
-"""The function that builds each scene."""
+"""The function that draws each scene."""
+
+
+def most_parts(scene: SceneConfig) -> int:
+    """At least as many as any layout of a scene from a seed has primitives."""
+    if scene.name != "forest":
+        return 512
+    wide, deep = scene.size or FOREST_SIZE
+    return 4 * scene.trees + round(wide * deep * (_SHRUB_DENSITY + _ROCK_DENSITY)) + 8
+
+
+def parts_of(scene: SceneConfig, seed: int) -> list[Parts]:
+    """What stands in a scene, but for what its MJCF file has."""
+    draft = Draft(scene, seed)
+    if scene.is_seeded:
+        GENERATORS[scene.name](draft)
+    return draft.parts

@@ -12,7 +12,7 @@ box about it, m; the last row is the radius by which that box is rounded.
 from collections.abc import Callable
 from functools import cache
 from types import FunctionType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -30,6 +30,7 @@ _ONE = np.float32(1.0)
 _TINY = np.float32(1e-12)
 _NUDGE = np.float32(1e-9)
 _BIG = np.float32(1e30)
+_UNTURNED = np.eye(3, dtype=np.float32).ravel()
 _MARGIN = np.float32(0.01)  # m: at tens of metres, float32 rounds by far less
 
 Array = Any
@@ -216,6 +217,89 @@ def distances(kinds: Array, table: Array, points: Array) -> Array:
     return nearest
 
 
+def _nearest(kinds: Array, table: Array, x: Array, y: Array, z: Array) -> Array:
+    """From a point to the nearest primitive of a layout but the first, the ground, m; 1e30 if there
+    is none.
+    """
+    nearest = _BIG
+    for j in range(1, kinds.size):
+        nearest = _least(nearest, _gap(kinds[j], table, j, (x, y, z)))
+    return nearest
+
+
+def _first(
+    kinds: Array, table: Array, x: Array, y: Array, z: Array, dx: Array, dy: Array, dz: Array
+) -> Array:
+    """Along a ray from a point to the first primitive but the ground, m; 1e30 if there is none."""
+    found = _BIG
+    ray = (dx, dy, dz)
+    for j in range(1, kinds.size):
+        solid = _seen(table, j, (x, y, z), _UNTURNED)
+        kind = kinds[j]
+        if kind == _SPHERE:
+            enters, leaves, meets = _sphere(ray, solid)
+        elif kind == _CAPSULE:
+            enters, leaves, meets = _capsule(ray, solid)
+        elif kind == _CYLINDER:
+            enters, leaves, meets = _cylinder(ray, solid)
+        elif kind == _BOX:
+            enters, leaves, meets = _box(ray, solid)
+        else:
+            enters, leaves, meets = _plane(ray, solid)
+        found = _nearer(found, enters, leaves, meets)
+    return found
+
+
+def first_by_numpy(kinds: Array, table: Array, point: Array, ray: Array) -> Array:
+    """As `_first`, of a point and a direction, (3,)."""
+    with np.errstate(all="ignore"):
+        return _first(kinds, table, *point, *ray)
+
+
+def _gaps(kinds: Array, tables: Array, which: Array, points: Array, due: Array, out: Array) -> None:
+    """Set `out`, (W, A), to the distances of points, (W, A, 3), where `due`, (W, A), is true.
+
+    float32, m; of layouts as `_packets` has them.
+    """
+    for w in range(out.shape[0]):
+        for a in range(out.shape[1]):
+            if due[w, a]:
+                x, y, z = points[w, a, 0], points[w, a, 1], points[w, a, 2]
+                out[w, a] = _nearest(kinds[which[w]], tables[which[w]], x, y, z)
+
+
+def gaps_by_numpy(
+    kinds: Array, tables: Array, which: Array, points: Array, due: Array, out: Array
+) -> None:
+    """As `_gaps`."""
+    for w in np.flatnonzero(due.any(axis=1)):
+        near = distances(kinds[which[w], 1:], tables[which[w], :, 1:], points[w])
+        out[w] = np.where(due[w], np.minimum(near, _BIG), out[w])
+
+
+def _nearest_at(count: int, kinds: Any, table: Any, x: Array, y: Array, z: Array) -> Array:
+    """As `_nearest`, by the addresses of the kinds and of the table of so many primitives."""
+    return _nearest(_array(kinds, (count,)), _array(table, (ROWS, count)), x, y, z)
+
+
+def _first_at(
+    count: int,
+    kinds: Any,
+    table: Any,
+    x: Array,
+    y: Array,
+    z: Array,
+    dx: Array,
+    dy: Array,
+    dz: Array,
+) -> Array:
+    """As `_first`, by such addresses."""
+    return _first(_array(kinds, (count,)), _array(table, (ROWS, count)), x, y, z, dx, dy, dz)
+
+
+_array: Any = None  # of an address: in `compiled` alone
+
+
 # ---- all rays of a sensor
 
 
@@ -239,6 +323,7 @@ def _packets(
         out: (W, N).
     """
     far = np.empty(kinds.shape[1], np.float32)
+    aside = np.empty(15, np.float32)
     hits = np.empty((planes.shape[0], LANES), np.int32)
     hit = hits.reshape(-1)
     found = np.empty((directions.shape[0], LANES), np.float32)
@@ -248,6 +333,10 @@ def _packets(
         table = tables[which[w]]
         found[:] = reach
         _ranges(table, place[w], far)
+        if whole.shape[0]:
+            for f in range(5):
+                aside[f], aside[5 + f], aside[10 + f] = _turned_back(attitude[w], whole[f])
+            _hide(table, place[w], aside, far)
         for j in range(kind.size):
             if far[j] > reach + _MARGIN:
                 continue
@@ -255,11 +344,6 @@ def _packets(
             if kind[j] == _PLANE:
                 hits[:] = 1
                 _meet(_plane, solid, hit, directions, found)
-                continue
-            sees = True
-            for f in range(whole.shape[0]):
-                sees &= _depth((whole[f, 0], whole[f, 1], whole[f, 2]), solid) >= -_MARGIN
-            if not sees:
                 continue
             if kind[j] == _BOX:
                 _look(_depth, planes, solid, hits)
@@ -285,6 +369,33 @@ def _ranges(table: Array, place: Array, far: Array) -> None:
         b = _most(abs(_dot(away, _three(table, _V, j))) - table[_SIZE + 1, j], _ZERO)
         c = _most(abs(_dot(away, _three(table, _AXIS, j))) - table[_SIZE + 2, j], _ZERO)
         far[j] = _root(a * a + b * b + c * c)
+
+
+def _turned_back(m: Array, vector: Array) -> Vector:
+    """A vector of a sensor's frame in the world."""
+    x, y, z = vector[0], vector[1], vector[2]
+    return (
+        m[0] * x + m[1] * y + m[2] * z,
+        m[3] * x + m[4] * y + m[5] * z,
+        m[6] * x + m[7] * y + m[8] * z,
+    )
+
+
+def _hide(table: Array, place: Array, normals: Array, far: Array) -> None:
+    """Set the distances of what lies behind one of five planes through a point: x of all normals,
+    then y, then z, in the world.
+    """
+    for j in range(far.size):
+        x, y, z = _three(table, _CENTER, j)
+        center = (x - place[0], y - place[1], z - place[2])
+        u, v, axis = _three(table, _U, j), _three(table, _V, j), _three(table, _AXIS, j)
+        worst = _BIG
+        for f in range(5):
+            normal = (normals[f], normals[5 + f], normals[10 + f])
+            depth = _dot(normal, center) + table[_SIZE, j] * abs(_dot(normal, u))
+            depth += table[_SIZE + 1, j] * abs(_dot(normal, v))
+            worst = _least(worst, depth + table[_SIZE + 2, j] * abs(_dot(normal, axis)))
+        far[j] = _pick(worst >= -_MARGIN, far[j], _BIG)
 
 
 def _depth(normal: Vector, solid: Array) -> Array:
@@ -345,12 +456,26 @@ def by_numpy(
 # ---- Numba
 
 
+class Compiled(NamedTuple):
+    """What Numba has compiled."""
+
+    packets: Function
+    gaps: Function
+    nearest: int
+    """Address of `_nearest_at`, whose first three arguments have 64 bits."""
+    first: int
+    """Address of `_first_at`."""
+    owners: Any
+    """Of the code there."""
+
+
 @cache
-def compiled() -> Function | None:
-    """`_packets` by Numba, or None where it is not installed: the extra `fast` brings it."""
+def compiled() -> Compiled | None:
+    """Kernels by Numba, or None where it is not installed: the extra `fast` brings it."""
     try:
+        import numba
         from llvmlite import ir
-        from numba import njit
+        from numba import cfunc, njit, types
         from numba.core.cpu import CPUTargetOptions
         from numba.core.options import TargetOptions
         from numba.extending import intrinsic
@@ -383,12 +508,25 @@ def compiled() -> Function | None:
     names["_root"] = inline(lambda x: np.sqrt(x))
     inlined = (
         _dot, _nonzero, _sphere, _ball, _side, _cylinder, _capsule, _box, _plane, _nearer, _three,
-        _turned, _seen, _ranges, _depth, _depth_of_round, _look, _shorten, _meet,
+        _turned, _turned_back, _seen, _gap, _nearest, _first, _ranges, _hide, _depth,
+        _depth_of_round, _look, _shorten, _meet,
     )  # fmt: skip
     for function in inlined:
         names[function.__name__] = inline(FunctionType(function.__code__, names))
     table, row, numbers = "f4[:,:,::1]", "i8[::1]", "f4[:,::1]"
     kinds = ["int8[:,::1]", table, row, *[numbers] * 5, "u8[::1]", "f4", numbers]
-    compile_now = njit(f"void({','.join(kinds)})", cache=True, **options)
-    run: Function = compile_now(FunctionType(_packets.__code__, names))
-    return run
+    whole: dict[str, Any] = {**options, "cache": True}
+    packets = njit(f"void({','.join(kinds)})", **whole)(FunctionType(_packets.__code__, names))
+    kinds = ["int8[:,::1]", table, row, table, "b1[:,::1]", numbers]
+    gaps = njit(f"void({','.join(kinds)})", **whole)(FunctionType(_gaps.__code__, names))
+    names["_array"] = vars(numba)["carray"]
+    number = types.float32
+    pointer: Any = types.CPointer
+
+    def by_address(function: Function, count: int) -> Any:
+        """A function of C of a layout and so many further numbers."""
+        kind = number(types.int64, pointer(types.int8), pointer(number), *[number] * count)
+        return cfunc(kind, cache=True)(FunctionType(function.__code__, names))
+
+    nearest, first = owners = by_address(_nearest_at, 3), by_address(_first_at, 6)
+    return Compiled(packets, gaps, nearest.address, first.address, owners)

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..models.errors import InputError, shortened
 from ..models.fields import Limits, check
+from ..models.matrices import settled
 from . import kernels
 from .kernels import LANES
 from .solids import Layouts, numbers
@@ -18,6 +19,7 @@ from .solids import Layouts, numbers
 Array = NDArray[np.float32]
 
 MAX_RAYS = 1 << 20
+MAX_REACH = 1e4  # m
 MAX_PLACE = 2e4  # m: further away, numbers of float32 are too coarse
 _COUNT = Limits(1, 4096, whole=True)
 _DEGREES = "degrees"
@@ -37,7 +39,7 @@ class Rays:
         sizes = np.sqrt((given * given).sum(axis=-1, keepdims=True))
         if not (np.isfinite(sizes) & (sizes > 0)).all():
             raise InputError("directions: expected vectors that are not 0, got one")
-        self.directions = given / sizes
+        self.directions = settled(given / sizes)
         self.directions.flags.writeable = False  # packets are made of them once
 
     @classmethod
@@ -55,14 +57,16 @@ class Rays:
 
     @classmethod
     def rings(cls, rows: int, columns: int, low: float, high: float) -> Self:
-        """Rings of a lidar, at elevations from `high` to `low`, degrees, the highest first.
+        """Rings of a lidar, at elevations from `high` to `low`, degrees, the highest first; a
+        single one lies in the middle.
 
         Each begins ahead and turns to the left.
         """
         _check_counts(rows, columns)
         for name, value in (("low", low), ("high", high)):
             check(name, Limits(-90.0, 90.0, _DEGREES), value)
-        elevation = np.radians(np.linspace(high, low, rows))[:, None]
+        ends = (high, low) if rows > 1 else ((high + low) / 2,) * 2
+        elevation = np.radians(np.linspace(*ends, rows))[:, None]
         azimuth = 2 * np.pi * np.arange(columns) / columns
         ahead = np.cos(elevation) * np.cos(azimuth)
         left = np.cos(elevation) * np.sin(azimuth)
@@ -88,7 +92,7 @@ class Rays:
             reach: m.
             which: Number of its layout, shape (W,).
         """
-        check("reach", Limits(1e-3, 1e4, "m"), reach)
+        check("reach", Limits(1e-3, MAX_REACH, "m"), reach)
         place = np.atleast_2d(numbers("position", position))
         turn = np.atleast_2d(numbers("attitude", attitude))
         if place.shape[1:] != (3,) or turn.shape != (len(place), 4):
@@ -109,7 +113,8 @@ class Rays:
         rows, columns = self.directions.shape[:2]
         out = np.empty((len(place), rows * columns), np.float32)
         near = np.array(place, np.float32, order="C")
-        run = kernels.compiled() or kernels.by_numpy
+        code = kernels.compiled()
+        run = code.packets if code else kernels.by_numpy
         run(
             kinds, tables, scenes, near, _matrices(turn), lanes, planes, whole,
             self._slots, np.float32(reach), out,

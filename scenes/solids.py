@@ -3,9 +3,10 @@
 World frame: z up, m.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property, lru_cache
+from itertools import compress
 from typing import NamedTuple, Self
 
 import mujoco
@@ -15,8 +16,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..models.errors import InputError, shortened
 from ..models.fields import Limits, check
+from ..models.matrices import settled
 from . import kernels
 from .build import HIDDEN_GROUP, add_scene, is_ground
+from .config import SceneConfig, parse_scene
+from .generators import Draft, Parts, parts_of
+from .looks import HALL_XML
 
 Array = NDArray[np.float64]
 
@@ -24,10 +29,13 @@ MAX_SOLIDS = 10_000
 """Most primitives of a scene."""
 MAX_CELLS = 1 << 26
 """Most cells of a grid, which takes 0.5 GB then."""
+_SPHERE, _CAPSULE, _CYLINDER, _, _PLANE = range(len(kernels.KINDS))
 _SIZE = Limits(1e-4, 1e4, "m")
 _ENDLESS = 1e6  # m: half the width of a plane
 _SHEET = 5e-4  # m: half the thickness of a plane of a size, which lies below its face
 _MARK = 10.0  # m: half the width of level ground; what is smaller is a mark on it
+# An unused column of a table is out of reach: its center is far along its first axis.
+_NOTHING = np.eye(kernels.ROWS)[0, :, None] * _ENDLESS + np.eye(kernels.ROWS)[3, :, None]
 _CHUNK = 1 << 22  # numbers that a step of `distance` has at once
 
 
@@ -38,8 +46,8 @@ class Solids:
     `Solids.of_scene("forest:3").distance(points)` is how much room there is at some points.
     """
 
-    names: tuple[str, ...]
-    """Of the geoms."""
+    label: Callable[[], tuple[str, ...]]
+    """Gives the names."""
     kinds: NDArray[np.int8]
     """Places in `kernels.KINDS`, shape (N,)."""
     centers: Array
@@ -50,20 +58,46 @@ class Solids:
     """Half the sides of the box about each, along its axes, m, shape (N, 3)."""
 
     @classmethod
-    def of_scene(cls, scene: str) -> Self:
-        """All that pictures show of a scene, NAME or NAME:SEED. Raises `InputError`."""
-        spec = MjSpec()
-        add_scene(spec, scene)
-        model = spec.compile()
-        return cls.of_model(model, model.geom_group != HIDDEN_GROUP)
+    def of_scene(cls, scene: str | SceneConfig) -> "Solids":
+        """All that pictures show of a single scene. Raises `InputError`."""
+        return _of_scene(parse_scene(scene))
+
+    @classmethod
+    def of_layout(cls, scene: SceneConfig, seed: int) -> "Solids":
+        """What stands in one layout of a scene, without level ground at z = 0."""
+        if scene.is_seeded and scene.name != "warehouse":
+            _, *parts = parts_of(scene, seed)  # the first is the ground
+            return Solids.of_parts(parts, scene.name)
+        return _made(scene, seed).standing()
+
+    @classmethod
+    def of_parts(cls, parts: Sequence[Parts], scene: str) -> Self:
+        """What stands in a scene from a seed."""
+        if not parts:
+            return cls(tuple, np.zeros(0, np.int8), *map(np.zeros, ((0, 3), (0, 3, 3), (0, 3))))
+        _, kinds, sizes, centers, _, turns = zip(*parts, strict=True)
+        kind = np.concatenate(kinds)
+        turn = np.concatenate(turns)
+        axes = np.zeros((len(turn), 3, 3))
+        axes[:, 0, 0] = axes[:, 1, 1] = settled(np.cos(turn))
+        axes[:, 1, 0] = settled(np.sin(turn))
+        axes[:, 0, 1] = -axes[:, 1, 0]
+        axes[:, 2, 2] = 1.0
+        return cls(
+            label=lambda: tuple(f"{scene}/{name}" for one in parts for name in one.names()),
+            kinds=kind,
+            centers=np.concatenate(centers),
+            axes=axes,
+            halves=_halves(kind, np.concatenate(sizes)),
+        )
 
     @classmethod
     def of_model(cls, model: MjModel, which: ArrayLike | None = None) -> Self:
         """Geoms of a model that stand still: those of `which`, bool, or those that can touch.
 
-        An ellipsoid is the capsule about it, or the box about a flat one. Level ground, and a plane
-        without a size, have no end; another plane is a sheet. Raises `InputError` for meshes and
-        height fields.
+        An ellipsoid is the capsule about it, or the box about a flat one. Level ground, a plane
+        that can touch, and one without a size have no end; another is a sheet. Raises `InputError`
+        for meshes and height fields.
         """
         if which is None:
             which = (model.geom_contype | model.geom_conaffinity) != 0
@@ -84,18 +118,52 @@ class Solids:
                 )
         axes = data.geom_xmat[chosen].reshape(-1, 3, 3)
         axes = np.take_along_axis(axes, np.array(orders, int).reshape(-1, 1, 3), axis=2)
+        axes[:, :, 0] *= np.linalg.det(axes).round()[:, None]  # right-handed again
+        names = tuple(_name(model, geom) for geom in chosen)
         is_plane = model.geom_type[chosen] == mjtGeom.mjGEOM_PLANE
         is_sheet = (is_plane & (half[:, 2] == _SHEET))[:, None]
         return cls(
-            names=tuple(_name(model, geom) for geom in chosen),
+            label=lambda: names,
             kinds=np.array([kernels.KINDS.index(kind) for kind in kinds], np.int8),
             centers=data.geom_xpos[chosen] - np.where(is_sheet, _SHEET * axes[:, :, 2], 0.0),
             axes=axes,
             halves=half,
         )
 
+    @classmethod
+    def none(cls) -> "Solids":
+        """Nothing."""
+        return Solids.of_parts((), "")
+
+    @classmethod
+    def ground(cls) -> "Solids":
+        """Level ground at z = 0."""
+        ground = Draft(SceneConfig(), 0)
+        ground.add("ground", "plane", (1, 1, 1), (0, 0, 0), "")
+        return Solids.of_parts(ground.parts, "plain")
+
     def __len__(self) -> int:
         return len(self.kinds)
+
+    def __add__(self, other: "Solids") -> "Solids":
+        """These and others."""
+        return Solids(lambda: self.names + other.names, *[
+            np.concatenate([getattr(self, one.name), getattr(other, one.name)])
+            for one in fields(self)[1:]
+        ])  # fmt: skip
+
+    def standing(self) -> "Solids":
+        """What reaches above level ground at z = 0."""
+        kept = self.centers[:, 2] + (abs(self.axes[:, 2]) * self.halves).sum(axis=1) > 1e-6
+        return Solids(
+            lambda: tuple(compress(self.names, kept)),
+            *[getattr(self, one.name)[kept] for one in fields(self)[1:]],
+        )
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Of the geoms."""
+        return self.label()
 
     @cached_property
     def table(self) -> Array:
@@ -165,15 +233,29 @@ class Layouts(NamedTuple):
     @classmethod
     def of(cls, *scenes: Solids) -> Self:
         """Of scenes in their order."""
-        most = max(map(len, scenes), default=0)
-        kinds = np.zeros((len(scenes), most), np.int8)
-        tables = np.zeros((len(scenes), kernels.ROWS, most), np.float32)
-        tables[:, 0] = _ENDLESS  # what is left over is out of reach:
-        tables[:, 3] = 1.0  # its center is far along its first axis
-        for scene, kind, table in zip(scenes, kinds, tables, strict=True):
-            kind[: len(scene)] = scene.kinds
-            table[:, : len(scene)] = scene.table
-        return cls(kinds, tables)
+        layouts = cls.empty(len(scenes), max(map(len, scenes), default=0))
+        for number, scene in enumerate(scenes):
+            layouts.put(number, scene)
+        return layouts
+
+    @classmethod
+    def empty(cls, count: int, most: int) -> Self:
+        """Layouts without solids, each with places for `most` of them."""
+        kinds = np.zeros((count, most), np.int8)
+        layouts = cls(kinds, np.zeros((count, kernels.ROWS, most), np.float32))
+        layouts.tables[:] = _NOTHING
+        return layouts
+
+    def put(self, number: int, *scenes: Solids) -> None:
+        """Set a scene, of all that stands in some, for which there is room."""
+        first = 0
+        for one in scenes:
+            last = first + len(one)
+            self.kinds[number, first:last] = one.kinds
+            self.tables[number, :, first:last] = one.table
+            first = last
+        self.kinds[number, first:] = 0
+        self.tables[number, :, first:] = _NOTHING
 
 
 def _name(model: MjModel, geom: int) -> str:
@@ -185,28 +267,64 @@ def _primitive(model: MjModel, geom: int) -> tuple[str, Sequence[float], Sequenc
     a, b, c = model.geom_size[geom].tolist()
     kind = mjtGeom(model.geom_type[geom])
     name = _name(model, geom)
+    touches = model.geom_contype[geom] or model.geom_conaffinity[geom]
     if kind == mjtGeom.mjGEOM_PLANE and (
-        not a * b or (is_ground(model, geom) and min(a, b) > _MARK)
+        touches or not a * b or (is_ground(model, geom) and min(a, b) > _MARK)
     ):
         return "plane", (_ENDLESS, _ENDLESS, 0.0), (0, 1, 2)
     order = [0, 1, 2]
-    shapes: dict[mjtGeom, tuple[str, Sequence[float]]] = {
-        mjtGeom.mjGEOM_SPHERE: ("sphere", (a, a, a)),
-        mjtGeom.mjGEOM_CAPSULE: ("capsule", (a, a, a + b)),
-        mjtGeom.mjGEOM_CYLINDER: ("cylinder", (a, a, b)),
-        mjtGeom.mjGEOM_BOX: ("box", (a, b, c)),
-        mjtGeom.mjGEOM_PLANE: ("box", (a, b, _SHEET)),
-    }
-    if kind == mjtGeom.mjGEOM_ELLIPSOID:
+    shape = kind.name.removeprefix("mjGEOM_").lower()
+    if kind == mjtGeom.mjGEOM_PLANE:
+        shape, c = "box", _SHEET
+    elif kind == mjtGeom.mjGEOM_ELLIPSOID:
         order = np.argsort((a, b, c)).tolist()
-        thin, wide, long = sorted((a, b, c))
-        is_flat = thin < wide / 2
-        shapes[kind] = ("box", (thin, wide, long)) if is_flat else ("capsule", (wide, wide, long))
-    if kind not in shapes:
+        a, b, c = thin, wide, long = sorted((a, b, c))
+        shape = "box"
+        if thin >= wide / 2:
+            shape, a, b = "capsule", wide, long - wide
+    elif shape not in kernels.KINDS:
         expected = ", ".join(kernels.KINDS)
-        got = kind.name.removeprefix("mjGEOM_").lower()
-        raise InputError(f"scene: expected {expected} or ellipsoid, got {name}, a {got}")
-    shape, half = shapes[kind]
+        raise InputError(f"scene: expected {expected} or ellipsoid, got {name}, a {shape}")
+    number = np.array([kernels.KINDS.index(shape)], np.int8)
+    (half,) = _halves(number, np.array([[a, b, c]])).tolist()
     for one in half:
         check(f"scene: half a side of {name}", _SIZE, one)
     return shape, half, order
+
+
+def _halves(kinds: NDArray[np.int8], sizes: Array) -> Array:
+    """Half the sides of boxes about primitives of sizes as MuJoCo has them, m, (n, 3)."""
+    halves = sizes.copy()
+    a, b, c = halves.T  # views
+    is_round = kinds <= _CYLINDER
+    c[:] = np.where(is_round, b + np.where(kinds == _CAPSULE, a, 0.0), c)
+    b[:] = np.where(is_round, a, b)
+    c[:] = np.where(kinds == _SPHERE, a, c)
+    halves[kinds == _PLANE] = _ENDLESS, _ENDLESS, 0.0
+    return halves
+
+
+@lru_cache(maxsize=256)
+def _of_scene(scene: SceneConfig) -> Solids:
+    return _made(scene, scene.seed)
+
+
+def _made(scene: SceneConfig, seed: int) -> Solids:
+    parts = Solids.of_parts(parts_of(scene, seed), scene.name)
+    if scene.name == "warehouse":
+        return _hall() + parts
+    if scene.is_seeded:
+        return parts
+    spec = MjSpec()
+    add_scene(spec, scene)
+    model = spec.compile()
+    return Solids.of_model(model, model.geom_group != HIDDEN_GROUP)
+
+
+@lru_cache
+def _hall() -> Solids:
+    spec = MjSpec.from_file(str(HALL_XML))
+    for geom in spec.geoms:
+        geom.material = ""
+    model = spec.compile()
+    return Solids.of_model(model, np.ones(model.ngeom, bool))

@@ -91,7 +91,7 @@ def test_directions() -> None:
     assert ring[0] == pytest.approx(
         np.array(((1, 0, 0), (0, 1, 0), (-1, 0, 0), (0, -1, 0))), abs=1e-15
     )
-    assert ring[1, 1] == pytest.approx((0.0, 0.75**0.5, -0.5), abs=1e-15)
+    assert ring[1, 1] == pytest.approx((0.0, 0.75**0.5, -0.5), abs=1e-12)
 
 
 def test_the_ground_below_a_sensor() -> None:

@@ -1,6 +1,7 @@
 """Solids of scenes: distances against closed forms and MuJoCo's, grids, and what is refused."""
 
 import math
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -57,8 +58,15 @@ def test_distances(
     assert turned.distance(there) == pytest.approx(expected, rel=1e-9)
 
 
-def test_a_plane_of_a_size_that_is_no_ground_is_a_sheet() -> None:
-    wall = solids("plane", (1.0, 2.0, 1.0), quat=(0.7, 0.0, 0.7, 0.0), pos=(3.0, 0.0, 1.0))
+def test_a_plane_of_a_size_is_a_sheet_unless_it_can_touch() -> None:
+    """MuJoCo lets craft collide with a plane beyond its size."""
+    place: Any = {"size": (1.0, 2.0, 1.0), "quat": (0.7, 0.0, 0.7, 0.0), "pos": (3.0, 0.0, 1.0)}
+    solid = solids("plane", **place)
+    assert solid.distance((5.0, 9.0, 1.0)) == pytest.approx(2.0)
+    assert solid.distance((1.0, 0.0, 1.0)) == pytest.approx(-2.0)
+    spec = mujoco.MjSpec()
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, contype=0, conaffinity=0, **place)
+    wall = Solids.of_model(spec.compile(), [True])
     assert wall.distance((5.0, 0.0, 1.0)) == pytest.approx(2.0)
     assert wall.distance((1.0, 0.0, 1.0)) == pytest.approx(2.0 - 1e-3)
     assert wall.distance((3.0, 6.0, 1.0)) == pytest.approx(4.0, abs=1e-3)

@@ -1,0 +1,183 @@
+"""Which scene surrounds the drones, and which of its layouts each episode has."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Annotated, Any, Literal, NoReturn, Self
+
+from ..models.errors import InputError, shortened
+from ..models.fields import Limits, check_fields, immutable, optional, read_table
+
+SCENES = ("plain", "airport", "forest", "warehouse", "gates")
+SEEDED_SCENES = SCENES[2:]
+"""Those that are drawn from a seed."""
+MAX_SEEDS = 64
+"""Seeds of a scene among which episodes choose."""
+NEW_SEEDS = 1 << 28
+"""How many seeds there are for new layouts, and as many for unseen ones."""
+_DENSE = ("forest",)
+"""Scenes with a density and a size."""
+FOREST_SIZE = (120.0, 120.0)  # m
+TREE_DENSITY = 0.0076  # 1/m²
+MAX_TREES = 2000
+_LEAST_HALF = 12.0  # m: half of a forest at least, around a middle that is clear
+
+
+@immutable
+class SceneConfig:
+    """Ground and obstacles around the drones.
+
+    As a text: NAME, then `:SEED`, `:FIRST-LAST`, `:new` or `:unseen`, then further fields, as in
+    `forest:new,density=0.1,size=34x16,clear=ends`.
+    """
+
+    name: str = "plain"
+    """One of `SCENES`."""
+    seeds: Annotated[
+        tuple[int, ...], Limits(0, 2 * NEW_SEEDS - 1, whole=True, count=0, least=0)
+    ] = ()
+    """Of layouts: of several, each episode draws one. None given: seed 0."""
+    layouts: Literal["given", "new", "unseen"] = "given"
+    """`given`: those of `seeds`. `new`: each episode of each world draws a layout of its own.
+    `unseen`: the same, of layouts that `new` never has, for tests of what was learned."""
+    density: float | None = optional(1e-4, 0.5, "1/m²")
+    """Trees per square metre of a forest."""
+    size: tuple[float, float] | None = optional(10.0, 400.0, "m", count=2)
+    """Of a forest along x and y, m."""
+    clear: Literal["middle", "ends"] = "middle"
+    """Where a forest leaves room for craft: 8 m about the z axis, or 2 m about the middles of both
+    of its ends in x."""
+
+    def __post_init__(self) -> None:
+        check_fields(self, "scene.")
+        seeds = self.seeds
+        first = seeds[0] if seeds else 0
+        if seeds != tuple(range(first, first + len(seeds))):
+            raise InputError(f"scene: expected consecutive seeds, got {shortened(seeds)}")
+        has_layouts = bool(seeds) or self.layouts != "given"
+        both = bool(seeds) and self.layouts != "given"
+        known = self.name in (SEEDED_SCENES if has_layouts else SCENES)
+        if self.name not in SCENES:
+            _refuse(shortened(self.name))
+        if not known or both or len(seeds) > MAX_SEEDS:
+            _refuse(f"{self.name} with seeds {shortened(seeds)} and {self.layouts} layouts")
+        more = {"density": self.density, "size": self.size, "clear": self.clear != "middle"}
+        given = [name for name, value in more.items() if value]
+        if given and self.name not in _DENSE:
+            expected = f"{' and '.join(given)} with the scene {' or '.join(_DENSE)} alone"
+            raise InputError(f"scene: expected {expected}, got {self.name}")
+        if self.name == "forest":
+            self._check_forest()
+
+    def _check_forest(self) -> None:
+        """Raise `InputError` for more trees than can be laid out, or no room for them."""
+        if self.trees > MAX_TREES:
+            raise InputError(f"scene: expected at most {MAX_TREES} trees, got {self.trees}")
+        widest = max(self.size or FOREST_SIZE)
+        if self.clear == "middle" and widest < 2 * _LEAST_HALF:
+            expected = f"a size of {2 * _LEAST_HALF:g} m or more, or clear=ends"
+            raise InputError(f"scene: expected {expected}, got a size of {widest:g} m")
+
+    @property
+    def trees(self) -> int:
+        """How many a forest has."""
+        wide, deep = self.size or FOREST_SIZE
+        return round(wide * deep * (self.density or TREE_DENSITY))
+
+    def __str__(self) -> str:
+        """The text that `parse` reads."""
+        text = self.name
+        if self.layouts != "given":
+            text += f":{self.layouts}"
+        elif self.seeds:
+            first, last = self.seeds[0], self.seeds[-1]
+            text += f":{first}" if first == last else f":{first}-{last}"
+        if self.density:
+            text += f",density={_digits(self.density)}"
+        if self.size:
+            text += f",size={'x'.join(map(_digits, self.size))}"
+        return text + (f",clear={self.clear}" if self.clear != "middle" else "")
+
+    @classmethod
+    def parse(cls, scene: Any) -> Self:
+        """A scene from its text, or from its fields by name. Raises `InputError`."""
+        if isinstance(scene, cls):
+            return scene
+        if isinstance(scene, Mapping):
+            return read_table(cls, scene, "scene")
+        text, *pairs = scene.replace(" ", "").split(",") if isinstance(scene, str) else ("",)
+        pattern = r"(\w+)(?::(?:(new|unseen)|([0-9]{1,9})(?:-([0-9]{1,9}))?))?"
+        found = re.fullmatch(pattern, text)
+        fields = [re.fullmatch(r"(density|size|clear)=([\w.+-]+)", pair) for pair in pairs]
+        once = len({pair.partition("=")[0] for pair in pairs}) == len(pairs)
+        if not found or not all(fields) or not once:
+            _refuse(shortened(scene))
+        name, layouts, first, last = found.groups()
+        seeds = range(int(first), int(last or first) + 1) if first else range(0)
+        if len(seeds) > MAX_SEEDS or (first and not seeds):
+            _refuse(shortened(scene))
+        values: dict[str, Any] = {match[1]: match[2] for match in fields if match}
+        for number, mark in (("density", ""), ("size", "x")):
+            if number in values:
+                values[number] = _numbers(values[number], mark)
+        values |= {"name": name, "layouts": layouts or "given", "seeds": tuple(seeds)}
+        return cls(**values)
+
+    @property
+    def single(self) -> "tuple[SceneConfig, ...]":
+        """The scenes of which each episode has one; none where each has a new one."""
+        if self.layouts != "given":
+            return ()
+        return tuple(replace(self, seeds=(seed,)) for seed in self.seeds) or (self,)
+
+    def with_seed(self, seed: int) -> "SceneConfig":
+        """The scene of one seed."""
+        return replace(self, seeds=(seed,), layouts="given") if self.is_seeded else self
+
+    def unseen(self) -> "SceneConfig":
+        """The same for tests: unseen layouts in place of new ones."""
+        return replace(self, layouts="unseen") if self.layouts == "new" else self
+
+    @property
+    def shown(self) -> "SceneConfig":
+        """What films and views show: the airport in place of bare ground."""
+        return replace(self, name="airport") if self.name == "plain" else self
+
+    @property
+    def is_seeded(self) -> bool:
+        """Whether it is drawn from a seed."""
+        return self.name in SEEDED_SCENES
+
+    @property
+    def seed(self) -> int:
+        """Of a single scene."""
+        return self.seeds[0] if self.seeds else 0
+
+
+def parse_scene(text: Any) -> SceneConfig:
+    """A single scene. Raises `InputError`."""
+    scene = SceneConfig.parse(text)
+    if len(scene.single) != 1:
+        raise InputError(f"scene: expected one, got {scene}")
+    return scene
+
+
+def _digits(number: float) -> str:
+    """All digits of a number."""
+    return repr(number).removesuffix(".0")
+
+
+def _numbers(text: str, mark: str) -> Any:
+    """A number of a text, or several with a mark between; the text where it is none."""
+    try:
+        return tuple(map(float, text.split(mark))) if mark else float(text)
+    except ValueError:
+        return text
+
+
+def _refuse(got: str) -> NoReturn:
+    names = " or ".join(map(repr, SCENES))
+    raise InputError(
+        f"scene: expected {names}, the last three with up to {MAX_SEEDS} seeds or none, as "
+        f"'forest:3', 'forest:0-7', 'forest:new' or 'forest:unseen', got {got}"
+    )
