@@ -18,9 +18,11 @@ import numpy as np
 from ..models.coefficients import Coefficients
 from ..models.fields import immutable
 from ..models.vehicle import Vehicle
+from ..scenes import SceneConfig, Solids
 from ..sim.backends.rigid import RigidWorld
 from ..sim.effects import EffectOptions
 from ..sim.rotations import between
+from ..sim.scenery import Scenery
 from ..sim.state import InitialState
 from ..sim.world import PhysicsError
 from .flight_logs import FlightLog, Floats, Ints
@@ -188,7 +190,8 @@ def _world(vehicle: Vehicle, numbers: Mapping[str, Floats], period: float) -> Ri
     has_rotor_drag = any(numbers[name].any() for name in _ON_ROTORS)
     effects = EffectOptions(body_drag=True, rotor_drag=has_rotor_drag)
     count = len(numbers["rotors.drag"])
-    return RigidWorld(free, count, effects=effects, dtype="float64")
+    nothing = Scenery(SceneConfig(), Solids.none(), count)
+    return RigidWorld(free, count, effects=effects, scenery=nothing, dtype="float64")
 
 
 def differences(predicted: Floats, truth: Floats) -> Floats:

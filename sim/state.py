@@ -12,6 +12,8 @@ import numpy as np
 
 from .compile import TracedArray
 
+FAR = 1000.0
+"""Largest distance to what stands around, m: also where nothing does."""
 _NUMBERS = (float, int)
 
 Array = Any

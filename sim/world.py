@@ -4,7 +4,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib import import_module
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -12,12 +12,16 @@ from .. import models
 from ..models import BACKENDS, MAX_DRONES, Backend
 from ..models.errors import InputError, NotCopied
 from ..models.fields import Choice, Flag, Limits, OrNone, Rule, check, immutable
+from ..scenes import SceneConfig
 from .compile.llvm import trouble
 from .effects import NO_EFFECTS, EffectOptions, Effects
 from .random import RANDOMIZATION, START, Draw, Random
 from .randomize import FIXED, Randomization
 from .snapshots import Arrays, Snapshot, joined, part_of
-from .state import Array, ByName, InitialState, WorldState, chosen
+from .state import FAR, Array, ByName, InitialState, WorldState, chosen
+
+if TYPE_CHECKING:
+    from .scenery import Scenery
 
 _CLASSES = {"mujoco": "MujocoWorld", "rigid": "RigidWorld"}
 """Backends by name: a class in the module of that name in `backends`."""
@@ -31,6 +35,8 @@ MAX_WORLDS = 1 << 16  # Most worlds of a batch
 CONTACT_CHECK = 0.02
 """Longest time between two checks for contact, s. A bounce of the paper's craft at full thrust
 lasts longer, unless its skids dip less than half a millimetre."""
+
+PLAIN = SceneConfig()
 
 _LEVEL = np.array((1.0, 0.0, 0.0, 0.0))
 
@@ -65,6 +71,7 @@ class World(NotCopied):
         randomize: What is drawn for each episode.
         random: The counters of all random numbers; `seed` seeds them.
         parameters: What was drawn for each drone's episode, by name, shape (W, A).
+        scenery: What stands around the drones.
         effects: What acts on drones besides gravity, contact and ideal rotors.
         acting: Mean thrust of each rotor over the last physics step, N, shape (W, A, R).
         wrench: Mean force and torque of the air over it, as of `Effects.step`; None: no air.
@@ -90,10 +97,12 @@ class World(NotCopied):
         shape: tuple[int, ...],
         effects: EffectOptions,
         randomize: Randomization,
+        scenery: "Scenery",
         dtype: str = "float64",
     ) -> None:
         self.vehicle = vehicle
         self.shape = shape
+        self.scenery = scenery
         self.parameters: ByName = {}
         self._options = effects
         self.randomize = randomize
@@ -138,7 +147,8 @@ class World(NotCopied):
 
     def calls(self, substeps: int, *, again: bool = False) -> list[Call]:
         """The calls of `fly` in a step, as of `step`."""
-        at_once = 1 if self._acts else self._check
+        often = self._acts or (self.scenery and not self.is_apart)
+        at_once = 1 if often else self._check
         calls = []
         for first in range(0, substeps, at_once):
             done = min(first + at_once, substeps)
@@ -158,6 +168,7 @@ class World(NotCopied):
         state = self.state
         rows = mask[..., None]
         self.random.begin(mask)
+        self.scenery.begin(self.random, mask)
         begun = self._begun(mask, pose)
         self._move(begun, mask)
         state.thrust = self._typed(begun["thrust"])
@@ -199,6 +210,14 @@ class World(NotCopied):
         """
         raise NotImplementedError
 
+    def clearance(self) -> Array:
+        """Distance between a sphere of `Vehicle.radius` about each body's origin and the nearest
+        solid but level ground, m, (W, A): at most `FAR`, and below 0 where it reaches into one.
+        """
+        if not self.scenery:
+            return self._nothing[..., 0] + FAR
+        return self.scenery.distance(self.state.position) - self.vehicle.radius
+
     def close(self) -> None:
         """Release threads and memory. The state keeps its numbers; nothing else can be called."""
 
@@ -207,7 +226,8 @@ class World(NotCopied):
         state = {name: getattr(self.state, name) for name in self.of_state}
         state |= {name: getattr(self, name) for name in self.arrays}
         parts: dict[str, Arrays] = {"state": state | self.hidden(), "parameters": self.parameters}
-        parts |= {"random": self.random.snapshot(), "effects": self.effects.snapshot()}
+        kept = {"random": self.random, "effects": self.effects, "scenery": self.scenery}
+        parts |= {name: one.snapshot() for name, one in kept.items()}
         return {name: np.copy(x) for name, x in joined(parts).items() if x is not None}
 
     def restore(self, arrays: Arrays) -> None:
@@ -215,6 +235,7 @@ class World(NotCopied):
         arrays = {name: array.copy() for name, array in arrays.items()}
         self.random.restore(part_of(arrays, "random"))
         self.effects.restore(part_of(arrays, "effects"))
+        self.scenery.restore(part_of(arrays, "scenery"))
         self.parameters = part_of(arrays, "parameters")
         self.effects.take(self.parameters)
         self._vary(self.parameters)
@@ -333,9 +354,10 @@ def make_world(
     drones: int = 1,
     effects: EffectOptions = NO_EFFECTS,
     randomize: Randomization = FIXED,
+    scene: SceneConfig = PLAIN,
     **settings: Any,
 ) -> World:
-    """W worlds of `drones` drones each.
+    """W worlds of `drones` drones each, in layouts of a scene.
 
     Settings are `num_threads` of `mujoco`, `dtype` of `rigid`, and `compiled` of both: false for
     NumPy, None for compiled code where llvmlite can make it. Raises `InputError`.
@@ -352,9 +374,14 @@ def make_world(
     if backend == "rigid":
         settings["compiled"] = wanted is not False and not reason
     module = import_module(f".backends.{backend}", __package__)
-    world: World = getattr(module, _CLASSES[backend])(
-        vehicle, num_worlds, drones=drones, effects=effects, randomize=randomize, **settings
-    )
+    from .scenery import Scenery, own_solids  # they import MuJoCo
+
+    cls = getattr(module, _CLASSES[backend])
+    scenery = Scenery(scene, own_solids(vehicle, felt=not cls.is_apart), num_worlds)
+    world: World = cls(
+        vehicle, num_worlds, drones=drones, effects=effects, randomize=randomize,
+        scenery=scenery, **settings,
+    )  # fmt: skip
     return world
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from ...models.matrices import settled
 from ...models.mjcf import level_data
-from ...models.vehicle import Vehicle, craft_geoms
+from ...models.vehicle import Vehicle, can_touch, craft_geoms
 from ..rotations import Parts
 from ..state import Array, clip, some
 from .body import added, forth
@@ -79,14 +79,6 @@ class Hull:
                 depth = depth + np.sqrt(added(0.0, *((size * size, a, a) for size, a in pairs)))
             depths.append(depth)
         return reduce(np.maximum, depths)
-
-
-def can_touch(model: mujoco.MjModel, geom: int, others: np.ndarray) -> bool:
-    """Whether a geom may collide with one of others, bool, (geoms,)."""
-    types = model.geom_contype
-    affinities = model.geom_conaffinity
-    pairs = (types[geom] & affinities[others]) | (affinities[geom] & types[others])
-    return bool(pairs.any())
 
 
 def _shapes(model: mujoco.MjModel) -> list[tuple[Array, ...]]:

@@ -14,6 +14,7 @@ from mujoco.batch import Batch, SimulationError
 
 from ...models.errors import InputError
 from ...models.fleet import members_of
+from ...models.mjcf import add_ground
 from ...models.swarm import CONTACTS, GROUNDED, contact_columns, swarm_model
 from ...models.vehicle import (
     SURROUNDINGS,
@@ -23,9 +24,12 @@ from ...models.vehicle import (
     payload_body,
     payload_radius,
 )
+from ...scenes.geoms import NAME, add_solids, geoms_of
+from ...scenes.solids import Solids
 from ..effects import EffectOptions
 from ..randomize import CENTER, Randomization
 from ..rotations import body_z
+from ..scenery import Scenery
 from ..snapshots import Arrays
 from ..state import Array, ByName, InitialState, WorldState, found, stack, total
 from ..world import Call, PhysicsError, World
@@ -56,16 +60,21 @@ class MujocoWorld(World):
         drones: int,
         effects: EffectOptions,
         randomize: Randomization,
+        scenery: Scenery,
         num_threads: int = 0,
     ) -> None:
         shape = (num_worlds, drones)
-        super().__init__(vehicle, shape, effects, randomize)
+        super().__init__(vehicle, shape, effects, randomize, scenery)
         threads = 1 if num_worlds == 1 else num_threads
         model = self._flown_model(drones)
+        if scenery.varies:  # the compiled trees of bounding boxes do not follow the geoms
+            model = copy.copy(model)
+            model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
         if self.effects.on_rotors:  # commands are within their limits; thrusts need not be
             model = copy.copy(model)
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
         self._batch = batch = Batch(model, num_worlds, threads)
+        self._laid = np.full(num_worlds, -1)  # seeds of the layouts that the geoms have
         self._cable = self._options.cable if self._options.payload else None
         self._varied = WorldParameters(batch.model, self._drawn)
         self._owner = None if threads == 1 else os.getpid()
@@ -100,12 +109,36 @@ class MujocoWorld(World):
         payload = self._options.payload
         cable = self._options.cable
         movable = bool(set(self._drawn) & set(CENTER))
-        if drones > 1:
-            crafts = members_of(vehicle, drones)
-            return swarm_model(crafts, movable=movable, payload=payload * drones, cable=cable)
-        if movable or payload:
-            return vehicle.movable(payload, cable)
-        return vehicle.model
+        model = vehicle.model
+        if drones == 1 and (movable or payload):
+            model = vehicle.movable(payload, cable)
+        if drones == 1 and not self.scenery.most:
+            return model
+        crafts = members_of(vehicle, drones)
+        surround = self._surround if self.scenery.most else add_ground
+        return swarm_model(
+            crafts, movable=movable, payload=payload * drones, cable=cable, surround=surround
+        )
+
+    def _surround(self, spec: mujoco.MjSpec) -> None:
+        """Add geoms to a spec for what stands in its scene, of which the first layout is known."""
+        scenery = self.scenery
+        fixed = Solids.none() if scenery.varies else scenery.solids(int(scenery.seeds[0]))
+        add_solids(spec, fixed, scenery.most)
+
+    def _lay(self, ids: np.ndarray) -> None:
+        """Give geoms the layouts of some worlds."""
+        if not self.scenery.varies:
+            return
+        model = self._batch.model
+        first = model.geom(f"{NAME}0").id
+        slots = slice(first, first + self.scenery.most)
+        seeds = self.scenery.seeds
+        for world in ids[(self._laid[ids] != seeds[ids]) & (seeds[ids] >= 0)].tolist():
+            solids = self.scenery.solids(int(seeds[world]))
+            for field, rows in geoms_of(solids, self.scenery.most).items():
+                self._batch.expand(field)[world, slots] = rows
+            self._laid[world] = seeds[world]
 
     def take(self) -> None:
         """Set the state's arrays that the physics changes."""
@@ -154,6 +187,7 @@ class MujocoWorld(World):
         if self._cable is not None:
             self._batch.bind("qpos")[ids, -7:-4] = state.payload[ids, 0]
             self._batch.bind("qvel")[ids, -6:-3] = state.payload_velocity[ids, 0]
+        self._lay(ids)
         self._vary_models(ids)
         self._ctrl[ids] = np.reshape(self.acting, self._ctrl.shape)[ids] / self._newtons
         # To wake the threads takes longer than a few worlds.
@@ -201,7 +235,9 @@ class MujocoWorld(World):
     def _put(self, arrays: Arrays) -> None:
         if "integration" in arrays:
             self._check_process()
-            self._vary_models(np.arange(len(self._ctrl)))
+            everybody = np.arange(len(self._ctrl))
+            self._lay(everybody)
+            self._vary_models(everybody)
             self._batch.state[...] = arrays["integration"]
             self._warnings.fill(0)
             for name in ("touching", "colliding"):

@@ -10,9 +10,11 @@ import mujoco
 import numpy as np
 
 from ...models.errors import InputError
-from ...models.vehicle import Vehicle, craft_bodies, craft_geoms
+from ...models.vehicle import Vehicle, craft_bodies
 from ..effects import NO_EFFECTS, EffectOptions
 from ..randomize import FIXED, Randomization
+from ..rotations import body_z
+from ..scenery import Scenery
 from ..snapshots import Arrays
 from ..state import (
     Array,
@@ -27,9 +29,11 @@ from ..state import (
 )
 from ..world import Call, PhysicsError, World
 from .body import RigidBody, mapped, motion
-from .hull import Hull, can_touch
+from .hull import Hull
 from .kernel import Kernel
 
+_NEAR = 1e-3  # m: nearer solids are measured
+_ROUNDED = 1.001  # of a way: more than what rounding adds up to
 _LEVEL = np.array((0.0, 0.0, 0.0, 1.0, *[0.0] * 9))  # motion of a craft at rest
 
 
@@ -38,7 +42,9 @@ class RigidWorld(World):
 
     A craft that reaches the ground is `touching`, and flies on through it: a task ends an episode
     there. Two crafts touch where their spheres overlap, of `Vehicle.radius` about their origins:
-    earlier than their geoms would. A step makes new arrays for the state.
+    earlier than their geoms would; so does a craft and what stands in a scene. That is looked for
+    after each physics step, where a craft may have come near to it since it was last measured. A
+    step makes new arrays for the state.
 
     Args:
         dtype: `float32` or `float64`.
@@ -46,10 +52,12 @@ class RigidWorld(World):
 
     Attributes:
         motion: Position, quaternion, velocity and body rates, (W, A, 13).
+        slack: Least way between a craft's sphere and what stands in its scene, m, (W, A); None:
+            nothing does.
     """
 
     of_state = ("command", "thrust", "touching", "colliding")
-    arrays = (*World.arrays, "bad", "motion")
+    arrays = (*World.arrays, "bad", "motion", "slack")
 
     def __init__(
         self,
@@ -59,6 +67,7 @@ class RigidWorld(World):
         drones: int = 1,
         effects: EffectOptions = NO_EFFECTS,
         randomize: Randomization = FIXED,
+        scenery: Scenery,
         dtype: str = "float32",
         compiled: bool = True,
     ) -> None:
@@ -68,8 +77,7 @@ class RigidWorld(World):
                 f"with mujoco, got {effects.payload:g} kg"
             )
         shape = (num_worlds, drones)
-        super().__init__(vehicle, shape, effects, randomize, dtype)
-        _check_obstacles(vehicle)
+        super().__init__(vehicle, shape, effects, randomize, scenery, dtype)
         _check_forces(vehicle)
         if "inertia" in self._drawn and len(craft_bodies(vehicle.model)) > 1:
             raise InputError(
@@ -80,6 +88,7 @@ class RigidWorld(World):
         self._hull = Hull(vehicle)
         thrust = self.acting
         self._nobody = nobody = self.bad
+        self.slack: Array = np.zeros(shape, self.dtype) if scenery else None
         moved = dict.fromkeys(("position", "quaternion", "velocity", "body_rates"))
         self.state = WorldState(**moved, command=thrust, thrust=thrust, touching=nobody)
         if drones > 1:
@@ -98,6 +107,8 @@ class RigidWorld(World):
 
     def place(self, mask: Array) -> None:
         """As `World.place`."""
+        if self.slack is not None:
+            self.slack = chosen(mask, np.zeros_like(self.slack), self.slack)
         self._look(mask, looks=True, clears=True)
 
     def fly(self, call: Call, mask: Array | None) -> None:
@@ -105,6 +116,9 @@ class RigidWorld(World):
         varying: list[Array] = []
         mapped(self._body.varying, varying.append)
         new = self._advance(call.steps, self.motion, self.acting, self.wrench, *varying)
+        if self.slack is not None:
+            way = _ROUNDED * length(new[..., :3] - self.motion[..., :3])
+            self.slack = chosen(mask, self._typed(self.slack - way), self.slack)
         self._show(chosen(mask, new, self.motion))
         self._look(mask, looks=call.looks, clears=call.clears)
         if not call.looks:
@@ -135,11 +149,15 @@ class RigidWorld(World):
         return stack(linear)
 
     def below(self) -> Array:
-        """As `World.below`: the ground is the only surface."""
+        """As `World.below`."""
         height = self.state.position[..., 2] - self._hull.ground
         cosine = self.state.tilt_cosine
         seen = (cosine > 0) & (height >= 0)
-        return np.where(seen, height / np.where(seen, cosine, 1.0), np.inf)
+        ground = np.where(seen, height / np.where(seen, cosine, 1.0), np.inf)
+        if not self.scenery:
+            return ground
+        down = -body_z(self.state.quaternion)
+        return np.minimum(ground, self.scenery.along(self.state.position, down))
 
     def _vary(self, parameters: Mapping[str, Array], inertia: Array = None) -> None:
         """As `RigidBody.vary`, with numbers of this dtype."""
@@ -167,6 +185,17 @@ class RigidWorld(World):
         state.velocity = now[..., 7:10]
         state.body_rates = now[..., 10:]
 
+    def _touches_solids(self, mask: Array | None) -> Array:
+        """Which crafts of a mask touch what stands in their scene, bool, (W, A).
+
+        The distance is computed where the last one, less the way since then, leaves no room.
+        """
+        due = self.slack < _NEAR
+        due = due if mask is None else due & mask
+        slack = self.scenery.distance(self.state.position, due) - self.vehicle.radius
+        self.slack = np.where(due, self._typed(slack), self.slack)
+        return due & (self.slack < 0)
+
     def _contacts(self) -> list[Array]:
         """Which crafts touch anything and, of several, which another, bool, (W, A)."""
         state = self.state
@@ -179,6 +208,8 @@ class RigidWorld(World):
     def _look(self, mask: Array | None, *, looks: bool, clears: bool) -> None:
         """Set which crafts touch, those of a mask: with what was before, unless it `clears`."""
         touched = self._contacts() if looks else [self._nobody, self._nobody]
+        if self.slack is not None:
+            touched[0] = touched[0] | self._touches_solids(mask)
         for name, new in zip(("touching", "colliding"), touched, strict=False):
             old = getattr(self.state, name)
             if old is not None:
@@ -196,22 +227,10 @@ def _parts(wrench: Array) -> Array:
     return None if wrench is None else parts_of(wrench)
 
 
-def _check_obstacles(vehicle: Vehicle) -> None:
-    """Refuse obstacles of the vehicle's file, through which drones would fly."""
-    model = vehicle.model
-    ours = craft_geoms(model)
-    for i in np.flatnonzero(~ours & (model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)).tolist():
-        if can_touch(model, i, ours):
-            name = model.geom(i).name or f"geom {i}"
-            raise InputError(
-                f"vehicle: expected no obstacles with the backend rigid, which has none (the "
-                f"backend mujoco has), got {name} in {vehicle.name}"
-            )
-
-
 def _check_forces(vehicle: Vehicle) -> None:
     """Refuse a vehicle that MuJoCo would move differently, by its joint or its integrator."""
-    model = vehicle.model
+    model = copy.copy(vehicle.model)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     data = mujoco.MjData(model)
     data.qpos[2:7] = (vehicle.rest_height + 1e3, 0.8, 0.36, -0.48, 0.0)
     data.qvel[:] = (1.0, -2.0, 0.5, 0.4, 0.7, -0.6)

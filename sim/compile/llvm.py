@@ -197,6 +197,8 @@ class _Printer:
             return self._gather(value)
         if operation == "call":
             return self._result(*value.inputs)
+        if operation == "outside":
+            return self._called(*value.inputs)
         inputs = [self._names[one.number] for one in value.inputs]
         before = value.inputs[0].dtype
         if operation == "cast":
@@ -210,6 +212,42 @@ class _Printer:
             to=self._suffix(_KINDS[value.dtype]),
         )
         return self._new(instruction)
+
+    def _called(self, address: int, mask: Value, *inputs: Value) -> str:
+        """What a function of C gives for each lane of a mask, and 0 elsewhere."""
+        self._count += 1
+        n = self._count
+        lanes = self._lanes("float")
+        flags = f"{self._lanes('i1')} {self._names[mask.number]}"
+        some = self._new(f"call i1 @llvm.vector.reduce.or.{self._suffix('i1')}({flags})")
+        self._lines += [
+            f"  br label %before.{n}",
+            f"before.{n}:",
+            f"  br i1 {some}, label %lane.{n}, label %done.{n}",
+            f"lane.{n}:",
+            f"  %l.{n} = phi i64 [0, %before.{n}], [%n.{n}, %next.{n}]",
+            f"  %out.{n} = phi {lanes} [zeroinitializer, %before.{n}], [%new.{n}, %next.{n}]",
+            f"  %flag.{n} = extractelement {flags}, i64 %l.{n}",
+            f"  br i1 %flag.{n}, label %call.{n}, label %next.{n}",
+            f"call.{n}:",
+        ]
+        given = []
+        for one in inputs:
+            vector = f"{self._type(one.dtype)} {self._names[one.number]}"
+            given.append(f"{_KINDS[one.dtype]} {self._new(f'extractelement {vector}, i64 %l.{n}')}")
+        result = self._new(f"call float inttoptr (i64 {address} to ptr)({', '.join(given)})")
+        put = self._new(f"insertelement {lanes} %out.{n}, float {result}, i64 %l.{n}")
+        self._lines += [
+            f"  br label %next.{n}",
+            f"next.{n}:",
+            f"  %new.{n} = phi {lanes} [%out.{n}, %lane.{n}], [{put}, %call.{n}]",
+            f"  %n.{n} = add i64 %l.{n}, 1",
+            f"  %more.{n} = icmp slt i64 %n.{n}, {self._width}",
+            f"  br i1 %more.{n}, label %lane.{n}, label %done.{n}",
+            f"done.{n}:",
+        ]
+        ends = f"[zeroinitializer, %before.{n}], [%new.{n}, %next.{n}]"
+        return self._new(f"phi {lanes} {ends}")
 
     # ---- functions of the programs
 

@@ -25,7 +25,8 @@ class Value:
     `load` reads a component of an array: its inputs are the array's name and the component's
     number. `constant` has the bytes of a number. `gather` reads a table of the program: it has the
     table's number, the component's, and a value, the row. `call` has a `Function`, the number of
-    its result, and values; `parameter` is one of a function, by its number. All others have values.
+    its result, and values; `parameter` is one of a function, by its number. `outside` has the
+    address of a function of C, a mask, and values. All others have values.
     """
 
     operation: str

@@ -264,6 +264,19 @@ def once(vectors: int = 0) -> Callable[[Call], Call]:
     return wrap
 
 
+def call_outside(address: int, mask: Traced, *arguments: Traced) -> TracedArray:
+    """float32 of a function of C at an address, for each drone of a mask; 0 for the others."""
+    given = [mask, *arguments]
+    program = mask.program
+    values = np.broadcast_arrays(*[one.values for one in given])
+    single = np.dtype(np.float32)
+
+    def called(*inputs: Value) -> object:
+        return program.value("outside", single, address, *inputs)
+
+    return TracedArray(program, np.frompyfunc(called, len(values), 1)(*values), single)
+
+
 def read(program: Program, name: str, dtype: DType, shape: tuple[int, ...]) -> TracedArray:
     """The variables of an array of a program, of such a shape for one world."""
     values: Any = [program.value("load", dtype, name, number) for number in range(prod(shape))]

@@ -142,21 +142,8 @@ class Sensor(Source):
                     "file, got none"
                 )
             values[name] = value
-        rate = values["rate"]
-        every = 1.0 if rate is None else 1 / (rate * period)
-        values["every"] = round(every)
-        if values["every"] < 1 or not _is_whole(every):
-            raise InputError(
-                f"sensors.{cls.name}.rate: expected the control rate of {1 / period:g} Hz over a "
-                f"whole number, got {rate:g} Hz"
-            )
-        delay = values["delay"]
-        values["lag"] = round(delay / period)
-        if values["lag"] > MAX_DELAY or not _is_whole(delay / period):
-            raise InputError(
-                f"sensors.{cls.name}.delay: expected a whole number of control periods of "
-                f"{period:g} s, at most {MAX_DELAY}, got {delay:g} s"
-            )
+        where = f"sensors.{cls.name}"
+        values["every"], values["lag"] = sampling(where, values["rate"], values["delay"], period)
         return values
 
     @property
@@ -202,6 +189,23 @@ class Sensor(Source):
     def _read(self, normal: Array) -> Array:
         """A reading within the sensor's bounds."""
         return clip(self.measure(normal[..., :-1]), self._low, self._high)
+
+
+def sampling(where: str, rate: float | None, delay: float, period: float) -> tuple[int, int]:
+    """Control steps between readings, and of their delay. Raises `InputError`."""
+    every = 1.0 if rate is None else 1 / (rate * period)
+    if round(every) < 1 or not _is_whole(every):
+        raise InputError(
+            f"{where}.rate: expected the control rate of {1 / period:g} Hz over a "
+            f"whole number, got {rate:g} Hz"
+        )
+    lag = round(delay / period)
+    if lag > MAX_DELAY or not _is_whole(delay / period):
+        raise InputError(
+            f"{where}.delay: expected a whole number of control periods of "
+            f"{period:g} s, at most {MAX_DELAY}, got {delay:g} s"
+        )
+    return round(every), lag
 
 
 def _is_whole(steps: float) -> bool:

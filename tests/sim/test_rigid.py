@@ -359,16 +359,23 @@ def test_what_mujoco_moves_in_another_way_is_refused(tmp_path: Path) -> None:
             racer(options)
 
 
-def test_obstacles_of_a_file_are_refused_by_name(tmp_path: Path) -> None:
+def test_obstacles_of_a_file_are_solid_or_refused_by_name(tmp_path: Path) -> None:
     file = tmp_path / "wood.xml"
     text = RACER.read_text()
     tree = '<geom name="tree" type="cylinder" size="0.1 2" pos="1 0 2"/></worldbody>'
     wood = text.replace("</worldbody>", tree, 1)
     file.write_text(wood)
     vehicle = Vehicle.load(file)
-    make_world(vehicle, 1)
-    with pytest.raises(InputError, match=r"^vehicle: expected no obstacles .* got tree in racer"):
-        arrays(vehicle)
+    for world in (make_world(vehicle, 1), arrays(vehicle, 1)):
+        begin(world, position=(0.5, 0.0, 2.0))
+        assert not world.state.touching.any()
+        begin(world, position=(0.9, 0.0, 2.0))
+        assert world.state.touching.all()
+    rough = 'type="hfield" hfield="hill" pos="9 0 0"/></worldbody>'
+    hill = '<asset><hfield name="hill" nrow="2" ncol="2" size="1 1 1 1"/></asset><worldbody>'
+    file.write_text(wood.replace("<worldbody>", hill, 1).replace(tree[6:], 'name="rock" ' + rough))
+    with pytest.raises(InputError, match=r"^scene: expected sphere, .* got rock, a hfield"):
+        arrays(Vehicle.load(file))
     seen = tree.replace("/>", ' contype="0" conaffinity="0"/>')  # which nothing touches
     wood = text.replace("</worldbody>", seen, 1)
     file.write_text(wood)

@@ -1,0 +1,184 @@
+"""What stands around drones: the layout of each world, and distances to its solids."""
+
+import numpy as np
+from mujoco import mjtGeom
+from numpy.typing import NDArray
+
+from ..models.errors import InputError
+from ..models.vehicle import Vehicle, can_touch, craft_geoms
+from ..scenes import SceneConfig, kernels
+from ..scenes.config import NEW_SEEDS
+from ..scenes.generators import most_parts
+from ..scenes.solids import Layouts, Solids
+from .compile import Untraceable
+from .compile.tracer import call_outside
+from .random import SCENES, Draw, Random
+from .snapshots import Arrays, Kept, Snapshot
+from .state import FAR, Array, clip, is_traced, looked_up, parts_of
+
+_FURTHEST = 1e5  # m: of a craft that is lost
+
+
+class Scenery(Kept):
+    """Layouts of W worlds. The first solid of each is level ground, which rays see, and no distance
+    knows: it is physics of its own.
+
+    Attributes:
+        scene: What is laid out.
+        seeds: Of each world's layout, int64, shape (W,).
+        layouts: Solids of all layouts in use.
+        which: Number of each world's layout, shape (W,).
+        rows: Of each world's layout how many primitives it has, and the addresses of their kinds
+            and of their table, uint64, shape (W, 3); variables in code that is being compiled.
+    """
+
+    arrays = ("seeds",)
+
+    def __init__(self, scene: SceneConfig, own: Solids, worlds: int) -> None:
+        """`own`: what stands in every layout, of the vehicle's file."""
+        self.scene = scene
+        self._given = np.array([one.seed for one in scene.single], np.int64)
+        self.seeds: Array = np.full(worlds, self._given[0] if self._given.size else -1, np.int64)
+        self.which: Array = np.zeros(worlds, np.int64)
+        self._always = Solids.ground() + own
+        laid = [self._always + self.solids(seed) for seed in self._given.tolist()]
+        self.layouts = Layouts.of(*laid)
+        self.rows: Array
+        self._point()
+
+    def __bool__(self) -> bool:
+        """Whether anything may stand there."""
+        return not self._given.size or self.layouts.kinds.shape[1] > 1
+
+    @property
+    def most(self) -> int:
+        """Most solids of a layout, as `solids` has them."""
+        if not self._given.size:
+            return most_parts(self.scene)
+        most: int = self.layouts.kinds.shape[1]
+        return most - len(self._always)
+
+    def solids(self, seed: int) -> Solids:
+        """What stands in a layout, without ground and `own`."""
+        return Solids.of_layout(self.scene, seed)
+
+    @property
+    def varies(self) -> bool:
+        """Whether episodes differ in their layouts."""
+        return len(self._given) != 1
+
+    def snapshot(self) -> Snapshot:
+        """Copies by name: nothing where all have the same layout."""
+        return super().snapshot() if self.varies else {}
+
+    def begin(self, random: Random, mask: Array, ahead: int = 0) -> None:
+        """Draw the layouts of the worlds of a mask, bool, (W, A), as of `Draw`."""
+        if not self.varies:
+            return
+        share = Draw(random, SCENES, mask, ahead).uniform(0.0, 1.0)[:, 0]
+        if self._given.size:
+            drawn = looked_up(self._given, np.floor(share * len(self._given)))
+        else:
+            number = np.floor(share * NEW_SEEDS).astype(np.int64)
+            drawn = 2 * number + (self.scene.layouts == "unseen")
+        self.take(np.where(mask[:, 0], drawn, self.seeds))
+
+    def take(self, seeds: Array) -> None:
+        """Give worlds the layouts of such seeds, shape (W,)."""
+        old, self.seeds = self.seeds, seeds
+        if is_traced(seeds):
+            return
+        if self._given.size:
+            self.which = np.searchsorted(self._given, seeds)
+        else:
+            self._lay(np.flatnonzero((seeds != old) & (seeds >= 0)))
+        self._point()
+
+    def restore(self, arrays: Arrays) -> None:
+        """Put a snapshot back."""
+        if self.varies:
+            self.take(arrays["seeds"].copy())
+
+    def distance(self, position: Array, due: Array = None) -> Array:
+        """From positions, (W, A, 3), to the nearest solid, m, float32, (W, A): at most `FAR`.
+
+        Only where `due`, bool, (W, A), is true, None being all; elsewhere 0.
+        """
+        code = kernels.compiled()
+        near = _single(position)
+        if is_traced(near):
+            mask = near[..., 0] == near[..., 0] if due is None else due
+            return self._called("nearest", mask, near)
+        found = np.zeros(near.shape[:-1], np.float32)
+        mask = np.ones(found.shape, bool) if due is None else due
+        run = code.gaps if code else kernels.gaps_by_numpy
+        run(*self.layouts, self.which, np.ascontiguousarray(near), mask, found)
+        return clip(found, np.float32(-FAR), np.float32(FAR))
+
+    def along(self, position: Array, direction: Array) -> Array:
+        """From positions along unit vectors, (W, A, 3), to the first solid, as `distance`."""
+        near = _single(position)
+        ray = _single(direction)
+        if is_traced(near):
+            return self._called("first", near[..., 0] == near[..., 0], near, ray)
+        kinds, tables = self.layouts
+        found = np.empty(near.shape[:-1], np.float32)
+        for world, drone in np.ndindex(found.shape):
+            layout = self.which[world]
+            found[world, drone] = kernels.first_by_numpy(
+                kinds[layout], tables[layout], near[world, drone], ray[world, drone]
+            )
+        return np.minimum(found, np.float32(FAR))
+
+    def _called(self, function: str, mask: Array, *vectors: Array) -> Array:
+        """What compiled code gives for each drone of a mask, (W, A)."""
+        code = kernels.compiled()
+        if code is None:
+            raise Untraceable("a scene needs Numba, which the extra `fast` brings")
+        layout = [row[:, None] for row in parts_of(self.rows)]
+        numbers = [number for vector in vectors for number in parts_of(vector)]
+        return clip(call_outside(getattr(code, function), mask, *layout, *numbers), -FAR, FAR)
+
+    def _lay(self, worlds: NDArray[np.int64]) -> None:
+        """Lay out what these worlds have: each has a row of its own."""
+        count = len(self.seeds)
+        made = {world: self.solids(int(self.seeds[world])) for world in worlds.tolist()}
+        kinds, tables = self.layouts
+        most = max([kinds.shape[1], *[len(self._always) + len(one) for one in made.values()]])
+        if kinds.shape != (count, most):
+            old = self.layouts
+            kinds, tables = self.layouts = Layouts.empty(count, most)
+            kinds[: len(old.kinds), : old.kinds.shape[1]] = old.kinds
+            tables[: len(old.kinds), :, : old.kinds.shape[1]] = old.tables
+            self.which = np.arange(count)
+        for world, solids in made.items():
+            self.layouts.put(world, self._always, solids)
+
+    def _point(self) -> None:
+        """Set `rows`."""
+        self.rows = np.empty((len(self.seeds), 3), np.uint64)
+        self.rows[:, 0] = self.layouts.kinds.shape[1]
+        arrays: tuple[Array, Array] = self.layouts
+        for column, array in enumerate(arrays, 1):
+            stride = array[:1].nbytes
+            self.rows[:, column] = array.ctypes.data + stride * self.which
+
+
+def _single(vectors: Array) -> Array:
+    return clip(vectors, -_FURTHEST, _FURTHEST).astype(np.float32)
+
+
+def own_solids(vehicle: Vehicle, *, felt: bool) -> Solids:
+    """Obstacles of a vehicle's file. Those that touch is computed from, `felt`, have to be
+    primitives: others raise `InputError`. Otherwise meshes and height fields are left out.
+    """
+    model = vehicle.model
+    ours = craft_geoms(model)
+    which = np.array([not ours[i] and can_touch(model, i, ours) for i in range(model.ngeom)])
+    moving = which & (model.body_weldid[model.geom_bodyid] != 0)
+    if felt and moving.any():
+        got = model.geom(int(moving.argmax())).name or "one that is moved"
+        raise InputError(f"vehicle: expected obstacles that stand still on rigid, got {got}")
+    if not felt:
+        which &= ~np.isin(model.geom_type, (mjtGeom.mjGEOM_MESH, mjtGeom.mjGEOM_HFIELD))
+    return Solids.of_model(model, which).standing()

@@ -1,0 +1,242 @@
+"""Sensors with many rays: depth cameras, lidars and time-of-flight arrays.
+
+They see the solids of a layout. `sights.toml` has their models.
+"""
+
+import math
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+from zlib import crc32
+
+import numpy as np
+
+from ...models.errors import InputError
+from ...models.fields import Choice, Limits, Rule, check, check_names
+from ...models.files import read_toml
+from ...scenes import Rays
+from ...scenes import returns as kernels
+from ...scenes.rays import MAX_PLACE, MAX_REACH
+from ...scenes.returns import Errors
+from ..random import words_of
+from ..rotations import to_world
+from ..scenery import Scenery
+from ..snapshots import Kept
+from ..state import Array, clip
+from .base import SAMPLING, Values, sampling
+
+MODELS: Mapping[str, Mapping[str, Values]] = read_toml(
+    Path(__file__).with_name("sights.toml"), "sights"
+)
+"""Settings by kind and model."""
+_COUNT = Limits(1, 1024, "rays", whole=True)
+_DEGREES = Limits(-180.0, 180.0, "degrees")
+_METRES = Limits(1e-3, 1e3, "m")
+_PART = Limits(0.0, 1.0)
+_RULES: Mapping[str, Rule] = {
+    "rows": _COUNT,
+    "columns": _COUNT,
+    "fov": Limits(1.0, 170.0, "degrees"),
+    "low": Limits(-90.0, 90.0, "degrees"),
+    "high": Limits(-90.0, 90.0, "degrees"),
+    "near": _METRES,
+    "reach": _METRES,
+    "noise": Limits(0.0, 10.0, "m"),
+    "share": _PART,
+    "growth": Limits(0.0, 1.0, "1/m"),
+    "dropout": _PART,
+    "edge_dropout": _PART,
+    "position": Limits(-10.0, 10.0, "m", count=3),
+    "pitch": _DEGREES,
+    "yaw": _DEGREES,
+    "rate": SAMPLING["rate"].limits,
+    "delay": SAMPLING["delay"].limits,
+}
+_DEFAULTS = {
+    "noise": 0.0, "share": 0.0, "growth": 0.0, "dropout": 0.0, "edge_dropout": 0.0,
+    "position": (0.0, 0.0, 0.0), "pitch": 0.0, "yaw": 0.0, "rate": None, "delay": 0.0,
+}  # fmt: skip
+_KINDS = {"depth": ("rows", "columns", "fov"), "lidar": ("rows", "columns", "low", "high")}
+_KINDS["tof"] = _KINDS["depth"]
+KINDS = tuple(_KINDS)
+"""In this order they are observed."""
+
+
+def checked(kind: str, given: Values) -> dict[str, Any]:
+    """Settings of a sensor as plain values. Raises `InputError`."""
+    where = f"sensors.{kind}"
+    models = tuple(MODELS[kind])
+    model = check(f"{where}.model", Choice(models), given.get("model", models[0]))
+    pattern = () if "directions" in MODELS[kind][model] else _KINDS[kind]
+    names = [name for name in _RULES if name in (*pattern, *_DEFAULTS, "near", "reach")]
+    check_names(given, ["model", *names], where)
+    values = {"model": model}
+    for name in given:
+        if name != "model":
+            value = check(f"{where}.{name}", _RULES[name], given[name])
+            values[name] = list(value) if isinstance(value, tuple) else value
+    return values
+
+
+class View(NamedTuple):
+    """What sensors look from: arrays of W worlds of A drones."""
+
+    position: Array
+    """World frame, m, (W, A, 3)."""
+    quaternion: Array
+    """From body to world frame, (W, A, 4)."""
+    steps: Array
+    """Control steps of each episode, (W, A)."""
+    keys: Array
+    """Of random numbers, as `Random` has them."""
+    episode: Array
+    late: Array
+    """Control steps by which an observation is late besides, (W, A)."""
+
+
+class Sight(Kept):
+    """A sensor with rays on each drone: distances, m, float32, (W, A, rows, columns).
+
+    `depth` and `tof` are measured along the sensor's axis, `lidar` along each ray. Where nothing
+    returns they read `reach`.
+
+    Attributes:
+        name: `depth`, `lidar` or `tof`.
+        value: What is observed, (W, A, rows, columns); None before an episode.
+        rays: In the body frame.
+        errors: Of its readings.
+    """
+
+    arrays = ("value", "_held", "_past")
+    value: Array = None
+    _held: Array = None
+    """The last reading that was taken."""
+    _past: Array = None
+    """Readings of the last steps, the oldest first, (W, A, steps, rows, columns)."""
+
+    def __init__(self, kind: str, given: Values, period: float, latest: int) -> None:
+        """From `checked`, with the period of a control step, s; no observation is later than
+        `latest` steps besides. Raises `InputError`.
+        """
+        model = MODELS[kind][given["model"]]
+        values = {**_DEFAULTS, **model, **given}
+        where = f"sensors.{kind}"
+        most = values["max_rate"]
+        if (values["rate"] or 0.0) > most:
+            expected = f"at most {most:g} Hz of a {values['model']}"
+            raise InputError(f"{where}.rate: expected {expected}, got {values['rate']:g} Hz")
+        every, self._lag = sampling(where, values["rate"], values["delay"], period)
+        if values["rate"] is None:
+            every = max(1, math.ceil(1 / (most * period) - 1e-6))
+        self.name = kind
+        self._every = every
+        self._longest = self._lag + latest
+        self._use = crc32(f"sensor {kind}".encode())
+        sensor = _rays_of(kind, values)
+        turn = _turn(math.radians(values["yaw"]), math.radians(values["pitch"]))
+        self.rays = Rays(sensor.directions @ turn.T)
+        along = sensor.directions[..., 0].ravel()
+        is_flat = kind != "lidar" and "directions" not in model
+        self._scale = (along if is_flat else np.ones_like(along)).astype(np.float32)
+        self._mount = np.array(values["position"])
+        self.errors = Errors(**{name: values[name] for name in Errors._fields})
+        if self.errors.near >= self.errors.reach:
+            raise InputError(
+                f"{where}.reach: expected more than near = {self.errors.near:g} m, "
+                f"got {self.errors.reach:g}"
+            )
+        self.shape = sensor.directions.shape[:2]
+        what = "along each ray" if not is_flat else "along the axis of the sensor"
+        self.frame = f"body, {what}"
+
+    def look(self, view: View, begun: Array, flown: Array, scenery: Scenery) -> None:
+        """Set `value` after a step of the drones that begin and of those that flew.
+
+        Masks are bool, (W, A).
+        """
+        due = begun | (flown & (view.steps % self._every == 0))
+        fresh = self._read(view, due, scenery)
+        old = fresh if self._held is None else self._held
+        rows = due[..., None, None]
+        self._held = self.value = np.where(rows, fresh, old)
+        if not self._longest:
+            return
+        begins = begun[..., None, None, None]
+        first = np.repeat(self._held[:, :, None], self._longest + 1, axis=2)
+        past = first if self._past is None else self._past
+        moved = np.concatenate((past[:, :, 1:], self._held[:, :, None]), axis=2)
+        moves = flown[..., None, None, None]
+        self._past = np.where(begins, first, np.where(moves, moved, past))
+        age = (self._longest - self._lag - view.late).astype(np.int64)
+        self.value = np.take_along_axis(self._past, age[..., None, None, None], axis=2)[:, :, 0]
+
+    def _read(self, view: View, due: Array, scenery: Scenery) -> Array:
+        """New readings of the drones of a mask; of the others anything."""
+        worlds, drones = due.shape
+        out = np.zeros((worlds, drones, *self.shape), np.float32)
+        chosen = ... if due.all() else due
+        place = view.position[chosen].reshape(-1, 3)
+        turn = view.quaternion[chosen].reshape(-1, 4)
+        if not len(place):
+            return out
+        if self._mount.any():
+            place = place + to_world(turn, self._mount + 0.0 * place)
+        which = np.broadcast_to(scenery.which[:, None], due.shape)[chosen].ravel()
+        reach = min(self.errors.reach / float(self._scale.min()), MAX_REACH)
+        place = clip(place, -MAX_PLACE, MAX_PLACE)
+        ranges = self.rays.cast(scenery.layouts, place, turn, reach=reach, which=which)
+        flat = ranges.reshape(len(place), -1)
+        words = self._words(view, due, chosen, flat.shape)
+        read = np.empty_like(flat)
+        code = kernels.compiled()
+        run = code.readings if code else kernels.by_numpy
+        run(flat, self._scale, self._neighbours, words, self.errors.numbers(), read)
+        out[chosen] = read.reshape(out[chosen].shape)
+        return out
+
+    def _words(self, view: View, due: Array, chosen: Any, shape: tuple[int, int]) -> Array:
+        """Random words of each ray of the drones that are due."""
+        if not self.errors.draws:
+            return np.full(shape, 0xFFFFF800, np.uint32)
+        worlds, drones = due.shape
+        size = -(-shape[1] // 4) * 4
+        rows = worlds * drones
+        words = np.empty((worlds, drones * size), np.uint32)
+        steps = view.steps[:, 0].astype(np.uint32)
+        code = kernels.compiled()
+        keys = np.ascontiguousarray(view.keys)
+        if code:
+            code.words(keys, np.uint64(self._use), view.episode, steps, words)
+        else:
+            words[:] = words_of(keys, self._use, view.episode, steps, drones * size)
+        return np.ascontiguousarray(words.reshape(rows, size)[due.ravel(), : shape[1]])
+
+    @cached_property
+    def _neighbours(self) -> Array:
+        """As `returns.by_numpy` has them: to the right and below."""
+        rows, columns = self.shape
+        if not self.errors.edge_dropout:
+            return np.zeros((0, 1 + rows * columns), np.int32)
+        has = np.ones((2, rows, columns), np.int32)
+        has[0, :, -1] = has[1, -1] = 0
+        steps = np.array([[1], [columns]], np.int32)
+        return np.concatenate((steps, has.reshape(2, -1)), axis=1)
+
+
+def _rays_of(kind: str, values: Values) -> Rays:
+    """In the sensor's frame."""
+    if "directions" in values:
+        return Rays([values["directions"]])
+    if kind == "lidar":
+        if values["low"] > values["high"]:
+            got = f"{values['low']:g} and {values['high']:g}"
+            raise InputError(f"sensors.lidar: expected low <= high, got {got} degrees")
+        return Rays.rings(*(values[name] for name in _KINDS[kind]))
+    return Rays.pinhole(*(values[name] for name in _KINDS[kind]))
+
+
+def _turn(yaw: float, pitch: float) -> np.ndarray:
+    """From the sensor's frame to the body's: first tilted up by the pitch, then turned left."""
+    c, s, p, q = math.cos(yaw), math.sin(yaw), math.cos(pitch), math.sin(pitch)
+    return np.array([[c * p, -s, -c * q], [s * p, c, -s * q], [q, 0.0, p]])
