@@ -78,6 +78,16 @@ def fitted(command: F, checkpoint: Checkpoint | Controller) -> F:
     return replace(command, **changes)
 
 
+def in_unseen(command: F) -> F:
+    """The command in layouts that no training has seen, unless the user names the scene."""
+    if not is_known(command.env_id) or getattr(command, "listen", None) is not None:
+        return command
+    scene = command.env_config().scene
+    if "scene" in command.given or scene.layouts != "new":
+        return command
+    return replace(command, options={**command.options, "scene": str(scene.unseen())})
+
+
 def policy_for(command: EnvFlags, checkpoint: Checkpoint | Controller, spec: EnvSpec) -> Policy:
     """The policy of a checkpoint, or a controller. Raises `InputError` if it does not fit the env,
     or was trained on another vehicle and the user has not named one.
@@ -101,7 +111,7 @@ def pilot_of(command: F, what: str) -> tuple[F, Policy | None]:
     if what == "random":
         return command, None
     checkpoint = load_checkpoint(what)
-    command = fitted(command, checkpoint)
+    command = in_unseen(fitted(command, checkpoint))
     return command, policy_for(command, checkpoint, env_spec(command.env_config()))
 
 

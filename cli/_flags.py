@@ -17,6 +17,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 from ..models import Backend
 from ..models.errors import InputError, shortened
 from ..models.fields import PositiveInt, immutable
+from ..scenes import SceneConfig
 
 if TYPE_CHECKING:
     from ..envs.config import EnvConfig
@@ -102,10 +103,11 @@ class EnvFlags(Command):
     """Control steps after which an episode is truncated. Default: the task's."""
     history: int = 1
     """Number of the last observations that are observed side by side."""
-    scene: str = "plain"
+    scene: str | None = None
     """Ground and obstacles: plain, airport, forest, warehouse or gates; the last three from a
-    seed, as forest:3, or from one of several for each episode, as forest:0-7. Films and views
-    show one scene; their default is the airport."""
+    seed, as forest:3, from one of several for each episode, as forest:0-7, or new in each, as
+    forest:new,density=0.01,size=60x60. Films and views show it, and the airport in place of
+    bare ground. Default: the task's."""
     cameras: Words = ()
     """Pictures that are observed: cameras of the vehicle, each NAME, NAME_KIND or
     NAME@WIDTHxHEIGHT."""
@@ -135,9 +137,10 @@ class EnvFlags(Command):
         return EnvConfig.from_keywords(self.env_id, **env, **settings)
 
     @property
-    def shown_scene(self) -> str:
-        """The scene of films and views."""
-        return str(self.options.get("scene", "airport"))
+    def shown_scene(self) -> str | None:
+        """The scene that the user wants to see, if it is a single one."""
+        scene = self.options.get("scene")
+        return str(scene) if scene and len(SceneConfig.parse(scene).single) == 1 else None
 
 
 class BackendFlags(EnvFlags):

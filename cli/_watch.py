@@ -11,6 +11,7 @@ import numpy as np
 from ..envs.rendering import moments
 from ..rendering.live import LiveView, Pace
 from ..rendering.stage import Stage
+from ..scenes import SceneConfig, parse_scene
 from ..udp.protocol.messages import Command
 from ..udp.transport.simulator import Simulator
 from ._flags import EnvFlags
@@ -59,15 +60,20 @@ class Watcher:
         return False
 
 
-def open_view(command: EnvFlags, drones: int, pace: Pace) -> closing[LiveView]:
-    """A window with the drones of a world; it is open within a `with` block."""
-    return closing(LiveView(Stage(command.shown_scene, drones, vehicle=command.vehicle), pace))
+def open_view(command: EnvFlags, drones: int, pace: Pace, flown: SceneConfig) -> closing[LiveView]:
+    """A window with the drones of a world in a scene; it is open within a `with` block.
+
+    Raises `InputError` for a scene of several layouts.
+    """
+    scene = parse_scene(command.shown_scene or flown.shown)
+    return closing(LiveView(Stage(scene, drones, vehicle=command.vehicle), pace))
 
 
 @contextmanager
 def watched(simulator: Simulator, command: "Sim") -> Iterator[None]:
     """Show a simulator during the block."""
-    with open_view(command, len(simulator.spec.agents), Pace(0.0)) as view:
+    flown = command.env_config().scene
+    with open_view(command, len(simulator.spec.agents), Pace(0.0), flown) as view:
         print("shown in the window")
         simulator.observer = Watcher(view, simulator)
         yield

@@ -21,10 +21,10 @@ class Evaluate(AgentFlags, BackendFlags):
 
         from ..flights.trajectories import fly_episodes
         from ..training.metrics import Headline, measure_episode
-        from ._env import fitted, load_checkpoint, policy_for, remote_env
+        from ._env import fitted, in_unseen, load_checkpoint, policy_for, remote_env
 
         checkpoint = load_checkpoint(self.policy)
-        command = fitted(self, checkpoint)
+        command = in_unseen(fitted(self, checkpoint))
         with remote_env(command, num_envs=command.drones, backend=self.backend) as env:
             headline = Headline.of(env.env_spec)
             policy = policy_for(command, checkpoint, env.env_spec)

@@ -25,11 +25,11 @@ class Serve(AgentFlags):
         """Fly episode after episode."""
         from ..flights.trajectories import fly_episodes
         from ..udp import LinkError
-        from ._env import fitted, load_checkpoint, policy_for, print_episode, remote_env
+        from ._env import fitted, in_unseen, load_checkpoint, policy_for, print_episode, remote_env
 
         checkpoint = load_checkpoint(self.policy)
         episode = 0
-        with remote_env(fitted(self, checkpoint), num_envs=None) as env:
+        with remote_env(in_unseen(fitted(self, checkpoint)), num_envs=None) as env:
             policy = policy_for(self, checkpoint, env.env_spec)
             worlds = env.num_envs // len(env.env_spec.agents)
             while self.episodes is None or episode < self.episodes:

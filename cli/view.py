@@ -1,6 +1,7 @@
 """`rotorgram view`: flights live, flown in process or read from a journal."""
 
 import time
+from contextlib import ExitStack
 from itertools import chain, count, islice
 from pathlib import Path
 
@@ -9,7 +10,6 @@ from tyro.conf import Positional
 from ..flights.recorded import recorded_trajectories
 from ..flights.trajectories import flown_trajectories
 from ..models import InputError
-from ..scenes import parse_scene
 from ._flags import Count, EnvFlags
 
 
@@ -33,7 +33,6 @@ class View(EnvFlags):
         from ._env import pilot_of, print_episode
         from ._watch import open_view
 
-        parse_scene(self.shown_scene)
         path = Path(self.what)
         shown = self
         if path.suffix == ".mcap":
@@ -46,9 +45,14 @@ class View(EnvFlags):
             flights = (flown_trajectories(policy, config, [one], "final") for one in count())
         first = next(flights)
         pace = Pace(first[0].spec.control_period, self.speed)
-        with open_view(shown, len(first), pace) as live:
-            print(f"showing {self.what} in the window (Ctrl-C ends)")
+        print(f"showing {self.what} in the window (Ctrl-C ends)")
+        with ExitStack() as opened:
+            scene = None
             for flight in islice(chain((first,), flights), self.episodes):
+                if flight[0].scene != scene:
+                    scene = flight[0].scene
+                    opened.close()
+                    live = opened.enter_context(open_view(shown, len(first), pace, scene))
                 shown_moments = [moments(one) for one in flight]
                 longest = max(map(len, shown_moments))
                 # A drone whose episode has ended stays as it ended.

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..models.errors import InputError, one_line
 from ..sim import Array, PhysicsError
+from ..sim.sensors.sight import View
 from ..sim.snapshots import Arrays, Snapshot
 from ..sim.state import some
 from ..sim.world import tell_once
@@ -80,6 +81,7 @@ class CompiledLoop(Loop):
         self._take_told(told)
         if some(results["wrong"]):
             self._check()
+        self._look()
 
     def prepare(self) -> None:
         """Compile."""
@@ -131,7 +133,8 @@ class CompiledLoop(Loop):
 
     def _give(self, results: np.ndarray) -> None:
         self.observations = {}
-        for number, array in enumerate(self.spec.observation):
+        self._results = results
+        for number, array in enumerate(self.arrays):
             self.observations[array.name] = results[f"observation/{number}"]
         self.rewards = results["reward"]
         self._headline = results["headline"]
@@ -139,6 +142,12 @@ class CompiledLoop(Loop):
         self.truncated = results["truncated"]
         self.done = results["done"]
         self.out = results["out"]
+
+    def _view(self) -> View:
+        machine = self._inside
+        if machine is None:
+            return super()._view()
+        return machine.view(self._results)
 
     def _undo(self, flew: Array) -> None:
         """Do not count a step that broke; its drones wait for a reset."""

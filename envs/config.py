@@ -26,7 +26,7 @@ from ..models.fields import (
 )
 from ..models.files import read_toml
 from ..models.library import is_of_the_library, vehicle_words
-from ..scenes import seeds_of
+from ..scenes import SceneConfig
 from ..sim import EffectOptions, Randomization
 from ..sim.effects import NO_EFFECTS
 from . import registry
@@ -42,40 +42,6 @@ DEFAULT_ENV = "rotorgram/Elevation-v0"
 MAX_CONTROL_PERIOD = 1.0  # s
 MAX_EPISODE_LENGTH = 1 << 31  # control steps
 MAX_HISTORY = 1000  # observations side by side
-
-
-@immutable
-class SceneConfig:
-    """Ground and obstacles around the drones."""
-
-    name: str = "plain"
-    """One of `scenes.SCENES`."""
-    seeds: tuple[int, ...] = ()
-    """Seeds of a generated scene. Of several seeds, each episode draws one."""
-
-    def __post_init__(self) -> None:
-        set_fields(self, seeds=tuple(self.seeds))
-        _, seeds = seeds_of(str(self))
-        if tuple(seeds) != self.seeds:
-            raise InputError(f"scene: expected consecutive seeds, got {shortened(self.seeds)}")
-
-    def __str__(self) -> str:
-        """The text that `parse` reads: `forest`, `forest:3` or `forest:0-7`."""
-        if not self.seeds:
-            return self.name
-        first = self.seeds[0]
-        last = self.seeds[-1]
-        return f"{self.name}:{first}" if first == last else f"{self.name}:{first}-{last}"
-
-    @classmethod
-    def parse(cls, scene: Any) -> Self:
-        """A scene from its text, or from its fields by name. Raises `InputError`."""
-        if isinstance(scene, cls):
-            return scene
-        if isinstance(scene, Mapping):
-            return read_table(cls, scene, "scene")
-        name, seeds = seeds_of(scene)
-        return cls(name=name, seeds=tuple(seeds))
 
 
 @immutable
@@ -130,7 +96,8 @@ class EnvConfig:
     paper's quadcopter."""
     drones: Annotated[int, Limits(1, MAX_DRONES, whole=True)] = 1
     """Drones of each world."""
-    scene: SceneConfig = SceneConfig()
+    scene: SceneConfig = None  # type: ignore[assignment]  # that of the task until it is known
+    """What surrounds the drones; as a text too, see there."""
     action: str | None = None
     """What an action sets: one of `sim.LEVELS`."""
     control_period: Annotated[float | None, Limits(1e-6, MAX_CONTROL_PERIOD, "s")] = None
@@ -145,8 +112,8 @@ class EnvConfig:
     effects: EffectOptions = NO_EFFECTS
     randomize: Options = field(default_factory=dict, hash=False)
     """Distributions of what is drawn for each episode: names of `sim.PARAMETERS` to texts."""
-    sensors: Options = field(default_factory=dict, hash=False)
-    """Settings by sensor, or true; see `sim/sensors`."""
+    sensors: Options = field(default=None, hash=False)  # type: ignore[arg-type]  # as the scene
+    """Settings by sensor, or true; see `sim/sensors`. None given: the task's."""
     cameras: tuple[str, ...] = ()
     """Pictures that are observed: cameras of the vehicle as NAME, NAME_KIND or
     NAME@WIDTHxHEIGHT."""
@@ -161,10 +128,15 @@ class EnvConfig:
 
     def __post_init__(self) -> None:
         check_fields(self)
+        env_id = canonical_id(self.env_id)
+        defaults = registry.task_type(env_id).defaults if registry.is_known(env_id) else {}
+        if self.sensors is None:
+            set_fields(self, sensors=defaults.get("sensors", {}))
+        if not self.vehicle:
+            set_fields(self, vehicle=defaults.get("vehicle", ()))
         set_fields(
             self,
-            env_id=canonical_id(self.env_id),
-            scene=SceneConfig.parse(self.scene),
+            env_id=env_id,
             backend=BackendConfig.parse(self.backend),
             vehicle=vehicle_words(self.vehicle),
             cameras=words_of("cameras", self.cameras),
@@ -183,13 +155,17 @@ class EnvConfig:
         if not isinstance(self.task, Mapping):
             raise InputError(f"task: expected options by name, got {shortened(self.task)}")
         options: Options = self.task
+        usual = SceneConfig()
         if registry.is_known(self.env_id):
             task = registry.task_type(self.env_id)
             defaults = {name: getattr(task, name) for name in _FROM_TASK}
             set_fields(self, **{k: v for k, v in defaults.items() if getattr(self, k) is None})
             check("action", Choice(task.actions), self.action)
-            options = task.Options.from_options(options, KEYWORDS).to_options()
-        set_fields(self, task=json_values(options))
+            chosen = task.Options.from_options(options, KEYWORDS)
+            options = chosen.to_options()
+            usual = task.scene(chosen)
+        scene = usual if self.scene is None else SceneConfig.parse(self.scene)
+        set_fields(self, task=json_values(options), scene=scene)
 
     # ---- other forms
 
@@ -220,13 +196,17 @@ class EnvConfig:
     def flat_options(self) -> Values:
         """Keywords of everything but the vehicle, the drones and the backend, as JSON values.
 
-        Every option of the task, and every other field that is not empty.
+        Every option of the task, and every other field that is not empty, or that of the task.
         """
         values: Values = {name: getattr(self, name) for name in _OPTIONS}
         values["effects"] = self.effects.to_options()
-        values["scene"] = str(self.scene) if self.cameras else None
+        own: Any = {"scene": None, "sensors": None}
+        usual = replace(self, **own)  # with those of the task, which follow from its options
+        values["scene"] = None if self.scene == usual.scene else str(self.scene)
         values["task"] = {name: value for name, value in self.task.items() if name in KEYWORDS}
         values = {name: value for name, value in values.items() if value not in (None, (), {})}
+        if self.sensors != usual.sensors:
+            values["sensors"] = self.sensors
         shown = {name: value for name, value in self.task.items() if name not in KEYWORDS}
         return json_values(values | shown)
 
@@ -237,9 +217,11 @@ class EnvConfig:
             values["vehicle"] = list(self.vehicle)
         if self.backend != BackendConfig():
             values["backend"] = asdict(self.backend)
-        if self.scene != SceneConfig():
-            values["scene"] = str(self.scene)
         return {**values, "drones": self.drones, **self.flat_options()}
+
+    def unseen(self) -> Self:
+        """The same for tests: in layouts that no training has seen."""
+        return replace(self, scene=self.scene.unseen())
 
     def changed(self, **keywords: Any) -> "EnvConfig":
         """The same with other keywords. Raises `InputError`."""
@@ -333,6 +315,10 @@ class EnvConfig:
             most = f" to {task.max_drones}" if task.max_drones > task.min_drones else ""
             expected = f"{task.min_drones}{most} with {self.env_id}"
             raise InputError(f"drones: expected {expected}, got {self.drones}")
+        if self.cameras and not self.scene.single:
+            raise InputError(
+                f"cameras: expected a scene of given seeds, as forest:0-7, got {self.scene}"
+            )
         whole = self.embedded()
         vehicle = whole.load_vehicle()
         vehicle.substeps(self.control_period or 0.0)
@@ -359,7 +345,7 @@ class EnvConfig:
         content = resolved.to_dict()
         for name in ("vehicle", "files"):  # their hash is there
             content.pop(name)
-        if not self.cameras:
+        if self.scene == SceneConfig():
             content.pop("scene")
         for name in ("num_threads", "compiled"):
             content["backend"].pop(name)

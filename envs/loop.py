@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 
 from ..models.errors import InputError
 from ..sim import Array, PhysicsError, Randomization, World, make_world
+from ..sim.sensors.sight import View
 from ..sim.snapshots import Arrays, Snapshot, joined, part_of
 from ..sim.state import some
 from .autoreset import Content, Seeds, Told, checked_seeds
 from .config import EnvConfig
 from .pipeline import Pipeline
-from .specification import make_task, spec_of
+from .specification import make_task, sights_in, spec_of
 from .stages import clock
 from .stages.record import Floats, Mask, Record
 from .tasks.task import Task
@@ -39,6 +40,8 @@ class Loop:
     Attributes:
         config: As given, resolved.
         pipeline: Its stages.
+        sights: Sensors with rays, which look after each step.
+        arrays: Of the observation, those of the stages.
         quantities: Of the telemetry.
         num_envs: N. Arrays below have one axis of N drones, world by world, and are new after each
             `advance`; those of record, world and task have the axes of `world.shape`.
@@ -69,10 +72,14 @@ class Loop:
             drones=config.drones,
             effects=flown.effects,
             randomize=Randomization(flown.randomize, flown.effects),
+            scene=flown.scene,
             **backend.settings,
         )
         self.pipeline = pipeline = Pipeline(task, world, shape)
+        self.sights = sights_in(task)
         self.spec = spec_of(config, task)
+        seen = [sight.name for sight in self.sights]
+        self.arrays = [array for array in self.spec.observation if array.name not in seen]
         kept = tuple(name for stage in pipeline.stages for name in stage.arrays)
         self._record = Record(world.shape, task.memory, kept)
         self.num_envs = num_worlds * config.drones
@@ -124,6 +131,7 @@ class Loop:
         if some(active):
             record.run(active, pipeline.observe)
         self._take()
+        self._look()
 
     def _begin(self, begun: Mask, seeds: Any) -> None:
         """Begin episodes: the task sets the start, and the other stages follow from it."""
@@ -136,13 +144,36 @@ class Loop:
             self._world.random.seed(begun, seeds[:: len(self.spec.agents)])
         record.run(None if all_begin else begun, begin)
 
+    def _look(self) -> None:
+        """Add what sensors with rays see to the observations."""
+        if not self.sights:
+            return
+        record = self._record
+        nobody = np.zeros(record.shape, bool)
+        begun = nobody if record.begun is None else record.begun
+        flown = ~nobody if record.flown is None else record.flown
+        view = self._view()
+        for sight in self.sights:
+            sight.look(view, begun, flown, self._world.scenery)
+            self.observations[sight.name] = np.array(sight.value).reshape(-1, *sight.shape)
+
+    def _view(self) -> View:
+        """From where they look."""
+        record = self._record
+        random = self._world.random
+        state = record.state
+        late = self._world.parameters.get("observation_delay", 0 * record.steps)
+        return View(
+            state.position, state.quaternion, record.steps, random.keys, random.episode, late
+        )
+
     def snapshot(self) -> Snapshot:
         """Copies of all arrays that a later step depends on, by name.
 
         Raises `gymnasium.error.ClosedEnvironmentError` after `close`.
         """
         self._check_open()
-        arrays = self.state()
+        arrays = self.state() | joined({sight.name: sight.snapshot() for sight in self.sights})
         arrays["loop/config"] = np.array(self.spec.config_digest)
         return {**arrays, "loop/arrays": np.array(sorted(arrays))}
 
@@ -168,6 +199,10 @@ class Loop:
         _check_snapshot(snapshot, self._record.shape, self.spec.config_digest)
         self.put(snapshot)
         self._take()
+        for sight in self.sights:
+            sight.restore(part_of(snapshot, sight.name))
+            if sight.value is not None:
+                self.observations[sight.name] = np.array(sight.value).reshape(-1, *sight.shape)
 
     def put(self, state: Arrays) -> None:
         """Put back what `state` gave."""
@@ -190,7 +225,7 @@ class Loop:
         self._headline: Floats | None = None
         known = vars(record).get("observations")
         self.observations = {}
-        for array in self.spec.observation:
+        for array in self.arrays if known is not None else self.spec.observation:
             shape = (count, *array.shape)
             if known is None:  # before an episode
                 self.observations[array.name] = np.zeros(shape, array.dtype)

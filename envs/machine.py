@@ -6,7 +6,7 @@ step depends on can be forgotten that a snapshot has.
 """
 
 import ctypes
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from math import prod
 from typing import Any
 
@@ -18,6 +18,7 @@ from ..sim.compile import Program, Untraceable, lift, read
 from ..sim.compile.alike import with_calls
 from ..sim.compile.layout import Layout, Memory, fields_of
 from ..sim.compile.llvm import Region, compiled, widest
+from ..sim.sensors.sight import View
 from ..sim.snapshots import Arrays, Snapshot, joined, part_of
 from ..sim.world import Call
 from .autoreset import Told
@@ -34,6 +35,10 @@ A step whose physics is array code is the last alone."""
 _PHYSICS = "physics/"
 _MASKS = ("flown", "begun", "active")
 _ENDS = ("terminated", "truncated", "done", "out", "waiting")
+_LAYOUT = "layout"
+_SEEN = "seen/"
+_POSE: Mapping[str, tuple[int, ...]] = {"position": (3,), "quaternion": (4,), "steps": ()}
+_LATE = "Flight/parameters/observation_delay"
 _TOLD = "told/"
 _TERM = "told/reward_"
 _KEYS = "Flight/random/keys"
@@ -77,6 +82,8 @@ class Machine:
         self._told = Layout(fields_of(self._telemetry()), lanes)
         given: Named = dict.fromkeys(_MASKS, (_BOOL, sent.shape[1:-1]))
         given["sent"] = (sent.dtype, sent.shape[1:])
+        if world.scenery:
+            given[_LAYOUT] = (world.scenery.rows.dtype, (3,))
         given |= fields_of(self._pushed())
         given |= fields_of({_PHYSICS + name: x for name, x in seen.items()})
         self._outside = given | fields_of(self._seen())
@@ -173,14 +180,27 @@ class Machine:
         np.add(self._starts, self._address, out=self._leaving)
         if sent is not None and not self.is_whole:
             self._fly(flown)
-        if begun is not None and seeds is not None:
+        if begun is not None:
             self._seed(begun, seeds)
+        if self._world.scenery:
+            given[_LAYOUT][:worlds] = self._world.scenery.rows
         if not self.is_whole:
             if begun is not None:
                 self._begin(begun)
             self._take(self._world.told())
         self._call(_LAST)
         return np.ndarray((), self._results, new), lambda: self._read(new)
+
+    def view(self, results: np.ndarray) -> View:
+        """From where sensors with rays look after a step."""
+        shape = self._world.shape
+        pose = [results[_SEEN + name].reshape(*shape, *more) for name, more in _POSE.items()]
+        late: Any = np.zeros(shape)
+        if _LATE in self._names:
+            late = self.memory.get(_LATE)
+        position, quaternion, steps = pose
+        keys = self.memory.get(_KEYS)
+        return View(position, quaternion, steps, keys, self.memory.get(_EPISODE), late)
 
     def _call(self, name: str) -> None:
         memory = self.memory
@@ -221,7 +241,10 @@ class Machine:
             self._given[_PHYSICS + name][:worlds] = values
 
     def derivative(self) -> Derivative:
-        """That of a step."""
+        """That of a step. Raises `InputError` where there are solids or rays, which have none."""
+        if self._world.scenery or self._loop.sights:
+            got = f"{self._world.scenery.scene} and {len(self._loop.sights)} sensors with rays"
+            raise InputError(f"derivative: expected bare ground and no rays, got {got}")
         return Derivative(self._loop, self._layouts[0], self._width, self._worlds)
 
     def begin_all(self) -> None:
@@ -233,13 +256,18 @@ class Machine:
         memory.put("record/kept/episodes", 0 * memory.get("record/kept/episodes"))
 
     def _seed(self, begun: Mask, seeds: Any) -> None:
-        """As `Random.seed`."""
-        random = self._world.random
+        """As `Random.seed`, where there are seeds; and lay out what the code will draw."""
+        world = self._world
+        if seeds is None and not world.scenery.varies:
+            return
+        random = world.random
         random.keys = self.memory.get(_KEYS)
         random.episode = self.memory.get(_EPISODE)
-        random.seed(begun, seeds)
-        self.memory.put(_KEYS, random.keys)
-        self.memory.put(_EPISODE, random.episode)
+        if seeds is not None:
+            random.seed(begun, seeds)
+            self.memory.put(_KEYS, random.keys)
+            self.memory.put(_EPISODE, random.episode)
+        world.scenery.begin(random, begun, ahead=1)
 
     def state(self) -> Snapshot:
         """As `Loop.state`."""
@@ -281,8 +309,10 @@ class Machine:
         metric = self._loop.spec.headline
         headline = record.metrics[metric.name] if metric else np.nan + record.reward
         seen = {"reward": record.reward, "headline": headline.astype(np.float64)}
-        for number, array in enumerate(self._loop.spec.observation):  # their names are the task's
+        for number, array in enumerate(self._loop.arrays):  # their names are the task's
             seen[f"observation/{number}"] = record.observations[array.name].astype(array.dtype)
+        if self._loop.sights:
+            seen |= {_SEEN + name: getattr(record.state, name) for name in _POSE}
         seen |= {name: getattr(record, name) for name in _ENDS}
         return seen | {"wrong": record.unfit | self._loop.world.bad}
 
@@ -312,6 +342,8 @@ class Machine:
             for name, values in arrays.items()
             if name.startswith(_PHYSICS)
         }
+        if _LAYOUT in arrays:
+            self._loop.world.scenery.rows = arrays[_LAYOUT]
         self._loop.put({name: arrays[name] for name in self._names})
         return arrays
 

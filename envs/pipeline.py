@@ -3,7 +3,7 @@
 import numpy as np
 
 from ..sim import World
-from ..sim.sensors import Sensors
+from ..sim.sensors import SENSOR_TYPES, Sensors
 from .specification import observed
 from .stages.actions import ActionDelay, Actions, Receive
 from .stages.clock import Clock
@@ -46,7 +46,9 @@ class Pipeline:
         period = task.control_period
         randomize = world.randomize
         look = lambda: world.state  # noqa: E731
-        sensors = Sensors(config.sensors, world, period) if config.sensors else None
+        sensors = None
+        if not config.sensors.keys().isdisjoint(SENSOR_TYPES):
+            sensors = Sensors(config.sensors, world, period)
         if sensors is not None and config.estimated:
             look = sensors.seen
         self.actions = Actions(world.shape, len(controller.low), controller.choices)
@@ -104,5 +106,5 @@ class Pipeline:
         if sensors is not None:
             stages.append(Readings(sensors, observed(task) if config.estimated else ()))
         if config.cameras:
-            stages.append(Pictures(task, world.random, shape))
+            stages.append(Pictures(task, world.scenery, shape))
         return stages

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..models.errors import InputError, shortened
 from ..models.fleet import members_of
+from ..scenes import SceneConfig
 from .spec import EnvSpec
 
 if TYPE_CHECKING:
@@ -31,6 +32,7 @@ class Renderer:
         self._canvas: Canvas | None = None
         self._view: LiveView | None = None
         self._shown: list[Moment] = []
+        self._drawn: SceneConfig | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         """Without what is open."""
@@ -54,13 +56,17 @@ class Renderer:
         from ..rendering import Canvas
 
         drones = len(self._loop.spec.agents)
-        if self._canvas is None:
-            one = len(now) == drones
-            size = (480, 360) if one else (240, 180)
-            self._canvas = Canvas(self._stage(trail=one), *size)
-        canvas = self._canvas
+        one = len(now) == drones
+        size = (480, 360) if one else (240, 180)
         pictures = []
         for first in range(0, len(now), drones):
+            scene = self._scene(first // drones)
+            if self._canvas is not None and scene != self._drawn:
+                self.close()
+            if self._canvas is None:
+                self._canvas = Canvas(self._stage(scene, trail=one), *size)
+                self._drawn = scene
+            canvas = self._canvas
             canvas.stage.show(*now[first : first + drones])
             pictures.append(canvas.draw())
         return tuple(pictures)
@@ -69,20 +75,29 @@ class Renderer:
         from ..rendering import live
 
         shown = now[: len(self._loop.spec.agents)]  # of the first world
+        scene = self._scene(0)
+        if self._view is not None and scene != self._drawn:
+            self.close()
         if self._view is None:
+            self._drawn = scene
             pace = live.Pace(self._loop.spec.control_period)
-            self._view = live.LiveView(self._stage(trail=True), pace)
+            self._view = live.LiveView(self._stage(scene, trail=True), pace)
         if shown != self._shown:  # `step` shows by itself, and a script may ask once more
             self._shown = shown
             self._view.draw_in_time(*shown)
 
-    def _stage(self, *, trail: bool) -> "Stage":
+    def _scene(self, world: int) -> SceneConfig:
+        """What surrounds the drones of a world."""
+        scenery = self._loop.world.scenery
+        return scenery.scene.with_seed(int(scenery.seeds[world])).shown
+
+    def _stage(self, scene: SceneConfig, *, trail: bool) -> "Stage":
         """Of a world."""
         from ..rendering import Stage
 
         drones = len(self._loop.spec.agents)
         crafts = members_of(self._loop.vehicle, drones)
-        return Stage(drones=drones, vehicle=[str(one.path) for one in crafts], trail=trail)
+        return Stage(scene, drones, vehicle=[str(one.path) for one in crafts], trail=trail)
 
     def close(self) -> None:
         """Close the canvas or the window."""

@@ -3,9 +3,9 @@
 from ..models.cameras import chosen_views
 from ..models.errors import InputError
 from ..models.swarm import drone_names
-from ..scenes import scenes_of
-from ..sim import Controller
-from ..sim.sensors import readings_of
+from ..sim import Controller, Randomization
+from ..sim.sensors import readings_of, sights_of
+from ..sim.sensors.sight import Sight
 from . import registry
 from .config import EnvConfig
 from .spec import ArraySpec, Discrete, EnvSpec
@@ -45,6 +45,16 @@ def spec_of(config: EnvConfig, task: Task) -> EnvSpec:
     """The `EnvSpec` of a config's env, whose task is made."""
     observation = [with_history(array, config.history) for array in observed(task)]
     observation += _pictures(task)
+    for sight in sights_in(task):
+        array = ArraySpec(
+            name=sight.name,
+            shape=sight.shape,
+            low=0.0,
+            high=sight.errors.reach,
+            unit="m",
+            frame=sight.frame,
+        )
+        observation.append(array)
     return EnvSpec(
         env_id=config.env_id,
         options=config.flat_options(),
@@ -70,6 +80,15 @@ def observed(task: Task) -> tuple[ArraySpec, ...]:
     """What is observed of one moment: by the task, and by sensors."""
     readings = readings_of(task.config.sensors, task.vehicle, task.control_period)
     return task.observation + tuple(ArraySpec(**reading) for reading in readings)
+
+
+def sights_in(task: Task) -> list[Sight]:
+    """Sensors with rays of a task's drones. Raises `InputError`."""
+    config = task.config
+    randomize = Randomization(config.randomize, config.effects)
+    late = "observation_delay"
+    latest = randomize.most_steps(late) if late in randomize.names else 0
+    return sights_of(config.sensors, task.control_period, latest)
 
 
 def _action(controller: Controller) -> ArraySpec | Discrete:
@@ -98,7 +117,7 @@ def _pictures(task: Task) -> tuple[ArraySpec, ...]:
 
     payload = config.effects.payload > 0
     objects = []
-    for scene in scenes_of(str(config.scene)):
+    for scene in config.scene.single:
         model = drawn_model(task.vehicle, config.drones, scene, task.marks, payload=payload)
         objects.append(objects_in(model)[0])
     return arrays_of(views, objects_of_all(objects))

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..sim.state import Array, WorldState
+from ..sim.state import FAR, Array, WorldState
 
 
 @dataclass(kw_only=True, slots=True)
@@ -19,6 +19,9 @@ class State(WorldState):
     """Control steps of each episode, whole numbers, shape (W, A)."""
     time: Array
     """Time since the start of each episode, s, shape (W, A)."""
+    clearance: Array = FAR
+    """Distance from a sphere about each body's origin, of `Vehicle.radius`, to the nearest solid
+    but level ground, m, shape (W, A): below 0 within one, at most `FAR`."""
     neighbours: NDArray[np.float64] | None = None
     """What each drone has heard of its neighbours, see `stages/radio.py`: shape (W, A, k, 7)."""
 

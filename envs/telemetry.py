@@ -80,6 +80,8 @@ def quantities_of(task: Task) -> list[Quantity]:
     if effects.payload:
         names = ("payload_x", "payload_y", "payload_z")
         quantities.append(_of_state("payload", names, "m", WORLD))
+    if len(task.config.scene.single) != 1:
+        quantities.append(Quantity("layout", ("layout",), "", _layout))
     if type(task).goal is not Task.goal:
         quantities.append(Quantity("goal", ("goal_x", "goal_y", "goal_z"), "m", _goal, WORLD))
     if task.metrics:
@@ -123,6 +125,11 @@ def _wind(loop: "Loop") -> Array:
 def _drawn(loop: "Loop") -> Array:
     drawn = loop.world.parameters
     return stack([drawn[name] for name in PARAMETERS if name in drawn])
+
+
+def _layout(loop: "Loop") -> Array:
+    """Seed of the layout of each world."""
+    return stack((loop.world.scenery.seeds[:, None],))
 
 
 def _goal(loop: "Loop") -> Array:

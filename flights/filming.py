@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Generator, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,7 +16,7 @@ from ..models.fields import Limits, check_fields, immutable
 from ..rendering import Camera, Canvas, Moment, Stage
 from ..rendering.film import QUALITY, Picture, write_film
 from ..rendering.gl import Lines
-from ..scenes import parse_scene
+from ..scenes import SceneConfig, parse_scene
 from .executors import Tell
 from .trajectories import Flights, Trajectory
 
@@ -88,7 +88,8 @@ class Film:
     fps: float = 25.0
     speed: Annotated[float, Limits(0.001, 1000)] = 1.0
     """Seconds of flight per second of film."""
-    scene: str = "airport"
+    scene: str | None = None
+    """None: the one that was flown in, and the airport in place of bare ground."""
     vehicle: str | None = None
     """File or name of the vehicle; None: the paper's."""
     overlay: bool = True
@@ -102,7 +103,8 @@ class Film:
 
     def __post_init__(self) -> None:
         check_fields(self)
-        parse_scene(self.scene)
+        if self.scene is not None:
+            parse_scene(self.scene)
 
 
 def film(
@@ -171,11 +173,17 @@ def _frames(
     width = (config.width - _SPACE * (columns - 1)) // columns
     height = (config.height - _SPACE * (rows - 1)) // rows
     drones = tracks[0].drones
-    stage = Stage(config.scene, drones, vehicle=config.vehicle)
-    with Canvas(stage, width, height, fast=config.fast) as canvas:
-        named = len(tracks) > 1
-        panes = [_Pane(track, stage.twin(), canvas, config, named) for track in tracks]
+    named = len(tracks) > 1
+    shown: SceneConfig | None = None
+    with ExitStack() as opened:
         for number, (episode, seconds) in enumerate(times, 1):
+            scene = _scene_of(tracks, config, episode)
+            if scene != shown:
+                opened.close()
+                stage = Stage(scene, drones, vehicle=config.vehicle)
+                canvas = opened.enter_context(Canvas(stage, width, height, fast=config.fast))
+                panes = [_Pane(track, stage.twin(), canvas, config, named) for track in tracks]
+                shown = scene
             frame = np.full((config.height, config.width, 3), _DARK, np.uint8)
             for place, pane in enumerate(panes):
                 row, column = divmod(place, columns)
@@ -184,6 +192,17 @@ def _frames(
                 frame[y : y + height, x : x + width] = pane.draw(episode, seconds)
             yield frame
             tell(number, len(times), "done" if number == len(times) else "frames")
+
+
+def _scene_of(tracks: Sequence[FilmTrack], config: Film, episode: int) -> SceneConfig:
+    """What surrounds the drones of an episode. Raises `InputError` where tracks differ."""
+    if config.scene is not None:
+        return parse_scene(config.scene)
+    scenes = {one.scene.shown for track in tracks for one in track.episodes[episode]}
+    if len(scenes) != 1:
+        got = " and ".join(sorted(map(str, scenes)))
+        raise InputError(f"scene: expected one for all flights of a film, got {got}")
+    return scenes.pop()
 
 
 @dataclass

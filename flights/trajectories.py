@@ -18,9 +18,11 @@ from numpy.typing import NDArray
 from ..agents.policies import Array, Policy
 from ..envs.autoreset import AdvancingVectorEnv, worlds_done
 from ..envs.config import EnvConfig
+from ..envs.registry import is_known
 from ..envs.spec import EnvSpec
 from ..models import InputError
 from ..models.fields import immutable
+from ..scenes import SceneConfig
 
 Floats = NDArray[np.float64]
 
@@ -88,6 +90,15 @@ class Trajectory:
     def terminated(self) -> bool:
         """Whether it ended by a crash or the like, not by the clock."""
         return self.ending == "terminated"
+
+    @cached_property
+    def scene(self) -> SceneConfig:
+        """What surrounded it, with its layout; what is not known here is plain."""
+        known = is_known(self.spec.env_id)
+        config = EnvConfig.from_keywords(self.spec.env_id, **self.spec.options) if known else None
+        scene = config.scene if config else SceneConfig()
+        layout = self.telemetry.get("layout")
+        return scene if layout is None else scene.with_seed(int(layout[0, 0]))
 
     @cached_property
     def pose(self) -> Floats:
@@ -232,11 +243,14 @@ def flown_trajectories(
     of: EpisodeSet = "curve",
     training_seed: int | None = None,
 ) -> Flights:
-    """Evaluation episodes of a set by number, flown in process as by `fly_episodes`."""
+    """Evaluation episodes of a set by number, flown in process as by `fly_episodes`, in unseen
+    layouts of a scene."""
     from ..envs.vector import LocalVectorEnv  # which imports MuJoCo
 
     found: Flights = []
-    with closing(LocalVectorEnv(config, config.drones, autoreset_mode="Disabled")) as world:
+    with closing(
+        LocalVectorEnv(config.unseen(), config.drones, autoreset_mode="Disabled")
+    ) as world:
         for episode in episodes:
             found += fly_episodes(world, policy, 1, of, episode, training_seed)
     return found

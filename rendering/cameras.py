@@ -22,7 +22,7 @@ from ..models.fleet import members_of
 from ..models.mjcf import swarm_spec
 from ..models.swarm import drone_names
 from ..models.vehicle import Vehicle, owners
-from ..scenes import add_scene
+from ..scenes import SceneConfig, add_scene
 from ..scenes.marks import Mark
 from .gl import Offscreen
 from .stage import LOOKS, scale_drawing
@@ -73,7 +73,7 @@ class Cameras:
         views: Sequence[View],
         shape: tuple[int, int] = (1, 1),
         *,
-        scene: str = "plain",
+        scene: str | SceneConfig = "plain",
         marks: Sequence[Mark] = (),
         payload: bool = False,
         fine: bool = False,
@@ -252,7 +252,7 @@ def _matrix(model: MjModel, camera: int, width: int, height: int) -> Array:
 
 
 def drawn_model(
-    vehicle: Vehicle, drones: int, scene: str, marks: Sequence[Mark], *, payload: bool
+    vehicle: Vehicle, drones: int, scene: str | SceneConfig, marks: Sequence[Mark], *, payload: bool
 ) -> MjModel:
     """What is drawn: craft with their cameras, what surrounds them, the task's marks."""
     names = drone_names(drones)

@@ -23,6 +23,7 @@ from ..models.fleet import load_vehicles, members_of
 from ..models.mjcf import level_data, swarm_spec
 from ..models.swarm import drone_names
 from ..models.vehicle import owners
+from ..scenes import SceneConfig
 from ..scenes.build import SCENE_PREFIX, add_scene
 from ..scenes.marks import Mark, Point
 from .gl import Lines, Offscreen
@@ -129,7 +130,7 @@ class Stage:
 
     def __init__(
         self,
-        scene: str = "airport",
+        scene: str | SceneConfig = "airport",
         drones: int = 1,
         *,
         vehicle: Path | str | Sequence[str] | None = None,

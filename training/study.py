@@ -144,7 +144,7 @@ def _evaluate(
     if len(snapshots) > 1:
         most = max(most, study.curve_episodes)
     worlds = min(most, max(MAX_BATCH // drones, 1))
-    with open_env(study.wire, row.env, worlds * drones) as env:
+    with open_env(study.wire, row.env.unseen(), worlds * drones) as env:
         headline = Headline.of(env.env_spec)
         for one in snapshots:
             last = one is snapshots[-1]

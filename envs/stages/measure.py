@@ -33,7 +33,11 @@ class Measure(Stage):
         """Measures without errors; sensors change it."""
         steps = record.steps
         record.state = kept_state(
-            self.world.state, action=record.action, steps=steps, time=steps * self.period
+            self.world.state,
+            action=record.action,
+            steps=steps,
+            time=steps * self.period,
+            clearance=self.world.clearance(),
         )
         record.measured = record.state
 

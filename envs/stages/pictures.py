@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...models.cameras import FARTHEST, View, chosen_views
-from ...scenes import scenes_of
-from ...sim.random import SCENES, Draw, Random
+from ...sim.scenery import Scenery
 from ...sim.snapshots import Arrays
 from ..spec import ArraySpec
 from ..tasks.task import Task
@@ -63,21 +62,21 @@ class Pictures(Stage):
     Threads draw its worlds, as many as there are cores; a world's pictures do not depend on them.
 
     Args:
-        task: Its options choose the cameras and the scene.
-        random: Of the world; scenes draw from it.
+        task: Its options choose the cameras.
+        scenery: Of the world.
         shape: (W, A).
     """
 
-    arrays = ("scenes", "pictures")
+    arrays = ("pictures",)
 
-    def __init__(self, task: Task, random: Random, shape: tuple[int, int]) -> None:
+    def __init__(self, task: Task, scenery: Scenery, shape: tuple[int, int]) -> None:
         from ...rendering.cameras import Cameras
 
         self._task = task
         self._shape = shape
-        self._random = random
+        self._scenery = scenery
         self.views = chosen_views(task.config.cameras, task.vehicle.cameras)
-        self._scenes = scenes_of(str(task.config.scene))
+        self._scenes = scenery.scene.single
         threads = min(os.cpu_count() or 1, shape[0], _MAX_THREADS)
         # It starts them with the first picture, so that a process may be forked before.
         self._pool = ThreadPoolExecutor(threads, "cameras")
@@ -102,12 +101,6 @@ class Pictures(Stage):
         for painter in self._painters:
             painter.cameras.close()
 
-    def begin(self, record: Record) -> None:
-        """Draw the scene of each world."""
-        shares = Draw(self._random, SCENES, record.begun).uniform(0.0, 1.0)
-        of_worlds = (shares[:, :1] * len(self._scenes)).astype(int)
-        record.scenes = np.repeat(of_worlds, self._shape[1], axis=1)
-
     def step(self, record: Record) -> None:
         """Add all pictures to the observations, shape (W, A, height, width, channels).
 
@@ -130,7 +123,7 @@ class Pictures(Stage):
         rows = {name: np.reshape(values, (count, -1)) for name, values in seen.items()}
         last = vars(record).get("pictures", self._blank)
         record.pictures = {name: np.array(picture) for name, picture in last.items()}
-        self._take(record.pictures, due, rows, record.scenes[:, 0])
+        self._take(record.pictures, due, rows, self._scenery.which)
         record.observations = {**record.observations, **record.pictures}
 
     def _take(

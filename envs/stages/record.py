@@ -52,7 +52,6 @@ class Record:
         waiting: Drones that must be reset before they fly, (W, A).
         actions_sent, past_observations, history: Of the last steps, the oldest first.
         said, heard, age, keys, silent: Of the radio; see `Radio`.
-        scenes: Number of each world's scene, (W, A).
         pictures: Last picture of each camera by name, (W, A, height, width, channels).
     """
 
@@ -74,7 +73,6 @@ class Record:
     reward: Floats
     terminated: Mask
     truncated: Mask
-    scenes: NDArray[np.int64]
     pictures: ByName
     said: Floats
     heard: Floats

@@ -52,8 +52,8 @@ def _nothing_runs_on() -> Iterator[None]:
     """After a test that failed, too."""
     yield
     for process in started:
-        if process.poll() is None:
-            process.kill()
+        process.kill()
+        if process.stdout is not None and not process.stdout.closed:
             process.communicate()
     started.clear()
 
