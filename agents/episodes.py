@@ -57,7 +57,8 @@ class Episode:
     total_reward: float
     """Return, not discounted."""
     mean_size: float
-    """Mean of |headline metric| over its steps, in the metric's unit; NaN if there is none."""
+    """Mean of |headline metric| over its steps, in the metric's unit; of a `final` one its size at
+    the end; NaN if there is none."""
     terminated: bool
     truncated: bool
     seconds: float
@@ -317,7 +318,12 @@ class EpisodeRecorder:
         sizes = np.abs(values)
         self._lengths += 1 if idle is None else ~idle
         self._rewards += self.env.rewards  # 0 of those that did not fly
-        self._sizes += sizes if idle is None else np.where(idle, 0.0, sizes)
+        metric = self.spec.headline
+        if metric is None or not metric.final:
+            self._sizes += sizes if idle is None else np.where(idle, 0.0, sizes)
+        else:
+            last = sizes * self._lengths  # over which it is divided
+            self._sizes = last if idle is None else np.where(idle, self._sizes, last)
         if self._keep_steps:
             thrust = self.env.telemetry.get("thrust", self._nothing).mean(axis=1)
             table = np.stack((self._numbers, values, self.env.rewards, thrust), axis=1)

@@ -12,7 +12,7 @@ from .config import Config
 from .episodes import EpisodeRecorder
 from .networks import ByName, Weights, make_network, named
 from .optimizers import Adam
-from .policies import NetworkPolicy, flat_size
+from .policies import NetworkPolicy, distances_in, flat_size
 from .rollouts import Collector, Diverged, Rollout
 
 OnUpdate = Callable[[], bool]
@@ -49,8 +49,10 @@ class Learner:
         self.terms: dict[str, Any] = {}
         weights_seed, self._rng = seeds_of(seed)
         self._actor = actor = NetworkPolicy(log.spec, config)
-        inputs = flat_size(log.spec) * (len(log.spec.agents) if self.central else 1)
-        self._both = make_network(inputs, actor.actions.outputs, config)
+        copies = len(log.spec.agents) if self.central else 1
+        inputs = copies * flat_size(log.spec)
+        seen = distances_in(log.spec, copies)
+        self._both = make_network(inputs, actor.actions.outputs, config, seen)
         count = 2 if self.has_critic else 1
         shapes = {**self._both.shapes, **actor.head.shapes}
         self.weights = Weights.zeros({name: (count, *shape) for name, shape in shapes.items()})
@@ -59,7 +61,7 @@ class Learner:
         rng = np.random.default_rng(weights_seed)
         actor.initialise(rng, config.log_std)
         if self.has_critic:
-            self._critic = make_network(inputs, 1, config)
+            self._critic = make_network(inputs, 1, config, seen)
             self._critic.bind(self.weights.of_one(1, self._critic.shapes))
             self._critic.initialise(rng, 1.0)
         self.optimizer = Adam(self.weights, self.epsilon)

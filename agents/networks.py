@@ -26,6 +26,7 @@ Parts = dict[str, Floats]
 ByName = dict[str, np.ndarray]
 Shapes = Mapping[str, tuple[int, ...]]
 Item = TypeVar("Item")
+_ZERO, _QUARTER, _HALF, _ONE, _TWO = map(np.float32, (0.0, 0.25, 0.5, 1.0, 2.0))
 
 
 def named(prefix: str, items: Mapping[str, Item]) -> dict[str, Item]:
@@ -185,6 +186,33 @@ class Tanh(Layer):
         return slope
 
 
+class Nearness(Layer):
+    """2 / (1 + d / 2 m) - 1 / 2 of distances d >= 0 m, in their place: what is near differs most.
+
+    `places` has the slices of the inputs that are distances; the others stay.
+    """
+
+    def __init__(self, places: Sequence[slice]) -> None:
+        self.places = places
+
+    def forward(self, inputs: Floats) -> Floats:
+        self._inputs = inputs
+        for place in self.places:
+            values = inputs[..., 1:, :][..., place, :]
+            np.maximum(values, _ZERO, out=values)
+            values *= _HALF
+            values += _ONE
+            np.divide(_TWO, values, out=values)
+            values -= _HALF
+        return inputs
+
+    def back(self, slope: Floats) -> Floats:
+        for place in self.places:
+            values = self._inputs[..., 1:, :][..., place, :] + _HALF
+            slope[..., place, :] *= -_QUARTER * values * values
+        return slope
+
+
 class Network(Module):
     """Layers in a row, from inputs (..., n, B) to outputs (..., k, B). Subclasses build them.
 
@@ -193,8 +221,13 @@ class Network(Module):
         shapes: Of all weights: `layers.0.weight` and so on, counted by layers that have weights.
     """
 
-    def __init__(self, inputs: int, outputs: int, config: Config) -> None:
+    def __init__(
+        self, inputs: int, outputs: int, config: Config, distances: Sequence[slice] = ()
+    ) -> None:
+        """`distances`: which of the inputs are distances, m, of rays."""
         self.layers = list(self.build(inputs, outputs, config))
+        if distances:
+            self.layers.insert(0, Nearness(distances))
         with_weights = [layer for layer in self.layers if layer.shapes]
         self._named = {f"layers.{i}.": layer for i, layer in enumerate(with_weights)}
         shapes: dict[str, tuple[int, ...]] = {}
@@ -232,11 +265,12 @@ class Network(Module):
 
         Once after a `forward`; the slope and what that returned are overwritten.
         """
-        first = self.layers[0]
+        first = next(layer for layer in self.layers if layer.shapes)
         for layer in reversed(self.layers):
             layer.learn(slope)
-            if layer is not first:
-                slope = layer.back(slope)
+            if layer is first:
+                break
+            slope = layer.back(slope)
 
 
 _ACTIVATIONS = {"relu": Relu, "tanh": Tanh}
@@ -258,14 +292,16 @@ NETWORKS: dict[str, type[Network]] = {"mlp": MLP}
 """Kinds of networks by the name in a config. A kind of your own is a new entry."""
 
 
-def make_network(inputs: int, outputs: int, config: Config) -> Network:
+def make_network(
+    inputs: int, outputs: int, config: Config, distances: Sequence[slice] = ()
+) -> Network:
     """A network of the kind that a config names. Raises `InputError` for an unknown one."""
     if config.network not in NETWORKS:
         raise InputError(
             f"network: expected one of {', '.join(NETWORKS)}, got {config.network!r}; import the "
             "module that registers it first"
         )
-    return NETWORKS[config.network](inputs, outputs, config)
+    return NETWORKS[config.network](inputs, outputs, config, distances)
 
 
 def orthogonal(rng: Generator, shape: tuple[int, ...], gain: float) -> NDArray[np.float64]:

@@ -44,6 +44,20 @@ def flat_size(spec: EnvSpec) -> int:
     return sum(array.size for array in spec.observation)
 
 
+def distances_in(spec: EnvSpec, copies: int = 1) -> list[slice]:
+    """Where flat observations, some of them side by side, have distances along rays: arrays of two
+    axes, m, from 0 on.
+    """
+    places = []
+    first = 0
+    for array in copies * spec.observation:
+        last = first + array.size
+        if array.unit == "m" and len(array.shape) == 2 and array.low == 0.0:
+            places.append(slice(first, last))
+        first = last
+    return places
+
+
 class ActionMap:
     """Maps outputs of a network to actions of an env.
 
@@ -108,7 +122,7 @@ class NetworkPolicy(Module):
         self.spec = spec
         self.actions = ActionMap(spec.action)
         outputs = self.actions.outputs
-        self.network = make_network(flat_size(spec), outputs, config)
+        self.network = make_network(flat_size(spec), outputs, config, distances_in(spec))
         self.head: Head = Head() if config.squashed else Gaussian(outputs)
         if self.actions.discrete:
             self.head = Categorical(outputs)

@@ -13,7 +13,7 @@ from .config import Config, SACConfig
 from .episodes import EpisodeRecorder
 from .learner import OnUpdate, seeds_of
 from .networks import ByName, Floats
-from .policies import NetworkPolicy
+from .policies import NetworkPolicy, distances_in
 from .ppo import PPO, PPOConfig
 from .rollouts import Diverged
 
@@ -156,6 +156,10 @@ class SB3Agent:
     def __init__(self, log: EpisodeRecorder, config: A2CConfig | SACConfig, seed: int) -> None:
         if config.network != "mlp":
             raise InputError(f"network: expected mlp with SB3, got {config.network!r}")
+        if distances_in(log.spec):
+            raise InputError(
+                "sb3: expected no distances of rays, which our own agents see as nearness"
+            )
         self.spec = log.spec
         self._config = config
         self._rate = config.learning_rate

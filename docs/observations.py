@@ -50,6 +50,11 @@ def _rows(array: ArraySpec) -> Iterator[tuple[str, ...]]:
     """Index, quantity, unit and bounds; a vector has one row, and so have rotors."""
     low, high = (bound.ravel() for bound in array.bounds())
     units = [array.unit] * low.size if isinstance(array.unit, str) else array.unit
+    if low.size > 1 and not array.components:
+        rows, columns = array.shape
+        quantity = f"{rows} rows of {columns} distances"
+        yield f"0-{low.size - 1}", quantity, units[0], _bounds(low[0], high[0])
+        return
     names = array.components or (array.name,)
 
     def key(index: int) -> tuple[object, ...]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from ...models.errors import InputError, require
 from ..checkpoints import Checkpoint
-from ..networks import Affine, Relu, Tanh
+from ..networks import Affine, Nearness, Relu, Tanh
 from ..policies import NetworkPolicy, flat_size
 
 FORMAT = 1
@@ -40,10 +40,9 @@ def export(checkpoint: Checkpoint, target: str) -> bytes:
     module = import_module(f"{__name__}.{target}")
     policy = checkpoint.policy()
     for layer in policy.network.layers:
-        if not isinstance(layer, Affine | Relu | Tanh):
-            raise InputError(
-                f"export: expected layers of affine, relu and tanh, got {type(layer).__name__}"
-            )
+        if not isinstance(layer, Affine | Nearness | Relu | Tanh):
+            expected = "layers of affine, nearness, relu and tanh"
+            raise InputError(f"export: expected {expected}, got {type(layer).__name__}")
     _check_finite(policy)
     return bytes(module.write(policy, metadata(checkpoint)))
 

@@ -16,7 +16,7 @@ from ...envs.spec import (
     component_names,
     component_units,
 )
-from ..networks import Affine, Floats, Relu, Tanh
+from ..networks import Affine, Floats, Nearness, Relu, Tanh
 from ..policies import NetworkPolicy, flat_size
 
 _LARGEST = float(np.finfo(np.float32).max)
@@ -104,6 +104,8 @@ class _Program:
                 self.lines += [f"float {outputs}[{units}];", f"rotorgram_layer({arguments});"]
                 self.at = outputs
                 self.size = units
+            elif isinstance(layer, Nearness):
+                self._near(layer)
             elif isinstance(layer, Relu):
                 self._each(f"{self.at}[i] = {self.at}[i] < 0.0f ? 0.0f : {self.at}[i];")
             else:
@@ -122,6 +124,17 @@ class _Program:
     def _each(self, statement: str) -> None:
         """A loop over the numbers so far."""
         self.lines += [f"for (int i = 0; i < {self.size}; i++)", f"    {statement}"]
+
+    def _near(self, layer: Nearness) -> None:
+        """Distances as nearness, in a copy of the observation."""
+        self.lines.append(f"float seen[{self.size}];")
+        self._each("seen[i] = observation[i];")
+        self.at = "seen"
+        for place in layer.places:
+            self.lines += [
+                f"for (int i = {place.start}; i < {place.stop}; i++)",
+                "    seen[i] = 2.0f / (1.0f + (seen[i] < 0.0f ? 0.0f : 0.5f * seen[i])) - 0.5f;",
+            ]
 
     def _act(self, policy: NetworkPolicy) -> None:
         """Map the outputs to the range of the action, and clip them to its bounds."""

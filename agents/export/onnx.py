@@ -6,7 +6,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from ..networks import Affine
+from ..networks import Affine, Nearness
 from ..policies import NetworkPolicy, flat_size
 
 OPSET = 13  # the first in which ArgMax, Max and Min are as they are today
@@ -24,11 +24,34 @@ class _Graph:
         """Append a node on the last output and some constants."""
         before = self.nodes[-1].output[0] if self.nodes else "observation"
         output = f"x{len(self.nodes)}"
-        names = []
-        for constant in constants:
-            names.append(f"c{len(self.constants)}")
-            self.constants.append(numpy_helper.from_array(constant, names[-1]))
+        names = [self._kept(constant) for constant in constants]
         self.nodes.append(helper.make_node(operator, [before, *names], [output], **attributes))  # type: ignore[arg-type]
+
+    def near(self, layer: Nearness, size: int) -> None:
+        """2 m / (1 + m x / 2) - m / 2 + (1 - m) x, where m is 1 for a distance and 0 otherwise.
+
+        A distance below 0 counts as 0.
+        """
+        mask = np.zeros((1, size), np.float32)
+        for place in layer.places:
+            mask[:, place] = 1.0
+        half = np.float32(0.5)
+        self.then("Mul", half * mask)
+        self.then("Relu")
+        self.then("Add", np.ones_like(mask))
+        self.then("Reciprocal")
+        self.then("Mul", mask / half)
+        self.then("Add", -half * mask)
+        seen = self.nodes[-1].output[0]
+        others = self._kept(np.float32(1.0) - mask)
+        self.nodes.append(helper.make_node("Mul", ["observation", others], ["others"]))
+        self.nodes.append(helper.make_node("Add", [seen, "others"], ["inputs"]))
+
+    def _kept(self, constant: np.ndarray) -> str:
+        """The name of a new constant."""
+        name = f"c{len(self.constants)}"
+        self.constants.append(numpy_helper.from_array(constant, name))
+        return name
 
 
 def write(policy: NetworkPolicy, facts: Mapping[str, str]) -> bytes:
@@ -41,6 +64,8 @@ def write(policy: NetworkPolicy, facts: Mapping[str, str]) -> bytes:
     for layer in policy.network.layers:
         if isinstance(layer, Affine):
             graph.then("Gemm", layer.weight[:, 1:], layer.weight[:, 0], transB=1)
+        elif isinstance(layer, Nearness):
+            graph.near(layer, flat_size(policy.spec))
         else:
             graph.then(type(layer).__name__)  # Relu or Tanh
     kind: int = TensorProto.INT64

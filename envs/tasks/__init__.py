@@ -3,8 +3,8 @@
 from ... import import_when_used
 
 __all__ = [
-    "Cable", "Crossing", "Elevation", "Escort", "Formation", "Hover", "Landing", "PayloadHover",
-    "Racing", "Recovery", "Tracking", "Waypoints",
+    "Cable", "Crossing", "Elevation", "Escort", "Forest", "Formation", "Hover", "Landing",
+    "PayloadHover", "Racing", "Recovery", "Tracking", "Waypoints",
 ]  # fmt: skip
 
 _modules = {name: f".{name.lower()}" for name in __all__} | {"PayloadHover": ".payload_hover"}

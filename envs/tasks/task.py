@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from ...models.errors import InputError, UnknownOption
 from ...models.fields import check_fields, immutable
+from ...scenes import SceneConfig
 from ...sim import LEVELS, Array, Controller, Draw, InitialState, make_controller
 from ..memory import Memory
 from ..spec import ArraySpec, Mark, Metric
@@ -80,6 +81,7 @@ class Task(ABC):
         min_drones, max_drones: Drones of one world; the task separates their starts.
         actions: Action levels at which the task can be flown.
         action, control_period, episode_length: Defaults of an `EnvConfig`.
+        defaults: Further ones: its fields `vehicle` and `sensors`, where they are empty.
         has_radio: Whether drones hear each other: see `stages/radio.py`.
         worst_step: No step's reward is lower, but for terms that add up to a difference, as
             progress does.
@@ -102,6 +104,7 @@ class Task(ABC):
     min_drones: ClassVar[int] = 1
     max_drones: ClassVar[int] = 1
     actions: ClassVar[tuple[str, ...]] = LEVELS
+    defaults: ClassVar[Mapping[str, Any]] = {}
     has_radio: bool = False
     worst_step: ClassVar[float] = 0.0
 
@@ -155,6 +158,11 @@ class Task(ABC):
         It may add, and never drop. Raises `InputError` for what contradicts the task.
         """
         return config
+
+    @classmethod
+    def scene(cls, options: Any) -> SceneConfig:
+        """What is flown in unless an `EnvConfig` names another scene."""
+        return SceneConfig()
 
     @abstractmethod
     def setup(self) -> None:

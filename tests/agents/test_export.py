@@ -160,6 +160,7 @@ CASES: dict[str, Callable[[], NetworkPolicy]] = {
     "hexa": lambda: policy_of(hover(vehicle="heavy_hexa")),
     "half bounded": lambda: policy_of(HALF_BOUNDED, (8,)),
     "choice": lambda: policy_of(CHOICE, (16, 8), "tanh"),
+    "by sight": lambda: policy_of(env_spec(EnvConfig(env_id="rotorgram/Forest-v0")), (16,), "tanh"),
     "linear": lambda: policy_of(spec_of(), ()),
 }
 RUNNERS = {"onnxruntime": by_onnxruntime, "gcc": by_gcc, "g++": by_gpp}

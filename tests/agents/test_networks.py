@@ -5,9 +5,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from nets import bound, mlp_of, random_policy
+from nets import bound, config_of, mlp_of, random_policy
 from rotorgram.agents.config import Config
 from rotorgram.agents.networks import (
+    MLP,
     Affine,
     Layer,
     Network,
@@ -173,3 +174,28 @@ def test_activations_may_come_first_and_last() -> None:
     assert inputs.tolist() == [[0.5], [-2.0]]
     columns = np.linalg.norm(weights.arrays["layers.0.weight"][:, 1:], axis=0)
     np.testing.assert_allclose(columns, 0.01, rtol=1e-5)
+
+
+def test_distances_come_in_as_nearness() -> None:
+    network = MLP(6, 2, config_of((4,), "tanh"), [slice(1, 3), slice(5, 6)])
+    weights = bound(network)
+    weights.values[:] = normal(weights.values.size)
+    inputs = np.abs(normal(6, BATCH)) * 3.0
+    tensor = torch.tensor(inputs.T, requires_grad=True)
+    near = 2 / (1 + tensor / 2) - 0.5
+    is_near = torch.tensor([False, True, True, False, False, True])
+    arrays = tensors(weights)
+    outputs = torch_mlp(arrays, torch.where(is_near, near, tensor), "tanh")
+    got = network.forward(inputs)
+    np.testing.assert_allclose(got, outputs.detach().numpy().T, rtol=1e-5, atol=1e-6)
+    slope = normal(2, BATCH)
+    outputs.backward(torch.tensor(slope.T))
+    network.backward(slope.copy())
+    agree(weights, arrays)
+    back = slope.copy()
+    network.forward(inputs)
+    for layer in reversed(network.layers):
+        back = layer.back(back)
+    theirs = tensor.grad
+    assert theirs is not None
+    np.testing.assert_allclose(back, theirs.numpy().T, rtol=1e-4, atol=1e-5)

@@ -94,7 +94,7 @@ def test_what_crosses_the_wire_needs_numpy_alone(where: str) -> None:
 def test_a_task_knows_the_world_and_the_spec() -> None:
     names = imported("envs/tasks")
     ours = {name for name in names if name.startswith("rotorgram.")}
-    assert packages(names) == {"envs", "models", "sim"}
+    assert packages(names) == {"envs", "models", "scenes", "sim"}
     assert {name for name in ours if ".envs." in name} == {
         "rotorgram.envs.config",
         "rotorgram.envs.memory",

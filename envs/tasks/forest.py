@@ -1,0 +1,262 @@
+"""`rotorgram/Forest-v0`: through a wood to a goal at a wanted speed."""
+
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+
+from ...models import InputError
+from ...models.fields import Limits, NumberOrPair, immutable
+from ...scenes import SceneConfig
+from ...scenes.config import MAX_TREES
+from ...sim import (
+    Array,
+    Draw,
+    InitialState,
+    body_x,
+    body_z,
+    clip,
+    exp,
+    length,
+    parts_of,
+    square_root,
+    stack,
+)
+from ..spec import ArraySpec, Metric
+from ..state import State
+from .goal import LEAST_TILT_COSINE, MAX_RATE, MAX_SPEED, Number, along, ends_of
+from .task import Outcome, Task, TaskOptions
+
+AISLE = 2.0
+"""From the ends of the wood to start and goal, m."""
+_WAY = (10.0, 100.0)  # m
+_REACHED = 1.0  # m: of the goal, in the plane and in height
+_LOW, _HIGH = 1.3, 2.2  # m: heights of start and goal
+_CEILING = 4.0  # m: a craft does not fly over the wood
+_BEHIND = 3.0  # m: that a craft may be behind start or goal
+_SPEEDING = 0.025  # s/m: cost of a step that is faster than wanted, by up to 1 m/s
+_ASIDE = 0.015  # 1/m: cost of another height than the goal's, by up to 1 m
+_NEAR = 0.03  # cost of a step that touches; e times less each 0.25 m further off
+_CHANGE = 0.005  # cost of the square of a change of the action, up to 2
+_ARRIVAL = 1.0
+_SHARE = 0.8  # of an episode in which the goal can be reached at the wanted speed
+_FAST = 1.05  # of the wanted speed: more speed earns nothing
+
+
+@immutable
+class ForestOptions(TaskOptions):
+    """Options of `rotorgram/Forest-v0`."""
+
+    density: Annotated[float, Limits(1e-3, 0.5, "1/m²")] = 0.1
+    """Trees per square metre."""
+    speed: Annotated[float | tuple[float, float], NumberOrPair(Limits(0.5, 20.0, "m/s"))] = 3.0
+    """Wanted speed, m/s; of a pair, each episode draws one between."""
+    way: Annotated[float, Limits(*_WAY, "m")] = 30.0
+    """From start to goal, m."""
+    width: Annotated[float, Limits(10.0, 100.0, "m")] = 16.0
+    """Of the wood, m."""
+
+    def check(self) -> None:
+        """Refuse more trees than a scene may have. Raises `InputError`."""
+        trees = round((self.way + 2 * AISLE) * self.width * self.density)
+        if trees > MAX_TREES:
+            expected = f"at most {MAX_TREES} trees"
+            raise InputError(f"density, way and width: expected {expected}, got {trees}")
+
+
+class Forest(Task):
+    """Fly through a wood that was never seen to a goal behind it.
+
+    ## Observation
+
+    `observation`, `float32`, shape (16 + k,) for k numbers of an action, in the world frame turned
+    by the heading, forward, left and up: the wanted velocity, which points to the goal in the
+    plane, m/s (2); the goal's height above the craft, m; velocity, m/s (3); the direction of the
+    thrust (3); body rates, body frame, rad/s (3); height, m; the way to the goal in the plane, m;
+    wanted speed, m/s; time left at that speed, s; the last action (k).
+
+    `depth`, `float32`, shape (6, 32): a depth camera of 120°, m. The option `sensors` takes others.
+
+    ## Action
+
+    By the option `action`; with `velocity` velocity and yaw rate.
+
+    ## Reward
+
+    What the way to the goal became shorter by in this step, over the wanted speed, s, but no more
+    than 1.05 steps; -0.025 s/m times what the speed is above 1.05 of the wanted one, up to 1 m/s;
+    -0.015 1/m times the difference in height to the goal, up to 1 m; -0.03 exp(-clearance /
+    0.25 m); -0.005 times the square of the change of the action, up to 2; 1 at the goal; and -8 on
+    a step that terminates elsewhere. All are ours.
+
+    ## Start, termination, truncation
+
+    At rest, level, looking at the goal, 1.3 m to 2.2 m high.
+
+    *Terminated*: within 1 m of the goal in the plane and in height; by contact; a tilt above 90°;
+    beside the wood, 3 m behind start or goal, or higher than 4 m. *Truncated*: after 400 steps of
+    0.05 s.
+    """
+
+    Options = ForestOptions
+    worst_step = -(_SPEEDING + _ASIDE + _NEAR + 2 * _CHANGE)
+    action = "velocity"
+    control_period = 0.05
+    episode_length = 400
+    defaults: ClassVar[Mapping[str, Any]] = {
+        "vehicle": ("hummingbird",),
+        "sensors": {"depth": {"rows": 6, "columns": 32, "fov": 120.0}},
+    }
+    metrics = (
+        Metric(name="success", unit="", goal="high", held=0.5, final=True),
+        Metric(name="touched", unit="", final=True),
+        Metric(name="mean_speed", unit="m/s", goal="high", final=True),
+        Metric(name="top_speed", unit="m/s", goal="high", final=True),
+        Metric(name="least_clearance", unit="m", goal="high", final=True),
+        Metric(name="flight_time", unit="s", final=True),
+    )
+
+    @classmethod
+    def scene(cls, options: Any) -> SceneConfig:
+        """A new wood in each episode."""
+        size = options.way + 2 * AISLE, options.width
+        return SceneConfig(
+            name="forest", layouts="new", density=options.density, size=size, clear="ends"
+        )
+
+    def setup(self) -> None:
+        """See the class."""
+        options = self.options
+        self._half = options.way / 2
+        slowest, _ = ends_of(options.speed)
+        least = options.way / (_SHARE * self.episode_length * self.control_period)
+        if slowest < least and self.episode_length == type(self).episode_length:
+            expected = f"at least {least:.3g} m/s, for {options.way:g} m in the time of an episode"
+            raise InputError(f"speed: expected {expected}, got {slowest:g}")
+        scene = self.config.scene
+        long = (scene.size or (0.0,))[0] >= options.way + 2 * AISLE
+        if scene.name == "forest" and not (scene.clear == "ends" and long):
+            expected = f"clear=ends and at least {options.way + 2 * AISLE:g} m along x"
+            raise InputError(f"scene: expected {expected}, got {scene}")
+        furthest = options.way + options.width
+        numbers = along("wanted velocity", "m/s", MAX_SPEED, "xy")
+        numbers.append(Number("goal - height", "m", -10.0, 10.0))
+        numbers += along("velocity", "m/s", MAX_SPEED) + along("thrust axis", "1", 1.001)
+        numbers += along("body rate", "rad/s", MAX_RATE)
+        numbers.append(Number("height", "m", -10.0, 100.0))
+        numbers.append(Number("way", "m", 0.0, furthest))
+        numbers.append(Number("wanted speed", "m/s", 0.0, MAX_SPEED))
+        numbers.append(Number("time left", "s", -100.0, 100.0))
+        controller = self.controller
+        for name in controller.components:
+            numbers.append(Number(f"last {name}", "1", -1.0, 1.0))
+        names, units, lows, highs = zip(*numbers, strict=True)
+        self.observation = (
+            ArraySpec(
+                name="observation",
+                shape=(len(numbers),),
+                low=lows,
+                high=highs,
+                unit=units,
+                frame="world turned by the heading; body rates: body",
+                components=names,
+            ),
+        )
+        self._bounds = np.array(lows), np.array(highs)
+
+    def begin(self, mask: Array, draw: Draw) -> InitialState:
+        """At rest before the wood, looking at the goal."""
+        height = draw.uniform(_LOW, _HIGH, (2,))
+        memory = self.memory
+        memory.height = height[..., 1]
+        memory.speed = draw.uniform(*ends_of(self.options.speed))
+        memory.way = 0.0 * memory.speed + self.options.way
+        memory.progress = memory.change = memory.path = memory.top = 0.0
+        memory.least = 0.0 * memory.speed + np.inf
+        memory.last = np.zeros_like(height, shape=(*mask.shape, len(self.controller.components)))
+        start = stack((0.0 * memory.speed - self._half, 0.0 * memory.speed, height[..., 0]))
+        return InitialState(position=start)
+
+    def goal(self, state: State) -> Array:
+        """Behind the wood."""
+        height = self.memory.height
+        return stack((0.0 * height + self._half, 0.0 * height, height))
+
+    def update_memory(self, state: State) -> None:
+        """How much shorter the way became; what was flown; what came nearest."""
+        memory = self.memory
+        way = self._way(state)
+        memory.progress = memory.way - way
+        memory.way = way
+        change = state.action - memory.last
+        memory.change = (change * change).sum(axis=-1)
+        memory.last = 1.0 * state.action
+        speed = length(state.velocity)
+        memory.path = memory.path + speed * self.control_period
+        memory.top = np.maximum(memory.top, speed)
+        memory.least = np.minimum(memory.least, state.clearance)
+
+    def observe(self, state: State) -> dict[str, Array]:
+        """See the class."""
+        memory = self.memory
+        x, y, _ = parts_of(body_x(state.quaternion))
+        size = square_root(x * x + y * y) + 1e-9
+        c, s = x / size, y / size
+
+        def turned(a: Array, b: Array) -> tuple[Array, Array]:
+            return c * a + s * b, c * b - s * a
+
+        to_goal = self.goal(state) - state.position
+        dx, dy, up = parts_of(to_goal)
+        way = self._way(state)
+        wanted = memory.speed / (way + 1e-6)
+        vx, vy, vz = parts_of(state.velocity)
+        ax, ay, az = parts_of(body_z(state.quaternion))
+        left = way / memory.speed
+        parts = (
+            *turned(wanted * dx, wanted * dy), up, *turned(vx, vy), vz, *turned(ax, ay), az,
+            *parts_of(state.body_rates), state.position[..., 2], way, memory.speed + 0.0 * way,
+            left, *parts_of(memory.last),
+        )  # fmt: skip
+        return {"observation": clip(stack(parts), *self._bounds)}
+
+    def outcome(self, state: State) -> Outcome:
+        """Progress, and the end at the goal, by contact or beside the wood."""
+        memory = self.memory
+        position = state.position
+        off = abs(position[..., 2] - memory.height)
+        arrived = (memory.way < _REACHED) & (off < _REACHED)
+        beside = (
+            (abs(position[..., 1]) > self.options.width / 2)
+            | (abs(position[..., 0]) > self._half + _BEHIND)
+            | (position[..., 2] > _CEILING)
+        )
+        touched = state.touching
+        crashed = touched | beside | (state.tilt_cosine < LEAST_TILT_COSINE)
+        success = arrived > crashed
+        speed = length(state.velocity)
+        most = _FAST * self.control_period
+        terms = {
+            "progress": np.minimum(memory.progress / memory.speed, most),
+            "speeding": -_SPEEDING * clip(speed - _FAST * memory.speed, 0.0, 1.0),
+            "height": -_ASIDE * np.minimum(off, 1.0),
+            "nearness": -_NEAR * exp(-np.maximum(state.clearance, 0.0) / 0.25),
+            "change": -_CHANGE * np.minimum(memory.change, 2.0),
+            "arrival": _ARRIVAL * success,
+            "termination": self.crash(crashed),
+        }
+        time = np.maximum(state.time, self.control_period)
+        metrics = {
+            "success": success * 1.0,
+            "touched": touched * 1.0,
+            "mean_speed": memory.path / time,
+            "top_speed": memory.top,
+            "least_clearance": np.minimum(memory.least, state.clearance),
+            "flight_time": state.time,
+        }
+        return Outcome(reward=terms, terminated=crashed | success, metrics=metrics)
+
+    def _way(self, state: State) -> Array:
+        """To the goal in the plane, m."""
+        x, y, _ = parts_of(self.goal(state) - state.position)
+        return square_root(x * x + y * y)
