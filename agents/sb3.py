@@ -158,7 +158,8 @@ class SB3Agent:
             raise InputError(f"network: expected mlp with SB3, got {config.network!r}")
         if distances_in(log.spec):
             raise InputError(
-                "sb3: expected no distances of rays, which our own agents see as nearness"
+                "sb3: expected observations without distances of rays, which our own agents "
+                "take as nearness and SB3's do not"
             )
         self.spec = log.spec
         self._config = config

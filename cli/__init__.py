@@ -110,10 +110,8 @@ def _run(words: list[str]) -> int:
     if get_terminal_size().columns < 40:  # tyro does not end on narrower terminals
         os.environ["COLUMNS"] = "40"
     early = _simulator(name, words)
-    with (
-        hidden_gl_setting(),
-        early,
-    ):  # importing OpenGL takes time, also for a command that draws nothing
+    # Importing OpenGL takes time, also for a command that draws nothing.
+    with hidden_gl_setting(), early:
         module = import_module(f".{name.replace('-', '_')}", __name__)
         kind: type[Command] = getattr(module, _class_of(name))
         return parse(kind, f"rotorgram {name}", words[1:]).run() or 0

@@ -140,7 +140,7 @@ class EnvFlags(Command):
     def shown_scene(self) -> str | None:
         """The scene that the user wants to see, if it is a single one."""
         scene = self.options.get("scene")
-        return str(scene) if scene and len(SceneConfig.parse(scene).single) == 1 else None
+        return str(scene) if scene and len(SceneConfig.parse(scene).given_scenes) == 1 else None
 
 
 class BackendFlags(EnvFlags):

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..models.errors import InputError, one_line
 from ..sim import Array, PhysicsError
-from ..sim.sensors.sight import View
+from ..sim.sensors.range_sensors import View
 from ..sim.snapshots import Arrays, Snapshot
 from ..sim.state import some
 from ..sim.world import tell_once
@@ -81,7 +81,7 @@ class CompiledLoop(Loop):
         self._take_told(told)
         if some(results["wrong"]):
             self._check()
-        self._look()
+        self._measure_ranges()
 
     def prepare(self) -> None:
         """Compile."""

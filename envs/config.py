@@ -315,7 +315,7 @@ class EnvConfig:
             most = f" to {task.max_drones}" if task.max_drones > task.min_drones else ""
             expected = f"{task.min_drones}{most} with {self.env_id}"
             raise InputError(f"drones: expected {expected}, got {self.drones}")
-        if self.cameras and not self.scene.single:
+        if self.cameras and not self.scene.given_scenes:
             raise InputError(
                 f"cameras: expected a scene of given seeds, as forest:0-7, got {self.scene}"
             )

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from ..models.errors import InputError
 from ..sim import Array, PhysicsError, Randomization, World, make_world
-from ..sim.sensors.sight import View
+from ..sim.sensors.range_sensors import View
 from ..sim.snapshots import Arrays, Snapshot, joined, part_of
 from ..sim.state import some
 from .autoreset import Content, Seeds, Told, checked_seeds
 from .config import EnvConfig
 from .pipeline import Pipeline
-from .specification import make_task, sights_in, spec_of
+from .specification import make_task, range_sensors_in, spec_of
 from .stages import clock
 from .stages.record import Floats, Mask, Record
 from .tasks.task import Task
@@ -40,7 +40,7 @@ class Loop:
     Attributes:
         config: As given, resolved.
         pipeline: Its stages.
-        sights: Sensors with rays, which look after each step.
+        range_sensors: Sensors with rays, which look after each step.
         arrays: Of the observation, those of the stages.
         quantities: Of the telemetry.
         num_envs: N. Arrays below have one axis of N drones, world by world, and are new after each
@@ -76,9 +76,9 @@ class Loop:
             **backend.settings,
         )
         self.pipeline = pipeline = Pipeline(task, world, shape)
-        self.sights = sights_in(task)
+        self.range_sensors = range_sensors_in(task)
         self.spec = spec_of(config, task)
-        seen = [sight.name for sight in self.sights]
+        seen = [sensor.name for sensor in self.range_sensors]
         self.arrays = [array for array in self.spec.observation if array.name not in seen]
         kept = tuple(name for stage in pipeline.stages for name in stage.arrays)
         self._record = Record(world.shape, task.memory, kept)
@@ -131,7 +131,7 @@ class Loop:
         if some(active):
             record.run(active, pipeline.observe)
         self._take()
-        self._look()
+        self._measure_ranges()
 
     def _begin(self, begun: Mask, seeds: Any) -> None:
         """Begin episodes: the task sets the start, and the other stages follow from it."""
@@ -144,18 +144,18 @@ class Loop:
             self._world.random.seed(begun, seeds[:: len(self.spec.agents)])
         record.run(None if all_begin else begun, begin)
 
-    def _look(self) -> None:
+    def _measure_ranges(self) -> None:
         """Add what sensors with rays see to the observations."""
-        if not self.sights:
+        if not self.range_sensors:
             return
         record = self._record
         nobody = np.zeros(record.shape, bool)
         begun = nobody if record.begun is None else record.begun
         flown = ~nobody if record.flown is None else record.flown
         view = self._view()
-        for sight in self.sights:
-            sight.look(view, begun, flown, self._world.scenery)
-            self.observations[sight.name] = np.array(sight.value).reshape(-1, *sight.shape)
+        for sensor in self.range_sensors:
+            sensor.measure(view, begun, flown, self._world.scenery)
+            self.observations[sensor.name] = np.array(sensor.value).reshape(-1, *sensor.shape)
 
     def _view(self) -> View:
         """From where they look."""
@@ -173,7 +173,9 @@ class Loop:
         Raises `gymnasium.error.ClosedEnvironmentError` after `close`.
         """
         self._check_open()
-        arrays = self.state() | joined({sight.name: sight.snapshot() for sight in self.sights})
+        arrays = self.state() | joined(
+            {sensor.name: sensor.snapshot() for sensor in self.range_sensors}
+        )
         arrays["loop/config"] = np.array(self.spec.config_digest)
         return {**arrays, "loop/arrays": np.array(sorted(arrays))}
 
@@ -199,10 +201,10 @@ class Loop:
         _check_snapshot(snapshot, self._record.shape, self.spec.config_digest)
         self.put(snapshot)
         self._take()
-        for sight in self.sights:
-            sight.restore(part_of(snapshot, sight.name))
-            if sight.value is not None:
-                self.observations[sight.name] = np.array(sight.value).reshape(-1, *sight.shape)
+        for sensor in self.range_sensors:
+            sensor.restore(part_of(snapshot, sensor.name))
+            if sensor.value is not None:
+                self.observations[sensor.name] = np.array(sensor.value).reshape(-1, *sensor.shape)
 
     def put(self, state: Arrays) -> None:
         """Put back what `state` gave."""

@@ -18,7 +18,7 @@ from ..sim.compile import Program, Untraceable, lift, read
 from ..sim.compile.alike import with_calls
 from ..sim.compile.layout import Layout, Memory, fields_of
 from ..sim.compile.llvm import Region, compiled, widest
-from ..sim.sensors.sight import View
+from ..sim.sensors.range_sensors import View
 from ..sim.snapshots import Arrays, Snapshot, joined, part_of
 from ..sim.world import Call
 from .autoreset import Told
@@ -242,8 +242,10 @@ class Machine:
 
     def derivative(self) -> Derivative:
         """That of a step. Raises `InputError` where there are solids or rays, which have none."""
-        if self._world.scenery or self._loop.sights:
-            got = f"{self._world.scenery.scene} and {len(self._loop.sights)} sensors with rays"
+        if self._world.scenery or self._loop.range_sensors:
+            got = (
+                f"{self._world.scenery.scene} and {len(self._loop.range_sensors)} sensors with rays"
+            )
             raise InputError(f"derivative: expected bare ground and no rays, got {got}")
         return Derivative(self._loop, self._layouts[0], self._width, self._worlds)
 
@@ -311,7 +313,7 @@ class Machine:
         seen = {"reward": record.reward, "headline": headline.astype(np.float64)}
         for number, array in enumerate(self._loop.arrays):  # their names are the task's
             seen[f"observation/{number}"] = record.observations[array.name].astype(array.dtype)
-        if self._loop.sights:
+        if self._loop.range_sensors:
             seen |= {_SEEN + name: getattr(record.state, name) for name in _POSE}
         seen |= {name: getattr(record, name) for name in _ENDS}
         return seen | {"wrong": record.unfit | self._loop.world.bad}

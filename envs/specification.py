@@ -4,8 +4,8 @@ from ..models.cameras import chosen_views
 from ..models.errors import InputError
 from ..models.swarm import drone_names
 from ..sim import Controller, Randomization
-from ..sim.sensors import readings_of, sights_of
-from ..sim.sensors.sight import Sight
+from ..sim.sensors import range_sensors_of, readings_of
+from ..sim.sensors.range_sensors import RangeSensor
 from . import registry
 from .config import EnvConfig
 from .spec import ArraySpec, Discrete, EnvSpec
@@ -45,14 +45,14 @@ def spec_of(config: EnvConfig, task: Task) -> EnvSpec:
     """The `EnvSpec` of a config's env, whose task is made."""
     observation = [with_history(array, config.history) for array in observed(task)]
     observation += _pictures(task)
-    for sight in sights_in(task):
+    for sensor in range_sensors_in(task):
         array = ArraySpec(
-            name=sight.name,
-            shape=sight.shape,
+            name=sensor.name,
+            shape=sensor.shape,
             low=0.0,
-            high=sight.errors.reach,
+            high=sensor.errors.reach,
             unit="m",
-            frame=sight.frame,
+            frame=sensor.frame,
         )
         observation.append(array)
     return EnvSpec(
@@ -82,13 +82,13 @@ def observed(task: Task) -> tuple[ArraySpec, ...]:
     return task.observation + tuple(ArraySpec(**reading) for reading in readings)
 
 
-def sights_in(task: Task) -> list[Sight]:
+def range_sensors_in(task: Task) -> list[RangeSensor]:
     """Sensors with rays of a task's drones. Raises `InputError`."""
     config = task.config
     randomize = Randomization(config.randomize, config.effects)
     late = "observation_delay"
     latest = randomize.most_steps(late) if late in randomize.names else 0
-    return sights_of(config.sensors, task.control_period, latest)
+    return range_sensors_of(config.sensors, task.control_period, latest)
 
 
 def _action(controller: Controller) -> ArraySpec | Discrete:
@@ -117,7 +117,7 @@ def _pictures(task: Task) -> tuple[ArraySpec, ...]:
 
     payload = config.effects.payload > 0
     objects = []
-    for scene in config.scene.single:
+    for scene in config.scene.given_scenes:
         model = drawn_model(task.vehicle, config.drones, scene, task.marks, payload=payload)
         objects.append(objects_in(model)[0])
     return arrays_of(views, objects_of_all(objects))

@@ -80,7 +80,7 @@ def quantities_of(task: Task) -> list[Quantity]:
     if effects.payload:
         names = ("payload_x", "payload_y", "payload_z")
         quantities.append(_of_state("payload", names, "m", WORLD))
-    if len(task.config.scene.single) != 1:
+    if len(task.config.scene.given_scenes) != 1:
         quantities.append(Quantity("layout", ("layout",), "", _layout))
     if type(task).goal is not Task.goal:
         quantities.append(Quantity("goal", ("goal_x", "goal_y", "goal_z"), "m", _goal, WORLD))

@@ -124,7 +124,7 @@ class SceneConfig:
         return cls(**values)
 
     @property
-    def single(self) -> "tuple[SceneConfig, ...]":
+    def given_scenes(self) -> "tuple[SceneConfig, ...]":
         """The scenes of which each episode has one; none where each has a new one."""
         if self.layouts != "given":
             return ()
@@ -157,7 +157,7 @@ class SceneConfig:
 def parse_scene(text: Any) -> SceneConfig:
     """A single scene. Raises `InputError`."""
     scene = SceneConfig.parse(text)
-    if len(scene.single) != 1:
+    if len(scene.given_scenes) != 1:
         raise InputError(f"scene: expected one, got {scene}")
     return scene
 

@@ -6,11 +6,11 @@ from mujoco import MjSpec, mjtGeom
 
 from ..models.mjcf import add_ground
 from . import kernels
+from .looks import GEOM_TYPES
 from .solids import Solids
 
 NAME = "rotorgram/solid"
 """Of a geom, before its number."""
-_TYPES = [getattr(mjtGeom, f"mjGEOM_{kind.upper()}") for kind in kernels.KINDS]
 _SPHERE, _CAPSULE, _CYLINDER, _BOX, _PLANE = range(len(kernels.KINDS))
 # MuJoCo's compiler notes which geoms have the axes of their body, and turns these no more.
 _TURNED = (0.8, 0.0, 0.0, 0.6)
@@ -43,7 +43,7 @@ def geoms_of(solids: Solids, count: int) -> dict[str, np.ndarray]:
     quaternion = np.tile(_TURNED, (count, 1))
     size = np.zeros((count, 3))
     size[:, 0] = 0.1
-    type_[:given] = np.array([one.value for one in _TYPES])[kinds]
+    type_[:given] = np.array([one.value for one in GEOM_TYPES])[kinds]
     position[:given] = solids.centers
     for row, axes in zip(quaternion, solids.axes, strict=False):
         mujoco.mju_mat2Quat(row, axes.ravel())

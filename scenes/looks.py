@@ -20,6 +20,8 @@ SKY = mujoco.mjtTexture.mjTEXTURE_SKYBOX
 HALL_XML = Path(__file__).with_name("hall.xml")
 """Walls, windows, roof, lamps and racks of the warehouse."""
 
+GEOM_TYPES = [getattr(mjtGeom, f"mjGEOM_{kind.upper()}") for kind in KINDS]
+"""MuJoCo's, by `kernels.KINDS`."""
 _FLAT = mujoco.mjtBuiltin.mjBUILTIN_FLAT
 _PATTERNS = {
     "checker": (mujoco.mjtBuiltin.mjBUILTIN_CHECKER, mujoco.mjtMark.mjMARK_NONE),
@@ -37,12 +39,13 @@ def add_parts(spec: MjSpec, scene: SceneConfig) -> None:
         walls = MjSpec.from_file(str(HALL_XML))
         spec.attach(walls, prefix="warehouse/", frame=spec.worldbody.add_frame())
     for parts in parts_of(scene, scene.seed):
-        kinds = [getattr(mjtGeom, f"mjGEOM_{KINDS[kind].upper()}") for kind in parts.kinds.tolist()]
-        names, materials = parts.names(), parts.materials()
+        names = parts.names()
+        materials = parts.materials()
         for i, turn in enumerate(parts.headings.tolist()):
+            quaternion = (math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2))
             spec.worldbody.add_geom(
-                name=f"{scene.name}/{names[i]}", type=kinds[i], size=parts.sizes[i],
-                pos=parts.positions[i], quat=(math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2)),
+                name=f"{scene.name}/{names[i]}", type=GEOM_TYPES[parts.kinds[i]],
+                size=parts.sizes[i], pos=parts.positions[i], quat=quaternion,
                 material=f"{scene.name}/{materials[i]}", contype=0, conaffinity=0,
                 group=GROUP, mass=0.0, density=0.0,
             )  # fmt: skip

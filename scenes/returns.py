@@ -19,6 +19,8 @@ LEVELS = 4096
 """How many values a normal number has here: those in the middle of as many equal shares."""
 SHARES = 1 << 20
 """How many shares a probability has."""
+CALM = 0xFFFFF800
+"""A word that loses no return."""
 _BITS = np.uint32(12)  # of a word, below those of a share
 _LEVEL = np.uint32(LEVELS - 1)
 _JUMP = np.float32(0.1)  # of a distance, to the next ray: more is an edge
@@ -39,8 +41,8 @@ def _quantiles() -> Array:
 QUANTILES = _quantiles()
 
 
-class Errors(NamedTuple):
-    """Errors of a sensor: its noise at a distance d has the size noise + share d + growth d², m."""
+class ErrorModel(NamedTuple):
+    """Of a sensor. Its noise at a distance d has the size noise + share d + growth d², m."""
 
     near: float
     """Nearest distance that returns, m."""
@@ -115,7 +117,7 @@ def by_numpy(
         inner: Of ways to a neighbour: how many rays further on it is, and which rays have it,
             int32, (ways, 1 + N). Without any, edges do not matter.
         words: Random, uint32, (M, N).
-        errors: `Errors.numbers()`.
+        errors: `ErrorModel.numbers()`.
     """
     distance = ranges * scale
     is_edge = np.zeros(distance.shape, bool)

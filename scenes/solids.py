@@ -74,7 +74,8 @@ class Solids:
     def of_parts(cls, parts: Sequence[Parts], scene: str) -> Self:
         """What stands in a scene from a seed."""
         if not parts:
-            return cls(tuple, np.zeros(0, np.int8), *map(np.zeros, ((0, 3), (0, 3, 3), (0, 3))))
+            nothing = np.zeros((0, 3))
+            return cls(tuple, np.zeros(0, np.int8), nothing, np.zeros((0, 3, 3)), nothing)
         _, kinds, sizes, centers, _, turns = zip(*parts, strict=True)
         kind = np.concatenate(kinds)
         turn = np.concatenate(turns)

@@ -37,7 +37,7 @@ class Scenery(Kept):
     def __init__(self, scene: SceneConfig, own: Solids, worlds: int) -> None:
         """`own`: what stands in every layout, of the vehicle's file."""
         self.scene = scene
-        self._given = np.array([one.seed for one in scene.single], np.int64)
+        self._given = np.array([one.seed for one in scene.given_scenes], np.int64)
         self.seeds: Array = np.full(worlds, self._given[0] if self._given.size else -1, np.int64)
         self.which: Array = np.zeros(worlds, np.int64)
         self._always = Solids.ground() + own
@@ -144,7 +144,8 @@ class Scenery(Kept):
         count = len(self.seeds)
         made = {world: self.solids(int(self.seeds[world])) for world in worlds.tolist()}
         kinds, tables = self.layouts
-        most = max([kinds.shape[1], *[len(self._always) + len(one) for one in made.values()]])
+        largest = max(map(len, made.values()), default=0)
+        most = max(kinds.shape[1], len(self._always) + largest)
         if kinds.shape != (count, most):
             old = self.layouts
             kinds, tables = self.layouts = Layouts.empty(count, most)

@@ -76,7 +76,7 @@ class Pictures(Stage):
         self._shape = shape
         self._scenery = scenery
         self.views = chosen_views(task.config.cameras, task.vehicle.cameras)
-        self._scenes = scenery.scene.single
+        self._scenes = scenery.scene.given_scenes
         threads = min(os.cpu_count() or 1, shape[0], _MAX_THREADS)
         # It starts them with the first picture, so that a process may be forked before.
         self._pool = ThreadPoolExecutor(threads, "cameras")

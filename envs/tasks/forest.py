@@ -22,9 +22,9 @@ from ...sim import (
     square_root,
     stack,
 )
-from ..spec import ArraySpec, Metric
+from ..spec import Metric
 from ..state import State
-from .goal import LEAST_TILT_COSINE, MAX_RATE, MAX_SPEED, Number, along, ends_of
+from .goal import LEAST_TILT_COSINE, MAX_RATE, MAX_SPEED, Number, along, array_of, ends_of
 from .task import Outcome, Task, TaskOptions
 
 AISLE = 2.0
@@ -150,19 +150,9 @@ class Forest(Task):
         controller = self.controller
         for name in controller.components:
             numbers.append(Number(f"last {name}", "1", -1.0, 1.0))
-        names, units, lows, highs = zip(*numbers, strict=True)
-        self.observation = (
-            ArraySpec(
-                name="observation",
-                shape=(len(numbers),),
-                low=lows,
-                high=highs,
-                unit=units,
-                frame="world turned by the heading; body rates: body",
-                components=names,
-            ),
-        )
-        self._bounds = np.array(lows), np.array(highs)
+        array = array_of(numbers, "world turned by the heading; body rates: body")
+        self.observation = (array,)
+        self._bounds = array.bounds()
 
     def begin(self, mask: Array, draw: Draw) -> InitialState:
         """At rest before the wood, looking at the goal."""

@@ -133,20 +133,10 @@ class GoalTask(Task):
         for rotor, (low, high) in enumerate(limits, 1):
             numbers.append(Number(f"thrust {rotor} over hover", "1", low, high))
         numbers += further
-        names, units, lows, highs = zip(*numbers, strict=True)
         frame = "body" if self.body else "world turned by the wanted heading; body rates: body"
-        self.observation = (
-            ArraySpec(
-                name="observation",
-                shape=(len(numbers),),
-                low=lows,
-                high=highs,
-                unit=units,
-                frame=frame,
-                components=names,
-            ),
-        )
-        self._bounds = np.array(lows), np.array(highs)
+        array = array_of(numbers, frame)
+        self.observation = (array,)
+        self._bounds = array.bounds()
 
     def observe(self, state: State) -> dict[str, Array]:
         """See the table of the class; further numbers are those of `further`."""
@@ -240,6 +230,20 @@ def at(point: Sequence[float], like: Array) -> Array:
 def ends_of(range_: float | tuple[float, float]) -> tuple[float, float]:
     """Low and high end of an option that is a number or a pair."""
     return range_ if isinstance(range_, tuple) else (range_, range_)
+
+
+def array_of(numbers: Sequence[Number], frame: str) -> ArraySpec:
+    """The spec of an observation of some numbers."""
+    names, units, lows, highs = zip(*numbers, strict=True)
+    return ArraySpec(
+        name="observation",
+        shape=(len(numbers),),
+        low=lows,
+        high=highs,
+        unit=units,
+        frame=frame,
+        components=names,
+    )
 
 
 def along(name: str, unit: str, size: float, axes: str = "xyz") -> list[Number]:

@@ -16,7 +16,7 @@ from ...models.fields import Choice, Flag, check, check_names
 from ..snapshots import Kept
 from ..state import Array, ByName, WorldState, chosen
 from ..world import World
-from . import sight
+from . import range_sensors
 from .barometer import Barometer
 from .base import Sensor, Source, Values
 from .estimator import Estimator
@@ -41,9 +41,9 @@ def checked_sensors(given: object) -> Settings:
     """
     if not isinstance(given, Mapping):
         raise InputError(f"sensors: expected settings by sensor, got {shortened(given)}")
-    check_names(given, [*SENSOR_TYPES, *sight.KINDS, _ESTIMATE, "observe"], "sensors")
+    check_names(given, [*SENSOR_TYPES, *range_sensors.KINDS, _ESTIMATE, "observe"], "sensors")
     sensors: Settings = {}
-    for name in (*SENSOR_TYPES, *sight.KINDS):
+    for name in (*SENSOR_TYPES, *range_sensors.KINDS):
         settings = given.get(name, False)
         if settings is False:
             continue
@@ -54,7 +54,7 @@ def checked_sensors(given: object) -> Settings:
                 f"sensors.{name}: expected true, or settings by name, got {shortened(settings)}"
             )
         kind = SENSOR_TYPES.get(name)
-        sensors[name] = kind.checked(settings) if kind else sight.checked(name, settings)
+        sensors[name] = kind.checked(settings) if kind else range_sensors.checked(name, settings)
     if check("sensors.estimate", Flag(), given.get(_ESTIMATE, False)):
         sensors[_ESTIMATE] = True
     observe = check("sensors.observe", _OBSERVED, given.get("observe", "added"))
@@ -101,10 +101,12 @@ def readings_of(sensors: Values, vehicle: "models.Vehicle", period: float) -> li
     return [] if "observe" in sensors else readings
 
 
-def sights_of(sensors: Values, period: float, latest: int) -> list[sight.Sight]:
-    """Sensors with rays, as of `Sight`. Raises `InputError`."""
-    kinds = [kind for kind in sight.KINDS if kind in sensors]
-    return [sight.Sight(kind, sensors[kind], period, latest) for kind in kinds]
+def range_sensors_of(
+    sensors: Values, period: float, latest: int
+) -> list[range_sensors.RangeSensor]:
+    """Sensors with rays, as of `RangeSensor`. Raises `InputError`."""
+    kinds = [kind for kind in range_sensors.KINDS if kind in sensors]
+    return [range_sensors.RangeSensor(kind, sensors[kind], period, latest) for kind in kinds]
 
 
 class Sensors(Kept):

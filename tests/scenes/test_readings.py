@@ -5,13 +5,13 @@ from typing import Any
 import numpy as np
 import pytest
 from rotorgram.scenes import returns
-from rotorgram.scenes.returns import Errors
+from rotorgram.scenes.returns import ErrorModel
 from rotorgram.sim.random import words_of
 
-EXACT = Errors(0.1, 10.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+EXACT = ErrorModel(0.1, 10.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-def read(ranges: Any, errors: Errors, words: Any, inner: Any = None, scale: Any = 1.0) -> Any:
+def read(ranges: Any, errors: ErrorModel, words: Any, inner: Any = None, scale: Any = 1.0) -> Any:
     """By both, which have to agree to the bit."""
     code = returns.compiled()
     assert code
@@ -54,7 +54,7 @@ def test_without_errors_a_reading_is_the_distance() -> None:
 
 
 def test_the_noise_has_the_size_that_it_says() -> None:
-    errors = Errors(0.0, 100.0, 0.02, 0.01, 0.003, 0.0, 0.0)
+    errors = ErrorModel(0.0, 100.0, 0.02, 0.01, 0.003, 0.0, 0.0)
     distances = np.array([1.0, 3.0, 8.0, 20.0])
     words = random_words(4, 100_000)
     got = read(np.tile(distances, (100_000, 1)), errors, words)
@@ -64,7 +64,7 @@ def test_the_noise_has_the_size_that_it_says() -> None:
 
 
 def test_returns_are_lost_and_at_edges_more() -> None:
-    errors = Errors(0.0, 10.0, 0.0, 0.0, 0.0, 0.1, 0.5)
+    errors = ErrorModel(0.0, 10.0, 0.0, 0.0, 0.0, 0.1, 0.5)
     inner = np.array([[1, 1, 1, 1, 1, 1, 1, 1, 0]], np.int32)  # a row of eight rays
     ranges = np.tile([2.0, 2.0, 2.0, 2.0, 4.0, 4.0, 4.0, 4.0], (50_000, 1))
     lost = read(ranges, errors, random_words(8, 50_000), inner) == 10.0
@@ -77,7 +77,7 @@ def test_returns_are_lost_and_at_edges_more() -> None:
 
 def test_edges_of_a_grid() -> None:
     """Three rows of three: the middle is near, and its four neighbours are at an edge with it."""
-    errors = Errors(0.0, 10.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+    errors = ErrorModel(0.0, 10.0, 0.0, 0.0, 0.0, 0.0, 1.0)
     inner = np.ones((2, 10), np.int32)
     inner[:, 0] = 1, 3
     inner[0, 3::3] = 0

@@ -1,6 +1,6 @@
 """Sensors with many rays: depth cameras, lidars and time-of-flight arrays.
 
-They see the solids of a layout. `sights.toml` has their models.
+They see the solids of a layout. `range_sensors.toml` has their models.
 """
 
 import math
@@ -18,7 +18,7 @@ from ...models.files import read_toml
 from ...scenes import Rays
 from ...scenes import returns as kernels
 from ...scenes.rays import MAX_PLACE, MAX_REACH
-from ...scenes.returns import Errors
+from ...scenes.returns import ErrorModel
 from ..random import words_of
 from ..rotations import to_world
 from ..scenery import Scenery
@@ -27,7 +27,7 @@ from ..state import Array, clip
 from .base import SAMPLING, Values, sampling
 
 MODELS: Mapping[str, Mapping[str, Values]] = read_toml(
-    Path(__file__).with_name("sights.toml"), "sights"
+    Path(__file__).with_name("range_sensors.toml"), "range_sensors"
 )
 """Settings by kind and model."""
 _COUNT = Limits(1, 1024, "rays", whole=True)
@@ -95,7 +95,7 @@ class View(NamedTuple):
     """Control steps by which an observation is late besides, (W, A)."""
 
 
-class Sight(Kept):
+class RangeSensor(Kept):
     """A sensor with rays on each drone: distances, m, float32, (W, A, rows, columns).
 
     `depth` and `tof` are measured along the sensor's axis, `lidar` along each ray. Where nothing
@@ -140,7 +140,7 @@ class Sight(Kept):
         is_flat = kind != "lidar" and "directions" not in model
         self._scale = (along if is_flat else np.ones_like(along)).astype(np.float32)
         self._mount = np.array(values["position"])
-        self.errors = Errors(**{name: values[name] for name in Errors._fields})
+        self.errors = ErrorModel(**{name: values[name] for name in ErrorModel._fields})
         if self.errors.near >= self.errors.reach:
             raise InputError(
                 f"{where}.reach: expected more than near = {self.errors.near:g} m, "
@@ -150,7 +150,7 @@ class Sight(Kept):
         what = "along each ray" if not is_flat else "along the axis of the sensor"
         self.frame = f"body, {what}"
 
-    def look(self, view: View, begun: Array, flown: Array, scenery: Scenery) -> None:
+    def measure(self, view: View, begun: Array, flown: Array, scenery: Scenery) -> None:
         """Set `value` after a step of the drones that begin and of those that flew.
 
         Masks are bool, (W, A).
@@ -198,7 +198,7 @@ class Sight(Kept):
     def _words(self, view: View, due: Array, chosen: Any, shape: tuple[int, int]) -> Array:
         """Random words of each ray of the drones that are due."""
         if not self.errors.draws:
-            return np.full(shape, 0xFFFFF800, np.uint32)
+            return np.full(shape, kernels.CALM, np.uint32)
         worlds, drones = due.shape
         size = -(-shape[1] // 4) * 4
         rows = worlds * drones

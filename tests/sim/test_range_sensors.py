@@ -8,7 +8,7 @@ from rotorgram.envs import Loop
 from rotorgram.envs.config import EnvConfig
 from rotorgram.models import InputError
 from rotorgram.scenes import Layouts, Rays, Solids
-from rotorgram.sim.sensors.sight import KINDS, MODELS
+from rotorgram.sim.sensors.range_sensors import KINDS, MODELS
 
 WOOD = "forest:3,density=0.1,size=34x16,clear=ends"
 EXACT: dict[str, Any] = {"growth": 0.0, "edge_dropout": 0.0, "near": 0.01}
