@@ -8,9 +8,8 @@ import numpy as np
 
 from ..models.errors import InputError, one_line
 from ..sim import Array, PhysicsError
-from ..sim.sensors.range_sensors import View
 from ..sim.snapshots import Arrays, Snapshot
-from ..sim.state import some
+from ..sim.state import ByName, some
 from ..sim.world import tell_once
 from .config import EnvConfig
 from .loop import Loop
@@ -26,7 +25,7 @@ _OURS = ("numpy", "rotorgram")
 
 def make_loop(config: EnvConfig, num_worlds: int = 1) -> Loop:
     """The loop of a config: compiled where it can be."""
-    if config.backend.compiled is not False and not config.cameras:
+    if config.backend.compiled is not False:
         from ..sim.compile.llvm import trouble
 
         if not trouble():
@@ -81,7 +80,7 @@ class CompiledLoop(Loop):
         self._take_told(told)
         if some(results["wrong"]):
             self._check()
-        self._measure_ranges()
+        self._measure()
 
     def prepare(self) -> None:
         """Compile."""
@@ -101,6 +100,7 @@ class CompiledLoop(Loop):
 
         config = self.config
         loop = Loop(replace(config, backend=replace(config.backend, compiled=False)))
+        loop.measures = False
         neutral = loop.pipeline.actions.neutral()
         try:
             _begin(loop, neutral)
@@ -143,11 +143,9 @@ class CompiledLoop(Loop):
         self.done = results["done"]
         self.out = results["out"]
 
-    def _view(self) -> View:
+    def _moment(self) -> ByName:
         machine = self._inside
-        if machine is None:
-            return super()._view()
-        return machine.view(self._results)
+        return super()._moment() if machine is None else machine.moment(self._results)
 
     def _undo(self, flew: Array) -> None:
         """Do not count a step that broke; its drones wait for a reset."""

@@ -13,17 +13,19 @@ from numpy.typing import NDArray
 
 from ..models.errors import InputError
 from ..sim import Array, PhysicsError, Randomization, World, make_world
-from ..sim.sensors.range_sensors import View
+from ..sim.sensors.instruments import Moment
 from ..sim.snapshots import Arrays, Snapshot, joined, part_of
-from ..sim.state import some
+from ..sim.state import ByName, some
 from .autoreset import Content, Seeds, Told, checked_seeds
 from .config import EnvConfig
 from .pipeline import Pipeline
-from .specification import make_task, range_sensors_in, spec_of
+from .specification import instruments_of, make_task, spec_of
 from .stages import clock
 from .stages.record import Floats, Mask, Record
 from .tasks.task import Task
 from .telemetry import quantities_of, telemetry_of
+
+_READINGS = "readings"
 
 
 class Loop:
@@ -40,7 +42,8 @@ class Loop:
     Attributes:
         config: As given, resolved.
         pipeline: Its stages.
-        range_sensors: Sensors with rays, which look after each step.
+        instruments: What measures after each step.
+        measures: Whether they do.
         arrays: Of the observation, those of the stages.
         quantities: Of the telemetry.
         num_envs: N. Arrays below have one axis of N drones, world by world, and are new after each
@@ -76,10 +79,11 @@ class Loop:
             **backend.settings,
         )
         self.pipeline = pipeline = Pipeline(task, world, shape)
-        self.range_sensors = range_sensors_in(task)
         self.spec = spec_of(config, task)
-        seen = [sensor.name for sensor in self.range_sensors]
-        self.arrays = [array for array in self.spec.observation if array.name not in seen]
+        self.instruments = instruments_of(task, shape)
+        self.measures = bool(self.instruments)
+        later = {name for instrument in self.instruments for name in instrument.every}
+        self.arrays = [array for array in self.spec.observation if array.name not in later]
         kept = tuple(name for stage in pipeline.stages for name in stage.arrays)
         self._record = Record(world.shape, task.memory, kept)
         self.num_envs = num_worlds * config.drones
@@ -131,7 +135,7 @@ class Loop:
         if some(active):
             record.run(active, pipeline.observe)
         self._take()
-        self._measure_ranges()
+        self._measure()
 
     def _begin(self, begun: Mask, seeds: Any) -> None:
         """Begin episodes: the task sets the start, and the other stages follow from it."""
@@ -144,28 +148,47 @@ class Loop:
             self._world.random.seed(begun, seeds[:: len(self.spec.agents)])
         record.run(None if all_begin else begun, begin)
 
-    def _measure_ranges(self) -> None:
-        """Add what sensors with rays see to the observations."""
-        if not self.range_sensors:
+    def _measure(self) -> None:
+        """Let instruments measure, and observe what they read."""
+        if not self.measures:
             return
         record = self._record
-        nobody = np.zeros(record.shape, bool)
-        begun = nobody if record.begun is None else record.begun
-        flown = ~nobody if record.flown is None else record.flown
-        view = self._view()
-        for sensor in self.range_sensors:
-            sensor.measure(view, begun, flown, self._world.scenery)
-            self.observations[sensor.name] = np.array(sensor.value).reshape(-1, *sensor.shape)
-
-    def _view(self) -> View:
-        """From where they look."""
-        record = self._record
-        random = self._world.random
-        state = record.state
-        late = self._world.parameters.get("observation_delay", 0 * record.steps)
-        return View(
-            state.position, state.quaternion, record.steps, random.keys, random.episode, late
+        everybody = np.ones(record.shape, bool)
+        seen = self._moment()
+        moment = Moment(
+            begun=~everybody if record.begun is None else record.begun,
+            flown=everybody if record.flown is None else record.flown,
+            scenery=self._world.scenery,
+            **seen,
         )
+        for instrument in self.instruments:
+            instrument.measure(moment)
+        self._observe(moment.late)
+
+    def _moment(self) -> ByName:
+        """What instruments see, by the names of `Moment`."""
+        random = self._world.random
+        return {"keys": random.keys, "episode": random.episode, **self.sight()}
+
+    def sight(self) -> ByName:
+        """What they see that a step changes."""
+        record = self._record
+        state = record.state
+        names = ("position", "quaternion", "payload")
+        seen = {"late": self._late(), "steps": record.steps}
+        seen |= {name: getattr(state, name) for name in names}
+        if any(mark.moves for mark in self._task.marks):
+            seen["goal"] = self._task.goal(state)
+        return {name: values for name, values in seen.items() if values is not None}
+
+    def _late(self) -> Array:
+        return self._world.parameters.get("observation_delay", 0 * self._record.steps)
+
+    def _observe(self, late: Array) -> None:
+        """Add what instruments read to the observations."""
+        for instrument in self.instruments:
+            for name, values in instrument.observed(late).items():
+                self.observations[name] = np.array(values).reshape(-1, *values.shape[2:])
 
     def snapshot(self) -> Snapshot:
         """Copies of all arrays that a later step depends on, by name.
@@ -173,9 +196,9 @@ class Loop:
         Raises `gymnasium.error.ClosedEnvironmentError` after `close`.
         """
         self._check_open()
-        arrays = self.state() | joined(
-            {sensor.name: sensor.snapshot() for sensor in self.range_sensors}
-        )
+        arrays = self.state()
+        for instrument in self.instruments:
+            arrays |= joined({_READINGS: instrument.snapshot()})
         arrays["loop/config"] = np.array(self.spec.config_digest)
         return {**arrays, "loop/arrays": np.array(sorted(arrays))}
 
@@ -201,10 +224,9 @@ class Loop:
         _check_snapshot(snapshot, self._record.shape, self.spec.config_digest)
         self.put(snapshot)
         self._take()
-        for sensor in self.range_sensors:
-            sensor.restore(part_of(snapshot, sensor.name))
-            if sensor.value is not None:
-                self.observations[sensor.name] = np.array(sensor.value).reshape(-1, *sensor.shape)
+        for instrument in self.instruments:
+            instrument.restore(part_of(snapshot, _READINGS))
+        self._observe(self._late())
 
     def put(self, state: Arrays) -> None:
         """Put back what `state` gave."""
@@ -317,6 +339,8 @@ class Loop:
         self._settle()
         for stage in self.pipeline.stages:
             stage.close()
+        for instrument in self.instruments:
+            instrument.close()
         self._closed = True
 
     def _check_open(self) -> None:

@@ -6,7 +6,7 @@ step depends on can be forgotten that a snapshot has.
 """
 
 import ctypes
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from math import prod
 from typing import Any
 
@@ -18,8 +18,8 @@ from ..sim.compile import Program, Untraceable, lift, read
 from ..sim.compile.alike import with_calls
 from ..sim.compile.layout import Layout, Memory, fields_of
 from ..sim.compile.llvm import Region, compiled, widest
-from ..sim.sensors.range_sensors import View
 from ..sim.snapshots import Arrays, Snapshot, joined, part_of
+from ..sim.state import ByName
 from ..sim.world import Call
 from .autoreset import Told
 from .derivative import Derivative
@@ -37,12 +37,11 @@ _MASKS = ("flown", "begun", "active")
 _ENDS = ("terminated", "truncated", "done", "out", "waiting")
 _LAYOUT = "layout"
 _SEEN = "seen/"
-_POSE: Mapping[str, tuple[int, ...]] = {"position": (3,), "quaternion": (4,), "steps": ()}
-_LATE = "Flight/parameters/observation_delay"
 _TOLD = "told/"
 _TERM = "told/reward_"
 _KEYS = "Flight/random/keys"
 _EPISODE = "Flight/random/episode"
+_SEEDS = "Flight/scenery/seeds"
 _BOOL = np.dtype(bool)
 
 Named = dict[str, Any]
@@ -191,16 +190,13 @@ class Machine:
         self._call(_LAST)
         return np.ndarray((), self._results, new), lambda: self._read(new)
 
-    def view(self, results: np.ndarray) -> View:
-        """From where sensors with rays look after a step."""
-        shape = self._world.shape
-        pose = [results[_SEEN + name].reshape(*shape, *more) for name, more in _POSE.items()]
-        late: Any = np.zeros(shape)
-        if _LATE in self._names:
-            late = self.memory.get(_LATE)
-        position, quaternion, steps = pose
-        keys = self.memory.get(_KEYS)
-        return View(position, quaternion, steps, keys, self.memory.get(_EPISODE), late)
+    def moment(self, results: np.ndarray) -> ByName:
+        """As `Loop._moment` after a step."""
+        seen = {"keys": self.memory.get(_KEYS), "episode": self.memory.get(_EPISODE)}
+        for name in self._loop.sight():
+            values = results[_SEEN + name]
+            seen[name] = values.reshape(*self._world.shape, *values.shape[1:])
+        return seen
 
     def _call(self, name: str) -> None:
         memory = self.memory
@@ -241,12 +237,11 @@ class Machine:
             self._given[_PHYSICS + name][:worlds] = values
 
     def derivative(self) -> Derivative:
-        """That of a step. Raises `InputError` where there are solids or rays, which have none."""
-        if self._world.scenery or self._loop.range_sensors:
-            got = (
-                f"{self._world.scenery.scene} and {len(self._loop.range_sensors)} sensors with rays"
-            )
-            raise InputError(f"derivative: expected bare ground and no rays, got {got}")
+        """That of a step. Raises `InputError` where there are solids, rays or pictures."""
+        instruments = len(self._loop.instruments)
+        if self._world.scenery or instruments:
+            got = f"{self._world.scenery.scene} and {instruments} of them"
+            raise InputError(f"derivative: expected bare ground, no rays, no pictures, got {got}")
         return Derivative(self._loop, self._layouts[0], self._width, self._worlds)
 
     def begin_all(self) -> None:
@@ -258,7 +253,7 @@ class Machine:
         memory.put("record/kept/episodes", 0 * memory.get("record/kept/episodes"))
 
     def _seed(self, begun: Mask, seeds: Any) -> None:
-        """As `Random.seed`, where there are seeds; and lay out what the code will draw."""
+        """As `Random.seed`, where there are seeds; and draw the layouts, which code does not."""
         world = self._world
         if seeds is None and not world.scenery.varies:
             return
@@ -270,6 +265,8 @@ class Machine:
             self.memory.put(_KEYS, random.keys)
             self.memory.put(_EPISODE, random.episode)
         world.scenery.begin(random, begun, ahead=1)
+        if world.scenery.varies:
+            self.memory.put(_SEEDS, world.scenery.seeds)
 
     def state(self) -> Snapshot:
         """As `Loop.state`."""
@@ -313,8 +310,8 @@ class Machine:
         seen = {"reward": record.reward, "headline": headline.astype(np.float64)}
         for number, array in enumerate(self._loop.arrays):  # their names are the task's
             seen[f"observation/{number}"] = record.observations[array.name].astype(array.dtype)
-        if self._loop.range_sensors:
-            seen |= {_SEEN + name: getattr(record.state, name) for name in _POSE}
+        if self._loop.instruments:
+            seen |= {_SEEN + name: values for name, values in self._loop.sight().items()}
         seen |= {name: getattr(record, name) for name in _ENDS}
         return seen | {"wrong": record.unfit | self._loop.world.bad}
 

@@ -12,7 +12,6 @@ from .stages.flight import Control, Flight, StandStill
 from .stages.history import History, ObservationDelay
 from .stages.judge import Judge, Remember, Starts
 from .stages.measure import Measure, Readings, Sensing
-from .stages.pictures import Pictures
 from .stages.radio import Radio
 from .stages.record import Stage
 from .tasks.task import Task
@@ -68,7 +67,7 @@ class Pipeline:
         self.flight = flight = Flight(world, parts, substeps, held)
         flying += [Clock(), flight]
 
-        observing = self._observing(task, world, sensors, shape)
+        observing = self._observing(task, world, sensors)
         if "observation_delay" in randomize.names:
             longest = randomize.most_steps("observation_delay")
             observing.append(ObservationDelay(world, longest))
@@ -90,9 +89,7 @@ class Pipeline:
             else:
                 self.set_out.append(flight.set_out if stage is flight else stage.begin)
 
-    def _observing(
-        self, task: Task, world: World, sensors: Sensors | None, shape: tuple[int, int]
-    ) -> list[Stage]:
+    def _observing(self, task: Task, world: World, sensors: Sensors | None) -> list[Stage]:
         """From the measurement to the observation of the present."""
         config = task.config
         period = task.control_period
@@ -105,6 +102,4 @@ class Pipeline:
         stages.append(Judge(task))
         if sensors is not None:
             stages.append(Readings(sensors, observed(task) if config.estimated else ()))
-        if config.cameras:
-            stages.append(Pictures(task, world.scenery, shape))
         return stages

@@ -5,12 +5,13 @@ from ..models.errors import InputError
 from ..models.swarm import drone_names
 from ..sim import Controller, Randomization
 from ..sim.sensors import range_sensors_of, readings_of
+from ..sim.sensors.instruments import Instrument
 from ..sim.sensors.range_sensors import RangeSensor
 from . import registry
 from .config import EnvConfig
+from .pictures import Pictures, arrays_of, objects_of_all
 from .spec import ArraySpec, Discrete, EnvSpec
 from .stages.history import with_history
-from .stages.pictures import arrays_of, objects_of_all
 from .tasks.task import Task
 from .telemetry import quantities_of
 
@@ -84,11 +85,24 @@ def observed(task: Task) -> tuple[ArraySpec, ...]:
 
 def range_sensors_in(task: Task) -> list[RangeSensor]:
     """Sensors with rays of a task's drones. Raises `InputError`."""
+    return range_sensors_of(task.config.sensors, task.control_period, _latest(task))
+
+
+def instruments_of(task: Task, shape: tuple[int, int]) -> list[Instrument]:
+    """What measures after each step in W worlds of A drones, in the order of the observation."""
+    config = task.config
+    instruments: list[Instrument] = []
+    if config.cameras:
+        instruments.append(Pictures(task, config.scene, shape, _latest(task)))
+    return instruments + range_sensors_in(task)
+
+
+def _latest(task: Task) -> int:
+    """Most control steps by which an observation is late."""
     config = task.config
     randomize = Randomization(config.randomize, config.effects)
     late = "observation_delay"
-    latest = randomize.most_steps(late) if late in randomize.names else 0
-    return range_sensors_of(config.sensors, task.control_period, latest)
+    return randomize.most_steps(late) if late in randomize.names else 0
 
 
 def _action(controller: Controller) -> ArraySpec | Discrete:

@@ -72,8 +72,10 @@ class Scenery(Kept):
         return super().snapshot() if self.varies else {}
 
     def begin(self, random: Random, mask: Array, ahead: int = 0) -> None:
-        """Draw the layouts of the worlds of a mask, bool, (W, A), as of `Draw`."""
-        if not self.varies:
+        """Draw the layouts of the worlds of a mask, bool, (W, A), as of `Draw`. Code that is
+        compiled does not draw: it is given the seeds.
+        """
+        if not self.varies or is_traced(mask):
             return
         share = Draw(random, SCENES, mask, ahead).uniform(0.0, 1.0)[:, 0]
         if self._given.size:

@@ -100,6 +100,23 @@ def chosen(mask: Array, new: Array, old: Array) -> Array:
     return np.where(mask.reshape(mask.shape + (1,) * more), new, old)
 
 
+def filled(values: Array, steps: int) -> Array:
+    """Array (W, A, *shape), repeated for `steps` steps along a new axis."""
+    return np.repeat(values[:, :, None], steps, 2)
+
+
+def pushed(past: Array, values: Array) -> Array:
+    """The past one step later: without its oldest values, and with new ones."""
+    return np.concatenate((past[:, :, 1:], values[:, :, None]), 2)
+
+
+def taken(past: Array, age: Array) -> Array:
+    """Array of `age` steps ago; the age has the shape (W, A), whole numbers."""
+    index = past.shape[2] - 1 - age.astype(int)
+    index = index.reshape(index.shape + (1,) * (past.ndim - 2))
+    return np.take_along_axis(past, index, 2).squeeze(2)
+
+
 def square_root(array: Array) -> Array:
     """Square root; 0 of a number below 0, which rounding may leave."""
     return np.sqrt(np.maximum(array, 0.0))

@@ -7,7 +7,7 @@ import numpy as np
 
 from ...models.errors import InputError
 from ...sim import World
-from .history import filled, pushed, taken
+from ...sim.state import filled, pushed, taken
 from .record import Floats, Mask, Record, Stage, is_finite
 
 

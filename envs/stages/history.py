@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...sim import World
-from ...sim.state import Array, chosen
+from ...sim.state import Array, chosen, filled, pushed, taken
 from ..spec import ArraySpec
 from .record import Record, Stage
 
@@ -92,16 +92,6 @@ def with_history(array: ArraySpec, steps: int) -> ArraySpec:
     )
 
 
-def filled(values: Values, steps: int) -> Values:
-    """Values (W, A, *shape), repeated for `steps` steps along a new axis."""
-    return np.repeat(values[:, :, None], steps, 2)
-
-
-def pushed(past: Values, values: Values) -> Values:
-    """The past one step later: without its oldest values, and with new ones."""
-    return np.concatenate((past[:, :, 1:], values[:, :, None]), 2)
-
-
 def later(past: Values | None, values: Values, steps: int, record: Record) -> Array:
     """The past of `steps` steps, one step later; of drones that begin it is the present."""
     if past is None:
@@ -110,10 +100,3 @@ def later(past: Values | None, values: Values, steps: int, record: Record) -> Ar
     if record.begun is None:
         return new
     return chosen(record.begun, filled(values, steps), new)
-
-
-def taken(past: Values, age: Array) -> Array:
-    """Values of `age` steps ago; the age has the shape (W, A), whole numbers."""
-    index = past.shape[2] - 1 - age.astype(int)
-    index = index.reshape(index.shape + (1,) * (past.ndim - 2))
-    return np.take_along_axis(past, index, 2).squeeze(2)

@@ -9,9 +9,8 @@ import numpy as np
 from ...sim import Array, length
 from ...sim.compile import once
 from ...sim.random import RADIO, uniform, words_of
-from ...sim.state import some
+from ...sim.state import filled, pushed, some
 from ..state import State
-from .history import filled, pushed
 from .record import Floats, Mask, Record, Stage
 
 if TYPE_CHECKING:

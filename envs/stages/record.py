@@ -52,7 +52,6 @@ class Record:
         waiting: Drones that must be reset before they fly, (W, A).
         actions_sent, past_observations, history: Of the last steps, the oldest first.
         said, heard, age, keys, silent: Of the radio; see `Radio`.
-        pictures: Last picture of each camera by name, (W, A, height, width, channels).
     """
 
     sent: NDArray[np.float32]
@@ -73,7 +72,6 @@ class Record:
     reward: Floats
     terminated: Mask
     truncated: Mask
-    pictures: ByName
     said: Floats
     heard: Floats
     age: Floats

@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from zlib import crc32
 
 import numpy as np
@@ -21,10 +21,9 @@ from ...scenes.rays import MAX_PLACE, MAX_REACH
 from ...scenes.returns import ErrorModel
 from ..random import words_of
 from ..rotations import to_world
-from ..scenery import Scenery
-from ..snapshots import Kept
-from ..state import Array, clip
+from ..state import Array, ByName, clip
 from .base import SAMPLING, Values, sampling
+from .instruments import Instrument, Moment
 
 MODELS: Mapping[str, Mapping[str, Values]] = read_toml(
     Path(__file__).with_name("range_sensors.toml"), "range_sensors"
@@ -79,23 +78,7 @@ def checked(kind: str, given: Values) -> dict[str, Any]:
     return values
 
 
-class View(NamedTuple):
-    """What sensors look from: arrays of W worlds of A drones."""
-
-    position: Array
-    """World frame, m, (W, A, 3)."""
-    quaternion: Array
-    """From body to world frame, (W, A, 4)."""
-    steps: Array
-    """Control steps of each episode, (W, A)."""
-    keys: Array
-    """Of random numbers, as `Random` has them."""
-    episode: Array
-    late: Array
-    """Control steps by which an observation is late besides, (W, A)."""
-
-
-class RangeSensor(Kept):
+class RangeSensor(Instrument):
     """A sensor with rays on each drone: distances, m, float32, (W, A, rows, columns).
 
     `depth` and `tof` are measured along the sensor's axis, `lidar` along each ray. Where nothing
@@ -103,17 +86,9 @@ class RangeSensor(Kept):
 
     Attributes:
         name: `depth`, `lidar` or `tof`.
-        value: What is observed, (W, A, rows, columns); None before an episode.
         rays: In the body frame.
         errors: Of its readings.
     """
-
-    arrays = ("value", "_held", "_past")
-    value: Array = None
-    _held: Array = None
-    """The last reading that was taken."""
-    _past: Array = None
-    """Readings of the last steps, the oldest first, (W, A, steps, rows, columns)."""
 
     def __init__(self, kind: str, given: Values, period: float, latest: int) -> None:
         """From `checked`, with the period of a control step, s; no observation is later than
@@ -126,12 +101,11 @@ class RangeSensor(Kept):
         if (values["rate"] or 0.0) > most:
             expected = f"at most {most:g} Hz of a {values['model']}"
             raise InputError(f"{where}.rate: expected {expected}, got {values['rate']:g} Hz")
-        every, self._lag = sampling(where, values["rate"], values["delay"], period)
+        every, lag = sampling(where, values["rate"], values["delay"], period)
         if values["rate"] is None:
             every = max(1, math.ceil(1 / (most * period) - 1e-6))
+        super().__init__({kind: every}, lag, latest)
         self.name = kind
-        self._every = every
-        self._longest = self._lag + latest
         self._use = crc32(f"sensor {kind}".encode())
         sensor = _rays_of(kind, values)
         turn = _turn(math.radians(values["yaw"]), math.radians(values["pitch"]))
@@ -150,34 +124,16 @@ class RangeSensor(Kept):
         what = "along each ray" if not is_flat else "along the axis of the sensor"
         self.frame = f"body, {what}"
 
-    def measure(self, view: View, begun: Array, flown: Array, scenery: Scenery) -> None:
-        """Set `value` after a step of the drones that begin and of those that flew.
+    def read(self, moment: Moment, due: ByName) -> ByName:
+        return {self.name: self._read(moment, due[self.name])}
 
-        Masks are bool, (W, A).
-        """
-        due = begun | (flown & (view.steps % self._every == 0))
-        fresh = self._read(view, due, scenery)
-        old = fresh if self._held is None else self._held
-        rows = due[..., None, None]
-        self._held = self.value = np.where(rows, fresh, old)
-        if not self._longest:
-            return
-        begins = begun[..., None, None, None]
-        first = np.repeat(self._held[:, :, None], self._longest + 1, axis=2)
-        past = first if self._past is None else self._past
-        moved = np.concatenate((past[:, :, 1:], self._held[:, :, None]), axis=2)
-        moves = flown[..., None, None, None]
-        self._past = np.where(begins, first, np.where(moves, moved, past))
-        age = (self._longest - self._lag - view.late).astype(np.int64)
-        self.value = np.take_along_axis(self._past, age[..., None, None, None], axis=2)[:, :, 0]
-
-    def _read(self, view: View, due: Array, scenery: Scenery) -> Array:
-        """New readings of the drones of a mask; of the others anything."""
+    def _read(self, moment: Moment, due: Array) -> Array:
         worlds, drones = due.shape
         out = np.zeros((worlds, drones, *self.shape), np.float32)
         chosen = ... if due.all() else due
-        place = view.position[chosen].reshape(-1, 3)
-        turn = view.quaternion[chosen].reshape(-1, 4)
+        scenery = moment.scenery
+        place = moment.position[chosen].reshape(-1, 3)
+        turn = moment.quaternion[chosen].reshape(-1, 4)
         if not len(place):
             return out
         if self._mount.any():
@@ -187,7 +143,7 @@ class RangeSensor(Kept):
         place = clip(place, -MAX_PLACE, MAX_PLACE)
         ranges = self.rays.cast(scenery.layouts, place, turn, reach=reach, which=which)
         flat = ranges.reshape(len(place), -1)
-        words = self._words(view, due, chosen, flat.shape)
+        words = self._words(moment, due, chosen, flat.shape)
         read = np.empty_like(flat)
         code = kernels.compiled()
         run = code.readings if code else kernels.by_numpy
@@ -195,7 +151,7 @@ class RangeSensor(Kept):
         out[chosen] = read.reshape(out[chosen].shape)
         return out
 
-    def _words(self, view: View, due: Array, chosen: Any, shape: tuple[int, int]) -> Array:
+    def _words(self, moment: Moment, due: Array, chosen: Any, shape: tuple[int, int]) -> Array:
         """Random words of each ray of the drones that are due."""
         if not self.errors.draws:
             return np.full(shape, kernels.CALM, np.uint32)
@@ -203,13 +159,13 @@ class RangeSensor(Kept):
         size = -(-shape[1] // 4) * 4
         rows = worlds * drones
         words = np.empty((worlds, drones * size), np.uint32)
-        steps = view.steps[:, 0].astype(np.uint32)
+        steps = moment.steps[:, 0].astype(np.uint32)
         code = kernels.compiled()
-        keys = np.ascontiguousarray(view.keys)
+        keys = np.ascontiguousarray(moment.keys)
         if code:
-            code.words(keys, np.uint64(self._use), view.episode, steps, words)
+            code.words(keys, np.uint64(self._use), moment.episode, steps, words)
         else:
-            words[:] = words_of(keys, self._use, view.episode, steps, drones * size)
+            words[:] = words_of(keys, self._use, moment.episode, steps, drones * size)
         return np.ascontiguousarray(words.reshape(rows, size)[due.ravel(), : shape[1]])
 
     @cached_property

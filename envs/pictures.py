@@ -1,25 +1,26 @@
 """Pictures as observations: which drones take which one when, of the state that a step ended in."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ...models.cameras import FARTHEST, View, chosen_views
-from ...sim.scenery import Scenery
-from ...sim.snapshots import Arrays
-from ..spec import ArraySpec
-from ..tasks.task import Task
-from .record import Record, Stage
+from ..models.cameras import FARTHEST, View, chosen_views
+from ..scenes import SceneConfig
+from ..sim.sensors.instruments import Instrument, Moment
+from ..sim.state import ByName
+from .spec import ArraySpec
+from .tasks.task import Task
 
 if TYPE_CHECKING:
-    from ...rendering.cameras import Cameras
+    from ..rendering.cameras import Cameras
 
 _MAX_THREADS = 16
 _UNITS = {"depth": "m"}
+_SEEN = ("position", "quaternion", "payload", "goal")
+"""What pictures show of a moment."""
 
 
 def arrays_of(views: Sequence[View], objects: Sequence[str]) -> tuple[ArraySpec, ...]:
@@ -56,44 +57,38 @@ class _Painter(NamedTuple):
     """bool, shape (W,)."""
 
 
-class Pictures(Stage):
+class Pictures(Instrument):
     """The cameras of a loop's drones.
 
     Threads draw its worlds, as many as there are cores; a world's pictures do not depend on them.
 
     Args:
         task: Its options choose the cameras.
-        scenery: Of the world.
+        scene: Of the world.
         shape: (W, A).
+        latest: As of `Instrument`.
     """
 
-    arrays = ("pictures",)
+    def __init__(self, task: Task, scene: SceneConfig, shape: tuple[int, int], latest: int) -> None:
+        from ..rendering.cameras import Cameras
 
-    def __init__(self, task: Task, scenery: Scenery, shape: tuple[int, int]) -> None:
-        from ...rendering.cameras import Cameras
-
-        self._task = task
-        self._shape = shape
-        self._scenery = scenery
         self.views = chosen_views(task.config.cameras, task.vehicle.cameras)
-        self._scenes = scenery.scene.given_scenes
+        super().__init__({view.name: view.camera.every for view in self.views}, 0, latest)
+        self._shape = shape
+        scenes = scene.given_scenes
         threads = min(os.cpu_count() or 1, shape[0], _MAX_THREADS)
         # It starts them with the first picture, so that a process may be forked before.
         self._pool = ThreadPoolExecutor(threads, "cameras")
-        parts = np.arange(shape[0]) % -(-threads // len(self._scenes))
+        parts = np.arange(shape[0]) % -(-threads // len(scenes))
         payload = task.config.effects.payload > 0
         self._painters = []
-        for number, scene in enumerate(self._scenes):
+        for number, one in enumerate(scenes):
             for part in range(parts.max() + 1):
                 cameras = Cameras(
-                    task.vehicle, self.views, shape, scene=scene, marks=task.marks, payload=payload
+                    task.vehicle, self.views, shape, scene=one, marks=task.marks, payload=payload
                 )
                 self._painters.append(_Painter(cameras, number, parts == part))
         self._names = objects_of_all([painter.cameras.objects for painter in self._painters])
-        self._goal_moves = any(mark.moves for mark in task.marks)
-        self._blank = {
-            view.name: np.zeros((*shape, *view.shape), view.dtype) for view in self.views
-        }
 
     def close(self) -> None:
         """Free what draws. A second call does nothing."""
@@ -101,51 +96,28 @@ class Pictures(Stage):
         for painter in self._painters:
             painter.cameras.close()
 
-    def step(self, record: Record) -> None:
-        """Add all pictures to the observations, shape (W, A, height, width, channels).
-
-        A drone takes one with the first state of an episode, and with every so many control steps
-        of it; until then it observes its last.
-        """
-        state = record.state
-        begun = False if record.begun is None else record.begun
-        flown = True if record.flown is None else record.flown
-        due = {}
-        for view in self.views:
-            again = flown & (record.steps % view.camera.every == 0)
-            due[view.name] = np.ravel(begun | again)
-        seen = {"position": state.position, "quaternion": state.quaternion}
-        if state.payload is not None:
-            seen["payload"] = state.payload
-        if self._goal_moves:
-            seen["goal"] = self._task.goal(state)
-        count = record.steps.size
-        rows = {name: np.reshape(values, (count, -1)) for name, values in seen.items()}
-        last = vars(record).get("pictures", self._blank)
-        record.pictures = {name: np.array(picture) for name, picture in last.items()}
-        self._take(record.pictures, due, rows, self._scenery.which)
-        record.observations = {**record.observations, **record.pictures}
-
-    def _take(
-        self,
-        pictures: Arrays,
-        due: Mapping[str, NDArray[np.bool_]],
-        rows: Arrays,
-        scenes: NDArray[np.int64],
-    ) -> None:
-        """Replace the pictures that are due, in worlds of these scenes, (W,)."""
+    def read(self, moment: Moment, due: ByName) -> ByName:
+        """All pictures, shape (W, A, height, width, channels)."""
+        scenes = moment.scenery.which
+        count = moment.steps.size
+        seen = {name: getattr(moment, name) for name in _SEEN}
+        state = {name: x.reshape(count, -1) for name, x in seen.items() if x is not None}
+        taken = {name: drones.ravel() for name, drones in due.items()}
+        pictures = {
+            view.name: np.zeros((*self._shape, *view.shape), view.dtype) for view in self.views
+        }
 
         def paint(painter: _Painter) -> None:
             worlds = painter.worlds & (scenes == painter.scene)
-            painter.cameras.take(due, rows, worlds)
+            painter.cameras.take(taken, state, worlds)
             drones = np.repeat(worlds, self._shape[1])
             for view in self.views:
-                taken = due[view.name] & drones
-                picture = painter.cameras.pictures[view.name][taken]
+                rows = taken[view.name] & drones
+                picture = painter.cameras.pictures[view.name][rows]
                 if view.kind == "segmentation":
                     numbers = [self._names.index(name) for name in painter.cameras.objects]
                     picture = np.array(numbers, np.int32)[picture]
-                pictures[view.name].reshape(-1, *view.shape)[taken] = picture
+                pictures[view.name].reshape(-1, *view.shape)[rows] = picture
 
         painters = []
         for painter in self._painters:
@@ -156,3 +128,4 @@ class Pictures(Stage):
             list(self._pool.map(paint, painters))
         else:
             paint(painters[0])
+        return pictures
