@@ -67,6 +67,9 @@ class CompiledLoop(Loop):
         try:
             if begun is not None and not record.has_begun and not begun.all():
                 machine.begin_all()
+            if flies and self._world.scenery.moves:
+                steps = machine.memory.get("record/kept/steps")
+                self._move_solids(steps + (1 if flew is None else flew))
             results, told = machine.step(sent, flew, begun, record.active, seeds)
         except BaseException as error:
             self._settle()  # the physics has gone on

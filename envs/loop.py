@@ -15,7 +15,7 @@ from ..models.errors import InputError
 from ..sim import Array, PhysicsError, Randomization, World, make_world
 from ..sim.sensors.instruments import Moment
 from ..sim.snapshots import Arrays, Snapshot, joined, part_of
-from ..sim.state import ByName, some
+from ..sim.state import ByName, is_traced, some
 from .autoreset import Content, Seeds, Told, checked_seeds
 from .config import EnvConfig
 from .pipeline import Pipeline
@@ -124,6 +124,7 @@ class Loop:
         pipeline = self.pipeline
         record.rest()
         if flies:
+            self._move_solids(record.steps + (1 if record.flown is None else record.flown))
             try:
                 record.run(record.flown, pipeline.fly)
             except PhysicsError:
@@ -136,6 +137,12 @@ class Loop:
             record.run(active, pipeline.observe)
         self._take()
         self._measure()
+
+    def _move_solids(self, steps: Array) -> None:
+        """Solids that move go to where they are after so many steps of each episode, (W, A)."""
+        scenery = self._world.scenery
+        if scenery.moves:
+            scenery.move(steps >= 0, self._task.control_period * steps[:, 0])
 
     def _begin(self, begun: Mask, seeds: Any) -> None:
         """Begin episodes: the task sets the start, and the other stages follow from it."""
@@ -234,6 +241,8 @@ class Loop:
         record.restore(part_of(state, "record"))
         for stage in self.pipeline.stages:
             stage.restore(record, part_of(state, type(stage).__name__))
+        if not is_traced(record.steps):
+            self._move_solids(record.steps)
 
     def __reduce__(self) -> Any:
         worlds = self.num_envs // self.config.drones

@@ -75,6 +75,7 @@ class Pictures(Instrument):
         self.views = chosen_views(task.config.cameras, task.vehicle.cameras)
         super().__init__({view.name: view.camera.every for view in self.views}, 0, latest)
         self._shape = shape
+        self._period = task.control_period
         scenes = scene.given_scenes
         threads = min(os.cpu_count() or 1, shape[0], _MAX_THREADS)
         # It starts them with the first picture, so that a process may be forked before.
@@ -102,6 +103,7 @@ class Pictures(Instrument):
         count = moment.steps.size
         seen = {name: getattr(moment, name) for name in _SEEN}
         state = {name: x.reshape(count, -1) for name, x in seen.items() if x is not None}
+        state["time"] = self._period * moment.steps.ravel()
         taken = {name: drones.ravel() for name, drones in due.items()}
         pictures = {
             view.name: np.zeros((*self._shape, *view.shape), view.dtype) for view in self.views

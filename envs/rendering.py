@@ -121,8 +121,8 @@ def moments(loop: "Loop", episodes: Sequence[int]) -> "list[Moment]":
     return found
 
 
-def moment(spec: EnvSpec, telemetry: Mapping[str, Any], **rest: Any) -> "Moment":
-    """The `Moment` of one drone, with `reward`, `step` and `episode` as `Moment` has them.
+def moment(spec: EnvSpec, telemetry: Mapping[str, Any], *, step: int, **rest: Any) -> "Moment":
+    """The `Moment` of one drone, with `step`, `reward` and `episode` as `Moment` has them.
 
     Telemetry is arrays by name: `position` (3,), `attitude` (4,), `thrust` (R,), and, if there are
     any, `metrics` (M,), `goal` (3,) and `payload` (3,).
@@ -145,5 +145,7 @@ def moment(spec: EnvSpec, telemetry: Mapping[str, Any], **rest: Any) -> "Moment"
         payload=numbers.get("payload"),
         metrics=tuple(metrics),
         marks=spec.marks,
+        time=spec.control_period * step,
+        step=step,
         **rest,
     )

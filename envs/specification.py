@@ -85,7 +85,8 @@ def observed(task: Task) -> tuple[ArraySpec, ...]:
 
 def range_sensors_in(task: Task) -> list[RangeSensor]:
     """Sensors with rays of a task's drones. Raises `InputError`."""
-    return range_sensors_of(task.config.sensors, task.control_period, _latest(task))
+    sensors = task.config.sensors
+    return range_sensors_of(sensors, task.control_period, _latest(task), task.vehicle.radius)
 
 
 def instruments_of(task: Task, shape: tuple[int, int]) -> list[Instrument]:

@@ -84,7 +84,8 @@ class PoseSequence:
 
     def state(self, row: int) -> dict[str, Floats]:
         """One pose of all drones."""
-        return {name: values[row] for name, values in self.states.items()}
+        poses = {name: values[row] for name, values in self.states.items()}
+        return poses | {"time": self.times[row : row + 1]}
 
 
 def sequences_of(journals: Sequence[Path], config: CaptureConfig) -> list[PoseSequence]:

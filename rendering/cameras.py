@@ -25,6 +25,7 @@ from ..models.vehicle import Vehicle, owners
 from ..scenes import SceneConfig, add_scene
 from ..scenes.marks import Mark
 from .gl import Offscreen
+from .moving import MovingGeoms
 from .stage import LOOKS, scale_drawing
 
 Array = np.ndarray
@@ -85,6 +86,7 @@ class Cameras:
         names = drone_names(shape[1])
         self.model = drawn_model(vehicle, shape[1], scene, marks, payload=payload)
         self.data = mujoco.MjData(self.model)
+        self._moving = MovingGeoms(self.model, scene)
         self.objects, self._object = objects_in(self.model)
         rows = shape[0] * shape[1]
         self.pictures = {
@@ -133,8 +135,8 @@ class Cameras:
         `due` has, by view name, the drones that take a picture, bool, shape (N,).
 
         The state has `position` (N, 3) and `quaternion` (N, 4), and, where there are any, `goal`
-        and `payload` (N, 3): MuJoCo's world frame, m. `of` has the worlds that are drawn, bool,
-        shape (W,); None: all.
+        and `payload` (N, 3): MuJoCo's world frame, m, and `time` of their episodes, (N,), s. `of`
+        has the worlds that are drawn, bool, shape (W,); None: all.
         """
         of_world = {name: np.reshape(mask, self._shape) for name, mask in due.items()}
         needed = np.any(list(of_world.values()), axis=(0, 2))
@@ -159,6 +161,8 @@ class Cameras:
         """Put the model where a state has a world; the rows of the world's drones."""
         drones = self._shape[1]
         rows = slice(world * drones, (world + 1) * drones)
+        if "time" in state:
+            self._moving.show(float(state["time"][rows.start]))
         self.data.qpos[self._poses[:, :3]] = state["position"][rows]
         self.data.qpos[self._poses[:, 3:]] = state["quaternion"][rows]
         for name, bodies in self._moved.items():

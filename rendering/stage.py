@@ -27,6 +27,7 @@ from ..scenes import SceneConfig
 from ..scenes.build import SCENE_PREFIX, add_scene
 from ..scenes.marks import Mark, Point
 from .gl import Lines, Offscreen
+from .moving import MovingGeoms
 
 Array = np.ndarray
 
@@ -98,6 +99,8 @@ class Moment:
     """Control steps since the episode began; 0 at its start."""
     episode: int = 0
     """Episodes before this one."""
+    time: float = 0.0
+    """Since the episode began, s."""
 
     @property
     def lines(self) -> Lines:
@@ -153,6 +156,7 @@ class Stage:
             raise InputError(
                 f"vehicle: expected a file that can be drawn, got: {one_line(error)}"
             ) from None
+        self._moving = MovingGeoms(self.model, scene)
         self.radius, top = _size(self.model)
         onboard = (0.03 * self.radius, 0.0, top + 0.154 * self.radius)
         self.model.camera(_ONBOARD).pos = onboard
@@ -207,6 +211,7 @@ class Stage:
                 if self._reach:
                     reach = min(reach, _FAR * self.radius)
                 self._reach = max(self._reach, reach)
+        self._moving.show(moments[0].time)
         place_cameras(self.model, self.data)
 
     def camera(self, name: Camera | Literal["free"]) -> mujoco.MjvCamera:

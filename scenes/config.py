@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, NoReturn, Self
 from ..models.errors import InputError, shortened
 from ..models.fields import Limits, check_fields, immutable, optional, read_table
 
-SCENES = ("plain", "airport", "forest", "warehouse", "gates")
+SCENES = ("plain", "airport", "forest", "warehouse", "gates", "traffic")
 SEEDED_SCENES = SCENES[2:]
 """Those that are drawn from a seed."""
 MAX_SEEDS = 64

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ..models.files import read_toml
 from .config import FOREST_SIZE, SceneConfig
 from .kernels import KINDS
+from .motion import GRAVITY, REST, along_ellipse, thrown
 
 Array = NDArray[np.float64]
 
@@ -38,6 +39,10 @@ _ROCK_DENSITY = 1 / 360
 _ROCK_REACH = 1.2  # m
 _ENDS = 2.0  # m: radius of the clear spaces at the ends of a forest
 _GATES = 8
+_POSTS = 4
+_BALLS = 8
+_FIRST_THROW = 1.0  # s
+_THROW_EVERY = 1.0  # s
 _OPENING = 5.0  # m: the paper's craft is 2.8 m wide with its rotors
 
 
@@ -57,6 +62,8 @@ class Parts(NamedTuple):
     materials: Names
     headings: Array
     """rad, shape (n,)."""
+    motions: Array
+    """As of `motion`, shape (n, 11)."""
 
 
 class Draft:
@@ -94,11 +101,12 @@ class Draft:
         position: Vector,
         material: str,
         heading: float = 0.0,
+        motion: Sequence[float] = REST,
     ) -> None:
-        """Add a part that is turned about z, rad."""
+        """Add a part that is turned about z, rad, and moves as of `motion`."""
         kinds = [KINDS.index(kind)]
         sizes, places = np.array([size], float), np.array([position], float)
-        self.add_all(lambda: [name], kinds, sizes, places, lambda: [material], heading)
+        self.add_all(lambda: [name], kinds, sizes, places, lambda: [material], heading, motion)
 
     def add_all(
         self,
@@ -108,12 +116,14 @@ class Draft:
         positions: Vector,
         materials: Names,
         headings: Vector = 0.0,
+        motion: Vector = REST,
     ) -> None:
-        """Add parts; one heading may be that of all."""
+        """Add parts; one heading may be that of all, and so may one motion."""
         rows = np.array(positions, float)
         turns = np.full(len(rows), headings, float)
         own = np.array(kinds, np.int8), np.array(sizes, float)
-        self.parts.append(Parts(names, *own, rows, materials, turns))
+        motions = np.tile(motion, (len(rows), 1))
+        self.parts.append(Parts(names, *own, rows, materials, turns, motions))
 
 
 def forest(wood: Draft) -> None:
@@ -277,12 +287,40 @@ def _add_gate(track: Draft, number: int) -> None:
         track.add(f"gate_{number}/frame_{part}", "box", (0.15, half, bar), position, tint, heading)
 
 
-GENERATORS = {"warehouse": warehouse, "forest": forest, "gates": gates}
+def traffic(field: Draft) -> None:
+    """Balls are thrown at the place 2 m above the origin, and posts cross it."""
+    field.add("ground/floor", "plane", (150, 150, 1), (0, 0, 0), "grass")
+    for i in range(_POSTS):
+        angle = field.uniform(0.0, 2 * math.pi)
+        ahead = (math.cos(angle), math.sin(angle))
+        aside = field.uniform(-1.0, 1.0)
+        way = field.uniform(4.0, 7.0)
+        period = field.uniform(10.0, 20.0)
+        place = (-aside * ahead[1], aside * ahead[0], 2.0)
+        motion = along_ellipse((way * ahead[0], way * ahead[1], 0.0), (0.0, 0.0, 0.0), period)
+        tint = field.choose("paint")
+        field.add(f"post_{i}/post", "cylinder", (0.15, 2.0, 0), place, tint, motion=motion)
+    for i in range(_BALLS):
+        angle = field.uniform(0.0, 2 * math.pi)
+        away = field.uniform(7.0, 9.0)
+        flight = field.uniform(1.2, 1.6)  # s
+        start = _FIRST_THROW + i * _THROW_EVERY + field.uniform(0.0, 0.5 * _THROW_EVERY)
+        radius = field.uniform(0.15, 0.3)
+        place = (away * math.cos(angle), away * math.sin(angle), radius)
+        aim = (field.uniform(-0.4, 0.4), field.uniform(-0.4, 0.4), 2.0)
+        forward, aside, up = ((end - begin) / flight for end, begin in zip(aim, place, strict=True))
+        motion = thrown((forward, aside, up + GRAVITY / 2 * flight), start)
+        field.add(f"ball_{i}/ball", "sphere", (radius, 0, 0), place, "ball", motion=motion)
+
+
+GENERATORS = {"warehouse": warehouse, "forest": forest, "gates": gates, "traffic": traffic}
 """The function that draws each scene."""
 
 
 def most_parts(scene: SceneConfig) -> int:
     """At least as many as any layout of a scene from a seed has primitives."""
+    if scene.name == "traffic":
+        return _BALLS + _POSTS
     if scene.name != "forest":
         return 512
     wide, deep = scene.size or FOREST_SIZE

@@ -134,4 +134,5 @@ _LIGHTS: Mapping[str, Callable[[Painter], None]] = {
     "warehouse": _lamps,
     "forest": Painter.sun,
     "gates": Painter.sun,
+    "traffic": Painter.sun,
 }

@@ -4,7 +4,7 @@ World frame: z up, m.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
 from itertools import compress
 from typing import NamedTuple, Self
@@ -22,6 +22,7 @@ from .build import HIDDEN_GROUP, add_scene, is_ground
 from .config import SceneConfig, parse_scene
 from .generators import Draft, Parts, parts_of
 from .looks import HALL_XML
+from .motion import REST, offsets
 
 Array = NDArray[np.float64]
 
@@ -41,7 +42,7 @@ _CHUNK = 1 << 22  # numbers that a step of `distance` has at once
 
 @dataclass(frozen=True, eq=False)
 class Solids:
-    """N primitives that stand still.
+    """N primitives where they are drawn, from which some move in the course of an episode.
 
     `Solids.of_scene("forest:3").distance(points)` is how much room there is at some points.
     """
@@ -56,6 +57,8 @@ class Solids:
     """As columns, shape (N, 3, 3)."""
     halves: Array
     """Half the sides of the box about each, along its axes, m, shape (N, 3)."""
+    motions: Array
+    """As of `motion`, shape (N, 11)."""
 
     @classmethod
     def of_scene(cls, scene: str | SceneConfig) -> "Solids":
@@ -75,8 +78,9 @@ class Solids:
         """What stands in a scene from a seed."""
         if not parts:
             nothing = np.zeros((0, 3))
-            return cls(tuple, np.zeros(0, np.int8), nothing, np.zeros((0, 3, 3)), nothing)
-        _, kinds, sizes, centers, _, turns = zip(*parts, strict=True)
+            still = np.zeros((0, len(REST)))
+            return cls(tuple, np.zeros(0, np.int8), nothing, np.zeros((0, 3, 3)), nothing, still)
+        _, kinds, sizes, centers, _, turns, motions = zip(*parts, strict=True)
         kind = np.concatenate(kinds)
         turn = np.concatenate(turns)
         axes = np.zeros((len(turn), 3, 3))
@@ -90,6 +94,7 @@ class Solids:
             centers=np.concatenate(centers),
             axes=axes,
             halves=_halves(kind, np.concatenate(sizes)),
+            motions=np.concatenate(motions),
         )
 
     @classmethod
@@ -129,6 +134,7 @@ class Solids:
             centers=data.geom_xpos[chosen] - np.where(is_sheet, _SHEET * axes[:, :, 2], 0.0),
             axes=axes,
             halves=half,
+            motions=np.zeros((len(half), len(REST))),
         )
 
     @classmethod
@@ -152,6 +158,16 @@ class Solids:
             np.concatenate([getattr(self, one.name), getattr(other, one.name)])
             for one in fields(self)[1:]
         ])  # fmt: skip
+
+    @property
+    def moves(self) -> NDArray[np.bool_]:
+        """Which of them move, (N,)."""
+        return np.asarray(self.motions.any(axis=1))
+
+    def at(self, time: float) -> "Solids":
+        """Where they are at a time of an episode, s."""
+        away = offsets(self.motions, np.array([time]))
+        return replace(self, centers=self.centers + away)
 
     def standing(self) -> "Solids":
         """What reaches above level ground at z = 0."""
@@ -237,6 +253,17 @@ class Layouts(NamedTuple):
         layouts = cls.empty(len(scenes), max(map(len, scenes), default=0))
         for number, scene in enumerate(scenes):
             layouts.put(number, scene)
+        return layouts
+
+    @classmethod
+    def of_balls(cls, centers: Array, radius: float) -> Self:
+        """S scenes of balls about centers, m, (..., P, 3)."""
+        places = centers.reshape(-1, *centers.shape[-2:])
+        layouts = cls.empty(*places.shape[:2])
+        unturned = np.ravel(np.eye(3))
+        layouts.tables[:, :3] = places.transpose(0, 2, 1)
+        layouts.tables[:, 3:12] = unturned[:, None]
+        layouts.tables[:, 12:] = radius
         return layouts
 
     @classmethod

@@ -9,6 +9,7 @@ from ..models.vehicle import Vehicle, can_touch, craft_geoms
 from ..scenes import SceneConfig, kernels
 from ..scenes.config import NEW_SEEDS
 from ..scenes.generators import most_parts
+from ..scenes.motion import REST, offsets
 from ..scenes.solids import Layouts, Solids
 from .compile import Untraceable
 from .compile.tracer import call_outside
@@ -28,6 +29,7 @@ class Scenery(Kept):
         seeds: Of each world's layout, int64, shape (W,).
         layouts: Solids of all layouts in use.
         which: Number of each world's layout, shape (W,).
+        moves: Whether solids move.
         rows: Of each world's layout how many primitives it has, and the addresses of their kinds
             and of their table, uint64, shape (W, 3); variables in code that is being compiled.
     """
@@ -43,6 +45,14 @@ class Scenery(Kept):
         self._always = Solids.ground() + own
         laid = [self._always + self.solids(seed) for seed in self._given.tolist()]
         self.layouts = Layouts.of(*laid)
+        self.moves = bool(self.solids(0).moves.any())
+        if self.moves:  # each world has a time of its own
+            most = self.most
+            self._motions = np.zeros((worlds, most, len(REST)))
+            self._places = np.zeros((worlds, most, 3))
+            self.layouts = Layouts.empty(worlds, len(self._always) + most)
+            self.which = np.arange(worlds)
+            self._lay(np.flatnonzero(self.seeds >= 0))
         self.rows: Array
         self._point()
 
@@ -64,8 +74,8 @@ class Scenery(Kept):
 
     @property
     def varies(self) -> bool:
-        """Whether episodes differ in their layouts."""
-        return len(self._given) != 1
+        """Whether episodes differ in their layouts, or times in one."""
+        return len(self._given) != 1 or self.moves
 
     def snapshot(self) -> Snapshot:
         """Copies by name: nothing where all have the same layout."""
@@ -84,17 +94,28 @@ class Scenery(Kept):
             number = np.floor(share * NEW_SEEDS).astype(np.int64)
             drawn = 2 * number + (self.scene.layouts == "unseen")
         self.take(np.where(mask[:, 0], drawn, self.seeds))
+        self.move(mask, np.zeros(len(mask)))
 
     def take(self, seeds: Array) -> None:
         """Give worlds the layouts of such seeds, shape (W,)."""
         old, self.seeds = self.seeds, seeds
         if is_traced(seeds):
             return
-        if self._given.size:
+        if self._given.size and not self.moves:
             self.which = np.searchsorted(self._given, seeds)
         else:
             self._lay(np.flatnonzero((seeds != old) & (seeds >= 0)))
         self._point()
+
+    def move(self, mask: Array, time: Array) -> None:
+        """Solids of the worlds of a mask, (W, A), go to where they are at times of their episodes,
+        s, (W,).
+        """
+        if not self.moves:
+            return
+        rows = np.flatnonzero(mask[:, 0])
+        centers = self._places[rows] + offsets(self._motions[rows], time[rows, None])
+        self.centers[rows] = centers.transpose(0, 2, 1)
 
     def restore(self, arrays: Arrays) -> None:
         """Put a snapshot back."""
@@ -156,6 +177,16 @@ class Scenery(Kept):
             self.which = np.arange(count)
         for world, solids in made.items():
             self.layouts.put(world, self._always, solids)
+            if self.moves:
+                self._motions[world, : len(solids)] = solids.motions
+                self._motions[world, len(solids) :] = REST
+                self._places[world] = self.centers[world].T
+
+    @property
+    def centers(self) -> Array:
+        """Centers of what stands in the layouts, views, (S, 3, P)."""
+        first = len(self._always)
+        return self.layouts.tables[:, :3, first : first + self.most]
 
     def _point(self) -> None:
         """Set `rows`."""

@@ -130,15 +130,25 @@ class MujocoWorld(World):
         """Give geoms the layouts of some worlds."""
         if not self.scenery.varies:
             return
-        model = self._batch.model
-        first = model.geom(f"{NAME}0").id
-        slots = slice(first, first + self.scenery.most)
         seeds = self.scenery.seeds
         for world in ids[(self._laid[ids] != seeds[ids]) & (seeds[ids] >= 0)].tolist():
             solids = self.scenery.solids(int(seeds[world]))
             for field, rows in geoms_of(solids, self.scenery.most).items():
-                self._batch.expand(field)[world, slots] = rows
+                self._batch.expand(field)[world, self._slots] = rows
             self._laid[world] = seeds[world]
+        self._follow(ids)
+
+    @property
+    def _slots(self) -> slice:
+        """Which geoms stand for solids of a layout."""
+        first = self._batch.model.geom(f"{NAME}0").id
+        return slice(first, first + self.scenery.most)
+
+    def _follow(self, ids: Array) -> None:
+        """Move the geoms of some worlds to where their solids are."""
+        if self.scenery.moves:
+            places = self._batch.expand("geom_pos")[:, self._slots]
+            places[ids] = self.scenery.centers.transpose(0, 2, 1)[ids]
 
     def take(self) -> None:
         """Set the state's arrays that the physics changes."""
@@ -208,6 +218,7 @@ class MujocoWorld(World):
             if self.wrench is not None:
                 self._applied[some] = self.wrench.reshape(self._applied.shape)[some]
         if call.clears:
+            self._follow(some)
             self._clear_contacts(some)
         try:
             self._batch.step(ids, nstep=call.steps)

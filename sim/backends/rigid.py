@@ -209,6 +209,8 @@ class RigidWorld(World):
         """Set which crafts touch, those of a mask: with what was before, unless it `clears`."""
         touched = self._contacts() if looks else [self._nobody, self._nobody]
         if self.slack is not None:
+            if clears and self.scenery.moves:
+                self.slack = chosen(mask, np.zeros_like(self.slack), self.slack)
             touched[0] = touched[0] | self._touches_solids(mask)
         for name, new in zip(("touching", "colliding"), touched, strict=False):
             old = getattr(self.state, name)

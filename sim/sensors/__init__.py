@@ -102,11 +102,13 @@ def readings_of(sensors: Values, vehicle: "models.Vehicle", period: float) -> li
 
 
 def range_sensors_of(
-    sensors: Values, period: float, latest: int
+    sensors: Values, period: float, latest: int, radius: float
 ) -> list[range_sensors.RangeSensor]:
     """Sensors with rays, as of `RangeSensor`. Raises `InputError`."""
     kinds = [kind for kind in range_sensors.KINDS if kind in sensors]
-    return [range_sensors.RangeSensor(kind, sensors[kind], period, latest) for kind in kinds]
+    return [
+        range_sensors.RangeSensor(kind, sensors[kind], period, latest, radius) for kind in kinds
+    ]
 
 
 class Sensors(Kept):

@@ -15,7 +15,7 @@ import numpy as np
 from ...models.errors import InputError
 from ...models.fields import Choice, Limits, Rule, check, check_names
 from ...models.files import read_toml
-from ...scenes import Rays
+from ...scenes import Layouts, Rays
 from ...scenes import returns as kernels
 from ...scenes.rays import MAX_PLACE, MAX_REACH
 from ...scenes.returns import ErrorModel
@@ -90,9 +90,9 @@ class RangeSensor(Instrument):
         errors: Of its readings.
     """
 
-    def __init__(self, kind: str, given: Values, period: float, latest: int) -> None:
+    def __init__(self, kind: str, given: Values, period: float, latest: int, radius: float) -> None:
         """From `checked`, with the period of a control step, s; no observation is later than
-        `latest` steps besides. Raises `InputError`.
+        `latest` steps besides. Other drones are balls of a radius, m. Raises `InputError`.
         """
         model = MODELS[kind][given["model"]]
         values = {**_DEFAULTS, **model, **given}
@@ -106,6 +106,7 @@ class RangeSensor(Instrument):
             every = max(1, math.ceil(1 / (most * period) - 1e-6))
         super().__init__({kind: every}, lag, latest)
         self.name = kind
+        self._radius = radius
         self._use = crc32(f"sensor {kind}".encode())
         sensor = _rays_of(kind, values)
         turn = _turn(math.radians(values["yaw"]), math.radians(values["pitch"]))
@@ -142,6 +143,11 @@ class RangeSensor(Instrument):
         reach = min(self.errors.reach / float(self._scale.min()), MAX_REACH)
         place = clip(place, -MAX_PLACE, MAX_PLACE)
         ranges = self.rays.cast(scenery.layouts, place, turn, reach=reach, which=which)
+        if drones > 1:
+            balls = Layouts.of_balls(_others(moment.position)[chosen], self._radius)
+            rows = np.arange(len(place))
+            hits = self.rays.cast(balls, place, turn, reach=reach, which=rows)
+            ranges = np.minimum(ranges, hits)
         flat = ranges.reshape(len(place), -1)
         words = self._words(moment, due, chosen, flat.shape)
         read = np.empty_like(flat)
@@ -178,6 +184,14 @@ class RangeSensor(Instrument):
         has[0, :, -1] = has[1, -1] = 0
         steps = np.array([[1], [columns]], np.int32)
         return np.concatenate((steps, has.reshape(2, -1)), axis=1)
+
+
+def _others(position: Array) -> Array:
+    """Positions of the other drones of a world, for each drone, (W, A, A - 1, 3)."""
+    drones = position.shape[1]
+    rows = np.arange(drones)[:, None]
+    after = np.arange(1, drones)
+    return position[:, (rows + after) % drones]
 
 
 def _rays_of(kind: str, values: Values) -> Rays:

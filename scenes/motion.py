@@ -1,0 +1,47 @@
+"""How solids move: where they are follows from the time since the episode began.
+
+A row of motions, (11,), has the velocity of a throw, m/s, and its start, s; then two vectors of an
+ellipse about the place of the solid, m, and its rate, rad/s:
+`cos(rate * t) * first + sin(rate * t) * second`.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..models.matrices import settled
+
+Array = NDArray[np.float64]
+
+GRAVITY = 9.8
+"""Of what is thrown, m/s², as in the paper."""
+REST = (0.0,) * 11
+"""The row of a solid that stands still."""
+
+
+def thrown(velocity: tuple[float, float, float], start: float) -> tuple[float, ...]:
+    """Rests in its place until `start`, s, and falls freely from then on."""
+    return (*velocity, start, *REST[4:])
+
+
+def along_ellipse(
+    first: tuple[float, float, float], second: tuple[float, float, float], period: float
+) -> tuple[float, ...]:
+    """Goes round in a period, s: on a circle, or to and fro on a line if one vector is 0."""
+    return (*REST[:4], *first, *second, 2 * math.pi / period)
+
+
+def offsets(motions: Array, time: Array) -> Array:
+    """From their places to where solids of motions, (..., N, 11), are at a time, s, (..., 1): m,
+    (..., N, 3). The bits are the same on every processor.
+    """
+    velocity, start, first, second, rate = np.split(motions, (3, 4, 7, 10), axis=-1)
+    moment = time[..., None]
+    angle = rate * moment
+    moved: Array = settled(np.cos(angle)) * first + settled(np.sin(angle)) * second
+    since = np.maximum(moment - start, 0.0)
+    is_thrown = velocity.any(axis=-1)
+    moved += velocity * since
+    moved[..., 2] -= np.where(is_thrown, GRAVITY / 2 * (since * since)[..., 0], 0.0)
+    return moved

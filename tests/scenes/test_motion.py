@@ -1,0 +1,165 @@
+"""Solids that move: where they are, who meets them, and who sees them."""
+
+import math
+from contextlib import closing
+from typing import Any
+
+import numpy as np
+import pytest
+from rotorgram.envs import Loop
+from rotorgram.envs.config import EnvConfig
+from rotorgram.models.cameras import chosen_views
+from rotorgram.models.vehicle import Vehicle
+from rotorgram.rendering.cameras import Cameras
+from rotorgram.scenes import Layouts, Rays, SceneConfig, Solids
+from rotorgram.scenes.motion import along_ellipse, offsets, thrown
+
+PERIOD = 0.02  # s: of a control step
+BACKENDS = pytest.mark.parametrize("backend", ["rigid", "mujoco"])
+
+
+def test_where_solids_are() -> None:
+    throw = thrown((3.0, -4.0, 5.0), 2.0)
+    circle = along_ellipse((2.0, 0.0, 0.0), (0.0, 2.0, 0.0), 8.0)
+    line = along_ellipse((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), 4.0)
+    motions = np.array([throw, circle, line, np.zeros(11)])
+    half = math.sqrt(0.5)
+    expected = {
+        0.0: [(0, 0, 0), (2, 0, 0), (0, 0, 1), (0, 0, 0)],
+        1.0: [(0, 0, 0), (2 * half, 2 * half, 0), (0, 0, 0), (0, 0, 0)],
+        4.0: [(6, -8, 10 - 19.6), (-2, 0, 0), (0, 0, 1), (0, 0, 0)],
+    }
+    for time, places in expected.items():
+        assert offsets(motions, np.array([time])) == pytest.approx(np.array(places, float))
+    both = offsets(np.stack((motions, motions)), np.array([[1.0], [4.0]]))
+    assert both[1] == pytest.approx(np.array(expected[4.0], float))
+
+
+def test_every_ball_is_thrown_at_the_craft() -> None:
+    for seed in range(20):
+        solids = Solids.of_layout(SceneConfig.parse("traffic:new"), seed)
+        assert solids.moves.all()
+        names = np.array(solids.names)
+        balls = np.array(["ball" in name for name in names])
+        times = np.arange(0.0, 12.0, 0.01)
+        tracks = solids.centers + offsets(np.stack([solids.motions] * len(times)), times[:, None])
+        away = np.linalg.norm(tracks - (0.0, 0.0, 2.0), axis=-1)
+        assert (away[:, balls].min(axis=0) < 0.7).all()
+        assert (away[0, balls] > 6.0).all()
+        firsts = np.sort(away[:, balls].argmin(axis=0))
+        assert (np.diff(firsts) > 0).all()  # one after the other
+        posts = np.hypot(tracks[:, ~balls, 0], tracks[:, ~balls, 1])
+        assert (posts.min(axis=0) < 1.1).all()
+
+
+def loop_in(scene: str, backend: str, **options: Any) -> Loop:
+    """Hovers 2 m above the origin, at rest."""
+    keywords: dict[str, Any] = {
+        "vehicle": "hummingbird", "start_band": 0.0, "goal": (0.0, 0.0, 2.0), "flight_band": 30.0,
+        "control_period": PERIOD, "action": "velocity", "episode_length": 1000,
+    }  # fmt: skip
+    config = EnvConfig.from_keywords(
+        "rotorgram/Hover-v0", scene=scene, backend=backend, compiled=False, **keywords, **options
+    )
+    loop = Loop(config, 2)
+    step(loop, begins=True)
+    return loop
+
+
+def step(loop: Loop, *, begins: bool = False) -> None:
+    count = loop.num_envs
+    begun = np.full(count, begins)
+    seeds = list(range(count)) if begins else None
+    loop.advance(np.zeros((count, 4), np.float32), begun, seeds, loop.done & ~begun)
+
+
+@BACKENDS
+def test_a_craft_that_waits_is_hit_when_a_solid_arrives(backend: str) -> None:
+    loop = loop_in("traffic:new", backend)
+    seeds = loop.world.scenery.seeds.tolist()
+    assert len(set(seeds)) == 2
+    radius = loop.vehicle.radius
+    hits: dict[int, int] = {}
+    for number in range(1, 900):
+        step(loop)
+        state = loop.record.state
+        for world, seed in enumerate(seeds):
+            if world in hits:
+                continue
+            solids = Solids.of_layout(SceneConfig.parse("traffic:new"), seed).at(number * PERIOD)
+            room = solids.distance(state.position[world, 0]) - radius
+            clearance = loop.world.clearance()[world, 0]
+            assert clearance == pytest.approx(room, abs=1e-4)
+            if loop.terminated[world]:
+                hits[world] = number
+                assert room < (0.002 if backend == "rigid" else 0.02)
+            elif backend == "rigid":
+                assert room > -1e-4  # not missed
+        if len(hits) == 2:
+            break
+    assert len(hits) == 2
+
+
+def test_rays_and_pictures_see_them_where_they_are(opengl: None) -> None:
+    scene = "traffic:5"
+    time = 2.2
+    place = np.array([[0.0, 0.0, 1.5]])
+    turn = np.array([[1.0, 0.0, 0.0, 0.0]])
+    vehicle = Vehicle.load("hummingbird")
+    views = chosen_views(["front_depth@32x24"], vehicle.cameras)
+    seen = {}
+    with closing(Cameras(vehicle, views, scene=scene)) as cameras:
+        for now in (0.0, time):
+            state = {"position": place, "quaternion": turn, "time": np.array([now])}
+            cameras.take({views[0].name: np.ones(1, bool)}, state)
+            seen[now] = cameras.pictures[views[0].name][0, ..., 0].copy()
+        lens = cameras.lens(views[0].name, state)
+    assert (abs(seen[0.0] - seen[time]) > 0.5).any()
+    fx, fy = lens.matrix[0, 0], lens.matrix[1, 1]
+    rows, columns = np.mgrid[:24, :32] + 0.5
+    x = (columns - lens.matrix[0, 2]) / fx
+    y = (rows - lens.matrix[1, 2]) / fy
+    rays = np.stack((x, y, np.ones_like(x)), axis=-1) @ lens.rotation
+    size = np.linalg.norm(rays, axis=-1)
+    origin = -lens.rotation.T @ lens.translation
+    for now, picture in seen.items():
+        layouts = Layouts.of(Solids.of_scene(scene).at(now))
+        along = Rays(rays / size[..., None]).cast(layouts, origin[None], turn, reach=90.0)[0]
+        flat = along / size
+        near = (picture < 30.0) & (flat < 30.0)
+        assert near.sum() > 100
+        assert (abs(picture - flat)[near] < 0.02 * flat[near]).mean() > 0.97  # all but edges
+
+
+@BACKENDS
+def test_a_snapshot_brings_them_back(backend: str) -> None:
+    ours = loop_in("traffic:0-5", backend, sensors={"lidar": True})
+    theirs = loop_in("traffic:0-5", backend, sensors={"lidar": True})
+    for _ in range(40):
+        step(ours)
+    theirs.restore(ours.snapshot())
+    for _ in range(20):
+        step(ours)
+        step(theirs)
+        assert (ours.observations["lidar"] == theirs.observations["lidar"]).all()
+        assert (ours.world.clearance() == theirs.world.clearance()).all()
+
+
+def test_drones_see_each_other() -> None:
+    exact = {"noise": 0.0, "share": 0.0, "dropout": 0.0, "near": 0.01}
+    config = EnvConfig.from_keywords(
+        "rotorgram/Formation-v0", drones=3, vehicle="hummingbird", backend="rigid",
+        compiled=False, sensors={"lidar": {**exact, "model": "os0", "rows": 64, "columns": 1024}},
+    )  # fmt: skip
+    loop = Loop(config, 2)
+    begun = np.ones(6, bool)
+    loop.advance(np.zeros((6, 4), np.float32), begun, list(range(6)))
+    place = loop.record.state.position
+    seen = loop.observations["lidar"].reshape(2, 3, -1).min(axis=-1)
+    for world in range(2):
+        for drone in range(3):
+            others = np.delete(place[world], drone, axis=0)
+            nearest = np.linalg.norm(others - place[world, drone], axis=1).min()
+            least = nearest - loop.vehicle.radius
+            ground = place[world, drone, 2]
+            assert seen[world, drone] == pytest.approx(min(least, ground), abs=0.02)
