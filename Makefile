@@ -37,9 +37,9 @@ test-libraries: .venv-libraries/.made
 
 .venv-libraries/.made: pyproject.toml
 	$(PYTHON) -m venv .venv-libraries
-	.venv-libraries/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[train,swarm]' \
+	.venv-libraries/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[train,swarm,fast]' \
 	  $(shell grep -E '^(torch|numpy|gymnasium|mujoco|stable_baselines3|pettingzoo)==' constraints.txt) \
-	  torchrl skrl supersuit rl_zoo3
+	  torchrl skrl supersuit rl_zoo3 sb3-contrib
 	@touch $@
 
 lint: .venv/.dev

@@ -2,7 +2,7 @@
 
 import traceback
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from ..sim import Array, PhysicsError
 from ..sim.snapshots import Arrays, Snapshot
 from ..sim.state import ByName, some
 from ..sim.world import tell_once
+from .autoreset import Seeds
 from .config import EnvConfig
 from .loop import Loop
 from .stages.ends import refuse_unfit
@@ -53,7 +54,7 @@ class CompiledLoop(Loop):
     refusal = ""
     """Why it is not compiled, once that was tried."""
 
-    def _step(self, seeds: Any, *, flies: bool) -> None:
+    def _step(self, seeds: Seeds | None, *, flies: bool) -> None:
         machine = self.machine()
         if machine is None:
             super()._step(seeds, flies=flies)

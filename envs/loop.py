@@ -118,7 +118,7 @@ class Loop:
             record.sent = self.pipeline.actions.checked(actions, record.flown)
         self._step(seeds, flies=flies)
 
-    def _step(self, seeds: Any, *, flies: bool) -> None:
+    def _step(self, seeds: Seeds | None, *, flies: bool) -> None:
         """Run the regions for the masks of the record."""
         record = self._record
         pipeline = self.pipeline
@@ -144,7 +144,7 @@ class Loop:
         if scenery.moves:
             scenery.move(steps >= 0, self._task.control_period * steps[:, 0])
 
-    def _begin(self, begun: Mask, seeds: Any) -> None:
+    def _begin(self, begun: Mask, seeds: Seeds | None) -> None:
         """Begin episodes: the task sets the start, and the other stages follow from it."""
         record = self._record
         begin = self.pipeline.begin

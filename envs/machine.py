@@ -21,7 +21,7 @@ from ..sim.compile.llvm import Region, compiled, widest
 from ..sim.snapshots import Arrays, Snapshot, joined, part_of
 from ..sim.state import ByName
 from ..sim.world import Call
-from .autoreset import Told
+from .autoreset import Seeds, Told
 from .derivative import Derivative
 from .loop import Loop
 from .stages.record import Mask, Record
@@ -155,7 +155,7 @@ class Machine:
         flown: Mask | None,
         begun: Mask | None,
         active: Mask | None,
-        seeds: Any = None,
+        seeds: Seeds | None = None,
     ) -> tuple[np.ndarray, Told]:
         """Run all regions. Returns what leaves the loop, by name, (N, ...), and `Loop.told`.
 
@@ -252,7 +252,7 @@ class Machine:
         memory.put("record/kept/waiting", everybody)
         memory.put("record/kept/episodes", 0 * memory.get("record/kept/episodes"))
 
-    def _seed(self, begun: Mask, seeds: Any) -> None:
+    def _seed(self, begun: Mask, seeds: Seeds | None) -> None:
         """As `Random.seed`, where there are seeds; and draw the layouts, which code does not."""
         world = self._world
         if seeds is None and not world.scenery.varies:

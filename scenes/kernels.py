@@ -37,6 +37,9 @@ Array = Any
 Vector = Any
 """Three numbers, or arrays of them."""
 Function = Callable[..., Any]
+Numba = Any
+"""What Numba gives and takes, which has no types."""
+Options = dict[str, Any]
 
 
 # ---- what formulas are made of: here for arrays, in `compiled` for numbers
@@ -277,15 +280,15 @@ def gaps_by_numpy(
         out[w] = np.where(due[w], np.minimum(near, _BIG), out[w])
 
 
-def _nearest_at(count: int, kinds: Any, table: Any, x: Array, y: Array, z: Array) -> Array:
+def _nearest_at(count: int, kinds: Numba, table: Numba, x: Array, y: Array, z: Array) -> Array:
     """As `_nearest`, by the addresses of the kinds and of the table of so many primitives."""
     return _nearest(_array(kinds, (count,)), _array(table, (ROWS, count)), x, y, z)
 
 
 def _first_at(
     count: int,
-    kinds: Any,
-    table: Any,
+    kinds: Numba,
+    table: Numba,
     x: Array,
     y: Array,
     z: Array,
@@ -297,7 +300,7 @@ def _first_at(
     return _first(_array(kinds, (count,)), _array(table, (ROWS, count)), x, y, z, dx, dy, dz)
 
 
-_array: Any = None  # of an address: in `compiled` alone
+_array: Numba = None  # of an address: in `compiled` alone
 
 
 # ---- all rays of a sensor
@@ -465,7 +468,7 @@ class Compiled(NamedTuple):
     """Address of `_nearest_at`, whose first three arguments have 64 bits."""
     first: int
     """Address of `_first_at`."""
-    owners: Any
+    owners: Numba
     """Of the code there."""
 
 
@@ -484,14 +487,14 @@ def compiled() -> Compiled | None:
     # No array overlaps another one: Numba can be told so, but has no public option for it.
     mapping: Function = TargetOptions.Mapping
     setattr(CPUTargetOptions, "noalias", mapping("noalias"))  # noqa: B010
-    options: dict[str, Any] = {"error_model": "numpy", "boundscheck": False, "nogil": True}
+    options: Options = {"error_model": "numpy", "boundscheck": False, "nogil": True}
 
     @intrinsic
-    def least(_: Any, a: Any, b: Any) -> Any:
+    def least(_: Numba, a: Numba, b: Numba) -> Numba:
         """One instruction. Of `a if a < b else b`, before a store, LLVM makes a masked store, and
         of a loop of them no vectors."""
 
-        def emit(_: Any, builder: Any, __: Any, given: Any) -> Any:
+        def emit(_: Numba, builder: Numba, __: Numba, given: Numba) -> Numba:
             number = ir.FloatType()
             kind = ir.FunctionType(number, [number, number])
             function = builder.module.declare_intrinsic("llvm.minnum", [number], kind)
@@ -499,8 +502,8 @@ def compiled() -> Compiled | None:
 
         return a(a, a), emit
 
-    names: dict[str, Any] = dict(globals())
-    inner: dict[str, Any] = {**options, "forceinline": True, "noalias": True}
+    names: Options = dict(globals())
+    inner: Options = {**options, "forceinline": True, "noalias": True}
     inline: Function = njit(**inner)
     names["_least"] = least
     names["_most"] = inline(lambda a, b: a if a > b else b)
@@ -515,15 +518,15 @@ def compiled() -> Compiled | None:
         names[function.__name__] = inline(FunctionType(function.__code__, names))
     table, row, numbers = "f4[:,:,::1]", "i8[::1]", "f4[:,::1]"
     kinds = ["int8[:,::1]", table, row, *[numbers] * 5, "u8[::1]", "f4", numbers]
-    whole: dict[str, Any] = {**options, "cache": True}
+    whole: Options = {**options, "cache": True}
     packets = njit(f"void({','.join(kinds)})", **whole)(FunctionType(_packets.__code__, names))
     kinds = ["int8[:,::1]", table, row, table, "b1[:,::1]", numbers]
     gaps = njit(f"void({','.join(kinds)})", **whole)(FunctionType(_gaps.__code__, names))
     names["_array"] = vars(numba)["carray"]
     number = types.float32
-    pointer: Any = types.CPointer
+    pointer: Numba = types.CPointer
 
-    def by_address(function: Function, count: int) -> Any:
+    def by_address(function: Function, count: int) -> Numba:
         """A function of C of a layout and so many further numbers."""
         kind = number(types.int64, pointer(types.int8), pointer(number), *[number] * count)
         return cfunc(kind, cache=True)(FunctionType(function.__code__, names))

@@ -7,13 +7,11 @@ from collections.abc import Callable
 from functools import cache
 from statistics import NormalDist
 from types import FunctionType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from .kernels import _least, _pick
-
-Array = Any
+from .kernels import Array, Function, Options, _least, _pick
 
 LEVELS = 4096
 """How many values a normal number has here: those in the middle of as many equal shares."""
@@ -181,9 +179,9 @@ def compiled() -> Compiled | None:
         from numba import njit
     except ImportError:
         return None
-    options: dict[str, Any] = {"error_model": "numpy", "boundscheck": False, "nogil": True}
-    inline: Callable[..., Any] = njit(**options, forceinline=True)
-    names: dict[str, Any] = dict(globals())
+    options: Options = {"error_model": "numpy", "boundscheck": False, "nogil": True}
+    inline: Function = njit(**options, forceinline=True)
+    names: Options = dict(globals())
     names["_least"] = inline(lambda a, b: a if a < b else b)
     names["_pick"] = inline(lambda flag, yes, no: yes if flag else no)
     names["_share"] = inline(lambda word: np.float32(word >> _BITS))

@@ -23,6 +23,7 @@ import rotorgram.envs  # noqa: F401  registers the envs
 
 ENV = "rotorgram/Hover-v0"
 SWARM = "rotorgram/Formation-v0"
+FOREST = "rotorgram/Forest-v0"
 STEPS = 20
 HEAD = """# With other libraries
 
@@ -70,6 +71,39 @@ def torchrl_swarm() -> None:
     from torchrl.envs.libs.pettingzoo import PettingZooWrapper
 
     PettingZooWrapper(LocalParallelEnv(SWARM, drones=3)).rollout(STEPS)
+
+
+def torchrl_forest() -> None:
+    """A mapping of arrays: numbers, and distances along rays."""
+    from torchrl.envs.libs.gym import GymEnv
+
+    flown = GymEnv(FOREST).rollout(STEPS)
+    assert flown["depth"].shape[1:] == (6, 32)
+
+
+def multi_input() -> None:
+    """SB3's policy for a mapping of arrays learns a little."""
+    from stable_baselines3 import PPO
+
+    PPO("MultiInputPolicy", gym.make(FOREST), n_steps=32, batch_size=32, n_epochs=1).learn(64)
+
+
+def convolutions() -> None:
+    """SB3's policy for images: a camera's uint8 picture, (height, width, 3), as SB3 wants."""
+    from stable_baselines3 import PPO
+
+    env = gym.make(FOREST, scene="forest:0-3,size=34x16,clear=ends", cameras="front@48x48")
+    space = env.observation_space["front"]
+    env = gym.wrappers.TransformObservation(env, lambda observed: observed["front"], space)
+    PPO("CnnPolicy", env, n_steps=16, batch_size=16, n_epochs=1).learn(32)
+
+
+def recurrent() -> None:
+    """RecurrentPPO of sb3-contrib, whose policy has an LSTM."""
+    from sb3_contrib import RecurrentPPO
+
+    env = gym.make(FOREST)
+    RecurrentPPO("MultiInputLstmPolicy", env, n_steps=32, batch_size=32, n_epochs=1).learn(64)
 
 
 def skrl(vector: bool) -> None:
@@ -125,6 +159,10 @@ CASES = (
     Case("torchrl", "`GymEnv`", torchrl_single),
     Case("torchrl", "`GymWrapper` on a vector env", torchrl_vector),
     Case("torchrl", "`PettingZooWrapper` on a swarm", torchrl_swarm),
+    Case("torchrl", "`GymEnv` on `Forest-v0`", torchrl_forest),
+    Case("stable_baselines3", "`MultiInputPolicy` on `Forest-v0`", multi_input),
+    Case("stable_baselines3", "`CnnPolicy` on pictures of `Forest-v0`", convolutions),
+    Case("sb3-contrib", "`RecurrentPPO` on `Forest-v0`", recurrent),
     Case("skrl", "`wrap_env`", lambda: skrl(vector=False)),
     Case("skrl", "`wrap_env` on a vector env", lambda: skrl(vector=True)),
     Case("SuperSuit", "`concat_vec_envs_v1` and SB3's PPO on a swarm", supersuit),

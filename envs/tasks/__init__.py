@@ -3,7 +3,7 @@
 from ... import import_when_used
 
 __all__ = [
-    "Cable", "Crossing", "Elevation", "Escort", "Forest", "Formation", "Hover", "Landing",
+    "Cable", "Crossing", "Dodge", "Elevation", "Escort", "Forest", "Formation", "Hover", "Landing",
     "PayloadHover", "Racing", "Recovery", "Tracking", "Waypoints",
 ]  # fmt: skip
 

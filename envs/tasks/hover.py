@@ -1,7 +1,7 @@
 """`rotorgram/Hover-v0`: hold a position and a heading with independent rotors."""
 
 import math
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from ...models.fields import Limits, immutable
 from ...sim import (
@@ -88,7 +88,7 @@ class Hover(GoalTask):
 
     Options = HoverOptions
     worst_step = -1.0 - HEADING_WEIGHT + WORST_RATES
-    metrics = (
+    metrics: ClassVar[tuple[Metric, ...]] = (
         Metric(name="position_error", unit="m", settled=0.1, held=0.1, symbol="e"),
         Metric(name="heading_error", unit="deg", settled=5.0, signed=True),
     )

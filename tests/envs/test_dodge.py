@@ -1,0 +1,53 @@
+"""`Dodge-v0`: who waits is hit, and who is not hit for 12 s succeeds."""
+
+import numpy as np
+import pytest
+from rotorgram.envs import Loop
+from rotorgram.envs.config import EnvConfig
+
+DODGE = "rotorgram/Dodge-v0"
+
+
+def waits(scene: str | None, worlds: int) -> Loop:
+    """Flies back to the goal, whatever comes, until the end of each episode."""
+    options = {} if scene is None else {"scene": scene}
+    loop = Loop(EnvConfig.from_keywords(DODGE, backend="rigid", **options), worlds)
+    scale = loop.spec.action_scale
+    loop.advance(np.zeros((worlds, 4)), np.ones(worlds, bool), list(range(worlds)))
+    ended = np.zeros(worlds, bool)
+    for _ in range(300):
+        to_goal = loop.observations["observation"][:, :3]
+        actions = np.column_stack((1.5 * to_goal, np.zeros(worlds))) / scale
+        loop.advance(np.clip(actions, -1, 1), None, None, ended)
+        ended = ended | loop.done
+    assert ended.all()
+    return loop
+
+
+def test_who_waits_is_hit() -> None:
+    loop = waits(None, 32)
+    metrics = loop.metrics
+    assert (metrics["touched"] == 1).all()
+    assert (metrics["success"] == 0).all()
+    assert (metrics["least_clearance"] < 0.01).all()
+    assert (loop.steps > 20).all()  # nothing comes at once
+    assert len(set(loop.world.scenery.seeds)) == 32
+
+
+def test_where_nothing_comes_it_succeeds() -> None:
+    metrics = waits("plain", 2).metrics
+    assert metrics["success"] == pytest.approx(1.0)
+    assert metrics["touched"] == pytest.approx(0.0)
+    assert (metrics["position_error"] < 0.1).all()
+    assert (metrics["least_clearance"] > 100).all()
+
+
+def test_success_counts_at_the_end_alone() -> None:
+    config = EnvConfig.from_keywords(DODGE, backend="rigid", scene="plain", episode_length=5)
+    loop = Loop(config, 1)
+    loop.advance(np.zeros((1, 4)), np.ones(1, bool), [0])
+    found = []
+    for _ in range(5):
+        loop.advance(np.zeros((1, 4)))
+        found.append(loop.metrics["success"][0])
+    assert found == [0, 0, 0, 0, 1]
