@@ -18,6 +18,8 @@ class Plot(Command):
     """MCAP files that --record wrote. Their names are those in the legend."""
     out: Path | None = None
     """PNG, PDF or SVG file to write. Default: the first journal's name with .png."""
+    plan: bool = False
+    """Draw the paths from above instead, among the solids of their layout."""
     session: int | None = None
     """Session of each journal, from 1, as rotorgram replay counts. Default: the first that flew."""
     drone: int = 0
@@ -45,5 +47,5 @@ class Plot(Command):
                 while name in found:
                     name += " (again)"
                 found[name] = flight
-        plot_flights(found, out)
+        plot_flights(found, out, plan=self.plan)
         print(f"{out}: {len(found)} flights" if len(found) > 1 else out)

@@ -47,6 +47,8 @@ class Render(EnvFlags):
     overlay: bool = True
     """Whether time and numbers are on the picture. Of several flights the names of their files
     always are."""
+    rays: bool = True
+    """Whether readings of sensors with rays are drawn: points in the scene, depth beside it."""
     fast: bool = False
     """Without shadows and smooth edges: several times as fast where software draws."""
     session: int | None = None
@@ -94,16 +96,21 @@ class Render(EnvFlags):
     def _find(self, what: str) -> "tuple[FilmTrack, str | None]":
         """Flights of a policy or a journal, and the vehicle."""
         from ..flights.filming import FilmTrack
+        from ..sim.sensors.range_sensors import KINDS
         from ._env import pilot_of
 
         episodes = range(self.episode, self.episode + self.episodes)
+        rays = KINDS if self.rays else ()
         path = Path(what)
         is_file = path.suffix in (".mcap", ".safetensors")
         name = agent_label(path.stem if is_file else path.name)
         if path.suffix == ".mcap":
-            recorded = recorded_trajectories(path, episodes, session=self.session, drone=self.drone)
+            recorded = recorded_trajectories(
+                path, episodes, session=self.session, drone=self.drone, observations=rays
+            )
             return FilmTrack(name=name, trajectories=recorded), self.vehicle
         command, policy = pilot_of(self, what)
-        flown = flown_trajectories(policy, command.env_config(), episodes, "final")
+        config = command.env_config()
+        flown = flown_trajectories(policy, config, episodes, "final", observations=rays)
         track = FilmTrack(name=name, trajectories=flown, drones=command.drones)
         return track, command.vehicle

@@ -9,6 +9,7 @@ import numpy as np
 from ..models.errors import InputError, shortened
 from ..models.fleet import members_of
 from ..scenes import SceneConfig
+from ..sim.sensors.range_sensors import RangeSensor
 from .spec import EnvSpec
 
 if TYPE_CHECKING:
@@ -108,7 +109,10 @@ class Renderer:
 
 
 def moments(loop: "Loop", episodes: Sequence[int]) -> "list[Moment]":
-    """The current `Moment` of every drone; `episodes` are the numbers of their episodes."""
+    """The current `Moment` of every drone; `episodes` are the numbers of their episodes.
+
+    Rays begin where the drones are now, also those of a reading that was taken before.
+    """
     telemetry = loop.telemetry
     steps = loop.steps
     rewards = loop.rewards
@@ -117,12 +121,21 @@ def moments(loop: "Loop", episodes: Sequence[int]) -> "list[Moment]":
         row = {name: values[i] for name, values in telemetry.items()}
         reward = float(rewards[i])
         step = int(steps[i])
-        found.append(moment(loop.spec, row, reward=reward, step=step, episode=episode))
+        pose = np.concatenate((row["position"], row["attitude"]))
+        readings = [
+            sensor.reading(loop.observations[sensor.name][i], pose)
+            for sensor in loop.instruments
+            if isinstance(sensor, RangeSensor)
+        ]
+        found.append(
+            moment(loop.spec, row, reward=reward, step=step, episode=episode, readings=readings)
+        )
     return found
 
 
 def moment(spec: EnvSpec, telemetry: Mapping[str, Any], *, step: int, **rest: Any) -> "Moment":
-    """The `Moment` of one drone, with `step`, `reward` and `episode` as `Moment` has them.
+    """The `Moment` of one drone, with `step`, `reward`, `episode` and `readings` as `Moment` has
+    them.
 
     Telemetry is arrays by name: `position` (3,), `attitude` (4,), `thrust` (R,), and, if there are
     any, `metrics` (M,), `goal` (3,) and `payload` (3,).

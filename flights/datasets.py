@@ -74,7 +74,7 @@ class RecordedEpisodes:
     def _whole(self, paths: Sequence[Path]) -> Iterator[Trajectory]:
         for path in paths:
             self.journal = path.name
-            for one in read_episodes(path, observations=True):
+            for one in read_episodes(path, observations=None):
                 if isinstance(one, Session):
                     self._check(path, one.spec, one.hello.session)
                 elif one.ending == "cut off":

@@ -16,9 +16,10 @@ from ..models.fields import Limits, check_fields, immutable
 from ..rendering import Camera, Canvas, Moment, Stage
 from ..rendering.film import QUALITY, Picture, write_film
 from ..rendering.gl import Lines
+from ..rendering.insets import add_insets
 from ..scenes import SceneConfig, parse_scene
 from .executors import Tell
-from .trajectories import Flights, Trajectory
+from .trajectories import Flights, Trajectory, common_scene
 
 MAX_FRAMES = 1_000_000
 """Largest number of frames of a film: 11 hours of it."""
@@ -30,7 +31,8 @@ _ASPECT = 1.2  # of a pane that shows a craft well
 def moments(trajectory: Trajectory) -> list[Moment]:
     """The moments of a trajectory: its start, and after each control step.
 
-    Raises `InputError` if its telemetry lacks position, attitude or thrust.
+    They have readings of sensors with rays if those are among the observations. Raises `InputError`
+    if its telemetry lacks position, attitude or thrust.
     """
     telemetry = trajectory.telemetry
     spec = trajectory.spec
@@ -42,7 +44,11 @@ def moments(trajectory: Trajectory) -> list[Moment]:
     found = []
     for step, reward in enumerate([0.0, *trajectory.rewards.tolist()]):
         row = {name: array[step] for name, array in telemetry.items()}
-        found.append(moment(spec, row, step=step, reward=reward, episode=trajectory.episode))
+        readings = trajectory.readings(step)
+        episode = trajectory.episode
+        found.append(
+            moment(spec, row, step=step, reward=reward, episode=episode, readings=readings)
+        )
     return found
 
 
@@ -198,11 +204,7 @@ def _scene_of(tracks: Sequence[FilmTrack], config: Film, episode: int) -> SceneC
     """What surrounds the drones of an episode. Raises `InputError` where tracks differ."""
     if config.scene is not None:
         return parse_scene(config.scene)
-    scenes = {one.scene.shown for track in tracks for one in track.episodes[episode]}
-    if len(scenes) != 1:
-        got = " and ".join(sorted(map(str, scenes)))
-        raise InputError(f"scene: expected one for all flights of a film, got {got}")
-    return scenes.pop()
+    return common_scene(one.scene.shown for track in tracks for one in track.episodes[episode])
 
 
 @dataclass
@@ -231,6 +233,7 @@ class _Pane:
             self.stage.show(*(own[min(now, len(own) - 1)] for own in flown))
         self.shown = episode, step
         self.picture = self.canvas.draw(self.config.camera, self.stage, self._lines(episode, step))
+        add_insets(self.picture, self.stage.moments[0])
         return self.picture
 
     def _lines(self, episode: int, step: int) -> Lines:
@@ -246,5 +249,7 @@ class _Pane:
         else:
             for metric in self.stage.moments[0].metrics[:1]:
                 lines.append((metric.label, metric.text))
+        for reading in self.stage.moments[0].readings:
+            lines.append((reading.name, f"0 to {reading.reach:g} m"))
         note = track.note(episode, step)
         return [*lines, (note, "")] if note else lines

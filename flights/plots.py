@@ -11,6 +11,7 @@ import numpy as np
 from ..models.errors import require
 from ..sim.rotations import euler
 from .palette import FLIGHT_COLORS
+from .plans import drawn_plan
 from .signals import QUATERNION, Column, Signal, signals_of
 from .trajectories import Floats, Trajectory
 
@@ -35,17 +36,19 @@ _WIDTH = 11.0  # inches
 _ROW = 1.75  # inches
 
 
-def plot_flights(flights: Mapping[str, Trajectory], out: Path) -> None:
-    """Draw flights, by the names in the legend, into a file of one of the `FORMATS`.
+def plot_flights(flights: Mapping[str, Trajectory], out: Path, *, plan: bool = False) -> None:
+    """Draw flights, by the names in the legend, into a file of one of the `FORMATS`; or their plan.
 
     A flight without a signal that another one has is not in its panels. Raises `ValueError`:
-    another ending; `MissingPackage`: there is no matplotlib; `OSError`: it cannot be written.
+    another ending; `MissingPackage`: there is no matplotlib; `OSError`: it cannot be written; and
+    what `drawn_plan` raises.
     """
     require("matplotlib", "report", "a plot")
     from matplotlib import rc_context
 
     with rc_context({"font.size": 9, "svg.fonttype": "none", "pdf.fonttype": 42}):
-        _drawn(flights).savefig(out, dpi=150)
+        figure = drawn_plan(flights) if plan else _drawn(flights)
+        figure.savefig(out, dpi=150)
 
 
 def shown_columns(flight: Trajectory) -> Columns:

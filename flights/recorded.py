@@ -1,7 +1,7 @@
 """Trajectories of a journal: one reader for films, logs, plots, pictures and data sets."""
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,13 +21,15 @@ def recorded_trajectories(
     *,
     session: int | None = None,
     drone: int | None = 0,
+    observations: Collection[str] = (),
 ) -> Flights:
     """Episodes of one drone (of the session, from 0) of one session of a journal; with None those
     of all drones, one drone after the other.
 
     Sessions are counted from 1, as `rotorgram replay` does; None is the first with a step in it.
     Episodes are given by number, None for all. Those of a drone are counted from 0; every episode
-    with a recorded step counts, also one that was given up or cut off by the journal's end.
+    with a recorded step counts, also one that was given up or cut off by the journal's end. They
+    get the observations of these names.
 
     Raises:
         InputError: It is no journal, or has no such session, drone or episode.
@@ -37,7 +39,7 @@ def recorded_trajectories(
         raise InputError(f"{path}: expected a journal (.mcap), got no such file")
     sessions: list[Session] = []
     found: Flights = []
-    for one in read_episodes(path, drone):
+    for one in read_episodes(path, drone, observations=observations):
         if isinstance(one, Session):
             sessions.append(one)
         elif session in (None, one.session):
@@ -71,7 +73,7 @@ def recorded_trajectories(
 
 
 def read_episodes(
-    path: Path, drone: int | None = None, *, observations: bool = False
+    path: Path, drone: int | None = None, *, observations: Collection[str] | None = ()
 ) -> Iterator[Session | Trajectory]:
     """The sessions of a journal as they begin, their episodes as they end.
 
@@ -80,7 +82,7 @@ def read_episodes(
     Args:
         path: The journal.
         drone: The one whose trajectories are made; None: all.
-        observations: Whether they get their observations.
+        observations: Names of those that they get; None: all.
     """
     flying: dict[int, _SessionReader] = {}  # the last session of each slot
     for item in Recording(path):
@@ -109,9 +111,15 @@ class _Flight(NamedTuple):
 class _SessionReader:
     """Makes trajectories from the transitions of one session."""
 
-    def __init__(self, session: Session, drone: int | None, observations: bool) -> None:
+    def __init__(
+        self, session: Session, drone: int | None, observations: Collection[str] | None
+    ) -> None:
         self.session = session
-        self._observations = observations
+        self._observed = {
+            array.name: place
+            for place, array in enumerate(session.spec.observation)
+            if observations is None or array.name in observations
+        }
         count = session.num_envs
         self._chosen = np.ones(count, bool) if drone is None else np.arange(count) == drone
         self._flights: dict[int, _Flight] = {}
@@ -149,8 +157,7 @@ class _SessionReader:
 
     def _arrays(self, state: State, drone: int) -> list[Array]:
         wanted = [*state.telemetry]
-        if self._observations:
-            wanted += state.observations
+        wanted += [state.observations[place] for place in self._observed.values()]
         return [np.array(values[drone]) for values in wanted]
 
     def _end(self, drone: int, ending: Ending) -> Iterator[Trajectory]:
@@ -161,8 +168,6 @@ class _SessionReader:
         spec = self.session.spec
         columns = iter([np.stack(column) for column in zip(*flight.arrays, strict=True)])
         telemetry = {array.name: next(columns) for array in spec.telemetry}
-        # None, if they are not wanted.
-        observations = dict(zip((array.name for array in spec.observation), columns, strict=False))
         yield Trajectory(
             spec=spec,
             telemetry=telemetry,
@@ -170,7 +175,7 @@ class _SessionReader:
             actions=np.stack(flight.actions),
             ending=ending,
             episode=self._episodes[drone],
-            observations=observations,
+            observations=dict(zip(self._observed, columns, strict=True)),
             session=self.session.index,
             drone=drone,
             seed=flight.seed,

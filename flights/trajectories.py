@@ -5,7 +5,7 @@ journals.
 """
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import field
 from functools import cached_property
@@ -23,6 +23,8 @@ from ..envs.spec import EnvSpec
 from ..models import InputError
 from ..models.fields import immutable
 from ..scenes import SceneConfig
+from ..sim.sensors import range_sensors_of
+from ..sim.sensors.range_sensors import KINDS, RangeSensor, Reading
 
 Floats = NDArray[np.float64]
 
@@ -92,11 +94,34 @@ class Trajectory:
         return self.ending == "terminated"
 
     @cached_property
+    def config(self) -> EnvConfig | None:
+        """Of its env; None where the task is not known here."""
+        spec = self.spec
+        if not is_known(spec.env_id):
+            return None
+        return EnvConfig.from_keywords(spec.env_id, **spec.options)
+
+    @cached_property
+    def _range_sensors(self) -> list[RangeSensor]:
+        """Sensors with rays that are among the observations."""
+        if self.config is None:
+            return []
+        sensors = range_sensors_of(self.config.sensors, self.spec.control_period)
+        return [sensor for sensor in sensors if sensor.name in self.observations]
+
+    def readings(self, step: int) -> list[Reading]:
+        """What sensors with rays among the observations read after so many steps. Their rays begin
+        where the craft was when they were cast.
+        """
+        return [
+            sensor.reading(self.observations[sensor.name][step], self.pose[sensor.taken(step)])
+            for sensor in self._range_sensors
+        ]
+
+    @cached_property
     def scene(self) -> SceneConfig:
         """What surrounded it, with its layout; what is not known here is plain."""
-        known = is_known(self.spec.env_id)
-        config = EnvConfig.from_keywords(self.spec.env_id, **self.spec.options) if known else None
-        scene = config.scene if config else SceneConfig()
+        scene = self.config.scene if self.config else SceneConfig()
         layout = self.telemetry.get("layout")
         return scene if layout is None else scene.with_seed(int(layout[0, 0]))
 
@@ -136,6 +161,15 @@ class Trajectory:
         return min(max(step, 0), len(self))
 
 
+def common_scene(scenes: Iterable[SceneConfig]) -> SceneConfig:
+    """The scene of all flights of a picture. Raises `InputError` where they differ."""
+    different = set(scenes)
+    if len(different) != 1:
+        got = " and ".join(sorted(map(str, different)))
+        raise InputError(f"scene: expected one for all flights of a picture, got {got}")
+    return different.pop()
+
+
 # ---- flown
 
 Flights = list[Trajectory]
@@ -149,13 +183,15 @@ def fly_episodes(
     of: EpisodeSet = "curve",
     first: int = 0,
     training_seed: int | None = None,
+    observations: Collection[str] = (),
 ) -> Flights:
     """Evaluation episodes of a set, from the number `first` on, in their order.
 
     The env, without autoreset, flies as many at a time as it has worlds, each drone with a copy of
     the policy and to the same bits as one after the other. An episode whose simulator was lost is
     flown again. Without a policy, actions are drawn at random, the same for the same episode. An
-    episode of several drones of one world gives a trajectory for each, in their order.
+    episode of several drones of one world gives a trajectory for each, in their order. Trajectories
+    get the observations of these names.
     """
     numbers = range(first, first + episodes)
     seeds = {number: evaluation_seed(number, of, training_seed) for number in numbers}
@@ -163,12 +199,17 @@ def fly_episodes(
     worlds = env.num_envs // len(env.env_spec.agents)
     while missing := [episode for episode in seeds if episode not in flown]:
         batch = {episode: seeds[episode] for episode in missing[:worlds]}
-        flown |= _fly_batch(env, policy, batch)  # without episodes whose simulator was lost
+        flown |= _fly_batch(
+            env, policy, batch, observations
+        )  # without episodes whose simulator was lost
     return [trajectory for episode in seeds for trajectory in flown[episode]]
 
 
 def _fly_batch(
-    env: AdvancingVectorEnv, policy: Policy | None, seeds: Mapping[int, int]
+    env: AdvancingVectorEnv,
+    policy: Policy | None,
+    seeds: Mapping[int, int],
+    observations: Collection[str],
 ) -> ByEpisode:
     """At most W episodes, one in each world, by number; those of a lost simulator are missing."""
     drones = len(env.env_spec.agents)
@@ -182,7 +223,8 @@ def _fly_batch(
     spare = [0] * (env.num_envs - used)
     env.reset(seed=of_drones + spare)
     nobody = np.zeros(env.num_envs, bool)
-    telemetry = [env.telemetry]
+    wanted = [array.name for array in env.env_spec.observation if array.name in observations]
+    rows = [_row(env, wanted)]
     rewards = []
     actions = []
     lengths = np.zeros(env.num_envs, int)
@@ -192,14 +234,14 @@ def _fly_batch(
     while not done.all():
         chosen = _act(env, policies, done)
         env.advance(chosen, nobody, None, worlds_done(done, drones))
-        telemetry.append(env.telemetry)
+        rows.append(_row(env, wanted))
         rewards.append(env.rewards)
         actions.append(chosen)
         lengths += ~done
         terminated = terminated | (env.terminated & ~done)
         lost = lost | (env.lost & ~done)
         done = done | env.terminated | env.truncated
-    arrays = {name: np.array([row[name] for row in telemetry]) for name in telemetry[0]}
+    arrays = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     all_rewards = np.array(rewards)
     all_actions = np.array(actions)
     episodes = list(seeds)
@@ -209,9 +251,11 @@ def _fly_batch(
     for drone in np.flatnonzero(~spoiled[:used]).tolist():
         episode = episodes[drone // drones]
         steps = lengths[drone]
+        rows_of = {name: array[: steps + 1, drone] for name, array in arrays.items()}
         trajectory = Trajectory(
             spec=env.env_spec,
-            telemetry={name: rows[: steps + 1, drone] for name, rows in arrays.items()},
+            observations={name: rows_of.pop(name) for name in wanted},
+            telemetry=rows_of,
             rewards=all_rewards[:steps, drone],
             actions=all_actions[:steps, drone],
             ending="terminated" if terminated[drone] else "truncated",
@@ -221,6 +265,14 @@ def _fly_batch(
         )
         flown.setdefault(episode, []).append(trajectory)
     return flown
+
+
+def _row(env: AdvancingVectorEnv, wanted: Sequence[str]) -> Mapping[str, Array]:
+    """The present telemetry, and some arrays of the observations."""
+    seen = env.observations
+    if not isinstance(seen, Mapping):
+        seen = dict.fromkeys(wanted, seen)
+    return {**env.telemetry, **{name: seen[name] for name in wanted}}
 
 
 def _act(
@@ -242,9 +294,10 @@ def flown_trajectories(
     episodes: Sequence[int],
     of: EpisodeSet = "curve",
     training_seed: int | None = None,
+    observations: Collection[str] = KINDS,
 ) -> Flights:
     """Evaluation episodes of a set by number, flown in process as by `fly_episodes`, in unseen
-    layouts of a scene."""
+    layouts of a scene; with the readings of sensors with rays."""
     from ..envs.vector import LocalVectorEnv  # which imports MuJoCo
 
     found: Flights = []
@@ -252,5 +305,5 @@ def flown_trajectories(
         LocalVectorEnv(config.unseen(), config.drones, autoreset_mode="Disabled")
     ) as world:
         for episode in episodes:
-            found += fly_episodes(world, policy, 1, of, episode, training_seed)
+            found += fly_episodes(world, policy, 1, of, episode, training_seed, observations)
     return found

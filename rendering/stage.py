@@ -5,7 +5,7 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple, get_args
@@ -26,6 +26,7 @@ from ..models.vehicle import owners
 from ..scenes import SceneConfig
 from ..scenes.build import SCENE_PREFIX, add_scene
 from ..scenes.marks import Mark, Point
+from ..sim.sensors.range_sensors import Reading
 from .gl import Lines, Offscreen
 from .moving import MovingGeoms
 
@@ -41,6 +42,8 @@ LOOKS = read_toml(Path(__file__).with_name("looks.toml"), "looks")
 """Colours and views of a stage."""
 MAX_NAMES = 16
 """Drones of one world whose names are shown; more would hide them."""
+_FAR_POINT = 0.004  # by how much points are larger, per distance
+_FEW = 64  # rays that are drawn whole, not only where they end
 _ONBOARD = "stage/onboard"
 _SIDES = Limits(16, 8192, "pixels", whole=True)
 
@@ -93,6 +96,8 @@ class Moment:
     """The headline first."""
     marks: tuple[Mark, ...] = ()
     """What is to be seen of the task; where there is any, no disc is drawn at the goal."""
+    readings: Sequence[Reading] = field(default=(), compare=False)
+    """Of sensors with rays, which are drawn."""
     reward: float = 0.0
     """Of the step that led here."""
     step: int = 0
@@ -260,7 +265,7 @@ class Stage:
         return np.asarray(points.mean(axis=0))
 
     def decorate(self, scene: MjvScene, *, goals: bool = True) -> None:
-        """Add marks, payloads and fading paths to a scene, and discs at the goals if wanted."""
+        """Add marks, payloads, fading paths, ends of rays, and discs at the goals if wanted."""
         radius = self.radius
         marked = any(moment.marks for moment in self.moments)
         labels = drone_names(self.drones) if 1 < self.drones <= MAX_NAMES else ()
@@ -291,6 +296,9 @@ class Stage:
                 if not np.array_equal(start, end):
                     rgba = (*color, 0.85 * number / len(path))
                     _connect(scene, "capsule", 0.019 * radius, start, end, rgba)
+        for moment in self.moments:  # last: they may be more than a scene takes
+            for reading in moment.readings:
+                _draw_reading(scene, reading, 0.015 * self.radius)
 
     @property
     def lines(self) -> Lines:
@@ -420,6 +428,26 @@ def _draw_mark(scene: MjvScene, mark: Mark, goal: Point | None) -> None:
             _decorate(scene, part.kind, (part.radius,) * 3, start, rgba)
         else:
             _connect(scene, part.kind, part.radius, start, end, rgba)
+
+
+def _draw_reading(scene: MjvScene, reading: Reading, size: float) -> None:
+    """Add a cube where each ray ended, larger than `size`, m, and the rays if they are few."""
+    origin = reading.origin
+    colors = range_colors(reading.distances, reading.reach)
+    ended = np.isfinite(reading.points[..., 0])
+    points = reading.points[ended]
+    sides = size + _FAR_POINT * np.linalg.norm(points - origin, axis=1)
+    for point, side, color in zip(points, sides, colors[ended], strict=True):
+        _decorate(scene, "box", (side,) * 3, point, (*color, 1.0))
+        if ended.size <= _FEW:
+            _connect(scene, "capsule", 0.3 * size, origin, point, (*color, 0.6))
+
+
+def range_colors(distances: Array, reach: float) -> Array:
+    """Colours of distances from 0 to `reach`, m: 0 to 1, with a last axis of 3."""
+    table = np.array(LOOKS["ranges"])
+    places = np.linspace(0.0, reach, len(table))
+    return np.stack([np.interp(distances, places, channel) for channel in table.T], axis=-1)
 
 
 def _connect(

@@ -102,7 +102,7 @@ def readings_of(sensors: Values, vehicle: "models.Vehicle", period: float) -> li
 
 
 def range_sensors_of(
-    sensors: Values, period: float, latest: int, radius: float
+    sensors: Values, period: float, latest: int = 0, radius: float = 0.0
 ) -> list[range_sensors.RangeSensor]:
     """Sensors with rays, as of `RangeSensor`. Raises `InputError`."""
     kinds = [kind for kind in range_sensors.KINDS if kind in sensors]

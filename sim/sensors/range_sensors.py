@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from zlib import crc32
 
 import numpy as np
@@ -78,6 +78,22 @@ def checked(kind: str, given: Values) -> dict[str, Any]:
     return values
 
 
+class Reading(NamedTuple):
+    """What a sensor with rays reads on one drone, for pictures."""
+
+    name: str
+    distances: Array
+    """m, (rows, columns); `reach` where nothing returned."""
+    reach: float
+    """m."""
+    is_flat: bool
+    """Whether distances are measured along the sensor's axis, as in a depth image."""
+    origin: Array
+    """Of the rays, world frame, m, (3,)."""
+    points: Array
+    """Where rays ended, world frame, m, (rows, columns, 3); nan where nothing returned."""
+
+
 class RangeSensor(Instrument):
     """A sensor with rays on each drone: distances, m, float32, (W, A, rows, columns).
 
@@ -90,7 +106,9 @@ class RangeSensor(Instrument):
         errors: Of its readings.
     """
 
-    def __init__(self, kind: str, given: Values, period: float, latest: int, radius: float) -> None:
+    def __init__(
+        self, kind: str, given: Values, period: float, latest: int = 0, radius: float = 0.0
+    ) -> None:
         """From `checked`, with the period of a control step, s; no observation is later than
         `latest` steps besides. Other drones are balls of a radius, m. Raises `InputError`.
         """
@@ -112,8 +130,8 @@ class RangeSensor(Instrument):
         turn = _turn(math.radians(values["yaw"]), math.radians(values["pitch"]))
         self.rays = Rays(sensor.directions @ turn.T)
         along = sensor.directions[..., 0].ravel()
-        is_flat = kind != "lidar" and "directions" not in model
-        self._scale = (along if is_flat else np.ones_like(along)).astype(np.float32)
+        self._is_flat = kind != "lidar" and "directions" not in model
+        self._scale = (along if self._is_flat else np.ones_like(along)).astype(np.float32)
         self._mount = np.array(values["position"])
         self.errors = ErrorModel(**{name: values[name] for name in ErrorModel._fields})
         if self.errors.near >= self.errors.reach:
@@ -122,11 +140,28 @@ class RangeSensor(Instrument):
                 f"got {self.errors.reach:g}"
             )
         self.shape = sensor.directions.shape[:2]
-        what = "along each ray" if not is_flat else "along the axis of the sensor"
+        what = "along the axis of the sensor" if self._is_flat else "along each ray"
         self.frame = f"body, {what}"
 
     def read(self, moment: Moment, due: ByName) -> ByName:
         return {self.name: self._read(moment, due[self.name])}
+
+    def taken(self, steps: int) -> int:
+        """The control step after which the reading was taken that is observed after `steps`."""
+        before = max(steps - self._lag, 0)
+        return before - before % self.every[self.name]
+
+    def reading(self, distances: Array, pose: Array) -> Reading:
+        """One that was taken, m, (rows, columns), where a drone had a position, m, and a quaternion
+        from body to world, (7,).
+        """
+        reach = self.errors.reach
+        ranges = np.where(distances < reach, distances, np.nan) / self._scale.reshape(self.shape)
+        rays = self._mount + self.rays.directions * ranges[..., None]
+        position, attitude = np.split(pose, [3])
+        origin = position + to_world(attitude, self._mount)
+        points = position + to_world(attitude, rays)
+        return Reading(self.name, distances, reach, self._is_flat, origin, points)
 
     def _read(self, moment: Moment, due: Array) -> Array:
         worlds, drones = due.shape

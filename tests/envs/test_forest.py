@@ -119,7 +119,7 @@ def test_a_film_has_one_wood(tmp_path: Path) -> None:
     config = EnvConfig.from_keywords(FOREST, backend="rigid", episode_length=3)
     first, second = flown_trajectories(None, config, [0, 1])
     tracks = [FilmTrack(name=str(i), trajectories=[one]) for i, one in enumerate((first, second))]
-    expected = "scene: expected one for all flights of a film, got forest:[0-9]+,.* and forest:"
+    expected = "scene: expected one for all flights of a picture, got forest:[0-9]+,.* and forest:"
     with pytest.raises(InputError, match=expected):
         film(tmp_path / "film.png", tracks, Film(width=64, height=48))
 

@@ -288,7 +288,7 @@ def simulator_of(*heights: float, rotors: int = 4) -> Any:
         "metrics": np.full((drones, 1), 0.5),
     }
     spec = env_spec(EnvConfig.from_keywords(ELEVATION, vehicle=HEXA if rotors == 6 else None))
-    loop = SimpleNamespace(spec=spec, telemetry=telemetry)
+    loop = SimpleNamespace(spec=spec, telemetry=telemetry, instruments=())
 
     def advance(cause: Command | None = None) -> Command | None:
         """Steps and rewards as `Loop` has them after a Command; otherwise as after a reset."""
