@@ -73,8 +73,11 @@ def fitted(command: F, checkpoint: Checkpoint | Controller) -> F:
     if "drones" not in command.given:
         changes["drones"] = len(checkpoint.spec.agents)
     listens = getattr(command, "listen", None) is not None
-    if checkpoint.env and not listens and "vehicle" not in command.given:
-        changes["vehicle"] = ",".join(checkpoint.env.vehicle_paths) or None
+    if checkpoint.env and not listens:
+        if "vehicle" not in command.given:
+            changes["vehicle"] = ",".join(checkpoint.env.vehicle_paths) or None
+        if checkpoint.env.scene.is_file and "scene" not in command.given:
+            options["scene"] = checkpoint.env.scene.path
     return replace(command, **changes)
 
 

@@ -27,6 +27,7 @@ from ..models.fields import (
 from ..models.files import read_toml
 from ..models.library import is_of_the_library, vehicle_words
 from ..scenes import SceneConfig
+from ..scenes.config import is_scene_file
 from ..sim import EffectOptions, Randomization
 from ..sim.effects import NO_EFFECTS
 from . import registry
@@ -124,7 +125,7 @@ class EnvConfig:
     vehicle_hash: str = ""
     """Hash of the vehicle's model; set by `resolve`."""
     task_hash: str = ""
-    """Hash of the source of a task that is not ours; set by `resolve`."""
+    """Hash of the source of a task and a scene that are not ours; set by `resolve`."""
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -227,7 +228,10 @@ class EnvConfig:
         """The same with other keywords. Raises `InputError`."""
         given = {**self.keywords(), "env_id": self.env_id, **keywords}
         other = EnvConfig.from_keywords(**given)
-        return replace(other, files=self.files) if other.vehicle == self.vehicle else other
+        if other.vehicle == self.vehicle:
+            other = replace(other, files=self.files)
+        same = str(other.scene) == str(self.scene)
+        return replace(other, scene=self.scene) if same else other
 
     @classmethod
     def from_toml(cls, path: Path | str, **keywords: Any) -> "EnvConfig":
@@ -238,7 +242,7 @@ class EnvConfig:
         """All fields as JSON values, with the version."""
         content = {one.name: getattr(self, one.name) for one in fields(self)}
         content |= {"effects": self.effects.to_options()}
-        content |= {"scene": asdict(self.scene), "backend": asdict(self.backend)}
+        content |= {"scene": self.scene.to_dict(), "backend": asdict(self.backend)}
         return json_values({"version": VERSION, **content})
 
     @classmethod
@@ -257,14 +261,16 @@ class EnvConfig:
 
     @property
     def module(self) -> str | None:
-        """Module that another process imports to know the task; None for ours."""
+        """Module that another process imports to know the task and the scene; None for ours."""
         known = registry.is_known(self.env_id)
-        name = registry.task_type(self.env_id).__module__ if known else "__main__"
-        return None if name.startswith("rotorgram.") or name == "__main__" else name
+        names = [registry.task_type(self.env_id).__module__] if known else []
+        names.append(getattr(self.scene.type.draw, "__module__", "__main__"))
+        ours = ("rotorgram", "__main__")
+        return next((name for name in names if name.partition(".")[0] not in ours), None)
 
     @property
     def own_task(self) -> str | None:
-        """`module:id` of a user's task; None for ours."""
+        """`module:id` of a user's task, or of a task in a user's scene; None for ours."""
         return f"{self.module}:{self.env_id}" if self.module else None
 
     @property
@@ -290,18 +296,20 @@ class EnvConfig:
         return load_vehicles(words, self.drones, linear_drag=self.effects.linear_drag)
 
     def embedded(self) -> Self:
-        """The same with the content of the vehicles' files, for a process that has not the files.
+        """The same with the content of the files of vehicles and scene, for a process that has not
+        the files.
 
         Raises `InputError`.
         """
         words = [word for word in self.vehicle if word not in self.files]
         words = [word for word in words if not is_of_the_library(word)]
+        scene = self.scene.embedded()
         if not words:
-            return self
+            return self if scene == self.scene else replace(self, scene=scene)
         from ..models.bundle import read_bundle  # it imports MuJoCo
 
         read = {word: read_bundle(word) for word in words}
-        return replace(self, files={**self.files, **read})
+        return replace(self, scene=scene, files={**self.files, **read})
 
     def resolve(self) -> Self:
         """The same with its files and hashes. Refuses by name what cannot be flown together.
@@ -330,7 +338,9 @@ class EnvConfig:
         randomize = Randomization(self.randomize, None)
         settings = self.backend.settings
         check_world(vehicle, self.backend.name, self.drones, self.effects, randomize, settings)
-        resolved = replace(whole, vehicle_hash=vehicle.hash, task_hash=source_hash(task))
+        resolved = replace(
+            whole, vehicle_hash=vehicle.hash, task_hash=source_hash(task, self.scene.type.draw)
+        )
         for name in ("vehicle_hash", "task_hash"):
             was = getattr(self, name)
             now = getattr(resolved, name)
@@ -345,6 +355,8 @@ class EnvConfig:
         content = resolved.to_dict()
         for name in ("vehicle", "files"):  # their hash is there
             content.pop(name)
+        if resolved.scene.is_file:  # its content is there
+            content["scene"].pop("name")
         if self.scene == SceneConfig():
             content.pop("scene")
         for name in ("num_threads", "compiled"):
@@ -367,7 +379,8 @@ KEYWORDS = (*_OPTIONS, "scene", "vehicle", "drones", "backend", *BACKEND_KEYWORD
 def read_keywords(path: Path | str) -> Values:
     """Keywords of `EnvConfig.from_keywords` from a TOML file, `env_id` among them.
 
-    A relative path of a vehicle is looked for beside the file first. Raises `InputError`.
+    A relative path of a vehicle or a scene is looked for beside the file first. Raises
+    `InputError`.
     """
     file = Path(path)
     try:
@@ -380,20 +393,25 @@ def read_keywords(path: Path | str) -> Values:
         content["vehicle"] = tuple(
             str(near) if near.is_file() else word for near, word in zip(beside, words, strict=True)
         )
+    scene = content.get("scene")
+    if is_scene_file(scene):
+        near = file.parent / str(scene)
+        content["scene"] = str(near if near.is_file() else scene)
     return content
 
 
-def source_hash(task: type) -> str:
-    """Hash of the source of a task and its bases that are not ours; empty for a task of ours."""
+def source_hash(task: type, draw: object = None) -> str:
+    """Hash of the source of a task, its bases and what draws its scene; empty if all are ours."""
     digest = blake2b(digest_size=16)
     found = False
-    for base in task.__mro__:
-        if base.__module__.partition(".")[0] in ("rotorgram", "abc", "builtins"):
+    for part in (*task.__mro__, draw):
+        module = getattr(part, "__module__", "builtins")
+        if module.partition(".")[0] in ("rotorgram", "abc", "builtins"):
             continue
         try:
-            source = inspect.getsource(sys.modules[base.__module__])
+            source = inspect.getsource(sys.modules[module])
         except (OSError, TypeError, KeyError):
-            source = base.__qualname__  # typed into an interpreter
+            source = getattr(part, "__qualname__", module)  # typed into an interpreter
         digest.update(source.encode())
         found = True
     return digest.hexdigest() if found else ""

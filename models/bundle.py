@@ -54,11 +54,11 @@ def unpacked(vehicle: str, bundle: Bundle) -> Path:
             return Path(vehicle)
     except InputError:
         pass  # it is missing here, or has changed
-    return Path(_written(bundle).name, bundle[0][0])
+    return Path(written(bundle).name, bundle[0][0])
 
 
 @lru_cache(maxsize=32)
-def _written(bundle: Bundle) -> TemporaryDirectory[str]:
+def written(bundle: Bundle) -> TemporaryDirectory[str]:
     """A folder with the files, as long as this process needs it."""
     folder = TemporaryDirectory(prefix="rotorgram-", ignore_cleanup_errors=True)
     for name, content in bundle:

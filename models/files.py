@@ -16,7 +16,8 @@ from typing import Any
 
 from .errors import InputError
 
-_MAX_BYTES = 1_000_000  # it is read within a few seconds
+MAX_BYTES = 1_000_000
+"""Largest size of a TOML file, which is read within a few seconds."""
 
 
 def read_toml(path: Path, what: str) -> dict[str, Any]:
@@ -25,15 +26,20 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
     Raises `InputError`, whose sentence begins with `what`, or `OSError` where it cannot be read.
     """
     size = path.stat().st_size
-    if size > _MAX_BYTES:
-        raise InputError(f"{what}: expected a TOML file of at most {_MAX_BYTES} bytes, got {size}")
+    if size > MAX_BYTES:
+        raise InputError(f"{what}: expected a TOML file of at most {MAX_BYTES} bytes, got {size}")
+    return parse_toml(path.read_bytes(), what, path.name)
+
+
+def parse_toml(content: str | bytes, what: str, name: str = "a text") -> dict[str, Any]:
+    """Tables of the content of a TOML file. Raises `InputError`, as `read_toml`."""
     try:
-        return tomllib.loads(path.read_text("utf-8"))
+        return tomllib.loads(content if isinstance(content, str) else content.decode())
     except RecursionError:
         reason = "tables or lists, too many in each other"
     except ValueError as error:
         reason = str(error)
-    raise InputError(f"{what}: expected a TOML file, got {path.name}: {reason}")
+    raise InputError(f"{what}: expected a TOML file, got {name}: {reason}")
 
 
 @contextmanager

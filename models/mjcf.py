@@ -14,6 +14,7 @@ from .files import read_toml
 from .vehicle_file import read_vehicle_file
 
 MAX_ELEMENTS = 10_000  # of a file, each as often as it is repeated: seconds to compile
+MAX_BYTES = 1 << 24  # of a file
 MAX_MEMORY = 1 << 30  # bytes of MJCF's attribute `memory`
 MAX_NUMBERS = 1 << 26  # of all height fields, textures, numerics and sensors: 0.5 GB
 _LARGEST = read_toml(Path(__file__).with_name("mjcf.toml"), "mjcf")
@@ -28,7 +29,7 @@ def read_spec(path: Path) -> MjSpec:
     if path.suffix.lower() == ".toml":
         file = read_vehicle_file(path)
         return craft_spec(file, None if file.model is None else read_spec(file.model))
-    _check_sizes(path)
+    check_sizes(path, "vehicle")
     switch_off_log_file()
     return MjSpec.from_file(str(path))
 
@@ -54,6 +55,18 @@ def add_ground(spec: MjSpec) -> None:
     ground.worldbody.add_geom(name="ground", type=plane, size=(0.0, 0.0, 0.5))
     ground.visual, ground.stat = spec.visual, spec.stat  # MuJoCo warns if they differ
     spec.attach(ground, prefix="rotorgram/", frame=spec.worldbody.add_frame())
+
+
+def delete_obstacles(spec: MjSpec) -> None:
+    """Delete all but craft and level ground of a spec: a scene stands in their place."""
+    crafts = {body.name for body in free_bodies(spec)}
+    for geom in list(spec.worldbody.geoms):
+        is_level = geom.pos[2] == 0.0 and list(geom.quat) == [1.0, 0.0, 0.0, 0.0]
+        if geom.type != mjtGeom.mjGEOM_PLANE or not is_level:
+            spec.delete(geom)
+    for body in list(spec.worldbody.bodies):
+        if body.name not in crafts:
+            spec.delete(body)
 
 
 def swarm_spec(vehicles: Sequence[Path], names: Sequence[str]) -> tuple[MjSpec, list[MjsBody]]:
@@ -108,44 +121,49 @@ def switch_off_log_file() -> None:
 # ---- the size of what a file describes
 
 
-def _check_sizes(path: Path) -> None:
+def check_sizes(path: Path, what: str) -> None:
     """Raise `InputError` if a file, with what it includes, has too many or too large parts.
+
+    `what` is the first word of its sentence.
 
     MuJoCo allocates their memory while it reads, and aborts the process if there is too little.
     """
+    _check_file(path, what)
     seen = {path}
     total = 0
     numbers = 0
     waiting = [(read_xml(path), 1)]
     while waiting:
         element, times = waiting.pop()
-        _check_element(element)
+        _check_element(element, what)
         if element.tag in _REPEATED:
             counts = filter(str.isdecimal, element.get("count", "").split())
             times *= math.prod(map(int, counts))
         elif element.tag in ("include", "model"):
             inner = path.parent / element.get("file", "")
             if inner not in seen:
+                _check_file(inner, what)
                 seen.add(inner)
                 waiting.append((read_xml(inner), times))
         total += times
         numbers += times * _numbers(element)
         if total > MAX_ELEMENTS:
-            _refuse(f"at most {MAX_ELEMENTS} elements", f"{total} or more")
+            _refuse(what, f"at most {MAX_ELEMENTS} elements", f"{total} or more")
         if numbers > MAX_NUMBERS:
-            _refuse(f"at most {MAX_NUMBERS} numbers of assets and sensors", f"{numbers} or more")
+            expected = f"at most {MAX_NUMBERS} numbers of assets and sensors"
+            _refuse(what, expected, f"{numbers} or more")
         waiting += [(child, times) for child in element]
 
 
-def _check_element(element: ElementTree.Element) -> None:
+def _check_element(element: ElementTree.Element, what: str) -> None:
     for name, most in (_LARGEST.get(element.tag, {}) | _LARGEST["any"]).items():
         text = element.get(name, "0")
         if _whole(text) > most:
-            _refuse(f"a {name} of at most {most} in <{element.tag}>", text)
+            _refuse(what, f"a {name} of at most {most} in <{element.tag}>", text)
     memory = element.get("memory", "0").strip().upper()
     number = _whole(memory.rstrip(_UNITS))
     if number << 10 * (_UNITS.find(memory[-1:]) + 1) > MAX_MEMORY:
-        _refuse(f"a memory of at most {MAX_MEMORY >> 30}G", memory)
+        _refuse(what, f"a memory of at most {MAX_MEMORY >> 30}G", memory)
 
 
 def _numbers(element: ElementTree.Element) -> int:
@@ -164,8 +182,16 @@ def _whole(text: str) -> int:
         return 0
 
 
-def _refuse(expected: str, got: str) -> None:
-    raise InputError(f"vehicle: expected {expected}, got {got:.80}")
+def _refuse(what: str, expected: str, got: str) -> None:
+    raise InputError(f"{what}: expected {expected}, got {got:.80}")
+
+
+def _check_file(path: Path, what: str) -> None:
+    """Raise `InputError` for what would be read without an end."""
+    if path.exists() and not path.is_file():
+        _refuse(what, "files", str(path))
+    if path.is_file() and path.stat().st_size > MAX_BYTES:
+        _refuse(what, f"files of at most {MAX_BYTES} bytes", str(path))
 
 
 def read_xml(path: Path) -> ElementTree.Element:

@@ -1,4 +1,5 @@
-"""Scenes around vehicles: ground, sky, light, an airport, and three that are drawn from a seed.
+"""Scenes around vehicles: ground, sky, light, an airport, those that are drawn from a seed, and
+those of users' files.
 
 What pictures show of them is solid. Importing this package does not import MuJoCo.
 """
@@ -7,16 +8,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from .. import import_when_used
-from .config import SCENES, SEEDED_SCENES, SceneConfig, parse_scene
+from .config import SceneConfig, parse_scene
+from .generators import Draft
+from .registry import SCENES, SceneType, register, seeded_scenes
 
 if TYPE_CHECKING:
     from .build import add_scene, build_scene
+    from .paths import find_path
     from .rays import Rays
     from .solids import Layouts, Solids
 
 __all__ = [
-    "SCENES", "SEEDED_SCENES", "Layouts", "Rays", "SceneConfig", "Solids", "add_scene",
-    "build_scene", "parse_scene",
+    "SCENES", "Draft", "Layouts", "Rays", "SceneConfig", "SceneType", "Solids", "add_scene",
+    "build_scene", "find_path", "parse_scene", "register", "seeded_scenes",
 ]  # fmt: skip
 
 SCENE_XML = Path(__file__).parent / "scene.xml"

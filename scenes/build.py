@@ -1,5 +1,6 @@
 """Add a scene to a vehicle's spec: what it lacks of ground, sky and light, and all around it."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import mujoco
@@ -7,10 +8,12 @@ import numpy as np
 from mujoco import MjSpec
 
 from ..models import QUAD_XML
-from ..models.mjcf import has_ground, read_spec
+from ..models.mjcf import delete_obstacles, has_ground, read_spec
 from . import AIRPORT_XML, SCENE_XML
 from .config import SceneConfig, parse_scene
-from .looks import SKY, add_parts
+from .kernels import KINDS
+from .looks import GEOM_TYPES, GROUP, SKY, add_parts
+from .obstacles import Obstacle, names_of, obstacles_of
 
 SCENE_PREFIX = "scene/"  # of all names that `add_scene` adds for the plain scene
 _NEAR = 0.25  # m: nearest distance that is drawn
@@ -42,8 +45,12 @@ def add_scene(spec: MjSpec, scene: str | SceneConfig = "plain") -> None:
     The craft move bit for bit as without it. Raises `InputError`.
     """
     chosen = parse_scene(scene)
+    if chosen.is_file:
+        delete_obstacles(spec)
     _add_plain(spec)
-    if chosen.name == "airport":
+    if chosen.is_file:
+        _add_obstacles(spec, obstacles_of(chosen.embedded().content))
+    elif chosen.name == "airport":
         _add_airport(spec)
     elif chosen.is_seeded:
         # In place of the spec's sky, lights and the look of its level ground.
@@ -52,6 +59,19 @@ def add_scene(spec: MjSpec, scene: str | SceneConfig = "plain") -> None:
             light.active = False
         add_parts(spec, chosen)
     spec.compiler.discardvisual = False
+
+
+def _add_obstacles(spec: MjSpec, obstacles: Sequence[Obstacle]) -> None:
+    """Add the obstacles of a file, which collide with nothing. Level ground is there already."""
+    for name, one in zip(names_of(obstacles), obstacles, strict=True):
+        if one.is_ground:
+            continue
+        size = one.size or (0.0, 0.0, 1.0)
+        spec.worldbody.add_geom(
+            name=name, type=GEOM_TYPES[KINDS.index(one.kind)], size=(*size, 0.0, 0.0)[:3],
+            pos=one.position, quat=one.attitude, rgba=(*one.color, 1.0),
+            contype=0, conaffinity=0, group=GROUP, mass=0.0, density=0.0,
+        )  # fmt: skip
 
 
 def _add_plain(spec: MjSpec) -> None:

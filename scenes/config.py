@@ -2,25 +2,24 @@
 
 import re
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, field, replace
+from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn, Self
 
 from ..models.errors import InputError, shortened
 from ..models.fields import Limits, check_fields, immutable, optional, read_table
+from .registry import MAX_SOLIDS, SCENES, SceneType, seeded_scenes
 
-SCENES = ("plain", "airport", "forest", "warehouse", "gates", "traffic")
-SEEDED_SCENES = SCENES[2:]
-"""Those that are drawn from a seed."""
 MAX_SEEDS = 64
 """Seeds of a scene among which episodes choose."""
 NEW_SEEDS = 1 << 28
 """How many seeds there are for new layouts, and as many for unseen ones."""
-_DENSE = ("forest",)
-"""Scenes with a density and a size."""
+FILES = (".toml", ".xml")
+"""Endings of files that describe a scene."""
 FOREST_SIZE = (120.0, 120.0)  # m
 TREE_DENSITY = 0.0076  # 1/m²
 MAX_TREES = 2000
-_LEAST_HALF = 12.0  # m: half of a forest at least, around a middle that is clear
+_LEAST_HALF = 12.0  # m: half of a forest or a maze at least, around a middle that is clear
 
 
 @immutable
@@ -28,11 +27,11 @@ class SceneConfig:
     """Ground and obstacles around the drones.
 
     As a text: NAME, then `:SEED`, `:FIRST-LAST`, `:new` or `:unseen`, then further fields, as in
-    `forest:new,density=0.1,size=34x16,clear=ends`.
+    `forest:new,density=0.1,size=34x16,clear=ends`. Or the path of a TOML or MJCF file.
     """
 
     name: str = "plain"
-    """One of `SCENES`."""
+    """One of `SCENES`, or the path of a file."""
     seeds: Annotated[
         tuple[int, ...], Limits(0, 2 * NEW_SEEDS - 1, whole=True, count=0, least=0)
     ] = ()
@@ -43,10 +42,13 @@ class SceneConfig:
     density: float | None = optional(1e-4, 0.5, "1/m²")
     """Trees per square metre of a forest."""
     size: tuple[float, float] | None = optional(10.0, 400.0, "m", count=2)
-    """Of a forest along x and y, m."""
+    """Of a forest or a maze along x and y, m."""
     clear: Literal["middle", "ends"] = "middle"
-    """Where a forest leaves room for craft: 8 m about the z axis, or 2 m about the middles of both
-    of its ends in x."""
+    """Where a forest or a maze leaves room for craft: 8 m about the z axis, or 2 m about the
+    middles of both of its ends in x."""
+    content: str = field(default="", repr=False)
+    """Obstacles of the file, as `obstacles` has them; set by `EnvConfig.resolve`, which needs the
+    file no more."""
 
     def __post_init__(self) -> None:
         check_fields(self, "scene.")
@@ -56,23 +58,28 @@ class SceneConfig:
             raise InputError(f"scene: expected consecutive seeds, got {shortened(seeds)}")
         has_layouts = bool(seeds) or self.layouts != "given"
         both = bool(seeds) and self.layouts != "given"
-        known = self.name in (SEEDED_SCENES if has_layouts else SCENES)
-        if self.name not in SCENES:
+        if self.name not in SCENES and not self.is_file:
             _refuse(shortened(self.name))
-        if not known or both or len(seeds) > MAX_SEEDS:
+        if self.content and not self.is_file:
+            raise InputError(f"scene: expected content of a file alone, got it with {self.name}")
+        wrong = has_layouts and not self.is_seeded
+        if wrong or both or len(seeds) > MAX_SEEDS:
             _refuse(f"{self.name} with seeds {shortened(seeds)} and {self.layouts} layouts")
-        more = {"density": self.density, "size": self.size, "clear": self.clear != "middle"}
-        given = [name for name, value in more.items() if value]
-        if given and self.name not in _DENSE:
-            expected = f"{' and '.join(given)} with the scene {' or '.join(_DENSE)} alone"
-            raise InputError(f"scene: expected {expected}, got {self.name}")
-        if self.name == "forest":
-            self._check_forest()
-
-    def _check_forest(self) -> None:
-        """Raise `InputError` for more trees than can be laid out, or no room for them."""
-        if self.trees > MAX_TREES:
+        self._check_options()
+        if self.name == "forest" and self.trees > MAX_TREES:
             raise InputError(f"scene: expected at most {MAX_TREES} trees, got {self.trees}")
+        most = self.type.most(self)
+        if most > MAX_SOLIDS:
+            raise InputError(f"scene: expected at most {MAX_SOLIDS} parts, got {most} of {self}")
+
+    def _check_options(self) -> None:
+        """Raise `InputError` for a field that the scene does not have, or no room for obstacles."""
+        more = {"density": self.density, "size": self.size, "clear": self.clear != "middle"}
+        for option, value in more.items():
+            if value and option not in self.type.options:
+                able = [name for name, kind in SCENES.items() if option in kind.options]
+                expected = f"{option} with the scene {' or '.join(able)} alone"
+                raise InputError(f"scene: expected {expected}, got {self.name}")
         widest = max(self.size or FOREST_SIZE)
         if self.clear == "middle" and widest < 2 * _LEAST_HALF:
             expected = f"a size of {2 * _LEAST_HALF:g} m or more, or clear=ends"
@@ -105,6 +112,8 @@ class SceneConfig:
             return scene
         if isinstance(scene, Mapping):
             return read_table(cls, scene, "scene")
+        if is_scene_file(scene):
+            return cls(name=scene)
         text, *pairs = scene.replace(" ", "").split(",") if isinstance(scene, str) else ("",)
         pattern = r"(\w+)(?::(?:(new|unseen)|([0-9]{1,9})(?:-([0-9]{1,9}))?))?"
         found = re.fullmatch(pattern, text)
@@ -144,14 +153,53 @@ class SceneConfig:
         return replace(self, name="airport") if self.name == "plain" else self
 
     @property
+    def type(self) -> SceneType:
+        """What draws it; a file has none."""
+        return SCENES.get(self.name, SceneType())
+
+    @property
     def is_seeded(self) -> bool:
         """Whether it is drawn from a seed."""
-        return self.name in SEEDED_SCENES
+        return self.type.draw is not None
+
+    @property
+    def is_file(self) -> bool:
+        """Whether a file describes it."""
+        return is_scene_file(self.name)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Fields by name."""
+        values = asdict(self)
+        if not self.is_file:  # digests of other scenes are as before
+            del values["content"]
+        return values
+
+    @property
+    def path(self) -> str:
+        """Of a file with its content, which is written to a folder if it is not here."""
+        from .files import path_of
+
+        return str(path_of(self))
+
+    def embedded(self) -> Self:
+        """The same with the content of its file, for a process that has not the file. Raises
+        `InputError`.
+        """
+        if self.content or not self.is_file:
+            return self
+        from .files import read_scene_file  # it imports MuJoCo
+
+        return replace(self, content=read_scene_file(Path(self.name)))
 
     @property
     def seed(self) -> int:
         """Of a single scene."""
         return self.seeds[0] if self.seeds else 0
+
+
+def is_scene_file(word: object) -> bool:
+    """Whether a word is the path of a file that describes a scene."""
+    return isinstance(word, str) and Path(word).suffix.lower() in FILES
 
 
 def parse_scene(text: Any) -> SceneConfig:
@@ -178,6 +226,7 @@ def _numbers(text: str, mark: str) -> Any:
 def _refuse(got: str) -> NoReturn:
     names = " or ".join(map(repr, SCENES))
     raise InputError(
-        f"scene: expected {names}, the last three with up to {MAX_SEEDS} seeds or none, as "
-        f"'forest:3', 'forest:0-7', 'forest:new' or 'forest:unseen', got {got}"
+        f"scene: expected {names}, a file that ends in {' or '.join(FILES)}, or one of "
+        f"{', '.join(seeded_scenes())} with up to {MAX_SEEDS} seeds or none, as 'forest:3', "
+        f"'forest:0-7', 'forest:new' or 'forest:unseen', got {got}"
     )

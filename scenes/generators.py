@@ -1,4 +1,4 @@
-"""Scenes from a seed: a forest, a warehouse, a track of gates.
+"""Scenes from a seed: a forest, a warehouse, a track of gates, a maze.
 
 World frame: z up, m. A generator draws what stands in a scene from one stream, in one order.
 """
@@ -12,10 +12,14 @@ import numpy as np
 from numpy.typing import ArrayLike as Vector
 from numpy.typing import NDArray
 
+from ..models.errors import InputError
 from ..models.files import read_toml
 from .config import FOREST_SIZE, SceneConfig
 from .kernels import KINDS
-from .motion import GRAVITY, REST, along_ellipse, thrown
+from .maze import maze, most_walls
+from .motion import REST
+from .registry import SceneType, register
+from .traffic import most_of_traffic, traffic
 
 Array = NDArray[np.float64]
 
@@ -23,7 +27,7 @@ SPHERE, CAPSULE, CYLINDER, BOX, _ = range(len(KINDS))
 
 CLEARANCE = 8.0
 """Half the width of the space about the z axis, 20 m high, that nothing but a gate enters, m."""
-MATERIALS = read_toml(Path(__file__).with_name("materials.toml"), "materials")
+_MATERIALS = read_toml(Path(__file__).with_name("materials.toml"), "materials")
 """By scene and name."""
 
 _TREES = read_toml(Path(__file__).with_name("trees.toml"), "trees")["kind"]
@@ -39,10 +43,6 @@ _ROCK_DENSITY = 1 / 360
 _ROCK_REACH = 1.2  # m
 _ENDS = 2.0  # m: radius of the clear spaces at the ends of a forest
 _GATES = 8
-_POSTS = 4
-_BALLS = 8
-_FIRST_THROW = 1.0  # s
-_THROW_EVERY = 1.0  # s
 _OPENING = 5.0  # m: the paper's craft is 2.8 m wide with its rotors
 
 
@@ -83,7 +83,7 @@ class Draft:
 
     def choices(self, name: str, count: int) -> list[str]:
         """As many such materials."""
-        colours = len(MATERIALS[self.scene.name][name]["colours"])
+        colours = len(self.scene.type.materials[name]["colours"])
         return [f"{name}_{one}" for one in self.rng.integers(colours, size=count).tolist()]
 
     def around(self, reach: float, far: float) -> tuple[float, float]:
@@ -287,42 +287,8 @@ def _add_gate(track: Draft, number: int) -> None:
         track.add(f"gate_{number}/frame_{part}", "box", (0.15, half, bar), position, tint, heading)
 
 
-def traffic(field: Draft) -> None:
-    """Balls are thrown at the place 2 m above the origin, and posts cross it."""
-    field.add("ground/floor", "plane", (150, 150, 1), (0, 0, 0), "grass")
-    for i in range(_POSTS):
-        angle = field.uniform(0.0, 2 * math.pi)
-        ahead = (math.cos(angle), math.sin(angle))
-        aside = field.uniform(-1.0, 1.0)
-        way = field.uniform(4.0, 7.0)
-        period = field.uniform(10.0, 20.0)
-        place = (-aside * ahead[1], aside * ahead[0], 2.0)
-        motion = along_ellipse((way * ahead[0], way * ahead[1], 0.0), (0.0, 0.0, 0.0), period)
-        tint = field.choose("paint")
-        field.add(f"post_{i}/post", "cylinder", (0.15, 2.0, 0), place, tint, motion=motion)
-    for i in range(_BALLS):
-        angle = field.uniform(0.0, 2 * math.pi)
-        away = field.uniform(7.0, 9.0)
-        flight = field.uniform(1.2, 1.6)  # s
-        start = _FIRST_THROW + i * _THROW_EVERY + field.uniform(0.0, 0.5 * _THROW_EVERY)
-        radius = field.uniform(0.15, 0.3)
-        place = (away * math.cos(angle), away * math.sin(angle), radius)
-        aim = (field.uniform(-0.4, 0.4), field.uniform(-0.4, 0.4), 2.0)
-        forward, aside, up = ((end - begin) / flight for end, begin in zip(aim, place, strict=True))
-        motion = thrown((forward, aside, up + GRAVITY / 2 * flight), start)
-        field.add(f"ball_{i}/ball", "sphere", (radius, 0, 0), place, "ball", motion=motion)
-
-
-GENERATORS = {"warehouse": warehouse, "forest": forest, "gates": gates, "traffic": traffic}
-"""The function that draws each scene."""
-
-
-def most_parts(scene: SceneConfig) -> int:
-    """At least as many as any layout of a scene from a seed has primitives."""
-    if scene.name == "traffic":
-        return _BALLS + _POSTS
-    if scene.name != "forest":
-        return 512
+def _most_of_forest(scene: SceneConfig) -> int:
+    """At least as many as any forest of this density and size has primitives."""
     wide, deep = scene.size or FOREST_SIZE
     return 4 * scene.trees + round(wide * deep * (_SHRUB_DENSITY + _ROCK_DENSITY)) + 8
 
@@ -330,6 +296,33 @@ def most_parts(scene: SceneConfig) -> int:
 def parts_of(scene: SceneConfig, seed: int) -> list[Parts]:
     """What stands in a scene, but for what its MJCF file has."""
     draft = Draft(scene, seed)
-    if scene.is_seeded:
-        GENERATORS[scene.name](draft)
+    draw = scene.type.draw
+    if draw is None:
+        return []
+    draw(draft)
+    most = scene.type.most(scene)
+    count = sum(len(one.kinds) for one in draft.parts)
+    if count > most:
+        raise InputError(f"scene: expected at most {most} parts of {scene.name}, got {count}")
     return draft.parts
+
+
+register(
+    "forest",
+    SceneType(
+        draw=forest,
+        materials=_MATERIALS["forest"],
+        most=_most_of_forest,
+        options=("density", "size", "clear"),
+    ),
+)
+register("warehouse", SceneType(draw=warehouse, materials=_MATERIALS["warehouse"]))
+register("gates", SceneType(draw=gates, materials=_MATERIALS["gates"]))
+register(
+    "maze",
+    SceneType(draw=maze, materials=_MATERIALS["maze"], most=most_walls, options=("size", "clear")),
+)
+register(
+    "traffic",
+    SceneType(draw=traffic, materials=_MATERIALS["traffic"], most=most_of_traffic),
+)

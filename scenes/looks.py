@@ -1,7 +1,7 @@
 """How scenes from a seed look: their parts as geoms, materials, lights and skies."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ from mujoco import MjSpec, mjtGeom
 from numpy.typing import ArrayLike as Vector
 
 from .config import SceneConfig
-from .generators import MATERIALS, parts_of
+from .generators import parts_of
 from .kernels import KINDS
 
 GROUP = 2
@@ -33,7 +33,10 @@ _PATTERNS = {
 def add_parts(spec: MjSpec, scene: SceneConfig) -> None:
     """Add a scene from a seed to a spec. Nothing of it touches or weighs anything."""
     painter = Painter(spec, scene)
-    _LIGHTS[scene.name](painter)
+    if scene.name == "warehouse":
+        _lamps(painter)
+    else:
+        painter.sun()
     painter.paint()
     if scene.name == "warehouse":
         walls = MjSpec.from_file(str(HALL_XML))
@@ -57,6 +60,7 @@ class Painter:
     def __init__(self, spec: MjSpec, scene: SceneConfig) -> None:
         self.spec = spec
         self.scene = scene.name
+        self.materials = scene.type.materials
         self.rng = np.random.Generator(np.random.PCG64((scene.seed, 1)))  # none of its parts
 
     def uniform(self, low: float, high: float) -> float:
@@ -68,7 +72,7 @@ class Painter:
 
     def paint(self) -> None:
         """Add the materials of the scene, in colours near those of the table."""
-        for name, look in MATERIALS[self.scene].items():
+        for name, look in self.materials.items():
             colours = look["colours"]
             for number, base in enumerate(colours):
                 colour = self.colour(base, look.get("by", 0.06))
@@ -128,11 +132,3 @@ def _lamps(hall: Painter) -> None:
         bright = hall.uniform(0.28, 0.42)
         direction = (-x / 30, hall.uniform(-0.4, 0.4), -1.0)
         hall.light(f"light_{i}", (x, 0.0, 22.0), direction, (bright,) * 3, 0.15)
-
-
-_LIGHTS: Mapping[str, Callable[[Painter], None]] = {
-    "warehouse": _lamps,
-    "forest": Painter.sun,
-    "gates": Painter.sun,
-    "traffic": Painter.sun,
-}

@@ -1,8 +1,8 @@
 """How solids move: where they are follows from the time since the episode began.
 
-A row of motions, (11,), has the velocity of a throw, m/s, and its start, s; then two vectors of an
-ellipse about the place of the solid, m, and its rate, rad/s:
-`cos(rate * t) * first + sin(rate * t) * second`.
+When it begins, all are in their places. A row of motions, (11,), has the velocity of a throw, m/s,
+and its start, s; then two vectors of an ellipse, m, and its rate, rad/s: a solid is away from its
+place by `(cos(rate * t) - 1) * first + sin(rate * t) * second`.
 """
 
 import math
@@ -39,7 +39,7 @@ def offsets(motions: Array, time: Array) -> Array:
     velocity, start, first, second, rate = np.split(motions, (3, 4, 7, 10), axis=-1)
     moment = time[..., None]
     angle = rate * moment
-    moved: Array = settled(np.cos(angle)) * first + settled(np.sin(angle)) * second
+    moved: Array = (settled(np.cos(angle)) - 1) * first + settled(np.sin(angle)) * second
     since = np.maximum(moment - start, 0.0)
     is_thrown = velocity.any(axis=-1)
     moved += velocity * since

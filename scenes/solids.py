@@ -20,14 +20,14 @@ from ..models.matrices import settled
 from . import kernels
 from .build import HIDDEN_GROUP, add_scene, is_ground
 from .config import SceneConfig, parse_scene
-from .generators import Draft, Parts, parts_of
+from .generators import Parts, parts_of
 from .looks import HALL_XML
 from .motion import REST, offsets
+from .obstacles import Obstacle, names_of, obstacles_of
+from .registry import MAX_SOLIDS
 
 Array = NDArray[np.float64]
 
-MAX_SOLIDS = 10_000
-"""Most primitives of a scene."""
 MAX_CELLS = 1 << 26
 """Most cells of a grid, which takes 0.5 GB then."""
 _SPHERE, _CAPSULE, _CYLINDER, _, _PLANE = range(len(kernels.KINDS))
@@ -68,9 +68,6 @@ class Solids:
     @classmethod
     def of_layout(cls, scene: SceneConfig, seed: int) -> "Solids":
         """What stands in one layout of a scene, without level ground at z = 0."""
-        if scene.is_seeded and scene.name != "warehouse":
-            _, *parts = parts_of(scene, seed)  # the first is the ground
-            return Solids.of_parts(parts, scene.name)
         return _made(scene, seed).standing()
 
     @classmethod
@@ -95,6 +92,25 @@ class Solids:
             axes=axes,
             halves=_halves(kind, np.concatenate(sizes)),
             motions=np.concatenate(motions),
+        )
+
+    @classmethod
+    def of_obstacles(cls, obstacles: Sequence[Obstacle]) -> Self:
+        """Those of a file."""
+        count = len(obstacles)
+        kinds = np.array([kernels.KINDS.index(one.kind) for one in obstacles], np.int8)
+        sizes = np.zeros((count, 3))
+        axes = np.zeros((count, 3, 3))
+        for one, size, matrix in zip(obstacles, sizes, axes, strict=True):
+            size[: len(one.size)] = one.size
+            mujoco.mju_quat2Mat(matrix.reshape(9), np.array(one.attitude))
+        return cls(
+            label=lambda: names_of(obstacles),
+            kinds=kinds,
+            centers=np.array([one.position for one in obstacles]).reshape(-1, 3),
+            axes=settled(axes),
+            halves=_halves(kinds, sizes),
+            motions=np.zeros((count, len(REST))),
         )
 
     @classmethod
@@ -145,9 +161,7 @@ class Solids:
     @classmethod
     def ground(cls) -> "Solids":
         """Level ground at z = 0."""
-        ground = Draft(SceneConfig(), 0)
-        ground.add("ground", "plane", (1, 1, 1), (0, 0, 0), "")
-        return Solids.of_parts(ground.parts, "plain")
+        return Solids.of_obstacles([Obstacle(kind="plane", label="ground")])
 
     def __len__(self) -> int:
         return len(self.kinds)
@@ -338,6 +352,9 @@ def _of_scene(scene: SceneConfig) -> Solids:
 
 
 def _made(scene: SceneConfig, seed: int) -> Solids:
+    if scene.is_file:
+        obstacles = obstacles_of(scene.embedded().content)
+        return Solids.ground() + Solids.of_obstacles(obstacles)
     parts = Solids.of_parts(parts_of(scene, seed), scene.name)
     if scene.name == "warehouse":
         return _hall() + parts

@@ -8,7 +8,6 @@ from ..models.errors import InputError
 from ..models.vehicle import Vehicle, can_touch, craft_geoms
 from ..scenes import SceneConfig, kernels
 from ..scenes.config import NEW_SEEDS
-from ..scenes.generators import most_parts
 from ..scenes.motion import REST, offsets
 from ..scenes.solids import Layouts, Solids
 from .compile import Untraceable
@@ -64,7 +63,7 @@ class Scenery(Kept):
     def most(self) -> int:
         """Most solids of a layout, as `solids` has them."""
         if not self._given.size:
-            return most_parts(self.scene)
+            return self.scene.type.most(self.scene)
         most: int = self.layouts.kinds.shape[1]
         return most - len(self._always)
 

@@ -374,10 +374,13 @@ def make_world(
     if backend == "rigid":
         settings["compiled"] = wanted is not False and not reason
     module = import_module(f".backends.{backend}", __package__)
-    from .scenery import Scenery, own_solids  # they import MuJoCo
+    from ..scenes import Solids  # they import MuJoCo
+    from .scenery import Scenery, own_solids
 
     cls = getattr(module, _CLASSES[backend])
-    scenery = Scenery(scene, own_solids(vehicle, felt=not cls.is_apart), num_worlds)
+    # A scene's file stands in place of what the vehicle's has.
+    own = Solids.none() if scene.is_file else own_solids(vehicle, felt=not cls.is_apart)
+    scenery = Scenery(scene, own, num_worlds)
     world: World = cls(
         vehicle, num_worlds, drones=drones, effects=effects, randomize=randomize,
         scenery=scenery, **settings,

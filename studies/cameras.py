@@ -25,7 +25,7 @@ from rotorgram.envs.config import EnvConfig
 from rotorgram.models.cameras import OUTPUTS, chosen_views
 from rotorgram.models.vehicle import Vehicle
 from rotorgram.rendering.cameras import Cameras
-from rotorgram.scenes import SEEDED_SCENES
+from rotorgram.scenes import seeded_scenes
 from rotorgram.udp import RemoteVectorEnv
 from rotorgram.udp.spawn import spawn_simulator, start_simulator
 from swarm import advanced
@@ -37,7 +37,7 @@ EPISODE = 100_000  # control steps: none ends while it is measured
 
 Step = Callable[[], object]
 Times = dict[str, float]
-WORLDS = ("plain", "airport", *SEEDED_SCENES)
+WORLDS = ("plain", "airport", *seeded_scenes())
 
 
 def ours(word: str, scene: str = "plain") -> tuple[Step, Cameras]:

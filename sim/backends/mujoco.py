@@ -14,7 +14,7 @@ from mujoco.batch import Batch, SimulationError
 
 from ...models.errors import InputError
 from ...models.fleet import members_of
-from ...models.mjcf import add_ground
+from ...models.mjcf import add_ground, delete_obstacles
 from ...models.swarm import CONTACTS, GROUNDED, contact_columns, swarm_model
 from ...models.vehicle import (
     SURROUNDINGS,
@@ -112,10 +112,11 @@ class MujocoWorld(World):
         model = vehicle.model
         if drones == 1 and (movable or payload):
             model = vehicle.movable(payload, cable)
-        if drones == 1 and not self.scenery.most:
+        is_own = not self.scenery.most and not self.scenery.scene.is_file
+        if drones == 1 and is_own:
             return model
         crafts = members_of(vehicle, drones)
-        surround = self._surround if self.scenery.most else add_ground
+        surround = add_ground if is_own else self._surround
         return swarm_model(
             crafts, movable=movable, payload=payload * drones, cable=cable, surround=surround
         )
@@ -123,6 +124,8 @@ class MujocoWorld(World):
     def _surround(self, spec: mujoco.MjSpec) -> None:
         """Add geoms to a spec for what stands in its scene, of which the first layout is known."""
         scenery = self.scenery
+        if scenery.scene.is_file:
+            delete_obstacles(spec)
         fixed = Solids.none() if scenery.varies else scenery.solids(int(scenery.seeds[0]))
         add_solids(spec, fixed, scenery.most)
 

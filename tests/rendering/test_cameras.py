@@ -21,7 +21,7 @@ from rotorgram.models.library import vehicle_names
 from rotorgram.models.vehicle import Vehicle
 from rotorgram.rendering.cameras import Cameras, Lens, drawn_model, objects_in
 from rotorgram.rendering.gl import offscreen_context
-from rotorgram.scenes import SEEDED_SCENES, Layouts, Rays, Solids
+from rotorgram.scenes import Layouts, Rays, Solids, seeded_scenes
 from rotorgram.sim.rotations import to_world
 
 BELLY = """
@@ -283,7 +283,7 @@ def test_known_points_come_to_their_pixels(made: Any, tmp_path: Path, lens: str)
         assert np.abs(places[near].mean(axis=0) - pixel).max() < 0.5
 
 
-@pytest.mark.parametrize("scene", SEEDED_SCENES)
+@pytest.mark.parametrize("scene", seeded_scenes())
 def test_depth_is_that_of_rays_among_solids(made: Any, scene: str) -> None:
     """Without MuJoCo's rays: what is seen is what is solid, but in pixels on edges."""
     cameras = made("front_depth@96x72", "crazyflie2", scene=f"{scene}:3")

@@ -25,9 +25,9 @@ def test_where_solids_are() -> None:
     motions = np.array([throw, circle, line, np.zeros(11)])
     half = math.sqrt(0.5)
     expected = {
-        0.0: [(0, 0, 0), (2, 0, 0), (0, 0, 1), (0, 0, 0)],
-        1.0: [(0, 0, 0), (2 * half, 2 * half, 0), (0, 0, 0), (0, 0, 0)],
-        4.0: [(6, -8, 10 - 19.6), (-2, 0, 0), (0, 0, 1), (0, 0, 0)],
+        0.0: [(0, 0, 0), (0, 0, 0), (0, 0, 0), (0, 0, 0)],
+        1.0: [(0, 0, 0), (2 * half - 2, 2 * half, 0), (0, 0, -1), (0, 0, 0)],
+        4.0: [(6, -8, 10 - 19.6), (-4, 0, 0), (0, 0, 0), (0, 0, 0)],
     }
     for time, places in expected.items():
         assert offsets(motions, np.array([time])) == pytest.approx(np.array(places, float))

@@ -1,0 +1,113 @@
+"""Obstacles of a scene's file, and their text in TOML, which a config carries."""
+
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields
+from functools import lru_cache
+from typing import Annotated
+
+from ..models.errors import InputError, shortened
+from ..models.fields import (
+    Choice,
+    Direction,
+    Limits,
+    Text,
+    check_fields,
+    check_names,
+    immutable,
+    read_table,
+)
+from ..models.files import MAX_BYTES, parse_toml
+from .kernels import KINDS
+from .registry import MAX_SOLIDS
+
+SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "box": 3, "plane": 0}
+"""How many numbers the size of each kind has."""
+_WORD = Text(r"[A-Za-z][A-Za-z0-9]{0,31}", "a word of at most 32 letters and digits")
+
+
+@immutable
+class Obstacle:
+    """A primitive that stands still. World frame: z up."""
+
+    kind: Annotated[str, Choice(KINDS)]
+    size: Annotated[tuple[float, ...], Limits(1e-4, 1e4, "m", count=0, least=0)] = ()
+    """As MuJoCo has them: radius; radius and half the length, without the round ends of a capsule;
+    half the sides of a box along x, y and z. A plane has no end and no size: its z axis points out
+    of it."""
+    position: Annotated[tuple[float, ...], Limits(-1e4, 1e4, "m", count=3)] = (0.0, 0.0, 0.0)
+    """Of its center."""
+    heading: Annotated[float, Limits(-360.0, 360.0, "degrees")] = 0.0
+    """Turn about z, anticlockwise, instead of a `quaternion`."""
+    quaternion: Annotated[tuple[float, ...], Direction(-1e3, 1e3, count=4)] = (1.0, 0.0, 0.0, 0.0)
+    """Attitude, w first."""
+    color: Annotated[tuple[float, ...], Limits(0.0, 1.0, count=3)] = (0.62, 0.64, 0.66)
+    """Red, green and blue."""
+    label: Annotated[str, _WORD] = ""
+    """Its class, a word as `tree`. None given: its kind."""
+
+    def __post_init__(self) -> None:
+        if not self.label:
+            object.__setattr__(self, "label", self.kind)
+        check_fields(self, "obstacle: ")
+        if self.heading and self.quaternion[1:] != (0.0, 0.0, 0.0):
+            raise InputError("obstacle: expected a heading or a quaternion, got both")
+        count = SIZES[self.kind]
+        if len(self.size) != count:
+            raise InputError(
+                f"obstacle: expected a size of {count} numbers for a {self.kind}, "
+                f"got {len(self.size)}"
+            )
+
+    @property
+    def attitude(self) -> tuple[float, ...]:
+        """Unit quaternion."""
+        if self.heading:
+            half = math.radians(self.heading) / 2
+            return math.cos(half), 0.0, 0.0, math.sin(half)
+        length = math.hypot(*self.quaternion)
+        return tuple(one / length for one in self.quaternion)
+
+    @property
+    def is_ground(self) -> bool:
+        """Whether it is level ground at z = 0 or below, which is in every scene."""
+        _, x, y, _ = self.attitude
+        return self.kind == "plane" and x == y == 0.0 and self.position[2] <= 0.0
+
+
+def to_content(obstacles: Iterable[Obstacle]) -> str:
+    """Obstacles as the text of a TOML file. Raises `InputError` if it would be too long to read."""
+    lines = []
+    for one in obstacles:
+        lines.append("[[obstacle]]")
+        for field in fields(one):
+            value = getattr(one, field.name)
+            if value != field.default:
+                lines.append(f"{field.name} = {json.dumps(value)}")
+    content = "\n".join(lines)
+    if len(content) > MAX_BYTES:
+        raise InputError(f"obstacle: expected {MAX_BYTES} bytes of them, got {len(content)}")
+    return content
+
+
+@lru_cache(maxsize=16)
+def obstacles_of(content: str) -> tuple[Obstacle, ...]:
+    """Obstacles of the text of a TOML file. Raises `InputError`."""
+    return obstacles_in(parse_toml(content, "obstacle"))
+
+
+def obstacles_in(file: Mapping[str, object]) -> tuple[Obstacle, ...]:
+    """Obstacles of the tables of a TOML file. Raises `InputError`."""
+    check_names(file, ["obstacle"], "obstacle")
+    tables = file.get("obstacle", [])
+    if not isinstance(tables, list):
+        raise InputError(f"obstacle: expected a list of tables, got {shortened(tables)}")
+    if len(tables) > MAX_SOLIDS:
+        raise InputError(f"obstacle: expected at most {MAX_SOLIDS}, got {len(tables)}")
+    return tuple(read_table(Obstacle, table, "obstacle") for table in tables)
+
+
+def names_of(obstacles: Sequence[Obstacle]) -> tuple[str, ...]:
+    """Of scene, object and part, as those of our scenes."""
+    return tuple(f"own/{one.label}_{i}/{one.kind}" for i, one in enumerate(obstacles))
