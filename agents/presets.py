@@ -3,14 +3,13 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 from typing import Any, Literal
 
 from ..envs.registry import is_known, task_type
 from ..models import Backend
 from ..models.errors import InputError
 from ..models.fields import check_names, immutable
-from ..models.files import read_toml
+from ..models.files import read_own_toml
 from .config import Config
 from .registry import find_algorithm
 
@@ -46,7 +45,7 @@ class Preset:
 @cache
 def presets_of(algorithm: str) -> Tables:
     """An algorithm's tables by preset and task; one without any has an empty `tuned`."""
-    content = read_toml(Path(__file__).with_name("presets.toml"), "presets")
+    content = read_own_toml(__file__, "presets")
     found: Tables = {}
     for table in content["preset"]:
         algorithms = table.pop("algorithms")

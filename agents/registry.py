@@ -6,11 +6,10 @@ if it has any, are in `presets.toml`.
 
 from dataclasses import dataclass
 from importlib import import_module
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from ..models.errors import InputError
-from ..models.files import read_toml
+from ..models.files import read_own_toml
 
 if TYPE_CHECKING:
     from .learner import Learner
@@ -53,10 +52,7 @@ def _find(name: str) -> Any:
     return getattr(import_module(module, __package__), one)
 
 
-ALGORITHMS = {
-    name: Algorithm(**row)
-    for name, row in read_toml(Path(__file__).with_name("algorithms.toml"), "algorithms").items()
-}
+ALGORITHMS = {name: Algorithm(**row) for name, row in read_own_toml(__file__, "algorithms").items()}
 
 if TYPE_CHECKING:
     AlgorithmName = str

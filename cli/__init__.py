@@ -23,12 +23,12 @@ from shutil import get_terminal_size
 from typing import TYPE_CHECKING, TypeGuard
 
 from ..models.errors import printable
-from ..models.files import read_toml
+from ..models.files import read_own_toml
 
 if TYPE_CHECKING:
     from ._flags import Command
 
-_NAMES = read_toml(Path(__file__).with_name("commands.toml"), "commands")
+_NAMES = read_own_toml(__file__, "commands")
 COMMANDS: tuple[str, ...] = tuple(_NAMES["commands"])
 """Each is a class in the module of its name: `Sim` in `sim`, `CheckTask` in `check_task`."""
 

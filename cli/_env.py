@@ -13,7 +13,7 @@ from ..envs.registry import env_spec, is_known, task_type
 from ..envs.spec import EnvSpec
 from ..flights.trajectories import Trajectory
 from ..models import Backend, InputError
-from ._flags import AgentFlags, EnvFlags, parse_address
+from ._flags import AgentFlags, EnvFlags, Options, parse_address
 
 if TYPE_CHECKING:
     from ..envs.vector import LocalVectorEnv
@@ -69,7 +69,7 @@ def fitted(command: F, checkpoint: Checkpoint | Controller) -> F:
                 f"policy was trained on, got options of {env_id}"
             )
     options = {**checkpoint.options, **options}
-    changes: dict[str, Any] = {"env": checkpoint.env_id, "options": options}
+    changes: Options = {"env": checkpoint.env_id, "options": options}
     if "drones" not in command.given:
         changes["drones"] = len(checkpoint.spec.agents)
     listens = getattr(command, "listen", None) is not None

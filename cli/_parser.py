@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import field, replace
 from inspect import cleandoc
 from types import UnionType
-from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import tyro
 from tyro.conf import arg
@@ -23,6 +23,7 @@ from ._flags import (
     parse_value,
 )
 
+T = TypeVar("T")
 _PLAIN_FLAGS = ("action", "control_period", "episode_length", "history", "scene", "cameras")
 _NAMED_FLAGS = ("effects", "randomize", "sensors")
 _OPTIONS = (
@@ -131,12 +132,12 @@ def _named_values(flag: str, words: Words) -> Options:
     return values
 
 
-def _run_tyro(kind: Any, prog: str, words: Sequence[str]) -> Any:
+def _run_tyro(kind: type[T], prog: str, words: Sequence[str]) -> T:
     """With what it says at once: to find a text, tyro reads source files, slowly."""
-    return tyro.cli(kind, prog=prog, args=words, description=cleandoc(kind.__doc__))
+    return tyro.cli(kind, prog=prog, args=words, description=cleandoc(kind.__doc__ or ""))
 
 
-def _for_tyro(kind: type, options: type | None = None) -> Any:
+def _for_tyro(kind: type[T], options: type | None = None) -> type[T]:
     """A class of flags for tyro, whose checks run later.
 
     `options` is the type of the field of that name. `X | Y` becomes `Union[X, Y]`: for the first,

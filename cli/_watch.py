@@ -4,10 +4,11 @@ import logging
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..envs.loop import Loop
 from ..envs.rendering import moments
 from ..rendering.live import LiveView, Pace
 from ..rendering.stage import Stage
@@ -31,7 +32,8 @@ class Watcher:
 
     def __init__(self, live: LiveView, simulator: Simulator) -> None:
         self._live: LiveView | None = live
-        self._loop: Any = simulator.stepped  # the command flies registered tasks alone
+        assert isinstance(simulator.stepped, Loop)  # the command flies registered tasks alone
+        self._loop = simulator.stepped
         self._steps = np.zeros(live.stage.drones, np.int64)
         self._episodes = np.zeros(live.stage.drones, np.int64)
 

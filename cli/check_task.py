@@ -5,7 +5,7 @@ import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
@@ -13,6 +13,8 @@ from ..models.errors import InputError, one_line
 from ._flags import Command
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from ..envs import Loop
 
 WORLDS = 8
@@ -22,7 +24,7 @@ _OWN = re.compile(
     r"|\b(?:(?:np|numpy)\.)?random\.\w+|\*\* ?[3-9]"
 )
 _ADVICE = "take sin, exp, power, total … from rotorgram.sim, and random numbers from `draw` alone"
-Step = dict[str, Any]
+Step = dict[str, "np.ndarray"]
 
 
 class CheckTask(Command):

@@ -36,7 +36,7 @@ class Identify(Command):
         from ..flights.flight_logs import read_log
         from ..flights.identify import DEFAULT, LAG, SEGMENT, WINDOW, identified_toml, identify
         from ..models.errors import InputError, require
-        from ..models.files import check_new_file, write_new
+        from ..models.files import check_new_file, write_whole
         from ..models.vehicle import Vehicle
 
         require("scipy", "identify", "system identification")
@@ -66,5 +66,5 @@ class Identify(Command):
         window = f"{found.windows} predictions over {WINDOW:g} s"
         print(f"mean error of {window}: {', '.join(errors)}")
         print(f"intervals: sandwich, clustered over {found.segments} segments of {SEGMENT:g} s")
-        write_new(self.out, identified_toml(vehicle, found))
+        write_whole(self.out, identified_toml(vehicle, found))
         print(self.out)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from ..models import InputError
-from ..models.files import check_new_file, write_new
+from ..models.files import check_new_file, write_whole
 from ._flags import Command
 
 if TYPE_CHECKING:
@@ -117,7 +117,7 @@ class Vehicle(Command):
             thrust=f"[0.0, {30.0 / count}]",  # twice the weight
             listed=_LIST if listed else "",
         )
-        write_new(path, text)
+        write_whole(path, text)
         print(f"vehicle: {path} (rotorgram vehicle check {path} examines it)")
 
     def _show(self) -> None:

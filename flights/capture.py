@@ -95,7 +95,7 @@ def capture(
             for name, data in files.items():
                 write_whole(folder / name, data)
             text = json.dumps(own, separators=(",", ":"))
-            write_whole(folder / "labels" / f"{own['frame']:06}.json", text.encode())
+            write_whole(folder / "labels" / f"{own['frame']:06}.json", text)
             labels.append(own)
 
     with open_executor(workers, len(jobs), on_progress) as executor:
@@ -262,7 +262,7 @@ def write_coco(
         "annotations": annotations,
         "categories": [{"id": number, "name": name} for name, number in categories.items()],
     }
-    write_whole(file, json.dumps(content, separators=(",", ":")).encode() + b"\n")
+    write_whole(file, json.dumps(content, separators=(",", ":")) + "\n")
 
 
 def category(name: str) -> str:

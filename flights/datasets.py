@@ -4,14 +4,15 @@ Parquet. See `docs/datasets.md`."""
 import copy
 import re
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence, Sized
 from dataclasses import fields, replace
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypeVar
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.envs.registration import EnvSpec as GymSpec
 from numpy.typing import NDArray
 
 from ..envs import registry
@@ -27,7 +28,9 @@ from .trajectories import Trajectory
 
 if TYPE_CHECKING:
     import pyarrow as pa
+    from minari.data_collector.episode_buffer import EpisodeBuffer
 
+_Item = TypeVar("_Item", bound=Sized)
 _ROW_GROUP = 1 << 17  # steps that are written together
 _MINARI_ID = re.compile(r"([\w-]{2,}/)*[\w-]+-v\d+", re.ASCII)
 
@@ -129,9 +132,9 @@ def write_parquet(episodes: RecordedEpisodes, out: Path) -> None:
             writer.write_table(table.cast(schema))
 
 
-def _batches(items: Iterable[Any]) -> Iterator[list[Any]]:
+def _batches(items: Iterable[_Item]) -> Iterator[list[_Item]]:
     """All items, together as soon as they have more than `_ROW_GROUP` rows."""
-    batch: list[Any] = []
+    batch: list[_Item] = []
     for item in items:
         batch.append(item)
         if sum(map(len, batch)) > _ROW_GROUP:
@@ -149,7 +152,7 @@ def _table(spec: EnvSpec, number: int, journal: str, episode: Trajectory) -> "pa
     def repeated(value: object, kind: pa.DataType) -> pa.Array:
         return pa.repeat(pa.scalar(value, kind), rows)
 
-    def with_null(values: Any) -> pa.Array:
+    def with_null(values: object) -> pa.Array:
         array = values if isinstance(values, pa.Array) else pa.array(values)
         return pa.concat_arrays([array, pa.nulls(1, array.type)])
 
@@ -239,7 +242,7 @@ def write_minari(
             data.update_dataset_from_buffer(batch)
 
 
-def env_of(spec: EnvSpec, vehicle: Path | str | None = None) -> Any:
+def env_of(spec: EnvSpec, vehicle: Path | str | None = None) -> GymSpec | None:
     """Gymnasium's spec of the env, which makes it with these options and this vehicle (file or
     name; None: the paper's). None if it is not registered here, or is another env here.
     """
@@ -259,7 +262,7 @@ def env_of(spec: EnvSpec, vehicle: Path | str | None = None) -> Any:
     return made
 
 
-def _buffer(spec: EnvSpec, episode: Trajectory) -> Any:
+def _buffer(spec: EnvSpec, episode: Trajectory) -> "EpisodeBuffer":
     from minari.data_collector.episode_buffer import EpisodeBuffer
 
     infos = {}

@@ -159,8 +159,10 @@ class _ThisProcess(Executor):
     def __init__(self, on_progress: OnProgress) -> None:
         _Worker.report = on_progress
 
-    def submit(self, function: Callable[..., Any], /, *args: Any, **_: object) -> Future[Any]:
-        future: Future[Any] = Future()
+    def submit(
+        self, function: Callable[..., _Value], /, *args: object, **_: object
+    ) -> Future[_Value]:
+        future: Future[_Value] = Future()
         future.set_result(function(*args))
         return future
 

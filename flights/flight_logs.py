@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..models.errors import InputError, one_line, require
 from ..models.fields import immutable
-from ..models.files import read_toml
+from ..models.files import read_own_toml
 from ..models.vehicle import Vehicle
 
 Floats = NDArray[np.float64]
@@ -249,7 +249,7 @@ def _grid(times: Floats, period: float) -> Floats:
 
 # ---- PX4
 
-_PX4 = read_toml(Path(__file__).with_name("px4.toml"), "px4")
+_PX4 = read_own_toml(__file__, "px4")
 """Topic, field and factor of each of our columns, in our frames."""
 _ATTITUDE = "vehicle_attitude"
 _RATES = "vehicle_angular_velocity"

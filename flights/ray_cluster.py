@@ -4,11 +4,12 @@ import logging
 import socket
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
-from typing import Any
+from typing import TypeVar
 
 from ..models.errors import InputError, one_line, require
 from ..models.files import software_versions
 
+_Value = TypeVar("_Value")
 _LISTENING_TIMEOUT = 5.0  # s
 
 
@@ -32,13 +33,15 @@ class RayExecutor(Executor):
             ) from None
         cores = int(self._ray.cluster_resources().get("CPU", 0))  # 0: machines start on demand
         self.workers = jobs or max(cores, 1)
-        self._submitted: dict[Future[Any], object] = {}
+        self._submitted: dict[object, object] = {}
 
-    def submit(self, function: Callable[..., Any], /, *args: Any, **_: object) -> Future[Any]:
+    def submit(
+        self, function: Callable[..., _Value], /, *args: object, **_: object
+    ) -> Future[_Value]:
         """Submit a function; a lost machine, or other software there, is its future's error."""
         remote = self._ray.remote(num_cpus=1)(_with_same_software)
         reference = remote.remote(software_versions(), function, *args)
-        future: Future[Any] = reference.future()
+        future: Future[_Value] = reference.future()
         self._submitted[future] = reference
         future.add_done_callback(self._submitted.pop)
         return future
@@ -51,8 +54,8 @@ class RayExecutor(Executor):
 
 
 def _with_same_software(
-    versions: dict[str, str], function: Callable[..., Any], *args: object
-) -> Any:
+    versions: dict[str, str], function: Callable[..., _Value], *args: object
+) -> _Value:
     """Call a function; `config.json` names one version of each package. (In a worker.)"""
     own = software_versions()
     for package in {**versions, **own}:

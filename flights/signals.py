@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..envs.spec import Discrete, component_names, component_units
-from ..models.files import write_new
+from ..models.files import write_whole
 from .trajectories import Floats, Trajectory
 
 QUATERNION = ("qw", "qx", "qy", "qz")
@@ -97,5 +97,5 @@ def write_csv(flights: Sequence[Trajectory], out: Path) -> int:
         for row in zip(*(column.values.tolist() for column in columns), strict=True):
             writer.writerow(["" if math.isnan(value) else value for value in row])
         count += len(flight) + 1
-    write_new(out, text.getvalue())
+    write_whole(out, text.getvalue())
     return count

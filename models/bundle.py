@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import mujoco
 
@@ -77,7 +76,7 @@ def _checked(given: object) -> Bundle:
     return tuple((name, content) for name, content in given)
 
 
-def _is_file(pair: Any) -> bool:
+def _is_file(pair: object) -> bool:
     """Whether it is base64 behind a relative path that stays in its folder, on every system."""
     if not isinstance(pair, list | tuple):
         return False

@@ -20,7 +20,7 @@ from mujoco import MjData, MjModel
 from numpy.typing import NDArray
 
 from .fields import check_names, immutable
-from .files import read_toml
+from .files import read_own_toml
 from .mjcf import vehicle_spec
 from .vehicle import Vehicle
 
@@ -77,7 +77,7 @@ class Check(Rule):
         return self.low <= self.measured <= self.high
 
 
-_RULES = read_toml(Path(__file__).with_name("rules.toml"), "rules")
+_RULES = read_own_toml(__file__, "rules")
 RULES = {name: Rule(**row) for name, row in _RULES.items()}
 """Every check by its name; {} stands for a rotor, an axis or a group."""
 

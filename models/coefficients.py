@@ -7,16 +7,16 @@ in the table GROUP. SI units; body axes x forward, y left, z up.
 
 from collections.abc import Mapping
 from dataclasses import make_dataclass
-from pathlib import Path
-from typing import Any
+from functools import cache
+from typing import Annotated, Any
 
 from .errors import InputError
-from .fields import Limits, check, check_names, optional
-from .files import read_toml
+from .fields import Limits, OrNone, check, check_names
+from .files import read_own_toml
 
 PREFIX = "rotorgram/"
-_GROUPS = read_toml(Path(__file__).with_name("coefficients.toml"), "coefficients")
-_NUMBERS = read_toml(Path(__file__).with_name("numbers.toml"), "numbers")
+_GROUPS = read_own_toml(__file__, "coefficients")
+_NUMBERS = read_own_toml(__file__, "numbers")
 COEFFICIENTS = {
     f"{group}.{name}": Limits(**row)
     for group, rows in _GROUPS.items()
@@ -62,17 +62,12 @@ class Coefficients(dict[str, Any]):
         return {name: as_tuple(value) for name, value in self.items() if value is not None}
 
 
-def _tables() -> dict[str, type]:
-    tables = {}
-    for group in {**_NUMBERS, **_GROUPS}:
-        rows = {**_GROUPS.get(group, {}), **_NUMBERS.get(group, {})}
-        fields = [(name, Any, optional(**row)) for name, row in rows.items()]
-        tables[group] = make_dataclass(group, fields, frozen=True, kw_only=True)
-    return tables
-
-
-TABLES = _tables()
-"""A dataclass for the numbers of each group of a vehicle's TOML file; None: it does not give it."""
+@cache
+def table_of(group: str) -> type:
+    """A dataclass for the numbers of a table of a vehicle's TOML file; None: not given."""
+    rows = {**_GROUPS.get(group, {}), **_NUMBERS.get(group, {})}
+    fields = [(name, Annotated[Any, OrNone(Limits(**row))], None) for name, row in rows.items()]
+    return make_dataclass(group, fields, frozen=True, kw_only=True)
 
 
 def as_tuple(value: float | tuple[float, ...]) -> tuple[float, ...]:

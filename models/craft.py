@@ -14,7 +14,7 @@ from mujoco import MjsBody, MjSpec, mjtGeom
 from .cameras import ORIGIN, UP, place_camera
 from .coefficients import PREFIX
 from .errors import InputError
-from .files import find_in_package, read_toml
+from .files import find_in_package, read_own_toml
 from .vehicle_file import Box, Cylinder, PlacedRotor, VehicleFile
 
 Vector = Sequence[float] | np.ndarray
@@ -23,7 +23,7 @@ DEFAULT_TIMESTEP = 0.01
 """Physics step of a file without one, s."""
 DEFAULT_GRAVITY = 9.81
 """Downward acceleration of a file without one, m/s²."""
-_LOOKS = read_toml(Path(__file__).with_name("craft.toml"), "craft")
+_LOOKS = read_own_toml(__file__, "craft")
 
 
 def craft_spec(file: VehicleFile, base: MjSpec | None = None) -> MjSpec:

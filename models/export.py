@@ -5,7 +5,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from .errors import InputError
-from .files import check_new_file, write_new
+from .files import check_new_file, write_whole
 from .library import find_vehicle
 from .mjcf import read_spec
 from .vehicle import Vehicle
@@ -26,4 +26,4 @@ def export_mjcf(vehicle: Path | str, out: Path) -> None:
             folder = model_of(path).parent / compiler.get(key, "")
             compiler.set(key, os.path.relpath(folder, out.resolve().parent))
     text = ElementTree.tostring(root, encoding="unicode") + "\n"
-    write_new(out, text)
+    write_whole(out, text)

@@ -251,15 +251,13 @@ def read_table(kind: type[T], table: object, where: str) -> T:
         names = ", ".join(known)
         raise InputError(f"{where}: expected values by name ({names}), got {shortened(table)}")
     check_names(table, known, where)
-    rules = rules_of(kind)
-    values = {}
+    values = dict(table)
+    for name, rule in rules_of(kind).items():
+        if name in values:
+            values[name] = check(f"{where}.{name}", rule, values[name])
     for name, one in known.items():
-        if name in table:
-            value = table[name]
-            if name in rules:
-                value = check(f"{where}.{name}", rules[name], value)
-            values[name] = value
-        elif one.default is MISSING and one.default_factory is MISSING:
+        needed = one.default is MISSING and one.default_factory is MISSING
+        if needed and name not in values:
             raise InputError(f"{where}: expected {name}, got none")
     return kind(**values)
 
@@ -272,18 +270,11 @@ def check_names(table: Iterable[str], known: Iterable[str], where: str) -> None:
             raise InputError(f"{where}: expected some of {', '.join(names)}, got {shortened(name)}")
 
 
-def optional(low: float, high: float, unit: str, count: int = 1) -> Any:
-    """A field of a dataclass that is None, or has a number or several within limits."""
-    rule = OrNone(Limits(low, high, unit, count=count))
-    return field(default=None, metadata={"rule": rule})
-
-
 def rules_of(kind: type) -> Mapping[str, Rule]:
     """The rules of a dataclass's fields, by name.
 
-    They are those of `optional` and of annotations: `Annotated` with a rule, `Literal`, and the
-    types bool, int, float and str. A class that gives a field another default keeps the rule of its
-    base.
+    They are those of annotations: `Annotated` with a rule, `Literal`, and the types bool, int,
+    float and str. A class that gives a field another default keeps the rule of its base.
     """
     if kind in _RULES:
         return _RULES[kind]
@@ -292,8 +283,7 @@ def rules_of(kind: type) -> Mapping[str, Rule]:
         for name, hint in inspect.get_annotations(base, eval_str=True).items():
             if hint not in _PLAIN or not rules.get(name):
                 rules[name] = _rule_of(hint)
-    found = {one.name: one.metadata.get("rule", rules[one.name]) for one in fields(kind)}
-    _RULES[kind] = {name: rule for name, rule in found.items() if rule is not None}
+    _RULES[kind] = {name: rule for name, rule in rules.items() if rule is not None}
     return _RULES[kind]
 
 
@@ -301,13 +291,13 @@ _RULES: dict[type, Mapping[str, Rule]] = {}
 """What `rules_of` has found."""
 
 
-def limits_of(kind: type, prefix: str = "") -> dict[str, Limits]:
-    """The limits of a dataclass's numbers, by the prefix and the name; None is no number."""
+def limits_of(kind: type) -> dict[str, Limits]:
+    """The limits of a dataclass's numbers by name; None is no number."""
     found = {}
     for name, rule in rules_of(kind).items():
         inner = rule.rule if isinstance(rule, OrNone) else rule
         if isinstance(inner, Limits):
-            found[prefix + name] = inner
+            found[name] = inner
     return found
 
 

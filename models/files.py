@@ -42,6 +42,11 @@ def parse_toml(content: str | bytes, what: str, name: str = "a text") -> dict[st
     raise InputError(f"{what}: expected a TOML file, got {name}: {reason}")
 
 
+def read_own_toml(module: str, name: str) -> dict[str, Any]:
+    """Tables of a file of ours beside a module: `read_own_toml(__file__, "rules")`."""
+    return read_toml(Path(module).with_name(f"{name}.toml"), name)
+
+
 @contextmanager
 def removed_on_error(path: Path) -> Iterator[None]:
     """Remove half a file or folder. An `OSError` without a file's name gets this one."""
@@ -58,23 +63,17 @@ def removed_on_error(path: Path) -> Iterator[None]:
         raise
 
 
-def write_new(path: Path, content: str | bytes) -> None:
-    """Write a new file, a text in UTF-8. Raises `OSError`, which names it; then it is not there."""
-    file = path.open("xb")
-    with removed_on_error(path), file:
-        file.write(content.encode() if isinstance(content, str) else content)
+def write_whole(path: Path, content: str | bytes) -> None:
+    """Write a file, a text in UTF-8.
 
-
-def write_whole(path: Path, data: bytes) -> None:
-    """Write a file: after a crash at any moment, `path` holds the old one or the new one.
-
-    Two processes may write it at the same time. `OSError` names the file.
+    After a crash at any moment, `path` holds the old one or the new one. Two processes may write it
+    at the same time. `OSError` names the file.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.{os.urandom(4).hex()}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with open(temporary, "xb") as file:
-            file.write(data)
+            file.write(content.encode() if isinstance(content, str) else content)
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
@@ -88,7 +87,7 @@ def write_whole(path: Path, data: bytes) -> None:
 
 def write_json(path: Path, content: object) -> None:
     """Write a value as JSON, as `write_whole`."""
-    write_whole(path, (json.dumps(content, indent=2) + "\n").encode())
+    write_whole(path, json.dumps(content, indent=2) + "\n")
 
 
 def check_new_file(out: Path, *endings: str) -> None:

@@ -10,14 +10,14 @@ from mujoco import MjData, MjsBody, MjSpec, mjtGeom
 
 from .craft import craft_spec, free_bodies
 from .errors import InputError
-from .files import read_toml
+from .files import read_own_toml
 from .vehicle_file import read_vehicle_file
 
 MAX_ELEMENTS = 10_000  # of a file, each as often as it is repeated: seconds to compile
 MAX_BYTES = 1 << 24  # of a file
 MAX_MEMORY = 1 << 30  # bytes of MJCF's attribute `memory`
 MAX_NUMBERS = 1 << 26  # of all height fields, textures, numerics and sensors: 0.5 GB
-_LARGEST = read_toml(Path(__file__).with_name("mjcf.toml"), "mjcf")
+_LARGEST = read_own_toml(__file__, "mjcf")
 """Largest attributes of elements. But for `size`, their product is a number of numbers."""
 _REPEATED = ("replicate", "composite", "flexcomp")
 _UNITS = "KMGTPE"  # each is 1024 times the one before

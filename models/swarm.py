@@ -1,4 +1,4 @@
-"""Several crafts in one world: its compiled model, and which parts belong to which craft."""
+"""The crafts of one world and their payload: the compiled model, and which part is whose."""
 
 from collections.abc import Callable, Sequence
 
@@ -8,10 +8,11 @@ from mujoco import MjModel
 
 from .errors import InputError
 from .mjcf import add_ground, swarm_spec
-from .vehicle import Vehicle, hang_payload, owners
+from .vehicle import PAYLOAD, Vehicle, owners, payload_radius
 
 SHARED = ("timestep", "gravity", "integrator", "density", "viscosity", "wind", "magnetic")
 """Options that a world has once, so that its vehicles have to agree."""
+_HIGH = 1e4  # m: nothing stands there
 CONTACTS = "rotorgram/contacts"
 GROUNDED = "rotorgram/grounded"
 """Sensors of a craft: how many contacts it has, and how many of them with the world."""
@@ -32,10 +33,16 @@ def swarm_model(
 ) -> MjModel:
     """A world with a craft of each vehicle, without visual elements.
 
-    Free joints and rotors come craft by craft, and two sensors of each count its contacts. With
-    `movable`, centers of mass may be moved. A payload, kg, is a ball on a cable, m, from each
-    craft: its free joint comes last, and centers of mass may be moved too. `surround` adds what
-    stands around the crafts. Raises `InputError` where vehicles do not agree in `SHARED`.
+    Free joints and rotors come craft by craft. Of several crafts two sensors count the contacts of
+    each. With `movable`, centers of mass may be moved: MuJoCo spares work where one is the body's
+    origin. `surround` adds what stands around the crafts.
+
+    A payload, kg, is a ball on a cable of a length, m, from each craft's origin. The cable is a
+    tendon that is slack below its length, and as stiff as MuJoCo's limits. The ball has the density
+    of water, and a free joint, which comes last. Centers of mass may be moved too.
+
+    Raises `InputError` where vehicles do not agree in `SHARED`, or if the ball touches a single
+    craft when it hangs straight below.
     """
     first = vehicles[0]
     names = drone_names(len(vehicles))
@@ -53,18 +60,56 @@ def swarm_model(
     spec.compiler.discardvisual = True
     for name, craft in zip(names, crafts, strict=True):
         if movable or payload:
-            craft.simple = False
-        _count_contacts(spec, f"{name}/{CONTACTS}", craft.name)
-        _count_contacts(spec, f"{name}/{GROUNDED}", craft.name, spec.worldbody.name)
+            craft.simple = False  # its inertia is no diagonal matrix once its center has moved
+        if len(crafts) > 1:
+            _count_contacts(spec, f"{name}/{CONTACTS}", craft.name)
+            _count_contacts(spec, f"{name}/{GROUNDED}", craft.name, spec.worldbody.name)
     if payload:
-        hang_payload(spec, crafts, payload, cable)
+        _hang_payload(spec, crafts, payload, cable)
     model = spec.compile()
     for name in SHARED:  # they may be others than those of the first file
         setattr(model.opt, name, getattr(first.model.opt, name))
     model.geom_group[:] = owners(model)[model.geom_bodyid] >= 0
     for drone, vehicle in enumerate(vehicles):
         model.dof_damping[6 * drone : 6 * drone + 3] = vehicle.model.dof_damping[:3]
+    if payload and len(vehicles) == 1:
+        _check_cable(model, cable, payload_radius(payload))
     return model
+
+
+def _hang_payload(
+    spec: mujoco.MjSpec, crafts: Sequence[mujoco.MjsBody], mass: float, cable: float
+) -> None:
+    """Add a ball of a mass, kg, and a cable of a length, m, to it from each craft's origin."""
+    ball = spec.worldbody.add_body(name=PAYLOAD)
+    ball.pos = crafts[0].pos - (0.0, 0.0, cable)
+    ball.add_freejoint()
+    radius = payload_radius(mass)
+    ball.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0], mass=mass)
+    end = ball.add_site(name=PAYLOAD)
+    for number, craft in enumerate(crafts):
+        hook = craft.add_site(name=f"rotorgram/hook_{number}")
+        name = f"rotorgram/cable_{number}"
+        tendon = spec.add_tendon(name=name, limited=True, range=[0.0, cable])
+        tendon.wrap_site(hook.name)
+        tendon.wrap_site(end.name)
+
+
+def _check_cable(model: MjModel, cable: float, radius: float) -> None:
+    """Raise `InputError` if the payload touches its craft when it hangs straight below."""
+    data = mujoco.MjData(model)
+    data.qpos[:3] = (0.0, 0.0, _HIGH)
+    data.qpos[7:10] = (0.0, 0.0, _HIGH - cable)
+    mujoco.mj_fwdPosition(model, data)
+    if data.ncon > 0:
+        clear = f"a payload with a radius of {radius:.3g} m hangs clear"
+        expected = f"expected a length at which {clear}"
+        raise InputError(f"effects.cable: {expected}, got {cable:g} m")
+
+
+def payload_body(model: MjModel) -> int:
+    """Id of the payload of a model with one."""
+    return int(model.body(PAYLOAD).id)
 
 
 def _count_contacts(spec: mujoco.MjSpec, name: str, craft: str, other: str = "") -> None:

@@ -24,7 +24,7 @@ from .errors import InputError, one_line
 from .fields import Limits, check, immutable
 from .library import find_vehicle
 from .matrices import inverse, product, right_inverse, settled
-from .mjcf import free_body, level_data, vehicle_spec
+from .mjcf import level_data, vehicle_spec
 from .vehicle_file import inertia_matrix, model_of, read_vehicle_file
 
 Array = np.ndarray
@@ -37,7 +37,8 @@ _MAX_MASS = 1e9  # kg: its squares overflow nowhere
 _RELATIVE = 1e-9  # of a hover's torques and forces: what rounding leaves
 _ROUNDED = 1e-5  # of the weight, sideways: what a file's six digits leave
 
-_PAYLOAD = "rotorgram/payload"  # the body's name
+PAYLOAD = "rotorgram/payload"
+"""Name of a payload's body."""
 
 SURROUNDINGS = (True, False, False, False, False, False)
 """Of a vehicle's model the groups of geoms that are not the craft's, for rays."""
@@ -183,34 +184,6 @@ class Vehicle:
             )
         return round(ratio)
 
-    def movable(self, payload: float = 0.0, cable: float = 0.0) -> MjModel:
-        """The model, compiled so that centers of mass may be moved: MuJoCo spares work where one
-        is the body's origin.
-
-        A payload, kg, is a ball on a cable of a length, m, from the body's origin. The cable is a
-        tendon that is slack below its length, and as stiff as MuJoCo's limits. The ball has the
-        density of water, and a free joint: `qpos` and `qvel` have it after the craft. Raises
-        `InputError` if the ball touches the craft when it hangs straight below.
-        """
-        spec = vehicle_spec(self.path)
-        craft = free_body(spec)
-        craft.simple = False  # its inertia is no diagonal matrix once its center has moved
-        if payload:
-            hang_payload(spec, [craft], payload, cable)
-        model = spec.compile()
-        model.dof_damping[0:3] = self.model.dof_damping[0:3]
-        model.geom_group[:] = craft_geoms(model)
-        if payload:
-            radius = payload_radius(payload)
-            data = MjData(model)
-            high = self.rest_height + 2 * (cable + radius)
-            data.qpos[7:10] = (0.0, 0.0, high - cable)
-            if _touches(model, data, high):
-                clear = f"a payload with a radius of {radius:.3g} m hangs clear"
-                expected = f"expected a length at which {clear}"
-                raise InputError(f"effects.cable: {expected}, got {cable:g} m")
-        return model
-
     def __deepcopy__(self, memo: object) -> Self:
         """Itself: it never changes."""
         return self
@@ -246,35 +219,11 @@ def payload_radius(mass: float) -> float:
     return float((3 * mass / (4 * math.pi * 1000.0)) ** (1 / 3))
 
 
-def hang_payload(spec: MjSpec, crafts: Sequence[mujoco.MjsBody], mass: float, cable: float) -> None:
-    """Add a ball of a mass, kg, and a cable of a length, m, to it from each craft's origin.
-
-    See `Vehicle.movable`.
-    """
-    ball = spec.worldbody.add_body(name=_PAYLOAD)
-    ball.pos = crafts[0].pos - (0.0, 0.0, cable)
-    ball.add_freejoint()
-    radius = payload_radius(mass)
-    ball.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0], mass=mass)
-    end = ball.add_site(name=_PAYLOAD)
-    for number, craft in enumerate(crafts):
-        hook = craft.add_site(name=f"rotorgram/hook_{number}")
-        name = f"rotorgram/cable_{number}"
-        tendon = spec.add_tendon(name=name, limited=True, range=[0.0, cable])
-        tendon.wrap_site(hook.name)
-        tendon.wrap_site(end.name)
-
-
-def craft_bodies(model: MjModel) -> Array:
-    """Ids of the first free body, and of what is welded to it."""
-    return np.flatnonzero(owners(model) == 0)
-
-
 def owners(model: MjModel) -> Array:
     """Number of the craft to which each body belongs, -1 if none, shape (B,)."""
     owner = np.full(model.nbody, -1)
     for body in model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE].tolist():
-        if model.body(body).name != _PAYLOAD:
+        if model.body(body).name != PAYLOAD:
             owner[model.body_rootid == body] = owner.max() + 1
     return owner
 
@@ -291,11 +240,6 @@ def can_touch(model: MjModel, geom: int, others: Array) -> bool:
     affinities = model.geom_conaffinity
     pairs = (types[geom] & affinities[others]) | (affinities[geom] & types[others])
     return bool(pairs.any())
-
-
-def payload_body(model: MjModel) -> int:
-    """Id of the payload of a model from `Vehicle.movable`."""
-    return int(model.body(_PAYLOAD).id)
 
 
 def body_axes(model: MjModel) -> Array:

@@ -14,14 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .cameras import AHEAD, ORIGIN, OUTPUTS, UP, Axis, Camera, Place, steps_of
-from .coefficients import COEFFICIENTS, TABLES, as_tuple
+from .coefficients import COEFFICIENTS, as_tuple, table_of
 from .errors import InputError, shortened
 from .fields import Choice, Limits, T, Text, check, immutable, limits_of, printable, read_table
 from .files import read_toml
 
-_Vehicle: Any = TABLES["vehicle"]
-_Body: Any = TABLES["body"]
-_Rotors: Any = TABLES["rotors"]
 _Numbers = tuple[float, ...]
 _Mass = Annotated[float, Limits(1e-6, 1e6, "kg")]
 _Length = Annotated[float, Limits(1e-5, 100.0, "m")]
@@ -56,7 +53,7 @@ _SHAPES: Final[Mapping[str, type[Box | Cylinder]]] = {"box": Box, "cylinder": Cy
 
 
 @immutable
-class Body(_Body):  # type: ignore[misc]
+class Body(table_of("body")):  # type: ignore[misc]
     """Mass and inertia, or parts that have them; and the hub."""
 
     parts: tuple[Box | Cylinder, ...] = ()
@@ -80,7 +77,7 @@ class PlacedRotor:
 
 
 @immutable
-class RotorTable(_Rotors):  # type: ignore[misc]
+class RotorTable(table_of("rotors")):  # type: ignore[misc]
     """Rotors, all alike, in a frame or in a list."""
 
     frame: Literal["plus", "cross", "hexa", "octo"] | None = None
@@ -103,7 +100,7 @@ class _Sourced:
 
 
 @immutable
-class Tables(_Vehicle):  # type: ignore[misc]
+class Tables(table_of("vehicle")):  # type: ignore[misc]
     """A whole file, its tables not read yet."""
 
     name: Annotated[str, printable(100)]
@@ -192,7 +189,7 @@ def read_vehicle_file(path: Path) -> VehicleFile:
     cameras = [_camera(numbers, one, where) for where, one in _listed(file.cameras, "cameras")]
     _check_distinct("cameras", [camera.name for camera in cameras])
     for group in ("drag", "battery", "sensors", "real_flights"):
-        _table(numbers, TABLES[group], tree.get(group, {}), group)
+        _table(numbers, table_of(group), tree.get(group, {}), group)
     physical = {key: value for key, value in tree.items() if key != "real_flights"}
     return VehicleFile(
         name=file.name,

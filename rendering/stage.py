@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from ..models.cameras import place_cameras
 from ..models.errors import InputError, one_line, shortened
 from ..models.fields import Limits, check_fields, immutable
-from ..models.files import read_toml
+from ..models.files import read_own_toml
 from ..models.fleet import load_vehicles, members_of
 from ..models.mjcf import level_data, swarm_spec
 from ..models.swarm import drone_names
@@ -38,7 +38,7 @@ CAMERAS = get_args(Camera)
 _MAX_METRICS = 4  # with a line of their own
 _TRAIL = 150  # control steps of a path
 _EVERY = 3  # control steps of one piece of it
-LOOKS = read_toml(Path(__file__).with_name("looks.toml"), "looks")
+LOOKS = read_own_toml(__file__, "looks")
 """Colours and views of a stage."""
 MAX_NAMES = 16
 """Drones of one world whose names are shown; more would hide them."""

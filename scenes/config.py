@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn, Self
 
 from ..models.errors import InputError, shortened
-from ..models.fields import Limits, check_fields, immutable, optional, read_table
+from ..models.fields import Limits, check_fields, immutable, read_table
 from .registry import MAX_SOLIDS, SCENES, SceneType, seeded_scenes
 
 MAX_SEEDS = 64
@@ -39,9 +39,9 @@ class SceneConfig:
     layouts: Literal["given", "new", "unseen"] = "given"
     """`given`: those of `seeds`. `new`: each episode of each world draws a layout of its own.
     `unseen`: the same, of layouts that `new` never has, for tests of what was learned."""
-    density: float | None = optional(1e-4, 0.5, "1/m²")
+    density: Annotated[float | None, Limits(1e-4, 0.5, "1/m²")] = None
     """Trees per square metre of a forest."""
-    size: tuple[float, float] | None = optional(10.0, 400.0, "m", count=2)
+    size: Annotated[tuple[float, float] | None, Limits(10.0, 400.0, "m", count=2)] = None
     """Of a forest or a maze along x and y, m."""
     clear: Literal["middle", "ends"] = "middle"
     """Where a forest or a maze leaves room for craft: 8 m about the z axis, or 2 m about the

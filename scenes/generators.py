@@ -5,7 +5,6 @@ World frame: z up, m. A generator draws what stands in a scene from one stream, 
 
 import math
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,7 +12,7 @@ from numpy.typing import ArrayLike as Vector
 from numpy.typing import NDArray
 
 from ..models.errors import InputError
-from ..models.files import read_toml
+from ..models.files import read_own_toml
 from .config import FOREST_SIZE, SceneConfig
 from .kernels import KINDS
 from .maze import maze, most_walls
@@ -27,10 +26,10 @@ SPHERE, CAPSULE, CYLINDER, BOX, _ = range(len(KINDS))
 
 CLEARANCE = 8.0
 """Half the width of the space about the z axis, 20 m high, that nothing but a gate enters, m."""
-_MATERIALS = read_toml(Path(__file__).with_name("materials.toml"), "materials")
+_MATERIALS = read_own_toml(__file__, "materials")
 """By scene and name."""
 
-_TREES = read_toml(Path(__file__).with_name("trees.toml"), "trees")["kind"]
+_TREES = read_own_toml(__file__, "trees")["kind"]
 _COUNTS = np.array([len(tree["crowns"]) for tree in _TREES])  # crowns of each kind of tree
 _FIRSTS = np.cumsum(_COUNTS) - _COUNTS
 _PARTS = [name for tree in _TREES for name, *_ in tree["crowns"]]

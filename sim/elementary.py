@@ -9,13 +9,12 @@ import math
 from collections.abc import Callable, Sequence
 from functools import wraps
 from math import factorial
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
-from ..models.files import read_toml
+from ..models.files import read_own_toml
 from .compile import once
 from .compile.tracer import add_function
 from .state import Array
@@ -42,7 +41,7 @@ def _precision(sines: int, powers: int, logs: int, **constants: Any) -> SimpleNa
     )
 
 
-_TABLES = read_toml(Path(__file__).with_name("elementary.toml"), "elementary")
+_TABLES = read_own_toml(__file__, "elementary")
 _SINGLE = _precision(**_TABLES["float32"])
 _DOUBLE = _precision(**_TABLES["float64"])
 

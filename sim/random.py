@@ -9,7 +9,6 @@ numbers of another. A batch of W worlds has the numbers of W single ones.
 from collections.abc import Mapping, Sequence
 from math import prod
 from secrets import randbits
-from typing import Any
 from zlib import crc32
 
 import numpy as np
@@ -22,7 +21,7 @@ from .state import Array, is_traced
 
 Words = NDArray[np.uint32]
 Numbers = NDArray[np.float64]
-Mask = Any
+Mask = Array
 """Of drones, bool, shape (W, A), the same for those of a world. None: all."""
 
 # Numbers of uses, and the name of the noise of gusts.
@@ -39,7 +38,6 @@ _ROUNDS = 10
 _UNIT = 2.0**-32
 _TURN = 6.283185307179586
 _AHEAD = 256  # Most rows of numbers that are drawn ahead, over all worlds
-_BLOCKS = 16  # Least blocks that a `Draw` computes at once for a world
 
 
 @once(vectors=1)
@@ -127,11 +125,11 @@ class Random(Kept):
         for noise in self._noises.values():
             noise.begin(begun)
 
-    def worlds(self, mask: Mask) -> Any:
+    def worlds(self, mask: Mask) -> Array:
         """The worlds of a mask, bool, shape (W,)."""
         return np.ones(len(self.episode), bool) if mask is None else mask[:, 0]
 
-    def ids(self, mask: Mask) -> Any:
+    def ids(self, mask: Mask) -> Array:
         """The numbers of the worlds of a mask; `...` of traced code, which has one world."""
         worlds = self.worlds(mask)
         return ... if is_traced(worlds) else np.flatnonzero(worlds)
@@ -162,7 +160,6 @@ class Draw:
         self._ids = ids = random.ids(mask)
         self._key = random.keys[ids]
         self._episode = random.episode[ids] + np.uint32(ahead)
-        self._words: Words = self._key[:, :0]
         self._first = 0  # block that comes next
 
     def uniform(self, low: float, high: float, size: tuple[int, ...] = ()) -> Array:
@@ -182,14 +179,9 @@ class Draw:
     def _next(self, size: tuple[int, ...], more: int = 0) -> Words:
         """The next words of each world that begins, from a new block on."""
         count = self._random.drones * prod(size) + more
-        if count > self._words.shape[1]:
-            many = 4 * max(_BLOCKS, -(-count // 4))
-            step = 0 * self._episode
-            self._words = words_of(self._key, self._use, self._episode, step, many, self._first)
-        words = self._words[:, :count]
-        used = -(-count // 4)
-        self._words = self._words[:, 4 * used :]
-        self._first += used
+        step = 0 * self._episode
+        words = words_of(self._key, self._use, self._episode, step, count, self._first)
+        self._first += -(-count // 4)
         return words
 
     def _spread(self, drawn: Numbers, size: tuple[int, ...]) -> Array:
@@ -217,9 +209,9 @@ class Noise(Kept):
         self._use = use
         self._size = size
         self._ahead = max(1, _AHEAD // worlds)
-        self._of: Any = None  # the key of each row, its episode and its steps
+        self._of: Array = None  # the key of each row, its episode and its steps
 
-    def begin(self, begun: Any) -> None:
+    def begin(self, begun: Array) -> None:
         """An episode of some worlds begins, bool, (W,)."""
         self.step = np.where(begun, np.uint32(0), self.step)
 

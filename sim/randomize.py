@@ -7,13 +7,12 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from ..models.errors import InputError, shortened
 from ..models.fields import check_names
-from ..models.files import read_toml
+from ..models.files import read_own_toml
 from .effects import EffectOptions
 from .elementary import exp, log
 from .random import Draw
@@ -35,7 +34,7 @@ class Parameter:
     """At least one of these effects must be on."""
 
 
-_TABLES = read_toml(Path(__file__).with_name("parameters.toml"), "parameters")
+_TABLES = read_own_toml(__file__, "parameters")
 PARAMETERS = {name: Parameter(**table) for name, table in _TABLES.items()}
 """What can be drawn, by name."""
 CENTER = ("center_x", "center_y", "center_z")

@@ -1,23 +1,23 @@
 """Env steps per second on this machine, from raw physics to a simulator over UDP.
 
-Other simulators of drones stand beside ours where they are installed. `rigid` and they count
-seconds of the processor, so that threads bring nothing: steps per second of one core. All layers
-are open at the same time and take turns to run for a moment; the median over the turns counts, so
-that a machine that slows down for a while slows all alike.
+`rigid` counts seconds of the processor, so that threads bring nothing: steps per second of one
+core. All layers are open at the same time and take turns to run for a moment; the median over the
+turns counts, so that a machine that slows down for a while slows all alike.
+`studies/beside.py` adds layers of other simulators.
 """
 
 import os
 import statistics
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from importlib.util import find_spec
 from itertools import cycle
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import perf_counter, process_time
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import gymnasium as gym
 import mujoco
@@ -33,16 +33,26 @@ from ..models.fields import Limits, check
 from ..models.files import software_versions, write_json
 from ..models.vehicle import Vehicle
 from ..udp.spawn import spawn_simulator
+from ..udp.transport.stepped import GymEnv
 from .results import machine
 
 ENV_ID = "rotorgram/Elevation-v0"
 HOVER = "rotorgram/Hover-v0"
 _PERIOD = 0.02  # s, of a control step
 _STEPS_AT_ONCE = 64  # of one drone between two looks at the clock
-_DRONES = 1024
+DRONES = 1024
 
 Step = Callable[[], int]
 """Flies a step of all drones; the number of env steps that it made."""
+
+
+class Measured(NamedTuple):
+    """What `bench` found."""
+
+    medians: dict[str, float]
+    """Env steps per second by the name of the layer."""
+    policy_seconds: float | None
+    """Processor time of a training, s; None where its packages are missing."""
 
 
 class Layer(NamedTuple):
@@ -54,35 +64,27 @@ class Layer(NamedTuple):
     start: Callable[[ExitStack], Step]
     """Opens it for as long as the stack is."""
     clock: Callable[[], float] = perf_counter
-    package: str = "rotorgram"
-    """What must be installed."""
 
 
-def layers() -> list[Layer]:
-    """Those that this machine can run."""
-    return [layer for layer in LAYERS if find_spec(layer.package)]
-
-
-def bench(rounds: int, seconds: float, folder: Path, on_progress: OnProgress) -> dict[str, Any]:
+def bench(
+    layers: Sequence[Layer], rounds: int, seconds: float, folder: Path, on_progress: OnProgress
+) -> Measured:
     """Measure every layer in turns of `seconds`, and write `bench.json` into `folder`.
 
-    `on_layer` is called before each turn: name of the layer, turns done, turns in all. Returns what
-    is written: `medians` has env steps per second of each layer, `policy_seconds` those of a
-    training, or None where its packages are missing. Raises `InputError`.
+    `on_progress` is called before each turn. Raises `InputError`.
     """
     check("rounds", Limits(1, whole=True), rounds)
     check("seconds", Limits(0, 60, "s", above=True), seconds)
-    found = layers()
-    turns = (rounds + 1) * len(found)
+    turns = (rounds + 1) * len(layers)
     done = 0
-    rates: dict[str, list[float]] = {layer.name: [] for layer in found}
+    rates: dict[str, list[float]] = {layer.name: [] for layer in layers}
     with ExitStack() as stack:
         steps = {}
-        for layer in found:
+        for layer in layers:
             on_progress("bench", done, turns, f"opening {layer.name}")
             steps[layer.name] = layer.start(stack)
         for number in range(rounds + 1):
-            for layer in found:
+            for layer in layers:
                 on_progress("bench", done, turns, layer.name)
                 done += 1
                 at_once = _STEPS_AT_ONCE if layer.drones == 1 else 1
@@ -90,17 +92,17 @@ def bench(rounds: int, seconds: float, folder: Path, on_progress: OnProgress) ->
                 if number:  # the first round warms up
                     rates[layer.name].append(round(rate, 1))
     medians = {name: statistics.median(values) for name, values in rates.items()}
+    measured = Measured(medians, policy_seconds() if find_spec("safetensors") else None)
     content = {
         "rounds": rounds,
         "seconds": seconds,
         "rates": rates,
-        "medians": medians,
-        "policy_seconds": policy_seconds() if find_spec("safetensors") else None,
+        **measured._asdict(),
         "machine": machine(),
         "versions": software_versions(),
     }
     write_json(folder / "bench.json", content)
-    return content
+    return measured
 
 
 def policy_seconds() -> float:
@@ -152,19 +154,19 @@ def _mj_step(_: ExitStack) -> Step:
 
 def _batch_step(_: ExitStack) -> Step:
     vehicle = Vehicle.load()
-    batch = Batch(vehicle.model, _DRONES)
+    batch = Batch(vehicle.model, DRONES)
     substeps = vehicle.substeps(_PERIOD)
     batch.qpos[:, 2] = 5.0
     batch.ctrl[:] = vehicle.hover_thrust
 
     def step() -> int:
         batch.step(nstep=substeps)
-        return _DRONES
+        return DRONES
 
     return step
 
 
-def _actions(*shape: int) -> Iterator[NDArray[np.float32]]:
+def actions(*shape: int) -> Iterator[NDArray[np.float32]]:
     """Random actions near hover, the same ones again and again."""
     return cycle(np.random.default_rng(0).uniform(-0.1, 0.1, shape).astype(np.float32))
 
@@ -175,13 +177,13 @@ def local_env(stack: ExitStack) -> Step:
     return single_step(env)
 
 
-def single_step(env: gym.Env[Any, Any], width: int = 1) -> Step:
+def single_step(env: GymEnv, width: int = 1) -> Step:
     """Steps of a single env with random actions; after an episode it is reset."""
-    actions = _actions(4096, width)
+    flown = actions(4096, width)
     env.reset(seed=0)
 
     def step() -> int:
-        _, _, terminated, truncated, _ = env.step(next(actions))
+        _, _, terminated, truncated, _ = env.step(next(flown))
         if terminated or truncated:
             env.reset()
         return 1
@@ -191,12 +193,12 @@ def single_step(env: gym.Env[Any, Any], width: int = 1) -> Step:
 
 def _vector_step(env: AdvancingVectorEnv) -> Step:
     """Drones whose episode ended are reset by the next step, as in NEXT_STEP."""
-    actions = _actions(16, env.num_envs, 1)
+    flown = actions(16, env.num_envs, 1)
     env.reset(seed=0)
 
     def step() -> int:
         resets = env.done
-        env.advance(next(actions), resets if resets.any() else None)
+        env.advance(next(flown), resets if resets.any() else None)
         return int((~resets).sum())
 
     return step
@@ -207,15 +209,15 @@ def _remote(stack: ExitStack) -> Step:
 
 
 def _vector(stack: ExitStack) -> Step:
-    return _vector_step(stack.enter_context(closing(LocalVectorEnv(ENV_ID, _DRONES))))
+    return _vector_step(stack.enter_context(closing(LocalVectorEnv(ENV_ID, DRONES))))
 
 
 def _remote_vector(stack: ExitStack) -> Step:
-    opened = spawn_simulator(EnvConfig(env_id=ENV_ID), num_envs=_DRONES)
+    opened = spawn_simulator(EnvConfig(env_id=ENV_ID), num_envs=DRONES)
     return _vector_step(stack.enter_context(opened))
 
 
-# ---- `rigid`, and other simulators on one core
+# ---- `rigid` on one core
 
 
 def _rigid_env(stack: ExitStack) -> Step:
@@ -227,11 +229,11 @@ def _rigid(drones: int) -> Callable[[ExitStack], Step]:
     def start(stack: ExitStack) -> Step:
         env = gym.make_vec(HOVER, num_envs=drones, backend="rigid")
         env = stack.enter_context(closing(env))
-        actions = _actions(16, drones, 4)
+        flown = actions(16, drones, 4)
         env.reset(seed=0)
 
         def step() -> int:
-            env.step(next(actions))
+            env.step(next(flown))
             return drones
 
         return step
@@ -239,75 +241,15 @@ def _rigid(drones: int) -> Callable[[ExitStack], Step]:
     return start
 
 
-def _l2f(_: ExitStack) -> Step:
-    os.environ.setdefault("OMP_NUM_THREADS", "1")  # it counts seconds of all threads
-    import l2f
-
-    vector = l2f.vector_selector[_DRONES]
-    device = l2f.Device()
-    env = vector.VectorEnvironment()
-    rng = vector.VectorRng()
-    parameters = vector.VectorParameters()
-    state, later = vector.VectorState(), vector.VectorState()
-    vector.initialize_rng(device, rng, 0)
-    vector.initialize_environment(device, env)
-    vector.initial_parameters(device, env, parameters)
-    vector.sample_initial_state(device, env, parameters, state, rng)
-    seen = np.zeros((_DRONES, env.OBSERVATION_DIM), np.float32)
-    actions = _actions(16, _DRONES, env.ACTION_DIM)
-
-    def step() -> int:
-        vector.step(device, env, parameters, state, next(actions), later, rng)
-        state.assign(later)
-        vector.observe(device, env, parameters, state, seen, rng)
-        return _DRONES
-
-    return step
-
-
-def _hyperdrone(_: ExitStack) -> Step:
-    from hyperdrone.dynamics import Sim
-
-    sim = Sim(_DRONES)
-    sim.reset(sample_states=True)
-    actions = _actions(16, _DRONES, sim.action_dim)
-
-    def step() -> int:
-        sim.step(next(actions))
-        sim.observe()
-        return _DRONES
-
-    return step
-
-
-def _crazyflow(stack: ExitStack) -> Step:
-    import crazyflow.envs  # noqa: F401  # it registers them
-    import jax
-
-    made = gym.make_vec("DroneReachPos-v0", num_envs=_DRONES, device="cpu", freq=50)
-    env = stack.enter_context(closing(made))
-    env.reset(seed=0)
-    actions = _actions(16, *(env.action_space.shape or ()))
-
-    def step() -> int:
-        jax.block_until_ready(env.step(next(actions))[0])
-        return _DRONES
-
-    return step
-
-
 LAYERS = (
     Layer("mj_step", "substeps of one control step", 1, _mj_step),
     Layer("env", "the single env's step", 1, local_env),
     Layer("UDP, 1", "RemoteEnv and a simulator", 1, _remote),
-    Layer("Batch.step, 1024", "mujoco.batch, the same substeps", _DRONES, _batch_step),
-    Layer("vector env, 1024", "the vector env", _DRONES, _vector),
-    Layer("UDP, 1024", "RemoteVectorEnv", _DRONES, _remote_vector),
+    Layer("Batch.step, 1024", "mujoco.batch, the same substeps", DRONES, _batch_step),
+    Layer("vector env, 1024", "the vector env", DRONES, _vector),
+    Layer("UDP, 1024", "RemoteVectorEnv", DRONES, _remote_vector),
     Layer("rigid, 1", "Hover-v0, two steps of RK4", 1, _rigid_env, process_time),
     Layer("rigid, 64", "the same", 64, _rigid(64), process_time),
-    Layer("rigid, 1024", "the same", _DRONES, _rigid(_DRONES), process_time),
+    Layer("rigid, 1024", "the same", DRONES, _rigid(DRONES), process_time),
     Layer("rigid, 4096", "the same", 4096, _rigid(4096), process_time),
-    Layer("L2F, 1024", "one step of RK4", _DRONES, _l2f, process_time, "l2f"),
-    Layer("HyperDrone, 1024", "the same", _DRONES, _hyperdrone, process_time, "hyperdrone"),
-    Layer("Crazyflow, 1024", "ten steps", _DRONES, _crazyflow, process_time, "crazyflow"),
 )

@@ -3,7 +3,7 @@
 Each claim of the paper's section 3 becomes one number per training run; the two agents' numbers are
 compared by the bootstrap of the difference between their interquartile means over seeds. The
 paper shows one run of each agent and gives no definitions, so the definitions here are ours, and
-every verdict states its own, and with which preset the agents were trained.
+every verdict states its own. The report adds with which preset the agents were trained.
 
 The paper's claims are four, and three comparisons judge them (presets `tuned` and `paper`, and the
 task that observes the error alone). Each is judged by an interval of 1 - 0.05 / 12 = 99.58 %
@@ -75,8 +75,6 @@ class Verdict:
     """Place in the paper."""
     definition: str
     """Of its measure and of the decision."""
-    preset: str
-    """Hyperparameters with which the agents were trained."""
     verdict: Outcome
     evidence: str
     """The numbers."""
@@ -128,17 +126,13 @@ def fluctuation(run: DataFrame) -> float:
     return float(_late_returns(run, run["return"] - moving).std())
 
 
-def judge_claims(
-    episodes: DataFrame, runs: DataFrame, preset: str, headline: Headline
-) -> list[Verdict]:
-    """Judge the paper's four claims from the tables `episodes` and `runs` of `results`. Every
-    verdict states the preset with which the agents were trained.
-    """
+def judge_claims(episodes: DataFrame, runs: DataFrame, headline: Headline) -> list[Verdict]:
+    """Judge the paper's four claims from the tables `episodes` and `runs` of `results`."""
     return [
-        Verdict(*_CONVERGES, preset, *_compare(episodes, convergence_step, True, _LATER)),
-        Verdict(*_REWARD, preset, *_compare(episodes, long_run_return, True)),
-        Verdict(*_FLUCTUATES, preset, *_compare(episodes, fluctuation, False)),
-        Verdict(*_holding_claim(headline), preset, *_both_hold(runs, headline)),
+        Verdict(*_CONVERGES, *_compare(episodes, convergence_step, True, _LATER)),
+        Verdict(*_REWARD, *_compare(episodes, long_run_return, True)),
+        Verdict(*_FLUCTUATES, *_compare(episodes, fluctuation, False)),
+        Verdict(*_holding_claim(headline), *_both_hold(runs, headline)),
     ]
 
 
@@ -250,7 +244,7 @@ def _holds(runs: DataFrame, headline: Headline) -> _Judged:
     return "undecided", text
 
 
-def judge_no_worse(runs: DataFrame, preset: str, headline: Headline) -> Verdict:
+def judge_no_worse(runs: DataFrame, headline: Headline) -> Verdict:
     """Judge whether our A2C is no worse than SB3's after as many env steps, from the table `runs`.
     The headline metric has a bound of its goal.
     """
@@ -264,7 +258,7 @@ def judge_no_worse(runs: DataFrame, preset: str, headline: Headline) -> Verdict:
         f"its whole 95 % interval, and no smaller share of its seeds holds. The margin is ours: "
         f"{MARGIN_SHARE:.0%} of the bound for holding the goal. It says nothing of other measures.",
     )
-    return Verdict(*claim, preset, *_no_worse(runs, margin, headline))
+    return Verdict(*claim, *_no_worse(runs, margin, headline))
 
 
 def _no_worse(runs: DataFrame, margin: float, headline: Headline) -> _Judged:

@@ -15,7 +15,7 @@ from markdown_it import MarkdownIt
 from ..models.errors import require
 from .claims import Verdict, judge_claims, judge_no_worse
 from .figures import PAPER, draw_figures
-from .results import Results, ResultsError
+from .results import Results
 from .tables import markdown, results_table
 
 PAGE_FILE = "report.html"
@@ -28,15 +28,15 @@ def write_report(results: Results) -> pd.DataFrame:
     """Draw the figures and write page, tables and verdicts into the folder; the table."""
     require("matplotlib", "report", "a report")
     folder = results.folder
-    if results.runs.empty and (folder / "runs.csv").exists():
-        raise ResultsError(
-            f"{folder}: expected the folder runs, with a file for each run, got runs.csv alone"
-        )
     table = results_table(results)
     table.to_csv(folder / "results.csv")
     if len(results.runs):
         results.runs.to_csv(folder / "runs.csv", index=False)
-    text = _head(results) + markdown(results, table) + _claims(judge(results))
+    text = (
+        _head(results)
+        + markdown(results, table)
+        + _claims(judge(results), results.study.rows[0].preset)
+    )
     (folder / "results.md").write_text(text, encoding="utf-8")
     figures = draw_figures(results, table) if len(table) else []
     parts = [MarkdownIt("js-default").render(text)]  # HTML in a name stays text
@@ -57,11 +57,9 @@ def judge(results: Results) -> list[Verdict]:
     """Verdicts on the paper's claims, and whether our A2C is no worse than SB3's."""
     if results.study.kind != "paper" or results.runs.empty:
         return []
-    row = results.study.rows[0]
-    headline = results.headline(row)
-    preset = row.preset
-    verdicts = judge_claims(results.episodes, results.runs, preset, headline)
-    return [*verdicts, judge_no_worse(results.runs, preset, headline)]
+    headline = results.headline(results.study.rows[0])
+    verdicts = judge_claims(results.episodes, results.runs, headline)
+    return [*verdicts, judge_no_worse(results.runs, headline)]
 
 
 def _head(results: Results) -> str:
@@ -90,11 +88,11 @@ def _head(results: Results) -> str:
     return "\n".join(lines) + "\n\n"
 
 
-def _claims(verdicts: Sequence[Verdict]) -> str:
-    """The verdicts in Markdown."""
+def _claims(verdicts: Sequence[Verdict], preset: str) -> str:
+    """The verdicts on agents that were trained with a preset, in Markdown."""
     text = "\n## Claims\n" if verdicts else ""
     for one in verdicts:
-        text += f"\n* {one.claim} ({one.source}; preset {one.preset}.)\n"
+        text += f"\n* {one.claim} ({one.source}; preset {preset}.)\n"
         text += f"  **{one.verdict}**: {one.evidence} {one.definition}\n"
     return text
 

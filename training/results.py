@@ -157,12 +157,8 @@ class Results:
     def read(cls, folder: Path | str) -> "Results":
         """Raises `ResultsError`."""
         path = Path(folder) / CONFIG_FILE
-        if not path.parent.is_dir():
-            raise ResultsError(f"{folder}: expected the folder of a study, there is none")
         if not path.is_file():
-            raise ResultsError(
-                f"{folder}: expected the folder of a study, got one without {CONFIG_FILE}"
-            )
+            raise ResultsError(f"{folder}: expected the folder of a study, there is no {path}")
         try:
             config = json.loads(path.read_text(encoding="utf-8"))
             study = Study.from_dict(f"{path}: study", config["study"])

@@ -60,7 +60,7 @@ class Run:
         if self.env_steps < least:
             raise InputError(f"env_steps: expected at least {least}, got {self.env_steps}")
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """All settings as JSON values."""
         return {**vars(self), "env": self.env.to_dict(), "config": asdict(self.config)}
 

@@ -17,13 +17,10 @@ from ..envs import registry
 from ..envs.compiled import import_ahead
 from ..envs.config import EnvConfig
 from ..models.errors import InputError, MissingPackage, NoOpenGL, shortened
-from ..models.fields import check_names
 from .protocol.client import LinkConfig
 from .protocol.errors import LinkError
 from .transport.simulator import Simulator
 
-_KEYS = ("config", "module", "num_envs", "server", "bind", "codec", "key_file", "insecure",
-                "record")  # fmt: skip
 _FOR_EVER = 30 * 86_400.0
 """Seconds that an agent may be silent while it holds standard input."""
 
@@ -68,13 +65,9 @@ def read_arguments(line: bytes) -> tuple[EnvConfig, dict[str, Any]]:
         raise InputError(f"standard input: expected a JSON object: {error}") from None
     if not isinstance(arguments, dict):
         raise InputError(f"standard input: expected a JSON object, got {shortened(arguments)}")
-    check_names(arguments, _KEYS, "standard input")
     content = arguments.pop("config", None)
     if module := arguments.pop("module", None):
         registry.load(f"{module}:{dict(content or {}).get('env_id', '')}")
-    for name in ("server", "bind"):
-        if name in arguments:
-            arguments[name] = tuple(arguments[name])
     return EnvConfig.from_dict(content), arguments
 
 

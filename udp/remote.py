@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any, Unpack
+from typing import Unpack
 
 import gymnasium as gym
 import numpy as np
@@ -20,6 +20,7 @@ from ..envs.autoreset import (
     checked_seeds,
     worlds_done,
 )
+from ..envs.info import Info
 from ..envs.spaces import action_space, joined, observation_space, telemetry_names
 from ..envs.spec import ArraySpec, Discrete, EnvSpec
 from ..models.errors import InputError, NotCopied
@@ -33,7 +34,6 @@ from .transport.agent import Agent, AgentConfig, AgentSettings
 from .transport.simulator import DEFAULT_AGENT
 
 Arrays = dict[str, Array]
-Info = dict[str, Any]
 _FLY = np.array([FLY], np.uint8)
 _RESET = np.array([RESET], np.uint8)
 
@@ -53,6 +53,16 @@ class _Remote(NotCopied):
             except BaseException:
                 self._agent.close()
                 raise
+
+    def close_extras(self, **kwargs: object) -> None:
+        """Tell the simulators and close the socket. May be called again."""
+        self._agent.close()
+        self._flying = False
+
+    def _expect_flight(self) -> None:
+        """Raise `ResetNeeded` where no reset has begun a flight."""
+        if not self._flying:
+            raise gym.error.ResetNeeded("step: expected a call of reset() first")
 
     @abstractmethod
     def connect(self) -> None:
@@ -175,9 +185,7 @@ class RemoteEnv(_Remote, gym.Env[Observation, ArrayLike]):
         return self._observation(), state.rewards.item(), terminated, truncated, self._info()
 
     def close(self) -> None:
-        """Tell the simulator and close the socket. May be called again."""
-        self._agent.close()
-        self._flying = False
+        self.close_extras()
 
     def _take_spec(self, spec: EnvSpec) -> None:
         """Set spaces and other attributes. Spaces that stay may have seeded generators."""
@@ -309,8 +317,7 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Observation, ArrayL
 
     def step(self, actions: ArrayLike) -> Step:
         """Fly every drone for one control period. The autoreset says what follows an episode."""
-        if not self._flying:
-            raise gym.error.ResetNeeded("step: expected a call of reset() first")
+        self._expect_flight()
         self._reasons = None
         return super().step(actions)
 
@@ -325,8 +332,7 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Observation, ArrayL
 
         With seeds every drone has one, also where it is ignored.
         """
-        if not self._flying:
-            raise gym.error.ResetNeeded("step: expected a call of reset() first")
+        self._expect_flight()
         resets = self._nobody if resets is None else resets
         frozen = self._nobody if frozen is None else frozen & ~resets
         still = resets | frozen
@@ -389,11 +395,6 @@ class RemoteVectorEnv(_Remote, AdvancingVectorEnv, VectorEnv[Observation, ArrayL
         self.truncated[self.lost] = True
         earlier = np.full(self.num_envs, None) if self._reasons is None else self._reasons
         self._reasons = np.where(self.lost, reasons, earlier)
-
-    def close_extras(self, **kwargs: object) -> None:
-        """Tell the simulators and close the socket."""
-        self._agent.close()
-        self._flying = False
 
     def _seeds(self, seed: int | Seeds | None) -> Array | None:
         """Seeds as they cross the wire. Raises `InputError`."""

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from math import prod
-from typing import Any
 
 import numpy as np
 
@@ -27,7 +26,7 @@ class Kernel:
         self._shape = shape
         self._made: dict[object, tuple[Memory, Callable[..., None]]] = {}
 
-    def __call__(self, *given: Any) -> np.ndarray:
+    def __call__(self, *given: Array) -> np.ndarray:
         """The function's result, the same bits."""
         kinds = tuple((x.dtype, x.shape) if _is_array(x) else x for x in given)
         if kinds not in self._made:
@@ -39,7 +38,7 @@ class Kernel:
         code(memory.blocks, memory.address, None)
         return memory.get(_RESULT).reshape(*self._shape, -1)
 
-    def _compiled(self, given: tuple[Any, ...]) -> tuple[Memory, Callable[..., None]]:
+    def _compiled(self, given: tuple[Array, ...]) -> tuple[Memory, Callable[..., None]]:
         program = Program()
         fields = {}
         variables = list(given)

@@ -15,13 +15,12 @@ from mujoco.batch import Batch, SimulationError
 from ...models.errors import InputError
 from ...models.fleet import members_of
 from ...models.mjcf import add_ground, delete_obstacles
-from ...models.swarm import CONTACTS, GROUNDED, contact_columns, swarm_model
+from ...models.swarm import CONTACTS, GROUNDED, contact_columns, payload_body, swarm_model
 from ...models.vehicle import (
     SURROUNDINGS,
     Vehicle,
     body_axes,
     owners,
-    payload_body,
     payload_radius,
 )
 from ...scenes.geoms import NAME, add_solids, geoms_of
@@ -109,12 +108,10 @@ class MujocoWorld(World):
         payload = self._options.payload
         cable = self._options.cable
         movable = bool(set(self._drawn) & set(CENTER))
-        model = vehicle.model
-        if drones == 1 and (movable or payload):
-            model = vehicle.movable(payload, cable)
         is_own = not self.scenery.most and not self.scenery.scene.is_file
-        if drones == 1 and is_own:
-            return model
+        plain = is_own and not (movable or payload)
+        if drones == 1 and plain:
+            return vehicle.model
         crafts = members_of(vehicle, drones)
         surround = add_ground if is_own else self._surround
         return swarm_model(

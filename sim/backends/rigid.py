@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from ...models.errors import InputError
-from ...models.vehicle import Vehicle, craft_bodies
+from ...models.vehicle import Vehicle, owners
 from ..effects import NO_EFFECTS, EffectOptions
 from ..randomize import FIXED, Randomization
 from ..rotations import body_z
@@ -79,7 +79,7 @@ class RigidWorld(World):
         shape = (num_worlds, drones)
         super().__init__(vehicle, shape, effects, randomize, scenery, dtype)
         _check_forces(vehicle)
-        if "inertia" in self._drawn and len(craft_bodies(vehicle.model)) > 1:
+        if "inertia" in self._drawn and np.count_nonzero(owners(vehicle.model) == 0) > 1:
             raise InputError(
                 "randomize: inertia: expected a craft of one body with the backend rigid, got "
                 f"{vehicle.name}"

@@ -3,7 +3,6 @@
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from math import prod
-from typing import Any
 
 from .layout import Fields
 from .program import Function, Program, Value
@@ -40,7 +39,7 @@ def with_calls(
     inner: dict[Each, Value] = {}
     for each in alike:
         first = each[0]
-        inputs: list[Any] = []
+        inputs: list[object] = []
         for place, one in enumerate(first.inputs):
             if isinstance(one, Value):
                 needs = tuple(value.inputs[place] for value in each)
@@ -78,8 +77,8 @@ def _alike(values: Sequence[Value], fields: Fields, drones: int) -> tuple[set[Va
     Inputs of the latter are of that kind too, or a drone loads them, or they depend on no drone.
     """
     owners: dict[Value, int | None] = {}  # None: several
-    kinds = defaultdict[Any, dict[int, Value]](dict)  # by key, and how often the drone had it
-    times = Counter[Any]()
+    kinds = defaultdict[object, dict[int, Value]](dict)  # by key, and how often the drone had it
+    times = Counter[object]()
     keys: dict[Value, int] = {}
     for value in values:
         if value.operation == "load":
@@ -88,7 +87,7 @@ def _alike(values: Sequence[Value], fields: Fields, drones: int) -> tuple[set[Va
             if shape[:1] != (drones,):
                 continue
             owner, component = divmod(row, prod(shape[1:]))
-            key: Any = array, component
+            key: object = array, component
         else:
             of = {owners[one] for one in value.inputs if one in owners}
             if not of:

@@ -6,15 +6,14 @@ that: `llvm.py` prints its operations for as many lanes as the processor has.
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ...models.files import read_toml
+from ...models.files import read_own_toml
 
 DType = np.dtype[Any]
-OPERATIONS = read_toml(Path(__file__).with_name("operations.toml"), "operations")
+OPERATIONS = read_own_toml(__file__, "operations")
 """LLVM's instruction of each operation, by the kind of its first input, and its name."""
 
 
@@ -58,9 +57,9 @@ class Program:
     def __init__(self) -> None:
         self.values: list[Value] = []
         self.tables: list[np.ndarray] = []
-        self._known: dict[tuple[Any, ...], Value] = {}
+        self._known: dict[object, Value] = {}
 
-    def value(self, operation: str, dtype: DType, *inputs: Any) -> Value:
+    def value(self, operation: str, dtype: DType, *inputs: object) -> Value:
         """The value of an operation; the one that is there if it is the same."""
         key = (operation, dtype, inputs)
         known = self._known.get(key)

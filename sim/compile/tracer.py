@@ -10,19 +10,20 @@ rules. An array has the shape that it has for one world: axes of worlds have the
 """
 
 from collections.abc import Callable, Sequence
-from functools import reduce, wraps
+from functools import partial, reduce, wraps
 from itertools import count
 from math import prod
 from typing import Any, NoReturn
 
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
+from numpy.typing import DTypeLike
 
 from .program import OPERATIONS, DType, Function, Program, Value
 
 Call = Callable[..., Any]
 Traced = Any
-"""A traced array, which the types of NumPy's functions do not know."""
+"""A traced array, or what is made one; the types of NumPy's functions do not know it."""
 
 _FLAG = np.dtype(bool)
 _WHOLE = np.dtype(np.int64)
@@ -57,9 +58,13 @@ class TracedArray(NDArrayOperatorsMixin):
 
     __hash__ = None  # type: ignore[assignment]  # as NumPy's
 
-    def __init__(self, program: Program, values: Any, dtype: DType) -> None:
+    def __init__(
+        self, program: Program, values: object, dtype: DType, shape: Sequence[int] | None = None
+    ) -> None:
+        """The shape is that of the values, unless another is given."""
+        array = np.asarray(values, object)
         self.program = program
-        self.values = np.asarray(values, object)
+        self.values = array if shape is None else array.reshape(shape)
         self.dtype = dtype
 
     def __getattr__(self, name: str) -> Any:
@@ -69,7 +74,7 @@ class TracedArray(NDArrayOperatorsMixin):
             move = getattr(self.values, name)
             return lambda *args, **options: self._like(move(*args, **options))
         if name in _REDUCTIONS:
-            return lambda axis=None, keepdims=False: self._reduced(name, axis, keepdims=keepdims)
+            return partial(self._reduced, _REDUCTIONS[name])
         if name.startswith("__"):
             raise AttributeError(name)
         return _refuse(f"array.{name}")
@@ -87,7 +92,7 @@ class TracedArray(NDArrayOperatorsMixin):
             _refuse("an index that is computed", "use looked_up() or np.take_along_axis()")
         return self._like(self.values[index])
 
-    def __setitem__(self, index: Any, value: Any) -> None:
+    def __setitem__(self, index: Any, value: object) -> None:
         self.values[index] = self.lifted(value, self.dtype).values
 
     def __bool__(self) -> bool:
@@ -101,22 +106,22 @@ class TracedArray(NDArrayOperatorsMixin):
     def __array__(self, *_: object, **__: object) -> np.ndarray:
         _refuse("a new array of this one", "use stack() or np.concatenate()")
 
-    def astype(self, dtype: Any, *, copy: bool = True) -> "TracedArray":
+    def astype(self, dtype: DTypeLike, *, copy: bool = True) -> "TracedArray":
         """As another dtype."""
         dtype = np.dtype(dtype)
         if dtype == self.dtype:
             return self.copy() if copy else self
         if dtype.name not in _DTYPES:
             _refuse(f"an array of {dtype}", f"take one of {', '.join(_DTYPES)}")
-        return self._each(lambda value: self.program.cast(value, dtype), dtype, self)
+        return self._each(partial(self.program.cast, dtype=dtype), dtype, self)
 
-    def view(self, dtype: Any = None) -> "TracedArray":
+    def view(self, dtype: DTypeLike | None = None) -> "TracedArray":
         """The bits of its numbers as another dtype of as many bits."""
         if dtype is None:
             return self._like(self.values)
         return self._applied("bits", np.dtype(dtype), self)
 
-    def clip(self, low: Any = None, high: Any = None) -> Traced:
+    def clip(self, low: Traced = None, high: Traced = None) -> Traced:
         """Within bounds; None is no bound."""
         above: Traced = self if low is None else np.maximum(self, low)
         return above if high is None else np.minimum(above, high)
@@ -128,12 +133,11 @@ class TracedArray(NDArrayOperatorsMixin):
         self.program.tables.append(flat)
         name = len(self.program.tables) - 1
         numbers = self.astype(_WHOLE).clip(0, rows - 1)
-        found: Any = []
+        found = []
         for row in numbers.values.ravel().tolist():
             for column in range(flat.shape[1]):
                 found.append(self.program.value("gather", flat.dtype, name, column, row))
-        shape = (*self.shape, *table.shape[1:])
-        return TracedArray(self.program, np.reshape(found, shape), flat.dtype)
+        return TracedArray(self.program, found, flat.dtype, (*self.shape, *table.shape[1:]))
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **options: Any) -> Traced:
         if method == "reduce" and ufunc in _REDUCTIONS.values():
@@ -165,10 +169,10 @@ class TracedArray(NDArrayOperatorsMixin):
             _refuse(f"np.{name}")
         return _FUNCTIONS[function](self, *inputs, **options)
 
-    def _like(self, values: Any) -> "TracedArray":
+    def _like(self, values: object) -> "TracedArray":
         return TracedArray(self.program, values, self.dtype)
 
-    def lifted(self, given: Any, dtype: DType) -> "TracedArray":
+    def lifted(self, given: Traced, dtype: DType) -> "TracedArray":
         """Anything as a traced array of this dtype."""
         if isinstance(given, TracedArray):
             if given.program is not self.program:
@@ -177,7 +181,7 @@ class TracedArray(NDArrayOperatorsMixin):
         constant = np.frompyfunc(lambda number: self.program.constant(number, dtype), 1, 1)
         return TracedArray(self.program, constant(np.asarray(given, dtype)), dtype)
 
-    def _alike(self, given: Sequence[Any]) -> "list[TracedArray]":
+    def _alike(self, given: Sequence[Traced]) -> "list[TracedArray]":
         """Arrays and numbers as arrays of the dtype that NumPy gives them together."""
         dtype = _result_type(self, *given)
         return [self.lifted(one, dtype) for one in given]
@@ -193,7 +197,7 @@ class TracedArray(NDArrayOperatorsMixin):
         self,
         function: Call,
         made: dict[object, Function],
-        given: Sequence[Any],
+        given: Sequence[Traced],
         vectors: int,
     ) -> "TracedArray":
         """A call for each number or vector."""
@@ -209,22 +213,19 @@ class TracedArray(NDArrayOperatorsMixin):
             np.broadcast_to(one.values, (*lead, *part)).reshape(prod(lead), -1)
             for one, part in zip(arrays, parts, strict=True)
         ]
-        results: Any = []
+        results = []
         for inputs in np.concatenate(rows, axis=1).tolist():
             for number in range(len(callee.results)):
                 results.append(self.program.value("call", dtype, callee, number, *inputs))
-        values = np.reshape(results, (*lead, *callee.shape))
-        return TracedArray(self.program, values, dtype)
+        return TracedArray(self.program, results, dtype, (*lead, *callee.shape))
 
     def _applied(self, operation: str, dtype: DType, *arrays: "TracedArray") -> "TracedArray":
-        def one(*values: Value) -> Value:
-            return self.program.value(operation, dtype, *values)
+        return self._each(partial(self.program.value, operation, dtype), dtype, *arrays)
 
-        return self._each(one, dtype, *arrays)
-
-    def _reduced(self, name: Any, axis: Any = None, *, keepdims: bool = False) -> Traced:
+    def _reduced(
+        self, function: np.ufunc, axis: Traced = None, *, keepdims: bool = False
+    ) -> Traced:
         """A sum and the like, from the first to the last."""
-        function = _REDUCTIONS.get(name, name)
         if axis is None and self.ndim > 1:
             _refuse(f"np.{function.__name__} over all worlds", "give an axis")
         axis = 0 if axis is None else axis
@@ -253,7 +254,7 @@ def once(vectors: int = 0) -> Callable[[Call], Call]:
         made: dict[object, Function] = {}
 
         @wraps(function)
-        def call(*arrays: Any) -> Any:
+        def call(*arrays: Traced) -> Traced:
             for one in arrays:
                 if isinstance(one, TracedArray):
                     return one._called(function, made, arrays, vectors)
@@ -266,38 +267,33 @@ def once(vectors: int = 0) -> Callable[[Call], Call]:
 
 def call_outside(address: int, mask: Traced, *arguments: Traced) -> TracedArray:
     """float32 of a function of C at an address, for each drone of a mask; 0 for the others."""
-    given = [mask, *arguments]
-    program = mask.program
-    values = np.broadcast_arrays(*[one.values for one in given])
     single = np.dtype(np.float32)
-
-    def called(*inputs: Value) -> object:
-        return program.value("outside", single, address, *inputs)
-
-    return TracedArray(program, np.frompyfunc(called, len(values), 1)(*values), single)
+    called = partial(mask.program.value, "outside", single, address)
+    result: TracedArray = mask._each(called, single, mask, *arguments)
+    return result
 
 
 def read(program: Program, name: str, dtype: DType, shape: tuple[int, ...]) -> TracedArray:
     """The variables of an array of a program, of such a shape for one world."""
-    values: Any = [program.value("load", dtype, name, number) for number in range(prod(shape))]
-    return TracedArray(program, np.reshape(values, shape), dtype)
+    values = [program.value("load", dtype, name, number) for number in range(prod(shape))]
+    return TracedArray(program, values, dtype, shape)
 
 
-def _function(function: Call, kinds: Sequence[tuple[DType, Any]]) -> Function:
+def _function(function: Call, kinds: Sequence[tuple[DType, tuple[int, ...]]]) -> Function:
     """A function traced on its parameters, of such dtypes and shapes."""
     program = Program()
     numbers = count()
     arrays = []
     for dtype, shape in kinds:
-        values: Any = [program.value("parameter", dtype, next(numbers)) for _ in range(prod(shape))]
-        arrays.append(TracedArray(program, np.reshape(values, shape), dtype))
+        values = [program.value("parameter", dtype, next(numbers)) for _ in range(prod(shape))]
+        arrays.append(TracedArray(program, values, dtype, shape))
     out = function(*arrays)
     dtypes = ".".join(dtype.name for dtype, _ in kinds)
     name = f"{function.__name__}.{dtypes}"
     return Function(name, program, out.values.ravel().tolist(), out.shape)
 
 
-def lift(program: Program, values: Any, dtype: DType) -> list[Value]:
+def lift(program: Program, values: Traced, dtype: DType) -> list[Value]:
     """The values of an array, traced or of constants, as this dtype."""
     like = values if isinstance(values, TracedArray) else TracedArray(program, [], dtype)
     found: list[Value] = like.lifted(values, dtype).values.reshape(-1).tolist()
@@ -308,14 +304,14 @@ def _refuse(what: str, advice: str = "") -> NoReturn:
     raise Untraceable(f"{what} cannot be compiled" + (f": {advice}" if advice else ""))
 
 
-def _kind(given: Any) -> Any:
+def _kind(given: Traced) -> Traced:
     """The dtype of an array, or the type of one of Python's numbers, which adapt to arrays."""
     if hasattr(given, "dtype"):
         return given.dtype
     return type(given) if type(given) in (int, float) else np.asarray(given).dtype
 
 
-def _result_type(_: TracedArray, *given: Any) -> DType:
+def _result_type(_: TracedArray, *given: Traced) -> DType:
     """Python's numbers adapt to arrays, and lists do not, as in NumPy."""
     arrays = [np.asarray(one) if isinstance(one, list | tuple) else one for one in given]
     return np.result_type(*[one.dtype if isinstance(one, TracedArray) else one for one in arrays])
@@ -324,21 +320,19 @@ def _result_type(_: TracedArray, *given: Any) -> DType:
 # ---- functions that are made of others
 
 
-def _where(like: TracedArray, flag: Any, first: Any, second: Any) -> Traced:
+def _where(like: TracedArray, flag: Traced, first: Traced, second: Traced) -> Traced:
     first, second = like._alike((first, second))
-    if not isinstance(flag, TracedArray):
-        flag = like.lifted(flag, _FLAG)
 
     def select(chosen: Value, a: Value, b: Value) -> Value:
         return a if a is b else like.program.value("select", first.dtype, chosen, a, b)
 
-    return like._each(select, first.dtype, flag.astype(_FLAG), first, second)
+    return like._each(select, first.dtype, like.lifted(flag, _FLAG), first, second)
 
 
 def _extreme(is_before: Call, is_not_before: Call) -> Call:
     """A NaN stays, and of 0 and -0 it is the second. A constant as the second needs less."""
 
-    def extreme(like: TracedArray, a: Any, b: Any) -> Traced:
+    def extreme(like: TracedArray, a: Traced, b: Traced) -> Traced:
         is_plain = not isinstance(b, TracedArray) and np.all(b == b)
         a, b = like._alike((a, b))
         if is_plain:
@@ -358,7 +352,7 @@ def _sign(like: TracedArray, x: Traced) -> Traced:
     return _where(like, x > 0, 1.0, _where(like, x < 0, -1.0, x + 0.0)).astype(x.dtype)
 
 
-def _remainder(like: TracedArray, x: Any, by: Any) -> Traced:
+def _remainder(like: TracedArray, x: Traced, by: Traced) -> Traced:
     """With the sign of the divisor; of a whole number and 0 it is 0."""
     x, by = like._alike((x, by))
     if x.dtype.kind == "i":  # By 0, and the least number by -1, processors stop the program.
@@ -370,7 +364,7 @@ def _remainder(like: TracedArray, x: Any, by: Any) -> Traced:
     return _where(like, rest == 0, whole, _where(like, (rest < 0) != (by < 0), rest + by, rest))
 
 
-def _power(like: TracedArray, x: Any, exponent: Any) -> Traced:
+def _power(like: TracedArray, x: Traced, exponent: Traced) -> Traced:
     if isinstance(exponent, list | tuple):
         _refuse("np.power with several exponents")
     if exponent == 0:
@@ -385,7 +379,7 @@ def _power(like: TracedArray, x: Any, exponent: Any) -> Traced:
     return power(x, exponent)
 
 
-def _take_along_axis(like: TracedArray, array: Any, indices: Traced, axis: int) -> Traced:
+def _take_along_axis(like: TracedArray, array: Traced, indices: Traced, axis: int) -> Traced:
     """By comparing the index with each that there is."""
     count = array.shape[axis]
     parts = [np.expand_dims(np.moveaxis(array, axis, 0)[i], axis) for i in range(count)]
@@ -409,7 +403,12 @@ def _argsort(like: TracedArray, array: Traced, axis: int = -1, **_: object) -> T
 
 
 def _filled(number: float) -> Callable[..., Traced]:
-    def filled(like: TracedArray, array: Traced, dtype: Any = None, shape: Any = None) -> Traced:
+    def filled(
+        like: TracedArray,
+        array: Traced,
+        dtype: DTypeLike | None = None,
+        shape: tuple[int, ...] | None = None,
+    ) -> Traced:
         numbers = np.full(array.shape if shape is None else shape, number, dtype or array.dtype)
         return like.lifted(numbers, numbers.dtype)
 

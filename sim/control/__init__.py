@@ -5,7 +5,7 @@ within bounds, or is one of some choices.
 """
 
 from collections.abc import Sequence
-from typing import Any, Final, Protocol, cast
+from typing import Final, Protocol, cast
 
 import numpy as np
 
@@ -74,26 +74,17 @@ class CollectiveThrust:
         )
         self.choices = 3 if discrete else 0
         self.newtons = newtons
-        hover = vehicle.hover_thrust
-        low = vehicle.thrust_low
-        high = vehicle.thrust_high
-        mean = total(hover) / len(hover)
-        alike = all((values == values[0]).all() for values in (hover, low, high))
-        # Rotors that are alike need one number for all of them.
-        self._alike = alike
         self._increment = increment
-        self._hover, self._per_action, self._low, self._high = (
-            values.item(0) if alike else values
-            for values in (hover, newtons * (hover / mean), low, high)
-        )
+        self._hover = hover = vehicle.hover_thrust
+        self._per_action = newtons * (hover / (total(hover) / len(hover)))
+        self._low = vehicle.thrust_low
+        self._high = vehicle.thrust_high
 
     def thrust(self, action: Array, state: WorldState) -> Array:
         """As `Controller.thrust`."""
         share = action[..., :1]
         share = share - 1.0 if self.choices else clip(share, -1.0, 1.0)
-        present = self._hover
-        if self._increment:
-            present = state.command[..., :1] if self._alike else state.command
+        present = state.command if self._increment else self._hover
         return clip(present + self._per_action * share, self._low, self._high)
 
 
@@ -126,7 +117,7 @@ class MixedController:
     def __init__(self, controllers: Sequence[tuple[Controller, Sequence[int]]]) -> None:
         self._controllers = controllers
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> object:
         if name == "_controllers":  # which a copy does not have yet
             raise AttributeError(name)
         return getattr(self._controllers[0][0], name)

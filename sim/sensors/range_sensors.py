@@ -6,7 +6,6 @@ They see the solids of a layout. `range_sensors.toml` has their models.
 import math
 from collections.abc import Mapping
 from functools import cached_property
-from pathlib import Path
 from typing import Any, NamedTuple
 from zlib import crc32
 
@@ -14,7 +13,7 @@ import numpy as np
 
 from ...models.errors import InputError
 from ...models.fields import Choice, Limits, Rule, check, check_names
-from ...models.files import read_toml
+from ...models.files import read_own_toml
 from ...scenes import Layouts, Rays
 from ...scenes import returns as kernels
 from ...scenes.rays import MAX_PLACE, MAX_REACH
@@ -25,9 +24,7 @@ from ..state import Array, ByName, clip
 from .base import SAMPLING, Values, sampling
 from .instruments import Instrument, Moment
 
-MODELS: Mapping[str, Mapping[str, Values]] = read_toml(
-    Path(__file__).with_name("range_sensors.toml"), "range_sensors"
-)
+MODELS: Mapping[str, Mapping[str, Values]] = read_own_toml(__file__, "range_sensors")
 """Settings by kind and model."""
 _COUNT = Limits(1, 1024, "rays", whole=True)
 _DEGREES = Limits(-180.0, 180.0, "degrees")

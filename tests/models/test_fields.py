@@ -14,7 +14,6 @@ from rotorgram.models.fields import (
     check,
     check_fields,
     limits_of,
-    optional,
     printable,
     read_table,
     rules_of,
@@ -29,7 +28,7 @@ class Options:
     laps: Annotated[int, Limits(1, 1 << 31, "rounds", whole=True)] = 1
     wind: Annotated[tuple[float, ...], Limits(-9, 9, "m/s", count=3)] = (0.0, 0.0, 0.0)
     share: Annotated[float | None, Limits(0.0, 1.0)] = None
-    length: float | None = optional(0.0, 2.0, "m")
+    length: Annotated[float | None, Limits(0.0, 2.0, "m")] = None
     speed: Annotated[float | tuple[float, float], NumberOrPair(Limits(0, 5, "m/s"))] = 1.0
     frame: Literal["body", "world"] = "body"
     name: Annotated[str, printable(5)] = "quad"

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from rotorgram.envs import LocalVectorEnv
 from rotorgram.models import QUAD_XML, InputError, Vehicle, library, vehicle_file
-from rotorgram.models.coefficients import COEFFICIENTS
+from rotorgram.models.coefficients import COEFFICIENTS, table_of
 from rotorgram.models.export import export_mjcf
 from rotorgram.models.fields import Limits, limits_of
 from rotorgram.models.vehicle_file import FRAMES, read_vehicle_file
@@ -565,16 +565,16 @@ TABLES = {
     "rotors.": vehicle_file.RotorTable,
     "rotors.list.": vehicle_file.PlacedRotor,
     "cameras.": vehicle_file.Camera,
-    "real_flights.": vehicle_file.TABLES["real_flights"],
+    "real_flights.": table_of("real_flights"),
 }
 
 
 def limits_of_all() -> dict[str, Limits]:
     """Of every number of a file, by its dotted name."""
-    found = limits_of(vehicle_file.Cylinder, "body.parts.")
-    for prefix, kind in TABLES.items():
-        found |= limits_of(kind, prefix)
-    return found | COEFFICIENTS
+    found = dict(COEFFICIENTS)
+    for prefix, kind in (*TABLES.items(), ("body.parts.", vehicle_file.Cylinder)):
+        found |= {prefix + name: limits for name, limits in limits_of(kind).items()}
+    return found
 
 
 def test_the_page_has_every_field_with_its_limits() -> None:

@@ -18,6 +18,7 @@ from rotorgram.envs.config import EnvConfig
 from rotorgram.models import InputError, Vehicle
 from rotorgram.models.fields import read_table
 from rotorgram.models.library import vehicle_names
+from rotorgram.models.swarm import swarm_model
 from rotorgram.sim import (
     PARAMETERS,
     EffectOptions,
@@ -692,7 +693,7 @@ def test_a_cable_is_slack_in_free_fall() -> None:
 
 def pendulum(vehicle: Vehicle, mass: float, cable: float, angle: float) -> tuple[Any, Any]:
     """Model and data with a payload that hangs at an angle in x, under a craft at 50 m."""
-    model = vehicle.movable(mass, cable)
+    model = swarm_model([vehicle], payload=mass, cable=cable)
     data = mujoco.MjData(model)
     data.qpos[:7] = (0, 0, 50, 1, 0, 0, 0)
     data.qpos[7:10] = (cable * sin(angle), 0, 50 - cable * cos(angle))

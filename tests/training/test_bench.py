@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from rotorgram.cli import main
-from rotorgram.training.bench import bench, layers
+from rotorgram.training.bench import LAYERS, bench
 from step_over_udp import multiple, one_core
 
 
@@ -33,7 +33,7 @@ def test_every_layer_is_measured(tmp_path: Path, capsys: pytest.CaptureFixture[s
     folder = tmp_path / "bench"
     assert main(["bench", "--rounds", "3", "--seconds", "0.01", "--out", str(folder)]) == 0
     written = json.loads((folder / "bench.json").read_text())
-    names = [layer.name for layer in layers()]
+    names = [layer.name for layer in LAYERS]
     assert list(written["rates"]) == names
     for name, rates in written["rates"].items():
         assert len(rates) == 3
@@ -50,4 +50,4 @@ def test_wrong_times(tmp_path: Path) -> None:
         (1, 0.0, "seconds: expected a number above 0, at most 60 s, got 0"),
     ):
         with pytest.raises(ValueError, match=sentence):
-            bench(rounds, seconds, tmp_path, lambda *_: None)
+            bench(LAYERS, rounds, seconds, tmp_path, lambda *_: None)

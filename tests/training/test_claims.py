@@ -58,7 +58,7 @@ HELD = evaluated(a2c=[0.01] * 80, vpg=[0.02] * 80)
 
 
 def judged(episodes: pd.DataFrame, evaluations: pd.DataFrame = HELD) -> list[Verdict]:
-    return judge_claims(episodes, evaluations, "paper", HEADLINE)
+    return judge_claims(episodes, evaluations, HEADLINE)
 
 
 def outcomes(episodes: pd.DataFrame, evaluations: pd.DataFrame = HELD) -> list[str]:
@@ -251,8 +251,7 @@ def test_runs_that_are_too_short_are_named():
 
 
 def test_verdicts_state_their_source_and_preset():
-    for verdict in judge_claims(training(paper_like), HELD, "tuned", HEADLINE):
-        assert verdict.preset == "tuned"
+    for verdict in judge_claims(training(paper_like), HELD, HEADLINE):
         assert "ection 3" in verdict.source
         assert verdict.definition
 
@@ -270,7 +269,7 @@ def test_verdicts_state_their_source_and_preset():
 )
 def test_no_worse_is_shown_by_a_margin(ours, theirs, expected):
     evaluations = evaluated(a2c=ours, **{"sb3-a2c": theirs})
-    verdict = judge_no_worse(evaluations, "tuned", HEADLINE)
+    verdict = judge_no_worse(evaluations, HEADLINE)
     assert verdict.verdict == expected
     assert "margin of 0.02 m" in verdict.definition
 
@@ -279,10 +278,10 @@ def test_no_worse_of_what_is_to_be_high_and_of_what_was_not_trained():
     high = Headline.of(spec_of(GATES))  # held from 3 gates on: the margin is 0.6 of a gate
     theirs = {"sb3-a2c": [5.0] * 30}
     alike = evaluated(a2c=[4.5] * 30, **theirs)
-    assert judge_no_worse(alike, "tuned", high).verdict == "borne out"
+    assert judge_no_worse(alike, high).verdict == "borne out"
     worse = evaluated(a2c=[4.0] * 30, **theirs)
-    assert judge_no_worse(worse, "tuned", high).verdict == "not borne out"
+    assert judge_no_worse(worse, high).verdict == "not borne out"
     alone = evaluated(a2c=[4.5] * 30)
-    verdict = judge_no_worse(alone, "tuned", high)
+    verdict = judge_no_worse(alone, high)
     assert verdict.verdict == "not tested"
     assert verdict.evidence == "sb3-a2c was not trained."

@@ -300,7 +300,7 @@ def test_an_agent_that_waits_for_long_is_asked_before_the_timeout(
 
 def test_silence_ends_a_simulator_and_a_pause_of_its_own_does_not() -> None:  # fault 25
     link = to(simulator(), "waiting", Wire("agent", False))
-    link.pardon(100.0)
+    link.deadline += 100.0
     assert link.handle_timer(50.0)
     assert not link.handle_timer(111.0)
     assert link.state == "closing"
@@ -347,15 +347,14 @@ def test_a_simulator_that_has_been_welcomed_waits_for_no_slot() -> None:
     assert not link.is_queued
 
 
-def test_while_wait_comes_there_is_no_silence() -> None:
+def test_while_wait_comes_there_is_no_silence(caplog: pytest.LogCaptureFixture) -> None:
     link = simulator()
     wire = Wire("agent", False)
     link.connect(0.0)
     for now in range(0, 100, 9):
         assert link.receive(wire(Wait(session=SESSION)), float(now)) is None
         assert link.handle_timer(now + 8.0)
-    (notice,) = link.statistics.take_notices()
-    assert notice == "every slot of the agent is taken; waiting for a free one"
+    assert caplog.messages == ["every slot of the agent is taken; waiting for a free one"]
     assert not link.handle_timer(200.0)
 
 

@@ -72,7 +72,7 @@ def test_arguments_of_the_simulator_program() -> None:
     config = EnvConfig(task={"target": 3.0})
     words = {"config": config.to_dict(), "server": ["127.0.0.1", 5]}
     arguments = read_arguments(json.dumps(words).encode() + b"\n")
-    assert arguments == (config, {"server": ("127.0.0.1", 5)})
+    assert arguments == (config, {"server": ["127.0.0.1", 5]})
 
 
 def test_the_simulator_program_says_which_package_is_missing(tmp_path: Path) -> None:

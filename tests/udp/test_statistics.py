@@ -1,19 +1,20 @@
-"""Counts, round trips and notices, on a clock that is moved."""
+"""Counts, round trips and warnings, on a clock that is moved."""
 
 import re
 
 import pytest
-from rotorgram.udp.protocol.statistics import Statistics
+from rotorgram.udp.protocol.statistics import Statistics, warn
 
-# ---- notices
+# ---- warnings
 
 
-def test_one_notice_for_each_cause_in_ten_seconds() -> None:
+def test_one_warning_for_each_cause_in_ten_seconds(caplog: pytest.LogCaptureFixture) -> None:
     statistics = Statistics()
     said = []
     for tick in range(6000):  # a minute, a hundred junk datagrams a second
         statistics.drop("malformed", f"junk {tick}", tick / 100)
-        said += [(tick / 100, notice) for notice in statistics.take_notices()]
+        said += [(tick / 100, sentence) for sentence in caplog.messages]
+        caplog.clear()
     assert [now for now, _ in said] == pytest.approx([0, 10, 20, 30, 40, 50])
     assert said[0][1] == "dropped a datagram: malformed junk 0"
     assert said[1][1] == "dropped a datagram: malformed junk 1000"
@@ -21,34 +22,35 @@ def test_one_notice_for_each_cause_in_ten_seconds() -> None:
     assert statistics.last_error == "malformed junk 5999"
 
 
-def test_each_cause_has_its_own_time() -> None:
+def test_each_cause_has_its_own_time(caplog: pytest.LogCaptureFixture) -> None:
     statistics = Statistics()
     for now in (0.0, 1.0, 11.0):
         for cause in ("forged", "foreign", "malformed", "refused"):
             statistics.drop(cause, "x", now)
-    assert [notice.split()[3] for notice in statistics.take_notices()] == [
+    assert [sentence.split()[3] for sentence in caplog.messages] == [
         "forged", "foreign", "malformed", "refused",
     ] * 2  # fmt: skip
-    assert statistics.take_notices() == []
 
 
-def test_what_every_bad_network_does_is_counted_and_not_said() -> None:
+def test_what_every_bad_network_does_is_counted_and_not_said(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     statistics = Statistics()
     for now in range(100):
         statistics.drop("duplicate", "", float(now))
         statistics.drop("stale", "", float(now))
-    assert statistics.take_notices() == []
+    assert not caplog.messages
     assert statistics.last_error == ""
     assert statistics.counters == {"duplicate": 100, "stale": 100}
 
 
-def test_a_notice_is_one_line_of_bounded_length() -> None:
+def test_a_warning_is_one_line_of_bounded_length(caplog: pytest.LogCaptureFixture) -> None:
     statistics = Statistics()
     statistics.drop("malformed", "a\nb\x1b[2J" + "ü" * 5000, 0.0)
-    statistics.notice("agent\r\nagain" + "x" * 5000)
-    for line in (statistics.last_error, *statistics.take_notices()):
+    warn("agent\r\nagain" + "x" * 5000)
+    for line in (statistics.last_error, *caplog.messages):
         assert not re.search(r"[\x00-\x1f\x7f-\x9f]", line)
-        assert len(line.encode()) <= 512 + len("dropped a datagram: ")
+        assert len(line.encode()) <= 512
 
 
 # ---- numbers

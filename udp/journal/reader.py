@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 import zstandard
@@ -220,7 +220,7 @@ class Recording:
                 slot, topic = topics[record.channel_id]
                 session = sessions.get(slot)
                 datagram = record.data
-                words: dict[str, Any] = {}
+                words: dict[str, str] = {}
                 try:
                     if topic == "events":
                         words = json.loads(datagram)
@@ -235,7 +235,7 @@ class Recording:
                     ) from None
                 if isinstance(message, Hello):
                     count += 1
-                    codec = str(words.get("codec", ""))
+                    codec = words.get("codec", "")
                     session = Session(count, slot, message, codec, record.log_time)
                     sessions[slot] = session
                 elif session is None or message.session != session.hello.session:

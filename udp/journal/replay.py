@@ -11,7 +11,7 @@ from ...envs.config import EnvConfig
 from ...envs.registry import is_known
 from ...envs.spec import component_names
 from ...models import Backend
-from ...models.errors import InputError, printable
+from ...models.errors import InputError, printable, shortened
 from ..protocol.layout import Array
 from ..protocol.messages import State
 from ..transport.stepped import Steppable, make_stepped
@@ -129,12 +129,9 @@ class SessionVerdict:
             if was != now:
                 loop.close()
                 hint = " (--vehicle names its file)" if name == "vehicle_hash" else ""
-                words = [repr(value) for value in (was, now)]
-                pairs = enumerate(zip(*words, strict=False))
-                differs = next((i for i, (one, other) in pairs if one != other), 0)
-                start = max(0, differs - 40)
-                expected, got = (word[start : start + 80] for word in words)
-                raise InputError(f"expected an env of the {name} {expected}, got {got}{hint}")
+                raise InputError(
+                    f"expected an env of the {name} {shortened(was)}, got {shortened(now)}{hint}"
+                )
         return loop
 
 

@@ -185,16 +185,15 @@ def _deferred_signals() -> Iterator[None]:
         yield
         return
     came: list[int] = []
-    handlers: dict[int, Any] = {}
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            handler = signal.getsignal(number)
+        for number, handler in handlers.items():
             if handler is not None:  # None: not set by Python, and cannot be set again
-                handlers[number] = handler
                 signal.signal(number, lambda signum, _: came.append(signum))
         yield
     finally:
-        for each, handler in handlers.items():
-            signal.signal(each, handler)
+        for number, handler in handlers.items():
+            if handler is not None:
+                signal.signal(number, handler)
         for each in came:
             signal.raise_signal(each)

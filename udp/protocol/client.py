@@ -33,7 +33,7 @@ from .messages import (
     Welcome,
     one_line,
 )
-from .statistics import Statistics
+from .statistics import Statistics, warn
 from .transitions import SIMULATOR, SimulatorState
 
 Address = tuple[str, int]  # IPv4 host and port
@@ -221,7 +221,7 @@ class Client:
         self._dice = Random(self.hello.spec) if self.config.drop else None  # others for each agent
         self.is_queued = False
         self._assembler = Assembler(self.layout.seeded_command.size)
-        self._transfer: Transfer | None = None  # of the outstanding message
+        self._transfer = Transfer(b"", self.largest)  # of the message that was sent last
         self._asking = b""  # the datagram that was sent last and wants an answer
         self.outgoing: list[bytes] = []
         self._round_trips = RoundTrips()
@@ -339,14 +339,13 @@ class Client:
             if self.state == "closing":
                 self._give_up()
                 return True
-            self._forget_transfer()
+            self._stop_asking()
             self.close(f"no answer from the agent for {self.config.timeout:g} s", now)
             return False
         self.statistics.counters["resent"] += 1
         self.sends += 1
         self._tries += 1
         self._round_trips.sent(now)
-        assert self._transfer is not None
         closing = self.state == "closing"
         missing = None if closing else self._assembler.missing()  # of the answer
         datagrams = [binary.encode(missing)] if missing else self._transfer.probe()
@@ -354,10 +353,6 @@ class Client:
         wait = CLOSE_INTERVAL if closing else self._round_trips.wait(self._tries)
         self.resend_at = now + wait
         return True
-
-    def pardon(self, seconds: float) -> None:
-        """Move the deadline: this process was stopped for so long, and the agent could not know."""
-        self.deadline += seconds
 
     # ---- what came
 
@@ -378,12 +373,10 @@ class Client:
         self.state = then
         self._record(message, plain)
         if isinstance(message, Unknown):
-            self.statistics.notice(
-                "the agent does not know this session (any more); beginning a new one"
-            )
+            warn("the agent does not know this session (any more); beginning a new one")
             self.begin_again(now)
             return None
-        self._forget_transfer()
+        self._stop_asking()
         if isinstance(message, Welcome):
             self.is_queued = False
             self.statistics.counters["sessions"] += 1
@@ -401,10 +394,8 @@ class Client:
     def _wait_on(self, message: Missing | Wait | Alive, now: float) -> None:
         """The agent is there, and has no answer yet."""
         if isinstance(message, Missing):
-            transfer = self._transfer
-            assert transfer is not None
-            is_ours = message.kind == binary.peek(transfer.message)[0]
-            fragments = transfer.resend(message) if is_ours else []
+            is_ours = message.kind == binary.peek(self._transfer.message)[0]
+            fragments = self._transfer.resend(message) if is_ours else []
             if not fragments:
                 self._drop("stale", "", now)
                 return
@@ -420,12 +411,11 @@ class Client:
             self.resend_at = now + min(wait, _LATEST, self.config.timeout / 4)
         elif not self.is_queued:
             self.is_queued = True
-            self.statistics.notice("every slot of the agent is taken; waiting for a free one")
+            warn("every slot of the agent is taken; waiting for a free one")
         self.deadline = now + self.config.timeout  # the agent is there: this is no silence
 
     def _take_command(self, command: Command, plain: bytes, now: float) -> None:
         self.state = SIMULATOR["waiting"]["received", Command]
-        self._transfer = None
         self.resend_at = self.deadline = inf
         self._answered_at = now
         if self.tap:
@@ -536,10 +526,9 @@ class Client:
 
     def _give_up(self) -> None:
         self.state = SIMULATOR[self.state]["unsaid", Close]
-        self._forget_transfer()
+        self._stop_asking()
 
-    def _forget_transfer(self) -> None:
-        self._transfer = None
+    def _stop_asking(self) -> None:
         self.resend_at = self.deadline = inf
 
     def _drop(self, cause: str, reason: str, now: float) -> None:

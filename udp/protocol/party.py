@@ -17,6 +17,7 @@ from .client import Address, Client, address_text
 from .errors import LinkError, PeerSilent, Refused
 from .layout import Array, Layout
 from .messages import FLY, RESET, Close, Command, Refuse, Welcome
+from .statistics import warn
 
 Mask = NDArray[np.bool_]
 Seeds = NDArray[np.uint64]
@@ -172,12 +173,12 @@ class WorldRules:
             elif unlogged and not client.is_queued and (link.trouble or not client.sequence):
                 link.logged = asked_at
                 words = link.silence(_COMPLAIN_AFTER, client.sends)
-                client.statistics.notice(f"{words}; asking for {client.config.timeout:g} s in all")
+                warn(f"{words}; asking for {client.config.timeout:g} s in all")
 
     def pardon(self, seconds: float) -> None:
         """Move all deadlines: this process was stopped, and the agents could not know."""
         for link in self.links:
-            link.client.pardon(seconds)
+            link.client.deadline += seconds
             link.patient_until += seconds
 
     def close(self, reason: str, now: float) -> None:
@@ -400,7 +401,7 @@ class SeveralAgents(WorldRules):
         if flew:
             self._let_go(link)
         if flew and why:
-            link.client.statistics.notice(f"{link.name} is lost ({why}): its drones hold")
+            warn(f"{link.name} is lost ({why}): its drones hold")
         if len(self._who("left")) == len(self.links):
             self.reason = why
 

@@ -378,7 +378,7 @@ class Server:
             # Another address has it: no answer of ours may end it.
             self._drop("foreign", f"session {number:016x}", arrival)
             return
-        self.statistics.counters["foreign"] += 1  # mostly after a restart: no notice
+        self.statistics.counters["foreign"] += 1  # mostly after a restart: no warning
         reply = binary.encode(Unknown(session=number, sequence=sequence))
         if self._key:  # of use only to the simulator that has sent this State
             reply = self._key.seal(reply, arrival.datagram)

@@ -67,7 +67,6 @@ class Session:
     welcome: Welcome | None = None
     slot: int = -1  # its slot; -1 before it has one
     sequence: int = 0  # number of the State that came last
-    reply: Transfer | None = None  # the answer to the last State, or the Welcome
     asked_at: float = 0.0
     # When it last said that it computes, or sent a fragment that was missing.
     heard_at: float = 0.0
@@ -77,6 +76,7 @@ class Session:
         self.is_text = self.hello is None
         self._assembler = Assembler(self.layout.state.size)
         self._largest = largest_datagram(self.peer)
+        self.reply = Transfer(b"", self._largest)  # the answer to the last State, or the Welcome
 
     def move(self, way: Way, kind: type[Message]) -> None:
         """Be in the state that such a message leads to. Raises `KeyError` if it may not."""
@@ -144,7 +144,6 @@ class Session:
 
     def repeat(self) -> None:
         """Send the last answer again, the same bytes."""
-        assert self.reply is not None
         self.outbox.put(self.reply.start(), self.peer, self.key, "resent")
 
     def _answer_again(self) -> None:
@@ -220,7 +219,7 @@ class Session:
         self.move("received", type(message))
         if isinstance(message, Alive):
             self.heard_at = now
-        elif isinstance(message, Missing) and self.reply and message.kind == binary.COMMAND:
+        elif isinstance(message, Missing) and message.kind == binary.COMMAND:
             self.outbox.put(self.reply.resend(message), self.peer, self.key, "resent")
         else:
             self._drop("stale", now)

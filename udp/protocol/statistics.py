@@ -1,16 +1,18 @@
-"""Statistics of one side of the wire: counts, round trips, and notices at a bounded rate."""
+"""Statistics of one side of the wire: counts, round trips, and warnings at a bounded rate."""
 
+import logging
 from collections import Counter, deque
 
 import numpy as np
 
 from .messages import one_line
 
-NOTICE_INTERVAL = 10.0  # shortest time between two notices of the same cause, s
+WARNING_INTERVAL = 10.0  # shortest time between two warnings of the same cause, s
 
+_log = logging.getLogger("rotorgram.udp")
 _REMEMBERED = 1 << 14
 _QUIET = frozenset({"duplicate", "stale"})
-"""Events of every network that loses datagrams: counted, without a notice."""
+"""Events of every network that loses datagrams: counted, without a warning."""
 
 
 class Statistics:
@@ -23,29 +25,17 @@ class Statistics:
         self.round_trips: deque[float] = deque(maxlen=_REMEMBERED)
         """The last ones, s: from the first sending of a message to the answer that counts."""
         self.last_error = ""  # why the last unexpected datagram was dropped; "" if none was
-        self.notices: list[str] = []
-        """Sentences for the log, until `take_notices`."""
-        self._next_notice: dict[str, float] = {}
+        self._next_warning: dict[str, float] = {}
 
     def drop(self, cause: str, reason: str, now: float) -> None:
-        """Count a datagram that changes nothing; say so if it is time to."""
+        """Count a datagram that changes nothing; warn if it is time to."""
         self.counters[cause] += 1
         if cause in _QUIET:
             return
         self.last_error = one_line(f"{cause} {reason}")
-        if now >= self._next_notice.get(cause, now):
-            self.notices.append(f"dropped a datagram: {self.last_error}")
-            self._next_notice[cause] = now + NOTICE_INTERVAL
-
-    def notice(self, sentence: str) -> None:
-        """Keep a notice for the log."""
-        self.notices.append(one_line(sentence))
-
-    def take_notices(self) -> list[str]:
-        """Sentences for the log, each once."""
-        notices = self.notices
-        self.notices = []
-        return notices
+        if now >= self._next_warning.get(cause, now):
+            warn(f"dropped a datagram: {self.last_error}")
+            self._next_warning[cause] = now + WARNING_INTERVAL
 
     def numbers(self) -> dict[str, float]:
         """All of it as numbers by name, round trips in milliseconds: for logs of training."""
@@ -62,3 +52,8 @@ class Statistics:
             return counts
         p50, p99, most = list(self.numbers().values())[-3:]
         return f"{counts}; round trip p50 {p50:.3f} ms, p99 {p99:.3f} ms, max {most:.3f} ms"
+
+
+def warn(sentence: str) -> None:
+    """Write a warning to the log `rotorgram.udp`: one line of bounded length."""
+    _log.warning("%s", one_line(sentence))

@@ -5,7 +5,7 @@ One table for each side says what a message does, sent or received.
 
 import tomllib
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Final, Literal, TypeVar
 
 from . import messages
 from .messages import Message
@@ -17,11 +17,12 @@ SimulatorState = Literal["idle", "hello", "ready", "waiting", "closing", "closed
 AgentState = Literal["new", "welcomed", "deciding", "expecting", "closing", "closed"]
 """State of an agent, for each simulator."""
 Move = tuple[Way, type[Message]]
+S = TypeVar("S")
 
 
-def _read(side: str) -> dict[Any, dict[Move, Any]]:
+def _read(side: str) -> dict[S, dict[Move, S]]:
     text = Path(__file__).with_name("transitions.toml").read_text("utf-8")
-    table: dict[Any, dict[Move, Any]] = {}
+    table: dict[S, dict[Move, S]] = {}
     for state, ways in tomllib.loads(text)[side].items():
         table[state] = {}
         for way, following in ways.items():

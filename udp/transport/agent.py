@@ -27,7 +27,7 @@ from ..protocol.layout import Array, Layout
 from ..protocol.messages import Close, Hello, State
 from ..protocol.server import Server
 from ..protocol.session import Event
-from .sockets import LONGEST_WAIT, PAUSE, Port, log_notices
+from .sockets import LONGEST_WAIT, PAUSE, Port
 
 if TYPE_CHECKING:
     from ..journal import Journal
@@ -233,7 +233,7 @@ class Agent:
             datagram = None
             try:
                 datagram, address = self._port.receive(left, strangers=None in slots)
-            except (OSError, ValueError):  # nothing came; or (Windows) one came back
+            except (OSError, ValueError):  # nothing came, or an earlier one came back
                 if not self.close.alive:  # another thread has closed the env
                     raise gym.error.ClosedEnvironmentError("the env was closed") from None
             now = time.monotonic()
@@ -364,5 +364,3 @@ def _flush(server: Server, port: Port) -> None:
             port.send(datagram, address)
         except OSError:  # as good as lost: the simulator asks again, or the wait ends in time
             outbox.statistics.counters["unsent"] += 1
-    if outbox.statistics.notices:
-        log_notices(outbox.statistics)

@@ -29,7 +29,7 @@ from ..protocol.party import (
     Rules,
     SeveralAgents,
 )
-from .sockets import LONGEST_WAIT, PAUSE, TEXT_WAY_OUT, WAY_OUT, Port, log_notices, resolve
+from .sockets import LONGEST_WAIT, PAUSE, TEXT_WAY_OUT, WAY_OUT, Port, resolve
 from .stepped import GymEnv, GymnasiumWorld, make_stepped
 
 if TYPE_CHECKING:
@@ -272,8 +272,6 @@ class Simulator(NotCopied):
                 except OSError as error:  # a full buffer or no network: as good as lost
                     client.statistics.counters["unsent"] += 1
                     link.trouble = _words(error, "sending")
-            if client.statistics.notices:
-                log_notices(client.statistics)
 
     def _say_alive(self, finished: threading.Event) -> None:
         """In a thread: tell agents that wait for a State that it will come."""

@@ -9,7 +9,6 @@ nothing came, or in which another process had the core, lets more of the next wa
 
 import errno
 import ipaddress
-import logging
 import select
 import selectors
 import socket
@@ -21,14 +20,12 @@ from math import ceil
 
 from ...models import InputError
 from ..protocol.client import Address, address_text
-from ..protocol.statistics import Statistics
 
 LONGEST_WAIT = 0.1
 """Longest wait in one go, s: flags that other threads and signals set are looked at as often."""
 PAUSE = 1.0
 """If a wait takes longer than it should by this time, s, this process was stopped meanwhile."""
 
-_log = logging.getLogger("rotorgram.udp")
 _LOOK = 200e-6  # look of a wait before it sleeps, s: a step of one drone takes less
 _LOST = 60e-6  # time between two looks if another process had the core, s; else 2e-6
 _MAX_ASLEEP = 64  # waits at most that sleep at once before one looks again
@@ -86,9 +83,8 @@ class Socket(socket.socket):
         self.setblocking(False)
         with suppress(OSError):  # room for the fragments of a large message, if the system has it
             self.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
-        self._poll = select.poll() if hasattr(select, "poll") else None
-        if self._poll:
-            self._poll.register(self.fileno(), select.POLLIN)
+        self._poll = select.poll()
+        self._poll.register(self.fileno(), select.POLLIN)
         self._asleep = 0  # of the next waits so many sleep at once
         self._row = 1  # and so many after the next wait in which nothing came
 
@@ -119,10 +115,7 @@ class Socket(socket.socket):
                     return came
             self._asleep = self._row = min(4 * self._row, _MAX_ASLEEP)
         timeout = min(timeout, LONGEST_WAIT)
-        if self._poll:
-            self._poll.poll(ceil(1e3 * timeout))
-        elif self.fileno() >= 0:  # Windows
-            select.select([self], [], [], timeout)
+        self._poll.poll(ceil(1e3 * timeout))
         try:  # OSError if another thread has closed it
             return self.recvfrom(_MAX_DATAGRAM)
         except BlockingIOError:
@@ -272,9 +265,3 @@ def _receive_any(selector: selectors.BaseSelector, timeout: float) -> tuple[byte
         datagram, address = key.fileobj.recvfrom(_MAX_DATAGRAM)
         return datagram, address
     raise TimeoutError
-
-
-def log_notices(statistics: Statistics) -> None:
-    """Write warnings to the log `rotorgram.udp`."""
-    for notice in statistics.take_notices():
-        _log.warning("%s", notice)
