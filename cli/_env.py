@@ -77,7 +77,9 @@ def fitted(command: F, checkpoint: Checkpoint | Controller) -> F:
         if "vehicle" not in command.given:
             changes["vehicle"] = ",".join(checkpoint.env.vehicle_paths) or None
         if checkpoint.env.scene.is_file and "scene" not in command.given:
-            options["scene"] = checkpoint.env.scene.path
+            from ..scenes.files import path_of  # it imports MuJoCo
+
+            options["scene"] = path_of(checkpoint.env.scene)
     return replace(command, **changes)
 
 

@@ -104,9 +104,9 @@ class EnvFlags(Command):
     history: int = 1
     """Number of the last observations that are observed side by side."""
     scene: str | None = None
-    """Ground and obstacles: plain, airport, forest, warehouse or gates; the last three from a
-    seed, as forest:3, from one of several for each episode, as forest:0-7, or new in each, as
-    forest:new,density=0.01,size=60x60. Films and views show it, and the airport in place of
+    """Ground and obstacles: plain, airport, a TOML or MJCF file, or forest, warehouse, gates, maze
+    from a seed, as forest:3, from one of several for each episode, as forest:0-7, or new in each,
+    as forest:new,density=0.01,size=60x60. Films and views show it, and the airport in place of
     bare ground. Default: the task's."""
     cameras: Words = ()
     """Pictures that are observed: cameras of the vehicle, each NAME, NAME_KIND or
@@ -129,7 +129,7 @@ class EnvFlags(Command):
         """The task without its module."""
         return self.env.rpartition(":")[2]
 
-    def env_config(self, **settings: Any) -> "EnvConfig":
+    def env_config(self, **settings: object) -> "EnvConfig":
         """The env of the flags."""
         from ..envs.config import EnvConfig
 
@@ -172,7 +172,7 @@ class AgentFlags(WireFlags):
     """Wait here for a simulator instead of starting one."""
 
 
-def parse_value(text: str) -> Any:
+def parse_value(text: str) -> object:
     """A value as JSON, else the text itself. Python's True, False and None are taken too."""
     try:
         return json.loads({"True": "true", "False": "false", "None": "null"}.get(text, text))
@@ -183,6 +183,9 @@ def parse_value(text: str) -> Any:
 def parse_address(text: str) -> tuple[str, int]:
     """HOST:PORT as a pair. Raises `InputError`."""
     host, _, port = text.rpartition(":")
-    if not host or not re.fullmatch("[0-9]{1,5}", port):
-        raise InputError(f"address: expected HOST:PORT, got {shortened(text)}")
+    is_port = re.fullmatch(r"[0-9]{1,5}", port) is not None and int(port) <= 65535
+    if not host or not is_port:
+        raise InputError(
+            f"address: expected HOST:PORT with a port up to 65535, got {shortened(text)}"
+        )
     return host, int(port)

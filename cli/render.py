@@ -9,7 +9,7 @@ from tyro.conf import Positional
 
 from ..flights.palette import agent_label
 from ..flights.recorded import recorded_trajectories
-from ..flights.trajectories import flown_trajectories
+from ..flights.trajectories import RANGES, flown_trajectories
 from ..models import InputError
 from ..models.fields import NonNegativeInt
 from ._flags import Count, EnvFlags, OneOrMore, Words
@@ -96,11 +96,10 @@ class Render(EnvFlags):
     def _find(self, what: str) -> "tuple[FilmTrack, str | None]":
         """Flights of a policy or a journal, and the vehicle."""
         from ..flights.filming import FilmTrack
-        from ..sim.sensors.range_sensors import KINDS
         from ._env import pilot_of
 
         episodes = range(self.episode, self.episode + self.episodes)
-        rays = KINDS if self.rays else ()
+        rays = RANGES if self.rays else ()
         path = Path(what)
         is_file = path.suffix in (".mcap", ".safetensors")
         name = agent_label(path.stem if is_file else path.name)

@@ -8,7 +8,7 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from ..flights.recorded import recorded_trajectories
-from ..flights.trajectories import flown_trajectories
+from ..flights.trajectories import RANGES, flown_trajectories
 from ..models import InputError
 from ._flags import Count, EnvFlags
 
@@ -30,7 +30,6 @@ class View(EnvFlags):
         """Fly and show, episode after episode."""
         from ..flights.filming import moments
         from ..rendering.live import Pace
-        from ..sim.sensors.range_sensors import KINDS
         from ._env import pilot_of, print_episode
         from ._watch import open_view
 
@@ -39,7 +38,7 @@ class View(EnvFlags):
         if path.suffix == ".mcap":
             if self.options.keys() - {"scene"}:
                 raise InputError("env: expected no options with a journal, which has its own")
-            flights = ([one] for one in recorded_trajectories(path, observations=KINDS))
+            flights = ([one] for one in recorded_trajectories(path, observations=RANGES))
         else:
             shown, policy = pilot_of(self, self.what)
             config = shown.env_config()

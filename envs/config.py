@@ -242,7 +242,7 @@ class EnvConfig:
         """All fields as JSON values, with the version."""
         content = {one.name: getattr(self, one.name) for one in fields(self)}
         content |= {"effects": self.effects.to_options()}
-        content |= {"scene": self.scene.to_dict(), "backend": asdict(self.backend)}
+        content |= {"scene": asdict(self.scene), "backend": asdict(self.backend)}
         return json_values({"version": VERSION, **content})
 
     @classmethod

@@ -23,10 +23,14 @@ from ..envs.spec import EnvSpec
 from ..models import InputError
 from ..models.fields import immutable
 from ..scenes import SceneConfig
+from ..scenes.returns import Reading
 from ..sim.sensors import range_sensors_of
-from ..sim.sensors.range_sensors import KINDS, RangeSensor, Reading
+from ..sim.sensors.range_sensors import KINDS, RangeSensor
 
 Floats = NDArray[np.float64]
+
+RANGES = KINDS
+"""Observations of sensors with rays."""
 
 _EVALUATION = 20230324  # the day the paper appeared
 
@@ -294,7 +298,7 @@ def flown_trajectories(
     episodes: Sequence[int],
     of: EpisodeSet = "curve",
     training_seed: int | None = None,
-    observations: Collection[str] = KINDS,
+    observations: Collection[str] = RANGES,
 ) -> Flights:
     """Evaluation episodes of a set by number, flown in process as by `fly_episodes`, in unseen
     layouts of a scene; with the readings of sensors with rays."""

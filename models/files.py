@@ -48,8 +48,11 @@ def read_own_toml(module: str, name: str) -> dict[str, Any]:
 
 
 @contextmanager
-def removed_on_error(path: Path) -> Iterator[None]:
-    """Remove half a file or folder. An `OSError` without a file's name gets this one."""
+def removed_on_error(path: Path, target: Path | None = None) -> Iterator[None]:
+    """Remove half a file or folder after an error.
+
+    An `OSError` names the target if there is one, else this path unless it names another file.
+    """
     try:
         yield
     except BaseException as error:
@@ -58,8 +61,9 @@ def removed_on_error(path: Path) -> Iterator[None]:
                 shutil.rmtree(path)
             else:
                 path.unlink(missing_ok=True)
-        if isinstance(error, OSError) and not error.filename:
-            raise OSError(error.errno, error.strerror or str(error), str(path)) from None
+        if isinstance(error, OSError) and (target or not error.filename):
+            reason = error.strerror or str(error)
+            raise OSError(error.errno, reason, str(target or path)) from None
         raise
 
 
@@ -70,19 +74,13 @@ def write_whole(path: Path, content: str | bytes) -> None:
     at the same time. `OSError` names the file.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.{os.urandom(4).hex()}.tmp")
-    try:
+    with removed_on_error(temporary, path):
         path.parent.mkdir(parents=True, exist_ok=True)
         with open(temporary, "xb") as file:
             file.write(content.encode() if isinstance(content, str) else content)
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
-    except BaseException as error:
-        with suppress(OSError):
-            temporary.unlink()
-        if isinstance(error, OSError):
-            raise OSError(error.errno, error.strerror, str(path)) from None
-        raise
 
 
 def write_json(path: Path, content: object) -> None:

@@ -14,7 +14,7 @@ from .files import read_own_toml
 from .vehicle_file import read_vehicle_file
 
 MAX_ELEMENTS = 10_000  # of a file, each as often as it is repeated: seconds to compile
-MAX_BYTES = 1 << 24  # of a file
+MAX_BYTES = 1 << 23  # of a file: it is parsed in a second
 MAX_MEMORY = 1 << 30  # bytes of MJCF's attribute `memory`
 MAX_NUMBERS = 1 << 26  # of all height fields, textures, numerics and sensors: 0.5 GB
 _LARGEST = read_own_toml(__file__, "mjcf")
@@ -76,7 +76,7 @@ def swarm_spec(vehicles: Sequence[Path], names: Sequence[str]) -> tuple[MjSpec, 
     the first vehicle.
     """
     spec = read_spec(vehicles[0])
-    spec.delete(free_body(spec))
+    spec.delete(free_bodies(spec)[0])
     _delete_targeting_cameras(spec)
     crafts = []
     for path, name in zip(vehicles, names, strict=True):
@@ -84,7 +84,7 @@ def swarm_spec(vehicles: Sequence[Path], names: Sequence[str]) -> tuple[MjSpec, 
         own.option.timestep = spec.option.timestep
         own.option.gravity = spec.option.gravity
         _delete_targeting_cameras(own)
-        craft = spec.worldbody.add_frame().attach_body(free_body(own), f"{name}/", "")
+        craft = spec.worldbody.add_frame().attach_body(free_bodies(own)[0], f"{name}/", "")
         crafts.append(craft)
     return spec, crafts
 
@@ -95,11 +95,6 @@ def _delete_targeting_cameras(spec: MjSpec) -> None:
     for camera in list(spec.cameras):
         if camera.mode in modes:
             spec.delete(camera)
-
-
-def free_body(spec: MjSpec) -> MjsBody:
-    """The first body with a free joint: the craft of a vehicle's spec."""
-    return free_bodies(spec)[0]
 
 
 def level_data(model: mujoco.MjModel) -> MjData:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ..sim.sensors.range_sensors import Reading
+from ..scenes.returns import Reading
 from .film import Picture
 from .stage import Array, Moment, range_colors
 

@@ -26,7 +26,7 @@ from ..models.vehicle import owners
 from ..scenes import SceneConfig
 from ..scenes.build import SCENE_PREFIX, add_scene
 from ..scenes.marks import Mark, Point
-from ..sim.sensors.range_sensors import Reading
+from ..scenes.returns import Reading
 from .gl import Lines, Offscreen
 from .moving import MovingGeoms
 
@@ -53,6 +53,7 @@ _NEAR = 0.14  # at most: where drawing begins
 _LOWER = 0.06  # of their distance front and side look below the goal
 _BACK = 2.6  # distance of a camera per distance between craft and goal
 _FOVY = 50.0  # vertical field of view of every camera but `onboard`, degrees
+_DISTANT = 40.0  # of a goal that no picture shows together with the craft
 _FAR = 10.0  # Cameras move back until craft and goal are as far apart, or as at the start
 
 
@@ -247,10 +248,13 @@ class Stage:
         return camera
 
     def follow(self, camera: mujoco.MjvCamera) -> None:
-        """Turn a viewer's camera towards the goal, or the craft; afterwards move it with that."""
-        focus = self.focus
+        """Turn a viewer's camera towards the goal, or the craft where that is too far from it;
+        afterwards move it with that.
+        """
+        is_far = self.drones == 1 and self._reach > _DISTANT * self.radius
+        focus = self._points[0].copy() if is_far else self.focus
         if self._focus is None:
-            view = self.camera("free")
+            view = self.camera("chase" if is_far else "free")
             for name in ("azimuth", "elevation", "distance", "lookat"):
                 setattr(camera, name, getattr(view, name))
         else:  # keep what the mouse has changed

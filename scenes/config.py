@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, field, replace
+from dataclasses import field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn, Self
 
@@ -166,20 +166,6 @@ class SceneConfig:
     def is_file(self) -> bool:
         """Whether a file describes it."""
         return is_scene_file(self.name)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Fields by name."""
-        values = asdict(self)
-        if not self.is_file:  # digests of other scenes are as before
-            del values["content"]
-        return values
-
-    @property
-    def path(self) -> str:
-        """Of a file with its content, which is written to a folder if it is not here."""
-        from .files import path_of
-
-        return str(path_of(self))
 
     def embedded(self) -> Self:
         """The same with the content of its file, for a process that has not the file. Raises

@@ -39,17 +39,17 @@ def read_scene_file(path: Path) -> str:
         raise InputError(f"scene: cannot read {path}: {error.strerror}") from None
 
 
-def path_of(scene: SceneConfig) -> Path:
+def path_of(scene: SceneConfig) -> str:
     """A file of the content of a scene: its own if that has the same content today."""
     own = Path(scene.name)
     try:
-        if read_scene_file(own) == scene.content:
-            return own
+        if scene.content in ("", read_scene_file(own)):
+            return scene.name
     except InputError:
         pass  # it is missing here, or has changed
     name = f"{own.stem}.toml"
     data = base64.b64encode(scene.content.encode()).decode()
-    return Path(written(((name, data),)).name, name)
+    return str(Path(written(((name, data),)).name, name))
 
 
 def _of_mjcf(path: Path) -> tuple[Obstacle, ...]:

@@ -24,7 +24,7 @@ from .registry import MAX_SOLIDS
 
 SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "box": 3, "plane": 0}
 """How many numbers the size of each kind has."""
-_WORD = Text(r"[A-Za-z][A-Za-z0-9]{0,31}", "a word of at most 32 letters and digits")
+_WORD = Text(r"([A-Za-z][\w-]{0,31})?", "a word of at most 32 letters, digits, - and _")
 
 
 @immutable
@@ -42,14 +42,12 @@ class Obstacle:
     """Turn about z, anticlockwise, instead of a `quaternion`."""
     quaternion: Annotated[tuple[float, ...], Direction(-1e3, 1e3, count=4)] = (1.0, 0.0, 0.0, 0.0)
     """Attitude, w first."""
-    color: Annotated[tuple[float, ...], Limits(0.0, 1.0, count=3)] = (0.62, 0.64, 0.66)
+    color: Annotated[tuple[float, ...], Limits(0.0, 1.0, count=3)] = (0.5, 0.5, 0.5)
     """Red, green and blue."""
     label: Annotated[str, _WORD] = ""
     """Its class, a word as `tree`. None given: its kind."""
 
     def __post_init__(self) -> None:
-        if not self.label:
-            object.__setattr__(self, "label", self.kind)
         check_fields(self, "obstacle: ")
         if self.heading and self.quaternion[1:] != (0.0, 0.0, 0.0):
             raise InputError("obstacle: expected a heading or a quaternion, got both")
@@ -87,7 +85,9 @@ def to_content(obstacles: Iterable[Obstacle]) -> str:
                 lines.append(f"{field.name} = {json.dumps(value)}")
     content = "\n".join(lines)
     if len(content) > MAX_BYTES:
-        raise InputError(f"obstacle: expected {MAX_BYTES} bytes of them, got {len(content)}")
+        raise InputError(
+            f"obstacle: expected text of at most {MAX_BYTES} bytes, got {len(content)}"
+        )
     return content
 
 
@@ -110,4 +110,4 @@ def obstacles_in(file: Mapping[str, object]) -> tuple[Obstacle, ...]:
 
 def names_of(obstacles: Sequence[Obstacle]) -> tuple[str, ...]:
     """Of scene, object and part, as those of our scenes."""
-    return tuple(f"own/{one.label}_{i}/{one.kind}" for i, one in enumerate(obstacles))
+    return tuple(f"own/{one.label or one.kind}_{i}/{one.kind}" for i, one in enumerate(obstacles))

@@ -34,8 +34,10 @@ def find_path(
     corner = numbers("low", low)
     places = (numbers("ends", ends) - corner) / cell
     if places.shape != (2, 3) or not ((places >= 0) & (places < room.shape)).all():
-        between = f"{shortened(low)} and {shortened(high)}"
-        raise InputError(f"ends: expected two places between {between}, got {shortened(ends)}")
+        got = shortened(ends)
+        raise InputError(
+            f"ends: expected two places within the grid from {shortened(low)}, got {got}"
+        )
     first, last = map(tuple, places.astype(int).tolist())
     free = set(map(tuple, np.argwhere(room >= 0).tolist()))
     found = _search(free, first, last) if {first, last} <= free else []

@@ -68,6 +68,22 @@ class ErrorModel(NamedTuple):
         return np.array([*self[:5], *chances], np.float32)
 
 
+class Reading(NamedTuple):
+    """What a sensor with rays reads on one drone, for pictures."""
+
+    name: str
+    distances: Array
+    """m, (rows, columns); `reach` where nothing returned."""
+    reach: float
+    """m."""
+    is_flat: bool
+    """Whether distances are measured along the sensor's axis, as in a depth image."""
+    origin: Array
+    """Of the rays, world frame, m, (3,)."""
+    points: Array
+    """Where rays ended, world frame, m, (rows, columns, 3); nan where nothing returned."""
+
+
 # ---- formulas
 
 

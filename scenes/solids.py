@@ -63,7 +63,7 @@ class Solids:
     @classmethod
     def of_scene(cls, scene: str | SceneConfig) -> "Solids":
         """All that pictures show of a single scene. Raises `InputError`."""
-        return _of_scene(parse_scene(scene))
+        return _of_scene(parse_scene(scene).embedded())
 
     @classmethod
     def of_layout(cls, scene: SceneConfig, seed: int) -> "Solids":

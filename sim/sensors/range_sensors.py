@@ -6,7 +6,7 @@ They see the solids of a layout. `range_sensors.toml` has their models.
 import math
 from collections.abc import Mapping
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 from zlib import crc32
 
 import numpy as np
@@ -17,7 +17,7 @@ from ...models.files import read_own_toml
 from ...scenes import Layouts, Rays
 from ...scenes import returns as kernels
 from ...scenes.rays import MAX_PLACE, MAX_REACH
-from ...scenes.returns import ErrorModel
+from ...scenes.returns import ErrorModel, Reading
 from ..random import words_of
 from ..rotations import to_world
 from ..state import Array, ByName, clip
@@ -73,22 +73,6 @@ def checked(kind: str, given: Values) -> dict[str, Any]:
             value = check(f"{where}.{name}", _RULES[name], given[name])
             values[name] = list(value) if isinstance(value, tuple) else value
     return values
-
-
-class Reading(NamedTuple):
-    """What a sensor with rays reads on one drone, for pictures."""
-
-    name: str
-    distances: Array
-    """m, (rows, columns); `reach` where nothing returned."""
-    reach: float
-    """m."""
-    is_flat: bool
-    """Whether distances are measured along the sensor's axis, as in a depth image."""
-    origin: Array
-    """Of the rays, world frame, m, (3,)."""
-    points: Array
-    """Where rays ended, world frame, m, (rows, columns, 3); nan where nothing returned."""
 
 
 class RangeSensor(Instrument):

@@ -31,7 +31,7 @@ PAGES = [
     ROOT / "models" / "README.md",
 ]
 FENCE = re.compile(r"^```(.*?)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-LANGUAGES = {"python", "python continued", "sh", "text", "toml", "mermaid"}
+LANGUAGES = {"python", "python continued", "sh", "text", "toml", "xml", "mermaid"}
 DRAWING = ("cameras", "rotorgram.rendering", "flights.filming")
 """Words of programs that need OpenGL."""
 COMPILED = {"c"}  # tests/agents/test_export.py compiles and runs it

@@ -16,7 +16,8 @@ from rotorgram.flights.recorded import recorded_trajectories
 from rotorgram.flights.trajectories import Trajectory, flown_trajectories
 from rotorgram.rendering import Canvas, Stage
 from rotorgram.rendering.insets import add_insets
-from rotorgram.sim.sensors.range_sensors import RangeSensor, Reading, checked
+from rotorgram.scenes.returns import Reading
+from rotorgram.sim.sensors.range_sensors import RangeSensor, checked
 from rotorgram.udp.spawn import spawn_simulator
 
 HOVER = "rotorgram/Hover-v0"

@@ -196,6 +196,16 @@ def test_without_a_goal_the_camera_goes_with_the_craft() -> None:
         assert camera.lookat.tolist() == [0.0, 0.0, height]
 
 
+def test_the_camera_goes_with_the_craft_if_the_goal_is_far_away() -> None:
+    stage = Stage("plain")
+    camera = mujoco.MjvCamera()
+    for height, error in ((5.0, 100.0), (25.0, 80.0)):
+        stage.show(moment(height=height, error=error))
+        stage.follow(camera)
+        assert camera.lookat.tolist() == [0.0, 0.0, height]
+        assert camera.distance < 10.0
+
+
 # The simulation never waits.
 
 

@@ -48,7 +48,9 @@ def test_without_a_way_there_are_no_points() -> None:
     ends = [(0.5, -0.5, 0.5), (9.5, -0.5, 0.5)]
     assert find_path(wall, ends, **BOX, radius=2.5, cell=1.0).shape == (0, 3)
     assert find_path(wall, [ends[0], (5.0, 0.5, 0.5)], **BOX, radius=0.1).shape == (0, 3)
-    with pytest.raises(InputError, match=r"^ends: expected two places between .* got .*11"):
+    with pytest.raises(
+        InputError, match=r"^ends: expected two places within the grid from .*, got .*11"
+    ):
         find_path(wall, [ends[0], (11.0, 0.0, 0.5)], **BOX, radius=0.1)
 
 

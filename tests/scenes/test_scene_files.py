@@ -15,6 +15,7 @@ from rotorgram.envs.config import EnvConfig
 from rotorgram.models import InputError
 from rotorgram.models.vehicle import Vehicle
 from rotorgram.scenes import SceneConfig, Solids, build_scene
+from rotorgram.scenes.files import path_of
 from rotorgram.sim import make_world
 from rotorgram.udp.spawn import spawn_simulator
 from worlds import begin
@@ -130,7 +131,7 @@ def test_content_travels_with_the_config_and_files_do_not(scene: str) -> None:
     assert there.digest == config.digest
     assert there.changed(history=2).scene == config.scene
     assert (Solids.of_scene(there.scene).table == solids.table).all()
-    copy = SceneConfig.parse(there.scene.path)  # as commands name it where the file is not
+    copy = SceneConfig.parse(path_of(there.scene))  # as commands name it where the file is not
     assert (Solids.of_scene(copy).table == solids.table).all()
     with pytest.raises(InputError, match=rf"^scene: expected a file {scene}, got none"):
         EnvConfig(env_id="rotorgram/Hover-v0", scene=scene).resolve()
@@ -225,7 +226,7 @@ FIELD = "<asset><hfield name='h' nrow='{0}' ncol='{0}' size='1 1 1 1'/></asset>"
         ("<include file='/dev/zero'/>", r"file: expected files, got /dev/zero"),
         ("<include file='..'/>", r"file: expected files, got .*"),
         ("<include file='../no.xml'/>", r"expected MJCF that MuJoCo reads, got: .*"),
-        ("<!--" + "x" * (1 << 24) + "-->", r"file: expected files of at most 16777216 bytes.*"),
+        ("<!--" + "x" * (1 << 23) + "-->", r"file: expected files of at most 8388608 bytes.*"),
     ],
 )
 def test_hostile_mjcf(tmp_path: Path, content: str, sentence: str) -> None:
@@ -246,3 +247,12 @@ def test_what_is_no_file(tmp_path: Path) -> None:
         Solids.of_scene(SceneConfig(name="world.toml", content="no text of a file"))
     with pytest.raises(InputError, match=r"^scene: expected .*, got world.toml with seeds \(3,\)"):
         SceneConfig(name="world.toml", seeds=(3,))
+
+
+@pytest.mark.parametrize("ending", ["toml", "xml"])
+def test_the_file_of_the_page(tmp_path: Path, ending: str) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "solids.md").read_text("utf-8")
+    block = page.partition(f"```{ending}\n")[2].partition("```")[0]
+    scene = written(tmp_path, block, f"my_world.{ending}")
+    counts = {"toml": 4, "xml": 6}
+    assert len(Solids.of_layout(SceneConfig.parse(scene), 0)) == counts[ending]

@@ -250,7 +250,7 @@ def test_runs_that_are_too_short_are_named():
     assert "did not converge" not in convergence.evidence
 
 
-def test_verdicts_state_their_source_and_preset():
+def test_verdicts_state_their_source():
     for verdict in judge_claims(training(paper_like), HELD, HEADLINE):
         assert "ection 3" in verdict.source
         assert verdict.definition

@@ -264,6 +264,7 @@ def test_verdicts_and_tables_are_files(comparison: Path) -> None:
     assert "Seeds 0 to 2; 67 evaluation episodes each;" in text
     assert "Fewer than five seeds decide nothing." in text
     assert text.count("**undecided**: ") == 5
+    assert text.count("; preset tuned.)") == 5
 
 
 def test_the_terminal_shows_the_table_in_a_hundred_columns(comparison: Path) -> None:

@@ -115,7 +115,7 @@ class GymnasiumWorld:
     def close(self) -> None:
         self._env.close()
 
-    def _keep(self, observation: object, info: Mapping[str, Any]) -> None:
+    def _keep(self, observation: object, info: Mapping[str, float]) -> None:
         for array in self.spec.observation:
             value = np.asarray(
                 observation[array.name] if isinstance(observation, dict) else observation
